@@ -1,0 +1,116 @@
+"""The seam between a robot, its sense of touch and an engine.
+
+Everything here is a NamedTuple of arrays with fixed shapes and dtypes, so that it is a JAX pytree without
+this package knowing JAX. A leading axis turns one into a chunk of many.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+import numpy as np
+
+Array = Any  # a NumPy or a JAX array
+
+
+class Motion(IntEnum):
+    """What the robot was doing during a step (the Create's state machine needs to know)."""
+
+    OTHER = 0
+    FORWARD = 1
+    BACK = 2
+    TURN = 3
+
+
+class Odometry(NamedTuple):
+    """Body-frame motion over one step: the robot's new pose in the frame of its old one.
+
+    Attributes:
+        dx: forward, m. dy: to the left, m. dtheta: counter-clockwise, rad. dt: duration, s.
+    """
+
+    dx: Array
+    dy: Array
+    dtheta: Array
+    dt: Array
+
+
+class Cycle(NamedTuple):
+    """One whisk cycle as the head reports it; host NumPy, the number of samples T may vary.
+
+    Attributes:
+        time: [T] s. angle: [T, W] whisker angles, rad. deflection: [T, W, 2] base deflections.
+        odometry: motion since the previous cycle.
+    """
+
+    time: np.ndarray
+    angle: np.ndarray
+    deflection: np.ndarray
+    odometry: Odometry
+
+
+class Observation(NamedTuple):
+    """What an engine is given at one step. Absent things are masked, never NaN.
+
+    Attributes:
+        odometry: motion since the previous observation.
+        motion: a `Motion`, int32.
+        view: [R, C, K] view, values in 0..1 (3 x 6 whiskers x channels, 20 x 60 x 1 for a camera).
+        view_seen: whether `view` holds a view, bool.
+        label: place-recognition id given by the recording, int32; -1 when there is none.
+        contact: [W] bool, whiskers that touched something.
+        point: [W, 2] m in base_link, where they touched.
+        wall: bool, whether a wall orientation was measured; wall_point: [2] its nearest point, m in
+            base_link; wall_sd: standard deviation of its direction, rad.
+    """
+
+    odometry: Odometry
+    motion: Array
+    view: Array
+    view_seen: Array
+    label: Array
+    contact: Array
+    point: Array
+    wall: Array
+    wall_point: Array
+    wall_sd: Array
+
+
+def observation(
+    odometry: Odometry,
+    view: np.ndarray | None = None,
+    *,
+    view_shape: tuple[int, int, int] = (3, 6, 1),
+    label: int = -1,
+    motion: Motion = Motion.OTHER,
+    whiskers: int = 0,
+) -> Observation:
+    """An observation of a view and / or a given label, without contacts.
+
+    Args:
+        view: [R, C, K], or None when nothing was seen; then `view_shape` gives its shape.
+        whiskers: W, the number of whiskers of the (masked) contact fields.
+    """
+    seen = view is not None
+    return Observation(
+        odometry=Odometry(*(np.float64(value) for value in odometry)),
+        motion=np.int32(motion),
+        view=np.asarray(view, np.float64) if seen else np.zeros(view_shape),
+        view_seen=np.bool_(seen),
+        label=np.int32(label),
+        contact=np.zeros(whiskers, bool),
+        point=np.zeros((whiskers, 2)),
+        wall=np.bool_(False),
+        wall_point=np.zeros(2),
+        wall_sd=np.float64(0.0),
+    )
+
+
+def stack(observations: Sequence[Observation]) -> Observation:
+    """A chunk: the observations stacked along a new leading axis."""
+    first = observations[0]
+    odometry = Odometry(*(np.stack(column) for column in zip(*(o.odometry for o in observations), strict=True)))
+    columns = zip(*(o[1:] for o in observations), strict=True)
+    return type(first)(odometry, *(np.stack(column) for column in columns))
