@@ -1,0 +1,64 @@
+"""The seam: what a SLAM method has to provide.
+
+A backend is a pure kernel and a map that folds what the kernel reports. The kernel never sees the map and
+the map never sees the kernel's state, so the kernel can be scanned, batched and replayed bit for bit.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+import networkx
+import numpy as np
+
+from ratslam.types import Estimate
+from tactile.types import Array, Observation
+
+State = Any
+"""A pytree of arrays of fixed shapes and dtypes."""
+Evidence = Any
+"""The backend's own fixed-shape record of one step, a NamedTuple of arrays."""
+
+
+class Capacity(NamedTuple):
+    """How much of what a kernel has used. Both are functions of the number of steps alone."""
+
+    size: int
+    """Rows in the kernel's growing arrays, a power of two."""
+    per_step: int
+    """Rows one step can use at most."""
+
+
+class Map(Protocol):
+    """The host side: folds one step at a time and answers in the map frame."""
+
+    def update(self, observation: Observation, estimate: Estimate, evidence: Evidence) -> None:
+        """Folds one step."""
+
+    def pose(self, estimate: Estimate) -> np.ndarray:
+        """[3] the robot's present pose in the map frame: x m, y m, heading rad."""
+
+    def graph(self) -> networkx.DiGraph:
+        """The map as a graph (empty for maps without nodes)."""
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All of its state, for a checkpoint."""
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """The inverse of `arrays`."""
+
+
+class Backend(Protocol):
+    """A SLAM method."""
+
+    def init(self, key: Array, capacity: int) -> State:
+        """The state before the first step, with room for `capacity` rows of whatever grows."""
+
+    def grow(self, state: State, capacity: int) -> State:
+        """The same state with more room."""
+
+    def kernel(self, state: State, observation: Observation) -> tuple[State, Estimate, Evidence]:
+        """One step, pure: it can be jitted, scanned and vmapped."""
+
+    def new_map(self) -> Map:
+        """An empty map."""
