@@ -1,0 +1,51 @@
+"""`python -m ratslam`, and what the console script calls."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import sys
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs the program.
+
+    Before anything else of ours is imported, it makes sure that it is ours: `tactile/__init__.py` says why.
+
+    Args:
+        argv: the arguments without the program's name; None takes those of the process.
+
+    Returns:
+        The exit code: 2 after an error the user can mend.
+    """
+    strangers = [_stranger(name) for name in ("ratslam", "tactile", "robot", "evaluation")]
+    if any(strangers):
+        print("\n".join(filter(None, strangers)), file=sys.stderr)
+        return 2
+    from ratslam.cli import main as run
+
+    return run(argv)
+
+
+def _stranger(name: str) -> str:
+    """What is wrong with the package of this name; '' if it is ours."""
+    spec = importlib.util.find_spec(name)
+    if spec is None:
+        return f"ratslam: error: the package '{name}' is missing; install ratslam again"
+    try:
+        package = importlib.import_module(name)
+    except (Exception, SystemExit) as error:
+        found = f"cannot be imported ({type(error).__name__}: {error})"
+    else:
+        if getattr(package, "RATSLAM_PACKAGE", None) == name:
+            return ""
+        found = "belongs to another distribution"
+    path = spec.origin or next(iter(spec.submodule_search_locations or ()), "an unknown place")
+    return (
+        f"ratslam: error: the package '{name}' at {path} {found} and hides ours; "
+        "install ratslam in a virtual environment of its own"
+    )
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

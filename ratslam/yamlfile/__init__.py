@@ -1,0 +1,136 @@
+"""Configuration files: YAML read strictly, validated in one pass, written back exactly."""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ValidationError
+
+from ratslam.yamlfile.complaints import complaints
+from ratslam.yamlfile.document import Document, KeyPath, Place, dotted, shown
+from ratslam.yamlfile.dumper import Dumper
+from ratslam.yamlfile.reader import Reader
+from tactile.errors import InputError, InputErrors
+
+Model = TypeVar("Model", bound=BaseModel)
+
+_MAX_BYTES = 1 << 17  # a configuration is a few kB; the parser needs about a second for this much
+
+
+def load(path: str | os.PathLike[str]) -> Document:
+    """The document in a file, with `${NAME}` in its texts replaced by environment variables.
+
+    Raises:
+        InputError: with file, line and column, whatever is wrong with the file.
+    """
+    name = os.fspath(path)
+    try:
+        with Path(name).open("rb") as file:
+            content = file.read(_MAX_BYTES + 1)
+    except OSError as error:
+        raise InputError(name, f"cannot be read: {error.strerror}") from None
+    except ValueError as error:  # a NUL or a lone surrogate in the name
+        raise InputError(ascii(name), f"cannot be read: {error}") from None
+    if len(content) > _MAX_BYTES:
+        raise InputError(name, "a large file", f"a configuration of at most {_MAX_BYTES >> 10} KiB")
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content.count(b"\n", 0, error.start) + 1
+        raise InputError(f"{name}:{line}", f"byte 0x{content[error.start]:02x}", "text in UTF-8") from None
+    return parse(text, name)
+
+
+def parse(text: str, name: str) -> Document:
+    """The document in a text; `name` is what messages call its file."""
+    reader = Reader(text, lambda line, column: f"{name}:{line}:{column}:")
+    data = reader.read()
+    if not isinstance(data, dict):
+        where = reader.places[()].value.rstrip(":")
+        raise InputError(where, shown(data), "keys and values such as 'seed: 1'")
+    return Document(data, reader.places | {(): Place(name, name)})
+
+
+def override(document: Document, assignments: Sequence[str]) -> Document:
+    """The document with values replaced or added, each given as `a.b=value` (list items as `a.0=value`)."""
+    data, places = copy.deepcopy(document.data), dict(document.places)
+    for assignment in assignments:
+        name, equals, text = assignment.partition("=")
+        keys = name.split(".")
+        where = f"--set {name}"
+        if not equals or not all(keys):
+            raise InputError(where, "no key and value", "key=value such as pose_cells.excite_sigma=1e-3")
+        section: Any = data
+        path: KeyPath = ()
+        for key in keys:
+            if path:
+                section = _opened(section, path[-1])
+            path += (_step(section, key, where, path),)
+        reader = Reader(text, lambda line, column: "--set", path)
+        section[path[-1]] = reader.read()
+        places = {at: place for at, place in places.items() if at[: len(path)] != path}
+        for length in range(1, len(path)):
+            places.setdefault(path[:length], Place("--set", "--set"))
+        places |= reader.places
+    return Document(data, places)
+
+
+def validate(document: Document, model: type[Model]) -> Model:
+    """The document as a model.
+
+    Raises:
+        InputErrors: all that is wrong with it, each with its place.
+    """
+    try:
+        # As JSON, because pydantic is then strict and still takes lists for tuples and texts for paths.
+        return model.model_validate_json(json.dumps(document.data), strict=True)
+    except ValidationError as error:
+        raise InputErrors(complaints(error, model, document)) from None
+
+
+def dump(model: BaseModel) -> str:
+    """The model as YAML that `load` and `validate` turn into an equal model."""
+    data = _escaped(model.model_dump(mode="json"))
+    return yaml.dump(data, Dumper=Dumper, sort_keys=False, allow_unicode=True, width=100)
+
+
+def schema(model: type[BaseModel]) -> dict[str, Any]:
+    """The JSON schema by which an editor completes and checks a configuration file."""
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **model.model_json_schema()}
+
+
+def _escaped(data: Any) -> Any:
+    """The data with `${` in its texts escaped, so that reading does not take it for a variable."""
+    match data:
+        case dict():
+            return {key: _escaped(value) for key, value in data.items()}
+        case list():
+            return [_escaped(value) for value in data]
+        case str():
+            return data.replace("${", "$${")
+        case _:
+            return data
+
+
+def _step(section: Any, key: str, where: str, path: KeyPath) -> str | int:
+    """The key or list index by which `key` leads into a section."""
+    if isinstance(section, dict):
+        return key
+    if isinstance(section, list):
+        if key.isascii() and key.isdigit() and len(key) < 9 and int(key) < len(section):
+            return int(key)
+        raise InputError(where, f"{dotted(path)} has {len(section)} items", f"an index below {len(section)}")
+    raise InputError(where, f"{dotted(path)} is {shown(section)}", "a section to put a key in")
+
+
+def _opened(section: Any, key: str | int) -> Any:
+    """The subsection at a key, made where there is none."""
+    if isinstance(section, dict) and section.get(str(key)) is None:
+        section[str(key)] = {}
+    return section[key]

@@ -1,0 +1,192 @@
+"""What pydantic found wrong with a configuration, in the words and at the places of its author."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Sequence
+from enum import Enum
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+from ratslam.yamlfile.document import Document, KeyPath, either, shown
+from tactile.errors import InputError
+
+_MAX_ERRORS = 50
+_WORDS = {
+    "a valid boolean": "true or false",
+    "a valid integer": "a whole number",
+    "a valid number": "a number",
+    "a valid string": "text",
+    "a valid array": "a list",
+    "an object": "a section of keys and values",
+    "None": "nothing",
+}
+
+
+def complaints(error: ValidationError, model: type[BaseModel], document: Document) -> list[InputError]:
+    """One error for each thing wrong, in the order of the file; the alternatives of a union in one."""
+    order = {path: rank for rank, path in enumerate(document.places)}
+    found = [(_spot(details["loc"], model), details) for details in error.errors(include_url=False)]
+    found.sort(key=lambda pair: order[document.nearest(pair[0].path)])
+    merged: dict[_Complaint, list[str]] = {}
+    for spot, details in found:
+        complaint = _complaint(details, spot, model, document)
+        expected = merged.setdefault(complaint._replace(expected=""), [])
+        if complaint.expected not in expected:
+            expected.append(complaint.expected)
+    errors = [
+        InputError(complaint.where, complaint.found, " or ".join(filter(None, expected)), complaint.cure)
+        for complaint, expected in merged.items()
+    ]
+    rest = len(errors) - _MAX_ERRORS
+    return errors[:_MAX_ERRORS] + ([InputError("", f"and {rest} more errors")] if rest > 0 else [])
+
+
+class _Complaint(NamedTuple):
+    """The arguments of an `InputError`."""
+
+    where: str
+    found: str
+    expected: str = ""
+    cure: str = ""
+
+
+class _Spot(NamedTuple):
+    """What an error is about.
+
+    Attributes:
+        path: its key path in the data.
+        owner: the model that holds the last key of the path; None if that is no model or not known.
+        kinds: the types that may stand there; several for a union, none if not known.
+    """
+
+    path: KeyPath
+    owner: type[BaseModel] | None
+    kinds: list[Any]
+
+
+def _complaint(details: ErrorDetails, spot: _Spot, model: type[BaseModel], document: Document) -> _Complaint:
+    """The words for one error of pydantic's."""
+    path, owner, kinds = spot
+    context = details.get("ctx", {})
+    value = document.value(path)
+    match details["type"]:
+        case "extra_forbidden":
+            known = list(owner.model_fields) if owner else []
+            cure = _did_you_mean(path[-1], known) or f"the keys here are {', '.join(known) or 'none'}"
+            return _Complaint(document.at_key(path), "unknown key", cure=cure)
+        case "missing" if isinstance(path[-1], int):  # an item of a tuple
+            return _wrong_length(_spot(details["loc"][:-1], model), "more values", document)
+        case "missing":
+            field = owner.model_fields.get(str(path[-1])) if owner else None
+            return _Complaint(document.at_key(path), "missing", cure=(field and field.description) or "")
+        case "too_long":
+            return _wrong_length(spot, f"at most {context['max_length']} values", document)
+        case "too_short":
+            return _wrong_length(spot, f"at least {context['min_length']} values", document)
+        case "union_tag_not_found":
+            at = (*path, context["discriminator"].strip("'"))
+            words = [word for kind in kinds for word in _words(kind, at[-1])]
+            return _Complaint(document.at_key(at), "missing", either(words) if words else "")
+        case "union_tag_invalid":
+            at = (*path, context["discriminator"].strip("'"))
+            return _wrong_word(at, context["expected_tags"], document)
+        case "literal_error" | "enum":
+            return _wrong_word(path, context["expected"], document)
+        case "value_error" | "assertion_error":
+            prefix = "" if isinstance(value, dict) else f"{shown(value)}: "
+            return _Complaint(document.at_value(path), f"{prefix}{context['error']}")
+    message = details["msg"]
+    if not message.startswith("Input should be "):
+        return _Complaint(document.at_value(path), f"{shown(value)}: {message[0].lower()}{message[1:]}")
+    expected = message.removeprefix("Input should be ")
+    expected = re.sub("^(greater|less|a multiple)", r"a number \1", _WORDS.get(expected, expected))
+    return _Complaint(document.at_value(path), shown(value), expected)
+
+
+def _wrong_length(spot: _Spot, expected: str, document: Document) -> _Complaint:
+    for kind in spot.kinds:
+        if get_origin(kind) is tuple and Ellipsis not in get_args(kind):
+            expected = f"{len(get_args(kind))} values"
+    return _Complaint(document.at_value(spot.path), shown(document.value(spot.path)), expected)
+
+
+def _wrong_word(path: KeyPath, expected: str, document: Document) -> _Complaint:
+    found = document.value(path)
+    words = re.findall("'([^']*)'", expected)
+    choice = either(words) if words else expected
+    return _Complaint(document.at_value(path), shown(found), choice, _did_you_mean(found, words))
+
+
+def _did_you_mean(found: Any, words: Sequence[str]) -> str:
+    """A suggestion, or ''."""
+    close = difflib.get_close_matches(str(found).lower(), {word.lower(): word for word in words}, n=1)
+    return "".join(f"did you mean '{word}'?" for word in words if close and word.lower() == close[0])
+
+
+def _spot(loc: Sequence[str | int], model: type[BaseModel]) -> _Spot:
+    """Follows pydantic's location through the types.
+
+    Pydantic puts the name of the alternative it tried between the keys wherever a union stands; only the
+    types tell that name from a key.
+    """
+    path: KeyPath = ()
+    owner: type[BaseModel] | None = None
+    kinds: list[Any] = [model]
+    for item in loc:
+        if len(kinds) > 1:
+            kinds = [kind for kind in kinds if _answers_to(kind, item)][:1]
+        elif item != "[key]":
+            path += (item,)
+            owner = kinds[0] if kinds and _is_model(kinds[0]) else None
+            kinds = _alternatives(_inside(kinds[0], item)) if kinds else []
+    return _Spot(path, owner, kinds)
+
+
+def _is_model(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, BaseModel)
+
+
+def _alternatives(kind: Any) -> list[Any]:
+    """The members of a union but None; the type itself where it is not a union."""
+    origin = get_origin(kind)
+    if origin is Annotated:
+        return _alternatives(get_args(kind)[0])
+    if origin in (Union, UnionType):
+        return [part for member in get_args(kind) if member is not NoneType for part in _alternatives(member)]
+    return [kind]
+
+
+def _answers_to(kind: Any, name: str | int) -> bool:
+    """Whether pydantic calls this alternative of a union by `name`: by its class or by a word of a tag."""
+    if not _is_model(kind):
+        return False
+    return kind.__name__ == name or any(name in _words(kind, field) for field in kind.model_fields)
+
+
+def _words(kind: Any, field: str | int) -> Sequence[Any]:
+    """The values a model's field is restricted to."""
+    annotation = _inside(kind, field) if _is_model(kind) else None
+    if isinstance(annotation, type) and issubclass(annotation, Enum):
+        return [member.value for member in annotation]
+    return get_args(annotation) if get_origin(annotation) is Literal else ()
+
+
+def _inside(kind: Any, key: str | int) -> Any:
+    """The type of what a value of type `kind` holds at a key or index; None where that is not known."""
+    if _is_model(kind):
+        field = kind.model_fields.get(str(key))
+        return field.annotation if field else None
+    arguments = get_args(kind)
+    match get_origin(kind), key:
+        case (origin, int(index)) if origin is tuple and Ellipsis not in arguments and index < len(arguments):
+            return arguments[index]
+        case (origin, int()) if isinstance(origin, type) and arguments:
+            return arguments[0]
+        case (origin, str()) if isinstance(origin, type) and len(arguments) == 2:
+            return arguments[1]
+    return None

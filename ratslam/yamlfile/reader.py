@@ -1,0 +1,174 @@
+"""YAML text to plain data, strictly, with the place of everything.
+
+Duplicate keys, anchors and tags are refused, so that every value has one place and no file unfolds into
+a larger one.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable
+from typing import Any
+
+import yaml
+
+from ratslam.yamlfile.document import KeyPath, Place, label, shown
+from ratslam.yamlfile.scalars import Refused, plain
+from tactile.errors import InputError, InputErrors
+
+_MAX_DEPTH = 32
+_NO_ANCHORS = "write the value out at each place"
+_RECORDINGS = "the recordings are not part of the project: set RATSLAM_DATA to the folder that holds them"
+
+
+class Reader:
+    """Reads one text.
+
+    Args:
+        text: the YAML; `${NAME}` in its texts becomes the environment variable, `$${` a literal `${`.
+        place: what to call a line and column (from 1), ending in a colon if it should.
+        root: the key path of the text's value.
+
+    Attributes:
+        places: of every key path read so far.
+    """
+
+    def __init__(self, text: str, place: Callable[[int, int], str], root: KeyPath = ()) -> None:
+        self.places: dict[KeyPath, Place] = {}
+        self._text = text
+        self._place = place
+        self._root = root
+        self._events = yaml.parse(text, Loader=yaml.SafeLoader)
+        self._line, self._column = 1, 1  # of the event read last
+        self._brackets: list[str] = []  # places of those still open
+        self._errors: list[InputError] = []  # that do not keep the rest from being read
+
+    def read(self) -> Any:
+        """The data.
+
+        Raises:
+            InputError: the first place where the text is not YAML, or else all values that cannot be used.
+        """
+        try:
+            data = self._document()
+        except yaml.reader.ReaderError as error:
+            self._line = self._text.count("\n", 0, error.position) + 1
+            self._column = error.position - self._text.rfind("\n", 0, error.position)
+            raise self._error(self._root, f"the character {self._text[error.position]!r}", "text") from None
+        except yaml.MarkedYAMLError as error:
+            raise self._syntax(error) from None
+        except InputError:
+            raise
+        except (ValueError, OverflowError):  # PyYAML's own, of escapes like "\UFFFFFFFF" and `%YAML 1.111…`
+            raise self._error(self._root, "not YAML: an escape out of range after this") from None
+        if self._errors:
+            raise InputErrors(self._errors)
+        return data
+
+    def _error(self, path: KeyPath, found: str, expected: str = "", cure: str = "") -> InputError:
+        """An error at the event read last."""
+        return InputError(label(self._place(self._line, self._column), path), found, expected, cure)
+
+    def _syntax(self, error: yaml.MarkedYAMLError) -> InputError:
+        """The parser's error in our words."""
+        problem = error.problem or error.context or ""
+        if "<stream end>" in problem and self._brackets:
+            return InputError(label(self._brackets[-1], self._root), "a bracket that is not closed")
+        mark = error.problem_mark or error.context_mark
+        if mark is not None:
+            self._line, self._column = mark.line + 1, mark.column + 1
+        cure = "indent with spaces, not tabs" if r"'\t'" in problem else ""
+        return self._error(self._root, f"not YAML: {problem}", cure=cure)
+
+    def _next(self) -> yaml.Event:
+        event = next(self._events)
+        assert event.start_mark
+        self._line, self._column = event.start_mark.line + 1, event.start_mark.column + 1
+        return event
+
+    def _document(self) -> Any:
+        self._next()  # the start of the stream
+        if isinstance(self._next(), yaml.StreamEndEvent):
+            raise self._error(self._root, "empty", "a value" if self._root else "keys and values")
+        data = self._value(self._next(), self._root)
+        self._next()  # the end of the document
+        if not isinstance(self._next(), yaml.StreamEndEvent):
+            raise self._error(self._root, "a second document", "only one")
+        return data
+
+    def _value(self, event: yaml.Event, path: KeyPath, key: str = "") -> Any:
+        """The value that begins with `event`; `key` is the place of its key."""
+        place = self._place(self._line, self._column)
+        self.places[path] = Place(key or place, place)
+        if isinstance(event, yaml.AliasEvent):
+            raise self._error(path, f"an alias (*{event.anchor})", cure=_NO_ANCHORS)
+        assert isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent)
+        if event.anchor:
+            raise self._error(path, f"an anchor (&{event.anchor})", cure=_NO_ANCHORS)
+        if event.tag:
+            raise self._error(path, f"a tag ({event.tag})", "a plain value")
+        if isinstance(event, yaml.ScalarEvent):
+            return self._scalar(event, path)
+        if len(path) - len(self._root) >= _MAX_DEPTH:
+            raise self._error(path[:3], f"sections nested more than {_MAX_DEPTH} deep")
+        if event.flow_style:
+            self._brackets.append(place)
+        data = self._mapping(path) if isinstance(event, yaml.MappingStartEvent) else self._sequence(path)
+        if event.flow_style:
+            self._brackets.pop()
+        return data
+
+    def _sequence(self, path: KeyPath) -> list[Any]:
+        items: list[Any] = []
+        while not isinstance(event := self._next(), yaml.SequenceEndEvent):
+            items.append(self._value(event, (*path, len(items))))
+        return items
+
+    def _mapping(self, path: KeyPath) -> dict[str, Any]:
+        data: dict[str, Any] = {}
+        while not isinstance(event := self._next(), yaml.MappingEndEvent):
+            place = self._place(self._line, self._column)
+            name = self._key(event, path)
+            at = (*path, name)
+            if name in data:
+                first = self.places[at].key.rstrip(":")
+                self._errors.append(self._error(at, "given twice", cure=f"the first is at {first}"))
+            data[name] = self._value(self._next(), at, place)
+        return data
+
+    def _key(self, event: yaml.Event, path: KeyPath) -> str:
+        if not isinstance(event, yaml.ScalarEvent) or event.anchor or event.tag:
+            raise self._error(path, "a key that is not plain text", "a name")
+        if not event.style and not isinstance(plain(event.value), str):
+            cure = f"write '{event.value}'"
+            self._errors.append(self._error(path, f"the key {event.value or 'is empty'}", "text", cure))
+        return self._text_of(event.value, path)
+
+    def _scalar(self, event: yaml.ScalarEvent, path: KeyPath) -> Any:
+        value = event.value if event.style else plain(event.value)
+        if isinstance(value, Refused):
+            self._errors.append(self._error(path, *value))
+        if not isinstance(value, str):
+            return value
+        return self._text_of(re.sub(r"(\$?)\$\{([^}]*)(\}?)", lambda m: self._variable(m, path), value), path)
+
+    def _text_of(self, text: str, path: KeyPath) -> str:
+        """The text, if it can be a file's name and be written to a file."""
+        if re.search("[\0\ud800-\udfff]", text):
+            self._errors.append(self._error(path, shown(text), "text without control characters"))
+        return text
+
+    def _variable(self, found: re.Match[str], path: KeyPath) -> str:
+        escaped, name, close = found.groups()
+        if escaped:
+            return found[0][1:]
+        if not close or not re.fullmatch("[A-Za-z_][A-Za-z0-9_]*", name):
+            error = self._error(path, shown(found[0]), "${NAME}", "write $${ for a literal ${")
+            self._errors.append(error)
+            return ""
+        value = os.environ.get(name, "")
+        if not value:
+            cure = _RECORDINGS if name == "RATSLAM_DATA" else f"set {name} or write the value out"
+            self._errors.append(self._error(path, f"the environment variable {name} is not set", cure=cure))
+        return value

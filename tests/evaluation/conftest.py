@@ -1,0 +1,86 @@
+"""Paths of reference data, and small runs whose right answers are known."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evaluation.run import Run
+from tactile.frames import compose, integrate, inverse
+
+_ROOT = Path(__file__).parents[2]
+
+
+def _reference() -> Path:
+    return Path(os.environ.get("RATSLAM_DATA", _ROOT.parent / "shared" / "reference"))
+
+
+@pytest.fixture(scope="session")
+def data() -> Callable[[str], Path]:
+    """The path of a reference file; skips the test where it is missing."""
+
+    def find(name: str) -> Path:
+        path = _reference() / name
+        if not path.is_file():
+            pytest.skip(f"{name} is not under ${{RATSLAM_DATA}} ({_reference()})")
+        return path
+
+    return find
+
+
+@pytest.fixture(scope="session")
+def trace(data: Callable[[str], Path]) -> Callable[[str], dict[str, np.ndarray]]:
+    """A recorded run of the reference implementation; the synthetic ones are part of the project."""
+
+    def load(name: str) -> dict[str, np.ndarray]:
+        golden = _ROOT / "tests" / "golden" / f"{name}.npz"
+        with np.load(golden if golden.is_file() else data(f"traces/{name}.npz")) as file:
+            return {key: file[key] for key in file.files}
+
+    return load
+
+
+@pytest.fixture(scope="session")
+def square() -> Callable[[int, int], tuple[np.ndarray, np.ndarray]]:
+    """Laps round a 0.6 m square of 8 places 0.3 m apart: ids [N] and true poses [N, 3].
+
+    At each place the robot dwells some steps, 0.02 m a step along its side.
+    """
+
+    def walk(laps: int, dwell: int) -> tuple[np.ndarray, np.ndarray]:
+        corners = np.array([[0, 0, 0], [0.6, 0, np.pi / 2], [0.6, 0.6, np.pi], [0, 0.6, -np.pi / 2]])
+        way = [(place // 2, 0.3 * (place % 2) + 0.02 * k) for place in range(8) for k in range(dwell)]
+        lap = np.array([compose(corners[side], np.array([along, 0, 0])) for side, along in way])
+        lap[:, 2] = corners[[side for side, _ in way], 2]
+        return np.tile(np.repeat(np.arange(8), dwell), laps), np.tile(lap, (laps, 1))
+
+    return walk
+
+
+@pytest.fixture(scope="session")
+def circle() -> Run:
+    """Three laps of a circle of 36 places; a perfect map, told in a frame of its own, and drifting odometry."""
+    laps, places = 3, 36
+    turn = np.full(laps * places, 2 * np.pi / places)
+    turn[0] = 0.0
+    motion = np.stack([np.where(turn > 0, 0.1, 0.0), np.zeros_like(turn), turn], axis=1)
+    truth = integrate(motion, np.array([2.0, 1.0, 0.5]))
+    elsewhere = np.array([-1.0, 0.5, 2.0])
+    final = compose(elsewhere, compose(inverse(truth[0]), truth))
+    places_ = np.arange(laps * places) % places
+    links = np.stack([np.arange(places), (np.arange(places) + 1) % places], axis=1)
+    return Run(
+        time=100.0 + np.arange(laps * places) / 2,
+        truth=truth,
+        online=final,
+        final=final,
+        odometry=integrate(motion * np.array([1.0, 1.0, 1.03])),
+        experience=places_,
+        created=np.arange(places),
+        nodes=final[:places],
+        links=links,
+    )

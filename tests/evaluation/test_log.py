@@ -1,0 +1,86 @@
+"""Any SLAM system's log, read from a CSV."""
+
+from __future__ import annotations
+
+import pytest
+
+from evaluation.log import read_log
+from evaluation.scorecard import score_log, table
+from tactile.errors import InputError
+
+ROWS = "0,7,0.1,0.2,3\n0.5,-1,0.1,0.2,-3\n"
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        "",
+        "t,id,x,y,th\n",
+        "Time, Experience, X, Y, Heading\n",
+        "# any system\ntime,experience_id,x,y,theta\n",
+    ],
+)
+def test_headers_are_taken_as_they_come(tmp_path, head):
+    path = tmp_path / "log.csv"
+    path.write_text(head + ROWS)
+    log = read_log(path)
+    assert log.time.tolist() == [0, 0.5]
+    assert log.experience.tolist() == [7, -1]
+    assert log.truth.tolist() == [[0.1, 0.2, 3], [0.1, 0.2, -3]]
+
+
+def test_columns_may_stand_in_any_order_among_others(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("heading,gain,y,x,id,t\n3,9,0.2,0.1,7,0\n")
+    log = read_log(path)
+    assert (log.time[0], log.experience[0], log.truth[0].tolist()) == (0, 7, [0.1, 0.2, 3])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("t,id,x,y\n0,1,2,3\n", r"log\.csv:1: no column theta among t id x y; expected theta/th/heading"),
+        ("t,id,x,y,th\n0,1,2,3,4\n1,2,3\n2,1,2,3,4\n", r"log\.csv:3: '1 2 3'; expected 5 finite numbers"),
+        (
+            "t,id,x,y,th\n0,1,2,3,4\n\n1,1.5,2,3,4\n",
+            r"log\.csv:4: experience id 1\.5; expected a whole number",
+        ),
+        ("t,id,x,y,th\n0,1,2,nan,4\n", r"log\.csv:2"),
+        ("t,id,x,y,th\n0,1,2,,4\n", r"log\.csv:2"),
+        ("t,id,x,y,th\n", r"log\.csv: no rows"),
+        ("", r"log\.csv: no rows"),
+        ("0,1,2", r"log\.csv: no rows"),
+    ],
+)
+def test_malformed_logs_are_refused_with_their_line(tmp_path, text, message):
+    path = tmp_path / "log.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message):
+        read_log(path)
+
+
+def test_missing_and_binary_files_are_refused(tmp_path):
+    with pytest.raises(InputError, match="cannot be read"):
+        read_log(tmp_path / "none.csv")
+    (tmp_path / "log.csv").write_bytes(b"\xff\xfe\x00\x81")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_log(tmp_path / "log.csv")
+
+
+def test_a_log_is_scored_in_all_modes(tmp_path, square):
+    ids, truth = square(3, 4)
+    ids[64:][ids[64:] == 3] = 7
+    path = tmp_path / "log.csv"
+    rows = [f"{t},{e},{x},{y},{th}" for t, (e, (x, y, th)) in enumerate(zip(ids, truth, strict=True))]
+    path.write_text("\n".join(["t,id,x,y,theta", *rows]))
+    card = score_log(read_log(path), "my system")
+    values = {name: quantity.value for name, quantity in card.quantities.items()}
+    assert values["exm_base"] == 32
+    assert values["exm_arr"] == 1.0
+    assert [values[f"exm_arcr_{mode}"] for mode in ("strict", "paper", "or", "literal")] == [
+        0.9375,
+        0.875,
+        0.96875,
+        0,
+    ]
+    assert "ARCR, strict" in table(card)

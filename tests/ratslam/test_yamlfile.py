@@ -1,0 +1,588 @@
+"""Configuration files: what is read, what is refused and where the message points."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable
+from enum import Enum
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import Field, model_validator
+
+from ratslam.yamlfile import dump, load, override, parse, schema, validate
+from tactile.errors import InputError
+from tactile.settings import Settings
+
+
+class Metric(Enum):
+    """An enum, as settings use it."""
+
+    L1 = "l1"
+    COSINE = "cosine"
+
+
+class PoseCells(Settings):
+    """A section."""
+
+    excite_sigma: float = Field(1.0, gt=0)
+    """Width of the excitation, cells."""
+    shape: tuple[int, int, int] = (21, 21, 36)
+    """Cells along x, y and heading."""
+
+    @model_validator(mode="after")
+    def _odd(self) -> PoseCells:
+        if self.shape[0] % 2 == 0 and self.shape[1] % 2 == 0:
+            raise ValueError("one of x and y must be odd")
+        return self
+
+
+class Recording(Settings):
+    """One alternative of a union."""
+
+    kind: Literal["recording", "bag"] = "recording"
+    path: Path
+    """The file of the recording."""
+
+
+class Simulation(Settings):
+    """The other alternative."""
+
+    kind: Literal["simulation"] = "simulation"
+    simulation: int = 0
+    """A field named as the union's tag."""
+
+
+Source = Annotated[Recording | Simulation, Field(discriminator="kind")]
+
+
+class Config(Settings):
+    """A whole configuration."""
+
+    pose_cells: PoseCells = PoseCells()
+    metric: Metric = Metric.L1
+    motion: Literal["forward", "turn"] = "forward"
+    source: Source = Simulation()
+    others: tuple[Source, ...] = ()
+    optional: PoseCells | None = None
+    width: float | tuple[float, float] = 1.0
+    gains: dict[str, float] = Field(default_factory=dict)
+    learn: bool = True
+    steps: int = Field(10, ge=0)
+    name: str = Field("run", max_length=1000)
+    weights: tuple[float, ...] = Field((), max_length=50)
+
+
+VALID = """\
+# every part once
+pose_cells:
+  excite_sigma: 1e-3
+  shape: [21, 21, 36]
+metric: cosine
+source:
+  kind: recording
+  path: "data/a.mcap"
+others:
+- kind: simulation
+  simulation: 3
+- {kind: bag, path: b.bag}
+optional:
+width: [1.5, .5]
+gains: {left: 1, right: -2.5e+2}
+learn: false
+name: off
+"""
+
+
+def _message(text: str) -> str:
+    """The message for a text that cannot be read or is not a `Config`."""
+    with pytest.raises(InputError) as caught:
+        validate(parse(text, "config.yaml"), Config)
+    return str(caught.value)
+
+
+def test_reads_every_part() -> None:
+    config = validate(parse(VALID, "config.yaml"), Config)
+    assert config == Config(
+        pose_cells=PoseCells(excite_sigma=1e-3),
+        metric=Metric.COSINE,
+        source=Recording(path=Path("data/a.mcap")),
+        others=(Simulation(simulation=3), Recording(kind="bag", path=Path("b.bag"))),
+        width=(1.5, 0.5),
+        gains={"left": 1.0, "right": -250.0},
+        learn=False,
+        name="off",
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("1e-3", 1e-3),
+        ("-1E+3", -1000.0),
+        (".5", 0.5),
+        ("1.", 1.0),
+        ("+7", 7),
+        ("0", 0),
+        ("0.0", 0.0),
+        ("0o17", 15),
+        ("0x1F", 31),
+        ("-9223372036854775808", -(1 << 63)),
+        ("-.inf", -math.inf),
+        ("true", True),
+        ("false", False),
+        ("null", None),
+        ("~", None),
+        ("", None),
+        ("yes", "yes"),
+        ("no", "no"),
+        ("on", "on"),
+        ("Off", "Off"),
+        ("True", "True"),
+        ("NULL", "NULL"),
+        ("12:30", "12:30"),
+        ("1:2:3", "1:2:3"),
+        ("1_000", "1_000"),
+        ("2024-01-01", "2024-01-01"),
+        ("0b11", "0b11"),
+        (".", "."),
+        ("1e", "1e"),
+        ("<<", "<<"),
+        ("=", "="),
+        ("'1e-3'", "1e-3"),
+        ('"010"', "010"),
+        ("'true'", "true"),
+        ("|\n  a\n  b", "a\nb"),
+        ("$5 and $${NAME}", "$5 and ${NAME}"),
+        ("größer", "größer"),
+    ],
+)
+def test_scalars(text: str, value: Any) -> None:
+    read = parse(f"key: {text}", "config.yaml").data["key"]
+    assert read == value
+    assert type(read) is type(value)
+
+
+def test_not_a_number() -> None:
+    assert math.isnan(parse("key: .nan", "config.yaml").data["key"])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "config.yaml:1:1: empty; expected keys and values"),
+        ("# only a comment\n", "config.yaml:2:1: empty; expected keys and values"),
+        ("---\n", "config.yaml:2:1: nothing; expected keys and values such as 'seed: 1'"),
+        ("\n- 1\n", "config.yaml:2:1: a list of 1; expected keys and values such as 'seed: 1'"),
+        ("hello", "config.yaml:1:1: 'hello'; expected keys and values such as 'seed: 1'"),
+        ("a: 1\n---\nb: 1", "config.yaml:2:1: a second document; expected only one"),
+        (
+            "a:\n  b: 1\n  c: 2\n  b: 3",
+            "config.yaml:4:3: a.b: given twice; the first is at config.yaml:2:3",
+        ),
+        ("a: [1, 2\nb: 3", "config.yaml:2:2: not YAML: expected ',' or ']', but got ':'"),
+        ("a: 1\nb: [1, {c: 2}", "config.yaml:2:4: a bracket that is not closed"),
+        ("b: [1, {c: 2", "config.yaml:1:8: a bracket that is not closed"),
+        ("a: b: c", "config.yaml:1:5: not YAML: mapping values are not allowed here"),
+        (
+            "a:\n\tb: 1",
+            r"config.yaml:2:1: not YAML: found character '\t' that cannot start any token; "
+            "indent with spaces, not tabs",
+        ),
+        ("a: 'b", "config.yaml:1:6: not YAML: found unexpected end of stream"),
+        (
+            "a: 010",
+            "config.yaml:1:4: a: 010; expected a number without leading zeros; quote it if it is a name",
+        ),
+        (
+            "a: 00.5",
+            "config.yaml:1:4: a: 00.5; expected a number without leading zeros; quote it if it is a name",
+        ),
+        ("a: 1e999", "config.yaml:1:4: a: 1e999; expected a number that fits 64 bits"),
+        (
+            "a: 9223372036854775808",
+            "config.yaml:1:4: a: 9223372036854775808; expected a number that fits 64 bits",
+        ),
+        ("1: a", "config.yaml:1:1: the key 1; expected text; write '1'"),
+        ("a: {true: 1}", "config.yaml:1:5: a: the key true; expected text; write 'true'"),
+        ("? [a, b]\n: 1", "config.yaml:1:3: a key that is not plain text; expected a name"),
+        ("a: &x 1\nb: *x", "config.yaml:1:4: a: an anchor (&x); write the value out at each place"),
+        ("a: *x", "config.yaml:1:4: a: an alias (*x); write the value out at each place"),
+        (
+            "a: !!python/name:os.system x",
+            "config.yaml:1:4: a: a tag (tag:yaml.org,2002:python/name:os.system)",
+        ),
+        ("a: !e x", "config.yaml:1:4: a: a tag (!e); expected a plain value"),
+        ("a: 1\nb: \x07", r"config.yaml:2:4: the character '\x07'; expected text"),
+        (r'a: "\0"', r"config.yaml:1:4: a: '\x00'; expected text without control characters"),
+        (r'a: "\ud800"', r"config.yaml:1:4: a: '\ud800'; expected text without control characters"),
+        (r'a: "\UFFFFFFFF"', "config.yaml:1:1: not YAML: an escape out of range after this"),
+        ("a: " + "[" * 33, "config.yaml:1:35: a.0.0: sections nested more than 32 deep"),
+        ("- " * 1000, "config.yaml:1:65: 0.0.0: sections nested more than 32 deep"),
+        ("a: ${}", "config.yaml:1:4: a: '${}'; expected ${NAME}; write $${ for a literal ${"),
+        ("a: ${HOME", "config.yaml:1:4: a: '${HOME'; expected ${NAME}; write $${ for a literal ${"),
+    ],
+)
+def test_what_cannot_be_read(text: str, message: str) -> None:
+    assert _message(text).startswith(message)
+
+
+def test_all_unusable_values_are_told_at_once() -> None:
+    lines = _message("a: 010\nb: 1\nb: 2\n3: 4").splitlines()
+    assert [line.split(": ")[0] for line in lines] == [
+        "config.yaml:1:4",
+        "config.yaml:3:1",
+        "config.yaml:4:1",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "steps: 1\npose_cells:\n  exite_sigma: 2",
+            "config.yaml:3:3: pose_cells.exite_sigma: unknown key; did you mean 'excite_sigma'?",
+        ),
+        (
+            "source: {sped: 3}",
+            "config.yaml:1:1: source.kind: missing; expected 'recording', 'bag' or 'simulation'",
+        ),
+        (
+            "source: {kind: simulation, sped: 3}",
+            "config.yaml:1:28: source.sped: unknown key; the keys here are kind, simulation",
+        ),
+        (
+            "source:\n  kind: simulation\n  simulation: x",
+            "config.yaml:3:15: source.simulation: 'x'; expected a whole number",
+        ),
+        (
+            "others:\n- kind: simulatoin",
+            "config.yaml:2:9: others.0.kind: 'simulatoin'; expected 'recording', 'bag' or 'simulation'; "
+            "did you mean 'simulation'?",
+        ),
+        (
+            "others:\n- kind: simulation\n- kind: bag",
+            "config.yaml:3:3: others.1.path: missing; The file of the recording.",
+        ),
+        ("source:\n  kind: bag", "config.yaml:1:1: source.path: missing; The file of the recording."),
+        (
+            "pose_cells:\n  excite_sigma: -1",
+            "config.yaml:2:17: pose_cells.excite_sigma: -1; expected a number greater than 0",
+        ),
+        ("steps: -1", "config.yaml:1:8: steps: -1; expected a number greater than or equal to 0"),
+        ("steps: 1.5", "config.yaml:1:8: steps: 1.5; expected a whole number"),
+        ("steps: '5'", "config.yaml:1:8: steps: '5'; expected a whole number"),
+        ("steps: true", "config.yaml:1:8: steps: true; expected a whole number"),
+        ("steps:", "config.yaml:1:7: steps: nothing; expected a whole number"),
+        ("learn: yes", "config.yaml:1:8: learn: 'yes'; expected true or false"),
+        ("learn: 1", "config.yaml:1:8: learn: 1; expected true or false"),
+        ("name: 3", "config.yaml:1:7: name: 3; expected text"),
+        ("gains: 3", "config.yaml:1:8: gains: 3; expected a section of keys and values"),
+        ("gains:\n  left: 12:30", "config.yaml:2:9: gains.left: '12:30'; expected a number"),
+        ("gains: {left: .inf}", "config.yaml:1:15: gains.left: inf; expected a finite number"),
+        (
+            "pose_cells: [1]",
+            "config.yaml:1:13: pose_cells: a list of 1; expected a section of keys and values",
+        ),
+        ("optional: {shape: 3}", "config.yaml:1:19: optional.shape: 3; expected a list"),
+        ("metric: L1", "config.yaml:1:9: metric: 'L1'; expected 'l1' or 'cosine'; did you mean 'l1'?"),
+        (
+            "motion: Turns",
+            "config.yaml:1:9: motion: 'Turns'; expected 'forward' or 'turn'; did you mean 'turn'?",
+        ),
+        ("motion: back", "config.yaml:1:9: motion: 'back'; expected 'forward' or 'turn'"),
+        ("width: wide", "config.yaml:1:8: width: 'wide'; expected a number or a list"),
+        ("pose_cells: {shape: [1]}", "config.yaml:1:21: pose_cells.shape: a list of 1; expected 3 values"),
+        (
+            "pose_cells: {shape: [1, 2, 3, 4]}",
+            "config.yaml:1:21: pose_cells.shape: a list of 4; expected 3 values",
+        ),
+        (
+            "pose_cells: {shape: [1, 2, x]}",
+            "config.yaml:1:28: pose_cells.shape.2: 'x'; expected a whole number",
+        ),
+        ("pose_cells: {shape: [2, 2, 2]}", "config.yaml:1:13: pose_cells: one of x and y must be odd"),
+        (
+            f"weights: {[0] * 51}",
+            "config.yaml:1:10: weights: a list of 51; expected at most 50 values",
+        ),
+    ],
+)
+def test_what_is_not_a_config(text: str, message: str) -> None:
+    assert _message(text) == message
+
+
+def test_all_errors_are_told_at_once_in_the_order_of_the_file() -> None:
+    lines = _message("zzz: 1\nsteps: x\nmetric: l3\npose_cells:\n  excite_sigma: 0\n  shape: []").splitlines()
+    assert [line.split(": ")[1] for line in lines] == [
+        "zzz",
+        "steps",
+        "metric",
+        "pose_cells.excite_sigma",
+        "pose_cells.shape",
+    ]
+
+
+def test_many_errors_are_cut_short() -> None:
+    lines = _message("gains:\n" + "".join(f"  k{i}: x\n" for i in range(99))).splitlines()
+    assert len(lines) == 51
+    assert lines[-1] == "and 49 more errors"
+
+
+def test_environment_variables(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RATSLAM_TEST", "here: ${and} there")
+    data = parse("a: ${RATSLAM_TEST}/x\nb: ['${RATSLAM_TEST}']\n${C}: 1", "config.yaml").data
+    assert data == {"a": "here: ${and} there/x", "b": ["here: ${and} there"], "${C}": 1}
+
+
+def test_an_unset_variable(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("RATSLAM_DATA", raising=False)
+    monkeypatch.setenv("RATSLAM_TEST", "")
+    first, second = _message("a: ${RATSLAM_DATA}/x\nb:\n- ${RATSLAM_TEST}").splitlines()
+    assert first == (
+        "config.yaml:1:4: a: the environment variable RATSLAM_DATA is not set; "
+        "the recordings are not part of the project: set RATSLAM_DATA to the folder that holds them"
+    )
+    assert second.startswith(
+        "config.yaml:3:3: b.0: the environment variable RATSLAM_TEST is not set; set RATSLAM_TEST"
+    )
+
+
+def test_files(tmp_path: Path) -> None:
+    file = tmp_path / "config.yaml"
+    file.write_bytes(b"\xef\xbb\xbfname: gr\xc3\xbcn\r\nsteps: 2\r\n")
+    assert load(file).data == {"name": "grün", "steps": 2}
+    assert load(file).at_value(("steps",)) == f"{file}:2:8: steps"
+    for content, found in {
+        b"a: 1\nb: \xff": r":2: byte 0xff; expected text in UTF-8",
+        b"\xff\xfea\x00": ":1: byte 0xff; expected text in UTF-8",
+        b"\x7fELF\x02\x00\x00": r":1:1: the character '\x7f'; expected text",
+        b"a: 1\n" * 40000: ": a large file; expected a configuration of at most 128 KiB",
+    }.items():
+        file.write_bytes(content)
+        with pytest.raises(InputError) as caught:
+            load(file)
+        assert str(caught.value) == f"{file}{found}"
+    for path in (tmp_path / "none.yaml", tmp_path, tmp_path / ("x" * 300), "a\0b"):
+        with pytest.raises(InputError, match="cannot be read: "):
+            load(path)
+
+
+def _overridden(*assignments: str, text: str = VALID) -> Config:
+    return validate(override(parse(text, "config.yaml"), assignments), Config)
+
+
+def test_override() -> None:
+    document = parse(VALID, "config.yaml")
+    config = validate(
+        override(
+            document,
+            [
+                "pose_cells.excite_sigma=2e-3",
+                "pose_cells.shape.0=23",
+                "others.0.simulation=4",
+                "optional.excite_sigma=3",
+                "gains={up: 1}",
+                "gains.down=2",
+                "name=a=b",
+                "steps=1",
+                "steps=2",
+            ],
+        ),
+        Config,
+    )
+    assert config.pose_cells == PoseCells(excite_sigma=2e-3, shape=(23, 21, 36))
+    assert config.others[0] == Simulation(simulation=4)
+    assert config.optional == PoseCells(excite_sigma=3)
+    assert config.gains == {"up": 1, "down": 2}
+    assert config.name == "a=b"
+    assert config.steps == 2
+    assert document == parse(VALID, "config.yaml")
+
+
+@pytest.mark.parametrize(
+    ("assignment", "message"),
+    [
+        ("steps", "--set steps: no key and value; expected key=value such as pose_cells.excite_sigma=1e-3"),
+        ("=1", "--set : no key and value"),
+        ("a..b=1", "--set a..b: no key and value"),
+        ("steps=", "--set steps: empty; expected a value"),
+        ("steps=yes", "--set steps: 'yes'; expected a whole number"),
+        ("steps=[1", "--set steps: a bracket that is not closed"),
+        ("steps=010", "--set steps: 010; expected a number without leading zeros"),
+        ("steps.x=1", "--set steps.x: steps is 5; expected a section to put a key in"),
+        ("weights.2=1", "--set weights.2: weights has 2 items; expected an index below 2"),
+        ("weights.x=1", "--set weights.x: weights has 2 items; expected an index below 2"),
+        ("stepz=1", "--set stepz: unknown key; did you mean 'steps'?"),
+        (
+            "pose_cells.exite_sigma=1",
+            "--set pose_cells.exite_sigma: unknown key; did you mean 'excite_sigma'?",
+        ),
+        (
+            "pose_cells={exite_sigma: 1}",
+            "--set pose_cells.exite_sigma: unknown key; did you mean 'excite_sigma'?",
+        ),
+        ("optional.shape.x=1", "--set optional.shape: a section of keys and values; expected a list"),
+        ("source.kind=bag", "--set source.path: missing; The file of the recording."),
+    ],
+)
+def test_override_errors(assignment: str, message: str) -> None:
+    with pytest.raises(InputError) as caught:
+        _overridden(assignment, text="steps: 5\nweights: [1, 2]")
+    assert str(caught.value).startswith(message)
+
+
+def test_dump_is_readable() -> None:
+    assert dump(Config(name="no", source=Recording(path=Path("a")), gains={"1": 1e-300})) == (
+        "pose_cells:\n  excite_sigma: 1.0\n  shape: [21, 21, 36]\n"
+        "metric: l1\nmotion: forward\n"
+        "source:\n  kind: recording\n  path: a\n"
+        "others: []\noptional: null\nwidth: 1.0\n"
+        "gains:\n  '1': 1.0e-300\n"
+        "learn: true\nsteps: 10\nname: 'no'\nweights: []\n"
+    )
+
+
+def test_schema_tells_an_editor_the_keys() -> None:
+    described = schema(Config)
+    json.dumps(described)
+    assert described["$schema"].startswith("https://json-schema.org/")
+    assert described["title"] == "Config"
+    assert described["description"] == "A whole configuration."
+    section = described["$defs"]["PoseCells"]
+    assert section["properties"]["excite_sigma"]["description"] == "Width of the excitation, cells."
+    assert section["properties"]["excite_sigma"]["exclusiveMinimum"] == 0
+    assert section["additionalProperties"] is False
+
+
+TEXTS = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=40)
+FLOATS = st.floats(allow_nan=False, allow_infinity=False)
+CONFIGS = st.builds(
+    Config,
+    name=TEXTS
+    | st.sampled_from(["yes", "1e-3", "010", "${HOME}", "$${", "~", "12:30", "=", "<<", "0x1", " ", "- "]),
+    gains=st.dictionaries(TEXTS, FLOATS),
+    width=FLOATS | st.tuples(FLOATS, FLOATS),
+    weights=st.lists(FLOATS, max_size=5).map(tuple),
+    steps=st.integers(0, (1 << 63) - 1),
+    metric=st.sampled_from(Metric),
+    others=st.lists(st.builds(Simulation, simulation=st.integers(-9, 9)), max_size=3).map(tuple),
+)
+
+
+def _round_trip(config: Config) -> None:
+    text = dump(config)
+    assert validate(parse(text, "config.yaml"), Config) == config
+    assert validate(parse(text, "config.yaml"), Config).model_dump_json() == config.model_dump_json()  # -0.0
+    if "${" not in text:  # any other reader sees the same
+        assert yaml.safe_load(text) == config.model_dump(mode="json")
+
+
+def _refusal(action: Callable[[], object]) -> str:
+    """The message of the one error an action may end with; '' if it succeeds."""
+    try:
+        action()
+    except InputError as error:
+        return str(error)
+    return ""
+
+
+def _reads_or_refuses(text: str) -> None:
+    """Whatever the text is: a config, or an error with a place."""
+    message = _refusal(lambda: validate(parse(text, "c.yaml"), Config))
+    assert not message or re.match(r"c\.yaml(:\d+:\d+)?: ", message)
+    message.encode()  # it can be printed
+
+
+def _assigns_or_refuses(assignment: str) -> None:
+    message = _refusal(lambda: _overridden(assignment))
+    assert not message or "--set" in message
+    message.encode()
+
+
+MUTATIONS = st.lists(
+    st.tuples(
+        st.integers(0, len(VALID)),
+        st.integers(0, 6),
+        st.sampled_from(
+            [
+                *"[]{}:,-\n\t #&*!|>'\"%@`?~$\\\0\ufeff\x85\u2028",
+                "\n  ",
+                ": ",
+                "- ",
+                "1e-3",
+                "? ",
+                "${",
+                "\\U",
+            ]
+        )
+        | st.text(max_size=4),
+    ),
+    min_size=1,
+    max_size=4,
+)
+ASSIGNMENTS = st.tuples(
+    st.lists(
+        st.sampled_from(["pose_cells", "shape", "others", "0", "7", "gains", "kind", ""]) | TEXTS, max_size=3
+    ),
+    st.text(max_size=20),
+)
+
+
+def _mutated(mutations: list[tuple[int, int, str]]) -> str:
+    text = VALID
+    for position, length, new in mutations:
+        text = text[:position] + new + text[position + length :]
+    return text
+
+
+@given(CONFIGS)
+def test_dump_round_trips(config: Config) -> None:
+    _round_trip(config)
+
+
+@given(st.text(max_size=60) | st.text("[]{}:,-\n\t #&*!|>'\"%ab1", max_size=40) | MUTATIONS.map(_mutated))
+def test_any_text_reads_or_is_refused(text: str) -> None:
+    _reads_or_refuses(text)
+
+
+@given(ASSIGNMENTS)
+def test_any_assignment_is_taken_or_refused(parts: tuple[list[str], str]) -> None:
+    _assigns_or_refuses(f"{'.'.join(parts[0])}={parts[1]}")
+
+
+@pytest.mark.soak
+@settings(max_examples=20_000)
+@given(CONFIGS)
+def test_dump_round_trips_often(config: Config) -> None:
+    _round_trip(config)
+
+
+@pytest.mark.soak
+@settings(max_examples=50_000)
+@given(st.text(max_size=200) | st.text("[]{}:,-\n\t #&*!|>'\"%ab1", max_size=80) | MUTATIONS.map(_mutated))
+def test_many_texts_read_or_are_refused(text: str) -> None:
+    _reads_or_refuses(text)
+
+
+@pytest.mark.soak
+@settings(max_examples=20_000)
+@given(ASSIGNMENTS)
+def test_many_assignments_are_taken_or_refused(parts: tuple[list[str], str]) -> None:
+    _assigns_or_refuses(f"{'.'.join(parts[0])}={parts[1]}")
+
+
+@pytest.mark.soak
+@settings(max_examples=20_000)
+@given(st.binary(max_size=200))
+def test_many_files_read_or_are_refused(tmp_path_factory: pytest.TempPathFactory, content: bytes) -> None:
+    file = tmp_path_factory.getbasetemp() / "c.yaml"
+    file.write_bytes(content)
+    message = _refusal(lambda: load(file))
+    assert not message or message.startswith(str(file))

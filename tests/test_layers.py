@@ -1,0 +1,141 @@
+"""Who may import whom: the contracts of pyproject.toml hold, each of them can fail, and imports are light."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("ratslam", "tactile", "robot", "evaluation")
+NOT_YET = ("cli", "config", "session", "rat", "storage", "posecells", "templates", "places", "experience")
+NOT_YET += ("posegraph", "relaxation")
+
+# For each contract, imports that break it: the importing module and the imported one.
+VIOLATIONS = {
+    "tactile imports nothing of ours": [("tactile.planted", "ratslam.types"), ("tactile.planted", "robot")],
+    "robot imports only tactile": [("robot.planted", "ratslam.types"), ("robot.planted", "evaluation")],
+    "evaluation imports only tactile": [
+        ("evaluation.planted", "ratslam.types"),
+        ("evaluation.planted", "robot"),
+    ],
+    "only the composition root imports robot and evaluation": [
+        ("ratslam.session", "robot"),
+        ("ratslam.types", "robot.planted"),
+        ("ratslam.rat", "evaluation"),
+    ],
+    "each module of ratslam imports only from below, and never its neighbour": [
+        ("ratslam.types", "ratslam.backend"),
+        ("ratslam.posecells", "ratslam.templates"),
+        ("ratslam.places", "ratslam.experience"),
+        ("ratslam.rat", "ratslam.session"),
+        ("ratslam.session", "ratslam.config"),
+        ("ratslam.planted", "ratslam.types"),
+    ],
+    "the session knows backends by the seam alone": [
+        ("ratslam.session", "ratslam.rat"),
+        ("ratslam.session", "ratslam.posecells"),
+        ("ratslam.storage", "ratslam.experience"),
+    ],
+    "networkx is for maps": [("ratslam.posecells", "networkx"), ("robot.planted", "networkx.algorithms")],
+    "jax is for the engine": [("robot.planted", "jax.numpy"), ("evaluation.planted", "jax")],
+}
+
+
+@pytest.fixture
+def tree(tmp_path: Path) -> Path:
+    """A copy of the packages and their contracts, with what a contract names but is still to be written."""
+    for name in PACKAGES:
+        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "pyproject.toml", tmp_path)
+    for name in NOT_YET:
+        if not (tmp_path / "ratslam" / name).is_dir():
+            (tmp_path / "ratslam" / f"{name}.py").touch()
+    return tmp_path
+
+
+def _verdicts(tree: Path) -> dict[str, str]:
+    """KEPT or BROKEN for each contract."""
+    code = "from importlinter.cli import lint_imports_command as check; check()"
+    command = [sys.executable, "-c", code, "--no-cache", "--no-logo"]
+    environment = os.environ | {"COLUMNS": "200", "PYTHONPATH": ""}
+    done = subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True, timeout=60)
+    verdicts = dict(re.findall(r"^(.*) (KEPT|BROKEN)", done.stdout, re.MULTILINE))
+    assert verdicts, done.stdout + done.stderr
+    return verdicts
+
+
+def test_contracts_hold(tree: Path) -> None:
+    assert _verdicts(tree) == dict.fromkeys(VIOLATIONS, "KEPT")
+
+
+@pytest.mark.parametrize(
+    ("contract", "importer", "imported"),
+    [(contract, *violation) for contract, violations in VIOLATIONS.items() for violation in violations],
+)
+def test_a_planted_import_breaks_its_contract(
+    contract: str, importer: str, imported: str, tree: Path
+) -> None:
+    for module in (imported, importer):
+        folder, _, name = module.rpartition(".")
+        if name == "planted":
+            (tree / folder / "planted.py").touch()
+    path = tree.joinpath(*importer.split("."))
+    path = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+    path.write_text(f"{path.read_text()}\nimport {imported}\n")
+    assert _verdicts(tree)[contract] == "BROKEN"
+
+
+def _report(code: str) -> Any:
+    """What a fresh interpreter in the root folder prints last, as JSON."""
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+HEAVY = """
+import json, sys
+print(json.dumps([name for name in ("jax", "matplotlib", "mcap", "scipy", "numba") if name in sys.modules]))
+"""
+
+
+def test_importing_ratslam_is_light() -> None:
+    assert _report(f"import ratslam\n{HEAVY}") == []
+
+
+@pytest.mark.skipif(
+    importlib.util.find_spec("ratslam.cli") is None, reason="ratslam.cli is still to be written"
+)
+def test_help_is_light() -> None:
+    code = """
+import contextlib
+from ratslam.__main__ import main
+with contextlib.suppress(SystemExit):
+    assert main(["--help"]) == 0
+"""
+    assert _report(code + HEAVY) == []
+
+
+def test_importing_ratslam_changes_no_setting_of_jax() -> None:
+    code = """
+import importlib, json, os, pkgutil
+import jax
+before = dict(jax.config.values), dict(os.environ)
+import ratslam
+names = [module.name for module in pkgutil.walk_packages(ratslam.__path__, "ratslam.")]
+for name in names:
+    importlib.import_module(name)
+after = dict(jax.config.values), dict(os.environ)
+print(json.dumps([len(names), before == after]))
+"""
+    count, unchanged = _report(code)
+    assert count > 5
+    assert unchanged
