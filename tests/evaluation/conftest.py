@@ -63,7 +63,7 @@ def square() -> Callable[[int, int], tuple[np.ndarray, np.ndarray]]:
 
 @pytest.fixture(scope="session")
 def circle() -> Run:
-    """Three laps of a circle of 36 places; a perfect map, told in a frame of its own, and drifting odometry."""
+    """Three laps of a circle of 36 places; a perfect map in a frame of its own, and drifting odometry."""
     laps, places = 3, 36
     turn = np.full(laps * places, 2 * np.pi / places)
     turn[0] = 0.0

@@ -35,7 +35,7 @@ def test_a_perfect_loop_scores_one(square, dwell):
 
 
 def test_paper_reading_loses_places_as_wide_as_the_threshold(square):
-    # a place of 6 steps is 0.10 m wide and entered 0.10 m from where it was last left, which is the threshold:
+    # a place of 6 steps is 0.10 m wide and entered 0.10 m from where it was last left, the threshold:
     # rounding says which of the 8 places pass, and the verdict holds for the visit
     ids, truth = square(2, 6)
     assert arcr(ids, truth)["paper"] == 0.25
@@ -95,6 +95,9 @@ def test_new_experiences_are_valid_only_after_a_right_relocalisation():
     assert ids[result.counted].tolist() == [0, 0, 3, 1, 0, 4]
     assert result.near[result.counted].tolist() == [True, True, True, False, True, True]
     assert result.right[result.counted].tolist() == [True, True, True, False, True, False]
+    # in the listing the right visit of 0 makes valid what came just before it, which is 4
+    paper = experience_metric(ids, truth, ExmConfig(mode="paper", base=3))
+    assert paper.right[paper.counted].tolist() == [True, True, True, False, True, True]
 
 
 def test_a_log_of_actions_scores_otherwise_than_a_log_of_steps(square):
@@ -117,6 +120,10 @@ def test_turning_about_near_the_start_is_no_loop(square):
     _, truth = square(2, 4)
     about = np.array([[0, 0, 0], [0, 0, 1.5], [0.15, 0, 3.0], [0, 0, 0.0]])
     assert base_end(np.concatenate([about, truth[1:]])) == 32 + 3
+    trembling = np.zeros((20, 3))
+    trembling[::2, 0] = 0.05
+    with pytest.raises(InputError, match="never returns"):
+        base_end(trembling)
 
 
 def test_a_run_that_never_returns_asks_for_the_base_set(square):

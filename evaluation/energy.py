@@ -1,0 +1,157 @@
+"""The Energy Metric: how far the motions within a map are from the true ones (Kuemmerle et al. 2009).
+
+    energy = mean over pairs (i, j) of  trans(delta_ij (-) delta*_ij)^2 + rot(delta_ij (-) delta*_ij)^2
+
+(Salman & Pearson 2016, eq. 1 and 2.) The paper does not say over which pairs, and adds m^2 to rad^2; so the
+pairs are an argument here and the two parts stay apart. For comparing with the paper only a ratio of two
+energies over the same pairs means anything.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from evaluation.table import read_table
+from evaluation.trajectory import interpolate, motion_errors
+from tactile.errors import InputError
+from tactile.frames import between, wrap
+
+_RELATIONS = {name: () for name in ("t1", "t2", "x", "y", "z", "roll", "pitch", "yaw")}
+
+
+class Energy(NamedTuple):
+    """The two parts of the energy and the number of pairs they are the means over (NaN over none).
+
+    Attributes:
+        trans2: mean squared translation error, m^2. rot2: mean squared rotation error, rad^2.
+    """
+
+    trans2: float
+    rot2: float
+    pairs: int
+
+    @property
+    def total(self) -> float:
+        """The paper's figure: m^2 and rad^2 added raw."""
+        return self.trans2 + self.rot2
+
+
+class Relations(NamedTuple):
+    """True relative motions between two moments of a recording, as the benchmark publishes them.
+
+    Attributes:
+        start: [P] s. end: [P] s. motion: [P, 3] pose at `end` in the frame of the pose at `start`, m, m, rad.
+    """
+
+    start: np.ndarray
+    end: np.ndarray
+    motion: np.ndarray
+
+
+class RelationErrors(NamedTuple):
+    """Mean absolute errors against a relations file.
+
+    Attributes:
+        translation: m. rotation_deg: degrees. used: pairs inside the recording. dropped: pairs outside it.
+    """
+
+    translation: float
+    rotation_deg: float
+    used: int
+    dropped: int
+
+
+def successive(count: int, step: int = 1) -> np.ndarray:
+    """The pairs (i, i + step) of `count` rows: [P, 2]; step 1 the consecutive ones, step k those of gap k."""
+    i = np.arange(max(0, count - step))
+    return np.stack([i, i + step], axis=1)
+
+
+def energy(estimate: np.ndarray, truth: np.ndarray, pairs: np.ndarray) -> Energy:
+    """Energy over the given pairs.
+
+    Args:
+        estimate: [N, 3] poses. truth: [N, 3] true poses of the same rows.
+        pairs: [P, 2] row indices: `successive(...)`, the links of a map, or any others.
+    """
+    if len(pairs) == 0:
+        return Energy(np.nan, np.nan, 0)
+    x, y, turn = motion_errors(estimate, truth, pairs).T
+    return Energy(float(np.mean(x * x + y * y)), float(np.mean(turn * turn)), len(pairs))
+
+
+def energy_all_pairs(estimate: np.ndarray, truth: np.ndarray) -> Energy:
+    """Energy over every pair i < j, in O(N log N) time and O(N) memory.
+
+    Positions as complex numbers z (estimate) and w (truth). The translation error of a pair is
+    |a_i (z_j - z_i) - (w_j - w_i)|, a_i the turn from the estimated to the true heading at row i; so for a
+    given i the sum of its squares over j needs four running sums only. The rotation error is the difference
+    of the two rows' heading errors, wrapped: with those sorted, the pairs more than half a turn apart, which
+    are the ones to wrap, are counted by running sums again.
+
+    Args:
+        estimate: [N, 3] poses. truth: [N, 3] true poses of the same rows.
+    """
+    count = len(estimate)
+    pairs = count * (count - 1) // 2
+    if pairs == 0:
+        return Energy(np.nan, np.nan, 0)
+    z = (estimate[:, 0] - estimate[:, 0].mean()) + 1j * (estimate[:, 1] - estimate[:, 1].mean())
+    w = (truth[:, 0] - truth[:, 0].mean()) + 1j * (truth[:, 1] - truth[:, 1].mean())
+    a = np.exp(1j * (truth[:, 2] - estimate[:, 2]))
+    here = a * z - w
+    squares = _after(np.abs(z) ** 2 + np.abs(w) ** 2) - 2 * (a * _after(z * w.conj())).real
+    cross = (here.conj() * (a * _after(z) - _after(w))).real
+    trans2 = np.sum(squares - 2 * cross + np.arange(count)[::-1] * np.abs(here) ** 2)
+    rot2 = _wrapped_differences(wrap(estimate[:, 2] - truth[:, 2]))
+    # the running sums may leave a perfect estimate a rounding error below zero
+    return Energy(max(0.0, float(trans2)) / pairs, max(0.0, rot2) / pairs, pairs)
+
+
+def read_relations(path: str | Path) -> Relations:
+    """A relations file, `t1 t2 x y z roll pitch yaw` a line (planar: z, roll and pitch are left out).
+
+    Raises:
+        InputError: naming file and line.
+    """
+    start, end, x, y, _, _, _, yaw = read_table(path, _RELATIONS).values.T
+    return Relations(start, end, np.stack([x, y, yaw], axis=1))
+
+
+def relation_errors(time: np.ndarray, pose: np.ndarray, relations: Relations) -> RelationErrors:
+    """Mean absolute error of a trajectory's motions against true ones (Kuemmerle et al. 2009, unsquared).
+
+    Args:
+        time: [N] s, increasing. pose: [N, 3]; interpolated at both ends of each relation.
+
+    Raises:
+        InputError: when no relation lies inside the recording.
+    """
+    found = between(interpolate(time, pose, relations.start), interpolate(time, pose, relations.end))
+    inside = np.isfinite(found).all(axis=1)
+    if not inside.any():
+        raise InputError("relations", "none inside the recording", f"times from {time[0]} to {time[-1]} s")
+    error = between(relations.motion[inside], found[inside])
+    used = int(inside.sum())
+    translation = float(np.mean(np.hypot(error[:, 0], error[:, 1])))
+    return RelationErrors(
+        translation, float(np.degrees(np.mean(np.abs(error[:, 2])))), used, len(inside) - used
+    )
+
+
+def _after(values: np.ndarray) -> np.ndarray:
+    """For each row, the sum over the rows after it: [N]."""
+    return np.cumsum(values[::-1])[::-1] - values
+
+
+def _wrapped_differences(angle: np.ndarray) -> float:
+    """The sum over i < j of wrap(angle_j - angle_i)^2, angles in one turn."""
+    angle = np.sort(angle - angle.mean())
+    far = np.searchsorted(angle, angle - np.pi)  # for each, how many lie more than half a turn below
+    below = np.concatenate([[0.0], np.cumsum(angle)])[far]
+    plain = len(angle) * np.sum(angle**2) - np.sum(angle) ** 2
+    turn = 2 * np.pi
+    return float(plain + np.sum(far * turn**2 - 2 * turn * (far * angle - below)))

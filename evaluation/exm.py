@@ -1,0 +1,340 @@
+"""The Experience Metric: how often a map was recognised again (ARR), and how often rightly (ARCR).
+
+Source: Salman & Pearson 2016, Algorithm 1; "line" below is a line of it. As printed, its ARCR is always 0
+(the set of correct re-localisations only grows from its own members), so there are four readings:
+
+    strict   the verdict on the first step of a visit holds for the visit; an experience stands for the pose
+             it was created at; a new experience is valid if the last re-localisation was right
+    paper    the printed listing with line 26 mended as the mirror of lines 10 and 11
+    or       line 26 with "or": a wrong visit passes from its second step on; for comparison only
+    literal  the printed listing
+
+ARR is the same in all four.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Literal, NamedTuple
+from zlib import crc32
+
+import numpy as np
+from pydantic import NonNegativeInt, PositiveFloat
+
+from evaluation.log import changes, creation_rows
+from tactile.errors import InputError
+from tactile.frames import wrap
+from tactile.settings import Settings
+
+Mode = Literal["strict", "paper", "or", "literal"]
+MODES: tuple[Mode, ...] = ("strict", "paper", "or", "literal")
+
+NO_RELOCALISATION = "nothing was re-localised: ARCR is 0/0"
+LITERAL_WARNING = "0 by construction: the printed line 26 never holds"
+
+
+class ExmConfig(Settings):
+    """What Algorithm 1 is given besides the two logs."""
+
+    mode: Mode = "strict"
+    """How the listing is read."""
+    log: Literal["step", "action"] = "step"
+    """One entry a step (the paper's), or one entry a change of experience. The values do not compare."""
+    base: NonNegativeInt | None = None
+    """Steps before the end of the base set (i_base); by default until the first return to the start."""
+    position: PositiveFloat = 0.1
+    """Position threshold, m (Salman & Pearson 2016, section III-G)."""
+    heading_deg: PositiveFloat = 25.0
+    """Heading threshold, degrees (as above)."""
+
+
+DEFAULT = ExmConfig()
+
+
+class ExperienceMetric(NamedTuple):
+    """ARR and ARCR of one run, and what they were made of.
+
+    Attributes:
+        arr: re-localisations / entries after the base set; NaN when there are none.
+        arcr: correct re-localisations / re-localisations; NaN when there are none.
+        entries: entries after the base set. relocalisations: eta. correct: eta_c.
+        base: entries in the base set, counted in the log that was used.
+        mode, log: as in `ExmConfig`. note: why a value is NaN, or what to beware of ('' if nothing).
+        counted: [N] bool, the entry is a re-localisation. right: [N] bool, a correct one.
+        near: [N] bool, true and perceived pose are within the thresholds (line 24; for the counted ones).
+    """
+
+    arr: float
+    arcr: float
+    entries: int
+    relocalisations: int
+    correct: int
+    base: int
+    mode: Mode
+    log: str
+    note: str
+    counted: np.ndarray
+    right: np.ndarray
+    near: np.ndarray
+
+
+class Pool(NamedTuple):
+    """Several runs together.
+
+    Attributes:
+        arr, arcr: the mean of the runs' values (macro average: each run weighs the same). A run without any
+            re-localisation has no ARCR and is left out of that mean.
+        arr_interval, arcr_interval: 95 % bootstrap intervals of these means over the runs.
+        arr_pooled, arcr_pooled: the ratios of the summed counts (each entry weighs the same).
+        runs: number of runs. judged: those among them with an ARCR.
+    """
+
+    arr: float
+    arcr: float
+    arr_interval: tuple[float, float]
+    arcr_interval: tuple[float, float]
+    arr_pooled: float
+    arcr_pooled: float
+    runs: int
+    judged: int
+
+
+class _Reading(NamedTuple):
+    """Where the readings of the listing differ.
+
+    Attributes:
+        perceived: ids [N] -> [N], the entry whose true pose an entry is compared with (lines 18 to 21).
+        turn: heading difference -> the angle that is compared (line 23).
+        correct: (line 24 holds, this is a dwell step, verdict on the entry before) -> verdict (line 26).
+        joins: (entry, it is novel) -> the entry whose experience becomes valid, or None (lines 34 to 37).
+    """
+
+    perceived: Callable[[np.ndarray], np.ndarray]
+    turn: Callable[[np.ndarray], np.ndarray]
+    correct: Callable[[bool, bool, bool], bool]
+    joins: Callable[[int, bool], int | None]
+
+
+def experience_metric(
+    experience: np.ndarray, truth: np.ndarray, config: ExmConfig = DEFAULT
+) -> ExperienceMetric:
+    """ARR and ARCR of one run (Algorithm 1).
+
+    Args:
+        experience: [N] id of the current experience at each step, -1 where there was none (those steps are
+            passed over). Names only: any renaming gives the same result.
+        truth: [N, 3] true poses, m, m, rad.
+
+    Raises:
+        InputError: when the logs do not fit each other, a true pose is not finite, there is no such base set,
+            or none was given and the run never returns to its start.
+    """
+    experience, truth = _checked(experience, truth)
+    end = base_end(truth, config.position, config.heading_deg) if config.base is None else config.base
+    rows = _entries(experience, config.log)
+    base = int(np.searchsorted(rows, _checked_base(end, len(experience))))
+    reading = _READINGS[config.mode]
+    ids, poses = experience[rows], truth[rows]
+    counted = relocalisations(ids, base)
+    near = _near(poses, poses[reading.perceived(ids)], reading, config)
+    right = _verdicts(ids, base, counted, near, reading)
+    eta, eta_c, entries = int(counted.sum()), int(right.sum()), len(ids) - base
+    notes = [
+        LITERAL_WARNING if config.mode == "literal" else "",
+        "" if entries else "no entry after the base set: ARR is 0/0",
+        "" if eta else NO_RELOCALISATION,
+    ]
+    note = "; ".join(filter(None, notes))
+    arr, arcr = _ratio(eta, entries), _ratio(eta_c, eta)
+    return ExperienceMetric(
+        arr, arcr, entries, eta, eta_c, base, config.mode, config.log, note, counted, right, near
+    )
+
+
+def relocalisations(experience: np.ndarray, base: int) -> np.ndarray:
+    """Which entries are re-localisations: [N] bool (lines 9 to 15; no truth is needed).
+
+    In closed form: an experience counts from its first entry after the base set that returns to it (it was
+    there before, but not at the entry before), and from then on always.
+
+    Args:
+        experience: [N] ids. base: entries in the base set.
+    """
+    base = _checked_base(base, len(experience))
+    entry = np.arange(len(experience))
+    _, code = np.unique(experience, return_inverse=True)
+    returns = (entry >= base) & (creation_rows(experience) < entry) & ~_dwell(experience)
+    since = np.full(len(experience) + 1, len(experience))
+    np.minimum.at(since, code[returns], entry[returns])
+    return entry >= since[code]
+
+
+def base_end(truth: np.ndarray, position: float = 0.1, heading_deg: float = 25.0) -> int:
+    """Where the base set ends if nobody says: the row of the first return to the start pose.
+
+    The return counts when the robot had left the start's surroundings and travelled more than half the first
+    loop's length. A loop through the farthest point is at least twice as long as that is far, so "half" is
+    taken as the greatest distance from the start in the whole run: turning about near the start is no loop.
+
+    Args:
+        truth: [N, 3] true poses. position, heading_deg: how near the start is near, m and degrees.
+
+    Raises:
+        InputError: when the run never returns.
+    """
+    away = np.hypot(truth[:, 0] - truth[0, 0], truth[:, 1] - truth[0, 1])
+    turned = np.abs(wrap(truth[:, 2] - truth[0, 2]))
+    near = (away < position) & (turned < np.radians(heading_deg))
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T))])
+    left = np.logical_or.accumulate(~near)
+    back = np.flatnonzero(near & left & (way > away.max()))
+    if len(back) == 0:
+        where = f"within {position} m and {heading_deg} degrees of its start"
+        raise InputError(
+            "true trajectory", f"never returns {where}", "a closed loop", "give the end of the base set"
+        )
+    return int(back[0])
+
+
+def pool(results: Sequence[ExperienceMetric], *, seed: int = 0) -> Pool:
+    """Several runs (data sets, seeds) together; the paper's averages are the macro ones.
+
+    Raises:
+        InputError: when the runs were not all scored in the same mode and on the same kind of log.
+    """
+    kinds = {(result.mode, result.log) for result in results}
+    if len(kinds) != 1:
+        raise InputError("runs", f"{sorted(kinds)}", "at least one run, all of one mode and kind of log")
+    arr = np.array([result.arr for result in results])
+    arcr = np.array([result.arcr for result in results])
+    judged = arcr[np.isfinite(arcr)]
+    arr = arr[np.isfinite(arr)]
+    eta = sum(result.relocalisations for result in results)
+    return Pool(
+        arr=float(arr.mean()) if len(arr) else np.nan,
+        arcr=float(judged.mean()) if len(judged) else np.nan,
+        arr_interval=bootstrap(arr, "exm.arr", seed=seed),
+        arcr_interval=bootstrap(judged, "exm.arcr", seed=seed),
+        arr_pooled=_ratio(eta, sum(result.entries for result in results)),
+        arcr_pooled=_ratio(sum(result.correct for result in results), eta),
+        runs=len(results),
+        judged=len(judged),
+    )
+
+
+def bootstrap(
+    values: np.ndarray, stream: str, *, level: float = 0.95, draws: int = 10_000, seed: int = 0
+) -> tuple[float, float]:
+    """Percentile interval of the mean of `values` [R] over resampled runs; NaN when there is no run.
+
+    Args:
+        stream: name of the random stream; with `seed` it fixes the draws, whatever else was drawn before.
+    """
+    if len(values) == 0:
+        return np.nan, np.nan
+    random = np.random.default_rng([seed, crc32(stream.encode())])
+    means = values[random.integers(0, len(values), (draws, len(values)))].mean(axis=1)
+    low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
+    return float(low), float(high)
+
+
+def _checked(experience: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    experience, truth = np.asarray(experience), np.asarray(truth, float)
+    if experience.ndim != 1 or len(experience) == 0 or truth.shape != (len(experience), 3):
+        raise InputError(
+            "experience log", f"shapes {experience.shape} and {truth.shape}", "[N] and [N, 3], N at least 1"
+        )
+    if not np.isfinite(truth).all():
+        row = int(np.argmin(np.isfinite(truth).all(axis=1)))
+        raise InputError(
+            f"true trajectory, row {row}", f"{truth[row]}", "finite numbers", "leave such rows out"
+        )
+    return experience, truth
+
+
+def _checked_base(base: int, length: int) -> int:
+    if not 0 <= base <= length:
+        raise InputError("i_base", str(base), f"0 to {length}, the length of the log")
+    return base
+
+
+def _entries(experience: np.ndarray, log: str) -> np.ndarray:
+    """The steps that are entries of such a log: [M] rows."""
+    return changes(experience) if log == "action" else np.flatnonzero(experience != -1)
+
+
+def _dwell(experience: np.ndarray) -> np.ndarray:
+    """The entry is the same as the one before: [N] bool."""
+    return np.concatenate([[False], experience[1:] == experience[:-1]])
+
+
+def _last_entry(experience: np.ndarray) -> np.ndarray:
+    """For each entry the last earlier one with the same id, itself if there is none: [N]."""
+    order = np.argsort(experience, kind="stable")
+    last = np.arange(len(experience))
+    again = _dwell(experience[order])
+    last[order[again]] = order[np.flatnonzero(again) - 1]
+    return last
+
+
+def _near(true: np.ndarray, perceived: np.ndarray, reading: _Reading, config: ExmConfig) -> np.ndarray:
+    """Lines 16 to 24 without the valid set: [N] bool."""
+    distance = np.hypot(*(true - perceived)[:, :2].T)
+    turn = np.abs(reading.turn(true[:, 2] - perceived[:, 2]))
+    return (distance < config.position) & (turn < np.radians(config.heading_deg))
+
+
+def _verdicts(
+    ids: np.ndarray, base: int, counted: np.ndarray, near: np.ndarray, reading: _Reading
+) -> np.ndarray:
+    """Which re-localisations are correct: [N] bool (lines 15 to 38).
+
+    One pass in order, because a verdict decides which experiences are valid later on.
+    """
+    ids_, dwell = ids.tolist(), _dwell(ids).tolist()
+    novel = (creation_rows(ids) == np.arange(len(ids))).tolist()
+    counted_, near_ = counted.tolist(), near.tolist()
+    valid = set(ids_[:base])
+    right = [False] * len(ids_)
+    sound = True  # the listing's r_c: the last re-localisation was correct
+    for i in range(base, len(ids_)):
+        if counted_[i]:
+            sound = right[i] = reading.correct(near_[i] and ids_[i] in valid, dwell[i], right[i - 1])
+        joins = reading.joins(i, novel[i])
+        if sound and joins is not None:
+            valid.add(ids_[joins])
+    return np.array(right, bool)
+
+
+def _ratio(part: int, whole: int) -> float:
+    return part / whole if whole else np.nan
+
+
+def _this_if_novel(entry: int, novel: bool) -> int | None:
+    return entry if novel else None
+
+
+def _the_one_before(entry: int, novel: bool) -> int | None:
+    return entry - 1 if entry else None
+
+
+def _as_printed(angle: np.ndarray) -> np.ndarray:
+    return angle
+
+
+# The listing asks whether an experience is in R_c, the correct ones so far. In a dwell that is the verdict on
+# the entry before: were R_c never to lose a member, one right visit would excuse the rest of all wrong ones.
+_READINGS: dict[Mode, _Reading] = {
+    "strict": _Reading(
+        creation_rows, wrap, lambda first, dwell, before: before if dwell else first, _this_if_novel
+    ),
+    "paper": _Reading(
+        _last_entry, wrap, lambda first, dwell, before: first and not (dwell and not before), _the_one_before
+    ),
+    "or": _Reading(
+        _last_entry, wrap, lambda first, dwell, before: first or (dwell and before), _the_one_before
+    ),
+    "literal": _Reading(
+        _last_entry, _as_printed, lambda first, dwell, before: first and dwell and before, _the_one_before
+    ),
+}

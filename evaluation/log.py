@@ -1,0 +1,86 @@
+"""The experience log: which experience was current at each step, beside the true pose."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from evaluation.table import read_table
+from tactile.errors import InputError
+
+_COLUMNS = {
+    "time": ("t", "timestamp", "stamp"),
+    "experience": ("id", "experience id", "experience_id", "exp", "place"),
+    "x": ("true_x", "gt_x", "truth_x"),
+    "y": ("true_y", "gt_y", "truth_y"),
+    "theta": (
+        "th",
+        "heading",
+        "yaw",
+        "true_theta",
+        "true_th",
+        "gt_th",
+        "gt_theta",
+        "truth_theta",
+        "truth_th",
+    ),
+}
+
+
+class Log(NamedTuple):
+    """One row a step (a whisk cycle, a frame), of any SLAM system that tells which place it is at.
+
+    Attributes:
+        time: [N] s. experience: [N] int ids, -1 where there was none. truth: [N, 3] true pose, m, m, rad.
+    """
+
+    time: np.ndarray
+    experience: np.ndarray
+    truth: np.ndarray
+
+
+def read_log(path: str | Path) -> Log:
+    """A log from a CSV of time (s), experience id, true x (m), y (m) and heading (rad).
+
+    The header may say `t` or `time`, `id` or `experience`, `theta`, `th` or `heading`, and so on; without a
+    header the columns come in this order.
+
+    Raises:
+        InputError: naming file and line; also where an id is not a whole number.
+    """
+    table = read_table(path, _COLUMNS)
+    time, experience, x, y, theta = table.values.T
+    broken = np.flatnonzero(experience != np.round(experience))
+    if len(broken):
+        row = broken[0]
+        raise InputError(
+            f"{path}:{table.line[row]}", f"experience id {experience[row]}", "a whole number, -1 for none"
+        )
+    return Log(time, experience.astype(np.int64), np.stack([x, y, theta], axis=1))
+
+
+def changes(experience: np.ndarray) -> np.ndarray:
+    """The steps at which the current experience changed, the first step included: [M] rows.
+
+    One row a graph action: the per-action form of a per-step log. An id of -1 is no experience; such steps
+    are passed over.
+    """
+    rows = np.flatnonzero(np.asarray(experience) != -1)
+    ids = np.asarray(experience)[rows]
+    return rows[np.concatenate([[True], ids[1:] != ids[:-1]])] if len(rows) else rows
+
+
+def creation_rows(experience: np.ndarray) -> np.ndarray:
+    """For each step, the first step with the same experience: [N] rows."""
+    _, first, code = np.unique(experience, return_index=True, return_inverse=True)
+    return first[code]
+
+
+def creation_poses(experience: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """For each step, the true pose [N, 3] when its experience was created.
+
+    What RatSLAM itself perceives when it re-localises: it stores one pose with an experience, once.
+    """
+    return truth[creation_rows(experience)]

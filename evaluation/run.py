@@ -1,0 +1,71 @@
+"""One run of an engine as plain arrays: all that scoring and drawing it needs."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from tactile.errors import InputError
+
+
+class Run(NamedTuple):
+    """What was told, what became of it, and what was true; N steps, M experiences, L links.
+
+    Attributes:
+        time: [N] s, increasing.
+        truth: [N, 3] true poses (m, m, rad), NaN in rows without one; or None.
+        online: [N, 3] the pose told at each step. final: [N, 3] the pose the final map gives to that step.
+        odometry: [N, 3] raw odometry, dead reckoning from any start.
+        experience: [N] current experience, an index into `nodes`, -1 where there was none.
+        created: [M] the step at which each experience was created.
+        nodes: [M, 3] poses of the experiences in the final map, in the frame of `final`.
+        links: [L, 2] experiences joined by a link.
+    """
+
+    time: np.ndarray
+    truth: np.ndarray | None
+    online: np.ndarray
+    final: np.ndarray
+    odometry: np.ndarray
+    experience: np.ndarray
+    created: np.ndarray
+    nodes: np.ndarray
+    links: np.ndarray
+
+
+def check_run(run: Run) -> None:
+    """Refuses arrays that do not fit each other.
+
+    Raises:
+        InputError: naming the array.
+    """
+    steps, nodes = len(run.time), len(run.nodes)
+    shapes: dict[str, tuple[int, ...]] = {
+        **dict.fromkeys(("time", "experience"), (steps,)),
+        **dict.fromkeys(("online", "final", "odometry"), (steps, 3)),
+        "created": (nodes,),
+        "nodes": (nodes, 3),
+        "links": (len(run.links), 2),
+    }
+    if run.truth is not None:
+        shapes["truth"] = (steps, 3)
+    for name, shape in shapes.items():
+        array = np.asarray(getattr(run, name))
+        if array.shape != shape:
+            raise InputError(f"run.{name}", f"shape {array.shape}", str(shape))
+        if name != "truth" and not np.isfinite(array).all():
+            raise InputError(f"run.{name}", "a value that is not finite", "finite numbers")
+    if steps == 0:
+        raise InputError("run.time", "no steps", "at least one")
+    for name, low, high in (("experience", -1, nodes), ("created", 0, steps), ("links", 0, nodes)):
+        index = np.asarray(getattr(run, name))
+        if index.size and not (low <= index.min() and index.max() < high):
+            raise InputError(f"run.{name}", f"{index.min()} to {index.max()}", f"{low} to {high - 1}")
+
+
+def known(run: Run) -> np.ndarray:
+    """The steps whose true pose is known: rows [K]."""
+    if run.truth is None:
+        return np.zeros(0, int)
+    return np.flatnonzero(np.isfinite(run.truth).all(axis=1))

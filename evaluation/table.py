@@ -1,0 +1,101 @@
+"""Text files of numbers: one row a line, separated by commas or blanks, with or without a header."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import isfinite
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from tactile.errors import InputError
+
+Columns = Mapping[str, tuple[str, ...]]
+"""The wanted columns in order: name -> other names a header may give it (compared in lower case)."""
+
+
+class Table(NamedTuple):
+    """The rows of a file: `values` [N, columns] float64 and the `line` [N] each stood in, counted from 1."""
+
+    values: np.ndarray
+    line: np.ndarray
+
+
+def read_table(path: str | Path, columns: Columns) -> Table:
+    """The wanted columns of a file.
+
+    A first line that is not all numbers is a header and tells where the columns are; others in the file are
+    passed over. Without a header the file holds exactly the wanted columns in their order. Blank lines and
+    lines that begin with `#` are passed over. A recording that was cut off ends without a newline: such a
+    last line is dropped when it is not a whole row.
+
+    Raises:
+        InputError: naming file and line, when the file cannot be read, lacks a column or has a malformed row.
+    """
+    lines = _lines(path)
+    if not lines:
+        raise InputError(str(path), "no rows", f"lines of {' '.join(columns)}")
+    first, fields = lines[0][0], lines[0][1]
+    header = not all(map(_is_number, fields))
+    names = [name.lower() for name in fields] if header else list(columns)
+    where = _places(f"{path}:{first}", names, columns)
+    rows, at = [], []
+    for number, cells, whole in lines[header:]:
+        row = _row(cells, len(names))
+        if row is not None:
+            rows.append([row[place] for place in where])
+            at.append(number)
+        elif whole:
+            found = f"'{' '.join(cells)}'"
+            raise InputError(f"{path}:{number}", found, f"{len(names)} finite numbers: {' '.join(names)}")
+    if not rows:
+        raise InputError(str(path), "no rows", f"lines of {' '.join(columns)}")
+    return Table(np.array(rows), np.array(at))
+
+
+def _lines(path: str | Path) -> list[tuple[int, list[str], bool]]:
+    """Line number, fields, and whether the line is known to be whole."""
+    try:
+        text = Path(path).read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(str(path), f"cannot be read ({error})", "a text file of numbers") from error
+    lines = text.split("\n")
+    return [
+        (number, _cells(line), number < len(lines))
+        for number, line in enumerate(lines, start=1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+
+
+def _cells(line: str) -> list[str]:
+    return [cell.strip() for cell in line.split(",")] if "," in line else line.split()
+
+
+def _places(where: str, names: list[str], columns: Columns) -> list[int]:
+    """Where each wanted column stands among the names of the header."""
+    found = [
+        [names.index(name) for name in (wanted, *others) if name in names]
+        for wanted, others in columns.items()
+    ]
+    missing = [wanted for wanted, at in zip(columns, found, strict=True) if not at]
+    if missing:
+        known = "; ".join("/".join((wanted, *columns[wanted])) for wanted in missing)
+        raise InputError(where, f"no column {', '.join(missing)} among {' '.join(names)}", known)
+    return [at[0] for at in found]
+
+
+def _row(cells: list[str], width: int) -> list[float] | None:
+    """The numbers of a line, or None when it is not a row of so many finite ones."""
+    if len(cells) != width or not all(map(_is_number, cells)):
+        return None
+    row = [float(cell) for cell in cells]
+    return row if all(map(isfinite, row)) else None
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,174 @@
+"""How far one trajectory lies from another: alignment, ATE, RPE, anytime error, and TUM files.
+
+A trajectory is an array [N, 3] of x (m), y (m), heading (rad); where two are compared, row i of one was taken
+at the same moment as row i of the other (`associate` sees to that).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from evaluation.table import read_table
+from tactile.errors import InputError
+from tactile.frames import between, compose, wrap
+
+_TUM = {name: () for name in ("t", "x", "y", "z", "qx", "qy", "qz", "qw")}
+
+
+class Motions(NamedTuple):
+    """Root mean square errors of relative motions: translation in m, rotation in rad."""
+
+    translation: float
+    rotation: float
+
+
+class Anytime(NamedTuple):
+    """How far off the robot's present pose was while it was told, all in m.
+
+    Attributes:
+        median: over all rows. late: root mean square over the second half of the rows.
+        jump: largest change of the error from one row to the next.
+    """
+
+    median: float
+    late: float
+    jump: float
+
+
+def align(estimate: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """The rigid motion [3] that brings the estimate's positions [N, 3] nearest to the reference's [N, 3].
+
+    Least squares over rotation and translation, without scale; compose(align(e, r), e) is e aligned to r.
+
+    Raises:
+        InputError: when there is no row, or the two differ in length.
+    """
+    a, b = _positions(estimate, reference)
+    turn = np.angle(np.vdot(a - a.mean(), b - b.mean()))
+    shift = b.mean() - np.exp(1j * turn) * a.mean()
+    return np.array([shift.real, shift.imag, turn])
+
+
+def position_errors(estimate: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Distance of each row from the reference after one alignment over all rows: [N] m."""
+    aligned = compose(align(estimate, reference), estimate)
+    return np.hypot(*(aligned - reference)[:, :2].T)
+
+
+def ate(estimate: np.ndarray, reference: np.ndarray) -> float:
+    """Absolute trajectory error: root mean square of `position_errors`, m (Sturm et al. 2012)."""
+    return _rms(position_errors(estimate, reference))
+
+
+def motion_errors(estimate: np.ndarray, reference: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """Estimated against true motion between two rows, delta_ij (-) delta*_ij: [P, 3] in m, m, rad.
+
+    Args:
+        pairs: [P, 2] row indices i, j.
+
+    Source: Salman & Pearson 2016, eq. 1 and 2; Kuemmerle et al. 2009.
+    """
+    i, j = np.asarray(pairs, int).reshape(-1, 2).T
+    return between(between(reference[i], reference[j]), between(estimate[i], estimate[j]))
+
+
+def rpe(estimate: np.ndarray, reference: np.ndarray, step: int = 1) -> Motions:
+    """Relative pose error over `step` rows (Sturm et al. 2012); NaN when there are not so many."""
+    i = np.arange(max(0, len(estimate) - step))
+    error = motion_errors(estimate, reference, np.stack([i, i + step], axis=1))
+    return Motions(_rms(np.hypot(error[:, 0], error[:, 1])), _rms(error[:, 2]))
+
+
+def anytime_errors(online: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Distance of each row from the reference, once the rows up to it are aligned to the reference's: [N] m.
+
+    What the robot could have been blamed for at that moment: later rows do not help. The alignments of all
+    beginnings come from running sums, so that the whole takes O(N).
+    """
+    a, b = _positions(online, reference)
+    a, b = a - a.mean(), b - b.mean()  # keeps the running sums small against their differences
+    n = np.arange(1, len(a) + 1)
+    mean_a, mean_b = np.cumsum(a) / n, np.cumsum(b) / n
+    turn = np.angle(np.cumsum(a.conj() * b) - n * mean_a.conj() * mean_b)
+    return np.abs(np.exp(1j * turn) * (a - mean_a) - (b - mean_b))
+
+
+def anytime(online: np.ndarray, reference: np.ndarray) -> Anytime:
+    """The summary of `anytime_errors`."""
+    error = anytime_errors(online, reference)
+    jump = np.abs(np.diff(error)).max(initial=0.0)
+    return Anytime(float(np.median(error)), _rms(error[len(error) // 2 :]), float(jump))
+
+
+def interpolate(time: np.ndarray, pose: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Poses [..., 3] at the moments `at` [...], linear between rows; NaN before the first and after the last.
+
+    The heading is unwrapped first, so it goes the short way round between two rows.
+
+    Raises:
+        InputError: when time [N] does not increase.
+    """
+    if np.any(np.diff(time) <= 0):
+        row = int(np.argmax(np.diff(time) <= 0))
+        raise InputError(
+            f"trajectory, row {row + 1}", f"time {time[row + 1]} after {time[row]}", "increasing times"
+        )
+    columns = (pose[:, 0], pose[:, 1], np.unwrap(pose[:, 2]))
+    x, y, heading = (np.interp(at, time, column, left=np.nan, right=np.nan) for column in columns)
+    return np.stack([x, y, wrap(heading)], axis=-1)
+
+
+def associate(
+    time: np.ndarray, pose: np.ndarray, reference_time: np.ndarray, reference: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Time [M], pose [M, 3] and interpolated reference [M, 3] of the rows that lie inside the reference."""
+    there = interpolate(reference_time, reference, time)
+    inside = np.isfinite(there).all(axis=1)
+    return time[inside], pose[inside], there[inside]
+
+
+def read_tum(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
+    """Time [N] s and planar pose [N, 3] of a TUM file, `t x y z qx qy qz qw` a line.
+
+    z is left out and of the rotation only the heading is kept. A cut-off last line is dropped.
+
+    Raises:
+        InputError: naming file and line.
+    """
+    table = read_table(path, _TUM)
+    t, x, y, _, qx, qy, qz, qw = table.values.T
+    norm = qx * qx + qy * qy + qz * qz + qw * qw
+    if np.any(norm == 0):
+        raise InputError(
+            f"{path}:{table.line[norm == 0][0]}", "a quaternion of length 0", "a rotation qx qy qz qw"
+        )
+    heading = np.arctan2(2 * (qw * qz + qx * qy), norm - 2 * (qy * qy + qz * qz))
+    return t, np.stack([x, y, heading], axis=1)
+
+
+def write_tum(path: str | Path, time: np.ndarray, pose: np.ndarray) -> None:
+    """Writes a planar trajectory so that `read_tum` gives back the same numbers (headings to rounding)."""
+    half = pose[:, 2] / 2
+    rows = zip(time, pose[:, 0], pose[:, 1], np.sin(half), np.cos(half), strict=True)
+    lines = [
+        " ".join(f"{float(value)!r}" for value in (t, x, y, 0, 0, 0, qz, qw)) for t, x, y, qz, qw in rows
+    ]
+    Path(path).write_text("".join(line + "\n" for line in lines), encoding="utf-8")
+
+
+def _positions(estimate: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Both as complex numbers x + iy: [N] each."""
+    if len(estimate) != len(reference) or len(estimate) == 0:
+        found = f"{len(estimate)} and {len(reference)} rows"
+        raise InputError(
+            "trajectories", found, "the same number of rows, at least one", "associate them by time first"
+        )
+    estimate, reference = np.asarray(estimate, float), np.asarray(reference, float)
+    return estimate[:, 0] + 1j * estimate[:, 1], reference[:, 0] + 1j * reference[:, 1]
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")

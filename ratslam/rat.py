@@ -1,0 +1,154 @@
+"""The rat: view templates recall, pose cells integrate, places and the experience map remember."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ratslam import places, posecells, templates
+from ratslam.experience import ExperienceConfig, ExperienceMap
+from ratslam.places import PlaceConfig, Places
+from ratslam.posecells import Outcome, PoseCellConfig, PoseCells
+from ratslam.templates import Match, TemplateConfig, Templates
+from ratslam.types import Estimate
+from tactile.frames import wrap
+from tactile.settings import Settings
+from tactile.types import Array, Observation, Odometry
+
+
+class RatConfig(Settings):
+    """Every parameter of the rat backend."""
+
+    pose_cells: PoseCellConfig = PoseCellConfig()
+    """The attractor network."""
+    templates: TemplateConfig = TemplateConfig()
+    """View matching."""
+    places: PlaceConfig = PlaceConfig()
+    """When a place is made, reached or kept."""
+    experience: ExperienceConfig = ExperienceConfig()
+    """The map."""
+
+
+class State(NamedTuple):
+    """All that the neural half remembers."""
+
+    cells: PoseCells
+    templates: Templates
+    places: Places
+    relative: Array
+    """Heading of the robot less that at which the current template was stored, rad."""
+
+
+class RatEvidence(NamedTuple):
+    """What one step adds to the map and to the record.
+
+    Attributes:
+        template: int32, -1 while no view was ever seen. error: of the best match. relative: rad, see `State`.
+        energy: injected. packet: [3] decoded, cells. outcome: an `Outcome`, int32.
+    """
+
+    template: Array
+    error: Array
+    relative: Array
+    energy: Array
+    packet: Array
+    outcome: Array
+
+
+class Rat:
+    """The rat backend for views of one shape.
+
+    Args:
+        view_shape: (R, C, K) of the observations' views. dtype: of all floating state.
+    """
+
+    def __init__(self, config: RatConfig, view_shape: tuple[int, int, int], dtype: Any = np.float64) -> None:
+        self.config = config
+        self.view_shape = view_shape
+        self.dtype = np.dtype(dtype)
+        self.tables = posecells.tables(config.pose_cells, self.dtype)
+        self.rings = posecells.rings(config.pose_cells, self.dtype)
+        self.units = posecells.units(config.pose_cells, self.dtype)
+
+    def init(self, key: Array, capacity: int) -> State:
+        """One packet in the middle of an empty world. Nothing here is random, so `key` is not used."""
+        del key
+        return State(
+            posecells.start(self.config.pose_cells, self.dtype),
+            templates.start(self.config.templates, self.view_shape, capacity, self.dtype),
+            places.start(capacity, self.dtype),
+            jnp.zeros((), self.dtype),
+        )
+
+    def grow(self, state: State, capacity: int) -> State:
+        """The same memories in larger arrays."""
+        empty = self.init(None, capacity)
+
+        def enlarge(old: Array, new: Array) -> Array:
+            return new.at[tuple(slice(0, size) for size in old.shape)].set(old) if old.shape else old
+
+        memories = jax.tree.map(enlarge, (state.templates, state.places), (empty.templates, empty.places))
+        return state._replace(templates=memories[0], places=memories[1])
+
+    def kernel(self, state: State, observation: Observation) -> tuple[State, Estimate, RatEvidence]:
+        """See, recall, inject and move, decode, learn, decide."""
+        config = self.config
+        odometry, view, seen, clean = self._finite(observation)
+
+        match = self._match(state.templates, view, observation.label, seen)
+        memory, energy = templates.recall(config.templates, state.templates, match, seen)
+        memory, learnt = templates.learn(
+            memory, view.reshape(-1)[: memory.view.shape[0]], observation.label, state.cells.pose,
+            seen & (match.template < 0),
+        )
+        relative = jnp.where(seen, match.relative, state.relative)
+        turned = jnp.stack([jnp.zeros_like(relative), jnp.zeros_like(relative), relative / self.units[2]])
+
+        recalled = (memory.packet[jnp.maximum(match.template, 0)] + turned) % self.rings
+        cells, spread, outcome = posecells.step(
+            config.pose_cells, self.tables, state.cells, odometry, recalled, energy
+        )
+        canonical = (cells.pose - turned) % self.rings
+        world, decision = places.decide(
+            config.places, self.rings, state.places, canonical, memory.current, seen & (memory.current >= 0)
+        )
+
+        outcome = jnp.where(learnt & decision.room, outcome, Outcome.FULL)
+        outcome = jnp.where(clean, outcome, Outcome.NOT_FINITE).astype(jnp.int32)
+        pose = cells.pose * self.units
+        estimate = Estimate(
+            pose=jnp.stack([pose[0], pose[1], wrap(pose[2])]),
+            spread=spread * self.units,
+            place=decision.place,
+            previous=decision.previous,
+            action=decision.action,
+            lost=(outcome == Outcome.RESEEDED) | (outcome == Outcome.TOO_FAST),
+        )
+        evidence = RatEvidence(memory.current, match.error, relative, energy, cells.pose, outcome)
+        return State(cells, memory, world, relative), estimate, evidence
+
+    def new_map(self) -> ExperienceMap:
+        """An empty experience map."""
+        return ExperienceMap(self.config.experience)
+
+    def _match(self, store: Templates, view: Array, label: Array, seen: Array) -> Match:
+        if self.config.templates.source == "labels":
+            match = templates.match_label(store, label)
+        else:
+            match = templates.match_view(self.config.templates, self.view_shape, store, view)
+        return match._replace(error=jnp.where(seen, match.error, jnp.inf))
+
+    def _finite(self, observation: Observation) -> tuple[Odometry, Array, Array, Array]:
+        """The observation in this precision, with anything that is not a number masked."""
+        odometry = Odometry(*(jnp.asarray(value, self.dtype) for value in observation.odometry))
+        moves = jnp.stack(odometry[:3])
+        fine = jnp.all(jnp.isfinite(moves))
+        odometry = Odometry(*jnp.where(fine, moves, 0.0), odometry.dt)
+        view = jnp.asarray(observation.view, self.dtype)
+        visible = jnp.all(jnp.isfinite(view))
+        view = templates.normalise(self.config.templates, jnp.where(visible, view, 0.0))
+        given = observation.label >= 0 if self.config.templates.source == "labels" else observation.view_seen & visible
+        return odometry, view, given, fine & (visible | ~observation.view_seen)

@@ -1,0 +1,208 @@
+"""View templates: what has been seen, and which of it a view looks like.
+
+A template never changes. The best match within a threshold wins; anything else is a new template. Source:
+Milford & Wyeth 2004; Ball et al. 2013, section 3.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+
+from tactile.settings import Settings
+from tactile.types import Array
+
+TIE = 1e-9
+"""Errors this close tie, whatever the rounding: the earliest template at the lowest offset wins."""
+
+
+class TemplateConfig(Settings):
+    """Matching of views, and what a match injects."""
+
+    source: Literal["views", "labels"] = "views"
+    """`views`: compare images; `labels`: trust the place ids given by the recording."""
+    threshold: Annotated[float, Field(ge=0, le=1)] = 0.05
+    """Largest mean absolute difference of a match, in units of a view's values (0..1)."""
+    shift: NonNegativeInt = 0
+    """Columns by which a view may be shifted either way; 0 compares in place."""
+    shift_step: PositiveInt = 1
+    """Columns between tried shifts."""
+    column_angle: float = 0.0
+    """Heading difference that a shift by one column means, rad (counter-clockwise columns: positive);
+    0 when unknown. Panoramic views know it: a full turn over the columns."""
+    panoramic: bool = False
+    """Whether the columns close into a ring; then all shifts are tried and `shift` is not used."""
+    normalise_mean: NonNegativeFloat = 0.0
+    """Scale views to this mean; 0 leaves them. For cameras."""
+    patch: NonNegativeInt = 0
+    """Normalise each value by mean and deviation of the (2 patch + 1)^2 values around it; 0 leaves them."""
+    patch_sd: NonNegativeFloat = 0.0
+    """Patches that vary less than this are flat: 0.5."""
+    recent: NonNegativeInt = 10
+    """The newest templates, this many, recall nothing: the robot has not left them yet."""
+    energy: PositiveFloat = 0.15
+    """Activity injected by a fresh match (before habituation takes its share)."""
+    habituation: NonNegativeFloat = 1.0
+    """What each further sight in a row adds to a template's habituation."""
+    recovery: NonNegativeFloat = 0.05
+    """What each view takes from the habituation of all templates."""
+
+
+MUTE = 3.0
+"""Habituation never exceeds this: beyond ln(30) / 1.2 = 2.83 a template injects nothing, and the longer it
+was seen the longer it would stay mute."""
+
+
+class Templates(NamedTuple):
+    """The store, rows in order of creation; columns of `view` so that matching runs along rows.
+
+    Attributes:
+        view: [D, C] values. label: [C] int32 given ids. packet: [C, 3] decoded packet at creation, cells.
+        habituation: [C]. count: templates known, int32. current: the last one seen, int32, -1 before.
+    """
+
+    view: Array
+    label: Array
+    packet: Array
+    habituation: Array
+    count: Array
+    current: Array
+
+
+class Match(NamedTuple):
+    """A view's best template.
+
+    Attributes:
+        template: int32, -1 for none within the threshold. error: of the best, whether it matched or not;
+            infinite when there is nothing to compare. relative: the robot's heading less the heading at
+            which the template was stored, rad.
+    """
+
+    template: Array
+    error: Array
+    relative: Array
+
+
+def start(config: TemplateConfig, shape: tuple[int, int, int], capacity: int, dtype: np.dtype) -> Templates:
+    """An empty store. Given labels need no views, so none are kept."""
+    size = int(np.prod(shape)) if config.source == "views" else 0
+    return Templates(
+        view=jnp.zeros((size, capacity), dtype),
+        label=jnp.full(capacity, -1, jnp.int32),
+        packet=jnp.zeros((capacity, 3), dtype),
+        habituation=jnp.full(capacity, config.habituation, dtype),
+        count=jnp.int32(0),
+        current=jnp.int32(-1),
+    )
+
+
+def normalise(config: TemplateConfig, view: Array) -> Array:
+    """The view [R, C, K] as it is stored and compared (Ball et al. 2013: global, then patch)."""
+    if config.normalise_mean:
+        mean = jnp.mean(view)
+        view = jnp.where(mean > 0, jnp.clip(view * (config.normalise_mean / jnp.where(mean > 0, mean, 1.0)), 0, 1), view)
+    if config.patch:
+        view = _patch_normalise(view, config.patch, config.patch_sd)
+    return view
+
+
+def match_view(config: TemplateConfig, shape: tuple[int, int, int], store: Templates, view: Array) -> Match:
+    """The template with the smallest mean absolute difference over all allowed shifts.
+
+    Exact: no template is skipped by its mean, which would hide matches of shifted views.
+    """
+    rows, columns, channels = shape
+    capacity = store.view.shape[1]
+    stored = store.view.reshape(rows, columns, channels, capacity)
+    if config.panoramic:
+        offsets = range(0, columns, config.shift_step)
+        differences = [jnp.roll(stored, -o, axis=1) - view[..., None] for o in offsets]
+        angles = [2 * np.pi * o / columns for o in offsets]
+        angles = [angle - 2 * np.pi if angle > np.pi else angle for angle in angles]
+    else:
+        s, width = config.shift, columns - 2 * config.shift
+        offsets = range(0, 2 * s + 1, config.shift_step)
+        seen = view[:, s : s + width, :, None]
+        differences = [stored[:, o : o + width] - seen for o in offsets]
+        angles = [(o - s) * config.column_angle for o in offsets]
+    cells = differences[0].size // capacity
+    errors = jnp.stack([jnp.sum(jnp.abs(d), axis=(0, 1, 2)) for d in differences]) / cells  # [offsets, C]
+    known = jnp.arange(capacity, dtype=jnp.int32) < store.count
+    errors = jnp.where(known[None, :], errors, jnp.inf)
+    best = jnp.min(errors)
+    tied = errors <= best + TIE
+    template = jnp.argmax(jnp.any(tied, axis=0)).astype(jnp.int32)
+    offset = jnp.argmax(lax.dynamic_index_in_dim(tied, template, 1, keepdims=False))
+    relative = jnp.asarray(angles, view.dtype)[offset]
+    matched = best <= config.threshold + TIE
+    return Match(jnp.where(matched, template, -1), best, jnp.where(matched, relative, 0.0))
+
+
+def match_label(store: Templates, label: Array) -> Match:
+    """The template that carries the given label."""
+    same = store.label == label
+    matched = jnp.any(same)
+    zero = jnp.zeros((), store.packet.dtype)
+    template = jnp.where(matched, jnp.argmax(same).astype(jnp.int32), -1)
+    return Match(template, jnp.where(matched, zero, jnp.inf), zero)
+
+
+def recall(config: TemplateConfig, store: Templates, match: Match, seen: Array) -> tuple[Templates, Array]:
+    """Habituates what is seen again and says with how much energy a match is injected.
+
+    Returns:
+        the store with habituation and `current` updated (for known templates), and the energy.
+    """
+    known = seen & (match.template >= 0)
+    row = jnp.maximum(match.template, 0)
+    again = known & (match.template == store.current)
+    level = store.habituation[row] + jnp.where(again, config.habituation, 0.0)
+    level = jnp.minimum(level, jnp.maximum(MUTE, config.habituation))
+    energy = config.energy / 30 * (30 - jnp.exp(1.2 * level))
+    old = match.template + config.recent < store.count
+    energy = jnp.where(known & old, jnp.maximum(energy, 0.0), 0.0)
+    levels = store.habituation.at[row].set(jnp.where(known, level, store.habituation[row]))
+    rested = jnp.maximum(levels - config.recovery, config.habituation)
+    return (
+        store._replace(
+            habituation=jnp.where(seen, rested, store.habituation),
+            current=jnp.where(known, match.template, store.current),
+        ),
+        energy,
+    )
+
+
+def learn(store: Templates, view: Array, label: Array, packet: Array, novel: Array) -> tuple[Templates, Array]:
+    """Stores a novel view [D] where the packet [3] was; returns the store and whether it had room."""
+    capacity = store.label.shape[0]
+    room = store.count < capacity
+    kept = novel & room
+    row = jnp.minimum(store.count, capacity - 1)
+    count = store.count + kept.astype(jnp.int32)
+    column = jnp.where(kept, view, store.view[:, row])
+    return (
+        store._replace(
+            view=store.view.at[:, row].set(column),
+            label=store.label.at[row].set(jnp.where(kept, label, store.label[row])),
+            packet=store.packet.at[row].set(jnp.where(kept, packet, store.packet[row])),
+            count=count,
+            current=jnp.where(kept, store.count, store.current),
+        ),
+        room | ~novel,
+    )
+
+
+def _patch_normalise(view: Array, half: int, flat: float) -> Array:
+    rows, columns, _ = view.shape
+    padded = jnp.pad(view, ((half, half), (half, half), (0, 0)), mode="edge")
+    window = range(2 * half + 1)
+    patches = jnp.stack([padded[y : y + rows, x : x + columns] for y in window for x in window])
+    mean, sd = jnp.mean(patches, axis=0), jnp.std(patches, axis=0)
+    # Rounding leaves a constant patch with a deviation near 1e-17: that is flat, not one sigma.
+    varied = sd > max(flat, 1e-6)
+    scaled = (view - mean) / jnp.where(varied, sd, 1.0)
+    return jnp.where(varied, jnp.clip((scaled + 3) / 6, 0, 1), 0.5)

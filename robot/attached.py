@@ -1,0 +1,171 @@
+"""What is attached to a table's odometry rows: views, place ids and truth, in its own file or in others."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from robot.columns import LabelColumns, PairColumns, TruthColumns, ViewColumns
+from robot.csvfile import CsvFile
+from robot.pairs import labels_from_pairs
+from robot.plausibility import Place, clock, finite, views
+from robot.units import Limits, headings
+from tactile.errors import InputError
+
+FAR = 20.0  # times max_range: a median range beyond it is in another unit
+
+Matched = tuple[np.ndarray, np.ndarray, list[InputError]]  # odometry rows [M], values [M, ...], faults
+
+
+def views_of(
+    base: CsvFile,
+    files: Mapping[Path, CsvFile],
+    part: ViewColumns,
+    time: np.ndarray,
+    shape: tuple[int, int, int],
+) -> Matched:
+    """Views [M, R, C, 1]: pixels as given, or the mean range of equal groups of consecutive beams."""
+    file = files[part.file or base.path]
+    values, empty = file.block(part.prefix)
+    there = np.flatnonzero(~empty.all(axis=1))
+    place = _place(file, there)
+    values = values[there]
+    what, pixels, width = f"{part.prefix}*", int(np.prod(shape)), values.shape[1]
+    if width % pixels or (part.max_range is None and width != pixels):
+        expected = f"{pixels} (table.rows {shape[0]} x table.columns {shape[1]})"
+        expected += "" if part.max_range is None else " or a multiple"
+        error = InputError(f"{file.path}:1", f"{width} columns {part.prefix}0, {part.prefix}1, ...", expected)
+        return there, values, [error]
+    if part.max_range is None:
+        errors = finite(values, what, place)
+        errors += views(values.min(axis=1), values.max(axis=1), what, place)
+    else:
+        values = np.where(np.isposinf(values), part.max_range, values)  # REP-117: nothing in reach
+        errors = finite(values, what, place) + _range_faults(values, part.max_range, what, place, file.path)
+        groups = np.minimum(values, part.max_range).reshape(len(values), pixels, -1)
+        values = groups.mean(axis=2) / part.max_range
+    rows, faults = _rows(file, base, there, part.time, part.tolerance, time)
+    return rows, values.reshape(-1, *shape), errors + faults
+
+
+def _range_faults(values: np.ndarray, reach: float, what: str, place: Place, path: Path) -> list[InputError]:
+    errors = []
+    negative = (values < 0).any(axis=1)
+    if negative.any():
+        row = int(negative.argmax())
+        errors.append(InputError(place(row), f"{what} is {values[row].min()}", "ranges of 0 m or more"))
+    typical = float(np.nanmedian(values)) if np.isfinite(values).any() else 0.0
+    if typical > FAR * reach:
+        cure = "divide by 1000 if they are millimetres, else raise table.views.max_range"
+        errors.append(InputError(str(path), f"half of the ranges are over {typical:.4g} m", "metres", cure))
+    return errors
+
+
+def labels_of(
+    base: CsvFile,
+    files: Mapping[Path, CsvFile],
+    labels: LabelColumns | None,
+    pairs: PairColumns | None,
+    time: np.ndarray,
+) -> Matched:
+    """Place ids [M] int32, as given or from pairs."""
+    if pairs is not None:
+        return _paired(base, files[pairs.file], pairs, time)
+    assert labels is not None
+    file = files[labels.file or base.path]
+    ids, empty = file.column(labels.column), file.empty[:, file.names.index(labels.column)]
+    there = np.flatnonzero(~empty & (ids != -1))
+    ids = ids[there]
+    rows, errors = _rows(file, base, there, labels.time, labels.tolerance, time)
+    bad = ~((ids >= 0) & (ids <= np.iinfo(np.int32).max) & (ids == np.round(ids)))
+    if bad.any():
+        row = int(bad.argmax())
+        found, expected = f"{labels.column} is {ids[row]}", "a whole number from 0, or -1 or nothing for none"
+        return rows, ids, [InputError(file.place(int(there[row])), found, expected), *errors]
+    return rows, ids.astype(np.int32), errors
+
+
+def _paired(base: CsvFile, file: CsvFile, part: PairColumns, time: np.ndarray) -> Matched:
+    later, earlier, score = (file.column(name) for name in (part.later, part.earlier, part.score))
+    errors = file.faults(part.later, part.earlier, part.score)
+    crossed = later <= earlier
+    if crossed.any():
+        row = int(crossed.argmax())
+        found = f"{part.later} {later[row]} is not after {part.earlier} {earlier[row]}"
+        cure = "swap table.pairs.later and earlier" if crossed.mean() > 0.5 else ""
+        errors.append(InputError(file.place(row), found, "the later time of a pair first", cure))
+    if errors:
+        return later, later, errors
+    moments, ids = labels_from_pairs(later.tolist(), earlier.tolist(), score.tolist(), part.threshold)
+    rows, errors = _nearest(moments, time, part.tolerance, lambda i: f"{file.path}, time {moments[i]}")
+    return rows, ids, errors
+
+
+def truth_of(
+    base: CsvFile, files: Mapping[Path, CsvFile], part: TruthColumns, time: np.ndarray, limits: Limits
+) -> tuple[np.ndarray, list[InputError]]:
+    """[N, 3] at the odometry rows, NaN outside the truth's span."""
+    file = files[part.file or base.path]
+    names = (part.x, part.y, part.heading)
+    errors = file.faults(*names)
+    truth = np.column_stack([file.column(name) for name in names])
+    moments = time if file is base else file.column(part.time)
+    if faults := headings(truth[:, 2], moments, part.heading, str(file.path), limits):
+        errors += faults
+        truth[:, 2] = np.deg2rad(truth[:, 2])  # or every other check would say it again
+    if file is base:
+        return truth, errors
+    errors += file.faults(part.time) + clock(moments, part.time, file.place)
+    if errors:
+        return np.full((len(time), 3), np.nan), errors
+    truth[:, 2] = np.unwrap(truth[:, 2])
+    known = (moments[0] <= time) & (time <= moments[-1])
+    if not known.any():
+        found = f"{part.time} is {moments[0]} to {moments[-1]} s, the odometry's {time[0]} to {time[-1]}"
+        errors.append(InputError(str(file.path), found, "times that overlap", "bring both to one clock"))
+    at = np.column_stack([np.interp(time, moments, column) for column in truth.T])
+    return np.where(known[:, None], at, np.nan), errors
+
+
+def _rows(
+    file: CsvFile, base: CsvFile, there: np.ndarray, name: str, tolerance: float | None, time: np.ndarray
+) -> tuple[np.ndarray, list[InputError]]:
+    """The odometry rows of a file's rows [M]: the same ones, or the nearest in time."""
+    if file is base:
+        return there, []
+    moments = file.column(name)[there]
+    place = _place(file, there)
+    errors = finite(moments, name, place) + clock(moments, name, place)
+    return (there, errors) if errors else _nearest(moments, time, tolerance, place)
+
+
+def _place(file: CsvFile, there: np.ndarray) -> Place:
+    """Where those of a file's rows [M] stand."""
+    return lambda row: file.place(int(there[row]))
+
+
+def _nearest(
+    moments: np.ndarray, time: np.ndarray, tolerance: float | None, place: Place
+) -> tuple[np.ndarray, list[InputError]]:
+    """The odometry row nearest in time to each of the moments [M], at most the tolerance away."""
+    steps = np.diff(time)
+    if not (steps > 0).all():
+        return np.zeros(len(moments), int), []  # the clock's fault is already reported
+    rows = np.searchsorted(time[:-1] + steps / 2, moments)
+    reach = float(np.median(steps)) if tolerance is None and len(steps) else tolerance or 0.0
+    away = np.abs(time[rows] - moments)
+    errors = []
+    far = away > reach
+    if far.any():
+        i = int(far.argmax())
+        found = f"the nearest odometry row is {away[i]:.4g} s away (one of {int(far.sum())} such rows)"
+        cure = "raise tolerance, or bring both to one clock"
+        errors.append(InputError(place(i), found, f"at most {reach:.4g} s", cure))
+    twice = np.flatnonzero(np.diff(rows) == 0)
+    if len(twice) and not errors:
+        i = int(twice[0]) + 1
+        found = f"belongs to the same odometry row as the one before (one of {len(twice)} such rows)"
+        errors.append(InputError(place(i), found, "one for each odometry row", "thin them out"))
+    return rows, errors

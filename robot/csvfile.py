@@ -1,0 +1,161 @@
+"""A CSV file of numbers under a header row, remembering which line each row came from."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from robot.files import digest_of, missing, read_bytes, refuse
+from robot.plausibility import and_more, finite
+from tactile.errors import InputError
+
+SHOWN = 8  # faults listed one by one before the rest is only counted
+
+
+@dataclass(frozen=True, eq=False)
+class CsvFile:
+    """The numbers of one file.
+
+    Attributes:
+        names: its C columns. values: [N, C]; NaN where a cell is empty. empty: [N, C] which cells are.
+        lines: [N] line numbers, from 1. content: the file's bytes.
+    """
+
+    path: Path
+    names: tuple[str, ...]
+    values: np.ndarray
+    empty: np.ndarray
+    lines: np.ndarray
+    content: bytes
+
+    def place(self, row: int) -> str:
+        return f"{self.path}:{self.lines[row]}"
+
+    def column(self, name: str) -> np.ndarray:
+        """[N] the named column, which `absences` found there."""
+        return self.values[:, self.names.index(name)]
+
+    def faults(self, *names: str) -> list[InputError]:
+        """Faults where a named column is empty, NaN or infinite."""
+        errors = []
+        for name in names:
+            empty = self.empty[:, self.names.index(name)]
+            if empty.any():
+                found = f"{name} is empty{and_more(empty)}"
+                errors.append(InputError(self.place(int(empty.argmax())), found, "a number"))
+            errors += finite(self.column(name), name, self.place, ~empty)
+        return errors
+
+    def absences(self, wanted: Sequence[tuple[str, str]]) -> list[InputError]:
+        """Faults for wanted (column, configuration key) that are not there."""
+        where = f"{self.path}:1"
+        return [
+            missing(where, "column", name, self.names, key) for name, key in wanted if name not in self.names
+        ]
+
+    def numbered(self, prefix: str) -> dict[int, int]:
+        """The columns called prefix0, prefix1, ...: their numbers, increasing, and where they stand."""
+        numbers = {
+            int(name[len(prefix) :]): place
+            for place, name in enumerate(self.names)
+            if name.startswith(prefix) and name[len(prefix) :].isdecimal()
+        }
+        return dict(sorted(numbers.items()))
+
+    def block(self, prefix: str) -> tuple[np.ndarray, np.ndarray]:
+        """Those columns in the order of their numbers: values [N, B], empty [N, B]."""
+        columns = list(self.numbered(prefix).values())
+        return self.values[:, columns], self.empty[:, columns]
+
+
+def read_csv(path: Path) -> CsvFile:
+    """Raises:
+    InputError: no such file, no header, no rows, rows of another length, cells that are no numbers.
+    """
+    content = read_bytes(path)
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(str(path), f"is not text (byte {error.start})", "a CSV file in UTF-8") from error
+    lines = text.splitlines()
+    names = _header(path, lines[0] if lines else "")
+    kept = [(number, line) for number, line in enumerate(lines[1:], start=2) if line.strip()]
+    if not kept:
+        raise InputError(str(path), "has no rows under its header", "at least one row")
+    values = _numbers([line for _, line in kept], len(names))
+    empty = np.zeros((len(kept), len(names)), bool)
+    if values is None:
+        values, empty = _cells(path, names, kept)
+    return CsvFile(path, names, values, empty, np.array([number for number, _ in kept]), content)
+
+
+def digest_of_files(files: Sequence[CsvFile]) -> str:
+    """sha256 (hex) of the files' bytes in the order they were named, each file once."""
+    return digest_of({file.path: file.content for file in files}.values())
+
+
+def _header(path: Path, line: str) -> tuple[str, ...]:
+    names = tuple(name.strip() for name in _split(line))
+    where = f"{path}:1"
+    if len(names) < 2:
+        for mark, word in ((";", "semicolons"), ("\t", "tabs")):
+            if mark in line:
+                raise InputError(where, f"the columns are separated by {word}", "commas")
+    if any(_is_number(name) for name in names):
+        raise InputError(where, f"the first line is {line[:60]!r}", "a header row that names the columns")
+    doubled = sorted({name for name in names if names.count(name) > 1})
+    if doubled:
+        raise InputError(where, f"several columns are called {doubled[0]!r}", "every name once")
+    return names
+
+
+def _numbers(lines: list[str], width: int) -> np.ndarray | None:
+    """[N, C] in one go, or None where something needs a closer look."""
+    try:
+        values = np.loadtxt(lines, delimiter=",", comments=None, ndmin=2)
+    except ValueError:
+        return None
+    return values if values.shape == (len(lines), width) else None
+
+
+def _cells(path: Path, names: tuple[str, ...], kept: list[tuple[int, str]]) -> tuple[np.ndarray, np.ndarray]:
+    """[N, C] values and which cells are empty, cell by cell, refusing what is no number."""
+    values = np.full((len(kept), len(names)), np.nan)
+    empty = np.zeros(values.shape, bool)
+    errors = []
+    for row, (number, line) in enumerate(kept):
+        cells = _split(line)
+        if len(cells) != len(names):
+            found, expected = f"{len(cells)} cells", f"{len(names)}, as in the header"
+            errors.append(InputError(f"{path}:{number}", found, expected, "the row may be cut off"))
+            continue
+        for column, cell in enumerate(cells):
+            if not cell.strip():
+                empty[row, column] = True
+            elif _is_number(cell):
+                values[row, column] = float(cell)
+            else:
+                errors.append(InputError(f"{path}:{number}", f"{names[column]} is {cell[:40]!r}", "a number"))
+    if len(errors) > SHOWN:
+        errors[SHOWN:] = [InputError(str(path), f"{len(errors) - SHOWN} more faults like these")]
+    refuse(errors)
+    return values, empty
+
+
+def _split(line: str) -> list[str]:
+    try:
+        return next(csv.reader([line]), [])
+    except csv.Error:  # a cell beyond the module's size limit: no number in any case
+        return line.split(",")
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,89 @@
+"""Reading what a user names: one clear error for every way in which a file can be absent or unusable."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+
+from tactile.errors import InputError, InputErrors
+
+
+def require_file(path: Path) -> None:
+    """Raises:
+    InputError: nothing there, not a regular file, not readable, or empty.
+    """
+    try:
+        if path.is_dir():
+            raise InputError(str(path), "is a folder", "a file")
+        if not path.exists():
+            raise InputError(str(path), "no such file", "an existing file", _neighbours(path))
+        if not path.is_file():
+            raise InputError(str(path), "is not a regular file", "a file")
+        with path.open("rb") as file:
+            if not file.read(1):
+                raise InputError(str(path), "is empty", "a recording", "was it copied completely?")
+    except OSError as error:
+        raise unreadable(path, error) from error
+
+
+def unreadable(path: Path, error: OSError) -> InputError:
+    """The operating system's refusal in our words."""
+    cure = "make it readable for this user" if isinstance(error, PermissionError) else ""
+    return InputError(str(path), f"cannot be read ({error.strerror or error})", cure=cure)
+
+
+def read_bytes(path: Path) -> bytes:
+    """The whole content of a file, at least one byte.
+
+    Raises:
+        InputError: see `require_file`.
+    """
+    require_file(path)
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise unreadable(path, error) from error
+
+
+def digest_of(contents: Iterable[bytes]) -> str:
+    """sha256 (hex) of all contents, in order."""
+    total = hashlib.sha256()
+    for content in contents:
+        total.update(content)
+    return total.hexdigest()
+
+
+def missing(where: str, kind: str, name: str, there: Sequence[str], key: str = "") -> InputError:
+    """The error about something a file does not hold: says what is there and what may have been meant.
+
+    Args:
+        kind: what is missing, 'column' or 'array'.
+        there: the names that exist.
+        key: the configuration key that named it, if any.
+    """
+    close = get_close_matches(name, there, n=1)
+    cure = f"did you mean {close[0]!r}?" if close else (f"name the {kind} with {key}" if key else "")
+    return InputError(where, f"no {kind} {name!r}", f"it among {_few(there)}", cure)
+
+
+def refuse(errors: Sequence[InputError]) -> None:
+    """Raise what was found: nothing, the one error, or all of them together."""
+    if len(errors) == 1:
+        raise errors[0]
+    if errors:
+        raise InputErrors(list(errors))
+
+
+def _few(names: Sequence[str], most: int = 12) -> str:
+    shown = ", ".join(map(repr, names[:most]))
+    return shown + (f" and {len(names) - most} more" if len(names) > most else "") if names else "(nothing)"
+
+
+def _neighbours(path: Path) -> str:
+    try:
+        close = get_close_matches(path.name, [other.name for other in path.parent.iterdir()], n=1)
+    except OSError:
+        return f"there is no folder {path.parent} either"
+    return f"did you mean {close[0]!r}?" if close else ""

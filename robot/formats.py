@@ -1,0 +1,81 @@
+"""Which reader opens which file: the one list to add a format to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from robot.columns import TableConfig
+from robot.files import require_file
+from robot.source import Source
+from robot.units import ORDINARY, Limits
+from tactile.errors import InputError
+from tactile.settings import Settings
+
+Warn = Callable[[str], None] | None
+
+
+class RecordingConfig(Settings):
+    """A recording to run on."""
+
+    file: Path
+    """The recording: `.mcap` (ours), `.npz` (a reference stream) or `.csv` (odometry)."""
+    table: TableConfig = TableConfig()
+    """For `.csv`: which column means what."""
+    limits: Limits = ORDINARY
+    """What the numbers may claim before they are refused as wrong units."""
+
+    def resolved(self, folder: Path) -> RecordingConfig:
+        """The same with every relative path taken from the folder (of the configuration file, say)."""
+        parts = {
+            key: part.model_copy(update={"file": folder / part.file})
+            for key in ("views", "labels", "pairs", "truth")
+            if (part := getattr(self.table, key)) is not None and part.file is not None
+        }
+        table = self.table.model_copy(update=parts)
+        return self.model_copy(update={"file": folder / self.file, "table": table})
+
+
+def _open_mcap(config: RecordingConfig, warn: Warn) -> Source:
+    from robot.recording import Recording  # mcap and zstandard load only where a recording is read
+
+    return Recording(config.file, config.limits, warn)
+
+
+def _open_npz(config: RecordingConfig, warn: Warn) -> Source:
+    from robot.streams import read_stream
+
+    return read_stream(config.file, config.limits)
+
+
+def _open_csv(config: RecordingConfig, warn: Warn) -> Source:
+    from robot.table import read_table
+
+    return read_table(config.file, config.table, config.limits)
+
+
+# ROS bags (a folder with metadata.yaml, or .bag) go here: a reader that returns a Source, and one line.
+FORMATS: dict[str, Callable[[RecordingConfig, Warn], Source]] = {
+    ".mcap": _open_mcap,
+    ".npz": _open_npz,
+    ".csv": _open_csv,
+}
+
+
+def open_recording(config: RecordingConfig, warn: Warn = None) -> Source:
+    """The recording as a source, read by its suffix and checked as a whole.
+
+    Args:
+        warn: called with one sentence if only a part of the recording could be read.
+
+    Raises:
+        InputError: no such file, a format we do not read, or faults in it.
+    """
+    opener = FORMATS.get(config.file.suffix.lower())
+    if opener is None:
+        require_file(config.file)
+        found = (
+            f"no reader for {config.file.suffix!r} files" if config.file.suffix else "a file without a suffix"
+        )
+        raise InputError(str(config.file), found, f"one of {', '.join(FORMATS)}")
+    return opener(config, warn)

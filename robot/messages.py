@@ -1,0 +1,232 @@
+"""How a sample is written down: ROS 2 messages in little-endian CDR, which any ROS 2 or MCAP tool can read.
+
+Fields are ordered so that CDR's alignment never needs padding. A message is therefore four bytes
+(00 01 00 00) and its fields back to back; an unbounded array is preceded by its length (uint32). float64 is
+kept bit for bit. The schemas below are stored in every file.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from robot.source import Sample
+from tactile.errors import InputError
+from tactile.types import Cycle, Observation, Odometry
+
+CDR = b"\x00\x01\x00\x00"
+MOST = 100_000_000  # numbers in one message; more is a damaged length
+
+ODOMETRY = """float64 time        # s, on the recording's own clock
+float64 dx          # motion since the sample before, in the body frame before it: forward, m
+float64 dy          # left, m
+float64 dtheta      # counter-clockwise, rad
+float64 dt          # the motion's duration, s
+"""
+SCHEMAS = {
+    "ratslam_msgs/msg/Observation": ODOMETRY
+    + """float64[2] wall_point  # its nearest point, m in base_link, if wall
+float64 wall_sd     # standard deviation of the wall's direction, rad
+int32 motion        # 0 other, 1 forward, 2 back, 3 turn
+int32 label         # place id given with the recording, -1 none
+uint32[3] view_shape  # rows, columns, channels
+float64[] view      # row-major, in 0..1, if view_seen
+uint32 whiskers
+float64[] point     # whiskers x 2, m in base_link, where contact
+bool[] contact      # which whiskers touched something
+bool view_seen
+bool wall           # whether a wall's orientation was measured
+""",
+    "ratslam_msgs/msg/Cycle": ODOMETRY
+    + """uint32 samples
+float64[] sample_time  # samples, s
+uint32 whiskers
+float64[] angle     # samples x whiskers, rad
+uint32 axes         # 2
+float64[] deflection  # samples x whiskers x 2
+""",
+    "ratslam_msgs/msg/Truth": """float64 time        # s, as in the reading it belongs to
+float64 x           # m
+float64 y           # m
+float64 heading     # rad
+""",
+}
+OBSERVATION, CYCLE, TRUTH = SCHEMAS
+
+
+class Malformed(ValueError):
+    """A message that is not what its schema says."""
+
+
+class Layout(NamedTuple):
+    """Where a message's fields are.
+
+    Attributes:
+        dtype: the whole message as a packed record. blank: one with its lengths and shapes filled in.
+        fixed: (start, stop, bytes) of everything that is the same in all messages of this layout.
+        fields: the others.
+    """
+
+    dtype: np.dtype
+    blank: np.ndarray
+    fixed: tuple[tuple[int, int, bytes], ...]
+    fields: tuple[str, ...]
+
+
+def encode(sample: Sample, view_shape: tuple[int, int, int], whiskers: int) -> tuple[str, bytes]:
+    """A sample's reading as (schema, message).
+
+    Raises:
+        InputError: a field of another shape, or with values that float64, int32 or bool cannot hold exactly.
+    """
+    reading = sample.reading
+    values: dict[str, Any] = {**reading._asdict(), **reading.odometry._asdict()}
+    if isinstance(reading, Cycle):
+        name, layout = CYCLE, cycle_layout(len(np.atleast_1d(reading.time)), whiskers)
+        values["sample_time"] = reading.time
+    else:
+        name, layout = OBSERVATION, observation_layout(view_shape, whiskers)
+    values["time"] = sample.time
+    record = layout.blank.copy()
+    for field in layout.fields:
+        record[field] = _exactly(field, values[field], layout.dtype[field])
+    return name, record.tobytes()
+
+
+def decode(name: str, message: bytes, view_shape: tuple[int, int, int], whiskers: int) -> tuple[float, Any]:
+    """(time, reading) of a message; the inverse of `encode`.
+
+    Raises:
+        Malformed: the message is not one of this schema with this view shape and so many whiskers.
+    """
+    if name == CYCLE:
+        samples = int.from_bytes(message[44:48], "little")
+        if samples * (1 + 3 * whiskers) > MOST:
+            raise Malformed(f"a cycle of {samples} samples")
+        layout = cycle_layout(samples, whiskers)
+    else:
+        layout = observation_layout(view_shape, whiskers)
+    if len(message) != layout.dtype.itemsize:
+        raise Malformed(f"a message of {len(message)} bytes where {layout.dtype.itemsize} were due")
+    if any(message[start:stop] != content for start, stop, content in layout.fixed):
+        raise Malformed("a message of another shape than the recording's")
+    record = np.frombuffer(message, layout.dtype)[0]
+    odometry = Odometry(record["dx"], record["dy"], record["dtheta"], record["dt"])
+    if name == CYCLE:
+        time, angle, deflection = (record[field].copy() for field in ("sample_time", "angle", "deflection"))
+        return float(record["time"]), Cycle(time, angle, deflection, odometry)
+    return float(record["time"]), Observation(
+        odometry=odometry,
+        motion=record["motion"],
+        view=record["view"].copy(),  # copies are aligned and the caller's own
+        view_seen=record["view_seen"],
+        label=record["label"],
+        contact=record["contact"].copy(),
+        point=record["point"].copy(),
+        wall=record["wall"],
+        wall_point=record["wall_point"].copy(),
+        wall_sd=record["wall_sd"],
+    )
+
+
+def encode_truth(time: float, truth: np.ndarray) -> bytes:
+    """A truth [3] as a message."""
+    return CDR + np.array([time, *_exactly("truth", truth, np.dtype(("<f8", (3,))))], "<f8").tobytes()
+
+
+def decode_truth(message: bytes) -> tuple[float, np.ndarray]:
+    """(time, truth [3]); raises `Malformed`."""
+    if len(message) != 36 or not message.startswith(CDR):
+        raise Malformed("a truth that is no truth")
+    time, *pose = np.frombuffer(message, "<f8", offset=4)
+    return float(time), np.array(pose)
+
+
+@lru_cache(maxsize=16)
+def observation_layout(view_shape: tuple[int, int, int], whiskers: int) -> Layout:
+    """The packed form of the Observation schema for these shapes."""
+    pixels = int(np.prod(view_shape))
+    return _layout(
+        [
+            *_ODOMETRY,
+            ("wall_point", "<f8", (2,)),
+            ("wall_sd", "<f8"),
+            ("motion", "<i4"),
+            ("label", "<i4"),
+            ("view_shape", "<u4", (3,)),
+            ("view_length", "<u4"),
+            ("view", "<f8", view_shape),
+            ("whiskers", "<u4"),
+            ("point_length", "<u4"),
+            ("point", "<f8", (whiskers, 2)),
+            ("contact_length", "<u4"),
+            ("contact", "?", (whiskers,)),
+            ("view_seen", "?"),
+            ("wall", "?"),
+        ],
+        view_shape=view_shape,
+        view_length=pixels,
+        whiskers=whiskers,
+        point_length=2 * whiskers,
+        contact_length=whiskers,
+    )
+
+
+@lru_cache(maxsize=64)
+def cycle_layout(samples: int, whiskers: int) -> Layout:
+    """The packed form of the Cycle schema for these shapes."""
+    return _layout(
+        [
+            *_ODOMETRY,
+            ("samples", "<u4"),
+            ("sample_time_length", "<u4"),
+            ("sample_time", "<f8", (samples,)),
+            ("whiskers", "<u4"),
+            ("angle_length", "<u4"),
+            ("angle", "<f8", (samples, whiskers)),
+            ("axes", "<u4"),
+            ("deflection_length", "<u4"),
+            ("deflection", "<f8", (samples, whiskers, 2)),
+        ],
+        samples=samples,
+        sample_time_length=samples,
+        whiskers=whiskers,
+        angle_length=samples * whiskers,
+        axes=2,
+        deflection_length=2 * samples * whiskers,
+    )
+
+
+_ODOMETRY = [("cdr", "u1", (4,)), *((name, "<f8") for name in ("time", "dx", "dy", "dtheta", "dt"))]
+
+
+def _layout(fields: list[Any], **fixed: Any) -> Layout:
+    dtype = np.dtype(fields)
+    blank = np.zeros((), dtype)
+    for name, value in {"cdr": list(CDR), **fixed}.items():
+        blank[name] = value
+    content = blank.tobytes()
+    places = [(dtype.fields[name][1], dtype[name].itemsize) for name in ("cdr", *fixed)]  # type: ignore[index]
+    return Layout(
+        dtype=dtype,
+        blank=blank,
+        fixed=tuple((start, start + size, content[start : start + size]) for start, size in places),
+        fields=tuple(name for name in dtype.names or () if name != "cdr" and name not in fixed),
+    )
+
+
+def _exactly(name: str, value: Any, dtype: np.dtype) -> np.ndarray:
+    """The value as that dtype and shape, or an error if it is not exactly that."""
+    array = np.asarray(value)
+    base, shape = dtype.base, dtype.shape
+    if array.shape != shape:
+        raise InputError(
+            name, f"shape {list(array.shape)}", f"{list(shape)}, as the recording was opened for"
+        )
+    if array.dtype != base:
+        kinds = "biuf" if base.kind == "f" else "biu"
+        if array.dtype.kind not in kinds or not np.array_equal(array.astype(base), array, equal_nan=True):
+            raise InputError(name, f"{array.dtype} values", f"values that {base} holds exactly")
+    return array

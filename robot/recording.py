@@ -1,0 +1,195 @@
+"""Reading our recordings, whole or cut off, and making a cut one whole again."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from array import array
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from robot.files import refuse, require_file, unreadable
+from robot.plausibility import clock, finite, views
+from robot.recorder import Recorder
+from robot.source import Sample, Source, rate_of
+from robot.units import ORDINARY, Limits, Track, units
+from robot.walk import Description, Walk
+from tactile.errors import InputError
+from tactile.types import Cycle
+
+
+class Recording:
+    """A recorded file as a `Source`. It is checked as a whole first, then read again sample by sample, so
+    that raw whisker recordings larger than the memory can be replayed.
+
+    Args:
+        path: an `.mcap` file written by `Recorder`, finished or not.
+        warn: called with one sentence if the file is cut off or damaged.
+
+    Attributes:
+        truncated: whether the file ends before its proper end; `length` samples are read all the same.
+        warning: that sentence, or ''.
+        created_by: program and version that recorded it.
+
+    Raises:
+        InputError: no such recording, no sample in it that can be read, or values that cannot be.
+    """
+
+    whiskers: int
+    view_shape: tuple[int, int, int]
+
+    def __init__(
+        self, path: Path, limits: Limits = ORDINARY, warn: Callable[[str], None] | None = None
+    ) -> None:
+        require_file(path)
+        self.path = path
+        self.name = path.stem
+        self.digest = _digest(path)
+        walk = Walk(path)
+        columns = array("d")
+        for sample in walk:
+            columns.extend(_column(sample))
+        description = _described(walk)
+        self.view_shape, self.whiskers = description.view_shape, description.whiskers
+        self.created_by = description.created_by
+        self.length = walk.count
+        self.truncated = bool(walk.broken)
+        self.warning = ""
+        if self.truncated:
+            self.warning = f"{path}: {self.length} samples could be read, the rest is lost: {walk.broken}"
+        time = self._check(np.frombuffer(columns).reshape(walk.count, -1), limits)
+        self.rate_hz = rate_of(time) or description.rate_hz
+        if self.truncated and warn is not None:
+            warn(self.warning)
+
+    def _check(self, columns: np.ndarray, limits: Limits) -> np.ndarray:
+        """The times [N] s of the samples with odometry, after refusing what cannot be."""
+        time, motion, truth = columns[:, 0], columns[:, 1:5], columns[:, 5:8]
+        low, high, odd, told = columns[:, 8:].T
+        moved = (motion != 0).any(axis=1)
+        moved[0] = True  # it sets the clock
+
+        def place(row: int) -> str:
+            return f"{self.path}, row {row}"
+
+        errors = finite(time, "time", place) + clock(time, "time", place, moved)
+        errors += finite(motion, "odometry", place) + views(low, high, "view", place)
+        errors += finite(odd, "a number in the reading", place) + finite(truth, "truth", place, told > 0)
+        back = motion[:, 3] < 0
+        if back.any():
+            row = int(back.argmax())
+            errors.append(InputError(place(row), f"odometry took {motion[row, 3]} s", "dt of 0 s or more"))
+        track = Track(time, moved, motion, truth if told.any() else None)
+        refuse(errors + units(track, str(self.path), limits))
+        return time[moved]
+
+    def __iter__(self) -> Iterator[Sample]:
+        walk = Walk(self.path)
+        for sample in walk:
+            yield sample
+            if walk.count == self.length:
+                return
+        raise InputError(
+            str(self.path), f"had {self.length} samples and now has {walk.count}", "a file at rest"
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        pass
+
+
+class Recovery(NamedTuple):
+    """What `recover` saved.
+
+    Attributes:
+        samples: how many. truncated: whether the old file was incomplete. reason: why its reading ended.
+    """
+
+    samples: int
+    truncated: bool
+    reason: str
+
+
+def record(source: Source, path: Path) -> int:
+    """Write all samples of a source to a new recording; their number."""
+    with Recorder(
+        path, view_shape=source.view_shape, whiskers=source.whiskers, rate_hz=source.rate_hz
+    ) as recorder:
+        for sample in source:
+            recorder.write(sample)
+        return recorder.count
+
+
+def recover(path: Path, out: Path) -> Recovery:
+    """Write every readable sample of a cut or damaged recording to a new, whole one.
+
+    The new file appears under its name only when it is complete. Nothing is judged but readability.
+
+    Raises:
+        InputError: nothing readable in `path`, or `out` exists.
+    """
+    require_file(path)
+    if out.exists():
+        raise InputError(str(out), "exists already", "a new file", "choose another name or move it")
+    walk = Walk(path)
+    samples = iter(walk)
+    first = next(samples, None)
+    description = _described(walk)
+    draft = out.with_name(f".{out.name}.{os.getpid()}.part")
+    try:
+        with Recorder(draft, view_shape=description.view_shape, whiskers=description.whiskers,
+                      rate_hz=description.rate_hz) as recorder:  # fmt: skip
+            if first is not None:
+                recorder.write(first)
+            for sample in samples:
+                recorder.write(sample)
+        with draft.open("rb") as file:
+            os.fsync(file.fileno())
+        os.replace(draft, out)
+    finally:
+        draft.unlink(missing_ok=True)
+    return Recovery(walk.count, bool(walk.broken), walk.broken)
+
+
+def _described(walk: Walk) -> Description:
+    """The walked file's description, refusing a file without one or without samples."""
+    if walk.description is None:
+        found = f"cannot be read as a recording: {walk.broken or 'it does not say what it holds'}"
+        raise InputError(
+            str(walk.path), found, "an MCAP file written by ratslam", "ROS bags are not read yet"
+        )
+    if not walk.count:
+        found = f"holds no samples{': ' + walk.broken if walk.broken else ''}"
+        raise InputError(str(walk.path), found, "at least one sample", "nothing can be recovered from it")
+    return walk.description
+
+
+def _column(sample: Sample) -> tuple[float, ...]:
+    """What is checked of a sample: time, odometry, truth, the view's extremes, any odd number, has truth."""
+    reading = sample.reading
+    truth = (np.nan,) * 3 if sample.truth is None else sample.truth
+    low = high = np.nan
+    if isinstance(reading, Cycle):
+        parts = [reading.time, reading.angle, reading.deflection]
+    else:
+        parts = [reading.view, reading.point, reading.wall_point, reading.wall_sd]
+        if reading.view_seen:
+            low, high = reading.view.min(), reading.view.max()
+    odd = next((float(part[~good].flat[0]) for part in parts if not (good := np.isfinite(part)).all()), 0.0)
+    return (sample.time, *reading.odometry, *truth, low, high, odd, sample.truth is not None)
+
+
+def _digest(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise unreadable(path, error) from error

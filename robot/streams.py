@@ -1,0 +1,203 @@
+"""The reference streams: one `.npz` a run, with the inputs that were given to OpenRatSLAM.
+
+Arrays, N rows: `in_t` s, `in_v` m/s, `in_w` rad/s, `in_flags` (1 = the row has a view, 2 = it has odometry,
+3 = both), `in_view` (a template, row-major [rows, columns], or two columns: place id and relative angle),
+`truth` [N, 3] (x m, y m, heading rad; optional) and `params_json` (a JSON object; its `template_y_size` and
+`template_x_size` give the template's shape). Values of a row that its flag does not announce are ignored.
+
+A row's speed is driven along the heading *after* its turn, as OpenRatSLAM does. The first odometry row only
+sets the clock; a row without odometry does not advance it.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+
+from robot.files import digest_of, missing, read_bytes, refuse
+from robot.log import Log
+from robot.odometry import NEW_HEADING, from_velocities
+from robot.plausibility import Place, clock, finite, views
+from robot.units import ORDINARY, Limits, Track, headings, units
+from tactile.errors import InputError
+
+VIEW, ODOMETRY = 1, 2
+COLUMNS = ("in_t", "in_v", "in_w", "in_flags")
+NEEDED = (*COLUMNS, "in_view", "params_json")
+
+# What NumPy and zipfile raise about a file that is damaged, cut off or something else altogether.
+_BROKEN = (zipfile.BadZipFile, zlib.error, ValueError, LookupError, EOFError, OSError, MemoryError,
+           RuntimeError, SyntaxError)  # fmt: skip
+
+
+def read_stream(path: Path, limits: Limits = ORDINARY) -> Log:
+    """A reference stream as a `Source`; `params` holds its parameters, numbers as numbers.
+
+    Raises:
+        InputError: not such a file, arrays missing or of the wrong shape, or values that cannot be.
+    """
+    content = read_bytes(path)
+    arrays = _arrays(path, content)
+    refuse(_shape_faults(path, arrays))
+    params = _params(path, arrays["params_json"])
+    shape, given_ids = _view_shape(path, params, arrays["in_view"].shape[1])
+
+    time, speed, turn = (arrays[name].astype(np.float64) for name in COLUMNS[:3])
+    flags = arrays["in_flags"]
+    seen, moved = np.isin(flags, (VIEW, VIEW | ODOMETRY)), np.isin(flags, (ODOMETRY, VIEW | ODOMETRY))
+    view = arrays["in_view"].astype(np.float64)
+    truth = arrays["truth"].astype(np.float64) if "truth" in arrays else None
+    motion = np.zeros((len(time), 4))
+    with np.errstate(all="ignore"):  # faulty values are reported below
+        motion[moved] = from_velocities(time[moved], speed[moved], 0.0, turn[moved], NEW_HEADING)
+
+    place = _place(path)
+    errors = [*_flag_faults(flags, place), *finite(time, "in_t", place), *clock(time, "in_t", place, moved)]
+    errors += finite(speed, "in_v", place, moved) + finite(turn, "in_w", place, moved)
+    errors += finite(view, "in_view", place, seen)
+    if given_ids:
+        errors += _id_faults(view, seen, place)
+    else:
+        low = np.where(seen, view.min(axis=1), np.nan)
+        errors += views(low, np.where(seen, view.max(axis=1), np.nan), "in_view", place)
+    if truth is not None:
+        errors += finite(truth, "truth", place)
+        if faults := headings(truth[:, 2], time, "truth's heading", str(path), limits):
+            errors += faults
+            truth[:, 2] = np.deg2rad(truth[:, 2])  # or every other check would say it again
+    refuse(errors + units(Track(time, moved, motion, truth), str(path), limits))
+
+    label = np.full(len(time), -1, np.int32)
+    picture = np.zeros((len(time), *shape))
+    if given_ids:
+        label[seen] = view[seen, 0].astype(np.int32)
+    else:
+        picture[seen] = view[seen].reshape(-1, *shape)
+    return Log(
+        name=path.stem,
+        digest=digest_of([content]),
+        time=time,
+        motion=motion,
+        moved=moved,
+        views=picture,
+        seen=np.zeros_like(seen) if given_ids else seen,
+        label=label,
+        truth=truth,
+        params=params,
+    )
+
+
+def _place(path: Path) -> Place:
+    return lambda row: f"{path}, row {row}"
+
+
+def _arrays(path: Path, content: bytes) -> dict[str, np.ndarray]:
+    """The arrays we know of, by name."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            there = [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
+            if absent := [name for name in NEEDED if name not in there]:
+                refuse([missing(str(path), "array", name, there) for name in absent])
+            return {name: _array(archive, name) for name in (*NEEDED, "truth") if name in there}
+    except InputError:
+        raise
+    except _BROKEN as error:
+        cut = content.startswith(b"PK") and isinstance(error, zipfile.BadZipFile)
+        cure = "it seems cut off or damaged: copy it again" if cut else "write it with numpy.savez"
+        raise InputError(str(path), f"cannot be read as .npz ({error})", "a NumPy archive", cure) from error
+
+
+def _array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
+    """One array; its checksum is verified before NumPy sees it, and nothing pickled is ever loaded."""
+    return np.lib.format.read_array(io.BytesIO(archive.read(f"{name}.npy")), allow_pickle=False)
+
+
+def _shape_faults(path: Path, arrays: dict[str, np.ndarray]) -> list[InputError]:
+    """Wrong dtypes, dimensions and lengths, and no rows at all."""
+    rows = arrays["in_t"].size
+    wanted: dict[str, tuple[str, ...]] = {name: ("N",) for name in COLUMNS} | {"in_view": ("N", "V")}
+    if "truth" in arrays:
+        wanted["truth"] = ("N", "3")
+    errors = []
+    for name, dims in wanted.items():
+        array = arrays[name]
+        if array.dtype.kind not in "fiub":
+            errors.append(InputError(str(path), f"{name} has dtype {array.dtype}", "real numbers"))
+        fits = array.ndim == len(dims) and array.shape[0] == rows and ("3" not in dims or array.shape[1] == 3)
+        if not fits:
+            expected = f"shape [{', '.join(dims)}] with N = {rows}, the rows of in_t"
+            errors.append(InputError(str(path), f"{name} has shape {list(array.shape)}", expected))
+    if not rows:
+        errors.append(InputError(str(path), "in_t has no rows", "at least one sample"))
+    return errors
+
+
+def _params(path: Path, text: np.ndarray) -> dict[str, float | int | str]:
+    """The parameters, numeric text made numbers."""
+    try:
+        params = json.loads(str(text[()]))
+    except (ValueError, RecursionError) as error:
+        raise InputError(str(path), f"params_json is no JSON ({error})", "a JSON object") from error
+    if not isinstance(params, dict):
+        raise InputError(str(path), f"params_json holds {type(params).__name__}", "a JSON object")
+    return {key: _number(value) for key, value in params.items()}
+
+
+def _number(value: object) -> float | int | str:
+    for kind in (int, float):
+        try:
+            return kind(str(value))
+        except ValueError:
+            continue
+    return str(value)
+
+
+def _view_shape(path: Path, params: dict, width: int) -> tuple[tuple[int, int, int], bool]:
+    """(R, C, 1), and whether `in_view` holds place ids instead of templates that are so large."""
+    where = f"{path}: params_json"
+    size = []
+    for name in ("template_y_size", "template_x_size"):
+        if name not in params:
+            raise missing(where, "key", name, list(params))
+        value = params[name]
+        if not isinstance(value, int) or not 0 < value < 10_000:
+            raise InputError(where, f"{name} is {value!r}", "a whole number of pixels")
+        size.append(value)
+    rows, columns = size
+    if width not in (rows * columns, 2):
+        expected = (
+            f"{rows * columns} (template_y_size {rows} x template_x_size {columns}), or 2 (id, relative_rad)"
+        )
+        raise InputError(str(path), f"in_view has {width} columns", expected)
+    return (rows, columns, 1), width != rows * columns
+
+
+def _flag_faults(flags: np.ndarray, place: Place) -> list[InputError]:
+    bad = ~np.isin(flags, (VIEW, ODOMETRY, VIEW | ODOMETRY))
+    if not bad.any():
+        return []
+    row = int(bad.argmax())
+    return [InputError(place(row), f"in_flags is {flags[row]}", "1 (view), 2 (odometry) or 3 (both)")]
+
+
+def _id_faults(view: np.ndarray, seen: np.ndarray, place: Place) -> list[InputError]:
+    """Ids are small whole numbers, and the heading of a match is not ours to use."""
+    ids, relative = np.nan_to_num(view).T
+    errors = []
+    bad = seen & ((ids < 0) | (ids != np.round(ids)) | (ids > np.iinfo(np.int32).max))
+    if bad.any():
+        row = int(bad.argmax())
+        errors.append(InputError(place(row), f"in_view's place id is {ids[row]}", "a whole number from 0"))
+    turned = seen & (relative != 0)
+    if turned.any():
+        row = int(turned.argmax())
+        found = f"in_view's relative angle is {relative[row]} rad"
+        errors.append(
+            InputError(place(row), found, "0", "relative angles of given matches are not supported")
+        )
+    return errors

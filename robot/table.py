@@ -1,0 +1,123 @@
+"""Plain CSV recordings: odometry in one file; views, place ids and truth in the same or in others."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from robot.attached import labels_of, truth_of, views_of
+from robot.columns import PoseColumns, TableConfig, ViewColumns
+from robot.csvfile import CsvFile, digest_of_files, read_csv
+from robot.files import missing, refuse
+from robot.log import Log
+from robot.odometry import from_poses, from_velocities
+from robot.plausibility import clock
+from robot.units import ORDINARY, Limits, Track, headings, units
+from tactile.errors import InputError
+
+
+def read_table(path: Path, config: TableConfig, limits: Limits = ORDINARY) -> Log:
+    """A CSV recording as a `Source`: one sample per row of the odometry file.
+
+    Raises:
+        InputError: files or columns missing, cells that are no numbers, or values that cannot be.
+    """
+    parts = (config.views, config.labels, config.pairs, config.truth)
+    paths = [path, *(part.file for part in parts if part is not None and part.file is not None)]
+    files = {name: read_csv(name) for name in dict.fromkeys(paths)}
+    base = files[path]
+    refuse(_absences(base, files, config))
+
+    time = base.column(config.time)
+    everywhere = np.ones(len(time), bool)
+    errors = base.faults(config.time) + clock(time, config.time, base.place)
+    motion, faults = _motion(base, time, config, limits)
+    errors += faults
+    shape = (config.rows, config.columns, 1)
+    pictures, seen = np.zeros((len(time), *shape)), np.zeros(len(time), bool)
+    label, truth = np.full(len(time), -1, np.int32), None
+    if config.views is not None:
+        rows, values, faults = views_of(base, files, config.views, time, shape)
+        errors += faults
+        if not faults:
+            pictures[rows], seen[rows] = values, True
+    if config.labels is not None or config.pairs is not None:
+        rows, values, faults = labels_of(base, files, config.labels, config.pairs, time)
+        errors += faults
+        if not faults:
+            label[rows] = values
+    if config.truth is not None:
+        truth, faults = truth_of(base, files, config.truth, time, limits)
+        errors += faults
+    refuse(errors + units(Track(time, everywhere, motion, truth), str(path), limits))
+    return Log(
+        name=path.stem,
+        digest=digest_of_files(list(files.values())),
+        time=time,
+        motion=motion,
+        moved=everywhere,
+        views=pictures,
+        seen=seen,
+        label=label,
+        truth=truth,
+    )
+
+
+def _absences(base: CsvFile, files: Mapping[Path, CsvFile], config: TableConfig) -> list[InputError]:
+    """Columns that a configuration key names and the file lacks, and choices that were not made."""
+    errors = base.absences([(config.time, "table.time")])
+    if (config.pose is None) == (config.velocity is None):
+        found = "neither table.pose nor table.velocity is given" if config.pose is None else "both are given"
+        expected = f"one of them, naming the odometry among {', '.join(base.names)}"
+        errors.append(InputError(str(base.path), found, expected))
+    if config.labels is not None and config.pairs is not None:
+        errors.append(
+            InputError(str(base.path), "both table.labels and table.pairs are given", "one of them")
+        )
+    for key in ("pose", "velocity", "labels", "pairs", "truth", "views"):
+        part = getattr(config, key)
+        if part is None:
+            continue
+        file = files[getattr(part, "file", None) or base.path]
+        named = part.model_dump(
+            exclude={"file", "tolerance", "threshold", "prefix", "max_range"}, exclude_none=True
+        )
+        if file is base:
+            named.pop("time", None)  # there it is the odometry's
+        errors += file.absences([(column, f"table.{key}.{field}") for field, column in named.items()])
+        if isinstance(part, ViewColumns):
+            errors += _gap(file, part.prefix)
+    return errors
+
+
+def _gap(file: CsvFile, prefix: str) -> list[InputError]:
+    """The fault of a view whose columns do not count up without a gap."""
+    there = list(file.numbered(prefix))
+    absent = (
+        next((number for number in range(there[0], there[-1]) if number not in there), None) if there else 0
+    )
+    if absent is None:
+        return []
+    return [missing(f"{file.path}:1", "column", f"{prefix}{absent}", file.names, "table.views.prefix")]
+
+
+def _motion(
+    base: CsvFile, time: np.ndarray, config: TableConfig, limits: Limits
+) -> tuple[np.ndarray, list[InputError]]:
+    """[N, 4] and the faults of its columns."""
+    part = config.pose or config.velocity
+    assert part is not None  # `_absences` saw to it
+    names = [name for name in part.model_dump().values() if name is not None]
+    columns = {name: base.column(name) for name in names}
+    errors = base.faults(*names)
+    with np.errstate(all="ignore"):  # faulty values were just reported
+        if isinstance(part, PoseColumns):
+            poses = np.column_stack([columns[name] for name in names])
+            if faults := headings(poses[:, 2], time, part.heading, str(base.path), limits):
+                errors += faults
+                poses[:, 2] = np.deg2rad(poses[:, 2])  # or every other check would say it again
+            return from_poses(time, poses), errors
+        left = columns[part.left] if part.left is not None else 0.0
+        return from_velocities(time, columns[part.forward], left, columns[part.turn]), errors

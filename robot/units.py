@@ -1,0 +1,183 @@
+"""Can a recording be in seconds, metres and radians? Judged by what most of the motion does.
+
+The *typical* speed is the one above which half of the path was covered, the typical turn rate the one above
+which half of all turning was done. Standing still and sensor noise weigh nothing in them, and the two
+fastest steps have no vote, so that a single glitch decides nothing. A robot given in millimetres drives a
+thousand times too fast; one given in degrees turns 57 times too fast, unless it is very slow: then only a
+truth to compare with can tell.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from tactile.errors import InputError
+from tactile.settings import Settings
+
+GLITCHES = 2  # fastest steps without a vote
+PAUSE = 1000.0  # median steps: a longer one is a fault of the clock, no motion to judge
+RATIO = 30.0  # odometry : truth, either way; real ones are near 1, a wrong unit makes it 57 or 1000
+LEAST_PATH, LEAST_TURNING = 0.05, 0.3  # m, rad: if the smaller total is less, the ratio says nothing,
+MOST = 5.0  # m or rad: nor if the larger one is less than this
+RULER = 0.05  # m: the truth's path is measured in steps of at least this, or its noise would add up
+STRETCHES = 50  # turning is compared net over so many, or its noise would add up
+
+
+class Limits(Settings):
+    """What a recording may claim before it is refused. Raise a limit if your robot really does that."""
+
+    speed: float = Field(default=25.0, gt=0)
+    """Fastest typical speed, m/s: a car in town does 15, a 30 mm/s arm taken for m/s does 30."""
+    turn_rate: float = Field(default=6.0, gt=0)
+    """Fastest typical turn rate, rad/s: robots do 0.2 to 1, which in degrees is 11 to 57."""
+    interval: float = Field(default=60.0, gt=0)
+    """Longest median step, s: 100 ms taken for seconds is 100."""
+
+
+ORDINARY = Limits()
+
+
+class Track(NamedTuple):
+    """The part of a recording that units can be judged by.
+
+    Attributes:
+        time: [N] s. moved: [N] rows that carry odometry. motion: [N, 4] (dx m, dy m, dtheta rad, dt s).
+        truth: [N, 3] (x m, y m, heading rad), NaN where unknown; or None.
+    """
+
+    time: np.ndarray
+    moved: np.ndarray
+    motion: np.ndarray
+    truth: np.ndarray | None
+
+
+class Typical(NamedTuple):
+    """How a robot moves most of the time.
+
+    Attributes:
+        interval: median time between rows, s. speed: m/s. turn_rate: rad/s. turn: rad in one step.
+        path, turning: (odometry's, truth's) totals, m and net rad; NaN without a truth.
+    """
+
+    interval: float
+    speed: float
+    turn_rate: float
+    turn: float
+    path: tuple[float, float]
+    turning: tuple[float, float]
+
+
+def typical(track: Track) -> Typical:
+    """How the robot of this track moves; faulty rows are looked past."""
+    steps = np.diff(track.time[track.moved & np.isfinite(track.time)])
+    interval = float(np.median(steps)) if len(steps) else 0.0
+    dt = track.motion[:, 3]
+    good = np.isfinite(track.motion).all(axis=1) & (dt > 0) & (dt <= PAUSE * interval)
+    length, turn = np.hypot(track.motion[good, 0], track.motion[good, 1]), np.abs(track.motion[good, 2])
+    path, turning = _beside_truth(track, good)
+    return Typical(
+        interval=interval,
+        speed=_typical(length, dt[good]),
+        turn_rate=_typical(turn, dt[good]),
+        turn=_typical(turn, np.ones_like(turn)),
+        path=path,
+        turning=turning,
+    )
+
+
+def units(track: Track, where: str, limits: Limits = ORDINARY) -> list[InputError]:
+    """Faults of the recording as a whole: times not in s, motion not in m or rad, odometry unlike truth."""
+    robot = typical(track)
+    faults = []
+    if robot.interval > limits.interval:
+        found = f"half of the steps take over {robot.interval:.4g} s"
+        faults.append(
+            (found, "times in seconds", f"divide by 1000 if they are ms; {_else('interval', limits)}")
+        )
+    if robot.speed > limits.speed:
+        found = f"half of the path is driven at over {robot.speed:.4g} m/s"
+        faults.append((found, "odometry in metres", f"{_MILLIMETRES}; {_else('speed', limits)}"))
+    if robot.turn_rate > limits.turn_rate or robot.turn > np.pi:
+        found = (
+            f"half of the turning is done at over {robot.turn_rate:.4g} rad/s ({robot.turn:.3g} rad a step)"
+        )
+        faults.append((found, "odometry in radians", f"{_DEGREES}; {_else('turn_rate', limits)}"))
+    if _unlike(*robot.path, LEAST_PATH):
+        found = "the odometry covers {:.4g} m, the truth {:.4g} m".format(*robot.path)
+        faults.append((found, "both in metres", _MILLIMETRES))
+    if _unlike(*robot.turning, LEAST_TURNING):
+        found = "the odometry turns by {:.4g} rad, the truth by {:.4g} rad".format(*robot.turning)
+        faults.append((found, "both in radians", _DEGREES))
+    return [InputError(where, *fault) for fault in faults]
+
+
+def headings(
+    heading: np.ndarray, time: np.ndarray, what: str, where: str, limits: Limits = ORDINARY
+) -> list[InputError]:
+    """Faults of a heading column [N] that must be degrees: wider than a turn, too fast for radians."""
+    good = np.isfinite(heading) & np.isfinite(time)
+    heading, dt = heading[good], np.diff(time[good])
+    if not len(heading) or np.abs(heading).max() <= 2 * np.pi + 0.1:
+        return []  # wrapped radians, or so few degrees that nobody could tell
+    turn = np.abs(np.diff(heading))
+    turn = np.minimum(turn, np.abs(360 - turn))[dt > 0]
+    rate = _typical(turn, dt[dt > 0])
+    if rate <= limits.turn_rate and _typical(turn, np.ones_like(turn)) <= np.pi:
+        return []
+    found = f"{what} runs from {heading.min():.4g} to {heading.max():.4g}, mostly at {rate:.3g} a second"
+    return [InputError(where, found, "a heading in radians", f"{_DEGREES}; {_else('turn_rate', limits)}")]
+
+
+def _typical(amount: np.ndarray, duration: np.ndarray) -> float:
+    """The rate above which half of the total amount [N] was done."""
+    rate = amount / duration
+    order = np.argsort(rate)[: max(len(rate) - GLITCHES, 0)]
+    done = np.cumsum(amount[order])
+    return float(rate[order][np.searchsorted(done, done[-1] / 2)]) if len(done) and done[-1] > 0 else 0.0
+
+
+def _beside_truth(track: Track, good: np.ndarray) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Path and net turning of odometry and truth where there is a truth; NaN where there is none."""
+    nothing = (np.nan, np.nan)
+    if track.truth is None:
+        return nothing, nothing
+    rows = np.flatnonzero(np.isfinite(track.truth).all(axis=1))
+    if len(rows) <= GLITCHES + 1:
+        return nothing, nothing
+    motion, truth = np.where(good[:, None], track.motion, 0.0), track.truth[rows]
+    driven = np.diff(np.cumsum(np.hypot(motion[:, 0], motion[:, 1]))[rows])
+    path = _most_of(driven), _most_of(_ruled(truth[:, :2]))
+    ends = np.unique(np.linspace(0, len(rows) - 1, STRETCHES + 1).astype(int))
+    turned = np.abs(np.diff(np.cumsum(motion[:, 2])[rows][ends]))
+    return path, (_most_of(turned), _most_of(np.abs(np.diff(np.unwrap(truth[:, 2])[ends]))))
+
+
+def _ruled(points: np.ndarray) -> np.ndarray:
+    """Lengths of the steps in which a ruler of length `RULER` is laid along the points [N, 2]."""
+    steps, last = [0.0], complex(*points[0])
+    for point in (points[:, 0] + 1j * points[:, 1]).tolist():
+        if (step := abs(point - last)) >= RULER:
+            steps.append(step)
+            last = point
+    return np.array(steps)
+
+
+def _most_of(amounts: np.ndarray) -> float:
+    return float(np.sort(amounts)[:-GLITCHES].sum())
+
+
+def _unlike(a: float, b: float, enough: float) -> bool:
+    """Odometry drifts by some per cent; a factor beyond `RATIO` is a unit. NaN is like everything."""
+    least, most = min(a, b), max(a, b)
+    return least > enough and most > MOST and most > RATIO * least
+
+
+def _else(name: str, limits: Limits) -> str:
+    return f"if it really is so, raise limits.{name} ({getattr(limits, name):g})"
+
+
+_DEGREES = "multiply by pi/180 if it is degrees"
+_MILLIMETRES = "divide by 1000 if it is millimetres"

@@ -1,0 +1,208 @@
+"""Reference streams: read as they were driven, and every fault named."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from robot.source import Source
+from robot.streams import read_stream
+from tactile.errors import InputError, InputErrors
+from tactile.frames import integrate
+from tactile.types import Observation
+
+
+def ate(path: np.ndarray, truth: np.ndarray) -> float:
+    """Root mean square distance, m, after the best rigid motion."""
+    a, b = (points[:, 0] + 1j * points[:, 1] for points in (path, truth))
+    a, b = a - a.mean(), b - b.mean()
+    turn = np.vdot(a, b)
+    return float(np.sqrt(np.mean(np.abs(a * turn / abs(turn) - b) ** 2)))
+
+
+def test_a_trace_is_read_row_by_row(trace: Path) -> None:
+    source = read_stream(trace)
+    assert isinstance(source, Source)
+    samples = list(source)
+    with np.load(trace) as arrays:
+        assert source.length == len(samples) == len(arrays["in_t"])
+        assert [sample.time for sample in samples] == arrays["in_t"].tolist()
+        views = np.stack([sample.reading.view for sample in samples])
+        assert (views.reshape(len(samples), -1) == arrays["in_view"]).all()
+        truths = np.stack([sample.truth for sample in samples if sample.truth is not None])
+        np.testing.assert_array_equal(truths, arrays["truth"])
+    assert (source.name, source.view_shape, source.whiskers) == (trace.stem, (3, 6, 1), 0)
+    assert source.rate_hz == pytest.approx(2.0)
+    assert all(sample.reading.view_seen for sample in samples)
+    assert source.params["exp_loops"] == 20
+    assert isinstance(source.params["vt_match_threshold"], float)
+    first = samples[0].reading
+    assert isinstance(first, Observation)
+    assert tuple(first.odometry) == (0, 0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [("b_figure8_alias", 0.174), ("f_real_intel_laser3x6", 24.16), ("f_real_tuc_lecture_hall", 12.95)],
+)
+def test_raw_odometry_errs_as_published(
+    name: str, expected: float, find_trace: Callable[[str], Path]
+) -> None:
+    source = read_stream(find_trace(name))
+    assert source.truth is not None
+    assert ate(integrate(source.motion[:, :3]), source.truth) == pytest.approx(expected, rel=3e-3)
+
+
+def test_rows_without_odometry_do_not_advance_its_clock(stream: Callable[..., Path]) -> None:
+    flags = np.full(12, 3.0)
+    flags[[0, 4, 5]], flags[7] = 1, 2
+    source = read_stream(stream(in_flags=flags, in_v=np.where(flags == 1, np.nan, 0.1)))
+    dt = [float(sample.reading.odometry.dt) for sample in source]
+    assert dt == [0, 0, 0.5, 0.5, 0, 0, 1.5, 0.5, 0.5, 0.5, 0.5, 0.5]
+    assert [bool(sample.reading.view_seen) for sample in source] == [i != 7 for i in range(12)]
+    assert all((sample.reading.odometry.dx != 0) == (sample.reading.odometry.dt > 0) for sample in source)
+    assert (list(source)[7].reading.view == 0).all()
+
+
+def test_a_view_may_share_its_time_with_odometry(stream: Callable[..., Path]) -> None:
+    time, flags = 100 + 0.5 * (np.arange(12) // 2), np.tile([1.0, 2.0], 6)
+    source = read_stream(stream(in_t=time, in_flags=flags))
+    assert source.rate_hz == 2.0
+
+
+def test_two_columns_are_given_ids(stream: Callable[..., Path]) -> None:
+    ids = np.column_stack([np.arange(12) // 3, np.zeros(12)])
+    ids[4] = np.nan
+    source = read_stream(stream(in_view=ids, in_flags=np.where(np.isnan(ids[:, 0]), 2.0, 3.0)))
+    samples = list(source)
+    assert [int(sample.reading.label) for sample in samples] == [0, 0, 0, 1, -1, 1, 2, 2, 2, 3, 3, 3]
+    assert not any(sample.reading.view_seen for sample in samples)
+    assert source.view_shape == (2, 3, 1)
+
+
+def test_a_template_of_two_pixels_is_no_id(stream: Callable[..., Path]) -> None:
+    params = '{"template_x_size": 2, "template_y_size": 1}'
+    source = read_stream(stream(in_view=np.full((12, 2), 0.25), params_json=params, truth=None))
+    assert [float(sample.reading.view.sum()) for sample in source] == [0.5] * 12
+    assert all(sample.truth is None for sample in source)
+
+
+def test_samples_share_nothing_that_could_be_spoilt(stream: Callable[..., Path]) -> None:
+    source = read_stream(stream())
+    sample = next(iter(source))
+    assert sample.truth is not None
+    sample.truth[:] = 9
+    with pytest.raises(ValueError, match="read-only"):
+        sample.reading.view[:] = 1
+    again = next(iter(source))
+    assert again.truth is not None
+    assert (again.truth == 0).all()
+
+
+def test_the_digest_names_the_content(stream: Callable[..., Path]) -> None:
+    one = read_stream(stream()).digest
+    assert read_stream(stream()).digest == one
+    assert read_stream(stream(in_v=np.full(12, 0.11))).digest != one
+
+
+def _with(array: Any, row: int, value: Any) -> np.ndarray:
+    changed = np.array(array, dtype=np.float64)
+    changed[row] = value
+    return changed
+
+
+TIME, VIEW = 100 + 0.5 * np.arange(12), np.full((12, 6), 0.5)
+IDS = np.column_stack([np.arange(12), np.zeros(12)])
+FAULTS: dict[str, tuple[dict[str, Any], list[str]]] = {
+    "backwards": ({"in_t": _with(TIME, 5, 100.25)}, ["row 5: in_t goes back from 102.0 to 100.25 s", "sort"]),
+    "repeated": ({"in_t": _with(TIME, 5, 102)}, ["row 5: in_t repeats 102.0 s", "increase", "drop the repeated"]),
+    "nan time": ({"in_t": _with(TIME, 5, np.nan)}, ["row 5: in_t is nan", "a finite number", "mend or drop"]),
+    "inf speed": ({"in_v": _with(np.ones(12), 3, np.inf)}, ["row 3: in_v is inf", "a finite number"]),
+    "nan turn": ({"in_w": _with(np.ones(12), 3, np.nan)}, ["row 3: in_w is nan"]),
+    "nan view": ({"in_view": _with(VIEW, 7, np.nan)}, ["row 7: in_view is nan"]),
+    "nan truth": ({"truth": _with(np.zeros((12, 3)), 2, np.nan)}, ["row 2: truth is nan"]),
+    "bytes": ({"in_view": 255 * VIEW}, ["row 0: in_view holds 127.5 (and so in 11 more rows)", "0..1", "by 255"]),
+    "below": ({"in_view": _with(VIEW, 3, -1)}, ["row 3: in_view holds -1.0;", "shift and scale"]),
+    "wide": ({"in_view": 9000 * VIEW}, ["by their largest possible value, at least 4500"]),
+    "flags": ({"in_flags": _with(np.full(12, 3), 4, 0)}, ["row 4: in_flags is 0.0", "1 (view), 2 (odometry)"]),
+    "view shape": ({"in_view": np.zeros((12, 5))}, ["in_view has 5 columns", "6 (template_y_size 2 x", "or 2"]),
+    "view rank": ({"in_view": np.zeros(12)}, ["in_view has shape [12]", "[N, V] with N = 12"]),
+    "length": ({"in_w": np.zeros(11)}, ["in_w has shape [11]", "[N] with N = 12, the rows of in_t"]),
+    "truth shape": ({"truth": np.zeros((12, 2))}, ["truth has shape [12, 2]", "[N, 3]"]),
+    "text": ({"in_v": np.full(12, "fast")}, ["in_v has dtype <U4", "real numbers"]),
+    "objects": ({"in_v": np.array([None] * 12)}, ["Object arrays cannot be loaded"]),
+    "absent": ({"in_v": None, "in_veiw": VIEW, "in_view": None}, ["no array 'in_v'", "among 'in_t'", "'in_veiw'?"]),
+    "no rows": ({"in_t": np.zeros(0)}, ["in_t has no rows", "at least one sample"]),
+    "json": ({"params_json": "{"}, ["params_json is no JSON", "a JSON object"]),
+    "list": ({"params_json": "[1]"}, ["params_json holds list"]),
+    "key": ({"params_json": '{"template_xsize": "3"}'}, ["no key 'template_y_size'", "did you mean 'template_xsize'?"]),
+    "size": ({"params_json": '{"template_y_size": "x"}'}, ["template_y_size is 'x'", "whole number of pixels"]),
+    "id": ({"in_view": _with(IDS, 2, [0.5, 0])}, ["row 2: in_view's place id is 0.5", "a whole number from 0"]),
+    "turned id": ({"in_view": _with(IDS, 2, [0, 0.1])}, ["row 2: in_view's relative angle is 0.1", "not supported"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("changes", "pieces"), FAULTS.values(), ids=FAULTS.keys())
+def test_faults_are_named(
+    changes: dict[str, Any],
+    pieces: list[str],
+    stream: Callable[..., Path],
+    refused: Callable[..., InputError],
+) -> None:
+    path = stream(**changes)
+    refused(lambda: read_stream(path), str(path), *pieces)
+
+
+def test_all_faults_are_told_together(
+    stream: Callable[..., Path], refused: Callable[..., InputError]
+) -> None:
+    path = stream(
+        in_t=_with(TIME, 5, 102),
+        in_v=1e3 * np.ones(12),
+        in_w=_with(np.zeros(12), 3, np.nan),
+        in_view=255 * VIEW,
+    )
+    error = refused(lambda: read_stream(path), "repeats", "in_w is nan", "127.5", "over 1000 m/s")
+    assert isinstance(error, InputErrors)
+    assert len(error.errors) == 5  # the truth does not agree either
+
+
+def test_a_broken_archive_is_one_clear_error(
+    stream: Callable[..., Path], tmp_path: Path, refused: Callable[..., InputError]
+) -> None:
+    content = stream().read_bytes()
+    path = tmp_path / "bad.npz"
+    for size in [*range(1, len(content) - 1, 97), len(content) - 1]:
+        path.write_bytes(content[:size])
+        refused(lambda: read_stream(path), str(path), "cannot be read as .npz", "a NumPy archive")
+    refused(lambda: read_stream(path), "cut off or damaged: copy it again")
+    np.save(tmp_path / "single.npy", np.zeros(3))
+    (tmp_path / "single.npy").rename(path)
+    refused(lambda: read_stream(path), "cannot be read as .npz", "write it with numpy.savez")
+
+
+def _fuzz(content: bytes, path: Path, rounds: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    for _ in range(rounds):
+        bad = bytearray(content)
+        for place in rng.integers(0, len(bad), rng.integers(1, 4)):
+            bad[place] = int(rng.integers(256))
+        path.write_bytes(bad)
+        try:
+            read_stream(path)
+        except InputError as error:
+            assert str(path) in str(error)
+
+
+def test_random_damage(stream: Callable[..., Path], tmp_path: Path) -> None:
+    _fuzz(stream().read_bytes(), tmp_path / "bad.npz", rounds=400, seed=1)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("seed", range(4))
+def test_much_random_damage(stream: Callable[..., Path], tmp_path: Path, seed: int) -> None:
+    _fuzz(stream().read_bytes(), tmp_path / "bad.npz", rounds=20_000, seed=seed + 100)

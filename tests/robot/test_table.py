@@ -1,0 +1,288 @@
+"""CSV: what is said to be where is read from there, and every fault is told by file and line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robot.columns import (
+    LabelColumns,
+    PairColumns,
+    PoseColumns,
+    TableConfig,
+    TruthColumns,
+    VelocityColumns,
+    ViewColumns,
+)
+from robot.csvfile import read_csv
+from robot.pairs import labels_from_pairs
+from robot.source import Source
+from robot.streams import read_stream
+from robot.table import read_table
+from tactile.errors import InputError, InputErrors
+from tactile.frames import integrate
+
+VELOCITY = TableConfig(velocity=VelocityColumns(), rows=1, columns=3)
+ODOMETRY = "t,vx,w\n0.0,0.2,0.0\n0.5,0.2,0.1\n1.0,0.2,0.0\n1.5,0.2,0.0\n"
+Write = Callable[..., Path]
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Write:
+    """Writes a file of that content."""
+
+    def to_file(content: str, name: str = "odometry.csv") -> Path:
+        path = tmp_path / name
+        path.write_text(content)
+        return path
+
+    return to_file
+
+
+def with_parts(**parts: Any) -> TableConfig:
+    return VELOCITY.model_copy(update=parts)
+
+
+def test_velocities_are_driven_along_the_mid_heading(write: Write) -> None:
+    source = read_table(write(ODOMETRY), VELOCITY)
+    assert isinstance(source, Source)
+    assert (source.name, source.length, source.rate_hz, source.view_shape) == ("odometry", 4, 2.0, (1, 3, 1))
+    odometry = [sample.reading.odometry for sample in source]
+    assert tuple(odometry[0]) == (0, 0, 0, 0)
+    assert tuple(odometry[1]) == pytest.approx((0.1 * np.cos(0.025), 0.1 * np.sin(0.025), 0.05, 0.5))
+    assert tuple(odometry[2]) == pytest.approx((0.1, 0, 0, 0.5))
+
+
+def test_poses_are_differenced(write: Write) -> None:
+    path = write("time, px, py, th\n1,0,0,1.5707963267948966\n2,0,1,1.5707963267948966\n3,-0.5,1,3.3\n")
+    config = TableConfig(time="time", pose=PoseColumns(x="px", y="py", heading="th"))
+    odometry = [sample.reading.odometry for sample in read_table(path, config)]
+    assert tuple(odometry[1]) == pytest.approx((1, 0, 0, 1))
+    assert tuple(odometry[2]) == pytest.approx((0, 0.5, 3.3 - np.pi / 2, 1))  # sideways
+
+
+def test_ranges_become_pixels(write: Write) -> None:
+    path = write("t,vx,w,r0,r1,r2,r3,r4,r5\n0,0.1,0,1,3,8,9,inf,4\n1,0.1,0,,,,,,\n")
+    first, second = read_table(path, with_parts(views=ViewColumns(max_range=8.0)))
+    assert first.reading.view.ravel().tolist() == [0.25, 1.0, 0.75]
+    assert not second.reading.view_seen
+    assert second.reading.view.shape == (1, 3, 1)
+
+
+def test_pixels_in_a_file_of_their_own_go_to_the_nearest_row(write: Write) -> None:
+    views = write("stamp,p2,p1,p3\n0.1,.2,.1,.3\n0.9,.5,.4,.6\n", "views.csv")
+    config = with_parts(views=ViewColumns(file=views, time="stamp", prefix="p", tolerance=0.11))
+    samples = list(read_table(write(ODOMETRY), config))
+    assert [bool(sample.reading.view_seen) for sample in samples] == [True, False, True, False]
+    assert samples[2].reading.view.ravel().tolist() == [0.4, 0.5, 0.6]
+
+
+def test_labels_beside_the_odometry(write: Write) -> None:
+    path = write("t,vx,w,place\n0,0.1,0,3\n1,0.1,0,\n2,0.1,0,-1\n3,0.1,0,0\n")
+    samples = read_table(path, with_parts(labels=LabelColumns(column="place")))
+    assert [int(sample.reading.label) for sample in samples] == [3, -1, -1, 0]
+    assert not any(sample.reading.view_seen for sample in samples)
+
+
+def test_labels_from_a_file_and_from_pairs(write: Write) -> None:
+    labels = write("t,label\n0.51,7\n1.49,8\n", "labels.csv")
+    samples = read_table(write(ODOMETRY), with_parts(labels=LabelColumns(file=labels)))
+    assert [int(sample.reading.label) for sample in samples] == [-1, 7, -1, 8]
+    pairs = write("t1,t2,score\n1.0,0.5,0.9\n1.5,1.0,0.7\n", "pairs.csv")
+    samples = read_table(write(ODOMETRY), with_parts(pairs=PairColumns(file=pairs)))
+    assert [int(sample.reading.label) for sample in samples] == [-1, 0, 0, 1]
+
+
+@given(st.lists(st.tuples(st.integers(0, 8), st.integers(1, 8), st.sampled_from([0.5, 0.75, 0.8, 0.9]))))
+def test_ids_follow_the_best_earlier_match(triples: list[tuple[int, int, float]]) -> None:
+    later = [float(earlier + gap) for earlier, gap, _ in triples]
+    earlier = [float(earlier) for earlier, _, _ in triples]
+    score = [score for *_, score in triples]
+    time, label = labels_from_pairs(later, earlier, score, 0.75)
+    assert time.tolist() == sorted({*later, *earlier})
+    ids = dict(zip(time.tolist(), label.tolist(), strict=True))
+    new = 0
+    for moment in time.tolist():
+        matches = [(s, -i, e) for i, (t, e, s) in enumerate(zip(later, earlier, score, strict=True))
+                   if t == moment and s >= 0.75]  # fmt: skip
+        assert ids[moment] == (ids[max(matches)[2]] if matches else new)
+        new += not matches
+
+
+def test_truth_is_interpolated_and_unwrapped(write: Write) -> None:
+    truth = write("t,x,y,heading\n0.25,0,0,3.0\n1.25,1,2,-3.0\n", "truth.csv")
+    samples = list(read_table(write(ODOMETRY), with_parts(truth=TruthColumns(file=truth))))
+    assert [sample.truth is None for sample in samples] == [True, False, False, True]
+    assert samples[1].truth == pytest.approx([0.25, 0.5, 3.0 + 0.25 * (2 * np.pi - 6)])
+    assert samples[2].truth == pytest.approx([0.75, 1.5, 3.0 + 0.75 * (2 * np.pi - 6)])
+
+
+def test_truth_beside_the_odometry(write: Write) -> None:
+    path = write("t,vx,w,x,y,heading\n0,0.1,0,1,2,3\n1,0.1,0,1.1,2,3\n")
+    samples = list(read_table(path, with_parts(truth=TruthColumns())))
+    assert [sample.truth.tolist() for sample in samples if sample.truth is not None] == [
+        [1, 2, 3],
+        [1.1, 2, 3],
+    ]
+
+
+def test_the_digest_covers_every_file(write: Write) -> None:
+    truth = write("t,x,y,heading\n0,0,0,0\n2,1,0,0\n", "truth.csv")
+    config = with_parts(truth=TruthColumns(file=truth))
+    one = read_table(write(ODOMETRY), config).digest
+    truth.write_text("t,x,y,heading\n0,0,0,0\n2,1,0,0.0\n")
+    assert read_table(write(ODOMETRY), config).digest != one
+    assert read_table(write(ODOMETRY), VELOCITY).digest != one
+
+
+def test_the_lecture_hall_is_reproduced(reference_data: Path) -> None:
+    """Every label of the reference stream follows from the pairs; truth differs by the files' rounding."""
+    data = reference_data / "data"
+    config = TableConfig(
+        velocity=VelocityColumns(left="vy"),
+        pairs=PairColumns(file=data / "tuc_lecture_hall_loops.csv"),
+        truth=TruthColumns(file=data / "tuc_lecture_hall_gt.csv", heading="th"),
+    )
+    log = read_table(data / "tuc_lecture_hall_odom.csv", config)
+    stream = read_stream(reference_data / "traces" / "f_real_tuc_lecture_hall.npz")
+    assert (log.label >= 0).sum() == 551
+    np.testing.assert_array_equal(log.label, stream.label)
+    np.testing.assert_allclose(log.time, stream.time - 100, atol=1e-9)
+    assert log.truth is not None
+    assert stream.truth is not None
+    known = ~np.isnan(log.truth).any(axis=1)
+    assert known.sum() == len(known) - 2  # the truth ends 0.19 s before the odometry
+    np.testing.assert_allclose(log.truth[known], stream.truth[known], atol=1e-6)
+
+
+def test_the_intel_laser_is_reproduced(reference_data: Path) -> None:
+    """180 beams as 3 x 6 pixels, equal in every bit; the sideways part of the motion is not lost."""
+    data = reference_data / "data"
+    config = TableConfig(
+        pose=PoseColumns(x="odo_x", y="odo_y", heading="odo_th"),
+        views=ViewColumns(file=data / "intel_scans.csv", max_range=8.0),
+        truth=TruthColumns(x="gt_x", y="gt_y", heading="gt_th"),
+    )
+    log = read_table(data / "intel_odom_gt.csv", config)
+    stream = read_stream(reference_data / "traces" / "f_real_intel_laser3x6.npz")
+    np.testing.assert_array_equal(log.views, stream.views)
+    np.testing.assert_array_equal(log.time, stream.time)
+    assert log.truth is not None
+    poses = np.loadtxt(data / "intel_odom_gt.csv", delimiter=",", skiprows=1)[:, 1:4]
+    np.testing.assert_allclose(integrate(log.motion[:, :3], poses[0])[:, :2], poses[:, :2], atol=1e-9)
+    side = np.abs(log.motion[:, 1])
+    assert side.max() > 0.1
+
+
+FAULTS: dict[str, tuple[str, dict[str, Any], list[str]]] = {
+    "column": ("t,vy,w\n0,1,0\n", {}, [":1: no column 'vx'", "among 't', 'vy', 'w'", "did you mean 'vy'?"]),
+    "key": ("stamp,vx,w\n0,1,0\n", {}, [":1: no column 't'", "name the column with table.time"]),
+    "word": ("t,vx,w\n0,1,0\n1,fast,0\n", {}, [":3: vx is 'fast'", "expected a number"]),
+    "empty": ("t,vx,w\n0,1,0\n\n1,,0\n", {}, [":4: vx is empty", "a number"]),
+    "nan": ("t,vx,w\n0,1,0\n1,nan,0\n", {}, [":3: vx is nan", "a finite number"]),
+    "inf": ("t,vx,w\n0,1,0\n1,1,-inf\n", {}, [":3: w is -inf"]),
+    "time": ("t,vx,w\n0,1,0\nnan,1,0\n", {}, [":3: t is nan"]),
+    "cut row": ("t,vx,w\n0,1,0\n1,1", {}, [":3: 2 cells", "3, as in the header", "cut off"]),
+    "backwards": ("t,vx,w\n0,1,0\n2,1,0\n1,1,0\n", {}, [":4: t goes back from 2.0 to 1.0 s", "sort the rows"]),
+    "repeated": ("t,vx,w\n0,1,0\n2,1,0\n2,1,0\n", {}, [":4: t repeats 2.0 s", "drop the repeated rows"]),
+    "no rows": ("t,vx,w\n", {}, ["no rows under its header", "at least one row"]),
+    "no header": ("0,1,2\n1,1,2\n", {}, [":1: the first line is '0,1,2'", "a header row that names the columns"]),
+    "doubled": ("t,vx,vx,w\n0,1,1,0\n", {}, [":1: several columns are called 'vx'", "once"]),
+    "semicolons": ("t;vx;w\n0;1;0\n", {}, ["separated by semicolons", "commas"]),
+    "tabs": ("t\tvx\tw\n0\t1\t0\n", {}, ["separated by tabs"]),
+    "neither": (ODOMETRY, {"velocity": None}, ["neither table.pose nor table.velocity", "among t, vx, w"]),
+    "both": (ODOMETRY, {"pose": PoseColumns()}, ["both are given", "one of them"]),
+    "no views": (ODOMETRY, {"views": ViewColumns()}, ["no column 'r0'", "name the column with table.views.prefix"]),
+    "gap": ("t,vx,w,r0,r2\n0,1,0,1,1\n", {"views": ViewColumns()}, ["no column 'r1'", "did you mean"]),
+    "pixels": ("t,vx,w,r0,r1\n0,1,0,1,1\n", {"views": ViewColumns()}, ["2 columns r0", "3 (table.rows 1 x"]),
+    "beams": ("t,vx,w,r0,r1\n0,1,0,1,1\n", {"views": ViewColumns(max_range=8)}, ["or a multiple"]),
+    "bytes": ("t,vx,w,r0,r1,r2\n0,1,0,0,9,200\n", {"views": ViewColumns()}, [":2: r* holds 200.0", "by 255"]),
+    "half view": ("t,vx,w,r0,r1,r2\n0,1,0,0,,1\n", {"views": ViewColumns()}, [":2: r* is nan"]),
+    "behind": ("t,vx,w,r0,r1,r2\n0,1,0,0,-1,1\n", {"views": ViewColumns(max_range=8)}, [":2: r* is -1.0", "0 m or more"]),
+    "mm": ("t,vx,w,r0,r1,r2\n0,1,0,900,800,700\n", {"views": ViewColumns(max_range=8)}, ["over 800 m", "by 1000"]),
+    "label": ("t,vx,w,label\n0,1,0,1.5\n", {"labels": LabelColumns()}, [":2: label is 1.5", "a whole number from 0"]),
+    "truth": ("t,vx,w,x,y,heading\n0,1,0,1,,1\n", {"truth": TruthColumns()}, [":2: y is empty"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("content", "parts", "pieces"), FAULTS.values(), ids=FAULTS.keys())
+def test_faults_are_named(
+    content: str, parts: dict[str, Any], pieces: list[str], write: Write, refused: Callable[..., InputError]
+) -> None:
+    path = write(content)
+    refused(lambda: read_table(path, with_parts(**parts)), str(path), *pieces)
+
+
+OTHERS: dict[str, tuple[str, Callable[[Path], dict[str, Any]], list[str]]] = {
+    "far view": ("t,r0,r1,r2\n0,0,0,0\n9,0,0,0\n", lambda p: {"views": ViewColumns(file=p)},
+                 [":3: the nearest odometry row is 7.5 s away (one of 1", "at most 0.5 s", "raise tolerance"]),
+    "two views": ("t,r0,r1,r2\n0.9,0,0,0\n1.1,0,0,0\n", lambda p: {"views": ViewColumns(file=p)},
+                  [":3: belongs to the same odometry row", "thin them out"]),
+    "view time": ("t,r0,r1,r2\n1,0,0,0\n0.5,0,0,0\n", lambda p: {"views": ViewColumns(file=p)},
+                  [":3: t goes back"]),
+    "exact": ("t,label\n0.1,0\n", lambda p: {"labels": LabelColumns(file=p, tolerance=0)}, ["at most 0 s"]),
+    "pair": ("t1,t2,score\n0.5,1,0.9\n", lambda p: {"pairs": PairColumns(file=p)},
+             [":2: t1 0.5 is not after t2 1.0", "the later time of a pair first", "swap table.pairs.later"]),
+    "score": ("t1,t2,score\n1,0.5,nan\n", lambda p: {"pairs": PairColumns(file=p)}, [":2: score is nan"]),
+    "pair time": ("t1,t2,score\n9,0.5,1\n", lambda p: {"pairs": PairColumns(file=p)}, [", time 9.0: the nearest"]),
+    "pair column": ("t1,t2,scores\n9,0.5,1\n", lambda p: {"pairs": PairColumns(file=p)},
+                    [":1: no column 'score'", "did you mean 'scores'?"]),
+    "both": ("t1,t2,score\n1,0.5,1\n", lambda p: {"pairs": PairColumns(file=p), "labels": LabelColumns(column="w")},
+             ["both table.labels and table.pairs"]),
+    "truth clock": ("t,x,y,heading\n0,0,0,0\n0,1,0,0\n", lambda p: {"truth": TruthColumns(file=p)},
+                    [":3: t repeats 0.0 s"]),
+    "truth elsewhen": ("t,x,y,heading\n50,0,0,0\n60,1,0,0\n", lambda p: {"truth": TruthColumns(file=p)},
+                       ["t is 50.0 to 60.0 s, the odometry's 0.0 to 1.5", "times that overlap", "one clock"]),
+    "truth time": ("t,x,y,heading\n0,0,0,0\n,1,0,0\n", lambda p: {"truth": TruthColumns(file=p)}, [":3: t is empty"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("content", "parts", "pieces"), OTHERS.values(), ids=OTHERS.keys())
+def test_faults_of_other_files_are_named(
+    content: str,
+    parts: Callable[[Path], dict[str, Any]],
+    pieces: list[str],
+    write: Write,
+    refused: Callable[..., InputError],
+) -> None:
+    path = write(content, "other.csv")
+    refused(lambda: read_table(write(ODOMETRY), with_parts(**parts(path))), *pieces)
+
+
+def test_all_faults_are_told_together(write: Write, refused: Callable[..., InputError]) -> None:
+    path = write("t,vx,w,r0,r1,r2\n0,1,0,0,0,0\n1,nan,0,0,0,300\n1,1,0,0,0,0\n")
+    error = refused(
+        lambda: read_table(path, with_parts(views=ViewColumns())), "vx is nan", "repeats", "300.0"
+    )
+    assert isinstance(error, InputErrors)
+    assert len(error.errors) == 3
+    path = write("t,vx,w\n" + "0,x,1\n" * 20)
+    error = refused(lambda: read_table(path, VELOCITY), ":9:", "12 more faults like these")
+    assert str(error).count("\n") == 8
+
+
+@given(st.text(max_size=200) | st.binary(max_size=200))
+def test_no_text_is_more_than_one_clear_error(tmp_path_factory: Any, text: str | bytes) -> None:
+    path = tmp_path_factory.getbasetemp() / "any.csv"
+    for content in (text, b"t,vx,w\n" + text if isinstance(text, bytes) else "t,vx,w\n" + text):
+        data = content if isinstance(content, bytes) else content.encode("utf-8", "surrogatepass")
+        path.write_bytes(data)
+        try:
+            read_table(path, VELOCITY)
+        except InputError as error:
+            assert str(path) in str(error)
+
+
+def test_lines_are_counted_as_an_editor_counts_them(write: Write) -> None:
+    file = read_csv(write("\ufefft,x\r\n\r\n1,2\r\n \r\n3,4"))
+    assert file.names == ("t", "x")
+    assert file.values.tolist() == [[1, 2], [3, 4]]
+    assert [file.place(row).rsplit(":", 1)[1] for row in (0, 1)] == ["3", "5"]
+    quoted = read_csv(write('"t","x"\n"1","2"\n'))
+    assert quoted.values.tolist() == [[1, 2]]

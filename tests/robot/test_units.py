@@ -1,0 +1,212 @@
+"""Units: every recording we have passes with room to spare, and in a wrong unit it does not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from robot.columns import PoseColumns, TableConfig, TruthColumns, VelocityColumns
+from robot.formats import RecordingConfig, open_recording
+from robot.log import Log
+from robot.streams import read_stream
+from robot.table import read_table
+from robot.units import ORDINARY, RATIO, Limits, Track, headings, typical, units
+from tactile.errors import InputError
+
+REAL = ("f_real_intel_laser3x6", "f_real_tuc_lecture_hall")
+DEGREES, MILLIMETRES, MILLISECONDS = 180 / np.pi, 1000.0, 1000.0
+
+
+@pytest.fixture(params=REAL)
+def real(request: pytest.FixtureRequest, find_trace: Callable[[str], Path]) -> Path:
+    """Each real reference stream."""
+    return find_trace(request.param)
+
+
+@pytest.fixture(params=["intel", "lecture hall"])
+def table(request: pytest.FixtureRequest, reference_data: Path) -> tuple[Path, TableConfig]:
+    """Each real recording as CSV, without its views."""
+    data = reference_data / "data"
+    if request.param == "intel":
+        truth = TruthColumns(x="gt_x", y="gt_y", heading="gt_th")
+        pose = PoseColumns(x="odo_x", y="odo_y", heading="odo_th")
+        return data / "intel_odom_gt.csv", TableConfig(pose=pose, truth=truth)
+    truth = TruthColumns(file=data / "tuc_lecture_hall_gt.csv", heading="th")
+    return data / "tuc_lecture_hall_odom.csv", TableConfig(velocity=VelocityColumns(left="vy"), truth=truth)
+
+
+def _margins(log: Log) -> dict[str, float]:
+    """How many times below its limit each quantity is."""
+    robot = typical(Track(log.time, log.moved, log.motion, log.truth))
+    ratios = [max(pair) / min(pair) if min(pair) else 1.0 for pair in (robot.path, robot.turning)]
+    return {
+        "interval": ORDINARY.interval / robot.interval,
+        "speed": ORDINARY.speed / robot.speed,
+        "turn_rate": ORDINARY.turn_rate / robot.turn_rate,
+        "turn": np.pi / robot.turn,
+        "path": RATIO / ratios[0],
+        "turning": RATIO / ratios[1],
+    }
+
+
+def _check_margins(log: Log) -> None:
+    margins = _margins(log)
+    print(log.name, {name: round(margin, 1) for name, margin in margins.items()})
+    assert min(margins.values()) > 5
+    assert min(margins["path"], margins["turning"]) > 20
+
+
+def test_traces_pass_with_a_margin(trace: Path) -> None:
+    _check_margins(read_stream(trace))
+
+
+def test_real_traces_pass_with_a_margin(real: Path) -> None:
+    _check_margins(read_stream(real))
+
+
+def test_real_tables_pass_with_a_margin(table: tuple[Path, TableConfig]) -> None:
+    _check_margins(read_table(*table))
+
+
+PLANTED = {
+    "turn in degrees": ("in_w", DEGREES, "in radians"),
+    "speed in mm/s": ("in_v", MILLIMETRES, "in metres"),
+    "views in bytes": ("in_view", 255.0, "in 0..1"),
+    "time in ms": ("in_t", MILLISECONDS, "times in seconds"),
+    "truth in mm": ("truth", np.array([MILLIMETRES, MILLIMETRES, 1]), "both in metres"),
+    "truth in degrees": ("truth", np.array([1, 1, DEGREES]), "in radians"),
+}
+
+
+def _plant(
+    trace: Path, path: Path, array: str, factor: float | np.ndarray, drop: tuple[str, ...] = ()
+) -> Path:
+    with np.load(trace) as arrays:
+        kept = {
+            name: arrays[name] for name in arrays.files if name.startswith("in_") or name == "params_json"
+        }
+        kept["truth"] = arrays["truth"]
+    kept[array] = kept[array] * factor
+    np.savez(path, **{name: value for name, value in kept.items() if name not in drop})
+    return path
+
+
+@pytest.mark.parametrize(("array", "factor", "expected"), PLANTED.values(), ids=PLANTED.keys())
+def test_a_wrong_unit_is_refused(
+    trace: Path,
+    array: str,
+    factor: float,
+    expected: str,
+    tmp_path: Path,
+    refused: Callable[..., InputError],
+) -> None:
+    path = _plant(trace, tmp_path / "planted.npz", array, factor)
+    refused(lambda: read_stream(path), str(path), expected)
+
+
+@pytest.mark.parametrize(("array", "factor", "expected"), PLANTED.values(), ids=PLANTED.keys())
+def test_a_wrong_unit_of_a_real_recording_is_refused(
+    real: Path,
+    array: str,
+    factor: float,
+    expected: str,
+    tmp_path: Path,
+    refused: Callable[..., InputError],
+) -> None:
+    if array == "in_view" and "lecture" in real.stem:
+        pytest.skip("its views are ids")
+    path = _plant(real, tmp_path / "planted.npz", array, factor)
+    refused(lambda: read_stream(path), str(path), expected)
+
+
+@pytest.mark.parametrize(("array", "factor", "expected"), list(PLANTED.values())[:2], ids=list(PLANTED)[:2])
+def test_a_wrong_unit_is_refused_without_truth(
+    trace: Path,
+    array: str,
+    factor: float,
+    expected: str,
+    tmp_path: Path,
+    refused: Callable[..., InputError],
+) -> None:
+    path = _plant(trace, tmp_path / "planted.npz", array, factor, drop=("truth",))
+    if array == "in_w" and trace.stem == "j_reverse_stop":
+        read_stream(path)  # turns by 1.1 degrees a second: nobody could tell
+    else:
+        refused(lambda: read_stream(path), str(path), expected)
+
+
+@pytest.mark.parametrize(
+    ("column", "factor", "expected"),
+    [("odo_th", DEGREES, "a heading in radians"), ("odo_x", MILLIMETRES, "in metres"),
+     ("gt_th", DEGREES, "a heading in radians"), ("t", MILLISECONDS, "times in seconds"),
+     ("w", DEGREES, "in radians"), ("vx", MILLIMETRES, "in metres")],
+)  # fmt: skip
+def test_a_wrong_unit_of_a_table_is_refused(
+    table: tuple[Path, TableConfig],
+    column: str,
+    factor: float,
+    expected: str,
+    tmp_path: Path,
+    refused: Callable[..., InputError],
+) -> None:
+    path, config = table
+    header, *_ = path.read_text().split("\n", 1)
+    if column not in header.split(","):
+        pytest.skip(f"no column {column}")
+    values = np.loadtxt(path, delimiter=",", skiprows=1)
+    values[:, header.split(",").index(column)] *= factor
+    planted = tmp_path / "planted.csv"
+    np.savetxt(planted, values, "%.6f", ",", header=header, comments="")
+    refused(lambda: read_table(planted, config), str(planted), expected)
+    refused(lambda: read_table(planted, config.model_copy(update={"truth": None})) if column != "gt_th"
+            else read_table(planted, config), expected)  # fmt: skip
+
+
+def test_one_row_decides_nothing(trace: Path, tmp_path: Path) -> None:
+    """Two wild rows, faster than anything, in a recording that hardly turns otherwise."""
+    with np.load(trace) as arrays:
+        kept = {
+            name: arrays[name] for name in arrays.files if name.startswith("in_") or name == "params_json"
+        }
+        kept["truth"] = arrays["truth"]
+    for name, value in (("in_w", 1e5), ("in_v", 1e6)):
+        kept[name] = kept[name].copy()
+        kept[name][[40, 41]] = value, -value
+    np.savez(tmp_path / "wild.npz", **kept)
+    assert read_stream(tmp_path / "wild.npz").length == len(kept["in_t"])
+
+
+def test_the_real_row_of_five_milliseconds_passes(find_trace: Callable[[str], Path]) -> None:
+    log = read_stream(find_trace("f_real_intel_laser3x6"))
+    rate = np.abs(log.motion[1:, 2]) / log.motion[1:, 3]
+    assert rate.max() > 90
+
+
+def test_a_limit_may_be_raised(stream: Callable[..., Path], refused: Callable[..., InputError]) -> None:
+    path = stream(in_v=np.full(12, 40.0), truth=None)
+    refused(lambda: read_stream(path), "over 40 m/s", "if it really is so, raise limits.speed (25)")
+    config = RecordingConfig(file=path, limits=Limits(speed=50.0))
+    assert open_recording(config).length == 12
+
+
+@pytest.mark.parametrize("turns", [0.4, 5.0])
+def test_headings_of_any_span_are_told_from_degrees(turns: float) -> None:
+    """Wrapped or not, in radians they pass and in degrees they do not."""
+    time = np.arange(200) * 0.5
+    heading = np.linspace(0, 2 * np.pi * turns, 200) - 1.0
+    wrapped = (heading + np.pi) % (2 * np.pi) - np.pi
+    limits = Limits(turn_rate=0.5) if turns < 1 else ORDINARY  # a slow one needs to be told
+    for column in (heading, wrapped):
+        assert headings(column, time, "th", "file", limits) == []
+        (error,) = headings(np.rad2deg(column), time, "th", "file", limits)
+        assert "multiply by pi/180" in str(error)
+
+
+def test_nothing_to_judge_is_nothing_to_refuse() -> None:
+    for rows in (0, 1, 2, 3):
+        still = Track(np.arange(rows) * 1.0, np.ones(rows, bool), np.zeros((rows, 4)), np.zeros((rows, 3)))
+        assert units(still, "file") == []
+        assert units(still._replace(moved=np.zeros(rows, bool), truth=None), "file") == []
