@@ -23,7 +23,7 @@ from robot.files import digest_of, missing, read_bytes, refuse
 from robot.log import Log
 from robot.odometry import NEW_HEADING, from_velocities
 from robot.plausibility import Place, clock, finite, views
-from robot.units import ORDINARY, Limits, Track, headings, units
+from robot.units import ORDINARY, Limits, Track, units
 from tactile.errors import InputError
 
 VIEW, ODOMETRY = 1, 2
@@ -67,9 +67,6 @@ def read_stream(path: Path, limits: Limits = ORDINARY) -> Log:
         errors += views(low, np.where(seen, view.max(axis=1), np.nan), "in_view", place)
     if truth is not None:
         errors += finite(truth, "truth", place)
-        if faults := headings(truth[:, 2], time, "truth's heading", str(path), limits):
-            errors += faults
-            truth[:, 2] = np.deg2rad(truth[:, 2])  # or every other check would say it again
     refuse(errors + units(Track(time, moved, motion, truth), str(path), limits))
 
     label = np.full(len(time), -1, np.int32)

@@ -20,8 +20,7 @@ from tactile.settings import Settings
 GLITCHES = 2  # fastest steps without a vote
 PAUSE = 1000.0  # median steps: a longer one is a fault of the clock, no motion to judge
 RATIO = 30.0  # odometry : truth, either way; real ones are near 1, a wrong unit makes it 57 or 1000
-LEAST_PATH, LEAST_TURNING = 0.05, 0.3  # m, rad: if the smaller total is less, the ratio says nothing,
-MOST = 5.0  # m or rad: nor if the larger one is less than this
+LEAST, MOST = 0.3, 5.0  # m or rad: the smaller and the larger total below which a ratio says nothing
 RULER = 0.05  # m: the truth's path is measured in steps of at least this, or its noise would add up
 STRETCHES = 50  # turning is compared net over so many, or its noise would add up
 
@@ -59,13 +58,15 @@ class Typical(NamedTuple):
 
     Attributes:
         interval: median time between rows, s. speed: m/s. turn_rate: rad/s. turn: rad in one step.
-        path, turning: (odometry's, truth's) totals, m and net rad; NaN without a truth.
+        true_speed: the truth's, m/s. path, turning: (odometry's, truth's) totals, m and net rad.
+            NaN without a truth.
     """
 
     interval: float
     speed: float
     turn_rate: float
     turn: float
+    true_speed: float
     path: tuple[float, float]
     turning: tuple[float, float]
 
@@ -77,41 +78,70 @@ def typical(track: Track) -> Typical:
     dt = track.motion[:, 3]
     good = np.isfinite(track.motion).all(axis=1) & (dt > 0) & (dt <= PAUSE * interval)
     length, turn = np.hypot(track.motion[good, 0], track.motion[good, 1]), np.abs(track.motion[good, 2])
-    path, turning = _beside_truth(track, good)
+    true_speed, path, turning = _beside_truth(track, good)
     return Typical(
         interval=interval,
         speed=_typical(length, dt[good]),
         turn_rate=_typical(turn, dt[good]),
         turn=_typical(turn, np.ones_like(turn)),
+        true_speed=true_speed,
         path=path,
         turning=turning,
     )
 
 
 def units(track: Track, where: str, limits: Limits = ORDINARY) -> list[InputError]:
-    """Faults of the recording as a whole: times not in s, motion not in m or rad, odometry unlike truth."""
+    """Faults of the recording as a whole: times not in s, motion not in m or rad, odometry unlike truth.
+
+    Each cause is told once: the truth is asked only about what nothing else has shown to be wrong.
+    """
+    errors = []
+    if track.truth is not None:
+        errors = headings(track.truth[:, 2], track.time, "the truth's heading", where, limits)
+        if errors:
+            track = track._replace(truth=track.truth * (1, 1, np.pi / 180))
     robot = typical(track)
-    faults = []
-    if robot.interval > limits.interval:
-        found = f"half of the steps take over {robot.interval:.4g} s"
-        faults.append(
-            (found, "times in seconds", f"divide by 1000 if they are ms; {_else('interval', limits)}")
-        )
-    if robot.speed > limits.speed:
-        found = f"half of the path is driven at over {robot.speed:.4g} m/s"
-        faults.append((found, "odometry in metres", f"{_MILLIMETRES}; {_else('speed', limits)}"))
-    if robot.turn_rate > limits.turn_rate or robot.turn > np.pi:
-        found = (
-            f"half of the turning is done at over {robot.turn_rate:.4g} rad/s ({robot.turn:.3g} rad a step)"
-        )
-        faults.append((found, "odometry in radians", f"{_DEGREES}; {_else('turn_rate', limits)}"))
-    if _unlike(*robot.path, LEAST_PATH):
-        found = "the odometry covers {:.4g} m, the truth {:.4g} m".format(*robot.path)
-        faults.append((found, "both in metres", _MILLIMETRES))
-    if _unlike(*robot.turning, LEAST_TURNING):
-        found = "the odometry turns by {:.4g} rad, the truth by {:.4g} rad".format(*robot.turning)
-        faults.append((found, "both in radians", _DEGREES))
-    return [InputError(where, *fault) for fault in faults]
+    rushes, truth_rushes = robot.speed > limits.speed, robot.true_speed > limits.speed
+    spins = robot.turn_rate > limits.turn_rate or robot.turn > np.pi
+    faults = (
+        (
+            robot.interval > limits.interval,
+            f"half of the steps take over {robot.interval:.4g} s",
+            "times in seconds",
+            f"divide by 1000 if they are ms; {_else('interval', limits)}",
+        ),
+        (
+            rushes,
+            f"half of the path is driven at over {robot.speed:.4g} m/s",
+            "odometry in metres",
+            f"{_MILLIMETRES}; {_else('speed', limits)}",
+        ),
+        (
+            spins,
+            f"half of the turning is done at over {robot.turn_rate:.4g} rad/s, {robot.turn:.3g} rad a step",
+            "odometry in radians",
+            f"{_DEGREES}; {_else('turn_rate', limits)}",
+        ),
+        (
+            truth_rushes,
+            f"half of the truth's path is driven at over {robot.true_speed:.4g} m/s",
+            "truth in metres",
+            f"{_MILLIMETRES}; {_else('speed', limits)}",
+        ),
+        (
+            not rushes and not truth_rushes and _unlike(*robot.path),
+            "the odometry covers {:.4g} m, the truth {:.4g} m".format(*robot.path),
+            "both in metres",
+            _MILLIMETRES,
+        ),
+        (
+            not spins and _unlike(*robot.turning),
+            "the odometry turns by {:.4g} rad, the truth by {:.4g} rad".format(*robot.turning),
+            "both in radians",
+            _DEGREES,
+        ),
+    )
+    return errors + [InputError(where, *words) for wrong, *words in faults if wrong]
 
 
 def headings(
@@ -139,20 +169,22 @@ def _typical(amount: np.ndarray, duration: np.ndarray) -> float:
     return float(rate[order][np.searchsorted(done, done[-1] / 2)]) if len(done) and done[-1] > 0 else 0.0
 
 
-def _beside_truth(track: Track, good: np.ndarray) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Path and net turning of odometry and truth where there is a truth; NaN where there is none."""
-    nothing = (np.nan, np.nan)
+def _beside_truth(track: Track, good: np.ndarray) -> tuple[float, tuple[float, float], tuple[float, float]]:
+    """The truth's speed; path and net turning of odometry and truth where there is a truth, else NaN."""
+    nothing = np.nan, (np.nan, np.nan), (np.nan, np.nan)
     if track.truth is None:
-        return nothing, nothing
+        return nothing
     rows = np.flatnonzero(np.isfinite(track.truth).all(axis=1))
     if len(rows) <= GLITCHES + 1:
-        return nothing, nothing
+        return nothing
     motion, truth = np.where(good[:, None], track.motion, 0.0), track.truth[rows]
     driven = np.diff(np.cumsum(np.hypot(motion[:, 0], motion[:, 1]))[rows])
+    length, dt = np.hypot(*np.diff(truth[:, :2], axis=0).T), np.diff(track.time[rows])
+    speed = _typical(length[dt > 0], dt[dt > 0])
     path = _most_of(driven), _most_of(_ruled(truth[:, :2]))
     ends = np.unique(np.linspace(0, len(rows) - 1, STRETCHES + 1).astype(int))
     turned = np.abs(np.diff(np.cumsum(motion[:, 2])[rows][ends]))
-    return path, (_most_of(turned), _most_of(np.abs(np.diff(np.unwrap(truth[:, 2])[ends]))))
+    return speed, path, (_most_of(turned), _most_of(np.abs(np.diff(np.unwrap(truth[:, 2])[ends]))))
 
 
 def _ruled(points: np.ndarray) -> np.ndarray:
@@ -169,10 +201,10 @@ def _most_of(amounts: np.ndarray) -> float:
     return float(np.sort(amounts)[:-GLITCHES].sum())
 
 
-def _unlike(a: float, b: float, enough: float) -> bool:
+def _unlike(a: float, b: float) -> bool:
     """Odometry drifts by some per cent; a factor beyond `RATIO` is a unit. NaN is like everything."""
     least, most = min(a, b), max(a, b)
-    return least > enough and most > MOST and most > RATIO * least
+    return least > LEAST and most > MOST and most > RATIO * least
 
 
 def _else(name: str, limits: Limits) -> str:

@@ -75,7 +75,6 @@ def test_a_file_that_cannot_be_opened_is_named(suffix: str, tmp_path: Path, refu
 
 def test_a_file_in_no_folder_is_named(tmp_path: Path, refused: Refused) -> None:
     refused(lambda: read_bytes(tmp_path / "no" / "run.csv"), "no such file", "no folder", "either")
-    refused(lambda: read_bytes(Path("nul\0byte")), "cannot be read")
 
 
 def test_a_file_without_permission_is_named(
@@ -143,7 +142,8 @@ def test_the_readme_example_runs(tmp_path: Path) -> None:
 
 def test_nothing_heavy_is_imported_to_configure() -> None:
     code = (
-        "import sys, robot.formats; heavy = {'mcap', 'zstandard', 'scipy', 'jax', 'ratslam'} & set(sys.modules);"
+        "import sys, robot.formats;"
+        "heavy = {'mcap', 'zstandard', 'scipy', 'jax', 'ratslam'} & set(sys.modules);"
         "assert not heavy, heavy"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)

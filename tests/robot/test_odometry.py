@@ -35,7 +35,7 @@ def test_the_first_row_only_sets_the_clock(velocities: np.ndarray, heading: floa
 
 
 def test_the_mid_heading_closes_a_circle() -> None:
-    """Forty steps of 9 degrees: the middle of the step errs by the second power of the turn, its end by the first."""
+    """Forty steps of 9 degrees: the mid heading errs by the turn's second power, the new one by its first."""
     time = np.arange(41) * 0.5
     turn = np.full(41, np.pi / 10)
     ends = [

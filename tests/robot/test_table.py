@@ -180,8 +180,9 @@ def test_the_intel_laser_is_reproduced(reference_data: Path) -> None:
     assert side.max() > 0.1
 
 
+RANGES = ViewColumns(max_range=8)
 FAULTS: dict[str, tuple[str, dict[str, Any], list[str]]] = {
-    "column": ("t,vy,w\n0,1,0\n", {}, [":1: no column 'vx'", "among 't', 'vy', 'w'", "did you mean 'vy'?"]),
+    "column": ("t,vxs,w\n0,1,0\n", {}, [":1: no column 'vx'", "among 't', 'vxs', 'w'", "mean 'vxs'?"]),
     "key": ("stamp,vx,w\n0,1,0\n", {}, [":1: no column 't'", "name the column with table.time"]),
     "word": ("t,vx,w\n0,1,0\n1,fast,0\n", {}, [":3: vx is 'fast'", "expected a number"]),
     "empty": ("t,vx,w\n0,1,0\n\n1,,0\n", {}, [":4: vx is empty", "a number"]),
@@ -189,24 +190,24 @@ FAULTS: dict[str, tuple[str, dict[str, Any], list[str]]] = {
     "inf": ("t,vx,w\n0,1,0\n1,1,-inf\n", {}, [":3: w is -inf"]),
     "time": ("t,vx,w\n0,1,0\nnan,1,0\n", {}, [":3: t is nan"]),
     "cut row": ("t,vx,w\n0,1,0\n1,1", {}, [":3: 2 cells", "3, as in the header", "cut off"]),
-    "backwards": ("t,vx,w\n0,1,0\n2,1,0\n1,1,0\n", {}, [":4: t goes back from 2.0 to 1.0 s", "sort the rows"]),
+    "backwards": ("t,vx,w\n0,1,0\n2,1,0\n1,1,0\n", {}, [":4: t goes back from 2.0 to 1.0 s", "sort"]),
     "repeated": ("t,vx,w\n0,1,0\n2,1,0\n2,1,0\n", {}, [":4: t repeats 2.0 s", "drop the repeated rows"]),
     "no rows": ("t,vx,w\n", {}, ["no rows under its header", "at least one row"]),
-    "no header": ("0,1,2\n1,1,2\n", {}, [":1: the first line is '0,1,2'", "a header row that names the columns"]),
+    "no header": ("0,1,2\n1,1,2\n", {}, [":1: the first line is '0,1,2'", "a header row"]),
     "doubled": ("t,vx,vx,w\n0,1,1,0\n", {}, [":1: several columns are called 'vx'", "once"]),
     "semicolons": ("t;vx;w\n0;1;0\n", {}, ["separated by semicolons", "commas"]),
     "tabs": ("t\tvx\tw\n0\t1\t0\n", {}, ["separated by tabs"]),
     "neither": (ODOMETRY, {"velocity": None}, ["neither table.pose nor table.velocity", "among t, vx, w"]),
     "both": (ODOMETRY, {"pose": PoseColumns()}, ["both are given", "one of them"]),
-    "no views": (ODOMETRY, {"views": ViewColumns()}, ["no column 'r0'", "name the column with table.views.prefix"]),
-    "gap": ("t,vx,w,r0,r2\n0,1,0,1,1\n", {"views": ViewColumns()}, ["no column 'r1'", "did you mean"]),
+    "no views": (ODOMETRY, {"views": ViewColumns()}, ["no column 'r0'", "table.views.prefix"]),
+    "gap": ("t,vx,w,r0,r2\n0,1,0,1,1\n", {"views": ViewColumns()}, ["no column 'r1'", "'r0', 'r2'"]),
     "pixels": ("t,vx,w,r0,r1\n0,1,0,1,1\n", {"views": ViewColumns()}, ["2 columns r0", "3 (table.rows 1 x"]),
     "beams": ("t,vx,w,r0,r1\n0,1,0,1,1\n", {"views": ViewColumns(max_range=8)}, ["or a multiple"]),
     "bytes": ("t,vx,w,r0,r1,r2\n0,1,0,0,9,200\n", {"views": ViewColumns()}, [":2: r* holds 200.0", "by 255"]),
     "half view": ("t,vx,w,r0,r1,r2\n0,1,0,0,,1\n", {"views": ViewColumns()}, [":2: r* is nan"]),
-    "behind": ("t,vx,w,r0,r1,r2\n0,1,0,0,-1,1\n", {"views": ViewColumns(max_range=8)}, [":2: r* is -1.0", "0 m or more"]),
-    "mm": ("t,vx,w,r0,r1,r2\n0,1,0,900,800,700\n", {"views": ViewColumns(max_range=8)}, ["over 800 m", "by 1000"]),
-    "label": ("t,vx,w,label\n0,1,0,1.5\n", {"labels": LabelColumns()}, [":2: label is 1.5", "a whole number from 0"]),
+    "behind": ("t,vx,w,r0,r1,r2\n0,1,0,0,-1,1\n", {"views": RANGES}, [":2: r* is -1.0", "0 m or more"]),
+    "mm": ("t,vx,w,r0,r1,r2\n0,1,0,900,800,700\n", {"views": RANGES}, ["over 800 m", "by 1000"]),
+    "label": ("t,vx,w,label\n0,1,0,1.5\n", {"labels": LabelColumns()}, [":2: label is 1.5", "a whole"]),
     "truth": ("t,vx,w,x,y,heading\n0,1,0,1,,1\n", {"truth": TruthColumns()}, [":2: y is empty"]),
 }  # fmt: skip
 
@@ -221,7 +222,7 @@ def test_faults_are_named(
 
 OTHERS: dict[str, tuple[str, Callable[[Path], dict[str, Any]], list[str]]] = {
     "far view": ("t,r0,r1,r2\n0,0,0,0\n9,0,0,0\n", lambda p: {"views": ViewColumns(file=p)},
-                 [":3: the nearest odometry row is 7.5 s away (one of 1", "at most 0.5 s", "raise tolerance"]),
+                 [":3: the nearest odometry row is 7.5 s away (one of 1", "at most 0.5 s", "raise"]),
     "two views": ("t,r0,r1,r2\n0.9,0,0,0\n1.1,0,0,0\n", lambda p: {"views": ViewColumns(file=p)},
                   [":3: belongs to the same odometry row", "thin them out"]),
     "view time": ("t,r0,r1,r2\n1,0,0,0\n0.5,0,0,0\n", lambda p: {"views": ViewColumns(file=p)},
@@ -230,16 +231,17 @@ OTHERS: dict[str, tuple[str, Callable[[Path], dict[str, Any]], list[str]]] = {
     "pair": ("t1,t2,score\n0.5,1,0.9\n", lambda p: {"pairs": PairColumns(file=p)},
              [":2: t1 0.5 is not after t2 1.0", "the later time of a pair first", "swap table.pairs.later"]),
     "score": ("t1,t2,score\n1,0.5,nan\n", lambda p: {"pairs": PairColumns(file=p)}, [":2: score is nan"]),
-    "pair time": ("t1,t2,score\n9,0.5,1\n", lambda p: {"pairs": PairColumns(file=p)}, [", time 9.0: the nearest"]),
+    "pair time": ("t1,t2,score\n9,0.5,1\n", lambda p: {"pairs": PairColumns(file=p)}, ["time 9.0: the near"]),
     "pair column": ("t1,t2,scores\n9,0.5,1\n", lambda p: {"pairs": PairColumns(file=p)},
                     [":1: no column 'score'", "did you mean 'scores'?"]),
-    "both": ("t1,t2,score\n1,0.5,1\n", lambda p: {"pairs": PairColumns(file=p), "labels": LabelColumns(column="w")},
+    "both": ("t1,t2,score\n1,0.5,1\n", lambda p: {"pairs": PairColumns(file=p), "labels": LabelColumns()},
              ["both table.labels and table.pairs"]),
     "truth clock": ("t,x,y,heading\n0,0,0,0\n0,1,0,0\n", lambda p: {"truth": TruthColumns(file=p)},
                     [":3: t repeats 0.0 s"]),
     "truth elsewhen": ("t,x,y,heading\n50,0,0,0\n60,1,0,0\n", lambda p: {"truth": TruthColumns(file=p)},
                        ["t is 50.0 to 60.0 s, the odometry's 0.0 to 1.5", "times that overlap", "one clock"]),
-    "truth time": ("t,x,y,heading\n0,0,0,0\n,1,0,0\n", lambda p: {"truth": TruthColumns(file=p)}, [":3: t is empty"]),
+    "truth time": ("t,x,y,heading\n0,0,0,0\n,1,0,0\n", lambda p: {"truth": TruthColumns(file=p)},
+                   [":3: t is empty"]),
 }  # fmt: skip
 
 
@@ -273,10 +275,12 @@ def test_no_text_is_more_than_one_clear_error(tmp_path_factory: Any, text: str |
     for content in (text, b"t,vx,w\n" + text if isinstance(text, bytes) else "t,vx,w\n" + text):
         data = content if isinstance(content, bytes) else content.encode("utf-8", "surrogatepass")
         path.write_bytes(data)
+        told = str(path)
         try:
             read_table(path, VELOCITY)
         except InputError as error:
-            assert str(path) in str(error)
+            told = str(error)
+        assert str(path) in told
 
 
 def test_lines_are_counted_as_an_editor_counts_them(write: Write) -> None:

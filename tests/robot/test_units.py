@@ -45,6 +45,7 @@ def _margins(log: Log) -> dict[str, float]:
     return {
         "interval": ORDINARY.interval / robot.interval,
         "speed": ORDINARY.speed / robot.speed,
+        "true_speed": ORDINARY.speed / robot.true_speed,
         "turn_rate": ORDINARY.turn_rate / robot.turn_rate,
         "turn": np.pi / robot.turn,
         "path": RATIO / ratios[0],
@@ -76,7 +77,7 @@ PLANTED = {
     "speed in mm/s": ("in_v", MILLIMETRES, "in metres"),
     "views in bytes": ("in_view", 255.0, "in 0..1"),
     "time in ms": ("in_t", MILLISECONDS, "times in seconds"),
-    "truth in mm": ("truth", np.array([MILLIMETRES, MILLIMETRES, 1]), "both in metres"),
+    "truth in mm": ("truth", np.array([MILLIMETRES, MILLIMETRES, 1]), "truth in metres"),
     "truth in degrees": ("truth", np.array([1, 1, DEGREES]), "in radians"),
 }
 

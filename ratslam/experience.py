@@ -1,0 +1,283 @@
+"""The experience map: where places lie, from the odometry between them.
+
+Growable arrays are the truth; networkx is how others see them. Motion accumulates in the body frame of the
+current node and is cleared whenever the node changes, so a link holds whatever the solver later does to the
+node it starts from. Source: Milford & Wyeth 2004; Ball et al. 2013, section 6.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, NamedTuple
+
+import networkx
+import numpy as np
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+
+from ratslam.growing import Growing
+from ratslam.posegraph import Edges, geman_mcclure, huber, least_squares, no_kernel
+from ratslam.relaxation import relax
+from ratslam.types import Action, Estimate
+from tactile.frames import between, compose, inverse
+from tactile.settings import Settings
+from tactile.types import Observation
+
+
+class OdometryNoise(Settings):
+    """How much the odometry between two nodes is believed: variances grow along the way."""
+
+    per_metre: PositiveFloat = 0.05
+    """Standard deviation of position after one metre, m."""
+    heading_per_metre: NonNegativeFloat = 0.05
+    """Standard deviation of heading after one metre, rad."""
+    heading_per_radian: NonNegativeFloat = 0.05
+    """Standard deviation of heading after a turn of one radian, rad."""
+    least: PositiveFloat = 0.005
+    """Standard deviation of any link, m and rad: no link is exact."""
+
+
+class LeastSquares(Settings):
+    """Exact SE(2) least squares, solved when a loop closes."""
+
+    name: Literal["least_squares"] = "least_squares"
+    """This solver's name."""
+    kernel: Literal["none", "huber", "geman_mcclure"] = "huber"
+    """What tames closures that disagree with the rest of the map."""
+    scale: PositiveFloat = 1.0
+    """The kernel's scale, in standard deviations."""
+
+
+class Relaxation(Settings):
+    """The classic sweep after every action: each link moves both of its ends a little."""
+
+    name: Literal["relaxation"] = "relaxation"
+    """This solver's name."""
+    loops: PositiveInt = 20
+    """Sweeps per action."""
+    correction: Annotated[float, Field(gt=0, le=1)] = 0.5
+    """Share of a link's error that each end takes."""
+
+
+class ExperienceConfig(Settings):
+    """The experience map."""
+
+    solver: Annotated[LeastSquares | Relaxation, Field(discriminator="name")] = LeastSquares()
+    """How the map gives way to closures."""
+    closures: bool = True
+    """Whether recognised places bend the map; without, it is raw odometry."""
+    noise: OdometryNoise = OdometryNoise()
+    """Trust in odometry."""
+    match_sd: PositiveFloat = 0.1
+    """Standard deviation of where the robot stands when it recognises a place, m."""
+    match_sd_heading: PositiveFloat = 0.1
+    """The same for its heading, rad."""
+
+
+class Travel(NamedTuple):
+    """Motion since the current node: pose [3] in its frame, variance [3], metres and seconds."""
+
+    motion: np.ndarray
+    variance: np.ndarray
+    length: float
+    duration: float
+
+
+def departure(relative: float) -> Travel:
+    """At a node, seen from `relative` rad off the heading at which it was stored."""
+    return Travel(np.array([0.0, 0.0, relative]), np.zeros(3), 0.0, 0.0)
+
+
+class ExperienceMap:
+    """Folds estimates and evidence of the rat backend (`ratslam.backend.Map`).
+
+    The fields of `arrays()` are its whole state: node poses [M, 3] (x m, y m, heading rad), the place each
+    node stands for, links with their measured motion, and for every folded step its node and the motion
+    since, from which the final trajectory follows.
+    """
+
+    def __init__(self, config: ExperienceConfig | None = None) -> None:
+        self.config = config or ExperienceConfig()
+        self._pose = Growing((3,), np.float64)
+        self._node_of = Growing((), np.int64)  # place id -> node, -1 for ids that never became a node
+        self._template = Growing((), np.int64)
+        self._ends = Growing((2,), np.int64)
+        self._motion = Growing((3,), np.float64)
+        self._information = Growing((3,), np.float64)
+        self._record = Growing((3,), np.float64)  # traversals, metres, seconds
+        self._closure = Growing((), np.bool_)
+        self._step_node = Growing((), np.int64)
+        self._step_motion = Growing((3,), np.float64)
+        self._link_of: dict[tuple[int, int], int] = {}
+        self._current = -1
+        self._travel = departure(0.0)
+
+    # What it answers
+
+    def pose(self, estimate: Estimate) -> np.ndarray:
+        """[3] the current node's pose and the motion since; before the first node, dead reckoning."""
+        del estimate
+        return compose(self._origin(), self._travel.motion)
+
+    def nodes(self) -> np.ndarray:
+        """[M, 3] poses of the nodes."""
+        return self._pose.rows.copy()
+
+    def edges(self) -> Edges:
+        """All links: ends, motion and information."""
+        ends = self._ends.rows
+        return Edges(ends[:, 0].copy(), ends[:, 1].copy(), self._motion.rows.copy(), self._information.rows.copy())
+
+    def trajectory(self) -> np.ndarray:
+        """[T, 3] every folded step as the map sees it now: final pose of its node and the motion since."""
+        node, motion = self._step_node.rows, self._step_motion.rows
+        if not len(self._pose.rows):
+            return motion.copy()
+        origin = np.where(node[:, None] >= 0, self._pose.rows[np.maximum(node, 0)], 0.0)
+        return compose(origin, motion)
+
+    def graph(self) -> networkx.DiGraph:
+        """Nodes with x, y (m), heading (rad), template; links with dx, dy, dtheta and their evidence."""
+        graph = networkx.DiGraph()
+        for node, (pose, template) in enumerate(zip(self._pose.rows, self._template.rows, strict=True)):
+            x, y, heading = map(float, pose)
+            graph.add_node(node, x=x, y=y, heading=heading, template=int(template))
+        links = zip(self._ends.rows, self._motion.rows, self._record.rows, self._closure.rows, strict=True)
+        for (a, b), motion, (traversals, length, duration), closure in links:
+            dx, dy, dtheta = map(float, motion)
+            graph.add_edge(
+                int(a), int(b), dx=dx, dy=dy, dtheta=dtheta, traversals=int(traversals),
+                length=float(length), duration=float(duration), closure=bool(closure),
+            )  # fmt: skip
+        return graph
+
+    # What changes it
+
+    def update(self, observation: Observation, estimate: Estimate, evidence: NamedTuple) -> None:
+        """Moves along the odometry, then creates, links or sets as the estimate says."""
+        self._advance(observation.odometry)
+        action, place = int(estimate.action), int(estimate.place)
+        relative = float(evidence.relative)
+        if action == Action.CREATE:
+            self._create(place, int(evidence.template), relative)
+        elif action in (Action.LINK, Action.SET) and self.config.closures and self._known(place) >= 0:
+            self._reach(self._known(place), relative)
+        self._step_node.append(self._current)
+        self._step_motion.append(self._travel.motion)
+
+    def _advance(self, odometry) -> None:
+        moved = np.array([float(odometry.dx), float(odometry.dy), float(odometry.dtheta)])
+        if not np.isfinite(moved).all():
+            return  # the kernel has named this outcome; a map of NaN would help nobody
+        noise, length = self.config.noise, float(np.hypot(moved[0], moved[1]))
+        heading = noise.heading_per_metre**2 * length + noise.heading_per_radian**2 * abs(moved[2])
+        along = noise.per_metre**2 * length
+        travel = self._travel
+        self._travel = Travel(
+            compose(travel.motion, moved),
+            travel.variance + np.array([along, along, heading]),
+            travel.length + length,
+            travel.duration + float(odometry.dt),
+        )
+
+    def _create(self, place: int, template: int, relative: float) -> None:
+        node = len(self._pose.rows)
+        measured = compose(self._travel.motion, np.array([0.0, 0.0, -relative]))
+        self._pose.append(compose(self._origin(), measured))
+        self._template.append(template)
+        while len(self._node_of.rows) <= place:
+            self._node_of.append(-1)
+        self._node_of.rows[place] = node
+        if self._current >= 0:
+            self._link(node, measured, closure=False)
+        self._arrive(node, relative)
+        self._relax()
+
+    def _reach(self, node: int, relative: float) -> None:
+        measured = compose(self._travel.motion, np.array([0.0, 0.0, -relative]))
+        if self._current >= 0 and node != self._current:
+            self._link(node, measured, closure=True)
+        self._arrive(node, relative)
+        self._solve()
+        self._relax()
+
+    def _arrive(self, node: int, relative: float) -> None:
+        self._current = node
+        self._travel = departure(relative)
+
+    def _link(self, node: int, measured: np.ndarray, closure: bool) -> None:
+        """A new link, or another traversal of one: the inverse-variance mean of what they measured."""
+        information = 1 / self._variance(closure)
+        evidence = np.array([1.0, self._travel.length, self._travel.duration])
+        known = self._link_of.get((self._current, node))
+        backwards = known is None and (node, self._current) in self._link_of
+        if backwards:
+            known = self._link_of[node, self._current]
+            measured = inverse(measured)
+        if known is None:
+            self._link_of[self._current, node] = len(self._ends.rows)
+            self._ends.append((self._current, node))
+            self._motion.append(measured)
+            self._information.append(information)
+            self._record.append(evidence)
+            self._closure.append(closure)
+            return
+        before = self._information.rows[known]
+        total = before + information
+        motion = self._motion.rows[known]
+        step = between(np.array([0.0, 0.0, motion[2]]), np.array([0.0, 0.0, measured[2]]))[2]
+        share = information / total
+        self._motion.rows[known] = motion + share * np.array([*(measured - motion)[:2], step])
+        self._information.rows[known] = total
+        self._record.rows[known] += evidence
+
+    def _variance(self, closure: bool) -> np.ndarray:
+        variance = self._travel.variance + self.config.noise.least**2
+        if closure:
+            xy, heading = self.config.match_sd**2, self.config.match_sd_heading**2
+            variance = variance + np.array([xy, xy, heading])
+        return variance
+
+    def _solve(self) -> None:
+        solver = self.config.solver
+        if isinstance(solver, LeastSquares):
+            kernels = {"none": no_kernel, "huber": huber(solver.scale), "geman_mcclure": geman_mcclure(solver.scale**2)}
+            solution = least_squares(
+                self._pose.rows, self.edges(), kernel=kernels[solver.kernel], robust=self._closure.rows
+            )
+            self._pose.rows[:] = solution.poses
+
+    def _relax(self) -> None:
+        solver = self.config.solver
+        if isinstance(solver, Relaxation) and len(self._ends.rows):
+            ends, motion = self._ends.rows, self._motion.rows
+            self._pose.rows[:] = relax(
+                self._pose.rows, ends[:, 0], ends[:, 1], np.hypot(motion[:, 0], motion[:, 1]),
+                np.arctan2(motion[:, 1], motion[:, 0]), motion[:, 2], solver.loops, solver.correction,
+            )  # fmt: skip
+
+    def _origin(self) -> np.ndarray:
+        return self._pose.rows[self._current] if self._current >= 0 else np.zeros(3)
+
+    def _known(self, place: int) -> int:
+        return int(self._node_of.rows[place]) if 0 <= place < len(self._node_of.rows) else -1
+
+    # What a checkpoint keeps
+
+    def _growing(self) -> dict[str, Growing]:
+        return {name[1:]: value for name, value in vars(self).items() if isinstance(value, Growing)}
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Everything, so that `restore` continues bit for bit."""
+        travel = self._travel
+        return {name: rows.rows.copy() for name, rows in self._growing().items()} | {
+            "current": np.int64(self._current),
+            "travel": np.concatenate([travel.motion, travel.variance, [travel.length, travel.duration]]),
+        }
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """Takes the place of everything folded so far."""
+        for name, rows in self._growing().items():
+            rows.replace(arrays[name])
+        self._current = int(arrays["current"])
+        travel = np.asarray(arrays["travel"])
+        self._travel = Travel(travel[:3].copy(), travel[3:6].copy(), float(travel[6]), float(travel[7]))
+        self._link_of = {(int(a), int(b)): k for k, (a, b) in enumerate(self._ends.rows)}

@@ -1,0 +1,142 @@
+"""The session: the one loop, and the one object that changes.
+
+Live and replay run the same compiled function over a chunk of fixed length with a traced count: live passes
+one observation, replay many, and both give the same bits. Memory grows to powers of two that depend on the
+number of steps alone, before a chunk that could need it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from functools import partial
+from itertools import islice
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from ratslam.backend import Backend, Evidence, Map
+from ratslam.types import Estimate
+from tactile.types import Observation, stack
+
+CHUNK = 64
+"""Observations per compiled call; capacities change only at multiples of it."""
+
+
+class Step(NamedTuple):
+    """What one observation led to.
+
+    Attributes:
+        estimate, evidence: of the backend, host NumPy. pose: [3] in the map frame as it was known then.
+    """
+
+    estimate: Estimate
+    evidence: Evidence
+    pose: np.ndarray
+
+
+class Session:
+    """Feeds observations to a backend and folds what it says into its map.
+
+    Args:
+        seed: of the backend's random stream. reserve: rows of memory made room for at the start, so that a
+            live session does not compile in mid-run. precision: of the kernel; float64 needs JAX's x64.
+
+    Raises:
+        ValueError: JAX is not set up for the precision asked for.
+    """
+
+    def __init__(
+        self, backend: Backend, *, seed: int = 0, reserve: int = 0, precision: Literal["float64", "float32"] = "float64"
+    ) -> None:
+        if precision == "float64":
+            jax.config.update("jax_enable_x64", True)
+        self.backend = backend
+        self.map: Map = backend.new_map()
+        self.steps = 0
+        self.reserve = reserve
+        self.state = backend.init(jax.random.key(seed), capacity_at(0, reserve))
+        self._run = jax.jit(partial(run_chunk, backend.kernel), donate_argnums=0)
+
+    def step(self, observation: Observation) -> Step:
+        """One observation, live."""
+        return self._advance([observation])[0]
+
+    def replay(self, observations: Iterable[Observation]) -> Iterator[Step]:
+        """Many observations, a chunk at a time; the same bits as `step` by `step`."""
+        remaining = iter(observations)
+        # Chunks end where capacities may change, wherever the session stands when the replay begins.
+        while chunk := list(islice(remaining, CHUNK - self.steps % CHUNK)):
+            yield from self._advance(chunk)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The whole session for a checkpoint: a restored one continues bit for bit."""
+        leaves = jax.tree.leaves(self.state)
+        return (
+            {f"state/{k}": np.asarray(leaf) for k, leaf in enumerate(leaves)}
+            | {f"map/{name}": value for name, value in self.map.arrays().items()}
+            | {"steps": np.int64(self.steps), "reserve": np.int64(self.reserve)}
+        )
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """Takes up where `arrays` was taken.
+
+        Raises:
+            ValueError: the arrays are of a session with another backend or other shapes.
+        """
+        steps, reserve = int(arrays["steps"]), int(arrays["reserve"])
+        # The last chunk's capacity, not the next one's: growing is the next step's business.
+        like = jax.eval_shape(lambda: self.backend.init(jax.random.key(0), capacity_at(max(steps - 1, 0), reserve)))
+        leaves, tree = jax.tree.flatten(like)
+        saved = [arrays.get(f"state/{k}") for k in range(len(leaves))]
+        for leaf, value in zip(leaves, saved, strict=True):
+            if value is None or value.shape != leaf.shape or value.dtype != leaf.dtype:
+                raise ValueError("the checkpoint is of another configuration or view shape")
+        self.state = tree.unflatten([jnp.asarray(value) for value in saved])
+        prefix = "map/"
+        self.map.restore({k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)})
+        self.steps, self.reserve = steps, reserve
+
+    def _advance(self, observations: list[Observation]) -> list[Step]:
+        capacity = capacity_at(self.steps, self.reserve)
+        if self.steps and capacity != capacity_at(self.steps - 1, self.reserve):
+            self.state = self.backend.grow(self.state, capacity)
+        count = len(observations)
+        chunk = stack(observations + observations[-1:] * (CHUNK - count))
+        self.state, outputs = self._run(self.state, chunk, np.int32(count))
+        estimates, evidence = jax.tree.map(np.asarray, outputs)
+        steps = []
+        for k, observation in enumerate(observations):
+            estimate = jax.tree.map(lambda column, k=k: column[k], estimates)
+            proof = jax.tree.map(lambda column, k=k: column[k], evidence)
+            self.map.update(observation, estimate, proof)
+            steps.append(Step(estimate, proof, self.map.pose(estimate)))
+        self.steps += count
+        return steps
+
+
+def capacity_at(step: int, reserve: int = 0) -> int:
+    """Rows of memory at a step: a power of two that holds one row for every step of its chunk and before."""
+    end = (step // CHUNK + 1) * CHUNK
+    return 1 << (max(end, reserve, 256) - 1).bit_length()
+
+
+def run_chunk(kernel: Any, state: Any, chunk: Observation, count: Any) -> tuple[Any, tuple[Estimate, Evidence]]:
+    """The kernel over the first `count` observations of a chunk; rows beyond are zero."""
+
+    def at(k: Any) -> Observation:
+        return jax.tree.map(lambda column: lax.dynamic_index_in_dim(column, k, 0, keepdims=False), chunk)
+
+    def body(k: Any, carry: Any) -> Any:
+        state, outputs = carry
+        state, *output = kernel(state, at(k))
+        outputs = jax.tree.map(
+            lambda column, row: lax.dynamic_update_index_in_dim(column, row, k, 0), outputs, tuple(output)
+        )
+        return state, outputs
+
+    _, *shapes = jax.eval_shape(kernel, state, jax.eval_shape(at, jnp.int32(0)))
+    empty = jax.tree.map(lambda shape: jnp.zeros((CHUNK, *shape.shape), shape.dtype), tuple(shapes))
+    return lax.fori_loop(0, count, body, (state, empty))
