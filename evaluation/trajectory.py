@@ -13,7 +13,7 @@ import numpy as np
 
 from evaluation.table import read_table
 from tactile.errors import InputError
-from tactile.frames import between, compose, wrap
+from tactile.frames import between, compose, wrap, tum_line
 
 _TUM = {name: () for name in ("t", "x", "y", "z", "qx", "qy", "qz", "qw")}
 
@@ -151,12 +151,8 @@ def read_tum(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
 
 def write_tum(path: str | Path, time: np.ndarray, pose: np.ndarray) -> None:
     """Writes a planar trajectory so that `read_tum` gives back the same numbers (headings to rounding)."""
-    half = pose[:, 2] / 2
-    rows = zip(time, pose[:, 0], pose[:, 1], np.sin(half), np.cos(half), strict=True)
-    lines = [
-        " ".join(f"{float(value)!r}" for value in (t, x, y, 0, 0, 0, qz, qw)) for t, x, y, qz, qw in rows
-    ]
-    Path(path).write_text("".join(line + "\n" for line in lines), encoding="utf-8")
+    lines = (tum_line(*row) for row in zip(time, pose, strict=True))
+    Path(path).write_text("".join(lines), encoding="utf-8")
 
 
 def _positions(estimate: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

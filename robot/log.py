@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import repeat
 from types import TracebackType
 from typing import Self
 
@@ -59,18 +60,17 @@ class Log:
 
     def __iter__(self) -> Iterator[Sample]:
         shape = self.view_shape
-        known = None if self.truth is None else ~np.isnan(self.truth).any(axis=1)
-        for row, (time, motion, seen, label) in enumerate(
-            zip(self.time.tolist(), self.motion, self.seen.tolist(), self.label.tolist(), strict=True)
+        for time, motion, view, seen, label, truth in zip(
+            self.time.tolist(), self.motion, self.views, self.seen, self.label, self._truths(), strict=True
         ):
-            view = self.views[row] if seen else None
-            reading = observation(Odometry(*motion), view, view_shape=shape, label=label)
-            truth = (
-                self.truth[row].copy()
-                if self.truth is not None and known is not None and known[row]
-                else None
-            )
-            yield Sample(time, reading, truth)
+            picture = view if seen else None
+            yield Sample(time, observation(Odometry(*motion), picture, view_shape=shape, label=label), truth)
+
+    def _truths(self) -> Iterator[np.ndarray | None]:
+        if self.truth is None:
+            yield from repeat(None, self.length)
+        else:
+            yield from (None if np.isnan(truth).any() else truth.copy() for truth in self.truth)
 
     def __enter__(self) -> Self:
         return self

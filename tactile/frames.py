@@ -53,3 +53,10 @@ def integrate(motions: np.ndarray, start: np.ndarray | None = None) -> np.ndarra
     x = start[0] + np.cumsum(c * motions[:, 0] - s * motions[:, 1])
     y = start[1] + np.cumsum(s * motions[:, 0] + c * motions[:, 1])
     return np.stack([x, y, wrap(heading)], axis=-1)
+
+
+def tum_line(time: float, pose: np.ndarray) -> str:
+    """One line `t x y z qx qy qz qw` of a TUM trajectory; floats are written so that they read back equal."""
+    x, y, heading = map(float, pose)
+    values = (float(time), x, y, 0.0, 0.0, 0.0, float(np.sin(heading / 2)), float(np.cos(heading / 2)))
+    return " ".join(map(repr, values)) + "\n"

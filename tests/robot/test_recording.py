@@ -191,7 +191,7 @@ def _fuzz(content: bytes, samples: list[Sample], path: Path, rounds: int, seed: 
         for place in rng.integers(0, len(bad), rng.integers(1, 4)):
             match int(rng.integers(4)):
                 case 0:
-                    bad[place] ^= 1 << int(rng.integers(8))
+                    bad[place % len(bad)] ^= 1 << int(rng.integers(8))
                 case 1:
                     bad[place : place + 8] = struct.pack("<Q", int(rng.integers(1 << 62)) << 1)
                 case 2:

@@ -1,0 +1,169 @@
+"""The main job: a recording through an engine into a run directory."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+import sys
+from collections.abc import Iterator
+from importlib.metadata import version
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from evaluation.energy import read_relations
+from evaluation.report import save_map
+from evaluation.rundirectory import read_run
+from evaluation.scorecard import Scorecard, score
+from evaluation.trajectory import write_tum
+from ratslam.config import RunConfig
+from ratslam.graphfile import write_g2o, write_json
+from ratslam.posecells import Outcome
+from ratslam.rat import Rat
+from ratslam.session import CHUNK, Session, Step
+from ratslam.storage import RunDirectory, read_checkpoint
+from ratslam.types import Action
+from ratslam.yamlfile import dump
+from robot.formats import open_recording
+from robot.source import Sample, Source
+from tactile.errors import InputError
+from tactile.frames import compose, tum_line
+
+CHECKPOINT_EVERY = 32 * CHUNK
+"""Steps between checkpoints: a kill loses no line, but a continued run repeats at most these."""
+
+
+def run(config: RunConfig, folder: Path, directory: Path, resume: Path | None = None) -> tuple[Scorecard, bool]:
+    """Runs and scores.
+
+    Args:
+        folder: of the configuration file; relative paths start there. resume: a checkpoint to go on from.
+
+    Returns:
+        the scorecard, and whether the run was interrupted (its outputs are then of the part done).
+
+    Raises:
+        InputError: the recording, the checkpoint or the run directory cannot be used. OSError: the disk is full.
+    """
+    warn = _tell
+    relations_file = config.score.relations
+    relations = read_relations(folder / relations_file) if relations_file else None
+    with open_recording(config.recording.resolved(folder), warn) as source:
+        dtype = np.dtype(config.session.precision)
+        session = Session(
+            Rat(config.rat(), source.view_shape, dtype),
+            seed=config.session.seed,
+            reserve=config.session.reserve,
+            precision=config.session.precision,
+        )
+        skip = _resume(session, resume, source.digest) if resume else 0
+        _check_length(source, skip, resume)
+        with RunDirectory(directory) as store:
+            text = dump(config)
+            store.text("config.yaml", text)
+            manifest = _manifest(config, text, source, resume)
+            store.manifest(manifest | {"status": "running"})
+            interrupted = _play(session, source, skip, store)
+            done = {"status": "interrupted" if interrupted else "complete", "steps": session.steps}
+            _finish(session, store, source.digest)
+            card = score(read_run(directory), directory.name, exm=config.score.experience_metric, relations=relations)
+            store.text("scorecard.json", card.model_dump_json(indent=2) + "\n")
+            store.file("map.png", lambda path: save_map(path, read_run(directory), card))
+            store.manifest(manifest | done)
+    return card, interrupted
+
+
+def _play(session: Session, source: Source, skip: int, store: RunDirectory) -> bool:
+    """Replays the source into the store; returns whether the user interrupted."""
+    samples = islice(iter(source), skip, None)
+    odometry = np.zeros(3)
+    total = None if source.length is None else source.length - skip
+    saved = session.steps
+    try:
+        with tqdm(total=total, unit="step", desc=source.name, file=sys.stderr, mininterval=0.5) as progress:
+            while chunk := list(islice(samples, CHUNK - session.steps % CHUNK)):
+                steps = list(session.replay([sample.reading for sample in chunk]))
+                reckoned = []
+                for sample in chunk:
+                    moved = sample.reading.odometry
+                    odometry = compose(odometry, np.array([moved.dx, moved.dy, moved.dtheta]))
+                    reckoned.append(odometry)
+                store.append(_lines(chunk, steps, reckoned))
+                if session.steps - saved >= CHECKPOINT_EVERY:
+                    store.checkpoint(session.arrays() | {"digest": np.array(source.digest)})
+                    saved = session.steps
+                progress.update(len(chunk))
+                progress.set_postfix(places=int(steps[-1].estimate.place) + 1, refresh=False)
+    except KeyboardInterrupt:
+        print("ratslam: interrupted; writing the results so far ...", file=sys.stderr)
+        return True
+    return False
+
+
+def _lines(samples: list[Sample], steps: list[Step], reckoned: list[np.ndarray]) -> dict[str, Iterator[str]]:
+    rows = list(zip(samples, steps, strict=True))
+    return {
+        "steps.csv": (_step_line(sample.time, step) for sample, step in rows),
+        "online.tum": (tum_line(sample.time, step.pose) for sample, step in rows),
+        "odometry.tum": (tum_line(s.time, pose) for s, pose in zip(samples, reckoned, strict=True)),
+        "truth.tum": (tum_line(s.time, s.truth) for s in samples if s.truth is not None),
+    }
+
+
+def _step_line(time: float, step: Step) -> str:
+    estimate, evidence = step.estimate, step.evidence
+    error = float(evidence.error)
+    cells = [
+        repr(float(time)),
+        str(int(evidence.template)),
+        repr(error) if np.isfinite(error) else "",
+        str(int(estimate.place)),
+        Action(int(estimate.action)).name.lower(),
+        *(repr(float(value)) for value in (*step.pose, *estimate.spread)),
+        Outcome(int(evidence.outcome)).name.lower(),
+    ]
+    return ",".join(cells) + "\n"
+
+
+def _finish(session: Session, store: RunDirectory, digest: str) -> None:
+    store.checkpoint(session.arrays() | {"digest": np.array(digest)})
+    time = np.loadtxt(store.path / "online.tum", usecols=0, ndmin=1)
+    final = session.map.trajectory()[session.steps - len(time) :]
+    store.file("trajectory.tum", lambda path: write_tum(path, time, final))
+    store.file("map.json", lambda path: write_json(path, session.map.graph()))
+    store.file("map.g2o", lambda path: write_g2o(path, session.map.nodes(), session.map.edges()))
+
+
+def _resume(session: Session, path: Path, digest: str) -> int:
+    """Restores a checkpoint; returns how many samples of this recording it has already seen."""
+    arrays = read_checkpoint(path)
+    try:
+        session.restore(arrays)
+    except (ValueError, KeyError) as error:
+        raise InputError(str(path), str(error), "a checkpoint made with this configuration") from None
+    return session.steps if str(arrays.get("digest", "")) == digest else 0
+
+
+def _check_length(source: Source, skip: int, resume: Path | None) -> None:
+    if source.length is not None and source.length <= skip:
+        raise InputError(str(resume), f"already holds all {skip} samples of {source.name}", "a run left unfinished")
+
+
+def _manifest(config: RunConfig, text: str, source: Source, resume: Path | None) -> dict[str, Any]:
+    packages = ("ratslam", "jax", "jaxlib", "numpy", "scipy", "networkx")
+    return {
+        "format": "ratslam-run-1",
+        "versions": {name: version(name) for name in packages} | {"python": platform.python_version()},
+        "machine": platform.machine(),
+        "recording": {"name": source.name, "sha256": source.digest, "samples": source.length},
+        "config_sha256": hashlib.sha256(text.encode()).hexdigest(),
+        "seeds": {"session": config.session.seed},
+        "continued": resume is not None,
+    }
+
+
+def _tell(sentence: str) -> None:
+    print(f"ratslam: warning: {sentence}", file=sys.stderr)
