@@ -99,6 +99,10 @@ class Session:
         self.map.restore({k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)})
         self.steps, self.reserve = steps, reserve
 
+    def compilations(self) -> int:
+        """How often the chunk function was compiled: once per capacity."""
+        return self._run._cache_size()
+
     def _advance(self, observations: list[Observation]) -> list[Step]:
         capacity = capacity_at(self.steps, self.reserve)
         if self.steps and capacity != capacity_at(self.steps - 1, self.reserve):

@@ -1,0 +1,74 @@
+"""The smallest backend there can be: it proves that the seam asks for nothing a RatSLAM has."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import networkx
+import numpy as np
+
+from ratslam.types import Action, Estimate
+from tactile.frames import compose, wrap
+
+
+class Nothing(NamedTuple):
+    """Evidence of a backend that has none."""
+
+    moved: Any
+
+
+class DeadReckoning:
+    """Adds up odometry."""
+
+    def init(self, key, capacity):
+        del key, capacity
+        return jnp.zeros(3)
+
+    def grow(self, state, capacity):
+        del capacity
+        return state
+
+    def kernel(self, state, observation):
+        o = observation.odometry
+        moved = jnp.where(jnp.isfinite(o.dx + o.dy + o.dtheta), jnp.stack([o.dx, o.dy, o.dtheta]), 0.0)
+        c, s = jnp.cos(state[2]), jnp.sin(state[2])
+        pose = jnp.stack(
+            [
+                state[0] + c * moved[0] - s * moved[1],
+                state[1] + s * moved[0] + c * moved[1],
+                wrap(state[2] + moved[2]),
+            ]
+        )
+        none = jnp.int32(-1)
+        estimate = Estimate(pose, jnp.zeros(3), none, none, jnp.int32(Action.NONE), jnp.bool_(False))
+        return pose, estimate, Nothing(moved)
+
+    def new_map(self):
+        return Reckoned()
+
+
+class Reckoned:
+    """A map that is only a path."""
+
+    def __init__(self) -> None:
+        self.path: list[np.ndarray] = [np.zeros(3)]
+
+    def update(self, observation, estimate, evidence) -> None:
+        del observation, estimate
+        self.path.append(compose(self.path[-1], evidence.moved))
+
+    def pose(self, estimate):
+        return np.asarray(estimate.pose)
+
+    def trajectory(self):
+        return np.array(self.path[1:])
+
+    def graph(self):
+        return networkx.DiGraph()
+
+    def arrays(self):
+        return {"path": np.array(self.path)}
+
+    def restore(self, arrays) -> None:
+        self.path = list(arrays["path"])

@@ -1,0 +1,164 @@
+"""What any backend must do; every backend goes through all of it."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from ratslam.rat import Rat, RatConfig
+from ratslam.session import CHUNK, Session, capacity_at
+from ratslam.types import Action
+from tactile.types import Odometry, observation
+
+VIEW = (3, 6, 1)
+
+
+def _dead_reckoning():
+    spec = importlib.util.spec_from_file_location("deadreckoning", Path(__file__).with_name("deadreckoning.py"))
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.DeadReckoning()
+
+
+def _rat():
+    return Rat(RatConfig.model_validate({"pose_cells": {"cells_xy": 11}}), VIEW)
+
+
+def _rat_of_labels():
+    return Rat(RatConfig.model_validate({"pose_cells": {"cells_xy": 11}, "templates": {"source": "labels"}}), VIEW)
+
+
+BACKENDS = {"rat": _rat, "rat-labels": _rat_of_labels, "dead-reckoning": _dead_reckoning}
+
+
+@pytest.fixture(params=BACKENDS)
+def make(request):
+    return BACKENDS[request.param]
+
+
+def walk(count: int, seed: int = 0):
+    """Round a small circuit again and again, with views that come back; some steps see nothing."""
+    stream = np.random.default_rng(seed)
+    places = stream.random((17, *VIEW))
+    for k in range(count):
+        turn = 2 * np.pi / 17 + stream.normal(0, 0.01)
+        odometry = Odometry(0.05 + stream.normal(0, 0.002), stream.normal(0, 0.002), turn, 0.1)
+        seen = stream.random() > 0.1
+        yield observation(
+            odometry, places[k % 17] if seen else None, view_shape=VIEW, label=k % 17 if seen else -1
+        )
+
+
+def equal(a, b) -> bool:
+    return all(np.array_equal(x, y, equal_nan=True) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+
+
+def test_kernel_keeps_shapes_and_dtypes(make):
+    backend = make()
+    state = backend.init(jax.random.key(0), 256)
+    after, estimate, _ = jax.jit(backend.kernel)(state, next(walk(1)))
+    kinds = [jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype, leaf.weak_type), tree) for tree in (state, after)]
+    assert kinds[0] == kinds[1]
+    assert estimate.pose.shape == estimate.spread.shape == (3,)
+    assert estimate.place.dtype == estimate.previous.dtype == estimate.action.dtype == np.int32
+
+
+def test_replay_and_live_are_the_same_bits(make):
+    observations = list(walk(150))
+    replayed = list(Session(make()).replay(observations))
+    live = Session(make())
+    assert equal(replayed, [live.step(o) for o in observations])
+
+
+def test_any_mixture_of_live_and_replay_is_the_same_bits(make):
+    observations = list(walk(150))
+    mixed = Session(make())
+    steps = [mixed.step(o) for o in observations[:30]]
+    steps += mixed.replay(observations[30:101])
+    steps += [mixed.step(o) for o in observations[101:110]]
+    steps += mixed.replay(observations[110:])
+    assert equal(steps, list(Session(make()).replay(observations)))
+
+
+@pytest.mark.parametrize("stop", [1, 64, 77, 256, 300])
+def test_a_restored_session_continues_as_if_never_stopped(make, stop):
+    observations = list(walk(340))
+    whole = Session(make())
+    expected = list(whole.replay(observations))
+    first = Session(make())
+    list(first.replay(observations[:stop]))
+    saved = first.arrays()
+    second = Session(make())
+    second.restore(saved)
+    assert equal(expected[stop:], list(second.replay(observations[stop:])))
+    assert second.arrays().keys() == whole.arrays().keys()
+    assert equal(whole.arrays(), second.arrays())
+
+
+def test_a_batch_of_runs_equals_each_run(make):
+    backend = make()
+    runs = [list(walk(20, seed)) for seed in range(3)]
+    batch = [jax.tree.map(lambda *rows: np.stack(rows), *step) for step in zip(*runs, strict=True)]
+    one = jax.jit(backend.kernel)
+    many = jax.jit(jax.vmap(backend.kernel))
+    alone = [backend.init(jax.random.key(0), 256) for _ in runs]
+    together = jax.tree.map(lambda *rows: np.stack(rows), *alone)
+    for k, step in enumerate(batch):
+        together, estimate, _ = many(together, step)
+        for r, run in enumerate(runs):
+            alone[r], expected, _ = one(alone[r], run[k])
+            assert np.allclose(estimate.pose[r], expected.pose, atol=1e-9)
+            assert estimate.place[r] == expected.place
+            assert estimate.action[r] == expected.action
+
+
+def test_places_are_consistent(make):
+    previous, known = -1, set()
+    for step in Session(make()).replay(walk(200)):
+        place, action = int(step.estimate.place), Action(int(step.estimate.action))
+        assert int(step.estimate.previous) == previous
+        if action == Action.CREATE:
+            assert place not in known
+        elif action in (Action.LINK, Action.SET):
+            assert place in known
+            assert place != previous
+        else:
+            assert place == previous
+        known.add(place)
+        previous = place
+
+
+def test_nothing_odd_comes_of_odd_input(make):
+    session = Session(make())
+    still = observation(Odometry(0, 0, 0, 0.1), np.full(VIEW, 0.5), label=3)
+    odd = still._replace(odometry=Odometry(*(np.float64(v) for v in (np.nan, np.inf, 0, 0.1))))
+    blind = still._replace(view=np.full(VIEW, np.nan))
+    for o in (still, odd, blind, still):
+        step = session.step(o)
+        assert np.isfinite(step.pose).all()
+        assert np.isfinite(step.estimate.pose).all()
+        assert np.isfinite(step.estimate.spread).all()
+
+
+def test_compiles_once_per_capacity(make):
+    session = Session(make())
+    observations = list(walk(600))
+    list(session.replay(observations))
+    for o in observations[:5]:
+        session.step(o)
+    capacities = {capacity_at(step) for step in range(605)}
+    assert session.compilations() <= len(capacities)
+    reserved = Session(make(), reserve=1024)
+    list(reserved.replay(observations))
+    assert reserved.compilations() == 1
+
+
+def test_capacity_depends_on_the_chunk_alone():
+    assert {capacity_at(step) for step in range(256)} == {256}
+    assert capacity_at(256) == 512
+    assert len({capacity_at(step) for step in range(CHUNK * 4, CHUNK * 5)}) == 1
+    assert capacity_at(0, 1000) == 1024
