@@ -32,13 +32,10 @@ class StockMap:
         self.y: list[float] = []
         self.th: list[float] = []
         self.outgoing: list[list[Link]] = []
+        self.links: list[Link] = []  # in order of creation
         self.current = 0
         self.dx = self.dy = self.time = 0.0
         self.facing = math.radians(parameters.exp_initial_em_deg)
-
-    def links(self) -> list[Link]:
-        """By start, then in order of creation: the order of the sweep."""
-        return [link for links in self.outgoing for link in links]
 
     def move(self, v: float, w: float, dt: float) -> None:
         """`on_odo`: turn first, then advance (Q13)."""
@@ -76,7 +73,9 @@ class StockMap:
             return
         heading = wrapped(math.atan2(self.dy, self.dx) - self.th[a])
         facing = wrapped(wrapped(self.facing + relative) - self.th[a])
-        self.outgoing[a].append(Link(a, b, math.hypot(self.dx, self.dy), heading, facing, self.time))
+        link = Link(a, b, math.hypot(self.dx, self.dy), heading, facing, self.time)
+        self.outgoing[a].append(link)
+        self.links.append(link)
 
     def set(self, node: int, relative: float) -> None:
         """Go to a node. Being there already, as after node 0, clears nothing (Q7)."""
@@ -93,7 +92,8 @@ class StockMap:
         """
         x, y, th, g = self.x, self.y, self.th, self.correction
         pi, turn, cos, sin = math.pi, 2 * math.pi, math.cos, math.sin
-        links = [(k.start, k.end, k.distance, k.heading, k.facing) for k in self.links()]
+        by_node = (link for outgoing in self.outgoing for link in outgoing)
+        links = [(k.start, k.end, k.distance, k.heading, k.facing) for k in by_node]
         for _ in range(self.loops):
             for a, b, distance, heading, facing in links:
                 direction = th[a] + heading

@@ -1,0 +1,87 @@
+"""Maps as files others read: g2o pose graphs and node-link JSON."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import networkx
+import numpy as np
+
+from ratslam.posegraph import Edges
+from tactile.errors import InputError
+
+UPPER = tuple(zip(*np.triu_indices(3), strict=True))
+
+
+def write_g2o(path: Path, poses: np.ndarray, edges: Edges) -> None:
+    """VERTEX_SE2 and EDGE_SE2 lines with repr-exact floats: the same map gives the same bytes."""
+    lines = [f"VERTEX_SE2 {k} {_floats(pose)}" for k, pose in enumerate(poses)]
+    information = edges.information
+    if information.ndim == 2:
+        information = information[:, :, None] * np.eye(3)
+    for i, j, motion, weight in zip(edges.i, edges.j, edges.motion, information, strict=True):
+        lines.append(f"EDGE_SE2 {int(i)} {int(j)} {_floats(motion)} {_floats(weight[k] for k in UPPER)}")
+    Path(path).write_text("".join(line + "\n" for line in lines), encoding="utf-8")
+
+
+def read_g2o(path: Path) -> tuple[np.ndarray, Edges]:
+    """Poses [N, 3] in order of id, and the edges with full information [E, 3, 3]. Other lines are left out.
+
+    Raises:
+        InputError: naming file and line.
+    """
+    poses: dict[int, list[float]] = {}
+    rows: list[tuple[int, int, list[float]]] = []
+    for number, line in enumerate(Path(path).read_text(encoding="utf-8").splitlines(), start=1):
+        word, *cells = line.split() or [""]
+        try:
+            if word == "VERTEX_SE2":
+                node, values = int(cells[0]), [float(cell) for cell in cells[1:]]
+                _expect(len(values) == 3)
+                poses[node] = values
+            elif word == "EDGE_SE2":
+                i, j, values = int(cells[0]), int(cells[1]), [float(cell) for cell in cells[2:]]
+                _expect(len(values) == 9)
+                rows.append((i, j, values))
+        except (ValueError, IndexError):
+            raise InputError(
+                f"{path}:{number}", repr(line), "VERTEX_SE2 id x y th, or EDGE_SE2 i j x y th and 6 information entries"
+            ) from None
+    row = {node: k for k, node in enumerate(sorted(poses))}
+    unknown = next((node for i, j, _ in rows for node in (i, j) if node not in row), None)
+    if unknown is not None:
+        raise InputError(str(path), f"an edge to node {unknown}, which has no vertex", "a vertex for every node")
+    values = np.array([values for _, _, values in rows]).reshape(-1, 9)
+    information = np.zeros((len(rows), 3, 3))
+    for k, (a, b) in enumerate(UPPER):
+        information[:, a, b] = information[:, b, a] = values[:, 3 + k]
+    i, j = (np.array([row[edge[k]] for edge in rows], int) for k in (0, 1))
+    return np.array([poses[node] for node in row]).reshape(-1, 3), Edges(i, j, values[:, :3], information)
+
+
+def write_json(path: Path, graph: networkx.DiGraph) -> None:
+    """Node-link JSON, as `networkx.node_link_graph` reads it."""
+    content = networkx.node_link_data(graph, edges="edges")
+    Path(path).write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def read_json(path: Path) -> networkx.DiGraph:
+    """The graph of a node-link file.
+
+    Raises:
+        InputError: it is not one.
+    """
+    try:
+        return networkx.node_link_graph(json.loads(Path(path).read_text(encoding="utf-8")), edges="edges")
+    except (ValueError, KeyError, TypeError, networkx.NetworkXException) as error:
+        raise InputError(str(path), f"not a node-link graph ({error})", "the map.json of a run") from None
+
+
+def _floats(values) -> str:
+    return " ".join(repr(float(value)) for value in values)
+
+
+def _expect(right: bool) -> None:
+    if not right:
+        raise ValueError

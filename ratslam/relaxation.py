@@ -1,0 +1,52 @@
+"""The classic relaxation of an experience map: every link moves both of its ends a little, in turn.
+
+Source: Ball et al. 2013, section 6 (Gauss-Seidel in order of creation, no node held, no weights). Kept for
+comparison: it takes thousands of sweeps to do what `ratslam.posegraph` does in one solve.
+"""
+
+from __future__ import annotations
+
+from math import cos, pi, sin
+
+import numpy as np
+
+
+def relax(
+    poses: np.ndarray,
+    start: np.ndarray,
+    end: np.ndarray,
+    distance: np.ndarray,
+    heading: np.ndarray,
+    facing: np.ndarray,
+    loops: int,
+    correction: float,
+) -> np.ndarray:
+    """Poses [N, 3] after `loops` sweeps over the links [L], from node `start` to node `end`.
+
+    Args:
+        distance, heading: where `end` lies in the frame of `start`, m and rad. facing: its heading there, rad.
+        correction: share of a link's error that each of its ends takes.
+    """
+    # Plain floats: every link needs what the one before has moved, so there is nothing to vectorise.
+    x, y, th = (column.tolist() for column in np.asarray(poses, float).T)
+    links = list(
+        zip(*(np.asarray(column).tolist() for column in (start, end, distance, heading, facing)), strict=True)
+    )
+    for _ in range(loops):
+        for a, b, far, aside, turned in links:
+            bearing = th[a] + aside
+            ex = correction * (x[b] - (x[a] + far * cos(bearing)))
+            ey = correction * (y[b] - (y[a] + far * sin(bearing)))
+            eth = correction * _wrap(th[b] - th[a] - turned)
+            x[a] += ex
+            y[a] += ey
+            x[b] -= ex
+            y[b] -= ey
+            th[a] = _wrap(th[a] + eth)
+            th[b] = _wrap(th[b] - eth)
+    return np.array([x, y, th]).T.reshape(-1, 3)
+
+
+def _wrap(angle: float) -> float:
+    # As `tactile.frames.wrap`, but exact for angles in range already: sweeps must not add up rounding.
+    return angle if -pi < angle <= pi else pi - (pi - angle) % (2 * pi)

@@ -1,0 +1,209 @@
+"""Laws of the attractor network."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ratslam import posecells
+from ratslam.posecells import Outcome, PoseCellConfig
+from tactile.types import Odometry
+
+CONFIG = PoseCellConfig()
+TABLE = posecells.tables(CONFIG, np.dtype(float))
+UNITS = posecells.units(CONFIG, np.dtype(float))
+RINGS = posecells.rings(CONFIG, np.dtype(float))
+
+
+@partial(jax.jit, static_argnames="config")
+def run(config, cells, motion, recall, energy):
+    """Motion in cells [T, 3]: poses [T, 3], outcomes [T], activity of the last step."""
+    table = posecells.tables(config, np.dtype(motion.dtype))
+    unit = posecells.units(config, np.dtype(motion.dtype))
+
+    def step(cells, row):
+        moved, at, how_much = row
+        odometry = Odometry(*(moved * unit), jnp.ones((), motion.dtype))
+        cells, spread, outcome = posecells.step(config, table, cells, odometry, at, how_much)
+        return cells, (cells.pose, outcome, spread)
+
+    return jax.lax.scan(step, cells, (motion, recall, energy))
+
+
+def go(motion, cells=None, injections=None, config=CONFIG, dtype=float):
+    motion = np.asarray(motion, dtype)
+    recall, energy = np.zeros((len(motion), 3), dtype), np.zeros(len(motion), dtype)
+    for k, (at, how_much) in (injections or {}).items():
+        recall[k], energy[k] = at, how_much
+    cells = cells if cells is not None else posecells.start(config, np.dtype(dtype))
+    after, outputs = run(config, cells, motion, recall, energy)
+    return after, tuple(np.asarray(output) for output in outputs)
+
+
+@pytest.fixture(scope="module")
+def settled():
+    return go(np.zeros((50, 3)))[0]
+
+
+def travelled(start, poses):
+    path = np.vstack([start, poses])
+    return np.stack([np.unwrap(path[:, a], period=RINGS[a]) for a in range(3)], 1)[-1] - np.asarray(start)
+
+
+@pytest.mark.parametrize("direction", [0, 25, 45, 130, 270])
+@pytest.mark.parametrize("speed", [0.001, 0.01, 0.1, 0.5, 1.7, 5.0])
+def test_decoded_motion_is_the_motion_told(settled, speed, direction):
+    angle = np.deg2rad(direction)
+    count = int(np.ceil(20 / speed))
+    _, (poses, outcomes, _) = go(np.tile([speed * np.cos(angle), speed * np.sin(angle), 0], (count, 1)), settled)
+    moved = travelled(settled.pose, poses)
+    heading = float(settled.pose[2]) * UNITS[2]
+    told = count * speed * np.array([np.cos(angle + heading), np.sin(angle + heading)])
+    assert np.hypot(*(moved[:2] - told)) <= 0.02 * np.hypot(*told)
+    assert not np.any(outcomes)
+
+
+@pytest.mark.parametrize("degrees", [0.01, 0.1, 1, 7, 10, 33, 60, -60, -0.05])
+def test_decoded_turning_is_the_turning_told(settled, degrees):
+    count = int(np.ceil(200 / abs(degrees)))
+    _, (poses, _, _) = go(np.tile([0, 0, np.deg2rad(degrees) / UNITS[2]], (count, 1)), settled)
+    assert travelled(settled.pose, poses)[2] == pytest.approx(count * degrees / 10, rel=0.02)
+
+
+def test_a_circle_closes(settled):
+    steps = 100
+    turn = 36 / steps
+    motion = np.tile([0.4, 0.1, turn], (steps, 1))
+    _, (poses, _, _) = go(motion, settled)
+    assert np.abs(travelled(settled.pose, poses) - [0, 0, 36]).max() < 0.15
+
+
+@settings(max_examples=25)
+@given(st.integers(0, 2**32 - 1), st.floats(-5, 5), st.floats(-5, 5), st.floats(-6, 6))
+def test_any_activity_becomes_a_distribution(seed, dx, dy, turn):
+    stream = np.random.default_rng(seed)
+    activity = stream.random((36, 21, 21)) * (stream.random((36, 21, 21)) < stream.random())
+    cells = posecells.start(CONFIG, np.dtype(float))._replace(activity=jnp.asarray(activity))
+    after, (poses, _, spread) = go([[dx, dy, turn]] * 3, cells)
+    assert float(after.activity.sum()) == pytest.approx(1)
+    assert float(after.activity.min()) >= 0
+    assert np.isfinite(poses).all()
+    assert np.isfinite(spread).all()
+    assert ((poses >= 0) & (poses < RINGS)).all()
+
+
+@pytest.mark.parametrize("level", [0.0, 1e-9, 1 / (36 * 21 * 21), 1.0])
+def test_uniform_activity_dies_and_is_put_back(settled, level):
+    cells = settled._replace(activity=jnp.full((36, 21, 21), level))
+    after, (poses, outcomes, _) = go(np.zeros((3, 3)), cells)
+    assert outcomes[0] == Outcome.RESEEDED
+    assert not np.any(outcomes[1:])
+    assert np.abs(posecells.around(poses[-1] - np.asarray(settled.pose), RINGS)).max() < 0.01
+    assert float(after.activity.sum()) == pytest.approx(1)
+
+
+@settings(max_examples=20)
+@given(st.tuples(*[st.floats(0, 1, exclude_max=True)] * 3))
+def test_a_deposit_between_cells_is_excited_like_one_on_a_cell(share):
+    """The peak of a deposit at its own point, read off between cells, does not depend on where it falls."""
+    pose = jnp.asarray([10, 10, 18]) + jnp.asarray(share)
+    energy = posecells.excited_share(CONFIG, pose)
+    assert 1 - 1e-9 <= float(energy) <= 1.5
+    empty = jnp.zeros((36, 21, 21))
+    total = float(posecells.deposit(empty, pose % RINGS, jnp.asarray(1.0)).sum())
+    assert total == pytest.approx(1)
+
+
+@pytest.mark.parametrize("shift", [(5, 0, 0), (0, 7, 0), (0, 0, 9), (20, 20, 35)])
+def test_the_torus_has_no_edge(shift):
+    """A run and the same run elsewhere on the torus are each other's shifted copies."""
+    stream = np.random.default_rng(1)
+    motion = stream.normal(0, 0.7, (40, 3))
+    here = posecells.start(CONFIG, np.dtype(float))
+    there = here._replace(
+        activity=jnp.roll(here.activity, (shift[2], shift[1], shift[0]), (0, 1, 2)),
+        pose=(here.pose + np.array(shift)) % RINGS,
+    )
+    if shift[2]:
+        motion[:, :2] = 0  # another heading moves elsewhere
+    first, (a, _, _) = go(motion, here)
+    second, (b, _, _) = go(motion, there)
+    assert np.abs(posecells.around(b - a - shift, RINGS)).max() < 1e-9
+    assert np.allclose(jnp.roll(first.activity, (shift[2], shift[1], shift[0]), (0, 1, 2)), second.activity, atol=1e-10)
+
+
+@pytest.mark.parametrize("energy", [0.15, 0.3])
+@pytest.mark.parametrize("distance", [0.7, 2.3, 4.0, 7.0])
+@pytest.mark.parametrize("speed", [0.0, 0.02])
+def test_feedback_never_undoes_a_closure(settled, speed, distance, energy):
+    """Where recall wins or pulls without feedback, it does so with feedback, and as far."""
+    at = (np.asarray(settled.pose) + [0, distance, 0.4]) % RINGS
+    injections = {0: (at, energy), 1: (at, 0.7 * energy)}
+    motion = np.tile([speed, 0, 0], (80, 1))
+    open_loop = CONFIG.model_copy(update={"settle_steps": 10**6})
+    _, (free, _, _) = go(motion, settled, injections, open_loop)
+    _, (fed, _, _) = go(motion, settled, injections)
+    pulled, kept = travelled(settled.pose, free)[1], travelled(settled.pose, fed)[1]
+    assert abs(kept - pulled) < 0.3
+    if abs(pulled) > 0.5:
+        assert kept > 0.85 * pulled
+
+
+def test_a_hundred_injections_at_once_settle():
+    stream = np.random.default_rng(3)
+    cells = posecells.start(CONFIG, np.dtype(float))
+    activity = cells.activity
+    for at in stream.random((100, 3)) * RINGS:
+        activity = posecells.deposit(activity, jnp.asarray(at), jnp.asarray(0.15))
+    after, (poses, outcomes, _) = go(np.zeros((150, 3)), cells._replace(activity=activity))
+    assert float((after.activity > 0).sum()) < 500
+    assert np.isfinite(poses).all()
+    assert not np.any(outcomes)
+
+
+def test_too_much_motion_is_cut_and_named(settled):
+    after, (poses, outcomes, _) = go([[1e6, 0, 0], [0, 0, 1e9]], settled)
+    assert list(outcomes) == [Outcome.TOO_FAST] * 2
+    assert np.isfinite(poses).all()
+    assert float(after.activity.min()) >= 0
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_standing_still_stays(settled, dtype):
+    start = jax.tree.map(lambda leaf: leaf.astype(dtype) if leaf.dtype == float else leaf, settled)
+    _, (poses, outcomes, _) = go(np.zeros((2000, 3)), start, dtype=dtype)
+    assert np.abs(np.asarray(poses[-1]) - np.asarray(settled.pose)).max() < 1e-3
+    assert not np.any(outcomes)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_standing_still_for_a_hundred_thousand_steps(settled, dtype):
+    start = jax.tree.map(lambda leaf: leaf.astype(dtype) if leaf.dtype == float else leaf, settled)
+    _, (poses, outcomes, _) = go(np.zeros((100_000, 3)), start, dtype=dtype)
+    assert np.abs(np.asarray(poses[-1]) - np.asarray(settled.pose)).max() < 1e-3
+    assert np.isfinite(poses).all()
+    assert not np.any(outcomes)
+
+
+def test_float32_makes_the_same_step(settled):
+    """Teacher-forced: both precisions from the same state, since whole runs diverge (weak chaos)."""
+    stream = np.random.default_rng(5)
+    cells, worst_pose, worst_activity = settled, 0.0, 0.0
+    for _ in range(100):
+        motion = stream.normal(0, 0.5, (1, 3))
+        inject = {0: (stream.random(3) * RINGS, 0.1)} if stream.random() < 0.1 else {}
+        narrow = jax.tree.map(lambda leaf: leaf.astype(np.float32) if leaf.dtype == float else leaf, cells)
+        low, (pose32, _, _) = go(motion, narrow, inject, dtype=np.float32)
+        cells, (pose64, _, _) = go(motion, cells, inject)
+        gap = posecells.around(np.asarray(pose32[0], float) - np.asarray(pose64[0]), RINGS)
+        worst_pose = max(worst_pose, np.abs(gap).max())
+        worst_activity = max(worst_activity, float(np.abs(np.asarray(low.activity, float) - cells.activity).max()))
+    assert worst_pose <= 5e-6
+    assert worst_activity <= 1e-7
