@@ -1,7 +1,7 @@
 """What every pose cell network here does alike: the attractor and the decoding of its packet (section 4).
 
-The activity is P[heading, y, x]. Only a small part of it is ever active, so the attractor works on the block of
-those layers, rows and columns that can become active; the cells left out are exactly zero before and after.
+The activity is P[heading, y, x]. Only a small part of it is ever active, so the attractor works on the block
+of those layers, rows and columns that can become active; the cells left out are exactly zero throughout.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ class Pose(NamedTuple):
 
 
 def gaussian(width: int, deviation: float) -> Array:
-    """One axis of the normalised Gaussian on a cube of `width` cells; the cube is the outer product of three."""
+    """One axis of the normalised Gaussian on a cube of `width` cells, which is the product of three."""
     r = np.arange(width) - width // 2
     taps = np.exp(-(r**2) / (2 * deviation**2))
     return taps / taps.sum()
 
 
 def circulant(taps: Array, n: int) -> Array:
-    """The matrix that convolves a ring of n cells with `taps`; wider kernels than the ring overlap themselves."""
+    """The matrix that convolves a ring of n cells; a kernel wider than the ring overlaps itself."""
     matrix = np.zeros((n, n))
     cells = np.arange(n)
     for offset, tap in enumerate(taps, start=-(len(taps) // 2)):
@@ -80,7 +80,7 @@ class Attractor:
 
 
 def decode(P: Array, peak: tuple[int, ...]) -> Pose:
-    """Circular means of the marginal sums over the box around `peak`, each in [0, n] as rounding will have it.
+    """Circular means of the marginal sums over the box around `peak`, each in [0, n]; n by rounding only.
 
     The box visits cells twice where an axis is shorter than it.
     """

@@ -79,8 +79,7 @@ class Report:
 class Follower:
     """Chooses the injected cell: truncation, or the recorded cell where rounding alone decides (Q2).
 
-    An independent double implementation cannot hit such edges by design, and one cell taken differently moves the
-    packet for the rest of the run.
+    One cell taken differently moves the packet for the rest of the run.
     """
 
     def __init__(self, trace: Trace) -> None:
@@ -203,12 +202,17 @@ def _compare_snapshot(report: Report, engine: Engine, trace: Trace, name: str) -
         report.note("map", engine.map_table(), trace.arrays[name], rings)
 
 
+def _by_ends(links: Array) -> Array:
+    """Links by their two nodes: recorded in the order they were made, kept by node."""
+    return links[np.lexsort((links[:, 1], links[:, 0]))]
+
+
 def _compare_tables(report: Report, engine: Engine, trace: Trace) -> None:
     """Links and templates at the end."""
     N, K = trace.params.pc_dim_xy, trace.params.pc_dim_th
     if "links" in trace.arrays:
-        ours, theirs = (t[np.lexsort((t[:, 1], t[:, 0]))] for t in (engine.link_table(), trace.arrays["links"]))
-        report.note("links", ours, theirs, np.array([inf, inf, inf, 2 * pi, 2 * pi, inf]))
+        rings = np.array([inf, inf, inf, 2 * pi, 2 * pi, inf])
+        report.note("links", _by_ends(engine.link_table()), _by_ends(trace.arrays["links"]), rings)
     if "vt_final" in trace.arrays:
         rings = np.array([inf, N, N, K, inf, inf])
         report.note("templates", engine.template_table(), trace.arrays["vt_final"], rings)

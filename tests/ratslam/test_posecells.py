@@ -112,7 +112,7 @@ def test_uniform_activity_dies_and_is_put_back(settled, level):
 @given(st.tuples(*[st.floats(0, 1, exclude_max=True)] * 3))
 def test_a_deposit_between_cells_is_excited_like_one_on_a_cell(share):
     """The peak of a deposit at its own point, read off between cells, does not depend on where it falls."""
-    pose = jnp.asarray([10, 10, 18]) + jnp.asarray(share)
+    pose = jnp.asarray([10.0, 10.0, 18.0]) + jnp.asarray(share)
     energy = posecells.excited_share(CONFIG, pose)
     assert 1 - 1e-9 <= float(energy) <= 1.5
     empty = jnp.zeros((36, 21, 21))
@@ -128,7 +128,7 @@ def test_the_torus_has_no_edge(shift):
     here = posecells.start(CONFIG, np.dtype(float))
     there = here._replace(
         activity=jnp.roll(here.activity, (shift[2], shift[1], shift[0]), (0, 1, 2)),
-        pose=(here.pose + np.array(shift)) % RINGS,
+        pose=(here.pose + np.array(shift, float)) % RINGS,
     )
     if shift[2]:
         motion[:, :2] = 0  # another heading moves elsewhere

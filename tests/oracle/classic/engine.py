@@ -146,7 +146,7 @@ class Engine:
         )
 
     def map_table(self) -> Array:
-        """Nodes as the recorded maps have them: id, x, y, heading, and the experience's cells and template."""
+        """Nodes as recorded: id, x, y, heading, and the experience's cells and template."""
         rows = zip(self.map.x, self.map.y, self.map.th, self.places.experiences, strict=True)
         table = [(k, x, y, th, *e.pose, e.template) for k, (x, y, th, e) in enumerate(rows)]
         return np.array(table, dtype=float).reshape(-1, 8)

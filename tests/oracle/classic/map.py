@@ -21,7 +21,7 @@ class Link(NamedTuple):
 
 
 class ExperienceMap:
-    """Nodes, directed links, and the odometry since the current node in the world frame of that moment (Q9)."""
+    """Nodes, links, and the odometry since the current node in the world frame of that moment (Q9)."""
 
     def __init__(self, params: Params) -> None:
         self.correction = params.exp_correction

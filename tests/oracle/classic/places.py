@@ -111,7 +111,7 @@ class Places:
         self.moved = True
 
     def delta(self, experience: Experience) -> float:
-        """Distance in cells between the packet and an experience; metres and degrees are summed alike (Q23)."""
+        """Distance in cells between the packet and an experience; metres and degrees count alike (Q23)."""
         best, there = self.network.best, experience.pose
         N, K = self.params.pc_dim_xy, self.params.pc_dim_th
         heading = into_ring(best.th - self.delta_heading, K)
