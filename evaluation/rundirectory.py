@@ -61,7 +61,9 @@ def _places(path: Path) -> np.ndarray:
     try:
         return np.array([int(line.split(",")[column]) for line in lines], int)
     except (ValueError, IndexError):
-        raise InputError(str(path), "rows without a place", "the columns t,template,match_error,place,...") from None
+        raise InputError(
+            str(path), "rows without a place", "the columns t,template,match_error,place,..."
+        ) from None
 
 
 def _map(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -73,5 +75,7 @@ def _map(path: Path) -> tuple[np.ndarray, np.ndarray]:
         nodes = [[node["x"], node["y"], node["heading"]] for node in content["nodes"]]
         links = [[link["source"], link["target"]] for link in content.get("edges", content.get("links"))]
     except (ValueError, KeyError, TypeError) as error:
-        raise InputError(str(path), f"not a node-link map ({error})", "the map.json of a run directory") from None
+        raise InputError(
+            str(path), f"not a node-link map ({error})", "the map.json of a run directory"
+        ) from None
     return np.array(nodes, float).reshape(-1, 3), np.array(links, int).reshape(-1, 2)

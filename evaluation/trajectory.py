@@ -13,7 +13,7 @@ import numpy as np
 
 from evaluation.table import read_table
 from tactile.errors import InputError
-from tactile.frames import between, compose, wrap, tum_line
+from tactile.frames import between, compose, tum_line, wrap
 
 _TUM = {name: () for name in ("t", "x", "y", "z", "qx", "qy", "qz", "qw")}
 

@@ -6,7 +6,9 @@ the map never sees the kernel's state, so the kernel can be scanned, batched and
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Protocol
 
 import networkx
 import numpy as np
@@ -20,15 +22,6 @@ Evidence = Any
 """The backend's own fixed-shape record of one step, a NamedTuple of arrays."""
 
 
-class Capacity(NamedTuple):
-    """How much of what a kernel has used. Both are functions of the number of steps alone."""
-
-    size: int
-    """Rows in the kernel's growing arrays, a power of two."""
-    per_step: int
-    """Rows one step can use at most."""
-
-
 class Map(Protocol):
     """The host side: folds one step at a time and answers in the map frame."""
 
@@ -38,8 +31,14 @@ class Map(Protocol):
     def pose(self, estimate: Estimate) -> np.ndarray:
         """[3] the robot's present pose in the map frame: x m, y m, heading rad."""
 
+    def trajectory(self) -> np.ndarray:
+        """[T, 3] every folded step as the map sees it now."""
+
     def graph(self) -> networkx.DiGraph:
         """The map as a graph (empty for maps without nodes)."""
+
+    def files(self) -> dict[str, Callable[[Path], None]]:
+        """What the map leaves in a run directory: names, and how each is written."""
 
     def arrays(self) -> dict[str, np.ndarray]:
         """All of its state, for a checkpoint."""

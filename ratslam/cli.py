@@ -106,7 +106,8 @@ def _prepare_jax() -> None:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="ratslam", description="Maps and localises by view or whisker: pose cells, templates, experience map."
+        prog="ratslam",
+        description="Maps and localises by view or whisker: pose cells, templates, experience map.",
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
@@ -117,20 +118,28 @@ def _parser() -> argparse.ArgumentParser:
 
     run = command("run", _run, "run a configuration and score what comes out")
     run.add_argument("config", help="the YAML file")
-    run.add_argument("-o", "--output", type=Path, metavar="DIR", help="new run directory (default runs/<config>)")
+    run.add_argument(
+        "-o", "--output", type=Path, metavar="DIR", help="new run directory (default runs/<config>)"
+    )
     run.add_argument(
         "--set", action="append", default=[], metavar="a.b=value", help="override a setting; may be repeated"
     )
     run.add_argument(
         "--continue", dest="resume", type=Path, metavar="NPZ",
-        help="go on from the map.npz of an earlier run: in the same recording where it stopped, in another from its start",
+        help="go on from the map.npz of an earlier run: where it stopped in the same recording, else from the start",
     )  # fmt: skip
 
-    score = command("score", _score, "score a run directory, or any log: a CSV of time, experience id, true pose")
+    score = command(
+        "score", _score, "score a run directory, or any log: a CSV of time, experience id, true pose"
+    )
     score.add_argument("log", type=Path, help="run directory or CSV (t, id, x, y, theta)")
-    score.add_argument("--mode", choices=("strict", "paper", "or", "literal"), default="strict", help="of the ExM")
+    score.add_argument(
+        "--mode", choices=("strict", "paper", "or", "literal"), default="strict", help="of the ExM"
+    )
     score.add_argument("--base", type=int, help="last step of the base set (default: the first return)")
-    score.add_argument("--relations", type=Path, help="file of true relative poses (t1,t2,x,y,z,roll,pitch,yaw)")
+    score.add_argument(
+        "--relations", type=Path, help="file of true relative poses (t1,t2,x,y,z,roll,pitch,yaw)"
+    )
     score.add_argument("--json", action="store_true", help="print JSON instead of a table")
 
     recover = command("recover", _recover, "make a complete recording of one that was cut off")

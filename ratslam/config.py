@@ -25,7 +25,7 @@ class SessionConfig(Settings):
     seed: NonNegativeInt = 0
     """Of every random stream."""
     reserve: Annotated[int, Field(ge=0, le=2**24)] = 0
-    """Rows of memory made room for at the start; 0 grows as needed, which compiles anew at each power of two."""
+    """Rows of memory made room for at the start; 0 grows as needed and compiles anew at each power of two."""
 
 
 class ScoreConfig(Settings):
@@ -60,5 +60,8 @@ class RunConfig(Settings):
     def rat(self) -> RatConfig:
         """The rat backend's part."""
         return RatConfig(
-            pose_cells=self.pose_cells, templates=self.templates, places=self.places, experience=self.experience
+            pose_cells=self.pose_cells,
+            templates=self.templates,
+            places=self.places,
+            experience=self.experience,
         )

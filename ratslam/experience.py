@@ -7,12 +7,16 @@ node it starts from. Source: Milford & Wyeth 2004; Ball et al. 2013, section 6.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
 import networkx
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
+from ratslam.backend import Evidence
+from ratslam.graphfile import write_g2o, write_json
 from ratslam.growing import Growing
 from ratslam.posegraph import Edges, geman_mcclure, huber, least_squares, no_kernel
 from ratslam.relaxation import relax
@@ -124,7 +128,9 @@ class ExperienceMap:
     def edges(self) -> Edges:
         """All links: ends, motion and information."""
         ends = self._ends.rows
-        return Edges(ends[:, 0].copy(), ends[:, 1].copy(), self._motion.rows.copy(), self._information.rows.copy())
+        return Edges(
+            ends[:, 0].copy(), ends[:, 1].copy(), self._motion.rows.copy(), self._information.rows.copy()
+        )
 
     def trajectory(self) -> np.ndarray:
         """[T, 3] every folded step as the map sees it now: final pose of its node and the motion since."""
@@ -136,7 +142,7 @@ class ExperienceMap:
 
     def graph(self) -> networkx.DiGraph:
         """Nodes with x, y (m), heading (rad), template; links with dx, dy, dtheta and their evidence."""
-        graph = networkx.DiGraph()
+        graph: networkx.DiGraph = networkx.DiGraph()
         for node, (pose, template) in enumerate(zip(self._pose.rows, self._template.rows, strict=True)):
             x, y, heading = map(float, pose)
             graph.add_node(node, x=x, y=y, heading=heading, template=int(template))
@@ -149,9 +155,16 @@ class ExperienceMap:
             )  # fmt: skip
         return graph
 
+    def files(self) -> dict[str, Callable[[Path], None]]:
+        """The map as node-link JSON and as a g2o graph."""
+        return {
+            "map.json": lambda path: write_json(path, self.graph()),
+            "map.g2o": lambda path: write_g2o(path, self.nodes(), self.edges()),
+        }
+
     # What changes it
 
-    def update(self, observation: Observation, estimate: Estimate, evidence: NamedTuple) -> None:
+    def update(self, observation: Observation, estimate: Estimate, evidence: Evidence) -> None:
         """Moves along the odometry, then creates, links or sets as the estimate says."""
         self._advance(observation.odometry)
         action, place = int(estimate.action), int(estimate.place)
@@ -239,7 +252,11 @@ class ExperienceMap:
     def _solve(self) -> None:
         solver = self.config.solver
         if isinstance(solver, LeastSquares):
-            kernels = {"none": no_kernel, "huber": huber(solver.scale), "geman_mcclure": geman_mcclure(solver.scale**2)}
+            kernels = {
+                "none": no_kernel,
+                "huber": huber(solver.scale),
+                "geman_mcclure": geman_mcclure(solver.scale**2),
+            }
             solution = least_squares(
                 self._pose.rows, self.edges(), kernel=kernels[solver.kernel], robust=self._closure.rows
             )
@@ -269,7 +286,7 @@ class ExperienceMap:
         """Everything, so that `restore` continues bit for bit."""
         travel = self._travel
         return {name: rows.rows.copy() for name, rows in self._growing().items()} | {
-            "current": np.int64(self._current),
+            "current": np.array(self._current),
             "travel": np.concatenate([travel.motion, travel.variance, [travel.length, travel.duration]]),
         }
 

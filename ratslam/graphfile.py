@@ -46,18 +46,22 @@ def read_g2o(path: Path) -> tuple[np.ndarray, Edges]:
                 rows.append((i, j, values))
         except (ValueError, IndexError):
             raise InputError(
-                f"{path}:{number}", repr(line), "VERTEX_SE2 id x y th, or EDGE_SE2 i j x y th and 6 information entries"
+                f"{path}:{number}",
+                repr(line),
+                "VERTEX_SE2 id x y th, or EDGE_SE2 i j x y th and 6 information entries",
             ) from None
     row = {node: k for k, node in enumerate(sorted(poses))}
     unknown = next((node for i, j, _ in rows for node in (i, j) if node not in row), None)
     if unknown is not None:
-        raise InputError(str(path), f"an edge to node {unknown}, which has no vertex", "a vertex for every node")
-    values = np.array([values for _, _, values in rows]).reshape(-1, 9)
+        raise InputError(
+            str(path), f"an edge to node {unknown}, which has no vertex", "a vertex for every node"
+        )
+    measured = np.array([values for _, _, values in rows]).reshape(-1, 9)
     information = np.zeros((len(rows), 3, 3))
     for k, (a, b) in enumerate(UPPER):
-        information[:, a, b] = information[:, b, a] = values[:, 3 + k]
+        information[:, a, b] = information[:, b, a] = measured[:, 3 + k]
     i, j = (np.array([row[edge[k]] for edge in rows], int) for k in (0, 1))
-    return np.array([poses[node] for node in row]).reshape(-1, 3), Edges(i, j, values[:, :3], information)
+    return np.array([poses[node] for node in row]).reshape(-1, 3), Edges(i, j, measured[:, :3], information)
 
 
 def write_json(path: Path, graph: networkx.DiGraph) -> None:
@@ -73,7 +77,9 @@ def read_json(path: Path) -> networkx.DiGraph:
         InputError: it is not one.
     """
     try:
-        return networkx.node_link_graph(json.loads(Path(path).read_text(encoding="utf-8")), edges="edges")
+        return networkx.node_link_graph(
+            json.loads(Path(path).read_text(encoding="utf-8")), directed=True, edges="edges"
+        )
     except (ValueError, KeyError, TypeError, networkx.NetworkXException) as error:
         raise InputError(str(path), f"not a node-link graph ({error})", "the map.json of a run") from None
 

@@ -97,7 +97,9 @@ def decide(
 
     travelled = (reach | create) & (previous >= 0)
     pair = jnp.stack([previous, place])
-    joined = jnp.any(jnp.all(store.link == pair[None, :], axis=1) | jnp.all(store.link == pair[None, ::-1], axis=1))
+    joined = jnp.any(
+        jnp.all(store.link == pair[None, :], axis=1) | jnp.all(store.link == pair[None, ::-1], axis=1)
+    )
     new_link = travelled & ~joined & (store.links < capacity)
     at = jnp.minimum(store.links, capacity - 1)
     end = jnp.minimum(store.count, capacity - 1)

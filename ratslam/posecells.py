@@ -16,7 +16,7 @@ from typing import Annotated, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from pydantic import Field, PositiveFloat, PositiveInt
+from pydantic import AfterValidator, Field, PositiveFloat, PositiveInt
 
 from tactile.settings import Settings
 from tactile.types import Array, Odometry
@@ -32,7 +32,14 @@ MOST_PARTS = 256
 JUMP = 1.0
 """A packet that moved this much otherwise than told (cells) has jumped; it has not lagged behind."""
 
-OddWidth = Annotated[int, Field(ge=3, le=21, multiple_of=1)]
+
+def _odd(width: int) -> int:
+    if width % 2 == 0:
+        raise ValueError("must be odd, so that a kernel has a middle")
+    return width
+
+
+Width = Annotated[int, Field(ge=3, le=15), AfterValidator(_odd)]
 
 
 class Outcome(IntEnum):
@@ -58,11 +65,11 @@ class PoseCellConfig(Settings):
     """Cells around the heading ring."""
     cell_size: PositiveFloat = 0.1
     """Side of a cell, m."""
-    excite_width: Annotated[int, Field(ge=3, le=7)] = 7
+    excite_width: Width = 7
     """Cells across the excitation kernel, odd."""
     excite_sigma: PositiveFloat = 1.0
     """Standard deviation of excitation, cells."""
-    inhibit_width: Annotated[int, Field(ge=3, le=7)] = 5
+    inhibit_width: Width = 5
     """Cells across the inhibition kernel, odd."""
     inhibit_sigma: PositiveFloat = 2.0
     """Standard deviation of inhibition, cells."""
@@ -123,9 +130,8 @@ def units(config: PoseCellConfig, dtype: np.dtype) -> np.ndarray:
 
 def start(config: PoseCellConfig, dtype: np.dtype) -> PoseCells:
     """One packet's seed, a single cell, in the middle."""
-    pose = rings(config, dtype) // 2
+    pose = jnp.asarray(rings(config, dtype) // 2)
     activity = jnp.zeros((config.cells_heading, config.cells_xy, config.cells_xy), dtype)
-    pose = jnp.asarray(pose)
     return PoseCells(deposit(activity, pose, jnp.asarray(1, dtype)), pose, jnp.zeros(3, dtype), jnp.int32(0))
 
 
@@ -187,7 +193,9 @@ def attract(config: PoseCellConfig, table: Tables, activity: Array, seed: Array)
     total = jnp.sum(kept)
     dead = ~(total > 0)
     alive = kept / jnp.where(dead, 1.0, total)
-    return lax.cond(dead, lambda: deposit(jnp.zeros_like(alive), seed, jnp.ones_like(total)), lambda: alive), dead
+    return lax.cond(
+        dead, lambda: deposit(jnp.zeros_like(alive), seed, jnp.ones_like(total)), lambda: alive
+    ), dead
 
 
 def integrate(table: Tables, activity: Array, told: Array, lag: Array) -> Array:
@@ -247,7 +255,8 @@ def decode(activity: Array) -> tuple[Array, Array]:
     box = activity[at[0]][:, at[1]][:, :, at[2]]
     marginals = (jnp.sum(box, (0, 1)), jnp.sum(box, (0, 2)), jnp.sum(box, (1, 2)))
     means, spreads = zip(
-        *(_circular(m, i, size) for m, i, size in zip(marginals, at[::-1], (n, n, k), strict=True)), strict=True
+        *(_circular(m, i, size) for m, i, size in zip(marginals, at[::-1], (n, n, k), strict=True)),
+        strict=True,
     )
     return jnp.stack(means), jnp.stack(spreads)
 

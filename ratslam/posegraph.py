@@ -158,7 +158,9 @@ def least_squares(
         never NaN: where nothing better was found, the poses are those given.
     """
     poses = np.array(poses, float)
-    if not (np.isfinite(poses).all() and np.isfinite(edges.motion).all() and np.isfinite(edges.information).all()):
+    if not (
+        np.isfinite(poses).all() and np.isfinite(edges.motion).all() and np.isfinite(edges.information).all()
+    ):
         return Solution(poses, Ending.NOT_FINITE, 0, np.inf, np.ones(len(edges.i)))
     if len(edges.i) == 0 or len(poses) < 2:
         return Solution(poses, Ending.CONVERGED, 0, 0.0, np.ones(len(edges.i)))
@@ -254,7 +256,9 @@ def _unrolled(count: int, edges: Edges) -> np.ndarray:
     return heading
 
 
-def _laplacian(count: int, edges: Edges, weight: np.ndarray, change: np.ndarray, first: np.ndarray) -> np.ndarray:
+def _laplacian(
+    count: int, edges: Edges, weight: np.ndarray, change: np.ndarray, first: np.ndarray
+) -> np.ndarray:
     """[count, D] values whose differences j - i best equal `change` [E, D], value 0 held at `first` [D]."""
     if count < 2:
         return np.tile(first, (count, 1))
@@ -265,9 +269,7 @@ def _laplacian(count: int, edges: Edges, weight: np.ndarray, change: np.ndarray,
     loose = matrix.diagonal() == 0
     matrix = matrix + csc_matrix((np.full(count - 1, 1e-12) + loose, (range(count - 1), range(count - 1))))
     pull = weight[:, None] * change
-    right = np.stack(
-        [np.bincount(j, p, count)[1:] - np.bincount(i, p, count)[1:] for p in pull.T], axis=1
-    )
+    right = np.stack([np.bincount(j, p, count)[1:] - np.bincount(i, p, count)[1:] for p in pull.T], axis=1)
     return np.concatenate([np.zeros((1, len(first))), splu(matrix, permc_spec="COLAMD").solve(right)]) + first
 
 

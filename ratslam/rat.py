@@ -101,7 +101,10 @@ class Rat:
         match = self._match(state.templates, view, observation.label, seen)
         memory, energy = templates.recall(config.templates, state.templates, match, seen)
         memory, learnt = templates.learn(
-            memory, view.reshape(-1)[: memory.view.shape[0]], observation.label, state.cells.pose,
+            memory,
+            view.reshape(-1)[: memory.view.shape[0]],
+            observation.label,
+            state.cells.pose,
             seen & (match.template < 0),
         )
         relative = jnp.where(seen, match.relative, state.relative)
@@ -146,11 +149,16 @@ class Rat:
         odometry = Odometry(*(jnp.asarray(value, self.dtype) for value in observation.odometry))
         moves = jnp.stack(odometry[:3])
         fine = jnp.all(jnp.isfinite(moves))
-        odometry = Odometry(*jnp.where(fine, moves, 0.0), odometry.dt)
+        dx, dy, dtheta = jnp.where(fine, moves, 0.0)
+        odometry = Odometry(dx, dy, dtheta, odometry.dt)
         view = jnp.asarray(observation.view, self.dtype)
         visible = jnp.all(jnp.isfinite(view))
         view = templates.normalise(self.config.templates, jnp.where(visible, view, 0.0))
-        given = observation.label >= 0 if self.config.templates.source == "labels" else observation.view_seen & visible
+        given = (
+            observation.label >= 0
+            if self.config.templates.source == "labels"
+            else observation.view_seen & visible
+        )
         return odometry, view, given, fine & (visible | ~observation.view_seen)
 
 
@@ -163,24 +171,53 @@ def from_parameters(params: dict[str, Any], labels: bool) -> RatConfig:
     """
     names = {
         "pose_cells": {
-            "pc_dim_xy": "cells_xy", "pc_dim_th": "cells_heading", "pc_cell_x_size": "cell_size",
-            "pc_w_e_dim": "excite_width", "pc_w_e_var": "excite_sigma", "pc_w_i_dim": "inhibit_width",
-            "pc_w_i_var": "inhibit_sigma", "pc_global_inhib": "global_inhibition",
+            "pc_dim_xy": "cells_xy",
+            "pc_dim_th": "cells_heading",
+            "pc_cell_x_size": "cell_size",
+            "pc_w_e_dim": "excite_width",
+            "pc_w_e_var": "excite_sigma",
+            "pc_w_i_dim": "inhibit_width",
+            "pc_w_i_var": "inhibit_sigma",
+            "pc_global_inhib": "global_inhibition",
         },
         "templates": {
-            "vt_shift_match": "shift", "vt_step_match": "shift_step", "vt_panoramic": "panoramic",
-            "vt_match_threshold": "threshold", "vt_active_decay": "habituation", "pc_vt_restore": "recovery",
+            "vt_shift_match": "shift",
+            "vt_step_match": "shift_step",
+            "vt_panoramic": "panoramic",
+            "vt_match_threshold": "threshold",
+            "vt_active_decay": "habituation",
+            "pc_vt_restore": "recovery",
             "pc_vt_inject_energy": "energy",
         },
     }
     defaults = {
-        "pc_dim_xy": 21, "pc_dim_th": 36, "pc_cell_x_size": 1.0, "vt_shift_match": 25, "vt_step_match": 5,
-        "vt_match_threshold": 0.03, "vt_panoramic": 0, "exp_delta_pc_threshold": 2.0,
+        "pc_dim_xy": 21,
+        "pc_dim_th": 36,
+        "pc_cell_x_size": 1.0,
+        "vt_shift_match": 25,
+        "vt_step_match": 5,
+        "vt_match_threshold": 0.03,
+        "vt_panoramic": 0,
+        "exp_delta_pc_threshold": 2.0,
     }
     given = defaults | {name: float(value) for name, value in params.items()}
-    whole = {"pc_dim_xy", "pc_dim_th", "pc_w_e_dim", "pc_w_i_dim", "vt_shift_match", "vt_step_match", "vt_panoramic"}
+    whole = {
+        "pc_dim_xy",
+        "pc_dim_th",
+        "pc_w_e_dim",
+        "pc_w_i_dim",
+        "vt_shift_match",
+        "vt_step_match",
+        "vt_panoramic",
+    }
     given = {name: int(value) if name in whole else value for name, value in given.items()}
-    parts = {part: {ours: given[theirs] for theirs, ours in table.items() if theirs in given} for part, table in names.items()}
-    parts["templates"] |= {"source": "labels" if labels else "views", "panoramic": bool(given["vt_panoramic"])}
+    parts: dict[str, dict[str, Any]] = {
+        part: {ours: given[theirs] for theirs, ours in table.items() if theirs in given}
+        for part, table in names.items()
+    }
+    parts["templates"] |= {
+        "source": "labels" if labels else "views",
+        "panoramic": bool(given["vt_panoramic"]),
+    }
     radius = given["exp_delta_pc_threshold"]
     return RatConfig.model_validate({**parts, "places": {"radius": radius, "radius_heading": radius}})

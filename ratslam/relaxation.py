@@ -24,7 +24,7 @@ def relax(
     """Poses [N, 3] after `loops` sweeps over the links [L], from node `start` to node `end`.
 
     Args:
-        distance, heading: where `end` lies in the frame of `start`, m and rad. facing: its heading there, rad.
+        distance, heading: where `end` lies in the frame of `start`, m and rad. facing: its heading, rad.
         correction: share of a link's error that each of its ends takes.
     """
     # Plain floats: every link needs what the one before has moved, so there is nothing to vectorise.

@@ -20,7 +20,6 @@ from evaluation.rundirectory import read_run
 from evaluation.scorecard import Scorecard, score
 from evaluation.trajectory import write_tum
 from ratslam.config import RunConfig
-from ratslam.graphfile import write_g2o, write_json
 from ratslam.posecells import Outcome
 from ratslam.rat import Rat
 from ratslam.session import CHUNK, Session, Step
@@ -31,12 +30,15 @@ from robot.formats import open_recording
 from robot.source import Sample, Source
 from tactile.errors import InputError
 from tactile.frames import compose, tum_line
+from tactile.types import Cycle, Observation
 
 CHECKPOINT_EVERY = 32 * CHUNK
 """Steps between checkpoints: a kill loses no line, but a continued run repeats at most these."""
 
 
-def run(config: RunConfig, folder: Path, directory: Path, resume: Path | None = None) -> tuple[Scorecard, bool]:
+def run(
+    config: RunConfig, folder: Path, directory: Path, resume: Path | None = None
+) -> tuple[Scorecard, bool]:
     """Runs and scores.
 
     Args:
@@ -46,7 +48,8 @@ def run(config: RunConfig, folder: Path, directory: Path, resume: Path | None = 
         the scorecard, and whether the run was interrupted (its outputs are then of the part done).
 
     Raises:
-        InputError: the recording, the checkpoint or the run directory cannot be used. OSError: the disk is full.
+        InputError: the recording, the checkpoint or the run directory cannot be used.
+        OSError: the disk is full.
     """
     warn = _tell
     relations_file = config.score.relations
@@ -69,7 +72,9 @@ def run(config: RunConfig, folder: Path, directory: Path, resume: Path | None = 
             interrupted = _play(session, source, skip, store)
             done = {"status": "interrupted" if interrupted else "complete", "steps": session.steps}
             _finish(session, store, source.digest)
-            card = score(read_run(directory), directory.name, exm=config.score.experience_metric, relations=relations)
+            card = score(
+                read_run(directory), directory.name, exm=config.score.experience_metric, relations=relations
+            )
             store.text("scorecard.json", card.model_dump_json(indent=2) + "\n")
             store.file("map.png", lambda path: save_map(path, read_run(directory), card))
             store.manifest(manifest | done)
@@ -85,10 +90,11 @@ def _play(session: Session, source: Source, skip: int, store: RunDirectory) -> b
     try:
         with tqdm(total=total, unit="step", desc=source.name, file=sys.stderr, mininterval=0.5) as progress:
             while chunk := list(islice(samples, CHUNK - session.steps % CHUNK)):
-                steps = list(session.replay([sample.reading for sample in chunk]))
+                observations = [_observation(sample) for sample in chunk]
+                steps = list(session.replay(observations))
                 reckoned = []
-                for sample in chunk:
-                    moved = sample.reading.odometry
+                for observation in observations:
+                    moved = observation.odometry
                     odometry = compose(odometry, np.array([moved.dx, moved.dy, moved.dtheta]))
                     reckoned.append(odometry)
                 store.append(_lines(chunk, steps, reckoned))
@@ -101,6 +107,12 @@ def _play(session: Session, source: Source, skip: int, store: RunDirectory) -> b
         print("ratslam: interrupted; writing the results so far ...", file=sys.stderr)
         return True
     return False
+
+
+def _observation(sample: Sample) -> Observation:
+    if isinstance(sample.reading, Cycle):
+        raise InputError("recording.file", "raw whisker cycles", "observations", "process the whiskers first")
+    return sample.reading
 
 
 def _lines(samples: list[Sample], steps: list[Step], reckoned: list[np.ndarray]) -> dict[str, Iterator[str]]:
@@ -133,8 +145,8 @@ def _finish(session: Session, store: RunDirectory, digest: str) -> None:
     time = np.loadtxt(store.path / "online.tum", usecols=0, ndmin=1)
     final = session.map.trajectory()[session.steps - len(time) :]
     store.file("trajectory.tum", lambda path: write_tum(path, time, final))
-    store.file("map.json", lambda path: write_json(path, session.map.graph()))
-    store.file("map.g2o", lambda path: write_g2o(path, session.map.nodes(), session.map.edges()))
+    for name, write in session.map.files().items():
+        store.file(name, write)
 
 
 def _resume(session: Session, path: Path, digest: str) -> int:
@@ -149,7 +161,9 @@ def _resume(session: Session, path: Path, digest: str) -> int:
 
 def _check_length(source: Source, skip: int, resume: Path | None) -> None:
     if source.length is not None and source.length <= skip:
-        raise InputError(str(resume), f"already holds all {skip} samples of {source.name}", "a run left unfinished")
+        raise InputError(
+            str(resume), f"already holds all {skip} samples of {source.name}", "a run left unfinished"
+        )
 
 
 def _manifest(config: RunConfig, text: str, source: Source, resume: Path | None) -> dict[str, Any]:

@@ -49,7 +49,12 @@ class Session:
     """
 
     def __init__(
-        self, backend: Backend, *, seed: int = 0, reserve: int = 0, precision: Literal["float64", "float32"] = "float64"
+        self,
+        backend: Backend,
+        *,
+        seed: int = 0,
+        reserve: int = 0,
+        precision: Literal["float64", "float32"] = "float64",
     ) -> None:
         if precision == "float64":
             jax.config.update("jax_enable_x64", True)
@@ -77,7 +82,7 @@ class Session:
         return (
             {f"state/{k}": np.asarray(leaf) for k, leaf in enumerate(leaves)}
             | {f"map/{name}": value for name, value in self.map.arrays().items()}
-            | {"steps": np.int64(self.steps), "reserve": np.int64(self.reserve)}
+            | {"steps": np.array(self.steps), "reserve": np.array(self.reserve)}
         )
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
@@ -88,20 +93,22 @@ class Session:
         """
         steps, reserve = int(arrays["steps"]), int(arrays["reserve"])
         # The last chunk's capacity, not the next one's: growing is the next step's business.
-        like = jax.eval_shape(lambda: self.backend.init(jax.random.key(0), capacity_at(max(steps - 1, 0), reserve)))
-        leaves, tree = jax.tree.flatten(like)
+        like = jax.eval_shape(
+            lambda: self.backend.init(jax.random.key(0), capacity_at(max(steps - 1, 0), reserve))
+        )
+        leaves = jax.tree.leaves(like)
         saved = [arrays.get(f"state/{k}") for k in range(len(leaves))]
         for leaf, value in zip(leaves, saved, strict=True):
             if value is None or value.shape != leaf.shape or value.dtype != leaf.dtype:
                 raise ValueError("the checkpoint is of another configuration or view shape")
-        self.state = tree.unflatten([jnp.asarray(value) for value in saved])
+        self.state = jax.tree.unflatten(jax.tree.structure(like), [jnp.asarray(value) for value in saved])
         prefix = "map/"
         self.map.restore({k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)})
         self.steps, self.reserve = steps, reserve
 
     def compilations(self) -> int:
         """How often the chunk function was compiled: once per capacity."""
-        return self._run._cache_size()
+        return self._run._cache_size()  # type: ignore[attr-defined]
 
     def _advance(self, observations: list[Observation]) -> list[Step]:
         capacity = capacity_at(self.steps, self.reserve)
@@ -127,7 +134,9 @@ def capacity_at(step: int, reserve: int = 0) -> int:
     return 1 << (max(end, reserve, 256) - 1).bit_length()
 
 
-def run_chunk(kernel: Any, state: Any, chunk: Observation, count: Any) -> tuple[Any, tuple[Estimate, Evidence]]:
+def run_chunk(
+    kernel: Any, state: Any, chunk: Observation, count: Any
+) -> tuple[Any, tuple[Estimate, Evidence]]:
     """The kernel over the first `count` observations of a chunk; rows beyond are zero."""
 
     def at(k: Any) -> Observation:

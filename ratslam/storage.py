@@ -41,11 +41,15 @@ class RunDirectory:
         try:
             path.mkdir(parents=True)
         except OSError as error:
-            raise InputError(str(path), f"cannot be made ({error.strerror})", "a folder that can be written") from None
+            raise InputError(
+                str(path), f"cannot be made ({error.strerror})", "a folder that can be written"
+            ) from None
         self._streams: dict[str, TextIO] = {}
 
     def __enter__(self) -> RunDirectory:
-        self._streams = {name: (self.path / name).open("x", encoding="utf-8", newline="") for name in self.STREAMS}
+        self._streams = {
+            name: (self.path / name).open("x", encoding="utf-8", newline="") for name in self.STREAMS
+        }
         self._streams["steps.csv"].write(",".join(COLUMNS) + "\n")
         return self
 

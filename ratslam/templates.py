@@ -104,7 +104,9 @@ def normalise(config: TemplateConfig, view: Array) -> Array:
     """The view [R, C, K] as it is stored and compared (Ball et al. 2013: global, then patch)."""
     if config.normalise_mean:
         mean = jnp.mean(view)
-        view = jnp.where(mean > 0, jnp.clip(view * (config.normalise_mean / jnp.where(mean > 0, mean, 1.0)), 0, 1), view)
+        view = jnp.where(
+            mean > 0, jnp.clip(view * (config.normalise_mean / jnp.where(mean > 0, mean, 1.0)), 0, 1), view
+        )
     if config.patch:
         view = _patch_normalise(view, config.patch, config.patch_sd)
     return view
@@ -176,7 +178,9 @@ def recall(config: TemplateConfig, store: Templates, match: Match, seen: Array) 
     )
 
 
-def learn(store: Templates, view: Array, label: Array, packet: Array, novel: Array) -> tuple[Templates, Array]:
+def learn(
+    store: Templates, view: Array, label: Array, packet: Array, novel: Array
+) -> tuple[Templates, Array]:
     """Stores a novel view [D] where the packet [3] was; returns the store and whether it had room."""
     capacity = store.label.shape[0]
     room = store.count < capacity

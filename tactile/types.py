@@ -111,6 +111,8 @@ def observation(
 def stack(observations: Sequence[Observation]) -> Observation:
     """A chunk: the observations stacked along a new leading axis."""
     first = observations[0]
-    odometry = Odometry(*(np.stack(column) for column in zip(*(o.odometry for o in observations), strict=True)))
+    odometry = Odometry(
+        *(np.stack(column) for column in zip(*(o.odometry for o in observations), strict=True))
+    )
     columns = zip(*(o[1:] for o in observations), strict=True)
     return type(first)(odometry, *(np.stack(column) for column in columns))

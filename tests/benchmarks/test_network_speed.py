@@ -59,7 +59,10 @@ def test_a_network_iteration(benchmark, n):
         theirs.append(timed(lambda: [plain.step(0.2, 0.1) for _ in range(8)]) / 8)
     ratio = float(np.median(theirs) / np.median(ours))
     benchmark.extra_info.update(
-        us_ours=np.median(ours) * 1e6, us_numpy=np.median(theirs) * 1e6, ratio=ratio, ratio_to_cpp=ratio / FACTOR[n]
+        us_ours=np.median(ours) * 1e6,
+        us_numpy=np.median(theirs) * 1e6,
+        ratio=ratio,
+        ratio_to_cpp=ratio / FACTOR[n],
     )
     print(
         f"\n{n} x {n} x 36: {np.median(ours) * 1e6:.0f} us, NumPy {np.median(theirs) * 1e6:.0f} us, "

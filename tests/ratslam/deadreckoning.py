@@ -67,6 +67,9 @@ class Reckoned:
     def graph(self):
         return networkx.DiGraph()
 
+    def files(self):
+        return {}
+
     def arrays(self):
         return {"path": np.array(self.path)}
 

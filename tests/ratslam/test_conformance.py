@@ -18,7 +18,9 @@ VIEW = (3, 6, 1)
 
 
 def _dead_reckoning():
-    spec = importlib.util.spec_from_file_location("deadreckoning", Path(__file__).with_name("deadreckoning.py"))
+    spec = importlib.util.spec_from_file_location(
+        "deadreckoning", Path(__file__).with_name("deadreckoning.py")
+    )
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module.DeadReckoning()
@@ -29,7 +31,9 @@ def _rat():
 
 
 def _rat_of_labels():
-    return Rat(RatConfig.model_validate({"pose_cells": {"cells_xy": 11}, "templates": {"source": "labels"}}), VIEW)
+    return Rat(
+        RatConfig.model_validate({"pose_cells": {"cells_xy": 11}, "templates": {"source": "labels"}}), VIEW
+    )
 
 
 BACKENDS = {"rat": _rat, "rat-labels": _rat_of_labels, "dead-reckoning": _dead_reckoning}
@@ -54,14 +58,19 @@ def walk(count: int, seed: int = 0):
 
 
 def equal(a, b) -> bool:
-    return all(np.array_equal(x, y, equal_nan=True) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+    return all(
+        np.array_equal(x, y, equal_nan=True)
+        for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    )
 
 
 def test_kernel_keeps_shapes_and_dtypes(make):
     backend = make()
     state = backend.init(jax.random.key(0), 256)
     after, estimate, _ = jax.jit(backend.kernel)(state, next(walk(1)))
-    kinds = [jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype, leaf.weak_type), tree) for tree in (state, after)]
+    kinds = [
+        jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype, leaf.weak_type), tree) for tree in (state, after)
+    ]
     assert kinds[0] == kinds[1]
     assert estimate.pose.shape == estimate.spread.shape == (3,)
     assert estimate.place.dtype == estimate.previous.dtype == estimate.action.dtype == np.int32

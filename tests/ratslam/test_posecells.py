@@ -61,7 +61,9 @@ def travelled(start, poses):
 def test_decoded_motion_is_the_motion_told(settled, speed, direction):
     angle = np.deg2rad(direction)
     count = int(np.ceil(20 / speed))
-    _, (poses, outcomes, _) = go(np.tile([speed * np.cos(angle), speed * np.sin(angle), 0], (count, 1)), settled)
+    _, (poses, outcomes, _) = go(
+        np.tile([speed * np.cos(angle), speed * np.sin(angle), 0], (count, 1)), settled
+    )
     moved = travelled(settled.pose, poses)
     heading = float(settled.pose[2]) * UNITS[2]
     told = count * speed * np.array([np.cos(angle + heading), np.sin(angle + heading)])
@@ -135,7 +137,9 @@ def test_the_torus_has_no_edge(shift):
     first, (a, _, _) = go(motion, here)
     second, (b, _, _) = go(motion, there)
     assert np.abs(posecells.around(b - a - shift, RINGS)).max() < 1e-9
-    assert np.allclose(jnp.roll(first.activity, (shift[2], shift[1], shift[0]), (0, 1, 2)), second.activity, atol=1e-10)
+    assert np.allclose(
+        jnp.roll(first.activity, (shift[2], shift[1], shift[0]), (0, 1, 2)), second.activity, atol=1e-10
+    )
 
 
 @pytest.mark.parametrize("energy", [0.15, 0.3])
@@ -204,6 +208,8 @@ def test_float32_makes_the_same_step(settled):
         cells, (pose64, _, _) = go(motion, cells, inject)
         gap = posecells.around(np.asarray(pose32[0], float) - np.asarray(pose64[0]), RINGS)
         worst_pose = max(worst_pose, np.abs(gap).max())
-        worst_activity = max(worst_activity, float(np.abs(np.asarray(low.activity, float) - cells.activity).max()))
+        worst_activity = max(
+            worst_activity, float(np.abs(np.asarray(low.activity, float) - cells.activity).max())
+        )
     assert worst_pose <= 5e-6
     assert worst_activity <= 1e-7

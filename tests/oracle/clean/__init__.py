@@ -1,0 +1,1 @@
+"""The semantics of `ratslam/README.md`, step by step, without OpenRatSLAM's quirks."""
