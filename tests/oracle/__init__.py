@@ -1,9 +1,6 @@
-"""The slow reference: RatSLAM in plain NumPy and Python, float64, written from the texts alone.
+"""The slow reference: the engine again, in plain NumPy and Python, written from the text alone.
 
-`classic` is OpenRatSLAM with every quirk, checked against recorded outputs of the compiled reference;
-`clean` is the quirk-free semantics of `ratslam/README.md`, which the engine itself is checked against.
-What both share lies beside them: the attractor (`cells`), the table of view differences (`views`), angles and
-rings (`circle`), parameters and streams.
-
-    python -m tests.oracle FILE.npz ... [--quirks on|off]
+Two engines live here. The *stock* one follows `openratslam.md` sections 1 to 5 with every quirk of section 7,
+and must reproduce the reference traces. The *plain* one follows "Semantics of the rat backend" in
+`ratslam/README.md`, and must agree with the JAX engine.
 """

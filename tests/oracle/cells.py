@@ -1,105 +1,185 @@
-"""What every pose cell network here does alike: the attractor and the decoding of its packet (section 4).
-
-The activity is P[heading, y, x]. Only a small part of it is ever active, so the attractor works on the block
-of those layers, rows and columns that can become active; the cells left out are exactly zero throughout.
-"""
+"""The pose cells: activity P[heading, y, x] on a torus (section 4; "3. Motion" of the engine's semantics)."""
 
 from __future__ import annotations
 
-from math import atan2, pi
-from typing import NamedTuple
+import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.oracle.params import Params
+from tests.oracle.trace import Array, Parameters
 
-Array = NDArray[np.float64]
-HALF_BOX = 3  # the packet is decoded from the 7 x 7 x 7 box around its peak
-
-
-class Pose(NamedTuple):
-    """A place on the torus, in cells."""
-
-    x: float
-    y: float
-    th: float
+Pose = tuple[float, float, float]
+Cell = tuple[int, int, int]
+BOX = 3  # half width of the box that is decoded
 
 
-def gaussian(width: int, deviation: float) -> Array:
-    """One axis of the normalised Gaussian on a cube of `width` cells, which is the product of three."""
-    r = np.arange(width) - width // 2
-    taps = np.exp(-(r**2) / (2 * deviation**2))
-    return taps / taps.sum()
+class NetworkDied(Exception):
+    """Nothing is left after the inhibition (Q6)."""
 
 
-def circulant(taps: Array, n: int) -> Array:
-    """The matrix that convolves a ring of n cells; a kernel wider than the ring overlaps itself."""
+def circulant(n: int, width: int, sigma: float) -> Array:
+    """One axis of the normalised Gaussian as a matrix: row = where it goes, column = where it comes from."""
+    reach = range(-(width // 2), width // 2 + 1)
+    weights = np.array([math.exp(-(o * o) / (2 * sigma * sigma)) for o in reach])
+    weights /= weights.sum()
     matrix = np.zeros((n, n))
-    cells = np.arange(n)
-    for offset, tap in enumerate(taps, start=-(len(taps) // 2)):
-        matrix[(cells + offset) % n, cells] += tap
+    for o, weight in zip(reach, weights, strict=True):
+        for source in range(n):
+            matrix[(source + o) % n, source] += weight
     return matrix
 
 
-def blur(block: Array, kernels: list[Array]) -> Array:
-    """The block convolved along heading, y and x."""
-    along_h, along_y, along_x = kernels
-    return np.tensordot(along_h, along_y @ (block @ along_x.T), axes=1)
-
-
-def reached(P: Array, reach: int) -> list[NDArray[np.intp]]:
-    """Per axis the indices that lie within `reach` cells of an active one, round the ring."""
-    spread = np.arange(-reach, reach + 1)
-    active = [np.flatnonzero(P.any(axis=others)) for others in ((1, 2), (0, 2), (0, 1))]
-    return [np.unique((a[:, None] + spread) % n) for a, n in zip(active, P.shape, strict=True)]
+def occupied(activity: Array) -> list[NDArray[np.intp]]:
+    """The indices along each axis at which anything is not zero."""
+    nonzero = activity != 0
+    return [np.flatnonzero(nonzero.any(axis=axes)) for axes in ((1, 2), (0, 2), (0, 1))]
 
 
 class Attractor:
-    """Local excitation, local inhibition and global inhibition, which keep one packet of activity alive."""
+    """Steps a to d of `on_odo`: excitation, inhibition, global inhibition; shared by both engines.
 
-    def __init__(self, params: Params) -> None:
-        excite = gaussian(params.pc_w_e_dim, params.pc_w_e_var)
-        inhibit = gaussian(params.pc_w_i_dim, params.pc_w_i_var)
-        shape = (params.pc_dim_th, params.pc_dim_xy, params.pc_dim_xy)
-        self.excite = [circulant(excite, n) for n in shape]
-        self.inhibit = [circulant(inhibit, n) for n in shape]
-        self.threshold = params.pc_global_inhib
-        self.reach = params.pc_w_e_dim // 2 + params.pc_w_i_dim // 2
-
-    def __call__(self, P: Array) -> tuple[Array, float]:
-        """Steps a to c: the activity after excitation and both inhibitions, and its sum."""
-        where = reached(P, self.reach)
-        excited = blur(P[np.ix_(*where)], [m[np.ix_(i, i)] for m, i in zip(self.excite, where, strict=True)])
-        inhibited = blur(excited, [m[np.ix_(i, i)] for m, i in zip(self.inhibit, where, strict=True)])
-        left = excited - inhibited
-        left = np.where(left >= self.threshold, left - self.threshold, 0.0)
-        out = np.zeros_like(P)
-        out[np.ix_(*where)] = left
-        return out, float(left.sum())
-
-
-def decode(P: Array, peak: tuple[int, ...]) -> Pose:
-    """Circular means of the marginal sums over the box around `peak`, each in [0, n]; n by rounding only.
-
-    The box visits cells twice where an axis is shorter than it.
+    The Gaussians are separable, and only the box of occupied cells, widened by both kernels, is computed:
+    everything outside it is exactly zero.
     """
-    span = np.arange(-HALF_BOX, HALF_BOX + 1)
-    th, y, x = ((centre + span) % n for centre, n in zip(peak, P.shape, strict=True))
-    box = P[np.ix_(th, y, x)]
-    K, N, _ = P.shape
-    return Pose(
-        x=_circular_mean(box.sum(axis=(0, 1)), x, N),
-        y=_circular_mean(box.sum(axis=(0, 2)), y, N),
-        th=_circular_mean(box.sum(axis=(1, 2)), th, K),
-    )
+
+    def __init__(self, parameters: Parameters) -> None:
+        p = parameters
+        self.global_inhibition = p.pc_global_inhib
+        lengths = (p.pc_dim_th, p.pc_dim_xy, p.pc_dim_xy)
+        self.excite = [circulant(n, p.pc_w_e_dim, p.pc_w_e_var) for n in lengths]
+        self.inhibit = [circulant(n, p.pc_w_i_dim, p.pc_w_i_var) for n in lengths]
+
+    def inhibited(self, activity: Array) -> Array:
+        """The activity after steps a, b and c, not yet normalised."""
+        here = occupied(activity)
+        excited = [np.flatnonzero((m[:, i] != 0).any(axis=1)) for m, i in zip(self.excite, here, strict=True)]
+        wide = [
+            np.flatnonzero((m[:, i] != 0).any(axis=1)) for m, i in zip(self.inhibit, excited, strict=True)
+        ]
+        box = activity[np.ix_(*here)]
+        box = along_axes([m[np.ix_(w, i)] for m, w, i in zip(self.excite, wide, here, strict=True)], box)
+        box = box - along_axes([m[np.ix_(w, w)] for m, w in zip(self.inhibit, wide, strict=True)], box)
+        box = np.where(box >= self.global_inhibition, box - self.global_inhibition, 0.0)
+        result = np.zeros_like(activity)
+        result[np.ix_(*wide)] = box
+        return result
 
 
-def _circular_mean(mass: Array, cells: NDArray[np.intp], n: int) -> float:
-    angle = 2 * pi * (cells + 1) / n
-    mean = atan2(mass @ np.sin(angle), mass @ np.cos(angle)) * n / (2 * pi) - 1
+def along_axes(matrices: list[Array], box: Array) -> Array:
+    """Apply one matrix per axis."""
+    k, j, i = matrices
+    box = np.tensordot(k, box, axes=(1, 0))
+    box = np.matmul(j, box)
+    return np.matmul(box, i.T)
+
+
+def translated_leaky(activity: Array, distance: float) -> Array:
+    """Step e: shift each heading layer, in the frame of its quadrant, with the corner that leaks (Q4).
+
+    Nothing checks that the shifts stay below one cell, so longer steps get negative weights (Q5).
+    """
+    headings, n, _ = activity.shape
+    result = np.zeros_like(activity)
+    layers = np.flatnonzero((activity != 0).any(axis=(1, 2)))
+    length = abs(distance)
+    angles = [k * (2 * math.pi / headings) + (math.pi if distance < 0 else 0.0) for k in layers]
+    quadrants = np.array([math.floor(2 * a / math.pi) for a in angles])
+    for q in np.unique(quadrants):
+        here = quadrants == q
+        rest = np.array([a for a, mine in zip(angles, here, strict=True) if mine]) - q * (math.pi / 2)
+        along_i = (length * np.sin(rest))[:, None, None]
+        along_j = (length * np.cos(rest))[:, None, None]
+        layer = np.rot90(activity[layers[here]], -q, axes=(1, 2))
+        wide = np.zeros((len(layer), n + 1, n + 1))
+        wide[:, :n, :n] = layer * ((1 - along_i) * (1 - along_j))
+        wide[:, :n, 1:] += layer * (along_i * (1 - along_j))
+        wide[:, 1:, :n] += layer * ((1 - along_i) * along_j)
+        wide[:, 1:, 1:] += layer * (along_i * along_j)
+        folded = wide[:, :n, :n].copy()
+        folded[:, 0, 1:] += wide[:, n, 1:n]
+        folded[:, 1:, 0] += wide[:, 1:n, n]
+        folded[:, 0, 0] += wide[:, n, n]
+        result[layers[here]] = np.rot90(folded, q, axes=(1, 2))
+    return result
+
+
+def rotated(activity: Array, angle: float) -> Array:
+    """Step f: shift along heading; a whole number of cells goes entirely with the upper one."""
+    if angle == 0:
+        return activity
+    cells = abs(angle) / (2 * math.pi / activity.shape[0])
+    sign = 1 if angle > 0 else -1
+    lower, upper = math.floor(cells), math.ceil(cells)
+    fraction = cells - lower if cells != lower else 1.0
+    shifted = np.roll(activity, sign * upper, axis=0) * fraction
+    return (1 - fraction) * np.roll(activity, sign * lower, axis=0) + shifted
+
+
+def box_around(activity: Array, peak: Cell) -> tuple[Array, list[NDArray[np.intp]]]:
+    """The wrapped box around a cell (k, j, i) and its indices; on a small torus it visits cells twice."""
+    reach = np.arange(-BOX, BOX + 1)
+    indices = [(c + reach) % n for c, n in zip(peak, activity.shape, strict=True)]
+    return activity[np.ix_(*indices)], indices
+
+
+def circular_mean(sums: Array, indices: NDArray[np.intp], n: int) -> float:
+    """Step g: the angle of the summed unit vectors in cells, counted from 1; n itself can come out."""
+    angles = 2 * math.pi * (indices + 1) / n
+    mean = math.atan2(float(sums @ np.sin(angles)), float(sums @ np.cos(angles))) * n / (2 * math.pi) - 1
     while mean < 0:
         mean += n
     while mean > n:
         mean -= n
     return mean
+
+
+def decoded(activity: Array) -> Pose:
+    """Step g: the pose (x, y, th) of the box around the first of the largest cells, k outermost."""
+    k, j, i = (int(c) for c in np.unravel_index(int(np.argmax(activity)), activity.shape))
+    box, (ks, js, xs) = box_around(activity, (k, j, i))
+    headings, n, _ = activity.shape
+    return (
+        circular_mean(box.sum(axis=(0, 1)), xs, n),
+        circular_mean(box.sum(axis=(0, 2)), js, n),
+        circular_mean(box.sum(axis=(1, 2)), ks, headings),
+    )
+
+
+class StockCells:
+    """Section 4: the stock engine's network and its decoded pose."""
+
+    def __init__(self, parameters: Parameters) -> None:
+        p = parameters
+        self.cell_size = p.pc_cell_x_size
+        self.attractor = Attractor(p)
+        start = (p.pc_dim_th // 2, p.pc_dim_xy // 2, p.pc_dim_xy // 2)
+        self.activity = np.zeros((p.pc_dim_th, p.pc_dim_xy, p.pc_dim_xy))
+        self.activity[start] = 1.0
+        self.best: Pose = (float(start[2]), float(start[1]), float(start[0]))
+
+    def inject(self, energy: float, pose: Pose, truncate: Callable[[Pose], Cell]) -> Cell | None:
+        """Raise the cell (x, y, th) that the pose truncates to; outside the grid the energy is lost (Q2)."""
+        i, j, k = truncate(pose)
+        headings, n, _ = self.activity.shape
+        if not (0 <= k < headings and 0 <= j < n and 0 <= i < n):
+            return None
+        self.activity[k, j, i] += energy
+        return i, j, k
+
+    def move(self, v: float, w: float, dt: float) -> None:
+        """`on_odo`: the steps a to g. The translation uses the heading before the rotation (Q13)."""
+        activity = self.attractor.inhibited(self.activity)
+        total = float(activity.sum())
+        if total <= 0:
+            raise NetworkDied("nothing is left of the activity: the stock engine aborts here")
+        activity = translated_leaky(activity / total, v * dt / self.cell_size)
+        self.activity = rotated(activity, w * dt)
+        self.best = decoded(self.activity)
+
+
+def truncated(pose: Pose) -> Cell:
+    """The cell that the stock engine injects into: towards zero, not to the nearest (Q2)."""
+    x, y, th = pose
+    return int(x), int(y), int(th)

@@ -1,218 +1,261 @@
-"""The classic oracle against what the compiled reference recorded for the same stream."""
+"""Run the stock engine on a trace and measure how far it is from what the file says."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
-from itertools import islice
-from math import inf, pi
 
 import numpy as np
 
-from tests.oracle.cells import Array, Pose
-from tests.oracle.classic.engine import Engine, Outcome
-from tests.oracle.classic.places import Cell, truncated
-from tests.oracle.trace import Row, Trace
+from tests.oracle.cells import Cell, NetworkDied, Pose, truncated
+from tests.oracle.engine import Step, StockEngine
+from tests.oracle.trace import Array, Trace, TraceError
 
-KNIFE_EDGE = 1e-6  # a coordinate this close to a whole number may be truncated either way (Q2)
-DUST = 1e-12  # activity that rounding alone can make or unmake
-
-DECISIONS = ("vt", "action", "src", "dest", "pc_exp", "em_exp", "n_vt", "n_exp", "n_links")
-TOLERANCE = {"view": 1e-12, "cells": 1e-9, "activity": 1e-12, "map": 1e-9, "links": 1e-9, "templates": 1e-9}
+POSE, ACTIVITY, ERROR = 1e-9, 1e-12, 1e-12
+KNIFE = 1e-6  # a stored coordinate that close to an integer does not decide its own cell
+DUST = 1e-12  # a cell that small can be exactly zero in another order of additions
+OUTPUTS = (
+    "vt", "vt_err", "rel_rad", "inj_energy", "inj_x", "inj_y", "inj_th", "best_x", "best_y", "best_th",
+    "max_act", "total", "min_act", "nnz", "vt_delta_pc_th", "delta_pc", "action", "src", "dest", "pc_exp",
+    "em_exp", "em_x", "em_y", "em_th", "acc_dx", "acc_dy", "acc_facing", "n_vt", "n_exp", "n_links",
+)  # fmt: skip
+NEEDED = {f"out_{name}" for name in OUTPUTS}
+NEEDED |= {"cells_final_idx_kyx", "cells_final_val", "map_final", "links", "vt_final"}
+HUGE = 1e300  # what a matching error is when nothing was compared
 
 
 @dataclass
 class Report:
-    """How far two runs of a stream lie apart.
-
-    Attributes:
-        name: of the stream.
-        steps: rows compared.
-        differing: rows in which a decision differs.
-        first: the first of them, in words.
-        deviation: the largest of each kind.
-        counts: rows whose number of active cells differs by more than dust.
-        dusty: rows whose number of active cells differs by dust.
-        followed: knife edges where the recorded cell was taken.
-        stopped: why a run ended early.
-    """
+    """The largest deviation of each kind, and the first decision that differs."""
 
     name: str
+    tolerances: dict[str, float]
     steps: int = 0
+    knife_edges: int = 0
+    dusty: int = 0
+    deviations: dict[str, float] = field(default_factory=dict)
     differing: int = 0
     first: str = ""
-    deviation: dict[str, float] = field(default_factory=lambda: dict.fromkeys(TOLERANCE, 0.0))
-    counts: int = 0
-    dusty: int = 0
-    followed: int = 0
-    stopped: str = ""
+
+    def decide(self, step: int | str, what: str, ours: object, theirs: object) -> bool:
+        """Note a decision; true if it is the same."""
+        same = ours == theirs
+        if not same:
+            self.differing += 1
+            self.first = self.first or f"{what} at {step}: {ours}, expected {theirs}"
+        return same
+
+    def measure(self, kind: str, ours: Array | float, theirs: Array | float, ring: float = 0.0) -> None:
+        """Note a deviation; around a ring where one is given. A NaN on one side only is infinitely far."""
+        a, b = np.asarray(ours, float), np.asarray(theirs, float)
+        if a.shape != b.shape:
+            self.deviations[kind] = math.inf
+            return
+        if not a.size:
+            return
+        d = np.abs(a - b)
+        if ring:
+            d = np.abs(np.minimum(d, np.abs(ring - d)))
+        d = np.where(np.isnan(a) & np.isnan(b), 0.0, np.where(np.isnan(d), math.inf, d))
+        self.deviations[kind] = max(self.deviations.get(kind, 0.0), float(d.max()))
 
     @property
-    def ok(self) -> bool:
-        """Every decision equal, every deviation tolerable."""
-        close = all(self.deviation[kind] <= limit for kind, limit in TOLERANCE.items())
-        return close and not (self.differing or self.counts or self.stopped)
-
-    def note(self, kind: str, ours: float | Array, theirs: float | Array, ring: float = inf) -> None:
-        """Keeps the largest difference of a kind; tables of different shapes are infinitely far apart."""
-        a, b = np.asarray(ours, dtype=float), np.asarray(theirs, dtype=float)
-        if a.shape != b.shape:
-            self.deviation[kind] = inf
-            return
-        apart = np.abs(a - b)
-        apart = np.minimum(apart, np.abs(ring - apart))
-        apart = np.where((a == b) | (np.isnan(a) & np.isnan(b)), 0.0, apart)
-        worst = float(np.nan_to_num(apart, nan=inf).max(initial=0.0))
-        self.deviation[kind] = max(self.deviation[kind], worst)
+    def agrees(self) -> bool:
+        """Every decision equal and every deviation within its tolerance."""
+        within = all(
+            self.deviations[k] <= limit for k, limit in self.tolerances.items() if k in self.deviations
+        )
+        return within and not self.differing
 
     def line(self) -> str:
-        """The comparison in one line."""
-        parts = [f"{self.name}: {self.steps} steps", f"{self.differing} decisions differ"]
-        parts += [f"{kind} {worst:.1e}" for kind, worst in self.deviation.items()]
-        parts.append(f"active counts differ {self.counts}")
-        parts += [f"by dust {self.dusty}"] if self.dusty else []
-        parts += [f"knife edges followed {self.followed}"] if self.followed else []
-        parts += [f"first at {self.first}"] if self.first else []
-        parts += [self.stopped] if self.stopped else []
-        return ", ".join(parts) + (": ok" if self.ok else ": DIFFERS")
+        """All of it in one line."""
+        parts = [f"{self.name}: {'ok' if self.agrees else 'DIFFERS'}, {self.steps} steps"]
+        parts += [f"{kind} {value:.1e}" for kind, value in self.deviations.items()]
+        parts.append(f"knife edges followed {self.knife_edges}")
+        parts.append(
+            f"decisions differing {self.differing}" + (f" (first: {self.first})" if self.first else "")
+        )
+        return ", ".join(parts)
+
+
+TOLERANCES = {
+    "packet": POSE,
+    "map": POSE,
+    "links": POSE,
+    "templates": POSE,
+    "activity": ACTIVITY,
+    "error": ERROR,
+}
 
 
 class Follower:
-    """Chooses the injected cell: truncation, or the recorded cell where rounding alone decides (Q2).
-
-    One cell taken differently moves the packet for the rest of the run.
-    """
+    """Chooses the cell of an injection, taking the file's where the coordinate is on the knife edge (Q2)."""
 
     def __init__(self, trace: Trace) -> None:
-        self.recorded = [trace.arrays[f"out_inj_{axis}"].astype(int) for axis in ("th", "y", "x")]
-        self.sizes = (trace.params.pc_dim_th, trace.params.pc_dim_xy, trace.params.pc_dim_xy)
-        self.row = 0
+        names = ("out_inj_x", "out_inj_y", "out_inj_th")
+        self.told = np.stack([trace.arrays[name] for name in names], axis=1).astype(int)
+        p = trace.parameters
+        self.rings = (p.pc_dim_xy, p.pc_dim_xy, p.pc_dim_th)
         self.followed = 0
+        self.step = 0
 
     def __call__(self, pose: Pose) -> Cell:
         own = truncated(pose)
-        th, y, x = (int(column[self.row]) for column in self.recorded)
-        recorded = (th, y, x)
-        if recorded == own:
-            return own
-        exact = (pose.th, pose.y, pose.x)
-        if min(recorded) < 0:  # recorded as lost: only possible beyond the last cell
-            recorded = self.sizes if any(_seam(c, n) for c, n in zip(exact, self.sizes, strict=True)) else own
-        elif not all(map(_possible, recorded, exact, self.sizes)):
-            return own
-        self.followed += recorded != own
-        return recorded
+        chosen = []
+        told = self.told[self.step]
+        outside = bool((told < 0).any())
+        for coordinate, cell, theirs, n in zip(pose, own, told, self.rings, strict=True):
+            near = round(coordinate)
+            if abs(coordinate - near) < KNIFE:
+                if outside and near % n == 0:
+                    cell = n  # lost: a coordinate of exactly n lies outside
+                elif not outside and theirs in (near % n, (near - 1) % n):
+                    cell = int(theirs)
+            chosen.append(cell)
+        self.followed += tuple(chosen) != own
+        return chosen[0], chosen[1], chosen[2]
 
 
-def _seam(coordinate: float, n: int) -> bool:
-    """Whether rounding can put a coordinate on either side of the ring's seam."""
-    return min(coordinate, abs(n - coordinate)) < KNIFE_EDGE
-
-
-def _possible(cell: int, coordinate: float, n: int) -> bool:
-    """Whether a coordinate can be truncated to a cell, give or take rounding."""
-    if _seam(coordinate, n):
-        return cell in (0, n - 1, n)
-    return cell in (int(coordinate - KNIFE_EDGE), int(coordinate + KNIFE_EDGE))
-
-
-def compare(trace: Trace, steps: int | None = None) -> Report:
-    """Runs a stream, or its first `steps` rows, and compares every number that was recorded."""
-    report = Report(trace.name)
-    follower = Follower(trace)
-    engine = Engine(trace.params, trace.given, follower)
-    for k, row in enumerate(islice(trace, steps)):
-        follower.row = k
+def stock(trace: Trace, steps: int | None = None) -> Report:
+    """The stock engine on (the first `steps` of) a trace, compared with what the file holds."""
+    if missing := sorted(NEEDED - trace.arrays.keys()):
+        raise TraceError(f"{trace.name}: nothing to compare with: no {', '.join(missing)} in the file")
+    engine, follow = StockEngine(trace.parameters), Follower(trace)
+    report = Report(trace.name, TOLERANCES)
+    for index, row in enumerate(trace.rows()):
+        if index == steps:
+            break
+        follow.step = index
         try:
-            outcome = engine.step(row)
-        except (ArithmeticError, ValueError) as error:
-            report.stopped = f"stopped at step {k}: {error}"
-            return report
-        report.steps += 1
-        _compare_row(report, engine, trace, row, k, outcome)
-        for kind in ("cells", "map"):
-            _compare_snapshot(report, engine, trace, f"{kind}_{k}")
+            step = engine.step(row, follow)
+        except (NetworkDied, ValueError) as error:
+            report.decide(index, "the engine stopped", str(error), "a whole run")
+            break
+        row_of(report, trace, engine, step, index, row.seen, row.odometry)
+        if f"cells_{index}_val" in trace.arrays:
+            cells(report, trace, engine, str(index))
+        if f"map_{index}" in trace.arrays:
+            nodes(report, trace, engine, str(index))
+        report.steps = index + 1
     if report.steps == len(trace):
-        _compare_snapshot(report, engine, trace, "cells_final")
-        _compare_snapshot(report, engine, trace, "map_final")
-        _compare_tables(report, engine, trace)
-    report.followed = follower.followed
+        final(report, trace, engine)
+    report.knife_edges = follow.followed
     return report
 
 
-def _compare_row(report: Report, engine: Engine, trace: Trace, row: Row, k: int, ours: Outcome) -> None:
-    """One row of the `out_` columns; what a row cannot tell is not compared.
+def row_of(
+    report: Report, trace: Trace, engine: StockEngine, step: Step, index: int, seen: bool, odometry: bool
+) -> None:
+    """Compare one row's outputs."""
+    out = {n.removeprefix("out_"): float(a[index]) for n, a in trace.arrays.items() if n.startswith("out_")}
+    activity, places, graph = engine.cells.activity, engine.places, engine.map
+    n, headings = trace.parameters.pc_dim_xy, trace.parameters.pc_dim_th
+    decisions: dict[str, float] = {
+        "action": step.action,
+        "pc_exp": places.experience,
+        "em_exp": graph.current,
+        "n_vt": len(places.memories),
+        "n_exp": len(places.experiences),
+        "n_links": len(graph.links),
+    }
+    count = int(np.count_nonzero(activity))
+    if count != out["nnz"] and dusty(activity, int(out["nnz"])):
+        report.dusty += 1
+    else:
+        decisions["nnz"] = count
+    if odometry:
+        decisions |= {"src": step.source, "dest": step.target}
+    if step.match is not None:
+        decisions["vt"] = step.match.template
+        injected = step.injected or (-1, -1, -1)
+        decisions |= dict(zip(("inj_x", "inj_y", "inj_th"), injected, strict=True))
+        report.measure("activity", step.energy, out["inj_energy"])
+        report.measure("packet", step.match.relative, out["rel_rad"], ring=2 * math.pi)
+        if not trace.labelled and not (step.match.error > HUGE and out["vt_err"] > HUGE):
+            report.measure("error", step.match.error, out["vt_err"])
+    for what, ours in decisions.items():
+        report.decide(index, what, ours, out[what])
+    for value, name, ring in zip(
+        engine.cells.best, ("best_x", "best_y", "best_th"), (n, n, headings), strict=True
+    ):
+        report.measure("packet", value, out[name], ring)
+    report.measure("packet", places.turned, out["vt_delta_pc_th"])
+    if odometry:
+        report.measure("packet", step.delta, out["delta_pc"])
+    for value, name in ((activity.max(), "max_act"), (activity.sum(), "total"), (activity.min(), "min_act")):
+        report.measure("activity", value, out[name])
+    here = graph.current
+    pose = (graph.x[here], graph.y[here], graph.th[here]) if graph.x else (math.nan,) * 3
+    report.measure("map", np.array(pose[:2]), np.array([out["em_x"], out["em_y"]]))
+    report.measure("map", pose[2], out["em_th"], ring=2 * math.pi)
+    report.measure("map", np.array([graph.dx, graph.dy]), np.array([out["acc_dx"], out["acc_dy"]]))
+    report.measure("map", graph.facing, out["acc_facing"], ring=2 * math.pi)
 
-    A row without a view has no match, and one without an action no source.
-    """
-    params = trace.params
-    theirs = Outcome(*(trace.arrays[f"out_{name}"][k] for name in Outcome._fields))
-    silent = (() if row.view is not None else ("vt",)) + (() if ours.action else ("src", "dest"))
-    differing = [name for name in DECISIONS if name not in silent]
-    lost = max(ours.inj_th - params.pc_dim_th, max(ours.inj_x, ours.inj_y) - params.pc_dim_xy) >= 0
-    if not lost:  # energy that falls outside the grid may be recorded as none
-        differing += ["inj_x", "inj_y", "inj_th"]
-        report.note("activity", ours.inj_energy, theirs.inj_energy)
-    differing = [name for name in differing if getattr(ours, name) != getattr(theirs, name)]
-    if differing:
-        report.differing += 1
-        name = differing[0]
-        report.first = report.first or f"step {k}: {name} {getattr(ours, name)} for {getattr(theirs, name):g}"
 
-    if row.view is not None:
-        report.note("view", ours.rel_rad, theirs.rel_rad, 2 * pi)
-        if not trace.given:
-            huge = max(abs(ours.vt_err), 1.0)
-            report.note("view", ours.vt_err / huge, theirs.vt_err / huge)
-    for name in ("max_act", "total", "min_act"):
-        report.note("activity", getattr(ours, name), getattr(theirs, name))
-    report.note("cells", [ours.best_x, ours.best_y], [theirs.best_x, theirs.best_y], params.pc_dim_xy)
-    headings = [ours.best_th, ours.vt_delta_pc_th], [theirs.best_th, theirs.vt_delta_pc_th]
-    report.note("cells", *headings, params.pc_dim_th)
-    if not np.isnan(ours.delta_pc):
-        report.note("cells", ours.delta_pc, theirs.delta_pc)
-    places = ("em_x", "em_y", "acc_dx", "acc_dy")
-    report.note("map", [getattr(ours, n) for n in places], [getattr(theirs, n) for n in places])
-    report.note("map", [ours.em_th, ours.acc_facing], [theirs.em_th, theirs.acc_facing], 2 * pi)
-    if ours.nnz != theirs.nnz:
-        explained = _only_dust(engine.places.network.P, theirs.nnz)
-        report.dusty += explained
-        report.counts += not explained
-
-
-def _only_dust(P: Array, recorded: float) -> bool:
-    """Whether cells that hold next to nothing explain another number of active cells.
-
-    Weights that are zero but for rounding leave dust beside active cells, here or there.
-    """
-    near = P != 0
+def dusty(activity: Array, count: int) -> bool:
+    """Whether a count of nonzero cells can be ours but for cells that rounding makes or unmakes."""
+    solid = np.abs(activity) > DUST
+    reach = solid
     for axis in range(3):
-        near = near | np.roll(near, 1, axis) | np.roll(near, -1, axis)
-    return bool((np.abs(P) > DUST).sum() <= recorded <= near.sum())
+        reach = reach | np.roll(reach, 1, axis) | np.roll(reach, -1, axis)
+    return int(solid.sum()) <= count <= int(reach.sum())
 
 
-def _compare_snapshot(report: Report, engine: Engine, trace: Trace, name: str) -> None:
-    """The whole network (`cells_`), or all nodes (`map_`), where they were recorded."""
-    if name.startswith("cells") and f"{name}_val" in trace.arrays:
-        P = np.zeros_like(engine.places.network.P)
-        P[tuple(trace.arrays[f"{name}_idx_kyx"].astype(int).T)] = trace.arrays[f"{name}_val"]
-        report.note("activity", engine.places.network.P, P)
-    if name.startswith("map") and name in trace.arrays:
-        N, K = trace.params.pc_dim_xy, trace.params.pc_dim_th
-        rings = np.array([inf, inf, inf, 2 * pi, N, N, K, inf])
-        report.note("map", engine.map_table(), trace.arrays[name], rings)
+def cells(report: Report, trace: Trace, engine: StockEngine, name: str) -> None:
+    """Compare the whole network."""
+    expected = np.zeros_like(engine.cells.activity)
+    expected[tuple(trace.arrays[f"cells_{name}_idx_kyx"].T.astype(int))] = trace.arrays[f"cells_{name}_val"]
+    report.measure("activity", engine.cells.activity, expected)
 
 
-def _by_ends(links: Array) -> Array:
-    """Links by their two nodes: recorded in the order they were made, kept by node."""
-    return links[np.lexsort((links[:, 1], links[:, 0]))]
+def columns(
+    report: Report, what: str, ours: list[tuple[float, ...]], theirs: Array, exact: int
+) -> Array | None:
+    """Our rows as an array, if their number and their first `exact` columns are the file's."""
+    if not report.decide(what, "number of rows", len(ours), len(theirs)):
+        return None
+    table = np.array(ours, float).reshape(len(ours), theirs.shape[1])
+    for row, (a, b) in enumerate(zip(table[:, :exact].tolist(), theirs[:, :exact].tolist(), strict=True)):
+        report.decide(f"{what} row {row}", "ids", a, b)
+    return table
 
 
-def _compare_tables(report: Report, engine: Engine, trace: Trace) -> None:
-    """Links and templates at the end."""
-    N, K = trace.params.pc_dim_xy, trace.params.pc_dim_th
-    if "links" in trace.arrays:
-        rings = np.array([inf, inf, inf, 2 * pi, 2 * pi, inf])
-        report.note("links", _by_ends(engine.link_table()), _by_ends(trace.arrays["links"]), rings)
-    if "vt_final" in trace.arrays:
-        rings = np.array([inf, N, N, K, inf, inf])
-        report.note("templates", engine.template_table(), trace.arrays["vt_final"], rings)
+def nodes(report: Report, trace: Trace, engine: StockEngine, name: str) -> None:
+    """Compare the nodes of the map and the experiences behind them."""
+    theirs = np.asarray(trace.arrays[f"map_{name}"], float)
+    graph, n, headings = engine.map, trace.parameters.pc_dim_xy, trace.parameters.pc_dim_th
+    ours = [
+        (e, graph.x[e], graph.y[e], graph.th[e], *place.packet, place.template)
+        for e, place in enumerate(engine.places.experiences)
+    ]
+    table = columns(report, f"map_{name}", ours, theirs, exact=1)
+    if table is None or not len(table):
+        return
+    for node, (a, b) in enumerate(zip(table[:, 7], theirs[:, 7], strict=True)):
+        report.decide(f"map_{name} node {node}", "template", a, b)
+    report.measure("map", table[:, 1:3], theirs[:, 1:3])
+    report.measure("map", table[:, 3], theirs[:, 3], ring=2 * math.pi)
+    report.measure("packet", table[:, 4:6], theirs[:, 4:6], ring=n)
+    report.measure("packet", table[:, 6], theirs[:, 6], ring=headings)
+
+
+def final(report: Report, trace: Trace, engine: StockEngine) -> None:
+    """Compare what is left at the end: network, map, links and templates."""
+    cells(report, trace, engine, "final")
+    nodes(report, trace, engine, "final")
+    theirs = np.asarray(trace.arrays["links"], float)
+    links = [(k.start, k.end, k.distance, k.heading, k.facing, k.time) for k in engine.map.links]
+    table = columns(report, "links", links, theirs, exact=2)
+    if table is not None:
+        report.measure("links", table[:, [2, 5]], theirs[:, [2, 5]])
+        report.measure("links", table[:, 3:5], theirs[:, 3:5], ring=2 * math.pi)
+    theirs = np.asarray(trace.arrays["vt_final"], float)
+    templates = [(t, *m.packet, m.decay, len(m.experiences)) for t, m in enumerate(engine.places.memories)]
+    table = columns(report, "vt_final", templates, theirs, exact=1)
+    if table is not None and len(table):
+        for template, (a, b) in enumerate(zip(table[:, 5], theirs[:, 5], strict=True)):
+            report.decide(f"vt_final template {template}", "experiences", a, b)
+        n, headings = trace.parameters.pc_dim_xy, trace.parameters.pc_dim_th
+        report.measure("templates", table[:, 1:3], theirs[:, 1:3], ring=n)
+        report.measure("templates", table[:, 3], theirs[:, 3], ring=headings)
+        report.measure("templates", table[:, 4], theirs[:, 4])

@@ -1,81 +1,119 @@
-"""A recorded stream: what went in row by row, and what the compiled reference made of it."""
+"""A trace: the parameters, the input rows and the recorded outputs of one `.npz` file."""
 
 from __future__ import annotations
 
 import json
 import zipfile
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from tests.oracle.cells import Array
-from tests.oracle.params import Params
+Array = NDArray[np.float64]
 
-VIEW, ODOMETRY = 1, 2  # bits of in_flags
-INPUTS = ("in_t", "in_v", "in_w", "in_flags", "in_view")
+VIEW, ODOMETRY = 1, 2
 
 
 class TraceError(Exception):
-    """A file that cannot be read as a stream, said in one line."""
+    """A file that is missing, unreadable or not a trace."""
 
 
-class Row(NamedTuple):
-    """One row: odometry (or its clock alone, in the first), a view, or both.
+@dataclass(frozen=True)
+class Parameters:
+    """Section 1: the parameters with their defaults; the widths and sigmas of the kernels are integers."""
 
-    Attributes:
-        time: s.
-        v: m/s.
-        w: rad/s.
-        moves: whether there is odometry.
-        view: pixels row by row, or (template id, relative heading); None without a view.
-    """
+    pc_dim_xy: int = 21
+    pc_dim_th: int = 36
+    pc_w_e_dim: int = 7
+    pc_w_i_dim: int = 5
+    pc_w_e_var: int = 1
+    pc_w_i_var: int = 2
+    pc_global_inhib: float = 2e-5
+    vt_active_decay: float = 1.0
+    pc_vt_restore: float = 0.05
+    pc_vt_inject_energy: float = 0.15
+    pc_cell_x_size: float = 1.0
+    exp_delta_pc_threshold: float = 2.0
+    template_x_size: int = 1
+    template_y_size: int = 1
+    vt_shift_match: int = 25
+    vt_step_match: int = 5
+    vt_match_threshold: float = 0.03
+    vt_panoramic: int = 0
+    exp_correction: float = 0.5
+    exp_loops: int = 10
+    exp_initial_em_deg: float = 90.0
 
-    time: float
+    @classmethod
+    def from_strings(cls, strings: Mapping[str, object]) -> Parameters:
+        """Read what is named, default the rest; names that only concern camera images are not ours."""
+        kinds = {field.name: int if field.type == "int" else float for field in fields(cls)}
+        return cls(**{name: kinds[name](str(text)) for name, text in strings.items() if name in kinds})
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of the input. `label` is a template decided elsewhere and its turn; both None: nothing seen."""
+
+    stamp: float
     v: float
     w: float
-    moves: bool
+    odometry: bool
     view: Array | None
+    label: tuple[int, float] | None
+
+    @property
+    def seen(self) -> bool:
+        """Whether the row holds a view at all, as an image or as a label."""
+        return self.view is not None or self.label is not None
 
 
 @dataclass(frozen=True)
 class Trace:
-    """A stream file."""
+    """One file. `arrays` holds everything in it under its own name."""
 
     name: str
-    params: Params
-    texts: dict[str, str]
-    given: bool
-    arrays: dict[str, Array]
+    parameters: Parameters
+    strings: dict[str, str]
+    labelled: bool
+    arrays: dict[str, NDArray[np.generic]]
 
     def __len__(self) -> int:
         return len(self.arrays["in_t"])
 
-    def __iter__(self) -> Iterator[Row]:
-        t, v, w, flags, views = (self.arrays[name] for name in INPUTS)
-        for k, flag in enumerate(flags.astype(int)):
-            view = views[k] if flag & VIEW and not np.isnan(views[k]).any() else None
-            yield Row(float(t[k]), float(v[k]), float(w[k]), bool(flag & ODOMETRY), view)
+    def rows(self) -> Iterator[Row]:
+        """The input rows in order; NaN means that no view was seen in the row."""
+        shape = (self.parameters.template_y_size, self.parameters.template_x_size)
+        columns = (self.arrays[name] for name in ("in_t", "in_v", "in_w", "in_flags", "in_view"))
+        for stamp, v, w, flags, seen in zip(*columns, strict=True):
+            view, label = None, None
+            if int(flags) & VIEW and not np.isnan(seen).any():
+                if self.labelled:
+                    label = (int(seen[0]), float(seen[1]))
+                else:
+                    view = seen.reshape(shape)
+            yield Row(float(stamp), float(v), float(w), bool(int(flags) & ODOMETRY), view, label)
 
 
-def read(path: Path) -> Trace:
-    """Reads a stream; views of two numbers are given ids, unless the templates are that small."""
-    if not path.is_file():
-        raise TraceError(f"{path}: no such file")
+def load(path: Path | str) -> Trace:
+    """Open a trace, or say in one line why that is not possible."""
+    path = Path(path)
     try:
-        with np.load(path) as file:
+        with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-        texts = json.loads(str(arrays.pop("params_json")))
-        params = Params.parse(texts)
-    except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
-        raise TraceError(f"{path}: not a readable stream: {error}") from error
-    if missing := [name for name in INPUTS if name not in arrays]:
-        raise TraceError(f"{path}: not a readable stream: no {', '.join(missing)}")
-    if len({len(arrays[name]) for name in INPUTS}) > 1 or arrays["in_view"].ndim != 2:
-        raise TraceError(f"{path}: not a readable stream: the inputs differ in length")
-    width, pixels = arrays["in_view"].shape[1], params.template_x_size * params.template_y_size
-    if width not in (pixels, 2):
-        raise TraceError(f"{path}: views of {width} numbers, for templates of {pixels} and ids of 2")
-    return Trace(path.name, params, texts, width != pixels, arrays)
+        strings = json.loads(str(arrays["params_json"][()]))
+        parameters = Parameters.from_strings(strings)
+        missing = [n for n in ("in_t", "in_v", "in_w", "in_flags", "in_view") if n not in arrays]
+        if missing:
+            raise TraceError(f"{path}: no {', '.join(missing)} in the file")
+    except KeyError as error:
+        raise TraceError(f"{path}: no {error.args[0]} in the file") from error
+    except (OSError, ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile) as error:
+        raise TraceError(f"{path}: {' '.join(str(error).split())}") from error
+    size = parameters.template_x_size * parameters.template_y_size
+    width = arrays["in_view"].shape[1] if arrays["in_view"].ndim == 2 else 0
+    if width not in (2, size):
+        raise TraceError(f"{path}: in_view has {width} columns, not {size} pixels or 2 (id, relative_rad)")
+    return Trace(path.stem, parameters, strings, width == 2 and size != 2, arrays)

@@ -1,71 +1,95 @@
-"""Views and how much two of them differ (section 3)."""
+"""Views and the templates they are compared with (section 3; "1. View" of the engine's semantics)."""
 
 from __future__ import annotations
 
-from math import pi
-from typing import NamedTuple
+import math
+import sys
+from dataclasses import dataclass
 
 import numpy as np
 
-from tests.oracle.cells import Array
-from tests.oracle.circle import wrap
-from tests.oracle.params import Params
+from tests.oracle.trace import Array, Parameters
+
+# What the stock engine starts its search with; it stays in the error when nothing was compared.
+NOTHING_COMPARED = sys.float_info.max
 
 
-class Match(NamedTuple):
-    """The template a view was taken for.
-
-    Attributes:
-        template: its id; the number of templates before if the view is new.
-        relative: heading of the view relative to the template, rad.
-        error: mean absolute difference to the best template there was, whether taken or not.
-    """
+@dataclass(frozen=True)
+class Match:
+    """Which template a view was taken for, at which error, turned by which angle in radians."""
 
     template: int
-    relative: float
     error: float
+    relative: float
+    novel: bool
 
 
-class Comparison:
-    """A view against stored ones at every offset that the parameters allow, as mean absolute differences."""
-
-    def __init__(self, params: Params) -> None:
-        self.rows, self.columns = params.template_y_size, params.template_x_size
-        self.panoramic = bool(params.vt_panoramic)
-        self.margin = 0 if self.panoramic else params.vt_shift_match
-        end = self.columns if self.panoramic else 2 * self.margin + 1
-        self.offsets = range(0, end, params.vt_step_match)
-        if self.columns <= 2 * self.margin:
-            raise ValueError(f"vt_shift_match {self.margin} leaves nothing of {self.columns} columns")
-        self.pixels = self.rows * (self.columns - 2 * self.margin)
-
-    def shape(self, view: Array) -> Array:
-        """A flat view as rows and columns."""
-        return view.reshape(self.rows, self.columns)
-
-    def errors(self, view: Array, stored: Array) -> Array:
-        """[template, offset] mean absolute differences of a view [y, x] from stored ones [template, y, x]."""
-        X, S = self.columns, self.margin
-        seen = view[:, S : X - S]
-        table = np.empty((len(stored), len(self.offsets)))
-        for n, o in enumerate(self.offsets):
-            shifted = np.roll(stored, -o, axis=2) if self.panoramic else stored[:, :, o : o + X - 2 * S]
-            table[:, n] = np.abs(seen - shifted).sum(axis=(1, 2))
-        return table / self.pixels
-
-    def turn(self, offset: int) -> float:
-        """Heading of a panoramic view found at `offset`, rad."""
-        return wrap(offset / self.columns * 2 * pi) if self.panoramic else 0.0
+def wrapped(angle: float) -> float:
+    """The angle in (-pi, pi]."""
+    while angle > math.pi:
+        angle -= 2 * math.pi
+    while angle <= -math.pi:
+        angle += 2 * math.pi
+    return angle
 
 
-class GivenViews:
-    """A stream whose views are already recognised: a row is (template id, relative heading)."""
+def offsets(parameters: Parameters) -> range:
+    """The offsets that are tried: around the ring, or up to twice the shift."""
+    if parameters.vt_panoramic:
+        return range(0, parameters.template_x_size, parameters.vt_step_match)
+    return range(0, 2 * parameters.vt_shift_match + 1, parameters.vt_step_match)
 
-    def __init__(self) -> None:
-        self.count = 0
 
-    def match(self, view: Array) -> Match:
-        """The id as given; a new one must be the next."""
-        template, relative = int(view[0]), float(view[1])
-        self.count = max(self.count, template + 1)
-        return Match(template, relative, 0.0)
+def compared_pixels(parameters: Parameters) -> int:
+    """How many pixels one comparison adds up."""
+    margin = 0 if parameters.vt_panoramic else 2 * parameters.vt_shift_match
+    return (parameters.template_x_size - margin) * parameters.template_y_size
+
+
+def summed_differences(view: Array, stored: Array, parameters: Parameters) -> Array:
+    """Sums of absolute differences, one row per template and one column per offset.
+
+    The sum runs pixel by pixel in row-major order (a cumulative sum does), because a pairwise one could
+    break a tie between two templates the other way.
+    """
+    width, shift = view.shape[1], parameters.vt_shift_match
+    sums = np.empty((len(stored), len(offsets(parameters))))
+    for column, o in enumerate(offsets(parameters)):
+        if parameters.vt_panoramic:
+            difference = view[None] - np.roll(stored, -o, axis=2)
+        else:
+            difference = view[None, :, shift : width - shift] - stored[:, :, o : width - 2 * shift + o]
+        sums[:, column] = np.abs(difference).reshape(len(stored), -1).cumsum(axis=1)[:, -1]
+    return sums
+
+
+class StockTemplates:
+    """Section 3: the stock engine's templates. They are never updated, merged or deleted."""
+
+    def __init__(self, parameters: Parameters) -> None:
+        self.parameters = parameters
+        self.stored: list[Array] = []
+        self.means: list[float] = []
+
+    def see(self, view: Array) -> Match:
+        """The best template that passes the gate on the mean, or a new one."""
+        p = self.parameters
+        mean = float(view.mean())
+        best, winner, relative = NOTHING_COMPARED, -1, 0.0
+        error = best
+        if self.stored:
+            # The gate hides a template from the search even where it would win (Q18).
+            passed = np.flatnonzero(np.abs(mean - np.array(self.means)) <= p.vt_match_threshold + 0.005)
+            if len(passed):
+                sums = summed_differences(view, np.stack([self.stored[k] for k in passed]), p)
+                # The first minimum in row-major order: earliest template, then lowest offset.
+                row, column = divmod(int(np.argmin(sums)), sums.shape[1])
+                best, winner = float(sums[row, column]), int(passed[row])
+                if p.vt_panoramic:
+                    relative = wrapped(offsets(p)[column] / p.template_x_size * 2 * math.pi)
+            error = best / compared_pixels(p)
+        if winner >= 0 and error <= p.vt_match_threshold:
+            return Match(winner, error, relative, novel=False)
+        self.stored.append(view)
+        self.means.append(mean)
+        return Match(len(self.stored) - 1, error, 0.0, novel=True)

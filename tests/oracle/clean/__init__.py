@@ -1,1 +1,0 @@
-"""The semantics of `ratslam/README.md`, step by step, without OpenRatSLAM's quirks."""

@@ -1,0 +1,310 @@
+"""The plain engine: "Semantics of the rat backend" in `ratslam/README.md`, steps 1 to 4.
+
+It differs from the stock one in every step, so only the attractor, the sums of differences and the box around
+the peak are shared.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from tests.oracle.cells import Attractor, Cell, Pose, box_around
+from tests.oracle.places import CREATE, EDGE, NONE, SET, Experience, Memory
+from tests.oracle.trace import Array, Parameters
+from tests.oracle.views import Match, compared_pixels, offsets, summed_differences, wrapped
+
+VIEW_TIE = PLACE_TIE = PEAK_TIE = 1e-9
+WORN_OUT = 3.0  # beyond this habituation nothing is injected, so it need not rise further
+LONGEST_PART, MOST_PARTS = 0.5, 256
+LOST = 1.0  # a lag beyond a cell is not a lag but a jump
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the plain engine has beyond the stock one's parameters."""
+
+    recent: int
+    settle_steps: int
+    column_angle: float
+
+
+@dataclass(frozen=True)
+class Input:
+    """One observation: the motion in the body frame (m, m, rad) and a view or a label, if there was one."""
+
+    motion: Pose
+    view: Array | None
+    label: int | None
+
+
+@dataclass(frozen=True)
+class PlainStep:
+    """What the plain engine decided in one step."""
+
+    template: int
+    energy: float
+    packet: Pose
+    action: int
+    place: int
+
+
+def around(d: float, n: float) -> float:
+    """A difference taken the short way round a ring."""
+    return (d + n / 2) % n - n / 2
+
+
+def on_ring(a: float, n: float) -> float:
+    """A coordinate in [0, n); the remainder of a tiny negative number rounds to n itself."""
+    a %= n
+    return 0.0 if a >= n else a
+
+
+class PlainTemplates:
+    """Step 1: no gate on the mean, and ties are decided by order rather than by the last bit."""
+
+    def __init__(self, parameters: Parameters, settings: Settings) -> None:
+        self.parameters, self.settings = parameters, settings
+        self.views: list[Array] = []
+        self.labels: list[int] = []
+
+    def see(self, seen: Input) -> Match:
+        """The template of a view or of a label."""
+        if seen.view is None:
+            assert seen.label is not None
+            if seen.label in self.labels:
+                return Match(self.labels.index(seen.label), 0.0, 0.0, novel=False)
+            self.labels.append(seen.label)
+            return Match(len(self.labels) - 1, math.inf, 0.0, novel=True)
+        return self.compare(seen.view)
+
+    def compare(self, view: Array) -> Match:
+        """The earliest template, at its lowest offset, among those as good as the best."""
+        p, best = self.parameters, math.inf
+        if self.views:
+            errors = summed_differences(view, np.stack(self.views), p) / compared_pixels(p)
+            best = float(errors.min())
+            template, column = np.argwhere(errors <= best + VIEW_TIE)[0]
+            if best <= p.vt_match_threshold + VIEW_TIE:
+                return Match(int(template), best, self.relative(offsets(p)[column]), novel=False)
+        self.views.append(view)
+        return Match(len(self.views) - 1, best, 0.0, novel=True)
+
+    def relative(self, offset: int) -> float:
+        """The turn that an offset stands for."""
+        p = self.parameters
+        if p.vt_panoramic:
+            return wrapped(2 * math.pi * offset / p.template_x_size)
+        return (offset - p.vt_shift_match) * self.settings.column_angle
+
+
+def corners(pose: Pose, lengths: Cell) -> Iterator[tuple[Cell, float]]:
+    """The eight cells (x, y, h) around a pose on the torus, with their trilinear shares."""
+    low = [math.floor(a) for a in pose]
+    for corner in np.ndindex(2, 2, 2):
+        share = math.prod(a - b if up else 1 - (a - b) for a, b, up in zip(pose, low, corner, strict=True))
+        i, j, k = ((b + up) % n for b, up, n in zip(low, corner, lengths, strict=True))
+        yield (i, j, k), share
+
+
+def shifted(layers: Array, shifts: Array, axis: int) -> Array:
+    """Each layer shifted by its own real number of cells along an axis, linearly and around."""
+    n = layers.shape[axis]
+    low = np.floor(shifts).astype(int)
+    fraction = (shifts - low)[:, None, None]
+    source = (np.arange(n)[None] - low[:, None]) % n
+    shape = (-1, n, 1) if axis == 1 else (-1, 1, n)
+    near = np.take_along_axis(layers, source.reshape(shape), axis)
+    far = np.take_along_axis(layers, ((source - 1) % n).reshape(shape), axis)
+    return (1 - fraction) * near + fraction * far
+
+
+class PlainCells:
+    """Steps 2 and 3: the network, its decoded pose, and how far it lags behind the odometry."""
+
+    def __init__(self, parameters: Parameters, settings: Settings) -> None:
+        p = parameters
+        self.parameters, self.settings = p, settings
+        self.attractor = Attractor(p)
+        self.rings: Cell = (p.pc_dim_xy, p.pc_dim_xy, p.pc_dim_th)
+        self.heading_cell = 2 * math.pi / p.pc_dim_th
+        i, j, k = (n // 2 for n in self.rings)
+        self.activity = np.zeros((p.pc_dim_th, p.pc_dim_xy, p.pc_dim_xy))
+        self.activity[k, j, i] = 1.0
+        self.best: Pose = (float(i), float(j), float(k))
+        self.lag: Pose = (0.0, 0.0, 0.0)
+        self.settling = 0
+
+    def deposit(self, energy: float, pose: Pose) -> None:
+        """Share an energy among the cells around a pose."""
+        for (i, j, k), share in corners(pose, self.rings):
+            self.activity[k, j, i] += energy * share
+
+    def inject(self, energy: float, packet: Pose, relative: float) -> None:
+        """Step 2: so much energy that the excited peak is as high as on a whole cell."""
+        turned = (packet[0], packet[1], packet[2] + relative / self.heading_cell)
+        pose = tuple(on_ring(a, n) for a, n in zip(turned, self.rings, strict=True))
+        spread = 2 * self.parameters.pc_w_e_var**2
+        for a in pose:
+            f = a - math.floor(a)
+            energy /= (1 - f) * math.exp(-(f**2) / spread) + f * math.exp(-((1 - f) ** 2) / spread)
+        self.deposit(energy, (pose[0], pose[1], pose[2]))
+
+    def move(self, motion: Pose, injected: bool) -> None:
+        """Step 3."""
+        size = self.parameters.pc_cell_x_size
+        told = np.array([motion[0] / size, motion[1] / size, motion[2] / self.heading_cell])
+        self.settling = self.settings.settle_steps if injected else max(self.settling - 1, 0)
+        measured = self.settling == 0
+        lag = np.array(self.lag) if measured else np.zeros(3)
+        reach = max(math.hypot(*told[:2]) + math.hypot(*lag[:2]), abs(told[2] + lag[2]))
+        parts = max(1, math.ceil(reach / LONGEST_PART - 1e-9))
+        if parts > MOST_PARTS:
+            told, lag, parts = told * (MOST_PARTS / parts), lag * (MOST_PARTS / parts), MOST_PARTS
+        before, died = self.best, False
+        for _ in range(parts):
+            died |= self.settle(before)
+            self.shift(told / parts, lag / parts)
+        self.best = self.decoded()
+        if measured:
+            self.lag = self.behind(told, lag, before, died)
+
+    def settle(self, fallback: Pose) -> bool:
+        """Excite, inhibit and normalise; true if nothing was left and the network was restarted."""
+        self.activity = self.attractor.inhibited(self.activity)
+        total = float(self.activity.sum())
+        if total == 0:
+            self.deposit(1.0, fallback)
+            return True
+        self.activity /= total
+        return False
+
+    def shift(self, told: Array, lag: Array) -> None:
+        """Translate each heading layer at the heading of mid-turn, then turn."""
+        turn = told[2] + lag[2]
+        layers = np.flatnonzero((self.activity != 0).any(axis=(1, 2)))
+        angle = layers * self.heading_cell + turn * self.heading_cell / 2
+        along_x = told[0] * np.cos(angle) - told[1] * np.sin(angle) + lag[0]
+        along_y = told[0] * np.sin(angle) + told[1] * np.cos(angle) + lag[1]
+        self.activity[layers] = shifted(shifted(self.activity[layers], along_x, 2), along_y, 1)
+        low = math.floor(turn)
+        f = turn - low
+        self.activity = (1 - f) * np.roll(self.activity, low, axis=0) + f * np.roll(
+            self.activity, low + 1, axis=0
+        )
+
+    def decoded(self) -> Pose:
+        """The pose of the box around the first peak, layer by layer, row by row, cell by cell."""
+        peak: list[int] = []
+        part = self.activity
+        while part.ndim:
+            largest = part.reshape(len(part), -1).max(axis=1)
+            peak.append(int(np.flatnonzero(largest >= largest.max() * (1 - PEAK_TIE))[0]))
+            part = part[peak[-1]]
+        box, (ks, js, xs) = box_around(self.activity, (peak[0], peak[1], peak[2]))
+        sums = (box.sum(axis=(0, 1)), box.sum(axis=(0, 2)), box.sum(axis=(1, 2)))
+        pose = []
+        for marginal, indices, n in zip(sums, (xs, js, ks), self.rings, strict=True):
+            angles = 2 * math.pi * indices / n
+            mean = math.atan2(float(marginal @ np.sin(angles)), float(marginal @ np.cos(angles)))
+            pose.append(on_ring(mean * n / (2 * math.pi), n))
+        return pose[0], pose[1], pose[2]
+
+    def behind(self, told: Array, lag: Array, before: Pose, died: bool) -> Pose:
+        """How far the decoded pose stayed behind what was wanted of it."""
+        angle = (before[2] + lag[2] + told[2] / 2) * self.heading_cell
+        wanted = (
+            told[0] * math.cos(angle) - told[1] * math.sin(angle) + lag[0],
+            told[0] * math.sin(angle) + told[1] * math.cos(angle) + lag[1],
+            told[2] + lag[2],
+        )
+        moved = (a - b for a, b in zip(self.best, before, strict=True))
+        rest = [around(float(w - m), n) for w, m, n in zip(wanted, moved, self.rings, strict=True)]
+        if died or any(abs(r) > LOST for r in rest):
+            return 0.0, 0.0, 0.0
+        return rest[0], rest[1], rest[2]
+
+
+class PlainPlaces:
+    """Step 4: places, and which of them are joined."""
+
+    def __init__(self, parameters: Parameters) -> None:
+        self.radius = parameters.exp_delta_pc_threshold
+        self.rings = (parameters.pc_dim_xy, parameters.pc_dim_xy, parameters.pc_dim_th)
+        self.places: list[Experience] = []
+        self.joined: set[frozenset[int]] = set()
+        self.current = -1
+
+    def far(self, place: int, packet: Pose) -> float:
+        """The distance in radii."""
+        there = self.places[place].packet
+        return math.hypot(
+            *(around(a - b, n) / self.radius for a, b, n in zip(packet, there, self.rings, strict=True))
+        )
+
+    def act(self, packet: Pose, template: int) -> int:
+        """Keep, reach or create a place."""
+        here = self.current
+        if here >= 0 and self.places[here].template == template and self.far(here, packet) <= 1 + PLACE_TIE:
+            return NONE
+        same = (e for e, place in enumerate(self.places) if place.template == template and e != here)
+        near = {e: distance for e in same if (distance := self.far(e, packet)) < 1 - PLACE_TIE}
+        if near:
+            nearest = min(near.values())
+            self.current = next(e for e, distance in near.items() if distance <= nearest + PLACE_TIE)
+            pair = frozenset((here, self.current))
+            if here < 0 or pair in self.joined:
+                return SET
+            self.joined.add(pair)
+            return EDGE
+        self.current = len(self.places)
+        self.places.append(Experience(packet, template))
+        if here >= 0:
+            self.joined.add(frozenset((here, self.current)))
+        return CREATE
+
+
+class PlainEngine:
+    """One observation after the other: view, motion, place."""
+
+    def __init__(self, parameters: Parameters, settings: Settings) -> None:
+        self.parameters, self.settings = parameters, settings
+        self.templates = PlainTemplates(parameters, settings)
+        self.cells = PlainCells(parameters, settings)
+        self.places = PlainPlaces(parameters)
+        self.memories: list[Memory] = []
+        self.template = -1
+        self.relative = 0.0
+
+    def step(self, seen: Input) -> PlainStep:
+        """One observation."""
+        viewed = seen.view is not None or seen.label is not None
+        energy = self.recall(self.templates.see(seen)) if viewed else 0.0
+        if energy > 0:
+            self.cells.inject(energy, self.memories[self.template].packet, self.relative)
+        self.cells.move(seen.motion, energy > 0)
+        action = NONE
+        if viewed:
+            x, y, h = self.cells.best
+            h = on_ring(h - self.relative / self.cells.heading_cell, self.parameters.pc_dim_th)
+            action = self.places.act((x, y, h), self.template)
+        return PlainStep(self.template, energy, self.cells.best, action, self.places.current)
+
+    def recall(self, match: Match) -> float:
+        """Step 1 after the match: habituate; the energy to be injected."""
+        p, energy = self.parameters, 0.0
+        if match.novel:
+            self.memories.append(Memory(self.cells.best, p.vt_active_decay))
+        else:
+            memory = self.memories[match.template]
+            if match.template == self.template:
+                memory.decay = min(memory.decay + p.vt_active_decay, max(WORN_OUT, p.vt_active_decay))
+            if match.template + self.settings.recent < len(self.memories):
+                energy = max(p.pc_vt_inject_energy / 30 * (30 - math.exp(1.2 * memory.decay)), 0.0)
+        for memory in self.memories:
+            memory.decay = max(memory.decay - p.pc_vt_restore, p.vt_active_decay)
+        self.template, self.relative = match.template, match.relative
+        return energy
