@@ -126,7 +126,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     run.add_argument(
         "--continue", dest="resume", type=Path, metavar="NPZ",
-        help="go on from the map.npz of an earlier run: where it stopped in the same recording, else from the start",
+        help="go on from an earlier run: where it stopped in the same recording, else from the start",
     )  # fmt: skip
 
     score = command(

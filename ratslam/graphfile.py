@@ -60,8 +60,9 @@ def read_g2o(path: Path) -> tuple[np.ndarray, Edges]:
     information = np.zeros((len(rows), 3, 3))
     for k, (a, b) in enumerate(UPPER):
         information[:, a, b] = information[:, b, a] = measured[:, 3 + k]
-    i, j = (np.array([row[edge[k]] for edge in rows], int) for k in (0, 1))
-    return np.array([poses[node] for node in row]).reshape(-1, 3), Edges(i, j, measured[:, :3], information)
+    start = np.array([row[i] for i, _, _ in rows], int)
+    end = np.array([row[j] for _, j, _ in rows], int)
+    return np.array([poses[node] for node in row]).reshape(-1, 3), Edges(start, end, measured[:, :3], information)
 
 
 def write_json(path: Path, graph: networkx.DiGraph) -> None:
@@ -77,9 +78,8 @@ def read_json(path: Path) -> networkx.DiGraph:
         InputError: it is not one.
     """
     try:
-        return networkx.node_link_graph(
-            json.loads(Path(path).read_text(encoding="utf-8")), directed=True, edges="edges"
-        )
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+        return networkx.DiGraph(networkx.node_link_graph(content, edges="edges"))
     except (ValueError, KeyError, TypeError, networkx.NetworkXException) as error:
         raise InputError(str(path), f"not a node-link graph ({error})", "the map.json of a run") from None
 

@@ -178,7 +178,8 @@ def least_squares(
     damping, taken = 1e-9, 0
     ending = Ending.ITERATIONS
     while taken < iterations:
-        step = system.step(*state[:3], state[3][:, None, None] * information, damping)
+        residual, by_i, by_j, weights, _ = state
+        step = system.step(residual, by_i, by_j, weights[:, None, None] * information, damping)
         if step is None:
             ending = Ending.SINGULAR
             break
