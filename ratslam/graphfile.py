@@ -62,7 +62,9 @@ def read_g2o(path: Path) -> tuple[np.ndarray, Edges]:
         information[:, a, b] = information[:, b, a] = measured[:, 3 + k]
     start = np.array([row[i] for i, _, _ in rows], int)
     end = np.array([row[j] for _, j, _ in rows], int)
-    return np.array([poses[node] for node in row]).reshape(-1, 3), Edges(start, end, measured[:, :3], information)
+    return np.array([poses[node] for node in row]).reshape(-1, 3), Edges(
+        start, end, measured[:, :3], information
+    )
 
 
 def write_json(path: Path, graph: networkx.DiGraph) -> None:

@@ -25,6 +25,12 @@ TIE = 1e-9
 """Activities this close to the largest (as a share) tie with it: the first wins, whatever the rounding."""
 BOX = 3
 """The packet is decoded from the (2 BOX + 1)^3 cells around its peak."""
+SIDE = 18
+"""Cells along each axis of the box that a settled packet is worked on in: 9 or 10, and a margin each side."""
+MARGIN = 4
+"""Cells that activity can spread in one iteration: 3 excited, 1 moved."""
+LEAST_BOXED = 31
+"""Smaller tori are as fast whole."""
 LARGEST_PART = 0.5
 """Cells one sub-step moves at most: a packet moved further at once shears into a ring."""
 MOST_PARTS = 256
@@ -96,7 +102,8 @@ class PoseCells(NamedTuple):
 
 
 class Tables(NamedTuple):
-    """Constants of one network shape, host NumPy: circulant matrices [n, n] along each axis."""
+    """Constants of one network shape, host NumPy: circulant matrices [n, n] along each axis, and the heading
+    [k] of each layer, rad."""
 
     excite_xy: np.ndarray
     both_xy: np.ndarray
@@ -110,11 +117,26 @@ def tables(config: PoseCellConfig, dtype: np.dtype) -> Tables:
 
     Both kernels are separable Gaussians of sum 1, so three products make a 3-D convolution.
     """
+    return _tables(config, config.cells_xy, config.cells_heading, dtype)
+
+
+def box_tables(config: PoseCellConfig, dtype: np.dtype) -> Tables | None:
+    """The same for a box of `SIDE` cells cut out of the torus; None where that would save nothing.
+
+    Around a box's edge the products wrap, but what they wrap there is below the threshold on both sides.
+    """
+    if config.cells_xy < LEAST_BOXED or config.cells_heading < SIDE:
+        return None
+    if max(config.excite_width, config.inhibit_width) > 2 * MARGIN - 1:
+        return None
+    return _tables(config, SIDE, SIDE, dtype)
+
+
+def _tables(config: PoseCellConfig, n: int, k: int, dtype: np.dtype) -> Tables:
     excite = _gaussian(config.excite_width, config.excite_sigma)
     both = np.convolve(excite, _gaussian(config.inhibit_width, config.inhibit_sigma))
-    n, k = config.cells_xy, config.cells_heading
     matrices = (_circulant(excite, n), _circulant(both, n), _circulant(excite, k), _circulant(both, k))
-    heading = 2 * np.pi / k * np.arange(k)
+    heading = 2 * np.pi / config.cells_heading * np.arange(k)
     return Tables(*(matrix.astype(dtype) for matrix in (*matrices, heading)))
 
 
@@ -161,22 +183,64 @@ def step(
     parts = jnp.minimum(wanted, float(MOST_PARTS))
     told, lag = told * (parts / wanted), lag * (parts / wanted)
 
-    def sub_step(_, carry):
-        activity, died = carry
-        activity, dead = attract(config, table, activity, cells.pose)
-        return integrate(table, activity, told / parts, lag / parts), died | dead
+    part, behind_part = told / parts, lag / parts
 
-    activity, died = lax.fori_loop(0, parts.astype(jnp.int32), sub_step, (activity, jnp.bool_(False)))
+    def sub_step(s, carry):
+        activity, died = carry
+        # Odometry is told in the frame the step began in; the packet has turned since, and lags behind it.
+        aside = lag[2] - s.astype(lag.dtype) * (part[2] + behind_part[2])
+        moved = jnp.stack([*_turned(part[0], part[1], aside * unit[2]), part[2]])
+        activity, dead = iterate(config, table, activity, cells.pose, moved, behind_part)
+        return activity, died | dead
+
+    count = parts.astype(jnp.int32)
+    activity, died = lax.fori_loop(0, count, sub_step, (activity, jnp.bool_(False)))
     pose, spread = decode(activity)
 
-    turn = (cells.pose[2] + lag[2] + told[2] / 2) * unit[2]
-    c, s = jnp.cos(turn), jnp.sin(turn)
-    world = jnp.stack([c * told[0] - s * told[1], s * told[0] + c * told[1], told[2]])
+    world = jnp.stack([*_turned(told[0], told[1], (cells.pose[2] + lag[2]) * unit[2]), told[2]])
     behind = around(world + lag - (pose - cells.pose), n)
     jumped = died | (jnp.max(jnp.abs(behind)) > JUMP)
     lag = jnp.where(measured, jnp.where(jumped, jnp.zeros_like(lag), behind), cells.lag)
     outcome = jnp.where(died, Outcome.RESEEDED, jnp.where(wanted > parts, Outcome.TOO_FAST, Outcome.OK))
     return PoseCells(activity, pose, lag, settling), spread, outcome.astype(jnp.int32)
+
+
+def iterate(
+    config: PoseCellConfig, table: Tables, activity: Array, seed: Array, told: Array, lag: Array
+) -> tuple[Array, Array]:
+    """One network iteration: attract, then integrate a part of the motion; also whether activity died.
+
+    A settled packet fills some 200 cells however large the torus is. Where all activity lies `MARGIN` cells
+    inside a box around the last packet, only the box is worked on: excitation reaches 3 cells and motion 1,
+    and inhibition beyond what is excited is below the threshold, so the result is that of the whole torus.
+    """
+    box = box_tables(config, activity.dtype)
+    rest = (told, lag)
+    if box is None:
+        return _iterate(config, table, activity, seed, *rest)
+    k, n, _ = activity.shape
+    origin = jnp.floor(seed) - SIDE // 2 + 1
+    row = np.arange(SIDE, dtype=np.int32)
+    corner = origin.astype(jnp.int32)
+    at = [(corner[axis] + row) % size for axis, size in ((2, k), (1, n), (0, n))]
+    window = (at[0][:, None, None], at[1][None, :, None], at[2][None, None, :])
+    part = activity[window]
+    inner = part[MARGIN:-MARGIN, MARGIN:-MARGIN, MARGIN:-MARGIN]
+    fits = jnp.sum(inner != 0) == jnp.sum(activity != 0)
+
+    def boxed() -> tuple[Array, Array]:
+        here = box._replace(heading=jnp.asarray(table.heading)[at[0]])
+        moved, died = _iterate(config, here, part, seed - origin, *rest)
+        return activity.at[window].set(moved), died
+
+    return lax.cond(fits, boxed, lambda: _iterate(config, table, activity, seed, *rest))
+
+
+def _iterate(
+    config: PoseCellConfig, table: Tables, activity: Array, seed: Array, told: Array, lag: Array
+) -> tuple[Array, Array]:
+    activity, died = attract(config, table, activity, seed)
+    return integrate(table, activity, told, lag), died
 
 
 def attract(config: PoseCellConfig, table: Tables, activity: Array, seed: Array) -> tuple[Array, Array]:
@@ -202,18 +266,14 @@ def integrate(table: Tables, activity: Array, told: Array, lag: Array) -> Array:
     """Path integration of at most half a cell: every heading layer moves its own way.
 
     Args:
-        told: [3] body-frame motion, cells: each layer moves along its own heading, taken at the middle of
-            the turn. lag: [3] in the network's frame, cells: every layer moves alike.
+        told: [3] body-frame motion, cells: each layer moves along its own heading, then all turn.
+        lag: [3] in the network's frame, cells: every layer moves alike.
     """
     k, n, _ = activity.shape
-    turn = told[2] + lag[2]
-    middle = table.heading + turn * (np.pi / k)
-    c, s = jnp.cos(middle), jnp.sin(middle)
-    shift_x = c * told[0] - s * told[1] + lag[0]
-    shift_y = s * told[0] + c * told[1] + lag[1]
-    activity = jnp.matmul(_shift(shift_y, n), activity)
-    activity = jnp.matmul(activity, jnp.swapaxes(_shift(shift_x, n), 1, 2))
-    return (_shift(turn, k) @ activity.reshape(k, n * n)).reshape(k, n, n)
+    x, y = _turned(told[0], told[1], jnp.asarray(table.heading))
+    activity = jnp.matmul(_shift(y + lag[1], n), activity)
+    activity = jnp.matmul(activity, jnp.swapaxes(_shift(x + lag[0], n), 1, 2))
+    return (_shift(told[2] + lag[2], k) @ activity.reshape(k, n * n)).reshape(k, n, n)
 
 
 def deposit(activity: Array, pose: Array, energy: Array) -> Array:
@@ -264,6 +324,11 @@ def decode(activity: Array) -> tuple[Array, Array]:
 def around(difference: Array, size: Array) -> Array:
     """A difference of poses in cells the short way round, in [-size/2, size/2)."""
     return (difference + size / 2) % size - size / 2
+
+
+def _turned(x: Array, y: Array, angle: Array) -> tuple[Array, Array]:
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    return c * x - s * y, s * x + c * y
 
 
 def _first_peak(marginal: Array) -> Array:

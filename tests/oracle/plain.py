@@ -165,9 +165,9 @@ class PlainCells:
         if parts > MOST_PARTS:
             told, lag, parts = told * (MOST_PARTS / parts), lag * (MOST_PARTS / parts), MOST_PARTS
         before, died = self.best, False
-        for _ in range(parts):
+        for part in range(parts):
             died |= self.settle(before)
-            self.shift(told / parts, lag / parts)
+            self.shift(told / parts, lag / parts, lag[2] - part * (told[2] + lag[2]) / parts)
         self.best = self.decoded()
         if measured:
             self.lag = self.behind(told, lag, before, died)
@@ -182,11 +182,11 @@ class PlainCells:
         self.activity /= total
         return False
 
-    def shift(self, told: Array, lag: Array) -> None:
-        """Translate each heading layer at the heading of mid-turn, then turn."""
+    def shift(self, told: Array, lag: Array, aside: float) -> None:
+        """Translate each heading layer `aside` (heading cells) of its own heading, then turn."""
         turn = told[2] + lag[2]
         layers = np.flatnonzero((self.activity != 0).any(axis=(1, 2)))
-        angle = layers * self.heading_cell + turn * self.heading_cell / 2
+        angle = (layers + aside) * self.heading_cell
         along_x = told[0] * np.cos(angle) - told[1] * np.sin(angle) + lag[0]
         along_y = told[0] * np.sin(angle) + told[1] * np.cos(angle) + lag[1]
         self.activity[layers] = shifted(shifted(self.activity[layers], along_x, 2), along_y, 1)
@@ -215,7 +215,7 @@ class PlainCells:
 
     def behind(self, told: Array, lag: Array, before: Pose, died: bool) -> Pose:
         """How far the decoded pose stayed behind what was wanted of it."""
-        angle = (before[2] + lag[2] + told[2] / 2) * self.heading_cell
+        angle = (before[2] + lag[2]) * self.heading_cell
         wanted = (
             told[0] * math.cos(angle) - told[1] * math.sin(angle) + lag[0],
             told[0] * math.sin(angle) + told[1] * math.cos(angle) + lag[1],

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from ratslam import posecells
 from ratslam.posecells import Outcome, PoseCellConfig
+from tactile.frames import integrate
 from tactile.types import Odometry
 
 CONFIG = PoseCellConfig()
@@ -78,12 +79,41 @@ def test_decoded_turning_is_the_turning_told(settled, degrees):
     assert travelled(settled.pose, poses)[2] == pytest.approx(count * degrees / 10, rel=0.02)
 
 
+@pytest.mark.parametrize("degrees", [1.0, -7.0, 20.0, 45.0])
+@pytest.mark.parametrize("speed", [0.05, 0.5, 1.7])
+def test_a_curve_ends_where_composed_odometry_ends(settled, speed, degrees):
+    """Odometry is the new pose in the frame of the old one, in the network as in the map."""
+    steps = int(np.ceil(180 / abs(degrees)))
+    motion = np.tile([speed, 0.2 * speed, np.deg2rad(degrees) / UNITS[2]], (steps, 1))
+    _, (poses, _, _) = go(motion, settled)
+    start = np.asarray(settled.pose) * [1, 1, UNITS[2]]
+    end = integrate(motion * [1, 1, UNITS[2]], start)[-1]
+    assert np.hypot(*(travelled(settled.pose, poses)[:2] - (end - start)[:2])) < 0.02 * speed * steps + 0.1
+
+
 def test_a_circle_closes(settled):
     steps = 100
     turn = 36 / steps
     motion = np.tile([0.4, 0.1, turn], (steps, 1))
     _, (poses, _, _) = go(motion, settled)
     assert np.abs(travelled(settled.pose, poses) - [0, 0, 36]).max() < 0.15
+
+
+def test_a_box_steps_as_the_whole_torus_does(monkeypatch):
+    """1 000 steps with injections anywhere, which leave the box and come back to it."""
+    config = PoseCellConfig(cells_xy=31)
+    stream = np.random.default_rng(0)
+    rings = posecells.rings(config, np.dtype(float))
+    motion = stream.normal(0, 0.3, (1000, 3))
+    injections = {k: (stream.random(3) * rings, 0.15) for k in range(1000) if stream.random() < 0.03}
+    assert posecells.box_tables(config, np.dtype(float)) is not None
+    boxed, (a, _, _) = go(motion, injections=injections, config=config)
+    jax.clear_caches()
+    monkeypatch.setattr(posecells, "box_tables", lambda *_: None)
+    whole, (b, _, _) = go(motion, injections=injections, config=config)
+    jax.clear_caches()
+    assert np.abs(posecells.around(a - b, rings)).max() <= 1e-12
+    assert float(jnp.abs(boxed.activity - whole.activity).max()) <= 1e-14
 
 
 @settings(max_examples=25)
