@@ -1,0 +1,182 @@
+"""Laws of the pose-graph solvers, and the graphs everybody knows."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ratslam.graphfile import read_g2o, write_g2o
+from ratslam.posegraph import (
+    Edges,
+    Ending,
+    difference_error,
+    geman_mcclure,
+    huber,
+    least_squares,
+    linear,
+    logmap_error,
+)
+from ratslam.relaxation import relax
+from tactile.errors import InputError
+from tactile.frames import between, compose, integrate, wrap
+
+
+def loops(stream, count=120, closures=20, noise=(0.0, 0.0)):
+    """A wandering path with true closures: poses and edges, measured with the given noise (m, rad)."""
+    truth = np.vstack([np.zeros(3), integrate(stream.normal([0.5, 0, 0], [0.1, 0.1, 0.5], (count - 1, 3)))])
+    i = np.concatenate([np.arange(count - 1), stream.integers(0, count // 2, closures)])
+    j = np.concatenate([np.arange(1, count), stream.integers(count // 2, count, closures)])
+    measured = between(truth[i], truth[j]) + stream.normal(0, 1, (len(i), 3)) * [noise[0], noise[0], noise[1]]
+    sd = np.maximum([noise[0], noise[0], noise[1]], 0.01)
+    return truth, Edges(i, j, measured, np.tile(1 / sd**2, (len(i), 1)))
+
+
+@given(st.integers(0, 1000), st.sampled_from([difference_error, logmap_error]))
+def test_jacobians_are_the_derivatives(seed, error):
+    stream = np.random.default_rng(seed)
+    poses = stream.normal(0, 1, (2, 3))
+    edges = Edges(np.array([0]), np.array([1]), stream.normal(0, 1, (1, 3)), np.ones((1, 3)))
+    value, *jacobians = error(poses, edges)
+    if abs(abs(value[0, 2]) - np.pi) < 0.01:
+        return
+    for node, jacobian in enumerate(jacobians):
+        for axis in range(3):
+            step = np.zeros((2, 3))
+            step[node, axis] = 1e-6
+            slope = (error(poses + step, edges)[0] - error(poses - step, edges)[0]) / 2e-6
+            assert np.allclose(slope[0], jacobian[0, :, axis], atol=1e-6, rtol=1e-4)
+
+
+@given(st.integers(0, 1000))
+def test_exact_graphs_stay_and_linear_finds_them(seed):
+    truth, edges = loops(np.random.default_rng(seed))
+    solved = least_squares(truth, edges)
+    assert solved.ending is Ending.CONVERGED
+    assert np.abs(solved.poses - truth).max() < 1e-9
+    found = linear(len(truth), edges)
+    assert np.abs(found[:, :2] - truth[:, :2]).max() < 1e-6
+
+
+@given(st.integers(0, 200), st.tuples(st.floats(-9, 9), st.floats(-9, 9), st.floats(-3, 3)))
+def test_a_moved_graph_has_the_moved_solution(seed, by):
+    truth, edges = loops(np.random.default_rng(seed), noise=(0.02, 0.01))
+    here = least_squares(truth, edges).poses
+    there = least_squares(compose(np.array(by), truth), edges).poses
+    gap = there - compose(np.array(by), here)
+    assert np.abs(gap[:, :2]).max() < 1e-5
+    assert np.abs(wrap(gap[:, 2])).max() < 1e-5
+
+
+def test_a_robust_kernel_shrugs_off_a_false_closure():
+    truth, edges = loops(np.random.default_rng(0), noise=(0.02, 0.005))
+    false = Edges(
+        *(np.concatenate([a, b]) for a, b in zip(edges, ([3], [110], [[0, 0, 0]], [[1e4] * 3]), strict=True))
+    )
+    robust = np.arange(len(false.i)) >= len(truth) - 1
+    harm = {}
+    for name, kernel in {"huber": huber(1.0), "geman": geman_mcclure(9.0)}.items():
+        poses = least_squares(truth, false, kernel=kernel, robust=robust).poses
+        harm[name] = np.abs(poses - truth)[:, :2].max()
+    plain = np.abs(least_squares(truth, false).poses - truth)[:, :2].max()
+    assert harm["geman"] < plain / 5
+    assert harm["huber"] < plain / 5
+
+
+def test_heavy_heading_noise_ends_with_a_name_and_no_nan():
+    stream = np.random.default_rng(1)
+    truth, edges = loops(stream, 400, 60, (0.02, 0.1))
+    start = np.vstack([np.zeros(3), integrate(edges.motion[:399])])
+    solved = least_squares(start, edges, iterations=200)
+    assert np.isfinite(solved.poses).all()
+    assert solved.ending in (Ending.CONVERGED, Ending.STUCK)
+    better = least_squares(linear(400, edges), edges, iterations=200)
+    assert np.isfinite(better.poses).all()
+    assert better.cost <= solved.cost * 1.001
+
+
+def test_heading_drift_beyond_a_turn_is_unrolled():
+    count = 400
+    truth = np.vstack([np.zeros(3), integrate(np.tile([0.1, 0, 0.05], (count - 1, 1)))])
+    i, j = np.arange(count - 1), np.arange(1, count)
+    measured = between(truth[i], truth[j]) + [0, 0, 0.01]  # 4 rad too much by the end
+    edges = Edges(
+        np.append(i, np.arange(0, 260, 10)), np.append(j, np.arange(0, 260, 10) + 126),
+        np.vstack([measured, between(truth[np.arange(0, 260, 10)], truth[np.arange(0, 260, 10) + 126])]),
+        np.vstack([np.tile([1e4, 1e4, 1e3], (count - 1, 1)), np.tile([1e4, 1e4, 1e4], (26, 1))]),
+    )  # fmt: skip
+    solved = least_squares(linear(count, edges), edges)
+    assert np.abs(solved.poses - truth)[:380, :2].max() < 0.5
+
+
+def test_endings_have_names():
+    nothing = Edges(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3)))
+    assert least_squares(np.zeros((1, 3)), nothing).ending is Ending.CONVERGED
+    one = Edges(np.array([0]), np.array([1]), np.array([[np.nan, 0, 0]]), np.ones((1, 3)))
+    assert least_squares(np.zeros((2, 3)), one).ending is Ending.NOT_FINITE
+    apart = Edges(np.array([0, 3]), np.array([1, 4]), np.ones((2, 3)), np.ones((2, 3)))
+    solved = least_squares(np.zeros((5, 3)), apart)
+    assert np.isfinite(solved.poses).all()
+    assert np.isfinite(linear(5, apart)).all()
+
+
+@pytest.fixture(scope="module")
+def m3500(reference_data):
+    table = np.loadtxt(reference_data / "data" / "m3500_edges.csv", delimiter=",", skiprows=1)
+    start = np.loadtxt(reference_data / "data" / "m3500_vertices.csv", delimiter=",", skiprows=1)[:, 1:]
+    information = np.zeros((len(table), 3, 3))
+    for k, (a, b) in enumerate(zip(*np.triu_indices(3), strict=True)):
+        information[:, a, b] = information[:, b, a] = table[:, 5 + k]
+    return start, Edges(table[:, 0].astype(int), table[:, 1].astype(int), table[:, 2:5], information)
+
+
+def test_m3500_ends_where_gtsam_ends(m3500):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        gtsam = pytest.importorskip("gtsam")
+    start, edges = m3500
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for k, pose in enumerate(start):
+        values.insert(k, gtsam.Pose2(*pose))
+    for i, j, motion, weight in zip(*edges, strict=True):
+        noise = gtsam.noiseModel.Gaussian.Information(weight)
+        graph.add(gtsam.BetweenFactorPose2(int(i), int(j), gtsam.Pose2(*motion), noise))
+    graph.add(gtsam.NonlinearEqualityPose2(0, gtsam.Pose2(*start[0])))
+    settings = gtsam.LevenbergMarquardtParams()
+    settings.setRelativeErrorTol(1e-15)
+    settings.setAbsoluteErrorTol(1e-15)
+    solved = gtsam.LevenbergMarquardtOptimizer(graph, values, settings).optimize()
+    theirs = np.array([[solved.atPose2(k).x(), solved.atPose2(k).y()] for k in range(len(start))])
+    for error, near in ((logmap_error, 1e-6), (difference_error, 1e-4)):
+        ours = least_squares(start, edges, error=error)
+        assert ours.ending is Ending.CONVERGED
+        assert np.hypot(*(ours.poses[:, :2] - theirs).T).max() <= near
+
+
+def test_relaxation_leaves_exact_graphs_and_pulls_others_together():
+    truth, edges = loops(np.random.default_rng(2), 30, 5)
+    motion = edges.motion
+    columns = (np.hypot(motion[:, 0], motion[:, 1]), np.arctan2(motion[:, 1], motion[:, 0]), motion[:, 2])
+    assert np.abs(relax(truth, edges.i, edges.j, *columns, 20, 0.5) - truth).max() < 1e-12
+    bent = truth + np.random.default_rng(3).normal(0, 0.05, truth.shape)
+    errors = [
+        np.abs(difference_error(relax(bent, edges.i, edges.j, *columns, n, 0.5), edges)[0]).max()
+        for n in (0, 50)
+    ]
+    assert errors[1] < errors[0] / 5
+
+
+def test_g2o_files_read_back_exactly_and_name_bad_lines(tmp_path):
+    truth, edges = loops(np.random.default_rng(4), 20, 4)
+    write_g2o(tmp_path / "a.g2o", truth, edges)
+    poses, back = read_g2o(tmp_path / "a.g2o")
+    assert np.array_equal(poses, truth)
+    assert np.array_equal(back.motion, edges.motion)
+    write_g2o(tmp_path / "b.g2o", poses, back)
+    assert (tmp_path / "a.g2o").read_bytes() == (tmp_path / "b.g2o").read_bytes()
+    (tmp_path / "c.g2o").write_text("VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 0 zero 0\n")
+    with pytest.raises(InputError, match=r"c\.g2o:2"):
+        read_g2o(tmp_path / "c.g2o")
