@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import platform
+import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from importlib.metadata import version
 from itertools import islice
 from pathlib import Path
@@ -51,10 +53,9 @@ def run(
         InputError: the recording, the checkpoint or the run directory cannot be used.
         OSError: the disk is full.
     """
-    warn = _tell
-    relations_file = config.score.relations
-    relations = read_relations(folder / relations_file) if relations_file else None
-    with open_recording(config.recording.resolved(folder), warn) as source:
+    config = _located(config, folder.resolve())
+    relations = read_relations(config.score.relations) if config.score.relations else None
+    with open_recording(config.recording, _tell) as source:
         dtype = np.dtype(config.session.precision)
         session = Session(
             Rat(config.rat(), source.view_shape, dtype),
@@ -81,32 +82,55 @@ def run(
     return card, interrupted
 
 
+def _located(config: RunConfig, folder: Path) -> RunConfig:
+    """The configuration with whole paths, so that the copy in the run directory can be run again."""
+    judgement = config.score
+    if judgement.relations:
+        judgement = judgement.model_copy(update={"relations": folder / judgement.relations})
+    return config.model_copy(update={"recording": config.recording.resolved(folder), "score": judgement})
+
+
 def _play(session: Session, source: Source, skip: int, store: RunDirectory) -> bool:
     """Replays the source into the store; returns whether the user interrupted."""
     samples = islice(iter(source), skip, None)
     odometry = np.zeros(3)
     total = None if source.length is None else source.length - skip
     saved = session.steps
+    bar = tqdm(total=total, unit="step", desc=source.name, file=sys.stderr, mininterval=0.5)
+    with bar as progress, _interrupts() as interrupted:
+        while not interrupted() and (chunk := list(islice(samples, CHUNK - session.steps % CHUNK))):
+            observations = [_observation(sample) for sample in chunk]
+            steps = list(session.replay(observations))
+            reckoned = []
+            for observation in observations:
+                moved = observation.odometry
+                odometry = compose(odometry, np.array([moved.dx, moved.dy, moved.dtheta]))
+                reckoned.append(odometry)
+            store.append(_lines(chunk, steps, reckoned))
+            if session.steps - saved >= CHECKPOINT_EVERY:
+                store.checkpoint(session.arrays() | {"digest": np.array(source.digest)})
+                saved = session.steps
+            progress.update(len(chunk))
+            progress.set_postfix(places=int(steps[-1].estimate.place) + 1, refresh=False)
+        return interrupted()
+
+
+@contextmanager
+def _interrupts() -> Iterator[Callable[[], bool]]:
+    """Says whether the user has pressed Ctrl-C, which waits for the chunk at work; twice does not wait."""
+    pressed: list[int] = []
+
+    def press(number: int, frame: Any) -> None:
+        if pressed:
+            raise KeyboardInterrupt
+        pressed.append(number)
+        print("\nratslam: interrupted; finishing this chunk and writing the results ...", file=sys.stderr)
+
+    before = signal.signal(signal.SIGINT, press)
     try:
-        with tqdm(total=total, unit="step", desc=source.name, file=sys.stderr, mininterval=0.5) as progress:
-            while chunk := list(islice(samples, CHUNK - session.steps % CHUNK)):
-                observations = [_observation(sample) for sample in chunk]
-                steps = list(session.replay(observations))
-                reckoned = []
-                for observation in observations:
-                    moved = observation.odometry
-                    odometry = compose(odometry, np.array([moved.dx, moved.dy, moved.dtheta]))
-                    reckoned.append(odometry)
-                store.append(_lines(chunk, steps, reckoned))
-                if session.steps - saved >= CHECKPOINT_EVERY:
-                    store.checkpoint(session.arrays() | {"digest": np.array(source.digest)})
-                    saved = session.steps
-                progress.update(len(chunk))
-                progress.set_postfix(places=int(steps[-1].estimate.place) + 1, refresh=False)
-    except KeyboardInterrupt:
-        print("ratslam: interrupted; writing the results so far ...", file=sys.stderr)
-        return True
-    return False
+        yield lambda: bool(pressed)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _observation(sample: Sample) -> Observation:

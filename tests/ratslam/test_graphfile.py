@@ -1,0 +1,137 @@
+"""Maps written and read back."""
+
+from __future__ import annotations
+
+import networkx
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ratslam.graphfile import read_g2o, read_json, write_g2o, write_json
+from ratslam.posegraph import Edges
+from tactile.errors import InputError
+
+FINITE = st.floats(allow_nan=False, allow_infinity=False)
+VERTICES = "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\n"
+
+
+def example(seed=0):
+    rng = np.random.default_rng(seed)
+    half = rng.normal(size=(6, 3, 3))
+    i, j = np.arange(6), np.array([1, 2, 3, 4, 0, 2])
+    return rng.normal(size=(7, 3)), Edges(i, j, rng.normal(size=(6, 3)), half + np.swapaxes(half, 1, 2))
+
+
+@given(values=st.lists(FINITE, min_size=9, max_size=9))
+def test_g2o_reads_back_exactly(values, tmp_path_factory):
+    """Every finite float survives, bit for bit."""
+    path = tmp_path_factory.mktemp("g2o") / "map.g2o"
+    values = np.array(values)
+    poses = np.stack([values[:3], values[3:6]])
+    write_g2o(path, poses, Edges(np.array([0]), np.array([1]), values[None, 6:], np.ones((1, 3))))
+    again, edges = read_g2o(path)
+    assert again.tobytes() == poses.tobytes()
+    assert edges.motion.tobytes() == values[None, 6:].tobytes()
+    assert (edges.information == np.eye(3)).all()
+
+
+def test_g2o_keeps_full_information(tmp_path):
+    """All six entries of an information matrix land where they were."""
+    poses, edges = example()
+    write_g2o(tmp_path / "map.g2o", poses, edges)
+    again, read = read_g2o(tmp_path / "map.g2o")
+    assert (again == poses).all()
+    for ours, theirs in zip(edges, read, strict=True):
+        assert (ours == theirs).all()
+
+
+def test_g2o_sorts_ids_and_passes_over_other_lines(tmp_path):
+    """Ids may be sparse and out of order; comments, blank lines and other elements are nothing to us."""
+    path = tmp_path / "map.g2o"
+    edge = "EDGE_SE2 7 3 1 2 3 1 0 0 1 0 1"
+    path.write_text(f"# note\nVERTEX_SE2 7 7 0 0\n\nFIX 3\nVERTEX_SE2 3 3 0 0\n{edge}\n")
+    poses, edges = read_g2o(path)
+    assert poses[:, 0].tolist() == [3, 7]
+    assert (edges.i.tolist(), edges.j.tolist()) == ([1], [0])
+
+
+def test_an_empty_g2o(tmp_path):
+    """No nodes and no links keep their shapes."""
+    path = tmp_path / "map.g2o"
+    path.write_text("")
+    poses, edges = read_g2o(path)
+    assert poses.shape == (0, 3)
+    assert edges.motion.shape == (0, 3)
+    assert edges.information.shape == (0, 3, 3)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "VERTEX_SE2",
+        "VERTEX_SE2 2 0 0",
+        "VERTEX_SE2 2 0 0 0 0",
+        "VERTEX_SE2 two 0 0 0",
+        "EDGE_SE2 0",
+        "EDGE_SE2 0 1 1 0 0 1 0 0 1 0",
+        "EDGE_SE2 0 1 1 0 0 1 0 0 1 0 x",
+        "EDGE_SE2 0 1.5 1 0 0 1 0 0 1 0 1",
+    ],
+)
+def test_a_malformed_line_is_named(tmp_path, line):
+    """The error says which file and which line."""
+    path = tmp_path / "map.g2o"
+    path.write_text(VERTICES + line + "\n")
+    with pytest.raises(InputError) as raised:
+        read_g2o(path)
+    assert raised.value.where == f"{path}:3"
+
+
+def test_an_edge_to_nowhere(tmp_path):
+    """A link needs both of its nodes."""
+    path = tmp_path / "map.g2o"
+    path.write_text(VERTICES + "EDGE_SE2 0 9 1 0 0 1 0 0 1 0 1\n")
+    with pytest.raises(InputError, match="node 9") as raised:
+        read_g2o(path)
+    assert str(path) in raised.value.where
+
+
+def graph():
+    made = networkx.DiGraph()
+    made.add_node(0, x=0.1, y=1 / 3, heading=-1e-300, template=4)
+    made.add_node(1, x=1.0, y=2.0, heading=3.0, template=0)
+    made.add_edge(0, 1, dx=0.1, dy=2 / 3, dtheta=0.0, traversals=2, length=1.5, duration=3.0, closure=True)
+    return made
+
+
+def test_json_reads_back_exactly(tmp_path):
+    """Ids, numbers, flags and directions all survive."""
+    write_json(tmp_path / "map.json", graph())
+    again = read_json(tmp_path / "map.json")
+    assert isinstance(again, networkx.DiGraph)
+    assert dict(again.nodes(data=True)) == dict(graph().nodes(data=True))
+    assert list(again.edges(data=True)) == list(graph().edges(data=True))
+
+
+def test_the_same_map_is_the_same_bytes(tmp_path):
+    """Written, read and written again: nothing changes."""
+    a, b, c = (tmp_path / name for name in "abc")
+    write_g2o(a, *example())
+    write_g2o(b, *example())
+    write_g2o(c, *read_g2o(a))
+    assert a.read_bytes() == b.read_bytes() == c.read_bytes()
+    write_json(a, graph())
+    write_json(b, graph())
+    write_json(c, read_json(a))
+    assert a.read_bytes() == b.read_bytes() == c.read_bytes()
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "{}", "3", '{"nodes": 3, "edges": []}', '{"nodes": [{}]}'])
+def test_what_is_no_graph_is_named(tmp_path, text):
+    """The error says which file."""
+    path = tmp_path / "map.json"
+    path.write_text(text)
+    with pytest.raises(InputError) as raised:
+        read_json(path)
+    assert raised.value.where.startswith(str(path))
