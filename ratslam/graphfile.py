@@ -82,7 +82,7 @@ def read_json(path: Path) -> networkx.DiGraph:
     try:
         content = json.loads(Path(path).read_text(encoding="utf-8"))
         return networkx.DiGraph(networkx.node_link_graph(content, edges="edges"))
-    except (ValueError, KeyError, TypeError, networkx.NetworkXException) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, networkx.NetworkXException) as error:
         raise InputError(str(path), f"not a node-link graph ({error})", "the map.json of a run") from None
 
 

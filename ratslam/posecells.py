@@ -109,7 +109,7 @@ class Tables(NamedTuple):
     both_xy: np.ndarray
     excite_heading: np.ndarray
     both_heading: np.ndarray
-    heading: np.ndarray
+    heading: Array
 
 
 def tables(config: PoseCellConfig, dtype: np.dtype) -> Tables:

@@ -170,11 +170,14 @@ def least_squares(
 
     def judge(at: np.ndarray):
         residual, by_i, by_j = error(at, edges)
-        chi2 = np.einsum("ea,eab,eb->e", residual, information, residual)
-        weights = np.where(tamed, kernel.weight(chi2), 1.0)
-        return residual, by_i, by_j, weights, float(np.where(tamed, kernel.loss(chi2), chi2).sum())
+        with np.errstate(over="ignore", invalid="ignore"):
+            chi2 = np.einsum("ea,eab,eb->e", residual, information, residual)
+            weights = np.where(tamed, kernel.weight(chi2), 1.0)
+            return residual, by_i, by_j, weights, float(np.where(tamed, kernel.loss(chi2), chi2).sum())
 
     state = judge(poses)
+    if not np.isfinite(state[-1]):
+        return Solution(poses, Ending.NOT_FINITE, 0, np.inf, np.ones(len(edges.i)))
     damping, taken = 1e-9, 0
     ending = Ending.ITERATIONS
     while taken < iterations:
