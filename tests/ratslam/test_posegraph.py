@@ -88,7 +88,7 @@ def test_a_robust_kernel_shrugs_off_a_false_closure():
 
 def test_heavy_heading_noise_ends_with_a_name_and_no_nan():
     stream = np.random.default_rng(1)
-    truth, edges = loops(stream, 400, 60, (0.02, 0.1))
+    _, edges = loops(stream, 400, 60, (0.02, 0.1))
     start = np.vstack([np.zeros(3), integrate(edges.motion[:399])])
     solved = least_squares(start, edges, iterations=200)
     assert np.isfinite(solved.poses).all()
