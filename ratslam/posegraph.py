@@ -155,7 +155,7 @@ def least_squares(
         tolerance: the largest change of a step that ends the solve, m and rad.
 
     Returns:
-        never NaN: where nothing better was found, the poses are those given.
+        from finite poses never NaN: where nothing better was found, the poses are those given.
     """
     poses = np.array(poses, float)
     if not (

@@ -146,7 +146,7 @@ def match_view(config: TemplateConfig, shape: tuple[int, int, int], store: Templ
 
 def match_label(store: Templates, label: Array) -> Match:
     """The template that carries the given label."""
-    same = store.label == label
+    same = (store.label == label) & (label >= 0)  # empty rows carry -1
     matched = jnp.any(same)
     zero = jnp.zeros((), store.packet.dtype)
     template = jnp.where(matched, jnp.argmax(same).astype(jnp.int32), -1)
