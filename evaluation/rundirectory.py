@@ -61,9 +61,7 @@ def _places(path: Path) -> np.ndarray:
     try:
         return np.array([int(line.split(",")[column]) for line in lines], int)
     except (ValueError, IndexError):
-        raise InputError(
-            str(path), "rows without a place", "the columns t,template,match_error,place,..."
-        ) from None
+        raise InputError(str(path), "rows without a place", "the columns t,place,action,...") from None
 
 
 def _map(path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from evaluation.table import read_table
 from tactile.errors import InputError
-from tactile.frames import between, compose, tum_line, wrap
+from tactile.frames import between, compose, fitted, tum_line, wrap
 
 _TUM = {name: () for name in ("t", "x", "y", "z", "qx", "qy", "qz", "qw")}
 
@@ -46,10 +46,8 @@ def align(estimate: np.ndarray, reference: np.ndarray) -> np.ndarray:
     Raises:
         InputError: when there is no row, or the two differ in length.
     """
-    a, b = _positions(estimate, reference)
-    turn = np.angle(np.vdot(a - a.mean(), b - b.mean()))
-    shift = b.mean() - np.exp(1j * turn) * a.mean()
-    return np.array([shift.real, shift.imag, turn])
+    _positions(estimate, reference)
+    return fitted(estimate, reference)
 
 
 def position_errors(estimate: np.ndarray, reference: np.ndarray) -> np.ndarray:

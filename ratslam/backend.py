@@ -1,7 +1,8 @@
 """The seam: what a SLAM method has to provide.
 
 A backend is a pure kernel and a map that folds what the kernel reports. The kernel never sees the map and
-the map never sees the kernel's state, so the kernel can be scanned, batched and replayed bit for bit.
+the map never sees the kernel's state, so the kernel can be scanned, batched and replayed bit for bit. One way
+leads back: at fixed counts of steps the map gives its guidance, a plain record, and the state takes it up.
 """
 
 from __future__ import annotations
@@ -20,13 +21,18 @@ State = Any
 """A pytree of arrays of fixed shapes and dtypes."""
 Evidence = Any
 """The backend's own fixed-shape record of one step, a NamedTuple of arrays."""
+Guidance = Any
+"""What a map tells its kernel, a record of host arrays; None where the kernel asks for nothing."""
 
 
 class Map(Protocol):
     """The host side: folds one step at a time and answers in the map frame."""
 
-    def update(self, observation: Observation, estimate: Estimate, evidence: Evidence) -> None:
-        """Folds one step."""
+    def update(self, observation: Observation, estimate: Estimate, evidence: Evidence) -> Estimate:
+        """Folds one step; returns the estimate with what only the map knows (places it has confirmed)."""
+
+    def guidance(self) -> Guidance:
+        """What the kernel may know of the map as it is now."""
 
     def pose(self, estimate: Estimate) -> np.ndarray:
         """[3] the robot's present pose in the map frame: x m, y m, heading rad."""
@@ -55,6 +61,9 @@ class Backend(Protocol):
 
     def grow(self, state: State, capacity: int) -> State:
         """The same state with more room."""
+
+    def inform(self, state: State, guidance: Guidance) -> State:
+        """The state that has taken up what the map told; same shapes and dtypes."""
 
     def kernel(self, state: State, observation: Observation) -> tuple[State, Estimate, Evidence]:
         """One step, pure: it can be jitted, scanned and vmapped."""

@@ -9,11 +9,15 @@ from pydantic import Field, NonNegativeInt
 
 from evaluation.exm import ExmConfig
 from ratslam.experience import ExperienceConfig
+from ratslam.framemap import FrameMapConfig
 from ratslam.places import PlaceConfig
 from ratslam.posecells import PoseCellConfig
 from ratslam.rat import RatConfig
+from ratslam.recall import RecallConfig
 from ratslam.templates import TemplateConfig
 from robot.formats import RecordingConfig
+from robot.log import Log
+from robot.source import Source
 from tactile.settings import Settings
 
 
@@ -44,6 +48,8 @@ class RunConfig(Settings):
     """What to run on."""
     backend: Literal["rat"] = "rat"
     """The method."""
+    matcher: Literal["recall", "classic"] = "recall"
+    """`recall`: the unified filter and the frame map; `classic`: winner takes all, as RatSLAM does."""
     pose_cells: PoseCellConfig = PoseCellConfig()
     """The attractor network."""
     templates: TemplateConfig = TemplateConfig()
@@ -51,7 +57,13 @@ class RunConfig(Settings):
     places: PlaceConfig = PlaceConfig()
     """When a place is made, reached or kept."""
     experience: ExperienceConfig = ExperienceConfig()
-    """The map."""
+    """The classic map; `closures` holds for both."""
+    recall: RecallConfig = RecallConfig()
+    """The unified filter."""
+    frames: FrameMapConfig = FrameMapConfig()
+    """The map of frames, for the unified filter."""
+    lost: Annotated[float, Field(ge=0, le=1)] = 0.25
+    """Share of fitting revisits under which the robot calls itself lost."""
     session: SessionConfig = SessionConfig()
     """Precision, seed and memory."""
     score: ScoreConfig = ScoreConfig()
@@ -59,9 +71,16 @@ class RunConfig(Settings):
 
     def rat(self) -> RatConfig:
         """The rat backend's part."""
-        return RatConfig(
-            pose_cells=self.pose_cells,
-            templates=self.templates,
-            places=self.places,
-            experience=self.experience,
-        )
+        return RatConfig(**{name: getattr(self, name) for name in RatConfig.model_fields})
+
+    def completed(self, source: Source) -> RunConfig:
+        """The same, with what the file leaves open and the recording knows: cell size, given place ids."""
+        parts: dict[str, Settings] = {}
+        params = getattr(source, "params", {})
+        if "cell_size" not in self.pose_cells.model_fields_set and "pc_cell_x_size" in params:
+            cell = {"cell_size": float(params["pc_cell_x_size"])}
+            parts["pose_cells"] = self.pose_cells.model_copy(update=cell)
+        ids_only = isinstance(source, Log) and bool((source.label >= 0).any()) and not source.seen.any()
+        if "source" not in self.templates.model_fields_set and ids_only:
+            parts["templates"] = self.templates.model_copy(update={"source": "labels"})
+        return self.model_copy(update=parts)

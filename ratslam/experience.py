@@ -164,7 +164,10 @@ class ExperienceMap:
 
     # What changes it
 
-    def update(self, observation: Observation, estimate: Estimate, evidence: Evidence) -> None:
+    def guidance(self) -> None:
+        """Nothing: the classic kernel knows no map."""
+
+    def update(self, observation: Observation, estimate: Estimate, evidence: Evidence) -> Estimate:
         """Moves along the odometry, then creates, links or sets as the estimate says."""
         self._advance(observation.odometry)
         action, place = int(estimate.action), int(estimate.place)
@@ -175,6 +178,7 @@ class ExperienceMap:
             self._reach(self._known(place), relative)
         self._step_node.append(self._current)
         self._step_motion.append(self._travel.motion)
+        return estimate
 
     def _advance(self, odometry) -> None:
         moved = np.array([float(odometry.dx), float(odometry.dy), float(odometry.dtheta)])

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from pydantic import Field
 
 from ratslam import places, posecells, templates
 from ratslam.experience import ExperienceConfig, ExperienceMap
+from ratslam.framemap import FrameMapConfig
 from ratslam.places import PlaceConfig, Places
 from ratslam.posecells import Outcome, PoseCellConfig, PoseCells
+from ratslam.recall import RecallConfig
 from ratslam.templates import Match, TemplateConfig, Templates
 from ratslam.types import Estimate
 from tactile.frames import wrap
@@ -22,6 +25,8 @@ from tactile.types import Array, Observation, Odometry
 class RatConfig(Settings):
     """Every parameter of the rat backend."""
 
+    matcher: Literal["recall", "classic"] = "recall"
+    """`recall`: the unified filter and the frame map; `classic`: winner takes all, as RatSLAM does."""
     pose_cells: PoseCellConfig = PoseCellConfig()
     """The attractor network."""
     templates: TemplateConfig = TemplateConfig()
@@ -29,7 +34,13 @@ class RatConfig(Settings):
     places: PlaceConfig = PlaceConfig()
     """When a place is made, reached or kept."""
     experience: ExperienceConfig = ExperienceConfig()
-    """The map."""
+    """The classic map; `closures` holds for both."""
+    recall: RecallConfig = RecallConfig()
+    """The unified filter."""
+    frames: FrameMapConfig = FrameMapConfig()
+    """The map of frames, for the unified filter."""
+    lost: Annotated[float, Field(ge=0, le=1)] = 0.25
+    """Share of fitting revisits under which the robot is lost (see `RecallEvidence.health`)."""
 
 
 class State(NamedTuple):
@@ -93,10 +104,15 @@ class Rat:
         memories = jax.tree.map(enlarge, (state.templates, state.places), (empty.templates, empty.places))
         return state._replace(templates=memories[0], places=memories[1])
 
+    def inform(self, state: State, guidance: None) -> State:
+        """The classic map tells its kernel nothing."""
+        del guidance
+        return state
+
     def kernel(self, state: State, observation: Observation) -> tuple[State, Estimate, RatEvidence]:
         """See, recall, inject and move, decode, learn, decide."""
         config = self.config
-        odometry, view, seen, clean = self._finite(observation)
+        odometry, view, seen, clean = finite(config.templates, self.dtype, observation)
 
         match = self._match(state.templates, view, observation.label, seen)
         memory, energy = templates.recall(config.templates, state.templates, match, seen)
@@ -144,22 +160,25 @@ class Rat:
             match = templates.match_view(self.config.templates, self.view_shape, store, view)
         return match._replace(error=jnp.where(seen, match.error, jnp.inf))
 
-    def _finite(self, observation: Observation) -> tuple[Odometry, Array, Array, Array]:
-        """The observation in this precision, with anything that is not a number masked."""
-        odometry = Odometry(*(jnp.asarray(value, self.dtype) for value in observation.odometry))
-        moves = jnp.stack(odometry[:3])
-        fine = jnp.all(jnp.isfinite(moves))
-        dx, dy, dtheta = jnp.where(fine, moves, 0.0)
-        odometry = Odometry(dx, dy, dtheta, odometry.dt)
-        view = jnp.asarray(observation.view, self.dtype)
-        visible = jnp.all(jnp.isfinite(view))
-        view = templates.normalise(self.config.templates, jnp.where(visible, view, 0.0))
-        given = (
-            observation.label >= 0
-            if self.config.templates.source == "labels"
-            else observation.view_seen & visible
-        )
-        return odometry, view, given, fine & (visible | ~observation.view_seen)
+
+def finite(
+    config: TemplateConfig, dtype: np.dtype, observation: Observation
+) -> tuple[Odometry, Array, Array, Array]:
+    """The observation in this precision, with anything that is not a number masked.
+
+    Returns:
+        odometry; the view as it is stored and compared; whether there is a view (or given id); whether all of
+        it was finite.
+    """
+    odometry = Odometry(*(jnp.asarray(value, dtype) for value in observation.odometry))
+    moves = jnp.stack(odometry[:3])
+    fine = jnp.all(jnp.isfinite(moves))
+    dx, dy, dtheta = jnp.where(fine, moves, 0.0)
+    view = jnp.asarray(observation.view, dtype)
+    visible = jnp.all(jnp.isfinite(view))
+    view = templates.normalise(config, jnp.where(visible, view, 0.0))
+    given = observation.label >= 0 if config.source == "labels" else observation.view_seen & visible
+    return Odometry(dx, dy, dtheta, odometry.dt), view, given, fine & (visible | ~observation.view_seen)
 
 
 def from_parameters(params: dict[str, Any], labels: bool) -> RatConfig:
@@ -220,4 +239,6 @@ def from_parameters(params: dict[str, Any], labels: bool) -> RatConfig:
         "panoramic": bool(given["vt_panoramic"]),
     }
     radius = given["exp_delta_pc_threshold"]
-    return RatConfig.model_validate({**parts, "places": {"radius": radius, "radius_heading": radius}})
+    return RatConfig.model_validate(
+        {"matcher": "classic", **parts, "places": {"radius": radius, "radius_heading": radius}}
+    )

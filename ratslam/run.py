@@ -23,7 +23,7 @@ from evaluation.scorecard import Scorecard, score
 from evaluation.trajectory import write_tum
 from ratslam.config import RunConfig
 from ratslam.posecells import Outcome
-from ratslam.rat import Rat
+from ratslam.recallrat import evidence_of, rat
 from ratslam.session import CHUNK, Session, Step
 from ratslam.storage import RunDirectory, read_checkpoint
 from ratslam.types import Action
@@ -34,7 +34,7 @@ from tactile.errors import InputError
 from tactile.frames import compose, tum_line
 from tactile.types import Cycle, Observation
 
-CHECKPOINT_EVERY = 32 * CHUNK
+CHECKPOINT_EVERY = 128 * CHUNK
 """Steps between checkpoints: a kill loses no line, but a continued run repeats at most these."""
 
 
@@ -56,16 +56,17 @@ def run(
     config = _located(config, folder.resolve())
     relations = read_relations(config.score.relations) if config.score.relations else None
     with open_recording(config.recording, _tell) as source:
+        config = config.completed(source)
         dtype = np.dtype(config.session.precision)
         session = Session(
-            Rat(config.rat(), source.view_shape, dtype),
+            rat(config.rat(), source.view_shape, dtype),
             seed=config.session.seed,
             reserve=config.session.reserve,
             precision=config.session.precision,
         )
         skip = _resume(session, resume, source.digest) if resume else 0
         _check_length(source, skip, resume)
-        with RunDirectory(directory) as store:
+        with RunDirectory(directory, _told(evidence_of(config.matcher))) as store:
             text = dump(config)
             store.text("config.yaml", text)
             manifest = _manifest(config, text, source, resume)
@@ -150,18 +151,28 @@ def _lines(samples: list[Sample], steps: list[Step], reckoned: list[np.ndarray])
 
 
 def _step_line(time: float, step: Step) -> str:
-    estimate, evidence = step.estimate, step.evidence
-    error = float(evidence.error)
+    estimate = step.estimate
     cells = [
         repr(float(time)),
-        str(int(evidence.template)),
-        repr(error) if np.isfinite(error) else "",
         str(int(estimate.place)),
         Action(int(estimate.action)).name.lower(),
         *(repr(float(value)) for value in (*step.pose, *estimate.spread)),
-        Outcome(int(evidence.outcome)).name.lower(),
+        str(int(estimate.lost)),
+        Outcome(int(step.evidence.outcome)).name.lower(),
+        *(_cell(getattr(step.evidence, name)) for name in _told(type(step.evidence))),
     ]
     return ",".join(cells) + "\n"
+
+
+def _told(evidence: Any) -> list[str]:
+    """The columns that a backend adds to steps.csv: what its evidence holds in single values."""
+    return [name for name in evidence._fields if name not in ("packet", "background", "outcome")]
+
+
+def _cell(value: Any) -> str:
+    if np.issubdtype(value.dtype, np.integer):
+        return str(int(value))
+    return repr(float(value)) if np.isfinite(value) else ""
 
 
 def _finish(session: Session, store: RunDirectory, digest: str) -> None:

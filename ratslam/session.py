@@ -2,7 +2,7 @@
 
 Live and replay run the same compiled function over a chunk of fixed length with a traced count: live passes
 one observation, replay many, and both give the same bits. Memory grows to powers of two that depend on the
-number of steps alone, before a chunk that could need it.
+number of steps alone, before a chunk that could need it; at the start of a chunk the kernel hears of the map.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from ratslam.backend import Backend, Evidence, Map
 from ratslam.types import Estimate
 from tactile.types import Observation, stack
 
-CHUNK = 64
-"""Observations per compiled call; capacities change only at multiples of it."""
+CHUNK = 16
+"""Observations per compiled call; capacities change and the map guides only at multiples of it."""
 
 
 class Step(NamedTuple):
@@ -114,6 +114,8 @@ class Session:
         capacity = capacity_at(self.steps, self.reserve)
         if self.steps and capacity != capacity_at(self.steps - 1, self.reserve):
             self.state = self.backend.grow(self.state, capacity)
+        if self.steps % CHUNK == 0:
+            self.state = self.backend.inform(self.state, self.map.guidance())
         count = len(observations)
         chunk = stack(observations + observations[-1:] * (CHUNK - count))
         self.state, outputs = self._run(self.state, chunk, np.int32(count))
@@ -122,7 +124,7 @@ class Session:
         for k, observation in enumerate(observations):
             estimate = jax.tree.map(lambda column, k=k: column[k], estimates)
             proof = jax.tree.map(lambda column, k=k: column[k], evidence)
-            self.map.update(observation, estimate, proof)
+            estimate = self.map.update(observation, estimate, proof)
             steps.append(Step(estimate, proof, self.map.pose(estimate)))
         self.steps += count
         return steps

@@ -19,14 +19,17 @@ import numpy as np
 from tactile.errors import InputError
 
 COLUMNS = (
-    "t", "template", "match_error", "place", "action", "x", "y", "heading",
-    "sd_x", "sd_y", "sd_heading", "outcome",
+    "t", "place", "action", "x", "y", "heading", "sd_x", "sd_y", "sd_heading", "lost", "outcome",
 )  # fmt: skip
-"""Of steps.csv: s; the pose is the one told at that step, in the map frame (m, rad)."""
+"""Of steps.csv, before those of the backend: s; the pose is the one told at that step, in the map frame (m,
+rad)."""
 
 
 class RunDirectory:
     """Files of one run.
+
+    Args:
+        columns: that the backend adds to steps.csv.
 
     Raises:
         InputError: the directory exists already, or cannot be made.
@@ -34,8 +37,8 @@ class RunDirectory:
 
     STREAMS = ("online.tum", "odometry.tum", "truth.tum", "steps.csv")
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: Path, columns: Iterable[str] = ()) -> None:
+        self.path, self.columns = path, (*COLUMNS, *columns)
         if path.exists():
             raise InputError(str(path), "exists already", "a new run directory", "choose another with -o")
         try:
@@ -50,7 +53,7 @@ class RunDirectory:
         self._streams = {
             name: (self.path / name).open("x", encoding="utf-8", newline="") for name in self.STREAMS
         }
-        self._streams["steps.csv"].write(",".join(COLUMNS) + "\n")
+        self._streams["steps.csv"].write(",".join(self.columns) + "\n")
         return self
 
     def __exit__(self, *_: object) -> None:

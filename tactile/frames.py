@@ -55,6 +55,17 @@ def integrate(motions: np.ndarray, start: np.ndarray | None = None) -> np.ndarra
     return np.stack([x, y, wrap(heading)], axis=-1)
 
 
+def fitted(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The rigid motion [3] that brings poses [N, 3] nearest to others by position: compose(fitted(a, b), a).
+
+    Least squares over rotation and translation, without scale (Umeyama 1991, in the plane).
+    """
+    x, y = (np.asarray(rows)[:, 0] + 1j * np.asarray(rows)[:, 1] for rows in (a, b))
+    turn = np.angle(np.vdot(x - x.mean(), y - y.mean()))
+    shift = y.mean() - np.exp(1j * turn) * x.mean()
+    return np.array([shift.real, shift.imag, turn])
+
+
 def tum_line(time: float, pose: np.ndarray) -> str:
     """One line `t x y z qx qy qz qw` of a TUM trajectory; floats are written so that they read back equal."""
     x, y, heading = map(float, pose)

@@ -29,6 +29,10 @@ class DeadReckoning:
         del capacity
         return state
 
+    def inform(self, state, guidance):
+        del guidance
+        return state
+
     def kernel(self, state, observation):
         o = observation.odometry
         moved = jnp.where(jnp.isfinite(o.dx + o.dy + o.dtheta), jnp.stack([o.dx, o.dy, o.dtheta]), 0.0)
@@ -54,9 +58,13 @@ class Reckoned:
     def __init__(self) -> None:
         self.path: list[np.ndarray] = [np.zeros(3)]
 
-    def update(self, observation, estimate, evidence) -> None:
-        del observation, estimate
+    def update(self, observation, estimate, evidence):
+        del observation
         self.path.append(compose(self.path[-1], evidence.moved))
+        return estimate
+
+    def guidance(self) -> None:
+        return None
 
     def pose(self, estimate):
         return np.asarray(estimate.pose)

@@ -9,7 +9,8 @@ import jax
 import numpy as np
 import pytest
 
-from ratslam.rat import Rat, RatConfig
+from ratslam.rat import RatConfig
+from ratslam.recallrat import rat
 from ratslam.session import CHUNK, Session, capacity_at
 from ratslam.types import Action
 from tactile.types import Odometry, observation
@@ -26,17 +27,18 @@ def _dead_reckoning():
     return module.DeadReckoning()
 
 
-def _rat():
-    return Rat(RatConfig.model_validate({"pose_cells": {"cells_xy": 11}}), VIEW)
+def _rat(matcher, source):
+    parts = {"matcher": matcher, "pose_cells": {"cells_xy": 11}, "templates": {"source": source}}
+    return lambda: rat(RatConfig.model_validate(parts), VIEW)
 
 
-def _rat_of_labels():
-    return Rat(
-        RatConfig.model_validate({"pose_cells": {"cells_xy": 11}, "templates": {"source": "labels"}}), VIEW
-    )
-
-
-BACKENDS = {"rat": _rat, "rat-labels": _rat_of_labels, "dead-reckoning": _dead_reckoning}
+BACKENDS = {
+    "recall": _rat("recall", "views"),
+    "recall-labels": _rat("recall", "labels"),
+    "classic": _rat("classic", "views"),
+    "classic-labels": _rat("classic", "labels"),
+    "dead-reckoning": _dead_reckoning,
+}
 
 
 @pytest.fixture(params=BACKENDS)

@@ -1,0 +1,213 @@
+"""A chain of frames with closures in runs and one heading bias: robust SE(2) least squares.
+
+Odometry that always pulls to one side is one number, not many errors: the bias, in radians per metre, is
+solved for with the poses. Closures that were recognised together stand or fall together: a run has one robust
+weight. Frame 0 is held where it is. Sources: Geman & McClure 1985 (the kernel); Kuemmerle et al. 2011 (the
+error); the bias and the weights by run are ours.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse import csc_matrix
+from scipy.sparse.linalg import SuperLU, splu
+
+from tactile.frames import wrap
+
+
+class Chain(NamedTuple):
+    """What odometry says from each frame to the next.
+
+    Attributes:
+        motion: [N - 1, 3] the later frame in the earlier one (m, m, rad). length: [N - 1] m travelled.
+        variance: [N - 1, 3] of the motion.
+    """
+
+    motion: np.ndarray
+    length: np.ndarray
+    variance: np.ndarray
+
+
+class Closures(NamedTuple):
+    """What recall says: frame j stands where frame i does, turned by `turn`.
+
+    Attributes:
+        i, j: [M] frames. turn: [M] rad. run: [M] which run each belongs to, 0..R - 1. variance: [3] of each.
+        scale: [R] mean chi-square at which the weight of a run has fallen to a quarter.
+    """
+
+    i: np.ndarray
+    j: np.ndarray
+    turn: np.ndarray
+    run: np.ndarray
+    variance: np.ndarray
+    scale: np.ndarray
+
+
+class Prior(NamedTuple):
+    """What is known of the heading bias beforehand, rad/m."""
+
+    mean: float
+    sd: float
+
+
+class Fit(NamedTuple):
+    """Poses [N, 3], heading bias rad/m, the weight [R] of each run."""
+
+    poses: np.ndarray
+    bias: float
+    weights: np.ndarray
+
+
+def corrected(motion: np.ndarray, length: np.ndarray | float, bias: float) -> np.ndarray:
+    """Motions [..., 3] freed of a heading bias that built up evenly along their lengths [...]."""
+    turn = bias * np.asarray(length)
+    c, s = np.cos(turn / 2), np.sin(turn / 2)
+    x, y = motion[..., 0], motion[..., 1]
+    return np.stack([c * x - s * y, s * x + c * y, wrap(motion[..., 2] + turn)], axis=-1)
+
+
+def solve(
+    poses: np.ndarray, bias: float, chain: Chain, closures: Closures, prior: Prior, iterations: int
+) -> Fit:
+    """Gauss-Newton with weights by run, from the given poses [N, 3] and bias.
+
+    Returns:
+        the fit after the last step that changed anything by more than 1e-4 (m, rad), `iterations` at most;
+        where the equations cannot be solved, what it had before.
+    """
+    system = _System(chain, closures, prior)
+    fit = Fit(np.array(poses, float), bias, np.ones(len(closures.scale)))
+    for _ in range(iterations):
+        equations = system.linearise(fit)
+        fit = fit._replace(weights=equations.weights)
+        step = equations.step()
+        if step is None:
+            break
+        moved = fit.poses + step[0]
+        moved[:, 2] = wrap(moved[:, 2])
+        fit = fit._replace(poses=moved, bias=fit.bias + step[1])
+        if np.abs(step[0]).max(initial=0.0) < 1e-4:
+            break
+    return fit
+
+
+def relative_covariance(
+    fit: Fit, chain: Chain, closures: Closures, prior: Prior, i: int, j: int, turn: float
+) -> np.ndarray:
+    """[3, 3] covariance of frame j seen from frame i turned by `turn`, under everything the map knows.
+
+    The exact marginal of the linearised problem, the bias included (it moves far frames together).
+    """
+    equations = _System(chain, closures, prior).linearise(fit)
+    a, b = fit.poses[i], fit.poses[j]
+    c, s = np.cos(a[2] + turn), np.sin(a[2] + turn)
+    dx, dy = (b - a)[:2]
+    by_i = np.array([[-c, -s, c * dy - s * dx], [s, -c, -c * dx - s * dy], [0, 0, -1.0]])
+    by_j = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
+    change = np.zeros((3 * len(fit.poses), 3))
+    change[3 * i : 3 * i + 3] = by_i.T
+    change[3 * j : 3 * j + 3] = by_j.T
+    return equations.covariance(change[3:])
+
+
+class _Equations(NamedTuple):
+    """Normal equations of poses and bias: the factor of the poses' block, the rest bordering it."""
+
+    factor: SuperLU | None
+    gradient: np.ndarray
+    border: np.ndarray
+    corner: float
+    slope: float
+    weights: np.ndarray
+
+    def step(self) -> tuple[np.ndarray, float] | None:
+        if self.factor is None:
+            return None
+        free, bent = self.factor.solve(np.stack([-self.gradient, self.border], axis=1)).T
+        bias = (-self.slope - self.border @ free) / (self.corner - self.border @ bent)
+        step = free - bias * bent
+        if not np.isfinite(step).all():
+            return None
+        return np.concatenate([np.zeros((1, 3)), step.reshape(-1, 3)]), float(bias)
+
+    def covariance(self, change: np.ndarray) -> np.ndarray:
+        if self.factor is None:
+            return np.full((change.shape[1],) * 2, np.inf)
+        spread = self.factor.solve(change)
+        bent = self.factor.solve(self.border)
+        pull = change.T @ bent
+        return change.T @ spread + np.outer(pull, pull) / (self.corner - self.border @ bent)
+
+
+class _System:
+    """Where every block of the normal equations goes, worked out once for a set of edges."""
+
+    def __init__(self, chain: Chain, closures: Closures, prior: Prior) -> None:
+        count, steps = len(chain.length) + 1, np.arange(len(chain.length))
+        self.i, self.j = np.concatenate([steps, closures.i]), np.concatenate([steps + 1, closures.j])
+        self.motion = np.concatenate([chain.motion, np.zeros((len(closures.i), 3))])
+        self.motion[len(steps) :, 2] = closures.turn
+        self.length = np.concatenate([chain.length, np.zeros(len(closures.i))])
+        spread = np.broadcast_to(closures.variance, (len(closures.i), 3))
+        self.information = 1 / np.concatenate([chain.variance, spread])
+        self.closures, self.prior, self.chained = closures, prior, len(steps)
+        self.members = np.bincount(closures.run, minlength=len(closures.scale))
+
+        self.size = 3 * (count - 1)
+        ends = 3 * np.stack([self.i, self.j], axis=1)[:, :, None] - 3
+        at = (ends + np.arange(3)).reshape(-1, 6)  # frame 0 is held: its rows are left out
+        self.free, self.row = at >= 0, at[at >= 0]
+        rows, columns = np.repeat(at[:, :, None], 6, axis=2), np.repeat(at[:, None, :], 6, axis=1)
+        self.used = (rows >= 0) & (columns >= 0)
+        flat = columns[self.used] * self.size + rows[self.used]
+        places, self.slot = np.unique(flat, return_inverse=True)
+        self.count, self.indices = len(places), (places % self.size).astype(np.int32)
+        self.indptr = np.searchsorted(places // self.size, np.arange(self.size + 1)).astype(np.int32)
+
+    def linearise(self, fit: Fit) -> _Equations:
+        a, b = fit.poses[self.i], fit.poses[self.j]
+        c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
+        dx, dy = (b - a)[:, 0], (b - a)[:, 1]
+        told = corrected(self.motion, self.length, fit.bias)
+        ahead, aside = c * dx + s * dy, c * dy - s * dx
+        error = np.stack([ahead - told[:, 0], aside - told[:, 1], wrap(b[:, 2] - a[:, 2] - told[:, 2])], 1)
+        chi2 = (error**2 * self.information).sum(axis=1)
+        total = np.bincount(self.closures.run, chi2[self.chained :], len(self.members))
+        mean = total / np.maximum(self.members, 1)
+        weights = (self.closures.scale / (self.closures.scale + mean)) ** 2
+
+        jacobian = np.zeros((len(a), 3, 6))
+        jacobian[:, 0, :3] = np.stack([-c, -s, aside], axis=1)
+        jacobian[:, 1, :3] = np.stack([s, -c, -ahead], axis=1)
+        jacobian[:, 0, 3], jacobian[:, 0, 4], jacobian[:, 1, 3], jacobian[:, 1, 4] = c, s, -s, c
+        jacobian[:, 2, 2], jacobian[:, 2, 5] = -1.0, 1.0
+        by_bias = np.stack([told[:, 1] / 2, -told[:, 0] / 2, -np.ones(len(a))], 1) * self.length[:, None]
+
+        trust = self.information.copy()
+        trust[self.chained :] *= weights[self.closures.run][:, None]
+        weighted = np.swapaxes(jacobian, 1, 2) * trust[:, None, :]
+        data = np.bincount(self.slot, (weighted @ jacobian)[self.used], self.count)
+        pulled = weighted @ np.stack([error, by_bias], axis=2)
+        gradient, border = (np.bincount(self.row, pulled[:, :, k][self.free], self.size) for k in (0, 1))
+        matrix = csc_matrix((data, self.indices, self.indptr), (self.size, self.size))
+        tight = 1 / self.prior.sd**2
+        return _Equations(
+            _factor(matrix),
+            gradient,
+            border,
+            float((by_bias**2 * trust).sum() + tight),
+            float((by_bias * trust * error).sum() + tight * (fit.bias - self.prior.mean)),
+            weights,
+        )
+
+
+def _factor(matrix: csc_matrix) -> SuperLU | None:
+    try:
+        return splu(
+            matrix, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0
+        )
+    except RuntimeError:  # singular: a frame that nothing ties to frame 0
+        return None

@@ -1,0 +1,509 @@
+"""Recall: a posterior over remembered frames, the sector shift that aligns them, and "this is new".
+
+One view is seldom enough to know a place by. So nothing is decided on one: the posterior is carried along by
+odometry, sharpened or weakened by every view, and what no frame explains goes to `novel`. A view that looks
+like many frames says little, because novelty is judged by the mean likelihood over all of them; a view that
+contradicts takes mass away. Odometry aligns, it is never evidence by itself. What the map believes of the
+robot's place enters as one more hypothesis, always weak: it proposes, views dispose.
+
+The kernel is pure and of fixed shapes. Poses, bias, sector angle and the scale of view errors come from the
+map as a `Guidance`; no closure verdict comes back otherwise. No constant is in units of the sensor: errors
+count in units of the scale, distances in pose cells. The filter is ours; its ancestors are Bayesian
+localisation (Fox et al. 1999) and the sequence matching of SeqSLAM (Milford & Wyeth 2012).
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+
+from tactile.frames import wrap
+from tactile.settings import Settings
+from tactile.types import Array
+
+Share = Annotated[float, Field(ge=0, le=1)]
+
+SAMPLES = 20
+"""Errors against ruled-out frames told to the map at each frame, to calibrate by."""
+LABELS = {"same": 0.6, "unknown": 0.35, "other": 0.05, "new_unknown": 0.9, "new_known": 0.1}
+"""How likely a given id is where its frame was, and where it is new: ids are right more often than not, a new
+id says little (the giver may have failed to recognise), and another known id speaks against."""
+LABEL_TEMPER = 0.5
+"""Ids of consecutive views are not independent: each counts half."""
+SUPPORT = 8.0
+"""Squared deviations at which the alignment kernel (1 - d2 / 8)^4 ends: like exp(-d2 / 2), but compact."""
+BASIN = 2.0
+"""Cells around the best frame whose mass counts as that candidate's."""
+
+
+FACING = float(np.cos(0.5))
+"""Cosine of the heading difference up to which a frame looks where the robot does."""
+
+
+class RecallConfig(Settings):
+    """The filter. Lengths are in pose cells, so that one setting serves every robot."""
+
+    fan: Literal["auto", "none"] | float = "auto"
+    """Whether a view is a fan of ordered sectors, so that a turned robot sees it shifted: its width in rad
+    (counter-clockwise positive), `none`, or `auto`: found out from the recording itself."""
+    shifts: NonNegativeInt = 3
+    """Sectors by which a fan may be shifted either way."""
+    frame_distance: PositiveFloat = 0.3
+    """Way after which a view becomes a frame, cells. Standing still remembers nothing."""
+    frame_turn: PositiveFloat = 0.15
+    """Turn after which it does, rad."""
+    guard: PositiveInt = 20
+    """The newest frames, this many, are not recalled: the robot has hardly left them."""
+    sharpness: PositiveFloat = 0.2
+    """Error that costs a factor e, in scales (the 1 % quantile of errors between different places)."""
+    floor: PositiveFloat = 1.27
+    """Error at which a view is as likely new as known, in scales."""
+    common: Share = 0.7
+    """How much of novelty's likelihood is the mean over all frames, not the floor."""
+    reach: PositiveFloat = 0.85
+    """Standard deviation of a frame's place against odometry, cells."""
+    reach_heading: PositiveFloat = 0.25
+    """The same of its heading, rad."""
+    nothing: PositiveFloat = 0.02
+    """Weight of there being no frame where odometry leads, against one just there."""
+    leave: Share = 0.01
+    """Share of a hypothesis that is lost at every frame."""
+    enter: Share = 0.05
+    """Share of novelty that becomes hypotheses at every frame."""
+    local: Share = 0.3
+    """How much of that lies around the map's pose; the rest goes to all frames alike."""
+    local_sd: PositiveFloat = 1.0
+    """Standard deviation of the map's pose after a closure, cells."""
+    local_rate: NonNegativeFloat = 0.05
+    """What each metre travelled since adds to it, m."""
+    local_heading: PositiveFloat = 0.3
+    """Standard deviation of the map's heading after a closure, rad."""
+    local_heading_rate: NonNegativeFloat = 0.006
+    """What each cell travelled since adds to it, rad."""
+    modes: PositiveInt = 8
+    """Hypotheses kept from frame to frame; the mass of the others goes to novelty."""
+
+
+class Guidance(NamedTuple):
+    """What the map tells the filter.
+
+    Attributes:
+        poses: [N, 3] of all frames in the map. bias: of the heading, rad/m. since: m travelled since the last
+            closure. angle: of a sector, rad, 0 while unknown. scale: of view errors, 0 while unknown.
+    """
+
+    poses: np.ndarray
+    bias: float
+    since: float
+    angle: float
+    scale: float
+
+
+class Memory(NamedTuple):
+    """All frames, rows in order of time, and what is believed now.
+
+    Attributes:
+        view: [D, C]. label: [C] int32. packet: [C, 3] pose-cell packet when the frame was taken, cells.
+        x, y, cosine, sine: [C] poses in the map. count, distinct: frames, and labels known, int32.
+        anchor: [K] int32 frames that hypotheses stand at, offset: [K, 3] where in their frames (m, rad),
+            mass: [K]. What they lack to 1 is novelty.
+        pose: [3] of the newest frame. motion, length, turn: since then: [3], m, rad.
+        bias, since, angle, scale: see `Guidance`.
+    """
+
+    view: Array
+    label: Array
+    packet: Array
+    x: Array
+    y: Array
+    cosine: Array
+    sine: Array
+    count: Array
+    distinct: Array
+    anchor: Array
+    offset: Array
+    mass: Array
+    pose: Array
+    motion: Array
+    length: Array
+    turn: Array
+    bias: Array
+    since: Array
+    angle: Array
+    scale: Array
+
+
+class Recollection(NamedTuple):
+    """What a view brought back.
+
+    Attributes:
+        frame: int32, the frame the view became, -1 for none. match: int32, the most likely frame, -1 for
+            none. shift: int32, sectors by which the view is shifted against it. mass: posterior within
+            `BASIN` cells of it. gain: log-likelihood ratio of the match against novelty. novel: posterior of
+            novelty. entropy: of hypotheses and novelty, nats. second: mass of the second hypothesis over the
+            first. agree: int32, 1 when the view fits a frame where the map says the robot is, 0 when it fits
+            none there, -1 when none is there. background: [SAMPLES] errors against ruled-out frames, NaN for
+            none.
+    """
+
+    frame: Array
+    match: Array
+    shift: Array
+    mass: Array
+    gain: Array
+    novel: Array
+    entropy: Array
+    second: Array
+    agree: Array
+    background: Array
+
+
+class Weighing(NamedTuple):
+    """What is seen, against what is remembered.
+
+    Attributes:
+        likelihood: [S or 1, C] of what is seen, at each shift and frame. novelty: the same where it is new.
+        background: see `Recollection`. certain: whether anything can be told yet.
+    """
+
+    likelihood: Array
+    novelty: Array
+    background: Array
+    certain: Array
+
+
+def offsets(config: RecallConfig) -> np.ndarray:
+    """[S] sectors by which views are shifted."""
+    reach = 0 if config.fan == "none" else config.shifts
+    return np.arange(-reach, reach + 1, dtype=np.int32)
+
+
+def fan_width(config: RecallConfig) -> float | None:
+    """Of the views, rad; 0: to be found out; None: they are no fan."""
+    if isinstance(config.fan, str):
+        return 0.0 if config.fan == "auto" else None
+    return config.fan
+
+
+def start(config: RecallConfig, size: int, capacity: int, dtype: np.dtype) -> Memory:
+    """No frames, everything new.
+
+    Args:
+        size: values of a view, D; 0 for recordings with given ids, which need no views.
+    """
+
+    def zeros(*shape: int) -> Array:  # one buffer each: the session donates them
+        return jnp.zeros(shape, dtype)
+
+    return Memory(
+        view=zeros(size, capacity),
+        label=jnp.full(capacity, -1, jnp.int32),
+        packet=zeros(capacity, 3),
+        x=zeros(capacity),
+        y=zeros(capacity),
+        cosine=zeros(capacity),
+        sine=zeros(capacity),
+        count=jnp.int32(0),
+        distinct=jnp.int32(0),
+        anchor=jnp.zeros(config.modes, jnp.int32),
+        offset=zeros(config.modes, 3),
+        mass=zeros(config.modes),
+        pose=zeros(3),
+        motion=zeros(3),
+        length=zeros(),
+        turn=zeros(),
+        bias=zeros(),
+        since=zeros(),
+        angle=zeros(),
+        scale=zeros(),
+    )
+
+
+def inform(memory: Memory, guidance: Guidance) -> Memory:
+    """The memory with the map's present poses in the place of older ones."""
+    dtype, count = memory.x.dtype, len(guidance.poses)
+    if not count:
+        return memory
+    full = np.zeros((4, memory.x.shape[0]))
+    x, y, heading = guidance.poses.T
+    full[:, :count] = x, y, np.cos(heading), np.sin(heading)
+    x, y, cosine, sine = (jnp.asarray(row, dtype) for row in full)
+    told = (guidance.bias, guidance.since, guidance.angle, guidance.scale)
+    bias, since, angle, scale = (jnp.asarray(value, dtype) for value in told)
+    return memory._replace(
+        x=x, y=y, cosine=cosine, sine=sine, pose=jnp.asarray(guidance.poses[-1], dtype),
+        bias=bias, since=since, angle=angle, scale=scale,
+    )  # fmt: skip
+
+
+def travel(memory: Memory, odometry: Array) -> Memory:
+    """Adds body-frame motion [3] (m, m, rad) to what has been travelled since the newest frame."""
+    return memory._replace(
+        motion=_compose(memory.motion, odometry),
+        length=memory.length + jnp.hypot(odometry[0], odometry[1]),
+        turn=memory.turn + jnp.abs(odometry[2]),
+    )
+
+
+def due(config: RecallConfig, cell: float, memory: Memory) -> Array:
+    """Whether a view seen now becomes a frame."""
+    moved = (memory.length >= config.frame_distance * cell) | (memory.turn > config.frame_turn)
+    return (memory.count < memory.label.shape[0]) & (moved | (memory.count == 0))
+
+
+def present(memory: Memory) -> Array:
+    """[3] the robot's pose in the map, as far as the kernel has been told."""
+    return _compose(memory.pose, _corrected(memory.motion, memory.length, memory.bias))
+
+
+def spread(config: RecallConfig, cell: float, memory: Memory) -> tuple[Array, Array]:
+    """How far off that pose may be, one standard deviation: m, rad."""
+    since = memory.since + memory.length
+    return (
+        config.local_sd * cell + config.local_rate * since,
+        config.local_heading + config.local_heading_rate / cell * since,
+    )
+
+
+def by_view(config: RecallConfig, cell: float, memory: Memory, view: Array) -> Weighing:
+    """Weighs all frames by a view [D]. A view that looks like many places makes all of them unlikely."""
+    error = _errors(offsets(config), memory, view)
+    old = _old(config, memory)
+    known = memory.scale > 0
+    width = jnp.where(known, config.sharpness * memory.scale, 1.0)
+    likelihood = jnp.where(old[None], jnp.exp(-error / width), 0.0)
+    shifts = jnp.sum(jnp.isfinite(error[:, 0]))
+    mean = jnp.sum(likelihood) / (jnp.maximum(jnp.sum(old), 1) * shifts).astype(width.dtype)
+    floor = jnp.exp(-config.floor * memory.scale / width)
+    novelty = config.common * mean + (1 - config.common) * floor
+    away = jnp.maximum(3 * cell, 3 * (0.5 * cell + 0.05 * (memory.since + memory.length)))
+    here = present(memory)
+    apart = (memory.x - here[0]) ** 2 + (memory.y - here[1]) ** 2
+    return Weighing(
+        likelihood=jnp.where(known, likelihood, 1.0),
+        novelty=jnp.where(known, novelty, 1.0),
+        background=_background(jnp.min(error, axis=0), old & (apart > away**2)),
+        certain=known & jnp.any(old),
+    )
+
+
+def by_label(config: RecallConfig, memory: Memory, label: Array) -> Weighing:
+    """Weighs all frames by a given id."""
+    known = jnp.any(memory.label == label)
+    share = 1 / jnp.maximum(memory.distinct + (~known).astype(jnp.int32), 1).astype(memory.x.dtype)
+    other = jnp.where(known, LABELS["other"] * share, LABELS["unknown"])
+    likelihood = jnp.where(memory.label == label, LABELS["same"], other)
+    novelty = jnp.where(known, LABELS["new_known"] * share, LABELS["new_unknown"])
+    return Weighing(
+        likelihood=(likelihood**LABEL_TEMPER)[None],
+        novelty=novelty**LABEL_TEMPER,
+        background=jnp.full(SAMPLES, jnp.nan, memory.x.dtype),
+        certain=jnp.any(_old(config, memory)),
+    )
+
+
+def look(
+    config: RecallConfig, cell: float, memory: Memory, weighing: Weighing
+) -> tuple[Memory, Recollection]:
+    """One frame: align what was believed, weigh it by what is seen, and name the best candidate.
+
+    Args:
+        cell: m, the unit of all lengths in the configuration.
+    """
+    shifts = offsets(config)
+    angles = -shifts.astype(memory.angle.dtype) * memory.angle  # robot's heading less the frame's
+    old, certain, novelty = _old(config, memory), weighing.certain, weighing.novelty
+    likelihood = jnp.where(old[None], weighing.likelihood, 0.0)
+    here = present(memory)
+    apart = (memory.x - here[0]) ** 2 + (memory.y - here[1]) ** 2
+
+    belief, novel = _align(config, cell, memory, angles, old, here)
+    belief, novel = belief * likelihood, novel * novelty
+    total = jnp.sum(belief) + novel
+    belief, novel = belief / total, novel / total
+
+    shift, match = jnp.unravel_index(jnp.argmax(belief), belief.shape)
+    shift, match = shift.astype(jnp.int32), match.astype(jnp.int32)
+    basin = (memory.x - memory.x[match]) ** 2 + (memory.y - memory.y[match]) ** 2 < (BASIN * cell) ** 2
+    mass = jnp.sum(jnp.where(basin[None], belief, 0.0))
+    gain = jnp.log(jnp.where(certain, likelihood[shift, match], 1.0) / novelty)
+    anchor, offset, masses = _modes(config, cell, memory, angles, belief)
+    near = old & (apart < cell**2)
+    facing = memory.cosine * jnp.cos(here[2]) + memory.sine * jnp.sin(here[2]) > FACING
+    best = jnp.max(jnp.where(near & facing, jnp.max(likelihood, axis=0), 0.0))
+    agree = jnp.where(certain & jnp.any(near & facing), (best >= novelty).astype(jnp.int32), -1)
+
+    shares = jnp.concatenate([masses, jnp.maximum(1 - jnp.sum(masses, keepdims=True), 0.0)])
+    recollection = Recollection(
+        frame=memory.count,
+        match=jnp.where(certain, match, -1),
+        shift=jnp.where(certain, jnp.asarray(shifts)[shift], 0),
+        mass=jnp.where(certain, mass, 0.0),
+        gain=jnp.where(certain, gain, 0.0),
+        novel=jnp.where(certain, novel, 1.0),
+        entropy=-jnp.sum(jnp.where(shares > 0, shares * jnp.log(jnp.where(shares > 0, shares, 1.0)), 0.0)),
+        second=masses[1] / jnp.maximum(masses[0], 1e-9) if config.modes > 1 else jnp.zeros_like(mass),
+        agree=agree,
+        background=weighing.background,
+    )
+    return memory._replace(anchor=anchor, offset=offset, mass=masses), recollection
+
+
+def remember(memory: Memory, view: Array, label: Array, packet: Array) -> Memory:
+    """The newest view becomes a frame at the robot's present pose."""
+    row, pose = memory.count, present(memory)
+    zero = jnp.zeros_like(memory.length)
+    known = jnp.any(memory.label == label) | (label < 0)
+    return memory._replace(
+        view=memory.view.at[:, row].set(view[: memory.view.shape[0]]),
+        label=memory.label.at[row].set(label),
+        packet=memory.packet.at[row].set(packet),
+        x=memory.x.at[row].set(pose[0]),
+        y=memory.y.at[row].set(pose[1]),
+        cosine=memory.cosine.at[row].set(jnp.cos(pose[2])),
+        sine=memory.sine.at[row].set(jnp.sin(pose[2])),
+        count=memory.count + 1,
+        distinct=memory.distinct + (~known).astype(jnp.int32),
+        pose=pose,
+        motion=jnp.zeros_like(memory.motion),
+        since=memory.since + memory.length,
+        length=zero,
+        turn=zero,
+    )
+
+
+def nothing(memory: Memory) -> Recollection:
+    """When no view became a frame."""
+    zero = jnp.zeros_like(memory.length)
+    return Recollection(
+        frame=jnp.int32(-1), match=jnp.int32(-1), shift=jnp.int32(0), mass=zero, gain=zero, novel=zero + 1,
+        entropy=zero, second=zero, agree=jnp.int32(-1), background=jnp.full(SAMPLES, jnp.nan, zero.dtype),
+    )  # fmt: skip
+
+
+def _old(config: RecallConfig, memory: Memory) -> Array:
+    """[C] the frames that may be recalled."""
+    return jnp.arange(memory.label.shape[0], dtype=jnp.int32) < memory.count - config.guard
+
+
+def _errors(shifts: np.ndarray, memory: Memory, view: Array) -> Array:
+    """[S, C] mean absolute difference where view[k:] meets the stored views' [:-k]; infinite where the
+    shift is not allowed because nothing says that sectors are ordered."""
+    size = memory.view.shape[0]
+    rows = []
+    for k in shifts.tolist():
+        stored = memory.view[max(-k, 0) : size - max(k, 0)]
+        seen = view[max(k, 0) : size - max(-k, 0)]
+        rows.append(jnp.mean(jnp.abs(stored - seen[:, None]), axis=0))
+    allowed = (shifts == 0)[:, None] | (memory.angle != 0)
+    return jnp.where(allowed, jnp.stack(rows), jnp.inf)
+
+
+def _background(error: Array, away: Array) -> Array:
+    """[SAMPLES] errors [C] of frames spread evenly over those that the map rules out."""
+    rank = jnp.cumsum(away.astype(jnp.int32))
+    count = rank[-1]
+    wanted = (jnp.arange(SAMPLES, dtype=jnp.int32) * jnp.maximum(count - 1, 0)) // (SAMPLES - 1) + 1
+    row = jnp.searchsorted(rank, wanted)
+    row = jnp.minimum(row, len(rank) - 1)
+    # With fewer than SAMPLES of them each is told once.
+    fresh = jnp.concatenate([jnp.ones(1, bool), row[1:] != row[:-1]])
+    return jnp.where(fresh & (count > 0), error[row], jnp.nan)
+
+
+def _align(
+    config: RecallConfig,
+    cell: float,
+    memory: Memory,
+    angles: Array,
+    old: Array,
+    here: Array,
+) -> tuple[Array, Array]:
+    """Every hypothesis moves with the robot and falls on the frames it comes to; novelty proposes new ones.
+
+    Returns:
+        prior mass at each shift and frame [S, C], and of novelty.
+    """
+    dtype = memory.x.dtype
+    shape = (len(angles), len(old))
+    moved = _corrected(memory.motion, memory.length, memory.bias)
+    at = memory.anchor
+    anchors = jnp.stack([memory.x[at], memory.y[at], jnp.arctan2(memory.sine[at], memory.cosine[at])])
+    poses = _compose(_compose(anchors, memory.offset.T), jnp.broadcast_to(moved[:, None], anchors.shape))
+
+    def landing(pose: Array, sd: Array, sd_heading: Array) -> Array:
+        apart = ((memory.x - pose[0]) ** 2 + (memory.y - pose[1]) ** 2) / sd**2
+        turned = pose[2] - angles
+        facing = jnp.cos(turned)[:, None] * memory.cosine[None] + jnp.sin(turned)[:, None] * memory.sine[None]
+        deviation = apart[None] + (2 / sd_heading**2) * (1 - facing)
+        inside = jnp.maximum(1 - deviation / SUPPORT, 0.0)
+        return jnp.where(old[None], inside**2 * inside**2, 0.0)
+
+    reach = jnp.asarray(config.reach * cell, dtype), jnp.asarray(config.reach_heading, dtype)
+
+    def carry(k: Array, sums: tuple[Array, Array]) -> tuple[Array, Array]:
+        belief, novel = sums
+        fall = landing(poses[:, k], *reach)
+        total = jnp.sum(fall) + config.nothing
+        stay = memory.mass[k] * (1 - config.leave)
+        belief = belief + (stay / total) * fall
+        return belief, novel + stay * config.nothing / total + memory.mass[k] * config.leave
+
+    fresh = 1 - jnp.sum(memory.mass)
+    shut = jnp.zeros(shape, dtype), jnp.zeros((), dtype)
+    belief, novel = lax.fori_loop(0, config.modes, carry, shut)
+    near = landing(here, *spread(config, cell, memory))
+    total = jnp.sum(near)
+    local, everywhere = fresh * config.enter * config.local, fresh * config.enter * (1 - config.local)
+    cells = jnp.maximum(jnp.sum(old), 1).astype(dtype) * shape[0]
+    belief = belief + jnp.where(old[None], everywhere / cells, 0.0) + (local / jnp.maximum(total, 1.0)) * near
+    entered = jnp.where(jnp.any(old), everywhere, 0.0) + local * total / jnp.maximum(total, 1.0)
+    return belief, novel + fresh - entered
+
+
+def _modes(
+    config: RecallConfig, cell: float, memory: Memory, angles: Array, belief: Array
+) -> tuple[Array, Array, Array]:
+    """The heaviest hypotheses: frames [K], mean pose around each in its frame [K, 3], mass [K].
+
+    Frames within a cell of a heavier one are part of it.
+    """
+    mass = jnp.sum(belief, axis=0)
+    cosine, sine = jnp.cos(angles) @ belief, jnp.sin(angles) @ belief
+    ahead = cosine * memory.cosine - sine * memory.sine  # summed headings of the robot at each frame
+    aside = cosine * memory.sine + sine * memory.cosine
+
+    def peel(rest: Array, _: None) -> tuple[Array, tuple[Array, Array, Array]]:
+        frame = jnp.argmax(rest).astype(jnp.int32)
+        dx, dy = memory.x - memory.x[frame], memory.y - memory.y[frame]
+        member = (dx**2 + dy**2 < cell**2) & (rest > 0)
+        part = jnp.where(member, rest, 0.0)
+        total = jnp.sum(part)
+        kept = total > 0
+        divisor = jnp.where(kept, total, 1.0)
+        x, y = jnp.sum(part * dx) / divisor, jnp.sum(part * dy) / divisor
+        heading = jnp.arctan2(jnp.sum(jnp.where(member, aside, 0.0)), jnp.sum(jnp.where(member, ahead, 0.0)))
+        c, s = memory.cosine[frame], memory.sine[frame]
+        offset = jnp.stack([c * x + s * y, c * y - s * x, wrap(heading - jnp.arctan2(s, c))])
+        return jnp.where(member, 0.0, rest), (frame, offset, jnp.where(kept, total, 0.0))
+
+    _, modes = lax.scan(peel, mass, None, length=config.modes)
+    return modes
+
+
+def _corrected(motion: Array, length: Array, bias: Array) -> Array:
+    """Motion [3] freed of a heading bias that built up evenly along its length."""
+    turn = bias * length
+    c, s = jnp.cos(turn / 2), jnp.sin(turn / 2)
+    x, y = motion[0], motion[1]
+    return jnp.stack([c * x - s * y, s * x + c * y, wrap(motion[2] + turn)])
+
+
+def _compose(a: Array, b: Array) -> Array:
+    """a followed by b, b in the frame of a: [3, ...]."""
+    c, s = jnp.cos(a[2]), jnp.sin(a[2])
+    return jnp.stack([a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], wrap(a[2] + b[2])])

@@ -1,0 +1,176 @@
+"""The rat with the unified filter: recall proposes, the frame map disposes, pose cells bridge."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from ratslam import posecells, recall
+from ratslam.backend import Backend
+from ratslam.framemap import FrameMap
+from ratslam.posecells import Outcome, PoseCells
+from ratslam.rat import Rat, RatConfig, RatEvidence, finite
+from ratslam.recall import Guidance, Memory, Recollection
+from ratslam.types import Action, Estimate
+from tactile.types import Array, Observation
+
+HEALTH_RATE = 0.1
+"""Share of the newest revisit in the running health."""
+
+
+class State(NamedTuple):
+    """All that the neural half remembers.
+
+    Attributes:
+        health: running share of revisits (frames where the map has older ones) whose view fits.
+    """
+
+    cells: PoseCells
+    memory: Memory
+    health: Array
+
+
+class RecallEvidence(NamedTuple):
+    """What one step adds to the map and to the record.
+
+    Attributes:
+        frame to background: see `Recollection`. energy: injected into the pose cells. packet: [3] decoded,
+            cells. health: see `State`. outcome: an `Outcome`, int32.
+    """
+
+    frame: Array
+    match: Array
+    shift: Array
+    mass: Array
+    gain: Array
+    novel: Array
+    entropy: Array
+    second: Array
+    agree: Array
+    background: Array
+    energy: Array
+    packet: Array
+    health: Array
+    outcome: Array
+
+
+class RecallRat:
+    """The rat backend with recall under ambiguity, for views of one shape.
+
+    Args:
+        view_shape: (R, C, K) of the observations' views. dtype: of all floating state.
+    """
+
+    def __init__(self, config: RatConfig, view_shape: tuple[int, int, int], dtype: Any = np.float64) -> None:
+        labels = config.templates.source == "labels"
+        self.config = config
+        self.recall = config.recall.model_copy(update={"fan": "none"}) if labels else config.recall
+        self.labels = labels
+        self.size = 0 if labels else int(np.prod(view_shape))
+        self.dtype = np.dtype(dtype)
+        self.cell = config.pose_cells.cell_size
+        self.tables = posecells.tables(config.pose_cells, self.dtype)
+        self.rings = posecells.rings(config.pose_cells, self.dtype)
+        self.units = posecells.units(config.pose_cells, self.dtype)
+
+    def init(self, key: Array, capacity: int) -> State:
+        """One packet in the middle of an empty world. Nothing here is random, so `key` is not used."""
+        del key
+        return State(
+            posecells.start(self.config.pose_cells, self.dtype),
+            recall.start(self.recall, self.size, capacity, self.dtype),
+            jnp.ones((), self.dtype),
+        )
+
+    def grow(self, state: State, capacity: int) -> State:
+        """The same memories in larger arrays."""
+
+        def enlarge(old: Array, new: Array) -> Array:
+            return old if old.shape == new.shape else new.at[tuple(slice(0, n) for n in old.shape)].set(old)
+
+        empty = self.init(None, capacity).memory
+        return state._replace(memory=jax.tree.map(enlarge, state.memory, empty))
+
+    def inform(self, state: State, guidance: Guidance) -> State:
+        """The filter takes up the poses, bias and scales of the map."""
+        return state._replace(memory=recall.inform(state.memory, guidance))
+
+    def kernel(self, state: State, observation: Observation) -> tuple[State, Estimate, RecallEvidence]:
+        """Move, look, inject softly, learn."""
+        odometry, view, seen, clean = finite(self.config.templates, self.dtype, observation)
+        moved = jnp.stack([odometry.dx, odometry.dy, odometry.dtheta])
+        memory = recall.travel(state.memory, moved)
+        frame = seen & recall.due(self.recall, self.cell, memory)
+
+        memory, recollection = lax.cond(
+            frame,
+            lambda: self._look(memory, view.reshape(-1)[: self.size], observation.label),
+            lambda: (memory, recall.nothing(memory)),
+        )
+        recalled, energy = self._injection(memory, recollection)
+        cells, _, outcome = posecells.step(
+            self.config.pose_cells, self.tables, state.cells, odometry, recalled, energy
+        )
+        memory = lax.cond(
+            frame,
+            lambda: recall.remember(memory, view.reshape(-1)[: self.size], observation.label, cells.pose),
+            lambda: memory,
+        )
+        health = jnp.where(
+            recollection.agree >= 0,
+            state.health + HEALTH_RATE * (recollection.agree.astype(self.dtype) - state.health),
+            state.health,
+        )
+
+        room = memory.count < memory.label.shape[0]
+        outcome = jnp.where(room | ~seen, outcome, Outcome.FULL)
+        outcome = jnp.where(clean, outcome, Outcome.NOT_FINITE).astype(jnp.int32)
+        sd, sd_heading = recall.spread(self.recall, self.cell, memory)
+        place = jnp.int32(-1)  # places are for the map to say: it knows which recollections hold
+        estimate = Estimate(
+            pose=recall.present(memory),
+            spread=jnp.stack([sd, sd, sd_heading]),
+            place=place,
+            previous=place,
+            action=jnp.int32(Action.NONE),
+            lost=(health < self.config.lost) | (outcome == Outcome.TOO_FAST),
+        )
+        evidence = RecallEvidence(
+            **recollection._asdict(), energy=energy, packet=cells.pose, health=health, outcome=outcome
+        )
+        return State(cells, memory, health), estimate, evidence
+
+    def new_map(self) -> FrameMap:
+        """An empty frame map."""
+        fan, closures = recall.fan_width(self.recall), self.config.experience.closures
+        return FrameMap(self.config.frames, self.cell, self.size, fan, closures)
+
+    def _look(self, memory: Memory, view: Array, label: Array) -> tuple[Memory, Recollection]:
+        if self.labels:
+            weighing = recall.by_label(self.recall, memory, label)
+        else:
+            weighing = recall.by_view(self.recall, self.cell, memory, view)
+        return recall.look(self.recall, self.cell, memory, weighing)
+
+    def _injection(self, memory: Memory, recollection: Recollection) -> tuple[Array, Array]:
+        """Where the best candidate's packet was, turned as the view is, and energy by its posterior."""
+        known = (recollection.frame >= 0) & (recollection.match >= 0)
+        turned = -recollection.shift.astype(self.dtype) * memory.angle / self.units[2]
+        packet = memory.packet[jnp.maximum(recollection.match, 0)]
+        packet = packet + jnp.stack([jnp.zeros_like(turned), jnp.zeros_like(turned), turned])
+        energy = jnp.where(known, self.config.templates.energy * recollection.mass, 0.0)
+        return packet % self.rings, energy
+
+
+def evidence_of(matcher: str) -> type[RecallEvidence] | type[RatEvidence]:
+    """What each step of such a matcher reports."""
+    return RecallEvidence if matcher == "recall" else RatEvidence
+
+
+def rat(config: RatConfig, view_shape: tuple[int, int, int], dtype: Any = np.float64) -> Backend:
+    """The rat with the matcher that the configuration names."""
+    return (RecallRat if config.matcher == "recall" else Rat)(config, view_shape, dtype)
