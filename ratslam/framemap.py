@@ -83,7 +83,8 @@ class FrameMapConfig(Settings):
     length: PositiveInt = 2
     """Candidates that an accepted run has at least."""
     score: PositiveFloat = 4.0
-    """Evidence it has at least, after half its squared Mahalanobis distance from the map is taken off."""
+    """Evidence it has at least, after half its squared Mahalanobis distance from the map is taken off, and the
+    log of how many times more frames the map allows than stand around one place."""
     distance: PositiveFloat = 12.0
     """That squared distance is smaller than this."""
     gate_sd: PositiveFloat = 0.7
@@ -342,21 +343,39 @@ class FrameMap:
         config, score, length = self.config, self._ledger.score(run), len(self._ledger.members(run))
         if length < config.length or score < config.score:
             return
-        distance = self._distance(candidate) if config.verify else 0.0
-        fits = distance < config.distance and score - distance / 2 >= config.score
+        distance, room = self._distance(candidate) if config.verify else (0.0, 0.0)
+        fits = distance < config.distance and score - distance / 2 - room >= config.score
         self._ledger.judge(run, Verdict.ACCEPTED if fits else Verdict.OPEN, distance)
         broken = config.breaks and length >= config.break_length and score >= config.break_score
         if not fits and broken and distance >= config.distance:
             self._break(run)
 
-    def _distance(self, candidate: Candidate) -> float:
-        """Squared Mahalanobis distance of what a candidate claims from what the map believes."""
+    def _distance(self, candidate: Candidate) -> tuple[float, float]:
+        """How far off what a candidate claims is from what the map believes.
+
+        Returns:
+            the squared Mahalanobis distance, and the room that the map leaves for such a claim to come about by
+            chance, see `_alternatives`.
+        """
         turn = -candidate.shift * self._angle()
         error = between(_turned(self._pose.rows[candidate.match], turn), self._pose.rows[candidate.frame])
         gate = self.config.gate_sd * self.cell
         allowed = self._relative(candidate.match, candidate.frame, turn)
-        allowed = allowed + np.diag([gate**2, gate**2, self.config.gate_heading**2])
-        return float(error @ np.linalg.solve(allowed, error))
+        least = np.diag([gate**2, gate**2, self.config.gate_heading**2])
+        allowed = allowed + least
+        room = self._alternatives(candidate, turn, allowed[:2, :2], gate)
+        return float(error @ np.linalg.solve(allowed, error)), float(room)
+
+    def _alternatives(self, candidate: Candidate, turn: float, allowed: np.ndarray, gate: float) -> float:
+        """Log of how many more frames the map allows than there are around one place."""
+        old = self._pose.rows[: candidate.frame - FEW_FRAMES]
+        origin = _turned(self._pose.rows[candidate.match], turn)
+        centre = between(origin, self._pose.rows[candidate.frame])[:2]
+        frames = between(origin, old)[:, :2]
+        apart = frames - centre
+        inside = np.exp(-np.einsum("na,ab,nb->n", apart, np.linalg.inv(allowed), apart) / 2).sum()
+        around = np.exp(-(frames**2).sum(axis=1) / (2 * gate**2)).sum()
+        return float(np.log(max(inside / max(around, 1.0), 1.0)))
 
     def _break(self, run: int) -> None:
         """Cuts the odometry where the views say that it broke, and joins the parts by the run."""

@@ -32,7 +32,7 @@ SAMPLES = 20
 LABELS = {"same": 0.6, "unknown": 0.35, "other": 0.05, "new_unknown": 0.9, "new_known": 0.1}
 """How likely a given id is where its frame was, and where it is new: ids are right more often than not, a new
 id says little (the giver may have failed to recognise), and another known id speaks against."""
-LABEL_TEMPER = 0.5
+LABEL_TEMPER = 0.7
 """Ids of consecutive views are not independent: each counts half."""
 SUPPORT = 8.0
 """Squared deviations at which the alignment kernel (1 - d2 / 8)^4 ends: like exp(-d2 / 2), but compact."""
