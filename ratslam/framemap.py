@@ -83,8 +83,8 @@ class FrameMapConfig(Settings):
     length: PositiveInt = 2
     """Candidates that an accepted run has at least."""
     score: PositiveFloat = 4.0
-    """Evidence it has at least, after half its squared Mahalanobis distance from the map is taken off, and the
-    log of how many times more frames the map allows than stand around one place."""
+    """Evidence it has at least, after half its squared Mahalanobis distance from the map is taken off and
+    the log of how many times more frames the map allows than stand around one place."""
     distance: PositiveFloat = 12.0
     """That squared distance is smaller than this."""
     gate_sd: PositiveFloat = 0.7
@@ -354,8 +354,8 @@ class FrameMap:
         """How far off what a candidate claims is from what the map believes.
 
         Returns:
-            the squared Mahalanobis distance, and the room that the map leaves for such a claim to come about by
-            chance, see `_alternatives`.
+            the squared Mahalanobis distance, and the room that the map leaves for such a claim to come
+            about by chance, see `_alternatives`.
         """
         turn = -candidate.shift * self._angle()
         error = between(_turned(self._pose.rows[candidate.match], turn), self._pose.rows[candidate.frame])
