@@ -184,13 +184,15 @@ def step(
     told, lag = told * (parts / wanted), lag * (parts / wanted)
 
     part, behind_part = told / parts, lag / parts
+    ahead = jnp.stack([*_turned(part[0], part[1], cells.pose[2] * unit[2]), part[2]])  # about, for each part
 
     def sub_step(s, carry):
         activity, died = carry
         # Odometry is told in the frame the step began in; the packet has turned since, and lags behind it.
         aside = lag[2] - s.astype(lag.dtype) * (part[2] + behind_part[2])
         moved = jnp.stack([*_turned(part[0], part[1], aside * unit[2]), part[2]])
-        activity, dead = iterate(config, table, activity, cells.pose, moved, behind_part)
+        centre = cells.pose + s.astype(lag.dtype) * ahead
+        activity, dead = iterate(config, table, activity, cells.pose, centre, moved, behind_part)
         return activity, died | dead
 
     count = parts.astype(jnp.int32)
@@ -206,27 +208,35 @@ def step(
 
 
 def iterate(
-    config: PoseCellConfig, table: Tables, activity: Array, seed: Array, told: Array, lag: Array
+    config: PoseCellConfig,
+    table: Tables,
+    activity: Array,
+    seed: Array,
+    centre: Array,
+    told: Array,
+    lag: Array,
 ) -> tuple[Array, Array]:
     """One network iteration: attract, then integrate a part of the motion; also whether activity died.
 
     A settled packet fills some 200 cells however large the torus is. Where all activity lies `MARGIN` cells
-    inside a box around the last packet, only the box is worked on: excitation reaches 3 cells and motion 1,
-    and inhibition beyond what is excited is below the threshold, so the result is that of the whole torus.
+    inside a box around `centre` [3], about where the packet is, only the box is worked on: excitation reaches
+    3 cells and motion 1, and inhibition beyond what is excited is below the threshold, so the result is that
+    of the whole torus.
     """
     box = box_tables(config, activity.dtype)
     rest = (told, lag)
     if box is None:
         return _iterate(config, table, activity, seed, *rest)
     k, n, _ = activity.shape
-    origin = jnp.floor(seed) - SIDE // 2 + 1
+    origin = jnp.floor(centre) - SIDE // 2 + 1
     row = np.arange(SIDE, dtype=np.int32)
     corner = origin.astype(jnp.int32)
     at = [(corner[axis] + row) % size for axis, size in ((2, k), (1, n), (0, n))]
     window = (at[0][:, None, None], at[1][None, :, None], at[2][None, None, :])
     part = activity[window]
     inner = part[MARGIN:-MARGIN, MARGIN:-MARGIN, MARGIN:-MARGIN]
-    fits = jnp.sum(inner != 0) == jnp.sum(activity != 0)
+    within = jnp.all((seed >= origin) & (seed < origin + SIDE - 1))  # where a dead network starts again
+    fits = within & (jnp.sum(inner != 0) == jnp.sum(activity != 0))
 
     def boxed() -> tuple[Array, Array]:
         here = box._replace(heading=jnp.asarray(table.heading)[at[0]])

@@ -84,6 +84,9 @@ class RecallConfig(Settings):
     """Standard deviation of the map's heading after a closure, rad."""
     local_heading_rate: NonNegativeFloat = 0.006
     """What each cell travelled since adds to it, rad."""
+    energy: PositiveFloat = 3.0
+    """Activity injected into the pose cells by a candidate, for each unit of its posterior; the packet's own
+    is 1. Weaker ones leave two packets to compete for long, which costs time and tells nothing more."""
     modes: PositiveInt = 8
     """Hypotheses kept from frame to frame; the mass of the others goes to novelty."""
 

@@ -157,12 +157,12 @@ class RecallRat:
         return recall.look(self.recall, self.cell, memory, weighing)
 
     def _injection(self, memory: Memory, recollection: Recollection) -> tuple[Array, Array]:
-        """Where the best candidate's packet was, turned as the view is, and energy by its posterior."""
-        known = (recollection.frame >= 0) & (recollection.match >= 0)
+        """Where a candidate's packet was, turned as the view is, and energy by its posterior."""
+        known = (recollection.frame >= 0) & (recollection.mass > self.config.frames.certain)
         turned = -recollection.shift.astype(self.dtype) * memory.angle / self.units[2]
         packet = memory.packet[jnp.maximum(recollection.match, 0)]
         packet = packet + jnp.stack([jnp.zeros_like(turned), jnp.zeros_like(turned), turned])
-        energy = jnp.where(known, self.config.templates.energy * recollection.mass, 0.0)
+        energy = jnp.where(known, self.recall.energy * recollection.mass, 0.0)
         return packet % self.rings, energy
 
 
