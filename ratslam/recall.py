@@ -170,13 +170,15 @@ class Weighing(NamedTuple):
 
     Attributes:
         likelihood: [S or 1, C] of what is seen, at each shift and frame. novelty: the same where it is new.
-        background: see `Recollection`. certain: whether anything can be told yet.
+        background: see `Recollection`. certain: whether anything can be told yet. telling: whether what is
+            seen speaks for or against a place (an id never given before does not).
     """
 
     likelihood: Array
     novelty: Array
     background: Array
     certain: Array
+    telling: Array
 
 
 def offsets(config: RecallConfig) -> np.ndarray:
@@ -291,6 +293,7 @@ def by_view(config: RecallConfig, cell: float, memory: Memory, view: Array) -> W
         novelty=jnp.where(known, novelty, 1.0),
         background=_background(jnp.min(error, axis=0), old & (apart > away**2)),
         certain=known & jnp.any(old),
+        telling=known,
     )
 
 
@@ -306,6 +309,7 @@ def by_label(config: RecallConfig, memory: Memory, label: Array) -> Weighing:
         novelty=novelty**LABEL_TEMPER,
         background=jnp.full(SAMPLES, jnp.nan, memory.x.dtype),
         certain=jnp.any(_old(config, memory)),
+        telling=known,
     )
 
 
@@ -329,8 +333,8 @@ def look(
     total = jnp.sum(belief) + novel
     belief, novel = belief / total, novel / total
 
-    shift, match = jnp.unravel_index(jnp.argmax(belief), belief.shape)
-    shift, match = shift.astype(jnp.int32), match.astype(jnp.int32)
+    match = _peak(jnp.max(belief, axis=0))
+    shift = _peak(belief[:, match])
     basin = (memory.x - memory.x[match]) ** 2 + (memory.y - memory.y[match]) ** 2 < (BASIN * cell) ** 2
     mass = jnp.sum(jnp.where(basin[None], belief, 0.0))
     gain = jnp.log(jnp.where(certain, likelihood[shift, match], 1.0) / novelty)
@@ -338,7 +342,9 @@ def look(
     near = old & (apart < cell**2)
     facing = memory.cosine * jnp.cos(here[2]) + memory.sine * jnp.sin(here[2]) > FACING
     best = jnp.max(jnp.where(near & facing, jnp.max(likelihood, axis=0), 0.0))
-    agree = jnp.where(certain & jnp.any(near & facing), (best >= novelty).astype(jnp.int32), -1)
+    agree = jnp.where(
+        certain & weighing.telling & jnp.any(near & facing), (best >= novelty).astype(jnp.int32), -1
+    )
 
     shares = jnp.concatenate([masses, jnp.maximum(1 - jnp.sum(masses, keepdims=True), 0.0)])
     recollection = Recollection(
@@ -401,7 +407,9 @@ def _errors(shifts: np.ndarray, memory: Memory, view: Array) -> Array:
     for k in shifts.tolist():
         stored = memory.view[max(-k, 0) : size - max(k, 0)]
         seen = view[max(k, 0) : size - max(-k, 0)]
-        rows.append(jnp.mean(jnp.abs(stored - seen[:, None]), axis=0))
+        # Written out, one pass over the frames adds all values; a reduction over them takes twice as long.
+        apart = sum((jnp.abs(stored[i] - seen[i]) for i in range(len(stored))), jnp.zeros_like(stored[0]))
+        rows.append(apart / len(stored))
     allowed = (shifts == 0)[:, None] | (memory.angle != 0)
     return jnp.where(allowed, jnp.stack(rows), jnp.inf)
 
@@ -481,7 +489,7 @@ def _modes(
     aside = cosine * memory.sine + sine * memory.cosine
 
     def peel(rest: Array, _: None) -> tuple[Array, tuple[Array, Array, Array]]:
-        frame = jnp.argmax(rest).astype(jnp.int32)
+        frame = _peak(rest)
         dx, dy = memory.x - memory.x[frame], memory.y - memory.y[frame]
         member = (dx**2 + dy**2 < cell**2) & (rest > 0)
         part = jnp.where(member, rest, 0.0)
@@ -496,6 +504,12 @@ def _modes(
 
     _, modes = lax.scan(peel, mass, None, length=config.modes)
     return modes
+
+
+def _peak(values: Array) -> Array:
+    """Index of the first largest value; an argmax that compilers turn into vector code."""
+    row = jnp.arange(len(values), dtype=jnp.int32)
+    return jnp.min(jnp.where(values >= jnp.max(values), row, len(values) - 1))
 
 
 def _corrected(motion: Array, length: Array, bias: Array) -> Array:
