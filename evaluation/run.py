@@ -21,6 +21,7 @@ class Run(NamedTuple):
         created: [M] the step at which each experience was created.
         nodes: [M, 3] poses of the experiences in the final map, in the frame of `final`.
         links: [L, 2] experiences joined by a link.
+        anytime: [A] errors of the present pose in the map so far, in order of time, m; empty if unknown.
     """
 
     time: np.ndarray
@@ -32,6 +33,7 @@ class Run(NamedTuple):
     created: np.ndarray
     nodes: np.ndarray
     links: np.ndarray
+    anytime: np.ndarray = np.zeros(0)
 
 
 def check_run(run: Run) -> None:

@@ -43,6 +43,7 @@ def read_run(path: Path) -> Run:
         created=created,
         nodes=nodes,
         links=links,
+        anytime=_anytime(path / "anytime.csv"),
     )
 
 
@@ -62,6 +63,18 @@ def _places(path: Path) -> np.ndarray:
         return np.array([int(line.split(",")[column]) for line in lines], int)
     except (ValueError, IndexError):
         raise InputError(str(path), "rows without a place", "the columns t,place,action,...") from None
+
+
+def _anytime(path: Path) -> np.ndarray:
+    """[A] the errors of a file `t,error`; none where it was never written. A cut-off last line is dropped."""
+    if not path.exists():
+        return np.zeros(0)
+    text = path.read_text(encoding="utf-8")
+    lines = text[: text.rfind("\n") + 1].splitlines()[1:]
+    try:
+        return np.array([float(line.split(",")[1]) for line in lines])
+    except (ValueError, IndexError):
+        raise InputError(str(path), "a row that is not t,error", "the anytime.csv of a run") from None
 
 
 def _map(path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -11,7 +11,7 @@ from evaluation.energy import Energy, Relations, energy, energy_all_pairs, relat
 from evaluation.exm import DEFAULT, MODES, ExmConfig, base_end, experience_metric
 from evaluation.log import Log, changes
 from evaluation.run import Run, check_run, known
-from evaluation.trajectory import anytime, ate, rpe
+from evaluation.trajectory import anytime, ate, rpe, summary
 from tactile.errors import InputError
 from tactile.settings import Settings
 
@@ -172,13 +172,14 @@ def _extent(run: Run, rows: np.ndarray) -> _Findings:
 def _trajectories(run: Run, truth: np.ndarray, rows: np.ndarray) -> _Findings:
     truth, online, final, odometry = (poses[rows] for poses in (truth, run.online, run.final, run.odometry))
     raw_ate, raw_rpe, raw_now = ate(odometry, truth), rpe(odometry, truth), anytime(odometry, truth)
-    now, step = anytime(online, truth), rpe(final, truth)
+    now, step = summary(run.anytime) if len(run.anytime) else anytime(online, truth), rpe(final, truth)
+    note = "in the map so far" if len(run.anytime) else "of the poses told"
     return {
         "ate_final": _Found(ate(final, truth), raw_ate),
         "ate_online": _Found(ate(online, truth), raw_ate),
-        "anytime_median": _Found(now.median, raw_now.median),
-        "anytime_late": _Found(now.late, raw_now.late),
-        "anytime_jump": _Found(now.jump, raw_now.jump),
+        "anytime_median": _Found(now.median, raw_now.median, note),
+        "anytime_late": _Found(now.late, raw_now.late, note),
+        "anytime_jump": _Found(now.jump, raw_now.jump, note),
         "rpe_translation": _Found(step.translation, raw_rpe.translation),
         "rpe_rotation_deg": _Found(float(np.degrees(step.rotation)), float(np.degrees(raw_rpe.rotation))),
     }

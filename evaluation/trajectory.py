@@ -96,7 +96,19 @@ def anytime_errors(online: np.ndarray, reference: np.ndarray) -> np.ndarray:
 
 def anytime(online: np.ndarray, reference: np.ndarray) -> Anytime:
     """The summary of `anytime_errors`."""
-    error = anytime_errors(online, reference)
+    return summary(anytime_errors(online, reference))
+
+
+def present_error(path: np.ndarray, reference: np.ndarray) -> float:
+    """Distance of the last row of a path [N, 3] from the reference's, once the whole path is aligned, m.
+
+    With the map as it was at that moment: what a robot that acts on its map is off by.
+    """
+    return float(position_errors(path, reference)[-1])
+
+
+def summary(error: np.ndarray) -> Anytime:
+    """Of errors [N] at increasing moments."""
     jump = np.abs(np.diff(error)).max(initial=0.0)
     return Anytime(float(np.median(error)), _rms(error[len(error) // 2 :]), float(jump))
 

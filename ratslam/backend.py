@@ -40,6 +40,12 @@ class Map(Protocol):
     def trajectory(self) -> np.ndarray:
         """[T, 3] every folded step as the map sees it now."""
 
+    def so_far(self) -> np.ndarray:
+        """[T, 3] the same, unsettled: what the robot acts on at this moment."""
+
+    def closures(self) -> np.ndarray:
+        """[M, 2] steps that the map takes to be at one place: the later and the earlier of each pair."""
+
     def graph(self) -> networkx.DiGraph:
         """The map as a graph (empty for maps without nodes)."""
 

@@ -39,7 +39,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    _prepare_jax()
+    prepare_jax()
     from evaluation.scorecard import table
     from ratslam.config import RunConfig
     from ratslam.run import run
@@ -78,6 +78,65 @@ def _recover(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _ablate(arguments: argparse.Namespace) -> int:
+    prepare_jax()
+    from ratslam.trials import PARTS
+
+    return _table(arguments, [(name, sets) for name, sets in PARTS.items()])[0]
+
+
+def _vary(arguments: argparse.Namespace) -> int:
+    prepare_jax()
+    from ratslam.config import RunConfig
+    from ratslam.trials import numbers, varied
+    from ratslam.yamlfile import load, override, validate
+
+    config = validate(override(load(arguments.config), arguments.set), RunConfig)
+    factors = (1 - arguments.by, 1 + arguments.by)
+    lines = [
+        (f"{name} = {varied(value, factor):.4g}", (f"{name}={varied(value, factor)!r}",))
+        for name, value in numbers(config)
+        for factor in factors
+    ]
+    code, finals = _table(arguments, [("as configured", ()), *lines])
+    limit = arguments.limit or 1.25 * finals[0]
+    kept = sum(final <= limit for final in finals[1:])
+    print(f"{kept} of {len(lines)} variations ({kept / len(lines):.0%}) end at {limit:.3g} m or less")
+    return code
+
+
+def _spread(arguments: argparse.Namespace) -> int:
+    prepare_jax()
+    from ratslam.trials import HEADER, compare, row
+
+    print(HEADER)
+    variants = [((), seed) for seed in range(arguments.runs + 1)]
+    trials = []
+    for seed, trial in enumerate(compare(Path(arguments.config), arguments.set, variants, arguments.workers)):
+        print(row(f"perturbed, seed {seed}" if seed else "as it is", [trial]), flush=True)
+        trials.append(trial)
+    print(row("all perturbed", trials[1:]))
+    return 0
+
+
+def _table(
+    arguments: argparse.Namespace, lines: list[tuple[str, tuple[str, ...]]]
+) -> tuple[int, list[float]]:
+    """Prints a row as soon as all of its trials are done; returns the final errors."""
+    from ratslam.trials import HEADER, compare, row
+
+    seeds = range(1, arguments.perturbed + 1) if arguments.perturbed else (0,)
+    variants = [(sets, seed) for _, sets in lines for seed in seeds]
+    trials = compare(Path(arguments.config), arguments.set, variants, arguments.workers)
+    print(HEADER)
+    finals = []
+    for name, _ in lines:
+        these = [next(trials) for _ in seeds]
+        print(row(name, these), flush=True)
+        finals.append(max(trial.final for trial in these))
+    return 0, finals
+
+
 def _schema(arguments: argparse.Namespace) -> int:
     from ratslam.config import RunConfig
     from ratslam.yamlfile import schema
@@ -90,18 +149,23 @@ def _schema(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _prepare_jax() -> None:
+def prepare_jax() -> None:
     """What must be settled before jax loads: one thread (more double the latency) and a lasting cache."""
     flag = "--xla_cpu_multi_thread_eigen=false"
     if flag not in os.environ.get("XLA_FLAGS", ""):
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flag}".strip()
+    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    wanted = {
+        "jax_compilation_cache_dir": str(Path(home) / "ratslam" / "jax"),
+        # The defaults keep nothing that compiles as fast as our kernels do on a CPU.
+        "jax_persistent_cache_min_compile_time_secs": 0,
+        "jax_persistent_cache_min_entry_size_bytes": -1,
+    }
+    os.environ.update({name.upper(): str(value) for name, value in wanted.items()})  # for child processes
     import jax
 
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    jax.config.update("jax_compilation_cache_dir", str(Path(home) / "ratslam" / "jax"))
-    # The defaults keep nothing that compiles as fast as our kernels do on a CPU.
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
-    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    for name, value in wanted.items():
+        jax.config.update(name, value)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -141,6 +205,27 @@ def _parser() -> argparse.ArgumentParser:
         "--relations", type=Path, help="file of true relative poses (t1,t2,x,y,z,roll,pitch,yaw)"
     )
     score.add_argument("--json", action="store_true", help="print JSON instead of a table")
+
+    ablate = command(
+        "ablate", _ablate, "turn each part of recall and map off in turn and see what it carries"
+    )
+    vary = command("vary", _vary, "vary every number of recall and map, one at a time, up and down")
+    vary.add_argument("--by", type=float, default=0.2, metavar="SHARE", help="by this share (default 0.2)")
+    vary.add_argument(
+        "--limit", type=float, metavar="M", help="final ATE that counts as kept (default 1.25 of the first)"
+    )
+    spread = command("spread", _spread, "run perturbed copies of the recording: what was luck?")
+    spread.add_argument("-n", dest="runs", type=int, default=10, metavar="N", help="copies (default 10)")
+    for several in (ablate, vary, spread):
+        several.add_argument("config", help="the YAML file")
+        several.add_argument(
+            "--set", action="append", default=[], metavar="a.b=value", help="override a setting"
+        )
+        several.add_argument("--workers", type=int, default=0, metavar="N", help="processes (default: cores)")
+    for several in (ablate, vary):
+        several.add_argument(
+            "--perturbed", type=int, default=0, metavar="N", help="run on N perturbed copies instead"
+        )
 
     recover = command("recover", _recover, "make a complete recording of one that was cut off")
     recover.add_argument("recording", type=Path, help="the .mcap file")

@@ -110,6 +110,7 @@ class ExperienceMap:
         self._closure = Growing((), np.bool_)
         self._step_node = Growing((), np.int64)
         self._step_motion = Growing((3,), np.float64)
+        self._reached = Growing((2,), np.int64)  # step, and the first step at the node reached
         self._link_of: dict[tuple[int, int], int] = {}
         self._current = -1
         self._travel = departure(0.0)
@@ -139,6 +140,14 @@ class ExperienceMap:
             return motion.copy()
         origin = np.where(node[:, None] >= 0, self._pose.rows[np.maximum(node, 0)], 0.0)
         return compose(origin, motion)
+
+    def so_far(self) -> np.ndarray:
+        """[T, 3] the same: this map has nothing left to settle."""
+        return self.trajectory()
+
+    def closures(self) -> np.ndarray:
+        """[M, 2] the steps at which a known node was reached, and the first step at it."""
+        return self._reached.rows.copy()
 
     def graph(self) -> networkx.DiGraph:
         """Nodes with x, y (m), heading (rad), template; links with dx, dy, dtheta and their evidence."""
@@ -210,6 +219,7 @@ class ExperienceMap:
 
     def _reach(self, node: int, relative: float) -> None:
         measured = compose(self._travel.motion, np.array([0.0, 0.0, -relative]))
+        self._reached.append((len(self._step_node.rows), int(np.argmax(self._step_node.rows == node))))
         if self._current >= 0 and node != self._current:
             self._link(node, measured, closure=True)
         self._arrive(node, relative)

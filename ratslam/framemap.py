@@ -190,7 +190,12 @@ class FrameMap:
         return self._jump.rows.copy()
 
     def closures(self) -> np.ndarray:
-        """[n, 9] all candidates, see `Ledger.table`."""
+        """[M, 2] the steps of the frames that accepted runs join."""
+        first = np.searchsorted(self._step_frame.rows, np.arange(len(self._pose.rows)))
+        return first[self._ledger.table()[self._ledger.accepted(), :2].astype(int)].reshape(-1, 2)
+
+    def candidates(self) -> np.ndarray:
+        """[n, 9] all that recall proposed and what became of it, see `Ledger.table`."""
         return self._ledger.table()
 
     def undo(self, run: int) -> None:
@@ -489,7 +494,7 @@ class FrameMap:
         names = "frame,match,step,match_step,shift,mass,gain,run,distance,verdict,weight"
         first = np.searchsorted(self._step_frame.rows, np.arange(len(self._pose.rows)))
         lines = [names]
-        for frame, match, shift, mass, gain, run, distance, verdict, weight in self.closures().tolist():
+        for frame, match, shift, mass, gain, run, distance, verdict, weight in self.candidates().tolist():
             frame, match, run = int(frame), int(match), int(run)
             lines.append(
                 f"{frame},{match},{first[frame]},{first[match]},{int(shift)},{mass!r},{gain!r},{run},"

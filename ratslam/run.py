@@ -6,7 +6,7 @@ import hashlib
 import platform
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
 from itertools import islice
@@ -20,7 +20,7 @@ from evaluation.energy import read_relations
 from evaluation.report import save_map
 from evaluation.rundirectory import read_run
 from evaluation.scorecard import Scorecard, score
-from evaluation.trajectory import write_tum
+from evaluation.trajectory import Anytime, present_error, summary, write_tum
 from ratslam.config import RunConfig
 from ratslam.posecells import Outcome
 from ratslam.recallrat import evidence_of, rat
@@ -95,6 +95,8 @@ def _play(session: Session, source: Source, skip: int, store: RunDirectory) -> b
     """Replays the source into the store; returns whether the user interrupted."""
     samples = islice(iter(source), skip, None)
     odometry = np.zeros(3)
+    truth: list[np.ndarray] = []
+    present = Anytimes(session.steps)
     total = None if source.length is None else source.length - skip
     saved = session.steps
     bar = tqdm(total=total, unit="step", desc=source.name, file=sys.stderr, mininterval=0.5)
@@ -107,7 +109,11 @@ def _play(session: Session, source: Source, skip: int, store: RunDirectory) -> b
                 moved = observation.odometry
                 odometry = compose(odometry, np.array([moved.dx, moved.dy, moved.dtheta]))
                 reckoned.append(odometry)
+            truth += [np.full(3, np.nan) if s.truth is None else s.truth for s in chunk]
             store.append(_lines(chunk, steps, reckoned))
+            error = present.see(session, truth)
+            if error is not None:
+                store.append({"anytime.csv": iter([f"{float(chunk[-1].time)!r},{error!r}\n"])})
             if session.steps - saved >= CHECKPOINT_EVERY:
                 store.checkpoint(session.arrays() | {"digest": np.array(source.digest)})
                 saved = session.steps
@@ -132,6 +138,43 @@ def _interrupts() -> Iterator[Callable[[], bool]]:
         yield lambda: bool(pressed)
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+class Anytimes:
+    """How far off the present pose is in the map so far, asked for at the ends of chunks, more seldom as the
+    path grows: each answer aligns the whole path.
+
+    Args:
+        skipped: steps that the map has folded before.
+    """
+
+    def __init__(self, skipped: int = 0) -> None:
+        self.errors: list[float] = []
+        self._skipped, self._due = skipped, skipped
+
+    def see(self, session: Session, truth: Sequence[np.ndarray]) -> float | None:
+        """The error now, if it is time and the truth [steps, 3] of this moment is known."""
+        if session.steps < self._due or session.steps % CHUNK or not np.isfinite(truth[-1]).all():
+            return None
+        self._due = session.steps + max(CHUNK, session.steps // 256)
+        true = np.array(truth)
+        known = np.isfinite(true).all(axis=1)
+        error = present_error(session.map.so_far()[self._skipped :][known], true[known])
+        self.errors.append(error)
+        return error
+
+    def summary(self) -> Anytime:
+        """Of all answers; NaN without any."""
+        return summary(np.array(self.errors)) if self.errors else Anytime(np.nan, np.nan, np.nan)
+
+
+def readings(source: Source) -> Iterator[tuple[Sample, Observation]]:
+    """Samples with what an engine is given of each.
+
+    Raises:
+        InputError: the source gives raw whisker cycles.
+    """
+    return ((sample, _observation(sample)) for sample in source)
 
 
 def _observation(sample: Sample) -> Observation:

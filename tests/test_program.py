@@ -19,8 +19,8 @@ from ratslam.cli import main
 
 ROOT = Path(__file__).parents[1]
 FILES = {
-    "closures.csv", "config.yaml", "manifest.json", "map.g2o", "map.json", "map.npz", "map.png",
-    "odometry.tum", "online.tum", "scorecard.json", "steps.csv", "trajectory.tum", "truth.tum",
+    "anytime.csv", "closures.csv", "config.yaml", "manifest.json", "map.g2o", "map.json", "map.npz",
+    "map.png", "odometry.tum", "online.tum", "scorecard.json", "steps.csv", "trajectory.tum", "truth.tum",
 }  # fmt: skip
 SQUARE = str(ROOT / "configs" / "square.yaml")
 

@@ -1,0 +1,204 @@
+"""Many runs of one recording side by side: parts turned off, numbers varied, inputs perturbed.
+
+A trial keeps no run directory; it answers with a handful of figures. Trials run in processes of their own, so
+that one cannot disturb another, and their results come in order, whichever is done first.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from itertools import islice
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from pydantic import BaseModel
+
+from evaluation.trajectory import ate
+from ratslam.config import RunConfig
+from ratslam.recallrat import rat
+from ratslam.run import Anytimes, readings
+from ratslam.session import CHUNK, Session
+from ratslam.yamlfile import load, override, validate
+from robot.formats import open_recording
+from robot.log import Log
+from robot.perturb import perturbed
+from tactile.errors import InputError
+from tactile.frames import integrate
+
+SAME_PLACE = 2.5
+"""Cells up to which two frames are the same place: farther apart in truth, a closure is false."""
+
+PARTS = {
+    "nothing (all parts on)": (),
+    "recall: the classic matcher instead": ("matcher=classic",),
+    "sector shifts": ("recall.fan=none",),
+    "negative evidence of common views": ("recall.common=0.0",),
+    "the map's pose as a hypothesis": ("recall.local=0.0",),
+    "verification against the map": ("frames.verify=false",),
+    "runs (each candidate alone)": ("frames.length=1",),
+    "robust weights": ("frames.robust=false",),
+    "heading bias in the map": ("frames.bias_in_map=false",),
+    "heading bias from the views": ("frames.bias_from_views=false",),
+    "both": ("frames.bias_in_map=false", "frames.bias_from_views=false"),
+    "breaks": ("frames.breaks=false",),
+    "pose cells hear of candidates": ("recall.energy=1.0e-12",),
+    "closures (odometry alone)": ("experience.closures=false",),
+}
+"""What `ablate` turns off, and how."""
+
+
+class Trial(NamedTuple):
+    """One run in figures; NaN where the recording has no truth.
+
+    Attributes:
+        final, told: ATE of the final map and of the poses told at the time, m. odometry: the same of raw
+            odometry. anytime, late: median, and root mean square of the second half, of the present pose's
+            error in the map so far, m. closures, false: how many, and how many farther apart than
+            `SAME_PLACE`. experiences: in the map. lost: share of steps.
+    """
+
+    final: float
+    told: float
+    odometry: float
+    anytime: float
+    late: float
+    closures: int
+    false: int
+    experiences: int
+    lost: float
+
+
+def trial(config: RunConfig, folder: Path, seed: int = 0) -> Trial:
+    """Runs once; a seed above 0 perturbs the recording first.
+
+    Raises:
+        InputError: the recording cannot be used, or cannot be perturbed because it is not read as a whole.
+    """
+    with open_recording(config.recording.resolved(folder), lambda _: None) as source:
+        config = config.completed(source)
+        if seed:
+            if not isinstance(source, Log):
+                raise InputError("recording.file", "a recording that is streamed", "a CSV or .npz recording")
+            source = perturbed(source, seed)
+        dtype = np.dtype(config.session.precision)
+        session = Session(
+            rat(config.rat(), source.view_shape, dtype),
+            seed=config.session.seed,
+            reserve=config.session.reserve,
+            precision=config.session.precision,
+        )
+        truth: list[np.ndarray] = []
+        motion: list[list[float]] = []
+        told: list[np.ndarray] = []
+        lost: list[bool] = []
+        present = Anytimes()
+        rows = readings(source)
+        while chunk := list(islice(rows, CHUNK)):
+            steps = list(session.replay([reading for _, reading in chunk]))
+            truth += [np.full(3, np.nan) if sample.truth is None else sample.truth for sample, _ in chunk]
+            motion += [[o.odometry.dx, o.odometry.dy, o.odometry.dtheta] for _, o in chunk]
+            told += [step.pose for step in steps]
+            lost += [bool(step.estimate.lost) for step in steps]
+            present.see(session, truth)
+    return _figures(config, session, present, np.array(truth), np.array(motion), np.array(told), lost)
+
+
+def _figures(
+    config: RunConfig,
+    session: Session,
+    present: Anytimes,
+    truth: np.ndarray,
+    motion: np.ndarray,
+    told: np.ndarray,
+    lost: list[bool],
+) -> Trial:
+    known = np.isfinite(truth).all(axis=1)
+    closures = session.map.closures()
+    apart = np.hypot(*(truth[closures[:, 0]] - truth[closures[:, 1]])[:, :2].T)
+    reckoned = integrate(motion)
+
+    def error(path: np.ndarray) -> float:
+        return ate(path[known], truth[known]) if known.any() else np.nan
+
+    anytime = present.summary()
+    return Trial(
+        final=error(session.map.trajectory()),
+        told=error(told),
+        odometry=error(reckoned),
+        anytime=anytime.median,
+        late=anytime.late,
+        closures=len(closures),
+        false=int((apart > SAME_PLACE * config.pose_cells.cell_size).sum()),
+        experiences=session.map.graph().number_of_nodes(),
+        lost=float(np.mean(lost)),
+    )
+
+
+def compare(
+    path: Path, assignments: Sequence[str], variants: Sequence[tuple[Sequence[str], int]], workers: int = 0
+) -> Iterator[Trial]:
+    """Trials of one configuration file, in the order of the variants.
+
+    Args:
+        assignments: overrides for all, as `a.b=value`. variants: further overrides and the perturbation's
+            seed (0: none) of each. workers: processes; 0: as many as there are cores.
+    """
+    for sets, _ in variants:  # complain before anything runs
+        validate(override(load(path), [*assignments, *sets]), RunConfig)
+    count = min(workers or os.cpu_count() or 1, len(variants))
+    # Forked children of a process that runs JAX may hang; spawned ones start clean.
+    pool = ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn"))
+    try:
+        tasks = [pool.submit(_try, path, [*assignments, *sets], seed) for sets, seed in variants]
+        for task in tasks:
+            yield task.result()
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _try(path: Path, assignments: list[str], seed: int) -> Trial:
+    return trial(validate(override(load(path), assignments), RunConfig), path.parent, seed)
+
+
+def numbers(config: RunConfig) -> list[tuple[str, float | int]]:
+    """Every number of the unified filter and its map, by key path: what `vary` varies."""
+    found: list[tuple[str, float | int]] = []
+
+    def walk(model: BaseModel, path: str) -> None:
+        for name in type(model).model_fields:
+            value = getattr(model, name)
+            if isinstance(value, BaseModel):
+                walk(value, f"{path}{name}.")
+            elif isinstance(value, int | float) and not isinstance(value, bool):
+                found.append((path + name, value))
+
+    walk(config.recall, "recall.")
+    walk(config.frames, "frames.")
+    return found
+
+
+def varied(value: float | int, factor: float) -> float | int:
+    """The value times the factor; whole numbers move by one at least. Shares stay at 1 or below."""
+    if isinstance(value, int):
+        moved = round(value * factor)
+        return moved if moved != value else max(value + (1 if factor > 1 else -1), 1)
+    return value * factor
+
+
+HEADER = f"{'':<42}{'final':>8}{'told':>8}{'anytime':>9}{'late':>8}{'closures':>10}{'false':>7}{'lost':>7}"
+"""Of the table that `row` fills: m, m, m, m, counts, share of steps."""
+
+
+def row(name: str, trials: Sequence[Trial]) -> str:
+    """One line of the table: medians over the trials, and the largest final error if there are several."""
+    middle = [float(np.median(column)) for column in zip(*trials, strict=True)]
+    t = Trial(*middle)  # type: ignore[arg-type]
+    most = f"  final at most {max(each.final for each in trials):.3g}" if len(trials) > 1 else ""
+    return (
+        f"{name:<42}{t.final:>8.3g}{t.told:>8.3g}{t.anytime:>9.3g}{t.late:>8.3g}"
+        f"{t.closures:>10.0f}{t.false:>7.0f}{t.lost:>7.2f}{most}"
+    )
