@@ -34,8 +34,10 @@ EVERY = 16
 """Frames between two looks at the bias that the views show."""
 ENOUGH = 400
 """Errors against ruled-out frames before their quantile is taken for the scale of errors."""
-BACKGROUND = 0.01
-"""That quantile: errors so small are still seen between different places."""
+BACKGROUND = (0.005, 0.01, 0.02, 0.04, 0.08)
+"""The quantiles whose geometric mean is the scale: errors so small are still seen between different places.
+Several, because the errors of places that look exactly alike make a step in the quantiles, and a scale taken
+from one quantile falls down that step."""
 LOOSE = 1e4
 """Standard deviation of a cut odometry edge, cells."""
 FAR_BACK = 400
@@ -486,7 +488,9 @@ class FrameMap:
         """The error below which different places seldom come; taken anew when a tenth more is known."""
         count, scale = len(self._background.rows), self._scale[1]
         if count >= max(ENOUGH, 1.1 * self._scale[0]):
-            scale = float(np.quantile(self._background.rows, BACKGROUND))
+            small = np.quantile(self._background.rows, BACKGROUND)
+            least = 1e-3 * small[-1]  # places may look alike to the last bit
+            scale = float(np.exp(np.log(np.maximum(small, least)).mean())) if least > 0 else 0.0
             self._scale = count, scale
         return scale
 

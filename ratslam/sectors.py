@@ -18,6 +18,8 @@ FANS = np.radians([sign * width for width in (60, 90, 120, 180, 240, 270, 360) f
 """Widths of fans that sensors have and that views can tell apart, rad; negative: clockwise."""
 SURE = 3.0
 """Standard errors by which shifted views must agree better than unshifted ones."""
+PLAIN = 0.1
+"""Share of the unshifted difference that shifting must explain: chance may be sure of a trifle."""
 FEWEST = 20
 """Turns to see before views are called a fan, and pairs before they tell a bias."""
 LAGS = (1, 2)
@@ -50,6 +52,7 @@ class Fan:
         self._view = Growing((size,), np.float64)
         self._step = Growing((2,), np.float64)  # turn, length into the frame
         self._gain = Growing((len(FANS),), np.float64)
+        self._still = Growing((len(FANS),), np.float64)  # the unshifted difference, where a fan would shift
         self._pairs = _no_pairs()
         self._angle = angle
         self._due = 1
@@ -64,7 +67,9 @@ class Fan:
         self._view.append(view)
         self._step.append((turn, length))
         if len(self._view.rows) > 1:
-            self._gain.append(self._gains())
+            gain, still = self._gains()
+            self._gain.append(gain)
+            self._still.append(still)
 
     def estimate(self) -> Slope:
         """The heading bias that the views show: what has to be added to the odometry's turn."""
@@ -85,18 +90,22 @@ class Fan:
         total, count = gain.sum(axis=0), (gain != 0).sum(axis=0)
         sure = total / np.sqrt(np.maximum((gain**2).sum(axis=0), 1e-300))
         best = int(np.argmax(np.where(count >= FEWEST, total, -np.inf)))
-        if count[best] >= FEWEST and sure[best] > SURE:
+        plain = total[best] > PLAIN * self._still.rows[:, best].sum()
+        if count[best] >= FEWEST and sure[best] > SURE and plain:
             self._angle = float(FANS[best] / self._view.rows.shape[1])
             self._due = 2 * len(gain)
             self._pairs = _no_pairs()
 
-    def _gains(self) -> np.ndarray:
-        """[F] by how much the newest two views agree better when shifted as each fan demands."""
+    def _gains(self) -> tuple[np.ndarray, np.ndarray]:
+        """[F] by how much the newest two views agree better when shifted as each fan demands, and how much
+        they differ unshifted; 0 where a fan demands no shift."""
         old, now = self._view.rows[-2], self._view.rows[-1]
         size = len(now)
         shift = np.round(-self._step.rows[-1, 0] / (FANS / size)).astype(int)
         still = np.abs(now - old).mean()
-        return np.array([still - _apart(now, old, k) if 0 < abs(k) <= size // 2 else 0.0 for k in shift])
+        moves = (shift != 0) & (np.abs(shift) <= size // 2)
+        gain = [still - _apart(now, old, k) if moved else 0.0 for k, moved in zip(shift, moves, strict=True)]
+        return np.array(gain), still * moves
 
     def _measured(self, lag: int) -> np.ndarray:
         """[P, 3] for each pair of frames `lag` apart: heading error, trust in it, way between them."""
@@ -130,6 +139,7 @@ class Fan:
             "view": self._view.rows.copy(),
             "step": self._step.rows.copy(),
             "gain": self._gain.rows.copy(),
+            "still": self._still.rows.copy(),
             "found": np.array([self._angle, self._due]),
         }
 
@@ -138,6 +148,7 @@ class Fan:
         self._view.replace(arrays["view"])
         self._step.replace(arrays["step"])
         self._gain.replace(arrays["gain"])
+        self._still.replace(arrays["still"])
         angle, due = np.asarray(arrays["found"])
         self._angle, self._due = float(angle), int(due)
         self._pairs = _no_pairs()
@@ -177,5 +188,8 @@ def _slope(pairs: np.ndarray, angle: float) -> Slope:
         value = float((weight * turned * length).sum() / (weight * length**2).sum())
     top, bottom = weight * turned * length, weight * length**2
     parts = np.array_split(np.arange(len(pairs)), BLOCKS)
-    without = np.array([(top.sum() - top[p].sum()) / (bottom.sum() - bottom[p].sum()) for p in parts])
+    rest = np.array([bottom.sum() - bottom[part].sum() for part in parts])
+    if rest.min() <= 1e-9 * bottom.sum():
+        return NOTHING  # all of it was seen in one stretch: nothing to compare it with
+    without = np.array([top.sum() - top[part].sum() for part in parts]) / rest
     return Slope(value, float(np.sqrt((1 - 1 / BLOCKS) * ((without - without.mean()) ** 2).sum())))

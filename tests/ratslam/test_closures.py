@@ -1,0 +1,168 @@
+"""Laws of the ledger: what is written down, what counts, and that both survive."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ratslam.closures import Candidate, Ledger, Verdict
+
+VARIANCE = np.array([0.1, 0.1, 0.02])
+SCALES = (0.5, 2.0, 20.0)
+steps = st.lists(
+    st.one_of(
+        st.tuples(st.just("add"), st.booleans(), st.floats(-5, 30)),
+        st.tuples(st.just("judge"), st.integers(0, 9), st.sampled_from(Verdict)),
+        st.tuples(st.just("strike"), st.integers(0, 9), st.integers(0, 9)),
+    ),
+    max_size=30,
+)
+
+
+def filled():
+    """Runs of 2, 3 and 1 candidates at frames 50, 52, ..; run k's candidates have the gain k + 1."""
+    ledger = Ledger()
+    for k, run in enumerate([0, 0, 1, 1, 1, 2]):
+        first = k in (0, 2, 5)
+        assert ledger.add(Candidate(50 + 2 * k, k, k - 3, 0.9, run + 1.0), not first) == run
+    return ledger
+
+
+@given(steps)
+def test_the_ledger_is_a_list_of_candidates(steps):
+    ledger, rows, verdicts, counts = Ledger(), [], [], []
+    for kind, a, b in steps:
+        if kind == "add":
+            follows = a and bool(verdicts)
+            candidate = Candidate(50 + len(rows), len(rows) // 2, len(rows) % 7 - 3, 0.5 + len(rows) / 99, b)
+            if not follows:
+                verdicts.append(Verdict.OPEN)
+            assert ledger.add(candidate, follows) == len(verdicts) - 1
+            rows.append([candidate, len(verdicts) - 1])
+            assert ledger.last() == candidate
+        elif kind == "judge" and verdicts:
+            verdicts[a % len(verdicts)] = b
+            ledger.judge(a % len(verdicts), b)
+        elif kind == "strike" and verdicts:
+            frame, spare = 50 + a, b % len(verdicts)
+            ledger.strike(frame, spare)
+            for row in rows:
+                accepted = row[1] >= 0 and verdicts[row[1]] == Verdict.ACCEPTED
+                if row[0].frame >= frame and accepted and row[1] != spare:
+                    row[1] = -1
+        # After every step, so that nothing once looked up outlives a change.
+        counts = [k for k, (_, run) in enumerate(rows) if run >= 0 and verdicts[run] == Verdict.ACCEPTED]
+        assert ledger.accepted().tolist() == counts
+    assert ledger.runs == len(verdicts)
+    assert [ledger.verdict(run) for run in range(ledger.runs)] == verdicts
+    for run in range(ledger.runs):
+        mine = [candidate for candidate, of in rows if of == run]
+        assert ledger.members(run).tolist() == [[*c[:3], run] for c in mine]
+        assert ledger.score(run) == pytest.approx(sum(c.gain for c in mine))
+    table = ledger.table()
+    assert table.shape == (len(rows), 9)
+    assert table[:, :6].tolist() == [[*candidate, run] for candidate, run in rows]
+    assert table[:, 7].tolist() == [verdicts[run] if run >= 0 else Verdict.UNDONE for _, run in rows]
+
+    closures = ledger.closures(0.2, VARIANCE, SCALES)
+    mine = [rows[k] for k in counts]
+    runs = sorted({run for _, run in mine})
+    assert closures.i.tolist() == [candidate.match for candidate, _ in mine]
+    assert closures.j.tolist() == [candidate.frame for candidate, _ in mine]
+    assert np.allclose(closures.turn, [-0.2 * candidate.shift for candidate, _ in mine])
+    assert closures.run.tolist() == [runs.index(run) for _, run in mine]
+    assert np.allclose(closures.scale, [min(max(0.5 * ledger.score(run), 2), 20) for run in runs])
+    assert closures.variance is VARIANCE
+
+    again = Ledger()
+    again.add(Candidate(1, 0, 0, 1.0, 1.0), False)
+    again.restore(ledger.arrays())
+    assert np.array_equal(again.table(), table)
+    assert np.array_equal(again.accepted(), ledger.accepted())
+    assert (again.runs, again.last()) == (ledger.runs, ledger.last())
+
+
+def test_an_empty_ledger_has_no_closures():
+    ledger = Ledger()
+    assert ledger.last() is None
+    assert ledger.runs == 0
+    assert ledger.table().shape == (0, 9)
+    assert [len(rows) for rows in ledger.closures(0.1, VARIANCE, SCALES)[:4]] == [0] * 4
+    assert ledger.closures(0.1, VARIANCE, SCALES).scale.shape == (0,)
+    ledger.weigh(np.zeros(0))
+    assert ledger.weights().shape == (0,)
+
+
+def test_a_run_counts_while_it_is_accepted():
+    ledger = filled()
+    assert len(ledger.accepted()) == 0
+    ledger.judge(1, Verdict.ACCEPTED, 3.0)
+    assert ledger.accepted().tolist() == [2, 3, 4]
+    ledger.add(Candidate(62, 9, 0, 0.9, 1.0), True)  # of the open run 2
+    ledger.judge(2, Verdict.ACCEPTED)
+    assert ledger.accepted().tolist() == [2, 3, 4, 5, 6]
+    ledger.add(Candidate(64, 9, 0, 0.9, 1.0), True)  # of a run accepted already
+    assert ledger.accepted().tolist() == [2, 3, 4, 5, 6, 7]
+    ledger.judge(1, Verdict.UNDONE)
+    assert ledger.accepted().tolist() == [5, 6, 7]
+    assert ledger.closures(0.1, VARIANCE, SCALES).run.tolist() == [0, 0, 0]
+
+
+def test_a_break_strikes_out_what_was_said_after_it():
+    ledger = filled()
+    for run in (0, 1):
+        ledger.judge(run, Verdict.ACCEPTED)
+    ledger.strike(56, 2)
+    assert ledger.accepted().tolist() == [0, 1, 2]  # run 1 keeps what it said before the break
+    assert ledger.score(1) == 2.0
+    assert ledger.table()[:, 5].tolist() == [0, 0, 1, -1, -1, 2]  # an open run is spared, accepted or not
+    assert ledger.table()[3, 6:].tolist() == [np.inf, Verdict.UNDONE, 0.0]
+    ledger.judge(2, Verdict.ACCEPTED)
+    ledger.strike(0, 2)
+    assert ledger.accepted().tolist() == [5]
+
+
+def test_scales_grow_with_the_score_between_their_limits():
+    ledger = filled()
+    for run in range(3):
+        ledger.judge(run, Verdict.ACCEPTED)
+    assert np.allclose(ledger.closures(0.1, VARIANCE, (1.0, 2.5, 4.0)).scale, [2.5, 4.0, 3.0])
+
+
+def test_weights_go_to_the_runs_that_count():
+    ledger = filled()
+    for run in (0, 2):
+        ledger.judge(run, Verdict.ACCEPTED)
+    assert ledger.weights().tolist() == [1, 1, 1]
+    ledger.weigh(np.array([0.25, 0.75]))
+    assert ledger.weights().tolist() == [0.25, 0.25, 0.75]
+    assert ledger.table()[:, 8].tolist() == [0.25, 0.25, 0, 0, 0, 0.75]
+    ledger.judge(0, Verdict.UNDONE)
+    ledger.weigh(np.array([0.5]))
+    assert ledger.weights().tolist() == [0.5]
+
+
+def test_the_table_tells_all_evidence():
+    ledger = Ledger()
+    ledger.add(Candidate(30, 4, -2, 0.75, 6.5), False)
+    ledger.add(Candidate(40, 5, 1, 0.5, -1.5), False)
+    ledger.judge(0, Verdict.ACCEPTED, 2.25)
+    ledger.judge(0, Verdict.ACCEPTED)  # without a distance, the one known stays
+    ledger.weigh(np.array([0.5]))
+    assert ledger.table().tolist() == [
+        [30, 4, -2, 0.75, 6.5, 0, 2.25, Verdict.ACCEPTED, 0.5],
+        [40, 5, 1, 0.5, -1.5, 1, np.inf, Verdict.OPEN, 0.0],
+    ]
+
+
+def test_what_is_kept_is_a_copy():
+    ledger = filled()
+    kept = ledger.arrays()
+    before = ledger.table()
+    ledger.judge(0, Verdict.ACCEPTED, 1.0)
+    ledger.strike(50, 2)
+    ledger.restore(kept)
+    assert np.array_equal(ledger.table(), before)
+    assert len(ledger.accepted()) == 0

@@ -1,0 +1,96 @@
+"""Small worlds with truth: the kinds of the reference traces, regenerated from a seed, and worse ones.
+
+A place is a cell of 10 cm seen under one of six headings; every place has a random 3 x 6 view, so views of
+neighbours are as different as any. Odometry has noise, a scale error of its turns and a gyro bias, as the
+traces have.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from robot.log import Log
+from tactile.frames import between, wrap
+
+CELL = 0.1
+STEP = 0.05
+
+
+def square(seed: int, laps: int = 3, jumps: tuple[tuple[int, int], ...] = ()) -> Log:
+    """Laps of a 1 m square, turning on the spot at its corners, like a_square3.
+
+    Args:
+        jumps: (row, places): at that row the robot is carried so many places ahead, unknown to its odometry,
+            like e_kidnap.
+    """
+    side = [(STEP, 0.0)] * 20 + [(0.0, np.pi / 18)] * 9
+    path = followed(side * 4 * (laps + sum(places for _, places in jumps) // 116 + 1))
+    rows = np.arange(116 * laps + 1)
+    for row, places in jumps:
+        rows[row:] += places
+    return sensed(path[rows], seed, carried=[row for row, _ in jumps])
+
+
+def figure_eight(seed: int, laps: int = 6, shared: float = 1 / 3) -> Log:
+    """Two circles in turn, like b_figure8_alias: a share of the second one's places look like the first's."""
+    left, right = [(STEP, np.pi / 18)] * 36, [(STEP, -np.pi / 18)] * 36
+    path = followed((left + right) * laps)
+    return sensed(path, seed, shared=shared)
+
+
+def corridor(seed: int, length: int = 400) -> Log:
+    """Straight on into the unknown: nothing ever comes back."""
+    return sensed(followed([(STEP, 0.0)] * length), seed)
+
+
+def followed(moves: list[tuple[float, float]]) -> np.ndarray:
+    """[N, 3] the path of steps ahead (m) and turns (rad), from the origin; headings are not wrapped."""
+    ahead, turn = np.array(moves).T
+    heading = np.concatenate([[0.0], np.cumsum(turn)])
+    x = np.concatenate([[0.0], np.cumsum(ahead * np.cos(heading[1:]))])
+    y = np.concatenate([[0.0], np.cumsum(ahead * np.sin(heading[1:]))])
+    return np.stack([x, y, heading], axis=1)
+
+
+def sensed(path: np.ndarray, seed: int, carried: list[int] | None = None, shared: float = 0.0) -> Log:
+    """What a robot on a path [N, 3] reports.
+
+    Args:
+        carried: rows that odometry knows nothing of. shared: share of places that look like another one.
+    """
+    stream = np.random.default_rng(seed)
+    count = len(path)
+    motion = np.zeros((count, 4))
+    motion[1:, :3] = between(path[:-1], path[1:])
+    for row in carried or []:
+        motion[row, :3] = STEP, 0.0, 0.0
+    scale, bias = stream.normal(1, 0.015), stream.normal(0, 0.002)
+    motion[1:, 0] += stream.normal(0, 0.001, count - 1)
+    motion[1:, 2] = motion[1:, 2] * scale + bias + stream.normal(0, 0.005, count - 1)
+    motion[:, 3] = 0.5
+
+    bucket = np.floor((wrap(path[:, 2:]) + np.pi + 0.01) / (np.pi / 3))
+    keys = np.concatenate([np.floor(path[:, :2] / CELL + 0.5), bucket], axis=1)
+    _, first, place = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    looks = stream.random((len(first), 18))
+    alike = stream.random(len(first)) < shared / 2
+    looks[alike] = looks[stream.permutation(len(first))[: alike.sum()]]
+    views = np.clip(looks[place.reshape(-1)] + stream.normal(0, 0.012, (count, 18)), 0, 1)
+    return recorded(path, motion, views)
+
+
+def recorded(path: np.ndarray, motion: np.ndarray, views: np.ndarray) -> Log:
+    """A log of these rows."""
+    count = len(path)
+    return Log(
+        name="scene",
+        digest="",
+        time=0.5 * np.arange(count),
+        motion=motion,
+        moved=np.ones(count, bool),
+        views=views.reshape(count, 3, 6, 1).copy(),
+        seen=np.ones(count, bool),
+        label=np.full(count, -1, np.int32),
+        truth=np.column_stack([path[:, :2], wrap(path[:, 2])]),
+        params={"pc_cell_x_size": CELL},
+    )
