@@ -62,8 +62,11 @@ class RecallConfig(Settings):
     """Error that costs a factor e, in scales (the 1 % quantile of errors between different places)."""
     floor: PositiveFloat = 1.27
     """Error at which a view is as likely new as known, in scales."""
-    common: Share = 0.7
-    """How much of novelty's likelihood is the mean over all frames, not the floor."""
+    common: Share = 1.0
+    """Weight of the mean likelihood over all frames in novelty's: at 1 a view that all places share tells
+    nothing at all."""
+    fresh: Share = 0.3
+    """Weight of a view at the floor in novelty's."""
     reach: PositiveFloat = 0.85
     """Standard deviation of a frame's place against odometry, cells."""
     reach_heading: PositiveFloat = 0.25
@@ -147,8 +150,8 @@ class Recollection(NamedTuple):
         frame: int32, the frame the view became, -1 for none. match: int32, the most likely frame, -1 for
             none. shift: int32, sectors by which the view is shifted against it. mass: posterior within
             `BASIN` cells of it. gain: log-likelihood ratio of the match against novelty. novel: posterior of
-            novelty. entropy: of hypotheses and novelty, nats. second: mass of the second hypothesis over the
-            first. agree: int32, 1 when the view fits a frame where the map says the robot is, 0 when it fits
+            novelty. entropy: of hypotheses and novelty, nats. second: mass of the second heaviest over
+            the heaviest. agree: int32, 1 when the view fits a frame where the map says the robot is, 0 when it fits
             none there, -1 when none is there. background: [SAMPLES] errors against ruled-out frames, NaN for
             none.
     """
@@ -278,13 +281,14 @@ def by_view(config: RecallConfig, cell: float, memory: Memory, view: Array) -> W
     """Weighs all frames by a view [D]. A view that looks like many places makes all of them unlikely."""
     error = _errors(offsets(config), memory, view)
     old = _old(config, memory)
-    known = memory.scale > 0
-    width = jnp.where(known, config.sharpness * memory.scale, 1.0)
+    width = config.sharpness * memory.scale
+    known = width > jnp.finfo(width.dtype).tiny
+    width = jnp.where(known, width, 1.0)
     likelihood = jnp.where(old[None], jnp.exp(-error / width), 0.0)
     shifts = jnp.sum(jnp.isfinite(error[:, 0]))
     mean = jnp.sum(likelihood) / (jnp.maximum(jnp.sum(old), 1) * shifts).astype(width.dtype)
     floor = jnp.exp(-config.floor * memory.scale / width)
-    novelty = config.common * mean + (1 - config.common) * floor
+    novelty = config.common * mean + config.fresh * floor
     away = jnp.maximum(3 * cell, 3 * (0.5 * cell + 0.05 * (memory.since + memory.length)))
     here = present(memory)
     apart = (memory.x - here[0]) ** 2 + (memory.y - here[1]) ** 2
@@ -330,7 +334,7 @@ def look(
 
     belief, novel = _align(config, cell, memory, angles, old, here)
     belief, novel = belief * likelihood, novel * novelty
-    total = jnp.sum(belief) + novel
+    total = jnp.maximum(jnp.sum(belief) + novel, jnp.finfo(novel.dtype).tiny)
     belief, novel = belief / total, novel / total
 
     match = _peak(jnp.max(belief, axis=0))
@@ -349,13 +353,13 @@ def look(
     shares = jnp.concatenate([masses, jnp.maximum(1 - jnp.sum(masses, keepdims=True), 0.0)])
     recollection = Recollection(
         frame=memory.count,
-        match=jnp.where(certain, match, -1),
-        shift=jnp.where(certain, jnp.asarray(shifts)[shift], 0),
+        match=jnp.where(certain & (mass > 0), match, -1),
+        shift=jnp.where(certain & (mass > 0), jnp.asarray(shifts)[shift], 0),
         mass=jnp.where(certain, mass, 0.0),
-        gain=jnp.where(certain, gain, 0.0),
+        gain=jnp.where(certain & (mass > 0), gain, 0.0),
         novel=jnp.where(certain, novel, 1.0),
         entropy=-jnp.sum(jnp.where(shares > 0, shares * jnp.log(jnp.where(shares > 0, shares, 1.0)), 0.0)),
-        second=masses[1] / jnp.maximum(masses[0], 1e-9) if config.modes > 1 else jnp.zeros_like(mass),
+        second=_second(masses),
         agree=agree,
         background=weighing.background,
     )
@@ -407,11 +411,18 @@ def _errors(shifts: np.ndarray, memory: Memory, view: Array) -> Array:
     for k in shifts.tolist():
         stored = memory.view[max(-k, 0) : size - max(k, 0)]
         seen = view[max(k, 0) : size - max(-k, 0)]
+        if size <= abs(k):
+            rows.append(jnp.full(memory.view.shape[1], jnp.inf, memory.view.dtype))
+            continue
         # Written out, one pass over the frames adds all values; a reduction over them takes twice as long.
         apart = sum((jnp.abs(stored[i] - seen[i]) for i in range(len(stored))), jnp.zeros_like(stored[0]))
         rows.append(apart / len(stored))
-    allowed = (shifts == 0)[:, None] | (memory.angle != 0)
-    return jnp.where(allowed, jnp.stack(rows), jnp.inf)
+    return jnp.where(_allowed(shifts, memory)[:, None], jnp.stack(rows), jnp.inf)
+
+
+def _allowed(shifts: np.ndarray, memory: Memory) -> Array:
+    """[S] the shifts that mean something: all once sectors are known to be ordered."""
+    return (shifts == 0) | (memory.angle != 0)
 
 
 def _background(error: Array, away: Array) -> Array:
@@ -440,7 +451,7 @@ def _align(
         prior mass at each shift and frame [S, C], and of novelty.
     """
     dtype = memory.x.dtype
-    shape = (len(angles), len(old))
+    cells = _allowed(offsets(config), memory)[:, None] & old[None]
     moved = _corrected(memory.motion, memory.length, memory.bias)
     at = memory.anchor
     anchors = jnp.stack([memory.x[at], memory.y[at], jnp.arctan2(memory.sine[at], memory.cosine[at])])
@@ -452,7 +463,7 @@ def _align(
         facing = jnp.cos(turned)[:, None] * memory.cosine[None] + jnp.sin(turned)[:, None] * memory.sine[None]
         deviation = apart[None] + (2 / sd_heading**2) * (1 - facing)
         inside = jnp.maximum(1 - deviation / SUPPORT, 0.0)
-        return jnp.where(old[None], inside**2 * inside**2, 0.0)
+        return jnp.where(cells, inside**2 * inside**2, 0.0)
 
     reach = jnp.asarray(config.reach * cell, dtype), jnp.asarray(config.reach_heading, dtype)
 
@@ -465,13 +476,13 @@ def _align(
         return belief, novel + stay * config.nothing / total + memory.mass[k] * config.leave
 
     fresh = 1 - jnp.sum(memory.mass)
-    shut = jnp.zeros(shape, dtype), jnp.zeros((), dtype)
+    shut = jnp.zeros(cells.shape, dtype), jnp.zeros((), dtype)
     belief, novel = lax.fori_loop(0, config.modes, carry, shut)
     near = landing(here, *spread(config, cell, memory))
     total = jnp.sum(near)
     local, everywhere = fresh * config.enter * config.local, fresh * config.enter * (1 - config.local)
-    cells = jnp.maximum(jnp.sum(old), 1).astype(dtype) * shape[0]
-    belief = belief + jnp.where(old[None], everywhere / cells, 0.0) + (local / jnp.maximum(total, 1.0)) * near
+    belief = belief + jnp.where(cells, everywhere / jnp.maximum(jnp.sum(cells), 1).astype(dtype), 0.0)
+    belief = belief + (local / jnp.maximum(total, 1.0)) * near
     entered = jnp.where(jnp.any(old), everywhere, 0.0) + local * total / jnp.maximum(total, 1.0)
     return belief, novel + fresh - entered
 
@@ -488,10 +499,14 @@ def _modes(
     ahead = cosine * memory.cosine - sine * memory.sine  # summed headings of the robot at each frame
     aside = cosine * memory.sine + sine * memory.cosine
 
+    row = jnp.arange(len(mass), dtype=jnp.int32)
+
     def peel(rest: Array, _: None) -> tuple[Array, tuple[Array, Array, Array]]:
         frame = _peak(rest)
         dx, dy = memory.x - memory.x[frame], memory.y - memory.y[frame]
         member = (dx**2 + dy**2 < cell**2) & (rest > 0)
+        # A way driven out and back has frames that face against each other: they are hypotheses of their own.
+        member = member & ((ahead * ahead[frame] + aside * aside[frame] > 0) | (row == frame))
         part = jnp.where(member, rest, 0.0)
         total = jnp.sum(part)
         kept = total > 0
@@ -510,6 +525,14 @@ def _peak(values: Array) -> Array:
     """Index of the first largest value; an argmax that compilers turn into vector code."""
     row = jnp.arange(len(values), dtype=jnp.int32)
     return jnp.min(jnp.where(values >= jnp.max(values), row, len(values) - 1))
+
+
+def _second(masses: Array) -> Array:
+    """The second largest mass [K] over the largest; 0 where there is none."""
+    if len(masses) < 2:
+        return jnp.zeros((), masses.dtype)
+    ordered = jnp.sort(masses)
+    return ordered[-2] / jnp.maximum(ordered[-1], 1e-9)
 
 
 def _corrected(motion: Array, length: Array, bias: Array) -> Array:
