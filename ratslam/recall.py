@@ -151,9 +151,9 @@ class Recollection(NamedTuple):
             none. shift: int32, sectors by which the view is shifted against it. mass: posterior within
             `BASIN` cells of it. gain: log-likelihood ratio of the match against novelty. novel: posterior of
             novelty. entropy: of hypotheses and novelty, nats. second: mass of the second heaviest over
-            the heaviest. agree: int32, 1 when the view fits a frame where the map says the robot is, 0 when it fits
-            none there, -1 when none is there. background: [SAMPLES] errors against ruled-out frames, NaN for
-            none.
+            the heaviest. agree: int32, 1 when the view fits a frame where the map says the robot is, 0 when
+            it fits none there, -1 when none is there. background: [SAMPLES] errors against ruled-out frames,
+            NaN for none.
     """
 
     frame: Array
