@@ -38,6 +38,8 @@ BACKGROUND = (0.005, 0.01, 0.02, 0.04, 0.08)
 """The quantiles whose geometric mean is the scale: errors so small are still seen between different places.
 Several, because the errors of places that look exactly alike make a step in the quantiles, and a scale taken
 from one quantile falls down that step."""
+ALIKE = 1e-3
+"""Least such quantile, as a share of the largest: places may look alike to the last bit."""
 LOOSE = 1e4
 """Standard deviation of a cut odometry edge, cells."""
 FAR_BACK = 400
@@ -489,8 +491,9 @@ class FrameMap:
         count, scale = len(self._background.rows), self._scale[1]
         if count >= max(ENOUGH, 1.1 * self._scale[0]):
             small = np.quantile(self._background.rows, BACKGROUND)
-            least = 1e-3 * small[-1]  # places may look alike to the last bit
-            scale = float(np.exp(np.log(np.maximum(small, least)).mean())) if least > 0 else 0.0
+            # As shares of the largest, so that the sensor's unit drops out to the last bit.
+            share = small / small[-1] if small[-1] > 0 else small
+            scale = float(small[-1] * np.exp(np.log(np.maximum(share, ALIKE)).mean()))
             self._scale = count, scale
         return scale
 
