@@ -62,10 +62,10 @@ class RecallConfig(Settings):
     """Error that costs a factor e, in scales (the 1 % quantile of errors between different places)."""
     floor: PositiveFloat = 1.27
     """Error at which a view is as likely new as known, in scales."""
-    common: Share = 1.0
+    common: NonNegativeFloat = 1.0
     """Weight of the mean likelihood over all frames in novelty's: at 1 a view that all places share tells
     nothing at all."""
-    fresh: Share = 0.3
+    fresh: NonNegativeFloat = 0.3
     """Weight of a view at the floor in novelty's."""
     reach: PositiveFloat = 0.85
     """Standard deviation of a frame's place against odometry, cells."""
