@@ -82,27 +82,30 @@ def _ablate(arguments: argparse.Namespace) -> int:
     prepare_jax()
     from ratslam.trials import PARTS
 
-    return _table(arguments, [(name, sets) for name, sets in PARTS.items()])[0]
+    _table(arguments, list(PARTS.items()))
+    return 0
 
 
 def _vary(arguments: argparse.Namespace) -> int:
     prepare_jax()
-    from ratslam.config import RunConfig
-    from ratslam.trials import numbers, varied
-    from ratslam.yamlfile import load, override, validate
+    from ratslam.trials import variations
+    from ratslam.yamlfile import load, override
 
-    config = validate(override(load(arguments.config), arguments.set), RunConfig)
-    factors = (1 - arguments.by, 1 + arguments.by)
+    if not 0 < arguments.by < 1:
+        raise InputError("--by", str(arguments.by), "a share between 0 and 1")
+    document = override(load(arguments.config), arguments.set)
     lines = [
-        (f"{name} = {varied(value, factor):.4g}", (f"{name}={varied(value, factor)!r}",))
-        for name, value in numbers(config)
-        for factor in factors
+        (f"{name} = {value:.4g}", (f"{name}={value!r}",))
+        for name, value in variations(document, arguments.by)
     ]
-    code, finals = _table(arguments, [("as configured", ()), *lines])
-    limit = arguments.limit or 1.25 * finals[0]
+    finals = _table(arguments, [("as configured", ()), *lines])
+    limit = 1.25 * finals[0] if arguments.limit is None else arguments.limit
+    if finals[0] != finals[0]:
+        print("the recording has no truth, so nothing can be said of what is kept")
+        return 0
     kept = sum(final <= limit for final in finals[1:])
     print(f"{kept} of {len(lines)} variations ({kept / len(lines):.0%}) end at {limit:.3g} m or less")
-    return code
+    return 0
 
 
 def _spread(arguments: argparse.Namespace) -> int:
@@ -119,9 +122,7 @@ def _spread(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _table(
-    arguments: argparse.Namespace, lines: list[tuple[str, tuple[str, ...]]]
-) -> tuple[int, list[float]]:
+def _table(arguments: argparse.Namespace, lines: list[tuple[str, tuple[str, ...]]]) -> list[float]:
     """Prints a row as soon as all of its trials are done; returns the final errors."""
     from ratslam.trials import HEADER, compare, row
 
@@ -134,7 +135,7 @@ def _table(
         these = [next(trials) for _ in seeds]
         print(row(name, these), flush=True)
         finals.append(max(trial.final for trial in these))
-    return 0, finals
+    return finals
 
 
 def _schema(arguments: argparse.Namespace) -> int:
@@ -147,6 +148,13 @@ def _schema(arguments: argparse.Namespace) -> int:
     else:
         print(text, end="")
     return 0
+
+
+def _count(text: str) -> int:
+    """A whole number from 1 on, for argparse."""
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is no whole number from 1 on")
+    return int(text)
 
 
 def prepare_jax() -> None:
@@ -171,7 +179,7 @@ def prepare_jax() -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="ratslam",
-        description="Maps and localises by view or whisker: pose cells, templates, experience map.",
+        description="Maps and localises by view or whisker: pose cells, recall, experience map.",
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
@@ -215,16 +223,18 @@ def _parser() -> argparse.ArgumentParser:
         "--limit", type=float, metavar="M", help="final ATE that counts as kept (default 1.25 of the first)"
     )
     spread = command("spread", _spread, "run perturbed copies of the recording: what was luck?")
-    spread.add_argument("-n", dest="runs", type=int, default=10, metavar="N", help="copies (default 10)")
+    spread.add_argument("-n", dest="runs", type=_count, default=10, metavar="N", help="copies (default 10)")
     for several in (ablate, vary, spread):
         several.add_argument("config", help="the YAML file")
         several.add_argument(
             "--set", action="append", default=[], metavar="a.b=value", help="override a setting"
         )
-        several.add_argument("--workers", type=int, default=0, metavar="N", help="processes (default: cores)")
+        several.add_argument(
+            "--workers", type=_count, default=0, metavar="N", help="processes (default: cores)"
+        )
     for several in (ablate, vary):
         several.add_argument(
-            "--perturbed", type=int, default=0, metavar="N", help="run on N perturbed copies instead"
+            "--perturbed", type=_count, default=0, metavar="N", help="run on N perturbed copies instead"
         )
 
     recover = command("recover", _recover, "make a complete recording of one that was cut off")

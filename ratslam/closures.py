@@ -23,7 +23,7 @@ class Verdict(IntEnum):
     ACCEPTED = 1
     """Its candidates are closures of the map."""
     UNDONE = 2
-    """Taken back by the user."""
+    """Taken back: by the user, or a candidate struck out because a break lies before it."""
 
 
 class Candidate(NamedTuple):
@@ -86,8 +86,7 @@ class Ledger:
     def judge(self, run: int, verdict: Verdict, distance: float | None = None) -> None:
         """Accepts, refuses or undoes a run; `distance` is its squared Mahalanobis distance."""
         self._verdict.rows[run] = verdict
-        if verdict == Verdict.ACCEPTED:
-            self._weight.rows[run] = 1.0
+        self._weight.rows[run] = float(verdict == Verdict.ACCEPTED)
         if distance is not None:
             self._distance.rows[run] = distance
         self._lines = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import isfinite
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -74,12 +75,13 @@ class RunConfig(Settings):
         return RatConfig(**{name: getattr(self, name) for name in RatConfig.model_fields})
 
     def completed(self, source: Source) -> RunConfig:
-        """The same, with what the file leaves open and the recording knows: cell size, given place ids."""
+        """The same, with what it leaves open and a recording read as a whole knows: cell size, place ids."""
         parts: dict[str, Settings] = {}
         params = getattr(source, "params", {})
-        if "cell_size" not in self.pose_cells.model_fields_set and "pc_cell_x_size" in params:
-            cell = {"cell_size": float(params["pc_cell_x_size"])}
-            parts["pose_cells"] = self.pose_cells.model_copy(update=cell)
+        cell = params.get("pc_cell_x_size")
+        stated = float(cell) if isinstance(cell, int | float) else 0.0
+        if "cell_size" not in self.pose_cells.model_fields_set and isfinite(stated) and stated > 0:
+            parts["pose_cells"] = self.pose_cells.model_copy(update={"cell_size": stated})
         ids_only = isinstance(source, Log) and bool((source.label >= 0).any()) and not source.seen.any()
         if "source" not in self.templates.model_fields_set and ids_only:
             parts["templates"] = self.templates.model_copy(update={"source": "labels"})

@@ -32,6 +32,8 @@ from tactile.types import Observation
 
 EVERY = 16
 """Frames between two looks at the bias that the views show."""
+EARLIEST = 40
+"""Frames before the first."""
 ENOUGH = 400
 """Errors against ruled-out frames before their quantile is taken for the scale of errors."""
 BACKGROUND = (0.005, 0.01, 0.02, 0.04, 0.08)
@@ -79,7 +81,7 @@ class FrameMapConfig(Settings):
     certain: PositiveFloat = 0.5
     """Posterior from which a recollection is a candidate."""
     gap: PositiveInt = 3
-    """Frames that may lie between two candidates of a run."""
+    """Frames from one candidate of a run to the next, at most."""
     agreement: PositiveFloat = 2.0
     """How far candidates of a run may differ from the odometry between them, cells (and a tenth of it)."""
     agreement_heading: PositiveFloat = 0.5
@@ -141,14 +143,24 @@ class FrameMap:
 
     Args:
         cell: size of a pose cell, m. size: values of a view; 0 for recordings with given ids.
-        fan: width of the views in rad, 0: to be found out; None: not a fan. closures: whether anything but
-            odometry shapes the map.
+        fan: width of the views in rad, 0: to be found out; None: not a fan. guard: newest frames that are
+            never recalled. closures: whether anything but odometry shapes the map. normalise: what recall
+            does to a view before it compares it.
     """
 
     def __init__(
-        self, config: FrameMapConfig, cell: float, size: int, fan: float | None, closures: bool = True
+        self,
+        config: FrameMapConfig,
+        cell: float,
+        size: int,
+        fan: float | None,
+        *,
+        guard: int = 20,
+        closures: bool = True,
+        normalise: Callable[[np.ndarray], np.ndarray] = np.asarray,
     ) -> None:
         self.config, self.cell, self.bent = config, cell, closures
+        self.guard, self._normalise = guard, normalise
         self._fan = None if fan is None or not size else Fan(size, fan / size)
         self._ledger = Ledger()
         self._grouping = Grouping(config.place_radius * cell, config.place_heading)
@@ -156,13 +168,12 @@ class FrameMap:
         self._motion = Growing((3,), np.float64)  # into each frame, as odometry told it
         self._length = Growing((), np.float64)
         self._turn = Growing((), np.float64)
-        self._cut = Growing((), np.bool_)
+        self._cut = Growing((), np.int64)  # the run that says the odometry broke before a frame, -1: none
         self._view = Growing((size,), np.float64)
         self._label = Growing((), np.int64)
         self._background = Growing((), np.float64)
         self._step_frame = Growing((), np.int64)
         self._step_motion = Growing((4,), np.float64)  # since that frame, and its length
-        self._jump = Growing((2,), np.float64)  # frame of each correction, and how far it moved the robot
         self._travel = HALT
         self._bias = 0.0
         self._prior = Prior(0.0, config.bias_sd / cell)
@@ -174,7 +185,7 @@ class FrameMap:
 
     def guidance(self) -> Guidance:
         """What the filter may know of the map."""
-        return Guidance(self._pose.rows, self._bias, self._since, self._angle(), self._scale_of_errors())
+        return Guidance(self._pose.rows, self._bias, self._since, self._angle(), self._scale[1])
 
     def pose(self, estimate: Estimate) -> np.ndarray:
         """[3] the newest frame's pose and the motion since."""
@@ -189,10 +200,6 @@ class FrameMap:
         """[T, 3] every folded step as the map sees it at this moment, unsettled: what the robot acts on."""
         return self._steps(Fit(self._pose.rows, self._bias, np.zeros(0)))
 
-    def jumps(self) -> np.ndarray:
-        """[J, 2] for each correction its frame and by how far it moved the robot's present pose, m."""
-        return self._jump.rows.copy()
-
     def closures(self) -> np.ndarray:
         """[M, 2] the steps of the frames that accepted runs join."""
         first = np.searchsorted(self._step_frame.rows, np.arange(len(self._pose.rows)))
@@ -206,10 +213,12 @@ class FrameMap:
         """Takes a run's closures back and solves without them.
 
         Raises:
-            ValueError: there is no such run, or it is not accepted.
+            ValueError: there is no such run, it is not accepted, or it joins parts that odometry does not.
         """
         if not 0 <= run < self._ledger.runs or self._ledger.verdict(run) != Verdict.ACCEPTED:
             raise ValueError(f"run {run} is not an accepted run of this map")
+        if np.any(self._cut.rows == run):
+            raise ValueError(f"run {run} joins what broken odometry left apart; nothing else would hold it")
         self._ledger.judge(run, Verdict.UNDONE)
         self._correct()
 
@@ -277,9 +286,11 @@ class FrameMap:
         self._motion.append(motion)
         self._length.append(length)
         self._turn.append(turn)
-        self._cut.append(False)
+        self._cut.append(-1)
         self._label.append(int(observation.label))
-        self._view.append(np.asarray(observation.view, float).reshape(-1)[: self._view.rows.shape[1]])
+        size = self._view.rows.shape[1]
+        view = self._normalise(np.asarray(observation.view, float)) if size else np.zeros(0)
+        self._view.append(np.asarray(view, float).reshape(-1)[:size])
         self._since += length
         self._travel = HALT
         if self._fan:
@@ -288,8 +299,9 @@ class FrameMap:
     def _calibrate(self, evidence: Evidence) -> None:
         for error in np.asarray(evidence.background)[np.isfinite(evidence.background)]:
             self._background.append(error)
+        self._rescale()
         count = len(self._pose.rows) - 1
-        if not self.bent or self._fan is None or count % EVERY or count < 2 * FEW_FRAMES:
+        if not self.bent or self._fan is None or count % EVERY or count < EARLIEST:
             return
         before, told = self._fan.angle, self._fan.estimate()
         cell, config = self.cell, self.config
@@ -305,7 +317,7 @@ class FrameMap:
             )
             sd = min(np.hypot(told.error, told.value - kept), 2 * config.bias_sd / cell)
             self._prior = Prior(kept, max(sd, config.bias_least / cell))
-        if not len(self._ledger.accepted()):
+        if not len(self._ledger.accepted()) and self._bias != self._prior.mean:
             self._bias = self._prior.mean
             self._retrace()
 
@@ -332,6 +344,7 @@ class FrameMap:
         if self._ledger.verdict(run) != Verdict.ACCEPTED:
             return -1
         self._correct()
+        self._since = 0.0
         return candidate.match
 
     def _follows(self, candidate: Candidate) -> bool:
@@ -377,7 +390,7 @@ class FrameMap:
 
     def _alternatives(self, candidate: Candidate, turn: float, allowed: np.ndarray, gate: float) -> float:
         """Log of how many more frames the map allows than there are around one place."""
-        old = self._pose.rows[: candidate.frame - FEW_FRAMES]
+        old = self._pose.rows[: candidate.frame - self.guard]
         origin = _turned(self._pose.rows[candidate.match], turn)
         centre = between(origin, self._pose.rows[candidate.frame])[:2]
         frames = between(origin, old)[:, :2]
@@ -394,7 +407,7 @@ class FrameMap:
         carried = compose(found, inverse(pose[middle[0]]))
         first = int(members[0, 0])
         at = self._first_carried(carried, first)
-        self._cut.rows[at] = True
+        self._cut.rows[at] = run
         self._pose.rows[at:] = compose(carried, pose[at:])
         self._ledger.strike(at, run)
         self._ledger.judge(run, Verdict.ACCEPTED)
@@ -415,14 +428,14 @@ class FrameMap:
 
     def _misfit(self, frame: int, pose: np.ndarray) -> float:
         """How badly a frame's view fits at a pose, 0..1: against the best of the older frames near it."""
-        old = self._pose.rows[: max(frame - FEW_FRAMES, 0)]
+        old = self._pose.rows[: max(frame - self.guard, 0)]
         near = np.flatnonzero(np.hypot(*(old - pose)[:, :2].T) < 1.5 * self.cell)
         if not len(near):
             return 0.5
         if not self._view.rows.shape[1]:
             return float(not np.any(self._label.rows[near] == self._label.rows[frame]))
         apart = np.abs(self._view.rows[near] - self._view.rows[frame]).mean(axis=1).min()
-        return float(min(apart / max(2 * self._scale_of_errors(), 1e-300), 1.0))
+        return float(min(apart / max(2 * self._scale[1], 1e-300), 1.0))
 
     def _correct(self) -> None:
         """Solves, and moves the map as a whole so that its frames move as little as possible."""
@@ -430,14 +443,12 @@ class FrameMap:
         fit = self._solve(self.config.iterations)
         self._ledger.weigh(fit.weights)
         moved = compose(fitted(fit.poses, before), fit.poses)
-        self._jump.append((len(before) - 1, np.hypot(*(moved[-1] - before[-1])[:2])))
         self._pose.rows[:] = moved
         self._bias = fit.bias
-        self._since = 0.0
+        self._settled = None
 
     def _solve(self, iterations: int) -> Fit:
-        prior = self._prior if self.config.bias_in_map else Prior(self._bias, 1e-9)
-        return solve(self._pose.rows, self._bias, self._chain(), self._closures(), prior, iterations)
+        return solve(self._pose.rows, self._bias, self._chain(), self._closures(), self._belief(), iterations)
 
     def _settle(self) -> Fit:
         if self._settled is None:
@@ -447,7 +458,11 @@ class FrameMap:
 
     def _relative(self, i: int, j: int, turn: float) -> np.ndarray:
         fit = Fit(self._pose.rows, self._bias, np.zeros(0))
-        return relative_covariance(fit, self._chain(), self._closures(), self._prior, i, j, turn)
+        return relative_covariance(fit, self._chain(), self._closures(), self._belief(), i, j, turn)
+
+    def _belief(self) -> Prior:
+        """About the bias."""
+        return self._prior if self.config.bias_in_map else Prior(self._bias, 1e-9)
 
     def _chain(self) -> Chain:
         noise, cell = self.config.noise, self.cell
@@ -457,7 +472,7 @@ class FrameMap:
         heading = heading + noise.least_heading**2
         variance = np.stack([along, along, heading], axis=1)
         loose = np.array([LOOSE * cell, LOOSE * cell, LOOSE]) ** 2
-        return Chain(self._motion.rows[1:], length, np.where(cut[:, None], loose, variance))
+        return Chain(self._motion.rows[1:], length, np.where(cut[:, None] >= 0, loose, variance))
 
     def _closures(self) -> Closures:
         config = self.config
@@ -486,16 +501,15 @@ class FrameMap:
     def _angle(self) -> float:
         return self._fan.angle if self._fan else 0.0
 
-    def _scale_of_errors(self) -> float:
+    def _rescale(self) -> None:
         """The error below which different places seldom come; taken anew when a tenth more is known."""
-        count, scale = len(self._background.rows), self._scale[1]
+        count = len(self._background.rows)
         if count >= max(ENOUGH, 1.1 * self._scale[0]):
             small = np.quantile(self._background.rows, BACKGROUND)
             # As shares of the largest, so that the sensor's unit drops out to the last bit.
             share = small / small[-1] if small[-1] > 0 else small
             scale = float(small[-1] * np.exp(np.log(np.maximum(share, ALIKE)).mean()))
             self._scale = count, scale
-        return scale
 
     def _write_closures(self, path: Path) -> None:
         names = "frame,match,step,match_step,shift,mass,gain,run,distance,verdict,weight"
@@ -545,10 +559,6 @@ class FrameMap:
 
     def _growing(self) -> dict[str, Growing]:
         return {name[1:]: value for name, value in vars(self).items() if isinstance(value, Growing)}
-
-
-FEW_FRAMES = 20
-"""Frames that are too near in time to be compared; twice as many before the views' bias is asked for."""
 
 
 def _turned(pose: np.ndarray, angle: float) -> np.ndarray:

@@ -33,7 +33,7 @@ LABELS = {"same": 0.6, "unknown": 0.35, "other": 0.05, "new_unknown": 0.9, "new_
 """How likely a given id is where its frame was, and where it is new: ids are right more often than not, a new
 id says little (the giver may have failed to recognise), and another known id speaks against."""
 LABEL_TEMPER = 0.7
-"""Ids of consecutive views are not independent: each counts half."""
+"""Ids of consecutive views are not independent: each counts as this share of one."""
 SUPPORT = 8.0
 """Squared deviations at which the alignment kernel (1 - d2 / 8)^4 ends: like exp(-d2 / 2), but compact."""
 BASIN = 2.0
@@ -49,7 +49,7 @@ class RecallConfig(Settings):
 
     fan: Literal["auto", "none"] | float = "auto"
     """Whether a view is a fan of ordered sectors, so that a turned robot sees it shifted: its width in rad
-    (counter-clockwise positive), `none`, or `auto`: found out from the recording itself."""
+    (counter-clockwise positive), `none`, or `auto` (also 0): found out from the recording itself."""
     shifts: NonNegativeInt = 3
     """Sectors by which a fan may be shifted either way."""
     frame_distance: PositiveFloat = 0.3
@@ -59,9 +59,9 @@ class RecallConfig(Settings):
     guard: PositiveInt = 20
     """The newest frames, this many, are not recalled: the robot has hardly left them."""
     sharpness: PositiveFloat = 0.2
-    """Error that costs a factor e, in scales (the 1 % quantile of errors between different places)."""
+    """Error that costs a factor e, in scales (see `Guidance`)."""
     floor: PositiveFloat = 1.27
-    """Error at which a view is as likely new as known, in scales."""
+    """Error that stands for a view never seen before, in scales."""
     common: NonNegativeFloat = 1.0
     """Weight of the mean likelihood over all frames in novelty's: at 1 a view that all places share tells
     nothing at all."""
@@ -99,7 +99,8 @@ class Guidance(NamedTuple):
 
     Attributes:
         poses: [N, 3] of all frames in the map. bias: of the heading, rad/m. since: m travelled since the last
-            closure. angle: of a sector, rad, 0 while unknown. scale: of view errors, 0 while unknown.
+            closure. angle: of a sector, rad, 0 while unknown. scale: of view errors, such as are still seen
+            between different places; 0 while unknown.
     """
 
     poses: np.ndarray

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam import posecells, recall
+from ratslam import posecells, recall, templates
 from ratslam.backend import Backend
 from ratslam.framemap import FrameMap
 from ratslam.posecells import Outcome, PoseCells
@@ -69,7 +69,7 @@ class RecallRat:
         labels = config.templates.source == "labels"
         self.config = config
         self.recall = config.recall.model_copy(update={"fan": "none"}) if labels else config.recall
-        self.labels = labels
+        self.labels, self.view_shape = labels, view_shape
         self.size = 0 if labels else int(np.prod(view_shape))
         self.dtype = np.dtype(dtype)
         self.cell = config.pose_cells.cell_size
@@ -147,7 +147,19 @@ class RecallRat:
     def new_map(self) -> FrameMap:
         """An empty frame map."""
         fan, closures = recall.fan_width(self.recall), self.config.experience.closures
-        return FrameMap(self.config.frames, self.cell, self.size, fan, closures)
+        return FrameMap(
+            self.config.frames,
+            self.cell,
+            self.size,
+            fan,
+            guard=self.recall.guard,
+            closures=closures,
+            normalise=self._normalised,
+        )
+
+    def _normalised(self, view: np.ndarray) -> np.ndarray:
+        shaped = jnp.asarray(view.reshape(self.view_shape), self.dtype)
+        return np.asarray(templates.normalise(self.config.templates, shaped))
 
     def _look(self, memory: Memory, view: Array, label: Array) -> tuple[Memory, Recollection]:
         if self.labels:

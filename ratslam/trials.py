@@ -1,15 +1,17 @@
 """Many runs of one recording side by side: parts turned off, numbers varied, inputs perturbed.
 
-A trial keeps no run directory; it answers with a handful of figures. Trials run in processes of their own, so
-that one cannot disturb another, and their results come in order, whichever is done first.
+A trial keeps no run directory; it answers with a handful of figures. Trials share a few worker processes, and
+their results come in order, whichever is done first.
 """
 
 from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -22,7 +24,7 @@ from ratslam.config import RunConfig
 from ratslam.recallrat import rat
 from ratslam.run import Anytimes, readings
 from ratslam.session import CHUNK, Session
-from ratslam.yamlfile import load, override, validate
+from ratslam.yamlfile import Document, load, override, validate
 from robot.formats import open_recording
 from robot.log import Log
 from robot.perturb import perturbed
@@ -35,7 +37,7 @@ SAME_PLACE = 2.5
 PARTS = {
     "nothing (all parts on)": (),
     "recall: the classic matcher instead": ("matcher=classic",),
-    "sector shifts": ("recall.fan=none",),
+    "sector shifts": ("recall.shifts=0",),
     "negative evidence of common views": ("recall.common=0.0",),
     "the map's pose as a hypothesis": ("recall.local=0.0",),
     "verification against the map": ("frames.verify=false",),
@@ -58,7 +60,7 @@ class Trial(NamedTuple):
         final, told: ATE of the final map and of the poses told at the time, m. odometry: the same of raw
             odometry. anytime, late: median, and root mean square of the second half, of the present pose's
             error in the map so far, m. closures, false: how many, and how many farther apart than
-            `SAME_PLACE`. experiences: in the map. lost: share of steps.
+            `SAME_PLACE`. lost: share of steps.
     """
 
     final: float
@@ -67,8 +69,7 @@ class Trial(NamedTuple):
     anytime: float
     late: float
     closures: int
-    false: int
-    experiences: int
+    false: float
     lost: float
 
 
@@ -132,8 +133,7 @@ def _figures(
         anytime=anytime.median,
         late=anytime.late,
         closures=len(closures),
-        false=int((apart > SAME_PLACE * config.pose_cells.cell_size).sum()),
-        experiences=session.map.graph().number_of_nodes(),
+        false=float((apart > SAME_PLACE * config.pose_cells.cell_size).sum()) if known.any() else np.nan,
         lost=float(np.mean(lost)),
     )
 
@@ -151,13 +151,22 @@ def compare(
         validate(override(load(path), [*assignments, *sets]), RunConfig)
     count = min(workers or os.cpu_count() or 1, len(variants))
     # Forked children of a process that runs JAX may hang; spawned ones start clean.
-    pool = ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn"))
+    context = multiprocessing.get_context("spawn")
+    # An interrupt is for this process, which then ends the others.
+    pool = ProcessPoolExecutor(count, context, signal.signal, (signal.SIGINT, signal.SIG_IGN))
     try:
         tasks = [pool.submit(_try, path, [*assignments, *sets], seed) for sets, seed in variants]
         for task in tasks:
             yield task.result()
+    except BrokenProcessPool:
+        raise InputError(
+            "--workers", "a process ended before its trial was done", "memory for all", "ask for fewer"
+        ) from None
     finally:
+        workers_left = list((pool._processes or {}).values())
         pool.shutdown(wait=False, cancel_futures=True)
+        for worker in workers_left:
+            worker.terminate()
 
 
 def _try(path: Path, assignments: list[str], seed: int) -> Trial:
@@ -182,11 +191,25 @@ def numbers(config: RunConfig) -> list[tuple[str, float | int]]:
 
 
 def varied(value: float | int, factor: float) -> float | int:
-    """The value times the factor; whole numbers move by one at least. Shares stay at 1 or below."""
+    """The value times the factor; whole numbers move by one at least."""
     if isinstance(value, int):
         moved = round(value * factor)
-        return moved if moved != value else max(value + (1 if factor > 1 else -1), 1)
+        return moved if moved != value else value + (1 if factor > 1 else -1)
     return value * factor
+
+
+def variations(document: Document, by: float) -> list[tuple[str, float | int]]:
+    """Every number moved down and up by a share, as (key path, value); values that cannot be are left out."""
+    found = []
+    for name, value in numbers(validate(document, RunConfig)):
+        for moved in (varied(value, 1 - by), varied(value, 1 + by)):
+            try:
+                validate(override(document, [f"{name}={moved!r}"]), RunConfig)
+            except InputError:
+                continue
+            if moved != value:
+                found.append((name, moved))
+    return found
 
 
 HEADER = f"{'':<42}{'final':>8}{'told':>8}{'anytime':>9}{'late':>8}{'closures':>10}{'false':>7}{'lost':>7}"
@@ -198,7 +221,8 @@ def row(name: str, trials: Sequence[Trial]) -> str:
     middle = [float(np.median(column)) for column in zip(*trials, strict=True)]
     t = Trial(*middle)  # type: ignore[arg-type]
     most = f"  final at most {max(each.final for each in trials):.3g}" if len(trials) > 1 else ""
+    false = "-" if np.isnan(t.false) else f"{t.false:.0f}"
     return (
         f"{name:<42}{t.final:>8.3g}{t.told:>8.3g}{t.anytime:>9.3g}{t.late:>8.3g}"
-        f"{t.closures:>10.0f}{t.false:>7.0f}{t.lost:>7.2f}{most}"
+        f"{t.closures:>10.0f}{false:>7}{t.lost:>7.2f}{most}"
     )

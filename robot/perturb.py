@@ -35,7 +35,7 @@ def perturbed(log: Log, seed: int) -> Log:
     stream = np.random.default_rng(seed)
     looks = np.flatnonzero(log.seen | (log.label >= 0))
     low, high = START
-    first = looks[min(int(stream.integers(low, high + 1)), len(looks) - 1)]
+    first = looks[min(int(stream.integers(low, high + 1)), len(looks) - 1)] if len(looks) else 0
     between = max(float(np.diff(looks).mean()), 1.0) if len(looks) > 1 else 1.0
 
     motion = log.motion.copy()
@@ -52,12 +52,13 @@ def perturbed(log: Log, seed: int) -> Log:
     keep[:first] = False
     keep[first] = True
     rows = np.flatnonzero(keep)
+    motion = _merged(motion, rows, first)
     return replace(
         log,
         digest=f"{log.digest}+{seed}",
         time=log.time[rows],
-        motion=_merged(motion, rows, first),
-        moved=log.moved[rows],
+        motion=motion,
+        moved=log.moved[rows] | motion[:, :3].any(axis=1),
         views=views[rows],
         seen=log.seen[rows],
         label=label[rows],

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 
 class InputError(ValueError):
     """Input that cannot be used. The program prints it without a traceback and exits with code 2.
@@ -25,6 +27,10 @@ class InputError(ValueError):
             parts.append(cure)
         super().__init__("; ".join(parts))
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Rebuilt from its parts: it has to come whole out of a worker process."""
+        return type(self), (self.where, self.found, self.expected, self.cure)
+
 
 class InputErrors(InputError):
     """Several errors found in one pass over the same input, reported together."""
@@ -32,3 +38,6 @@ class InputErrors(InputError):
     def __init__(self, errors: list[InputError]) -> None:
         self.errors = errors
         ValueError.__init__(self, "\n".join(str(error) for error in errors))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.errors,)

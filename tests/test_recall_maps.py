@@ -43,7 +43,7 @@ def odometry_error(log: Log) -> float:
 
 def cuts(session: Session) -> list[int]:
     """Frames before which the odometry was cut; in these scenes every row is a frame."""
-    return np.flatnonzero(session.map.arrays()["cut"]).tolist()
+    return np.flatnonzero(session.map.arrays()["cut"] >= 0).tolist()
 
 
 def golden(name: str) -> Log:

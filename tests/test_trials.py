@@ -9,7 +9,7 @@ import pytest
 
 from ratslam.cli import main
 from ratslam.config import RunConfig
-from ratslam.trials import PARTS, Trial, numbers, row, trial, varied
+from ratslam.trials import PARTS, Trial, row, trial, variations
 from ratslam.yamlfile import load, override, validate
 from robot import perturb
 from robot.perturb import perturbed
@@ -66,15 +66,20 @@ def test_every_part_can_be_turned_off():
         validate(override(load(SQUARE), sets), RunConfig)
 
 
-@pytest.mark.parametrize("factor", [0.8, 1.2])
-def test_every_number_can_be_varied(factor):
-    config = validate(load(SQUARE), RunConfig)
-    found = numbers(config)
-    assert {"recall.reach", "frames.score", "frames.noise.per_cell"} <= {name for name, _ in found}
-    for name, value in found:
-        moved = varied(value, factor)
-        assert moved != value or value == 0
-        validate(override(load(SQUARE), [f"{name}={moved!r}"]), RunConfig)
+def test_every_number_is_varied_down_and_up_as_far_as_it_goes():
+    document = override(load(SQUARE), ["recall.local=0.9"])
+    found = variations(document, 0.2)
+    names = [name for name, _ in found]
+    assert names.count("recall.reach") == names.count("frames.score") == 2
+    assert names.count("frames.noise.per_cell") == 2
+    assert names.count("recall.local") == 1  # a share: it cannot exceed 1
+    assert ("recall.modes", 6) in found
+    assert ("recall.modes", 10) in found
+
+
+def test_faults_come_out_of_a_worker_as_they_are(capsys):
+    assert main(["spread", str(SQUARE), "--set", "recording.file=nothing.npz", "-n", "1"]) == 2
+    assert "nothing.npz" in capsys.readouterr().err
 
 
 def test_a_trial_counts_closures_true_and_false():
@@ -87,7 +92,7 @@ def test_a_trial_counts_closures_true_and_false():
 
 
 def test_a_row_shows_the_middle_and_the_worst():
-    one = Trial(1.0, 2.0, 3.0, 0.5, 0.6, 10, 1, 5, 0.0)
+    one = Trial(1.0, 2.0, 3.0, 0.5, 0.6, 10, 1, 0.0)
     text = row("name", [one, one._replace(final=3.0), one._replace(final=1.5)])
     assert text.startswith("name")
     assert "1.5" in text
