@@ -57,13 +57,7 @@ def run(
     relations = read_relations(config.score.relations) if config.score.relations else None
     with open_recording(config.recording, _tell) as source:
         config = config.completed(source)
-        dtype = np.dtype(config.session.precision)
-        session = Session(
-            rat(config.rat(), source.view_shape, dtype),
-            seed=config.session.seed,
-            reserve=config.session.reserve,
-            precision=config.session.precision,
-        )
+        session = session_of(config, source)
         skip = _resume(session, resume, source.digest) if resume else 0
         _check_length(source, skip, resume)
         with RunDirectory(directory, _told(evidence_of(config.matcher))) as store:
@@ -81,6 +75,16 @@ def run(
             store.file("map.png", lambda path: save_map(path, read_run(directory), card))
             store.manifest(manifest | done)
     return card, interrupted
+
+
+def session_of(config: RunConfig, source: Source) -> Session:
+    """A fresh session for what a source gives."""
+    return Session(
+        rat(config.rat(), source.view_shape, np.dtype(config.session.precision)),
+        seed=config.session.seed,
+        reserve=config.session.reserve,
+        precision=config.session.precision,
+    )
 
 
 def _located(config: RunConfig, folder: Path) -> RunConfig:

@@ -21,8 +21,7 @@ from pydantic import BaseModel
 
 from evaluation.trajectory import ate
 from ratslam.config import RunConfig
-from ratslam.recallrat import rat
-from ratslam.run import Anytimes, readings
+from ratslam.run import Anytimes, readings, session_of
 from ratslam.session import CHUNK, Session
 from ratslam.yamlfile import Document, load, override, validate
 from robot.formats import open_recording
@@ -85,13 +84,7 @@ def trial(config: RunConfig, folder: Path, seed: int = 0) -> Trial:
             if not isinstance(source, Log):
                 raise InputError("recording.file", "a recording that is streamed", "a CSV or .npz recording")
             source = perturbed(source, seed)
-        dtype = np.dtype(config.session.precision)
-        session = Session(
-            rat(config.rat(), source.view_shape, dtype),
-            seed=config.session.seed,
-            reserve=config.session.reserve,
-            precision=config.session.precision,
-        )
+        session = session_of(config, source)
         truth: list[np.ndarray] = []
         motion: list[list[float]] = []
         told: list[np.ndarray] = []
@@ -212,17 +205,23 @@ def variations(document: Document, by: float) -> list[tuple[str, float | int]]:
     return found
 
 
-HEADER = f"{'':<42}{'final':>8}{'told':>8}{'anytime':>9}{'late':>8}{'closures':>10}{'false':>7}{'lost':>7}"
-"""Of the table that `row` fills: m, m, m, m, counts, share of steps."""
+COLUMNS = {
+    "final": 9,
+    "odometry": 10,
+    "told": 9,
+    "anytime": 9,
+    "late": 9,
+    "closures": 10,
+    "false": 7,
+    "lost": 8,
+}
+HEADER = " " * 42 + "".join(f"{name:>{width}}" for name, width in COLUMNS.items())
+"""Of the table that `row` fills: m, m, m, m, m, counts, share of steps."""
 
 
 def row(name: str, trials: Sequence[Trial]) -> str:
     """One line of the table: medians over the trials, and the largest final error if there are several."""
-    middle = [float(np.median(column)) for column in zip(*trials, strict=True)]
-    t = Trial(*middle)  # type: ignore[arg-type]
+    middle = Trial(*(float(np.median(column)) for column in zip(*trials, strict=True)))  # type: ignore[arg-type]
+    cells = "".join(f"{getattr(middle, column):>{width}.4g}" for column, width in COLUMNS.items())
     most = f"  final at most {max(each.final for each in trials):.3g}" if len(trials) > 1 else ""
-    false = "-" if np.isnan(t.false) else f"{t.false:.0f}"
-    return (
-        f"{name:<42}{t.final:>8.3g}{t.told:>8.3g}{t.anytime:>9.3g}{t.late:>8.3g}"
-        f"{t.closures:>10.0f}{false:>7}{t.lost:>7.2f}{most}"
-    )
+    return f"{name:<42}{cells}{most}"
