@@ -222,6 +222,10 @@ HEADER = " " * 42 + "".join(f"{name:>{width}}" for name, width in COLUMNS.items(
 def row(name: str, trials: Sequence[Trial]) -> str:
     """One line of the table: medians over the trials, and the largest final error if there are several."""
     middle = Trial(*(float(np.median(column)) for column in zip(*trials, strict=True)))  # type: ignore[arg-type]
-    cells = "".join(f"{getattr(middle, column):>{width}.4g}" for column, width in COLUMNS.items())
+    cells = "".join(f"{_short(getattr(middle, column)):>{width}}" for column, width in COLUMNS.items())
     most = f"  final at most {max(each.final for each in trials):.3g}" if len(trials) > 1 else ""
     return f"{name:<42}{cells}{most}"
+
+
+def _short(value: float) -> str:
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
