@@ -170,9 +170,10 @@ def test_a_run_can_be_undone():
     session = mapped(log)
     frames = session.map
     accepted = np.unique(frames.candidates()[frames.candidates()[:, 7] == Verdict.ACCEPTED, 5]).astype(int)
-    before = frames.closures()
+    before, path = frames.closures(), frames.trajectory()
     frames.undo(int(accepted[0]))
     assert len(frames.closures()) < len(before)
+    assert not np.array_equal(frames.trajectory(), path)
     with pytest.raises(ValueError, match="not an accepted run"):
         frames.undo(int(accepted[0]))
     for run in accepted[1:]:
