@@ -51,6 +51,28 @@ class Cycle(NamedTuple):
     odometry: Odometry
 
 
+class Whisk(NamedTuple):
+    """One whisk cycle as each whisker felt it: what is kept of a `Cycle`, or simulated without one.
+
+    Angles are protractions from rest. Values of whiskers that did not feel it are 0.
+
+    Attributes:
+        odometry: motion since the previous cycle.
+        alive: [W] bool, the whisker reports at all. contact: [W] bool, it touched something on its way.
+        touched: [W] angle at first contact, rad. held: [W] bool, it still touched at the end of the
+            protraction. highest: [W] largest angle, rad. reach: [W] how far along the shaft it was touched,
+            as a share of its length.
+    """
+
+    odometry: Odometry
+    alive: np.ndarray
+    contact: np.ndarray
+    touched: np.ndarray
+    held: np.ndarray
+    highest: np.ndarray
+    reach: np.ndarray
+
+
 class Observation(NamedTuple):
     """What an engine is given at one step. Absent things are masked, never NaN.
 
@@ -60,7 +82,8 @@ class Observation(NamedTuple):
         view: [R, C, K] view, values in 0..1 (3 x 6 whiskers x channels, 20 x 60 x 1 for a camera).
         view_seen: whether `view` holds a view, bool.
         label: place-recognition id given by the recording, int32; -1 when there is none.
-        contact: [W] bool, whiskers that touched something.
+        contact: [W] bool, whiskers that touched something. alive: [W] bool, whiskers that report at all; a
+            pixel of the view that belongs to another one says nothing.
         point: [W, 2] m in base_link, where they touched.
         wall: bool, whether a wall orientation was measured; wall_point: [2] its nearest point, m in
             base_link; wall_sd: standard deviation of its direction, rad.
@@ -72,6 +95,7 @@ class Observation(NamedTuple):
     view_seen: Array
     label: Array
     contact: Array
+    alive: Array
     point: Array
     wall: Array
     wall_point: Array
@@ -101,6 +125,7 @@ def observation(
         view_seen=np.bool_(seen),
         label=np.int32(label),
         contact=np.zeros(whiskers, bool),
+        alive=np.ones(whiskers, bool),
         point=np.zeros((whiskers, 2)),
         wall=np.bool_(False),
         wall_point=np.zeros(2),

@@ -1,0 +1,259 @@
+"""Micromouse mazes: cells of 18 cm, walls of plastic between posts; from a seed or from a text file.
+
+Cell (column, row) counts from the south-west. A maze is what is between its cells, so it stays small however
+it is used; `walls` makes boxes of it. Text files are the usual ones: posts `o` or `+`, walls `---` and `|`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from robot.walls import Walls
+from tactile.errors import InputError
+
+CELL = 0.18
+"""Side of a cell, m (IEEE micromouse rules)."""
+THICK = 0.012
+"""Thickness of walls and posts, m (as above)."""
+TALL = 0.05
+"""Their height, m (as above)."""
+
+Cell = tuple[int, int]
+
+
+class Maze(NamedTuple):
+    """Attributes:
+    across: [rows + 1, columns] bool, the wall south of each cell (and north of the last row's).
+    along: [rows, columns + 1] bool, the wall west of each cell (and east of the last column's).
+    """
+
+    across: np.ndarray
+    along: np.ndarray
+
+    @property
+    def columns(self) -> int:
+        return self.across.shape[1]
+
+    @property
+    def rows(self) -> int:
+        return self.along.shape[0]
+
+
+def closed(columns: int, rows: int) -> Maze:
+    """A maze in which every cell is walled in."""
+    return Maze(np.ones((rows + 1, columns), bool), np.ones((rows, columns + 1), bool))
+
+
+def scattered(columns: int, rows: int, loop: list[Cell], share: float, random: np.random.Generator) -> Maze:
+    """A maze with its outer walls, the given loop open, and that share of all other walls."""
+    maze = Maze(random.random((rows + 1, columns)) < share, random.random((rows, columns + 1)) < share)
+    maze.across[[0, -1]] = True
+    maze.along[:, [0, -1]] = True
+    for a, b in zip(loop, loop[1:] + loop[:1], strict=True):
+        _remove(maze, a, b)
+    return maze
+
+
+def random_loop(columns: int, rows: int, length: int, random: np.random.Generator) -> list[Cell]:
+    """A closed path of that many different cells, counter-clockwise.
+
+    The outline of a blob on the lattice of the cells' centres, grown square by square where that keeps it a
+    single outline, until it has that length.
+
+    Raises:
+        InputError: no such loop fits.
+    """
+    most = columns * rows - (columns * rows) % 2
+    if length % 2 or not 4 <= length <= most or min(columns, rows) < 2:
+        raise InputError(
+            "simulation.maze.loop", f"{length} cells", f"an even number from 4 to {most} in {columns} x {rows}"
+        )
+    for _ in range(1000):
+        blob = np.zeros((columns + 1, rows + 1), bool)  # squares between centres, with a margin
+        blob[1 + int(random.integers(columns - 1)), 1 + int(random.integers(rows - 1))] = True
+        for _ in range(8 * columns * rows):
+            if _outline(blob) == length:
+                return _walked(blob, random)
+            i, j = 1 + int(random.integers(columns - 1)), 1 + int(random.integers(rows - 1))
+            if not blob[i, j] and _simple(blob, i, j):
+                blob[i, j] = True
+                if _outline(blob) > length:
+                    blob[i, j] = False
+    raise InputError("simulation.maze.loop", f"no loop of {length} cells found in {columns} x {rows}")
+
+
+def _outline(blob: np.ndarray) -> int:
+    padded = np.pad(blob, 1)
+    return int((padded[1:] != padded[:-1]).sum() + (padded[:, 1:] != padded[:, :-1]).sum())
+
+
+def _simple(blob: np.ndarray, i: int, j: int) -> bool:
+    """Whether a square joined to the blob leaves one outline: its neighbours in it hang together."""
+    padded = np.pad(blob, 1)
+    ring = [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)]
+    around = [bool(padded[i + 1 + di, j + 1 + dj]) for di, dj in ring]
+    sides = around[::2]
+    changes = sum(a != b for a, b in zip(around, around[1:] + around[:1], strict=True))
+    return any(sides) and changes == 2 and not any(
+        around[k] and not (around[k - 1] or around[(k + 1) % 8]) for k in (1, 3, 5, 7)
+    )
+
+
+def _walked(blob: np.ndarray, random: np.random.Generator) -> list[Cell]:
+    """The outline as cells in order, counter-clockwise, from a random one of them."""
+    # Square (i, j) lies between the centres of cells i - 1 and i, j - 1 and j. Blob to the left of the way.
+    ways: dict[Cell, Cell] = {}
+    for i, j in np.argwhere(blob).tolist():
+        padded = np.pad(blob, 1)
+        if not padded[i + 1, j]:
+            ways[i - 1, j - 1] = (i, j - 1)
+        if not padded[i + 2, j + 1]:
+            ways[i, j - 1] = (i, j)
+        if not padded[i + 1, j + 2]:
+            ways[i, j] = (i - 1, j)
+        if not padded[i, j + 1]:
+            ways[i - 1, j] = (i - 1, j - 1)
+    start = sorted(ways)[int(random.integers(len(ways)))]
+    loop = [start]
+    while (following := ways[loop[-1]]) != start:
+        loop.append(following)
+    return loop
+
+
+def _remove(maze: Maze, a: Cell, b: Cell) -> None:
+    wall, place = between_cells(maze, a, b)
+    wall[place] = False
+
+
+def between_cells(maze: Maze, a: Cell, b: Cell) -> tuple[np.ndarray, tuple[int, int]]:
+    """The array and the place in it of the wall between neighbouring cells.
+
+    Raises:
+        ValueError: they are no neighbours.
+    """
+    (x, y), (u, v) = a, b
+    if abs(x - u) + abs(y - v) != 1:
+        raise ValueError(f"cells {a} and {b} are no neighbours")
+    return (maze.along, (y, max(x, u))) if y == v else (maze.across, (max(y, v), x))
+
+
+def is_open(maze: Maze, a: Cell, b: Cell) -> bool:
+    """Whether one can go from a cell to its neighbour."""
+    wall, place = between_cells(maze, a, b)
+    return not wall[place]
+
+
+def neighbours(maze: Maze, cell: Cell) -> list[Cell]:
+    """The cells that one can go to from a cell: east, north, west, south."""
+    x, y = cell
+    beside = [(x + 1, y), (x, y + 1), (x - 1, y), (x, y - 1)]
+    return [b for b in beside if _inside(maze, b) and is_open(maze, cell, b)]
+
+
+def _inside(maze: Maze, cell: Cell) -> bool:
+    return 0 <= cell[0] < maze.columns and 0 <= cell[1] < maze.rows
+
+
+def centre(cell: Cell) -> np.ndarray:
+    """[2] m, the middle of a cell; the south-west corner post of the maze stands at the origin."""
+    return (np.array(cell, float) + 0.5) * CELL
+
+
+def walls(maze: Maze, random: np.random.Generator, heights: tuple[float, ...] = (TALL,)) -> Walls:
+    """The maze as boxes: a post at every corner, walls between them, each of one of the heights (m)."""
+    half = THICK / 2
+    boxes = []
+    for j, i in np.argwhere(maze.across).tolist():
+        boxes.append((i * CELL + half, j * CELL - half, (i + 1) * CELL - half, j * CELL + half))
+    for j, i in np.argwhere(maze.along).tolist():
+        boxes.append((i * CELL - half, j * CELL + half, i * CELL + half, (j + 1) * CELL - half))
+    count = len(boxes)
+    for j in range(maze.rows + 1):
+        for i in range(maze.columns + 1):
+            boxes.append((i * CELL - half, j * CELL - half, i * CELL + half, j * CELL + half))
+    height = np.concatenate(
+        [random.choice(heights, count) if len(heights) > 1 else np.full(count, heights[0]),
+         np.full(len(boxes) - count, max(heights))]
+    )  # fmt: skip
+    return Walls(np.array(boxes), height)
+
+
+def read_maze(path: Path) -> Maze:
+    """A maze from a text file.
+
+    Raises:
+        InputError: no such file, a character where there should be none, or an outer wall that is missing.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(str(path), f"cannot be read ({error})", "a micromouse maze as text") from None
+    lines = [line.rstrip() for line in lines if line.strip()]
+    rows, width = len(lines) // 2, max((len(line) for line in lines), default=0)
+    columns = (width - 1) // 4
+    if len(lines) % 2 == 0 or rows < 1 or columns < 1 or width != 4 * columns + 1:
+        raise InputError(
+            str(path),
+            f"{len(lines)} lines of up to {width} characters",
+            "2 rows + 1 lines of 4 columns + 1 characters: posts `o`, walls `---` and `|`",
+        )
+    maze = Maze(np.zeros((rows + 1, columns), bool), np.zeros((rows, columns + 1), bool))
+    for number, line in enumerate(lines):
+        line = line.ljust(width)
+        row = rows - (number + 1) // 2
+        for column in range(columns + 1):
+            post = 4 * column
+            if number % 2 == 0:
+                _expect(path, number, post, line[post], "o+.")
+                if column < columns:
+                    kinds = set(line[post + 1 : post + 4])
+                    if kinds not in ({"-"}, {" "}):
+                        raise _odd(path, number, post + 1, line[post + 1 : post + 4], "`---` or three spaces")
+                    maze.across[row, column] = kinds == {"-"}
+            else:
+                _expect(path, number, post, line[post], "| ")
+                maze.along[row, column] = line[post] == "|"
+    _sealed(path, maze, lines)
+    return maze
+
+
+def _expect(path: Path, line: int, column: int, found: str, among: str) -> None:
+    if found not in among:
+        raise _odd(path, line, column, found, " or ".join(f"`{character}`" for character in among))
+
+
+def _odd(path: Path, line: int, column: int, found: str, expected: str) -> InputError:
+    return InputError(f"{path}:{line + 1}:{column + 1}", f"{found!r}", expected)
+
+
+def _sealed(path: Path, maze: Maze, lines: list[str]) -> None:
+    """Refuses a maze that leaks."""
+    for side, present, place in (
+        ("south", maze.across[0], lambda k: (len(lines), 4 * k + 2)),
+        ("north", maze.across[-1], lambda k: (1, 4 * k + 2)),
+        ("west", maze.along[:, 0], lambda k: (len(lines) - 1 - 2 * k, 1)),
+        ("east", maze.along[:, -1], lambda k: (len(lines) - 1 - 2 * k, 4 * maze.columns + 1)),
+    ):
+        if not present.all():
+            gap = int(np.argmin(present))
+            line, column = place(gap)
+            raise InputError(
+                f"{path}:{line}:{column}",
+                f"a gap in the {side} wall: the maze leaks",
+                "a wall all around",
+                "close it",
+            )
+
+
+def text(maze: Maze) -> str:
+    """The maze as such a file; the inverse of `read_maze`."""
+    lines = []
+    for row in range(maze.rows, -1, -1):
+        lines.append("o" + "".join(("---" if wall else "   ") + "o" for wall in maze.across[row]))
+        if row:
+            marks = ["|" if wall else " " for wall in maze.along[row - 1]]
+            lines.append("   ".join(marks))
+    return "\n".join(lines) + "\n"

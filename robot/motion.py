@@ -1,0 +1,103 @@
+"""How the head moves along a way: the pose at any time, varied from visit to visit as a real robot's is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from pydantic import NonNegativeFloat, PositiveFloat
+
+from robot.maze import Cell, centre
+from tactile.frames import wrap
+from tactile.settings import Settings
+
+
+class JitterConfig(Settings):
+    """How one visit differs from the next, standard deviations. Drawn anew in every cell."""
+
+    position: NonNegativeFloat = 0.002
+    """Off the middle of the way, m, each axis."""
+    yaw_deg: NonNegativeFloat = 0.5
+    """Off the direction of travel, degrees."""
+    speed: NonNegativeFloat = 0.0
+    """Share of the speed."""
+
+
+class MotionConfig(Settings):
+    """The arm's motion."""
+
+    speed: PositiveFloat = 0.03
+    """m/s"""
+    turn_rate: PositiveFloat = 0.4
+    """On the spot, rad/s."""
+    backwards: bool = False
+    """Whether the head looks away from where it goes (reverse tracking)."""
+    jitter: JitterConfig = JitterConfig()
+    """From visit to visit."""
+
+
+class Path(NamedTuple):
+    """Poses in order of time; between two of them the motion is even.
+
+    Attributes:
+        time: [K] s. pose: [K, 3] m, m, rad; headings are not wrapped.
+    """
+
+    time: np.ndarray
+    pose: np.ndarray
+
+    @property
+    def duration(self) -> float:
+        return float(self.time[-1])
+
+
+def planned(config: MotionConfig, way: Sequence[Cell], random: np.random.Generator) -> Path:
+    """The path along cells: straight on from middle to middle, turning on the spot."""
+    jitter = config.jitter
+    count = len(way)
+    offset = jitter.position * random.standard_normal((count, 2))
+    yaw = np.radians(jitter.yaw_deg) * random.standard_normal(count)
+    pace = config.speed * np.clip(1 + jitter.speed * random.standard_normal(count), 0.2, 5.0)
+    middle = np.array([centre(cell) for cell in way])
+    step = np.diff(middle, axis=0)
+    course = np.arctan2(step[:, 1], step[:, 0]) + (np.pi if config.backwards else 0.0)
+    heading = np.concatenate([course[:1], course[:1] + np.cumsum(wrap(np.diff(course)))])
+
+    place = middle + offset
+    time, pose = [0.0], [[*place[0], heading[0] + yaw[0]]]
+    for k in range(count - 1):
+        turn = heading[k] - (heading[k - 1] if k else heading[0])
+        if turn:
+            time.append(time[-1] + abs(turn) / config.turn_rate)
+            pose.append([*place[k], heading[k] + yaw[k]])
+        time.append(time[-1] + float(np.hypot(*step[k])) / pace[k])
+        pose.append([*place[k + 1], heading[k] + yaw[k + 1]])
+    return Path(np.array(time), np.array(pose))
+
+
+def at(path: Path, time: np.ndarray) -> np.ndarray:
+    """[..., 3] the poses at times [...] s; before and after the path, its ends."""
+    return np.stack([np.interp(time, path.time, path.pose[:, k]) for k in range(3)], axis=-1)
+
+
+def carried(path: Path, at_times: Sequence[float], ahead: float) -> tuple[Path, np.ndarray]:
+    """The path with kidnaps: at each of these times the head is set down where it would be `ahead` s later.
+
+    Returns:
+        the path, and the times [J] s at which it was carried.
+    """
+    times, poses, start, done = [], [], 0.0, 0.0
+    jumps = []
+    for when in [*sorted(at_times), np.inf]:
+        stop = min(when + start - done, path.duration) if np.isfinite(when) else path.duration
+        inner = (path.time > start) & (path.time < stop)
+        part = np.concatenate([[start], path.time[inner], [stop]])
+        times.append(part - start + done)
+        poses.append(at(path, part))
+        done += stop - start
+        start = stop + ahead
+        if start >= path.duration or not np.isfinite(when):
+            break
+        jumps.append(done)
+    return Path(np.concatenate(times), np.concatenate(poses)), np.array(jumps)

@@ -1,0 +1,133 @@
+"""Walls as boxes, and where a whisker of the UR-10 head meets them: contact in closed form.
+
+Each whisker swings in a vertical plane through the head's axis, from outside down and inwards. What it can
+meet are the tops of boxes (with its tip) and their far upper edges (with its shaft): of a straight stick
+that comes down over a box, the lowest point above the box is the outermost one.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from tactile.head import Head
+
+BUCKET = 0.18
+"""Side of the squares that remember which boxes are near, m."""
+FREE = np.inf
+"""The protraction of a whisker that meets nothing."""
+
+
+class Walls(NamedTuple):
+    """Boxes standing on the floor along the axes.
+
+    Attributes:
+        box: [B, 4] west, south, east, north, m. height: [B] m.
+    """
+
+    box: np.ndarray
+    height: np.ndarray
+
+
+class Contact(NamedTuple):
+    """Where whiskers would first touch.
+
+    Attributes:
+        angle: [P, W] protraction, rad; infinite where nothing is met.
+        reach: [P, W] how far along the shaft, as a share of its length; 1 at the tip.
+        wall: [P, W] the box, -1 for none.
+    """
+
+    angle: np.ndarray
+    reach: np.ndarray
+    wall: np.ndarray
+
+
+class Surroundings:
+    """Walls made ready for many questions.
+
+    Args:
+        head: with all whisker planes through the vertical axis of base_link.
+    """
+
+    def __init__(self, walls: Walls, head: Head) -> None:
+        self.walls, self.head = walls, head
+        base = np.hypot(head.base[:, 0], head.base[:, 1])
+        outwards = head.rest[:, :2] / np.linalg.norm(head.rest[:, :2], axis=1, keepdims=True)
+        self._radius, self._azimuth = base, np.arctan2(outwards[:, 1], outwards[:, 0])
+        self._opening = np.arctan2(np.hypot(head.rest[:, 0], head.rest[:, 1]), -head.rest[:, 2])
+        self.range = float((base + head.length).max())
+        self._rays, self._ray = np.unique(np.round(self._azimuth, 12), return_inverse=True)
+        self._near: dict[tuple[int, int], np.ndarray] = {}
+
+    def contact(self, pose: np.ndarray) -> Contact:
+        """What each whisker would meet first if the head stood still at poses [P, 3] (m, m, rad)."""
+        pose = np.asarray(pose, float)
+        count, whiskers = len(pose), len(self._radius)
+        angle = np.full((count, whiskers), FREE)
+        reach, wall = np.zeros((count, whiskers)), np.full((count, whiskers), -1)
+        places, place = np.unique(np.floor(pose[:, :2] / BUCKET).astype(int), axis=0, return_inverse=True)
+        for k, (i, j) in enumerate(places.tolist()):
+            near, rows = self._boxes(i, j), np.flatnonzero(place.reshape(-1) == k)
+            if len(near):
+                angle[rows], reach[rows], wall[rows] = self._met(pose[rows], near)
+        return Contact(angle, reach, wall)
+
+    def _boxes(self, i: int, j: int) -> np.ndarray:
+        """The boxes within range of somewhere in a bucket."""
+        if (i, j) not in self._near:
+            low, high = np.array([i, j]) * BUCKET - self.range, np.array([i + 1, j + 1]) * BUCKET + self.range
+            box = self.walls.box
+            inside = (box[:, 0] <= high[0]) & (box[:, 2] >= low[0])
+            inside &= (box[:, 1] <= high[1]) & (box[:, 3] >= low[1])
+            self._near[i, j] = np.flatnonzero(inside)
+        return self._near[i, j]
+
+    def _met(self, pose: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        enter, leave = self._crossed(pose, self.walls.box[near])  # [P, A, B]
+        met, reach = np.full((len(pose), len(self._radius)), FREE), np.zeros((len(pose), len(self._radius)))
+        wall = np.full(met.shape, -1)
+        row, ray, box = np.nonzero((leave > enter) & (leave > 0) & (enter < self.range))
+        d1, d2, top = enter[row, ray, box], leave[row, ray, box], self.walls.height[near[box]]
+        for w in range(len(self._radius)):
+            mine = np.flatnonzero(ray == self._ray[w])
+            angle, share = self._down(w, d1[mine], d2[mine], top[mine])
+            # Of several boxes the one met first counts: the smallest protraction.
+            order = np.argsort(-angle, kind="stable")
+            met[row[mine][order], w] = angle[order]
+            reach[row[mine][order], w] = share[order]
+            wall[row[mine][order], w] = near[box[mine][order]]
+        free = ~np.isfinite(met)
+        reach[free], wall[free] = 0.0, -1
+        return met, reach, wall
+
+    def _crossed(self, pose: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Distances at which each ray from each head enters and leaves each box: [P, A, B] twice."""
+        heading = pose[:, 2:3] + self._rays
+        far = []
+        for axis, direction in enumerate((np.cos(heading), np.sin(heading))):
+            direction = np.where(np.abs(direction) < 1e-12, 1e-12, direction)[:, :, None]
+            edges = [(box[:, k] - pose[:, axis, None])[:, None] / direction for k in (axis, axis + 2)]
+            far.append((np.minimum(*edges), np.maximum(*edges)))
+        return np.maximum(far[0][0], far[1][0]), np.minimum(far[0][1], far[1][1])
+
+    def _down(
+        self, w: int, d1: np.ndarray, d2: np.ndarray, top: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Protraction at which whisker w, coming down, meets boxes from d1 to d2 m away, and where along it."""
+        radius, length, rest = self._radius[w], self.head.length[w], self._opening[w]
+        drop = self.head.base[w, 2] - top
+        # With the tip as high as the top, how far out is it?
+        opening = np.arccos(np.clip(drop / length, -1, 1))
+        out = radius + length * np.sin(opening)
+        low = np.abs(drop) <= length
+        by_tip = low & (out >= d1) & (out <= d2)
+        edge = np.hypot(drop, d2 - radius)
+        by_edge = (low & (out > d2)) & (edge <= length)
+        # A head that hangs below the tops, or over a box, meets its walls at once: protraction 0.
+        over = np.arctan2(d2 - radius, drop)
+        found = np.where(by_tip, opening, np.where(by_edge, over, -np.inf))
+        share = np.where(by_tip, 1.0, edge / length)
+        angle = np.where(found > -np.inf, np.maximum(rest - found, 0.0), FREE)
+        return angle, np.where(np.isfinite(angle), np.clip(share, 0, 1), 0.0)
