@@ -53,6 +53,18 @@ def _run(arguments: argparse.Namespace) -> int:
     return INTERRUPTED if interrupted else 0
 
 
+def _simulate(arguments: argparse.Namespace) -> int:
+    from ratslam.config import RunConfig
+    from ratslam.run import simulate
+    from ratslam.yamlfile import load, override, validate
+
+    sets = [*arguments.set, *(["simulation.raw=true"] if arguments.raw else [])]
+    config = validate(override(load(arguments.config), sets), RunConfig)
+    count, interrupted = simulate(config, Path(arguments.config).parent, arguments.output)
+    print(f"{arguments.output}: {count} whisks")
+    return INTERRUPTED if interrupted else 0
+
+
 def _score(arguments: argparse.Namespace) -> int:
     from evaluation.energy import read_relations
     from evaluation.exm import ExmConfig
@@ -200,6 +212,18 @@ def _parser() -> argparse.ArgumentParser:
         "--continue", dest="resume", type=Path, metavar="NPZ",
         help="go on from an earlier run: where it stopped in the same recording, else from the start",
     )  # fmt: skip
+
+    simulate = command(
+        "simulate", _simulate, "write the session that a configuration simulates to a recording"
+    )
+    simulate.add_argument("config", help="the YAML file")
+    simulate.add_argument("-o", "--output", type=Path, required=True, metavar="MCAP", help="the new file")
+    simulate.add_argument(
+        "--set", action="append", default=[], metavar="a.b=value", help="override a setting; may be repeated"
+    )
+    simulate.add_argument(
+        "--raw", action="store_true", help="every sample, 2000 a second, not what they tell"
+    )
 
     score = command(
         "score", _score, "score a run directory, or any log: a CSV of time, experience id, true pose"

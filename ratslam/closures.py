@@ -79,6 +79,30 @@ class Ledger:
         """Evidence of a run: the log-likelihood ratios of its candidates, added up."""
         return float(self._evidence.rows[self._candidate.rows[:, 3] == run, 1].sum())
 
+    def scores(self) -> np.ndarray:
+        """[R] the same of every run."""
+        rows, known = self._candidate.rows, self._candidate.rows[:, 3] >= 0
+        return np.bincount(rows[known, 3], self._evidence.rows[known, 1], self.runs)
+
+    def sizes(self) -> np.ndarray:
+        """[R] candidates in every run."""
+        run = self._candidate.rows[:, 3]
+        return np.bincount(run[run >= 0], minlength=self.runs)
+
+    def firsts(self) -> np.ndarray:
+        """[R] first frame of every run."""
+        first = np.full(self.runs, np.iinfo(np.int64).max)
+        rows = self._candidate.rows[self._candidate.rows[:, 3] >= 0]
+        np.minimum.at(first, rows[:, 3], rows[:, 0])
+        return first
+
+    def lasts(self) -> np.ndarray:
+        """[R] last frame of every run."""
+        last = np.full(self.runs, -1)
+        rows = self._candidate.rows[self._candidate.rows[:, 3] >= 0]
+        np.maximum.at(last, rows[:, 3], rows[:, 0])
+        return last
+
     def verdict(self, run: int) -> Verdict:
         """What became of a run."""
         return Verdict(int(self._verdict.rows[run]))
@@ -105,16 +129,26 @@ class Ledger:
             self._lines = np.flatnonzero((run >= 0) & (self._verdict.rows[run] == Verdict.ACCEPTED))
         return self._lines
 
-    def closures(self, angle: float, variance: np.ndarray, scales: tuple[float, float, float]) -> Closures:
+    def closures(
+        self,
+        angle: float,
+        variance: np.ndarray,
+        scales: tuple[float, float, float],
+        which: np.ndarray | None = None,
+    ) -> Closures:
         """The closures of the map.
 
         Args:
             angle: of a sector, rad. variance: [3] of a closure. scales: robust scale for each unit of a
                 run's score, and the least and the largest scale.
         """
-        rows = self._candidate.rows[self.accepted()]
+        taken = self.accepted()
+        if which is not None:
+            of = self._candidate.rows[:, 3]
+            taken = np.flatnonzero((of >= 0) & which[of])
+        rows = self._candidate.rows[taken]
         runs, run = np.unique(rows[:, 3], return_inverse=True)
-        score = np.bincount(run, self._evidence.rows[self.accepted(), 1], len(runs))
+        score = np.bincount(run, self._evidence.rows[taken, 1], len(runs))
         return Closures(
             i=rows[:, 1],
             j=rows[:, 0],
@@ -122,6 +156,7 @@ class Ledger:
             run=run,
             variance=variance,
             scale=np.clip(scales[0] * score, *scales[1:]),
+            score=score,
         )
 
     def weigh(self, weights: np.ndarray) -> None:

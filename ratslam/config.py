@@ -6,7 +6,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, NonNegativeInt
+from pydantic import Field, NonNegativeInt, ValidationInfo, field_validator
 
 from evaluation.exm import ExmConfig
 from ratslam.experience import ExperienceConfig
@@ -18,7 +18,10 @@ from ratslam.recall import RecallConfig
 from ratslam.templates import TemplateConfig
 from robot.formats import RecordingConfig
 from robot.log import Log
+from robot.sensing import head_of
+from robot.simulation import SimulationConfig
 from robot.source import Source
+from tactile.frontend import TouchConfig
 from tactile.settings import Settings
 
 
@@ -45,8 +48,12 @@ class ScoreConfig(Settings):
 class RunConfig(Settings):
     """A run: `python -m ratslam run config.yaml`."""
 
-    recording: RecordingConfig
-    """What to run on."""
+    recording: RecordingConfig | None = None
+    """What to run on: a recording, or the `simulation` below."""
+    simulation: Annotated[SimulationConfig | None, Field(validate_default=True)] = None
+    """A session to simulate and run on."""
+    touch: TouchConfig = TouchConfig()
+    """How whiskers become views."""
     backend: Literal["rat"] = "rat"
     """The method."""
     matcher: Literal["recall", "classic"] = "recall"
@@ -70,13 +77,30 @@ class RunConfig(Settings):
     score: ScoreConfig = ScoreConfig()
     """Judgement."""
 
+    @field_validator("simulation", mode="after")
+    @classmethod
+    def _one_source(
+        cls, simulation: SimulationConfig | None, info: ValidationInfo
+    ) -> SimulationConfig | None:
+        if "recording" in info.data and (info.data["recording"] is None) == (simulation is None):
+            there = "neither recording nor" if simulation is None else "both recording and"
+            raise ValueError(f"{there} simulation; give one of them, and null for the other")
+        return simulation
+
     def rat(self) -> RatConfig:
         """The rat backend's part."""
         return RatConfig(**{name: getattr(self, name) for name in RatConfig.model_fields})
 
     def completed(self, source: Source) -> RunConfig:
-        """The same, with what it leaves open and a recording read as a whole knows: cell size, place ids."""
+        """The same, with what it leaves open and the source knows: head, cell size, given place ids.
+
+        Raises:
+            InputError: the recording's head is none.
+        """
         parts: dict[str, Settings] = {}
+        head = head_of(source, self.touch.head)
+        if head != self.touch.head:
+            parts["touch"] = self.touch.model_copy(update={"head": head})
         params = getattr(source, "params", {})
         cell = params.get("pc_cell_x_size")
         stated = float(cell) if isinstance(cell, int | float) else 0.0

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import SuperLU, splu
 
-from tactile.frames import wrap
+from tactile.frames import between, wrap
 
 
 class Chain(NamedTuple):
@@ -44,6 +44,8 @@ class Closures(NamedTuple):
     run: np.ndarray
     variance: np.ndarray
     scale: np.ndarray
+    score: np.ndarray | None = None
+    stray: float = np.inf
 
 
 class Prior(NamedTuple):
@@ -94,6 +96,23 @@ def solve(
     return fit
 
 
+def robust_cost(fit: Fit, chain: Chain, closures: Closures, prior: Prior) -> float:
+    """What is left of the contradictions between odometry and closures under a fit: what `solve` lessens."""
+    told = corrected(chain.motion, chain.length, fit.bias)
+    apart = between(fit.poses[:-1], fit.poses[1:]) - told
+    apart[:, 2] = wrap(apart[:, 2])
+    odometry = float((apart**2 / chain.variance).sum())
+    error = between(fit.poses[closures.i], fit.poses[closures.j])
+    error[:, 2] = wrap(error[:, 2] - closures.turn)
+    spread = np.broadcast_to(closures.variance, error.shape)
+    members = np.bincount(closures.run, minlength=len(closures.scale))
+    _, tamed = _tamed((error**2 / spread).sum(axis=1), closures.stray)
+    total = np.bincount(closures.run, tamed, len(closures.scale))
+    mean = total / np.maximum(members, 1)
+    lost = members * closures.scale * mean / (closures.scale + mean)
+    return odometry + float(lost.sum()) + ((fit.bias - prior.mean) / prior.sd) ** 2
+
+
 def relative_covariance(
     fit: Fit, chain: Chain, closures: Closures, prior: Prior, i: int, j: int, turn: float
 ) -> np.ndarray:
@@ -111,6 +130,15 @@ def relative_covariance(
     change[3 * i : 3 * i + 3] = by_i.T
     change[3 * j : 3 * j + 3] = by_j.T
     return equations.covariance(change[3:])
+
+
+def _tamed(chi2: np.ndarray, stray: float) -> tuple[np.ndarray, np.ndarray]:
+    """Weights of single closures, and their chi-squares [M] when none can cost more than `stray`: one that is
+    astray must not take its run with it."""
+    if not np.isfinite(stray):
+        return np.ones_like(chi2), chi2
+    share = stray / (stray + chi2)
+    return share**2, share * chi2
 
 
 class _Equations(NamedTuple):
@@ -175,7 +203,8 @@ class _System:
         ahead, aside = c * dx + s * dy, c * dy - s * dx
         error = np.stack([ahead - told[:, 0], aside - told[:, 1], wrap(b[:, 2] - a[:, 2] - told[:, 2])], 1)
         chi2 = (error**2 * self.information).sum(axis=1)
-        total = np.bincount(self.closures.run, chi2[self.chained :], len(self.members))
+        keep, tamed = _tamed(chi2[self.chained :], self.closures.stray)
+        total = np.bincount(self.closures.run, tamed, len(self.members))
         mean = total / np.maximum(self.members, 1)
         weights = (self.closures.scale / (self.closures.scale + mean)) ** 2
 
@@ -187,7 +216,7 @@ class _System:
         by_bias = np.stack([told[:, 1] / 2, -told[:, 0] / 2, -np.ones(len(a))], 1) * self.length[:, None]
 
         trust = self.information.copy()
-        trust[self.chained :] *= weights[self.closures.run][:, None]
+        trust[self.chained :] *= (keep * weights[self.closures.run])[:, None]
         weighted = np.swapaxes(jacobian, 1, 2) * trust[:, None, :]
         data = np.bincount(self.slot, (weighted @ jacobian)[self.used], self.count)
         pulled = weighted @ np.stack([error, by_bias], axis=2)

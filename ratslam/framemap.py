@@ -17,6 +17,7 @@ import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 
 from ratslam.backend import Evidence
+from ratslam.arbitration import KEPT, Case, arbitrate
 from ratslam.closures import Candidate, Ledger, Verdict
 from ratslam.framegraph import Chain, Closures, Fit, Prior, corrected, relative_covariance, solve
 from ratslam.graphfile import write_g2o, write_json
@@ -26,7 +27,7 @@ from ratslam.posegraph import Edges
 from ratslam.recall import Guidance
 from ratslam.sectors import Fan
 from ratslam.types import Estimate
-from tactile.frames import between, compose, fitted, inverse, wrap
+from tactile.frames import between, compose, fitted, integrate, inverse, wrap
 from tactile.settings import Settings
 from tactile.types import Observation
 
@@ -121,6 +122,17 @@ class FrameMapConfig(Settings):
     """Solver steps when a loop closes."""
     settling: PositiveInt = 15
     """Solver steps for the final map."""
+    learn_every: PositiveInt = 40
+    floor_least: float = 3.0
+    floor_quantile: float = 0.2
+    solve_every: PositiveInt = 20
+    mass: float = 0.5
+    whole_run: float = 0.0
+    reconsider: int = 0
+    reconsider_score: float = 8.0
+    reconsider_length: int = 4
+    penalty: float = 0.0
+    stray: float = 6.0
     place_radius: PositiveFloat = 2.0
     """Reach of an experience, cells."""
     place_heading: PositiveFloat = 0.35
@@ -158,6 +170,7 @@ class FrameMap:
         guard: int = 20,
         closures: bool = True,
         normalise: Callable[[np.ndarray], np.ndarray] = np.asarray,
+        whiskers: Any = None,
     ) -> None:
         self.config, self.cell, self.bent = config, cell, closures
         self.guard, self._normalise = guard, normalise
@@ -178,6 +191,11 @@ class FrameMap:
         self._bias = 0.0
         self._prior = Prior(0.0, config.bias_sd / cell)
         self._since = 0.0
+        self._whiskers = whiskers
+        self._level = Growing((size if whiskers else 0,), np.int32)
+        self._table: np.ndarray | None = None
+        self._floor = 0.0
+        self._odd = None
         self._scale = (0, 0.0)  # errors it was taken from, and the scale
         self._settled: Fit | None = None
 
@@ -185,6 +203,8 @@ class FrameMap:
 
     def guidance(self) -> Guidance:
         """What the filter may know of the map."""
+        if self._whiskers:
+            return Guidance(self._pose.rows, self._bias, self._since, self._angle(), self._floor, self._table)
         return Guidance(self._pose.rows, self._bias, self._since, self._angle(), self._scale[1])
 
     def pose(self, estimate: Estimate) -> np.ndarray:
@@ -264,6 +284,10 @@ class FrameMap:
             self._append(observation)
             self._calibrate(evidence)
             matched = self._consider(evidence)
+            if self.config.reconsider and len(self._pose.rows) % self.config.reconsider == 0:
+                self._reconsider()
+            if matched >= 0 and self._whiskers and int(evidence.shift):
+                matched = -1  # the same spot faced the other way is another place
             sure = self._since <= 5 * self.cell
             said = self._grouping.arrive(self._pose.rows, len(self._pose.rows) - 1, matched, sure)
         self._step_frame.append(len(self._pose.rows) - 1)
@@ -291,12 +315,43 @@ class FrameMap:
         size = self._view.rows.shape[1]
         view = self._normalise(np.asarray(observation.view, float)) if size else np.zeros(0)
         self._view.append(np.asarray(view, float).reshape(-1)[:size])
+        if self._whiskers:
+            from ratslam.likeness import levels
+            al = np.asarray(observation.alive)
+            al = np.repeat(al, self._whiskers[2][2]) if al.size else True
+            self._level.append(levels(self._view.rows[-1], al))
         self._since += length
         self._travel = HALT
         if self._fan:
             self._fan.append(self._view.rows[-1], motion[2], length)
 
+    def _learn(self) -> None:
+        """The likeness of whisker images, from what is known by now."""
+        from ratslam import likeness
+        images = self._level.rows
+        count = len(images)
+        if count < 40 or count % self.config.learn_every:
+            return
+        group, behind, _ = self._whiskers
+        random = np.random.default_rng(count)
+        pairs = random.integers(0, count, (4000, 2))
+        pairs = pairs[np.abs(pairs[:, 0] - pairs[:, 1]) > 20]
+        known = self._ledger.table()[self._ledger.accepted()]
+        known = known[(known[:, 3] > 0.95) & (known[:, 8] > 0.5)]
+        frame, match, shift = known[:, 0].astype(int), known[:, 1].astype(int), known[:, 2].astype(int)
+        now, then = images[frame], images[match]
+        then = np.where((shift != 0)[:, None], then[:, behind], then)
+        common = likeness.background(images, group)
+        visits = likeness.variation(now, then)
+        self._table = likeness.table(common, visits)
+        self.visits = visits
+        same = self._table[group, now, then].sum(axis=1)
+        floor = float(np.quantile(same, self.config.floor_quantile)) if len(same) >= 20 else 0.0
+        self._floor = max(self.config.floor_least, floor)
+
     def _calibrate(self, evidence: Evidence) -> None:
+        if self._whiskers:
+            return self._learn()
         for error in np.asarray(evidence.background)[np.isfinite(evidence.background)]:
             self._background.append(error)
         self._rescale()
@@ -343,9 +398,56 @@ class FrameMap:
             self._judge(run, candidate)
         if self._ledger.verdict(run) != Verdict.ACCEPTED:
             return -1
-        self._correct()
+        fresh = run != getattr(self, "_lastrun", None) or candidate.frame - self._solved >= self.config.solve_every
+        if fresh or not self._whiskers:
+            self._correct()
+            self._lastrun, self._solved = run, candidate.frame
         self._since = 0.0
         return candidate.match
+
+    def _reconsider(self) -> None:
+        """Weighs all runs against each other anew."""
+        config, ledger = self.config, self._ledger
+        score, size = ledger.scores(), ledger.sizes()
+        user = np.array([ledger.verdict(run) == Verdict.UNDONE for run in range(ledger.runs)], bool)
+        taken = (score >= config.reconsider_score) & (size >= config.reconsider_length) & ~user
+        if not taken.any():
+            return
+        self._cut.rows[:] = -1
+        chain, prior = self._chain(), self._belief()
+        reckoned = integrate(corrected(chain.motion, chain.length, self._prior.mean), self._pose.rows[0])
+        reckoned = np.concatenate([self._pose.rows[:1], reckoned])
+        case = Case(chain, self._closures_of(taken), prior, score[taken], ledger.firsts()[taken], ledger.lasts()[taken])
+        starts = [Fit(self._pose.rows, self._bias, np.zeros(0)), Fit(reckoned, self._prior.mean, np.zeros(0))]
+        judged = arbitrate(case, starts, self._where_carried)
+        kept = np.zeros(ledger.runs, bool)
+        kept[np.flatnonzero(taken)] = judged.fit.weights > KEPT
+        for run in np.flatnonzero(~user).tolist():
+            ledger.judge(run, Verdict.ACCEPTED if kept[run] else Verdict.OPEN)
+        for frame, run in judged.cuts:
+            self._cut.rows[frame] = np.flatnonzero(taken)[run]
+        before = self._pose.rows.copy()
+        self._pose.rows[:], self._bias = judged.fit.poses, judged.fit.bias
+        fit = self._solve(6) if kept.any() else judged.fit
+        if kept.any():
+            ledger.weigh(fit.weights)
+        self._pose.rows[:] = compose(fitted(fit.poses, before), fit.poses)
+        self._bias = fit.bias
+        self._settled = None
+
+    def _where_carried(self, poses: np.ndarray, onwards: np.ndarray, carried: np.ndarray, since: int) -> int:
+        """See `arbitration.Where`: views before the cut fit better where odometry leads, those after it carried."""
+        frames = np.arange(since + 1, since + 1 + len(onwards))[-FAR_BACK:]
+        onwards = onwards[-FAR_BACK:]
+        old = self._pose.rows.copy()
+        self._pose.rows[:] = poses
+        stays, goes = (
+            np.array([self._misfit(int(frame), pose) for frame, pose in zip(frames, rows, strict=True)])
+            for rows in (onwards, compose(carried, onwards))
+        )
+        self._pose.rows[:] = old
+        cost = np.concatenate([[0], np.cumsum(stays)[:-1]]) + np.cumsum(goes[::-1])[::-1]
+        return int(frames[len(cost) - 1 - np.argmin(cost[::-1])])
 
     def _follows(self, candidate: Candidate) -> bool:
         """Whether it continues the newest run: as far from its last candidate in memory as in odometry."""
@@ -358,7 +460,15 @@ class FrameMap:
         travelled = between(pose[last.frame], pose[candidate.frame])
         apart = np.hypot(*(remembered - travelled)[:2])
         allowed = config.agreement * self.cell + 0.1 * np.hypot(*travelled[:2])
-        return bool(apart < allowed and abs(wrap(remembered[2] - travelled[2])) < config.agreement_heading)
+        near = bool(apart < allowed and abs(wrap(remembered[2] - travelled[2])) < config.agreement_heading)
+        if near and config.whole_run:
+            frame, match, shift, run = self._ledger.members(self._ledger.runs - 1)[0]
+            remembered = between(_turned(pose[match], -shift * angle), _turned(pose[candidate.match], -candidate.shift * angle))
+            travelled = between(pose[frame], pose[candidate.frame])
+            apart = np.hypot(*(remembered - travelled)[:2])
+            allowed = config.agreement * self.cell + config.whole_run * np.hypot(*travelled[:2])
+            return bool(apart < allowed and abs(wrap(remembered[2] - travelled[2])) < 2*config.agreement_heading)
+        return near
 
     def _judge(self, run: int, candidate: Candidate) -> None:
         """Accepts a run with enough evidence where the map allows it; a long one that contradicts, cuts."""
@@ -432,6 +542,14 @@ class FrameMap:
         near = np.flatnonzero(np.hypot(*(old - pose)[:, :2].T) < 1.5 * self.cell)
         if not len(near):
             return 0.5
+        if self._whiskers:
+            if self._table is None:
+                return 0.5
+            group, behind, _ = self._whiskers
+            now, turned = self._level.rows[frame], np.cos(old[near, 2] - pose[2]) < 0
+            then = np.where(turned[:, None], self._level.rows[near][:, behind], self._level.rows[near])
+            odds = self._table[group, now, then].sum(axis=1).max()
+            return float(np.log1p(np.exp(-0.25 * odds)))
         if not self._view.rows.shape[1]:
             return float(not np.any(self._label.rows[near] == self._label.rows[frame]))
         apart = np.abs(self._view.rows[near] - self._view.rows[frame]).mean(axis=1).min()
@@ -476,10 +594,16 @@ class FrameMap:
 
     def _closures(self) -> Closures:
         config = self.config
+        return self._closures_of(None)
+
+    def _closures_of(self, which: np.ndarray | None) -> Closures:
+        config = self.config
         spread = config.closure_sd * self.cell
         variance = np.array([spread**2, spread**2, config.closure_heading**2])
         scales = (config.robust_per_score, config.robust_least, config.robust_most)
-        closures = self._ledger.closures(self._angle(), variance, scales)
+        closures = self._ledger.closures(self._angle(), variance, scales, which)
+        if config.penalty:
+            closures = closures._replace(scale=2 * np.maximum(closures.score - config.penalty, 1.0) / np.bincount(closures.run), stray=config.stray)
         return closures if config.robust else closures._replace(scale=np.full_like(closures.scale, 1e12))
 
     def _steps(self, fit: Fit) -> np.ndarray:
@@ -499,6 +623,8 @@ class FrameMap:
         return parts | {"fan": self._fan} if self._fan else parts
 
     def _angle(self) -> float:
+        if self._whiskers:
+            return np.pi / 3
         return self._fan.angle if self._fan else 0.0
 
     def _rescale(self) -> None:

@@ -21,6 +21,7 @@ import numpy as np
 from jax import lax
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
+from ratslam.likeness import LEVELS
 from tactile.frames import wrap
 from tactile.settings import Settings
 from tactile.types import Array
@@ -47,9 +48,10 @@ FACING = float(np.cos(0.5))
 class RecallConfig(Settings):
     """The filter. Lengths are in pose cells, so that one setting serves every robot."""
 
-    fan: Literal["auto", "none"] | float = "auto"
+    fan: Literal["auto", "none", "whiskers"] | float = "auto"
     """Whether a view is a fan of ordered sectors, so that a turned robot sees it shifted: its width in rad
-    (counter-clockwise positive), `none`, or `auto` (also 0): found out from the recording itself."""
+    (counter-clockwise positive), `none`, `whiskers` (rows of whiskers all around the robot), or `auto` (also
+    0): found out from the recording itself."""
     shifts: NonNegativeInt = 3
     """Sectors by which a fan may be shifted either way."""
     frame_distance: PositiveFloat = 0.3
@@ -87,6 +89,11 @@ class RecallConfig(Settings):
     """Standard deviation of the map's heading after a closure, rad."""
     local_heading_rate: NonNegativeFloat = 0.006
     """What each cell travelled since adds to it, rad."""
+    band: PositiveInt = 4
+    temper: PositiveFloat = 0.25
+    """Whiskers: share of the log-odds of an image that counts, because pixels are not independent."""
+    familiar: Share = 0.8
+    """Whiskers: weight in novelty of what places that looked alike before look like next, against `floor`."""
     energy: PositiveFloat = 3.0
     """Activity injected into the pose cells by a candidate, for each unit of its posterior; the packet's own
     is 1. Weaker ones leave two packets to compete for long, which costs time and tells nothing more."""
@@ -108,6 +115,7 @@ class Guidance(NamedTuple):
     since: float
     angle: float
     scale: float
+    likeness: np.ndarray | None = None
 
 
 class Memory(NamedTuple):
@@ -142,6 +150,9 @@ class Memory(NamedTuple):
     since: Array
     angle: Array
     scale: Array
+    likeness: Array
+    before: Array
+    rest: Array
 
 
 class Recollection(NamedTuple):
@@ -187,6 +198,8 @@ class Weighing(NamedTuple):
 
 def offsets(config: RecallConfig) -> np.ndarray:
     """[S] sectors by which views are shifted."""
+    if config.fan == "whiskers":
+        return np.array([0, 3], dtype=np.int32)
     reach = 0 if config.fan == "none" else config.shifts
     return np.arange(-reach, reach + 1, dtype=np.int32)
 
@@ -198,7 +211,7 @@ def fan_width(config: RecallConfig) -> float | None:
     return config.fan
 
 
-def start(config: RecallConfig, size: int, capacity: int, dtype: np.dtype) -> Memory:
+def start(config: RecallConfig, size: int, capacity: int, dtype: np.dtype, groups: int = 0) -> Memory:
     """No frames, everything new.
 
     Args:
@@ -208,8 +221,9 @@ def start(config: RecallConfig, size: int, capacity: int, dtype: np.dtype) -> Me
     def zeros(*shape: int) -> Array:  # one buffer each: the session donates them
         return jnp.zeros(shape, dtype)
 
+    touch = config.fan == "whiskers"
     return Memory(
-        view=zeros(size, capacity),
+        view=jnp.zeros((size, capacity), jnp.int32) if touch else zeros(size, capacity),
         label=jnp.full(capacity, -1, jnp.int32),
         packet=zeros(capacity, 3),
         x=zeros(capacity),
@@ -229,6 +243,9 @@ def start(config: RecallConfig, size: int, capacity: int, dtype: np.dtype) -> Me
         since=zeros(),
         angle=zeros(),
         scale=zeros(),
+        likeness=zeros(groups, LEVELS, LEVELS) if touch else zeros(0, 0, 0),
+        before=zeros(len(offsets(config)), capacity if touch else 0),
+        rest=zeros(len(offsets(config)), capacity if touch else 0),
     )
 
 
@@ -243,6 +260,8 @@ def inform(memory: Memory, guidance: Guidance) -> Memory:
     x, y, cosine, sine = (jnp.asarray(row, dtype) for row in full)
     told = (guidance.bias, guidance.since, guidance.angle, guidance.scale)
     bias, since, angle, scale = (jnp.asarray(value, dtype) for value in told)
+    if guidance.likeness is not None:
+        memory = memory._replace(likeness=jnp.asarray(guidance.likeness, dtype))
     return memory._replace(
         x=x, y=y, cosine=cosine, sine=sine, pose=jnp.asarray(guidance.poses[-1], dtype),
         bias=bias, since=since, angle=angle, scale=scale,
@@ -302,6 +321,51 @@ def by_view(config: RecallConfig, cell: float, memory: Memory, view: Array) -> W
     )
 
 
+def by_touch(config: RecallConfig, memory: Memory, level: Array, group: np.ndarray, behind: np.ndarray) -> tuple[Memory, Weighing]:
+    """Weighs all frames by a whisker image: levels [D] of pixels.
+
+    Args:
+        group: [D] of each pixel, see `likeness.table`. behind: [D] the pixel that sees what this one saw once the
+            robot has turned about.
+    """
+    old = _old(config, memory)
+    rows = memory.likeness[group, level]  # [D, L]
+    zero = jnp.zeros_like(memory.x)
+    same = sum((rows[i][memory.view[i]] for i in range(len(group))), zero)
+    back = sum((rows[i][memory.view[behind[i]]] for i in range(len(group))), zero)
+    certain = (memory.scale != 0) & jnp.any(old)
+    odds = jnp.stack([same, back])
+    likelihood = jnp.where(old[None], jnp.exp(config.temper * odds), 0.0)
+    floor = jnp.exp(config.temper * memory.scale)
+    expected = _onwards(memory.before)
+    expected = jnp.where(old[None], expected, 0.0)
+    total = jnp.sum(expected)
+    known = jnp.sum(expected * likelihood) / jnp.where(total > 0, total, 1.0)
+    share = jnp.where(total > 0, config.familiar, 0.0)
+    novelty = share * known + (1 - share) * floor
+    weighing = Weighing(
+        likelihood=jnp.where(certain, likelihood, 1.0),
+        novelty=jnp.where(certain, novelty, 1.0),
+        background=jnp.full(SAMPLES, jnp.nan, memory.x.dtype),
+        certain=certain,
+        telling=certain,
+    )
+    return memory._replace(before=jnp.where(certain, likelihood, 0.0)), weighing
+
+
+def _onwards(before: Array) -> Array:
+    """[2, C] where frames that were likely lead: one on, or one back for a robot that has turned about."""
+    def rolled(row: Array, by: int) -> Array:
+        moved = jnp.roll(row, by)
+        index = jnp.arange(len(row), dtype=jnp.int32)
+        return jnp.where((index >= by) if by >= 0 else (index < len(row) + by), moved, 0.0)
+
+    weights = (0.02, 0.94, 0.02, 0.02)
+    on = sum(w * rolled(before[0], d) for d, w in enumerate(weights))
+    back = sum(w * rolled(before[1], -d) for d, w in enumerate(weights))
+    return jnp.stack([on, back])
+
+
 def by_label(config: RecallConfig, memory: Memory, label: Array) -> Weighing:
     """Weighs all frames by a given id."""
     known = jnp.any(memory.label == label)
@@ -343,7 +407,7 @@ def look(
     basin = (memory.x - memory.x[match]) ** 2 + (memory.y - memory.y[match]) ** 2 < (BASIN * cell) ** 2
     mass = jnp.sum(jnp.where(basin[None], belief, 0.0))
     gain = jnp.log(jnp.where(certain, likelihood[shift, match], 1.0) / novelty)
-    anchor, offset, masses = _modes(config, cell, memory, angles, belief)
+    (anchor, offset, masses), rest = _modes(config, cell, memory, angles, belief)
     near = old & (apart < cell**2)
     facing = memory.cosine * jnp.cos(here[2]) + memory.sine * jnp.sin(here[2]) > FACING
     best = jnp.max(jnp.where(near & facing, jnp.max(likelihood, axis=0), 0.0))
@@ -364,6 +428,8 @@ def look(
         agree=agree,
         background=weighing.background,
     )
+    if config.fan == "whiskers":
+        memory = memory._replace(rest=jnp.where(rest[None] > 0, belief, 0.0))
     return memory._replace(anchor=anchor, offset=offset, mass=masses), recollection
 
 
@@ -476,8 +542,10 @@ def _align(
         belief = belief + (stay / total) * fall
         return belief, novel + stay * config.nothing / total + memory.mass[k] * config.leave
 
-    fresh = 1 - jnp.sum(memory.mass)
+    fresh = 1 - jnp.sum(memory.mass) - jnp.sum(memory.rest)
     shut = jnp.zeros(cells.shape, dtype), jnp.zeros((), dtype)
+    if config.fan == "whiskers":
+        shut = _followed(config, cell, memory, angles, cells, moved)
     belief, novel = lax.fori_loop(0, config.modes, carry, shut)
     near = landing(here, *spread(config, cell, memory))
     total = jnp.sum(near)
@@ -488,10 +556,40 @@ def _align(
     return belief, novel + fresh - entered
 
 
+def _followed(config, cell, memory, angles, cells, moved):
+    """The light hypotheses go on along the way the frames were taken: each to the few frames that follow it."""
+    dtype = memory.x.dtype
+    index = jnp.arange(len(memory.x), dtype=jnp.int32)
+    belief, novel = jnp.zeros(cells.shape, dtype), jnp.zeros((), dtype)
+    rows = []
+    for s, sign in ((0, 1), (1, -1)):
+        turn = angles[s]
+        c = memory.cosine * jnp.cos(turn) - memory.sine * jnp.sin(turn)
+        n = memory.sine * jnp.cos(turn) + memory.cosine * jnp.sin(turn)
+        x, y = memory.x + c * moved[0] - n * moved[1], memory.y + n * moved[0] + c * moved[1]
+        ct, st = c * jnp.cos(moved[2]) - n * jnp.sin(moved[2]), n * jnp.cos(moved[2]) + c * jnp.sin(moved[2])
+        falls = []
+        for d in range(config.band):
+            roll = lambda row: jnp.roll(row, -sign * d)
+            apart = ((x - roll(memory.x)) ** 2 + (y - roll(memory.y)) ** 2) / (config.reach * cell) ** 2
+            facing = ct * roll(c) + st * roll(n)
+            deviation = apart + (2 / config.reach_heading**2) * (1 - facing)
+            inside = jnp.maximum(1 - deviation / SUPPORT, 0.0)
+            to = index + sign * d
+            fine = (to >= 0) & (to < len(index)) & roll(cells[s])
+            falls.append(jnp.where(fine, inside**2 * inside**2, 0.0))
+        total = sum(falls) + config.nothing
+        stay = memory.rest[s] * (1 - config.leave)
+        rows.append(sum(jnp.roll(stay * fall / total, sign * d) for d, fall in enumerate(falls)))
+        novel = novel + jnp.sum(stay * config.nothing / total) + jnp.sum(memory.rest[s]) * config.leave
+    return jnp.stack(rows), novel
+
+
 def _modes(
     config: RecallConfig, cell: float, memory: Memory, angles: Array, belief: Array
-) -> tuple[Array, Array, Array]:
-    """The heaviest hypotheses: frames [K], mean pose around each in its frame [K, 3], mass [K].
+) -> tuple[tuple[Array, Array, Array], Array]:
+    """The heaviest hypotheses: frames [K], mean pose around each in its frame [K, 3], mass [K]; and what is
+    left [C].
 
     Frames within a cell of a heavier one are part of it.
     """
@@ -518,8 +616,8 @@ def _modes(
         offset = jnp.stack([c * x + s * y, c * y - s * x, wrap(heading - jnp.arctan2(s, c))])
         return jnp.where(member, 0.0, rest), (frame, offset, jnp.where(kept, total, 0.0))
 
-    _, modes = lax.scan(peel, mass, None, length=config.modes)
-    return modes
+    rest, modes = lax.scan(peel, mass, None, length=config.modes)
+    return modes, rest
 
 
 def _peak(values: Array) -> Array:

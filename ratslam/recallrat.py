@@ -12,6 +12,7 @@ from jax import lax
 from ratslam import posecells, recall, templates
 from ratslam.backend import Backend
 from ratslam.framemap import FrameMap
+from ratslam.likeness import DEAD, HEIGHTS
 from ratslam.posecells import Outcome, PoseCells
 from ratslam.rat import Rat, RatConfig, RatEvidence, finite
 from ratslam.recall import Guidance, Memory, Recollection
@@ -71,6 +72,11 @@ class RecallRat:
         self.recall = config.recall.model_copy(update={"fan": "none"}) if labels else config.recall
         self.labels, self.view_shape = labels, view_shape
         self.size = 0 if labels else int(np.prod(view_shape))
+        self.touch = self.recall.fan == "whiskers"
+        rows, columns, channels = view_shape
+        number = np.arange(self.size).reshape(view_shape if self.size else (0, 0, 0))
+        self.group = (np.arange(rows)[:, None, None] * channels + np.arange(channels) + np.zeros((1, columns, 1), int)).reshape(-1)
+        self.behind = np.roll(number, -(columns // 2), axis=1).reshape(-1)
         self.dtype = np.dtype(dtype)
         self.cell = config.pose_cells.cell_size
         self.tables = posecells.tables(config.pose_cells, self.dtype)
@@ -82,7 +88,7 @@ class RecallRat:
         del key
         return State(
             posecells.start(self.config.pose_cells, self.dtype),
-            recall.start(self.recall, self.size, capacity, self.dtype),
+            recall.start(self.recall, self.size, capacity, self.dtype, int(self.group.max()) + 1),
             jnp.ones((), self.dtype),
         )
 
@@ -105,10 +111,11 @@ class RecallRat:
         moved = jnp.stack([odometry.dx, odometry.dy, odometry.dtheta])
         memory = recall.travel(state.memory, moved)
         frame = seen & recall.due(self.recall, self.cell, memory)
+        view = self._pixels(view, observation)
 
         memory, recollection = lax.cond(
             frame,
-            lambda: self._look(memory, view.reshape(-1)[: self.size], observation.label),
+            lambda: self._look(memory, view, observation.label),
             lambda: (memory, recall.nothing(memory)),
         )
         recalled, energy = self._injection(memory, recollection)
@@ -117,7 +124,7 @@ class RecallRat:
         )
         memory = lax.cond(
             frame,
-            lambda: recall.remember(memory, view.reshape(-1)[: self.size], observation.label, cells.pose),
+            lambda: recall.remember(memory, view, observation.label, cells.pose),
             lambda: memory,
         )
         health = jnp.where(
@@ -155,15 +162,26 @@ class RecallRat:
             guard=self.recall.guard,
             closures=closures,
             normalise=self._normalised,
+            whiskers=(self.group, self.behind, self.view_shape) if self.touch else None,
         )
 
     def _normalised(self, view: np.ndarray) -> np.ndarray:
         shaped = jnp.asarray(view.reshape(self.view_shape), self.dtype)
         return np.asarray(templates.normalise(self.config.templates, shaped))
 
+    def _pixels(self, view: Array, observation: Observation) -> Array:
+        flat = view.reshape(-1)[: self.size]
+        if not self.touch:
+            return flat
+        height = jnp.clip(jnp.ceil(flat * HEIGHTS), 0, HEIGHTS).astype(jnp.int32)
+        alive = jnp.repeat(observation.alive, self.view_shape[2]) if observation.alive.size else jnp.ones(self.size, bool)
+        return jnp.where(alive, height, DEAD)
+
     def _look(self, memory: Memory, view: Array, label: Array) -> tuple[Memory, Recollection]:
         if self.labels:
             weighing = recall.by_label(self.recall, memory, label)
+        elif self.touch:
+            memory, weighing = recall.by_touch(self.recall, memory, view, self.group, self.behind)
         else:
             weighing = recall.by_view(self.recall, self.cell, memory, view)
         return recall.look(self.recall, self.cell, memory, weighing)

@@ -1,4 +1,4 @@
-"""The main job: a recording through an engine into a run directory."""
+"""The main job: a recording or a simulated session through an engine into a run directory."""
 
 from __future__ import annotations
 
@@ -29,10 +29,14 @@ from ratslam.storage import RunDirectory, read_checkpoint
 from ratslam.types import Action
 from ratslam.yamlfile import dump
 from robot.formats import open_recording
-from robot.source import Sample, Source
+from robot.recorder import Recorder
+from robot.sensing import calibration_of, observation_of, sensing
+from robot.simulation import simulated
+from robot.source import Sample, Source, rig_of
 from tactile.errors import InputError
 from tactile.frames import compose, tum_line
-from tactile.types import Cycle, Observation
+from tactile.frontend import Frontend
+from tactile.types import Observation
 
 CHECKPOINT_EVERY = 128 * CHUNK
 """Steps between checkpoints: a kill loses no line, but a continued run repeats at most these."""
@@ -50,13 +54,14 @@ def run(
         the scorecard, and whether the run was interrupted (its outputs are then of the part done).
 
     Raises:
-        InputError: the recording, the checkpoint or the run directory cannot be used.
+        InputError: the recording, the simulation, the checkpoint or the run directory cannot be used.
         OSError: the disk is full.
     """
-    config = _located(config, folder.resolve())
+    config = located(config, folder.resolve())
     relations = read_relations(config.score.relations) if config.score.relations else None
-    with open_recording(config.recording, _tell) as source:
+    with open_source(config, _tell) as source:
         config = config.completed(source)
+        source = sensing(source, config.touch)
         session = session_of(config, source)
         skip = _resume(session, resume, source.digest) if resume else 0
         _check_length(source, skip, resume)
@@ -77,6 +82,58 @@ def run(
     return card, interrupted
 
 
+def simulate(config: RunConfig, folder: Path, path: Path) -> tuple[int, bool]:
+    """Writes the simulated session of a configuration to a recording: what each whisker felt, or its samples.
+
+    Returns:
+        how many whisks were written, and whether the user interrupted.
+
+    Raises:
+        InputError: there is nothing to simulate, it cannot be simulated, or the file exists.
+    """
+    config = located(config, folder.resolve())
+    if config.simulation is None:
+        raise InputError("simulation", "missing", "what to simulate", "`simulation: {}` is a whole session")
+    source = open_source(config, _tell)
+    frontend = Frontend(config.touch, calibration_of(source))
+    recorder = Recorder(
+        path,
+        view_shape=source.view_shape,
+        whiskers=source.whiskers,
+        rate_hz=source.rate_hz,
+        rig=rig_of(source),
+        chunk_s=CHUNK / source.rate_hz,
+    )
+    bar = tqdm(source, unit="whisk", desc=source.name, file=sys.stderr, mininterval=0.5, total=source.length)
+    with recorder, bar, _interrupts("closing the file") as interrupted:
+        for sample in bar:
+            if not config.simulation.raw and not isinstance(sample.reading, Observation):
+                sample = sample._replace(reading=frontend.felt(sample.reading))
+            recorder.write(sample)
+            if interrupted():
+                break
+        return recorder.count, interrupted()
+
+
+def open_source(config: RunConfig, tell: Callable[[str], None] | None = None) -> Source:
+    """The recording of a configuration with whole paths, or its simulated session.
+
+    Args:
+        tell: called with one sentence on how much is simulated and why, or if only a part of a recording
+            could be read.
+
+    Raises:
+        InputError: it cannot be read, or not be simulated.
+    """
+    if config.simulation is not None:
+        session = simulated(config.simulation, config.touch.head)
+        if tell is not None:
+            tell(f"simulating in the {session.tier.name} tier: {session.tier.why}")
+        return session
+    assert config.recording is not None
+    return open_recording(config.recording, tell and (lambda sentence: tell(f"warning: {sentence}")))
+
+
 def session_of(config: RunConfig, source: Source) -> Session:
     """A fresh session for what a source gives."""
     return Session(
@@ -87,12 +144,16 @@ def session_of(config: RunConfig, source: Source) -> Session:
     )
 
 
-def _located(config: RunConfig, folder: Path) -> RunConfig:
+def located(config: RunConfig, folder: Path) -> RunConfig:
     """The configuration with whole paths, so that the copy in the run directory can be run again."""
     judgement = config.score
     if judgement.relations:
         judgement = judgement.model_copy(update={"relations": folder / judgement.relations})
-    return config.model_copy(update={"recording": config.recording.resolved(folder), "score": judgement})
+    parts = {
+        "recording": config.recording and config.recording.resolved(folder),
+        "simulation": config.simulation and config.simulation.resolved(folder),
+    }
+    return config.model_copy(update={**parts, "score": judgement})
 
 
 def _play(session: Session, source: Source, skip: int, store: RunDirectory) -> bool:
@@ -104,9 +165,10 @@ def _play(session: Session, source: Source, skip: int, store: RunDirectory) -> b
     total = None if source.length is None else source.length - skip
     saved = session.steps
     bar = tqdm(total=total, unit="step", desc=source.name, file=sys.stderr, mininterval=0.5)
-    with bar as progress, _interrupts() as interrupted:
+    last = "finishing this chunk and writing the results"
+    with bar as progress, _interrupts(last) as interrupted:
         while not interrupted() and (chunk := list(islice(samples, CHUNK - session.steps % CHUNK))):
-            observations = [_observation(sample) for sample in chunk]
+            observations = [observation_of(sample) for sample in chunk]
             steps = list(session.replay(observations))
             reckoned = []
             for observation in observations:
@@ -127,15 +189,19 @@ def _play(session: Session, source: Source, skip: int, store: RunDirectory) -> b
 
 
 @contextmanager
-def _interrupts() -> Iterator[Callable[[], bool]]:
-    """Says whether the user has pressed Ctrl-C, which waits for the chunk at work; twice does not wait."""
+def _interrupts(last: str) -> Iterator[Callable[[], bool]]:
+    """Says whether the user has pressed Ctrl-C, which waits for the chunk at work; twice does not wait.
+
+    Args:
+        last: what is still done then.
+    """
     pressed: list[int] = []
 
     def press(number: int, frame: Any) -> None:
         if pressed:
             raise KeyboardInterrupt
         pressed.append(number)
-        print("\nratslam: interrupted; finishing this chunk and writing the results ...", file=sys.stderr)
+        print(f"\nratslam: interrupted; {last} ...", file=sys.stderr)
 
     before = signal.signal(signal.SIGINT, press)
     try:
@@ -176,15 +242,9 @@ def readings(source: Source) -> Iterator[tuple[Sample, Observation]]:
     """Samples with what an engine is given of each.
 
     Raises:
-        InputError: the source gives raw whisker cycles.
+        InputError: the source gives whiskers that nobody has made observations of.
     """
-    return ((sample, _observation(sample)) for sample in source)
-
-
-def _observation(sample: Sample) -> Observation:
-    if isinstance(sample.reading, Cycle):
-        raise InputError("recording.file", "raw whisker cycles", "observations", "process the whiskers first")
-    return sample.reading
+    return ((sample, observation_of(sample)) for sample in source)
 
 
 def _lines(samples: list[Sample], steps: list[Step], reckoned: list[np.ndarray]) -> dict[str, Iterator[str]]:
@@ -249,12 +309,14 @@ def _check_length(source: Source, skip: int, resume: Path | None) -> None:
 
 
 def _manifest(config: RunConfig, text: str, source: Source, resume: Path | None) -> dict[str, Any]:
+    made = rig_of(source).get("simulation", {})
     packages = ("ratslam", "jax", "jaxlib", "numpy", "scipy", "networkx")
     return {
         "format": "ratslam-run-1",
         "versions": {name: version(name) for name in packages} | {"python": platform.python_version()},
         "machine": platform.machine(),
         "recording": {"name": source.name, "sha256": source.digest, "samples": source.length},
+        "simulation": {name: made.get(name) for name in ("sha256", "seed", "tier", "why")} if made else None,
         "config_sha256": hashlib.sha256(text.encode()).hexdigest(),
         "seeds": {"session": config.session.seed},
         "continued": resume is not None,
@@ -262,4 +324,4 @@ def _manifest(config: RunConfig, text: str, source: Source, resume: Path | None)
 
 
 def _tell(sentence: str) -> None:
-    print(f"ratslam: warning: {sentence}", file=sys.stderr)
+    print(f"ratslam: {sentence}", file=sys.stderr)

@@ -21,12 +21,12 @@ from pydantic import BaseModel
 
 from evaluation.trajectory import ate
 from ratslam.config import RunConfig
-from ratslam.run import Anytimes, readings, session_of
+from ratslam.run import Anytimes, located, open_source, readings, session_of
 from ratslam.session import CHUNK, Session
 from ratslam.yamlfile import Document, load, override, validate
-from robot.formats import open_recording
-from robot.log import Log
+from robot.log import Log, collected
 from robot.perturb import perturbed
+from robot.sensing import sensing
 from tactile.errors import InputError
 from tactile.frames import integrate
 
@@ -73,14 +73,17 @@ class Trial(NamedTuple):
 
 
 def trial(config: RunConfig, folder: Path, seed: int = 0) -> Trial:
-    """Runs once; a seed above 0 perturbs the recording first.
+    """Runs once; a seed above 0 perturbs the recording, or what was simulated, first.
 
     Raises:
         InputError: the recording cannot be used, or cannot be perturbed because it is not read as a whole.
     """
-    with open_recording(config.recording.resolved(folder), lambda _: None) as source:
+    with open_source(located(config, folder.resolve())) as source:
         config = config.completed(source)
+        source = sensing(source, config.touch)
         if seed:
+            if config.simulation is not None:
+                source = collected(source)
             if not isinstance(source, Log):
                 raise InputError("recording.file", "a recording that is streamed", "a CSV or .npz recording")
             source = perturbed(source, seed)

@@ -14,10 +14,20 @@ from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 
 from robot.motion import Path, at
 from robot.walls import Surroundings
+from tactile.contact import ShaftConfig, stiffness
 from tactile.head import Head
 from tactile.settings import Settings
 from tactile.types import Odometry, Whisk
-from tactile.whisking import WhiskingConfig, phase
+from tactile.whisking import WhiskingConfig, beside, phase
+
+SHAFT = ShaftConfig()
+"""Of all whiskers."""
+SHORTEST = 0.05
+"""Reach, as a share of the shaft, under which a contact counts as this far out."""
+SDS = 20.0
+"""Noise that a reading must exceed for the whisking law to heed it, in standard deviations (the paper's)."""
+MEAN = 0.3
+"""Noise of the largest angle, which is a mean over 10 ms, as a share of one sample's."""
 
 
 class MechanicsConfig(Settings):
@@ -60,50 +70,108 @@ def felt(
     random: np.random.Generator,
 ) -> Felt:
     """Whisk cycles that start at times [N] s along a path."""
-    head = surroundings.head
+    met = _met(config, whisking, surroundings, path, start)
+    felt = _pushed(config, whisking, surroundings.head, met)
+    return _sensed(config, whisking, surroundings.head, felt, random)
+
+
+class _Met(NamedTuple):
+    """What whiskers meet [N, W]: whether anything on their way, the protraction at which, where along the
+    shaft, and the same two (infinite where free) at the end of the protraction."""
+
+    contact: np.ndarray
+    touched: np.ndarray
+    reach: np.ndarray
+    last: np.ndarray
+    last_reach: np.ndarray
+
+
+def _met(
+    config: MechanicsConfig,
+    whisking: WhiskingConfig,
+    surroundings: Surroundings,
+    path: Path,
+    start: np.ndarray,
+) -> _Met:
+    whiskers, count = len(surroundings.head.length), len(start)
     amplitude = np.radians(whisking.amplitude_deg)
-    whiskers, count = len(head.length), len(start)
     lag = (np.arange(config.poses) + 1) / config.poses / (2 * whisking.rate)
-    command = amplitude * phase(whisking, lag)
+    command, midway = amplitude * phase(whisking, lag), amplitude * phase(whisking, lag - lag[0] / 2)
     met = surroundings.contact(at(path, start[:, None] + lag).reshape(-1, 3))
-    wall = met.angle.reshape(count, config.poses, whiskers)
-    along = met.reach.reshape(count, config.poses, whiskers)
-
-    before = np.concatenate([[0.0], command[:-1]])
+    wall, along, box = (column.reshape(count, config.poses, whiskers) for column in met)
     touches = wall <= command[:, None]
-    contact = touches.any(axis=1)
-    first = np.argmax(touches, axis=1)
-    touched = np.take_along_axis(wall, first[:, None], axis=1)[:, 0]
-    reach = np.take_along_axis(along, first[:, None], axis=1)[:, 0]
-    # A wall that the head's own motion brought into the sweep is met where the whisker is by then.
-    touched = np.where(contact, np.maximum(touched, before[first]), 0.0)
+    contact, first = touches.any(axis=1), np.argmax(touches, axis=1)
 
-    push = config.servo / (1 + config.servo)
-    if whisking.mode != "open":
-        push = push / (1 + push * whisking.gain)
-    last = wall[:, -1]
-    bend = np.where(np.isfinite(last), push * (amplitude - np.where(np.isfinite(last), last, 0.0)), 0.0)
-    held = contact & np.isfinite(last) & (bend <= config.slip) & (last < amplitude)
-    # The bend at which contact shows: all of it, also of a whisker that slips off later.
-    bent = np.where(contact, push * (amplitude - touched), 0.0)
-    noticed = contact & (np.maximum(bend, bent) > config.dead_zone)
+    def then(column: np.ndarray, row: np.ndarray) -> np.ndarray:
+        return np.take_along_axis(column, row[:, None], axis=1)[:, 0]
 
-    missed = random.random((count, whiskers)) < config.missed
-    spurious = ~contact & (random.random((count, whiskers)) < config.spurious)
-    anywhere = random.random((count, whiskers)) * amplitude
-    noise = config.noise * random.standard_normal((2, count, whiskers))
-    smeared = config.reach_noise * random.standard_normal((count, whiskers))
-    contact = (noticed & ~missed) | spurious
-    touched = np.where(spurious, anywhere, touched + config.dead_zone)
-    held = held & noticed & ~missed
-    highest = np.where(held, last + bend, amplitude) + noise[1]
-    alive = head.alive
+    # A wall that the head's own motion brought into the sweep is met where the whisker is by then: about
+    # half-way between two poses. That it was met late stays for the whole cycle.
+    new = (first > 0) & (then(box, np.maximum(first - 1, 0)) != then(box, first))
+    before = np.concatenate([[0.0], command[:-1]])
+    stands = np.where(contact, then(wall, first), 0.0)
+    touched = np.where(contact, np.maximum(stands, np.where(new, midway[first], before[first])), 0.0)
+    reach = np.where(contact, np.maximum(then(along, first), SHORTEST), 1.0)
+    last = wall[:, -1] + touched - stands
+    return _Met(contact, touched, reach, last, np.where(np.isfinite(last), along[:, -1], 1.0))
+
+
+def _pushed(config: MechanicsConfig, whisking: WhiskingConfig, head: Head, met: _Met) -> Felt:
+    """What the drives make of it: how far whiskers bend and turn. A whisker touched near its base is stiffer:
+    it bends less and its sensor reads more."""
+    amplitude = np.radians(whisking.amplitude_deg)
+    hard = stiffness(SHAFT, met.reach)
+    push = hard * config.servo / (config.servo + hard)  # reading for each radian commanded beyond contact
+    reading = np.where(met.contact, push * (amplitude - met.touched), 0.0)
+    reading, taken = _fed_back(config, whisking, head, reading, push)
+    there = np.isfinite(met.last)
+    last = np.where(there, met.last, 0.0)
+    hard_last = stiffness(SHAFT, np.maximum(met.last_reach, SHORTEST))
+    bend = np.where(there, config.servo / (config.servo + hard_last) * (amplitude - taken - last), 0.0)
+    noticed = met.contact & (np.maximum(reading, hard_last * bend) > config.dead_zone)
+    # Slip is a matter of the angle at the end; whether contact still shows then, of the reading.
+    held = noticed & there & (bend <= config.slip) & (hard_last * bend > config.dead_zone)
+    highest = np.where(held, last + bend, amplitude - taken)
+    return Felt(noticed, np.where(noticed, met.touched + config.dead_zone, 0.0), held, highest, met.reach)
+
+
+def _fed_back(
+    config: MechanicsConfig, whisking: WhiskingConfig, head: Head, reading: np.ndarray, push: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Readings [N, W] and the amplitude taken off, rad, once the whisking law has had its say: what exceeds
+    the contact threshold lowers the amplitude, which lowers the reading, and so on to the balance."""
+    if whisking.mode == "open":
+        return reading, np.zeros_like(reading)
+    limit, gain = SDS * config.noise, whisking.gain
+    over = reading > limit
+    reading = np.where(over, (reading + push * gain * limit) / (1 + push * gain), reading)
+    taken = gain * np.maximum(reading - limit, 0.0)
+    if whisking.mode == "spread":
+        led = taken == 0
+        taken = np.where(led, whisking.follow * beside(taken, head.shape), taken)
+        reading = np.where(led, np.maximum(reading - push * taken, 0.0), reading)
+    return reading, taken
+
+
+def _sensed(
+    config: MechanicsConfig, whisking: WhiskingConfig, head: Head, felt: Felt, random: np.random.Generator
+) -> Felt:
+    """With the sensors' noise and faults."""
+    shape, alive = felt.contact.shape, head.alive
+    missed = random.random(shape) < config.missed
+    spurious = ~felt.contact & (random.random(shape) < config.spurious)
+    anywhere = random.random(shape) * np.radians(whisking.amplitude_deg)
+    noise = config.noise * random.standard_normal((2, *shape)) * np.array([1.0, MEAN])[:, None, None]
+    smeared = config.reach_noise * random.standard_normal(shape)
+    contact = ((felt.contact & ~missed) | spurious) & alive
+    touched = np.where(spurious, anywhere, felt.touched)
+    highest = np.where(spurious, anywhere, felt.highest + noise[1])
     return Felt(
-        contact=contact & alive,
-        touched=np.where(contact & alive, touched + noise[0], 0.0),
-        held=(held | spurious) & alive,
-        highest=np.where(alive, np.where(spurious, touched, highest), 0.0),
-        reach=np.where(contact & alive, np.clip(np.where(spurious, 1.0, reach) + smeared, 0.0, 1.0), 0.0),
+        contact=contact,
+        touched=np.where(contact, touched + noise[0], 0.0),
+        held=((felt.held & ~missed) | spurious) & alive,
+        highest=np.where(alive, highest, 0.0),
+        reach=np.where(contact, np.clip(felt.reach + smeared, 0.0, 1.0), 0.0),
     )
 
 

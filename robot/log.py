@@ -10,8 +10,9 @@ from typing import Self
 
 import numpy as np
 
-from robot.source import Sample, rate_of
-from tactile.types import Odometry, observation
+from robot.source import Sample, Source, rate_of
+from tactile.errors import InputError
+from tactile.types import Observation, Odometry, observation
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +26,7 @@ class Log:
         label: [N] given place id, -1 for none.
         truth: [N, 3] (x m, y m, heading rad), a row of NaN where unknown; None when nowhere known.
         params: what the recording says about itself, for whoever wants to reproduce a run on it.
+        alive: [W] whiskers that report at all; none for cameras, lasers and given labels.
     """
 
     name: str
@@ -37,6 +39,7 @@ class Log:
     label: np.ndarray
     truth: np.ndarray | None = None
     params: Mapping[str, float | int | str] = field(default_factory=dict)
+    alive: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
 
     def __post_init__(self) -> None:
         self.views.flags.writeable = False  # samples hand out slices of it
@@ -52,7 +55,7 @@ class Log:
 
     @property
     def whiskers(self) -> int:
-        return 0
+        return len(self.alive)
 
     @property
     def length(self) -> int:
@@ -63,8 +66,14 @@ class Log:
         for time, motion, view, seen, label, truth in zip(
             self.time.tolist(), self.motion, self.views, self.seen, self.label, self._truths(), strict=True
         ):
-            picture = view if seen else None
-            yield Sample(time, observation(Odometry(*motion), picture, view_shape=shape, label=label), truth)
+            reading = observation(
+                Odometry(*motion),
+                view if seen else None,
+                view_shape=shape,
+                label=label,
+                whiskers=self.whiskers,
+            )
+            yield Sample(time, reading._replace(alive=self.alive.copy()), truth)
 
     def _truths(self) -> Iterator[np.ndarray | None]:
         if self.truth is None:
@@ -79,3 +88,33 @@ class Log:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         pass
+
+
+def collected(source: Source) -> Log:
+    """A source of observations as a whole in memory; where whiskers touched is not kept.
+
+    Raises:
+        InputError: it holds whiskers that nobody has made observations of, or whiskers that died on the way.
+    """
+    samples = list(source)
+    readings = [sample.reading for sample in samples if isinstance(sample.reading, Observation)]
+    if len(readings) < len(samples) or not samples:
+        raise InputError(source.name, "nothing but whiskers" if samples else "no samples", "observations")
+    alive = readings[0].alive
+    if any((reading.alive != alive).any() for reading in readings):
+        raise InputError(source.name, "whiskers that come alive or die", "a head that stays the same")
+    unknown = np.full(3, np.nan)
+    truth = np.array([unknown if sample.truth is None else sample.truth for sample in samples])
+    return Log(
+        name=source.name,
+        digest=source.digest,
+        time=np.array([sample.time for sample in samples]),
+        motion=np.array([[*reading.odometry] for reading in readings], float),
+        moved=np.ones(len(samples), bool),
+        views=np.array([reading.view for reading in readings]),
+        seen=np.array([reading.view_seen for reading in readings]),
+        label=np.array([reading.label for reading in readings], np.int32),
+        truth=None if np.isnan(truth).all() else truth,
+        params=getattr(source, "params", {}),
+        alive=alive,
+    )

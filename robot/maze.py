@@ -69,7 +69,9 @@ def random_loop(columns: int, rows: int, length: int, random: np.random.Generato
     most = columns * rows - (columns * rows) % 2
     if length % 2 or not 4 <= length <= most or min(columns, rows) < 2:
         raise InputError(
-            "simulation.maze.loop", f"{length} cells", f"an even number from 4 to {most} in {columns} x {rows}"
+            "simulation.maze.loop",
+            f"{length} cells",
+            f"an even number from 4 to {most} in {columns} x {rows}",
         )
     for _ in range(1000):
         blob = np.zeros((columns + 1, rows + 1), bool)  # squares between centres, with a margin
@@ -97,8 +99,10 @@ def _simple(blob: np.ndarray, i: int, j: int) -> bool:
     around = [bool(padded[i + 1 + di, j + 1 + dj]) for di, dj in ring]
     sides = around[::2]
     changes = sum(a != b for a, b in zip(around, around[1:] + around[:1], strict=True))
-    return any(sides) and changes == 2 and not any(
-        around[k] and not (around[k - 1] or around[(k + 1) % 8]) for k in (1, 3, 5, 7)
+    return (
+        any(sides)
+        and changes == 2
+        and not any(around[k] and not (around[k - 1] or around[(k + 1) % 8]) for k in (1, 3, 5, 7))
     )
 
 
@@ -181,6 +185,16 @@ def walls(maze: Maze, random: np.random.Generator, heights: tuple[float, ...] = 
     return Walls(np.array(boxes), height)
 
 
+def named(walls: Walls, number: int) -> str:
+    """A box of a maze in words."""
+    x, y = (walls.box[number, :2] + walls.box[number, 2:]) / 2 / CELL
+    at_post = abs(x - round(x)) < 0.25, abs(y - round(y)) < 0.25
+    if all(at_post):
+        return f"the post at corner ({round(x)}, {round(y)})"
+    side, cell = ("west", (round(x), int(y))) if at_post[0] else ("south", (int(x), round(y)))
+    return f"the wall {side} of cell {cell}"
+
+
 def read_maze(path: Path) -> Maze:
     """A maze from a text file.
 
@@ -191,7 +205,11 @@ def read_maze(path: Path) -> Maze:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(str(path), f"cannot be read ({error})", "a micromouse maze as text") from None
-    lines = [line.rstrip() for line in lines if line.strip()]
+    lines = [line.rstrip() for line in lines]
+    skipped = next((number for number, line in enumerate(lines) if line), 0)
+    while lines and not lines[-1]:
+        lines.pop()
+    lines = lines[skipped:]
     rows, width = len(lines) // 2, max((len(line) for line in lines), default=0)
     columns = (width - 1) // 4
     if len(lines) % 2 == 0 or rows < 1 or columns < 1 or width != 4 * columns + 1:
@@ -200,46 +218,41 @@ def read_maze(path: Path) -> Maze:
             f"{len(lines)} lines of up to {width} characters",
             "2 rows + 1 lines of 4 columns + 1 characters: posts `o`, walls `---` and `|`",
         )
+
+    def expect(number: int, column: int, found: str, *kinds: str) -> None:
+        if found not in kinds:
+            expected = " or ".join(f"`{kind}`" if kind.strip() else f"{len(kind)} blank" for kind in kinds)
+            raise InputError(f"{path}:{skipped + number + 1}:{column + 1}", f"{found!r}", expected)
+
     maze = Maze(np.zeros((rows + 1, columns), bool), np.zeros((rows, columns + 1), bool))
     for number, line in enumerate(lines):
         line = line.ljust(width)
         row = rows - (number + 1) // 2
         for column in range(columns + 1):
             post = 4 * column
-            if number % 2 == 0:
-                _expect(path, number, post, line[post], "o+.")
-                if column < columns:
-                    kinds = set(line[post + 1 : post + 4])
-                    if kinds not in ({"-"}, {" "}):
-                        raise _odd(path, number, post + 1, line[post + 1 : post + 4], "`---` or three spaces")
-                    maze.across[row, column] = kinds == {"-"}
-            else:
-                _expect(path, number, post, line[post], "| ")
+            if number % 2:
+                expect(number, post, line[post], "|", " ")
                 maze.along[row, column] = line[post] == "|"
-    _sealed(path, maze, lines)
+                continue
+            expect(number, post, line[post], "o", "+", ".")
+            if column < columns:
+                expect(number, post + 1, line[post + 1 : post + 4], "---", "   ")
+                maze.across[row, column] = line[post + 1] == "-"
+    _sealed(path, maze, skipped)
     return maze
 
 
-def _expect(path: Path, line: int, column: int, found: str, among: str) -> None:
-    if found not in among:
-        raise _odd(path, line, column, found, " or ".join(f"`{character}`" for character in among))
-
-
-def _odd(path: Path, line: int, column: int, found: str, expected: str) -> InputError:
-    return InputError(f"{path}:{line + 1}:{column + 1}", f"{found!r}", expected)
-
-
-def _sealed(path: Path, maze: Maze, lines: list[str]) -> None:
+def _sealed(path: Path, maze: Maze, skipped: int) -> None:
     """Refuses a maze that leaks."""
+    last = skipped + 2 * maze.rows + 1
     for side, present, place in (
-        ("south", maze.across[0], lambda k: (len(lines), 4 * k + 2)),
-        ("north", maze.across[-1], lambda k: (1, 4 * k + 2)),
-        ("west", maze.along[:, 0], lambda k: (len(lines) - 1 - 2 * k, 1)),
-        ("east", maze.along[:, -1], lambda k: (len(lines) - 1 - 2 * k, 4 * maze.columns + 1)),
+        ("south", maze.across[0], lambda k: (last, 4 * k + 2)),
+        ("north", maze.across[-1], lambda k: (skipped + 1, 4 * k + 2)),
+        ("west", maze.along[:, 0], lambda k: (last - 1 - 2 * k, 1)),
+        ("east", maze.along[:, -1], lambda k: (last - 1 - 2 * k, 4 * maze.columns + 1)),
     ):
         if not present.all():
-            gap = int(np.argmin(present))
-            line, column = place(gap)
+            line, column = place(int(np.argmin(present)))
             raise InputError(
                 f"{path}:{line}:{column}",
                 f"a gap in the {side} wall: the maze leaks",

@@ -14,7 +14,7 @@ import numpy as np
 
 from robot.source import Sample
 from tactile.errors import InputError
-from tactile.types import Cycle, Observation, Odometry
+from tactile.types import Cycle, Observation, Odometry, Whisk
 
 CDR = b"\x00\x01\x00\x00"
 MOST = 100_000_000  # numbers in one message; more is a damaged length
@@ -35,7 +35,7 @@ uint32[3] view_shape  # rows, columns, channels
 float64[] view      # row-major, in 0..1, if view_seen
 uint32 whiskers
 float64[] point     # whiskers x 2, m in base_link, where contact
-bool[] contact      # which whiskers touched something
+uint8[] flags       # of each whisker; bit 0: it touched something, bit 1: it is dead
 bool view_seen
 bool wall           # whether a wall's orientation was measured
 """,
@@ -47,13 +47,22 @@ float64[] angle     # samples x whiskers, rad
 uint32 axes         # 2
 float64[] deflection  # samples x whiskers x 2
 """,
+    "ratslam_msgs/msg/Whisk": ODOMETRY
+    + """uint32 whiskers
+float64[] felt      # whiskers x 3: angle at first contact, rad; largest angle, rad; share of the shaft
+uint8[] flags       # of each whisker; bit 0: it reports, bit 1: it touched, bit 2: it did so to the end
+""",
     "ratslam_msgs/msg/Truth": """float64 time        # s, as in the reading it belongs to
 float64 x           # m
 float64 y           # m
 float64 heading     # rad
 """,
 }
-OBSERVATION, CYCLE, TRUTH = SCHEMAS
+OBSERVATION, CYCLE, WHISK, TRUTH = SCHEMAS
+FELT = ("touched", "highest", "reach")
+"""What `felt` of a whisk holds of each whisker."""
+FLAGS = {OBSERVATION: ("contact", "dead"), WHISK: ("alive", "contact", "held")}
+"""What the bits of `flags` mean, from the lowest."""
 
 
 class Malformed(ValueError):
@@ -86,8 +95,15 @@ def encode(sample: Sample, view_shape: tuple[int, int, int], whiskers: int) -> t
     if isinstance(reading, Cycle):
         name, layout = CYCLE, cycle_layout(len(np.atleast_1d(reading.time)), whiskers)
         values["sample_time"] = reading.time
+    elif isinstance(reading, Whisk):
+        name, layout = WHISK, whisk_layout(whiskers)
+        numbers = np.dtype(("<f8", (whiskers,)))
+        values["felt"] = np.stack([_exactly(field, values[field], numbers) for field in FELT], axis=1)
     else:
         name, layout = OBSERVATION, observation_layout(view_shape, whiskers)
+        values["dead"] = ~_exactly("alive", reading.alive, np.dtype(("?", (whiskers,)))).astype(bool)
+    if name in FLAGS:
+        values["flags"] = _packed(values, FLAGS[name], whiskers)
     values["time"] = sample.time
     record = layout.blank.copy()
     for field in layout.fields:
@@ -106,6 +122,8 @@ def decode(name: str, message: bytes, view_shape: tuple[int, int, int], whiskers
         if samples * (1 + 3 * whiskers) > MOST:
             raise Malformed(f"a cycle of {samples} samples")
         layout = cycle_layout(samples, whiskers)
+    elif name == WHISK:
+        layout = whisk_layout(whiskers)
     else:
         layout = observation_layout(view_shape, whiskers)
     if len(message) != layout.dtype.itemsize:
@@ -117,13 +135,18 @@ def decode(name: str, message: bytes, view_shape: tuple[int, int, int], whiskers
     if name == CYCLE:
         time, angle, deflection = (record[field].copy() for field in ("sample_time", "angle", "deflection"))
         return float(record["time"]), Cycle(time, angle, deflection, odometry)
+    flags = _unpacked(record["flags"], FLAGS[name])
+    if name == WHISK:
+        felt = {field: record["felt"][:, k].copy() for k, field in enumerate(FELT)}
+        return float(record["time"]), Whisk(odometry=odometry, **flags, **felt)
     return float(record["time"]), Observation(
         odometry=odometry,
         motion=record["motion"],
         view=record["view"].copy(),  # copies are aligned and the caller's own
         view_seen=record["view_seen"],
         label=record["label"],
-        contact=record["contact"].copy(),
+        contact=flags["contact"],
+        alive=~flags["dead"],
         point=record["point"].copy(),
         wall=record["wall"],
         wall_point=record["wall_point"].copy(),
@@ -161,8 +184,8 @@ def observation_layout(view_shape: tuple[int, int, int], whiskers: int) -> Layou
             ("whiskers", "<u4"),
             ("point_length", "<u4"),
             ("point", "<f8", (whiskers, 2)),
-            ("contact_length", "<u4"),
-            ("contact", "?", (whiskers,)),
+            ("flags_length", "<u4"),
+            ("flags", "u1", (whiskers,)),
             ("view_seen", "?"),
             ("wall", "?"),
         ],
@@ -170,7 +193,25 @@ def observation_layout(view_shape: tuple[int, int, int], whiskers: int) -> Layou
         view_length=pixels,
         whiskers=whiskers,
         point_length=2 * whiskers,
-        contact_length=whiskers,
+        flags_length=whiskers,
+    )
+
+
+@lru_cache(maxsize=16)
+def whisk_layout(whiskers: int) -> Layout:
+    """The packed form of the Whisk schema for so many whiskers."""
+    return _layout(
+        [
+            *_ODOMETRY,
+            ("whiskers", "<u4"),
+            ("felt_length", "<u4"),
+            ("felt", "<f8", (whiskers, len(FELT))),
+            ("flags_length", "<u4"),
+            ("flags", "u1", (whiskers,)),
+        ],
+        whiskers=whiskers,
+        felt_length=len(FELT) * whiskers,
+        flags_length=whiskers,
     )
 
 
@@ -215,6 +256,21 @@ def _layout(fields: list[Any], **fixed: Any) -> Layout:
         fixed=tuple((start, start + size, content[start : start + size]) for start, size in places),
         fields=tuple(name for name in dtype.names or () if name != "cdr" and name not in fixed),
     )
+
+
+def _packed(values: dict[str, Any], names: tuple[str, ...], whiskers: int) -> np.ndarray:
+    """[W] uint8, the truths [W] of these names as bits."""
+    flags = np.zeros(whiskers, np.uint8)
+    for bit, name in enumerate(names):
+        flags |= _exactly(name, values[name], np.dtype(("?", (whiskers,)))).astype(np.uint8) << bit
+    return flags
+
+
+def _unpacked(flags: np.ndarray, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """The inverse of `_packed`."""
+    if (flags >> len(names)).any():
+        raise Malformed(f"whisker flags {int(flags.max())} where {2 ** len(names) - 1} is the largest known")
+    return {name: (flags >> bit & 1).astype(bool) for bit, name in enumerate(names)}
 
 
 def _exactly(name: str, value: Any, dtype: np.dtype) -> np.ndarray:

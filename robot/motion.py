@@ -90,7 +90,7 @@ def carried(path: Path, at_times: Sequence[float], ahead: float) -> tuple[Path, 
     times, poses, start, done = [], [], 0.0, 0.0
     jumps = []
     for when in [*sorted(at_times), np.inf]:
-        stop = min(when + start - done, path.duration) if np.isfinite(when) else path.duration
+        stop = min(max(when + start - done, start), path.duration)
         inner = (path.time > start) & (path.time < stop)
         part = np.concatenate([[start], path.time[inner], [stop]])
         times.append(part - start + done)

@@ -1,4 +1,8 @@
-"""What a robot believes of its motion: odometry with errors of the kinds that real ones make."""
+"""Body-frame motions: of what robots log, velocities or poses, and of what a simulated one believes.
+
+A motion is a row (dx m, dy m, dtheta rad, dt s), the pose after a step in the frame of the pose before
+it. The first row of a log only sets the clock: its motion is zero and took no time.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +14,38 @@ from pydantic import NonNegativeFloat, PositiveFloat
 from tactile.frames import between, wrap
 from tactile.settings import Settings
 
-MOVES = 1e-3
-"""m in a sample from which a robot is driving."""
+NEW_HEADING = 1.0  # OpenRatSLAM: turn first, then move
+MID_HEADING = 0.5  # second order: exact to O(turn^2) for a constant twist over the step
+DRIVES = 1e-3
+"""m/s above which a robot is driving."""
 TURNS = 0.06
-"""rad in a sample from which it is turning."""
+"""rad/s above which it is turning."""
+
+
+def from_velocities(
+    time: np.ndarray,
+    forward: np.ndarray,
+    left: np.ndarray | float,
+    turn: np.ndarray,
+    heading: float = MID_HEADING,
+) -> np.ndarray:
+    """Motions [N, 4] of a robot that had row i's velocities since row i - 1.
+
+    Args:
+        time: [N] s. forward, left: [N] m/s in the body frame. turn: [N] rad/s, counter-clockwise.
+        heading: the share of the step's turn made before the robot moves: `MID_HEADING`, or
+            `NEW_HEADING` as in OpenRatSLAM.
+    """
+    dt = np.diff(time, prepend=time[:1])
+    dtheta = turn * dt
+    c, s = np.cos(heading * dtheta), np.sin(heading * dtheta)
+    return np.stack([(c * forward - s * left) * dt, (s * forward + c * left) * dt, dtheta, dt], axis=-1)
+
+
+def from_poses(time: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """Motions [N, 4] between successive poses [N, 3] of a world frame, the sideways part kept."""
+    steps = between(poses[:-1], poses[1:])
+    return np.column_stack([np.vstack([np.zeros((1, 3)), steps]), np.diff(time, prepend=time[:1])])
 
 
 class OdometryConfig(Settings):
@@ -35,9 +67,12 @@ class OdometryConfig(Settings):
 
 
 def reckoned(
-    config: OdometryConfig, time: np.ndarray, pose: np.ndarray, random: np.random.Generator,
+    config: OdometryConfig,
+    time: np.ndarray,
+    pose: np.ndarray,
+    random: np.random.Generator,
     carried: np.ndarray | None = None,
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """[N, 4] (dx m, dy m, dtheta rad, dt s) since the row before, as the odometry tells it.
 
     Args:
@@ -76,9 +111,9 @@ def _errors(
     else:
         gate = np.ones((count, 2), bool)
         if config.noise == "gated":
-            way = np.concatenate([np.zeros((1, 2)), np.cumsum(
-                np.abs(np.stack([np.hypot(motion[:, 0], motion[:, 1]), motion[:, 2]], 1)), axis=0)])  # fmt: skip
-            moved = np.stack([np.diff(np.interp(ticks, time, column)) for column in way.T], axis=1)
-            gate = moved > [MOVES, TURNS / config.rate]
+            amount = np.abs(np.stack([np.hypot(motion[:, 0], motion[:, 1]), motion[:, 2]], axis=1))
+            total = np.concatenate([np.zeros((1, 2)), np.cumsum(amount, axis=0)])
+            moved = np.stack([np.diff(np.interp(ticks, time, column)) for column in total.T], axis=1)
+            gate = moved * config.rate > [DRIVES, TURNS]
         total = np.concatenate([np.zeros((1, 2)), np.cumsum(error[1:] * gate, axis=0)])
     return np.stack([np.diff(np.interp(time, ticks, column)) for column in total.T], axis=1)

@@ -6,10 +6,11 @@ full or half a second old, so that a killed process loses at most that half seco
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
@@ -26,11 +27,14 @@ class Recorder:
     Args:
         path: must not exist yet.
         view_shape, whiskers: of every sample. rate_hz: how fast they come, if known; for readers' eyes only.
+        rig: by what the samples were made (see `robot.source.Rigged`): what JSON can hold. It stands at the
+            start of the file, so one that is cut off still has it.
         chunk_bytes: a chunk is written when it is so large, before compression,
         chunk_s: or when its last sample comes so many seconds after that of the chunk before.
 
     Raises:
         InputError: the file exists or cannot be made.
+        ValueError, TypeError: the rig is more than JSON can hold.
     """
 
     def __init__(
@@ -40,11 +44,13 @@ class Recorder:
         view_shape: tuple[int, int, int] = (3, 6, 1),
         whiskers: int = 0,
         rate_hz: float = 0.0,
+        rig: Mapping[str, Any] | None = None,
         chunk_bytes: int = 1 << 16,
         chunk_s: float = 0.5,
     ) -> None:
-        description = Description(view_shape, whiskers, rate_hz, _program())
-        Description.from_metadata(description.to_metadata())
+        description = Description(view_shape, whiskers, rate_hz, _program(), dict(rig or {}))
+        metadata = description.to_metadata()
+        Description.from_metadata(metadata)
         try:
             self._file = path.open("xb")
         except FileExistsError as error:
@@ -63,7 +69,7 @@ class Recorder:
             self._file, chunk_size=1 << 62, compression=CompressionType.ZSTD, enable_data_crcs=True
         )
         self._writer.start(library=_program())
-        self._writer.add_metadata(METADATA, description.to_metadata())
+        self._writer.add_metadata(METADATA, metadata)
         self._writer.flush()
 
     def write(self, sample: Sample) -> None:

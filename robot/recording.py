@@ -5,21 +5,21 @@ from __future__ import annotations
 import hashlib
 import os
 from array import array
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
 from robot.files import refuse, require_file, unreadable
 from robot.plausibility import clock, finite, views
 from robot.recorder import Recorder
-from robot.source import Sample, Source, rate_of
+from robot.source import Sample, Source, rate_of, rig_of
 from robot.units import ORDINARY, Limits, Track, units
 from robot.walk import Description, Walk
 from tactile.errors import InputError
-from tactile.types import Cycle
+from tactile.types import Cycle, Observation, Whisk
 
 
 class Recording:
@@ -34,6 +34,8 @@ class Recording:
         truncated: whether the file ends before its proper end; `length` samples are read all the same.
         warning: that sentence, or ''.
         created_by: program and version that recorded it.
+        rig: by what it was made, {} where the file does not say. whisked: whether some of its readings are
+            whiskers, which have no view yet. params: what the rig says for whoever reproduces a run on it.
 
     Raises:
         InputError: no such recording, no sample in it that can be read, or values that cannot be.
@@ -51,11 +53,13 @@ class Recording:
         self.digest = _digest(path)
         walk = Walk(path)
         columns = array("d")
+        self.whisked = False
         for sample in walk:
             columns.extend(_column(sample))
+            self.whisked |= not isinstance(sample.reading, Observation)
         description = _described(walk)
         self.view_shape, self.whiskers = description.view_shape, description.whiskers
-        self.created_by = description.created_by
+        self.created_by, self.rig = description.created_by, description.rig
         self.length = walk.count
         self.truncated = bool(walk.broken)
         self.warning = ""
@@ -65,6 +69,11 @@ class Recording:
         self.rate_hz = rate_of(time) or description.rate_hz
         if self.truncated and warn is not None:
             warn(self.warning)
+
+    @property
+    def params(self) -> Mapping[str, Any]:
+        params = self.rig.get("params")
+        return params if isinstance(params, dict) else {}
 
     def _check(self, columns: np.ndarray, limits: Limits) -> np.ndarray:
         """The times [N] s of the samples with odometry, after refusing what cannot be."""
@@ -121,7 +130,11 @@ class Recovery(NamedTuple):
 def record(source: Source, path: Path) -> int:
     """Write all samples of a source to a new recording; their number."""
     with Recorder(
-        path, view_shape=source.view_shape, whiskers=source.whiskers, rate_hz=source.rate_hz
+        path,
+        view_shape=source.view_shape,
+        whiskers=source.whiskers,
+        rate_hz=source.rate_hz,
+        rig=rig_of(source),
     ) as recorder:
         for sample in source:
             recorder.write(sample)
@@ -146,7 +159,7 @@ def recover(path: Path, out: Path) -> Recovery:
     draft = out.with_name(f".{out.name}.{os.getpid()}.part")
     try:
         with Recorder(draft, view_shape=description.view_shape, whiskers=description.whiskers,
-                      rate_hz=description.rate_hz) as recorder:  # fmt: skip
+                      rate_hz=description.rate_hz, rig=description.rig) as recorder:  # fmt: skip
             if first is not None:
                 recorder.write(first)
             for sample in samples:
@@ -179,6 +192,8 @@ def _column(sample: Sample) -> tuple[float, ...]:
     low = high = np.nan
     if isinstance(reading, Cycle):
         parts = [reading.time, reading.angle, reading.deflection]
+    elif isinstance(reading, Whisk):
+        parts = [reading.touched, reading.highest, reading.reach]
     else:
         parts = [reading.view, reading.point, reading.wall_point, reading.wall_sd]
         if reading.view_seen:

@@ -7,6 +7,7 @@ looks where it goes, and turns on the spot.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -24,7 +25,9 @@ def circuits(loop: Sequence[Cell], word: str) -> list[Cell]:
         InputError: another letter, or none.
     """
     if not word or set(word.upper()) - set("CA"):
-        raise InputError("simulation.path.circuits", repr(word), "a word of C (clockwise) and A (anticlockwise)")
+        raise InputError(
+            "simulation.path.circuits", repr(word), "a word of C (clockwise) and A (anticlockwise)"
+        )
     way = [loop[0]]
     for letter in word.upper():
         way += [*loop[1:], loop[0]] if letter == "A" else [*loop[:0:-1], loop[0]]
@@ -35,7 +38,7 @@ def exploration(maze: Maze, start: Cell, cells: int, random: np.random.Generator
     """So many cells of a way that chooses at random where it can, and turns back only in dead ends.
 
     Raises:
-        InputError: there is no way out of the start.
+        InputError: the start lies outside, or there is no way out of it.
     """
     way = [start]
     before: Cell | None = None
@@ -49,8 +52,26 @@ def exploration(maze: Maze, start: Cell, cells: int, random: np.random.Generator
     return way
 
 
-def checked(maze: Maze, way: Sequence[Cell]) -> None:
+def anticlockwise(loop: Sequence[Cell]) -> list[Cell]:
+    """The loop that way round, from the same cell.
+
+    Raises:
+        InputError: it passes a cell twice, or holds fewer than four.
+    """
+    if len(loop) < 4 or len(set(loop)) < len(loop):
+        twice = next((cell for k, cell in enumerate(loop) if cell in loop[:k]), None)
+        found = f"{len(loop)} cells" if twice is None else f"cell {twice} twice"
+        raise InputError("simulation.path.loop", found, "at least four different cells")
+    x, y = np.array(loop).T
+    area = np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))
+    return list(loop) if area > 0 else [loop[0], *loop[:0:-1]]
+
+
+def checked(maze: Maze, way: Sequence[Cell], where: str = "simulation.path.cells") -> None:
     """Refuses a way that leaves the maze or goes through a wall.
+
+    Args:
+        where: what messages call the way.
 
     Raises:
         InputError: naming the leg and the wall.
@@ -58,17 +79,17 @@ def checked(maze: Maze, way: Sequence[Cell]) -> None:
     for number, cell in enumerate(way):
         if not (0 <= cell[0] < maze.columns and 0 <= cell[1] < maze.rows):
             raise InputError(
-                f"simulation.path.cells[{number}]",
+                f"{where}[{number}]",
                 f"cell {tuple(cell)}",
                 f"columns 0 to {maze.columns - 1} and rows 0 to {maze.rows - 1}",
             )
-    for number, (a, b) in enumerate(zip(way, way[1:], strict=False)):
-        where = f"simulation.path.cells[{number}] to [{number + 1}]"
+    for number, (a, b) in enumerate(pairwise(way)):
+        leg = f"{where}[{number}] to [{number + 1}]"
         if abs(a[0] - b[0]) + abs(a[1] - b[1]) != 1:
-            raise InputError(where, f"from cell {tuple(a)} to {tuple(b)}", "a step to a neighbouring cell")
+            raise InputError(leg, f"from cell {tuple(a)} to {tuple(b)}", "a step to a neighbouring cell")
         if not is_open(maze, a, b):
             raise InputError(
-                where,
+                leg,
                 f"a way through the wall between cells {tuple(a)} and {tuple(b)}",
                 "a way around the walls",
                 "take the wall out of the maze or lead the path around it",

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from types import TracebackType
-from typing import NamedTuple, Protocol, Self, runtime_checkable
+from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
 
 import numpy as np
 
-from tactile.types import Cycle, Observation
+from tactile.types import Cycle, Observation, Whisk
 
 
 class Sample(NamedTuple):
@@ -16,13 +16,14 @@ class Sample(NamedTuple):
 
     Attributes:
         time: s, on the source's own clock; never goes back.
-        reading: what the robot sensed: raw whiskers (`Cycle`) or an `Observation`.
+        reading: what the robot sensed: an `Observation`, or whiskers, raw (`Cycle`) or felt (`Whisk`), of
+            which the sense of touch makes one.
         truth: [3] where the robot really was (x m, y m, heading rad), or None where that is unknown.
             It travels beside the reading, never inside, so no engine can peek.
     """
 
     time: float
-    reading: Observation | Cycle
+    reading: Observation | Cycle | Whisk
     truth: np.ndarray | None
 
 
@@ -56,6 +57,26 @@ class Source(Protocol):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None: ...
+
+
+@runtime_checkable
+class Rigged(Source, Protocol):
+    """A source that knows by what it was made.
+
+    Attributes:
+        rig: a JSON document: the head's configuration, the simulation's, calibrations; {} where unknown.
+        whisked: whether readings are whiskers, which have no view yet.
+    """
+
+    @property
+    def rig(self) -> Mapping[str, Any]: ...
+    @property
+    def whisked(self) -> bool: ...
+
+
+def rig_of(source: Source) -> Mapping[str, Any]:
+    """By what a source was made; {} where it does not know."""
+    return source.rig if isinstance(source, Rigged) else {}
 
 
 def rate_of(time: np.ndarray) -> float:

@@ -8,10 +8,12 @@ is exactly a prefix of what was written.
 
 from __future__ import annotations
 
+import json
 import struct
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any, NamedTuple, cast
+from zlib import crc32
 
 import numpy as np
 import zstandard
@@ -20,12 +22,27 @@ from mcap.records import Channel, Chunk, McapRecord, Message, Metadata, Schema, 
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 from robot.files import unreadable
-from robot.messages import CYCLE, MOST, OBSERVATION, TRUTH, Malformed, decode, decode_truth
+from robot.messages import (
+    CYCLE,
+    MOST,
+    OBSERVATION,
+    SCHEMAS,
+    TRUTH,
+    WHISK,
+    Malformed,
+    decode,
+    decode_truth,
+)
 from robot.source import Sample
 
 METADATA = "ratslam"
-FORMAT = "1"
-TOPICS = {OBSERVATION: "/ratslam/observation", CYCLE: "/ratslam/cycle", TRUTH: "/ratslam/truth"}
+FORMAT = "2"
+TOPICS = {
+    OBSERVATION: "/ratslam/observation",
+    CYCLE: "/ratslam/cycle",
+    WHISK: "/ratslam/whisk",
+    TRUTH: "/ratslam/truth",
+}
 SCHEMA_OF = {topic: name for name, topic in TOPICS.items()}
 CHUNK_LIMIT = 1 << 28  # bytes; ours hold 64 kB, or one sample if that is larger
 
@@ -39,38 +56,51 @@ class Description(NamedTuple):
     Attributes:
         view_shape: (R, C, K). whiskers: W. rate_hz: as announced by who recorded it, 0 if unknown.
         created_by: program and version.
+        rig: a JSON document about the robot that was recorded (see `robot.source.Rigged`).
     """
 
     view_shape: tuple[int, int, int]
     whiskers: int
     rate_hz: float
     created_by: str
+    rig: Mapping[str, Any] = {}
 
     def to_metadata(self) -> dict[str, str]:
-        return {
+        """Raises `ValueError` for a rig that JSON cannot hold."""
+        data = {
             "format": FORMAT,
             "view_shape": ",".join(map(str, self.view_shape)),
             "whiskers": str(self.whiskers),
             "rate_hz": repr(self.rate_hz),
             "created_by": self.created_by,
+            "rig": json.dumps(self.rig, allow_nan=False, sort_keys=True),
         }
+        return data | {"crc32": _checksum(data)}
 
     @classmethod
     def from_metadata(cls, data: Mapping[str, str]) -> Description:
         """Raises `ValueError` for anything `to_metadata` cannot have written."""
         if data.get("format") != FORMAT:
             raise Malformed(f"format {data.get('format')!r} where {FORMAT!r} is the one known")
+        if data.get("crc32") != _checksum(data):
+            raise Malformed("a description without its checksum")
         try:
             rows, columns, channels = (int(size) for size in data["view_shape"].split(","))
-            found = cls(
-                (rows, columns, channels), int(data["whiskers"]), float(data["rate_hz"]), data["created_by"]
-            )
+            whiskers, rate_hz, rig = int(data["whiskers"]), float(data["rate_hz"]), json.loads(data["rig"])
+            found = cls((rows, columns, channels), whiskers, rate_hz, data["created_by"], rig)
         except KeyError as error:
             raise Malformed(f"a description without {error}") from error
         sizes = (*found.view_shape, found.whiskers + 1)
         if min(sizes) < 1 or rows * columns * channels + 3 * found.whiskers > MOST:
             raise Malformed(f"views of shape {found.view_shape} and {found.whiskers} whiskers")
+        if not isinstance(rig, dict):
+            raise Malformed("a rig that is no document")
         return found
+
+
+def _checksum(data: Mapping[str, str]) -> str:
+    """Of all of a description but the checksum; outside chunks, MCAP itself has none."""
+    return str(crc32(json.dumps({**data, "crc32": ""}, sort_keys=True).encode()))
 
 
 class Walk:
@@ -96,15 +126,18 @@ class Walk:
             raise unreadable(self.path, error) from error
 
     def _samples(self, file: IO[bytes]) -> Iterator[Sample]:
+        schemas: dict[int, Schema] = {}
         names: dict[int, str] = {}
         truth: tuple[float, np.ndarray] | None = None
         try:
             for record in _records(file):
                 if isinstance(record, Metadata) and record.name == METADATA and self.description is None:
                     self.description = Description.from_metadata(record.metadata)
+                elif isinstance(record, Schema):
+                    schemas[record.id] = record
                 elif isinstance(record, Channel):
                     if record.topic in SCHEMA_OF:
-                        names[record.id] = SCHEMA_OF[record.topic]
+                        names[record.id] = _known(record, schemas)
                 elif isinstance(record, Message) and record.channel_id in names:
                     name = names[record.channel_id]
                     if self.description is None:
@@ -136,6 +169,14 @@ class Walk:
         written = sum(counts.get(number, 0) for number, name in names.items() if name != TRUTH)
         if written != self.count:
             raise Malformed(f"{self.count} samples where {written} were written")
+
+
+def _known(channel: Channel, schemas: Mapping[int, Schema]) -> str:
+    """The schema of a topic of ours; raises `Malformed` for one that other versions wrote."""
+    name, schema = SCHEMA_OF[channel.topic], schemas.get(channel.schema_id)
+    if schema is None or schema.data != SCHEMAS[name].encode():
+        raise Malformed(f"messages on {channel.topic} that are defined otherwise than here")
+    return name
 
 
 class _Bounded:

@@ -2,7 +2,8 @@
 
 Each whisker swings in a vertical plane through the head's axis, from outside down and inwards. What it can
 meet are the tops of boxes (with its tip) and their far upper edges (with its shaft): of a straight stick
-that comes down over a box, the lowest point above the box is the outermost one.
+that comes down over a box, the lowest point above the box is the outermost one. A box nearer to the axis than
+its base it meets beyond the vertical, with the tip against the far face.
 """
 
 from __future__ import annotations
@@ -112,10 +113,8 @@ class Surroundings:
             far.append((np.minimum(*edges), np.maximum(*edges)))
         return np.maximum(far[0][0], far[1][0]), np.minimum(far[0][1], far[1][1])
 
-    def _down(
-        self, w: int, d1: np.ndarray, d2: np.ndarray, top: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Protraction at which whisker w, coming down, meets boxes from d1 to d2 m away, and where along it."""
+    def _down(self, w: int, d1: np.ndarray, d2: np.ndarray, top: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Protraction at which whisker w meets boxes from d1 to d2 m away, and where along it."""
         radius, length, rest = self._radius[w], self.head.length[w], self._opening[w]
         drop = self.head.base[w, 2] - top
         # With the tip as high as the top, how far out is it?
@@ -127,7 +126,10 @@ class Surroundings:
         by_edge = (low & (out > d2)) & (edge <= length)
         # A head that hangs below the tops, or over a box, meets its walls at once: protraction 0.
         over = np.arctan2(d2 - radius, drop)
+        # Past the vertical the tip leads: it runs into the far face below that edge.
+        inside = d2 < radius
+        over = np.where(inside, np.arcsin(np.clip((d2 - radius) / length, -1, 1)), over)
         found = np.where(by_tip, opening, np.where(by_edge, over, -np.inf))
-        share = np.where(by_tip, 1.0, edge / length)
+        share = np.where(by_tip | inside, 1.0, edge / length)
         angle = np.where(found > -np.inf, np.maximum(rest - found, 0.0), FREE)
         return angle, np.where(np.isfinite(angle), np.clip(share, 0, 1), 0.0)

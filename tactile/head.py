@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
 from tactile.settings import Settings
 from tactile.types import Array
@@ -34,7 +34,7 @@ class HeadConfig(Settings):
     """The UR-10 head of Salman & Pearson 2016, III-A: rings around a vertical axis, whiskers hanging out and
     down, protracting towards the axis. Lengths are the paper's; what it leaves open are these defaults."""
 
-    rings: tuple[RingConfig, ...] = (
+    rings: Annotated[tuple[RingConfig, ...], Field(min_length=1)] = (
         RingConfig(length=0.05, radius=0.045, height=0.082),
         RingConfig(length=0.11, radius=0.065, height=0.12),
         RingConfig(length=0.16, radius=0.08, height=0.165),
@@ -50,6 +50,13 @@ class HeadConfig(Settings):
     """Largest protraction that the drives allow."""
     dead: tuple[NonNegativeInt, ...] = ()
     """Whiskers that do not report, by number (row by row)."""
+
+    @model_validator(mode="after")
+    def _known(self) -> HeadConfig:
+        count = len(self.rings) * self.whiskers
+        if any(whisker >= count for whisker in self.dead):
+            raise ValueError(f"dead whiskers {list(self.dead)}: the head has whiskers 0 to {count - 1}")
+        return self
 
 
 class Head(NamedTuple):
@@ -71,11 +78,7 @@ class Head(NamedTuple):
 
 
 def ur10_head(config: HeadConfig) -> Head:
-    """The head of that geometry.
-
-    Raises:
-        ValueError: a dead whisker that there is not.
-    """
+    """The head of that geometry."""
     rows, columns = len(config.rings), config.whiskers
     azimuth = np.radians(config.first_deg) + np.arange(columns) * (2 * np.pi / columns)
     outwards = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(columns)], axis=1)
@@ -84,8 +87,6 @@ def ur10_head(config: HeadConfig) -> Head:
     rest = np.sin(opening) * outwards - np.cos(opening) * up
     swing = -np.cos(opening) * outwards - np.sin(opening) * up
     alive = np.ones(rows * columns, bool)
-    if any(whisker >= len(alive) for whisker in config.dead):
-        raise ValueError(f"dead whiskers {list(config.dead)}: the head has whiskers 0 to {len(alive) - 1}")
     alive[list(config.dead)] = False
     return Head(
         base=np.concatenate([ring.radius * outwards + ring.height * up for ring in config.rings]),

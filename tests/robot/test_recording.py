@@ -17,14 +17,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from robot.messages import decode, encode
+from robot.messages import OBSERVATION, SCHEMAS, WHISK, decode, encode
 from robot.recorder import Recorder
 from robot.recording import Recording, record, recover
-from robot.source import Sample, Source
+from robot.source import Rigged, Sample, Source, rig_of
 from robot.streams import read_stream
-from robot.walk import TOPICS, Walk
+from robot.walk import FORMAT, TOPICS, Walk, _checksum
 from tactile.errors import InputError
-from tactile.types import Cycle, Observation, Odometry, observation
+from tactile.types import Cycle, Observation, Odometry, Whisk, observation
 
 SHAPE, WHISKERS = (2, 3, 2), 4
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
@@ -51,6 +51,7 @@ OBSERVATIONS = st.builds(
     view_seen=st.booleans().map(np.bool_),
     label=st.integers(-1, 2**31 - 1).map(np.int32),
     contact=_bools(WHISKERS),
+    alive=_bools(WHISKERS),
     point=_numbers(WHISKERS, 2),
     wall=st.booleans().map(np.bool_),
     wall_point=_numbers(2),
@@ -65,8 +66,19 @@ CYCLES = st.integers(0, 5).flatmap(
         odometry=ODOMETRIES,
     )
 )
+WHISKS = st.builds(
+    Whisk,
+    odometry=ODOMETRIES,
+    alive=_bools(WHISKERS),
+    contact=_bools(WHISKERS),
+    touched=_numbers(WHISKERS),
+    held=_bools(WHISKERS),
+    highest=_numbers(WHISKERS),
+    reach=_numbers(WHISKERS),
+)
+RIG = {"head": {"rest_deg": 75.0}, "calibration": {"sd": [[1e-3, 0.1], [1e-300, -0.0]]}, "über": None}
 TRUTHS = st.none() | _numbers(3, low=-0.1, high=0.1)
-SAMPLES = st.lists(st.tuples(OBSERVATIONS | CYCLES, TRUTHS), min_size=1, max_size=12).map(
+SAMPLES = st.lists(st.tuples(OBSERVATIONS | CYCLES | WHISKS, TRUTHS), min_size=1, max_size=12).map(
     lambda parts: [Sample(100 + 0.5 * i, *part) for i, part in enumerate(parts)]
 )
 
@@ -93,6 +105,7 @@ def _same(one: Sequence[Sample], other: Sequence[Sample]) -> bool:
 
 def _write(path: Path, samples: Sequence[Sample], **options: Any) -> Path:
     path.unlink(missing_ok=True)
+    options = {"rig": RIG} | options
     with Recorder(path, view_shape=SHAPE, whiskers=WHISKERS, rate_hz=2.0, **options) as recorder:
         for sample in samples:
             recorder.write(sample)
@@ -100,7 +113,7 @@ def _write(path: Path, samples: Sequence[Sample], **options: Any) -> Path:
 
 
 def _samples(count: int, seed: int = 0) -> list[Sample]:
-    """Samples of both kinds with every field filled."""
+    """Samples of all kinds with every field filled."""
     rng = np.random.default_rng(seed)
     samples = []
     for i in range(count):
@@ -109,10 +122,15 @@ def _samples(count: int, seed: int = 0) -> list[Sample]:
         if i % 4 == 3:
             arrays_ = (rng.random(2), rng.normal(size=(2, WHISKERS)), rng.normal(size=(2, WHISKERS, 2)))
             samples.append(Sample(0.5 * i, Cycle(*arrays_, odometry), truth))
+        elif i % 4 == 2:
+            truths, numbers = rng.random((3, WHISKERS)) < 0.5, rng.normal(size=(3, WHISKERS))
+            felt = Whisk(odometry, truths[0], truths[1], numbers[0], truths[2], *numbers[1:])
+            samples.append(Sample(0.5 * i, felt, truth))
         else:
             seen = observation(odometry, rng.random(SHAPE), label=i, whiskers=WHISKERS)
             point = rng.normal(size=(WHISKERS, 2))
-            samples.append(Sample(0.5 * i, seen._replace(point=point, contact=point[:, 0] > 0), truth))
+            seen = seen._replace(point=point, contact=point[:, 0] > 0, alive=point[:, 1] > 0)
+            samples.append(Sample(0.5 * i, seen, truth))
     return samples
 
 
@@ -134,6 +152,8 @@ def test_what_is_written_comes_back_bit_for_bit(tmp_path_factory: Any, samples: 
         assert _same(list(source), samples)  # and again
         assert (source.length, source.view_shape, source.whiskers) == (len(samples), SHAPE, WHISKERS)
         assert (source.truncated, source.warning, source.rate_hz) == (False, "", 2.0)
+        assert source.rig == rig_of(source) == RIG
+        assert source.whisked == any(not isinstance(sample.reading, Observation) for sample in samples)
 
 
 def test_the_file_depends_on_the_samples_alone(tmp_path: Path) -> None:
@@ -167,6 +187,7 @@ def _check_prefix(path: Path, samples: list[Sample]) -> int:
         return 0
     read = list(source)
     assert _same(read, samples[: len(read)])
+    assert source.rig == RIG
     assert source.length == len(read)
     assert told == ([source.warning] if source.truncated else [])
     assert source.truncated or len(read) == len(samples)
@@ -177,7 +198,8 @@ def test_a_recording_may_be_cut_off_anywhere(small: tuple[bytes, list[Sample]], 
     content, samples = small
     path = tmp_path / "cut.mcap"
     counts = []
-    for size in range(len(content)):
+    last = content.rindex(b"\x28\xb5\x2f\xfd")  # behind it stands the table of contents
+    for size in [*range(last), *range(last, len(content), 7)]:
         path.write_bytes(content[:size])
         counts.append(_check_prefix(path, samples))
     assert counts == sorted(counts)
@@ -255,7 +277,7 @@ def test_recover_makes_a_whole_file(small: tuple[bytes, list[Sample]], tmp_path:
     again = Recording(whole)
     assert not again.truncated
     assert _same(list(again), samples[: found.length])
-    assert (again.view_shape, again.whiskers) == (SHAPE, WHISKERS)
+    assert (again.view_shape, again.whiskers, again.rig) == (SHAPE, WHISKERS, RIG)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cut.mcap", "whole.mcap"]
     assert recover(whole, tmp_path / "third.mcap") == (found.length, False, "")
 
@@ -303,6 +325,7 @@ def test_a_recorder_refuses_what_it_cannot_hold(tmp_path: Path, refused: Callabl
         "label: float64 values": {"label": 1.5},
         "view: complex128 values": {"view": np.zeros(SHAPE, complex)},
         "contact: int64 values; expected values that bool holds": {"contact": np.array([0, 1, 2, 0])},
+        "alive: shape [3]; expected [4]": {"alive": np.ones(3, bool)},
     }
     with Recorder(path, view_shape=SHAPE, whiskers=WHISKERS) as recorder:
         for piece, change in wrong.items():
@@ -363,7 +386,8 @@ def test_the_standard_reader_reads_it(small: tuple[bytes, list[Sample]], tmp_pat
         reader = make_reader(file)
         assert [m.metadata["view_shape"] for m in reader.iter_metadata() if m.name == "ratslam"] == ["2,3,2"]
         found = [(schema.encoding, channel.topic) for schema, channel, _ in reader.iter_messages()]
-    assert set(found) == {("ros2msg", f"/ratslam/{name}") for name in ("observation", "cycle", "truth")}
+    topics = ("observation", "cycle", "whisk", "truth")
+    assert set(found) == {("ros2msg", f"/ratslam/{name}") for name in topics}
     assert len(found) == len(samples) + sum(sample.truth is not None for sample in samples)
 
 
@@ -371,7 +395,7 @@ def test_ros_tools_read_the_messages() -> None:
     pytest.importorskip("rosbags", reason="rosbags, an extra, is not installed")
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    from robot.messages import CYCLE, OBSERVATION, SCHEMAS
+    from robot.messages import CYCLE
 
     store = get_typestore(Stores.EMPTY)
     for name, text in SCHEMAS.items():
@@ -383,7 +407,14 @@ def test_ros_tools_read_the_messages() -> None:
         assert (read.time, read.dtheta) == (sample.time, sample.reading.odometry.dtheta)
         if name == OBSERVATION:
             assert (read.view.reshape(SHAPE) == sample.reading.view).all()
-            assert (read.contact == sample.reading.contact).all()
+            flags = sample.reading.contact + 2 * ~sample.reading.alive
+            assert (read.flags == flags).all()
+        elif name == WHISK:
+            felt = sample.reading
+            assert (
+                read.felt.reshape(WHISKERS, 3) == np.stack([felt.touched, felt.highest, felt.reach], 1)
+            ).all()
+            assert (read.flags == felt.alive + 2 * felt.contact + 4 * felt.held).all()
         else:
             assert name == CYCLE
             assert (read.deflection.reshape(2, WHISKERS, 2) == sample.reading.deflection).all()
@@ -410,9 +441,10 @@ def test_a_chunk_that_would_not_fit_into_memory_is_not_opened(
     st.binary(max_size=200),
     st.sampled_from(["2,3,2", "2,3", "0,1,1", "9999999,9999,9", "a,b,c", "-1,1,1"]),
     st.integers(-1, 1 << 40),
+    st.sampled_from(["{}", "[]", "{", "1"]),
 )
 def test_a_valid_file_with_strange_contents_is_told_apart(
-    tmp_path_factory: Any, name: str, message: bytes, shape: str, whiskers: int
+    tmp_path_factory: Any, name: str, message: bytes, shape: str, whiskers: int, rig: str
 ) -> None:
     """Checksums in order, contents not ours."""
     from mcap.writer import Writer
@@ -421,12 +453,60 @@ def test_a_valid_file_with_strange_contents_is_told_apart(
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
-        metadata = {"format": "1", "view_shape": shape, "whiskers": str(whiskers), "rate_hz": "1.0"}
-        writer.add_metadata("ratslam", metadata | {"created_by": "somebody"})
-        writer.add_message(writer.register_channel(TOPICS[name], "cdr", 0), 0, b"\0\1\0\0" + message, 0)
+        metadata = {"format": FORMAT, "view_shape": shape, "whiskers": str(whiskers), "rate_hz": "1.0"}
+        metadata |= {"created_by": "somebody", "rig": rig}
+        writer.add_metadata("ratslam", metadata | {"crc32": _checksum(metadata)})
+        schema = writer.register_schema(name, "ros2msg", SCHEMAS[name].encode())
+        writer.add_message(writer.register_channel(TOPICS[name], "cdr", schema), 0, b"\0\1\0\0" + message, 0)
         writer.finish()
     with pytest.raises(InputError):
         Recording(path)
+
+
+def test_a_file_of_another_version_is_named(
+    tmp_path: Path, refused: Callable[..., InputError], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    old = tmp_path / "old.mcap"
+    with monkeypatch.context() as patch:
+        patch.setattr("robot.walk.FORMAT", "1")
+        _write(old, _samples(3))
+    refused(lambda: Recording(old), str(old), "format '1' where '2' is the one known")
+    other = tmp_path / "other.mcap"
+    with monkeypatch.context() as patch:
+        patch.setitem(SCHEMAS, OBSERVATION, SCHEMAS[OBSERVATION] + "bool more\n")
+        _write(other, _samples(3))
+    refused(lambda: Recording(other), str(other), "/ratslam/observation", "defined otherwise than here")
+
+
+@pytest.mark.parametrize("rig", [{"a": np.nan}, {"a": object()}, {"a": np.zeros(2)}])
+def test_a_rig_that_is_no_document_is_refused_before_anything_is_written(tmp_path: Path, rig: Any) -> None:
+    with pytest.raises((ValueError, TypeError)):
+        Recorder(tmp_path / "a.mcap", rig=rig)
+    assert not (tmp_path / "a.mcap").exists()
+
+
+def test_a_rig_without_a_sample_to_it_is_not_lost(tmp_path: Path) -> None:
+    """It stands before the first sample, so a recorder killed at once leaves it."""
+    path = _write(tmp_path / "a.mcap", _samples(2))
+    content = path.read_bytes()
+    path.write_bytes(content[: content.index(b"\x28\xb5\x2f\xfd")])
+    walk = Walk(path)
+    assert list(walk) == []
+    assert walk.description is not None
+    assert walk.description.rig == RIG
+
+
+def test_what_knows_its_rig_says_so(find_trace: Callable[[str], Path], tmp_path: Path) -> None:
+    plain = read_stream(find_trace("a_square3"))
+    assert not isinstance(plain, Rigged)
+    assert rig_of(plain) == {}
+    record(plain, tmp_path / "plain.mcap")
+    assert rig_of(Recording(tmp_path / "plain.mcap")) == {}
+    _write(tmp_path / "a.mcap", _samples(5), rig={"params": {"pc_cell_x_size": 0.05}})
+    record(Recording(tmp_path / "a.mcap"), tmp_path / "b.mcap")
+    again = Recording(tmp_path / "b.mcap")
+    assert isinstance(again, Rigged)
+    assert again.params == {"pc_cell_x_size": 0.05}
 
 
 def test_a_truth_in_degrees_is_refused(tmp_path: Path, refused: Callable[..., InputError]) -> None:

@@ -1,0 +1,254 @@
+"""A simulated session of a whiskered head as a source: the same bits every time, from one seed.
+
+Every part draws from a stream of its own name (maze.loop, maze.walls, maze.heights, path, motion, sensor,
+odometry), so that changing one leaves the others as they were.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path as File
+from types import TracebackType
+from typing import Annotated, Any, Literal, NamedTuple, Self
+
+import numpy as np
+from pydantic import Field, NonNegativeInt
+
+from robot.dynamic import dynamic
+from robot.files import digest_of
+from robot.kinematic import Felt, MechanicsConfig, felt, whisk
+from robot.maze import text
+from robot.mechanics import StreamConfig
+from robot.motion import MotionConfig, at
+from robot.odometry import OdometryConfig, reckoned
+from robot.quasistatic import quasistatic
+from robot.scene import KidnapConfig, MazeConfig, PathConfig, another, scene
+from robot.sensing import kept
+from robot.source import Sample
+from robot.sweep import cycles, free_cycles
+from robot.walls import Surroundings
+from tactile.calibration import Calibration, CalibrationConfig, calibrated
+from tactile.errors import InputError
+from tactile.frames import wrap
+from tactile.head import HeadConfig, ur10_head
+from tactile.settings import Settings
+from tactile.streams import stream
+from tactile.types import Cycle, Odometry, Whisk
+from tactile.whisking import WhiskingConfig, checked
+
+CELL_SIZE = 0.05
+"""Side of a pose cell that suits these mazes, m."""
+RAW = {"quasistatic": quasistatic, "dynamic": dynamic}
+"""The tiers that make raw samples."""
+MIDDLE = 0.25
+"""Where in a cycle its sample belongs, as a share of it: the middle of the protraction."""
+
+
+class SimulationConfig(Settings):
+    """A session to simulate. What the paper leaves open are these defaults."""
+
+    maze: MazeConfig = MazeConfig()
+    """The world."""
+    path: PathConfig = PathConfig()
+    """Where the head goes."""
+    motion: MotionConfig = MotionConfig()
+    """How it moves."""
+    kidnaps: KidnapConfig = KidnapConfig()
+    """When it is carried."""
+    odometry: OdometryConfig = OdometryConfig()
+    """What it believes of its motion."""
+    whisking: WhiskingConfig = WhiskingConfig()
+    """How whiskers are driven."""
+    mechanics: MechanicsConfig = MechanicsConfig()
+    """Drives, whiskers and sensors."""
+    stream: StreamConfig = StreamConfig()
+    """What the raw tiers know of them besides."""
+    calibration: CalibrationConfig = CalibrationConfig()
+    """The free whisking before the session, for the raw tiers."""
+    later_maze: Annotated[float, Field(gt=0, lt=1)] | None = None
+    """Share of the session after which whiskers feel another maze, as a control: nothing there can be known
+    again."""
+    seed: NonNegativeInt = 0
+    """Of everything random."""
+    fidelity: Literal["auto", "kinematic", "quasistatic", "dynamic"] = "auto"
+    """How much is modelled; `auto`: as little as the wanted outputs need."""
+    raw: bool = False
+    """Whether raw whisker samples are wanted, 2000 a second."""
+
+    def resolved(self, folder: File) -> SimulationConfig:
+        """The same with every relative path taken from the folder (of the configuration file, say)."""
+        if self.maze.file is None:
+            return self
+        maze = self.maze.model_copy(update={"file": folder / self.maze.file})
+        return self.model_copy(update={"maze": maze})
+
+
+class Tier(NamedTuple):
+    """How much is modelled, and why."""
+
+    name: Literal["kinematic", "quasistatic", "dynamic"]
+    why: str
+
+
+def tier(config: SimulationConfig) -> Tier:
+    """The cheapest tier that gives what is wanted, or the one that was named.
+
+    Raises:
+        InputError: the one that was named cannot give it.
+    """
+    if config.fidelity == "kinematic" and config.raw:
+        raise InputError(
+            "simulation.fidelity", "kinematic, which makes no raw samples", "auto, quasistatic or dynamic"
+        )
+    if config.fidelity != "auto":
+        return Tier(config.fidelity, "it was named")
+    if config.raw:
+        return Tier("quasistatic", "raw samples are wanted, bending modes and overshoot are not")
+    return Tier("kinematic", "angles of contact are all that is wanted")
+
+
+class Simulation:
+    """A simulated session as a `Source`; make one with `simulated`.
+
+    Attributes:
+        config, head_config: what it was made from. tier: how much was modelled, and why.
+        scene: maze, path and walls. calibration: of the head, None in the kinematic tier.
+        time: [N] s. start: [N] s, when the whisk cycles began.
+        truth: [N, 3]. odometry: [N, 4]. carried: [N] bool, the head was carried since the row before.
+        rig: what a recording of it keeps (see `robot.source.Rigged`).
+    """
+
+    name = "simulation"
+    whisked = True
+
+    def __init__(self, config: SimulationConfig, head_config: HeadConfig) -> None:
+        self.config, self.head_config, self.tier = config, head_config, tier(config)
+        self.head = head = ur10_head(head_config)
+        whisking, seed = config.whisking, config.seed
+        checked(whisking, head)
+        self.scene = scene(config.maze, config.path, config.motion, config.kidnaps, head, seed)
+        count = int(min(self.scene.duration, self.scene.path.duration) * whisking.rate)
+        if count < 1:
+            raise InputError("simulation.path", f"{self.scene.duration:.3g} s", "time for one whisk at least")
+        self.start = np.arange(count) / whisking.rate
+        self.time = self.start + MIDDLE / whisking.rate
+        pose = at(self.scene.path, self.time)
+        self.truth = np.column_stack([pose[:, :2], wrap(pose[:, 2])])
+        self.carried = np.zeros(count, bool)
+        rows = np.searchsorted(self.time, self.scene.jumps)
+        self.carried[rows[rows < count]] = True
+        self.odometry = reckoned(config.odometry, self.time, pose, stream(seed, "odometry"), self.carried)
+        self._parts = self._surroundings()
+        self.calibration = None if self.tier.name == "kinematic" else self._calibrated()
+        self._felt = self._kinematic() if self.calibration is None else None
+
+        plain = config.model_dump(mode="json", exclude={"maze": {"file"}})
+        document = {
+            "head": head_config.model_dump(mode="json"),
+            "simulation": plain,
+            "maze": text(self.scene.maze) if config.maze.file else "",
+        }
+        self.digest = digest_of([json.dumps(document, sort_keys=True).encode()])
+        self.params: Mapping[str, float | int | str] = {"pc_cell_x_size": CELL_SIZE}
+        self.rig: Mapping[str, Any] = {
+            "head": document["head"],
+            "simulation": plain | {"sha256": self.digest, "tier": self.tier.name, "why": self.tier.why},
+            "maze": text(self.scene.maze),
+            "params": dict(self.params),
+        }
+        if self.calibration is not None:
+            self.rig = {**self.rig, "calibration": kept(self.calibration)}
+
+    @property
+    def rate_hz(self) -> float:
+        return self.config.whisking.rate
+
+    @property
+    def view_shape(self) -> tuple[int, int, int]:
+        return (*self.head.shape, 1)
+
+    @property
+    def whiskers(self) -> int:
+        return len(self.head.length)
+
+    @property
+    def length(self) -> int:
+        return len(self.time)
+
+    def __iter__(self) -> Iterator[Sample]:
+        rows = zip(self.time.tolist(), self.odometry, self.truth, self._readings(), strict=True)
+        for time, motion, truth, reading in rows:
+            yield Sample(time, reading._replace(odometry=Odometry(*motion)), truth.copy())
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        pass
+
+    def _surroundings(self) -> list[tuple[Surroundings, slice]]:
+        """What is around in which cycles."""
+        later = self.config.later_maze
+        if later is None:
+            return [(self.scene.surroundings, slice(None))]
+        change = int(later * self.length)
+        other = another(self.scene, self.config.maze, self.head, self.config.seed)
+        return [(self.scene.surroundings, slice(change)), (other, slice(change, None))]
+
+    def _kinematic(self) -> Felt:
+        config = self.config
+        parts = []
+        for surroundings, rows in self._parts:
+            random = stream(config.seed, "sensor")  # the whole session's noise, whatever is around
+            all_of_it = felt(
+                config.mechanics, config.whisking, surroundings, self.scene.path, self.start, random
+            )
+            parts.append([column[rows] for column in all_of_it])
+        return Felt(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+    def _calibrated(self) -> Calibration:
+        """What the head's sensors report in free air, before the session."""
+        config = self.config
+        count = int(np.ceil(config.calibration.shortest * config.whisking.rate))
+        random = stream(config.seed, "calibration")
+        record = free_cycles(
+            RAW[self.tier.name], config.stream, config.mechanics, config.whisking, self.head, count, random
+        )
+        return calibrated(config.calibration, record, where="simulation")
+
+    def _readings(self) -> Iterator[Whisk | Cycle]:
+        """Of each cycle, without its odometry."""
+        if self._felt is None:
+            return self._cycles()
+        still = Odometry(0.0, 0.0, 0.0, 0.0)
+        return (whisk(self.head, self._felt, row, still) for row in range(self.length))
+
+    def _cycles(self) -> Iterator[Cycle]:
+        """Raw samples of each cycle, without its odometry."""
+        assert self.calibration is not None
+        config, random = self.config, stream(self.config.seed, "sensor")
+        model, threshold = RAW[self.tier.name], self.calibration.threshold[:, 1]
+        for surroundings, rows in self._parts:
+            yield from cycles(
+                model,
+                config.stream,
+                config.mechanics,
+                config.whisking,
+                surroundings,
+                self.scene.path,
+                self.start[rows],
+                random,
+                threshold,
+            )
+
+
+def simulated(config: SimulationConfig, head_config: HeadConfig | None = None) -> Simulation:
+    """The session of a configuration.
+
+    Raises:
+        InputError: what is asked for cannot be simulated; says what and where.
+    """
+    return Simulation(config, head_config or HeadConfig())

@@ -1,0 +1,169 @@
+"""What is in the way of whiskers, sample by sample, and the cycles that a tier makes of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from robot.kinematic import MechanicsConfig
+from robot.mechanics import StreamConfig
+from robot.motion import Path, at
+from robot.walls import FREE, Surroundings
+from tactile.frames import between
+from tactile.head import Head
+from tactile.types import Cycle, Odometry
+from tactile.whisking import WhiskingConfig
+
+
+class Sweep(NamedTuple):
+    """Cycles side by side.
+
+    Attributes:
+        time: [T] s since the cycle began. wall: [T, N, W] protraction at which a whisker would touch, rad;
+            infinite where nothing is met. reach: [T, N, W] where along its shaft, as a share.
+        drift: [T, N, W] rad/s, how fast the wall moves sideways as seen from the whisker's base.
+        noise: [N, T, W, 3] rad, of angle, x and y.
+    """
+
+    time: np.ndarray
+    wall: np.ndarray
+    reach: np.ndarray
+    drift: np.ndarray
+    noise: np.ndarray
+
+
+class Tier(Protocol):
+    """A model of the mechanics."""
+
+    def __call__(
+        self,
+        config: StreamConfig,
+        mechanics: MechanicsConfig,
+        whisking: WhiskingConfig,
+        head: Head,
+        sweep: Sweep,
+        threshold: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The true angle, x and y of every sample, [T, N, W] rad; the law is told y with its noise."""
+        ...
+
+
+def cycles(
+    tier: Tier,
+    config: StreamConfig,
+    mechanics: MechanicsConfig,
+    whisking: WhiskingConfig,
+    surroundings: Surroundings,
+    path: Path,
+    start: np.ndarray,
+    random: np.random.Generator,
+    threshold: np.ndarray,
+    odometry: np.ndarray | None = None,
+) -> Iterator[Cycle]:
+    """The raw cycles that start at times [N] s along a path. Whiskers are still when a cycle starts.
+
+    Args:
+        threshold: [W] contact threshold of y, from a calibration, rad. odometry: [N, 4] dx, dy, dtheta, dt of
+            each cycle.
+    """
+    told = np.zeros((len(start), 4)) if odometry is None else odometry
+    for k in range(0, len(start), config.batch):
+        some = slice(k, k + config.batch)
+        sweep = _swept(config, mechanics, whisking, surroundings, path, start[some], random)
+        yield from _run(
+            tier, config, mechanics, whisking, surroundings.head, sweep, threshold, start[some], told[some]
+        )
+
+
+def free_cycles(
+    tier: Tier,
+    config: StreamConfig,
+    mechanics: MechanicsConfig,
+    whisking: WhiskingConfig,
+    head: Head,
+    count: int,
+    random: np.random.Generator,
+) -> list[Cycle]:
+    """A record for calibration: that many cycles, in free air and open loop."""
+    whisking = whisking.model_copy(update={"mode": "open"})
+    start = np.arange(count) / whisking.rate
+    record: list[Cycle] = []
+    for k in range(0, count, config.batch):
+        some = start[k : k + config.batch]
+        time = _times(config, whisking)
+        nothing = np.zeros((len(time), len(some), len(head.length)))
+        noise = mechanics.noise * random.standard_normal((len(some), len(time), len(head.length), 3))
+        sweep = Sweep(time, nothing + FREE, nothing + 1.0, nothing, noise)
+        threshold, still = np.full(len(head.length), np.inf), np.zeros((len(some), 4))
+        record += _run(tier, config, mechanics, whisking, head, sweep, threshold, some, still)
+    return record
+
+
+def _run(
+    tier: Tier,
+    config: StreamConfig,
+    mechanics: MechanicsConfig,
+    whisking: WhiskingConfig,
+    head: Head,
+    sweep: Sweep,
+    threshold: np.ndarray,
+    start: np.ndarray,
+    odometry: np.ndarray,
+) -> Iterator[Cycle]:
+    truth = tier(config, mechanics, whisking, head, sweep, threshold)
+    # A dead whisker sends zeros.
+    seen = (np.stack([part.swapaxes(0, 1) for part in truth], axis=-1) + sweep.noise) * head.alive[:, None]
+    deflection = np.clip(seen[..., 1:], -config.full_scale, config.full_scale)
+    for k in range(len(start)):
+        yield Cycle(start[k] + sweep.time, seen[k, ..., 0], deflection[k], Odometry(*odometry[k]))
+
+
+def _times(config: StreamConfig, whisking: WhiskingConfig) -> np.ndarray:
+    return np.arange(round(config.rate / whisking.rate)) / config.rate
+
+
+def _swept(
+    config: StreamConfig,
+    mechanics: MechanicsConfig,
+    whisking: WhiskingConfig,
+    surroundings: Surroundings,
+    path: Path,
+    start: np.ndarray,
+    random: np.random.Generator,
+) -> Sweep:
+    head, time = surroundings.head, _times(config, whisking)
+    knots = np.linspace(0.0, 1 / whisking.rate, config.poses + 1)
+    pose = at(path, start[:, None] + knots)
+    met = surroundings.contact(pose.reshape(-1, 3))
+    shape = (len(start), len(knots), len(head.length))
+    wall, reach, box = (column.reshape(shape).swapaxes(0, 1) for column in met)
+
+    # Between two poses a wall's angle changes evenly; where another wall takes over, half-way.
+    place = np.clip(np.searchsorted(knots, time, side="right") - 1, 0, config.poses - 1)
+    share = ((time - knots[place]) / knots[1])[:, None, None]
+    same = (box[:-1] == box[1:]) & (box[1:] >= 0)
+    share = np.where(same[place], share, np.round(share))
+    drift = _drift(head, pose, knots[1], wall, reach)
+    with np.errstate(invalid="ignore"):
+        mixed = wall[place] + share * (wall[place + 1] - wall[place])
+    return Sweep(
+        time=time,
+        wall=np.where(share == 0, wall[place], np.where(share == 1, wall[place + 1], mixed)),
+        reach=np.maximum(reach[place] + share * (reach[place + 1] - reach[place]), 0.05),
+        drift=drift[place],
+        noise=mechanics.noise * random.standard_normal((len(start), len(time), len(head.length), 3)),
+    )
+
+
+def _drift(head: Head, pose: np.ndarray, step: float, wall: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """[K, N, W] rad/s between one pose and the next."""
+    motion = between(pose[:, :-1].reshape(-1, 3), pose[:, 1:].reshape(-1, 3)).reshape(*pose[:, 1:].shape)
+    speed = motion.swapaxes(0, 1)[:, :, None] / step
+    outwards = head.rest[:, :2] / np.linalg.norm(head.rest[:, :2], axis=1, keepdims=True)
+    opening = np.arctan2(np.hypot(*head.rest[:, :2].T), -head.rest[:, 2]) - np.where(wall < FREE, wall, 0.0)
+    arm = np.maximum(reach, 0.05) * head.length
+    out = np.hypot(*head.base[:, :2].T) + arm * np.sin(opening)
+    sideways = speed[..., 1] * outwards[:, 0] - speed[..., 0] * outwards[:, 1] + speed[..., 2] * out[:-1]
+    return -sideways / arm[:-1]

@@ -1,0 +1,60 @@
+"""The sense of touch as a whole: from what a head reports to what an engine is given."""
+
+from __future__ import annotations
+
+from tactile.calibration import Calibration
+from tactile.contact import ContactConfig, sensed
+from tactile.errors import InputError
+from tactile.head import HeadConfig, ur10_head
+from tactile.image import ImageConfig, observed, view_shape
+from tactile.settings import Settings
+from tactile.types import Cycle, Observation, Whisk
+
+
+class TouchConfig(Settings):
+    """How touch is sensed."""
+
+    head: HeadConfig = HeadConfig()
+    """The whiskers; a recording that knows its own goes before what is not set here."""
+    contact: ContactConfig = ContactConfig()
+    """From raw samples to contacts."""
+    image: ImageConfig = ImageConfig()
+    """From contacts to a view."""
+
+
+class Frontend:
+    """Turns readings of whiskers into observations, each for itself.
+
+    Args:
+        calibration: of the head, for raw readings.
+
+    Attributes:
+        view_shape: of the views. whiskers: W.
+    """
+
+    def __init__(self, config: TouchConfig, calibration: Calibration | None = None) -> None:
+        self.config, self.calibration = config, calibration
+        self.head = ur10_head(config.head)
+        self.view_shape = view_shape(config.image, self.head)
+        self.whiskers = len(self.head.length)
+
+    def felt(self, reading: Cycle | Whisk) -> Whisk:
+        """What each whisker felt; a whisker that the head's configuration calls dead does not report.
+
+        Raises:
+            InputError: raw samples without a calibration, or that cannot be used.
+        """
+        if isinstance(reading, Cycle):
+            if self.calibration is None:
+                raise InputError(
+                    "calibration", "raw whisker samples without one", "a record of free whisking with them"
+                )
+            reading = sensed(self.config.contact, self.calibration, reading)
+        alive = reading.alive & self.head.alive
+        return reading._replace(alive=alive, contact=reading.contact & alive, held=reading.held & alive)
+
+    def observed(self, reading: Observation | Cycle | Whisk) -> Observation:
+        """What an engine is given; an observation stays as it is."""
+        if isinstance(reading, Observation):
+            return reading
+        return observed(self.config.image, self.head, self.felt(reading))

@@ -1,0 +1,106 @@
+"""Paths: through every cell, at the given speed, varied as asked, carried where asked, backwards the same."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from robot.maze import CELL, centre, random_loop
+from robot.motion import JitterConfig, MotionConfig, Path, at, carried, planned
+from robot.route import circuits
+from tactile.frames import wrap
+from tactile.streams import stream
+
+SEEDS = st.integers(0, 1000)
+STEADY = JitterConfig(position=0, yaw_deg=0, speed=0)
+
+
+def path_of(seed: int, word: str = "CA", **changes: object) -> Path:
+    way = circuits(random_loop(7, 5, 20, stream(seed, "maze.loop")), word)
+    return planned(MotionConfig(**changes), way, stream(seed, "motion"))
+
+
+@given(SEEDS)
+def test_without_jitter_the_head_goes_straight_from_middle_to_middle_and_looks_ahead(seed: int) -> None:
+    path = path_of(seed, jitter=STEADY)
+    way = circuits(random_loop(7, 5, 20, stream(seed, "maze.loop")), "CA")
+    passed = path.pose[np.concatenate([[True], np.abs(np.diff(path.pose[:, :2], axis=0)).sum(axis=1) > 1e-9])]
+    assert np.allclose(passed[:, :2], [centre(cell) for cell in way], atol=1e-12)
+    step, took = np.diff(path.pose, axis=0), np.diff(path.time)
+    driven = np.hypot(step[:, 0], step[:, 1])
+    straight = driven > 1e-9
+    assert np.allclose(driven[straight] / took[straight], 0.03)
+    assert np.allclose(step[straight, 2], 0)
+    assert np.allclose(
+        wrap(np.arctan2(step[straight, 1], step[straight, 0]) - path.pose[1:][straight, 2]), 0, atol=1e-9
+    )
+    assert np.allclose(np.abs(step[~straight, 2]) / took[~straight], 0.4)
+    assert (np.abs(step[:, 2]) <= np.pi + 1e-12).all()
+    assert np.isclose(path.duration, 40 * CELL / 0.03 + np.abs(step[:, 2]).sum() / 0.4)
+
+
+@given(SEEDS)
+def test_backwards_is_the_way_there_looked_at_the_other_way(seed: int) -> None:
+    """Going a way backwards looks at every place as coming the other way along it does."""
+    way = circuits(random_loop(7, 5, 20, stream(seed, "maze.loop")), "A")
+    there = planned(MotionConfig(jitter=STEADY), way, stream(seed, "motion"))
+    back = planned(MotionConfig(jitter=STEADY, backwards=True), way[::-1], stream(seed, "motion"))
+    assert np.isclose(there.duration, back.duration)
+    time = np.linspace(0, there.duration, 200)
+    one, other = at(there, time), at(back, there.duration - time)
+    assert np.allclose(one[:, :2], other[:, :2], atol=1e-9)
+    assert np.allclose(wrap(one[:, 2] - other[:, 2]), 0, atol=1e-9)
+
+
+def test_visits_vary_as_asked() -> None:
+    jitter = JitterConfig(position=0.005, yaw_deg=3.0, speed=0.1)
+    path = path_of(0, "A" * 60, jitter=jitter)
+    steady = path_of(0, "A" * 60, jitter=STEADY)
+    off = path.pose - steady.pose
+    assert off[:, :2].std() == pytest.approx(0.005, rel=0.1)
+    assert np.degrees(off[:, 2]).std() == pytest.approx(3.0, rel=0.1)
+    took = np.diff(path.time) / np.diff(steady.time)
+    turns = np.hypot(*np.diff(steady.pose[:, :2], axis=0).T) < 1e-9
+    assert np.allclose(took[turns], 1)
+    assert (1 / took[~turns]).std() == pytest.approx(0.1, rel=0.1)
+
+
+@given(SEEDS, st.integers(0, 1000))
+def test_a_path_follows_from_its_seed(seed: int, other: int) -> None:
+    one, again = path_of(seed), path_of(seed)
+    assert (one.pose == again.pose).all()
+    if other != seed:
+        assert path_of(other).pose.shape != one.pose.shape or (path_of(other).pose != one.pose).any()
+
+
+def test_time_only_goes_on_and_ends_are_kept() -> None:
+    path = path_of(3)
+    assert (np.diff(path.time) > 0).all()
+    assert (at(path, np.array([-5.0, 1e9])) == path.pose[[0, -1]]).all()
+
+
+@settings(max_examples=40)
+@given(SEEDS, st.lists(st.floats(0.05, 0.7), min_size=1, max_size=4), st.floats(1.0, 30.0))
+def test_a_kidnapped_head_goes_on_from_where_it_would_have_been(
+    seed: int, shares: list[float], ahead: float
+) -> None:
+    path = path_of(seed)
+    when = [share * path.duration for share in shares]
+    there, jumps = carried(path, when, ahead)
+    assert len(jumps) <= len(when)
+    assert (np.diff(there.time) >= 0).all()
+    assert np.allclose(jumps, sorted(when)[: len(jumps)])
+    assert there.duration == pytest.approx(path.duration - ahead * len(jumps))
+    time = np.linspace(0, there.duration, 300)
+    skipped = ahead * (time[:, None] > jumps).sum(axis=1)
+    away = np.abs(time[:, None] - jumps).min(axis=1) > 1e-6
+    assert np.allclose(at(there, time)[away], at(path, time + skipped)[away], atol=1e-9)
+
+
+def test_who_is_carried_past_the_end_has_arrived() -> None:
+    path = path_of(0)
+    there, jumps = carried(path, [path.duration - 10.0], 45.0)
+    assert there.duration == pytest.approx(path.duration - 10.0)
+    assert len(jumps) == 0

@@ -1,0 +1,139 @@
+"""What a simulated robot believes of its motion: each structure of noise does what its name says."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robot.odometry import OdometryConfig, reckoned
+from tactile.frames import between, integrate, wrap
+from tactile.streams import stream
+
+KINDS = ("white", "gated", "telescoping")
+
+
+def still(count: int) -> tuple[np.ndarray, np.ndarray]:
+    return np.arange(count, dtype=float), np.zeros((count, 3))
+
+
+def driven(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Twenty seconds ahead at 30 mm/s, then five of turning on the spot at 0.4 rad/s, again and again."""
+    turns = np.arange(count) % 25 >= 20
+    motion = np.zeros((count, 3))
+    motion[~turns, 0], motion[turns, 2] = 0.03, 0.4
+    motion[0] = 0
+    pose = integrate(motion)
+    pose[:, 2] = np.cumsum(motion[:, 2])
+    return np.arange(count, dtype=float), pose
+
+
+def errors(kind: str, scene: tuple[np.ndarray, np.ndarray], seed: int = 0, **changes: Any) -> np.ndarray:
+    """[N - 1, 3] told motion less true motion."""
+    time, pose = scene
+    told = reckoned(OdometryConfig(noise=kind, **changes), time, pose, stream(seed, "odometry"))
+    error = told[1:, :3] - between(pose[:-1], pose[1:])
+    return np.column_stack([error[:, :2], wrap(error[:, 2])])
+
+
+@given(st.integers(0, 10**6), st.sampled_from(KINDS))
+def test_odometry_follows_from_its_seed(seed: int, kind: str) -> None:
+    one, again, other = (errors(kind, driven(60), k) for k in (seed, seed, seed + 1))
+    assert (one == again).all()
+    assert (one != other).any()
+
+
+def test_without_noise_it_is_the_truth() -> None:
+    assert np.abs(errors("none", driven(100))).max() < 1e-12
+
+
+def test_white_noise_is_everywhere_and_independent() -> None:
+    for scene in (still(4000), driven(4000)):
+        error = errors("white", scene)
+        assert error[:, 0].std() == pytest.approx(8.2e-3, rel=0.05)
+        assert error[:, 2].std() == pytest.approx(0.103, rel=0.05)
+        assert (error[:, 1] == 0).all() or np.abs(error[:, 1]).max() < 1e-12
+        for column in (0, 2):
+            lagged = np.corrcoef(error[:-1, column], error[1:, column])[0, 1]
+            assert abs(lagged) < 0.06
+
+
+def test_gated_noise_is_only_on_what_moves() -> None:
+    assert np.abs(errors("gated", still(500))).max() == 0
+    time, pose = driven(4000)
+    error = errors("gated", (time, pose))
+    turns = np.abs(np.diff(pose[:, 2])) > 0.1
+    assert np.abs(error[turns, 0]).max() < 1e-12
+    assert np.abs(error[~turns, 2]).max() < 1e-12
+    assert error[~turns, 0].std() == pytest.approx(8.2e-3, rel=0.05)
+    assert error[turns, 2].std() == pytest.approx(0.103, rel=0.1)
+
+
+def test_telescoping_noise_stays_bounded_and_the_others_grow() -> None:
+    def last(kind: str, count: int) -> float:
+        totals = [errors(kind, still(count), seed)[:, 2].sum() for seed in range(200)]
+        return float(np.std(totals))
+
+    short, long = (last("telescoping", count) for count in (50, 800))
+    assert long == pytest.approx(short, rel=0.25)
+    assert short == pytest.approx(np.sqrt(2) * 0.103, rel=0.2)
+    assert last("white", 800) == pytest.approx(4 * last("white", 50), rel=0.3)
+    every = errors("telescoping", still(800))
+    assert np.abs(np.cumsum(every[:, 0])).max() < 10 * 8.2e-3
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_noise_has_its_own_rate(kind: str) -> None:
+    """Rows twice as close add up to the same errors, whatever the rows are."""
+    time, pose = driven(200)
+    fine = np.arange(0, 199.5, 0.5)
+    finely = np.column_stack([np.interp(fine, time, column) for column in pose.T])
+    coarse = errors(kind, (time, pose))
+    halves = errors(kind, (fine, finely))
+    assert np.allclose(halves[:, [0, 2]].reshape(-1, 2, 2).sum(axis=1), coarse[:, [0, 2]], atol=1e-9)
+
+
+def test_biases_belong_to_the_run() -> None:
+    time, pose = driven(500)
+    scales, bends = [], []
+    for seed in range(300):
+        config = OdometryConfig(noise="none", length_bias=0.02, heading_bias=0.1)
+        told = reckoned(config, time, pose, stream(seed, "odometry"))[1:]
+        true = between(pose[:-1], pose[1:])
+        ahead = true[:, 0] > 0.01
+        scale, bend = told[ahead, 0] / true[ahead, 0], (told[ahead, 2] - true[ahead, 2]) / true[ahead, 0]
+        assert np.allclose(scale, scale[0])
+        assert np.allclose(bend, bend[0])
+        scales.append(scale[0])
+        bends.append(bend[0])
+    assert np.std(scales) == pytest.approx(0.02, rel=0.15)
+    assert np.mean(scales) == pytest.approx(1, abs=5e-3)
+    assert np.std(bends) == pytest.approx(0.1, rel=0.15)
+
+
+def test_who_is_carried_is_told_the_motion_before() -> None:
+    time, pose = driven(100)
+    pose = pose.copy()
+    pose[50:, :2] += [0.7, -0.4]
+    pose[50:, 2] += 2.0
+    hidden = np.zeros(100, bool)
+    hidden[50] = True
+    random = stream(0, "odometry")
+    told = reckoned(OdometryConfig(noise="none"), time, pose, random, hidden)
+    assert np.allclose(told[50, :3], told[49, :3])
+    open_ = reckoned(OdometryConfig(noise="none"), time, pose, stream(0, "odometry"))
+    assert np.hypot(*open_[50, :2]) > 0.5
+    assert (np.delete(told, 50, 0) == np.delete(open_, 50, 0)).all()
+
+
+def test_the_first_row_only_sets_the_clock() -> None:
+    time, pose = driven(10)
+    for kind in (*KINDS, "none"):
+        told = reckoned(OdometryConfig(noise=kind), time + 7.0, pose, stream(0, "odometry"))
+        assert (told[0] == 0).all()
+        assert (told[1:, 3] == 1).all()
+        one = reckoned(OdometryConfig(noise=kind), time[:1], pose[:1], stream(0, "odometry"))
+        assert (one == 0).all()

@@ -1,0 +1,366 @@
+"""Simulated sessions: same seed, same bits; parts that do not disturb each other; faults named."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from robot.log import collected
+from robot.maze import CELL, text
+from robot.odometry import OdometryConfig
+from robot.recording import Recording, record
+from robot.sensing import head_of, sensing
+from robot.simulation import Simulation, SimulationConfig, simulated, tier
+from robot.source import Rigged, Sample, Source, rig_of
+from tactile.errors import InputError
+from tactile.frames import between, wrap
+from tactile.frontend import TouchConfig
+from tactile.head import HeadConfig, RingConfig
+from tactile.image import ImageConfig
+from tactile.types import Cycle, Observation, Whisk
+
+SHORT = {"path": {"circuits": "CA"}}
+
+
+def made(head: HeadConfig | None = None, **changes: Any) -> Simulation:
+    return simulated(SimulationConfig.model_validate(SHORT | changes), head)
+
+
+def leaves(sample: Sample) -> Iterator[bytes]:
+    yield np.float64(sample.time).tobytes()
+    yield b"" if sample.truth is None else sample.truth.tobytes()
+    for part in (*sample.reading.odometry, *sample.reading[1:]):
+        if not isinstance(part, tuple):
+            yield np.asarray(part).tobytes()
+    if isinstance(sample.reading, Cycle):
+        yield sample.reading.time.tobytes()
+
+
+def bits(source: Source) -> list[list[bytes]]:
+    return [list(leaves(sample)) for sample in source]
+
+
+def test_a_session_has_the_same_bits_every_time() -> None:
+    one = made()
+    assert isinstance(one, Source)
+    assert isinstance(one, Rigged)
+    with one as source:
+        first = bits(source)
+        assert bits(source) == first
+    assert bits(made()) == first
+    assert len(first) == one.length > 250
+    assert made().digest == one.digest
+    other = made(seed=1)
+    assert other.digest != one.digest
+    assert bits(other)[:50] != first[:50]
+
+
+def test_the_digest_tells_what_was_asked_for(tmp_path: Path) -> None:
+    maze = tmp_path / "maze.txt"
+    maze.write_text(text(made().scene.maze))
+    loop = made().scene.loop
+    sessions = [
+        made(),
+        made(seed=3),
+        made(HeadConfig(rest_deg=70.0)),
+        made(mechanics={"servo": 0.5}),
+        made(maze={"file": maze}, path={"loop": loop, "circuits": "CA"}),
+    ]
+    assert len({session.digest for session in sessions}) == len(sessions)
+    again = tmp_path / "copy.txt"
+    again.write_text(maze.read_text().replace("o", "+"))
+    moved = made(maze={"file": again}, path={"loop": loop, "circuits": "CA"})
+    assert moved.digest == sessions[-1].digest  # what is in the file counts, not where it lies
+    maze.write_text(maze.read_text().replace("|", " ", 1).replace(" ", "|", 1))
+    assert str(tmp_path) not in repr(moved.rig)
+
+
+def test_streams_are_independent() -> None:
+    """Another odometry leaves what whiskers felt as it was, another sensor the odometry, and so on."""
+    base = made()
+    other = made(odometry={"noise": "white"})
+    assert (base.odometry != other.odometry).any()
+    assert all((one == two).all() for one, two in zip(base._felt, other._felt, strict=True))
+    noisy = made(mechanics={"noise": 5e-3})
+    assert (noisy.odometry == base.odometry).all()
+    assert (noisy._felt.touched != base._felt.touched).any()
+    fuller = made(maze={"share": 0.9})
+    assert fuller.scene.loop == base.scene.loop
+    assert (fuller.truth == base.truth).all()
+    rough = made(motion={"jitter": {"position": 0.005}})
+    assert text(rough.scene.maze) == text(base.scene.maze)
+    assert (rough.truth != base.truth).any()
+
+
+def test_one_maze_can_have_many_sessions() -> None:
+    one, two = (made(seed=seed, maze={"seed": 7}) for seed in (1, 2))
+    assert text(one.scene.maze) == text(two.scene.maze)
+    assert one.scene.loop == two.scene.loop
+    assert (one.odometry[:99] != two.odometry[:99]).any()
+
+
+def test_a_session_is_what_its_samples_say() -> None:
+    session = made()
+    samples = list(session)
+    assert len(samples) == session.length
+    assert (np.diff([sample.time for sample in samples]) > 0).all()
+    assert samples[0].time == 0.25  # the middle of the protraction
+    assert session.rate_hz == 1.0
+    assert session.view_shape == (3, 6, 1)
+    truth = np.array([sample.truth for sample in samples])
+    assert (truth[:, :2] > 0).all()
+    assert (truth[:, :2] < [7 * CELL, 5 * CELL]).all()
+    assert (np.abs(truth[:, 2]) <= np.pi).all()
+    felt = [sample.reading for sample in samples]
+    assert all(isinstance(reading, Whisk) for reading in felt)
+    contact = np.array([reading.contact for reading in felt])
+    assert 0.1 < contact.mean() < 0.6
+    told = np.array([[*reading.odometry] for reading in felt])
+    assert (told == session.odometry).all()
+    samples[0].truth[:] = 9  # a reader's own copy
+    assert (next(iter(session)).truth != 9).all()
+
+
+def test_twice_the_rate_is_twice_the_whisks() -> None:
+    once, twice = made(), made(whisking={"rate": 2.0})
+    assert abs(twice.length - 2 * once.length) <= 1
+    assert twice.rate_hz == 2.0
+    assert twice.time[0] == 0.125
+
+
+def test_a_session_backwards_sees_the_same_places_from_the_same_side() -> None:
+    steady, calm = {"jitter": {"position": 0, "yaw_deg": 0}}, {"noise": "none"}
+    quiet = {"noise": 0.0, "reach_noise": 0.0}
+    there = made(path={"circuits": "C"}, motion=steady, odometry=calm, mechanics=quiet)
+    backwards = steady | {"backwards": True}
+    back = made(path={"circuits": "A"}, motion=backwards, odometry=calm, mechanics=quiet)
+    assert (there.odometry[:, 0] > -1e-9).all()
+    assert (back.odometry[:, 0] < 1e-9).all()
+    gap = between(there.truth[:, None], back.truth[None])
+    away = np.hypot(gap[..., 0], gap[..., 1]) + 0.1 * np.abs(gap[..., 2])
+    nearest = away.argmin(axis=1)
+    assert away.min(axis=1).max() < 0.04  # half a step, or half a turn's
+    same = there._felt.contact == back._felt.contact[nearest]
+    apart = there._felt.contact == back._felt.contact[np.roll(nearest, 40)]
+    assert same.mean() > 0.9 > apart.mean()
+
+
+def test_kidnaps_are_spread_and_hidden_from_odometry() -> None:
+    whole = made(path={"circuits": "CACA"})
+    session = made(path={"circuits": "CACA"}, kidnaps={"count": 3, "ahead": 30.0}, odometry={"noise": "none"})
+    rows = np.flatnonzero(session.carried)
+    assert len(rows) == 3
+    assert (rows >= session.length // 4 - 1).all()
+    assert abs(session.length - (whole.length - 90)) <= 1
+    true = between(session.truth[:-1], session.truth[1:])
+    told = session.odometry[1:, :3]
+    wrong = np.flatnonzero(np.abs(told[:, :2] - true[:, :2]).max(axis=1) > 0.02)
+    assert set(wrong) <= set(rows - 1)
+    assert len(wrong) >= 2  # where it is set down may look like going on
+    assert (told[rows - 1] == told[rows - 2]).all()
+    assert made().carried.sum() == 0
+
+
+def test_later_another_maze_is_felt() -> None:
+    base, control = made(), made(later_maze=0.5)
+    half = base.length // 2
+    for one, two in zip(base._felt, control._felt, strict=True):
+        assert (one[:half] == two[:half]).all()
+    assert (base._felt.contact[half:] != control._felt.contact[half:]).mean() > 0.05
+    assert (base.truth == control.truth).all()
+    assert (base.odometry == control.odometry).all()
+
+
+def test_exploration_lasts_as_long_as_asked() -> None:
+    session = made(path={"explore": 400.0})
+    assert session.length == 400
+    cells = {tuple(cell) for cell in np.floor(session.truth[:, :2] / CELL).astype(int)}
+    assert len(cells) > 12
+    carried = made(path={"explore": 400.0}, kidnaps={"count": 2, "ahead": 60.0})
+    assert carried.length == 400
+    assert carried.carried.sum() == 2
+    assert made(path={"explore": 400.0}, seed=1).truth[-1].tolist() != session.truth[-1].tolist()
+
+
+def test_given_cells_are_gone_through(tmp_path: Path) -> None:
+    (tmp_path / "maze.txt").write_text("o---o---o\n|       |\no   o   o\n|   |   |\no---o---o\n")
+    cells = [(0, 0), (0, 1), (1, 1), (1, 0)]
+    session = made(maze={"file": tmp_path / "maze.txt"}, path={"cells": cells})
+    passed = [tuple(cell) for cell in np.floor(session.truth[:, :2] / CELL).astype(int).tolist()]
+    assert list(dict.fromkeys(passed)) == cells
+    assert made(maze={"file": tmp_path / "maze.txt"}, path={"explore": 60}).length == 60
+
+
+LOOP = [(0, 0), (1, 0), (1, 1), (0, 1)]
+ROOM = "o---o---o\n|       |\no   o   o\n|       |\no---o---o\n"
+BLOCKED = "o---o---o\n|       |\no   o   o\n|   |   |\no---o---o\n"
+LOW = HeadConfig(rings=(RingConfig(length=0.16, radius=0.045, height=0.07),), rest_deg=75.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "head", "said"),
+    [
+        ({"maze": {"loop": 21}}, None, ["simulation.maze.loop", "21 cells", "even"]),
+        (
+            {"maze": {"heights": (0.05, 0.09)}},
+            None,
+            ["simulation.maze.heights", "0.09 m", "less than 0.082 m"],
+        ),
+        ({"maze": {"file": "ROOM"}}, None, ["simulation.path.loop", "circuits without a loop"]),
+        (
+            {"maze": {"file": "BLOCKED"}, "path": {"loop": LOOP}},
+            None,
+            ["simulation.path.loop[0] to [1]", "the wall between cells (0, 0) and (1, 0)"],
+        ),
+        (
+            {"maze": {"file": "BLOCKED"}, "path": {"cells": LOOP}},
+            None,
+            ["simulation.path.cells[0] to [1]", "the wall between cells (0, 0) and (1, 0)"],
+        ),
+        (
+            {"maze": {"file": "ROOM"}, "path": {"cells": [(0, 0), (2, 0)]}},
+            None,
+            ["cells[1]", "columns 0 to 1"],
+        ),
+        ({"path": {"loop": [*LOOP, (3, 3)]}}, None, ["path.loop[3] to [4]", "neighbouring"]),
+        ({"path": {"loop": [(-1, 0), (0, 0)]}}, None, ["path.loop[0]", "cell (-1, 0)"]),
+        ({"path": {"cells": [(0, 0)]}}, None, ["simulation.path.cells", "at least two"]),
+        ({"path": {"circuits": "CAX"}}, None, ["simulation.path.circuits", "'CAX'"]),
+        ({"path": {"explore": 0.5}}, None, ["simulation.path", "0.5 s", "one whisk"]),
+        ({"whisking": {"amplitude_deg": 80.0}}, None, ["simulation.whisking.amplitude_deg", "70"]),
+        ({"kidnaps": {"count": 40, "ahead": 60.0}}, None, ["simulation.kidnaps", "40 times 60 s"]),
+        ({"fidelity": "kinematic", "raw": True}, None, ["simulation.fidelity", "no raw samples"]),
+        (
+            {"maze": {"share": 1.0}},
+            LOW,
+            ["simulation.path", "at 0.0 s, in cell", "whisker", "at rest is inside the", "of cell"],
+        ),
+    ],
+)
+def test_what_cannot_be_simulated_is_named(
+    changes: dict[str, Any],
+    head: HeadConfig | None,
+    said: list[str],
+    tmp_path: Path,
+    refused: Callable[..., InputError],
+) -> None:
+    for name, drawing in {"ROOM": ROOM, "BLOCKED": BLOCKED}.items():
+        (tmp_path / name).write_text(drawing)
+    config = SimulationConfig.model_validate(changes).resolved(tmp_path)
+    refused(lambda: simulated(config, head), *said)
+
+
+def test_a_low_head_may_go_where_its_whiskers_are_free(tmp_path: Path) -> None:
+    """Whiskers at rest under the tops of the walls are no fault where no wall is near."""
+    wide = "o" + "---o" * 6 + "\n" + "\n".join(["|" + " " * 23 + "|", "o" + "   o" * 6] * 5)
+    drawing = wide + "\n|" + " " * 23 + "|\no" + "---o" * 6 + "\n"
+    (tmp_path / "maze.txt").write_text(drawing.replace("   o" * 6 + "\n|", "   o" * 6 + "\n|"))
+    short = HeadConfig(rings=(RingConfig(length=0.04, radius=0.02, height=0.055),))
+    session = made(short, maze={"file": tmp_path / "maze.txt"}, path={"cells": [(2, 2), (3, 2), (3, 3)]})
+    assert not session._felt.contact.any()
+
+
+@pytest.mark.parametrize(
+    "path", [{"circuits": ""}, {"explore": 5.0, "cells": LOOP}, {"circuits": "CA", "explore": 5.0}]
+)
+def test_one_way_is_asked_for(path: dict[str, Any]) -> None:
+    with pytest.raises(ValidationError, match="give exactly one"):
+        SimulationConfig.model_validate({"path": path})
+
+
+def test_a_configuration_written_out_asks_for_the_same() -> None:
+    for path in ({"explore": 5.0}, {"cells": LOOP}, {"circuits": "A"}, {}):
+        config = SimulationConfig.model_validate({"path": path})
+        assert SimulationConfig.model_validate(config.model_dump(mode="json")) == config
+
+
+def test_the_cheapest_tier_that_serves_is_taken() -> None:
+    assert tier(SimulationConfig()).name == "kinematic"
+    assert tier(SimulationConfig(raw=True)).name == "quasistatic"
+    assert tier(SimulationConfig(fidelity="dynamic")).name == "dynamic"
+    assert all(tier(SimulationConfig(raw=raw)).why for raw in (False, True))
+
+
+@pytest.mark.parametrize("name", ["quasistatic", "dynamic"])
+def test_raw_sessions_have_the_same_bits_every_time_and_feel_what_the_others_do(name: str) -> None:
+    changes: dict[str, Any] = {"path": {"explore": 20.0}, "fidelity": name, "mechanics": {"noise": 1e-3}}
+    raw = made(**changes)
+    first = bits(raw)
+    assert bits(raw) == first
+    assert bits(made(**changes)) == first
+    assert len(first) == 20
+    reading = next(iter(raw)).reading
+    assert isinstance(reading, Cycle)
+    assert reading.angle.shape == (2000, 18)
+    simple = made(**changes | {"fidelity": "kinematic"})
+    assert (raw.truth == simple.truth).all()
+    assert (raw.odometry == simple.odometry).all()
+    felt = [np.array([s.reading.contact for s in sensing(source, TouchConfig())]) for source in (raw, simple)]
+    assert (felt[0] == felt[1]).mean() > 0.85
+    assert felt[0].mean() > 0.1
+    assert "calibration" in raw.rig
+
+
+@pytest.mark.parametrize(("radial", "raw"), list(product([False, True], repeat=2)))
+def test_a_recorded_session_is_the_session(radial: bool, raw: bool, tmp_path: Path) -> None:
+    head = HeadConfig(dead=(2,), rest_deg=70.0)
+    session = made(head, raw=raw, path={"explore": 6.0 if raw else 60.0})
+    record(session, tmp_path / "a.mcap")
+    again = Recording(tmp_path / "a.mcap")
+    assert bits(again) == bits(session)
+    assert again.rig == rig_of(session)
+    assert again.params == session.params
+    assert again.whisked
+    assert head_of(again, HeadConfig()) == head
+    assert head_of(again, HeadConfig(dead=(4,))) == head.model_copy(update={"dead": (4,)})
+    touch = TouchConfig(head=head, image=ImageConfig(radial=radial))
+    seen = [sensing(source, touch) for source in (session, again)]
+    assert seen[0].view_shape == seen[1].view_shape == (3, 6, 1 + radial)
+    assert bits(seen[0]) == bits(seen[1])
+    observed = next(iter(seen[0])).reading
+    assert isinstance(observed, Observation)
+    assert not observed.alive[2]
+    assert sensing(seen[0], touch) is seen[0]
+
+
+def test_a_session_in_memory_is_the_session() -> None:
+    source = sensing(made(HeadConfig(dead=(5,))), TouchConfig())
+    log = collected(source)
+    assert (log.length, log.view_shape, log.whiskers) == (source.length, (3, 6, 1), 18)
+    assert log.params == {"pc_cell_x_size": 0.05}
+    for one, two in zip(source, log, strict=True):
+        assert (one.reading.view == two.reading.view).all()
+        assert (one.reading.alive == two.reading.alive).all()
+        assert one.reading.odometry == two.reading.odometry
+        assert (one.truth == two.truth).all()
+
+
+def test_whiskers_are_not_taken_for_observations(refused: Callable[..., InputError]) -> None:
+    refused(lambda: collected(made()), "simulation", "nothing but whiskers")
+
+
+def test_another_head_than_the_recorded_one_is_refused(
+    tmp_path: Path, refused: Callable[..., InputError]
+) -> None:
+    record(made(path={"explore": 3.0}), tmp_path / "a.mcap")
+    source = Recording(tmp_path / "a.mcap")
+    refused(
+        lambda: sensing(source, TouchConfig(head=HeadConfig(whiskers=5))),
+        "touch.head",
+        "15 whiskers",
+        "18, as a has",
+    )
+
+
+def test_odometry_is_that_of_the_middles() -> None:
+    session = made(odometry=OdometryConfig(noise="none").model_dump())
+    true = between(session.truth[:-1], session.truth[1:])
+    assert np.allclose(session.odometry[1:, :2], true[:, :2], atol=1e-12)
+    assert np.allclose(wrap(session.odometry[1:, 2] - true[:, 2]), 0, atol=1e-9)
+    assert (session.odometry[1:, 3] == 1).all()

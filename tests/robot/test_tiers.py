@@ -1,0 +1,221 @@
+"""The raw tiers: mechanics that can be checked by hand, and that all tiers tell of one world."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from robot.dynamic import dynamic
+from robot.kinematic import Felt, MechanicsConfig
+from robot.maze import random_loop, scattered, walls
+from robot.mechanics import BeamConfig, StreamConfig, beam, clock
+from robot.motion import MotionConfig, Path, planned
+from robot.quasistatic import quasistatic
+from robot.sweep import Tier, cycles, free_cycles
+from robot.walls import Surroundings, Walls
+from tactile.calibration import Calibration, CalibrationConfig, calibrated
+from tactile.contact import ContactConfig, ShaftConfig, sensed, stiffness
+from tactile.errors import InputError
+from tactile.head import HeadConfig, ur10_head
+from tactile.streams import stream
+from tactile.types import Cycle
+from tactile.whisking import WhiskingConfig
+
+HEAD = ur10_head(HeadConfig())
+STREAM, MECHANICS, OPEN, RCP = (
+    StreamConfig(),
+    MechanicsConfig(),
+    WhiskingConfig(mode="open"),
+    WhiskingConfig(),
+)
+TIERS = pytest.mark.parametrize("tier", [quasistatic, dynamic])
+
+
+def calibration(
+    tier: Tier, mechanics: MechanicsConfig = MECHANICS, config: StreamConfig = STREAM
+) -> Calibration:
+    record = free_cycles(tier, config, mechanics, OPEN, HEAD, 4, stream(9, "calibration"))
+    return calibrated(CalibrationConfig(), record)
+
+
+def still(wall: Walls) -> tuple[Surroundings, Path]:
+    return Surroundings(wall, HEAD), Path(np.array([0.0, 100.0]), np.zeros((2, 3)))
+
+
+def one(
+    tier: Tier, wall: Walls, whisking: WhiskingConfig, mechanics: MechanicsConfig, path: Path | None = None
+) -> Cycle:
+    there, stays = still(wall)
+    limit = np.full(18, 0.04)
+    start, random = np.zeros(1), stream(0, "sensor")
+    return next(iter(cycles(tier, STREAM, mechanics, whisking, there, path or stays, start, random, limit)))
+
+
+LOW = Walls(np.array([[-1.0, -1.0, 1.0, 1.0]]), np.array([0.05]))
+"""A table under the whole head: every whisker meets it with its tip."""
+
+
+def maze(count: int) -> tuple[Surroundings, Path, np.ndarray]:
+    loop = random_loop(4, 3, 8, stream(0, "maze.loop"))
+    built = walls(scattered(4, 3, loop, 0.6, stream(0, "maze.walls")), stream(0, "maze.heights"))
+    return (
+        Surroundings(built, HEAD),
+        planned(MotionConfig(), loop, stream(0, "motion")),
+        np.arange(count) * 1.0,
+    )
+
+
+def felt(tier: Tier, count: int, whisking: WhiskingConfig, rate: float = 2000.0) -> Felt:
+    config = StreamConfig(rate=rate)
+    there, path, start = maze(count)
+    known = calibration(tier, config=config)
+    raw = cycles(
+        tier, config, MECHANICS, whisking, there, path, start, stream(1, "sensor"), known.threshold[:, 1]
+    )
+    whisks = [sensed(ContactConfig(), known, cycle) for cycle in raw]
+    return Felt(*(np.array([getattr(whisk, name) for whisk in whisks]) for name in Felt._fields))
+
+
+@pytest.mark.parametrize("taper", [0.1, 0.2, 0.6])
+def test_the_beam_is_as_stiff_as_theory_where_it_is_loaded(taper: float) -> None:
+    model = beam(ShaftConfig(taper=taper))
+    for reach in (1.0, 0.65):
+        shape = model.at(np.array(reach))
+        loads = np.linalg.solve(model.stiffness, shape)
+        hard = reach**2 / (shape @ loads) / model.unit
+        assert hard == pytest.approx(stiffness(ShaftConfig(taper=taper), reach), rel=2e-3)
+        assert model.moment @ loads == pytest.approx(reach, rel=2e-3)
+
+
+def test_a_straight_whisker_rings_as_a_cantilever_does() -> None:
+    first, second = beam(ShaftConfig(taper=1.0)).modes
+    # Two shapes can only be stiffer than the whole (Rayleigh and Ritz).
+    assert 1.8751**2 <= first < 1.01 * 1.8751**2
+    assert 4.6941**2 <= second < 1.1 * 4.6941**2
+    assert clock(BeamConfig(), 0.2) == pytest.approx(4 * clock(BeamConfig(), 0.1))
+
+
+@TIERS
+def test_free_whiskers_follow_the_command_and_feel_nothing(tier: Tier) -> None:
+    found = calibration(tier)
+    np.testing.assert_allclose(found.free, np.radians(65), atol=0.02)
+    # Beyond the sensor's noise, the inertia of the long whiskers.
+    assert (found.sd > 0.97 * 2e-3).all()
+    assert (found.sd < 1.25 * 2e-3).all()
+    np.testing.assert_allclose(found.mean, 0.0, atol=3e-4)
+
+
+@TIERS
+@pytest.mark.parametrize("servo", [0.2, 1.0])
+def test_drive_and_whisker_share_what_is_commanded_beyond_the_wall(tier: Tier, servo: float) -> None:
+    mechanics = MechanicsConfig(servo=servo, noise=0.0, slip=1.0)
+    whisking = WhiskingConfig(mode="open", rate=0.25)
+    cycle = one(tier, LOW, whisking, mechanics)
+    met = still(LOW)[0].contact(np.zeros((1, 3))).angle[0]
+    hard = stiffness(ShaftConfig(), 1.0)
+    bend = servo / (servo + hard) * (np.radians(65) - met)
+    half = len(cycle.time) // 2
+    np.testing.assert_allclose(cycle.angle[half], met + bend, atol=0.01)
+    np.testing.assert_allclose(cycle.deflection[half, :, 1], hard * bend, atol=0.01)
+    assert (np.abs(cycle.deflection[..., 0]) < 1e-9).all()
+
+
+@TIERS
+def test_whiskers_bent_too_far_slip_off(tier: Tier) -> None:
+    cycle = one(tier, LOW, OPEN, MechanicsConfig(noise=0.0, slip=0.1))
+    met = still(LOW)[0].contact(np.zeros((1, 3))).angle[0]
+    half = len(cycle.time) // 2
+    assert (met < 0.9).any()
+    np.testing.assert_allclose(cycle.angle[half, met < 0.9], np.radians(65), atol=0.02)
+    np.testing.assert_allclose(cycle.deflection[half, met < 0.9, 1], 0.0, atol=0.02)
+
+
+@TIERS
+def test_feedback_lessens_the_push(tier: Tier) -> None:
+    quiet = MechanicsConfig(noise=0.0, slip=1.0)
+    most = [one(tier, LOW, whisking, quiet).deflection[..., 1].max(axis=0) for whisking in (OPEN, RCP)]
+    assert (most[1] < 0.8 * most[0]).all()
+    assert (most[1] > 0.04).all()
+
+
+@TIERS
+def test_a_head_that_moves_drags_its_whiskers_sideways_until_they_slide(tier: Tier) -> None:
+    ahead = Path(np.array([0.0, 1.0]), np.array([[0.0, 0, 0], [0.05, 0, 0]]))
+    cycle = one(tier, LOW, OPEN, MechanicsConfig(noise=0.0, slip=1.0), ahead)
+    x, y = np.abs(cycle.deflection[1000]).T
+    across = np.abs(HEAD.swing[:, 1]) > 0.1
+    assert (x[across] > 0.01).all()
+    assert (x[~across] < 1e-6).all()
+    assert (x <= BeamConfig().friction * y * 1.2 + 1e-9).all()
+
+
+@TIERS
+def test_what_is_felt_does_not_depend_on_how_cycles_are_batched(tier: Tier) -> None:
+    there, path, start = maze(5)
+    limit = np.full(18, 0.04)
+    runs = [
+        list(cycles(tier, StreamConfig(batch=n), MECHANICS, RCP, there, path, start, stream(1, "s"), limit))
+        for n in (2, 5)
+    ]
+    for a, b in zip(*runs, strict=True):
+        assert np.array_equal(a.time, b.time)
+        np.testing.assert_allclose(a.angle, b.angle, atol=1e-9)
+        np.testing.assert_allclose(a.deflection, b.deflection, atol=1e-9)
+
+
+@pytest.mark.parametrize("mode", ["open", "rcp", "spread"])
+def test_the_tiers_tell_of_one_world(mode: str) -> None:
+    slow, quick = (felt(tier, 40, WhiskingConfig(mode=mode)) for tier in (dynamic, quasistatic))
+    assert slow.contact.mean() > 0.1
+    assert (slow.contact != quick.contact).mean() < 0.02
+    assert (slow.held != quick.held).mean() < 0.03
+    both = slow.contact & quick.contact
+    assert np.abs(slow.touched - quick.touched)[both].mean() < 0.015
+
+
+@TIERS
+def test_the_sample_rate_does_not_matter(tier: Tier) -> None:
+    usual = felt(tier, 16, RCP)
+    for rate in (1000.0, 4000.0):
+        other = felt(tier, 16, RCP, rate)
+        assert (usual.contact != other.contact).sum() <= 1
+        both = usual.contact & other.contact
+        off = (usual.touched - other.touched)[both]
+        assert np.sqrt((off**2).mean()) < 2e-3 * np.pi * np.radians(65)
+
+
+def test_where_drives_are_soft_feedback_brings_nothing() -> None:
+    def kept(servo: float, whisking: WhiskingConfig) -> np.ndarray:
+        mechanics = MechanicsConfig(servo=servo)
+        there, path, start = maze(30)
+        known = calibration(quasistatic, mechanics)
+        raw = cycles(
+            quasistatic,
+            STREAM,
+            mechanics,
+            whisking,
+            there,
+            path,
+            start,
+            stream(1, "sensor"),
+            known.threshold[:, 1],
+        )
+        return np.array([sensed(ContactConfig(), known, cycle).held for cycle in raw])
+
+    soft, stiff = (kept(servo, RCP).mean() - kept(servo, OPEN).mean() for servo in (0.3, 3.0))
+    assert abs(soft) < 0.03
+    assert stiff > 0.05
+
+
+def test_dead_whiskers_send_nothing_and_are_known_as_dead() -> None:
+    head = ur10_head(HeadConfig(dead=(3, 7)))
+    record = free_cycles(quasistatic, STREAM, MECHANICS, OPEN, head, 4, stream(0, "calibration"))
+    assert np.flatnonzero(~calibrated(CalibrationConfig(), record).alive).tolist() == [3, 7]
+
+
+@TIERS
+def test_a_record_among_walls_is_no_calibration(tier: Tier) -> None:
+    there, path, start = maze(6)
+    raw = cycles(tier, STREAM, MECHANICS, OPEN, there, path, start, stream(1, "s"), np.full(18, np.inf))
+    with pytest.raises(InputError, match="contacts of whisker"):
+        calibrated(CalibrationConfig(), list(raw))

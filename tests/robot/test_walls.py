@@ -1,0 +1,126 @@
+"""Contact in closed form, against a whisker that is marched along its way and its shaft."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from robot.maze import random_loop, scattered, walls
+from robot.walls import FREE, Surroundings, Walls
+from tactile.head import Head, HeadConfig, RingConfig, shaft, ur10_head
+from tactile.streams import stream
+
+STEP = 1 / 600
+"""Of the march, as a share of the sweep."""
+SHARES = np.arange(1, 161) / 160
+"""Points of the shaft that it looks at."""
+WIDE = (RingConfig(length=0.05, radius=0.09, height=0.09), RingConfig(length=0.16, radius=0.12, height=0.17))
+HEADS = {
+    "ur10": (HeadConfig(), 65.0),
+    "steep": (HeadConfig(rest_deg=60.0, first_deg=17.0), 70.0),
+    "past the vertical": (HeadConfig(rest_deg=45.0, limit_deg=100.0, rings=WIDE), 95.0),
+    "one ring of five": (
+        HeadConfig(rings=(RingConfig(length=0.16, radius=0.05, height=0.16),), whiskers=5),
+        70.0,
+    ),
+}
+
+
+def maze_of(seed: int, heights: tuple[float, ...] = (0.05,)) -> Walls:
+    loop = random_loop(3, 3, 8, stream(seed, "maze.loop"))
+    return walls(scattered(3, 3, loop, 0.6, stream(seed, "maze.walls")), stream(seed, "heights"), heights)
+
+
+def marched(head: Head, boxes: Walls, pose: np.ndarray, sweep: float) -> tuple[np.ndarray, np.ndarray]:
+    """[W] the first protraction at which a point of the shaft is inside a box, and [S, W] what is then."""
+    angle = np.arange(0, sweep, sweep * STEP)
+    shape = (len(angle), len(SHARES), len(head.length))
+    along = SHARES[:, None] * head.length + np.zeros(shape)
+    point = shaft(head, np.broadcast_to(angle[:, None, None], shape), along)
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    x, y = pose[0] + c * point[..., 0] - s * point[..., 1], pose[1] + s * point[..., 0] + c * point[..., 1]
+    inside = np.zeros(shape, bool)
+    for (west, south, east, north), height in zip(boxes.box, boxes.height, strict=True):
+        inside |= (west < x) & (x < east) & (south < y) & (y < north) & (point[..., 2] < height)
+    hit = inside.any(axis=1)
+    first = np.argmax(hit, axis=0)
+    return np.where(hit.any(axis=0), angle[first], FREE), inside[first, :, np.arange(shape[2])].T
+
+
+@pytest.mark.parametrize("name", HEADS)
+def test_contact_is_where_the_march_finds_it(name: str) -> None:
+    config, degrees = HEADS[name]
+    head, sweep = ur10_head(config), np.radians(degrees)
+    random = np.random.default_rng(0)
+    late, beside, missed = [], [], []
+    for seed in range(5):
+        boxes = maze_of(seed, (0.05, 0.03))
+        poses = np.column_stack([random.uniform(0, 0.54, (2, 2)), random.uniform(-9, 9, 2)])
+        contact = Surroundings(boxes, head).contact(poses)
+        for pose, angle, reach in zip(poses, contact.angle, contact.reach, strict=True):
+            brute, inside = marched(head, boxes, pose, sweep)
+            there, met = angle <= sweep, np.isfinite(brute)
+            assert (there | ~met).all()  # what the march finds is there
+            late += (brute[met] - angle[met]).tolist()
+            missed += (there & ~met)[there].tolist()
+            nearest = np.where(inside, np.abs(SHARES[:, None] - reach), 1.0).min(axis=0)
+            beside += nearest[met & (angle > 0)].tolist()
+    assert len(late) > 10
+    # A corner that is grazed for less than a step is found late by the march, or not at all.
+    assert min(late) > -1e-9
+    assert np.quantile(late, 0.95) < 0.006
+    assert np.mean(missed) < 0.05
+    assert np.quantile(beside, 0.95) < 0.01
+
+
+def test_a_lone_wall_is_met_by_the_tip_on_its_top_and_by_the_shaft_behind_it() -> None:
+    """Worked by hand: a 100 mm whisker at rest out, its base 100 mm over the floor on the head's axis."""
+    ring = RingConfig(length=0.1, radius=1e-9, height=0.1)
+    head = ur10_head(HeadConfig(rings=(ring,), whiskers=1, rest_deg=90.0, limit_deg=90.0))
+
+    def met(west: float, east: float, height: float) -> tuple[float, float]:
+        boxes = Walls(np.array([[west, -0.5, east, 0.5]]), np.array([height]))
+        contact = Surroundings(boxes, head).contact(np.zeros((1, 3)))
+        return float(contact.angle[0, 0]), float(contact.reach[0, 0])
+
+    angle, reach = met(0.05, 0.2, 0.04)  # the tip comes down to 4 cm: cos = 0.6
+    assert (angle, reach) == pytest.approx((np.pi / 2 - np.arccos(0.6), 1.0))
+    angle, reach = met(0.02, 0.03, 0.06)  # the edge 3 cm out and 4 cm below the base
+    assert (angle, reach) == pytest.approx((np.pi / 2 - np.arctan2(0.03, 0.04), 0.5))
+    assert met(0.09, 0.2, 0.04)[0] == FREE  # the tip lands short of it
+    assert met(-0.2, -0.1, 0.04)[0] == FREE  # behind
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 50), st.floats(0, 0.54), st.floats(0, 0.54), st.floats(-4, 4))
+def test_turning_the_head_by_a_column_moves_the_image_by_one(
+    seed: int, x: float, y: float, heading: float
+) -> None:
+    around = Surroundings(maze_of(seed), ur10_head(HeadConfig()))
+    one, turned = around.contact(np.array([[x, y, heading], [x, y, heading + np.pi / 3]])).angle.reshape(
+        2, 3, 6
+    )
+    assert np.allclose(np.roll(one, -1, axis=1), turned, atol=1e-6, equal_nan=True)
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 50), st.integers(1, 40))
+def test_many_questions_have_the_answers_of_each(seed: int, count: int) -> None:
+    random = np.random.default_rng(seed)
+    pose = np.column_stack([random.uniform(-0.1, 0.64, (count, 2)), random.uniform(-9, 9, count)])
+    around = Surroundings(maze_of(seed), ur10_head(HeadConfig()))
+    whole = around.contact(pose)
+    for row in range(count):
+        alone = Surroundings(maze_of(seed), ur10_head(HeadConfig())).contact(pose[row : row + 1])
+        for column, other in zip(whole, alone, strict=True):
+            assert (column[row] == other[0]).all()
+    assert ((whole.wall >= 0) == np.isfinite(whole.angle)).all()
+    assert (whole.reach[~np.isfinite(whole.angle)] == 0).all()
+
+
+def test_far_from_everything_nothing_is_met() -> None:
+    contact = Surroundings(maze_of(0), ur10_head(HeadConfig())).contact(np.array([[30.0, -20.0, 1.0]]))
+    assert (contact.angle == FREE).all()
+    assert (contact.wall == -1).all()

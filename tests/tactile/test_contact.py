@@ -1,0 +1,138 @@
+"""Contact found in made-up streams whose truth is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tactile.calibration import Calibration
+from tactile.contact import ContactConfig, ShaftConfig, reached, sensed, stiffness
+from tactile.errors import InputError
+from tactile.streams import stream
+from tactile.types import Cycle, Odometry
+
+AMPLITUDE = 1.134
+W = 18
+CONFIG = ContactConfig()
+
+
+def known(sd: float = 2e-3) -> Calibration:
+    ones = np.ones((W, 2))
+    return Calibration(0 * ones, sd * ones, 20 * sd * ones, AMPLITUDE * np.ones(W), np.ones(W, bool), 2000.0)
+
+
+def whisk(
+    wall: np.ndarray, *, rate: float = 2000.0, sd: float = 2e-3, share: float = 0.5, reach: float = 0.75,
+    slips: float = np.inf, seed: int = 0,
+) -> Cycle:  # fmt: skip
+    """A cycle against walls at angles [W] that take up `share` of what is commanded beyond them."""
+    time = np.arange(int(rate)) / rate
+    command = AMPLITUDE * (1 - np.cos(2 * np.pi * time))[:, None] / 2
+    bend = np.where(command > wall, share * np.maximum(command - np.where(wall < np.inf, wall, 0), 0), 0.0)
+    bend[np.maximum.accumulate(bend, axis=0) > slips] = 0.0
+    angle = np.where(bend > 0, wall + bend, command)
+    deflection = np.stack([0 * bend, stiffness(CONFIG.shaft, reach) * bend], axis=-1)
+    noise = sd * stream(seed, "sensor").standard_normal((len(time), W, 3))
+    return Cycle(time, angle + noise[..., 0], deflection + noise[..., 1:], Odometry(0.03, 0, 0, 1))
+
+
+WALLS = np.linspace(0.1, 1.0, W)
+FREE = np.full(W, np.inf)
+
+
+def test_nothing_is_felt_where_nothing_is() -> None:
+    for seed in range(20):
+        felt = sensed(CONFIG, known(), whisk(FREE, seed=seed))
+        assert not felt.contact.any()
+        assert not felt.held.any()
+        assert not felt.touched.any()
+        assert not felt.reach.any()
+        np.testing.assert_allclose(felt.highest, AMPLITUDE, atol=3e-3)
+
+
+@given(st.integers(0, 100), st.floats(0.25, 0.6))
+def test_walls_are_found_where_they_are(seed: int, share: float) -> None:
+    felt = sensed(CONFIG, known(), whisk(WALLS, seed=seed, share=share))
+    assert felt.contact.all()
+    assert felt.held.all()
+    # Never before the wall, but for noise; late by the bend at which it shows.
+    assert (felt.touched > WALLS - 0.01).all()
+    assert (felt.touched < WALLS + 0.04).all()
+    np.testing.assert_allclose(felt.highest, WALLS + share * (AMPLITUDE - WALLS), atol=3e-3)
+
+
+def test_no_more_than_a_promille_is_false_or_missed() -> None:
+    at = stream(1, "walls").uniform(0.05, AMPLITUDE - 0.04, (60, W))
+    assert (
+        sum((~sensed(CONFIG, known(), whisk(at[k], seed=k)).contact).sum() for k in range(60))
+        <= 0.003 * at.size
+    )
+    assert (
+        sum(sensed(CONFIG, known(), whisk(FREE, seed=k)).contact.sum() for k in range(60)) <= 0.0013 * at.size
+    )
+
+
+def test_a_whisker_that_slips_off_has_touched_but_is_not_held() -> None:
+    felt = sensed(CONFIG, known(), whisk(np.full(W, 0.3), slips=0.2))
+    assert felt.contact.all()
+    assert not felt.held.any()
+    np.testing.assert_allclose(felt.touched, 0.31, atol=0.02)
+
+
+def test_it_feels_the_same_at_any_sample_rate() -> None:
+    usual = [sensed(CONFIG, known(), whisk(WALLS, seed=k)) for k in range(8)]
+    for rate in (1000.0, 4000.0):
+        other = [sensed(CONFIG, known(), whisk(WALLS, rate=rate, seed=99 + k)) for k in range(8)]
+        assert all(np.array_equal(a.contact, b.contact) for a, b in zip(usual, other, strict=True))
+        off = np.array([a.touched - b.touched for a, b in zip(usual, other, strict=True)])
+        # Two milliseconds of the fastest sweep.
+        assert np.sqrt((off**2).mean()) < 2e-3 * np.pi * AMPLITUDE
+
+
+@given(st.floats(0.3, 1.0), st.floats(0.05, 1.0))
+def test_the_radial_distance_inverts_the_stiffness(reach: float, taper: float) -> None:
+    shaft = ShaftConfig(taper=taper)
+    assert reached(shaft, stiffness(shaft, reach)) == pytest.approx(reach)
+    assert stiffness(shaft, shaft.reference) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("reach", [0.5, 0.65, 0.8, 1.0])
+def test_the_radial_distance_is_felt(reach: float) -> None:
+    felt = sensed(CONFIG, known(), whisk(np.linspace(0.1, 0.8, W), reach=reach))
+    np.testing.assert_allclose(felt.reach, reach, atol=0.05)
+
+
+def test_offsets_of_the_sensors_are_taken_off() -> None:
+    cycle = whisk(WALLS)
+    shifted = cycle._replace(deflection=cycle.deflection + [0.3, -0.2])
+    there = known()._replace(mean=np.tile([0.3, -0.2], (W, 1)))
+    for a, b in zip(sensed(CONFIG, known(), cycle)[1:], sensed(CONFIG, there, shifted)[1:], strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-9)
+
+
+def test_whiskers_that_do_not_report_say_nothing_and_disturb_nobody() -> None:
+    plain = sensed(CONFIG, known(), whisk(WALLS))
+    cycle = whisk(WALLS)
+    cycle.angle[3, 2], cycle.deflection[700, 5, 0] = np.nan, np.inf
+    felt = sensed(CONFIG, known()._replace(alive=np.arange(W) != 9), cycle)
+    silent = np.isin(np.arange(W), [2, 5, 9])
+    assert np.array_equal(felt.alive, ~silent)
+    for name in ("contact", "touched", "held", "highest", "reach"):
+        assert not getattr(felt, name)[silent].any()
+        # Not to the last bit: all whiskers together tell when the protraction ended.
+        np.testing.assert_allclose(getattr(felt, name)[~silent], getattr(plain, name)[~silent], atol=1e-3)
+
+
+def test_streams_too_coarse_for_the_slope_window_are_refused() -> None:
+    with pytest.raises(InputError, match=r"500 samples per second.*slope_window"):
+        sensed(CONFIG, known(), whisk(FREE, rate=500.0))
+
+
+def test_broken_streams_are_refused() -> None:
+    cycle = whisk(FREE)
+    with pytest.raises(InputError, match="out of order"):
+        sensed(CONFIG, known(), cycle._replace(time=cycle.time * 0))
+    with pytest.raises(InputError, match="cut off"):
+        sensed(CONFIG, known(), Cycle(*(part[:10] for part in cycle[:3]), cycle.odometry))

@@ -1,0 +1,106 @@
+"""Laws of the drive: what contact may change of the sinusoid, and what not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tactile.errors import InputError
+from tactile.head import HeadConfig, ur10_head
+from tactile.streams import stream
+from tactile.whisking import WhiskingConfig, beside, checked, command, phase, still
+
+SHAPE = (3, 6)
+THRESHOLD = np.full(18, 0.04)
+MODES = st.sampled_from(["open", "rcp", "spread"])
+
+
+def driven(config: WhiskingConfig, y: np.ndarray, rate: float = 2000.0) -> np.ndarray:
+    """[T, ..., W] what is commanded over one cycle of deflections [T, ..., W]."""
+    drive, angles = still(*y.shape[1:]), []
+    for k in range(len(y)):
+        angle, drive = command(config, drive, k / rate, y[k], THRESHOLD, SHAPE)
+        angles.append(angle)
+    return np.array(angles)
+
+
+def touch(whisker: int, size: float, count: int = 1000, since: int = 200) -> np.ndarray:
+    y = np.zeros((count, 18))
+    y[since:, whisker] = size
+    return y
+
+
+@given(MODES, st.floats(0, 1), st.integers(0, 17))
+def test_contact_lowers_the_amplitude_only(mode: str, size: float, whisker: int) -> None:
+    config = WhiskingConfig(mode=mode)
+    angles = driven(config, touch(whisker, size, count=100, since=10), rate=200.0)
+    free = np.radians(config.amplitude_deg) * phase(config, np.arange(100) / 200.0)[:, None]
+    assert (angles[0] == 0).all()
+    assert (angles >= 0).all()
+    assert (angles <= free + 1e-12).all()
+
+
+@given(MODES, st.floats(0, 0.04))
+def test_below_the_threshold_nothing_changes(mode: str, size: float) -> None:
+    config = WhiskingConfig(mode=mode)
+    free = np.radians(config.amplitude_deg) * phase(config, np.arange(100) / 200.0)
+    np.testing.assert_allclose(driven(config, touch(3, -size, 100, 10), 200.0)[:, 3], free, atol=1e-12)
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_the_loss_is_the_gain_times_the_excess(sign: int) -> None:
+    config = WhiskingConfig(gain=2.0)
+    top = driven(config, touch(4, sign * 0.1))[-1] / phase(config, 999 / 2000)
+    np.testing.assert_allclose(np.radians(65) - top[4], 2.0 * 0.06, rtol=1e-6)
+    np.testing.assert_allclose(np.delete(top, 4), np.radians(65))
+
+
+def test_a_whisker_does_not_spring_back_within_a_cycle_but_starts_the_next_afresh() -> None:
+    config = WhiskingConfig()
+    y = touch(0, 0.1)
+    y[400:] = 0
+    assert driven(config, y)[-1, 0] < np.radians(65) - 0.2
+    drive = still(18)
+    for time in (*np.arange(0, 1, 0.005), 0.0, 0.5):
+        angle, drive = command(config, drive, time, y[300] if 0 < time < 0.4 else y[0], THRESHOLD, SHAPE)
+    np.testing.assert_allclose(angle, np.radians(65))
+
+
+def test_the_perturbation_is_the_same_at_any_sample_rate() -> None:
+    config = WhiskingConfig()
+    coarse = driven(config, touch(0, 0.2, 500, 100), 1000.0)[::5]
+    fine = driven(config, touch(0, 0.2, 2000, 400), 4000.0)[::20]
+    np.testing.assert_allclose(coarse, fine, atol=0.02)
+
+
+def test_one_call_for_many_heads_is_many_calls() -> None:
+    y = np.abs(stream(0, "y").standard_normal((100, 3, 18))) * 0.1
+    for mode in ("open", "rcp", "spread"):
+        config = WhiskingConfig(mode=mode)
+        together = driven(config, y, 200.0)
+        apart = np.stack([driven(config, y[:, k], 200.0) for k in range(3)], axis=1)
+        assert np.array_equal(together, apart)
+
+
+@given(st.integers(0, 17), st.floats(0, 1))
+def test_free_whiskers_beside_follow_in_part(whisker: int, follow: float) -> None:
+    config = WhiskingConfig(mode="spread", follow=follow)
+    top = driven(config, touch(whisker, 0.1, 60, 10), 120.0)[-1]
+    loss = np.radians(65) * phase(config, 59 / 120) - top
+    row, column = divmod(whisker, 6)
+    near = {row * 6 + (column + 1) % 6, row * 6 + (column - 1) % 6, *(r * 6 + column for r in range(3))}
+    for other in set(range(18)) - {whisker}:
+        np.testing.assert_allclose(loss[other], follow * loss[whisker] if other in near else 0, atol=1e-12)
+
+
+def test_a_single_row_has_ends() -> None:
+    assert beside(np.array([1.0, 0, 0, 0]), (1, 4)).tolist() == [1, 1, 0, 0]
+
+
+def test_more_than_the_drives_allow_is_refused() -> None:
+    head = ur10_head(HeadConfig(limit_deg=70))
+    checked(WhiskingConfig(amplitude_deg=70), head)
+    with pytest.raises(InputError, match=r"simulation\.whisking\.amplitude_deg: 80 degrees.*70"):
+        checked(WhiskingConfig(amplitude_deg=80), head)
