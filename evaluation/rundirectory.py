@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import csv
 import json
+import zipfile
 from pathlib import Path
 
 import numpy as np
 
 from evaluation.run import Run
+from evaluation.scorecard import Scorecard
+from evaluation.table import read_table
 from evaluation.trajectory import read_tum
 from tactile.errors import InputError
 
@@ -45,6 +49,76 @@ def read_run(path: Path) -> Run:
         links=links,
         anytime=_anytime(path / "anytime.csv"),
     )
+
+
+def read_card(path: Path) -> Scorecard:
+    """The scorecard in a run directory.
+
+    Raises:
+        InputError: there is none.
+    """
+    try:
+        return Scorecard.model_validate_json((path / "scorecard.json").read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(str(path / "scorecard.json"), "no such file", "a scored run's") from None
+    except ValueError as error:
+        raise InputError(str(path / "scorecard.json"), f"no scorecard ({error})", "a scored run's") from None
+
+
+WALLS = ("west", "south", "east", "north", "height")
+"""The columns of walls.csv, m: boxes along the axes, in the frame of the truth."""
+
+
+def write_walls(path: str | Path, walls: np.ndarray) -> None:
+    """Writes walls [B, 5] with repr-exact floats."""
+    lines = [",".join(WALLS), *(",".join(map(repr, row)) for row in walls.tolist())]
+    Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def read_walls(path: Path) -> np.ndarray:
+    """[B, 5] the walls in a run directory; none where it knows of none.
+
+    Raises:
+        InputError: naming the line that holds no wall.
+    """
+    file = path / "walls.csv"
+    if not file.exists():
+        return np.zeros((0, len(WALLS)))
+    return read_table(file, dict.fromkeys(WALLS, ())).values
+
+
+def read_closures(path: Path) -> np.ndarray:
+    """[n, 2] the steps that accepted closures join; none where the run kept no list of them.
+
+    Raises:
+        InputError: naming the line that cannot be read.
+    """
+    file = path / "closures.csv"
+    if not file.exists():
+        return np.zeros((0, 2), int)
+    skipped = _skipped(path)
+    joined = []
+    with file.open(encoding="utf-8", newline="") as lines:
+        for row in (reader := csv.DictReader(lines)):
+            try:
+                if row["verdict"] == "accepted":
+                    joined.append([int(row["match_step"]), int(row["step"])])
+            except (KeyError, TypeError, ValueError):
+                raise InputError(
+                    f"{file}:{reader.line_num}", "no closure", "the columns step, match_step, verdict"
+                ) from None
+    steps = np.array(joined, int).reshape(-1, 2) - skipped
+    return steps[(steps >= 0).all(axis=1)]
+
+
+def _skipped(path: Path) -> int:
+    """Steps that an earlier run had taken before this one went on from its checkpoint."""
+    try:
+        with np.load(path / "map.npz", allow_pickle=False) as archive:
+            total = int(archive["steps"])
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return 0
+    return max(0, total - len(_tum(path / "online.tum")[0]))
 
 
 def _tum(path: Path) -> tuple[np.ndarray, np.ndarray]:

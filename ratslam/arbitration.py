@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ratslam.framegraph import Chain, Closures, Fit, Prior, corrected, robust_cost, solve
-from tactile.frames import between, compose, integrate, inverse, wrap
+from tactile.frames import between, compose, integrate, inverse
 
 KEPT = 0.25
 """Robust weight above which a run is believed: it then strains the map by less than its evidence."""
@@ -61,28 +61,39 @@ class Judgement(NamedTuple):
 
 
 Where = Callable[[np.ndarray, np.ndarray, np.ndarray, int], int]
-"""Finds the frame before which the odometry is cut, given all poses [N, 3], those [n, 3] that odometry alone
-tells for the frames after frame `since`, and the motion [3] that carries the last of them where it belongs."""
+"""Finds the frame before which the odometry is cut: given all poses [N, 3], those [n, 3] that odometry alone
+tells for the frames after a frame, the motion [3] that carries the last of them where it belongs, and that
+frame."""
 
 
-def arbitrate(case: Case, starts: Sequence[Fit], where: Where) -> Judgement:
+def arbitrate(
+    case: Case, starts: Sequence[Fit], where: Where, earlier: tuple[tuple[int, int], ...] = ()
+) -> Judgement:
     """The judgement with the least cost.
 
     Args:
         starts: maps to begin from; the first is the present one, the last odometry's own. where: see `Where`.
+        earlier: cuts (frame, run) of the present map.
     """
-    best = _settled(case, starts[0], ())
-    if (best.fit.weights > KEPT).all():
-        return _with_cuts(case, best, where)
-    begin = list(starts[1:])
+    best = _settled(case, starts[0], earlier)
+    if not (best.fit.weights > KEPT).all():
+        best = min([best, *_anew(case, starts)], key=_cost)
+    return _with_cuts(case, best, where)
+
+
+def _anew(case: Case, starts: Sequence[Fit]) -> list[Judgement]:
+    """Maps without cuts from all starts, and from those that only strong runs make of the last one."""
+    begin, path = list(starts), starts[-1]
     for least in STRONG:
         strong = case.evidence >= least
         if strong.any() and not strong.all():
-            fit = solve(starts[-1].poses, starts[-1].bias, case.chain, _only(case.closures, strong), case.prior, STEPS)
-            begin.append(fit)
-    for start in begin:
-        best = min(best, _settled(case, start, ()), key=lambda judgement: judgement.cost)
-    return _with_cuts(case, best, where)
+            alone = _only(case.closures, strong)
+            begin.append(solve(path.poses, path.bias, case.chain, alone, case.prior, STEPS))
+    return [_settled(case, start, ()) for start in begin]
+
+
+def _cost(judgement: Judgement) -> float:
+    return judgement.cost
 
 
 def _with_cuts(case: Case, best: Judgement, where: Where) -> Judgement:
@@ -92,7 +103,7 @@ def _with_cuts(case: Case, best: Judgement, where: Where) -> Judgement:
         tempting = [run for run in np.argsort(-strain)[:TRIES].tolist() if strain[run] >= TELLING]
         cut = min(
             (judgement for run in tempting for judgement in _cut(case, best, run, where)),
-            key=lambda judgement: judgement.cost,
+            key=_cost,
             default=best,
         )
         if cut.cost >= best.cost:
@@ -104,7 +115,7 @@ def _strain(case: Case, best: Judgement) -> np.ndarray:
     """[R] squared deviation of where each run begins from where odometry leads since the last closure that is
     believed, both by what they claim alone: a map that has bent to a jump does not hide it."""
     chain, closures = _severed(case.chain, best.cuts), case.closures
-    poses, strain = best.fit.poses, np.zeros(len(case.evidence))
+    strain = np.zeros(len(case.evidence))
     for run in range(len(strain)):
         since, first = _since(case, best, run), int(case.first[run])
         if first <= since:
@@ -146,7 +157,7 @@ def _cut(case: Case, best: Judgement, run: int, where: Where) -> list[Judgement]
     if first <= since:
         return []
     claimed = _claim(best, case.closures, first, run)
-    frame, moved, carried = _carried(case, best, since, first, claimed, poses, where)
+    frame, moved = _carried(case, best, since, first, claimed, poses, where)
     cuts = (*best.cuts, (frame, run))
     found = [_settled(case, best.fit._replace(poses=moved), cuts)]
     believed = best.fit.weights > KEPT
@@ -155,7 +166,7 @@ def _cut(case: Case, best: Judgement, run: int, where: Where) -> list[Judgement]
         return found
     following = int(later[np.argmin(case.first[later])])
     end, back = int(case.last[run]), int(case.first[following])
-    again, twice, _ = _carried(case, best, end, back, poses[back], moved, where)
+    again, twice = _carried(case, best, end, back, poses[back], moved, where)
     twice[back:] = poses[back:]
     return [*found, _settled(case, best.fit._replace(poses=twice), (*cuts, (again, following)))]
 
@@ -168,9 +179,9 @@ def _carried(
     claimed: np.ndarray,
     poses: np.ndarray,
     where: Where,
-) -> tuple[int, np.ndarray, np.ndarray]:
+) -> tuple[int, np.ndarray]:
     """The frame between `since` and `first` before which to cut so that `first` comes to where it is claimed,
-    the poses that follow from that, and the motion that carries what comes after."""
+    and the poses that follow from that."""
     chain = case.chain
     told = corrected(chain.motion[since:first], chain.length[since:first], best.fit.bias)
     onwards = integrate(told, poses[since])  # of frames since + 1 ... first
@@ -180,7 +191,7 @@ def _carried(
     moved[since + 1 : first + 1] = onwards
     moved[first + 1 :] = compose(compose(onwards[-1], inverse(poses[first])), poses[first + 1 :])
     moved[frame:] = compose(carried, moved[frame:])
-    return frame, moved, carried
+    return frame, moved
 
 
 def _severed(chain: Chain, cuts: tuple[tuple[int, int], ...]) -> Chain:
@@ -202,7 +213,10 @@ def _only(closures: Closures, runs: np.ndarray) -> Closures:
     """The closures of some runs [R] bool."""
     rows = runs[closures.run]
     number = np.cumsum(runs) - 1
-    return Closures(
-        closures.i[rows], closures.j[rows], closures.turn[rows], number[closures.run[rows]],
-        closures.variance, closures.scale[runs], None if closures.score is None else closures.score[runs],
-    )  # fmt: skip
+    return closures._replace(
+        i=closures.i[rows],
+        j=closures.j[rows],
+        turn=closures.turn[rows],
+        run=number[closures.run[rows]],
+        scale=closures.scale[runs],
+    )

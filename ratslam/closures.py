@@ -89,19 +89,17 @@ class Ledger:
         run = self._candidate.rows[:, 3]
         return np.bincount(run[run >= 0], minlength=self.runs)
 
-    def firsts(self) -> np.ndarray:
-        """[R] first frame of every run."""
-        first = np.full(self.runs, np.iinfo(np.int64).max)
+    def spans(self) -> np.ndarray:
+        """[R, 2] first and last frame of every run; first after last where all is struck out."""
+        spans = np.tile(np.array([np.iinfo(np.int64).max, -1]), (self.runs, 1))
         rows = self._candidate.rows[self._candidate.rows[:, 3] >= 0]
-        np.minimum.at(first, rows[:, 3], rows[:, 0])
-        return first
+        np.minimum.at(spans[:, 0], rows[:, 3], rows[:, 0])
+        np.maximum.at(spans[:, 1], rows[:, 3], rows[:, 0])
+        return spans
 
-    def lasts(self) -> np.ndarray:
-        """[R] last frame of every run."""
-        last = np.full(self.runs, -1)
-        rows = self._candidate.rows[self._candidate.rows[:, 3] >= 0]
-        np.maximum.at(last, rows[:, 3], rows[:, 0])
-        return last
+    def verdicts(self) -> np.ndarray:
+        """[R] what became of every run."""
+        return self._verdict.rows
 
     def verdict(self, run: int) -> Verdict:
         """What became of a run."""
@@ -129,26 +127,16 @@ class Ledger:
             self._lines = np.flatnonzero((run >= 0) & (self._verdict.rows[run] == Verdict.ACCEPTED))
         return self._lines
 
-    def closures(
-        self,
-        angle: float,
-        variance: np.ndarray,
-        scales: tuple[float, float, float],
-        which: np.ndarray | None = None,
-    ) -> Closures:
+    def closures(self, angle: float, variance: np.ndarray, scales: tuple[float, float, float]) -> Closures:
         """The closures of the map.
 
         Args:
             angle: of a sector, rad. variance: [3] of a closure. scales: robust scale for each unit of a
                 run's score, and the least and the largest scale.
         """
-        taken = self.accepted()
-        if which is not None:
-            of = self._candidate.rows[:, 3]
-            taken = np.flatnonzero((of >= 0) & which[of])
-        rows = self._candidate.rows[taken]
+        rows = self._candidate.rows[self.accepted()]
         runs, run = np.unique(rows[:, 3], return_inverse=True)
-        score = np.bincount(run, self._evidence.rows[taken, 1], len(runs))
+        score = np.bincount(run, self._evidence.rows[self.accepted(), 1], len(runs))
         return Closures(
             i=rows[:, 1],
             j=rows[:, 0],

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from math import isfinite
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, NonNegativeInt, ValidationInfo, field_validator
 
 from evaluation.exm import ExmConfig
 from ratslam.experience import ExperienceConfig
-from ratslam.framemap import FrameMapConfig
+from ratslam.framesettings import FrameMapConfig
 from ratslam.places import PlaceConfig
 from ratslam.posecells import PoseCellConfig
 from ratslam.rat import RatConfig
@@ -23,6 +23,25 @@ from robot.simulation import SimulationConfig
 from robot.source import Source
 from tactile.frontend import TouchConfig
 from tactile.settings import Settings
+
+TOUCH: dict[str, dict[str, Any]] = {
+    "pose_cells": {"cell_size": 0.05, "cells_xy": 21},
+    "recall": {"fan": "whiskers"},
+    "frames": {
+        "noise": {"per_cell": 0.22, "heading_per_cell": 0.06, "heading_per_radian": 0.2},
+        "bias_sd": 0.001,
+        "score": 12.0,
+        "distance": 60.0,
+        "whole": 0.2,
+        "breaks": False,
+        "weigh_every": 50,
+        "solve_every": 20,
+        "place_radius": 1.4,
+        "place_heading": 0.25,
+    },
+}
+"""What is set for sessions with whiskers unless the configuration says otherwise: the odometry of Salman &
+Pearson's arm (2016, III-C), images of which many look alike, and so all runs weighed against each other."""
 
 
 class SessionConfig(Settings):
@@ -109,4 +128,18 @@ class RunConfig(Settings):
         ids_only = isinstance(source, Log) and bool((source.label >= 0).any()) and not source.seen.any()
         if "source" not in self.templates.model_fields_set and ids_only:
             parts["templates"] = self.templates.model_copy(update={"source": "labels"})
-        return self.model_copy(update=parts)
+        completed = self.model_copy(update=parts)
+        if source.whiskers and "fan" not in self.recall.model_fields_set:
+            return _filled(completed, TOUCH)
+        return completed
+
+
+def _filled(settings: Any, values: dict[str, Any]) -> Any:
+    """The settings with these values in the place of all that nobody has set."""
+    update = {}
+    for name, value in values.items():
+        if isinstance(value, dict):
+            update[name] = _filled(getattr(settings, name), value)
+        elif name not in settings.model_fields_set:
+            update[name] = value
+    return settings.model_copy(update=update)

@@ -35,7 +35,8 @@ class Closures(NamedTuple):
 
     Attributes:
         i, j: [M] frames. turn: [M] rad. run: [M] which run each belongs to, 0..R - 1. variance: [3] of each.
-        scale: [R] mean chi-square at which the weight of a run has fallen to a quarter.
+        scale: [R] mean chi-square at which the weight of a run has fallen to a quarter. score: [R] evidence.
+        stray: chi-square that one closure counts at most.
     """
 
     i: np.ndarray
@@ -44,7 +45,7 @@ class Closures(NamedTuple):
     run: np.ndarray
     variance: np.ndarray
     scale: np.ndarray
-    score: np.ndarray | None = None
+    score: np.ndarray = np.zeros(0)
     stray: float = np.inf
 
 

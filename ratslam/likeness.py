@@ -12,6 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tactile.types import Array
+
 LEVELS = 32
 """Of a pixel: 0 silent, 1 to 30 heights, 31 dead."""
 DEAD = LEVELS - 1
@@ -39,10 +41,36 @@ PRIOR_PAIRS = 20.0
 """Pairs of images that the prior is worth."""
 
 
-def levels(view: np.ndarray, alive: np.ndarray) -> np.ndarray:
-    """The level of every pixel, int32: of values [...] in 0..1 and whether their whiskers report [...]."""
-    height = np.clip(np.ceil(np.asarray(view) * HEIGHTS), 0, HEIGHTS)
-    return np.where(alive, height, DEAD).astype(np.int32)
+class Pixels(NamedTuple):
+    """How the pixels of a whisker image [R, C, K], flat, belong together; D of them.
+
+    Attributes:
+        group: [D] those of one ring and channel, which are alike. behind: [D] the pixel that felt what this
+            one feels before the head turned about: of the whisker opposite. columns: whiskers in a ring.
+    """
+
+    group: np.ndarray
+    behind: np.ndarray
+    columns: int
+
+
+def pixels(view_shape: tuple[int, int, int]) -> Pixels:
+    """Of images of that shape."""
+    _, columns, channels = view_shape
+    row, _, channel = np.indices(view_shape)
+    number = np.arange(row.size).reshape(view_shape)
+    behind = np.roll(number, -(columns // 2), axis=1)
+    return Pixels((row * channels + channel).reshape(-1), behind.reshape(-1), columns)
+
+
+def levels(view: Array, alive: Array) -> Array:
+    """The level of every pixel: of values [...] in 0..1, and whether their whiskers report [...] (0 or 1).
+
+    Operators only, so it serves NumPy and JAX alike; whole numbers of the view's own type.
+    """
+    height = -(-view * HEIGHTS // 1)
+    height = height - (height > HEIGHTS) * (height - HEIGHTS)
+    return alive * height + (1 - alive) * DEAD
 
 
 class Background(NamedTuple):

@@ -11,7 +11,7 @@ from pydantic import Field
 
 from ratslam import places, posecells, templates
 from ratslam.experience import ExperienceConfig, ExperienceMap
-from ratslam.framemap import FrameMapConfig
+from ratslam.framesettings import FrameMapConfig
 from ratslam.places import PlaceConfig, Places
 from ratslam.posecells import Outcome, PoseCellConfig, PoseCells
 from ratslam.recall import RecallConfig

@@ -30,13 +30,10 @@ Share = Annotated[float, Field(ge=0, le=1)]
 
 SAMPLES = 20
 """Errors against ruled-out frames told to the map at each frame, to calibrate by."""
-LABELS = {"same": 0.6, "unknown": 0.35, "other": 0.05, "new_unknown": 0.9, "new_known": 0.1}
-"""How likely a given id is where its frame was, and where it is new: ids are right more often than not, a new
-id says little (the giver may have failed to recognise), and another known id speaks against."""
-LABEL_TEMPER = 0.7
-"""Ids of consecutive views are not independent: each counts as this share of one."""
 SUPPORT = 8.0
 """Squared deviations at which the alignment kernel (1 - d2 / 8)^4 ends: like exp(-d2 / 2), but compact."""
+FOLLOWERS = 4
+"""Frames from one on that may be the next: it may also stay, or pass one or two by."""
 BASIN = 2.0
 """Cells around the best frame whose mass counts as that candidate's."""
 
@@ -53,7 +50,8 @@ class RecallConfig(Settings):
     (counter-clockwise positive), `none`, `whiskers` (rows of whiskers all around the robot), or `auto` (also
     0): found out from the recording itself."""
     shifts: NonNegativeInt = 3
-    """Sectors by which a fan may be shifted either way."""
+    """Sectors by which a fan may be shifted either way. Whiskers: not 0 where a head that has turned about
+    feels with each whisker what the one opposite felt."""
     frame_distance: PositiveFloat = 0.3
     """Way after which a view becomes a frame, cells. Standing still remembers nothing."""
     frame_turn: PositiveFloat = 0.15
@@ -89,7 +87,6 @@ class RecallConfig(Settings):
     """Standard deviation of the map's heading after a closure, rad."""
     local_heading_rate: NonNegativeFloat = 0.006
     """What each cell travelled since adds to it, rad."""
-    band: PositiveInt = 4
     temper: PositiveFloat = 0.25
     """Whiskers: share of the log-odds of an image that counts, because pixels are not independent."""
     familiar: Share = 0.8
@@ -101,13 +98,18 @@ class RecallConfig(Settings):
     """Hypotheses kept from frame to frame; the mass of the others goes to novelty."""
 
 
+NO_LIKENESS = np.zeros((0, 0, 0))
+
+
 class Guidance(NamedTuple):
     """What the map tells the filter.
 
     Attributes:
         poses: [N, 3] of all frames in the map. bias: of the heading, rad/m. since: m travelled since the last
-            closure. angle: of a sector, rad, 0 while unknown. scale: of view errors, such as are still seen
-            between different places; 0 while unknown.
+            closure. angle: of a sector, rad, 0 while unknown; whiskers: a half turn. scale: of view errors,
+            such as are still seen between different places; whiskers: the log-odds that stand for an image
+            never seen before; 0 while unknown. likeness: [G, L, L] see `likeness.table`; empty but for
+            whiskers.
     """
 
     poses: np.ndarray
@@ -115,19 +117,22 @@ class Guidance(NamedTuple):
     since: float
     angle: float
     scale: float
-    likeness: np.ndarray | None = None
+    likeness: np.ndarray = NO_LIKENESS
 
 
 class Memory(NamedTuple):
     """All frames, rows in order of time, and what is believed now.
 
     Attributes:
-        view: [D, C]. label: [C] int32. packet: [C, 3] pose-cell packet when the frame was taken, cells.
+        view: [D, C]; whiskers: levels, int32. label: [C] int32. packet: [C, 3] pose-cell packet when the
+            frame was taken, cells.
         x, y, cosine, sine: [C] poses in the map. count, distinct: frames, and labels known, int32.
         anchor: [K] int32 frames that hypotheses stand at, offset: [K, 3] where in their frames (m, rad),
             mass: [K]. What they lack to 1 is novelty.
         pose: [3] of the newest frame. motion, length, turn: since then: [3], m, rad.
-        bias, since, angle, scale: see `Guidance`.
+        bias, since, angle, scale, likeness: see `Guidance`.
+        before: [S, C] likelihoods of the image before, rest: [S, C] what is believed beside the hypotheses;
+            both for whiskers only, else of no size.
     """
 
     view: Array
@@ -197,9 +202,9 @@ class Weighing(NamedTuple):
 
 
 def offsets(config: RecallConfig) -> np.ndarray:
-    """[S] sectors by which views are shifted."""
+    """[S] sectors by which views are shifted; whiskers: half turns."""
     if config.fan == "whiskers":
-        return np.array([0, 3], dtype=np.int32)
+        return np.arange(2 if config.shifts else 1, dtype=np.int32)
     reach = 0 if config.fan == "none" else config.shifts
     return np.arange(-reach, reach + 1, dtype=np.int32)
 
@@ -215,7 +220,8 @@ def start(config: RecallConfig, size: int, capacity: int, dtype: np.dtype, group
     """No frames, everything new.
 
     Args:
-        size: values of a view, D; 0 for recordings with given ids, which need no views.
+        size: values of a view, D; 0 for recordings with given ids, which need no views. groups: of whiskers,
+            G, see `likeness.table`.
     """
 
     def zeros(*shape: int) -> Array:  # one buffer each: the session donates them
@@ -244,8 +250,8 @@ def start(config: RecallConfig, size: int, capacity: int, dtype: np.dtype, group
         angle=zeros(),
         scale=zeros(),
         likeness=zeros(groups, LEVELS, LEVELS) if touch else zeros(0, 0, 0),
-        before=zeros(len(offsets(config)), capacity if touch else 0),
-        rest=zeros(len(offsets(config)), capacity if touch else 0),
+        before=zeros(*(shape := (len(offsets(config)), capacity if touch else 0))),
+        rest=zeros(*shape),
     )
 
 
@@ -260,7 +266,7 @@ def inform(memory: Memory, guidance: Guidance) -> Memory:
     x, y, cosine, sine = (jnp.asarray(row, dtype) for row in full)
     told = (guidance.bias, guidance.since, guidance.angle, guidance.scale)
     bias, since, angle, scale = (jnp.asarray(value, dtype) for value in told)
-    if guidance.likeness is not None:
+    if guidance.likeness.size:
         memory = memory._replace(likeness=jnp.asarray(guidance.likeness, dtype))
     return memory._replace(
         x=x, y=y, cosine=cosine, sine=sine, pose=jnp.asarray(guidance.poses[-1], dtype),
@@ -297,91 +303,6 @@ def spread(config: RecallConfig, cell: float, memory: Memory) -> tuple[Array, Ar
     )
 
 
-def by_view(config: RecallConfig, cell: float, memory: Memory, view: Array) -> Weighing:
-    """Weighs all frames by a view [D]. A view that looks like many places makes all of them unlikely."""
-    error = _errors(offsets(config), memory, view)
-    old = _old(config, memory)
-    width = config.sharpness * memory.scale
-    known = width > jnp.finfo(width.dtype).tiny
-    width = jnp.where(known, width, 1.0)
-    likelihood = jnp.where(old[None], jnp.exp(-error / width), 0.0)
-    shifts = jnp.sum(jnp.isfinite(error[:, 0]))
-    mean = jnp.sum(likelihood) / (jnp.maximum(jnp.sum(old), 1) * shifts).astype(width.dtype)
-    floor = jnp.exp(-config.floor * memory.scale / width)
-    novelty = config.common * mean + config.fresh * floor
-    away = jnp.maximum(3 * cell, 3 * (0.5 * cell + 0.05 * (memory.since + memory.length)))
-    here = present(memory)
-    apart = (memory.x - here[0]) ** 2 + (memory.y - here[1]) ** 2
-    return Weighing(
-        likelihood=jnp.where(known, likelihood, 1.0),
-        novelty=jnp.where(known, novelty, 1.0),
-        background=_background(jnp.min(error, axis=0), old & (apart > away**2)),
-        certain=known & jnp.any(old),
-        telling=known,
-    )
-
-
-def by_touch(config: RecallConfig, memory: Memory, level: Array, group: np.ndarray, behind: np.ndarray) -> tuple[Memory, Weighing]:
-    """Weighs all frames by a whisker image: levels [D] of pixels.
-
-    Args:
-        group: [D] of each pixel, see `likeness.table`. behind: [D] the pixel that sees what this one saw once the
-            robot has turned about.
-    """
-    old = _old(config, memory)
-    rows = memory.likeness[group, level]  # [D, L]
-    zero = jnp.zeros_like(memory.x)
-    same = sum((rows[i][memory.view[i]] for i in range(len(group))), zero)
-    back = sum((rows[i][memory.view[behind[i]]] for i in range(len(group))), zero)
-    certain = (memory.scale != 0) & jnp.any(old)
-    odds = jnp.stack([same, back])
-    likelihood = jnp.where(old[None], jnp.exp(config.temper * odds), 0.0)
-    floor = jnp.exp(config.temper * memory.scale)
-    expected = _onwards(memory.before)
-    expected = jnp.where(old[None], expected, 0.0)
-    total = jnp.sum(expected)
-    known = jnp.sum(expected * likelihood) / jnp.where(total > 0, total, 1.0)
-    share = jnp.where(total > 0, config.familiar, 0.0)
-    novelty = share * known + (1 - share) * floor
-    weighing = Weighing(
-        likelihood=jnp.where(certain, likelihood, 1.0),
-        novelty=jnp.where(certain, novelty, 1.0),
-        background=jnp.full(SAMPLES, jnp.nan, memory.x.dtype),
-        certain=certain,
-        telling=certain,
-    )
-    return memory._replace(before=jnp.where(certain, likelihood, 0.0)), weighing
-
-
-def _onwards(before: Array) -> Array:
-    """[2, C] where frames that were likely lead: one on, or one back for a robot that has turned about."""
-    def rolled(row: Array, by: int) -> Array:
-        moved = jnp.roll(row, by)
-        index = jnp.arange(len(row), dtype=jnp.int32)
-        return jnp.where((index >= by) if by >= 0 else (index < len(row) + by), moved, 0.0)
-
-    weights = (0.02, 0.94, 0.02, 0.02)
-    on = sum(w * rolled(before[0], d) for d, w in enumerate(weights))
-    back = sum(w * rolled(before[1], -d) for d, w in enumerate(weights))
-    return jnp.stack([on, back])
-
-
-def by_label(config: RecallConfig, memory: Memory, label: Array) -> Weighing:
-    """Weighs all frames by a given id."""
-    known = jnp.any(memory.label == label)
-    share = 1 / jnp.maximum(memory.distinct + (~known).astype(jnp.int32), 1).astype(memory.x.dtype)
-    other = jnp.where(known, LABELS["other"] * share, LABELS["unknown"])
-    likelihood = jnp.where(memory.label == label, LABELS["same"], other)
-    novelty = jnp.where(known, LABELS["new_known"] * share, LABELS["new_unknown"])
-    return Weighing(
-        likelihood=(likelihood**LABEL_TEMPER)[None],
-        novelty=novelty**LABEL_TEMPER,
-        background=jnp.full(SAMPLES, jnp.nan, memory.x.dtype),
-        certain=jnp.any(_old(config, memory)),
-        telling=known,
-    )
-
-
 def look(
     config: RecallConfig, cell: float, memory: Memory, weighing: Weighing
 ) -> tuple[Memory, Recollection]:
@@ -392,12 +313,12 @@ def look(
     """
     shifts = offsets(config)
     angles = -shifts.astype(memory.angle.dtype) * memory.angle  # robot's heading less the frame's
-    old, certain, novelty = _old(config, memory), weighing.certain, weighing.novelty
-    likelihood = jnp.where(old[None], weighing.likelihood, 0.0)
+    known, certain, novelty = old(config, memory), weighing.certain, weighing.novelty
+    likelihood = jnp.where(known[None], weighing.likelihood, 0.0)
     here = present(memory)
     apart = (memory.x - here[0]) ** 2 + (memory.y - here[1]) ** 2
 
-    belief, novel = _align(config, cell, memory, angles, old, here)
+    belief, novel = _align(config, cell, memory, angles, known, here)
     belief, novel = belief * likelihood, novel * novelty
     total = jnp.maximum(jnp.sum(belief) + novel, jnp.finfo(novel.dtype).tiny)
     belief, novel = belief / total, novel / total
@@ -408,7 +329,7 @@ def look(
     mass = jnp.sum(jnp.where(basin[None], belief, 0.0))
     gain = jnp.log(jnp.where(certain, likelihood[shift, match], 1.0) / novelty)
     (anchor, offset, masses), rest = _modes(config, cell, memory, angles, belief)
-    near = old & (apart < cell**2)
+    near = known & (apart < cell**2)
     facing = memory.cosine * jnp.cos(here[2]) + memory.sine * jnp.sin(here[2]) > FACING
     best = jnp.max(jnp.where(near & facing, jnp.max(likelihood, axis=0), 0.0))
     agree = jnp.where(
@@ -465,43 +386,14 @@ def nothing(memory: Memory) -> Recollection:
     )  # fmt: skip
 
 
-def _old(config: RecallConfig, memory: Memory) -> Array:
+def old(config: RecallConfig, memory: Memory) -> Array:
     """[C] the frames that may be recalled."""
     return jnp.arange(memory.label.shape[0], dtype=jnp.int32) < memory.count - config.guard
 
 
-def _errors(shifts: np.ndarray, memory: Memory, view: Array) -> Array:
-    """[S, C] mean absolute difference where view[k:] meets the stored views' [:-k]; infinite where the
-    shift is not allowed because nothing says that sectors are ordered."""
-    size = memory.view.shape[0]
-    rows = []
-    for k in shifts.tolist():
-        stored = memory.view[max(-k, 0) : size - max(k, 0)]
-        seen = view[max(k, 0) : size - max(-k, 0)]
-        if size <= abs(k):
-            rows.append(jnp.full(memory.view.shape[1], jnp.inf, memory.view.dtype))
-            continue
-        # Written out, one pass over the frames adds all values; a reduction over them takes twice as long.
-        apart = sum((jnp.abs(stored[i] - seen[i]) for i in range(len(stored))), jnp.zeros_like(stored[0]))
-        rows.append(apart / len(stored))
-    return jnp.where(_allowed(shifts, memory)[:, None], jnp.stack(rows), jnp.inf)
-
-
-def _allowed(shifts: np.ndarray, memory: Memory) -> Array:
+def allowed(shifts: np.ndarray, memory: Memory) -> Array:
     """[S] the shifts that mean something: all once sectors are known to be ordered."""
     return (shifts == 0) | (memory.angle != 0)
-
-
-def _background(error: Array, away: Array) -> Array:
-    """[SAMPLES] errors [C] of frames spread evenly over those that the map rules out."""
-    rank = jnp.cumsum(away.astype(jnp.int32))
-    count = rank[-1]
-    wanted = (jnp.arange(SAMPLES, dtype=jnp.int32) * jnp.maximum(count - 1, 0)) // (SAMPLES - 1) + 1
-    row = jnp.searchsorted(rank, wanted)
-    row = jnp.minimum(row, len(rank) - 1)
-    # With fewer than SAMPLES of them each is told once.
-    fresh = jnp.concatenate([jnp.ones(1, bool), row[1:] != row[:-1]])
-    return jnp.where(fresh & (count > 0), error[row], jnp.nan)
 
 
 def _align(
@@ -509,7 +401,7 @@ def _align(
     cell: float,
     memory: Memory,
     angles: Array,
-    old: Array,
+    known: Array,
     here: Array,
 ) -> tuple[Array, Array]:
     """Every hypothesis moves with the robot and falls on the frames it comes to; novelty proposes new ones.
@@ -518,7 +410,7 @@ def _align(
         prior mass at each shift and frame [S, C], and of novelty.
     """
     dtype = memory.x.dtype
-    cells = _allowed(offsets(config), memory)[:, None] & old[None]
+    cells = allowed(offsets(config), memory)[:, None] & known[None]
     moved = _corrected(memory.motion, memory.length, memory.bias)
     at = memory.anchor
     anchors = jnp.stack([memory.x[at], memory.y[at], jnp.arctan2(memory.sine[at], memory.cosine[at])])
@@ -545,44 +437,52 @@ def _align(
     fresh = 1 - jnp.sum(memory.mass) - jnp.sum(memory.rest)
     shut = jnp.zeros(cells.shape, dtype), jnp.zeros((), dtype)
     if config.fan == "whiskers":
-        shut = _followed(config, cell, memory, angles, cells, moved)
+        shut = _followed(config, cell, memory, angles, cells.astype(dtype), moved)
     belief, novel = lax.fori_loop(0, config.modes, carry, shut)
     near = landing(here, *spread(config, cell, memory))
     total = jnp.sum(near)
     local, everywhere = fresh * config.enter * config.local, fresh * config.enter * (1 - config.local)
     belief = belief + jnp.where(cells, everywhere / jnp.maximum(jnp.sum(cells), 1).astype(dtype), 0.0)
     belief = belief + (local / jnp.maximum(total, 1.0)) * near
-    entered = jnp.where(jnp.any(old), everywhere, 0.0) + local * total / jnp.maximum(total, 1.0)
+    entered = jnp.where(jnp.any(known), everywhere, 0.0) + local * total / jnp.maximum(total, 1.0)
     return belief, novel + fresh - entered
 
 
-def _followed(config, cell, memory, angles, cells, moved):
-    """The light hypotheses go on along the way the frames were taken: each to the few frames that follow it."""
-    dtype = memory.x.dtype
+def _followed(
+    config: RecallConfig, cell: float, memory: Memory, angles: Array, cells: Array, moved: Array
+) -> tuple[Array, Array]:
+    """What is believed beside the hypotheses goes on along the way the frames were taken, each to the few
+    frames that follow it; backwards where the robot faces against them.
+
+    Returns:
+        as `_align`.
+    """
+    beliefs, novel = [], jnp.zeros((), memory.x.dtype)
     index = jnp.arange(len(memory.x), dtype=jnp.int32)
-    belief, novel = jnp.zeros(cells.shape, dtype), jnp.zeros((), dtype)
-    rows = []
-    for s, sign in ((0, 1), (1, -1)):
-        turn = angles[s]
-        c = memory.cosine * jnp.cos(turn) - memory.sine * jnp.sin(turn)
-        n = memory.sine * jnp.cos(turn) + memory.cosine * jnp.sin(turn)
-        x, y = memory.x + c * moved[0] - n * moved[1], memory.y + n * moved[0] + c * moved[1]
-        ct, st = c * jnp.cos(moved[2]) - n * jnp.sin(moved[2]), n * jnp.cos(moved[2]) + c * jnp.sin(moved[2])
+    for s, sign in enumerate((1, -1)[: len(cells)]):
+        cosine = memory.cosine * jnp.cos(angles[s]) - memory.sine * jnp.sin(angles[s])
+        sine = memory.sine * jnp.cos(angles[s]) + memory.cosine * jnp.sin(angles[s])
+        x = memory.x + cosine * moved[0] - sine * moved[1]
+        y = memory.y + sine * moved[0] + cosine * moved[1]
+        ahead = cosine * jnp.cos(moved[2]) - sine * jnp.sin(moved[2])
+        aside = sine * jnp.cos(moved[2]) + cosine * jnp.sin(moved[2])
         falls = []
-        for d in range(config.band):
-            roll = lambda row: jnp.roll(row, -sign * d)
-            apart = ((x - roll(memory.x)) ** 2 + (y - roll(memory.y)) ** 2) / (config.reach * cell) ** 2
-            facing = ct * roll(c) + st * roll(n)
-            deviation = apart + (2 / config.reach_heading**2) * (1 - facing)
-            inside = jnp.maximum(1 - deviation / SUPPORT, 0.0)
-            to = index + sign * d
-            fine = (to >= 0) & (to < len(index)) & roll(cells[s])
-            falls.append(jnp.where(fine, inside**2 * inside**2, 0.0))
-        total = sum(falls) + config.nothing
+        for step in range(FOLLOWERS):
+            to = index + sign * step
+            there = (to >= 0) & (to < len(index))
+            near = jnp.roll(jnp.stack([memory.x, memory.y, cosine, sine, cells[s]]), -sign * step, axis=1)
+            apart = ((x - near[0]) ** 2 + (y - near[1]) ** 2) / (config.reach * cell) ** 2
+            facing = ahead * near[2] + aside * near[3]
+            inside = jnp.maximum(1 - (apart + (2 / config.reach_heading**2) * (1 - facing)) / SUPPORT, 0.0)
+            falls.append(jnp.where(there, near[4] * inside**2 * inside**2, 0.0))
+        total = sum(falls, jnp.full_like(x, config.nothing))
         stay = memory.rest[s] * (1 - config.leave)
-        rows.append(sum(jnp.roll(stay * fall / total, sign * d) for d, fall in enumerate(falls)))
+        zero = jnp.zeros_like(x)
+        beliefs.append(
+            sum((jnp.roll(stay * fall / total, sign * step) for step, fall in enumerate(falls)), zero)
+        )
         novel = novel + jnp.sum(stay * config.nothing / total) + jnp.sum(memory.rest[s]) * config.leave
-    return jnp.stack(rows), novel
+    return jnp.stack(beliefs), novel
 
 
 def _modes(

@@ -10,13 +10,15 @@ import numpy as np
 from jax import lax
 
 from ratslam import posecells, recall, templates
+from ratslam.appearance import Appearance, Labels, Touch, Views
 from ratslam.backend import Backend
 from ratslam.framemap import FrameMap
-from ratslam.likeness import DEAD, HEIGHTS
+from ratslam.likeness import levels, pixels
 from ratslam.posecells import Outcome, PoseCells
 from ratslam.rat import Rat, RatConfig, RatEvidence, finite
 from ratslam.recall import Guidance, Memory, Recollection
 from ratslam.types import Action, Estimate
+from ratslam.weighing import by_label, by_touch, by_view
 from tactile.types import Array, Observation
 
 HEALTH_RATE = 0.1
@@ -72,11 +74,7 @@ class RecallRat:
         self.recall = config.recall.model_copy(update={"fan": "none"}) if labels else config.recall
         self.labels, self.view_shape = labels, view_shape
         self.size = 0 if labels else int(np.prod(view_shape))
-        self.touch = self.recall.fan == "whiskers"
-        rows, columns, channels = view_shape
-        number = np.arange(self.size).reshape(view_shape if self.size else (0, 0, 0))
-        self.group = (np.arange(rows)[:, None, None] * channels + np.arange(channels) + np.zeros((1, columns, 1), int)).reshape(-1)
-        self.behind = np.roll(number, -(columns // 2), axis=1).reshape(-1)
+        self.pixels = pixels(view_shape) if self.recall.fan == "whiskers" else None
         self.dtype = np.dtype(dtype)
         self.cell = config.pose_cells.cell_size
         self.tables = posecells.tables(config.pose_cells, self.dtype)
@@ -88,7 +86,7 @@ class RecallRat:
         del key
         return State(
             posecells.start(self.config.pose_cells, self.dtype),
-            recall.start(self.recall, self.size, capacity, self.dtype, int(self.group.max()) + 1),
+            recall.start(self.recall, self.size, capacity, self.dtype, self._groups()),
             jnp.ones((), self.dtype),
         )
 
@@ -111,11 +109,11 @@ class RecallRat:
         moved = jnp.stack([odometry.dx, odometry.dy, odometry.dtheta])
         memory = recall.travel(state.memory, moved)
         frame = seen & recall.due(self.recall, self.cell, memory)
-        view = self._pixels(view, observation)
+        looks = self._looks(view, observation)
 
         memory, recollection = lax.cond(
             frame,
-            lambda: self._look(memory, view, observation.label),
+            lambda: self._look(memory, looks, observation.label),
             lambda: (memory, recall.nothing(memory)),
         )
         recalled, energy = self._injection(memory, recollection)
@@ -124,7 +122,7 @@ class RecallRat:
         )
         memory = lax.cond(
             frame,
-            lambda: recall.remember(memory, view, observation.label, cells.pose),
+            lambda: recall.remember(memory, looks, observation.label, cells.pose),
             lambda: memory,
         )
         health = jnp.where(
@@ -153,37 +151,41 @@ class RecallRat:
 
     def new_map(self) -> FrameMap:
         """An empty frame map."""
-        fan, closures = recall.fan_width(self.recall), self.config.experience.closures
-        return FrameMap(
-            self.config.frames,
-            self.cell,
-            self.size,
-            fan,
-            guard=self.recall.guard,
-            closures=closures,
-            normalise=self._normalised,
-            whiskers=(self.group, self.behind, self.view_shape) if self.touch else None,
-        )
+        guard, closures = self.recall.guard, self.config.experience.closures
+        return FrameMap(self.config.frames, self.cell, self._appearance(), guard=guard, closures=closures)
+
+    def _appearance(self) -> Appearance:
+        if self.labels:
+            return Labels()
+        if self.pixels is not None:
+            return Touch(self.pixels, self.recall.temper)
+        return Views(self.size, recall.fan_width(self.recall), self._normalised)
+
+    def _groups(self) -> int:
+        return 0 if self.pixels is None else int(self.pixels.group.max()) + 1
 
     def _normalised(self, view: np.ndarray) -> np.ndarray:
         shaped = jnp.asarray(view.reshape(self.view_shape), self.dtype)
         return np.asarray(templates.normalise(self.config.templates, shaped))
 
-    def _pixels(self, view: Array, observation: Observation) -> Array:
+    def _looks(self, view: Array, observation: Observation) -> Array:
+        """What is compared and remembered of a view: its values, or the levels of its whiskers."""
         flat = view.reshape(-1)[: self.size]
-        if not self.touch:
+        if self.pixels is None:
             return flat
-        height = jnp.clip(jnp.ceil(flat * HEIGHTS), 0, HEIGHTS).astype(jnp.int32)
-        alive = jnp.repeat(observation.alive, self.view_shape[2]) if observation.alive.size else jnp.ones(self.size, bool)
-        return jnp.where(alive, height, DEAD)
+        reports = jnp.ones(self.view_shape[:2], bool)
+        if observation.alive.size == reports.size:
+            reports = observation.alive.reshape(reports.shape)
+        reports = jnp.repeat(reports[:, :, None], self.view_shape[2], axis=2).reshape(-1)
+        return levels(flat, reports.astype(self.dtype)).astype(jnp.int32)
 
     def _look(self, memory: Memory, view: Array, label: Array) -> tuple[Memory, Recollection]:
         if self.labels:
-            weighing = recall.by_label(self.recall, memory, label)
-        elif self.touch:
-            memory, weighing = recall.by_touch(self.recall, memory, view, self.group, self.behind)
+            weighing = by_label(self.recall, memory, label)
+        elif self.pixels is not None:
+            memory, weighing = by_touch(self.recall, memory, view, self.pixels)
         else:
-            weighing = recall.by_view(self.recall, self.cell, memory, view)
+            weighing = by_view(self.recall, self.cell, memory, view)
         return recall.look(self.recall, self.cell, memory, weighing)
 
     def _injection(self, memory: Memory, recollection: Recollection) -> tuple[Array, Array]:

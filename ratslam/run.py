@@ -17,8 +17,9 @@ import numpy as np
 from tqdm import tqdm
 
 from evaluation.energy import read_relations
-from evaluation.report import save_map
-from evaluation.rundirectory import read_run
+from evaluation.images import Images, write_images
+from evaluation.report import pictures
+from evaluation.rundirectory import read_run, write_walls
 from evaluation.scorecard import Scorecard, score
 from evaluation.trajectory import Anytime, present_error, summary, write_tum
 from ratslam.config import RunConfig
@@ -29,17 +30,24 @@ from ratslam.storage import RunDirectory, read_checkpoint
 from ratslam.types import Action
 from ratslam.yamlfile import dump
 from robot.formats import open_recording
+from robot.maze import read_maze, walls
 from robot.recorder import Recorder
+from robot.scene import MazeConfig
 from robot.sensing import calibration_of, observation_of, sensing
 from robot.simulation import simulated
 from robot.source import Sample, Source, rig_of
 from tactile.errors import InputError
 from tactile.frames import compose, tum_line
-from tactile.frontend import Frontend
+from tactile.frontend import Frontend, TouchConfig
+from tactile.head import ur10_head
+from tactile.streams import stream
 from tactile.types import Observation
 
 CHECKPOINT_EVERY = 128 * CHUNK
 """Steps between checkpoints: a kill loses no line, but a continued run repeats at most these."""
+
+_Felt = tuple[np.ndarray, np.ndarray]
+"""A whisker image: brightness [R, C, K], and which whiskers [W] report at all."""
 
 
 def run(
@@ -70,14 +78,18 @@ def run(
             store.text("config.yaml", text)
             manifest = _manifest(config, text, source, resume)
             store.manifest(manifest | {"status": "running"})
-            interrupted = _play(session, source, skip, store)
+            _keep_maze(source, store)
+            felt: list[_Felt] = []
+            interrupted = _play(session, source, skip, store, felt)
             done = {"status": "interrupted" if interrupted else "complete", "steps": session.steps}
             _finish(session, store, source.digest)
+            _keep_images(felt, config.touch, store)
             card = score(
                 read_run(directory), directory.name, exm=config.score.experience_metric, relations=relations
             )
             store.text("scorecard.json", card.model_dump_json(indent=2) + "\n")
-            store.file("map.png", lambda path: save_map(path, read_run(directory), card))
+            for name, save in pictures(directory).items():
+                store.file(name, save)
             store.manifest(manifest | done)
     return card, interrupted
 
@@ -156,8 +168,12 @@ def located(config: RunConfig, folder: Path) -> RunConfig:
     return config.model_copy(update={**parts, "score": judgement})
 
 
-def _play(session: Session, source: Source, skip: int, store: RunDirectory) -> bool:
-    """Replays the source into the store; returns whether the user interrupted."""
+def _play(session: Session, source: Source, skip: int, store: RunDirectory, felt: list[_Felt]) -> bool:
+    """Replays the source into the store; returns whether the user interrupted.
+
+    Args:
+        felt: the image of each whisk is added to it.
+    """
     samples = islice(iter(source), skip, None)
     odometry = np.zeros(3)
     truth: list[np.ndarray] = []
@@ -170,6 +186,7 @@ def _play(session: Session, source: Source, skip: int, store: RunDirectory) -> b
         while not interrupted() and (chunk := list(islice(samples, CHUNK - session.steps % CHUNK))):
             observations = [observation_of(sample) for sample in chunk]
             steps = list(session.replay(observations))
+            felt += [(o.view, o.alive) for o in observations] if source.whiskers else []
             reckoned = []
             for observation in observations:
                 moved = observation.odometry
@@ -289,6 +306,38 @@ def _finish(session: Session, store: RunDirectory, digest: str) -> None:
     store.file("trajectory.tum", lambda path: write_tum(path, time, final))
     for name, write in session.map.files().items():
         store.file(name, write)
+
+
+def _keep_maze(source: Source, store: RunDirectory) -> None:
+    """maze.txt and walls.csv, for the pictures, of a source that knows its maze."""
+    rig = rig_of(source)
+    if not isinstance(rig.get("maze"), str):
+        return
+    store.text("maze.txt", rig["maze"])
+    try:
+        made = MazeConfig.model_validate(rig["simulation"]["maze"])
+        seed = int(rig["simulation"]["seed"] if made.seed is None else made.seed)
+        random = stream(seed, "maze.heights")
+        boxes = walls(read_maze(store.path / "maze.txt"), random, made.heights)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{source.name}: maze", str(error), "a maze as kept with a session") from None
+    store.file("walls.csv", lambda path: write_walls(path, np.column_stack(boxes)))
+
+
+def _keep_images(felt: list[_Felt], config: TouchConfig, store: RunDirectory) -> None:
+    """views.npz, for the pictures, of a source whose views are whisker images."""
+    head = ur10_head(config.head)
+    if not felt or felt[0][0].shape[:2] != head.shape or len(felt[0][1]) != len(head.length):
+        return
+    columns = head.shape[1]
+    images = Images(
+        view=np.array([view[..., 0] for view, _ in felt]),
+        alive=np.array([alive.reshape(head.shape) for _, alive in felt]),
+        azimuth=np.arctan2(head.rest[:columns, 1], head.rest[:columns, 0]),
+        length=head.length[::columns],
+        tallest=config.image.tallest,
+    )
+    store.file("views.npz", lambda path: write_images(path, images))
 
 
 def _resume(session: Session, path: Path, digest: str) -> int:

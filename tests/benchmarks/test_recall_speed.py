@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ratslam import recall
+from ratslam import recall, weighing
 from ratslam.recall import Guidance, RecallConfig
 
 CELL = 0.6
@@ -43,7 +43,7 @@ def test_a_look_back(benchmark, frames, shifts, dtype):
     def replay(memory):
         def look(k, memory):
             memory = recall.travel(memory, moved)
-            weighing = recall.by_view(config, CELL, memory, views[k % 64])
+            weighing = weighing.by_view(config, CELL, memory, views[k % 64])
             memory, _ = recall.look(config, CELL, memory, weighing)
             return memory._replace(motion=jnp.zeros_like(moved), length=jnp.zeros_like(memory.length))
 

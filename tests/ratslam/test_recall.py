@@ -12,11 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ratslam import recall
+from ratslam import recall, weighing
 from ratslam.rat import RatConfig
-from ratslam.recall import BASIN, FACING, LABEL_TEMPER, LABELS, SAMPLES, SUPPORT, Guidance, RecallConfig
+from ratslam.recall import BASIN, FACING, SAMPLES, SUPPORT, Guidance, RecallConfig
 from ratslam.recallrat import rat
 from ratslam.session import Session
+from ratslam.weighing import LABEL_TEMPER, LABELS
 from tactile.frames import between, compose, wrap
 from tactile.types import Odometry, observation
 
@@ -74,15 +75,15 @@ def believing(memory, frames, masses, offsets=None):
 @cache
 def looker(config, cell=CELL):
     return jax.jit(
-        lambda memory, view: recall.look(config, cell, memory, recall.by_view(config, cell, memory, view))
+        lambda memory, view: recall.look(config, cell, memory, weighing.by_view(config, cell, memory, view))
     )
 
 
 @cache
 def labelled(config):
     def read(memory, label):
-        weighing = recall.by_label(config, memory, label)
-        return *recall.look(config, CELL, memory, weighing), weighing
+        weighed = weighing.by_label(config, memory, label)
+        return *recall.look(config, CELL, memory, weighed), weighed
 
     return jax.jit(read)
 

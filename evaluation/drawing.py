@@ -1,0 +1,86 @@
+"""The look that all pictures share. matplotlib is imported when something is drawn, and without pyplot: no
+window, no global state, the same bytes each time.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Okabe and Ito's colours keep apart for every common kind of colour vision
+INK = "#222222"
+QUIET = "#767676"
+FAINT = "#e6e6e6"
+GREY = "#adadad"
+BLUE = "#0072b2"
+SKY = "#56b4e9"
+GREEN = "#009e73"
+VERMILLION = "#d55e00"
+PURPLE = "#cc79a7"
+
+WIDTH, LEFT, RIGHT, TOP = 8.0, 0.62, 0.25, 0.90
+"""Of every picture and its margins, inches."""
+
+
+def blank(height: float, title: str, line: str) -> Figure:
+    """A figure of `WIDTH` and a height in inches, 1200 pixels wide, with a title and a line below it."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(WIDTH, height), dpi=150, facecolor="white")
+    FigureCanvasAgg(figure)
+    left = LEFT / WIDTH
+    figure.text(left, 1 - 0.42 / height, title, fontsize=15, weight="bold", color=INK)
+    figure.text(left, 1 - 0.70 / height, line, fontsize=9.2, color=QUIET)
+    return figure
+
+
+def plot(figure: Figure, left: float, bottom: float, width: float, height: float) -> Axes:
+    """Axes at that place of the figure, in inches, without a frame."""
+    across, up = figure.get_size_inches()
+    axes = figure.add_axes((left / across, bottom / up, width / across, height / up))
+    axes.set_axisbelow(True)
+    axes.tick_params(length=0, labelsize=8.5, labelcolor=QUIET)
+    axes.spines[:].set_visible(False)
+    return axes
+
+
+def name_axes(axes: Axes, across: str, up: str) -> None:
+    """Labels of the axes, with units."""
+    axes.set_xlabel(across, color=QUIET, fontsize=9)
+    axes.set_ylabel(up, color=QUIET, fontsize=9)
+
+
+def metric_grid(axes: Axes) -> None:
+    """The same round steps on both axes, in m, and a faint grid."""
+    from matplotlib.ticker import MaxNLocator, MultipleLocator
+
+    step = MaxNLocator(7, steps=[1, 2, 5, 10]).tick_values(*axes.get_xlim())
+    axes.xaxis.set_major_locator(MultipleLocator(step[1] - step[0]))
+    axes.yaxis.set_major_locator(MultipleLocator(step[1] - step[0]))
+    axes.grid(color=FAINT, lw=0.7)
+    name_axes(axes, "x (m)", "y (m)")
+
+
+def legend(figure: Figure, axes: Axes, *, columns: int = 4) -> None:
+    """What the axes show, at the bottom left of the figure, in the order of drawing."""
+    handles, labels = axes.get_legend_handles_labels()
+    across, up = figure.get_size_inches()
+    figure.legend(
+        handles,
+        labels,
+        loc="lower left",
+        bbox_to_anchor=(LEFT / across, 0.08 / up),
+        bbox_transform=figure.transFigure,
+        borderaxespad=0,
+        borderpad=0,
+        ncols=columns,
+        frameon=False,
+        fontsize=9,
+        labelcolor=INK,
+        handlelength=1.8,
+        columnspacing=1.8,
+    )

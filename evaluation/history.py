@@ -1,0 +1,78 @@
+"""The experience history: which experience was current at each step (Salman & Pearson 2016, Fig. 3)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from evaluation import drawing
+from evaluation.drawing import BLUE, FAINT, GREY, INK, VERMILLION
+from evaluation.exm import ExperienceMetric, experience_metric
+from evaluation.run import Run, known
+from evaluation.scorecard import Scorecard
+from tactile.errors import InputError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_HEIGHT, _BOTTOM = 5.2, 1.05  # inches
+
+
+def draw_history(run: Run, card: Scorecard) -> Figure:
+    """Experience against step, the end of the base set, and what strict ExM says of each re-localisation.
+
+    Without truth, or where the run never returns to its start, nobody can say; then all look the same.
+    """
+    rows = known(run)
+    rows = rows if len(rows) else np.arange(len(run.time))
+    rows = rows[run.experience[rows] >= 0]
+    judged, why = _judged(run, card, rows)
+    experience = run.experience[rows]
+    figure = drawing.blank(_HEIGHT, card.name, why if judged is None else _line(judged))
+    inner = drawing.WIDTH - drawing.LEFT - drawing.RIGHT
+    axes = drawing.plot(figure, drawing.LEFT, _BOTTOM, inner, _HEIGHT - drawing.TOP - _BOTTOM)
+    counted = np.zeros(len(rows), bool) if judged is None else judged.counted
+    right = counted if judged is None else judged.right
+    for some, color, mark, size, name in (
+        (~counted, GREY, "o", 2.2, "experience"),
+        (right, BLUE, "o", 2.6, "correct re-localisation"),
+        (counted & ~right, VERMILLION, "x", 3.4, "incorrect re-localisation"),
+    ):
+        if some.any():
+            label = name if judged is None or name == "experience" else f"{name} ({some.sum()})"
+            axes.plot(rows[some], experience[some], mark, ms=size, mew=0.9 if mark == "x" else 0,
+                      color=color, label=label, zorder=3)  # fmt: skip
+    if judged is not None and judged.base < len(rows):
+        axes.axvline(rows[judged.base] - 0.5, color=INK, lw=1.1, ls=(0, (2, 2)), zorder=2,
+                     label="end of the base set")  # fmt: skip
+    last = max(1, len(run.time) - 1)
+    axes.set(xlim=(-0.01 * last, 1.01 * last), ylim=(-0.02 * max(1, len(run.nodes)), None))
+    axes.locator_params(integer=True)
+    axes.grid(color=FAINT, lw=0.7)
+    drawing.name_axes(axes, "step", "experience, in order of creation")
+    drawing.legend(figure, axes)
+    return figure
+
+
+def _judged(run: Run, card: Scorecard, rows: np.ndarray) -> tuple[ExperienceMetric | None, str]:
+    """Strict ExM of the steps `rows` that have an experience, or why there is none."""
+    if run.truth is None or len(known(run)) == 0:
+        return None, "no ground truth: re-localisations cannot be judged"
+    if len(rows) == 0:
+        return None, "no experiences"
+    base = None if card.exm.base is None else int(np.searchsorted(rows, card.exm.base))
+    config = card.exm.model_copy(update={"mode": "strict", "log": "step", "base": base})
+    try:
+        return experience_metric(run.experience[rows], run.truth[rows], config), ""
+    except InputError as error:
+        return None, str(error)
+
+
+def _line(found: ExperienceMetric) -> str:
+    parts = [
+        f"base set of {found.base} steps",
+        f"ARR {found.arr:.2f} ({found.relocalisations} of {found.entries} steps after it)",
+        f"ARCR {found.arcr:.2f} ({found.correct} of {found.relocalisations} correct, read strictly)",
+    ]
+    return "  ·  ".join(part for part in parts if "nan" not in part)

@@ -1,0 +1,207 @@
+"""The map of a run over the truth, with raw odometry for comparison, and the walls it went between."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from evaluation import drawing
+from evaluation.drawing import BLUE, GREEN, GREY, INK, PURPLE, VERMILLION
+from evaluation.run import Run, known
+from evaluation.scorecard import Scorecard
+from evaluation.trajectory import align
+from tactile.frames import between, compose
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_BOTTOM = 1.0  # inches below the axes
+_FLATTEST, _TALLEST = 0.4, 1.15  # height / width of the axes
+_ROOM, _MARGIN = 0.2, 0.08  # shares of the map's size: for drifting odometry, and all round
+_JUMP = 5.0  # a step so many times as long as most is no motion: the robot was carried
+_PALE, _DARK = 0.86, 0.62  # greys of a wall without height and of the tallest
+NO_WALLS = np.zeros((0, 5))
+NO_CLOSURES = np.zeros((0, 2), int)
+
+
+class _Layers(NamedTuple):
+    """What is drawn, in one frame (the truth's where there is one): positions [.., 2] in m."""
+
+    truth: np.ndarray | None
+    odometry: np.ndarray
+    final: np.ndarray
+    nodes: np.ndarray
+
+
+def draw_map(
+    run: Run, card: Scorecard, walls: np.ndarray = NO_WALLS, closures: np.ndarray = NO_CLOSURES
+) -> Figure:
+    """Map over truth and raw odometry, equal axes in m.
+
+    With truth, map and odometry are each aligned to it as for ATE; without, odometry starts where the map
+    does. The frame holds truth, walls and map; odometry that drifts far off leaves it. Between walls, laps
+    lie over each other, so experiences and their links give way to the trajectory and the closures.
+
+    Args:
+        run: the run. card: its scorecard, for the headline.
+        walls: [B, 5] west, south, east, north, height in m, in the frame of the truth (drawn if there is one).
+        closures: [n, 2] steps that closures join; drawn with walls.
+    """
+    layers = _placed(run)
+    shown = walls if layers.truth is not None else NO_WALLS
+    box = _frame(layers, shown)
+    width, height = box[1] - box[0]
+    inner = drawing.WIDTH - drawing.LEFT - drawing.RIGHT
+    figure = drawing.blank(inner * height / width + drawing.TOP + _BOTTOM, card.name, headline(card))
+    axes = drawing.plot(figure, drawing.LEFT, _BOTTOM, inner, inner * height / width)
+    axes.set(xlim=box[:, 0], ylim=box[:, 1], aspect="equal")
+    drawing.metric_grid(axes)
+    if len(shown):
+        paint_walls(axes, shown)
+        _paint_laps(axes, run, layers, card.exm.position, closures)
+    else:
+        _paint(axes, run, layers)
+    _paint_start(axes, layers)
+    drawing.legend(figure, axes)
+    return figure
+
+
+def headline(card: Scorecard) -> str:
+    """The few figures that matter most, in one line."""
+    ate, online = card.quantities["ate_final"], card.quantities["ate_online"]
+    parts = [f"{card.quantities['experiences'].value} experiences"]
+    if ate.value is None:
+        parts.append("no ground truth")
+    else:
+        parts.append(
+            f"ATE {ate.value:.3g} m final, {online.value:.3g} m online, {ate.odometry:.3g} m raw odometry"
+        )
+    arr, arcr = card.quantities["exm_arr"].value, card.quantities["exm_arcr_strict"].value
+    parts += [] if arr is None else [f"ARR {arr:.2f}"]
+    parts += [] if arcr is None else [f"ARCR {arcr:.2f}"]
+    return "  ·  ".join(parts)
+
+
+def paint_walls(axes: Axes, walls: np.ndarray) -> None:
+    """Walls [B, 5] in grey, the taller the darker."""
+    from matplotlib.collections import PatchCollection
+    from matplotlib.patches import Rectangle
+
+    west, south, east, north, height = walls.T
+    shade = _PALE + (_DARK - _PALE) * height / height.max()
+    boxes = [Rectangle(corner, *size) for corner, size in zip(
+        zip(west, south, strict=True), zip(east - west, north - south, strict=True), strict=True
+    )]  # fmt: skip
+    greys = np.repeat(shade[:, None], 3, axis=1)
+    axes.add_collection(PatchCollection(boxes, facecolors=greys, linewidths=0, zorder=0.6))
+
+
+def corners(*points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The least and the greatest coordinates [2] of points [.., 2]."""
+    every = np.concatenate(points)
+    return np.nanmin(every, axis=0), np.nanmax(every, axis=0)
+
+
+def edges(walls: np.ndarray) -> np.ndarray:
+    """[2 B, 2] two opposite corners of each wall."""
+    return np.concatenate([walls[:, :2], walls[:, 2:4]])
+
+
+def _placed(run: Run) -> _Layers:
+    rows = known(run)
+    if run.truth is None or len(rows) == 0:
+        to_map = compose(run.final[0], between(run.odometry[0], np.zeros(3)))
+        return _Layers(None, _xy(compose(to_map, run.odometry)), _xy(run.final), _xy(run.nodes))
+    true = run.truth[rows]
+    to_truth = align(run.final[rows], true)
+    odometry = compose(align(run.odometry[rows], true), run.odometry)
+    final, nodes = compose(to_truth, run.final), compose(to_truth, run.nodes)
+    return _Layers(_xy(run.truth), _xy(odometry), _xy(final), _xy(nodes))
+
+
+def _xy(pose: np.ndarray) -> np.ndarray:
+    return np.asarray(pose)[:, :2]
+
+
+def _frame(layers: _Layers, walls: np.ndarray) -> np.ndarray:
+    """Corners [[left, bottom], [right, top]] in m: truth, walls and map, and what lies near them of the
+    odometry."""
+    truth = [] if layers.truth is None else [layers.truth]
+    low, high = corners(layers.final, layers.nodes, edges(walls), *truth)
+    if len(walls) == 0:
+        room = _ROOM * (high - low).max()
+        far_low, far_high = corners(layers.odometry)
+        low = np.minimum(low, np.maximum(far_low, low - room))
+        high = np.maximum(high, np.minimum(far_high, high + room))
+    middle, size = (low + high) / 2, np.maximum(high - low + _MARGIN * (high - low).max(), 1e-3)
+    size = np.maximum(size, size[::-1] * [1 / _TALLEST, _FLATTEST])
+    return np.stack([middle - size / 2, middle + size / 2])
+
+
+def _paint(axes: Axes, run: Run, layers: _Layers) -> None:
+    """Draws the layers; the order of drawing is the order of the legend, `zorder` what covers what."""
+    from matplotlib.collections import LineCollection
+
+    crowd = min(1.0, np.sqrt(150 / max(1, len(layers.nodes))))  # finer strokes for many experiences
+    truth, odometry, final, nodes = layers
+    if truth is not None:
+        axes.plot(*truth.T, color=INK, lw=0.8, zorder=5, label="truth")
+    axes.plot(*odometry.T, color=GREY, lw=0.9, ls=(0, (5, 3)), zorder=1, label="raw odometry")
+    axes.plot(*final.T, color=BLUE, lw=0.8, alpha=0.4, zorder=2, label="trajectory in the map")
+    if len(nodes):
+        dot = {"s": 26 * crowd**2, "color": BLUE, "edgecolors": "white", "linewidths": 0.6 * (crowd == 1)}
+        axes.scatter(*nodes.T, zorder=4, label="experience", **dot)
+    older = _older(run.links)
+    for links, color, label in (
+        (run.links[~older], BLUE, "link"),
+        (run.links[older], VERMILLION, "link to an older experience"),
+    ):
+        if len(links):
+            axes.add_collection(
+                LineCollection(nodes[links], colors=color, lw=1.6 * crowd, zorder=3, label=label)
+            )
+
+
+def _paint_laps(axes: Axes, run: Run, layers: _Layers, apart: float, closures: np.ndarray) -> None:
+    """The same between walls. A closure is wrong where it joins places more than `apart` m apart in truth."""
+    from matplotlib.collections import LineCollection
+
+    truth, odometry, final, nodes = layers
+    assert truth is not None
+    axes.plot(*odometry.T, color=GREY, lw=0.6, alpha=0.6, zorder=1, label="raw odometry")
+    axes.plot(*_broken(truth, truth).T, color=INK, lw=0.8, zorder=3, label="truth")
+    axes.plot(*_broken(final, truth).T, color=BLUE, lw=0.9, alpha=0.75, zorder=4, label="path in the map")
+    joined, place = (closures, final) if len(closures) else (run.links[_older(run.links)], nodes)
+    steps = joined if len(closures) else run.created[joined]
+    with np.errstate(invalid="ignore"):
+        wrong = np.hypot(*(truth[steps[:, 0]] - truth[steps[:, 1]]).T) > apart
+    for some, color, width, name in (
+        (~wrong, PURPLE, 0.7, "closure"),
+        (wrong, VERMILLION, 0.5, f"closure of places over {apart:g} m apart"),
+    ):
+        if some.any():
+            axes.add_collection(
+                LineCollection(place[joined[some]], colors=color, lw=width, zorder=5, label=name)
+            )
+
+
+def _older(links: np.ndarray) -> np.ndarray:
+    """Which links lead to another experience than the one made just before."""
+    return np.abs(links[:, 0] - links[:, 1]) > 1
+
+
+def _broken(line: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """The line [N, 2], interrupted where the true one was carried."""
+    step = np.hypot(*np.diff(truth, axis=0).T)
+    moving = step[np.isfinite(step) & (step > 0)]
+    if len(moving) == 0:
+        return line
+    return np.insert(line, 1 + np.flatnonzero(step > _JUMP * np.quantile(moving, 0.9)), np.nan, axis=0)
+
+
+def _paint_start(axes: Axes, layers: _Layers) -> None:
+    truth = layers.truth
+    start = layers.final if truth is None else truth[np.isfinite(truth).all(axis=1)]
+    axes.plot(*start[0], "o", ms=9, mfc="none", mec=GREEN, mew=1.8, zorder=6, label="start")

@@ -1,0 +1,224 @@
+"""What the whiskers told in a session: every image as a column, and a few where they were taken."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from evaluation import drawing
+from evaluation.drawing import FAINT, INK, QUIET
+from evaluation.exm import base_end
+from evaluation.images import Images
+from evaluation.mappicture import NO_WALLS, corners, edges, paint_walls
+from evaluation.run import Run, known
+from evaluation.scorecard import Scorecard
+from tactile.errors import InputError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.colors import Colormap
+    from matplotlib.figure import Figure
+
+SHOWN = 12
+"""Images that are drawn where they were taken, at most."""
+COLUMNS = 540
+"""Whisks side by side in one strip: two pixels each."""
+STRIPS = 3
+"""Strips at most; of a longer session every so manieth whisk is shown."""
+
+_NOTHING, _DEAD = "#f3f3f3", "#8f8f8f"
+_ROW, _GAP, _BOTTOM, _KEY = 0.062, 0.42, 0.62, 1.25  # inches
+_FLATTEST, _TALLEST = 0.35, 1.3
+_REACH = 0.078  # m, of a drawn head: it fits between the walls of a cell
+_LARGEST, _LEAST = 0.08, 0.045  # the same as shares of the scene, where that is larger or smaller
+_HOLE = 0.28  # share of it that is the head itself
+
+
+def draw_whiskers(run: Run, card: Scorecard, images: Images, walls: np.ndarray = NO_WALLS) -> Figure:
+    """Strips of time against whiskers, coloured by the height that was felt, and below them some of the
+    images as rings around the head, where it was (in truth, else in the map) and as it looked.
+
+    Args:
+        card: for the name. images: as many as the run has steps.
+        walls: [B, 5] west, south, east, north, height, m, in the frame of the truth (drawn if there is one).
+
+    Raises:
+        InputError: another number of images than of steps.
+    """
+    if len(images.view) != len(run.time):
+        raise InputError("views.npz", f"{len(images.view)} images", f"{len(run.time)}, one for each step")
+    rows = known(run)
+    pose = run.final if len(rows) == 0 or run.truth is None else run.truth
+    steps = np.arange(len(pose)) if len(rows) == 0 else rows
+    shown = walls if len(rows) else NO_WALLS
+    box, reach = _frame(pose[steps, :2], shown)
+    chosen = _spread(pose, _first_visit(pose, steps), 2.4 * reach)
+
+    whiskers = images.view[0].size
+    strips = min(STRIPS, -(-len(run.time) // COLUMNS))
+    inner = drawing.WIDTH - drawing.LEFT - drawing.RIGHT
+    wide = inner - _KEY
+    high = wide * (box[1, 1] - box[0, 1]) / (box[1, 0] - box[0, 0])
+    tall = whiskers * _ROW
+    total = drawing.TOP + strips * (tall + _GAP) + 0.25 + high + _BOTTOM
+    figure = drawing.blank(total, card.name, _line(images))
+
+    colors = _colors()
+    pixels, bottom = _pixels(images, colors), total - drawing.TOP
+    for part in np.array_split(np.arange(len(run.time)), strips):
+        bottom -= tall + _GAP
+        axes = drawing.plot(figure, drawing.LEFT, bottom + _GAP, inner, tall)
+        _paint_strip(axes, run.time, pixels, images, part, chosen)
+    drawing.name_axes(axes, "time (s)", "")
+
+    axes = drawing.plot(figure, drawing.LEFT, _BOTTOM, wide, high)
+    axes.set(xlim=box[:, 0], ylim=box[:, 1], aspect="equal")
+    drawing.metric_grid(axes)
+    if len(shown):
+        paint_walls(axes, shown)
+    axes.plot(*pose[steps, :2].T, color=FAINT, lw=0.8, zorder=0.8)
+    for number, step in enumerate(chosen, start=1):
+        _paint_head(axes, pose[step], reach, pixels[step], images)
+        axes.text(*pose[step, :2], str(number), ha="center", va="center", fontsize=7, color=INK, zorder=5)
+    _paint_key(figure, images, colors, drawing.LEFT + wide, high)
+    return figure
+
+
+def _line(images: Images) -> str:
+    rings = ", ".join(f"{1000 * length:.0f}" for length in images.length)
+    touched = (images.view > 0).sum() / max(1, images.alive.sum())
+    return f"{len(images.view)} whisks  ·  rings of {images.view.shape[2]} whiskers, {rings} mm long  ·  {touched:.0%} of whiskers touched"
+
+
+def _frame(path: np.ndarray, walls: np.ndarray) -> tuple[np.ndarray, float]:
+    """Corners [[left, bottom], [right, top]] in m, and how large a head is drawn."""
+    low, high = corners(path, edges(walls))
+    extent = max((high - low).max(), 1e-3)
+    reach = float(np.clip(_REACH, _LEAST * extent, _LARGEST * extent))
+    middle, size = (low + high) / 2, high - low + (0.02 * extent if len(walls) else 2.6 * reach)
+    size = np.maximum(size, size[::-1] * [1 / _TALLEST, _FLATTEST])
+    return np.stack([middle - size / 2, middle + size / 2]), reach
+
+
+def _first_visit(pose: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """The steps of the first loop, all of them where there is none."""
+    try:
+        return steps[: max(1, base_end(pose[steps]))]
+    except InputError:
+        return steps
+
+
+def _spread(pose: np.ndarray, steps: np.ndarray, apart: float) -> np.ndarray:
+    """Up to `SHOWN` of the steps, in order, as far from each other as can be and at least so far (m).
+
+    From the first on, each next one is the farthest from all before it.
+    """
+    chosen = [0]
+    place = pose[steps, :2]
+    away = np.hypot(*(place - place[0]).T)
+    while len(chosen) < SHOWN and away.max() >= apart:
+        chosen.append(int(away.argmax()))
+        away = np.minimum(away, np.hypot(*(place - place[chosen[-1]]).T))
+    return np.sort(steps[chosen])
+
+
+def _colors() -> Colormap:
+    import matplotlib
+
+    return matplotlib.colormaps["viridis_r"]
+
+
+def _pixels(images: Images, colors: Colormap) -> np.ndarray:
+    """[N, R, C, 3] the colour of each whisker."""
+    from matplotlib.colors import to_rgb
+
+    pixels = colors(images.view)[..., :3]
+    pixels[images.view == 0] = to_rgb(_NOTHING)
+    pixels[~images.alive] = to_rgb(_DEAD)
+    return pixels
+
+
+def _paint_strip(
+    axes: Axes, time: np.ndarray, pixels: np.ndarray, images: Images, part: np.ndarray, chosen: np.ndarray
+) -> None:
+    rings, columns = images.view.shape[1:]
+    some = part[:: -(-len(part) // COLUMNS)]
+    whisk = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
+    start, end = float(time[part[0]]) - whisk / 2, float(time[part[-1]]) + whisk / 2
+    strip = pixels[some].reshape(len(some), rings * columns, 3).swapaxes(0, 1)
+    axes.imshow(
+        strip, extent=(start, end, rings * columns, 0), aspect="auto", interpolation="nearest", zorder=1
+    )
+    axes.hlines(columns * np.arange(1, rings), start, end, color="white", lw=1.2, zorder=2)
+    middles = columns * (np.arange(rings) + 0.5)
+    axes.set_yticks(middles, [f"{1000 * length:.0f} mm" for length in images.length])
+    axes.set(xlim=(start, end), ylim=(rings * columns, 0))
+    axes.tick_params(pad=2)
+    for number, step in enumerate(chosen, start=1):
+        if part[0] <= step <= part[-1]:
+            axes.plot(time[step], -0.5, "v", ms=3, color=INK, clip_on=False, zorder=3)
+            axes.annotate(
+                str(number), (time[step], -0.5), (0, 3), textcoords="offset points",
+                ha="center", fontsize=7, color=INK, annotation_clip=False,
+            )  # fmt: skip
+
+
+def _paint_head(axes: Axes, pose: np.ndarray, reach: float, pixels: np.ndarray, images: Images) -> None:
+    """One image: a ring of the image a ring around the head, the inner whiskers inside; a tip points ahead."""
+    from matplotlib.collections import PatchCollection
+    from matplotlib.patches import Polygon, Wedge
+
+    rings, columns = pixels.shape[:2]
+    hole, half = _HOLE * reach, 180 / columns
+    thick = (reach - hole) / rings
+    centre, middle = pose[:2], np.degrees(pose[2] + images.azimuth)
+    wedges = [
+        Wedge(centre, hole + (ring + 1) * thick, middle[column] - half, middle[column] + half, width=thick)
+        for ring in range(rings)
+        for column in range(columns)
+    ]
+    face = pixels.reshape(-1, 3)
+    axes.add_collection(PatchCollection(wedges, facecolors=face, edgecolors="white", lw=0.6, zorder=3))
+    ahead = np.array([np.cos(pose[2]), np.sin(pose[2])])
+    beside = np.array([-ahead[1], ahead[0]])
+    tip = centre + reach * np.stack(
+        [1.24 * ahead, 1.05 * ahead + 0.11 * beside, 1.05 * ahead - 0.11 * beside]
+    )
+    axes.add_patch(Polygon(tip, facecolor=INK, edgecolor="none", zorder=4))
+
+
+def _paint_key(figure: Figure, images: Images, colors: Colormap, left: float, high: float) -> None:
+    """How to read a head, and which colour is how high."""
+    from matplotlib.patches import Patch
+
+    rings, columns = images.view.shape[1:]
+    top, size = _BOTTOM + high, _KEY - 0.2
+    axes = drawing.plot(figure, left + 0.2, top - size, size, size)
+    axes.set(xlim=(-1.3, 1.3), ylim=(-1.3, 1.3), aspect="equal", xticks=[], yticks=[])
+    shades = np.repeat(np.linspace(0.95, 0.8, rings), columns)
+    pixels = np.repeat(shades[:, None], 3, axis=1).reshape(rings, columns, 3)
+    _paint_head(axes, np.array([0.0, 0.0, np.pi / 2]), 1.0, pixels, images)
+    axes.text(0.16, 1.14, "ahead", fontsize=7.5, color=QUIET, va="center")
+    for ring, length in enumerate(images.length):
+        out = _HOLE + (ring + 0.5) * (1 - _HOLE) / rings
+        axes.text(
+            0, -out, f"{1000 * length:.0f}", fontsize=6.5, color=INK, ha="center", va="center", zorder=5
+        )
+
+    tall = max(0.5, min(1.6, high - size - 1.0))
+    bar = drawing.plot(figure, left + 0.35, top - size - 0.35 - tall, 0.16, tall)
+    shades = colors(np.linspace(0, 1, 256))[:, None, :3]
+    bar.imshow(shades, extent=(0, 1, 0, 1000 * images.tallest), origin="lower", aspect="auto")
+    bar.set_xticks([])
+    bar.yaxis.tick_right()
+    bar.set_title("height felt (mm)", fontsize=8, color=QUIET, loc="left", pad=5)
+    across, up = figure.get_size_inches()
+    handles = [Patch(facecolor=_NOTHING, edgecolor=QUIET, lw=0.4, label="nothing touched")]
+    if not images.alive.all():
+        handles.append(Patch(facecolor=_DEAD, label="does not report"))
+    figure.legend(
+        handles=handles, loc="upper left", frameon=False, fontsize=8, labelcolor=QUIET, borderpad=0,
+        borderaxespad=0, handlelength=1.0, handletextpad=0.5,
+        bbox_to_anchor=((left + 0.33) / across, (top - size - 0.5 - tall) / up),
+    )  # fmt: skip

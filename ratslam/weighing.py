@@ -1,0 +1,138 @@
+"""Weighing: how likely what is seen now is at every remembered frame, and where it is new.
+
+A view is weighed by its error, in scales; a whisker image by its log-odds; a given id by what ids are worth.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+
+from ratslam.likeness import Pixels
+from ratslam.recall import SAMPLES, Memory, RecallConfig, Weighing, allowed, offsets, old, present
+from tactile.types import Array
+
+LABELS = {"same": 0.6, "unknown": 0.35, "other": 0.05, "new_unknown": 0.9, "new_known": 0.1}
+"""How likely a given id is where its frame was, and where it is new: ids are right more often than not, a new
+id says little (the giver may have failed to recognise), and another known id speaks against."""
+LABEL_TEMPER = 0.7
+"""Ids of consecutive views are not independent: each counts as this share of one."""
+STEPS = (0.02, 0.94, 0.02, 0.02)
+"""How often, where images follow each other, the next is that of the same frame, the next one, and so on."""
+
+
+def by_view(config: RecallConfig, cell: float, memory: Memory, view: Array) -> Weighing:
+    """Weighs all frames by a view [D]. A view that looks like many places makes all of them unlikely."""
+    error = _errors(offsets(config), memory, view)
+    frames = old(config, memory)
+    width = config.sharpness * memory.scale
+    known = width > jnp.finfo(width.dtype).tiny
+    width = jnp.where(known, width, 1.0)
+    likelihood = jnp.where(frames[None], jnp.exp(-error / width), 0.0)
+    shifts = jnp.sum(jnp.isfinite(error[:, 0]))
+    mean = jnp.sum(likelihood) / (jnp.maximum(jnp.sum(frames), 1) * shifts).astype(width.dtype)
+    floor = jnp.exp(-config.floor * memory.scale / width)
+    novelty = config.common * mean + config.fresh * floor
+    away = jnp.maximum(3 * cell, 3 * (0.5 * cell + 0.05 * (memory.since + memory.length)))
+    here = present(memory)
+    apart = (memory.x - here[0]) ** 2 + (memory.y - here[1]) ** 2
+    return Weighing(
+        likelihood=jnp.where(known, likelihood, 1.0),
+        novelty=jnp.where(known, novelty, 1.0),
+        background=_background(jnp.min(error, axis=0), frames & (apart > away**2)),
+        certain=known & jnp.any(frames),
+        telling=known,
+    )
+
+
+def by_touch(config: RecallConfig, memory: Memory, level: Array, pixels: Pixels) -> tuple[Memory, Weighing]:
+    """Weighs all frames by a whisker image: levels [D].
+
+    Pixels are not independent, so their log-odds are tempered. A new place is as likely to look like this as
+    the places that follow those that looked like the last one: images in corridors go on as they began.
+
+    Returns:
+        the memory, which has to know this image at the next one, too.
+    """
+    frames = old(config, memory)
+    row = memory.likeness[pixels.group, level]
+    then = [memory.view, memory.view[pixels.behind]][: len(offsets(config))]
+    odds = jnp.stack([jnp.sum(jnp.take_along_axis(row, levels, axis=1), axis=0) for levels in then])
+    certain = (memory.scale != 0) & jnp.any(frames)
+    likelihood = jnp.where(frames[None] & certain, jnp.exp(config.temper * odds), 0.0)
+    expected = jnp.where(frames[None], _onwards(memory.before), 0.0)
+    total = jnp.sum(expected)
+    familiar = jnp.sum(expected * likelihood) / jnp.where(total > 0, total, 1.0)
+    share = jnp.where(total > 0, config.familiar, 0.0)
+    novelty = share * familiar + (1 - share) * jnp.exp(config.temper * memory.scale)
+    weighing = Weighing(
+        likelihood=jnp.where(certain, likelihood, 1.0),
+        novelty=jnp.where(certain, novelty, 1.0),
+        background=jnp.full(SAMPLES, jnp.nan, memory.x.dtype),
+        certain=certain,
+        telling=certain,
+    )
+    return memory._replace(before=likelihood), weighing
+
+
+def _onwards(before: Array) -> Array:
+    """[S, C] where frames of such likelihoods lead: one on, or one back for a robot that has turned about."""
+    index = jnp.arange(before.shape[1], dtype=jnp.int32)
+
+    def led(row: Array, by: int) -> Array:
+        came = index - by
+        return jnp.where((came >= 0) & (came < len(index)), jnp.roll(row, by), 0.0)
+
+    rows = [
+        sum(
+            (share * led(before[s], sign * step) for step, share in enumerate(STEPS)),
+            jnp.zeros_like(before[s]),
+        )
+        for s, sign in enumerate((1, -1)[: len(before)])
+    ]
+    return jnp.stack(rows)
+
+
+def by_label(config: RecallConfig, memory: Memory, label: Array) -> Weighing:
+    """Weighs all frames by a given id."""
+    known = jnp.any(memory.label == label)
+    share = 1 / jnp.maximum(memory.distinct + (~known).astype(jnp.int32), 1).astype(memory.x.dtype)
+    other = jnp.where(known, LABELS["other"] * share, LABELS["unknown"])
+    likelihood = jnp.where(memory.label == label, LABELS["same"], other)
+    novelty = jnp.where(known, LABELS["new_known"] * share, LABELS["new_unknown"])
+    return Weighing(
+        likelihood=(likelihood**LABEL_TEMPER)[None],
+        novelty=novelty**LABEL_TEMPER,
+        background=jnp.full(SAMPLES, jnp.nan, memory.x.dtype),
+        certain=jnp.any(old(config, memory)),
+        telling=known,
+    )
+
+
+def _errors(shifts: np.ndarray, memory: Memory, view: Array) -> Array:
+    """[S, C] mean absolute difference where view[k:] meets the stored views' [:-k]; infinite where the
+    shift is not allowed because nothing says that sectors are ordered."""
+    size = memory.view.shape[0]
+    rows = []
+    for k in shifts.tolist():
+        stored = memory.view[max(-k, 0) : size - max(k, 0)]
+        seen = view[max(k, 0) : size - max(-k, 0)]
+        if size <= abs(k):
+            rows.append(jnp.full(memory.view.shape[1], jnp.inf, memory.view.dtype))
+            continue
+        # Written out, one pass over the frames adds all values; a reduction over them takes twice as long.
+        apart = sum((jnp.abs(stored[i] - seen[i]) for i in range(len(stored))), jnp.zeros_like(stored[0]))
+        rows.append(apart / len(stored))
+    return jnp.where(allowed(shifts, memory)[:, None], jnp.stack(rows), jnp.inf)
+
+
+def _background(error: Array, away: Array) -> Array:
+    """[SAMPLES] errors [C] of frames spread evenly over those that the map rules out."""
+    rank = jnp.cumsum(away.astype(jnp.int32))
+    count = rank[-1]
+    wanted = (jnp.arange(SAMPLES, dtype=jnp.int32) * jnp.maximum(count - 1, 0)) // (SAMPLES - 1) + 1
+    row = jnp.searchsorted(rank, wanted)
+    row = jnp.minimum(row, len(rank) - 1)
+    # With fewer than SAMPLES of them each is told once.
+    fresh = jnp.concatenate([jnp.ones(1, bool), row[1:] != row[:-1]])
+    return jnp.where(fresh & (count > 0), error[row], jnp.nan)
