@@ -14,8 +14,8 @@ export OMP_NUM_THREADS := 1
 .PHONY: run test soak lint bench clean
 
 run: $(READY)
-	@n=1; while [ -e runs/square-$$n ]; do n=$$((n + 1)); done; \
-	set -x; $(BIN)/python -m ratslam run configs/square.yaml -o runs/square-$$n
+	@n=1; while [ -e runs/whisker_maze-$$n ]; do n=$$((n + 1)); done; \
+	set -x; $(BIN)/python -m ratslam run configs/whisker_maze.yaml -o runs/whisker_maze-$$n
 
 test: $(READY)
 	$(BIN)/python -m pytest -n 2

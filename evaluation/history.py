@@ -24,24 +24,25 @@ def draw_history(run: Run, card: Scorecard) -> Figure:
 
     Without truth, or where the run never returns to its start, nobody can say; then all look the same.
     """
-    rows = known(run)
-    rows = rows if len(rows) else np.arange(len(run.time))
-    rows = rows[run.experience[rows] >= 0]
+    rows = known(run) if len(known(run)) else np.arange(len(run.time))
     judged, why = _judged(run, card, rows)
+    rows = rows[run.experience[rows] >= 0]
     experience = run.experience[rows]
     figure = drawing.blank(_HEIGHT, card.name, why if judged is None else _line(judged))
     inner = drawing.WIDTH - drawing.LEFT - drawing.RIGHT
     axes = drawing.plot(figure, drawing.LEFT, _BOTTOM, inner, _HEIGHT - drawing.TOP - _BOTTOM)
     counted = np.zeros(len(rows), bool) if judged is None else judged.counted
     right = counted if judged is None else judged.right
+    free = ~counted
+    coarse = min(2.5, max(1.0, np.sqrt(600 / max(1, len(rows)))))  # larger marks for few steps
     for some, color, mark, size, name in (
-        (~counted, GREY, "o", 2.2, "experience"),
+        (free, GREY, "o", 2.2, "no re-localisation" if judged else "experience"),
         (right, BLUE, "o", 2.6, "correct re-localisation"),
         (counted & ~right, VERMILLION, "x", 3.4, "incorrect re-localisation"),
     ):
         if some.any():
-            label = name if judged is None or name == "experience" else f"{name} ({some.sum()})"
-            axes.plot(rows[some], experience[some], mark, ms=size, mew=0.9 if mark == "x" else 0,
+            label = name if some is free else f"{name} ({some.sum()})"
+            axes.plot(rows[some], experience[some], mark, ms=coarse * size, mew=0.9 if mark == "x" else 0,
                       color=color, label=label, zorder=3)  # fmt: skip
     if judged is not None and judged.base < len(rows):
         axes.axvline(rows[judged.base] - 0.5, color=INK, lw=1.1, ls=(0, (2, 2)), zorder=2,
@@ -51,22 +52,23 @@ def draw_history(run: Run, card: Scorecard) -> Figure:
     axes.locator_params(integer=True)
     axes.grid(color=FAINT, lw=0.7)
     drawing.name_axes(axes, "step", "experience, in order of creation")
-    drawing.legend(figure, axes)
+    drawing.legend(figure, axes, columns=2)
     return figure
 
 
 def _judged(run: Run, card: Scorecard, rows: np.ndarray) -> tuple[ExperienceMetric | None, str]:
-    """Strict ExM of the steps `rows` that have an experience, or why there is none."""
+    """Strict ExM of the steps `rows`, of which those without an experience are no entries; or why there is
+    none."""
     if run.truth is None or len(known(run)) == 0:
         return None, "no ground truth: re-localisations cannot be judged"
-    if len(rows) == 0:
+    if (run.experience[rows] < 0).all():
         return None, "no experiences"
     base = None if card.exm.base is None else int(np.searchsorted(rows, card.exm.base))
     config = card.exm.model_copy(update={"mode": "strict", "log": "step", "base": base})
     try:
         return experience_metric(run.experience[rows], run.truth[rows], config), ""
     except InputError as error:
-        return None, str(error)
+        return None, f"not judged: {error.where} {error.found}"
 
 
 def _line(found: ExperienceMetric) -> str:

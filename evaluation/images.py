@@ -47,10 +47,10 @@ def read_images(path: str | Path) -> Images:
         InputError: it is no such file.
     """
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in Images._fields}
         view = arrays["view"] / _WHITE
-        images = Images(view, *(arrays[name] for name in Images._fields[1:-1]), float(arrays["tallest"]))
+        images = Images(**arrays | {"view": view, "tallest": float(arrays["tallest"])})
     except FileNotFoundError:
         raise InputError(str(path), "no such file", "the views.npz of a run directory") from None
     except (OSError, ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile) as error:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from evaluation import drawing
-from evaluation.drawing import BLUE, GREEN, GREY, INK, PURPLE, VERMILLION
+from evaluation.drawing import BLUE, GREEN, GREY, INK, PURPLE, VERMILLION, YELLOW
 from evaluation.run import Run, known
 from evaluation.scorecard import Scorecard
 from evaluation.trajectory import align
@@ -46,7 +46,8 @@ def draw_map(
 
     Args:
         run: the run. card: its scorecard, for the headline.
-        walls: [B, 5] west, south, east, north, height in m, in the frame of the truth (drawn if there is one).
+        walls: [B, 5] west, south, east, north, height in m, in the frame of the truth (drawn if there is
+            one).
         closures: [n, 2] steps that closures join; drawn with walls.
     """
     layers = _placed(run)
@@ -170,20 +171,20 @@ def _paint_laps(axes: Axes, run: Run, layers: _Layers, apart: float, closures: n
 
     truth, odometry, final, nodes = layers
     assert truth is not None
-    axes.plot(*odometry.T, color=GREY, lw=0.6, alpha=0.6, zorder=1, label="raw odometry")
-    axes.plot(*_broken(truth, truth).T, color=INK, lw=0.8, zorder=3, label="truth")
-    axes.plot(*_broken(final, truth).T, color=BLUE, lw=0.9, alpha=0.75, zorder=4, label="path in the map")
+    axes.plot(*broken(truth, truth).T, color=YELLOW, lw=5, solid_capstyle="butt", zorder=0.8, label="truth")
+    axes.plot(*broken(final, truth).T, color=BLUE, lw=0.7, zorder=3, label="path in the map")
+    axes.plot(*odometry.T, color=GREY, lw=0.7, alpha=0.7, zorder=1, label="raw odometry")
     joined, place = (closures, final) if len(closures) else (run.links[_older(run.links)], nodes)
     steps = joined if len(closures) else run.created[joined]
     with np.errstate(invalid="ignore"):
         wrong = np.hypot(*(truth[steps[:, 0]] - truth[steps[:, 1]]).T) > apart
-    for some, color, width, name in (
-        (~wrong, PURPLE, 0.7, "closure"),
-        (wrong, VERMILLION, 0.5, f"closure of places over {apart:g} m apart"),
+    for some, color, over, name in (
+        (~wrong, PURPLE, 5, "closure"),
+        (wrong, VERMILLION, 2, f"closure of places over {apart:g} m apart"),
     ):
         if some.any():
             axes.add_collection(
-                LineCollection(place[joined[some]], colors=color, lw=width, zorder=5, label=name)
+                LineCollection(place[joined[some]], colors=color, lw=0.7, zorder=over, label=name)
             )
 
 
@@ -192,7 +193,7 @@ def _older(links: np.ndarray) -> np.ndarray:
     return np.abs(links[:, 0] - links[:, 1]) > 1
 
 
-def _broken(line: np.ndarray, truth: np.ndarray) -> np.ndarray:
+def broken(line: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """The line [N, 2], interrupted where the true one was carried."""
     step = np.hypot(*np.diff(truth, axis=0).T)
     moving = step[np.isfinite(step) & (step > 0)]

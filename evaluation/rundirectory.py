@@ -114,7 +114,7 @@ def read_closures(path: Path) -> np.ndarray:
 def _skipped(path: Path) -> int:
     """Steps that an earlier run had taken before this one went on from its checkpoint."""
     try:
-        with np.load(path / "map.npz", allow_pickle=False) as archive:
+        with (path / "map.npz").open("rb") as file, np.load(file, allow_pickle=False) as archive:
             total = int(archive["steps"])
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return 0

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from evaluation import drawing
-from evaluation.drawing import FAINT, INK, QUIET
+from evaluation.drawing import FAINT, GREY, INK, QUIET
 from evaluation.exm import base_end
 from evaluation.images import Images
-from evaluation.mappicture import NO_WALLS, corners, edges, paint_walls
+from evaluation.mappicture import NO_WALLS, broken, corners, edges, paint_walls
 from evaluation.run import Run, known
 from evaluation.scorecard import Scorecard
 from tactile.errors import InputError
@@ -28,7 +28,7 @@ STRIPS = 3
 """Strips at most; of a longer session every so manieth whisk is shown."""
 
 _NOTHING, _DEAD = "#f3f3f3", "#8f8f8f"
-_ROW, _GAP, _BOTTOM, _KEY = 0.062, 0.42, 0.62, 1.25  # inches
+_ROW, _GAP, _MARKS, _BOTTOM, _KEY = 0.062, 0.5, 0.22, 0.62, 1.25  # inches
 _FLATTEST, _TALLEST = 0.35, 1.3
 _REACH = 0.078  # m, of a drawn head: it fits between the walls of a cell
 _LARGEST, _LEAST = 0.08, 0.045  # the same as shares of the scene, where that is larger or smaller
@@ -61,26 +61,27 @@ def draw_whiskers(run: Run, card: Scorecard, images: Images, walls: np.ndarray =
     wide = inner - _KEY
     high = wide * (box[1, 1] - box[0, 1]) / (box[1, 0] - box[0, 0])
     tall = whiskers * _ROW
-    total = drawing.TOP + strips * (tall + _GAP) + 0.25 + high + _BOTTOM
+    total = drawing.TOP + _MARKS + strips * (tall + _GAP) + 0.25 + high + _BOTTOM
     figure = drawing.blank(total, card.name, _line(images))
 
     colors = _colors()
-    pixels, bottom = _pixels(images, colors), total - drawing.TOP
+    pixels, bottom = _pixels(images, colors), total - drawing.TOP - _MARKS + _GAP
     for part in np.array_split(np.arange(len(run.time)), strips):
         bottom -= tall + _GAP
-        axes = drawing.plot(figure, drawing.LEFT, bottom + _GAP, inner, tall)
+        axes = drawing.plot(figure, drawing.LEFT, bottom, inner, tall)
         _paint_strip(axes, run.time, pixels, images, part, chosen)
-    drawing.name_axes(axes, "time (s)", "")
+    drawing.name_axes(axes, "time (s); of each ring, the whisker ahead is on top, then anticlockwise", "")
 
     axes = drawing.plot(figure, drawing.LEFT, _BOTTOM, wide, high)
     axes.set(xlim=box[:, 0], ylim=box[:, 1], aspect="equal")
     drawing.metric_grid(axes)
     if len(shown):
         paint_walls(axes, shown)
-    axes.plot(*pose[steps, :2].T, color=FAINT, lw=0.8, zorder=0.8)
+    axes.plot(*broken(pose[steps, :2], pose[steps, :2]).T, color=FAINT, lw=0.8, zorder=0.8)
     for number, step in enumerate(chosen, start=1):
         _paint_head(axes, pose[step], reach, pixels[step], images)
-        axes.text(*pose[step, :2], str(number), ha="center", va="center", fontsize=7, color=INK, zorder=5)
+        x, y, _ = pose[step]
+        axes.text(x, y, str(number), ha="center", va="center", fontsize=7, color=INK, zorder=5)
     _paint_key(figure, images, colors, drawing.LEFT + wide, high)
     return figure
 
@@ -88,7 +89,12 @@ def draw_whiskers(run: Run, card: Scorecard, images: Images, walls: np.ndarray =
 def _line(images: Images) -> str:
     rings = ", ".join(f"{1000 * length:.0f}" for length in images.length)
     touched = (images.view > 0).sum() / max(1, images.alive.sum())
-    return f"{len(images.view)} whisks  ·  rings of {images.view.shape[2]} whiskers, {rings} mm long  ·  {touched:.0%} of whiskers touched"
+    parts = [
+        f"{len(images.view)} whisks",
+        f"rings of {images.view.shape[2]} whiskers, {rings} mm long",
+        f"{touched:.0%} of whiskers touched",
+    ]
+    return "  ·  ".join(parts)
 
 
 def _frame(path: np.ndarray, walls: np.ndarray) -> tuple[np.ndarray, float]:
@@ -165,24 +171,25 @@ def _paint_strip(
 
 
 def _paint_head(axes: Axes, pose: np.ndarray, reach: float, pixels: np.ndarray, images: Images) -> None:
-    """One image: a ring of the image a ring around the head, the inner whiskers inside; a tip points ahead."""
+    """One image: its rows as rings around the head, the shortest whiskers inside; a tip points ahead."""
     from matplotlib.collections import PatchCollection
-    from matplotlib.patches import Polygon, Wedge
+    from matplotlib.patches import Circle, Polygon, Wedge
 
     rings, columns = pixels.shape[:2]
     hole, half = _HOLE * reach, 180 / columns
     thick = (reach - hole) / rings
-    centre, middle = pose[:2], np.degrees(pose[2] + images.azimuth)
+    centre, middle = (float(pose[0]), float(pose[1])), np.degrees(pose[2] + images.azimuth)
     wedges = [
         Wedge(centre, hole + (ring + 1) * thick, middle[column] - half, middle[column] + half, width=thick)
         for ring in range(rings)
         for column in range(columns)
     ]
     face = pixels.reshape(-1, 3)
+    axes.add_patch(Circle(centre, reach, facecolor="white", edgecolor=GREY, lw=0.7, zorder=2.9))
     axes.add_collection(PatchCollection(wedges, facecolors=face, edgecolors="white", lw=0.6, zorder=3))
     ahead = np.array([np.cos(pose[2]), np.sin(pose[2])])
     beside = np.array([-ahead[1], ahead[0]])
-    tip = centre + reach * np.stack(
+    tip = pose[:2] + reach * np.stack(
         [1.24 * ahead, 1.05 * ahead + 0.11 * beside, 1.05 * ahead - 0.11 * beside]
     )
     axes.add_patch(Polygon(tip, facecolor=INK, edgecolor="none", zorder=4))
@@ -212,7 +219,7 @@ def _paint_key(figure: Figure, images: Images, colors: Colormap, left: float, hi
     bar.imshow(shades, extent=(0, 1, 0, 1000 * images.tallest), origin="lower", aspect="auto")
     bar.set_xticks([])
     bar.yaxis.tick_right()
-    bar.set_title("height felt (mm)", fontsize=8, color=QUIET, loc="left", pad=5)
+    bar.set_title("height felt (mm)", fontsize=8, color=QUIET, loc="left", pad=8)
     across, up = figure.get_size_inches()
     handles = [Patch(facecolor=_NOTHING, edgecolor=QUIET, lw=0.4, label="nothing touched")]
     if not images.alive.all():

@@ -23,6 +23,8 @@ STRONG = (20.0, 40.0)
 """Evidence of the runs that the further starts are made from."""
 STEPS = 12
 """Solver steps from each start."""
+FINE = 1e-3
+"""m and rad that a solver step moves at most when a map counts as settled."""
 CUT = 30.0
 """What cutting the odometry costs, in chi-square: robots are seldom carried away."""
 PLAUSIBLE = 3.0
@@ -88,7 +90,7 @@ def _anew(case: Case, starts: Sequence[Fit]) -> list[Judgement]:
         strong = case.evidence >= least
         if strong.any() and not strong.all():
             alone = _only(case.closures, strong)
-            begin.append(solve(path.poses, path.bias, case.chain, alone, case.prior, STEPS))
+            begin.append(solve(path.poses, path.bias, case.chain, alone, case.prior, STEPS, FINE))
     return [_settled(case, start, ()) for start in begin]
 
 
@@ -204,7 +206,7 @@ def _severed(chain: Chain, cuts: tuple[tuple[int, int], ...]) -> Chain:
 
 def _settled(case: Case, start: Fit, cuts: tuple[tuple[int, int], ...]) -> Judgement:
     chain = _severed(case.chain, cuts)
-    fit = solve(start.poses, start.bias, chain, case.closures, case.prior, STEPS)
+    fit = solve(start.poses, start.bias, chain, case.closures, case.prior, STEPS, FINE)
     cost = robust_cost(fit, chain, case.closures, case.prior) + CUT * len(cuts)
     return Judgement(fit, cost, cuts)
 

@@ -36,8 +36,8 @@ TOUCH: dict[str, dict[str, Any]] = {
         "breaks": False,
         "weigh_every": 50,
         "solve_every": 20,
-        "place_radius": 1.4,
-        "place_heading": 0.25,
+        "place_radius": 1.3,
+        "place_heading": 0.17,
     },
 }
 """What is set for sessions with whiskers unless the configuration says otherwise: the odometry of Salman &

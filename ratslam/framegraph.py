@@ -73,13 +73,19 @@ def corrected(motion: np.ndarray, length: np.ndarray | float, bias: float) -> np
 
 
 def solve(
-    poses: np.ndarray, bias: float, chain: Chain, closures: Closures, prior: Prior, iterations: int
+    poses: np.ndarray,
+    bias: float,
+    chain: Chain,
+    closures: Closures,
+    prior: Prior,
+    iterations: int,
+    tolerance: float = 1e-4,
 ) -> Fit:
     """Gauss-Newton with weights by run, from the given poses [N, 3] and bias.
 
     Returns:
-        the fit after the last step that changed anything by more than 1e-4 (m, rad), `iterations` at most;
-        where the equations cannot be solved, what it had before.
+        the fit after the last step that changed anything by more than the tolerance (m, rad), `iterations` at
+        most; where the equations cannot be solved, what it had before.
     """
     system = _System(chain, closures, prior)
     fit = Fit(np.array(poses, float), bias, np.ones(len(closures.scale)))
@@ -92,7 +98,7 @@ def solve(
         moved = fit.poses + step[0]
         moved[:, 2] = wrap(moved[:, 2])
         fit = fit._replace(poses=moved, bias=fit.bias + step[1])
-        if np.abs(step[0]).max(initial=0.0) < 1e-4:
+        if np.abs(step[0]).max(initial=0.0) < tolerance:
             break
     return fit
 

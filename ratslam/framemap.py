@@ -90,7 +90,7 @@ class FrameMap:
         self._travel = HALT
         self._bias = 0.0
         self._prior = Prior(0.0, config.bias_sd / cell)
-        self._since = 0.0
+        self._since, self._turned = 0.0, 0.0  # way (m) and turn (rad) since the last closure
         self._solved = (-1, -1)  # the run and the frame of the last solution
         self._settled: Settled | None = None
 
@@ -180,8 +180,8 @@ class FrameMap:
             self._learn(evidence)
             matched = self._consider(evidence)
             self._weigh()
-            sure = self._since <= 5 * self.cell
-            said = self._grouping.arrive(self._pose.rows, len(self._pose.rows) - 1, matched, sure)
+            frame = len(self._pose.rows) - 1
+            said = self._grouping.arrive(self._pose.rows, frame, matched, self._sure())
         self._step_frame.append(len(self._pose.rows) - 1)
         self._step_motion.append([*self._travel.motion, self._travel.length])
         self._settled = None
@@ -204,6 +204,7 @@ class FrameMap:
         self._turn.append(turn)
         self._cut.append(-1)
         self._since += length
+        self._turned += turn
         self._travel = HALT
         self._looks.append(observation, motion[2], length)
 
@@ -252,9 +253,16 @@ class FrameMap:
         if run != self._solved[0] or candidate.frame - self._solved[1] >= self.config.solve_every:
             self._solved = run, candidate.frame
             self._correct()
-        self._since = 0.0
+        self._since = self._turned = 0.0
         # Facing the other way a spot is another place.
         return candidate.match if np.cos(candidate.shift * self._angle()) > 0 else -1
+
+    def _sure(self) -> bool:
+        """Whether little enough has been driven and turned since the last closure to know the experience."""
+        noise = self.config.noise
+        driven = noise.heading_per_cell**2 * self._since / self.cell
+        variance = driven + noise.heading_per_radian**2 * self._turned
+        return self._since <= 5 * self.cell and variance <= self.config.place_heading**2
 
     def _weigh(self) -> None:
         """Now and then, weighs all runs against each other anew and takes up the map that comes of it."""
@@ -511,7 +519,7 @@ class FrameMap:
             }
             | {
                 "travel": np.array([*travel.motion, travel.length, travel.turn]),
-                "drift": np.array([self._bias, *self._prior, self._since]),
+                "drift": np.array([self._bias, *self._prior, self._since, self._turned]),
                 "solved": np.array(self._solved),
             }
         )
@@ -525,7 +533,7 @@ class FrameMap:
             whole.restore({k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)})
         travel, drift = np.asarray(arrays["travel"]), np.asarray(arrays["drift"])
         self._travel = Travel(travel[:3].copy(), float(travel[3]), float(travel[4]))
-        self._bias, self._since = float(drift[0]), float(drift[3])
+        self._bias, self._since, self._turned = float(drift[0]), float(drift[3]), float(drift[4])
         self._prior = Prior(float(drift[1]), float(drift[2]))
         run, frame = np.asarray(arrays["solved"])
         self._solved = int(run), int(frame)

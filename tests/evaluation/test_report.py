@@ -8,7 +8,8 @@ import sys
 import numpy as np
 import pytest
 
-from evaluation.report import draw_map, headline, save_map
+from evaluation.mappicture import broken, draw_map, headline
+from evaluation.report import save_map
 from evaluation.scorecard import score
 
 
@@ -70,6 +71,56 @@ def test_truth_with_holes_is_drawn(circle):
     truth[:5] = np.nan
     holed = circle._replace(truth=truth)
     assert "truth" in labels(draw_map(holed, score(holed)))
+
+
+WALLS = np.array([[-1.0, -1.0, 5.0, -0.9, 0.05], [-1.0, 4.0, 5.0, 4.1, 0.02]])
+
+
+def drawn(figure, label):
+    """The lines with that label in the legend, [n, 2, 2]."""
+    found = [lines for lines in figure.axes[0].collections if lines.get_label() == label]
+    return np.array([segment for lines in found for segment in lines.get_segments()])
+
+
+def test_walls_are_drawn_in_the_frame_of_the_truth(circle):
+    figure = draw_map(circle, score(circle), WALLS)
+    axes = figure.axes[0]
+    assert labels(figure)[:3] == ["truth", "path in the map", "raw odometry"]
+    (boxes,) = (found for found in axes.collections if len(found.get_paths()) == len(WALLS))
+    for box, path in zip(WALLS, boxes.get_paths(), strict=True):
+        assert path.get_extents().extents == pytest.approx(box[:4])
+    tall, low = boxes.get_facecolor()[:, 0]
+    assert tall < low < 1
+    assert axes.get_xlim()[0] < -1
+    assert axes.get_ylim()[1] > 4.1
+
+
+def test_a_closure_is_wrong_where_it_joins_places_far_apart(circle):
+    right, wrong = [[0, 36], [5, 77], [36, 72]], [[0, 18], [3, 50]]
+    figure = draw_map(circle, score(circle), WALLS, np.array(right + wrong))
+    for joined, label in ((right, "closure"), (wrong, "closure of places over 0.1 m apart")):
+        ends = drawn(figure, label)
+        assert ends == pytest.approx(circle.truth[np.array(joined)][..., :2], abs=1e-9)
+
+
+def test_without_a_list_of_closures_links_to_older_experiences_stand_for_them(circle):
+    figure = draw_map(circle, score(circle), WALLS)
+    links = circle.links[np.abs(circle.links[:, 0] - circle.links[:, 1]) > 1]
+    assert len(drawn(figure, "closure of places over 0.1 m apart")) == len(links) == 1  # 0.115 m apart
+
+
+def test_walls_need_a_truth_to_lie_in(circle):
+    blind = circle._replace(truth=None)
+    assert labels(draw_map(blind, score(blind), WALLS)) == labels(draw_map(blind, score(blind)))
+
+
+def test_a_line_is_interrupted_only_where_the_robot_was_carried(circle):
+    path = circle.truth[:, :2].copy()
+    assert broken(path, path) is path or np.array_equal(broken(path, path), path)
+    path[50:] += 2.0
+    found = broken(path, path)
+    assert np.flatnonzero(np.isnan(found).all(axis=1)).tolist() == [50]
+    assert np.array_equal(np.delete(found, 50, axis=0), path)
 
 
 def test_scoring_needs_no_matplotlib_and_drawing_no_pyplot():

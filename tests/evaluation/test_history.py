@@ -1,0 +1,89 @@
+"""The experience history: each step once, coloured as strict ExM counts it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from evaluation.exm import experience_metric
+from evaluation.history import draw_history
+from evaluation.scorecard import score
+
+
+def marks(figure):
+    """Of each kind of mark its steps and experiences, by the first words of its name."""
+    return {line.get_label().split(" (")[0]: line.get_xydata() for line in figure.axes[0].lines}
+
+
+@pytest.fixture
+def confused(circle):
+    """The third lap takes half of the places for their neighbours across the circle."""
+    experience = circle.experience.copy()
+    experience[80:98] = (experience[80:98] + 18) % 36
+    return circle._replace(experience=experience)
+
+
+def test_every_step_is_drawn_once_and_as_it_was_judged(confused):
+    figure = draw_history(confused, score(confused))
+    found = marks(figure)
+    base = found.pop("end of the base set")
+    expected = experience_metric(confused.experience, confused.truth)
+    assert base[0, 0] == expected.base - 0.5
+    for name, which in (
+        ("no re-localisation", ~expected.counted),
+        ("correct re-localisation", expected.right),
+        ("incorrect re-localisation", expected.counted & ~expected.right),
+    ):
+        steps = np.flatnonzero(which)
+        assert len(steps) > 0
+        assert np.array_equal(found[name], np.stack([steps, confused.experience[steps]], axis=1)), name
+    assert len(found) == 3
+
+
+def test_the_legend_counts(confused):
+    found = experience_metric(confused.experience, confused.truth)
+    names = [text.get_text() for text in draw_history(confused, score(confused)).legends[0].get_texts()]
+    assert f"correct re-localisation ({found.correct})" in names
+    assert f"incorrect re-localisation ({found.relocalisations - found.correct})" in names
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"truth": None}, "no ground truth"),
+        ({"experience": np.full(108, -1)}, "no experiences"),
+        ({"truth": np.linspace([0, 0, 0], [9, 9, 0], 108)}, "never returns"),
+    ],
+)
+def test_what_cannot_be_judged_is_said_and_drawn_alike(circle, change, said):
+    run = circle._replace(**change)
+    figure = draw_history(run, score(run))
+    assert any(said in text.get_text() for text in figure.texts)
+    assert set(marks(figure)) <= {"experience"}
+
+
+def test_the_picture_and_the_scorecard_agree(confused):
+    """Also where experiences begin late, or the truth has holes."""
+    late = confused._replace(experience=np.where(np.arange(108) < 10, -1, confused.experience))
+    truth = confused.truth.copy()
+    truth[5:9] = np.nan
+    for run in (confused, late, late._replace(truth=truth)):
+        card = score(run)
+        figure = draw_history(run, card)
+        told = " ".join(text.get_text() for text in figure.texts)
+        base = card.quantities["exm_base"].value
+        assert f"base set of {base} steps" in told
+        for name, words in (("exm_arr", "ARR"), ("exm_arcr_strict", "ARCR")):
+            assert f"{words} {card.quantities[name].value:.2f} (" in told
+        steps = np.flatnonzero((run.experience >= 0) & np.isfinite(run.truth).all(axis=1))
+        assert marks(figure)["end of the base set"][0, 0] == steps[base] - 0.5
+
+
+def test_steps_without_truth_are_left_out(circle):
+    truth = circle.truth.copy()
+    truth[::7] = np.nan
+    holed = circle._replace(truth=truth)
+    found = marks(draw_history(holed, score(holed)))
+    found.pop("end of the base set")
+    steps = np.sort(np.concatenate([points[:, 0] for points in found.values()]))
+    assert np.array_equal(steps, np.flatnonzero(np.isfinite(truth).all(axis=1)))

@@ -1,0 +1,162 @@
+"""Whisker images, kept in a file and drawn: what is drawn is what was felt, where it was felt."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from matplotlib.collections import PatchCollection
+
+from evaluation.images import Images, read_images, write_images
+from evaluation.scorecard import score
+from evaluation.whiskerpicture import SHOWN, draw_whiskers
+from tactile.errors import InputError
+
+AZIMUTH = np.arange(6) * np.pi / 3
+LENGTH = np.array([0.05, 0.11, 0.16])
+
+
+def felt(steps=108, seed=0, dead=()):
+    """Random images, half of the pixels dark."""
+    random = np.random.default_rng(seed)
+    view = random.random((steps, 3, 6)) * (random.random((steps, 3, 6)) < 0.5)
+    alive = np.ones((steps, 3, 6), bool)
+    alive.reshape(steps, 18)[:, list(dead)] = False
+    return Images(view * alive, alive, AZIMUTH, LENGTH, 0.05)
+
+
+def heads(figure):
+    """The rings of the map's heads: each as its 18 wedges and their colours, in order of drawing."""
+    (axes,) = (axes for axes in figure.axes if axes.get_xlabel() == "x (m)")
+    found = [c for c in axes.collections if isinstance(c, PatchCollection) and len(c.get_paths()) == 18]
+    return [(c.get_paths(), c.get_facecolor()[:, :3]) for c in found]
+
+
+def strips(figure):
+    return [axes.images[0] for axes in figure.axes if axes.images and axes.get_xlim()[1] != 1]
+
+
+@given(arrays(np.float64, (4, 3, 6), elements=st.floats(0, 1)))
+def test_images_come_back_within_a_step_of_brightness(tmp_path_factory, view):
+    images = felt(4)._replace(view=view)
+    path = tmp_path_factory.mktemp("images") / "views.npz"
+    write_images(path, images)
+    found = read_images(path)
+    assert np.abs(found.view - view).max() <= 1 / 255
+    assert np.array_equal(found.view > 0, view > 0)
+    for name in ("alive", "azimuth", "length", "tallest"):
+        assert np.array_equal(getattr(found, name), getattr(images, name))
+
+
+def test_the_same_images_are_the_same_bytes(tmp_path):
+    for name in ("a", "b"):
+        write_images(tmp_path / name, felt())
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_other_files_are_refused(tmp_path):
+    write_images(tmp_path / "whole.npz", felt())
+    content = (tmp_path / "whole.npz").read_bytes()
+    (tmp_path / "cut.npz").write_bytes(content[: len(content) // 2])
+    (tmp_path / "text.npz").write_text("no images")
+    np.savez(tmp_path / "other.npz", view=np.zeros(3))
+    np.savez(tmp_path / "odd.npz", **felt()._replace(length=np.zeros(2))._asdict())
+    for name in ("cut", "text", "other", "odd", "missing"):
+        with pytest.raises(InputError, match=name):
+            read_images(tmp_path / f"{name}.npz")
+
+
+def test_a_column_is_an_image(circle):
+    images = felt(dead=(4,))
+    figure = draw_whiskers(circle, score(circle), images)
+    (strip,) = strips(figure)
+    pixels = np.asarray(strip.get_array())
+    assert pixels.shape == (18, 108, 3)
+    dark = pixels[images.view.reshape(108, 18).T == 0]
+    assert len(np.unique(dark, axis=0)) == 2  # touched nothing, and does not report
+    assert len(np.unique(pixels[4], axis=0)) == 1
+    assert strip.get_extent() == pytest.approx((circle.time[0] - 0.25, circle.time[-1] + 0.25, 18, 0))
+
+
+def test_heads_show_the_images_of_the_steps_they_stand_for(circle):
+    images = felt(seed=1)
+    figure = draw_whiskers(circle, score(circle), images)
+    strip = np.asarray(strips(figure)[0].get_array())
+    drawn = heads(figure)
+    assert len(drawn) == SHOWN
+    centres = np.array([np.mean([p.vertices.mean(axis=0) for p in paths], axis=0) for paths, _ in drawn])
+    steps = [int(np.argmin(np.hypot(*(circle.truth[:36, :2] - centre).T))) for centre in centres]
+    assert sorted(set(steps)) == steps
+    for step, (_, colors) in zip(steps, drawn, strict=True):
+        assert colors == pytest.approx(strip[:, step])
+
+
+@settings(max_examples=15)
+@given(st.floats(-7, 7), st.floats(-np.pi, np.pi))
+def test_a_sector_points_where_its_whisker_does(heading, first):
+    from evaluation.run import Run
+
+    pose = np.array([[0.3, -0.2, heading]])
+    run = Run(
+        np.zeros(1), pose, pose, pose, pose, np.zeros(1, int), np.zeros(1, int), pose, np.zeros((0, 2), int)
+    )
+    images = felt(1)._replace(azimuth=AZIMUTH + first)
+    ((paths, _),) = heads(draw_whiskers(run, score(run), images))
+    radii = []
+    for whisker, path in enumerate(paths):
+        arc = path.vertices[np.hypot(*(path.vertices - pose[0, :2]).T) > 0] - pose[0, :2]
+        towards = heading + images.azimuth[whisker % 6]
+        assert (arc @ [np.cos(towards), np.sin(towards)] > 0).all()
+        assert np.abs(arc @ [-np.sin(towards), np.cos(towards)]).max() <= np.hypot(*arc.T).max() * 0.51
+        radii.append(np.hypot(*arc.T).max())
+    assert (np.diff(np.array(radii).reshape(3, 6).mean(axis=1)) > 0).all()  # shorter whiskers inside
+
+
+def test_heads_do_not_cover_each_other(circle):
+    still = circle._replace(truth=circle.truth * [0.2, 0.2, 1.0])
+    for run in (circle, still):
+        drawn = heads(draw_whiskers(run, score(run), felt()))
+        boxes = [np.concatenate([p.vertices for p in paths]) for paths, _ in drawn]
+        centres = np.array([(box.min(axis=0) + box.max(axis=0)) / 2 for box in boxes])
+        reach = max(np.ptp(box, axis=0).max() for box in boxes) / 2
+        apart = np.hypot(*(centres[:, None] - centres).T)[~np.eye(len(centres), dtype=bool)]
+        assert apart.size == 0 or apart.min() >= 2 * reach - 1e-9
+
+
+@pytest.mark.parametrize("steps", [1, 2, 108, 1500, 5000])
+def test_sessions_of_any_length_are_drawn(circle, steps):
+    row = np.minimum(np.arange(steps), 107)
+    run = circle._replace(
+        time=np.arange(steps) / 1.0,
+        **{
+            name: getattr(circle, name)[row]
+            for name in ("truth", "online", "final", "odometry", "experience")
+        },
+        created=np.minimum(circle.created, steps - 1),
+    )
+    figure = draw_whiskers(run, score(run), felt(steps))
+    across, down = figure.get_size_inches() * figure.dpi
+    assert across == 1200
+    assert 500 < down < 2500
+    drawn = strips(figure)
+    assert len(drawn) <= 3
+    assert drawn[0].get_extent()[0] == pytest.approx(-0.5)
+    assert drawn[-1].get_extent()[1] == pytest.approx(steps - 0.5)
+
+
+def test_without_truth_heads_stand_in_the_map(circle):
+    blind = circle._replace(truth=None)
+    walls = np.array([[0.0, 0.0, 9.0, 0.1, 0.05]])
+    figure = draw_whiskers(blind, score(blind), felt(), walls)
+    for paths, _ in heads(figure):
+        centre = np.mean([path.vertices.mean(axis=0) for path in paths], axis=0)
+        assert np.hypot(*(circle.final[:, :2] - centre).T).min() < 0.02
+    (axes,) = (axes for axes in figure.axes if axes.get_xlabel() == "x (m)")
+    assert axes.get_xlim()[1] < 9
+
+
+def test_another_number_of_images_is_refused(circle):
+    with pytest.raises(InputError, match=r"views\.npz: 7 images"):
+        draw_whiskers(circle, score(circle), felt(7))
