@@ -66,10 +66,11 @@ def pixels(view_shape: tuple[int, int, int]) -> Pixels:
 def levels(view: Array, alive: Array) -> Array:
     """The level of every pixel: of values [...] in 0..1, and whether their whiskers report [...] (0 or 1).
 
-    Operators only, so it serves NumPy and JAX alike; whole numbers of the view's own type.
+    Operators only, so it serves NumPy and JAX alike; whole numbers of the view's own type, which `alive` has
+    to be of, too, where types are strict.
     """
     height = -(-view * HEIGHTS // 1)
-    height = height - (height > HEIGHTS) * (height - HEIGHTS)
+    height = (height + HEIGHTS - abs(height - HEIGHTS)) / 2  # at most
     return alive * height + (1 - alive) * DEAD
 
 

@@ -76,6 +76,9 @@ def test_a_column_is_an_image(circle):
     assert pixels.shape == (18, 108, 3)
     dark = pixels[images.view.reshape(108, 18).T == 0]
     assert len(np.unique(dark, axis=0)) == 2  # touched nothing, and does not report
+    # What touched nothing is pale, as nothing on the scale of heights is.
+    assert pixels[((images.view == 0) & images.alive).reshape(108, 18).T].min() > 0.9
+    assert pixels[images.view.reshape(108, 18).T > 0].min(axis=1).max() < 0.5
     assert len(np.unique(pixels[4], axis=0)) == 1
     assert strip.get_extent() == pytest.approx((circle.time[0] - 0.25, circle.time[-1] + 0.25, 18, 0))
 

@@ -1,0 +1,435 @@
+"""Laws of recall by whiskers, against loops written out."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ratslam import recall
+from ratslam.likeness import DEAD, HEIGHTS, LEVELS, PRIOR, background, levels, pixels, table
+from ratslam.recall import FOLLOWERS, SUPPORT, Guidance, RecallConfig
+from ratslam.weighing import STEPS, by_touch
+from tactile.frames import between, compose
+
+CELL = 0.05
+SHAPE = (3, 6, 1)
+PIXELS = pixels(SHAPE)
+SIZE = len(PIXELS.group)
+GUARD = 5
+CAPACITY = 64
+NEVER = 3.0
+BOTH = RecallConfig(fan="whiskers", guard=GUARD)
+AHEAD = BOTH.model_copy(update={"shifts": 0})
+SEEDS = range(8)
+seeds = st.integers(0, 10_000)
+
+
+def felt(stream, count, touching=0.4, dead=0.0):
+    """[count, D] levels."""
+    level = stream.integers(1, DEAD, (count, SIZE)) * (stream.random((count, SIZE)) < touching)
+    return np.where(stream.random((count, SIZE)) < dead, DEAD, level)
+
+
+def known(images):
+    """The likeness that such images teach."""
+    return table(background(images, PIXELS.group), PRIOR)
+
+
+def filled(config, images, poses, likeness, *, scale=NEVER, dtype=float):
+    """A memory of frames [N, D] at poses [N, 3]; the robot stands at the newest, everything is new."""
+    count = len(poses)
+    memory = recall.start(config, SIZE, CAPACITY, np.dtype(dtype), len(likeness))
+    store = np.zeros((SIZE, CAPACITY), np.int32)
+    store[:, :count] = images.T
+    memory = memory._replace(view=jnp.asarray(store), count=jnp.int32(count))
+    return recall.inform(memory, Guidance(poses, 0.0, 0.0, np.pi, scale, likeness))
+
+
+def spaced(count, cells=4.0):
+    """Poses in a row so far apart that no frame is near another."""
+    return np.stack([np.arange(count) * cells * CELL, np.zeros(count), np.zeros(count)], axis=1)
+
+
+def random_case(seed, config=BOTH):
+    """A memory in the middle of a way that doubles back, everything in it filled, and an image half known."""
+    stream = np.random.default_rng(seed)
+    count = int(stream.integers(GUARD + 2, CAPACITY + 1))
+    poses = np.cumsum(stream.normal(0, 0.5 * CELL, (count, 3)), axis=0)
+    poses[:, 2] = stream.normal(0, 0.3, count) + np.pi * stream.integers(0, 2, count)
+    images = felt(stream, count, dead=0.05)
+    memory = filled(config, images, poses, known(images))
+    old = max(count - GUARD, 0)
+    rows = len(recall.offsets(config))
+    before, rest = np.zeros((2, rows, CAPACITY))
+    before[:, :old] = stream.exponential(1, (rows, old))
+    before[:, CAPACITY // 3] = 0.0
+    rest[:, :old] = stream.dirichlet(np.full(rows * old + 1, 0.3))[:-1].reshape(rows, old) * 0.6
+    mass = stream.dirichlet(np.full(config.modes + 1, 0.7))[:-1] * (1 - rest.sum())
+    offset = stream.normal(0, 0.5 * CELL, (config.modes, 3)) * [1, 1, 4]
+    memory = memory._replace(
+        before=jnp.asarray(before), rest=jnp.asarray(rest), mass=jnp.asarray(mass), offset=jnp.asarray(offset),
+        anchor=jnp.asarray(stream.integers(0, max(old, 1), config.modes), jnp.int32),
+    )  # fmt: skip
+    memory = recall.travel(memory, jnp.asarray(stream.normal(0, [CELL, 0.2 * CELL, 0.1])))
+    near = images[stream.integers(0, max(old, 1))]
+    return memory, np.where(stream.random(SIZE) < 0.7, near, felt(stream, 1)[0])
+
+
+@cache
+def weigher(config):
+    return jax.jit(lambda memory, level: by_touch(config, memory, level, PIXELS))
+
+
+@cache
+def looker(config):
+    def look(memory, level):
+        memory, weighing = by_touch(config, memory, level, PIXELS)
+        return recall.look(config, CELL, memory, weighing)
+
+    return jax.jit(look)
+
+
+def host(tree):
+    return jax.tree.map(np.asarray, tree)
+
+
+def weigh(config, memory, level):
+    return host(weigher(config)(memory, jnp.asarray(level, jnp.int32)))
+
+
+def look(config, memory, level):
+    return host(looker(config)(memory, jnp.asarray(level, jnp.int32)))
+
+
+# The loops
+
+
+def weighed_by_loops(config, memory, level):
+    """Likelihoods [S, C] and that of novelty, pixel by pixel."""
+    m = host(memory)
+    old = range(int(m.count) - config.guard)
+    turned = len(m.before) > 1
+    likelihood = np.zeros(m.before.shape)
+    for c in old:
+        for s in range(1 + turned):
+            odds = 0.0
+            for d in range(SIZE):
+                then = m.view[PIXELS.behind[d] if s else d, c]
+                odds += m.likeness[PIXELS.group[d], level[d], then]
+            likelihood[s, c] = math.exp(config.temper * odds)
+    weight, familiar = 0.0, 0.0
+    for s in range(1 + turned):
+        for c in range(CAPACITY):
+            for step, share in enumerate(STEPS):
+                to = c - step if s else c + step
+                if to in old:
+                    weight += m.before[s, c] * share
+                    familiar += m.before[s, c] * share * likelihood[s, to]
+    unlike = math.exp(config.temper * m.scale)
+    if not weight:
+        return likelihood, unlike
+    return likelihood, config.familiar * familiar / weight + (1 - config.familiar) * unlike
+
+
+def followed_by_loops(config, m):
+    """What is believed beside the hypotheses, frame by frame: where it goes, and what becomes novel."""
+    heading = np.arctan2(m.sine, m.cosine)
+    belief, novel = np.zeros(m.rest.shape), 0.0
+    old = range(int(m.count) - config.guard)
+    for s in range(len(m.rest)):
+        for c in range(CAPACITY):
+            robot = compose(np.array([m.x[c], m.y[c], heading[c] - s * np.pi]), m.motion)
+            falls = {}
+            for step in range(FOLLOWERS):
+                to = c - step if s else c + step
+                if to not in old:
+                    continue
+                apart = between(np.array([m.x[to], m.y[to], heading[to] - s * np.pi]), robot)
+                deviation = (apart[0] ** 2 + apart[1] ** 2) / (config.reach * CELL) ** 2
+                deviation += 2 * (1 - math.cos(apart[2])) / config.reach_heading**2
+                falls[to] = max(1 - deviation / SUPPORT, 0) ** 4
+            total = sum(falls.values()) + config.nothing
+            stay = m.rest[s, c] * (1 - config.leave)
+            for to, fall in falls.items():
+                belief[s, to] += stay * fall / total
+            novel += m.rest[s, c] * config.leave + stay * config.nothing / total
+    return belief, novel
+
+
+@pytest.mark.parametrize("config", [BOTH, AHEAD], ids=["both ways", "ahead only"])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_an_image_weighs_what_loops_find(config, seed):
+    memory, level = random_case(seed, config)
+    likelihood, novelty = weighed_by_loops(config, memory, level)
+    after, found = weigh(config, memory, level)
+    assert np.allclose(found.likelihood, likelihood, rtol=1e-9)
+    assert float(found.novelty) == pytest.approx(novelty, rel=1e-9)
+    assert np.array_equal(after.before, found.likelihood)
+    assert found.certain == found.telling == (int(memory.count) > GUARD)
+    assert np.isnan(found.background).all()
+    same = {name for name in after._fields if name != "before"}
+    assert all(np.array_equal(getattr(after, name), getattr(memory, name)) for name in same)
+
+
+@pytest.mark.parametrize("config", [BOTH, AHEAD], ids=["both ways", "ahead only"])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_what_is_left_of_belief_follows_the_frames(config, seed):
+    memory, _ = random_case(seed, config)
+    m = host(memory)
+    shifts = recall.offsets(config)
+    cells = np.ones((len(shifts), 1)) * (np.arange(CAPACITY) < int(m.count) - GUARD)
+    angles = jnp.asarray(-shifts * np.pi)
+    belief, novel = recall._followed(config, CELL, memory, angles, jnp.asarray(cells), memory.motion)
+    expected, lost = followed_by_loops(config, m)
+    assert np.allclose(belief, expected, atol=1e-12)
+    assert float(novel) == pytest.approx(lost, abs=1e-12)
+    assert float(belief.sum() + novel) == pytest.approx(float(m.rest.sum()), abs=1e-12)
+
+
+def test_the_seeds_reach_what_they_are_for():
+    shares = []
+    for seed in SEEDS:
+        memory, _ = random_case(seed)
+        belief, novel = followed_by_loops(BOTH, host(memory))
+        shares.append([*belief.sum(axis=1), novel])
+    assert (np.array(shares).max(axis=0) > 0.05).all()
+
+
+# Belief is a distribution
+
+
+@settings(max_examples=30)
+@given(seeds, st.sampled_from([BOTH, AHEAD]), st.sampled_from(["known", "other", "silent", "dead", "full"]))
+def test_mass_is_conserved(seed, config, kind):
+    memory, level = random_case(seed, config)
+    level = {
+        "known": level,
+        "other": felt(np.random.default_rng(seed + 1), 1)[0],
+        "silent": np.zeros(SIZE, int),
+        "dead": np.full(SIZE, DEAD),
+        "full": np.full(SIZE, HEIGHTS),
+    }[kind]
+    after, found = look(config, memory, level)
+    assert (after.mass >= 0).all()
+    assert (after.rest >= 0).all()
+    assert after.mass.sum() + after.rest.sum() + found.novel == pytest.approx(1, abs=1e-12)
+    assert 0 <= found.mass <= 1 + 1e-12
+    assert 0 <= found.entropy <= math.log(config.modes + 1) + 1e-12
+
+
+@pytest.mark.parametrize(("config", "dtype"), [(BOTH, float), (AHEAD, float), (BOTH, np.float32)])
+def test_mass_is_conserved_along_a_way(config, dtype):
+    """A lap driven three times, every image remembered, from the first one on."""
+    stream = np.random.default_rng(0)
+    lap = felt(stream, 20)
+    turn, tolerance = 2 * np.pi / 20, 1e-9 if dtype is float else 1e-4
+    likeness = known(felt(stream, 200))
+    memory = recall.start(config, SIZE, CAPACITY, np.dtype(dtype), len(likeness))
+    memory = recall.inform(memory, Guidance(np.zeros((1, 3)), 0.0, 0.0, np.pi, NEVER, likeness))
+    again = []
+    for k in range(60):
+        level = np.where(stream.random(SIZE) < 0.9, lap[k % 20], felt(stream, 1)[0])
+        memory = recall.travel(memory, jnp.asarray([0.6 * CELL, 0.0, turn], memory.x.dtype))
+        after, found = look(config, memory, level)
+        assert not any(np.isnan(leaf).any() for leaf in [*after, *found[:-1]])
+        assert {leaf.dtype for leaf in [*after, *found]} == {np.dtype(dtype), np.dtype(np.int32)}
+        total = after.mass.sum() + after.rest.sum() + found.novel
+        assert total == pytest.approx(1, abs=tolerance)
+        again.append(found.match >= 0 and (k - found.match) % 20 == 0 and found.mass > 0.1)
+        memory = recall.remember(
+            jax.tree.map(jnp.asarray, after), jnp.asarray(level, jnp.int32), jnp.int32(-1),
+            jnp.zeros(3, memory.x.dtype),
+        )  # fmt: skip
+    assert not any(again[:20])
+    assert np.mean(again[20:]) > 0.9  # from the second lap on it knows where it is
+
+
+def test_what_is_beside_the_hypotheses_is_not_in_them():
+    for seed in SEEDS:
+        memory, level = random_case(seed)
+        config = BOTH.model_copy(update={"modes": 1})
+        memory = memory._replace(
+            anchor=memory.anchor[:1], mass=memory.mass[:1], offset=memory.offset[:1]
+        )
+        after, _ = look(config, memory, level)
+        if not after.mass[0]:
+            continue
+        assert not after.rest[:, after.anchor[0]].any()
+        assert (after.rest[:, int(memory.count) - GUARD :] == 0).all()
+
+
+# What says nothing
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_dead_whisker_changes_nothing_whatever_its_pixel_says(seed):
+    memory, _ = random_case(seed)
+    stream = np.random.default_rng(seed)
+    view, alive = stream.random(SIZE), stream.random(SIZE) < 0.7
+    other = np.where(alive, view, stream.random(SIZE))
+    first, second = (weigh(BOTH, memory, levels(seen, alive).astype(int)) for seen in (view, other))
+    for one, two in zip(first[1], second[1], strict=True):
+        assert np.array_equal(one, two, equal_nan=True)
+    # And it is as if the head had no such whisker.
+    without = memory._replace(likeness=jnp.asarray(np.zeros(memory.likeness.shape)))
+    odds = np.log(first[1].likelihood[:, : int(memory.count) - GUARD])
+    for d in np.flatnonzero(alive).tolist():
+        only = np.full(SIZE, DEAD)
+        only[d] = levels(view, alive).astype(int)[d]
+        odds = odds - np.log(weigh(BOTH, memory, only)[1].likelihood[:, : int(memory.count) - GUARD])
+    assert np.allclose(odds, 0, atol=1e-9)
+    blank = weigh(BOTH, without, levels(view, alive).astype(int))[1].likelihood
+    assert (blank[:, : int(memory.count) - GUARD] == 1).all()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_whisker_that_was_dead_says_nothing_now(seed):
+    memory, level = random_case(seed)
+    stream = np.random.default_rng(seed)
+    gone = stream.choice(SIZE, 4, replace=False)
+    gone = np.union1d(gone, PIXELS.behind[gone])  # turned about, the opposite ones feel what they felt
+    view = np.asarray(memory.view).copy()
+    view[gone] = DEAD
+    then = memory._replace(view=jnp.asarray(view))
+    other = level.copy()
+    other[gone] = felt(stream, 1)[0][gone]
+    first, second = weigh(BOTH, then, level)[1], weigh(BOTH, then, other)[1]
+    assert np.array_equal(first.likelihood, second.likelihood)
+    silenced = level.copy()
+    silenced[gone] = DEAD
+    assert np.allclose(weigh(BOTH, memory, silenced)[1].likelihood, first.likelihood, rtol=1e-12)
+
+
+def test_a_dead_head_knows_no_place():
+    memory, _ = random_case(1)
+    found = weigh(BOTH, memory, np.full(SIZE, DEAD))[1]
+    assert (found.likelihood[:, : int(memory.count) - GUARD] == 1).all()
+    assert found.novelty >= 1
+
+
+@pytest.mark.parametrize("config", [BOTH, AHEAD])
+def test_nothing_is_certain_before_anything_is_known(config):
+    images = felt(np.random.default_rng(0), 40)
+    learnt = known(images)
+    empty = filled(config, images[:GUARD], spaced(GUARD), learnt)
+    untaught = filled(config, images, spaced(40), np.zeros(learnt.shape), scale=0.0)
+    for memory in (empty, untaught):
+        after, found = weigh(config, memory, images[7])
+        assert not found.certain
+        assert not found.telling
+        assert (found.likelihood == 1).all()
+        assert found.novelty == 1
+        assert not after.before.any()
+        after, told = look(config, memory, images[7])
+        assert (told.match, told.gain, told.mass, told.novel, told.agree) == (-1, 0, 0, 1, -1)
+    taught = filled(config, images, spaced(40), learnt)
+    assert look(config, taught, images[7])[1].match == 7
+
+
+def test_room_is_made_for_what_whiskers_need():
+    for config, rows in ((BOTH, 2), (AHEAD, 1)):
+        memory = recall.start(config, SIZE, CAPACITY, np.dtype(float), 3)
+        assert memory.before.shape == memory.rest.shape == (rows, CAPACITY)
+        assert memory.likeness.shape == (3, LEVELS, LEVELS)
+        assert memory.view.dtype == np.int32
+    for fan in ("auto", "none", 1.0):
+        memory = recall.start(RecallConfig(fan=fan), SIZE, CAPACITY, np.dtype(float))
+        assert memory.before.size == memory.rest.size == memory.likeness.size == 0
+
+
+# What is found
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_head_turned_about_is_found_with_its_heading(turned):
+    images = felt(np.random.default_rng(0), 40)
+    memory = filled(BOTH, images, spaced(40), known(images))
+    for place in (0, 11, 34):
+        now = images[place][PIXELS.behind] if turned else images[place]
+        after, found = look(BOTH, memory, now)
+        assert found.match == place
+        assert found.shift == turned
+        assert after.anchor[0] == place
+        assert math.cos(after.offset[0, 2]) == pytest.approx(-1 if turned else 1, abs=1e-6)
+        alone = look(AHEAD, filled(AHEAD, images, spaced(40), known(images)), now)[1]
+        assert alone.shift == 0
+        assert (alone.match == place and alone.gain > 0) != turned
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_belief_goes_on_the_way_the_head_faces(turned):
+    """What stands beside the hypotheses comes to the next frame, or, turned about, to the one before."""
+    images = felt(np.random.default_rng(0), 40)
+    memory = filled(BOTH, images, spaced(40, 1.0), known(images))
+    rest = np.zeros((2, CAPACITY))
+    rest[int(turned), 20] = 0.5
+    memory = memory._replace(rest=jnp.asarray(rest))
+    memory = recall.travel(memory, jnp.asarray([CELL, 0.0, 0.0]))
+    shifts = jnp.asarray([0.0, -np.pi])
+    cells = jnp.asarray(np.ones((2, CAPACITY)))
+    belief, _ = recall._followed(BOTH, CELL, memory, shifts, cells, memory.motion)
+    assert np.unravel_index(np.argmax(belief), belief.shape) == (int(turned), 19 if turned else 21)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_where_a_frame_stands_in_memory_does_not_matter_to_its_likelihood(seed):
+    memory, level = random_case(seed)
+    old = int(memory.count) - GUARD
+    order = np.arange(CAPACITY)
+    order[:old] = np.random.default_rng(seed).permutation(old)
+    shuffled = memory._replace(view=memory.view[:, order])
+    first, second = weigh(BOTH, memory, level)[1], weigh(BOTH, shuffled, level)[1]
+    assert np.allclose(first.likelihood[:, order], second.likelihood, rtol=1e-12)
+
+
+def test_a_corridor_that_looks_alike_all_along_says_nothing():
+    stream = np.random.default_rng(0)
+    wall, others = felt(stream, 1)[0], felt(stream, 200)
+    memory = filled(AHEAD, np.tile(wall, (50, 1)), spaced(50, 0.6), known(others))
+    first, gain = look(AHEAD, memory, wall)
+    assert gain.gain > 0  # at first sight it is something known
+    _, then = weigh(AHEAD, jax.tree.map(jnp.asarray, first), wall)
+    assert np.log(then.likelihood.max() / then.novelty) < -math.log(AHEAD.familiar)
+
+
+def test_an_image_that_many_places_lead_to_says_less():
+    """Of two equally good matches of the image before, one is followed by what is felt now, or both are."""
+    stream = np.random.default_rng(0)
+    images = felt(stream, 50)
+    likeness = known(felt(stream, 200))
+    gains = []
+    for copies in (1, 4, 16):
+        places = np.arange(2, 2 + 2 * copies, 2)
+        alike = images.copy()
+        alike[places], alike[places + 1] = images[2], images[3]
+        memory = filled(AHEAD, alike, spaced(50), likeness)
+        after, _ = weigh(AHEAD, memory, images[2])
+        one = weigh(AHEAD, jax.tree.map(jnp.asarray, after), images[3])[1]
+        alike[places[1:] + 1] = images[30]
+        memory = filled(AHEAD, alike, spaced(50), likeness)
+        after, _ = weigh(AHEAD, memory, images[2])
+        other = weigh(AHEAD, jax.tree.map(jnp.asarray, after), images[3])[1]
+        gains.append([float(np.log(w.likelihood[0, 3] / w.novelty)) for w in (one, other)])
+    shared, alone = np.array(gains).T
+    assert shared[0] == alone[0]
+    assert np.allclose(shared, shared[0], atol=0.2)
+    assert alone[0] < alone[1] < alone[2]
+
+
+def test_the_heights_of_the_sensor_enter_by_the_table_alone():
+    """Other numbers for the same levels, in memory, image and table, change nothing."""
+    memory, level = random_case(3)
+    order = np.concatenate([[0], 1 + np.random.default_rng(0).permutation(HEIGHTS), [DEAD]])
+    likeness = np.zeros(memory.likeness.shape)
+    likeness[:, order[:, None], order] = np.asarray(memory.likeness)
+    renamed = memory._replace(view=jnp.asarray(order[np.asarray(memory.view)], jnp.int32), likeness=jnp.asarray(likeness))
+    first, second = look(BOTH, memory, level), look(BOTH, renamed, order[level])
+    for name in ("match", "shift", "mass", "gain", "novel"):
+        assert getattr(first[1], name) == getattr(second[1], name), name
