@@ -26,9 +26,9 @@ from tactile.settings import Settings
 
 TOUCH: dict[str, dict[str, Any]] = {
     "pose_cells": {"cell_size": 0.05, "cells_xy": 21},
-    "recall": {"fan": "whiskers"},
+    "recall": {"fan": "whiskers", "leave": 0.003, "nothing": 0.01},
     "frames": {
-        "noise": {"per_cell": 0.22, "heading_per_cell": 0.06, "heading_per_radian": 0.2},
+        "noise": {"per_cell": 0.22, "heading_per_cell": 0.1, "heading_per_radian": 0.2},
         "bias_sd": 0.001,
         "score": 12.0,
         "distance": 60.0,

@@ -124,6 +124,37 @@ def test_a_break_strikes_out_what_was_said_after_it():
     assert ledger.accepted().tolist() == [5]
 
 
+@given(steps)
+def test_runs_are_summed_up_as_their_members_say(steps):
+    ledger = Ledger()
+    for k, (kind, a, b) in enumerate(steps):
+        if kind == "add":
+            ledger.add(Candidate(50 + k, k, 0, 0.9, b), a and ledger.runs > 0)
+        elif kind == "judge" and ledger.runs:
+            ledger.judge(a % ledger.runs, b)
+        elif kind == "strike" and ledger.runs:
+            ledger.strike(50 + a, b % ledger.runs)
+    members = [ledger.members(run) for run in range(ledger.runs)]
+    assert ledger.sizes().tolist() == [len(rows) for rows in members]
+    assert ledger.scores() == pytest.approx([ledger.score(run) for run in range(ledger.runs)], abs=1e-12)
+    assert ledger.verdicts().tolist() == [ledger.verdict(run) for run in range(ledger.runs)]
+    assert ledger.spans().shape == (ledger.runs, 2)
+    for (first, last), rows in zip(ledger.spans().tolist(), members, strict=True):
+        if len(rows):
+            assert (first, last) == (rows[0, 0], rows[-1, 0])
+        else:
+            assert first > last
+
+
+def test_closures_bring_the_evidence_of_their_runs():
+    ledger = filled()
+    for run in (0, 2):
+        ledger.judge(run, Verdict.ACCEPTED)
+    closures = ledger.closures(0.1, VARIANCE, SCALES)
+    assert closures.score.tolist() == [2.0, 3.0]
+    assert closures.run.tolist() == [0, 0, 1]
+
+
 def test_scales_grow_with_the_score_between_their_limits():
     ledger = filled()
     for run in range(3):

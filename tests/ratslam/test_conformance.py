@@ -27,17 +27,31 @@ def _dead_reckoning():
     return module.DeadReckoning()
 
 
-def _rat(matcher, source):
+def _rat(matcher, source, dtype=np.float64, **more):
     parts = {"matcher": matcher, "pose_cells": {"cells_xy": 11}, "templates": {"source": source}}
-    return lambda: rat(RatConfig.model_validate(parts), VIEW)
+    return lambda: rat(RatConfig.model_validate(parts | more), VIEW, dtype)
+
+
+# Weighs its runs every few frames, so that it does so in mid-run wherever one stops.
+TOUCH = {"recall": {"fan": "whiskers"}, "frames": {"weigh_every": 15, "breaks": False, "whole": 0.2}}
 
 
 BACKENDS = {
     "recall": _rat("recall", "views"),
     "recall-labels": _rat("recall", "labels"),
+    "touch": _rat("recall", "views", **TOUCH),
     "classic": _rat("classic", "views"),
     "classic-labels": _rat("classic", "labels"),
     "dead-reckoning": _dead_reckoning,
+}
+
+
+SINGLE = {
+    "recall": _rat("recall", "views", np.float32),
+    "recall-labels": _rat("recall", "labels", np.float32),
+    "touch": _rat("recall", "views", np.float32, **TOUCH),
+    "classic": _rat("classic", "views", np.float32),
+    "classic-labels": _rat("classic", "labels", np.float32),
 }
 
 
@@ -153,6 +167,30 @@ def test_nothing_odd_comes_of_odd_input(make):
         assert np.isfinite(step.pose).all()
         assert np.isfinite(step.estimate.pose).all()
         assert np.isfinite(step.estimate.spread).all()
+
+
+@pytest.mark.parametrize("kind", SINGLE)
+def test_single_precision_stays_single_and_finite(kind):
+    session = Session(SINGLE[kind](), precision="float32")
+    for step in session.replay(walk(300)):
+        assert np.isfinite(step.pose).all()
+        told = step.evidence._replace(**({"background": 0.0} if hasattr(step.evidence, "background") else {}))
+        floats = [leaf for leaf in [*step.estimate[:2], *told] if np.asarray(leaf).dtype.kind == "f"]
+        assert all(np.isfinite(leaf).all() for leaf in floats if leaf is not getattr(told, "error", None))
+    kinds = {leaf.dtype for leaf in jax.tree.leaves(session.state)}
+    assert np.dtype(np.float64) not in kinds
+    assert np.dtype(np.float32) in kinds
+    assert np.isfinite(session.map.trajectory()).all()
+
+
+def test_touch_closes_and_weighs_in_these_walks():
+    # Else replay, checkpoints and capacities would prove little of it.
+    session = Session(BACKENDS["touch"]())
+    list(session.replay(walk(150)))
+    assert len(session.map.closures()) > 20
+    arrays = session.map.arrays()
+    assert arrays["looks/likeness"].any()
+    assert (arrays["ledger/weight"] % 1 > 0).any()
 
 
 def test_compiles_once_per_capacity(make):

@@ -8,7 +8,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
-from ratslam.framegraph import Chain, Closures, Fit, Prior, corrected, relative_covariance, solve
+from ratslam.framegraph import (
+    Chain,
+    Closures,
+    Fit,
+    Prior,
+    corrected,
+    relative_covariance,
+    robust_cost,
+    solve,
+)
 from tactile.frames import between, compose, integrate, wrap
 
 WIDE = Prior(0.0, 10.0)
@@ -199,6 +208,96 @@ def test_a_run_that_is_far_off_counts_for_nothing(bias):
     assert apart(fit.poses, right.poses) < 5e-3
     trusting = solve(reckoned(chain), bias, chain, both._replace(scale=np.full(4, SURE)), WIDE, 50)
     assert apart(trusting.poses, right.poses) > 0.3
+
+
+def robust_case(seed, stray, count=8):
+    """Laps with noise, a start that is off, and runs of which the second is astray."""
+    stream = np.random.default_rng(seed)
+    truth, chain, closures = laps(stream, 0.04, count, 0.02)
+    turn = closures.turn + (closures.run == 1) * stream.uniform(-0.5, 0.5)
+    closures = closures._replace(scale=stream.uniform(1, 20, 3), stray=stray, turn=turn)
+    start = truth + stream.normal(0, 0.05, truth.shape)
+    start[0] = truth[0]
+    return start, chain, closures, Prior(0.03, 0.02)
+
+
+def cost_by_loops(fit, chain, closures, prior):
+    odometry, recall = parts(fit.poses, fit.bias, chain, closures)
+    cost = (odometry**2).sum() + ((fit.bias - prior.mean) / prior.sd) ** 2
+    for run, scale in enumerate(closures.scale):
+        each = [(recall[k] ** 2).sum() for k in np.flatnonzero(closures.run == run)]
+        if np.isfinite(closures.stray):
+            each = [closures.stray * chi2 / (closures.stray + chi2) for chi2 in each]
+        mean = sum(each) / max(len(each), 1)
+        cost += len(each) * scale * mean / (scale + mean)
+    return cost
+
+
+@given(seeds, st.sampled_from([np.inf, 6.0, 0.5]))
+def test_the_robust_cost_is_what_odometry_and_runs_lack(seed, stray):
+    start, chain, closures, prior = robust_case(seed, stray)
+    fit = Fit(start, 0.01, np.zeros(3))
+    assert robust_cost(fit, chain, closures, prior) == pytest.approx(
+        cost_by_loops(fit, chain, closures, prior), rel=1e-9
+    )
+
+
+def test_the_robust_cost_of_a_perfect_map_is_none():
+    truth, chain, closures = laps(np.random.default_rng(0), 0.03)
+    assert robust_cost(Fit(truth, 0.03, np.zeros(3)), chain, closures, Prior(0.03, 1.0)) < 1e-12
+    alone = closed([])
+    assert robust_cost(Fit(truth, 0.03, np.zeros(0)), chain, alone, Prior(0.02, 0.01)) == pytest.approx(1.0)
+
+
+@given(seeds, st.sampled_from([np.inf, 20.0, 6.0]))
+@settings(max_examples=40)
+def test_every_step_lessens_the_robust_cost(seed, stray):
+    start, chain, closures, prior = robust_case(seed, stray)
+    fit = Fit(start, 0.0, np.zeros(3))
+    costs = [robust_cost(fit, chain, closures, prior)]
+    for _ in range(25):
+        fit = solve(fit.poses, fit.bias, chain, closures, prior, 1)
+        costs.append(robust_cost(fit, chain, closures, prior))
+    assert (np.diff(costs) <= 1e-9 * np.array(costs[:-1])).all()
+    assert costs[-1] < 0.5 * costs[0]
+
+
+@pytest.mark.parametrize("stray", [6.0, 1.0])
+def test_where_solving_ends_the_robust_cost_is_least(stray):
+    start, chain, closures, prior = robust_case(3, stray)
+    fit = solve(start, 0.0, chain, closures, prior, 500)
+    assert ((fit.weights > 0.01) & (fit.weights < 0.999)).any()
+    least = robust_cost(fit, chain, closures, prior)
+    for k in range(1, len(fit.poses)):
+        for step in 1e-3 * np.eye(3):
+            for sign in (1, -1):
+                poses = fit.poses.copy()
+                poses[k] += sign * step
+                assert robust_cost(fit._replace(poses=poses), chain, closures, prior) > least
+
+
+def test_one_closure_astray_does_not_take_its_run_with_it():
+    truth, chain, closures = laps(np.random.default_rng(1), 0.0, noise=0.005)
+    closures = closures._replace(scale=np.full(3, 4.0))
+    astray = closures._replace(i=np.where(np.arange(len(closures.i)) == 5, 20, closures.i))
+    strict = solve(reckoned(chain), 0.0, chain, astray, WIDE, 50)
+    lenient = solve(reckoned(chain), 0.0, chain, astray._replace(stray=6.0), WIDE, 50)
+    run = closures.run[5]
+    assert strict.weights[run] < 0.01
+    assert lenient.weights[run] > 0.25
+    assert apart(lenient.poses, truth) < 0.1
+
+
+def test_a_coarser_tolerance_takes_fewer_steps():
+    start, chain, closures, prior = robust_case(0, 6.0)
+    fine = solve(start, 0.0, chain, closures, prior, 100, 1e-9)
+    for tolerance in (1e-3, 1e-5):
+        coarse = solve(start, 0.0, chain, closures, prior, 100, tolerance)
+        assert 0 < apart(coarse.poses, fine.poses) < 100 * tolerance
+    assert np.array_equal(
+        solve(start, 0.0, chain, closures, prior, 1, 1e-9).poses,
+        solve(start, 0.0, chain, closures, prior, 100, 1e3).poses,
+    )
 
 
 @given(seeds)

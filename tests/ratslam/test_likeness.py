@@ -40,7 +40,9 @@ def images(seed, count=60, size=SIZE, touching=0.4, dead=0.1):
 def common(seed, groups=3):
     """A background as it may be: rare and common heights."""
     stream = np.random.default_rng(seed)
-    return Background(stream.uniform(0.02, 0.98, groups), stream.dirichlet(np.full(HEIGHTS, 0.5), groups) + 1e-9)
+    return Background(
+        stream.uniform(0.02, 0.98, groups), stream.dirichlet(np.full(HEIGHTS, 0.5), groups) + 1e-9
+    )
 
 
 def of_background(known, group):
@@ -153,7 +155,9 @@ def test_the_background_is_counted_by_ring_and_channel():
     group = pixels((3, 6, 1)).group
     rates = np.array([0.1, 0.5, 0.9])
     stream = np.random.default_rng(0)
-    level = stream.choice([3, 20], (4000, SIZE), p=[0.25, 0.75]) * (stream.random((4000, SIZE)) < rates[group])
+    level = stream.choice([3, 20], (4000, SIZE), p=[0.25, 0.75]) * (
+        stream.random((4000, SIZE)) < rates[group]
+    )
     known = background(level, group)
     assert np.allclose(known.touching, rates, atol=0.01)
     assert np.allclose(known.heights[:, [2, 19]], [0.25, 0.75], atol=0.02)
@@ -196,7 +200,7 @@ def test_many_pairs_tell_how_visits_differ(true):
     found = variation(visited_again(then, true, stream), then)
     assert found.appears == pytest.approx(true.appears, abs=0.01)
     assert found.vanishes == pytest.approx(true.vanishes, abs=0.01)
-    # Heights end at the lowest and the highest, so that wide variations look narrower and some of them astray.
+    # Heights end at the lowest and the highest, so that wide variations look narrower, and some astray.
     assert 0.65 * true.width < found.width < 1.1 * true.width
     assert found.astray == pytest.approx(true.astray, abs=0.12)
 

@@ -74,8 +74,9 @@ def random_case(seed, config=BOTH):
     mass = stream.dirichlet(np.full(config.modes + 1, 0.7))[:-1] * (1 - rest.sum())
     offset = stream.normal(0, 0.5 * CELL, (config.modes, 3)) * [1, 1, 4]
     memory = memory._replace(
-        before=jnp.asarray(before), rest=jnp.asarray(rest), mass=jnp.asarray(mass), offset=jnp.asarray(offset),
+        before=jnp.asarray(before), rest=jnp.asarray(rest), mass=jnp.asarray(mass),
         anchor=jnp.asarray(stream.integers(0, max(old, 1), config.modes), jnp.int32),
+        offset=jnp.asarray(offset),
     )  # fmt: skip
     memory = recall.travel(memory, jnp.asarray(stream.normal(0, [CELL, 0.2 * CELL, 0.1])))
     near = images[stream.integers(0, max(old, 1))]
@@ -255,9 +256,7 @@ def test_what_is_beside_the_hypotheses_is_not_in_them():
     for seed in SEEDS:
         memory, level = random_case(seed)
         config = BOTH.model_copy(update={"modes": 1})
-        memory = memory._replace(
-            anchor=memory.anchor[:1], mass=memory.mass[:1], offset=memory.offset[:1]
-        )
+        memory = memory._replace(anchor=memory.anchor[:1], mass=memory.mass[:1], offset=memory.offset[:1])
         after, _ = look(config, memory, level)
         if not after.mass[0]:
             continue
@@ -429,7 +428,9 @@ def test_the_heights_of_the_sensor_enter_by_the_table_alone():
     order = np.concatenate([[0], 1 + np.random.default_rng(0).permutation(HEIGHTS), [DEAD]])
     likeness = np.zeros(memory.likeness.shape)
     likeness[:, order[:, None], order] = np.asarray(memory.likeness)
-    renamed = memory._replace(view=jnp.asarray(order[np.asarray(memory.view)], jnp.int32), likeness=jnp.asarray(likeness))
+    renamed = memory._replace(
+        view=jnp.asarray(order[np.asarray(memory.view)], jnp.int32), likeness=jnp.asarray(likeness)
+    )
     first, second = look(BOTH, memory, level), look(BOTH, renamed, order[level])
     for name in ("match", "shift", "mass", "gain", "novel"):
         assert getattr(first[1], name) == getattr(second[1], name), name

@@ -1,0 +1,58 @@
+"""Touch: simulated seconds for each second of work, on one core, after compilation."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+from evaluation.energy import energy_all_pairs
+from evaluation.exm import experience_metric
+from ratslam.config import RunConfig
+from ratslam.run import open_source, readings, session_of
+from robot.sensing import sensing
+
+JITTER = {"position": 0.005, "yaw_deg": 1.5, "speed": 0.05}
+
+
+def config(**simulation):
+    """Seed 2's session."""
+    return RunConfig.model_validate({"simulation": {"motion": {"jitter": JITTER}} | simulation})
+
+
+def sensed(settings):
+    """All observations and truths of a session, and the source."""
+    source = open_source(settings)
+    settings = settings.completed(source)
+    seen = sensing(source, settings.touch)
+    rows = list(readings(seen))
+    return settings, seen, [reading for _, reading in rows], np.array([sample.truth for sample, _ in rows])
+
+
+def whole(settings, session):
+    """Simulated, sensed, mapped and scored."""
+    settings, source, observations, truth = sensed(settings)
+    fresh = session_of(settings, source)
+    fresh._run = session._run  # compiled once
+    place = np.array([int(step.estimate.place) for step in fresh.replay(observations)])
+    experience_metric(place, truth)
+    return energy_all_pairs(fresh.map.trajectory(), truth)
+
+
+def test_ten_circuits_mapped_and_scored(benchmark):
+    settings = config()
+    settings = settings.model_copy(update={"session": settings.session.model_copy(update={"reserve": 2048})})
+    completed, source, observations, truth = sensed(settings)
+    session = session_of(completed, source)
+    list(session.replay(observations[:32]))
+    benchmark.pedantic(partial(whole, settings, session), rounds=3)
+    benchmark.extra_info["times_real_time"] = round(len(truth) / benchmark.stats.stats.median)
+
+
+@pytest.mark.parametrize("tier", ["kinematic", "quasistatic", "dynamic"])
+def test_one_circuit_simulated_and_sensed(benchmark, tier):
+    settings = config(fidelity=tier, path={"circuits": "C"})
+    length = len(sensed(settings)[3])
+    benchmark.pedantic(partial(sensed, settings), rounds=3)
+    benchmark.extra_info["times_real_time"] = round(length / benchmark.stats.stats.median)

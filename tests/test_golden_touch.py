@@ -1,0 +1,23 @@
+"""Experience-Metric regression: stored touch sessions lead to exactly the stored decisions."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from tests import touchgolden
+
+
+@pytest.mark.parametrize("name", touchgolden.SESSIONS)
+def test_decisions_are_those_stored(name):
+    stored = json.loads((touchgolden.FOLDER / f"{name}.json").read_text(encoding="utf-8"))
+    found = touchgolden.decisions(name)
+    assert found.keys() == stored.keys()
+    for part in stored:
+        assert found[part] == stored[part], part
+
+
+@pytest.mark.parametrize("name", touchgolden.SESSIONS)
+def test_sessions_stay_small(name):
+    assert (touchgolden.FOLDER / f"{name}.mcap").stat().st_size < 300_000
