@@ -26,7 +26,7 @@ from tactile.settings import Settings
 
 TOUCH: dict[str, dict[str, Any]] = {
     "pose_cells": {"cell_size": 0.05, "cells_xy": 21},
-    "recall": {"fan": "whiskers", "leave": 0.003, "nothing": 0.01},
+    "recall": {"fan": "whiskers", "leave": 0.003, "nothing": 0.01, "modes": 4},
     "frames": {
         "noise": {"per_cell": 0.22, "heading_per_cell": 0.1, "heading_per_radian": 0.2},
         "bias_sd": 0.001,
@@ -36,6 +36,7 @@ TOUCH: dict[str, dict[str, Any]] = {
         "breaks": False,
         "weigh_every": 50,
         "solve_every": 20,
+        "facing": 0.6,
         "place_radius": 1.3,
         "place_heading": 0.17,
     },

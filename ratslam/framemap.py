@@ -254,8 +254,15 @@ class FrameMap:
             self._solved = run, candidate.frame
             self._correct()
         self._since = self._turned = 0.0
-        # Facing the other way a spot is another place.
-        return candidate.match if np.cos(candidate.shift * self._angle()) > 0 else -1
+        return candidate.match if self._faces(candidate) else -1
+
+    def _faces(self, candidate: Candidate) -> bool:
+        """Whether the robot looks where it looked then, as far as odometry knows: turned it is elsewhere, even
+        where a view that hardly changes with the heading says otherwise."""
+        pose, turn = self._pose.rows, -candidate.shift * self._angle()
+        turned = wrap(pose[candidate.frame, 2] - pose[candidate.match, 2])
+        drift = abs(wrap(turned - turn))
+        return bool(np.cos(turn) > 0 and drift < self.config.agreement_heading * self.config.facing)
 
     def _sure(self) -> bool:
         """Whether little enough has been driven and turned since the last closure to know the experience."""

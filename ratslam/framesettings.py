@@ -96,6 +96,8 @@ class FrameMapConfig(Settings):
     """Solver steps when a loop closes."""
     settling: PositiveInt = 15
     """Solver steps for the final map."""
+    facing: PositiveFloat = 10.0
+    """Share of `agreement_heading` by which a robot may be turned and still be in a known experience."""
     place_radius: PositiveFloat = 2.0
     """Reach of an experience, cells."""
     place_heading: PositiveFloat = 0.35

@@ -6,12 +6,7 @@ their results come in order, whichever is done first.
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import signal
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -23,6 +18,7 @@ from evaluation.trajectory import ate
 from ratslam.config import RunConfig
 from ratslam.run import Anytimes, located, open_source, readings, session_of
 from ratslam.session import CHUNK, Session
+from ratslam.trials.workers import shared_out
 from ratslam.yamlfile import Document, load, override, validate
 from robot.log import Log, collected
 from robot.perturb import perturbed
@@ -145,27 +141,12 @@ def compare(
     """
     for sets, _ in variants:  # complain before anything runs
         validate(override(load(path), [*assignments, *sets]), RunConfig)
-    count = min(workers or os.cpu_count() or 1, len(variants))
-    # Forked children of a process that runs JAX may hang; spawned ones start clean.
-    context = multiprocessing.get_context("spawn")
-    # An interrupt is for this process, which then ends the others.
-    pool = ProcessPoolExecutor(count, context, signal.signal, (signal.SIGINT, signal.SIG_IGN))
-    try:
-        tasks = [pool.submit(_try, path, [*assignments, *sets], seed) for sets, seed in variants]
-        for task in tasks:
-            yield task.result()
-    except BrokenProcessPool:
-        raise InputError(
-            "--workers", "a process ended before its trial was done", "memory for all", "ask for fewer"
-        ) from None
-    finally:
-        workers_left = list((pool._processes or {}).values())
-        pool.shutdown(wait=False, cancel_futures=True)
-        for worker in workers_left:
-            worker.terminate()
+    tasks = [(path, (*assignments, *sets), seed) for sets, seed in variants]
+    return shared_out(_try, tasks, workers)
 
 
-def _try(path: Path, assignments: list[str], seed: int) -> Trial:
+def _try(task: tuple[Path, tuple[str, ...], int]) -> Trial:
+    path, assignments, seed = task
     return trial(validate(override(load(path), assignments), RunConfig), path.parent, seed)
 
 

@@ -1,0 +1,239 @@
+"""The figures of the reproductions. Everything comes as arrays; nothing here knows what was run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from evaluation import drawing
+from evaluation.drawing import BLUE, FAINT, GREEN, GREY, INK, PURPLE, QUIET, VERMILLION, WIDTH, YELLOW
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+SERIES = (GREY, BLUE, VERMILLION, GREEN, PURPLE, YELLOW)
+"""Colours of what is compared, in this order."""
+_GAP, _BOTTOM = 0.75, 0.9  # inches between panels, and below them
+_MEDIAN = 0.3  # of a mark's column
+
+
+class Path(NamedTuple):
+    """A path that was driven, and what odometry made of it.
+
+    Attributes:
+        truth, odometry: [T, 2] m, from the same start. lap: [T] int, from 0.
+    """
+
+    truth: np.ndarray
+    odometry: np.ndarray
+    lap: np.ndarray
+
+
+class Experiences(NamedTuple):
+    """Which experience was current at each step [T], and what the Experience Metric says of it.
+
+    Attributes:
+        place: [T], -1 for none. counted: [T] a re-localisation. right: [T] a correct one.
+        invalid: [T] an experience made after an incorrect one and before the next correct one.
+        base: steps of the base set.
+    """
+
+    place: np.ndarray
+    counted: np.ndarray
+    right: np.ndarray
+    invalid: np.ndarray
+    base: int
+
+
+class Measured(NamedTuple):
+    """One quantity of several conditions.
+
+    Attributes:
+        label: with its unit. values: by series, [C, S] over conditions and sets. paper: [C], NaN where the
+            paper gives none. log: whether it spans powers of ten.
+    """
+
+    label: str
+    values: Mapping[str, np.ndarray]
+    paper: np.ndarray
+    log: bool = False
+
+
+def draw_drift(title: str, line: str, paths: Mapping[str, Path]) -> Figure:
+    """The path driven and the path that odometry tells, side by side for several kinds of error; later laps
+    are darker (Salman & Pearson 2016, Fig. 2)."""
+    figure, panels = _panels(title, line, len(paths), 3.2)
+    for axes, (name, path) in zip(panels, paths.items(), strict=True):
+        axes.set_title(name, fontsize=9.5, color=INK, loc="left")
+        axes.plot(*path.truth.T, ".", ms=3, color=INK, zorder=3, label="truth")
+        laps = np.unique(path.lap)
+        for lap in laps:
+            rows = path.lap == lap
+            shade = 0.3 + 0.7 * (lap + 1) / len(laps)
+            label = "odometry, later laps darker" if lap == laps[-1] else None
+            axes.plot(*path.odometry[rows].T, "-", lw=1.2, color=VERMILLION, alpha=shade, label=label)
+        axes.plot(*path.truth[0], "o", ms=9, mfc="none", mec=GREEN, mew=1.8, zorder=6, label="start")
+        _map_axes(axes)
+    drawing.legend(figure, panels[0])
+    return figure
+
+
+def draw_experiences(title: str, line: str, runs: Mapping[str, Experiences]) -> Figure:
+    """The experience at each step, the end of the base set, and what became of each (Fig. 3)."""
+    figure, panels = _panels(title, line, len(runs), 3.4)
+    for axes, (name, run) in zip(panels, runs.items(), strict=True):
+        axes.set_title(name, fontsize=9.5, color=INK, loc="left")
+        known = run.place >= 0
+        new = known & ~run.counted
+        for rows, color, mark, label in (
+            (new & ~run.invalid, GREY, "o", "valid experience"),
+            (new & run.invalid, YELLOW, "o", "invalid experience"),
+            (run.counted & run.right, BLUE, "o", "correct re-localisation"),
+            (run.counted & ~run.right, VERMILLION, "x", "incorrect re-localisation"),
+        ):
+            steps = np.flatnonzero(rows)
+            axes.plot(steps, run.place[steps], mark, ms=2.6 if mark == "o" else 3.6,
+                      mew=0.9 if mark == "x" else 0, color=color, label=label)  # fmt: skip
+        axes.axvline(run.base - 0.5, color=INK, lw=1.1, ls=(0, (2, 2)), label="end of the base set")
+        axes.grid(color=FAINT, lw=0.7)
+        drawing.name_axes(axes, "step", "experience")
+    drawing.legend(figure, panels[0], columns=3)
+    return figure
+
+
+def draw_measured(title: str, line: str, conditions: Sequence[str], measured: Sequence[Measured]) -> Figure:
+    """A dot for each set, a bar for the median, a line where the paper has a figure (Figs. 4, 6 and 7)."""
+    figure, panels = _panels(title, line, len(measured), 3.4, below=1.3)
+    for axes, quantity in zip(panels, measured, strict=True):
+        axes.set_title(quantity.label, fontsize=9.5, color=INK, loc="left")
+        count = len(quantity.values)
+        for k, (name, values) in enumerate(quantity.values.items()):
+            at = np.arange(len(conditions)) + (k - (count - 1) / 2) * 0.8 / max(count, 1)
+            color = SERIES[k % len(SERIES)]
+            where = np.repeat(at, values.shape[1])
+            axes.plot(where, values.reshape(-1), "o", ms=4, mew=0, alpha=0.6, color=color, label=name)
+            some = np.isfinite(values).any(axis=1)
+            middle = [np.nanmedian(row) for row in values[some]]
+            half = _MEDIAN / max(count, 1)
+            axes.hlines(middle, at[some] - half, at[some] + half, color=color, lw=2.2)
+        given = np.isfinite(quantity.paper)
+        if given.any():
+            where, dots = np.flatnonzero(given), (0, (2, 2))
+            axes.hlines(
+                quantity.paper[given], where - 0.42, where + 0.42, color=INK, lw=1.1, ls=dots, label="paper"
+            )
+        axes.set_xticks(range(len(conditions)), conditions, rotation=20, ha="right")
+        axes.set_xlim(-0.6, len(conditions) - 0.4)
+        if quantity.log:
+            axes.set_yscale("log")
+            axes.tick_params(which="minor", length=0)
+        else:
+            axes.set_ylim(bottom=0)
+        axes.grid(color=FAINT, lw=0.7, axis="y")
+    fullest = max(panels, key=lambda axes: len(axes.get_legend_handles_labels()[1]))
+    drawing.legend(figure, fullest)
+    return figure
+
+
+def draw_directions(title: str, line: str, maps: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
+    """Mapped paths, clockwise laps apart from anticlockwise ones (Fig. 5).
+
+    Args:
+        maps: by name, positions [T, 2] m and whether the step is of a clockwise lap, [T] bool.
+    """
+    across = min(2, len(maps))
+    figure, panels = _panels(title, line, len(maps), 3.2, across=across)
+    for axes, (name, (position, clockwise)) in zip(panels, maps.items(), strict=True):
+        axes.set_title(name, fontsize=9.5, color=INK, loc="left")
+        for rows, color, label in (
+            (clockwise, VERMILLION, "clockwise"),
+            (~clockwise, GREEN, "anticlockwise"),
+        ):
+            part = np.where(rows[:, None], position, np.nan)
+            axes.plot(*part.T, "-", lw=1.0, alpha=0.7, color=color, label=label)
+        _map_axes(axes)
+    drawing.legend(figure, panels[0])
+    return figure
+
+
+def draw_curves(
+    title: str, line: str, curves: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]]
+) -> Figure:
+    """ARR against ARCR as the threshold rises, one curve a set.
+
+    Args:
+        curves: by panel and condition, ARCR and ARR [S, B] over sets and thresholds.
+    """
+    figure, panels = _panels(title, line, len(curves), 3.6)
+    for axes, (panel, conditions) in zip(panels, curves.items(), strict=True):
+        axes.set_title(panel, fontsize=9.5, color=INK, loc="left")
+        for color, (name, (arcr, arr)) in zip(SERIES[1:], conditions.items(), strict=False):
+            for number, (x, y) in enumerate(zip(arcr, arr, strict=True)):
+                axes.plot(x, y, "o-", ms=3, lw=0.9, alpha=0.7, color=color, label=None if number else name)
+        axes.set(xlim=(0, 1.03), ylim=(0, None))
+        axes.grid(color=FAINT, lw=0.7)
+        drawing.name_axes(axes, "ARCR, strict", "ARR")
+    drawing.legend(figure, panels[0])
+    return figure
+
+
+def draw_tuning(
+    edge: np.ndarray,
+    same: np.ndarray,
+    other: np.ndarray,
+    auc: float,
+    threshold: np.ndarray,
+    correct: np.ndarray,
+    incorrect: np.ndarray,
+    winner: float | None,
+) -> Figure:
+    """How unlike views of one place and of different ones are, and what each threshold led to.
+
+    Args:
+        edge: [B + 1] of the histograms. same, other: [B] pairs. auc: of telling them apart.
+        threshold, correct, incorrect: [G] of the grid. winner: the threshold taken, if any.
+    """
+    taken = "no threshold satisfies" if winner is None else f"threshold {winner:g}"
+    figure, (left, right) = _panels("Tuning of the classic matcher", f"AUC {auc:.3f}  ·  {taken}", 2, 3.4)
+    for count, color, label in ((same, BLUE, "same place"), (other, VERMILLION, "different places")):
+        left.stairs(count / max(count.sum(), 1), edge, color=color, fill=True, alpha=0.45, label=label)
+    left.grid(color=FAINT, lw=0.7)
+    drawing.name_axes(left, "difference of two views", "share of pairs")
+    right.plot(threshold, correct, "o-", ms=3, lw=1.0, color=GREEN, label="correct")
+    right.plot(threshold, incorrect, "x-", ms=4, lw=1.0, color=PURPLE, label="incorrect")
+    right.grid(color=FAINT, lw=0.7)
+    drawing.name_axes(right, "threshold", "re-localisations")
+    for axes in (left, right):
+        if winner is not None:
+            axes.axvline(winner, color=INK, lw=1.1, ls=(0, (2, 2)), label="chosen")
+    right.legend(frameon=False, fontsize=9, labelcolor=INK)
+    drawing.legend(figure, left)
+    return figure
+
+
+def _panels(
+    title: str, line: str, count: int, height: float, *, across: int = 0, below: float = _BOTTOM
+) -> tuple[Figure, list[Axes]]:
+    """A figure with so many panels of a height in inches, `across` of them in a row (0: all)."""
+    across = across or count
+    rows = -(-count // across)
+    whole = drawing.TOP + rows * height + (rows - 1) * _GAP + below
+    figure = drawing.blank(whole, title, line)
+    width = (WIDTH - drawing.LEFT - drawing.RIGHT - (across - 1) * _GAP) / across
+    panels = []
+    for number in range(count):
+        row, column = divmod(number, across)
+        left = drawing.LEFT + column * (width + _GAP)
+        bottom = whole - drawing.TOP - 0.2 - (row + 1) * height - row * _GAP + 0.2
+        panels.append(drawing.plot(figure, left, bottom, width, height - 0.2))
+    return figure, panels
+
+
+def _map_axes(axes: Axes) -> None:
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.grid(color=FAINT, lw=0.7)
+    axes.tick_params(labelcolor=QUIET)
+    drawing.name_axes(axes, "x (m)", "y (m)")

@@ -1,0 +1,88 @@
+"""The commands for whiskers: reproduce, tune, tiers."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from ratslam.cli.common import INTERRUPTED, Add, configured, count, prepare_jax, settable, shared
+from tactile.errors import InputError
+
+NAMES = ("fig2", "fig3", "fig4", "fig5", "fig6", "fig7", "reverse", "controls", "matched")
+"""Of the reproductions, known before jax is loaded."""
+
+
+def add(command: Add) -> None:
+    """Adds them to the program."""
+    reproduce = command(
+        "reproduce", _reproduce, "make a figure of the whisker paper again, controls beside it"
+    )
+    reproduce.add_argument("name", choices=NAMES, metavar="NAME", help=", ".join(NAMES))
+    reproduce.add_argument("--sets", type=count, default=3, metavar="N", help="mazes a condition (default 3)")
+    reproduce.add_argument("--seed", type=int, default=0, metavar="S", help="of all sets (default 0)")
+    reproduce.add_argument(
+        "-o", "--output", type=Path, default=Path("runs") / "reproduce", metavar="DIR",
+        help="where NAME.csv and NAME.png go (default runs/reproduce)",
+    )  # fmt: skip
+    settable(reproduce)
+    shared(reproduce)
+
+    tune = command("tune", _tune, "choose the classic matcher's threshold as the whisker paper does")
+    configured(tune)
+    shared(tune, 1)
+    tune.add_argument("-o", "--output", type=Path, metavar="DIR", help="leave tune.png and tune.csv there")
+
+    tiers = command(
+        "tiers", _tiers, "run a scene through all tiers of simulation: what each costs and changes"
+    )
+    configured(tiers)
+    tiers.add_argument(
+        "--seconds", type=float, default=600.0, metavar="S", help="of the session at most (default 600)"
+    )
+
+
+def _reproduce(arguments: argparse.Namespace) -> int:
+    if arguments.seed < 0:
+        raise InputError("--seed", str(arguments.seed), "a whole number from 0 on")
+    prepare_jax(lasting=False)
+    from ratslam.reproduce import reproduce
+
+    text, interrupted = reproduce(
+        arguments.name,
+        arguments.output,
+        sets=arguments.sets,
+        workers=arguments.workers,
+        seed=arguments.seed,
+        assignments=arguments.set,
+    )
+    print(text)
+    left = "the rows" if interrupted else f"the figure; {arguments.output / arguments.name}.csv the rows"
+    kind = "csv" if interrupted else "png"
+    print(f"\n{arguments.output / arguments.name}.{kind} holds {left}")
+    return INTERRUPTED if interrupted else 0
+
+
+def _tune(arguments: argparse.Namespace) -> int:
+    prepare_jax(lasting=False)
+    from ratslam.tune import report, save, tune
+    from ratslam.yamlfile import load, override
+
+    document = override(load(arguments.config), arguments.set)
+    found = tune(document, Path(arguments.config).parent, arguments.workers)
+    print(report(found))
+    if arguments.output:
+        picture, table = save(found, arguments.output)
+        print(f"\n{picture} shows the distances and thresholds, {table} holds them")
+    return 0
+
+
+def _tiers(arguments: argparse.Namespace) -> int:
+    if not 0 < arguments.seconds < float("inf"):
+        raise InputError("--seconds", str(arguments.seconds), "a time above 0 s")
+    prepare_jax(lasting=False)
+    from ratslam.tiers import report, tiers
+    from ratslam.yamlfile import load, override
+
+    document = override(load(arguments.config), arguments.set)
+    print(report(*tiers(document, Path(arguments.config).parent, arguments.seconds)))
+    return 0
