@@ -257,8 +257,8 @@ class FrameMap:
         return candidate.match if self._faces(candidate) else -1
 
     def _faces(self, candidate: Candidate) -> bool:
-        """Whether the robot looks where it looked then, as far as odometry knows: turned it is elsewhere, even
-        where a view that hardly changes with the heading says otherwise."""
+        """Whether the robot looks where it looked then, as far as odometry knows. A robot that has turned is
+        elsewhere, even where a view that hardly changes with heading says otherwise."""
         pose, turn = self._pose.rows, -candidate.shift * self._angle()
         turned = wrap(pose[candidate.frame, 2] - pose[candidate.match, 2])
         drift = abs(wrap(turned - turn))

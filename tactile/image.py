@@ -13,7 +13,7 @@ from pydantic import PositiveFloat
 
 from tactile.head import Head, height, shaft
 from tactile.settings import Settings
-from tactile.types import Motion, Observation, Whisk, observation
+from tactile.types import Observation, Whisk, observation
 
 DARKEST = 0.02
 """The least brightness of a whisker that touched: never as dark as one that did not."""
@@ -48,15 +48,9 @@ def image(config: ImageConfig, head: Head, whisk: Whisk) -> np.ndarray:
 
 
 def observed(config: ImageConfig, head: Head, whisk: Whisk) -> Observation:
-    """What an engine is given of one cycle."""
-    plain = observation(
-        whisk.odometry, image(config, head, whisk), motion=Motion.OTHER, whiskers=len(head.length)
-    )
+    """What an engine is given of one cycle; points of contact where the whiskers were touched."""
+    plain = observation(whisk.odometry, image(config, head, whisk), whiskers=len(head.length))
     seen = whisk.contact & whisk.alive
-    angle = np.where(seen, whisk.touched, 0.0)
-    return plain._replace(contact=seen, alive=whisk.alive, point=_points(head, angle, whisk.reach) * seen[:, None])
-
-
-def _points(head: Head, angle: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    along = np.where(reach > 0, reach, 1.0) * head.length
-    return shaft(head, angle, along)[:, :2]
+    along = np.where(whisk.reach > 0, whisk.reach, 1.0) * head.length
+    point = shaft(head, np.where(seen, whisk.touched, 0.0), along)[:, :2] * seen[:, None]
+    return plain._replace(contact=seen, alive=whisk.alive, point=point)

@@ -16,7 +16,7 @@ from ratslam.config import RunConfig
 from ratslam.reproduce import jobs_of, matched, reproduce
 from ratslam.reproduce.extras import across, directions, lap_of
 from ratslam.reproduce.protocols import PROTOCOLS, THRESHOLDS, Claim
-from ratslam.reproduce.verdicts import Row, column, verdict
+from ratslam.reproduce.verdicts import Row, column, table, verdict
 from ratslam.trials.controls import controlled
 from ratslam.trials.thresholds import classics, mapped
 from ratslam.trials.touch import Played, figures, first, lap_ends, play, room_for, session_log
@@ -254,6 +254,20 @@ def test_energies_are_compared_by_ratio():
 def test_sets_stay_paired_where_one_is_missing():
     rows = [Row("a", "ours", "as felt", k, k, {"arr": k / 10}) for k in (0, 2)]
     assert np.array_equal(column(rows, "a", "ours", "as felt", "arr"), [0, np.nan, 0.2], equal_nan=True)
+
+
+@pytest.mark.parametrize(("sets", "said"), [(1, False), (3, True), (6, False)])
+def test_a_table_says_how_little_few_sets_prove(sets, said):
+    protocol = PROTOCOLS["fig6"]
+    rows = [
+        Row(condition.name, "ours", "as felt", k, k, {"arr": 0.1 * k + number / 10})
+        for k in range(sets)
+        for number, condition in enumerate(protocol.conditions)
+    ]
+    text = table(protocol, rows, sets)
+    assert ("in 25% of cases" in text) == said
+    assert ("CONFIRMED: difference 0.1" in text) == (sets > 1)
+    assert "0.1765" in text
 
 
 def test_matched_thresholds_reach_what_all_conditions_reach():

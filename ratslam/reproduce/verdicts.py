@@ -14,6 +14,8 @@ ALIKE = 0.05
 """Shares that differ by less are about the same."""
 SMALL = 0.1
 """A share below is nearly nothing."""
+DECISIVE = 6
+"""Sets from which on a difference of one sign in all of them is no accident (1 in 32)."""
 RATIOS = ("em", "em_places", "em_odometry", "ratio", "apart")
 """Quantities that span powers of ten: compared by ratio, one false loop must not decide a mean."""
 LABELS = {
@@ -123,6 +125,11 @@ def table(protocol: Protocol, rows: Sequence[Row], sets: int) -> str:
                 _line(f"  {condition.name}", width, "-" if stated is None else f"{stated:.4g}", cells)
             )
     lines += [""] + [line for claim in protocol.claims for line in _judged(claim, rows, methods)]
+    if protocol.claims and 1 < done < DECISIVE:
+        lines.append(
+            f"Chance alone makes all {done} sets agree in {2.0 ** (1 - done):.0%} of cases; "
+            f"--sets {DECISIVE} brings that to {2.0 ** (1 - DECISIVE):.0%}."
+        )
     return "\n".join([*lines, *([protocol.note] if protocol.note else [])])
 
 

@@ -43,8 +43,8 @@ def test_a_look_back(benchmark, frames, shifts, dtype):
     def replay(memory):
         def look(k, memory):
             memory = recall.travel(memory, moved)
-            weighing = weighing.by_view(config, CELL, memory, views[k % 64])
-            memory, _ = recall.look(config, CELL, memory, weighing)
+            weighed = weighing.by_view(config, CELL, memory, views[k % 64])
+            memory, _ = recall.look(config, CELL, memory, weighed)
             return memory._replace(motion=jnp.zeros_like(moved), length=jnp.zeros_like(memory.length))
 
         return jax.lax.fori_loop(0, looks, look, memory)
