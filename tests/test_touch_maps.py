@@ -369,13 +369,15 @@ def test_ten_circuits_are_mapped(seed: int) -> None:
 
 @pytest.mark.soak
 def test_later_circuits_in_another_maze_are_hardly_joined() -> None:
-    together, apart = 0, 0
+    """In most mazes: two may have the same walls along the way by chance, the outer ones always."""
+    shares = []
     for seed in range(6):
         made = way(seed, maze={}, path={})
         half = len(made.felt) // 2
-        together += crossing(mapped(made.felt, 2048), half)
-        apart += crossing(mapped(way(seed, maze={}, path={}, later_maze=0.5).felt, 2048), half)
-    assert apart <= 0.1 * together
+        other = way(seed, maze={}, path={}, later_maze=0.5)
+        joined = [crossing(mapped(one.felt, 2048), half) for one in (made, other)]
+        shares.append(joined[1] / joined[0])
+    assert np.median(shares) <= 0.1
 
 
 @pytest.mark.soak
