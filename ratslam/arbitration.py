@@ -78,6 +78,8 @@ def arbitrate(
         earlier: cuts (frame, run) of the present map.
     """
     best = _settled(case, starts[0], earlier)
+    if earlier:  # they may serve no purpose any more
+        best = min(best, _settled(case, starts[0], ()), key=_cost)
     if not (best.fit.weights > KEPT).all():
         best = min([best, *_anew(case, starts)], key=_cost)
     return _with_cuts(case, best, where)
@@ -221,4 +223,5 @@ def _only(closures: Closures, runs: np.ndarray) -> Closures:
         turn=closures.turn[rows],
         run=number[closures.run[rows]],
         scale=closures.scale[runs],
+        stray=np.broadcast_to(closures.stray, closures.scale.shape)[runs],
     )

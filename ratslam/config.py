@@ -130,7 +130,7 @@ class RunConfig(Settings):
         if "source" not in self.templates.model_fields_set and ids_only:
             parts["templates"] = self.templates.model_copy(update={"source": "labels"})
         completed = self.model_copy(update=parts)
-        if source.whiskers and "fan" not in self.recall.model_fields_set:
+        if source.whiskers and ("fan" not in self.recall.model_fields_set or self.recall.fan == "whiskers"):
             return _filled(completed, TOUCH)
         return completed
 

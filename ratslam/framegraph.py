@@ -36,7 +36,7 @@ class Closures(NamedTuple):
     Attributes:
         i, j: [M] frames. turn: [M] rad. run: [M] which run each belongs to, 0..R - 1. variance: [3] of each.
         scale: [R] mean chi-square at which the weight of a run has fallen to a quarter. score: [R] evidence.
-        stray: chi-square that one closure counts at most.
+        stray: [R] or for all runs, chi-square that one closure counts at most.
     """
 
     i: np.ndarray
@@ -46,7 +46,7 @@ class Closures(NamedTuple):
     variance: np.ndarray
     scale: np.ndarray
     score: np.ndarray = np.zeros(0)
-    stray: float = np.inf
+    stray: np.ndarray | float = np.inf
 
 
 class Prior(NamedTuple):
@@ -113,7 +113,7 @@ def robust_cost(fit: Fit, chain: Chain, closures: Closures, prior: Prior) -> flo
     error[:, 2] = wrap(error[:, 2] - closures.turn)
     spread = np.broadcast_to(closures.variance, error.shape)
     members = np.bincount(closures.run, minlength=len(closures.scale))
-    _, tamed = _tamed((error**2 / spread).sum(axis=1), closures.stray)
+    _, tamed = _tamed((error**2 / spread).sum(axis=1), closures)
     total = np.bincount(closures.run, tamed, len(closures.scale))
     mean = total / np.maximum(members, 1)
     lost = members * closures.scale * mean / (closures.scale + mean)
@@ -139,12 +139,13 @@ def relative_covariance(
     return equations.covariance(change[3:])
 
 
-def _tamed(chi2: np.ndarray, stray: float) -> tuple[np.ndarray, np.ndarray]:
+def _tamed(chi2: np.ndarray, closures: Closures) -> tuple[np.ndarray, np.ndarray]:
     """Weights of single closures, and their chi-squares [M] when none can cost more than `stray`: one that is
     astray must not take its run with it."""
-    if not np.isfinite(stray):
+    most = np.broadcast_to(closures.stray, closures.scale.shape)[closures.run]
+    if not np.isfinite(most).all():
         return np.ones_like(chi2), chi2
-    share = stray / (stray + chi2)
+    share = most / (most + chi2)
     return share**2, share * chi2
 
 
@@ -210,7 +211,7 @@ class _System:
         ahead, aside = c * dx + s * dy, c * dy - s * dx
         error = np.stack([ahead - told[:, 0], aside - told[:, 1], wrap(b[:, 2] - a[:, 2] - told[:, 2])], 1)
         chi2 = (error**2 * self.information).sum(axis=1)
-        keep, tamed = _tamed(chi2[self.chained :], self.closures.stray)
+        keep, tamed = _tamed(chi2[self.chained :], self.closures)
         total = np.bincount(self.closures.run, tamed, len(self.members))
         mean = total / np.maximum(self.members, 1)
         weights = (self.closures.scale / (self.closures.scale + mean)) ** 2

@@ -129,9 +129,10 @@ class FrameMap:
         Raises:
             ValueError: there is no such run, it is not accepted, or it joins parts that odometry does not.
         """
-        if not 0 <= run < self._ledger.runs or self._ledger.verdict(run) != Verdict.ACCEPTED:
+        settled = self._settle()
+        if not 0 <= run < self._ledger.runs or settled.ledger.verdict(run) != Verdict.ACCEPTED:
             raise ValueError(f"run {run} is not an accepted run of this map")
-        if np.any(self._cut.rows == run):
+        if np.any(settled.cut.rows == run):
             raise ValueError(f"run {run} joins what broken odometry left apart; nothing else would hold it")
         self._ledger.judge(run, Verdict.UNDONE)
         self._correct()
@@ -479,7 +480,8 @@ class FrameMap:
         closures = ledger.closures(self._angle(), variance, scales)
         if config.weigh_every:
             worth = 2 * np.maximum(closures.score - config.doubt, 1.0) / np.bincount(closures.run)
-            return closures._replace(scale=worth, stray=config.stray)
+            # A run must be able to cost more than it is worth, else it can never be refused.
+            return closures._replace(scale=worth, stray=np.maximum(config.stray, 1.5 * worth))
         return closures if config.robust else closures._replace(scale=np.full_like(closures.scale, 1e12))
 
     def _steps(self, fit: Fit) -> np.ndarray:

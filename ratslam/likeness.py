@@ -71,6 +71,7 @@ def levels(view: Array, alive: Array) -> Array:
     """
     height = -(-view * HEIGHTS // 1)
     height = (height + HEIGHTS - abs(height - HEIGHTS)) / 2  # at most
+    height = (height + abs(height)) / 2  # at least 0
     return alive * height + (1 - alive) * DEAD
 
 

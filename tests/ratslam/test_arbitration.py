@@ -166,6 +166,16 @@ def test_a_map_bent_by_a_false_run_is_set_right(seed):
     assert off(judged.fit, made.truth) < 0.1
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_hopeless_present_map_is_given_up(seed):
+    made = world(seed)
+    stream = np.random.default_rng(seed)
+    lost = made.reckoned()._replace(poses=stream.uniform(-2, 2, made.truth.shape))
+    judged = arbitrate(made.case, [lost, made.reckoned()], made.where)
+    assert (judged.fit.weights > KEPT).all()
+    assert off(judged.fit, made.truth) < 0.1
+
+
 def test_the_more_evidence_the_more_a_run_may_strain_the_map():
     made = world(0)
     case = made.case

@@ -307,6 +307,13 @@ def test_the_likeliest_then_is_what_is_felt_now(touching):
     assert (log[1:DEAD, 0] < 0).all()
 
 
+def test_heights_that_are_all_astray_tell_touch_alone():
+    known = common(0)
+    log = table(known, PRIOR._replace(astray=1.0))[:, 1:DEAD, 1:DEAD]
+    expected = np.log((1 - PRIOR.vanishes) / known.touching)[:, None, None]
+    assert np.allclose(log, expected)
+
+
 def test_a_rare_height_says_more_than_a_common_one():
     heights = np.full(HEIGHTS, 0.2 / (HEIGHTS - 1))
     heights[25] = 0.8
