@@ -38,6 +38,10 @@ DOUBT = 0.5
 """How much a frame misfits where there is nothing to compare it with."""
 
 
+UNTOLD = float(np.log(2))
+"""The same for whisker images: what one misfits that says nothing."""
+
+
 class Measure(NamedTuple):
     """What recall compares by: see `Guidance`."""
 
@@ -184,11 +188,14 @@ class Touch:
     """Whisker images, compared by log-odds that are learned from the session.
 
     Args:
-        temper: share of the log-odds that counts, see `RecallConfig`.
+        temper: share of the log-odds that counts, see `RecallConfig`. normalise: what recall does to an image
+            before it compares it.
     """
 
-    def __init__(self, pixels: Pixels, temper: float) -> None:
-        self._pixels, self._temper = pixels, temper
+    def __init__(
+        self, pixels: Pixels, temper: float, normalise: Callable[[np.ndarray], np.ndarray] = np.asarray
+    ) -> None:
+        self._pixels, self._temper, self._normalise = pixels, temper, normalise
         self._level = Growing((len(pixels.group),), np.int64)
         self._likeness = NO_LIKENESS
 
@@ -196,7 +203,7 @@ class Touch:
         return Measure(np.pi, NEVER if self._likeness.size else 0.0, self._likeness)
 
     def append(self, observation: Observation, turn: float, length: float) -> None:
-        view = np.asarray(observation.view, float)
+        view = self._normalise(np.asarray(observation.view, float))
         self._level.append(levels(view.reshape(-1), alive(observation).reshape(-1)).astype(np.int64))
 
     def learn(self, evidence: Evidence, known: Callable[[], Match]) -> Slope:
@@ -211,7 +218,7 @@ class Touch:
     def misfit(self, frame: int, near: np.ndarray, about: np.ndarray) -> float:
         """By how much the image is less likely there than the likeliest there is, at most."""
         if not len(near) or not self._likeness.size:
-            return DOUBT
+            return UNTOLD
         image, pixels = self._level.rows, self._pixels
         then = np.where(about[:, None], image[near][:, pixels.behind], image[near])
         odds = self._likeness[pixels.group, image[frame], then].sum(axis=1).max()

@@ -17,7 +17,7 @@ import networkx
 import numpy as np
 
 from ratslam.appearance import Appearance, Match
-from ratslam.arbitration import KEPT, Case, arbitrate
+from ratslam.arbitration import FINE, KEPT, STEPS, Case, arbitrate
 from ratslam.backend import Evidence
 from ratslam.closures import Candidate, Ledger, Verdict
 from ratslam.framegraph import Chain, Closures, Fit, Prior, corrected, relative_covariance, solve
@@ -308,8 +308,10 @@ class FrameMap:
             ledger.judge(run, Verdict.ACCEPTED if weight > KEPT else Verdict.OPEN)
         for frame, run in judged.cuts:
             cut.rows[frame] = runs[run]
-        ledger.weigh(judged.fit.weights[judged.fit.weights > KEPT])
-        return Settled(judged.fit, ledger, cut)
+        # Once more without those that are not believed: their last pull goes.
+        fit = solve(*judged.fit[:2], self._chain(cut), self._closures(ledger), self._belief(), STEPS, FINE)
+        ledger.weigh(fit.weights)
+        return Settled(fit, ledger, cut)
 
     def _where_broken(self, poses: np.ndarray, onwards: np.ndarray, carried: np.ndarray, since: int) -> int:
         """See `arbitration.Where`."""

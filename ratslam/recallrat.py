@@ -72,6 +72,8 @@ class RecallRat:
         labels = config.templates.source == "labels"
         self.config = config
         self.recall = config.recall.model_copy(update={"fan": "none"}) if labels else config.recall
+        if self.recall.fan == "whiskers" and view_shape[1] % 2:  # no whisker has one opposite
+            self.recall = self.recall.model_copy(update={"shifts": 0})
         self.labels, self.view_shape = labels, view_shape
         self.size = 0 if labels else int(np.prod(view_shape))
         self.pixels = pixels(view_shape) if self.recall.fan == "whiskers" else None
@@ -158,7 +160,7 @@ class RecallRat:
         if self.labels:
             return Labels()
         if self.pixels is not None:
-            return Touch(self.pixels, self.recall.temper)
+            return Touch(self.pixels, self.recall.temper, self._normalised)
         return Views(self.size, recall.fan_width(self.recall), self._normalised)
 
     def _groups(self) -> int:

@@ -9,7 +9,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ratslam.appearance import DOUBT, EARLIEST, ENOUGH, LEARN, NEVER, Labels, Match, Touch, Views, alive
+from ratslam.appearance import (
+    DOUBT,
+    EARLIEST,
+    ENOUGH,
+    LEARN,
+    NEVER,
+    UNTOLD,
+    Labels,
+    Match,
+    Touch,
+    Views,
+    alive,
+)
 from ratslam.likeness import DEAD, HEIGHTS, LEVELS, PRIOR, background, levels, pixels, table, variation
 from ratslam.sectors import NOTHING
 from tactile.types import Odometry, observation
@@ -86,7 +98,7 @@ def test_whiskers_are_compared_once_there_is_enough_to_learn_from():
         assert measure.angle == np.pi
         assert measure.scale == (NEVER if k >= EARLIEST else 0.0)
         assert measure.likeness.size == (3 * LEVELS**2 if k >= EARLIEST else 0)
-        assert (looks.misfit(0, *alone(0)) == DOUBT) == (k < EARLIEST)
+        assert (looks.misfit(0, *alone(0)) == UNTOLD) == (k < EARLIEST)
     assert asked == list(range(LEARN, 201, LEARN))
 
 
@@ -176,7 +188,7 @@ def test_where_there_is_nothing_to_compare_with_there_is_doubt(kind):
     views = felt(np.random.default_rng(0), LEARN)
     looks = {"touch": touched(views), "views": viewed(views), "labels": labelled([1] * 5)}[kind]
     none = np.zeros(0, int)
-    assert looks.misfit(3, none, none.astype(bool)) == DOUBT
+    assert looks.misfit(3, none, none.astype(bool)) == (UNTOLD if isinstance(looks, Touch) else DOUBT)
 
 
 def test_whiskers_that_nobody_speaks_of_report():
