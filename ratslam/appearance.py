@@ -36,8 +36,6 @@ NEVER = 3.0
 """Log-odds that stand for a whisker image never felt before."""
 DOUBT = 0.5
 """How much a frame misfits where there is nothing to compare it with."""
-
-
 UNTOLD = float(np.log(2))
 """The same for whisker images: what one misfits that says nothing."""
 

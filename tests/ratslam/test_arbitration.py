@@ -221,6 +221,7 @@ def test_the_order_of_runs_does_not_matter(seed):
         closures._replace(
             i=closures.i[among], j=closures.j[among], turn=closures.turn[among],
             run=number[closures.run[among]], scale=closures.scale[order], score=closures.score[order],
+            stray=np.asarray(closures.stray)[order],
         ),
         case.prior, case.evidence[order], case.first[order], case.last[order],
     )  # fmt: skip
@@ -246,7 +247,8 @@ def test_a_robot_that_was_carried_is_cut_where_it_was(seed):
     jump = int(stream.integers(2 * LAP + 5, 3 * LAP)), int(stream.integers(15, 45))
     made = world(seed, jumps=(jump,))
     judged = arbitrate(made.case, made.starts(), made.where)
-    assert [frame for frame, _ in judged.cuts] == [jump[0]]
+    (cut,) = [frame for frame, _ in judged.cuts]
+    assert abs(cut - jump[0]) <= 3
     assert made.case.first[judged.cuts[0][1]] >= jump[0]
     assert (judged.fit.weights > KEPT).all()
     assert off(judged.fit, made.truth) < 0.1
