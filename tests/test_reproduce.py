@@ -28,6 +28,7 @@ TINY = (
     "simulation.maze.rows=2",
     "simulation.maze.loop=4",
     "simulation.path.circuits=CCA",
+    "simulation.kidnaps.ahead=2.0",
 )
 RISES = Claim("a rises", "arr", "rises", "a", "b")
 

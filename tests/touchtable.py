@@ -70,7 +70,8 @@ ROWS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
 class Figures(NamedTuple):
     """Of one run. energy: of the frame graph; experiences: read through the experiences; odometry: of dead
     reckoning. arr, arcr (strict), chain_free: Experience Metric. recall: share of revisits that were closed.
-    later: closures across a change of maze. recovery: whisks from each jump to the first true closure."""
+    across: closures of the last seven tenths of a session with the first three. recovery: whisks from each
+    jump to the first true closure."""
 
     energy: float
     experiences: float
@@ -188,8 +189,7 @@ def line(row: str, runs: list[Figures]) -> str:
         f"{median('experiences'):6.3f} {median('odometry'):6.2f} {median('arr'):6.3f} {median('arcr'):6.3f}"
         f" {worst:5.2f} {median('chain_free'):6.3f} {median('recall'):6.2f} {false:5d}/{closures:<6d}"
     )
-    if "other maze" in row:
-        text += f" across the change: {sum(figures.across for figures in runs)}"
+    text += f" {sum(figures.across for figures in runs):6d}"
     recovery = np.array([whisks for figures in runs for whisks in figures.recovery])
     if len(recovery):
         text += f" recovery: median {np.median(recovery):.0f}, within 45: {(recovery <= 45).mean():.2f}"
@@ -198,7 +198,7 @@ def line(row: str, runs: list[Figures]) -> str:
 
 HEADER = (
     f"{'row':22s} {'EM':>6s} {'worst':>6s} {'success':>7s}{'exp.':>6s} {'odom.':>6s} {'ARR':>6s} {'ARCR':>6s}"
-    f" {'worst':>5s} {'free':>6s} {'recall':>6s} {'false/closures':>12s}"
+    f" {'worst':>5s} {'free':>6s} {'recall':>6s} {'false/closures':>12s} across"
 )
 
 
