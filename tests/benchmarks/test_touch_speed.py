@@ -47,7 +47,7 @@ def told(benchmark, length):
 
 
 def test_ten_circuits_mapped_and_scored(benchmark):
-    settings = config() if benchmark.enabled else config(path={"circuits": "CA"})
+    settings = config() if benchmark.enabled else config(path={"circuits": "CC"})
     settings = settings.model_copy(update={"session": settings.session.model_copy(update={"reserve": 2048})})
     completed, source, observations, truth = sensed(settings)
     session = session_of(completed, source)
