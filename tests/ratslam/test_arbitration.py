@@ -242,7 +242,7 @@ def test_nothing_is_cut_without_a_jump(seed):
 
 
 def test_a_robot_that_was_carried_is_cut_where_it_was():
-    """In seven of eight worlds at least: in one the cut comes three frames late and a run is lost by it."""
+    """In seven of eight worlds at least: in one the cut comes three frames late and the map is off."""
     found = 0
     for seed in range(8):
         stream = np.random.default_rng(seed)
