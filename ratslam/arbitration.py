@@ -33,6 +33,8 @@ TELLING = 16.0
 """Squared deviation from which a cut is tried."""
 TRIES = 5
 """Places where a cut is tried before the best of them is taken."""
+ALIKE = 0.5
+"""Difference in cost, in chi-square, that tells nothing of where a cut belongs."""
 LOOSE = 1e4
 """Standard deviation of a cut, m and rad."""
 
@@ -105,14 +107,19 @@ def _with_cuts(case: Case, best: Judgement, where: Where) -> Judgement:
     while True:
         strain = _strain(case, best)
         tempting = [run for run in np.argsort(-strain)[:TRIES].tolist() if strain[run] >= TELLING]
-        cut = min(
-            (judgement for run in tempting for judgement in _cut(case, best, run, where)),
-            key=_cost,
-            default=best,
-        )
+        found = [judgement for run in tempting for judgement in _cut(case, best, run, where)]
+        cut = _nearest(case, best, found) if found else best
         if cut.cost >= best.cost:
             return best
         best = cut
+
+
+def _nearest(case: Case, best: Judgement, found: list[Judgement]) -> Judgement:
+    """The cheapest; of those that cost the same, that told of by the run that begins first: between two runs
+    a cut costs the same wherever it is, and the less odometry lies between, the surer the views tell where."""
+    least = min(judgement.cost for judgement in found)
+    alike = [judgement for judgement in found if judgement.cost <= least + ALIKE]
+    return min(alike, key=lambda judgement: case.first[judgement.cuts[len(best.cuts)][1]])
 
 
 def _strain(case: Case, best: Judgement) -> np.ndarray:

@@ -133,10 +133,9 @@ def relative_covariance(
     dx, dy = (b - a)[:2]
     by_i = np.array([[-c, -s, c * dy - s * dx], [s, -c, -c * dx - s * dy], [0, 0, -1.0]])
     by_j = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
-    change = np.zeros((3 * len(fit.poses), 3))
-    change[3 * i : 3 * i + 3] = by_i.T
-    change[3 * j : 3 * j + 3] = by_j.T
-    return equations.covariance(change[3:])
+    change = np.zeros((len(fit.poses), 3, 3))
+    change[i], change[j] = by_i.T, by_j.T
+    return equations.covariance(change[1:])
 
 
 def _tamed(chi2: np.ndarray, closures: Closures) -> tuple[np.ndarray, np.ndarray]:
@@ -150,9 +149,11 @@ def _tamed(chi2: np.ndarray, closures: Closures) -> tuple[np.ndarray, np.ndarray
 
 
 class _Equations(NamedTuple):
-    """Normal equations of poses and bias: the factor of the poses' block, the rest bordering it."""
+    """Normal equations of poses and bias: the factor of the poses' block, the rest bordering it; and where
+    each free frame stands among the unknowns."""
 
     factor: SuperLU | None
+    order: np.ndarray
     gradient: np.ndarray
     border: np.ndarray
     corner: float
@@ -167,11 +168,13 @@ class _Equations(NamedTuple):
         step = free - bias * bent
         if not np.isfinite(step).all():
             return None
-        return np.concatenate([np.zeros((1, 3)), step.reshape(-1, 3)]), float(bias)
+        return np.concatenate([np.zeros((1, 3)), step.reshape(-1, 3)[self.order]]), float(bias)
 
     def covariance(self, change: np.ndarray) -> np.ndarray:
+        """Of what changes by `change` [F, 3, n] with the poses of the free frames: [n, n]."""
         if self.factor is None:
-            return np.full((change.shape[1],) * 2, np.inf)
+            return np.full((change.shape[2],) * 2, np.inf)
+        change = change[np.argsort(self.order)].reshape(-1, change.shape[2])
         spread = self.factor.solve(change)
         bent = self.factor.solve(self.border)
         pull = change.T @ bent
@@ -193,7 +196,8 @@ class _System:
         self.members = np.bincount(closures.run, minlength=len(closures.scale))
 
         self.size = 3 * (count - 1)
-        ends = 3 * np.stack([self.i, self.j], axis=1)[:, :, None] - 3
+        self.order = _order(self.i, self.j, count)
+        ends = 3 * np.stack([self.order[self.i], self.order[self.j]], axis=1)[:, :, None]
         at = (ends + np.arange(3)).reshape(-1, 6)  # frame 0 is held: its rows are left out
         self.free, self.row = at >= 0, at[at >= 0]
         rows, columns = np.repeat(at[:, :, None], 6, axis=2), np.repeat(at[:, None, :], 6, axis=1)
@@ -233,6 +237,7 @@ class _System:
         tight = 1 / self.prior.sd**2
         return _Equations(
             _factor(matrix),
+            self.order[1:],
             gradient,
             border,
             float((by_bias**2 * trust).sum() + tight),
@@ -241,10 +246,26 @@ class _System:
         )
 
 
+def _order(i: np.ndarray, j: np.ndarray, count: int) -> np.ndarray:
+    """[N] where frames stand among the unknowns for factors with few entries: of minimum degree, as SuperLU
+    finds it, but for frames and once, not for their coordinates at every step. Frame 0 stands before all."""
+    free = (i > 0) & (j > 0)
+    i, j = i[free] - 1, j[free] - 1
+    ends, size = np.arange(count - 1), count - 1
+    ties = np.ones(len(i))
+    # Only who is tied to whom matters; the diagonal keeps it from being singular.
+    among = csc_matrix((ties, (i, j)), (size, size))
+    degree = csc_matrix((np.full(size, 4.0 * len(i) + 1), (ends, ends)), (size, size))
+    factor = _factored(among + among.T + degree, "MMD_AT_PLUS_A")
+    return np.concatenate([[-1], factor.perm_c])
+
+
 def _factor(matrix: csc_matrix) -> SuperLU | None:
     try:
-        return splu(
-            matrix, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0
-        )
+        return _factored(matrix, "NATURAL")
     except RuntimeError:  # singular: a frame that nothing ties to frame 0
         return None
+
+
+def _factored(matrix: csc_matrix, ordering: str) -> SuperLU:
+    return splu(matrix, permc_spec=ordering, options={"SymmetricMode": True}, diag_pivot_thresh=0.0)

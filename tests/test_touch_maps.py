@@ -234,7 +234,7 @@ def test_a_robot_that_is_carried_is_cut_where_it_was() -> None:
         near = len(told.cuts) == 1 and abs(told.cuts[0] - 240) <= 5
         right = metric(told.path, made.truth) < 0.25 * metric(reckoned(made.felt), made.truth)
         found.append([near, right])
-    assert (np.sum(found, axis=0) >= [5, 6]).all()
+    assert (np.sum(found, axis=0) >= [5, 7]).all()
 
 
 # The map while it grows
