@@ -167,8 +167,11 @@ class RecallRat:
         return 0 if self.pixels is None else int(self.pixels.group.max()) + 1
 
     def _normalised(self, view: np.ndarray) -> np.ndarray:
-        shaped = jnp.asarray(view.reshape(self.view_shape), self.dtype)
-        return np.asarray(templates.normalise(self.config.templates, shaped))
+        shaped = np.asarray(view.reshape(self.view_shape), self.dtype)
+        config = self.config.templates
+        if not (config.normalise_mean or config.patch):  # nothing to do, and JAX would take long about it
+            return shaped
+        return np.asarray(templates.normalise(config, jnp.asarray(shaped)))
 
     def _looks(self, view: Array, observation: Observation) -> Array:
         """What is compared and remembered of a view: its values, or the levels of its whiskers."""

@@ -119,11 +119,10 @@ class Session:
         count = len(observations)
         chunk = stack(observations + observations[-1:] * (CHUNK - count))
         self.state, outputs = self._run(self.state, chunk, np.int32(count))
-        estimates, evidence = jax.tree.map(np.asarray, outputs)
+        columns, record = jax.tree.flatten(jax.device_get(outputs))
         steps = []
         for k, observation in enumerate(observations):
-            estimate = jax.tree.map(lambda column, k=k: column[k], estimates)
-            proof = jax.tree.map(lambda column, k=k: column[k], evidence)
+            estimate, proof = jax.tree.unflatten(record, [column[k] for column in columns])
             estimate = self.map.update(observation, estimate, proof)
             steps.append(Step(estimate, proof, self.map.pose(estimate)))
         self.steps += count
