@@ -116,7 +116,7 @@ def _with_cuts(case: Case, best: Judgement, where: Where) -> Judgement:
 
 def _nearest(case: Case, best: Judgement, found: list[Judgement]) -> Judgement:
     """The cheapest; of those that cost the same, that told of by the run that begins first: between two runs
-    a cut costs the same wherever it is, and the less odometry lies between, the surer the views tell where."""
+    a cut costs the same wherever it is, and the less odometry lies between, the surer views tell where."""
     least = min(judgement.cost for judgement in found)
     alike = [judgement for judgement in found if judgement.cost <= least + ALIKE]
     return min(alike, key=lambda judgement: case.first[judgement.cuts[len(best.cuts)][1]])
