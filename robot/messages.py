@@ -14,7 +14,7 @@ import numpy as np
 
 from robot.source import Sample
 from tactile.errors import InputError
-from tactile.types import Cycle, Observation, Odometry, Whisk
+from tactile.types import Cycle, Observation, Odometry, Report, Whisk
 
 CDR = b"\x00\x01\x00\x00"
 MOST = 100_000_000  # numbers in one message; more is a damaged length
@@ -52,16 +52,25 @@ float64[] deflection  # samples x whiskers x 2
 float64[] felt      # whiskers x 3: angle at first contact, rad; largest angle, rad; share of the shaft
 uint8[] flags       # of each whisker; bit 0: it reports, bit 1: it touched, bit 2: it did so to the end
 """,
+    "ratslam_msgs/msg/Report": ODOMETRY
+    + """int32 motion        # 0 other, 1 forward, 2 back, 3 turn
+int32 moment        # how the step ended: 0 as planned, 1 first contact, 2 a second one, 3 strained too much
+uint32 whiskers
+float64[] sample_time  # samples, s since the beginning of the step
+uint32 axes         # 2
+float64[] strain    # samples x whiskers x 2
+uint8[] flags       # of each whisker; bit 0: it reports, bit 1: it touches something
+""",
     "ratslam_msgs/msg/Truth": """float64 time        # s, as in the reading it belongs to
 float64 x           # m
 float64 y           # m
 float64 heading     # rad
 """,
 }
-OBSERVATION, CYCLE, WHISK, TRUTH = SCHEMAS
+OBSERVATION, CYCLE, WHISK, REPORT, TRUTH = SCHEMAS
 FELT = ("touched", "highest", "reach")
 """What `felt` of a whisk holds of each whisker."""
-FLAGS = {OBSERVATION: ("contact", "dead"), WHISK: ("alive", "contact", "held")}
+FLAGS = {OBSERVATION: ("contact", "dead"), WHISK: ("alive", "contact", "held"), REPORT: ("alive", "contact")}
 """What the bits of `flags` mean, from the lowest."""
 
 
@@ -99,6 +108,9 @@ def encode(sample: Sample, view_shape: tuple[int, int, int], whiskers: int) -> t
         name, layout = WHISK, whisk_layout(whiskers)
         numbers = np.dtype(("<f8", (whiskers,)))
         values["felt"] = np.stack([_exactly(field, values[field], numbers) for field in FELT], axis=1)
+    elif isinstance(reading, Report):
+        name, layout = REPORT, report_layout(len(np.atleast_1d(reading.time)), whiskers)
+        values["sample_time"] = reading.time
     else:
         name, layout = OBSERVATION, observation_layout(view_shape, whiskers)
         values["dead"] = ~_exactly("alive", reading.alive, np.dtype(("?", (whiskers,)))).astype(bool)
@@ -124,6 +136,11 @@ def decode(name: str, message: bytes, view_shape: tuple[int, int, int], whiskers
         layout = cycle_layout(samples, whiskers)
     elif name == WHISK:
         layout = whisk_layout(whiskers)
+    elif name == REPORT:
+        samples = int.from_bytes(message[56:60], "little")
+        if samples * (1 + 2 * whiskers) > MOST:
+            raise Malformed(f"a report of {samples} samples")
+        layout = report_layout(samples, whiskers)
     else:
         layout = observation_layout(view_shape, whiskers)
     if len(message) != layout.dtype.itemsize:
@@ -139,6 +156,10 @@ def decode(name: str, message: bytes, view_shape: tuple[int, int, int], whiskers
     if name == WHISK:
         felt = {field: record["felt"][:, k].copy() for k, field in enumerate(FELT)}
         return float(record["time"]), Whisk(odometry=odometry, **flags, **felt)
+    if name == REPORT:
+        time, strain = record["sample_time"].copy(), record["strain"].copy()
+        moved, ended = int(record["motion"]), int(record["moment"])
+        return float(record["time"]), Report(odometry, moved, ended, **flags, time=time, strain=strain)
     return float(record["time"]), Observation(
         odometry=odometry,
         motion=record["motion"],
@@ -211,6 +232,31 @@ def whisk_layout(whiskers: int) -> Layout:
         ],
         whiskers=whiskers,
         felt_length=len(FELT) * whiskers,
+        flags_length=whiskers,
+    )
+
+
+@lru_cache(maxsize=256)
+def report_layout(samples: int, whiskers: int) -> Layout:
+    """The packed form of the Report schema for these shapes."""
+    return _layout(
+        [
+            *_ODOMETRY,
+            ("motion", "<i4"),
+            ("moment", "<i4"),
+            ("whiskers", "<u4"),
+            ("sample_time_length", "<u4"),
+            ("sample_time", "<f8", (samples,)),
+            ("axes", "<u4"),
+            ("strain_length", "<u4"),
+            ("strain", "<f8", (samples, whiskers, 2)),
+            ("flags_length", "<u4"),
+            ("flags", "u1", (whiskers,)),
+        ],
+        whiskers=whiskers,
+        sample_time_length=samples,
+        axes=2,
+        strain_length=2 * samples * whiskers,
         flags_length=whiskers,
     )
 

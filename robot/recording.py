@@ -19,7 +19,7 @@ from robot.source import Sample, Source, rate_of, rig_of
 from robot.units import ORDINARY, Limits, Track, units
 from robot.walk import Description, Walk
 from tactile.errors import InputError
-from tactile.types import Cycle, Observation, Whisk
+from tactile.types import Cycle, Observation, Report, Whisk
 
 
 class Recording:
@@ -192,6 +192,8 @@ def _column(sample: Sample) -> tuple[float, ...]:
     low = high = np.nan
     if isinstance(reading, Cycle):
         parts = [reading.time, reading.angle, reading.deflection]
+    elif isinstance(reading, Report):
+        parts = [reading.time, reading.strain]
     elif isinstance(reading, Whisk):
         parts = [reading.touched, reading.highest, reading.reach]
     else:

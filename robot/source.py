@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
 
 import numpy as np
 
-from tactile.types import Cycle, Observation, Whisk
+from tactile.types import Cycle, Observation, Report, Whisk
 
 
 class Sample(NamedTuple):
@@ -16,14 +16,14 @@ class Sample(NamedTuple):
 
     Attributes:
         time: s, on the source's own clock; never goes back.
-        reading: what the robot sensed: an `Observation`, or whiskers, raw (`Cycle`) or felt (`Whisk`), of
-            which the sense of touch makes one.
+        reading: what the robot sensed: an `Observation`, or whiskers, raw (`Cycle`), felt (`Whisk`) or of a
+            state machine (`Report`), of which the sense of touch makes one.
         truth: [3] where the robot really was (x m, y m, heading rad), or None where that is unknown.
             It travels beside the reading, never inside, so no engine can peek.
     """
 
     time: float
-    reading: Observation | Cycle | Whisk
+    reading: Observation | Cycle | Whisk | Report
     truth: np.ndarray | None
 
 

@@ -26,6 +26,7 @@ from robot.messages import (
     CYCLE,
     MOST,
     OBSERVATION,
+    REPORT,
     SCHEMAS,
     TRUTH,
     WHISK,
@@ -41,6 +42,7 @@ TOPICS = {
     OBSERVATION: "/ratslam/observation",
     CYCLE: "/ratslam/cycle",
     WHISK: "/ratslam/whisk",
+    REPORT: "/ratslam/report",
     TRUTH: "/ratslam/truth",
 }
 SCHEMA_OF = {topic: name for name, topic in TOPICS.items()}

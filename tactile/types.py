@@ -73,6 +73,39 @@ class Whisk(NamedTuple):
     reach: np.ndarray
 
 
+class Moment(IntEnum):
+    """Where the Create's state machine stands at the end of a step (Fox et al. 2012, II-C)."""
+
+    FREE = 0
+    """The step ended as planned, and nothing was met."""
+    HIT1 = 1
+    """A whisker has met something: the drive on (FWD1) ended."""
+    HIT2 = 2
+    """A second one has: the slow drive on (FWD2) ended."""
+    ABORT = 3
+    """The strain of a whisker passed what is safe, and the step ended early."""
+
+
+class Report(NamedTuple):
+    """One step of the Create's state machine as its fixed whiskers felt it.
+
+    Attributes:
+        odometry: motion since the previous report. motion: a `Motion`. moment: a `Moment`, how it ended.
+        alive: [W] bool, the whisker reports at all. contact: [W] bool, strained beyond the contact threshold
+            at the end of the step.
+        time: [T] s since the beginning of the step, evenly spaced. strain: [T, W, 2] horizontal and vertical,
+            during the slow drive between HIT1 and HIT2 or ABORT; T is 0 for every other step.
+    """
+
+    odometry: Odometry
+    motion: int
+    moment: int
+    alive: np.ndarray
+    contact: np.ndarray
+    time: np.ndarray
+    strain: np.ndarray
+
+
 class Observation(NamedTuple):
     """What an engine is given at one step. Absent things are masked, never NaN.
 

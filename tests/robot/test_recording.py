@@ -17,14 +17,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from robot.messages import OBSERVATION, SCHEMAS, WHISK, decode, encode
+from robot.messages import OBSERVATION, REPORT, SCHEMAS, WHISK, decode, encode
 from robot.recorder import Recorder
 from robot.recording import Recording, record, recover
 from robot.source import Rigged, Sample, Source, rig_of
 from robot.streams import read_stream
 from robot.walk import FORMAT, TOPICS, Walk, _checksum
 from tactile.errors import InputError
-from tactile.types import Cycle, Observation, Odometry, Whisk, observation
+from tactile.types import Cycle, Observation, Odometry, Report, Whisk, observation
 
 SHAPE, WHISKERS = (2, 3, 2), 4
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
@@ -76,9 +76,21 @@ WHISKS = st.builds(
     highest=_numbers(WHISKERS),
     reach=_numbers(WHISKERS),
 )
+REPORTS = st.integers(0, 5).flatmap(
+    lambda t: st.builds(
+        Report,
+        odometry=ODOMETRIES,
+        motion=st.integers(0, 3),
+        moment=st.integers(0, 3),
+        alive=_bools(WHISKERS),
+        contact=_bools(WHISKERS),
+        time=_numbers(t),
+        strain=_numbers(t, WHISKERS, 2),
+    )
+)
 RIG = {"head": {"rest_deg": 75.0}, "calibration": {"sd": [[1e-3, 0.1], [1e-300, -0.0]]}, "über": None}
 TRUTHS = st.none() | _numbers(3, low=-0.1, high=0.1)
-SAMPLES = st.lists(st.tuples(OBSERVATIONS | CYCLES | WHISKS, TRUTHS), min_size=1, max_size=12).map(
+SAMPLES = st.lists(st.tuples(OBSERVATIONS | CYCLES | WHISKS | REPORTS, TRUTHS), min_size=1, max_size=12).map(
     lambda parts: [Sample(100 + 0.5 * i, *part) for i, part in enumerate(parts)]
 )
 
@@ -119,7 +131,11 @@ def _samples(count: int, seed: int = 0) -> list[Sample]:
     for i in range(count):
         odometry = Odometry(*(np.float64(x) for x in (*rng.normal(0, 0.05, 3), 0.5)))
         truth = rng.normal(size=3) if i % 3 else None
-        if i % 4 == 3:
+        if i % 5 == 4:
+            flags, strain = rng.random((2, WHISKERS)) < 0.5, rng.normal(size=(3, WHISKERS, 2))
+            told = Report(odometry, 1, 2, *flags, time=np.arange(3) / 2000, strain=strain)
+            samples.append(Sample(0.5 * i, told, truth))
+        elif i % 4 == 3:
             arrays_ = (rng.random(2), rng.normal(size=(2, WHISKERS)), rng.normal(size=(2, WHISKERS, 2)))
             samples.append(Sample(0.5 * i, Cycle(*arrays_, odometry), truth))
         elif i % 4 == 2:
@@ -386,7 +402,7 @@ def test_the_standard_reader_reads_it(small: tuple[bytes, list[Sample]], tmp_pat
         reader = make_reader(file)
         assert [m.metadata["view_shape"] for m in reader.iter_metadata() if m.name == "ratslam"] == ["2,3,2"]
         found = [(schema.encoding, channel.topic) for schema, channel, _ in reader.iter_messages()]
-    topics = ("observation", "cycle", "whisk", "truth")
+    topics = ("observation", "cycle", "whisk", "report", "truth")
     assert set(found) == {("ros2msg", f"/ratslam/{name}") for name in topics}
     assert len(found) == len(samples) + sum(sample.truth is not None for sample in samples)
 
@@ -400,7 +416,7 @@ def test_ros_tools_read_the_messages() -> None:
     store = get_typestore(Stores.EMPTY)
     for name, text in SCHEMAS.items():
         store.register(get_types_from_msg(text, name))
-    for sample in _samples(4):
+    for sample in _samples(5):
         name, message = encode(sample, SHAPE, WHISKERS)
         read: Any = store.deserialize_cdr(message, name)
         assert bytes(store.serialize_cdr(read, name)) == message
@@ -415,6 +431,10 @@ def test_ros_tools_read_the_messages() -> None:
                 read.felt.reshape(WHISKERS, 3) == np.stack([felt.touched, felt.highest, felt.reach], 1)
             ).all()
             assert (read.flags == felt.alive + 2 * felt.contact + 4 * felt.held).all()
+        elif name == REPORT:
+            told = sample.reading
+            assert (read.motion, read.moment) == (told.motion, told.moment)
+            assert (read.strain.reshape(-1, WHISKERS, 2) == told.strain).all()
         else:
             assert name == CYCLE
             assert (read.deflection.reshape(2, WHISKERS, 2) == sample.reading.deflection).all()
