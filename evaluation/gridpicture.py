@@ -1,0 +1,176 @@
+"""Occupancy maps as pictures: one with the paths that led to it, or many side by side.
+
+Bright is occupied, as in the figures of Fox et al. 2012, on the same scale from 0 to 1 everywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from evaluation import drawing
+from evaluation.drawing import GREEN, INK, QUIET, VERMILLION, WIDTH, YELLOW
+from evaluation.grid import Grid
+from evaluation.griderror import HEADLINE
+from evaluation.gridscore import GridScore
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+NO_SEGMENTS = np.zeros((0, 4))
+
+_SKY = "#56b4e9"  # Okabe and Ito's, for lines on dark ground
+_PALE = "#c9c9c9"
+_KEY, _BAR = 0.72, 0.15  # inches: right of the maps, and of the colours in it
+_HEAD, _GAP, _BOTTOM = 0.48, 0.42, 1.0  # inches above a small map, between two, and below all
+
+
+class Paths(NamedTuple):
+    """Where the robot was in the end, [T, 2] or [T, 3] each, m; truth may have NaN rows.
+
+    Attributes:
+        truth: really. estimate: as the filter told at the time. odometry: by dead reckoning.
+    """
+
+    truth: np.ndarray
+    estimate: np.ndarray
+    odometry: np.ndarray
+
+
+class Panel(NamedTuple):
+    """A map to draw.
+
+    Attributes:
+        name: what it is. line: what is measured on it. grid: the map. segments: [S, 4] true walls, m, drawn
+            as thin lines. paths: how it came about.
+    """
+
+    name: str
+    line: str
+    grid: Grid
+    segments: np.ndarray = NO_SEGMENTS
+    paths: Paths | None = None
+
+
+def draw_grid(panel: Panel) -> Figure:
+    """One map, large, with its walls and paths (Fig. 6 of Fox et al. 2012)."""
+    inner = WIDTH - drawing.LEFT - drawing.RIGHT - _KEY
+    tall = inner * _aspect(panel.grid)
+    figure = drawing.blank(drawing.TOP + tall + _BOTTOM, panel.name, panel.line)
+    axes = drawing.plot(figure, drawing.LEFT, _BOTTOM, inner, tall)
+    _paint(axes, panel)
+    if panel.paths is not None:
+        _paint_paths(axes, panel.paths, told=True)
+    _paint_key(figure, drawing.LEFT + inner, _BOTTOM, min(tall, 2.4))
+    drawing.legend(figure, axes, columns=3)
+    return figure
+
+
+def draw_grids(title: str, line: str, panels: Sequence[Panel], *, across: int = 3) -> Figure:
+    """Maps side by side, `across` in a row (Figs. 4 and 5 of Fox et al. 2012)."""
+    across = min(across, len(panels))
+    rows = -(-len(panels) // across)
+    inner = WIDTH - drawing.LEFT - drawing.RIGHT - _KEY
+    width = (inner - (across - 1) * _GAP) / across
+    high = width * max(_aspect(panel.grid) for panel in panels)
+    whole = drawing.TOP + rows * (_HEAD + high) + (rows - 1) * _GAP + _BOTTOM
+    figure = drawing.blank(whole, title, line)
+    for number, panel in enumerate(panels):
+        row, column = divmod(number, across)
+        left = drawing.LEFT + column * (width + _GAP)
+        top = whole - drawing.TOP - row * (_HEAD + high + _GAP) - _HEAD
+        tall = width * _aspect(panel.grid)
+        axes = drawing.plot(figure, left, top - tall, width, tall)
+        _paint(axes, panel)
+        if panel.paths is not None:
+            _paint_paths(axes, panel.paths)
+        if column:
+            axes.set_ylabel("")
+            if axes.get_ylim() == figure.axes[-2].get_ylim():
+                axes.set_yticklabels([])
+        if number + across < len(panels):
+            axes.set_xlabel("")
+        axes.tick_params(labelsize=7.5)
+        figure.text(left / WIDTH, (top + 0.24) / whole, panel.name, fontsize=9.5, color=INK)
+        figure.text(left / WIDTH, (top + 0.08) / whole, panel.line, fontsize=8, color=QUIET)
+    _paint_key(figure, drawing.LEFT + inner, whole - drawing.TOP - _HEAD - high, min(high, 2.4))
+    fullest = max(figure.axes, key=lambda axes: len(axes.get_legend_handles_labels()[1]))
+    drawing.legend(figure, fullest, columns=5)
+    return figure
+
+
+def headline(score: GridScore) -> str:
+    """The few figures that matter most, in one line."""
+    error, found = score.under(HEADLINE), score.quantities
+    parts = [f"eq. 6: {error.error:.3f} (0.3 everywhere: {error.prior:.3f})"]
+    skill, auc = found["map_brier_skill"].value, found["map_auc"].value
+    ways = found["map_chamfer_map"].value, found["map_chamfer_walls"].value
+    parts += [] if skill is None else [f"Brier skill {skill:.2f}"]
+    parts += [] if auc is None else [f"wall AUC {auc:.2f}"]
+    parts += [] if None in ways else [f"Chamfer {ways[0]:.3f} and {ways[1]:.3f} m"]
+    return "  ·  ".join(parts)
+
+
+def position_error(path: np.ndarray, truth: np.ndarray) -> float:
+    """Mean distance from the true positions, m, not aligned; NaN where none is known."""
+    away = np.hypot(*(np.asarray(path)[:, :2] - np.asarray(truth)[:, :2]).T)
+    return float(np.nanmean(away)) if np.isfinite(away).any() else float("nan")
+
+
+def _aspect(grid: Grid) -> float:
+    height, width = grid.probability.shape
+    return height / width
+
+
+def _paint(axes: Axes, panel: Panel) -> None:
+    """The map and the walls; the order of drawing is the order of the legend."""
+    from matplotlib.collections import LineCollection
+
+    grid, (height, width) = panel.grid, panel.grid.probability.shape
+    left, bottom = (float(value) for value in grid.origin)
+    right, top = left + width * grid.cell, bottom + height * grid.cell
+    axes.imshow(
+        grid.probability, cmap="gray", vmin=0, vmax=1, origin="lower", extent=(left, right, bottom, top),
+        interpolation="nearest", zorder=0.5,
+    )  # fmt: skip
+    axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", autoscale_on=False)
+    drawing.metric_grid(axes)
+    axes.grid(visible=False)
+    axes.tick_params(axis="x", pad=6)  # below the lowest number of the other axis
+    if len(panel.segments):
+        walls = panel.segments.reshape(-1, 2, 2)
+        axes.add_collection(
+            LineCollection(list(walls), colors=VERMILLION, lw=1.0, zorder=2, label="true walls")
+        )
+
+
+def _paint_paths(axes: Axes, paths: Paths, *, told: bool = False) -> None:
+    """The paths, with their errors in the legend if `told`; what leaves the map is cut off."""
+    truth, estimate, odometry = (np.asarray(path)[:, :2] for path in paths)
+
+    def name(word: str, path: np.ndarray) -> str:
+        off = position_error(path, truth) if told else np.nan
+        return word if np.isnan(off) else f"{word}, {off:.3f} m off"
+
+    dashed = (0, (4, 2))
+    axes.plot(*odometry.T, color=_PALE, lw=0.8, ls=dashed, zorder=3, label=name("dead reckoning", odometry))
+    axes.plot(*truth.T, color=YELLOW, lw=2.4, alpha=0.8, zorder=4, label="true path")
+    axes.plot(*estimate.T, color=_SKY, lw=1.0, zorder=5, label=name("estimated path", estimate))
+    start = truth[np.isfinite(truth).all(axis=1)]
+    if len(start):
+        axes.plot(*start[0], "o", ms=9, mfc="none", mec=GREEN, mew=1.8, zorder=6, label="start")
+
+
+def _paint_key(figure: Figure, left: float, bottom: float, tall: float) -> None:
+    """Which grey is which occupancy, right of a map, in inches."""
+    bar = drawing.plot(figure, left + 0.2, bottom, _BAR, tall)
+    shades = np.linspace(0, 1, 256)[:, None]
+    bar.imshow(shades, cmap="gray", vmin=0, vmax=1, extent=(0, 1, 0, 1), origin="lower", aspect="auto")
+    bar.set_xticks([])
+    bar.set_yticks([0, 0.3, 0.5, 1.0])
+    bar.yaxis.tick_right()
+    bar.tick_params(labelsize=7.5)
+    bar.set_title("occupied", fontsize=8, color=QUIET, loc="left", pad=9)

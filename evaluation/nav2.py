@@ -1,0 +1,180 @@
+"""Occupancy maps as files: the pair that nav2's map_server reads, and an .npz with every digit.
+
+map_server takes the brightness of a pixel as how free it is (with `negate: 0`), the first row of the image as
+the one with the greatest y, and `origin` as the lower left corner. In mode `trinary` a cell is occupied above
+one threshold, free below the other and unknown between; 205 is the customary grey of an unknown cell, which
+is an occupancy of 0.196, so the usual free_thresh of 0.25 turns unknown cells into free ones.
+"""
+
+from __future__ import annotations
+
+import re
+import zipfile
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import yaml
+
+from evaluation.grid import Grid, check_grid
+from tactile.errors import InputError
+
+Mode = Literal["trinary", "scale"]
+"""`trinary` tells occupied, free and unknown; `scale` every grade between, but then a PGM knows no unknown
+cell: the prior comes out as 24 of 100."""
+
+FREE_THRESH, OCCUPIED_THRESH = 0.19, 0.65
+"""Below and above, cells are free and occupied. 205 stays unknown by a margin, even for a reader that divides
+by 256."""
+
+_BLACK, _UNKNOWN, _WHITE = 0, 205, 254  # as map_saver writes them
+_HEAD = re.compile(rb"P5(?:\s+|#[^\n]*\n)+(\d+)(?:\s+|#[^\n]*\n)+(\d+)(?:\s+|#[^\n]*\n)+(\d+)\s")
+
+
+class Served(NamedTuple):
+    """A map as map_server tells it.
+
+    Attributes:
+        cell: [H, W] int, occupancy in 0..100 or -1 for unknown; row j counts y upwards.
+        origin: [3] x, y (m) and yaw (rad) of the lower left corner. resolution: side of a cell, m.
+    """
+
+    cell: np.ndarray
+    origin: np.ndarray
+    resolution: float
+
+
+def write_nav2(folder: Path, grid: Grid, mode: Mode = "trinary") -> None:
+    """Writes map.pgm and map.yaml into a folder."""
+    write_image(folder / "map.pgm", grid, mode)
+    write_description(folder / "map.yaml", grid, mode)
+
+
+def write_image(path: str | Path, grid: Grid, mode: Mode = "trinary") -> None:
+    """Writes a binary PGM of 8 bits: dark is occupied."""
+    check_grid(grid)
+    if mode == "scale":
+        pixel = np.rint(255 * (1 - grid.probability))
+    else:
+        free, occupied = grid.probability < FREE_THRESH, grid.probability > OCCUPIED_THRESH
+        pixel = np.where(occupied, _BLACK, np.where(free, _WHITE, _UNKNOWN))
+    height, width = pixel.shape
+    Path(path).write_bytes(f"P5\n{width} {height}\n255\n".encode() + pixel[::-1].astype(np.uint8).tobytes())
+
+
+def write_description(path: str | Path, grid: Grid, mode: Mode = "trinary", image: str = "map.pgm") -> None:
+    """Writes the YAML beside the image; `image` is the image's name in the same folder."""
+    x, y = (_number(value) for value in grid.origin)
+    lines = (
+        f"image: {image}",
+        f"mode: {mode}",
+        f"resolution: {_number(grid.cell)}",
+        f"origin: [{x}, {y}, 0.0]",
+        "negate: 0",
+        f"occupied_thresh: {OCCUPIED_THRESH}",
+        f"free_thresh: {FREE_THRESH}",
+    )
+    Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def read_nav2(path: str | Path) -> Served:
+    """A map.yaml and its image by map_server's rules (modes trinary, scale and raw; binary PGM of 8 bits).
+
+    Raises:
+        InputError: naming the file, and in it the key that is missing or makes no sense.
+    """
+    path = Path(path)
+    given = _description(path)
+    resolution, free, occupied = (
+        _value(path, given, key) for key in ("resolution", "free_thresh", "occupied_thresh")
+    )
+    origin = given.get("origin")
+    if not isinstance(origin, list) or len(origin) != 3:
+        raise InputError(f"{path}: origin", repr(origin), "[x, y, yaw]")
+    place = np.array([_value(path, {"origin": value}, "origin") for value in origin])
+    if resolution <= 0 or not 0 <= free < occupied <= 1:
+        raise InputError(
+            str(path),
+            f"resolution {resolution:g}, thresholds {free:g}, {occupied:g}",
+            "a positive one, and free_thresh below occupied_thresh",
+        )
+    shade = _image(path.parent / str(given.get("image", "")))[::-1] / 255
+    occupancy = shade if given.get("negate") else 1 - shade
+    mode = given.get("mode", "trinary")
+    if mode == "raw":
+        cell = np.where(shade * 255 <= 100, np.rint(shade * 255), -1)
+    elif mode in ("trinary", "scale"):
+        between = -1 if mode == "trinary" else np.rint(100 * (occupancy - free) / (occupied - free))
+        cell = np.where(occupancy > occupied, 100, np.where(occupancy < free, 0, between))
+    else:
+        raise InputError(f"{path}: mode", repr(mode), "trinary, scale or raw")
+    return Served(cell.astype(int), place, resolution)
+
+
+def write_grid(path: str | Path, grid: Grid) -> None:
+    """Writes the arrays of a map to an .npz; the same map gives the same bytes."""
+    check_grid(grid)
+    with Path(path).open("wb") as file:
+        np.savez_compressed(file, **{name: np.asarray(array) for name, array in grid._asdict().items()})  # type: ignore[arg-type]
+
+
+def read_grid(path: str | Path) -> Grid:
+    """The inverse of `write_grid`.
+
+    Raises:
+        InputError: it is no such file.
+    """
+    expected = "probability [H, W], origin [2] and cell"
+    try:
+        with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            probability, origin, cell = (archive[name] for name in Grid._fields)
+        grid = Grid(probability.astype(float), origin.astype(float).reshape(2), float(cell))
+        check_grid(grid)
+    except FileNotFoundError:
+        raise InputError(str(path), "no such file", expected) from None
+    except (OSError, ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(str(path), f"no occupancy map ({error})", expected) from None
+    return grid
+
+
+def _number(value: float) -> str:
+    """Every digit and never an exponent: YAML readers disagree on whether 1e-05 is a number."""
+    return np.format_float_positional(float(value), trim="0")
+
+
+def _description(path: Path) -> dict[str, Any]:
+    try:
+        given = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise InputError(str(path), f"cannot be read ({error})", "the map.yaml of a map_server") from None
+    if not isinstance(given, dict):
+        raise InputError(str(path), "no keys", "the map.yaml of a map_server")
+    return given
+
+
+def _value(path: Path, given: dict[str, Any], key: str) -> float:
+    try:
+        value = float(given[key])
+    except (KeyError, TypeError, ValueError):
+        raise InputError(f"{path}: {key}", repr(given.get(key)), "a number") from None
+    if not np.isfinite(value):
+        raise InputError(f"{path}: {key}", f"{value}", "a finite number")
+    return value
+
+
+def _image(path: Path) -> np.ndarray:
+    """[H, W] pixels, the first row on top."""
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(
+            str(path), f"cannot be read ({error.strerror})", "an image beside its map.yaml"
+        ) from None
+    head = _HEAD.match(content)
+    if head is None or int(head[3]) != 255:
+        raise InputError(str(path), "another kind of image", "a binary PGM (P5) of 8 bits")
+    width, height = int(head[1]), int(head[2])
+    pixels = np.frombuffer(content[head.end() :], np.uint8)
+    if len(pixels) != width * height or len(pixels) == 0:
+        raise InputError(str(path), f"{len(pixels)} pixels", f"{width} x {height}")
+    return pixels.reshape(height, width)
