@@ -9,7 +9,6 @@ is an occupancy of 0.196, so the usual free_thresh of 0.25 turns unknown cells i
 from __future__ import annotations
 
 import re
-import zipfile
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -109,32 +108,6 @@ def read_nav2(path: str | Path) -> Served:
     else:
         raise InputError(f"{path}: mode", repr(mode), "trinary, scale or raw")
     return Served(cell.astype(int), place, resolution)
-
-
-def write_grid(path: str | Path, grid: Grid) -> None:
-    """Writes the arrays of a map to an .npz; the same map gives the same bytes."""
-    check_grid(grid)
-    with Path(path).open("wb") as file:
-        np.savez_compressed(file, **{name: np.asarray(array) for name, array in grid._asdict().items()})  # type: ignore[arg-type]
-
-
-def read_grid(path: str | Path) -> Grid:
-    """The inverse of `write_grid`.
-
-    Raises:
-        InputError: it is no such file.
-    """
-    expected = "probability [H, W], origin [2] and cell"
-    try:
-        with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            probability, origin, cell = (archive[name] for name in Grid._fields)
-        grid = Grid(probability.astype(float), origin.astype(float).reshape(2), float(cell))
-        check_grid(grid)
-    except FileNotFoundError:
-        raise InputError(str(path), "no such file", expected) from None
-    except (OSError, ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(str(path), f"no occupancy map ({error})", expected) from None
-    return grid
 
 
 def _number(value: float) -> str:

@@ -8,6 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from evaluation.gridfiles import read_grid, read_truth
+from evaluation.gridpicture import Panel, Paths, draw_grid, headline
+from evaluation.gridscore import GridScore
 from evaluation.history import draw_history
 from evaluation.images import read_images
 from evaluation.mappicture import NO_CLOSURES, NO_WALLS, draw_map
@@ -15,6 +18,7 @@ from evaluation.run import Run
 from evaluation.rundirectory import read_card, read_closures, read_run, read_walls
 from evaluation.scorecard import Scorecard
 from evaluation.whiskerpicture import draw_whiskers
+from tactile.frames import between
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -34,8 +38,8 @@ def save_map(
 def pictures(directory: Path) -> dict[str, Callable[[Path], None]]:
     """What to call with a path to have each picture of a scored run drawn, by file name.
 
-    `map.png` of every run; of one with whiskers also `whiskers.png` and `experiences.png`. The same directory
-    gives the same bytes.
+    `map.png` of every run; of one with whiskers also `whiskers.png` and `experiences.png`; of one whose map
+    is a grid `grid.png`. The same directory gives the same bytes.
 
     Raises:
         InputError: naming the file that is missing or malformed.
@@ -48,10 +52,24 @@ def pictures(directory: Path) -> dict[str, Callable[[Path], None]]:
         drawn["whiskers.png"] = lambda: draw_whiskers(run, card, images, walls)
         drawn["experiences.png"] = lambda: draw_history(run, card)
 
+    if (directory / "grid.npz").exists():
+        drawn["grid.png"] = lambda: draw_grid(_charted(directory, run))
+
     def saver(draw: Callable[[], Figure]) -> Callable[[Path], None]:
         return lambda path: draw().savefig(path)
 
     return {name: saver(draw) for name, draw in drawn.items()}
+
+
+def _charted(directory: Path, run: Run) -> Panel:
+    """The grid of a run, with what is known of the truth."""
+    grid = read_grid(directory / "grid.npz")
+    if run.truth is None or not (directory / "arena.npz").exists():
+        return Panel(directory.name, "", grid)
+    truth, start = read_truth(directory / "arena.npz")
+    told = GridScore.model_validate_json((directory / "gridscore.json").read_text(encoding="utf-8"))
+    paths = Paths(between(start, run.truth), run.online, run.odometry)
+    return Panel(directory.name, headline(told), grid, truth.segments, paths)
 
 
 def redraw(directory: Path) -> None:

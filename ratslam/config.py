@@ -11,16 +11,19 @@ from pydantic import Field, NonNegativeInt, ValidationInfo, field_validator
 from evaluation.exm import ExmConfig
 from ratslam.experience import ExperienceConfig
 from ratslam.framesettings import FrameMapConfig
+from ratslam.gridsettings import GridConfig
 from ratslam.places import PlaceConfig
 from ratslam.posecells import PoseCellConfig
 from ratslam.rat import RatConfig
 from ratslam.recall import RecallConfig
 from ratslam.templates import TemplateConfig
+from robot.extent import extent
 from robot.formats import RecordingConfig
 from robot.log import Log
+from robot.roving import RovingConfig
 from robot.sensing import head_of
 from robot.simulation import SimulationConfig
-from robot.source import Source
+from robot.source import Source, rig_of
 from tactile.frontend import TouchConfig
 from tactile.settings import Settings
 
@@ -43,6 +46,13 @@ TOUCH: dict[str, dict[str, Any]] = {
 }
 """What is set for sessions with whiskers unless the configuration says otherwise: the odometry of Salman &
 Pearson's arm (2016, III-C), images of which many look alike, and so all runs weighed against each other."""
+
+ARM: dict[str, dict[str, Any]] = {
+    "grid": {"body": 0.0, "drift": {"run": 0.0, "move": 0.0, "step": 0.27, "heading": 2e-3}}
+}
+"""The same for the grid filter: an arm stands nowhere, and errs anew in each sample."""
+MARGIN = 1.15, 0.6
+"""A map covers so many times what odometry covers, for its drift, and so much more, for whiskers, m."""
 
 
 class SessionConfig(Settings):
@@ -69,13 +79,17 @@ class RunConfig(Settings):
     """A run: `python -m ratslam run config.yaml`."""
 
     recording: RecordingConfig | None = None
-    """What to run on: a recording, or the `simulation` below."""
-    simulation: Annotated[SimulationConfig | None, Field(validate_default=True)] = None
-    """A session to simulate and run on."""
+    """What to run on: a recording, or a session simulated as one of the two below say."""
+    simulation: SimulationConfig | None = None
+    """Of an arm with a whisker head in a maze."""
+    roving: Annotated[RovingConfig | None, Field(validate_default=True)] = None
+    """Of a whiskered Create in an arena."""
     touch: TouchConfig = TouchConfig()
     """How whiskers become views."""
-    backend: Literal["rat"] = "rat"
-    """The method."""
+    backend: Literal["rat", "grid"] = "rat"
+    """The method: RatSLAM, or the grid particle filter."""
+    grid: GridConfig = GridConfig()
+    """The grid particle filter."""
     matcher: Literal["recall", "classic"] = "recall"
     """`recall`: the unified filter and the frame map; `classic`: winner takes all, as RatSLAM does."""
     pose_cells: PoseCellConfig = PoseCellConfig()
@@ -97,15 +111,15 @@ class RunConfig(Settings):
     score: ScoreConfig = ScoreConfig()
     """Judgement."""
 
-    @field_validator("simulation", mode="after")
+    @field_validator("roving", mode="after")
     @classmethod
-    def _one_source(
-        cls, simulation: SimulationConfig | None, info: ValidationInfo
-    ) -> SimulationConfig | None:
-        if "recording" in info.data and (info.data["recording"] is None) == (simulation is None):
-            there = "neither recording nor" if simulation is None else "both recording and"
-            raise ValueError(f"{there} simulation; give one of them, and null for the other")
-        return simulation
+    def _one_source(cls, roving: RovingConfig | None, info: ValidationInfo) -> RovingConfig | None:
+        sources = {name: info.data.get(name) for name in ("recording", "simulation")} | {"roving": roving}
+        given = [name for name, source in sources.items() if source is not None]
+        if "recording" in info.data and "simulation" in info.data and len(given) != 1:
+            there = " and ".join(given) if given else "neither recording, simulation nor roving"
+            raise ValueError(f"{there}; give one of these three, and null for the others")
+        return roving
 
     def rat(self) -> RatConfig:
         """The rat backend's part."""
@@ -130,9 +144,19 @@ class RunConfig(Settings):
         if "source" not in self.templates.model_fields_set and ids_only:
             parts["templates"] = self.templates.model_copy(update={"source": "labels"})
         completed = self.model_copy(update=parts)
+        if completed.backend == "grid":
+            return completed._charted(source)
         if source.whiskers and ("fan" not in self.recall.model_fields_set or self.recall.fan == "whiskers"):
             return _filled(completed, TOUCH)
         return completed
+
+    def _charted(self, source: Source) -> RunConfig:
+        """The same, with what the grid filter should know of the source."""
+        completed = self if "roving" in rig_of(source) else _filled(self, ARM)
+        if completed.grid.side is not None or source.length is None:
+            return completed
+        share, more = MARGIN
+        return _filled(completed, {"grid": {"side": round(2 * (share * extent(source) + more), 2)}})
 
 
 def _filled(settings: Any, values: dict[str, Any]) -> Any:

@@ -17,37 +17,30 @@ import numpy as np
 from tqdm import tqdm
 
 from evaluation.energy import read_relations
-from evaluation.images import Images, write_images
 from evaluation.report import pictures
-from evaluation.rundirectory import read_run, write_walls
+from evaluation.rundirectory import read_run
 from evaluation.scorecard import Scorecard, score
 from evaluation.trajectory import Anytime, present_error, summary, write_tum
+from ratslam.backends import Telling, backend_of, telling
 from ratslam.config import RunConfig
-from ratslam.posecells import Outcome
-from ratslam.recallrat import evidence_of, rat
+from ratslam.keeping import Felt, keep_chart, keep_images, keep_world
 from ratslam.session import CHUNK, Session, Step
 from ratslam.storage import RunDirectory, read_checkpoint
 from ratslam.types import Action
 from ratslam.yamlfile import dump
 from robot.formats import open_recording
-from robot.maze import read_maze, walls
 from robot.recorder import Recorder
-from robot.scene import MazeConfig
-from robot.sensing import calibration_of, observation_of, sensing
+from robot.roving import roving
+from robot.sensing import calibration_of, feelers_of, observation_of, sensing
 from robot.simulation import simulated
 from robot.source import Sample, Source, rig_of
 from tactile.errors import InputError
 from tactile.frames import compose, tum_line
-from tactile.frontend import Frontend, TouchConfig
-from tactile.head import ur10_head
-from tactile.streams import stream
-from tactile.types import Observation
+from tactile.frontend import Frontend
+from tactile.types import Cycle, Observation, Whisk
 
 CHECKPOINT_EVERY = 128 * CHUNK
 """Steps between checkpoints: a kill loses no line, but a continued run repeats at most these."""
-
-_Felt = tuple[np.ndarray, np.ndarray]
-"""A whisker image: brightness [R, C, K], and which whiskers [W] report at all."""
 
 
 def run(
@@ -73,17 +66,19 @@ def run(
         session = session_of(config, source)
         skip = _resume(session, resume, source.digest) if resume else 0
         _check_length(source, skip, resume)
-        with RunDirectory(directory, _told(evidence_of(config.matcher))) as store:
+        told = telling(config)
+        with RunDirectory(directory, list(told.columns)) as store:
             text = dump(config)
             store.text("config.yaml", text)
             manifest = _manifest(config, text, source, resume)
             store.manifest(manifest | {"status": "running"})
-            _keep_maze(source, store)
-            felt: list[_Felt] = []
-            interrupted = _play(session, source, skip, store, felt)
+            keep_world(source, store)
+            felt: list[Felt] = []
+            interrupted = _play(session, source, skip, store, felt, told)
             done = {"status": "interrupted" if interrupted else "complete", "steps": session.steps}
             _finish(session, store, source.digest)
-            _keep_images(felt, config.touch, store)
+            keep_images(felt, config.touch, store)
+            keep_chart(source, store)
             card = score(
                 read_run(directory), directory.name, exm=config.score.experience_metric, relations=relations
             )
@@ -104,10 +99,10 @@ def simulate(config: RunConfig, folder: Path, path: Path) -> tuple[int, bool]:
         InputError: there is nothing to simulate, it cannot be simulated, or the file exists.
     """
     config = located(config, folder.resolve())
-    if config.simulation is None:
+    if config.simulation is None and config.roving is None:
         raise InputError("simulation", "missing", "what to simulate", "`simulation: {}` is a whole session")
     source = open_source(config, _tell)
-    frontend = Frontend(config.touch, calibration_of(source))
+    keep = _kept(config, source)
     recorder = Recorder(
         path,
         view_shape=source.view_shape,
@@ -119,12 +114,24 @@ def simulate(config: RunConfig, folder: Path, path: Path) -> tuple[int, bool]:
     bar = tqdm(source, unit="whisk", desc=source.name, file=sys.stderr, mininterval=0.5, total=source.length)
     with recorder, bar, _interrupts("closing the file") as interrupted:
         for sample in bar:
-            if not config.simulation.raw and not isinstance(sample.reading, Observation):
-                sample = sample._replace(reading=frontend.felt(sample.reading))
-            recorder.write(sample)
+            recorder.write(keep(sample))
             if interrupted():
                 break
         return recorder.count, interrupted()
+
+
+def _kept(config: RunConfig, source: Source) -> Callable[[Sample], Sample]:
+    """What of a simulated sample goes into a recording: what whiskers felt, unless raw samples are wanted."""
+    if config.simulation is None or config.simulation.raw:
+        return lambda sample: sample
+    frontend = Frontend(config.touch, calibration_of(source))
+
+    def felt(sample: Sample) -> Sample:
+        if not isinstance(sample.reading, Cycle | Whisk):
+            return sample
+        return sample._replace(reading=frontend.felt(sample.reading))
+
+    return felt
 
 
 def open_source(config: RunConfig, tell: Callable[[str], None] | None = None) -> Source:
@@ -137,6 +144,8 @@ def open_source(config: RunConfig, tell: Callable[[str], None] | None = None) ->
     Raises:
         InputError: it cannot be read, or not be simulated.
     """
+    if config.roving is not None:
+        return roving(config.roving)
     if config.simulation is not None:
         session = simulated(config.simulation, config.touch.head)
         if tell is not None:
@@ -149,7 +158,7 @@ def open_source(config: RunConfig, tell: Callable[[str], None] | None = None) ->
 def session_of(config: RunConfig, source: Source) -> Session:
     """A fresh session for what a source gives."""
     return Session(
-        rat(config.rat(), source.view_shape, np.dtype(config.session.precision)),
+        backend_of(config, source.view_shape, feelers_of(source, config.touch)),
         seed=config.session.seed,
         reserve=config.session.reserve,
         precision=config.session.precision,
@@ -164,11 +173,14 @@ def located(config: RunConfig, folder: Path) -> RunConfig:
     parts = {
         "recording": config.recording and config.recording.resolved(folder),
         "simulation": config.simulation and config.simulation.resolved(folder),
+        "roving": config.roving and config.roving.resolved(folder),
     }
     return config.model_copy(update={**parts, "score": judgement})
 
 
-def _play(session: Session, source: Source, skip: int, store: RunDirectory, felt: list[_Felt]) -> bool:
+def _play(
+    session: Session, source: Source, skip: int, store: RunDirectory, felt: list[Felt], told: Telling
+) -> bool:
     """Replays the source into the store; returns whether the user interrupted.
 
     Args:
@@ -193,7 +205,7 @@ def _play(session: Session, source: Source, skip: int, store: RunDirectory, felt
                 odometry = compose(odometry, np.array([moved.dx, moved.dy, moved.dtheta]))
                 reckoned.append(odometry)
             truth += [np.full(3, np.nan) if s.truth is None else s.truth for s in chunk]
-            store.append(_lines(chunk, steps, reckoned))
+            store.append(_lines(chunk, steps, reckoned, told))
             error = present.see(session, truth)
             if error is not None:
                 store.append({"anytime.csv": iter([f"{float(chunk[-1].time)!r},{error!r}\n"])})
@@ -264,17 +276,19 @@ def readings(source: Source) -> Iterator[tuple[Sample, Observation]]:
     return ((sample, observation_of(sample)) for sample in source)
 
 
-def _lines(samples: list[Sample], steps: list[Step], reckoned: list[np.ndarray]) -> dict[str, Iterator[str]]:
+def _lines(
+    samples: list[Sample], steps: list[Step], reckoned: list[np.ndarray], told: Telling
+) -> dict[str, Iterator[str]]:
     rows = list(zip(samples, steps, strict=True))
     return {
-        "steps.csv": (_step_line(sample.time, step) for sample, step in rows),
+        "steps.csv": (_step_line(sample.time, step, told) for sample, step in rows),
         "online.tum": (tum_line(sample.time, step.pose) for sample, step in rows),
         "odometry.tum": (tum_line(s.time, pose) for s, pose in zip(samples, reckoned, strict=True)),
         "truth.tum": (tum_line(s.time, s.truth) for s in samples if s.truth is not None),
     }
 
 
-def _step_line(time: float, step: Step) -> str:
+def _step_line(time: float, step: Step, told: Telling) -> str:
     estimate = step.estimate
     cells = [
         repr(float(time)),
@@ -282,15 +296,10 @@ def _step_line(time: float, step: Step) -> str:
         Action(int(estimate.action)).name.lower(),
         *(repr(float(value)) for value in (*step.pose, *estimate.spread)),
         str(int(estimate.lost)),
-        Outcome(int(step.evidence.outcome)).name.lower(),
-        *(_cell(getattr(step.evidence, name)) for name in _told(type(step.evidence))),
+        told.outcomes(int(step.evidence.outcome)).name.lower(),
+        *(_cell(getattr(step.evidence, name)) for name in told.columns),
     ]
     return ",".join(cells) + "\n"
-
-
-def _told(evidence: Any) -> list[str]:
-    """The columns that a backend adds to steps.csv: what its evidence holds in single values."""
-    return [name for name in evidence._fields if name not in ("packet", "background", "outcome")]
 
 
 def _cell(value: Any) -> str:
@@ -306,38 +315,6 @@ def _finish(session: Session, store: RunDirectory, digest: str) -> None:
     store.file("trajectory.tum", lambda path: write_tum(path, time, final))
     for name, write in session.map.files().items():
         store.file(name, write)
-
-
-def _keep_maze(source: Source, store: RunDirectory) -> None:
-    """maze.txt and walls.csv, for the pictures, of a source that knows its maze."""
-    rig = rig_of(source)
-    if not isinstance(rig.get("maze"), str):
-        return
-    store.text("maze.txt", rig["maze"])
-    try:
-        made = MazeConfig.model_validate(rig["simulation"]["maze"])
-        seed = int(rig["simulation"]["seed"] if made.seed is None else made.seed)
-        random = stream(seed, "maze.heights")
-        boxes = walls(read_maze(store.path / "maze.txt"), random, made.heights)
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{source.name}: maze", str(error), "a maze as kept with a session") from None
-    store.file("walls.csv", lambda path: write_walls(path, np.column_stack(boxes)))
-
-
-def _keep_images(felt: list[_Felt], config: TouchConfig, store: RunDirectory) -> None:
-    """views.npz, for the pictures, of a source whose views are whisker images."""
-    head = ur10_head(config.head)
-    if not felt or felt[0][0].shape[:2] != head.shape or len(felt[0][1]) != len(head.length):
-        return
-    columns = head.shape[1]
-    images = Images(
-        view=np.array([view[..., 0] for view, _ in felt]),
-        alive=np.array([alive.reshape(head.shape) for _, alive in felt]),
-        azimuth=np.arctan2(head.rest[:columns, 1], head.rest[:columns, 0]),
-        length=head.length[::columns],
-        tallest=config.image.tallest,
-    )
-    store.file("views.npz", lambda path: write_images(path, images))
 
 
 def _resume(session: Session, path: Path, digest: str) -> int:

@@ -2,46 +2,73 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
 import numpy as np
 
+from robot.roving import RovingConfig
 from robot.source import Rigged, Sample, Source, rig_of
+from robot.training import trained
 from tactile.calibration import Calibration, arrays, from_arrays
 from tactile.errors import InputError
+from tactile.feelers import Feelers, swept
 from tactile.frontend import Frontend, TouchConfig
-from tactile.head import HeadConfig
+from tactile.head import HeadConfig, ur10_head
+from tactile.reports import Reporting, ReportsConfig
+from tactile.straintemplates import StrainTemplates
 from tactile.types import Observation
+
+TALLEST = 0.05
+"""Of the walls of micromouse mazes, m."""
+
+
+class Sense(Protocol):
+    """Turns readings, in their order, into observations.
+
+    Attributes:
+        view_shape: of the views. whiskers: W.
+    """
+
+    @property
+    def view_shape(self) -> tuple[int, int, int]: ...
+    @property
+    def whiskers(self) -> int: ...
+    def observed(self, reading: Any) -> Observation | None:
+        """What an engine is given; None if the reading is kept for the next one."""
 
 
 class Sensing:
     """A source whose readings are all observations.
 
     Args:
-        source: of whiskers, at least in part.
+        source: of whiskers, at least in part. sense: makes a sense that has felt nothing yet.
 
     Raises:
-        InputError: another number of whiskers than the head has.
+        InputError: another number of whiskers than the sense has.
     """
 
     whisked = False
 
-    def __init__(self, source: Source, frontend: Frontend) -> None:
-        if source.whiskers != frontend.whiskers:
+    def __init__(self, source: Source, sense: Callable[[], Sense]) -> None:
+        first = sense()
+        if source.whiskers != first.whiskers:
             raise InputError(
-                "touch.head", f"{frontend.whiskers} whiskers", f"{source.whiskers}, as {source.name} has"
+                "touch", f"{first.whiskers} whiskers", f"{source.whiskers}, as {source.name} has"
             )
-        self.source, self.frontend = source, frontend
+        self.source, self.sense = source, sense
         self.name, self.rate_hz, self.digest = source.name, source.rate_hz, source.digest
-        self.view_shape, self.whiskers, self.length = frontend.view_shape, source.whiskers, source.length
+        self.view_shape, self.whiskers, self.length = first.view_shape, source.whiskers, source.length
         self.rig: Mapping[str, Any] = rig_of(source)
         self.params: Mapping[str, Any] = getattr(source, "params", {})
 
     def __iter__(self) -> Iterator[Sample]:
+        sense = self.sense()
         for sample in self.source:
-            reading = self.frontend.observed(sample.reading)
+            reading = sense.observed(sample.reading)
+            if reading is None:
+                continue
             if reading.view.shape != self.view_shape:
                 raise InputError(
                     self.name, f"a view of shape {reading.view.shape}", f"{self.view_shape}, as of whiskers"
@@ -65,7 +92,12 @@ def sensing(source: Source, config: TouchConfig) -> Source:
     """
     if not isinstance(source, Rigged) or not source.whisked:
         return source
-    return Sensing(source, Frontend(config, calibration_of(source)))
+    if "roving" in source.rig:
+        reports = reports_of(source, config.reports)
+        templates = templates_of(source, reports)
+        return Sensing(source, lambda: Reporting(reports, templates))
+    frontend = Frontend(config, calibration_of(source))
+    return Sensing(source, lambda: frontend)
 
 
 def kept(calibration: Calibration) -> dict[str, Any]:
@@ -121,3 +153,46 @@ def observation_of(sample: Sample) -> Observation:
     if not isinstance(sample.reading, Observation):
         raise InputError("recording.file", "whiskers", "observations", "process the whiskers first")
     return sample.reading
+
+
+def feelers_of(source: Source, config: TouchConfig) -> Feelers | None:
+    """A source's whiskers as a map of the floor sees them; None of one without.
+
+    Raises:
+        InputError: it does not say what whiskers it has.
+    """
+    if not source.whiskers:
+        return None
+    if "roving" in rig_of(source):
+        return reports_of(source, config.reports).feelers
+    return swept(ur10_head(head_of(source, config.head)), TALLEST)
+
+
+def reports_of(source: Source, config: ReportsConfig) -> ReportsConfig:
+    """The settings with the whiskers of a source of reports, but for what is set.
+
+    Raises:
+        InputError: it does not say what whiskers it has.
+    """
+    whiskers = _roving(source).whiskers
+    found = {
+        "mounts": tuple((mount.x, mount.y, mount.direction_deg) for mount in whiskers.mounts),
+        "length": whiskers.length,
+    }
+    return config.model_copy(update={k: v for k, v in found.items() if k not in config.model_fields_set})
+
+
+def templates_of(source: Source, config: ReportsConfig) -> StrainTemplates | None:
+    """Strain templates of a simulated Create, driven into walls as it was made; None where none are asked for
+    or a file has them."""
+    if config.templates is not None or config.walls not in ("template", "fused"):
+        return None
+    return trained(_roving(source))
+
+
+def _roving(source: Source) -> RovingConfig:
+    made = {name: value for name, value in rig_of(source)["roving"].items() if name != "sha256"}
+    try:
+        return RovingConfig.model_validate(made)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{source.name}: roving", str(error), "a robot as kept with a session") from None

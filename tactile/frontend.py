@@ -7,8 +7,9 @@ from tactile.contact import ContactConfig, sensed
 from tactile.errors import InputError
 from tactile.head import HeadConfig, ur10_head
 from tactile.image import ImageConfig, observed, view_shape
+from tactile.reports import ReportsConfig
 from tactile.settings import Settings
-from tactile.types import Cycle, Observation, Whisk
+from tactile.types import Cycle, Observation, Report, Whisk
 
 
 class TouchConfig(Settings):
@@ -20,6 +21,8 @@ class TouchConfig(Settings):
     """From raw samples to contacts."""
     image: ImageConfig = ImageConfig()
     """From contacts to a view."""
+    reports: ReportsConfig = ReportsConfig()
+    """Of a Create: from reports of its steps to contacts and walls."""
 
 
 class Frontend:
@@ -53,8 +56,14 @@ class Frontend:
         alive = reading.alive & self.head.alive
         return reading._replace(alive=alive, contact=reading.contact & alive, held=reading.held & alive)
 
-    def observed(self, reading: Observation | Cycle | Whisk) -> Observation:
-        """What an engine is given; an observation stays as it is."""
+    def observed(self, reading: Observation | Cycle | Whisk | Report) -> Observation:
+        """What an engine is given; an observation stays as it is.
+
+        Raises:
+            InputError: the report of another robot.
+        """
         if isinstance(reading, Observation):
             return reading
+        if isinstance(reading, Report):
+            raise InputError("recording.file", "reports of a Create", "whisk cycles of a head")
         return observed(self.config.image, self.head, self.felt(reading))

@@ -139,8 +139,8 @@ def test_there_must_be_something_to_simulate(capsys, folder, tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("touch: {}\n", ["neither recording nor simulation"]),
-        ("recording: {file: a.npz}\nsimulation: {}\n", ["both recording and simulation"]),
+        ("touch: {}\n", ["neither recording, simulation nor roving"]),
+        ("recording: {file: a.npz}\nsimulation: {}\n", ["recording and simulation; give one"]),
         ("simulation: {sed: 1}\n", ["did you mean 'seed'"]),
         ("simulation: {path: {circuits: CA, explore: 3}}\n", ["circuits and explore", "exactly one"]),
         ("simulation: {maze: {file: none.txt}}\n", ["none.txt"]),

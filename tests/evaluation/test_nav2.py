@@ -13,13 +13,12 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
 from evaluation.grid import PRIOR, Grid
+from evaluation.gridfiles import read_grid, write_grid
 from evaluation.nav2 import (
     FREE_THRESH,
     OCCUPIED_THRESH,
-    read_grid,
     read_nav2,
     write_description,
-    write_grid,
     write_image,
     write_nav2,
 )

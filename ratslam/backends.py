@@ -1,0 +1,50 @@
+"""The methods by name: what a configuration asks for, made ready."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+
+from ratslam import gridfilter, posecells
+from ratslam.backend import Backend
+from ratslam.config import RunConfig
+from ratslam.gridfilter import GridEvidence, GridFilter
+from ratslam.recallrat import evidence_of, rat
+from tactile.errors import InputError
+from tactile.feelers import Feelers
+
+LIVE_SIDE = 2.5
+"""Side of a map of which nothing is known beforehand, m (Fox et al. 2012, II-D)."""
+ARRAYS = ("packet", "background", "ancestor", "poses", "weights")
+"""What evidence holds that is no single number."""
+
+
+class Telling(NamedTuple):
+    """How a backend's steps are written down: names of its single values, and its outcomes."""
+
+    columns: tuple[str, ...]
+    outcomes: type[IntEnum]
+
+
+def backend_of(config: RunConfig, view_shape: tuple[int, int, int], feelers: Feelers | None) -> Backend:
+    """The backend of a completed configuration for observations of that shape.
+
+    Raises:
+        InputError: it needs whiskers and there are none.
+    """
+    precision = np.dtype(config.session.precision)
+    if config.backend == "rat":
+        return rat(config.rat(), view_shape, precision)
+    if feelers is None:
+        raise InputError("backend", "grid, for a recording without whiskers", "rat, or a session of whiskers")
+    return GridFilter(config.grid, feelers, config.grid.side or LIVE_SIDE, precision)
+
+
+def telling(config: RunConfig) -> Telling:
+    """What each step reports."""
+    evidence = GridEvidence if config.backend == "grid" else evidence_of(config.matcher)
+    outcomes: type[IntEnum] = gridfilter.Outcome if config.backend == "grid" else posecells.Outcome
+    quiet = {*ARRAYS, "outcome"}
+    return Telling(tuple(name for name in evidence._fields if name not in quiet), outcomes)

@@ -1,0 +1,325 @@
+"""SLAM by a grid particle filter: each particle carries a pose, its own map, and a belief of the odometry.
+
+After Fox et al. 2012, Algorithm 1. What makes it work beyond the paper is ours: odometry errors that last are
+part of the state, unexplored space says nothing, and walls are expected to run on as they did.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from ratslam import likelihoods, occupancy, particles, stamps
+from ratslam.gridmap import GridMap
+from ratslam.gridsettings import GridConfig
+from ratslam.occupancy import COSINE, EVIDENCE, SINE
+from ratslam.particles import Particles
+from ratslam.types import Action, Estimate
+from tactile.feelers import Feelers
+from tactile.types import Array, Motion, Observation, Odometry
+
+FREE = (0.2, 0.5, 0.8)
+"""Where along a whisker that meets nothing the map is told so, as shares of its length."""
+RIM = 4
+"""Points on the robot's rim that the map is asked about, besides its middle."""
+SEGMENTS = 5
+"""Of a whisker, for eq. 2."""
+REACH = 2.5
+"""Standard deviations of a stamp that are drawn."""
+WALL, COMPASS = 100.0, 40.0
+"""Largest precision of a wall's direction against the field there, and against all walls."""
+
+
+class Outcome(IntEnum):
+    """How a step of the filter went."""
+
+    OK = 0
+    RESAMPLED = 1
+    """Particles were drawn anew."""
+    VANISHED = 2
+    """No particle explains what was felt; the weights were left as they were."""
+    OUTSIDE = 3
+    """What was felt lies outside the map, at least for some particles; there it is forgotten."""
+    NOT_FINITE = 4
+    """Odometry or contacts were NaN or infinite and were taken as no motion and no contact."""
+
+
+class State(NamedTuple):
+    """All that the filter remembers.
+
+    Attributes:
+        maps: [N, layers, S, S]. compass: [N, 2] sums of unit vectors of four times each wall's direction.
+        motion: the last report's `Motion`. touched: [W] its contacts. key: data of the random stream's key.
+    """
+
+    particles: Particles
+    maps: Array
+    compass: Array
+    motion: Array
+    touched: Array
+    key: Array
+
+
+class GridEvidence(NamedTuple):
+    """What one step adds to the map and to the record.
+
+    Attributes:
+        ancestor: [N] int32, whom each particle is a copy of. poses: [N, 3] and weights: [N] before copies
+            were made. effective: how many particles these are worth. outcome: an `Outcome`, int32.
+    """
+
+    ancestor: Array
+    poses: Array
+    weights: Array
+    effective: Array
+    outcome: Array
+
+
+class Felt(NamedTuple):
+    """An observation as the filter takes it.
+
+    Attributes:
+        told: bool, it counts as evidence. free: [W] bool, whiskers that meet nothing. new: [W] bool, that
+            meet something and did not before. touching: [W] bool. point: [W, 2] m, where. wall: bool.
+            on_wall: [2] m, the contact upon the wall. direction: of the wall, rad. sd: of that, rad.
+    """
+
+    told: Array
+    free: Array
+    new: Array
+    touching: Array
+    point: Array
+    wall: Array
+    on_wall: Array
+    direction: Array
+    sd: Array
+
+
+class GridFilter:
+    """The backend.
+
+    Args:
+        feelers: the whiskers of the observations. side: of the map, m. dtype: of all floating state.
+    """
+
+    def __init__(self, config: GridConfig, feelers: Feelers, side: float, dtype: Any = np.float64) -> None:
+        self.config, self.feelers, self.dtype = config, feelers, np.dtype(dtype)
+        self.side = int(np.ceil(side / config.cell))
+        self.whiskers = len(feelers.length)
+        self.free = feelers.points(np.array(FREE)).reshape(-1, 2).astype(self.dtype)
+        self.shafts = feelers.points((1 + np.arange(SEGMENTS)) / SEGMENTS).reshape(-1, 2).astype(self.dtype)
+        angle = np.arange(RIM) * 2 * np.pi / RIM
+        rim = 0.85 * config.body * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        self.body = np.concatenate([np.zeros((1, 2)), rim]).astype(self.dtype)
+        self.blob_sd = config.stamps.blob_sd / config.cell
+        self.wide = int(np.ceil(2 * REACH * config.stamps.along / config.cell)) + 2
+
+    def init(self, key: Array, capacity: int) -> State:
+        """All particles at the origin of an empty map. Nothing grows, so `capacity` is not used."""
+        del capacity
+        count = self.config.particles
+        first, key = jax.random.split(key)
+        return State(
+            particles.start(self.config.drift, first, count, self.dtype),
+            occupancy.blank(count, self.side, self.dtype),
+            jnp.zeros((count, 2), self.dtype),
+            jnp.int32(Motion.OTHER),
+            jnp.zeros(self.whiskers, bool),
+            jax.random.key_data(key),
+        )
+
+    def grow(self, state: State, capacity: int) -> State:
+        """The same: nothing grows."""
+        del capacity
+        return state
+
+    def inform(self, state: State, guidance: Any) -> State:
+        """The same: the filter asks nothing of its map."""
+        del guidance
+        return state
+
+    def kernel(self, state: State, observation: Observation) -> tuple[State, Estimate, GridEvidence]:
+        """Move, weigh, draw anew, leave a mark."""
+        key, draw, pick, jitter = jax.random.split(jax.random.wrap_key_data(state.key), 4)
+        odometry, felt, clean = self._taken(state, observation)
+        motion = jnp.asarray(observation.motion, jnp.int32)
+        swarm = particles.moved(self.config.drift, state.particles, odometry, motion != state.motion, draw)
+        swarm, vanished = particles.weighed(swarm, self._likelihood(state, swarm.pose, felt))
+        share = particles.shares(swarm.weight)
+        worth = particles.effective(share)
+        pose, spread = particles.mean(swarm.pose, share)
+        poses = swarm.pose
+
+        swarm, who = self._drawn(swarm, share, worth, felt.told, pick, jitter)
+        maps = particles.copied_rows(state.maps, who)
+        compass = state.compass[who.ancestor]
+        maps, compass, outside = self._marked(maps, compass, swarm.pose, felt)
+
+        outcome = jnp.where(who.copies > 0, Outcome.RESAMPLED, Outcome.OK)
+        outcome = jnp.where(outside, Outcome.OUTSIDE, outcome)
+        outcome = jnp.where(vanished, Outcome.VANISHED, outcome)
+        outcome = jnp.where(clean, outcome, Outcome.NOT_FINITE).astype(jnp.int32)
+        place = jnp.int32(-1)  # a grid has none
+        estimate = Estimate(pose, spread, place, place, jnp.int32(Action.NONE), vanished)
+        evidence = GridEvidence(who.ancestor, poses, share, worth, outcome)
+        touched = jnp.where(felt.told, felt.touching, False)
+        after = State(swarm, maps, compass, motion, touched, jax.random.key_data(key))
+        return after, estimate, evidence
+
+    def new_map(self) -> GridMap:
+        """An empty map."""
+        return GridMap(self.config, self.feelers, self.side)
+
+    def _taken(self, state: State, observation: Observation) -> tuple[Odometry, Felt, Array]:
+        """Odometry and contacts with anything that is not a number masked, and whether nothing was."""
+        odometry = Odometry(*(jnp.asarray(value, self.dtype) for value in observation.odometry))
+        moves = jnp.stack(odometry[:3])
+        fine = jnp.all(jnp.isfinite(moves))
+        dx, dy, dtheta = jnp.where(fine, moves, 0.0)
+        point = jnp.asarray(observation.point, self.dtype)
+        placed = jnp.all(jnp.isfinite(point), axis=1)
+        touching = jnp.asarray(observation.contact) & observation.alive & placed
+        clean = fine & jnp.all(placed | ~observation.contact)
+
+        turning = observation.motion == Motion.TURN
+        told = observation.motion != Motion.BACK
+        # Whiskers that whisk touch anew each time; fixed ones go on touching what they have met.
+        fresh = ~state.touched | (observation.motion == Motion.OTHER)
+        foot = jnp.asarray(observation.wall_point, self.dtype)
+        away = jnp.hypot(foot[0], foot[1])
+        wall = observation.wall & told & (away > 1e-6) & jnp.isfinite(away) & jnp.any(touching)
+        normal = jnp.where(wall, foot / jnp.where(wall, away, 1.0), jnp.zeros(2, self.dtype))
+        among = touching.astype(self.dtype)
+        point = jnp.where(touching[:, None], point, 0.0)
+        middle = among @ point / jnp.maximum(jnp.sum(among), 1.0)
+        felt = Felt(
+            told=told,
+            free=told & observation.alive & ~observation.contact,
+            new=told & touching & fresh & ~turning,
+            touching=touching,
+            point=point,
+            wall=wall,
+            on_wall=middle + normal * (jnp.where(wall, away, 0.0) - normal @ middle),
+            direction=jnp.arctan2(normal[1], normal[0]) + np.pi / 2,
+            sd=jnp.where(wall, jnp.asarray(observation.wall_sd, self.dtype), 1.0),
+        )
+        return Odometry(dx, dy, dtheta, odometry.dt), felt, clean
+
+    def _likelihood(self, state: State, pose: Array, felt: Felt) -> Array:
+        config = self.config.likelihood
+        if config.model != "evidence":
+            return self._printed(state.maps, pose, felt)
+        points = jnp.concatenate([jnp.asarray(self.free), jnp.asarray(self.body)])
+        evidence = occupancy.read(state.maps, EVIDENCE, self._placed(pose, points))
+        shafts = jnp.repeat(felt.free, len(FREE))
+        body = jnp.broadcast_to(felt.told & (self.config.body > 0), len(self.body))
+        likelihood = likelihoods.free(config, evidence, jnp.concatenate([shafts, body]))
+        # Few reports tell of a contact: the rest is worked out for those alone.
+        return likelihood + lax.cond(
+            jnp.any(felt.new) | felt.wall,
+            lambda: self._met(state, pose, felt),
+            lambda: jnp.zeros_like(likelihood),
+        )
+
+    def _met(self, state: State, pose: Array, felt: Felt) -> Array:
+        """[N] log-likelihood of new contacts, and of a wall's direction: as the map has it there, and as
+        walls are at large."""
+        config = self.config.likelihood
+        evidence = occupancy.read(state.maps, EVIDENCE, self._placed(pose, felt.point))
+        likelihood = likelihoods.contact(config, evidence, felt.new)
+        place = self._placed(pose, felt.on_wall[None])
+        field = [occupancy.read(state.maps, layer, place) for layer in (COSINE, SINE)]
+        direction = pose[:, 2] + felt.direction
+        sharp = jnp.minimum(WALL, 1 / (4 * felt.sd**2))
+        aligned = likelihoods.direction(config, jnp.concatenate(field, axis=1), 2 * direction, sharp)
+        if config.compass:
+            sharp = jnp.minimum(COMPASS, 1 / (16 * felt.sd**2))
+            aligned += likelihoods.direction(config, state.compass, 4 * direction, sharp)
+        return likelihood + jnp.where(felt.wall, aligned, 0.0)
+
+    def _printed(self, maps: Array, pose: Array, felt: Felt) -> Array:
+        cell = jnp.round(self._placed(pose, jnp.asarray(self.shafts)))
+        evidence = occupancy.read(maps, EVIDENCE, cell)
+        shape = (len(pose), self.whiskers, SEGMENTS)
+        likelihood = likelihoods.printed(
+            self.config.likelihood, self.config.prior,
+            evidence.reshape(shape), cell.reshape(*shape, 2), felt.touching,
+        )  # fmt: skip
+        return jnp.where(felt.told, likelihood, 0.0)
+
+    def _drawn(
+        self, swarm: Particles, share: Array, worth: Array, told: Array, pick: Array, jitter: Array
+    ) -> tuple[Particles, particles.Drawn]:
+        config = self.config.resampling
+        needed = worth < config.effective * self.config.particles if config.when == "needed" else told
+
+        def anew() -> tuple[Particles, particles.Drawn]:
+            who = particles.drawn(config, share, pick)
+            return particles.copied(config, swarm, who, jitter), who
+
+        return lax.cond(needed, anew, lambda: (swarm, particles.spared(self.config.particles)))
+
+    def _marked(self, maps: Array, compass: Array, pose: Array, felt: Felt) -> tuple[Array, Array, Array]:
+        """Every particle's map with what was felt left in it; and whether any of it lies outside."""
+        config, cell = self.config.stamps, self.config.cell
+        middle = self._placed(pose, jnp.zeros((1, 2), self.dtype))
+        windows = occupancy.around(middle[:, 0], self.side)
+        amount = -config.free * jnp.repeat(felt.free, len(FREE)).astype(self.dtype)
+        place = occupancy.within(self._placed(pose, jnp.asarray(self.free)), windows)
+        stamp = stamps.blobs(place, amount, self.blob_sd, windows.size)
+        if self.config.body:
+            body = stamps.disc(occupancy.within(middle, windows)[:, 0], self.config.body / cell, windows.size)
+            stamp -= jnp.where(felt.told, config.body, 0.0) * body
+        maps = self._added(maps, EVIDENCE, windows, stamp)
+
+        met = jnp.any(felt.new) | (felt.wall & (config.wall != "blob"))
+        maps, compass = lax.cond(
+            met, lambda: self._met_marked(maps, compass, pose, felt), lambda: (maps, compass)
+        )
+        ends = self._placed(pose, felt.point)
+        beyond = jnp.any((ends < 0) | (ends > self.side - 1), axis=-1)
+        return maps, compass, jnp.any(beyond & felt.touching[None])
+
+    def _met_marked(self, maps: Array, compass: Array, pose: Array, felt: Felt) -> tuple[Array, Array]:
+        """With contacts and a wall drawn in."""
+        config, cell = self.config.stamps, self.config.cell
+        ends = self._placed(pose, felt.point)
+        windows = occupancy.around(self._placed(pose, jnp.zeros((1, 2), self.dtype))[:, 0], self.side)
+        amount = config.blob * felt.new.astype(self.dtype)
+        stamp = stamps.blobs(occupancy.within(ends, windows), amount, self.blob_sd, windows.size)
+        maps = self._added(maps, EVIDENCE, windows, stamp)
+        if config.wall == "blob":
+            return maps, compass
+        place = self._placed(pose, felt.on_wall[None])
+        windows = occupancy.around(place[:, 0], self.side, self.wide)
+        place = occupancy.within(place, windows)[:, 0]
+        direction = pose[:, 2] + felt.direction
+        if config.wall == "edge":
+            shape = stamps.fan(place, direction, config.along / cell, config.fan, windows.size)
+        else:
+            shape = stamps.edge(place, direction, config.along / cell, config.across / cell, windows.size)
+        shape = jnp.where(felt.wall, shape, 0.0)
+        maps = self._added(maps, EVIDENCE, windows, config.edge * shape)
+        for layer, part in ((COSINE, jnp.cos(2 * direction)), (SINE, jnp.sin(2 * direction))):
+            field = occupancy.cut(maps, windows, layer) + shape * part[:, None, None]
+            maps = occupancy.put(maps, windows, layer, field)
+        pointing = jnp.stack([jnp.cos(4 * direction), jnp.sin(4 * direction)], axis=1)
+        return maps, compass + jnp.where(felt.wall, pointing, 0.0)
+
+    def _added(self, maps: Array, layer: int, windows: occupancy.Windows, stamp: Array) -> Array:
+        most = self.config.stamps.most
+        evidence = jnp.clip(occupancy.cut(maps, windows, layer) + stamp, -most, most)
+        return occupancy.put(maps, windows, layer, evidence)
+
+    def _placed(self, pose: Array, points: Array) -> Array:
+        """[N, K, 2] points [K, 2] of base_link in cells of the map."""
+        c, s = jnp.cos(pose[:, 2:]), jnp.sin(pose[:, 2:])
+        right, up = points.T[:, None]
+        x = pose[:, :1] + c * right - s * up
+        y = pose[:, 1:2] + s * right + c * up
+        return occupancy.in_cells(jnp.stack([x, y], axis=2), self.config.cell, self.side)

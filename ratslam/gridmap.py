@@ -1,0 +1,110 @@
+"""The map of the grid filter: the path of the particles that survived, and what was felt drawn along it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import networkx
+import numpy as np
+
+from ratslam.ancestry import Ancestry
+from ratslam.gridsettings import GridConfig
+from ratslam.growing import Growing
+from ratslam.marks import Marks, draw
+from ratslam.types import Estimate
+from tactile.feelers import Feelers
+from tactile.types import Motion, Observation
+
+
+class GridMap:
+    """Folds what the grid filter reports (`ratslam.backend.Map`).
+
+    Args:
+        feelers: the whiskers of the observations. side: of the map, cells.
+    """
+
+    def __init__(self, config: GridConfig, feelers: Feelers, side: int) -> None:
+        self.config, self.feelers, self.side = config, feelers, side
+        whiskers = len(feelers.length)
+        self._ancestry = Ancestry(config.particles)
+        self._online = Growing((3,), np.float64)
+        self._motion = Growing((), np.int64)
+        self._flags = Growing((whiskers, 2), bool)  # in contact, reports at all
+        self._point = Growing((whiskers, 2), np.float64)
+        self._wall = Growing((2,), np.float64)  # its nearest point; NaN: none
+
+    def update(self, observation: Observation, estimate: Estimate, evidence: Any) -> Estimate:
+        """Keeps the particles and what was felt."""
+        self._ancestry.append(evidence.poses, evidence.weights, evidence.ancestor)
+        self._online.append(estimate.pose)
+        self._motion.append(int(observation.motion))
+        self._flags.append(np.stack([observation.contact, observation.alive], axis=1))
+        self._point.append(observation.point)
+        self._wall.append(observation.wall_point if observation.wall else [np.nan, np.nan])
+        return estimate
+
+    def guidance(self) -> None:
+        """The filter asks for nothing."""
+
+    def pose(self, estimate: Estimate) -> np.ndarray:
+        """[3] the weighted mean of the particles."""
+        return np.asarray(estimate.pose, float)
+
+    def trajectory(self) -> np.ndarray:
+        """[T, 3] the weighted mean of the paths of the particles that are left."""
+        return self._ancestry.path()
+
+    def so_far(self) -> np.ndarray:
+        """[T, 3] the same: it needs no settling."""
+        return self._ancestry.path()
+
+    def closures(self) -> np.ndarray:
+        """[0, 2]: a grid joins no steps."""
+        return np.zeros((0, 2), int)
+
+    def graph(self) -> networkx.DiGraph:
+        """Empty: a grid has no nodes."""
+        return networkx.DiGraph()
+
+    def occupancy(self) -> np.ndarray:
+        """[S, S] chance of an obstacle in each cell (rows are y, columns x; the robot started in the middle),
+        as Fox et al. 2012 draw it: wide stamps along the path."""
+        return draw(self.config, self.feelers, self.side, self.trajectory(), self._marks())
+
+    def files(self) -> dict[str, Callable[[Path], None]]:
+        """The map as arrays: probability [S, S], origin [2] m of its lower left corner, cell m."""
+        return {"grid.npz": self._write}
+
+    def _write(self, path: Path) -> None:
+        corner = np.full(2, -self.side * self.config.cell / 2)
+        np.savez_compressed(path, probability=self.occupancy(), origin=corner, cell=self.config.cell)
+
+    def _marks(self) -> Marks:
+        flags = self._flags.rows
+        told = self._motion.rows != Motion.BACK
+        return Marks(
+            told=told,
+            contact=flags[..., 0] & flags[..., 1] & told[:, None],
+            free=~flags[..., 0] & flags[..., 1] & told[:, None],
+            turning=self._motion.rows == Motion.TURN,
+            point=self._point.rows,
+            wall=self._wall.rows,
+        )
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Everything, so that `restore` continues bit for bit."""
+        return {name: rows.rows.copy() for name, rows in self._growing().items()} | {
+            f"ancestry/{name}": rows for name, rows in self._ancestry.arrays().items()
+        }
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """Takes the place of everything folded so far."""
+        for name, rows in self._growing().items():
+            rows.replace(arrays[name])
+        prefix = "ancestry/"
+        self._ancestry.restore({k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)})
+
+    def _growing(self) -> dict[str, Growing]:
+        return {name[1:]: value for name, value in vars(self).items() if isinstance(value, Growing)}

@@ -1,0 +1,82 @@
+"""What a run directory keeps of the world and of what was felt, for scores and pictures."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from evaluation.grid import Truth, centres
+from evaluation.gridfiles import read_grid, write_truth
+from evaluation.gridscore import score_grid
+from evaluation.images import Images, write_images
+from evaluation.nav2 import write_description, write_image
+from evaluation.rundirectory import write_walls
+from ratslam.storage import RunDirectory
+from robot.arena import enclosed, occupied, read_arena, segments
+from robot.maze import read_maze, walls
+from robot.scene import MazeConfig
+from robot.source import Source, rig_of
+from tactile.errors import InputError
+from tactile.frames import compose, inverse
+from tactile.frontend import TouchConfig
+from tactile.head import ur10_head
+from tactile.streams import stream
+
+Felt = tuple[np.ndarray, np.ndarray]
+"""A whisker image: brightness [R, C, K], and which whiskers [W] report at all."""
+
+
+def keep_world(source: Source, store: RunDirectory) -> None:
+    """maze.txt and walls.csv, for the pictures, of a source that knows its maze; arena.txt of one that knows
+    its arena."""
+    rig = rig_of(source)
+    if isinstance(rig.get("arena"), str):
+        store.text("arena.txt", rig["arena"])
+    if not isinstance(rig.get("maze"), str):
+        return
+    store.text("maze.txt", rig["maze"])
+    try:
+        made = MazeConfig.model_validate(rig["simulation"]["maze"])
+        seed = int(rig["simulation"]["seed"] if made.seed is None else made.seed)
+        random = stream(seed, "maze.heights")
+        boxes = walls(read_maze(store.path / "maze.txt"), random, made.heights)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{source.name}: maze", str(error), "a maze as kept with a session") from None
+    store.file("walls.csv", lambda path: write_walls(path, np.column_stack(boxes)))
+
+
+def keep_images(felt: list[Felt], config: TouchConfig, store: RunDirectory) -> None:
+    """views.npz, for the pictures, of a source whose views are whisker images."""
+    head = ur10_head(config.head)
+    if not felt or felt[0][0].shape[:2] != head.shape or len(felt[0][1]) != len(head.length):
+        return
+    columns = head.shape[1]
+    images = Images(
+        view=np.array([view[..., 0] for view, _ in felt]),
+        alive=np.array([alive.reshape(head.shape) for _, alive in felt]),
+        azimuth=np.arctan2(head.rest[:columns, 1], head.rest[:columns, 0]),
+        length=head.length[::columns],
+        tallest=config.image.tallest,
+    )
+    store.file("views.npz", lambda path: write_images(path, images))
+
+
+def keep_chart(source: Source, store: RunDirectory) -> None:
+    """map.pgm and map.yaml of a run whose map is a grid; with a known arena also arena.npz, what is really
+    there in the frame of the map, and gridscore.json."""
+    file = store.path / "grid.npz"
+    if not file.exists():
+        return
+    grid = read_grid(file)
+    store.file("map.pgm", lambda path: write_image(path, grid))
+    store.file("map.yaml", lambda path: write_description(path, grid))
+    if not (store.path / "arena.txt").exists():
+        return
+    arena = read_arena(store.path / "arena.txt")
+    place = centres(grid)
+    there = compose(arena.start, np.concatenate([place, np.zeros((*place.shape[:2], 1))], axis=2))[..., :2]
+    ends = segments(arena).reshape(-1, 2)
+    seen = compose(inverse(arena.start), np.column_stack([ends, np.zeros(len(ends))]))[:, :2]
+    truth = Truth(occupied(arena, there), enclosed(arena, there), seen.reshape(-1, 4))
+    store.file("arena.npz", lambda path: write_truth(path, truth, arena.start))
+    score = score_grid(grid, truth, store.path.name)
+    store.text("gridscore.json", score.model_dump_json(indent=2) + "\n")

@@ -1,0 +1,111 @@
+"""What was felt, drawn along a path: the maps of Fox et al. 2012, II-E and II-F.
+
+The three mappers are one: wherever a wall's direction is known an edge is drawn, elsewhere a blob. Each mark
+is a likelihood that is neutral, 0.5, far from where it was made (eq. 3 and 4 as printed fall to 0 there and
+would erase the map), and marks are added as log-odds.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import expit, logit
+
+from ratslam.gridsettings import DrawingConfig, GridConfig
+from tactile.feelers import Feelers
+from tactile.frames import compose
+
+FAR = 3.0
+"""Standard deviations beyond which a mark is left out."""
+
+
+class Marks(NamedTuple):
+    """T reports.
+
+    Attributes:
+        told: [T] bool, counts as evidence. contact, free: [T, W] bool. turning: [T] bool. point: [T, W, 2] m
+            in base_link. wall: [T, 2] m, its nearest point; NaN where none is known.
+    """
+
+    told: np.ndarray
+    contact: np.ndarray
+    free: np.ndarray
+    turning: np.ndarray
+    point: np.ndarray
+    wall: np.ndarray
+
+
+class _Mark(NamedTuple):
+    """One stamp: its middle [2] m, its chance there, and a wall's direction or NaN."""
+
+    place: np.ndarray
+    chance: float
+    sd: float
+    direction: float
+
+
+def draw(config: GridConfig, feelers: Feelers, side: int, path: np.ndarray, marks: Marks) -> np.ndarray:
+    """[S, S] chance of an obstacle.
+
+    Args:
+        side: S, cells. path: [T, 3] where each report was made, from the middle of the map.
+    """
+    drawing, cell = config.drawing, config.cell
+    evidence = np.zeros((side, side))
+    for mark in _marks(drawing, config.body, feelers, path, marks):
+        reach = FAR * (drawing.edge_sd if np.isfinite(mark.direction) else mark.sd)
+        place = mark.place / cell + (side - 1) / 2
+        low = np.clip(np.ceil(place - reach / cell).astype(int), 0, side)
+        high = np.clip(np.floor(place + reach / cell).astype(int) + 1, 0, side)
+        across, up = (np.arange(low[k], high[k]) * cell - place[k] * cell for k in (0, 1))
+        shape = _shape(drawing, mark, across[None, :], up[:, None])
+        rows = slice(low[1], high[1]), slice(low[0], high[0])
+        evidence[rows] += logit(0.5 + (mark.chance - 0.5) * shape)
+        np.clip(evidence[rows], -drawing.most, drawing.most, out=evidence[rows])
+    return expit(evidence + logit(config.prior))
+
+
+def _shape(config: DrawingConfig, mark: _Mark, across: np.ndarray, up: np.ndarray) -> np.ndarray:
+    away = across**2 + up**2
+    if not np.isfinite(mark.direction):
+        return np.exp(-away / (2 * mark.sd**2))
+    # Seen from the contact, modulo half a turn: the edge goes both ways.
+    off = np.mod(np.arctan2(up, across) - mark.direction + np.pi / 2, np.pi) - np.pi / 2
+    off = np.where(away > 0, off, 0.0)
+    return np.exp(-away / (2 * config.edge_sd**2) - off**2 / (2 * config.edge_fan**2))
+
+
+def _marks(
+    config: DrawingConfig, body: float, feelers: Feelers, path: np.ndarray, marks: Marks
+) -> list[_Mark]:
+    """All marks in the order they were made."""
+    middles = feelers.points(np.array([0.5]))[:, 0]
+    made: list[_Mark] = []
+    before = np.zeros(marks.contact.shape[1], bool)
+    pending: list[_Mark] = []
+    for k, pose in enumerate(path):
+        if not marks.told[k]:
+            made, pending, before = made + pending, [], np.zeros_like(before)
+            continue
+        for point in middles[marks.free[k]]:
+            made.append(_Mark(_at(pose, point), config.free, config.free_sd, np.nan))
+        if body:
+            made.append(_Mark(pose[:2], config.body, body, np.nan))
+        new = marks.contact[k] & ~before & ~marks.turning[k]
+        pending += [_Mark(_at(pose, p), config.contact, config.blob_sd, np.nan) for p in marks.point[k][new]]
+        foot = marks.wall[k]
+        if np.isfinite(foot).all() and marks.contact[k].any():
+            pending = []  # the edge says what these contacts were of
+            away = np.hypot(*foot)
+            normal = foot / away
+            middle = marks.point[k][marks.contact[k]].mean(axis=0)
+            place = _at(pose, middle + normal * (away - normal @ middle))
+            direction = pose[2] + np.arctan2(normal[1], normal[0]) + np.pi / 2
+            made.append(_Mark(place, config.contact, config.blob_sd, float(direction)))
+        before = marks.contact[k]
+    return made + pending
+
+
+def _at(pose: np.ndarray, point: np.ndarray) -> np.ndarray:
+    return compose(pose, np.array([*point, 0.0]))[:2]

@@ -1,0 +1,204 @@
+"""Arenas with walls all around and objects in them (Fox et al. 2012, II-C and fig. 2), as data and as text.
+
+As text: one thing a line, lengths in m, angles in degrees, `#` before comments.
+
+    outer 0 0  1.25 0  1.25 1.25  0 1.25    # corners of the walls, in order
+    square 0.6 0.7 0.2 30                   # middle, side, angle
+    polygon 1.25 0.5  1.05 0.6  1.25 0.7    # corners of any other object
+    start 0.3 0.3 90                        # of the robot, and its heading
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path as File
+from typing import NamedTuple
+
+import numpy as np
+
+from robot.files import read_bytes
+from robot.polygons import area, contains, crossing, distance, edges, square
+from tactile.errors import InputError
+
+FORMS = {
+    "outer": "outer x y x y x y ...",
+    "square": "square x y side angle",
+    "polygon": "polygon x y x y x y ...",
+    "start": "start x y heading",
+}
+NEEDED = {"outer": "the walls", "start": "where the robot starts"}
+ROOM = 0.17
+"""Radius of the robot that must fit at the start, m."""
+
+
+class Arena(NamedTuple):
+    """Attributes:
+    name: for reports. outer: [N, 2] corners of the walls, m. objects: of [M, 2], their corners.
+    start: [3] where the robot starts (x m, y m, heading rad).
+    """
+
+    name: str
+    outer: np.ndarray
+    objects: tuple[np.ndarray, ...]
+    start: np.ndarray
+
+
+def segments(arena: Arena) -> np.ndarray:
+    """[S, 4] x1, y1, x2, y2, m: every wall that can be touched."""
+    return np.vstack([edges(arena.outer), *(edges(polygon) for polygon in arena.objects)])
+
+
+def enclosed(arena: Arena, points: np.ndarray) -> np.ndarray:
+    """[...] bool, which points [..., 2] are within the outer walls, objects or not."""
+    return contains(arena.outer, points)
+
+
+def inside(arena: Arena, points: np.ndarray) -> np.ndarray:
+    """[...] bool, which points [..., 2] are in free space."""
+    free = enclosed(arena, points)
+    for polygon in arena.objects:
+        free &= ~contains(polygon, points)
+    return free
+
+
+def occupied(arena: Arena, centres: np.ndarray) -> np.ndarray:
+    """[...] bool, which cells with those centres [..., 2] are not free: in an object or beyond the walls."""
+    return ~inside(arena, centres)
+
+
+def fits(arena: Arena, places: np.ndarray, radius: float) -> np.ndarray:
+    """[...] bool, whether a disc of that radius (m) at places [..., 2] is all in free space."""
+    return inside(arena, places) & (distance(segments(arena), places).min(axis=-1) >= radius)
+
+
+def read_arena(path: File) -> Arena:
+    """An arena from a text file.
+
+    Raises:
+        InputError: what cannot be an arena; says where and why.
+    """
+    try:
+        lines = read_bytes(path).decode("utf-8").splitlines()
+    except UnicodeDecodeError as error:
+        raise InputError(str(path), f"is no text ({error})", "an arena") from None
+    read = [line for number, content in enumerate(lines, 1) if (line := _parsed(path, number, content))]
+    single: dict[str, _Line] = {}
+    for line in read:
+        if line.word in NEEDED and line.word in single:
+            raise InputError(line.places[0], f"another `{line.word}`", "one", "remove one of them")
+        single[line.word] = line
+    for word, meaning in NEEDED.items():
+        if word not in single:
+            raise InputError(str(path), f"no line `{word}`", f"`{FORMS[word]}`, {meaning}")
+    outer = _polygon(single["outer"])
+    objects: list[np.ndarray] = []
+    for line in read:
+        if line.word not in NEEDED:
+            polygon = _polygon(line)
+            _placed(line, polygon, outer, objects)
+            objects.append(polygon)
+    x, y, heading = single["start"].values
+    made = Arena(path.stem, outer, tuple(objects), np.array([x, y, np.radians(heading)]))
+    if not fits(made, made.start[:2], ROOM):
+        raise InputError(
+            single["start"].places[1],
+            f"a start at {x:g} {y:g} that is not free",
+            f"{ROOM:g} m of free space around it",
+            "move it away from walls and objects",
+        )
+    return made
+
+
+def text(arena: Arena) -> str:
+    """The arena as such a file; the inverse of `read_arena`."""
+
+    def line(word: str, values: np.ndarray) -> str:
+        return " ".join([word, *(repr(float(value)) for value in values)])
+
+    x, y, heading = arena.start
+    lines = [line("outer", arena.outer.ravel())]
+    lines += [line("polygon", polygon.ravel()) for polygon in arena.objects]
+    lines.append(line("start", np.array([x, y, np.degrees(heading)])))
+    return "\n".join(lines) + "\n"
+
+
+class _Line(NamedTuple):
+    """A line: its word, its numbers, and where each of them stands."""
+
+    word: str
+    values: np.ndarray
+    places: list[str]
+
+
+def _parsed(path: File, number: int, content: str) -> _Line | None:
+    """A line, or None where there is nothing on it."""
+    words = [(found[0], found.start() + 1) for found in re.finditer(r"\S+", content.split("#")[0])]
+    if not words:
+        return None
+    places = [f"{path}:{number}:{column}" for _, column in words]
+    word = words[0][0]
+    if word not in FORMS:
+        raise InputError(places[0], f"{word!r}", f"one of {', '.join(FORMS)}")
+    values = []
+    for (told, _), place in zip(words[1:], places[1:], strict=True):
+        try:
+            value = float(told)
+        except ValueError:
+            value = np.nan
+        if not np.isfinite(value):
+            raise InputError(place, f"{told!r}", "a number", f"`{FORMS[word]}`")
+        values.append(value)
+    count = len(values)
+    wanted = {"square": 4, "start": 3}.get(word)
+    if wanted is None and (count % 2 or count < 6):
+        raise InputError(places[0], f"{count} numbers", "three corners or more, two numbers each")
+    if wanted is not None and count != wanted:
+        raise InputError(places[0], f"{count} numbers", f"`{FORMS[word]}`")
+    if word == "square" and values[2] <= 0:
+        raise InputError(places[3], f"a side of {values[2]:g} m", "one above 0")
+    return _Line(word, np.array(values), places)
+
+
+def _polygon(line: _Line) -> np.ndarray:
+    """Its corners, checked to bound something."""
+    if line.word == "square":
+        return square(line.values[:2], line.values[2], np.radians(line.values[3]))
+    corners = line.values.reshape(-1, 2)
+    sides = edges(corners)
+    short = np.hypot(*(sides[:, 2:] - sides[:, :2]).T) < 1e-9
+    if short.any():
+        again = (int(np.argmax(short)) + 1) % len(corners)
+        raise InputError(
+            line.places[1 + 2 * again],
+            "the same corner twice in a row",
+            "corners apart from one another",
+            "leave it out: the last corner is joined to the first by itself",
+        )
+    crosses = np.argwhere(crossing(sides, sides))
+    if len(crosses):
+        one, other = sorted(crosses[0].tolist())
+        raise InputError(
+            line.places[1 + 2 * one],
+            f"walls that cross: side {one + 1} and side {other + 1}",
+            "corners in order around what they bound",
+        )
+    if abs(area(corners)) < 1e-9:
+        raise InputError(line.places[0], "corners in one line", "walls that bound something")
+    return corners
+
+
+def _placed(line: _Line, polygon: np.ndarray, outer: np.ndarray, others: list[np.ndarray]) -> None:
+    """Refuses an object that is not in the arena, or not by itself."""
+    middle = (polygon + np.roll(polygon, -1, axis=0)) / 2
+    probe = np.vstack([polygon, middle]) * (1 - 1e-6) + polygon.mean(axis=0) * 1e-6  # may touch the wall
+    if crossing(edges(polygon), edges(outer)).any() or not contains(outer, probe).all():
+        raise InputError(line.places[0], "an object outside the walls", "objects within `outer`")
+    for number, other in enumerate(others, 1):
+        over = crossing(edges(polygon), edges(other)).any()
+        if over or contains(other, probe).any() or contains(polygon, other.mean(axis=0)[None]).any():
+            raise InputError(
+                line.places[0],
+                f"an object over object {number}",
+                "objects apart from one another",
+                "move one of them",
+            )

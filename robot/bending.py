@@ -1,0 +1,184 @@
+"""How a fixed, tapered whisker bends where its straight shaft would enter a wall: statics, in closed form.
+
+A whisker gives way by the smallest turn about its base that frees it, and keeps to that side for as long as
+it touches. It is then held at a point of its shaft: by the tip sliding on a wall, by a wall that it lies
+along, or by the corner of an object. It slips off, and springs back, as soon as it would be free straight.
+
+Beam theory for a cone, exact for small turns: radius r0 (1 - k x) at x along the shaft. A turn of the line
+from base to contact at a by an angle takes the base moment 3 E I (1 / a - k) times it, and there the shaft
+has turned by (3 - 2 k a) / (2 (1 - k a)) times it. A shaft cannot turn into a wall: from where its tip would
+lie flat on, the contact moves towards the base. That this line gets shorter by bending is left out.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+CHAIN = 4
+"""Walls, one beginning where the other ends, that a whisker may have to get clear of."""
+TOUCHING = 1e-9
+"""Turn under which two walls count as joined, rad."""
+HALVINGS = 24
+"""Of the stretch in which the contact with a wall is looked for: to 10 nm."""
+
+
+class Shaft(NamedTuple):
+    """Attributes:
+    length: m. radius: at its base, m. taper: k, 1/m.
+    """
+
+    length: float
+    radius: float
+    taper: float
+
+
+class Bent(NamedTuple):
+    """Whiskers [T, W] as they are bent; where free, zero, and the reach is the length.
+
+    Attributes:
+        turn: of the line from base to contact, rad, counter-clockwise. reach: length of it, m.
+        lean: of that line against a perpendicular push, rad: the wall pushes along the shaft with the tangent
+            of it times what it pushes across. side: 1 counter-clockwise, -1 clockwise, 0 free.
+    """
+
+    turn: np.ndarray
+    reach: np.ndarray
+    lean: np.ndarray
+    side: np.ndarray
+
+    def at(self, row: int) -> Bent:
+        """One row, as one of one."""
+        return Bent(*(column[row : row + 1] for column in self))
+
+
+def base_strain(shaft: Shaft, turn: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """Surface strain at the base, signed as the turn: M r0 / (E I)."""
+    return 3 * shaft.radius * (1 / reach - shaft.taper) * turn
+
+
+def tilt(shaft: Shaft, reach: np.ndarray) -> np.ndarray:
+    """Turn of the shaft at the contact over that of the line from base to contact."""
+    narrow = shaft.taper * reach
+    return (3 - 2 * narrow) / (2 * (1 - narrow))
+
+
+def bent(
+    shaft: Shaft, base: np.ndarray, direction: np.ndarray, segments: np.ndarray, side: np.ndarray
+) -> Bent:
+    """Whiskers among walls.
+
+    Args:
+        base: [T, W, 2] m, where they are mounted, in order of time. direction: [T, W] rad, straight ones.
+        segments: [S, 4] m. side: [W] as in `Bent`, before the first row.
+    """
+    free, no_side = np.zeros(direction.shape), np.zeros(direction.shape, int)
+    nothing = Bent(free, free + shaft.length, free, no_side)
+    if not len(segments):
+        return nothing
+    low, high = _shadows(shaft, base, direction, segments)
+    blocked = np.any((low.angle < 0) & (high.angle > 0), axis=-1)
+    if not blocked.any():
+        return nothing
+    row, whisker = np.nonzero(blocked)
+    low, high = (_Ends(*(column[row, whisker] for column in ends)) for ends in (low, high))
+    left = _cleared(low, high)
+    right = _cleared(_mirrored(high), _mirrored(low))
+    easier = no_side.copy()
+    easier[row, whisker] = np.where(left.angle <= right.angle, 1, -1)
+    sides = _kept(blocked, easier, side)
+    way = sides[row, whisker]
+    chosen = _Ends(*(np.where(way > 0, a, b) for a, b in zip(left, right, strict=True)))
+    turn, reach, lean = (free.copy() for _ in range(3))
+    reach += shaft.length
+    angle, reach[row, whisker], lean[row, whisker] = _held(shaft, chosen)
+    turn[row, whisker] = way * angle
+    return Bent(turn, reach, lean, sides)
+
+
+class _Ends(NamedTuple):
+    """One end of the angles at which a whisker would touch a wall: the angle, rad; how far from the base it
+    would, m; how far the wall's nearest point in reach is, and the wall's line, m."""
+
+    angle: np.ndarray
+    radius: np.ndarray
+    near: np.ndarray
+    away: np.ndarray
+
+
+def _shadows(
+    shaft: Shaft, base: np.ndarray, direction: np.ndarray, segments: np.ndarray
+) -> tuple[_Ends, _Ends]:
+    """[T, W, S] The lower and upper ends of the directions, from the straight one, that walls block. Where a
+    wall is out of reach the lower end is above the upper one."""
+    c, s = np.cos(direction)[..., None], np.sin(direction)[..., None]
+    x, y = segments[:, 0] - base[..., :1], segments[:, 1] - base[..., 1:]
+    u, v = segments[:, 2] - segments[:, 0], segments[:, 3] - segments[:, 1]
+    x, y, u, v = c * x + s * y, c * y - s * x, c * u + s * v, c * v - s * u
+    # The part of each wall within a whisker's length of the base.
+    square, middle = u * u + v * v, -(x * u + y * v)
+    inner = middle**2 - square * (x * x + y * y - shaft.length**2)
+    half = np.sqrt(np.maximum(inner, 0.0))
+    first, last = np.maximum((middle - half) / square, 0.0), np.minimum((middle + half) / square, 1.0)
+    there = (inner > 0) & (first < last)
+    x1, y1, x2, y2 = x + first * u, y + first * v, x + last * u, y + last * v
+    away = np.abs(x * v - y * u) / np.sqrt(square)
+    start = np.arctan2(y1, x1)
+    # Seen from the base a wall spans less than half a turn.
+    span = np.arctan2(x1 * y2 - y1 * x2, x1 * x2 + y1 * y2)
+    one, two = np.hypot(x1, y1), np.hypot(x2, y2)
+    foot = middle / square
+    near = np.where((first < foot) & (foot < last), away, np.minimum(one, two))
+    up = span >= 0
+    low = np.where(there, start + np.minimum(span, 0.0), np.inf)
+    high = np.where(there, start + np.maximum(span, 0.0), -np.inf)
+    return _Ends(low, np.where(up, one, two), near, away), _Ends(high, np.where(up, two, one), near, away)
+
+
+def _mirrored(ends: _Ends) -> _Ends:
+    return ends._replace(angle=-ends.angle)
+
+
+def _cleared(low: _Ends, high: _Ends) -> _Ends:
+    """[K] The end at which whiskers, all blocked, get clear counter-clockwise; from ends [K, S]."""
+    angle = np.zeros(len(low.angle))
+    for _ in range(CHAIN):
+        joined = low.angle <= angle[:, None] + TOUCHING
+        angle = np.maximum(angle, np.where(joined, high.angle, 0.0).max(axis=1))
+    # Of walls that end together (a corner) the nearest holds it.
+    last = np.abs(high.angle - angle[:, None]) <= TOUCHING
+    which = np.argmin(np.where(last, high.radius, np.inf), axis=1)[:, None]
+    radius, near, away = (np.take_along_axis(column, which, axis=1)[:, 0] for column in high[1:])
+    return _Ends(angle, radius, near, away)
+
+
+def _kept(blocked: np.ndarray, easier: np.ndarray, side: np.ndarray) -> np.ndarray:
+    """[T, W] The side of each whisker: the easier one when it is first touched, then that one."""
+    was = np.vstack([side != 0, blocked[:-1]])
+    row = np.arange(len(blocked))[:, None]
+    onset = np.maximum.accumulate(np.where(blocked & ~was, row, -1), axis=0)
+    since = np.where(onset >= 0, np.take_along_axis(easier, np.maximum(onset, 0), axis=0), side)
+    return np.where(blocked, since, 0)
+
+
+def _held(shaft: Shaft, end: _Ends) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """[K] turn, reach and lean of whiskers held at that end."""
+    turn, reach = end.angle.copy(), end.radius.copy()
+    tip = end.radius >= shaft.length * (1 - 1e-9)
+    away = np.minimum(end.away, reach * (1 - 1e-12))
+    slant = np.arcsin(away / reach)  # between the line to the contact and the wall
+    lean = np.where(tip, slant, (tilt(shaft, reach) - 1) * turn)
+    flat = np.flatnonzero(tip & ((tilt(shaft, reach) - 1) * turn > slant))
+    if len(flat):
+        wall = turn[flat] + slant[flat]  # between the straight shaft and the wall
+        near, far = end.near[flat], np.full(len(flat), shaft.length)
+        for _ in range(HALVINGS):
+            middle = (near + far) / 2
+            slope = np.arcsin(np.minimum(away[flat] / middle, 1.0))
+            beyond = (tilt(shaft, middle) - 1) * (wall - slope) > slope
+            near, far = np.where(beyond, near, middle), np.where(beyond, middle, far)
+        reach[flat] = far
+        turn[flat] = wall - np.arcsin(np.minimum(away[flat] / far, 1.0))
+        lean[flat] = (tilt(shaft, far) - 1) * turn[flat]
+    return turn, reach, lean

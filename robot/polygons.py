@@ -1,0 +1,70 @@
+"""Polygons in the plane: what is inside, how far things are apart, what crosses what.
+
+A polygon is [N, 2] corners in order, m, closed by itself; a segment is a row x1, y1, x2, y2.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def edges(polygon: np.ndarray) -> np.ndarray:
+    """[N, 4] the sides of a polygon."""
+    return np.hstack([polygon, np.roll(polygon, -1, axis=0)])
+
+
+def area(polygon: np.ndarray) -> float:
+    """m2; positive where the corners go counter-clockwise."""
+    x, y = polygon.T
+    return float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) / 2)
+
+
+def contains(polygon: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """[...] bool, which points [..., 2] are inside, by counting the sides to their right."""
+    points = np.asarray(points, np.float64)[..., None, :]
+    x1, y1, x2, y2 = edges(polygon).T
+    x, y = points[..., 0], points[..., 1]
+    spans = (y1 > y) != (y2 > y)
+    run = np.where(y2 == y1, 1.0, y2 - y1)  # a level side spans nothing
+    right = x < x1 + (y - y1) * (x2 - x1) / run
+    return np.logical_xor.reduce(spans & right, axis=-1)
+
+
+def distance(segments: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """[..., S] m, from points [..., 2] to segments [S, 4]."""
+    points = np.asarray(points, np.float64)[..., None, :]
+    start, along = segments[:, :2], segments[:, 2:] - segments[:, :2]
+    away = points - start
+    square = np.maximum((along**2).sum(axis=-1), 1e-300)
+    share = np.clip((away * along).sum(axis=-1) / square, 0.0, 1.0)
+    return np.linalg.norm(away - share[..., None] * along, axis=-1)
+
+
+def crossing(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """[S, R] bool, which segments [S, 4] and [R, 4] cross; to touch is not to cross."""
+
+    def side(segments: np.ndarray, points: np.ndarray) -> np.ndarray:
+        start, along = segments[:, None, :2], segments[:, None, 2:] - segments[:, None, :2]
+        away = points[None] - start
+        turned = along[..., 0] * away[..., 1] - along[..., 1] * away[..., 0]
+        size = np.linalg.norm(along, axis=-1) * np.maximum(np.linalg.norm(away, axis=-1), 1e-300)
+        return np.sign(np.where(np.abs(turned) > 1e-9 * size, turned, 0.0))
+
+    there = side(one, other[:, :2]) * side(one, other[:, 2:]) < 0
+    back = side(other, one[:, :2]) * side(other, one[:, 2:]) < 0
+    return there & back.T
+
+
+def gap(one: np.ndarray, other: np.ndarray) -> float:
+    """m between the outlines of two polygons; 0 where they cross or touch."""
+    sides, others = edges(one), edges(other)
+    if crossing(sides, others).any():
+        return 0.0
+    return float(min(distance(sides, other).min(), distance(others, one).min()))
+
+
+def square(centre: np.ndarray, side: float, angle: float) -> np.ndarray:
+    """[4, 2] a square, its sides turned by the angle (rad)."""
+    corner = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]) * side / 2
+    c, s = np.cos(angle), np.sin(angle)
+    return np.asarray(centre, np.float64) + corner @ np.array([[c, s], [-s, c]])

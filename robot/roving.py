@@ -1,0 +1,195 @@
+"""A simulated session of the whiskered Create as a source: the same bits every time, from one seed.
+
+Every step of the state machine is one `Report`. Every part draws from a stream of its own name (arena,
+behaviour, wheels, strain), so that changing one leaves what the others draw as it was.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path as File
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
+
+from robot.arena import segments, text
+from robot.behaviour import BehaviourConfig, Command, Doing, State, command, following
+from robot.files import digest_of
+from robot.layout import ArenaConfig, arena
+from robot.source import Sample, rate_of
+from robot.stepping import Robot, Step
+from robot.strain import WhiskersConfig, fan
+from robot.wheels import WheelsConfig, reckoned
+from tactile.errors import InputError
+from tactile.frames import between, wrap
+from tactile.settings import Settings
+from tactile.streams import stream
+from tactile.types import Moment, Odometry, Report
+
+
+class RovingConfig(Settings):
+    """A session of the Create to simulate. What the paper leaves open are these defaults."""
+
+    arena: ArenaConfig = ArenaConfig()
+    """The world."""
+    behaviour: BehaviourConfig = BehaviourConfig()
+    """What the robot does."""
+    whiskers: WhiskersConfig = WhiskersConfig()
+    """What it feels with."""
+    wheels: WheelsConfig = WheelsConfig()
+    """What it believes of its motion."""
+    minutes: PositiveFloat = 6.0
+    """How long it goes on."""
+    reports: PositiveInt | None = None
+    """How many steps it makes instead."""
+    seed: NonNegativeInt = 0
+    """Of everything random."""
+
+    def resolved(self, folder: File) -> RovingConfig:
+        """The same with every relative path taken from the folder (of the configuration file, say)."""
+        if self.arena.file is None:
+            return self
+        return self.model_copy(
+            update={"arena": self.arena.model_copy(update={"file": folder / self.arena.file})}
+        )
+
+
+class Rover:
+    """A simulated session of the Create as a `Source`; make one with `roving`.
+
+    Attributes:
+        config: what it was made from. arena: where it is. fan: its whiskers. steps: [N] what it did.
+        time: [N] s, at the end of each step. truth: [N, 3] then. odometry: [N, 4] of each.
+        rig: what a recording of it keeps (see `robot.source.Rigged`).
+    """
+
+    name = "roving"
+    whisked = True
+    view_shape = (1, 4, 1)
+
+    def __init__(self, config: RovingConfig) -> None:
+        self.config = config
+        self.arena = arena(config.arena, config.seed)
+        robot = Robot(config.behaviour, config.whiskers, segments(self.arena), stream(config.seed, "strain"))
+        self.fan = robot.fan
+        start = robot.at(self.arena.start)
+        self.steps = steps = list(_driven(config, robot, start))
+        duration = np.array([step.duration for step in steps])
+        self.time = np.cumsum(duration)
+        pose = np.array([start.pose, *(step.pose for step in steps)])
+        self.truth = np.column_stack([pose[1:, :2], wrap(pose[1:, 2])])
+        motion = np.column_stack([between(pose[:-1], pose[1:])[:, :2], np.diff(pose[:, 2]), duration])
+        kind = np.array([step.state.motion for step in steps])
+        self.odometry = reckoned(config.wheels, motion, kind, stream(config.seed, "wheels"))
+        plain = config.model_dump(mode="json", exclude={"arena": {"file"}})
+        document = {"roving": plain, "arena": text(self.arena)}
+        self.digest = digest_of([json.dumps(document, sort_keys=True).encode()])
+        self.params: Mapping[str, float | int | str] = {}
+        self.rig: Mapping[str, Any] = {**document, "roving": plain | {"sha256": self.digest}}
+
+    @property
+    def rate_hz(self) -> float:
+        return rate_of(self.time)
+
+    @property
+    def whiskers(self) -> int:
+        return len(self.fan.base)
+
+    @property
+    def length(self) -> int:
+        return len(self.time)
+
+    def __iter__(self) -> Iterator[Sample]:
+        rows = zip(self.time.tolist(), self.steps, self.odometry, self.truth, strict=True)
+        for time, step, motion, truth in rows:
+            yield Sample(time, report(self.config, step, Odometry(*motion)), truth.copy())
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        pass
+
+
+def _driven(config: RovingConfig, robot: Robot, start: Step) -> Iterator[Step]:
+    random = stream(config.seed, "behaviour")
+    step, doing, time, count = start, Doing(State.FWD1), 0.0, 0
+    while (count < config.reports) if config.reports else (time < 60 * config.minutes):
+        before = step
+        step = robot.step(before, doing.state, command(config.behaviour, doing))
+        time, count = time + step.duration, count + 1
+        turned = float(step.pose[2] - before.pose[2])
+        doing = following(config.behaviour, doing, step.moment, turned, random)
+        yield step
+
+
+def roving(config: RovingConfig) -> Rover:
+    """The session of a configuration.
+
+    Raises:
+        InputError: what is asked for cannot be simulated; says what and where.
+    """
+    return Rover(config)
+
+
+LONG = 10.0
+"""Half of a wall that is as good as endless, m."""
+AHEAD = 0.015
+"""How far away it is at most when the robot sets out, m."""
+RECORD = 2.0
+"""Length of what is kept, s (Fox et al. 2012, II-G)."""
+
+
+def drive_into_wall(config: RovingConfig, angle: float, random: np.random.Generator) -> Report:
+    """What whiskers feel as the robot drives into one flat wall, for templates.
+
+    It drives on to the first contact as in FWD1, then for `RECORD` as in FWD2, whatever the strain. That is
+    what is told, its first sample taken at contact.
+
+    Args:
+        angle: of the wall's direction in base_link, rad, counter-clockwise from ahead: 90 degrees is a wall
+            straight across, a lesser one it has to its right, a larger one to its left.
+
+    Raises:
+        InputError: whiskers that never report a contact.
+    """
+    towards = np.array([np.sin(angle), -np.cos(angle)])
+    if towards[0] < 0.05:
+        raise ValueError(f"the robot does not drive into a wall at {angle:g} rad")
+    whiskers, behaviour = config.whiskers, config.behaviour
+    room = float((fan(whiskers).tip @ towards).max()) + AHEAD * random.uniform(0.5, 1.0) * towards[0]
+    along = LONG * np.array([np.cos(angle), np.sin(angle)])
+    wall = np.concatenate([room * towards - along, room * towards + along])[None]
+    robot = Robot(behaviour, whiskers, wall, random)
+    step = robot.at(np.zeros(3))
+    while step.moment == Moment.FREE and step.pose[0] < 2 * AHEAD + whiskers.length:
+        step = robot.step(step, State.FWD1, Command(behaviour.fast, 0.0, behaviour.step))
+    if step.moment != Moment.HIT1:
+        raise InputError(
+            "roving.behaviour.contact",
+            f"no contact at a strain of {behaviour.contact:g} with a wall at {np.degrees(angle):.0f} degrees",
+            "a lower strain, or whiskers that reach beyond the body",
+        )
+    patient = behaviour.model_copy(update={"safety": np.inf, "least": RECORD})
+    told = Command(behaviour.slow, 0.0, RECORD)
+    felt = Robot(patient, whiskers, wall, random).step(step, State.FWD2, told)
+    odometry = Odometry(behaviour.slow * RECORD, 0.0, 0.0, RECORD)
+    return report(config, felt, odometry)
+
+
+def report(config: RovingConfig, step: Step, odometry: Odometry) -> Report:
+    """A step as it is told."""
+    return Report(
+        odometry=odometry,
+        motion=int(step.state.motion),
+        moment=int(step.moment),
+        alive=fan(config.whiskers).alive,
+        contact=step.contact.copy(),
+        time=np.arange(len(step.strain)) / config.whiskers.rate,
+        strain=step.strain.copy(),
+    )

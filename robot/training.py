@@ -1,0 +1,25 @@
+"""Strain templates of a simulated Create: it drives into one wall at every angle (Fox et al. 2012, II-G)."""
+
+from __future__ import annotations
+
+from robot.roving import RovingConfig, drive_into_wall
+from tactile.straintemplates import StrainTemplates, TemplateTraining, driven, train
+from tactile.streams import stream
+
+
+def trained(config: RovingConfig, training: TemplateTraining | None = None) -> StrainTemplates:
+    """Templates of the robot of a session; from its seed, always the same.
+
+    Raises:
+        InputError: the robot's whiskers are sampled otherwise than the training says.
+    """
+    training = training or TemplateTraining(rate=config.whiskers.rate, speed=config.behaviour.slow)
+    random = stream(config.seed, "templates")
+    return train(
+        (
+            driven(angle, repeat, drive_into_wall(config, angle, random))
+            for angle in training.angles.tolist()
+            for repeat in range(training.repeats)
+        ),
+        training,
+    )

@@ -1,0 +1,34 @@
+"""Whiskers as a map of the floor sees them: straight feelers in the plane."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from tactile.head import Head
+
+
+class Feelers(NamedTuple):
+    """W whiskers in base_link.
+
+    Attributes:
+        base: [W, 2] m, where each begins to feel. direction: [W, 2] unit vectors. length: [W] m.
+    """
+
+    base: np.ndarray
+    direction: np.ndarray
+    length: np.ndarray
+
+    def points(self, share: np.ndarray) -> np.ndarray:
+        """[W, K, 2] m, the points at shares [K] of the lengths."""
+        along = self.length[:, None] * np.asarray(share, float)
+        return self.base[:, None] + along[..., None] * self.direction[:, None]
+
+
+def swept(head: Head, height: float) -> Feelers:
+    """The whiskers of a head over obstacles of a height, m: what each would touch of them lies in line with
+    its base, from there to where its tip comes down to their tops."""
+    outwards = head.rest[:, :2] / np.linalg.norm(head.rest[:, :2], axis=1, keepdims=True)
+    drop = np.clip((head.base[:, 2] - height) / head.length, 0.0, 1.0)
+    return Feelers(head.base[:, :2], outwards, head.length * np.sqrt(1 - drop**2))

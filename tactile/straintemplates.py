@@ -1,0 +1,263 @@
+"""Strain templates: what all channels of all whiskers read as the robot drives into a wall at fifteen angles
+(Fox et al. 2012, II-G), their training, their file, and which one a contact is like (eq. 5).
+
+An angle here is always the wall's *direction* in base_link, counter-clockwise from ahead, modulo half a turn:
+90 degrees is a wall straight across. The paper speaks of normals; those are at right angles to it.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, NamedTuple, Self
+
+import numpy as np
+from pydantic import Field, PositiveFloat, PositiveInt, ValidationError, model_validator
+
+from tactile.errors import InputError
+from tactile.settings import Settings
+from tactile.types import Report
+
+VERSION = 1
+"""Of the file."""
+WHERE = "templates"
+"""What errors call a training."""
+NEAR = np.radians(0.5)
+"""How far a drive may be from the angle that it is for, rad."""
+MEDIAN = 0.4549
+"""Of the square of a standard normal variable."""
+Angle = Annotated[float, Field(gt=0, lt=180)]
+
+
+class TemplateTraining(Settings):
+    """How templates are trained; as in the paper, which leaves open what low-pass it is."""
+
+    first_deg: Angle = 20.0
+    """Direction of the first wall."""
+    last_deg: Angle = 160.0
+    """Of the last one."""
+    step_deg: PositiveFloat = 10.0
+    """Between two."""
+    repeats: Annotated[int, Field(ge=2)] = 4
+    """Drives at each angle, which are averaged."""
+    rate: PositiveFloat = 2000.0
+    """Samples per second."""
+    duration: PositiveFloat = 2.0
+    """What is kept from first contact (HIT1) on, s."""
+    speed: PositiveFloat = 0.02
+    """Of the drive, m/s: that of FWD2."""
+    cutoff: PositiveFloat = 17.0
+    """Of the low-pass, Hz."""
+    order: PositiveInt = 2
+    """Of the low-pass (Butterworth)."""
+    window: PositiveInt = 5
+    """Samples of the moving average."""
+
+    @model_validator(mode="after")
+    def _sound(self) -> Self:
+        if self.last_deg < self.first_deg:
+            raise ValueError(f"last_deg: {self.last_deg:g} is less than first_deg, {self.first_deg:g}")
+        if 2 * self.cutoff >= self.rate:
+            raise ValueError(f"cutoff: {self.cutoff:g} Hz is more than {self.rate:g} samples a second hold")
+        return self
+
+    @property
+    def angles(self) -> np.ndarray:
+        """[A] rad."""
+        count = int((self.last_deg - self.first_deg) / self.step_deg + 1e-9) + 1
+        return np.radians(self.first_deg + self.step_deg * np.arange(count))
+
+    @property
+    def samples(self) -> int:
+        """T, of a template."""
+        return round(self.duration * self.rate)
+
+
+class Drive(NamedTuple):
+    """One drive into a wall.
+
+    Attributes:
+        angle: the wall's direction in base_link, rad. repeat: which of those at this angle.
+        strain: [T, W, 2] raw, from first contact on. rate: samples per second.
+    """
+
+    angle: float
+    repeat: int
+    strain: np.ndarray
+    rate: float
+
+
+class StrainTemplates(NamedTuple):
+    """Attributes:
+    training: how they were made. angle: [A] rad, wall directions. mean: [A, T, W, 2] the templates.
+    spread: [T, 2] standard deviation of one drive's filtered channels about them, but for its contacts.
+    """
+
+    training: TemplateTraining
+    angle: np.ndarray
+    mean: np.ndarray
+    spread: np.ndarray
+
+
+class Match(NamedTuple):
+    """Attributes:
+    error: [A] of each template, eq. 5. winner: the number of the best one. angle: its direction, rad.
+    refined: direction at the lowest point of the parabola through it and its neighbours, rad.
+    relative: its error over the mean square of what was read: near 0 for walls, near 1 for anything else.
+    """
+
+    error: np.ndarray
+    winner: int
+    angle: float
+    refined: float
+    relative: float
+
+
+def rate_of(report: Report) -> float:
+    """Samples per second of its strain; 0 where there are fewer than two."""
+    count = len(report.time)
+    return float((count - 1) / (report.time[-1] - report.time[0])) if count > 1 else 0.0
+
+
+def driven(angle: float, repeat: int, report: Report) -> Drive:
+    """The drive that a report tells of."""
+    return Drive(angle, repeat, report.strain, rate_of(report))
+
+
+def smoothed(training: TemplateTraining, strain: np.ndarray) -> np.ndarray:
+    """[T, ...] Strain [T, ...] through the low-pass and the moving average.
+
+    Both look back only: what is known at HIT2 must not depend on what comes later, nor templates be made
+    otherwise than what is compared with them. Both begin as if the first sample had lasted for ever, so that
+    nothing rings at the start.
+    """
+    from scipy.signal import butter, sosfilt, sosfilt_zi  # slow to import
+
+    rows = np.asarray(strain, np.float64).reshape(len(strain), -1)
+    if not rows.size:
+        return rows.reshape(np.shape(strain))
+    sections = butter(training.order, training.cutoff, fs=training.rate, output="sos")
+    begun = sosfilt_zi(sections)[..., None] * rows[0]
+    low, _ = sosfilt(sections, rows, axis=0, zi=begun)
+    before = np.repeat(rows[:1], training.window - 1, axis=0)
+    windows = np.lib.stride_tricks.sliding_window_view(np.concatenate([before, low]), training.window, axis=0)
+    return windows.mean(axis=-1).reshape(np.shape(strain))
+
+
+def train(drives: Iterable[Drive], training: TemplateTraining | None = None) -> StrainTemplates:
+    """Templates from drives into walls.
+
+    Raises:
+        InputError: angles without enough drives, at none of the angles, of another sample rate, too short, of
+            other whiskers than the first, or with channels that have no values.
+    """
+    training, drives = training or TemplateTraining(), list(drives)
+    angles = training.angles
+    _check(training, drives)
+    given = np.array([drive.angle for drive in drives])
+    near = np.abs(given[:, None] - angles) < NEAR
+    count = near.sum(axis=0)
+    if (count < training.repeats).any():
+        few = ", ".join(f"{count[k]} at {np.degrees(angles[k]):.3g} degrees" for k in _less(training, count))
+        raise InputError(WHERE, f"too few drives: {few}", f"{training.repeats} at each angle", "drive again")
+    sets = []
+    for at in near.T:
+        chosen = [drives[k].strain[: training.samples] for k in np.flatnonzero(at)]
+        sets.append(np.stack([smoothed(training, strain) for strain in chosen]))
+    mean = np.stack([one.mean(axis=0) for one in sets])
+    # Most channels feel nothing most of the time: the median is of those.
+    square = np.concatenate(
+        [((one - one.mean(axis=0)) ** 2).swapaxes(1, 2).reshape(-1, training.samples, 2) for one in sets]
+    ) / (1 - 1 / count.min())
+    return StrainTemplates(training, angles, mean, np.sqrt(np.median(square, axis=0) / MEDIAN))
+
+
+def matched(templates: StrainTemplates, strain: np.ndarray, alive: np.ndarray | None = None) -> Match:
+    """Which template filtered strain [N, W, 2] since HIT1 is most like, by the whiskers that report, [W]."""
+    count = min(len(strain), templates.mean.shape[1])
+    use = np.ones(strain.shape[1], bool) if alive is None else np.asarray(alive, bool)
+    if not count or not use.any():
+        raise ValueError("no samples or no whiskers to match")
+    read = strain[:count, use]
+    error = ((read - templates.mean[:, :count, use]) ** 2).sum(axis=(2, 3)).mean(axis=1)
+    winner = int(error.argmin())
+    refined = angle = float(templates.angle[winner])
+    if 0 < winner < len(error) - 1:
+        below, least, above = error[winner - 1 : winner + 2]
+        bend = below - 2 * least + above
+        step = templates.angle[winner + 1] - templates.angle[winner]
+        refined += float(step * (below - above) / (2 * bend)) if bend > 0 else 0.0
+    power = float((read**2).sum(axis=(1, 2)).mean())
+    return Match(error, winner, angle, refined, float(error[winner] / max(power, 1e-300)))
+
+
+def save(templates: StrainTemplates, path: Path | str) -> None:
+    """Write them to a file (.npz)."""
+    with open(path, "wb") as file:
+        np.savez_compressed(
+            file,
+            strain_templates=np.int64(VERSION),
+            training=np.array(templates.training.model_dump_json()),
+            angle=templates.angle,
+            mean=templates.mean,
+            spread=templates.spread,
+        )
+
+
+def load(path: Path | str) -> StrainTemplates:
+    """Read what `save` wrote.
+
+    Raises:
+        InputError: it cannot be read, or is something else.
+    """
+    try:
+        # Opened here: np.load leaves a broken file open.
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as kept:
+            if "strain_templates" not in kept or int(kept["strain_templates"]) != VERSION:
+                raise ValueError("not of this kind and version")
+            training = TemplateTraining.model_validate_json(str(kept["training"]))
+            templates = StrainTemplates(training, kept["angle"], kept["mean"], kept["spread"])
+        angles, count, _, channels = templates.mean.shape
+        whole = (angles, count, channels) == (len(training.angles), training.samples, 2)
+        whole &= templates.angle.shape == (angles,)
+        if not whole or templates.spread.shape != (count, 2) or not np.isfinite(templates.mean).all():
+            raise ValueError("incomplete")
+    except FileNotFoundError:
+        raise InputError(str(path), "no such file", "strain templates", CURE) from None
+    except (OSError, ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile, ValidationError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        found = f"no strain templates ({reason})"
+        raise InputError(str(path), found, f"a file of version {VERSION}", CURE) from error
+    return templates
+
+
+CURE = "make one with `python -m ratslam train-templates`"
+
+
+def _check(training: TemplateTraining, drives: list[Drive]) -> None:
+    if not drives:
+        raise InputError(WHERE, "no drives", f"{training.repeats} at each of {len(training.angles)} angles")
+    whiskers = np.shape(drives[0].strain)[1:2]
+    for drive in drives:
+        where = f"{WHERE}: drive {drive.repeat} at {np.degrees(drive.angle):.4g} degrees"
+        strain = np.asarray(drive.strain)
+        if strain.ndim != 3 or strain.shape[1:] != (*whiskers, 2):
+            raise InputError(where, f"strain of shape {strain.shape}", f"[T, {whiskers[0]}, 2]")
+        if abs(drive.rate - training.rate) > 1e-3 * training.rate:
+            raise InputError(where, f"{drive.rate:.5g} samples per second", f"{training.rate:g}")
+        if len(strain) < training.samples:
+            found = f"{len(strain) / training.rate:.3g} s"
+            raise InputError(where, found, f"{training.duration:g} s from first contact on")
+        if not np.isfinite(strain).all():
+            raise InputError(where, "samples without a value", "numbers", "leave this drive out")
+        if np.abs(drive.angle - training.angles).min() >= NEAR:
+            raise InputError(where, "none of the angles", f"{_listed(training.angles)} degrees")
+
+
+def _less(training: TemplateTraining, count: np.ndarray) -> list[int]:
+    return np.flatnonzero(count < training.repeats).tolist()
+
+
+def _listed(angles: np.ndarray) -> str:
+    return ", ".join(f"{angle:.4g}" for angle in np.degrees(angles))

@@ -1,0 +1,127 @@
+"""What tests of the grid filter share: a Create's feelers, simple reports, a way to drive through them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache, partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ratslam.gridfilter import GridEvidence, GridFilter, State
+from ratslam.gridsettings import GridConfig
+from ratslam.session import CHUNK, run_chunk
+from ratslam.types import Estimate
+from tactile.feelers import Feelers
+from tactile.types import Motion, Observation, Odometry, observation, stack
+
+MOUNTS = ((0.10, 0.08, 50), (0.13, 0.03, 15), (0.13, -0.03, -15), (0.10, -0.08, -50))
+"""x m, y m, direction deg, of a Create's whiskers from left to right."""
+LENGTH = 0.14
+RADIUS = 0.13
+"""Where along a whisker a contact is told, m (Fox et al. 2012, II-D)."""
+STEADY = {"run": 0.0, "move": 0.0, "step": 0.0, "heading": 0.0}
+"""Of a drift: odometry is believed to the letter."""
+BLANK = {"edge": 0.0, "blob": 0.0, "free": 0.0, "body": 0.0}
+"""Of stamps: the map stays as it is."""
+
+
+def create(whiskers: int = len(MOUNTS)) -> Feelers:
+    """The first few feelers of a Create."""
+    mounts = np.array(MOUNTS)[:whiskers]
+    angle = np.radians(mounts[:, 2])
+    direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return Feelers(mounts[:, :2], direction, np.full(len(mounts), LENGTH))
+
+
+TIPS = create().points(np.array([RADIUS / LENGTH]))[:, 0]
+"""[W, 2] m in base_link, where contacts are told."""
+
+
+def report(
+    forward: float = 0.0,
+    turn: float = 0.0,
+    *,
+    touching: Sequence[int] = (),
+    wall: tuple[float, float] | None = None,
+    sd: float = 0.05,
+    dead: Sequence[int] = (),
+    motion: Motion | None = None,
+    whiskers: int = len(MOUNTS),
+) -> Observation:
+    """One report of a Create.
+
+    Args:
+        forward: m. turn: rad. touching: whiskers in contact. wall: distance m and bearing rad of its nearest
+            point. sd: of its direction, rad. dead: whiskers that do not report. motion: what it looks like.
+    """
+    if motion is None:
+        motion = Motion.BACK if forward < 0 else Motion.TURN if turn and not forward else Motion.FORWARD
+    plain = observation(Odometry(forward, 0.0, turn, 0.5), motion=motion, whiskers=whiskers)
+    marked = np.arange(whiskers)
+    contact = np.isin(marked, touching)
+    foot = np.zeros(2) if wall is None else wall[0] * np.array([np.cos(wall[1]), np.sin(wall[1])])
+    return plain._replace(
+        contact=contact,
+        alive=~np.isin(marked, dead),
+        point=np.where(contact[:, None], TIPS[:whiskers], 0.0),
+        wall=np.bool_(wall is not None),
+        wall_point=foot,
+        wall_sd=np.float64(0.0 if wall is None else sd),
+    )
+
+
+@cache
+def filter_of(
+    config: GridConfig, whiskers: int = len(MOUNTS), side: float = 2.5, dtype: Any = np.float64
+) -> GridFilter:
+    """The filter of a configuration, made and compiled once."""
+    return GridFilter(config, create(whiskers), side, dtype)
+
+
+def settings(**parts: Any) -> GridConfig:
+    """A configuration; few particles unless said otherwise."""
+    return GridConfig.model_validate({"particles": 30} | parts)
+
+
+@cache
+def _runner(backend: GridFilter) -> Any:
+    # Little optimised: most filters take few steps here, and compiling them is what takes long.
+    options = {"xla_backend_optimization_level": 0}
+    return jax.jit(partial(run_chunk, backend.kernel), compiler_options=options)
+
+
+def drive(
+    backend: GridFilter, state: State, reports: Sequence[Observation]
+) -> tuple[State, Estimate, GridEvidence]:
+    """The state after the reports, and what was said at each of them: [T, ...]."""
+    outputs = []
+    for start in range(0, len(reports), CHUNK):
+        chunk = list(reports[start : start + CHUNK])
+        padded = stack(chunk + chunk[-1:] * (CHUNK - len(chunk)))
+        state, output = _runner(backend)(state, padded, np.int32(len(chunk)))
+        outputs.append(_first(output, len(chunk)))
+    estimate, evidence = jax.tree.map(lambda *rows: np.concatenate(rows), *outputs)
+    return state, estimate, evidence
+
+
+def _first(output: Any, count: int) -> Any:
+    return jax.tree.map(lambda rows: np.asarray(rows)[:count], output)
+
+
+def begun(backend: GridFilter, seed: int = 0) -> State:
+    """The state before the first report."""
+    return backend.init(jax.random.key(seed), 256)
+
+
+def standing(state: State, pose: Sequence[float]) -> State:
+    """All particles at one pose."""
+    there = jnp.broadcast_to(jnp.asarray(pose, state.particles.pose.dtype)[None], state.particles.pose.shape)
+    return state._replace(particles=state.particles._replace(pose=there))
+
+
+def remembering(state: State, evidence: np.ndarray) -> State:
+    """All particles with one map of evidence [S, S] (rows are y)."""
+    return state._replace(maps=state.maps.at[:, 0].set(jnp.asarray(evidence, state.maps.dtype)[None]))

@@ -1,0 +1,141 @@
+"""Laws of stamps: their shapes, and that these turn and move with what they are of."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ratslam import stamps
+from tactile.frames import wrap
+
+SIZE = 31
+MIDDLE = (SIZE - 1) / 2
+PLACE = st.tuples(*[st.floats(10, 20)] * 2)
+ANGLE = st.floats(-10, 10)
+FAN = np.pi / 12
+
+blobs = jax.jit(stamps.blobs, static_argnums=(2, 3))
+disc = jax.jit(stamps.disc, static_argnums=(1, 2))
+SHAPES = {
+    "edge": jax.jit(lambda place, angle: stamps.edge(place, angle, 4.0, 1.2, SIZE)),
+    "fan": jax.jit(lambda place, angle: stamps.fan(place, angle, 5.0, FAN, SIZE)),
+}
+
+
+@pytest.fixture(params=SHAPES, scope="module")
+def shape(request):
+    """The stamp [SIZE, SIZE] of a wall at a place [2], cells, of a direction, rad."""
+    return lambda place, angle: np.asarray(SHAPES[request.param](np.array([place]), np.array([angle])))[0]
+
+
+def offsets(place):
+    at = np.arange(SIZE)
+    return at[None] - place[0], at[:, None] - place[1]
+
+
+# Contacts
+
+
+@given(st.lists(PLACE, min_size=3, max_size=3), st.lists(st.floats(-3, 3), min_size=3, max_size=3))
+def test_blobs_are_sums_of_round_gaussians(places, amounts):
+    expected = np.zeros((SIZE, SIZE))
+    for place, amount in zip(places, amounts, strict=True):
+        right, up = offsets(place)
+        expected += amount * np.exp(-(right**2 + up**2) / (2 * 1.5**2))
+    stamp = np.asarray(blobs(np.array([places, places[::-1]]), np.array(amounts), 1.5, SIZE))
+    assert stamp[0] == pytest.approx(expected, abs=1e-12)
+    doubled = np.asarray(blobs(np.array([places]), 2 * np.array(amounts), 1.5, SIZE))
+    assert doubled[0] == pytest.approx(2 * expected, abs=1e-12)
+
+
+def test_a_blob_has_its_amount_where_it_is_and_no_whiskers_make_none():
+    place = np.array([[[9.0, 20.0]]])  # x, y
+    stamp = np.asarray(blobs(place, np.array([2.0]), 1.0, SIZE))[0]
+    assert np.unravel_index(stamp.argmax(), stamp.shape) == (20, 9)
+    assert stamp.max() == pytest.approx(2)
+    assert stamp[20, 10] == stamp[21, 9] == pytest.approx(2 * np.exp(-0.5))
+    assert not np.any(blobs(np.zeros((4, 0, 2)), np.zeros(0), 1.0, SIZE))
+
+
+@given(PLACE, st.floats(1.0, 6.0))
+def test_a_disc_is_full_inside_and_empty_outside(place, radius):
+    stamp = np.asarray(jax.jit(stamps.disc, static_argnums=2)(np.array([place]), radius, SIZE))[0]
+    away = np.hypot(*offsets(place))
+    assert (stamp[away <= radius - 0.5] == 1).all()
+    assert (stamp[away >= radius + 0.5] == 0).all()
+    assert ((stamp >= 0) & (stamp <= 1)).all()
+    assert stamp.sum() == pytest.approx(np.pi * (radius**2 + 1 / 12), abs=0.25 + 0.1 * radius)
+
+
+# Walls
+
+
+@given(PLACE, ANGLE)
+def test_a_wall_has_no_sense(shape, place, angle):
+    """Turned by half it is the same; and the same backward as forward."""
+    stamp = shape(place, angle)
+    assert stamp == pytest.approx(shape(place, angle + np.pi), abs=1e-9)
+    opposite = shape(np.array([SIZE - 1, SIZE - 1]) - place, angle)[::-1, ::-1]
+    assert stamp == pytest.approx(opposite, abs=1e-9)
+
+
+@given(PLACE, ANGLE)
+def test_a_stamp_turns_with_its_wall(shape, place, angle):
+    """By a right angle, which maps the window onto itself: x, y becomes -y, x."""
+    turned = shape((SIZE - 1 - place[1], place[0]), angle + np.pi / 2)
+    assert turned == pytest.approx(np.rot90(shape(place, angle), -1), abs=1e-6)
+    mirrored = shape((place[0], SIZE - 1 - place[1]), -angle)
+    assert mirrored == pytest.approx(shape(place, angle)[::-1], abs=1e-6)
+
+
+@pytest.mark.parametrize("angle", np.radians([0, 30, 45, 90, 135, 200]))
+def test_a_stamp_is_largest_at_the_contact_and_lies_along_the_wall(shape, angle):
+    stamp = shape((MIDDLE, MIDDLE), angle)
+    assert stamp[SIZE // 2, SIZE // 2] == 1
+    assert stamp.max() == 1
+    right, up = offsets((MIDDLE, MIDDLE))
+    spread = [(stamp * part).sum() for part in (right**2 + 0 * up, right * up, 0 * right + up**2)]
+    axis = 0.5 * np.arctan2(2 * spread[1], spread[0] - spread[2])
+    assert np.sin(axis - angle) == pytest.approx(0, abs=0.01)
+
+
+def test_an_edge_is_as_long_and_as_wide_as_told():
+    stamp = np.asarray(SHAPES["edge"](np.array([[MIDDLE, MIDDLE]]), np.zeros(1)))[0]
+    right, up = offsets((MIDDLE, MIDDLE))
+    assert stamp == pytest.approx(np.exp(-(right**2) / (2 * 4.0**2) - up**2 / (2 * 1.2**2)), abs=1e-12)
+
+
+@pytest.mark.parametrize("angle", np.radians([0, 30, 90, 160, 250]))
+def test_eq_4_draws_the_edge_both_ways(angle):
+    """With a standard deviation of 5 cells and pi / 12, each way has a mass of 16.7; read as printed, without
+    the modulus, the way back has none."""
+    size = 51
+    place = np.array([[25.0, 25.0]])
+    stamp = np.asarray(stamps.fan(place, np.array([angle]), 5.0, FAN, size))[0]
+    right, up = np.arange(size)[None] - 25.0, np.arange(size)[:, None] - 25.0
+    ahead = np.cos(angle) * right + np.sin(angle) * up
+    forward, backward = stamp[ahead > 1e-9].sum(), stamp[ahead < -1e-9].sum()
+    assert forward == pytest.approx(backward, rel=1e-6)
+    assert forward == pytest.approx(16.7, rel=0.05)
+    off, away = wrap(np.arctan2(up, right) - angle), np.hypot(right, up)
+    printed = np.exp(-(away**2) / (2 * 25) - off**2 / (2 * FAN**2))
+    assert stamp[ahead > 1e-9] == pytest.approx(printed[ahead > 1e-9], abs=1e-9)
+    assert printed[ahead < -1e-9].sum() < 1e-3
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_stamps_keep_their_precision(dtype):
+    place, angle = np.full((2, 2), 3.0, dtype), np.ones(2, dtype)
+    made = (
+        stamps.blobs(place[:, None], np.ones(1, dtype), 1.0, 8),
+        stamps.disc(place, 2.0, 8),
+        stamps.edge(place, angle, 3.0, 1.0, 8),
+        stamps.fan(place, angle, 3.0, FAN, 8),
+    )
+    for stamp in made:
+        assert stamp.dtype == dtype
+        assert stamp.shape == (2, 8, 8)
+        assert np.isfinite(stamp).all()

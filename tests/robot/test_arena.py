@@ -1,0 +1,213 @@
+"""Arenas: the robot gets around every object, free space is what the walls bound, faulty texts are named."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+from scipy.ndimage import label
+
+from robot.arena import Arena, enclosed, fits, inside, occupied, read_arena, segments, text
+from robot.layout import ArenaConfig, arena
+from robot.polygons import area, contains, crossing, distance, edges, gap, square
+from tactile.errors import InputError
+
+SEEDS = st.integers(0, 10**6)
+KINDS = st.sampled_from(
+    [ArenaConfig(side=side, rotated=rotated) for side in (1.25, 2.5) for rotated in (False, True)]
+)
+GOOD = """# a room
+outer 0 0  2 0  2 2  0 2
+square 0.3 1.7 0.2 30
+
+polygon 2 1  1.7 1.2  2 1.4 # a wedge
+start 1 1 90
+"""
+
+
+@settings(max_examples=25)
+@given(SEEDS, KINDS)
+def test_ways_are_wide_enough(seed: int, config: ArenaConfig) -> None:
+    made = arena(config, seed)
+    assert len(made.objects) == config.count
+    for number, one in enumerate(made.objects):
+        assert config.smallest**2 <= area(one) * (1 + 1e-9) <= config.largest**2 * (1 + 2e-9)
+        room = gap(one, made.outer)
+        assert room < 1e-9 or room >= config.passage
+        for other in made.objects[:number]:
+            assert gap(one, other) >= config.passage
+    assert fits(made, made.start[:2], 0.2)
+
+
+@settings(max_examples=12)
+@given(SEEDS, KINDS)
+def test_the_robot_can_reach_every_place_that_it_fits_in(seed: int, config: ArenaConfig) -> None:
+    made = arena(config, seed)
+    axis = np.arange(0.005, config.side, 0.02)
+    places = np.stack(np.meshgrid(axis, axis), axis=-1)
+    _, regions = label(fits(made, places, 0.18))
+    assert regions == 1
+
+
+def test_rotated_objects_are_turned_and_others_are_not() -> None:
+    def slants(rotated: bool) -> np.ndarray:
+        made = arena(ArenaConfig(side=2.5, rotated=rotated), 3)
+        along = np.array([one[1] - one[0] for one in made.objects])
+        return np.degrees(np.arctan2(along[:, 1], along[:, 0])) % 90
+
+    assert np.allclose(slants(False), 0)
+    assert np.ptp(slants(True)) > 20
+
+
+def test_objects_stand_at_walls_as_often_as_asked() -> None:
+    def share(against: float) -> float:
+        made = [arena(ArenaConfig(side=2.5, objects=4, against=against), seed) for seed in range(8)]
+        return float(np.mean([gap(one, room.outer) < 1e-9 for room in made for one in room.objects]))
+
+    assert share(0.0) == 0
+    assert share(1.0) == 1
+    assert 0.3 < share(0.5) < 0.9
+
+
+def test_an_arena_follows_from_its_seed() -> None:
+    config = ArenaConfig()
+    one, again, other = (arena(config, seed) for seed in (4, 4, 5))
+    assert text(one) == text(again) != text(other)
+    assert text(arena(ArenaConfig(seed=4), 9)) == text(one)
+
+
+def test_the_sizes_of_the_paper_have_four_and_seven_objects() -> None:
+    assert ArenaConfig().count == 4
+    assert ArenaConfig(side=2.5).count == 7
+    assert arena(ArenaConfig(objects=0), 0).objects == ()
+
+
+def test_what_does_not_fit_is_refused(refused: Callable[..., InputError]) -> None:
+    refused(lambda: arena(ArenaConfig(objects=30), 0), "roving.arena.objects", "30 objects", "fewer")
+    with pytest.raises(ValidationError, match="smallest"):
+        ArenaConfig(smallest=0.3)
+    with pytest.raises(ValidationError, match="largest"):
+        ArenaConfig(side=0.2)
+
+
+@settings(max_examples=30)
+@given(SEEDS, KINDS)
+def test_a_line_from_inside_to_outside_crosses_an_odd_number_of_walls(seed: int, config: ArenaConfig) -> None:
+    """The walls that are touched and the space that is free are the same arena."""
+    made = arena(config, seed)
+    points = np.random.default_rng(seed).uniform(-0.2, config.side + 0.2, (40, 2, 2))
+    crossings = crossing(points.reshape(-1, 4), segments(made)).sum(axis=1)
+    free = inside(made, points)
+    assert ((crossings % 2 == 1) == (free[:, 0] != free[:, 1])).all()
+    assert (occupied(made, points) == ~free).all()
+    assert (free <= enclosed(made, points)).all()
+
+
+def test_the_share_that_is_occupied_is_that_of_the_objects() -> None:
+    made = arena(ArenaConfig(rotated=True), 2)
+    axis = (np.arange(250) + 0.5) / 250 * 1.25
+    cells = np.stack(np.meshgrid(axis, axis), axis=-1)
+    expected = sum(area(one) for one in made.objects) / 1.25**2
+    assert occupied(made, cells).mean() == pytest.approx(expected, rel=0.01)
+    assert occupied(made, cells + 5).all()
+
+
+@given(SEEDS)
+def test_distances_are_those_of_the_nearest_point(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    walls, points = random.uniform(-1, 1, (5, 4)), random.uniform(-1, 1, (7, 2))
+    share = np.linspace(0, 1, 2001)[:, None, None]
+    along = walls[:, :2] + share * (walls[:, 2:] - walls[:, :2])
+    sampled = np.linalg.norm(points[:, None, None] - along, axis=-1).min(axis=1)
+    assert np.allclose(distance(walls, points), sampled, atol=1e-3)
+    assert (distance(walls, points) <= sampled + 1e-12).all()
+
+
+@given(SEEDS, st.floats(-10, 10))
+def test_squares_are_square_however_they_are_turned(seed: int, angle: float) -> None:
+    one = square(np.array([0.3, -0.2]), 0.4, angle)
+    assert area(one) == pytest.approx(0.16)
+    assert contains(one, np.array([0.3, -0.2]))
+    points = np.random.default_rng(seed).uniform(-0.5, 0.5, (50, 2))
+    c, s = np.cos(angle), np.sin(angle)
+    u, v = np.abs((points - [0.3, -0.2]) @ np.array([[c, -s], [s, c]])).T
+    assert (contains(one, points) == (np.maximum(u, v) < 0.2)).all()
+
+
+def test_to_touch_is_not_to_cross() -> None:
+    sides = edges(square(np.zeros(2), 1.0, 0.0))
+    assert not crossing(sides, sides).any()
+    assert crossing(sides, np.array([[0.0, 0.0, 2.0, 0.1]])).sum() == 1
+
+
+@settings(max_examples=20)
+@given(SEEDS, KINDS)
+def test_an_arena_survives_its_text(
+    tmp_path_factory: pytest.TempPathFactory, seed: int, config: ArenaConfig
+) -> None:
+    made = arena(config, seed)
+    path = tmp_path_factory.getbasetemp() / "room.txt"
+    path.write_text(text(made))
+    read = read_arena(path)
+    assert read.name == "room"
+    assert (segments(read) == segments(made)).all()
+    assert np.allclose(read.start, made.start)
+
+
+def test_a_text_says_what_stands_where(tmp_path: Path) -> None:
+    path = tmp_path / "room.txt"
+    path.write_text(GOOD)
+    read = read_arena(path)
+    assert isinstance(read, Arena)
+    assert len(read.objects) == 2
+    assert np.allclose(read.start, [1, 1, np.pi / 2])
+    assert area(read.objects[0]) == pytest.approx(0.04)
+    assert not inside(read, np.array([0.3, 1.7]))
+    assert not inside(read, np.array([1.9, 1.2]))
+    path.write_text(GOOD.replace("outer 0 0  2 0  2 2  0 2", "outer 0 2  2 2  2 0  0 0"))  # clockwise
+    assert (inside(read_arena(path), np.array([[1.0, 1.0], [1.9, 1.2]])) == [True, False]).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "where", "said"),
+    [
+        (("outer 0 0", "walls 0 0"), "room.txt:2:1", "'walls'"),
+        (("2 2  0 2", "2 2  0 nan"), "room.txt:2:24", "'nan'"),
+        (("0.2 30", "0.2 thirty"), "room.txt:3:20", "'thirty'"),
+        (("0.2 30", "0.2"), "room.txt:3:1", "3 numbers"),
+        (("0.2 30", "-0.2 30"), "room.txt:3:16", "a side of -0.2 m"),
+        (("  2 2  0 2", ""), "room.txt:2:1", "4 numbers"),
+        (("  2 2  0 2", "  0 2 2 2"), "room.txt:2:12", "walls that cross"),
+        (("  2 2  0 2", "  2 0 2 2 0 2"), "room.txt:2:17", "the same corner twice"),
+        (("  2 2  0 2", "  2 2  0 2  0 0"), "room.txt:2:7", "the same corner twice"),
+        (("  2 2  0 2", "  3 0  1 0"), "room.txt:2:1", "in one line"),
+        (("start 1 1 90\n", ""), "room.txt", "no line `start`"),
+        (("outer 0 0  2 0  2 2  0 2", ""), "room.txt", "no line `outer`"),
+        (("start 1 1 90", "start 1 1 90\nstart 1 1 80"), "room.txt:7:1", "another `start`"),
+        (("square 0.3 1.7", "square 2.3 1.7"), "room.txt:3:1", "outside the walls"),
+        (("square 0.3 1.7", "square 2 1.8"), "room.txt:3:1", "outside the walls"),
+        (("square 0.3 1.7", "square 1.85 1.2"), "room.txt:5:1", "an object over object 1"),
+        (("square 0.3 1.7 0.2", "square 1.85 1.2 0.05"), "room.txt:5:1", "an object over object 1"),
+        (("start 1 1 90", "start 0.3 1.7 90"), "room.txt:6:7", "not free"),
+        (("start 1 1 90", "start 0.1 1 90"), "room.txt:6:7", "not free"),
+        (("start 1 1 90", "start inf 1 90"), "room.txt:6:7", "'inf'"),
+    ],
+)
+def test_a_faulty_text_is_refused(
+    tmp_path: Path, change: tuple[str, str], where: str, said: str, refused: Callable[..., InputError]
+) -> None:
+    path = tmp_path / "room.txt"
+    assert change[0] in GOOD
+    path.write_text(GOOD.replace(*change, 1))
+    refused(lambda: read_arena(path), where, said)
+
+
+def test_a_file_that_is_no_text_is_refused(tmp_path: Path, refused: Callable[..., InputError]) -> None:
+    refused(lambda: read_arena(tmp_path / "none.txt"), "none.txt", "no such file")
+    (tmp_path / "bytes.txt").write_bytes(b"\xff\xfe\x00")
+    refused(lambda: read_arena(tmp_path / "bytes.txt"), "bytes.txt", "is no text")

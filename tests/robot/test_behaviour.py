@@ -1,0 +1,182 @@
+"""The state machine: what follows what, how far it turns, and what ends a motion, the first thing first."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from robot.behaviour import (
+    BehaviourConfig,
+    Command,
+    Doing,
+    State,
+    TurnConfig,
+    command,
+    ended,
+    following,
+    moved,
+    turn,
+)
+from tactile.frames import compose
+from tactile.streams import stream
+from tactile.types import Moment, Motion
+
+CONFIG = BehaviourConfig()
+ROWS = 40
+NONE = np.zeros(4, bool)
+
+
+def quiet() -> np.ndarray:
+    return np.zeros((ROWS, 4, 2))
+
+
+def end_of(
+    state: State, strain: np.ndarray, bumped: int = ROWS, before: np.ndarray = NONE
+) -> tuple[int, Moment]:
+    end = ended(CONFIG, state, strain, np.arange(ROWS) >= bumped, before)
+    return end.row, end.moment
+
+
+@pytest.mark.parametrize(
+    ("state", "moment", "then"),
+    [
+        (State.FWD1, Moment.FREE, State.FWD1),
+        (State.FWD1, Moment.HIT1, State.FWD2),
+        (State.FWD1, Moment.ABORT, State.BACK),
+        (State.FWD2, Moment.HIT2, State.BACK),
+        (State.FWD2, Moment.ABORT, State.BACK),
+        (State.BACK, Moment.FREE, State.TURN),
+        (State.TURN, Moment.FREE, State.FWD1),
+        (State.TURN, Moment.ABORT, State.BACK),
+    ],
+)
+def test_what_follows_what(state: State, moment: Moment, then: State) -> None:
+    doing = following(CONFIG, Doing(state), moment, 0.0, stream(0, "behaviour"))
+    assert doing.state == then
+    assert (doing.rest != 0) == (then == State.TURN)
+
+
+def test_a_turn_is_made_in_steps_that_add_up() -> None:
+    random = stream(0, "behaviour")
+    for _ in range(50):
+        doing = following(CONFIG, Doing(State.BACK), Moment.FREE, 0.0, random)
+        whole, total, steps = doing.rest, 0.0, 0
+        while doing.state == State.TURN:
+            told = command(CONFIG, doing)
+            assert told.speed == 0
+            assert told.duration <= 0.5
+            total += told.rate * told.duration
+            doing = following(CONFIG, doing, Moment.FREE, told.rate * told.duration, random)
+            steps += 1
+        assert doing.state == State.FWD1
+        assert total == pytest.approx(whole, abs=1e-5)
+        assert steps == max(1, int(np.ceil(abs(whole) / 0.15 - 1e-4)))
+
+
+def test_a_turn_can_be_one_step() -> None:
+    config = BehaviourConfig(turn=TurnConfig(step=None))
+    told = command(config, Doing(State.TURN, -1.2))
+    assert told == Command(0.0, -0.3, pytest.approx(4.0))
+
+
+def test_speeds_and_times_are_the_papers() -> None:
+    assert command(CONFIG, Doing(State.FWD1)) == (0.05, 0.0, 0.5)
+    assert command(CONFIG, Doing(State.BACK)) == (-0.05, 0.0, 0.5)
+    assert command(CONFIG, Doing(State.FWD2))[:2] == (0.02, 0.0)
+    assert [state.motion for state in State] == [Motion.FORWARD, Motion.FORWARD, Motion.BACK, Motion.TURN]
+
+
+def drawn(**changes: object) -> np.ndarray:
+    config, random = TurnConfig.model_validate(changes), stream(1, "behaviour")
+    return np.array([turn(config, random) for _ in range(4000)])
+
+
+def test_turns_are_drawn_from_the_two_gaussians() -> None:
+    angles = drawn(share=0.6)
+    small = np.isclose(angles, 0.14 * np.pi)
+    assert small.mean() == pytest.approx(0.6, abs=0.03)
+    assert angles[~small].mean() == pytest.approx(0.3 * np.pi, abs=0.06)
+    assert angles[~small].std() == pytest.approx(0.25 * np.pi, rel=0.05)
+    wider = drawn(share=0.0, spread="variance")
+    assert wider.std() > angles[~small].std() + 0.03
+    assert np.abs(wider).max() <= np.pi
+    assert (drawn()[:99] == drawn()[:99]).all()
+
+
+def test_an_undisturbed_motion_ends_as_planned() -> None:
+    for state in (State.FWD1, State.BACK, State.TURN):
+        assert end_of(state, quiet()) == (ROWS - 1, Moment.FREE)
+    assert end_of(State.FWD2, quiet()) == (ROWS - 1, Moment.ABORT)
+
+
+@given(st.integers(0, ROWS - 2), st.integers(0, ROWS - 2), st.integers(0, ROWS - 2), st.sampled_from([-1, 1]))
+def test_the_first_thing_ends_it(touch: int, over: int, bump: int, sign: int) -> None:
+    strain = quiet()
+    strain[touch:, 1, 0] = sign * 1.5 * CONFIG.contact
+    strain[over:, 2, 0] = sign * 1.5 * CONFIG.safety
+    stop = min(over, bump)
+    # What is over the safety threshold is over the contact threshold as well: too much comes first.
+    expected = (touch, Moment.HIT1) if touch < stop else (stop, Moment.ABORT)
+    assert end_of(State.FWD1, strain, bump) == expected
+    assert end_of(State.BACK, strain, bump) == (bump, Moment.FREE)
+
+
+@given(st.integers(0, 3), st.integers(0, 3), st.integers(10, ROWS - 2))
+def test_a_second_whisker_is_another_one(first: int, second: int, row: int) -> None:
+    strain, before = quiet(), NONE.copy()
+    before[first] = True
+    strain[:, first, 0] = 2 * CONFIG.contact
+    strain[row:, second, 0] = -2 * CONFIG.contact
+    other = second != first
+    expected = (row, Moment.HIT2) if other else (ROWS - 1, Moment.ABORT)
+    assert end_of(State.FWD2, strain, before=before) == expected
+    # Also when the first one has slipped off by then.
+    strain[row - 5 :, first] = 0
+    strain[row:, second, 0] = -2 * CONFIG.contact
+    assert end_of(State.FWD2, strain, before=before) == expected
+
+
+def test_two_whiskers_at_once_are_felt_for_a_while() -> None:
+    before = np.array([False, True, True, False])
+    row, moment = end_of(State.FWD2, quiet(), before=before)
+    assert moment == Moment.HIT2
+    assert row == round(CONFIG.least / CONFIG.period)
+
+
+def test_too_much_in_either_channel_ends_it() -> None:
+    for channel in (0, 1):
+        strain = quiet()
+        strain[7:, 3, channel] = -1.1 * CONFIG.safety
+        assert end_of(State.FWD2, strain) == (7, Moment.ABORT)
+
+
+def test_a_turn_may_get_a_whisker_out_of_what_it_is_in() -> None:
+    strain = quiet()
+    strain[:, 1, 0] = np.linspace(2.0, 0.5, ROWS) * CONFIG.safety
+    assert end_of(State.TURN, strain) == (ROWS - 1, Moment.FREE)
+    strain[:, 1, 0] = np.linspace(1.2, 2.0, ROWS) * CONFIG.safety
+    row, moment = end_of(State.TURN, strain)
+    assert moment == Moment.ABORT
+    assert 0 < row < ROWS - 1
+
+
+@given(*[st.floats(-3, 3)] * 3, st.sampled_from([(0.05, 0.0), (-0.05, 0.0), (0.0, 0.3), (0.0, -0.3)]))
+def test_motions_are_straight_or_on_the_spot(
+    x: float, y: float, heading: float, how: tuple[float, float]
+) -> None:
+    pose, time = np.array([x, y, heading]), np.linspace(0.0, 2.0, 9)
+    told = Command(*how, 2.0)
+    poses = moved(told, pose, time)
+    steps = np.column_stack([how[0] * time, 0 * time, how[1] * time])
+    there = compose(pose, steps)
+    assert np.allclose(poses[:, :2], there[:, :2])
+    assert np.allclose(np.exp(1j * poses[:, 2]), np.exp(1j * there[:, 2]))
+
+
+@pytest.mark.parametrize("changes", [{"contact": 3e-3}, {"period": 0.6}, {"least": 2.0}, {"safety": 0.0}])
+def test_a_machine_that_cannot_work_is_refused(changes: dict[str, float]) -> None:
+    with pytest.raises(ValidationError):
+        BehaviourConfig.model_validate(changes)

@@ -1,0 +1,260 @@
+"""Sessions of the Create: same seed, same bits; parts that do not disturb each other; the paper's counts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from robot.arena import inside, segments, text
+from robot.behaviour import State
+from robot.polygons import distance
+from robot.roving import Rover, RovingConfig, drive_into_wall, roving
+from robot.source import Rigged, Sample, Source, rig_of
+from tactile.errors import InputError
+from tactile.frames import between, compose, wrap
+from tactile.streams import stream
+from tactile.types import Moment, Motion, Report
+
+SHORT = {"reports": 150}
+
+
+def made(**changes: Any) -> Rover:
+    return roving(RovingConfig.model_validate(SHORT | changes))
+
+
+@cache
+def session(seed: int, side: float = 1.25) -> Rover:
+    return roving(RovingConfig.model_validate({"seed": seed, "arena": {"side": side}}))
+
+
+def column(rover: Rover, name: str) -> np.ndarray:
+    return np.array([getattr(step, name) for step in rover.steps])
+
+
+def leaves(sample: Sample) -> Iterator[bytes]:
+    yield np.float64(sample.time).tobytes()
+    yield sample.truth.tobytes()
+    for part in (*sample.reading.odometry, *sample.reading[1:]):
+        yield np.asarray(part).tobytes()
+
+
+def bits(source: Source) -> list[list[bytes]]:
+    return [list(leaves(sample)) for sample in source]
+
+
+def test_a_session_has_the_same_bits_every_time() -> None:
+    one = made()
+    assert isinstance(one, Source)
+    assert isinstance(one, Rigged)
+    with one as source:
+        first = bits(source)
+        assert bits(source) == first
+    assert bits(made()) == first
+    assert len(first) == one.length == 150
+    assert made().digest == one.digest
+    other = made(seed=1)
+    assert other.digest != one.digest
+    assert bits(other)[:20] != first[:20]
+
+
+def test_a_longer_session_begins_like_a_shorter_one() -> None:
+    assert bits(made(reports=80)) == bits(made())[:80]
+
+
+def test_streams_are_independent() -> None:
+    base = made()
+    other = made(wheels={"noise": "bias"})
+    assert (other.odometry != base.odometry).any()
+    assert (other.truth == base.truth).all()
+    assert all((a.strain == b.strain).all() for a, b in zip(base.steps, other.steps, strict=True))
+    elsewhere = made(behaviour={"turn": {"share": 0.0}})
+    assert text(elsewhere.arena) == text(base.arena)
+    assert (elsewhere.truth != base.truth).any()
+    one, two = (made(seed=seed, arena={"seed": 7}) for seed in (1, 2))
+    assert text(one.arena) == text(two.arena)
+    assert (one.odometry[:20] != two.odometry[:20]).any()
+
+
+def test_the_digest_tells_what_was_asked_for(tmp_path: Path) -> None:
+    base = made()
+    path, again = tmp_path / "room.txt", tmp_path / "copy.txt"
+    room = base.arena._replace(objects=base.arena.objects[1:])
+    path.write_text(text(room))
+    again.write_text("# the same\n" + text(room))
+    filed = made(arena={"file": path})
+    sessions = [base, made(seed=3), made(whiskers={"noise": 1e-6}), filed, made(arena={"side": 2.5})]
+    assert len({one.digest for one in sessions}) == len(sessions)
+    assert made(arena={"file": again}).digest == filed.digest  # what is in the file counts, not where it lies
+    assert str(tmp_path) not in repr(rig_of(filed))
+    config = RovingConfig.model_validate({"arena": {"file": "room.txt"}}).resolved(tmp_path)
+    assert config.arena.file == path
+    assert text(filed.arena) == text(room)
+
+
+def test_a_session_is_what_its_samples_say() -> None:
+    rover = session(0)
+    samples = list(rover)
+    assert len(samples) == rover.length
+    assert (rover.whiskers, rover.view_shape, rover.whisked) == (4, (1, 4, 1), True)
+    assert rover.rate_hz == pytest.approx(2.0)
+    assert samples[-1].time >= 360 > samples[-2].time
+    before = rover.arena.start
+    for sample, step in zip(samples, rover.steps, strict=True):
+        report = sample.reading
+        assert isinstance(report, Report)
+        assert report.motion == step.state.motion
+        assert report.odometry.dt == pytest.approx(step.duration)
+        assert report.contact.shape == report.alive.shape == (4,)
+        assert report.strain.shape == (len(report.time), 4, 2)
+        if step.state == State.FWD2:
+            assert len(report.time) == round(step.duration * 2000) > 0
+            assert np.allclose(report.time, np.arange(len(report.time)) / 2000)
+        else:
+            assert len(report.time) == 0
+        moved = between(before, sample.truth)
+        assert (report.odometry.dx != 0) == (report.motion != Motion.TURN)
+        if report.motion == Motion.TURN:
+            assert np.allclose(moved[:2], 0, atol=1e-12)
+        else:
+            assert abs(moved[2]) < 1e-12
+            assert np.sign(moved[0]) == np.sign(report.odometry.dx)
+        before = sample.truth
+    assert (np.abs(rover.truth[:, 2]) <= np.pi).all()
+    samples[0].truth[:] = 9  # a reader's own copy
+    samples[0].reading.contact[:] = True
+    assert not np.all(next(iter(rover)).truth == 9)
+    assert not next(iter(rover)).reading.contact.all()
+
+
+def test_without_noise_odometry_leads_along_the_truth() -> None:
+    rover = made(wheels={"noise": "none"})
+    pose = rover.arena.start
+    for sample in rover:
+        pose = compose(pose, np.array(sample.reading.odometry[:3]))
+        assert np.allclose(pose[:2], sample.truth[:2], atol=1e-9)
+        assert abs(wrap(pose[2] - sample.truth[2])) < 1e-9
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_machine_goes_its_way(seed: int) -> None:
+    """Forward until contact, on slowly, back, a turn, forward; moments are told where they belong."""
+    rover = session(seed)
+    state, moment, contact = (column(rover, name) for name in ("state", "moment", "contact"))
+    follows = {
+        State.FWD1: {Moment.FREE: State.FWD1, Moment.HIT1: State.FWD2, Moment.ABORT: State.BACK},
+        State.FWD2: {Moment.HIT2: State.BACK, Moment.ABORT: State.BACK},
+        State.BACK: {Moment.FREE: State.TURN},
+    }
+    for now, how, then in zip(state[:-1], moment[:-1], state[1:], strict=True):
+        if now == State.TURN:
+            assert then in ((State.TURN, State.FWD1) if how == Moment.FREE else (State.BACK,))
+        else:
+            assert follows[now][how] == then
+    assert contact[moment == Moment.HIT1].any(axis=1).all()
+    assert not contact[(state == State.FWD1) & (moment == Moment.FREE)].any()
+    durations = column(rover, "duration")
+    assert durations[state != State.FWD2].max() <= 0.5 + 1e-9
+    assert durations[state == State.FWD2].max() <= 2.0 + 1e-9
+    assert durations.min() > 0
+
+
+@pytest.mark.parametrize(("seed", "side"), [(0, 1.25), (1, 1.25), (2, 2.5), (3, 2.5)])
+def test_the_body_stays_out_of_walls(seed: int, side: float) -> None:
+    rover = session(seed, side)
+    assert inside(rover.arena, rover.truth[:, :2]).all()
+    room = distance(segments(rover.arena), rover.truth[:, :2]).min()
+    assert room > 0.17 - 0.05 * 0.01 - 1e-6  # one look's way
+
+
+def test_six_minutes_are_as_in_the_paper() -> None:
+    """About 30 contacts and more, 3 to 4 circuits, anticlockwise, not all of them with a second contact."""
+    counts = []
+    for seed in range(12):
+        rover = session(seed)
+        state, moment = column(rover, "state"), column(rover, "moment")
+        middle = rover.arena.outer.mean(axis=0)
+        bearing = np.unwrap(np.arctan2(*(rover.truth[:, :2] - middle).T[::-1]))
+        slow = state == State.FWD2
+        counts.append(
+            [
+                rover.length,
+                (moment == Moment.HIT1).sum(),
+                (bearing[-1] - bearing[0]) / (2 * np.pi),
+                (moment[slow] == Moment.HIT2).mean(),
+                ((state == State.TURN) & (moment == Moment.ABORT)).sum(),
+            ]
+        )
+    reports, hits, circuits, seconds, stuck = np.array(counts).T
+    assert 600 < reports.mean() < 760
+    assert hits.min() >= 30
+    assert hits.mean() < 60
+    assert 2.2 < circuits.mean() < 4
+    assert circuits.min() > 0.5
+    assert 0.15 < seconds.mean() < 0.5
+    assert stuck.max() < 60
+
+
+def test_whiskers_that_are_dead_never_report() -> None:
+    rover = made(whiskers={"dead": [0, 3]})
+    assert not column(rover, "contact")[:, [0, 3]].any()
+    assert (next(iter(rover)).reading.alive == [False, True, True, False]).all()
+    alone = made(whiskers={"dead": [0, 1, 2, 3]})  # nothing but its bumper
+    assert not column(alone, "contact").any()
+    assert (column(alone, "moment") == Moment.ABORT).any()
+
+
+def into(angle_deg: float, seed: int = 0, **changes: Any) -> Report:
+    config = RovingConfig.model_validate(changes)
+    return drive_into_wall(config, np.radians(angle_deg), stream(seed, "templates"))
+
+
+def settled(report: Report) -> np.ndarray:
+    """[T, 4] horizontal strain without vibration: means over a tenth of a second."""
+    return report.strain[..., 0].reshape(-1, 200, 4).mean(axis=1)
+
+
+@pytest.mark.parametrize("angle", range(20, 161, 10))
+def test_a_wall_is_first_felt_where_it_is(angle: int) -> None:
+    report = into(angle)
+    assert report.strain.shape == (4000, 4, 2)
+    assert (report.odometry.dx, report.odometry.dt) == (0.04, 2.0)
+    first = np.abs(settled(report)[0])
+    if angle <= 50:
+        assert first.argmax() == 3  # to the right
+    elif angle >= 130:
+        assert first.argmax() == 0
+    else:
+        assert first.argmax() in (1, 2)
+    # Aligned at contact: it has just begun, and grows from there.
+    assert 1.5e-4 < first.max() < 8e-4
+    level = np.abs(settled(report)).max(axis=1)
+    assert level[-1] > 2 * level[0]
+
+
+@pytest.mark.parametrize("angle", [25, 50, 75])
+def test_walls_to_the_left_are_felt_as_those_to_the_right(angle: int) -> None:
+    calm = {"noise": 0.0, "shake": {"start": 0.0, "rumble": 0.0}}
+    right, left = into(angle, whiskers=calm), into(180 - angle, whiskers=calm)
+    assert np.allclose(right.strain[..., 0], -left.strain[:, ::-1, 0], atol=1e-9)
+    # Crosstalk has a sign, droop has none.
+    even = right.strain[..., 1] - 0.08 * right.strain[..., 0]
+    assert np.allclose(even, left.strain[:, ::-1, 1] - 0.08 * left.strain[:, ::-1, 0], atol=1e-9)
+    assert (even <= 1e-12).all()
+
+
+def test_repeats_differ_and_angles_differ_more() -> None:
+    same = np.abs(settled(into(60, 1)) - settled(into(60, 2))).max()
+    other = np.abs(settled(into(60, 1)) - settled(into(80, 2))).max()
+    assert 0 < same < 0.1 * other
+
+
+def test_a_wall_that_cannot_be_driven_into_is_refused(refused: Callable[..., InputError]) -> None:
+    for angle in (0, 180, 270):
+        with pytest.raises(ValueError, match="does not drive"):
+            into(angle)
+    refused(lambda: into(90, behaviour={"contact": 0.9, "safety": 1.0}), "roving.behaviour.contact")

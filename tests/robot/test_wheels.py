@@ -1,0 +1,86 @@
+"""Wheel odometry: each structure of noise does what its name says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robot.wheels import WheelsConfig, reckoned
+from tactile.streams import stream
+from tactile.types import Motion
+
+KINDS = ("white", "move", "bias", "none")
+
+
+def driven(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Seven steps ahead, one back, two of turning, again and again: motions [N, 4] and kinds [N]."""
+    phase = np.arange(count) % 10
+    kind = np.where(phase < 7, Motion.FORWARD, np.where(phase < 8, Motion.BACK, Motion.TURN))
+    motion = np.zeros((count, 4))
+    motion[:, 0] = np.where(kind == Motion.FORWARD, 0.025, np.where(kind == Motion.BACK, -0.025, 0.0))
+    motion[:, 2] = np.where(kind == Motion.TURN, 0.15, 0.0)
+    motion[:, 3] = 0.5
+    return motion, kind
+
+
+def scales(
+    noise: str, count: int = 3000, seed: int = 0, level: float = 0.05
+) -> tuple[np.ndarray, np.ndarray]:
+    """Told over true, of what moves in each step, and the kinds."""
+    motion, kind = driven(count)
+    told = reckoned(WheelsConfig(noise=noise, level=level), motion, kind, stream(seed, "wheels"))
+    column = np.where(kind == Motion.TURN, 2, 0)
+    rows = np.arange(count)
+    return told[rows, column] / motion[rows, column], kind
+
+
+@given(st.integers(0, 10**6), st.sampled_from(KINDS))
+def test_only_what_moves_is_told_wrong(seed: int, noise: str) -> None:
+    motion, kind = driven(40)
+    config = WheelsConfig(noise=noise)
+    told = reckoned(config, motion, kind, stream(seed, "wheels"))
+    assert (told[motion == 0] == 0).all()
+    assert (told[:, 3] == motion[:, 3]).all()
+    assert (told == reckoned(config, motion, kind, stream(seed, "wheels"))).all()
+    if noise != "none":
+        assert (told != reckoned(config, motion, kind, stream(seed + 1, "wheels"))).any()
+    assert (motion == driven(40)[0]).all()
+
+
+def test_without_noise_it_is_the_truth() -> None:
+    motion, kind = driven(30)
+    for config in (WheelsConfig(noise="none"), WheelsConfig(noise="move", level=0.0)):
+        assert (reckoned(config, motion, kind, stream(0, "wheels")) == motion).all()
+    assert reckoned(WheelsConfig(), motion[:0], kind[:0], stream(0, "wheels")).shape == (0, 4)
+
+
+def test_white_noise_is_of_its_level_and_independent() -> None:
+    scale, _ = scales("white")
+    assert scale.mean() == pytest.approx(1, abs=0.005)
+    assert scale.std() == pytest.approx(0.05, rel=0.05)
+    assert abs(np.corrcoef(scale[:-1], scale[1:])[0, 1]) < 0.06
+    doubled, _ = scales("white", level=0.1)
+    assert np.allclose(doubled - 1, 2 * (scale - 1))
+
+
+def test_one_error_lasts_a_move() -> None:
+    scale, kind = scales("move")
+    same = kind[1:] == kind[:-1]
+    assert np.allclose(scale[1:][same], scale[:-1][same])
+    assert (np.abs(np.diff(scale))[~same] > 1e-9).all()
+    assert scale[1:][~same].std() == pytest.approx(0.05, rel=0.1)
+
+
+def test_a_bias_lasts_the_run() -> None:
+    lengths, turns = [], []
+    for seed in range(300):
+        scale, kind = scales("bias", 200, seed)
+        turned = kind == Motion.TURN
+        assert scale[~turned].std() == pytest.approx(0.01, rel=0.3)
+        lengths.append(scale[~turned].mean())
+        turns.append(scale[turned].mean())
+    assert np.std(lengths) == pytest.approx(0.05, rel=0.15)
+    assert np.std(turns) == pytest.approx(0.05, rel=0.15)
+    assert abs(np.corrcoef(lengths, turns)[0, 1]) < 0.2
