@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 
 from ratslam.growing import Growing
-from tactile.frames import wrap
 
 LEVELS = 4_000_000
 """Poses kept of reports that may still be told apart."""
@@ -74,6 +73,5 @@ class Ancestry:
 
 
 def _mean(pose: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    first = pose[0, 2]
-    turned = float(weight @ wrap(pose[:, 2] - first))
-    return np.array([*(weight @ pose[:, :2]), wrap(first + turned)])
+    heading = np.arctan2(weight @ np.sin(pose[:, 2]), weight @ np.cos(pose[:, 2]))
+    return np.array([*(weight @ pose[:, :2]), heading])

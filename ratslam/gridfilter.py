@@ -117,7 +117,10 @@ class GridFilter:
         rim = 0.85 * config.body * np.stack([np.cos(angle), np.sin(angle)], axis=1)
         self.body = np.concatenate([np.zeros((1, 2)), rim]).astype(self.dtype)
         self.blob_sd = config.stamps.blob_sd / config.cell
-        self.wide = int(np.ceil(2 * REACH * config.stamps.along / config.cell)) + 2
+        blob, along = REACH * config.stamps.blob_sd, REACH * config.stamps.along
+        reach = max(np.hypot(*self.free.T).max(initial=0.0) + 0.8 * blob, config.body)
+        tips = np.hypot(*feelers.points(np.ones(1))[:, 0].T).max(initial=0.0)
+        self.near, self.far, self.long = (self._window(far) for far in (reach, tips + blob, along))
 
     def init(self, key: Array, capacity: int) -> State:
         """All particles at the origin of an empty map. Nothing grows, so `capacity` is not used."""
@@ -185,6 +188,8 @@ class GridFilter:
         placed = jnp.all(jnp.isfinite(point), axis=1)
         touching = jnp.asarray(observation.contact) & observation.alive & placed
         clean = fine & jnp.all(placed | ~observation.contact)
+        measured = jnp.all(jnp.isfinite(jnp.append(observation.wall_point, observation.wall_sd)))
+        clean &= measured | ~observation.wall
 
         turning = observation.motion == Motion.TURN
         told = observation.motion != Motion.BACK
@@ -192,7 +197,7 @@ class GridFilter:
         fresh = ~state.touched | (observation.motion == Motion.OTHER)
         foot = jnp.asarray(observation.wall_point, self.dtype)
         away = jnp.hypot(foot[0], foot[1])
-        wall = observation.wall & told & (away > 1e-6) & jnp.isfinite(away) & jnp.any(touching)
+        wall = observation.wall & told & measured & (away > 1e-6) & jnp.any(touching)
         normal = jnp.where(wall, foot / jnp.where(wall, away, 1.0), jnp.zeros(2, self.dtype))
         among = touching.astype(self.dtype)
         point = jnp.where(touching[:, None], point, 0.0)
@@ -248,7 +253,7 @@ class GridFilter:
         shape = (len(pose), self.whiskers, SEGMENTS)
         likelihood = likelihoods.printed(
             self.config.likelihood, self.config.prior,
-            evidence.reshape(shape), cell.reshape(*shape, 2), felt.touching,
+            evidence.reshape(shape), cell.reshape(*shape, 2), felt.touching, felt.free | felt.touching,
         )  # fmt: skip
         return jnp.where(felt.told, likelihood, 0.0)
 
@@ -268,7 +273,7 @@ class GridFilter:
         """Every particle's map with what was felt left in it; and whether any of it lies outside."""
         config, cell = self.config.stamps, self.config.cell
         middle = self._placed(pose, jnp.zeros((1, 2), self.dtype))
-        windows = occupancy.around(middle[:, 0], self.side)
+        windows = occupancy.around(middle[:, 0], self.side, self.near)
         amount = -config.free * jnp.repeat(felt.free, len(FREE)).astype(self.dtype)
         place = occupancy.within(self._placed(pose, jnp.asarray(self.free)), windows)
         stamp = stamps.blobs(place, amount, self.blob_sd, windows.size)
@@ -289,14 +294,16 @@ class GridFilter:
         """With contacts and a wall drawn in."""
         config, cell = self.config.stamps, self.config.cell
         ends = self._placed(pose, felt.point)
-        windows = occupancy.around(self._placed(pose, jnp.zeros((1, 2), self.dtype))[:, 0], self.side)
+        windows = occupancy.around(
+            self._placed(pose, jnp.zeros((1, 2), self.dtype))[:, 0], self.side, self.far
+        )
         amount = config.blob * felt.new.astype(self.dtype)
         stamp = stamps.blobs(occupancy.within(ends, windows), amount, self.blob_sd, windows.size)
         maps = self._added(maps, EVIDENCE, windows, stamp)
         if config.wall == "blob":
             return maps, compass
         place = self._placed(pose, felt.on_wall[None])
-        windows = occupancy.around(place[:, 0], self.side, self.wide)
+        windows = occupancy.around(place[:, 0], self.side, self.long)
         place = occupancy.within(place, windows)[:, 0]
         direction = pose[:, 2] + felt.direction
         if config.wall == "edge":
@@ -315,6 +322,10 @@ class GridFilter:
         most = self.config.stamps.most
         evidence = jnp.clip(occupancy.cut(maps, windows, layer) + stamp, -most, most)
         return occupancy.put(maps, windows, layer, evidence)
+
+    def _window(self, reach: float) -> int:
+        """Cells a side of a window that shows so far, m, on every side of the place that it is about."""
+        return 2 * int(np.ceil(reach / self.config.cell)) + 2
 
     def _placed(self, pose: Array, points: Array) -> Array:
         """[N, K, 2] points [K, 2] of base_link in cells of the map."""

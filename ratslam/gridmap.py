@@ -84,9 +84,10 @@ class GridMap:
     def _marks(self) -> Marks:
         flags = self._flags.rows
         told = self._motion.rows != Motion.BACK
+        placed = np.isfinite(self._point.rows).all(axis=2)
         return Marks(
             told=told,
-            contact=flags[..., 0] & flags[..., 1] & told[:, None],
+            contact=flags[..., 0] & flags[..., 1] & told[:, None] & placed,
             free=~flags[..., 0] & flags[..., 1] & told[:, None],
             turning=self._motion.rows == Motion.TURN,
             point=self._point.rows,

@@ -44,17 +44,19 @@ def direction(config: LikelihoodConfig, field: Array, angle: Array, precision: A
     return jnp.log(1 - config.wall + config.wall * likely)
 
 
-def printed(config: LikelihoodConfig, prior: float, evidence: Array, cell: Array, felt: Array) -> Array:
+def printed(
+    config: LikelihoodConfig, prior: float, evidence: Array, cell: Array, felt: Array, alive: Array
+) -> Array:
     """[N] eq. 1 and 2.
 
     Args:
         evidence: [N, W, G] at the points along each whisker, from base to tip. cell: [N, W, G, 2] their
-            cells. felt: [W] bool, contacts, which are all at the tip.
+            cells. felt: [W] bool, contacts, which are all at the tip. alive: [W] bool, whiskers that count.
     """
     chance = jnp.clip(jax.nn.sigmoid(evidence + _logit(prior)), 1e-6, 1 - 1e-6)
     count = evidence.shape[2]
     tip = jnp.arange(count) == count - 1
-    counted = jnp.ones(evidence.shape, bool)
+    counted = jnp.broadcast_to(alive[None, :, None], evidence.shape)
     if config.model != "literal":
         counted = ~(tip[None] & felt[:, None])[None] & counted
     if config.model == "distinct":

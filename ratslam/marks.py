@@ -92,12 +92,14 @@ def _marks(
             made.append(_Mark(_at(pose, point), config.free, config.free_sd, np.nan))
         if body:
             made.append(_Mark(pose[:2], config.body, body, np.nan))
+        if not marks.contact[k].any():
+            made, pending = made + pending, []
         new = marks.contact[k] & ~before & ~marks.turning[k]
         pending += [_Mark(_at(pose, p), config.contact, config.blob_sd, np.nan) for p in marks.point[k][new]]
         foot = marks.wall[k]
-        if np.isfinite(foot).all() and marks.contact[k].any():
+        away = np.hypot(*foot)
+        if np.isfinite(away) and away > 1e-6 and marks.contact[k].any():
             pending = []  # the edge says what these contacts were of
-            away = np.hypot(*foot)
             normal = foot / away
             middle = marks.point[k][marks.contact[k]].mean(axis=0)
             place = _at(pose, middle + normal * (away - normal @ middle))

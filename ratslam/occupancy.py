@@ -1,8 +1,8 @@
 """Maps of many particles, read and written through small windows: work follows what is touched, not the map.
 
 A map holds evidence (log-odds, 0 where nothing was felt) and the doubled directions of walls as a field of
-vectors. Places are in cells. What lies near a particle is changed in one window of `WINDOW` cells a side that
-is cut out of its map and put back. What lies outside the map is unexplored for ever.
+vectors. Places are in cells. What lies near a particle is changed in a window that is cut out of its map and
+put back. What lies outside the map is unexplored for ever.
 """
 
 from __future__ import annotations
@@ -15,8 +15,6 @@ from jax import lax
 
 from tactile.types import Array
 
-WINDOW = 16
-"""Cells a side: a Create and its whiskers fit in at 5 cm."""
 EVIDENCE, COSINE, SINE = 0, 1, 2
 LAYERS = 3
 
@@ -38,8 +36,8 @@ def in_cells(point: Array, cell: float, side: int) -> Array:
     return point / cell + (side - 1) / 2
 
 
-def around(place: Array, side: int, size: int = WINDOW) -> Windows:
-    """The windows about places [N, 2] in cells, inside the map."""
+def around(place: Array, side: int, size: int) -> Windows:
+    """The windows of `size` cells a side about places [N, 2] in cells, inside the map."""
     size = min(size, side)
     corner = jnp.floor(place).astype(jnp.int32) - (size // 2 - 1)
     return Windows(jnp.clip(corner, 0, side - size), size)

@@ -53,7 +53,7 @@ def start(config: DriftConfig, key: Array, count: int, dtype: jnp.dtype) -> Part
 def moved(
     config: DriftConfig, particles: Particles, odometry: Odometry, changed: Array, key: Array
 ) -> Particles:
-    """After an odometry reading: turned first, then driven along the new heading.
+    """After an odometry reading.
 
     Args:
         changed: bool, another movement has begun; its scale errors are drawn.
@@ -63,10 +63,13 @@ def moved(
     move = jnp.where(changed, config.move * draws[:2].T, particles.move)
     scale = 1 + particles.run + move + config.step * draws[2:4].T
     x, y, heading = particles.pose.T
-    heading = heading + odometry.dtheta * scale[:, 1] + config.heading * draws[4]
-    c, s = jnp.cos(heading), jnp.sin(heading)
+    error = odometry.dtheta * (scale[:, 1] - 1) + config.heading * draws[4]
+    on = heading + error / 2  # odometry tells of the way in the old frame; its errors build up along it
+    c, s = jnp.cos(on), jnp.sin(on)
     dx, dy = odometry.dx * scale[:, 0], odometry.dy * scale[:, 0]
-    pose = jnp.stack([x + c * dx - s * dy, y + s * dx + c * dy, heading], axis=1)
+    turned = heading + odometry.dtheta + error
+    turned -= 2 * jnp.pi * jnp.round(turned / (2 * jnp.pi))  # large angles are coarse in float32
+    pose = jnp.stack([x + c * dx - s * dy, y + s * dx + c * dy, turned], axis=1)
     return particles._replace(pose=pose, move=move)
 
 
@@ -99,8 +102,9 @@ def drawn(config: ResamplingConfig, share: Array, key: Array) -> Drawn:
         at = jnp.sort(jax.random.uniform(key, (count,), share.dtype))
     else:
         at = (jnp.arange(count, dtype=share.dtype) + jax.random.uniform(key, (), share.dtype)) / count
+    at = jnp.minimum(at, 1 - jnp.finfo(share.dtype).epsneg)  # where it was rounded up to 1
     # How many points fall below the end of each particle's stretch, so how many copies it gets.
-    below = jnp.searchsorted(at, total, side="left").astype(jnp.int32).at[-1].set(count)
+    below = jnp.searchsorted(at, total, side="left").astype(jnp.int32)
     offspring = jnp.diff(below, prepend=jnp.int32(0))
     return placed(offspring)
 

@@ -10,13 +10,20 @@ import jax
 import numpy as np
 import pytest
 
+from ratslam.gridfilter import GridFilter, Outcome
+from ratslam.gridsettings import GridConfig
 from ratslam.rat import RatConfig
 from ratslam.recallrat import rat
 from ratslam.session import CHUNK, Session, capacity_at
 from ratslam.types import Action
+from tactile.feelers import Feelers
 from tactile.types import Odometry, observation
 
 VIEW = (3, 6, 1)
+WHISKERS = VIEW[0] * VIEW[1]
+BEARING = np.arange(WHISKERS) * 2 * np.pi / WHISKERS
+AROUND = np.stack([np.cos(BEARING), np.sin(BEARING)], axis=1)
+REACH = 0.2
 
 
 def _dead_reckoning():
@@ -33,6 +40,18 @@ def _rat(matcher, source, dtype=np.float64, **more):
     return lambda: rat(RatConfig.model_validate(parts | more), VIEW, dtype)
 
 
+def _grid(dtype=np.float64):
+    # Of little faith in odometry, so that it draws anew in mid-run wherever one stops.
+    doubtful = {
+        "drift": {"step": 0.3, "heading": 0.05},
+        "likelihood": {"free": 0.5, "contact": 4.0},
+        "resampling": {"effective": 0.9},
+    }
+    config = GridConfig.model_validate({"particles": 20} | doubtful)
+    feelers = Feelers(np.zeros((WHISKERS, 2)), AROUND, np.full(WHISKERS, REACH))
+    return lambda: GridFilter(config, feelers, 3.0, dtype)
+
+
 # Weighs its runs every few frames, so that it does so in mid-run wherever one stops.
 TOUCH = {"recall": {"fan": "whiskers"}, "frames": {"weigh_every": 15, "breaks": False, "whole": 0.2}}
 
@@ -43,6 +62,7 @@ BACKENDS = {
     "touch": _rat("recall", "views", **TOUCH),
     "classic": _rat("classic", "views"),
     "classic-labels": _rat("classic", "labels"),
+    "grid": _grid(),
     "dead-reckoning": _dead_reckoning,
 }
 
@@ -53,6 +73,7 @@ SINGLE = {
     "touch": _rat("recall", "views", np.float32, **TOUCH),
     "classic": _rat("classic", "views", np.float32),
     "classic-labels": _rat("classic", "labels", np.float32),
+    "grid": _grid(np.float32),
 }
 
 
@@ -62,16 +83,20 @@ def make(request):
 
 
 def walk(count: int, seed: int = 0):
-    """Round a small circuit again and again, with views that come back; some steps see nothing."""
-    stream = np.random.default_rng(seed)
+    """Round a small circuit again and again, with views that come back; some steps see nothing, and now and
+    then whiskers touch something."""
+    stream, felt = np.random.default_rng(seed), np.random.default_rng([seed, 1])
     places = stream.random((17, *VIEW))
     for k in range(count):
         turn = 2 * np.pi / 17 + stream.normal(0, 0.01)
         odometry = Odometry(0.05 + stream.normal(0, 0.002), stream.normal(0, 0.002), turn, 0.1)
         seen = stream.random() > 0.1
-        yield observation(
-            odometry, places[k % 17] if seen else None, view_shape=VIEW, label=k % 17 if seen else -1
-        )
+        o = observation(
+            odometry, places[k % 17] if seen else None, view_shape=VIEW, label=k % 17 if seen else -1,
+            whiskers=WHISKERS,
+        )  # fmt: skip
+        contact = felt.random(WHISKERS) < (0.2 if k % 5 == 0 else 0.0)
+        yield o._replace(contact=contact, point=np.where(contact[:, None], REACH * AROUND, 0.0))
 
 
 @cache
@@ -164,7 +189,7 @@ def test_places_are_consistent(make):
 
 def test_nothing_odd_comes_of_odd_input(make):
     session = Session(make())
-    still = observation(Odometry(0, 0, 0, 0.1), np.full(VIEW, 0.5), label=3)
+    still = observation(Odometry(0, 0, 0, 0.1), np.full(VIEW, 0.5), label=3, whiskers=WHISKERS)
     odd = still._replace(odometry=Odometry(*(np.float64(v) for v in (np.nan, np.inf, 0, 0.1))))
     blind = still._replace(view=np.full(VIEW, np.nan))
     for o in (still, odd, blind, still):
@@ -194,6 +219,12 @@ def test_touch_closes_and_weighs_in_these_walks():
     assert arrays["map/looks/likeness"].any()
     weight = arrays["map/ledger/weight"]
     assert ((weight > 0) & (weight < 1)).any()
+
+
+def test_the_grid_draws_anew_in_these_walks():
+    # Else replay and checkpoints would prove little of it.
+    outcomes = np.array([step.evidence.outcome for step in replayed(BACKENDS["grid"])[0]])
+    assert 10 < (outcomes == Outcome.RESAMPLED).sum() < 330
 
 
 def test_compiles_once_per_capacity(make):

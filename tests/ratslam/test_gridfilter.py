@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -41,6 +43,7 @@ CORRIDOR = filter_of(
         resampling={"length": 0.0, "heading": 0.0, "scale": 0.0},
         likelihood={"free": 0.3, "contact": 1.0},
     ),
+    whiskers=2,
     side=1.6,
 )  # fmt: skip
 ALL = range(4)
@@ -147,9 +150,8 @@ def test_a_wall_says_the_same_from_wherever_it_is_felt():
     for heading in (0.0, 1.0, 2.5, np.pi):
         start = standing(begun(FILTER), [0.0, 0.0, heading])
         state, *_ = drive(FILTER, start, [report(touching=[1, 2], wall=(0.3, 1.2 - heading), sd=0.05)])
-        spread = np.asarray(state.particles.pose)[:, 2].std()
         fields.append(np.asarray(state.compass).mean(axis=0))
-        assert spread < 0.01
+        assert wrap(np.asarray(state.particles.pose)[:, 2] - heading) == pytest.approx(0, abs=0.01)
     assert np.array(fields) == pytest.approx(np.tile(fields[0], (4, 1)), abs=0.01)
 
 
@@ -239,13 +241,13 @@ def corridor(backend, reports, spread):
 
     Weighs as the filter does, from its likelihoods at each place; [T, 2], m and m2.
     """
-    config, fine = backend.config, 1e-3
+    config, fine = backend.config, 2e-3
     x = np.arange(-0.3, 1.2, fine)
     pose = np.stack([x, 0 * x, 0 * x], axis=1)
     maps = (
         occupancy.blank(1, backend.side, np.dtype(float)).at[0, EVIDENCE].set(column_of_wall(backend, 0.65))
     )
-    belief, touched, told = np.where(np.abs(x) < fine / 2, 1.0, 0.0), np.zeros(4, bool), []
+    belief, touched, told = np.where(np.abs(x) < fine / 2, 1.0, 0.0), np.zeros(2, bool), []
 
     def evidence(points):
         place = placed(backend, pose, points).reshape(1, -1, 2)
@@ -256,9 +258,9 @@ def corridor(backend, reports, spread):
         gap = (x[:, None] - x[None] - float(o.odometry.dx)) / sd
         belief = np.exp(-0.5 * gap**2) @ belief
         if o.motion != Motion.BACK:
-            free = np.repeat(~o.contact, backend.free.shape[0] // 4)
+            free = np.repeat(~o.contact, len(backend.free) // 2)
             logs = likelihoods.free(config.likelihood, evidence(backend.free), free)
-            logs += likelihoods.contact(config.likelihood, evidence(TIPS), o.contact & ~touched)
+            logs += likelihoods.contact(config.likelihood, evidence(TIPS[:2]), o.contact & ~touched)
             belief = belief * np.exp(np.asarray(logs))
         touched = o.contact & (o.motion != Motion.BACK)
         belief = belief / belief.sum()
@@ -268,12 +270,13 @@ def corridor(backend, reports, spread):
 
 
 def test_position_in_a_corridor_is_that_of_an_exact_filter():
-    """Mean and variance of the position at four reports named beforehand, over 30 runs of 1 000 particles:
-    |t| < 4.5 in each of eight tests with 29 degrees of freedom. Size: 8e-4."""
-    spread, runs = CORRIDOR.config.drift.step, 30
+    """Mean and variance of the position at four reports named beforehand, over 20 runs of 1 000 particles:
+    |t| < 5 in each of eight tests with 19 degrees of freedom. Size: 7e-4."""
+    spread, runs = CORRIDOR.config.drift.step, 20
     backend = CORRIDOR
-    reports = [report(0.1)] * 4 + [report(0.1, touching=[1, 2])] + [report(-0.05)] * 2 + [report(0.05)]
-    reports += [report(0.06, touching=[1, 2]), report(0.02, touching=[0, 1, 2, 3])]
+    felt = partial(report, whiskers=2)
+    reports = [felt(0.1)] * 4 + [felt(0.1, touching=[1])] + [felt(-0.05)] * 2 + [felt(0.05)]
+    reports += [felt(0.06, touching=[1]), felt(0.02, touching=[0, 1])]
     checked = [3, 4, 6, 9]  # free, a contact, backed off, the last contact
     exact = corridor(backend, reports, spread)
     found, drawn = [], []
@@ -284,15 +287,15 @@ def test_position_in_a_corridor_is_that_of_an_exact_filter():
         drawn.append((told.ancestor != np.arange(1000)).any(axis=1))
     found = np.array(found)
     error = found.std(axis=0, ddof=1) / np.sqrt(runs)
-    assert (np.abs((found.mean(axis=0) - exact) / error)[checked] < 4.5).all()
+    assert (np.abs((found.mean(axis=0) - exact) / error)[checked] < 5).all()
     # What would have been found without drawing anew, or without the contacts, lies far off.
-    assert np.all(drawn, axis=0).sum() >= 2
+    assert np.any(drawn, axis=1).all()
     blind = corridor(
         backend,
-        [o._replace(contact=np.zeros(4, bool), motion=np.int32(Motion.BACK)) for o in reports],
+        [o._replace(contact=np.zeros(2, bool), motion=np.int32(Motion.BACK)) for o in reports],
         spread,
     )
-    assert (np.abs((blind - exact) / error)[checked[1:]] > 20).all()
+    assert (np.abs((blind - exact) / error)[checked[1:], 0] > 20).all()
 
 
 # Drawing anew
@@ -308,7 +311,7 @@ def test_maps_follow_their_particles():
             weight=-0.05 * names, run=1e-9 * jnp.stack([names, names], axis=1)
         ),
     )
-    after, _, told = drive(CORRIDOR, state, [report(0.02)])
+    after, _, told = drive(CORRIDOR, state, [report(0.02, whiskers=2)])
     ancestor = told.ancestor[0]
     assert told.outcome[0] == Outcome.RESAMPLED
     assert 20 < len(np.unique(ancestor)) < 500

@@ -23,14 +23,24 @@ EVIDENCE = st.floats(-30, 30)
 free = jax.jit(likelihoods.free, static_argnums=0)
 contact = jax.jit(likelihoods.contact, static_argnums=0)
 direction = jax.jit(likelihoods.direction, static_argnums=0)
-printed = jax.jit(likelihoods.printed, static_argnums=(0, 1))
+printed = jax.jit(
+    lambda config, prior, evidence, cell, felt: likelihoods.printed(
+        config, prior, evidence, cell, felt, jnp.ones(felt.shape, bool)
+    ),
+    static_argnums=(0, 1),
+)
 
 
-def by_loops(model, evidence, cell, felt):
+def printed(config, evidence, cell, felt, alive=None):
+    """[N] as of whiskers that all report unless told otherwise."""
+    return weighing(config, PRIOR, evidence, cell, felt, np.ones_like(felt) if alive is None else alive)
+
+
+def by_loops(model, evidence, cell, felt, alive):
     """Eq. 1 and 2 of one particle, written out."""
     chance = expit(evidence + logit(PRIOR))
     product = 1.0
-    for whisker in range(len(felt)):
+    for whisker in np.flatnonzero(alive):
         ends = tuple(cell[whisker, -1])
         points = range(SEGMENTS)
         if felt[whisker]:
@@ -53,7 +63,7 @@ def walls(model, chance, whiskers):
     evidence = np.zeros((2, whiskers, SEGMENTS))
     evidence[1, :, -1] = logit(chance) - logit(PRIOR)
     cell = np.tile(cell, (2, 1, 1, 1))
-    unknown, known = np.exp(printed(MODELS[model], PRIOR, evidence, cell, np.ones(whiskers, bool)))
+    unknown, known = np.exp(printed(MODELS[model], evidence, cell, np.ones(whiskers, bool)))
     return known / unknown
 
 
@@ -77,9 +87,10 @@ def test_printed_likelihoods_are_the_products_told(model, seed):
     for k, c in np.ndindex(2, 3):  # the same cell, the same evidence
         _, index = np.unique(cell[k, c], axis=0, return_inverse=True)
         evidence[k, c] = evidence[k, c][index.ravel()]
-    felt = stream.random(3) < 0.5
-    logs = printed(MODELS[model], PRIOR, evidence, cell, felt)
-    expected = [by_loops(model, evidence[k], cell[k], felt) for k in range(2)]
+    alive = stream.random(3) < 0.8
+    felt = (stream.random(3) < 0.5) & alive
+    logs = printed(MODELS[model], evidence, cell, felt, alive)
+    expected = [by_loops(model, evidence[k], cell[k], felt, alive) for k in range(2)]
     assert np.exp(logs) == pytest.approx(expected)
 
 
@@ -87,8 +98,7 @@ def test_the_last_free_point_in_the_contact_cell_does_not_count():
     cell = np.array([0, 1, 2, 3, 3.0]).repeat(2).reshape(1, 1, SEGMENTS, 2)
     evidence = np.array([0, 0, 0, 9, 9.0]).reshape(1, 1, SEGMENTS)
     logs = {
-        name: float(printed(config, PRIOR, evidence, cell, np.ones(1, bool))[0])
-        for name, config in MODELS.items()
+        name: float(printed(config, evidence, cell, np.ones(1, bool))[0]) for name, config in MODELS.items()
     }
     wall = expit(9 + logit(PRIOR))
     assert np.exp(logs["distinct"]) == pytest.approx(0.7**3 * wall)
@@ -108,7 +118,7 @@ def test_five_points_on_a_whisker_hit_three_to_four_cells():
     ]
     flat = np.full((count, 1, SEGMENTS), -logit(PRIOR))  # every cell halves the likelihood
     half = {
-        name: np.rint(-np.asarray(printed(config, PRIOR, flat, cell, np.zeros(1, bool))) / np.log(2))
+        name: np.rint(-np.asarray(printed(config, flat, cell, np.zeros(1, bool))) / np.log(2))
         for name, config in MODELS.items()
     }
     assert (half["literal"] == SEGMENTS).all()
@@ -116,9 +126,7 @@ def test_five_points_on_a_whisker_hit_three_to_four_cells():
     assert half["distinct"].mean() == pytest.approx(
         3.45, abs=0.005 + 4 * half["distinct"].std() / np.sqrt(count)
     )
-    touched = np.rint(
-        -np.asarray(printed(MODELS["distinct"], PRIOR, flat, cell, np.ones(1, bool))) / np.log(2)
-    )
+    touched = np.rint(-np.asarray(printed(MODELS["distinct"], flat, cell, np.ones(1, bool))) / np.log(2))
     assert np.array_equal(touched, half["distinct"])  # one cell is the contact's instead
     last = np.all(cell[:, 0, -1] == cell[:, 0, -2], axis=1).mean()
     assert last == pytest.approx(0.39, abs=0.005 + 4 * 0.5 / np.sqrt(count))
@@ -131,7 +139,7 @@ def test_certain_cells_leave_printed_likelihoods_finite(model, dtype):
     for sign in (-1, 1):
         for felt in (False, True):
             evidence = np.full((1, 1, SEGMENTS), sign * 1e4, dtype)
-            logs = printed(MODELS[model], PRIOR, evidence, cell, np.array([felt]))
+            logs = printed(MODELS[model], evidence, cell, np.array([felt]))
             assert logs.dtype == dtype
             assert np.isfinite(logs).all()
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given
@@ -11,11 +10,22 @@ from hypothesis import strategies as st
 from scipy.ndimage import map_coordinates
 
 from ratslam import occupancy
-from ratslam.occupancy import LAYERS, WINDOW
+from ratslam.occupancy import LAYERS, Windows
 
 COUNT, SIDE = 3, 24
 
+WINDOW = 16
 read = jax.jit(occupancy.read, static_argnums=1)
+around = jax.jit(
+    lambda place, side, size=WINDOW: occupancy.around(place, side, size).corner, static_argnums=(1, 2)
+)
+cut = jax.jit(
+    lambda maps, corner, size, layer: occupancy.cut(maps, Windows(corner, size), layer), static_argnums=(2, 3)
+)
+put = jax.jit(
+    lambda maps, corner, size, layer, values: occupancy.put(maps, Windows(corner, size), layer, values),
+    static_argnums=(2, 3),
+)
 
 
 def filled(side=SIDE, dtype=float, seed=0):
@@ -85,34 +95,32 @@ def test_windows_lie_inside_the_map_and_hold_what_they_are_about(side, size, dty
     assert ((right >= room) | (corner[:50] + windows.size == side)).all()
 
 
-@pytest.mark.parametrize("size", [6, WINDOW, 99])
+@pytest.mark.parametrize("size", [6, WINDOW, SIDE])
 @pytest.mark.parametrize("layer", range(LAYERS))
 def test_what_is_put_is_cut_and_nothing_else_changes(size, layer):
     maps = filled()
-    place = np.random.default_rng(2).uniform(-5, SIDE + 5, (COUNT, 2))
-    windows = occupancy.around(place, SIDE, size)
-    before = occupancy.cut(maps, windows, layer)
-    for k, (x, y) in enumerate(np.asarray(windows.corner)):
-        assert np.array_equal(before[k], maps[k, layer, y : y + windows.size, x : x + windows.size])
-    assert np.array_equal(occupancy.put(maps, windows, layer, before), maps)
+    corner = np.asarray(around(np.random.default_rng(2).uniform(-5, SIDE + 5, (COUNT, 2)), SIDE, size))
+    before = cut(maps, corner, size, layer)
+    for k, (x, y) in enumerate(corner):
+        assert np.array_equal(before[k], maps[k, layer, y : y + size, x : x + size])
+    assert np.array_equal(put(maps, corner, size, layer, before), maps)
     values = np.random.default_rng(3).normal(size=before.shape)
-    after = np.array(occupancy.put(maps, windows, layer, values))
-    assert np.array_equal(occupancy.cut(after, windows, layer), values)
-    for k, (x, y) in enumerate(np.asarray(windows.corner)):
-        after[k, layer, y : y + windows.size, x : x + windows.size] = before[k]
+    after = np.array(put(maps, corner, size, layer, values))
+    assert np.array_equal(cut(after, corner, size, layer), values)
+    for k, (x, y) in enumerate(corner):
+        after[k, layer, y : y + size, x : x + size] = before[k]
     assert np.array_equal(after, maps)
 
 
 def test_places_in_windows_are_places_in_the_map():
     maps = filled()
     place = np.random.default_rng(4).uniform(4, SIDE - 5, (COUNT, 2))
-    windows = occupancy.around(place, SIDE)
-    inside = occupancy.within(place[:, None], windows)
+    corner = np.asarray(around(place, SIDE))
+    inside = np.asarray(occupancy.within(place[:, None], Windows(corner, WINDOW)))
+    assert inside[:, 0] == pytest.approx(place - corner)
+    windows = np.stack([cut(maps, corner, WINDOW, layer) for layer in range(LAYERS)], axis=1)
     for layer in range(LAYERS):
-        cut = jnp.broadcast_to(
-            occupancy.cut(maps, windows, layer)[:, None], (COUNT, LAYERS, windows.size, windows.size)
-        )
-        assert read(cut, layer, inside) == pytest.approx(np.asarray(read(maps, layer, place[:, None])))
+        assert read(windows, layer, inside) == pytest.approx(np.asarray(read(maps, layer, place[:, None])))
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

@@ -28,6 +28,7 @@ moved = jax.jit(particles.moved, static_argnums=0)
 weighed = jax.jit(particles.weighed)
 drawing = jax.jit(particles.drawn, static_argnums=0)
 placing = jax.jit(particles.placed)
+averaged = jax.jit(particles.mean)
 
 
 def drawn(config, share, seed):
@@ -110,20 +111,21 @@ def test_one_heavy_particle_takes_all(config, heavy):
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("count", [2, 30, 100])
 def test_equal_weights_change_nothing(count, dtype):
-    share = particles.shares(jnp.full(count, -3.0, dtype))
+    share = np.asarray(particles.shares(jnp.full(count, -3.0, dtype)))
     for seed in range(10):
         who = drawn(SYSTEMATIC, share, seed)
         assert who.copies == 0
         assert np.array_equal(who.ancestor, np.arange(count))
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_a_weightless_last_particle_is_never_drawn(dtype):
+def test_a_weightless_last_particle_is_never_drawn():
     """Among so many that in float32 the last point of a systematic draw is often rounded up to 1."""
     count = 100_000
-    share = particles.shares(jnp.zeros(count, dtype).at[-1].set(-jnp.inf))
+    share = particles.shares(jnp.zeros(count, np.float32).at[-1].set(-jnp.inf))
     assert share[-1] == 0
-    assert all(drawn(SYSTEMATIC, share, seed).ancestor[-1] != count - 1 for seed in range(100))
+    assert all(
+        drawn(SYSTEMATIC, share, seed).ancestor[-1] != count - 1 for seed in [*range(20), 65, 178, 881]
+    )
 
 
 @pytest.mark.parametrize("config", [SYSTEMATIC, MULTINOMIAL], ids=["systematic", "multinomial"])
@@ -214,8 +216,8 @@ def test_one_particle_that_explains_what_was_felt_is_enough():
 def test_the_mean_turns_with_the_particles(seed, turned):
     stream = np.random.default_rng(seed)
     poses, share = stream.normal(0, [1, 1, 0.4], (COUNT, 3)), stream.dirichlet(np.ones(COUNT))
-    pose, spread = jax.jit(particles.mean)(poses, share)
-    shifted, same = jax.jit(particles.mean)(poses + [3, -2, turned], share)
+    pose, spread = averaged(poses, share)
+    shifted, same = averaged(poses + [3, -2, turned], share)
     middle = share @ poses[:, :2]
     assert pose[:2] == pytest.approx(middle)
     assert spread[:2] == pytest.approx(np.sqrt(share @ (poses[:, :2] - middle) ** 2))
@@ -227,7 +229,7 @@ def test_the_mean_turns_with_the_particles(seed, turned):
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_particles_that_agree_have_no_spread(dtype):
-    pose, spread = particles.mean(jnp.full((COUNT, 3), 2.5, dtype), jnp.full(COUNT, 1 / COUNT, dtype))
+    pose, spread = averaged(np.full((COUNT, 3), 2.5, dtype), np.full(COUNT, 1 / COUNT, dtype))
     assert pose == pytest.approx([2.5, 2.5, 2.5])
     assert np.asarray(spread) == pytest.approx(0, abs=1e-3)  # square roots of rounding errors
 
@@ -288,7 +290,7 @@ def test_scale_errors_last_as_long_as_they_should():
 
 
 def test_noise_of_each_step_has_the_scale_told():
-    """Size: 10 means and variances of 40 000 particles within 4.5 standard errors: 1e-4."""
+    """Size: 8 means and variances of 40 000 particles within 4.5 standard errors: 1e-4."""
     count = 40_000
     config = DriftConfig(run=0.0, move=0.0, step=0.02, heading=5e-4)
     error = 4.5 / np.sqrt(count)
@@ -301,7 +303,7 @@ def test_noise_of_each_step_has_the_scale_told():
 
     straight, turn, still = after(0.5, 0.0), after(0.0, -0.8), after(0.0, 0.0)
     told = [
-        (straight[:, 0], 0.5, 0.01), (straight[:, 2], 0.0, 5e-4), (straight[:, 1], 0.0, 0.5 * 5e-4),
+        (straight[:, 0], 0.5, 0.01), (straight[:, 2], 0.0, 5e-4), (straight[:, 1], 0.0, 0.5 * 2.5e-4),
         (turn[:, 2], -0.8, np.hypot(0.016, 5e-4)), (still[:, 2], 0.0, 5e-4),
     ]  # fmt: skip
     for value, mean, sd in told:
