@@ -90,16 +90,17 @@ class StampConfig(Settings):
 
 
 class DrawingConfig(Settings):
-    """How the map is drawn (Fox et al. 2012, eq. 3 and 4), along the path that the filter has found."""
+    """How the map is drawn (Fox et al. 2012, eq. 3 and 4), along the path that the filter has found. Edges are
+    shorter and surer than the paper's, which run on beyond the ends of walls."""
 
-    contact: Share = 0.8
+    contact: Share = 0.95
     """Chance of an obstacle where one was felt."""
-    blob_sd: PositiveFloat = 0.05
+    blob_sd: PositiveFloat = 0.04
     """Standard deviation of a contact without a known wall, m."""
-    edge_sd: PositiveFloat = 0.25
-    """Of one with a wall, along it, m."""
-    edge_fan: PositiveFloat = 0.2617993877991494
-    """Of the direction in which it is seen from the contact, rad: pi / 12."""
+    edge_sd: PositiveFloat = 0.14
+    """Of one with a wall, along it, m; 0.25 in the paper."""
+    edge_fan: PositiveFloat = 0.35
+    """Of the direction in which it is seen from the contact, rad; pi / 12 in the paper."""
     free: Share = 0.4
     """Chance of an obstacle at the middle of a whisker that meets nothing."""
     free_sd: PositiveFloat = 0.05

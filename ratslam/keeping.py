@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from evaluation.grid import Truth, centres
+from evaluation.grid import Grid, Truth, centres
 from evaluation.gridfiles import read_grid, write_truth
 from evaluation.gridscore import score_grid
 from evaluation.images import Images, write_images
 from evaluation.nav2 import write_description, write_image
 from evaluation.rundirectory import write_walls
 from ratslam.storage import RunDirectory
-from robot.arena import enclosed, occupied, read_arena, segments
+from robot.arena import Arena, enclosed, occupied, read_arena, segments
 from robot.maze import read_maze, walls
 from robot.scene import MazeConfig
 from robot.source import Source, rig_of
@@ -72,11 +72,16 @@ def keep_chart(source: Source, store: RunDirectory) -> None:
     if not (store.path / "arena.txt").exists():
         return
     arena = read_arena(store.path / "arena.txt")
+    truth = truth_of(arena, grid)
+    store.file("arena.npz", lambda path: write_truth(path, truth, arena.start))
+    score = score_grid(grid, truth, store.path.name)
+    store.text("gridscore.json", score.model_dump_json(indent=2) + "\n")
+
+
+def truth_of(arena: Arena, grid: Grid) -> Truth:
+    """What is really there, on the cells and in the frame of a map that begins where the robot starts."""
     place = centres(grid)
     there = compose(arena.start, np.concatenate([place, np.zeros((*place.shape[:2], 1))], axis=2))[..., :2]
     ends = segments(arena).reshape(-1, 2)
     seen = compose(inverse(arena.start), np.column_stack([ends, np.zeros(len(ends))]))[:, :2]
-    truth = Truth(occupied(arena, there), enclosed(arena, there), seen.reshape(-1, 4))
-    store.file("arena.npz", lambda path: write_truth(path, truth, arena.start))
-    score = score_grid(grid, truth, store.path.name)
-    store.text("gridscore.json", score.model_dump_json(indent=2) + "\n")
+    return Truth(occupied(arena, there), enclosed(arena, there), seen.reshape(-1, 4))
