@@ -90,8 +90,8 @@ class StampConfig(Settings):
 
 
 class DrawingConfig(Settings):
-    """How the map is drawn (Fox et al. 2012, eq. 3 and 4), along the path that the filter has found. Edges are
-    shorter and surer than the paper's, which run on beyond the ends of walls."""
+    """How the map is drawn (Fox et al. 2012, eq. 3 and 4), along the path that the filter has found. Edges
+    are shorter and surer than the paper's, which run on beyond the ends of walls."""
 
     contact: Share = 0.95
     """Chance of an obstacle where one was felt."""

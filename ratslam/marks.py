@@ -86,14 +86,16 @@ def _marks(
     pending: list[_Mark] = []
     for k, pose in enumerate(path):
         if not marks.told[k]:
-            made, pending, before = made + pending, [], np.zeros_like(before)
+            made += pending
+            pending, before = [], np.zeros_like(before)
             continue
         for point in middles[marks.free[k]]:
             made.append(_Mark(_at(pose, point), config.free, config.free_sd, np.nan))
         if body:
             made.append(_Mark(pose[:2], config.body, body, np.nan))
         if not marks.contact[k].any():
-            made, pending = made + pending, []
+            made += pending
+            pending = []
         new = marks.contact[k] & ~before & ~marks.turning[k]
         pending += [_Mark(_at(pose, p), config.contact, config.blob_sd, np.nan) for p in marks.point[k][new]]
         foot = marks.wall[k]

@@ -69,7 +69,7 @@ def run(world: str, row: str, arena: int) -> Figures:
     from ratslam.run import open_source, readings, session_of
     from robot.sensing import sensing
     from tactile.frames import compose, integrate
-    from tactile.types import Moment, Motion
+    from tactile.types import Motion
 
     noise, changes = ROWS[row]
     roving = WORLDS[world] | {"wheels": {"noise": noise}, "seed": arena}

@@ -23,12 +23,7 @@ EVIDENCE = st.floats(-30, 30)
 free = jax.jit(likelihoods.free, static_argnums=0)
 contact = jax.jit(likelihoods.contact, static_argnums=0)
 direction = jax.jit(likelihoods.direction, static_argnums=0)
-printed = jax.jit(
-    lambda config, prior, evidence, cell, felt: likelihoods.printed(
-        config, prior, evidence, cell, felt, jnp.ones(felt.shape, bool)
-    ),
-    static_argnums=(0, 1),
-)
+weighing = jax.jit(likelihoods.printed, static_argnums=(0, 1))
 
 
 def printed(config, evidence, cell, felt, alive=None):

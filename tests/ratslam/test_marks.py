@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 from scipy.special import expit, logit
 
-from ratslam.gridsettings import GridConfig
+from ratslam.gridsettings import DrawingConfig, GridConfig
 from ratslam.marks import Marks, draw
 from tactile.frames import compose
 from tests.gridworld import TIPS, create
 
 SIDE, MIDDLE = 51, 25
-CONFIG = GridConfig(body=0.0)
+PAPER = DrawingConfig(contact=0.8, blob_sd=0.05, edge_sd=0.25, edge_fan=np.pi / 12)
+CONFIG = GridConfig(body=0.0, drawing=PAPER)
 PRIOR = CONFIG.prior
 
 
