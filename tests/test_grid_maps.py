@@ -1,0 +1,57 @@
+"""The grid filter on whole sessions: it beats dead reckoning, and what carries it does."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from tests.gridtable import Figures, run
+
+FEW, MANY = (9100, 9101), tuple(range(9100, 9108))
+
+
+@cache
+def sessions(row: str, arenas: tuple[int, ...] = FEW) -> list[Figures]:
+    return [run("A", row, arena) for arena in arenas]
+
+
+def ratio(row: str, arenas: tuple[int, ...] = FEW) -> float:
+    """Mean error over that of dead reckoning, in 1.25 m arenas."""
+    found = sessions(row, arenas)
+    return float(np.sum([one.error for one in found]) / np.sum([one.odometry for one in found]))
+
+
+def test_errors_that_last_are_taken_out():
+    assert ratio("bias") < 0.3
+
+
+@pytest.mark.soak
+def test_errors_of_single_moves_are_made_good_in_part():
+    assert ratio("move", MANY) < 0.85
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize(("row", "least"), [
+    ("bias without run errors", 2.0), ("bias, BACK skipped", 2.0),
+    ("move, temper 1, prior 0.3", 1.2), ("move, BACK skipped", 1.2),
+])  # fmt: skip
+def test_what_carries_it_does(row, least):
+    """Errors that last taken for noise; a way back left out; unknown space that counts as obstacles."""
+    assert ratio(row, MANY) > least * ratio(row.split(",")[0].split()[0], MANY)
+
+
+def test_a_map_is_drawn_where_walls_are():
+    auc, skill, free, there, back = np.mean([one.map for one in sessions("bias")], axis=0)
+    assert auc > 0.85
+    assert skill > max(0.25, free)
+    assert max(there, back) < 0.08
+
+
+def test_walls_are_told_as_they_run():
+    found = sessions("bias")
+    off = np.degrees(np.concatenate([one.angle for one in found]))
+    assert off.mean() < 6
+    assert (off > 15).mean() < 0.04
+    assert len(off) > 0.45 * sum(one.contacts for one in found)
