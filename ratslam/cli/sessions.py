@@ -53,6 +53,8 @@ def add(command: Add) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     prepare_jax()
+    from evaluation.gridscore import GridScore
+    from evaluation.gridscore import table as chart
     from evaluation.scorecard import table
     from ratslam.config import RunConfig
     from ratslam.run import run
@@ -62,6 +64,9 @@ def _run(arguments: argparse.Namespace) -> int:
     directory = arguments.output or Path("runs") / Path(arguments.config).stem
     card, interrupted = run(config, Path(arguments.config).parent, directory, arguments.resume)
     print(table(card))
+    if (directory / "gridscore.json").exists():
+        told = (directory / "gridscore.json").read_text(encoding="utf-8")
+        print("\n" + chart([GridScore.model_validate_json(told)]))
     print(f"\n{directory}/map.png shows the map, {directory}/trajectory.tum holds the path")
     return INTERRUPTED if interrupted else 0
 

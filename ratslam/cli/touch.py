@@ -5,20 +5,26 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from ratslam.cli.arena import SETS
 from ratslam.cli.common import INTERRUPTED, Add, configured, count, prepare_jax, settable, shared
 from tactile.errors import InputError
 
 NAMES = ("fig2", "fig3", "fig4", "fig5", "fig6", "fig7", "reverse", "controls", "matched")
-"""Of the reproductions, known before jax is loaded."""
+"""Of the reproductions of Salman & Pearson 2016, known before jax is loaded; Fox et al.'s are in `SETS`."""
+USUAL = 3
+"""Sets of each."""
 
 
 def add(command: Add) -> None:
     """Adds them to the program."""
     reproduce = command(
-        "reproduce", _reproduce, "make a figure of the whisker paper again, controls beside it"
+        "reproduce", _reproduce, "make a figure of the whisker papers again, controls beside it"
     )
-    reproduce.add_argument("name", choices=NAMES, metavar="NAME", help=", ".join(NAMES))
-    reproduce.add_argument("--sets", type=count, default=3, metavar="N", help="mazes a condition (default 3)")
+    every, usual = (*NAMES, *SETS), ", ".join(f"{name} {sets}" for name, sets in SETS.items())
+    reproduce.add_argument("name", choices=every, metavar="NAME", help=", ".join(every))
+    reproduce.add_argument(
+        "--sets", type=count, metavar="N", help=f"mazes or trials a condition (default {USUAL}; {usual})"
+    )
     reproduce.add_argument("--seed", type=int, default=0, metavar="S", help="of all sets (default 0)")
     reproduce.add_argument(
         "-o", "--output", type=Path, default=Path("runs") / "reproduce", metavar="DIR",
@@ -45,12 +51,15 @@ def _reproduce(arguments: argparse.Namespace) -> int:
     if arguments.seed < 0:
         raise InputError("--seed", str(arguments.seed), "a whole number from 0 on")
     prepare_jax(lasting=False)
-    from ratslam.reproduce import reproduce
+    if arguments.name in SETS:
+        from ratslam.arenas import reproduce
+    else:
+        from ratslam.reproduce import reproduce
 
     text, interrupted = reproduce(
         arguments.name,
         arguments.output,
-        sets=arguments.sets,
+        sets=arguments.sets or SETS.get(arguments.name, USUAL),
         workers=arguments.workers,
         seed=arguments.seed,
         assignments=arguments.set,

@@ -1,0 +1,200 @@
+"""A session of the simulated Create, and what a grid filter makes of it, in the frame of the arena.
+
+Sessions of one arena begin at different places. One process makes many of them with few compiled filters.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from evaluation.grid import Grid, Truth, centres
+from ratslam.config import RunConfig
+from ratslam.gridfilter import GridFilter
+from ratslam.gridsettings import GridConfig
+from ratslam.marks import Marks, draw
+from ratslam.session import Session, capacity_at
+from robot.arena import Arena, enclosed, fits, occupied, segments, text
+from robot.layout import arena
+from robot.roving import Rover, RovingConfig, roving
+from robot.sensing import Sensing, observation_of, reports_of
+from robot.training import trained
+from tactile.errors import InputError
+from tactile.feelers import Feelers
+from tactile.frames import compose, integrate
+from tactile.reports import Mount, Reporting, ReportsConfig
+from tactile.straintemplates import StrainTemplates
+from tactile.streams import stream
+from tactile.types import Motion, Observation, stack
+
+ROOM = 0.2
+"""Free space around a start, m: the robot's, and a little."""
+OVERSPILL = 2.0
+"""A chart covers the arena so many times over, in each direction (Fox et al. 2012, II-D)."""
+BEYOND = 0.4
+"""Of the filter's map, whose middle is the start: so much more than the arena to every side, m."""
+
+
+class Outing(NamedTuple):
+    """A session of T reports.
+
+    Attributes:
+        source: of its reports. arena: with the robot's start. truth, odometry: [T, 3] poses after each
+            report, true and reckoned from the start.
+    """
+
+    source: Rover
+    arena: Arena
+    truth: np.ndarray
+    odometry: np.ndarray
+
+
+class Mapped(NamedTuple):
+    """What a filter made of the first T reports; all in the frame of the arena.
+
+    Attributes:
+        told: [T, 3] poses as told at the time. path: [T, 3] as known in the end. grid: the map drawn along
+            that path.
+    """
+
+    told: np.ndarray
+    path: np.ndarray
+    grid: Grid
+
+
+def outing(config: RovingConfig) -> Outing:
+    """The session, from a start that its seed draws.
+
+    Raises:
+        InputError: it cannot be simulated.
+    """
+    made = started(arena(config.arena, config.seed), config.seed)
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "arena.txt"
+        file.write_text(text(made), encoding="utf-8")
+        source = roving(config.model_copy(update={"arena": config.arena.model_copy(update={"file": file})}))
+    return Outing(source, made, source.truth, compose(made.start, integrate(source.odometry[:, :3])))
+
+
+def started(arena: Arena, seed: int) -> Arena:
+    """The arena with another start, anywhere that the robot fits in.
+
+    Raises:
+        InputError: it fits in nowhere.
+    """
+    random = stream(seed, "start")
+    low, high = arena.outer.min(axis=0), arena.outer.max(axis=0)
+    places, heading = random.uniform(low, high, (1000, 2)), random.uniform(-np.pi, np.pi)
+    there = places[fits(arena, places, ROOM)]
+    if not len(there):
+        raise InputError("roving.arena", "no room for a start", f"{ROOM:g} m of free space somewhere")
+    return arena._replace(start=np.array([*there[0], heading]))
+
+
+def felt(config: RunConfig, outing: Outing, seed: int) -> list[Observation]:
+    """What the filter is given of a session by the configuration's estimator of walls.
+
+    Args:
+        seed: of the drives into walls that strain templates are trained with.
+
+    Raises:
+        InputError: templates that cannot be used.
+    """
+    reports = reports_of(outing.source, config.touch.reports)
+    templates = None
+    if reports.templates is None and reports.walls in ("template", "fused"):
+        made = outing.source.config
+        templates = _templates(RovingConfig(whiskers=made.whiskers, behaviour=made.behaviour, seed=seed))
+    source = Sensing(outing.source, lambda: Reporting(reports, templates))
+    return [observation_of(sample) for sample in source]
+
+
+def mapped(
+    config: RunConfig, outing: Outing, reports: list[Observation], stops: tuple[int, ...]
+) -> list[Mapped]:
+    """What the configuration's filter has made of the reports at each stop, a number of them."""
+    touch = reports_of(outing.source, config.touch.reports)
+    grid = config.grid
+    if grid.side is None:
+        grid = grid.model_copy(update={"side": 2 * (span(outing.arena) + BEYOND)})
+    session = _fresh(grid, touch.mounts, touch.length, config.session.precision, config.session.seed)
+    start, marks = outing.arena.start, marks_of(reports)
+    told: list[np.ndarray] = []
+    found = []
+    for stop in stops:
+        told += [step.pose for step in session.replay(reports[len(told) : stop])]
+        path = compose(start, session.map.trajectory())
+        drawn = chart(grid, touch.feelers, outing.arena, path, marks)
+        found.append(Mapped(compose(start, np.array(told)), path, drawn))
+    return found
+
+
+def chart(config: GridConfig, feelers: Feelers, arena: Arena, path: np.ndarray, marks: Marks) -> Grid:
+    """The map drawn along a path [T, 3] in the frame of the arena, which it covers `OVERSPILL` times over.
+
+    Args:
+        marks: of T reports or more.
+    """
+    side = round(OVERSPILL * span(arena) / config.cell)
+    middle = _middle(arena)
+    first = Marks(*(rows[: len(path)] for rows in marks))
+    probability = draw(config, feelers, side, path - np.array([*middle, 0.0]), first)
+    return Grid(probability, middle - side * config.cell / 2, config.cell)
+
+
+def truth_of(arena: Arena, grid: Grid) -> Truth:
+    """What is really there, on the cells of a chart."""
+    place = centres(grid)
+    return Truth(occupied(arena, place), enclosed(arena, place), segments(arena))
+
+
+def span(arena: Arena) -> float:
+    """Its larger side, m."""
+    return float(np.ptp(arena.outer, axis=0).max())
+
+
+def marks_of(reports: list[Observation]) -> Marks:
+    """What there is to draw of them."""
+    rows = stack(reports)
+    told = rows.motion != Motion.BACK
+    return Marks(
+        told=told,
+        contact=rows.contact & rows.alive & told[:, None],
+        free=~rows.contact & rows.alive & told[:, None],
+        turning=rows.motion == Motion.TURN,
+        point=rows.point,
+        wall=np.where(rows.wall[:, None], rows.wall_point, np.nan),
+    )
+
+
+def _middle(arena: Arena) -> np.ndarray:
+    return (arena.outer.min(axis=0) + arena.outer.max(axis=0)) / 2
+
+
+def _fresh(grid: GridConfig, mounts: tuple[Mount, ...], length: float, precision: str, seed: int) -> Session:
+    """A session at its start, compiled already if one like it was asked for lately."""
+    session = _compiled(grid, mounts, length, precision)
+    session.map, session.steps = session.backend.new_map(), 0
+    session.state = session.backend.init(jax.random.key(seed), capacity_at(0))
+    return session
+
+
+@lru_cache(maxsize=4)
+def _compiled(grid: GridConfig, mounts: tuple[Mount, ...], length: float, precision: str) -> Session:
+    assert grid.side is not None
+    feelers = ReportsConfig(mounts=mounts, length=length).feelers
+    if precision == "float64":
+        jax.config.update("jax_enable_x64", True)
+        return Session(GridFilter(grid, feelers, grid.side, np.float64))
+    return Session(GridFilter(grid, feelers, grid.side, np.float32), precision="float32")
+
+
+@lru_cache(maxsize=1)
+def _templates(config: RovingConfig) -> StrainTemplates:
+    """Of a robot: as off-line in the paper, for all sessions."""
+    return trained(config)

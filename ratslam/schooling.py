@@ -1,0 +1,118 @@
+"""Strain templates trained, kept, and tried at once on walls that they were not trained on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from robot.roving import RovingConfig, drive_into_wall
+from robot.training import trained
+from tactile.errors import InputError
+from tactile.reports import ReportsConfig
+from tactile.slidingtip import learned
+from tactile.straintemplates import StrainTemplates, matched, save, smoothed
+from tactile.streams import stream
+from tactile.surface import Meeting, fused, touching
+from tactile.types import Moment
+
+SECONDS = (0.5, 1.0, 2.0)
+"""Of the drive on after first contact that is shown to the estimators: in arenas it lasts 1 to 2 s mostly."""
+WAYS = ("winner", "between", "fused")
+"""What is asked: eq. 5; the lowest point of a parabola through the best and its neighbours; ours."""
+FAR = 10.0
+"""An error beyond is marked, degrees: a template's step."""
+
+
+class Tried(NamedTuple):
+    """One drive into a wall that no template was made of.
+
+    Attributes:
+        angle: the wall's direction in base_link, degrees. known: whether templates are of that angle.
+        error: [S, 3] degrees, by `SECONDS` and `WAYS`; NaN where no wall was known.
+    """
+
+    angle: float
+    known: bool
+    error: np.ndarray
+
+
+def schooled(config: RovingConfig, path: Path) -> StrainTemplates:
+    """Trains the templates of a session's robot and writes them.
+
+    Raises:
+        InputError: the file exists, or whiskers that feel nothing.
+    """
+    if path.exists():
+        raise InputError(str(path), "exists", "a new file", "choose another name with -o")
+    templates = trained(config)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    save(templates, path)
+    return templates
+
+
+def held_out(config: RovingConfig, templates: StrainTemplates) -> list[Tried]:
+    """One more drive at each angle, and one half-way between each two."""
+    random = stream(config.seed, "templates.held out")
+    angles = np.sort(np.concatenate([templates.angle, (templates.angle[1:] + templates.angle[:-1]) / 2]))
+    mounts = tuple((mount.x, mount.y, mount.direction_deg) for mount in config.whiskers.mounts)
+    settings = ReportsConfig(mounts=mounts, length=config.whiskers.length)
+    points, tip = touching(settings.feelers, settings.contact_radius), learned(templates, settings.feelers)
+    found = []
+    for angle in angles.tolist():
+        report = drive_into_wall(config, angle, random)
+        strain = smoothed(templates.training, report.strain)
+        first = np.arange(strain.shape[1]) == np.abs(strain[0, :, 0]).argmax()
+        errors = []
+        for seconds in SECONDS:
+            part = strain[: max(round(seconds * config.whiskers.rate), 1)]
+            match = matched(templates, part, report.alive)
+            travel = np.array([config.behaviour.slow * seconds, 0.0, 0.0])
+            wall = fused(tip, points, Meeting(first, first, travel, Moment.ABORT, part, report.alive))
+            ways = match.angle, match.refined, wall.direction if wall.known else np.nan
+            errors.append([_apart(way, angle) for way in ways])
+        known = bool(np.isclose(templates.angle, angle).any())
+        found.append(Tried(float(np.degrees(angle)), known, np.array(errors)))
+    return found
+
+
+def report(tried: Sequence[Tried], repeats: int) -> str:
+    """A line for each wall, and the means."""
+    heads = [f"{way}, {seconds:g} s" for seconds in SECONDS for way in WAYS]
+    lines = [
+        "Error of the wall's direction on drives that were not trained on, degrees "
+        f"({repeats} drives a template)",
+        f"{'wall':>8}" + "".join(f"{head:>16}" for head in heads),
+    ]
+    for one in tried:
+        cells = "".join(f"{_cell(error):>16}" for error in one.error.reshape(-1))
+        lines.append(f"{one.angle:>6.0f}{' ' if one.known else '~'} {cells}")
+    for name, known in (("trained", True), ("~ between", False)):
+        errors = np.array([one.error.reshape(-1) for one in tried if one.known == known])
+        if len(errors):
+            lines.append(f"{name:<9}".ljust(8) + "".join(f"{_mean(column):>16}" for column in errors.T))
+    return "\n".join(
+        [
+            *lines,
+            f"~ between two trained angles; ! off by more than {FAR:g}; - no wall was known. Winner: eq. 5 "
+            "of Fox et al. 2012; between: the\nlowest point of a parabola through it and its neighbours; "
+            "fused: how the first whisker's tip slides (`touch.reports.walls`).",
+        ]
+    )
+
+
+def _apart(one: float, other: float) -> float:
+    """Between two directions, degrees: 0 to 90."""
+    off = (one - other + np.pi / 2) % np.pi - np.pi / 2
+    return float(np.degrees(abs(off)))
+
+
+def _cell(error: float) -> str:
+    return "-" if np.isnan(error) else f"{'! ' if error > FAR else ''}{error:.1f}"
+
+
+def _mean(errors: np.ndarray) -> str:
+    known = errors[np.isfinite(errors)]
+    return f"{known.mean():.1f}" if len(known) else "-"

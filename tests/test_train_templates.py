@@ -1,0 +1,128 @@
+"""Strain templates from the program: trained, kept, tried on other walls, used, and refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ratslam.cli import main
+from ratslam.config import RunConfig
+from ratslam.schooling import SECONDS, WAYS, Tried, held_out, report
+from robot.roving import RovingConfig, roving
+from robot.sensing import observation_of, sensing
+from robot.training import trained
+from tactile.errors import InputError
+from tactile.straintemplates import StrainTemplates, load
+
+CONFIG = RovingConfig(seed=4)
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a configuration and the templates that the program made of it."""
+    folder = tmp_path_factory.mktemp("templates")
+    (folder / "create.yaml").write_text("roving: {seed: 4}\n")
+    arguments = ["train-templates", str(folder / "create.yaml"), "-o", str(folder / "new" / "t.npz")]
+    assert main(arguments) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def templates(kept: Path) -> StrainTemplates:
+    return load(kept / "new" / "t.npz")
+
+
+def errors(tried: list[Tried], way: str, known: bool) -> np.ndarray:
+    """[drives, SECONDS] of one way, at trained angles or between."""
+    return np.array([one.error[:, WAYS.index(way)] for one in tried if one.known == known])
+
+
+def test_the_file_holds_what_the_seed_gives(templates: StrainTemplates) -> None:
+    again = trained(CONFIG)
+    assert len(templates.angle) == 15
+    assert np.array_equal(templates.mean, again.mean)
+    assert templates.training == again.training
+    assert not np.array_equal(templates.mean, trained(CONFIG.model_copy(update={"seed": 5})).mean)
+
+
+def test_walls_that_were_not_trained_on_are_known(templates: StrainTemplates) -> None:
+    tried = held_out(CONFIG, templates)
+    assert [one.known for one in tried] == [True, False] * 14 + [True]
+    assert np.allclose([one.angle for one in tried], np.arange(20, 161, 5))
+    assert errors(tried, "winner", True).mean() < 2
+    # Between two templates the nearer one is half a step off, at best.
+    between = errors(tried, "winner", False)
+    assert between.min() == pytest.approx(5)
+    assert between.mean() < 6
+    assert np.nanmean(errors(tried, "fused", False)) < 1
+
+
+def test_bad_templates_are_seen_at_once(templates: StrainTemplates) -> None:
+    # One angle's drives went wrong: its template is another one's.
+    mean = templates.mean.copy()
+    mean[5] = mean[12]
+    tried = held_out(CONFIG, templates._replace(mean=mean))
+    assert (errors(tried, "winner", True)[5] > 5).all()
+    with pytest.raises(InputError, match="do not turn"):
+        held_out(CONFIG, templates._replace(mean=templates.mean[::-1].copy()))
+
+
+def test_the_report_marks_what_is_far_off_and_what_is_not_known() -> None:
+    error = np.full((len(SECONDS), len(WAYS)), 1.0)
+    far, unknown = error.copy(), error.copy()
+    far[0, 0], unknown[:, 2] = 12.3, np.nan
+    lines = report(
+        [Tried(20.0, True, far), Tried(25.0, False, unknown), Tried(30.0, True, error)], 4
+    ).splitlines()
+    assert lines[2].split()[:3] == ["20", "!", "12.3"]
+    assert lines[3].split()[:4] == ["25~", "1.0", "1.0", "-"]
+    assert lines[5].split()[1] == f"{(12.3 + 1) / 2:.1f}"
+    assert lines[6].split()[-1] == "-"
+
+
+def test_sessions_use_the_file(kept: Path, templates: StrainTemplates) -> None:
+    config = RunConfig.model_validate(
+        {
+            "roving": {"reports": 60, "seed": 1},
+            "touch": {"reports": {"walls": "template", "templates": kept / "new" / "t.npz", "flat": None}},
+        }
+    )
+    assert config.roving is not None
+    walls = []
+    for reports in (config.touch.reports, config.touch.reports.model_copy(update={"templates": None})):
+        touch = config.touch.model_copy(update={"reports": reports})
+        samples = sensing(roving(config.roving), touch)
+        walls.append([observation_of(sample).wall_point for sample in samples if observation_of(sample).wall])
+    assert len(walls[0]) == len(walls[1]) > 0
+    directions = [np.degrees(np.arctan2(*np.array(points).T[::-1])) for points in walls]
+    assert np.allclose(directions[0], directions[1], atol=10.01)
+
+
+def test_what_is_there_is_not_overwritten(kept: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = kept / "new" / "t.npz"
+    before = file.read_bytes()
+    assert main(["train-templates", str(kept / "create.yaml"), "-o", str(file)]) == 2
+    error = capsys.readouterr().err
+    assert error.count("ratslam: error:") == 1
+    assert "exists" in error
+    assert file.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("simulation: {}\n", "roving"),
+        ("roving: {seed: -1}\n", "roving.seed"),
+        ("roving: {behaviour: {contact: 0.0019}, whiskers: {length: 0.01}}\n", "no contact"),
+    ],
+)
+def test_what_cannot_be_trained_is_refused(
+    text: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tmp_path / "c.yaml"
+    config.write_text(text)
+    assert main(["train-templates", str(config), "-o", str(tmp_path / "t.npz")]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "t.npz").exists()
