@@ -174,6 +174,7 @@ def located(config: RunConfig, folder: Path) -> RunConfig:
         "recording": config.recording and config.recording.resolved(folder),
         "simulation": config.simulation and config.simulation.resolved(folder),
         "roving": config.roving and config.roving.resolved(folder),
+        "touch": config.touch.model_copy(update={"reports": config.touch.reports.resolved(folder)}),
     }
     return config.model_copy(update={**parts, "score": judgement})
 

@@ -22,9 +22,9 @@ LEGEND = (
     "told, final: mean error of position as told at the time and as known in the end, m, start given, not "
     "aligned; heading: as told,\ndegrees; / dead r.: told over dead reckoning's, and in how many sets it is "
     "less; gap, closed: by how much the final path misses\nwhere the robot comes back, m, and the share of "
-    f"these missed by less than {CLOSED:g} m (- where it never does); eq. 6: all cells, unknown\noutside, raw; "
-    "Brier skill, wall AUC and Chamfer (map to walls, walls to map, m): over what whiskers can tell. Means "
-    "over sets."
+    f"these missed by less than {CLOSED:g} m (- where it never does); eq. 6: all cells, unknown\n"
+    "outside, raw; Brier skill, wall AUC and Chamfer (map to walls, walls to map, m): over what whiskers can "
+    "tell. Means over sets."
 )
 
 _ALONG = {RECKONED: "on dead reckoning", TRUE: "on the true path"}
