@@ -43,7 +43,8 @@ class Sensing:
     """A source whose readings are all observations.
 
     Args:
-        source: of whiskers, at least in part. sense: makes a sense that has felt nothing yet.
+        source: of whiskers, at least in part. sense: makes a sense that has felt nothing yet. where: what
+            configures its whiskers.
 
     Raises:
         InputError: another number of whiskers than the sense has.
@@ -51,12 +52,10 @@ class Sensing:
 
     whisked = False
 
-    def __init__(self, source: Source, sense: Callable[[], Sense]) -> None:
+    def __init__(self, source: Source, sense: Callable[[], Sense], where: str) -> None:
         first = sense()
         if source.whiskers != first.whiskers:
-            raise InputError(
-                "touch", f"{first.whiskers} whiskers", f"{source.whiskers}, as {source.name} has"
-            )
+            raise InputError(where, f"{first.whiskers} whiskers", f"{source.whiskers}, as {source.name} has")
         self.source, self.sense = source, sense
         self.name, self.rate_hz, self.digest = source.name, source.rate_hz, source.digest
         self.view_shape, self.whiskers, self.length = first.view_shape, source.whiskers, source.length
@@ -95,9 +94,9 @@ def sensing(source: Source, config: TouchConfig) -> Source:
     if "roving" in source.rig:
         reports = reports_of(source, config.reports)
         templates = templates_of(source, reports)
-        return Sensing(source, lambda: Reporting(reports, templates))
+        return Sensing(source, lambda: Reporting(reports, templates), "touch.reports.mounts")
     frontend = Frontend(config, calibration_of(source))
-    return Sensing(source, lambda: frontend)
+    return Sensing(source, lambda: frontend, "touch.head")
 
 
 def kept(calibration: Calibration) -> dict[str, Any]:

@@ -110,7 +110,7 @@ def felt(config: RunConfig, outing: Outing, seed: int) -> list[Observation]:
     if reports.templates is None and reports.walls in ("template", "fused"):
         made = outing.source.config
         templates = _templates(RovingConfig(whiskers=made.whiskers, behaviour=made.behaviour, seed=seed))
-    source = Sensing(outing.source, lambda: Reporting(reports, templates))
+    source = Sensing(outing.source, lambda: Reporting(reports, templates), "touch.reports.mounts")
     return [observation_of(sample) for sample in source]
 
 

@@ -99,10 +99,21 @@ def walk(count: int, seed: int = 0):
         yield o._replace(contact=contact, point=np.where(contact[:, None], REACH * AROUND, 0.0))
 
 
+RUNS = {}
+"""The compiled chunk function of each backend: it is pure, so sessions may share it."""
+
+
+def fresh(make) -> Session:
+    """A session."""
+    session = Session(make())
+    session._run = RUNS.setdefault(make, session._run)
+    return session
+
+
 @cache
 def replayed(make):
     """The steps of a replay of `walk(340)`, and all that the session knew at its end."""
-    session = Session(make())
+    session = fresh(make)
     return list(session.replay(walk(340))), session.arrays()
 
 
@@ -126,13 +137,13 @@ def test_kernel_keeps_shapes_and_dtypes(make):
 
 
 def test_replay_and_live_are_the_same_bits(make):
-    live = Session(make())
+    live = fresh(make)
     assert equal(replayed(make)[0][:150], [live.step(o) for o in walk(150)])
 
 
 def test_any_mixture_of_live_and_replay_is_the_same_bits(make):
     observations = list(walk(150))
-    mixed = Session(make())
+    mixed = fresh(make)
     steps = [mixed.step(o) for o in observations[:30]]
     steps += mixed.replay(observations[30:101])
     steps += [mixed.step(o) for o in observations[101:110]]
@@ -144,10 +155,10 @@ def test_any_mixture_of_live_and_replay_is_the_same_bits(make):
 def test_a_restored_session_continues_as_if_never_stopped(make, stop):
     observations = list(walk(340))
     expected, whole = replayed(make)
-    first = Session(make())
+    first = fresh(make)
     list(first.replay(observations[:stop]))
     saved = first.arrays()
-    second = Session(make())
+    second = fresh(make)
     second.restore(saved)
     assert equal(expected[stop:], list(second.replay(observations[stop:])))
     assert second.arrays().keys() == whole.keys()
@@ -173,7 +184,7 @@ def test_a_batch_of_runs_equals_each_run(make):
 
 def test_places_are_consistent(make):
     previous, known = -1, set()
-    for step in Session(make()).replay(walk(200)):
+    for step in fresh(make).replay(walk(200)):
         place, action = int(step.estimate.place), Action(int(step.estimate.action))
         assert int(step.estimate.previous) == previous
         if action == Action.CREATE:
@@ -188,7 +199,7 @@ def test_places_are_consistent(make):
 
 
 def test_nothing_odd_comes_of_odd_input(make):
-    session = Session(make())
+    session = fresh(make)
     still = observation(Odometry(0, 0, 0, 0.1), np.full(VIEW, 0.5), label=3, whiskers=WHISKERS)
     odd = still._replace(odometry=Odometry(*(np.float64(v) for v in (np.nan, np.inf, 0, 0.1))))
     blind = still._replace(view=np.full(VIEW, np.nan))
