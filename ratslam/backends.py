@@ -11,12 +11,15 @@ from ratslam import gridfilter, posecells
 from ratslam.backend import Backend
 from ratslam.config import RunConfig
 from ratslam.gridfilter import GridEvidence, GridFilter
+from ratslam.occupancy import LAYERS
 from ratslam.recallrat import evidence_of, rat
 from tactile.errors import InputError
 from tactile.feelers import Feelers
 
 LIVE_SIDE = 2.5
 """Side of a map of which nothing is known beforehand, m (Fox et al. 2012, II-D)."""
+MOST = 2**31 - 1
+"""Cells of all maps together: they are numbered in int32."""
 ARRAYS = ("packet", "background", "ancestor", "poses", "weights")
 """What evidence holds that is no single number."""
 
@@ -32,14 +35,21 @@ def backend_of(config: RunConfig, view_shape: tuple[int, int, int], feelers: Fee
     """The backend of a completed configuration for observations of that shape.
 
     Raises:
-        InputError: it needs whiskers and there are none.
+        InputError: it needs whiskers and there are none, or its maps have more cells than can be counted.
     """
     precision = np.dtype(config.session.precision)
     if config.backend == "rat":
         return rat(config.rat(), view_shape, precision)
     if feelers is None:
         raise InputError("backend", "grid, for a recording without whiskers", "rat, or a session of whiskers")
-    return GridFilter(config.grid, feelers, config.grid.side or LIVE_SIDE, precision)
+    grid, side = config.grid, config.grid.side or LIVE_SIDE
+    cells = grid.particles * LAYERS * int(np.ceil(side / grid.cell)) ** 2
+    if cells > MOST:
+        found = f"{grid.particles} particles with maps of {side:g} m in cells of {grid.cell:g} m"
+        raise InputError(
+            "grid", found, "2^31 cells in all", "fewer particles, coarser cells or a smaller map"
+        )
+    return GridFilter(grid, feelers, side, precision)
 
 
 def telling(config: RunConfig) -> Telling:

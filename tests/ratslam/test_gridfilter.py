@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 
 from ratslam import likelihoods, occupancy
+from ratslam.backends import backend_of
+from ratslam.config import RunConfig
 from ratslam.gridfilter import Outcome
 from ratslam.occupancy import COSINE, EVIDENCE, SINE
 from ratslam.session import Session
+from tactile.errors import InputError
 from tactile.frames import wrap
 from tactile.types import Motion
 from tests.gridworld import (
@@ -20,6 +23,7 @@ from tests.gridworld import (
     STEADY,
     TIPS,
     begun,
+    create,
     drive,
     filter_of,
     remembering,
@@ -531,3 +535,13 @@ def test_seeds_differ_and_repeat():
     runs = [drive(FILTER, begun(FILTER, seed), circuit(10))[1].pose for seed in (0, 0, 1)]
     assert np.array_equal(runs[0], runs[1])
     assert not np.array_equal(runs[0], runs[2])
+
+
+def test_more_cells_than_can_be_counted_are_refused():
+    config = RunConfig.model_validate(
+        {"roving": {}, "backend": "grid", "grid": {"particles": 300_000, "side": 2.5}}
+    )
+    with pytest.raises(InputError, match="fewer particles"):
+        backend_of(config, (1, 4, 1), create())
+    with pytest.raises(InputError, match="without whiskers"):
+        backend_of(config, (1, 4, 1), None)
