@@ -12,10 +12,10 @@ import numpy as np
 from ratslam.ancestry import Ancestry
 from ratslam.gridsettings import GridConfig
 from ratslam.growing import Growing
-from ratslam.marks import Marks, draw
+from ratslam.marks import Marks, draw, marks_of
 from ratslam.types import Estimate
 from tactile.feelers import Feelers
-from tactile.types import Motion, Observation
+from tactile.types import Observation
 
 
 class GridMap:
@@ -82,17 +82,8 @@ class GridMap:
         np.savez_compressed(path, probability=self.occupancy(), origin=corner, cell=self.config.cell)
 
     def _marks(self) -> Marks:
-        flags = self._flags.rows
-        told = self._motion.rows != Motion.BACK
-        placed = np.isfinite(self._point.rows).all(axis=2)
-        return Marks(
-            told=told,
-            contact=flags[..., 0] & flags[..., 1] & told[:, None] & placed,
-            free=~flags[..., 0] & flags[..., 1] & told[:, None],
-            turning=self._motion.rows == Motion.TURN,
-            point=self._point.rows,
-            wall=self._wall.rows,
-        )
+        contact, alive = np.moveaxis(self._flags.rows, 2, 0)
+        return marks_of(self._motion.rows, contact, alive, self._point.rows, self._wall.rows)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Everything, so that `restore` continues bit for bit."""

@@ -15,6 +15,7 @@ from scipy.special import expit, logit
 from ratslam.gridsettings import DrawingConfig, GridConfig
 from tactile.feelers import Feelers
 from tactile.frames import compose
+from tactile.types import Motion
 
 FAR = 3.0
 """Standard deviations beyond which a mark is left out."""
@@ -34,6 +35,17 @@ class Marks(NamedTuple):
     turning: np.ndarray
     point: np.ndarray
     wall: np.ndarray
+
+
+def marks_of(
+    motion: np.ndarray, contact: np.ndarray, alive: np.ndarray, point: np.ndarray, wall: np.ndarray
+) -> Marks:
+    """The marks of T reports: motion [T], contact and alive [T, W], point [T, W, 2], wall [T, 2]. A contact
+    at no number is none, but its whisker does not count as free."""
+    told = motion != Motion.BACK
+    counts = alive & told[:, None]
+    placed = np.isfinite(point).all(axis=2)
+    return Marks(told, contact & counts & placed, ~contact & counts, motion == Motion.TURN, point, wall)
 
 
 class _Mark(NamedTuple):

@@ -16,7 +16,7 @@ import ratslam.arenas
 from ratslam.arenas import jobs_of, reproduce
 from ratslam.arenas.figures import AWAY, FIELDS, measured, revisits
 from ratslam.arenas.orders import MEASURES, Measure, order, orders
-from ratslam.arenas.outing import ROOM, chart, felt, mapped, marks_of, outing, span, started, truth_of
+from ratslam.arenas.outing import ROOM, chart, felt, felt_marks, mapped, outing, span, started, truth_of
 from ratslam.arenas.protocols import FILTERED, MAPPERS, PAPERS, PROTOCOLS, RECKONED, TRUE
 from ratslam.arenas.trials import Result, results
 from ratslam.cli import main
@@ -102,26 +102,26 @@ def test_a_start_needs_room() -> None:
 def test_what_was_felt_is_drawn_where_it_was() -> None:
     reports = [report(forward=0.02), report(forward=0.02, touching=[1])]
     path = np.array([[0.4, 0.5, np.pi / 2], [0.4, 0.52, np.pi / 2]])
-    grid = chart(GridConfig(body=0.0), create(), ROOMY, path, marks_of(reports))
+    grid = chart(GridConfig(body=0.0), create(), ROOMY, path, felt_marks(reports))
     assert grid.probability.shape == (40, 40)
     assert np.allclose(grid.origin, -0.5)
     row, column = np.unravel_index(grid.probability.argmax(), grid.probability.shape)
     there = grid.origin + grid.cell * (np.array([column, row]) + 0.5)
     assert np.abs(there - [0.4 - TIPS[1, 1], 0.52 + TIPS[1, 0]]).max() <= grid.cell / 2 + 1e-9
     # What came later is not drawn.
-    first = chart(GridConfig(body=0.0), create(), ROOMY, path[:1], marks_of(reports))
+    first = chart(GridConfig(body=0.0), create(), ROOMY, path[:1], felt_marks(reports))
     assert first.probability.max() == pytest.approx(0.3)
 
 
 def test_charts_lie_on_the_truth_of_any_arena() -> None:
     place = arena(ArenaConfig(seed=2), 0)
-    empty = chart(GridConfig(), create(), place, np.zeros((0, 3)), marks_of([report()]))
+    empty = chart(GridConfig(), create(), place, np.zeros((0, 3)), felt_marks([report()]))
     truth = truth_of(place, empty)
     assert truth.inside.mean() == pytest.approx(0.25)
     assert (truth.occupied | truth.inside).all()
     assert span(place) == 1.25
     moved = place._replace(outer=place.outer + 3.0, objects=tuple(p + 3.0 for p in place.objects))
-    grid = chart(GridConfig(), create(), moved, np.zeros((0, 3)), marks_of([report()]))
+    grid = chart(GridConfig(), create(), moved, np.zeros((0, 3)), felt_marks([report()]))
     assert np.array_equal(truth_of(moved, grid).occupied, truth.occupied)
 
 

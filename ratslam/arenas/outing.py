@@ -17,7 +17,7 @@ from evaluation.grid import Grid, Truth, centres
 from ratslam.config import RunConfig
 from ratslam.gridfilter import GridFilter
 from ratslam.gridsettings import GridConfig
-from ratslam.marks import Marks, draw
+from ratslam.marks import Marks, draw, marks_of
 from ratslam.session import Session, capacity_at
 from robot.arena import Arena, enclosed, fits, occupied, segments, text
 from robot.layout import arena
@@ -30,7 +30,7 @@ from tactile.frames import compose, integrate
 from tactile.reports import Mount, Reporting, ReportsConfig
 from tactile.straintemplates import StrainTemplates
 from tactile.streams import stream
-from tactile.types import Motion, Observation, stack
+from tactile.types import Observation, stack
 
 ROOM = 0.2
 """Free space around a start, m: the robot's, and a little."""
@@ -123,7 +123,7 @@ def mapped(
     if grid.side is None:
         grid = grid.model_copy(update={"side": 2 * (span(outing.arena) + BEYOND)})
     session = _fresh(grid, touch.mounts, touch.length, config.session.precision, config.session.seed)
-    start, marks = outing.arena.start, marks_of(reports)
+    start, marks = outing.arena.start, felt_marks(reports)
     told: list[np.ndarray] = []
     found = []
     for stop in stops:
@@ -158,18 +158,11 @@ def span(arena: Arena) -> float:
     return float(np.ptp(arena.outer, axis=0).max())
 
 
-def marks_of(reports: list[Observation]) -> Marks:
+def felt_marks(reports: list[Observation]) -> Marks:
     """What there is to draw of them."""
     rows = stack(reports)
-    told = rows.motion != Motion.BACK
-    return Marks(
-        told=told,
-        contact=rows.contact & rows.alive & told[:, None],
-        free=~rows.contact & rows.alive & told[:, None],
-        turning=rows.motion == Motion.TURN,
-        point=rows.point,
-        wall=np.where(rows.wall[:, None], rows.wall_point, np.nan),
-    )
+    wall = np.where(rows.wall[:, None], rows.wall_point, np.nan)
+    return marks_of(rows.motion, rows.contact, rows.alive, rows.point, wall)
 
 
 def _middle(arena: Arena) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 from evaluation.grid import Grid
 from evaluation.gridscore import GridScore, score_grid
 from ratslam.arenas.figures import measured, off, scored
-from ratslam.arenas.outing import Mapped, Outing, chart, felt, mapped, marks_of, outing, truth_of
+from ratslam.arenas.outing import Mapped, Outing, chart, felt, felt_marks, mapped, outing, truth_of
 from ratslam.arenas.protocols import FILTERED, RECKONED, TRUE
 from ratslam.config import RunConfig
 from robot.arena import Arena
@@ -73,7 +73,7 @@ def results(job: Job) -> list[Result]:
     found: list[Result] = []
     for (method, mapper), config in job.variants.items():
         reports = felt(config, out, job.training)
-        marks, feelers = marks_of(reports), reports_of(out.source, config.touch.reports).feelers
+        marks, feelers = felt_marks(reports), reports_of(out.source, config.touch.reports).feelers
         for stop, filtered in enumerate(mapped(config, out, reports, stops)):
             found.append(_judged(job, out, (method, mapper, FILTERED), stop, filtered))
             for name, whole in ((RECKONED, out.odometry), (TRUE, out.truth)):
