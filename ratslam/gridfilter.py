@@ -116,9 +116,11 @@ class GridFilter:
         angle = np.arange(RIM) * 2 * np.pi / RIM
         rim = 0.85 * config.body * np.stack([np.cos(angle), np.sin(angle)], axis=1)
         self.body = np.concatenate([np.zeros((1, 2)), rim]).astype(self.dtype)
-        self.blob_sd = config.stamps.blob_sd / config.cell
-        blob, along = REACH * config.stamps.blob_sd, REACH * config.stamps.along
-        reach = max(np.hypot(*self.free.T).max(initial=0.0) + 0.8 * blob, config.body)
+        self.blob_sd, self.free_sd = config.stamps.blob_sd / config.cell, config.stamps.free_sd / config.cell
+        blob, free, along = (
+            REACH * sd for sd in (config.stamps.blob_sd, config.stamps.free_sd, config.stamps.along)
+        )
+        reach = max(np.hypot(*self.free.T).max(initial=0.0) + free, config.body)
         tips = np.hypot(*feelers.points(np.ones(1))[:, 0].T).max(initial=0.0)
         self.near, self.far, self.long = (self._window(far) for far in (reach, tips + blob, along))
 
@@ -276,7 +278,7 @@ class GridFilter:
         windows = occupancy.around(middle[:, 0], self.side, self.near)
         amount = -config.free * jnp.repeat(felt.free, len(FREE)).astype(self.dtype)
         place = occupancy.within(self._placed(pose, jnp.asarray(self.free)), windows)
-        stamp = stamps.blobs(place, amount, self.blob_sd, windows.size)
+        stamp = stamps.blobs(place, amount, self.free_sd, windows.size)
         if self.config.body:
             body = stamps.disc(occupancy.within(middle, windows)[:, 0], self.config.body / cell, windows.size)
             stamp -= jnp.where(felt.told, config.body, 0.0) * body

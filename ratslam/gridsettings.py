@@ -17,7 +17,7 @@ class DriftConfig(Settings):
     Errors of scale last; a filter that takes them for noise of each step cannot follow them.
     """
 
-    run: NonNegativeFloat = 0.05
+    run: NonNegativeFloat = 0.04
     """Standard deviation of the scale error that lasts the whole run, as a share."""
     move: NonNegativeFloat = 0.03
     """Of the one that lasts one straight or one turn."""
@@ -54,7 +54,7 @@ class LikelihoodConfig(Settings):
     """Chance of an obstacle where nothing was felt, for `evidence`."""
     free: NonNegativeFloat = 0.05
     """Weight of each point of a shaft, or of the body, that meets nothing."""
-    contact: NonNegativeFloat = 0.5
+    contact: NonNegativeFloat = 0.8
     """Weight of a new contact."""
     surprise: Share = 0.1
     """Chance of a contact where the map has nothing."""
@@ -77,15 +77,17 @@ class StampConfig(Settings):
     """Across it, m."""
     fan: PositiveFloat = 0.2617993877991494
     """Of the direction seen from the contact, for `edge`, rad: pi / 12."""
-    blob: NonNegativeFloat = 2.0
+    blob: NonNegativeFloat = 4.0
     """At a contact."""
     blob_sd: PositiveFloat = 0.05
     """m"""
     free: NonNegativeFloat = 0.5
     """Taken off at each point of a shaft that meets nothing."""
+    free_sd: PositiveFloat = 0.02
+    """Standard deviation there, m: wider ones reach beyond the shaft and wipe out walls felt before."""
     body: NonNegativeFloat = 1.0
     """Taken off where the robot stands."""
-    most: PositiveFloat = 4.0
+    most: PositiveFloat = 6.0
     """Largest evidence of a cell, for or against."""
 
 
