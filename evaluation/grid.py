@@ -109,13 +109,9 @@ def surface(grid: Grid, truth: Truth) -> Surface:
 
 
 def painted(truth: Truth, wall: np.ndarray, outside: float = PRIOR) -> np.ndarray:
-    """[H, W] the truth as occupancy: 1 in objects and walls, 0 in free space, `outside` beyond."""
+    """[H, W] the truth as occupancy: 1 in objects and walls, 0 in free space, `outside` beyond (Fig. 3 of Fox
+    et al. 2012)."""
     return np.where(wall | (truth.inside & truth.occupied), 1.0, np.where(truth.inside, 0.0, outside))
-
-
-def true_grid(grid: Grid, truth: Truth, outside: float = PRIOR) -> Grid:
-    """The truth as a map on the cells of another (Fig. 3 of Fox et al. 2012)."""
-    return grid._replace(probability=painted(truth, surface(grid, truth).wall, outside))
 
 
 def mean_grid(grids: Sequence[Grid]) -> Grid:

@@ -16,6 +16,7 @@ import numpy as np
 import yaml
 
 from evaluation.grid import Grid, check_grid
+from evaluation.whole import in_one_piece
 from tactile.errors import InputError
 
 Mode = Literal["trinary", "scale"]
@@ -44,9 +45,9 @@ class Served(NamedTuple):
 
 
 def write_nav2(folder: Path, grid: Grid, mode: Mode = "trinary") -> None:
-    """Writes map.pgm and map.yaml into a folder."""
-    write_image(folder / "map.pgm", grid, mode)
-    write_description(folder / "map.yaml", grid, mode)
+    """Writes map.pgm and map.yaml into a folder, each in one piece."""
+    in_one_piece(folder / "map.pgm", lambda path: write_image(path, grid, mode))
+    in_one_piece(folder / "map.yaml", lambda path: write_description(path, grid, mode))
 
 
 def write_image(path: str | Path, grid: Grid, mode: Mode = "trinary") -> None:

@@ -111,6 +111,12 @@ class DrawingConfig(Settings):
     """Where the robot stands."""
     most: PositiveFloat = 3.5
     """Largest evidence of a cell, for or against, log-odds."""
+    fusion: Literal["log_odds", "literal", "max", "average"] = "log_odds"
+    """How a mark is fused with what is there, the others for study: `log_odds`: their evidence is added;
+    `literal`: eq. 3 and 4 as printed, likelihoods that fall to 0 far from where they were made, multiplied
+    into the whole map: one contact erases it; `max`: the stronger of the two evidences, so that nothing
+    counts twice; `average`: the mean of the map's chance and of what the mark alone would draw, so that old
+    marks fade."""
 
 
 class GridConfig(Settings):

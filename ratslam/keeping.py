@@ -8,7 +8,7 @@ from evaluation.grid import Grid, Truth, centres
 from evaluation.gridfiles import read_grid, write_truth
 from evaluation.gridscore import score_grid
 from evaluation.images import Images, write_images
-from evaluation.nav2 import write_description, write_image
+from evaluation.nav2 import write_nav2
 from evaluation.rundirectory import write_walls
 from ratslam.storage import RunDirectory
 from robot.arena import Arena, enclosed, occupied, read_arena, segments
@@ -67,8 +67,7 @@ def keep_chart(source: Source, store: RunDirectory) -> None:
     if not file.exists():
         return
     grid = read_grid(file)
-    store.file("map.pgm", lambda path: write_image(path, grid))
-    store.file("map.yaml", lambda path: write_description(path, grid))
+    write_nav2(store.path, grid)
     if not (store.path / "arena.txt").exists():
         return
     arena = read_arena(store.path / "arena.txt")

@@ -2,11 +2,12 @@
 
 The three mappers are one: wherever a wall's direction is known an edge is drawn, elsewhere a blob. Each mark
 is a likelihood that is neutral, 0.5, far from where it was made (eq. 3 and 4 as printed fall to 0 there and
-would erase the map), and marks are added as log-odds.
+would erase the map), and marks are added as log-odds; other ways to fuse them are there for study.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +20,8 @@ from tactile.types import Motion
 
 FAR = 3.0
 """Standard deviations beyond which a mark is left out."""
+NEARLY = 1e-3
+"""No chance comes nearer to 0 or 1 than this by the literal fusion, which knows no other limit."""
 
 
 class Marks(NamedTuple):
@@ -48,6 +51,59 @@ def marks_of(
     return Marks(told, contact & counts & placed, ~contact & counts, motion == Motion.TURN, point, wall)
 
 
+class Fusion(NamedTuple):
+    """How marks become a map.
+
+    Attributes:
+        chance: what a mark tells of the cells around it: the chance of an obstacle, from that in its middle
+            and its shape there, 1 in the middle and 0 far away.
+        fuse: the evidence of cells, log-odds beyond the prior, once a mark's chances are fused with it.
+        far: standard deviations beyond which a mark is left out.
+    """
+
+    chance: Callable[[float, np.ndarray], np.ndarray]
+    fuse: Callable[[np.ndarray, np.ndarray, GridConfig], np.ndarray]
+    far: float = FAR
+
+
+def _neutral(middle: float, shape: np.ndarray) -> np.ndarray:
+    return 0.5 + (middle - 0.5) * shape
+
+
+def _printed(middle: float, shape: np.ndarray) -> np.ndarray:
+    return middle * shape
+
+
+def _added(there: np.ndarray, chance: np.ndarray, config: GridConfig) -> np.ndarray:
+    most = config.drawing.most
+    return np.clip(there + logit(chance), -most, most)
+
+
+def _multiplied(there: np.ndarray, chance: np.ndarray, config: GridConfig) -> np.ndarray:
+    """m l / (m l + (1 - m)(1 - l)), which is a sum of log-odds."""
+    prior, most = logit(config.prior), -logit(NEARLY)
+    return np.clip(there + prior + logit(chance), -most, most) - prior
+
+
+def _stronger(there: np.ndarray, chance: np.ndarray, config: GridConfig) -> np.ndarray:
+    told, most = logit(chance), config.drawing.most
+    return np.clip(np.where(np.abs(told) > np.abs(there), told, there), -most, most)
+
+
+def _averaged(there: np.ndarray, chance: np.ndarray, config: GridConfig) -> np.ndarray:
+    prior = logit(config.prior)
+    return logit((expit(there + prior) + expit(logit(chance) + prior)) / 2) - prior
+
+
+FUSIONS: Mapping[str, Fusion] = {
+    "log_odds": Fusion(_neutral, _added),
+    "literal": Fusion(_printed, _multiplied, np.inf),
+    "max": Fusion(_neutral, _stronger),
+    "average": Fusion(_neutral, _averaged),
+}
+"""By the names of `DrawingConfig.fusion`, which says what each does."""
+
+
 class _Mark(NamedTuple):
     """One stamp: its middle [2] m, its chance there, and a wall's direction or NaN."""
 
@@ -64,17 +120,17 @@ def draw(config: GridConfig, feelers: Feelers, side: int, path: np.ndarray, mark
         side: S, cells. path: [T, 3] where each report was made, from the middle of the map.
     """
     drawing, cell = config.drawing, config.cell
+    fusion = FUSIONS[drawing.fusion]
     evidence = np.zeros((side, side))
     for mark in _marks(drawing, config.body, feelers, path, marks):
-        reach = FAR * (drawing.edge_sd if np.isfinite(mark.direction) else mark.sd)
+        reach = fusion.far * (drawing.edge_sd if np.isfinite(mark.direction) else mark.sd)
         place = mark.place / cell + (side - 1) / 2
-        low = np.clip(np.ceil(place - reach / cell).astype(int), 0, side)
-        high = np.clip(np.floor(place + reach / cell).astype(int) + 1, 0, side)
+        low = np.clip(np.ceil(place - reach / cell), 0, side).astype(int)
+        high = np.clip(np.floor(place + reach / cell) + 1, 0, side).astype(int)
         across, up = (np.arange(low[k], high[k]) * cell - place[k] * cell for k in (0, 1))
         shape = _shape(drawing, mark, across[None, :], up[:, None])
         rows = slice(low[1], high[1]), slice(low[0], high[0])
-        evidence[rows] += logit(0.5 + (mark.chance - 0.5) * shape)
-        np.clip(evidence[rows], -drawing.most, drawing.most, out=evidence[rows])
+        evidence[rows] = fusion.fuse(evidence[rows], fusion.chance(mark.chance, shape), config)
     return expit(evidence + logit(config.prior))
 
 

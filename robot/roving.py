@@ -6,25 +6,23 @@ behaviour, wheels, strain), so that changing one leaves what the others draw as 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path as File
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 
 from robot.arena import segments, text
 from robot.behaviour import BehaviourConfig, Command, Doing, State, command, following
-from robot.files import digest_of
 from robot.layout import ArenaConfig, arena
-from robot.source import Sample, rate_of
+from robot.made import STILL, Made, document_digest, placed
+from robot.source import rate_of
 from robot.stepping import Robot, Step
 from robot.strain import WhiskersConfig, fan
 from robot.wheels import WheelsConfig, reckoned
 from tactile.errors import InputError
-from tactile.frames import between, wrap
+from tactile.frames import between
 from tactile.settings import Settings
 from tactile.streams import stream
 from tactile.types import Moment, Odometry, Report
@@ -57,7 +55,7 @@ class RovingConfig(Settings):
         )
 
 
-class Rover:
+class Rover(Made):
     """A simulated session of the Create as a `Source`; make one with `roving`.
 
     Attributes:
@@ -67,7 +65,6 @@ class Rover:
     """
 
     name = "roving"
-    whisked = True
     view_shape = (1, 4, 1)
 
     def __init__(self, config: RovingConfig) -> None:
@@ -80,13 +77,13 @@ class Rover:
         duration = np.array([step.duration for step in steps])
         self.time = np.cumsum(duration)
         pose = np.array([start.pose, *(step.pose for step in steps)])
-        self.truth = np.column_stack([pose[1:, :2], wrap(pose[1:, 2])])
+        self.truth = placed(pose[1:])
         motion = np.column_stack([between(pose[:-1], pose[1:])[:, :2], np.diff(pose[:, 2]), duration])
         kind = np.array([step.state.motion for step in steps])
         self.odometry = reckoned(config.wheels, motion, kind, stream(config.seed, "wheels"))
         plain = config.model_dump(mode="json", exclude={"arena": {"file"}})
         document = {"roving": plain, "arena": text(self.arena)}
-        self.digest = digest_of([json.dumps(document, sort_keys=True).encode()])
+        self.digest = document_digest(document)
         self.params: Mapping[str, float | int | str] = {}
         self.rig: Mapping[str, Any] = {**document, "roving": plain | {"sha256": self.digest}}
 
@@ -98,22 +95,8 @@ class Rover:
     def whiskers(self) -> int:
         return len(self.fan.base)
 
-    @property
-    def length(self) -> int:
-        return len(self.time)
-
-    def __iter__(self) -> Iterator[Sample]:
-        rows = zip(self.time.tolist(), self.steps, self.odometry, self.truth, strict=True)
-        for time, step, motion, truth in rows:
-            yield Sample(time, report(self.config, step, Odometry(*motion)), truth.copy())
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        pass
+    def _readings(self) -> Iterator[Report]:
+        return (report(self.config, step, STILL) for step in self.steps)
 
 
 def _driven(config: RovingConfig, robot: Robot, start: Step) -> Iterator[Step]:

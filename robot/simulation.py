@@ -6,18 +6,16 @@ odometry), so that changing one leaves the others as they were.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path as File
-from types import TracebackType
-from typing import Annotated, Any, Literal, NamedTuple, Self
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field, NonNegativeInt
 
 from robot.dynamic import dynamic
-from robot.files import digest_of
 from robot.kinematic import Felt, MechanicsConfig, felt, whisk
+from robot.made import STILL, Made, document_digest, placed
 from robot.maze import text
 from robot.mechanics import StreamConfig
 from robot.motion import MotionConfig, at
@@ -25,16 +23,14 @@ from robot.odometry import OdometryConfig, reckoned
 from robot.quasistatic import quasistatic
 from robot.scene import KidnapConfig, MazeConfig, PathConfig, another, scene
 from robot.sensing import kept
-from robot.source import Sample
 from robot.sweep import cycles, free_cycles
 from robot.walls import Surroundings
 from tactile.calibration import Calibration, CalibrationConfig, calibrated
 from tactile.errors import InputError
-from tactile.frames import wrap
 from tactile.head import HeadConfig, ur10_head
 from tactile.settings import Settings
 from tactile.streams import stream
-from tactile.types import Cycle, Odometry, Whisk
+from tactile.types import Cycle, Whisk
 from tactile.whisking import WhiskingConfig, checked
 
 CELL_SIZE = 0.05
@@ -108,7 +104,7 @@ def tier(config: SimulationConfig) -> Tier:
     return Tier("kinematic", "angles of contact are all that is wanted")
 
 
-class Simulation:
+class Simulation(Made):
     """A simulated session as a `Source`; make one with `simulated`.
 
     Attributes:
@@ -120,7 +116,6 @@ class Simulation:
     """
 
     name = "simulation"
-    whisked = True
 
     def __init__(self, config: SimulationConfig, head_config: HeadConfig) -> None:
         self.config, self.head_config, self.tier = config, head_config, tier(config)
@@ -134,7 +129,7 @@ class Simulation:
         self.start = np.arange(count) / whisking.rate
         self.time = self.start + MIDDLE / whisking.rate
         pose = at(self.scene.path, self.time)
-        self.truth = np.column_stack([pose[:, :2], wrap(pose[:, 2])])
+        self.truth = placed(pose)
         self.carried = np.zeros(count, bool)
         rows = np.searchsorted(self.time, self.scene.jumps)
         self.carried[rows[rows < count]] = True
@@ -149,7 +144,7 @@ class Simulation:
             "simulation": plain,
             "maze": text(self.scene.maze) if config.maze.file else "",
         }
-        self.digest = digest_of([json.dumps(document, sort_keys=True).encode()])
+        self.digest = document_digest(document)
         self.params: Mapping[str, float | int | str] = {"pc_cell_x_size": CELL_SIZE}
         self.rig: Mapping[str, Any] = {
             "head": document["head"],
@@ -171,23 +166,6 @@ class Simulation:
     @property
     def whiskers(self) -> int:
         return len(self.head.length)
-
-    @property
-    def length(self) -> int:
-        return len(self.time)
-
-    def __iter__(self) -> Iterator[Sample]:
-        rows = zip(self.time.tolist(), self.odometry, self.truth, self._readings(), strict=True)
-        for time, motion, truth, reading in rows:
-            yield Sample(time, reading._replace(odometry=Odometry(*motion)), truth.copy())
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        pass
 
     def _surroundings(self) -> list[tuple[Surroundings, slice]]:
         """What is around in which cycles."""
@@ -220,11 +198,9 @@ class Simulation:
         return calibrated(config.calibration, record, where="simulation")
 
     def _readings(self) -> Iterator[Whisk | Cycle]:
-        """Of each cycle, without its odometry."""
         if self._felt is None:
             return self._cycles()
-        still = Odometry(0.0, 0.0, 0.0, 0.0)
-        return (whisk(self.head, self._felt, row, still) for row in range(self.length))
+        return (whisk(self.head, self._felt, row, STILL) for row in range(self.length))
 
     def _cycles(self) -> Iterator[Cycle]:
         """Raw samples of each cycle, without its odometry."""

@@ -6,22 +6,20 @@ every mapper and method sees the same sets, so their differences are paired.
 
 from __future__ import annotations
 
-import csv
-import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import IO, Any
-
-from tqdm import tqdm
 
 from ratslam.arenas.figures import FIELDS
 from ratslam.arenas.pictures import picture
 from ratslam.arenas.protocols import PROTOCOLS, Protocol, World, configured
 from ratslam.arenas.tables import table
 from ratslam.arenas.trials import Job, Result, results
+from ratslam.trials.sheet import cells, filled, named, progress
 from ratslam.trials.workers import shared_out
-from tactile.errors import InputError
 from tactile.streams import stream
+
+HEADING = ("world", "method", "mapper", "along", "set", "seed", "reports", *FIELDS)
+"""Of NAME.csv."""
 
 
 def reproduce(
@@ -46,27 +44,18 @@ def reproduce(
     Raises:
         InputError: no such reproduction, it is there already, or a session cannot be simulated.
     """
-    if name not in PROTOCOLS:
-        raise InputError("NAME", repr(name), f"one of {', '.join(PROTOCOLS)}")
-    protocol = PROTOCOLS[name]
+    protocol = named(name, PROTOCOLS)
     jobs = jobs_of(protocol, sets, seed, assignments)
-    path = directory / f"{name}.csv"
-    if path.exists():
-        raise InputError(str(path), "exists", "a folder without it", "choose another folder with -o")
-    directory.mkdir(parents=True, exist_ok=True)
     found: list[Result] = []
-    interrupted = False
-    bar = tqdm(total=len(jobs), unit="session", desc=name, file=sys.stderr, mininterval=0.5)
-    with path.open("w", encoding="utf-8", newline="") as file, bar as progress:
-        writer = csv.writer(file)
-        writer.writerow(("world", "method", "mapper", "along", "set", "seed", "reports", *FIELDS))
-        try:
+
+    def sessions() -> Iterator[Iterator[list[object]]]:
+        with progress(name, len(jobs)) as bar:
             for new in shared_out(results, jobs, workers):
-                _write(writer, file, new)
-                found += new
-                progress.update()
-        except KeyboardInterrupt:
-            interrupted = True
+                found.extend(new)
+                yield map(_row, new)
+                bar.update()
+
+    interrupted = filled(directory / f"{name}.csv", HEADING, sessions())
     if found and not interrupted:
         picture(name, protocol, found).savefig(directory / f"{name}.png")
     return table(protocol, found, sets), interrupted
@@ -97,10 +86,6 @@ def _job(protocol: Protocol, world: World, number: int, seed: int, assignments: 
     return Job(world.name, number, own, seed, protocol.stops, variants)
 
 
-def _write(writer: Any, file: IO[str], found: list[Result]) -> None:
-    for one in found:
-        cells = ("" if value is None else repr(value) for value in (one.values.get(f) for f in FIELDS))
-        writer.writerow(
-            (one.world, one.method, one.mapper, one.along, one.number, one.seed, one.reports, *cells)
-        )
-    file.flush()
+def _row(one: Result) -> list[object]:
+    which = (one.world, one.method, one.mapper, one.along, one.number, one.seed, one.reports)
+    return [*which, *cells(one.values, FIELDS)]

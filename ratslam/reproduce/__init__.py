@@ -6,14 +6,11 @@ method of a reproduction sees the same sets, so their differences are paired.
 
 from __future__ import annotations
 
-import csv
-import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
 from evaluation.exm import experience_metric
 from ratslam.config import RunConfig
@@ -22,15 +19,30 @@ from ratslam.reproduce.pictures import picture
 from ratslam.reproduce.protocols import COMMON, METHODS, PROTOCOLS, SWEPT, THRESHOLDS, Condition, Protocol
 from ratslam.reproduce.verdicts import Row, table
 from ratslam.trials.controls import Control
+from ratslam.trials.sheet import cells, filled, named, progress
 from ratslam.trials.thresholds import classics
 from ratslam.trials.touch import Played, Task, TouchTrial, chain_free, figures, played, session_log
 from ratslam.trials.workers import shared_out
 from ratslam.yamlfile import override, parse, validate
-from tactile.errors import InputError
 from tactile.streams import stream
 
 KEPT = 3
 """Sets of a condition, as in the paper (III-C)."""
+FIELDS = (
+    *TouchTrial._fields,
+    "ratio",
+    "counterparts",
+    "first_anticlockwise",
+    "last_anticlockwise",
+    "rightly",
+    "apart",
+    "across",
+    "across_share",
+    "threshold",
+)
+"""Columns of figures in NAME.csv."""
+HEADING = ("condition", "method", "control", "set", "seed", *FIELDS)
+"""Of NAME.csv."""
 
 
 class Job(NamedTuple):
@@ -65,27 +77,19 @@ def reproduce(
     Raises:
         InputError: no such reproduction, it is there already, or a session cannot be simulated.
     """
-    if name not in PROTOCOLS:
-        raise InputError("NAME", repr(name), f"one of {', '.join(PROTOCOLS)}")
-    protocol = PROTOCOLS[name]
+    protocol = named(name, PROTOCOLS)
     jobs = jobs_of(protocol, sets, seed, assignments)
-    path = directory / f"{name}.csv"
-    if path.exists():
-        raise InputError(str(path), "exists", "a folder without it", "choose another folder with -o")
-    directory.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []
     sessions: dict[tuple[str, str], tuple[str, Played]] = {}
-    interrupted = False
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file)
-        try:
-            for row, job, result in _run(name, protocol, jobs, workers):
-                rows.append(_completed(row, rows))
-                _write(writer, file, rows)
-                if result is not None and job.number == 0 and job.control == "as felt":
-                    sessions[job.condition.name, job.method] = job.word, result
-        except KeyboardInterrupt:
-            interrupted = True
+
+    def lines() -> Iterator[list[list[object]]]:
+        for row, job, result in _run(name, protocol, jobs, workers):
+            rows.append(_completed(row, rows))
+            yield [[*rows[-1][:5], *cells(rows[-1].values, FIELDS)]]
+            if result is not None and job.number == 0 and job.control == "as felt":
+                sessions[job.condition.name, job.method] = job.word, result
+
+    interrupted = filled(directory / f"{name}.csv", HEADING, lines())
     if rows and not interrupted:
         picture(name, protocol, rows, sessions).savefig(directory / f"{name}.png")
     return table(protocol, rows, sets), interrupted
@@ -156,7 +160,7 @@ def _run(
 ) -> Iterator[tuple[Row, Job, Played | None]]:
     """The rows in the order of the jobs; of sweeps, first all thresholds and then the matched ones."""
     if not protocol.swept:
-        with _progress(name, len(jobs)) as bar:
+        with progress(name, len(jobs)) as bar:
             for job, result in zip(
                 jobs, shared_out(_played, [job.task for job in jobs], workers), strict=True
             ):
@@ -164,7 +168,7 @@ def _run(
                 bar.update()
         return
     swept: list[Row] = []
-    with _progress(f"{name}, thresholds", len(jobs)) as bar:
+    with progress(f"{name}, thresholds", len(jobs)) as bar:
         for job, found in zip(jobs, shared_out(_swept, [job.task for job in jobs], workers), strict=True):
             for values in found:
                 row = Row(job.condition.name, job.method, "sweep", job.number, job.task.seed, values)
@@ -183,7 +187,7 @@ def _run(
             templates = job.task.config.templates.model_copy(update={"threshold": best.values["threshold"]})
             task = job.task._replace(config=job.task.config.model_copy(update={"templates": templates}))
             chosen.append((job._replace(task=task), best.values["threshold"]))
-    with _progress(f"{name}, matched", len(chosen)) as bar:
+    with progress(f"{name}, matched", len(chosen)) as bar:
         results = shared_out(_played, [job.task for job, _ in chosen], workers)
         for (job, threshold), result in zip(chosen, results, strict=True):
             row = _row(job, result, job.word)
@@ -233,40 +237,11 @@ def _completed(row: Row, before: Sequence[Row]) -> Row:
     return row._replace(values={**row.values, "across_share": share})
 
 
-FIELDS = (
-    *TouchTrial._fields,
-    "ratio",
-    "counterparts",
-    "first_anticlockwise",
-    "last_anticlockwise",
-    "rightly",
-    "apart",
-    "across",
-    "across_share",
-    "threshold",
-)
-"""Columns of figures in NAME.csv."""
-
-
-def _write(writer: csv.writer, file: IO[str], rows: Sequence[Row]) -> None:  # type: ignore[valid-type]
-    """Writes the newest row, and the heading before the first."""
-    if len(rows) == 1:
-        writer.writerow(("condition", "method", "control", "set", "seed", *FIELDS))  # type: ignore[attr-defined]
-    row = rows[-1]
-    cells = ("" if np.isnan(v) else repr(v) for v in (row.values.get(f, np.nan) for f in FIELDS))
-    writer.writerow((*row[:5], *cells))  # type: ignore[attr-defined]
-    file.flush()
-
-
 def _controls(protocol: Protocol, condition: Condition, method: str) -> tuple[Control, ...]:
     if not protocol.controls:
         return ("as felt",)
     # Without images the classic matcher matches everything with everything: only its chance level is told.
     return ("as felt", "shuffled", "blank") if method == "ours" else ("as felt", "shuffled")
-
-
-def _progress(name: str, total: int) -> tqdm:
-    return tqdm(total=total, unit="session", desc=name, file=sys.stderr, mininterval=0.5)
 
 
 def _parted(assignment: str) -> tuple[str, str, str]:

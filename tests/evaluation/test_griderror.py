@@ -19,7 +19,6 @@ from evaluation.grid import (
     painted,
     surface,
     touched,
-    true_grid,
 )
 from evaluation.griderror import CONVENTIONS, HEADLINE, PRINTED, Convention, grid_error, pool_errors, smoothed
 from evaluation.gridscore import CLAMP, GridScore, pool_grids, score_grid, table
@@ -48,6 +47,11 @@ def scene(boxes=((5, 5, 8, 8), (13, 12, 16, 15)), side=20, margin=6, cell=CELL):
         walls.append(box(west, south, east, north))
     empty = Grid(np.full((size, size), PRIOR), np.full(2, -margin * cell), cell)
     return empty, Truth(occupied, inside, np.concatenate(walls) * cell)
+
+
+def true_grid(grid, truth, outside=PRIOR):
+    """The truth as a map on the cells of another: what nothing can be better than."""
+    return grid._replace(probability=painted(truth, surface(grid, truth).wall, outside))
 
 
 @st.composite

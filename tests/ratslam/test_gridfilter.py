@@ -104,7 +104,8 @@ def known(state):
 def test_what_meets_nothing_is_found_free():
     state, *_ = drive(FILTER, begun(FILTER), [report(0.02)])
     shafts = np.asarray(FILTER.free)
-    assert (evidence_at(FILTER, state, shafts) < -0.3).all()
+    # Between cells the bottom of a narrow mark is cut.
+    assert (evidence_at(FILTER, state, shafts) < -0.4 * FILTER.config.stamps.free).all()
     assert (evidence_at(FILTER, state, np.zeros((1, 2))) <= -0.99 * FILTER.config.stamps.body).all()
     assert (evidence_at(FILTER, state, np.array([[0.45, 0.0], [-0.25, 0.0], [0.0, 0.3]])) > -0.01).all()
     assert not np.any(state.maps[:, COSINE:])
@@ -122,7 +123,7 @@ def test_a_contact_leaves_evidence_where_it_was_felt(cell):
         found = evidence_at(backend, state, TIPS[[0, 2]])
         assert (found > 0.75 * blob).all()  # between cells the top of a blob is cut
         assert (found < 1.25 * blob).all()
-        assert (evidence_at(backend, state, TIPS[[0]] * [1, -1]) <= 0.1).all()
+        assert (evidence_at(backend, state, TIPS[[0]] * [1, -1]) <= 0.05 * blob).all()
 
 
 def test_a_wall_is_drawn_along_itself_with_its_direction():

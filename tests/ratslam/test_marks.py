@@ -1,13 +1,18 @@
-"""Laws of the map as it is drawn: eq. 3 and 4, neutral far away, and which contacts are drawn as what."""
+"""Laws of the map as it is drawn: eq. 3 and 4, neutral far away, which contacts are drawn as what, and how
+marks are fused."""
 
 from __future__ import annotations
 
+from typing import get_args
+
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.special import expit, logit
 
 from ratslam.gridsettings import DrawingConfig, GridConfig
-from ratslam.marks import Marks, draw
+from ratslam.marks import FUSIONS, Marks, draw
 from tactile.frames import compose
 from tests.gridworld import TIPS, create
 
@@ -164,3 +169,111 @@ def test_what_lies_outside_is_forgotten(side):
     assert grid.shape == (side, side)
     assert np.isfinite(grid).all()
     assert drawn(Marks(*(rows[:3] for rows in told)), path[:3], side=side) == pytest.approx(PRIOR)
+
+
+# Fusions
+
+MOST = CONFIG.drawing.most
+EVIDENCE = st.lists(st.floats(-MOST, MOST), min_size=1, max_size=9).map(np.array)
+CHANCE = st.floats(1e-6, 1 - 1e-6)
+
+
+def fused(name, there, *chances):
+    """Evidence, log-odds beyond the prior, after marks of so many chances."""
+    for chance in chances:
+        there = FUSIONS[name].fuse(there, np.asarray(chance), CONFIG)
+    return there
+
+
+def by(fusion, **some):
+    return GridConfig(body=some.pop("body", 0.0), drawing=PAPER.model_copy(update={"fusion": fusion, **some}))
+
+
+def test_every_fusion_that_can_be_asked_for_is_there():
+    assert set(get_args(DrawingConfig.model_fields["fusion"].annotation)) == set(FUSIONS)
+
+
+@pytest.mark.parametrize("name", ["log_odds", "max"])
+@given(there=EVIDENCE, chance=CHANCE)
+def test_neutral_marks_change_nothing_and_others_pull_their_way(name, there, chance):
+    assert np.array_equal(fused(name, there, 0.5), there)
+    moved = fused(name, there, chance) - there
+    assert (moved * np.sign(chance - 0.5) >= 0).all()
+
+
+@given(there=st.floats(0.02, 0.9), chance=st.floats(0.04, 0.96))
+def test_fusions_are_what_they_say_of_probabilities(there, chance):
+    prior = logit(PRIOR)
+    evidence, alone = logit(there) - prior, expit(logit(chance) + prior)
+
+    def after(name):
+        return expit(fused(name, np.array([evidence]), chance)[0] + prior)
+
+    product = there * chance / (there * chance + (1 - there) * (1 - chance))
+    assert after("literal") == pytest.approx(np.clip(product, 1e-3, 1 - 1e-3), abs=1e-12)
+    assert after("average") == pytest.approx((there + alone) / 2, abs=1e-12)
+    assert after("max") == pytest.approx(alone if abs(logit(chance)) > abs(evidence) else there, abs=1e-12)
+
+
+@given(st.lists(st.floats(0.3, 0.7), min_size=2, max_size=4), st.randoms(use_true_random=False))
+def test_added_evidence_knows_no_order(chances, random):
+    shuffled = random.sample(chances, len(chances))
+    there = np.zeros(1)
+    assert fused("log_odds", there, *chances) == pytest.approx(fused("log_odds", there, *shuffled), abs=1e-12)
+    assert np.abs(fused("log_odds", there, *chances)).max() < MOST  # else the limit makes an order
+
+
+@given(EVIDENCE, st.lists(st.floats(0.04, 0.96), min_size=1, max_size=5))
+def test_the_strongest_evidence_stays_and_counts_once(there, chances):
+    strong = fused("max", there, *chances)
+    assert np.array_equal(fused("max", strong, *chances), strong)
+    most = np.maximum(np.abs(there), np.abs(logit(np.array(chances))).max())
+    assert np.abs(strong) == pytest.approx(most)
+
+
+@pytest.mark.parametrize("name", FUSIONS)
+@given(
+    seed=st.integers(0, 1000),
+    chances=st.tuples(CHANCE, CHANCE, CHANCE),
+    most=st.floats(0.1, 20.0),
+    side=st.integers(1, 12),
+)
+def test_whatever_is_felt_and_fused_is_a_map_of_chances(name, seed, chances, most, side):
+    random, count = np.random.default_rng(seed), 12
+    told = Marks(
+        random.random(count) < 0.8, random.random((count, 4)) < 0.3, random.random((count, 4)) < 0.6,
+        random.random(count) < 0.2, random.normal(0, 0.2, (count, 4, 2)),
+        np.where(random.random((count, 1)) < 0.5, np.nan, random.normal(0, 0.2, (count, 2))),
+    )  # fmt: skip
+    contact, free, body = chances
+    config = by(name, contact=contact, free=free, most=most)
+    config = config.model_copy(
+        update={"body": 0.12, "drawing": config.drawing.model_copy(update={"body": body})}
+    )
+    grid = drawn(told, np.cumsum(random.normal(0, 0.1, (count, 3)), axis=0), config=config, side=side)
+    assert ((grid > 0) & (grid < 1)).all()
+
+
+@pytest.mark.parametrize("wall", [np.nan, 0.2])
+def test_eq_3_and_4_as_printed_erase_the_map(wall):
+    """One contact takes all of it to nothing but its own place; every other fusion leaves what is far."""
+    told = marks(1, wall=np.array([[wall, 0.0]]), **touching(1, 0, [0.2, 0.0]))
+    row, column = MIDDLE, MIDDLE + 4
+    far = np.hypot(*np.mgrid[:SIDE, :SIDE] - np.array([row, column])[:, None, None]) > 24
+    printed = drawn(told, config=by("literal"))
+    assert printed[far].max() <= 0.005
+    assert printed[row, column] == pytest.approx(expit(logit(0.8) + logit(PRIOR)))
+    for name in FUSIONS.keys() - {"literal"}:
+        assert drawn(told, config=by(name))[far] == pytest.approx(PRIOR)
+        assert drawn(told, config=by(name))[row, column] > PRIOR
+
+
+def test_fusions_differ_by_how_marks_of_one_place_count():
+    told = marks(9, **touching(9, 0, [0.2, 0.0]))
+    told.told[1::2] = False
+    chances = {name: drawn(told, config=by(name))[MIDDLE, MIDDLE + 4] for name in FUSIONS}
+    once = expit(logit(0.8) + logit(PRIOR))
+    assert chances["max"] == pytest.approx(once)
+    assert chances["average"] == pytest.approx(once + (PRIOR - once) / 2**5)
+    assert chances["log_odds"] == pytest.approx(expit(MOST + logit(PRIOR)))
+    assert chances["literal"] == pytest.approx(expit(5 * logit(0.8) + logit(PRIOR)))

@@ -1,0 +1,192 @@
+"""How far a run has come, from what its directory holds while another process fills it."""
+
+from __future__ import annotations
+
+import json
+import time
+import zipfile
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from math import atan2
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from tactile.errors import InputError
+
+RUNNING = "running"
+"""The status of a run that has not ended, or was killed."""
+PICTURE = "watch.png"
+"""What a monitor leaves in the directory; no sign of life of the run."""
+
+_NUMBERS = ("t", "x", "y", "heading", "sd_x", "sd_y", "sd_heading", "lost")
+
+
+class Progress(NamedTuple):
+    """A run so far, N steps.
+
+    Attributes:
+        status: as in its manifest; `running` while there is none. total: steps there will be, if known.
+        path: [N, 3] poses as told at the time, map frame, m, m, rad. spread: [3] standard deviations of the
+            last; NaN before. odometry: [N, 3] from where this run began. truth: [N, 2] m, NaN where unknown.
+        outcomes: how many steps went how. lost: how many were. off: by how much the present pose was when the
+            run last compared it with the truth, its whole path aligned, m.
+        saved: steps of the last checkpoint. pace: mean steps a second, by the dates of the files.
+        silent: s since the run wrote anything.
+    """
+
+    name: str
+    status: str
+    total: int | None
+    path: np.ndarray
+    spread: np.ndarray
+    odometry: np.ndarray
+    truth: np.ndarray
+    outcomes: Mapping[str, int]
+    lost: int
+    off: float | None
+    saved: int
+    pace: float | None
+    silent: float
+
+
+def counted(seen: Progress) -> str:
+    """How many steps were made, in words."""
+    return f"{len(seen.path)} steps" if seen.total is None else f"{len(seen.path)} of {seen.total} steps"
+
+
+class Watched:
+    """A run directory to look at again and again. Each line is read once, and no file is kept open.
+
+    Raises:
+        InputError: there is no run in it.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self.directory = directory
+        if not directory.is_dir():
+            raise InputError(str(directory), "no such folder", "the directory of a run")
+        if not any((directory / name).exists() for name in ("manifest.json", "steps.csv")):
+            raise InputError(str(directory), "no run in it", "the directory of a run")
+        names = ("steps.csv", "odometry.tum", "truth.tum", "anytime.csv")
+        self._steps, self._odometry, self._truth, self._errors = (_Lines(directory / name) for name in names)
+        self._header: list[str] = []
+        self._rows: list[list[float]] = []  # of _NUMBERS
+        self._outcomes: list[str] = []
+        self._reckoned: list[list[float]] = []  # x, y, heading
+        self._true: dict[float, list[float]] = {}  # t: x, y
+        self._off: float | None = None
+
+    def look(self) -> Progress:
+        """The run as it is now.
+
+        Raises:
+            InputError: a line or a manifest that no run writes, or the directory is gone.
+        """
+        status, total = self._manifest()  # first: once it tells of the end, no line is missing
+        self._read()
+        count = min(len(self._rows), len(self._reckoned))  # a chunk's lines come to one file after the other
+        rows = np.array(self._rows[:count], float).reshape(count, len(_NUMBERS))
+        truth = [self._true.get(t, [np.nan, np.nan]) for t in rows[:, 0].tolist()]
+        began, last = self._date("config.yaml"), self._date("steps.csv")
+        return Progress(
+            name=self.directory.resolve().name,
+            status=status,
+            total=total,
+            path=rows[:, 1:4],
+            spread=rows[-1, 4:7] if count else np.full(3, np.nan),
+            odometry=np.array(self._reckoned[:count], float).reshape(count, 3),
+            truth=np.array(truth, float).reshape(count, 2),
+            outcomes=Counter(self._outcomes[:count]),
+            lost=int(rows[:, 7].sum()),
+            off=self._off,
+            saved=self._saved(),
+            pace=count / (last - began) if 0 < began < last else None,
+            silent=max(0.0, time.time() - self._date(*self._files())),
+        )
+
+    def _read(self) -> None:
+        for where, line in self._steps.new():
+            cells = line.split(",")
+            if not self._header:
+                self._header = cells
+                continue
+            told = dict(zip(self._header, cells, strict=False))
+            self._rows.append(_numbers(where, [told.get(name, "") for name in _NUMBERS], len(_NUMBERS)))
+            self._outcomes.append(told.get("outcome", ""))
+        for where, line in self._odometry.new():
+            _, x, y, *_, qz, qw = _numbers(where, line.split(), 8)
+            self._reckoned.append([x, y, 2 * atan2(qz, qw)])
+        for where, line in self._truth.new():
+            t, x, y, *_ = _numbers(where, line.split(), 8)
+            self._true[t] = [x, y]
+        for where, line in self._errors.new():
+            if not line.startswith("t,"):
+                self._off = _numbers(where, line.split(","), 2)[1]
+
+    def _manifest(self) -> tuple[str, int | None]:
+        file = self.directory / "manifest.json"
+        try:
+            content = json.loads(file.read_text(encoding="utf-8"))
+            total = content["recording"]["samples"]
+            return str(content["status"]), None if content["continued"] else total
+        except FileNotFoundError:
+            return RUNNING, None
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InputError(str(file), f"no manifest ({error})", "that of a run") from None
+
+    def _saved(self) -> int:
+        try:
+            with (self.directory / "map.npz").open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+                return int(arrays["steps"])
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+            return 0
+
+    def _files(self) -> list[str]:
+        """All but a monitor's own."""
+        try:
+            return [path.name for path in self.directory.iterdir() if not path.name.endswith(PICTURE)]
+        except OSError as error:
+            raise InputError(str(self.directory), f"gone ({error.strerror})", "a run's directory") from None
+
+    def _date(self, *names: str) -> float:
+        """When the last of these files was written, s; 0 if none was."""
+        dates = [0.0]
+        for name in names:
+            try:
+                dates.append((self.directory / name).stat().st_mtime)
+            except OSError:
+                continue  # not there yet, or renamed just now
+        return max(dates)
+
+
+class _Lines:
+    """A text file that grows. A last line that is half written waits for the rest of it."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self._offset, self._count = path, 0, 0
+
+    def new(self) -> Iterator[tuple[str, str]]:
+        """The whole lines since the last time, each with where it stands."""
+        try:
+            with self.path.open("rb") as file:
+                file.seek(self._offset)
+                added = file.read()
+        except FileNotFoundError:
+            return
+        whole = added[: added.rfind(b"\n") + 1]
+        self._offset += len(whole)
+        for line in whole.decode("utf-8", "replace").split("\n")[:-1]:
+            self._count += 1
+            yield f"{self.path}:{self._count}", line
+
+
+def _numbers(where: str, cells: list[str], count: int) -> list[float]:
+    try:
+        numbers = [float(cell) for cell in cells]
+    except ValueError:
+        numbers = []
+    if len(numbers) != count:
+        raise InputError(where, f"'{' '.join(cells)}'", f"{count} numbers, as a run writes them")
+    return numbers
