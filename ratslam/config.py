@@ -9,11 +9,11 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, NonNegativeInt, ValidationInfo, field_validator
 
 from evaluation.exm import ExmConfig
+from ratslam.cellsettings import PoseCellConfig
 from ratslam.experience import ExperienceConfig
 from ratslam.framesettings import FrameMapConfig
 from ratslam.gridsettings import GridConfig
 from ratslam.places import PlaceConfig
-from ratslam.posecells import PoseCellConfig
 from ratslam.rat import RatConfig
 from ratslam.recall import RecallConfig
 from ratslam.templates import TemplateConfig

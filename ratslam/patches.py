@@ -9,8 +9,9 @@ Activity is [H, Y, X] over heading, y, x; poses, origins and shifts are [3] over
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -36,8 +37,8 @@ class Axis(NamedTuple):
     size: int
     ring: int
     whole: bool
-    excite: np.ndarray
-    both: np.ndarray
+    excite: Array
+    both: Array
     apart: np.ndarray
 
 
@@ -51,7 +52,7 @@ class Patch(NamedTuple):
     """
 
     axes: tuple[Axis, Axis, Axis]
-    threshold: float
+    threshold: Any
     unit: float
     margin: int
     shell: np.ndarray
@@ -91,6 +92,21 @@ def patch(config: PoseCellConfig, inner: int | None, dtype: np.dtype) -> Patch:
     return Patch((axes[0], axes[1], axes[2]), config.global_inhibition, unit, margin, shell, gap)
 
 
+def tuned(config: PoseCellConfig, patch: Patch, excite: Array, inhibit: Array, threshold: Array) -> Patch:
+    """The patch with other kernels of the same widths, traced.
+
+    Args:
+        excite, inhibit: their standard deviations, cells. threshold: global inhibition.
+    """
+    excitation = _gaussian(config.excite_width, excite)
+    both = jnp.convolve(excitation, _gaussian(config.inhibit_width, inhibit))
+    heading, y, x = (
+        axis._replace(excite=_spread(excitation, axis.apart), both=_spread(both, axis.apart))
+        for axis in patch.axes
+    )
+    return patch._replace(axes=(heading, y, x), threshold=threshold)
+
+
 def torus(patch: Patch) -> np.ndarray:
     """[3] int32 cells around x, y and heading."""
     return np.array([axis.ring for axis in patch.axes[::-1]], np.int32)
@@ -111,7 +127,7 @@ def kept(patch: Patch, activity: Array) -> Array:
     """What excitation, inhibition and threshold leave; not normalised."""
     heading, y, x = patch.axes
     h, n, m = patch.shape
-    twice = np.concatenate([heading.excite, heading.both])
+    twice = jnp.concatenate([heading.excite, heading.both])
     excited, inhibited = (twice @ activity.reshape(h, n * m)).reshape(2, h * n, m)
     excited = jnp.einsum("ab,kbi->kai", y.excite, (excited @ x.excite.T).reshape(h, n, m))
     inhibited = jnp.einsum("ab,kbi->kai", y.both, (inhibited @ x.both.T).reshape(h, n, m))
@@ -253,10 +269,17 @@ def _circular(mass: Array, at: Array, ring: np.ndarray) -> tuple[Array, Array]:
     return jnp.where(mean >= ring, 0.0, mean), jnp.sqrt(-2 * jnp.log(length)) / unit
 
 
-def _gaussian(width: int, sigma: float) -> np.ndarray:
+def _gaussian(width: int, sigma: Any) -> Any:
     offset = np.arange(width) - width // 2
-    weight = np.exp(-(offset**2) / (2 * sigma**2))
+    square = offset.astype(sigma.dtype) ** 2 if isinstance(sigma, jax.Array) else offset**2
+    weight = (jnp if isinstance(sigma, jax.Array) else np).exp(-square / (2 * sigma**2))
     return weight / weight.sum()
+
+
+def _spread(kernel: Array, apart: np.ndarray) -> Array:
+    """[size, size] a traced kernel laid along an axis; it must be shorter than a whole ring."""
+    at = apart.astype(np.int32) + len(kernel) // 2
+    return jnp.where((at >= 0) & (at < len(kernel)), kernel[np.clip(at, 0, len(kernel) - 1)], 0.0)
 
 
 def _banded(kernel: np.ndarray, size: int, ring: bool) -> np.ndarray:

@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from pydantic import Field
 
-from ratslam import places, posecells, templates
+from ratslam import ladder, places, posecells, templates
+from ratslam.cellsettings import PoseCellConfig, rings, units
 from ratslam.experience import ExperienceConfig, ExperienceMap
 from ratslam.framesettings import FrameMapConfig
 from ratslam.places import PlaceConfig, Places
-from ratslam.posecells import Outcome, PoseCellConfig, PoseCells
+from ratslam.posecells import Outcome, PoseCells
 from ratslam.recall import RecallConfig
 from ratslam.templates import Match, TemplateConfig, Templates
 from ratslam.types import Estimate
@@ -58,7 +59,8 @@ class RatEvidence(NamedTuple):
 
     Attributes:
         template: int32, -1 while no view was ever seen. error: of the best match. relative: rad, see `State`.
-        energy: injected. packet: [3] decoded, cells. outcome: an `Outcome`, int32.
+        energy: injected. packet: [3] decoded, cells. rung: of the ladder of patches, int32. outcome: an
+            `Outcome`, int32.
     """
 
     template: Array
@@ -66,6 +68,7 @@ class RatEvidence(NamedTuple):
     relative: Array
     energy: Array
     packet: Array
+    rung: Array
     outcome: Array
 
 
@@ -80,9 +83,9 @@ class Rat:
         self.config = config
         self.view_shape = view_shape
         self.dtype = np.dtype(dtype)
-        self.tables = posecells.tables(config.pose_cells, self.dtype)
-        self.rings = posecells.rings(config.pose_cells, self.dtype)
-        self.units = posecells.units(config.pose_cells, self.dtype)
+        self.rungs = ladder.rungs(config.pose_cells, self.dtype)
+        self.rings = rings(config.pose_cells, self.dtype)
+        self.units = units(config.pose_cells, self.dtype)
 
     def init(self, key: Array, capacity: int) -> State:
         """One packet in the middle of an empty world. Nothing here is random, so `key` is not used."""
@@ -127,26 +130,24 @@ class Rat:
         turned = jnp.stack([jnp.zeros_like(relative), jnp.zeros_like(relative), relative / self.units[2]])
 
         recalled = (memory.packet[jnp.maximum(match.template, 0)] + turned) % self.rings
-        cells, spread, outcome = posecells.step(
-            config.pose_cells, self.tables, state.cells, odometry, recalled, energy
-        )
+        cells, told = posecells.step(config.pose_cells, self.rungs, state.cells, odometry, recalled, energy)
         canonical = (cells.pose - turned) % self.rings
         world, decision = places.decide(
             config.places, self.rings, state.places, canonical, memory.current, seen & (memory.current >= 0)
         )
 
-        outcome = jnp.where(learnt & decision.room, outcome, Outcome.FULL)
+        outcome = jnp.where(learnt & decision.room, told.outcome, Outcome.FULL)
         outcome = jnp.where(clean, outcome, Outcome.NOT_FINITE).astype(jnp.int32)
         pose = cells.pose * self.units
         estimate = Estimate(
             pose=jnp.stack([pose[0], pose[1], wrap(pose[2])]),
-            spread=spread * self.units,
+            spread=told.spread * self.units,
             place=decision.place,
             previous=decision.previous,
             action=decision.action,
             lost=(outcome == Outcome.RESEEDED) | (outcome == Outcome.TOO_FAST),
         )
-        evidence = RatEvidence(memory.current, match.error, relative, energy, cells.pose, outcome)
+        evidence = RatEvidence(memory.current, match.error, relative, energy, cells.pose, told.rung, outcome)
         return State(cells, memory, world, relative), estimate, evidence
 
     def new_map(self) -> ExperienceMap:

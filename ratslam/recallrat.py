@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam import posecells, recall, templates
+from ratslam import ladder, posecells, recall, templates
 from ratslam.appearance import Appearance, Labels, Touch, Views
 from ratslam.backend import Backend
+from ratslam.cellsettings import rings, units
 from ratslam.framemap import FrameMap
 from ratslam.likeness import levels, pixels
 from ratslam.posecells import Outcome, PoseCells
@@ -57,6 +58,7 @@ class RecallEvidence(NamedTuple):
     background: Array
     energy: Array
     packet: Array
+    rung: Array
     health: Array
     outcome: Array
 
@@ -79,9 +81,9 @@ class RecallRat:
         self.pixels = pixels(view_shape) if self.recall.fan == "whiskers" else None
         self.dtype = np.dtype(dtype)
         self.cell = config.pose_cells.cell_size
-        self.tables = posecells.tables(config.pose_cells, self.dtype)
-        self.rings = posecells.rings(config.pose_cells, self.dtype)
-        self.units = posecells.units(config.pose_cells, self.dtype)
+        self.rungs = ladder.rungs(config.pose_cells, self.dtype)
+        self.rings = rings(config.pose_cells, self.dtype)
+        self.units = units(config.pose_cells, self.dtype)
 
     def init(self, key: Array, capacity: int) -> State:
         """One packet in the middle of an empty world. Nothing here is random, so `key` is not used."""
@@ -119,8 +121,8 @@ class RecallRat:
             lambda: (memory, recall.nothing(memory)),
         )
         recalled, energy = self._injection(memory, recollection)
-        cells, _, outcome = posecells.step(
-            self.config.pose_cells, self.tables, state.cells, odometry, recalled, energy
+        cells, told = posecells.step(
+            self.config.pose_cells, self.rungs, state.cells, odometry, recalled, energy
         )
         memory = lax.cond(
             frame,
@@ -134,7 +136,7 @@ class RecallRat:
         )
 
         room = memory.count < memory.label.shape[0]
-        outcome = jnp.where(room | ~seen, outcome, Outcome.FULL)
+        outcome = jnp.where(room | ~seen, told.outcome, Outcome.FULL)
         outcome = jnp.where(clean, outcome, Outcome.NOT_FINITE).astype(jnp.int32)
         sd, sd_heading = recall.spread(self.recall, self.cell, memory)
         place = jnp.int32(-1)  # places are for the map to say: it knows which recollections hold
@@ -147,7 +149,12 @@ class RecallRat:
             lost=(health < self.config.lost) | (outcome == Outcome.TOO_FAST),
         )
         evidence = RecallEvidence(
-            **recollection._asdict(), energy=energy, packet=cells.pose, health=health, outcome=outcome
+            **recollection._asdict(),
+            energy=energy,
+            packet=cells.pose,
+            rung=told.rung,
+            health=health,
+            outcome=outcome,
         )
         return State(cells, memory, health), estimate, evidence
 

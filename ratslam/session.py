@@ -18,8 +18,9 @@ import numpy as np
 from jax import lax
 
 from ratslam.backend import Backend, Evidence, Map
+from ratslam.rows import Layout, Rows, empty, layout_of, room
 from ratslam.types import Estimate
-from tactile.types import Observation, stack
+from tactile.types import Observation
 
 CHUNK = 16
 """Observations per compiled call; capacities change and the map guides only at multiples of it."""
@@ -63,6 +64,7 @@ class Session:
         self.steps = 0
         self.reserve = reserve
         self.state = backend.init(jax.random.key(seed), capacity_at(0, reserve))
+        self._layout: Layout | None = None
         self._run = jax.jit(partial(run_chunk, backend.kernel), donate_argnums=0)
 
     def step(self, observation: Observation) -> Step:
@@ -117,12 +119,13 @@ class Session:
         if self.steps % CHUNK == 0:
             self.state = self.backend.inform(self.state, self.map.guidance())
         count = len(observations)
-        chunk = stack(observations + observations[-1:] * (CHUNK - count))
-        self.state, outputs = self._run(self.state, chunk, np.int32(count))
-        columns, record = jax.tree.flatten(jax.device_get(outputs))
-        steps = []
+        self._layout = self._layout or layout_of(observations[0])
+        chunk = room(self._layout, CHUNK)
         for k, observation in enumerate(observations):
-            estimate, proof = jax.tree.unflatten(record, [column[k] for column in columns])
+            chunk.write(k, observation)
+        self.state, told = self._run(self.state, chunk, np.int32(count))
+        steps = []
+        for observation, (estimate, proof) in zip(observations, told.records(count), strict=True):
             estimate = self.map.update(observation, estimate, proof)
             steps.append(Step(estimate, proof, self.map.pose(estimate)))
         self.steps += count
@@ -135,22 +138,14 @@ def capacity_at(step: int, reserve: int = 0) -> int:
     return 1 << (max(end, reserve, 256) - 1).bit_length()
 
 
-def run_chunk(
-    kernel: Any, state: Any, chunk: Observation, count: Any
-) -> tuple[Any, tuple[Estimate, Evidence]]:
-    """The kernel over the first `count` observations of a chunk; rows beyond are zero."""
-
-    def at(k: Any) -> Observation:
-        return jax.tree.map(lambda column: lax.dynamic_index_in_dim(column, k, 0, keepdims=False), chunk)
+def run_chunk(kernel: Any, state: Any, chunk: Rows, count: Any) -> tuple[Any, Rows]:
+    """The kernel over the first `count` observations of a chunk: the state after them, and what each step
+    told, (estimate, evidence); rows beyond are zero."""
 
     def body(k: Any, carry: Any) -> Any:
-        state, outputs = carry
-        state, *output = kernel(state, at(k))
-        outputs = jax.tree.map(
-            lambda column, row: lax.dynamic_update_index_in_dim(column, row, k, 0), outputs, tuple(output)
-        )
-        return state, outputs
+        state, told = carry
+        state, *output = kernel(state, chunk.at(k))
+        return state, told.put(k, tuple(output))
 
-    _, *shapes = jax.eval_shape(kernel, state, jax.eval_shape(at, jnp.int32(0)))
-    empty = jax.tree.map(lambda shape: jnp.zeros((CHUNK, *shape.shape), shape.dtype), tuple(shapes))
-    return lax.fori_loop(0, count, body, (state, empty))
+    _, *output = jax.eval_shape(kernel, state, jax.eval_shape(chunk.at, jnp.int32(0)))
+    return lax.fori_loop(0, count, body, (state, empty(layout_of(tuple(output)), CHUNK)))

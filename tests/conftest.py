@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import atexit
 import os
+import shutil
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -11,12 +14,20 @@ import pytest
 os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
 os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_multi_thread_eigen=false"
 
+if "RATSLAM_TEST_CACHE" not in os.environ:
+    # Workers share what one of them has compiled; every run of the suite starts from nothing.
+    os.environ["RATSLAM_TEST_CACHE"] = tempfile.mkdtemp(prefix="ratslam-tests-")
+    atexit.register(shutil.rmtree, os.environ["RATSLAM_TEST_CACHE"], ignore_errors=True)
+
 import jax
 from hypothesis import HealthCheck, settings
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_compilation_cache_dir", os.environ["RATSLAM_TEST_CACHE"])
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 settings.register_profile(
     "ratslam", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow]

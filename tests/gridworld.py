@@ -12,10 +12,11 @@ import numpy as np
 
 from ratslam.gridfilter import GridEvidence, GridFilter, State
 from ratslam.gridsettings import GridConfig
+from ratslam.rows import layout_of, room
 from ratslam.session import CHUNK, run_chunk
 from ratslam.types import Estimate
 from tactile.feelers import Feelers
-from tactile.types import Motion, Observation, Odometry, observation, stack
+from tactile.types import Motion, Observation, Odometry, observation
 
 MOUNTS = ((0.10, 0.08, 50), (0.13, 0.03, 15), (0.13, -0.03, -15), (0.10, -0.08, -50))
 """x m, y m, direction deg, of a Create's whiskers from left to right."""
@@ -100,15 +101,13 @@ def drive(
     outputs = []
     for start in range(0, len(reports), CHUNK):
         chunk = list(reports[start : start + CHUNK])
-        padded = stack(chunk + chunk[-1:] * (CHUNK - len(chunk)))
-        state, output = _runner(backend)(state, padded, np.int32(len(chunk)))
-        outputs.append(_first(output, len(chunk)))
-    estimate, evidence = jax.tree.map(lambda *rows: np.concatenate(rows), *outputs)
+        rows = room(layout_of(chunk[0]), CHUNK)
+        for k, report in enumerate(chunk):
+            rows.write(k, report)
+        state, told = _runner(backend)(state, rows, np.int32(len(chunk)))
+        outputs += told.records(len(chunk))
+    estimate, evidence = jax.tree.map(lambda *rows: np.stack(rows), *outputs)
     return state, estimate, evidence
-
-
-def _first(output: Any, count: int) -> Any:
-    return jax.tree.map(lambda rows: np.asarray(rows)[:count], output)
 
 
 def begun(backend: GridFilter, seed: int = 0) -> State:

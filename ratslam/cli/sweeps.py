@@ -1,0 +1,131 @@
+"""The command on studies: sweep, and with it tuning on several objectives."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from tqdm import tqdm
+
+from ratslam.cli.common import MENDABLE, Add, prepare_jax, settable, shared
+
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""How many threads NumPy sums with."""
+
+
+def add(command: Add) -> None:
+    """Adds it to the program."""
+    sweep = command("sweep", _sweep, "run every configuration of a study over its seeds, or tune parameters")
+    sweep.add_argument("study", help="the YAML file")
+    settable(sweep)
+    shared(sweep)
+    sweep.add_argument(
+        "--scheduler", metavar="tcp://HOST:PORT", help="of Dask, that has workers, instead of processes here"
+    )
+    sweep.add_argument(
+        "-o", "--output", type=Path, metavar="DIR",
+        help="where results are kept, and taken from if they are there (default runs/<study>)",
+    )  # fmt: skip
+    sweep.add_argument("--tune", action="store_true", help="choose parameters as the study's `tune` says")
+
+
+class Progress:
+    """A bar for the runs of a study; it hears of each that is done, and keeps what failed.
+
+    Args:
+        total: runs. directory: of their results.
+    """
+
+    def __init__(self, total: int | None, directory: Path) -> None:
+        self.failed: list[Any] = []
+        self._directory = directory
+        self._bar = tqdm(
+            total=total, unit="run", desc=directory.name, file=sys.stderr, mininterval=0.5, delay=1.0
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __call__(self, result: Any = None) -> None:
+        """A run is done; without its result if that was not looked at."""
+        if result is not None and result.error is not None:
+            self.failed.append(result)
+        self._bar.update()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bar.close()
+        if kind is KeyboardInterrupt:
+            print(
+                f"ratslam: {self._bar.n} runs are kept in {self._directory}; the same command goes on",
+                file=sys.stderr,
+            )
+
+    def told(self) -> int:
+        """Says what failed; the exit code."""
+        for result in self.failed:
+            settings = {key: value for key, value in result.varied.items()}
+            label = " ".join([result.row, *(f"{key}={value}" for key, value in settings.items())]).strip()
+            for line in result.error.splitlines():
+                print(
+                    f"ratslam: error: {label or 'as configured'}, seed {result.seed}: {line}", file=sys.stderr
+                )
+        if self.failed:
+            print(
+                f"ratslam: {len(self.failed)} runs failed; where that is kept in "
+                f"{self._directory}, remove the file there to try again",
+                file=sys.stderr,
+            )
+        return MENDABLE if self.failed else 0
+
+
+def settle_threads() -> None:
+    """One thread for NumPy, as workers have, so that results are the same; call it before NumPy loads."""
+    for name in THREADS:
+        os.environ.setdefault(name, "1")
+
+
+def _sweep(arguments: argparse.Namespace) -> int:
+    settle_threads()
+    prepare_jax()
+    from ratslam.sweeps.study import read_study
+
+    study = read_study(arguments.study, arguments.set)
+    directory = arguments.output or Path("runs") / study.name
+    return (_tune if arguments.tune else _table)(arguments, study, directory)
+
+
+def _table(arguments: argparse.Namespace, study: Any, directory: Path) -> int:
+    from ratslam.sweeps.pool import FOLDER, results
+    from ratslam.sweeps.report import remarks, rows, save, table
+    from ratslam.sweeps.study import jobs
+
+    asked = jobs(study)
+    with Progress(len({job.key for job in asked}), directory / FOLDER) as progress:
+        found = list(results(asked, directory, arguments.workers, arguments.scheduler, progress))
+    lines = rows(found)
+    paths = save(lines, directory)
+    print("\n\n".join([table(lines), *remarks(found, directory / FOLDER)]))
+    print(f"\n{paths[0]} and {paths[1].name} hold all quantities, {directory / FOLDER} every run")
+    return progress.told()
+
+
+def _tune(arguments: argparse.Namespace, study: Any, directory: Path) -> int:
+    from ratslam.sweeps.pool import FOLDER
+    from ratslam.sweeps.tuning import report, save, tune
+
+    plan = study.plan
+    total = plan.tune and plan.tune.trials * len(plan.every_seed())
+    with Progress(total, directory / FOLDER) as progress:
+        trials = tune(study, directory, arguments.workers, arguments.scheduler, progress)
+    print(report(trials))
+    print(f"\n{save(trials, directory)} holds all trials; the same command with more of them goes on")
+    if any(trial.values for trial in trials):
+        return 0
+    print("ratslam: error: no trial has a value of every objective", file=sys.stderr)
+    return progress.told() or MENDABLE

@@ -1,0 +1,69 @@
+"""Studies of sessions that take a moment, and jobs that take none."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from evaluation.scorecard import Quantity
+from ratslam.cli.common import prepare_jax
+from ratslam.sweeps.results import Result
+from ratslam.sweeps.study import Job
+
+TINY = {
+    "simulation.maze": {"columns": 3, "rows": 2, "loop": 6},
+    "simulation.path": {"circuits": "C"},
+    "simulation.whisking.rate": 0.5,
+    "pose_cells.cells_xy": 11,
+    "pose_cells.cells_heading": 12,
+    "matcher": "classic",
+}
+"""Some 40 whisks."""
+
+
+@pytest.fixture(scope="session", autouse=True)
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """One compile cache for all programs of these tests, away from the user's."""
+    before = os.environ.get("XDG_CACHE_HOME")
+    os.environ["XDG_CACHE_HOME"] = str(tmp_path_factory.mktemp("cache"))
+    prepare_jax()
+    yield
+    os.environ.pop("XDG_CACHE_HOME") if before is None else os.environ.update(XDG_CACHE_HOME=before)
+
+
+@pytest.fixture
+def tiny(tmp_path: Path) -> Callable[..., Path]:
+    """Writes a study of tiny sessions."""
+
+    def write(**content: object) -> Path:
+        (tmp_path / "base.yaml").write_text("simulation: {}\n")
+        path = tmp_path / "study.yaml"
+        settings = TINY | dict(content.pop("set", {}))  # type: ignore[call-overload]
+        path.write_text(json.dumps({"base": "base.yaml", "set": settings, **content}))
+        return path
+
+    return write
+
+
+@pytest.fixture
+def played(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Jobs are not run: their answers follow from settings and seed. The keys asked for."""
+    asked: list[str] = []
+
+    def run_job(job: Job) -> Result:
+        asked.append(job.key)
+        if job.config.frames.score > 40:
+            return Result(hash=job.hash, seed=job.seed, error="frames.score: too much")
+        values = {
+            "energy_all": (job.config.frames.score - 7) ** 2 + job.seed,
+            "exm_arr": 1 / (1 + abs(job.config.frames.score - 12) + job.config.recall.modes),
+        }
+        quantities = {name: Quantity(label=name, value=value, unit="") for name, value in values.items()}
+        return Result(hash=job.hash, seed=job.seed, quantities=quantities, steps=1)
+
+    monkeypatch.setattr("ratslam.sweeps.pool.run_job", run_job)
+    return asked

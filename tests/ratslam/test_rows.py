@@ -1,0 +1,83 @@
+"""Laws of records kept as rows of a few arrays."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ratslam.rows import Rows, empty, layout_of, room
+
+DTYPES = [np.dtype(name) for name in ("float64", "float32", "int32", "uint32", "bool")]
+
+
+class Inner(NamedTuple):
+    a: np.ndarray
+    b: np.ndarray
+
+
+@st.composite
+def kinds(draw):
+    """Shapes and dtypes of the leaves of a kind of record."""
+    shape = st.lists(st.integers(0, 3), max_size=3).map(tuple)
+    return draw(st.lists(st.tuples(shape, st.sampled_from(DTYPES)), min_size=2, max_size=6))
+
+
+def record(kind, seed):
+    stream = np.random.default_rng(seed)
+    leaves = [(stream.normal(0, 9, shape) ** 2).astype(dtype) for shape, dtype in kind]
+    return {"inner": Inner(*leaves[:2]), "rest": leaves[2:]}
+
+
+def same(one, other):
+    assert jax.tree.structure(one) == jax.tree.structure(other)
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        assert a.dtype == b.dtype
+        assert np.array_equal(a, b)
+        assert np.shape(a) == np.shape(b)
+
+
+@given(kinds(), st.integers(1, 5))
+def test_what_is_written_is_read(kind, count):
+    records = [record(kind, seed) for seed in range(count)]
+    rows = room(layout_of(records[0]), count + 2)
+    for k, each in enumerate(records):
+        rows.write(k, each)
+    assert len(rows.arrays) == len({dtype for _, dtype in kind})
+    read = list(rows.records(count))
+    for one, other in zip(records, read, strict=True):
+        same(one, other)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_compiled_code_reads_and_writes_the_same(seed):
+    stream = np.random.default_rng(seed)
+    dtypes = [DTYPES[k] for k in stream.integers(0, len(DTYPES), 4)]
+    kind = [(tuple(stream.integers(1, 4, stream.integers(0, 3))), dtype) for dtype in dtypes]
+    records = [record(kind, k) for k in range(3)]
+    rows = room(layout_of(records[0]), 3)
+    for k, each in enumerate(records):
+        rows.write(k, each)
+
+    @jax.jit
+    def turned(rows: Rows) -> Rows:
+        out = empty(rows.layout, 3)
+        for k in range(3):
+            out = out.put(jnp.int32(2 - k), rows.at(jnp.int32(k)))
+        return out
+
+    for one, other in zip(records, list(turned(rows).records(3))[::-1], strict=True):
+        same(one, other)
+
+
+def test_a_record_of_another_shape_is_refused():
+    rows = room(layout_of(Inner(np.zeros(3), np.zeros((2, 2)))), 1)
+    with pytest.raises(ValueError, match="another shape"):
+        rows.write(0, Inner(np.zeros(3), np.zeros(4)))
+    with pytest.raises(ValueError, match="another shape"):
+        rows.write(0, Inner(np.zeros(1), np.zeros((2, 2))))
