@@ -6,7 +6,7 @@ import warnings
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ratslam.graphfile import read_g2o, write_g2o
@@ -20,9 +20,12 @@ from ratslam.posegraph import (
     linear,
     logmap_error,
 )
+from ratslam.posegraph.chains import chains
+from ratslam.posegraph.edges import full
+from ratslam.posegraph.normal import Folded
 from ratslam.relaxation import relax
 from tactile.errors import InputError
-from tactile.frames import between, compose, integrate, wrap
+from tactile.frames import between, compose, integrate, inverse, wrap
 
 
 def loops(stream, count=120, closures=20, noise=(0.0, 0.0)):
@@ -33,6 +36,27 @@ def loops(stream, count=120, closures=20, noise=(0.0, 0.0)):
     measured = between(truth[i], truth[j]) + stream.normal(0, 1, (len(i), 3)) * [noise[0], noise[0], noise[1]]
     sd = np.maximum([noise[0], noise[0], noise[1]], 0.01)
     return truth, Edges(i, j, measured, np.tile(1 / sd**2, (len(i), 1)))
+
+
+def tangle(stream, count):
+    """Chains of all lengths hung on one another anyhow: measured forwards and backwards, twice over, with
+    blind alleys, a loop at one node, two nodes in a ring and one alone; nodes and edges in any order."""
+    nodes, i, j = 1, [], []
+    while nodes < count:
+        length = int(stream.integers(1, 9))
+        run = [int(stream.integers(nodes)), *range(nodes, nodes + length)]
+        nodes += length
+        if stream.random() < 0.7:
+            run.append(int(stream.integers(nodes)))
+        i, j = i + run[:-1], j + run[1:]
+    i, j = i + [i[0], nodes, nodes + 1], j + [j[0], nodes + 1, nodes]
+    name = np.concatenate([[0], 1 + stream.permutation(nodes + 2)])
+    turned, order = stream.random(len(i)) < 0.5, stream.permutation(len(i))
+    i, j = name[np.where(turned, j, i)][order], name[np.where(turned, i, j)][order]
+    truth = stream.normal(0, 3, (nodes + 3, 3))
+    measured = between(truth[i], truth[j]) + stream.normal(0, 0.05, (len(i), 3))
+    half = stream.normal(0, 3, (len(i), 3, 3)) + 9 * np.eye(3)
+    return truth, Edges(i, j, measured, half @ half.swapaxes(1, 2))
 
 
 @given(st.integers(0, 1000), st.sampled_from([difference_error, logmap_error]))
@@ -51,14 +75,103 @@ def test_jacobians_are_the_derivatives(seed, error):
             assert np.allclose(slope[0], jacobian[0, :, axis], atol=1e-6, rtol=1e-4)
 
 
-@given(st.integers(0, 1000))
-def test_exact_graphs_stay_and_linear_finds_them(seed):
+def plainly(edges, count, heading):
+    """Positions by dense least squares, headings given; node 0 at the origin."""
+    rows = np.zeros((len(edges.i), count))
+    rows[np.arange(len(edges.i)), edges.j] += 1
+    rows[np.arange(len(edges.i)), edges.i] -= 1
+    c, s = np.cos(heading[edges.i]), np.sin(heading[edges.i])
+    x, y = edges.motion[:, 0], edges.motion[:, 1]
+    moved = np.stack([c * x - s * y, s * x + c * y], axis=1)
+    root = np.sqrt(edges.information[:, :2].mean(axis=1))[:, None]
+    found = np.linalg.lstsq(root * rows[:, 1:], root * moved)[0]
+    root = np.sqrt(edges.information[:, 2:])
+    around = wrap(heading[edges.j] - heading[edges.i] - edges.motion[:, 2])
+    left = np.linalg.lstsq(root * rows[:, 1:], root * around[:, None])[0]
+    return np.vstack([np.zeros((1, 2)), found]), np.abs(left).max()
+
+
+@given(st.integers(0, 1000), st.integers(5, 60), st.sampled_from([0.01, 0.1]))
+def test_linear_is_the_plain_two_stage_solve(seed, closures, noise):
+    stream = np.random.default_rng(seed)
+    truth, edges = loops(stream, 120, closures, (0.02, noise))
+    turned = stream.random(len(edges.i)) < 0.3  # some measured the other way round
+    motion = edges.motion.copy()
+    motion[turned] = inverse(motion[turned])
+    i, j = np.where(turned, edges.j, edges.i), np.where(turned, edges.i, edges.j)
+    edges = Edges(i, j, motion, stream.uniform(50, 500, (len(i), 3)))
+    found = linear(len(truth), edges)
+    positions, left = plainly(edges, len(truth), found[:, 2])
+    assert left < 1e-9  # no change of headings would fit them better
+    assert np.abs(found[:, :2] - positions).max() < 1e-9
+
+
+def test_linear_hangs_parts_on_nothing_at_the_start():
+    edges = Edges(np.array([0, 2, 3]), np.array([1, 3, 4]), np.tile([1.0, 0, 0], (3, 1)), np.ones((3, 3)))
+    assert np.allclose(linear(6, edges, np.array([5, 5, np.pi / 2])), [
+        [5, 5, np.pi / 2], [5, 6, np.pi / 2],
+        [5, 5, np.pi / 2], [5, 6, np.pi / 2], [5, 7, np.pi / 2], [5, 5, np.pi / 2],
+    ])  # fmt: skip
+
+
+@given(st.integers(0, 1000), st.booleans())
+def test_exact_graphs_stay_and_linear_finds_them(seed, folded):
     truth, edges = loops(np.random.default_rng(seed))
-    solved = least_squares(truth, edges)
+    solved = least_squares(truth, edges, folded=folded)
     assert solved.ending is Ending.CONVERGED
     assert np.abs(solved.poses - truth).max() < 1e-9
     found = linear(len(truth), edges)
     assert np.abs(found[:, :2] - truth[:, :2]).max() < 1e-6
+
+
+@given(st.integers(0, 1000), st.integers(2, 60))
+def test_chains_lead_from_fork_to_fork(seed, count):
+    truth, edges = tangle(np.random.default_rng(seed), count)
+    solid = np.random.default_rng(seed + 1).random(len(edges.i)) < 0.9
+    found = chains(len(truth), edges.i, edges.j, solid)
+    assert sorted([*found.forks, *found.inner]) == list(range(len(truth)))
+    assert sorted([*found.edge, *found.loose]) == list(range(len(edges.i)))
+    assert solid[found.edge].all()
+    assert found.forks[0] == 0
+    start = np.where(found.sign > 0, edges.i[found.edge], edges.j[found.edge])
+    stop = np.where(found.sign > 0, edges.j[found.edge], edges.i[found.edge])
+    begins = np.isin(np.arange(len(start)), found.first)
+    assert np.array_equal(start[begins], found.forks[found.a[: len(found.first)]])
+    assert np.array_equal(stop[np.roll(begins, -1)], found.forks[found.b[: len(found.first)]])
+    assert np.array_equal(start[~begins], found.inner)
+    assert np.array_equal(stop[found.into], found.inner)
+    # None is left: whoever is tied to two others by solid edges is in a chain, but for rings on their own.
+    degree = np.bincount(edges.i, minlength=len(truth)) + np.bincount(edges.j, minlength=len(truth))
+    degree[edges.i[~solid]] = degree[edges.j[~solid]] = degree[edges.i[edges.i == edges.j]] = 9
+    assert set(np.flatnonzero(degree[:-2] == 2)) - {0} <= {*found.inner, *ring(edges)}
+
+
+def ring(edges):
+    """Nodes that two edges tie to one and the same other."""
+    pairs = np.sort(np.stack([edges.i, edges.j], axis=1), axis=1)
+    kinds, times = np.unique(pairs, axis=0, return_counts=True)
+    return kinds[times > 1].ravel()
+
+
+@given(st.integers(0, 1000), st.integers(2, 60), st.sampled_from([difference_error, logmap_error]))
+def test_a_folded_step_balances_the_whole_graph(seed, count, error):
+    truth, edges = tangle(np.random.default_rng(seed), count)
+    at = truth + np.random.default_rng(seed + 1).normal(0, 0.2, truth.shape)
+    errors = error(at, edges)
+    folded = Folded(len(at), edges, np.zeros(len(edges.i), bool))
+    short = folded.step(at, errors, full(edges.information), 0.0)
+    residual, by_i, by_j = errors
+    # Least squares of the linearised errors, gauge free parts and all: what is left must be as little.
+    change = (
+        residual
+        + np.einsum("eab,eb->ea", by_i, short[edges.i])
+        + np.einsum("eab,eb->ea", by_j, short[edges.j])
+    )
+    force = np.einsum("eab,eb->ea", full(edges.information), change)
+    balance = np.zeros_like(at)
+    np.add.at(balance, edges.i, np.einsum("eba,eb->ea", by_i, force))
+    np.add.at(balance, edges.j, np.einsum("eba,eb->ea", by_j, force))
+    assert np.abs(balance[1:]).max() < 1e-7 * np.abs(force).max()
 
 
 @given(st.integers(0, 200), st.tuples(st.floats(-9, 9), st.floats(-9, 9), st.floats(-3, 3)))
@@ -71,7 +184,32 @@ def test_a_moved_graph_has_the_moved_solution(seed, by):
     assert np.abs(wrap(gap[:, 2])).max() < 1e-5
 
 
-def test_a_robust_kernel_shrugs_off_a_false_closure():
+@given(st.integers(0, 1000), st.sampled_from([0.01, 0.03]), st.sampled_from([difference_error, logmap_error]))
+@settings(max_examples=40)
+def test_folded_ends_where_whole_does(seed, noise, error):
+    truth, edges = loops(np.random.default_rng(seed), 200, 40, (0.02, noise))
+    start = linear(len(truth), edges)
+    whole, folded = (least_squares(start, edges, error=error, folded=f) for f in (False, True))
+    assert whole.ending is folded.ending is Ending.CONVERGED
+    assert folded.cost == pytest.approx(whole.cost, rel=1e-9)
+    assert np.abs(between(whole.poses, folded.poses)).max() < 1e-5
+
+
+def test_noise_of_a_tenth_of_a_radian_a_step():
+    """What is left is what noise leaves: chi-square of as many degrees of freedom."""
+    for seed in range(5):
+        truth, edges = loops(np.random.default_rng(seed), 1200, 150, (0.02, 0.1))
+        start = linear(len(truth), edges)
+        folded = least_squares(start, edges, folded=True)
+        assert folded.ending is Ending.CONVERGED
+        free = 3 * (len(edges.i) - len(truth) + 1)
+        assert folded.cost < free + 5 * np.sqrt(2 * free)
+        whole = least_squares(start, edges, folded=False, iterations=folded.iterations)
+        assert folded.cost <= whole.cost * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("folded", [False, True])
+def test_a_robust_kernel_shrugs_off_a_false_closure(folded):
     truth, edges = loops(np.random.default_rng(0), noise=(0.02, 0.005))
     false = Edges(
         *(np.concatenate([a, b]) for a, b in zip(edges, ([3], [110], [[0, 0, 0]], [[1e4] * 3]), strict=True))
@@ -79,9 +217,9 @@ def test_a_robust_kernel_shrugs_off_a_false_closure():
     robust = np.arange(len(false.i)) >= len(truth) - 1
     harm = {}
     for name, kernel in {"huber": huber(1.0), "geman": geman_mcclure(9.0)}.items():
-        poses = least_squares(truth, false, kernel=kernel, robust=robust).poses
+        poses = least_squares(truth, false, kernel=kernel, robust=robust, folded=folded).poses
         harm[name] = np.abs(poses - truth)[:, :2].max()
-    plain = np.abs(least_squares(truth, false).poses - truth)[:, :2].max()
+    plain = np.abs(least_squares(truth, false, folded=folded).poses - truth)[:, :2].max()
     assert harm["geman"] < plain / 5
     assert harm["huber"] < plain / 5
 
@@ -118,8 +256,10 @@ def test_endings_have_names():
     one = Edges(np.array([0]), np.array([1]), np.array([[np.nan, 0, 0]]), np.ones((1, 3)))
     assert least_squares(np.zeros((2, 3)), one).ending is Ending.NOT_FINITE
     apart = Edges(np.array([0, 3]), np.array([1, 4]), np.ones((2, 3)), np.ones((2, 3)))
-    solved = least_squares(np.zeros((5, 3)), apart)
-    assert np.isfinite(solved.poses).all()
+    for folded in (False, True):
+        solved = least_squares(np.zeros((5, 3)), apart, folded=folded)
+        assert np.isfinite(solved.poses).all()
+        assert solved.ending is Ending.CONVERGED
     assert np.isfinite(linear(5, apart)).all()
 
 
@@ -151,9 +291,10 @@ def test_m3500_ends_where_gtsam_ends(m3500):
     solved = gtsam.LevenbergMarquardtOptimizer(graph, values, settings).optimize()
     theirs = np.array([[solved.atPose2(k).x(), solved.atPose2(k).y()] for k in range(len(start))])
     for error, near in ((logmap_error, 1e-6), (difference_error, 1e-4)):
-        ours = least_squares(start, edges, error=error)
-        assert ours.ending is Ending.CONVERGED
-        assert np.hypot(*(ours.poses[:, :2] - theirs).T).max() <= near
+        for folded in (False, True):
+            ours = least_squares(start, edges, error=error, folded=folded)
+            assert ours.ending is Ending.CONVERGED
+            assert np.hypot(*(ours.poses[:, :2] - theirs).T).max() <= near
 
 
 def test_relaxation_leaves_exact_graphs_and_pulls_others_together():

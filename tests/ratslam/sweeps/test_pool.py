@@ -149,7 +149,7 @@ def test_what_fails_is_told_and_the_rest_goes_on(tiny, tmp_path, capsys, played)
     for _ in range(2):  # the second time nothing is run, and it is said again
         assert main(["sweep", str(study), "-o", str(tmp_path / "out"), "--workers", "1"]) == 2
         told = capsys.readouterr()
-        assert "frames.score=41, seed 1: frames.score: too much" in told.err
+        assert "score=41, seed 1: frames.score: too much" in told.err
         assert "2 runs failed" in told.err
         assert "score=6" in told.out
         assert "0, 2 failed" in told.out

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from evaluation.scorecard import Quantity
 from ratslam.sweeps.quantities import DIRECTIONS, MAIN
-from ratslam.sweeps.report import SHORT, rows, save, spread, table
+from ratslam.sweeps.report import SHORT, label, rows, save, spread, table
 from ratslam.sweeps.results import Memory, Result, Timing, read_result, write_result
 
 FINITE = st.floats(-1e6, 1e6)
@@ -99,7 +99,10 @@ def test_a_table_has_a_line_for_each_row_in_order(tmp_path):
             result("b", 1, "one", varied={"x.k": 2}, error="no whiskers"),
         ]
     )
-    assert [(row.label, row.seeds, row.failed) for row in found] == [("one k=1", 2, 0), ("one k=2", 1, 1)]
+    assert [(label(row.row, row.varied), row.seeds, row.failed) for row in found] == [
+        ("one k=1", 2, 0),
+        ("one k=2", 1, 1),
+    ]
     head, first, second = table(found).splitlines()
     assert head.split() == ["seeds", "EM", "ARR"]
     assert "2 ± 1.41 (3)" in first
@@ -112,6 +115,13 @@ def test_a_table_has_a_line_for_each_row_in_order(tmp_path):
     assert float(lines[0]["energy_all_mean"]) == 2.0
     assert lines[1]["exm_arr_mean"] == ""
     assert json.loads(paths[1].read_text())[0]["spreads"]["ate_online"]["worst"] == 3.0
+
+
+def test_a_label_is_as_short_as_can_be():
+    assert label("", {}) == "as configured"
+    assert label("a", {}) == "a"
+    assert label("a", {"x.k": "v", "y.l": 1.5}) == "a k=v l=1.5"
+    assert label("", {"x.k": 1, "y.k": [2]}) == "x.k=1 y.k=[2]"
 
 
 def test_two_values_that_look_alike_are_two_rows():

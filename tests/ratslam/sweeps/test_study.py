@@ -183,6 +183,8 @@ TUNE = {"parameters": {"frames.score": {"low": 1.0, "high": 2.0}}, "objectives":
         ({"vary": GRID, "rows": {"a": {"frames": {}}}}, ["rows.a.frames", "'frames.score' varies"]),
         ({"vary": GRID | {"frames": [{}]}}, ["vary.frames", "'frames.score' varies"]),
         ({"vary": {"simulation.seed": [1, 2]}}, ["simulation.seed: a seed"]),
+        ({"set": {"simulation.seed": 1}}, ["simulation.seed: a seed"]),
+        ({"base": str(SQUARE), "rows": {"a": {"session.seed": 1}}}, ["session.seed: a seed"]),
         ({"set": {"a..b": 3}}, ["a..b: no key path"]),
         ({"set": {"touch.image.levels.x": 3}}, ["touch.image.levels"]),
         ({"seeds": 0}, ["seeds: 0"]),

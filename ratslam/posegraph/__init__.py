@@ -1,0 +1,25 @@
+"""SE(2) pose graphs: exact linear start, damped and robust least squares, chains of odometry eliminated.
+
+Node 0 is held where it is. Sources: Kuemmerle et al. 2011 (g2o: the plain error), Dellaert & Kaess 2017
+(the logarithmic one), Carlone et al. 2014 (headings first, then positions).
+"""
+
+from ratslam.posegraph.edges import Edges, Error, difference_error, logmap_error
+from ratslam.posegraph.kernels import Kernel, geman_mcclure, huber, no_kernel
+from ratslam.posegraph.leastsquares import Ending, Solution, least_squares
+from ratslam.posegraph.linear import linear
+
+__all__ = [
+    "Edges",
+    "Ending",
+    "Error",
+    "Kernel",
+    "Solution",
+    "difference_error",
+    "geman_mcclure",
+    "huber",
+    "least_squares",
+    "linear",
+    "logmap_error",
+    "no_kernel",
+]
