@@ -68,13 +68,12 @@ class Progress:
 
     def told(self) -> int:
         """Says what failed; the exit code."""
+        from ratslam.sweeps.report import label
+
         for result in self.failed:
-            settings = {key: value for key, value in result.varied.items()}
-            label = " ".join([result.row, *(f"{key}={value}" for key, value in settings.items())]).strip()
+            where = f"{label(result.row, result.varied)}, seed {result.seed}"
             for line in result.error.splitlines():
-                print(
-                    f"ratslam: error: {label or 'as configured'}, seed {result.seed}: {line}", file=sys.stderr
-                )
+                print(f"ratslam: error: {where}: {line}", file=sys.stderr)
         if self.failed:
             print(
                 f"ratslam: {len(self.failed)} runs failed; where that is kept in "

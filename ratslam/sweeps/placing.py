@@ -33,8 +33,7 @@ def put(document: Document, key: str, value: Any, origin: Document, at: KeyPath)
         section = section[step]
     section[last] = copy.deepcopy(value)
     root: KeyPath = (*sections, last)
-    named = at[:-1] if isinstance(at[-1], int) else at  # of a list of values: what they are values of
-    key_place, value_place = (origin.places[origin.nearest(path)] for path in (named, at))
+    key_place, value_place = (origin.places[origin.nearest(path)] for path in (named(at), at))
     here = Place(key_place.key, value_place.value)
     made = {path for path, place in changed.places.items() if document.places.get(path) != place}
     places = {path: here if path in made else place for path, place in changed.places.items()}
@@ -43,6 +42,11 @@ def put(document: Document, key: str, value: Any, origin: Document, at: KeyPath)
     }
     places[root] = here
     return Document(changed.data, places)
+
+
+def named(at: KeyPath) -> KeyPath:
+    """Of one of a list of values: the path of what they are values of."""
+    return at[:-1] if isinstance(at[-1], int) else at
 
 
 def overlap(first: str, second: str) -> bool:

@@ -62,6 +62,8 @@ class Pool:
 
     def _fresh(self, jobs: Sequence[Job], folder: Path) -> Generator[Result, None, None]:
         """Results as they come, each on disk if it is worth keeping."""
+        if not jobs:
+            return
         count = min(self._workers, max(len(jobs), self._most))
         if self._scheduler is None and (count == 1 or len(jobs) <= 1):
             for job in jobs:
@@ -69,7 +71,7 @@ class Pool:
                 write_result(folder, result)
                 yield result
             return
-        if self._client is None and jobs:
+        if self._client is None:
             self._client = self._open.enter_context(connected(count, self._scheduler))
         for job, answer in answers(self._client, jobs):
             if answer is not None:

@@ -57,11 +57,13 @@ class Row(NamedTuple):
     failed: int
     spreads: dict[str, Spread]
 
-    @property
-    def label(self) -> str:
-        """Its name and its combination."""
-        parts = [f"{key.rpartition('.')[2]}={_plain(value)}" for key, value in self.varied.items()]
-        return " ".join([self.row, *parts]).strip() or "as configured"
+
+def label(row: str, varied: dict[str, Any]) -> str:
+    """A row's name and combination, keys without their sections where that is enough."""
+    last = [key.rpartition(".")[2] for key in varied]
+    names = last if len(set(last)) == len(last) else list(varied)
+    parts = [f"{name}={_plain(value)}" for name, value in zip(names, varied.values(), strict=True)]
+    return " ".join([row, *parts]).strip() or "as configured"
 
 
 def rows(results: Sequence[Result]) -> list[Row]:
@@ -86,7 +88,7 @@ def table(found: Sequence[Row]) -> str:
     """The main quantities as plain text: mean ± standard deviation (worst)."""
     names = [name for name in MAIN if any(row.spreads[name].seeds for row in found if name in row.spreads)]
     columns = [[SHORT[name], *(_cell(row.spreads.get(name)) for row in found)] for name in names]
-    labels = ["", *(row.label for row in found)]
+    labels = ["", *(label(row.row, row.varied) for row in found)]
     seeds = ["seeds", *(f"{row.seeds}" + (f", {row.failed} failed" if row.failed else "") for row in found)]
     filled = [_filled(labels, "<"), *(_filled(column, ">") for column in [seeds, *columns])]
     return "\n".join("  ".join(cells).rstrip() for cells in zip(*filled, strict=True))

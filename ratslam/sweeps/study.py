@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Iterator, Sequence
-from functools import lru_cache
 from itertools import combinations, product
 from math import prod
 from pathlib import Path
@@ -13,7 +11,8 @@ from typing import Any, NamedTuple
 
 from ratslam.config import RunConfig
 from ratslam.run import located
-from ratslam.sweeps.placing import outermost_first, overlap, put
+from ratslam.sweeps.identity import digest_of, seed_key, with_seed
+from ratslam.sweeps.placing import named, outermost_first, overlap, put
 from ratslam.sweeps.plan import StudyPlan, TunePlan
 from ratslam.yamlfile import Document, load, override, validate
 from ratslam.yamlfile.document import KeyPath, Place
@@ -22,10 +21,6 @@ from tactile.errors import InputError, InputErrors
 
 MOST = 100_000
 """Jobs of a study."""
-SEEDS = {"simulation": "simulation.seed", "roving": "roving.seed", "recording": "session.seed"}
-"""What `seeds` sets, by what is run on."""
-DIGITS = 16
-"""Of a configuration's hash, in hexadecimal."""
 
 
 class Variant(NamedTuple):
@@ -130,6 +125,12 @@ def variant_of(
     for key, value, at in settings:
         document = put(document, key, value, study.document, at)
     config = located(validate(document, RunConfig), study.folder.resolve())
+    everywhere: list[tuple[str, Any, KeyPath]] = [
+        (key, value, ("set", key)) for key, value in study.plan.set.items()
+    ]
+    for key, _, at in [*everywhere, *settings]:
+        if key == seed_key(config):
+            raise InputError(study.document.at_key(named(at)), "a seed", "the study's `seeds`")
     return Variant(row, varied or {}, config, digest_of(config, study.plan.pace))
 
 
@@ -141,28 +142,6 @@ def tuned(study: Study, parameters: dict[str, Any]) -> Variant:
     """
     settings = [(key, value, ("tune", "parameters", key)) for key, value in parameters.items()]
     return variant_of(study, settings, "tune", parameters)
-
-
-def with_seed(config: RunConfig, seed: int) -> RunConfig:
-    """The configuration under another seed: of what is simulated, or of the session on a recording."""
-    section, _, name = seed_key(config).partition(".")
-    return config.model_copy(update={section: getattr(config, section).model_copy(update={name: seed})})
-
-
-def seed_key(config: RunConfig) -> str:
-    """The key path that `seeds` sets."""
-    return next(key for part, key in SEEDS.items() if getattr(config, part) is not None)
-
-
-def digest_of(config: RunConfig, pace: str = "replay") -> str:
-    """Of a configuration with whole paths, without its seed: of each value, of which values were chosen (what
-    is not may be completed from the source), and of the content of each file that it names."""
-    section, _, name = seed_key(config).partition(".")
-    parts = [config.model_dump(), config.model_dump(exclude_unset=True)]
-    for part in parts:
-        part.get(section, {}).pop(name, None)
-    text = json.dumps([*parts, pace], sort_keys=True, default=_content)
-    return hashlib.sha256(text.encode()).hexdigest()[:DIGITS]
 
 
 def made(directory: Path) -> None:
@@ -243,17 +222,12 @@ def _unambiguous(plan: StudyPlan, document: Document) -> None:
     pairs = list(combinations(several, 2))
     parameters: list[tuple[str, KeyPath]] = [(key, ("tune", "parameters", key)) for key in tuned]
     pairs += combinations(parameters, 2)
-    given: list[tuple[str, KeyPath]] = [(key, ("set", key)) for key in plan.set]
     for name, row in rows.items():
         in_row: list[tuple[str, KeyPath]] = [(key, ("rows", name, key)) for key in row]
         pairs += [(mine, other) for mine in several for other in in_row]
-        given += in_row
     for (first, _), (second, at) in pairs:
         if overlap(first, second):
             raise InputError(document.at_key(at), f"sets what {first!r} varies", "one or the other")
-    for key, at in [*given, *several, *parameters]:
-        if key in SEEDS.values() and key != SEEDS["recording"]:
-            raise InputError(document.at_key(at), "a seed", "the study's `seeds`")
     for key, values in plan.vary.items():
         told = [json.dumps(value, sort_keys=True) for value in values]
         twice = next((k for k, text in enumerate(told) if text in told[:k]), None)
@@ -265,21 +239,3 @@ def _unambiguous(plan: StudyPlan, document: Document) -> None:
         overridden = document.places.get(("set", key))
         if overridden and overridden.key == "--set":
             raise InputError(f"--set {key}", "varied by the study", "a setting of all runs")
-
-
-def _content(value: Any) -> Any:
-    """What stands for a value that JSON has no word for: of files what is in them, wherever they lie."""
-    if isinstance(value, Path):
-        try:
-            stat = value.stat()
-            return _digest(value, stat.st_mtime_ns, stat.st_size) if value.is_file() else str(value)
-        except OSError:
-            return str(value)
-    raise TypeError(f"a configuration that holds {type(value).__name__}")
-
-
-@lru_cache(maxsize=256)
-def _digest(path: Path, modified: int, size: int) -> str:
-    """sha256 of a file; `modified` and `size` tell when it is another one."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

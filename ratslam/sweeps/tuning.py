@@ -12,12 +12,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from ratslam.sweeps.identity import digest_of
 from ratslam.sweeps.journal import Trial, opened
 from ratslam.sweeps.plan import TunePlan
 from ratslam.sweeps.pool import Pool
 from ratslam.sweeps.report import replace
 from ratslam.sweeps.results import Result
-from ratslam.sweeps.study import Job, Study, digest_of, made, seeded, tuned, variant_of
+from ratslam.sweeps.study import Job, Study, made, seeded, tuned, variant_of
 from tactile.errors import InputError
 
 Done = Callable[[Result | None], None]
