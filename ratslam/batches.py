@@ -57,15 +57,31 @@ class Track(NamedTuple):
     rung: Array
 
 
-@partial(jax.jit, static_argnames=("config", "block"))
 def networks(config: PoseCellConfig, sets: Network, course: Course, block: int = BLOCK) -> Track:
-    """The pose cells with every parameter set over one course, in the precision of the course."""
+    """The pose cells with every parameter set over one course, in the precision of the course.
+
+    All are run on the lowest rung of the ladder; those that it could not hold all the way are run again with
+    the others at hand, which cost even where they are not climbed.
+    """
+    track = jax.tree.map(np.array, _networks(config, 1, sets, course, block))
+    again = np.flatnonzero(np.any(track.rung > 0, axis=1))
+    if len(again):
+        room = np.resize(again, 1 << (len(again) - 1).bit_length())  # few shapes to compile
+        chosen = jax.tree.map(lambda column: jnp.asarray(column)[room], sets)
+        whole = _networks(config, None, chosen, course, 1)
+        for rows, exact in zip(track, whole, strict=True):
+            rows[again] = np.asarray(exact)[: len(again)]
+    return track
+
+
+@partial(jax.jit, static_argnames=("config", "rungs", "block"))
+def _networks(config: PoseCellConfig, rungs: int | None, sets: Network, course: Course, block: int) -> Track:
     dtype = np.dtype(course.motion.dtype)
-    rungs = ladder.rungs(config, dtype)
+    steps = ladder.rungs(config, dtype)[:rungs]
 
     def run(network: Network) -> Track:
         kernels = network.excite_sigma, network.inhibit_sigma, network.global_inhibition
-        tuned = tuple(rung._replace(patch=patches.tuned(config, rung.patch, *kernels)) for rung in rungs)
+        tuned = tuple(rung._replace(patch=patches.tuned(rung.patch, *kernels)) for rung in steps)
         here = config.model_copy(update={"excite_sigma": network.excite_sigma})
 
         def step(cells: Any, row: Course) -> Any:
@@ -74,7 +90,7 @@ def networks(config: PoseCellConfig, sets: Network, course: Course, block: int =
             cells, told = posecells.step(here, tuned, cells, odometry, row.recall, energy)
             return cells, Track(cells.pose, told.outcome, told.rung)
 
-        return lax.scan(step, posecells.start(config, dtype), course)[1]
+        return lax.scan(step, posecells.start(config, dtype, steps), course)[1]
 
     return lax.map(run, sets, batch_size=block)
 

@@ -125,18 +125,31 @@ def whole(ladder: tuple[Rung, ...], activity: Array) -> Activity:
 
 
 def climb(ladder: tuple[Rung, ...], activity: Activity, push: Push) -> tuple[Activity, Result]:
-    """One step, on the lowest rung where it is exact."""
-    block, result, exact = _step(ladder[0], activity.blocks[0], push)
+    """One step, on the lowest rung where it is exact.
+
+    A ladder of a small patch alone tells of the second rung from the step on that it could not make.
+    """
     if len(ladder) == 1:
-        return Activity((block,), activity.rung), result
-    end = len(ladder)
-    done = exact & (activity.rung == 0)
-    to_try = jnp.where(done, end, jnp.maximum(activity.rung, 1)).astype(jnp.int32)
+        block, result, exact = _step(ladder[0], activity.blocks[0], push)
+        missing = jnp.where(exact, activity.rung, 1).astype(jnp.int32)
+        return Activity((block,), missing), result._replace(rung=missing)
+    nothing = jnp.zeros_like(push.pose)
+    carry = (activity.rung, activity.blocks[0], Result(nothing, nothing, jnp.bool_(False), jnp.int32(0)))
+    # Loops of one round or none: what a branch hands on is copied, what a loop does not touch is not.
+    to_try, block, result = lax.while_loop(_is_first, partial(_first, ladder, push), carry)
     now = Activity((block, *activity.blocks[1:]), jnp.int32(0))
-    # A loop of one round or none: what a branch hands on is copied, what a loop does not touch is not.
     climbing = partial(_climbing, ladder, activity.blocks[0], activity.rung, push)
-    _, now, result = lax.while_loop(lambda carry: carry[0] < end, climbing, (to_try, now, result))
-    return now, result
+    _, after, result = lax.while_loop(lambda carry: carry[0] < len(ladder), climbing, (to_try, now, result))
+    return after, result
+
+
+def _is_first(carry: Any) -> Array:
+    return carry[0] == 0
+
+
+def _first(ladder: tuple[Rung, ...], push: Push, carry: Any) -> Any:
+    block, result, exact = _step(ladder[0], carry[1], push)
+    return jnp.where(exact, len(ladder), 1).astype(jnp.int32), block, result
 
 
 def _climbing(ladder: tuple[Rung, ...], lowest: Block, held: Array, push: Push, carry: Any) -> Any:
@@ -159,9 +172,7 @@ def _attempt(ladder: tuple[Rung, ...], k: int, lowest: Block, held: Array, push:
     source = _switched(ladder, k, before, patches.origin_about(rung.patch, _middle(ladder, before, push)))
     block, result, exact = _step(rung, source, push)
     exact = (exact & _same(_mass(before), jnp.sum(source.activity))) | last
-    low = _transfer(rung, block, ladder[0], patches.origin_about(ladder[0].patch, result.pose))
-    fits = patches.contained(ladder[0].patch, low.activity[0])
-    fits &= jnp.sum(low.activity > 0) == jnp.sum(block.activity > 0)
+    low, fits = _lowered(ladder, rung, block, result.pose)
     blocks = list(now.blocks)
     blocks[0], blocks[k] = low, jax.tree.map(partial(jnp.where, exact), block, now.blocks[k])
     to_try = jnp.where(exact, len(ladder), k + 1).astype(jnp.int32)
@@ -235,7 +246,9 @@ def _integrated(rung: Rung, block: Block, push: Push, s: Array) -> tuple[Block, 
         middle = ahead(push.pose)[None] if rung.led else jax.vmap(partial(_following, patch, push))(block)
         origin = jax.vmap(partial(patches.origin_about, patch))(middle)
     ring = patches.torus(patch)[None]
-    shift = (origin - block.origin + ring // 2) % ring - ring // 2
+    # A patch that is left behind follows a cell at a time.
+    shift = jnp.clip((origin - block.origin + ring // 2) % ring - ring // 2, -1, 1)
+    origin = (block.origin + shift) % ring
 
     def moved(cells: Array, first: Array, by: Array) -> Array:
         return patches.integrate(patch, cells, first, told, push.behind, by)
@@ -292,6 +305,16 @@ def _strongest_first(rung: Rung, block: Block) -> Block:
     place = jax.vmap(partial(patches.peak_number, rung.patch))(block.activity, block.origin)
     front = jnp.argmin(jnp.where(tied, place, jnp.iinfo(jnp.int32).max))
     return jax.tree.map(lambda leaf: jnp.roll(leaf, -front, axis=0), block)
+
+
+def _lowered(ladder: tuple[Rung, ...], rung: Rung, block: Block, pose: Array) -> tuple[Block, Array]:
+    """The block on the lowest rung, and whether that holds all of it."""
+    lowest = ladder[0]
+    if rung.patch is lowest.patch:
+        return jax.tree.map(lambda leaf: leaf[:1], block), jnp.max(block.activity[1:]) <= 0
+    low = _transfer(rung, block, lowest, patches.origin_about(lowest.patch, pose))
+    held = jnp.sum(low.activity > 0) == jnp.sum(block.activity > 0)
+    return low, held & patches.contained(lowest.patch, low.activity[0])
 
 
 def _middle(ladder: tuple[Rung, ...], activity: Activity, push: Push) -> Array:

@@ -9,6 +9,8 @@ Activity is [H, Y, X] over heading, y, x; poses, origins and shifts are [3] over
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import reduce
 from typing import Any, NamedTuple
 
 import jax
@@ -21,37 +23,32 @@ from tactile.types import Array
 
 TIE = 1e-9
 """Activities this close to the largest (as a share) tie with it: the first wins, whatever the rounding."""
+SMALL = 18
+"""Whole rings of fewer cells are worked on by matrices: loops over so few cost more than they do."""
 BOX = 3
 """The packet is decoded from the (2 BOX + 1)^3 cells around its peak."""
 
 
 class Axis(NamedTuple):
-    """One axis of a patch, host constants.
-
-    Attributes:
-        size, ring: cells of the patch and of the torus. whole: the patch is the ring. excite, both:
-            [size, size] excitation, and excitation followed by inhibition. apart: [size, size] cells from
-            column to row.
-    """
+    """One axis of a patch: size, ring: its cells and those of the torus. whole: the patch is the ring."""
 
     size: int
     ring: int
     whole: bool
-    excite: Array
-    both: Array
-    apart: np.ndarray
 
 
 class Patch(NamedTuple):
-    """Host constants of one shape.
+    """One shape, and the network's constants.
 
     Attributes:
-        axes: heading, y, x. threshold: global inhibition. unit: of heading, rad. margin: cells that activity
-            must lie inside. shell: [H, Y, X] bool, the cells of the margin. gap: cells between packets that
-            do not feel each other.
+        axes: heading, y, x. excite, inhibit: [w] kernels along any axis. threshold: global inhibition. unit:
+            of heading, rad. margin: cells that activity must lie inside. shell: [H, Y, X] bool, the cells of
+            the margin. gap: cells between packets that do not feel each other.
     """
 
     axes: tuple[Axis, Axis, Axis]
+    excite: Array
+    inhibit: Array
     threshold: Any
     unit: float
     margin: int
@@ -72,39 +69,34 @@ class Patch(NamedTuple):
 
 def patch(config: PoseCellConfig, inner: int | None, dtype: np.dtype) -> Patch:
     """A patch that shows exactly any activity that lies within `inner` cells along each axis; None: all."""
-    excite = _gaussian(config.excite_width, config.excite_sigma)
-    both = np.convolve(excite, _gaussian(config.inhibit_width, config.inhibit_sigma))
-    margin, gap = len(excite) // 2, len(excite) // 2 + len(both) // 2
+    margin = config.excite_width // 2
+    gap = 2 * margin + config.inhibit_width // 2
     axes, shell = [], np.zeros((1, 1, 1), bool)
     for k, ring in enumerate((config.cells_heading, config.cells_xy, config.cells_xy)):
         # Activity must not feel itself around the ring: inner cells, and the gap besides.
         whole = inner is None or ring < inner + gap
         size = ring if whole or inner is None else inner + 2 * margin
+        axes.append(Axis(size, ring, whole))
         at = np.arange(size)
-        apart = at[:, None] - at[None, :]
-        if whole:
-            apart = (apart + size // 2) % size - size // 2
-        first, second = (_banded(kernel, size, whole).astype(dtype) for kernel in (excite, both))
-        axes.append(Axis(size, ring, whole, first, second, apart.astype(dtype)))
         outer = np.zeros(size, bool) if whole else (at < margin) | (at >= size - margin)
         shell = shell | outer.reshape([-1 if axis == k else 1 for axis in range(3)])
-    unit = 2 * np.pi / config.cells_heading
-    return Patch((axes[0], axes[1], axes[2]), config.global_inhibition, unit, margin, shell, gap)
+    excite = _gaussian(config.excite_width, np.float64(config.excite_sigma)).astype(dtype)
+    inhibit = _gaussian(config.inhibit_width, np.float64(config.inhibit_sigma)).astype(dtype)
+    unit, (heading, y, x) = 2 * np.pi / config.cells_heading, axes
+    return Patch((heading, y, x), excite, inhibit, config.global_inhibition, unit, margin, shell, gap)
 
 
-def tuned(config: PoseCellConfig, patch: Patch, excite: Array, inhibit: Array, threshold: Array) -> Patch:
+def tuned(patch: Patch, excite: Array, inhibit: Array, threshold: Array) -> Patch:
     """The patch with other kernels of the same widths, traced.
 
     Args:
         excite, inhibit: their standard deviations, cells. threshold: global inhibition.
     """
-    excitation = _gaussian(config.excite_width, excite)
-    both = jnp.convolve(excitation, _gaussian(config.inhibit_width, inhibit))
-    heading, y, x = (
-        axis._replace(excite=_spread(excitation, axis.apart), both=_spread(both, axis.apart))
-        for axis in patch.axes
+    return patch._replace(
+        excite=_gaussian(len(patch.excite), excite),
+        inhibit=_gaussian(len(patch.inhibit), inhibit),
+        threshold=threshold,
     )
-    return patch._replace(axes=(heading, y, x), threshold=threshold)
 
 
 def torus(patch: Patch) -> np.ndarray:
@@ -124,14 +116,9 @@ def half(patch: Patch) -> np.ndarray:
 
 
 def kept(patch: Patch, activity: Array) -> Array:
-    """What excitation, inhibition and threshold leave; not normalised."""
-    heading, y, x = patch.axes
-    h, n, m = patch.shape
-    twice = jnp.concatenate([heading.excite, heading.both])
-    excited, inhibited = (twice @ activity.reshape(h, n * m)).reshape(2, h * n, m)
-    excited = jnp.einsum("ab,kbi->kai", y.excite, (excited @ x.excite.T).reshape(h, n, m))
-    inhibited = jnp.einsum("ab,kbi->kai", y.both, (inhibited @ x.both.T).reshape(h, n, m))
-    left = excited - inhibited
+    """What excitation, inhibition and threshold leave; not normalised. Both kernels are separable."""
+    excited = _blurred(patch, patch.excite, activity)
+    left = excited - _blurred(patch, patch.inhibit, excited)
     return jnp.where(left >= patch.threshold, left - patch.threshold, 0.0)
 
 
@@ -139,19 +126,17 @@ def integrate(patch: Patch, activity: Array, origin: Array, told: Array, lag: Ar
     """Path integration: every heading layer moves its own way.
 
     Args:
-        told: [3] body-frame motion, cells: each layer moves along its own heading, then all turn. Less than
-            a cell where the patch is a whole ring. lag: [3] in the network's frame, cells: every layer moves
-            alike. shift: [3] int32 by which the patch itself moves.
+        told: [3] body-frame motion, cells: each layer moves along its own heading, then all turn. lag: [3]
+            in the network's frame, cells: every layer moves alike. Together less than a cell along each axis.
+        shift: [3] int32, -1 to 1, by which the patch itself moves.
     """
-    heading, y, x = patch.axes
-    h, n, m = patch.shape
-    layer = (origin[2] + np.arange(h, dtype=np.int32)) % heading.ring
+    heading = patch.axes[0]
+    layer = (origin[2] + np.arange(heading.size, dtype=np.int32)) % heading.ring
     along, across = turned(told[0], told[1], layer.astype(told.dtype) * patch.unit)
     moved = shift.astype(told.dtype)
-    activity = jnp.matmul(_shared(y, across + (lag[1] - moved[1])), activity)
-    activity = jnp.matmul(activity, jnp.swapaxes(_shared(x, along + (lag[0] - moved[0])), 1, 2))
-    turn = _shared(heading, told[2] + lag[2] - moved[2])
-    return (turn @ activity.reshape(h, n * m)).reshape(h, n, m)
+    activity = _moved(patch, activity, 1, (across + (lag[1] - moved[1]))[:, None, None])
+    activity = _moved(patch, activity, 2, (along + (lag[0] - moved[0]))[:, None, None])
+    return _moved(patch, activity, 0, told[2] + lag[2] - moved[2])
 
 
 def deposit(patch: Patch, activity: Array, origin: Array, pose: Array, energy: Array) -> Array:
@@ -229,10 +214,69 @@ def excited_share(config: PoseCellConfig, pose: Array) -> Array:
     return 1 / jnp.prod((1 - f) * jnp.exp(sharp * f**2) + f * jnp.exp(sharp * (1 - f) ** 2))
 
 
-def _shared(axis: Axis, distance: Array) -> Array:
-    """Matrices [..., size, size] that move activity by a part of a cell, linearly shared."""
-    apart = axis.apart.reshape((1,) * distance.ndim + axis.apart.shape)
-    return jnp.maximum(0.0, 1 - jnp.abs(apart - distance[..., None, None]))
+def _blurred(patch: Patch, kernel: Array, activity: Array) -> Array:
+    """Convolved with an even kernel [w] along each axis."""
+    half = len(kernel) // 2
+    for k in (1, 0, 2):
+        if _small(patch.axes[k]):
+            activity = _product(
+                jnp.tensordot(kernel, _turns(patch.axes[k], half, kernel.dtype), 1), activity, k
+            )
+            continue
+        shifted = _shifted(patch, activity, k, half)
+        activity = kernel[half] * shifted(0)
+        for t in range(1, half + 1):
+            activity = activity + kernel[half + t] * (shifted(t) + shifted(-t))
+    return activity
+
+
+def _moved(patch: Patch, activity: Array, k: int, distance: Array) -> Array:
+    """Moved along one axis by a distance [] or [H, 1, 1], in parts of a cell linearly shared."""
+    reach = 1 if patch.axes[k].whole else 2
+    share = [jnp.maximum(0.0, 1 - jnp.abs(distance - t)) for t in range(-reach, reach + 1)]
+    if _small(patch.axes[k]):
+        return _product(
+            jnp.tensordot(jnp.stack(share, -1), _turns(patch.axes[k], 1, activity.dtype), 1), activity, k
+        )
+    shifted = _shifted(patch, activity, k, reach)
+    return reduce(
+        jnp.add, (part * shifted(t) for t, part in zip(range(-reach, reach + 1), share, strict=True))
+    )
+
+
+def _small(axis: Axis) -> bool:
+    return axis.whole and axis.size < SMALL
+
+
+def _turns(axis: Axis, reach: int, dtype: np.dtype) -> np.ndarray:
+    """[2 reach + 1, size, size] matrices that move activity around a ring by -reach to reach cells."""
+    return np.stack([np.roll(np.eye(axis.size, dtype=dtype), t, axis=0) for t in range(-reach, reach + 1)])
+
+
+def _product(matrix: Array, activity: Array, k: int) -> Array:
+    """A matrix [n, n], or one for each heading layer [H, 1, 1, n, n], along one axis."""
+    h, n, m = activity.shape
+    if k == 0:
+        return (matrix @ activity.reshape(h, n * m)).reshape(h, n, m)
+    matrix = matrix.reshape(-1, *matrix.shape[-2:])
+    if k == 1:
+        return jnp.matmul(jnp.broadcast_to(matrix, (h, n, n)), activity)
+    return jnp.matmul(activity, jnp.broadcast_to(jnp.swapaxes(matrix, 1, 2), (h, m, m)))
+
+
+def _shifted(patch: Patch, activity: Array, k: int, reach: int) -> Callable[[int], Array]:
+    """Activity moved by t cells along one axis, |t| up to the reach, as a function of t."""
+    size = activity.shape[k]
+    if patch.axes[k].whole:
+        before = lax.slice_in_dim(activity, size - reach, size, axis=k)
+        after = lax.slice_in_dim(activity, 0, reach, axis=k)
+    else:
+        before = after = jnp.zeros(
+            [reach if a == k else n for a, n in enumerate(activity.shape)], activity.dtype
+        )
+    # Kept as an array: looked up through its three pieces, every cell would cost a branch.
+    padded = lax.optimization_barrier(jnp.concatenate([before, activity, after], axis=k))
+    return lambda t: lax.slice_in_dim(padded, reach - t, reach - t + size, axis=k)
 
 
 def _peak(patch: Patch, activity: Array, first: Array) -> tuple[Array, Array, Array]:
@@ -271,23 +315,7 @@ def _circular(mass: Array, at: Array, ring: np.ndarray) -> tuple[Array, Array]:
 
 def _gaussian(width: int, sigma: Any) -> Any:
     offset = np.arange(width) - width // 2
-    square = offset.astype(sigma.dtype) ** 2 if isinstance(sigma, jax.Array) else offset**2
-    weight = (jnp if isinstance(sigma, jax.Array) else np).exp(-square / (2 * sigma**2))
+    weight = (jnp if isinstance(sigma, jax.Array) else np).exp(
+        offset.astype(sigma.dtype) ** 2 / (-2 * sigma**2)
+    )
     return weight / weight.sum()
-
-
-def _spread(kernel: Array, apart: np.ndarray) -> Array:
-    """[size, size] a traced kernel laid along an axis; it must be shorter than a whole ring."""
-    at = apart.astype(np.int32) + len(kernel) // 2
-    return jnp.where((at >= 0) & (at < len(kernel)), kernel[np.clip(at, 0, len(kernel) - 1)], 0.0)
-
-
-def _banded(kernel: np.ndarray, size: int, ring: bool) -> np.ndarray:
-    """C with (C @ v)[i] = sum over t of kernel[t] v[i + t - half], around a ring or between two ends."""
-    row = np.arange(size)
-    matrix = np.zeros((size, size))
-    for t, weight in enumerate(kernel):
-        column = row + t - len(kernel) // 2
-        among = np.ones(size, bool) if ring else (column >= 0) & (column < size)
-        np.add.at(matrix, (row[among], column[among] % size), weight)
-    return matrix

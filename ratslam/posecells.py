@@ -72,10 +72,10 @@ class Told(NamedTuple):
     rung: Array
 
 
-def start(config: PoseCellConfig, dtype: np.dtype) -> PoseCells:
-    """One packet's seed, a single cell, in the middle."""
+def start(config: PoseCellConfig, dtype: np.dtype, rungs: tuple[Rung, ...] | None = None) -> PoseCells:
+    """One packet's seed, a single cell, in the middle; of the whole ladder or of these rungs."""
     pose = jnp.asarray(rings(config, dtype) // 2)
-    activity = ladder.seeded(ladder.rungs(config, dtype), pose)
+    activity = ladder.seeded(rungs or ladder.rungs(config, dtype), pose)
     return PoseCells(activity, pose, jnp.zeros(3, dtype), jnp.int32(0))
 
 

@@ -48,7 +48,8 @@ def stepping(n: int, engine: str, dtype=float):
 
 
 def replaying(n: int, engine: str, steps: int, dtype=float, every: int = 0):
-    """A run of so many steps, every so many of them with an injection half a torus away."""
+    """A run of so many steps, every so many of them with a little injected at another packet, which moves
+    as the first does, half a torus away."""
     step, start = stepping(n, engine, dtype)
     ring = rings(PoseCellConfig(cells_xy=n), np.dtype(dtype))
 
@@ -56,9 +57,9 @@ def replaying(n: int, engine: str, steps: int, dtype=float, every: int = 0):
     def run(cells):
         def body(k, carry):
             cells, above = carry
-            far = (cells.pose + ring / 2) % ring
+            far = (cells.pose + ring / 2 * np.array([1, 1, 0], dtype)) % ring
             inject = (k % every == every - 1) if every else jnp.bool_(False)
-            cells, told = step(cells, far, jnp.where(inject, 0.15, 0.0).astype(dtype))
+            cells, told = step(cells, far, jnp.where(inject, 0.02, 0.0).astype(dtype))
             return cells, above + (told.rung > 0).astype(jnp.int32)
 
         return jax.lax.fori_loop(0, steps, body, (cells, jnp.int32(0)))
@@ -128,17 +129,17 @@ def test_replay(benchmark, n):
 
 @pytest.mark.parametrize("n", [41, 101])
 def test_two_packets(benchmark, n):
-    """An injection half a torus away every 20 steps: a second patch for as long as its packet lives."""
+    """Two packets that are kept alive: each step on two patches, beside a step on one."""
     steps = 2000 if benchmark.enabled else 20
     alone, start = replaying(n, "window", steps)
-    pairs, _ = replaying(n, "window", steps, every=20)
-    us = in_turns({"one": (partial(alone, start), steps), "two at times": (partial(pairs, start), steps)})
+    pairs, _ = replaying(n, "window", steps, every=4)
+    us = in_turns({"one": (partial(alone, start), steps), "two": (partial(pairs, start), steps)})
     _, above = benchmark.pedantic(pairs, args=(start,), rounds=1)
     share = int(above) / steps
-    assert share > 0
-    pair = us["one"] + (us["two at times"] - us["one"]) / share
+    assert share > 0.5
+    pair = us["one"] + (us["two"] - us["one"]) / share
     benchmark.extra_info.update(us=us, share=share, us_of_a_step_with_two=pair)
-    print(f"\n{n}: one packet {us['one']:.0f} us, a step with two {pair:.0f} us ({share:.0%} of steps)")
+    print(f"\n{n}: one packet {us['one']:.0f} us, two {pair:.0f} us ({share:.0%} of the steps)")
 
 
 @pytest.mark.parametrize("n", [21, 101])
