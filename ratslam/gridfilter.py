@@ -31,6 +31,8 @@ SEGMENTS = 5
 """Of a whisker, for eq. 2."""
 REACH = 2.5
 """Standard deviations of a stamp that are drawn."""
+LARGEST = 1e6
+"""Motion of one step from which on it is no motion, m or rad."""
 WALL, COMPASS = 100.0, 40.0
 """Largest precision of a wall's direction against the field there, and against all walls."""
 
@@ -46,7 +48,7 @@ class Outcome(IntEnum):
     OUTSIDE = 3
     """What was felt lies outside the map, at least for some particles; there it is forgotten."""
     NOT_FINITE = 4
-    """Odometry or contacts were NaN or infinite and were taken as no motion and no contact."""
+    """Odometry or contacts were NaN, infinite or of no possible size; taken as no motion and no contact."""
 
 
 class State(NamedTuple):
@@ -184,7 +186,7 @@ class GridFilter:
         """Odometry and contacts with anything that is not a number masked, and whether nothing was."""
         odometry = Odometry(*(jnp.asarray(value, self.dtype) for value in observation.odometry))
         moves = jnp.stack(odometry[:3])
-        fine = jnp.all(jnp.isfinite(moves))
+        fine = jnp.all(jnp.abs(moves) < LARGEST)  # false for NaN, too
         dx, dy, dtheta = jnp.where(fine, moves, 0.0)
         point = jnp.asarray(observation.point, self.dtype)
         placed = jnp.all(jnp.isfinite(point), axis=1)

@@ -23,6 +23,7 @@ from evaluation.scorecard import Scorecard, score
 from evaluation.trajectory import Anytime, present_error, summary, write_tum
 from ratslam.backends import Telling, backend_of, telling
 from ratslam.config import RunConfig
+from ratslam.growing import Growing
 from ratslam.keeping import Felt, keep_chart, keep_images, keep_world
 from ratslam.session import CHUNK, Session, Step
 from ratslam.storage import RunDirectory, read_checkpoint
@@ -39,8 +40,9 @@ from tactile.frames import compose, tum_line
 from tactile.frontend import Frontend
 from tactile.types import Cycle, Observation, Whisk
 
-CHECKPOINT_EVERY = 128 * CHUNK
-"""Steps between checkpoints: a kill loses no line, but a continued run repeats at most these."""
+CHECKPOINT_EVERY, CHECKPOINT_SHARE = 128 * CHUNK, 32
+"""Steps between checkpoints, at least, and one part in so many of all steps so far: a kill loses no line, but
+a continued run repeats at most these. Each holds the whole run: at a fixed distance all would cost O(N^2)."""
 
 
 def run(
@@ -189,7 +191,7 @@ def _play(
     """
     samples = islice(iter(source), skip, None)
     odometry = np.zeros(3)
-    truth: list[np.ndarray] = []
+    truth = Growing((3,), np.float64)
     present = Anytimes(session.steps)
     total = None if source.length is None else source.length - skip
     saved = session.steps
@@ -205,12 +207,13 @@ def _play(
                 moved = observation.odometry
                 odometry = compose(odometry, np.array([moved.dx, moved.dy, moved.dtheta]))
                 reckoned.append(odometry)
-            truth += [np.full(3, np.nan) if s.truth is None else s.truth for s in chunk]
+            for sample in chunk:
+                truth.append(np.nan if sample.truth is None else sample.truth)
             store.append(_lines(chunk, steps, reckoned, told))
-            error = present.see(session, truth)
+            error = present.see(session, truth.rows)
             if error is not None:
                 store.append({"anytime.csv": iter([f"{float(chunk[-1].time)!r},{error!r}\n"])})
-            if session.steps - saved >= CHECKPOINT_EVERY:
+            if session.steps - saved >= max(CHECKPOINT_EVERY, session.steps // CHECKPOINT_SHARE):
                 store.checkpoint(session.arrays() | {"digest": np.array(source.digest)})
                 saved = session.steps
             progress.update(len(chunk))
@@ -252,12 +255,12 @@ class Anytimes:
         self.errors: list[float] = []
         self._skipped, self._due = skipped, skipped
 
-    def see(self, session: Session, truth: Sequence[np.ndarray]) -> float | None:
+    def see(self, session: Session, truth: Sequence[np.ndarray] | np.ndarray) -> float | None:
         """The error now, if it is time and the truth [steps, 3] of this moment is known."""
         if session.steps < self._due or session.steps % CHUNK or not np.isfinite(truth[-1]).all():
             return None
         self._due = session.steps + max(CHUNK, session.steps // 256)
-        true = np.array(truth)
+        true = np.asarray(truth)
         known = np.isfinite(true).all(axis=1)
         error = present_error(session.map.so_far()[self._skipped :][known], true[known])
         self.errors.append(error)

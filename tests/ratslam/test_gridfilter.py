@@ -351,6 +351,8 @@ def test_weights_that_agree_are_left_alone():
 ODD = {
     "odometry": lambda o: o._replace(odometry=o.odometry._replace(dx=np.float64(np.nan))),
     "infinite odometry": lambda o: o._replace(odometry=o.odometry._replace(dy=np.float64(-np.inf))),
+    "huge odometry": lambda o: o._replace(odometry=o.odometry._replace(dx=np.float64(1e300))),
+    "a turn beyond counting": lambda o: o._replace(odometry=o.odometry._replace(dtheta=np.float64(-1e30))),
     "points": lambda o: o._replace(point=np.where(o.contact[:, None], np.nan, o.point)),
     "one point": lambda o: o._replace(point=np.array([[np.inf, 0.0], *o.point[1:]])),
     "wall": lambda o: o._replace(wall_point=np.full(2, np.nan)),
@@ -369,6 +371,15 @@ def test_what_is_no_number_is_named_and_left_out(backend, odd):
     state, estimate, told = drive(backend, state, [plain])
     assert told.outcome[0] in (Outcome.OK, Outcome.RESAMPLED)
     assert finite((state, estimate, told))
+
+
+@pytest.mark.parametrize("backend", [FILTER, SINGLE], ids=["float64", "float32"])
+def test_a_robot_may_leave_the_map_as_far_as_it_likes(backend):
+    state, estimate, told = drive(backend, begun(backend), [report(9e5, touching=[0])] * 100)
+    assert finite((state, estimate, told))
+    assert np.asarray(estimate.pose)[-1, 0] > 1e7
+    assert told.outcome[-1] in (Outcome.OUTSIDE, Outcome.OK)
+    assert not np.any(state.maps[:, 1:])
 
 
 @pytest.mark.parametrize("backend", [FILTER, SINGLE], ids=["float64", "float32"])
