@@ -1,0 +1,191 @@
+"""Speed against error: time per cycle and error of several choices, and which no other betters in both."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from evaluation import drawing
+from evaluation.drawing import BLUE, FAINT, GREY, INK, QUIET, VERMILLION, WIDTH
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_TALL, _EACH, _BOTTOM = 4.4, 0.13, 0.95  # inches of the axes, more for each mark beyond a dozen, and below
+_ROOM = 0.12  # share of the axes kept free on each side
+_FLOOR = 0.5  # an error of 0 is drawn at so much of the least that is none
+_GRID, _GAP, _NEAR = (
+    3.0,
+    (5.0, 2.0),
+    14.0,
+)  # pixels: steps of labels, around them (across, up), and without a line to their mark
+_CROSSING = 12.0  # pixels that a label goes further so as not to cross a bar
+_SIZE = 7.6  # of labels, points
+
+
+class Mark(NamedTuple):
+    """One choice.
+
+    Attributes:
+        name: its label. time, error: (least, median, largest) over seeds. optimal: no other is as fast and
+            as good, and better in one of them.
+    """
+
+    name: str
+    time: tuple[float, float, float]
+    error: tuple[float, float, float]
+    optimal: bool
+
+
+def draw_frontier(title: str, line: str, marks: Sequence[Mark], time: str, error: str) -> Figure:
+    """Both axes logarithmic; bars from the least to the largest over seeds.
+
+    Args:
+        marks: at least one. time, error: what the axes are, with units.
+    """
+    inner = WIDTH - drawing.LEFT - drawing.RIGHT
+    tall = _TALL + _EACH * max(0, len(marks) - 12)
+    figure = drawing.blank(drawing.TOP + tall + _BOTTOM, title, line)
+    axes = drawing.plot(figure, drawing.LEFT, _BOTTOM, inner, tall)
+    spans = np.array([[mark.time, mark.error] for mark in marks])  # [N, 2, 3]
+    positive = spans[:, 1][spans[:, 1] > 0]
+    floor = _FLOOR * positive.min() if len(positive) else 1.0
+    spans[:, 1] = np.maximum(spans[:, 1], floor)
+    best = np.array([mark.optimal for mark in marks])
+    _frame(axes, spans)
+    _paint(axes, spans, best)
+    none = bool((spans[:, 1] == floor).any())
+    drawing.name_axes(axes, time, f"{error}{', 0 at the bottom' if none else ''}")
+    drawing.legend(figure, axes)
+    _label(axes, [mark.name for mark in marks], spans, best)
+    return figure
+
+
+def placed(
+    size: np.ndarray, anchor: np.ndarray, area: np.ndarray, blocked: np.ndarray, crossed: np.ndarray
+) -> np.ndarray:
+    """[N, 2] lower left corners of labels, each as near to its anchor as is free when its turn comes.
+
+    None overlaps another one or what is blocked as long as there is room inside the area; without any, a
+    label lies where it hides the least.
+
+    Args:
+        size: [N, 2] of the labels. anchor: [N, 2] what they belong to. area: [4] left, bottom, right, top.
+            blocked: [M, 4] the same of what they may not cover. crossed: [L, 4] of what they should rather not.
+    """
+    room = np.array([-_GAP[0], -_GAP[1], _GAP[0], _GAP[1]])
+    taken, corners = list(np.asarray(blocked, float) + room / 2), np.zeros((len(size), 2))
+    for k, ((width, height), at) in enumerate(zip(size, anchor, strict=True)):
+        x = np.arange(area[0], max(area[2] - width, area[0]) + 1e-9, _GRID)
+        y = np.arange(area[1], max(area[3] - height, area[1]) + 1e-9, _GRID)
+        spots = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        boxes = np.concatenate([spots, spots + [width, height]], axis=1)
+        away = np.maximum(np.maximum(boxes[:, :2] - at, at - boxes[:, 2:]), 0.0)
+        # Of spots as near, one beside the mark reads better than one above it.
+        cost = np.hypot(*away.T) + 0.02 * np.abs((boxes[:, 1] + boxes[:, 3]) / 2 - at[1])
+        cost += _CROSSING * (_shared(boxes, np.reshape(crossed, (-1, 4))) > 0).sum(axis=1)
+        hidden = _shared(boxes, np.reshape(taken, (-1, 4))).sum(axis=1)
+        chosen = np.lexsort((cost, hidden))[0]
+        corners[k] = spots[chosen]
+        taken.append(boxes[chosen] + room)
+    return corners
+
+
+def _shared(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """[N, M] how much each box covers of each other one, pixels squared."""
+    low = np.maximum(boxes[:, None, :2], others[None, :, :2])
+    high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
+    return np.maximum(high - low, 0.0).prod(axis=2)
+
+
+def _frame(axes: Axes, spans: np.ndarray) -> None:
+    """Logarithmic axes around [N, 2, 3], with round numbers."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
+    axes.set(xscale="log", yscale="log")
+    for axis, limit, values in (
+        (axes.xaxis, axes.set_xlim, spans[:, 0]),
+        (axes.yaxis, axes.set_ylim, spans[:, 1]),
+    ):
+        low, high = np.log(values.min()), np.log(values.max())
+        room = _ROOM * max(high - low, np.log(2.0)) / (1 - 2 * _ROOM)
+        limit(np.exp(low - room), np.exp(high + room))
+        steps = (1, 2, 5) if high - low < np.log(300) else (1,)
+        axis.set_major_locator(LogLocator(subs=steps, numticks=30))
+        axis.set_minor_locator(NullLocator())
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.10g}"))
+    axes.grid(color=FAINT, lw=0.7)
+
+
+def _front(axes: Axes, spans: np.ndarray, best: np.ndarray) -> np.ndarray:
+    """[P, 2] corners of the stairs that no mark is below, up to the right end; [0, 2] without any."""
+    front = spans[best][:, :, 1]
+    if not len(front):
+        return front
+    front = front[np.lexsort((front[:, 1], front[:, 0]))]
+    end = np.array([[axes.get_xlim()[1], front[-1, 1]]])
+    across = np.stack([np.append(front[1:, 0], end[0, 0]), front[:, 1]], axis=1)  # on, before it falls
+    return np.stack([front, across], axis=1).reshape(-1, 2)
+
+
+def _paint(axes: Axes, spans: np.ndarray, best: np.ndarray) -> None:
+    time, error = spans[:, 0], spans[:, 1]
+    front = _front(axes, spans, best)
+    if len(front):
+        axes.plot(*front.T, color=VERMILLION, lw=1.3, label="Pareto front", zorder=2)
+    for some, color, size, name in (
+        (best, BLUE, 5.5, "Pareto-optimal"),
+        (~best, GREY, 4.5, "bettered by another"),
+    ):
+        if some.any():
+            bars = [np.abs(values[some][:, [0, 2]] - values[some][:, 1:2]).T for values in (time, error)]
+            axes.errorbar(
+                time[some, 1], error[some, 1], xerr=bars[0], yerr=bars[1], fmt="o", ms=size, mew=0,
+                color=color, elinewidth=0.9, alpha=0.95, zorder=4 if some is best else 3, label=name,
+            )  # fmt: skip
+
+
+def _label(axes: Axes, names: Sequence[str], spans: np.ndarray, best: np.ndarray) -> None:
+    """Names beside marks, the optimal ones first; a line to those that stand further off."""
+    from matplotlib.patheffects import withStroke
+
+    size = _SIZE * axes.figure.dpi / 72
+    halo = [withStroke(linewidth=2.0, foreground="white")]
+    texts = [
+        axes.annotate(
+            name,
+            (0, 0),
+            xycoords="figure pixels",
+            fontsize=_SIZE,
+            color=INK if top else QUIET,
+            path_effects=halo,
+            zorder=5,
+        )
+        for name, top in zip(names, best, strict=True)
+    ]
+    boxes = [text.get_window_extent() for text in texts]
+    sizes = np.array([[box.width, box.height] for box in boxes])
+    at = axes.transData.transform(spans[:, :, 1])
+    low, high = axes.transData.transform(spans[:, :, 0]), axes.transData.transform(spans[:, :, 2])
+    stairs = axes.transData.transform(_front(axes, spans, best).reshape(-1, 2))
+    dots = np.concatenate([at - size / 2.2, at + size / 2.2], axis=1)
+    ends = np.minimum(stairs[1:], stairs[:-1]) - 1, np.maximum(stairs[1:], stairs[:-1]) + 1
+    blocked = np.concatenate([dots, np.concatenate(ends, axis=1)])
+    across = np.stack([low[:, 0], at[:, 1] - 1, high[:, 0], at[:, 1] + 1], axis=1)
+    up = np.stack([at[:, 0] - 1, low[:, 1], at[:, 0] + 1, high[:, 1]], axis=1)
+    bars = np.concatenate([across, up])
+    order = np.lexsort((at[:, 0], ~best))
+    frame = np.array(axes.get_window_extent().extents)
+    corners = placed(sizes[order], at[order], frame, blocked, bars)
+    for k, corner in zip(order, corners, strict=True):
+        texts[k].xyann = tuple(corner - [boxes[k].x0, boxes[k].y0])
+        near = np.clip(at, corner, corner + sizes[k])
+        away = np.hypot(*(near - at).T)
+        if away[k] > min(_NEAR, 1.5 * np.delete(away, k).min(initial=np.inf)):
+            axes.annotate(
+                "", at[k], near[k], xycoords="figure pixels", textcoords="figure pixels",
+                arrowprops={"arrowstyle": "-", "color": GREY, "lw": 0.6, "shrinkA": 0, "shrinkB": 3},
+            )  # fmt: skip

@@ -1,0 +1,104 @@
+"""The commands that weigh speed against error: frontier, size."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from ratslam.cli.common import Add, configured, count, prepare_jax, settable, shared
+from ratslam.cli.sweeps import Progress, settle_threads
+from tactile.errors import InputError
+
+CYCLES = 800
+"""Of a session on which settings are tried."""
+LEAST = 50
+"""In fewer nothing is known again."""
+
+
+def add(command: Add) -> None:
+    """Adds them to the program."""
+    frontier = command(
+        "frontier", _frontier, "run a study and show speed against error: a table, a picture, the best rows"
+    )
+    frontier.add_argument("study", help="the YAML file, as for sweep")
+    settable(frontier)
+    shared(frontier, 1)
+    frontier.add_argument(
+        "--error", metavar="NAME",
+        help="to hold speed against: em, ate, arr, arcr, exm (ARR x ARCR), map or any quantity of the "
+        "scorecards (default: the first of em, ate, map that all rows have)",
+    )  # fmt: skip
+    frontier.add_argument(
+        "-o", "--output", type=Path, metavar="DIR",
+        help="where all goes, and results are taken from if they are there (default runs/frontier/<study>)",
+    )  # fmt: skip
+
+    size = command(
+        "size", _size, "propose settings that fit a scene, and show what each cheaper one costs in error"
+    )
+    configured(size)
+    size.add_argument(
+        "--cycles", type=count, default=CYCLES, metavar="N",
+        help=f"of the session to try them on (default {CYCLES})",
+    )  # fmt: skip
+
+
+def _frontier(arguments: argparse.Namespace) -> int:
+    settle_threads()
+    prepare_jax()
+    from ratslam.frontier.circumstances import circumstances, disturbances
+    from ratslam.frontier.errors import error_named, usual_error
+    from ratslam.frontier.lines import grouped, lines
+    from ratslam.frontier.measuring import measured
+    from ratslam.frontier.report import Frontier, save, text
+    from ratslam.sweeps.pool import FOLDER
+    from ratslam.sweeps.report import remarks
+    from ratslam.sweeps.study import jobs, read_study
+
+    error = error_named(arguments.error) if arguments.error else None
+    study = read_study(arguments.study, arguments.set)
+    directory = arguments.output or Path("runs") / "frontier" / study.name
+    asked = jobs(study)
+    with Progress(len({job.key for job in asked}), directory / FOLDER) as progress:
+        found = measured(asked, directory, arguments.workers, progress)
+    groups = grouped(found.results)
+    error = error or usual_error([[each for each in group if each.error is None] for group in groups])
+    told = Frontier(
+        study.name,
+        error,
+        lines(groups, error),
+        circumstances(found.results, study.plan.pace),
+        [*remarks(found.results, directory / FOLDER), *disturbances(found.others, arguments.workers)],
+    )
+    paths = save(told, directory)
+    print(text(told))
+    print(f"\n{paths[-1]} shows it, {', '.join(path.name for path in paths[:-1])} hold it")
+    return progress.told()
+
+
+def _size(arguments: argparse.Namespace) -> int:
+    if arguments.cycles < LEAST:
+        raise InputError("--cycles", str(arguments.cycles), f"{LEAST} and more")
+    settle_threads()
+    prepare_jax()
+    from ratslam.config import RunConfig
+    from ratslam.run import located, open_source
+    from ratslam.sizing.proposal import proposals
+    from ratslam.sizing.report import length_text, proposed_text, snippet, tried_text
+    from ratslam.sizing.scene import cheapest, scene_of
+    from ratslam.sizing.trying import tried
+    from ratslam.yamlfile import load, override, validate
+
+    path = Path(arguments.config)
+    config = validate(override(load(path), arguments.set), RunConfig)
+    config = located(config, path.parent.resolve())
+    with open_source(cheapest(config)) as source:
+        scene, config = scene_of(source), config.completed(source)
+    found = proposals(config, scene)
+    print(f"{scene.told()}\n\n{proposed_text(found)}\n", flush=True)
+    steps = tried(config, found, arguments.cycles)
+    print(f"What each cheaper step costs, over {length_text(steps[0].result, scene.cycles)}:\n")
+    print(tried_text(steps))
+    text = snippet(found)
+    print(f"\nFor {path.name}:\n\n{text}" if text else f"\n{path.name} has it like that already")
+    return 0
