@@ -89,6 +89,8 @@ def many(call, count: int):
 def test_replay(benchmark, n):
     """The moving window and the dense network, beside the yardstick, compiled loops and FFTs."""
     enabled = benchmark.enabled
+    if not enabled and n not in (11, 41):
+        pytest.skip("timed by make bench only")
     steps, few = (4000, max(5, 400 // n)) if enabled else (10, 1)
     window, start = replaying(n, "window", steps)
     calls = {"window": (partial(window, start), steps)}
@@ -130,6 +132,8 @@ def test_replay(benchmark, n):
 @pytest.mark.parametrize("n", [41, 101])
 def test_two_packets(benchmark, n):
     """Two packets that are kept alive: each step on two patches, beside a step on one."""
+    if not benchmark.enabled and n != 41:
+        pytest.skip("timed by make bench only")
     steps = 2000 if benchmark.enabled else 20
     alone, start = replaying(n, "window", steps)
     pairs, _ = replaying(n, "window", steps, every=4)
@@ -145,6 +149,8 @@ def test_two_packets(benchmark, n):
 @pytest.mark.parametrize("n", [21, 101])
 def test_live(benchmark, n):
     """One call for each step, its pose read back."""
+    if not benchmark.enabled and n != 21:
+        pytest.skip("timed by make bench only")
     step, cells = stepping(n, "window")
     live = jax.jit(step, donate_argnums=0)
     nowhere, nothing = np.zeros(3), np.zeros(())
