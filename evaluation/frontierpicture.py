@@ -22,7 +22,10 @@ _GRID, _GAP, _NEAR = (
     (5.0, 2.0),
     14.0,
 )  # pixels: steps of labels, around them (across, up), and without a line to their mark
-_CROSSING = 12.0  # pixels that a label goes further so as not to cross a bar
+_CROSSING, _MISTAKEN = (
+    8.0,
+    16.0,
+)  # pixels that a label goes further not to cross a bar, or be nearer to another mark
 _SIZE = 7.6  # of labels, points
 
 
@@ -74,24 +77,32 @@ def placed(
 
     Args:
         size: [N, 2] of the labels. anchor: [N, 2] what they belong to. area: [4] left, bottom, right, top.
-            blocked: [M, 4] the same of what they may not cover. crossed: [L, 4] of what they should rather not.
+            blocked: [M, 4] the same of what they may not cover. crossed: [L, 4] of what they had better not.
     """
     room = np.array([-_GAP[0], -_GAP[1], _GAP[0], _GAP[1]])
     taken, corners = list(np.asarray(blocked, float) + room / 2), np.zeros((len(size), 2))
+    anchor = np.asarray(anchor, float)
     for k, ((width, height), at) in enumerate(zip(size, anchor, strict=True)):
         x = np.arange(area[0], max(area[2] - width, area[0]) + 1e-9, _GRID)
         y = np.arange(area[1], max(area[3] - height, area[1]) + 1e-9, _GRID)
         spots = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
         boxes = np.concatenate([spots, spots + [width, height]], axis=1)
-        away = np.maximum(np.maximum(boxes[:, :2] - at, at - boxes[:, 2:]), 0.0)
+        away = _away(boxes, anchor)
+        cost = away[:, k] + _MISTAKEN * (np.delete(away, k, axis=1) < away[:, k : k + 1]).sum(axis=1)
         # Of spots as near, one beside the mark reads better than one above it.
-        cost = np.hypot(*away.T) + 0.02 * np.abs((boxes[:, 1] + boxes[:, 3]) / 2 - at[1])
+        cost += 0.02 * np.abs((boxes[:, 1] + boxes[:, 3]) / 2 - at[1])
         cost += _CROSSING * (_shared(boxes, np.reshape(crossed, (-1, 4))) > 0).sum(axis=1)
         hidden = _shared(boxes, np.reshape(taken, (-1, 4))).sum(axis=1)
         chosen = np.lexsort((cost, hidden))[0]
         corners[k] = spots[chosen]
         taken.append(boxes[chosen] + room)
     return corners
+
+
+def _away(boxes: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """[N, M] pixels from boxes to points."""
+    low, high = boxes[:, None, :2] - points, points - boxes[:, None, 2:]
+    return np.hypot(*np.moveaxis(np.maximum(np.maximum(low, high), 0.0), -1, 0))
 
 
 def _shared(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
@@ -182,10 +193,10 @@ def _label(axes: Axes, names: Sequence[str], spans: np.ndarray, best: np.ndarray
     corners = placed(sizes[order], at[order], frame, blocked, bars)
     for k, corner in zip(order, corners, strict=True):
         texts[k].xyann = tuple(corner - [boxes[k].x0, boxes[k].y0])
-        near = np.clip(at, corner, corner + sizes[k])
-        away = np.hypot(*(near - at).T)
+        near = np.clip(at[k], corner, corner + sizes[k])
+        away = _away(np.concatenate([corner, corner + sizes[k]])[None], at)[0]
         if away[k] > min(_NEAR, 1.5 * np.delete(away, k).min(initial=np.inf)):
             axes.annotate(
-                "", at[k], near[k], xycoords="figure pixels", textcoords="figure pixels",
+                "", at[k], near, xycoords="figure pixels", textcoords="figure pixels",
                 arrowprops={"arrowstyle": "-", "color": GREY, "lw": 0.6, "shrinkA": 0, "shrinkB": 3},
             )  # fmt: skip

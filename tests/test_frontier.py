@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import os
+from contextlib import nullcontext
 from itertools import pairwise
 from pathlib import Path
 
@@ -271,6 +272,19 @@ def test_several_workers_are_said_to_disturb_each_other(tmp_path, capsys, stubbe
     assert "disturb" not in capsys.readouterr().out
     assert main(["frontier", str(path), "-o", str(output), "--workers", "2"]) == 0
     assert "disturb each other" in capsys.readouterr().out
+
+
+def test_what_disturbed_a_measurement_is_not_forgotten(tmp_path, capsys, stubbed, monkeypatch):
+    busy = iter([2.5, 0.1])
+    monkeypatch.setattr(measuring, "others", lambda: nullcontext(lambda: next(busy)))
+    path, output = study(tmp_path), tmp_path / "out"
+    assert main(["frontier", str(path), "-o", str(output)]) == 0
+    assert "kept 2.5 cores busy" in capsys.readouterr().out
+    assert main(["frontier", str(path), "-o", str(output)]) == 0  # nothing is measured
+    assert "kept 2.5 cores busy" in capsys.readouterr().out
+    assert main(["frontier", str(path), "-o", str(output), "--set", "seeds=2"]) == 0
+    assert "kept 2.5 cores busy" in capsys.readouterr().out
+    assert len(stubbed) == 2
 
 
 def test_measuring_keeps_to_one_core_and_lets_go_of_it():

@@ -46,7 +46,7 @@ def add(command: Add) -> None:
 def _frontier(arguments: argparse.Namespace) -> int:
     settle_threads()
     prepare_jax()
-    from ratslam.frontier.circumstances import circumstances, disturbances
+    from ratslam.frontier.circumstances import circumstances, disturbances, most_others
     from ratslam.frontier.errors import error_named, usual_error
     from ratslam.frontier.lines import grouped, lines
     from ratslam.frontier.measuring import measured
@@ -63,12 +63,15 @@ def _frontier(arguments: argparse.Namespace) -> int:
         found = measured(asked, directory, arguments.workers, progress)
     groups = grouped(found.results)
     error = error or usual_error([[each for each in group if each.error is None] for group in groups])
+    kept = found.fresh < len({job.key for job in asked})
+    others = most_others(found.others, directory / "frontier.json") if kept else found.others
     told = Frontier(
         study.name,
         error,
         lines(groups, error),
         circumstances(found.results, study.plan.pace),
-        [*remarks(found.results, directory / FOLDER), *disturbances(found.others, arguments.workers)],
+        [*remarks(found.results, directory / FOLDER), *disturbances(others, arguments.workers)],
+        others,
     )
     paths = save(told, directory)
     print(text(told))

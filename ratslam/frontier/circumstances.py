@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from ratslam.sweeps.results import Machine, Result
 
@@ -29,8 +31,19 @@ def circumstances(results: Sequence[Result], pace: str) -> dict[str, str]:
     }
 
 
+def most_others(others: float | None, path: Path) -> float | None:
+    """Cores that others kept busy, now or when what stands in the file of an earlier call was measured: at
+    most so many."""
+    try:
+        earlier = json.loads(path.read_bytes()).get("others")
+    except (OSError, ValueError, AttributeError):
+        earlier = None
+    known = [each for each in (others, earlier) if isinstance(each, float)]
+    return max(known, default=None)
+
+
 def disturbances(others: float | None, workers: int) -> list[str]:
-    """What spoils times measured just now: sentences.
+    """What spoils the times: sentences.
 
     Args:
         others: cores that other processes kept busy meanwhile. workers: runs at a time.

@@ -14,8 +14,8 @@ from ratslam.frontier.pareto import optimal
 from ratslam.sweeps.quantities import DIRECTIONS, MEASURED
 from ratslam.sweeps.results import Result
 
-REST = "rest_time"
-"""Time per cycle of all beside the engine: simulating whiskers, sensing, judging, us."""
+WHOLE = "run_time"
+"""Time per cycle of a whole run: simulating, sensing, the engine, judging, but not compiling, us."""
 
 
 class Span(NamedTuple):
@@ -79,13 +79,12 @@ def span(values: Sequence[float | None], direction: str | None = None) -> Span |
     return Span(tuple(values), statistics.median(known), low, high, worst)
 
 
-def rest_time(result: Result) -> float | None:
-    """See `REST`."""
+def run_time(result: Result) -> float | None:
+    """See `WHOLE`."""
     timing = result.timing
-    if timing is None or timing.median_us is None or not result.steps:
+    if timing is None or not result.steps:
         return None
-    steps = 1e-6 * timing.median_us * result.steps
-    return 1e6 * max(timing.total_s - timing.compile_s - timing.finish_s - steps, 0.0) / result.steps
+    return 1e6 * max(timing.total_s - timing.compile_s, 0.0) / result.steps
 
 
 def _line(group: Sequence[Result], error: ErrorOf | None) -> Line:
@@ -96,7 +95,7 @@ def _line(group: Sequence[Result], error: ErrorOf | None) -> Line:
         return lambda result: result.value(name)
 
     found = {name: span([*map(asked(name), fine)], DIRECTIONS.get(name)) for name in [*MEASURED, *scored]}
-    found[REST] = span([*map(rest_time, fine)], "low")
+    found[WHOLE] = span([*map(run_time, fine)], "low")
     return Line(
         row=group[0].row,
         varied=group[0].varied,

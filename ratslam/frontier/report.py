@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from evaluation.frontierpicture import Mark, draw_frontier
 from ratslam.frontier.errors import ErrorOf
-from ratslam.frontier.lines import REST, Line, Span
+from ratslam.frontier.lines import WHOLE, Line, Span
 from ratslam.sweeps.report import label, replace
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 COLUMNS = {
     "step_time": "us a cycle",
     "step_time_p99": "99 %",
-    REST: "all else",
+    WHOLE: "whole run",
     "compile_time": "compile s",
     "memory": "MiB",
     "exm_arr": "ARR",
@@ -38,7 +38,8 @@ class Frontier(NamedTuple):
 
     Attributes:
         study: its name. error: what speed is held against; None if no row has any. lines: its rows.
-        measured: where, with what and how often, by name. remarks: sentences.
+        measured: where, with what and how often, by name. remarks: sentences. others: cores that other
+            processes kept busy; None where nobody knows.
     """
 
     study: str
@@ -46,6 +47,7 @@ class Frontier(NamedTuple):
     lines: Sequence[Line]
     measured: Mapping[str, str]
     remarks: Sequence[str]
+    others: float | None = None
 
 
 def text(found: Frontier) -> str:
@@ -121,8 +123,8 @@ def _notes(found: Frontier, mark: str) -> list[str]:
     remarks = [f"{remark[0].upper()}{remark[1:]}." for remark in found.remarks]
     return [
         f"Medians over seeds (worst). {optimal}",
-        "All else: simulating, sensing and judging, us a cycle. Of a row's seeds the first compiles (worst), "
-        "the others fetch.",
+        "Whole run: simulating, sensing and judging included, us a cycle. The first of a row's seeds "
+        "compiles (worst), others fetch what they share.",
         f"{'; '.join(found.measured.values())}.",
         *remarks,
     ]
@@ -168,6 +170,7 @@ def _json(found: Frontier) -> str:
         "error": found.error and {"name": found.error.name, "label": found.error.label},
         "measured": dict(found.measured),
         "remarks": list(found.remarks),
+        "others": found.others,
         "rows": rows,
     }
     return json.dumps(content, indent=1, allow_nan=False) + "\n"

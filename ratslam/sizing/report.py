@@ -7,7 +7,7 @@ from typing import Any
 
 import yaml
 
-from ratslam.frontier.lines import rest_time
+from ratslam.frontier.lines import run_time
 from ratslam.frontier.report import number
 from ratslam.sizing.proposal import Proposal
 from ratslam.sizing.trying import Tried
@@ -35,7 +35,7 @@ def tried_text(found: Sequence[Tried]) -> str:
     """What each step costs and saves, beside the first."""
     first = found[0].result.value("step_time")
     names = [name for name in ERRORS if any(one.result.value(name) is not None for one in found)]
-    rows = [["", "us a cycle", "99 %", "of proposed", "all else", *(ERRORS[name] for name in names)]]
+    rows = [["", "us a cycle", "99 %", "of proposed", "whole run", *(ERRORS[name] for name in names)]]
     for step, result in found:
         if result.error is not None:
             rows.append([step.name, "-", "-", "-", "-", *("-" for _ in names)])
@@ -44,7 +44,7 @@ def tried_text(found: Sequence[Tried]) -> str:
         share = f"{time / first:.2f}" if time and first else "-"
         errors = [number(result.value(name)) for name in names]
         rows.append([step.name, number(time), number(result.value("step_time_p99")), share,
-                     number(rest_time(result)), *errors])  # fmt: skip
+                     number(run_time(result)), *errors])  # fmt: skip
     failed = [f"{step.name}: {result.error}" for step, result in found if result.error is not None]
     return "\n".join([_aligned(rows, "<" + ">" * (len(rows[0]) - 1)), *failed])
 
