@@ -43,7 +43,7 @@ def test_contacts_alone_take_out_errors_that_last():
     ("move, as printed", 1.0),
 ])  # fmt: skip
 def test_what_carries_it_does(row, least):
-    """A way back left out; unknown space that counts as obstacles; the paper's filter: dead reckoning again."""
+    """A way back left out; unknown space as obstacles; the paper's filter: dead reckoning again."""
     assert ratio(row, MANY) > least
 
 
