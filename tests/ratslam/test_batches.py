@@ -40,7 +40,7 @@ def alone(config: PoseCellConfig, given: Course, factor: float) -> np.ndarray:
     )
 
 
-@pytest.mark.parametrize("block", [1, 3])
+@pytest.mark.parametrize("block", [pytest.param(1, marks=pytest.mark.soak), 3])
 def test_parameter_sets_are_networks_of_those_parameters(block):
     given, sets = course(1), [(1.0, 2.0, 2e-5, 1.0), (0.9, 2.3, 1e-5, 1.0), (1.2, 1.8, 3e-5, 2.0)]
     columns = Network(*(jnp.asarray(column) for column in zip(*sets, strict=True)))

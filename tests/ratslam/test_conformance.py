@@ -36,7 +36,10 @@ def _dead_reckoning():
 
 
 def _rat(matcher, source, dtype=np.float64, **more):
-    parts = {"matcher": matcher, "pose_cells": {"cells_xy": 11}, "templates": {"source": source}}
+    # Both engines of the pose cells have to conform; each with one kind of either matcher.
+    engine = "window" if source == "views" and not more else "dense"
+    cells = {"cells_xy": 11, "engine": engine}
+    parts = {"matcher": matcher, "pose_cells": cells, "templates": {"source": source}}
     return lambda: rat(RatConfig.model_validate(parts | more), VIEW, dtype)
 
 
