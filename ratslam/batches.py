@@ -82,12 +82,11 @@ def _networks(config: PoseCellConfig, rungs: int | None, sets: Network, course: 
     def run(network: Network) -> Track:
         kernels = network.excite_sigma, network.inhibit_sigma, network.global_inhibition
         tuned = tuple(rung._replace(patch=patches.tuned(rung.patch, *kernels)) for rung in steps)
-        here = config.model_copy(update={"excite_sigma": network.excite_sigma})
 
         def step(cells: Any, row: Course) -> Any:
             odometry = Odometry(row.motion[0], row.motion[1], row.motion[2], jnp.ones((), dtype))
             energy = row.energy * network.energy
-            cells, told = posecells.step(here, tuned, cells, odometry, row.recall, energy)
+            cells, told = posecells.step(config, tuned, cells, odometry, row.recall, energy)
             return cells, Track(cells.pose, told.outcome, told.rung)
 
         return lax.scan(step, posecells.start(config, dtype, steps), course)[1]

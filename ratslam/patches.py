@@ -41,14 +41,16 @@ class Patch(NamedTuple):
     """One shape, and the network's constants.
 
     Attributes:
-        axes: heading, y, x. excite, inhibit: [w] kernels along any axis. threshold: global inhibition. unit:
-            of heading, rad. margin: cells that activity must lie inside. shell: [H, Y, X] bool, the cells of
-            the margin. gap: cells between packets that do not feel each other.
+        axes: heading, y, x. excite, inhibit: [w] kernels along any axis. sigma: of excitation, cells.
+            threshold: global inhibition. unit: of heading, rad. margin: cells that activity must lie inside.
+        shell: [H, Y, X] bool, the cells of the margin. gap: cells between packets that do not feel each
+            other.
     """
 
     axes: tuple[Axis, Axis, Axis]
     excite: Array
     inhibit: Array
+    sigma: Any
     threshold: Any
     unit: float
     margin: int
@@ -83,7 +85,8 @@ def patch(config: PoseCellConfig, inner: int | None, dtype: np.dtype) -> Patch:
     excite = _gaussian(config.excite_width, np.float64(config.excite_sigma)).astype(dtype)
     inhibit = _gaussian(config.inhibit_width, np.float64(config.inhibit_sigma)).astype(dtype)
     unit, (heading, y, x) = 2 * np.pi / config.cells_heading, axes
-    return Patch((heading, y, x), excite, inhibit, config.global_inhibition, unit, margin, shell, gap)
+    sigma, threshold = config.excite_sigma, config.global_inhibition
+    return Patch((heading, y, x), excite, inhibit, sigma, threshold, unit, margin, shell, gap)
 
 
 def tuned(patch: Patch, excite: Array, inhibit: Array, threshold: Array) -> Patch:
@@ -95,6 +98,7 @@ def tuned(patch: Patch, excite: Array, inhibit: Array, threshold: Array) -> Patc
     return patch._replace(
         excite=_gaussian(len(patch.excite), excite),
         inhibit=_gaussian(len(patch.inhibit), inhibit),
+        sigma=excite,
         threshold=threshold,
     )
 
@@ -203,14 +207,14 @@ def around(difference: Array, size: Array) -> Array:
     return (difference + size / 2) % size - size / 2
 
 
-def excited_share(config: PoseCellConfig, pose: Array) -> Array:
+def excited_share(patch: Patch, pose: Array) -> Array:
     """How much more energy a deposit between cells needs to be excited as high as one on a cell.
 
     Along one axis, a share f on the next cell is excited to (1 - f) g(f) + f g(1 - f) of the whole at the
     point itself, g the excitation kernel.
     """
     f = pose - jnp.floor(pose)
-    sharp = -0.5 / config.excite_sigma**2
+    sharp = -0.5 / patch.sigma**2
     return 1 / jnp.prod((1 - f) * jnp.exp(sharp * f**2) + f * jnp.exp(sharp * (1 - f) ** 2))
 
 

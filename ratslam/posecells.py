@@ -116,7 +116,7 @@ def step(
     parts = jnp.minimum(wanted, float(MOST_PARTS))
     told, lag = told * (parts / wanted), lag * (parts / wanted)
 
-    energy = excited_share(config, recall) * energy
+    energy = excited_share(rungs[0].patch, recall) * energy
     push = Push(cells.pose, recall, energy, parts.astype(jnp.int32), told / parts, lag / parts, lag[2])
     activity, (pose, spread, died, rung) = ladder.climb(rungs, cells.activity, push)
 

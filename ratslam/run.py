@@ -105,14 +105,7 @@ def simulate(config: RunConfig, folder: Path, path: Path) -> tuple[int, bool]:
         raise InputError("simulation", "missing", "what to simulate", "`simulation: {}` is a whole session")
     source = open_source(config, _tell)
     keep = _kept(config, source)
-    recorder = Recorder(
-        path,
-        view_shape=source.view_shape,
-        whiskers=source.whiskers,
-        rate_hz=source.rate_hz,
-        rig=rig_of(source),
-        chunk_s=CHUNK / source.rate_hz,
-    )
+    recorder = recorder_of(path, source)
     bar = tqdm(source, unit="whisk", desc=source.name, file=sys.stderr, mininterval=0.5, total=source.length)
     with recorder, bar, _interrupts("closing the file") as interrupted:
         for sample in bar:
@@ -120,6 +113,22 @@ def simulate(config: RunConfig, folder: Path, path: Path) -> tuple[int, bool]:
             if interrupted():
                 break
         return recorder.count, interrupted()
+
+
+def recorder_of(path: Path, source: Source) -> Recorder:
+    """What records a source, a chunk of the session's at a time.
+
+    Raises:
+        InputError: the file exists or cannot be made.
+    """
+    return Recorder(
+        path,
+        view_shape=source.view_shape,
+        whiskers=source.whiskers,
+        rate_hz=source.rate_hz,
+        rig=rig_of(source),
+        chunk_s=CHUNK / (source.rate_hz or 1.0),
+    )
 
 
 def _kept(config: RunConfig, source: Source) -> Callable[[Sample], Sample]:

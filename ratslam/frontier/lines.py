@@ -110,7 +110,7 @@ def _line(group: Sequence[Result], error: ErrorOf | None) -> Line:
 
 def _cost(line: Line) -> tuple[float, float]:
     """Time per cycle and error, NaN where anything is missing."""
-    both = (line.spans.get("step_time"), line.error)
-    if line.failed or any(each is None or None in each.values for each in both):
+    time, error = line.spans.get("step_time"), line.error
+    if line.failed or time is None or error is None or None in (*time.values, *error.values):
         return np.nan, np.nan
-    return tuple(each.median for each in both if each)  # type: ignore[return-value]
+    return time.median, error.median

@@ -9,12 +9,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ratslam.config import RunConfig
-from ratslam.run import open_source
-from ratslam.session import CHUNK
+from ratslam.run import open_source, recorder_of
 from ratslam.tiers import shortened
 from robot.formats import RecordingConfig
-from robot.recorder import Recorder
-from robot.source import Source, rig_of
+from robot.source import Source
 from tactile.errors import InputError
 from tactile.frames import integrate
 
@@ -100,18 +98,9 @@ def short(config: RunConfig, cycles: int, folder: Path) -> RunConfig:
     if config.simulation is not None:
         return shortened(config, cycles / config.simulation.whisking.rate)
     path = folder / "beginning.mcap"
-    with open_source(config) as source:
-        recorder = Recorder(
-            path,
-            view_shape=source.view_shape,
-            whiskers=source.whiskers,
-            rate_hz=source.rate_hz,
-            rig=rig_of(source),
-            chunk_s=CHUNK / (source.rate_hz or 1.0),
-        )
-        with recorder:
-            for sample in islice(source, cycles):
-                recorder.write(sample)
+    with open_source(config) as source, recorder_of(path, source) as recorder:
+        for sample in islice(source, cycles):
+            recorder.write(sample)
     return config.model_copy(update={"recording": RecordingConfig(file=path)})
 
 

@@ -56,6 +56,16 @@ def compare(n, motion, recall, energy):
     return np.asarray(rung)[:count]
 
 
+def thousand(n, seed, often, speed):
+    """Motion of any size, injections of any energy anywhere; without any, one patch is enough."""
+    stream = np.random.default_rng(seed)
+    motion = stream.normal(0, speed, (1000, 3)) * [1, 0.3, 0.5]
+    energy = np.where(stream.random(1000) < often, stream.choice([0.02, 0.1, 0.5, 2.0], 1000), 0.0)
+    rung = compare(n, motion, stream.random((1000, 3)) * [n, n, 36], energy)
+    if often == 0:
+        assert not np.any(rung)
+
+
 @settings(max_examples=4)
 @given(
     st.sampled_from([21, 41]),
@@ -64,14 +74,7 @@ def compare(n, motion, recall, energy):
     st.sampled_from([0.05, 0.4, 2.0]),
 )
 def test_a_thousand_steps_are_those_of_the_torus(n, seed, often, speed):
-    """Motion of any size, injections of any energy anywhere."""
-    stream = np.random.default_rng(seed)
-    motion = stream.normal(0, speed, (1000, 3)) * [1, 0.3, 0.5]
-    energy = np.where(stream.random(1000) < often, stream.choice([0.02, 0.1, 0.5, 2.0], 1000), 0.0)
-    recall = stream.random((1000, 3)) * [n, n, 36]
-    rung = compare(n, motion, recall, energy)
-    if often == 0:
-        assert not np.any(rung)
+    thousand(n, seed, often, speed)
 
 
 @settings(max_examples=6)
@@ -158,7 +161,4 @@ def test_wide_kernels_have_wide_margins():
     st.sampled_from([0.05, 0.4, 2.0]),
 )
 def test_many_thousands_of_steps_are_those_of_the_torus(n, seed, often, speed):
-    stream = np.random.default_rng(seed)
-    motion = stream.normal(0, speed, (1000, 3)) * [1, 0.3, 0.5]
-    energy = np.where(stream.random(1000) < often, stream.choice([0.02, 0.1, 0.5, 2.0], 1000), 0.0)
-    compare(n, motion, stream.random((1000, 3)) * [n, n, 36], energy)
+    thousand(n, seed, often, speed)

@@ -148,7 +148,7 @@ def test_uniform_activity_dies_and_is_put_back(settled, level):
 def test_a_deposit_between_cells_is_excited_like_one_on_a_cell(share):
     """The peak of a deposit at its own point, read off between cells, does not depend on where it falls."""
     pose = jnp.asarray([10.0, 10.0, 18.0]) + jnp.asarray(share)
-    energy = patches.excited_share(CONFIG, pose)
+    energy = patches.excited_share(patches.patch(CONFIG, None, np.dtype(float)), pose)
     assert 1 - 1e-9 <= float(energy) <= 1.5
     total = float(deposited(jnp.zeros((36, 21, 21)), pose % RINGS, 1.0).sum())
     assert total == pytest.approx(1)
