@@ -61,3 +61,10 @@ def reference_data() -> Path:
 def golden() -> Path:
     """The folder of the reference engine's traces that are part of the project."""
     return ROOT / "tests" / "golden"
+
+
+@pytest.fixture(scope="session")
+def loopback() -> str:
+    """An address of this worker's own: ports of robots are fixed."""
+    worker = os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw")
+    return f"127.0.0.{11 + int(worker)}"
