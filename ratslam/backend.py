@@ -65,6 +65,9 @@ class Backend(Protocol):
     def init(self, key: Array, capacity: int) -> State:
         """The state before the first step, with room for `capacity` rows of whatever grows."""
 
+    def rows(self, state: State) -> int:
+        """Rows in use of whatever grows most; a step adds one at most."""
+
     def grow(self, state: State, capacity: int) -> State:
         """The same state with more room."""
 

@@ -103,6 +103,7 @@ class ExperienceMap:
         self._pose = Growing((3,), np.float64)
         self._node_of = Growing((), np.int64)  # place id -> node, -1 for ids that never became a node
         self._template = Growing((), np.int64)
+        self._made = Growing((), np.int64)  # the step at which each node was made
         self._ends = Growing((2,), np.int64)
         self._motion = Growing((3,), np.float64)
         self._information = Growing((3,), np.float64)
@@ -209,6 +210,7 @@ class ExperienceMap:
         measured = compose(self._travel.motion, np.array([0.0, 0.0, -relative]))
         self._pose.append(compose(self._origin(), measured))
         self._template.append(template)
+        self._made.append(len(self._step_node.rows))
         while len(self._node_of.rows) <= place:
             self._node_of.append(-1)
         self._node_of.rows[place] = node
@@ -219,7 +221,7 @@ class ExperienceMap:
 
     def _reach(self, node: int, relative: float) -> None:
         measured = compose(self._travel.motion, np.array([0.0, 0.0, -relative]))
-        self._reached.append((len(self._step_node.rows), int(np.argmax(self._step_node.rows == node))))
+        self._reached.append((len(self._step_node.rows), self._made.rows[node]))
         if self._current >= 0 and node != self._current:
             self._link(node, measured, closure=True)
         self._arrive(node, relative)

@@ -140,6 +140,11 @@ class GridFilter:
             jax.random.key_data(key),
         )
 
+    def rows(self, state: State) -> int:
+        """None: nothing grows."""
+        del state
+        return 0
+
     def grow(self, state: State, capacity: int) -> State:
         """The same: nothing grows."""
         del capacity

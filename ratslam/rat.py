@@ -97,6 +97,10 @@ class Rat:
             jnp.zeros((), self.dtype),
         )
 
+    def rows(self, state: State) -> int:
+        """Templates, places or links, whichever are most."""
+        return max(int(n) for n in (state.templates.count, state.places.count, state.places.links))
+
     def grow(self, state: State, capacity: int) -> State:
         """The same memories in larger arrays."""
         empty = self.init(None, capacity)

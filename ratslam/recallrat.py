@@ -94,6 +94,10 @@ class RecallRat:
             jnp.ones((), self.dtype),
         )
 
+    def rows(self, state: State) -> int:
+        """Frames."""
+        return int(state.memory.count)
+
     def grow(self, state: State, capacity: int) -> State:
         """The same memories in larger arrays."""
 

@@ -63,7 +63,8 @@ class Session:
         self.map: Map = backend.new_map()
         self.steps = 0
         self.reserve = reserve
-        self.state = backend.init(jax.random.key(seed), capacity_at(0, reserve))
+        self._capacity = capacity_at(0, reserve)
+        self.state = backend.init(jax.random.key(seed), self._capacity)
         self._layout: Layout | None = None
         self._run = jax.jit(partial(run_chunk, backend.kernel), donate_argnums=0)
 
@@ -84,7 +85,11 @@ class Session:
         return (
             {f"state/{k}": np.asarray(leaf) for k, leaf in enumerate(leaves)}
             | {f"map/{name}": value for name, value in self.map.arrays().items()}
-            | {"steps": np.array(self.steps), "reserve": np.array(self.reserve)}
+            | {
+                "steps": np.array(self.steps),
+                "reserve": np.array(self.reserve),
+                "capacity": np.array(self._capacity),
+            }
         )
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
@@ -94,10 +99,8 @@ class Session:
             ValueError: the arrays are of a session with another backend or other shapes.
         """
         steps, reserve = int(arrays["steps"]), int(arrays["reserve"])
-        # The last chunk's capacity, not the next one's: growing is the next step's business.
-        like = jax.eval_shape(
-            lambda: self.backend.init(jax.random.key(0), capacity_at(max(steps - 1, 0), reserve))
-        )
+        capacity = int(arrays["capacity"])
+        like = jax.eval_shape(lambda: self.backend.init(jax.random.key(0), capacity))
         leaves = jax.tree.leaves(like)
         saved = [arrays.get(f"state/{k}") for k in range(len(leaves))]
         for leaf, value in zip(leaves, saved, strict=True):
@@ -106,17 +109,18 @@ class Session:
         self.state = jax.tree.unflatten(jax.tree.structure(like), [jnp.asarray(value) for value in saved])
         prefix = "map/"
         self.map.restore({k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)})
-        self.steps, self.reserve = steps, reserve
+        self.steps, self.reserve, self._capacity = steps, reserve, capacity
 
     def compilations(self) -> int:
         """How often the chunk function was compiled: once per capacity."""
         return self._run._cache_size()  # type: ignore[attr-defined]
 
     def _advance(self, observations: list[Observation]) -> list[Step]:
-        capacity = capacity_at(self.steps, self.reserve)
-        if self.steps and capacity != capacity_at(self.steps - 1, self.reserve):
-            self.state = self.backend.grow(self.state, capacity)
         if self.steps % CHUNK == 0:
+            # A step fills one row at most.
+            capacity = capacity_at(self.backend.rows(self.state) + CHUNK - 1, self.reserve)
+            if capacity > self._capacity:
+                self.state, self._capacity = self.backend.grow(self.state, capacity), capacity
             self.state = self.backend.inform(self.state, self.map.guidance())
         count = len(observations)
         self._layout = self._layout or layout_of(observations[0])
@@ -132,9 +136,9 @@ class Session:
         return steps
 
 
-def capacity_at(step: int, reserve: int = 0) -> int:
-    """Rows of memory at a step: a power of two that holds one row for every step of its chunk and before."""
-    end = (step // CHUNK + 1) * CHUNK
+def capacity_at(row: int, reserve: int = 0) -> int:
+    """Rows of memory where `row` may be filled: a power of two that holds its whole chunk."""
+    end = (row // CHUNK + 1) * CHUNK
     return 1 << (max(end, reserve, 256) - 1).bit_length()
 
 

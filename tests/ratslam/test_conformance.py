@@ -254,6 +254,14 @@ def test_compiles_once_per_capacity(make):
     assert reserved.compilations() == 1
 
 
+@pytest.mark.parametrize("name", ["classic", "classic-labels", "grid", "dead-reckoning"])
+def test_what_learns_nothing_new_does_not_grow(name):
+    """Else a long run on known ground would take more and more time and memory."""
+    session = Session(BACKENDS[name]())
+    list(session.replay(walk(600)))
+    assert session.compilations() == 1
+
+
 def test_capacity_depends_on_the_chunk_alone():
     assert {capacity_at(step) for step in range(256)} == {256}
     assert capacity_at(256) == 512
