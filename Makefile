@@ -44,8 +44,8 @@ $(READY): pyproject.toml constraints.txt
 	@echo "Making the virtual environment $(VENV) ..."
 	@$(PYTHON) -m venv $(VENV)
 	@echo "Installing ratslam and what it needs (a minute or two) ..."
-	@$(INSTALL) --only-binary gtsam -e '.[dev,sweep,anchor]' || { \
+	@$(INSTALL) --only-binary gtsam -e '.[dev,sweep,live,anchor]' || { \
 	  echo "That did not work; trying without gtsam (its test will be skipped) ..."; \
-	  $(INSTALL) -e '.[dev,sweep]'; }
+	  $(INSTALL) -e '.[dev,sweep,live]'; }
 	@touch $@
 	@echo "$(VENV) is ready."

@@ -12,7 +12,8 @@ import numpy as np
 from evaluation.energy import energy_all_pairs
 from evaluation.trajectory import ate
 from ratslam.config import RunConfig
-from ratslam.run import located, open_source, session_of
+from ratslam.playing import session_of
+from ratslam.run import located, open_source
 from ratslam.session import CHUNK
 from robot.sensing import observation_of, sensing
 from robot.source import Sample, Source

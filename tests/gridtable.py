@@ -70,7 +70,8 @@ def run(world: str, row: str, arena: int) -> Figures:
 
     jax.config.update("jax_enable_x64", True)
     from ratslam.config import RunConfig
-    from ratslam.run import open_source, readings, session_of
+    from ratslam.playing import readings, session_of
+    from ratslam.run import open_source
     from robot.sensing import sensing
     from tactile.frames import compose, integrate
     from tactile.types import Motion

@@ -116,7 +116,8 @@ def replayed(kind: str, steps: int, folder: Path) -> dict[str, Any]:
     jax.config.update("jax_enable_x64", True)
     from ratslam.backends import telling
     from ratslam.config import RunConfig
-    from ratslam.run import _play, session_of
+    from ratslam.playing import Playing, session_of
+    from ratslam.run import replayed as through
     from ratslam.storage import RunDirectory
 
     source = Circuit(kind, steps)
@@ -130,7 +131,7 @@ def replayed(kind: str, steps: int, folder: Path) -> dict[str, Any]:
     )
     session, told = session_of(config, source), telling(config)
     with RunDirectory(folder, told.columns) as store:
-        _play(session, source, 0, store, [], told)
+        through(Playing(config, source, store, {}, session, 0), source)
     (_, early, late), rest = source.moments, 0.9 * steps
     with (folder / "steps.csv").open(encoding="utf-8") as lines:
         written = sum(1 for _ in lines) - 1
@@ -171,7 +172,6 @@ def holds(found: dict[str, Any]) -> None:
     assert found["places"] <= 2 * PLACES, "the circuit is not known again: this measures something else"
 
 
-@pytest.mark.soak
 def test_a_replay_keeps_little_of_each_step(tmp_path):
     holds(apart("labels", 10_000, tmp_path / "run"))
 

@@ -12,7 +12,7 @@ import pytest
 from evaluation.energy import energy_all_pairs
 from ratslam.closures import Verdict
 from ratslam.config import TOUCH, RunConfig
-from ratslam.run import readings, session_of
+from ratslam.playing import readings, session_of
 from ratslam.session import Session
 from robot.sensing import sensing
 from robot.simulation import simulated

@@ -15,7 +15,8 @@ import numpy as np
 
 from evaluation.exm import experience_metric
 from ratslam.config import RunConfig
-from ratslam.run import open_source, readings, session_of
+from ratslam.playing import readings, session_of
+from ratslam.run import open_source
 from ratslam.types import Action
 from robot.sensing import sensing
 from tactile.types import Observation

@@ -96,7 +96,8 @@ def run(row: str, maze: int, seed: int, matcher: str = "recall") -> Figures:
     from evaluation.energy import energy_all_pairs
     from evaluation.exm import ExmConfig, experience_metric
     from ratslam.config import RunConfig
-    from ratslam.run import open_source, readings, session_of
+    from ratslam.playing import readings, session_of
+    from ratslam.run import open_source
     from robot.log import collected
     from robot.sensing import sensing
     from tactile.errors import InputError

@@ -26,7 +26,8 @@ from evaluation.run import Run
 from evaluation.scorecard import Quantity, score
 from ratslam.config import RunConfig
 from ratslam.keeping import truth_of
-from ratslam.run import Anytimes, open_source, readings, session_of
+from ratslam.playing import Anytimes, readings, session_of
+from ratslam.run import open_source
 from ratslam.session import CHUNK, Session
 from ratslam.sweeps.memory import weighed
 from ratslam.sweeps.results import Machine, Result, Timing

@@ -16,7 +16,8 @@ from pydantic import BaseModel
 
 from evaluation.trajectory import ate
 from ratslam.config import RunConfig
-from ratslam.run import Anytimes, located, open_source, readings, session_of
+from ratslam.playing import Anytimes, readings, session_of
+from ratslam.run import located, open_source
 from ratslam.session import CHUNK, Session
 from ratslam.trials.workers import shared_out
 from ratslam.yamlfile import Document, load, override, validate

@@ -10,7 +10,8 @@ import pytest
 from evaluation.energy import energy_all_pairs
 from evaluation.exm import experience_metric
 from ratslam.config import RunConfig
-from ratslam.run import open_source, readings, session_of
+from ratslam.playing import readings, session_of
+from ratslam.run import open_source
 from robot.sensing import sensing
 
 JITTER = {"position": 0.005, "yaw_deg": 1.5, "speed": 0.05}
