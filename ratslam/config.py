@@ -19,6 +19,7 @@ from ratslam.recall import RecallConfig
 from ratslam.templates import TemplateConfig
 from robot.extent import extent
 from robot.formats import RecordingConfig
+from robot.live.settings import LiveConfig
 from robot.log import Log
 from robot.roving import RovingConfig
 from robot.sensing import head_of
@@ -88,8 +89,10 @@ class RunConfig(Settings):
     """What to run on: a recording, or a session simulated as one of the two below say."""
     simulation: SimulationConfig | None = None
     """Of an arm with a whisker head in a maze."""
-    roving: Annotated[RovingConfig | None, Field(validate_default=True)] = None
+    roving: RovingConfig | None = None
     """Of a whiskered Create in an arena."""
+    live: Annotated[LiveConfig | None, Field(validate_default=True)] = None
+    """Or a session on an arm, for `python -m ratslam live`."""
     touch: TouchConfig = TouchConfig()
     """How whiskers become views."""
     backend: Literal["rat", "grid"] = "rat"
@@ -117,15 +120,16 @@ class RunConfig(Settings):
     score: ScoreConfig = ScoreConfig()
     """Judgement."""
 
-    @field_validator("roving", mode="after")
+    @field_validator("live", mode="after")
     @classmethod
-    def _one_source(cls, roving: RovingConfig | None, info: ValidationInfo) -> RovingConfig | None:
-        sources = {name: info.data.get(name) for name in ("recording", "simulation")} | {"roving": roving}
+    def _one_source(cls, live: LiveConfig | None, info: ValidationInfo) -> LiveConfig | None:
+        names = ("recording", "simulation", "roving")
+        sources = {name: info.data.get(name) for name in names} | {"live": live}
         given = [name for name, source in sources.items() if source is not None]
-        if "recording" in info.data and "simulation" in info.data and len(given) != 1:
-            there = " and ".join(given) if given else "neither recording, simulation nor roving"
-            raise ValueError(f"{there}; give one of these three, and null for the others")
-        return roving
+        if all(name in info.data for name in names) and len(given) != 1:
+            there = " and ".join(given) if given else "neither recording, simulation, roving nor live"
+            raise ValueError(f"{there}; give one of these four, and null for the others")
+        return live
 
     def rat(self) -> RatConfig:
         """The rat backend's part."""
@@ -161,8 +165,14 @@ class RunConfig(Settings):
         completed = self if "roving" in rig_of(source) else _filled(self, ARM)
         if completed.grid.side is not None or source.length is None:
             return completed
+        return completed.covering(extent(source))
+
+    def covering(self, reach: float) -> RunConfig:
+        """The same with a grid that covers so many metres from the start, unless it says how large it is."""
+        if self.grid.side is not None:
+            return self
         share, more = MARGIN
-        return _filled(completed, {"grid": {"side": round(2 * (share * extent(source) + more), 2)}})
+        return _filled(self, {"grid": {"side": round(2 * (share * reach + more), 2)}})
 
 
 def _filled(settings: Any, values: dict[str, Any]) -> Any:

@@ -35,8 +35,9 @@ def keep_world(source: Source, store: RunDirectory) -> None:
         return
     store.text("maze.txt", rig["maze"])
     try:
-        made = MazeConfig.model_validate(rig["simulation"]["maze"])
-        seed = int(rig["simulation"]["seed"] if made.seed is None else made.seed)
+        plan = rig["simulation"] if "simulation" in rig else rig["live"]["plan"]
+        made = MazeConfig.model_validate(plan["maze"])
+        seed = int(plan["seed"] if made.seed is None else made.seed)
         random = stream(seed, "maze.heights")
         boxes = walls(read_maze(store.path / "maze.txt"), random, made.heights)
     except (KeyError, TypeError, ValueError) as error:

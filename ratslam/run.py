@@ -136,7 +136,9 @@ def open_source(config: RunConfig, tell: Callable[[str], None] | None = None) ->
         if tell is not None:
             tell(f"simulating in the {session.tier.name} tier: {session.tier.why}")
         return session
-    assert config.recording is not None
+    if config.recording is None:
+        cure = "`python -m ratslam live` runs it; here its recording can be run"
+        raise InputError("live", "a session on a robot", "a recording, or what to simulate", cure)
     return open_recording(config.recording, tell and (lambda sentence: tell(f"warning: {sentence}")))
 
 
@@ -149,6 +151,7 @@ def located(config: RunConfig, folder: Path) -> RunConfig:
         "recording": config.recording and config.recording.resolved(folder),
         "simulation": config.simulation and config.simulation.resolved(folder),
         "roving": config.roving and config.roving.resolved(folder),
+        "live": config.live and config.live.resolved(folder),
         "touch": config.touch.model_copy(update={"reports": config.touch.reports.resolved(folder)}),
     }
     return config.model_copy(update={**parts, "score": judgement})

@@ -2,7 +2,7 @@
 
 Live and replay run the same compiled function over a chunk of fixed length with a traced count: live passes
 one observation, replay many, and both give the same bits. Memory grows to powers of two that depend on the
-number of steps alone, before a chunk that could need it; at the start of a chunk the kernel hears of the map.
+rows in use alone, before a chunk that could need more; at the start of a chunk the kernel hears of the map.
 """
 
 from __future__ import annotations
@@ -78,6 +78,12 @@ class Session:
         # Chunks end where capacities may change, wherever the session stands when the replay begins.
         while chunk := list(islice(remaining, CHUNK - self.steps % CHUNK)):
             yield from self._advance(chunk)
+
+    def warm(self, observation: Observation) -> None:
+        """Compiles for observations like this one; the first step stays what it would have been."""
+        self._layout = self._layout or layout_of(observation)
+        self.state = self.backend.inform(self.state, self.map.guidance())
+        self.state, _ = self._run(self.state, room(self._layout, CHUNK), np.int32(0))
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The whole session for a checkpoint: a restored one continues bit for bit."""

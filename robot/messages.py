@@ -1,8 +1,7 @@
 """How a sample is written down: ROS 2 messages in little-endian CDR, which any ROS 2 or MCAP tool can read.
 
-Fields are ordered so that CDR's alignment never needs padding. A message is therefore four bytes
-(00 01 00 00) and its fields back to back; an unbounded array is preceded by its length (uint32). float64 is
-kept bit for bit. The schemas below are stored in every file.
+A message is four bytes (00 01 00 00) and the fields of its schema (`robot.schemas`) back to back; an
+unbounded array is preceded by its length (uint32). float64 is kept bit for bit.
 """
 
 from __future__ import annotations
@@ -12,62 +11,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from robot.schemas import CYCLE, OBSERVATION, REPORT, WHISK
 from robot.source import Sample
 from tactile.errors import InputError
 from tactile.types import Cycle, Observation, Odometry, Report, Whisk
 
 CDR = b"\x00\x01\x00\x00"
 MOST = 100_000_000  # numbers in one message; more is a damaged length
-
-ODOMETRY = """float64 time        # s, on the recording's own clock
-float64 dx          # motion since the sample before, in the body frame before it: forward, m
-float64 dy          # left, m
-float64 dtheta      # counter-clockwise, rad
-float64 dt          # the motion's duration, s
-"""
-SCHEMAS = {
-    "ratslam_msgs/msg/Observation": ODOMETRY
-    + """float64[2] wall_point  # its nearest point, m in base_link, if wall
-float64 wall_sd     # standard deviation of the wall's direction, rad
-int32 motion        # 0 other, 1 forward, 2 back, 3 turn
-int32 label         # place id given with the recording, -1 none
-uint32[3] view_shape  # rows, columns, channels
-float64[] view      # row-major, in 0..1, if view_seen
-uint32 whiskers
-float64[] point     # whiskers x 2, m in base_link, where contact
-uint8[] flags       # of each whisker; bit 0: it touched something, bit 1: it is dead
-bool view_seen
-bool wall           # whether a wall's orientation was measured
-""",
-    "ratslam_msgs/msg/Cycle": ODOMETRY
-    + """uint32 samples
-float64[] sample_time  # samples, s
-uint32 whiskers
-float64[] angle     # samples x whiskers, rad
-uint32 axes         # 2
-float64[] deflection  # samples x whiskers x 2
-""",
-    "ratslam_msgs/msg/Whisk": ODOMETRY
-    + """uint32 whiskers
-float64[] felt      # whiskers x 3: angle at first contact, rad; largest angle, rad; share of the shaft
-uint8[] flags       # of each whisker; bit 0: it reports, bit 1: it touched, bit 2: it did so to the end
-""",
-    "ratslam_msgs/msg/Report": ODOMETRY
-    + """int32 motion        # 0 other, 1 forward, 2 back, 3 turn
-int32 moment        # how the step ended: 0 as planned, 1 first contact, 2 a second one, 3 strained too much
-uint32 whiskers
-float64[] sample_time  # samples, s since the beginning of the step
-uint32 axes         # 2
-float64[] strain    # samples x whiskers x 2
-uint8[] flags       # of each whisker; bit 0: it reports, bit 1: it touches something
-""",
-    "ratslam_msgs/msg/Truth": """float64 time        # s, as in the reading it belongs to
-float64 x           # m
-float64 y           # m
-float64 heading     # rad
-""",
-}
-OBSERVATION, CYCLE, WHISK, REPORT, TRUTH = SCHEMAS
 FELT = ("touched", "highest", "reach")
 """What `felt` of a whisk holds of each whisker."""
 FLAGS = {OBSERVATION: ("contact", "dead"), WHISK: ("alive", "contact", "held"), REPORT: ("alive", "contact")}

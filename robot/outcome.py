@@ -9,7 +9,7 @@ from typing import NamedTuple
 class Outcome(Enum):
     """How a live session ended; the value says what to do."""
 
-    COMPLETE = "the whole path was driven"
+    COMPLETE = "nothing is left to do"
     INTERRUPTED = "the operator stopped it; `run` on the recording maps what there is"
     REFUSED = "it never moved: mend what the self-test names and start again"
     ARM_GONE = "look at the controller and its network, then start again from where the arm stands"

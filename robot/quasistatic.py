@@ -8,6 +8,10 @@ wall again without force on its way back.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
 import numpy as np
 
 from robot.kinematic import MechanicsConfig
@@ -15,7 +19,69 @@ from robot.mechanics import StreamConfig
 from robot.sweep import Sweep
 from tactile.contact import stiffness
 from tactile.head import Head
-from tactile.whisking import WhiskingConfig, command, still
+from tactile.whisking import Drive, WhiskingConfig, command, still
+
+Law = Callable[[Drive, float, np.ndarray], tuple[np.ndarray, Drive]]
+"""From drives, the time in the cycle (s) and the newest y [N, W] as sensors report it, to the protractions
+commanded [N, W] and the drives after it: `tactile.whisking.command`, say."""
+
+
+class Balance(NamedTuple):
+    """Whiskers between two samples, [N, W] each.
+
+    Attributes:
+        drive: what the law remembers. told: y as last reported, rad. touching, slipped: bool.
+        late: protraction by which a wall is met later than it stands, rad. side: sideways bend, rad.
+        before: protraction at the last sample, rad.
+    """
+
+    drive: Drive
+    told: np.ndarray
+    touching: np.ndarray
+    slipped: np.ndarray
+    late: np.ndarray
+    side: np.ndarray
+    before: np.ndarray
+
+
+def rest(*size: int) -> Balance:
+    """Whiskers [N, W] before their first cycle, which touch nothing."""
+    zero, no = np.zeros(size), np.zeros(size, bool)
+    return Balance(still(*size), zero, no, no, zero, zero, zero)
+
+
+def advance(
+    config: StreamConfig, mechanics: MechanicsConfig, law: Law, sweep: Sweep, balance: Balance
+) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], Balance]:
+    """The samples of a sweep, which may be any part of a cycle, from where the whiskers were.
+
+    Returns:
+        angle, x and y, [T, N, W] rad, and where the whiskers are after the last of them.
+    """
+    hard = stiffness(config.beam.shaft, sweep.reach)
+    share = mechanics.servo / (mechanics.servo + hard)
+    heard = sweep.noise[..., 2].swapaxes(0, 1)
+    slide = sweep.drift / config.rate
+    angle, bent, aside = (np.zeros(sweep.wall.shape) for _ in range(3))
+
+    drive, told, touching, slipped, late, side, before = balance
+    for k, time in enumerate(sweep.time.tolist()):
+        aim, drive = law(drive, time, told)
+        # A wall that comes upon a whisker from the side is met where the whisker is.
+        late = np.where(touching, late, np.maximum(before - sweep.wall[k], 0.0))
+        wall = sweep.wall[k] + late
+        bend = share[k] * (aim - wall)
+        touching = (bend > 0) & ~slipped
+        slipped = slipped | touching & (bend > mechanics.slip)
+        touching &= ~slipped
+        bend = np.where(touching, bend, 0.0)
+        before = np.where(touching, wall + bend, aim)
+        limit = config.beam.friction * bend
+        side = np.minimum(np.maximum(side + slide[k], -limit), limit)
+        angle[k], bent[k], aside[k] = before, bend, side
+        told = hard[k] * bend + heard[k]
+    after = Balance(drive, told, touching, slipped, late, side, before)
+    return (angle, hard * aside, hard * bent), after
 
 
 def quasistatic(
@@ -27,29 +93,16 @@ def quasistatic(
     threshold: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Angle, x and y, [T, N, W] rad: a `robot.sweep.Tier`."""
-    size = sweep.wall.shape[1:]
-    hard = stiffness(config.beam.shaft, sweep.reach)
-    share = mechanics.servo / (mechanics.servo + hard)
-    heard = sweep.noise[..., 2].swapaxes(0, 1)
-    slide = sweep.drift / config.rate
-    angle, bent, side = (np.zeros(sweep.wall.shape) for _ in range(3))
+    law = partial(_law, whisking, threshold, head.shape)
+    return advance(config, mechanics, law, sweep, rest(*sweep.wall.shape[1:]))[0]
 
-    drive, told = still(*size), np.zeros(size)
-    touching, slipped = np.zeros(size, bool), np.zeros(size, bool)
-    late, x, before = np.zeros(size), np.zeros(size), np.zeros(size)
-    for k, time in enumerate(sweep.time):
-        aim, drive = command(whisking, drive, time, told, threshold, head.shape)
-        # A wall that comes upon a whisker from the side is met where the whisker is.
-        late = np.where(touching, late, np.maximum(before - sweep.wall[k], 0.0))
-        wall = sweep.wall[k] + late
-        bend = share[k] * (aim - wall)
-        touching = (bend > 0) & ~slipped
-        slipped |= touching & (bend > mechanics.slip)
-        touching &= ~slipped
-        bend = np.where(touching, bend, 0.0)
-        before = np.where(touching, wall + bend, aim)
-        limit = config.beam.friction * bend
-        x = np.minimum(np.maximum(x + slide[k], -limit), limit)
-        angle[k], bent[k], side[k] = before, bend, x
-        told = hard[k] * bend + heard[k]
-    return angle, hard * side, hard * bent
+
+def _law(
+    whisking: WhiskingConfig,
+    threshold: np.ndarray,
+    shape: tuple[int, int],
+    drive: Drive,
+    time: float,
+    told: np.ndarray,
+) -> tuple[np.ndarray, Drive]:
+    return command(whisking, drive, time, told, threshold, shape)

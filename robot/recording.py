@@ -6,18 +6,23 @@ import hashlib
 import os
 from array import array
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
+from itertools import chain
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 
+from robot.blocks import Event
 from robot.files import refuse, require_file, unreadable
 from robot.plausibility import clock, finite, views
 from robot.recorder import Recorder
+from robot.schemas import TRUTH
 from robot.source import Sample, Source, rate_of, rig_of
+from robot.tape import Tape
 from robot.units import ORDINARY, Limits, Track, units
-from robot.walk import Description, Walk
+from robot.walk import Walk
 from tactile.errors import InputError
 from tactile.types import Cycle, Observation, Report, Whisk
 
@@ -34,6 +39,7 @@ class Recording:
         truncated: whether the file ends before its proper end; `length` samples are read all the same.
         warning: that sentence, or ''.
         created_by: program and version that recorded it.
+        events: what a live session noted: faults, discontinuities, dropped images.
         rig: by what it was made, {} where the file does not say. whisked: whether some of its readings are
             whiskers, which have no view yet. params: what the rig says for whoever reproduces a run on it.
 
@@ -53,11 +59,18 @@ class Recording:
         self.digest = _digest(path)
         walk = Walk(path)
         columns = array("d")
+        events: list[Event] = []
         self.whisked = False
-        for sample in walk:
-            columns.extend(_column(sample))
-            self.whisked |= not isinstance(sample.reading, Observation)
-        description = _described(walk)
+        for entry in walk.entries():
+            if isinstance(entry.content, Sample):
+                columns.extend(_column(entry.content))
+                self.whisked |= not isinstance(entry.content.reading, Observation)
+            elif isinstance(entry.content, Event):
+                events.append(entry.content)
+        description = walk.description
+        if description is None or not walk.count:
+            raise _nothing(walk)
+        self.events = tuple(events)
         self.view_shape, self.whiskers = description.view_shape, description.whiskers
         self.created_by, self.rig = description.created_by, description.rig
         self.length = walk.count
@@ -142,7 +155,7 @@ def record(source: Source, path: Path) -> int:
 
 
 def recover(path: Path, out: Path) -> Recovery:
-    """Write every readable sample of a cut or damaged recording to a new, whole one.
+    """Write every readable message of a cut or damaged recording as it is to a new, whole one.
 
     The new file appears under its name only when it is complete. Nothing is judged but readability.
 
@@ -153,17 +166,22 @@ def recover(path: Path, out: Path) -> Recovery:
     if out.exists():
         raise InputError(str(out), "exists already", "a new file", "choose another name or move it")
     walk = Walk(path)
-    samples = iter(walk)
-    first = next(samples, None)
-    description = _described(walk)
+    entries = walk.entries()
+    first = next(entries, None)
+    if first is None or walk.description is None:
+        raise _nothing(walk)
+    described = walk.description
     draft = out.with_name(f".{out.name}.{os.getpid()}.part")
     try:
-        with Recorder(draft, view_shape=description.view_shape, whiskers=description.whiskers,
-                      rate_hz=description.rate_hz, rig=description.rig) as recorder:  # fmt: skip
-            if first is not None:
-                recorder.write(first)
-            for sample in samples:
-                recorder.write(sample)
+        tape = Tape(draft, view_shape=described.view_shape, whiskers=described.whiskers,
+                    rate_hz=described.rate_hz, rig=described.rig)  # fmt: skip
+        with closing(tape):
+            for entry in chain([first], entries):
+                if entry.truth is not None:
+                    tape.append(TRUTH, entry.time, entry.truth)
+                tape.append(entry.name, entry.time, entry.message)
+        if not walk.count:
+            raise _nothing(walk)
         with draft.open("rb") as file:
             os.fsync(file.fileno())
         os.replace(draft, out)
@@ -172,17 +190,15 @@ def recover(path: Path, out: Path) -> Recovery:
     return Recovery(walk.count, bool(walk.broken), walk.broken)
 
 
-def _described(walk: Walk) -> Description:
-    """The walked file's description, refusing a file without one or without samples."""
+def _nothing(walk: Walk) -> InputError:
+    """The refusal of a walked file without a description or without samples."""
     if walk.description is None:
         found = f"cannot be read as a recording: {walk.broken or 'it does not say what it holds'}"
-        raise InputError(
+        return InputError(
             str(walk.path), found, "an MCAP file written by ratslam", "ROS bags are not read yet"
         )
-    if not walk.count:
-        found = f"holds no samples{': ' + walk.broken if walk.broken else ''}"
-        raise InputError(str(walk.path), found, "at least one sample", "nothing can be recovered from it")
-    return walk.description
+    found = f"holds no samples{': ' + walk.broken if walk.broken else ''}"
+    return InputError(str(walk.path), found, "at least one sample", "nothing can be recovered from it")
 
 
 def _column(sample: Sample) -> tuple[float, ...]:

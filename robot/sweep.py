@@ -113,11 +113,18 @@ def _run(
     odometry: np.ndarray,
 ) -> Iterator[Cycle]:
     truth = tier(config, mechanics, whisking, head, sweep, threshold)
-    # A dead whisker sends zeros.
-    seen = (np.stack([part.swapaxes(0, 1) for part in truth], axis=-1) + sweep.noise) * head.alive[:, None]
-    deflection = np.clip(seen[..., 1:], -config.full_scale, config.full_scale)
+    angle, deflection = reported(config, head, truth, sweep.noise)
     for k in range(len(start)):
-        yield Cycle(start[k] + sweep.time, seen[k, ..., 0], deflection[k], Odometry(*odometry[k]))
+        yield Cycle(start[k] + sweep.time, angle[k], deflection[k], Odometry(*odometry[k]))
+
+
+def reported(
+    config: StreamConfig, head: Head, truth: tuple[np.ndarray, np.ndarray, np.ndarray], noise: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """What sensors make of what a tier found: angles [N, T, W] and deflections [N, T, W, 2], rad."""
+    # A dead whisker sends zeros.
+    seen = (np.stack([part.swapaxes(0, 1) for part in truth], axis=-1) + noise) * head.alive[:, None]
+    return seen[..., 0], np.clip(seen[..., 1:], -config.full_scale, config.full_scale)
 
 
 def _times(config: StreamConfig, whisking: WhiskingConfig) -> np.ndarray:
@@ -133,19 +140,33 @@ def _swept(
     start: np.ndarray,
     random: np.random.Generator,
 ) -> Sweep:
-    head, time = surroundings.head, _times(config, whisking)
+    time = _times(config, whisking)
     knots = np.linspace(0.0, 1 / whisking.rate, config.poses + 1)
-    pose = at(path, start[:, None] + knots)
+    whiskers = len(surroundings.head.length)
+    noise = mechanics.noise * random.standard_normal((len(start), len(time), whiskers, 3))
+    return passed(surroundings, at(path, start[:, None] + knots), knots, time, noise)
+
+
+def passed(
+    surroundings: Surroundings, pose: np.ndarray, knots: np.ndarray, time: np.ndarray, noise: np.ndarray
+) -> Sweep:
+    """What is in the way while heads move evenly from pose to pose.
+
+    Args:
+        pose: [N, K + 1, 3] m, m, rad; headings may be wrapped. knots: [K + 1] s, evenly spaced, when they are
+            reached. time: [T] s, of the samples. noise: [N, T, W, 3] rad.
+    """
+    head, step = surroundings.head, knots[1] - knots[0]
     met = surroundings.contact(pose.reshape(-1, 3))
-    shape = (len(start), len(knots), len(head.length))
+    shape = (len(pose), len(knots), len(head.length))
     wall, reach, box = (column.reshape(shape).swapaxes(0, 1) for column in met)
 
     # Between two poses a wall's angle changes evenly; where another wall takes over, half-way.
-    place = np.clip(np.searchsorted(knots, time, side="right") - 1, 0, config.poses - 1)
-    share = ((time - knots[place]) / knots[1])[:, None, None]
+    place = np.clip(np.searchsorted(knots, time, side="right") - 1, 0, len(knots) - 2)
+    share = ((time - knots[place]) / step)[:, None, None]
     same = (box[:-1] == box[1:]) & (box[1:] >= 0)
     share = np.where(same[place], share, np.round(share))
-    drift = _drift(head, pose, knots[1], wall, reach)
+    drift = _drift(head, pose, step, wall, reach)
     with np.errstate(invalid="ignore"):
         mixed = wall[place] + share * (wall[place + 1] - wall[place])
     return Sweep(
@@ -153,7 +174,7 @@ def _swept(
         wall=np.where(share == 0, wall[place], np.where(share == 1, wall[place + 1], mixed)),
         reach=np.maximum(reach[place] + share * (reach[place + 1] - reach[place]), 0.05),
         drift=drift[place],
-        noise=mechanics.noise * random.standard_normal((len(start), len(time), len(head.length), 3)),
+        noise=noise,
     )
 
 

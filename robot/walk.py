@@ -1,55 +1,42 @@
 """Reading a recording from its first byte to its last, or to the first that is broken.
 
-MCAP's own reader wants the table of contents at the end, which a killed writer never wrote. Here records are
-taken in the order they were written. Nothing a damaged file says is believed: lengths are bounded by what is
-left of the file, chunks must have their checksum, and samples their number in the sequence, so what is read
-is exactly a prefix of what was written.
+Nothing a damaged file says is believed: messages must be what their schemas say and have their number in the
+sequence, so what is read is exactly a prefix of what was written.
 """
 
 from __future__ import annotations
 
 import json
-import struct
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import IO, Any, NamedTuple, cast
+from typing import IO, Any, NamedTuple
 from zlib import crc32
 
 import numpy as np
-import zstandard
-from mcap.exceptions import EndOfFile, McapError
-from mcap.records import Channel, Chunk, McapRecord, Message, Metadata, Schema, Statistics
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.exceptions import EndOfFile
+from mcap.records import Channel, Message, Metadata, Schema, Statistics
 
+from robot.blocks import Event, decode_cut, decode_event, decode_frames, decode_states
 from robot.files import unreadable
-from robot.messages import (
-    CYCLE,
-    MOST,
-    OBSERVATION,
-    REPORT,
+from robot.head.decoder import Frames
+from robot.live.cycle import Window, assembled, no_frames
+from robot.messages import MOST, Malformed, decode, decode_truth
+from robot.records import BROKEN, records
+from robot.schemas import (
+    ARM,
+    BESIDE,
+    CUT,
+    FRAMES,
+    READINGS,
+    SCHEMA_OF,
     SCHEMAS,
     TRUTH,
-    WHISK,
-    Malformed,
-    decode,
-    decode_truth,
 )
 from robot.source import Sample
 
 METADATA = "ratslam"
 FORMAT = "2"
-TOPICS = {
-    OBSERVATION: "/ratslam/observation",
-    CYCLE: "/ratslam/cycle",
-    WHISK: "/ratslam/whisk",
-    REPORT: "/ratslam/report",
-    TRUTH: "/ratslam/truth",
-}
-SCHEMA_OF = {topic: name for name, topic in TOPICS.items()}
-CHUNK_LIMIT = 1 << 28  # bytes; ours hold 64 kB, or one sample if that is larger
-
-# What the MCAP and zstd libraries, and we, raise about bytes that are not what they should be.
-_BROKEN = (McapError, zstandard.ZstdError, struct.error, ValueError, OverflowError)
 
 
 class Description(NamedTuple):
@@ -105,8 +92,24 @@ def _checksum(data: Mapping[str, str]) -> str:
     return str(crc32(json.dumps({**data, "crc32": ""}, sort_keys=True).encode()))
 
 
+class Entry(NamedTuple):
+    """What a file holds, one after the other.
+
+    Attributes:
+        name: its schema. time: s, of the reading or of the newest part of a block.
+        message: as it is written. truth: the message that belongs to it, of a reading.
+        content: what it says: a sample, a head's frames, an arm's states [N], or an event.
+    """
+
+    name: str
+    time: float
+    message: bytes
+    truth: bytes | None
+    content: Sample | Frames | np.ndarray | Event
+
+
 class Walk:
-    """One pass over a file; iterate once.
+    """One pass over a file; iterate once, over its samples or over all its `entries`.
 
     Attributes:
         description: None until the file's has been read.
@@ -119,58 +122,108 @@ class Walk:
         self.description: Description | None = None
         self.broken = "it was not read to its end"
         self.count = 0
+        self._beside: Counter[str] = Counter()
+        self._window: Window | None = None
 
     def __iter__(self) -> Iterator[Sample]:
+        return (entry.content for entry in self.entries() if isinstance(entry.content, Sample))
+
+    def entries(self) -> Iterator[Entry]:
+        """Samples and what was written beside them, in their order."""
         try:
             with self.path.open("rb") as file:
-                yield from self._samples(file)
+                yield from self._entries(file)
         except OSError as error:
             raise unreadable(self.path, error) from error
 
-    def _samples(self, file: IO[bytes]) -> Iterator[Sample]:
+    def _entries(self, file: IO[bytes]) -> Iterator[Entry]:
         schemas: dict[int, Schema] = {}
-        names: dict[int, str] = {}
-        truth: tuple[float, np.ndarray] | None = None
+        names: dict[int, str | None] = {}  # of channels told; None: not one of ours
+        truth: bytes | None = None
         try:
-            for record in _records(file):
+            for record in records(file):
                 if isinstance(record, Metadata) and record.name == METADATA and self.description is None:
                     self.description = Description.from_metadata(record.metadata)
                 elif isinstance(record, Schema):
                     schemas[record.id] = record
                 elif isinstance(record, Channel):
-                    if record.topic in SCHEMA_OF:
-                        names[record.id] = _known(record, schemas)
-                elif isinstance(record, Message) and record.channel_id in names:
+                    names[record.id] = _known(record, schemas) if record.topic in SCHEMA_OF else None
+                elif isinstance(record, Message):
+                    if record.channel_id not in names:
+                        raise Malformed("a message on a channel that was not told")
                     name = names[record.channel_id]
-                    if self.description is None:
-                        raise Malformed("a sample before the recording's description")
-                    if record.sequence != self.count % (1 << 32):
-                        raise Malformed(f"sample {record.sequence} where {self.count} was due")
-                    if name == TRUTH:
-                        truth = decode_truth(record.data)
+                    if name is None:
                         continue
-                    time, reading = decode(
-                        name, record.data, self.description.view_shape, self.description.whiskers
-                    )
-                    sample = Sample(time, reading, truth[1] if truth is not None else None)
-                    truth = None
-                    self.count += 1
-                    yield sample
+                    self._number(name, record.sequence)
+                    if name == TRUTH:
+                        decode_truth(record.data)
+                        truth = record.data
+                    elif name in READINGS:
+                        sample = self._sample(name, record.data, truth)
+                        self.count += 1
+                        yield Entry(name, sample.time, record.data, truth, sample)
+                        truth = None
+                    else:
+                        time, content = self._block(name, record.data)
+                        self._beside[name] += 1
+                        yield Entry(name, time, record.data, None, content)
                 elif isinstance(record, Statistics):
                     self._compare(record, names)
-        except _BROKEN as error:
+        except BROKEN as error:
             self.broken = (
                 "it ends too early" if isinstance(error, EndOfFile) else str(error) or type(error).__name__
             )
         else:
             self.broken = ""
 
-    def _compare(self, statistics: Statistics, names: Mapping[int, str]) -> None:
+    def _number(self, name: str, number: int) -> None:
+        """Readings are numbered, a truth as its reading, and each kind of block for itself."""
+        if self.description is None:
+            raise Malformed("a sample before the recording's description")
+        what, due = ("sample", self.count) if name in (*READINGS, TRUTH) else (name, self._beside[name])
+        if number != due % (1 << 32):
+            raise Malformed(f"{what} {number} where {due} was due")
+
+    def _sample(self, name: str, message: bytes, truth: bytes | None) -> Sample:
+        assert self.description is not None
+        where = None if truth is None else decode_truth(truth)[1]
+        if name != CUT:
+            time, reading = decode(name, message, self.description.view_shape, self.description.whiskers)
+            return Sample(time, reading, where)
+        cut = decode_cut(message)
+        return Sample(cut.time, assembled(self._frames.between(cut.first, cut.last), cut), where)
+
+    def _block(self, name: str, message: bytes) -> tuple[float, Frames | np.ndarray | Event]:
+        assert self.description is not None
+        if name == FRAMES:
+            time, frames = decode_frames(message, self.description.whiskers)
+            self._frames.add(frames)
+            return time, frames
+        if name == ARM:
+            return decode_states(message)
+        event = decode_event(message)
+        return event.time, event
+
+    @property
+    def _frames(self) -> Window:
+        if self._window is None:
+            assert self.description is not None
+            self._window = Window(no_frames(self.description.whiskers))
+        return self._window
+
+    def _compare(self, statistics: Statistics, names: Mapping[int, str | None]) -> None:
         """A chunk whose very type is damaged is passed over as unknown: then the numbers differ."""
-        counts = statistics.channel_message_counts
-        written = sum(counts.get(number, 0) for number, name in names.items() if name != TRUTH)
-        if written != self.count:
-            raise Malformed(f"{self.count} samples where {written} were written")
+        written: Counter[str | None] = Counter()
+        for channel, count in statistics.channel_message_counts.items():
+            if channel not in names:
+                raise Malformed("messages were written on a channel that was not told")
+            written[names[channel]] += count
+        readings = sum(written[name] for name in READINGS)
+        if readings != self.count:
+            raise Malformed(f"{self.count} samples where {readings} were written")
+        for name in BESIDE:
+            if written[name] != self._beside[name]:
+                raise Malformed(f"{self._beside[name]} messages {name} where {written[name]} were written")
 
 
 def _known(channel: Channel, schemas: Mapping[int, Schema]) -> str:
@@ -179,44 +232,3 @@ def _known(channel: Channel, schemas: Mapping[int, Schema]) -> str:
     if schema is None or schema.data != SCHEMAS[name].encode():
         raise Malformed(f"messages on {channel.topic} that are defined otherwise than here")
     return name
-
-
-class _Bounded:
-    """A file that neither pretends to be longer than it is nor hands out half of what was asked for."""
-
-    def __init__(self, file: IO[bytes]) -> None:
-        self._file = file
-        self._left = file.seek(0, 2)
-        file.seek(0)
-
-    def read(self, size: int) -> bytes:
-        if not 0 <= size <= self._left:
-            raise EndOfFile
-        content = self._file.read(size)
-        if len(content) != size:
-            raise EndOfFile  # it shrank while we read
-        self._left -= size
-        return content
-
-
-def _records(file: IO[bytes]) -> Iterator[McapRecord]:
-    """Every record in order, chunks opened; raises one of `_BROKEN`."""
-    reader = StreamReader(cast(Any, _Bounded(file)), emit_chunks=True, validate_crcs=True)
-    for record in reader.records:
-        if isinstance(record, Chunk):
-            yield from _opened(record)
-        elif not isinstance(record, (Message, Channel, Schema)):  # outside a chunk they have no checksum
-            yield record
-
-
-def _opened(chunk: Chunk) -> list[McapRecord]:
-    if chunk.compression not in ("zstd", ""):
-        raise Malformed(f"a chunk compressed with {chunk.compression!r}")
-    size = len(chunk.data)
-    if chunk.compression:
-        size = max(chunk.uncompressed_size, zstandard.frame_content_size(chunk.data))
-    if size > CHUNK_LIMIT:
-        raise Malformed(f"a chunk of {size} bytes")
-    if not chunk.uncompressed_crc:
-        raise Malformed("a chunk without its checksum")
-    return breakup_chunk(chunk, validate_crc=True)

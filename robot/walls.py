@@ -91,14 +91,14 @@ class Surroundings:
         wall = np.full(met.shape, -1)
         row, ray, box = np.nonzero((leave > enter) & (leave > 0) & (enter < self.range))
         d1, d2, top = enter[row, ray, box], leave[row, ray, box], self.walls.height[near[box]]
-        for w in range(len(self._radius)):
-            mine = np.flatnonzero(ray == self._ray[w])
-            angle, share = self._down(w, d1[mine], d2[mine], top[mine])
-            # Of several boxes the one met first counts: the smallest protraction.
-            order = np.argsort(-angle, kind="stable")
-            met[row[mine][order], w] = angle[order]
-            reach[row[mine][order], w] = share[order]
-            wall[row[mine][order], w] = near[box[mine][order]]
+        # What a ray crosses is met by every whisker that lies in it.
+        crossing, whisker = np.nonzero(ray[:, None] == self._ray)
+        row, box = row[crossing], box[crossing]
+        angle, share = self._down(whisker, d1[crossing], d2[crossing], top[crossing])
+        # Of several boxes the one met first counts: the smallest protraction, which is written last.
+        order = np.argsort(-angle, kind="stable")
+        place = row[order], whisker[order]
+        met[place], reach[place], wall[place] = angle[order], share[order], near[box[order]]
         free = ~np.isfinite(met)
         reach[free], wall[free] = 0.0, -1
         return met, reach, wall
@@ -113,8 +113,10 @@ class Surroundings:
             far.append((np.minimum(*edges), np.maximum(*edges)))
         return np.maximum(far[0][0], far[1][0]), np.minimum(far[0][1], far[1][1])
 
-    def _down(self, w: int, d1: np.ndarray, d2: np.ndarray, top: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Protraction at which whisker w meets boxes from d1 to d2 m away, and where along it."""
+    def _down(
+        self, w: np.ndarray, d1: np.ndarray, d2: np.ndarray, top: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Protraction at which whiskers w [N] meet boxes from d1 to d2 m away, and where along them."""
         radius, length, rest = self._radius[w], self.head.length[w], self._opening[w]
         drop = self.head.base[w, 2] - top
         # With the tip as high as the top, how far out is it?

@@ -63,7 +63,8 @@ def reached(config: ShaftConfig, ratio: Array) -> np.ndarray:
 def sensed(config: ContactConfig, calibration: Calibration, cycle: Cycle, where: str = "touch") -> Whisk:
     """What each whisker felt in one cycle.
 
-    A whisker with a value missing anywhere in the cycle is not alive in it.
+    A whisker with a value missing anywhere in the cycle is not alive in it; in a cycle without samples, whose
+    stream was dropped, none is.
 
     Args:
         where: what errors call the stream.
@@ -71,6 +72,8 @@ def sensed(config: ContactConfig, calibration: Calibration, cycle: Cycle, where:
     Raises:
         InputError: the stream is broken, cut off or too coarse for the slope window.
     """
+    if not len(cycle.time):
+        return _nothing(cycle, len(calibration.alive))
     rate = sample_rate(cycle.time, config.slope_window, where)
     window = round(config.slope_window * rate)
     if len(cycle.time) < 2 * window:
@@ -111,6 +114,11 @@ def sensed(config: ContactConfig, calibration: Calibration, cycle: Cycle, where:
         highest=np.where(alive, np.where(held, smooth[last], smooth.max(axis=0)), 0.0),
         reach=np.where(contact, reach, 0.0),
     )
+
+
+def _nothing(cycle: Cycle, whiskers: int) -> Whisk:
+    no, zero = np.zeros(whiskers, bool), np.zeros(whiskers)
+    return Whisk(cycle.odometry, no, no, zero, no, zero, zero)
 
 
 def _line(value: np.ndarray, window: int) -> tuple[np.ndarray, np.ndarray]:

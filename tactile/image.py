@@ -48,9 +48,12 @@ def image(config: ImageConfig, head: Head, whisk: Whisk) -> np.ndarray:
 
 
 def observed(config: ImageConfig, head: Head, whisk: Whisk) -> Observation:
-    """What an engine is given of one cycle; points of contact where the whiskers were touched."""
+    """What an engine is given of one cycle; points of contact where the whiskers were touched.
+
+    There is no view where no whisker reports.
+    """
     plain = observation(whisk.odometry, image(config, head, whisk), whiskers=len(head.length))
     seen = whisk.contact & whisk.alive
     along = np.where(whisk.reach > 0, whisk.reach, 1.0) * head.length
     point = shaft(head, np.where(seen, whisk.touched, 0.0), along)[:, :2] * seen[:, None]
-    return plain._replace(contact=seen, alive=whisk.alive, point=point)
+    return plain._replace(view_seen=np.bool_(whisk.alive.any()), contact=seen, alive=whisk.alive, point=point)

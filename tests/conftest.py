@@ -18,6 +18,8 @@ if "RATSLAM_TEST_CACHE" not in os.environ:
     # Workers share what one of them has compiled; every run of the suite starts from nothing.
     os.environ["RATSLAM_TEST_CACHE"] = tempfile.mkdtemp(prefix="ratslam-tests-")
     atexit.register(shutil.rmtree, os.environ["RATSLAM_TEST_CACHE"], ignore_errors=True)
+# Programs that tests start keep what they compile there too, away from the user's.
+os.environ["XDG_CACHE_HOME"] = os.environ["RATSLAM_TEST_CACHE"]
 
 import jax
 from hypothesis import HealthCheck, settings
@@ -25,7 +27,7 @@ from hypothesis import HealthCheck, settings
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
-jax.config.update("jax_compilation_cache_dir", os.environ["RATSLAM_TEST_CACHE"])
+jax.config.update("jax_compilation_cache_dir", f"{os.environ['XDG_CACHE_HOME']}/ratslam/jax")
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 

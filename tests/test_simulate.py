@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -25,15 +24,6 @@ ROOT = Path(__file__).parents[1]
 CONFIG = "simulation: {path: {explore: 150}, seed: 5}\ntouch: {head: {dead: [4]}}\n"
 REPLAY = "recording: {file: session.mcap}\n"
 SAME = ("trajectory.tum", "online.tum", "odometry.tum", "truth.tum", "steps.csv", "map.g2o", "map.json")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory):
-    """One compile cache for all runs of this file, away from the user's."""
-    before = os.environ.get("XDG_CACHE_HOME")
-    os.environ["XDG_CACHE_HOME"] = str(tmp_path_factory.mktemp("cache"))
-    yield
-    os.environ.pop("XDG_CACHE_HOME") if before is None else os.environ.update(XDG_CACHE_HOME=before)
 
 
 @pytest.fixture(scope="module")
@@ -139,7 +129,7 @@ def test_there_must_be_something_to_simulate(capsys, folder, tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("touch: {}\n", ["neither recording, simulation nor roving"]),
+        ("touch: {}\n", ["neither recording, simulation, roving nor live"]),
         ("recording: {file: a.npz}\nsimulation: {}\n", ["recording and simulation; give one"]),
         ("simulation: {sed: 1}\n", ["did you mean 'seed'"]),
         ("simulation: {path: {circuits: CA, explore: 3}}\n", ["circuits and explore", "exactly one"]),

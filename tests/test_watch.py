@@ -29,14 +29,6 @@ from tactile.frames import tum_line
 ROOT = Path(__file__).parents[1]
 
 
-@pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory):
-    """One compile cache for all runs of this file, away from the user's."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        yield
-
-
 SQUARE = str(ROOT / "configs" / "square.yaml")
 PACED = """
 import sys, time

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable
 
 # Only what parsing arguments needs is imported here: `--help` answers before jax would have loaded.
-from ratslam.cli import arena, frontier, many, sessions, sweeps, touch, watch
+from ratslam.cli import arena, frontier, live, many, sessions, sweeps, touch, watch
 from ratslam.cli.common import INTERRUPTED, MENDABLE
 from tactile.errors import InputError
 
@@ -44,6 +44,6 @@ def _parser() -> argparse.ArgumentParser:
         added.set_defaults(command=does)
         return added
 
-    for group in (sessions, many, sweeps, frontier, touch, arena, watch):
+    for group in (sessions, live, many, sweeps, frontier, touch, arena, watch):
         group.add(command)
     return parser

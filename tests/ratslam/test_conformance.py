@@ -254,6 +254,14 @@ def test_compiles_once_per_capacity(make):
     assert reserved.compilations() == 1
 
 
+def test_warming_up_changes_nothing_but_when_it_compiles(make):
+    warm = Session(make())
+    warm.warm(next(walk(1)))
+    assert (warm.compilations(), warm.steps) == (1, 0)
+    assert equal([warm.step(o) for o in walk(20)], replayed(make)[0][:20])
+    assert warm.compilations() == 1
+
+
 @pytest.mark.parametrize("name", ["classic", "classic-labels", "grid", "dead-reckoning"])
 def test_what_learns_nothing_new_does_not_grow(name):
     """Else a long run on known ground would take more and more time and memory."""

@@ -17,12 +17,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from robot.messages import OBSERVATION, REPORT, SCHEMAS, WHISK, decode, encode
+from robot.messages import decode, encode
 from robot.recorder import Recorder
 from robot.recording import Recording, record, recover
+from robot.schemas import CYCLE, OBSERVATION, REPORT, SCHEMAS, TOPICS, WHISK
 from robot.source import Rigged, Sample, Source, rig_of
 from robot.streams import read_stream
-from robot.walk import FORMAT, TOPICS, Walk, _checksum
+from robot.walk import FORMAT, Walk, _checksum
 from tactile.errors import InputError
 from tactile.types import Cycle, Observation, Odometry, Report, Whisk, observation
 
@@ -410,8 +411,6 @@ def test_the_standard_reader_reads_it(small: tuple[bytes, list[Sample]], tmp_pat
 def test_ros_tools_read_the_messages() -> None:
     pytest.importorskip("rosbags", reason="rosbags, an extra, is not installed")
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    from robot.messages import CYCLE
 
     store = get_typestore(Stores.EMPTY)
     for name, text in SCHEMAS.items():

@@ -136,3 +136,14 @@ def test_broken_streams_are_refused() -> None:
         sensed(CONFIG, known(), cycle._replace(time=cycle.time * 0))
     with pytest.raises(InputError, match="cut off"):
         sensed(CONFIG, known(), Cycle(*(part[:10] for part in cycle[:3]), cycle.odometry))
+
+
+def test_a_whisk_without_samples_says_nothing() -> None:
+    """Its stream was dropped; motion counts all the same."""
+    whole = whisk(WALLS)
+    felt = sensed(CONFIG, known(), Cycle(*(part[:0] for part in whole[:3]), whole.odometry))
+    usual = sensed(CONFIG, known(), whole)
+    assert felt.odometry == whole.odometry
+    for part, other in zip(felt[1:], usual[1:], strict=True):
+        assert (part.shape, part.dtype) == (other.shape, other.dtype)
+        assert not part.any()

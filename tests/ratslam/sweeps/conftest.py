@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from evaluation.scorecard import Quantity
-from ratslam.cli.common import prepare_jax
 from ratslam.sweeps.results import Result
 from ratslam.sweeps.study import Job
 
@@ -23,16 +21,6 @@ TINY = {
     "matcher": "classic",
 }
 """Some 40 whisks."""
-
-
-@pytest.fixture(scope="session", autouse=True)
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """One compile cache for all programs of these tests, away from the user's."""
-    before = os.environ.get("XDG_CACHE_HOME")
-    os.environ["XDG_CACHE_HOME"] = str(tmp_path_factory.mktemp("cache"))
-    prepare_jax()
-    yield
-    os.environ.pop("XDG_CACHE_HOME") if before is None else os.environ.update(XDG_CACHE_HOME=before)
 
 
 @pytest.fixture

@@ -1,0 +1,268 @@
+"""The engine in a process of its own: samples go in as they come, steps come back when they are done.
+
+The process that moves the robot never waits for it, and a fault in one does not end the other: without its
+parent, the mapper ends the run directory with what it has.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import queue
+import signal
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from multiprocessing.connection import Connection
+from pathlib import Path
+from threading import Thread
+from types import TracebackType
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+
+from evaluation.scorecard import Scorecard
+from ratslam.config import RunConfig
+from robot.source import Sample
+from tactile.errors import InputError
+
+LOG = "mapper.log"
+"""In the run directory: what the mapper's process had to say."""
+END = 120.0
+"""How long it may take to score and draw, s."""
+
+
+class Order(NamedTuple):
+    """What is to be mapped.
+
+    Attributes:
+        config: with `recording` being what the session is recorded to. rig: as in the recording.
+        directory: the new run directory. view_shape, whiskers, rate_hz: of the samples.
+    """
+
+    config: RunConfig
+    rig: Mapping[str, Any]
+    directory: Path
+    view_shape: tuple[int, int, int]
+    whiskers: int
+    rate_hz: float
+
+
+class Told(NamedTuple):
+    """What a sample led to.
+
+    Attributes:
+        number: of the sample. pose: [3] as estimated then, in the map. place: -1 without one. action: by
+            name. seconds: that it took.
+    """
+
+    number: int
+    pose: np.ndarray
+    place: int
+    action: str
+    seconds: float
+
+
+class Mapper:
+    """The mapper's process from outside; a context manager. It starts at once, to be ready when it is needed.
+
+    Attributes:
+        told: of every sample that was mapped, in order.
+    """
+
+    def __init__(self, process: Any = None) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._line, theirs = context.Pipe()
+        target = process or mapping
+        self._process = context.Process(target=target, args=(theirs,), daemon=True, name="ratslam mapper")
+        self._process.start()
+        theirs.close()
+        self.told: list[Told] = []
+        self._ready, self._failed = False, ""
+        self._refusal: InputError | None = None
+        self._card: Scorecard | None = None
+        self._offered: list[float] = []
+        self._outbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._sender = Thread(target=self._send, daemon=True, name="to mapper")
+        self._sender.start()
+
+    def begin(self, order: Order) -> None:
+        """Has it make its directory and compile; returns at once, `ready` tells when it is done."""
+        self._outbox.put(order)
+
+    def ready(self) -> bool:
+        """Whether samples may come.
+
+        Raises:
+            InputError: what it was ordered cannot be done, or it is no more.
+        """
+        self.hear()
+        if self._refusal is not None:
+            raise self._refusal
+        if not self.alive:
+            raise InputError("live", f"the mapper ended: {self.failure}", "")
+        return self._ready
+
+    def offer(self, sample: Sample) -> None:
+        """The next sample; returns at once."""
+        self._offered.append(time.monotonic())
+        self._outbox.put(sample)
+
+    def behind(self) -> float:
+        """For how long the oldest sample that is not mapped yet has waited, s."""
+        self.hear()
+        return (
+            time.monotonic() - self._offered[len(self.told)] if len(self.told) < len(self._offered) else 0.0
+        )
+
+    def hear(self) -> None:
+        """Takes in what it has told."""
+        try:
+            while self._line.poll():
+                self._take(self._line.recv())
+        except (EOFError, OSError):
+            self._failed = self._failed or "its line broke"
+
+    @property
+    def alive(self) -> bool:
+        """Whether it can still map."""
+        return self._process.is_alive() and not self._failed and self._refusal is None
+
+    @property
+    def failure(self) -> str:
+        """Why it cannot, as far as is known."""
+        return self._failed or str(self._refusal or f"it ended with code {self._process.exitcode}")
+
+    def finish(self, interrupted: bool) -> Scorecard | None:
+        """The score of what was mapped; None if it is no more, or mapped nothing.
+
+        Args:
+            interrupted: whether there was more to come.
+        """
+        self._outbox.put(interrupted)
+        due = time.monotonic() + END
+        while self._card is None and self.alive and time.monotonic() < due:
+            self._line.poll(0.05)
+            self.hear()
+        return self._card
+
+    def _take(self, word: Any) -> None:
+        if isinstance(word, Told):
+            self.told.append(word)
+        elif isinstance(word, Scorecard):
+            self._card = word
+        elif isinstance(word, InputError):
+            self._refusal = word
+        elif word is True:
+            self._ready = True
+        else:
+            self._failed = str(word)
+
+    def _send(self) -> None:
+        while True:
+            word = self._outbox.get()
+            try:
+                self._line.send(word)
+            except (OSError, ValueError):
+                return
+            if isinstance(word, bool):
+                return
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._card is None and self._process.is_alive():
+            self._process.kill()
+        self._process.join(5.0)
+        self._outbox.put(True)
+        self._line.close()
+
+
+class Fed:
+    """Samples as they come down a line, as a source.
+
+    Attributes:
+        interrupted: whether there was more to come, when it ends. received: when the last sample came, s.
+    """
+
+    name, digest, whisked, length = "live", "", True, None
+
+    def __init__(self, order: Order, line: Connection) -> None:
+        self.rate_hz, self.view_shape, self.whiskers = order.rate_hz, order.view_shape, order.whiskers
+        self.rig, self.params = order.rig, order.rig.get("params", {})
+        self.interrupted = True  # unless the parent says otherwise
+        self.received = 0.0
+        self._line = line
+
+    def __iter__(self) -> Iterator[Sample]:
+        while True:
+            try:
+                word = self._line.recv()
+            except (EOFError, OSError):
+                return  # nobody is there any more
+            if isinstance(word, bool):
+                self.interrupted = word
+                return
+            self.received = time.monotonic()
+            yield word
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        return None
+
+
+def mapping(line: Connection) -> None:
+    """What the mapper's process does."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to hear
+    try:
+        _map(line)
+    except InputError as error:
+        _tell(line, error)
+    except EOFError:
+        pass  # nobody wants it any more
+    except Exception as error:
+        _tell(line, f"{type(error).__name__}: {error}")
+        raise
+
+
+def _map(line: Connection) -> None:
+    from ratslam.playing import playing
+    from ratslam.types import Action
+    from robot.sensing import sensing
+    from tactile.types import Odometry, observation
+
+    order = line.recv()
+    with Fed(order, line) as fed:
+        config = order.config.completed(fed)
+        source = sensing(fed, config.touch)
+        with playing(config, source, order.directory) as play:
+            _log(order.directory / LOG)
+            blank = observation(
+                Odometry(0.0, 0.0, 0.0, 0.0), view_shape=source.view_shape, whiskers=source.whiskers
+            )
+            play.session.warm(blank)
+            line.send(True)
+            for number, sample in enumerate(source):
+                (step,) = play.feed([sample])
+                action = Action(int(step.estimate.action)).name.lower()
+                took = time.monotonic() - fed.received
+                _tell(line, Told(number, np.asarray(step.pose), int(step.estimate.place), action, took))
+            if play.session.steps:
+                _tell(line, play.finish(fed.interrupted))
+
+
+def _tell(line: Connection, word: Any) -> None:
+    with suppress(OSError):  # nobody listens: the results are for the disk
+        line.send(word)
+
+
+def _log(path: Path) -> None:
+    """What the process prints, tracebacks included, goes to a file: the terminal is the parent's."""
+    with path.open("ab") as file:
+        os.dup2(file.fileno(), sys.stderr.fileno())

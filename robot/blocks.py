@@ -1,0 +1,199 @@
+"""How a live session is written down: blocks of frames and of arm states, cuts, events.
+
+Messages as in `robot.messages`. Frames lie channel by channel, as differences from frame to frame: small
+numbers, of which compression leaves little.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import NamedTuple
+
+import numpy as np
+
+from robot.head.decoder import Frames
+from robot.head.wire import CHANNELS
+from robot.live.cycle import Cut
+from robot.messages import CDR, MOST, Malformed
+from robot.ur10.states import STATE
+from tactile.types import Odometry
+
+NUMBERS = ("host", "robot", "tcp", "speed", "force", "joints")
+WORDS = ("mode", "safety", "runtime", "operation", "progress")
+"""Which fields of a state are numbers, which words, in the order in which they are written."""
+
+
+class Event(NamedTuple):
+    """Something that happened, for whoever reads the recording.
+
+    Attributes:
+        time: s. name: one word, as `fault` or `discontinuity`. text: what was found.
+    """
+
+    time: float
+    name: str
+    text: str
+
+
+def encode_frames(time: float, frames: Frames) -> bytes:
+    """A block of frames, the newest of which came at that time, s."""
+    count, whiskers, channels = frames.values.shape
+    planes = frames.values.reshape(count, whiskers * channels).T
+    parts = [
+        struct.pack("<4sd2I", CDR, time, count, count),
+        _steps(frames.sequence, "<i8"),
+        struct.pack("<2I", whiskers, count),
+        _steps(frames.time, "<i8"),
+        struct.pack("<2I", channels, count),
+        frames.flags.astype("<u4").tobytes(),
+        struct.pack("<I", planes.size),
+        _steps(planes, "<i2"),
+    ]
+    return b"".join(parts)
+
+
+def decode_frames(message: bytes, whiskers: int) -> tuple[float, Frames]:
+    """The inverse of `encode_frames`, for a head with so many whiskers; raises `Malformed`."""
+    fields = _Fields(message)
+    time = fields.number("<d")
+    count = fields.size()
+    sequence = fields.array("<i8", count)
+    if fields.size() != whiskers:
+        raise Malformed(f"frames of another head than the recording's, which has {whiskers} whiskers")
+    device = fields.array("<i8", count)
+    if fields.size() != CHANNELS:
+        raise Malformed(f"frames of other than {CHANNELS} channels")
+    flags = fields.array("<u4", count)
+    planes = fields.array("<i2", count * whiskers * CHANNELS).reshape(whiskers * CHANNELS, count)
+    fields.end()
+    if (flags > 255).any():
+        raise Malformed(f"frame flags {int(flags.max())} where 255 is the largest possible")
+    values = np.cumsum(planes, axis=1, dtype=np.int16).T.reshape(count, whiskers, CHANNELS)
+    return time, Frames(
+        np.cumsum(sequence, dtype=np.int64),
+        np.cumsum(device, dtype=np.int64),
+        flags.astype(np.uint8),
+        np.ascontiguousarray(values),
+    )
+
+
+def encode_states(states: np.ndarray) -> bytes:
+    """A block of arm states [N] (`robot.ur10.states.STATE`), at least one."""
+    count = len(states)
+    numbers = np.concatenate([states[name].reshape(count, -1) for name in NUMBERS], axis=1)
+    words = np.stack([states[name].astype("<i4") for name in WORDS])
+    parts = [
+        struct.pack("<4sd2I", CDR, states["host"][-1], count, count),
+        states["counter"].astype("<i8").tobytes(),
+        struct.pack("<2I", numbers.shape[1], numbers.size),
+        np.ascontiguousarray(numbers.T, "<f8").tobytes(),
+        struct.pack("<2I", len(words), words.size),
+        words.tobytes(),
+    ]
+    return b"".join(parts)
+
+
+def decode_states(message: bytes) -> tuple[float, np.ndarray]:
+    """(time, states [N]), the inverse of `encode_states`; raises `Malformed`."""
+    fields = _Fields(message)
+    time = fields.number("<d")
+    count = fields.size()
+    counter = fields.array("<i8", count)
+    rows = fields.size()
+    numbers = fields.array("<f8", rows * count).reshape(rows, count)
+    width = fields.size()
+    words = fields.array("<i4", width * count).reshape(width, count)
+    fields.end()
+    if width != len(WORDS) or rows != sum(STATE[name].itemsize // 8 for name in NUMBERS):
+        raise Malformed(f"arm states of {rows} numbers and {width} words")
+    states = np.zeros(count, STATE)
+    states["counter"] = counter
+    row = 0
+    for name in NUMBERS:
+        wide = STATE[name].itemsize // 8
+        states[name] = numbers[row : row + wide].T.reshape(states[name].shape)
+        row += wide
+    for name, word in zip(WORDS, words, strict=True):
+        states[name] = word.astype(STATE[name])
+    return time, states
+
+
+_CUT = struct.Struct("<4s6d3qI?")
+
+
+def encode_cut(cut: Cut) -> bytes:
+    """A cut as a message."""
+    return _CUT.pack(
+        CDR, cut.time, *cut.odometry, cut.start, cut.number, cut.first, cut.last, cut.frames, cut.seen
+    )
+
+
+def decode_cut(message: bytes) -> Cut:
+    """The inverse of `encode_cut`; raises `Malformed`."""
+    if len(message) != _CUT.size or not message.startswith(CDR):
+        raise Malformed("a cut that is no cut")
+    _, time, *motion, start, number, first, last, frames, seen = _CUT.unpack(message)
+    odometry = Odometry(*(np.float64(value) for value in motion))
+    return Cut(number, time, start, first, last, frames, odometry, seen)
+
+
+def encode_event(event: Event) -> bytes:
+    """An event as a message."""
+    if ": " in event.name:
+        raise ValueError(f"an event's name {event.name!r} with a colon in it")
+    text = f"{event.name}: {event.text}".encode() + b"\0"
+    return struct.pack("<4sdI", CDR, event.time, len(text)) + text
+
+
+def decode_event(message: bytes) -> Event:
+    """The inverse of `encode_event`; raises `Malformed`."""
+    fields = _Fields(message)
+    time = fields.number("<d")
+    text = fields.array("u1", None).tobytes()
+    fields.end()
+    name, colon, found = text[:-1].decode().partition(": ")
+    if not (colon and text.endswith(b"\0")):
+        raise Malformed("an event without a name")
+    return Event(time, name, found)
+
+
+def _steps(value: np.ndarray, kind: str) -> bytes:
+    """The first along the last axis, then differences, which wrap as the numbers do."""
+    return np.diff(value, axis=-1, prepend=value.dtype.type(0)).astype(kind).tobytes()
+
+
+class _Fields:
+    """A message's fields, one after the other."""
+
+    def __init__(self, message: bytes) -> None:
+        if not message.startswith(CDR):
+            raise Malformed("a message in another encoding")
+        self._message, self._place = message, len(CDR)
+
+    def number(self, kind: str) -> float:
+        """One number."""
+        return float(self._take(kind, 1)[0])
+
+    def size(self) -> int:
+        """A uint32."""
+        return int(self._take("<u4", 1)[0])
+
+    def array(self, kind: str, count: int | None) -> np.ndarray:
+        """An array that must have so many numbers (None: any number of them)."""
+        found = self.size()
+        if count is not None and found != count:
+            raise Malformed(f"an array of {found} numbers where {count} were due")
+        return self._take(kind, found)
+
+    def end(self) -> None:
+        """There must be no more."""
+        if self._place != len(self._message):
+            raise Malformed(f"{len(self._message) - self._place} bytes more than a message has")
+
+    def _take(self, kind: str, count: int) -> np.ndarray:
+        size = np.dtype(kind).itemsize * count
+        if count > MOST or self._place + size > len(self._message):
+            raise Malformed("a message that ends too early")
+        found = np.frombuffer(self._message, kind, count, self._place)
+        self._place += size
+        return found

@@ -1,0 +1,50 @@
+"""`python -m robot.emulators.head --host 127.0.0.11 --config FILE.json`: serves until it is killed.
+
+Prints `ready` when it listens.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from robot.emulators.head.server import serve
+from robot.emulators.head.settings import HeadEmulatorConfig
+from tactile.errors import InputError
+
+
+def main(words: list[str] | None = None) -> int:
+    """The program; returns its exit code."""
+    parser = argparse.ArgumentParser(prog="python -m robot.emulators.head", description=__doc__)
+    parser.add_argument("--host", help="address to listen at, instead of the configuration's")
+    parser.add_argument("--config", type=Path, help="JSON of a HeadEmulatorConfig; its defaults without")
+    asked = parser.parse_args(words)
+    try:
+        config = _read(asked.config)
+        if asked.host is not None:
+            config = config.model_copy(update={"host": asked.host})
+        serve(config)
+    except InputError as error:
+        print(error, file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+    return 0
+
+
+def _read(file: Path | None) -> HeadEmulatorConfig:
+    if file is None:
+        return HeadEmulatorConfig()
+    try:
+        return HeadEmulatorConfig.model_validate_json(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(str(file), str(error.strerror), "a readable file") from None
+    except ValidationError as error:
+        raise InputError(str(file), str(error), "a HeadEmulatorConfig") from None
+
+
+if __name__ == "__main__":
+    sys.exit(main())

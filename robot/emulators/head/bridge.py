@@ -1,0 +1,220 @@
+"""An emulated head as its host knows it: transfers in and out, and frames as time goes on.
+
+Nothing here waits or reads a clock: who serves it tells the time.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+from collections import Counter
+from typing import Any
+
+import numpy as np
+
+from robot.emulators.head import descriptors
+from robot.emulators.head.faults import Faults
+from robot.emulators.head.fifo import Fifo
+from robot.emulators.head.settings import HeadEmulatorConfig
+from robot.emulators.head.whereabouts import Along, Place
+from robot.emulators.head.whiskers import Block, Whiskers
+from robot.head.wire import CHANNELS, REQUEST_IN, VERSION, Flag, Request, counts, encode, unpack
+from robot.walls import Walls
+from tactile.head import ur10_head
+from tactile.streams import stream
+
+BLOCK = 0.01
+"""s of samples that are made, and become readable, together."""
+STRING, CONFIGURE, CONFIGURED, ALTERNATE = (0x80, 6), (0x00, 9), (0x80, 8), (0x01, 11)
+"""Standard requests that it answers, by bmRequestType and bRequest."""
+
+
+class Bridge:
+    """A head with power.
+
+    Args:
+        walls: around it. place: where it is. now: s, host's monotonic clock, when its clock begins.
+
+    Attributes:
+        fifo: frames for the host. faults: what goes wrong with it. whiskers: what it feels with.
+        streaming: whether it makes frames. heard: commands that came, by kind; "" for those it ignored.
+    """
+
+    def __init__(self, config: HeadEmulatorConfig, walls: Walls, place: Place, now: float) -> None:
+        head = ur10_head(config.head)
+        self.config, self.place, self.began = config, place, now
+        self.samples = max(round(BLOCK * config.stream.rate), 2)
+        self.whiskers = Whiskers(
+            config.stream,
+            config.mechanics,
+            head,
+            walls,
+            place,
+            stream(config.seed, "sensor"),
+            self.samples,
+        )
+        self.fifo = Fifo(config.fifo)
+        self.faults = Faults(len(head.length), stream(config.seed, "faults"))
+        self.streaming = False
+        self.heard: Counter[str] = Counter()
+        self._pace = 1 + config.drift_ppm * 1e-6  # of its clock
+        self._made = 0  # samples
+        self._first = round(config.age * config.stream.rate)
+
+    @property
+    def due(self) -> float:
+        """When the next block is complete, s."""
+        return self._when(self._made + self.samples)
+
+    def advance(self, now: float) -> bool:
+        """Makes the next block, if it is complete by now; whether it was."""
+        end = self.due
+        if now < end:
+            return False
+        if self.streaming or not self.whiskers.drives.resting:
+            block = self.whiskers.block(self._when(self._made), end)
+            if self.streaming:
+                self._send(block, end)
+        else:
+            self.whiskers.rested()
+        self._made += self.samples
+        return True
+
+    def bulk_in(self, size: int, now: float) -> bytes:
+        """So many bytes of frames, or what there is.
+
+        Raises:
+            OSError: as the transfer ends.
+        """
+        return self.fifo.take(size) if self.faults.check_in(now) else b""
+
+    def bulk_out(self, packet: bytes, now: float) -> None:
+        """Takes a command; one that is none of ours is ignored."""
+        command = unpack(packet)
+        if command is None:
+            self.heard[""] += 1
+            return
+        self.heard[command.kind.name] += 1
+        self.whiskers.drives.hear(command, now)
+
+    def control(self, kind: int, request: int, value: int, size: int, now: float) -> bytes:
+        """The answer to a control request, cut to the size.
+
+        Raises:
+            OSError: EPIPE for one that it does not know.
+        """
+        if (kind, request) == STRING and value >> 8 == 3:
+            answer = descriptors.string(value & 0xFF)
+        elif (kind, request) == CONFIGURED:
+            answer = b"\1"
+        elif (kind, request) in (CONFIGURE, ALTERNATE):
+            answer = b""
+        elif kind & 0x60 == REQUEST_IN & 0x60 and request in set(Request):
+            answer = self._vendor(Request(request), now)
+        else:
+            answer = None
+        if answer is None:
+            raise OSError(errno.EPIPE, os.strerror(errno.EPIPE))
+        return answer[:size]
+
+    def do(self, asked: dict[str, Any], now: float) -> dict[str, Any]:
+        """Begins a fault, or tells of the head: {"do": its name, ...}.
+
+        Raises:
+            ValueError, TypeError: what is asked for cannot be done.
+        """
+        told = dict(asked)
+        name = str(told.pop("do", ""))
+        if name == "counts":
+            return self.counts()
+        if name == "state":
+            return self.state(now)
+        self.faults.do(name, now, told)
+        if name == "unplug":
+            self.halt()
+        return {"ok": True}
+
+    def halt(self) -> None:
+        """Retracts, makes no more frames and forgets those that nobody read."""
+        self.streaming = False
+        self.whiskers.drives.stop()
+        self.fifo.clear()
+
+    def counts(self) -> dict[str, int]:
+        """Frames: made = sent + queued + lost (nobody read) + dropped (by a stop) + skipped (by a fault)."""
+        fifo, skipped = self.fifo, self.faults.skipped
+        return {
+            "made": fifo.made + skipped,
+            "sent": fifo.sent,
+            "queued": len(fifo),
+            "lost": fifo.lost,
+            "dropped": fifo.dropped,
+            "skipped": skipped,
+        }
+
+    def state(self, now: float) -> dict[str, Any]:
+        """Where it is and what it does, as JSON can hold it."""
+        drives, whisk = self.whiskers.drives, self.whiskers.drives.whisk
+        pose, lift = self.place.at(now)
+        doing = {} if whisk is None else whisk.whisking.model_dump() | {"amplitude": whisk.amplitude.tolist()}
+        return {
+            "plugged": self.faults.plugged,
+            "streaming": self.streaming,
+            "resting": drives.resting,
+            "whisking": doing,
+            "angle": self.whiskers.balance.before[0].tolist(),
+            "pose": pose.tolist(),
+            "lift": float(lift) if np.isfinite(lift) else None,
+            "commands": dict(self.heard),
+            "sequence": self._first + self._made,
+            "late": now - self.due + BLOCK / self._pace,
+        }
+
+    def _vendor(self, request: Request, now: float) -> bytes:
+        if request == Request.START:
+            self.fifo.clear()
+            self.streaming = True
+            if isinstance(self.place, Along):
+                self.place.begin(self._when(self._made))
+        elif request == Request.STOP:
+            self.halt()
+        elif request == Request.CLOCK:
+            return self._clock(now).to_bytes(8, "little")
+        else:
+            head = self.whiskers.head
+            identity = {
+                "name": "emulated head",
+                "version": f"{VERSION}",
+                "whiskers": len(head.length),
+                "channels": CHANNELS,
+                "rate": self.config.stream.rate,
+            }
+            return json.dumps(identity).encode()
+        return b""
+
+    def _send(self, block: Block, now: float) -> None:
+        flags = np.where(block.begins, Flag.CYCLE, 0) | (Flag.RCP if block.fed_back else 0)
+        values = counts(block.angle, block.deflection)
+        values = self.faults.felt(values, self.config.stream.full_scale, now)
+        some = slice(self.samples - self.faults.kept(self.samples), None)
+        sample = self._made + np.arange(self.samples)[some]
+        if len(sample) == 0:
+            return
+        flags = flags[some]
+        flags[0] |= Flag.OVERRUN if self.fifo.overran else 0
+        number = self._first + sample
+        time = np.rint(number * (1e6 / self.config.stream.rate)).astype(np.int64) + self.faults.jump
+        raw = encode(number, time, flags, values[some])
+        size = len(raw) // len(sample)
+        frames = [raw[k : k + size] for k in range(0, len(raw), size)]
+        self.fifo.push(self.faults.sent(frames))
+
+    def _clock(self, now: float) -> int:
+        """us since it has power, by itself."""
+        seconds = self.config.age + (now - self.began) * self._pace
+        return max(round(seconds * 1e6) + self.faults.jump, 0)
+
+    def _when(self, sample: int) -> float:
+        """Host's time of a sample, s."""
+        return self.began + sample / (self.config.stream.rate * self._pace)

@@ -1,0 +1,35 @@
+"""What the emulated bridge says about itself on the bus."""
+
+from __future__ import annotations
+
+import struct
+
+from robot.head.wire import ENDPOINT_IN, ENDPOINT_OUT, INTERFACE, PRODUCT, VENDOR
+
+STRINGS = ("", "ratslam", "emulated whisker head", "EMULATED")
+"""By their number: none, manufacturer, product, serial."""
+LANGUAGE = 0x0409
+"""Of the strings: English."""
+PACKET = 512
+"""Bytes of a bulk packet, high speed."""
+
+
+def device() -> bytes:
+    """The device descriptor, USB 2.0, a class of the vendor's own."""
+    return struct.pack("<BBHBBBBHHHBBBB", 18, 1, 0x0200, 0xFF, 0, 0, 64, VENDOR, PRODUCT, 0x0100, 1, 2, 3, 1)
+
+
+def configuration() -> bytes:
+    """The only configuration: self-powered, an interface, bulk endpoints in and out."""
+    interface = struct.pack("<9B", 9, 4, INTERFACE, 0, 2, 0xFF, 0, 0, 0)
+    ends = b"".join(struct.pack("<BBBBHB", 7, 5, end, 2, PACKET, 0) for end in (ENDPOINT_IN, ENDPOINT_OUT))
+    size = 9 + len(interface) + len(ends)
+    return struct.pack("<BBHBBBBB", 9, 2, size, 1, 1, 0, 0xC0, 0) + interface + ends
+
+
+def string(number: int) -> bytes | None:
+    """A string descriptor; that of number 0 names the language. None where there is none."""
+    if not 0 <= number < len(STRINGS):
+        return None
+    text = STRINGS[number].encode("utf-16-le") if number else struct.pack("<H", LANGUAGE)
+    return struct.pack("<BB", 2 + len(text), 3) + text

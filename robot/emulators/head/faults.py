@@ -1,0 +1,125 @@
+"""What can go wrong with a head, on demand."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from robot.head.wire import tally
+
+HEADER = 20 - 4
+"""Bytes of a frame before its values."""
+
+
+class Faults:
+    """Faults that are under way; times are the host's monotonic clock, s.
+
+    Attributes:
+        plugged: whether the head is on the bus. plugs: how often it was plugged in; whoever opened it before
+            the last time has lost it. skipped: frames left out so far. jump: us, by which its clock is off.
+    """
+
+    def __init__(self, whiskers: int, random: np.random.Generator) -> None:
+        self.plugged, self.plugs = True, 1
+        self.skipped, self.jump = 0, 0
+        self._whiskers, self._random = whiskers, random
+        self._skip = self._corrupt = self._garbage = self._swap = 0
+        self._saturated: dict[int, float] = {}
+        self._halted, self._halted_until, self._silent_until = False, -np.inf, -np.inf
+        self.known: dict[str, Callable[..., None]] = {
+            "unplug": self._unplugged,
+            "plug": self._plugged,
+            "stall": self._stall,
+            "silence": self._silence,
+            "garbage": lambda now, bytes=64: self._count("_garbage", bytes),
+            "corrupt": lambda now, frames=1: self._count("_corrupt", frames),
+            "skip": lambda now, frames=1: self._count("_skip", frames),
+            "swap": lambda now, frames=1: self._count("_swap", frames),
+            "clock": lambda now, jump_us: self._jump(jump_us),
+            "saturate": self._saturate,
+            "die": lambda now: os._exit(1),
+        }
+        """By their names; each takes the time and what it is told."""
+
+    def do(self, name: str, now: float, told: dict[str, Any]) -> None:
+        """Begins a fault.
+
+        Raises:
+            ValueError, TypeError: it is not known, or is not told what it takes.
+        """
+        if name not in self.known:
+            raise ValueError(f"{name!r}; known are {', '.join(self.known)}, counts, state")
+        self.known[name](now, **told)
+
+    def check_in(self, now: float) -> bool:
+        """Whether the endpoint of frames gives any.
+
+        Raises:
+            OSError: EPIPE while it is halted.
+        """
+        if self._halted or now < self._halted_until:
+            self._halted = True
+            raise OSError(errno.EPIPE, os.strerror(errno.EPIPE))
+        return now >= self._silent_until
+
+    def clear_halt(self) -> None:
+        """As the host asks; while the cause lasts, it halts again."""
+        self._halted = False
+
+    def felt(self, values: np.ndarray, full_scale: float, now: float) -> np.ndarray:
+        """[T, W, 3] counts, with whiskers that are pressed to their ends."""
+        for whisker, until in list(self._saturated.items()):
+            if now < until:
+                values[:, whisker, 1:] = tally(np.array(full_scale))
+            else:
+                del self._saturated[whisker]
+        return values
+
+    def kept(self, count: int) -> int:
+        """How many of the next frames, from the last one backwards, are not left out."""
+        out = min(self._skip, count)
+        self._skip -= out
+        self.skipped += out
+        return count - out
+
+    def sent(self, frames: list[bytes]) -> list[bytes]:
+        """The frames as they go out: their number stays."""
+        for k in range(min(self._corrupt, len(frames))):
+            place = HEADER + int(self._random.integers(len(frames[k]) - HEADER))
+            frames[k] = frames[k][:place] + bytes([frames[k][place] ^ 0x55]) + frames[k][place + 1 :]
+            self._corrupt -= 1
+        if self._garbage and frames:
+            frames[0] = self._random.bytes(self._garbage) + frames[0]
+            self._garbage = 0
+        if self._swap and len(frames) > 1:
+            frames[-2:] = frames[:-3:-1]
+            self._swap -= 1
+        return frames
+
+    def _count(self, name: str, more: int) -> None:
+        setattr(self, name, getattr(self, name) + int(more))
+
+    def _unplugged(self, now: float) -> None:
+        self.plugged = False
+
+    def _plugged(self, now: float) -> None:
+        self.plugs += not self.plugged
+        self.plugged, self._halted, self._halted_until = True, False, -np.inf
+
+    def _stall(self, now: float, seconds: float = 0.0) -> None:
+        self._halted, self._halted_until = True, now + float(seconds)
+
+    def _silence(self, now: float, seconds: float = 1.0) -> None:
+        self._silent_until = now + float(seconds)
+
+    def _jump(self, jump_us: int) -> None:
+        self.jump += int(jump_us)
+
+    def _saturate(self, now: float, whisker: int = 0, seconds: float = 1.0) -> None:
+        if not 0 <= whisker < self._whiskers:
+            raise ValueError(f"whisker {whisker}; the head has 0 to {self._whiskers - 1}")
+        self._saturated[whisker] = now + float(seconds)

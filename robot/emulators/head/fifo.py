@@ -1,0 +1,57 @@
+"""Frames that wait to be read, with exact numbers of those that never were."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+
+
+class Fifo:
+    """As many frames as fit; those made while it is full are lost.
+
+    Attributes:
+        made, sent, lost, dropped: frames ever given to it, read from it whole, lost because it was full, and
+            thrown away with the rest by `clear`. made = sent + lost + dropped + those still in it.
+        overran: whether the newest frame was lost.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self.capacity = capacity
+        self.made = self.sent = self.lost = self.dropped = 0
+        self.overran = False
+        self._frames: deque[bytes] = deque()
+        self._begun = b""  # the rest of a frame of which a part was read
+
+    def __len__(self) -> int:
+        """Frames in it."""
+        return len(self._frames) + bool(self._begun)
+
+    @property
+    def room(self) -> int:
+        """Frames that still fit."""
+        return self.capacity - len(self)
+
+    def push(self, frames: Sequence[bytes]) -> None:
+        """Takes in what fits, of the first ones."""
+        fits = frames[: self.room]
+        self._frames.extend(fits)
+        self.made += len(frames)
+        self.lost += len(frames) - len(fits)
+        self.overran = len(fits) < len(frames)
+
+    def take(self, size: int) -> bytes:
+        """So many bytes, or what there is."""
+        parts, left = [], size
+        while left and (self._begun or self._frames):
+            frame = self._begun or self._frames.popleft()
+            parts.append(frame[:left])
+            self._begun = frame[left:]
+            left -= len(parts[-1])
+            self.sent += not self._begun
+        return b"".join(parts)
+
+    def clear(self) -> None:
+        """Throws all of it away."""
+        self.dropped += len(self)
+        self._frames.clear()
+        self._begun, self.overran = b"", False

@@ -1,0 +1,183 @@
+"""The process of an emulated head: its samples in real time, its USB and its faults on sockets.
+
+One thread does all of it in turn, so nothing has to be locked. Deadlines are absolute: after a delay the
+blocks that are due are made one after another, with transfers served between them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import json
+import os
+import time
+from collections.abc import Awaitable, Callable
+
+from robot.emulators.head import descriptors
+from robot.emulators.head.bridge import Bridge
+from robot.emulators.head.settings import HeadEmulatorConfig
+from robot.emulators.head.whereabouts import Along, Carried, Place
+from robot.emulators.usbline import ANSWER, IN, REQUEST, Op
+from robot.head.wire import ENDPOINT_IN
+from robot.motion import Path
+from robot.scene import KidnapConfig, scene
+from tactile.head import ur10_head
+
+Client = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
+ENDS = (ConnectionError, asyncio.IncompleteReadError, asyncio.CancelledError)
+"""How a connection ends."""
+
+
+def serve(config: HeadEmulatorConfig) -> None:
+    """Serves a head until the process ends; prints `ready` when it listens.
+
+    Raises:
+        InputError: there is no such maze or way. OSError: somebody else listens there.
+    """
+    head = ur10_head(config.head)
+    made = scene(config.maze, config.path, config.motion, KidnapConfig(), head, config.seed)
+    with contextlib.ExitStack() as stack:
+        bridge = Bridge(config, made.surroundings.walls, _place(config, made.path, stack), time.monotonic())
+        asyncio.run(_served(config, bridge))
+
+
+def _place(config: HeadEmulatorConfig, path: Path, stack: contextlib.ExitStack) -> Place:
+    if config.arm is None:
+        return Along(path if config.follow else Path(path.time[:1], path.pose[:1]))
+    from robot.emulators.ur10.poses import PoseStream
+
+    arm = PoseStream(config.arm, hz=config.arm_hz)
+    stack.callback(arm.close)
+    return Carried(arm, config.placing)
+
+
+async def _served(config: HeadEmulatorConfig, bridge: Bridge) -> None:
+    server = Server(bridge)
+    async with contextlib.AsyncExitStack() as stack:
+        for client, port in ((server.usb, config.port), (server.faults, config.control_port)):
+            await stack.enter_async_context(
+                await asyncio.start_server(_polite(client), config.host, port, reuse_address=True)
+            )
+        print("ready", flush=True)
+        await server.run()
+
+
+def _polite(client: Client) -> Client:
+    """A client whose end is no error, nor that of the server."""
+
+    async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with contextlib.suppress(*ENDS):
+            await client(reader, writer)
+        writer.close()
+
+    return talk
+
+
+class Server:
+    """What clients say to a bridge."""
+
+    def __init__(self, bridge: Bridge) -> None:
+        self.bridge = bridge
+        self._changed = asyncio.Event()
+        self._owner: tuple[object, int] | None = None  # of the interface, and when it was plugged in
+
+    async def run(self) -> None:
+        """Makes blocks when they are due."""
+        while True:
+            if self.bridge.advance(time.monotonic()):
+                self._tell()
+                await asyncio.sleep(0)
+            else:
+                await asyncio.sleep(self.bridge.due - time.monotonic())
+
+    async def usb(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """A connection of `robot.emulators.usbline`; it belongs to the device as plugged in when it began."""
+        plugs = self.bridge.faults.plugs
+        try:
+            while True:
+                header = REQUEST.unpack(await reader.readexactly(REQUEST.size))
+                op, address, *_, length = header
+                takes = op in (Op.CONTROL, Op.BULK) and not address & IN
+                data = await reader.readexactly(length) if takes else b""
+                try:
+                    status, answer = 0, await self._answered(header, data, plugs, writer)
+                except OSError as error:
+                    status, answer = -(error.errno or errno.EIO), b""
+                writer.write(ANSWER.pack(status, len(answer)) + answer)
+                await writer.drain()
+        finally:
+            self._release(writer)
+
+    async def faults(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """A line of JSON is answered by a line of JSON."""
+        while line := await reader.readline():
+            try:
+                answer = self.bridge.do(dict(json.loads(line)), time.monotonic())
+            except (TypeError, ValueError) as error:
+                answer = {"ok": False, "error": str(error)}
+            self._tell()
+            writer.write(json.dumps(answer).encode() + b"\n")
+            await writer.drain()
+
+    async def _answered(self, header: tuple[int, ...], data: bytes, plugs: int, connection: object) -> bytes:
+        op, address, request, value, _, timeout, length = header
+        bridge, now = self.bridge, time.monotonic()
+        self._present(plugs)
+        if op == Op.DESCRIBE:
+            return descriptors.device() + descriptors.configuration()
+        if op == Op.CLAIM:
+            if self._owner is not None and self._owner[0] is not connection and self._owner[1] == plugs:
+                raise _error(errno.EBUSY)
+            self._owner = connection, plugs
+        elif op == Op.RELEASE:
+            self._release(connection)
+        elif op == Op.CONTROL:
+            return bridge.control(address, request, value, length, now)
+        elif op == Op.BULK and address == ENDPOINT_IN:
+            return await self._frames(length, timeout, plugs)
+        elif op == Op.BULK:
+            bridge.bulk_out(data, now)
+        elif op == Op.CLEAR:
+            if address == ENDPOINT_IN:
+                bridge.faults.clear_halt()
+        elif op == Op.RESET:
+            bridge.halt()
+        else:
+            raise _error(errno.EINVAL)
+        return b""
+
+    async def _frames(self, size: int, timeout: int, plugs: int) -> bytes:
+        """What there is, as soon as there is any.
+
+        Args:
+            timeout: ms, 0 for none.
+        """
+        end = time.monotonic() + timeout / 1000 if timeout else float("inf")
+        while True:
+            self._present(plugs)
+            now = time.monotonic()
+            if got := self.bridge.bulk_in(size, now):
+                return got
+            if now >= end:
+                raise _error(errno.ETIMEDOUT)
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._changed.wait(), min(end - now, 1.0))
+
+    def _present(self, plugs: int) -> None:
+        faults = self.bridge.faults
+        if not faults.plugged or plugs != faults.plugs:
+            raise _error(errno.ENODEV)
+
+    def _release(self, connection: object) -> None:
+        if self._owner is not None and self._owner[0] is connection:
+            self._owner = None
+
+    def _tell(self) -> None:
+        """Wakes those who wait for frames."""
+        self._changed.set()
+        self._changed.clear()
+
+
+def _error(number: int) -> OSError:
+    return OSError(number, os.strerror(number))

@@ -1,0 +1,107 @@
+"""The whiskers of an emulated head, in blocks of samples as time goes on."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from robot.emulators.head.drives import Drives
+from robot.emulators.head.whereabouts import Place
+from robot.kinematic import MechanicsConfig
+from robot.mechanics import StreamConfig
+from robot.quasistatic import advance, rest
+from robot.sweep import Sweep, passed, reported
+from robot.walls import FREE, Surroundings, Walls
+from tactile.head import Head
+
+STEP = 1e-4
+"""Lifts are told apart by so much, m; an arm at working height is within it."""
+
+
+class Block(NamedTuple):
+    """T samples.
+
+    Attributes:
+        angle: [T, W] rad. deflection: [T, W, 2] rad. begins: [T] bool, the first sample of a whisk.
+        fed_back: whether feedback has lowered an amplitude.
+    """
+
+    angle: np.ndarray
+    deflection: np.ndarray
+    begins: np.ndarray
+    fed_back: bool
+
+
+class Whiskers:
+    """They remember where they are from block to block, and the walls around them.
+
+    Attributes:
+        drives: which take commands. pose, lift: where the head was at the end of the last block.
+    """
+
+    def __init__(
+        self,
+        config: StreamConfig,
+        mechanics: MechanicsConfig,
+        head: Head,
+        walls: Walls,
+        place: Place,
+        random: np.random.Generator,
+        samples: int,
+    ) -> None:
+        self.config, self.mechanics, self.head = config, mechanics, head
+        self.walls, self.place, self.random, self.samples = walls, place, random, samples
+        self.drives = Drives(head, config.rate)
+        self.balance = rest(1, len(head.length))
+        self.pose: np.ndarray | None = None
+        self.lift = np.inf
+        self._around: Surroundings | None = None
+        self._lowered = np.inf
+        # Above this, no tip comes down to the tallest wall.
+        self._clear = float(walls.height.max() + (head.length - head.base[:, 2]).max())
+
+    def rested(self) -> None:
+        """A block passes in which nobody looks and nothing moves."""
+        self.pose = None
+
+    def block(self, start: float, end: float) -> Block:
+        """The samples between two times, s, host's monotonic clock."""
+        rate, size = self.config.rate, self.samples
+        if self.pose is None:
+            self.pose, self.lift = self.place.at(start)
+        before = self.pose
+        self.pose, self.lift = self.place.at(end)
+        pose = np.stack([before, self.pose])[None]
+        noise = self.mechanics.noise * self.random.standard_normal((1, size, len(self.head.length), 3))
+        begins, parts, done = np.zeros(size, bool), [], 0
+        while done < size:
+            share = done / size
+            self.balance = self.drives.begin(start + share * (end - start), self.balance)
+            first, left = self.drives.sample, self.drives.left
+            begins[done] = self.drives.whisk is not None and first == 0
+            count = size - done if left is None else min(size - done, left)
+            # Time counts from where the whisk began, which may be within the block.
+            knots = np.array([first - done, first - done + size]) / rate
+            time = (first + np.arange(count)) / rate
+            sweep = self._sweep(pose, knots, time, noise[:, done : done + count])
+            truth, self.balance = advance(self.config, self.mechanics, self.drives.law, sweep, self.balance)
+            parts.append(reported(self.config, self.head, truth, sweep.noise))
+            self.drives.sample = 0 if left is None else first + count
+            done += count
+        angle, deflection = (np.concatenate([part[k][0] for part in parts]) for k in range(2))
+        return Block(angle, deflection, begins, bool((self.balance.drive.most > 0).any()))
+
+    def _sweep(self, pose: np.ndarray, knots: np.ndarray, time: np.ndarray, noise: np.ndarray) -> Sweep:
+        if self.lift < self._clear:
+            return passed(self._surroundings(), pose, knots, time, noise)
+        nothing = np.zeros((len(time), 1, len(self.head.length)))
+        return Sweep(time, nothing + FREE, nothing + 1.0, nothing, noise)
+
+    def _surroundings(self) -> Surroundings:
+        """The walls as a head sees them that is lifted: so much lower."""
+        lift = STEP * round(self.lift / STEP)
+        if self._around is None or lift != self._lowered:
+            lower = self.walls._replace(height=self.walls.height - lift)
+            self._around, self._lowered = Surroundings(lower, self.head), lift
+        return self._around

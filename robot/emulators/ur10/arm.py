@@ -1,0 +1,153 @@
+"""The arm itself: it carries out orders step by step, meets walls, and comes to rest when it is halted."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterable
+
+from robot.emulators.ur10 import motion as motions
+from robot.emulators.ur10.kinematics import UR10, UR10E
+from robot.emulators.ur10.motion import ZERO, Drive, Line, Model, Motion, State, Swing, Unreachable
+from robot.emulators.ur10.orders import Mark, MoveJ, MoveL, Order, StopL, begun, same_kind
+from robot.emulators.ur10.rotation import Vector6
+from robot.emulators.ur10.settings import UrEmulatorConfig, WallConfig
+
+NEAR: Vector6 = (
+    0.0,
+    -1.6,
+    -1.6,
+    -1.6,
+    1.57,
+    0.0,
+)  # elbow up, tool down: which of eight postures it starts in
+
+
+class Arm:
+    """Joints and tool over time.
+
+    Attributes:
+        state: where it is. force: N and Nm at the tool, in the base. penetration_max: deepest in a wall, m.
+        marks: progress its orders told and nobody has taken yet. scale: the speed slider, 0 to 1.
+    """
+
+    def __init__(self, config: UrEmulatorConfig) -> None:
+        self.model: Model = Model(UR10 if config.version.major < 5 else UR10E)
+        self.walls = list(config.walls)
+        self.turn_ratio = config.turn_ratio
+        self.scale = 1.0
+        self.force: Vector6 = ZERO
+        self.penetration_max = 0.0
+        self.marks: list[int] = []
+        self._motion: Motion | None = None
+        self._order: Order | None = None
+        self._queue: deque[Order] = deque()
+        tcp = config.start
+        self.state: State = State(tcp, ZERO, self.model.backward(tcp, NEAR), ZERO)
+        self._feel()
+
+    @property
+    def busy(self) -> bool:
+        """Whether it moves, or has orders left."""
+        return self._motion is not None or bool(self._queue)
+
+    @property
+    def moving(self) -> bool:
+        return any(self.state.speed) or any(self.state.joint_speed)
+
+    @property
+    def remaining(self) -> list[Order]:
+        """What it has not finished."""
+        return ([self._order] if self._order is not None else []) + list(self._queue)
+
+    def place(self, tcp: Vector6) -> None:
+        """Stand somewhere else at once, as if moved by hand. Raises `Unreachable`."""
+        self.state = State(tcp, ZERO, self.model.backward(tcp, self.state.joints), ZERO)
+        self._motion, self._order = None, None
+        self._queue.clear()
+        self._feel()
+
+    def set_tool(self, tool: Vector6) -> None:
+        """Another tool's pose in the flange: the joints stay, the tool's pose is another."""
+        self.model = self.model.with_tool(tool)
+        self.state = self.state._replace(tcp=self.model.forward(self.state.joints))
+
+    def order(self, orders: Iterable[Order]) -> None:
+        """Do these and nothing else. A move that finds the arm moving lets it stop first."""
+        new = deque(orders)
+        first = next((order for order in new if not isinstance(order, Mark)), None)
+        if self.moving and isinstance(first, MoveL | MoveJ):  # these plan from rest
+            new.appendleft(StopL(first.acceleration))
+        if self._motion is not None and new and same_kind(new[0], self._motion):
+            self._order = new.popleft()
+            self._motion = begun(self._order, self.model, self.state, self.turn_ratio)
+        else:
+            self._motion, self._order = None, None
+        self._queue = new
+
+    def halt(self, acceleration: float) -> None:
+        """Forget all orders and come to rest, m/s^2."""
+        self._queue.clear()
+        self._order = None
+        self._motion = Drive(ZERO, acceleration, self.turn_ratio) if self.moving else None
+
+    def step(self, dt: float) -> None:
+        """One control step. Raises `Unreachable`; the arm then stands."""
+        try:
+            while self._motion is None and self._queue:
+                self._order = self._queue.popleft()
+                if isinstance(self._order, Mark):
+                    self.marks.append(self._order.progress)
+                self._motion = begun(self._order, self.model, self.state, self.turn_ratio)
+            if self._motion is not None:
+                self._advance(dt)
+        except Unreachable:
+            self._motion, self._order = None, None
+            self._queue.clear()
+            self._rest()
+            raise
+        self._feel()
+
+    def _advance(self, dt: float) -> None:
+        assert self._motion is not None
+        scale = self.scale if isinstance(self._motion, Line | Swing) else 1.0
+        if scale <= 0:
+            self._rest()
+            return
+        state, self._motion = self._motion.advanced(self.model, self.state, dt * scale)
+        if scale != 1.0:
+            speed, rate = motions.scaled(state.speed, scale), motions.scaled(state.joint_speed, scale)
+            state = state._replace(speed=speed, joint_speed=rate)
+        self.state = state
+        if self._motion is None:
+            self._order = None
+            self._rest()
+
+    def _rest(self) -> None:
+        self.state = self.state._replace(speed=ZERO, joint_speed=ZERO)
+
+    def _feel(self) -> None:
+        if not self.walls:
+            self.force = ZERO
+            return
+        self.force = felt(self.walls, self.state.tcp)
+        deepest = max(depth(wall, self.state.tcp) for wall in self.walls)
+        self.penetration_max = max(self.penetration_max, deepest)
+
+
+def depth(wall: WallConfig, tcp: Vector6) -> float:
+    """How far the tool is in a wall, m; 0 where it is not."""
+    return max(0.0, wall.solid * (tcp["xyz".index(wall.axis)] - wall.at))
+
+
+def felt(walls: Iterable[WallConfig], tcp: Vector6) -> Vector6:
+    """The force of walls on the tool: springs that push it out, N."""
+    force = [0.0, 0.0, 0.0]
+    for wall in walls:
+        force["xyz".index(wall.axis)] -= wall.solid * wall.stiffness * depth(wall, tcp)
+    return force[0], force[1], force[2], 0.0, 0.0, 0.0
+
+
+def size(force: Vector6) -> float:
+    """Of a force, N."""
+    return math.hypot(*force[:3])

@@ -1,0 +1,190 @@
+"""The controller without its sockets: an arm, a program, safety, registers, and what faults do to them."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+from robot.emulators.ur10.arm import Arm, size
+from robot.emulators.ur10.motion import Unreachable
+from robot.emulators.ur10.orders import MoveJ, MoveL, Order, Servo, SpeedJ, SpeedL
+from robot.emulators.ur10.program import Program, Script
+from robot.emulators.ur10.registers import Registers
+from robot.emulators.ur10.rotation import Vector6
+from robot.emulators.ur10.safety import BITS, RobotMode, Runtime, SafetyMode, StatusBits
+from robot.emulators.ur10.settings import UrEmulatorConfig
+
+KEPT = 100_000  # orders remembered
+
+
+class Controller:
+    """An emulated controller. `tick` is one control step; all else is what clients do to it between steps."""
+
+    def __init__(self, config: UrEmulatorConfig) -> None:
+        self.config = config
+        self.dt: float = 1 / config.hz
+        self.arm: Arm = Arm(config)
+        self.registers = Registers()
+        self.program: Program | Script | None = None
+        self.safety = SafetyMode.NORMAL
+        self.robot_mode = RobotMode.RUNNING
+        self.runtime = Runtime.STOPPED
+        self.ik_fails = False
+        self.time = 0.0
+        self.remote = config.remote
+        self.targets: deque[dict[str, Any]] = deque(maxlen=KEPT)
+        self.waypoint: Vector6 = self.arm.state.tcp
+        self.watchdog_stops = self.program_stops = self.programs = 0
+        self._uploaded: tuple[float, str] | None = None  # when it starts, and what
+        self._resumed: list[Order] = []
+        self._watchdog: tuple[float, int, float] | None = None  # s of patience, register, set at
+        self._stopped_at = -1e9
+        self.publish()
+
+    def tick(self, host: float) -> None:
+        """One control step at a host time, s."""
+        self.time += self.dt
+        if self._watchdog is not None:
+            patience, register, since = self._watchdog
+            if host - max(self.registers.written[register], since) > patience:
+                self.watchdog_stops += 1
+                self.stop_program()
+        if self._uploaded is not None and self.time >= self._uploaded[0]:
+            self._run(self._uploaded[1])
+        slider = self.registers.inputs.pop("speed_slider_fraction", None)
+        if slider is not None and self.registers.inputs.get("speed_slider_mask", (0,))[0]:
+            self.arm.scale = min(1.0, max(0.0, slider[0]))
+        try:
+            if self.program is not None and self.runtime is Runtime.PLAYING and not self.program.step():
+                self.stop_program()
+        except Unreachable:
+            self.stop_program()
+        try:
+            self.arm.step(self.dt)
+        except Unreachable:  # on its way: a real arm would stop for safety
+            self.protective_stop()
+        if size(self.arm.force) > self.config.protective_force and self.safety is SafetyMode.NORMAL:
+            self.protective_stop()
+        self.publish()
+
+    def watch(self, frequency: float, register: int) -> None:
+        """Stop the program when a register is not written that often."""
+        self._watchdog = (
+            (1 / frequency, register, self.registers.written[register]) if frequency > 0 else None
+        )
+
+    def upload(self, text: str) -> None:
+        """A program arrives; it replaces the one that runs."""
+        self.stop_program()
+        if self.safety is SafetyMode.NORMAL and self.robot_mode is RobotMode.RUNNING:
+            self._uploaded = (self.time + self.config.starting, text)
+
+    def _run(self, text: str) -> None:
+        self._uploaded = None
+        self.programs += 1
+        self.runtime = Runtime.PLAYING
+        self.program = Program(self, text) if "def rtde_control" in text else Script(self, text)
+
+    def stop_program(self) -> None:
+        """The program ends and the arm comes to rest."""
+        if self.program is not None:
+            self.program_stops += 1
+        self.program, self._uploaded, self._watchdog = None, None, None
+        self._resumed = []
+        self.runtime = Runtime.STOPPED
+        self.arm.halt(self.config.halt)
+
+    def protective_stop(self) -> None:
+        """The arm brakes; nothing moves until it is unlocked, and the program stays where it is."""
+        self._stop(SafetyMode.PROTECTIVE_STOP)
+
+    def safeguard_stop(self) -> None:
+        """The arm brakes; it goes on by itself when the safeguard is closed."""
+        remaining = self.arm.remaining
+        self._stop(SafetyMode.SAFEGUARD_STOP)
+        self._resumed = remaining
+
+    def emergency_stop(self) -> None:
+        """The arm brakes and loses its power; the program ends."""
+        self._stop(SafetyMode.ROBOT_EMERGENCY_STOP)
+        self.stop_program()
+        self.arm.halt(self.config.brake)
+        self.robot_mode = RobotMode.POWER_OFF
+
+    def _stop(self, mode: SafetyMode) -> None:
+        self.safety = mode
+        self._stopped_at = self.time
+        if self.runtime is Runtime.PLAYING:
+            self.runtime = Runtime.PAUSED
+        self._watchdog, self._uploaded = None, None
+        self.arm.halt(self.config.brake)
+
+    def unlock(self) -> bool:
+        """End a protective stop; not before a while."""
+        if self.safety is SafetyMode.PROTECTIVE_STOP:
+            if self.time - self._stopped_at < self.config.unlock_wait:
+                return False
+            self.safety = SafetyMode.NORMAL
+        return True
+
+    def clear(self) -> None:
+        """What made it stop is gone. A safeguarded program goes on; an emergency leaves the power off."""
+        if self.safety is SafetyMode.SAFEGUARD_STOP and self.runtime is Runtime.PAUSED:
+            self.runtime = Runtime.PLAYING
+            self.arm.order(self._resumed)
+            self._resumed = []
+        self.safety = SafetyMode.NORMAL
+
+    def power(self, mode: RobotMode) -> None:
+        """Power on, release the brakes, or power off."""
+        if self.safety is SafetyMode.NORMAL:
+            self.robot_mode = mode
+            if mode is not RobotMode.RUNNING:
+                self.stop_program()
+
+    def solved(self, tcp: Vector6, near: Vector6) -> Vector6:
+        """Joints for a pose. Raises `Unreachable`."""
+        if self.ik_fails:
+            raise Unreachable("told to fail")
+        return self.arm.model.backward(tcp, near)
+
+    def solvable(self, tcp: Vector6) -> bool:
+        try:
+            self.solved(tcp, self.arm.state.joints)
+        except Unreachable:
+            return False
+        return True
+
+    def noted(self, kind: str, new: Sequence[Order]) -> None:
+        """Remember what was commanded, for whoever asks."""
+        for order in new:
+            if isinstance(order, MoveL):
+                self.waypoint = order.goal
+            entry: dict[str, Any] = {"time": self.time, "do": kind, "order": type(order).__name__}
+            if isinstance(order, MoveL | MoveJ | SpeedL | SpeedJ | Servo):
+                entry["goal"] = list(order.goal)
+            if isinstance(order, MoveL | MoveJ):
+                entry["speed"] = order.speed
+            if isinstance(order, MoveL | MoveJ | SpeedL | SpeedJ):
+                entry["acceleration"] = order.acceleration
+            self.targets.append(entry)
+
+    def publish(self) -> None:
+        """Bring the published fields up to date."""
+        fields, state = self.registers.fields, self.arm.state
+        playing = self.runtime is Runtime.PLAYING
+        powered = self.robot_mode is not RobotMode.POWER_OFF
+        fields["timestamp"] = (self.time,)
+        fields["actual_TCP_pose"] = fields["target_TCP_pose"] = state.tcp
+        fields["actual_TCP_speed"] = fields["target_TCP_speed"] = state.speed
+        fields["actual_q"] = fields["target_q"] = state.joints
+        fields["actual_qd"] = fields["target_qd"] = state.joint_speed
+        fields["actual_TCP_force"] = fields["ft_raw_wrench"] = self.arm.force
+        fields["runtime_state"] = (self.runtime,)
+        fields["robot_mode"] = (self.robot_mode,)
+        fields["safety_mode"] = (self.safety,)
+        fields["safety_status_bits"] = (BITS[self.safety],)
+        bits = StatusBits.POWER_ON * powered | StatusBits.PROGRAM_RUNNING * playing
+        fields["robot_status_bits"] = (bits,)
+        fields["target_speed_fraction"] = (self.arm.scale,)

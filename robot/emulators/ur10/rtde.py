@@ -1,0 +1,134 @@
+"""One RTDE client: its handshake, its recipes, what it writes, and the states it is sent."""
+
+from __future__ import annotations
+
+import struct
+
+from robot.emulators.ur10 import wire
+from robot.emulators.ur10.controller import Controller
+from robot.emulators.ur10.registers import Value
+
+
+class Claims:
+    """Which client controls which input variable: each has one master.
+
+    Attributes:
+        by_others: whether something outside (a fieldbus, say) holds the integer registers.
+    """
+
+    def __init__(self) -> None:
+        self.owners: dict[str, RtdeSession] = {}
+        self.by_others = False
+
+    def free(self, name: str, asker: RtdeSession) -> bool:
+        if self.by_others and name.startswith("input_int_register"):
+            return False
+        return self.owners.get(name, asker) is asker
+
+    def release(self, session: RtdeSession) -> None:
+        self.owners = {name: owner for name, owner in self.owners.items() if owner is not session}
+
+
+class RtdeSession:
+    """What the controller knows of one client.
+
+    Args:
+        controller: what it talks to. claims: shared by all clients.
+
+    Attributes:
+        started: whether states are sent. every: one state in so many control steps.
+    """
+
+    def __init__(self, controller: Controller, claims: Claims) -> None:
+        self.started = False
+        self.every = 1
+        self.ignored = 0
+        self._controller = controller
+        self._claims = claims
+        self._splitter = wire.Splitter()
+        self._outputs: list[str] = []
+        self._layout = wire.layout([])
+        self._inputs: list[tuple[list[str], struct.Struct]] = []
+
+    def received(self, data: bytes, host: float) -> bytes:
+        """Answers to what arrived at a host time. Raises ValueError where it is no RTDE."""
+        try:
+            return b"".join(self._answer(package, host) for package in self._splitter.feed(data))
+        except struct.error as error:
+            raise ValueError(str(error)) from error
+
+    def closed(self) -> None:
+        """The client is gone: others may write what it wrote."""
+        self._claims.release(self)
+
+    def state(self, overrides: dict[str, Value]) -> bytes:
+        """The state now, as its recipe wants it."""
+        fields = self._controller.registers.fields
+        numbers: list[float] = []
+        for name in self._outputs:
+            numbers += overrides.get(name) or fields[name]
+        return wire.packed(wire.DATA, self._layout.pack(1, *numbers))
+
+    def _answer(self, package: wire.Package, host: float) -> bytes:
+        kind, body = package
+        if kind == wire.DATA:
+            self._take(body, host)
+            return b""
+        if kind == wire.PROTOCOL:
+            (version,) = struct.unpack(">H", body)
+            return wire.packed(kind, bytes([version == wire.VERSION]))
+        if kind == wire.CONTROLLER:
+            return wire.packed(kind, struct.pack(">4I", *self._controller.config.version, 0))
+        if kind == wire.OUTPUTS:
+            return wire.packed(kind, self._set_outputs(body))
+        if kind == wire.INPUTS:
+            return wire.packed(kind, self._set_inputs(body))
+        if kind in (wire.START, wire.PAUSE):
+            self.started = kind == wire.START
+            return wire.packed(kind, b"\1")
+        return b""
+
+    def _set_outputs(self, body: bytes) -> bytes:
+        (frequency,) = struct.unpack_from(">d", body)
+        names = split(body[8:])
+        hz = self._controller.config.hz
+        self.every = max(1, round(hz / frequency)) if 0 < frequency <= hz else 1
+        types = [wire.OUTPUT_TYPES.get(name, "NOT_FOUND") for name in names]
+        known = "NOT_FOUND" not in types
+        self._outputs = names if known else []
+        self._layout = wire.layout(types if known else [])
+        return bytes([known]) + ",".join(types).encode()
+
+    def _set_inputs(self, body: bytes) -> bytes:
+        names = split(body)
+        types = [wire.INPUT_TYPES.get(name, "NOT_FOUND") for name in names]
+        types = [
+            kind if self._claims.free(name, self) else "IN_USE"
+            for name, kind in zip(names, types, strict=True)
+        ]
+        if "NOT_FOUND" in types or "IN_USE" in types:
+            return b"\0" + ",".join(types).encode()
+        for name in names:
+            self._claims.owners[name] = self
+        self._inputs.append((names, wire.layout(types)))
+        return bytes([len(self._inputs)]) + ",".join(types).encode()
+
+    def _take(self, body: bytes, host: float) -> None:
+        """What a client writes; what is too short for its recipe is passed over, what is too long cut off."""
+        recipe = body[0] if body else 0
+        if not 1 <= recipe <= len(self._inputs) or len(body) < self._inputs[recipe - 1][1].size:
+            self.ignored += 1
+            return
+        names, layout = self._inputs[recipe - 1]
+        numbers = layout.unpack_from(body)[1:]
+        registers = self._controller.registers
+        first = 0
+        for name in names:
+            length = 6 if wire.INPUT_TYPES[name] == "VECTOR6D" else 1
+            registers.write(name, numbers[first : first + length], host)
+            first += length
+
+
+def split(names: bytes) -> list[str]:
+    """Names from a list with commas, which may end in one."""
+    return [name for name in names.decode("ascii", "replace").split(",") if name]

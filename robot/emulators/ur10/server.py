@@ -1,0 +1,176 @@
+"""The emulator's one loop: control steps at absolute times, and whatever clients send in between.
+
+One thread and no locks. A step that comes late is made up for, up to `BACKLOG`, so that the mean rate is kept
+on a busy machine; what is later than that is left out and the robot's clock jumps on.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import selectors
+import socket
+import sys
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+from robot.emulators.ur10.controller import Controller
+from robot.emulators.ur10.dashboard import WELCOME, DashboardSession
+from robot.emulators.ur10.faults import Faults, FaultSession
+from robot.emulators.ur10.motion import Unreachable
+from robot.emulators.ur10.rtde import Claims, RtdeSession
+from robot.emulators.ur10.script import ScriptSession
+from robot.emulators.ur10.settings import (
+    DASHBOARD_PORT,
+    FAULT_PORT,
+    RTDE_PORT,
+    SCRIPT_PORT,
+    UrEmulatorConfig,
+)
+from tactile.errors import InputError
+
+BACKLOG = 0.1  # s
+PENDING = 1 << 18  # bytes that a client may leave unread before states are kept from it
+
+
+class Session(Protocol):
+    """One client's side of a port."""
+
+    def received(self, data: bytes, host: float) -> bytes: ...
+
+    def closed(self) -> None: ...
+
+
+class Connection:
+    """A socket with its session and what could not be sent yet."""
+
+    def __init__(self, link: socket.socket, session: Session) -> None:
+        link.setblocking(False)
+        link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self.link = link
+        self.session = session
+        self._pending = b""
+
+    def send(self, data: bytes) -> None:
+        """Send now or later, or never where the client does not read. Raises OSError when it is gone."""
+        if self._pending:
+            if len(self._pending) > PENDING:
+                return
+            data = self._pending + data
+        try:
+            self._pending = data[self.link.send(data) :]
+        except BlockingIOError:
+            self._pending = data
+
+
+class Server:
+    """Four listening ports around one controller."""
+
+    def __init__(self, config: UrEmulatorConfig) -> None:
+        self.controller = Controller(config)
+        self.claims = Claims()
+        self.faults = Faults(self)
+        self.clients: list[Connection] = []
+        self._selector = selectors.SelectSelector()  # microseconds; epoll's waits are whole milliseconds
+        self._steps = 0
+        doors: dict[int, Callable[[], Session]] = {
+            RTDE_PORT: lambda: RtdeSession(self.controller, self.claims),
+            SCRIPT_PORT: lambda: ScriptSession(self.controller),
+            DASHBOARD_PORT: lambda: DashboardSession(self.controller),
+            FAULT_PORT: lambda: FaultSession(self.faults),
+        }
+        for port, door in doors.items():
+            listener = socket.create_server((config.host, port), backlog=16)
+            listener.setblocking(False)
+            self._selector.register(listener, selectors.EVENT_READ, door)
+
+    @property
+    def rtde(self) -> list[tuple[Connection, RtdeSession]]:
+        """The RTDE clients."""
+        return [(c, c.session) for c in self.clients if isinstance(c.session, RtdeSession)]
+
+    def run(self) -> None:
+        """Until the process is ended."""
+        dt = self.controller.dt
+        due = time.monotonic() + dt
+        while True:
+            for key, _ in self._selector.select(max(0.0, due - time.monotonic())):
+                self._serve(key)
+            now = time.monotonic()
+            if now - due > BACKLOG:
+                missed = int((now - due) / dt)
+                self.controller.time += missed * dt
+                due += missed * dt
+            while due <= now:
+                self._step(now)
+                due += dt
+
+    def close(self, connection: Connection) -> None:
+        """A client is gone, or shall be."""
+        if connection in self.clients:
+            self.clients.remove(connection)
+            self._selector.unregister(connection.link)
+            connection.link.close()
+            connection.session.closed()
+
+    def _step(self, now: float) -> None:
+        self.controller.tick(now)
+        self._steps += 1
+        if not self.faults.publishing(self._steps):
+            return
+        overrides = self.faults.overrides()
+        for connection, session in self.rtde:
+            if session.started and self._steps % session.every == 0:
+                self.send(connection, session.state(overrides))
+
+    def _serve(self, key: selectors.SelectorKey) -> None:
+        if not isinstance(key.data, Connection):
+            self._accept(key)
+            return
+        connection = key.data
+        if connection not in self.clients:
+            return
+        if self.faults.stalled and isinstance(connection.session, RtdeSession):
+            time.sleep(0.0005)  # left unread: without this the loop would spin on it
+            return
+        try:
+            data = connection.link.recv(1 << 16)
+            reply = connection.session.received(data, time.monotonic()) if data else b""
+        except BlockingIOError:
+            return
+        except (OSError, ValueError):
+            data = reply = b""
+        if not data:
+            self.close(connection)
+        elif reply:
+            self.send(connection, reply)
+
+    def _accept(self, key: selectors.SelectorKey) -> None:
+        assert isinstance(key.fileobj, socket.socket)
+        with contextlib.suppress(OSError):
+            connection = Connection(key.fileobj.accept()[0], key.data())
+            self.clients.append(connection)
+            self._selector.register(connection.link, selectors.EVENT_READ, connection)
+            if isinstance(connection.session, DashboardSession):
+                self.send(connection, WELCOME)
+
+    def send(self, connection: Connection, data: bytes) -> None:
+        """Send to a client; one that cannot be sent to is gone."""
+        try:
+            connection.send(data)
+        except OSError:
+            self.close(connection)
+
+
+def serve(config: UrEmulatorConfig) -> None:
+    """Emulate a controller until the process is ended; says "ready" on standard output when it listens."""
+    try:
+        server = Server(config)
+    except Unreachable as error:
+        raise InputError("start", str(error), "a pose within 1.3 m of the base", "move it") from error
+    with contextlib.suppress(OSError):  # a controller keeps its rate: go before others where that is allowed
+        os.setpriority(os.PRIO_PROCESS, 0, -10)
+    sys.stdout.write("ready\n")
+    sys.stdout.flush()
+    server.run()

@@ -1,0 +1,205 @@
+"""What goes over a whisker head's wire: frames from it, commands to it, and the requests beside them.
+
+All numbers are little-endian, angles int16 counts of `ANGLE`. The bridges of published heads (BIOTACT) are
+not documented, so this format is our own: another bridge brings another `robot.head.decoder.Decodes`.
+
+A frame, 20 + 2 n c bytes, 128 for 18 whiskers of 3 channels; each sample of the head is one:
+
+    u32 magic "WHK1" | u32 sequence | u32 device time, us | u8 flags | u8 n whiskers | u8 c channels
+    u8 version | int16[n][c] theta, x, y | u32 CRC-32 of all before it
+
+`sequence` counts the samples since the head has power, those it had to drop too, and wraps, as the time does.
+
+A command, 32 + 2 n bytes:
+
+    u32 magic "WHKC" | u8 version | u8 kind | u8 mode | u8 n | f32 amplitude, rad | f32 frequency, Hz
+    f32 gain | f32 window, s | f32 offset, rad | int16[n] of the kind | u32 CRC-32 of all before it
+
+A head executes whole and known commands and ignores others. Without any for `SILENCE` s it retracts its
+whiskers and stops its drives; it goes on sending.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from enum import IntEnum, IntFlag
+from typing import NamedTuple
+
+import numpy as np
+
+from tactile.types import Array
+
+VENDOR, PRODUCT = 0x1209, 0x0001
+"""The USB numbers that pid.codes keeps for tests."""
+ENDPOINT_IN, ENDPOINT_OUT = 0x81, 0x01
+"""Bulk: frames to the host, commands to the head."""
+INTERFACE = 0
+MAGIC, COMMAND_MAGIC = b"WHK1", b"WHKC"
+VERSION = 1
+CHANNELS = 3
+"""theta, x, y"""
+ANGLE = np.pi / 32768
+"""rad per count, of theta, x and y alike."""
+SILENCE = 0.5
+"""s without a command after which a head retracts."""
+WRAP = 2**32
+"""Sequence and device time begin at 0 again there."""
+
+
+class Flag(IntFlag):
+    """What a frame says about the head."""
+
+    OVERRUN = 1
+    """Frames were dropped just before this one: nobody read them."""
+    RCP = 2
+    """The head's own feedback lowers an amplitude now."""
+    FAULT = 4
+    """A drive reports a fault."""
+    CYCLE = 8
+    """The first sample of a whisk."""
+
+
+class Kind(IntEnum):
+    """What a command is for."""
+
+    KEEP = 0
+    """Stay awake: nothing else in it counts."""
+    DRIVE = 1
+    """Whisk so from the next cycle on. The n numbers are the thresholds of y; `OFF` never touches."""
+    AMPLITUDES = 2
+    """In mode `OPEN`: the n numbers are the whiskers' amplitudes for the rest of this cycle; in the next one
+    it is the common one again. What does not come in time does no harm."""
+    CENTRE = 3
+    """The n numbers are the mean of y in free air, which feedback in the head is relative to."""
+
+
+class Mode(IntEnum):
+    """Who lowers the amplitude when a whisker touches."""
+
+    OPEN = 0
+    """Nobody in the head: the host may, by `Kind.AMPLITUDES`."""
+    RCP = 1
+    """The head, as `tactile.whisking` has it."""
+
+
+class Request(IntEnum):
+    """Vendor control requests to the device; answers in parentheses."""
+
+    START = 1
+    """Send frames, from now on (nothing)."""
+    STOP = 2
+    """Retract, stop the drives, send no more frames (nothing)."""
+    CLOCK = 3
+    """(u64: the device's time, us, of which frames carry the lower 32 bits.)"""
+    IDENTITY = 4
+    """(JSON: name, version, whiskers, channels, rate in Hz.)"""
+
+
+REQUEST_IN, REQUEST_OUT = 0xC0, 0x40
+"""bmRequestType: vendor, device."""
+LONGEST = 1024
+"""Bytes of an answer, at most."""
+OFF = 32767
+"""A threshold that no deflection reaches."""
+
+
+class Command(NamedTuple):
+    """One command.
+
+    Attributes:
+        kind: what for. mode: who feeds back. amplitude, offset: rad; a whisk protracts from the offset.
+            frequency: Hz. gain: rad per rad. window: s, over which deflections are averaged.
+        numbers: [n] int16 counts, what they are follows from the kind.
+    """
+
+    kind: Kind
+    mode: Mode = Mode.OPEN
+    amplitude: float = 0.0
+    frequency: float = 0.0
+    gain: float = 0.0
+    window: float = 0.0
+    offset: float = 0.0
+    numbers: np.ndarray = np.zeros(0, np.int16)
+
+
+_COMMAND = struct.Struct("<4sBBBB5f")
+COMMAND_SIZE = _COMMAND.size + 4
+"""Bytes of a command without numbers: 32."""
+KEEP_ALIVE = Command(Kind.KEEP)
+
+
+def frame_dtype(whiskers: int, channels: int = CHANNELS) -> np.dtype:
+    """A frame as it lies in memory, without padding."""
+    return np.dtype(
+        [
+            ("magic", "<u4"),
+            ("sequence", "<u4"),
+            ("time", "<u4"),
+            ("flags", "u1"),
+            ("whiskers", "u1"),
+            ("channels", "u1"),
+            ("version", "u1"),
+            ("values", "<i2", (whiskers, channels)),
+            ("crc", "<u4"),
+        ]
+    )
+
+
+def encode(sequence: Array, time: Array, flags: Array, values: Array) -> bytes:
+    """The frames of N samples, back to back.
+
+    Args:
+        sequence: [N] of any size. time: [N] us, of any size. flags: [N] `Flag`. values: [N, W, C] int16.
+    """
+    values = np.asarray(values)
+    frames = np.empty(len(values), frame_dtype(*values.shape[1:]))
+    frames["magic"] = int.from_bytes(MAGIC, "little")
+    frames["sequence"] = np.asarray(sequence, np.int64) % WRAP
+    frames["time"] = np.asarray(time, np.int64) % WRAP
+    frames["flags"] = flags
+    frames["whiskers"], frames["channels"] = values.shape[1:]
+    frames["version"] = VERSION
+    frames["values"] = values
+    size, raw = frames.itemsize, memoryview(frames.tobytes())
+    frames["crc"] = [zlib.crc32(raw[k : k + size - 4]) for k in range(0, len(raw), size)]
+    return frames.tobytes()
+
+
+def counts(angle: Array, deflection: Array) -> np.ndarray:
+    """[N, W, 3] int16 of angles [N, W] and deflections [N, W, 2], rad; clipped to what int16 holds."""
+    return tally(np.concatenate([np.asarray(angle)[..., None], np.asarray(deflection)], axis=-1))
+
+
+def tally(value: Array) -> np.ndarray:
+    """int16 counts of values in rad."""
+    return np.clip(np.rint(np.asarray(value, float) / ANGLE), -32768, 32767).astype(np.int16)
+
+
+def radians(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Angles [N, W] and deflections [N, W, 2], rad, of counts [N, W, 3]."""
+    value = values * ANGLE
+    return value[..., 0], value[..., 1:]
+
+
+def pack(command: Command) -> bytes:
+    """A command as it is sent."""
+    numbers = np.asarray(command.numbers, "<i2")
+    kind, mode, *drive = command[:-1]
+    body = _COMMAND.pack(COMMAND_MAGIC, VERSION, kind, mode, len(numbers), *drive) + numbers.tobytes()
+    return body + struct.pack("<I", zlib.crc32(body))
+
+
+def unpack(packet: bytes) -> Command | None:
+    """The command in a packet; None if it is not a whole one of ours."""
+    if len(packet) < COMMAND_SIZE or zlib.crc32(packet[:-4]) != int.from_bytes(packet[-4:], "little"):
+        return None
+    magic, version, kind, mode, count, amplitude, frequency, gain, window, offset = _COMMAND.unpack_from(
+        packet
+    )
+    drive = amplitude, frequency, gain, window, offset
+    known = magic == COMMAND_MAGIC and version == VERSION and kind in set(Kind) and mode in set(Mode)
+    if not known or len(packet) != COMMAND_SIZE + 2 * count or not np.isfinite(drive).all():
+        return None
+    numbers = np.frombuffer(packet, "<i2", count, _COMMAND.size).astype(np.int16)
+    return Command(Kind(kind), Mode(mode), *drive, numbers)

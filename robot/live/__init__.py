@@ -1,0 +1,1 @@
+"""A session on real devices, or on emulated ones."""

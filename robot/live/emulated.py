@@ -1,0 +1,42 @@
+"""The emulators that fit a live session: an arm above the start of its way, a head in its maze."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from robot.emulators.head.settings import HeadEmulatorConfig
+from robot.emulators.ur10.settings import UrEmulatorConfig
+from robot.head.address import Address
+from robot.live.route import way
+from robot.live.settings import LiveConfig
+from robot.ur10.placing import tcp_of
+from tactile.head import HeadConfig, ur10_head
+
+
+def controller(config: LiveConfig, head: HeadConfig, host: str | None = None) -> UrEmulatorConfig:
+    """A controller at the session's address, or another one; its arm hangs above where the way begins."""
+    start = way(config, ur10_head(head)).pose[0]
+    start = tcp_of(config.arm.placing, start, config.lift / 2)
+    return UrEmulatorConfig(
+        host=host or config.arm.host, hz=config.arm.hz, start=tuple(np.asarray(start).tolist())
+    )
+
+
+def whiskers(config: LiveConfig, head: HeadConfig, host: str | None = None) -> HeadEmulatorConfig:
+    """A head in the maze of the session's plan, carried by its arm."""
+    where = Address.parse(config.head.address)
+    plan = config.plan
+    return HeadEmulatorConfig(
+        host=host or where.host or config.arm.host,
+        port=where.port,
+        head=head,
+        mechanics=plan.mechanics,
+        stream=plan.stream,
+        maze=plan.maze,
+        path=plan.path,
+        motion=plan.motion,
+        seed=plan.seed,
+        arm=config.arm.host,
+        arm_hz=config.arm.hz,
+        placing=config.arm.placing,
+    )

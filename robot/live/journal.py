@@ -1,0 +1,170 @@
+"""A live session on its way into a recording, while it happens.
+
+Frames and arm states are gathered for a moment and written as a block. Everything is with the operating
+system within 0.2 s, counted on the times that are handed in: whoever kills the process takes no more than
+that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from threading import Lock
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from robot.blocks import Event, encode_cut, encode_event, encode_frames, encode_states
+from robot.head.decoder import Frames
+from robot.live.cycle import KEPT, Cut, within
+from robot.messages import encode_truth
+from robot.outcome import Fault, Outcome
+from robot.schemas import ARM, CUT, EVENT, FRAMES, TRUTH
+from robot.tape import Tape, Unwritable
+
+GATHERED = 0.15
+"""How long frames and states wait for others, s."""
+
+
+class Journal:
+    """Writes a session to a new recording; a context manager.
+
+    Any thread may hand something in, and waits as long as the disk does. A disk that takes no more is told by
+    `fault` alone: from then on everything is passed over, and the recording stays readable up to there.
+
+    Args:
+        path: must not exist yet. view_shape, whiskers, rate_hz, rig: see `robot.tape.Tape`.
+
+    Attributes:
+        fault: why nothing is written any more; None while it is.
+
+    Raises:
+        InputError: the file exists or cannot be made.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        view_shape: tuple[int, int, int],
+        whiskers: int,
+        rate_hz: float = 0.0,
+        rig: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.fault: Fault | None = None
+        self._tape = Tape(path, view_shape=view_shape, whiskers=whiskers, rate_hz=rate_hz, rig=rig)
+        self._lock = Lock()
+        self._frames: list[Frames] = []
+        self._states: list[np.ndarray] = []
+        self._arrival = self._since = -np.inf  # of the newest frames; of the oldest that waits
+        self._known = np.full(KEPT, -1, np.int64)  # sequences that were handed in
+
+    @property
+    def count(self) -> int:
+        """Whisks so far."""
+        return self._tape.count
+
+    def frames(self, frames: Frames, arrival: float) -> None:
+        """What the head sent, which came at that time, s. Frames known already are passed over."""
+        with self._writing(arrival) as able:
+            if able:
+                self._arrival = arrival
+                self._gather(frames)
+                self._waited(arrival)
+
+    def arm(self, states: np.ndarray) -> None:
+        """What the arm sent: states [N] (`robot.ur10.states.STATE`), oldest first."""
+        if not len(states):
+            return
+        newest = float(states["host"][-1])
+        with self._writing(newest) as able:
+            if able:
+                self._states.append(states.copy())
+                self._waited(newest)
+
+    def cut(self, cut: Cut, frames: Frames, truth: np.ndarray | None = None) -> None:
+        """A whisk, at once.
+
+        Args:
+            frames: of the whisk, all; those that `frames` has not brought yet are written before it.
+            truth: [3] where the head really was.
+
+        Raises:
+            ValueError: the frames are not those of the cut.
+        """
+        mine = within(frames, cut.first, cut.last)
+        if cut.seen and not 0 < len(mine.sequence) == cut.frames <= KEPT:
+            raise ValueError(f"{len(mine.sequence)} frames for a whisk of {cut.frames}")
+        with self._writing(cut.time) as able:
+            if able:
+                self._arrival = max(self._arrival, cut.time)
+                self._gather(mine)
+                self._write()
+                if truth is not None:
+                    self._tape.append(TRUTH, cut.time, encode_truth(cut.time, truth))
+                self._tape.append(CUT, cut.time, encode_cut(cut))
+                self._tape.flush()
+
+    def event(self, time: float, name: str, text: str) -> None:
+        """Something that happened, at once.
+
+        Args:
+            time: s. name: one word. text: what was found.
+        """
+        message = encode_event(Event(time, name, text))
+        with self._writing(time) as able:
+            if able:
+                self._write()
+                self._tape.append(EVENT, time, message)
+                self._tape.flush()
+
+    def close(self) -> None:
+        """Write what waits and finish the file; closing twice is fine."""
+        with self._writing(self._arrival) as able:
+            if able:
+                self._write()
+            self._tape.close()
+
+    def _gather(self, frames: Frames) -> None:
+        place = frames.sequence % KEPT
+        new = self._known[place] != frames.sequence
+        self._known[place] = frames.sequence
+        if new.any():
+            self._frames.append(Frames(*(column[new] for column in frames)))
+
+    def _waited(self, time: float) -> None:
+        """Something was handed in at that time: perhaps others have waited long enough."""
+        if self._since == -np.inf:
+            self._since = time
+        elif time - self._since >= GATHERED:
+            self._write()
+            self._tape.flush()
+
+    def _write(self) -> None:
+        if self._frames:
+            parts = zip(*self._frames, strict=True)
+            block = Frames(*(np.concatenate(part) for part in parts))
+            self._tape.append(FRAMES, self._arrival, encode_frames(self._arrival, block))
+        if self._states:
+            states = np.concatenate(self._states)
+            self._tape.append(ARM, float(states["host"][-1]), encode_states(states))
+        self._frames, self._states, self._since = [], [], -np.inf
+
+    @contextmanager
+    def _writing(self, time: float) -> Iterator[bool]:
+        """Alone with the tape; whether it still takes something."""
+        with self._lock:
+            try:
+                yield self.fault is None
+            except Unwritable as error:
+                self.fault = Fault(Outcome.DISK_FULL, str(error), time)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

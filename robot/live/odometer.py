@@ -1,0 +1,84 @@
+"""What the arm says of its motion: poses at any time, and the motion from whisk to whisk."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from robot.live.settings import LiveConfig
+from robot.odometry import MID_HEADING, from_velocities, reckoned
+from robot.ur10.placing import heading_of, pose_of
+from tactile.frames import compose, wrap
+from tactile.streams import stream
+from tactile.types import Odometry
+
+KEPT = 10.0
+"""s of states that are kept."""
+
+
+class Odometer:
+    """Collects the arm's states by host time, and tells poses and motions from them."""
+
+    def __init__(self, config: LiveConfig) -> None:
+        self._config = config
+        self._states: deque[tuple[float, np.ndarray, np.ndarray]] = deque()
+        self._time: list[float] = []
+        self._pose: list[np.ndarray] = []
+
+    def add(self, time: np.ndarray, tcp: np.ndarray, speed: np.ndarray) -> None:
+        """States [N], their times (s, host) and [N, 6] tool poses and their rates in the base."""
+        self._states.extend(zip(time.tolist(), tcp, speed, strict=True))
+        while self._states and self._states[0][0] < self._states[-1][0] - KEPT:
+            self._states.popleft()
+
+    @property
+    def newest(self) -> float:
+        """Time of the newest state, s; -inf without one."""
+        return self._states[-1][0] if self._states else -np.inf
+
+    def pose(self, time: float) -> np.ndarray:
+        """[3] of the head in the map at a time, between two states; the nearest one's beyond them."""
+        times = np.array([state[0] for state in self._states])
+        k = int(np.clip(np.searchsorted(times, time), 1, len(times) - 1)) if len(times) > 1 else 0
+        pair = [self._states[max(k - 1, 0)], self._states[k]]
+        poses, _ = pose_of(self._config.arm.placing, np.stack([state[1] for state in pair]))
+        span = pair[1][0] - pair[0][0]
+        share = float(np.clip((time - pair[0][0]) / span, 0, 1)) if span > 0 else 0.0
+        step = poses[1] - poses[0]
+        step[2] = wrap(step[2])
+        pose = poses[0] + share * step
+        pose[2] = wrap(pose[2])
+        return pose
+
+    def told(self, stamp: float, time: float) -> tuple[Odometry, np.ndarray]:
+        """The motion since this was last asked for, with the errors that the settings add, and the pose now.
+
+        Args:
+            stamp: of the whisk, s. time: the same moment on the host's clock.
+        """
+        pose = self.pose(time)
+        if self._config.odometry == "velocity" and self._time:
+            pose = self._driven(stamp - self._time[-1], time)
+        # Headings run on, for errors go by how far it turned.
+        last = self._pose[-1][2] if self._pose else pose[2]
+        self._pose.append(np.array([*pose[:2], last + wrap(pose[2] - last)]))
+        self._time.append(stamp)
+        random = stream(self._config.seed, "live.odometry")
+        # Drawn from the start each time: the errors of a whisk do not depend on how many follow.
+        rows = reckoned(self._config.noise, np.array(self._time), np.array(self._pose), random)
+        return Odometry(*rows[-1]), self.pose(time)
+
+    def _driven(self, took: float, time: float) -> np.ndarray:
+        """Where the mean velocity since the last whisk leads from where that was."""
+        states = [state for state in self._states if time - took < state[0] <= time]
+        if not states:
+            return self._pose[-1]
+        _, tcp, speed = (np.array(column) for column in zip(*states, strict=True))
+        heading = heading_of(tcp)
+        c, s = np.cos(heading), np.sin(heading)
+        forward, left = c * speed[:, 0] + s * speed[:, 1], -s * speed[:, 0] + c * speed[:, 1]
+        times = np.array([0.0, took])
+        mean = [np.array([0.0, part.mean()]) for part in (forward, left, speed[:, 5])]
+        motion = from_velocities(times, mean[0], mean[1], mean[2], MID_HEADING)[1, :3]
+        return compose(self._pose[-1], motion)

@@ -1,0 +1,181 @@
+"""Arm and head as one thing: looked after a hundred times a second, with one clock for both."""
+
+from __future__ import annotations
+
+import queue
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from robot.clock import Clock
+from robot.head.decoder import Frames
+from robot.head.device import open_bridge
+from robot.head.reader import Link, Reader
+from robot.head.whisk import HeadDriver
+from robot.head.wire import Flag
+from robot.live.journal import Journal
+from robot.live.odometer import Odometer
+from robot.live.settings import LiveConfig
+from robot.outcome import Fault, Outcome
+from robot.ur10.arm import Arm
+from tactile.head import HeadConfig, ur10_head
+
+TICK = 0.01
+"""s between two looks."""
+STANDS = 1.0
+"""How long an arm that was stopped is looked at, s."""
+
+
+class Faulted(Exception):
+    """What ends a session, raised by whoever looks."""
+
+    def __init__(self, fault: Fault) -> None:
+        super().__init__(str(fault))
+        self.fault = fault
+
+
+class Stopped(Exception):
+    """The operator wants it to end."""
+
+
+class Rig:
+    """The two devices of a session; a context manager that leaves both at rest.
+
+    Args:
+        stopped: whether the operator wants it to end.
+
+    Attributes:
+        arm, head, driver: the devices. clock: of the head. odometer: of the arm. epoch: time 0 of the session
+            on the host's clock, s. ages: s, of the newest state at each look. starts: sequences of the first
+            frames of whisks. restarts: how often a head was found. journal: what all is written to, or None.
+    """
+
+    def __init__(self, config: LiveConfig, head: HeadConfig, stopped: Callable[[], bool]) -> None:
+        self.config, self.shape = config, ur10_head(head)
+        whiskers = len(self.shape.length)
+        self.arm = Arm(config.arm)
+        self.head = Reader(
+            lambda: open_bridge(config.head.address),
+            whiskers,
+            config.head,
+            alive=self.shape.alive,
+            on_overload=self._overload,
+        )
+        self.driver = HeadDriver(self.head, self.shape)
+        self.clock, self.odometer = Clock(), Odometer(config)
+        self.epoch = time.monotonic()
+        self.ages: list[float] = []
+        self.starts: list[int] = []
+        self.restarts = 0
+        self.journal: Journal | None = None
+        self._stopped = stopped
+        self._arm_clock = Clock()
+        self._seen = 0
+        self._blocks: queue.SimpleQueue[tuple[Frames, float] | None] = queue.SimpleQueue()
+        self.head.on_restart.append(lambda device, host: self._blocks.put(None))
+        self.head.listeners.append(lambda frames, arrival: self._blocks.put((frames, arrival)))
+
+    def now(self) -> float:
+        """s of the session."""
+        return time.monotonic() - self.epoch
+
+    def look(self) -> None:
+        """Takes in what both devices have sent, and raises what ends the session.
+
+        Raises:
+            Faulted, Stopped.
+        """
+        self._take_frames()
+        self._take_states()
+        fault = self.arm.fault or self.head.fault or (self.journal and self.journal.fault)
+        if fault:
+            raise Faulted(fault)
+        for clock, whose in ((self.clock, "head"), (self._arm_clock, "controller")):
+            if clock.jumped:
+                detail = f"the {whose}'s clock jumped"
+                raise Faulted(Fault(Outcome.CLOCK_JUMPED, detail, time.monotonic()))
+        if self._stopped():
+            raise Stopped
+
+    def until(self, done: Callable[[], bool], longest: float, late: Outcome, what: str) -> None:
+        """Looks until it is done.
+
+        Args:
+            longest: s. late, what: how the session ends if it takes longer, and what was waited for.
+
+        Raises:
+            Faulted, Stopped.
+        """
+        due = time.monotonic() + longest
+        while not done():
+            if time.monotonic() > due:
+                raise Faulted(Fault(late, f"{what} took more than {longest:g} s", time.monotonic()))
+            self.look()
+            time.sleep(TICK)
+
+    def begin(self) -> None:
+        """Counts the session's time from now."""
+        self.epoch = time.monotonic()
+        self.ages = []
+
+    def rest(self, reason: str) -> bool:
+        """Stops the arm and retracts the whiskers; whether the arm was seen to stand."""
+        self.arm.halt(reason)
+        self.driver.rest()
+        due = time.monotonic() + STANDS
+        while not (still := self.arm.still()) and time.monotonic() < due:
+            time.sleep(TICK)
+        return still
+
+    def note(self, name: str, text: str) -> None:
+        """Keeps with the recording that something happened."""
+        if self.journal is not None:
+            self.journal.event(self.now(), name, text)
+
+    @property
+    def streaming(self) -> bool:
+        """Whether samples come."""
+        return self.head.state.link is Link.STREAMING
+
+    def _take_frames(self) -> None:
+        while not self._blocks.empty():
+            block = self._blocks.get()
+            if block is None:  # a head was found: its clock may be another one
+                self.clock, self.starts = Clock(), []
+                self.restarts += 1
+                continue
+            frames, arrival = block
+            self.clock.observe(float(frames.time[-1]) * 1e-6, arrival)
+            begins = (frames.flags & np.uint8(Flag.CYCLE)) > 0
+            self.starts += frames.sequence[begins].tolist()
+            if self.journal is not None:
+                self.journal.frames(frames, arrival - self.epoch)
+
+    def _take_states(self) -> None:
+        states = self.arm.states(self._seen)
+        self.ages.append(self.arm.age())
+        if not len(states):
+            return
+        self._seen = int(states["counter"][-1])
+        for robot, host in zip(states["robot"].tolist(), states["host"].tolist(), strict=True):
+            self._arm_clock.observe(robot, host)
+        times = np.asarray(self._arm_clock.host(states["robot"]))
+        self.odometer.add(times, states["tcp"], states["speed"])
+        if self.journal is not None:
+            states["host"] -= self.epoch
+            self.journal.arm(states)
+
+    def _overload(self, whisker: int) -> None:
+        self.arm.fail(Outcome.CONTACT, f"whisker {whisker} is bent as far as it can be")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.arm.close()
+        self.head.close()

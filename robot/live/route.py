@@ -1,0 +1,109 @@
+"""Where the arm goes: targets one after the other, each sent when it has arrived at the one before."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from robot.live.settings import LiveConfig
+from robot.motion import Path
+from robot.scene import Scene, scene
+from robot.simulation import SimulationConfig
+from robot.ur10.placing import tcp_of
+from tactile.errors import InputError
+from tactile.head import Head
+
+
+class Moves(Protocol):
+    """The part of `robot.ur10.arm.Arm` that a route needs."""
+
+    def move(self, tcp: np.ndarray, speed: float | None = None) -> object: ...
+    def arrived(self) -> bool: ...
+
+
+class Route:
+    """Targets [K, 6] in the arm's base, at a speed (m/s)."""
+
+    def __init__(self, targets: np.ndarray, speed: float) -> None:
+        self.targets, self.speed = targets, speed
+        self.sent = 0
+
+    @property
+    def length(self) -> int:
+        return len(self.targets)
+
+    def advance(self, arm: Moves) -> bool:
+        """Sends the next target if the arm has arrived; whether it has arrived at the last one.
+
+        Raises:
+            robot.ur10.safety.Refused: the arm may not go there.
+        """
+        if self.sent and not arm.arrived():
+            return False
+        if self.sent == self.length:
+            return True
+        arm.move(self.targets[self.sent], self.speed)
+        self.sent += 1
+        return False
+
+    def again(self) -> None:
+        """Sends the last target once more, after the arm was stopped on its way."""
+        self.sent = max(self.sent - 1, 0)
+
+
+def way(config: LiveConfig, head: Head) -> Path:
+    """The poses of the head in the map, in time if nothing holds it up.
+
+    Raises:
+        InputError: there is no such way, or it leads nowhere.
+    """
+    if config.waypoints:
+        return _along(config)
+    made = world(config.plan, head)
+    if len(made.jumps):
+        raise InputError(
+            "live.plan.kidnaps", "a head that is carried", "0: an arm cannot be", "leave them out"
+        )
+    keep = made.path.time <= made.duration
+    return Path(made.path.time[keep], made.path.pose[keep])
+
+
+def world(plan: SimulationConfig, head: Head) -> Scene:
+    """The maze of a plan and the path in it.
+
+    Raises:
+        InputError: there is no such scene.
+    """
+    return scene(plan.maze, plan.path, plan.motion, plan.kidnaps, head, plan.seed)
+
+
+def _along(config: LiveConfig) -> Path:
+    pose = np.array(config.waypoints)
+    pose[:, 2] = np.unwrap(np.radians(pose[:, 2]))
+    if len(pose) < 2:
+        raise InputError("live.waypoints", "one", "at least two")
+    step = np.abs(np.diff(pose, axis=0))
+    motion = config.plan.motion
+    took = np.maximum(np.hypot(step[:, 0], step[:, 1]) / motion.speed, step[:, 2] / motion.turn_rate)
+    return Path(np.concatenate([[0.0], np.cumsum(took)]), pose)
+
+
+def routed(config: LiveConfig, path: Path) -> Route:
+    """The route along a way, without its first pose, where it starts."""
+    return Route(tcp_of(config.arm.placing, path.pose[1:]), speed_of(config))
+
+
+def approach(config: LiveConfig, path: Path) -> Route:
+    """From wherever the arm stands to above the first pose."""
+    return Route(tcp_of(config.arm.placing, path.pose[:1], config.lift), speed_of(config))
+
+
+def descent(config: LiveConfig, path: Path) -> Route:
+    """From there down to it."""
+    return Route(tcp_of(config.arm.placing, path.pose[:1]), speed_of(config))
+
+
+def speed_of(config: LiveConfig) -> float:
+    """m/s, of the plan or what the arm may do, whichever is less."""
+    return min(config.plan.motion.speed, config.arm.speed)

@@ -1,0 +1,80 @@
+"""What is asked of both devices, and of this machine, before anything moves."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from robot.live.rig import Rig
+from robot.live.settings import LiveConfig
+from robot.outcome import Outcome
+from tactile.errors import InputError
+
+LISTENED = 1.5
+"""How long both streams are listened to, s."""
+LEAST = 0.9
+"""Share of its nominal rate that a stream must have."""
+
+
+def room(config: LiveConfig, directory: Path) -> str:
+    """How much room the disk has.
+
+    Raises:
+        InputError: too little.
+    """
+    there = next(folder for folder in (directory, *directory.resolve().parents) if folder.exists())
+    free = shutil.disk_usage(there).free
+    if free < config.room:
+        found = f"{free / 1e9:.2g} GB free"
+        raise InputError(
+            str(directory), found, f"{config.room / 1e9:.2g} GB", "make room, or choose another disk with -o"
+        )
+    return f"disk: {free / 1e9:.0f} GB free"
+
+
+def started(rig: Rig) -> Iterator[str]:
+    """Starts both devices and listens to them; a line for each thing that is as it should be.
+
+    Raises:
+        InputError: one is not; says what and what to do.
+        robot.live.rig.Faulted, robot.live.rig.Stopped.
+    """
+    rig.head.start()
+    identity = rig.head.identity
+    assert identity is not None
+    yield f"head: {identity.name} {identity.version}, {identity.whiskers} whiskers at {identity.rate:g} Hz"
+    rig.arm.start()
+    yield f"arm: {rig.config.arm.host}, admitted, states at {rig.config.arm.hz} Hz"
+    before = rig.head.decoder.counts
+    _listened(rig)
+    after = rig.head.decoder.counts
+    rate = (after.good - before.good) / LISTENED
+    if rate < LEAST * identity.rate:
+        raise InputError(
+            "head", f"{rate:.0f} of {identity.rate:g} samples a second", "", "look at the USB hub and cable"
+        )
+    if after.bad > before.bad:
+        raise InputError(
+            "head", f"{after.bad - before.bad} damaged samples in {LISTENED:g} s", "none", "change the cable"
+        )
+    if rig.clock.residual > rig.config.residual:
+        found = f"its samples come up to {rig.clock.residual * 1e3:.1f} ms late"
+        raise InputError(
+            "head", found, f"{rig.config.residual * 1e3:g} ms", "look at what else this machine does"
+        )
+    age = float(np.median(rig.ages[-100:]))
+    yield f"clocks: head {rig.clock.residual * 1e3:.1f} ms, newest state {age * 1e3:.0f} ms old"
+
+
+def _listened(rig: Rig) -> None:
+    end = rig.now() + LISTENED
+    rig.until(lambda: rig.now() >= end, LISTENED + 5.0, Outcome.HEAD_SILENT, "the self-test")
+
+
+def reported(lines: Iterator[str], tell: Callable[[str], None]) -> None:
+    """Tells every line as it comes."""
+    for line in lines:
+        tell(line)

@@ -1,0 +1,64 @@
+"""The records of an MCAP file in the order in which they were written, none of them believed.
+
+MCAP's own reader wants the table of contents at the end, which a killed writer never wrote. Lengths are
+bounded by what is left of the file, and chunks must have their checksum.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from typing import IO, Any, cast
+
+import zstandard
+from mcap.exceptions import EndOfFile, McapError
+from mcap.records import Channel, Chunk, McapRecord, Message, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
+
+from robot.messages import Malformed
+
+CHUNK_LIMIT = 1 << 28  # bytes; ours hold 64 kB, or one sample if that is larger
+
+# What the MCAP and zstd libraries, and we, raise about bytes that are not what they should be.
+BROKEN = (McapError, zstandard.ZstdError, struct.error, ValueError, OverflowError)
+
+
+class _Bounded:
+    """A file that neither pretends to be longer than it is nor hands out half of what was asked for."""
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self._file = file
+        self._left = file.seek(0, 2)
+        file.seek(0)
+
+    def read(self, size: int) -> bytes:
+        if not 0 <= size <= self._left:
+            raise EndOfFile
+        content = self._file.read(size)
+        if len(content) != size:
+            raise EndOfFile  # it shrank while we read
+        self._left -= size
+        return content
+
+
+def records(file: IO[bytes]) -> Iterator[McapRecord]:
+    """Every record in order, chunks opened; raises one of `BROKEN`."""
+    reader = StreamReader(cast(Any, _Bounded(file)), emit_chunks=True, validate_crcs=True)
+    for record in reader.records:
+        if isinstance(record, Chunk):
+            yield from _opened(record)
+        elif not isinstance(record, (Message, Channel, Schema)):  # outside a chunk they have no checksum
+            yield record
+
+
+def _opened(chunk: Chunk) -> list[McapRecord]:
+    if chunk.compression not in ("zstd", ""):
+        raise Malformed(f"a chunk compressed with {chunk.compression!r}")
+    size = len(chunk.data)
+    if chunk.compression:
+        size = max(chunk.uncompressed_size, zstandard.frame_content_size(chunk.data))
+    if size > CHUNK_LIMIT:
+        raise Malformed(f"a chunk of {size} bytes")
+    if not chunk.uncompressed_crc:
+        raise Malformed("a chunk without its checksum")
+    return breakup_chunk(chunk, validate_crc=True)

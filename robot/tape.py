@@ -1,0 +1,187 @@
+"""A recording being written: an MCAP file that stays readable when the process is killed or the disk is full.
+
+zstd-compressed chunks with checksums, each handed to the operating system as a whole.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from mcap.writer import CompressionType, Writer
+
+from robot.schemas import READINGS, SCHEMAS, TOPICS, TRUTH
+from robot.walk import METADATA, Description
+from tactile.errors import InputError
+
+
+class Unwritable(InputError):
+    """The operating system takes no more of a recording."""
+
+    def __init__(self, path: Path, error: OSError) -> None:
+        cure = "free room on the disk; what was written until then can be read"
+        super().__init__(str(path), f"cannot be written on ({error.strerror or error})", "", cure)
+
+
+class Tape:
+    """Appends messages to a new file.
+
+    Args:
+        path: must not exist yet.
+        view_shape, whiskers: of every sample. rate_hz: how fast they come, if known; for readers' eyes only.
+        rig: by what the samples were made (see `robot.source.Rigged`): what JSON can hold. It stands at the
+            start of the file, so one that is cut off still has it.
+        chunk_bytes: a chunk is written when it is so large, before compression,
+        chunk_s: or when its last message's time is so many seconds off the last one's of the chunk before.
+
+    Attributes:
+        count: readings so far.
+
+    Raises:
+        InputError: the file exists or cannot be made.
+        ValueError, TypeError: the rig is more than JSON can hold.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        view_shape: tuple[int, int, int],
+        whiskers: int,
+        rate_hz: float,
+        rig: Mapping[str, Any] | None,
+        chunk_bytes: int = 1 << 16,
+        chunk_s: float = 0.5,
+    ) -> None:
+        self.description = Description(view_shape, whiskers, rate_hz, _program(), dict(rig or {}))
+        metadata = self.description.to_metadata()
+        Description.from_metadata(metadata)
+        self.path = path
+        try:
+            self._file = _Whole(path)
+        except FileExistsError as error:
+            raise InputError(
+                str(path), "exists already", "a new file", "choose another name or move it"
+            ) from error
+        except OSError as error:
+            raise InputError(str(path), f"cannot be written ({error.strerror})") from error
+        self._chunk_bytes, self._chunk_s = chunk_bytes, chunk_s
+        self._pending, self._flushed = 0, -np.inf  # bytes in the open chunk; time of the last closed one
+        self._channels: dict[str, int] = {}
+        self.count = 0
+        self._beside: Counter[str] = Counter()
+        self._failed = False
+        # Chunks are ended here, never by the library, so that each one reaches the operating system whole.
+        self._writer = Writer(
+            cast(Any, self._file),
+            chunk_size=1 << 62,
+            compression=CompressionType.ZSTD,
+            enable_data_crcs=True,
+        )
+        self._writer.start(library=_program())
+        self._writer.add_metadata(METADATA, metadata)
+        self.flush()
+
+    def append(self, name: str, time: float, message: bytes) -> None:
+        """Append a message of that schema; the truth of a reading goes before it.
+
+        Raises:
+            Unwritable: the operating system takes no more.
+        """
+        counted = name in READINGS or name == TRUTH
+        number = self.count if counted else self._beside[name]
+        # MCAP's clock has no negative times.
+        stamp = min(max(round(time * 1e9), 0), (1 << 63) - 1) if np.isfinite(time) else 0
+        self._writer.add_message(self._channel(name), stamp, message, stamp, number % (1 << 32))
+        self._pending += len(message)
+        if name == TRUTH:
+            return
+        self.count += name in READINGS
+        self._beside[name] += not counted
+        if self._pending >= self._chunk_bytes or abs(time - self._flushed) >= self._chunk_s:
+            self.flush()
+            self._flushed = time
+
+    def flush(self) -> None:
+        """Hand everything so far to the operating system.
+
+        Raises:
+            Unwritable: it does not take it.
+        """
+        try:
+            self._writer.flush()
+        except OSError as error:
+            self._failed = True
+            raise Unwritable(self.path, error) from error
+        self._pending = 0
+
+    def close(self) -> None:
+        """Finish the file; closing twice is fine. What was unwritable before is tried once more, silently.
+
+        Raises:
+            Unwritable: the operating system does not take the rest.
+        """
+        if self._file.closed:
+            return
+        try:
+            self._writer.finish()
+            self._file.flush()
+        except OSError as error:
+            if not self._failed:
+                raise Unwritable(self.path, error) from error
+        finally:
+            self._file.close()
+
+    def _channel(self, name: str) -> int:
+        if name not in self._channels:
+            schema = self._writer.register_schema(name, "ros2msg", SCHEMAS[name].encode())
+            self._channels[name] = self._writer.register_channel(TOPICS[name], "cdr", schema)
+        return self._channels[name]
+
+
+class _Whole:
+    """A new file that is written at `flush`, all of what is waiting or nothing."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("xb", buffering=0)
+        self._size = 0
+        self._waiting = bytearray()
+
+    def write(self, data: bytes) -> int:
+        self._waiting += data
+        return len(data)
+
+    def tell(self) -> int:
+        return self._size + len(self._waiting)
+
+    def flush(self) -> None:
+        rest = memoryview(bytes(self._waiting))
+        try:
+            while rest:
+                rest = rest[self._file.write(rest) :]
+        except OSError:
+            with suppress(OSError):
+                self._file.truncate(self._size)
+                self._file.seek(self._size)
+            raise
+        self._size += len(self._waiting)
+        self._waiting.clear()
+
+    def close(self) -> None:
+        self._file.close()
+
+    @property
+    def closed(self) -> bool:
+        return self._file.closed
+
+
+def _program() -> str:
+    try:
+        return f"ratslam {version('ratslam')}"
+    except PackageNotFoundError:  # used from a checkout
+        return "ratslam"

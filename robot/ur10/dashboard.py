@@ -1,0 +1,109 @@
+"""The controller's dashboard server: a line asked, a line answered. The second way to stop the arm.
+
+An own client, because it has to answer or give up within a time, whatever the controller does.
+"""
+
+from __future__ import annotations
+
+import re
+import socket
+from contextlib import suppress
+from typing import NamedTuple
+
+PORT = 29999
+OLDEST = (3, 4)  # PolyScope; older ones lack what the control script asks for
+
+
+class Silent(ConnectionError):
+    """Nobody answers as a dashboard server does."""
+
+
+class Controller(NamedTuple):
+    """What a controller says of itself.
+
+    Attributes:
+        version: of PolyScope, as (5, 11). mode: robot mode, as `RUNNING`. safety: safety mode, as `NORMAL`.
+        program: whether a program runs. remote: whether it is under remote control; None where it has no such
+            switch (CB3, PolyScope before 5.6).
+    """
+
+    version: tuple[int, ...]
+    mode: str
+    safety: str
+    program: bool
+    remote: bool | None
+
+
+class Dashboard:
+    """A connection to the dashboard server; a context manager."""
+
+    def __init__(self, host: str, timeout: float = 1.0) -> None:
+        self.host = host
+        self._rest = b""
+        try:
+            self._socket = socket.create_connection((host, PORT), timeout)
+            self._socket.settimeout(timeout)
+            self._line()  # the greeting
+        except OSError as error:
+            raise Silent(f"no dashboard server answers at {host}:{PORT} ({error})") from None
+
+    def __enter__(self) -> Dashboard:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def ask(self, command: str) -> str:
+        """The answer to a command, one line."""
+        try:
+            self._socket.sendall(command.encode() + b"\n")
+            return self._line()
+        except OSError as error:
+            raise Silent(f"{self.host}:{PORT} did not answer `{command}` ({error})") from None
+
+    def stop(self) -> str:
+        """End the controller's program, which stops the arm."""
+        return self.ask("stop")
+
+    def controller(self) -> Controller:
+        """What the controller says of itself."""
+        version = _version(self.ask("PolyscopeVersion"))
+        safety = self.ask("safetymode")
+        remote = "true" in self.ask("is in remote control").lower() if version >= (5, 6) else None
+        program = "true" in self.ask("running").lower()
+        return Controller(version, _value(self.ask("robotmode")), _value(safety), program, remote)
+
+    def close(self) -> None:
+        """Hang up."""
+        with suppress(OSError):
+            self._socket.close()
+
+    def _line(self) -> str:
+        while b"\n" not in self._rest:
+            data = self._socket.recv(4096)
+            if not data:
+                raise OSError("it hung up")
+            self._rest += data
+            if len(self._rest) > 65536:
+                raise OSError("it answers without end")
+        line, self._rest = self._rest.split(b"\n", 1)
+        return line.decode(errors="replace").strip()
+
+
+def stop(host: str, timeout: float = 0.5, tries: int = 3) -> str:
+    """Stop the controller's program by a connection of its own; its answer, '' if nobody gives one."""
+    for _ in range(tries):
+        with suppress(Silent), Dashboard(host, timeout) as dashboard:
+            return dashboard.stop()
+    return ""
+
+
+def _version(line: str) -> tuple[int, ...]:
+    """(5, 11) of `URSoftware 5.11.0.1234 (Jan 01 2022)`."""
+    found = re.search(r"(\d+)\.(\d+)", line)
+    return (int(found[1]), int(found[2])) if found else (0, 0)
+
+
+def _value(line: str) -> str:
+    """`RUNNING` of `Robotmode: RUNNING`."""
+    return line.rsplit(":", 1)[-1].strip().upper()

@@ -1,0 +1,77 @@
+"""Where the plane of the map lies in the arm's base: poses of the head become poses of the tool, and back.
+
+A tool pose is an array [..., 6] as UR controllers write it: x, y, z of the tool centre point in the base frame,
+m, and a rotation vector, rad. The tool points down: its rotation is Rz(heading) Rx(pi), half a turn about the
+level axis (cos h/2, sin h/2, 0).
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+
+from tactile.frames import between, compose
+from tactile.settings import Settings
+
+
+class PlacingConfig(Settings):
+    """The map's origin and x axis in the arm's base frame.
+
+    The default sets a maze of 7 x 5 micromouse cells before the base, within a UR-10's reach.
+    """
+
+    x: float = -0.63
+    """Of the map's origin, m."""
+    y: float = 0.22
+    """Of the map's origin, m."""
+    z: float = 0.1
+    """Of the tool centre point at working height, m."""
+    yaw_deg: Annotated[float, Field(ge=-180, le=180)] = 0.0
+    """From the base's x axis to the map's, degrees."""
+
+
+def tcp_of(config: PlacingConfig, pose: np.ndarray, lift: float | np.ndarray = 0.0) -> np.ndarray:
+    """[..., 6] the tool pose that puts the head at a pose of the map.
+
+    Args:
+        pose: [..., 3] x, y (m) and heading (rad) in the map. lift: [...] m above working height.
+    """
+    x, y, heading = np.moveaxis(compose(_origin(config), np.asarray(pose, np.float64)), -1, 0)
+    z = np.broadcast_to(config.z + np.asarray(lift, np.float64), x.shape)
+    axis = np.pi * np.cos(heading / 2), np.pi * np.sin(heading / 2)
+    return np.stack([x, y, z, *axis, np.zeros_like(x)], axis=-1)
+
+
+def pose_of(config: PlacingConfig, tcp: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The head's pose in the map [..., 3], heading wrapped, and its lift above working height [...] m."""
+    tcp = np.asarray(tcp, np.float64)
+    pose = np.stack([tcp[..., 0], tcp[..., 1], heading_of(tcp)], axis=-1)
+    return between(_origin(config), pose), tcp[..., 2] - config.z
+
+
+def heading_of(tcp: np.ndarray) -> np.ndarray:
+    """[...] rad: where the tool's x axis points, seen from above, in the base frame."""
+    axis, turn = _axis_angle(tcp)
+    x, y, z = np.moveaxis(axis, -1, 0)
+    cos, sin = np.cos(turn), np.sin(turn)
+    return np.arctan2(z * sin + x * y * (1 - cos), cos + x * x * (1 - cos))
+
+
+def tilt_of(tcp: np.ndarray) -> np.ndarray:
+    """[...] rad: the angle between the tool's z axis and straight down."""
+    axis, turn = _axis_angle(tcp)
+    up = np.cos(turn) + axis[..., 2] ** 2 * (1 - np.cos(turn))
+    return np.arccos(np.clip(-up, -1.0, 1.0))
+
+
+def _axis_angle(tcp: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The rotation's axis [..., 3], unit (any for no rotation), and its angle [...] rad."""
+    vector = np.asarray(tcp, np.float64)[..., 3:]
+    turn = np.linalg.norm(vector, axis=-1)
+    return vector / np.where(turn > 0, turn, 1.0)[..., None], turn
+
+
+def _origin(config: PlacingConfig) -> np.ndarray:
+    return np.array([config.x, config.y, np.radians(config.yaw_deg)])

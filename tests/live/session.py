@@ -1,0 +1,32 @@
+"""`python -m tests.live.session`: a session that waits, with everything loaded, for what it is to do.
+
+A line of JSON on its standard input tells the `arguments` of `python -m ratslam`, and with `mapper` (s for each
+sample) that a stub takes the mapper's place. What a loaded machine would spoil is taken care of here alone.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from functools import partial
+from typing import Any
+
+
+def main() -> int:
+    import ratslam.live
+    from ratslam.cli import main as program
+    from ratslam.live import live
+    from robot.live import selftest
+    from tests.live import stub
+
+    print("waiting", flush=True)
+    told: dict[str, Any] = json.loads(sys.stdin.readline())
+    arguments = told["arguments"]
+    directory = arguments[arguments.index("-o") + 1]
+    ratslam.live.live = partial(live, mapping=partial(stub.mapping, directory, told["mapper"]))
+    selftest.LISTENED = told.get("listened", selftest.LISTENED)
+    return program(arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

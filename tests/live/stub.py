@@ -1,0 +1,57 @@
+"""Takes the place of the mapper's process: follows its protocol, loads almost nothing, maps nothing."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import time
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+SHORT = 64
+"""Bytes; a message that is shorter is no sample."""
+
+
+class Answer:
+    """Becomes `ratslam.live.mapper.Told` on its way, which this process need not know."""
+
+    def __init__(self, *fields: Any) -> None:
+        self.fields = fields
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return told, self.fields
+
+
+def told(number: int, seconds: float) -> Any:
+    """What a sample led to."""
+    import numpy as np
+
+    from ratslam.live.mapper import Told
+
+    return Told(number, np.zeros(3), -1, "none", seconds)
+
+
+def mapping(directory: str, seconds: float, line: Connection) -> None:
+    """What the process does.
+
+    Args:
+        directory: that a mapper would make; `mapper.pid` in it tells who does. seconds: for each sample.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        line.recv_bytes()  # the order
+        Path(directory).mkdir(parents=True)
+        Path(directory, "mapper.pid").write_text(str(os.getpid()))
+        line.send(True)
+        number = 0
+        while True:
+            word = line.recv_bytes()
+            if len(word) < SHORT and isinstance(pickle.loads(word), bool):
+                return  # without a score
+            time.sleep(seconds)
+            line.send(Answer(number, seconds))
+            number += 1
+    except (EOFError, OSError):
+        pass  # nobody wants it any more

@@ -1,0 +1,99 @@
+"""A Create in this process, on a line of bytes in a time of its own; and one on a terminal, in real time."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from typing import Any
+
+from robot.create.link import Link
+from robot.create.pilot import PAUSE, Pilot
+from robot.create.settings import CreateConfig
+from robot.create.wire import SAFE, START
+from robot.emulators.create import Create, CreateEmulatorConfig
+
+
+class Line:
+    """A port without a wire: what is written reaches the robot at once, replies come as `mangle` leaves them.
+
+    Attributes:
+        now: s, its clock; waiting for bytes that do not come lets it go on.
+    """
+
+    def __init__(self) -> None:
+        self.robot = Create(CreateEmulatorConfig())
+        self.now, self.timeout = 100.0, 0.0
+        self.mangle: Callable[[bytes], bytes] = lambda reply: reply
+        self.gone = False
+        self._waiting = b""
+
+    def wait(self, seconds: float) -> None:
+        self.now += seconds
+        self.robot.advance(seconds)
+
+    def clock(self) -> float:
+        return self.now
+
+    @property
+    def in_waiting(self) -> int:
+        self._attached()
+        return len(self._waiting)
+
+    def read(self, size: int = 1) -> bytes:
+        self._attached()
+        data, self._waiting = self._waiting[:size], self._waiting[size:]
+        if len(data) < size:
+            self.wait(self.timeout or 0.0)
+        return data
+
+    def write(self, data: bytes) -> int:
+        self._attached()
+        for reply in self.robot.receive(data):
+            self._waiting += self.mangle(reply)
+        return len(data)
+
+    def arrive(self, data: bytes) -> None:
+        """Bytes come by themselves."""
+        self._waiting += data
+
+    def close(self) -> None: ...
+
+    def _attached(self) -> None:
+        if self.gone:
+            raise OSError(5, "Input/output error")
+
+    def flown(self, **settings: Any) -> Pilot:
+        """A pilot of this robot, awake and in safe mode."""
+        link = Link(self)
+        for command in (START, SAFE):
+            link.send(command)
+            self.wait(PAUSE)
+        link.ask(float("inf"))
+        return Pilot(CreateConfig(**settings), link, self.clock)
+
+
+class Emulated:
+    """The emulator's process."""
+
+    def __init__(self, *arguments: str) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "robot.emulators.create", *arguments],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            bufsize=1,
+        )
+        assert self.process.stdout
+        self.path = self.process.stdout.readline().strip()
+
+    def do(self, what: str, **more: Any) -> Any:
+        assert self.process.stdin
+        assert self.process.stdout
+        self.process.stdin.write(json.dumps({"do": what, **more}) + "\n")
+        return json.loads(self.process.stdout.readline())
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.communicate()

@@ -1,0 +1,85 @@
+"""Odometry in whole millimetres and degrees: what is not told yet is all that is missing."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robot.create import wire
+from robot.create.odometer import Odometer
+from robot.emulators.create import Create, CreateEmulatorConfig
+from tactile.frames import compose
+
+SPEED = st.integers(-wire.TOP_SPEED, wire.TOP_SPEED)
+LEG = st.tuples(SPEED, SPEED, st.floats(0.005, 0.5), st.integers(1, 20))  # wheels, s, readings
+LEGS = st.lists(LEG, min_size=1, max_size=12)
+
+
+def readings(legs: list[tuple[int, int, float, int]]) -> tuple[Create, list[tuple[int, int, float]]]:
+    """A robot driven so, and what it told: mm, degrees, time."""
+    robot = Create(CreateEmulatorConfig())
+    robot.receive(wire.START + wire.SAFE)
+    told = []
+    for right, left, seconds, count in legs:
+        robot.receive(wire.drive(right, left))
+        for _ in range(count):
+            robot.advance(seconds)
+            (reply,) = robot.receive(wire.QUERY)
+            millimetres, degrees, *_ = wire.REPLY.unpack(reply)
+            told.append((millimetres, degrees, robot.time))
+    return robot, told
+
+
+@given(LEGS)
+def test_sums_are_the_truth_within_what_is_not_told(legs: list[tuple[int, int, float, int]]) -> None:
+    robot, told = readings(legs)
+    assert abs(sum(m for m, _, _ in told) - 1000 * robot.base.travelled) < 1 + 1e-6
+    assert abs(sum(d for _, d, _ in told) - math.degrees(robot.base.turned)) < 1 + 1e-6
+
+
+@given(LEGS)
+def test_the_pose_is_the_truth_within_quantisation(legs: list[tuple[int, int, float, int]]) -> None:
+    robot, told = readings(legs)
+    odometer = Odometer(0.0)
+    for reading in told:
+        odometer.add(*reading)
+    dx, dy, dtheta, dt = odometer.take()
+    driven = sum(abs(right + left) / 2000 * s * n for right, left, s, n in legs)
+    turned = math.radians(sum(abs(d) for _, d, _ in told))
+    # A heading is off by a degree at most, all along; a millimetre is told late, in another direction.
+    bound = driven * math.radians(1) + 1e-3 * (1 + turned)
+    assert math.hypot(dx - robot.base.x, dy - robot.base.y) <= bound + 1e-9
+    assert abs(dtheta - robot.base.heading) < math.radians(1) + 1e-9
+    assert dt == pytest.approx(robot.time)
+
+
+@given(LEGS, st.lists(st.booleans(), min_size=240, max_size=240))
+def test_taking_it_in_parts_changes_nothing(
+    legs: list[tuple[int, int, float, int]], taken: list[bool]
+) -> None:
+    _, told = readings(legs)
+    whole, parts = Odometer(0.0), Odometer(0.0)
+    pose, time = np.zeros(3), 0.0
+    for reading, take in zip(told, taken, strict=False):
+        whole.add(*reading)
+        parts.add(*reading)
+        if take:
+            *motion, dt = parts.take()
+            pose, time = compose(pose, np.array(motion)), time + dt
+    *motion, dt = parts.take()
+    pose, time = compose(pose, np.array(motion)), time + dt
+    total = whole.take()
+    assert pose[:2] == pytest.approx(total[:2], abs=1e-9)
+    assert math.cos(pose[2] - total.dtheta) == pytest.approx(1)
+    assert time == pytest.approx(total.dt)
+
+
+def test_an_arc_is_an_arc() -> None:
+    odometer = Odometer(0.0)
+    odometer.add(1571, 90, 1.0)  # a quarter of a circle of 1 m
+    assert odometer.take() == pytest.approx((1.0, 1.0, math.pi / 2, 1.0), abs=2e-4)
+    assert odometer.take() == (0, 0, 0, 0)

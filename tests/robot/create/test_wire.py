@@ -1,0 +1,107 @@
+"""Bytes of the Open Interface: what is sent is what was meant, and only a Create's replies are believed."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from robot.create import wire
+from robot.create.halts import Refused, wheels
+from robot.create.settings import CreateConfig
+from robot.emulators.create import Create, CreateEmulatorConfig
+
+SPEED = st.integers(-wire.TOP_SPEED, wire.TOP_SPEED)
+
+
+def awake() -> Create:
+    robot = Create(CreateEmulatorConfig())
+    assert robot.receive(wire.START + wire.SAFE) == []
+    return robot
+
+
+@given(SPEED, SPEED, st.integers(1, 5))
+def test_wheels_turn_as_they_are_told_however_the_command_is_cut(right: int, left: int, cut: int) -> None:
+    robot = awake()
+    command = wire.drive(right, left)
+    robot.receive(command[:cut])
+    robot.receive(command[cut:])
+    assert (robot.right, robot.left) == (right, left)
+    assert robot.unknown == 0
+
+
+@given(SPEED, SPEED, st.integers(0, 6))
+def test_a_stop_stops_after_a_command_that_broke_off(right: int, left: int, length: int) -> None:
+    for command in (wire.drive(right, left), wire.QUERY):
+        robot = awake()
+        robot.receive(wire.drive(200, 200) + command[:length])
+        robot.receive(wire.STOP_ANYHOW)
+        assert (robot.right, robot.left) == (0, 0)
+
+
+@pytest.mark.parametrize(("right", "left"), [(501, 0), (0, -501), (32767, 0)])
+def test_no_command_is_beyond_the_interface(right: int, left: int) -> None:
+    with pytest.raises(ValueError, match="500 at most"):
+        wire.drive(right, left)
+
+
+@given(SPEED, SPEED, st.floats(0, 3), st.sampled_from([0, 1, 2, 3, 4, 16, 31]))
+def test_what_a_create_says_is_believed(right: int, left: int, elapsed: float, bumps: int) -> None:
+    robot = awake()
+    robot.receive(wire.drive(right, left))
+    robot.touch(wire.Bumps(bumps))
+    robot.advance(elapsed)
+    (reply,) = robot.receive(wire.QUERY)
+    found = wire.sensed(reply, elapsed)
+    assert found is not None
+    assert found.bumps == bumps
+    assert found.mode == (wire.Mode.PASSIVE if bumps > 3 else wire.Mode.SAFE)
+    assert abs(found.millimetres - 1000 * robot.base.travelled) < 1
+    assert abs(found.degrees - math.degrees(robot.base.turned)) < 1
+
+
+@given(st.binary(max_size=12), st.floats(0, 1))
+@example(wire.REPLY.pack(0, 0, 0, 2), 0.0)
+@example(wire.REPLY.pack(60, 0, 0, 2), 0.0)
+@example(wire.REPLY.pack(0, -60, 0, 2), 0.0)
+@example(wire.REPLY.pack(0, 0, 32, 2), 0.0)
+@example(wire.REPLY.pack(0, 0, 0, 0), 0.0)
+@example(wire.REPLY.pack(0, 0, 0, 4), 0.0)
+def test_what_is_believed_is_possible(data: bytes, elapsed: float) -> None:
+    found = wire.sensed(data, elapsed)
+    if found is not None:
+        assert wire.REPLY.pack(*found) == data
+        assert found.mode in (1, 2, 3)
+        assert abs(found.millimetres) <= 500 * (elapsed + 0.1) + 5
+        assert abs(found.degrees) <= 222 * (elapsed + 0.1) + 5
+    else:
+        assert data != wire.REPLY.pack(0, 0, 0, 2)
+
+
+@given(st.floats(0.0005, 0.5), st.floats(allow_infinity=True, allow_nan=True), st.floats())
+@example(0.2, 0.2, 0.0)
+@example(0.2004, 0.2004, 0.0)
+@example(0.1996, 0.1996, 0.0)
+@example(0.2, 0.2006, 0.0)
+@example(0.5, 0.0, 3.875)
+def test_no_wheel_is_over_the_cap(cap: float, forward: float, turn: float) -> None:
+    config = CreateConfig(speed=cap)
+    apart = turn * config.wheel_base / 2
+    fits = max(abs(forward + apart), abs(forward - apart)) <= cap  # False of NaN
+    try:
+        right, left = wheels(config, forward, turn)
+    except Refused:
+        assert not fits
+        return
+    assert max(abs(right), abs(left)) <= 1000 * cap + 1e-6
+    assert abs(right - 1000 * (forward + apart)) < 1.001
+    assert abs(left - 1000 * (forward - apart)) < 1.001
+
+
+@given(st.floats(-0.1, 0.1), st.floats(-0.7, 0.7))
+def test_forward_and_turn_are_the_wheels_mean_and_difference(forward: float, turn: float) -> None:
+    right, left = wheels(CreateConfig(), forward, turn)
+    assert (right + left) / 2000 == pytest.approx(forward, abs=1e-3)
+    assert (right - left) / 1000 / 0.258 == pytest.approx(turn, abs=4e-3)

@@ -1,0 +1,329 @@
+"""The controller without sockets: recipes and masters, the handshake, watchdog, safety, dashboard."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robot.emulators.ur10 import wire
+from robot.emulators.ur10.controller import Controller
+from robot.emulators.ur10.dashboard import DashboardSession
+from robot.emulators.ur10.rtde import Claims, RtdeSession
+from robot.emulators.ur10.safety import RobotMode, Runtime, SafetyMode
+from robot.emulators.ur10.script import ScriptSession
+from robot.emulators.ur10.settings import UrEmulatorConfig
+
+PROGRAM = (
+    "def rtde_control():\n    global reg_offset_int = # int register offset\n0\n"
+    "    def exec_move_path():\n      # inject move path\n{}    end\nend\n"
+)
+HERE = (0.6, 0.0, 0.3, math.pi, 0.0, 0.0)
+THERE = (0.6, 0.1, 0.3, math.pi, 0.0, 0.0)
+RUNNING = 1 << 15
+
+
+class Bench:
+    """A controller, its clock, and a client that writes registers as the library does."""
+
+    def __init__(self, path: str = "", **settings: object) -> None:
+        self.controller = Controller(UrEmulatorConfig.model_validate(settings))
+        self.host = 0.0
+        self.script = ScriptSession(self.controller)
+        self.dashboard = DashboardSession(self.controller)
+        self.upload(path)
+
+    def upload(self, path: str = "") -> None:
+        self.script.received(PROGRAM.format(path).encode(), self.host)
+        self.ticks(0.1)
+
+    def ticks(self, seconds: float) -> None:
+        for _ in range(round(seconds / self.controller.dt)):
+            self.host += self.controller.dt
+            self.controller.tick(self.host)
+
+    def write(self, command: int, doubles: tuple[float, ...] = (), asynchronous: int = 0) -> None:
+        registers = self.controller.registers
+        for index, number in enumerate(doubles):
+            registers.write(f"input_double_register_{index}", (number,), self.host)
+        registers.write("input_int_register_1", (asynchronous,), self.host)
+        registers.write("input_int_register_0", (command,), self.host)
+
+    def out(self, index: int) -> int:
+        return int(self.controller.registers.fields[f"output_int_register_{index}"][0])
+
+    def command(
+        self, number: int, doubles: tuple[float, ...] = (), asynchronous: int = 0, wait: float = 30
+    ) -> bool:
+        """One command, answered and cleared; False where it is never answered."""
+        assert self.out(0) == 1
+        self.write(number, doubles, asynchronous)
+        for _ in range(round(wait / self.controller.dt)):
+            self.ticks(self.controller.dt)
+            if self.out(0) == 2:
+                self.write(0)
+                self.ticks(0.02)
+                return True
+            if self.controller.runtime is not Runtime.PLAYING:
+                self.write(0)
+                return False
+        return False
+
+    def ask(self, line: str) -> str:
+        return self.dashboard.received(line.encode() + b"\n", self.host).decode().strip()
+
+
+def test_a_command_is_done_once_and_the_next_waits_for_the_clearing() -> None:
+    bench = Bench()
+    assert bench.out(0) == 1
+    assert bench.command(3, (*THERE, 0.2, 1.0))
+    assert bench.controller.arm.state.tcp[:3] == pytest.approx(THERE[:3])
+    bench.write(3, (*HERE, 0.2, 1.0))
+    bench.ticks(5.0)  # never cleared: carried out once, and 2 stays
+    assert bench.out(0) == 2
+    assert len([t for t in bench.controller.targets if t["do"] == "movel"]) == 2
+
+
+def test_the_word_of_progress_tells_one_operation_from_the_next() -> None:
+    bench = Bench()
+    before = bench.out(2)
+    assert not before & RUNNING
+    assert bench.command(3, (*THERE, 0.1, 1.0), asynchronous=1)
+    first = bench.out(2)
+    assert first & RUNNING
+    assert first >> 24 == (before >> 24) + 1
+    assert bench.command(3, (*HERE, 0.1, 1.0), asynchronous=1)  # in the midst of the first
+    second = bench.out(2)
+    assert second & RUNNING
+    assert second >> 24 == (first >> 24) + 1
+    bench.ticks(5.0)
+    assert not bench.out(2) & RUNNING
+    assert bench.out(2) >> 24 == second >> 24
+    assert bench.controller.arm.state.tcp[:3] == pytest.approx(HERE[:3], abs=1e-9)
+
+
+def test_an_asynchronous_stop_ends_a_move_and_is_an_operation_itself() -> None:
+    bench = Bench()
+    assert bench.command(3, (*THERE, 0.1, 1.0), asynchronous=1)
+    operation = bench.out(2) >> 24
+    bench.ticks(0.3)
+    assert bench.command(33, (1.0,), asynchronous=1)
+    bench.ticks(0.5)
+    assert not bench.controller.arm.moving
+    assert bench.controller.arm.state.tcp[1] < 0.09
+    assert bench.out(2) >> 24 == operation + 1
+    assert not bench.out(2) & RUNNING
+
+
+def test_a_path_reports_its_progress() -> None:
+    line = "\tsignal_async_progress({})\n\tmovel(p[{},0,0.3,3.14159,0,0],a=1,v=0.1,r=0)\n"
+    bench = Bench("".join(line.format(k, 0.62 + 0.02 * k) for k in range(3)))
+    assert bench.command(45, asynchronous=1)
+    seen = []
+    for _ in range(200):
+        bench.ticks(0.008)
+        word = bench.out(2)
+        if not word & RUNNING:
+            break
+        seen.append(word & (RUNNING - 1))
+    assert sorted(set(seen)) == [0, 1, 2]
+    assert seen == sorted(seen)
+    assert bench.controller.arm.state.tcp[0] == pytest.approx(0.66)
+
+
+@given(frequency=st.sampled_from([5.0, 10.0, 20.0]), kicks=st.integers(2, 12))
+def test_the_watchdog_stops_what_is_not_kicked_and_nothing_else(frequency: float, kicks: int) -> None:
+    bench = Bench()
+    assert bench.command(35, (frequency,))
+    bench.write(10, (0.0, 0.05, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0))
+    bench.ticks(0.008)
+    for _ in range(kicks):
+        bench.write(0)
+        bench.ticks(0.8 / frequency)
+        assert bench.controller.runtime is Runtime.PLAYING
+        assert bench.controller.arm.moving
+    bench.ticks(0.2 / frequency + 0.1)
+    assert bench.controller.watchdog_stops == 1
+    assert bench.controller.runtime is Runtime.STOPPED
+    assert not bench.controller.arm.moving
+
+
+def test_where_no_joints_are_the_program_ends() -> None:
+    bench = Bench()
+    assert not bench.command(3, (3.0, *THERE[1:], 0.1, 1.0))
+    assert bench.controller.runtime is Runtime.STOPPED
+    bench.upload()
+    assert not bench.command(46, (math.nan,) * 6)
+    bench.upload()
+    assert bench.command(46, THERE)
+    bench.controller.ik_fails = True
+    assert not bench.command(46, THERE)
+    assert bench.controller.arm.state.tcp == HERE
+
+
+def test_a_protective_stop_holds_until_it_is_unlocked_late_enough() -> None:
+    bench = Bench()
+    assert bench.command(3, (*THERE, 0.1, 1.0), asynchronous=1)
+    bench.ticks(0.3)
+    bench.controller.protective_stop()
+    bench.ticks(0.3)
+    assert not bench.controller.arm.moving
+    assert bench.controller.safety is SafetyMode.PROTECTIVE_STOP
+    assert bench.controller.registers.fields["safety_status_bits"] == (1 << 2 | 1 << 10,)
+    assert bench.controller.runtime is Runtime.PAUSED
+    assert bench.ask("unlock protective stop").startswith("Cannot")
+    bench.upload()
+    assert bench.controller.runtime is not Runtime.PLAYING  # nothing starts while it holds
+    bench.ticks(5.0)
+    assert bench.ask("unlock protective stop") == "Protective stop releasing"
+    bench.upload()
+    assert bench.command(3, (*THERE, 0.1, 1.0))
+
+
+def test_a_closed_safeguard_goes_on_by_itself() -> None:
+    bench = Bench()
+    assert bench.command(3, (*THERE, 0.1, 1.0), asynchronous=1)
+    bench.ticks(0.3)
+    bench.controller.safeguard_stop()
+    bench.ticks(1.0)
+    assert not bench.controller.arm.moving
+    stood = bench.controller.arm.state.tcp[1]
+    assert 0 < stood < 0.1
+    bench.controller.clear()
+    bench.ticks(3.0)
+    assert bench.controller.arm.state.tcp[1] == pytest.approx(0.1)
+
+
+def test_an_emergency_stop_takes_the_power_until_it_is_given_by_hand() -> None:
+    bench = Bench()
+    assert bench.command(3, (*THERE, 0.1, 1.0), asynchronous=1)
+    bench.ticks(0.3)
+    bench.controller.emergency_stop()
+    bench.ticks(0.5)
+    assert not bench.controller.arm.moving
+    assert bench.controller.robot_mode is RobotMode.POWER_OFF
+    assert bench.ask("safetymode") == "Safetymode: ROBOT_EMERGENCY_STOP"
+    assert bench.controller.registers.fields["safety_status_bits"][0] & 1 << 7
+    bench.controller.clear()
+    bench.upload()
+    assert bench.controller.runtime is Runtime.STOPPED
+    assert bench.ask("power on") == "Powering on"
+    assert bench.ask("brake release") == "Brake releasing"
+    bench.upload()
+    assert bench.command(3, (*THERE, 0.1, 1.0))
+
+
+def test_too_much_force_is_a_protective_stop() -> None:
+    bench = Bench(walls=[{"axis": "y", "at": 0.02, "stiffness": 5000.0}], protective_force=100.0)
+    bench.command(3, (*THERE, 0.1, 1.0), asynchronous=1)
+    bench.ticks(2.0)
+    assert bench.controller.safety is SafetyMode.PROTECTIVE_STOP
+    assert 0.02 < bench.controller.arm.penetration_max < 0.03
+
+
+def test_the_slider_is_where_it_was_last_moved() -> None:
+    bench = Bench()
+    for name, value in (("speed_slider_mask", 1), ("speed_slider_fraction", 0.5)):
+        bench.controller.registers.write(name, (value,), 0.0)
+    bench.ticks(0.1)
+    assert bench.controller.arm.scale == 0.5
+    bench.controller.arm.scale = 0.2  # by hand
+    bench.ticks(0.1)
+    assert bench.controller.registers.fields["target_speed_fraction"] == (0.2,)
+
+
+@pytest.mark.parametrize(("polyscope", "modern"), [("3.4", False), ("5.5.1", False), ("5.6", True)])
+def test_the_dashboard_knows_what_its_version_knows(polyscope: str, modern: bool) -> None:
+    bench = Bench(polyscope=polyscope)
+    assert polyscope in bench.ask("PolyscopeVersion")
+    assert bench.ask("robotmode") == "Robotmode: RUNNING"
+    assert bench.ask("running") == "Program running: true"
+    assert bench.ask("stop") == "Stopped"
+    assert bench.ask("running") == "Program running: false"
+    assert (bench.ask("is in remote control") == "true") == modern
+    assert bench.ask("get serial number").isdigit() == modern
+    assert bench.ask("juggle") == "could not understand: 'juggle'"
+
+
+def names(variables: list[str], frequency: float | None = None) -> bytes:
+    listed = ",".join(variables).encode()
+    return listed if frequency is None else struct.pack(">d", frequency) + listed
+
+
+def reply(session: RtdeSession, kind: int, body: bytes = b"") -> bytes:
+    (package,) = wire.Splitter().feed(session.received(wire.packed(kind, body), 0.0))
+    assert package.kind == kind
+    return package.body
+
+
+def test_recipes_are_told_by_type_and_states_follow_them() -> None:
+    bench = Bench()
+    session = RtdeSession(bench.controller, Claims())
+    assert reply(session, wire.PROTOCOL, b"\0\2") == b"\1"
+    assert reply(session, wire.PROTOCOL, b"\0\1") == b"\0"
+    assert reply(session, wire.CONTROLLER) == struct.pack(">4I", 3, 15, 8, 0)
+    wanted = ["timestamp", "actual_TCP_pose", "robot_mode", "output_int_register_0"]
+    assert reply(session, wire.OUTPUTS, names([*wanted, "weather"], 125.0))[1:].endswith(b"NOT_FOUND")
+    assert reply(session, wire.OUTPUTS, names(wanted, 62.5)) == b"\1DOUBLE,VECTOR6D,INT32,INT32"
+    assert session.every == 2
+    assert reply(session, wire.START) == b"\1"
+    (package,) = wire.Splitter().feed(session.state({}))
+    recipe, time, *rest = struct.unpack(">Bd6dii", package.body)
+    assert recipe == 1
+    assert time == bench.controller.time
+    assert tuple(rest) == (*HERE, 7, 1)
+
+
+def test_an_input_has_one_master() -> None:
+    claims = Claims()
+    controller = Controller(UrEmulatorConfig())
+    first, second = RtdeSession(controller, claims), RtdeSession(controller, claims)
+    registers = ["input_int_register_0", "input_double_register_3"]
+    assert reply(first, wire.INPUTS, names(registers)) == b"\1INT32,DOUBLE"
+    assert reply(first, wire.INPUTS, names(registers[:1])) == b"\2INT32"
+    assert reply(second, wire.INPUTS, names(registers)) == b"\0IN_USE,IN_USE"
+    first.received(wire.packed(wire.DATA, struct.pack(">Bid", 1, 7, 0.5)), 3.0)
+    first.received(wire.packed(wire.DATA, struct.pack(">Bi", 1, 8)), 4.0)  # too short for its recipe
+    assert (controller.registers.ints[0], controller.registers.doubles[3]) == (7, 0.5)
+    assert controller.registers.written[0] == 3.0
+    assert first.ignored == 1
+    first.closed()
+    assert reply(second, wire.INPUTS, names(registers)) == b"\1INT32,DOUBLE"
+    claims.by_others = True
+    assert reply(RtdeSession(controller, claims), wire.INPUTS, names(registers[:1])) == b"\0IN_USE"
+
+
+@given(data=st.lists(st.binary(max_size=60), max_size=8))
+def test_no_bytes_bring_a_session_down(data: list[bytes]) -> None:
+    controller = Controller(UrEmulatorConfig())
+    for session in (
+        RtdeSession(controller, Claims()),
+        ScriptSession(controller),
+        DashboardSession(controller),
+    ):
+        with contextlib.suppress(ValueError):  # which ends the one connection
+            for piece in data:
+                session.received(piece, 0.0)
+        controller.tick(0.0)
+
+
+@given(
+    kind=st.sampled_from([wire.PROTOCOL, wire.OUTPUTS, wire.INPUTS, wire.START, wire.DATA, wire.TEXT]),
+    body=st.binary(max_size=40),
+)
+def test_no_body_brings_the_wire_down(kind: int, body: bytes) -> None:
+    session = RtdeSession(Controller(UrEmulatorConfig()), Claims())
+    with contextlib.suppress(ValueError):
+        session.received(wire.packed(kind, body), 0.0)
+    session.state({})
+
+
+@given(data=st.binary(max_size=300), cut=st.integers(0, 300))
+def test_packages_do_not_depend_on_how_they_are_cut(data: bytes, cut: int) -> None:
+    stream = b"".join(wire.packed(byte, data[:byte]) for byte in data[:20])
+    whole, parts = wire.Splitter(), wire.Splitter()
+    assert list(whole.feed(stream)) == [*parts.feed(stream[:cut]), *parts.feed(stream[cut:])]

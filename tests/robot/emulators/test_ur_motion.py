@@ -1,0 +1,217 @@
+"""The emulated arm moves as a machine does: within its speed and acceleration, to its goal, and to rest."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from robot.emulators.ur10.arm import Arm
+from robot.emulators.ur10.motion import Profile, Unreachable
+from robot.emulators.ur10.orders import (
+    Mark,
+    MoveJ,
+    MoveL,
+    Order,
+    Servo,
+    SpeedJ,
+    SpeedL,
+    StopJ,
+    StopL,
+    orders_in,
+)
+from robot.emulators.ur10.rotation import turn
+from robot.emulators.ur10.settings import UrEmulatorConfig, WallConfig
+
+DOWN = (math.pi, 0.0, 0.0)
+NOWHERE = (3.0, 0.0, 0.3, *DOWN)
+SPEED, RATE = st.floats(0.03, 0.5), st.floats(0.05, 5.0)
+PLACE = st.tuples(st.floats(0.4, 0.8), st.floats(-0.3, 0.3), st.floats(0.2, 0.5))
+
+
+def run(arm: Arm, seconds: float, dt: float = 0.008) -> np.ndarray:
+    """(tool's pose and speed) at every step [T, 12], until it rests or the time is up."""
+    rows = []
+    for _ in range(round(seconds / dt)):
+        arm.step(dt)
+        rows.append([*arm.state.tcp, *arm.state.speed])
+        if not arm.busy:
+            break
+    return np.array(rows)
+
+
+@given(length=st.floats(1e-4, 10), speed=SPEED, rate=RATE, share=st.floats(0, 1))
+def test_a_profile_keeps_its_limits_and_its_speed_is_its_slope(
+    length: float, speed: float, rate: float, share: float
+) -> None:
+    profile = Profile(length, speed, rate)
+    duration = profile.duration
+    assert profile.at(0.0) == (0.0, 0.0)
+    assert profile.at(duration) == (length, 0.0)
+    assert duration >= length / speed * (1 - 1e-12)
+    time, step = share * duration, duration * 1e-6
+    (before, _), (here, now), (after, _) = (profile.at(time + d) for d in (-step, 0.0, step))
+    assert 0 <= here <= length * (1 + 1e-12)
+    assert 0 <= now <= speed * (1 + 1e-9)
+    if step < time < duration - step:
+        assert (after - before) / (2 * step) == pytest.approx(now, abs=rate * step + 1e-6 * speed)
+
+
+@settings(max_examples=30)
+@given(place=PLACE, heading=st.floats(-1.5, 1.5), speed=SPEED, rate=RATE)
+def test_a_linear_move_arrives_on_a_straight_line_within_its_limits(
+    place: tuple[float, float, float], heading: float, speed: float, rate: float
+) -> None:
+    config = UrEmulatorConfig()
+    arm = Arm(config)
+    start = arm.state.tcp
+    goal = (*place, math.pi * math.cos(heading / 2), math.pi * math.sin(heading / 2), 0.0)
+    arm.order([MoveL(goal, speed, rate)])
+    try:
+        rows = run(arm, 120.0)
+    except Unreachable:
+        assume(False)
+    assert not arm.busy
+    assert not arm.moving
+    np.testing.assert_allclose(arm.state.tcp[:3], goal[:3], atol=1e-12)
+    assert math.hypot(*turn(arm.state.tcp, goal)) < 1e-9
+    way = np.subtract(goal[:3], start[:3])
+    off = rows[:, :3] - start[:3]
+    length = np.linalg.norm(way)
+    if length > 0:
+        along = off @ way / length**2
+        np.testing.assert_allclose(off, along[:, None] * way, atol=1e-12)
+    fast = np.linalg.norm(rows[:, 6:9], axis=1)
+    turning = np.linalg.norm(rows[:, 9:], axis=1)
+    assert fast.max() <= speed * (1 + 1e-9)
+    assert turning.max() <= speed * config.turn_ratio * (1 + 1e-9)
+    assert np.abs(np.diff(fast[:-1], prepend=0.0)).max() <= rate * 0.008 * (1 + 1e-6) + 1e-12
+
+
+@settings(max_examples=30)
+@given(other=PLACE, after=st.floats(0.05, 2.0), rate=st.floats(0.2, 3.0))
+def test_a_new_move_in_the_midst_of_another_never_jumps(
+    other: tuple[float, float, float], after: float, rate: float
+) -> None:
+    arm = Arm(UrEmulatorConfig())
+    arm.order([MoveL((0.6, 0.25, 0.3, *DOWN), 0.1, rate)])
+    first = run(arm, after)
+    arm.order([MoveL((*other, *DOWN), 0.1, rate)])
+    try:
+        rows = np.concatenate([first, run(arm, 60.0)])
+    except Unreachable:
+        assume(False)
+    np.testing.assert_allclose(rows[-1, :3], other, atol=1e-12)
+    jumps = np.linalg.norm(np.diff(rows[:, 6:9], axis=0), axis=1)
+    assert jumps.max() <= 2 * rate * 0.008 + 1e-9  # the last step of a move is cut short
+    steps = np.linalg.norm(np.diff(rows[:, :3], axis=0), axis=1)
+    assert steps.max() <= 0.1 * 0.008 * (1 + 1e-9)
+
+
+@given(joints=st.tuples(*[st.floats(-0.5, 0.5)] * 6), speed=st.floats(0.1, 2.0), rate=st.floats(0.5, 10))
+def test_a_joint_move_arrives_with_no_joint_faster_than_allowed(
+    joints: tuple[float, ...], speed: float, rate: float
+) -> None:
+    arm = Arm(UrEmulatorConfig())
+    goal = tuple(np.add(arm.state.joints, joints))
+    arm.order([MoveJ(goal, speed, rate)])
+    fastest = 0.0
+    while arm.busy:
+        arm.step(0.008)
+        fastest = max(fastest, *map(abs, arm.state.joint_speed))
+    np.testing.assert_allclose(arm.state.joints, goal, atol=1e-12)
+    assert fastest <= speed * (1 + 1e-9)
+    np.testing.assert_allclose(arm.state.tcp, arm.model.forward(goal), atol=1e-12)
+
+
+@pytest.mark.parametrize("stop", [StopL(2.0), StopJ(2.0)])
+@pytest.mark.parametrize(
+    "go",
+    [
+        SpeedL((0.0, 0.1, 0.0, 0.0, 0.0, 0.2), 1.0),
+        SpeedJ((0.1,) * 6, 1.0),
+        MoveL((0.6, 0.3, 0.3, *DOWN), 0.1, 1.0),
+    ],
+)
+def test_whatever_it_does_it_comes_to_rest(go: Order, stop: Order) -> None:
+    arm = Arm(UrEmulatorConfig())
+    arm.order([go])
+    run(arm, 0.5)
+    assert arm.moving
+    arm.order([stop])
+    rows = run(arm, 1.0)
+    assert not arm.moving
+    assert not arm.busy
+    assert len(rows) * 0.008 <= 0.25
+
+
+def test_a_speed_is_kept_until_told_otherwise_and_a_servo_follows() -> None:
+    arm = Arm(UrEmulatorConfig())
+    arm.order([SpeedL((0.0, 0.05, 0.0, 0.0, 0.0, 0.0), 0.5)])
+    run(arm, 2.0)
+    assert arm.state.speed[1] == pytest.approx(0.05)
+    assert arm.state.tcp[1] == pytest.approx(0.05 * 1.95, abs=1e-3)
+    arm.halt(5.0)
+    run(arm, 1.0)
+    goal = tuple(np.add(arm.state.joints, 0.05))
+    arm.order([Servo(goal, 0.1)])
+    run(arm, 2.0)
+    np.testing.assert_allclose(arm.state.joints, goal, atol=1e-6)
+
+
+def test_a_wall_pushes_back_by_its_stiffness() -> None:
+    arm = Arm(UrEmulatorConfig(walls=(WallConfig(axis="x", at=0.65, stiffness=2000.0),)))
+    assert arm.force == (0.0,) * 6
+    arm.order([MoveL((0.66, 0.0, 0.3, *DOWN), 0.05, 1.0)])
+    run(arm, 10.0)
+    assert arm.force[0] == pytest.approx(-20.0)
+    assert arm.penetration_max == pytest.approx(0.01)
+    arm.order([MoveL((0.6, 0.0, 0.3, *DOWN), 0.05, 1.0)])
+    run(arm, 10.0)
+    assert arm.force[0] == 0.0
+    assert arm.penetration_max == pytest.approx(0.01)
+
+
+def test_out_of_reach_raises_and_the_arm_stands() -> None:
+    arm = Arm(UrEmulatorConfig())
+    arm.order([MoveL(NOWHERE, 0.1, 1.0)])
+    with pytest.raises(Unreachable):
+        arm.step(0.008)
+    assert not arm.busy
+    arm.order([SpeedL((0.5, 0.0, 0.0, 0.0, 0.0, 0.0), 5.0)])
+    with pytest.raises(Unreachable):
+        run(arm, 10.0)
+    assert not arm.moving
+
+
+def test_the_speed_slider_slows_moves_and_not_stops() -> None:
+    arm = Arm(UrEmulatorConfig())
+    arm.scale = 0.1
+    arm.order([MoveL((0.6, 0.3, 0.3, *DOWN), 0.2, 1.0)])
+    rows = run(arm, 3.0)
+    assert np.linalg.norm(rows[:, 6:9], axis=1).max() <= 0.02 * (1 + 1e-9)
+    arm.order([StopL(1.0)])
+    assert len(run(arm, 1.0)) * 0.008 <= 0.05
+
+
+def test_a_path_is_read_as_the_client_writes_it() -> None:
+    text = (
+        "\tsignal_async_progress(0)\n\tmovel(p[0.6,0.1,0.3,3.14159,0,0],a=0.5,v=0.1,r=0.02)\n"
+        "\tsignal_async_progress(1)\n\tmovej([0,-1.5,1e-05,0,0,0],a=2,v=1,r=0)\nstopl(2)\nsync()\n"
+    )
+    assert orders_in(text) == [
+        Mark(0),
+        MoveL((0.6, 0.1, 0.3, 3.14159, 0.0, 0.0), 0.1, 0.5, 0.02),
+        Mark(1),
+        MoveJ((0.0, -1.5, 1e-5, 0.0, 0.0, 0.0), 1.0, 2.0, 0.0),
+        StopL(2.0),
+    ]
+
+
+@given(text=st.text())
+def test_no_text_is_too_strange_to_read(text: str) -> None:
+    orders_in(text)
+    orders_in(f"movel(p[{text}],a={text})\nstopl({text})\nsignal_async_progress({text})")

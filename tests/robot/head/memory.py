@@ -1,0 +1,110 @@
+"""A head in memory: what it sends is what the test puts in, what it was told is there to look at."""
+
+from __future__ import annotations
+
+import errno
+import json
+import threading
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from robot.head.device import Gone, Stalled
+from robot.head.wire import CHANNELS, Command, Request, encode, unpack
+
+WHISKERS = 2
+
+
+class MemoryHead:
+    """Attributes:
+    plugged: whether it is there. stalls: how many of the next transfers it refuses. clock: device time, us.
+    commands, requests: what it was told. opened: how often.
+    """
+
+    def __init__(self, whiskers: int = WHISKERS, channels: int = CHANNELS) -> None:
+        self.identity = {
+            "name": "memory",
+            "version": "1",
+            "whiskers": whiskers,
+            "channels": channels,
+            "rate": 2000,
+        }
+        self.plugged, self.stalls, self.clock, self.opened = True, 0, 0, 0
+        self.commands: list[Command] = []
+        self.requests: list[Request] = []
+        self.closed = 0
+        self._data = bytearray()
+        self._there = threading.Condition()
+
+    def connect(self) -> Wire:
+        self.check()
+        self.opened += 1
+        return Wire(self)
+
+    def put(self, data: bytes) -> None:
+        with self._there:
+            self._data += data
+            self._there.notify_all()
+
+    def send(self, first: int, count: int = 10, values: np.ndarray | None = None, flags: int = 0) -> None:
+        """Frames in order, 500 us apart."""
+        number = first + np.arange(count)
+        if values is None:
+            values = np.zeros((count, WHISKERS, CHANNELS), np.int16)
+        self.put(encode(number, 500 * number, np.full(count, flags), values))
+
+    def unplug(self) -> None:
+        with self._there:
+            self.plugged = False
+            self._data.clear()
+            self._there.notify_all()
+
+    def check(self) -> None:
+        if not self.plugged:
+            raise Gone(errno.ENODEV, "pulled out")
+        if self.stalls:
+            self.stalls -= 1
+            raise Stalled(errno.EPIPE, "refused")
+
+    def take(self, size: int, timeout: float) -> bytes:
+        with self._there:
+            self._there.wait_for(lambda: self._data or not self.plugged, timeout)
+            self.check()
+            data = bytes(self._data[:size])
+            del self._data[:size]
+            return data
+
+
+class Wire:
+    """A `robot.head.device.Bridge`."""
+
+    def __init__(self, head: MemoryHead) -> None:
+        self.head = head
+
+    def read(self, size: int, timeout: float) -> bytes:
+        return self.head.take(size, timeout)
+
+    def write(self, data: bytes) -> None:
+        self.head.check()
+        command = unpack(data)
+        assert command is not None
+        self.head.commands.append(command)
+
+    def request(self, request: Request) -> bytes:
+        self.head.check()
+        self.head.requests.append(request)
+        if request == Request.CLOCK:
+            return self.head.clock.to_bytes(8, "little")
+        return json.dumps(self.head.identity).encode() if request == Request.IDENTITY else b""
+
+    def close(self) -> None:
+        self.head.closed += 1
+
+
+def until(true: Callable[[], object], timeout: float = 5.0) -> None:
+    """Waits for something to become true; fails if it does not."""
+    end = time.monotonic() + timeout
+    while not true():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.002)

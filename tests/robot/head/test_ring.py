@@ -1,0 +1,80 @@
+"""A ring holds what a dictionary of the newest numbers would."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robot.head.decoder import Frames
+from robot.head.ring import Ring
+
+SIZE = 16
+
+
+def frames(numbers: list[int]) -> Frames:
+    number = np.array(numbers, np.int64)
+    values = np.repeat(number[:, None] % 30000, 3, axis=1)[:, None].astype(np.int16)
+    return Frames(number, 500 * number, (number % 256).astype(np.uint8), values)
+
+
+BLOCKS = st.lists(
+    st.lists(st.integers(-40, 40), max_size=8, unique=True), max_size=8
+)  # steps about the highest so far
+
+
+@given(BLOCKS, st.integers(0, 60), st.integers(0, 40))
+def test_what_is_kept(blocks, first, length):
+    ring, kept, highest = Ring(1, size=SIZE), {}, 2**32
+    for k, block in enumerate(blocks):
+        numbers = [highest + step for step in block]
+        highest = max([highest, *numbers]) if kept or numbers else highest
+        ring.append(frames(numbers), float(k))
+        kept |= {n: 500 * n for n in numbers}
+        if kept:
+            newest = max(kept)
+            kept = {n: t for n, t in kept.items() if n > newest - SIZE}
+            assert ring.newest is not None
+            assert ring.newest[:2] == (newest, 500 * newest)
+    start = 2**32 - 20 + first
+    wanted = sorted(n for n in kept if start <= n <= start + length)
+    for got in (ring.between(start, start + length), ring.during(500 * start, 500 * (start + length) + 1)):
+        assert got.sequence.tolist() == wanted
+        assert got.time.tolist() == [500 * n for n in wanted]
+        assert got.flags.tolist() == [n % 256 for n in wanted]
+        assert got.values[:, 0, 2].tolist() == [n % 30000 for n in wanted]
+
+
+def test_an_empty_ring_has_nothing():
+    ring = Ring(1)
+    assert ring.newest is None
+    assert not len(ring.between(0, 10).sequence)
+    assert not len(ring.during(-(2**40), 2**40).sequence)
+    assert not ring.wait(0, 0.0)
+
+
+def test_what_is_handed_out_stays_as_it_was():
+    ring = Ring(1, size=SIZE)
+    ring.append(frames(list(range(10))), 0.0)
+    got = ring.between(0, 9)
+    ring.append(frames(list(range(10, 30))), 0.0)
+    assert got.sequence.tolist() == list(range(10))
+    assert ring.between(0, 99).sequence.tolist() == list(range(14, 30))
+
+
+def test_waiting_ends_with_the_sample():
+    ring = Ring(1)
+    began = time.monotonic()
+    threading.Timer(0.05, lambda: ring.append(frames([7]), 0.0)).start()
+    assert ring.wait(3500, 5.0)
+    assert time.monotonic() - began < 4.0
+    assert not ring.wait(3501, 0.01)
+
+
+def test_sizes():
+    with pytest.raises(ValueError, match="power of two"):
+        Ring(1, size=100)

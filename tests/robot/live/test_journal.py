@@ -1,0 +1,577 @@
+"""A live session comes back from its recording as it was handed on, up to the moment it was killed."""
+
+from __future__ import annotations
+
+import re
+import resource
+import signal
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from robot.blocks import (
+    Event,
+    decode_cut,
+    decode_event,
+    decode_frames,
+    decode_states,
+    encode_cut,
+    encode_event,
+    encode_frames,
+    encode_states,
+)
+from robot.head.decoder import Frames
+from robot.live.cycle import KEPT, Cut, Window, assembled, cut_of, no_frames, within
+from robot.live.journal import Journal
+from robot.outcome import Outcome
+from robot.recording import Recording, recover
+from robot.schemas import SCHEMAS
+from robot.tape import _Whole
+from robot.ur10.states import STATE
+from robot.walk import Entry, Walk
+from tactile.errors import InputError
+from tactile.types import Cycle, Odometry
+
+ROOT = Path(__file__).parents[3]
+W, RATE = 4, 200
+START = 5e4
+"""Of the session, on the host's clock, s."""
+RIG = {"head": {"rest_deg": 75.0}}
+
+
+def some_frames(count: int, seed: int = 0, first: int = 0) -> Frames:
+    random = np.random.default_rng(seed)
+    values = random.integers(-(2**15), 2**15, (count, W, 3)).astype(np.int16)
+    number = first + np.arange(count)
+    return Frames(
+        number, 7_000_000 + number * (1_000_000 // RATE), random.integers(0, 16, count, np.uint8), values
+    )
+
+
+def some_states(count: int, seed: int = 0, begin: float = START) -> np.ndarray:
+    random = np.random.default_rng(seed)
+    states = np.zeros(count, STATE)
+    for name in STATE.names or ():
+        shape = states[name].shape
+        if STATE[name].base.kind == "f":
+            states[name] = random.normal(size=shape)
+        else:
+            states[name] = random.integers(0, 2**31, shape)
+    states["progress"], states["safety"] = -1, 2**31 + 5
+    states["host"] = begin + np.arange(count) / 125
+    return states
+
+
+def rows(frames: Frames, which: Any) -> Frames:
+    return Frames(*(column[which] for column in frames))
+
+
+def moved(k: int) -> Odometry:
+    return Odometry(*(np.float64(value) for value in (0.01 * (k % 3), 0.002, 0.05, 1.0)))
+
+
+def same(one: Any, other: Any) -> bool:
+    """Whether two tuples of arrays are equal in every bit, shape, dtype and order in memory."""
+    if isinstance(one, tuple):
+        return type(one) is type(other) and all(map(same, one, other))
+    a, b = np.asarray(one), np.asarray(other)
+    alike = a.flags.c_contiguous == b.flags.c_contiguous
+    return alike and (a.shape, a.dtype, a.tobytes()) == (b.shape, b.dtype, b.tobytes())
+
+
+def opened(path: Path) -> Journal:
+    path.unlink(missing_ok=True)
+    return Journal(path, view_shape=(2, 2, 1), whiskers=W, rate_hz=1.0, rig=RIG)
+
+
+def content(path: Path, kind: type) -> list[Any]:
+    return [entry.content for entry in Walk(path).entries() if isinstance(entry.content, kind)]
+
+
+def session(path: Path, whisks: int = 3) -> tuple[list[Cycle], Frames, np.ndarray]:
+    """A session of whisks, arm states and two events; what was handed on, and all frames and states."""
+    frames, states = some_frames(whisks * RATE, seed=whisks), some_states(whisks * 125)
+    journal = opened(path)
+    cycles = []
+    journal.event(START, "start", "emulated: a robot, über")
+    for k in range(whisks):
+        for block in np.split(np.arange(k * RATE, (k + 1) * RATE), RATE // 4):
+            journal.frames(rows(frames, block), START + block[-1] / RATE)
+            journal.arm(
+                states[
+                    (states["host"] > START + block[0] / RATE - 0.02)
+                    & (states["host"] <= START + block[-1] / RATE)
+                ]
+            )
+        mine = rows(frames, slice(k * RATE, (k + 1) * RATE))
+        cut = cut_of(k, START + k + 0.25, START + k, mine, moved(k), seen=k != 1)
+        journal.cut(cut, mine, np.array([0.01 * k, 0.0, 0.05 * k]) if k != 2 else None)
+        cycles.append(assembled(mine, cut))
+    journal.event(START + whisks, "dropped", "1 image")
+    journal.close()
+    return cycles, frames, states
+
+
+def test_a_session_comes_back_bit_for_bit(tmp_path: Path) -> None:
+    cycles, frames, _ = session(tmp_path / "a.mcap")
+    recording = Recording(tmp_path / "a.mcap")
+    samples = list(recording)
+    assert all(same(sample.reading, cycle) for sample, cycle in zip(samples, cycles, strict=True))
+    assert [sample.time for sample in samples] == [START + 0.25, START + 1.25, START + 2.25]
+    assert [sample.truth is None for sample in samples] == [False, False, True]
+    assert recording.whisked
+    assert not recording.truncated
+    assert (recording.rig, recording.whiskers, recording.length) == (RIG, W, 3)
+    assert recording.events == (
+        Event(START, "start", "emulated: a robot, über"), Event(START + 3, "dropped", "1 image")
+    )  # fmt: skip
+    assert [len(cycle.time) for cycle in cycles] == [RATE, 0, RATE]
+    assert cycles[1].angle.shape == (0, W)
+    assert cycles[1].deflection.shape == (0, W, 2)
+    # The frames of the dropped image are there all the same.
+    parts = content(tmp_path / "a.mcap", Frames)
+    assert same(Frames(*(np.concatenate(part) for part in zip(*parts, strict=True))), frames)
+
+
+def test_a_whisk_says_what_its_frames_say() -> None:
+    frames = some_frames(10, first=90)
+    cycle = assembled(frames, cut_of(0, 3.0, 2.5, rows(frames, slice(2, 7)), moved(0)))
+    np.testing.assert_allclose(cycle.time, 2.5 + np.arange(5) / RATE, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(cycle.angle, frames.values[2:7, :, 0] * np.pi / 32768)
+    np.testing.assert_allclose(cycle.deflection, frames.values[2:7, :, 1:] * np.pi / 32768)
+    assert cycle.odometry == moved(0)
+    assert all(part.flags.c_contiguous for part in cycle[:3])
+    mixed = rows(frames, np.random.default_rng(0).permutation(10))
+    assert same(assembled(mixed, cut_of(0, 3.0, 2.5, rows(frames, slice(2, 7)), moved(0))), cycle)
+
+
+@settings(max_examples=40)
+@given(st.data())
+def test_whatever_way_frames_come(tmp_path_factory: Any, data: st.DataObject) -> None:
+    """Some are lost, some late; cuts overlap, leave gaps, or are made before their frames were handed in."""
+    path = tmp_path_factory.getbasetemp() / "law.mcap"
+    count = data.draw(st.integers(0, 120))
+    frames = some_frames(count, count, first=data.draw(st.sampled_from([0, 2**31, 2**40])))
+    order = np.array(data.draw(st.lists(st.integers(0, max(count - 1, 0)), unique=True)), int)[:count]
+    order = order[np.argsort(order + np.array([3 * (k % 4 == 0) for k in range(len(order))]), kind="stable")]
+    came = rows(frames, order)
+    cycles, at = [], 0
+    with opened(path) as journal:
+        while True:
+            step = data.draw(st.integers(1, 30))
+            block = rows(came, slice(at, at + step))
+            ahead = rows(came, slice(0, at + step))  # the ring has them before the journal
+            first = int(frames.sequence[0]) + data.draw(st.integers(-5, 120)) if count else 0
+            mine = within(ahead, first, first + data.draw(st.integers(0, 60)))
+            cut = cut_of(len(cycles), START + at, START, mine, moved(at), seen=data.draw(st.booleans()))
+            early = data.draw(st.booleans())
+            if early:
+                journal.cut(cut, mine)
+            journal.frames(block, START + 0.01 * at)
+            if not early:
+                journal.cut(cut, mine)
+            cycles.append(assembled(mine, cut))
+            at += step
+            if at >= len(order):
+                break
+    walk = Walk(path)
+    entries = list(walk.entries())
+    assert not walk.broken
+    samples = [entry.content for entry in entries if hasattr(entry.content, "reading")]
+    assert all(same(sample.reading, cycle) for sample, cycle in zip(samples, cycles, strict=True))
+    numbers = [entry.content.sequence for entry in entries if isinstance(entry.content, Frames)]
+    assert sorted(np.concatenate([np.zeros(0, int), *numbers])) == sorted(came.sequence)  # each once
+
+
+@given(st.integers(0, 40), st.integers(0, 5), st.integers(0, 2**32))
+def test_blocks_come_back(count: int, seed: int, first: int) -> None:
+    frames, states = some_frames(count, seed, first), some_states(count + 1, seed)
+    assert same(decode_frames(encode_frames(3.5, frames), W), (3.5, frames))
+    assert encode_frames(3.5, no_frames(W)) == encode_frames(3.5, rows(frames, slice(0)))
+    at, again = decode_states(encode_states(states))
+    assert at == states["host"][-1]
+    assert again.dtype == STATE
+    assert all((again[name] == states[name]).all() for name in STATE.names or ())
+    cut = cut_of(count, 1.5, 1.0, frames, moved(seed))
+    assert same(decode_cut(encode_cut(cut)), cut)
+    assert cut.seen == (count > 0)
+    event = Event(0.1, "fault", "ünder: way")
+    assert decode_event(encode_event(event)) == event
+
+
+@given(st.binary(max_size=120), st.sampled_from([0, 1, 2, 3]), st.integers(0, 400), st.integers(0, 2**32 - 1))
+def test_no_bytes_are_believed(noise: bytes, kind: int, place: int, number: int) -> None:
+    frames = some_frames(3)
+    decode: Any = (lambda m: decode_frames(m, W), decode_states, decode_cut, decode_event)[kind]
+    good = (
+        encode_frames(1.0, frames), encode_states(some_states(2)),
+        encode_cut(cut_of(0, 1.0, 1.0, frames, moved(0))), encode_event(Event(1.0, "a", "b")),
+    )[kind]  # fmt: skip
+    place = place % len(good)
+    for bad in (
+        noise,
+        b"\0\1\0\0" + noise,
+        good[:place],
+        good[:place] + struct.pack("<I", number) + good[place + 4 :],
+    ):
+        with suppress(ValueError):
+            decode(bad)
+    with pytest.raises(ValueError):
+        decode(good[: max(place, 1) - 1])
+    with pytest.raises(ValueError):
+        decode(good + b"\0")
+
+
+def test_everything_is_on_its_way_within_a_fifth_of_a_second(tmp_path: Path) -> None:
+    """Counted on the times handed in: the file is read after every call."""
+    path = tmp_path / "a.mcap"
+    frames, journal = some_frames(RATE), opened(path)
+    states = some_states(125)
+    late = []
+    for k in range(0, RATE, 2):
+        now = START + (k + 1) / RATE
+        journal.frames(rows(frames, slice(k, k + 2)), now)
+        journal.arm(states[(states["host"] > now - 2 / RATE) & (states["host"] <= now)])
+        got = [part.sequence[-1] for part in content(path, Frames)]
+        late.append(k + 1 - max(got, default=-1))
+        known = content(path, np.ndarray)
+        assert now - (known[-1]["host"][-1] if known else START) < 0.2
+    assert max(late) / RATE < 0.2
+    assert len(content(path, Frames)) >= 5  # and not one by one
+    mine = rows(frames, slice(0, RATE))
+    journal.cut(cut_of(0, START + 1.0, START, mine, moved(0)), mine)
+    assert Walk(path).__iter__().__next__().reading.angle.shape == (RATE, W)
+    journal.close()
+
+
+WRITER = """
+import mmap, struct, sys
+from pathlib import Path
+import numpy as np
+from robot.head.decoder import Frames
+from robot.live.cycle import cut_of
+from robot.live.journal import Journal
+from tactile.types import Odometry
+
+path, beside = map(Path, sys.argv[1:])
+journal = Journal(path, view_shape=(3, 6, 1), whiskers=18)
+random = np.random.default_rng(0)
+pool = random.integers(-300, 300, (2000, 18, 3)).astype(np.int16)
+with beside.open("r+b") as file:
+    told = mmap.mmap(file.fileno(), 16)
+k = 0
+while True:
+    number = np.arange(20 * k, 20 * k + 20)
+    frames = Frames(number, number * 500, np.zeros(20, np.uint8), pool[number % 2000])
+    journal.frames(frames, 0.01 * k)
+    if k % 100 == 99:
+        number = np.arange(20 * k - 1980, 20 * k + 20)
+        mine = Frames(number, number * 500, np.zeros(2000, np.uint8), pool[number % 2000])
+        motion = Odometry(0.01, 0.0, 0.0, 1.0)
+        journal.cut(cut_of(k // 100, 0.01 * k, 0.01 * k - 1, mine, motion), mine)
+    k += 1
+    told[:16] = struct.pack("<qq", k, k // 100)
+"""
+
+
+def killed(folder: Path, seconds: float) -> tuple[int, int, Path]:
+    """(blocks of 10 ms, whisks) that a writer had handed in for certain when it was killed, and its file."""
+    path, beside = folder / "killed.mcap", folder / "beside"
+    path.unlink(missing_ok=True)
+    beside.write_bytes(bytes(16))
+    process = subprocess.Popen([sys.executable, "-c", WRITER, path, beside], cwd=ROOT)
+    try:
+        patience = time.monotonic() + 8
+        while not beside.read_bytes()[0] and time.monotonic() < patience:
+            time.sleep(0.01)
+        time.sleep(seconds)
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.wait(10)
+    blocks, whisks = struct.unpack("<qq", beside.read_bytes())
+    return blocks, whisks, path
+
+
+def check_killed(folder: Path, seconds: float) -> None:
+    blocks, whisks, path = killed(folder, seconds)
+    walk = Walk(path)
+    newest = -1
+    for entry in walk.entries():
+        if isinstance(entry.content, Frames):
+            assert entry.content.sequence[0] == newest + 1
+            newest = int(entry.content.sequence[-1])
+    assert blocks > 20
+    assert blocks - (newest + 1) / 20 <= 20  # 0.2 s of the session
+    assert whisks <= walk.count <= whisks + 1
+    assert walk.broken == "it ends too early"
+
+
+def test_a_killed_session_loses_less_than_a_fifth_of_a_second(tmp_path: Path) -> None:
+    for seconds in (0.02, 0.17, 0.4):
+        check_killed(tmp_path, seconds)
+
+
+@pytest.mark.soak
+def test_many_killed_sessions(tmp_path: Path) -> None:
+    for seconds in np.random.default_rng(1).uniform(0, 1, 50):
+        check_killed(tmp_path, float(seconds))
+
+
+def test_a_full_disk_is_told_once_and_the_recording_stays_readable(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    frames, journal = some_frames(6 * RATE), opened(path)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))
+        sizes = []
+        for k in range(6 * RATE // 4):
+            mine = rows(frames, slice(4 * k, 4 * k + 4))
+            journal.frames(mine, START + 4 * k / RATE)
+            if k % 50 == 49:
+                mine = rows(frames, slice(4 * k - RATE + 4, 4 * k + 4))
+                journal.cut(cut_of(k, START + k, START, mine, moved(k)), mine)
+            sizes.append(path.stat().st_size)
+        fault = journal.fault
+        journal.event(START, "late", "nobody hears it")
+        journal.close()
+        journal.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert fault is not None
+    assert fault is journal.fault
+    assert fault.outcome is Outcome.DISK_FULL
+    assert str(path) in fault.detail
+    assert "free room" in fault.detail
+    assert max(sizes) < 20_000  # no half chunks: what could not be written whole was taken off
+    recording = Recording(path)
+    assert recording.truncated
+    assert 1 <= recording.length == len(list(recording)) < 6
+    assert recover(path, tmp_path / "b.mcap").samples == recording.length
+
+
+def test_room_that_comes_back_makes_a_whole_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.mcap"
+    frames, journal = some_frames(3 * RATE), opened(path)
+    with monkeypatch.context() as patch:
+        for k in range(3):
+            mine = rows(frames, slice(k * RATE, (k + 1) * RATE))
+            if k == 1:
+                patch.setattr(_Whole, "flush", _no_room)
+            journal.cut(cut_of(k, START + k, START + k, mine, moved(k)), mine)
+    assert journal.fault is not None
+    journal.close()
+    recording = Recording(path)
+    assert (recording.length, recording.truncated) == (1, False)
+
+
+def _no_room(_: Any) -> None:
+    raise OSError(28, "No space left on device")
+
+
+def _entries(path: Path) -> list[Entry]:
+    return list(Walk(path).entries())
+
+
+def test_recover_keeps_what_stands_beside_the_samples(tmp_path: Path) -> None:
+    session(tmp_path / "whole.mcap")
+    data = (tmp_path / "whole.mcap").read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(data[: data.rindex(b"\x28\xb5\x2f\xfd")])  # in its last chunk
+    before = _entries(tmp_path / "cut.mcap")
+    report = recover(tmp_path / "cut.mcap", tmp_path / "good.mcap")
+    assert report == (3, True, "it ends too early")
+    after = _entries(tmp_path / "good.mcap")
+    assert [entry[:4] for entry in after] == [entry[:4] for entry in before]
+    assert len({entry.name for entry in after}) == 4
+    again = Recording(tmp_path / "good.mcap")
+    assert not again.truncated
+    assert [event.name for event in again.events] == ["start"]
+    assert all(
+        same(a.reading, b.reading) for a, b in zip(again, Recording(tmp_path / "cut.mcap"), strict=True)
+    )
+
+
+def test_a_recording_without_a_whisk_is_not_recovered(tmp_path: Path) -> None:
+    with opened(tmp_path / "a.mcap") as journal:
+        journal.frames(some_frames(5), START)
+    for action in (
+        lambda: recover(tmp_path / "a.mcap", tmp_path / "b.mcap"),
+        lambda: Recording(tmp_path / "a.mcap"),
+    ):
+        with pytest.raises(InputError, match="holds no samples"):
+            action()
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
+
+
+def damaged(data: bytes, seed: int, rounds: int) -> Iterator[bytes]:
+    random = np.random.default_rng(seed)
+    for _ in range(rounds):
+        bad = bytearray(data)
+        for place in random.integers(0, len(bad), random.integers(1, 4)):
+            match int(random.integers(4)):
+                case 0:
+                    bad[place % len(bad)] ^= 1 << int(random.integers(8))
+                case 1:
+                    bad[place : place + int(random.integers(1, 4000))] = b""
+                case 2:
+                    bad[place : place + 16] = bytes(16)
+                case _:
+                    del bad[place:]
+        yield bytes(bad)
+
+
+@pytest.mark.parametrize("rounds", [150, pytest.param(5000, marks=pytest.mark.soak)])
+def test_of_a_damaged_file_exactly_a_prefix_is_read(tmp_path: Path, rounds: int) -> None:
+    session(tmp_path / "a.mcap", whisks=2)
+    whole = [entry[:4] for entry in _entries(tmp_path / "a.mcap")]
+    lengths = set()
+    for bad in damaged((tmp_path / "a.mcap").read_bytes(), rounds, rounds):
+        (tmp_path / "bad.mcap").write_bytes(bad)
+        walk = Walk(tmp_path / "bad.mcap")
+        found = [entry[:4] for entry in walk.entries()]
+        assert found == whole[: len(found)]
+        assert walk.broken or len(found) == len(whole)
+        lengths.add(len(found))
+    assert len(lengths) > 5
+
+
+@pytest.mark.parametrize("unsigned", [False, True])
+def test_a_chunk_that_is_passed_over_is_missed(tmp_path: Path, unsigned: bool) -> None:
+    """Its type is damaged; and perhaps the checksum of the whole has gone too (0: there is none)."""
+    session(tmp_path / "a.mcap", whisks=2)
+    whole = [entry[:4] for entry in _entries(tmp_path / "a.mcap")]
+    data = (tmp_path / "a.mcap").read_bytes()
+    chunks = [found.start() - CHUNK_HEADER for found in re.finditer(b"\x28\xb5\x2f\xfd", data)]
+    assert len(chunks) > 10
+    for chunk in chunks:
+        assert data[chunk] == 6
+        bad = bytearray(data)
+        bad[chunk] = 0x7F
+        if unsigned:
+            end = data.index(b"\x0f" + struct.pack("<Q", 4), chunks[-1])
+            bad[end + 9 : end + 13] = bytes(4)
+        (tmp_path / "bad.mcap").write_bytes(bad)
+        walk = Walk(tmp_path / "bad.mcap")
+        found = [entry[:4] for entry in walk.entries()]
+        assert found == whole[: len(found)]
+        assert walk.broken
+
+
+CHUNK_HEADER = 1 + 8 + 3 * 8 + 4 + 8 + 8
+"""Bytes from a chunk's beginning to its content."""
+
+
+def test_a_cut_must_be_of_its_frames(tmp_path: Path) -> None:
+    frames, journal = some_frames(20), opened(tmp_path / "a.mcap")
+    cut = cut_of(0, START, START, frames, moved(0))
+    for wrong in (cut._replace(frames=19), cut._replace(first=1), cut._replace(frames=0, first=50, last=60)):
+        with pytest.raises(ValueError, match="frames for a whisk"):
+            journal.cut(wrong, frames)
+    with pytest.raises(ValueError, match="a whisk of 20 frames"):
+        assembled(rows(frames, slice(1, 20)), cut)
+    with pytest.raises(ValueError, match="colon"):
+        journal.event(START, "a: b", "c")
+    journal.cut(cut, frames)
+    journal.close()
+    assert Recording(tmp_path / "a.mcap").length == 1
+
+
+def test_a_cut_whose_frames_are_missing_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No journal writes such a file."""
+    with monkeypatch.context() as patch, opened(tmp_path / "a.mcap") as journal:
+        patch.setattr(
+            "robot.live.journal.encode_cut", lambda cut: encode_cut(cut._replace(frames=cut.frames + 1))
+        )
+        frames = some_frames(20)
+        journal.cut(cut_of(0, START, START, frames, moved(0)), frames)
+    walk = Walk(tmp_path / "a.mcap")
+    assert list(walk) == []
+    assert walk.broken == "a whisk of 21 frames, of which 20 are there"
+
+
+def test_the_window_holds_what_a_ring_would() -> None:
+    window = Window(no_frames(W))
+    assert len(window.between(0, 10**9).sequence) == 0
+    block = some_frames(1000)
+    for k in range(100):
+        window.add(block._replace(sequence=block.sequence + 1000 * k))
+    kept = window.between(0, 10**9).sequence
+    assert KEPT <= len(kept) < KEPT + 1000
+    assert (np.diff(kept) == 1).all()
+    assert kept[-1] == 99_999
+    assert (window.between(99_990, 99_992).sequence == [99_990, 99_991, 99_992]).all()
+
+
+def test_three_threads_write_one_recording(tmp_path: Path) -> None:
+    frames, states = some_frames(4 * RATE), some_states(500)
+    journal = opened(tmp_path / "a.mcap")
+
+    def head() -> None:
+        for k in range(0, 4 * RATE, 4):
+            journal.frames(rows(frames, slice(k, k + 4)), START + k / RATE)
+
+    def arm() -> None:
+        for k in range(0, 500, 5):
+            journal.arm(states[k : k + 5])
+
+    def loop() -> None:
+        for k in range(4):
+            mine = rows(frames, slice(k * RATE, (k + 1) * RATE))
+            journal.cut(cut_of(k, START + k, START + k, mine, moved(k)), mine)
+
+    threads = [threading.Thread(target=target) for target in (head, arm, loop)]
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-5)
+    try:
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(10)
+    finally:
+        sys.setswitchinterval(interval)
+    journal.close()
+    walk = Walk(tmp_path / "a.mcap")
+    entries = list(walk.entries())
+    assert not walk.broken
+    numbers = np.concatenate([e.content.sequence for e in entries if isinstance(e.content, Frames)])
+    assert (np.sort(numbers) == frames.sequence).all()
+    counters = np.concatenate([e.content["host"] for e in entries if isinstance(e.content, np.ndarray)])
+    assert (counters == states["host"]).all()
+    assert walk.count == 4
+
+
+def test_ros_tools_read_the_messages(tmp_path: Path) -> None:
+    pytest.importorskip("rosbags", reason="rosbags, an extra, is not installed")
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store: Any = get_typestore(Stores.EMPTY)
+    for name, text in SCHEMAS.items():
+        store.register(get_types_from_msg(text, name))
+    session(tmp_path / "a.mcap")
+    for entry in _entries(tmp_path / "a.mcap"):
+        read = store.deserialize_cdr(entry.message, entry.name)
+        assert bytes(store.serialize_cdr(read, entry.name)) == entry.message
+        assert read.time == entry.time
+
+
+def test_an_unseen_cut_needs_no_frames(tmp_path: Path, refused: Callable[..., InputError]) -> None:
+    with opened(tmp_path / "a.mcap") as journal:
+        cut = cut_of(0, START, START, no_frames(W), moved(0))
+        assert not cut.seen
+        journal.cut(cut, no_frames(W))
+    (sample,) = Recording(tmp_path / "a.mcap")
+    assert isinstance(sample.reading, Cycle)
+    assert len(sample.reading.time) == 0
+    assert sample.reading.odometry == moved(0)
+    assert isinstance(cut, Cut)
+    refused(lambda: Journal(tmp_path / "a.mcap", view_shape=(1, 1, 1), whiskers=1), "exists already")

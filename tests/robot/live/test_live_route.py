@@ -1,0 +1,90 @@
+"""The route: targets in order, each after the one before was reached, and where they come from."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from robot.live.route import approach, descent, routed, way
+from robot.live.settings import LiveConfig
+from robot.motion import at
+from robot.scene import scene
+from robot.ur10.placing import pose_of
+from tactile.errors import InputError
+from tactile.head import HeadConfig, ur10_head
+
+HEAD = ur10_head(HeadConfig())
+
+
+class Obedient:
+    """An arm that reports its arrival when it is told to."""
+
+    def __init__(self) -> None:
+        self.sent: list[np.ndarray] = []
+        self.there = False
+
+    def move(self, tcp, speed=None):
+        self.sent.append(tcp)
+        self.speed, self.there = speed, False
+
+    def arrived(self):
+        return self.there
+
+
+def test_a_target_is_sent_when_the_last_one_was_reached_and_once():
+    config = LiveConfig(waypoints=((0.1, 0.1, 0.0), (0.2, 0.1, 0.0), (0.2, 0.1, 90.0)))
+    route, arm = routed(config, way(config, HEAD)), Obedient()
+    assert [route.advance(arm) for _ in range(3)] == [False] * 3
+    assert len(arm.sent) == 1
+    arm.there = True
+    assert not route.advance(arm)
+    assert not route.advance(arm)
+    assert len(arm.sent) == 2
+    arm.there = True
+    assert route.advance(arm)
+    assert route.advance(arm)
+    assert len(arm.sent) == 2
+    assert np.array_equal(arm.sent, route.targets)
+
+
+def test_an_arm_that_was_stopped_is_sent_there_again():
+    config = LiveConfig(waypoints=((0.1, 0.1, 0.0), (0.2, 0.1, 0.0)))
+    route, arm = routed(config, way(config, HEAD)), Obedient()
+    route.again()
+    route.advance(arm)
+    route.again()
+    assert not route.advance(arm)
+    assert len(arm.sent) == 2
+    assert np.array_equal(arm.sent[0], arm.sent[1])
+
+
+def test_the_way_is_that_of_the_simulated_session():
+    config = LiveConfig()
+    plan, path = config.plan, way(config, HEAD)
+    made = scene(plan.maze, plan.path, plan.motion, plan.kidnaps, HEAD, plan.seed)
+    assert np.array_equal(path.pose, at(made.path, path.time))
+    pose, lift = pose_of(config.arm.placing, routed(config, path).targets)
+    assert np.allclose(pose[:, :2], path.pose[1:, :2])
+    assert np.allclose(np.cos(pose[:, 2] - path.pose[1:, 2]), 1.0)
+    assert np.allclose(lift, 0.0)
+    for route, height in ((approach(config, path), config.lift), (descent(config, path), 0.0)):
+        pose, lift = pose_of(config.arm.placing, route.targets)
+        assert np.allclose(pose[0, :2], path.pose[0, :2])
+        assert np.allclose(lift, height)
+
+
+def test_the_arm_goes_no_faster_than_it_may():
+    config = LiveConfig.model_validate({"arm": {"speed": 0.02}, "plan": {"motion": {"speed": 0.2}}})
+    assert routed(config, way(config, HEAD)).speed == 0.02
+
+
+@pytest.mark.parametrize(
+    ("settings", "key"),
+    [
+        ({"waypoints": [[0.1, 0.1, 0.0]]}, "live.waypoints"),
+        ({"plan": {"kidnaps": {"count": 2}}}, "live.plan.kidnaps"),
+    ],
+)
+def test_ways_that_no_arm_can_go_are_refused(settings, key):
+    with pytest.raises(InputError, match=key):
+        way(LiveConfig.model_validate(settings), HEAD)

@@ -1,0 +1,92 @@
+"""The odometer: poses between states, motions between whisks, and the errors that are added."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robot.live.odometer import Odometer
+from robot.live.settings import LiveConfig
+from robot.odometry import OdometryConfig
+from robot.ur10.placing import tcp_of
+from tactile.frames import compose, integrate
+
+HZ = 125.0
+
+
+def arc(config: LiveConfig, seconds: float, speed: float, turn: float) -> tuple[np.ndarray, ...]:
+    """Time [N], poses in the map [N, 3], tool poses and their rates [N, 6] of an arm on an arc."""
+    time = np.arange(round(seconds * HZ)) / HZ
+    heading = 0.3 + turn * time
+    step = np.stack([np.cos(heading), np.sin(heading)], axis=1) * speed / HZ
+    place = np.array([0.2, 0.4]) + np.concatenate([np.zeros((1, 2)), np.cumsum(step[:-1], axis=0)])
+    pose = np.column_stack([place, heading])
+    tcp = tcp_of(config.arm.placing, pose)
+    rate = np.zeros((len(time), 6))
+    rate[:, :3] = np.gradient(tcp[:, :3], 1 / HZ, axis=0)
+    rate[:, 5] = turn
+    return time, pose, tcp, rate
+
+
+def odometer(config: LiveConfig, *motion: float) -> tuple[Odometer, np.ndarray, np.ndarray]:
+    """One that has seen an arc, and the arc's times and poses."""
+    time, pose, tcp, rate = arc(config, *motion)
+    made = Odometer(config)
+    made.add(100.0 + time, tcp, rate)
+    return made, 100.0 + time, pose
+
+
+@given(
+    st.floats(-0.9, 0.9),
+    st.floats(-175, 175),
+    st.floats(0.0, 0.25),
+    st.floats(-0.8, 0.8),
+    st.floats(0.01, 2.9),
+)
+def test_poses_are_those_of_the_map_wherever_it_lies(x, yaw, speed, turn, when):
+    config = LiveConfig.model_validate({"arm": {"placing": {"x": x, "yaw_deg": yaw}}})
+    made, time, pose = odometer(config, 3.0, speed, turn)
+    k = int(np.searchsorted(time, 100.0 + when))
+    share = (100.0 + when - time[k - 1]) * HZ
+    expected = pose[k - 1] + share * (pose[k] - pose[k - 1])
+    assert np.allclose(made.pose(100.0 + when), expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["pose", "velocity"])
+@pytest.mark.parametrize(("speed", "turn"), [(0.05, 0.0), (0.0, 0.4), (0.04, -0.3)])
+def test_motions_lead_along_the_way(kind, speed, turn):
+    made, _, pose = odometer(LiveConfig(odometry=kind), 9.0, speed, turn)
+    told, truth = zip(*(made.told(k, 100.0 + k) for k in range(9)), strict=True)
+    moves = np.array([[m.dx, m.dy, m.dtheta] for m in told], float)
+    assert not moves[0].any()
+    assert np.allclose([m.dt for m in told[1:]], 1.0)
+    reckoned = compose(truth[0], integrate(moves[1:], np.zeros(3)))
+    # Velocities are means over a whisk, driven along the middle heading.
+    assert np.allclose(reckoned[-1, :2], truth[-1][:2], atol=1e-9 if kind == "pose" else 3e-3)
+    assert np.allclose(truth[-1], compose(np.zeros(3), pose[8 * int(HZ)]), atol=1e-9)
+
+
+def test_errors_are_added_and_do_not_depend_on_what_follows():
+    noisy = LiveConfig(noise=OdometryConfig(noise="white"), seed=4)
+    short, *_ = odometer(noisy, 9.0, 0.05, 0.1)
+    long, *_ = odometer(noisy, 9.0, 0.05, 0.1)
+    other, *_ = odometer(noisy.model_copy(update={"seed": 5}), 9.0, 0.05, 0.1)
+    exact, *_ = odometer(LiveConfig(), 9.0, 0.05, 0.1)
+    times = [(float(k), 100.0 + k) for k in range(8)]
+    first = [short.told(*t)[0] for t in times[:4]]
+    assert first == [long.told(*t)[0] for t in times][:4]
+    assert first != [other.told(*t)[0] for t in times][:4]
+    without = [exact.told(*t)[0] for t in times[:4]]
+    assert all(a.dx != b.dx and a.dy == b.dy for a, b in zip(first[1:], without[1:], strict=True))
+
+
+def test_it_remembers_only_the_last_seconds():
+    made, *_ = odometer(LiveConfig(), 9.0, 0.05, 0.0)
+    before = len(made._states)
+    time, _, tcp, rate = arc(LiveConfig(), 20.0, 0.05, 0.0)
+    made.add(200.0 + time, tcp, rate)
+    assert len(made._states) <= 10 * HZ + 2
+    assert made.newest == 200.0 + time[-1]
+    assert before == round(9 * HZ)

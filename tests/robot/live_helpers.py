@@ -1,0 +1,98 @@
+"""What tests of live parts share: emulators in processes of their own, their fault ports, waiting with an end."""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[2]
+UR_FAULTS, HEAD_FAULTS = 30098, 30099
+
+
+class Faults:
+    """The fault port of a running emulator: `faults(do="stall", seconds=3)` returns its answer.
+
+    Attributes:
+        process: the emulator. host: its address. config: the settings it was started with.
+    """
+
+    def __init__(self, process: subprocess.Popen[bytes], host: str, port: int) -> None:
+        self.process, self.host, self._port = process, host, port
+        self._stream: socket.socket | None = None
+        self._rest = b""
+
+    def __call__(self, **request: Any) -> dict[str, Any]:
+        if self._stream is None:
+            self._stream = socket.create_connection((self.host, self._port), 2.0)
+        self._stream.sendall(json.dumps(request).encode() + b"\n")
+        while b"\n" not in self._rest:
+            data = self._stream.recv(1 << 20)
+            if not data:
+                raise ConnectionError("the emulator hung up")
+            self._rest += data
+        line, self._rest = self._rest.split(b"\n", 1)
+        answer: dict[str, Any] = json.loads(line)
+        assert answer.get("ok", True), answer
+        return answer
+
+    def state(self) -> dict[str, Any]:
+        """What the emulator knows."""
+        return self(do="state")
+
+    def die(self) -> None:
+        """End the emulator in the midst of everything; it does not answer any more."""
+        with suppress(OSError, ValueError):
+            self(do="die")
+        self.process.wait(5)
+
+    def close(self) -> None:
+        if self._stream is not None:
+            self._stream.close()
+
+
+@contextmanager
+def emulator(module: str, port: int, host: str, *arguments: str) -> Iterator[Faults]:
+    """A running `python -m MODULE --host HOST ...` that has said `ready`; it ends with the block."""
+    command = [sys.executable, "-m", module, "--host", host, *arguments]
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, bufsize=0)
+    faults = Faults(process, host, port)
+    try:
+        assert process.stdout is not None
+        said = process.stdout.readline()
+        assert said.strip() == b"ready", f"{module} does not start; does another one hold {host}?"
+        yield faults
+    finally:
+        faults.close()
+        process.kill()
+        process.wait(5)
+        assert process.stdout is not None
+        process.stdout.close()
+
+
+def ur_emulator(host: str, start: Any, *arguments: str) -> Any:
+    """An emulated UR controller whose tool stands at a pose [6]; a context manager of its Faults."""
+    place = [repr(float(number)) for number in start]
+    return emulator("robot.emulators.ur10", UR_FAULTS, host, *arguments, "--start", *place)
+
+
+def moves(controller: Faults, after: int = 0) -> list[dict[str, Any]]:
+    """What reached a UR emulator after so many orders, without those that stop the arm."""
+    return [order for order in controller.state()["targets"][after:] if not order["order"].startswith("Stop")]
+
+
+def until(condition: Callable[[], Any], seconds: float, what: str = "") -> Any:
+    """What a condition gives once it is true; fails when that takes longer."""
+    end = time.monotonic() + seconds
+    while True:
+        found = condition()
+        if found:
+            return found
+        assert time.monotonic() < end, f"not in {seconds} s: {what or condition}"
+        time.sleep(0.002)

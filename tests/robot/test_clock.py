@@ -1,0 +1,171 @@
+"""A device's clock is found through any delays; its jumps are told."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robot.clock import AHEAD, SCALE, WINDOW, Clock
+from tactile.streams import stream
+
+SHORTEST = 2e-4
+"""The way's shortest delay, s."""
+
+
+def pairs(
+    seconds: float, rate: float = 100.0, ppm: float = 50.0, offset: float = 3e4, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(device, arrival, when it really was) [N] s, with long-tailed delays of up to 32 ms."""
+    random = stream(seed, "delays")
+    host = offset + np.arange(round(seconds * rate)) / rate
+    device = 17.0 + (host - offset) * (1 + ppm * 1e-6)
+    delay = SHORTEST + np.minimum(random.exponential(4e-4, len(host)), 0.032)
+    spikes = random.random(len(host)) < 0.02
+    delay[spikes] += random.uniform(0, 0.032, spikes.sum())
+    # What comes later never overtakes.
+    return device, np.maximum.accumulate(host + delay), host
+
+
+def fed(device: np.ndarray, arrival: np.ndarray, clock: Clock | None = None) -> Clock:
+    clock = clock or Clock()
+    for one, other in zip(device, arrival, strict=True):
+        clock.observe(one, other)
+    return clock
+
+
+@given(st.floats(-150, 150), st.integers(0, 30), st.sampled_from([100.0, 125.0, 500.0]))
+def test_time_is_found_within_the_shortest_delay(ppm: float, seed: int, rate: float) -> None:
+    device, arrival, host = pairs(8, rate, ppm, seed=seed)
+    clock = fed(device, arrival)
+    off = clock.host(device) - host - SHORTEST
+    assert np.abs(off[-round(2 * rate) :]).max() < 2e-4  # while single arrivals are up to 32 ms off
+    assert abs(clock.scale - 1 / (1 + ppm * 1e-6)) < 6e-5
+    np.testing.assert_allclose(clock.device(clock.host(device)), device, atol=1e-9)
+    assert clock.jumped == 0
+
+
+@given(st.floats(-150, 150), st.integers(0, 30))
+def test_nothing_arrives_before_it_happened(ppm: float, seed: int) -> None:
+    device, arrival, _ = pairs(5, ppm=ppm, seed=seed)
+    assert (arrival - fed(device, arrival).host(device)).min() > -1e-9
+
+
+@pytest.mark.parametrize("drift", [-0.8e-6, 0.8e-6])
+def test_a_drifting_clock_is_followed(drift: float) -> None:
+    """What is older than the window says nothing any more."""
+    device, arrival, host = pairs(4 * WINDOW, 50.0, ppm=0)
+    device = device + drift * (host - host[0]) ** 2  # by 192 ppm at the end
+    clock = Clock()
+    off = []
+    for one, other, real in zip(device, arrival, host, strict=True):
+        clock.observe(one, other)
+        off.append(clock.host(one) - real - SHORTEST)
+    assert np.abs(off[100:]).max() < 6e-4
+    assert clock.jumped == 0
+
+
+def test_it_depends_on_what_was_observed_alone() -> None:
+    device, arrival, _ = pairs(3)
+    one, other = fed(device, arrival), Clock()
+    for k in range(len(device)):
+        other.observe(device[k], arrival[k])
+        other.host(1.0), other.residual
+    assert (one.host(50.0), one.scale, one.residual) == (other.host(50.0), other.scale, other.residual)
+
+
+def test_a_scale_no_quartz_has_is_not_believed() -> None:
+    device, arrival, _ = pairs(10, ppm=2000)
+    clock = fed(device, arrival)
+    assert abs(clock.scale - 1) <= SCALE * 1.0001
+    assert (arrival - clock.host(device)).min() > -1e-9
+
+
+def test_the_residual_is_how_late_the_late_ones_come() -> None:
+    device, arrival, host = pairs(20)
+    late = arrival - host
+    expected = np.quantile(late, 0.99) - np.median(late)
+    assert fed(device, arrival).residual == pytest.approx(expected, rel=0.02)
+    assert fed(device, host).residual < 1e-9
+    assert Clock().residual == 0.0
+
+
+@pytest.mark.parametrize("jump", [-3600.0, -1.0, -0.05, 0.01, 1.0, 4295.0])
+def test_jumps_are_told_at_once_and_lived_with(jump: float) -> None:
+    device, arrival, host = pairs(20)
+    half = len(device) // 2
+    clock = fed(device[:half], arrival[:half])
+    assert clock.jumped == 0
+    late = int(np.argmax((arrival - host)[half:] < AHEAD / 5)) + 1
+    fed(device[half : half + late] + jump, arrival[half : half + late], clock)
+    assert clock.jumped == 1
+    fed(device[half + late :] + jump, arrival[half + late :], clock)
+    assert clock.jumped == 1
+    assert np.abs(clock.host(device[half + 200 :] + jump) - host[half + 200 :] - SHORTEST).max() < 2e-4
+
+
+def test_a_small_step_back_is_told_in_a_while() -> None:
+    device, arrival, _ = pairs(20, rate=20.0)
+    half = len(device) // 2
+    clock = fed(device[:half], arrival[:half])
+    fed(device[half:] - 0.04, arrival[half:], clock)
+    assert clock.jumped == 1
+
+
+@pytest.mark.parametrize("stall", [0.5, 2.0, 5.0])
+def test_a_host_that_slept_is_no_jump(stall: float) -> None:
+    """Everything that waited comes at once."""
+    device, arrival, host = pairs(20)
+    asleep = (host > host[0] + 8) & (host < host[0] + 8 + stall)
+    arrival = arrival.copy()
+    arrival[asleep] = host[0] + 8 + stall + 1e-4 * np.arange(asleep.sum())
+    clock = fed(device, np.maximum.accumulate(arrival))
+    assert clock.jumped == 0
+    assert np.abs(clock.host(device[-200:]) - host[-200:] - SHORTEST).max() < 2e-4
+
+
+def test_a_head_that_was_away_is_no_jump() -> None:
+    """Its clock went on, nothing came."""
+    device, arrival, host = pairs(30)
+    there = (host < host[0] + 5) | (host > host[0] + 25)
+    clock = fed(device[there], arrival[there])
+    assert clock.jumped == 0
+    assert abs(clock.host(device[-1]) - host[-1] - SHORTEST) < 2e-4
+
+
+def test_a_late_first_arrival_is_no_jump() -> None:
+    device, arrival, host = pairs(5)
+    arrival[0] += 0.009
+    clock = fed(device, arrival)
+    assert clock.jumped == 0
+    assert abs(clock.host(device[-1]) - host[-1] - SHORTEST) < 2e-4
+
+
+@pytest.mark.parametrize("step", [0.002, 0.05])
+def test_stamps_that_repeat(step: float) -> None:
+    """A coarse clock: the first arrival of a stamp is what counts."""
+    device, arrival, _ = pairs(5, rate=500.0)
+    device = np.floor(device / step) * step
+    clock = fed(device, arrival)
+    assert (arrival - clock.host(device)).min() > -1e-9
+    assert clock.jumped == 0
+
+
+def test_before_anything_is_known_nothing_is_said() -> None:
+    with pytest.raises(ValueError, match="observed nothing"):
+        Clock().host(1.0)
+    with pytest.raises(ValueError, match="observed nothing"):
+        Clock().device(1.0)
+    clock = fed(np.array([5.0]), np.array([105.0]))
+    assert clock.host(6.0) == 106.0
+    assert clock.device(106.0) == 6.0
+
+
+@given(st.lists(st.tuples(st.floats(0, 0.3), st.floats(0, 0.3)), min_size=1, max_size=40))
+def test_any_observations_are_borne(steps: list[tuple[float, float]]) -> None:
+    device, arrival = np.cumsum(np.array(steps), axis=0).T
+    clock = fed(device, arrival)
+    assert np.isfinite(clock.host(device)).all()
+    assert abs(clock.scale - 1) <= SCALE * 1.0001
+    assert clock.residual >= 0

@@ -1,0 +1,73 @@
+"""The resumable loop of the quasistatic tier: in any parts, the same bits."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robot.kinematic import MechanicsConfig
+from robot.mechanics import StreamConfig
+from robot.quasistatic import advance, quasistatic, rest
+from robot.sweep import Sweep
+from robot.walls import FREE
+from tactile.head import HeadConfig, ur10_head
+from tactile.streams import stream
+from tactile.whisking import Drive, WhiskingConfig, command
+
+HEAD = ur10_head(HeadConfig())
+SAMPLES, CYCLES = 80, 3
+
+
+def sweep() -> Sweep:
+    """Walls that come, go and slide."""
+    random = stream(0, "walls")
+    size = (SAMPLES, CYCLES, 18)
+    wall = np.repeat(random.uniform(0.2, 1.4, (8, CYCLES, 18)), SAMPLES // 8, axis=0)
+    wall = np.where(random.random((1, CYCLES, 18)) < 0.3, FREE, wall)
+    noise = 2e-3 * random.standard_normal((CYCLES, SAMPLES, 18, 3))
+    reach, drift = random.uniform(0.3, 1.0, size), random.normal(0, 0.2, size)
+    return Sweep(np.arange(SAMPLES) / SAMPLES, wall, reach, drift, noise)
+
+
+def part(whole: Sweep, some: slice) -> Sweep:
+    return Sweep(*(column[some] for column in whole[:-1]), whole.noise[:, some])
+
+
+@given(
+    st.lists(st.integers(1, SAMPLES - 1), max_size=6, unique=True), st.sampled_from(["open", "rcp", "spread"])
+)
+def test_a_cycle_in_parts_is_the_cycle(cuts: list[int], mode: str) -> None:
+    config, mechanics, whole = StreamConfig(rate=SAMPLES), MechanicsConfig(slip=0.1), sweep()
+    whisking, threshold = WhiskingConfig(mode=mode), np.full(18, 0.04)
+
+    def law(drive: Drive, time: float, told: np.ndarray) -> tuple[np.ndarray, Drive]:
+        return command(whisking, drive, time, told, threshold, HEAD.shape)
+
+    ends = [0, *sorted(cuts), SAMPLES]
+    balance, parts = rest(CYCLES, 18), []
+    for first, last in itertools.pairwise(ends):
+        found, balance = advance(config, mechanics, law, part(whole, slice(first, last)), balance)
+        parts.append(found)
+    once = quasistatic(config, mechanics, whisking, HEAD, whole, threshold)
+    assert (once[2] > 0).any()
+    assert balance.slipped.any()
+    for k, column in enumerate(once):
+        assert np.array_equal(np.concatenate([found[k] for found in parts]), column)
+
+
+def test_a_beginning_is_not_used_up() -> None:
+    config, mechanics, whole = StreamConfig(rate=SAMPLES), MechanicsConfig(slip=0.1), sweep()
+    whisking = WhiskingConfig(mode="open")
+
+    def law(drive: Drive, time: float, told: np.ndarray) -> tuple[np.ndarray, Drive]:
+        return command(whisking, drive, time, told, np.full(18, 0.04), HEAD.shape)
+
+    before = rest(CYCLES, 18)
+    first = advance(config, mechanics, law, whole, before)
+    second = advance(config, mechanics, law, whole, before)
+    assert all(np.array_equal(a, b) for a, b in zip(first[0], second[0], strict=True))
+    assert not before.touching.any()
+    assert not before.slipped.any()
