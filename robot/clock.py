@@ -25,6 +25,8 @@ AHEAD = 5e-3
 """An arrival so much before the line, s, tells that the device's clock went forward by itself."""
 LATE, STAYS = 20e-3, 1.0
 """Arrivals later than that, s, for so long on end, s, tell that it went back a little."""
+EARLY = 0.1
+"""Share of arrivals that should come as fast as they can."""
 SETTLED = 1.0
 """s of pairs from which on the line is trusted to tell it."""
 
@@ -99,7 +101,8 @@ class Clock:
 
     @property
     def residual(self) -> float:
-        """By how much the latest arrivals of a hundred come later than the usual one, s; 0 before any."""
+        """How far above the line the earliest tenth of arrivals lies, s; 0 before any. Where it is large the
+        line hangs on a few lucky ones; how late the others come does not matter."""
         with self._lock:
             points = [point for piece in self._pieces for point in piece.points]
             line = self._line
@@ -107,7 +110,7 @@ class Clock:
             return 0.0
         device, arrival = np.array(points).T
         late = arrival - line.at(device)
-        return float(np.quantile(late, 0.99) - np.median(late))
+        return float(np.quantile(late, EARLY))
 
     def _known(self) -> Line:
         if not self._pieces:

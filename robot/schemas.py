@@ -83,9 +83,7 @@ string event        # its name, ': ', what was found
 }
 (OBSERVATION, CYCLE, WHISK, REPORT, TRUTH, CUT, FRAMES, ARM, EVENT) = SCHEMAS
 READINGS = (OBSERVATION, CYCLE, WHISK, REPORT, CUT)
-"""What a sample is made of."""
-BESIDE = (FRAMES, ARM, EVENT)
-"""What stands beside samples."""
+"""What a sample is made of; the others stand beside them."""
 TOPICS = {
     OBSERVATION: "/ratslam/observation",
     CYCLE: "/ratslam/cycle",

@@ -5,7 +5,6 @@ zstd-compressed chunks with checksums, each handed to the operating system as a 
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
@@ -74,7 +73,7 @@ class Tape:
         self._pending, self._flushed = 0, -np.inf  # bytes in the open chunk; time of the last closed one
         self._channels: dict[str, int] = {}
         self.count = 0
-        self._beside: Counter[str] = Counter()
+        self._number = 0
         self._failed = False
         # Chunks are ended here, never by the library, so that each one reaches the operating system whole.
         self._writer = Writer(
@@ -93,16 +92,14 @@ class Tape:
         Raises:
             Unwritable: the operating system takes no more.
         """
-        counted = name in READINGS or name == TRUTH
-        number = self.count if counted else self._beside[name]
         # MCAP's clock has no negative times.
         stamp = min(max(round(time * 1e9), 0), (1 << 63) - 1) if np.isfinite(time) else 0
-        self._writer.add_message(self._channel(name), stamp, message, stamp, number % (1 << 32))
+        self._writer.add_message(self._channel(name), stamp, message, stamp, self._number % (1 << 32))
         self._pending += len(message)
         if name == TRUTH:
             return
+        self._number += 1
         self.count += name in READINGS
-        self._beside[name] += not counted
         if self._pending >= self._chunk_bytes or abs(time - self._flushed) >= self._chunk_s:
             self.flush()
             self._flushed = time

@@ -7,7 +7,6 @@ sequence, so what is read is exactly a prefix of what was written.
 from __future__ import annotations
 
 import json
-from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -25,7 +24,6 @@ from robot.messages import MOST, Malformed, decode, decode_truth
 from robot.records import BROKEN, records
 from robot.schemas import (
     ARM,
-    BESIDE,
     CUT,
     FRAMES,
     READINGS,
@@ -122,7 +120,7 @@ class Walk:
         self.description: Description | None = None
         self.broken = "it was not read to its end"
         self.count = 0
-        self._beside: Counter[str] = Counter()
+        self._number = 0  # of the next message; a truth has its reading's
         self._window: Window | None = None
 
     def __iter__(self) -> Iterator[Sample]:
@@ -138,7 +136,7 @@ class Walk:
 
     def _entries(self, file: IO[bytes]) -> Iterator[Entry]:
         schemas: dict[int, Schema] = {}
-        names: dict[int, str | None] = {}  # of channels told; None: not one of ours
+        names: dict[int, str] = {}  # of channels told; '': not one of ours
         truth: bytes | None = None
         try:
             for record in records(file):
@@ -147,25 +145,27 @@ class Walk:
                 elif isinstance(record, Schema):
                     schemas[record.id] = record
                 elif isinstance(record, Channel):
-                    names[record.id] = _known(record, schemas) if record.topic in SCHEMA_OF else None
+                    names[record.id] = _known(record, schemas) if record.topic in SCHEMA_OF else ""
                 elif isinstance(record, Message):
-                    if record.channel_id not in names:
-                        raise Malformed("a message on a channel that was not told")
-                    name = names[record.channel_id]
-                    if name is None:
+                    name = names.get(record.channel_id, "")
+                    if not name:
                         continue
-                    self._number(name, record.sequence)
+                    if self.description is None:
+                        raise Malformed("a sample before the recording's description")
+                    if record.sequence != self._number % (1 << 32):
+                        raise Malformed(f"message {record.sequence} where {self._number} was due")
                     if name == TRUTH:
                         decode_truth(record.data)
                         truth = record.data
-                    elif name in READINGS:
+                        continue
+                    self._number += 1
+                    if name in READINGS:
                         sample = self._sample(name, record.data, truth)
                         self.count += 1
                         yield Entry(name, sample.time, record.data, truth, sample)
                         truth = None
                     else:
                         time, content = self._block(name, record.data)
-                        self._beside[name] += 1
                         yield Entry(name, time, record.data, None, content)
                 elif isinstance(record, Statistics):
                     self._compare(record, names)
@@ -175,14 +175,6 @@ class Walk:
             )
         else:
             self.broken = ""
-
-    def _number(self, name: str, number: int) -> None:
-        """Readings are numbered, a truth as its reading, and each kind of block for itself."""
-        if self.description is None:
-            raise Malformed("a sample before the recording's description")
-        what, due = ("sample", self.count) if name in (*READINGS, TRUTH) else (name, self._beside[name])
-        if number != due % (1 << 32):
-            raise Malformed(f"{what} {number} where {due} was due")
 
     def _sample(self, name: str, message: bytes, truth: bytes | None) -> Sample:
         assert self.description is not None
@@ -211,19 +203,13 @@ class Walk:
             self._window = Window(no_frames(self.description.whiskers))
         return self._window
 
-    def _compare(self, statistics: Statistics, names: Mapping[int, str | None]) -> None:
+    def _compare(self, statistics: Statistics, names: Mapping[int, str]) -> None:
         """A chunk whose very type is damaged is passed over as unknown: then the numbers differ."""
-        written: Counter[str | None] = Counter()
-        for channel, count in statistics.channel_message_counts.items():
-            if channel not in names:
-                raise Malformed("messages were written on a channel that was not told")
-            written[names[channel]] += count
-        readings = sum(written[name] for name in READINGS)
-        if readings != self.count:
-            raise Malformed(f"{self.count} samples where {readings} were written")
-        for name in BESIDE:
-            if written[name] != self._beside[name]:
-                raise Malformed(f"{self._beside[name]} messages {name} where {written[name]} were written")
+        counts = statistics.channel_message_counts
+        others = {channel for channel, name in names.items() if name in ("", TRUTH)}
+        written = sum(count for channel, count in counts.items() if channel not in others)
+        if written != self._number:
+            raise Malformed(f"{self._number} samples and blocks where {written} were written")
 
 
 def _known(channel: Channel, schemas: Mapping[int, Schema]) -> str:

@@ -30,7 +30,6 @@ from robot.motion import Path as Way
 from robot.outcome import Fault, Outcome
 from robot.sensing import kept
 from robot.simulation import CELL_SIZE
-from robot.ur10.safety import Refused
 from tactile.calibration import Calibration, calibrated
 from tactile.errors import InputError
 from tactile.head import ur10_head
@@ -102,8 +101,6 @@ def live(
                 fault = error.fault
             except Stopped:
                 fault = Fault(Outcome.INTERRUPTED, f"after {len(handed)} whisks", time.monotonic())
-            except Refused as error:
-                fault = Fault(Outcome.OUT_OF_BOX, str(error), time.monotonic())
             standing = rig.rest(fault.detail)
             report = _report(fault, rig, mapper, handed, standing)
         card = mapper.finish(fault.outcome is not Outcome.COMPLETE) if handed else None
@@ -189,7 +186,11 @@ def _driven(rig: Rig, path: Way, mapper: Mapper, handed: list[Handed]) -> None:
             bar.update()
             bar.set_postfix_str(_status(rig, mapper, handed), refresh=False)
 
-        drive(rig, routed(rig.config, path), mapper, tell)
+        try:
+            drive(rig, routed(rig.config, path), mapper, tell)
+        except Faulted as error:
+            rig.note("fault", str(error.fault))
+            raise
 
 
 def _status(rig: Rig, mapper: Mapper, handed: list[Handed]) -> str:

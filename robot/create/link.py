@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import importlib
+import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 from robot.create import wire
 from tactile.errors import InputError
@@ -72,7 +72,7 @@ def open_port(name: str, *, exclusive: bool = True) -> Port:
         InputError: without pyserial.
     """
     try:
-        serial: Any = importlib.import_module("serial")
+        import serial
     except ImportError:
         raise InputError("serial", "pyserial is not installed", "", "pip install 'ratslam[live]'") from None
     # Without `exclusive` pyserial never asks for a lock; False would be refused on Windows.
@@ -87,13 +87,14 @@ def open_port(name: str, *, exclusive: bool = True) -> Port:
 def _explained(name: str, error: OSError) -> NoPort:
     """The error in words. pyserial tells most causes in its text alone."""
     cause = error.errno or getattr(error.__context__, "errno", None)
-    if cause == 2 or isinstance(error, FileNotFoundError):
-        tools: Any = importlib.import_module("serial.tools.list_ports")
-        ports = ", ".join(sorted(port.device for port in tools.comports())) or "none; plug the cable in"
+    if cause == errno.ENOENT:
+        from serial.tools.list_ports import comports
+
+        ports = ", ".join(sorted(port.device for port in comports())) or "none; plug the cable in"
         return NoPort(name, "there is no such port", f"one of those there are: {ports}")
-    if cause == 13:
+    if cause == errno.EACCES:
         return NoPort(name, "may not be opened", "", "join its group: sudo usermod -aG dialout $USER")
-    if cause in (11, 16):
+    if cause in (errno.EAGAIN, errno.EBUSY):
         return NoPort(name, "is held by another program", "", "end that program")
     return NoPort(name, f"cannot be opened ({error})", "a serial port")
 

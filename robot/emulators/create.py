@@ -46,8 +46,9 @@ class Base(NamedTuple):
     def moved(self, right: float, left: float, wheel_base: float, seconds: float) -> Base:
         """After wheels of these speeds, m/s: an arc."""
         way, turn = (right + left) / 2 * seconds, (right - left) / wheel_base * seconds
-        chord = way * (math.sin(turn / 2) / (turn / 2) if turn else 1.0)
-        middle = self.heading + turn / 2
+        half = turn / 2
+        chord = way * (math.sin(half) / half if half else 1.0)
+        middle = self.heading + half
         return Base(
             self.x + chord * math.cos(middle),
             self.y + chord * math.sin(middle),

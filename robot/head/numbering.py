@@ -83,7 +83,6 @@ class Numbering:
 
     def _begin(self, raw: int) -> int:
         number = raw + (WRAP * (self._highest // WRAP + 1) if self.streams else 0)
-        self._seen[:] = False
         self._seen[number % LATE] = True
         self._first = self._highest = number
         self._held, self._begun = 1, True

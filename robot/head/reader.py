@@ -158,7 +158,7 @@ class Reader:
         """What the session cannot wait for any longer; once one, always one."""
         link = self.state.link
         lost = link in ENDS and self.age > self.config.patience
-        if self._fault is None and lost and not self._ending.is_set():
+        if self._fault is None and lost:
             why = f" ({self._refusal})" if self._refusal else ""
             detail = f"{link.value}{why}, {self.age:.1f} s after the last sample"
             self._fault = Fault(ENDS[link], detail, time.monotonic())

@@ -16,6 +16,7 @@ from robot.live.route import Route
 from robot.outcome import Fault, Outcome
 from robot.simulation import MIDDLE
 from robot.source import Sample
+from robot.ur10.safety import Refused
 from tactile.errors import InputError
 from tactile.types import Cycle, Odometry
 
@@ -98,7 +99,7 @@ def drive(rig: Rig, route: Route, mapper: Maps, tell: Callable[[Handed], None]) 
         streak, life = next_streak(rig, number), rig.restarts
         while rig.streaming and rig.restarts == life:
             _look(rig, mapper)
-            arrived = arrived or route.advance(rig.arm)
+            arrived = arrived or _advanced(rig, route)
             handed = _whisk(rig, streak, number, mapper)
             if handed is None:
                 time.sleep(TICK)
@@ -113,7 +114,7 @@ def drive(rig: Rig, route: Route, mapper: Maps, tell: Callable[[Handed], None]) 
 
 def go(rig: Rig, route: Route) -> None:
     """Goes a route without whisking for anybody."""
-    rig.until(lambda: route.advance(rig.arm), LONGEST, Outcome.NOT_ARRIVED, "the way")
+    rig.until(lambda: _advanced(rig, route), LONGEST, Outcome.NOT_ARRIVED, "the way")
 
 
 def hold(rig: Rig, route: Route) -> None:
@@ -186,6 +187,15 @@ def _whisk(rig: Rig, streak: Streak, number: int, mapper: Maps) -> Handed | None
     return Handed(number, time.monotonic() - due, cut.seen, streak.samples - len(frames.sequence))
 
 
+def _advanced(rig: Rig, route: Route) -> bool:
+    """Whether the arm has arrived at the end of the route; if at a target, it is sent to the next one."""
+    try:
+        return route.advance(rig.arm)
+    except Refused as error:  # for what ends it anyway, or for the target
+        fault = rig.arm.fault or Fault(Outcome.OUT_OF_BOX, str(error), time.monotonic())
+        raise Faulted(fault) from error
+
+
 def _look(rig: Rig, mapper: Maps) -> None:
     rig.look()
     if not mapper.alive:
@@ -199,6 +209,8 @@ def _complete(rig: Rig, last: int) -> bool:
 
 
 def _whole(frames: Frames, first: int, last: int, gap: int) -> bool:
-    """Whether no more than so many samples are missing anywhere on end."""
+    """Whether fewer than so many samples are missing anywhere on end, and their times are as even."""
     known = np.concatenate([[first - 1], frames.sequence, [last + 1]])
-    return bool(np.diff(known).max() <= gap + 1)
+    step = np.diff(frames.time)
+    even = len(step) > 0 and step.min() > 0 and step.max() <= gap * np.median(step)
+    return bool(np.diff(known).max() <= gap and even)

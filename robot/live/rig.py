@@ -25,8 +25,9 @@ from tactile.head import HeadConfig, ur10_head
 
 TICK = 0.01
 """s between two looks."""
-STANDS = 1.0
-"""How long an arm that was stopped is looked at, s."""
+STANDS, SETTLED = 2.0, 0.3
+"""How long an arm that was stopped is looked at, at most and until it has stood for so long, s: after a contact
+it stands, and then backs off."""
 
 
 class Faulted(Exception):
@@ -122,13 +123,16 @@ class Rig:
         self.ages = []
 
     def rest(self, reason: str) -> bool:
-        """Stops the arm and retracts the whiskers; whether the arm was seen to stand."""
-        self.arm.halt(reason)
+        """Stops the arm, unless a fault has, and retracts the whiskers; whether the arm was seen to stand."""
+        if self.arm.fault is None:
+            self.arm.halt(reason)
         self.driver.rest()
-        due = time.monotonic() + STANDS
-        while not (still := self.arm.still()) and time.monotonic() < due:
+        began = stood = now = time.monotonic()
+        while now - stood < SETTLED and now - began < STANDS and self.arm.age() <= self.config.arm.stale:
             time.sleep(TICK)
-        return still
+            now = time.monotonic()
+            stood = stood if self.arm.still() else now
+        return self.arm.still()
 
     def note(self, name: str, text: str) -> None:
         """Keeps with the recording that something happened."""
@@ -148,7 +152,7 @@ class Rig:
                 self.restarts += 1
                 continue
             frames, arrival = block
-            self.clock.observe(float(frames.time[-1]) * 1e-6, arrival)
+            self.clock.observe(float(frames.time.max()) * 1e-6, arrival)
             begins = (frames.flags & np.uint8(Flag.CYCLE)) > 0
             self.starts += frames.sequence[begins].tolist()
             if self.journal is not None:

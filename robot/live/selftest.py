@@ -61,7 +61,7 @@ def started(rig: Rig) -> Iterator[str]:
             "head", f"{after.bad - before.bad} damaged samples in {LISTENED:g} s", "none", "change the cable"
         )
     if rig.clock.residual > rig.config.residual:
-        found = f"its samples come up to {rig.clock.residual * 1e3:.1f} ms late"
+        found = f"its clock is known to {rig.clock.residual * 1e3:.1f} ms"
         raise InputError(
             "head", found, f"{rig.config.residual * 1e3:g} ms", "look at what else this machine does"
         )

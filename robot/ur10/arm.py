@@ -54,10 +54,10 @@ class Arm:
         try:
             self._await_ready(process)
             accepted(self.config, lambda: self.states(first - 1))
+            self._supervisor.arm()
         except BaseException:
             self._supervisor.bury()
             raise
-        self._supervisor.armed = True
 
     def respawn(self) -> None:
         """Start anew after a fault, with all checks; the pose may be another one, so this is no odometry."""

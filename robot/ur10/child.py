@@ -2,11 +2,11 @@
 
     python -m robot.ur10.child NAME CONFIG_JSON
 
-NAME is the session's board (states.py). Orders come as JSON lines on the standard input, reports leave as JSON
-lines on the standard output, whatever the library prints goes to the standard error.
+NAME is the session's board (states.py). Orders come as JSON lines on the standard input, reports leave as
+JSON lines on the standard output, whatever the library prints goes to the standard error.
 
-The arm is stopped from here when a state says so, when the session asks for it, when it falls silent, and when
-it is gone. Should this process be gone as well, the controller's watchdog goes hungry and stops the arm.
+The arm is stopped from here when a state says so, when the session asks for it, when it falls silent, and
+when it is gone. Should this process be gone as well, the controller's watchdog goes hungry and stops the arm.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ VARIABLES = [
 
 
 class Child:
-    """Both interfaces of one controller: states are read, judged and passed on, the session is listened to."""
+    """Both interfaces of a controller: states are read, judged and passed on, the session is listened to."""
 
     def __init__(self, config: ArmConfig, board: Board, receive: Any, control: Any, reports: int) -> None:
         self.config, self.board, self.receive, self.control = config, board, receive, control

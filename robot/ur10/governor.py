@@ -116,16 +116,19 @@ class Governor:
         while True:
             self._wake.wait(0.3 / self.config.watchdog_hz)
             self._wake.clear()
-            if self.ungoverned:
-                continue
-            wanted = self._wanted()
-            if wanted != self._stopped:
-                self.control.stopL(self.config.deceleration, True)
-                self._stopped = wanted
-            while not (self._orders.empty() or self.leaving):
-                self.execute(self._orders.get())
-            if time.monotonic() - float(self.board.control["heartbeat"]) <= self.config.heartbeat:
-                self.control.kickWatchdog()
+            if not self.ungoverned:
+                self.act()
+
+    def act(self) -> None:
+        """Stop if asked to, then begin what was ordered; feed the watchdog while the session lives."""
+        wanted = self._wanted()
+        if wanted != self._stopped:
+            self.control.stopL(self.config.deceleration, True)
+            self._stopped = wanted
+        while not (self._orders.empty() or self.leaving):
+            self.execute(self._orders.get())
+        if time.monotonic() - float(self.board.control["heartbeat"]) <= self.config.heartbeat:
+            self.control.kickWatchdog()
 
     def execute(self, order: Order) -> None:
         """Begin a move, if nothing speaks against it."""

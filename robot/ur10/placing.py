@@ -1,8 +1,8 @@
 """Where the plane of the map lies in the arm's base: poses of the head become poses of the tool, and back.
 
-A tool pose is an array [..., 6] as UR controllers write it: x, y, z of the tool centre point in the base frame,
-m, and a rotation vector, rad. The tool points down: its rotation is Rz(heading) Rx(pi), half a turn about the
-level axis (cos h/2, sin h/2, 0).
+A tool pose is an array [..., 6] as UR controllers write it: x, y, z of the tool centre point in the base
+frame, m, and a rotation vector, rad. The tool points down: its rotation is Rz(heading) Rx(pi), half a turn
+about the level axis (cos h/2, sin h/2, 0).
 """
 
 from __future__ import annotations

@@ -155,7 +155,7 @@ def inside(config: ArmConfig, tcp: np.ndarray) -> bool:
 
 
 def overloaded(config: ArmConfig, force: np.ndarray, rest: np.ndarray, most: float | None = None) -> bool:
-    """Whether a force [6] differs from that at rest by more than the limit (`most` N; none: as configured)."""
+    """Whether a force [6] differs from that at rest by more than the limit (`most`; none: as configured)."""
     limit = config.force_limit if most is None else most
     return not math.hypot(*(force[:3] - rest[:3])) <= limit
 

@@ -46,8 +46,8 @@ class ArmConfig(Settings):
     turn_rate: Annotated[float, Field(gt=0, le=TURN_CAP)] = 0.4
     """Of the tool on the spot, rad/s."""
     turn_ratio: Annotated[float, Field(ge=4, le=100)] = 4.0
-    """rad/s by which a controller turns the tool for every m/s it is told, at most. A guess that no controller
-    has confirmed: one that turns more slowly takes longer, which is allowed for."""
+    """rad/s by which a controller turns the tool for every m/s it is told, at most. A guess, confirmed by no
+    controller: one that turns more slowly takes longer, which is allowed for."""
     acceleration: Annotated[float, Field(gt=0, le=1.2)] = 0.3
     """Of the tool, m/s^2."""
     deceleration: Annotated[float, Field(gt=0, le=10.0)] = 2.0

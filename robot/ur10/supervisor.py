@@ -72,6 +72,15 @@ class Supervisor:
         if not self._thread.is_alive():
             self._thread.start()
 
+    def arm(self) -> None:
+        """From now on a finding is a fault; one that came before is a reason not to start, and raised."""
+        with self.lock:
+            if self.process is not None:
+                self.hear(self.process)
+            if self.refused is not None:
+                raise self.refused
+            self.armed = True
+
     def bury(self) -> None:
         """End the process, whatever it does."""
         with self.lock:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import pytest
 
-from tests.live.bench import Bench, Session
+from tests.live.bench import Bench
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def table(loopback: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     """Emulators of this worker."""
     bench = Bench(loopback, tmp_path_factory.mktemp("live"))

@@ -1,4 +1,4 @@
-"""What tests of live parts share: emulators in processes of their own, their fault ports, waiting with an end."""
+"""What tests of live parts share: emulators in processes of their own, their fault ports, patience."""
 
 from __future__ import annotations
 

@@ -37,11 +37,10 @@ class Bus:
 
     def look(self) -> bool:
         """Brings the bus up to date; True, to be called again."""
-        described = self._described()
-        if described and self._node is None:
-            self._add(described)
-        elif not described and self._node is not None:
+        if self._node is not None and not self._node.present():
             self._remove()
+        if self._node is None and (described := self._described()):
+            self._add(described)
         return True
 
     def _described(self) -> bytes:
@@ -57,8 +56,11 @@ class Bus:
             line.close()
 
     def _add(self, described: bytes) -> None:
+        try:
+            node = Usbfs(self._host, self._port)
+        except OSError:  # pulled out again
+            return
         self._number += 1
-        node = Usbfs(self._host, self._port)
         self._testbed.add_from_string(_description(self._number, described))
         self._path = _path(self._number)
         handler = self._umockdev.IoctlBase()

@@ -96,6 +96,13 @@ class Usbfs:
         for way, line in lines.items():
             threading.Thread(target=self._carry, args=(self._queues[way], line), daemon=True).start()
 
+    def present(self) -> bool:
+        """Whether it is still plugged in, and was all the time."""
+        try:
+            return bool(self._control.call(Op.DESCRIBE))
+        except OSError:
+            return False
+
     def close(self) -> None:
         """Lets its threads end."""
         for waiting in self._queues.values():

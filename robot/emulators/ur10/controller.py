@@ -15,7 +15,7 @@ from robot.emulators.ur10.rotation import Vector6
 from robot.emulators.ur10.safety import BITS, RobotMode, Runtime, SafetyMode, StatusBits
 from robot.emulators.ur10.settings import UrEmulatorConfig
 
-KEPT = 100_000  # orders remembered
+KEPT = 10_000  # orders remembered: what "state" tells within a control step or two
 
 
 class Controller:

@@ -79,11 +79,10 @@ def read(device: Any, seconds: float, decoder: Decoder) -> Frames:
 
 
 def test_it_is_a_backend() -> None:
+    backend = importlib.import_module("usb.backend").IBackend
     asked = {
         name: method
-        for name, method in inspect.getmembers(
-            importlib.import_module("usb.backend").IBackend, inspect.isfunction
-        )
+        for name, method in inspect.getmembers(backend, inspect.isfunction)
         if not name.startswith("_") and name != "finalize"
     }
     assert len(asked) > 20

@@ -1,4 +1,4 @@
-"""What `test_umock` runs on a test bed: a host of the head on the system's libusb. Prints what it saw as JSON."""
+"""What `test_umock` runs on a test bed: a host of the head on the system's libusb. Prints JSON."""
 
 from __future__ import annotations
 
@@ -8,9 +8,6 @@ import sys
 import time
 from typing import Any
 
-# The libusb that a package brings does not hear of unplugged devices here: it asks the kernel, not udev.
-sys.modules["libusb_package"] = None  # type: ignore[assignment]
-
 from robot.emulators.head.settings import CONTROL_PORT
 from robot.head.decoder import Decoder
 from robot.head.device import Bridge, Gone, Stalled, identity, open_bridge
@@ -19,7 +16,9 @@ from tests.robot.emulators.heads import drive
 
 
 def main(host: str) -> None:
-    """Reads, is stalled, silenced, unplugged and plugged in again."""
+    """Reads, is stalled, stopped, unplugged and plugged in again."""
+    # The libusb that a package brings does not hear of unplugged devices here: it asks the kernel, not udev.
+    sys.modules["libusb_package"] = None  # type: ignore[assignment]
     seen: dict[str, Any] = {}
     bridge = open_bridge("usb")
     decoder = Decoder(18, 3)
@@ -32,7 +31,7 @@ def main(host: str) -> None:
     seen["stalls"] = 0
     for _ in range(3):
         try:
-            bridge.read(4096, 0.5)
+            decoder.feed(bridge.read(4096, 0.5))
         except Stalled:
             seen["stalls"] += 1
     read(bridge, decoder, 0.3)

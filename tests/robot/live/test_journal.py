@@ -451,8 +451,23 @@ def test_a_chunk_that_is_passed_over_is_missed(tmp_path: Path, unsigned: bool) -
     session(tmp_path / "a.mcap", whisks=2)
     whole = [entry[:4] for entry in _entries(tmp_path / "a.mcap")]
     data = (tmp_path / "a.mcap").read_bytes()
-    chunks = [found.start() - CHUNK_HEADER for found in re.finditer(b"\x28\xb5\x2f\xfd", data)]
+    chunks = [found.start() - CHUNK_HEADER for found in re.finditer(re.escape(b"\x28\xb5\x2f\xfd"), data)]
     assert len(chunks) > 10
+    _check_passed_over(tmp_path, data, chunks, whole, unsigned)
+
+
+@pytest.mark.parametrize("unsigned", [False, True])
+def test_a_chunk_that_was_all_is_missed(tmp_path: Path, unsigned: bool) -> None:
+    """The channel went with it."""
+    with opened(tmp_path / "a.mcap") as journal:
+        journal.event(START, "start", "and end")
+    data = (tmp_path / "a.mcap").read_bytes()
+    _check_passed_over(tmp_path, data, [data.index(b"\x28\xb5\x2f\xfd") - CHUNK_HEADER], [], unsigned)
+
+
+def _check_passed_over(
+    folder: Path, data: bytes, chunks: list[int], whole: list[Any], unsigned: bool
+) -> None:
     for chunk in chunks:
         assert data[chunk] == 6
         bad = bytearray(data)
@@ -460,8 +475,8 @@ def test_a_chunk_that_is_passed_over_is_missed(tmp_path: Path, unsigned: bool) -
         if unsigned:
             end = data.index(b"\x0f" + struct.pack("<Q", 4), chunks[-1])
             bad[end + 9 : end + 13] = bytes(4)
-        (tmp_path / "bad.mcap").write_bytes(bad)
-        walk = Walk(tmp_path / "bad.mcap")
+        (folder / "bad.mcap").write_bytes(bad)
+        walk = Walk(folder / "bad.mcap")
         found = [entry[:4] for entry in walk.entries()]
         assert found == whole[: len(found)]
         assert walk.broken

@@ -70,16 +70,14 @@ def test_it_goes_where_it_is_sent_and_says_when_it_is_there(arm: Arm, controller
     assert not arm.arrived()
     arm.move(target)
     until(arm.arrived, 3.0)
-    assert arm.fault is None
-    assert controller.state()["watchdog_stops"] == 0
-
-
-def test_a_newer_move_replaces_an_older_one(arm: Arm, controller: Faults) -> None:
+    # A newer move replaces an older one.
     under_way(arm, controller)
-    back = HOME + [0.03, 0.0, 0.0, 0.0, 0.0, 0.0]
+    back = target + [0.03, 0.0, 0.0, 0.0, 0.0, 0.0]
     arm.move(back)
     until(arm.arrived, 4.0, "arrival")
     np.testing.assert_allclose(controller.state()["tcp"], back, atol=1e-9)
+    assert arm.fault is None
+    assert controller.state()["watchdog_stops"] == 0
 
 
 @pytest.mark.parametrize(
@@ -165,6 +163,18 @@ def test_the_arms_process_is_gone(arm: Arm, controller: Faults, number: int, out
         assert arm.fault is None
         move = arm.move(HOME + [0.005, 0, 0, 0, 0, 0])
         until(arm.arrived, move.most + 1, "arrival after a respawn")
+
+
+def test_a_halt_that_does_not_show_is_asked_for_the_second_way(controller: Faults) -> None:
+    with Arm(settings(controller.host, stale=1.0, watchdog_hz=2.0)) as arm:
+        arm.start()
+        under_way(arm, controller)
+        bites, ends = (controller.state()[name] for name in ("watchdog_stops", "program_stops"))
+        os.kill(arm.pid, signal.SIGSTOP)
+        arm.halt("nobody listens")
+        until(lambda: not controller.state()["moving"], 0.45, "a standstill")
+        assert controller.state()["program_stops"] == ends + 1
+        assert controller.state()["watchdog_stops"] == bites
 
 
 def test_no_joints_for_a_target(arm: Arm, controller: Faults) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -37,8 +38,15 @@ class Control:
 
     def __init__(self) -> None:
         self.moves: list[tuple[Any, ...]] = []
-        self.stops = 0
+        self.stops = self.kicks = 0
         self.reachable = True
+
+    def stopL(self, deceleration: float, asynchronous: bool) -> None:
+        self.stops += 1
+
+    def kickWatchdog(self) -> bool:
+        self.kicks += 1
+        return True
 
     def isPoseWithinSafetyLimits(self, pose: list[float]) -> bool:
         return self.reachable
@@ -96,6 +104,31 @@ def test_a_stop_revokes_the_orders_before_it(board: Board) -> None:
     governor.execute(order)
     assert control.moves == []
     governor.execute(order._replace(stops=int(board.control["stops"])))
+    assert len(control.moves) == 1
+
+
+def test_the_watchdog_is_fed_only_while_the_session_lives(board: Board) -> None:
+    governor, control, _ = governed(board)
+    board.control["heartbeat"] = time.monotonic()
+    governor.act()
+    assert (control.kicks, control.stops) == (1, 0)
+    board.control["heartbeat"] = time.monotonic() - CONFIG.heartbeat - 0.001
+    governor.act()
+    assert control.kicks == 1
+
+
+def test_a_stop_comes_before_what_was_ordered(board: Board) -> None:
+    governor, control, _ = governed(board)
+    stops = int(board.control["stops"])
+    governor.put(Order("move", 1, tuple(HOME), 0.01, stops))
+    board.control["stops"] += 1
+    governor.put(Order("move", 2, tuple(HOME), 0.02, stops + 1))
+    governor.act()
+    assert control.stops == 1
+    assert [call[1] for call in control.moves] == [0.02]
+    governor.leaving = True
+    governor.put(Order("move", 3, tuple(HOME), 0.01, stops + 1))
+    governor.act()
     assert len(control.moves) == 1
 
 

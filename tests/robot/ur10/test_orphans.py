@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -11,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.robot.live_helpers import ROOT, Faults, until
+from tests.robot.ur10.conftest import AWAY
 
 SESSION = """
 import sys, time
@@ -33,10 +35,8 @@ def runs(pid: int) -> bool:
         return False
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
-def test_a_session_that_ends_or_hangs(controller: Faults, number: int) -> None:
-    from tests.robot.ur10.conftest import AWAY
-
+@pytest.mark.parametrize("what", ["killed", "hangs", "killed with the arm's process"])
+def test_a_session_that_ends_or_hangs(controller: Faults, what: str) -> None:
     target = [repr(float(value)) for value in AWAY]
     session = subprocess.Popen(
         [sys.executable, "-c", SESSION, controller.host, *target],
@@ -48,7 +48,12 @@ def test_a_session_that_ends_or_hangs(controller: Faults, number: int) -> None:
         assert session.stdout is not None
         pid, name = session.stdout.readline().split()
         until(lambda: controller.state()["speed"][0] > 0.049, 2.0, "the arm moves")
-        session.send_signal(number)
+        bites = controller.state()["watchdog_stops"]
+        if what == "killed with the arm's process":
+            os.kill(int(pid), signal.SIGSTOP)  # it must not find out first
+        session.send_signal(signal.SIGSTOP if what == "hangs" else signal.SIGKILL)
+        if what == "killed with the arm's process":
+            os.kill(int(pid), signal.SIGKILL)
         began = time.monotonic()
         until(lambda: not controller.state()["moving"], 0.5, "a standstill")
         assert time.monotonic() - began < 0.5
@@ -56,7 +61,9 @@ def test_a_session_that_ends_or_hangs(controller: Faults, number: int) -> None:
         until(lambda: not runs(int(pid)), 2.0, "the arm's process ends")
         until(lambda: controller.state()["runtime"] == "STOPPED", 0.5, "its program is ended")
         assert controller.state()["tcp"] == place
-        if number == signal.SIGKILL:
+        if what == "killed with the arm's process":
+            assert controller.state()["watchdog_stops"] == bites + 1
+        if what != "hangs":
             until(lambda: gone(name.decode()), 2.0, "the memory is taken away")
     finally:
         session.kill()

@@ -92,9 +92,12 @@ def test_a_dashboard_that_does_not_answer_is_given_up(elsewhere: str) -> None:
     with pytest.raises(Refusal, match="no dashboard server answers"):
         admitted(ArmConfig(host=elsewhere))
     assert dashboard.stop(elsewhere) == ""
-    with answering(elsewhere, {}), Dashboard(elsewhere, timeout=0.2) as connection:
-        with pytest.raises(Silent, match="robotmode"):
-            connection.ask("robotmode")
+    with (
+        answering(elsewhere, {}),
+        Dashboard(elsewhere, timeout=0.2) as connection,
+        pytest.raises(Silent, match="robotmode"),
+    ):
+        connection.ask("robotmode")
     assert time.monotonic() - began < 2.0
 
 
@@ -127,9 +130,8 @@ def test_standing_outside_the_box(controller: Faults) -> None:
 
 
 def test_a_controller_that_does_not_answer_on_its_other_ports(elsewhere: str) -> None:
-    with answering(elsewhere, GOOD), Arm(ArmConfig(host=elsewhere, connect=2.0)) as arm:
-        with pytest.raises(Refusal):
-            arm.start()
+    with answering(elsewhere, GOOD), Arm(ArmConfig(host=elsewhere)) as arm, pytest.raises(Refusal):
+        arm.start()
 
 
 def test_an_arm_that_was_not_started_refuses_and_closes(loopback: str) -> None:
