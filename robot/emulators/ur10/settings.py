@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
@@ -42,7 +42,7 @@ class UrEmulatorConfig(Settings):
     """Address to listen on; the ports are the real ones, so every emulator needs an address of its own."""
     hz: Literal[125, 500] = 125
     """Control steps and states a second: 125 for a CB3 (a UR-10 of 2016), 500 for an e-Series."""
-    polyscope: str = Field("", pattern=r"^(\d+\.\d+(\.\d+)?)?$")
+    polyscope: Annotated[str, Field(pattern=r"^(\d+\.\d+(\.\d+)?)?$")] = ""
     """PolyScope's version; "" means 3.15.8 at 125 Hz and 5.11.0 at 500 Hz."""
     start: Vector6 = (0.6, 0.0, 0.3, 3.141592653589793, 0.0, 0.0)
     """The tool's pose when the arm is switched on: m and rotation vector in the base."""
