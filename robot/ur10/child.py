@@ -73,8 +73,9 @@ class Child:
             if not self._settled and self.board.newest and now - began > SETTLE:
                 self._settle()
             self._listen()
-            if now - float(self.board.control["heartbeat"]) > self.config.heartbeat:
-                self._leave()
+            silent = now - float(self.board.control["heartbeat"])
+            if silent > self.config.heartbeat:
+                self._leave(f"the session was silent for {silent:.3f} s")
             self.governor.look()
             time.sleep(0.25 / self.config.hz)
 
@@ -83,7 +84,7 @@ class Child:
         try:
             os.write(self._reports, json.dumps(fields).encode() + b"\n")
         except OSError:
-            self._leave()
+            self._leave("the session does not listen")
 
     def _read(self, now: float) -> bool:
         """Take over a new state, all of one packet; whether there was one."""
@@ -127,18 +128,19 @@ class Child:
         except BlockingIOError:
             return
         if not data:
-            self._leave()
+            self._leave("the session is gone")
         *lines, self._input = (self._input + data).split(b"\n")
         for line in lines:
             order = Order(**json.loads(line))
             if order.do == "end":
-                self._leave()
+                self._leave("told to end")
             else:
                 self.governor.put(order)
 
-    def _leave(self) -> None:
+    def _leave(self, reason: str) -> None:
         """Begin to end: a last stop."""
         if math.isinf(self._leaving):
+            print(reason, file=sys.stderr, flush=True)
             self._leaving = time.monotonic() + LEAVING
             self.governor.leaving = True
             self.governor.stop()

@@ -61,14 +61,14 @@ def test_libusb_reads_it_and_hears_of_everything_that_goes_wrong(tmp_path: Path,
         assert code == 0, complained
         seen = json.loads(said)
         assert seen["whiskers"] == 18
-        assert seen["frames"] > 2000
+        assert seen["frames"] >= 3000
         assert seen["stalls"] == 1  # cleared by then
         assert (seen["counts"]["missing"], seen["counts"]["bad"], seen["counts"]["overruns"]) == (0, 0, 0)
         assert seen["idle"][0] == 0
         assert seen["idle"][1] >= 0.2
         assert seen["gone"]
         assert seen["absent"]
-        assert seen["again"] > 200
+        assert seen["again"] >= 1000
         assert seen["missing"] == 0
         assert head(do="counts")["lost"] == 0
 

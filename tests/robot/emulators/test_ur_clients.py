@@ -114,7 +114,7 @@ def found(host: str, scenario: str) -> Any:
 
 VERSIONS = [
     ("125", "3.4"),
-    ("125", "3.15.8"),
+    pytest.param("125", "3.15.8", marks=pytest.mark.soak),
     ("500", "5.11"),
     pytest.param("500", "5.23", marks=pytest.mark.soak),
 ]
@@ -197,16 +197,16 @@ def test_the_rate_can_be_too_low(faults: Faults) -> None:
         with PoseStream(faults.host) as poses:
             until(poses.newest, 2.0)
             times = set()
-            end = poses.newest().robot_time + 1.0
+            end = poses.newest().robot_time + 0.5
             while poses.newest().robot_time < end:
                 times.add(poses.newest().robot_time)
                 time.sleep(0.001)
         return len(times)
 
     faults(do="rate", hz=40)
-    assert 35 <= told() <= 45
+    assert 15 <= told() <= 25
     faults(do="clear")
-    assert told() > 60
+    assert told() > 30
 
 
 @emulated
@@ -218,7 +218,9 @@ def test_the_rate_can_be_too_low(faults: Faults) -> None:
         ({"do": "freeze"}, lambda seen: seen["went"] < 0.1),
         ({"do": "stall", "seconds": 1.0}, lambda seen: seen["connected"] and seen["went"] < 0.1),
         ({"do": "protective"}, lambda seen: seen["bits"] == 1 << 2 | 1 << 10),
-        ({"do": "safeguard"}, lambda seen: seen["bits"] == 1 << 4 | 1 << 10),
+        pytest.param(
+            {"do": "safeguard"}, lambda seen: seen["bits"] == 1 << 4 | 1 << 10, marks=pytest.mark.soak
+        ),
         ({"do": "slider", "fraction": 0.1}, lambda seen: seen["slider"] == pytest.approx(0.1)),
         (
             {"do": "wall", "z": 0.31, "solid": -1, "stiffness": 1e3},

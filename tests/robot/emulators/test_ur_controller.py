@@ -119,6 +119,35 @@ def test_an_asynchronous_stop_ends_a_move_and_is_an_operation_itself() -> None:
     assert not bench.out(2) & RUNNING
 
 
+def test_a_stop_that_waits_goes_by_joints_until_one_has_not_waited() -> None:
+    def seconds(bench: Bench) -> float:
+        assert bench.command(3, (*THERE, 0.1, 1.0), asynchronous=1)
+        bench.ticks(0.3)
+        began = bench.controller.time
+        assert bench.command(33, (0.2,))
+        assert not bench.out(2) & RUNNING  # the move that it ended
+        return bench.controller.time - began
+
+    bench = Bench()
+    joints = seconds(bench)
+    assert bench.command(33, (1.0,), asynchronous=1)
+    assert seconds(Bench()) == pytest.approx(joints, abs=0.01)
+    bench.command(3, (*HERE, 0.2, 1.0))
+    tool = seconds(bench)
+    assert tool == pytest.approx(0.1 / 0.2, abs=0.05)
+    assert joints > 1.2 * tool
+
+
+def test_a_move_that_waits_ends_the_one_that_does_not() -> None:
+    bench = Bench()
+    assert bench.command(3, (*THERE, 0.1, 1.0), asynchronous=1)
+    bench.ticks(0.1)
+    bench.write(3, (*HERE, 0.1, 1.0))
+    bench.ticks(0.05)
+    assert bench.controller.arm.moving
+    assert not bench.out(2) & RUNNING
+
+
 def test_a_path_reports_its_progress() -> None:
     line = "\tsignal_async_progress({})\n\tmovel(p[{},0,0.3,3.14159,0,0],a=1,v=0.1,r=0)\n"
     bench = Bench("".join(line.format(k, 0.62 + 0.02 * k) for k in range(3)))

@@ -25,7 +25,7 @@ def main(host: str) -> None:
     seen["whiskers"] = identity(bridge).whiskers
     bridge.request(Request.START)
     bridge.write(pack(drive()))
-    seen["frames"] = read(bridge, decoder, 2.0)
+    seen["frames"] = read(bridge, decoder, 3000)
 
     asked(host, do="stall")
     seen["stalls"] = 0
@@ -34,7 +34,7 @@ def main(host: str) -> None:
             decoder.feed(bridge.read(4096, 0.5))
         except Stalled:
             seen["stalls"] += 1
-    read(bridge, decoder, 0.3)
+    read(bridge, decoder, 500)
     seen["counts"] = decoder.counts._asdict()
 
     bridge.request(Request.STOP)
@@ -50,16 +50,16 @@ def main(host: str) -> None:
     bridge = again(5.0)
     bridge.request(Request.START)
     decoder = Decoder(18, 3)
-    seen["again"] = read(bridge, decoder, 0.5)
+    seen["again"] = read(bridge, decoder, 1000)
     seen["missing"] = decoder.counts.missing
     bridge.close()
     print(json.dumps(seen))
 
 
-def read(bridge: Bridge, decoder: Decoder, seconds: float) -> int:
-    """How many frames come."""
-    end, got = time.monotonic() + seconds, 0
-    while time.monotonic() < end:
+def read(bridge: Bridge, decoder: Decoder, frames: int) -> int:
+    """How many frames come, until they are so many or it takes too long."""
+    end, got = time.monotonic() + 10.0, 0
+    while got < frames and time.monotonic() < end:
         got += len(decoder.feed(bridge.read(4096, 0.5)).values)
         bridge.write(pack(KEEP_ALIVE))
     return got

@@ -21,7 +21,7 @@ AWAY = tcp_of(ArmConfig().placing, np.array([0.93, 0.45, 0.0]))  # 6 s away
 
 def settings(host: str, **others: Any) -> ArmConfig:
     """Settings with more patience than the default has, for machines on which other tests run."""
-    patient = {"stale": 0.3, "heartbeat": 0.3, "watchdog_hz": 5.0}
+    patient = {"stale": 0.5, "heartbeat": 0.5, "watchdog_hz": 2.0}
     return ArmConfig(host=host, **{**patient, **others})
 
 

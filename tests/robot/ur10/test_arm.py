@@ -21,7 +21,8 @@ from tests.robot.ur10.conftest import AWAY, HOME, settings
 def under_way(arm: Arm, controller: Faults) -> None:
     """Send the arm off and wait until it is at full speed."""
     arm.move(AWAY)
-    until(lambda: controller.state()["speed"][0] > 0.049, 2.0, "the arm moves")
+    until(lambda: arm.fault or controller.state()["speed"][0] > 0.049, 2.0, "the arm moves")
+    assert arm.fault is None
 
 
 def ended(arm: Arm, controller: Faults, within: float = 0.5) -> Outcome:
@@ -108,7 +109,7 @@ def test_a_stall(arm: Arm, controller: Faults, seconds: float) -> None:
     controller(do="stall", seconds=seconds)
     began = time.monotonic()
     assert ended(arm, controller) is Outcome.ARM_STALE
-    assert arm.fault.time - began < arm.config.stale + 0.1
+    assert arm.fault.time - began < arm.config.stale + 0.3
     assert len(arm.history) > 10
 
 
@@ -166,7 +167,7 @@ def test_the_arms_process_is_gone(arm: Arm, controller: Faults, number: int, out
 
 
 def test_a_halt_that_does_not_show_is_asked_for_the_second_way(controller: Faults) -> None:
-    with Arm(settings(controller.host, stale=1.0, watchdog_hz=2.0)) as arm:
+    with Arm(settings(controller.host, stale=1.0)) as arm:
         arm.start()
         under_way(arm, controller)
         bites, ends = (controller.state()[name] for name in ("watchdog_stops", "program_stops"))
@@ -175,6 +176,7 @@ def test_a_halt_that_does_not_show_is_asked_for_the_second_way(controller: Fault
         until(lambda: not controller.state()["moving"], 0.45, "a standstill")
         assert controller.state()["program_stops"] == ends + 1
         assert controller.state()["watchdog_stops"] == bites
+        os.kill(arm.pid, signal.SIGKILL)
 
 
 def test_no_joints_for_a_target(arm: Arm, controller: Faults) -> None:
