@@ -18,7 +18,7 @@ run: $(READY)
 	set -x; $(BIN)/python -m ratslam run configs/whisker_maze.yaml -o runs/whisker_maze-$$n
 
 test: $(READY)
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 soak: $(READY)
 	$(BIN)/python -m pytest --soak -m soak -n 4 -v --timeout 3600

@@ -71,6 +71,7 @@ def test_engine_agrees(name: str) -> None:
     assert report.steps == len(load(path))
 
 
+@pytest.mark.soak
 def test_engine_agrees_on_intel() -> None:
     path = real(INTEL)
     report = counterpart.plain(load(path), path, steps=300)

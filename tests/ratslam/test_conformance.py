@@ -216,12 +216,13 @@ def test_nothing_odd_comes_of_odd_input(make):
 @pytest.mark.parametrize("kind", SINGLE)
 def test_single_precision_stays_single_and_finite(kind):
     session = Session(SINGLE[kind](), precision="float32")
-    for step in session.replay(walk(300)):
+    for step in session.replay(walk(200)):
         assert np.isfinite(step.pose).all()
         told = step.evidence._replace(**({"background": 0.0} if hasattr(step.evidence, "background") else {}))
         floats = [leaf for leaf in [*step.estimate[:2], *told] if np.asarray(leaf).dtype.kind == "f"]
         assert all(np.isfinite(leaf).all() for leaf in floats if leaf is not getattr(told, "error", None))
-    kinds = {leaf.dtype for leaf in jax.tree.leaves(session.state)}
+    grown = session.backend.grow(session.state, 512)
+    kinds = {leaf.dtype for leaf in jax.tree.leaves((session.state, grown))}
     assert np.dtype(np.float64) not in kinds
     assert np.dtype(np.float32) in kinds
     assert np.isfinite(session.map.trajectory()).all()
@@ -243,13 +244,13 @@ def test_the_grid_draws_anew_in_these_walks():
 
 def test_compiles_once_per_capacity(make):
     session = Session(make())
-    observations = list(walk(600))
+    observations = list(walk(300))
     list(session.replay(observations))
     for o in observations[:5]:
         session.step(o)
-    capacities = {capacity_at(step) for step in range(605)}
+    capacities = {capacity_at(step) for step in range(305)}
     assert session.compilations() <= len(capacities)
-    reserved = Session(make(), reserve=1024)
+    reserved = Session(make(), reserve=512)
     list(reserved.replay(observations))
     assert reserved.compilations() == 1
 

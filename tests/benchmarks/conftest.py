@@ -1,0 +1,12 @@
+"""Benchmarks are for `make bench` and `make soak`: in the suite they would tell nothing."""
+
+from __future__ import annotations
+
+import pytest
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if not config.getoption("--benchmark-only"):
+        for item in items:
+            if "tests/benchmarks" in item.path.as_posix():
+                item.add_marker(pytest.mark.soak)
