@@ -23,7 +23,7 @@ from robot.formats import RecordingConfig
 from robot.live.drive import Handed, drive, free_whisks, go
 from robot.live.journal import Journal
 from robot.live.rig import Faulted, Rig, Stopped
-from robot.live.route import approach, descent, routed, way, world
+from robot.live.route import approach, checked, descent, routed, way, world
 from robot.live.selftest import reported, room, started
 from robot.maze import text
 from robot.motion import Path as Way
@@ -83,6 +83,7 @@ def live(
     config = located(config, folder.resolve())
     assert config.live is not None
     path = way(config.live, ur10_head(config.touch.head))
+    checked(config.live, path)
     if directory.exists():
         raise InputError(str(directory), "exists already", "a new run directory", "choose another with -o")
     tell(room(config.live, directory))

@@ -138,11 +138,17 @@ def next_streak(rig: Rig, number: int) -> Streak:
     count = rig.head.identity.rate / rate
     if abs(count - round(count)) > 1e-6:
         raise InputError("live.plan.whisking.rate", f"{count:g} samples a whisk", "a whole number of samples")
-    known = len(rig.starts)
-    rig.until(
-        lambda: len(rig.starts) > known, 2 / rate + 1.0, Outcome.HEAD_SILENT, "the beginning of a whisk"
-    )
-    first = rig.starts[known]
+    rig.look()  # what a head that was away has sent since may be waiting
+    known, life = len(rig.starts), rig.restarts
+
+    def begun() -> int | None:
+        """The first frame of the first whisk to begin from now on, which may be that of a head found anew."""
+        return next(iter(rig.starts[known if rig.restarts == life else 0 :]), None)
+
+    longest = rig.config.head.patience + 2 / rate + 1.0
+    rig.until(lambda: begun() is not None, longest, Outcome.HEAD_SILENT, "the beginning of a whisk")
+    first = begun()
+    assert first is not None
     device = float(rig.head.ring.between(first, first).time[0]) * 1e-6
     start = float(rig.clock.host(device)) - rig.epoch
     return Streak(number, first, device, start, round(count), 1 / rate)

@@ -26,8 +26,11 @@ from tactile.head import HeadConfig, ur10_head
 TICK = 0.01
 """s between two looks."""
 STANDS, SETTLED = 2.0, 0.3
-"""How long an arm that was stopped is looked at, at most and until it has stood for so long, s: after a contact
-it stands, and then backs off."""
+"""How long an arm that was stopped is looked at, s: at most, and until it has stood for so long. After a
+contact it stands, and then backs off."""
+
+UNEVEN = 2e-3
+"""By how much a head's clock may step against its count of samples, s."""
 
 
 class Faulted(Exception):
@@ -75,6 +78,8 @@ class Rig:
         self._stopped = stopped
         self._arm_clock = Clock()
         self._seen = 0
+        self._ahead: float | None = None  # s, of the head's clock before its count
+        self._uneven = 0.0
         self._blocks: queue.SimpleQueue[tuple[Frames, float] | None] = queue.SimpleQueue()
         self.head.on_restart.append(lambda device, host: self._blocks.put(None))
         self.head.listeners.append(lambda frames, arrival: self._blocks.put((frames, arrival)))
@@ -94,10 +99,12 @@ class Rig:
         fault = self.arm.fault or self.head.fault or (self.journal and self.journal.fault)
         if fault:
             raise Faulted(fault)
-        for clock, whose in ((self.clock, "head"), (self._arm_clock, "controller")):
-            if clock.jumped:
-                detail = f"the {whose}'s clock jumped"
-                raise Faulted(Fault(Outcome.CLOCK_JUMPED, detail, time.monotonic()))
+        for jumped, whose in ((self.clock.jumped, "head"), (self._arm_clock.jumped, "controller")):
+            if jumped:
+                raise Faulted(Fault(Outcome.CLOCK_JUMPED, f"the {whose}'s clock jumped", time.monotonic()))
+        if self._uneven > UNEVEN:
+            detail = f"the head's clock is {self._uneven * 1e3:.1f} ms off its samples' count"
+            raise Faulted(Fault(Outcome.CLOCK_JUMPED, detail, time.monotonic()))
         if self._stopped():
             raise Stopped
 
@@ -128,10 +135,11 @@ class Rig:
             self.arm.halt(reason)
         self.driver.rest()
         began = stood = now = time.monotonic()
-        while now - stood < SETTLED and now - began < STANDS and self.arm.age() <= self.config.arm.stale:
+        while now - stood < SETTLED and now - began < STANDS:
             time.sleep(TICK)
             now = time.monotonic()
-            stood = stood if self.arm.still() else now
+            if not self.arm.still() and self.arm.age() <= self.config.arm.stale:
+                stood = now
         return self.arm.still()
 
     def note(self, name: str, text: str) -> None:
@@ -150,13 +158,23 @@ class Rig:
             if block is None:  # a head was found: its clock may be another one
                 self.clock, self.starts = Clock(), []
                 self.restarts += 1
+                self._ahead = None
                 continue
             frames, arrival = block
             self.clock.observe(float(frames.time.max()) * 1e-6, arrival)
+            self._count(frames)
             begins = (frames.flags & np.uint8(Flag.CYCLE)) > 0
             self.starts += frames.sequence[begins].tolist()
             if self.journal is not None:
                 self.journal.frames(frames, arrival - self.epoch)
+
+    def _count(self, frames: Frames) -> None:
+        """Holds the head's clock against its count of samples: they agree, whatever the host does."""
+        assert self.head.identity is not None
+        ahead = frames.time * 1e-6 - frames.sequence / self.head.identity.rate
+        before = ahead[0] if self._ahead is None else self._ahead
+        self._uneven = max(self._uneven, float(np.abs(ahead - before).max()))
+        self._ahead = float(ahead[-1])
 
     def _take_states(self) -> None:
         states = self.arm.states(self._seen)

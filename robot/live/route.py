@@ -11,6 +11,8 @@ from robot.motion import Path
 from robot.scene import Scene, scene
 from robot.simulation import SimulationConfig
 from robot.ur10.placing import tcp_of
+from robot.ur10.safety import Refused
+from robot.ur10.safety import checked as allowed
 from tactile.errors import InputError
 from tactile.head import Head
 
@@ -102,6 +104,24 @@ def approach(config: LiveConfig, path: Path) -> Route:
 def descent(config: LiveConfig, path: Path) -> Route:
     """From there down to it."""
     return Route(tcp_of(config.arm.placing, path.pose[:1]), speed_of(config))
+
+
+def checked(config: LiveConfig, path: Path) -> None:
+    """Asks for every target whether the arm may go there, before it goes anywhere.
+
+    Raises:
+        InputError: it may not go to one; says to which and why.
+    """
+    routes = approach(config, path), descent(config, path), routed(config, path)
+    targets = np.concatenate([route.targets for route in routes])
+    before = targets[0]
+    for target in targets:
+        try:
+            allowed(config.arm, target, before)
+        except Refused as error:
+            where = "live.waypoints" if config.waypoints else "live.plan.path"
+            raise InputError(where, str(error), cure="move them, or `live.arm.placing`") from None
+        before = target
 
 
 def speed_of(config: LiveConfig) -> float:

@@ -104,7 +104,7 @@ class Session:
         """Has it run the program with these arguments, in its own directory."""
         undisturbed(self.process.pid)
         assert self.process.stdin is not None
-        told = {"arguments": [*arguments, "-o", str(self.directory)], "mapper": 0.0, "listened": 0.3}
+        told = {"arguments": [*arguments, "-o", str(self.directory)], "mapper": 0.0, "listened": 0.7}
         self.process.stdin.write(json.dumps(told | others).encode() + b"\n")
         self.process.stdin.flush()
 
@@ -182,15 +182,35 @@ def _runs(folder: Path) -> bool:
     return (folder / "stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
 
 
-class Bench:
-    """An address with an emulated arm and head, started when they are wanted and as often as it takes, and a
-    session that waits for its turn."""
+class Queue:
+    """A session that waits for its turn, and behind it always another one."""
 
-    def __init__(self, host: str, folder: Path) -> None:
-        self.host, self._folder, self._count = host, folder, 0
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._count = folder, 0
+        self._waiting: Session | None = None
+
+    def take(self) -> Session:
+        """The one whose turn it is; whoever takes it ends it."""
+        session, self._waiting = self._waiting or self._next(), self._next()
+        session.until(lambda: "waiting" in session.said(), 60.0, "it has loaded everything")
+        return session
+
+    def close(self) -> None:
+        if self._waiting is not None:
+            self._waiting.end()
+
+    def _next(self) -> Session:
+        self._count += 1
+        return Session(self._folder / str(self._count))
+
+
+class Bench:
+    """An address with an emulated arm and head, started when they are wanted and as often as it takes."""
+
+    def __init__(self, host: str, queue: Queue, folder: Path) -> None:
+        self.host, self._queue, self._folder = host, queue, folder
         self._arm, self._head = ExitStack(), ExitStack()
         self._faults: dict[str, Faults] = {}
-        self._waiting: Session | None = None
         self.starved = 0  # stops by the controller's watchdog, before the test
 
     @property
@@ -232,7 +252,7 @@ class Bench:
         Args:
             mapper: s that it takes for each sample. settings: of the section `live`.
         """
-        session = self.cold()
+        session = self._queue.take()
         try:
             config = session.directory.parent / "config.yaml"
             config.write_text(json.dumps({"live": self.quick(**settings)}))
@@ -252,25 +272,19 @@ class Bench:
 
     def quick(self, **settings: Any) -> dict[str, Any]:
         """The section `live` of a session that takes a few seconds and, of a busy machine, much."""
-        arm = {"host": self.host, "stale": 0.3, "heartbeat": 0.3, "watchdog_hz": 5.0}
+        arm = {"host": self.host, "stale": 0.5, "heartbeat": 0.5, "watchdog_hz": 4.0}
         plan = {
             "whisking": {"rate": 4.0},
             "calibration": {"shortest": 1.0},
             "motion": {"speed": 0.05},
         }
-        head = {"address": self.host, "patience": 1.0, "silence": 0.25}
+        head = {"address": self.host, "patience": 0.6, "silence": 0.25}
         usual = {"waypoints": LEGS, "lift": 0.01, "residual": 1.0, "room": 0.0}
         given = {
-            name: value | settings.pop(name, {}) for name, value in
-            {"arm": arm, "head": head, "plan": plan}.items()
+            name: value | settings.pop(name, {})
+            for name, value in {"arm": arm, "head": head, "plan": plan}.items()
         }
         return usual | given | settings
-
-    def cold(self) -> Session:
-        """A session that has not begun; the next one is on its way."""
-        session, self._waiting = self._waiting or self._next(), self._next()
-        session.until(lambda: "waiting" in session.said(), 60.0, "it has loaded everything")
-        return session
 
     def moment(self) -> Moment:
         """Now, by the devices' clocks."""
@@ -290,14 +304,8 @@ class Bench:
         self.head.process.wait(5)
 
     def close(self) -> None:
-        if self._waiting is not None:
-            self._waiting.end()
         self._arm.close()
         self._head.close()
-
-    def _next(self) -> Session:
-        self._count += 1
-        return Session(self._folder / str(self._count))
 
     def _runs(self, name: str) -> bool:
         return name in self._faults and self._faults[name].process.poll() is None

@@ -1,7 +1,7 @@
 """`python -m tests.live.session`: a session that waits, with everything loaded, for what it is to do.
 
-A line of JSON on its standard input tells the `arguments` of `python -m ratslam`, and with `mapper` (s for each
-sample) that a stub takes the mapper's place. What a loaded machine would spoil is taken care of here alone.
+A line of JSON on its standard input tells the `arguments` of `python -m ratslam`, how long the stub in the
+mapper's place takes for a sample (`mapper`, s), and how long the self-test listens (`listened`, s).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def main() -> int:
     arguments = told["arguments"]
     directory = arguments[arguments.index("-o") + 1]
     ratslam.live.live = partial(live, mapping=partial(stub.mapping, directory, told["mapper"]))
-    selftest.LISTENED = told.get("listened", selftest.LISTENED)
+    selftest.LISTENED = told["listened"]
     return program(arguments)
 
 

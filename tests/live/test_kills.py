@@ -1,4 +1,4 @@
-"""Sessions that are killed or interrupted at any moment: the arm stands, and the recording is whole to there."""
+"""Sessions killed or interrupted at any moment: the arm stands, and the recording is whole to there."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def recovered(recording: Path) -> Path:
 def test_the_whole_session_is_killed(bench: Bench, number: int) -> None:
     with bench.session() as session:
         session.says("armed")
-        time.sleep(float(stream(number, "killed").uniform(0.6, 3.0)))
+        time.sleep(float(stream(number, "killed").uniform(0.6, 2.0)))
         at = bench.moment()
         os.killpg(session.process.pid, signal.SIGKILL)
         stands(bench)
@@ -56,7 +56,7 @@ def test_the_parent_is_killed_in_motion(bench: Bench) -> None:
         assert saved.lost(at) <= LOST
         until(lambda: not session.lives(), 5.0, "nothing of it stays")
         assert bench.arm.state()["runtime"] == "STOPPED"
-    assert bench.head.state()["resting"]
+    until(lambda: bench.head.state()["resting"], 2.0, "the whiskers are retracted")
 
 
 @pytest.mark.parametrize("number", NUMBERS)
@@ -77,7 +77,7 @@ def test_it_is_interrupted(bench: Bench, number: int) -> None:
                 ended(bench, session, outcome, at)
         else:
             assert code == 130
-            assert "interrupted: " in session.said()
+            assert "interrupted" in session.said()
         assert bench.arm.state()["watchdog_stops"] == bench.starved
 
 

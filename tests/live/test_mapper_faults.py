@@ -6,7 +6,6 @@ import os
 import signal
 
 import numpy as np
-import pytest
 
 from robot.recording import Recording
 from tests.live.bench import Bench
@@ -15,19 +14,19 @@ from tests.live.ends import ended
 
 def test_a_slow_mapper(bench: Bench) -> None:
     """Images are dropped, odometry never; the recording repeats it."""
-    with bench.session(mapper=0.55, budget=0.3, whisks=16) as session:
+    with bench.session(mapper=0.55, budget=0.3, whisks=10) as session:
         assert session.code(30.0) == 0, session.said()
         report, kept = session.report(), session.kept()
         assert report["outcome"] == "complete"
         assert report["standing"]
-        assert report["whisks"] == 16
-        assert 6 <= report["dropped"] <= 14
+        assert report["whisks"] == 10
+        assert 3 <= report["dropped"] <= 9
         assert kept.names().count("dropped") == report["dropped"]
         seen = [len(sample.reading.time) > 0 for sample in kept.samples]
         assert seen.count(False) == report["dropped"]
         assert seen[0]
         recording = Recording(session.directory / "session.mcap")
-        assert recording.length == 16
+        assert recording.length == 10
         for sample, again in zip(kept.samples, recording, strict=True):
             assert (sample.time, sample.reading.odometry) == (again.time, again.reading.odometry)
             assert len(sample.reading.time) == len(again.reading.time)
@@ -38,10 +37,9 @@ def test_a_slow_mapper(bench: Bench) -> None:
         assert x[-1] > 0.05
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
-def test_the_mapper_is_killed(bench: Bench, number: int) -> None:
+def test_the_mapper_is_killed(bench: Bench) -> None:
     with bench.under_way() as session:
         at = bench.moment()
-        os.kill(session.mapper(), number)
+        os.kill(session.mapper(), signal.SIGKILL)
         report, _ = ended(bench, session, "mapper_gone", at)
         assert report["standing"]
