@@ -24,13 +24,12 @@ import numpy as np
 
 from evaluation.scorecard import Scorecard
 from ratslam.config import RunConfig
+from robot.priority import PATIENT, ranked
 from robot.source import Sample
 from tactile.errors import InputError
 
 LOG = "mapper.log"
 """In the run directory: what the mapper's process had to say."""
-YIELDS = 10
-"""By how much it stands back behind what moves the robot: compiling takes every core there is."""
 END = 120.0
 """How long it may take to score and draw, s."""
 
@@ -222,7 +221,7 @@ class Fed:
 def mapping(line: Connection) -> None:
     """What the mapper's process does."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to hear
-    os.nice(YIELDS)
+    ranked(PATIENT)  # compiling takes every core there is
     try:
         _map(line)
     except InputError as error:

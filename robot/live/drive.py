@@ -51,7 +51,7 @@ class Handed(NamedTuple):
 
     Attributes:
         number: of the whisk. lateness: s, from its end to then. seen: whether its image went with it.
-        missing: frames that never came.
+        missing: frames that had not come by then.
     """
 
     number: int

@@ -20,6 +20,7 @@ from robot.live.journal import Journal
 from robot.live.odometer import Odometer
 from robot.live.settings import LiveConfig
 from robot.outcome import Fault, Outcome
+from robot.ur10 import dashboard
 from robot.ur10.arm import Arm
 from tactile.head import HeadConfig, ur10_head
 
@@ -199,5 +200,7 @@ class Rig:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if kind is KeyboardInterrupt:  # asked twice: the second way, at once
+            dashboard.stop(self.config.arm.host)
         self.arm.close()
         self.head.close()

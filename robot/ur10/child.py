@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from robot.outcome import Outcome
+from robot.priority import URGENT, ranked
 from robot.ur10 import dashboard
 from robot.ur10.governor import MISSING, Governor, Order
 from robot.ur10.safety import Finding, still
@@ -176,6 +177,7 @@ def main(name: str, text: str) -> None:
     os.dup2(2, 1)
     os.set_blocking(0, False)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the session decides what an interrupt means
+    ranked(URGENT)
     config = ArmConfig.model_validate_json(text)
     board = Board(name)
     # The constructors hold the interpreter's lock and may wait for ever; the alarm ends even that.

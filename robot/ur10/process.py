@@ -52,7 +52,7 @@ class Process:
 
     def order(self, **fields: Any) -> None:
         """Send an order; a process that is gone is found out elsewhere."""
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError, ValueError):  # ValueError: its end of the line is closed
             self._orders.write(json.dumps(fields).encode() + b"\n")
 
     def reports(self) -> list[dict[str, Any]]:

@@ -21,6 +21,7 @@ from robot.emulators.head.whereabouts import Along, Carried, Place
 from robot.emulators.usbline import ANSWER, IN, REQUEST, Op
 from robot.head.wire import ENDPOINT_IN
 from robot.motion import Path
+from robot.priority import URGENT, ranked
 from robot.scene import KidnapConfig, scene
 from tactile.head import ur10_head
 
@@ -35,6 +36,7 @@ def serve(config: HeadEmulatorConfig) -> None:
     Raises:
         InputError: there is no such maze or way. OSError: somebody else listens there.
     """
+    ranked(URGENT)
     head = ur10_head(config.head)
     made = scene(config.maze, config.path, config.motion, KidnapConfig(), head, config.seed)
     with contextlib.ExitStack() as stack:

@@ -7,7 +7,6 @@ on a busy machine; what is later than that is left out and the robot's clock jum
 from __future__ import annotations
 
 import contextlib
-import os
 import selectors
 import socket
 import sys
@@ -28,6 +27,7 @@ from robot.emulators.ur10.settings import (
     SCRIPT_PORT,
     UrEmulatorConfig,
 )
+from robot.priority import URGENT, ranked
 from tactile.errors import InputError
 
 BACKLOG = 0.1  # s
@@ -169,8 +169,7 @@ def serve(config: UrEmulatorConfig) -> None:
         server = Server(config)
     except Unreachable as error:
         raise InputError("start", str(error), "a pose within 1.3 m of the base", "move it") from error
-    with contextlib.suppress(OSError):  # a controller keeps its rate: go before others where that is allowed
-        os.setpriority(os.PRIO_PROCESS, 0, -10)
+    ranked(URGENT)
     sys.stdout.write("ready\n")
     sys.stdout.flush()
     server.run()
