@@ -21,8 +21,9 @@ SCALE = 200e-6
 """How far a device's second can be from the host's, as a share: quartzes stay within half of it."""
 PIECE = 0.25
 """s of device time that enter and leave the window together."""
-AHEAD = 5e-3
-"""An arrival so much before the line, s, tells that the device's clock went forward by itself."""
+AHEAD = 0.1
+"""An arrival so much before the line, s, tells that the device's clock went forward by itself. Less is what a
+host that was busy for long leaves: its line is too late until something comes in time again."""
 EARLY = 0.1
 """Share of arrivals that should come as fast as they can."""
 SETTLED = 1.0

@@ -37,6 +37,9 @@ settings.register_profile(
 settings.load_profile("ratslam")
 
 ROOT = Path(__file__).parents[1]
+REAL_TIME = ("live", "robot/live", "robot/ur10", "robot/head", "robot/create", "robot/emulators")
+"""Rooms whose tests keep real time, which a busy machine can take from them: what fails is tried twice more,
+and what is wrong fails each time."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -44,6 +47,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    for item in items:
+        if any(f"tests/{room}/" in item.path.as_posix() for room in REAL_TIME):
+            item.add_marker(pytest.mark.flaky(reruns=2))
     if not config.getoption("--soak"):
         for item in items:
             if item.get_closest_marker("soak"):

@@ -12,22 +12,24 @@ from tests.live.ends import ended, stands
 
 BLIND = {"stall", "malformed", "truncated", "huge", "nan", "freeze", "die"}
 """Faults after which the session does not see the arm any more."""
+OFTEN = pytest.mark.soak
+"""The arm alone meets these in every run of the suite (`tests/robot/ur10`), whole sessions in `make soak`."""
 
 
 @pytest.mark.parametrize(
     ("fault", "outcomes"),
     [
-        ({"do": "stall", "seconds": 1.0}, {"arm_stale"}),
+        pytest.param({"do": "stall", "seconds": 1.0}, {"arm_stale"}, marks=OFTEN),
         ({"do": "stall", "seconds": 3.0}, {"arm_stale"}),
         ({"do": "malformed"}, {"arm_malformed"}),
         # What half a frame and one without an end are taken for is the library's affair.
-        ({"do": "truncated"}, {"arm_malformed", "arm_stale"}),
-        ({"do": "huge"}, {"arm_malformed", "arm_stale"}),
-        ({"do": "nan"}, {"arm_malformed"}),
-        ({"do": "freeze"}, {"arm_stale"}),
+        pytest.param({"do": "truncated"}, {"arm_malformed", "arm_stale"}, marks=OFTEN),
+        pytest.param({"do": "huge"}, {"arm_malformed", "arm_stale"}, marks=OFTEN),
+        pytest.param({"do": "nan"}, {"arm_malformed"}, marks=OFTEN),
+        pytest.param({"do": "freeze"}, {"arm_stale"}, marks=OFTEN),
         ({"do": "protective"}, {"protective_stop"}),
-        ({"do": "safeguard"}, {"safeguard_stop"}),
-        ({"do": "emergency"}, {"emergency_stop"}),
+        pytest.param({"do": "safeguard"}, {"safeguard_stop"}, marks=OFTEN),
+        pytest.param({"do": "emergency"}, {"emergency_stop"}, marks=OFTEN),
         ({"do": "ik_fails"}, {"unreachable"}),
         ({"do": "die"}, {"arm_gone", "arm_stale"}),
     ],
