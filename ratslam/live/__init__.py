@@ -37,8 +37,8 @@ from tactile.image import view_shape
 
 RECORDING, REPORT = "session.mcap", "live.json"
 """In the run directory: what was recorded, and how the session went."""
-LONGEST = 120.0
-"""How long the way to the start, or the mapper, may take, s."""
+LONGEST = 300.0
+"""How long the mapper may take to be ready, compilation included, s."""
 
 
 class Ended(NamedTuple):
