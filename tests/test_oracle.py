@@ -63,7 +63,12 @@ def test_stock_lecture_hall_whole() -> None:
     assert report.steps == 13838
 
 
-@pytest.mark.parametrize("name", SYNTHETIC)
+LONG = {"c_corridor_wrap"}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.soak) if name in LONG else name for name in SYNTHETIC]
+)
 def test_engine_agrees(name: str) -> None:
     path = GOLDEN / f"{name}.npz"
     report = counterpart.plain(load(path), path)
@@ -140,7 +145,10 @@ def test_labels(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "parameters",
     [
-        {"template_x_size": 60, "template_y_size": 20, "vt_shift_match": 4, "vt_step_match": 1},
+        pytest.param(
+            {"template_x_size": 60, "template_y_size": 20, "vt_shift_match": 4, "vt_step_match": 1},
+            marks=pytest.mark.soak,
+        ),
         {"template_x_size": 12, "template_y_size": 2, "vt_panoramic": 1, "vt_step_match": 1},
         {"template_x_size": 6, "template_y_size": 3, "vt_shift_match": 0, "pc_dim_xy": 14, "pc_dim_th": 20},
     ],

@@ -68,7 +68,8 @@ def test_one_setting_maps_every_trace(trace, limit, broken):
     assert cuts(session) == broken
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.soak) for k in range(1, 10))])
+@pytest.mark.soak
+@pytest.mark.parametrize("seed", range(10))
 def test_regenerated_streams_behave_as_the_published_ones(seed):
     stream = np.random.default_rng(100 + seed)
     jumps = tuple(
@@ -83,13 +84,13 @@ def test_regenerated_streams_behave_as_the_published_ones(seed):
     assert cuts(session) == [row for row, _ in jumps]
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.soak)])
 def test_a_perturbed_recording_is_mapped_as_well(seed):
     log = perturbed(golden("b_figure8_alias"), seed)
     assert error(mapped(log), log) <= 0.05
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.soak)])
 def test_an_unknown_corridor_stays_odometry(seed):
     log = scenes.corridor(seed)
     session = mapped(log)
@@ -135,7 +136,7 @@ def test_views_that_tell_nothing_close_nothing(control):
     assert error(session, log) == pytest.approx(odometry_error(log), abs=1e-9)
 
 
-@pytest.mark.parametrize("factor", [0.5, 2.0])
+@pytest.mark.parametrize("factor", [pytest.param(0.5, marks=pytest.mark.soak), 2.0])
 def test_the_sensors_unit_does_not_matter(factor):
     log = golden("a_square3")
     scaled = replace(log, views=log.views * factor)
@@ -144,6 +145,7 @@ def test_the_sensors_unit_does_not_matter(factor):
     assert np.array_equal(first.map.candidates(), second.map.candidates())
 
 
+@pytest.mark.soak
 def test_single_precision_maps_as_well():
     log = golden("b_figure8_alias")
     session = mapped(log, "float32")

@@ -80,7 +80,16 @@ SINGLE = {
 }
 
 
-@pytest.fixture(params=BACKENDS)
+OFTEN = {"recall-labels"}
+"""What differs from another one by the source of its views alone: for `make soak`."""
+
+
+def some(names):
+    """The names as parameters, those of `OFTEN` for the soak."""
+    return [pytest.param(name, marks=pytest.mark.soak) if name in OFTEN else name for name in names]
+
+
+@pytest.fixture(params=some(BACKENDS))
 def make(request):
     return BACKENDS[request.param]
 
@@ -213,7 +222,7 @@ def test_nothing_odd_comes_of_odd_input(make):
         assert np.isfinite(step.estimate.spread).all()
 
 
-@pytest.mark.parametrize("kind", SINGLE)
+@pytest.mark.parametrize("kind", some(SINGLE))
 def test_single_precision_stays_single_and_finite(kind):
     session = Session(SINGLE[kind](), precision="float32")
     for step in session.replay(walk(200)):
