@@ -9,7 +9,13 @@ import pytest
 from tests import touchgolden
 
 
-@pytest.mark.parametrize("name", touchgolden.SESSIONS)
+LONG = {"touch_circuits"}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(k, marks=pytest.mark.soak) if k in LONG else k for k in touchgolden.SESSIONS],
+)
 def test_decisions_are_those_stored(name):
     stored = json.loads((touchgolden.FOLDER / f"{name}.json").read_text(encoding="utf-8"))
     found = touchgolden.decisions(name)

@@ -23,6 +23,7 @@ def ratio(row: str, arenas: tuple[int, ...] = FEW) -> float:
     return float(np.sum([one.error for one in found]) / np.sum([one.odometry for one in found]))
 
 
+@pytest.mark.soak
 def test_errors_that_last_are_taken_out():
     assert ratio("bias") < 0.3
 

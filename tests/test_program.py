@@ -79,9 +79,9 @@ def test_the_same_config_twice_gives_the_same_bytes(square, tmp_path):
 TRACES = (
     "a_square3",
     "b_figure8_alias",
-    "c_corridor_wrap",
-    "d1_rotation_generic",
-    "e_kidnap",
+    pytest.param("c_corridor_wrap", marks=pytest.mark.soak),
+    pytest.param("d1_rotation_generic", marks=pytest.mark.soak),
+    pytest.param("e_kidnap", marks=pytest.mark.soak),
     "j_reverse_stop",
 )
 

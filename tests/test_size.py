@@ -164,6 +164,7 @@ def test_a_session_is_cut_to_about_so_many_cycles(tmp_path):
                     assert np.array_equal(np.asarray(a), np.asarray(b), equal_nan=True)
 
 
+@pytest.mark.soak
 def test_a_small_arena_is_sized(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(
         "ratslam.sizing.trying.cheaper", lambda config: cheaper(config)[:1]

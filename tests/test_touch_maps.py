@@ -208,6 +208,7 @@ def test_images_that_tell_nothing_close_nothing(
         assert np.allclose(found.path, reckoned(made.felt), atol=1e-9)
 
 
+@pytest.mark.soak
 def test_later_laps_in_another_maze_are_hardly_joined() -> None:
     """Small mazes share their outer walls, so the later images are those of another way as well."""
     together, apart = 0, 0

@@ -44,7 +44,11 @@ def test_a_head_that_stays_away_ends_it(bench: Bench, fault: dict, outcome: str)
 
 @pytest.mark.parametrize(
     "fault",
-    [{"do": "unplug"}, {"do": "silence", "seconds": 0.7}, {"do": "stall", "seconds": 0.7}],
+    [
+        {"do": "unplug"},
+        {"do": "stall", "seconds": 0.7},
+        pytest.param({"do": "silence", "seconds": 0.7}, marks=pytest.mark.soak),
+    ],
     ids=lambda fault: fault["do"],
 )
 def test_a_head_that_comes_back_is_waited_for(bench: Bench, fault: dict) -> None:
