@@ -8,7 +8,6 @@ import pytest
 
 from tests import touchgolden
 
-
 LONG = {"touch_circuits"}
 
 
