@@ -32,11 +32,6 @@ class Odometer:
         while self._states and self._states[0][0] < self._states[-1][0] - KEPT:
             self._states.popleft()
 
-    @property
-    def newest(self) -> float:
-        """Time of the newest state, s; -inf without one."""
-        return self._states[-1][0] if self._states else -np.inf
-
     def pose(self, time: float) -> np.ndarray:
         """[3] of the head in the map at a time, between two states; the nearest one's beyond them."""
         times = np.array([state[0] for state in self._states])
