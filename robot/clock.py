@@ -89,11 +89,6 @@ class Clock:
         """
         return self._known().at(device)
 
-    def device(self, host: Array) -> Array:
-        """The inverse of `host`."""
-        line = self._known()
-        return line.device + (host - line.arrival) / line.scale
-
     @property
     def scale(self) -> float:
         """Host's seconds in a device's second; 1 before anything was observed."""

@@ -30,17 +30,17 @@ class Ring:
         self._flags = np.zeros(size, np.uint8)
         self._values = np.zeros((size, whiskers, channels), np.int16)
         self._newest, self._latest, self._arrival = NEVER, NEVER, -np.inf
-        self._grown = threading.Condition()
+        self._lock = threading.Lock()
 
     @property
     def newest(self) -> tuple[int, int, float] | None:
         """Highest number, latest device time (us) and last arrival (s, host); None before any came."""
-        with self._grown:
+        with self._lock:
             return None if self._newest == NEVER else (self._newest, self._latest, self._arrival)
 
     def append(self, frames: Frames, arrival: float) -> None:
         """Takes what arrived at a host time, s; but nothing from further back than the ring reaches."""
-        with self._grown:
+        with self._lock:
             if not len(frames.sequence):
                 return
             newest = max(self._newest, int(frames.sequence.max()))
@@ -52,26 +52,12 @@ class Ring:
             self._values[place] = frames.values[kept]
             self._newest, self._arrival = newest, arrival
             self._latest = int(self._time[newest % self._size])
-            self._grown.notify_all()
 
     def between(self, first: int, last: int) -> Frames:
         """Those numbered `first` to `last`, both included, that are there; in order."""
-        with self._grown:
+        with self._lock:
             number = np.arange(max(first, self._newest - self._size + 1), min(last, self._newest) + 1)
             return self._at(number[self._sequence[number % self._size] == number] % self._size)
-
-    def during(self, start: int, end: int) -> Frames:
-        """Those whose device time (us) lies in [start, end), that are there; in order."""
-        with self._grown:
-            kept = self._sequence > max(NEVER, self._newest - self._size)
-            within = (self._time >= start) & (self._time < end) & kept
-            place = np.flatnonzero(within)
-            return self._at(place[np.argsort(self._sequence[place])])
-
-    def wait(self, until: int, timeout: float) -> bool:
-        """Whether a sample with a device time (us) of `until` or later came within `timeout` s."""
-        with self._grown:
-            return self._grown.wait_for(lambda: self._latest >= until, timeout)
 
     def _at(self, place: np.ndarray) -> Frames:
         return Frames(self._sequence[place], self._time[place], self._flags[place], self._values[place])

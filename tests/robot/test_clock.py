@@ -42,7 +42,6 @@ def test_time_is_found_within_the_shortest_delay(ppm: float, seed: int, rate: fl
     off = clock.host(device) - host - SHORTEST
     assert np.abs(off[-round(2 * rate) :]).max() < 2e-4  # while single arrivals are up to 32 ms off
     assert abs(clock.scale - 1 / (1 + ppm * 1e-6)) < 6e-5
-    np.testing.assert_allclose(clock.device(clock.host(device)), device, atol=1e-9)
     assert clock.jumped == 0
 
 
@@ -164,11 +163,8 @@ def test_stamps_that_repeat(step: float) -> None:
 def test_before_anything_is_known_nothing_is_said() -> None:
     with pytest.raises(ValueError, match="observed nothing"):
         Clock().host(1.0)
-    with pytest.raises(ValueError, match="observed nothing"):
-        Clock().device(1.0)
     clock = fed(np.array([5.0]), np.array([105.0]))
     assert clock.host(6.0) == 106.0
-    assert clock.device(106.0) == 6.0
 
 
 @given(st.lists(st.tuples(st.floats(0, 0.3), st.floats(0, 0.3)), min_size=1, max_size=40))

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-import time
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -42,19 +39,17 @@ def test_what_is_kept(blocks, first, length):
             assert ring.newest[:2] == (newest, 500 * newest)
     start = 2**32 - 20 + first
     wanted = sorted(n for n in kept if start <= n <= start + length)
-    for got in (ring.between(start, start + length), ring.during(500 * start, 500 * (start + length) + 1)):
-        assert got.sequence.tolist() == wanted
-        assert got.time.tolist() == [500 * n for n in wanted]
-        assert got.flags.tolist() == [n % 256 for n in wanted]
-        assert got.values[:, 0, 2].tolist() == [n % 30000 for n in wanted]
+    got = ring.between(start, start + length)
+    assert got.sequence.tolist() == wanted
+    assert got.time.tolist() == [500 * n for n in wanted]
+    assert got.flags.tolist() == [n % 256 for n in wanted]
+    assert got.values[:, 0, 2].tolist() == [n % 30000 for n in wanted]
 
 
 def test_an_empty_ring_has_nothing():
     ring = Ring(1)
     assert ring.newest is None
     assert not len(ring.between(0, 10).sequence)
-    assert not len(ring.during(-(2**40), 2**40).sequence)
-    assert not ring.wait(0, 0.0)
 
 
 def test_what_is_handed_out_stays_as_it_was():
@@ -64,15 +59,6 @@ def test_what_is_handed_out_stays_as_it_was():
     ring.append(frames(list(range(10, 30))), 0.0)
     assert got.sequence.tolist() == list(range(10))
     assert ring.between(0, 99).sequence.tolist() == list(range(14, 30))
-
-
-def test_waiting_ends_with_the_sample():
-    ring = Ring(1)
-    began = time.monotonic()
-    threading.Timer(0.05, lambda: ring.append(frames([7]), 0.0)).start()
-    assert ring.wait(3500, 5.0)
-    assert time.monotonic() - began < 4.0
-    assert not ring.wait(3501, 0.01)
 
 
 def test_sizes():
