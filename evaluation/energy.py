@@ -16,8 +16,8 @@ import numpy as np
 
 from evaluation.table import read_table
 from evaluation.trajectory import interpolate, motion_errors
-from tactile.errors import InputError
-from tactile.frames import between, wrap
+from tactile.base.errors import InputError
+from tactile.base.se2 import between, wrap
 
 _RELATIONS = {name: () for name in ("t1", "t2", "x", "y", "z", "roll", "pitch", "yaw")}
 

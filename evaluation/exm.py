@@ -22,9 +22,9 @@ import numpy as np
 from pydantic import NonNegativeInt, PositiveFloat
 
 from evaluation.log import changes, creation_rows
-from tactile.errors import InputError
-from tactile.frames import wrap
-from tactile.settings import Settings
+from tactile.base.config import Settings
+from tactile.base.errors import InputError
+from tactile.base.se2 import wrap
 
 Mode = Literal["strict", "paper", "or", "literal"]
 MODES: tuple[Mode, ...] = ("strict", "paper", "or", "literal")

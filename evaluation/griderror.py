@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from evaluation.grid import PRIOR, Grid, Surface, Truth, painted
-from tactile.settings import Settings
+from tactile.base.config import Settings
 
 Mask = Literal["grid", "arena"]
 """Over which cells is averaged: all, or the arena's and its wall's."""

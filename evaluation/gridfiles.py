@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from evaluation.grid import Grid, Truth, check_grid
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 
 def write_grid(path: str | Path, grid: Grid) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from evaluation.grid import PRIOR, Grid, Surface, Truth, centres, check_grid, surface, touched
 from evaluation.griderror import CONVENTIONS, Convention, GridError, grid_error, pool_errors
 from evaluation.scorecard import Quantity
-from tactile.settings import Settings
+from tactile.base.config import Settings
 
 CLAMP = 1e-3
 """Probabilities are kept so far from 0 and 1 before their logarithm is taken."""

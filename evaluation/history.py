@@ -11,7 +11,7 @@ from evaluation.drawing import BLUE, FAINT, GREY, INK, VERMILLION
 from evaluation.exm import ExperienceMetric, experience_metric
 from evaluation.run import Run, known
 from evaluation.scorecard import Scorecard
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

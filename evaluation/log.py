@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.table import read_table
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 _COLUMNS = {
     "time": ("t", "timestamp", "stamp"),

@@ -11,7 +11,7 @@ from evaluation.drawing import BLUE, GREEN, GREY, INK, PURPLE, VERMILLION, YELLO
 from evaluation.run import Run, known
 from evaluation.scorecard import Scorecard
 from evaluation.trajectory import align
-from tactile.frames import between, compose
+from tactile.base.se2 import between, compose
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

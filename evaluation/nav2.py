@@ -16,8 +16,8 @@ import numpy as np
 import yaml
 
 from evaluation.grid import Grid, check_grid
-from evaluation.whole import in_one_piece
-from tactile.errors import InputError
+from tactile.base.atomic_write import in_one_piece
+from tactile.base.errors import InputError
 
 Mode = Literal["trinary", "scale"]
 """`trinary` tells occupied, free and unknown; `scale` every grade between, but then a PGM knows no unknown

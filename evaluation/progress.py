@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 RUNNING = "running"
 """The status of a run that has not ended, or was killed."""

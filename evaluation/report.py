@@ -18,7 +18,7 @@ from evaluation.run import Run
 from evaluation.rundirectory import read_card, read_closures, read_run, read_walls
 from evaluation.scorecard import Scorecard
 from evaluation.whiskerpicture import draw_whiskers
-from tactile.frames import between
+from tactile.base.se2 import between
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 
 class Run(NamedTuple):

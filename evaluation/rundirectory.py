@@ -13,7 +13,7 @@ from evaluation.run import Run
 from evaluation.scorecard import Scorecard
 from evaluation.table import read_table
 from evaluation.trajectory import read_tum
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 
 def read_run(path: Path) -> Run:

@@ -12,8 +12,8 @@ from evaluation.exm import DEFAULT, MODES, ExmConfig, base_end, experience_metri
 from evaluation.log import Log, changes
 from evaluation.run import Run, check_run, known
 from evaluation.trajectory import anytime, ate, rpe, summary
-from tactile.errors import InputError
-from tactile.settings import Settings
+from tactile.base.config import Settings
+from tactile.base.errors import InputError
 
 
 class Quantity(Settings):

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 Columns = Mapping[str, tuple[str, ...]]
 """The wanted columns in order: name -> other names a header may give it (compared in lower case)."""

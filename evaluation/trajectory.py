@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.table import read_table
-from tactile.errors import InputError
-from tactile.frames import between, compose, fitted, tum_line, wrap
+from tactile.base.errors import InputError
+from tactile.base.se2 import between, compose, fitted, tum_line, wrap
 
 _TUM = {name: () for name in ("t", "x", "y", "z", "qx", "qy", "qz", "qw")}
 

@@ -15,8 +15,8 @@ import numpy as np
 from evaluation.progress import PICTURE, RUNNING, Progress, Watched, counted
 from evaluation.rundirectory import read_walls
 from evaluation.watchpicture import draw_watch
-from evaluation.whole import in_one_piece
-from tactile.errors import InputError
+from tactile.base.atomic_write import in_one_piece
+from tactile.base.errors import InputError
 
 PATIENCE = 300.0
 """A run that wrote nothing for so long was killed, s: to compile, and to draw in the end, takes less."""

@@ -11,7 +11,7 @@ from evaluation.drawing import BLUE, FAINT, GREY, INK, QUIET, VERMILLION, WIDTH,
 from evaluation.mappicture import NO_WALLS, broken, paint_walls
 from evaluation.progress import Progress, counted
 from evaluation.trajectory import align
-from tactile.frames import between, compose
+from tactile.base.se2 import between, compose
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -13,7 +13,7 @@ from evaluation.images import Images
 from evaluation.mappicture import NO_WALLS, broken, corners, edges, paint_walls
 from evaluation.run import Run, known
 from evaluation.scorecard import Scorecard
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -16,7 +16,7 @@ from ratslam.growing import Growing
 from ratslam.likeness import Pixels, background, levels, table, variation
 from ratslam.recall import NO_LIKENESS
 from ratslam.sectors import NOTHING, Fan, Slope
-from tactile.types import Observation
+from tactile.base.types import Observation
 
 EVERY = 16
 """Frames between two looks at the bias that the views show."""

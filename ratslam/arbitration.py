@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ratslam.framegraph import Chain, Closures, Fit, Prior, corrected, robust_cost, solve
-from tactile.frames import between, compose, integrate, inverse
+from tactile.base.se2 import between, compose, integrate, inverse
 
 KEPT = 0.25
 """Robust weight above which a run is believed: it then strains the map by less than its evidence."""

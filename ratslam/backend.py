@@ -15,7 +15,7 @@ import networkx
 import numpy as np
 
 from ratslam.types import Estimate
-from tactile.types import Array, Observation
+from tactile.base.types import Array, Observation
 
 State = Any
 """A pytree of arrays of fixed shapes and dtypes."""

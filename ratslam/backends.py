@@ -13,7 +13,7 @@ from ratslam.config import RunConfig
 from ratslam.gridfilter import GridEvidence, GridFilter
 from ratslam.occupancy import LAYERS
 from ratslam.recallrat import evidence_of, rat
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 from tactile.feelers import Feelers
 
 LIVE_SIDE = 2.5

@@ -17,7 +17,7 @@ from jax import lax
 from ratslam import ladder, patches, posecells
 from ratslam.cellsettings import PoseCellConfig
 from ratslam.types import Estimate
-from tactile.types import Array, Observation, Odometry
+from tactile.base.types import Array, Observation, Odometry
 
 BLOCK = 8
 """Runs of the pose cells at a time: what a processor's cache holds."""

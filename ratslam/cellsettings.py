@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import AfterValidator, Field, PositiveFloat, PositiveInt
 
-from tactile.settings import Settings
+from tactile.base.config import Settings
 
 
 def _odd(width: int) -> int:

@@ -17,9 +17,9 @@ from ratslam.run import located, open_source
 from ratslam.session import CHUNK
 from robot.sensing import observation_of, sensing
 from robot.source import Sample, Source
-from tactile.errors import InputError
-from tactile.frames import compose, integrate, inverse
-from tactile.types import Observation
+from tactile.base.errors import InputError
+from tactile.base.se2 import compose, integrate, inverse
+from tactile.base.types import Observation
 
 RECKONED = "dead reckoning"
 

@@ -25,8 +25,8 @@ from robot.roving import RovingConfig
 from robot.sensing import head_of
 from robot.simulation import SimulationConfig
 from robot.source import Source, rig_of
+from tactile.base.config import Settings
 from tactile.frontend import TouchConfig
-from tactile.settings import Settings
 
 TOUCH: dict[str, dict[str, Any]] = {
     "pose_cells": {"cell_size": 0.05, "cells_xy": 21},

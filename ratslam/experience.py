@@ -21,9 +21,9 @@ from ratslam.growing import Growing
 from ratslam.posegraph import Edges, geman_mcclure, huber, least_squares, no_kernel
 from ratslam.relaxation import relax
 from ratslam.types import Action, Estimate
-from tactile.frames import between, compose, inverse
-from tactile.settings import Settings
-from tactile.types import Observation
+from tactile.base.config import Settings
+from tactile.base.se2 import between, compose, inverse
+from tactile.base.types import Observation
 
 
 class OdometryNoise(Settings):

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import SuperLU, splu
 
-from tactile.frames import between, wrap
+from tactile.base.se2 import between, wrap
 
 
 class Chain(NamedTuple):

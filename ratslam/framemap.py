@@ -28,8 +28,8 @@ from ratslam.growing import Growing
 from ratslam.posegraph import Edges
 from ratslam.recall import Guidance
 from ratslam.types import Estimate
-from tactile.frames import between, compose, fitted, integrate, inverse, wrap
-from tactile.types import Observation
+from tactile.base.se2 import between, compose, fitted, integrate, inverse, wrap
+from tactile.base.types import Observation
 
 LOOSE = 1e4
 """Standard deviation of a cut odometry edge, cells."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
-from tactile.settings import Settings
+from tactile.base.config import Settings
 
 
 class FrameNoise(Settings):

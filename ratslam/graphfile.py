@@ -9,7 +9,7 @@ import networkx
 import numpy as np
 
 from ratslam.posegraph import Edges
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 UPPER = tuple(zip(*np.triu_indices(3), strict=True))
 

@@ -14,8 +14,8 @@ from ratslam.gridsettings import GridConfig
 from ratslam.growing import Growing
 from ratslam.marks import Marks, draw, marks_of
 from ratslam.types import Estimate
+from tactile.base.types import Observation
 from tactile.feelers import Feelers
-from tactile.types import Observation
 
 
 class GridMap:

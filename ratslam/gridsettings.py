@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
-from tactile.settings import Settings
+from tactile.base.config import Settings
 
 Share = Annotated[float, Field(gt=0, lt=1)]
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from ratslam.growing import Growing
 from ratslam.types import Action
-from tactile.frames import between, wrap
+from tactile.base.se2 import between, wrap
 
 
 class Said(NamedTuple):

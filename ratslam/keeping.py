@@ -15,11 +15,11 @@ from robot.arena import Arena, enclosed, occupied, read_arena, segments
 from robot.maze import read_maze, walls
 from robot.scene import MazeConfig
 from robot.source import Source, rig_of
-from tactile.errors import InputError
-from tactile.frames import compose, inverse
+from tactile.base.errors import InputError
+from tactile.base.random_streams import stream
+from tactile.base.se2 import compose, inverse
 from tactile.frontend import TouchConfig
 from tactile.head import ur10_head
-from tactile.streams import stream
 
 Felt = tuple[np.ndarray, np.ndarray]
 """A whisker image: brightness [R, C, K], and which whiskers [W] report at all."""

@@ -21,7 +21,7 @@ from jax import lax
 from ratslam import patches
 from ratslam.cellsettings import PoseCellConfig
 from ratslam.patches import Patch
-from tactile.types import Array
+from tactile.base.types import Array
 
 SETTLED = 10
 """Cells across a packet as it settles, for the patch that moves with it (with the default kernels 16^3)."""

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ratslam.gridsettings import LikelihoodConfig
-from tactile.types import Array
+from tactile.base.types import Array
 
 FIRM = 0.5
 """Length of the direction field at which it counts half."""

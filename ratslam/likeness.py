@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tactile.types import Array
+from tactile.base.types import Array
 
 LEVELS = 32
 """Of a pixel: 0 silent, 1 to 30 heights, 31 dead."""

@@ -14,9 +14,9 @@ import numpy as np
 from scipy.special import expit, logit
 
 from ratslam.gridsettings import DrawingConfig, GridConfig
+from tactile.base.se2 import compose
+from tactile.base.types import Motion
 from tactile.feelers import Feelers
-from tactile.frames import compose
-from tactile.types import Motion
 
 FAR = 3.0
 """Standard deviations beyond which a mark is left out."""

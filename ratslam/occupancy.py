@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from tactile.types import Array
+from tactile.base.types import Array
 
 EVIDENCE, COSINE, SINE = 0, 1, 2
 LAYERS = 3

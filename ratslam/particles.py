@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from ratslam.gridsettings import DriftConfig, ResamplingConfig
-from tactile.types import Array, Odometry
+from tactile.base.types import Array, Odometry
 
 
 class Particles(NamedTuple):

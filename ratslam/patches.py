@@ -19,7 +19,7 @@ import numpy as np
 from jax import lax
 
 from ratslam.cellsettings import PoseCellConfig
-from tactile.types import Array
+from tactile.base.types import Array
 
 TIE = 1e-9
 """Activities this close to the largest (as a share) tie with it: the first wins, whatever the rounding."""

@@ -13,8 +13,8 @@ import numpy as np
 from pydantic import PositiveFloat
 
 from ratslam.types import Action
-from tactile.settings import Settings
-from tactile.types import Array
+from tactile.base.config import Settings
+from tactile.base.types import Array
 
 TIE = 1e-9
 """Distances this close to each other or to the radius tie, whatever the rounding."""

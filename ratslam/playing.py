@@ -27,9 +27,9 @@ from ratslam.types import Action
 from ratslam.yamlfile import dump
 from robot.sensing import feelers_of, observation_of
 from robot.source import Sample, Source, rig_of
-from tactile.errors import InputError
-from tactile.frames import compose, tum_line
-from tactile.types import Observation
+from tactile.base.errors import InputError
+from tactile.base.se2 import compose, tum_line
+from tactile.base.types import Observation
 
 CHECKPOINT_EVERY, CHECKPOINT_SHARE = 128 * CHUNK, 32
 """Steps between checkpoints, at least, and one part in so many of all steps so far: a kill loses no line, but

@@ -20,7 +20,7 @@ from ratslam import ladder
 from ratslam.cellsettings import PoseCellConfig, rings, units
 from ratslam.ladder import Activity, Push, Rung
 from ratslam.patches import TIE, around, excited_share, turned
-from tactile.types import Array, Odometry
+from tactile.base.types import Array, Odometry
 
 LARGEST_PART = 0.5
 """Cells one sub-step moves at most: a packet moved further at once shears into a ring."""

@@ -18,9 +18,9 @@ from ratslam.posecells import Outcome, PoseCells
 from ratslam.recall import RecallConfig
 from ratslam.templates import Match, TemplateConfig, Templates
 from ratslam.types import Estimate
-from tactile.frames import wrap
-from tactile.settings import Settings
-from tactile.types import Array, Observation, Odometry
+from tactile.base.config import Settings
+from tactile.base.se2 import wrap
+from tactile.base.types import Array, Observation, Odometry
 
 
 class RatConfig(Settings):

@@ -22,9 +22,9 @@ from jax import lax
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from ratslam.likeness import LEVELS
-from tactile.frames import wrap
-from tactile.settings import Settings
-from tactile.types import Array
+from tactile.base.config import Settings
+from tactile.base.se2 import wrap
+from tactile.base.types import Array
 
 Share = Annotated[float, Field(ge=0, le=1)]
 

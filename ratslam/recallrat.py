@@ -20,7 +20,7 @@ from ratslam.rat import Rat, RatConfig, RatEvidence, finite
 from ratslam.recall import Guidance, Memory, Recollection
 from ratslam.types import Action, Estimate
 from ratslam.weighing import by_label, by_touch, by_view
-from tactile.types import Array, Observation
+from tactile.base.types import Array, Observation
 
 HEALTH_RATE = 0.1
 """Share of the newest revisit in the running health."""

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from tactile.types import Array
+from tactile.base.types import Array
 
 
 class Leaf(NamedTuple):

@@ -22,9 +22,9 @@ from robot.roving import roving
 from robot.sensing import calibration_of, sensing
 from robot.simulation import simulated
 from robot.source import Sample, Source, rig_of
-from tactile.errors import InputError
+from tactile.base.errors import InputError
+from tactile.base.types import Cycle, Whisk
 from tactile.frontend import Frontend
-from tactile.types import Cycle, Whisk
 
 
 def run(

@@ -10,13 +10,13 @@ import numpy as np
 
 from robot.roving import RovingConfig, drive_into_wall
 from robot.training import trained
-from tactile.errors import InputError
+from tactile.base.errors import InputError
+from tactile.base.random_streams import stream
+from tactile.base.types import Moment
 from tactile.reports import ReportsConfig
 from tactile.slidingtip import learned
 from tactile.straintemplates import StrainTemplates, matched, save, smoothed
-from tactile.streams import stream
 from tactile.surface import Meeting, fused, touching
-from tactile.types import Moment
 
 SECONDS = (0.5, 1.0, 2.0)
 """Of the drive on after first contact that is shown to the estimators: in arenas it lasts 1 to 2 s mostly."""

@@ -20,7 +20,7 @@ from jax import lax
 from ratslam.backend import Backend, Evidence, Map
 from ratslam.rows import Layout, Rows, empty, layout_of, room
 from ratslam.types import Estimate
-from tactile.types import Observation
+from tactile.base.types import Observation
 
 CHUNK = 16
 """Observations per compiled call; capacities change and the map guides only at multiples of it."""

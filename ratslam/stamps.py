@@ -9,7 +9,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from tactile.types import Array
+from tactile.base.types import Array
 
 
 def blobs(place: Array, amount: Array, sd: float, size: int) -> Array:

@@ -16,7 +16,7 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 COLUMNS = (
     "t", "place", "action", "x", "y", "heading", "sd_x", "sd_y", "sd_heading", "lost", "outcome",

@@ -13,8 +13,8 @@ import numpy as np
 from jax import lax
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
-from tactile.settings import Settings
-from tactile.types import Array
+from tactile.base.config import Settings
+from tactile.base.types import Array
 
 TIE = 1e-9
 """Errors this close tie, whatever the rounding: the earliest template at the lowest offset wins."""

@@ -15,7 +15,7 @@ from ratslam.config import RunConfig
 from ratslam.trials.touch import TouchTrial, figures, play, session_log, whole
 from ratslam.yamlfile import Document, override, validate
 from robot.simulation import SimulationConfig, simulated, tier
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 TIERS = ("kinematic", "quasistatic", "dynamic")
 """From the cheapest."""

@@ -23,8 +23,8 @@ from ratslam.trials.touch import first, lap_ends, session_log, whole
 from ratslam.trials.workers import shared_out
 from ratslam.yamlfile import Document, override, validate
 from robot.log import Log
-from tactile.errors import InputError
-from tactile.frames import wrap
+from tactile.base.errors import InputError
+from tactile.base.se2 import wrap
 
 CLASSIC = ("matcher=classic", "templates.energy=0.05")
 """What is tuned: half of iRat's 0.1 (III-F; the value is Ball et al. 2013's)."""

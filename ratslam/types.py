@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import NamedTuple
 
-from tactile.types import Array
+from tactile.base.types import Array
 
 
 class Action(IntEnum):

@@ -10,7 +10,7 @@ import numpy as np
 
 from ratslam.likeness import Pixels
 from ratslam.recall import SAMPLES, Memory, RecallConfig, Weighing, allowed, offsets, old, present
-from tactile.types import Array
+from tactile.base.types import Array
 
 LABELS = {"same": 0.6, "unknown": 0.35, "other": 0.05, "new_unknown": 0.9, "new_known": 0.1}
 """How likely a given id is where its frame was, and where it is new: ids are right more often than not, a new

@@ -18,7 +18,7 @@ import numpy as np
 
 from robot.files import read_bytes
 from robot.polygons import area, contains, crossing, distance, edges, square
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 FORMS = {
     "outer": "outer x y x y x y ...",

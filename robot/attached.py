@@ -12,7 +12,7 @@ from robot.csvfile import CsvFile
 from robot.pairs import labels_from_pairs
 from robot.plausibility import Place, clock, finite, views
 from robot.units import Limits, headings
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 FAR = 20.0  # times max_range: a median range beyond it is in another unit
 

@@ -14,8 +14,8 @@ from typing import Annotated, Literal, NamedTuple, Self
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
-from tactile.settings import Settings
-from tactile.types import Moment, Motion
+from tactile.base.config import Settings
+from tactile.base.types import Moment, Motion
 
 Share = Annotated[float, Field(ge=0, le=1)]
 STRAIGHT = 1e-6

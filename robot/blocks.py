@@ -16,7 +16,7 @@ from robot.head.wire import CHANNELS
 from robot.live.cycle import Cut
 from robot.messages import CDR, MOST, Malformed
 from robot.ur10.states import STATE
-from tactile.types import Odometry
+from tactile.base.types import Odometry
 
 NUMBERS = ("host", "robot", "tcp", "speed", "force", "joints")
 WORDS = ("mode", "safety", "runtime", "operation", "progress")

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tactile.types import Array
+from tactile.base.types import Array
 
 WINDOW = 30.0
 """How long pairs count, s."""

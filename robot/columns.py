@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pydantic import Field
 
-from tactile.settings import Settings
+from tactile.base.config import Settings
 
 
 class PoseColumns(Settings):

@@ -11,7 +11,7 @@ import numpy as np
 
 from robot.files import digest_of, missing, read_bytes, refuse
 from robot.plausibility import and_more, finite
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 SHOWN = 8  # faults listed one by one before the rest is only counted
 

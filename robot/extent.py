@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from robot.source import Source
-from tactile.frames import integrate
+from tactile.base.se2 import integrate
 
 
 def extent(source: Source) -> float:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 
-from tactile.errors import InputError, InputErrors
+from tactile.base.errors import InputError, InputErrors
 
 
 def require_file(path: Path) -> None:

@@ -9,8 +9,8 @@ from robot.columns import TableConfig
 from robot.files import require_file
 from robot.source import Source
 from robot.units import ORDINARY, Limits
-from tactile.errors import InputError
-from tactile.settings import Settings
+from tactile.base.config import Settings
+from tactile.base.errors import InputError
 
 Warn = Callable[[str], None] | None
 

@@ -14,10 +14,10 @@ from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 
 from robot.motion import Path, at
 from robot.walls import Surroundings
+from tactile.base.config import Settings
+from tactile.base.types import Odometry, Whisk
 from tactile.contact import ShaftConfig, stiffness
 from tactile.head import Head
-from tactile.settings import Settings
-from tactile.types import Odometry, Whisk
 from tactile.whisking import WhiskingConfig, beside, phase
 
 SHAFT = ShaftConfig()

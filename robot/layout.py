@@ -14,9 +14,9 @@ from pydantic import Field, NonNegativeInt, PositiveFloat, model_validator
 
 from robot.arena import Arena, fits, read_arena
 from robot.polygons import contains, gap, square
-from tactile.errors import InputError
-from tactile.settings import Settings
-from tactile.streams import stream
+from tactile.base.config import Settings
+from tactile.base.errors import InputError
+from tactile.base.random_streams import stream
 
 Share = Annotated[float, Field(ge=0, le=1)]
 PLACES = 200

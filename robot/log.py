@@ -11,8 +11,8 @@ from typing import Self
 import numpy as np
 
 from robot.source import Sample, Source, rate_of
-from tactile.errors import InputError
-from tactile.types import Observation, Odometry, observation
+from tactile.base.errors import InputError
+from tactile.base.types import Observation, Odometry, observation
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,8 +12,8 @@ import numpy as np
 
 from robot.files import digest_of
 from robot.source import Sample
-from tactile.frames import wrap
-from tactile.types import Cycle, Odometry, Report, Whisk
+from tactile.base.se2 import wrap
+from tactile.base.types import Cycle, Odometry, Report, Whisk
 
 STILL = Odometry(0.0, 0.0, 0.0, 0.0)
 """Of a reading that does not know its own yet."""

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from robot.walls import Walls
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 CELL = 0.18
 """Side of a cell, m (IEEE micromouse rules)."""

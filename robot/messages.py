@@ -13,8 +13,8 @@ import numpy as np
 
 from robot.schemas import CYCLE, OBSERVATION, REPORT, WHISK
 from robot.source import Sample
-from tactile.errors import InputError
-from tactile.types import Cycle, Observation, Odometry, Report, Whisk
+from tactile.base.errors import InputError
+from tactile.base.types import Cycle, Observation, Odometry, Report, Whisk
 
 CDR = b"\x00\x01\x00\x00"
 MOST = 100_000_000  # numbers in one message; more is a damaged length

@@ -9,8 +9,8 @@ import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat
 
 from robot.maze import Cell, centre
-from tactile.frames import wrap
-from tactile.settings import Settings
+from tactile.base.config import Settings
+from tactile.base.se2 import wrap
 
 
 class JitterConfig(Settings):

@@ -11,8 +11,8 @@ from typing import Literal
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat
 
-from tactile.frames import between, wrap
-from tactile.settings import Settings
+from tactile.base.config import Settings
+from tactile.base.se2 import between, wrap
 
 NEW_HEADING = 1.0  # OpenRatSLAM: turn first, then move
 MID_HEADING = 0.5  # second order: exact to O(turn^2) for a constant twist over the step

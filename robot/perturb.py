@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from robot.log import Log
-from tactile.frames import compose
+from tactile.base.se2 import compose
 
 VIEW_NOISE = 0.01
 """Standard deviation added to every value of a view."""

@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 Place = Callable[[int], str]  # where a row stands in the user's file
 

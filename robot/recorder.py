@@ -13,7 +13,7 @@ from robot.messages import encode, encode_truth
 from robot.schemas import TRUTH
 from robot.source import Sample
 from robot.tape import Tape
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 
 class Recorder:

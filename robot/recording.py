@@ -23,8 +23,8 @@ from robot.source import Sample, Source, rate_of, rig_of
 from robot.tape import Tape
 from robot.units import ORDINARY, Limits, Track, units
 from robot.walk import Walk
-from tactile.errors import InputError
-from tactile.types import Cycle, Observation, Report, Whisk
+from tactile.base.errors import InputError
+from tactile.base.types import Cycle, Observation, Report, Whisk
 
 
 class Recording:

@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from robot.maze import Cell, Maze, is_open, neighbours
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 
 def circuits(loop: Sequence[Cell], word: str) -> list[Cell]:

@@ -21,11 +21,11 @@ from robot.source import rate_of
 from robot.stepping import Robot, Step
 from robot.strain import WhiskersConfig, fan
 from robot.wheels import WheelsConfig, reckoned
-from tactile.errors import InputError
-from tactile.frames import between
-from tactile.settings import Settings
-from tactile.streams import stream
-from tactile.types import Moment, Odometry, Report
+from tactile.base.config import Settings
+from tactile.base.errors import InputError
+from tactile.base.random_streams import stream
+from tactile.base.se2 import between
+from tactile.base.types import Moment, Odometry, Report
 
 
 class RovingConfig(Settings):

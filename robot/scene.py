@@ -12,10 +12,10 @@ from robot.maze import CELL, TALL, Cell, Maze, closed, named, random_loop, read_
 from robot.motion import MotionConfig, Path, at, carried, planned
 from robot.route import anticlockwise, checked, circuits, exploration
 from robot.walls import Surroundings, Walls
-from tactile.errors import InputError
+from tactile.base.config import Settings
+from tactile.base.errors import InputError
+from tactile.base.random_streams import stream
 from tactile.head import Head, tip
-from tactile.settings import Settings
-from tactile.streams import stream
 
 WORD = "CCCAAACACA"
 """Seed 2's protocol (Salman & Pearson 2016, III-C)."""

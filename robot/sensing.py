@@ -11,14 +11,14 @@ import numpy as np
 from robot.roving import RovingConfig
 from robot.source import Rigged, Sample, Source, rig_of
 from robot.training import trained
+from tactile.base.errors import InputError
+from tactile.base.types import Observation
 from tactile.calibration import Calibration, arrays, from_arrays
-from tactile.errors import InputError
 from tactile.feelers import Feelers, swept
 from tactile.frontend import Frontend, TouchConfig
 from tactile.head import HeadConfig, ur10_head
 from tactile.reports import Reporting, ReportsConfig
 from tactile.straintemplates import StrainTemplates
-from tactile.types import Observation
 
 TALLEST = 0.05
 """Of the walls of micromouse mazes, m."""

@@ -25,12 +25,12 @@ from robot.scene import KidnapConfig, MazeConfig, PathConfig, another, scene
 from robot.sensing import kept
 from robot.sweep import cycles, free_cycles
 from robot.walls import Surroundings
+from tactile.base.config import Settings
+from tactile.base.errors import InputError
+from tactile.base.random_streams import stream
+from tactile.base.types import Cycle, Whisk
 from tactile.calibration import Calibration, CalibrationConfig, calibrated
-from tactile.errors import InputError
 from tactile.head import HeadConfig, ur10_head
-from tactile.settings import Settings
-from tactile.streams import stream
-from tactile.types import Cycle, Whisk
 from tactile.whisking import WhiskingConfig, checked
 
 CELL_SIZE = 0.05

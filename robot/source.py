@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
 
 import numpy as np
 
-from tactile.types import Cycle, Observation, Report, Whisk
+from tactile.base.types import Cycle, Observation, Report, Whisk
 
 
 class Sample(NamedTuple):

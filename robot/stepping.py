@@ -9,7 +9,7 @@ import numpy as np
 from robot.behaviour import BehaviourConfig, Command, State, ended, moved
 from robot.polygons import distance
 from robot.strain import WhiskersConfig, among, fan, monitored, sampled, strained
-from tactile.types import Moment
+from tactile.base.types import Moment
 
 MOMENT = 1e-6
 """Shortest motion, s."""

@@ -24,7 +24,7 @@ from robot.log import Log
 from robot.odometry import NEW_HEADING, from_velocities
 from robot.plausibility import Place, clock, finite, views
 from robot.units import ORDINARY, Limits, Track, units
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 VIEW, ODOMETRY = 1, 2
 COLUMNS = ("in_t", "in_v", "in_w", "in_flags")

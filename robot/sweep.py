@@ -11,9 +11,9 @@ from robot.kinematic import MechanicsConfig
 from robot.mechanics import StreamConfig
 from robot.motion import Path, at
 from robot.walls import FREE, Surroundings
-from tactile.frames import between
+from tactile.base.se2 import between
+from tactile.base.types import Cycle, Odometry
 from tactile.head import Head
-from tactile.types import Cycle, Odometry
 from tactile.whisking import WhiskingConfig
 
 

@@ -15,7 +15,7 @@ from robot.log import Log
 from robot.odometry import from_poses, from_velocities
 from robot.plausibility import clock
 from robot.units import ORDINARY, Limits, Track, headings, units
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 
 def read_table(path: Path, config: TableConfig, limits: Limits = ORDINARY) -> Log:

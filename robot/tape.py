@@ -16,7 +16,7 @@ from mcap.writer import CompressionType, Writer
 
 from robot.schemas import READINGS, SCHEMAS, TOPICS, TRUTH
 from robot.walk import METADATA, Description
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 
 class Unwritable(InputError):

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from robot.roving import RovingConfig, drive_into_wall
+from tactile.base.random_streams import stream
 from tactile.straintemplates import StrainTemplates, TemplateTraining, driven, train
-from tactile.streams import stream
 
 
 def trained(config: RovingConfig, training: TemplateTraining | None = None) -> StrainTemplates:

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import Field
 
-from tactile.errors import InputError
-from tactile.settings import Settings
+from tactile.base.config import Settings
+from tactile.base.errors import InputError
 
 GLITCHES = 2  # fastest steps without a vote
 PAUSE = 1000.0  # median steps: a longer one is a fault of the clock, no motion to judge

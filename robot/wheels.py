@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from pydantic import NonNegativeFloat
 
-from tactile.settings import Settings
+from tactile.base.config import Settings
 
 KEPT_WHITE = 0.2
 """White noise beside a bias, as a share of the level: 1 % beside 5 %."""

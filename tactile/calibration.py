@@ -12,9 +12,9 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from pydantic import Field, PositiveFloat
 
-from tactile.errors import InputError
-from tactile.settings import Settings
-from tactile.types import Cycle
+from tactile.base.config import Settings
+from tactile.base.errors import InputError
+from tactile.base.types import Cycle
 
 FEWEST = 8
 """Samples that a slope window has to hold: a line through fewer is mostly noise."""

@@ -12,10 +12,10 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field, PositiveFloat
 
+from tactile.base.config import Settings
+from tactile.base.errors import InputError
+from tactile.base.types import Array, Cycle, Whisk
 from tactile.calibration import Calibration, sample_rate
-from tactile.errors import InputError
-from tactile.settings import Settings
-from tactile.types import Array, Cycle, Whisk
 
 
 class ShaftConfig(Settings):

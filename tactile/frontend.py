@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from tactile.base.config import Settings
+from tactile.base.errors import InputError
+from tactile.base.types import Cycle, Observation, Report, Whisk
 from tactile.calibration import Calibration
 from tactile.contact import ContactConfig, sensed
-from tactile.errors import InputError
 from tactile.head import HeadConfig, ur10_head
 from tactile.image import ImageConfig, observed, view_shape
 from tactile.reports import ReportsConfig
-from tactile.settings import Settings
-from tactile.types import Cycle, Observation, Report, Whisk
 
 
 class TouchConfig(Settings):

@@ -12,8 +12,8 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
-from tactile.settings import Settings
-from tactile.types import Array
+from tactile.base.config import Settings
+from tactile.base.types import Array
 
 Degrees = Annotated[float, Field(ge=-360, le=360)]
 Opening = Annotated[float, Field(gt=0, le=90)]

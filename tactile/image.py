@@ -11,9 +11,9 @@ from typing import Literal
 import numpy as np
 from pydantic import PositiveFloat
 
+from tactile.base.config import Settings
+from tactile.base.types import Observation, Whisk, observation
 from tactile.head import Head, height, shaft
-from tactile.settings import Settings
-from tactile.types import Observation, Whisk, observation
 
 DARKEST = 0.02
 """The least brightness of a whisker that touched: never as dark as one that did not."""

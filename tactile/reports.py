@@ -12,15 +12,15 @@ from typing import Annotated, Literal, NamedTuple, Self
 import numpy as np
 from pydantic import Field, PositiveFloat, model_validator
 
-from tactile.errors import InputError
+from tactile.base.config import Settings
+from tactile.base.errors import InputError
+from tactile.base.se2 import compose
+from tactile.base.types import Moment, Motion, Observation, Odometry, Report, observation
 from tactile.feelers import Feelers
-from tactile.frames import compose
 from tactile.head import Degrees
-from tactile.settings import Settings
 from tactile.slidingtip import learned
 from tactile.straintemplates import StrainTemplates, load, matched, rate_of, smoothed
 from tactile.surface import Meeting, Wall, fused, geometric, nothing, template, touching
-from tactile.types import Moment, Motion, Observation, Odometry, Report, observation
 
 Mount = tuple[float, float, Degrees]
 RATE_TOLERANCE = 1e-2

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 from tactile.feelers import Feelers
 from tactile.straintemplates import WHERE, StrainTemplates
 

@@ -15,9 +15,9 @@ from typing import Annotated, NamedTuple, Self
 import numpy as np
 from pydantic import Field, PositiveFloat, PositiveInt, ValidationError, model_validator
 
-from tactile.errors import InputError
-from tactile.settings import Settings
-from tactile.types import Report
+from tactile.base.config import Settings
+from tactile.base.errors import InputError
+from tactile.base.types import Report
 
 VERSION = 1
 """Of the file."""

@@ -10,11 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tactile.base.se2 import inverse
+from tactile.base.types import Moment
 from tactile.feelers import Feelers
-from tactile.frames import inverse
 from tactile.slidingtip import DIRECTIONS, Tip, profile
 from tactile.straintemplates import Match
-from tactile.types import Moment
 
 CELL = 0.05
 """Two contacts closer than this have no line through them, m."""

@@ -13,10 +13,10 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
-from tactile.errors import InputError
+from tactile.base.config import Settings
+from tactile.base.errors import InputError
+from tactile.base.types import Array
 from tactile.head import Head
-from tactile.settings import Settings
-from tactile.types import Array
 
 
 class WhiskingConfig(Settings):

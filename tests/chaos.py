@@ -25,8 +25,8 @@ from ratslam import ladder, posecells
 from ratslam.cellsettings import PoseCellConfig, rings, units
 from ratslam.patches import around
 from ratslam.posecells import PoseCells
-from tactile.streams import stream
-from tactile.types import Odometry
+from tactile.base.random_streams import stream
+from tactile.base.types import Odometry
 
 MARKS = 100, 1_000, 10_000, 20_000, 100_000
 """Steps after which the difference is told."""

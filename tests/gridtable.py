@@ -73,8 +73,8 @@ def run(world: str, row: str, arena: int) -> Figures:
     from ratslam.playing import readings, session_of
     from ratslam.run import open_source
     from robot.sensing import sensing
-    from tactile.frames import compose, integrate
-    from tactile.types import Motion
+    from tactile.base.se2 import compose, integrate
+    from tactile.base.types import Motion
 
     noise, changes = ROWS[row]
     roving = WORLDS[world] | {"wheels": {"noise": noise}, "seed": arena}
@@ -115,7 +115,7 @@ def _off(arena: Any, pose: np.ndarray, told: Any) -> float:
     """Between a wall's direction as told and that of the segment nearest to where it was met, rad."""
     from robot.arena import segments
     from robot.polygons import distance
-    from tactile.frames import compose
+    from tactile.base.se2 import compose
 
     foot = told.wall_point
     normal = foot / np.hypot(*foot)

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import stats
 
-from tactile.streams import stream
+from tactile.base.random_streams import stream
 
 FIRST_SEED = 9200
 SEEDS = 20

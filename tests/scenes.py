@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from robot.log import Log
-from tactile.frames import between, wrap
+from tactile.base.se2 import between, wrap
 
 CELL = 0.1
 STEP = 0.05

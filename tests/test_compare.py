@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from ratslam.cli import main
 from ratslam.compare import RECKONED, Compared, _judged, _played, compared, report
 from ratslam.config import RunConfig
-from tactile.errors import InputError
-from tactile.frames import compose
+from tactile.base.errors import InputError
+from tactile.base.se2 import compose
 
 ROOT = Path(__file__).parents[1]
 ORIGIN = np.zeros(3)

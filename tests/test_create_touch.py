@@ -11,12 +11,12 @@ from robot.arena import segments
 from robot.layout import ArenaConfig
 from robot.polygons import distance
 from robot.roving import RovingConfig, drive_into_wall, roving
-from tactile.frames import compose
+from tactile.base.random_streams import stream
+from tactile.base.se2 import compose
+from tactile.base.types import Moment, Odometry, Report
 from tactile.reports import Reporting, ReportsConfig
 from tactile.straintemplates import StrainTemplates, TemplateTraining, driven, matched, smoothed, train
-from tactile.streams import stream
 from tactile.surface import touching
-from tactile.types import Moment, Odometry, Report
 from tests.flatwalls import apart
 
 CONFIG = RovingConfig()

@@ -24,7 +24,7 @@ from ratslam.cli.arena import SETS
 from ratslam.gridsettings import GridConfig
 from robot.arena import Arena, fits
 from robot.layout import ArenaConfig, arena
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 from tests.gridworld import TIPS, create, report
 
 TINY = ("roving.reports=40", "grid.particles=20")

@@ -27,7 +27,7 @@ from ratslam.sweeps.jobs import machine
 from ratslam.sweeps.pool import FOLDER
 from ratslam.sweeps.results import Result, Timing, write_result
 from ratslam.sweeps.study import read_study
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 ROOT = Path(__file__).parents[1]
 TINY = {

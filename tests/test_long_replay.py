@@ -22,9 +22,9 @@ import numpy as np
 import pytest
 
 from robot.source import Sample
-from tactile.frames import integrate
-from tactile.streams import stream
-from tactile.types import Odometry, observation
+from tactile.base.random_streams import stream
+from tactile.base.se2 import integrate
+from tactile.base.types import Odometry, observation
 
 PLACES, DWELL = 60, 10
 """Places of the circuit, and steps at each: a lap is 600 steps."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tactile.streams import stream
+from tactile.base.random_streams import stream
 from tests import chaos, precision
 
 

@@ -16,8 +16,8 @@ from ratslam.session import Session
 from robot.log import Log
 from robot.perturb import perturbed
 from robot.streams import read_stream
-from tactile.frames import integrate
-from tactile.types import Odometry, observation
+from tactile.base.se2 import integrate
+from tactile.base.types import Odometry, observation
 from tests import scenes
 
 GOLDEN = Path(__file__).parent / "golden"

@@ -20,8 +20,8 @@ from ratslam.reproduce.verdicts import Row, column, table, verdict
 from ratslam.trials.controls import controlled
 from ratslam.trials.thresholds import classics, mapped
 from ratslam.trials.touch import Played, figures, first, lap_ends, play, room_for, session_log
-from tactile.errors import InputError
-from tactile.frames import compose
+from tactile.base.errors import InputError
+from tactile.base.se2 import compose
 
 TINY = (
     "simulation.maze.columns=2",

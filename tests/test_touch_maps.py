@@ -16,8 +16,8 @@ from ratslam.playing import readings, session_of
 from ratslam.session import Session
 from robot.sensing import sensing
 from robot.simulation import simulated
-from tactile.frames import integrate
-from tactile.types import Observation
+from tactile.base.se2 import integrate
+from tactile.base.types import Observation
 
 SMALL = {"columns": 3, "rows": 3, "loop": 8}
 WIDE = {"columns": 5, "rows": 5, "loop": 12}

@@ -13,7 +13,7 @@ from ratslam.schooling import SECONDS, WAYS, Tried, held_out, report
 from robot.roving import RovingConfig, roving
 from robot.sensing import observation_of, sensing
 from robot.training import trained
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 from tactile.straintemplates import StrainTemplates, load
 
 CONFIG = RovingConfig(seed=4)

@@ -14,8 +14,8 @@ from ratslam.yamlfile import load, override, validate
 from robot import perturb
 from robot.perturb import perturbed
 from robot.streams import read_stream
-from tactile.errors import InputError
-from tactile.frames import between, integrate
+from tactile.base.errors import InputError
+from tactile.base.se2 import between, integrate
 
 ROOT = Path(__file__).parents[1]
 SQUARE = ROOT / "configs" / "square.yaml"

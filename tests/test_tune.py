@@ -18,7 +18,7 @@ from ratslam.templates import TemplateConfig
 from ratslam.tune import THRESHOLDS, Likeness, Tried, auc, chosen, compared, differences, report, tune
 from ratslam.yamlfile import parse
 from robot.log import Log
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 ROOT = Path(__file__).parents[1]
 LIKENESS = Likeness(np.linspace(0, 1, 11), np.eye(10, dtype=int)[1] * 8, np.ones(10, int), 0.9)

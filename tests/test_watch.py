@@ -23,8 +23,8 @@ from evaluation.rundirectory import read_run
 from evaluation.watching import distance, status_line, watch
 from evaluation.watchpicture import draw_watch
 from ratslam.cli import main
-from tactile.errors import InputError
-from tactile.frames import tum_line
+from tactile.base.errors import InputError
+from tactile.base.se2 import tum_line
 
 ROOT = Path(__file__).parents[1]
 

@@ -19,7 +19,7 @@ from ratslam.playing import readings, session_of
 from ratslam.run import open_source
 from ratslam.types import Action
 from robot.sensing import sensing
-from tactile.types import Observation
+from tactile.base.types import Observation
 
 FOLDER = Path(__file__).parent / "golden"
 SESSIONS = ("touch_circuits", "touch_kidnap")

@@ -100,8 +100,8 @@ def run(row: str, maze: int, seed: int, matcher: str = "recall") -> Figures:
     from ratslam.run import open_source
     from robot.log import collected
     from robot.sensing import sensing
-    from tactile.errors import InputError
-    from tactile.frames import integrate
+    from tactile.base.errors import InputError
+    from tactile.base.se2 import integrate
 
     simulation, touch = ROWS[row]
     simulation = simulation | {"seed": seed, "maze": {"seed": maze} | simulation.get("maze", {})}

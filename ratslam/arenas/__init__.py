@@ -16,7 +16,7 @@ from ratslam.arenas.tables import table
 from ratslam.arenas.trials import Job, Result, results
 from ratslam.trials.sheet import cells, filled, named, progress
 from ratslam.trials.workers import shared_out
-from tactile.streams import stream
+from tactile.base.random_streams import stream
 
 HEADING = ("world", "method", "mapper", "along", "set", "seed", "reports", *FIELDS)
 """Of NAME.csv."""

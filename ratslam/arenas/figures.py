@@ -6,7 +6,7 @@ import numpy as np
 
 from evaluation.griderror import CONVENTIONS, Convention
 from evaluation.gridscore import GridScore
-from tactile.frames import wrap
+from tactile.base.se2 import wrap
 
 NEAR = 0.1
 """A robot so near to where it was before is there again, m: two cells."""

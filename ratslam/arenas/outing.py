@@ -24,13 +24,13 @@ from robot.layout import arena
 from robot.roving import Rover, RovingConfig, roving
 from robot.sensing import Sensing, observation_of, reports_of
 from robot.training import trained
-from tactile.errors import InputError
+from tactile.base.errors import InputError
+from tactile.base.random_streams import stream
+from tactile.base.se2 import compose, integrate
+from tactile.base.types import Observation, stack
 from tactile.feelers import Feelers
-from tactile.frames import compose, integrate
 from tactile.reports import Mount, Reporting, ReportsConfig
 from tactile.straintemplates import StrainTemplates
-from tactile.streams import stream
-from tactile.types import Observation, stack
 
 ROOM = 0.2
 """Free space around a start, m: the robot's, and a little."""

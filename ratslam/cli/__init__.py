@@ -9,7 +9,7 @@ from collections.abc import Callable
 # Only what parsing arguments needs is imported here: `--help` answers before jax would have loaded.
 from ratslam.cli import arena, frontier, live, many, sessions, sweeps, touch, watch
 from ratslam.cli.common import INTERRUPTED, MENDABLE
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 
 def main(argv: list[str] | None = None) -> int:

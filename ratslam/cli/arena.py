@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from ratslam.cli.common import Add, configured, prepare_jax
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 SETS = {"fox-fig4": 20, "fox-fig5": 2, "fox-fig6": 3}
 """Of the reproductions, known before jax is loaded: sets of each."""

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ratslam.cli.common import Add, configured, count, prepare_jax, settable, shared
 from ratslam.cli.sweeps import Progress, settle_threads
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 CYCLES = 800
 """Of a session on which settings are tried."""

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ratslam.cli.common import INTERRUPTED, MENDABLE, Add, configured, prepare_jax
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 
 def add(command: Add) -> None:

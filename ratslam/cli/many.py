@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from ratslam.cli.common import Add, configured, count, prepare_jax, shared
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 
 def add(command: Add) -> None:

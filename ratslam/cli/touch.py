@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ratslam.cli.arena import SETS
 from ratslam.cli.common import INTERRUPTED, Add, configured, count, prepare_jax, settable, shared
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 NAMES = ("fig2", "fig3", "fig4", "fig5", "fig6", "fig7", "reverse", "controls", "matched")
 """Of the reproductions of Salman & Pearson 2016, known before jax is loaded; Fox et al.'s are in `SETS`."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from shutil import get_terminal_size
 
 from ratslam.cli.common import Add
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 
 def add(command: Add) -> None:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from ratslam.sweeps.quantities import DIRECTIONS, MEASURED
 from ratslam.sweeps.results import Result
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 SHORT = {
     "em": "energy_all",

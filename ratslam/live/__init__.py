@@ -30,8 +30,8 @@ from robot.motion import Path as Way
 from robot.outcome import Fault, Outcome
 from robot.sensing import kept
 from robot.simulation import CELL_SIZE
+from tactile.base.errors import InputError
 from tactile.calibration import Calibration, calibrated
-from tactile.errors import InputError
 from tactile.head import ur10_head
 from tactile.image import view_shape
 

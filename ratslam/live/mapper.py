@@ -26,7 +26,7 @@ from evaluation.scorecard import Scorecard
 from ratslam.config import RunConfig
 from robot.priority import PATIENT, ranked
 from robot.source import Sample
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 LOG = "mapper.log"
 """In the run directory: what the mapper's process had to say."""
@@ -237,7 +237,7 @@ def _map(line: Connection) -> None:
     from ratslam.playing import playing
     from ratslam.types import Action
     from robot.sensing import sensing
-    from tactile.types import Odometry, observation
+    from tactile.base.types import Odometry, observation
 
     order = line.recv()
     with Fed(order, line) as fed:

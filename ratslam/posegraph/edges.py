@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tactile.frames import wrap
+from tactile.base.se2 import wrap
 
 
 class Edges(NamedTuple):

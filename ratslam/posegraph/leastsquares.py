@@ -10,7 +10,7 @@ import numpy as np
 from ratslam.posegraph.edges import Edges, Error, difference_error, full
 from ratslam.posegraph.kernels import Kernel, no_kernel
 from ratslam.posegraph.normal import Folded, Whole
-from tactile.frames import wrap
+from tactile.base.se2 import wrap
 
 FOLDED_FROM = 2000
 """Graphs of so many nodes are solved over their forks; smaller ones are done sooner than folded."""

@@ -11,7 +11,7 @@ import numpy as np
 from ratslam.posegraph.chains import Chains, chains
 from ratslam.posegraph.edges import Edges, diagonal
 from ratslam.posegraph.pattern import Pattern, unreached
-from tactile.frames import wrap
+from tactile.base.se2 import wrap
 
 
 def linear(count: int, edges: Edges, first: np.ndarray | None = None) -> np.ndarray:

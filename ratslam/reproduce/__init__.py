@@ -24,7 +24,7 @@ from ratslam.trials.thresholds import classics
 from ratslam.trials.touch import Played, Task, TouchTrial, chain_free, figures, played, session_log
 from ratslam.trials.workers import shared_out
 from ratslam.yamlfile import override, parse, validate
-from tactile.streams import stream
+from tactile.base.random_streams import stream
 
 KEPT = 3
 """Sets of a condition, as in the paper (III-C)."""

@@ -23,7 +23,7 @@ from ratslam.reproduce.extras import clockwise_steps, lap_of
 from ratslam.reproduce.protocols import METHODS, Protocol
 from ratslam.reproduce.verdicts import LABELS, RATIOS, Row, column
 from ratslam.trials.touch import Played, judged
-from tactile.frames import compose
+from tactile.base.se2 import compose
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -13,8 +13,8 @@ from ratslam.run import open_source, recorder_of
 from ratslam.tiers import shortened
 from robot.formats import RecordingConfig
 from robot.source import Source
-from tactile.errors import InputError
-from tactile.frames import integrate
+from tactile.base.errors import InputError
+from tactile.base.se2 import integrate
 
 STANDING = 0.1
 """A cycle in which less than this share of the longest distance is driven is no driving."""

@@ -15,7 +15,7 @@ from ratslam.sizing.scene import short
 from ratslam.sweeps.jobs import run_job
 from ratslam.sweeps.results import Result
 from ratslam.sweeps.study import Job
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 COARSER = 1.5
 """Size of a cell, of what it was."""

@@ -16,7 +16,7 @@ from uuid import uuid4
 from ratslam.sweeps.results import Result
 from ratslam.sweeps.study import Job
 from ratslam.sweeps.work import environment, work
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 DEATHS = 5
 """How often a job is tried again after its process was killed."""

@@ -36,8 +36,8 @@ from ratslam.sweeps.study import Job
 from robot.arena import read_arena
 from robot.sensing import sensing
 from robot.source import Source, rig_of
-from tactile.errors import InputError
-from tactile.frames import integrate
+from tactile.base.errors import InputError
+from tactile.base.se2 import integrate
 
 PACKAGES = ("ratslam", "tactile", "robot", "evaluation")
 

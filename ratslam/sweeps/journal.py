@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ratslam.sweeps.plan import Parameter, TunePlan
-from tactile.errors import InputError
-from tactile.streams import stream
+from tactile.base.errors import InputError
+from tactile.base.random_streams import stream
 
 JOURNAL = "journal.log"
 """The file's name."""

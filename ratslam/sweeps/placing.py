@@ -8,7 +8,7 @@ from typing import Any
 
 from ratslam.yamlfile import Document, override
 from ratslam.yamlfile.document import KeyPath, Place
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 
 def put(document: Document, key: str, value: Any, origin: Document, at: KeyPath) -> Document:

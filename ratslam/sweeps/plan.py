@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, NonNegativeInt, field_validator, model_validator
 
 from ratslam.sweeps.quantities import DIRECTIONS, MAIN
-from tactile.settings import Settings
+from tactile.base.config import Settings
 
 
 def _known(name: str) -> str:

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from evaluation.scorecard import Quantity
 from ratslam.sweeps.quantities import MEASURED
-from tactile.settings import Settings
+from tactile.base.config import Settings
 
 
 class Timing(Settings):

@@ -17,7 +17,7 @@ from ratslam.sweeps.plan import StudyPlan, TunePlan
 from ratslam.yamlfile import Document, load, override, validate
 from ratslam.yamlfile.document import KeyPath, Place
 from ratslam.yamlfile.reader import Reader
-from tactile.errors import InputError, InputErrors
+from tactile.base.errors import InputError, InputErrors
 
 MOST = 100_000
 """Jobs of a study."""

@@ -19,7 +19,7 @@ from ratslam.sweeps.pool import Pool
 from ratslam.sweeps.report import replace
 from ratslam.sweeps.results import Result
 from ratslam.sweeps.study import Job, Study, made, seeded, tuned, variant_of
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 Done = Callable[[Result | None], None]
 

@@ -24,8 +24,8 @@ from ratslam.yamlfile import Document, load, override, validate
 from robot.log import Log, collected
 from robot.perturb import perturbed
 from robot.sensing import sensing
-from tactile.errors import InputError
-from tactile.frames import integrate
+from tactile.base.errors import InputError
+from tactile.base.se2 import integrate
 
 SAME_PLACE = 2.5
 """Cells up to which two frames are the same place: farther apart in truth, a closure is false."""

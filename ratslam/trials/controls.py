@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from robot.log import Log
-from tactile.streams import stream
+from tactile.base.random_streams import stream
 
 Control = Literal["as felt", "shuffled", "blank", "ideal"]
 """`shuffled`: the views in another order; `blank`: nothing was ever felt; `ideal`: a view for each spot."""

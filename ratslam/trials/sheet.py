@@ -10,7 +10,7 @@ from typing import TypeVar
 
 from tqdm import tqdm
 
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 Protocol = TypeVar("Protocol")
 Cells = Sequence[object]

@@ -21,7 +21,7 @@ from ratslam.trials.touch import Played, room_for, told
 from ratslam.types import Estimate
 from robot.log import Log
 from robot.sensing import observation_of
-from tactile.types import Array, Observation, stack
+from tactile.base.types import Array, Observation, stack
 
 
 class Batch(NamedTuple):

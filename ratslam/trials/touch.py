@@ -22,8 +22,8 @@ from ratslam.session import Session, capacity_at
 from ratslam.trials.controls import Control, controlled
 from robot.log import Log, collected
 from robot.sensing import observation_of, sensing
-from tactile.errors import InputError
-from tactile.frames import integrate
+from tactile.base.errors import InputError
+from tactile.base.se2 import integrate
 
 FALSE = 0.1
 """A closure between steps farther apart in truth is false, m (the paper's threshold, III-G)."""

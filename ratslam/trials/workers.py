@@ -10,7 +10,7 @@ from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from typing import TypeVar
 
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")

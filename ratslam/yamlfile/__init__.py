@@ -16,7 +16,7 @@ from ratslam.yamlfile.complaints import complaints
 from ratslam.yamlfile.document import Document, KeyPath, Place, dotted, shown
 from ratslam.yamlfile.dumper import Dumper
 from ratslam.yamlfile.reader import Reader
-from tactile.errors import InputError, InputErrors
+from tactile.base.errors import InputError, InputErrors
 
 Model = TypeVar("Model", bound=BaseModel)
 

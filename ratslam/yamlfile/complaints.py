@@ -13,7 +13,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from ratslam.yamlfile.document import Document, KeyPath, either, shown
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 _MAX_ERRORS = 50
 _WORDS = {

@@ -15,7 +15,7 @@ import yaml
 
 from ratslam.yamlfile.document import KeyPath, Place, label, shown
 from ratslam.yamlfile.scalars import Refused, plain
-from tactile.errors import InputError, InputErrors
+from tactile.base.errors import InputError, InputErrors
 
 _MAX_DEPTH = 32
 _NO_ANCHORS = "write the value out at each place"

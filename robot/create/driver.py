@@ -14,8 +14,8 @@ from robot.create.halts import Halt, Halted, Refused
 from robot.create.link import Counts, Garbled, Link, Silent, Unplugged, open_port
 from robot.create.pilot import PAUSE, Pilot
 from robot.create.settings import CreateConfig
-from tactile.errors import InputError
-from tactile.types import Odometry
+from tactile.base.errors import InputError
+from tactile.base.types import Odometry
 
 TRIES = 5
 """Queries until a Create has to have answered."""

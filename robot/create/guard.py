@@ -15,7 +15,7 @@ import threading
 
 from robot.create import wire
 from robot.create.link import open_port
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 START_LIMIT = 10.0
 """s that a guard may take to start."""

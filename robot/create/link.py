@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import NamedTuple, Protocol
 
 from robot.create import wire
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 ANSWER = 0.1
 """s within which a reply has to come; a USB adapter holds it back for up to 16 ms."""

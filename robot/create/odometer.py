@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from tactile.types import Odometry
+from tactile.base.types import Odometry
 
 
 class Odometer:

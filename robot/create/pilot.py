@@ -12,7 +12,7 @@ from robot.create.halts import Halt, Halted, Refused, objection, wheels
 from robot.create.link import Counts, Garbled, Link, Silent, Unplugged
 from robot.create.odometer import Odometer
 from robot.create.settings import CreateConfig
-from tactile.types import Odometry
+from tactile.base.types import Odometry
 
 PAUSE = 0.03
 """s between commands that change the mode; within 20 ms of one the robot may miss the next."""

@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import Field, PositiveFloat, model_validator
 
 from robot.create.wire import TOP_SPEED, WHEEL_BASE
-from tactile.settings import Settings
+from tactile.base.config import Settings
 
 
 class CreateConfig(Settings):

@@ -18,9 +18,9 @@ import time
 from typing import Any, NamedTuple
 
 from robot.create.wire import BAUD, TOP_SPEED, WHEEL_BASE, Bumps, Mode
-from tactile.errors import InputError
-from tactile.settings import Settings
-from tactile.streams import stream
+from tactile.base.config import Settings
+from tactile.base.errors import InputError
+from tactile.base.random_streams import stream
 
 DATA = {128: 0, 131: 0, 132: 0, 145: 4}  # bytes after an opcode; a query's follow from its first
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 
 from robot.head.address import Address
 from robot.head.wire import ENDPOINT_IN, ENDPOINT_OUT, INTERFACE, LONGEST, REQUEST_IN, REQUEST_OUT, Request
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 T = TypeVar("T")
 TIMEOUT = 500

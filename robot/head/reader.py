@@ -22,7 +22,7 @@ from robot.head.ring import Ring
 from robot.head.settings import HeadLinkConfig
 from robot.head.wire import CHANNELS, Command, Request, pack
 from robot.outcome import Fault, Outcome
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 READ = 4096
 """Bytes asked for at once: 16 ms of 18 whiskers at 2 kHz."""

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, PositiveFloat
 
 from robot.head.address import Address
-from tactile.settings import Settings
+from tactile.base.config import Settings
 
 
 def _readable(address: str) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from robot.head.decoder import Frames
 from robot.head.reader import Reader
 from robot.head.wire import ANGLE, OFF, Command, Flag, Kind, Mode, tally
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 from tactile.head import Head
 from tactile.whisking import WhiskingConfig, checked, command, phase, still
 

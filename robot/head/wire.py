@@ -28,7 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tactile.types import Array
+from tactile.base.types import Array
 
 VENDOR, PRODUCT = 0x1209, 0x0001
 """The USB numbers that pid.codes keeps for tests."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from robot.head.decoder import Frames
 from robot.head.wire import CHANNELS, radians
-from tactile.types import Cycle, Odometry
+from tactile.base.types import Cycle, Odometry
 
 KEPT = 1 << 16
 """Frames that are kept to be cut: half a minute at 2 kHz."""

@@ -17,8 +17,8 @@ from robot.outcome import Fault, Outcome
 from robot.simulation import MIDDLE
 from robot.source import Sample
 from robot.ur10.safety import Refused
-from tactile.errors import InputError
-from tactile.types import Cycle, Odometry
+from tactile.base.errors import InputError
+from tactile.base.types import Cycle, Odometry
 
 LONGEST = 120.0
 """How long a way without whisks may take, s."""

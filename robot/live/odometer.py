@@ -9,9 +9,9 @@ import numpy as np
 from robot.live.settings import LiveConfig
 from robot.odometry import MID_HEADING, from_velocities, reckoned
 from robot.ur10.placing import heading_of, pose_of
-from tactile.frames import compose, wrap
-from tactile.streams import stream
-from tactile.types import Odometry
+from tactile.base.random_streams import stream
+from tactile.base.se2 import compose, wrap
+from tactile.base.types import Odometry
 
 KEPT = 10.0
 """s of states that are kept."""

@@ -13,7 +13,7 @@ from robot.simulation import SimulationConfig
 from robot.ur10.placing import tcp_of
 from robot.ur10.safety import Refused
 from robot.ur10.safety import checked as allowed
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 from tactile.head import Head
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from robot.live.rig import Rig
 from robot.live.settings import LiveConfig
 from robot.outcome import Outcome
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 LISTENED = 1.5
 """How long both streams are listened to, s."""

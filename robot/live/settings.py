@@ -11,7 +11,7 @@ from robot.head.settings import HeadLinkConfig
 from robot.odometry import OdometryConfig
 from robot.simulation import SimulationConfig
 from robot.ur10.settings import ArmConfig
-from tactile.settings import Settings
+from tactile.base.config import Settings
 
 
 class LiveConfig(Settings):

@@ -12,7 +12,7 @@ import numpy as np
 from robot.ur10 import dashboard
 from robot.ur10.safety import inside
 from robot.ur10.settings import ArmConfig
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 ENOUGH = 0.9  # of the nominal rate of states
 MEASURE = 0.25  # s of states that the rate is taken from

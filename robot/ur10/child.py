@@ -29,7 +29,7 @@ from robot.ur10.governor import MISSING, Governor, Order
 from robot.ur10.safety import Finding, still
 from robot.ur10.settings import ArmConfig
 from robot.ur10.states import STATE, Board
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 PLAYING = 2  # runtime state
 SETTLE = 0.25  # s of states at rest from which the force at rest is taken, and the session takes the rate

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, PositiveFloat, model_validator
 
 from robot.ur10.placing import PlacingConfig
-from tactile.settings import Settings
+from tactile.base.config import Settings
 
 SPEED_CAP = 0.25  # m/s; ISO 10218-1's reduced speed. No setting reaches beyond it
 TURN_CAP = 1.0  # rad/s

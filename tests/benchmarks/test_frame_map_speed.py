@@ -7,7 +7,7 @@ import time
 import numpy as np
 
 from ratslam.framegraph import Chain, Closures, Fit, Prior, relative_covariance, solve
-from tactile.frames import integrate
+from tactile.base.se2 import integrate
 
 
 def laps(frames: int, closures: int):

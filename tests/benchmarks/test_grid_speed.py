@@ -12,8 +12,8 @@ from ratslam.gridsettings import GridConfig
 from ratslam.session import Session
 from robot.roving import RovingConfig, roving
 from robot.sensing import feelers_of, sensing
+from tactile.base.types import stack
 from tactile.frontend import TouchConfig
-from tactile.types import stack
 
 
 @pytest.fixture(scope="module")

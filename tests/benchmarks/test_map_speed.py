@@ -14,8 +14,8 @@ from scipy.spatial import cKDTree
 from ratslam.experience import ExperienceConfig, ExperienceMap
 from ratslam.posegraph import Edges, Ending, least_squares, linear
 from ratslam.types import Action, Estimate
-from tactile.frames import between, integrate, wrap
-from tactile.types import Odometry, observation
+from tactile.base.se2 import between, integrate, wrap
+from tactile.base.types import Odometry, observation
 
 NOISE = np.array([0.02, 0.02, 0.01])
 """Standard deviations of every edge, m, m, rad; of the headings, ten times as much where it says so."""

@@ -18,7 +18,7 @@ import pytest
 
 from ratslam import ladder, posecells
 from ratslam.cellsettings import PoseCellConfig, rings, units
-from tactile.types import Odometry
+from tactile.base.types import Odometry
 
 
 def beside(name: str) -> ModuleType:

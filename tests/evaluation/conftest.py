@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from evaluation.run import Run
-from tactile.frames import compose, integrate, inverse
+from tactile.base.se2 import compose, integrate, inverse
 
 _ROOT = Path(__file__).parents[2]
 

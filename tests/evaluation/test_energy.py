@@ -17,8 +17,8 @@ from evaluation.energy import (
     relation_errors,
     successive,
 )
-from tactile.errors import InputError
-from tactile.frames import between, compose
+from tactile.base.errors import InputError
+from tactile.base.se2 import between, compose
 
 law = settings(derandomize=True, deadline=None, max_examples=60)
 motions = st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(-np.pi, np.pi)).map(np.array)

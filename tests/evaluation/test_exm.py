@@ -19,8 +19,8 @@ from evaluation.exm import (
     relocalisations,
 )
 from evaluation.log import changes, creation_poses
-from tactile.errors import InputError
-from tactile.frames import wrap
+from tactile.base.errors import InputError
+from tactile.base.se2 import wrap
 
 
 def arcr(ids, truth, **config):

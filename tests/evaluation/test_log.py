@@ -6,7 +6,7 @@ import pytest
 
 from evaluation.log import read_log
 from evaluation.scorecard import score_log, table
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 ROWS = "0,7,0.1,0.2,3\n0.5,-1,0.1,0.2,-3\n"
 

@@ -22,7 +22,7 @@ from evaluation.nav2 import (
     write_image,
     write_nav2,
 )
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 law = settings(max_examples=40)
 probabilities = arrays(np.float64, array_shapes(min_dims=2, max_dims=2, max_side=9), elements=st.floats(0, 1))

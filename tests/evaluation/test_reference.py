@@ -7,7 +7,7 @@ import pytest
 
 from evaluation.energy import read_relations, relation_errors
 from evaluation.trajectory import ate
-from tactile.frames import integrate
+from tactile.base.se2 import integrate
 
 
 def dead_reckoning(trace):

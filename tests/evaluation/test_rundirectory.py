@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 
 from evaluation.rundirectory import read_card, read_closures, read_walls, write_walls
 from evaluation.scorecard import score
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 CLOSURES = """frame,match,step,match_step,verdict,weight
 9,2,30,10,accepted,1.0

@@ -10,7 +10,7 @@ import pytest
 from evaluation.energy import Relations
 from evaluation.exm import ExmConfig
 from evaluation.scorecard import Scorecard, score, table
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 
 def values(card):

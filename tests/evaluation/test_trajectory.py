@@ -20,8 +20,8 @@ from evaluation.trajectory import (
     rpe,
     write_tum,
 )
-from tactile.errors import InputError
-from tactile.frames import between, compose, wrap
+from tactile.base.errors import InputError
+from tactile.base.se2 import between, compose, wrap
 
 law = settings(derandomize=True, deadline=None, max_examples=60)
 motions = st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(-np.pi, np.pi)).map(np.array)

@@ -12,7 +12,7 @@ from matplotlib.collections import PatchCollection
 from evaluation.images import Images, read_images, write_images
 from evaluation.scorecard import score
 from evaluation.whiskerpicture import SHOWN, draw_whiskers
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 AZIMUTH = np.arange(6) * np.pi / 3
 LENGTH = np.array([0.05, 0.11, 0.16])

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from robot.recording import Recording, recover
-from tactile.streams import stream
+from tactile.base.random_streams import stream
 from tests.live.bench import Bench, kept
 from tests.live.ends import LOST, ended, stands
 from tests.robot.live_helpers import until

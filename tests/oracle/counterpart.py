@@ -11,8 +11,8 @@ import numpy as np
 from ratslam.rat import Rat, RatConfig, from_parameters
 from ratslam.session import Session
 from robot.formats import RecordingConfig, open_recording
-from tactile.errors import InputError
-from tactile.types import Observation
+from tactile.base.errors import InputError
+from tactile.base.types import Observation
 from tests.oracle.compare import Report
 from tests.oracle.plain import Input, PlainEngine, PlainStep, Settings
 from tests.oracle.trace import Trace, TraceError

@@ -9,7 +9,7 @@ import networkx
 import numpy as np
 
 from ratslam.types import Action, Estimate
-from tactile.frames import compose, wrap
+from tactile.base.se2 import compose, wrap
 
 
 class Nothing(NamedTuple):

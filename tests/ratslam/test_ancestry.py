@@ -7,7 +7,7 @@ import pytest
 
 from ratslam import ancestry
 from ratslam.ancestry import Ancestry
-from tactile.frames import wrap
+from tactile.base.se2 import wrap
 
 COUNT = 6
 

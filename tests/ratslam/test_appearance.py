@@ -24,7 +24,7 @@ from ratslam.appearance import (
 )
 from ratslam.likeness import DEAD, HEIGHTS, LEVELS, PRIOR, background, levels, pixels, table, variation
 from ratslam.sectors import NOTHING
-from tactile.types import Odometry, observation
+from tactile.base.types import Odometry, observation
 
 SHAPE = (3, 6, 1)
 PIXELS = pixels(SHAPE)

@@ -11,7 +11,7 @@ import pytest
 from ratslam import arbitration
 from ratslam.arbitration import CUT, KEPT, STEPS, Case, arbitrate
 from ratslam.framegraph import Chain, Closures, Fit, Prior, robust_cost, solve
-from tactile.frames import between, compose, fitted, integrate, wrap
+from tactile.base.se2 import between, compose, fitted, integrate, wrap
 
 LAP = 60
 STEP = 0.03

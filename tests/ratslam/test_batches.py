@@ -12,7 +12,7 @@ from ratslam.batches import Course, Network, networks, trials
 from ratslam.cellsettings import PoseCellConfig, units
 from ratslam.patches import around
 from ratslam.session import Session
-from tactile.types import Odometry, stack
+from tactile.base.types import Odometry, stack
 from tests.gridworld import filter_of, report, settings
 
 CONFIG = PoseCellConfig(cells_xy=21)

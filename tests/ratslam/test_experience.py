@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from ratslam.experience import ExperienceConfig, ExperienceMap
 from ratslam.types import Action, Estimate
-from tactile.frames import compose, integrate, inverse
-from tactile.types import Odometry, observation
+from tactile.base.se2 import compose, integrate, inverse
+from tactile.base.types import Odometry, observation
 
 
 class Evidence(NamedTuple):

@@ -18,7 +18,7 @@ from ratslam.framegraph import (
     robust_cost,
     solve,
 )
-from tactile.frames import between, compose, integrate, wrap
+from tactile.base.se2 import between, compose, integrate, wrap
 
 WIDE = Prior(0.0, 10.0)
 SURE = 1e12  # a robust scale at which no run ever loses weight

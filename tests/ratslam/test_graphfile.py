@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from ratslam.graphfile import read_g2o, read_json, write_g2o, write_json
 from ratslam.posegraph import Edges
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
 VERTICES = "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\n"

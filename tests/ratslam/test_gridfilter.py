@@ -15,9 +15,9 @@ from ratslam.config import RunConfig
 from ratslam.gridfilter import Outcome
 from ratslam.occupancy import COSINE, EVIDENCE, SINE
 from ratslam.session import Session
-from tactile.errors import InputError
-from tactile.frames import wrap
-from tactile.types import Motion
+from tactile.base.errors import InputError
+from tactile.base.se2 import wrap
+from tactile.base.types import Motion
 from tests.gridworld import (
     BLANK,
     STEADY,

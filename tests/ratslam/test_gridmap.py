@@ -8,7 +8,7 @@ import pytest
 from ratslam import ancestry
 from ratslam.gridfilter import GridEvidence
 from ratslam.types import Estimate
-from tactile.types import Motion
+from tactile.base.types import Motion
 from tests.gridworld import TIPS, filter_of, report, settings
 
 COUNT = 5

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from ratslam.grouping import Grouping, Said
 from ratslam.types import Action
-from tactile.frames import compose, wrap
+from tactile.base.se2 import compose, wrap
 
 RADIUS, HEADING = 1.0, 0.5
 

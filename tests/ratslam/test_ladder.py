@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from ratslam import ladder, patches, posecells
 from ratslam.cellsettings import PoseCellConfig, rings, units
-from tactile.types import Odometry
+from tactile.base.types import Odometry
 
 CELLS = {11: 2, 21: 2, 41: 3, 61: 4}
 """Cells a side, and how many rungs the ladder has there."""

@@ -13,7 +13,7 @@ from scipy.special import expit, logit
 
 from ratslam.gridsettings import DrawingConfig, GridConfig
 from ratslam.marks import FUSIONS, Marks, draw
-from tactile.frames import compose
+from tactile.base.se2 import compose
 from tests.gridworld import TIPS, create
 
 SIDE, MIDDLE = 51, 25

@@ -15,8 +15,8 @@ from scipy.stats import chisquare
 from ratslam import particles
 from ratslam.gridsettings import DriftConfig, ResamplingConfig
 from ratslam.particles import Particles
-from tactile.frames import compose, wrap
-from tactile.types import Odometry
+from tactile.base.se2 import compose, wrap
+from tactile.base.types import Odometry
 from tests.gridworld import STEADY
 
 SYSTEMATIC = ResamplingConfig()

@@ -15,8 +15,8 @@ from ratslam import ladder, patches, posecells
 from ratslam.cellsettings import PoseCellConfig, rings, units
 from ratslam.patches import around
 from ratslam.posecells import Outcome
-from tactile.frames import integrate
-from tactile.types import Odometry
+from tactile.base.se2 import integrate
+from tactile.base.types import Odometry
 
 CONFIG = PoseCellConfig()
 UNITS = units(CONFIG, np.dtype(float))

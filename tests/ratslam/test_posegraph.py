@@ -24,8 +24,8 @@ from ratslam.posegraph.chains import chains
 from ratslam.posegraph.edges import full
 from ratslam.posegraph.normal import Folded
 from ratslam.relaxation import relax
-from tactile.errors import InputError
-from tactile.frames import between, compose, integrate, inverse, wrap
+from tactile.base.errors import InputError
+from tactile.base.se2 import between, compose, integrate, inverse, wrap
 
 
 def loops(stream, count=120, closures=20, noise=(0.0, 0.0)):

@@ -18,8 +18,8 @@ from ratslam.recall import BASIN, FACING, SAMPLES, SUPPORT, Guidance, RecallConf
 from ratslam.recallrat import rat
 from ratslam.session import Session
 from ratslam.weighing import LABEL_TEMPER, LABELS
-from tactile.frames import between, compose, wrap
-from tactile.types import Odometry, observation
+from tactile.base.se2 import between, compose, wrap
+from tactile.base.types import Odometry, observation
 
 CELL = 0.1
 SIZE = 12

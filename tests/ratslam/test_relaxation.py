@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ratslam.relaxation import relax
-from tactile.frames import between, wrap
+from tactile.base.se2 import between, wrap
 
 
 def naive(poses, start, end, distance, heading, facing, loops, correction):

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ratslam import stamps
-from tactile.frames import wrap
+from tactile.base.se2 import wrap
 
 SIZE = 31
 MIDDLE = (SIZE - 1) / 2

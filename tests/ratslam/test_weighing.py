@@ -16,7 +16,7 @@ from ratslam import recall
 from ratslam.likeness import DEAD, HEIGHTS, LEVELS, PRIOR, background, levels, pixels, table
 from ratslam.recall import FOLLOWERS, SUPPORT, Guidance, RecallConfig
 from ratslam.weighing import STEPS, by_touch
-from tactile.frames import between, compose
+from tactile.base.se2 import between, compose
 
 CELL = 0.05
 SHAPE = (3, 6, 1)

@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 from pydantic import Field, model_validator
 
 from ratslam.yamlfile import dump, load, override, parse, schema, validate
-from tactile.errors import InputError
-from tactile.settings import Settings
+from tactile.base.config import Settings
+from tactile.base.errors import InputError
 
 
 class Metric(Enum):

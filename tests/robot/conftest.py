@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 SYNTHETIC = (
     "a_square3",

@@ -15,7 +15,7 @@ from scipy.ndimage import label
 from robot.arena import Arena, enclosed, fits, inside, occupied, read_arena, segments, text
 from robot.layout import ArenaConfig, arena
 from robot.polygons import area, contains, crossing, distance, edges, gap, square
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 SEEDS = st.integers(0, 10**6)
 KINDS = st.sampled_from(

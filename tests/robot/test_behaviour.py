@@ -20,9 +20,9 @@ from robot.behaviour import (
     moved,
     turn,
 )
-from tactile.frames import compose
-from tactile.streams import stream
-from tactile.types import Moment, Motion
+from tactile.base.random_streams import stream
+from tactile.base.se2 import compose
+from tactile.base.types import Moment, Motion
 
 CONFIG = BehaviourConfig()
 ROWS = 40

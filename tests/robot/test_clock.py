@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robot.clock import AHEAD, EARLY, SCALE, WINDOW, Clock
-from tactile.streams import stream
+from tactile.base.random_streams import stream
 
 SHORTEST = 2e-4
 """The way's shortest delay, s."""

@@ -18,7 +18,7 @@ from robot.files import read_bytes
 from robot.formats import FORMATS, RecordingConfig, open_recording
 from robot.recording import record
 from robot.source import Source
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 ROOT = Path(__file__).parents[2]
 Refused = Callable[..., InputError]

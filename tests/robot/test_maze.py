@@ -25,8 +25,8 @@ from robot.maze import (
     text,
     walls,
 )
-from tactile.errors import InputError
-from tactile.streams import stream
+from tactile.base.errors import InputError
+from tactile.base.random_streams import stream
 
 SEEDS = st.integers(0, 10**6)
 

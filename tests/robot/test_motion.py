@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from robot.maze import CELL, centre, random_loop
 from robot.motion import JitterConfig, MotionConfig, Path, at, carried, planned
 from robot.route import circuits
-from tactile.frames import wrap
-from tactile.streams import stream
+from tactile.base.random_streams import stream
+from tactile.base.se2 import wrap
 
 SEEDS = st.integers(0, 1000)
 STEADY = JitterConfig(position=0, yaw_deg=0, speed=0)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from robot.odometry import MID_HEADING, NEW_HEADING, from_poses, from_velocities
-from tactile.frames import integrate, wrap
+from tactile.base.se2 import integrate, wrap
 
 STEPS = st.integers(1, 30)
 MOTIONS = STEPS.flatmap(lambda n: arrays(np.float64, (n, 3), elements=st.floats(-3, 3)))

@@ -13,8 +13,8 @@ from robot.mechanics import StreamConfig
 from robot.quasistatic import advance, quasistatic, rest
 from robot.sweep import Sweep
 from robot.walls import FREE
+from tactile.base.random_streams import stream
 from tactile.head import HeadConfig, ur10_head
-from tactile.streams import stream
 from tactile.whisking import Drive, WhiskingConfig, command
 
 HEAD = ur10_head(HeadConfig())

@@ -24,8 +24,8 @@ from robot.schemas import CYCLE, OBSERVATION, REPORT, SCHEMAS, TOPICS, WHISK
 from robot.source import Rigged, Sample, Source, rig_of
 from robot.streams import read_stream
 from robot.walk import FORMAT, Walk, _checksum
-from tactile.errors import InputError
-from tactile.types import Cycle, Observation, Odometry, Report, Whisk, observation
+from tactile.base.errors import InputError
+from tactile.base.types import Cycle, Observation, Odometry, Report, Whisk, observation
 
 SHAPE, WHISKERS = (2, 3, 2), 4
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)

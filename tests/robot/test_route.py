@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from robot.maze import Maze, closed, is_open, neighbours, random_loop, scattered
 from robot.route import anticlockwise, checked, circuits, exploration
-from tactile.errors import InputError
-from tactile.streams import stream
+from tactile.base.errors import InputError
+from tactile.base.random_streams import stream
 
 SQUARE = [(0, 0), (1, 0), (1, 1), (0, 1)]
 

@@ -15,10 +15,10 @@ from robot.behaviour import State
 from robot.polygons import distance
 from robot.roving import Rover, RovingConfig, drive_into_wall, roving
 from robot.source import Rigged, Sample, Source, rig_of
-from tactile.errors import InputError
-from tactile.frames import between, compose, wrap
-from tactile.streams import stream
-from tactile.types import Moment, Motion, Report
+from tactile.base.errors import InputError
+from tactile.base.random_streams import stream
+from tactile.base.se2 import between, compose, wrap
+from tactile.base.types import Moment, Motion, Report
 
 SHORT = {"reports": 150}
 

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robot.odometry import OdometryConfig, reckoned
-from tactile.frames import between, integrate, wrap
-from tactile.streams import stream
+from tactile.base.random_streams import stream
+from tactile.base.se2 import between, integrate, wrap
 
 KINDS = ("white", "gated", "telescoping")
 

@@ -18,12 +18,12 @@ from robot.recording import Recording, record
 from robot.sensing import head_of, sensing
 from robot.simulation import Simulation, SimulationConfig, simulated, tier
 from robot.source import Rigged, Sample, Source, rig_of
-from tactile.errors import InputError
-from tactile.frames import between, wrap
+from tactile.base.errors import InputError
+from tactile.base.se2 import between, wrap
+from tactile.base.types import Cycle, Observation, Whisk
 from tactile.frontend import TouchConfig
 from tactile.head import HeadConfig, RingConfig
 from tactile.image import ImageConfig
-from tactile.types import Cycle, Observation, Whisk
 
 SHORT = {"path": {"circuits": "CA"}}
 

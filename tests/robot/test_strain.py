@@ -13,8 +13,8 @@ from robot.bending import Bent, Shaft, base_strain, bent, tilt
 from robot.layout import ArenaConfig, arena
 from robot.polygons import crossing, distance, edges, square
 from robot.strain import ShakeConfig, WhiskersConfig, among, fan, sampled, shaken, strained
+from tactile.base.random_streams import stream
 from tactile.contact import ShaftConfig, stiffness
-from tactile.streams import stream
 
 SEEDS = st.integers(0, 10**6)
 CONFIG = WhiskersConfig()

@@ -11,9 +11,9 @@ import pytest
 
 from robot.source import Source
 from robot.streams import read_stream
-from tactile.errors import InputError, InputErrors
-from tactile.frames import integrate
-from tactile.types import Observation
+from tactile.base.errors import InputError, InputErrors
+from tactile.base.se2 import integrate
+from tactile.base.types import Observation
 
 
 def ate(path: np.ndarray, truth: np.ndarray) -> float:

@@ -25,8 +25,8 @@ from robot.pairs import labels_from_pairs
 from robot.source import Source
 from robot.streams import read_stream
 from robot.table import read_table
-from tactile.errors import InputError, InputErrors
-from tactile.frames import integrate
+from tactile.base.errors import InputError, InputErrors
+from tactile.base.se2 import integrate
 
 VELOCITY = TableConfig(velocity=VelocityColumns(), rows=1, columns=3)
 ODOMETRY = "t,vx,w\n0.0,0.2,0.0\n0.5,0.2,0.1\n1.0,0.2,0.0\n1.5,0.2,0.0\n"

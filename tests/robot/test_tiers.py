@@ -13,12 +13,12 @@ from robot.motion import MotionConfig, Path, planned
 from robot.quasistatic import quasistatic
 from robot.sweep import Tier, cycles, free_cycles
 from robot.walls import Surroundings, Walls
+from tactile.base.errors import InputError
+from tactile.base.random_streams import stream
+from tactile.base.types import Cycle
 from tactile.calibration import Calibration, CalibrationConfig, calibrated
 from tactile.contact import ContactConfig, ShaftConfig, sensed, stiffness
-from tactile.errors import InputError
 from tactile.head import HeadConfig, ur10_head
-from tactile.streams import stream
-from tactile.types import Cycle
 from tactile.whisking import WhiskingConfig
 
 HEAD = ur10_head(HeadConfig())

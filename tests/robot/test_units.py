@@ -14,7 +14,7 @@ from robot.log import Log
 from robot.streams import read_stream
 from robot.table import read_table
 from robot.units import ORDINARY, RATIO, Limits, Track, headings, typical, units
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 REAL = ("f_real_intel_laser3x6", "f_real_tuc_lecture_hall")
 DEGREES, MILLIMETRES, MILLISECONDS = 180 / np.pi, 1000.0, 1000.0

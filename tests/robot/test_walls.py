@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from robot.maze import random_loop, scattered, walls
 from robot.walls import FREE, Surroundings, Walls
+from tactile.base.random_streams import stream
 from tactile.head import Head, HeadConfig, RingConfig, shaft, ur10_head
-from tactile.streams import stream
 
 STEP = 1 / 600
 """Of the march, as a share of the sweep."""

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robot.wheels import WheelsConfig, reckoned
-from tactile.streams import stream
-from tactile.types import Motion
+from tactile.base.random_streams import stream
+from tactile.base.types import Motion
 
 KINDS = ("white", "move", "bias", "none")
 

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tactile.base.errors import InputError
+from tactile.base.random_streams import stream
+from tactile.base.types import Cycle, Odometry
 from tactile.calibration import Calibration, CalibrationConfig, arrays, calibrated, from_arrays
-from tactile.errors import InputError
-from tactile.streams import stream
-from tactile.types import Cycle, Odometry
 
 CONFIG = CalibrationConfig()
 

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tactile.base.errors import InputError
+from tactile.base.random_streams import stream
+from tactile.base.types import Cycle, Odometry
 from tactile.calibration import Calibration
 from tactile.contact import ContactConfig, ShaftConfig, reached, sensed, stiffness
-from tactile.errors import InputError
-from tactile.streams import stream
-from tactile.types import Cycle, Odometry
 
 AMPLITUDE = 1.134
 W = 18

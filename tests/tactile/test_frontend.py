@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tactile.base.types import Cycle, Observation, Odometry, Whisk
 from tactile.calibration import Calibration
 from tactile.frontend import Frontend, TouchConfig
-from tactile.types import Cycle, Observation, Odometry, Whisk
 
 W = 18
 MOTION = Odometry(0.03, 0.01, -0.2, 1.0)

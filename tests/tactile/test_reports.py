@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactile.errors import InputError
-from tactile.frames import compose
+from tactile.base.errors import InputError
+from tactile.base.random_streams import stream
+from tactile.base.se2 import compose
+from tactile.base.types import Moment, Motion, Observation, Odometry, Report, stack
 from tactile.reports import Reporting, ReportsConfig
 from tactile.straintemplates import Drive, StrainTemplates, TemplateTraining, save, train
-from tactile.streams import stream
 from tactile.surface import across
-from tactile.types import Moment, Motion, Observation, Odometry, Report, stack
 from tests.flatwalls import RATE, apart, met, report, wall
 
 TRAINING = TemplateTraining()

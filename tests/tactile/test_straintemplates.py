@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactile.errors import InputError
+from tactile.base.errors import InputError
+from tactile.base.random_streams import stream
 from tactile.straintemplates import (
     Drive,
     StrainTemplates,
@@ -20,7 +21,6 @@ from tactile.straintemplates import (
     smoothed,
     train,
 )
-from tactile.streams import stream
 from tests.flatwalls import RATE, apart, wall
 
 TRAINING = TemplateTraining()

@@ -7,11 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactile.errors import InputError
-from tactile.frames import compose
+from tactile.base.errors import InputError
+from tactile.base.random_streams import stream
+from tactile.base.se2 import compose
+from tactile.base.types import Moment
 from tactile.slidingtip import Tip, learned
 from tactile.straintemplates import Drive, StrainTemplates, TemplateTraining, matched, smoothed, train
-from tactile.streams import stream
 from tactile.surface import (
     DOUBT,
     Meeting,
@@ -25,7 +26,6 @@ from tactile.surface import (
     through,
     touching,
 )
-from tactile.types import Moment
 from tests.flatwalls import FEELERS, RATE, SPEED, apart, met, post, wall
 
 POINTS = touching(FEELERS, 0.13)

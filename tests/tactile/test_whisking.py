@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactile.errors import InputError
+from tactile.base.errors import InputError
+from tactile.base.random_streams import stream
 from tactile.head import HeadConfig, ur10_head
-from tactile.streams import stream
 from tactile.whisking import WhiskingConfig, beside, checked, command, phase, still
 
 SHAPE = (3, 6)

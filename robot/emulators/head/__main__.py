@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from robot.emulators.head.server import serve
 from robot.emulators.head.settings import HeadEmulatorConfig
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 
 def main(words: list[str] | None = None) -> int:

@@ -12,8 +12,8 @@ from robot.mechanics import StreamConfig
 from robot.motion import MotionConfig
 from robot.scene import MazeConfig, PathConfig
 from robot.ur10.placing import PlacingConfig
+from tactile.base.config import Settings
 from tactile.head import HeadConfig
-from tactile.settings import Settings
 
 CONTROL_PORT = 30099
 """Where faults are asked for."""

@@ -28,7 +28,7 @@ from robot.emulators.ur10.settings import (
     UrEmulatorConfig,
 )
 from robot.priority import URGENT, ranked
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 BACKLOG = 0.1  # s
 PENDING = 1 << 18  # bytes that a client may leave unread before states are kept from it

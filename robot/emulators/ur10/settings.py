@@ -6,7 +6,7 @@ from typing import Annotated, Literal, NamedTuple
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
-from tactile.settings import Settings
+from tactile.base.config import Settings
 
 RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999  # fixed: the client library knows no others
 FAULT_PORT = 30098

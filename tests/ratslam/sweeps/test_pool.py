@@ -21,7 +21,7 @@ from ratslam.cli import main
 from ratslam.sweeps.pool import FOLDER, results
 from ratslam.sweeps.results import Result, read_result
 from ratslam.sweeps.study import jobs, read_study
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 ROOT = Path(__file__).parents[3]
 PATIENCE = 120.0

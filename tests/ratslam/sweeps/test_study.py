@@ -14,7 +14,7 @@ from ratslam.config import RunConfig
 from ratslam.framesettings import FrameMapConfig
 from ratslam.sweeps.plan import StudyPlan
 from ratslam.sweeps.study import Study, jobs, read_study
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 ROOT = Path(__file__).parents[3]
 MAZE = ROOT / "configs" / "whisker_maze.yaml"

@@ -14,7 +14,7 @@ from ratslam.sweeps.journal import JOURNAL, Trial, opened
 from ratslam.sweeps.pool import FOLDER
 from ratslam.sweeps.study import read_study
 from ratslam.sweeps.tuning import report, tune
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 
 TUNE = {
     "trials": 14,

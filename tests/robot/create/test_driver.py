@@ -16,7 +16,7 @@ from robot.create.driver import CreateDriver, NoAnswer, NotSafe
 from robot.create.halts import Halt, Refused
 from robot.create.link import NoPort
 from robot.create.settings import CreateConfig
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 from tests.robot.create.lines import Emulated
 
 pytest.importorskip("serial", reason="needs pyserial")

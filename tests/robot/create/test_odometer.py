@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from robot.create import wire
 from robot.create.odometer import Odometer
 from robot.emulators.create import Create, CreateEmulatorConfig
-from tactile.frames import compose
+from tactile.base.se2 import compose
 
 SPEED = st.integers(-wire.TOP_SPEED, wire.TOP_SPEED)
 LEG = st.tuples(SPEED, SPEED, st.floats(0.005, 0.5), st.integers(1, 20))  # wheels, s, readings

@@ -14,8 +14,8 @@ from robot.quasistatic import quasistatic
 from robot.sweep import cycles
 from robot.ur10.placing import PlacingConfig, tcp_of
 from robot.walls import Surroundings
+from tactile.base.random_streams import stream
 from tactile.head import HeadConfig
-from tactile.streams import stream
 from tactile.whisking import WhiskingConfig
 from tests.robot.emulators.heads import TABLE, Told, drive, world
 

@@ -13,7 +13,7 @@ from robot.head.address import Address
 from robot.head.device import Gone, Identity, Stalled, UsbBridge, identity, open_bridge
 from robot.head.settings import HeadLinkConfig
 from robot.head.wire import ENDPOINT_IN, ENDPOINT_OUT, REQUEST_IN, REQUEST_OUT, Request
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 from tests.robot.head.memory import MemoryHead
 
 usb = pytest.importorskip("usb.core", reason="pyusb is not installed")

@@ -12,7 +12,7 @@ from robot.head.reader import Link, Reader
 from robot.head.settings import HeadLinkConfig
 from robot.head.wire import Command, Kind, Mode, Request
 from robot.outcome import Outcome
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 from tests.robot.head.memory import WHISKERS, MemoryHead, until
 
 QUICK = HeadLinkConfig(silence=0.1, patience=0.4)

@@ -12,7 +12,7 @@ from robot.head.reader import Reader
 from robot.head.settings import HeadLinkConfig
 from robot.head.whisk import HeadDriver, HostRcp, commands
 from robot.head.wire import ANGLE, OFF, Flag, Kind, Mode, tally
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 from tactile.head import HeadConfig, ur10_head
 from tactile.whisking import WhiskingConfig, command, still
 from tests.robot.head.memory import MemoryHead, until

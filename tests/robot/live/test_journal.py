@@ -40,8 +40,8 @@ from robot.schemas import SCHEMAS
 from robot.tape import _Whole
 from robot.ur10.states import STATE
 from robot.walk import Entry, Walk
-from tactile.errors import InputError
-from tactile.types import Cycle, Odometry
+from tactile.base.errors import InputError
+from tactile.base.types import Cycle, Odometry
 
 ROOT = Path(__file__).parents[3]
 W, RATE = 4, 200

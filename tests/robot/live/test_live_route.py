@@ -10,7 +10,7 @@ from robot.live.settings import LiveConfig
 from robot.motion import at
 from robot.scene import scene
 from robot.ur10.placing import pose_of
-from tactile.errors import InputError
+from tactile.base.errors import InputError
 from tactile.head import HeadConfig, ur10_head
 
 HEAD = ur10_head(HeadConfig())

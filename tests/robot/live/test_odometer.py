@@ -11,7 +11,7 @@ from robot.live.odometer import Odometer
 from robot.live.settings import LiveConfig
 from robot.odometry import OdometryConfig
 from robot.ur10.placing import tcp_of
-from tactile.frames import compose, integrate
+from tactile.base.se2 import compose, integrate
 
 HZ = 125.0
 

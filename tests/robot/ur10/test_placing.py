@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robot.ur10.placing import PlacingConfig, heading_of, pose_of, tcp_of, tilt_of
-from tactile.frames import between, wrap
+from tactile.base.se2 import between, wrap
 
 metres = st.floats(-2, 2)
 angles = st.one_of(st.floats(-10, 10), st.sampled_from([0.0, np.pi, -np.pi, np.pi / 2, np.pi - 1e-9, 1e-9]))
