@@ -14,7 +14,7 @@ from ratslam.gridfilter import GridEvidence, GridFilter
 from ratslam.occupancy import LAYERS
 from ratslam.recallrat import evidence_of, rat
 from tactile.base.errors import InputError
-from tactile.feelers import Feelers
+from tactile.whiskers.planar_whiskers import Feelers
 
 LIVE_SIDE = 2.5
 """Side of a map of which nothing is known beforehand, m (Fox et al. 2012, II-D)."""

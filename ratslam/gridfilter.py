@@ -21,7 +21,7 @@ from ratslam.occupancy import COSINE, EVIDENCE, SINE
 from ratslam.particles import Particles
 from ratslam.types import Action, Estimate
 from tactile.base.types import Array, Motion, Observation, Odometry
-from tactile.feelers import Feelers
+from tactile.whiskers.planar_whiskers import Feelers
 
 FREE = (0.2, 0.5, 0.8)
 """Where along a whisker that meets nothing the map is told so, as shares of its length."""

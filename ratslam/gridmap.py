@@ -15,7 +15,7 @@ from ratslam.growing import Growing
 from ratslam.marks import Marks, draw, marks_of
 from ratslam.types import Estimate
 from tactile.base.types import Observation
-from tactile.feelers import Feelers
+from tactile.whiskers.planar_whiskers import Feelers
 
 
 class GridMap:

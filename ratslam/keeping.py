@@ -19,7 +19,7 @@ from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose, inverse
 from tactile.frontend import TouchConfig
-from tactile.head import ur10_head
+from tactile.whiskers.head_geometry import ur10_head
 
 Felt = tuple[np.ndarray, np.ndarray]
 """A whisker image: brightness [R, C, K], and which whiskers [W] report at all."""

@@ -16,7 +16,7 @@ from scipy.special import expit, logit
 from ratslam.gridsettings import DrawingConfig, GridConfig
 from tactile.base.se2 import compose
 from tactile.base.types import Motion
-from tactile.feelers import Feelers
+from tactile.whiskers.planar_whiskers import Feelers
 
 FAR = 3.0
 """Standard deviations beyond which a mark is left out."""

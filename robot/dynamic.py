@@ -16,8 +16,8 @@ from robot.kinematic import MechanicsConfig
 from robot.mechanics import Beam, StreamConfig, beam, clock
 from robot.sweep import Sweep
 from tactile.contact import stiffness
-from tactile.head import Head
-from tactile.whisking import WhiskingConfig, command, still
+from tactile.whiskers.head_geometry import Head
+from tactile.whiskers.whisking import WhiskingConfig, command, still
 
 WALL = 300.0
 """Stiffness of a wall over that of a whisker."""

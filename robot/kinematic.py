@@ -17,8 +17,8 @@ from robot.walls import Surroundings
 from tactile.base.config import Settings
 from tactile.base.types import Odometry, Whisk
 from tactile.contact import ShaftConfig, stiffness
-from tactile.head import Head
-from tactile.whisking import WhiskingConfig, beside, phase
+from tactile.whiskers.head_geometry import Head
+from tactile.whiskers.whisking import WhiskingConfig, beside, phase
 
 SHAFT = ShaftConfig()
 """Of all whiskers."""

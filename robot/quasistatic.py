@@ -18,8 +18,8 @@ from robot.kinematic import MechanicsConfig
 from robot.mechanics import StreamConfig
 from robot.sweep import Sweep
 from tactile.contact import stiffness
-from tactile.head import Head
-from tactile.whisking import Drive, WhiskingConfig, command, still
+from tactile.whiskers.head_geometry import Head
+from tactile.whiskers.whisking import Drive, WhiskingConfig, command, still
 
 Law = Callable[[Drive, float, np.ndarray], tuple[np.ndarray, Drive]]
 """From drives, the time in the cycle (s) and the newest y [N, W] as sensors report it, to the protractions

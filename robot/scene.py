@@ -15,7 +15,7 @@ from robot.walls import Surroundings, Walls
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
-from tactile.head import Head, tip
+from tactile.whiskers.head_geometry import Head, tip
 
 WORD = "CCCAAACACA"
 """Seed 2's protocol (Salman & Pearson 2016, III-C)."""

@@ -14,11 +14,11 @@ from robot.training import trained
 from tactile.base.errors import InputError
 from tactile.base.types import Observation
 from tactile.calibration import Calibration, arrays, from_arrays
-from tactile.feelers import Feelers, swept
 from tactile.frontend import Frontend, TouchConfig
-from tactile.head import HeadConfig, ur10_head
 from tactile.reports import Reporting, ReportsConfig
 from tactile.straintemplates import StrainTemplates
+from tactile.whiskers.head_geometry import HeadConfig, ur10_head
+from tactile.whiskers.planar_whiskers import Feelers, swept
 
 TALLEST = 0.05
 """Of the walls of micromouse mazes, m."""

@@ -30,8 +30,8 @@ from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.types import Cycle, Whisk
 from tactile.calibration import Calibration, CalibrationConfig, calibrated
-from tactile.head import HeadConfig, ur10_head
-from tactile.whisking import WhiskingConfig, checked
+from tactile.whiskers.head_geometry import HeadConfig, ur10_head
+from tactile.whiskers.whisking import WhiskingConfig, checked
 
 CELL_SIZE = 0.05
 """Side of a pose cell that suits these mazes, m."""

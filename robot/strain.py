@@ -17,7 +17,7 @@ from scipy.signal import lfilter
 
 from robot.bending import Bent, Shaft, base_strain, bent
 from tactile.base.config import Settings
-from tactile.head import Degrees
+from tactile.whiskers.head_geometry import Degrees
 
 STEEPEST = np.radians(75.0)
 """Lean up to which a push along the shaft is passed on; beyond, a whisker buckles instead."""

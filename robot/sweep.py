@@ -13,8 +13,8 @@ from robot.motion import Path, at
 from robot.walls import FREE, Surroundings
 from tactile.base.se2 import between
 from tactile.base.types import Cycle, Odometry
-from tactile.head import Head
-from tactile.whisking import WhiskingConfig
+from tactile.whiskers.head_geometry import Head
+from tactile.whiskers.whisking import WhiskingConfig
 
 
 class Sweep(NamedTuple):

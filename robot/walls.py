@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tactile.head import Head
+from tactile.whiskers.head_geometry import Head
 
 BUCKET = 0.18
 """Side of the squares that remember which boxes are near, m."""

@@ -7,9 +7,9 @@ from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Observation, Report, Whisk
 from tactile.calibration import Calibration
 from tactile.contact import ContactConfig, sensed
-from tactile.head import HeadConfig, ur10_head
 from tactile.image import ImageConfig, observed, view_shape
 from tactile.reports import ReportsConfig
+from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 
 
 class TouchConfig(Settings):

@@ -13,7 +13,7 @@ from pydantic import PositiveFloat
 
 from tactile.base.config import Settings
 from tactile.base.types import Observation, Whisk, observation
-from tactile.head import Head, height, shaft
+from tactile.whiskers.head_geometry import Head, height, shaft
 
 DARKEST = 0.02
 """The least brightness of a whisker that touched: never as dark as one that did not."""

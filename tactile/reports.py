@@ -16,11 +16,11 @@ from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.se2 import compose
 from tactile.base.types import Moment, Motion, Observation, Odometry, Report, observation
-from tactile.feelers import Feelers
-from tactile.head import Degrees
 from tactile.slidingtip import learned
 from tactile.straintemplates import StrainTemplates, load, matched, rate_of, smoothed
 from tactile.surface import Meeting, Wall, fused, geometric, nothing, template, touching
+from tactile.whiskers.head_geometry import Degrees
+from tactile.whiskers.planar_whiskers import Feelers
 
 Mount = tuple[float, float, Degrees]
 RATE_TOLERANCE = 1e-2

@@ -19,8 +19,8 @@ from typing import NamedTuple
 import numpy as np
 
 from tactile.base.errors import InputError
-from tactile.feelers import Feelers
 from tactile.straintemplates import WHERE, StrainTemplates
+from tactile.whiskers.planar_whiskers import Feelers
 
 RATE = 50.0
 """Of the samples that are used, per second: what the low-pass leaves."""

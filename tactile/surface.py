@@ -12,9 +12,9 @@ import numpy as np
 
 from tactile.base.se2 import inverse
 from tactile.base.types import Moment
-from tactile.feelers import Feelers
 from tactile.slidingtip import DIRECTIONS, Tip, profile
 from tactile.straintemplates import Match
+from tactile.whiskers.planar_whiskers import Feelers
 
 CELL = 0.05
 """Two contacts closer than this have no line through them, m."""

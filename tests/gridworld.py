@@ -16,7 +16,7 @@ from ratslam.rows import layout_of, room
 from ratslam.session import CHUNK, run_chunk
 from ratslam.types import Estimate
 from tactile.base.types import Motion, Observation, Odometry, observation
-from tactile.feelers import Feelers
+from tactile.whiskers.planar_whiskers import Feelers
 
 MOUNTS = ((0.10, 0.08, 50), (0.13, 0.03, 15), (0.13, -0.03, -15), (0.10, -0.08, -50))
 """x m, y m, direction deg, of a Create's whiskers from left to right."""

@@ -28,9 +28,9 @@ from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose, integrate
 from tactile.base.types import Observation, stack
-from tactile.feelers import Feelers
 from tactile.reports import Mount, Reporting, ReportsConfig
 from tactile.straintemplates import StrainTemplates
+from tactile.whiskers.planar_whiskers import Feelers
 
 ROOM = 0.2
 """Free space around a start, m: the robot's, and a little."""

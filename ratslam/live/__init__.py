@@ -32,8 +32,8 @@ from robot.sensing import kept
 from robot.simulation import CELL_SIZE
 from tactile.base.errors import InputError
 from tactile.calibration import Calibration, calibrated
-from tactile.head import ur10_head
 from tactile.image import view_shape
+from tactile.whiskers.head_geometry import ur10_head
 
 RECORDING, REPORT = "session.mcap", "live.json"
 """In the run directory: what was recorded, and how the session went."""

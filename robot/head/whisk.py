@@ -10,8 +10,8 @@ from robot.head.decoder import Frames
 from robot.head.reader import Reader
 from robot.head.wire import ANGLE, OFF, Command, Flag, Kind, Mode, tally
 from tactile.base.errors import InputError
-from tactile.head import Head
-from tactile.whisking import WhiskingConfig, checked, command, phase, still
+from tactile.whiskers.head_geometry import Head
+from tactile.whiskers.whisking import WhiskingConfig, checked, command, phase, still
 
 WHERE = "live.plan.whisking"
 

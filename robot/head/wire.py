@@ -80,7 +80,7 @@ class Mode(IntEnum):
     OPEN = 0
     """Nobody in the head: the host may, by `Kind.AMPLITUDES`."""
     RCP = 1
-    """The head, as `tactile.whisking` has it."""
+    """The head, as `tactile.whiskers.whisking` has it."""
 
 
 class Request(IntEnum):

@@ -10,7 +10,7 @@ from robot.head.address import Address
 from robot.live.route import way
 from robot.live.settings import LiveConfig
 from robot.ur10.placing import tcp_of
-from tactile.head import HeadConfig, ur10_head
+from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 
 
 def controller(config: LiveConfig, head: HeadConfig, host: str | None = None) -> UrEmulatorConfig:

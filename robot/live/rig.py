@@ -22,7 +22,7 @@ from robot.live.settings import LiveConfig
 from robot.outcome import Fault, Outcome
 from robot.ur10 import dashboard
 from robot.ur10.arm import Arm
-from tactile.head import HeadConfig, ur10_head
+from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 
 TICK = 0.01
 """s between two looks."""

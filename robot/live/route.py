@@ -14,7 +14,7 @@ from robot.ur10.placing import tcp_of
 from robot.ur10.safety import Refused
 from robot.ur10.safety import checked as allowed
 from tactile.base.errors import InputError
-from tactile.head import Head
+from tactile.whiskers.head_geometry import Head
 
 
 class Moves(Protocol):

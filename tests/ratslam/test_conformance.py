@@ -17,7 +17,7 @@ from ratslam.recallrat import rat
 from ratslam.session import CHUNK, Session, capacity_at
 from ratslam.types import Action
 from tactile.base.types import Odometry, observation
-from tactile.feelers import Feelers
+from tactile.whiskers.planar_whiskers import Feelers
 
 VIEW = (3, 6, 1)
 WHISKERS = VIEW[0] * VIEW[1]

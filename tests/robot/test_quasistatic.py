@@ -14,8 +14,8 @@ from robot.quasistatic import advance, quasistatic, rest
 from robot.sweep import Sweep
 from robot.walls import FREE
 from tactile.base.random_streams import stream
-from tactile.head import HeadConfig, ur10_head
-from tactile.whisking import Drive, WhiskingConfig, command
+from tactile.whiskers.head_geometry import HeadConfig, ur10_head
+from tactile.whiskers.whisking import Drive, WhiskingConfig, command
 
 HEAD = ur10_head(HeadConfig())
 SAMPLES, CYCLES = 80, 3

@@ -22,8 +22,8 @@ from tactile.base.errors import InputError
 from tactile.base.se2 import between, wrap
 from tactile.base.types import Cycle, Observation, Whisk
 from tactile.frontend import TouchConfig
-from tactile.head import HeadConfig, RingConfig
 from tactile.image import ImageConfig
+from tactile.whiskers.head_geometry import HeadConfig, RingConfig
 
 SHORT = {"path": {"circuits": "CA"}}
 

@@ -18,8 +18,8 @@ from tactile.base.random_streams import stream
 from tactile.base.types import Cycle
 from tactile.calibration import Calibration, CalibrationConfig, calibrated
 from tactile.contact import ContactConfig, ShaftConfig, sensed, stiffness
-from tactile.head import HeadConfig, ur10_head
-from tactile.whisking import WhiskingConfig
+from tactile.whiskers.head_geometry import HeadConfig, ur10_head
+from tactile.whiskers.whisking import WhiskingConfig
 
 HEAD = ur10_head(HeadConfig())
 STREAM, MECHANICS, OPEN, RCP = (

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from robot.maze import random_loop, scattered, walls
 from robot.walls import FREE, Surroundings, Walls
 from tactile.base.random_streams import stream
-from tactile.head import Head, HeadConfig, RingConfig, shaft, ur10_head
+from tactile.whiskers.head_geometry import Head, HeadConfig, RingConfig, shaft, ur10_head
 
 STEP = 1 / 600
 """Of the march, as a share of the sweep."""

@@ -9,7 +9,16 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from pydantic import ValidationError
 
-from tactile.head import Head, HeadConfig, RingConfig, create_head, height, shaft, tip, ur10_head
+from tactile.whiskers.head_geometry import (
+    Head,
+    HeadConfig,
+    RingConfig,
+    create_head,
+    height,
+    shaft,
+    tip,
+    ur10_head,
+)
 
 CONFIGS = st.builds(
     HeadConfig,

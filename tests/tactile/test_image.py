@@ -12,8 +12,8 @@ from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Odometry, Whisk, observation
 from tactile.calibration import Calibration
 from tactile.frontend import Frontend, TouchConfig
-from tactile.head import HeadConfig, height, shaft, ur10_head
 from tactile.image import DARKEST, ImageConfig, image, observed, view_shape
+from tactile.whiskers.head_geometry import HeadConfig, height, shaft, ur10_head
 
 HEAD = ur10_head(HeadConfig())
 ODOMETRY = Odometry(0.03, 0.001, 0.02, 1.0)

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
-from tactile.head import HeadConfig, ur10_head
-from tactile.whisking import WhiskingConfig, beside, checked, command, phase, still
+from tactile.whiskers.head_geometry import HeadConfig, ur10_head
+from tactile.whiskers.whisking import WhiskingConfig, beside, checked, command, phase, still
 
 SHAPE = (3, 6)
 THRESHOLD = np.full(18, 0.04)

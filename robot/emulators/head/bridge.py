@@ -22,7 +22,7 @@ from robot.emulators.head.whiskers import Block, Whiskers
 from robot.head.wire import CHANNELS, REQUEST_IN, VERSION, Flag, Request, counts, encode, unpack
 from robot.walls import Walls
 from tactile.base.random_streams import stream
-from tactile.head import ur10_head
+from tactile.whiskers.head_geometry import ur10_head
 
 BLOCK = 0.01
 """s of samples that are made, and become readable, together."""

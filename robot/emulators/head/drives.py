@@ -12,8 +12,8 @@ from pydantic import ValidationError
 
 from robot.head.wire import ANGLE, OFF, SILENCE, Command, Kind, Mode
 from robot.quasistatic import Balance, rest
-from tactile.head import Head
-from tactile.whisking import Drive, WhiskingConfig, command, phase
+from tactile.whiskers.head_geometry import Head
+from tactile.whiskers.whisking import Drive, WhiskingConfig, command, phase
 
 RETRACTION = 0.2
 """s that whiskers take to go back to rest."""

@@ -23,7 +23,7 @@ from robot.head.wire import ENDPOINT_IN
 from robot.motion import Path
 from robot.priority import URGENT, ranked
 from robot.scene import KidnapConfig, scene
-from tactile.head import ur10_head
+from tactile.whiskers.head_geometry import ur10_head
 
 Client = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 ENDS = (ConnectionError, asyncio.IncompleteReadError, asyncio.CancelledError)

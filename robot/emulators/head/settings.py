@@ -13,7 +13,7 @@ from robot.motion import MotionConfig
 from robot.scene import MazeConfig, PathConfig
 from robot.ur10.placing import PlacingConfig
 from tactile.base.config import Settings
-from tactile.head import HeadConfig
+from tactile.whiskers.head_geometry import HeadConfig
 
 CONTROL_PORT = 30099
 """Where faults are asked for."""

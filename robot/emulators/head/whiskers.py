@@ -13,7 +13,7 @@ from robot.mechanics import StreamConfig
 from robot.quasistatic import advance, rest
 from robot.sweep import Sweep, passed, reported
 from robot.walls import FREE, Surroundings, Walls
-from tactile.head import Head
+from tactile.whiskers.head_geometry import Head
 
 STEP = 1e-4
 """Lifts are told apart by so much, m; an arm at working height is within it."""

@@ -24,7 +24,7 @@ from robot.head.wire import (
 )
 from robot.scene import KidnapConfig, Scene, scene
 from robot.walls import Walls
-from tactile.head import ur10_head
+from tactile.whiskers.head_geometry import ur10_head
 from tests.robot.live_helpers import Faults, emulator
 
 TABLE = Walls(np.array([[-9.0, -9.0, 9.0, 9.0]]), np.array([0.05]))

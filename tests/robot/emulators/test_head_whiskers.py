@@ -15,8 +15,8 @@ from robot.sweep import cycles
 from robot.ur10.placing import PlacingConfig, tcp_of
 from robot.walls import Surroundings
 from tactile.base.random_streams import stream
-from tactile.head import HeadConfig
-from tactile.whisking import WhiskingConfig
+from tactile.whiskers.head_geometry import HeadConfig
+from tactile.whiskers.whisking import WhiskingConfig
 from tests.robot.emulators.heads import TABLE, Told, drive, world
 
 PLACING = PlacingConfig(x=-0.4, y=0.3, z=0.12, yaw_deg=30.0)

@@ -16,8 +16,8 @@ from robot.head.reader import Link, Reader
 from robot.head.settings import HeadLinkConfig
 from robot.head.whisk import HeadDriver
 from robot.head.wire import ANGLE, Flag
-from tactile.head import HeadConfig, ur10_head
-from tactile.whisking import WhiskingConfig
+from tactile.whiskers.head_geometry import HeadConfig, ur10_head
+from tactile.whiskers.whisking import WhiskingConfig
 from tests.robot.head.memory import until
 
 pytest.importorskip("usb.core", reason="pyusb is not installed")

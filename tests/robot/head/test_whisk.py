@@ -13,8 +13,8 @@ from robot.head.settings import HeadLinkConfig
 from robot.head.whisk import HeadDriver, HostRcp, commands
 from robot.head.wire import ANGLE, OFF, Flag, Kind, Mode, tally
 from tactile.base.errors import InputError
-from tactile.head import HeadConfig, ur10_head
-from tactile.whisking import WhiskingConfig, command, still
+from tactile.whiskers.head_geometry import HeadConfig, ur10_head
+from tactile.whiskers.whisking import WhiskingConfig, command, still
 from tests.robot.head.memory import MemoryHead, until
 
 HEAD = ur10_head(HeadConfig())

@@ -11,7 +11,7 @@ from robot.motion import at
 from robot.scene import scene
 from robot.ur10.placing import pose_of
 from tactile.base.errors import InputError
-from tactile.head import HeadConfig, ur10_head
+from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 
 HEAD = ur10_head(HeadConfig())
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tactile.head import Head
+from tactile.whiskers.head_geometry import Head
 
 
 class Feelers(NamedTuple):

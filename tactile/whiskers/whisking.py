@@ -16,7 +16,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.types import Array
-from tactile.head import Head
+from tactile.whiskers.head_geometry import Head
 
 
 class WhiskingConfig(Settings):
