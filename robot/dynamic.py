@@ -15,7 +15,7 @@ from scipy.linalg import expm
 from robot.kinematic import MechanicsConfig
 from robot.mechanics import Beam, StreamConfig, beam, clock
 from robot.sweep import Sweep
-from tactile.contact import stiffness
+from tactile.features.contact import stiffness
 from tactile.whiskers.head_geometry import Head
 from tactile.whiskers.whisking import WhiskingConfig, command, still
 

@@ -16,7 +16,7 @@ from robot.motion import Path, at
 from robot.walls import Surroundings
 from tactile.base.config import Settings
 from tactile.base.types import Odometry, Whisk
-from tactile.contact import ShaftConfig, stiffness
+from tactile.features.contact import ShaftConfig, stiffness
 from tactile.whiskers.head_geometry import Head
 from tactile.whiskers.whisking import WhiskingConfig, beside, phase
 

@@ -9,7 +9,7 @@ from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 from scipy.linalg import eigh
 
 from tactile.base.config import Settings
-from tactile.contact import ShaftConfig
+from tactile.features.contact import ShaftConfig
 
 LINE = np.linspace(0.0, 1.0, 401)
 """Shares of a whisker's length at which it is integrated."""

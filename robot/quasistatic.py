@@ -17,7 +17,7 @@ import numpy as np
 from robot.kinematic import MechanicsConfig
 from robot.mechanics import StreamConfig
 from robot.sweep import Sweep
-from tactile.contact import stiffness
+from tactile.features.contact import stiffness
 from tactile.whiskers.head_geometry import Head
 from tactile.whiskers.whisking import Drive, WhiskingConfig, command, still
 

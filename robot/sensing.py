@@ -13,7 +13,7 @@ from robot.source import Rigged, Sample, Source, rig_of
 from robot.training import trained
 from tactile.base.errors import InputError
 from tactile.base.types import Observation
-from tactile.calibration import Calibration, arrays, from_arrays
+from tactile.features.calibration import Calibration, arrays, from_arrays
 from tactile.frontend import Frontend, TouchConfig
 from tactile.reports import Reporting, ReportsConfig
 from tactile.straintemplates import StrainTemplates

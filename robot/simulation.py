@@ -29,7 +29,7 @@ from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.types import Cycle, Whisk
-from tactile.calibration import Calibration, CalibrationConfig, calibrated
+from tactile.features.calibration import Calibration, CalibrationConfig, calibrated
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 from tactile.whiskers.whisking import WhiskingConfig, checked
 

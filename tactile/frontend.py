@@ -5,9 +5,9 @@ from __future__ import annotations
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Observation, Report, Whisk
-from tactile.calibration import Calibration
-from tactile.contact import ContactConfig, sensed
-from tactile.image import ImageConfig, observed, view_shape
+from tactile.features.calibration import Calibration
+from tactile.features.contact import ContactConfig, sensed
+from tactile.features.whisker_image import ImageConfig, observed, view_shape
 from tactile.reports import ReportsConfig
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 

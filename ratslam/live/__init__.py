@@ -31,8 +31,8 @@ from robot.outcome import Fault, Outcome
 from robot.sensing import kept
 from robot.simulation import CELL_SIZE
 from tactile.base.errors import InputError
-from tactile.calibration import Calibration, calibrated
-from tactile.image import view_shape
+from tactile.features.calibration import Calibration, calibrated
+from tactile.features.whisker_image import view_shape
 from tactile.whiskers.head_geometry import ur10_head
 
 RECORDING, REPORT = "session.mcap", "live.json"

@@ -21,8 +21,8 @@ from robot.source import Rigged, Sample, Source, rig_of
 from tactile.base.errors import InputError
 from tactile.base.se2 import between, wrap
 from tactile.base.types import Cycle, Observation, Whisk
+from tactile.features.whisker_image import ImageConfig
 from tactile.frontend import TouchConfig
-from tactile.image import ImageConfig
 from tactile.whiskers.head_geometry import HeadConfig, RingConfig
 
 SHORT = {"path": {"circuits": "CA"}}

@@ -14,7 +14,7 @@ from robot.layout import ArenaConfig, arena
 from robot.polygons import crossing, distance, edges, square
 from robot.strain import ShakeConfig, WhiskersConfig, among, fan, sampled, shaken, strained
 from tactile.base.random_streams import stream
-from tactile.contact import ShaftConfig, stiffness
+from tactile.features.contact import ShaftConfig, stiffness
 
 SEEDS = st.integers(0, 10**6)
 CONFIG = WhiskersConfig()

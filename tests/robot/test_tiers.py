@@ -16,8 +16,8 @@ from robot.walls import Surroundings, Walls
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.types import Cycle
-from tactile.calibration import Calibration, CalibrationConfig, calibrated
-from tactile.contact import ContactConfig, ShaftConfig, sensed, stiffness
+from tactile.features.calibration import Calibration, CalibrationConfig, calibrated
+from tactile.features.contact import ContactConfig, ShaftConfig, sensed, stiffness
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 from tactile.whiskers.whisking import WhiskingConfig
 

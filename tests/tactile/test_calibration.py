@@ -10,7 +10,13 @@ from hypothesis import strategies as st
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.types import Cycle, Odometry
-from tactile.calibration import Calibration, CalibrationConfig, arrays, calibrated, from_arrays
+from tactile.features.calibration import (
+    Calibration,
+    CalibrationConfig,
+    arrays,
+    calibrated,
+    from_arrays,
+)
 
 CONFIG = CalibrationConfig()
 

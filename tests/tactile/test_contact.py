@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.types import Cycle, Odometry
-from tactile.calibration import Calibration
-from tactile.contact import ContactConfig, ShaftConfig, reached, sensed, stiffness
+from tactile.features.calibration import Calibration
+from tactile.features.contact import ContactConfig, ShaftConfig, reached, sensed, stiffness
 
 AMPLITUDE = 1.134
 W = 18

@@ -10,9 +10,9 @@ from hypothesis.extra.numpy import arrays
 
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Odometry, Whisk, observation
-from tactile.calibration import Calibration
+from tactile.features.calibration import Calibration
+from tactile.features.whisker_image import DARKEST, ImageConfig, image, observed, view_shape
 from tactile.frontend import Frontend, TouchConfig
-from tactile.image import DARKEST, ImageConfig, image, observed, view_shape
 from tactile.whiskers.head_geometry import HeadConfig, height, shaft, ur10_head
 
 HEAD = ur10_head(HeadConfig())

@@ -15,7 +15,7 @@ from pydantic import Field, PositiveFloat
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.types import Array, Cycle, Whisk
-from tactile.calibration import Calibration, sample_rate
+from tactile.features.calibration import Calibration, sample_rate
 
 
 class ShaftConfig(Settings):

@@ -1,0 +1,1 @@
+"""From raw signals to contact features and whisker images."""
