@@ -13,10 +13,10 @@ from robot.training import trained
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.types import Moment
-from tactile.reports import ReportsConfig
-from tactile.slidingtip import learned
-from tactile.straintemplates import StrainTemplates, matched, save, smoothed
-from tactile.surface import Meeting, fused, touching
+from tactile.wall_estimation.estimators import Meeting, fused, touching
+from tactile.wall_estimation.report_frontend import ReportsConfig
+from tactile.wall_estimation.sliding_tip import learned
+from tactile.wall_estimation.strain_templates import StrainTemplates, matched, save, smoothed
 
 SECONDS = (0.5, 1.0, 2.0)
 """Of the drive on after first contact that is shown to the estimators: in arenas it lasts 1 to 2 s mostly."""

@@ -15,8 +15,8 @@ from tactile.base.errors import InputError
 from tactile.base.types import Observation
 from tactile.features.calibration import Calibration, arrays, from_arrays
 from tactile.frontend import Frontend, TouchConfig
-from tactile.reports import Reporting, ReportsConfig
-from tactile.straintemplates import StrainTemplates
+from tactile.wall_estimation.report_frontend import Reporting, ReportsConfig
+from tactile.wall_estimation.strain_templates import StrainTemplates
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 from tactile.whiskers.planar_whiskers import Feelers, swept
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from robot.roving import RovingConfig, drive_into_wall
 from tactile.base.random_streams import stream
-from tactile.straintemplates import StrainTemplates, TemplateTraining, driven, train
+from tactile.wall_estimation.strain_templates import StrainTemplates, TemplateTraining, driven, train
 
 
 def trained(config: RovingConfig, training: TemplateTraining | None = None) -> StrainTemplates:

@@ -8,7 +8,7 @@ from tactile.base.types import Cycle, Observation, Report, Whisk
 from tactile.features.calibration import Calibration
 from tactile.features.contact import ContactConfig, sensed
 from tactile.features.whisker_image import ImageConfig, observed, view_shape
-from tactile.reports import ReportsConfig
+from tactile.wall_estimation.report_frontend import ReportsConfig
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 
 

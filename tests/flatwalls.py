@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tactile.base.types import Moment, Motion, Odometry, Report
-from tactile.reports import ReportsConfig
+from tactile.wall_estimation.report_frontend import ReportsConfig
 
 RATE, SPEED, CONTACT = 2000.0, 0.02, 2e-4
 FEELERS = ReportsConfig().feelers

@@ -14,9 +14,16 @@ from robot.roving import RovingConfig, drive_into_wall, roving
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose
 from tactile.base.types import Moment, Odometry, Report
-from tactile.reports import Reporting, ReportsConfig
-from tactile.straintemplates import StrainTemplates, TemplateTraining, driven, matched, smoothed, train
-from tactile.surface import touching
+from tactile.wall_estimation.estimators import touching
+from tactile.wall_estimation.report_frontend import Reporting, ReportsConfig
+from tactile.wall_estimation.strain_templates import (
+    StrainTemplates,
+    TemplateTraining,
+    driven,
+    matched,
+    smoothed,
+    train,
+)
 from tests.flatwalls import apart
 
 CONFIG = RovingConfig()

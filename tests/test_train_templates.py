@@ -14,7 +14,7 @@ from robot.roving import RovingConfig, roving
 from robot.sensing import observation_of, sensing
 from robot.training import trained
 from tactile.base.errors import InputError
-from tactile.straintemplates import StrainTemplates, load
+from tactile.wall_estimation.strain_templates import StrainTemplates, load
 
 CONFIG = RovingConfig(seed=4)
 

@@ -28,8 +28,8 @@ from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose, integrate
 from tactile.base.types import Observation, stack
-from tactile.reports import Mount, Reporting, ReportsConfig
-from tactile.straintemplates import StrainTemplates
+from tactile.wall_estimation.report_frontend import Mount, Reporting, ReportsConfig
+from tactile.wall_estimation.strain_templates import StrainTemplates
 from tactile.whiskers.planar_whiskers import Feelers
 
 ROOM = 0.2

@@ -13,9 +13,15 @@ from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose
 from tactile.base.types import Moment, Motion, Observation, Odometry, Report, stack
-from tactile.reports import Reporting, ReportsConfig
-from tactile.straintemplates import Drive, StrainTemplates, TemplateTraining, save, train
-from tactile.surface import across
+from tactile.wall_estimation.estimators import across
+from tactile.wall_estimation.report_frontend import Reporting, ReportsConfig
+from tactile.wall_estimation.strain_templates import (
+    Drive,
+    StrainTemplates,
+    TemplateTraining,
+    save,
+    train,
+)
 from tests.flatwalls import RATE, apart, met, report, wall
 
 TRAINING = TemplateTraining()

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
-from tactile.straintemplates import (
+from tactile.wall_estimation.strain_templates import (
     Drive,
     StrainTemplates,
     TemplateTraining,

@@ -11,9 +11,7 @@ from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose
 from tactile.base.types import Moment
-from tactile.slidingtip import Tip, learned
-from tactile.straintemplates import Drive, StrainTemplates, TemplateTraining, matched, smoothed, train
-from tactile.surface import (
+from tactile.wall_estimation.estimators import (
     DOUBT,
     Meeting,
     Wall,
@@ -25,6 +23,15 @@ from tactile.surface import (
     template,
     through,
     touching,
+)
+from tactile.wall_estimation.sliding_tip import Tip, learned
+from tactile.wall_estimation.strain_templates import (
+    Drive,
+    StrainTemplates,
+    TemplateTraining,
+    matched,
+    smoothed,
+    train,
 )
 from tests.flatwalls import FEELERS, RATE, SPEED, apart, met, post, wall
 

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tactile.base.errors import InputError
-from tactile.straintemplates import WHERE, StrainTemplates
+from tactile.wall_estimation.strain_templates import WHERE, StrainTemplates
 from tactile.whiskers.planar_whiskers import Feelers
 
 RATE = 50.0

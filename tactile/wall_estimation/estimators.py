@@ -12,8 +12,8 @@ import numpy as np
 
 from tactile.base.se2 import inverse
 from tactile.base.types import Moment
-from tactile.slidingtip import DIRECTIONS, Tip, profile
-from tactile.straintemplates import Match
+from tactile.wall_estimation.sliding_tip import DIRECTIONS, Tip, profile
+from tactile.wall_estimation.strain_templates import Match
 from tactile.whiskers.planar_whiskers import Feelers
 
 CELL = 0.05

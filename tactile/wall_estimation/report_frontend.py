@@ -16,9 +16,17 @@ from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.se2 import compose
 from tactile.base.types import Moment, Motion, Observation, Odometry, Report, observation
-from tactile.slidingtip import learned
-from tactile.straintemplates import StrainTemplates, load, matched, rate_of, smoothed
-from tactile.surface import Meeting, Wall, fused, geometric, nothing, template, touching
+from tactile.wall_estimation.estimators import (
+    Meeting,
+    Wall,
+    fused,
+    geometric,
+    nothing,
+    template,
+    touching,
+)
+from tactile.wall_estimation.sliding_tip import learned
+from tactile.wall_estimation.strain_templates import StrainTemplates, load, matched, rate_of, smoothed
 from tactile.whiskers.head_geometry import Degrees
 from tactile.whiskers.planar_whiskers import Feelers
 

@@ -1,0 +1,1 @@
+"""Walls from the strain of a Create's whiskers."""
