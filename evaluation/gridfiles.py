@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from evaluation.grid import Grid, Truth, check_grid
+from evaluation.metrics.occupancy_grid import Grid, Truth, check_grid
 from tactile.base.errors import InputError
 
 

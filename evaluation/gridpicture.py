@@ -12,9 +12,9 @@ import numpy as np
 
 from evaluation import drawing
 from evaluation.drawing import GREEN, INK, QUIET, VERMILLION, WIDTH, YELLOW
-from evaluation.grid import Grid
-from evaluation.griderror import HEADLINE
-from evaluation.gridscore import GridScore
+from evaluation.metrics.grid_error import HEADLINE
+from evaluation.metrics.grid_score import GridScore
+from evaluation.metrics.occupancy_grid import Grid
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,9 +8,9 @@ import numpy as np
 
 from evaluation import drawing
 from evaluation.drawing import BLUE, FAINT, GREY, INK, VERMILLION
-from evaluation.exm import ExperienceMetric, experience_metric
-from evaluation.run import Run, known
-from evaluation.scorecard import Scorecard
+from evaluation.metrics.experience_metric import ExperienceMetric, experience_metric
+from evaluation.metrics.run_arrays import Run, known
+from evaluation.metrics.scorecard import Scorecard
 from tactile.base.errors import InputError
 
 if TYPE_CHECKING:

@@ -8,9 +8,9 @@ import numpy as np
 
 from evaluation import drawing
 from evaluation.drawing import BLUE, GREEN, GREY, INK, PURPLE, VERMILLION, YELLOW
-from evaluation.run import Run, known
-from evaluation.scorecard import Scorecard
-from evaluation.trajectory import align
+from evaluation.metrics.run_arrays import Run, known
+from evaluation.metrics.scorecard import Scorecard
+from evaluation.metrics.trajectory import align
 from tactile.base.se2 import between, compose
 
 if TYPE_CHECKING:

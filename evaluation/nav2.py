@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import yaml
 
-from evaluation.grid import Grid, check_grid
+from evaluation.metrics.occupancy_grid import Grid, check_grid
 from tactile.base.atomic_write import in_one_piece
 from tactile.base.errors import InputError
 

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from evaluation.run import Run
-from evaluation.scorecard import Scorecard
-from evaluation.table import read_table
-from evaluation.trajectory import read_tum
+from evaluation.metrics.run_arrays import Run
+from evaluation.metrics.scorecard import Scorecard
+from evaluation.metrics.text_table import read_table
+from evaluation.metrics.trajectory import read_tum
 from tactile.base.errors import InputError
 
 

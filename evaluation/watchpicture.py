@@ -9,8 +9,8 @@ import numpy as np
 from evaluation import drawing
 from evaluation.drawing import BLUE, FAINT, GREY, INK, QUIET, VERMILLION, WIDTH, YELLOW
 from evaluation.mappicture import NO_WALLS, broken, paint_walls
+from evaluation.metrics.trajectory import align
 from evaluation.progress import Progress, counted
-from evaluation.trajectory import align
 from tactile.base.se2 import between, compose
 
 if TYPE_CHECKING:

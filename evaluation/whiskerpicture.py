@@ -8,11 +8,11 @@ import numpy as np
 
 from evaluation import drawing
 from evaluation.drawing import FAINT, GREY, INK, QUIET
-from evaluation.exm import base_end
 from evaluation.images import Images
 from evaluation.mappicture import NO_WALLS, broken, corners, edges, paint_walls
-from evaluation.run import Run, known
-from evaluation.scorecard import Scorecard
+from evaluation.metrics.experience_metric import base_end
+from evaluation.metrics.run_arrays import Run, known
+from evaluation.metrics.scorecard import Scorecard
 from tactile.base.errors import InputError
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.energy import energy_all_pairs
-from evaluation.trajectory import ate
+from evaluation.metrics.energy_metric import energy_all_pairs
+from evaluation.metrics.trajectory import ate
 from ratslam.config import RunConfig
 from ratslam.playing import session_of
 from ratslam.run import located, open_source

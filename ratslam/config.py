@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, NonNegativeInt, ValidationInfo, field_validator
 
-from evaluation.exm import ExmConfig
+from evaluation.metrics.experience_metric import ExmConfig
 from ratslam.cellsettings import PoseCellConfig
 from ratslam.experience import ExperienceConfig
 from ratslam.framesettings import FrameMapConfig

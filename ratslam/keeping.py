@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from evaluation.grid import Grid, Truth, centres
 from evaluation.gridfiles import read_grid, write_truth
-from evaluation.gridscore import score_grid
 from evaluation.images import Images, write_images
+from evaluation.metrics.grid_score import score_grid
+from evaluation.metrics.occupancy_grid import Grid, Truth, centres
 from evaluation.nav2 import write_nav2
 from evaluation.rundirectory import write_walls
 from ratslam.storage import RunDirectory

@@ -12,7 +12,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from evaluation.scorecard import Scorecard
+from evaluation.metrics.scorecard import Scorecard
 from ratslam.config import RunConfig
 from ratslam.playing import Playing, playing
 from ratslam.session import CHUNK

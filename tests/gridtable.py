@@ -129,8 +129,8 @@ def _off(arena: Any, pose: np.ndarray, told: Any) -> float:
 
 
 def _chart(session: Any, source: Any) -> tuple[float, ...]:
-    from evaluation.grid import Grid
-    from evaluation.gridscore import score_grid
+    from evaluation.metrics.grid_score import score_grid
+    from evaluation.metrics.occupancy_grid import Grid
     from ratslam.keeping import truth_of
 
     chart = session.map

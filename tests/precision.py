@@ -98,7 +98,7 @@ def sessions(task: Task) -> dict[str, Figures]:
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from evaluation.trajectory import ate
+    from evaluation.metrics.trajectory import ate
     from ratslam.config import RunConfig
     from ratslam.trials.touch import figures, play, session_log
 

@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evaluation.frontierpicture import Mark, draw_frontier, placed
-from evaluation.scorecard import Quantity
+from evaluation.metrics.scorecard import Quantity
 from ratslam.cli import main
 from ratslam.frontier import measuring
 from ratslam.frontier.cores import one_core, others

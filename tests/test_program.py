@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.trajectory import read_tum
+from evaluation.metrics.trajectory import read_tum
 from ratslam.cli import main
 
 ROOT = Path(__file__).parents[1]

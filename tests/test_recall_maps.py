@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.trajectory import ate
+from evaluation.metrics.trajectory import ate
 from ratslam.closures import Verdict
 from ratslam.rat import RatConfig
 from ratslam.recallrat import rat

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evaluation.scorecard import Quantity
+from evaluation.metrics.scorecard import Quantity
 from ratslam.cli import main
 from ratslam.config import RunConfig
 from ratslam.occupancy import LAYERS

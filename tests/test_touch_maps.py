@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from evaluation.energy import energy_all_pairs
+from evaluation.metrics.energy_metric import energy_all_pairs
 from ratslam.closures import Verdict
 from ratslam.config import TOUCH, RunConfig
 from ratslam.playing import readings, session_of

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from evaluation.exm import experience_metric
+from evaluation.metrics.experience_metric import experience_metric
 from ratslam.config import RunConfig
 from ratslam.playing import readings, session_of
 from ratslam.run import open_source

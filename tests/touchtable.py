@@ -93,8 +93,8 @@ def run(row: str, maze: int, seed: int, matcher: str = "recall") -> Figures:
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from evaluation.energy import energy_all_pairs
-    from evaluation.exm import ExmConfig, experience_metric
+    from evaluation.metrics.energy_metric import energy_all_pairs
+    from evaluation.metrics.experience_metric import ExmConfig, experience_metric
     from ratslam.config import RunConfig
     from ratslam.playing import readings, session_of
     from ratslam.run import open_source

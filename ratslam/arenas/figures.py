@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from evaluation.griderror import CONVENTIONS, Convention
-from evaluation.gridscore import GridScore
+from evaluation.metrics.grid_error import CONVENTIONS, Convention
+from evaluation.metrics.grid_score import GridScore
 from tactile.base.se2 import wrap
 
 NEAR = 0.1

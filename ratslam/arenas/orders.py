@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.exm import bootstrap
-from evaluation.griderror import CONVENTIONS, Convention
+from evaluation.metrics.experience_metric import bootstrap
+from evaluation.metrics.grid_error import CONVENTIONS, Convention
 from ratslam.arenas.figures import word_of
 from ratslam.arenas.protocols import FILTERED, PAPERS, RECKONED, TRUE
 from ratslam.arenas.trials import Result

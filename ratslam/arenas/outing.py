@@ -13,7 +13,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from evaluation.grid import Grid, Truth, centres
+from evaluation.metrics.occupancy_grid import Grid, Truth, centres
 from ratslam.config import RunConfig
 from ratslam.gridfilter import GridFilter
 from ratslam.gridsettings import GridConfig

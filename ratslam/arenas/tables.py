@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from evaluation.griderror import HEADLINE
-from evaluation.gridscore import pool_grids
-from evaluation.gridscore import table as full
+from evaluation.metrics.grid_error import HEADLINE
+from evaluation.metrics.grid_score import pool_grids
+from evaluation.metrics.grid_score import table as full
 from ratslam.arenas.figures import CLOSED, word_of
 from ratslam.arenas.orders import orders
 from ratslam.arenas.protocols import FILTERED, PAPERS, PATHS, RECKONED, TRUE, Protocol

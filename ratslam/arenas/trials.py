@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.grid import Grid
-from evaluation.gridscore import GridScore, score_grid
+from evaluation.metrics.grid_score import GridScore, score_grid
+from evaluation.metrics.occupancy_grid import Grid
 from ratslam.arenas.figures import measured, off, scored
 from ratslam.arenas.outing import Mapped, Outing, chart, felt, felt_marks, mapped, outing, truth_of
 from ratslam.arenas.protocols import FILTERED, RECKONED, TRUE

@@ -38,7 +38,7 @@ def add(command: Add) -> None:
 
 def _live(arguments: argparse.Namespace) -> int:
     prepare_jax()
-    from evaluation.scorecard import table
+    from evaluation.metrics.scorecard import table
     from ratslam.live import live
     from robot.outcome import Outcome
 

@@ -53,9 +53,9 @@ def add(command: Add) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     prepare_jax()
-    from evaluation.gridscore import GridScore
-    from evaluation.gridscore import table as chart
-    from evaluation.scorecard import table
+    from evaluation.metrics.grid_score import GridScore
+    from evaluation.metrics.grid_score import table as chart
+    from evaluation.metrics.scorecard import table
     from ratslam.config import RunConfig
     from ratslam.run import run
     from ratslam.yamlfile import load, override, validate
@@ -84,11 +84,11 @@ def _simulate(arguments: argparse.Namespace) -> int:
 
 
 def _score(arguments: argparse.Namespace) -> int:
-    from evaluation.energy import read_relations
-    from evaluation.exm import ExmConfig
-    from evaluation.log import read_log
+    from evaluation.metrics.energy_metric import read_relations
+    from evaluation.metrics.experience_log import read_log
+    from evaluation.metrics.experience_metric import ExmConfig
+    from evaluation.metrics.scorecard import score, score_log, table
     from evaluation.rundirectory import read_run
-    from evaluation.scorecard import score, score_log, table
 
     exm = ExmConfig(mode=arguments.mode, base=arguments.base)
     if arguments.log.is_dir():

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from evaluation.scorecard import Scorecard
+from evaluation.metrics.scorecard import Scorecard
 from ratslam.config import RunConfig
 from ratslam.live.mapper import Mapper, Order
 from ratslam.run import interrupts, located

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from evaluation.scorecard import Scorecard
+from evaluation.metrics.scorecard import Scorecard
 from ratslam.config import RunConfig
 from robot.priority import PATIENT, ranked
 from robot.source import Sample

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.exm import experience_metric
+from evaluation.metrics.experience_metric import experience_metric
 from ratslam.config import RunConfig
 from ratslam.reproduce.extras import extras
 from ratslam.reproduce.pictures import picture

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from evaluation.log import creation_rows
+from evaluation.metrics.experience_log import creation_rows
 from ratslam.reproduce.protocols import LATER
 from ratslam.trials.touch import FALSE, Played, lap_ends
 

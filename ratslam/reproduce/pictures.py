@@ -17,8 +17,8 @@ from evaluation.figures import (
     draw_experiences,
     draw_measured,
 )
-from evaluation.log import creation_rows
-from evaluation.trajectory import align
+from evaluation.metrics.experience_log import creation_rows
+from evaluation.metrics.trajectory import align
 from ratslam.reproduce.extras import clockwise_steps, lap_of
 from ratslam.reproduce.protocols import METHODS, Protocol
 from ratslam.reproduce.verdicts import LABELS, RATIOS, Row, column

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.exm import bootstrap
+from evaluation.metrics.experience_metric import bootstrap
 from ratslam.reproduce.protocols import METHODS, Claim, Protocol
 
 ALIKE = 0.05

@@ -18,12 +18,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from evaluation.energy import read_relations
-from evaluation.griderror import HEADLINE
 from evaluation.gridfiles import read_grid
-from evaluation.gridscore import score_grid
-from evaluation.run import Run
-from evaluation.scorecard import Quantity, score
+from evaluation.metrics.energy_metric import read_relations
+from evaluation.metrics.grid_error import HEADLINE
+from evaluation.metrics.grid_score import score_grid
+from evaluation.metrics.run_arrays import Run
+from evaluation.metrics.scorecard import Quantity, score
 from ratslam.config import RunConfig
 from ratslam.keeping import truth_of
 from ratslam.playing import Anytimes, readings, session_of

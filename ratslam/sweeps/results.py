@@ -8,7 +8,7 @@ from typing import Any
 
 from pydantic import Field
 
-from evaluation.scorecard import Quantity
+from evaluation.metrics.scorecard import Quantity
 from ratslam.sweeps.quantities import MEASURED
 from tactile.base.config import Settings
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import BaseModel
 
-from evaluation.trajectory import ate
+from evaluation.metrics.trajectory import ate
 from ratslam.config import RunConfig
 from ratslam.playing import Anytimes, readings, session_of
 from ratslam.run import located, open_source

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from evaluation.energy import energy_all_pairs
-from evaluation.exm import ExmConfig, ExperienceMetric, experience_metric
+from evaluation.metrics.energy_metric import energy_all_pairs
+from evaluation.metrics.experience_metric import ExmConfig, ExperienceMetric, experience_metric
 from ratslam.config import RunConfig, SessionConfig
 from ratslam.rat import RatConfig
 from ratslam.recallrat import rat

@@ -7,8 +7,8 @@ from functools import partial
 import numpy as np
 import pytest
 
-from evaluation.energy import energy_all_pairs
-from evaluation.exm import experience_metric
+from evaluation.metrics.energy_metric import energy_all_pairs
+from evaluation.metrics.experience_metric import experience_metric
 from ratslam.config import RunConfig
 from ratslam.playing import readings, session_of
 from ratslam.run import open_source

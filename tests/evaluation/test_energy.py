@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evaluation.energy import (
+from evaluation.metrics.energy_metric import (
     Relations,
     energy,
     energy_all_pairs,

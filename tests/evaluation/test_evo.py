@@ -10,7 +10,7 @@ import subprocess
 import numpy as np
 import pytest
 
-from evaluation.trajectory import ate, rpe, write_tum
+from evaluation.metrics.trajectory import ate, rpe, write_tum
 
 
 @pytest.fixture

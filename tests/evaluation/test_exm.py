@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evaluation.exm import (
+from evaluation.metrics.experience_log import changes, creation_poses
+from evaluation.metrics.experience_metric import (
     LITERAL_WARNING,
     MODES,
     NO_RELOCALISATION,
@@ -18,7 +19,6 @@ from evaluation.exm import (
     pool,
     relocalisations,
 )
-from evaluation.log import changes, creation_poses
 from tactile.base.errors import InputError
 from tactile.base.se2 import wrap
 

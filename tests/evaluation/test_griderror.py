@@ -10,7 +10,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evaluation.grid import (
+from evaluation.metrics.grid_error import (
+    CONVENTIONS,
+    HEADLINE,
+    PRINTED,
+    Convention,
+    grid_error,
+    pool_errors,
+    smoothed,
+)
+from evaluation.metrics.grid_score import CLAMP, GridScore, pool_grids, score_grid, table
+from evaluation.metrics.occupancy_grid import (
     PRIOR,
     Grid,
     Truth,
@@ -20,8 +30,6 @@ from evaluation.grid import (
     surface,
     touched,
 )
-from evaluation.griderror import CONVENTIONS, HEADLINE, PRINTED, Convention, grid_error, pool_errors, smoothed
-from evaluation.gridscore import CLAMP, GridScore, pool_grids, score_grid, table
 
 law = settings(max_examples=25)
 CELL = 0.05

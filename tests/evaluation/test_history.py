@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evaluation.exm import experience_metric
 from evaluation.history import draw_history
-from evaluation.scorecard import score
+from evaluation.metrics.experience_metric import experience_metric
+from evaluation.metrics.scorecard import score
 
 
 def marks(figure):

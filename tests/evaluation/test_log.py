@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from evaluation.log import read_log
-from evaluation.scorecard import score_log, table
+from evaluation.metrics.experience_log import read_log
+from evaluation.metrics.scorecard import score_log, table
 from tactile.base.errors import InputError
 
 ROWS = "0,7,0.1,0.2,3\n0.5,-1,0.1,0.2,-3\n"

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
-from evaluation.grid import PRIOR, Grid
 from evaluation.gridfiles import read_grid, write_grid
+from evaluation.metrics.occupancy_grid import PRIOR, Grid
 from evaluation.nav2 import (
     FREE_THRESH,
     OCCUPIED_THRESH,

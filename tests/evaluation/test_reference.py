@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evaluation.energy import read_relations, relation_errors
-from evaluation.trajectory import ate
+from evaluation.metrics.energy_metric import read_relations, relation_errors
+from evaluation.metrics.trajectory import ate
 from tactile.base.se2 import integrate
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from evaluation.mappicture import broken, draw_map, headline
+from evaluation.metrics.scorecard import score
 from evaluation.report import save_map
-from evaluation.scorecard import score
 
 
 def labels(figure):

@@ -7,9 +7,9 @@ import json
 import numpy as np
 import pytest
 
-from evaluation.energy import Relations
-from evaluation.exm import ExmConfig
-from evaluation.scorecard import Scorecard, score, table
+from evaluation.metrics.energy_metric import Relations
+from evaluation.metrics.experience_metric import ExmConfig
+from evaluation.metrics.scorecard import Scorecard, score, table
 from tactile.base.errors import InputError
 
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from evaluation.trajectory import (
+from evaluation.metrics.trajectory import (
     align,
     anytime,
     anytime_errors,

@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from matplotlib.collections import PatchCollection
 
 from evaluation.images import Images, read_images, write_images
-from evaluation.scorecard import score
+from evaluation.metrics.scorecard import score
 from evaluation.whiskerpicture import SHOWN, draw_whiskers
 from tactile.base.errors import InputError
 
@@ -99,7 +99,7 @@ def test_heads_show_the_images_of_the_steps_they_stand_for(circle):
 @settings(max_examples=15)
 @given(st.floats(-7, 7), st.floats(-np.pi, np.pi))
 def test_a_sector_points_where_its_whisker_does(heading, first):
-    from evaluation.run import Run
+    from evaluation.metrics.run_arrays import Run
 
     pose = np.array([[0.3, -0.2, heading]])
     run = Run(

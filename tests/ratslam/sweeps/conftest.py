@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from evaluation.scorecard import Quantity
+from evaluation.metrics.scorecard import Quantity
 from ratslam.sweeps.results import Result
 from ratslam.sweeps.study import Job
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import jax
 import pytest
 
-from evaluation.gridscore import score_grid
+from evaluation.metrics.grid_score import score_grid
 from evaluation.rundirectory import read_card
 from ratslam.run import run
 from ratslam.sweeps.jobs import run_job

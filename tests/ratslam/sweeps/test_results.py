@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evaluation.scorecard import Quantity
+from evaluation.metrics.scorecard import Quantity
 from ratslam.sweeps.quantities import DIRECTIONS, MAIN
 from ratslam.sweeps.report import SHORT, label, rows, save, spread, table
 from ratslam.sweeps.results import Memory, Result, Timing, read_result, write_result

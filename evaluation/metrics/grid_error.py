@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from evaluation.grid import PRIOR, Grid, Surface, Truth, painted
+from evaluation.metrics.occupancy_grid import PRIOR, Grid, Surface, Truth, painted
 from tactile.base.config import Settings
 
 Mask = Literal["grid", "arena"]

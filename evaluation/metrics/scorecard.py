@@ -7,11 +7,24 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.energy import Energy, Relations, energy, energy_all_pairs, relation_errors, successive
-from evaluation.exm import DEFAULT, MODES, ExmConfig, base_end, experience_metric
-from evaluation.log import Log, changes
-from evaluation.run import Run, check_run, known
-from evaluation.trajectory import anytime, ate, rpe, summary
+from evaluation.metrics.energy_metric import (
+    Energy,
+    Relations,
+    energy,
+    energy_all_pairs,
+    relation_errors,
+    successive,
+)
+from evaluation.metrics.experience_log import Log, changes
+from evaluation.metrics.experience_metric import (
+    DEFAULT,
+    MODES,
+    ExmConfig,
+    base_end,
+    experience_metric,
+)
+from evaluation.metrics.run_arrays import Run, check_run, known
+from evaluation.metrics.trajectory import anytime, ate, rpe, summary
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
 

@@ -12,9 +12,18 @@ from itertools import pairwise
 
 import numpy as np
 
-from evaluation.grid import PRIOR, Grid, Surface, Truth, centres, check_grid, surface, touched
-from evaluation.griderror import CONVENTIONS, Convention, GridError, grid_error, pool_errors
-from evaluation.scorecard import Quantity
+from evaluation.metrics.grid_error import CONVENTIONS, Convention, GridError, grid_error, pool_errors
+from evaluation.metrics.occupancy_grid import (
+    PRIOR,
+    Grid,
+    Surface,
+    Truth,
+    centres,
+    check_grid,
+    surface,
+    touched,
+)
+from evaluation.metrics.scorecard import Quantity
 from tactile.base.config import Settings
 
 CLAMP = 1e-3

@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.table import read_table
-from evaluation.trajectory import interpolate, motion_errors
+from evaluation.metrics.text_table import read_table
+from evaluation.metrics.trajectory import interpolate, motion_errors
 from tactile.base.errors import InputError
 from tactile.base.se2 import between, wrap
 

@@ -21,7 +21,7 @@ from zlib import crc32
 import numpy as np
 from pydantic import NonNegativeInt, PositiveFloat
 
-from evaluation.log import changes, creation_rows
+from evaluation.metrics.experience_log import changes, creation_rows
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.se2 import wrap

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.table import read_table
+from evaluation.metrics.text_table import read_table
 from tactile.base.errors import InputError
 from tactile.base.se2 import between, compose, fitted, tum_line, wrap
 

@@ -1,0 +1,1 @@
+"""Metrics of trajectories, experiences and grids."""
