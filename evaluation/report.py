@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evaluation.gridfiles import read_grid, read_truth
+from evaluation.artifacts.grid_npz import read_grid, read_truth
+from evaluation.artifacts.run_directory import read_card, read_closures, read_run, read_walls
+from evaluation.artifacts.whisker_views import read_images
 from evaluation.gridpicture import Panel, Paths, draw_grid, headline
 from evaluation.history import draw_history
-from evaluation.images import read_images
 from evaluation.mappicture import NO_CLOSURES, NO_WALLS, draw_map
 from evaluation.metrics.grid_score import GridScore
 from evaluation.metrics.run_arrays import Run
 from evaluation.metrics.scorecard import Scorecard
-from evaluation.rundirectory import read_card, read_closures, read_run, read_walls
 from evaluation.whiskerpicture import draw_whiskers
 from tactile.base.se2 import between
 

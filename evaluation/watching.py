@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
+from evaluation.artifacts.run_directory import read_walls
 from evaluation.progress import PICTURE, RUNNING, Progress, Watched, counted
-from evaluation.rundirectory import read_walls
 from evaluation.watchpicture import draw_watch
 from tactile.base.atomic_write import in_one_piece
 from tactile.base.errors import InputError

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from evaluation import drawing
+from evaluation.artifacts.whisker_views import Images
 from evaluation.drawing import FAINT, GREY, INK, QUIET
-from evaluation.images import Images
 from evaluation.mappicture import NO_WALLS, broken, corners, edges, paint_walls
 from evaluation.metrics.experience_metric import base_end
 from evaluation.metrics.run_arrays import Run, known

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from evaluation.gridfiles import read_grid, write_truth
-from evaluation.images import Images, write_images
+from evaluation.artifacts.grid_npz import read_grid, write_truth
+from evaluation.artifacts.nav2 import write_nav2
+from evaluation.artifacts.run_directory import write_walls
+from evaluation.artifacts.whisker_views import Images, write_images
 from evaluation.metrics.grid_score import score_grid
 from evaluation.metrics.occupancy_grid import Grid, Truth, centres
-from evaluation.nav2 import write_nav2
-from evaluation.rundirectory import write_walls
 from ratslam.storage import RunDirectory
 from robot.arena import Arena, enclosed, occupied, read_arena, segments
 from robot.maze import read_maze, walls

@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from evaluation.artifacts.run_directory import read_run
 from evaluation.metrics.energy_metric import read_relations
 from evaluation.metrics.scorecard import Scorecard, score
 from evaluation.metrics.trajectory import Anytime, present_error, summary, write_tum
 from evaluation.report import pictures
-from evaluation.rundirectory import read_run
 from ratslam.backends import Telling, backend_of, telling
 from ratslam.config import RunConfig
 from ratslam.growing import Growing

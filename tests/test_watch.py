@@ -18,8 +18,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from evaluation.artifacts.run_directory import read_run
 from evaluation.progress import RUNNING, Progress, Watched
-from evaluation.rundirectory import read_run
 from evaluation.watching import distance, status_line, watch
 from evaluation.watchpicture import draw_watch
 from ratslam.cli import main

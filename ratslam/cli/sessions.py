@@ -84,11 +84,11 @@ def _simulate(arguments: argparse.Namespace) -> int:
 
 
 def _score(arguments: argparse.Namespace) -> int:
+    from evaluation.artifacts.run_directory import read_run
     from evaluation.metrics.energy_metric import read_relations
     from evaluation.metrics.experience_log import read_log
     from evaluation.metrics.experience_metric import ExmConfig
     from evaluation.metrics.scorecard import score, score_log, table
-    from evaluation.rundirectory import read_run
 
     exm = ExmConfig(mode=arguments.mode, base=arguments.base)
     if arguments.log.is_dir():

@@ -18,7 +18,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from evaluation.gridfiles import read_grid
+from evaluation.artifacts.grid_npz import read_grid
 from evaluation.metrics.energy_metric import read_relations
 from evaluation.metrics.grid_error import HEADLINE
 from evaluation.metrics.grid_score import score_grid

@@ -12,9 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
-from evaluation.gridfiles import read_grid, write_grid
-from evaluation.metrics.occupancy_grid import PRIOR, Grid
-from evaluation.nav2 import (
+from evaluation.artifacts.grid_npz import read_grid, write_grid
+from evaluation.artifacts.nav2 import (
     FREE_THRESH,
     OCCUPIED_THRESH,
     read_nav2,
@@ -22,6 +21,7 @@ from evaluation.nav2 import (
     write_image,
     write_nav2,
 )
+from evaluation.metrics.occupancy_grid import PRIOR, Grid
 from tactile.base.errors import InputError
 
 law = settings(max_examples=40)

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.images import read_images
+from evaluation.artifacts.run_directory import read_walls
+from evaluation.artifacts.whisker_views import read_images
 from evaluation.report import redraw
-from evaluation.rundirectory import read_walls
 from ratslam.cli import main
 from ratslam.config import RunConfig
 from ratslam.run import located, open_source

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from evaluation.artifacts.run_directory import read_card, read_closures, read_walls, write_walls
 from evaluation.metrics.scorecard import score
-from evaluation.rundirectory import read_card, read_closures, read_walls, write_walls
 from tactile.base.errors import InputError
 
 CLOSURES = """frame,match,step,match_step,verdict,weight

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from matplotlib.collections import PatchCollection
 
-from evaluation.images import Images, read_images, write_images
+from evaluation.artifacts.whisker_views import Images, read_images, write_images
 from evaluation.metrics.scorecard import score
 from evaluation.whiskerpicture import SHOWN, draw_whiskers
 from tactile.base.errors import InputError

@@ -8,8 +8,8 @@ from pathlib import Path
 import jax
 import pytest
 
+from evaluation.artifacts.run_directory import read_card
 from evaluation.metrics.grid_score import score_grid
-from evaluation.rundirectory import read_card
 from ratslam.run import run
 from ratslam.sweeps.jobs import run_job
 from ratslam.sweeps.memory import weighed
