@@ -11,13 +11,13 @@ import numpy as np
 from evaluation.artifacts.grid_npz import read_grid, read_truth
 from evaluation.artifacts.run_directory import read_card, read_closures, read_run, read_walls
 from evaluation.artifacts.whisker_views import read_images
-from evaluation.gridpicture import Panel, Paths, draw_grid, headline
-from evaluation.history import draw_history
-from evaluation.mappicture import NO_CLOSURES, NO_WALLS, draw_map
 from evaluation.metrics.grid_score import GridScore
 from evaluation.metrics.run_arrays import Run
 from evaluation.metrics.scorecard import Scorecard
-from evaluation.whiskerpicture import draw_whiskers
+from evaluation.plots.experience_plot import draw_history
+from evaluation.plots.grid_plot import Panel, Paths, draw_grid, headline
+from evaluation.plots.map_plot import NO_CLOSURES, NO_WALLS, draw_map
+from evaluation.plots.whisker_plot import draw_whiskers
 from tactile.base.se2 import between
 
 if TYPE_CHECKING:

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evaluation import drawing
-from evaluation.drawing import BLUE, FAINT, GREY, INK, QUIET, VERMILLION, WIDTH, YELLOW
-from evaluation.mappicture import NO_WALLS, broken, paint_walls
 from evaluation.metrics.trajectory import align
+from evaluation.plots import style
+from evaluation.plots.map_plot import NO_WALLS, broken, paint_walls
+from evaluation.plots.style import BLUE, FAINT, GREY, INK, QUIET, VERMILLION, WIDTH, YELLOW
 from evaluation.progress import Progress, counted
 from tactile.base.se2 import between, compose
 
@@ -30,17 +30,17 @@ def draw_watch(seen: Progress, walls: np.ndarray = NO_WALLS) -> Figure:
     Args:
         walls: [B, 5] west, south, east, north, height in m; drawn with truth.
     """
-    figure = drawing.blank(_HEIGHT, seen.name, _line(seen))
-    inner = WIDTH - drawing.LEFT - drawing.RIGHT - _COUNTS
-    axes = drawing.plot(figure, drawing.LEFT, _BOTTOM, inner, _HEIGHT - drawing.TOP - _BOTTOM)
+    figure = style.blank(_HEIGHT, seen.name, _line(seen))
+    inner = WIDTH - style.LEFT - style.RIGHT - _COUNTS
+    axes = style.plot(figure, style.LEFT, _BOTTOM, inner, _HEIGHT - style.TOP - _BOTTOM)
     axes.set_aspect("equal", adjustable="datalim")
     if len(seen.path):
         _paint(axes, seen, walls)
     axes.apply_aspect()
-    drawing.metric_grid(axes)
-    _paint_counts(figure, seen, drawing.LEFT + inner + 0.25)
+    style.metric_grid(axes)
+    _paint_counts(figure, seen, style.LEFT + inner + 0.25)
     if len(seen.path):
-        drawing.legend(figure, axes)
+        style.legend(figure, axes)
     return figure
 
 
@@ -88,8 +88,8 @@ def _paint_counts(figure: Figure, seen: Progress, left: float) -> None:
     counts += [("lost", seen.lost)] if seen.lost else []
     steps = max(1, len(seen.path))
     for row, (name, count) in enumerate(counts):
-        low = _HEIGHT - drawing.TOP - 0.45 * (row + 1)
-        bar = drawing.plot(figure, left, low, _COUNTS - 0.3, 0.1)
+        low = _HEIGHT - style.TOP - 0.45 * (row + 1)
+        bar = style.plot(figure, left, low, _COUNTS - 0.3, 0.1)
         bar.barh([0, 0], [1, count / steps], color=[FAINT, INK if name == "ok" else BLUE])
         bar.set(xlim=(0, 1), ylim=(-0.4, 0.4), xticks=[], yticks=[])
         bar.set_title(f"{name}  {count}", fontsize=8.5, color=QUIET, loc="left", pad=2)

@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.figures import draw_tuning
 from evaluation.metrics.experience_metric import base_end, experience_metric
+from evaluation.plots.paper_figures import draw_tuning
 from ratslam.config import RunConfig
 from ratslam.templates import TemplateConfig
 from ratslam.trials.thresholds import classics

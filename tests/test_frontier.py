@@ -15,8 +15,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evaluation.frontierpicture import Mark, draw_frontier, placed
 from evaluation.metrics.scorecard import Quantity
+from evaluation.plots.pareto_plot import Mark, draw_frontier, placed
 from ratslam.cli import main
 from ratslam.frontier import measuring
 from ratslam.frontier.cores import one_core, others

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evaluation.gridpicture import Panel, Paths, draw_grids
 from evaluation.metrics.grid_error import HEADLINE
 from evaluation.metrics.occupancy_grid import mean_grid
+from evaluation.plots.grid_plot import Panel, Paths, draw_grids
 from ratslam.arenas.figures import word_of
 from ratslam.arenas.protocols import FILTERED, Protocol
 from ratslam.arenas.trials import Result

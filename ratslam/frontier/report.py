@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from evaluation.frontierpicture import Mark, draw_frontier
+from evaluation.plots.pareto_plot import Mark, draw_frontier
 from ratslam.frontier.errors import ErrorOf
 from ratslam.frontier.lines import WHOLE, Line, Span
 from ratslam.sweeps.report import label, replace

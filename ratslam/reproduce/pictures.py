@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evaluation.figures import (
+from evaluation.metrics.experience_log import creation_rows
+from evaluation.metrics.trajectory import align
+from evaluation.plots.paper_figures import (
     Experiences,
     Measured,
     Path,
@@ -17,8 +19,6 @@ from evaluation.figures import (
     draw_experiences,
     draw_measured,
 )
-from evaluation.metrics.experience_log import creation_rows
-from evaluation.metrics.trajectory import align
 from ratslam.reproduce.extras import clockwise_steps, lap_of
 from ratslam.reproduce.protocols import METHODS, Protocol
 from ratslam.reproduce.verdicts import LABELS, RATIOS, Row, column

@@ -7,7 +7,7 @@ import io
 import numpy as np
 import pytest
 
-from evaluation.figures import (
+from evaluation.plots.paper_figures import (
     Experiences,
     Measured,
     Path,

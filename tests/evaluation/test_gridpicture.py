@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from matplotlib.collections import LineCollection
 
-from evaluation.drawing import VERMILLION, YELLOW
-from evaluation.gridpicture import Panel, Paths, draw_grid, draw_grids, headline, position_error
 from evaluation.metrics.grid_score import score_grid
 from evaluation.metrics.occupancy_grid import PRIOR, Grid, Truth
+from evaluation.plots.grid_plot import Panel, Paths, draw_grid, draw_grids, headline, position_error
+from evaluation.plots.style import VERMILLION, YELLOW
 
 SIDE = np.array(
     [[-0.6, -0.6, 0.6, -0.6], [0.6, -0.6, 0.6, 0.6], [0.6, 0.6, -0.6, 0.6], [-0.6, 0.6, -0.6, -0.6]]

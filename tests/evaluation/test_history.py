@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evaluation.history import draw_history
 from evaluation.metrics.experience_metric import experience_metric
 from evaluation.metrics.scorecard import score
+from evaluation.plots.experience_plot import draw_history
 
 
 def marks(figure):

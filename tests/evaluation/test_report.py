@@ -8,8 +8,8 @@ import sys
 import numpy as np
 import pytest
 
-from evaluation.mappicture import broken, draw_map, headline
 from evaluation.metrics.scorecard import score
+from evaluation.plots.map_plot import broken, draw_map, headline
 from evaluation.report import save_map
 
 

@@ -11,7 +11,7 @@ from matplotlib.collections import PatchCollection
 
 from evaluation.artifacts.whisker_views import Images, read_images, write_images
 from evaluation.metrics.scorecard import score
-from evaluation.whiskerpicture import SHOWN, draw_whiskers
+from evaluation.plots.whisker_plot import SHOWN, draw_whiskers
 from tactile.base.errors import InputError
 
 AZIMUTH = np.arange(6) * np.pi / 3

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from evaluation import drawing
-from evaluation.drawing import GREEN, INK, QUIET, VERMILLION, WIDTH, YELLOW
 from evaluation.metrics.grid_error import HEADLINE
 from evaluation.metrics.grid_score import GridScore
 from evaluation.metrics.occupancy_grid import Grid
+from evaluation.plots import style
+from evaluation.plots.style import GREEN, INK, QUIET, VERMILLION, WIDTH, YELLOW
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -57,15 +57,15 @@ class Panel(NamedTuple):
 
 def draw_grid(panel: Panel) -> Figure:
     """One map, large, with its walls and paths (Fig. 6 of Fox et al. 2012)."""
-    inner = WIDTH - drawing.LEFT - drawing.RIGHT - _KEY
+    inner = WIDTH - style.LEFT - style.RIGHT - _KEY
     tall = inner * _aspect(panel.grid)
-    figure = drawing.blank(drawing.TOP + tall + _BOTTOM, panel.name, panel.line)
-    axes = drawing.plot(figure, drawing.LEFT, _BOTTOM, inner, tall)
+    figure = style.blank(style.TOP + tall + _BOTTOM, panel.name, panel.line)
+    axes = style.plot(figure, style.LEFT, _BOTTOM, inner, tall)
     _paint(axes, panel)
     if panel.paths is not None:
         _paint_paths(axes, panel.paths, told=True)
-    _paint_key(figure, drawing.LEFT + inner, _BOTTOM, min(tall, 2.4))
-    drawing.legend(figure, axes, columns=3)
+    _paint_key(figure, style.LEFT + inner, _BOTTOM, min(tall, 2.4))
+    style.legend(figure, axes, columns=3)
     return figure
 
 
@@ -73,17 +73,17 @@ def draw_grids(title: str, line: str, panels: Sequence[Panel], *, across: int = 
     """Maps side by side, `across` in a row (Figs. 4 and 5 of Fox et al. 2012)."""
     across = min(across, len(panels))
     rows = -(-len(panels) // across)
-    inner = WIDTH - drawing.LEFT - drawing.RIGHT - _KEY
+    inner = WIDTH - style.LEFT - style.RIGHT - _KEY
     width = (inner - (across - 1) * _GAP) / across
     high = width * max(_aspect(panel.grid) for panel in panels)
-    whole = drawing.TOP + rows * (_HEAD + high) + (rows - 1) * _GAP + _BOTTOM
-    figure = drawing.blank(whole, title, line)
+    whole = style.TOP + rows * (_HEAD + high) + (rows - 1) * _GAP + _BOTTOM
+    figure = style.blank(whole, title, line)
     for number, panel in enumerate(panels):
         row, column = divmod(number, across)
-        left = drawing.LEFT + column * (width + _GAP)
-        top = whole - drawing.TOP - row * (_HEAD + high + _GAP) - _HEAD
+        left = style.LEFT + column * (width + _GAP)
+        top = whole - style.TOP - row * (_HEAD + high + _GAP) - _HEAD
         tall = width * _aspect(panel.grid)
-        axes = drawing.plot(figure, left, top - tall, width, tall)
+        axes = style.plot(figure, left, top - tall, width, tall)
         _paint(axes, panel)
         if panel.paths is not None:
             _paint_paths(axes, panel.paths)
@@ -96,9 +96,9 @@ def draw_grids(title: str, line: str, panels: Sequence[Panel], *, across: int = 
         axes.tick_params(labelsize=7.5)
         figure.text(left / WIDTH, (top + 0.24) / whole, panel.name, fontsize=9.5, color=INK)
         figure.text(left / WIDTH, (top + 0.08) / whole, panel.line, fontsize=8, color=QUIET)
-    _paint_key(figure, drawing.LEFT + inner, whole - drawing.TOP - _HEAD - high, min(high, 2.4))
+    _paint_key(figure, style.LEFT + inner, whole - style.TOP - _HEAD - high, min(high, 2.4))
     fullest = max(figure.axes, key=lambda axes: len(axes.get_legend_handles_labels()[1]))
-    drawing.legend(figure, fullest, columns=5)
+    style.legend(figure, fullest, columns=5)
     return figure
 
 
@@ -137,7 +137,7 @@ def _paint(axes: Axes, panel: Panel) -> None:
         interpolation="nearest", zorder=0.5,
     )  # fmt: skip
     axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", autoscale_on=False)
-    drawing.metric_grid(axes)
+    style.metric_grid(axes)
     axes.grid(visible=False)
     axes.tick_params(axis="x", pad=6)  # below the lowest number of the other axis
     if len(panel.segments):
@@ -166,7 +166,7 @@ def _paint_paths(axes: Axes, paths: Paths, *, told: bool = False) -> None:
 
 def _paint_key(figure: Figure, left: float, bottom: float, tall: float) -> None:
     """Which grey is which occupancy, right of a map, in inches."""
-    bar = drawing.plot(figure, left + 0.2, bottom, _BAR, tall)
+    bar = style.plot(figure, left + 0.2, bottom, _BAR, tall)
     shades = np.linspace(0, 1, 256)[:, None]
     bar.imshow(shades, cmap="gray", vmin=0, vmax=1, extent=(0, 1, 0, 1), origin="lower", aspect="auto")
     bar.set_xticks([])

@@ -7,8 +7,19 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from evaluation import drawing
-from evaluation.drawing import BLUE, FAINT, GREEN, GREY, INK, PURPLE, QUIET, VERMILLION, WIDTH, YELLOW
+from evaluation.plots import style
+from evaluation.plots.style import (
+    BLUE,
+    FAINT,
+    GREEN,
+    GREY,
+    INK,
+    PURPLE,
+    QUIET,
+    VERMILLION,
+    WIDTH,
+    YELLOW,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -77,7 +88,7 @@ def draw_drift(title: str, line: str, paths: Mapping[str, Path]) -> Figure:
             axes.plot(*path.odometry[rows].T, "-", lw=1.2, color=VERMILLION, alpha=shade, label=label)
         axes.plot(*path.truth[0], "o", ms=9, mfc="none", mec=GREEN, mew=1.8, zorder=6, label="start")
         _map_axes(axes)
-    drawing.legend(figure, panels[0])
+    style.legend(figure, panels[0])
     return figure
 
 
@@ -99,8 +110,8 @@ def draw_experiences(title: str, line: str, runs: Mapping[str, Experiences]) -> 
                       mew=0.9 if mark == "x" else 0, color=color, label=label)  # fmt: skip
         axes.axvline(run.base - 0.5, color=INK, lw=1.1, ls=(0, (2, 2)), label="end of the base set")
         axes.grid(color=FAINT, lw=0.7)
-        drawing.name_axes(axes, "step", "experience")
-    drawing.legend(figure, panels[0], columns=3)
+        style.name_axes(axes, "step", "experience")
+    style.legend(figure, panels[0], columns=3)
     return figure
 
 
@@ -134,7 +145,7 @@ def draw_measured(title: str, line: str, conditions: Sequence[str], measured: Se
             axes.set_ylim(bottom=0)
         axes.grid(color=FAINT, lw=0.7, axis="y")
     fullest = max(panels, key=lambda axes: len(axes.get_legend_handles_labels()[1]))
-    drawing.legend(figure, fullest)
+    style.legend(figure, fullest)
     return figure
 
 
@@ -155,7 +166,7 @@ def draw_directions(title: str, line: str, maps: Mapping[str, tuple[np.ndarray, 
             part = np.where(rows[:, None], position, np.nan)
             axes.plot(*part.T, "-", lw=1.0, alpha=0.7, color=color, label=label)
         _map_axes(axes)
-    drawing.legend(figure, panels[0])
+    style.legend(figure, panels[0])
     return figure
 
 
@@ -175,8 +186,8 @@ def draw_curves(
                 axes.plot(x, y, "o-", ms=3, lw=0.9, alpha=0.7, color=color, label=None if number else name)
         axes.set(xlim=(0, 1.03), ylim=(0, None))
         axes.grid(color=FAINT, lw=0.7)
-        drawing.name_axes(axes, "ARCR, strict", "ARR")
-    drawing.legend(figure, panels[0])
+        style.name_axes(axes, "ARCR, strict", "ARR")
+    style.legend(figure, panels[0])
     return figure
 
 
@@ -201,16 +212,16 @@ def draw_tuning(
     for count, color, label in ((same, BLUE, "same place"), (other, VERMILLION, "different places")):
         left.stairs(count / max(count.sum(), 1), edge, color=color, fill=True, alpha=0.45, label=label)
     left.grid(color=FAINT, lw=0.7)
-    drawing.name_axes(left, "difference of two views", "share of pairs")
+    style.name_axes(left, "difference of two views", "share of pairs")
     right.plot(threshold, correct, "o-", ms=3, lw=1.0, color=GREEN, label="correct")
     right.plot(threshold, incorrect, "x-", ms=4, lw=1.0, color=PURPLE, label="incorrect")
     right.grid(color=FAINT, lw=0.7)
-    drawing.name_axes(right, "threshold", "re-localisations")
+    style.name_axes(right, "threshold", "re-localisations")
     for axes in (left, right):
         if winner is not None:
             axes.axvline(winner, color=INK, lw=1.1, ls=(0, (2, 2)), label="chosen")
     right.legend(frameon=False, fontsize=9, labelcolor=INK)
-    drawing.legend(figure, left)
+    style.legend(figure, left)
     return figure
 
 
@@ -220,15 +231,15 @@ def _panels(
     """A figure with so many panels of a height in inches, `across` of them in a row (0: all)."""
     across = across or count
     rows = -(-count // across)
-    whole = drawing.TOP + rows * height + (rows - 1) * _GAP + below
-    figure = drawing.blank(whole, title, line)
-    width = (WIDTH - drawing.LEFT - drawing.RIGHT - (across - 1) * _GAP) / across
+    whole = style.TOP + rows * height + (rows - 1) * _GAP + below
+    figure = style.blank(whole, title, line)
+    width = (WIDTH - style.LEFT - style.RIGHT - (across - 1) * _GAP) / across
     panels = []
     for number in range(count):
         row, column = divmod(number, across)
-        left = drawing.LEFT + column * (width + _GAP)
-        bottom = whole - drawing.TOP - 0.2 - (row + 1) * height - row * _GAP + 0.2
-        panels.append(drawing.plot(figure, left, bottom, width, height - 0.2))
+        left = style.LEFT + column * (width + _GAP)
+        bottom = whole - style.TOP - 0.2 - (row + 1) * height - row * _GAP + 0.2
+        panels.append(style.plot(figure, left, bottom, width, height - 0.2))
     return figure, panels
 
 
@@ -236,4 +247,4 @@ def _map_axes(axes: Axes) -> None:
     axes.set_aspect("equal", adjustable="datalim")
     axes.grid(color=FAINT, lw=0.7)
     axes.tick_params(labelcolor=QUIET)
-    drawing.name_axes(axes, "x (m)", "y (m)")
+    style.name_axes(axes, "x (m)", "y (m)")

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from evaluation import drawing
-from evaluation.drawing import BLUE, GREEN, GREY, INK, PURPLE, VERMILLION, YELLOW
 from evaluation.metrics.run_arrays import Run, known
 from evaluation.metrics.scorecard import Scorecard
 from evaluation.metrics.trajectory import align
+from evaluation.plots import style
+from evaluation.plots.style import BLUE, GREEN, GREY, INK, PURPLE, VERMILLION, YELLOW
 from tactile.base.se2 import between, compose
 
 if TYPE_CHECKING:
@@ -54,18 +54,18 @@ def draw_map(
     shown = walls if layers.truth is not None else NO_WALLS
     box = _frame(layers, shown)
     width, height = box[1] - box[0]
-    inner = drawing.WIDTH - drawing.LEFT - drawing.RIGHT
-    figure = drawing.blank(inner * height / width + drawing.TOP + _BOTTOM, card.name, headline(card))
-    axes = drawing.plot(figure, drawing.LEFT, _BOTTOM, inner, inner * height / width)
+    inner = style.WIDTH - style.LEFT - style.RIGHT
+    figure = style.blank(inner * height / width + style.TOP + _BOTTOM, card.name, headline(card))
+    axes = style.plot(figure, style.LEFT, _BOTTOM, inner, inner * height / width)
     axes.set(xlim=box[:, 0], ylim=box[:, 1], aspect="equal")
-    drawing.metric_grid(axes)
+    style.metric_grid(axes)
     if len(shown):
         paint_walls(axes, shown)
         _paint_laps(axes, run, layers, card.exm.position, closures)
     else:
         _paint(axes, run, layers)
     _paint_start(axes, layers)
-    drawing.legend(figure, axes)
+    style.legend(figure, axes)
     return figure
 
 

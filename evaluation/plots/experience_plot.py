@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evaluation import drawing
-from evaluation.drawing import BLUE, FAINT, GREY, INK, VERMILLION
 from evaluation.metrics.experience_metric import ExperienceMetric, experience_metric
 from evaluation.metrics.run_arrays import Run, known
 from evaluation.metrics.scorecard import Scorecard
+from evaluation.plots import style
+from evaluation.plots.style import BLUE, FAINT, GREY, INK, VERMILLION
 from tactile.base.errors import InputError
 
 if TYPE_CHECKING:
@@ -28,9 +28,9 @@ def draw_history(run: Run, card: Scorecard) -> Figure:
     judged, why = _judged(run, card, rows)
     rows = rows[run.experience[rows] >= 0]
     experience = run.experience[rows]
-    figure = drawing.blank(_HEIGHT, card.name, why if judged is None else _line(judged))
-    inner = drawing.WIDTH - drawing.LEFT - drawing.RIGHT
-    axes = drawing.plot(figure, drawing.LEFT, _BOTTOM, inner, _HEIGHT - drawing.TOP - _BOTTOM)
+    figure = style.blank(_HEIGHT, card.name, why if judged is None else _line(judged))
+    inner = style.WIDTH - style.LEFT - style.RIGHT
+    axes = style.plot(figure, style.LEFT, _BOTTOM, inner, _HEIGHT - style.TOP - _BOTTOM)
     counted = np.zeros(len(rows), bool) if judged is None else judged.counted
     right = counted if judged is None else judged.right
     free = ~counted
@@ -51,8 +51,8 @@ def draw_history(run: Run, card: Scorecard) -> Figure:
     axes.set(xlim=(-0.01 * last, 1.01 * last), ylim=(-0.02 * max(1, len(run.nodes)), None))
     axes.locator_params(integer=True)
     axes.grid(color=FAINT, lw=0.7)
-    drawing.name_axes(axes, "step", "experience, in order of creation")
-    drawing.legend(figure, axes, columns=2)
+    style.name_axes(axes, "step", "experience, in order of creation")
+    style.legend(figure, axes, columns=2)
     return figure
 
 

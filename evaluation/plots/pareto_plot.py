@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from evaluation import drawing
-from evaluation.drawing import BLUE, FAINT, GREY, INK, QUIET, VERMILLION, WIDTH
+from evaluation.plots import style
+from evaluation.plots.style import BLUE, FAINT, GREY, INK, QUIET, VERMILLION, WIDTH
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -49,10 +49,10 @@ def draw_frontier(title: str, line: str, marks: Sequence[Mark], time: str, error
     Args:
         marks: at least one. time, error: what the axes are, with units.
     """
-    inner = WIDTH - drawing.LEFT - drawing.RIGHT
+    inner = WIDTH - style.LEFT - style.RIGHT
     tall = _TALL + _EACH * max(0, len(marks) - 12)
-    figure = drawing.blank(drawing.TOP + tall + _BOTTOM, title, line)
-    axes = drawing.plot(figure, drawing.LEFT, _BOTTOM, inner, tall)
+    figure = style.blank(style.TOP + tall + _BOTTOM, title, line)
+    axes = style.plot(figure, style.LEFT, _BOTTOM, inner, tall)
     spans = np.array([[mark.time, mark.error] for mark in marks])  # [N, 2, 3]
     positive = spans[:, 1][spans[:, 1] > 0]
     floor = _FLOOR * positive.min() if len(positive) else 1.0
@@ -61,8 +61,8 @@ def draw_frontier(title: str, line: str, marks: Sequence[Mark], time: str, error
     _frame(axes, spans)
     _paint(axes, spans, best)
     none = bool((spans[:, 1] == floor).any())
-    drawing.name_axes(axes, time, f"{error}{', 0 at the bottom' if none else ''}")
-    drawing.legend(figure, axes)
+    style.name_axes(axes, time, f"{error}{', 0 at the bottom' if none else ''}")
+    style.legend(figure, axes)
     _label(axes, [mark.name for mark in marks], spans, best)
     return figure
 

@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evaluation import drawing
 from evaluation.artifacts.whisker_views import Images
-from evaluation.drawing import FAINT, GREY, INK, QUIET
-from evaluation.mappicture import NO_WALLS, broken, corners, edges, paint_walls
 from evaluation.metrics.experience_metric import base_end
 from evaluation.metrics.run_arrays import Run, known
 from evaluation.metrics.scorecard import Scorecard
+from evaluation.plots import style
+from evaluation.plots.map_plot import NO_WALLS, broken, corners, edges, paint_walls
+from evaluation.plots.style import FAINT, GREY, INK, QUIET
 from tactile.base.errors import InputError
 
 if TYPE_CHECKING:
@@ -57,24 +57,24 @@ def draw_whiskers(run: Run, card: Scorecard, images: Images, walls: np.ndarray =
 
     whiskers = images.view[0].size
     strips = min(STRIPS, -(-len(run.time) // COLUMNS))
-    inner = drawing.WIDTH - drawing.LEFT - drawing.RIGHT
+    inner = style.WIDTH - style.LEFT - style.RIGHT
     wide = inner - _KEY
     high = wide * (box[1, 1] - box[0, 1]) / (box[1, 0] - box[0, 0])
     tall = whiskers * _ROW
-    total = drawing.TOP + _MARKS + strips * (tall + _GAP) + 0.25 + high + _BOTTOM
-    figure = drawing.blank(total, card.name, _line(images))
+    total = style.TOP + _MARKS + strips * (tall + _GAP) + 0.25 + high + _BOTTOM
+    figure = style.blank(total, card.name, _line(images))
 
     colors = _colors()
-    pixels, bottom = _pixels(images, colors), total - drawing.TOP - _MARKS + _GAP
+    pixels, bottom = _pixels(images, colors), total - style.TOP - _MARKS + _GAP
     for part in np.array_split(np.arange(len(run.time)), strips):
         bottom -= tall + _GAP
-        axes = drawing.plot(figure, drawing.LEFT, bottom, inner, tall)
+        axes = style.plot(figure, style.LEFT, bottom, inner, tall)
         _paint_strip(axes, run.time, pixels, images, part, chosen)
-    drawing.name_axes(axes, "time (s); of each ring, the whisker ahead is on top, then anticlockwise", "")
+    style.name_axes(axes, "time (s); of each ring, the whisker ahead is on top, then anticlockwise", "")
 
-    axes = drawing.plot(figure, drawing.LEFT, _BOTTOM, wide, high)
+    axes = style.plot(figure, style.LEFT, _BOTTOM, wide, high)
     axes.set(xlim=box[:, 0], ylim=box[:, 1], aspect="equal")
-    drawing.metric_grid(axes)
+    style.metric_grid(axes)
     if len(shown):
         paint_walls(axes, shown)
     axes.plot(*broken(pose[steps, :2], pose[steps, :2]).T, color=FAINT, lw=0.8, zorder=0.8)
@@ -82,7 +82,7 @@ def draw_whiskers(run: Run, card: Scorecard, images: Images, walls: np.ndarray =
         _paint_head(axes, pose[step], reach, pixels[step], images)
         x, y, _ = pose[step]
         axes.text(x, y, str(number), ha="center", va="center", fontsize=7, color=INK, zorder=5)
-    _paint_key(figure, images, colors, drawing.LEFT + wide, high)
+    _paint_key(figure, images, colors, style.LEFT + wide, high)
     return figure
 
 
@@ -201,7 +201,7 @@ def _paint_key(figure: Figure, images: Images, colors: Colormap, left: float, hi
 
     rings, columns = images.view.shape[1:]
     top, size = _BOTTOM + high, _KEY - 0.2
-    axes = drawing.plot(figure, left + 0.2, top - size, size, size)
+    axes = style.plot(figure, left + 0.2, top - size, size, size)
     axes.set(xlim=(-1.3, 1.3), ylim=(-1.3, 1.3), aspect="equal", xticks=[], yticks=[])
     shades = np.repeat(np.linspace(0.95, 0.8, rings), columns)
     pixels = np.repeat(shades[:, None], 3, axis=1).reshape(rings, columns, 3)
@@ -214,7 +214,7 @@ def _paint_key(figure: Figure, images: Images, colors: Colormap, left: float, hi
         )
 
     tall = max(0.5, min(1.6, high - size - 1.0))
-    bar = drawing.plot(figure, left + 0.35, top - size - 0.35 - tall, 0.16, tall)
+    bar = style.plot(figure, left + 0.35, top - size - 0.35 - tall, 0.16, tall)
     shades = colors(np.linspace(0, 1, 256))[:, None, :3]
     bar.imshow(shades, extent=(0, 1, 0, 1000 * images.tallest), origin="lower", aspect="auto")
     bar.set_xticks([])
