@@ -19,9 +19,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evaluation.artifacts.run_directory import read_run
-from evaluation.progress import RUNNING, Progress, Watched
-from evaluation.watching import distance, status_line, watch
-from evaluation.watchpicture import draw_watch
+from evaluation.monitor.plot import draw_watch
+from evaluation.monitor.progress import RUNNING, Progress, Watched
+from evaluation.monitor.watch import distance, status_line, watch
 from ratslam.cli import main
 from tactile.base.errors import InputError
 from tactile.base.se2 import tum_line

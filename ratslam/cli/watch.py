@@ -26,8 +26,8 @@ def add(command: Add) -> None:
 
 
 def _watch(arguments: argparse.Namespace) -> int:
-    from evaluation.progress import PICTURE, RUNNING
-    from evaluation.watching import watch
+    from evaluation.monitor.progress import PICTURE, RUNNING
+    from evaluation.monitor.watch import watch
 
     for name in ("every", "patience"):
         if not 0 < getattr(arguments, name) < float("inf"):

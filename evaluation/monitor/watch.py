@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from evaluation.artifacts.run_directory import read_walls
-from evaluation.progress import PICTURE, RUNNING, Progress, Watched, counted
-from evaluation.watchpicture import draw_watch
+from evaluation.monitor.plot import draw_watch
+from evaluation.monitor.progress import PICTURE, RUNNING, Progress, Watched, counted
 from tactile.base.atomic_write import in_one_piece
 from tactile.base.errors import InputError
 

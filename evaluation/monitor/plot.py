@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from evaluation.metrics.trajectory import align
+from evaluation.monitor.progress import Progress, counted
 from evaluation.plots import style
 from evaluation.plots.map_plot import NO_WALLS, broken, paint_walls
 from evaluation.plots.style import BLUE, FAINT, GREY, INK, QUIET, VERMILLION, WIDTH, YELLOW
-from evaluation.progress import Progress, counted
 from tactile.base.se2 import between, compose
 
 if TYPE_CHECKING:

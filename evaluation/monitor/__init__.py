@@ -1,0 +1,1 @@
+"""Progress of a running job, read from its run directory."""
