@@ -11,10 +11,10 @@ from evaluation.artifacts.whisker_views import Images, write_images
 from evaluation.metrics.grid_score import score_grid
 from evaluation.metrics.occupancy_grid import Grid, Truth, centres
 from ratslam.storage import RunDirectory
-from robot.arena import Arena, enclosed, occupied, read_arena, segments
-from robot.maze import read_maze, walls
-from robot.scene import MazeConfig
 from robot.source import Source, rig_of
+from robot.world.arena import Arena, enclosed, occupied, read_arena, segments
+from robot.world.maze import read_maze, walls
+from robot.world.scene import MazeConfig
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose, inverse

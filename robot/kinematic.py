@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 
-from robot.motion import Path, at
-from robot.walls import Surroundings
+from robot.world.head_trajectory import Path, at
+from robot.world.walls import Surroundings
 from tactile.base.config import Settings
 from tactile.base.types import Odometry, Whisk
 from tactile.features.contact import ShaftConfig, stiffness

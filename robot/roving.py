@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 
-from robot.arena import segments, text
 from robot.behaviour import BehaviourConfig, Command, Doing, State, command, following
-from robot.layout import ArenaConfig, arena
 from robot.made import STILL, Made, document_digest, placed
 from robot.source import rate_of
 from robot.stepping import Robot, Step
 from robot.strain import WhiskersConfig, fan
 from robot.wheels import WheelsConfig, reckoned
+from robot.world.arena import segments, text
+from robot.world.random_arena import ArenaConfig, arena
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream

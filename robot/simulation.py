@@ -16,15 +16,15 @@ from pydantic import Field, NonNegativeInt
 from robot.dynamic import dynamic
 from robot.kinematic import Felt, MechanicsConfig, felt, whisk
 from robot.made import STILL, Made, document_digest, placed
-from robot.maze import text
 from robot.mechanics import StreamConfig
-from robot.motion import MotionConfig, at
 from robot.odometry import OdometryConfig, reckoned
 from robot.quasistatic import quasistatic
-from robot.scene import KidnapConfig, MazeConfig, PathConfig, another, scene
 from robot.sensing import kept
 from robot.sweep import cycles, free_cycles
-from robot.walls import Surroundings
+from robot.world.head_trajectory import MotionConfig, at
+from robot.world.maze import text
+from robot.world.scene import KidnapConfig, MazeConfig, PathConfig, another, scene
+from robot.world.walls import Surroundings
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from robot.behaviour import BehaviourConfig, Command, State, ended, moved
-from robot.polygons import distance
 from robot.strain import WhiskersConfig, among, fan, monitored, sampled, strained
+from robot.world.polygons import distance
 from tactile.base.types import Moment
 
 MOMENT = 1e-6

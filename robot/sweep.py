@@ -9,8 +9,8 @@ import numpy as np
 
 from robot.kinematic import MechanicsConfig
 from robot.mechanics import StreamConfig
-from robot.motion import Path, at
-from robot.walls import FREE, Surroundings
+from robot.world.head_trajectory import Path, at
+from robot.world.walls import FREE, Surroundings
 from tactile.base.se2 import between
 from tactile.base.types import Cycle, Odometry
 from tactile.whiskers.head_geometry import Head

@@ -113,8 +113,8 @@ def run(world: str, row: str, arena: int) -> Figures:
 
 def _off(arena: Any, pose: np.ndarray, told: Any) -> float:
     """Between a wall's direction as told and that of the segment nearest to where it was met, rad."""
-    from robot.arena import segments
-    from robot.polygons import distance
+    from robot.world.arena import segments
+    from robot.world.polygons import distance
     from tactile.base.se2 import compose
 
     foot = told.wall_point

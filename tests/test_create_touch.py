@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from robot.arena import segments
-from robot.layout import ArenaConfig
-from robot.polygons import distance
 from robot.roving import RovingConfig, drive_into_wall, roving
+from robot.world.arena import segments
+from robot.world.polygons import distance
+from robot.world.random_arena import ArenaConfig
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose
 from tactile.base.types import Moment, Odometry, Report

@@ -22,8 +22,8 @@ from ratslam.arenas.trials import Result, results
 from ratslam.cli import main
 from ratslam.cli.arena import SETS
 from ratslam.gridsettings import GridConfig
-from robot.arena import Arena, fits
-from robot.layout import ArenaConfig, arena
+from robot.world.arena import Arena, fits
+from robot.world.random_arena import ArenaConfig, arena
 from tactile.base.errors import InputError
 from tests.gridworld import TIPS, create, report
 

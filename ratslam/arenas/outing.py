@@ -19,11 +19,11 @@ from ratslam.gridfilter import GridFilter
 from ratslam.gridsettings import GridConfig
 from ratslam.marks import Marks, draw, marks_of
 from ratslam.session import Session, capacity_at
-from robot.arena import Arena, enclosed, fits, occupied, segments, text
-from robot.layout import arena
 from robot.roving import Rover, RovingConfig, roving
 from robot.sensing import Sensing, observation_of, reports_of
 from robot.training import trained
+from robot.world.arena import Arena, enclosed, fits, occupied, segments, text
+from robot.world.random_arena import arena
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose, integrate

@@ -13,7 +13,7 @@ from evaluation.plots.grid_plot import Panel, Paths, draw_grids
 from ratslam.arenas.figures import word_of
 from ratslam.arenas.protocols import FILTERED, Protocol
 from ratslam.arenas.trials import Result
-from robot.arena import segments
+from robot.world.arena import segments
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -25,11 +25,11 @@ from robot.live.journal import Journal
 from robot.live.rig import Faulted, Rig, Stopped
 from robot.live.route import approach, checked, descent, routed, way, world
 from robot.live.selftest import reported, room, started
-from robot.maze import text
-from robot.motion import Path as Way
 from robot.outcome import Fault, Outcome
 from robot.sensing import kept
 from robot.simulation import CELL_SIZE
+from robot.world.head_trajectory import Path as Way
+from robot.world.maze import text
 from tactile.base.errors import InputError
 from tactile.features.calibration import Calibration, calibrated
 from tactile.features.whisker_image import view_shape

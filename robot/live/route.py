@@ -7,12 +7,12 @@ from typing import Protocol
 import numpy as np
 
 from robot.live.settings import LiveConfig
-from robot.motion import Path
-from robot.scene import Scene, scene
 from robot.simulation import SimulationConfig
 from robot.ur10.placing import tcp_of
 from robot.ur10.safety import Refused
 from robot.ur10.safety import checked as allowed
+from robot.world.head_trajectory import Path
+from robot.world.scene import Scene, scene
 from tactile.base.errors import InputError
 from tactile.whiskers.head_geometry import Head
 

@@ -16,8 +16,8 @@ from ratslam.cli import main
 from ratslam.config import RunConfig
 from ratslam.run import located, open_source
 from ratslam.yamlfile import load, validate
-from robot.scene import MazeConfig
 from robot.sensing import sensing
+from robot.world.scene import MazeConfig
 
 ROOT = Path(__file__).parents[2]
 PICTURES = ("map.png", "whiskers.png", "experiences.png")

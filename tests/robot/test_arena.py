@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 from scipy.ndimage import label
 
-from robot.arena import Arena, enclosed, fits, inside, occupied, read_arena, segments, text
-from robot.layout import ArenaConfig, arena
-from robot.polygons import area, contains, crossing, distance, edges, gap, square
+from robot.world.arena import Arena, enclosed, fits, inside, occupied, read_arena, segments, text
+from robot.world.polygons import area, contains, crossing, distance, edges, gap, square
+from robot.world.random_arena import ArenaConfig, arena
 from tactile.base.errors import InputError
 
 SEEDS = st.integers(0, 10**6)

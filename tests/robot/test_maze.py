@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.maze import (
+from robot.world.maze import (
     CELL,
     TALL,
     THICK,

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robot.maze import CELL, centre, random_loop
-from robot.motion import JitterConfig, MotionConfig, Path, at, carried, planned
-from robot.route import circuits
+from robot.world.head_trajectory import JitterConfig, MotionConfig, Path, at, carried, planned
+from robot.world.maze import CELL, centre, random_loop
+from robot.world.maze_routes import circuits
 from tactile.base.random_streams import stream
 from tactile.base.se2 import wrap
 

@@ -12,7 +12,7 @@ from robot.kinematic import MechanicsConfig
 from robot.mechanics import StreamConfig
 from robot.quasistatic import advance, quasistatic, rest
 from robot.sweep import Sweep
-from robot.walls import FREE
+from robot.world.walls import FREE
 from tactile.base.random_streams import stream
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 from tactile.whiskers.whisking import Drive, WhiskingConfig, command

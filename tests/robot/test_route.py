@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.maze import Maze, closed, is_open, neighbours, random_loop, scattered
-from robot.route import anticlockwise, checked, circuits, exploration
+from robot.world.maze import Maze, closed, is_open, neighbours, random_loop, scattered
+from robot.world.maze_routes import anticlockwise, checked, circuits, exploration
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robot.arena import inside, segments, text
 from robot.behaviour import State
-from robot.polygons import distance
 from robot.roving import Rover, RovingConfig, drive_into_wall, roving
 from robot.source import Rigged, Sample, Source, rig_of
+from robot.world.arena import inside, segments, text
+from robot.world.polygons import distance
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.se2 import between, compose, wrap

@@ -12,12 +12,12 @@ import pytest
 from pydantic import ValidationError
 
 from robot.log import collected
-from robot.maze import CELL, text
 from robot.odometry import OdometryConfig
 from robot.recording import Recording, record
 from robot.sensing import head_of, sensing
 from robot.simulation import Simulation, SimulationConfig, simulated, tier
 from robot.source import Rigged, Sample, Source, rig_of
+from robot.world.maze import CELL, text
 from tactile.base.errors import InputError
 from tactile.base.se2 import between, wrap
 from tactile.base.types import Cycle, Observation, Whisk

@@ -8,11 +8,11 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from robot.arena import Arena, fits, segments
 from robot.bending import Bent, Shaft, base_strain, bent, tilt
-from robot.layout import ArenaConfig, arena
-from robot.polygons import crossing, distance, edges, square
 from robot.strain import ShakeConfig, WhiskersConfig, among, fan, sampled, shaken, strained
+from robot.world.arena import Arena, fits, segments
+from robot.world.polygons import crossing, distance, edges, square
+from robot.world.random_arena import ArenaConfig, arena
 from tactile.base.random_streams import stream
 from tactile.features.contact import ShaftConfig, stiffness
 

@@ -7,12 +7,12 @@ import pytest
 
 from robot.dynamic import dynamic
 from robot.kinematic import Felt, MechanicsConfig
-from robot.maze import random_loop, scattered, walls
 from robot.mechanics import BeamConfig, StreamConfig, beam, clock
-from robot.motion import MotionConfig, Path, planned
 from robot.quasistatic import quasistatic
 from robot.sweep import Tier, cycles, free_cycles
-from robot.walls import Surroundings, Walls
+from robot.world.head_trajectory import MotionConfig, Path, planned
+from robot.world.maze import random_loop, scattered, walls
+from robot.world.walls import Surroundings, Walls
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.types import Cycle

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robot.maze import random_loop, scattered, walls
-from robot.walls import FREE, Surroundings, Walls
+from robot.world.maze import random_loop, scattered, walls
+from robot.world.walls import FREE, Surroundings, Walls
 from tactile.base.random_streams import stream
 from tactile.whiskers.head_geometry import Head, HeadConfig, RingConfig, shaft, ur10_head
 

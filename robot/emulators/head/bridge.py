@@ -20,7 +20,7 @@ from robot.emulators.head.settings import HeadEmulatorConfig
 from robot.emulators.head.whereabouts import Along, Place
 from robot.emulators.head.whiskers import Block, Whiskers
 from robot.head.wire import CHANNELS, REQUEST_IN, VERSION, Flag, Request, counts, encode, unpack
-from robot.walls import Walls
+from robot.world.walls import Walls
 from tactile.base.random_streams import stream
 from tactile.whiskers.head_geometry import ur10_head
 

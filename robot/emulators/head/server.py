@@ -20,9 +20,9 @@ from robot.emulators.head.settings import HeadEmulatorConfig
 from robot.emulators.head.whereabouts import Along, Carried, Place
 from robot.emulators.usbline import ANSWER, IN, REQUEST, Op
 from robot.head.wire import ENDPOINT_IN
-from robot.motion import Path
 from robot.priority import URGENT, ranked
-from robot.scene import KidnapConfig, scene
+from robot.world.head_trajectory import Path
+from robot.world.scene import KidnapConfig, scene
 from tactile.whiskers.head_geometry import ur10_head
 
 Client = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]

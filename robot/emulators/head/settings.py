@@ -9,9 +9,9 @@ from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
 from robot.emulators.usbline import PORT
 from robot.kinematic import MechanicsConfig
 from robot.mechanics import StreamConfig
-from robot.motion import MotionConfig
-from robot.scene import MazeConfig, PathConfig
 from robot.ur10.placing import PlacingConfig
+from robot.world.head_trajectory import MotionConfig
+from robot.world.scene import MazeConfig, PathConfig
 from tactile.base.config import Settings
 from tactile.whiskers.head_geometry import HeadConfig
 

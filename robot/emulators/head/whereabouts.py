@@ -6,8 +6,8 @@ from typing import Protocol
 
 import numpy as np
 
-from robot.motion import Path, at
 from robot.ur10.placing import PlacingConfig, pose_of
+from robot.world.head_trajectory import Path, at
 
 AHEAD = 0.1
 """s for which an arm's speed is believed; then it counts as standing where that led."""

@@ -12,7 +12,7 @@ from robot.kinematic import MechanicsConfig
 from robot.mechanics import StreamConfig
 from robot.quasistatic import advance, rest
 from robot.sweep import Sweep, passed, reported
-from robot.walls import FREE, Surroundings, Walls
+from robot.world.walls import FREE, Surroundings, Walls
 from tactile.whiskers.head_geometry import Head
 
 STEP = 1e-4

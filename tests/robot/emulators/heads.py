@@ -22,8 +22,8 @@ from robot.head.wire import (
     pack,
     tally,
 )
-from robot.scene import KidnapConfig, Scene, scene
-from robot.walls import Walls
+from robot.world.scene import KidnapConfig, Scene, scene
+from robot.world.walls import Walls
 from tactile.whiskers.head_geometry import ur10_head
 from tests.robot.live_helpers import Faults, emulator
 

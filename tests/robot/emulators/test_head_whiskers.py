@@ -9,11 +9,11 @@ from robot.emulators.head.bridge import BLOCK
 from robot.emulators.head.settings import HeadEmulatorConfig
 from robot.emulators.head.whereabouts import AHEAD, Along, Carried
 from robot.head.wire import ANGLE, SILENCE, Command, Flag, Kind, Mode, counts, radians, tally
-from robot.motion import Path
 from robot.quasistatic import quasistatic
 from robot.sweep import cycles
 from robot.ur10.placing import PlacingConfig, tcp_of
-from robot.walls import Surroundings
+from robot.world.head_trajectory import Path
+from robot.world.walls import Surroundings
 from tactile.base.random_streams import stream
 from tactile.whiskers.head_geometry import HeadConfig
 from tactile.whiskers.whisking import WhiskingConfig

@@ -7,9 +7,9 @@ import pytest
 
 from robot.live.route import approach, descent, routed, way
 from robot.live.settings import LiveConfig
-from robot.motion import at
-from robot.scene import scene
 from robot.ur10.placing import pose_of
+from robot.world.head_trajectory import at
+from robot.world.scene import scene
 from tactile.base.errors import InputError
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 

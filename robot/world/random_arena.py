@@ -12,8 +12,8 @@ from typing import Annotated, Self
 import numpy as np
 from pydantic import Field, NonNegativeInt, PositiveFloat, model_validator
 
-from robot.arena import Arena, fits, read_arena
-from robot.polygons import contains, gap, square
+from robot.world.arena import Arena, fits, read_arena
+from robot.world.polygons import contains, gap, square
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream

@@ -8,10 +8,21 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
-from robot.maze import CELL, TALL, Cell, Maze, closed, named, random_loop, read_maze, scattered, walls
-from robot.motion import MotionConfig, Path, at, carried, planned
-from robot.route import anticlockwise, checked, circuits, exploration
-from robot.walls import Surroundings, Walls
+from robot.world.head_trajectory import MotionConfig, Path, at, carried, planned
+from robot.world.maze import (
+    CELL,
+    TALL,
+    Cell,
+    Maze,
+    closed,
+    named,
+    random_loop,
+    read_maze,
+    scattered,
+    walls,
+)
+from robot.world.maze_routes import anticlockwise, checked, circuits, exploration
+from robot.world.walls import Surroundings, Walls
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat
 
-from robot.maze import Cell, centre
+from robot.world.maze import Cell, centre
 from tactile.base.config import Settings
 from tactile.base.se2 import wrap
 

@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from robot.maze import Cell, Maze, is_open, neighbours
+from robot.world.maze import Cell, Maze, is_open, neighbours
 from tactile.base.errors import InputError
 
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robot.walls import Walls
+from robot.world.walls import Walls
 from tactile.base.errors import InputError
 
 CELL = 0.18

@@ -1,0 +1,1 @@
+"""Mazes, arenas, walls, routes and trajectories."""
