@@ -17,14 +17,14 @@ from ratslam.places import PlaceConfig
 from ratslam.rat import RatConfig
 from ratslam.recall import RecallConfig
 from ratslam.templates import TemplateConfig
-from robot.extent import extent
 from robot.formats import RecordingConfig
 from robot.live.settings import LiveConfig
-from robot.log import Log
 from robot.roving import RovingConfig
 from robot.sensing import head_of
 from robot.simulation import SimulationConfig
-from robot.source import Source, rig_of
+from robot.sources.in_memory import Log
+from robot.sources.odometry_extent import extent
+from robot.sources.source import Source, rig_of
 from tactile.base.config import Settings
 from tactile.frontend import TouchConfig
 

@@ -11,7 +11,7 @@ from evaluation.artifacts.whisker_views import Images, write_images
 from evaluation.metrics.grid_score import score_grid
 from evaluation.metrics.occupancy_grid import Grid, Truth, centres
 from ratslam.storage import RunDirectory
-from robot.source import Source, rig_of
+from robot.sources.source import Source, rig_of
 from robot.world.arena import Arena, enclosed, occupied, read_arena, segments
 from robot.world.maze import read_maze, walls
 from robot.world.scene import MazeConfig

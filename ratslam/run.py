@@ -21,7 +21,7 @@ from robot.recorder import Recorder
 from robot.roving import roving
 from robot.sensing import calibration_of, sensing
 from robot.simulation import simulated
-from robot.source import Sample, Source, rig_of
+from robot.sources.source import Sample, Source, rig_of
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Whisk
 from tactile.frontend import Frontend

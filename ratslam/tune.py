@@ -22,7 +22,7 @@ from ratslam.trials.thresholds import classics
 from ratslam.trials.touch import first, lap_ends, session_log, whole
 from ratslam.trials.workers import shared_out
 from ratslam.yamlfile import Document, override, validate
-from robot.log import Log
+from robot.sources.in_memory import Log
 from tactile.base.errors import InputError
 from tactile.base.se2 import wrap
 

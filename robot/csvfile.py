@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from robot.files import digest_of, missing, read_bytes, refuse
 from robot.plausibility import and_more, finite
+from robot.sources.input_files import digest_of, missing, read_bytes, refuse
 from tactile.base.errors import InputError
 
 SHOWN = 8  # faults listed one by one before the rest is only counted

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from robot.columns import TableConfig
-from robot.files import require_file
-from robot.source import Source
+from robot.sources.input_files import require_file
+from robot.sources.source import Source
 from robot.units import ORDINARY, Limits
 from tactile.base.config import Settings
 from tactile.base.errors import InputError

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from robot.schemas import CYCLE, OBSERVATION, REPORT, WHISK
-from robot.source import Sample
+from robot.sources.source import Sample
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Observation, Odometry, Report, Whisk
 

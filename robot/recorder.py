@@ -11,7 +11,7 @@ import numpy as np
 
 from robot.messages import encode, encode_truth
 from robot.schemas import TRUTH
-from robot.source import Sample
+from robot.sources.source import Sample
 from robot.tape import Tape
 from tactile.base.errors import InputError
 

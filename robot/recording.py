@@ -15,11 +15,11 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from robot.blocks import Event
-from robot.files import refuse, require_file, unreadable
 from robot.plausibility import clock, finite, views
 from robot.recorder import Recorder
 from robot.schemas import TRUTH
-from robot.source import Sample, Source, rate_of, rig_of
+from robot.sources.input_files import refuse, require_file, unreadable
+from robot.sources.source import Sample, Source, rate_of, rig_of
 from robot.tape import Tape
 from robot.units import ORDINARY, Limits, Track, units
 from robot.walk import Walk

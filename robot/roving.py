@@ -14,8 +14,8 @@ import numpy as np
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 
 from robot.behaviour import BehaviourConfig, Command, Doing, State, command, following
-from robot.made import STILL, Made, document_digest, placed
-from robot.source import rate_of
+from robot.sources.simulated import STILL, Made, document_digest, placed
+from robot.sources.source import rate_of
 from robot.stepping import Robot, Step
 from robot.strain import WhiskersConfig, fan
 from robot.wheels import WheelsConfig, reckoned

@@ -9,7 +9,7 @@ from typing import Any, Protocol, Self
 import numpy as np
 
 from robot.roving import RovingConfig
-from robot.source import Rigged, Sample, Source, rig_of
+from robot.sources.source import Rigged, Sample, Source, rig_of
 from robot.training import trained
 from tactile.base.errors import InputError
 from tactile.base.types import Observation

@@ -15,11 +15,11 @@ from pydantic import Field, NonNegativeInt
 
 from robot.dynamic import dynamic
 from robot.kinematic import Felt, MechanicsConfig, felt, whisk
-from robot.made import STILL, Made, document_digest, placed
 from robot.mechanics import StreamConfig
-from robot.odometry import OdometryConfig, reckoned
 from robot.quasistatic import quasistatic
 from robot.sensing import kept
+from robot.sources.odometry import OdometryConfig, reckoned
+from robot.sources.simulated import STILL, Made, document_digest, placed
 from robot.sweep import cycles, free_cycles
 from robot.world.head_trajectory import MotionConfig, at
 from robot.world.maze import text

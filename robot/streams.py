@@ -19,10 +19,10 @@ from pathlib import Path
 
 import numpy as np
 
-from robot.files import digest_of, missing, read_bytes, refuse
-from robot.log import Log
-from robot.odometry import NEW_HEADING, from_velocities
 from robot.plausibility import Place, clock, finite, views
+from robot.sources.in_memory import Log
+from robot.sources.input_files import digest_of, missing, read_bytes, refuse
+from robot.sources.odometry import NEW_HEADING, from_velocities
 from robot.units import ORDINARY, Limits, Track, units
 from tactile.base.errors import InputError
 

@@ -10,10 +10,10 @@ import numpy as np
 from robot.attached import labels_of, truth_of, views_of
 from robot.columns import PoseColumns, TableConfig, ViewColumns
 from robot.csvfile import CsvFile, digest_of_files, read_csv
-from robot.files import missing, refuse
-from robot.log import Log
-from robot.odometry import from_poses, from_velocities
 from robot.plausibility import clock
+from robot.sources.in_memory import Log
+from robot.sources.input_files import missing, refuse
+from robot.sources.odometry import from_poses, from_velocities
 from robot.units import ORDINARY, Limits, Track, headings, units
 from tactile.base.errors import InputError
 

@@ -17,7 +17,6 @@ from mcap.exceptions import EndOfFile
 from mcap.records import Channel, Message, Metadata, Schema, Statistics
 
 from robot.blocks import Event, decode_cut, decode_event, decode_frames, decode_states
-from robot.files import unreadable
 from robot.head.decoder import Frames
 from robot.live.cycle import Window, assembled, no_frames
 from robot.messages import MOST, Malformed, decode, decode_truth
@@ -31,7 +30,8 @@ from robot.schemas import (
     SCHEMAS,
     TRUTH,
 )
-from robot.source import Sample
+from robot.sources.input_files import unreadable
+from robot.sources.source import Sample
 
 METADATA = "ratslam"
 FORMAT = "2"

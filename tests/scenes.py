@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from robot.log import Log
+from robot.sources.in_memory import Log
 from tactile.base.se2 import between, wrap
 
 CELL = 0.1

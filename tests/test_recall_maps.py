@@ -13,8 +13,8 @@ from ratslam.closures import Verdict
 from ratslam.rat import RatConfig
 from ratslam.recallrat import rat
 from ratslam.session import Session
-from robot.log import Log
-from robot.perturb import perturbed
+from robot.sources.in_memory import Log
+from robot.sources.perturbation import perturbed
 from robot.streams import read_stream
 from tactile.base.se2 import integrate
 from tactile.base.types import Odometry, observation

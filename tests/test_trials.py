@@ -11,8 +11,8 @@ from ratslam.cli import main
 from ratslam.config import RunConfig
 from ratslam.trials import PARTS, Trial, row, trial, variations
 from ratslam.yamlfile import load, override, validate
-from robot import perturb
-from robot.perturb import perturbed
+from robot.sources import perturbation
+from robot.sources.perturbation import perturbed
 from robot.streams import read_stream
 from tactile.base.errors import InputError
 from tactile.base.se2 import between, integrate
@@ -52,7 +52,7 @@ def test_without_noise_the_path_is_kept_whole_though_rows_are_dropped(log, monke
 
 def test_some_ids_become_new_and_some_wrong():
     label = np.where(np.arange(3000) % 3 == 0, np.arange(3000) // 300, -1).astype(np.int32)
-    changed = perturb._wrong(label, np.random.default_rng(0))
+    changed = perturbation._wrong(label, np.random.default_rng(0))
     given = label >= 0
     assert np.array_equal(changed < 0, ~given)
     new = changed[given] > label.max()

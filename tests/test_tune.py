@@ -17,7 +17,7 @@ from ratslam.cli import main
 from ratslam.templates import TemplateConfig
 from ratslam.tune import THRESHOLDS, Likeness, Tried, auc, chosen, compared, differences, report, tune
 from ratslam.yamlfile import parse
-from robot.log import Log
+from robot.sources.in_memory import Log
 from tactile.base.errors import InputError
 
 ROOT = Path(__file__).parents[1]

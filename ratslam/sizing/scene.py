@@ -12,7 +12,7 @@ from ratslam.config import RunConfig
 from ratslam.run import open_source, recorder_of
 from ratslam.tiers import shortened
 from robot.formats import RecordingConfig
-from robot.source import Source
+from robot.sources.source import Source
 from tactile.base.errors import InputError
 from tactile.base.se2 import integrate
 

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from robot.log import Log
+from robot.sources.in_memory import Log
 from tactile.base.random_streams import stream
 
 Control = Literal["as felt", "shuffled", "blank", "ideal"]

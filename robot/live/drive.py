@@ -15,7 +15,7 @@ from robot.live.rig import TICK, Faulted, Rig
 from robot.live.route import Route
 from robot.outcome import Fault, Outcome
 from robot.simulation import MIDDLE
-from robot.source import Sample
+from robot.sources.source import Sample
 from robot.ur10.safety import Refused
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Odometry

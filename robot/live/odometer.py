@@ -7,7 +7,7 @@ from collections import deque
 import numpy as np
 
 from robot.live.settings import LiveConfig
-from robot.odometry import MID_HEADING, from_velocities, reckoned
+from robot.sources.odometry import MID_HEADING, from_velocities, reckoned
 from robot.ur10.placing import heading_of, pose_of
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose, wrap

@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from robot.head.settings import HeadLinkConfig
-from robot.odometry import OdometryConfig
 from robot.simulation import SimulationConfig
+from robot.sources.odometry import OdometryConfig
 from robot.ur10.settings import ArmConfig
 from tactile.base.config import Settings
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robot.files import read_bytes
+from robot.sources.input_files import read_bytes
 from robot.world.polygons import area, contains, crossing, distance, edges, square
 from tactile.base.errors import InputError
 

@@ -18,7 +18,7 @@ import numpy as np
 from robot.blocks import Event
 from robot.emulators.head.settings import HeadEmulatorConfig
 from robot.head.decoder import Frames
-from robot.source import Sample
+from robot.sources.source import Sample
 from robot.ur10.dashboard import Dashboard
 from robot.ur10.placing import PlacingConfig, tcp_of
 from robot.walk import Walk

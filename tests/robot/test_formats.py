@@ -14,10 +14,10 @@ import pytest
 from pydantic import ValidationError
 
 from robot.columns import PairColumns, TableConfig, TruthColumns, VelocityColumns, ViewColumns
-from robot.files import read_bytes
 from robot.formats import FORMATS, RecordingConfig, open_recording
 from robot.recording import record
-from robot.source import Source
+from robot.sources.input_files import read_bytes
+from robot.sources.source import Source
 from tactile.base.errors import InputError
 
 ROOT = Path(__file__).parents[2]

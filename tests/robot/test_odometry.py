@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from robot.odometry import MID_HEADING, NEW_HEADING, from_poses, from_velocities
+from robot.sources.odometry import MID_HEADING, NEW_HEADING, from_poses, from_velocities
 from tactile.base.se2 import integrate, wrap
 
 STEPS = st.integers(1, 30)

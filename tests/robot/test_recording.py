@@ -21,7 +21,7 @@ from robot.messages import decode, encode
 from robot.recorder import Recorder
 from robot.recording import Recording, record, recover
 from robot.schemas import CYCLE, OBSERVATION, REPORT, SCHEMAS, TOPICS, WHISK
-from robot.source import Rigged, Sample, Source, rig_of
+from robot.sources.source import Rigged, Sample, Source, rig_of
 from robot.streams import read_stream
 from robot.walk import FORMAT, Walk, _checksum
 from tactile.base.errors import InputError

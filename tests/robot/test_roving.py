@@ -12,7 +12,7 @@ import pytest
 
 from robot.behaviour import State
 from robot.roving import Rover, RovingConfig, drive_into_wall, roving
-from robot.source import Rigged, Sample, Source, rig_of
+from robot.sources.source import Rigged, Sample, Source, rig_of
 from robot.world.arena import inside, segments, text
 from robot.world.polygons import distance
 from tactile.base.errors import InputError

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.odometry import OdometryConfig, reckoned
+from robot.sources.odometry import OdometryConfig, reckoned
 from tactile.base.random_streams import stream
 from tactile.base.se2 import between, integrate, wrap
 

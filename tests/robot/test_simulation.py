@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from robot.log import collected
-from robot.odometry import OdometryConfig
 from robot.recording import Recording, record
 from robot.sensing import head_of, sensing
 from robot.simulation import Simulation, SimulationConfig, simulated, tier
-from robot.source import Rigged, Sample, Source, rig_of
+from robot.sources.in_memory import collected
+from robot.sources.odometry import OdometryConfig
+from robot.sources.source import Rigged, Sample, Source, rig_of
 from robot.world.maze import CELL, text
 from tactile.base.errors import InputError
 from tactile.base.se2 import between, wrap

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robot.source import Source
+from robot.sources.source import Source
 from robot.streams import read_stream
 from tactile.base.errors import InputError, InputErrors
 from tactile.base.se2 import integrate

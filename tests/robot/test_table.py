@@ -22,7 +22,7 @@ from robot.columns import (
 )
 from robot.csvfile import read_csv
 from robot.pairs import labels_from_pairs
-from robot.source import Source
+from robot.sources.source import Source
 from robot.streams import read_stream
 from robot.table import read_table
 from tactile.base.errors import InputError, InputErrors

@@ -10,7 +10,7 @@ import pytest
 
 from robot.columns import PoseColumns, TableConfig, TruthColumns, VelocityColumns
 from robot.formats import RecordingConfig, open_recording
-from robot.log import Log
+from robot.sources.in_memory import Log
 from robot.streams import read_stream
 from robot.table import read_table
 from robot.units import ORDINARY, RATIO, Limits, Track, headings, typical, units

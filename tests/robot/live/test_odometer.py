@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from robot.live.odometer import Odometer
 from robot.live.settings import LiveConfig
-from robot.odometry import OdometryConfig
+from robot.sources.odometry import OdometryConfig
 from robot.ur10.placing import tcp_of
 from tactile.base.se2 import compose, integrate
 

@@ -10,8 +10,8 @@ from typing import Any, Self
 
 import numpy as np
 
-from robot.files import digest_of
-from robot.source import Sample
+from robot.sources.input_files import digest_of
+from robot.sources.source import Sample
 from tactile.base.se2 import wrap
 from tactile.base.types import Cycle, Odometry, Report, Whisk
 

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from robot.log import Log
+from robot.sources.in_memory import Log
 from tactile.base.se2 import compose
 
 VIEW_NOISE = 0.01

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from robot.source import Source
+from robot.sources.source import Source
 from tactile.base.se2 import integrate
 
 

@@ -10,7 +10,7 @@ from typing import Self
 
 import numpy as np
 
-from robot.source import Sample, Source, rate_of
+from robot.sources.source import Sample, Source, rate_of
 from tactile.base.errors import InputError
 from tactile.base.types import Observation, Odometry, observation
 

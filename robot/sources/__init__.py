@@ -1,0 +1,1 @@
+"""What a source of samples is, and sources held in memory."""
