@@ -19,9 +19,9 @@ from ratslam.recall import RecallConfig
 from ratslam.templates import TemplateConfig
 from robot.formats import RecordingConfig
 from robot.live.settings import LiveConfig
-from robot.roving import RovingConfig
 from robot.sensing import head_of
-from robot.simulation import SimulationConfig
+from robot.simulation.create.session import RovingConfig
+from robot.simulation.head.session import SimulationConfig
 from robot.sources.in_memory import Log
 from robot.sources.odometry_extent import extent
 from robot.sources.source import Source, rig_of

@@ -18,9 +18,9 @@ from ratslam.playing import Playing, playing
 from ratslam.session import CHUNK
 from robot.formats import open_recording
 from robot.recorder import Recorder
-from robot.roving import roving
 from robot.sensing import calibration_of, sensing
-from robot.simulation import simulated
+from robot.simulation.create.session import roving
+from robot.simulation.head.session import simulated
 from robot.sources.source import Sample, Source, rig_of
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Whisk

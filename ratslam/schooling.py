@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robot.roving import RovingConfig, drive_into_wall
-from robot.training import trained
+from robot.simulation.create.session import RovingConfig, drive_into_wall
+from robot.simulation.create.template_training import trained
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.types import Moment

@@ -14,7 +14,7 @@ import numpy as np
 from ratslam.config import RunConfig
 from ratslam.trials.touch import TouchTrial, figures, play, session_log, whole
 from ratslam.yamlfile import Document, override, validate
-from robot.simulation import SimulationConfig, simulated, tier
+from robot.simulation.head.session import SimulationConfig, simulated, tier
 from tactile.base.errors import InputError
 
 TIERS = ("kinematic", "quasistatic", "dynamic")

@@ -8,9 +8,9 @@ from typing import Any, Protocol, Self
 
 import numpy as np
 
-from robot.roving import RovingConfig
+from robot.simulation.create.session import RovingConfig
+from robot.simulation.create.template_training import trained
 from robot.sources.source import Rigged, Sample, Source, rig_of
-from robot.training import trained
 from tactile.base.errors import InputError
 from tactile.base.types import Observation
 from tactile.features.calibration import Calibration, arrays, from_arrays

@@ -91,7 +91,7 @@ def test_what_cannot_be_compared_is_refused(tmp_path: Path, capsys: pytest.Captu
 
 def test_a_recording_without_truth_is_refused(tmp_path: Path) -> None:
     from robot.recording import record
-    from robot.roving import RovingConfig, roving
+    from robot.simulation.create.session import RovingConfig, roving
 
     source = roving(RovingConfig(reports=5))
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from robot.roving import RovingConfig, drive_into_wall, roving
+from robot.simulation.create.session import RovingConfig, drive_into_wall, roving
 from robot.world.arena import segments
 from robot.world.polygons import distance
 from robot.world.random_arena import ArenaConfig

@@ -18,7 +18,7 @@ from ratslam.run import open_source, simulate
 from ratslam.trials import trial
 from robot.recording import Recording
 from robot.sensing import sensing
-from robot.simulation import simulated
+from robot.simulation.head.session import simulated
 
 ROOT = Path(__file__).parents[1]
 CONFIG = "simulation: {path: {explore: 150}, seed: 5}\ntouch: {head: {dead: [4]}}\n"

@@ -15,7 +15,7 @@ from ratslam.config import TOUCH, RunConfig
 from ratslam.playing import readings, session_of
 from ratslam.session import Session
 from robot.sensing import sensing
-from robot.simulation import simulated
+from robot.simulation.head.session import simulated
 from tactile.base.se2 import integrate
 from tactile.base.types import Observation
 

@@ -27,7 +27,7 @@ from robot.live.route import approach, checked, descent, routed, way, world
 from robot.live.selftest import reported, room, started
 from robot.outcome import Fault, Outcome
 from robot.sensing import kept
-from robot.simulation import CELL_SIZE
+from robot.simulation.head.session import CELL_SIZE
 from robot.world.head_trajectory import Path as Way
 from robot.world.maze import text
 from tactile.base.errors import InputError

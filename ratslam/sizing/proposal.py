@@ -14,7 +14,7 @@ from ratslam.gridsettings import DriftConfig
 from ratslam.ladder import SETTLED, rungs
 from ratslam.occupancy import LAYERS
 from ratslam.sizing.scene import Scene
-from robot.simulation import tier
+from robot.simulation.head.session import tier
 
 PART = 0.5
 """Cells that the packet moves in one sub-step at most."""

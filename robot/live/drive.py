@@ -14,7 +14,7 @@ from robot.live.cycle import assembled, cut_of
 from robot.live.rig import TICK, Faulted, Rig
 from robot.live.route import Route
 from robot.outcome import Fault, Outcome
-from robot.simulation import MIDDLE
+from robot.simulation.head.session import MIDDLE
 from robot.sources.source import Sample
 from robot.ur10.safety import Refused
 from tactile.base.errors import InputError

@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 
 from robot.live.settings import LiveConfig
-from robot.simulation import SimulationConfig
+from robot.simulation.head.session import SimulationConfig
 from robot.ur10.placing import tcp_of
 from robot.ur10.safety import Refused
 from robot.ur10.safety import checked as allowed

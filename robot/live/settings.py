@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from robot.head.settings import HeadLinkConfig
-from robot.simulation import SimulationConfig
+from robot.simulation.head.session import SimulationConfig
 from robot.sources.odometry import OdometryConfig
 from robot.ur10.settings import ArmConfig
 from tactile.base.config import Settings

@@ -10,8 +10,8 @@ from jax import lax
 from ratslam.gridfilter import GridFilter
 from ratslam.gridsettings import GridConfig
 from ratslam.session import Session
-from robot.roving import RovingConfig, roving
 from robot.sensing import feelers_of, sensing
+from robot.simulation.create.session import RovingConfig, roving
 from tactile.base.types import stack
 from tactile.frontend import TouchConfig
 

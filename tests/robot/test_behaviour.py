@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from robot.behaviour import (
+from robot.simulation.create.state_machine import (
     BehaviourConfig,
     Command,
     Doing,

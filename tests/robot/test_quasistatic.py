@@ -8,10 +8,10 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.kinematic import MechanicsConfig
-from robot.mechanics import StreamConfig
-from robot.quasistatic import advance, quasistatic, rest
-from robot.sweep import Sweep
+from robot.simulation.head.beam import StreamConfig
+from robot.simulation.head.kinematic import MechanicsConfig
+from robot.simulation.head.quasistatic import advance, quasistatic, rest
+from robot.simulation.head.whisk_stream import Sweep
 from robot.world.walls import FREE
 from tactile.base.random_streams import stream
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robot.behaviour import State
-from robot.roving import Rover, RovingConfig, drive_into_wall, roving
+from robot.simulation.create.session import Rover, RovingConfig, drive_into_wall, roving
+from robot.simulation.create.state_machine import State
 from robot.sources.source import Rigged, Sample, Source, rig_of
 from robot.world.arena import inside, segments, text
 from robot.world.polygons import distance

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from robot.recording import Recording, record
 from robot.sensing import head_of, sensing
-from robot.simulation import Simulation, SimulationConfig, simulated, tier
+from robot.simulation.head.session import Simulation, SimulationConfig, simulated, tier
 from robot.sources.in_memory import collected
 from robot.sources.odometry import OdometryConfig
 from robot.sources.source import Rigged, Sample, Source, rig_of

@@ -8,8 +8,16 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from robot.bending import Bent, Shaft, base_strain, bent, tilt
-from robot.strain import ShakeConfig, WhiskersConfig, among, fan, sampled, shaken, strained
+from robot.simulation.create.strain_sensors import (
+    ShakeConfig,
+    WhiskersConfig,
+    among,
+    fan,
+    sampled,
+    shaken,
+    strained,
+)
+from robot.simulation.create.whisker_bending import Bent, Shaft, base_strain, bent, tilt
 from robot.world.arena import Arena, fits, segments
 from robot.world.polygons import crossing, distance, edges, square
 from robot.world.random_arena import ArenaConfig, arena

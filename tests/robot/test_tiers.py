@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robot.dynamic import dynamic
-from robot.kinematic import Felt, MechanicsConfig
-from robot.mechanics import BeamConfig, StreamConfig, beam, clock
-from robot.quasistatic import quasistatic
-from robot.sweep import Tier, cycles, free_cycles
+from robot.simulation.head.beam import BeamConfig, StreamConfig, beam, clock
+from robot.simulation.head.dynamic import dynamic
+from robot.simulation.head.kinematic import Felt, MechanicsConfig
+from robot.simulation.head.quasistatic import quasistatic
+from robot.simulation.head.whisk_stream import Tier, cycles, free_cycles
 from robot.world.head_trajectory import MotionConfig, Path, planned
 from robot.world.maze import random_loop, scattered, walls
 from robot.world.walls import Surroundings, Walls

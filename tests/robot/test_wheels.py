@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.wheels import WheelsConfig, reckoned
+from robot.simulation.create.wheel_odometry import WheelsConfig, reckoned
 from tactile.base.random_streams import stream
 from tactile.base.types import Motion
 

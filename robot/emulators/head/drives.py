@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from robot.head.wire import ANGLE, OFF, SILENCE, Command, Kind, Mode
-from robot.quasistatic import Balance, rest
+from robot.simulation.head.quasistatic import Balance, rest
 from tactile.whiskers.head_geometry import Head
 from tactile.whiskers.whisking import Drive, WhiskingConfig, command, phase
 

@@ -7,8 +7,8 @@ from typing import Annotated
 from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
 
 from robot.emulators.usbline import PORT
-from robot.kinematic import MechanicsConfig
-from robot.mechanics import StreamConfig
+from robot.simulation.head.beam import StreamConfig
+from robot.simulation.head.kinematic import MechanicsConfig
 from robot.ur10.placing import PlacingConfig
 from robot.world.head_trajectory import MotionConfig
 from robot.world.scene import MazeConfig, PathConfig

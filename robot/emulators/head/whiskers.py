@@ -8,10 +8,10 @@ import numpy as np
 
 from robot.emulators.head.drives import Drives
 from robot.emulators.head.whereabouts import Place
-from robot.kinematic import MechanicsConfig
-from robot.mechanics import StreamConfig
-from robot.quasistatic import advance, rest
-from robot.sweep import Sweep, passed, reported
+from robot.simulation.head.beam import StreamConfig
+from robot.simulation.head.kinematic import MechanicsConfig
+from robot.simulation.head.quasistatic import advance, rest
+from robot.simulation.head.whisk_stream import Sweep, passed, reported
 from robot.world.walls import FREE, Surroundings, Walls
 from tactile.whiskers.head_geometry import Head
 

@@ -9,8 +9,8 @@ from robot.emulators.head.bridge import BLOCK
 from robot.emulators.head.settings import HeadEmulatorConfig
 from robot.emulators.head.whereabouts import AHEAD, Along, Carried
 from robot.head.wire import ANGLE, SILENCE, Command, Flag, Kind, Mode, counts, radians, tally
-from robot.quasistatic import quasistatic
-from robot.sweep import cycles
+from robot.simulation.head.quasistatic import quasistatic
+from robot.simulation.head.whisk_stream import cycles
 from robot.ur10.placing import PlacingConfig, tcp_of
 from robot.world.head_trajectory import Path
 from robot.world.walls import Surroundings

@@ -14,9 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robot.kinematic import MechanicsConfig
-from robot.mechanics import StreamConfig
-from robot.sweep import Sweep
+from robot.simulation.head.beam import StreamConfig
+from robot.simulation.head.kinematic import MechanicsConfig
+from robot.simulation.head.whisk_stream import Sweep
 from tactile.features.contact import stiffness
 from tactile.whiskers.head_geometry import Head
 from tactile.whiskers.whisking import Drive, WhiskingConfig, command, still

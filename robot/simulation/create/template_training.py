@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from robot.roving import RovingConfig, drive_into_wall
+from robot.simulation.create.session import RovingConfig, drive_into_wall
 from tactile.base.random_streams import stream
 from tactile.wall_estimation.strain_templates import StrainTemplates, TemplateTraining, driven, train
 

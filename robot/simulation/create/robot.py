@@ -6,8 +6,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robot.behaviour import BehaviourConfig, Command, State, ended, moved
-from robot.strain import WhiskersConfig, among, fan, monitored, sampled, strained
+from robot.simulation.create.state_machine import BehaviourConfig, Command, State, ended, moved
+from robot.simulation.create.strain_sensors import (
+    WhiskersConfig,
+    among,
+    fan,
+    monitored,
+    sampled,
+    strained,
+)
 from robot.world.polygons import distance
 from tactile.base.types import Moment
 

@@ -7,8 +7,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from robot.kinematic import MechanicsConfig
-from robot.mechanics import StreamConfig
+from robot.simulation.head.beam import StreamConfig
+from robot.simulation.head.kinematic import MechanicsConfig
 from robot.world.head_trajectory import Path, at
 from robot.world.walls import FREE, Surroundings
 from tactile.base.se2 import between

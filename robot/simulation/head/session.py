@@ -13,14 +13,14 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from pydantic import Field, NonNegativeInt
 
-from robot.dynamic import dynamic
-from robot.kinematic import Felt, MechanicsConfig, felt, whisk
-from robot.mechanics import StreamConfig
-from robot.quasistatic import quasistatic
 from robot.sensing import kept
+from robot.simulation.head.beam import StreamConfig
+from robot.simulation.head.dynamic import dynamic
+from robot.simulation.head.kinematic import Felt, MechanicsConfig, felt, whisk
+from robot.simulation.head.quasistatic import quasistatic
+from robot.simulation.head.whisk_stream import cycles, free_cycles
 from robot.sources.odometry import OdometryConfig, reckoned
 from robot.sources.simulated import STILL, Made, document_digest, placed
-from robot.sweep import cycles, free_cycles
 from robot.world.head_trajectory import MotionConfig, at
 from robot.world.maze import text
 from robot.world.scene import KidnapConfig, MazeConfig, PathConfig, another, scene

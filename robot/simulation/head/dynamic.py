@@ -12,9 +12,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import expm
 
-from robot.kinematic import MechanicsConfig
-from robot.mechanics import Beam, StreamConfig, beam, clock
-from robot.sweep import Sweep
+from robot.simulation.head.beam import Beam, StreamConfig, beam, clock
+from robot.simulation.head.kinematic import MechanicsConfig
+from robot.simulation.head.whisk_stream import Sweep
 from tactile.features.contact import stiffness
 from tactile.whiskers.head_geometry import Head
 from tactile.whiskers.whisking import WhiskingConfig, command, still

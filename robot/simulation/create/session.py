@@ -13,12 +13,19 @@ from typing import Any
 import numpy as np
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 
-from robot.behaviour import BehaviourConfig, Command, Doing, State, command, following
+from robot.simulation.create.robot import Robot, Step
+from robot.simulation.create.state_machine import (
+    BehaviourConfig,
+    Command,
+    Doing,
+    State,
+    command,
+    following,
+)
+from robot.simulation.create.strain_sensors import WhiskersConfig, fan
+from robot.simulation.create.wheel_odometry import WheelsConfig, reckoned
 from robot.sources.simulated import STILL, Made, document_digest, placed
 from robot.sources.source import rate_of
-from robot.stepping import Robot, Step
-from robot.strain import WhiskersConfig, fan
-from robot.wheels import WheelsConfig, reckoned
 from robot.world.arena import segments, text
 from robot.world.random_arena import ArenaConfig, arena
 from tactile.base.config import Settings

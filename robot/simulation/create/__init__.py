@@ -1,0 +1,1 @@
+"""Simulated sessions of a whiskered Create in an arena."""
