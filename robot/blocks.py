@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robot.head.decoder import Frames
-from robot.head.wire import CHANNELS
-from robot.live.cycle import Cut
+from robot.drivers.head.cycle_assembly import Cut
+from robot.drivers.head.decoder import Frames
+from robot.drivers.head.protocol import CHANNELS
+from robot.drivers.ur10.shared_state import STATE
 from robot.messages import CDR, MOST, Malformed
-from robot.ur10.states import STATE
 from tactile.base.types import Odometry
 
 NUMBERS = ("host", "robot", "tcp", "speed", "force", "joints")

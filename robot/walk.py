@@ -17,8 +17,8 @@ from mcap.exceptions import EndOfFile
 from mcap.records import Channel, Message, Metadata, Schema, Statistics
 
 from robot.blocks import Event, decode_cut, decode_event, decode_frames, decode_states
-from robot.head.decoder import Frames
-from robot.live.cycle import Window, assembled, no_frames
+from robot.drivers.head.cycle_assembly import Window, assembled, no_frames
+from robot.drivers.head.decoder import Frames
 from robot.messages import MOST, Malformed, decode, decode_truth
 from robot.records import BROKEN, records
 from robot.schemas import (

@@ -40,7 +40,7 @@ def _live(arguments: argparse.Namespace) -> int:
     prepare_jax()
     from evaluation.metrics.scorecard import table
     from ratslam.live import live
-    from robot.outcome import Outcome
+    from robot.drivers.outcome import Outcome
 
     config = _configured(arguments, arguments.ur_host, arguments.head)
     directory = arguments.output or Path("runs") / Path(arguments.config).stem

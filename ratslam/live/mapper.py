@@ -24,7 +24,7 @@ import numpy as np
 
 from evaluation.metrics.scorecard import Scorecard
 from ratslam.config import RunConfig
-from robot.priority import PATIENT, ranked
+from robot.drivers.process_priority import PATIENT, ranked
 from robot.sources.source import Sample
 from tactile.base.errors import InputError
 

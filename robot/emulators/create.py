@@ -17,7 +17,7 @@ import sys
 import time
 from typing import Any, NamedTuple
 
-from robot.create.wire import BAUD, TOP_SPEED, WHEEL_BASE, Bumps, Mode
+from robot.drivers.create.protocol import BAUD, TOP_SPEED, WHEEL_BASE, Bumps, Mode
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream

@@ -9,14 +9,14 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from robot.head.decoder import Frames
-from robot.live.cycle import assembled, cut_of
+from robot.drivers.head.cycle_assembly import assembled, cut_of
+from robot.drivers.head.decoder import Frames
+from robot.drivers.outcome import Fault, Outcome
+from robot.drivers.ur10.safety import Refused
 from robot.live.rig import TICK, Faulted, Rig
 from robot.live.route import Route
-from robot.outcome import Fault, Outcome
 from robot.simulation.head.session import MIDDLE
 from robot.sources.source import Sample
-from robot.ur10.safety import Refused
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Odometry
 

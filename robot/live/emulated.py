@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from robot.drivers.head.address import Address
+from robot.drivers.ur10.base_transform import tcp_of
 from robot.emulators.head.settings import HeadEmulatorConfig
 from robot.emulators.ur10.settings import UrEmulatorConfig
-from robot.head.address import Address
 from robot.live.route import way
 from robot.live.settings import LiveConfig
-from robot.ur10.placing import tcp_of
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 
 

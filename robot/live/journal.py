@@ -17,10 +17,10 @@ from typing import Any, Self
 import numpy as np
 
 from robot.blocks import Event, encode_cut, encode_event, encode_frames, encode_states
-from robot.head.decoder import Frames
-from robot.live.cycle import KEPT, Cut, within
+from robot.drivers.head.cycle_assembly import KEPT, Cut, within
+from robot.drivers.head.decoder import Frames
+from robot.drivers.outcome import Fault, Outcome
 from robot.messages import encode_truth
-from robot.outcome import Fault, Outcome
 from robot.schemas import ARM, CUT, EVENT, FRAMES, TRUTH
 from robot.tape import Tape, Unwritable
 

@@ -6,9 +6,9 @@ from collections import deque
 
 import numpy as np
 
+from robot.drivers.ur10.base_transform import heading_of, pose_of
 from robot.live.settings import LiveConfig
 from robot.sources.odometry import MID_HEADING, from_velocities, reckoned
-from robot.ur10.placing import heading_of, pose_of
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose, wrap
 from tactile.base.types import Odometry

@@ -10,18 +10,18 @@ from typing import Self
 
 import numpy as np
 
-from robot.clock import Clock
-from robot.head.decoder import Frames
-from robot.head.device import open_bridge
-from robot.head.reader import Link, Reader
-from robot.head.whisk import HeadDriver
-from robot.head.wire import Flag
+from robot.drivers.clock_sync import Clock
+from robot.drivers.head.decoder import Frames
+from robot.drivers.head.device import open_bridge
+from robot.drivers.head.protocol import Flag
+from robot.drivers.head.reader import Link, Reader
+from robot.drivers.head.whisk_control import HeadDriver
+from robot.drivers.outcome import Fault, Outcome
+from robot.drivers.ur10 import dashboard
+from robot.drivers.ur10.arm import Arm
 from robot.live.journal import Journal
 from robot.live.odometer import Odometer
 from robot.live.settings import LiveConfig
-from robot.outcome import Fault, Outcome
-from robot.ur10 import dashboard
-from robot.ur10.arm import Arm
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 
 TICK = 0.01

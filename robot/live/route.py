@@ -6,11 +6,11 @@ from typing import Protocol
 
 import numpy as np
 
+from robot.drivers.ur10.base_transform import tcp_of
+from robot.drivers.ur10.safety import Refused
+from robot.drivers.ur10.safety import checked as allowed
 from robot.live.settings import LiveConfig
 from robot.simulation.head.session import SimulationConfig
-from robot.ur10.placing import tcp_of
-from robot.ur10.safety import Refused
-from robot.ur10.safety import checked as allowed
 from robot.world.head_trajectory import Path
 from robot.world.scene import Scene, scene
 from tactile.base.errors import InputError

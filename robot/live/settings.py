@@ -7,10 +7,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
-from robot.head.settings import HeadLinkConfig
+from robot.drivers.head.config import HeadLinkConfig
+from robot.drivers.ur10.config import ArmConfig
 from robot.simulation.head.session import SimulationConfig
 from robot.sources.odometry import OdometryConfig
-from robot.ur10.settings import ArmConfig
 from tactile.base.config import Settings
 
 

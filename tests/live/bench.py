@@ -16,11 +16,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from robot.blocks import Event
+from robot.drivers.head.decoder import Frames
+from robot.drivers.ur10.base_transform import PlacingConfig, tcp_of
+from robot.drivers.ur10.dashboard import Dashboard
 from robot.emulators.head.settings import HeadEmulatorConfig
-from robot.head.decoder import Frames
 from robot.sources.source import Sample
-from robot.ur10.dashboard import Dashboard
-from robot.ur10.placing import PlacingConfig, tcp_of
 from robot.walk import Walk
 from tests.robot.live_helpers import HEAD_FAULTS, ROOT, Faults, emulator, until, ur_emulator
 
@@ -151,7 +151,10 @@ class Session:
         for folder in Path("/proc").glob("[0-9]*"):
             with suppress(OSError):
                 words = (folder / "cmdline").read_bytes().split(b"\0")
-                if b"robot.ur10.child" in words and os.getpgid(int(folder.name)) == self.process.pid:
+                if (
+                    b"robot.drivers.ur10.rtde_process" in words
+                    and os.getpgid(int(folder.name)) == self.process.pid
+                ):
                     return int(folder.name)
         raise AssertionError("no process of the arm")
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.clock import AHEAD, EARLY, SCALE, WINDOW, Clock
+from robot.drivers.clock_sync import AHEAD, EARLY, SCALE, WINDOW, Clock
 from tactile.base.random_streams import stream
 
 SHORTEST = 2e-4

@@ -13,13 +13,22 @@ from typing import Any
 
 import numpy as np
 
+from robot.drivers.head.protocol import (
+    CHANNELS,
+    REQUEST_IN,
+    VERSION,
+    Flag,
+    Request,
+    counts,
+    encode,
+    unpack,
+)
 from robot.emulators.head import descriptors
 from robot.emulators.head.faults import Faults
 from robot.emulators.head.fifo import Fifo
 from robot.emulators.head.settings import HeadEmulatorConfig
 from robot.emulators.head.whereabouts import Along, Place
 from robot.emulators.head.whiskers import Block, Whiskers
-from robot.head.wire import CHANNELS, REQUEST_IN, VERSION, Flag, Request, counts, encode, unpack
 from robot.world.walls import Walls
 from tactile.base.random_streams import stream
 from tactile.whiskers.head_geometry import ur10_head

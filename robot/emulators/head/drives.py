@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import ValidationError
 
-from robot.head.wire import ANGLE, OFF, SILENCE, Command, Kind, Mode
+from robot.drivers.head.protocol import ANGLE, OFF, SILENCE, Command, Kind, Mode
 from robot.simulation.head.quasistatic import Balance, rest
 from tactile.whiskers.head_geometry import Head
 from tactile.whiskers.whisking import Drive, WhiskingConfig, command, phase

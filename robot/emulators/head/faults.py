@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from robot.head.wire import tally
+from robot.drivers.head.protocol import tally
 
 HEADER = 20 - 4
 """Bytes of a frame before its values."""

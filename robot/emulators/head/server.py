@@ -14,13 +14,13 @@ import os
 import time
 from collections.abc import Awaitable, Callable
 
+from robot.drivers.head.protocol import ENDPOINT_IN
+from robot.drivers.head.usb_tcp_protocol import ANSWER, IN, REQUEST, Op
+from robot.drivers.process_priority import URGENT, ranked
 from robot.emulators.head import descriptors
 from robot.emulators.head.bridge import Bridge
 from robot.emulators.head.settings import HeadEmulatorConfig
 from robot.emulators.head.whereabouts import Along, Carried, Place
-from robot.emulators.usbline import ANSWER, IN, REQUEST, Op
-from robot.head.wire import ENDPOINT_IN
-from robot.priority import URGENT, ranked
 from robot.world.head_trajectory import Path
 from robot.world.scene import KidnapConfig, scene
 from tactile.whiskers.head_geometry import ur10_head
@@ -47,7 +47,7 @@ def serve(config: HeadEmulatorConfig) -> None:
 def _place(config: HeadEmulatorConfig, path: Path, stack: contextlib.ExitStack) -> Place:
     if config.arm is None:
         return Along(path if config.follow else Path(path.time[:1], path.pose[:1]))
-    from robot.emulators.ur10.poses import PoseStream
+    from robot.drivers.ur10.pose_listener import PoseStream
 
     arm = PoseStream(config.arm, hz=config.arm_hz)
     stack.callback(arm.close)
@@ -94,7 +94,7 @@ class Server:
                 await asyncio.sleep(self.bridge.due - time.monotonic())
 
     async def usb(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """A connection of `robot.emulators.usbline`; it belongs to the device as plugged in when it began."""
+        """A connection of `robot.drivers.head.usb_tcp_protocol`; it belongs to the device as plugged in when it began."""
         plugs = self.bridge.faults.plugs
         try:
             while True:

@@ -6,10 +6,10 @@ from typing import Annotated
 
 from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
 
-from robot.emulators.usbline import PORT
+from robot.drivers.head.usb_tcp_protocol import PORT
+from robot.drivers.ur10.base_transform import PlacingConfig
 from robot.simulation.head.beam import StreamConfig
 from robot.simulation.head.kinematic import MechanicsConfig
-from robot.ur10.placing import PlacingConfig
 from robot.world.head_trajectory import MotionConfig
 from robot.world.scene import MazeConfig, PathConfig
 from tactile.base.config import Settings

@@ -6,7 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
-from robot.ur10.placing import PlacingConfig, pose_of
+from robot.drivers.ur10.base_transform import PlacingConfig, pose_of
 from robot.world.head_trajectory import Path, at
 
 AHEAD = 0.1

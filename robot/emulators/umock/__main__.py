@@ -16,8 +16,8 @@ import sys
 import threading
 from typing import Any
 
+from robot.drivers.head.usb_tcp_protocol import PORT, Line, Op
 from robot.emulators.umock.usbfs import REAP, REAP_NOW, Usbfs
-from robot.emulators.usbline import PORT, Line, Op
 
 LOOK = 20
 """ms between looks at whether the head is plugged in."""

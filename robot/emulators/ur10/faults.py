@@ -29,7 +29,7 @@ import os
 import time
 from typing import TYPE_CHECKING, Any
 
-from robot.emulators.ur10 import wire
+from robot.drivers.ur10 import rtde_protocol
 from robot.emulators.ur10.registers import Value
 from robot.emulators.ur10.settings import WallConfig
 
@@ -110,7 +110,7 @@ class Faults:
         self._stalled_until = time.monotonic() + float(request["seconds"])
 
     def _do_malformed(self, request: dict[str, Any]) -> None:
-        self._raw(wire.HEADER.pack(0, wire.DATA))
+        self._raw(rtde_protocol.HEADER.pack(0, rtde_protocol.DATA))
 
     def _do_truncated(self, request: dict[str, Any]) -> None:
         for connection, session in self._server.rtde:
@@ -119,7 +119,7 @@ class Faults:
                 self._server.send(connection, whole[: len(whole) // 2])
 
     def _do_huge(self, request: dict[str, Any]) -> None:
-        self._raw(wire.HEADER.pack(0xFFFF, wire.DATA))
+        self._raw(rtde_protocol.HEADER.pack(0xFFFF, rtde_protocol.DATA))
 
     def _do_nan(self, request: dict[str, Any]) -> None:
         self._nan = True

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from robot.emulators.ur10.wire import OUTPUT_TYPES, REGISTERS
+from robot.drivers.ur10.rtde_protocol import OUTPUT_TYPES, REGISTERS
 
 Value = tuple[float, ...]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 
-from robot.emulators.ur10 import wire
+from robot.drivers.ur10 import rtde_protocol
 from robot.emulators.ur10.controller import Controller
 from robot.emulators.ur10.registers import Value
 
@@ -45,9 +45,9 @@ class RtdeSession:
         self.ignored = 0
         self._controller = controller
         self._claims = claims
-        self._splitter = wire.Splitter()
+        self._splitter = rtde_protocol.Splitter()
         self._outputs: list[str] = []
-        self._layout = wire.layout([])
+        self._layout = rtde_protocol.layout([])
         self._inputs: list[tuple[list[str], struct.Struct]] = []
 
     def received(self, data: bytes, host: float) -> bytes:
@@ -67,25 +67,25 @@ class RtdeSession:
         numbers: list[float] = []
         for name in self._outputs:
             numbers += overrides.get(name) or fields[name]
-        return wire.packed(wire.DATA, self._layout.pack(1, *numbers))
+        return rtde_protocol.packed(rtde_protocol.DATA, self._layout.pack(1, *numbers))
 
-    def _answer(self, package: wire.Package, host: float) -> bytes:
+    def _answer(self, package: rtde_protocol.Package, host: float) -> bytes:
         kind, body = package
-        if kind == wire.DATA:
+        if kind == rtde_protocol.DATA:
             self._take(body, host)
             return b""
-        if kind == wire.PROTOCOL:
+        if kind == rtde_protocol.PROTOCOL:
             (version,) = struct.unpack(">H", body)
-            return wire.packed(kind, bytes([version == wire.VERSION]))
-        if kind == wire.CONTROLLER:
-            return wire.packed(kind, struct.pack(">4I", *self._controller.config.version, 0))
-        if kind == wire.OUTPUTS:
-            return wire.packed(kind, self._set_outputs(body))
-        if kind == wire.INPUTS:
-            return wire.packed(kind, self._set_inputs(body))
-        if kind in (wire.START, wire.PAUSE):
-            self.started = kind == wire.START
-            return wire.packed(kind, b"\1")
+            return rtde_protocol.packed(kind, bytes([version == rtde_protocol.VERSION]))
+        if kind == rtde_protocol.CONTROLLER:
+            return rtde_protocol.packed(kind, struct.pack(">4I", *self._controller.config.version, 0))
+        if kind == rtde_protocol.OUTPUTS:
+            return rtde_protocol.packed(kind, self._set_outputs(body))
+        if kind == rtde_protocol.INPUTS:
+            return rtde_protocol.packed(kind, self._set_inputs(body))
+        if kind in (rtde_protocol.START, rtde_protocol.PAUSE):
+            self.started = kind == rtde_protocol.START
+            return rtde_protocol.packed(kind, b"\1")
         return b""
 
     def _set_outputs(self, body: bytes) -> bytes:
@@ -93,15 +93,15 @@ class RtdeSession:
         names = split(body[8:])
         hz = self._controller.config.hz
         self.every = max(1, round(hz / frequency)) if 0 < frequency <= hz else 1
-        types = [wire.OUTPUT_TYPES.get(name, "NOT_FOUND") for name in names]
+        types = [rtde_protocol.OUTPUT_TYPES.get(name, "NOT_FOUND") for name in names]
         known = "NOT_FOUND" not in types
         self._outputs = names if known else []
-        self._layout = wire.layout(types if known else [])
+        self._layout = rtde_protocol.layout(types if known else [])
         return bytes([known]) + ",".join(types).encode()
 
     def _set_inputs(self, body: bytes) -> bytes:
         names = split(body)
-        types = [wire.INPUT_TYPES.get(name, "NOT_FOUND") for name in names]
+        types = [rtde_protocol.INPUT_TYPES.get(name, "NOT_FOUND") for name in names]
         types = [
             kind if self._claims.free(name, self) else "IN_USE"
             for name, kind in zip(names, types, strict=True)
@@ -110,7 +110,7 @@ class RtdeSession:
             return b"\0" + ",".join(types).encode()
         for name in names:
             self._claims.owners[name] = self
-        self._inputs.append((names, wire.layout(types)))
+        self._inputs.append((names, rtde_protocol.layout(types)))
         return bytes([len(self._inputs)]) + ",".join(types).encode()
 
     def _take(self, body: bytes, host: float) -> None:
@@ -124,7 +124,7 @@ class RtdeSession:
         registers = self._controller.registers
         first = 0
         for name in names:
-            length = 6 if wire.INPUT_TYPES[name] == "VECTOR6D" else 1
+            length = 6 if rtde_protocol.INPUT_TYPES[name] == "VECTOR6D" else 1
             registers.write(name, numbers[first : first + length], host)
             first += length
 

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
+from robot.drivers.process_priority import URGENT, ranked
 from robot.emulators.ur10.controller import Controller
 from robot.emulators.ur10.dashboard import WELCOME, DashboardSession
 from robot.emulators.ur10.faults import Faults, FaultSession
@@ -27,7 +28,6 @@ from robot.emulators.ur10.settings import (
     SCRIPT_PORT,
     UrEmulatorConfig,
 )
-from robot.priority import URGENT, ranked
 from tactile.base.errors import InputError
 
 BACKLOG = 0.1  # s

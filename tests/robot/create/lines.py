@@ -8,10 +8,10 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-from robot.create.link import Link
-from robot.create.pilot import PAUSE, Pilot
-from robot.create.settings import CreateConfig
-from robot.create.wire import SAFE, START
+from robot.drivers.create.config import CreateConfig
+from robot.drivers.create.control_loop import PAUSE, Pilot
+from robot.drivers.create.protocol import SAFE, START
+from robot.drivers.create.serial_link import Link
 from robot.emulators.create import Create, CreateEmulatorConfig
 
 

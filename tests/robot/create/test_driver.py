@@ -12,10 +12,10 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from robot.create.driver import CreateDriver, NoAnswer, NotSafe
-from robot.create.halts import Halt, Refused
-from robot.create.link import NoPort
-from robot.create.settings import CreateConfig
+from robot.drivers.create.config import CreateConfig
+from robot.drivers.create.driver import CreateDriver, NoAnswer, NotSafe
+from robot.drivers.create.serial_link import NoPort
+from robot.drivers.create.stop_reasons import Halt, Refused
 from tactile.base.errors import InputError
 from tests.robot.create.lines import Emulated
 

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.create import wire
-from robot.create.odometer import Odometer
+from robot.drivers.create import protocol
+from robot.drivers.create.odometry import Odometer
 from robot.emulators.create import Create, CreateEmulatorConfig
 from tactile.base.se2 import compose
 
-SPEED = st.integers(-wire.TOP_SPEED, wire.TOP_SPEED)
+SPEED = st.integers(-protocol.TOP_SPEED, protocol.TOP_SPEED)
 LEG = st.tuples(SPEED, SPEED, st.floats(0.005, 0.5), st.integers(1, 20))  # wheels, s, readings
 LEGS = st.lists(LEG, min_size=1, max_size=12)
 
@@ -22,14 +22,14 @@ LEGS = st.lists(LEG, min_size=1, max_size=12)
 def readings(legs: list[tuple[int, int, float, int]]) -> tuple[Create, list[tuple[int, int, float]]]:
     """A robot driven so, and what it told: mm, degrees, time."""
     robot = Create(CreateEmulatorConfig())
-    robot.receive(wire.START + wire.SAFE)
+    robot.receive(protocol.START + protocol.SAFE)
     told = []
     for right, left, seconds, count in legs:
-        robot.receive(wire.drive(right, left))
+        robot.receive(protocol.drive(right, left))
         for _ in range(count):
             robot.advance(seconds)
-            (reply,) = robot.receive(wire.QUERY)
-            millimetres, degrees, *_ = wire.REPLY.unpack(reply)
+            (reply,) = robot.receive(protocol.QUERY)
+            millimetres, degrees, *_ = protocol.REPLY.unpack(reply)
             told.append((millimetres, degrees, robot.time))
     return robot, told
 

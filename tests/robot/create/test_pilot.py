@@ -10,9 +10,9 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from robot.create import wire
-from robot.create.halts import Halt, Refused
-from robot.create.pilot import Pilot
+from robot.drivers.create import protocol
+from robot.drivers.create.control_loop import Pilot
+from robot.drivers.create.stop_reasons import Halt, Refused
 from robot.emulators.create import Create
 from tests.robot.create.lines import Line
 
@@ -68,7 +68,7 @@ def test_a_bump_stops_it_and_leaves_the_way_back() -> None:
     line = Line()
     pilot = line.flown()
     drive(line, pilot, 0.5, 0.1)
-    line.robot.touch(wire.Bumps.LEFT)
+    line.robot.touch(protocol.Bumps.LEFT)
     pilot.poll()
     assert not rolls(line.robot)
     assert pilot.halted
@@ -86,8 +86,8 @@ def test_a_bump_stops_it_and_leaves_the_way_back() -> None:
 
 
 @pytest.mark.parametrize("forward", [0.1, -0.1, 0.0])
-@pytest.mark.parametrize("dropped", [wire.Bumps.DROPPED_LEFT, wire.Bumps.DROPPED_CASTER])
-def test_a_dropped_wheel_stops_it_until_it_stands(dropped: wire.Bumps, forward: float) -> None:
+@pytest.mark.parametrize("dropped", [protocol.Bumps.DROPPED_LEFT, protocol.Bumps.DROPPED_CASTER])
+def test_a_dropped_wheel_stops_it_until_it_stands(dropped: protocol.Bumps, forward: float) -> None:
     line = Line()
     pilot = line.flown()
     drive(line, pilot, 0.2, forward, 0.2)
@@ -98,7 +98,7 @@ def test_a_dropped_wheel_stops_it_until_it_stands(dropped: wire.Bumps, forward: 
     pilot.release()
     drive(line, pilot, 0.2, forward, 0.2)
     assert pilot.halted is not None  # it hangs still
-    line.robot.touch(wire.Bumps(0))
+    line.robot.touch(protocol.Bumps(0))
     pilot.release()
     drive(line, pilot, 0.2, forward, 0.2)
     assert rolls(line.robot)
@@ -108,14 +108,14 @@ def test_a_robot_that_left_safe_mode_is_brought_back_by_release_alone() -> None:
     line = Line()
     pilot = line.flown()
     drive(line, pilot, 0.2, 0.1)
-    line.robot.touch(wire.Bumps(0), cliff=True)
+    line.robot.touch(protocol.Bumps(0), cliff=True)
     drive(line, pilot, 1.0, 0.1)
     assert pilot.halted
     assert pilot.halted.halt is Halt.LEFT_SAFE_MODE
-    assert line.robot.mode == wire.Mode.PASSIVE
+    assert line.robot.mode == protocol.Mode.PASSIVE
     pilot.release()
     drive(line, pilot, 0.2, 0.1)
-    assert line.robot.mode == wire.Mode.SAFE
+    assert line.robot.mode == protocol.Mode.SAFE
     assert rolls(line.robot)
 
 
@@ -248,7 +248,7 @@ def test_garbage_before_a_reply_costs_nothing(count: int, noise: bytes, forward:
 def test_what_is_asked_for_while_it_is_read_is_looked_at_too() -> None:
     line = Line()
     pilot = line.flown()
-    line.robot.touch(wire.Bumps.RIGHT)
+    line.robot.touch(protocol.Bumps.RIGHT)
 
     def mangle(reply: bytes) -> bytes:
         pilot.steer(0.1, 0.0)
@@ -264,9 +264,9 @@ def test_nothing_asked_for_before_a_stop_is_done_after_its_release() -> None:
     line = Line()
     pilot = line.flown()
     drive(line, pilot, 0.5, 0.1)
-    line.robot.touch(wire.Bumps.RIGHT)
+    line.robot.touch(protocol.Bumps.RIGHT)
     pilot.poll()
-    line.robot.touch(wire.Bumps(0))
+    line.robot.touch(protocol.Bumps(0))
     pilot.release()
     for _ in range(3):
         line.wait(PERIOD)

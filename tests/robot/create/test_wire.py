@@ -8,24 +8,24 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from robot.create import wire
-from robot.create.halts import Refused, wheels
-from robot.create.settings import CreateConfig
+from robot.drivers.create import protocol
+from robot.drivers.create.config import CreateConfig
+from robot.drivers.create.stop_reasons import Refused, wheels
 from robot.emulators.create import Create, CreateEmulatorConfig
 
-SPEED = st.integers(-wire.TOP_SPEED, wire.TOP_SPEED)
+SPEED = st.integers(-protocol.TOP_SPEED, protocol.TOP_SPEED)
 
 
 def awake() -> Create:
     robot = Create(CreateEmulatorConfig())
-    assert robot.receive(wire.START + wire.SAFE) == []
+    assert robot.receive(protocol.START + protocol.SAFE) == []
     return robot
 
 
 @given(SPEED, SPEED, st.integers(1, 5))
 def test_wheels_turn_as_they_are_told_however_the_command_is_cut(right: int, left: int, cut: int) -> None:
     robot = awake()
-    command = wire.drive(right, left)
+    command = protocol.drive(right, left)
     robot.receive(command[:cut])
     robot.receive(command[cut:])
     assert (robot.right, robot.left) == (right, left)
@@ -34,50 +34,50 @@ def test_wheels_turn_as_they_are_told_however_the_command_is_cut(right: int, lef
 
 @given(SPEED, SPEED, st.integers(0, 6))
 def test_a_stop_stops_after_a_command_that_broke_off(right: int, left: int, length: int) -> None:
-    for command in (wire.drive(right, left), wire.QUERY):
+    for command in (protocol.drive(right, left), protocol.QUERY):
         robot = awake()
-        robot.receive(wire.drive(200, 200) + command[:length])
-        robot.receive(wire.STOP_ANYHOW)
+        robot.receive(protocol.drive(200, 200) + command[:length])
+        robot.receive(protocol.STOP_ANYHOW)
         assert (robot.right, robot.left) == (0, 0)
 
 
 @pytest.mark.parametrize(("right", "left"), [(501, 0), (0, -501), (32767, 0)])
 def test_no_command_is_beyond_the_interface(right: int, left: int) -> None:
     with pytest.raises(ValueError, match="500 at most"):
-        wire.drive(right, left)
+        protocol.drive(right, left)
 
 
 @given(SPEED, SPEED, st.floats(0, 3), st.sampled_from([0, 1, 2, 3, 4, 16, 31]))
 def test_what_a_create_says_is_believed(right: int, left: int, elapsed: float, bumps: int) -> None:
     robot = awake()
-    robot.receive(wire.drive(right, left))
-    robot.touch(wire.Bumps(bumps))
+    robot.receive(protocol.drive(right, left))
+    robot.touch(protocol.Bumps(bumps))
     robot.advance(elapsed)
-    (reply,) = robot.receive(wire.QUERY)
-    found = wire.sensed(reply, elapsed)
+    (reply,) = robot.receive(protocol.QUERY)
+    found = protocol.sensed(reply, elapsed)
     assert found is not None
     assert found.bumps == bumps
-    assert found.mode == (wire.Mode.PASSIVE if bumps > 3 else wire.Mode.SAFE)
+    assert found.mode == (protocol.Mode.PASSIVE if bumps > 3 else protocol.Mode.SAFE)
     assert abs(found.millimetres - 1000 * robot.base.travelled) < 1
     assert abs(found.degrees - math.degrees(robot.base.turned)) < 1
 
 
 @given(st.binary(max_size=12), st.floats(0, 1))
-@example(wire.REPLY.pack(0, 0, 0, 2), 0.0)
-@example(wire.REPLY.pack(60, 0, 0, 2), 0.0)
-@example(wire.REPLY.pack(0, -60, 0, 2), 0.0)
-@example(wire.REPLY.pack(0, 0, 32, 2), 0.0)
-@example(wire.REPLY.pack(0, 0, 0, 0), 0.0)
-@example(wire.REPLY.pack(0, 0, 0, 4), 0.0)
+@example(protocol.REPLY.pack(0, 0, 0, 2), 0.0)
+@example(protocol.REPLY.pack(60, 0, 0, 2), 0.0)
+@example(protocol.REPLY.pack(0, -60, 0, 2), 0.0)
+@example(protocol.REPLY.pack(0, 0, 32, 2), 0.0)
+@example(protocol.REPLY.pack(0, 0, 0, 0), 0.0)
+@example(protocol.REPLY.pack(0, 0, 0, 4), 0.0)
 def test_what_is_believed_is_possible(data: bytes, elapsed: float) -> None:
-    found = wire.sensed(data, elapsed)
+    found = protocol.sensed(data, elapsed)
     if found is not None:
-        assert wire.REPLY.pack(*found) == data
+        assert protocol.REPLY.pack(*found) == data
         assert found.mode in (1, 2, 3)
         assert abs(found.millimetres) <= 500 * (elapsed + 0.1) + 5
         assert abs(found.degrees) <= 222 * (elapsed + 0.1) + 5
     else:
-        assert data != wire.REPLY.pack(0, 0, 0, 2)
+        assert data != protocol.REPLY.pack(0, 0, 0, 2)
 
 
 @given(st.floats(0.0005, 0.5), st.floats(allow_infinity=True, allow_nan=True), st.floats())

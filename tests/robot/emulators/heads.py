@@ -8,11 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from robot.emulators.head.bridge import BLOCK, Bridge
-from robot.emulators.head.settings import CONTROL_PORT, HeadEmulatorConfig
-from robot.emulators.head.whereabouts import Along, Place
-from robot.head.decoder import Decoder, Frames
-from robot.head.wire import (
+from robot.drivers.head.decoder import Decoder, Frames
+from robot.drivers.head.protocol import (
     KEEP_ALIVE,
     REQUEST_OUT,
     Command,
@@ -22,6 +19,9 @@ from robot.head.wire import (
     pack,
     tally,
 )
+from robot.emulators.head.bridge import BLOCK, Bridge
+from robot.emulators.head.settings import CONTROL_PORT, HeadEmulatorConfig
+from robot.emulators.head.whereabouts import Along, Place
 from robot.world.scene import KidnapConfig, Scene, scene
 from robot.world.walls import Walls
 from tactile.whiskers.head_geometry import ur10_head

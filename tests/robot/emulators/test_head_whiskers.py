@@ -5,13 +5,23 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from robot.drivers.head.protocol import (
+    ANGLE,
+    SILENCE,
+    Command,
+    Flag,
+    Kind,
+    Mode,
+    counts,
+    radians,
+    tally,
+)
+from robot.drivers.ur10.base_transform import PlacingConfig, tcp_of
 from robot.emulators.head.bridge import BLOCK
 from robot.emulators.head.settings import HeadEmulatorConfig
 from robot.emulators.head.whereabouts import AHEAD, Along, Carried
-from robot.head.wire import ANGLE, SILENCE, Command, Flag, Kind, Mode, counts, radians, tally
 from robot.simulation.head.quasistatic import quasistatic
 from robot.simulation.head.whisk_stream import cycles
-from robot.ur10.placing import PlacingConfig, tcp_of
 from robot.world.head_trajectory import Path
 from robot.world.walls import Surroundings
 from tactile.base.random_streams import stream

@@ -21,7 +21,7 @@ from typing import Any
 
 import pytest
 
-from robot.emulators.ur10.poses import PoseStream
+from robot.drivers.ur10.pose_listener import PoseStream
 from tests.robot.live_helpers import ROOT, Faults, until, ur_emulator
 
 REAL = os.environ.get("RATSLAM_UR_HOST", "")

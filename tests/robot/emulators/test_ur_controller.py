@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.emulators.ur10 import wire
+from robot.drivers.ur10 import rtde_protocol
 from robot.emulators.ur10.controller import Controller
 from robot.emulators.ur10.dashboard import DashboardSession
 from robot.emulators.ur10.rtde import Claims, RtdeSession
@@ -284,7 +284,7 @@ def names(variables: list[str], frequency: float | None = None) -> bytes:
 
 
 def reply(session: RtdeSession, kind: int, body: bytes = b"") -> bytes:
-    (package,) = wire.Splitter().feed(session.received(wire.packed(kind, body), 0.0))
+    (package,) = rtde_protocol.Splitter().feed(session.received(rtde_protocol.packed(kind, body), 0.0))
     assert package.kind == kind
     return package.body
 
@@ -292,15 +292,17 @@ def reply(session: RtdeSession, kind: int, body: bytes = b"") -> bytes:
 def test_recipes_are_told_by_type_and_states_follow_them() -> None:
     bench = Bench()
     session = RtdeSession(bench.controller, Claims())
-    assert reply(session, wire.PROTOCOL, b"\0\2") == b"\1"
-    assert reply(session, wire.PROTOCOL, b"\0\1") == b"\0"
-    assert reply(session, wire.CONTROLLER) == struct.pack(">4I", 3, 15, 8, 0)
+    assert reply(session, rtde_protocol.PROTOCOL, b"\0\2") == b"\1"
+    assert reply(session, rtde_protocol.PROTOCOL, b"\0\1") == b"\0"
+    assert reply(session, rtde_protocol.CONTROLLER) == struct.pack(">4I", 3, 15, 8, 0)
     wanted = ["timestamp", "actual_TCP_pose", "robot_mode", "output_int_register_0"]
-    assert reply(session, wire.OUTPUTS, names([*wanted, "weather"], 125.0))[1:].endswith(b"NOT_FOUND")
-    assert reply(session, wire.OUTPUTS, names(wanted, 62.5)) == b"\1DOUBLE,VECTOR6D,INT32,INT32"
+    assert reply(session, rtde_protocol.OUTPUTS, names([*wanted, "weather"], 125.0))[1:].endswith(
+        b"NOT_FOUND"
+    )
+    assert reply(session, rtde_protocol.OUTPUTS, names(wanted, 62.5)) == b"\1DOUBLE,VECTOR6D,INT32,INT32"
     assert session.every == 2
-    assert reply(session, wire.START) == b"\1"
-    (package,) = wire.Splitter().feed(session.state({}))
+    assert reply(session, rtde_protocol.START) == b"\1"
+    (package,) = rtde_protocol.Splitter().feed(session.state({}))
     recipe, time, *rest = struct.unpack(">Bd6dii", package.body)
     assert recipe == 1
     assert time == bench.controller.time
@@ -312,18 +314,20 @@ def test_an_input_has_one_master() -> None:
     controller = Controller(UrEmulatorConfig())
     first, second = RtdeSession(controller, claims), RtdeSession(controller, claims)
     registers = ["input_int_register_0", "input_double_register_3"]
-    assert reply(first, wire.INPUTS, names(registers)) == b"\1INT32,DOUBLE"
-    assert reply(first, wire.INPUTS, names(registers[:1])) == b"\2INT32"
-    assert reply(second, wire.INPUTS, names(registers)) == b"\0IN_USE,IN_USE"
-    first.received(wire.packed(wire.DATA, struct.pack(">Bid", 1, 7, 0.5)), 3.0)
-    first.received(wire.packed(wire.DATA, struct.pack(">Bi", 1, 8)), 4.0)  # too short for its recipe
+    assert reply(first, rtde_protocol.INPUTS, names(registers)) == b"\1INT32,DOUBLE"
+    assert reply(first, rtde_protocol.INPUTS, names(registers[:1])) == b"\2INT32"
+    assert reply(second, rtde_protocol.INPUTS, names(registers)) == b"\0IN_USE,IN_USE"
+    first.received(rtde_protocol.packed(rtde_protocol.DATA, struct.pack(">Bid", 1, 7, 0.5)), 3.0)
+    first.received(
+        rtde_protocol.packed(rtde_protocol.DATA, struct.pack(">Bi", 1, 8)), 4.0
+    )  # too short for its recipe
     assert (controller.registers.ints[0], controller.registers.doubles[3]) == (7, 0.5)
     assert controller.registers.written[0] == 3.0
     assert first.ignored == 1
     first.closed()
-    assert reply(second, wire.INPUTS, names(registers)) == b"\1INT32,DOUBLE"
+    assert reply(second, rtde_protocol.INPUTS, names(registers)) == b"\1INT32,DOUBLE"
     claims.by_others = True
-    assert reply(RtdeSession(controller, claims), wire.INPUTS, names(registers[:1])) == b"\0IN_USE"
+    assert reply(RtdeSession(controller, claims), rtde_protocol.INPUTS, names(registers[:1])) == b"\0IN_USE"
 
 
 @given(data=st.lists(st.binary(max_size=60), max_size=8))
@@ -341,18 +345,27 @@ def test_no_bytes_bring_a_session_down(data: list[bytes]) -> None:
 
 
 @given(
-    kind=st.sampled_from([wire.PROTOCOL, wire.OUTPUTS, wire.INPUTS, wire.START, wire.DATA, wire.TEXT]),
+    kind=st.sampled_from(
+        [
+            rtde_protocol.PROTOCOL,
+            rtde_protocol.OUTPUTS,
+            rtde_protocol.INPUTS,
+            rtde_protocol.START,
+            rtde_protocol.DATA,
+            rtde_protocol.TEXT,
+        ]
+    ),
     body=st.binary(max_size=40),
 )
 def test_no_body_brings_the_wire_down(kind: int, body: bytes) -> None:
     session = RtdeSession(Controller(UrEmulatorConfig()), Claims())
     with contextlib.suppress(ValueError):
-        session.received(wire.packed(kind, body), 0.0)
+        session.received(rtde_protocol.packed(kind, body), 0.0)
     session.state({})
 
 
 @given(data=st.binary(max_size=300), cut=st.integers(0, 300))
 def test_packages_do_not_depend_on_how_they_are_cut(data: bytes, cut: int) -> None:
-    stream = b"".join(wire.packed(byte, data[:byte]) for byte in data[:20])
-    whole, parts = wire.Splitter(), wire.Splitter()
+    stream = b"".join(rtde_protocol.packed(byte, data[:byte]) for byte in data[:20])
+    whole, parts = rtde_protocol.Splitter(), rtde_protocol.Splitter()
     assert list(whole.feed(stream)) == [*parts.feed(stream[:cut]), *parts.feed(stream[cut:])]

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from robot.emulators.ur10.poses import PoseStream
+from robot.drivers.ur10.pose_listener import PoseStream
 from tests.robot.live_helpers import Faults, until, ur_emulator
 
 START = (0.6, 0.0, 0.3, math.pi, 0.0, 0.0)

@@ -16,10 +16,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robot.emulators.head.settings import HeadEmulatorConfig
-from robot.emulators.usbsocket import SocketBackend, backend
-from robot.head.decoder import Decoder, Frames
-from robot.head.wire import (
+from robot.drivers.head.decoder import Decoder, Frames
+from robot.drivers.head.protocol import (
     ENDPOINT_IN,
     ENDPOINT_OUT,
     KEEP_ALIVE,
@@ -31,6 +29,8 @@ from robot.head.wire import (
     Request,
     pack,
 )
+from robot.drivers.head.usb_tcp_backend import SocketBackend, backend
+from robot.emulators.head.settings import HeadEmulatorConfig
 from tests.robot.emulators.heads import drive, running
 from tests.robot.live_helpers import Faults, until
 

@@ -8,10 +8,10 @@ import sys
 import time
 from typing import Any
 
+from robot.drivers.head.decoder import Decoder
+from robot.drivers.head.device import Bridge, Gone, Stalled, identity, open_bridge
+from robot.drivers.head.protocol import KEEP_ALIVE, Request, pack
 from robot.emulators.head.settings import CONTROL_PORT
-from robot.head.decoder import Decoder
-from robot.head.device import Bridge, Gone, Stalled, identity, open_bridge
-from robot.head.wire import KEEP_ALIVE, Request, pack
 from tests.robot.emulators.heads import drive
 
 

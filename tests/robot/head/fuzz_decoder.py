@@ -9,10 +9,10 @@ import sys
 
 import atheris
 
-with atheris.instrument_imports(include=["robot.head"]):
-    from robot.head.decoder import Counts, Decoder
+with atheris.instrument_imports(include=["robot.drivers.head"]):
+    from robot.drivers.head.decoder import Counts, Decoder
 
-from robot.head.wire import encode
+from robot.drivers.head.protocol import encode
 from tests.robot.head.oracle import told
 
 SHAPE = (2, 1)

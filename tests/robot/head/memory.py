@@ -10,8 +10,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from robot.head.device import Gone, Stalled
-from robot.head.wire import CHANNELS, Command, Request, encode, unpack
+from robot.drivers.head.device import Gone, Stalled
+from robot.drivers.head.protocol import CHANNELS, Command, Request, encode, unpack
 
 WHISKERS = 2
 

@@ -14,8 +14,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robot.head.decoder import Counts, Decoder, Frames
-from robot.head.wire import Flag, encode
+from robot.drivers.head.decoder import Counts, Decoder, Frames
+from robot.drivers.head.protocol import Flag, encode
 from tests.robot.head.damage import damaged, soaked, streams
 from tests.robot.head.oracle import Sample, told
 

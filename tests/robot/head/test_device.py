@@ -9,10 +9,10 @@ from array import array
 
 import pytest
 
-from robot.head.address import Address
-from robot.head.device import Gone, Identity, Stalled, UsbBridge, identity, open_bridge
-from robot.head.settings import HeadLinkConfig
-from robot.head.wire import ENDPOINT_IN, ENDPOINT_OUT, REQUEST_IN, REQUEST_OUT, Request
+from robot.drivers.head.address import Address
+from robot.drivers.head.config import HeadLinkConfig
+from robot.drivers.head.device import Gone, Identity, Stalled, UsbBridge, identity, open_bridge
+from robot.drivers.head.protocol import ENDPOINT_IN, ENDPOINT_OUT, REQUEST_IN, REQUEST_OUT, Request
 from tactile.base.errors import InputError
 from tests.robot.head.memory import MemoryHead
 

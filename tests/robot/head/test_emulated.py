@@ -11,11 +11,11 @@ import time
 import numpy as np
 import pytest
 
-from robot.head.device import open_bridge
-from robot.head.reader import Link, Reader
-from robot.head.settings import HeadLinkConfig
-from robot.head.whisk import HeadDriver
-from robot.head.wire import ANGLE, Flag
+from robot.drivers.head.config import HeadLinkConfig
+from robot.drivers.head.device import open_bridge
+from robot.drivers.head.protocol import ANGLE, Flag
+from robot.drivers.head.reader import Link, Reader
+from robot.drivers.head.whisk_control import HeadDriver
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 from tactile.whiskers.whisking import WhiskingConfig
 from tests.robot.head.memory import until

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robot.head import numbering
-from robot.head.numbering import Numbering
+from robot.drivers.head import sequence_numbers
+from robot.drivers.head.sequence_numbers import Numbering
 from tests.robot.head import oracle
 
 STEPS = st.one_of(st.integers(-9, 12), st.sampled_from([1, 1, 1, 2**31 - 1, 2**31, -(2**31)]))

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.head.overload import Overload
-from robot.head.wire import ANGLE
+from robot.drivers.head.overload import Overload
+from robot.drivers.head.protocol import ANGLE
 
 LIMIT = 1000
 

@@ -8,10 +8,10 @@ import time
 import numpy as np
 import pytest
 
-from robot.head.reader import Link, Reader
-from robot.head.settings import HeadLinkConfig
-from robot.head.wire import Command, Kind, Mode, Request
-from robot.outcome import Outcome
+from robot.drivers.head.config import HeadLinkConfig
+from robot.drivers.head.protocol import Command, Kind, Mode, Request
+from robot.drivers.head.reader import Link, Reader
+from robot.drivers.outcome import Outcome
 from tactile.base.errors import InputError
 from tests.robot.head.memory import WHISKERS, MemoryHead, until
 

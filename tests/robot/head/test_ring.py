@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.head.decoder import Frames
-from robot.head.ring import Ring
+from robot.drivers.head.decoder import Frames
+from robot.drivers.head.ring_buffer import Ring
 
 SIZE = 16
 

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robot.head.decoder import Frames
-from robot.head.reader import Reader
-from robot.head.settings import HeadLinkConfig
-from robot.head.whisk import HeadDriver, HostRcp, commands
-from robot.head.wire import ANGLE, OFF, Flag, Kind, Mode, tally
+from robot.drivers.head.config import HeadLinkConfig
+from robot.drivers.head.decoder import Frames
+from robot.drivers.head.protocol import ANGLE, OFF, Flag, Kind, Mode, tally
+from robot.drivers.head.reader import Reader
+from robot.drivers.head.whisk_control import HeadDriver, HostRcp, commands
 from tactile.base.errors import InputError
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 from tactile.whiskers.whisking import WhiskingConfig, command, still

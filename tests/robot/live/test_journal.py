@@ -31,14 +31,14 @@ from robot.blocks import (
     encode_frames,
     encode_states,
 )
-from robot.head.decoder import Frames
-from robot.live.cycle import KEPT, Cut, Window, assembled, cut_of, no_frames, within
+from robot.drivers.head.cycle_assembly import KEPT, Cut, Window, assembled, cut_of, no_frames, within
+from robot.drivers.head.decoder import Frames
+from robot.drivers.outcome import Outcome
+from robot.drivers.ur10.shared_state import STATE
 from robot.live.journal import Journal
-from robot.outcome import Outcome
 from robot.recording import Recording, recover
 from robot.schemas import SCHEMAS
 from robot.tape import _Whole
-from robot.ur10.states import STATE
 from robot.walk import Entry, Walk
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Odometry

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from robot.drivers.ur10.base_transform import pose_of
 from robot.live.route import approach, descent, routed, way
 from robot.live.settings import LiveConfig
-from robot.ur10.placing import pose_of
 from robot.world.head_trajectory import at
 from robot.world.scene import scene
 from tactile.base.errors import InputError

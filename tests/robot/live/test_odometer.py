@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from robot.drivers.ur10.base_transform import tcp_of
 from robot.live.odometer import Odometer
 from robot.live.settings import LiveConfig
 from robot.sources.odometry import OdometryConfig
-from robot.ur10.placing import tcp_of
 from tactile.base.se2 import compose, integrate
 
 HZ = 125.0

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robot.ur10.arm import Arm
-from robot.ur10.dashboard import Dashboard
-from robot.ur10.placing import tcp_of
-from robot.ur10.settings import ArmConfig
+from robot.drivers.ur10.arm import Arm
+from robot.drivers.ur10.base_transform import tcp_of
+from robot.drivers.ur10.config import ArmConfig
+from robot.drivers.ur10.dashboard import Dashboard
 from tests.robot.live_helpers import Faults, until, ur_emulator
 
 HOME = tcp_of(ArmConfig().placing, np.array([0.63, 0.45, 0.0]))

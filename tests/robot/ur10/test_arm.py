@@ -9,11 +9,11 @@ import time
 import numpy as np
 import pytest
 
-from robot.outcome import Outcome
-from robot.ur10.arm import Arm
-from robot.ur10.dashboard import Dashboard
-from robot.ur10.safety import Refused
-from robot.ur10.settings import BoxConfig
+from robot.drivers.outcome import Outcome
+from robot.drivers.ur10.arm import Arm
+from robot.drivers.ur10.config import BoxConfig
+from robot.drivers.ur10.dashboard import Dashboard
+from robot.drivers.ur10.safety import Refused
 from tests.robot.live_helpers import Faults, moves, until
 from tests.robot.ur10.conftest import AWAY, HOME, settings
 

@@ -12,13 +12,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.outcome import Outcome
-from robot.ur10.arm import Arm
-from robot.ur10.governor import Governor, Order
-from robot.ur10.placing import tcp_of
-from robot.ur10.safety import LEAST, Refused, inside
-from robot.ur10.settings import SPEED_CAP, ArmConfig
-from robot.ur10.states import Board
+from robot.drivers.outcome import Outcome
+from robot.drivers.ur10.arm import Arm
+from robot.drivers.ur10.base_transform import tcp_of
+from robot.drivers.ur10.command_thread import Governor, Order
+from robot.drivers.ur10.config import SPEED_CAP, ArmConfig
+from robot.drivers.ur10.safety import LEAST, Refused, inside
+from robot.drivers.ur10.shared_state import Board
 from tests.robot.ur10.conftest import HOME
 from tests.robot.ur10.test_safety import a_state
 

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.ur10.placing import PlacingConfig, heading_of, pose_of, tcp_of, tilt_of
+from robot.drivers.ur10.base_transform import PlacingConfig, heading_of, pose_of, tcp_of, tilt_of
 from tactile.base.se2 import between, wrap
 
 metres = st.floats(-2, 2)

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robot.ur10 import dashboard
-from robot.ur10.arm import Arm
-from robot.ur10.arming import Refusal, admitted
-from robot.ur10.dashboard import PORT, Dashboard, Silent
-from robot.ur10.settings import ArmConfig, BoxConfig
+from robot.drivers.ur10 import dashboard
+from robot.drivers.ur10.arm import Arm
+from robot.drivers.ur10.config import ArmConfig, BoxConfig
+from robot.drivers.ur10.dashboard import PORT, Dashboard, Silent
+from robot.drivers.ur10.startup_checks import Refusal, admitted
 from tests.robot.live_helpers import Faults, moves, until
 from tests.robot.ur10.conftest import HOME, settings
 
@@ -135,7 +135,7 @@ def test_a_controller_that_does_not_answer_on_its_other_ports(elsewhere: str) ->
 
 
 def test_an_arm_that_was_not_started_refuses_and_closes(loopback: str) -> None:
-    from robot.ur10.safety import Refused
+    from robot.drivers.ur10.safety import Refused
 
     with Arm(ArmConfig(host=loopback)) as arm:
         with pytest.raises(Refused, match="not armed"):

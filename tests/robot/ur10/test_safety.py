@@ -8,9 +8,10 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from robot.outcome import Outcome
-from robot.ur10.placing import tcp_of
-from robot.ur10.safety import (
+from robot.drivers.outcome import Outcome
+from robot.drivers.ur10.base_transform import tcp_of
+from robot.drivers.ur10.config import SPEED_CAP, ArmConfig, BoxConfig
+from robot.drivers.ur10.safety import (
     LEAST,
     REACH,
     SAFETY_BITS,
@@ -26,8 +27,7 @@ from robot.ur10.safety import (
     retreat,
     turned,
 )
-from robot.ur10.settings import SPEED_CAP, ArmConfig, BoxConfig
-from robot.ur10.states import STATE
+from robot.drivers.ur10.shared_state import STATE
 
 CONFIG = ArmConfig()
 HOME = tcp_of(CONFIG.placing, np.array([0.63, 0.45, 0.0]))

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robot.ur10.states import SLOTS, STATE, Board
+from robot.drivers.ur10.shared_state import SLOTS, STATE, Board
 
 WRITER = """
 import sys, numpy as np

@@ -9,9 +9,9 @@ import time
 import numpy as np
 from hypothesis import HealthCheck, given, settings
 
-from robot.ur10.arm import Arm
-from robot.ur10.safety import Refused, inside
-from robot.ur10.settings import SPEED_CAP
+from robot.drivers.ur10.arm import Arm
+from robot.drivers.ur10.config import SPEED_CAP
+from robot.drivers.ur10.safety import Refused, inside
 from tests.robot.live_helpers import Faults, moves, until
 from tests.robot.ur10.test_orders import poses, speeds
 

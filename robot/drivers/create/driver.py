@@ -1,0 +1,197 @@
+"""Drives a Create: a thread that reads and steers, and a guard for when even that ends."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import threading
+import time
+from typing import Self
+
+from robot.drivers.create import protocol
+from robot.drivers.create.config import CreateConfig
+from robot.drivers.create.control_loop import PAUSE, Pilot
+from robot.drivers.create.serial_link import Counts, Garbled, Link, Silent, Unplugged, open_port
+from robot.drivers.create.stop_reasons import Halt, Halted, Refused
+from robot.drivers.create.watchdog import Guard
+from tactile.base.errors import InputError
+from tactile.base.types import Odometry
+
+TRIES = 5
+"""Queries until a Create has to have answered."""
+
+
+class NoAnswer(InputError):
+    """Nothing on the port answers as a Create does."""
+
+
+class NotSafe(InputError):
+    """It answers, but does not go into safe mode."""
+
+
+class CreateDriver:
+    """A Create that drives while it is told to, and stops by itself otherwise.
+
+    Times are of `time.monotonic()`. All methods return at once, except `start`, `stop` and `close` (at most
+    some tenths of a second), and may be called from any thread.
+    """
+
+    def __init__(self, config: CreateConfig) -> None:
+        self.config = config
+        self._pilot: Pilot | None = None
+        self._link: Link | None = None
+        self._guard: Guard | None = None
+        self._thread: threading.Thread | None = None
+        self._ending, self._wake, self._polled = (threading.Event() for _ in range(3))
+
+    def start(self) -> None:
+        """Opens the port, brings the robot into safe mode, clears its counters, starts reading.
+
+        Raises:
+            InputError: `NoPort`, `NoAnswer`, `NotSafe` or `Unguarded`, each with its cure.
+        """
+        if self._link is not None:
+            raise ValueError("a driver starts once")
+        self._link = Link(open_port(self.config.port))
+        try:
+            self._guard = Guard(self.config.port, self.config.patience)
+            self._rouse(self._link)
+            self._pilot = Pilot(self.config, self._link, time.monotonic)
+        except BaseException:
+            self.close()
+            raise
+        self._thread = threading.Thread(target=self._run, name="create", daemon=True)
+        self._thread.start()
+
+    def drive(self, forward: float, turn: float) -> None:
+        """Drives, m/s and rad/s counter-clockwise, for at most `patience`: call it again to go on.
+
+        Raises:
+            Refused: a wheel over the cap, not finite, not started, or stopped by something not released.
+        """
+        self._flown().steer(forward, turn)
+        self._wake.set()
+
+    def stop(self) -> None:
+        """Stops the wheels; when it returns, that was sent."""
+        self._flown().steer(0.0, 0.0)
+        self._next_poll()
+
+    def release(self) -> None:
+        """Lets it be driven again after something stopped it, and brings it back into safe mode.
+
+        Raises:
+            Refused: nothing but a new driver can help.
+        """
+        self._flown().release()
+        self._next_poll()
+
+    def odometry(self) -> Odometry:
+        """Motion since the last call, up to the last reading; plain floats, the turn not wrapped."""
+        return self._flown().take()
+
+    def gap(self) -> bool:
+        """Whether readings were lost since the last call: then some motion may be missing in the odometry."""
+        return self._flown().gap()
+
+    @property
+    def halted(self) -> Halted | None:
+        """What stopped it, until it is released."""
+        return self._pilot.halted if self._pilot else None
+
+    @property
+    def sensed(self) -> protocol.Sensed | None:
+        """The last reading."""
+        return self._pilot.sensed if self._pilot else None
+
+    @property
+    def counts(self) -> Counts:
+        """What became of the queries so far."""
+        return self._link.counts if self._link else Counts()
+
+    def close(self) -> None:
+        """Stops the wheels, leaves safe mode, gives the port back. May be called more than once."""
+        self._ending.set()
+        self._wake.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        if self._link is not None:
+            with contextlib.suppress(Unplugged):
+                self._link.send(protocol.STOP_ANYHOW)
+                self._link.send(protocol.START)
+            self._link.close()
+        if self._guard is not None:
+            self._guard.close()
+            self._guard = None
+        self._pilot = None
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _flown(self) -> Pilot:
+        if self._pilot is None:
+            raise Refused("the driver is not started")
+        return self._pilot
+
+    def _rouse(self, link: Link) -> None:
+        """Brings it into safe mode and clears its counters."""
+        port = self.config.port
+        found, last = None, ""
+        try:
+            for _ in range(TRIES):
+                for command in (protocol.STOP_ANYHOW, protocol.START, protocol.SAFE):
+                    link.send(command)
+                    time.sleep(PAUSE)
+                try:
+                    found = link.ask(math.inf)
+                    break
+                except (Silent, Garbled) as error:
+                    last = str(error)
+        except Unplugged as error:
+            last = str(error)
+        if found is None:
+            raise NoAnswer(
+                port,
+                f"nothing answers as a Create does ({last})",
+                f"replies at {protocol.BAUD} baud",
+                "switch it on, look at the cable and the port; a Create 2 is another robot",
+            )
+        if found.bumps & protocol.Bumps.DROPPED or found.mode != protocol.Mode.SAFE:
+            raise NotSafe(
+                port,
+                f"the Create stays in {found.mode.name.lower()} mode, {protocol.named(found.bumps)}",
+                "safe mode",
+                "set it on all its wheels, away from edges, and unplug its charger",
+            )
+
+    def _run(self) -> None:
+        pilot, guard = self._pilot, self._guard
+        assert pilot is not None
+        assert guard is not None
+        try:
+            while not self._ending.is_set():
+                due = time.monotonic() + 1 / self.config.rate
+                pilot.poll()
+                self._polled.set()
+                if pilot.halted and pilot.halted.halt is Halt.UNPLUGGED:
+                    return
+                if not guard.beat():
+                    pilot.halt(Halt.UNGUARDED, "its guard does not hear")
+                self._wake.wait(max(0.0, due - time.monotonic()))
+                self._wake.clear()
+        finally:  # whatever ended it, nobody drives on; the guard stops the wheels
+            pilot.halt(Halt.UNGUARDED, "the thread that reads it has ended")
+
+    def _next_poll(self) -> None:
+        """Waits until a poll has begun and ended after now."""
+        thread = self._thread
+        for _ in range(2):  # the first may have begun before
+            self._polled.clear()
+            self._wake.set()
+            while thread and thread.is_alive() and not self._polled.wait(0.05):
+                pass

@@ -1,0 +1,74 @@
+"""What stops a Create by itself, each with a name; its sentence tells the cure."""
+
+from __future__ import annotations
+
+import math
+from enum import Enum
+from typing import NamedTuple
+
+from robot.drivers.create.config import CreateConfig
+from robot.drivers.create.protocol import Bumps, Mode, Sensed, named
+
+
+class Halt(Enum):
+    """Why the wheels were stopped; the value says what to do."""
+
+    BUMPED = "`release` it and drive back"
+    WHEEL_DROP = "set it on its wheels, then `release` it"
+    LEFT_SAFE_MODE = "a cliff, its charger or a button ended safe mode: look at it, then `release` it"
+    SILENT = "replies stopped coming: look at its battery and cable; it may still drive"
+    GARBLED = "what comes is no reply of a Create: look at the cable, and whether another program reads it"
+    UNPLUGGED = "the port is gone, and it may still drive: lift it, plug the cable in, start again"
+    UNGUARDED = "the process that stops it when this one is killed has ended: start again"
+
+
+class Halted(NamedTuple):
+    """What stopped it.
+
+    Attributes:
+        halt: which reason. detail: what was found. time: s, host's monotonic clock.
+    """
+
+    halt: Halt
+    detail: str
+    time: float
+
+    def __str__(self) -> str:
+        return f"{self.halt.name.lower()}: {self.detail}; {self.halt.value}"
+
+
+class Refused(ValueError):
+    """A command that is not carried out."""
+
+
+def wheels(config: CreateConfig, forward: float, turn: float) -> tuple[int, int]:
+    """Right and left wheel, mm/s.
+
+    Args:
+        forward: m/s. turn: rad/s, counter-clockwise.
+
+    Raises:
+        Refused: not finite, or a wheel would be faster than `config.speed`.
+    """
+    if not (math.isfinite(forward) and math.isfinite(turn)):
+        raise Refused(f"forward {forward} m/s, turn {turn} rad/s: not finite")
+    apart = turn * config.wheel_base / 2
+    right, left = (1000 * speed for speed in (forward + apart, forward - apart))
+    if max(abs(right), abs(left)) > 1000 * config.speed + 1e-6:
+        raise Refused(
+            f"forward {forward:g} m/s, turn {turn:g} rad/s needs a wheel at"
+            f" {max(abs(right), abs(left)) / 1000:g} m/s; the cap is {config.speed:g} (`speed`)"
+        )
+    cap = math.floor(1000 * config.speed + 1e-6)  # what is below the cap must not be rounded above it
+    return max(-cap, min(cap, round(right))), max(-cap, min(cap, round(left)))
+
+
+def objection(sensed: Sensed, right: int, left: int) -> tuple[Halt, str] | None:
+    """Why the wheels may not turn like that, by what was sensed, or None. A bump leaves the way back open."""
+    if sensed.bumps & Bumps.DROPPED:
+        return Halt.WHEEL_DROP, named(sensed.bumps & Bumps.DROPPED)
+    if sensed.mode != Mode.SAFE:
+        return Halt.LEFT_SAFE_MODE, f"it is in {sensed.mode.name.lower()} mode"
+    if sensed.bumps & Bumps.BUMPED and right + left > 0:
+        return Halt.BUMPED, named(sensed.bumps & Bumps.BUMPED)
+    return None

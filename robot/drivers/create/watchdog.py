@@ -1,0 +1,105 @@
+"""A process that stops the wheels when the one that drives has died or hangs: the Create has no watchdog.
+
+`python -m robot.drivers.create.watchdog PORT PATIENCE` is started by the driver and hears a beat, any byte, from it on
+standard input. Without one for PATIENCE s, or with the end of the input, it stops the wheels. A `q` ends it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import queue
+import subprocess
+import sys
+import threading
+
+from robot.drivers.create import protocol
+from robot.drivers.create.serial_link import open_port
+from tactile.base.errors import InputError
+
+START_LIMIT = 10.0
+"""s that a guard may take to start."""
+
+
+class Unguarded(InputError):
+    """The guard did not start."""
+
+
+class Guard:
+    """The driver's end: starts the process and beats."""
+
+    def __init__(self, port: str, patience: float) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "robot.drivers.create.watchdog", port, repr(patience)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            bufsize=0,
+            start_new_session=True,  # an interrupt from the terminal must not end it first
+        )
+        ready = threading.Thread(target=self._hear, daemon=True)
+        self._heard = b""
+        ready.start()
+        ready.join(START_LIMIT)
+        if self._heard != b"r":
+            self.close()
+            raise Unguarded(port, "the process that guards it did not start")
+
+    def beat(self) -> bool:
+        """Tells that all is well; False if nobody hears it."""
+        try:
+            assert self._process.stdin is not None
+            self._process.stdin.write(b".")
+        except OSError:
+            return False
+        return True
+
+    def close(self) -> None:
+        """Ends it; the wheels are left as they are."""
+        with contextlib.suppress(subprocess.TimeoutExpired, OSError):
+            self._process.communicate(b"q", timeout=1)
+        if self._process.poll() is None:
+            self._process.kill()
+            self._process.wait()
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe:
+                with contextlib.suppress(OSError):
+                    pipe.close()
+
+    def _hear(self) -> None:
+        assert self._process.stdout is not None
+        self._heard = self._process.stdout.read(1)
+
+
+def watch(port: str, patience: float) -> None:
+    """The process: stops the wheels once for each time the beat fails."""
+    line = open_port(port, exclusive=False)
+    beats: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+
+    def hear() -> None:
+        while data := os.read(0, 4096):
+            beats.put(data)
+        beats.put(b"")
+
+    threading.Thread(target=hear, daemon=True).start()
+    print("r", end="", flush=True)
+    beating = False  # until the first beat nothing drives
+    while True:
+        try:
+            data = beats.get(timeout=patience if beating else None)
+        except queue.Empty:
+            data, beating = None, False
+        if data and b"q" in data:
+            return
+        if data:
+            beating = True
+            continue
+        try:
+            line.write(protocol.STOP_ANYHOW)
+        except OSError:  # nobody to stop
+            return
+        if data is not None:
+            return
+
+
+if __name__ == "__main__":
+    watch(sys.argv[1], float(sys.argv[2]))

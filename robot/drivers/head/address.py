@@ -1,0 +1,46 @@
+"""Where a head is: on a USB, or an emulated one behind a socket."""
+
+from __future__ import annotations
+
+import re
+from typing import NamedTuple
+
+from robot.drivers.head.protocol import PRODUCT, VENDOR
+
+EMULATOR_PORT = 30100
+_USB = re.compile(r"usb(?::([0-9a-f]{4}):([0-9a-f]{4})(?::(\S+))?)?", re.IGNORECASE)
+_HOST = re.compile(r"([\w.-]+)(?::(\d{1,5}))?")
+
+
+class Address(NamedTuple):
+    """Attributes:
+    vendor, product: USB numbers. serial: of a certain device, or None for any.
+    host, port: of an emulated head; host None for a real one.
+    """
+
+    vendor: int = VENDOR
+    product: int = PRODUCT
+    serial: str | None = None
+    host: str | None = None
+    port: int = EMULATOR_PORT
+
+    @classmethod
+    def parse(cls, text: str) -> Address:
+        """The address that is written so.
+
+        Raises:
+            ValueError: it is none.
+        """
+        if found := _USB.fullmatch(text):
+            vendor, product, serial = found.groups()
+            return cls(int(vendor, 16), int(product, 16), serial) if vendor else cls()
+        found = _HOST.fullmatch(text)
+        if found and not text.lower().startswith("usb") and int(found[2] or 0) < 65536:
+            return cls(host=found[1], port=int(found[2] or EMULATOR_PORT))
+        known = "usb, usb:1209:0001, usb:1209:0001:SERIAL or HOST:PORT"
+        raise ValueError(f"{text!r} is no address of a head; these are: {known}")
+
+    def __str__(self) -> str:
+        if self.host is not None:
+            return f"{self.host}:{self.port}"
+        return f"usb:{self.vendor:04x}:{self.product:04x}" + (f":{self.serial}" if self.serial else "")

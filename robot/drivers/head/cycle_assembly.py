@@ -1,0 +1,113 @@
+"""From a head's frames to the cycle of one whisk: the same function live and when a recording is read."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+
+from robot.drivers.head.decoder import Frames
+from robot.drivers.head.protocol import CHANNELS, radians
+from tactile.base.types import Cycle, Odometry
+
+KEPT = 1 << 16
+"""Frames that are kept to be cut: half a minute at 2 kHz."""
+
+
+class Cut(NamedTuple):
+    """Which frames are a whisk, and what else is known of it.
+
+    Attributes:
+        number: of the whisk. time: of its sample, s. start: when it began, s, on the same clock.
+        first, last: sequences of its first and last frame. frames: how many from first to last came.
+        odometry: motion since the cut before.
+        seen: whether its frames become a reading; False where its image was dropped: the motion counts all
+            the same.
+    """
+
+    number: int
+    time: float
+    start: float
+    first: int
+    last: int
+    frames: int
+    odometry: Odometry
+    seen: bool
+
+
+def cut_of(
+    number: int, time: float, start: float, frames: Frames, odometry: Odometry, seen: bool = True
+) -> Cut:
+    """The cut that is exactly these frames; without any, nothing is seen."""
+    count = len(frames.sequence)
+    first, last = (int(frames.sequence.min()), int(frames.sequence.max())) if count else (0, -1)
+    return Cut(number, float(time), float(start), first, last, count, odometry, bool(seen and count))
+
+
+def within(frames: Frames, first: int, last: int) -> Frames:
+    """The frames from first to last, both included, ordered by sequence."""
+    rows = np.flatnonzero((frames.sequence >= first) & (frames.sequence <= last))
+    rows = rows[np.argsort(frames.sequence[rows], kind="stable")]
+    return Frames(*(np.ascontiguousarray(column[rows]) for column in frames))
+
+
+def assembled(frames: Frames, cut: Cut) -> Cycle:
+    """The whisk; without samples if the cut is not `seen`.
+
+    Args:
+        frames: those of the cut, and perhaps others; in any order.
+
+    Raises:
+        ValueError: some of the cut's frames are not among them.
+    """
+    if not cut.seen:
+        frames = within(frames, 0, -1)
+        return Cycle(np.zeros(0), *radians(frames.values), cut.odometry)
+    mine = within(frames, cut.first, cut.last)
+    if len(mine.sequence) != cut.frames:
+        raise ValueError(f"a whisk of {cut.frames} frames, of which {len(mine.sequence)} are there")
+    # The order in memory is part of the result: it decides in which order sums are taken.
+    angle, deflection = (np.ascontiguousarray(part) for part in radians(mine.values))
+    time = cut.start + (mine.time - mine.time[0]) * 1e-6
+    return Cycle(time, angle, deflection, cut.odometry)
+
+
+def no_frames(whiskers: int) -> Frames:
+    """No frame of a head with so many whiskers."""
+    return Frames(
+        np.zeros(0, np.int64),
+        np.zeros(0, np.int64),
+        np.zeros(0, np.uint8),
+        np.zeros((0, whiskers, CHANNELS), np.int16),
+    )
+
+
+class Window:
+    """The frames of late, in blocks as they came.
+
+    Args:
+        empty: a block without frames, which tells the head's shape.
+    """
+
+    def __init__(self, empty: Frames) -> None:
+        self._empty = empty
+        self._blocks: deque[Frames] = deque()
+        self._count = 0
+
+    def add(self, block: Frames) -> None:
+        """The next block; the oldest ones go, but for the last `KEPT` frames."""
+        if not len(block.sequence):
+            return
+        self._blocks.append(block)
+        self._count += len(block.sequence)
+        while self._count - len(self._blocks[0].sequence) >= KEPT:
+            self._count -= len(self._blocks.popleft().sequence)
+
+    def between(self, first: int, last: int) -> Frames:
+        """Those of the frames from first to last that are there, ordered by sequence."""
+        blocks = [
+            block for block in self._blocks if block.sequence.min() <= last and block.sequence.max() >= first
+        ]
+        parts = zip(*(blocks or [self._empty]), strict=True)
+        return within(Frames(*(np.concatenate(part) for part in parts)), first, last)

@@ -1,0 +1,189 @@
+"""From the bytes of a head's stream to frames, through whatever happens to bytes on their way.
+
+Bytes are read from left to right. Where the magic stands, as many bytes as a frame has are awaited and
+judged: a whole frame is stepped over; a refused one costs a byte, and the search for the magic goes on behind
+it. So a damaged frame takes nothing with it, where a stream was cut into pieces makes no difference, and
+
+    bytes fed = frame size x (good + duplicates) + skipped_bytes + `pending`: those the next ones decide on
+"""
+
+from __future__ import annotations
+
+import zlib
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from robot.drivers.head.protocol import CHANNELS, MAGIC, VERSION, WRAP, Flag, frame_dtype
+from robot.drivers.head.sequence_numbers import HALF, Numbering
+
+RUN, LONGEST_RUN = 32, 1024
+"""Frames judged at once: so many after a fault, twice as many after every run without one."""
+
+
+class Frames(NamedTuple):
+    """Samples of a head, in the order in which they came.
+
+    Attributes:
+        sequence: [N] int64 number, no two alike; modulo 2^32 what the head sent (`robot.drivers.head.sequence_numbers`).
+        time: [N] int64 device time, us; modulo 2^32 what the head sent, and within 35 minutes of the sample
+            before.
+        flags: [N] uint8 `robot.head.wire.Flag`. values: [N, W, C] int16 counts of theta, x and y.
+    """
+
+    sequence: np.ndarray
+    time: np.ndarray
+    flags: np.ndarray
+    values: np.ndarray
+
+
+class Counts(NamedTuple):
+    """What a decoder has met since it was made.
+
+    Attributes:
+        good: frames accepted, which are those handed out.
+        bad: places where the magic stood, but no frame of this head: another version or shape, a wrong CRC.
+        missing: numbers between the first and the highest accepted of a stream that were not accepted, summed
+            over the streams. A frame that comes late takes its number off again.
+        skipped_bytes: bytes that belong to no whole frame, counted when they are passed by.
+        overruns: accepted frames that say the head dropped some before them.
+        duplicates: whole frames that were not handed out, for their number was accepted already or lies
+            before the first of its stream.
+        restarts: streams after the first.
+    """
+
+    good: int = 0
+    bad: int = 0
+    missing: int = 0
+    skipped_bytes: int = 0
+    overruns: int = 0
+    duplicates: int = 0
+    restarts: int = 0
+
+
+class Decodes(Protocol):
+    """What reads a bridge's stream; another bridge brings its own."""
+
+    @property
+    def counts(self) -> Counts:
+        """So far."""
+        ...
+
+    def feed(self, data: bytes) -> Frames:
+        """The samples that these bytes complete."""
+        ...
+
+    def restart(self, time: int | None = None) -> None:
+        """What comes next is a new stream; a frame begun is given up.
+
+        Args:
+            time: the device's clock about now, us; None: the next frame's time is taken as it stands.
+        """
+        ...
+
+
+class Decoder:
+    """Reads the frames of `robot.drivers.head.protocol`.
+
+    Args:
+        whiskers: of the head. channels: of a whisker.
+    """
+
+    def __init__(self, whiskers: int, channels: int = CHANNELS) -> None:
+        self._type = frame_dtype(whiskers, channels)
+        self._size = self._type.itemsize
+        self._shape = bytes((whiskers, channels, VERSION))
+        self._shape_at = self._type.fields["whiskers"][1]  # type: ignore[index]
+        self._magic = int.from_bytes(MAGIC, "little")
+        self._rest = b""
+        self._run = RUN
+        self._numbering = Numbering()
+        self._time: int | None = None
+        self._good = self._bad = self._skipped = self._overruns = self._duplicates = 0
+
+    @property
+    def counts(self) -> Counts:
+        return Counts(
+            good=self._good,
+            bad=self._bad,
+            missing=self._numbering.missing,
+            skipped_bytes=self._skipped,
+            overruns=self._overruns,
+            duplicates=self._duplicates,
+            restarts=max(0, self._numbering.streams - 1),
+        )
+
+    @property
+    def pending(self) -> int:
+        """Bytes whose fate the next ones decide; fewer than a frame has."""
+        return len(self._rest)
+
+    def restart(self, time: int | None = None) -> None:
+        self._skipped += len(self._rest)
+        self._rest = b""
+        self._numbering.restart()
+        self._time = time
+
+    def feed(self, data: bytes) -> Frames:
+        buffer = self._rest + data if self._rest else bytes(data)
+        runs: list[bytes] = []
+        place = 0
+        while 0 <= (start := buffer.find(MAGIC, place)) <= len(buffer) - self._size:
+            self._skipped += start - place
+            place = start + self._whole(buffer, start) * self._size
+            if place > start:
+                runs.append(buffer[start:place])
+            else:
+                self._bad += 1
+                self._skipped += 1
+                place += 1
+        end = start if start >= 0 else len(buffer) - _begun(buffer[max(place, len(buffer) - 3) :])
+        self._skipped += end - place
+        self._rest = buffer[end:]
+        return self._accepted(np.frombuffer(b"".join(runs), self._type))
+
+    def _whole(self, buffer: bytes, start: int) -> int:
+        """How many whole frames stand back to back from there, of those that are judged at once."""
+        shape_at = start + self._shape_at
+        if buffer[shape_at : shape_at + 3] != self._shape:
+            return 0
+        count = min((len(buffer) - start) // self._size, self._run)
+        frames = np.frombuffer(buffer, self._type, count, start)
+        whiskers, channels, version = self._shape
+        fits = (frames["magic"] == self._magic) & (frames["version"] == version)
+        fits &= (frames["whiskers"] == whiskers) & (frames["channels"] == channels)
+        body, raw = self._size - 4, memoryview(buffer)
+        whole = 0
+        for crc in frames["crc"][: count if fits.all() else int(fits.argmin())].tolist():
+            place = start + whole * self._size
+            if zlib.crc32(raw[place : place + body]) != crc:
+                break
+            whole += 1
+        self._run = min(2 * self._run, LONGEST_RUN) if whole == count else RUN
+        return whole
+
+    def _accepted(self, frames: np.ndarray) -> Frames:
+        number, new = self._numbering.take(frames["sequence"])
+        if not new.all():
+            frames, number = frames[new], number[new]
+        self._good += len(frames)
+        self._duplicates += len(new) - len(frames)
+        self._overruns += int(np.count_nonzero(frames["flags"] & Flag.OVERRUN))
+        return Frames(
+            number, self._unwrapped(frames["time"]), frames["flags"].copy(), frames["values"].copy()
+        )
+
+    def _unwrapped(self, raw: np.ndarray) -> np.ndarray:
+        time = raw.astype(np.int64)
+        if len(time):
+            before = int(time[0]) if self._time is None else self._time
+            time[1:] -= time[:-1].copy()
+            time[0] -= before
+            time = before + ((time + HALF) % WRAP - HALF).cumsum()
+            self._time = int(time[-1])
+        return time
+
+
+def _begun(tail: bytes) -> int:
+    """Bytes at the end that may be the beginning of the magic."""
+    return next((k for k in range(len(tail), 0, -1) if tail.endswith(MAGIC[:k])), 0)

@@ -1,0 +1,245 @@
+"""The thread that a head's wire belongs to: samples in, commands out, and a head that goes and comes back.
+
+Only this thread touches the bridge: it reads what is there, hands it on, and sends what waits.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable, Iterator
+from enum import Enum
+from typing import NamedTuple
+
+import numpy as np
+
+from robot.drivers.head.command_queue import Outbox
+from robot.drivers.head.config import HeadLinkConfig
+from robot.drivers.head.decoder import Decoder, Decodes, Frames
+from robot.drivers.head.device import Bridge, Gone, Identity, Stalled, identity
+from robot.drivers.head.overload import Overload
+from robot.drivers.head.protocol import CHANNELS, Command, Request, pack
+from robot.drivers.head.ring_buffer import Ring
+from robot.drivers.outcome import Fault, Outcome
+from tactile.base.errors import InputError
+
+READ = 4096
+"""Bytes asked for at once: 16 ms of 18 whiskers at 2 kHz."""
+WAIT = 0.02
+"""s that a read waits for bytes, and so about the longest that a command waits."""
+AGAIN = 0.25
+"""s between attempts to find a head that is away, or to start one that is silent."""
+
+
+class Link(Enum):
+    """How it stands with the head."""
+
+    STREAMING = "samples come"
+    SILENT = "the head is there, and sends nothing"
+    GARBLED = "bytes come, and no sample can be made of them"
+    AWAY = "the head is not there"
+    CLOSED = "nobody reads"
+
+
+class State(NamedTuple):
+    """How it stands, and since when (s, host)."""
+
+    link: Link
+    since: float
+
+
+DEFAULT = HeadLinkConfig()
+ENDS = {
+    Link.SILENT: Outcome.HEAD_SILENT,
+    Link.GARBLED: Outcome.HEAD_GARBLED,
+    Link.AWAY: Outcome.HEAD_GONE,
+}
+
+
+class Reader:
+    """Reads a head, from `start` until `close`.
+
+    Args:
+        connect: opens the bridge; called again whenever the head has gone. whiskers: that it must have.
+        config: when it counts as lost. decoder: of its stream; None for that of `robot.drivers.head.protocol`.
+        alive: [W] whose overload counts; None for all. on_overload: told the whisker with every block of
+            samples that shows one.
+
+    Attributes:
+        ring: the newest samples. listeners: told every block of samples, and when it arrived (s, host).
+            on_restart: told the device's clock (us) and the host's (s) whenever a head was found: its numbers
+            and its clock may have begun anew. All are called on the reader's thread, and must be quick.
+        identity: of the head found last. stalls: transfers refused so far.
+    """
+
+    def __init__(
+        self,
+        connect: Callable[[], Bridge],
+        whiskers: int,
+        config: HeadLinkConfig = DEFAULT,
+        *,
+        decoder: Decodes | None = None,
+        alive: np.ndarray | None = None,
+        on_overload: Callable[[int], None] = lambda whisker: None,
+    ) -> None:
+        self.config = config
+        self.decoder: Decodes = Decoder(whiskers) if decoder is None else decoder
+        self.ring = Ring(whiskers)
+        self.listeners: list[Callable[[Frames, float], None]] = []
+        self.on_restart: list[Callable[[int, float], None]] = []
+        self.identity: Identity | None = None
+        self.stalls = 0
+        self._connect, self._whiskers, self._on_overload = connect, whiskers, on_overload
+        self._overload = Overload(config.overload, np.ones(whiskers, bool) if alive is None else alive)
+        self._outbox = Outbox()
+        self._ending, self._tried = threading.Event(), threading.Event()
+        self._refusal: Exception | None = None
+        self._fault: Fault | None = None
+        self._away: float | None = None
+        self._sample = self._bytes = self._streaming = -np.inf
+        self._thread = threading.Thread(target=self._run, name="head reader", daemon=True)
+
+    def start(self, timeout: float = 5.0) -> Reader:
+        """Finds the head and starts its stream.
+
+        Raises:
+            InputError: there is none within `timeout` s, or it is not the one wanted.
+        """
+        self._sample = self._away = time.monotonic()
+        self._thread.start()
+        if not self._tried.wait(timeout) or self._refusal is not None:
+            self.close()
+            if isinstance(self._refusal, InputError):
+                raise self._refusal
+            cure = "plug it in, or correct `head.address`"
+            raise InputError("head", str(self._refusal or "no answer"), "", cure) from self._refusal
+        return self
+
+    def close(self) -> None:
+        """Stops the head, and lets go of it."""
+        self._ending.set()
+        if self._thread.is_alive() and self._thread is not threading.current_thread():
+            self._thread.join(5.0)
+
+    def __enter__(self) -> Reader:
+        return self.start()
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def send(self, command: Command) -> None:
+        """Has a command sent, within about `WAIT`. From now on the head is kept awake."""
+        self._outbox.put(command)
+
+    def rest(self) -> None:
+        """Lets the head go to rest, within `robot.head.wire.SILENCE`: it is no longer kept awake."""
+        self._outbox.rest()
+
+    @property
+    def state(self) -> State:
+        """How it stands with the head; right even while the thread hangs in a transfer."""
+        now, sample, away = time.monotonic(), self._sample, self._away
+        if self._ending.is_set() or not self._thread.is_alive():
+            return State(Link.CLOSED, sample)
+        if away is not None:
+            return State(Link.AWAY, away)
+        if now - sample <= self.config.silence:
+            return State(Link.STREAMING, self._streaming)
+        return State(Link.GARBLED if self._bytes > sample else Link.SILENT, sample)
+
+    @property
+    def age(self) -> float:
+        """Of the newest sample, s."""
+        return time.monotonic() - self._sample
+
+    @property
+    def fault(self) -> Fault | None:
+        """What the session cannot wait for any longer; once one, always one."""
+        link = self.state.link
+        lost = link in ENDS and self.age > self.config.patience
+        if self._fault is None and lost:
+            why = f" ({self._refusal})" if self._refusal else ""
+            detail = f"{link.value}{why}, {self.age:.1f} s after the last sample"
+            self._fault = Fault(ENDS[link], detail, time.monotonic())
+        return self._fault
+
+    def _run(self) -> None:
+        try:
+            while not self._ending.is_set():
+                try:
+                    with contextlib.closing(self._found()) as bridge:
+                        self._serve(bridge)
+                except (Gone, Stalled, InputError) as error:
+                    self._refusal = error
+                self._tried.set()
+                self._away = time.monotonic() if self._away is None else self._away
+                self._ending.wait(AGAIN)
+        except Exception as error:
+            detail = f"its reader ended: {type(error).__name__}: {error}"
+            self._fault = Fault(Outcome.HEAD_GONE, detail, time.monotonic())
+            raise
+
+    def _found(self) -> Bridge:
+        """A bridge whose head is the right one, told all that it has to know."""
+        bridge = self._connect()
+        try:
+            self.identity = found = identity(bridge)
+            if (found.whiskers, found.channels) != (self._whiskers, CHANNELS):
+                shape = f"{found.whiskers} whiskers of {found.channels} channels"
+                raise InputError("head", f"{found.name} has {shape}", f"{self._whiskers} of {CHANNELS}")
+            clock = int.from_bytes(bridge.request(Request.CLOCK)[:8], "little")
+            self.decoder.restart(clock)
+            for told in self.on_restart:
+                told(clock, time.monotonic())
+            self._outbox.again()
+            bridge.request(Request.START)
+        except BaseException:
+            bridge.close()
+            raise
+        self._refusal, self._away = None, None
+        self._tried.set()
+        return bridge
+
+    def _serve(self, bridge: Bridge) -> None:
+        started = time.monotonic()
+        while not self._ending.is_set():
+            data = b""
+            with self._tolerant():
+                data = bridge.read(READ, WAIT)
+            now = time.monotonic()
+            if data:
+                self._bytes = now
+                self._take(self.decoder.feed(data), now)
+            elif now - max(started, self._sample) > max(AGAIN, self.config.silence):
+                started = now
+                with self._tolerant():
+                    bridge.request(Request.START)
+            with self._tolerant():
+                while (command := self._outbox.next(now)) is not None:
+                    bridge.write(pack(command))
+                    self._outbox.sent(command, now)
+        with self._tolerant():
+            bridge.request(Request.STOP)
+
+    def _take(self, frames: Frames, now: float) -> None:
+        if not len(frames.sequence):
+            return
+        if now - self._sample > self.config.silence:
+            self._streaming = now
+        self._sample = now
+        self.ring.append(frames, now)
+        whisker = self._overload.seen(frames.values)
+        if whisker is not None:
+            self._on_overload(whisker)
+        for told in self.listeners:
+            told(frames, now)
+
+    @contextlib.contextmanager
+    def _tolerant(self) -> Iterator[None]:
+        """Gives up a transfer that was refused, and waits a moment, for the next one may be too."""
+        try:
+            yield
+        except Stalled:
+            self.stalls += 1
+            self._ending.wait(0.005)

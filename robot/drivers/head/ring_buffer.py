@@ -1,0 +1,63 @@
+"""The newest samples of a head, kept by their number."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+
+from robot.drivers.head.decoder import Frames
+from robot.drivers.head.protocol import CHANNELS
+
+SIZE = 2**16
+"""Samples: 33 s at 2 kHz."""
+NEVER = -(2**62)
+
+
+class Ring:
+    """The last samples; any thread may ask while another appends. What is handed out is the asker's own.
+
+    Args:
+        whiskers, channels: of the head. size: samples kept, a power of two.
+    """
+
+    def __init__(self, whiskers: int, channels: int = CHANNELS, size: int = SIZE) -> None:
+        if size & (size - 1):
+            raise ValueError(f"size {size}: must be a power of two")
+        self._size = size
+        self._sequence = np.full(size, NEVER, np.int64)
+        self._time = np.zeros(size, np.int64)
+        self._flags = np.zeros(size, np.uint8)
+        self._values = np.zeros((size, whiskers, channels), np.int16)
+        self._newest, self._latest, self._arrival = NEVER, NEVER, -np.inf
+        self._lock = threading.Lock()
+
+    @property
+    def newest(self) -> tuple[int, int, float] | None:
+        """Highest number, latest device time (us) and last arrival (s, host); None before any came."""
+        with self._lock:
+            return None if self._newest == NEVER else (self._newest, self._latest, self._arrival)
+
+    def append(self, frames: Frames, arrival: float) -> None:
+        """Takes what arrived at a host time, s; but nothing from further back than the ring reaches."""
+        with self._lock:
+            if not len(frames.sequence):
+                return
+            newest = max(self._newest, int(frames.sequence.max()))
+            kept = frames.sequence > newest - self._size
+            place = frames.sequence[kept] % self._size
+            self._sequence[place] = frames.sequence[kept]
+            self._time[place] = frames.time[kept]
+            self._flags[place] = frames.flags[kept]
+            self._values[place] = frames.values[kept]
+            self._newest, self._arrival = newest, arrival
+            self._latest = int(self._time[newest % self._size])
+
+    def between(self, first: int, last: int) -> Frames:
+        """Those numbered `first` to `last`, both included, that are there; in order."""
+        with self._lock:
+            number = np.arange(max(first, self._newest - self._size + 1), min(last, self._newest) + 1)
+            return self._at(number[self._sequence[number % self._size] == number] % self._size)
+
+    def _at(self, place: np.ndarray) -> Frames:
+        return Frames(self._sequence[place], self._time[place], self._flags[place], self._values[place])

@@ -1,0 +1,101 @@
+"""Numbers of 32 bits continued without a wrap: which frames are new, which miss, where a stream begins."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from robot.drivers.head.protocol import WRAP
+
+LATE = 4096
+"""How far behind the newest a frame can be and still be late: a head holds no more of them."""
+HALF = WRAP // 2
+AT_ONCE = 1024
+"""Numbers looked at together."""
+
+
+class Numbering:
+    """The numbers of the frames accepted so far.
+
+    A number less than `HALF` above the highest is ahead; one less than `LATE` below it is late; from further
+    below speaks a head that began to count anew, and a new stream begins. Its numbers are put into the next
+    2^32, so that no two frames share one.
+    """
+
+    def __init__(self) -> None:
+        self.streams = 0
+        """Streams begun."""
+        self._begun = False
+        self._first = self._highest = self._held = 0
+        self._before = 0
+        self._seen = np.zeros(LATE, bool)
+
+    @property
+    def missing(self) -> int:
+        """Numbers between the first and the highest accepted of a stream that were not accepted."""
+        return self._before + self._lacking()
+
+    def restart(self) -> None:
+        """The next frame begins a stream."""
+        self._before += self._lacking()
+        self._begun = False
+
+    def take(self, raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Frames with the numbers raw [N], in the order of their arrival.
+
+        Returns:
+            [N] int64 full numbers, and [N] bool, those to accept: the number is new, and not before the first
+            of its stream.
+        """
+        raw = raw.astype(np.int64)
+        number, new = np.empty_like(raw), np.ones(len(raw), bool)
+        place = 0
+        while place < len(raw):
+            some = slice(place, place + self._rising(raw[place : place + AT_ONCE]))
+            if some.stop > place:
+                number[some] = self._highest + (raw[some] - self._highest) % WRAP
+                self._ahead(number[some])
+                place = some.stop
+            else:
+                number[place], new[place] = self._other(int(raw[place]))
+                place += 1
+        return number, new
+
+    def _rising(self, raw: np.ndarray) -> int:
+        """How many of these each lie ahead of the one before."""
+        if not self._begun:
+            return 0
+        ahead = (raw - self._highest) % WRAP
+        rising = ahead < HALF
+        rising[0] &= ahead[0] > 0
+        rising[1:] &= ahead[1:] > ahead[:-1]
+        return len(raw) if rising.all() else int(rising.argmin())
+
+    def _other(self, raw: int) -> tuple[int, bool]:
+        """A number that is not ahead, and whether it is to be accepted."""
+        number = self._highest - (self._highest - raw) % WRAP
+        if not self._begun or number <= self._highest - LATE:
+            self.restart()
+            return self._begin(raw), True
+        new = number > self._first and not self._seen[number % LATE]
+        self._seen[number % LATE] |= new
+        self._held += new
+        return number, bool(new)
+
+    def _begin(self, raw: int) -> int:
+        number = raw + (WRAP * (self._highest // WRAP + 1) if self.streams else 0)
+        self._seen[number % LATE] = True
+        self._first = self._highest = number
+        self._held, self._begun = 1, True
+        self.streams += 1
+        return number
+
+    def _ahead(self, number: np.ndarray) -> None:
+        """Increasing numbers, all above the highest."""
+        last = int(number[-1])
+        self._seen[np.arange(max(self._highest, last - LATE) + 1, last + 1) % LATE] = False
+        self._seen[number[number > last - LATE] % LATE] = True
+        self._highest = last
+        self._held += len(number)
+
+    def _lacking(self) -> int:
+        return self._highest - self._first + 1 - self._held if self._begun else 0

@@ -1,0 +1,204 @@
+"""A pyusb backend whose bus is an emulator's socket: real pyusb, no kernel, no libusb."""
+
+from __future__ import annotations
+
+import errno
+import struct
+from array import array
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
+from typing import Any, NoReturn, TypeVar
+
+from robot.drivers.head.usb_tcp_protocol import IN, PORT, Line, Op
+
+T = TypeVar("T")
+
+
+class Handle:
+    """An open device: a connection for what waits for data, another for all else."""
+
+    def __init__(self, host: str, port: int) -> None:
+        self.inwards = Line(host, port)
+        try:
+            self.other = Line(host, port)
+        except OSError:
+            self.inwards.close()
+            raise
+
+    def close(self) -> None:
+        self.inwards.close()
+        self.other.close()
+
+
+class SocketBackend:
+    """Behaves as a `usb.backend.IBackend` with at most one device, so it is one; make it with `backend`."""
+
+    def __init__(self, host: str, port: int) -> None:
+        self.host, self.port = host, port
+
+    def enumerate_devices(self) -> Iterator[bytes]:
+        """The device's descriptors, if one is plugged in; they are its identification."""
+        try:
+            line = Line(self.host, self.port)
+        except OSError:
+            return
+        try:
+            yield line.call(Op.DESCRIBE)
+        except OSError:
+            return
+        finally:
+            line.close()
+
+    def get_parent(self, dev: bytes) -> None:
+        """None is known."""
+
+    def get_device_descriptor(self, dev: bytes) -> SimpleNamespace:
+        names = (
+            "bLength bDescriptorType bcdUSB bDeviceClass bDeviceSubClass bDeviceProtocol bMaxPacketSize0 "
+            "idVendor idProduct bcdDevice iManufacturer iProduct iSerialNumber bNumConfigurations"
+        )
+        whereabouts = {"bus": 1, "address": 1, "port_number": 1, "port_numbers": (1,), "speed": 3}
+        return SimpleNamespace(**_named("<BBHBBBBHHHBBBB", names, dev), **whereabouts)
+
+    def get_configuration_descriptor(self, dev: bytes, config: int) -> SimpleNamespace:
+        _only(config)
+        names = (
+            "bLength bDescriptorType wTotalLength bNumInterfaces bConfigurationValue iConfiguration "
+            "bmAttributes bMaxPower"
+        )
+        return SimpleNamespace(**_named("<BBHBBBBB", names, _descriptors(dev, 2)[0]), extra_descriptors=[])
+
+    def get_interface_descriptor(self, dev: bytes, intf: int, alt: int, config: int) -> SimpleNamespace:
+        _only(intf, alt, config)
+        names = (
+            "bLength bDescriptorType bInterfaceNumber bAlternateSetting bNumEndpoints bInterfaceClass "
+            "bInterfaceSubClass bInterfaceProtocol iInterface"
+        )
+        return SimpleNamespace(**_named("<9B", names, _descriptors(dev, 4)[0]), extra_descriptors=[])
+
+    def get_endpoint_descriptor(
+        self, dev: bytes, ep: int, intf: int, alt: int, config: int
+    ) -> SimpleNamespace:
+        _only(intf, alt, config)
+        names = "bLength bDescriptorType bEndpointAddress bmAttributes wMaxPacketSize bInterval"
+        return SimpleNamespace(
+            **_named("<BBBBHB", names, _descriptors(dev, 5)[ep]),
+            bRefresh=0,
+            bSynchAddress=0,
+            extra_descriptors=[],
+        )
+
+    def open_device(self, dev: bytes) -> Handle:
+        return _usb(lambda: Handle(self.host, self.port))
+
+    def close_device(self, dev_handle: Handle) -> None:
+        dev_handle.close()
+
+    def set_configuration(self, dev_handle: Handle, config_value: int) -> None:
+        self._request(dev_handle, Op.CONTROL, 0x00, request=9, value=config_value)
+
+    def get_configuration(self, dev_handle: Handle) -> int:
+        return self._request(dev_handle, Op.CONTROL, 0x80, request=8, size=1)[0]
+
+    def set_interface_altsetting(self, dev_handle: Handle, intf: int, altsetting: int) -> None:
+        self._request(dev_handle, Op.CONTROL, 0x01, request=11, value=altsetting, index=intf)
+
+    def claim_interface(self, dev_handle: Handle, intf: int) -> None:
+        self._request(dev_handle, Op.CLAIM)
+
+    def release_interface(self, dev_handle: Handle, intf: int) -> None:
+        self._request(dev_handle, Op.RELEASE)
+
+    def bulk_write(self, dev_handle: Handle, ep: int, intf: int, data: array[int], timeout: int) -> int:
+        packet = data.tobytes()
+        self._request(dev_handle, Op.BULK, ep, data=packet, timeout=timeout)
+        return len(packet)
+
+    def bulk_read(self, dev_handle: Handle, ep: int, intf: int, buff: array[int], timeout: int) -> int:
+        got = self._request(dev_handle, Op.BULK, ep, size=_size(buff), timeout=timeout)
+        return _filled(buff, got)
+
+    def ctrl_transfer(
+        self,
+        dev_handle: Handle,
+        bmRequestType: int,
+        bRequest: int,
+        wValue: int,
+        wIndex: int,
+        data: array[int],
+        timeout: int,
+    ) -> int:
+        setup = {"request": bRequest, "value": wValue, "index": wIndex, "timeout": timeout}
+        if bmRequestType & IN:
+            got = self._request(dev_handle, Op.CONTROL, bmRequestType, size=_size(data), **setup)
+            return _filled(data, got)
+        self._request(dev_handle, Op.CONTROL, bmRequestType, data=data.tobytes(), **setup)
+        return _size(data)
+
+    def clear_halt(self, dev_handle: Handle, ep: int) -> None:
+        self._request(dev_handle, Op.CLEAR, ep)
+
+    def reset_device(self, dev_handle: Handle) -> None:
+        self._request(dev_handle, Op.RESET)
+
+    def is_kernel_driver_active(self, dev_handle: Handle, intf: int) -> bool:
+        return False
+
+    def detach_kernel_driver(self, dev_handle: Handle, intf: int) -> None:
+        """There is none."""
+
+    def attach_kernel_driver(self, dev_handle: Handle, intf: int) -> None:
+        """There is none."""
+
+    def intr_write(self, *transfer: Any) -> NoReturn:
+        raise NotImplementedError("interrupt transfers")
+
+    intr_read = iso_write = iso_read = intr_write
+
+    def _request(self, handle: Handle, op: Op, address: int = 0, **more: Any) -> bytes:
+        line = handle.inwards if op == Op.BULK and address & IN else handle.other
+        return _usb(lambda: line.call(op, address, **more))
+
+
+def backend(host: str, port: int = PORT) -> SocketBackend:
+    """A backend for pyusb whose bus is the emulator at that address: `usb.core.find(backend=...)`."""
+    return SocketBackend(host, port)
+
+
+def _usb(action: Callable[[], T]) -> T:
+    """The action, whose errors are told as libusb's are."""
+    import usb.core
+
+    try:
+        return action()
+    except OSError as error:
+        kind = usb.core.USBTimeoutError if error.errno == errno.ETIMEDOUT else usb.core.USBError
+        raise kind(error.strerror, None, error.errno) from None
+
+
+def _descriptors(dev: bytes, kind: int) -> list[bytes]:
+    """The descriptors of a kind: each begins with its length and its kind."""
+    found, place = [], 0
+    while place < len(dev):
+        if dev[place + 1] == kind:
+            found.append(dev[place : place + dev[place]])
+        place += dev[place]
+    return found
+
+
+def _named(layout: str, names: str, descriptor: bytes) -> dict[str, int]:
+    return dict(zip(names.split(), struct.unpack_from(layout, descriptor), strict=True))
+
+
+def _only(*index: int) -> None:
+    if any(index):
+        raise IndexError(f"descriptor {index}: the device has one of each")
+
+
+def _size(buffer: array[int]) -> int:
+    return len(buffer) * buffer.itemsize
+
+
+def _filled(buffer: array[int], data: bytes) -> int:
+    memoryview(buffer).cast("B")[: len(data)] = data
+    return len(data)

@@ -1,0 +1,146 @@
+"""How a head is told to whisk, and what the host adds where the head feeds nothing back."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from robot.drivers.head.decoder import Frames
+from robot.drivers.head.protocol import ANGLE, OFF, Command, Flag, Kind, Mode, tally
+from robot.drivers.head.reader import Reader
+from tactile.base.errors import InputError
+from tactile.whiskers.head_geometry import Head
+from tactile.whiskers.whisking import WhiskingConfig, checked, command, phase, still
+
+WHERE = "live.plan.whisking"
+
+
+def commands(
+    whisking: WhiskingConfig,
+    threshold: np.ndarray | None = None,
+    centre: np.ndarray | None = None,
+    rcp: Literal["head", "host"] = "head",
+) -> list[Command]:
+    """What a head is told, in that order.
+
+    Args:
+        threshold: [W] of y, rad from the centre, infinite for whiskers that do not count; None: none does.
+        centre: [W] mean of y in free air, rad. rcp: who feeds back, where the mode does.
+
+    Raises:
+        InputError: the head does not know that mode.
+    """
+    if whisking.mode == "spread" and rcp == "head":
+        raise InputError(f"{WHERE}.mode", "spread", "rcp or open", "or set `live.head.rcp: host`")
+    drive = Command(
+        Kind.DRIVE,
+        Mode.RCP if whisking.mode == "rcp" and rcp == "head" and threshold is not None else Mode.OPEN,
+        amplitude=float(np.radians(whisking.amplitude_deg)),
+        frequency=whisking.rate,
+        gain=whisking.gain,
+        window=whisking.window,
+        numbers=np.zeros(0, np.int16) if threshold is None else _thresholds(threshold),
+    )
+    return [drive] if centre is None else [Command(Kind.CENTRE, numbers=tally(centre)), drive]
+
+
+class HostRcp:
+    """The feedback on the host: `tactile.whisking.command` on the samples that come, a block at a time.
+
+    Args:
+        shape: rows and columns of the head. threshold, centre: [W] of y, rad.
+    """
+
+    def __init__(
+        self, whisking: WhiskingConfig, shape: tuple[int, int], threshold: np.ndarray, centre: np.ndarray
+    ) -> None:
+        self._whisking, self._shape = whisking, shape
+        self._threshold, self._centre = threshold, centre
+        self._full = np.full(len(threshold), np.radians(whisking.amplitude_deg))
+        self._drive = still(len(threshold))
+        self._amplitude = self._full
+        self._told: np.ndarray | None = None
+        self._began: int | None = None
+
+    def amplitudes(self, frames: Frames) -> np.ndarray | None:
+        """[W] int16 amplitudes to whisk with now; None while the head has been told, or no whisk begun.
+
+        They are told anew in every cycle: what was told late in the one before may have come in this one.
+        """
+        y = frames.values[..., 2] * ANGLE - self._centre
+        for time, flags, heard in zip(frames.time.tolist(), frames.flags.tolist(), y, strict=True):
+            if flags & Flag.CYCLE:
+                self._began = time
+                self._drive = still(len(self._threshold))
+                self._amplitude, self._told = self._full, None
+            if self._began is None:
+                continue
+            since = (time - self._began) * 1e-6
+            aim, self._drive = command(
+                self._whisking, self._drive, since, heard, self._threshold, self._shape
+            )
+            share = float(phase(self._whisking, since))
+            # At rest no amplitude can be told from the aim.
+            if share > 1e-3:
+                self._amplitude = aim / share
+        told = tally(self._amplitude)
+        if self._began is None or (self._told is not None and (told == self._told).all()):
+            return None
+        self._told = told
+        return told
+
+
+class HeadDriver:
+    """Has a head whisk.
+
+    Args:
+        reader: of the head; its settings say who feeds back. head: its geometry.
+    """
+
+    def __init__(self, reader: Reader, head: Head) -> None:
+        self._reader, self._head = reader, head
+        self._feedback: HostRcp | None = None
+        reader.listeners.append(self._heard)
+
+    def whisk(
+        self,
+        whisking: WhiskingConfig,
+        threshold: np.ndarray | None = None,
+        centre: np.ndarray | None = None,
+    ) -> None:
+        """Whisks so from the next cycle on; without a threshold (before the calibration) nothing is fed back.
+
+        Args:
+            threshold, centre: [W] of y, rad, as `tactile.calibration.Calibration` has them in column 1.
+
+        Raises:
+            InputError: the drives cannot do it, or the head does not know the mode.
+        """
+        checked(whisking, self._head, WHERE)
+        rcp = self._reader.config.rcp
+        told = commands(whisking, threshold, centre, rcp)
+        self._feedback = None
+        if rcp == "host" and whisking.mode != "open" and threshold is not None:
+            middle = np.zeros(len(threshold)) if centre is None else centre
+            self._feedback = HostRcp(whisking, self._head.shape, threshold, middle)
+        for one in told:
+            self._reader.send(one)
+
+    def rest(self) -> None:
+        """Retracts the whiskers; samples go on coming."""
+        self._feedback = None
+        self._reader.rest()
+
+    def _heard(self, frames: Frames, arrival: float) -> None:
+        feedback = self._feedback
+        amplitude = None if feedback is None else feedback.amplitudes(frames)
+        if amplitude is not None:
+            self._reader.send(Command(Kind.AMPLITUDES, Mode.OPEN, numbers=amplitude))
+
+
+def _thresholds(threshold: np.ndarray) -> np.ndarray:
+    finite = np.isfinite(threshold)
+    return np.where(finite, np.minimum(tally(np.where(finite, threshold, 0.0)), OFF - 1), OFF).astype(
+        np.int16
+    )

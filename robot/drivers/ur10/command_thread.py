@@ -1,0 +1,174 @@
+"""Who speaks to the arm: stops first, then moves, then food for the watchdog; in a thread of its own.
+
+A call of the control interface takes some 20 ms, and for ever when the controller stalls. States are read and
+judged beside it, in the thread that owns the process (child.py).
+"""
+
+from __future__ import annotations
+
+import math
+import queue
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from robot.drivers.outcome import Outcome
+from robot.drivers.ur10.config import ArmConfig
+from robot.drivers.ur10.safety import GENTLE, SLACK, Finding, Refused, Watch, allowed, judged
+from robot.drivers.ur10.shared_state import Board
+
+MISSING = 3  # periods without a state that are no accident
+UNGOVERNED = {
+    Outcome.ARM_GONE,
+    Outcome.PROTECTIVE_STOP,
+    Outcome.SAFEGUARD_STOP,
+    Outcome.EMERGENCY_STOP,
+}
+"""Ends after which the control script is not spoken to: its watchdog goes hungry and ends it."""
+
+
+class Order(NamedTuple):
+    """What the session wants of the arm.
+
+    Attributes:
+        do: `move`, `retreat` or `end`. number: of the order. target: [6] tool pose. speed: as the controller
+            is told. stops: how many stops the session had asked for; a later stop revokes the order.
+    """
+
+    do: str
+    number: int = 0
+    target: tuple[float, ...] = ()
+    speed: float = 0.0
+    stops: int = 0
+
+
+class Governor:
+    """The control interface, what holds the arm, and what is still to be told.
+
+    Attributes:
+        held: why no more moves are taken. ungoverned: whether the control script is left alone.
+    """
+
+    def __init__(self, config: ArmConfig, board: Board, control: Any, report: Callable[..., None]) -> None:
+        self.config, self.board, self.control, self.report = config, board, control, report
+        self.held: Finding | None = None
+        self.ungoverned = False
+        self.leaving = False
+        self._retreating = False
+        self._watch = Watch()
+        self._rest = np.zeros(6)
+        self._most = math.inf  # N; no contact is judged before the force at rest is known
+        self._own_stops = 0
+        self._stopped = self._wanted()
+        self._orders: queue.SimpleQueue[Order] = queue.SimpleQueue()
+        self._wake = threading.Event()
+
+    # What the thread that reads states calls.
+
+    def settle(self, rest: np.ndarray) -> None:
+        """From now on a contact counts; `rest` [6] is the force without one."""
+        self._rest, self._most = rest, self.config.force_limit
+        self._watch = self._watch._replace(loaded=0)
+
+    def judge(self, state: np.ndarray) -> None:
+        """Stop if a state (STATE) says so."""
+        self._watch, finding = judged(self.config, self._watch, state, self._rest, self._most)
+        if finding is not None:
+            self.hold(finding)
+
+    def hold(self, finding: Finding) -> None:
+        """Stop, and take no more moves. What holds already and is no retreat has been stopped."""
+        self.ungoverned |= finding.outcome in UNGOVERNED
+        if self.held is not None and not self._retreating:
+            return
+        if self.held is None:
+            self.held = finding
+            self.report(say="fault", outcome=finding.outcome.name, detail=finding.detail)
+        self._retreating = False
+        self.stop()
+
+    def stop(self) -> None:
+        """Ask for one more stop."""
+        self._own_stops += 1
+        self._wake.set()
+
+    def put(self, order: Order) -> None:
+        self._orders.put(order)
+        self._wake.set()
+
+    def look(self) -> None:
+        """See whether the session asks for a stop."""
+        if self._wanted() != self._stopped:
+            self._wake.set()
+
+    @property
+    def obeyed(self) -> bool:
+        """Whether every stop has been told."""
+        return self.ungoverned or self._wanted() == self._stopped
+
+    # What its own thread does.
+
+    def run(self) -> None:
+        """For ever; the process ends without it."""
+        while True:
+            self._wake.wait(0.3 / self.config.watchdog_hz)
+            self._wake.clear()
+            if not self.ungoverned:
+                self.act()
+
+    def act(self) -> None:
+        """Stop if asked to, then begin what was ordered; feed the watchdog while the session lives."""
+        wanted = self._wanted()
+        if wanted != self._stopped:
+            self.control.stopL(self.config.deceleration, True)
+            self._stopped = wanted
+        while not (self._orders.empty() or self.leaving):
+            self.execute(self._orders.get())
+        if time.monotonic() - float(self.board.control["heartbeat"]) <= self.config.heartbeat:
+            self.control.kickWatchdog()
+
+    def execute(self, order: Order) -> None:
+        """Begin a move, if nothing speaks against it."""
+        here = self.board.latest()
+        if here is None or self._revoked(order):
+            return
+        try:
+            target = allowed(self.config, order.target, here["tcp"], order.speed)
+            if order.do == "retreat":
+                _gentle(self.config, target, here["tcp"], order.speed)
+        except Refused as refused:
+            self.hold(Finding(Outcome.NOT_ARRIVED, f"the arm's process refused: {refused}"))
+            return
+        # moveL takes any target: one without joints ends the script on a real controller.
+        if not self.control.isPoseWithinSafetyLimits(target.tolist()):
+            time.sleep(MISSING / self.config.hz)  # False means a stop as well: then a state says so
+            places = ", ".join(f"{v:.3f}" for v in target)
+            self.hold(Finding(Outcome.UNREACHABLE, f"no joints for ({places})"))
+            return
+        if self._revoked(order):
+            return
+        if order.do == "retreat":
+            force = math.hypot(*(here["force"][:3] - self._rest[:3]))
+            self._most = max(force, self.config.force_limit) + self.config.force_limit
+            self._watch = self._watch._replace(loaded=0)
+            self._retreating = True
+        newest = self.board.latest()
+        assert newest is not None
+        self.report(say="moving", number=order.number, operation=int(newest["operation"]))
+        self.control.moveL(target.tolist(), order.speed, self.config.acceleration, True)
+
+    def _revoked(self, order: Order) -> bool:
+        stopped = order.stops != int(self.board.control["stops"]) or self._wanted() != self._stopped
+        return stopped or (self.held is not None and order.do != "retreat")
+
+    def _wanted(self) -> tuple[int, int]:
+        return int(self.board.control["stops"]), self._own_stops
+
+
+def _gentle(config: ArmConfig, target: np.ndarray, here: np.ndarray, speed: float) -> None:
+    way = math.dist(target[:3], here[:3])
+    if way > config.backoff + 2 * SLACK or speed > GENTLE:
+        raise Refused(f"backing off by {way:.3f} m at {speed:g} m/s")

@@ -1,0 +1,106 @@
+"""Where the tool of a controller is, as a stream: a small RTDE client that only listens.
+
+It writes nothing to the controller and claims none of its registers, so it can listen beside whoever moves
+the arm; it speaks to an emulated controller and to a real one alike.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import struct
+import threading
+import time
+from types import TracebackType
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from robot.drivers.ur10 import rtde_protocol
+from robot.emulators.ur10.settings import RTDE_PORT
+
+_FIELDS = ("timestamp", "actual_TCP_pose", "actual_TCP_speed")
+
+
+class Pose(NamedTuple):
+    """A tool's pose when it was told.
+
+    Attributes:
+        time: s, host's monotonic clock at receipt. tcp: [6] m and rotation vector in the base.
+        speed: [6] m/s, rad/s. robot_time: s, the controller's clock.
+    """
+
+    time: float
+    tcp: np.ndarray
+    speed: np.ndarray
+    robot_time: float
+
+
+class PoseStream:
+    """Listens in a thread of its own, and connects anew whenever the controller goes away.
+
+    Args:
+        host: the controller. hz: states a second to ask for. patience: s without a state after which it
+            connects anew. port: RTDE's.
+    """
+
+    def __init__(self, host: str, hz: float = 125, patience: float = 1.0, port: int = RTDE_PORT) -> None:
+        self._address = (host, port)
+        self._hz = hz
+        self._patience = patience
+        self._latest: Pose | None = None
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="tool poses", daemon=True)
+        self._thread.start()
+
+    def latest(self) -> tuple[float, np.ndarray, np.ndarray] | None:
+        """(host time s, tcp [6], speed [6]) of the newest state; None before the first."""
+        pose = self._latest
+        return None if pose is None else (pose.time, pose.tcp, pose.speed)
+
+    def newest(self) -> Pose | None:
+        """The newest state with the controller's time."""
+        return self._latest
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._closing.set()
+        self._thread.join(self._patience + 1.0)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _run(self) -> None:
+        while not self._closing.is_set():
+            # A package that cannot be one, too: the connection is of no more use.
+            with contextlib.suppress(OSError, ValueError, struct.error):
+                self._listen()
+            self._closing.wait(0.1)
+
+    def _listen(self) -> None:
+        layout = rtde_protocol.layout([rtde_protocol.OUTPUT_TYPES[name] for name in _FIELDS])
+        splitter = rtde_protocol.Splitter()
+        with socket.create_connection(self._address, timeout=self._patience) as link:
+            link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            link.sendall(
+                rtde_protocol.packed(rtde_protocol.PROTOCOL, struct.pack(">H", rtde_protocol.VERSION))
+            )
+            recipe = struct.pack(">d", self._hz) + ",".join(_FIELDS).encode()
+            link.sendall(
+                rtde_protocol.packed(rtde_protocol.OUTPUTS, recipe)
+                + rtde_protocol.packed(rtde_protocol.START)
+            )
+            while not self._closing.is_set():
+                data = link.recv(1 << 14)
+                if not data:
+                    return
+                host = time.monotonic()
+                for kind, body in splitter.feed(data):
+                    if kind == rtde_protocol.DATA:
+                        numbers = np.array(layout.unpack(body)[1:])
+                        self._latest = Pose(host, numbers[1:7], numbers[7:13], float(numbers[0]))

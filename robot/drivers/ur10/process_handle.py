@@ -1,0 +1,99 @@
+"""The arm's process seen from the session: started, given orders, heard, buried."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from robot.drivers.outcome import Outcome
+from robot.drivers.ur10.config import ArmConfig
+from robot.drivers.ur10.safety import Finding
+
+HUNG_UP = ("closed the connection", "Connection reset", "Connection refused", "End of file")
+
+
+class Process:
+    """A running `robot.drivers.ur10.rtde_process`. Its end of the pipes closes with this process, however that ends."""
+
+    def __init__(self, board: str, config: ArmConfig) -> None:
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115
+        paths = [str(Path(__file__).parents[3]), *filter(None, [os.environ.get("PYTHONPATH")])]
+        environment = {
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join(paths),
+            "OMP_NUM_THREADS": "1",
+            "OPENBLAS_NUM_THREADS": "1",
+        }
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "robot.drivers.ur10.rtde_process", board, config.model_dump_json()],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._errors,
+            bufsize=0,
+            env=environment,
+        )
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._orders, self._reports = self._process.stdin, self._process.stdout
+        os.set_blocking(self._orders.fileno(), False)
+        os.set_blocking(self._reports.fileno(), False)
+        self._rest = b""
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    def order(self, **fields: Any) -> None:
+        """Send an order; a process that is gone is found out elsewhere."""
+        with contextlib.suppress(OSError, ValueError):  # ValueError: its end of the line is closed
+            self._orders.write(json.dumps(fields).encode() + b"\n")
+
+    def reports(self) -> list[dict[str, Any]]:
+        """What it has told since the last time."""
+        data = self._reports.read(65536) or b""
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        return [json.loads(line) for line in lines]
+
+    def ended(self) -> Finding | None:
+        """How it ended; None while it runs."""
+        code = self._process.poll()
+        if code is None:
+            return None
+        said = self.said()
+        name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+        lines = [line for line in said.splitlines() if "what():" in line] or said.splitlines() or [""]
+        last = lines[-1].replace("what():", "").strip()[-200:]
+        detail = f"the arm's process ended ({name})" + (f": {last}" if last else "")
+        if code == -signal.SIGABRT and not any(word in said for word in HUNG_UP):
+            return Finding(Outcome.ARM_MALFORMED, detail)
+        return Finding(Outcome.ARM_GONE, detail)
+
+    def said(self) -> str:
+        """What it and the library printed."""
+        # A position of our own: the file's is shared with the process that writes.
+        size = os.fstat(self._errors.fileno()).st_size
+        return os.pread(self._errors.fileno(), 4096, max(0, size - 4096)).decode(errors="replace")
+
+    def end(self, patience: float) -> bool:
+        """Ask it to stop the arm and go; whether it did in time, s."""
+        self.order(do="end")
+        try:
+            self._process.wait(patience)
+        except subprocess.TimeoutExpired:
+            return False
+        return True
+
+    def kill(self) -> None:
+        """Make sure that it is gone."""
+        self._process.kill()
+        self._process.wait()
+        for file in (self._orders, self._reports, self._errors):
+            with contextlib.suppress(OSError):
+                file.close()

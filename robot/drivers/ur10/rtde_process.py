@@ -1,0 +1,196 @@
+"""The arm's own process: the only one that loads ur_rtde, which aborts, hangs and faults when controllers do.
+
+    python -m robot.drivers.ur10.rtde_process NAME CONFIG_JSON
+
+NAME is the session's board (states.py). Orders come as JSON lines on the standard input, reports leave as
+JSON lines on the standard output, whatever the library prints goes to the standard error.
+
+The arm is stopped from here when a state says so, when the session asks for it, when it falls silent, and
+when it is gone. Should this process be gone as well, the controller's watchdog goes hungry and stops the arm.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import sys
+import threading
+import time
+from typing import Any
+
+import numpy as np
+
+from robot.drivers.outcome import Outcome
+from robot.drivers.process_priority import URGENT, ranked
+from robot.drivers.ur10 import dashboard
+from robot.drivers.ur10.command_thread import MISSING, Governor, Order
+from robot.drivers.ur10.config import ArmConfig
+from robot.drivers.ur10.safety import Finding, still
+from robot.drivers.ur10.shared_state import STATE, Board
+from tactile.base.errors import InputError
+
+PLAYING = 2  # runtime state
+SETTLE = 0.25  # s of states at rest from which the force at rest is taken, and the session takes the rate
+LEAVING = 0.4  # s that a last stop may take before the dashboard server is asked for it
+
+VARIABLES = [
+    "timestamp",
+    "actual_TCP_pose",
+    "actual_TCP_speed",
+    "actual_TCP_force",
+    "actual_q",
+    "robot_mode",
+    "safety_status_bits",
+    "runtime_state",
+]
+
+
+class Child:
+    """Both interfaces of a controller: states are read, judged and passed on, the session is listened to."""
+
+    def __init__(self, config: ArmConfig, board: Board, receive: Any, control: Any, reports: int) -> None:
+        self.config, self.board, self.receive, self.control = config, board, receive, control
+        self.governor = Governor(config, board, control, self.report)
+        self._reports = reports
+        self._state = np.zeros((), STATE)
+        self._settled = False
+        self._leaving = math.inf
+        self._input = b""
+
+    def run(self) -> None:
+        """Until the session ends or is gone."""
+        began = time.monotonic()
+        threading.Thread(target=self.governor.run, daemon=True).start()
+        while not self._left():
+            now = time.monotonic()
+            if self._read(now):
+                self.governor.judge(self._state)
+                if self._settled and self._state["runtime"] != PLAYING:
+                    self._lose("the control script ended on the controller")
+            elif now - self._state["host"] > MISSING / self.config.hz and not self.receive.isConnected():
+                self._lose("the controller closed the connection")
+            if not self._settled and self.board.newest and now - began > SETTLE:
+                self._settle()
+            self._listen()
+            silent = now - float(self.board.control["heartbeat"])
+            if silent > self.config.heartbeat:
+                self._leave(f"the session was silent for {silent:.3f} s")
+            self.governor.look()
+            time.sleep(0.25 / self.config.hz)
+
+    def report(self, **fields: Any) -> None:
+        """Tell the session; if it is gone, nobody."""
+        try:
+            os.write(self._reports, json.dumps(fields).encode() + b"\n")
+        except OSError:
+            self._leave("the session does not listen")
+
+    def _read(self, now: float) -> bool:
+        """Take over a new state, all of one packet; whether there was one."""
+        receive, state = self.receive, self._state
+        stamp = receive.getTimestamp()
+        if stamp == state["robot"]:
+            return False
+        for _ in range(4):
+            state["robot"] = stamp
+            state["tcp"] = receive.getActualTCPPose()
+            state["speed"] = receive.getActualTCPSpeed()
+            state["force"] = receive.getActualTCPForce()
+            state["joints"] = receive.getActualQ()
+            state["mode"] = receive.getRobotMode()
+            state["safety"] = receive.getSafetyStatusBits()
+            state["runtime"] = receive.getRuntimeState()
+            stamp = receive.getTimestamp()
+            if stamp == state["robot"]:
+                break
+        operation = self.control.getAsyncOperationProgressEx()
+        state["operation"] = operation.operationId()
+        state["progress"] = operation.progress() if operation.isAsyncOperationRunning() else -1
+        state["host"] = now
+        self.board.publish(state)
+        return True
+
+    def _settle(self) -> None:
+        """The force at rest is the median of what was seen; the arm is ready."""
+        states = self.board.since(int(self.board.control["first"]) - 1)
+        self.governor.settle(np.median(states["force"], axis=0))
+        self._settled = True
+        self.report(say="ready")
+
+    def _lose(self, detail: str) -> None:
+        self.governor.hold(Finding(Outcome.ARM_GONE, detail))
+
+    def _listen(self) -> None:
+        """Take orders; the end of the input is the end of the session."""
+        try:
+            data = os.read(0, 65536)
+        except BlockingIOError:
+            return
+        if not data:
+            self._leave("the session is gone")
+        *lines, self._input = (self._input + data).split(b"\n")
+        for line in lines:
+            order = Order(**json.loads(line))
+            if order.do == "end":
+                self._leave("told to end")
+            else:
+                self.governor.put(order)
+
+    def _leave(self, reason: str) -> None:
+        """Begin to end: a last stop."""
+        if math.isinf(self._leaving):
+            print(reason, file=sys.stderr, flush=True)
+            self._leaving = time.monotonic() + LEAVING
+            self.governor.leaving = True
+            self.governor.stop()
+
+    def _left(self) -> bool:
+        """Whether the arm stands, or all was tried; the program on the controller is ended with it."""
+        stands = self.governor.leaving and self.governor.obeyed and still(self._state)
+        if stands or time.monotonic() > self._leaving:
+            dashboard.stop(self.config.host)
+            return True
+        return False
+
+
+def connected(config: ArmConfig) -> tuple[Any, Any]:
+    """The library's receive and control interfaces, with the tool set and the watchdog on."""
+    try:
+        import rtde_control
+        import rtde_receive
+    except ImportError as error:
+        raise InputError("ur_rtde", "not installed", "", "pip install 'ratslam[live]'") from error
+    receive = rtde_receive.RTDEReceiveInterface(config.host, config.hz, VARIABLES)
+    control = rtde_control.RTDEControlInterface(config.host, config.hz)
+    if config.tool is not None and not control.setTcp(list(config.tool)):
+        raise RuntimeError("the controller did not take the tool centre point")
+    if not control.setWatchdog(config.watchdog_hz):
+        raise RuntimeError("the controller did not take the watchdog")
+    return receive, control
+
+
+def main(name: str, text: str) -> None:
+    """The process; ends without destructors, for the library aborts in them when the controller is gone."""
+    reports = os.dup(1)
+    os.dup2(2, 1)
+    os.set_blocking(0, False)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the session decides what an interrupt means
+    ranked(URGENT)
+    config = ArmConfig.model_validate_json(text)
+    board = Board(name)
+    # The constructors hold the interpreter's lock and may wait for ever; the alarm ends even that.
+    signal.alarm(math.ceil(config.connect) + 1)
+    try:
+        receive, control = connected(config)
+    except Exception as error:
+        os.write(reports, json.dumps({"say": "refused", "detail": str(error)}).encode() + b"\n")
+        os._exit(1)
+    signal.alarm(0)
+    Child(config, board, receive, control, reports).run()
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
