@@ -16,8 +16,8 @@ from evaluation.metrics.scorecard import Scorecard
 from ratslam.config import RunConfig
 from ratslam.playing import Playing, playing
 from ratslam.session import CHUNK
-from robot.formats import open_recording
-from robot.recorder import Recorder
+from robot.recordings.formats import open_recording
+from robot.recordings.recorder import Recorder
 from robot.sensing import calibration_of, sensing
 from robot.simulation.create.session import roving
 from robot.simulation.head.session import simulated

@@ -90,7 +90,7 @@ def test_what_cannot_be_compared_is_refused(tmp_path: Path, capsys: pytest.Captu
 
 
 def test_a_recording_without_truth_is_refused(tmp_path: Path) -> None:
-    from robot.recording import record
+    from robot.recordings.mcap_reader import record
     from robot.simulation.create.session import RovingConfig, roving
 
     source = roving(RovingConfig(reports=5))

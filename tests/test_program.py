@@ -297,8 +297,8 @@ def test_a_full_disk_is_one_clear_error(tmp_path):
 
 
 def test_a_cut_recording_is_recovered_and_run(capsys, tmp_path):
-    from robot.formats import RecordingConfig, open_recording
-    from robot.recording import record
+    from robot.recordings.formats import RecordingConfig, open_recording
+    from robot.recordings.mcap_reader import record
 
     with open_recording(RecordingConfig(file=ROOT / "tests" / "golden" / "a_square3.npz")) as source:
         record(source, tmp_path / "whole.mcap")

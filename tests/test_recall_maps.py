@@ -13,9 +13,9 @@ from ratslam.closures import Verdict
 from ratslam.rat import RatConfig
 from ratslam.recallrat import rat
 from ratslam.session import Session
+from robot.recordings.npz_trace import read_stream
 from robot.sources.in_memory import Log
 from robot.sources.perturbation import perturbed
-from robot.streams import read_stream
 from tactile.base.se2 import integrate
 from tactile.base.types import Odometry, observation
 from tests import scenes

@@ -16,7 +16,7 @@ from ratslam.cli import main
 from ratslam.config import RunConfig
 from ratslam.run import open_source, simulate
 from ratslam.trials import trial
-from robot.recording import Recording
+from robot.recordings.mcap_reader import Recording
 from robot.sensing import sensing
 from robot.simulation.head.session import simulated
 

@@ -11,9 +11,9 @@ from ratslam.cli import main
 from ratslam.config import RunConfig
 from ratslam.trials import PARTS, Trial, row, trial, variations
 from ratslam.yamlfile import load, override, validate
+from robot.recordings.npz_trace import read_stream
 from robot.sources import perturbation
 from robot.sources.perturbation import perturbed
-from robot.streams import read_stream
 from tactile.base.errors import InputError
 from tactile.base.se2 import between, integrate
 
@@ -117,7 +117,7 @@ def test_parts_are_turned_off_one_by_one(capsys):
 
 
 def test_streamed_recordings_are_not_perturbed(tmp_path, log):
-    from robot.recording import record
+    from robot.recordings.mcap_reader import record
 
     record(log, tmp_path / "a.mcap")
     config = validate(override(load(SQUARE), [f"recording.file={tmp_path / 'a.mcap'}"]), RunConfig)

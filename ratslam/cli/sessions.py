@@ -101,7 +101,7 @@ def _score(arguments: argparse.Namespace) -> int:
 
 
 def _recover(arguments: argparse.Namespace) -> int:
-    from robot.recording import recover
+    from robot.recordings.mcap_reader import recover
 
     report = recover(arguments.recording, arguments.output)
     print(f"{arguments.output}: {report}")

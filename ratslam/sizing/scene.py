@@ -11,7 +11,7 @@ import numpy as np
 from ratslam.config import RunConfig
 from ratslam.run import open_source, recorder_of
 from ratslam.tiers import shortened
-from robot.formats import RecordingConfig
+from robot.recordings.formats import RecordingConfig
 from robot.sources.source import Source
 from tactile.base.errors import InputError
 from tactile.base.se2 import integrate

@@ -16,13 +16,13 @@ from typing import Any, Self
 
 import numpy as np
 
-from robot.blocks import Event, encode_cut, encode_event, encode_frames, encode_states
 from robot.drivers.head.cycle_assembly import KEPT, Cut, within
 from robot.drivers.head.decoder import Frames
 from robot.drivers.outcome import Fault, Outcome
-from robot.messages import encode_truth
-from robot.schemas import ARM, CUT, EVENT, FRAMES, TRUTH
-from robot.tape import Tape, Unwritable
+from robot.recordings.cdr import encode_truth
+from robot.recordings.cdr_live import Event, encode_cut, encode_event, encode_frames, encode_states
+from robot.recordings.mcap_writer import Tape, Unwritable
+from robot.recordings.schemas import ARM, CUT, EVENT, FRAMES, TRUTH
 
 GATHERED = 0.15
 """How long frames and states wait for others, s."""

@@ -15,13 +15,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from robot.blocks import Event
 from robot.drivers.head.decoder import Frames
 from robot.drivers.ur10.base_transform import PlacingConfig, tcp_of
 from robot.drivers.ur10.dashboard import Dashboard
 from robot.emulators.head.settings import HeadEmulatorConfig
+from robot.recordings.cdr_live import Event
+from robot.recordings.mcap_scanner import Walk
 from robot.sources.source import Sample
-from robot.walk import Walk
 from tests.robot.live_helpers import HEAD_FAULTS, ROOT, Faults, emulator, until, ur_emulator
 
 SAMPLES = 2000.0

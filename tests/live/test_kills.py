@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robot.recording import Recording, recover
+from robot.recordings.mcap_reader import Recording, recover
 from tactile.base.random_streams import stream
 from tests.live.bench import Bench, kept
 from tests.live.ends import LOST, ended, stands

@@ -7,7 +7,7 @@ import signal
 
 import numpy as np
 
-from robot.recording import Recording
+from robot.recordings.mcap_reader import Recording
 from tests.live.bench import Bench
 from tests.live.ends import ended
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ratslam.rat import Rat, RatConfig, from_parameters
 from ratslam.session import Session
-from robot.formats import RecordingConfig, open_recording
+from robot.recordings.formats import RecordingConfig, open_recording
 from tactile.base.errors import InputError
 from tactile.base.types import Observation
 from tests.oracle.compare import Report

@@ -13,9 +13,15 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from robot.columns import PairColumns, TableConfig, TruthColumns, VelocityColumns, ViewColumns
-from robot.formats import FORMATS, RecordingConfig, open_recording
-from robot.recording import record
+from robot.recordings.csv_config import (
+    PairColumns,
+    TableConfig,
+    TruthColumns,
+    VelocityColumns,
+    ViewColumns,
+)
+from robot.recordings.formats import FORMATS, RecordingConfig, open_recording
+from robot.recordings.mcap_reader import record
 from robot.sources.input_files import read_bytes
 from robot.sources.source import Source
 from tactile.base.errors import InputError

@@ -17,13 +17,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from robot.messages import decode, encode
-from robot.recorder import Recorder
-from robot.recording import Recording, record, recover
-from robot.schemas import CYCLE, OBSERVATION, REPORT, SCHEMAS, TOPICS, WHISK
+from robot.recordings.cdr import decode, encode
+from robot.recordings.mcap_reader import Recording, record, recover
+from robot.recordings.mcap_scanner import FORMAT, Walk, _checksum
+from robot.recordings.npz_trace import read_stream
+from robot.recordings.recorder import Recorder
+from robot.recordings.schemas import CYCLE, OBSERVATION, REPORT, SCHEMAS, TOPICS, WHISK
 from robot.sources.source import Rigged, Sample, Source, rig_of
-from robot.streams import read_stream
-from robot.walk import FORMAT, Walk, _checksum
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Observation, Odometry, Report, Whisk, observation
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from robot.recording import Recording, record
+from robot.recordings.mcap_reader import Recording, record
 from robot.sensing import head_of, sensing
 from robot.simulation.head.session import Simulation, SimulationConfig, simulated, tier
 from robot.sources.in_memory import collected

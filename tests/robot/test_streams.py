@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from robot.recordings.npz_trace import read_stream
 from robot.sources.source import Source
-from robot.streams import read_stream
 from tactile.base.errors import InputError, InputErrors
 from tactile.base.se2 import integrate
 from tactile.base.types import Observation

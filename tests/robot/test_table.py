@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.columns import (
+from robot.recordings.csv_config import (
     LabelColumns,
     PairColumns,
     PoseColumns,
@@ -20,11 +20,11 @@ from robot.columns import (
     VelocityColumns,
     ViewColumns,
 )
-from robot.csvfile import read_csv
-from robot.pairs import labels_from_pairs
+from robot.recordings.csv_file import read_csv
+from robot.recordings.csv_reader import read_table
+from robot.recordings.match_pairs import labels_from_pairs
+from robot.recordings.npz_trace import read_stream
 from robot.sources.source import Source
-from robot.streams import read_stream
-from robot.table import read_table
 from tactile.base.errors import InputError, InputErrors
 from tactile.base.se2 import integrate
 

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robot.columns import PoseColumns, TableConfig, TruthColumns, VelocityColumns
-from robot.formats import RecordingConfig, open_recording
+from robot.recordings.csv_config import PoseColumns, TableConfig, TruthColumns, VelocityColumns
+from robot.recordings.csv_reader import read_table
+from robot.recordings.formats import RecordingConfig, open_recording
+from robot.recordings.npz_trace import read_stream
+from robot.recordings.unit_check import ORDINARY, RATIO, Limits, Track, headings, typical, units
 from robot.sources.in_memory import Log
-from robot.streams import read_stream
-from robot.table import read_table
-from robot.units import ORDINARY, RATIO, Limits, Track, headings, typical, units
 from tactile.base.errors import InputError
 
 REAL = ("f_real_intel_laser3x6", "f_real_tuc_lecture_hall")

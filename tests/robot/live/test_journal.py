@@ -20,7 +20,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robot.blocks import (
+from robot.drivers.head.cycle_assembly import KEPT, Cut, Window, assembled, cut_of, no_frames, within
+from robot.drivers.head.decoder import Frames
+from robot.drivers.outcome import Outcome
+from robot.drivers.ur10.shared_state import STATE
+from robot.live.journal import Journal
+from robot.recordings.cdr_live import (
     Event,
     decode_cut,
     decode_event,
@@ -31,15 +36,10 @@ from robot.blocks import (
     encode_frames,
     encode_states,
 )
-from robot.drivers.head.cycle_assembly import KEPT, Cut, Window, assembled, cut_of, no_frames, within
-from robot.drivers.head.decoder import Frames
-from robot.drivers.outcome import Outcome
-from robot.drivers.ur10.shared_state import STATE
-from robot.live.journal import Journal
-from robot.recording import Recording, recover
-from robot.schemas import SCHEMAS
-from robot.tape import _Whole
-from robot.walk import Entry, Walk
+from robot.recordings.mcap_reader import Recording, recover
+from robot.recordings.mcap_scanner import Entry, Walk
+from robot.recordings.mcap_writer import _Whole
+from robot.recordings.schemas import SCHEMAS
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Odometry
 

@@ -14,8 +14,8 @@ from typing import Any, cast
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
-from robot.schemas import READINGS, SCHEMAS, TOPICS, TRUTH
-from robot.walk import METADATA, Description
+from robot.recordings.mcap_scanner import METADATA, Description
+from robot.recordings.schemas import READINGS, SCHEMAS, TOPICS, TRUTH
 from tactile.base.errors import InputError
 
 

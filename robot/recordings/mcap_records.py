@@ -15,7 +15,7 @@ from mcap.exceptions import EndOfFile, McapError
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
-from robot.messages import Malformed
+from robot.recordings.cdr import Malformed
 
 CHUNK_LIMIT = 1 << 28  # bytes; ours hold 64 kB, or one sample if that is larger
 

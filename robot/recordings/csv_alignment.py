@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from robot.columns import LabelColumns, PairColumns, TruthColumns, ViewColumns
-from robot.csvfile import CsvFile
-from robot.pairs import labels_from_pairs
-from robot.plausibility import Place, clock, finite, views
-from robot.units import Limits, headings
+from robot.recordings.csv_config import LabelColumns, PairColumns, TruthColumns, ViewColumns
+from robot.recordings.csv_file import CsvFile
+from robot.recordings.match_pairs import labels_from_pairs
+from robot.recordings.sanity_checks import Place, clock, finite, views
+from robot.recordings.unit_check import Limits, headings
 from tactile.base.errors import InputError
 
 FAR = 20.0  # times max_range: a median range beyond it is in another unit

@@ -2,7 +2,7 @@
 
 Asked of a whole recording before anything is run on it. Each check returns the faults it found and never
 raises, so that a reader can report all of them at once. Non-finite values are one check's business; the
-others look past them. Whether the units can be right is asked in `robot.units`.
+others look past them. Whether the units can be right is asked in `robot.recordings.unit_check`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """How a sample is written down: ROS 2 messages in little-endian CDR, which any ROS 2 or MCAP tool can read.
 
-A message is four bytes (00 01 00 00) and the fields of its schema (`robot.schemas`) back to back; an
+A message is four bytes (00 01 00 00) and the fields of its schema (`robot.recordings.schemas`) back to back; an
 unbounded array is preceded by its length (uint32). float64 is kept bit for bit.
 """
 
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from robot.schemas import CYCLE, OBSERVATION, REPORT, WHISK
+from robot.recordings.schemas import CYCLE, OBSERVATION, REPORT, WHISK
 from robot.sources.source import Sample
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Observation, Odometry, Report, Whisk

@@ -9,10 +9,10 @@ from typing import Any, Self
 
 import numpy as np
 
-from robot.messages import encode, encode_truth
-from robot.schemas import TRUTH
+from robot.recordings.cdr import encode, encode_truth
+from robot.recordings.mcap_writer import Tape
+from robot.recordings.schemas import TRUTH
 from robot.sources.source import Sample
-from robot.tape import Tape
 from tactile.base.errors import InputError
 
 

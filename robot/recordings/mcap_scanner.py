@@ -16,20 +16,12 @@ import numpy as np
 from mcap.exceptions import EndOfFile
 from mcap.records import Channel, Message, Metadata, Schema, Statistics
 
-from robot.blocks import Event, decode_cut, decode_event, decode_frames, decode_states
 from robot.drivers.head.cycle_assembly import Window, assembled, no_frames
 from robot.drivers.head.decoder import Frames
-from robot.messages import MOST, Malformed, decode, decode_truth
-from robot.records import BROKEN, records
-from robot.schemas import (
-    ARM,
-    CUT,
-    FRAMES,
-    READINGS,
-    SCHEMA_OF,
-    SCHEMAS,
-    TRUTH,
-)
+from robot.recordings.cdr import MOST, Malformed, decode, decode_truth
+from robot.recordings.cdr_live import Event, decode_cut, decode_event, decode_frames, decode_states
+from robot.recordings.mcap_records import BROKEN, records
+from robot.recordings.schemas import ARM, CUT, FRAMES, READINGS, SCHEMA_OF, SCHEMAS, TRUTH
 from robot.sources.input_files import unreadable
 from robot.sources.source import Sample
 

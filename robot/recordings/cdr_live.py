@@ -1,6 +1,6 @@
 """How a live session is written down: blocks of frames and of arm states, cuts, events.
 
-Messages as in `robot.messages`. Frames lie channel by channel, as differences from frame to frame: small
+Messages as in `robot.recordings.cdr`. Frames lie channel by channel, as differences from frame to frame: small
 numbers, of which compression leaves little.
 """
 
@@ -15,7 +15,7 @@ from robot.drivers.head.cycle_assembly import Cut
 from robot.drivers.head.decoder import Frames
 from robot.drivers.head.protocol import CHANNELS
 from robot.drivers.ur10.shared_state import STATE
-from robot.messages import CDR, MOST, Malformed
+from robot.recordings.cdr import CDR, MOST, Malformed
 from tactile.base.types import Odometry
 
 NUMBERS = ("host", "robot", "tcp", "speed", "force", "joints")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from robot.plausibility import and_more, finite
+from robot.recordings.sanity_checks import and_more, finite
 from robot.sources.input_files import digest_of, missing, read_bytes, refuse
 from tactile.base.errors import InputError
 

@@ -14,15 +14,15 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from robot.blocks import Event
-from robot.plausibility import clock, finite, views
-from robot.recorder import Recorder
-from robot.schemas import TRUTH
+from robot.recordings.cdr_live import Event
+from robot.recordings.mcap_scanner import Walk
+from robot.recordings.mcap_writer import Tape
+from robot.recordings.recorder import Recorder
+from robot.recordings.sanity_checks import clock, finite, views
+from robot.recordings.schemas import TRUTH
+from robot.recordings.unit_check import ORDINARY, Limits, Track, units
 from robot.sources.input_files import refuse, require_file, unreadable
 from robot.sources.source import Sample, Source, rate_of, rig_of
-from robot.tape import Tape
-from robot.units import ORDINARY, Limits, Track, units
-from robot.walk import Walk
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Observation, Report, Whisk
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from robot.columns import TableConfig
+from robot.recordings.csv_config import TableConfig
+from robot.recordings.unit_check import ORDINARY, Limits
 from robot.sources.input_files import require_file
 from robot.sources.source import Source
-from robot.units import ORDINARY, Limits
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
 
@@ -37,19 +37,19 @@ class RecordingConfig(Settings):
 
 
 def _open_mcap(config: RecordingConfig, warn: Warn) -> Source:
-    from robot.recording import Recording  # mcap and zstandard load only where a recording is read
+    from robot.recordings.mcap_reader import Recording
 
     return Recording(config.file, config.limits, warn)
 
 
 def _open_npz(config: RecordingConfig, warn: Warn) -> Source:
-    from robot.streams import read_stream
+    from robot.recordings.npz_trace import read_stream
 
     return read_stream(config.file, config.limits)
 
 
 def _open_csv(config: RecordingConfig, warn: Warn) -> Source:
-    from robot.table import read_table
+    from robot.recordings.csv_reader import read_table
 
     return read_table(config.file, config.table, config.limits)
 

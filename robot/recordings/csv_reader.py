@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from robot.attached import labels_of, truth_of, views_of
-from robot.columns import PoseColumns, TableConfig, ViewColumns
-from robot.csvfile import CsvFile, digest_of_files, read_csv
-from robot.plausibility import clock
+from robot.recordings.csv_alignment import labels_of, truth_of, views_of
+from robot.recordings.csv_config import PoseColumns, TableConfig, ViewColumns
+from robot.recordings.csv_file import CsvFile, digest_of_files, read_csv
+from robot.recordings.sanity_checks import clock
+from robot.recordings.unit_check import ORDINARY, Limits, Track, headings, units
 from robot.sources.in_memory import Log
 from robot.sources.input_files import missing, refuse
 from robot.sources.odometry import from_poses, from_velocities
-from robot.units import ORDINARY, Limits, Track, headings, units
 from tactile.base.errors import InputError
 
 

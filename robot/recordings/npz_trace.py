@@ -19,11 +19,11 @@ from pathlib import Path
 
 import numpy as np
 
-from robot.plausibility import Place, clock, finite, views
+from robot.recordings.sanity_checks import Place, clock, finite, views
+from robot.recordings.unit_check import ORDINARY, Limits, Track, units
 from robot.sources.in_memory import Log
 from robot.sources.input_files import digest_of, missing, read_bytes, refuse
 from robot.sources.odometry import NEW_HEADING, from_velocities
-from robot.units import ORDINARY, Limits, Track, units
 from tactile.base.errors import InputError
 
 VIEW, ODOMETRY = 1, 2

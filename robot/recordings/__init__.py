@@ -1,0 +1,1 @@
+"""Recordings: MCAP, CSV and npz traces, read and written."""
