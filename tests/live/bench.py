@@ -18,7 +18,7 @@ import numpy as np
 from robot.drivers.head.decoder import Frames
 from robot.drivers.ur10.base_transform import PlacingConfig, tcp_of
 from robot.drivers.ur10.dashboard import Dashboard
-from robot.emulators.head.settings import HeadEmulatorConfig
+from robot.emulators.head.config import HeadEmulatorConfig
 from robot.recordings.cdr_live import Event
 from robot.recordings.mcap_scanner import Walk
 from robot.sources.source import Sample

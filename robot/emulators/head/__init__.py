@@ -1,6 +1,6 @@
 """A whisker head that is not there: a process that moves its whiskers in a maze and answers as USB would."""
 
+from robot.emulators.head.config import HeadEmulatorConfig
 from robot.emulators.head.server import serve
-from robot.emulators.head.settings import HeadEmulatorConfig
 
 __all__ = ["HeadEmulatorConfig", "serve"]

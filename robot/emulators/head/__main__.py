@@ -11,8 +11,8 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
+from robot.emulators.head.config import HeadEmulatorConfig
 from robot.emulators.head.server import serve
-from robot.emulators.head.settings import HeadEmulatorConfig
 from tactile.base.errors import InputError
 
 

@@ -17,10 +17,10 @@ from collections.abc import Awaitable, Callable
 from robot.drivers.head.protocol import ENDPOINT_IN
 from robot.drivers.head.usb_tcp_protocol import ANSWER, IN, REQUEST, Op
 from robot.drivers.process_priority import URGENT, ranked
-from robot.emulators.head import descriptors
-from robot.emulators.head.bridge import Bridge
-from robot.emulators.head.settings import HeadEmulatorConfig
-from robot.emulators.head.whereabouts import Along, Carried, Place
+from robot.emulators.head import usb_descriptors
+from robot.emulators.head.config import HeadEmulatorConfig
+from robot.emulators.head.device import Bridge
+from robot.emulators.head.pose_source import Along, Carried, Place
 from robot.world.head_trajectory import Path
 from robot.world.scene import KidnapConfig, scene
 from tactile.whiskers.head_geometry import ur10_head
@@ -127,7 +127,7 @@ class Server:
         bridge, now = self.bridge, time.monotonic()
         self._present(plugs)
         if op == Op.DESCRIBE:
-            return descriptors.device() + descriptors.configuration()
+            return usb_descriptors.device() + usb_descriptors.configuration()
         if op == Op.CLAIM:
             if self._owner is not None and self._owner[0] is not connection and self._owner[1] == plugs:
                 raise _error(errno.EBUSY)

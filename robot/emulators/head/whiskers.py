@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robot.emulators.head.drives import Drives
-from robot.emulators.head.whereabouts import Place
+from robot.emulators.head.pose_source import Place
+from robot.emulators.head.servo_drives import Drives
 from robot.simulation.head.beam import StreamConfig
 from robot.simulation.head.kinematic import MechanicsConfig
 from robot.simulation.head.quasistatic import advance, rest

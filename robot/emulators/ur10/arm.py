@@ -7,11 +7,11 @@ from collections import deque
 from collections.abc import Iterable
 
 from robot.emulators.ur10 import motion as motions
+from robot.emulators.ur10.config import UrEmulatorConfig, WallConfig
 from robot.emulators.ur10.kinematics import UR10, UR10E
 from robot.emulators.ur10.motion import ZERO, Drive, Line, Model, Motion, State, Swing, Unreachable
-from robot.emulators.ur10.orders import Mark, MoveJ, MoveL, Order, StopL, begun, same_kind
 from robot.emulators.ur10.rotation import Vector6
-from robot.emulators.ur10.settings import UrEmulatorConfig, WallConfig
+from robot.emulators.ur10.urscript_moves import Mark, MoveJ, MoveL, Order, StopL, begun, same_kind
 
 NEAR: Vector6 = (
     0.0,

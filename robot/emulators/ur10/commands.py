@@ -11,11 +11,11 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from robot.emulators.ur10.motion import ZERO
-from robot.emulators.ur10.orders import MoveJ, MoveL, Servo, SpeedJ, SpeedL, StopL
 from robot.emulators.ur10.rotation import composed, inverse, quaternion, rotated
+from robot.emulators.ur10.urscript_moves import MoveJ, MoveL, Servo, SpeedJ, SpeedL, StopL
 
 if TYPE_CHECKING:
-    from robot.emulators.ur10.program import Program
+    from robot.emulators.ur10.control_program import Program
 
 REALTIME = frozenset([6, 9, 10, 11, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70, 71])
 SERVO_C_LAG = 0.1  # s

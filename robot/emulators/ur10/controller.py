@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from typing import Any
 
 from robot.emulators.ur10.arm import Arm, size
+from robot.emulators.ur10.config import UrEmulatorConfig
+from robot.emulators.ur10.control_program import Program, Script
 from robot.emulators.ur10.motion import Unreachable
-from robot.emulators.ur10.orders import MoveJ, MoveL, Order, Servo, SpeedJ, SpeedL
-from robot.emulators.ur10.program import Program, Script
 from robot.emulators.ur10.registers import Registers
 from robot.emulators.ur10.rotation import Vector6
 from robot.emulators.ur10.safety import BITS, RobotMode, Runtime, SafetyMode, StatusBits
-from robot.emulators.ur10.settings import UrEmulatorConfig
+from robot.emulators.ur10.urscript_moves import MoveJ, MoveL, Order, Servo, SpeedJ, SpeedL
 
 KEPT = 10_000  # orders remembered: what "state" tells within a control step or two
 

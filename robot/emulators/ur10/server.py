@@ -15,19 +15,19 @@ from collections.abc import Callable
 from typing import Protocol
 
 from robot.drivers.process_priority import URGENT, ranked
-from robot.emulators.ur10.controller import Controller
-from robot.emulators.ur10.dashboard import WELCOME, DashboardSession
-from robot.emulators.ur10.faults import Faults, FaultSession
-from robot.emulators.ur10.motion import Unreachable
-from robot.emulators.ur10.rtde import Claims, RtdeSession
-from robot.emulators.ur10.script import ScriptSession
-from robot.emulators.ur10.settings import (
+from robot.emulators.ur10.config import (
     DASHBOARD_PORT,
     FAULT_PORT,
     RTDE_PORT,
     SCRIPT_PORT,
     UrEmulatorConfig,
 )
+from robot.emulators.ur10.controller import Controller
+from robot.emulators.ur10.dashboard_server import WELCOME, DashboardSession
+from robot.emulators.ur10.fault_server import Faults, FaultSession
+from robot.emulators.ur10.motion import Unreachable
+from robot.emulators.ur10.rtde_server import Claims, RtdeSession
+from robot.emulators.ur10.script_server import ScriptSession
 from tactile.base.errors import InputError
 
 BACKLOG = 0.1  # s

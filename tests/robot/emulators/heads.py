@@ -19,9 +19,9 @@ from robot.drivers.head.protocol import (
     pack,
     tally,
 )
-from robot.emulators.head.bridge import BLOCK, Bridge
-from robot.emulators.head.settings import CONTROL_PORT, HeadEmulatorConfig
-from robot.emulators.head.whereabouts import Along, Place
+from robot.emulators.head.config import CONTROL_PORT, HeadEmulatorConfig
+from robot.emulators.head.device import BLOCK, Bridge
+from robot.emulators.head.pose_source import Along, Place
 from robot.world.scene import KidnapConfig, Scene, scene
 from robot.world.walls import Walls
 from tactile.whiskers.head_geometry import ur10_head

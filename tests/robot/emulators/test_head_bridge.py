@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robot.drivers.head.protocol import ANGLE, REQUEST_IN, REQUEST_OUT, WRAP, Flag, Request
-from robot.emulators.head.bridge import BLOCK
+from robot.emulators.head.config import HeadEmulatorConfig
+from robot.emulators.head.device import BLOCK
 from robot.emulators.head.fifo import Fifo
-from robot.emulators.head.settings import HeadEmulatorConfig
 from tests.robot.emulators.heads import EVER, Told, drive
 
 FREE = HeadEmulatorConfig()

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from robot.drivers.ur10.base_transform import PlacingConfig, tcp_of
-from robot.emulators.head.settings import HeadEmulatorConfig
+from robot.emulators.head.config import HeadEmulatorConfig
 from tests.robot.emulators.heads import running
 from tests.robot.live_helpers import until, ur_emulator
 

@@ -17,9 +17,9 @@ from robot.drivers.head.protocol import (
     tally,
 )
 from robot.drivers.ur10.base_transform import PlacingConfig, tcp_of
-from robot.emulators.head.bridge import BLOCK
-from robot.emulators.head.settings import HeadEmulatorConfig
-from robot.emulators.head.whereabouts import AHEAD, Along, Carried
+from robot.emulators.head.config import HeadEmulatorConfig
+from robot.emulators.head.device import BLOCK
+from robot.emulators.head.pose_source import AHEAD, Along, Carried
 from robot.simulation.head.quasistatic import quasistatic
 from robot.simulation.head.whisk_stream import cycles
 from robot.world.head_trajectory import Path

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from robot.emulators.head.settings import HeadEmulatorConfig
+from robot.emulators.head.config import HeadEmulatorConfig
 from tests.robot.emulators.heads import running
 from tests.robot.live_helpers import ROOT
 

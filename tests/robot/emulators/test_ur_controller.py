@@ -11,12 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robot.drivers.ur10 import rtde_protocol
+from robot.emulators.ur10.config import UrEmulatorConfig
 from robot.emulators.ur10.controller import Controller
-from robot.emulators.ur10.dashboard import DashboardSession
-from robot.emulators.ur10.rtde import Claims, RtdeSession
+from robot.emulators.ur10.dashboard_server import DashboardSession
+from robot.emulators.ur10.rtde_server import Claims, RtdeSession
 from robot.emulators.ur10.safety import RobotMode, Runtime, SafetyMode
-from robot.emulators.ur10.script import ScriptSession
-from robot.emulators.ur10.settings import UrEmulatorConfig
+from robot.emulators.ur10.script_server import ScriptSession
 
 PROGRAM = (
     "def rtde_control():\n    global reg_offset_int = # int register offset\n0\n"

@@ -10,8 +10,10 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from robot.emulators.ur10.arm import Arm
+from robot.emulators.ur10.config import UrEmulatorConfig, WallConfig
 from robot.emulators.ur10.motion import Profile, Unreachable
-from robot.emulators.ur10.orders import (
+from robot.emulators.ur10.rotation import turn
+from robot.emulators.ur10.urscript_moves import (
     Mark,
     MoveJ,
     MoveL,
@@ -23,8 +25,6 @@ from robot.emulators.ur10.orders import (
     StopL,
     orders_in,
 )
-from robot.emulators.ur10.rotation import turn
-from robot.emulators.ur10.settings import UrEmulatorConfig, WallConfig
 
 DOWN = (math.pi, 0.0, 0.0)
 NOWHERE = (3.0, 0.0, 0.3, *DOWN)

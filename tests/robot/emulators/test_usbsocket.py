@@ -30,7 +30,7 @@ from robot.drivers.head.protocol import (
     pack,
 )
 from robot.drivers.head.usb_tcp_backend import SocketBackend, backend
-from robot.emulators.head.settings import HeadEmulatorConfig
+from robot.emulators.head.config import HeadEmulatorConfig
 from tests.robot.emulators.heads import drive, running
 from tests.robot.live_helpers import Faults, until
 

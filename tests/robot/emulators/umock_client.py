@@ -11,7 +11,7 @@ from typing import Any
 from robot.drivers.head.decoder import Decoder
 from robot.drivers.head.device import Bridge, Gone, Stalled, identity, open_bridge
 from robot.drivers.head.protocol import KEEP_ALIVE, Request, pack
-from robot.emulators.head.settings import CONTROL_PORT
+from robot.emulators.head.config import CONTROL_PORT
 from tests.robot.emulators.heads import drive
 
 

@@ -14,8 +14,8 @@ from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
 
 from robot.emulators.ur10.commands import COMMANDS, REALTIME
-from robot.emulators.ur10.orders import Order, SpeedJ, StopJ, StopL, orders_in
 from robot.emulators.ur10.rotation import Vector6
+from robot.emulators.ur10.urscript_moves import Order, SpeedJ, StopJ, StopL, orders_in
 
 if TYPE_CHECKING:
     from robot.emulators.ur10.arm import Arm

@@ -30,8 +30,8 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from robot.drivers.ur10 import rtde_protocol
+from robot.emulators.ur10.config import WallConfig
 from robot.emulators.ur10.registers import Value
-from robot.emulators.ur10.settings import WallConfig
 
 if TYPE_CHECKING:
     from robot.emulators.ur10.server import Server

@@ -23,11 +23,11 @@ from robot.drivers.head.protocol import (
     encode,
     unpack,
 )
-from robot.emulators.head import descriptors
+from robot.emulators.head import usb_descriptors
+from robot.emulators.head.config import HeadEmulatorConfig
 from robot.emulators.head.faults import Faults
 from robot.emulators.head.fifo import Fifo
-from robot.emulators.head.settings import HeadEmulatorConfig
-from robot.emulators.head.whereabouts import Along, Place
+from robot.emulators.head.pose_source import Along, Place
 from robot.emulators.head.whiskers import Block, Whiskers
 from robot.world.walls import Walls
 from tactile.base.random_streams import stream
@@ -114,7 +114,7 @@ class Bridge:
             OSError: EPIPE for one that it does not know.
         """
         if (kind, request) == STRING and value >> 8 == 3:
-            answer = descriptors.string(value & 0xFF)
+            answer = usb_descriptors.string(value & 0xFF)
         elif (kind, request) == CONFIGURED:
             answer = b"\1"
         elif (kind, request) in (CONFIGURE, ALTERNATE):
