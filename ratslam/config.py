@@ -17,7 +17,7 @@ from ratslam.places import PlaceConfig
 from ratslam.rat import RatConfig
 from ratslam.recall import RecallConfig
 from ratslam.templates import TemplateConfig
-from robot.live.settings import LiveConfig
+from robot.live.config import LiveConfig
 from robot.recordings.formats import RecordingConfig
 from robot.sensing import head_of
 from robot.simulation.create.session import RovingConfig

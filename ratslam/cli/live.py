@@ -57,7 +57,7 @@ def _live(arguments: argparse.Namespace) -> int:
 
 def _emulate(arguments: argparse.Namespace) -> int:
     config = _configured(arguments, arguments.ur_host, None)
-    from robot.live.emulated import controller, whiskers
+    from robot.live.emulator_config import controller, whiskers
 
     session, head = config.live, config.touch.head
     try:

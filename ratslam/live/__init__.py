@@ -20,11 +20,11 @@ from ratslam.live.mapper import Mapper, Order
 from ratslam.run import interrupts, located
 from ratslam.session import CHUNK
 from robot.drivers.outcome import Fault, Outcome
-from robot.live.drive import Handed, drive, free_whisks, go
-from robot.live.journal import Journal
+from robot.live.recorder import Journal
 from robot.live.rig import Faulted, Rig, Stopped
 from robot.live.route import approach, checked, descent, routed, way, world
 from robot.live.selftest import reported, room, started
+from robot.live.whisk_loop import Handed, drive, free_whisks, go
 from robot.recordings.formats import RecordingConfig
 from robot.sensing import kept
 from robot.simulation.head.session import CELL_SIZE

@@ -19,9 +19,9 @@ from robot.drivers.head.whisk_control import HeadDriver
 from robot.drivers.outcome import Fault, Outcome
 from robot.drivers.ur10 import dashboard
 from robot.drivers.ur10.arm import Arm
-from robot.live.journal import Journal
-from robot.live.odometer import Odometer
-from robot.live.settings import LiveConfig
+from robot.live.arm_odometry import Odometer
+from robot.live.config import LiveConfig
+from robot.live.recorder import Journal
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 
 TICK = 0.01

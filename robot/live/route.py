@@ -9,7 +9,7 @@ import numpy as np
 from robot.drivers.ur10.base_transform import tcp_of
 from robot.drivers.ur10.safety import Refused
 from robot.drivers.ur10.safety import checked as allowed
-from robot.live.settings import LiveConfig
+from robot.live.config import LiveConfig
 from robot.simulation.head.session import SimulationConfig
 from robot.world.head_trajectory import Path
 from robot.world.scene import Scene, scene

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from robot.drivers.outcome import Outcome
+from robot.live.config import LiveConfig
 from robot.live.rig import Rig
-from robot.live.settings import LiveConfig
 from tactile.base.errors import InputError
 
 LISTENED = 1.5

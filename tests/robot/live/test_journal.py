@@ -24,7 +24,7 @@ from robot.drivers.head.cycle_assembly import KEPT, Cut, Window, assembled, cut_
 from robot.drivers.head.decoder import Frames
 from robot.drivers.outcome import Outcome
 from robot.drivers.ur10.shared_state import STATE
-from robot.live.journal import Journal
+from robot.live.recorder import Journal
 from robot.recordings.cdr_live import (
     Event,
     decode_cut,

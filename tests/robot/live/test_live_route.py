@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from robot.drivers.ur10.base_transform import pose_of
+from robot.live.config import LiveConfig
 from robot.live.route import approach, descent, routed, way
-from robot.live.settings import LiveConfig
 from robot.world.head_trajectory import at
 from robot.world.scene import scene
 from tactile.base.errors import InputError

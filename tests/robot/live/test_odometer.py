@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robot.drivers.ur10.base_transform import tcp_of
-from robot.live.odometer import Odometer
-from robot.live.settings import LiveConfig
+from robot.live.arm_odometry import Odometer
+from robot.live.config import LiveConfig
 from robot.sources.odometry import OdometryConfig
 from tactile.base.se2 import compose, integrate
 

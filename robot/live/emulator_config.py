@@ -8,8 +8,8 @@ from robot.drivers.head.address import Address
 from robot.drivers.ur10.base_transform import tcp_of
 from robot.emulators.head.config import HeadEmulatorConfig
 from robot.emulators.ur10.config import UrEmulatorConfig
+from robot.live.config import LiveConfig
 from robot.live.route import way
-from robot.live.settings import LiveConfig
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 
 

@@ -7,7 +7,7 @@ from collections import deque
 import numpy as np
 
 from robot.drivers.ur10.base_transform import heading_of, pose_of
-from robot.live.settings import LiveConfig
+from robot.live.config import LiveConfig
 from robot.sources.odometry import MID_HEADING, from_velocities, reckoned
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose, wrap
