@@ -15,8 +15,8 @@ from ratslam.config import RunConfig
 from ratslam.playing import session_of
 from ratslam.run import located, open_source
 from ratslam.session import CHUNK
-from robot.sensing import observation_of, sensing
 from robot.sources.source import Sample, Source
+from robot.touch_source import observation_of, sensing
 from tactile.base.errors import InputError
 from tactile.base.se2 import compose, integrate, inverse
 from tactile.base.types import Observation

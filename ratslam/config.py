@@ -19,12 +19,12 @@ from ratslam.recall import RecallConfig
 from ratslam.templates import TemplateConfig
 from robot.live.config import LiveConfig
 from robot.recordings.formats import RecordingConfig
-from robot.sensing import head_of
 from robot.simulation.create.session import RovingConfig
 from robot.simulation.head.session import SimulationConfig
 from robot.sources.in_memory import Log
 from robot.sources.odometry_extent import extent
 from robot.sources.source import Source, rig_of
+from robot.touch_source import head_of
 from tactile.base.config import Settings
 from tactile.frontend import TouchConfig
 

@@ -25,8 +25,8 @@ from ratslam.session import CHUNK, Session, Step
 from ratslam.storage import RunDirectory, read_checkpoint
 from ratslam.types import Action
 from ratslam.yamlfile import dump
-from robot.sensing import feelers_of, observation_of
 from robot.sources.source import Sample, Source, rig_of
+from robot.touch_source import feelers_of, observation_of
 from tactile.base.errors import InputError
 from tactile.base.se2 import compose, tum_line
 from tactile.base.types import Observation

@@ -18,10 +18,10 @@ from ratslam.playing import Playing, playing
 from ratslam.session import CHUNK
 from robot.recordings.formats import open_recording
 from robot.recordings.recorder import Recorder
-from robot.sensing import calibration_of, sensing
 from robot.simulation.create.session import roving
 from robot.simulation.head.session import simulated
 from robot.sources.source import Sample, Source, rig_of
+from robot.touch_source import calibration_of, sensing
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Whisk
 from tactile.frontend import Frontend

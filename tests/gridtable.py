@@ -72,7 +72,7 @@ def run(world: str, row: str, arena: int) -> Figures:
     from ratslam.config import RunConfig
     from ratslam.playing import readings, session_of
     from ratslam.run import open_source
-    from robot.sensing import sensing
+    from robot.touch_source import sensing
     from tactile.base.se2 import compose, integrate
     from tactile.base.types import Motion
 

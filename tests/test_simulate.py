@@ -17,8 +17,8 @@ from ratslam.config import RunConfig
 from ratslam.run import open_source, simulate
 from ratslam.trials import trial
 from robot.recordings.mcap_reader import Recording
-from robot.sensing import sensing
 from robot.simulation.head.session import simulated
+from robot.touch_source import sensing
 
 ROOT = Path(__file__).parents[1]
 CONFIG = "simulation: {path: {explore: 150}, seed: 5}\ntouch: {head: {dead: [4]}}\n"

@@ -14,8 +14,8 @@ from ratslam.closures import Verdict
 from ratslam.config import TOUCH, RunConfig
 from ratslam.playing import readings, session_of
 from ratslam.session import Session
-from robot.sensing import sensing
 from robot.simulation.head.session import simulated
+from robot.touch_source import sensing
 from tactile.base.se2 import integrate
 from tactile.base.types import Observation
 

@@ -10,9 +10,9 @@ import pytest
 from ratslam.cli import main
 from ratslam.config import RunConfig
 from ratslam.schooling import SECONDS, WAYS, Tried, held_out, report
-from robot.sensing import observation_of, sensing
 from robot.simulation.create.session import RovingConfig, roving
 from robot.simulation.create.template_training import trained
+from robot.touch_source import observation_of, sensing
 from tactile.base.errors import InputError
 from tactile.wall_estimation.strain_templates import StrainTemplates, load
 

@@ -18,7 +18,7 @@ from ratslam.config import RunConfig
 from ratslam.playing import readings, session_of
 from ratslam.run import open_source
 from ratslam.types import Action
-from robot.sensing import sensing
+from robot.touch_source import sensing
 from tactile.base.types import Observation
 
 FOLDER = Path(__file__).parent / "golden"

@@ -98,8 +98,8 @@ def run(row: str, maze: int, seed: int, matcher: str = "recall") -> Figures:
     from ratslam.config import RunConfig
     from ratslam.playing import readings, session_of
     from ratslam.run import open_source
-    from robot.sensing import sensing
     from robot.sources.in_memory import collected
+    from robot.touch_source import sensing
     from tactile.base.errors import InputError
     from tactile.base.se2 import integrate
 

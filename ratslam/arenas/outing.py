@@ -19,9 +19,9 @@ from ratslam.gridfilter import GridFilter
 from ratslam.gridsettings import GridConfig
 from ratslam.marks import Marks, draw, marks_of
 from ratslam.session import Session, capacity_at
-from robot.sensing import Sensing, observation_of, reports_of
 from robot.simulation.create.session import Rover, RovingConfig, roving
 from robot.simulation.create.template_training import trained
+from robot.touch_source import Sensing, observation_of, reports_of
 from robot.world.arena import Arena, enclosed, fits, occupied, segments, text
 from robot.world.random_arena import arena
 from tactile.base.errors import InputError

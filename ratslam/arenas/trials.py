@@ -13,7 +13,7 @@ from ratslam.arenas.figures import measured, off, scored
 from ratslam.arenas.outing import Mapped, Outing, chart, felt, felt_marks, mapped, outing, truth_of
 from ratslam.arenas.protocols import FILTERED, RECKONED, TRUE
 from ratslam.config import RunConfig
-from robot.sensing import reports_of
+from robot.touch_source import reports_of
 from robot.world.arena import Arena
 
 

@@ -26,8 +26,8 @@ from robot.live.route import approach, checked, descent, routed, way, world
 from robot.live.selftest import reported, room, started
 from robot.live.whisk_loop import Handed, drive, free_whisks, go
 from robot.recordings.formats import RecordingConfig
-from robot.sensing import kept
 from robot.simulation.head.session import CELL_SIZE
+from robot.touch_source import kept
 from robot.world.head_trajectory import Path as Way
 from robot.world.maze import text
 from tactile.base.errors import InputError

@@ -236,7 +236,7 @@ def mapping(line: Connection) -> None:
 def _map(line: Connection) -> None:
     from ratslam.playing import playing
     from ratslam.types import Action
-    from robot.sensing import sensing
+    from robot.touch_source import sensing
     from tactile.base.types import Odometry, observation
 
     order = line.recv()

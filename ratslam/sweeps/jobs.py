@@ -33,8 +33,8 @@ from ratslam.sweeps.memory import weighed
 from ratslam.sweeps.results import Machine, Result, Timing
 from ratslam.sweeps.stopwatch import Stopwatch
 from ratslam.sweeps.study import Job
-from robot.sensing import sensing
 from robot.sources.source import Source, rig_of
+from robot.touch_source import sensing
 from robot.world.arena import read_arena
 from tactile.base.errors import InputError
 from tactile.base.se2 import integrate

@@ -21,9 +21,9 @@ from ratslam.run import located, open_source
 from ratslam.session import CHUNK, Session
 from ratslam.trials.workers import shared_out
 from ratslam.yamlfile import Document, load, override, validate
-from robot.sensing import sensing
 from robot.sources.in_memory import Log, collected
 from robot.sources.perturbation import perturbed
+from robot.touch_source import sensing
 from tactile.base.errors import InputError
 from tactile.base.se2 import integrate
 

@@ -20,8 +20,8 @@ from ratslam.recallrat import rat
 from ratslam.run import located, open_source
 from ratslam.session import Session, capacity_at
 from ratslam.trials.controls import Control, controlled
-from robot.sensing import observation_of, sensing
 from robot.sources.in_memory import Log, collected
+from robot.touch_source import observation_of, sensing
 from tactile.base.errors import InputError
 from tactile.base.se2 import integrate
 

@@ -10,8 +10,8 @@ from jax import lax
 from ratslam.gridfilter import GridFilter
 from ratslam.gridsettings import GridConfig
 from ratslam.session import Session
-from robot.sensing import feelers_of, sensing
 from robot.simulation.create.session import RovingConfig, roving
+from robot.touch_source import feelers_of, sensing
 from tactile.base.types import stack
 from tactile.frontend import TouchConfig
 

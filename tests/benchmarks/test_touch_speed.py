@@ -12,7 +12,7 @@ from evaluation.metrics.experience_metric import experience_metric
 from ratslam.config import RunConfig
 from ratslam.playing import readings, session_of
 from ratslam.run import open_source
-from robot.sensing import sensing
+from robot.touch_source import sensing
 
 JITTER = {"position": 0.005, "yaw_deg": 1.5, "speed": 0.05}
 

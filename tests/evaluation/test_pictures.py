@@ -16,7 +16,7 @@ from ratslam.cli import main
 from ratslam.config import RunConfig
 from ratslam.run import located, open_source
 from ratslam.yamlfile import load, validate
-from robot.sensing import sensing
+from robot.touch_source import sensing
 from robot.world.scene import MazeConfig
 
 ROOT = Path(__file__).parents[2]

@@ -12,11 +12,11 @@ import pytest
 from pydantic import ValidationError
 
 from robot.recordings.mcap_reader import Recording, record
-from robot.sensing import head_of, sensing
 from robot.simulation.head.session import Simulation, SimulationConfig, simulated, tier
 from robot.sources.in_memory import collected
 from robot.sources.odometry import OdometryConfig
 from robot.sources.source import Rigged, Sample, Source, rig_of
+from robot.touch_source import head_of, sensing
 from robot.world.maze import CELL, text
 from tactile.base.errors import InputError
 from tactile.base.se2 import between, wrap

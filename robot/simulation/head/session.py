@@ -13,7 +13,6 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from pydantic import Field, NonNegativeInt
 
-from robot.sensing import kept
 from robot.simulation.head.beam import StreamConfig
 from robot.simulation.head.dynamic import dynamic
 from robot.simulation.head.kinematic import Felt, MechanicsConfig, felt, whisk
@@ -21,6 +20,7 @@ from robot.simulation.head.quasistatic import quasistatic
 from robot.simulation.head.whisk_stream import cycles, free_cycles
 from robot.sources.odometry import OdometryConfig, reckoned
 from robot.sources.simulated import STILL, Made, document_digest, placed
+from robot.touch_source import kept
 from robot.world.head_trajectory import MotionConfig, at
 from robot.world.maze import text
 from robot.world.scene import KidnapConfig, MazeConfig, PathConfig, another, scene
