@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ratslam.growing import Growing
+from ratslam.core.growable_array import Growing
 
 LEVELS = 4_000_000
 """Poses kept of reports that may still be told apart."""

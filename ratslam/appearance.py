@@ -11,8 +11,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from ratslam.backend import Evidence
-from ratslam.growing import Growing
+from ratslam.core.backend import Evidence
+from ratslam.core.growable_array import Growing
 from ratslam.likeness import Pixels, background, levels, table, variation
 from ratslam.recall import NO_LIKENESS
 from ratslam.sectors import NOTHING, Fan, Slope

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ratslam import gridfilter, posecells
-from ratslam.backend import Backend
 from ratslam.config import RunConfig
+from ratslam.core.backend import Backend
 from ratslam.gridfilter import GridEvidence, GridFilter
 from ratslam.occupancy import LAYERS
 from ratslam.recallrat import evidence_of, rat

@@ -16,7 +16,7 @@ from jax import lax
 
 from ratslam import ladder, patches, posecells
 from ratslam.cellsettings import PoseCellConfig
-from ratslam.types import Estimate
+from ratslam.core.types import Estimate
 from tactile.base.types import Array, Observation, Odometry
 
 BLOCK = 8

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ratslam.core.growable_array import Growing
 from ratslam.framegraph import Closures
-from ratslam.growing import Growing
 
 
 class Verdict(IntEnum):

@@ -18,16 +18,16 @@ import numpy as np
 
 from ratslam.appearance import Appearance, Match
 from ratslam.arbitration import FINE, KEPT, STEPS, Case, arbitrate
-from ratslam.backend import Evidence
 from ratslam.closures import Candidate, Ledger, Verdict
+from ratslam.core.backend import Evidence
+from ratslam.core.growable_array import Growing
+from ratslam.core.types import Estimate
 from ratslam.framegraph import Chain, Closures, Fit, Prior, corrected, relative_covariance, solve
 from ratslam.framesettings import FrameMapConfig
 from ratslam.graphfile import write_g2o, write_json
 from ratslam.grouping import Grouping
-from ratslam.growing import Growing
 from ratslam.posegraph import Edges
 from ratslam.recall import Guidance
-from ratslam.types import Estimate
 from tactile.base.se2 import between, compose, fitted, integrate, inverse, wrap
 from tactile.base.types import Observation
 

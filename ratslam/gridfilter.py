@@ -15,11 +15,11 @@ import numpy as np
 from jax import lax
 
 from ratslam import likelihoods, occupancy, particles, stamps
+from ratslam.core.types import Action, Estimate
 from ratslam.gridmap import GridMap
 from ratslam.gridsettings import GridConfig
 from ratslam.occupancy import COSINE, EVIDENCE, SINE
 from ratslam.particles import Particles
-from ratslam.types import Action, Estimate
 from tactile.base.types import Array, Motion, Observation, Odometry
 from tactile.whiskers.planar_whiskers import Feelers
 

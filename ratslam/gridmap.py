@@ -10,10 +10,10 @@ import networkx
 import numpy as np
 
 from ratslam.ancestry import Ancestry
+from ratslam.core.growable_array import Growing
+from ratslam.core.types import Estimate
 from ratslam.gridsettings import GridConfig
-from ratslam.growing import Growing
 from ratslam.marks import Marks, draw, marks_of
-from ratslam.types import Estimate
 from tactile.base.types import Observation
 from tactile.whiskers.planar_whiskers import Feelers
 

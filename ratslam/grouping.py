@@ -11,8 +11,8 @@ from typing import NamedTuple
 import networkx
 import numpy as np
 
-from ratslam.growing import Growing
-from ratslam.types import Action
+from ratslam.core.growable_array import Growing
+from ratslam.core.types import Action
 from tactile.base.se2 import between, wrap
 
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from pydantic import PositiveFloat
 
-from ratslam.types import Action
+from ratslam.core.types import Action
 from tactile.base.config import Settings
 from tactile.base.types import Array
 

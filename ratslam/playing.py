@@ -19,11 +19,11 @@ from evaluation.metrics.trajectory import Anytime, present_error, summary, write
 from evaluation.report import pictures
 from ratslam.backends import Telling, backend_of, telling
 from ratslam.config import RunConfig
-from ratslam.growing import Growing
+from ratslam.core.growable_array import Growing
+from ratslam.core.session import CHUNK, Session, Step
+from ratslam.core.types import Action
 from ratslam.keeping import Felt, keep_chart, keep_images, keep_world
-from ratslam.session import CHUNK, Session, Step
 from ratslam.storage import RunDirectory, read_checkpoint
-from ratslam.types import Action
 from ratslam.yamlfile import dump
 from robot.sources.source import Sample, Source, rig_of
 from robot.touch_source import feelers_of, observation_of

@@ -11,13 +11,13 @@ from pydantic import Field
 
 from ratslam import ladder, places, posecells, templates
 from ratslam.cellsettings import PoseCellConfig, rings, units
+from ratslam.core.types import Estimate
 from ratslam.experience import ExperienceConfig, ExperienceMap
 from ratslam.framesettings import FrameMapConfig
 from ratslam.places import PlaceConfig, Places
 from ratslam.posecells import Outcome, PoseCells
 from ratslam.recall import RecallConfig
 from ratslam.templates import Match, TemplateConfig, Templates
-from ratslam.types import Estimate
 from tactile.base.config import Settings
 from tactile.base.se2 import wrap
 from tactile.base.types import Array, Observation, Odometry

@@ -11,14 +11,14 @@ from jax import lax
 
 from ratslam import ladder, posecells, recall, templates
 from ratslam.appearance import Appearance, Labels, Touch, Views
-from ratslam.backend import Backend
 from ratslam.cellsettings import rings, units
+from ratslam.core.backend import Backend
+from ratslam.core.types import Action, Estimate
 from ratslam.framemap import FrameMap
 from ratslam.likeness import levels, pixels
 from ratslam.posecells import Outcome, PoseCells
 from ratslam.rat import Rat, RatConfig, RatEvidence, finite
 from ratslam.recall import Guidance, Memory, Recollection
-from ratslam.types import Action, Estimate
 from ratslam.weighing import by_label, by_touch, by_view
 from tactile.base.types import Array, Observation
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.growing import Growing
+from ratslam.core.growable_array import Growing
 
 FANS = np.radians([sign * width for width in (60, 90, 120, 180, 240, 270, 360) for sign in (1, -1)])
 """Widths of fans that sensors have and that views can tell apart, rad; negative: clockwise."""

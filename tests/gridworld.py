@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ratslam.core.packing import layout_of, room
+from ratslam.core.session import CHUNK, run_chunk
+from ratslam.core.types import Estimate
 from ratslam.gridfilter import GridEvidence, GridFilter, State
 from ratslam.gridsettings import GridConfig
-from ratslam.rows import layout_of, room
-from ratslam.session import CHUNK, run_chunk
-from ratslam.types import Estimate
 from tactile.base.types import Motion, Observation, Odometry, observation
 from tactile.whiskers.planar_whiskers import Feelers
 

@@ -10,9 +10,9 @@ import pytest
 
 from evaluation.metrics.trajectory import ate
 from ratslam.closures import Verdict
+from ratslam.core.session import Session
 from ratslam.rat import RatConfig
 from ratslam.recallrat import rat
-from ratslam.session import Session
 from robot.recordings.npz_trace import read_stream
 from robot.sources.in_memory import Log
 from robot.sources.perturbation import perturbed

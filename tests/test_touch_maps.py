@@ -12,8 +12,8 @@ import pytest
 from evaluation.metrics.energy_metric import energy_all_pairs
 from ratslam.closures import Verdict
 from ratslam.config import TOUCH, RunConfig
+from ratslam.core.session import Session
 from ratslam.playing import readings, session_of
-from ratslam.session import Session
 from robot.simulation.head.session import simulated
 from robot.touch_source import sensing
 from tactile.base.se2 import integrate

@@ -234,8 +234,8 @@ def mapping(line: Connection) -> None:
 
 
 def _map(line: Connection) -> None:
+    from ratslam.core.types import Action
     from ratslam.playing import playing
-    from ratslam.types import Action
     from robot.touch_source import sensing
     from tactile.base.types import Odometry, observation
 

@@ -15,10 +15,10 @@ import numpy as np
 from jax import lax
 
 from ratslam.config import RunConfig
+from ratslam.core.types import Estimate
 from ratslam.experience import ExperienceMap
 from ratslam.rat import Rat, RatConfig, RatEvidence
 from ratslam.trials.touch import Played, room_for, told
-from ratslam.types import Estimate
 from robot.sources.in_memory import Log
 from robot.touch_source import observation_of
 from tactile.base.types import Array, Observation, stack

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from jax import lax
 
+from ratslam.core.session import Session
 from ratslam.gridfilter import GridFilter
 from ratslam.gridsettings import GridConfig
-from ratslam.session import Session
 from robot.simulation.create.session import RovingConfig, roving
 from robot.touch_source import feelers_of, sensing
 from tactile.base.types import stack

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from ratslam.core.types import Action, Estimate
 from ratslam.experience import ExperienceConfig, ExperienceMap
 from ratslam.posegraph import Edges, Ending, least_squares, linear
-from ratslam.types import Action, Estimate
 from tactile.base.se2 import between, integrate, wrap
 from tactile.base.types import Odometry, observation
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import networkx
 import numpy as np
 
-from ratslam.types import Action, Estimate
+from ratslam.core.types import Action, Estimate
 from tactile.base.se2 import compose, wrap
 
 

@@ -10,8 +10,8 @@ import pytest
 from ratslam import ladder, posecells
 from ratslam.batches import Course, Network, networks, trials
 from ratslam.cellsettings import PoseCellConfig, units
+from ratslam.core.session import Session
 from ratslam.patches import around
-from ratslam.session import Session
 from tactile.base.types import Odometry, stack
 from tests.gridworld import filter_of, report, settings
 

@@ -10,12 +10,12 @@ import jax
 import numpy as np
 import pytest
 
+from ratslam.core.session import CHUNK, Session, capacity_at
+from ratslam.core.types import Action
 from ratslam.gridfilter import GridFilter, Outcome
 from ratslam.gridsettings import GridConfig
 from ratslam.rat import RatConfig
 from ratslam.recallrat import rat
-from ratslam.session import CHUNK, Session, capacity_at
-from ratslam.types import Action
 from tactile.base.types import Odometry, observation
 from tactile.whiskers.planar_whiskers import Feelers
 

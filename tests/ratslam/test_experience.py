@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ratslam.core.types import Action, Estimate
 from ratslam.experience import ExperienceConfig, ExperienceMap
-from ratslam.types import Action, Estimate
 from tactile.base.se2 import compose, integrate, inverse
 from tactile.base.types import Odometry, observation
 

@@ -12,9 +12,9 @@ import pytest
 from ratslam import likelihoods, occupancy
 from ratslam.backends import backend_of
 from ratslam.config import RunConfig
+from ratslam.core.session import Session
 from ratslam.gridfilter import Outcome
 from ratslam.occupancy import COSINE, EVIDENCE, SINE
-from ratslam.session import Session
 from tactile.base.errors import InputError
 from tactile.base.se2 import wrap
 from tactile.base.types import Motion

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from ratslam import ancestry
+from ratslam.core.types import Estimate
 from ratslam.gridfilter import GridEvidence
-from ratslam.types import Estimate
 from tactile.base.types import Motion
 from tests.gridworld import TIPS, filter_of, report, settings
 

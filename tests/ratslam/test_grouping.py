@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ratslam.core.types import Action
 from ratslam.grouping import Grouping, Said
-from ratslam.types import Action
 from tactile.base.se2 import compose, wrap
 
 RADIUS, HEADING = 1.0, 0.5

@@ -13,10 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ratslam import recall, weighing
+from ratslam.core.session import Session
 from ratslam.rat import RatConfig
 from ratslam.recall import BASIN, FACING, SAMPLES, SUPPORT, Guidance, RecallConfig
 from ratslam.recallrat import rat
-from ratslam.session import Session
 from ratslam.weighing import LABEL_TEMPER, LABELS
 from tactile.base.se2 import between, compose, wrap
 from tactile.base.types import Odometry, observation

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ratslam.rows import Rows, empty, layout_of, room
+from ratslam.core.packing import Rows, empty, layout_of, room
 
 DTYPES = [np.dtype(name) for name in ("float64", "float32", "int32", "uint32", "bool")]
 

@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.backend import Backend, Evidence, Map
-from ratslam.rows import Layout, Rows, empty, layout_of, room
-from ratslam.types import Estimate
+from ratslam.core.backend import Backend, Evidence, Map
+from ratslam.core.packing import Layout, Rows, empty, layout_of, room
+from ratslam.core.types import Estimate
 from tactile.base.types import Observation
 
 CHUNK = 16

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import networkx
 import numpy as np
 
-from ratslam.types import Estimate
+from ratslam.core.types import Estimate
 from tactile.base.types import Array, Observation
 
 State = Any
