@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam import gridfilter, posecells
+from ratslam import gridfilter
+from ratslam.attractor import pose_cells
 from ratslam.config import RunConfig
 from ratslam.core.backend import Backend
 from ratslam.gridfilter import GridEvidence, GridFilter
@@ -55,6 +56,6 @@ def backend_of(config: RunConfig, view_shape: tuple[int, int, int], feelers: Fee
 def telling(config: RunConfig) -> Telling:
     """What each step reports."""
     evidence = GridEvidence if config.backend == "grid" else evidence_of(config.matcher)
-    outcomes: type[IntEnum] = gridfilter.Outcome if config.backend == "grid" else posecells.Outcome
+    outcomes: type[IntEnum] = gridfilter.Outcome if config.backend == "grid" else pose_cells.Outcome
     quiet = {*ARRAYS, "outcome"}
     return Telling(tuple(name for name in evidence._fields if name not in quiet), outcomes)

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, NonNegativeInt, ValidationInfo, field_validator
 
 from evaluation.metrics.experience_metric import ExmConfig
-from ratslam.cellsettings import PoseCellConfig
+from ratslam.attractor.config import PoseCellConfig
 from ratslam.experience import ExperienceConfig
 from ratslam.framesettings import FrameMapConfig
 from ratslam.gridsettings import GridConfig

@@ -9,13 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from pydantic import Field
 
-from ratslam import ladder, places, posecells, templates
-from ratslam.cellsettings import PoseCellConfig, rings, units
+from ratslam import places, templates
+from ratslam.attractor import adaptive_window, pose_cells
+from ratslam.attractor.config import PoseCellConfig, rings, units
+from ratslam.attractor.pose_cells import Outcome, PoseCells
 from ratslam.core.types import Estimate
 from ratslam.experience import ExperienceConfig, ExperienceMap
 from ratslam.framesettings import FrameMapConfig
 from ratslam.places import PlaceConfig, Places
-from ratslam.posecells import Outcome, PoseCells
 from ratslam.recall import RecallConfig
 from ratslam.templates import Match, TemplateConfig, Templates
 from tactile.base.config import Settings
@@ -83,7 +84,7 @@ class Rat:
         self.config = config
         self.view_shape = view_shape
         self.dtype = np.dtype(dtype)
-        self.rungs = ladder.rungs(config.pose_cells, self.dtype)
+        self.rungs = adaptive_window.rungs(config.pose_cells, self.dtype)
         self.rings = rings(config.pose_cells, self.dtype)
         self.units = units(config.pose_cells, self.dtype)
 
@@ -91,7 +92,7 @@ class Rat:
         """One packet in the middle of an empty world. Nothing here is random, so `key` is not used."""
         del key
         return State(
-            posecells.start(self.config.pose_cells, self.dtype),
+            pose_cells.start(self.config.pose_cells, self.dtype),
             templates.start(self.config.templates, self.view_shape, capacity, self.dtype),
             places.start(capacity, self.dtype),
             jnp.zeros((), self.dtype),
@@ -134,7 +135,7 @@ class Rat:
         turned = jnp.stack([jnp.zeros_like(relative), jnp.zeros_like(relative), relative / self.units[2]])
 
         recalled = (memory.packet[jnp.maximum(match.template, 0)] + turned) % self.rings
-        cells, told = posecells.step(config.pose_cells, self.rungs, state.cells, odometry, recalled, energy)
+        cells, told = pose_cells.step(config.pose_cells, self.rungs, state.cells, odometry, recalled, energy)
         canonical = (cells.pose - turned) % self.rings
         world, decision = places.decide(
             config.places, self.rings, state.places, canonical, memory.current, seen & (memory.current >= 0)

@@ -9,14 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam import ladder, posecells, recall, templates
+from ratslam import recall, templates
 from ratslam.appearance import Appearance, Labels, Touch, Views
-from ratslam.cellsettings import rings, units
+from ratslam.attractor import adaptive_window, pose_cells
+from ratslam.attractor.config import rings, units
+from ratslam.attractor.pose_cells import Outcome, PoseCells
 from ratslam.core.backend import Backend
 from ratslam.core.types import Action, Estimate
 from ratslam.framemap import FrameMap
 from ratslam.likeness import levels, pixels
-from ratslam.posecells import Outcome, PoseCells
 from ratslam.rat import Rat, RatConfig, RatEvidence, finite
 from ratslam.recall import Guidance, Memory, Recollection
 from ratslam.weighing import by_label, by_touch, by_view
@@ -81,7 +82,7 @@ class RecallRat:
         self.pixels = pixels(view_shape) if self.recall.fan == "whiskers" else None
         self.dtype = np.dtype(dtype)
         self.cell = config.pose_cells.cell_size
-        self.rungs = ladder.rungs(config.pose_cells, self.dtype)
+        self.rungs = adaptive_window.rungs(config.pose_cells, self.dtype)
         self.rings = rings(config.pose_cells, self.dtype)
         self.units = units(config.pose_cells, self.dtype)
 
@@ -89,7 +90,7 @@ class RecallRat:
         """One packet in the middle of an empty world. Nothing here is random, so `key` is not used."""
         del key
         return State(
-            posecells.start(self.config.pose_cells, self.dtype),
+            pose_cells.start(self.config.pose_cells, self.dtype),
             recall.start(self.recall, self.size, capacity, self.dtype, self._groups()),
             jnp.ones((), self.dtype),
         )
@@ -125,7 +126,7 @@ class RecallRat:
             lambda: (memory, recall.nothing(memory)),
         )
         recalled, energy = self._injection(memory, recollection)
-        cells, told = posecells.step(
+        cells, told = pose_cells.step(
             self.config.pose_cells, self.rungs, state.cells, odometry, recalled, energy
         )
         memory = lax.cond(

@@ -21,10 +21,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam import ladder, posecells
-from ratslam.cellsettings import PoseCellConfig, rings, units
-from ratslam.patches import around
-from ratslam.posecells import PoseCells
+from ratslam.attractor import adaptive_window, pose_cells
+from ratslam.attractor.config import PoseCellConfig, rings, units
+from ratslam.attractor.pose_cells import PoseCells
+from ratslam.attractor.window import around
 from tactile.base.random_streams import stream
 from tactile.base.types import Odometry
 
@@ -69,7 +69,7 @@ def decoded(kind: Kind, motion: np.ndarray) -> np.ndarray:
     if not kind.fed_back:  # the lag is measured once the packet has settled: never
         config = config.model_copy(update={"settle_steps": 2**31 - 1})
     dtype = np.dtype(kind.dtype)
-    start = posecells.start(config, dtype)
+    start = pose_cells.start(config, dtype)
     if not kind.fed_back:
         start = start._replace(settling=jnp.int32(config.settle_steps))
     settled, _ = _walk(config, start, np.zeros((SETTLING, 3), dtype))
@@ -88,12 +88,12 @@ def _nudged(cells: PoseCells, by: float) -> PoseCells:
 @partial(jax.jit, static_argnums=0)
 def _walk(config: PoseCellConfig, cells: PoseCells, motion: Any) -> tuple[PoseCells, Any]:
     dtype = np.dtype(motion.dtype)
-    rungs, unit = ladder.rungs(config, dtype), units(config, dtype)
+    rungs, unit = adaptive_window.rungs(config, dtype), units(config, dtype)
     nowhere, nothing = jnp.zeros(3, dtype), jnp.zeros((), dtype)
 
     def step(cells: PoseCells, moved: Any) -> tuple[PoseCells, Any]:
         odometry = Odometry(*(moved * unit), jnp.ones((), dtype))
-        cells, _ = posecells.step(config, rungs, cells, odometry, nowhere, nothing)
+        cells, _ = pose_cells.step(config, rungs, cells, odometry, nowhere, nothing)
         return cells, cells.pose
 
     return lax.scan(step, cells, motion)

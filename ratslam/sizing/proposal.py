@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ratslam.attractor.adaptive_window import SETTLED, rungs
+from ratslam.attractor.config import PoseCellConfig
 from ratslam.backends import LIVE_SIDE
-from ratslam.cellsettings import PoseCellConfig
 from ratslam.config import RunConfig
 from ratslam.gridsettings import DriftConfig
-from ratslam.ladder import SETTLED, rungs
 from ratslam.occupancy import LAYERS
 from ratslam.sizing.scene import Scene
 from robot.simulation.head.session import tier

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ratslam import ladder, posecells
-from ratslam.cellsettings import PoseCellConfig, rings, units
+from ratslam.attractor import adaptive_window, pose_cells
+from ratslam.attractor.config import PoseCellConfig, rings, units
 from tactile.base.types import Odometry
 
 
@@ -38,13 +38,13 @@ MOTION = 0.2, 0.1
 def stepping(n: int, engine: str, dtype=float):
     """A step of that engine as (cells, recall, energy) -> (cells, told), and its start."""
     config, dtype = PoseCellConfig(cells_xy=n, engine=engine), np.dtype(dtype)
-    rungs, unit = ladder.rungs(config, dtype), units(config, dtype)
+    rungs, unit = adaptive_window.rungs(config, dtype), units(config, dtype)
     moved = Odometry(*(jnp.asarray(v, dtype) for v in (MOTION[0] * unit[0], 0.0, MOTION[1] * unit[2], 1.0)))
 
     def step(cells, recall, energy):
-        return posecells.step(config, rungs, cells, moved, recall, energy)
+        return pose_cells.step(config, rungs, cells, moved, recall, energy)
 
-    return step, posecells.start(config, dtype)
+    return step, pose_cells.start(config, dtype)
 
 
 def replaying(n: int, engine: str, steps: int, dtype=float, every: int = 0):

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ratslam import ladder, posecells
-from ratslam.batches import Course, Network, networks, trials
-from ratslam.cellsettings import PoseCellConfig, units
+from ratslam.attractor import adaptive_window, pose_cells
+from ratslam.attractor.batch import Course, Network, networks, trials
+from ratslam.attractor.config import PoseCellConfig, units
+from ratslam.attractor.window import around
 from ratslam.core.session import Session
-from ratslam.patches import around
 from tactile.base.types import Odometry, stack
 from tests.gridworld import filter_of, report, settings
 
@@ -27,16 +27,16 @@ def course(seed: int) -> Course:
 
 
 def alone(config: PoseCellConfig, given: Course, factor: float) -> np.ndarray:
-    rungs = ladder.rungs(config, np.dtype(float))
+    rungs = adaptive_window.rungs(config, np.dtype(float))
 
     def step(cells, row):
         motion, recall, energy = row
         odometry = Odometry(motion[0], motion[1], motion[2], jnp.ones(()))
-        cells, _ = posecells.step(config, rungs, cells, odometry, recall, energy * factor)
+        cells, _ = pose_cells.step(config, rungs, cells, odometry, recall, energy * factor)
         return cells, cells.pose
 
     return np.asarray(
-        jax.jit(lambda rows: jax.lax.scan(step, posecells.start(config, float), rows)[1])(given)
+        jax.jit(lambda rows: jax.lax.scan(step, pose_cells.start(config, float), rows)[1])(given)
     )
 
 

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ratslam import ladder, patches, posecells
-from ratslam.cellsettings import PoseCellConfig, rings, units
+from ratslam.attractor import adaptive_window, pose_cells, window
+from ratslam.attractor.config import PoseCellConfig, rings, units
 from tactile.base.types import Odometry
 
 CELLS = {11: 2, 21: 2, 41: 3, 61: 4}
@@ -22,18 +22,18 @@ CELLS = {11: 2, 21: 2, 41: 3, 61: 4}
 @partial(jax.jit, static_argnames="config")
 def run(config, cells, motion, recall, energy):
     """Motion in cells [T, 3]: poses, spreads [T, 3], outcomes and rungs [T]."""
-    rungs, unit = ladder.rungs(config, np.dtype(float)), units(config, np.dtype(float))
+    rungs, unit = adaptive_window.rungs(config, np.dtype(float)), units(config, np.dtype(float))
 
     def step(cells, row):
         moved, at, how_much = row
         odometry = Odometry(*(moved * unit), jnp.ones(()))
-        cells, told = posecells.step(config, rungs, cells, odometry, at, how_much)
+        cells, told = pose_cells.step(config, rungs, cells, odometry, at, how_much)
         return cells, (cells.pose, *told)
 
     return jax.lax.scan(step, cells, (motion, recall, energy))
 
 
-spread_out = jax.jit(posecells.activity, static_argnums=0)
+spread_out = jax.jit(pose_cells.activity, static_argnums=0)
 
 
 def compare(n, motion, recall, energy):
@@ -43,11 +43,11 @@ def compare(n, motion, recall, energy):
     energy = np.pad(energy, (0, 1000 - count))
     window = PoseCellConfig(cells_xy=n)
     dense = window.model_copy(update={"engine": "dense"})
-    start = [posecells.start(config, np.dtype(float)) for config in (window, dense)]
+    start = [pose_cells.start(config, np.dtype(float)) for config in (window, dense)]
     one, (pose, spread, outcome, rung) = run(window, start[0], motion, recall, energy)
     all_, (whole_pose, whole_spread, whole_outcome, whole_rung) = run(dense, start[1], motion, recall, energy)
     ring = rings(window, np.dtype(float))
-    assert np.abs(patches.around(np.asarray(pose) - np.asarray(whole_pose), ring)).max() <= 1e-12
+    assert np.abs(window.around(np.asarray(pose) - np.asarray(whole_pose), ring)).max() <= 1e-12
     assert np.nanmax(np.abs(np.asarray(spread) - np.asarray(whole_spread))) <= 1e-9
     assert np.array_equal(outcome, whole_outcome)
     assert not np.any(whole_rung)
@@ -110,7 +110,7 @@ def test_what_a_rung_cannot_hold_climbs(n):
     recall[20], recall[100:103] = [1, n // 2, 3], [[1, 1, 1], [n // 2, 1, 30], [1, n // 2, 10]]
     rung = compare(n, np.zeros((600, 3)), recall, energy)
     top = CELLS[n] - 1
-    assert len(ladder.rungs(PoseCellConfig(cells_xy=n), np.dtype(float))) == CELLS[n]
+    assert len(adaptive_window.rungs(PoseCellConfig(cells_xy=n), np.dtype(float))) == CELLS[n]
     assert not np.any(rung[:20])
     assert rung[20] == (1 if top > 1 else top)
     assert rung[102] == top
@@ -121,34 +121,36 @@ def test_what_a_rung_cannot_hold_climbs(n):
 def test_an_overflow_is_seen(away, exact):
     """A deposit so far out that the small patch would lose what it excites is refused by it."""
     config = PoseCellConfig()
-    rungs = ladder.rungs(config, np.dtype(float))
+    rungs = adaptive_window.rungs(config, np.dtype(float))
     pose = jnp.asarray([10.0, 10.0, 18.0])
-    activity = ladder.seeded(rungs, pose)
-    push = ladder.Push(
+    activity = adaptive_window.seeded(rungs, pose)
+    push = adaptive_window.Push(
         pose, pose + jnp.asarray([away, 0.0, 0.0]), jnp.asarray(0.3), jnp.int32(1), *[jnp.zeros(3)] * 2,
         jnp.zeros(()),
     )  # fmt: skip
-    assert bool(ladder._step(rungs[0], activity.blocks[0], push)[2]) == exact
+    assert bool(adaptive_window._step(rungs[0], activity.blocks[0], push)[2]) == exact
 
 
 @pytest.mark.parametrize("where", [(0.0, 0.0, 0.0), (20.7, 0.2, 35.9), (10.0, 20.5, 17.0)])
 def test_activity_is_the_same_on_any_rung(where):
     config = PoseCellConfig(cells_xy=41)
-    rungs = ladder.rungs(config, np.dtype(float))
-    small = ladder.seeded(rungs, jnp.asarray(where))
-    whole = ladder.spread_out(rungs, small)
+    rungs = adaptive_window.rungs(config, np.dtype(float))
+    small = adaptive_window.seeded(rungs, jnp.asarray(where))
+    whole = adaptive_window.spread_out(rungs, small)
     assert float(whole.sum()) == pytest.approx(1)
     for k in range(1, len(rungs)):
-        block = ladder._switched(rungs, k, small, patches.origin_about(rungs[k].patch, jnp.asarray(where)))
+        block = adaptive_window._switched(
+            rungs, k, small, window.origin_about(rungs[k].patch, jnp.asarray(where))
+        )
         held = small._replace(
             blocks=tuple(block if j == k else b for j, b in enumerate(small.blocks)), rung=jnp.int32(k)
         )
-        assert np.array_equal(ladder.spread_out(rungs, held), whole)
+        assert np.array_equal(adaptive_window.spread_out(rungs, held), whole)
 
 
 def test_wide_kernels_have_wide_margins():
     config = PoseCellConfig(cells_xy=61, excite_width=11, inhibit_width=9)
-    small = ladder.rungs(config, np.dtype(float))[0].patch
+    small = adaptive_window.rungs(config, np.dtype(float))[0].patch
     assert (small.margin, small.gap, small.shape) == (5, 14, (20, 20, 20))
 
 

@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ratslam import ladder, patches, posecells
-from ratslam.cellsettings import PoseCellConfig, rings, units
-from ratslam.patches import around
-from ratslam.posecells import Outcome
+from ratslam.attractor import adaptive_window, pose_cells, window
+from ratslam.attractor.config import PoseCellConfig, rings, units
+from ratslam.attractor.pose_cells import Outcome
+from ratslam.attractor.window import around
 from tactile.base.se2 import integrate
 from tactile.base.types import Odometry
 
@@ -30,13 +30,13 @@ ROOMS = 256, 32768, 131072
 @partial(jax.jit, static_argnames="config")
 def run(config, cells, motion, recall, energy, count):
     """The first `count` of motion in cells [T, 3]: poses [T, 3], outcomes [T], spreads [T, 3]."""
-    rungs = ladder.rungs(config, np.dtype(motion.dtype))
+    rungs = adaptive_window.rungs(config, np.dtype(motion.dtype))
     unit = units(config, np.dtype(motion.dtype))
 
     def step(k, carry):
         cells, poses, outcomes, spreads = carry
         odometry = Odometry(*(motion[k] * unit), jnp.ones((), motion.dtype))
-        cells, told = posecells.step(config, rungs, cells, odometry, recall[k], energy[k])
+        cells, told = pose_cells.step(config, rungs, cells, odometry, recall[k], energy[k])
         told = poses.at[k].set(cells.pose), outcomes.at[k].set(told.outcome), spreads.at[k].set(told.spread)
         return cells, *told
 
@@ -52,19 +52,19 @@ def go(motion, cells=None, injections=None, config=CONFIG, dtype=float):
     recall, energy = np.zeros((room, 3), dtype), np.zeros(room, dtype)
     for k, (at, how_much) in (injections or {}).items():
         recall[k], energy[k] = at, how_much
-    cells = cells if cells is not None else posecells.start(config, np.dtype(dtype))
+    cells = cells if cells is not None else pose_cells.start(config, np.dtype(dtype))
     after, *outputs = run(config, cells, motion, recall, energy, np.int32(count))
     return after, tuple(np.asarray(output)[:count] for output in outputs)
 
 
 @jax.jit
 def whole(cells):
-    return posecells.activity(CONFIG, cells)
+    return pose_cells.activity(CONFIG, cells)
 
 
 def deposited(activity, at, energy):
-    torus = patches.patch(CONFIG, None, np.dtype(float))
-    return patches.deposit(torus, activity, jnp.zeros(3, jnp.int32), at, jnp.asarray(energy))
+    torus = window.patch(CONFIG, None, np.dtype(float))
+    return window.deposit(torus, activity, jnp.zeros(3, jnp.int32), at, jnp.asarray(energy))
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +124,7 @@ def test_a_circle_closes(settled):
 def test_any_activity_becomes_a_distribution(seed, dx, dy, turn):
     stream = np.random.default_rng(seed)
     activity = stream.random((36, 21, 21)) * (stream.random((36, 21, 21)) < stream.random())
-    cells = posecells.replaced(CONFIG, posecells.start(CONFIG, np.dtype(float)), jnp.asarray(activity))
+    cells = pose_cells.replaced(CONFIG, pose_cells.start(CONFIG, np.dtype(float)), jnp.asarray(activity))
     after, (poses, _, spread) = go([[dx, dy, turn]] * 3, cells)
     assert float(whole(after).sum()) == pytest.approx(1)
     assert float(whole(after).min()) >= 0
@@ -135,7 +135,7 @@ def test_any_activity_becomes_a_distribution(seed, dx, dy, turn):
 
 @pytest.mark.parametrize("level", [0.0, 1e-9, 1 / (36 * 21 * 21), 1.0])
 def test_uniform_activity_dies_and_is_put_back(settled, level):
-    cells = posecells.replaced(CONFIG, settled, jnp.full((36, 21, 21), level))
+    cells = pose_cells.replaced(CONFIG, settled, jnp.full((36, 21, 21), level))
     after, (poses, outcomes, _) = go(np.zeros((3, 3)), cells)
     assert outcomes[0] == Outcome.RESEEDED
     assert not np.any(outcomes[1:])
@@ -148,7 +148,7 @@ def test_uniform_activity_dies_and_is_put_back(settled, level):
 def test_a_deposit_between_cells_is_excited_like_one_on_a_cell(share):
     """The peak of a deposit at its own point, read off between cells, does not depend on where it falls."""
     pose = jnp.asarray([10.0, 10.0, 18.0]) + jnp.asarray(share)
-    energy = patches.excited_share(patches.patch(CONFIG, None, np.dtype(float)), pose)
+    energy = window.excited_share(window.patch(CONFIG, None, np.dtype(float)), pose)
     assert 1 - 1e-9 <= float(energy) <= 1.5
     total = float(deposited(jnp.zeros((36, 21, 21)), pose % RINGS, 1.0).sum())
     assert total == pytest.approx(1)
@@ -159,8 +159,8 @@ def test_the_torus_has_no_edge(shift):
     """A run and the same run elsewhere on the torus are each other's shifted copies."""
     stream = np.random.default_rng(1)
     motion = stream.normal(0, 0.7, (40, 3))
-    here = posecells.start(CONFIG, np.dtype(float))
-    there = posecells.replaced(CONFIG, here, jnp.roll(whole(here), shift[::-1], (0, 1, 2)))
+    here = pose_cells.start(CONFIG, np.dtype(float))
+    there = pose_cells.replaced(CONFIG, here, jnp.roll(whole(here), shift[::-1], (0, 1, 2)))
     there = there._replace(pose=(here.pose + np.array(shift, float)) % RINGS)
     if shift[2]:
         motion[:, :2] = 0  # another heading moves elsewhere
@@ -189,11 +189,11 @@ def test_feedback_never_undoes_a_closure(settled, speed, distance, energy):
 
 def test_a_hundred_injections_at_once_settle():
     stream = np.random.default_rng(3)
-    cells = posecells.start(CONFIG, np.dtype(float))
+    cells = pose_cells.start(CONFIG, np.dtype(float))
     activity = whole(cells)
     for at in stream.random((100, 3)) * RINGS:
         activity = deposited(activity, jnp.asarray(at), 0.15)
-    after, (poses, outcomes, _) = go(np.zeros((150, 3)), posecells.replaced(CONFIG, cells, activity))
+    after, (poses, outcomes, _) = go(np.zeros((150, 3)), pose_cells.replaced(CONFIG, cells, activity))
     assert float((whole(after) > 0).sum()) < 500
     assert np.isfinite(poses).all()
     assert not np.any(outcomes)

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam import ladder, patches, posecells
-from ratslam.cellsettings import PoseCellConfig
+from ratslam.attractor import adaptive_window, pose_cells, window
+from ratslam.attractor.config import PoseCellConfig
 from ratslam.core.types import Estimate
 from tactile.base.types import Array, Observation, Odometry
 
@@ -77,19 +77,19 @@ def networks(config: PoseCellConfig, sets: Network, course: Course, block: int =
 @partial(jax.jit, static_argnames=("config", "rungs", "block"))
 def _networks(config: PoseCellConfig, rungs: int | None, sets: Network, course: Course, block: int) -> Track:
     dtype = np.dtype(course.motion.dtype)
-    steps = ladder.rungs(config, dtype)[:rungs]
+    steps = adaptive_window.rungs(config, dtype)[:rungs]
 
     def run(network: Network) -> Track:
         kernels = network.excite_sigma, network.inhibit_sigma, network.global_inhibition
-        tuned = tuple(rung._replace(patch=patches.tuned(rung.patch, *kernels)) for rung in steps)
+        tuned = tuple(rung._replace(patch=window.tuned(rung.patch, *kernels)) for rung in steps)
 
         def step(cells: Any, row: Course) -> Any:
             odometry = Odometry(row.motion[0], row.motion[1], row.motion[2], jnp.ones((), dtype))
             energy = row.energy * network.energy
-            cells, told = posecells.step(config, tuned, cells, odometry, row.recall, energy)
+            cells, told = pose_cells.step(config, tuned, cells, odometry, row.recall, energy)
             return cells, Track(cells.pose, told.outcome, told.rung)
 
-        return lax.scan(step, posecells.start(config, dtype, steps), course)[1]
+        return lax.scan(step, pose_cells.start(config, dtype, steps), course)[1]
 
     return lax.map(run, sets, batch_size=block)
 

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.cellsettings import PoseCellConfig
+from ratslam.attractor.config import PoseCellConfig
 from tactile.base.types import Array
 
 TIE = 1e-9

@@ -16,10 +16,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from ratslam import ladder
-from ratslam.cellsettings import PoseCellConfig, rings, units
-from ratslam.ladder import Activity, Push, Rung
-from ratslam.patches import TIE, around, excited_share, turned
+from ratslam.attractor import adaptive_window
+from ratslam.attractor.adaptive_window import Activity, Push, Rung
+from ratslam.attractor.config import PoseCellConfig, rings, units
+from ratslam.attractor.window import TIE, around, excited_share, turned
 from tactile.base.types import Array, Odometry
 
 LARGEST_PART = 0.5
@@ -75,18 +75,20 @@ class Told(NamedTuple):
 def start(config: PoseCellConfig, dtype: np.dtype, rungs: tuple[Rung, ...] | None = None) -> PoseCells:
     """One packet's seed, a single cell, in the middle; of the whole ladder or of these rungs."""
     pose = jnp.asarray(rings(config, dtype) // 2)
-    activity = ladder.seeded(rungs or ladder.rungs(config, dtype), pose)
+    activity = adaptive_window.seeded(rungs or adaptive_window.rungs(config, dtype), pose)
     return PoseCells(activity, pose, jnp.zeros(3, dtype), jnp.int32(0))
 
 
 def activity(config: PoseCellConfig, cells: PoseCells) -> Array:
     """[K, N, N] the activity of the whole torus."""
-    return ladder.spread_out(ladder.rungs(config, cells.pose.dtype), cells.activity)
+    return adaptive_window.spread_out(adaptive_window.rungs(config, cells.pose.dtype), cells.activity)
 
 
 def replaced(config: PoseCellConfig, cells: PoseCells, activity: Array) -> PoseCells:
     """The same state with any activity [K, N, N] of the whole torus."""
-    return cells._replace(activity=ladder.whole(ladder.rungs(config, cells.pose.dtype), activity))
+    return cells._replace(
+        activity=adaptive_window.whole(adaptive_window.rungs(config, cells.pose.dtype), activity)
+    )
 
 
 def step(
@@ -118,7 +120,7 @@ def step(
 
     energy = excited_share(rungs[0].patch, recall) * energy
     push = Push(cells.pose, recall, energy, parts.astype(jnp.int32), told / parts, lag / parts, lag[2])
-    activity, (pose, spread, died, rung) = ladder.climb(rungs, cells.activity, push)
+    activity, (pose, spread, died, rung) = adaptive_window.climb(rungs, cells.activity, push)
 
     world = jnp.stack([*turned(told[0], told[1], (cells.pose[2] + lag[2]) * unit[2]), told[2]])
     behind = around(world + lag - (pose - cells.pose), n)

@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam import patches
-from ratslam.cellsettings import PoseCellConfig
-from ratslam.patches import Patch
+from ratslam.attractor import window
+from ratslam.attractor.config import PoseCellConfig
+from ratslam.attractor.window import Patch
 from tactile.base.types import Array
 
 SETTLED = 10
@@ -90,10 +90,10 @@ class Result(NamedTuple):
 
 def rungs(config: PoseCellConfig, dtype: np.dtype) -> tuple[Rung, ...]:
     """From the smallest to the torus."""
-    torus = Rung(patches.patch(config, None, dtype), 1)
+    torus = Rung(window.patch(config, None, dtype), 1)
     if config.engine == "dense":
         return (torus,)
-    small, wide = (patches.patch(config, inner, dtype) for inner in (SETTLED, WIDE))
+    small, wide = (window.patch(config, inner, dtype) for inner in (SETTLED, WIDE))
     lower = [Rung(small, 1, led=True), Rung(small, 2), Rung(wide, 1)]
     most = WORTH * np.prod(torus.patch.shape)
     return (*(rung for rung in lower if rung.patches * np.prod(rung.patch.shape) <= most), torus)
@@ -107,8 +107,8 @@ def empty(rung: Rung, dtype: np.dtype) -> Block:
 def seeded(ladder: tuple[Rung, ...], pose: Array) -> Activity:
     """A single cell's activity, between cells shared out, on the lowest rung."""
     patch, dtype = ladder[0].patch, pose.dtype
-    origin = patches.origin_about(patch, pose)
-    cells = patches.deposit(patch, jnp.zeros(patch.shape, dtype), origin, pose, jnp.ones((), dtype))
+    origin = window.origin_about(patch, pose)
+    cells = window.deposit(patch, jnp.zeros(patch.shape, dtype), origin, pose, jnp.ones((), dtype))
     above = tuple(empty(rung, dtype) for rung in ladder[1:])
     return Activity((Block(cells[None], origin[None]), *above), jnp.int32(0))
 
@@ -169,7 +169,7 @@ def _attempt(ladder: tuple[Rung, ...], k: int, lowest: Block, held: Array, push:
     _, now, _ = carry
     rung, last = ladder[k], k == len(ladder) - 1
     before = Activity((lowest, *now.blocks[1:]), held)
-    source = _switched(ladder, k, before, patches.origin_about(rung.patch, _middle(ladder, before, push)))
+    source = _switched(ladder, k, before, window.origin_about(rung.patch, _middle(ladder, before, push)))
     block, result, exact = _step(rung, source, push)
     exact = (exact & _same(_mass(before), jnp.sum(source.activity))) | last
     low, fits = _lowered(ladder, rung, block, result.pose)
@@ -194,14 +194,14 @@ def _step(rung: Rung, block: Block, push: Push) -> tuple[Block, Result, Array]:
 
     block, exact, died = lax.fori_loop(0, push.parts, part, (block, exact, jnp.bool_(False)))
     block = _strongest_first(rung, block)
-    pose, spread = patches.decode(patch, block.activity[0], block.origin[0])
+    pose, spread = window.decode(patch, block.activity[0], block.origin[0])
     return block, Result(pose, spread, died, jnp.int32(0)), exact
 
 
 def _injected(rung: Rung, block: Block, push: Push) -> tuple[Block, Array]:
     """Energy goes to the packet it is near to, else to a patch of its own."""
     patch, given = rung.patch, push.energy > 0
-    near = jax.vmap(lambda origin: patches.inside(patch, origin, push.recall))(block.origin)
+    near = jax.vmap(lambda origin: window.inside(patch, origin, push.recall))(block.origin)
     if rung.patches == 1:
         at, room, origin = jnp.int32(0), near[0], block.origin
     else:
@@ -209,9 +209,9 @@ def _injected(rung: Rung, block: Block, push: Push) -> tuple[Block, Array]:
         open_new = ~jnp.any(near & ~free)
         at = jnp.argmax(jnp.where(open_new, free, near & ~free)).astype(jnp.int32)
         room = ~open_new | jnp.any(free)
-        fresh = jnp.where(open_new & given & room, patches.origin_about(patch, push.recall), block.origin[at])
+        fresh = jnp.where(open_new & given & room, window.origin_about(patch, push.recall), block.origin[at])
         origin = block.origin.at[at].set(fresh)
-    cells = patches.deposit(patch, block.activity[at], origin[at], push.recall, push.energy)
+    cells = window.deposit(patch, block.activity[at], origin[at], push.recall, push.energy)
     return Block(block.activity.at[at].set(cells), origin), room | ~given
 
 
@@ -220,12 +220,12 @@ def _attracted(rung: Rung, block: Block, seed: Array) -> tuple[Array, Array]:
 
     Uniform activity always dies: both kernels sum to 1, so it excites and inhibits itself alike.
     """
-    cells = _each(rung, partial(patches.kept, rung.patch), block.activity)
+    cells = _each(rung, partial(window.kept, rung.patch), block.activity)
     total = jnp.sum(cells)
     dead = ~(total > 0)
 
     def again() -> Array:
-        one = patches.deposit(
+        one = window.deposit(
             rung.patch, jnp.zeros_like(cells[0]), block.origin[0], seed, jnp.ones_like(total)
         )
         return jnp.zeros_like(cells).at[0].set(one)
@@ -239,28 +239,28 @@ def _integrated(rung: Rung, block: Block, push: Push, s: Array) -> tuple[Block, 
     unit, done = patch.unit, s.astype(push.part.dtype)
     # Odometry is told in the frame the step began in; the packet has turned since, and lags behind it.
     aside = push.lag - done * (push.part[2] + push.behind[2])
-    told = jnp.stack([*patches.turned(push.part[0], push.part[1], aside * unit), push.part[2]])
+    told = jnp.stack([*window.turned(push.part[0], push.part[1], aside * unit), push.part[2]])
     ahead = partial(_ahead, patch, push, done + 1)
     origin = block.origin
     if not patch.all_whole:
         middle = ahead(push.pose)[None] if rung.led else jax.vmap(partial(_following, patch, push))(block)
-        origin = jax.vmap(partial(patches.origin_about, patch))(middle)
-    ring = patches.torus(patch)[None]
+        origin = jax.vmap(partial(window.origin_about, patch))(middle)
+    ring = window.torus(patch)[None]
     # A patch that is left behind follows a cell at a time.
     shift = jnp.clip((origin - block.origin + ring // 2) % ring - ring // 2, -1, 1)
     origin = (block.origin + shift) % ring
 
     def moved(cells: Array, first: Array, by: Array) -> Array:
-        return patches.integrate(patch, cells, first, told, push.behind, by)
+        return window.integrate(patch, cells, first, told, push.behind, by)
 
     cells = _each(rung, moved, block.activity, block.origin, shift)
-    whole = jnp.all(jax.vmap(partial(patches.contained, patch))(cells)) & _same(jnp.sum(cells), 1.0)
+    whole = jnp.all(jax.vmap(partial(window.contained, patch))(cells)) & _same(jnp.sum(cells), 1.0)
     return Block(cells, origin), whole | patch.all_whole
 
 
 def _ahead(patch: Patch, push: Push, parts: Array, pose: Array) -> Array:
     """About where a packet that was at a pose [3] when the step began is after some parts of it."""
-    x, y = patches.turned(push.part[0], push.part[1], pose[2] * patch.unit)
+    x, y = window.turned(push.part[0], push.part[1], pose[2] * patch.unit)
     return pose + parts * (jnp.stack([x, y, push.part[2]]) + push.behind)
 
 
@@ -268,7 +268,7 @@ def _following(patch: Patch, push: Push, block: Block) -> Array:
     """[3] about where the middle of one patch's activity is after this part."""
     low, high, some = _extent(patch, block)
     at = _ahead(patch, push, jnp.ones_like(push.energy), (low + high) / 2)
-    kept = (block.origin + patches.half(patch)).astype(low.dtype)
+    kept = (block.origin + window.half(patch)).astype(low.dtype)
     return jnp.where(some, at, kept)
 
 
@@ -278,9 +278,9 @@ def _apart(rung: Rung, block: Block) -> Array:
         return jnp.bool_(True)
     patch = rung.patch
     low, high, some = jax.vmap(partial(_extent, patch))(block)
-    ring = patches.torus(patch).astype(low.dtype)
+    ring = window.torus(patch).astype(low.dtype)
     middle, half = (low + high) / 2, (high - low) / 2
-    between = jnp.abs(patches.around(middle[0] - middle[1], ring)) - half[0] - half[1]
+    between = jnp.abs(window.around(middle[0] - middle[1], ring)) - half[0] - half[1]
     return jnp.any(between > patch.gap) | ~jnp.all(some)
 
 
@@ -301,8 +301,8 @@ def _strongest_first(rung: Rung, block: Block) -> Block:
     if rung.patches == 1:
         return block
     peak = jnp.max(block.activity, axis=(1, 2, 3))
-    tied = peak >= jnp.max(peak) * (1 - patches.TIE)
-    place = jax.vmap(partial(patches.peak_number, rung.patch))(block.activity, block.origin)
+    tied = peak >= jnp.max(peak) * (1 - window.TIE)
+    place = jax.vmap(partial(window.peak_number, rung.patch))(block.activity, block.origin)
     front = jnp.argmin(jnp.where(tied, place, jnp.iinfo(jnp.int32).max))
     return jax.tree.map(lambda leaf: jnp.roll(leaf, -front, axis=0), block)
 
@@ -312,20 +312,20 @@ def _lowered(ladder: tuple[Rung, ...], rung: Rung, block: Block, pose: Array) ->
     lowest = ladder[0]
     if rung.patch is lowest.patch:
         return jax.tree.map(lambda leaf: leaf[:1], block), jnp.max(block.activity[1:]) <= 0
-    low = _transfer(rung, block, lowest, patches.origin_about(lowest.patch, pose))
+    low = _transfer(rung, block, lowest, window.origin_about(lowest.patch, pose))
     held = jnp.sum(low.activity > 0) == jnp.sum(block.activity > 0)
-    return low, held & patches.contained(lowest.patch, low.activity[0])
+    return low, held & window.contained(lowest.patch, low.activity[0])
 
 
 def _middle(ladder: tuple[Rung, ...], activity: Activity, push: Push) -> Array:
     """[3] between the packet and another one, or else where energy is injected."""
-    ring = patches.torus(ladder[0].patch).astype(push.pose.dtype)
+    ring = window.torus(ladder[0].patch).astype(push.pose.dtype)
     other = jnp.where(push.energy > 0, push.recall, push.pose)
     for k, rung in enumerate(ladder):
         if rung.patches > 1:
             low, high, some = _extent(rung.patch, jax.tree.map(lambda leaf: leaf[1], activity.blocks[k]))
             other = jnp.where((activity.rung == k) & some, (low + high) / 2, other)
-    return push.pose + patches.around(other - push.pose, ring) / 2
+    return push.pose + window.around(other - push.pose, ring) / 2
 
 
 def _switched(ladder: tuple[Rung, ...], k: int, activity: Activity, origin: Array) -> Block:
@@ -344,7 +344,7 @@ def _transfer(source: Rung, block: Block, target: Rung, origin: Array) -> Block:
     more = target.patches - source.patches
     if more > 0:
         return jax.tree.map(lambda leaf: jnp.pad(leaf, [(0, more)] + [(0, 0)] * (leaf.ndim - 1)), block)
-    ring = patches.torus(source.patch)[::-1]
+    ring = window.torus(source.patch)[::-1]
 
     def shown(cells: Array, first: Array) -> Array:
         for k, axis in enumerate(target.patch.axes):

@@ -1,0 +1,1 @@
+"""The pose-cell continuous attractor network and its adaptive window."""
