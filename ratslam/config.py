@@ -15,7 +15,7 @@ from ratslam.framesettings import FrameMapConfig
 from ratslam.gridsettings import GridConfig
 from ratslam.places import PlaceConfig
 from ratslam.rat import RatConfig
-from ratslam.recall import RecallConfig
+from ratslam.recall.filter import RecallConfig
 from ratslam.templates import TemplateConfig
 from robot.live.config import LiveConfig
 from robot.recordings.formats import RecordingConfig

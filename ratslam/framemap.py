@@ -27,7 +27,7 @@ from ratslam.framesettings import FrameMapConfig
 from ratslam.graphfile import write_g2o, write_json
 from ratslam.grouping import Grouping
 from ratslam.posegraph import Edges
-from ratslam.recall import Guidance
+from ratslam.recall.filter import Guidance
 from tactile.base.se2 import between, compose, fitted, integrate, inverse, wrap
 from tactile.base.types import Observation
 

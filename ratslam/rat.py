@@ -17,7 +17,7 @@ from ratslam.core.types import Estimate
 from ratslam.experience import ExperienceConfig, ExperienceMap
 from ratslam.framesettings import FrameMapConfig
 from ratslam.places import PlaceConfig, Places
-from ratslam.recall import RecallConfig
+from ratslam.recall.filter import RecallConfig
 from ratslam.templates import Match, TemplateConfig, Templates
 from tactile.base.config import Settings
 from tactile.base.se2 import wrap

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam import recall, templates
+from ratslam import templates
 from ratslam.appearance import Appearance, Labels, Touch, Views
 from ratslam.attractor import adaptive_window, pose_cells
 from ratslam.attractor.config import rings, units
@@ -17,10 +17,11 @@ from ratslam.attractor.pose_cells import Outcome, PoseCells
 from ratslam.core.backend import Backend
 from ratslam.core.types import Action, Estimate
 from ratslam.framemap import FrameMap
-from ratslam.likeness import levels, pixels
 from ratslam.rat import Rat, RatConfig, RatEvidence, finite
-from ratslam.recall import Guidance, Memory, Recollection
-from ratslam.weighing import by_label, by_touch, by_view
+from ratslam.recall import filter
+from ratslam.recall.filter import Guidance, Memory, Recollection
+from ratslam.recall.observation_model import by_label, by_touch, by_view
+from ratslam.recall.whisker_likelihood import levels, pixels
 from tactile.base.types import Array, Observation
 
 HEALTH_RATE = 0.1
@@ -91,7 +92,7 @@ class RecallRat:
         del key
         return State(
             pose_cells.start(self.config.pose_cells, self.dtype),
-            recall.start(self.recall, self.size, capacity, self.dtype, self._groups()),
+            filter.start(self.recall, self.size, capacity, self.dtype, self._groups()),
             jnp.ones((), self.dtype),
         )
 
@@ -110,20 +111,20 @@ class RecallRat:
 
     def inform(self, state: State, guidance: Guidance) -> State:
         """The filter takes up the poses, bias and scales of the map."""
-        return state._replace(memory=recall.inform(state.memory, guidance))
+        return state._replace(memory=filter.inform(state.memory, guidance))
 
     def kernel(self, state: State, observation: Observation) -> tuple[State, Estimate, RecallEvidence]:
         """Move, look, inject softly, learn."""
         odometry, view, seen, clean = finite(self.config.templates, self.dtype, observation)
         moved = jnp.stack([odometry.dx, odometry.dy, odometry.dtheta])
-        memory = recall.travel(state.memory, moved)
-        frame = seen & recall.due(self.recall, self.cell, memory)
+        memory = filter.travel(state.memory, moved)
+        frame = seen & filter.due(self.recall, self.cell, memory)
         looks = self._looks(view, observation)
 
         memory, recollection = lax.cond(
             frame,
             lambda: self._look(memory, looks, observation.label),
-            lambda: (memory, recall.nothing(memory)),
+            lambda: (memory, filter.nothing(memory)),
         )
         recalled, energy = self._injection(memory, recollection)
         cells, told = pose_cells.step(
@@ -131,7 +132,7 @@ class RecallRat:
         )
         memory = lax.cond(
             frame,
-            lambda: recall.remember(memory, looks, observation.label, cells.pose),
+            lambda: filter.remember(memory, looks, observation.label, cells.pose),
             lambda: memory,
         )
         health = jnp.where(
@@ -143,10 +144,10 @@ class RecallRat:
         room = memory.count < memory.label.shape[0]
         outcome = jnp.where(room | ~seen, told.outcome, Outcome.FULL)
         outcome = jnp.where(clean, outcome, Outcome.NOT_FINITE).astype(jnp.int32)
-        sd, sd_heading = recall.spread(self.recall, self.cell, memory)
+        sd, sd_heading = filter.spread(self.recall, self.cell, memory)
         place = jnp.int32(-1)  # places are for the map to say: it knows which recollections hold
         estimate = Estimate(
-            pose=recall.present(memory),
+            pose=filter.present(memory),
             spread=jnp.stack([sd, sd, sd_heading]),
             place=place,
             previous=place,
@@ -173,7 +174,7 @@ class RecallRat:
             return Labels()
         if self.pixels is not None:
             return Touch(self.pixels, self.recall.temper, self._normalised)
-        return Views(self.size, recall.fan_width(self.recall), self._normalised)
+        return Views(self.size, filter.fan_width(self.recall), self._normalised)
 
     def _groups(self) -> int:
         return 0 if self.pixels is None else int(self.pixels.group.max()) + 1
@@ -203,7 +204,7 @@ class RecallRat:
             memory, weighing = by_touch(self.recall, memory, view, self.pixels)
         else:
             weighing = by_view(self.recall, self.cell, memory, view)
-        return recall.look(self.recall, self.cell, memory, weighing)
+        return filter.look(self.recall, self.cell, memory, weighing)
 
     def _injection(self, memory: Memory, recollection: Recollection) -> tuple[Array, Array]:
         """Where a candidate's packet was, turned as the view is, and energy by its posterior."""

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ratslam import recall, weighing
-from ratslam.recall import Guidance, RecallConfig
+from ratslam.recall import filter, observation_model
+from ratslam.recall.filter import Guidance, RecallConfig
 
 CELL = 0.6
 
@@ -19,14 +19,14 @@ def remembered(config: RecallConfig, frames: int, size: int, dtype):
     """A memory of a random walk with random views, with hypotheses under way."""
     stream = np.random.default_rng(0)
     capacity = 1 << (frames - 1).bit_length()
-    memory = recall.start(config, size, capacity, np.dtype(dtype))
+    memory = filter.start(config, size, capacity, np.dtype(dtype))
     turns = np.cumsum(stream.normal(0, 0.3, frames))
     steps = 0.5 * np.stack([np.cos(turns), np.sin(turns)], axis=1)
     poses = np.column_stack([np.cumsum(steps, axis=0), turns])
     memory = memory._replace(
         view=jnp.asarray(stream.random((size, capacity)), dtype), count=jnp.int32(frames - 1)
     )
-    return recall.inform(memory, Guidance(poses, 0.01, 5.0, np.pi / 18, 0.06))
+    return filter.inform(memory, Guidance(poses, 0.01, 5.0, np.pi / 18, 0.06))
 
 
 @pytest.mark.parametrize("shifts", [0, 3])
@@ -42,9 +42,9 @@ def test_a_look_back(benchmark, frames, shifts, dtype):
     @jax.jit
     def replay(memory):
         def look(k, memory):
-            memory = recall.travel(memory, moved)
-            weighed = weighing.by_view(config, CELL, memory, views[k % 64])
-            memory, _ = recall.look(config, CELL, memory, weighed)
+            memory = filter.travel(memory, moved)
+            weighed = observation_model.by_view(config, CELL, memory, views[k % 64])
+            memory, _ = filter.look(config, CELL, memory, weighed)
             return memory._replace(motion=jnp.zeros_like(moved), length=jnp.zeros_like(memory.length))
 
         return jax.lax.fori_loop(0, looks, look, memory)

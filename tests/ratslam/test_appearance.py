@@ -22,7 +22,17 @@ from ratslam.appearance import (
     Views,
     alive,
 )
-from ratslam.likeness import DEAD, HEIGHTS, LEVELS, PRIOR, background, levels, pixels, table, variation
+from ratslam.recall.whisker_likelihood import (
+    DEAD,
+    HEIGHTS,
+    LEVELS,
+    PRIOR,
+    background,
+    levels,
+    pixels,
+    table,
+    variation,
+)
 from ratslam.sectors import NOTHING
 from tactile.base.types import Odometry, observation
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ratslam.likeness import (
+from ratslam.recall.whisker_likelihood import (
     DEAD,
     HEIGHTS,
     LEVELS,

@@ -12,12 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ratslam import recall, weighing
 from ratslam.core.session import Session
 from ratslam.rat import RatConfig
-from ratslam.recall import BASIN, FACING, SAMPLES, SUPPORT, Guidance, RecallConfig
+from ratslam.recall import filter, observation_model
+from ratslam.recall.filter import BASIN, FACING, SAMPLES, SUPPORT, Guidance, RecallConfig
+from ratslam.recall.observation_model import LABEL_TEMPER, LABELS
 from ratslam.recallrat import rat
-from ratslam.weighing import LABEL_TEMPER, LABELS
 from tactile.base.se2 import between, compose, wrap
 from tactile.base.types import Odometry, observation
 
@@ -50,13 +50,13 @@ def filled(
     store[:, :count] = views.T
     ids = np.full(capacity, -1, np.int32)
     ids[:count] = -1 if labels is None else labels
-    memory = recall.start(config, views.shape[1], capacity, np.dtype(dtype))._replace(
+    memory = filter.start(config, views.shape[1], capacity, np.dtype(dtype))._replace(
         view=jnp.asarray(store, dtype),
         label=jnp.asarray(ids),
         count=jnp.int32(count),
         distinct=jnp.int32(len(set(ids[ids >= 0].tolist()))),
     )
-    return recall.inform(memory, Guidance(poses, bias, since, angle, scale))
+    return filter.inform(memory, Guidance(poses, bias, since, angle, scale))
 
 
 def believing(memory, frames, masses, offsets=None):
@@ -75,15 +75,17 @@ def believing(memory, frames, masses, offsets=None):
 @cache
 def looker(config, cell=CELL):
     return jax.jit(
-        lambda memory, view: recall.look(config, cell, memory, weighing.by_view(config, cell, memory, view))
+        lambda memory, view: filter.look(
+            config, cell, memory, observation_model.by_view(config, cell, memory, view)
+        )
     )
 
 
 @cache
 def labelled(config):
     def read(memory, label):
-        weighed = weighing.by_label(config, memory, label)
-        return *recall.look(config, CELL, memory, weighed), weighed
+        weighed = observation_model.by_label(config, memory, label)
+        return *filter.look(config, CELL, memory, weighed), weighed
 
     return jax.jit(read)
 
@@ -115,8 +117,8 @@ def random_case(seed, config=FAN, angle=ANGLE, dtype=float):
     masses = stream.dirichlet(np.full(config.modes + 1, 0.7))[:-1]
     frames = stream.integers(0, count - GUARD, config.modes)
     memory = believing(memory, frames, masses, stream.normal(0, 0.5 * CELL, (config.modes, 3)) * [1, 1, 4])
-    memory = recall.travel(memory, jnp.asarray(stream.normal(0, [CELL, 0.2 * CELL, 0.1]), dtype))
-    memory = recall.travel(memory, jnp.asarray(stream.normal(0, [CELL, 0.2 * CELL, 0.1]), dtype))
+    memory = filter.travel(memory, jnp.asarray(stream.normal(0, [CELL, 0.2 * CELL, 0.1]), dtype))
+    memory = filter.travel(memory, jnp.asarray(stream.normal(0, [CELL, 0.2 * CELL, 0.1]), dtype))
     near = np.roll(views[frames[int(masses.argmax())]], int(stream.choice([-2, -1, 0, 0, 0, 1, 2])))
     return memory, np.clip(0.6 * near + 0.4 * stream.random(SIZE), 0, 1)
 
@@ -315,7 +317,7 @@ def test_single_precision_has_no_nan(stored, scale):
     memory = believing(memory, [3, 20], [0.7, 0.3])
     for value in (0.0, 0.5, 1.0, None, 1.0, 0.0):
         seen = stream.random(SIZE) if value is None else np.full(SIZE, value)
-        memory = recall.travel(memory, jnp.asarray([0.5 * CELL, 0, 0.01], jnp.float32))
+        memory = filter.travel(memory, jnp.asarray([0.5 * CELL, 0, 0.01], jnp.float32))
         after, found = look(FAN, memory, seen)
         told = found._replace(background=np.zeros(0))  # there NaN says none
         assert not any(np.isnan(leaf).any() for leaf in [*after, *told])
@@ -375,7 +377,7 @@ def test_where_the_map_lies_does_not_matter():
         frames = np.stack([memory.x, memory.y, np.arctan2(memory.sine, memory.cosine)], axis=1)
         poses = compose(elsewhere, frames[: int(memory.count)])
         told = (float(memory.bias), float(memory.since), float(memory.angle), float(memory.scale))
-        moved = recall.inform(memory, Guidance(poses, *told))
+        moved = filter.inform(memory, Guidance(poses, *told))
         moved = moved._replace(pose=jnp.asarray(compose(elsewhere, memory.pose)))
         found, there = look(FAN, memory, view)[1], look(FAN, moved, view)[1]
         for name in found._fields:
@@ -429,7 +431,7 @@ def test_a_turned_hypothesis_moves_the_way_it_faces():
     views[13] = views[12]  # the view alone cannot tell these two
     memory = filled(FAN, views, poses, angle=ANGLE, scale=0.02)
     after, _ = look(FAN, memory, seen(11, robot))
-    memory = recall.travel(jax.tree.map(jnp.asarray, after), jnp.asarray([3 * CELL, 0, 0.0]))
+    memory = filter.travel(jax.tree.map(jnp.asarray, after), jnp.asarray([3 * CELL, 0, 0.0]))
     _, found = look(FAN, memory, views[12])
     assert found.match == 12
     assert found.shift == 0
@@ -481,8 +483,8 @@ def test_without_a_scale_nothing_is_recalled_but_all_is_remembered():
     assert found.frame == 40
     assert look(FAN, memory._replace(scale=jnp.asarray(0.1)), views[7])[1].match == 7
 
-    memory = recall.travel(jax.tree.map(jnp.asarray, after), jnp.asarray([CELL, 0.0, 0.5]))
-    memory = recall.remember(memory, jnp.asarray(views[7]), jnp.int32(5), jnp.asarray([1.0, 2.0, 3.0]))
+    memory = filter.travel(jax.tree.map(jnp.asarray, after), jnp.asarray([CELL, 0.0, 0.5]))
+    memory = filter.remember(memory, jnp.asarray(views[7]), jnp.int32(5), jnp.asarray([1.0, 2.0, 3.0]))
     assert int(memory.count) == 41
     assert np.array_equal(memory.view[:, 40], views[7])
     assert np.array_equal(memory.packet[40], [1, 2, 3])
@@ -554,11 +556,11 @@ def test_a_contradicting_view_takes_mass_away():
 def test_odometry_alone_is_never_evidence():
     # A straight way driven twice: odometry follows the first drive perfectly, yet nothing is seen.
     memory = filled(FLAT, np.zeros((40, SIZE)), spaced(40, 0.5), scale=0.1)
-    blank = recall.Weighing(
+    blank = filter.Weighing(
         likelihood=jnp.ones((1, CAPACITY)), novelty=jnp.ones(()), background=jnp.full(SAMPLES, jnp.nan),
         certain=jnp.bool_(True), telling=jnp.bool_(False),
     )  # fmt: skip
-    blind = jax.jit(partial(recall.look, FLAT, CELL))
+    blind = jax.jit(partial(filter.look, FLAT, CELL))
     # A view that all frames share: by views, too, nothing is told.
     same = np.full(SIZE, FLAT.floor * 0.1)
     for sure in (0.0, 0.3, 1.0):
@@ -568,10 +570,10 @@ def test_odometry_alone_is_never_evidence():
             belief, limit = start, sure
             for _ in range(20):
                 limit = limit * (1 - FLAT.leave) + (1 - limit) * FLAT.enter
-                belief = recall.travel(belief, jnp.asarray([0.5 * CELL, 0.0, 0.0]))
+                belief = filter.travel(belief, jnp.asarray([0.5 * CELL, 0.0, 0.0]))
                 belief, _ = looker(FLAT)(belief, jnp.asarray(same)) if seeing else blind(belief, blank)
                 belief = belief._replace(
-                    pose=recall.present(belief), motion=jnp.zeros(3), length=jnp.zeros(())
+                    pose=filter.present(belief), motion=jnp.zeros(3), length=jnp.zeros(())
                 )
                 assert float(belief.mass.sum()) <= limit + 1e-9
             # Neither is it evidence against: what was believed is still there.
@@ -581,8 +583,8 @@ def test_odometry_alone_is_never_evidence():
 def test_a_hypothesis_that_comes_to_no_frame_is_lost():
     memory = believing(filled(FLAT, np.zeros((40, SIZE)), spaced(40, 1.0), scale=0.1), [9], [1.0])
     view = np.full(SIZE, FLAT.floor * 0.1)
-    on_way = recall.travel(memory, jnp.asarray([CELL, 0.0, 0.0]))
-    aside = recall.travel(memory, jnp.asarray([0.0, 4 * CELL, 0.0]))
+    on_way = filter.travel(memory, jnp.asarray([CELL, 0.0, 0.0]))
+    aside = filter.travel(memory, jnp.asarray([0.0, 4 * CELL, 0.0]))
     assert look(FLAT, on_way, view)[1].novel < 0.05
     assert look(FLAT, aside, view)[1].novel == pytest.approx(1, abs=1e-9)
 
@@ -611,14 +613,21 @@ def test_ids_speak_for_and_against():
     same, other, new = (by_label(memory, label) for label in (ids[9], ids[30], 77))
 
     weighing = same[2]
-    assert weighing.likelihood.shape == (1, CAPACITY)
-    assert set(np.flatnonzero(weighing.likelihood[0] == weighing.likelihood.max())) == {8, 9, 10, 11}
-    assert weighing.likelihood[0, 9] == pytest.approx(LABELS["same"] ** LABEL_TEMPER)
-    assert weighing.novelty == pytest.approx((LABELS["new_known"] / known) ** LABEL_TEMPER)
-    assert weighing.likelihood[0, 9] > weighing.novelty > weighing.likelihood[0, 30]
+    assert observation_model.likelihood.shape == (1, CAPACITY)
+    assert set(np.flatnonzero(observation_model.likelihood[0] == observation_model.likelihood.max())) == {
+        8,
+        9,
+        10,
+        11,
+    }
+    assert observation_model.likelihood[0, 9] == pytest.approx(LABELS["same"] ** LABEL_TEMPER)
+    assert observation_model.novelty == pytest.approx((LABELS["new_known"] / known) ** LABEL_TEMPER)
+    assert (
+        observation_model.likelihood[0, 9] > observation_model.novelty > observation_model.likelihood[0, 30]
+    )
     assert new[2].likelihood[0, :40] == pytest.approx(LABELS["unknown"] ** LABEL_TEMPER)
     assert new[2].novelty > new[2].likelihood.max()
-    assert np.isnan(weighing.background).all()
+    assert np.isnan(observation_model.background).all()
 
     mass = [float(after.mass[after.anchor == 9].sum()) for after, *_ in (same, other, new)]
     assert mass[0] > 0.9
@@ -633,7 +642,7 @@ def test_only_a_known_id_tells_whether_the_map_is_right():
     memory = filled(FLAT, np.zeros((40, 0)), spaced(40), labels=ids)
     memory = memory._replace(pose=jnp.asarray(spaced(40)[20]))
     answers = {label: by_label(memory, label) for label in (20, 3, 77)}
-    assert [bool(weighing.telling) for *_, weighing in answers.values()] == [True, True, False]
+    assert [bool(observation_model.telling) for *_, weighing in answers.values()] == [True, True, False]
     assert [int(found.agree) for _, found, _ in answers.values()] == [1, 0, -1]
 
 
@@ -641,7 +650,7 @@ def test_an_id_is_new_once():
     memory = filled(FLAT, np.zeros((2, 0)), spaced(2), labels=[4, 4])
     given_then = [(9, 2), (9, 2), (-1, 2), (4, 2), (0, 3)]
     for label, distinct in given_then:
-        memory = recall.remember(memory, jnp.zeros(0), jnp.int32(label), jnp.zeros(3))
+        memory = filter.remember(memory, jnp.zeros(0), jnp.int32(label), jnp.zeros(3))
         assert int(memory.distinct) == distinct
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from jax import lax
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
-from ratslam.likeness import LEVELS
+from ratslam.recall.whisker_likelihood import LEVELS
 from tactile.base.config import Settings
 from tactile.base.se2 import wrap
 from tactile.base.types import Array

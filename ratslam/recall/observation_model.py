@@ -8,8 +8,17 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from ratslam.likeness import Pixels
-from ratslam.recall import SAMPLES, Memory, RecallConfig, Weighing, allowed, offsets, old, present
+from ratslam.recall.filter import (
+    SAMPLES,
+    Memory,
+    RecallConfig,
+    Weighing,
+    allowed,
+    offsets,
+    old,
+    present,
+)
+from ratslam.recall.whisker_likelihood import Pixels
 from tactile.base.types import Array
 
 LABELS = {"same": 0.6, "unknown": 0.35, "other": 0.05, "new_unknown": 0.9, "new_known": 0.1}

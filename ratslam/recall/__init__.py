@@ -1,0 +1,1 @@
+"""The Bayes filter over remembered frames and its observation models."""
