@@ -11,8 +11,8 @@ from pydantic import Field, NonNegativeInt, ValidationInfo, field_validator
 from evaluation.metrics.experience_metric import ExmConfig
 from ratslam.attractor.config import PoseCellConfig
 from ratslam.experience import ExperienceConfig
-from ratslam.framesettings import FrameMapConfig
 from ratslam.gridsettings import GridConfig
+from ratslam.keyframes.config import FrameMapConfig
 from ratslam.places import PlaceConfig
 from ratslam.rat import RatConfig
 from ratslam.recall.filter import RecallConfig

@@ -15,7 +15,7 @@ from ratslam.attractor.config import PoseCellConfig, rings, units
 from ratslam.attractor.pose_cells import Outcome, PoseCells
 from ratslam.core.types import Estimate
 from ratslam.experience import ExperienceConfig, ExperienceMap
-from ratslam.framesettings import FrameMapConfig
+from ratslam.keyframes.config import FrameMapConfig
 from ratslam.places import PlaceConfig, Places
 from ratslam.recall.filter import RecallConfig
 from ratslam.templates import Match, TemplateConfig, Templates

@@ -10,13 +10,13 @@ import numpy as np
 from jax import lax
 
 from ratslam import templates
-from ratslam.appearance import Appearance, Labels, Touch, Views
 from ratslam.attractor import adaptive_window, pose_cells
 from ratslam.attractor.config import rings, units
 from ratslam.attractor.pose_cells import Outcome, PoseCells
 from ratslam.core.backend import Backend
 from ratslam.core.types import Action, Estimate
-from ratslam.framemap import FrameMap
+from ratslam.keyframes.appearance import Appearance, Labels, Touch, Views
+from ratslam.keyframes.map import FrameMap
 from ratslam.rat import Rat, RatConfig, RatEvidence, finite
 from ratslam.recall import filter
 from ratslam.recall.filter import Guidance, Memory, Recollection

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from evaluation.metrics.trajectory import ate
-from ratslam.closures import Verdict
 from ratslam.core.session import Session
+from ratslam.keyframes.loop_closures import Verdict
 from ratslam.rat import RatConfig
 from ratslam.recallrat import rat
 from robot.recordings.npz_trace import read_stream

@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 
-from ratslam.framegraph import Chain, Closures, Fit, Prior, relative_covariance, solve
+from ratslam.keyframes.optimizer import Chain, Closures, Fit, Prior, relative_covariance, solve
 from tactile.base.se2 import integrate
 
 

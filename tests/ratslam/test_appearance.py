@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ratslam.appearance import (
+from ratslam.keyframes.appearance import (
     DOUBT,
     EARLIEST,
     ENOUGH,
@@ -22,6 +22,7 @@ from ratslam.appearance import (
     Views,
     alive,
 )
+from ratslam.keyframes.view_sectors import NOTHING
 from ratslam.recall.whisker_likelihood import (
     DEAD,
     HEIGHTS,
@@ -33,7 +34,6 @@ from ratslam.recall.whisker_likelihood import (
     table,
     variation,
 )
-from ratslam.sectors import NOTHING
 from tactile.base.types import Odometry, observation
 
 SHAPE = (3, 6, 1)

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from ratslam import arbitration
-from ratslam.arbitration import CUT, KEPT, STEPS, Case, arbitrate
-from ratslam.framegraph import Chain, Closures, Fit, Prior, robust_cost, solve
+from ratslam.keyframes import closure_selection
+from ratslam.keyframes.closure_selection import CUT, KEPT, STEPS, Case, arbitrate
+from ratslam.keyframes.optimizer import Chain, Closures, Fit, Prior, robust_cost, solve
 from tactile.base.se2 import between, compose, fitted, integrate, wrap
 
 LAP = 60
@@ -122,7 +122,9 @@ def test_runs_that_are_all_true_are_solved_for(seed):
     judged = arbitrate(case, starts, made.where)
     assert (judged.fit.weights > KEPT).all()
     assert judged.cuts == ()
-    plain = solve(starts[0].poses, starts[0].bias, case.chain, case.closures, PRIOR, STEPS, arbitration.FINE)
+    plain = solve(
+        starts[0].poses, starts[0].bias, case.chain, case.closures, PRIOR, STEPS, closure_selection.FINE
+    )
     assert np.array_equal(judged.fit.poses, plain.poses)
     assert judged.cost == robust_cost(plain, case.chain, case.closures, PRIOR)
     assert off(judged.fit, made.truth) < 0.1
@@ -204,7 +206,7 @@ def test_the_cost_is_never_above_that_of_the_present_map(seed):
     assert judged.cost <= robust_cost(present, case.chain, case.closures, PRIOR)
     again = arbitrate(case, [judged.fit, made.reckoned()], made.where, judged.cuts)
     assert again.cost <= judged.cost + 0.5  # solver steps, not another map
-    severed = arbitration._severed(case.chain, judged.cuts)
+    severed = closure_selection._severed(case.chain, judged.cuts)
     whole = robust_cost(judged.fit, severed, case.closures, PRIOR) + CUT * len(judged.cuts)
     assert judged.cost == pytest.approx(whole, rel=1e-9)
 
@@ -269,7 +271,7 @@ def test_a_visit_may_be_told_by_runs_however_strong_they_are():
     jumps = ((2 * LAP + 45, 34), (2 * LAP + 85, -34))
     made = world(0, laps=5, jumps=jumps, least=44.0, most=45.0)
     judged = arbitrate(made.case, made.starts(), made.where)
-    whole = arbitration._settled(
+    whole = closure_selection._settled(
         made.case, Fit(made.truth.copy(), 0.0, np.zeros(0)), ((jumps[0][0], 5), (jumps[1][0], 7))
     )
     assert judged.cost <= whole.cost + 1

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ratslam.closures import Candidate, Ledger, Verdict
+from ratslam.keyframes.loop_closures import Candidate, Ledger, Verdict
 
 VARIANCE = np.array([0.1, 0.1, 0.02])
 SCALES = (0.5, 2.0, 20.0)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
-from ratslam.framegraph import (
+from ratslam.keyframes.optimizer import (
     Chain,
     Closures,
     Fit,

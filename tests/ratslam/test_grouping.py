@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ratslam.core.types import Action
-from ratslam.grouping import Grouping, Said
+from ratslam.keyframes.experiences import Grouping, Said
 from tactile.base.se2 import compose, wrap
 
 RADIUS, HEADING = 1.0, 0.5

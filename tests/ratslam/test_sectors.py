@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ratslam.sectors import NOTHING, Fan
+from ratslam.keyframes.view_sectors import NOTHING, Fan
 
 SIZE = 18
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from ratslam.cli import main
 from ratslam.config import RunConfig
-from ratslam.framesettings import FrameMapConfig
+from ratslam.keyframes.config import FrameMapConfig
 from ratslam.sweeps.plan import StudyPlan
 from ratslam.sweeps.study import Study, jobs, read_study
 from tactile.base.errors import InputError

@@ -16,16 +16,24 @@ from typing import Any, NamedTuple
 import networkx
 import numpy as np
 
-from ratslam.appearance import Appearance, Match
-from ratslam.arbitration import FINE, KEPT, STEPS, Case, arbitrate
-from ratslam.closures import Candidate, Ledger, Verdict
 from ratslam.core.backend import Evidence
 from ratslam.core.growable_array import Growing
 from ratslam.core.types import Estimate
-from ratslam.framegraph import Chain, Closures, Fit, Prior, corrected, relative_covariance, solve
-from ratslam.framesettings import FrameMapConfig
 from ratslam.graphfile import write_g2o, write_json
-from ratslam.grouping import Grouping
+from ratslam.keyframes.appearance import Appearance, Match
+from ratslam.keyframes.closure_selection import FINE, KEPT, STEPS, Case, arbitrate
+from ratslam.keyframes.config import FrameMapConfig
+from ratslam.keyframes.experiences import Grouping
+from ratslam.keyframes.loop_closures import Candidate, Ledger, Verdict
+from ratslam.keyframes.optimizer import (
+    Chain,
+    Closures,
+    Fit,
+    Prior,
+    corrected,
+    relative_covariance,
+    solve,
+)
 from ratslam.posegraph import Edges
 from ratslam.recall.filter import Guidance
 from tactile.base.se2 import between, compose, fitted, integrate, inverse, wrap

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ratslam.core.growable_array import Growing
-from ratslam.framegraph import Closures
+from ratslam.keyframes.optimizer import Closures
 
 
 class Verdict(IntEnum):

@@ -81,7 +81,7 @@ class FrameMapConfig(Settings):
     only from one candidate to the next."""
     weigh_every: NonNegativeInt = 0
     """Frames after which all runs are weighed against each other anew, believed or not (see
-    `ratslam.arbitration`); 0: never, a run once accepted stays."""
+    `ratslam.keyframes.closure_selection`); 0: never, a run once accepted stays."""
     weigh_score: PositiveFloat = 12.0
     """Evidence of the runs that are weighed."""
     weigh_length: PositiveInt = 4

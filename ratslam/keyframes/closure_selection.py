@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.framegraph import Chain, Closures, Fit, Prior, corrected, robust_cost, solve
+from ratslam.keyframes.optimizer import Chain, Closures, Fit, Prior, corrected, robust_cost, solve
 from tactile.base.se2 import between, compose, integrate, inverse
 
 KEPT = 0.25

@@ -13,9 +13,9 @@ import numpy as np
 
 from ratslam.core.backend import Evidence
 from ratslam.core.growable_array import Growing
+from ratslam.keyframes.view_sectors import NOTHING, Fan, Slope
 from ratslam.recall.filter import NO_LIKENESS
 from ratslam.recall.whisker_likelihood import Pixels, background, levels, table, variation
-from ratslam.sectors import NOTHING, Fan, Slope
 from tactile.base.types import Observation
 
 EVERY = 16
