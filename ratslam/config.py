@@ -10,13 +10,13 @@ from pydantic import Field, NonNegativeInt, ValidationInfo, field_validator
 
 from evaluation.metrics.experience_metric import ExmConfig
 from ratslam.attractor.config import PoseCellConfig
-from ratslam.experience import ExperienceConfig
+from ratslam.classic.experience_map import ExperienceConfig
+from ratslam.classic.places import PlaceConfig
+from ratslam.classic.view_templates import TemplateConfig
 from ratslam.gridsettings import GridConfig
 from ratslam.keyframes.config import FrameMapConfig
-from ratslam.places import PlaceConfig
 from ratslam.rat import RatConfig
 from ratslam.recall.filter import RecallConfig
-from ratslam.templates import TemplateConfig
 from robot.live.config import LiveConfig
 from robot.recordings.formats import RecordingConfig
 from robot.simulation.create.session import RovingConfig

@@ -9,16 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 from pydantic import Field
 
-from ratslam import places, templates
 from ratslam.attractor import adaptive_window, pose_cells
 from ratslam.attractor.config import PoseCellConfig, rings, units
 from ratslam.attractor.pose_cells import Outcome, PoseCells
+from ratslam.classic import places, view_templates
+from ratslam.classic.experience_map import ExperienceConfig, ExperienceMap
+from ratslam.classic.places import PlaceConfig, Places
+from ratslam.classic.view_templates import Match, TemplateConfig, Templates
 from ratslam.core.types import Estimate
-from ratslam.experience import ExperienceConfig, ExperienceMap
 from ratslam.keyframes.config import FrameMapConfig
-from ratslam.places import PlaceConfig, Places
 from ratslam.recall.filter import RecallConfig
-from ratslam.templates import Match, TemplateConfig, Templates
 from tactile.base.config import Settings
 from tactile.base.se2 import wrap
 from tactile.base.types import Array, Observation, Odometry
@@ -93,7 +93,7 @@ class Rat:
         del key
         return State(
             pose_cells.start(self.config.pose_cells, self.dtype),
-            templates.start(self.config.templates, self.view_shape, capacity, self.dtype),
+            view_templates.start(self.config.templates, self.view_shape, capacity, self.dtype),
             places.start(capacity, self.dtype),
             jnp.zeros((), self.dtype),
         )
@@ -123,8 +123,8 @@ class Rat:
         odometry, view, seen, clean = finite(config.templates, self.dtype, observation)
 
         match = self._match(state.templates, view, observation.label, seen)
-        memory, energy = templates.recall(config.templates, state.templates, match, seen)
-        memory, learnt = templates.learn(
+        memory, energy = view_templates.recall(config.templates, state.templates, match, seen)
+        memory, learnt = view_templates.learn(
             memory,
             view.reshape(-1)[: memory.view.shape[0]],
             observation.label,
@@ -161,9 +161,9 @@ class Rat:
 
     def _match(self, store: Templates, view: Array, label: Array, seen: Array) -> Match:
         if self.config.templates.source == "labels":
-            match = templates.match_label(store, label)
+            match = view_templates.match_label(store, label)
         else:
-            match = templates.match_view(self.config.templates, self.view_shape, store, view)
+            match = view_templates.match_view(self.config.templates, self.view_shape, store, view)
         return match._replace(error=jnp.where(seen, match.error, jnp.inf))
 
 
@@ -182,7 +182,7 @@ def finite(
     dx, dy, dtheta = jnp.where(fine, moves, 0.0)
     view = jnp.asarray(observation.view, dtype)
     visible = jnp.all(jnp.isfinite(view))
-    view = templates.normalise(config, jnp.where(visible, view, 0.0))
+    view = view_templates.normalise(config, jnp.where(visible, view, 0.0))
     given = observation.label >= 0 if config.source == "labels" else observation.view_seen & visible
     return Odometry(dx, dy, dtheta, odometry.dt), view, given, fine & (visible | ~observation.view_seen)
 

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam import templates
 from ratslam.attractor import adaptive_window, pose_cells
 from ratslam.attractor.config import rings, units
 from ratslam.attractor.pose_cells import Outcome, PoseCells
+from ratslam.classic import view_templates
 from ratslam.core.backend import Backend
 from ratslam.core.types import Action, Estimate
 from ratslam.keyframes.appearance import Appearance, Labels, Touch, Views
@@ -184,7 +184,7 @@ class RecallRat:
         config = self.config.templates
         if not (config.normalise_mean or config.patch):  # nothing to do, and JAX would take long about it
             return shaped
-        return np.asarray(templates.normalise(config, jnp.asarray(shaped)))
+        return np.asarray(view_templates.normalise(config, jnp.asarray(shaped)))
 
     def _looks(self, view: Array, observation: Observation) -> Array:
         """What is compared and remembered of a view: its values, or the levels of its whiskers."""

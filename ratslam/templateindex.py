@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 TIE = 1e-9
-"""Errors this close tie, as in `ratslam.templates`: the earliest template wins."""
+"""Errors this close tie, as in `ratslam.classic.view_templates`: the earliest template wins."""
 
 TAIL = 256
 """Views that are compared one by one before a tree takes them over."""

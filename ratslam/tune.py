@@ -16,8 +16,8 @@ import numpy as np
 
 from evaluation.metrics.experience_metric import base_end, experience_metric
 from evaluation.plots.paper_figures import draw_tuning
+from ratslam.classic.view_templates import TemplateConfig
 from ratslam.config import RunConfig
-from ratslam.templates import TemplateConfig
 from ratslam.trials.thresholds import classics
 from ratslam.trials.touch import first, lap_ends, session_log, whole
 from ratslam.trials.workers import shared_out

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from ratslam import templates
+from ratslam.classic import view_templates
+from ratslam.classic.view_templates import TemplateConfig
 from ratslam.cli import main
-from ratslam.templates import TemplateConfig
 from ratslam.tune import THRESHOLDS, Likeness, Tried, auc, chosen, compared, differences, report, tune
 from ratslam.yamlfile import parse
 from robot.sources.in_memory import Log
@@ -69,10 +69,10 @@ def test_auc_is_the_chance_that_other_places_look_less_alike(same, other):
 def test_differences_are_the_matchers_own(how, views):
     config = TemplateConfig(threshold=1.0, **how)
     found = differences(config, views, views)
-    store = templates.start(config, (3, 6, 2), 1, np.dtype(float))
+    store = view_templates.start(config, (3, 6, 2), 1, np.dtype(float))
     for i in range(3):
         kept = store._replace(view=jnp.asarray(views[i].reshape(-1, 1)), count=jnp.int32(1))
-        match = templates.match_view(config, (3, 6, 2), kept, jnp.asarray(views[i - 1]))
+        match = view_templates.match_view(config, (3, 6, 2), kept, jnp.asarray(views[i - 1]))
         assert found[i - 1, i] == pytest.approx(float(match.error), abs=1e-12)
 
 

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from ratslam.classic.experience_map import ExperienceMap
 from ratslam.config import RunConfig
 from ratslam.core.types import Estimate
-from ratslam.experience import ExperienceMap
 from ratslam.rat import Rat, RatConfig, RatEvidence
 from ratslam.trials.touch import Played, room_for, told
 from robot.sources.in_memory import Log

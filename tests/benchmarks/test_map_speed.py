@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from ratslam.classic.experience_map import ExperienceConfig, ExperienceMap
 from ratslam.core.types import Action, Estimate
-from ratslam.experience import ExperienceConfig, ExperienceMap
 from ratslam.posegraph import Edges, Ending, least_squares, linear
 from tactile.base.se2 import between, integrate, wrap
 from tactile.base.types import Odometry, observation

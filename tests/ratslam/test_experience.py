@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ratslam.classic.experience_map import ExperienceConfig, ExperienceMap
 from ratslam.core.types import Action, Estimate
-from ratslam.experience import ExperienceConfig, ExperienceMap
 from tactile.base.se2 import compose, integrate, inverse
 from tactile.base.types import Odometry, observation
 

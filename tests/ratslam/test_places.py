@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ratslam.classic.places import PlaceConfig, decide, distance, start
 from ratslam.core.types import Action
-from ratslam.places import PlaceConfig, decide, distance, start
 
 CONFIG = PlaceConfig(radius=2.0, radius_heading=3.0)
 RINGS = np.array([11.0, 11.0, 36.0])

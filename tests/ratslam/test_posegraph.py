@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ratslam.classic.relaxation import relax
 from ratslam.graphfile import read_g2o, write_g2o
 from ratslam.posegraph import (
     Edges,
@@ -23,7 +24,6 @@ from ratslam.posegraph import (
 from ratslam.posegraph.chains import chains
 from ratslam.posegraph.edges import full
 from ratslam.posegraph.normal import Folded
-from ratslam.relaxation import relax
 from tactile.base.errors import InputError
 from tactile.base.se2 import between, compose, integrate, inverse, wrap
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ratslam.relaxation import relax
+from ratslam.classic.relaxation import relax
 from tactile.base.se2 import between, wrap
 
 

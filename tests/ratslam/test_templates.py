@@ -6,18 +6,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ratslam import templates
-from ratslam.templates import TemplateConfig
+from ratslam.classic import view_templates
+from ratslam.classic.view_templates import TemplateConfig
 
 SHAPE = (3, 8, 1)
 FLOAT = np.dtype(float)
 
 
 def filled(config, views, capacity=16):
-    store = templates.start(config, SHAPE, capacity, FLOAT)
+    store = view_templates.start(config, SHAPE, capacity, FLOAT)
     for k, view in enumerate(views):
         flat = jnp.asarray(view.reshape(-1))
-        store, _ = templates.learn(store, flat, jnp.int32(100 + k), jnp.full(3, float(k)), jnp.bool_(True))
+        store, _ = view_templates.learn(
+            store, flat, jnp.int32(100 + k), jnp.full(3, float(k)), jnp.bool_(True)
+        )
     return store
 
 
@@ -51,7 +53,7 @@ def test_the_best_template_is_the_one_loops_find(settings, seed):
     stream = np.random.default_rng(seed)
     views = stream.random((7, *SHAPE))
     view = np.clip(np.roll(views[4], seed % 3, axis=1) + stream.normal(0, 0.01, SHAPE), 0, 1)
-    found = templates.match_view(config, SHAPE, filled(config, views), jnp.asarray(view))
+    found = view_templates.match_view(config, SHAPE, filled(config, views), jnp.asarray(view))
     error, template, relative = by_loops(config, views, view)
     assert int(found.template) == template
     assert float(found.error) == pytest.approx(error, abs=1e-12)
@@ -61,7 +63,7 @@ def test_the_best_template_is_the_one_loops_find(settings, seed):
 def test_ties_go_to_the_earliest():
     config = TemplateConfig(panoramic=True)
     flat = np.full(SHAPE, 0.5)
-    found = templates.match_view(config, SHAPE, filled(config, [flat, flat, flat]), jnp.asarray(flat))
+    found = view_templates.match_view(config, SHAPE, filled(config, [flat, flat, flat]), jnp.asarray(flat))
     assert int(found.template) == 0
     assert float(found.relative) == 0
 
@@ -69,8 +71,8 @@ def test_ties_go_to_the_earliest():
 def test_an_empty_store_and_a_far_view_match_nothing():
     config = TemplateConfig()
     view = jnp.full(SHAPE, 0.9)
-    assert int(templates.match_view(config, SHAPE, filled(config, []), view).template) == -1
-    found = templates.match_view(config, SHAPE, filled(config, [np.zeros(SHAPE)]), view)
+    assert int(view_templates.match_view(config, SHAPE, filled(config, []), view).template) == -1
+    found = view_templates.match_view(config, SHAPE, filled(config, [np.zeros(SHAPE)]), view)
     assert int(found.template) == -1
     assert float(found.error) == pytest.approx(0.9)
 
@@ -78,32 +80,32 @@ def test_an_empty_store_and_a_far_view_match_nothing():
 def test_labels_of_any_number_find_their_template():
     config = TemplateConfig(source="labels")
     store = filled(config, [np.zeros(0)] * 3)
-    assert int(templates.match_label(store, jnp.int32(102)).template) == 2
-    assert int(templates.match_label(store, jnp.int32(7)).template) == -1
+    assert int(view_templates.match_label(store, jnp.int32(102)).template) == 2
+    assert int(view_templates.match_label(store, jnp.int32(7)).template) == -1
 
 
 def test_energy_fades_while_a_view_stays_and_comes_back():
     config = TemplateConfig(recent=0)
     store = filled(config, [np.zeros(SHAPE), np.ones(SHAPE)])
-    first, second = (templates.Match(jnp.int32(k), jnp.asarray(0.0), jnp.asarray(0.0)) for k in (0, 1))
+    first, second = (view_templates.Match(jnp.int32(k), jnp.asarray(0.0), jnp.asarray(0.0)) for k in (0, 1))
     energies = []
     for _ in range(30):
-        store, energy = templates.recall(config, store, first, jnp.bool_(True))
+        store, energy = view_templates.recall(config, store, first, jnp.bool_(True))
         energies.append(float(energy) / config.energy)
     assert energies[0] == pytest.approx((30 - np.exp(1.2)) / 30)
     assert energies[1] == pytest.approx((30 - np.exp(1.2 * 2.0)) / 30)
     assert energies[-1] == 0
     for _ in range(60):
-        store, _ = templates.recall(config, store, second, jnp.bool_(True))
-    _, energy = templates.recall(config, store, first, jnp.bool_(True))
+        store, _ = view_templates.recall(config, store, second, jnp.bool_(True))
+    _, energy = view_templates.recall(config, store, first, jnp.bool_(True))
     assert float(energy) / config.energy == pytest.approx(energies[0])
 
 
 def test_recent_templates_recall_nothing():
     config = TemplateConfig(recent=2)
     store = filled(config, [np.zeros(SHAPE)] * 3)
-    match = [templates.Match(jnp.int32(k), jnp.asarray(0.0), jnp.asarray(0.0)) for k in range(3)]
-    energies = [float(templates.recall(config, store, m, jnp.bool_(True))[1]) for m in match]
+    match = [view_templates.Match(jnp.int32(k), jnp.asarray(0.0), jnp.asarray(0.0)) for k in range(3)]
+    energies = [float(view_templates.recall(config, store, m, jnp.bool_(True))[1]) for m in match]
     assert energies[0] > 0
     assert energies[1:] == [0, 0]
 
@@ -112,7 +114,7 @@ def test_a_full_store_keeps_what_it_has():
     config = TemplateConfig()
     views = np.random.default_rng(0).random((4, *SHAPE))
     store = filled(config, views, capacity=4)
-    after, room = templates.learn(store, jnp.zeros(24), jnp.int32(9), jnp.zeros(3), jnp.bool_(True))
+    after, room = view_templates.learn(store, jnp.zeros(24), jnp.int32(9), jnp.zeros(3), jnp.bool_(True))
     assert not room
     assert np.array_equal(after.view, store.view)
     assert int(after.count) == 4
@@ -120,8 +122,8 @@ def test_a_full_store_keeps_what_it_has():
 
 def test_flat_and_empty_views_survive_normalisation():
     patchy = TemplateConfig(patch=1)
-    assert np.allclose(templates.normalise(patchy, jnp.full(SHAPE, 0.3)), 0.5)
+    assert np.allclose(view_templates.normalise(patchy, jnp.full(SHAPE, 0.3)), 0.5)
     scaled = TemplateConfig(normalise_mean=0.4)
-    assert not np.any(templates.normalise(scaled, jnp.zeros(SHAPE)))
+    assert not np.any(view_templates.normalise(scaled, jnp.zeros(SHAPE)))
     view = jnp.asarray(np.random.default_rng(0).random(SHAPE) * 0.3)
-    assert float(jnp.mean(templates.normalise(scaled, view))) == pytest.approx(0.4, abs=0.05)
+    assert float(jnp.mean(view_templates.normalise(scaled, view))) == pytest.approx(0.4, abs=0.05)

@@ -1,0 +1,1 @@
+"""RatSLAM as published: view templates, places, experience map, relaxation."""
