@@ -19,8 +19,8 @@ from ratslam.classic.relaxation import relax
 from ratslam.core.backend import Evidence
 from ratslam.core.growable_array import Growing
 from ratslam.core.types import Action, Estimate
-from ratslam.graphfile import write_g2o, write_json
-from ratslam.posegraph import Edges, geman_mcclure, huber, least_squares, no_kernel
+from ratslam.pose_graph import Edges, geman_mcclure, huber, least_squares, no_kernel
+from ratslam.pose_graph.io import write_g2o, write_json
 from tactile.base.config import Settings
 from tactile.base.se2 import between, compose, inverse
 from tactile.base.types import Observation

@@ -1,7 +1,7 @@
 """The classic relaxation of an experience map: every link moves both of its ends a little, in turn.
 
 Source: Ball et al. 2013, section 6 (Gauss-Seidel in order of creation, no node held, no weights). Kept for
-comparison: it takes thousands of sweeps to do what `ratslam.posegraph` does in one solve.
+comparison: it takes thousands of sweeps to do what `ratslam.pose_graph` does in one solve.
 """
 
 from __future__ import annotations

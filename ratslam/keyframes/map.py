@@ -19,7 +19,6 @@ import numpy as np
 from ratslam.core.backend import Evidence
 from ratslam.core.growable_array import Growing
 from ratslam.core.types import Estimate
-from ratslam.graphfile import write_g2o, write_json
 from ratslam.keyframes.appearance import Appearance, Match
 from ratslam.keyframes.closure_selection import FINE, KEPT, STEPS, Case, arbitrate
 from ratslam.keyframes.config import FrameMapConfig
@@ -34,7 +33,8 @@ from ratslam.keyframes.optimizer import (
     relative_covariance,
     solve,
 )
-from ratslam.posegraph import Edges
+from ratslam.pose_graph import Edges
+from ratslam.pose_graph.io import write_g2o, write_json
 from ratslam.recall.filter import Guidance
 from tactile.base.se2 import between, compose, fitted, integrate, inverse, wrap
 from tactile.base.types import Observation

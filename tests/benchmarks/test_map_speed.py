@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from ratslam.classic.experience_map import ExperienceConfig, ExperienceMap
 from ratslam.core.types import Action, Estimate
-from ratslam.posegraph import Edges, Ending, least_squares, linear
+from ratslam.pose_graph import Edges, Ending, least_squares, linear_init
 from tactile.base.se2 import between, integrate, wrap
 from tactile.base.types import Odometry, observation
 

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ratslam.graphfile import read_g2o, read_json, write_g2o, write_json
-from ratslam.posegraph import Edges
+from ratslam.pose_graph import Edges
+from ratslam.pose_graph.io import read_g2o, read_json, write_g2o, write_json
 from tactile.base.errors import InputError
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)

@@ -10,20 +10,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ratslam.classic.relaxation import relax
-from ratslam.graphfile import read_g2o, write_g2o
-from ratslam.posegraph import (
+from ratslam.pose_graph import (
     Edges,
     Ending,
     difference_error,
     geman_mcclure,
     huber,
     least_squares,
-    linear,
+    linear_init,
     logmap_error,
 )
-from ratslam.posegraph.chains import chains
-from ratslam.posegraph.edges import full
-from ratslam.posegraph.normal import Folded
+from ratslam.pose_graph.chains import chains
+from ratslam.pose_graph.edges import full
+from ratslam.pose_graph.io import read_g2o, write_g2o
+from ratslam.pose_graph.normal_equations import Folded
 from tactile.base.errors import InputError
 from tactile.base.se2 import between, compose, integrate, inverse, wrap
 

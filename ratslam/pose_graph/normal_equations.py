@@ -9,9 +9,9 @@ from scipy.sparse import csc_matrix, csr_matrix
 from scipy.sparse.csgraph import breadth_first_order
 from scipy.sparse.linalg import splu
 
-from ratslam.posegraph.chains import chains
-from ratslam.posegraph.edges import Edges, diagonal
-from ratslam.posegraph.pattern import Pattern, unreached
+from ratslam.pose_graph.chains import chains
+from ratslam.pose_graph.edges import Edges, diagonal
+from ratslam.pose_graph.sparsity import Pattern, unreached
 
 
 class Damping(NamedTuple):

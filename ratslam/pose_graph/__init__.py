@@ -4,10 +4,10 @@ Node 0 is held where it is. Sources: Kuemmerle et al. 2011 (g2o: the plain error
 (the logarithmic one), Carlone et al. 2014 (headings first, then positions).
 """
 
-from ratslam.posegraph.edges import Edges, Error, difference_error, logmap_error
-from ratslam.posegraph.kernels import Kernel, geman_mcclure, huber, no_kernel
-from ratslam.posegraph.leastsquares import Ending, Solution, least_squares
-from ratslam.posegraph.linear import linear
+from ratslam.pose_graph.edges import Edges, Error, difference_error, logmap_error
+from ratslam.pose_graph.least_squares import Ending, Solution, least_squares
+from ratslam.pose_graph.linear_init import linear
+from ratslam.pose_graph.robust_kernels import Kernel, geman_mcclure, huber, no_kernel
 
 __all__ = [
     "Edges",

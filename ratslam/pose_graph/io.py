@@ -8,7 +8,7 @@ from pathlib import Path
 import networkx
 import numpy as np
 
-from ratslam.posegraph import Edges
+from ratslam.pose_graph import Edges
 from tactile.base.errors import InputError
 
 UPPER = tuple(zip(*np.triu_indices(3), strict=True))

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.posegraph.edges import Edges, Error, difference_error, full
-from ratslam.posegraph.kernels import Kernel, no_kernel
-from ratslam.posegraph.normal import Folded, Whole
+from ratslam.pose_graph.edges import Edges, Error, difference_error, full
+from ratslam.pose_graph.normal_equations import Folded, Whole
+from ratslam.pose_graph.robust_kernels import Kernel, no_kernel
 from tactile.base.se2 import wrap
 
 FOLDED_FROM = 2000

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ratslam.posegraph.chains import Chains, chains
-from ratslam.posegraph.edges import Edges, diagonal
-from ratslam.posegraph.pattern import Pattern, unreached
+from ratslam.pose_graph.chains import Chains, chains
+from ratslam.pose_graph.edges import Edges, diagonal
+from ratslam.pose_graph.sparsity import Pattern, unreached
 from tactile.base.se2 import wrap
 
 
