@@ -11,8 +11,8 @@ from ratslam import gridfilter
 from ratslam.attractor import pose_cells
 from ratslam.config import RunConfig
 from ratslam.core.backend import Backend
+from ratslam.grid.particle_maps import LAYERS
 from ratslam.gridfilter import GridEvidence, GridFilter
-from ratslam.occupancy import LAYERS
 from ratslam.recallrat import evidence_of, rat
 from tactile.base.errors import InputError
 from tactile.whiskers.planar_whiskers import Feelers

@@ -13,7 +13,7 @@ from ratslam.attractor.config import PoseCellConfig
 from ratslam.classic.experience_map import ExperienceConfig
 from ratslam.classic.places import PlaceConfig
 from ratslam.classic.view_templates import TemplateConfig
-from ratslam.gridsettings import GridConfig
+from ratslam.grid.config import GridConfig
 from ratslam.keyframes.config import FrameMapConfig
 from ratslam.rat import RatConfig
 from ratslam.recall.filter import RecallConfig

@@ -14,12 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam import likelihoods, occupancy, particles, stamps
 from ratslam.core.types import Action, Estimate
-from ratslam.gridmap import GridMap
-from ratslam.gridsettings import GridConfig
-from ratslam.occupancy import COSINE, EVIDENCE, SINE
-from ratslam.particles import Particles
+from ratslam.grid import kernels, likelihoods, particle_maps, particles
+from ratslam.grid.config import GridConfig
+from ratslam.grid.map import GridMap
+from ratslam.grid.particle_maps import COSINE, EVIDENCE, SINE
+from ratslam.grid.particles import Particles
 from tactile.base.types import Array, Motion, Observation, Odometry
 from tactile.whiskers.planar_whiskers import Feelers
 
@@ -133,7 +133,7 @@ class GridFilter:
         first, key = jax.random.split(key)
         return State(
             particles.start(self.config.drift, first, count, self.dtype),
-            occupancy.blank(count, self.side, self.dtype),
+            particle_maps.blank(count, self.side, self.dtype),
             jnp.zeros((count, 2), self.dtype),
             jnp.int32(Motion.OTHER),
             jnp.zeros(self.whiskers, bool),
@@ -229,7 +229,7 @@ class GridFilter:
         if config.model != "evidence":
             return self._printed(state.maps, pose, felt)
         points = jnp.concatenate([jnp.asarray(self.free), jnp.asarray(self.body)])
-        evidence = occupancy.read(state.maps, EVIDENCE, self._placed(pose, points))
+        evidence = particle_maps.read(state.maps, EVIDENCE, self._placed(pose, points))
         shafts = jnp.repeat(felt.free, len(FREE))
         body = jnp.broadcast_to(felt.told & (self.config.body > 0), len(self.body))
         likelihood = likelihoods.free(config, evidence, jnp.concatenate([shafts, body]))
@@ -244,10 +244,10 @@ class GridFilter:
         """[N] log-likelihood of new contacts, and of a wall's direction: as the map has it there, and as
         walls are at large."""
         config = self.config.likelihood
-        evidence = occupancy.read(state.maps, EVIDENCE, self._placed(pose, felt.point))
+        evidence = particle_maps.read(state.maps, EVIDENCE, self._placed(pose, felt.point))
         likelihood = likelihoods.contact(config, evidence, felt.new)
         place = self._placed(pose, felt.on_wall[None])
-        field = [occupancy.read(state.maps, layer, place) for layer in (COSINE, SINE)]
+        field = [particle_maps.read(state.maps, layer, place) for layer in (COSINE, SINE)]
         direction = pose[:, 2] + felt.direction
         sharp = jnp.minimum(WALL, 1 / (4 * felt.sd**2))
         aligned = likelihoods.direction(config, jnp.concatenate(field, axis=1), 2 * direction, sharp)
@@ -258,7 +258,7 @@ class GridFilter:
 
     def _printed(self, maps: Array, pose: Array, felt: Felt) -> Array:
         cell = jnp.round(self._placed(pose, jnp.asarray(self.shafts)))
-        evidence = occupancy.read(maps, EVIDENCE, cell)
+        evidence = particle_maps.read(maps, EVIDENCE, cell)
         shape = (len(pose), self.whiskers, SEGMENTS)
         likelihood = likelihoods.printed(
             self.config.likelihood, self.config.prior,
@@ -282,12 +282,14 @@ class GridFilter:
         """Every particle's map with what was felt left in it; and whether any of it lies outside."""
         config, cell = self.config.stamps, self.config.cell
         middle = self._placed(pose, jnp.zeros((1, 2), self.dtype))
-        windows = occupancy.around(middle[:, 0], self.side, self.near)
+        windows = particle_maps.around(middle[:, 0], self.side, self.near)
         amount = -config.free * jnp.repeat(felt.free, len(FREE)).astype(self.dtype)
-        place = occupancy.within(self._placed(pose, jnp.asarray(self.free)), windows)
-        stamp = stamps.blobs(place, amount, self.free_sd, windows.size)
+        place = particle_maps.within(self._placed(pose, jnp.asarray(self.free)), windows)
+        stamp = kernels.blobs(place, amount, self.free_sd, windows.size)
         if self.config.body:
-            body = stamps.disc(occupancy.within(middle, windows)[:, 0], self.config.body / cell, windows.size)
+            body = kernels.disc(
+                particle_maps.within(middle, windows)[:, 0], self.config.body / cell, windows.size
+            )
             stamp -= jnp.where(felt.told, config.body, 0.0) * body
         maps = self._added(maps, EVIDENCE, windows, stamp)
 
@@ -303,34 +305,34 @@ class GridFilter:
         """With contacts and a wall drawn in."""
         config, cell = self.config.stamps, self.config.cell
         ends = self._placed(pose, felt.point)
-        windows = occupancy.around(
+        windows = particle_maps.around(
             self._placed(pose, jnp.zeros((1, 2), self.dtype))[:, 0], self.side, self.far
         )
         amount = config.blob * felt.new.astype(self.dtype)
-        stamp = stamps.blobs(occupancy.within(ends, windows), amount, self.blob_sd, windows.size)
+        stamp = kernels.blobs(particle_maps.within(ends, windows), amount, self.blob_sd, windows.size)
         maps = self._added(maps, EVIDENCE, windows, stamp)
         if config.wall == "blob":
             return maps, compass
         place = self._placed(pose, felt.on_wall[None])
-        windows = occupancy.around(place[:, 0], self.side, self.long)
-        place = occupancy.within(place, windows)[:, 0]
+        windows = particle_maps.around(place[:, 0], self.side, self.long)
+        place = particle_maps.within(place, windows)[:, 0]
         direction = pose[:, 2] + felt.direction
         if config.wall == "edge":
-            shape = stamps.fan(place, direction, config.along / cell, config.fan, windows.size)
+            shape = kernels.fan(place, direction, config.along / cell, config.fan, windows.size)
         else:
-            shape = stamps.edge(place, direction, config.along / cell, config.across / cell, windows.size)
+            shape = kernels.edge(place, direction, config.along / cell, config.across / cell, windows.size)
         shape = jnp.where(felt.wall, shape, 0.0)
         maps = self._added(maps, EVIDENCE, windows, config.edge * shape)
         for layer, part in ((COSINE, jnp.cos(2 * direction)), (SINE, jnp.sin(2 * direction))):
-            field = occupancy.cut(maps, windows, layer) + shape * part[:, None, None]
-            maps = occupancy.put(maps, windows, layer, field)
+            field = particle_maps.cut(maps, windows, layer) + shape * part[:, None, None]
+            maps = particle_maps.put(maps, windows, layer, field)
         pointing = jnp.stack([jnp.cos(4 * direction), jnp.sin(4 * direction)], axis=1)
         return maps, compass + jnp.where(felt.wall, pointing, 0.0)
 
-    def _added(self, maps: Array, layer: int, windows: occupancy.Windows, stamp: Array) -> Array:
+    def _added(self, maps: Array, layer: int, windows: particle_maps.Windows, stamp: Array) -> Array:
         most = self.config.stamps.most
-        evidence = jnp.clip(occupancy.cut(maps, windows, layer) + stamp, -most, most)
-        return occupancy.put(maps, windows, layer, evidence)
+        evidence = jnp.clip(particle_maps.cut(maps, windows, layer) + stamp, -most, most)
+        return particle_maps.put(maps, windows, layer, evidence)
 
     def _window(self, reach: float) -> int:
         """Cells a side of a window that shows so far, m, on every side of the place that it is about."""
@@ -342,4 +344,4 @@ class GridFilter:
         right, up = points.T[:, None]
         x = pose[:, :1] + c * right - s * up
         y = pose[:, 1:2] + s * right + c * up
-        return occupancy.in_cells(jnp.stack([x, y], axis=2), self.config.cell, self.side)
+        return particle_maps.in_cells(jnp.stack([x, y], axis=2), self.config.cell, self.side)

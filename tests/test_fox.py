@@ -21,7 +21,7 @@ from ratslam.arenas.protocols import FILTERED, MAPPERS, PAPERS, PROTOCOLS, RECKO
 from ratslam.arenas.trials import Result, results
 from ratslam.cli import main
 from ratslam.cli.arena import SETS
-from ratslam.gridsettings import GridConfig
+from ratslam.grid.config import GridConfig
 from robot.world.arena import Arena, fits
 from robot.world.random_arena import ArenaConfig, arena
 from tactile.base.errors import InputError

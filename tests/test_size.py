@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from evaluation.metrics.scorecard import Quantity
 from ratslam.cli import main
 from ratslam.config import RunConfig
-from ratslam.occupancy import LAYERS
+from ratslam.grid.particle_maps import LAYERS
 from ratslam.run import located, open_source
 from ratslam.sizing.proposal import (
     FEWEST,

@@ -11,8 +11,8 @@ from ratslam.attractor.adaptive_window import SETTLED, rungs
 from ratslam.attractor.config import PoseCellConfig
 from ratslam.backends import LIVE_SIDE
 from ratslam.config import RunConfig
-from ratslam.gridsettings import DriftConfig
-from ratslam.occupancy import LAYERS
+from ratslam.grid.config import DriftConfig
+from ratslam.grid.particle_maps import LAYERS
 from ratslam.sizing.scene import Scene
 from robot.simulation.head.session import tier
 

@@ -8,8 +8,8 @@ import pytest
 from jax import lax
 
 from ratslam.core.session import Session
+from ratslam.grid.config import GridConfig
 from ratslam.gridfilter import GridFilter
-from ratslam.gridsettings import GridConfig
 from robot.simulation.create.session import RovingConfig, roving
 from robot.touch_source import feelers_of, sensing
 from tactile.base.types import stack

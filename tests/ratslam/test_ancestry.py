@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ratslam import ancestry
-from ratslam.ancestry import Ancestry
+from ratslam.grid import genealogy
+from ratslam.grid.genealogy import Ancestry
 from tactile.base.se2 import wrap
 
 COUNT = 6

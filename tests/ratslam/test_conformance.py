@@ -12,8 +12,8 @@ import pytest
 
 from ratslam.core.session import CHUNK, Session, capacity_at
 from ratslam.core.types import Action
+from ratslam.grid.config import GridConfig
 from ratslam.gridfilter import GridFilter, Outcome
-from ratslam.gridsettings import GridConfig
 from ratslam.rat import RatConfig
 from ratslam.recallrat import rat
 from tactile.base.types import Odometry, observation

@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ratslam import likelihoods, occupancy
 from ratslam.backends import backend_of
 from ratslam.config import RunConfig
 from ratslam.core.session import Session
+from ratslam.grid import likelihoods, particle_maps
+from ratslam.grid.particle_maps import COSINE, EVIDENCE, SINE
 from ratslam.gridfilter import Outcome
-from ratslam.occupancy import COSINE, EVIDENCE, SINE
 from tactile.base.errors import InputError
 from tactile.base.se2 import wrap
 from tactile.base.types import Motion
@@ -59,13 +59,13 @@ def placed(backend, pose, point):
     c, s = np.cos(pose[:, 2, None]), np.sin(pose[:, 2, None])
     x = pose[:, :1] + c * point[:, 0] - s * point[:, 1]
     y = pose[:, 1:2] + s * point[:, 0] + c * point[:, 1]
-    return np.asarray(occupancy.in_cells(np.stack([x, y], axis=2), backend.config.cell, backend.side))
+    return np.asarray(particle_maps.in_cells(np.stack([x, y], axis=2), backend.config.cell, backend.side))
 
 
 def evidence_at(backend, state, point, layer=EVIDENCE):
     """[N, K] what each particle's map holds at points [K, 2] of base_link."""
     place = placed(backend, state.particles.pose, point).astype(backend.dtype)
-    return np.asarray(occupancy.read(state.maps, layer, place))
+    return np.asarray(particle_maps.read(state.maps, layer, place))
 
 
 def column_of_wall(backend, x, *, before=-3.0, wall=4.0, width=0.1):
@@ -250,13 +250,15 @@ def corridor(backend, reports, spread):
     x = np.arange(-0.3, 1.2, fine)
     pose = np.stack([x, 0 * x, 0 * x], axis=1)
     maps = (
-        occupancy.blank(1, backend.side, np.dtype(float)).at[0, EVIDENCE].set(column_of_wall(backend, 0.65))
+        particle_maps.blank(1, backend.side, np.dtype(float))
+        .at[0, EVIDENCE]
+        .set(column_of_wall(backend, 0.65))
     )
     belief, touched, told = np.where(np.abs(x) < fine / 2, 1.0, 0.0), np.zeros(2, bool), []
 
     def evidence(points):
         place = placed(backend, pose, points).reshape(1, -1, 2)
-        return np.asarray(occupancy.read(maps, EVIDENCE, place)).reshape(len(x), len(points))
+        return np.asarray(particle_maps.read(maps, EVIDENCE, place)).reshape(len(x), len(points))
 
     for o in reports:
         sd = spread * abs(float(o.odometry.dx))

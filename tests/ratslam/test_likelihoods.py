@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import expit, logit
 
-from ratslam import likelihoods
-from ratslam.gridsettings import LikelihoodConfig
+from ratslam.grid import likelihoods
+from ratslam.grid.config import LikelihoodConfig
 from tests.gridworld import LENGTH
 
 CONFIG = LikelihoodConfig()

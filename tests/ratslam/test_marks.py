@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import expit, logit
 
-from ratslam.gridsettings import DrawingConfig, GridConfig
-from ratslam.marks import FUSIONS, Marks, draw
+from ratslam.grid.config import DrawingConfig, GridConfig
+from ratslam.grid.map_drawing import FUSIONS, Marks, draw
 from tactile.base.se2 import compose
 from tests.gridworld import TIPS, create
 

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chisquare
 
-from ratslam import particles
-from ratslam.gridsettings import DriftConfig, ResamplingConfig
-from ratslam.particles import Particles
+from ratslam.grid import particles
+from ratslam.grid.config import DriftConfig, ResamplingConfig
+from ratslam.grid.particles import Particles
 from tactile.base.se2 import compose, wrap
 from tactile.base.types import Odometry
 from tests.gridworld import STEADY

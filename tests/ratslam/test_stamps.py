@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ratslam import stamps
+from ratslam.grid import kernels
 from tactile.base.se2 import wrap
 
 SIZE = 31
@@ -17,11 +17,11 @@ PLACE = st.tuples(*[st.floats(10, 20)] * 2)
 ANGLE = st.floats(-10, 10)
 FAN = np.pi / 12
 
-blobs = jax.jit(stamps.blobs, static_argnums=(2, 3))
-disc = jax.jit(stamps.disc, static_argnums=(1, 2))
-fan = jax.jit(lambda place, angle, size: stamps.fan(place, angle, 5.0, FAN, size), static_argnums=2)
+blobs = jax.jit(kernels.blobs, static_argnums=(2, 3))
+disc = jax.jit(kernels.disc, static_argnums=(1, 2))
+fan = jax.jit(lambda place, angle, size: kernels.fan(place, angle, 5.0, FAN, size), static_argnums=2)
 SHAPES = {
-    "edge": jax.jit(lambda place, angle: stamps.edge(place, angle, 4.0, 1.2, SIZE)),
+    "edge": jax.jit(lambda place, angle: kernels.edge(place, angle, 4.0, 1.2, SIZE)),
     "fan": lambda place, angle: fan(place, angle, SIZE),
 }
 
@@ -63,7 +63,7 @@ def test_a_blob_has_its_amount_where_it_is_and_no_whiskers_make_none():
 
 @given(PLACE, st.floats(1.0, 6.0))
 def test_a_disc_is_full_inside_and_empty_outside(place, radius):
-    stamp = np.asarray(jax.jit(stamps.disc, static_argnums=2)(np.array([place]), radius, SIZE))[0]
+    stamp = np.asarray(jax.jit(kernels.disc, static_argnums=2)(np.array([place]), radius, SIZE))[0]
     away = np.hypot(*offsets(place))
     assert (stamp[away <= radius - 0.5] == 1).all()
     assert (stamp[away >= radius + 0.5] == 0).all()
@@ -131,10 +131,10 @@ def test_eq_4_draws_the_edge_both_ways(angle):
 def test_stamps_keep_their_precision(dtype):
     place, angle, amount = np.full((2, 2), 3.0, dtype), np.ones(2, dtype), np.ones(1, dtype)
     for make, *parts in (
-        (lambda place, amount: stamps.blobs(place[:, None], amount, 1.0, 8), place, amount),
-        (lambda place: stamps.disc(place, 2.0, 8), place),
-        (lambda place, angle: stamps.edge(place, angle, 3.0, 1.0, 8), place, angle),
-        (lambda place, angle: stamps.fan(place, angle, 3.0, FAN, 8), place, angle),
+        (lambda place, amount: kernels.blobs(place[:, None], amount, 1.0, 8), place, amount),
+        (lambda place: kernels.disc(place, 2.0, 8), place),
+        (lambda place, angle: kernels.edge(place, angle, 3.0, 1.0, 8), place, angle),
+        (lambda place, angle: kernels.fan(place, angle, 3.0, FAN, 8), place, angle),
     ):
         stamp = jax.eval_shape(make, *parts)
         assert stamp.dtype == dtype

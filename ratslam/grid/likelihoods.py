@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ratslam.gridsettings import LikelihoodConfig
+from ratslam.grid.config import LikelihoodConfig
 from tactile.base.types import Array
 
 FIRM = 0.5

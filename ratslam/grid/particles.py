@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from ratslam.gridsettings import DriftConfig, ResamplingConfig
+from ratslam.grid.config import DriftConfig, ResamplingConfig
 from tactile.base.types import Array, Odometry
 
 

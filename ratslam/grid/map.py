@@ -9,11 +9,11 @@ from typing import Any
 import networkx
 import numpy as np
 
-from ratslam.ancestry import Ancestry
 from ratslam.core.growable_array import Growing
 from ratslam.core.types import Estimate
-from ratslam.gridsettings import GridConfig
-from ratslam.marks import Marks, draw, marks_of
+from ratslam.grid.config import GridConfig
+from ratslam.grid.genealogy import Ancestry
+from ratslam.grid.map_drawing import Marks, draw, marks_of
 from tactile.base.types import Observation
 from tactile.whiskers.planar_whiskers import Feelers
 

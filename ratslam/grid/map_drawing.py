@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import expit, logit
 
-from ratslam.gridsettings import DrawingConfig, GridConfig
+from ratslam.grid.config import DrawingConfig, GridConfig
 from tactile.base.se2 import compose
 from tactile.base.types import Motion
 from tactile.whiskers.planar_whiskers import Feelers
