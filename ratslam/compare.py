@@ -13,8 +13,8 @@ from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.trajectory import ate
 from ratslam.config import RunConfig
 from ratslam.core.session import CHUNK
-from ratslam.playing import session_of
-from ratslam.run import located, open_source
+from ratslam.pipeline.run import located, open_source
+from ratslam.pipeline.runner import session_of
 from robot.sources.source import Sample, Source
 from robot.touch_source import observation_of, sensing
 from tactile.base.errors import InputError

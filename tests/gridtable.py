@@ -70,8 +70,8 @@ def run(world: str, row: str, arena: int) -> Figures:
 
     jax.config.update("jax_enable_x64", True)
     from ratslam.config import RunConfig
-    from ratslam.playing import readings, session_of
-    from ratslam.run import open_source
+    from ratslam.pipeline.run import open_source
+    from ratslam.pipeline.runner import readings, session_of
     from robot.touch_source import sensing
     from tactile.base.se2 import compose, integrate
     from tactile.base.types import Motion
@@ -131,7 +131,7 @@ def _off(arena: Any, pose: np.ndarray, told: Any) -> float:
 def _chart(session: Any, source: Any) -> tuple[float, ...]:
     from evaluation.metrics.grid_score import score_grid
     from evaluation.metrics.occupancy_grid import Grid
-    from ratslam.keeping import truth_of
+    from ratslam.pipeline.artifacts import truth_of
 
     chart = session.map
     corner = np.full(2, -chart.side * chart.config.cell / 2)

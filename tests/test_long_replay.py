@@ -114,11 +114,11 @@ def replayed(kind: str, steps: int, folder: Path) -> dict[str, Any]:
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from ratslam.backends import telling
     from ratslam.config import RunConfig
-    from ratslam.playing import Playing, session_of
-    from ratslam.run import replayed as through
-    from ratslam.storage import RunDirectory
+    from ratslam.pipeline.backend_registry import telling
+    from ratslam.pipeline.run import replayed as through
+    from ratslam.pipeline.run_directory import RunDirectory
+    from ratslam.pipeline.runner import Playing, session_of
 
     source = Circuit(kind, steps)
     config = RunConfig.model_validate(

@@ -14,7 +14,7 @@ import pytest
 
 from ratslam.cli import main
 from ratslam.config import RunConfig
-from ratslam.run import open_source, simulate
+from ratslam.pipeline.run import open_source, simulate
 from ratslam.trials import trial
 from robot.recordings.mcap_reader import Recording
 from robot.simulation.head.session import simulated

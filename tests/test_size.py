@@ -14,7 +14,7 @@ from evaluation.metrics.scorecard import Quantity
 from ratslam.cli import main
 from ratslam.config import RunConfig
 from ratslam.grid.particle_maps import LAYERS
-from ratslam.run import located, open_source
+from ratslam.pipeline.run import located, open_source
 from ratslam.sizing.proposal import (
     FEWEST,
     MEMORY,

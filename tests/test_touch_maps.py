@@ -13,7 +13,7 @@ from evaluation.metrics.energy_metric import energy_all_pairs
 from ratslam.config import TOUCH, RunConfig
 from ratslam.core.session import Session
 from ratslam.keyframes.loop_closures import Verdict
-from ratslam.playing import readings, session_of
+from ratslam.pipeline.runner import readings, session_of
 from robot.simulation.head.session import simulated
 from robot.touch_source import sensing
 from tactile.base.se2 import integrate

@@ -16,8 +16,8 @@ import numpy as np
 from evaluation.metrics.experience_metric import experience_metric
 from ratslam.config import RunConfig
 from ratslam.core.types import Action
-from ratslam.playing import readings, session_of
-from ratslam.run import open_source
+from ratslam.pipeline.run import open_source
+from ratslam.pipeline.runner import readings, session_of
 from robot.touch_source import sensing
 from tactile.base.types import Observation
 

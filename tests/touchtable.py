@@ -96,8 +96,8 @@ def run(row: str, maze: int, seed: int, matcher: str = "recall") -> Figures:
     from evaluation.metrics.energy_metric import energy_all_pairs
     from evaluation.metrics.experience_metric import ExmConfig, experience_metric
     from ratslam.config import RunConfig
-    from ratslam.playing import readings, session_of
-    from ratslam.run import open_source
+    from ratslam.pipeline.run import open_source
+    from ratslam.pipeline.runner import readings, session_of
     from robot.sources.in_memory import collected
     from robot.touch_source import sensing
     from tactile.base.errors import InputError

@@ -30,7 +30,7 @@ def add(command: Add) -> None:
 
 def _train(arguments: argparse.Namespace) -> int:
     from ratslam.config import RunConfig
-    from ratslam.run import located
+    from ratslam.pipeline.run import located
     from ratslam.schooling import held_out, report, schooled
     from ratslam.yamlfile import load, override, validate
 

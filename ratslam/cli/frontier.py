@@ -85,7 +85,7 @@ def _size(arguments: argparse.Namespace) -> int:
     settle_threads()
     prepare_jax()
     from ratslam.config import RunConfig
-    from ratslam.run import located, open_source
+    from ratslam.pipeline.run import located, open_source
     from ratslam.sizing.proposal import proposals
     from ratslam.sizing.report import length_text, proposed_text, snippet, tried_text
     from ratslam.sizing.scene import cheapest, scene_of

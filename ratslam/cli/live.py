@@ -108,7 +108,7 @@ def _configured(arguments: argparse.Namespace, arm: str | None, head: str | None
         InputError: it is not one of a live session.
     """
     from ratslam.config import RunConfig
-    from ratslam.run import located
+    from ratslam.pipeline.run import located
     from ratslam.yamlfile import load, override, validate
 
     given = [f"live.arm.host={arm}"] if arm else []

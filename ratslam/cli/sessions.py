@@ -57,7 +57,7 @@ def _run(arguments: argparse.Namespace) -> int:
     from evaluation.metrics.grid_score import table as chart
     from evaluation.metrics.scorecard import table
     from ratslam.config import RunConfig
-    from ratslam.run import run
+    from ratslam.pipeline.run import run
     from ratslam.yamlfile import load, override, validate
 
     config = validate(override(load(arguments.config), arguments.set), RunConfig)
@@ -73,7 +73,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _simulate(arguments: argparse.Namespace) -> int:
     from ratslam.config import RunConfig
-    from ratslam.run import simulate
+    from ratslam.pipeline.run import simulate
     from ratslam.yamlfile import load, override, validate
 
     sets = [*arguments.set, *(["simulation.raw=true"] if arguments.raw else [])]

@@ -18,7 +18,7 @@ from evaluation.metrics.scorecard import Scorecard
 from ratslam.config import RunConfig
 from ratslam.core.session import CHUNK
 from ratslam.live.mapper import Mapper, Order
-from ratslam.run import interrupts, located
+from ratslam.pipeline.run import interrupts, located
 from robot.drivers.outcome import Fault, Outcome
 from robot.live.recorder import Journal
 from robot.live.rig import Faulted, Rig, Stopped

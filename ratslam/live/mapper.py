@@ -235,7 +235,7 @@ def mapping(line: Connection) -> None:
 
 def _map(line: Connection) -> None:
     from ratslam.core.types import Action
-    from ratslam.playing import playing
+    from ratslam.pipeline.runner import playing
     from robot.touch_source import sensing
     from tactile.base.types import Odometry, observation
 

@@ -9,10 +9,10 @@ import numpy as np
 
 from ratslam.attractor.adaptive_window import SETTLED, rungs
 from ratslam.attractor.config import PoseCellConfig
-from ratslam.backends import LIVE_SIDE
 from ratslam.config import RunConfig
 from ratslam.grid.config import DriftConfig
 from ratslam.grid.particle_maps import LAYERS
+from ratslam.pipeline.backend_registry import LIVE_SIDE
 from ratslam.sizing.scene import Scene
 from robot.simulation.head.session import tier
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from ratslam.config import RunConfig
 from ratslam.frontier.cores import one_core
-from ratslam.run import open_source
+from ratslam.pipeline.run import open_source
 from ratslam.sizing.proposal import FEWEST, Proposal, with_settings
 from ratslam.sizing.scene import short
 from ratslam.sweeps.jobs import run_job

@@ -26,9 +26,9 @@ from evaluation.metrics.run_arrays import Run
 from evaluation.metrics.scorecard import Quantity, score
 from ratslam.config import RunConfig
 from ratslam.core.session import CHUNK, Session
-from ratslam.keeping import truth_of
-from ratslam.playing import Anytimes, readings, session_of
-from ratslam.run import open_source
+from ratslam.pipeline.artifacts import truth_of
+from ratslam.pipeline.run import open_source
+from ratslam.pipeline.runner import Anytimes, readings, session_of
 from ratslam.sweeps.memory import weighed
 from ratslam.sweeps.results import Machine, Result, Timing
 from ratslam.sweeps.stopwatch import Stopwatch

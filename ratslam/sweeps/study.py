@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ratslam.config import RunConfig
-from ratslam.run import located
+from ratslam.pipeline.run import located
 from ratslam.sweeps.identity import digest_of, seed_key, with_seed
 from ratslam.sweeps.placing import named, outermost_first, overlap, put
 from ratslam.sweeps.plan import StudyPlan, TunePlan

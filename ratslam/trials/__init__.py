@@ -17,8 +17,8 @@ from pydantic import BaseModel
 from evaluation.metrics.trajectory import ate
 from ratslam.config import RunConfig
 from ratslam.core.session import CHUNK, Session
-from ratslam.playing import Anytimes, readings, session_of
-from ratslam.run import located, open_source
+from ratslam.pipeline.run import located, open_source
+from ratslam.pipeline.runner import Anytimes, readings, session_of
 from ratslam.trials.workers import shared_out
 from ratslam.yamlfile import Document, load, override, validate
 from robot.sources.in_memory import Log, collected

@@ -10,8 +10,8 @@ import pytest
 from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.experience_metric import experience_metric
 from ratslam.config import RunConfig
-from ratslam.playing import readings, session_of
-from ratslam.run import open_source
+from ratslam.pipeline.run import open_source
+from ratslam.pipeline.runner import readings, session_of
 from robot.touch_source import sensing
 
 JITTER = {"position": 0.005, "yaw_deg": 1.5, "speed": 0.05}

@@ -14,7 +14,7 @@ from evaluation.artifacts.whisker_views import read_images
 from evaluation.report import redraw
 from ratslam.cli import main
 from ratslam.config import RunConfig
-from ratslam.run import located, open_source
+from ratslam.pipeline.run import located, open_source
 from ratslam.yamlfile import load, validate
 from robot.touch_source import sensing
 from robot.world.scene import MazeConfig

@@ -10,7 +10,7 @@ import pytest
 
 from evaluation.artifacts.run_directory import read_card
 from evaluation.metrics.grid_score import score_grid
-from ratslam.run import run
+from ratslam.pipeline.run import run
 from ratslam.sweeps.jobs import run_job
 from ratslam.sweeps.memory import weighed
 from ratslam.sweeps.quantities import DIRECTIONS, MEASURED

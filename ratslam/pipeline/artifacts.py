@@ -10,7 +10,7 @@ from evaluation.artifacts.run_directory import write_walls
 from evaluation.artifacts.whisker_views import Images, write_images
 from evaluation.metrics.grid_score import score_grid
 from evaluation.metrics.occupancy_grid import Grid, Truth, centres
-from ratslam.storage import RunDirectory
+from ratslam.pipeline.run_directory import RunDirectory
 from robot.sources.source import Source, rig_of
 from robot.world.arena import Arena, enclosed, occupied, read_arena, segments
 from robot.world.maze import read_maze, walls

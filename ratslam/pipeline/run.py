@@ -15,7 +15,7 @@ from tqdm import tqdm
 from evaluation.metrics.scorecard import Scorecard
 from ratslam.config import RunConfig
 from ratslam.core.session import CHUNK
-from ratslam.playing import Playing, playing
+from ratslam.pipeline.runner import Playing, playing
 from robot.recordings.formats import open_recording
 from robot.recordings.recorder import Recorder
 from robot.simulation.create.session import roving
