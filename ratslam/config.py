@@ -10,12 +10,12 @@ from pydantic import Field, NonNegativeInt, ValidationInfo, field_validator
 
 from evaluation.metrics.experience_metric import ExmConfig
 from ratslam.attractor.config import PoseCellConfig
+from ratslam.backends.classic import RatConfig
 from ratslam.classic.experience_map import ExperienceConfig
 from ratslam.classic.places import PlaceConfig
 from ratslam.classic.view_templates import TemplateConfig
 from ratslam.grid.config import GridConfig
 from ratslam.keyframes.config import FrameMapConfig
-from ratslam.rat import RatConfig
 from ratslam.recall.filter import RecallConfig
 from robot.live.config import LiveConfig
 from robot.recordings.formats import RecordingConfig

@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ratslam.backends.grid import GridEvidence, GridFilter, State
 from ratslam.core.packing import layout_of, room
 from ratslam.core.session import CHUNK, run_chunk
 from ratslam.core.types import Estimate
 from ratslam.grid.config import GridConfig
-from ratslam.gridfilter import GridEvidence, GridFilter, State
 from tactile.base.types import Motion, Observation, Odometry, observation
 from tactile.whiskers.planar_whiskers import Feelers
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from evaluation.metrics.trajectory import ate
+from ratslam.backends.classic import RatConfig
+from ratslam.backends.recall import rat
 from ratslam.core.session import Session
 from ratslam.keyframes.loop_closures import Verdict
-from ratslam.rat import RatConfig
-from ratslam.recallrat import rat
 from robot.recordings.npz_trace import read_stream
 from robot.sources.in_memory import Log
 from robot.sources.perturbation import perturbed

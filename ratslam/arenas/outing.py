@@ -14,11 +14,11 @@ import jax
 import numpy as np
 
 from evaluation.metrics.occupancy_grid import Grid, Truth, centres
+from ratslam.backends.grid import GridFilter
 from ratslam.config import RunConfig
 from ratslam.core.session import Session, capacity_at
 from ratslam.grid.config import GridConfig
 from ratslam.grid.map_drawing import Marks, draw, marks_of
-from ratslam.gridfilter import GridFilter
 from robot.simulation.create.session import Rover, RovingConfig, roving
 from robot.simulation.create.template_training import trained
 from robot.touch_source import Sensing, observation_of, reports_of

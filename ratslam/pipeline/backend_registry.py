@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam import gridfilter
 from ratslam.attractor import pose_cells
+from ratslam.backends import grid
+from ratslam.backends.grid import GridEvidence, GridFilter
+from ratslam.backends.recall import evidence_of, rat
 from ratslam.config import RunConfig
 from ratslam.core.backend import Backend
 from ratslam.grid.particle_maps import LAYERS
-from ratslam.gridfilter import GridEvidence, GridFilter
-from ratslam.recallrat import evidence_of, rat
 from tactile.base.errors import InputError
 from tactile.whiskers.planar_whiskers import Feelers
 
@@ -56,6 +56,6 @@ def backend_of(config: RunConfig, view_shape: tuple[int, int, int], feelers: Fee
 def telling(config: RunConfig) -> Telling:
     """What each step reports."""
     evidence = GridEvidence if config.backend == "grid" else evidence_of(config.matcher)
-    outcomes: type[IntEnum] = gridfilter.Outcome if config.backend == "grid" else pose_cells.Outcome
+    outcomes: type[IntEnum] = grid.Outcome if config.backend == "grid" else pose_cells.Outcome
     quiet = {*ARRAYS, "outcome"}
     return Telling(tuple(name for name in evidence._fields if name not in quiet), outcomes)

@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from ratslam.backends.classic import Rat, RatConfig, RatEvidence
 from ratslam.classic.experience_map import ExperienceMap
 from ratslam.config import RunConfig
 from ratslam.core.types import Estimate
-from ratslam.rat import Rat, RatConfig, RatEvidence
 from ratslam.trials.touch import Played, room_for, told
 from robot.sources.in_memory import Log
 from robot.touch_source import observation_of

@@ -14,11 +14,11 @@ import numpy as np
 
 from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.experience_metric import ExmConfig, ExperienceMetric, experience_metric
+from ratslam.backends.classic import RatConfig
+from ratslam.backends.recall import rat
 from ratslam.config import RunConfig, SessionConfig
 from ratslam.core.session import Session, capacity_at
 from ratslam.pipeline.run import located, open_source
-from ratslam.rat import RatConfig
-from ratslam.recallrat import rat
 from ratslam.trials.controls import Control, controlled
 from robot.sources.in_memory import Log, collected
 from robot.touch_source import observation_of, sensing

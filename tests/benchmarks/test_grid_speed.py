@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from jax import lax
 
+from ratslam.backends.grid import GridFilter
 from ratslam.core.session import Session
 from ratslam.grid.config import GridConfig
-from ratslam.gridfilter import GridFilter
 from robot.simulation.create.session import RovingConfig, roving
 from robot.touch_source import feelers_of, sensing
 from tactile.base.types import stack

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from ratslam.backends.classic import Rat, RatConfig, from_parameters
 from ratslam.core.session import Session
-from ratslam.rat import Rat, RatConfig, from_parameters
 from robot.recordings.formats import RecordingConfig, open_recording
 from tactile.base.errors import InputError
 from tactile.base.types import Observation

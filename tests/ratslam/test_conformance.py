@@ -10,12 +10,12 @@ import jax
 import numpy as np
 import pytest
 
+from ratslam.backends.classic import RatConfig
+from ratslam.backends.grid import GridFilter, Outcome
+from ratslam.backends.recall import rat
 from ratslam.core.session import CHUNK, Session, capacity_at
 from ratslam.core.types import Action
 from ratslam.grid.config import GridConfig
-from ratslam.gridfilter import GridFilter, Outcome
-from ratslam.rat import RatConfig
-from ratslam.recallrat import rat
 from tactile.base.types import Odometry, observation
 from tactile.whiskers.planar_whiskers import Feelers
 

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from ratslam.backends.grid import Outcome
 from ratslam.config import RunConfig
 from ratslam.core.session import Session
 from ratslam.grid import likelihoods, particle_maps
 from ratslam.grid.particle_maps import COSINE, EVIDENCE, SINE
-from ratslam.gridfilter import Outcome
 from ratslam.pipeline.backend_registry import backend_of
 from tactile.base.errors import InputError
 from tactile.base.se2 import wrap

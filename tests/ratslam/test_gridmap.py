@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ratslam.backends.grid import GridEvidence
 from ratslam.core.types import Estimate
 from ratslam.grid import genealogy
-from ratslam.gridfilter import GridEvidence
 from tactile.base.types import Motion
 from tests.gridworld import TIPS, filter_of, report, settings
 

@@ -12,12 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ratslam.backends.classic import RatConfig
+from ratslam.backends.recall import rat
 from ratslam.core.session import Session
-from ratslam.rat import RatConfig
 from ratslam.recall import filter, observation_model
 from ratslam.recall.filter import BASIN, FACING, SAMPLES, SUPPORT, Guidance, RecallConfig
 from ratslam.recall.observation_model import LABEL_TEMPER, LABELS
-from ratslam.recallrat import rat
 from tactile.base.se2 import between, compose, wrap
 from tactile.base.types import Odometry, observation
 

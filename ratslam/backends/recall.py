@@ -12,12 +12,12 @@ from jax import lax
 from ratslam.attractor import adaptive_window, pose_cells
 from ratslam.attractor.config import rings, units
 from ratslam.attractor.pose_cells import Outcome, PoseCells
+from ratslam.backends.classic import Rat, RatConfig, RatEvidence, finite
 from ratslam.classic import view_templates
 from ratslam.core.backend import Backend
 from ratslam.core.types import Action, Estimate
 from ratslam.keyframes.appearance import Appearance, Labels, Touch, Views
 from ratslam.keyframes.map import FrameMap
-from ratslam.rat import Rat, RatConfig, RatEvidence, finite
 from ratslam.recall import filter
 from ratslam.recall.filter import Guidance, Memory, Recollection
 from ratslam.recall.observation_model import by_label, by_touch, by_view

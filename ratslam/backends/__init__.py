@@ -1,0 +1,1 @@
+"""The SLAM methods, one file each."""
