@@ -11,7 +11,7 @@ import numpy as np
 
 from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.trajectory import ate
-from ratslam.config import RunConfig
+from ratslam.config.run_config import RunConfig
 from ratslam.core.session import CHUNK
 from ratslam.pipeline.run import located, open_source
 from ratslam.pipeline.runner import session_of

@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.config import RunConfig
+from ratslam.config.run_config import RunConfig
+from ratslam.config.strict_yaml import Document, override, validate
 from ratslam.trials.touch import TouchTrial, figures, play, session_log, whole
-from ratslam.yamlfile import Document, override, validate
 from robot.simulation.head.session import SimulationConfig, simulated, tier
 from tactile.base.errors import InputError
 

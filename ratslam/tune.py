@@ -17,11 +17,11 @@ import numpy as np
 from evaluation.metrics.experience_metric import base_end, experience_metric
 from evaluation.plots.paper_figures import draw_tuning
 from ratslam.classic.view_templates import TemplateConfig
-from ratslam.config import RunConfig
+from ratslam.config.run_config import RunConfig
+from ratslam.config.strict_yaml import Document, override, validate
 from ratslam.trials.thresholds import classics
 from ratslam.trials.touch import first, lap_ends, session_log, whole
 from ratslam.trials.workers import shared_out
-from ratslam.yamlfile import Document, override, validate
 from robot.sources.in_memory import Log
 from tactile.base.errors import InputError
 from tactile.base.se2 import wrap

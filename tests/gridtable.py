@@ -69,7 +69,7 @@ def run(world: str, row: str, arena: int) -> Figures:
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from ratslam.config import RunConfig
+    from ratslam.config.run_config import RunConfig
     from ratslam.pipeline.run import open_source
     from ratslam.pipeline.runner import readings, session_of
     from robot.touch_source import sensing

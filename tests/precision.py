@@ -99,7 +99,7 @@ def sessions(task: Task) -> dict[str, Figures]:
 
     jax.config.update("jax_enable_x64", True)
     from evaluation.metrics.trajectory import ate
-    from ratslam.config import RunConfig
+    from ratslam.config.run_config import RunConfig
     from ratslam.trials.touch import figures, play, session_log
 
     simulation = SESSION | {"seed": task.seed, "maze": {"seed": task.seed}}

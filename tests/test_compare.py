@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from ratslam.cli import main
 from ratslam.compare import RECKONED, Compared, _judged, _played, compared, report
-from ratslam.config import RunConfig
+from ratslam.config.run_config import RunConfig
 from tactile.base.errors import InputError
 from tactile.base.se2 import compose
 

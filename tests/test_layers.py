@@ -36,7 +36,7 @@ VIOLATIONS = {
         ("ratslam.attractor.pose_cells", "ratslam.classic.view_templates"),
         ("ratslam.classic.places", "ratslam.classic.experience_map"),
         ("ratslam.backends.classic", "ratslam.core.session"),
-        ("ratslam.core.session", "ratslam.config"),
+        ("ratslam.core.session", "ratslam.config.run_config"),
         ("ratslam.planted", "ratslam.core.types"),
     ],
     "the session knows backends by the seam alone": [

@@ -114,7 +114,7 @@ def replayed(kind: str, steps: int, folder: Path) -> dict[str, Any]:
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from ratslam.config import RunConfig
+    from ratslam.config.run_config import RunConfig
     from ratslam.pipeline.backend_registry import telling
     from ratslam.pipeline.run import replayed as through
     from ratslam.pipeline.run_directory import RunDirectory

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import ratslam.reproduce
 from ratslam.cli import main
 from ratslam.cli.touch import NAMES
-from ratslam.config import RunConfig
+from ratslam.config.run_config import RunConfig
 from ratslam.reproduce import jobs_of, matched, reproduce
 from ratslam.reproduce.extras import across, directions, lap_of
 from ratslam.reproduce.protocols import PROTOCOLS, THRESHOLDS, Claim

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from ratslam.cli import main
-from ratslam.config import RunConfig
+from ratslam.config.run_config import RunConfig
 from ratslam.pipeline.run import open_source, simulate
 from ratslam.trials import trial
 from robot.recordings.mcap_reader import Recording

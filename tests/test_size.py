@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from evaluation.metrics.scorecard import Quantity
 from ratslam.cli import main
-from ratslam.config import RunConfig
+from ratslam.config.run_config import RunConfig
+from ratslam.config.strict_yaml import override, parse, validate
 from ratslam.grid.particle_maps import LAYERS
 from ratslam.pipeline.run import located, open_source
 from ratslam.sizing.proposal import (
@@ -31,7 +32,6 @@ from ratslam.sizing.report import snippet
 from ratslam.sizing.scene import Scene, cheapest, scene_of, short
 from ratslam.sizing.trying import cheaper
 from ratslam.sweeps.results import Result
-from ratslam.yamlfile import override, parse, validate
 
 ROOT = Path(__file__).parents[1]
 GOLDEN = ROOT / "tests" / "golden"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from evaluation.metrics.energy_metric import energy_all_pairs
-from ratslam.config import TOUCH, RunConfig
+from ratslam.config.run_config import TOUCH, RunConfig
 from ratslam.core.session import Session
 from ratslam.keyframes.loop_closures import Verdict
 from ratslam.pipeline.runner import readings, session_of

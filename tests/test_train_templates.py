@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ratslam.cli import main
-from ratslam.config import RunConfig
+from ratslam.config.run_config import RunConfig
 from ratslam.schooling import SECONDS, WAYS, Tried, held_out, report
 from robot.simulation.create.session import RovingConfig, roving
 from robot.simulation.create.template_training import trained

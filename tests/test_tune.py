@@ -15,8 +15,8 @@ from hypothesis.extra import numpy as arrays
 from ratslam.classic import view_templates
 from ratslam.classic.view_templates import TemplateConfig
 from ratslam.cli import main
+from ratslam.config.strict_yaml import parse
 from ratslam.tune import THRESHOLDS, Likeness, Tried, auc, chosen, compared, differences, report, tune
-from ratslam.yamlfile import parse
 from robot.sources.in_memory import Log
 from tactile.base.errors import InputError
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from evaluation.metrics.experience_metric import experience_metric
-from ratslam.config import RunConfig
+from ratslam.config.run_config import RunConfig
 from ratslam.core.types import Action
 from ratslam.pipeline.run import open_source
 from ratslam.pipeline.runner import readings, session_of

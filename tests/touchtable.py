@@ -95,7 +95,7 @@ def run(row: str, maze: int, seed: int, matcher: str = "recall") -> Figures:
     jax.config.update("jax_enable_x64", True)
     from evaluation.metrics.energy_metric import energy_all_pairs
     from evaluation.metrics.experience_metric import ExmConfig, experience_metric
-    from ratslam.config import RunConfig
+    from ratslam.config.run_config import RunConfig
     from ratslam.pipeline.run import open_source
     from ratslam.pipeline.runner import readings, session_of
     from robot.sources.in_memory import collected

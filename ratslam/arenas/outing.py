@@ -15,7 +15,7 @@ import numpy as np
 
 from evaluation.metrics.occupancy_grid import Grid, Truth, centres
 from ratslam.backends.grid import GridFilter
-from ratslam.config import RunConfig
+from ratslam.config.run_config import RunConfig
 from ratslam.core.session import Session, capacity_at
 from ratslam.grid.config import GridConfig
 from ratslam.grid.map_drawing import Marks, draw, marks_of

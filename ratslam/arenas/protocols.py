@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from ratslam.config import RunConfig
-from ratslam.yamlfile import override, parse, validate
+from ratslam.config.run_config import RunConfig
+from ratslam.config.strict_yaml import override, parse, validate
 
 MAPPERS = {
     "blob": ("touch.reports.walls=none",),

@@ -12,7 +12,7 @@ from evaluation.metrics.occupancy_grid import Grid
 from ratslam.arenas.figures import measured, off, scored
 from ratslam.arenas.outing import Mapped, Outing, chart, felt, felt_marks, mapped, outing, truth_of
 from ratslam.arenas.protocols import FILTERED, RECKONED, TRUE
-from ratslam.config import RunConfig
+from ratslam.config.run_config import RunConfig
 from robot.touch_source import reports_of
 from robot.world.arena import Arena
 

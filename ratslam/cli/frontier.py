@@ -84,13 +84,13 @@ def _size(arguments: argparse.Namespace) -> int:
         raise InputError("--cycles", str(arguments.cycles), f"{LEAST} and more")
     settle_threads()
     prepare_jax()
-    from ratslam.config import RunConfig
+    from ratslam.config.run_config import RunConfig
+    from ratslam.config.strict_yaml import load, override, validate
     from ratslam.pipeline.run import located, open_source
     from ratslam.sizing.proposal import proposals
     from ratslam.sizing.report import length_text, proposed_text, snippet, tried_text
     from ratslam.sizing.scene import cheapest, scene_of
     from ratslam.sizing.trying import tried
-    from ratslam.yamlfile import load, override, validate
 
     path = Path(arguments.config)
     config = validate(override(load(path), arguments.set), RunConfig)

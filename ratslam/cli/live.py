@@ -107,9 +107,9 @@ def _configured(arguments: argparse.Namespace, arm: str | None, head: str | None
     Raises:
         InputError: it is not one of a live session.
     """
-    from ratslam.config import RunConfig
+    from ratslam.config.run_config import RunConfig
+    from ratslam.config.strict_yaml import load, override, validate
     from ratslam.pipeline.run import located
-    from ratslam.yamlfile import load, override, validate
 
     given = [f"live.arm.host={arm}"] if arm else []
     given += [f"live.head.address={head}"] if head else []

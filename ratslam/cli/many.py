@@ -40,8 +40,8 @@ def _ablate(arguments: argparse.Namespace) -> int:
 
 def _vary(arguments: argparse.Namespace) -> int:
     prepare_jax()
+    from ratslam.config.strict_yaml import load, override
     from ratslam.trials import variations
-    from ratslam.yamlfile import load, override
 
     if not 0 < arguments.by < 1:
         raise InputError("--by", str(arguments.by), "a share between 0 and 1")

@@ -56,9 +56,9 @@ def _run(arguments: argparse.Namespace) -> int:
     from evaluation.metrics.grid_score import GridScore
     from evaluation.metrics.grid_score import table as chart
     from evaluation.metrics.scorecard import table
-    from ratslam.config import RunConfig
+    from ratslam.config.run_config import RunConfig
+    from ratslam.config.strict_yaml import load, override, validate
     from ratslam.pipeline.run import run
-    from ratslam.yamlfile import load, override, validate
 
     config = validate(override(load(arguments.config), arguments.set), RunConfig)
     directory = arguments.output or Path("runs") / Path(arguments.config).stem
@@ -72,9 +72,9 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _simulate(arguments: argparse.Namespace) -> int:
-    from ratslam.config import RunConfig
+    from ratslam.config.run_config import RunConfig
+    from ratslam.config.strict_yaml import load, override, validate
     from ratslam.pipeline.run import simulate
-    from ratslam.yamlfile import load, override, validate
 
     sets = [*arguments.set, *(["simulation.raw=true"] if arguments.raw else [])]
     config = validate(override(load(arguments.config), sets), RunConfig)
@@ -109,8 +109,8 @@ def _recover(arguments: argparse.Namespace) -> int:
 
 
 def _schema(arguments: argparse.Namespace) -> int:
-    from ratslam.config import RunConfig
-    from ratslam.yamlfile import schema
+    from ratslam.config.run_config import RunConfig
+    from ratslam.config.strict_yaml import schema
 
     text = json.dumps(schema(RunConfig), indent=2) + "\n"
     if arguments.output:

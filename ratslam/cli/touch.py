@@ -73,8 +73,8 @@ def _reproduce(arguments: argparse.Namespace) -> int:
 
 def _tune(arguments: argparse.Namespace) -> int:
     prepare_jax(lasting=False)
+    from ratslam.config.strict_yaml import load, override
     from ratslam.tune import report, save, tune
-    from ratslam.yamlfile import load, override
 
     document = override(load(arguments.config), arguments.set)
     found = tune(document, Path(arguments.config).parent, arguments.workers)
@@ -89,8 +89,8 @@ def _tiers(arguments: argparse.Namespace) -> int:
     if not 0 < arguments.seconds < float("inf"):
         raise InputError("--seconds", str(arguments.seconds), "a time above 0 s")
     prepare_jax(lasting=False)
+    from ratslam.config.strict_yaml import load, override
     from ratslam.tiers import report, tiers
-    from ratslam.yamlfile import load, override
 
     document = override(load(arguments.config), arguments.set)
     print(report(*tiers(document, Path(arguments.config).parent, arguments.seconds)))

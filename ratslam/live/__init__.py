@@ -15,7 +15,7 @@ import numpy as np
 from tqdm import tqdm
 
 from evaluation.metrics.scorecard import Scorecard
-from ratslam.config import RunConfig
+from ratslam.config.run_config import RunConfig
 from ratslam.core.session import CHUNK
 from ratslam.live.mapper import Mapper, Order
 from ratslam.pipeline.run import interrupts, located

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from evaluation.metrics.scorecard import Scorecard
-from ratslam.config import RunConfig
+from ratslam.config.run_config import RunConfig
 from robot.drivers.process_priority import PATIENT, ranked
 from robot.sources.source import Sample
 from tactile.base.errors import InputError

@@ -11,7 +11,7 @@ from ratslam.attractor import pose_cells
 from ratslam.backends import grid
 from ratslam.backends.grid import GridEvidence, GridFilter
 from ratslam.backends.recall import evidence_of, rat
-from ratslam.config import RunConfig
+from ratslam.config.run_config import RunConfig
 from ratslam.core.backend import Backend
 from ratslam.grid.particle_maps import LAYERS
 from tactile.base.errors import InputError

@@ -13,7 +13,7 @@ from typing import Any
 from tqdm import tqdm
 
 from evaluation.metrics.scorecard import Scorecard
-from ratslam.config import RunConfig
+from ratslam.config.run_config import RunConfig
 from ratslam.core.session import CHUNK
 from ratslam.pipeline.runner import Playing, playing
 from robot.recordings.formats import open_recording

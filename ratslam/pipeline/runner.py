@@ -17,14 +17,14 @@ from evaluation.metrics.energy_metric import read_relations
 from evaluation.metrics.scorecard import Scorecard, score
 from evaluation.metrics.trajectory import Anytime, present_error, summary, write_tum
 from evaluation.report import pictures
-from ratslam.config import RunConfig
+from ratslam.config.run_config import RunConfig
+from ratslam.config.strict_yaml import dump
 from ratslam.core.growable_array import Growing
 from ratslam.core.session import CHUNK, Session, Step
 from ratslam.core.types import Action
 from ratslam.pipeline.artifacts import Felt, keep_chart, keep_images, keep_world
 from ratslam.pipeline.backend_registry import Telling, backend_of, telling
 from ratslam.pipeline.run_directory import RunDirectory, read_checkpoint
-from ratslam.yamlfile import dump
 from robot.sources.source import Sample, Source, rig_of
 from robot.touch_source import feelers_of, observation_of
 from tactile.base.errors import InputError

@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.metrics.experience_metric import experience_metric
-from ratslam.config import RunConfig
+from ratslam.config.run_config import RunConfig
+from ratslam.config.strict_yaml import override, parse, validate
 from ratslam.reproduce.extras import extras
 from ratslam.reproduce.pictures import picture
 from ratslam.reproduce.protocols import COMMON, METHODS, PROTOCOLS, SWEPT, THRESHOLDS, Condition, Protocol
@@ -23,7 +24,6 @@ from ratslam.trials.sheet import cells, filled, named, progress
 from ratslam.trials.thresholds import classics
 from ratslam.trials.touch import Played, Task, TouchTrial, chain_free, figures, played, session_log
 from ratslam.trials.workers import shared_out
-from ratslam.yamlfile import override, parse, validate
 from tactile.base.random_streams import stream
 
 KEPT = 3

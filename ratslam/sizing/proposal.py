@@ -9,7 +9,7 @@ import numpy as np
 
 from ratslam.attractor.adaptive_window import SETTLED, rungs
 from ratslam.attractor.config import PoseCellConfig
-from ratslam.config import RunConfig
+from ratslam.config.run_config import RunConfig
 from ratslam.grid.config import DriftConfig
 from ratslam.grid.particle_maps import LAYERS
 from ratslam.pipeline.backend_registry import LIVE_SIDE

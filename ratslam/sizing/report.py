@@ -7,12 +7,12 @@ from typing import Any
 
 import yaml
 
+from ratslam.config.strict_yaml.dumper import Dumper
 from ratslam.frontier.lines import run_time
 from ratslam.frontier.report import number
 from ratslam.sizing.proposal import Proposal
 from ratslam.sizing.trying import Tried
 from ratslam.sweeps.results import Result
-from ratslam.yamlfile.dumper import Dumper
 
 ERRORS = {
     "energy_all": "EM",

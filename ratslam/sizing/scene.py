@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.config import RunConfig
+from ratslam.config.run_config import RunConfig
 from ratslam.pipeline.run import open_source, recorder_of
 from ratslam.tiers import shortened
 from robot.recordings.formats import RecordingConfig

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ratslam.config import RunConfig
+from ratslam.config.run_config import RunConfig
 from ratslam.frontier.cores import one_core
 from ratslam.pipeline.run import open_source
 from ratslam.sizing.proposal import FEWEST, Proposal, with_settings

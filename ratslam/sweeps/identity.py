@@ -8,7 +8,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from ratslam.config import RunConfig
+from ratslam.config.run_config import RunConfig
 
 SEEDS = {"simulation": "simulation.seed", "roving": "roving.seed", "recording": "session.seed"}
 """What `seeds` sets, by what is run on."""

@@ -24,7 +24,7 @@ from evaluation.metrics.grid_error import HEADLINE
 from evaluation.metrics.grid_score import score_grid
 from evaluation.metrics.run_arrays import Run
 from evaluation.metrics.scorecard import Quantity, score
-from ratslam.config import RunConfig
+from ratslam.config.run_config import RunConfig
 from ratslam.core.session import CHUNK, Session
 from ratslam.pipeline.artifacts import truth_of
 from ratslam.pipeline.run import open_source

@@ -6,8 +6,8 @@ import copy
 from collections.abc import Iterable
 from typing import Any
 
-from ratslam.yamlfile import Document, override
-from ratslam.yamlfile.document import KeyPath, Place
+from ratslam.config.strict_yaml import Document, override
+from ratslam.config.strict_yaml.document import KeyPath, Place
 from tactile.base.errors import InputError
 
 

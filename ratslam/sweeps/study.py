@@ -9,14 +9,14 @@ from math import prod
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ratslam.config import RunConfig
+from ratslam.config.run_config import RunConfig
+from ratslam.config.strict_yaml import Document, load, override, validate
+from ratslam.config.strict_yaml.document import KeyPath, Place
+from ratslam.config.strict_yaml.reader import Reader
 from ratslam.pipeline.run import located
 from ratslam.sweeps.identity import digest_of, seed_key, with_seed
 from ratslam.sweeps.placing import named, outermost_first, overlap, put
 from ratslam.sweeps.plan import StudyPlan, TunePlan
-from ratslam.yamlfile import Document, load, override, validate
-from ratslam.yamlfile.document import KeyPath, Place
-from ratslam.yamlfile.reader import Reader
 from tactile.base.errors import InputError, InputErrors
 
 MOST = 100_000

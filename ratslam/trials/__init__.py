@@ -15,12 +15,12 @@ import numpy as np
 from pydantic import BaseModel
 
 from evaluation.metrics.trajectory import ate
-from ratslam.config import RunConfig
+from ratslam.config.run_config import RunConfig
+from ratslam.config.strict_yaml import Document, load, override, validate
 from ratslam.core.session import CHUNK, Session
 from ratslam.pipeline.run import located, open_source
 from ratslam.pipeline.runner import Anytimes, readings, session_of
 from ratslam.trials.workers import shared_out
-from ratslam.yamlfile import Document, load, override, validate
 from robot.sources.in_memory import Log, collected
 from robot.sources.perturbation import perturbed
 from robot.touch_source import sensing

@@ -16,7 +16,7 @@ from jax import lax
 
 from ratslam.backends.classic import Rat, RatConfig, RatEvidence
 from ratslam.classic.experience_map import ExperienceMap
-from ratslam.config import RunConfig
+from ratslam.config.run_config import RunConfig
 from ratslam.core.types import Estimate
 from ratslam.trials.touch import Played, room_for, told
 from robot.sources.in_memory import Log

@@ -16,7 +16,7 @@ from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.experience_metric import ExmConfig, ExperienceMetric, experience_metric
 from ratslam.backends.classic import RatConfig
 from ratslam.backends.recall import rat
-from ratslam.config import RunConfig, SessionConfig
+from ratslam.config.run_config import RunConfig, SessionConfig
 from ratslam.core.session import Session, capacity_at
 from ratslam.pipeline.run import located, open_source
 from ratslam.trials.controls import Control, controlled

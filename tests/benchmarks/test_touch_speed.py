@@ -9,7 +9,7 @@ import pytest
 
 from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.experience_metric import experience_metric
-from ratslam.config import RunConfig
+from ratslam.config.run_config import RunConfig
 from ratslam.pipeline.run import open_source
 from ratslam.pipeline.runner import readings, session_of
 from robot.touch_source import sensing

@@ -13,9 +13,9 @@ from evaluation.artifacts.run_directory import read_walls
 from evaluation.artifacts.whisker_views import read_images
 from evaluation.report import redraw
 from ratslam.cli import main
-from ratslam.config import RunConfig
+from ratslam.config.run_config import RunConfig
+from ratslam.config.strict_yaml import load, validate
 from ratslam.pipeline.run import located, open_source
-from ratslam.yamlfile import load, validate
 from robot.touch_source import sensing
 from robot.world.scene import MazeConfig
 

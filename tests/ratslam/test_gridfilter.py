@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ratslam.backends.grid import Outcome
-from ratslam.config import RunConfig
+from ratslam.config.run_config import RunConfig
 from ratslam.core.session import Session
 from ratslam.grid import likelihoods, particle_maps
 from ratslam.grid.particle_maps import COSINE, EVIDENCE, SINE

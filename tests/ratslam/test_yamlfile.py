@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import Field, model_validator
 
-from ratslam.yamlfile import dump, load, override, parse, schema, validate
+from ratslam.config.strict_yaml import dump, load, override, parse, schema, validate
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ratslam.cli import main
-from ratslam.config import RunConfig
+from ratslam.config.run_config import RunConfig
 from ratslam.keyframes.config import FrameMapConfig
 from ratslam.sweeps.plan import StudyPlan
 from ratslam.sweeps.study import Study, jobs, read_study

@@ -6,7 +6,7 @@ from typing import Any
 
 import yaml
 
-from ratslam.yamlfile.scalars import plain
+from ratslam.config.strict_yaml.scalars import plain
 
 _TEXT = "tag:yaml.org,2002:str"
 

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_ori
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from ratslam.yamlfile.document import Document, KeyPath, either, shown
+from ratslam.config.strict_yaml.document import Document, KeyPath, either, shown
 from tactile.base.errors import InputError
 
 _MAX_ERRORS = 50

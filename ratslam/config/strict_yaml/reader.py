@@ -13,8 +13,8 @@ from typing import Any
 
 import yaml
 
-from ratslam.yamlfile.document import KeyPath, Place, label, shown
-from ratslam.yamlfile.scalars import Refused, plain
+from ratslam.config.strict_yaml.document import KeyPath, Place, label, shown
+from ratslam.config.strict_yaml.scalars import Refused, plain
 from tactile.base.errors import InputError, InputErrors
 
 _MAX_DEPTH = 32

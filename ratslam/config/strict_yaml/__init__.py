@@ -12,10 +12,10 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from ratslam.yamlfile.complaints import complaints
-from ratslam.yamlfile.document import Document, KeyPath, Place, dotted, shown
-from ratslam.yamlfile.dumper import Dumper
-from ratslam.yamlfile.reader import Reader
+from ratslam.config.strict_yaml.document import Document, KeyPath, Place, dotted, shown
+from ratslam.config.strict_yaml.dumper import Dumper
+from ratslam.config.strict_yaml.reader import Reader
+from ratslam.config.strict_yaml.validation_errors import complaints
 from tactile.base.errors import InputError, InputErrors
 
 Model = TypeVar("Model", bound=BaseModel)

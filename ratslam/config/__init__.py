@@ -1,0 +1,1 @@
+"""The configuration of a run: read from YAML, completed once for its source, written back."""
