@@ -39,7 +39,7 @@ def add(command: Add) -> None:
 def _live(arguments: argparse.Namespace) -> int:
     prepare_jax()
     from evaluation.metrics.scorecard import table
-    from ratslam.live import live
+    from ratslam.live.session import live
     from robot.drivers.outcome import Outcome
 
     config = _configured(arguments, arguments.ur_host, arguments.head)

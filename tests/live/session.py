@@ -13,9 +13,10 @@ from typing import Any
 
 
 def main() -> int:
-    import ratslam.live
+    import ratslam.live.session.session
+    from ratslam.live.session.session import live
+
     from ratslam.cli import main as program
-    from ratslam.live import live
     from robot.live import selftest
     from tests.live import stub
 
@@ -23,7 +24,7 @@ def main() -> int:
     told: dict[str, Any] = json.loads(sys.stdin.readline())
     arguments = told["arguments"]
     directory = arguments[arguments.index("-o") + 1]
-    ratslam.live.live = partial(live, mapping=partial(stub.mapping, directory, told["mapper"]))
+    ratslam.live.session.live = partial(live, mapping=partial(stub.mapping, directory, told["mapper"]))
     selftest.LISTENED = told["listened"]
     return program(arguments)
 

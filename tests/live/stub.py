@@ -28,7 +28,7 @@ def told(number: int, seconds: float) -> Any:
     """What a sample led to."""
     import numpy as np
 
-    from ratslam.live.mapper import Told
+    from ratslam.live.mapper_process import Told
 
     return Told(number, np.zeros(3), -1, "none", seconds)
 
