@@ -10,8 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ratslam.cli import main
-from ratslam.compare import RECKONED, Compared, _judged, _played, compared, report
 from ratslam.config.run_config import RunConfig
+from ratslam.experiments.backend_comparison import (
+    RECKONED,
+    Compared,
+    _judged,
+    _played,
+    compared,
+    report,
+)
 from tactile.base.errors import InputError
 from tactile.base.se2 import compose
 

@@ -12,15 +12,25 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import ratslam.arenas
-from ratslam.arenas import jobs_of, reproduce
-from ratslam.arenas.figures import AWAY, FIELDS, measured, revisits
-from ratslam.arenas.orders import MEASURES, Measure, order, orders
-from ratslam.arenas.outing import ROOM, chart, felt, felt_marks, mapped, outing, span, started, truth_of
-from ratslam.arenas.protocols import FILTERED, MAPPERS, PAPERS, PROTOCOLS, RECKONED, TRUE
-from ratslam.arenas.trials import Result, results
+import ratslam.experiments.fox2012
 from ratslam.cli import main
 from ratslam.cli.arena import SETS
+from ratslam.experiments.fox2012 import jobs_of, reproduce
+from ratslam.experiments.fox2012.mapper_ranking import MEASURES, Measure, order, orders
+from ratslam.experiments.fox2012.metrics import AWAY, FIELDS, measured, revisits
+from ratslam.experiments.fox2012.protocols import FILTERED, MAPPERS, PAPERS, PROTOCOLS, RECKONED, TRUE
+from ratslam.experiments.fox2012.session import (
+    ROOM,
+    chart,
+    felt,
+    felt_marks,
+    mapped,
+    outing,
+    span,
+    started,
+    truth_of,
+)
+from ratslam.experiments.fox2012.trials import Result, results
 from ratslam.grid.config import GridConfig
 from robot.world.arena import Arena, fits
 from robot.world.random_arena import ArenaConfig, arena
@@ -276,7 +286,7 @@ def test_an_interrupt_leaves_what_was_finished(tmp_path: Path, monkeypatch: pyte
         ]
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(ratslam.arenas, "shared_out", interrupted)
+    monkeypatch.setattr(ratslam.experiments.fox2012, "shared_out", interrupted)
     text, stopped = reproduce("fox-fig4", tmp_path, sets=3, workers=1)
     assert stopped
     assert "1 of 3 sets" in text

@@ -18,15 +18,15 @@ from hypothesis import strategies as st
 from evaluation.metrics.scorecard import Quantity
 from evaluation.plots.pareto_plot import Mark, draw_frontier, placed
 from ratslam.cli import main
-from ratslam.frontier import measuring
-from ratslam.frontier.cores import one_core, others
-from ratslam.frontier.errors import error_named, usual_error
-from ratslam.frontier.lines import lines
-from ratslam.frontier.pareto import optimal
-from ratslam.sweeps.jobs import machine
-from ratslam.sweeps.pool import FOLDER
-from ratslam.sweeps.results import Result, Timing, write_result
-from ratslam.sweeps.study import read_study
+from ratslam.experiments.pareto import benchmark
+from ratslam.experiments.pareto.cpu_affinity import one_core, others
+from ratslam.experiments.pareto.error_metrics import error_named, usual_error
+from ratslam.experiments.pareto.pareto_front import optimal
+from ratslam.experiments.pareto.summary import lines
+from ratslam.experiments.studies.executor import FOLDER
+from ratslam.experiments.studies.results import Result, Timing, write_result
+from ratslam.experiments.studies.run_job import machine
+from ratslam.experiments.studies.study import read_study
 from tactile.base.errors import InputError
 
 ROOT = Path(__file__).parents[1]

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from tests.gridtable import Figures, run
+from ratslam.experiments.tables.grid import Figures, run
 
 FEW, MANY = (9100, 9101), tuple(range(9100, 9108))
 

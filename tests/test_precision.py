@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ratslam.experiments.tables import chaos, precision
 from tactile.base.random_streams import stream
-from tests import chaos, precision
 
 
 @pytest.mark.parametrize("count", [9, 20, 33])
@@ -50,7 +50,7 @@ def test_float32_maps_as_well_as_float64(matcher):
 
 @pytest.mark.soak
 def test_runs_that_differ_by_one_rounding_agree_for_a_thousand_steps():
-    """And no test may ask for much more: `python -m tests.chaos` says when they part."""
+    """And no test may ask for much more: `python -m ratslam.experiments.tables.chaos` says when they part."""
     walk = chaos.walk(0, 1000)
     assert chaos.parted(*chaos.PAIRS["one-cell"], walk).max() < 1e-10
     assert chaos.parted(*chaos.PAIRS["window, dense"], walk).max() < 1e-10

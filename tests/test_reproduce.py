@@ -9,17 +9,25 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import ratslam.reproduce
+import ratslam.experiments.salman2016
 from ratslam.cli import main
 from ratslam.cli.touch import NAMES
 from ratslam.config.run_config import RunConfig
-from ratslam.reproduce import jobs_of, matched, reproduce
-from ratslam.reproduce.extras import across, directions, lap_of
-from ratslam.reproduce.protocols import PROTOCOLS, THRESHOLDS, Claim
-from ratslam.reproduce.verdicts import Row, column, table, verdict
-from ratslam.trials.controls import controlled
-from ratslam.trials.thresholds import classics, mapped
-from ratslam.trials.touch import Played, figures, first, lap_ends, play, room_for, session_log
+from ratslam.experiments.salman2016 import jobs_of, matched, reproduce
+from ratslam.experiments.salman2016.claims import Row, column, table, verdict
+from ratslam.experiments.salman2016.direction_metrics import across, directions, lap_of
+from ratslam.experiments.salman2016.protocols import PROTOCOLS, THRESHOLDS, Claim
+from ratslam.experiments.trials.controls import controlled
+from ratslam.experiments.trials.threshold_sweep import classics, mapped
+from ratslam.experiments.trials.touch_trial import (
+    Played,
+    figures,
+    first,
+    lap_ends,
+    play,
+    room_for,
+    session_log,
+)
 from tactile.base.errors import InputError
 from tactile.base.se2 import compose
 
@@ -334,7 +342,7 @@ def test_an_interrupt_leaves_what_was_finished(tmp_path, monkeypatch):
         yield from (session(square("CCC")) for _ in tasks[:2])
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(ratslam.reproduce, "shared_out", interrupted)
+    monkeypatch.setattr(ratslam.experiments.salman2016, "shared_out", interrupted)
     text, stopped = reproduce("fig2", tmp_path, sets=1, workers=1, assignments=TINY)
     assert stopped
     assert "Odometry drift" in text

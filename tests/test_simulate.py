@@ -14,8 +14,8 @@ import pytest
 
 from ratslam.cli import main
 from ratslam.config.run_config import RunConfig
+from ratslam.experiments.trials.ablation import trial
 from ratslam.pipeline.run import open_source, simulate
-from ratslam.trials import trial
 from robot.recordings.mcap_reader import Recording
 from robot.simulation.head.session import simulated
 from robot.touch_source import sensing

@@ -14,9 +14,7 @@ from evaluation.metrics.scorecard import Quantity
 from ratslam.cli import main
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import override, parse, validate
-from ratslam.grid.particle_maps import LAYERS
-from ratslam.pipeline.run import located, open_source
-from ratslam.sizing.proposal import (
+from ratslam.experiments.sizing.recommendation import (
     FEWEST,
     MEMORY,
     MOST,
@@ -28,10 +26,12 @@ from ratslam.sizing.proposal import (
     proposals,
     with_settings,
 )
-from ratslam.sizing.report import snippet
-from ratslam.sizing.scene import Scene, cheapest, scene_of, short
-from ratslam.sizing.trying import cheaper
-from ratslam.sweeps.results import Result
+from ratslam.experiments.sizing.report import snippet
+from ratslam.experiments.sizing.scene_statistics import Scene, cheapest, scene_of, short
+from ratslam.experiments.sizing.trial_runs import cheaper
+from ratslam.experiments.studies.results import Result
+from ratslam.grid.particle_maps import LAYERS
+from ratslam.pipeline.run import located, open_source
 
 ROOT = Path(__file__).parents[1]
 GOLDEN = ROOT / "tests" / "golden"

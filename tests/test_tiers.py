@@ -10,7 +10,7 @@ from hypothesis.extra import numpy as arrays
 
 from ratslam.cli import main
 from ratslam.config.run_config import RunConfig
-from ratslam.tiers import METHODS, TIERS, shortened, unlike
+from ratslam.experiments.fidelity_comparison import METHODS, TIERS, shortened, unlike
 
 VIEWS = arrays.arrays(float, (5, 3, 6, 1), elements=st.sampled_from([0.0, 0.02, 0.5, 1.0]))
 

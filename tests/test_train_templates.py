@@ -9,7 +9,7 @@ import pytest
 
 from ratslam.cli import main
 from ratslam.config.run_config import RunConfig
-from ratslam.schooling import SECONDS, WAYS, Tried, held_out, report
+from ratslam.experiments.fox2012.template_training import SECONDS, WAYS, Tried, held_out, report
 from robot.simulation.create.session import RovingConfig, roving
 from robot.simulation.create.template_training import trained
 from robot.touch_source import observation_of, sensing

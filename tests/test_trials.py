@@ -10,7 +10,7 @@ import pytest
 from ratslam.cli import main
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import load, override, validate
-from ratslam.trials import PARTS, Trial, row, trial, variations
+from ratslam.experiments.trials.ablation import PARTS, Trial, row, trial, variations
 from robot.recordings.npz_trace import read_stream
 from robot.sources import perturbation
 from robot.sources.perturbation import perturbed

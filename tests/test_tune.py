@@ -16,7 +16,17 @@ from ratslam.classic import view_templates
 from ratslam.classic.view_templates import TemplateConfig
 from ratslam.cli import main
 from ratslam.config.strict_yaml import parse
-from ratslam.tune import THRESHOLDS, Likeness, Tried, auc, chosen, compared, differences, report, tune
+from ratslam.experiments.salman2016.threshold_tuning import (
+    THRESHOLDS,
+    Likeness,
+    Tried,
+    auc,
+    chosen,
+    compared,
+    differences,
+    report,
+    tune,
+)
 from robot.sources.in_memory import Log
 from tactile.base.errors import InputError
 

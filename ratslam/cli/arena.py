@@ -31,8 +31,8 @@ def add(command: Add) -> None:
 def _train(arguments: argparse.Namespace) -> int:
     from ratslam.config.run_config import RunConfig
     from ratslam.config.strict_yaml import load, override, validate
+    from ratslam.experiments.fox2012.template_training import held_out, report, schooled
     from ratslam.pipeline.run import located
-    from ratslam.schooling import held_out, report, schooled
 
     config = validate(override(load(arguments.config), arguments.set), RunConfig)
     roving = located(config, Path(arguments.config).parent.resolve()).roving
@@ -50,9 +50,9 @@ def _train(arguments: argparse.Namespace) -> int:
 
 def _compare(arguments: argparse.Namespace) -> int:
     prepare_jax(lasting=False)
-    from ratslam.compare import compared, report
     from ratslam.config.run_config import RunConfig
     from ratslam.config.strict_yaml import load, override, validate
+    from ratslam.experiments.backend_comparison import compared, report
 
     config = validate(override(load(arguments.config), arguments.set), RunConfig)
     print(report(compared(config, Path(arguments.config).parent)))

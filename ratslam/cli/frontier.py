@@ -46,14 +46,14 @@ def add(command: Add) -> None:
 def _frontier(arguments: argparse.Namespace) -> int:
     settle_threads()
     prepare_jax()
-    from ratslam.frontier.circumstances import circumstances, disturbances, most_others
-    from ratslam.frontier.errors import error_named, usual_error
-    from ratslam.frontier.lines import grouped, lines
-    from ratslam.frontier.measuring import measured
-    from ratslam.frontier.report import Frontier, save, text
-    from ratslam.sweeps.pool import FOLDER
-    from ratslam.sweeps.report import remarks
-    from ratslam.sweeps.study import jobs, read_study
+    from ratslam.experiments.pareto.benchmark import measured
+    from ratslam.experiments.pareto.environment import circumstances, disturbances, most_others
+    from ratslam.experiments.pareto.error_metrics import error_named, usual_error
+    from ratslam.experiments.pareto.report import Frontier, save, text
+    from ratslam.experiments.pareto.summary import grouped, lines
+    from ratslam.experiments.studies.executor import FOLDER
+    from ratslam.experiments.studies.report import remarks
+    from ratslam.experiments.studies.study import jobs, read_study
 
     error = error_named(arguments.error) if arguments.error else None
     study = read_study(arguments.study, arguments.set)
@@ -86,11 +86,11 @@ def _size(arguments: argparse.Namespace) -> int:
     prepare_jax()
     from ratslam.config.run_config import RunConfig
     from ratslam.config.strict_yaml import load, override, validate
+    from ratslam.experiments.sizing.recommendation import proposals
+    from ratslam.experiments.sizing.report import length_text, proposed_text, snippet, tried_text
+    from ratslam.experiments.sizing.scene_statistics import cheapest, scene_of
+    from ratslam.experiments.sizing.trial_runs import tried
     from ratslam.pipeline.run import located, open_source
-    from ratslam.sizing.proposal import proposals
-    from ratslam.sizing.report import length_text, proposed_text, snippet, tried_text
-    from ratslam.sizing.scene import cheapest, scene_of
-    from ratslam.sizing.trying import tried
 
     path = Path(arguments.config)
     config = validate(override(load(path), arguments.set), RunConfig)

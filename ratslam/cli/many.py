@@ -32,7 +32,7 @@ def add(command: Add) -> None:
 
 def _ablate(arguments: argparse.Namespace) -> int:
     prepare_jax()
-    from ratslam.trials import PARTS
+    from ratslam.experiments.trials.ablation import PARTS
 
     _table(arguments, list(PARTS.items()))
     return 0
@@ -41,7 +41,7 @@ def _ablate(arguments: argparse.Namespace) -> int:
 def _vary(arguments: argparse.Namespace) -> int:
     prepare_jax()
     from ratslam.config.strict_yaml import load, override
-    from ratslam.trials import variations
+    from ratslam.experiments.trials.ablation import variations
 
     if not 0 < arguments.by < 1:
         raise InputError("--by", str(arguments.by), "a share between 0 and 1")
@@ -62,7 +62,7 @@ def _vary(arguments: argparse.Namespace) -> int:
 
 def _spread(arguments: argparse.Namespace) -> int:
     prepare_jax()
-    from ratslam.trials import HEADER, compare, row
+    from ratslam.experiments.trials.ablation import HEADER, compare, row
 
     print(HEADER)
     variants = [((), seed) for seed in range(arguments.runs + 1)]
@@ -76,7 +76,7 @@ def _spread(arguments: argparse.Namespace) -> int:
 
 def _table(arguments: argparse.Namespace, lines: list[tuple[str, tuple[str, ...]]]) -> list[float]:
     """Prints a row as soon as all of its trials are done; returns the final errors."""
-    from ratslam.trials import HEADER, compare, row
+    from ratslam.experiments.trials.ablation import HEADER, compare, row
 
     seeds = range(1, arguments.perturbed + 1) if arguments.perturbed else (0,)
     variants = [(sets, seed) for _, sets in lines for seed in seeds]

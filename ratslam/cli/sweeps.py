@@ -68,7 +68,7 @@ class Progress:
 
     def told(self) -> int:
         """Says what failed; the exit code."""
-        from ratslam.sweeps.report import label
+        from ratslam.experiments.studies.report import label
 
         for result in self.failed:
             where = f"{label(result.row, result.varied)}, seed {result.seed}"
@@ -92,7 +92,7 @@ def settle_threads() -> None:
 def _sweep(arguments: argparse.Namespace) -> int:
     settle_threads()
     prepare_jax()
-    from ratslam.sweeps.study import read_study
+    from ratslam.experiments.studies.study import read_study
 
     study = read_study(arguments.study, arguments.set)
     directory = arguments.output or Path("runs") / study.name
@@ -100,9 +100,9 @@ def _sweep(arguments: argparse.Namespace) -> int:
 
 
 def _table(arguments: argparse.Namespace, study: Any, directory: Path) -> int:
-    from ratslam.sweeps.pool import FOLDER, results
-    from ratslam.sweeps.report import remarks, rows, save, table
-    from ratslam.sweeps.study import jobs
+    from ratslam.experiments.studies.executor import FOLDER, results
+    from ratslam.experiments.studies.report import remarks, rows, save, table
+    from ratslam.experiments.studies.study import jobs
 
     asked = jobs(study)
     with Progress(len({job.key for job in asked}), directory / FOLDER) as progress:
@@ -115,8 +115,8 @@ def _table(arguments: argparse.Namespace, study: Any, directory: Path) -> int:
 
 
 def _tune(arguments: argparse.Namespace, study: Any, directory: Path) -> int:
-    from ratslam.sweeps.pool import FOLDER
-    from ratslam.sweeps.tuning import report, save, tune
+    from ratslam.experiments.studies.executor import FOLDER
+    from ratslam.experiments.studies.tuning import report, save, tune
 
     plan = study.plan
     total = plan.tune and plan.tune.trials * len(plan.every_seed())

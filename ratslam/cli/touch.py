@@ -52,9 +52,9 @@ def _reproduce(arguments: argparse.Namespace) -> int:
         raise InputError("--seed", str(arguments.seed), "a whole number from 0 on")
     prepare_jax(lasting=False)
     if arguments.name in SETS:
-        from ratslam.arenas import reproduce
+        from ratslam.experiments.fox2012 import reproduce
     else:
-        from ratslam.reproduce import reproduce
+        from ratslam.experiments.salman2016 import reproduce
 
     text, interrupted = reproduce(
         arguments.name,
@@ -74,7 +74,7 @@ def _reproduce(arguments: argparse.Namespace) -> int:
 def _tune(arguments: argparse.Namespace) -> int:
     prepare_jax(lasting=False)
     from ratslam.config.strict_yaml import load, override
-    from ratslam.tune import report, save, tune
+    from ratslam.experiments.salman2016.threshold_tuning import report, save, tune
 
     document = override(load(arguments.config), arguments.set)
     found = tune(document, Path(arguments.config).parent, arguments.workers)
@@ -90,7 +90,7 @@ def _tiers(arguments: argparse.Namespace) -> int:
         raise InputError("--seconds", str(arguments.seconds), "a time above 0 s")
     prepare_jax(lasting=False)
     from ratslam.config.strict_yaml import load, override
-    from ratslam.tiers import report, tiers
+    from ratslam.experiments.fidelity_comparison import report, tiers
 
     document = override(load(arguments.config), arguments.set)
     print(report(*tiers(document, Path(arguments.config).parent, arguments.seconds)))

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from evaluation.metrics.scorecard import Quantity
-from ratslam.sweeps.results import Result
-from ratslam.sweeps.study import Job
+from ratslam.experiments.studies.results import Result
+from ratslam.experiments.studies.study import Job
 
 TINY = {
     "simulation.maze": {"columns": 3, "rows": 2, "loop": 6},

@@ -10,12 +10,12 @@ import pytest
 
 from evaluation.artifacts.run_directory import read_card
 from evaluation.metrics.grid_score import score_grid
+from ratslam.experiments.studies.memory import weighed
+from ratslam.experiments.studies.metrics import DIRECTIONS, MEASURED
+from ratslam.experiments.studies.run_job import run_job
+from ratslam.experiments.studies.study import jobs, read_study
+from ratslam.experiments.studies.timing import Stopwatch
 from ratslam.pipeline.run import run
-from ratslam.sweeps.jobs import run_job
-from ratslam.sweeps.memory import weighed
-from ratslam.sweeps.quantities import DIRECTIONS, MEASURED
-from ratslam.sweeps.stopwatch import Stopwatch
-from ratslam.sweeps.study import jobs, read_study
 
 ROOT = Path(__file__).parents[3]
 SMALL = {"simulation.path": {"circuits": "CC"}}

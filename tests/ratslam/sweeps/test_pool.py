@@ -18,9 +18,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ratslam.cli import main
-from ratslam.sweeps.pool import FOLDER, results
-from ratslam.sweeps.results import Result, read_result
-from ratslam.sweeps.study import jobs, read_study
+from ratslam.experiments.studies.executor import FOLDER, results
+from ratslam.experiments.studies.results import Result, read_result
+from ratslam.experiments.studies.study import jobs, read_study
 from tactile.base.errors import InputError
 
 ROOT = Path(__file__).parents[3]

@@ -12,9 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evaluation.metrics.scorecard import Quantity
-from ratslam.sweeps.quantities import DIRECTIONS, MAIN
-from ratslam.sweeps.report import SHORT, label, rows, save, spread, table
-from ratslam.sweeps.results import Memory, Result, Timing, read_result, write_result
+from ratslam.experiments.studies.metrics import DIRECTIONS, MAIN
+from ratslam.experiments.studies.report import SHORT, label, rows, save, spread, table
+from ratslam.experiments.studies.results import Memory, Result, Timing, read_result, write_result
 
 FINITE = st.floats(-1e6, 1e6)
 

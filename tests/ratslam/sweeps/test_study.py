@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from ratslam.cli import main
 from ratslam.config.run_config import RunConfig
+from ratslam.experiments.studies.schema import StudyPlan
+from ratslam.experiments.studies.study import Study, jobs, read_study
 from ratslam.keyframes.config import FrameMapConfig
-from ratslam.sweeps.plan import StudyPlan
-from ratslam.sweeps.study import Study, jobs, read_study
 from tactile.base.errors import InputError
 
 ROOT = Path(__file__).parents[3]

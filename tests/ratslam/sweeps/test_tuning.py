@@ -10,10 +10,10 @@ import time
 import pytest
 
 from ratslam.cli import main
-from ratslam.sweeps.journal import JOURNAL, Trial, opened
-from ratslam.sweeps.pool import FOLDER
-from ratslam.sweeps.study import read_study
-from ratslam.sweeps.tuning import report, tune
+from ratslam.experiments.studies.executor import FOLDER
+from ratslam.experiments.studies.optuna_storage import JOURNAL, Trial, opened
+from ratslam.experiments.studies.study import read_study
+from ratslam.experiments.studies.tuning import report, tune
 from tactile.base.errors import InputError
 
 TUNE = {

@@ -1,0 +1,1 @@
+"""Studies, the two papers' figures, and sizing; nothing else imports them."""

@@ -1,0 +1,109 @@
+"""A scene in the numbers that settings follow from, and a short version of it to try them on."""
+
+from __future__ import annotations
+
+from itertools import islice
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ratslam.config.run_config import RunConfig
+from ratslam.experiments.fidelity_comparison import shortened
+from ratslam.pipeline.run import open_source, recorder_of
+from robot.recordings.formats import RecordingConfig
+from robot.sources.source import Source
+from tactile.base.errors import InputError
+from tactile.base.se2 import integrate
+
+STANDING = 0.1
+"""A cycle in which less than this share of the longest distance is driven is no driving."""
+USUAL, MOST = 0.5, 0.95
+"""Quantiles that stand for what is usual, and for all but a few."""
+
+
+class Scene(NamedTuple):
+    """A session as its odometry tells it.
+
+    Attributes:
+        name: of the source. cycles: how many. rate: of them, Hz; 0 if unknown. span: [2] m, what the path
+            covers along x and y. usual, most: distance driven in a cycle, where one is driven, m: the median
+            and the 95 % quantile. turn: the 95 % quantile of the angle turned by in a cycle, rad.
+    """
+
+    name: str
+    cycles: int
+    rate: float
+    span: tuple[float, float]
+    usual: float
+    most: float
+    turn: float
+
+    def told(self) -> str:
+        """In a sentence."""
+        pace = f" at {self.rate:.3g} Hz, {self.usual * self.rate:.3g} m/s" if self.rate else ""
+        return (
+            f"{self.name}: {self.cycles} cycles{pace}; odometry spans {self.span[0]:.3g} x "
+            f"{self.span[1]:.3g} m, {self.usual:.2g} m a cycle (95 %: {self.most:.2g}), turns up to "
+            f"{self.turn:.2g} rad (95 %)"
+        )
+
+
+def cheapest(config: RunConfig) -> RunConfig:
+    """The configuration with as little simulated as odometry needs."""
+    if config.simulation is None:
+        return config
+    update = {"fidelity": "kinematic", "raw": False}
+    return config.model_copy(update={"simulation": config.simulation.model_copy(update=update)})
+
+
+def scene_of(source: Source) -> Scene:
+    """The numbers of a source.
+
+    Raises:
+        InputError: it has no samples, or its odometry is not finite.
+    """
+    moves = np.array([sample.reading.odometry[:3] for sample in source], float).reshape(-1, 3)
+    moves = moves[np.isfinite(moves).all(axis=1)]
+    if not len(moves):
+        raise InputError(source.name, "no odometry", "a session that goes somewhere")
+    path = integrate(moves)[:, :2]
+    distance, turn = np.hypot(moves[:, 0], moves[:, 1]), np.abs(moves[:, 2])
+    driving = distance[distance > STANDING * distance.max()]
+    if not len(driving):
+        raise InputError(source.name, "a robot that never moves", "a session that goes somewhere")
+    width, height = np.ptp(path, axis=0)
+    return Scene(
+        name=source.name,
+        cycles=len(moves),
+        rate=source.rate_hz,
+        span=(float(width), float(height)),
+        usual=float(np.quantile(driving, USUAL)),
+        most=float(np.quantile(driving, MOST)),
+        turn=float(np.quantile(turn, MOST)),
+    )
+
+
+def short(config: RunConfig, cycles: int, folder: Path) -> RunConfig:
+    """The configuration of about so many cycles: of circuits whole ones, two at least; of a recording its
+    beginning, which is copied to the folder.
+
+    Raises:
+        InputError: the recording cannot be read.
+    """
+    if config.roving is not None:
+        return config.model_copy(
+            update={"roving": config.roving.model_copy(update={"reports": _reports(config, cycles)})}
+        )
+    if config.simulation is not None:
+        return shortened(config, cycles / config.simulation.whisking.rate)
+    path = folder / "beginning.mcap"
+    with open_source(config) as source, recorder_of(path, source) as recorder:
+        for sample in islice(source, cycles):
+            recorder.write(sample)
+    return config.model_copy(update={"recording": RecordingConfig(file=path)})
+
+
+def _reports(config: RunConfig, cycles: int) -> int:
+    assert config.roving is not None
+    return min(config.roving.reports or cycles, cycles)

@@ -1,0 +1,1 @@
+"""Touch sessions repeated over mazes and seeds."""

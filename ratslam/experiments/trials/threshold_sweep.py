@@ -1,0 +1,85 @@
+"""The classic matcher at many matching thresholds, in one compiled batch over one session.
+
+Which experience is current is decided in the kernel, so the Experience Metric needs no map; a map is folded
+only for a threshold that one is wanted of.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from ratslam.backends.classic import Rat, RatConfig, RatEvidence
+from ratslam.classic.experience_map import ExperienceMap
+from ratslam.config.run_config import RunConfig
+from ratslam.core.types import Estimate
+from ratslam.experiments.trials.touch_trial import Played, room_for, told
+from robot.sources.in_memory import Log
+from robot.touch_source import observation_of
+from tactile.base.types import Array, Observation, stack
+
+
+class Batch(NamedTuple):
+    """A session at B thresholds; T steps.
+
+    Attributes:
+        threshold: [B]. place: [B, T] current experience. estimate, evidence: of all steps, leading axes
+            [B, T].
+    """
+
+    threshold: np.ndarray
+    place: np.ndarray
+    estimate: Estimate
+    evidence: RatEvidence
+
+
+def classics(config: RunConfig, log: Log, thresholds: np.ndarray) -> Batch:
+    """Runs the classic matcher at thresholds [B] over the same views.
+
+    Raises:
+        ValueError: the configuration's matcher is another.
+    """
+    if config.matcher != "classic":
+        raise ValueError(f"thresholds are the classic matcher's, not {config.matcher}'s")
+    dtype = np.dtype(config.session.precision)
+    if dtype == np.float64:
+        jax.config.update("jax_enable_x64", True)
+    rows = room_for(log.length)
+    readings = [observation_of(sample) for sample in log]
+    chunk = stack(readings + readings[-1:] * (rows - len(readings)))  # steps beyond the last are cut off
+    found = _batch(config.rat(), log.view_shape, dtype.name, jnp.asarray(thresholds, dtype), chunk)
+    estimate, evidence = jax.tree.map(lambda column: np.asarray(column)[:, : log.length], found)
+    return Batch(np.asarray(thresholds), estimate.place, estimate, evidence)
+
+
+def mapped(config: RunConfig, log: Log, batch: Batch, number: int) -> Played:
+    """What the session leads to at one of the thresholds, map and all."""
+    map = ExperienceMap(config.experience)
+    for row, sample in enumerate(log):
+        one: Any = jax.tree.map(lambda column, row=row: column[number, row], batch[2:])
+        map.update(observation_of(sample), *one)
+    return told(log, batch.place[number], map)
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def _batch(
+    config: RatConfig, shape: tuple[int, int, int], dtype: str, thresholds: Array, chunk: Observation
+) -> tuple[Estimate, RatEvidence]:
+    rows = chunk.label.shape[0]
+
+    def one(threshold: Array) -> tuple[Estimate, RatEvidence]:
+        matching = config.templates.model_copy(update={"threshold": threshold})
+        backend = Rat(config.model_copy(update={"templates": matching}), shape, np.dtype(dtype))
+
+        def step(state: Any, observation: Observation) -> tuple[Any, tuple[Estimate, RatEvidence]]:
+            state, estimate, evidence = backend.kernel(state, observation)
+            return state, (estimate, evidence)
+
+        return lax.scan(step, backend.init(None, rows), chunk)[1]
+
+    return lax.map(one, thresholds)  # in turn: side by side, all branches of the network would be computed
