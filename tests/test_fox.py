@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 import ratslam.experiments.fox2012
 from ratslam.cli import main
-from ratslam.cli.arena import SETS
+from ratslam.cli.create import SETS
 from ratslam.experiments.fox2012 import jobs_of, reproduce
 from ratslam.experiments.fox2012.mapper_ranking import MEASURES, Measure, order, orders
 from ratslam.experiments.fox2012.metrics import AWAY, FIELDS, measured, revisits

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import ratslam.experiments.salman2016
 from ratslam.cli import main
-from ratslam.cli.touch import NAMES
+from ratslam.cli.reproduce import NAMES
 from ratslam.config.run_config import RunConfig
 from ratslam.experiments.salman2016 import jobs_of, matched, reproduce
 from ratslam.experiments.salman2016.claims import Row, column, table, verdict

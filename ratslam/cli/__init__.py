@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable
 
 # Only what parsing arguments needs is imported here: `--help` answers before jax would have loaded.
-from ratslam.cli import arena, frontier, live, many, sessions, sweeps, touch, watch
+from ratslam.cli import ablation, create, live, pareto, reproduce, run, studies, watch
 from ratslam.cli.common import INTERRUPTED, MENDABLE
 from tactile.base.errors import InputError
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ratslam.cli.arena import SETS
 from ratslam.cli.common import INTERRUPTED, Add, configured, count, prepare_jax, settable, shared
+from ratslam.cli.create import SETS
 from tactile.base.errors import InputError
 
 NAMES = ("fig2", "fig3", "fig4", "fig5", "fig6", "fig7", "reverse", "controls", "matched")

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from ratslam.cli.common import Add, configured, count, prepare_jax, settable, shared
-from ratslam.cli.sweeps import Progress, settle_threads
+from ratslam.cli.studies import Progress, settle_threads
 from tactile.base.errors import InputError
 
 CYCLES = 800
