@@ -1,0 +1,134 @@
+"""The pictures that a run on touch leaves, and the configurations that lead to them."""
+
+from __future__ import annotations
+
+import shutil
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evaluation.artifacts.run_directory import read_walls
+from evaluation.artifacts.whisker_views import read_images
+from evaluation.report import redraw
+from ratslam.cli import main
+from ratslam.config.run_config import RunConfig
+from ratslam.config.strict_yaml import load, validate
+from ratslam.pipeline.run import located, open_source
+from robot.touch_source import sensing
+from robot.world.scene import MazeConfig
+
+ROOT = Path(__file__).parents[3]
+PICTURES = ("map.png", "whiskers.png", "experiences.png")
+KEPT = ("walls.csv", "views.npz", "maze.txt")
+CONFIG = """
+simulation: {path: {explore: 40}, maze: {heights: [0.03, 0.05]}, seed: 3}
+touch: {head: {dead: [4]}}
+matcher: classic
+"""
+TOUCH = sorted(path.stem for path in (ROOT / "configs").glob("whisker_*.yaml"))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A tiny session on touch: run, and written to a file that is run."""
+    path = tmp_path_factory.mktemp("pictures")
+    (path / "config.yaml").write_text(CONFIG)
+    (path / "replay.yaml").write_text("recording: {file: session.mcap}\nmatcher: classic\n")
+    assert main(["simulate", str(path / "config.yaml"), "-o", str(path / "session.mcap")]) == 0
+    assert main(["run", str(path / "config.yaml"), "-o", str(path / "run")]) == 0
+    assert main(["run", str(path / "replay.yaml"), "-o", str(path / "replayed")]) == 0
+    return path
+
+
+def size(path):
+    """Width and height of a PNG in pixels."""
+    head = path.read_bytes()[:24]
+    assert head[:8] == b"\x89PNG\r\n\x1a\n"
+    return struct.unpack(">II", head[16:24])
+
+
+@pytest.mark.parametrize("name", PICTURES)
+def test_a_run_on_touch_leaves_pictures(folder, name):
+    width, height = size(folder / "run" / name)
+    assert width == 1200
+    assert 500 < height < 2500
+
+
+def test_pictures_are_drawn_again_from_the_directory_alone(folder, tmp_path):
+    elsewhere = tmp_path / "moved"
+    shutil.copytree(folder / "run", elsewhere, ignore=shutil.ignore_patterns("*.png"))
+    redraw(elsewhere)
+    for name in PICTURES:
+        assert (elsewhere / name).read_bytes() == (folder / "run" / name).read_bytes(), name
+
+
+def test_a_replayed_session_knows_its_maze_and_images(folder):
+    for name in KEPT:
+        assert (folder / "run" / name).read_bytes() == (folder / "replayed" / name).read_bytes(), name
+
+
+def test_what_is_kept_is_what_was_felt_and_where(folder):
+    config = located(validate(load(folder / "config.yaml"), RunConfig), folder)
+    source = open_source(config)
+    boxes = source.scene.surroundings.walls
+    assert np.array_equal(read_walls(folder / "run"), np.column_stack(boxes))
+    assert len(np.unique(boxes.height)) == 2
+    given = [sample.reading for sample in sensing(source, config.touch)]
+    images = read_images(folder / "run" / "views.npz")
+    assert np.abs(images.view - np.array([g.view[..., 0] for g in given])).max() <= 1 / 255
+    assert np.array_equal(images.alive.reshape(-1, 18), np.array([g.alive for g in given]))
+    assert not images.alive[:, 0, 4].any()
+    assert images.azimuth == pytest.approx(np.radians([0, 60, 120, 180, -120, -60]))
+    assert images.length == pytest.approx([0.05, 0.11, 0.16])
+
+
+def test_the_maze_that_was_kept_can_be_run(folder):
+    kept = MazeConfig(file=folder / "run" / "maze.txt")
+    config = RunConfig.model_validate({"simulation": {"maze": kept, "path": {"explore": 5}}})
+    assert open_source(config).length == 5
+
+
+def test_what_is_kept_is_small(folder):
+    assert sum((folder / "run" / name).stat().st_size for name in KEPT) < 10_000
+
+
+def test_a_session_without_whiskers_has_only_its_map(folder, tmp_path):
+    square = ROOT / "configs" / "square.yaml"
+    assert main(["run", str(square), "-o", str(tmp_path / "run"), "--set", "matcher=classic"]) == 0
+    assert [path.name for path in (tmp_path / "run").glob("*.png")] == ["map.png"]
+    assert not {path.name for path in (tmp_path / "run").iterdir()} & set(KEPT)
+
+
+@pytest.mark.parametrize("name", TOUCH)
+def test_a_config_says_where_it_comes_from_and_only_what_is_not_default(name):
+    """Every leaf that a configuration sets differs from what would be without it."""
+    path = ROOT / "configs" / f"{name}.yaml"
+    first = path.read_text().splitlines()[0]
+    assert first.startswith("# Salman & Pearson 2016, ")
+    document = load(path)
+    whole = validate(document, RunConfig).model_dump(mode="json")
+    plain = RunConfig.model_validate({"simulation": {}}).model_dump(mode="json")
+
+    def leaves(part, *keys):
+        if isinstance(part, dict):
+            return [leaf for key, value in part.items() for leaf in leaves(value, *keys, key)]
+        return [keys]
+
+    set_here = leaves(validate(document, RunConfig).model_dump(mode="json", exclude_unset=True))
+    assert set_here
+    for keys in set_here:
+        ours, default = whole, plain
+        for key in keys:
+            ours, default = ours[key], default[key]
+        assert ours != default, ".".join(keys)
+
+
+def test_there_is_a_config_for_each_of_these():
+    assert TOUCH == ["whisker_exploration", "whisker_maze", "whisker_open_loop", "whisker_raw"]
+
+
+def test_make_run_runs_the_maze():
+    lines = (ROOT / "Makefile").read_text().split("\nrun:", 1)[1].split("\n\n", 1)[0]
+    assert "ratslam run configs/whisker_maze.yaml -o runs/whisker_maze-" in lines

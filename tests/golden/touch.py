@@ -1,0 +1,56 @@
+"""Golden touch sessions: recordings with their noise in them, and the decisions our engine took on them.
+
+`python -m tests.golden.touch` writes the decisions anew, for whoever changed them on purpose; it never makes
+the sessions again.
+"""
+
+from __future__ import annotations
+
+import json
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evaluation.metrics.experience_metric import experience_metric
+from ratslam.config.run_config import RunConfig
+from ratslam.core.types import Action
+from ratslam.pipeline.run import open_source
+from ratslam.pipeline.runner import readings, session_of
+from robot.touch_source import sensing
+from tactile.base.types import Observation
+
+FOLDER = Path(__file__).parent / "golden"
+SESSIONS = ("touch_circuits", "touch_kidnap")
+
+
+def decisions(name: str) -> dict[str, Any]:
+    """What was decided on a session: experiences as [id, steps] in order, how often each action was taken,
+    closures as [later, earlier] steps, and the Experience Metric's counts."""
+    config = RunConfig.model_validate({"recording": {"file": FOLDER / f"{name}.mcap"}})
+    with open_source(config) as source:
+        config = config.completed(source)
+        source = sensing(source, config.touch)
+        session = session_of(config, source)
+        rows: list[tuple[Any, Observation]] = list(readings(source))
+        steps = list(session.replay([reading for _, reading in rows]))
+    place = [int(step.estimate.place) for step in steps]
+    actions = [Action(int(step.estimate.action)).name.lower() for step in steps]
+    metric = experience_metric(np.array(place), np.array([sample.truth for sample, _ in rows]))
+    return {
+        "places": [[key, len(list(group))] for key, group in groupby(place)],
+        "actions": {name: actions.count(name) for name in sorted(set(actions))},
+        "closures": session.map.closures().tolist(),
+        "relocalisations": metric.relocalisations,
+        "correct": metric.correct,
+    }
+
+
+if __name__ == "__main__":
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    for session in SESSIONS:
+        text = json.dumps(decisions(session))
+        (FOLDER / f"{session}.json").write_text(text + "\n", encoding="utf-8")

@@ -1,0 +1,72 @@
+"""Whole runs in one call are those made one by one."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ratslam.attractor import adaptive_window, pose_cells
+from ratslam.attractor.batch import Course, Network, networks, trials
+from ratslam.attractor.config import PoseCellConfig, units
+from ratslam.attractor.window import around
+from ratslam.core.session import Session
+from tactile.base.types import Odometry, stack
+from tests.helpers.grid_world import filter_of, report, settings
+
+CONFIG = PoseCellConfig(cells_xy=21)
+STEPS = 60
+
+
+def course(seed: int) -> Course:
+    stream = np.random.default_rng(seed)
+    motion = stream.normal(0, 0.3, (STEPS, 3)) * units(CONFIG, np.dtype(float))
+    recall, energy = stream.random((STEPS, 3)) * [21, 21, 36], np.where(np.arange(STEPS) == 30, 0.15, 0.0)
+    return Course(motion, recall, energy)
+
+
+def alone(config: PoseCellConfig, given: Course, factor: float) -> np.ndarray:
+    rungs = adaptive_window.rungs(config, np.dtype(float))
+
+    def step(cells, row):
+        motion, recall, energy = row
+        odometry = Odometry(motion[0], motion[1], motion[2], jnp.ones(()))
+        cells, _ = pose_cells.step(config, rungs, cells, odometry, recall, energy * factor)
+        return cells, cells.pose
+
+    return np.asarray(
+        jax.jit(lambda rows: jax.lax.scan(step, pose_cells.start(config, float), rows)[1])(given)
+    )
+
+
+@pytest.mark.parametrize("block", [pytest.param(1, marks=pytest.mark.soak), 3])
+def test_parameter_sets_are_networks_of_those_parameters(block):
+    given, sets = course(1), [(1.0, 2.0, 2e-5, 1.0), (0.9, 2.3, 1e-5, 1.0), (1.2, 1.8, 3e-5, 2.0)]
+    columns = Network(*(jnp.asarray(column) for column in zip(*sets, strict=True)))
+    track = networks(CONFIG, columns, given, block)
+    for k, (excite, inhibit, threshold, factor) in enumerate(sets):
+        config = CONFIG.model_copy(
+            update={"excite_sigma": excite, "inhibit_sigma": inhibit, "global_inhibition": threshold}
+        )
+        gap = around(np.asarray(track.pose[k]) - alone(config, given, factor), np.array([[21, 21, 36]]))
+        assert np.abs(gap).max() <= 1e-9
+    assert np.asarray(track.rung[:, 30]).min() > 0
+    assert not np.any(track.rung[:, :30])
+
+
+def test_trials_of_other_seeds_and_noise_are_sessions_of_their_own():
+    backend = filter_of(settings(particles=20))
+    stream = np.random.default_rng(0)
+    courses = [[report(float(dx)) for dx in stream.uniform(0, 0.03, 12)] for _ in range(3)]
+    states = [backend.init(jax.random.key(seed), 256) for seed in range(3)]
+    together = trials(
+        backend.kernel,
+        jax.tree.map(lambda *rows: jnp.stack(rows), *states),
+        jax.tree.map(lambda *rows: np.stack(rows), *(stack(rows) for rows in courses)),
+        block=2,
+    )
+    for seed, rows in enumerate(courses):
+        session = Session(backend, seed=seed, precision="float64")
+        told = np.array([step.estimate.pose for step in session.replay(rows)])
+        assert np.abs(np.asarray(together.pose[seed]) - told).max() <= 1e-12

@@ -1,0 +1,561 @@
+"""Laws of the grid filter: against an exact one, of what a report leaves and weighs, and of bad input."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ratslam.backends.grid import Outcome
+from ratslam.config.run_config import RunConfig
+from ratslam.core.session import Session
+from ratslam.grid import likelihoods, particle_maps
+from ratslam.grid.particle_maps import COSINE, EVIDENCE, SINE
+from ratslam.pipeline.backend_registry import backend_of
+from tactile.base.errors import InputError
+from tactile.base.se2 import wrap
+from tactile.base.types import Motion
+from tests.helpers.grid_world import (
+    BLANK,
+    STEADY,
+    TIPS,
+    begun,
+    create,
+    drive,
+    filter_of,
+    remembering,
+    report,
+    settings,
+    standing,
+)
+
+FILTER = filter_of(settings())
+MOST = FILTER.config.stamps.most
+AS_PRINTED = {
+    "likelihood": {"model": "literal"},
+    "stamps": {"wall": "edge"},
+    "resampling": {"when": "always", "how": "multinomial"},
+}
+PRINTED = filter_of(settings(**AS_PRINTED))
+SINGLE = filter_of(settings(), dtype=np.float32)
+CORRIDOR = filter_of(
+    settings(
+        particles=1000, cell=0.1, body=0.0, stamps=BLANK, drift=STEADY | {"step": 0.3},
+        resampling={"length": 0.0, "heading": 0.0, "scale": 0.0},
+        likelihood={"free": 0.3, "contact": 1.0},
+    ),
+    whiskers=2,
+    side=1.6,
+)  # fmt: skip
+ALL = range(4)
+
+
+def placed(backend, pose, point):
+    """[N, K, 2] points [K, 2] of base_link in cells of the map."""
+    pose, point = np.asarray(pose, float), np.asarray(point, float)
+    c, s = np.cos(pose[:, 2, None]), np.sin(pose[:, 2, None])
+    x = pose[:, :1] + c * point[:, 0] - s * point[:, 1]
+    y = pose[:, 1:2] + s * point[:, 0] + c * point[:, 1]
+    return np.asarray(particle_maps.in_cells(np.stack([x, y], axis=2), backend.config.cell, backend.side))
+
+
+def evidence_at(backend, state, point, layer=EVIDENCE):
+    """[N, K] what each particle's map holds at points [K, 2] of base_link."""
+    place = placed(backend, state.particles.pose, point).astype(backend.dtype)
+    return np.asarray(particle_maps.read(state.maps, layer, place))
+
+
+def column_of_wall(backend, x, *, before=-3.0, wall=4.0, width=0.1):
+    """[S, S] evidence: free before x, a wall there, nothing known behind it; m."""
+    at = (np.arange(backend.side) - (backend.side - 1) / 2) * backend.config.cell
+    row = np.where(at < x - width / 2, before, np.where(at < x + width / 2, wall, 0.0))
+    return np.tile(row, (backend.side, 1))
+
+
+def scattered(backend):
+    """A state of particles apart from each other, each with a map of its own."""
+    stream, state = np.random.default_rng(0), begun(backend)
+    pose = stream.normal(0, [0.1, 0.1, 1.0], state.particles.pose.shape)
+    maps = stream.normal(0, 2.0, state.maps[:, EVIDENCE].shape)
+    return state._replace(
+        maps=state.maps.at[:, EVIDENCE].set(maps), particles=state.particles._replace(pose=jnp.asarray(pose))
+    )
+
+
+def equal(a, b):
+    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+
+
+def finite(tree):
+    return all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(tree))
+
+
+def known(state):
+    """The state but for contacts held, of which nothing is said at once."""
+    return state._replace(touched=0)
+
+
+# What a report leaves in the map
+
+
+def test_what_meets_nothing_is_found_free():
+    state, *_ = drive(FILTER, begun(FILTER), [report(0.02)])
+    shafts = np.asarray(FILTER.free)
+    # Between cells the bottom of a narrow mark is cut.
+    assert (evidence_at(FILTER, state, shafts) < -0.4 * FILTER.config.stamps.free).all()
+    assert (evidence_at(FILTER, state, np.zeros((1, 2))) <= -0.99 * FILTER.config.stamps.body).all()
+    assert (evidence_at(FILTER, state, np.array([[0.45, 0.0], [-0.25, 0.0], [0.0, 0.3]])) > -0.01).all()
+    assert not np.any(state.maps[:, COSINE:])
+    assert not np.any(state.compass)
+    assert float(state.maps.max()) <= 0
+
+
+@pytest.mark.parametrize("cell", [0.05, 0.02])
+def test_a_contact_leaves_evidence_where_it_was_felt(cell):
+    backend = FILTER if cell == 0.05 else filter_of(settings(particles=2, cell=cell))
+    blob = FILTER.config.stamps.blob
+    for heading in (0.0, 0.8, -2.0):
+        start = standing(begun(backend), [0.2, -0.1, heading])
+        state, *_ = drive(backend, start, [report(0.02, touching=[0, 2], dead=[1, 3])])
+        found = evidence_at(backend, state, TIPS[[0, 2]])
+        assert (found > 0.75 * blob).all()  # between cells the top of a blob is cut
+        assert (found < 1.25 * blob).all()
+        assert (evidence_at(backend, state, TIPS[[0]] * [1, -1]) <= 0.05 * blob).all()
+
+
+def test_a_wall_is_drawn_along_itself_with_its_direction():
+    wall, start = (0.3, 0.4), standing(begun(FILTER), [0.1, 0.2, 0.7])
+    state, *_ = drive(FILTER, start, [report(0.02, touching=[0, 1], wall=wall, dead=[2, 3])])
+    normal = np.array([np.cos(wall[1]), np.sin(wall[1])])
+    along = np.array([-normal[1], normal[0]])
+    middle = TIPS[:2].mean(axis=0)
+    foot = middle + normal * (wall[0] - normal @ middle)
+    steps = np.array([-0.12, 0.0, 0.12])[:, None]
+    # The blobs of the contacts themselves lie on this side of the wall.
+    ahead, beyond = (
+        evidence_at(FILTER, state, points) for points in (foot + steps * along, foot + 0.12 * normal[None])
+    )
+    assert (ahead > 0.6).all()
+    assert (beyond < 0.2).all()
+    turned = np.asarray(state.particles.pose)[:, 2:] + wall[1] + np.pi / 2
+    for layer, part in ((COSINE, np.cos(2 * turned)), (SINE, np.sin(2 * turned))):
+        field = evidence_at(FILTER, state, foot[None], layer)
+        assert field == pytest.approx(np.broadcast_to(part, field.shape), abs=0.2)
+    assert np.asarray(state.compass) == pytest.approx(
+        np.concatenate([np.cos(4 * turned), np.sin(4 * turned)], axis=1)
+    )
+
+
+def test_a_wall_says_the_same_from_wherever_it_is_felt():
+    """A robot turned about, at another place, feels the same wall of the room."""
+    fields = []
+    for heading in (0.0, 1.0, 2.5, np.pi):
+        start = standing(begun(FILTER), [0.0, 0.0, heading])
+        state, *_ = drive(FILTER, start, [report(touching=[1, 2], wall=(0.3, 1.2 - heading), sd=0.05)])
+        fields.append(np.asarray(state.compass).mean(axis=0))
+        assert wrap(np.asarray(state.particles.pose)[:, 2] - heading) == pytest.approx(0, abs=0.01)
+    assert np.array(fields) == pytest.approx(np.tile(fields[0], (4, 1)), abs=0.01)
+
+
+def test_backing_off_brings_no_evidence_but_moves():
+    start, *_ = drive(FILTER, begun(FILTER), [report(0.02)] * 3 + [report(0.02, touching=[1, 2])])
+    state, *_ = drive(FILTER, start, [report(-0.025, touching=[0, 1], wall=(0.3, 0.0))])
+    assert np.array_equal(state.maps, start.maps)
+    assert np.array_equal(state.compass, start.compass)
+    assert np.array_equal(state.particles.weight, start.particles.weight)
+    moved = np.asarray(state.particles.pose - start.particles.pose)[:, 0]
+    assert moved == pytest.approx(-0.025, rel=0.5)
+    assert np.all(moved != 0)
+
+
+@pytest.mark.parametrize("backend", [FILTER, SINGLE], ids=["float64", "float32"])
+def test_contacts_while_turning_say_nothing(backend):
+    start = scattered(backend) if backend is FILTER else drive(backend, begun(backend), [report(0.02)] * 3)[0]
+    touched, _, told = drive(backend, start, [report(turn=0.1, touching=[0, 1])])
+    dead, _, expected = drive(backend, start, [report(turn=0.1, dead=[0, 1])])
+    assert equal(known(touched), known(dead))
+    assert np.array_equal(told.weights, expected.weights)
+
+
+def test_contacts_are_told_once():
+    start, *_ = drive(FILTER, begun(FILTER), [report(0.02, touching=[0, 1])])
+    held, _, told = drive(FILTER, start, [report(0.01, touching=[0, 1])])
+    dead, _, expected = drive(FILTER, start, [report(0.01, dead=[0, 1])])
+    assert equal(known(held), known(dead))
+    assert np.array_equal(told.weights, expected.weights)
+    # But again after the robot has backed off.
+    again, *_ = drive(FILTER, start, [report(-0.01, touching=[0, 1]), report(0.01, touching=[0, 1])])
+    assert (evidence_at(FILTER, again, TIPS[:2]) > 1.3 * FILTER.config.stamps.blob).all()
+
+
+@pytest.mark.parametrize("backend", [FILTER, PRINTED], ids=["evidence", "printed"])
+def test_dead_whiskers_say_nothing(backend):
+    start, told = scattered(backend), []
+    for touching in ([], [0, 1]):
+        state, _, evidence = drive(backend, start, [report(0.02, touching=touching, dead=[0, 1])])
+        told.append((known(state), evidence))
+    assert equal(*told)
+    # Nor does it matter what the maps hold, but for where the robot's body is.
+    numb = backend.config.body * (backend is FILTER)
+    near = np.hypot(*np.mgrid[: backend.side, : backend.side] - (backend.side - 1) / 2) * 0.05 < numb + 0.1
+    maps = jnp.where(jnp.asarray(near & (numb > 0))[None], 0.0, start.maps[:, EVIDENCE])
+    start = begun(backend)._replace(maps=start.maps.at[:, EVIDENCE].set(maps))
+    _, _, evidence = drive(backend, start, [report(dead=ALL, motion=Motion.FORWARD)])
+    assert evidence.weights[0] == pytest.approx(1 / 30)
+
+
+# What a report weighs
+
+
+@pytest.mark.parametrize("backend", [FILTER, SINGLE], ids=["float64", "float32"])
+def test_particles_whose_map_explains_a_contact_weigh_more(backend):
+    start = remembering(begun(backend), column_of_wall(backend, 0.6))
+    poses = jnp.zeros_like(start.particles.pose)
+    tips = TIPS[1, 0]
+    for k, x in enumerate((0.6 - tips, 0.9 - tips, 0.3 - tips)):  # on the wall, behind it, before it
+        poses = poses.at[10 * k : 10 * k + 10, 0].set(float(x))
+    start = start._replace(particles=start.particles._replace(pose=poses, run=0 * start.particles.run))
+    _, _, told = drive(backend, start, [report(touching=[1, 2], dead=[0, 3], motion=Motion.OTHER)])
+    wall, unknown, empty = told.weights[0].reshape(3, 10)
+    assert wall.min() > 3 * unknown.max()
+    assert unknown.min() > empty.max()
+    _, _, told = drive(backend, start, [report(dead=[0, 3], motion=Motion.OTHER)])
+    wall, unknown, empty = told.weights[0].reshape(3, 10)
+    assert wall.max() < unknown.min() <= empty.min() * 1.1
+
+
+def test_particles_whose_map_has_the_wall_that_way_weigh_more():
+    wall = report(touching=[0, 1], wall=(0.3, 0.3), sd=0.04)
+    start = standing(begun(FILTER), [0.0, 0.0, 0.0])
+    start, *_ = drive(FILTER, start, [wall, report(-1e-6)] * 6)
+    turned = np.repeat([0.0, 0.3, np.pi / 4], 10)
+    pose = start.particles.pose.at[:, 2].set(turned)
+    start = start._replace(particles=start.particles._replace(pose=pose, weight=0 * start.particles.weight))
+    _, _, told = drive(FILTER, start, [wall])
+    aligned, oblique, across = told.weights[0].reshape(3, 10)
+    assert aligned.min() > oblique.max()
+    assert oblique.min() > across.max()
+
+
+def corridor(backend, reports, spread):
+    """Mean and variance of the position after each report along a corridor whose map is given, by an exact
+    histogram filter: a heading of 0, and steps d with a standard deviation of `spread` d.
+
+    Weighs as the filter does, from its likelihoods at each place; [T, 2], m and m2.
+    """
+    config, fine = backend.config, 2e-3
+    x = np.arange(-0.3, 1.2, fine)
+    pose = np.stack([x, 0 * x, 0 * x], axis=1)
+    maps = (
+        particle_maps.blank(1, backend.side, np.dtype(float))
+        .at[0, EVIDENCE]
+        .set(column_of_wall(backend, 0.65))
+    )
+    belief, touched, told = np.where(np.abs(x) < fine / 2, 1.0, 0.0), np.zeros(2, bool), []
+
+    def evidence(points):
+        place = placed(backend, pose, points).reshape(1, -1, 2)
+        return np.asarray(particle_maps.read(maps, EVIDENCE, place)).reshape(len(x), len(points))
+
+    for o in reports:
+        sd = spread * abs(float(o.odometry.dx))
+        gap = (x[:, None] - x[None] - float(o.odometry.dx)) / sd
+        belief = np.exp(-0.5 * gap**2) @ belief
+        if o.motion != Motion.BACK:
+            free = np.repeat(~o.contact, len(backend.free) // 2)
+            logs = likelihoods.free(config.likelihood, evidence(backend.free), free)
+            logs += likelihoods.contact(config.likelihood, evidence(TIPS[:2]), o.contact & ~touched)
+            belief = belief * np.exp(np.asarray(logs))
+        touched = o.contact & (o.motion != Motion.BACK)
+        belief = belief / belief.sum()
+        mean = belief @ x
+        told.append([mean, belief @ (x - mean) ** 2])
+    return np.array(told)
+
+
+def test_position_in_a_corridor_is_that_of_an_exact_filter():
+    """Mean and variance of the position at four reports named beforehand, over 20 runs of 1 000 particles:
+    |t| < 5 in each of eight tests with 19 degrees of freedom. Size: 7e-4."""
+    spread, runs = CORRIDOR.config.drift.step, 20
+    backend = CORRIDOR
+    felt = partial(report, whiskers=2)
+    reports = [felt(0.1)] * 4 + [felt(0.1, touching=[1])] + [felt(-0.05)] * 2 + [felt(0.05)]
+    reports += [felt(0.06, touching=[1]), felt(0.02, touching=[0, 1])]
+    checked = [3, 4, 6, 9]  # free, a contact, backed off, the last contact
+    exact = corridor(backend, reports, spread)
+    found, drawn = [], []
+    for seed in range(runs):
+        start = remembering(begun(backend, seed), column_of_wall(backend, 0.65))
+        _, estimate, told = drive(backend, start, reports)
+        found.append(np.stack([estimate.pose[:, 0], estimate.spread[:, 0] ** 2], axis=1))
+        drawn.append((told.ancestor != np.arange(1000)).any(axis=1))
+    found = np.array(found)
+    error = found.std(axis=0, ddof=1) / np.sqrt(runs)
+    assert (np.abs((found.mean(axis=0) - exact) / error)[checked] < 5).all()
+    # What would have been found without drawing anew, or without the contacts, lies far off.
+    assert np.any(drawn, axis=1).all()
+    blind = corridor(
+        backend,
+        [o._replace(contact=np.zeros(2, bool), motion=np.int32(Motion.BACK)) for o in reports],
+        spread,
+    )
+    assert (np.abs((blind - exact) / error)[checked[1:], 0] > 20).all()
+
+
+# Drawing anew
+
+
+def test_maps_follow_their_particles():
+    state = begun(CORRIDOR)
+    names = jnp.arange(1.0, 1001.0)
+    state = state._replace(
+        maps=state.maps + 1e-6 * names[:, None, None, None],
+        compass=jnp.stack([names, -names], axis=1),
+        particles=state.particles._replace(
+            weight=-0.05 * names, run=1e-9 * jnp.stack([names, names], axis=1)
+        ),
+    )
+    after, _, told = drive(CORRIDOR, state, [report(0.02, whiskers=2)])
+    ancestor = told.ancestor[0]
+    assert told.outcome[0] == Outcome.RESAMPLED
+    assert 20 < len(np.unique(ancestor)) < 500
+    assert np.array_equal(after.maps, state.maps[ancestor])
+    assert np.array_equal(after.compass, state.compass[ancestor])
+    assert np.array_equal(after.particles.run, state.particles.run[ancestor])
+    assert np.array_equal(after.particles.pose, told.poses[0][ancestor])
+    assert not np.any(after.particles.weight)
+    # Weights are told as they were before.
+    assert told.weights[0] == pytest.approx(np.exp(-0.05 * names) / np.exp(-0.05 * names).sum(), rel=0.05)
+    assert told.effective[0] == pytest.approx(40, rel=0.1)
+
+
+def test_the_literal_filter_draws_at_every_report_that_tells():
+    _, _, told = drive(
+        PRINTED, begun(PRINTED), [report(0.02), report(0.02, touching=[1]), report(-0.05), report(turn=0.1)]
+    )
+    assert list(told.outcome) == [Outcome.RESAMPLED, Outcome.RESAMPLED, Outcome.OK, Outcome.RESAMPLED]
+    assert np.array_equal(told.ancestor[2], np.arange(30))
+
+
+def test_weights_that_agree_are_left_alone():
+    _, _, told = drive(FILTER, begun(FILTER), [report(0.02)] * 5)
+    assert not told.outcome.any()
+    assert (told.ancestor == np.arange(30)).all()
+    assert told.weights.sum(axis=1) == pytest.approx(1)
+
+
+# Bad input
+
+
+ODD = {
+    "odometry": lambda o: o._replace(odometry=o.odometry._replace(dx=np.float64(np.nan))),
+    "infinite odometry": lambda o: o._replace(odometry=o.odometry._replace(dy=np.float64(-np.inf))),
+    "huge odometry": lambda o: o._replace(odometry=o.odometry._replace(dx=np.float64(1e300))),
+    "a turn beyond counting": lambda o: o._replace(odometry=o.odometry._replace(dtheta=np.float64(-1e30))),
+    "points": lambda o: o._replace(point=np.where(o.contact[:, None], np.nan, o.point)),
+    "one point": lambda o: o._replace(point=np.array([[np.inf, 0.0], *o.point[1:]])),
+    "wall": lambda o: o._replace(wall_point=np.full(2, np.nan)),
+    "wall's precision": lambda o: o._replace(wall_sd=np.float64(np.nan)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("backend", [FILTER, SINGLE, PRINTED], ids=["float64", "float32", "printed"])
+@pytest.mark.parametrize("odd", ODD)
+def test_what_is_no_number_is_named_and_left_out(backend, odd):
+    start, *_ = drive(backend, begun(backend), [report(0.02)] * 2)
+    plain = report(0.02, touching=[0, 1], wall=(0.3, 0.3))
+    state, estimate, told = drive(backend, start, [ODD[odd](plain)])
+    assert told.outcome[0] == Outcome.NOT_FINITE
+    assert finite((state, estimate, told))
+    state, estimate, told = drive(backend, state, [plain])
+    assert told.outcome[0] in (Outcome.OK, Outcome.RESAMPLED)
+    assert finite((state, estimate, told))
+
+
+@pytest.mark.parametrize("backend", [FILTER, SINGLE], ids=["float64", "float32"])
+def test_a_robot_may_leave_the_map_as_far_as_it_likes(backend):
+    state, estimate, told = drive(backend, begun(backend), [report(9e5, touching=[0])] * 100)
+    assert finite((state, estimate, told))
+    assert np.asarray(estimate.pose)[-1, 0] > 1e7
+    assert told.outcome[-1] in (Outcome.OUTSIDE, Outcome.OK)
+    assert not np.any(state.maps[:, 1:])
+
+
+@pytest.mark.parametrize("backend", [FILTER, SINGLE], ids=["float64", "float32"])
+def test_odometry_that_is_no_number_is_no_motion(backend):
+    start, *_ = drive(backend, begun(backend), [report(0.1)])
+    odd, *_ = drive(backend, start, [ODD["odometry"](report(0.02, touching=[1]))])
+    still, *_ = drive(backend, start, [report(0.0, touching=[1], motion=Motion.FORWARD)])
+    assert equal(odd, still)
+
+
+@pytest.mark.parametrize("backend", [FILTER, PRINTED], ids=["evidence", "printed"])
+def test_contacts_that_are_no_number_are_as_of_dead_whiskers(backend):
+    start = scattered(backend)
+    odd, _, told = drive(backend, start, [ODD["points"](report(0.02, touching=[0, 1]))])
+    dead, _, expected = drive(backend, start, [report(0.02, dead=[0, 1])])
+    assert equal(odd, dead)
+    assert np.array_equal(told.weights, expected.weights)
+
+
+@pytest.mark.parametrize("backend", [FILTER, SINGLE], ids=["float64", "float32"])
+@pytest.mark.parametrize("odd", [np.inf, np.nan])
+def test_when_all_weights_vanish_they_are_kept(backend, odd):
+    """Maps that allow nothing of what is felt."""
+    start = remembering(begun(backend), np.full((backend.side, backend.side), odd))
+    start = start._replace(
+        particles=start.particles._replace(weight=-0.01 * jnp.arange(30, dtype=backend.dtype))
+    )
+    state, estimate, told = drive(backend, start, [report(0.02)])
+    assert told.outcome[0] == Outcome.VANISHED
+    assert estimate.lost[0]
+    assert np.array_equal(state.particles.weight, start.particles.weight)
+    assert finite((estimate, told))
+
+
+@pytest.mark.parametrize("backend", [FILTER, SINGLE], ids=["float64", "float32"])
+def test_contacts_outside_the_map_are_named_and_forgotten(backend):
+    rim = standing(begun(backend), [1.15, 0.0, 0.0])
+    felt = report(touching=ALL, wall=(0.3, 0.0), motion=Motion.FORWARD)
+    state, _, told = drive(backend, rim, [felt])
+    assert told.outcome[0] == Outcome.OUTSIDE
+    assert finite((state, told))
+    for far in ([3.0, 0.0, 0.0], [-1e3, 1e3, 2.0], [1e9, -1e9, 0.0]):
+        away = standing(begun(backend), far)
+        state, estimate, told = drive(backend, away, [report(0.02), felt, report(-0.1)])
+        assert told.outcome[1] == Outcome.OUTSIDE
+        assert finite((state, estimate, told))
+        assert np.abs(state.maps).max() < 1e-3  # a wall may reach in from outside
+
+
+# Hard cases, in single precision
+
+
+def circuit(count):
+    return [report(turn=0.3) if k % 5 == 4 else report(0.05) for k in range(count)]
+
+
+def sound(state, estimate, told):
+    """Nothing is anything but a number, and evidence stays within its limits."""
+    limit = MOST * (1 + 1e-6)
+    return finite((state, estimate, told)) and float(jnp.abs(state.maps[:, EVIDENCE]).max()) <= limit
+
+
+def long(count):
+    state, estimate, told = drive(SINGLE, begun(SINGLE), circuit(count))
+    assert sound(state, estimate, told)
+    assert told.weights.sum(axis=1) == pytest.approx(1, abs=1e-5)
+    assert {leaf.dtype for leaf in jax.tree.leaves(state)} == {
+        np.dtype(t) for t in (np.float32, np.int32, bool, np.uint32)
+    }
+
+
+def test_ten_thousand_reports_without_contact():
+    long(10_000)
+
+
+@pytest.mark.soak
+def test_a_hundred_thousand_reports_without_contact():
+    long(100_000)
+
+
+def test_contact_in_every_report():
+    stream = np.random.default_rng(0)
+    reports = []
+    for k in range(1000):
+        turn = 0.2 * (k % 7 == 6)
+        touching = np.flatnonzero(stream.random(4) < 0.6)
+        wall = (0.3, stream.normal(0, 0.5)) if len(touching) and stream.random() < 0.5 else None
+        reports.append(report(0.0 if turn else 0.01, turn, touching=[*touching, k % 4], wall=wall))
+    state, estimate, told = drive(SINGLE, begun(SINGLE), reports)
+    assert sound(state, estimate, told)
+    assert Outcome.RESAMPLED in told.outcome
+    assert not np.isin(told.outcome, [Outcome.VANISHED, Outcome.NOT_FINITE]).any()
+    assert finite(state.compass)
+
+
+def test_a_wall_is_believed_soon_after_much_that_was_free():
+    """The clamp keeps what was found free from lasting for ever."""
+    free, met = (
+        [report(0.0, motion=Motion.FORWARD)] * 20,
+        [report(touching=ALL, motion=Motion.FORWARD), report(-1e-6)],
+    )
+    state, *_ = drive(SINGLE, begun(SINGLE), free)
+    assert evidence_at(SINGLE, state, TIPS).mean() < -2
+    found = []
+    for _ in range(3):
+        state, *_ = drive(SINGLE, state, met)
+        found.append(evidence_at(SINGLE, state, TIPS).mean())
+    assert found == sorted(found)
+    assert found[-1] > 0
+
+
+@pytest.mark.parametrize("backend", [FILTER, SINGLE], ids=["float64", "float32"])
+def test_a_kidnap_breaks_nothing(backend):
+    there = [report(0.05)] * 5 + [report(0.02, touching=[0, 1], wall=(0.25, 0.2)), report(-0.05)]
+    reports = [*there, report(1.0), *there, report(0.0, 3.0), *there, report(-1.0), *there, report(0.05, 0.1)]
+    state, estimate, told = drive(backend, begun(backend), reports)
+    assert sound(state, estimate, told)
+    assert not np.isin(told.outcome, [Outcome.VANISHED, Outcome.NOT_FINITE]).any()
+
+
+# As a backend
+
+
+def test_without_whiskers_and_body_it_is_dead_reckoning_compiled_once():
+    backend = filter_of(settings(body=0.0, drift=STEADY), whiskers=0)
+    session = Session(backend)
+    reports = [report(0.05, 0.0, whiskers=0), report(0.0, 0.4, whiskers=0)] * 150  # past the first capacity
+    steps = list(session.replay(reports[:290])) + [session.step(o) for o in reports[290:]]
+    assert session.compilations() == 1
+    assert not np.any(session.state.maps)
+    assert not any(step.evidence.outcome for step in steps)
+    turned = 0.4 * np.arange(150)
+    path = 0.05 * np.cumsum(np.exp(1j * turned))
+    expected = np.stack([path.real, path.imag, turned], axis=1)
+    found = np.array([step.pose for step in steps])
+    assert found[::2, :2] == pytest.approx(expected[:, :2], abs=1e-9)
+    assert np.asarray(wrap(found[::2, 2] - turned)) == pytest.approx(0, abs=1e-9)
+    path = session.map.trajectory()
+    assert path[:, :2] == pytest.approx(found[:, :2], abs=1e-9)
+    assert wrap(path[:, 2] - found[:, 2]) == pytest.approx(0, abs=1e-9)
+
+
+def test_a_batch_of_seeds_equals_each():
+    backend = PRINTED
+    reports = [*circuit(6), report(0.05, touching=[0, 2], wall=(0.25, 0.1)), report(-0.05), *circuit(6)]
+    together = jax.vmap(backend.init, in_axes=(0, None))(jax.vmap(jax.random.key)(jnp.arange(3)), 256)
+    many = jax.jit(
+        jax.vmap(backend.kernel, in_axes=(0, None)), compiler_options={"xla_backend_optimization_level": 0}
+    )
+    outputs = []
+    for o in reports:
+        together, *output = many(together, o)
+        outputs.append(output)
+    for seed in range(3):
+        alone, estimate, told = drive(backend, begun(backend, seed), reports)
+        for k, (estimates, proofs) in enumerate(outputs):
+            assert np.asarray(estimates.pose[seed]) == pytest.approx(estimate.pose[k], abs=1e-9)
+            assert np.array_equal(proofs.ancestor[seed], told.ancestor[k])
+            assert proofs.outcome[seed] == told.outcome[k]
+        assert np.asarray(together.maps[seed]) == pytest.approx(np.asarray(alone.maps), abs=1e-9)
+        assert Outcome.RESAMPLED in told.outcome
+
+
+def test_seeds_differ_and_repeat():
+    runs = [drive(FILTER, begun(FILTER, seed), circuit(10))[1].pose for seed in (0, 0, 1)]
+    assert np.array_equal(runs[0], runs[1])
+    assert not np.array_equal(runs[0], runs[2])
+
+
+def test_more_cells_than_can_be_counted_are_refused():
+    config = RunConfig.model_validate(
+        {"roving": {}, "backend": "grid", "grid": {"particles": 300_000, "side": 2.5}}
+    )
+    with pytest.raises(InputError, match="fewer particles"):
+        backend_of(config, (1, 4, 1), create())
+    with pytest.raises(InputError, match="without whiskers"):
+        backend_of(config, (1, 4, 1), None)

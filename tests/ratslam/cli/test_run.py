@@ -1,0 +1,325 @@
+"""The program as its users meet it: results, repeats, interrupts, kills, faults."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evaluation.metrics.trajectory import read_tum
+from ratslam.cli import main
+
+ROOT = Path(__file__).parents[3]
+FILES = {
+    "anytime.csv", "closures.csv", "config.yaml", "manifest.json", "map.g2o", "map.json", "map.npz",
+    "map.png", "odometry.tum", "online.tum", "scorecard.json", "steps.csv", "trajectory.tum", "truth.tum",
+}  # fmt: skip
+SQUARE = str(ROOT / "configs" / "square.yaml")
+
+
+@pytest.fixture(scope="module")
+def square(tmp_path_factory):
+    """A finished run."""
+    path = tmp_path_factory.mktemp("square") / "run"
+    assert main(["run", SQUARE, "-o", str(path)]) == 0
+    return path
+
+
+@pytest.fixture(scope="module")
+def corridor(tmp_path_factory):
+    """A config that runs for some seconds, and its uninterrupted run."""
+    folder = tmp_path_factory.mktemp("corridor")
+    config = folder / "long.yaml"
+    golden = ROOT / "tests" / "golden" / "c_corridor_wrap.npz"
+    config.write_text(
+        f"recording: {{file: {golden}}}\npose_cells: {{cells_xy: 25, cell_size: 0.02}}\n"
+        "session: {reserve: 640}\n"  # compiled once, not at each power of two
+    )
+    assert main(["run", str(config), "-o", str(folder / "whole")]) == 0
+    return config, folder / "whole"
+
+
+def start(config, directory):
+    """The program in a process of its own."""
+    command = [sys.executable, "-m", "ratslam", "run", str(config), "-o", str(directory)]
+    return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+
+
+def refused(capsys, arguments, *said):
+    """The command fails as faults must: code 2, an error that says all of `said`, no traceback."""
+    capsys.readouterr()
+    assert main([str(argument) for argument in arguments]) == 2
+    error = capsys.readouterr().err
+    assert "Traceback" not in error
+    assert "ratslam: error: " in error
+    for words in said:
+        assert words in error
+
+
+def test_a_run_leaves_everything(square):
+    assert {path.name for path in square.iterdir()} == FILES
+    assert json.loads((square / "manifest.json").read_text())["status"] == "complete"
+    card = json.loads((square / "scorecard.json").read_text())["quantities"]["ate_final"]
+    assert card["value"] < card["odometry"] / 2
+
+
+def test_the_same_config_twice_gives_the_same_bytes(square, tmp_path):
+    assert main(["run", str(square / "config.yaml"), "-o", str(tmp_path / "again")]) == 0
+    for name in ("steps.csv", "trajectory.tum", "online.tum", "map.g2o", "map.json", "config.yaml"):
+        assert (square / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
+
+
+TRACES = (
+    "a_square3",
+    "b_figure8_alias",
+    pytest.param("c_corridor_wrap", marks=pytest.mark.soak),
+    pytest.param("d1_rotation_generic", marks=pytest.mark.soak),
+    pytest.param("e_kidnap", marks=pytest.mark.soak),
+    "j_reverse_stop",
+)
+
+
+def check_odometry(path):
+    _, final = read_tum(path / "trajectory.tum")
+    _, odometry = read_tum(path / "odometry.tum")
+    assert np.abs(final[:, :2] - odometry[:, :2]).max() <= 1e-9
+
+
+@pytest.mark.parametrize("trace", TRACES)
+def test_without_closures_the_map_is_odometry(trace, tmp_path):
+    file = ROOT / "tests" / "golden" / f"{trace}.npz"
+    sets = ["--set", f"recording.file={file}", "--set", "experience.closures=false"]
+    assert main(["run", SQUARE, "-o", str(tmp_path / "run"), *sets]) == 0
+    check_odometry(tmp_path / "run")
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("config", ["intel_laser", "tuc_lecture_hall"])
+def test_without_closures_real_maps_are_odometry(config, reference_data, tmp_path, monkeypatch):
+    monkeypatch.setenv("RATSLAM_DATA", str(reference_data))
+    path = tmp_path / "run"
+    arguments = ["-o", str(path), "--set", "experience.closures=false"]
+    assert main(["run", str(ROOT / "configs" / f"{config}.yaml"), *arguments]) == 0
+    check_odometry(path)
+
+
+@pytest.mark.soak
+def test_the_lecture_hall_is_mapped(reference_data, tmp_path, monkeypatch):
+    monkeypatch.setenv("RATSLAM_DATA", str(reference_data))
+    assert main(["run", str(ROOT / "configs" / "tuc_lecture_hall.yaml"), "-o", str(tmp_path / "run")]) == 0
+    card = json.loads((tmp_path / "run" / "scorecard.json").read_text())
+    assert card["quantities"]["ate_final"]["value"] <= 1.5
+
+
+def wait_for_steps(process, directory):
+    while process.poll() is None:
+        if (directory / "steps.csv").exists() and (directory / "steps.csv").stat().st_size > 200:
+            return
+        time.sleep(0.005)
+
+
+def test_an_interrupted_run_is_scored_and_continues(corridor, tmp_path):
+    config, whole = corridor
+    process = start(config, tmp_path / "first")
+    wait_for_steps(process, tmp_path / "first")
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate()
+    first = tmp_path / "first"
+    assert process.returncode == 130, said
+    assert json.loads((first / "manifest.json").read_text())["status"] == "interrupted"
+    assert {path.name for path in first.iterdir()} == FILES
+    more = ["--continue", str(first / "map.npz"), "-o", str(tmp_path / "second")]
+    assert main(["run", str(config), *more]) == 0
+    rows = (first / "steps.csv").read_text() + (tmp_path / "second" / "steps.csv").read_text().split("\n", 1)[
+        1
+    ]
+    assert rows == (whole / "steps.csv").read_text()
+    tail = (tmp_path / "second" / "trajectory.tum").read_text()
+    assert (whole / "trajectory.tum").read_text().endswith(tail)
+
+
+def kill_once(corridor, directory, delay):
+    config, whole = corridor
+    process = start(config, directory)
+    try:
+        process.communicate(timeout=delay)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.communicate()
+    for name in ("steps.csv", "online.tum", "odometry.tum", "truth.tum"):
+        if (directory / name).exists():
+            written = (directory / name).read_bytes()
+            assert (whole / name).read_bytes().startswith(written)
+            assert not written or written.endswith(b"\n")
+    code = main(["score", str(directory)])
+    rows = (directory / "steps.csv").read_text().count("\n") if (directory / "steps.csv").exists() else 0
+    assert code == (0 if rows > 1 else 2)
+    return rows
+
+
+@pytest.mark.parametrize("delay", [1.5, 2.5, 3.3])
+def test_a_killed_run_is_readable(corridor, tmp_path, delay):
+    kill_once(corridor, tmp_path / "run", delay)
+
+
+@pytest.mark.soak
+def test_fifty_killed_runs_are_readable(corridor, tmp_path):
+    began = time.monotonic()
+    process = start(corridor[0], tmp_path / "timed")
+    process.communicate()
+    whole = time.monotonic() - began  # a busy machine takes longer
+    delays = whole * np.random.default_rng(0).uniform(0.1, 1.0, 50)
+    rows = [kill_once(corridor, tmp_path / str(k), delay) for k, delay in enumerate(delays)]
+    print("rows left by each kill:", rows)
+    assert sum(count > 1 for count in rows) > 10
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", ["config.yaml"]),
+        (
+            "recording: {file: a.npz}\npose_cells: {excite_sigm: 1}\n",
+            ["did you mean 'excite_sigma'", "config.yaml:2:"],
+        ),
+        ("recording: {file: a.npz}\npose_cells: {excite_sigma: -1}\n", ["pose_cells.excite_sigma"]),
+        ("recording: {file: a.npz}\npose_cells: {excite_width: 6}\n", ["odd"]),
+        ("recording: {file: a.npz}\ntemplates: {threshold: high}\n", ["templates.threshold"]),
+        ("recording: {file: a.npz}\nrecording: {file: b.npz}\n", ["recording"]),
+        ("recording: {file: missing.npz}\n", ["missing.npz"]),
+        ("recording: {file: '${RATSLAM_NOT_SET}/a.npz'}\n", ["RATSLAM_NOT_SET"]),
+        ("recording: {file: a.npz\n", [":"]),
+        ("pose_cells: {}\nplaces: {radius: 0}\n", ["recording", "places.radius"]),
+    ],
+)
+def test_a_faulty_config_is_refused(capsys, tmp_path, text, said):
+    config = tmp_path / "config.yaml"
+    config.write_text(text)
+    refused(capsys, ["run", config, "-o", tmp_path / "run"], *said)
+    assert not (tmp_path / "run").exists()
+
+
+def changed(tmp_path, **changes):
+    """A golden stream with some arrays changed."""
+    with np.load(ROOT / "tests" / "golden" / "a_square3.npz") as archive:
+        arrays = dict(archive)
+    for name, change in changes.items():
+        arrays[name] = change(arrays[name].copy())
+    np.savez(tmp_path / "changed.npz", **arrays)
+    return tmp_path / "changed.npz"
+
+
+def put(row, value):
+    def change(array):
+        array[row] = value
+        return array
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"in_w": lambda w: w * 180 / np.pi}, "deg"),
+        ({"in_v": lambda v: v * 1000}, "m"),
+        ({"in_v": put(7, np.nan)}, "row 7"),
+        ({"in_t": put(9, 0.0)}, "row 9"),
+        ({"in_view": lambda view: view * 255}, "0..1"),
+        ({"in_view": lambda view: view[:, :5]}, "in_view"),
+    ],
+    ids=["degrees", "millimetres", "nan", "backwards", "bytes", "shape"],
+)
+def test_a_faulty_recording_is_refused(capsys, tmp_path, changes, said):
+    file = changed(tmp_path, **changes)
+    refused(capsys, ["run", SQUARE, "-o", tmp_path / "run", "--set", f"recording.file={file}"], said)
+    assert not (tmp_path / "run").exists()
+
+
+def test_cut_and_empty_recordings_are_refused(capsys, tmp_path):
+    whole = (ROOT / "tests" / "golden" / "a_square3.npz").read_bytes()
+    for name, content in (("cut.npz", whole[:5000]), ("empty.npz", b""), ("noise.mcap", b"noise" * 99)):
+        (tmp_path / name).write_bytes(content)
+        file = f"recording.file={tmp_path / name}"
+        refused(capsys, ["run", SQUARE, "-o", tmp_path / "run", "--set", file], name)
+
+
+def test_what_exists_is_never_touched(capsys, square):
+    before = {path: path.read_bytes() for path in square.iterdir()}
+    refused(capsys, ["run", SQUARE, "-o", square], "exists")
+    assert before == {path: path.read_bytes() for path in square.iterdir()}
+
+
+def test_wrong_checkpoints_are_refused(capsys, square, tmp_path):
+    out = ["-o", tmp_path / "run"]
+    refused(capsys, ["run", SQUARE, *out, "--continue", square / "map.npz"], "already")
+    refused(capsys, ["run", SQUARE, *out, "--continue", square / "steps.csv"], "checkpoint")
+    refused(capsys, ["run", SQUARE, *out, "--continue", tmp_path / "none.npz"], "none.npz")
+    other = ["--set", "pose_cells.cells_xy=25"]
+    refused(capsys, ["run", SQUARE, *out, *other, "--continue", square / "map.npz"], "configuration")
+    assert not (tmp_path / "run").exists()
+
+
+def test_scoring_refuses_what_is_no_log(capsys, tmp_path):
+    refused(capsys, ["score", tmp_path], "steps.csv" if False else "online.tum")
+    (tmp_path / "log.csv").write_text("t,id\n0,1\n")
+    refused(capsys, ["score", tmp_path / "log.csv"], "log.csv")
+
+
+def test_a_scored_directory_gives_its_scorecard(capsys, square):
+    capsys.readouterr()
+    assert main(["score", str(square), "--json"]) == 0
+    card = json.loads(capsys.readouterr().out)
+    assert card["quantities"] == json.loads((square / "scorecard.json").read_text())["quantities"]
+
+
+def test_a_full_disk_is_one_clear_error(tmp_path):
+    """A file-size limit stops a process the way a full disk does: the write fails."""
+    code = (
+        "import resource, signal, sys\n"
+        "from ratslam.__main__ import main\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "import ratslam.run, matplotlib.figure\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))\n"
+        f"sys.exit(main(['run', {SQUARE!r}, '-o', {str(tmp_path / 'run')!r}]))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 2, done.stderr
+    assert "Traceback" not in done.stderr
+    assert "ratslam: error: " in done.stderr
+    assert main(["score", str(tmp_path / "run")]) == 0
+
+
+def test_a_cut_recording_is_recovered_and_run(capsys, tmp_path):
+    from robot.recordings.formats import RecordingConfig, open_recording
+    from robot.recordings.mcap_reader import record
+
+    with open_recording(RecordingConfig(file=ROOT / "tests" / "golden" / "a_square3.npz")) as source:
+        record(source, tmp_path / "whole.mcap")
+    content = (tmp_path / "whole.mcap").read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(content[: len(content) * 6 // 10])
+    assert main(["recover", str(tmp_path / "cut.mcap"), "-o", str(tmp_path / "good.mcap")]) == 0
+    file = f"recording.file={tmp_path / 'good.mcap'}"
+    assert main(["run", SQUARE, "-o", str(tmp_path / "run"), "--set", file]) == 0
+    steps = (tmp_path / "run" / "steps.csv").read_text().count("\n") - 1
+    assert 50 < steps < 349
+    refused(capsys, ["recover", ROOT / "LICENSE", "-o", tmp_path / "x.mcap"], "LICENSE")
+
+
+def test_the_schema_names_every_part(capsys):
+    capsys.readouterr()
+    assert main(["schema"]) == 0
+    schema = json.loads(capsys.readouterr().out)
+    assert {"recording", "pose_cells", "templates", "places", "experience"} <= set(schema["properties"])
+
+
+def test_a_folder_that_cannot_be_made_is_refused(capsys, tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    refused(capsys, ["run", SQUARE, "-o", tmp_path / "file" / "run"], "cannot be made")
+    assert shutil.disk_usage(tmp_path).total > 0

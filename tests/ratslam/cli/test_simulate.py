@@ -1,0 +1,196 @@
+"""Simulated sessions through the program: written, replayed, interrupted, killed, refused."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ratslam.cli import main
+from ratslam.config.run_config import RunConfig
+from ratslam.experiments.trials.ablation import trial
+from ratslam.pipeline.run import open_source, simulate
+from robot.recordings.mcap_reader import Recording
+from robot.simulation.head.session import simulated
+from robot.touch_source import sensing
+
+ROOT = Path(__file__).parents[3]
+CONFIG = "simulation: {path: {explore: 150}, seed: 5}\ntouch: {head: {dead: [4]}}\n"
+REPLAY = "recording: {file: session.mcap}\n"
+SAME = ("trajectory.tum", "online.tum", "odometry.tum", "truth.tum", "steps.csv", "map.g2o", "map.json")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A configuration, its session as a file, and the runs of both."""
+    path = tmp_path_factory.mktemp("simulate")
+    (path / "config.yaml").write_text(CONFIG)
+    (path / "replay.yaml").write_text(REPLAY)
+    assert main(["simulate", str(path / "config.yaml"), "-o", str(path / "session.mcap")]) == 0
+    assert main(["run", str(path / "config.yaml"), "-o", str(path / "direct")]) == 0
+    assert main(["run", str(path / "replay.yaml"), "-o", str(path / "replayed")]) == 0
+    return path
+
+
+def refused(capsys, arguments, *said):
+    """The command fails as faults must: code 2, an error that says all of `said`, no traceback."""
+    capsys.readouterr()
+    assert main([str(argument) for argument in arguments]) == 2
+    error = capsys.readouterr().err
+    assert "Traceback" not in error
+    for words in ("ratslam: error: ", *said):
+        assert words in error
+
+
+def test_a_replayed_session_is_the_session(folder):
+    for name in SAME:
+        assert (folder / "direct" / name).read_bytes() == (folder / "replayed" / name).read_bytes(), name
+    assert (folder / "direct" / "steps.csv").read_text().count("\n") == 151
+
+
+def test_a_manifest_names_the_simulation(folder):
+    config = RunConfig.model_validate({"simulation": {"path": {"explore": 150}, "seed": 5}})
+    session = simulated(config.simulation)
+    for name in ("direct", "replayed"):
+        made = json.loads((folder / name / "manifest.json").read_text())["simulation"]
+        assert made["seed"] == 5
+        assert made["tier"] == "kinematic"
+        assert made["why"]
+        assert made["sha256"] == Recording(folder / "session.mcap").rig["simulation"]["sha256"]
+        assert made["sha256"] != session.digest  # its head has a dead whisker
+    assert (
+        json.loads((folder / "direct" / "manifest.json").read_text())["recording"]["sha256"] == made["sha256"]
+    )
+
+
+def test_what_was_run_can_be_run_again(folder, tmp_path):
+    assert main(["run", str(folder / "direct" / "config.yaml"), "-o", str(tmp_path / "again")]) == 0
+    for name in SAME:
+        assert (tmp_path / "again" / name).read_bytes() == (folder / "direct" / name).read_bytes()
+
+
+def test_a_run_takes_the_cell_size_and_the_head_of_the_session(folder):
+    text = (folder / "replayed" / "config.yaml").read_text()
+    assert "cell_size: 0.05" in text
+    assert "dead: [4]" in text or "- 4" in text
+
+
+def test_the_same_session_is_the_same_file(folder, tmp_path):
+    assert main(["simulate", str(folder / "config.yaml"), "-o", str(tmp_path / "again.mcap")]) == 0
+    assert (tmp_path / "again.mcap").read_bytes() == (folder / "session.mcap").read_bytes()
+    assert (folder / "session.mcap").stat().st_size < 300_000
+    other = ["--set", "simulation.seed=6"]
+    assert main(["simulate", str(folder / "config.yaml"), "-o", str(tmp_path / "other.mcap"), *other]) == 0
+    assert Recording(tmp_path / "other.mcap").digest != Recording(folder / "session.mcap").digest
+
+
+@pytest.mark.parametrize("raw", [False, True])
+def test_a_session_of_raw_samples_is_given_to_the_engine_as_if_live(raw, tmp_path):
+    """With its samples or with what they tell: recorded or not, the same observations."""
+    (tmp_path / "config.yaml").write_text("simulation: {path: {explore: 12}, fidelity: quasistatic}\n")
+    path = tmp_path / "session.mcap"
+    arguments = ["simulate", str(tmp_path / "config.yaml"), "-o", str(path), *(["--raw"] if raw else [])]
+    assert main(arguments) == 0
+    assert (path.stat().st_size > 1_000_000) == raw
+    live = RunConfig.model_validate({"simulation": {"path": {"explore": 12}, "fidelity": "quasistatic"}})
+    replay = RunConfig.model_validate({"recording": {"file": path}})
+    given = []
+    for config in (live, replay):
+        source = open_source(config)
+        given.append([sample.reading for sample in sensing(source, config.completed(source).touch)])
+    assert len(given[0]) == len(given[1]) == 12
+    for one, other in zip(*given, strict=True):
+        assert one.odometry == other.odometry
+        assert all(np.array_equal(part, same) for part, same in zip(one[1:], other[1:], strict=True))
+
+
+def test_the_tier_is_told_and_why(capsys, folder, tmp_path):
+    assert main(["simulate", str(folder / "config.yaml"), "-o", str(tmp_path / "a.mcap")]) == 0
+    assert "in the kinematic tier: angles of contact" in capsys.readouterr().err
+
+
+def test_nothing_is_overwritten(capsys, folder):
+    before = (folder / "session.mcap").read_bytes()
+    refused(capsys, ["simulate", folder / "config.yaml", "-o", folder / "session.mcap"], "exists already")
+    assert (folder / "session.mcap").read_bytes() == before
+
+
+def test_there_must_be_something_to_simulate(capsys, folder, tmp_path):
+    refused(capsys, ["simulate", folder / "replay.yaml", "-o", tmp_path / "a.mcap"], "simulation: missing")
+    assert not (tmp_path / "a.mcap").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("touch: {}\n", ["neither recording, simulation, roving nor live"]),
+        ("recording: {file: a.npz}\nsimulation: {}\n", ["recording and simulation; give one"]),
+        ("simulation: {sed: 1}\n", ["did you mean 'seed'"]),
+        ("simulation: {path: {circuits: CA, explore: 3}}\n", ["circuits and explore", "exactly one"]),
+        ("simulation: {maze: {file: none.txt}}\n", ["none.txt"]),
+        ("simulation: {whisking: {amplitude_deg: 75}}\n", ["simulation.whisking.amplitude_deg"]),
+        ("simulation: {}\ntouch: {head: {dead: [18]}}\n", ["touch.head", "0 to 17"]),
+        ("simulation: {maze: {loop: 7}}\n", ["simulation.maze.loop"]),
+    ],
+)
+def test_a_faulty_config_is_refused(capsys, tmp_path, text, said):
+    config = tmp_path / "config.yaml"
+    config.write_text(text)
+    refused(capsys, ["run", config, "-o", tmp_path / "run"], *said)
+    assert not (tmp_path / "run").exists()
+
+
+LONG = "simulation: {path: {explore: 30000}, mechanics: {poses: 2}}\n"
+
+
+def started(tmp_path):
+    """The program, writing a session that takes long, in a process of its own; it has begun."""
+    (tmp_path / "long.yaml").write_text(LONG)
+    path = tmp_path / "long.mcap"
+    command = [sys.executable, "-m", "ratslam", "simulate", str(tmp_path / "long.yaml"), "-o", str(path)]
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    while process.poll() is None and not (path.exists() and path.stat().st_size > 30_000):
+        time.sleep(0.005)
+    return process, path
+
+
+def test_an_interrupted_session_is_a_whole_file(tmp_path):
+    process, path = started(tmp_path)
+    process.send_signal(signal.SIGINT)
+    out, said = process.communicate()
+    assert process.returncode == 130, said
+    source = Recording(path)
+    assert not source.truncated
+    assert 16 < source.length < 30_000
+    assert f"{source.length} whisks" in out
+    assert source.rig["simulation"]["seed"] == 0
+
+
+def test_a_killed_session_is_readable(tmp_path):
+    process, path = started(tmp_path)
+    process.kill()
+    process.communicate()
+    source = Recording(path)
+    assert source.truncated
+    assert source.length > 16
+    assert source.rig["simulation"]["seed"] == 0
+
+
+def test_a_maze_file_lies_beside_its_configuration(folder, tmp_path):
+    (tmp_path / "maze.txt").write_text("o---o---o\n|       |\no   o   o\n|       |\no---o---o\n")
+    config = RunConfig.model_validate(
+        {"simulation": {"maze": {"file": "maze.txt"}, "path": {"loop": [(0, 0), (1, 0), (1, 1), (0, 1)]}}}
+    )
+    assert simulate(config, tmp_path, tmp_path / "a.mcap") == (Recording(tmp_path / "a.mcap").length, False)
+
+
+def test_copies_of_a_session_are_perturbed(folder):
+    config = RunConfig.model_validate({"simulation": {"path": {"explore": 120}}})
+    plain, copy = (trial(config, folder, seed) for seed in (0, 1))
+    assert copy.odometry != plain.odometry

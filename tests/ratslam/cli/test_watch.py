@@ -1,0 +1,288 @@
+"""A run watched from another process: at work, done, killed; and what the watching changes of it: nothing."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from evaluation.artifacts.run_directory import read_run
+from evaluation.monitor.plot import draw_watch
+from evaluation.monitor.progress import RUNNING, Progress, Watched
+from evaluation.monitor.watch import distance, status_line, watch
+from ratslam.cli import main
+from tactile.base.errors import InputError
+from tactile.base.se2 import tum_line
+
+ROOT = Path(__file__).parents[3]
+
+
+SQUARE = str(ROOT / "configs" / "square.yaml")
+PACED = """
+import sys, time
+from pathlib import Path
+from ratslam.__main__ import main
+from ratslam.storage import RunDirectory
+
+go, append, count = Path(sys.argv[1]), RunDirectory.append, []
+
+def paced(store, lines):
+    append(store, lines)
+    count.append(1)
+    while len(count) > 8 and not go.exists():
+        time.sleep(0.01)
+
+RunDirectory.append = paced
+sys.exit(main(sys.argv[2:]))
+"""
+"""The program; a run stands still after some chunks until a file is there."""
+
+
+def arguments(folder):
+    return ["run", SQUARE, "-o", str(folder), "--set", "matcher=classic"]
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    """What a run leaves when nobody looks."""
+    folder = tmp_path_factory.mktemp("alone") / "run"
+    assert main(arguments(folder)) == 0
+    return folder
+
+
+@contextmanager
+def at_work(folder):
+    """A run in a process of its own that has made some steps and stands still, and what lets it go on."""
+    go = folder.with_name("go")
+    process = subprocess.Popen(
+        [sys.executable, "-c", PACED, str(go), *arguments(folder)],
+        cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    try:
+        while not (folder / "steps.csv").exists() or (folder / "steps.csv").stat().st_size < 200:
+            assert process.poll() is None
+            time.sleep(0.01)
+        yield process, go
+    finally:
+        process.kill()
+        process.wait()
+
+
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory):
+    """A run that was killed at work."""
+    folder = tmp_path_factory.mktemp("killed") / "run"
+    with at_work(folder) as (process, _):
+        process.kill()
+    assert json.loads((folder / "manifest.json").read_text())["status"] == RUNNING
+    return folder
+
+
+def test_a_run_at_work_is_watched_to_its_end_and_does_not_notice(alone, tmp_path):
+    folder = tmp_path / "run"
+    told, pictures = [], []
+    with at_work(folder) as (process, go):
+
+        def tell(line):
+            told.append(line)
+            pictures.append((folder / "watch.png").read_bytes())
+            go.touch()
+
+        seen = watch(folder, tell, every=0.1)
+        assert process.wait() == 0
+    steps = int(re.search(r"run: running, (\d+) of 349 steps", told[0])[1])
+    assert 0 < steps < 349
+    assert seen.status == "complete"
+    assert told[-1].startswith("run: complete, 349 of 349 steps, ")
+    assert pictures[0] != pictures[-1]
+    assert all(content.startswith(b"\x89PNG") and content.endswith(b"IEND\xaeB`\x82") for content in pictures)
+    left = {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "watch.png"}
+    assert left == {path.name: path.read_bytes() for path in alone.iterdir()}
+
+
+def test_a_run_that_is_done_is_seen_as_it_is_read(alone, tmp_path, capsys):
+    folder = tmp_path / "run"
+    shutil.copytree(alone, folder)
+    assert main(["watch", str(folder)]) == 0
+    line, shown = capsys.readouterr().out.splitlines()
+    assert "run: complete" in line
+    assert str(folder / "watch.png") in shown
+    seen, run = Watched(folder).look(), read_run(folder)
+    assert np.allclose(seen.path, run.online, atol=1e-12)
+    assert np.allclose(seen.odometry, run.odometry, atol=1e-12)
+    assert np.array_equal(seen.truth, run.truth[:, :2], equal_nan=True)
+    assert seen.off == run.anytime[-1]
+    assert sum(seen.outcomes.values()) == len(run.time) == seen.saved
+    assert f"{distance(seen.odometry):.1f} m" in line
+    assert np.isfinite(seen.spread).all()
+
+
+def test_a_killed_run_is_given_up_when_it_has_been_silent_for_long(killed, tmp_path, capsys):
+    folder = tmp_path / "run"
+    shutil.copytree(killed, folder)
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert main(["watch", str(folder), "--once"]) == 0
+    assert "it was killed" not in capsys.readouterr().out
+    for path in folder.iterdir():
+        os.utime(path, (0, time.time() - 100))
+    assert main(["watch", str(folder), "--patience", "50"]) == 0
+    said = capsys.readouterr().out
+    assert "run: running" in said
+    assert "silent for 100 s\n" in said
+    assert "it was killed" in said
+    assert before == {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "watch.png"}
+    assert 0 < len(Watched(folder).look().path) <= (folder / "steps.csv").read_text().count("\n") - 1
+
+
+def test_ctrl_c_ends_it_and_no_engine_is_loaded(killed):
+    code = (
+        "import signal, sys\n"
+        "from ratslam.__main__ import main\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)  # what runs in the background ignores it\n"
+        f"code = main(['watch', {str(killed)!r}, '--every', '0.05', '--patience', '1e6'])\n"
+        "print('jax' in sys.modules, code)\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert "running" in process.stdout.readline()
+    process.send_signal(signal.SIGINT)
+    assert process.communicate(timeout=60)[0].splitlines()[-1] == "False 130"
+
+
+@pytest.mark.parametrize("kind", ["unknown", "empty", "file"])
+def test_where_there_is_no_run_there_is_nothing_to_watch(kind, tmp_path, capsys):
+    folder = tmp_path / kind
+    if kind == "empty":
+        folder.mkdir()
+    if kind == "file":
+        folder.touch()
+    assert main(["watch", str(folder)]) == 2
+    assert f"ratslam: error: {folder}: no " in capsys.readouterr().err
+    assert not (folder / "watch.png").exists()
+
+
+def test_times_that_are_none_are_refused(tmp_path, capsys):
+    for option, value in (("--every", "0"), ("--patience", "nan")):
+        assert main(["watch", str(tmp_path), option, value]) == 2
+        assert option in capsys.readouterr().err
+
+
+# What a run may look like at any moment
+
+
+def files(steps, random, truth=True):
+    """The streams of a run of so many steps."""
+    pose = random.normal(size=(steps, 3))
+    rows = ["t,place,action,x,y,heading,sd_x,sd_y,sd_heading,lost,outcome,match"]
+    for k, told in enumerate(pose.tolist()):
+        cells = [k / 4, k, "none", *told, 0.1, 0.2, 0.3, k % 2, ("ok", "reseeded")[k % 3 == 1], ""]
+        rows.append(",".join(map(str, cells)))
+    tum = [
+        "".join(tum_line(k / 4, p) for k, p in enumerate(random.normal(size=(steps, 3)))) for _ in range(2)
+    ]
+    known = tum[1] if truth else ""
+    return {
+        "steps.csv": "\n".join(rows) + "\n",
+        "odometry.tum": tum[0],
+        "truth.tum": known,
+        "anytime.csv": "t,error\n" + "".join(f"{k / 4},{k}\n" for k in range(0, steps, 3)),
+    }
+
+
+def same(one, other):
+    """Whether two sights are of the same steps, whatever the clock says."""
+    rest = {"pace": None, "silent": 0.0}
+    parts = zip(one._replace(**rest), other._replace(**rest), strict=True)
+    return all(
+        np.array_equal(a, b, equal_nan=True) if isinstance(a, np.ndarray) else a == b for a, b in parts
+    )
+
+
+@settings(max_examples=25)
+@given(st.integers(0, 6), st.lists(st.integers(0, 900), max_size=4), st.booleans(), st.integers(0, 99))
+def test_however_the_lines_come_the_same_is_seen(tmp_path_factory, steps, cuts, truth, seed):
+    """Cut anywhere, in mid-line too, and looked at in between."""
+    folder = tmp_path_factory.mktemp("growing")
+    content = {name: text.encode() for name, text in files(steps, np.random.default_rng(seed), truth).items()}
+    watched = None
+    for cut in [*sorted(cuts), max(map(len, content.values()))]:
+        for name, data in content.items():
+            (folder / name).write_bytes(data[:cut])
+        watched = watched or Watched(folder)
+        seen = watched.look()
+        assert len(seen.path) == len(seen.odometry) == len(seen.truth) == sum(seen.outcomes.values()) <= steps
+    assert len(seen.path) == steps
+    assert seen.status == RUNNING
+    assert same(seen, Watched(folder).look())
+    assert np.isfinite(seen.truth).all() == (truth or not steps)
+    assert seen.lost == steps // 2
+
+
+@pytest.mark.parametrize("truth", [True, False])
+@pytest.mark.parametrize("steps", [0, 1, 2, 9])
+def test_every_sight_has_a_picture_and_the_same_one_each_time(steps, truth, tmp_path):
+    for stream, text in files(steps, np.random.default_rng(1), truth).items():
+        (tmp_path / stream).write_text(text)
+    for name in ("a", "b")[: 1 + (steps == 9)]:
+        draw_watch(Watched(tmp_path).look()).savefig(tmp_path / f"{name}.png")
+    assert steps < 9 or (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+@pytest.mark.parametrize(("name", "line"), [
+    ("steps.csv", "1.0,x,none\n"), ("odometry.tum", "0 here 0 0 0 0 0 1\n"),
+    ("odometry.tum", "0 0 1\n"), ("truth.tum", "noise\n"), ("truth.tum", "0.0 1.0\n"),
+    ("anytime.csv", "1.0,far\n"),
+])  # fmt: skip
+def test_lines_that_no_run_writes_are_named(name, line, tmp_path):
+    for stream, text in files(3, np.random.default_rng(0)).items():
+        (tmp_path / stream).write_text(text)
+    watched = Watched(tmp_path)
+    watched.look()
+    count = (tmp_path / name).read_text().count("\n")
+    with (tmp_path / name).open("a") as file:
+        file.write(line)
+    with pytest.raises(InputError, match=rf"{name}:{count + 1}"):
+        watched.look()
+
+
+def test_a_run_that_is_taken_away_is_missed(tmp_path):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "steps.csv").touch()
+    watched = Watched(folder)
+    assert watched.look().status == RUNNING
+    shutil.rmtree(folder)
+    with pytest.raises(InputError, match="gone"):
+        watched.look()
+
+
+def test_silence_is_of_the_run_and_not_of_who_watches(tmp_path):
+    (tmp_path / "steps.csv").touch()
+    os.utime(tmp_path / "steps.csv", (0, time.time() - 100))
+    (tmp_path / "watch.png").touch()
+    assert 99 < Watched(tmp_path).look().silent < 200
+
+
+def test_it_tells_steps_distance_pace_and_outcomes():
+    nothing = np.zeros((4, 2))
+    way = np.array([[0.0, 1.0, 0.0], [0.0, 2.0, 1.0], [3.0, 2.0, 2.0], [3.0, 2.0, 3.0]])
+    seen = Progress(
+        "name", RUNNING, 9, np.zeros((4, 3)), np.zeros(3), way, nothing,
+        outcomes={"ok": 1, "reseeded": 3}, lost=2, off=0.5, saved=2, pace=None, silent=11.0,
+    )  # fmt: skip
+    assert status_line(seen, 8.2) == (
+        "name: running, 4 of 9 steps, 5.0 m, 8 steps/s, off by 0.5 m, 3 reseeded, 1 ok, 2 lost, "
+        "checkpoint at 2, silent for 11 s"
+    )

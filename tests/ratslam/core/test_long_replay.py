@@ -1,0 +1,212 @@
+"""Long replays: every step is on the disk, and memory grows by what a final map needs of each step alone.
+
+    python -m tests.ratslam.core.test_long_replay labels | views | blind [--steps 1000000] [--folder FOLDER]
+
+replays laps of a small circuit through the classic rat into run files, as `ratslam run` does, and prints what
+it took.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+import pytest
+
+from robot.sources.source import Sample
+from tactile.base.random_streams import stream
+from tactile.base.se2 import integrate
+from tactile.base.types import Odometry, observation
+
+PLACES, DWELL = 60, 10
+"""Places of the circuit, and steps at each: a lap is 600 steps."""
+VIEW = (3, 6, 1)
+KINDS = "labels", "views", "blind"
+"""What is seen: a given place id, a view, or nothing, which leaves path integration alone."""
+
+POSE = 24
+"""Bytes of a pose."""
+MAP = 8 + POSE
+"""Bytes of a step for the final map: its node and the motion since."""
+KEPT = 2 * (MAP + POSE)
+"""With its true pose, known or not, in arrays that double when they are full."""
+COPIED = MAP
+"""A checkpoint is written from a copy."""
+ALIGNED = 6 * POSE
+"""How far off the present pose is, is asked of the whole path: so many poses a step for that moment."""
+SLACK = 24 * 2**20
+"""Bytes that no step is to blame for: what an allocator keeps, compiled code, buffers of files."""
+
+STATUS = Path("/proc/self/status")
+FORGET = Path("/proc/self/clear_refs")
+
+
+class Moment(NamedTuple):
+    """peak: most memory resident since the moment before, bytes. clock, own: s, by the clock and of this
+    process alone."""
+
+    peak: int
+    clock: float
+    own: float
+
+
+class Circuit:
+    """A `robot.source.Source` that goes round and round, and measures the memory of its process."""
+
+    rate_hz, view_shape, whiskers, digest = 10.0, VIEW, 0, ""
+
+    def __init__(self, kind: str, steps: int) -> None:
+        self.name, self.kind, self.length = kind, kind, steps
+        self.moments: list[Moment] = []
+        lap = PLACES * DWELL
+        random = stream(0, "tests.long_replay")
+        self._views = random.random((PLACES, *VIEW))
+        # The same errors on each lap, so that the last lap is what the second was.
+        self._motion = np.tile([0.01, 0.0, 2 * np.pi / lap], (lap, 1)) + random.normal(0, 2e-4, (lap, 3))
+        self._truth = integrate(np.tile([0.01, 0.0, 2 * np.pi / lap], (lap, 1)))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def __iter__(self) -> Iterator[Sample]:
+        early, lap = self.length // 10, len(self._motion)
+        for k in range(self.length):
+            if k in (early // 2, early):
+                self._look()
+            place, blind = k % lap // DWELL, self.kind == "blind"
+            yield Sample(
+                0.1 * k,
+                observation(
+                    Odometry(*self._motion[k % lap], 0.1),
+                    self._views[place] if self.kind == "views" else None,
+                    view_shape=VIEW,
+                    label=place if self.kind == "labels" else -1,
+                ),
+                None if blind else self._truth[k % lap],
+            )
+        self._look()
+
+    def _look(self) -> None:
+        self.moments.append(Moment(_peak(), time.perf_counter(), time.process_time()))
+        _forget()
+
+
+def replayed(kind: str, steps: int, folder: Path) -> dict[str, Any]:
+    """Replays so many steps into a run directory; what it took.
+
+    Returns:
+        steps, and lines in steps.csv; early, late: most memory resident in the second half of the first tenth
+        of the replay, and in the other nine, bytes; growth from the one to the other, bytes a step;
+        microseconds a step in those nine, by the clock and of this process alone; compilations; places;
+        kernel: bytes of its state.
+    """
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    from ratslam.config.run_config import RunConfig
+    from ratslam.pipeline.backend_registry import telling
+    from ratslam.pipeline.run import replayed as through
+    from ratslam.pipeline.run_directory import RunDirectory
+    from ratslam.pipeline.runner import Playing, session_of
+
+    source = Circuit(kind, steps)
+    config = RunConfig.model_validate(
+        {
+            "recording": {"file": "circuit.npz"},
+            "matcher": "classic",
+            "templates": {"source": "labels" if kind == "labels" else "views"},
+            "experience": {"solver": {"name": "relaxation", "loops": 1}},
+        }
+    )
+    session, told = session_of(config, source), telling(config)
+    with RunDirectory(folder, told.columns) as store:
+        through(Playing(config, source, store, {}, session, 0), source)
+    (_, early, late), rest = source.moments, 0.9 * steps
+    with (folder / "steps.csv").open(encoding="utf-8") as lines:
+        written = sum(1 for _ in lines) - 1
+    return {
+        "kind": kind,
+        "steps": steps,
+        "written": written,
+        "early": early.peak,
+        "late": late.peak,
+        "growth": (late.peak - early.peak) / rest,
+        "clock_us": 1e6 * (late.clock - early.clock) / rest,
+        "own_us": 1e6 * (late.own - early.own) / rest,
+        "compilations": session.compilations(),
+        "places": len(session.map.graph()),
+        "kernel": sum(leaf.nbytes for leaf in jax.tree.leaves(session.state)),
+    }
+
+
+def apart(kind: str, steps: int, folder: Path) -> dict[str, Any]:
+    """The same in a process of its own, whose memory is that of the replay alone."""
+    if not STATUS.exists() or not FORGET.exists():
+        pytest.skip("this system does not tell a process its peak memory")
+    command = [sys.executable, "-m", "tests.ratslam.core.test_long_replay", kind, "--steps", str(steps)]
+    done = subprocess.run([*command, "--folder", str(folder)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def bound(kind: str, steps: int) -> float:
+    """Bytes that memory may grow by between the first tenth of a replay and its end."""
+    return (KEPT + COPIED + (0 if kind == "blind" else ALIGNED)) * steps + SLACK
+
+
+def holds(found: dict[str, Any]) -> None:
+    """Everything was written, and memory has grown by no more than what must be kept."""
+    assert found["written"] == found["steps"]
+    assert found["late"] - found["early"] <= bound(found["kind"], found["steps"]), found
+    assert found["places"] <= 2 * PLACES, "the circuit is not known again: this measures something else"
+
+
+def test_a_replay_keeps_little_of_each_step(tmp_path):
+    holds(apart("labels", 10_000, tmp_path / "run"))
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(7200)
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_million_steps_fit_in_memory(kind, tmp_path):
+    found = apart(kind, 1_000_000, tmp_path / "run")
+    print(json.dumps(found))
+    holds(found)
+
+
+def _peak() -> int:
+    """Most memory resident since `_forget`, bytes; 0 where the system does not tell."""
+    if not STATUS.exists():
+        return 0
+    lines = STATUS.read_text(encoding="ascii").splitlines()
+    return next(1024 * int(line.split()[1]) for line in lines if line.startswith("VmHWM"))
+
+
+def _forget() -> None:
+    if FORGET.exists():
+        FORGET.write_text("5", encoding="ascii")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("kind", choices=KINDS)
+    parser.add_argument("--steps", type=int, default=1_000_000)
+    parser.add_argument("--folder", type=Path)
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as scratch:
+        print(json.dumps(replayed(given.kind, given.steps, given.folder or Path(scratch) / "run")))
+
+
+if __name__ == "__main__":
+    main()

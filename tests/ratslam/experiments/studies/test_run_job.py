@@ -1,0 +1,147 @@
+"""One job: the same figures as a run has, whatever ran before in this process, and what it took."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import jax
+import pytest
+
+from evaluation.artifacts.run_directory import read_card
+from evaluation.metrics.grid_score import score_grid
+from ratslam.experiments.studies.memory import weighed
+from ratslam.experiments.studies.metrics import DIRECTIONS, MEASURED
+from ratslam.experiments.studies.run_job import run_job
+from ratslam.experiments.studies.study import jobs, read_study
+from ratslam.experiments.studies.timing import Stopwatch
+from ratslam.pipeline.run import run
+
+ROOT = Path(__file__).parents[4]
+SMALL = {"simulation.path": {"circuits": "CC"}}
+
+
+@pytest.mark.parametrize("matcher", ["classic", pytest.param("recall", marks=pytest.mark.soak)])
+def test_a_job_has_the_figures_of_a_run(tiny, tmp_path, matcher):
+    (job,) = jobs(read_study(tiny(set=SMALL | {"matcher": matcher}, seeds=[3])))
+    result = run_job(job)
+    run(job.config, tmp_path, tmp_path / "run")
+    card = read_card(tmp_path / "run")
+    assert list(result.quantities) == list(card.quantities)
+    for name, quantity in card.quantities.items():
+        ours = result.quantities[name]
+        assert (ours.label, ours.unit) == (quantity.label, quantity.unit)
+        # Headings lose a bit on their way through a file's quaternions.
+        assert ours.value == (quantity.value and pytest.approx(quantity.value, rel=1e-6, abs=1e-9))
+    assert result.steps == result.quantities["steps"].value
+    assert (result.row, result.seed, result.error) == ("", 3, None)
+
+
+def test_a_job_is_timed_with_compiling_apart_and_weighed(tiny):
+    (job,) = jobs(read_study(tiny(set=SMALL)))
+    result = run_job(job)
+    timing, memory = result.timing, result.memory
+    assert 0 < timing.median_us <= timing.p99_us
+    assert timing.compilations > 0
+    assert timing.compile_s + 1e-6 * timing.median_us * result.steps < timing.total_s * 1.2
+    assert timing.compile_s > 100e-6 * timing.median_us  # not hidden among the steps
+    assert 0 < memory.before <= memory.peak
+    assert result.machine.versions["jax"] == jax.__version__
+    assert all(result.value(name) > 0 for name in MEASURED)
+
+
+def test_pace_and_what_ran_before_change_no_figure(tiny):
+    vary = {"session.precision": ["float32", "float64"]}
+    single, double = jobs(read_study(tiny(vary=vary)))
+    (live, _) = jobs(read_study(tiny(vary=vary, pace="live")))
+    first, before = run_job(single), jax.config.jax_enable_x64
+    wide = run_job(double)
+    stepwise = run_job(live)
+    assert first.quantities == stepwise.quantities
+    assert first.timing.pace == "replay"
+    assert stepwise.timing.pace == "live"
+    assert first.quantities != wide.quantities or first.source == wide.source
+    assert jax.config.jax_enable_x64 == before
+
+
+def test_the_grid_filter_is_judged_by_its_map(tmp_path):
+    (tmp_path / "study.yaml").write_text(
+        f"base: {ROOT}/configs/create_arena.yaml\nset: {{roving.reports: 30, grid.particles: 8}}\n"
+    )
+    (job,) = jobs(read_study(tmp_path / "study.yaml"))
+    result = run_job(job)
+    assert result.error is None
+    assert 0 < result.value("map_error") < 1
+    assert 0 <= result.value("map_auc") <= 1
+    assert set(result.quantities) <= set(DIRECTIONS)
+
+
+def test_every_quantity_of_the_scorecards_is_known(tiny, tmp_path):
+    """Otherwise it could not be tuned for, and its worst would not be told."""
+    (job,) = jobs(read_study(tiny()))
+    (tmp_path / "relations").write_text("2.5,4.5,0,0,0,0,0,0\n2.5,6.5,0,0,0,0,0,0\n")
+    score = job.config.score.model_copy(update={"relations": tmp_path / "relations"})
+    told = run_job(job._replace(config=job.config.model_copy(update={"score": score})))
+    assert told.error is None
+    maps = {name for name in DIRECTIONS if name.startswith("map_")}
+    assert set(told.quantities) | maps | set(MEASURED) == set(DIRECTIONS)
+    assert maps - {"map_error"} == set(score_grid.__globals__["_QUANTITIES"])
+
+
+def test_what_a_user_can_mend_is_a_result(tiny):
+    (job,) = jobs(read_study(tiny(set={"simulation.maze": {"file": "nowhere.txt"}})))
+    result = run_job(job)
+    assert "nowhere.txt" in result.error
+    assert result.quantities == {}
+    assert result.value("energy_all") is None
+
+
+def test_what_nobody_can_mend_is_not_hidden(tiny, monkeypatch):
+    monkeypatch.setattr("ratslam.sweeps.jobs.session_of", lambda *_: 1 / 0)
+    (job,) = jobs(read_study(tiny()))
+    with pytest.raises(ZeroDivisionError):
+        run_job(job)
+
+
+def test_a_stopwatch_keeps_compiling_out_of_the_steps(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr("ratslam.sweeps.stopwatch.perf_counter", lambda: now[0])
+    watch = Stopwatch()
+    with watch.preparing():
+        now[0] += 3.0
+    for seconds, compiles in ((10.016, True), (0.016, False), (0.016, False), (0.032, False), (5.016, True)):
+        with watch.taking(16):
+            now[0] += seconds
+            watch._counted[0] += compiles
+    told = watch.told()
+    assert told["median_us"] == pytest.approx(1000)
+    assert told["p99_us"] == pytest.approx(2000, rel=0.02)
+    assert told["compile_s"] == pytest.approx(18.0)
+    assert told["compilations"] == 2
+
+
+def test_a_stopwatch_counts_what_jax_compiles():
+    watch = Stopwatch()
+    for _ in range(2):
+        with watch.taking(1):
+            jax.jit(lambda x: x * math.pi + 1)(1.0).block_until_ready()
+    kept = jax.jit(lambda x: x - 1)
+    for _ in range(3):
+        with watch.taking(1):
+            kept(1.0).block_until_ready()
+    assert watch.told()["compilations"] >= 3
+    assert len(watch._taken) == 2
+
+
+def test_memory_is_of_this_piece_of_work():
+    with weighed() as memory:
+        large = bytearray(200 << 20)
+        large[::4096] = b"x" * len(large[::4096])
+        del large
+    told = memory()
+    with weighed() as after:
+        pass
+    if told.exact:
+        assert told.peak - told.before > 150
+        assert after().peak < told.peak - 100
+    assert told.peak >= told.before > 0

@@ -1,0 +1,258 @@
+"""Studies: what comes of a file, that no configuration is lost or run twice, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ratslam.cli import main
+from ratslam.config.run_config import RunConfig
+from ratslam.experiments.studies.schema import StudyPlan
+from ratslam.experiments.studies.study import Study, jobs, read_study
+from ratslam.keyframes.config import FrameMapConfig
+from tactile.base.errors import InputError
+
+ROOT = Path(__file__).parents[4]
+MAZE = ROOT / "configs" / "whisker_maze.yaml"
+SQUARE = ROOT / "configs" / "square.yaml"
+AXES = {
+    "frames.score": st.floats(1, 50, allow_subnormal=False),
+    "recall.modes": st.integers(1, 8),
+    "matcher": st.sampled_from(["recall", "classic"]),
+    "session.precision": st.sampled_from(["float32", "float64"]),
+    "simulation.whisking.rate": st.floats(0.5, 4),
+    "places": st.sampled_from([{}, {"radius": 1.0}, {"radius": 1.5}]),
+}
+GRIDS = st.lists(st.sampled_from(sorted(AXES)), unique=True, max_size=3).flatmap(
+    lambda keys: st.fixed_dictionaries(
+        {key: st.lists(AXES[key], min_size=1, max_size=3, unique_by=json.dumps) for key in keys}
+    )
+)
+
+
+def study(folder: Path, base: Path = MAZE, **content: object) -> Path:
+    """A study file. JSON is YAML."""
+    path = folder / "study.yaml"
+    path.write_text(json.dumps({"base": str(base), **content}))
+    return path
+
+
+def read(folder: Path, *overrides: str, base: Path = MAZE, **content: object) -> Study:
+    return read_study(study(folder, base, **content), overrides)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("study")
+
+
+@settings(max_examples=25)
+@given(grid=GRIDS, rows=st.lists(st.integers(1, 99), unique=True, max_size=3), seeds=st.integers(1, 4))
+def test_rows_by_combinations_by_seeds(folder, grid, rows, seeds):
+    named = {f"row {n}": {"frames.distance": n + 0.5} for n in rows}
+    found = jobs(read(folder, vary=grid, rows=named, seeds=seeds))
+    combinations = 1
+    for values in grid.values():
+        combinations *= len(values)
+    assert len(found) == max(len(rows), 1) * combinations * seeds
+    assert len({job.key for job in found}) == len(found)  # they all differ, so do their keys
+    assert [job.seed for job in found[:seeds]] == list(range(seeds))
+    assert list(dict.fromkeys(job.row for job in found)) == (list(named) or [""])
+    for job in found:
+        assert job.config.simulation.seed == job.seed
+        for key, value in job.varied.items():
+            assert value in grid[key]
+            if key == "frames.score":
+                assert job.config.frames.score == value
+
+
+@settings(max_examples=25)
+@given(grid=GRIDS, data=st.data())
+def test_hashes_follow_from_what_is_set_and_not_from_how_it_is_written(folder, grid, data):
+    first = {key: values[0] for key, values in grid.items()}
+    shuffled = {key: grid[key] for key in data.draw(st.permutations(sorted(grid)))}
+    expected = {job.key for job in jobs(read(folder, vary=grid, seeds=2))}
+    assert {job.key for job in jobs(read(folder, vary=shuffled, seeds=2))} == expected
+    as_row = jobs(read(folder, rows={"one": {key: first[key] for key in shuffled}}, seeds=2))
+    as_set = jobs(read(folder, set={key: first[key] for key in shuffled}, seeds=[1, 0]))
+    assert {job.key for job in as_row} == {job.key for job in as_set} <= expected
+
+
+def test_a_row_that_equals_another_is_the_same_job(folder):
+    found = jobs(read(folder, rows={"a": None, "b": {}, "c": {"frames.score": 3.0}}))
+    assert [job.row for job in found] == ["a", "b", "c"]
+    assert found[0].key == found[1].key != found[2].key
+
+
+def test_what_is_set_counts_even_if_it_is_the_default(folder):
+    """What nobody sets may be completed from the source: touch has a `frames.score` of its own."""
+    usual = FrameMapConfig().score
+    unset, default = jobs(read(folder, rows={"unset": {}, "default": {"frames.score": usual}}))
+    assert unset.config == default.config
+    assert unset.key != default.key
+
+
+def test_seeds_are_no_part_of_the_hash_and_the_base_may_have_any(folder):
+    base = folder / "seeded.yaml"
+    base.write_text("simulation: {seed: 77}\n")
+    plain = folder / "plain.yaml"
+    plain.write_text("simulation: {}\n")
+    seeded, bare = (jobs(read(folder, base=path, seeds=[5])) for path in (base, plain))
+    assert seeded[0].key == bare[0].key
+    assert seeded[0].config.simulation.seed == 5
+
+
+@pytest.mark.parametrize(
+    ("base", "section"),
+    [("whisker_maze.yaml", "simulation"), ("create_arena.yaml", "roving"), ("square.yaml", "session")],
+)
+def test_seeds_are_of_what_is_run_on(folder, base, section):
+    found = jobs(read(folder, base=ROOT / "configs" / base, seeds=[3, 8]))
+    assert [getattr(job.config, section).seed for job in found] == [3, 8]
+
+
+def test_the_content_of_a_file_counts_and_not_where_it_lies(folder):
+    golden = ROOT / "tests" / "golden" / "a_square3.npz"
+    keys = []
+    for name, more in (("x", b""), ("y", b""), ("x", b"more")):
+        (folder / name).mkdir(exist_ok=True)
+        (folder / name / "run.npz").write_bytes(golden.read_bytes() + more)
+        (folder / name / "base.yaml").write_text("recording: {file: run.npz}\n")
+        (folder / name / "study.yaml").write_text("base: base.yaml\n")
+        keys.append(jobs(read_study(folder / name / "study.yaml"))[0].key)
+    assert keys[0] == keys[1] != keys[2]
+
+
+def test_paths_of_the_base_start_at_the_base(folder):
+    (job,) = jobs(read(folder, base=SQUARE))
+    assert job.config.recording.file.samefile(ROOT / "tests" / "golden" / "a_square3.npz")
+
+
+def test_pace_counts_because_times_are_of_it(folder):
+    (replay,), (live,) = (jobs(read(folder, pace=pace)) for pace in ("replay", "live"))
+    assert (replay.pace, live.pace) == ("replay", "live")
+    assert replay.key != live.key
+
+
+def test_overrides_are_of_the_study_or_of_all_runs(folder):
+    found = read(
+        folder, "seeds=3", "frames.score=9", "simulation.path.circuits=CC", set={"frames.score": 2.0}
+    )
+    assert len(jobs(found)) == 3
+    assert {job.config.frames.score for job in jobs(found)} == {9.0}
+    assert {job.config.simulation.path.circuits for job in jobs(found)} == {"CC"}
+    whole = read(folder, "frames={distance: 9}", set={"frames.score": 2.0})
+    assert jobs(whole)[0].config.frames.model_fields_set == {"distance"}
+
+
+def test_a_section_is_set_before_what_is_in_it(folder):
+    written = {"frames.score": 2.0, "frames": {"distance": 9.0}}
+    found = [jobs(read(folder, set=dict(items))) for items in (written.items(), reversed(written.items()))]
+    assert found[0] == found[1]
+    assert found[0][0].config.frames.score == 2.0
+
+
+def test_no_key_of_studies_is_one_of_runs():
+    assert not set(StudyPlan.model_fields) & set(RunConfig.model_fields)  # `--set` tells them apart by it
+
+
+GRID = {"frames.score": [3]}
+
+
+def tune(**parameter: object) -> dict[str, object]:
+    return {"tune": TUNE | {"parameters": {"frames.score": parameter}}}
+
+
+TUNE = {"parameters": {"frames.score": {"low": 1.0, "high": 2.0}}, "objectives": ["exm_arr"]}
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ({"base": "nowhere.yaml"}, ["nowhere.yaml", "No such file"]),
+        ({"vary": {"frames.scor": [1, 2]}}, ["study.yaml:1:", "frames.scor: unknown key", "'score'"]),
+        ({"rows": {"a": {"recall.leave": "x"}}}, ["recall.leave: 'x'", "a number"]),
+        ({"set": {"frames.score": [1]}}, ["frames.score: a list of 1"]),
+        ({"vary": {"frames.score": []}}, ["vary.frames.score", "at least 1"]),
+        ({"vary": {"frames.score": 3}}, ["vary.frames.score: 3", "a list"]),
+        ({"vary": {"frames.score": [3, 4, 3]}}, ["vary.frames.score.2: 3 given twice"]),
+        ({"vary": GRID, "rows": {"a": {"frames": {}}}}, ["rows.a.frames", "'frames.score' varies"]),
+        ({"vary": GRID | {"frames": [{}]}}, ["vary.frames", "'frames.score' varies"]),
+        ({"vary": {"simulation.seed": [1, 2]}}, ["simulation.seed: a seed"]),
+        ({"set": {"simulation.seed": 1}}, ["simulation.seed: a seed"]),
+        ({"base": str(SQUARE), "rows": {"a": {"session.seed": 1}}}, ["session.seed: a seed"]),
+        ({"set": {"a..b": 3}}, ["a..b: no key path"]),
+        ({"set": {"touch.image.levels.x": 3}}, ["touch.image.levels"]),
+        ({"seeds": 0}, ["seeds: 0"]),
+        ({"seeds": [1, 1]}, ["seeds", "twice"]),
+        ({"seeds": [-1]}, ["seeds.0: -1"]),
+        ({"vary": {f"frames.{key}": list(range(1, 60)) for key in "abc"}}, ["205379 jobs"]),
+        ({"sedes": 3}, ["sedes: unknown key", "'seeds'"]),
+        ({"tune": TUNE | {"objectives": ["speed"]}}, ["objectives.0: 'speed'", "step_time"]),
+        ({"tune": TUNE | {"objectives": ["steps"]}}, ["objectives.0: 'steps'", "minimise or maximise"]),
+        ({"tune": TUNE | {"objectives": []}}, ["tune: no objectives"]),
+        ({"tune": TUNE | {"minimise": ["exm_arr"]}}, ["tune: a quantity named twice"]),
+        ({"tune": TUNE | {"parameters": {}}}, ["tune.parameters"]),
+        ({"tune": TUNE | {"parameters": {"frames.x": {"low": 1, "high": 2}}}}, ["frames.x: unknown key"]),
+        ({"tune": TUNE | {"parameters": {"recall.leave": {"low": 0.1, "high": 2.0}}}}, ["recall.leave: 2"]),
+        (tune(low=2, high=2), ["low 2 is not below"]),
+        (tune(low=0, high=2, log=True), ["log needs"]),
+        (tune(low=2), ["give low and high, or choices"]),
+        (tune(low=2, high=3, choices=[1, 2]), ["give low and high, or choices"]),
+    ],
+)  # fmt: skip
+def test_a_bad_study_is_refused_before_anything_runs(capsys, folder, content, said):
+    output = folder / "never"
+    assert main(["sweep", str(study(folder, **content)), "-o", str(output)]) == 2
+    error = capsys.readouterr().err
+    assert "Traceback" not in error
+    assert error.startswith("ratslam: error: ")
+    for words in said:
+        assert words in error
+    assert not output.exists()
+
+
+def test_a_fault_is_told_once_and_all_faults_are_told(folder):
+    with pytest.raises(InputError) as caught:
+        read(
+            folder, vary={"matcher": ["recall", "classic"], "frames.scor": [1, 2]}, set={"recall.leave": "x"}
+        )
+    lines = str(caught.value).splitlines()
+    assert len(lines) == 2
+    assert "recall.leave: 'x'" in str(caught.value)
+    assert "frames.scor: unknown key" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("frames.scor=3", "--set frames.scor: unknown key"),
+        ("matcher=recall", "varied"),
+        ("x", "no key and value"),
+    ],
+)
+def test_a_bad_override_is_refused(folder, override, said):
+    with pytest.raises(InputError, match=said):
+        read(folder, override, vary={"matcher": ["recall", "classic"]})
+
+
+def test_an_empty_file_and_a_missing_base_are_refused(folder):
+    for text, said in (("", "empty"), ("seeds: 2\n", "base: missing"), ("base: study.yaml\n", "unknown key")):
+        (folder / "study.yaml").write_text(text)
+        with pytest.raises(InputError, match=said):
+            read_study(folder / "study.yaml")
+
+
+def test_nothing_to_tune_is_refused(capsys, folder):
+    assert main(["sweep", str(study(folder)), "-o", str(folder / "never"), "--tune"]) == 2
+    assert "tune: missing" in capsys.readouterr().err
+    assert not (folder / "never").exists()
+
+
+def test_the_examples_are_studies():
+    for path in (ROOT / "configs").glob("study_*.yaml"):
+        assert jobs(read_study(path))

@@ -1,0 +1,322 @@
+"""The figures of Fox et al. 2012 made again: charts, loops, orders, and a tiny reproduction end to end."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import ratslam.experiments.fox2012
+from ratslam.cli import main
+from ratslam.cli.create import SETS
+from ratslam.experiments.fox2012 import jobs_of, reproduce
+from ratslam.experiments.fox2012.mapper_ranking import MEASURES, Measure, order, orders
+from ratslam.experiments.fox2012.metrics import AWAY, FIELDS, measured, revisits
+from ratslam.experiments.fox2012.protocols import FILTERED, MAPPERS, PAPERS, PROTOCOLS, RECKONED, TRUE
+from ratslam.experiments.fox2012.session import (
+    ROOM,
+    chart,
+    felt,
+    felt_marks,
+    mapped,
+    outing,
+    span,
+    started,
+    truth_of,
+)
+from ratslam.experiments.fox2012.trials import Result, results
+from ratslam.grid.config import GridConfig
+from robot.world.arena import Arena, fits
+from robot.world.random_arena import ArenaConfig, arena
+from tactile.base.errors import InputError
+from tests.helpers.grid_world import TIPS, create, report
+
+TINY = ("roving.reports=40", "grid.particles=20")
+ROOMY = Arena("roomy", np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]), (), np.zeros(3))
+BRIER = next(measure for measure in MEASURES if measure.key == "map_brier_skill")
+EVERYWHERE = MEASURES[0]
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, bool]:
+    """The folder and the text of a small reproduction."""
+    folder = tmp_path_factory.mktemp("fox")
+    text, interrupted = reproduce("fox-fig4", folder, sets=2, workers=1, assignments=TINY)
+    return folder, text, interrupted
+
+
+@pytest.fixture(scope="module")
+def rows(tiny: tuple[Path, str, bool]) -> list[dict[str, str]]:
+    with (tiny[0] / "fox-fig4.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def made(
+    mapper: str, number: int, key: str, value: float, along: str = FILTERED, best: float = 0.0
+) -> Result:
+    """A result of which nothing matters but one figure."""
+    score: Any = SimpleNamespace(under=lambda convention: SimpleNamespace(best=best))
+    nothing: Any = None
+    return Result(
+        "",
+        "ours",
+        mapper,
+        along,
+        number,
+        0,
+        0,
+        40,
+        {key: value},
+        score,
+        nothing,
+        ROOMY,
+        nothing,
+        nothing,
+        nothing,
+    )
+
+
+def of(
+    measure: Measure, table: dict[str, list[float]], along: str = FILTERED, best: float = 0.0
+) -> list[Result]:
+    return [
+        made(mapper, k, measure.key, value, along, best)
+        for mapper, values in table.items()
+        for k, value in enumerate(values)
+    ]
+
+
+# Sessions and charts
+
+
+@given(st.integers(0, 50))
+def test_trials_of_one_arena_start_anywhere_that_is_free(seed: int) -> None:
+    place = arena(ArenaConfig(seed=1), 0)
+    one, other = started(place, seed), started(place, seed + 1)
+    assert fits(one, one.start[None, :2], ROOM).all()
+    assert not np.allclose(one.start, other.start)
+    assert one.objects is place.objects
+
+
+def test_a_start_needs_room() -> None:
+    with pytest.raises(InputError, match="no room"):
+        started(ROOMY._replace(outer=0.3 * ROOMY.outer), 0)
+
+
+def test_what_was_felt_is_drawn_where_it_was() -> None:
+    reports = [report(forward=0.02), report(forward=0.02, touching=[1])]
+    path = np.array([[0.4, 0.5, np.pi / 2], [0.4, 0.52, np.pi / 2]])
+    grid = chart(GridConfig(body=0.0), create(), ROOMY, path, felt_marks(reports))
+    assert grid.probability.shape == (40, 40)
+    assert np.allclose(grid.origin, -0.5)
+    row, column = np.unravel_index(grid.probability.argmax(), grid.probability.shape)
+    there = grid.origin + grid.cell * (np.array([column, row]) + 0.5)
+    assert np.abs(there - [0.4 - TIPS[1, 1], 0.52 + TIPS[1, 0]]).max() <= grid.cell / 2 + 1e-9
+    # What came later is not drawn.
+    first = chart(GridConfig(body=0.0), create(), ROOMY, path[:1], felt_marks(reports))
+    assert first.probability.max() == pytest.approx(0.3)
+
+
+def test_charts_lie_on_the_truth_of_any_arena() -> None:
+    place = arena(ArenaConfig(seed=2), 0)
+    empty = chart(GridConfig(), create(), place, np.zeros((0, 3)), felt_marks([report()]))
+    truth = truth_of(place, empty)
+    assert truth.inside.mean() == pytest.approx(0.25)
+    assert (truth.occupied | truth.inside).all()
+    assert span(place) == 1.25
+    moved = place._replace(outer=place.outer + 3.0, objects=tuple(p + 3.0 for p in place.objects))
+    grid = chart(GridConfig(), create(), moved, np.zeros((0, 3)), felt_marks([report()]))
+    assert np.array_equal(truth_of(moved, grid).occupied, truth.occupied)
+
+
+def test_a_stop_on_the_way_changes_nothing(tiny: object) -> None:
+    job = jobs_of(PROTOCOLS["fox-fig4"], 1, 0, TINY)[0]
+    config = job.variants["ours", "blob"]
+    assert config.roving is not None
+    out = outing(config.roving)
+    reports = felt(config, out, 0)
+    early, late = mapped(config, out, reports, (23, len(reports)))
+    (whole,) = mapped(config, out, reports, (len(reports),))
+    assert np.array_equal(late.told, whole.told)
+    assert np.array_equal(late.grid.probability, whole.grid.probability)
+    assert np.array_equal(early.told, whole.told[:23])
+    assert len(early.path) == 23
+
+
+# Paths and loops
+
+
+def there_and_back(count: int = 40, far: float = 1.0) -> np.ndarray:
+    x = np.concatenate([np.linspace(0, far, count), np.linspace(far, 0, count)])
+    return np.column_stack([x, np.zeros_like(x), np.zeros_like(x)])
+
+
+def test_a_robot_that_comes_back_is_there_again() -> None:
+    truth = there_and_back()
+    later, earlier = revisits(truth).T
+    assert (later >= 40).all()
+    assert np.abs(truth[later, 0] - truth[earlier, 0]).max() < 0.02
+    assert truth[later, 0].max() < 1 - AWAY / 2 + 0.03  # near the turn it was never away
+    assert len(revisits(truth[:40])) == 0
+    assert len(revisits(there_and_back(far=AWAY))) == 0
+
+
+def test_loops_are_closed_by_where_visits_lie_to_each_other() -> None:
+    truth = there_and_back()
+    shifted = truth + [3.0, -4.0, 0.1]
+    found = measured(shifted, shifted, truth)
+    assert found["told"] == found["final"] == pytest.approx(5)
+    assert found["gap"] == pytest.approx(0, abs=1e-12)
+    assert found["closed"] == 1
+    assert found["heading"] == pytest.approx(np.degrees(0.1))
+    drifted = truth + np.column_stack([np.zeros(80), np.linspace(0, 1, 80), np.zeros(80)])
+    assert measured(truth, drifted, truth)["closed"] == 0
+    assert measured(truth[:9], truth[:9], truth[:9])["closed"] is None
+
+
+# Orders
+
+
+def test_the_papers_order_holds_or_not() -> None:
+    falling = {"blob": [0.5, 0.6, 0.7], "geometric": [0.4, 0.5, 0.6], "template": [0.3, 0.4, 0.5]}
+    rising = dict(zip(falling, list(falling.values())[::-1], strict=True))
+    mixed = falling | {"geometric": [0.4, 0.7, 0.6]}
+    words = [order(of(EVERYWHERE, table), "ours", EVERYWHERE) for table in (falling, rising, mixed)]
+    assert [one.word for one in words if one] == ["holds", "does not hold", "not decided"]
+    # More skill is better, so the same numbers say the opposite.
+    better = [order(of(BRIER, table), "ours", BRIER) for table in (falling, rising)]
+    assert [one.word for one in better if one] == ["does not hold", "holds"]
+    assert order(of(EVERYWHERE, {name: [0.1] for name in PAPERS}), "ours", EVERYWHERE) is None
+    assert order(of(EVERYWHERE, falling), "as printed", EVERYWHERE) is None
+
+
+@given(st.lists(st.tuples(*[st.floats(0, 1)] * 3), min_size=2, max_size=6))
+def test_an_order_and_its_reverse_do_not_both_hold(sets: list[tuple[float, float, float]]) -> None:
+    columns = [list(column) for column in zip(*sets, strict=True)]
+    forth, back = (
+        order(of(EVERYWHERE, dict(zip(PAPERS, each, strict=True))), "ours", EVERYWHERE)
+        for each in (columns, columns[::-1])
+    )
+    assert forth is not None
+    assert back is not None
+    assert {forth.word, back.word} != {"holds"}
+    if forth.word == "holds":
+        assert back.word == "does not hold"
+
+
+def test_a_constant_that_wins_is_named() -> None:
+    falling = {"blob": [0.5, 0.6], "geometric": [0.4, 0.5], "template": [0.3, 0.4]}
+    beaten, good = (order(of(EVERYWHERE, falling, best=b), "ours", EVERYWHERE) for b in (0.2, 0.5))
+    assert beaten is not None
+    assert good is not None
+    assert (beaten.beaten, good.beaten) == (True, False)
+    skill = order(of(BRIER, {name: [-0.1, -0.2] for name in PAPERS}), "ours", BRIER)
+    assert skill is not None
+    assert skill.beaten
+    lines = orders("ours", of(EVERYWHERE, falling, best=0.2) + of(EVERYWHERE, falling, RECKONED, best=0.2))
+    assert lines[2].count("holds") == 2  # also along dead reckoning; the true path is not known here
+    assert lines[2].endswith("knows nothing is as good")
+    assert lines[-1].startswith("Intervals of less than")
+
+
+# The reproductions themselves
+
+
+def test_the_program_knows_them_all() -> None:
+    assert set(SETS) == set(PROTOCOLS)
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_all_variants_of_a_set_are_of_one_session(name: str) -> None:
+    jobs = jobs_of(PROTOCOLS[name], 2, 0)
+    assert len(jobs) == 2 * len(PROTOCOLS[name].worlds)
+    assert all(len({config.roving for config in job.variants.values()}) == 1 for job in jobs)
+    sessions = {
+        (job.number, config.roving.seed) for job in jobs for config in job.variants.values() if config.roving
+    }
+    assert len(sessions) == 2
+    arenas = {config.roving.arena.seed for job in jobs for config in job.variants.values() if config.roving}
+    assert len(arenas) == (1 if PROTOCOLS[name].one_arena else 2)
+
+
+def test_a_tiny_reproduction_leaves_table_rows_and_figure(
+    tiny: tuple[Path, str, bool], rows: list[dict[str, str]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, text, interrupted = tiny
+    assert not interrupted
+    assert "2 of 2 sets" in text
+    assert "constant 0.3" in text
+    assert "blob worse than geometric worse than template? as printed" in text
+    assert len(rows) == 2 * 2 * 3 * len(MAPPERS)
+    assert set(FIELDS) < set(rows[0])
+    assert (folder / "fox-fig4.png").read_bytes().startswith(b"\x89PNG")
+    assert main(["reproduce", "fox-fig4", "-o", str(folder)]) == 2
+    assert "exists" in capsys.readouterr().err
+
+
+def test_all_see_the_same_sets_and_paths_without_a_filter_are_what_they_say(
+    rows: list[dict[str, str]],
+) -> None:
+    reckoned = [{row["reckoned"] for row in rows if row["set"] == number} for number in "01"]
+    assert [len(each) for each in reckoned] == [1, 1]
+    assert reckoned[0] != reckoned[1]
+    assert all(row["told"] == row["reckoned"] for row in rows if row["along"] == RECKONED)
+    assert all(float(row["told"]) == 0 for row in rows if row["along"] == TRUE)
+    filtered = [row["told"] for row in rows if row["along"] == FILTERED and row["set"] == "0"]
+    assert len(set(filtered)) > 2
+
+
+def test_a_set_gives_the_same_whatever_ran_before(rows: list[dict[str, str]]) -> None:
+    again = results(jobs_of(PROTOCOLS["fox-fig4"], 2, 0, TINY)[1])
+    before = [row for row in rows if row["set"] == "1"]
+    assert [repr(one.values["told"]) for one in again] == [row["told"] for row in before]
+    assert [repr(one.values["map_auc"]) for one in again] == [row["map_auc"] for row in before]
+
+
+def test_an_interrupt_leaves_what_was_finished(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(function, tasks, workers):
+        yield [
+            made(mapper, 0, "told", 0.1)._replace(values={"told": 0.1, "reckoned": 0.2}) for mapper in PAPERS
+        ]
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ratslam.experiments.fox2012, "shared_out", interrupted)
+    text, stopped = reproduce("fox-fig4", tmp_path, sets=3, workers=1)
+    assert stopped
+    assert "1 of 3 sets" in text
+    assert len((tmp_path / "fox-fig4.csv").read_text().splitlines()) == 4
+    assert not (tmp_path / "fox-fig4.png").exists()
+
+
+def test_what_cannot_be_run_is_refused_before_anything_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "a"
+    for assignment, said in (
+        ("grid.cell=-1", "grid.cell"),
+        ("roving.arena.sides=2", "side"),
+        ("touch.reports.walls=edges", "walls"),
+    ):
+        assert main(["reproduce", "fox-fig6", "-o", str(folder), "--set", assignment]) == 2
+        assert said in capsys.readouterr().err
+    assert not folder.exists()
+    with pytest.raises(SystemExit) as stopped:
+        main(["reproduce", "fox-fig3"])
+    assert stopped.value.code == 2
+    with pytest.raises(InputError, match="fox-fig3"):
+        reproduce("fox-fig3", tmp_path)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_reproductions_run_to_their_end(name: str, tmp_path: Path) -> None:
+    text, stopped = reproduce(name, tmp_path, sets=2, workers=2, assignments=TINY)
+    assert not stopped
+    assert PROTOCOLS[name].title in text
+    assert (tmp_path / f"{name}.png").exists()

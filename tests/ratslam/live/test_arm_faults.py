@@ -1,0 +1,85 @@
+"""Whatever goes wrong with the arm ends the session under its name, with the arm at rest and nothing lost."""
+
+from __future__ import annotations
+
+import os
+import signal
+
+import pytest
+
+from tests.ratslam.live.bench import Bench
+from tests.ratslam.live.expected_outcomes import ended, stands
+
+BLIND = {"stall", "malformed", "truncated", "huge", "nan", "freeze", "die"}
+"""Faults after which the session does not see the arm any more."""
+OFTEN = pytest.mark.soak
+"""The arm alone meets these in every run of the suite (`tests/robot/ur10`), whole sessions in `make soak`."""
+
+
+@pytest.mark.parametrize(
+    ("fault", "outcomes"),
+    [
+        pytest.param({"do": "stall", "seconds": 1.0}, {"arm_stale"}, marks=OFTEN),
+        ({"do": "stall", "seconds": 3.0}, {"arm_stale"}),
+        ({"do": "malformed"}, {"arm_malformed"}),
+        # What half a frame and one without an end are taken for is the library's affair.
+        pytest.param({"do": "truncated"}, {"arm_malformed", "arm_stale"}, marks=OFTEN),
+        pytest.param({"do": "huge"}, {"arm_malformed", "arm_stale"}, marks=OFTEN),
+        pytest.param({"do": "nan"}, {"arm_malformed"}, marks=OFTEN),
+        pytest.param({"do": "freeze"}, {"arm_stale"}, marks=OFTEN),
+        ({"do": "protective"}, {"protective_stop"}),
+        pytest.param({"do": "safeguard"}, {"safeguard_stop"}, marks=OFTEN),
+        pytest.param({"do": "emergency"}, {"emergency_stop"}, marks=OFTEN),
+        ({"do": "ik_fails"}, {"unreachable"}),
+        ({"do": "die"}, {"arm_gone", "arm_stale"}),
+    ],
+    ids=lambda value: "-".join(map(str, value.values())) if isinstance(value, dict) else "",
+)
+def test_a_fault_of_the_controller(bench: Bench, fault: dict, outcomes: set[str]) -> None:
+    with bench.under_way() as session:
+        at = bench.moment()
+        if fault["do"] == "die":
+            bench.arm.die()
+        else:
+            bench.arm(**fault)
+        session.code()
+        outcome = session.report()["outcome"]
+        assert outcome in outcomes
+        report, kept = ended(bench, session, outcome, at)
+        assert report["standing"] or fault["do"] in BLIND
+        assert kept.events[-1].name == "fault"
+        assert kept.events[-1].text.startswith(outcome)
+        if fault["do"] in {"safeguard", "protective", "stall", "freeze"}:
+            bench.arm(do="clear")  # nothing resumes by itself
+            stands(bench)
+
+
+def test_the_arms_process_crashes(bench: Bench) -> None:
+    with bench.under_way() as session:
+        at = bench.moment()
+        os.kill(session.child(), signal.SIGSEGV)
+        report, _ = ended(bench, session, "arm_gone", at)
+        assert "SIGSEGV" in report["detail"]
+
+
+def test_registers_in_use(bench: Bench) -> None:
+    bench.arm(do="registers")
+    sent = len(bench.arm.state()["targets"])
+    with bench.session() as session:
+        assert session.code() == 2
+        assert "registers in use" in session.said()
+        assert "EtherNet/IP" in session.said()
+        assert "Traceback" not in session.said()
+        assert not session.directory.exists()
+        assert len(bench.arm.state()["targets"]) == sent
+
+
+def test_the_tool_hits_a_wall(bench: Bench) -> None:
+    with bench.under_way() as session:
+        at, touched = bench.moment(), bench.arm.state()["tcp"][0] + 0.02
+        bench.arm(do="wall", x=touched, stiffness=20_000)
+        ended(bench, session, "contact", at)
+        state = bench.arm.state()
+        assert 0 < state["penetration_max"] <= 0.003
+        assert state["safety"] == "NORMAL"
+        assert state["tcp"][0] == pytest.approx(touched + state["penetration_max"] - 0.01, abs=0.0015)

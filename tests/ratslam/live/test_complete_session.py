@@ -1,0 +1,154 @@
+"""A session as the README has it: emulators, `live`, and `run` on what it recorded, each by the program."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.helpers.live import HEAD_FAULTS, ROOT, UR_FAULTS, Faults, until
+from tests.ratslam.live.bench import kept, undisturbed
+
+CONFIG = str(ROOT / "configs" / "live_maze.yaml")
+REPLAY = """
+import sys
+from ratslam.__main__ import main
+code = main(sys.argv[1:])
+strangers = ("rtde", "dashboard_client", "usb", "serial", "libusb_package")
+print([name for name in sys.modules if name.startswith(strangers)])
+sys.exit(code)
+"""
+SAME = ("steps.csv", "trajectory.tum", "online.tum", "odometry.tum", "truth.tum", "map.json", "map.g2o")
+PATIENT = ("stale=0.5", "heartbeat=0.5", "watchdog_hz=4")
+"""Of the arm's settings, for machines on which other tests run."""
+
+
+@contextmanager
+def emulated(what: str, port: int, host: str, *settings: str) -> Iterator[Faults]:
+    """`emulate` as a process, until the end of the block."""
+    command = [sys.executable, "-m", "ratslam", "emulate", what, CONFIG, "--host", host, "--ur-host", host]
+    process = subprocess.Popen([*command, *settings], cwd=ROOT, stdout=subprocess.PIPE)
+    faults = Faults(process, host, port)
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline().strip().endswith(b"ready")
+        undisturbed(process.pid)
+        yield faults
+    finally:
+        faults.close()
+        process.kill()
+        process.wait(5)
+        assert process.stdout is not None
+        process.stdout.close()
+
+
+def mapper_of(session: int) -> int:
+    """Its mapper's process."""
+    children = Path(f"/proc/{session}/task/{session}/children").read_text().split()
+    (found,) = (pid for pid in children if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes())
+    return int(found)
+
+
+def _begun(session: subprocess.Popen, log: Path) -> bool:
+    """Whether it has told of its third whisk, or a later one; fails when it has ended."""
+    said = log.read_text()
+    assert session.poll() is None, said
+    return any(int(done) >= 3 for done in re.findall(r"(\d+)/\d+ \[", said))
+
+
+def lived(host: str, folder: Path, *settings: str, longest: float, freeze: float = 0.0) -> Path:
+    """The run directory of a session that completes, on emulators of its own.
+
+    Args:
+        longest: s that it may take. freeze: s for which its mapper is stopped on the way.
+    """
+    given = [word for setting in settings for word in ("--set", setting)]
+    directory = folder / "live"
+    with (
+        emulated("ur10", UR_FAULTS, host, *given) as arm,
+        emulated("head", HEAD_FAULTS, host, *given) as head,
+    ):
+        command = [sys.executable, "-m", "ratslam", "live", CONFIG, "--ur-host", host, "--head", host]
+        with (folder / "log").open("wb") as log:
+            process = subprocess.Popen(
+                [*command, "-o", str(directory), *given], cwd=ROOT, stdout=log, stderr=log
+            )
+            undisturbed(process.pid)
+            try:
+                if freeze and until(partial(_begun, process, folder / "log"), longest, "the third whisk"):
+                    mapper = mapper_of(process.pid)
+                    os.kill(mapper, signal.SIGSTOP)
+                    time.sleep(freeze)
+                    os.kill(mapper, signal.SIGCONT)
+                code = process.wait(longest)
+            finally:
+                process.kill()
+                process.wait(5)
+        said = (folder / "log").read_text()
+        assert code == 0, said
+        assert "complete: " in said
+        assert "Traceback" not in said
+        state = arm.state()
+        assert not state["moving"]
+        assert state["watchdog_stops"] == 0
+        assert head(do="counts")["lost"] == 0
+    return directory
+
+
+def holds(directory: Path, whisks: int) -> dict:
+    """The report of a session that lost nothing and whose replay is the same to the bit."""
+    report = json.loads((directory / "live.json").read_text())
+    print(json.dumps(report, indent=1))
+    assert report["outcome"] == "complete"
+    assert report["standing"]
+    assert report["whisks"] == whisks
+    assert report["missing"] == 0
+    faults = {name: count for name, count in report["head"].items() if name != "good"}
+    assert set(faults.values()) == {0}, faults
+    recorded = kept(directory / "session.mcap")
+    assert len(recorded.samples) == whisks
+    assert (np.diff(recorded.sequence) == 1).all()
+    assert recorded.names().count("dropped") == report["dropped"]
+
+    again = directory.parent / "again"
+    done = subprocess.run(
+        [sys.executable, "-c", REPLAY, "run", str(directory / "config.yaml"), "-o", str(again)],
+        cwd=ROOT, capture_output=True, text=True, timeout=1200,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "[]", "the replay loads what only live sessions need"
+    for name in SAME:
+        assert (directory / name).read_bytes() == (again / name).read_bytes(), name
+    assert len((directory / "steps.csv").read_text().splitlines()) == whisks + 1
+    return report
+
+
+def test_half_a_minute(loopback: str, tmp_path: Path) -> None:
+    """With a mapper that is late for once: the image that it loses, it loses in the replay too."""
+    settings = [f"live.arm.{setting}" for setting in PATIENT]
+    settings += ["live.whisks=20", "live.residual=1", "live.room=0", "live.budget=1.5"]
+    report = holds(lived(loopback, tmp_path, *settings, longest=150, freeze=3.2), 20)
+    assert 1 <= report["dropped"] < 20
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(2400)
+@pytest.mark.parametrize("hz", [125, 500])
+def test_ten_minutes(loopback: str, tmp_path: Path, hz: int) -> None:
+    settings = ["live.whisks=600", f"live.arm.hz={hz}", "live.plan.path.circuits=CACACA"]
+    report = holds(lived(loopback, tmp_path, *settings, longest=1000), 600)
+    assert report["dropped"] == 0
+    assert report["lateness_s"]["p99"] <= 0.05
+    assert report["state_age_s"]["p99"] <= 0.02
+    assert report["mapper_s"]["p99"] <= 0.6

@@ -1,0 +1,131 @@
+"""Whatever goes wrong with the head has a name or a number, and passes where it can."""
+
+from __future__ import annotations
+
+import time
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from tests.helpers.live import until
+from tests.ratslam.live.bench import LEGS, START, Bench, Kept
+from tests.ratslam.live.expected_outcomes import ended, stands
+
+
+def gaps(kept: Kept) -> int:
+    """Frames that are missing between the first and the last one of a recording."""
+    known = np.unique(kept.sequence)
+    return int(known[-1] - known[0] + 1 - len(known))
+
+
+@pytest.mark.parametrize(
+    ("fault", "outcome"),
+    [
+        ({"do": "unplug"}, "head_gone"),
+        ({"do": "silence", "seconds": 60}, "head_silent"),
+        ({"do": "corrupt", "frames": 10**6}, "head_garbled"),
+    ],
+    ids=lambda value: value["do"] if isinstance(value, dict) else "",
+)
+def test_a_head_that_stays_away_ends_it(bench: Bench, fault: dict, outcome: str) -> None:
+    with bench.under_way() as session:
+        at = bench.moment()
+        bench.head(**fault)
+        until(bench.still, 1.5, "the arm stands while the head sends nothing")
+        report, kept = ended(bench, session, outcome, at)
+        assert report["standing"]
+        assert kept.names()[-2:] == ["held", "fault"]
+        if fault["do"] == "corrupt":
+            assert report["head"]["bad"] > 1000
+    if fault["do"] == "corrupt":
+        bench.worn()
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        {"do": "unplug"},
+        {"do": "stall", "seconds": 0.7},
+        pytest.param({"do": "silence", "seconds": 0.7}, marks=pytest.mark.soak),
+    ],
+    ids=lambda fault: fault["do"],
+)
+def test_a_head_that_comes_back_is_waited_for(bench: Bench, fault: dict) -> None:
+    with bench.under_way(head={"patience": 20.0}, waypoints=LEGS[:2]) as session:
+        bench.head(**fault)
+        until(bench.still, 1.5, "the arm stands")
+        stands(bench)
+        bench.head(do="plug")
+        report, kept = ended(bench, session, "complete", bench.moment()._replace(robot=0.0, sample=0))
+        assert report["standing"]
+        names = [name for name in kept.names() if name != "dropped"]
+        assert names == ["held", "resumed"]
+        assert report["head"]["restarts"] == (fault["do"] == "unplug")
+        assert (report["head"]["stalls"] > 0) == (fault["do"] == "stall")
+        assert len(kept.samples) == report["whisks"]
+        goal = START[:2] + np.subtract(LEGS[1][:2], LEGS[0][:2])
+        np.testing.assert_allclose(bench.arm.state()["tcp"][:2], goal, atol=1e-3)
+        # While it was away the arm was stopped, which is motion like any other.
+        told = sum(float(np.hypot(*sample.reading.odometry[:2])) for sample in kept.samples)
+        truth = [sample.truth for sample in kept.samples]
+        way = sum(float(np.hypot(*(b - a)[:2])) for a, b in pairwise(truth))
+        assert told == pytest.approx(way, abs=1e-6)
+
+
+def test_what_is_damaged_is_counted(bench: Bench) -> None:
+    """Garbage, damaged frames, frames left out and out of sequence: exact numbers, and it goes on."""
+    with bench.under_way(whisks=12, budget=60.0) as session:
+        before = bench.head(do="counts")
+        bench.head(do="corrupt", frames=7)
+        bench.head(do="garbage", bytes=100_000)
+        bench.head(do="skip", frames=30)
+        bench.head(do="swap", frames=5)
+        at = bench.moment()
+        report, kept = ended(bench, session, "complete", at._replace(robot=0.0, sample=0))
+        after = bench.head(do="counts")
+        counts = report["head"]
+        assert counts["bad"] >= 7  # random bytes may spell the magic
+        lost = sum(after[name] - before[name] for name in ("lost", "dropped"))
+        assert counts["missing"] == 37 + lost
+        assert counts["skipped_bytes"] == 7 * 128 + 100_000
+        assert counts["duplicates"] == counts["restarts"] == 0
+        assert gaps(kept) == 37 + lost
+        assert report["dropped"] == kept.names().count("dropped") >= 1
+        assert report["missing"] == 37 + lost
+
+
+def test_frames_lost_to_an_overrun_are_counted(bench: Bench) -> None:
+    with bench.under_way(head={"silence": 5.0, "patience": 20.0}, whisks=16) as session:
+        before = bench.head(do="counts")
+        bench.head(do="silence", seconds=2.4)  # more than its FIFO holds
+        report, kept = ended(bench, session, "complete", bench.moment()._replace(robot=0.0, sample=0))
+        lost = bench.head(do="counts")["lost"] - before["lost"]
+        assert lost > 100
+        assert report["head"]["missing"] == gaps(kept) == lost
+        assert report["missing"] >= lost  # and those that came too late
+        assert report["head"]["overruns"] >= 1
+        assert report["head"]["bad"] == 0
+
+
+@pytest.mark.parametrize("jump", [500_000, pytest.param(-200_000, marks=pytest.mark.soak)])
+def test_its_clock_jumps(bench: Bench, jump: int) -> None:
+    with bench.under_way() as session:
+        at = bench.moment()
+        bench.head(do="clock", jump_us=jump)
+        report, _ = ended(bench, session, "clock_jumped", at)
+        assert "head" in report["detail"]
+        assert report["standing"]
+    bench.head(do="clock", jump_us=-jump)
+
+
+def test_a_whisker_pressed_to_its_end(bench: Bench) -> None:
+    with bench.under_way() as session:
+        time.sleep(0.3)  # 10 mm to back off
+        at = bench.moment()
+        bench.head(do="saturate", whisker=11, seconds=0.3)
+        furthest = until(lambda: bench.still() and bench.arm.state()["tcp"], 1.0, "a standstill")
+        report, _ = ended(bench, session, "contact", at)
+        assert "whisker 11" in report["detail"]
+        back = np.linalg.norm(np.subtract(bench.arm.state()["tcp"], furthest))
+        assert back == pytest.approx(0.01, abs=0.001)

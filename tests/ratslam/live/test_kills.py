@@ -1,0 +1,107 @@
+"""Sessions killed or interrupted at any moment: the arm stands, and the recording is whole to there."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from robot.recordings.mcap_reader import Recording, recover
+from tactile.base.random_streams import stream
+from tests.helpers.live import until
+from tests.ratslam.live.bench import Bench, kept
+from tests.ratslam.live.expected_outcomes import LOST, ended, stands
+
+FEW, MANY = range(3), range(3, 53)
+NUMBERS = [*FEW, *(pytest.param(number, marks=pytest.mark.soak) for number in MANY)]
+
+
+def recovered(recording: Path) -> Path:
+    """A whole recording of what can be read of one."""
+    whole = recording.with_name("whole.mcap")
+    told = recover(recording, whole)
+    assert told.samples == Recording(whole).length > 0
+    return whole
+
+
+@pytest.mark.parametrize("number", NUMBERS)
+def test_the_whole_session_is_killed(bench: Bench, number: int) -> None:
+    with bench.session() as session:
+        session.says("armed")
+        time.sleep(float(stream(number, "killed").uniform(0.6, 2.0)))
+        at = bench.moment()
+        os.killpg(session.process.pid, signal.SIGKILL)
+        stands(bench)
+        session.process.wait(5)
+        saved = kept(recovered(session.directory / "session.mcap"))
+        assert saved.lost(at) <= LOST
+        # What can be read of the cut one is the same.
+        cut = session.kept()
+        assert len(cut.samples) == len(saved.samples)
+        np.testing.assert_array_equal(cut.sequence, saved.sequence)
+
+
+def test_the_parent_is_killed_in_motion(bench: Bench) -> None:
+    with bench.under_way() as session:
+        at = bench.moment()
+        session.process.kill()
+        stands(bench)
+        session.process.wait(5)
+        saved = kept(recovered(session.directory / "session.mcap"))
+        assert saved.lost(at) <= LOST
+        until(lambda: not session.lives(), 5.0, "nothing of it stays")
+        assert bench.arm.state()["runtime"] == "STOPPED"
+    until(lambda: bench.head.state()["resting"], 2.0, "the whiskers are retracted")
+
+
+@pytest.mark.parametrize("number", NUMBERS)
+def test_it_is_interrupted(bench: Bench, number: int) -> None:
+    """From the first moment to the last: a controlled stop, and what there is is kept."""
+    with bench.session(waypoints=[(0.63, 0.45, 0.0), (0.7, 0.45, 0.0)]) as session:
+        session.says("disk:")
+        time.sleep(float(stream(number, "interrupted").uniform(0.0, 5.0)))
+        at = bench.moment()
+        session.process.send_signal(signal.SIGINT)
+        code = session.code()
+        stands(bench)
+        assert "Traceback" not in session.said()
+        if session.directory.exists() and (session.directory / "session.mcap").exists():
+            outcome = session.report()["outcome"]
+            assert (outcome, code) in {("interrupted", 130), ("complete", 0)}
+            if outcome == "interrupted":
+                ended(bench, session, outcome, at)
+        else:
+            assert code == 130
+            assert "interrupted" in session.said()
+        assert bench.arm.state()["watchdog_stops"] == bench.starved
+
+
+def test_interrupted_twice(bench: Bench) -> None:
+    """The second time nothing is waited for, but the arm."""
+    with bench.under_way() as session:
+        session.process.send_signal(signal.SIGINT)
+        time.sleep(0.005)
+        session.process.send_signal(signal.SIGINT)
+        assert session.code() == 130
+        stands(bench)
+        until(lambda: bench.arm.state()["runtime"] == "STOPPED", 1.0, "its program is ended")
+        recovered(session.directory / "session.mcap")
+
+
+def test_the_disk_is_full(bench: Bench) -> None:
+    with bench.under_way() as session:
+        at = bench.moment()
+        size = (session.directory / "session.mcap").stat().st_size
+        resource.prlimit(session.process.pid, resource.RLIMIT_FSIZE, (size + 5000, size + 5000))
+        code = session.code()
+        assert code == 2
+        assert "disk_full: " in session.said()
+        assert "Traceback" not in session.said()
+        stands(bench)
+        saved = kept(recovered(session.directory / "session.mcap"))
+        assert saved.lost(at) <= LOST

@@ -1,0 +1,91 @@
+"""What a session is asked for and cannot or must not do: refused with its cure, and nothing moves."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from ratslam.cli import main
+from tests.helpers.live import ROOT
+from tests.ratslam.live.bench import LEGS, Bench
+
+MISSING = "raise ImportError('not here')\n"
+NO_LIBRARIES = "import ctypes.util\nctypes.util.find_library = lambda name: None\n"
+
+
+def written(bench: Bench, folder: Path, **settings: Any) -> list[str]:
+    """The arguments for a session with these settings."""
+    config = folder / "config.yaml"
+    config.write_text(yaml.safe_dump({"live": bench.quick(**settings)}))
+    return ["live", str(config), "-o", str(folder / "run")]
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"waypoints": [*LEGS[:2], (3.0, 0.45, 0.0)]}, ["live.waypoints", "outside the box"]),
+        ({"waypoints": [*LEGS[:2], (0.63, float("nan"), 0.0)]}, ["live.waypoints.2.1", "finite"]),
+        ({"arm": {"speed": 0.26}}, ["live.arm.speed", "0.25"]),
+        ({"arm": {"speed": float("inf")}}, ["live.arm.speed"]),
+        ({"lift": 0.6}, ["outside the box"]),
+        ({"room": 1e18}, ["GB free", "-o"]),
+    ],
+    ids=["outside", "nan", "fast", "infinite", "high", "full"],
+)
+def test_what_the_configuration_asks(
+    bench: Bench,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    settings: dict[str, Any],
+    said: list[str],
+) -> None:
+    before = bench.arm.state()
+    assert main(written(bench, tmp_path, **settings)) == 2
+    told = capsys.readouterr().err
+    for text in said:
+        assert text in told
+    assert not (tmp_path / "run").exists()
+    after = bench.arm.state()
+    assert (after["targets"], after["programs"]) == (before["targets"], before["programs"])
+
+
+@pytest.mark.parametrize(
+    ("without", "address", "said"),
+    [
+        (("rtde_control", "rtde_receive"), None, ["ur_rtde", "pip install 'ratslam[live]'"]),
+        (("usb",), None, ["usb", "pip install 'ratslam[live]'"]),
+        (("libusb_package", "sitecustomize"), "usb", ["no libusb", "pip install libusb-package"]),
+        ((), "127.0.0.200", ["no head at 127.0.0.200", "plug it in"]),
+    ],
+    ids=["ur_rtde", "pyusb", "libusb", "head"],
+)
+def test_what_is_not_there(
+    bench: Bench, tmp_path: Path, without: tuple[str, ...], address: str | None, said: list[str]
+) -> None:
+    """Modules that cannot be imported, in any process of the session."""
+    for name in without:
+        (tmp_path / f"{name}.py").write_text(NO_LIBRARIES if name == "sitecustomize" else MISSING)
+    sent = len(bench.arm.state()["targets"])
+    done = subprocess.run(
+        [
+            *(sys.executable, "-m", "ratslam"),
+            *written(bench, tmp_path, head={"address": address or bench.host}),
+        ],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+    )
+    assert done.returncode == 2, done.stderr
+    assert "Traceback" not in done.stderr, done.stderr
+    for text in said:
+        assert text in done.stderr
+    assert not (tmp_path / "run").exists()
+    assert len(bench.arm.state()["targets"]) == sent

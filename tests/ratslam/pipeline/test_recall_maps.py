@@ -1,0 +1,206 @@
+"""Whole maps by recall: what classic matching ruins comes out right, what cannot be told is left alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evaluation.metrics.trajectory import ate
+from ratslam.backends.classic import RatConfig
+from ratslam.backends.recall import rat
+from ratslam.core.session import Session
+from ratslam.keyframes.loop_closures import Verdict
+from robot.recordings.npz_trace import read_stream
+from robot.sources.in_memory import Log
+from robot.sources.perturbation import perturbed
+from tactile.base.se2 import integrate
+from tactile.base.types import Odometry, observation
+from tests.helpers import scenes
+
+GOLDEN = Path(__file__).parent / "golden"
+
+
+def mapped(log: Log, precision: str = "float64", **parts) -> Session:
+    """A session that has replayed the log with one setting for all, on pose cells small enough for a test."""
+    cells = {"cells_xy": 11, "cell_size": float(log.params["pc_cell_x_size"])}
+    config = RatConfig.model_validate({"pose_cells": cells, **parts})
+    session = Session(rat(config, log.view_shape, np.dtype(precision)), reserve=512, precision=precision)
+    for _ in session.replay(sample.reading for sample in log):
+        pass
+    return session
+
+
+def error(session: Session, log: Log) -> float:
+    return ate(session.map.trajectory(), log.truth)
+
+
+def odometry_error(log: Log) -> float:
+    return ate(integrate(log.motion[:, :3]), log.truth)
+
+
+def cuts(session: Session) -> list[int]:
+    """Frames before which the odometry was cut; in these scenes every row is a frame."""
+    return np.flatnonzero(session.map.arrays()["cut"] >= 0).tolist()
+
+
+def golden(name: str) -> Log:
+    return read_stream(GOLDEN / f"{name}.npz")
+
+
+@pytest.mark.parametrize(
+    ("trace", "limit", "broken"),
+    [
+        ("a_square3", 0.02, []),
+        ("b_figure8_alias", 0.03, []),
+        ("e_kidnap", 0.08, [127]),
+        ("c_corridor_wrap", None, []),
+        ("d1_rotation_generic", None, []),
+        ("j_reverse_stop", None, []),
+    ],
+)
+def test_one_setting_maps_every_trace(trace, limit, broken):
+    log = golden(trace)
+    session = mapped(log)
+    assert error(session, log) <= (limit or 1.05 * odometry_error(log) + 0.02)
+    assert cuts(session) == broken
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("seed", range(10))
+def test_regenerated_streams_behave_as_the_published_ones(seed):
+    stream = np.random.default_rng(100 + seed)
+    jumps = tuple(
+        (int(stream.integers(*rows)), int(stream.integers(20, 100))) for rows in ((122, 160), (210, 260))
+    )
+    square, eight = scenes.square(seed), scenes.figure_eight(seed)
+    kidnapped = scenes.square(seed + 50, laps=4, jumps=jumps)
+    assert error(mapped(square), square) <= 0.02
+    assert error(mapped(eight), eight) <= 0.03
+    session = mapped(kidnapped)
+    assert error(session, kidnapped) <= 0.08
+    assert cuts(session) == [row for row, _ in jumps]
+
+
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.soak)])
+def test_a_perturbed_recording_is_mapped_as_well(seed):
+    log = perturbed(golden("b_figure8_alias"), seed)
+    assert error(mapped(log), log) <= 0.05
+
+
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.soak)])
+def test_an_unknown_corridor_stays_odometry(seed):
+    log = scenes.corridor(seed)
+    session = mapped(log)
+    assert len(session.map.closures()) == 0
+    assert error(session, log) == pytest.approx(odometry_error(log), abs=1e-9)
+
+
+def test_a_lap_the_other_way_round_joins_where_it_turns():
+    # The way back shows other views (another heading), so nothing may close but what faces the same way.
+    there = [(0.05, 0.0)] * 30 + [(0.0, np.pi / 18)] * 18
+    log = scenes.sensed(scenes.followed(there * 8), 3)
+    session = mapped(log)
+    assert error(session, log) <= 0.05
+    pairs = session.map.closures()
+    assert len(pairs) > 20
+    assert np.hypot(*(log.truth[pairs[:, 0]] - log.truth[pairs[:, 1]])[:, :2].T).max() < 0.25
+
+
+# Controls
+
+
+def shuffled(log: Log) -> Log:
+    return replace(log, views=np.random.default_rng(0).permutation(log.views))
+
+
+def blank(log: Log) -> Log:
+    return replace(log, views=np.zeros_like(log.views))
+
+
+def alike(log: Log) -> Log:
+    return replace(log, views=np.broadcast_to(log.views[:1], log.views.shape).copy())
+
+
+def different(log: Log) -> Log:
+    return replace(log, views=np.random.default_rng(0).random(log.views.shape))
+
+
+@pytest.mark.parametrize("control", [shuffled, blank, alike, different])
+def test_views_that_tell_nothing_close_nothing(control):
+    log = control(golden("a_square3"))
+    session = mapped(log)
+    assert len(session.map.closures()) == 0
+    assert error(session, log) == pytest.approx(odometry_error(log), abs=1e-9)
+
+
+@pytest.mark.parametrize("factor", [pytest.param(0.5, marks=pytest.mark.soak), 2.0])
+def test_the_sensors_unit_does_not_matter(factor):
+    log = golden("a_square3")
+    scaled = replace(log, views=log.views * factor)
+    first, second = mapped(log), mapped(scaled)
+    assert np.array_equal(first.map.trajectory(), second.map.trajectory())
+    assert np.array_equal(first.map.candidates(), second.map.candidates())
+
+
+@pytest.mark.soak
+def test_single_precision_maps_as_well():
+    log = golden("b_figure8_alias")
+    session = mapped(log, "float32")
+    assert error(session, log) <= 0.03
+    assert np.isfinite(session.map.trajectory()).all()
+    assert np.isfinite(session.map.candidates()[:, 3:5]).all()
+
+
+# What is told beside the map
+
+
+def test_a_kidnapped_robot_knows_that_it_is_lost_and_then_where_it_is():
+    log = golden("e_kidnap")
+    cells = {"cells_xy": 11, "cell_size": 0.1}
+    session = Session(rat(RatConfig.model_validate({"pose_cells": cells}), log.view_shape), reserve=512)
+    lost = np.array([bool(s.estimate.lost) for s in session.replay(sample.reading for sample in log)])
+    assert not lost[:127].any()
+    assert lost[140:155].all()
+    assert not lost[-60:].any()
+
+
+def test_a_run_can_be_undone():
+    log = golden("a_square3")
+    session = mapped(log)
+    frames = session.map
+    accepted = np.unique(frames.candidates()[frames.candidates()[:, 7] == Verdict.ACCEPTED, 5]).astype(int)
+    before, path = frames.closures(), frames.trajectory()
+    frames.undo(int(accepted[0]))
+    assert len(frames.closures()) < len(before)
+    assert not np.array_equal(frames.trajectory(), path)
+    with pytest.raises(ValueError, match="not an accepted run"):
+        frames.undo(int(accepted[0]))
+    for run in accepted[1:]:
+        frames.undo(int(run))
+    assert len(frames.closures()) == 0
+    reckoned = odometry_error(log)
+    assert error(session, log) == pytest.approx(reckoned, rel=0.05)
+
+
+def test_doubt_grows_on_the_way_and_falls_at_a_closure():
+    log = golden("a_square3")
+    config = RatConfig.model_validate({"pose_cells": {"cells_xy": 11, "cell_size": 0.1}})
+    session = Session(rat(config, log.view_shape), reserve=512)
+    rows, at = list(log), {}
+    for start in range(0, 180, 20):
+        list(session.replay(sample.reading for sample in rows[start : start + 20]))
+        at[start + 20] = np.sqrt(np.linalg.eigvalsh(session.map.covariance()[:2, :2]).max())
+    assert at[20] < at[60] < at[100]
+    assert at[180] < at[100]  # the second lap is recognised
+
+
+def test_standing_still_costs_nothing():
+    config = RatConfig.model_validate({"pose_cells": {"cells_xy": 11}})
+    session = Session(rat(config, (3, 6, 1)), reserve=512)
+    still = observation(Odometry(0.0, 0.0, 0.0, 0.1), np.full((3, 6, 1), 0.5))
+    list(session.replay(still for _ in range(300)))
+    assert len(session.map.arrays()["pose"]) == 1
+    assert session.map.graph().number_of_nodes() == 1

@@ -1,0 +1,286 @@
+"""What the wheels are told, whatever the line and the robot do: in a time of their own."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable
+
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from robot.drivers.create import protocol
+from robot.drivers.create.control_loop import Pilot
+from robot.drivers.create.stop_reasons import Halt, Refused
+from robot.emulators.create import Create
+from tests.robot.drivers.create.serial_lines import Line
+
+PERIOD = 0.05
+NUMBER = st.one_of(st.floats(-0.3, 0.3), st.floats())
+
+
+def rolls(robot: Create) -> bool:
+    return bool(robot.right or robot.left)
+
+
+def drive(line: Line, pilot: Pilot, seconds: float, forward: float, turn: float = 0.0) -> None:
+    """Drives on for so long; a driver that is refused goes on trying."""
+    for _ in range(round(seconds / PERIOD)):
+        try:
+            pilot.steer(forward, turn)
+        except Refused:
+            assert pilot.halted
+        pilot.poll()
+        line.wait(PERIOD)
+
+
+@given(st.floats(0.01, 0.5), st.lists(st.tuples(NUMBER, NUMBER), max_size=10))
+def test_no_speed_over_the_cap_reaches_the_wire(cap: float, wanted: list[tuple[float, float]]) -> None:
+    line = Line()
+    pilot = line.flown(speed=cap)
+    for forward, turn in wanted:
+        with contextlib.suppress(Refused):
+            pilot.steer(forward, turn)
+        pilot.poll()
+        line.wait(PERIOD)
+    assert len(line.robot.drives) == len(wanted)
+    assert all(max(abs(right), abs(left)) <= 1000 * cap + 1e-6 for _, right, left in line.robot.drives)
+
+
+def test_what_is_not_renewed_ends() -> None:
+    line = Line()
+    pilot = line.flown(patience=0.5)
+    pilot.steer(0.1, 0.0)
+    rolled = []
+    for _ in range(20):
+        pilot.poll()
+        rolled.append(rolls(line.robot))
+        line.wait(PERIOD)
+    assert rolled == [True] * rolled.count(True) + [False] * rolled.count(False)
+    assert 0.4 <= PERIOD * rolled.count(True) <= 0.6
+    assert pilot.halted is None
+    drive(line, pilot, 0.2, 0.1)
+    assert rolls(line.robot)
+
+
+def test_a_bump_stops_it_and_leaves_the_way_back() -> None:
+    line = Line()
+    pilot = line.flown()
+    drive(line, pilot, 0.5, 0.1)
+    line.robot.touch(protocol.Bumps.LEFT)
+    pilot.poll()
+    assert not rolls(line.robot)
+    assert pilot.halted
+    assert pilot.halted.halt is Halt.BUMPED
+    assert "left" in str(pilot.halted)
+    with pytest.raises(Refused, match="bumped"):
+        pilot.steer(-0.1, 0.0)
+    pilot.release()
+    drive(line, pilot, 0.5, -0.1)
+    assert line.robot.right == -100
+    before = len(line.robot.drives)
+    drive(line, pilot, 0.5, 0.1)  # still pressed: not by a millimetre
+    assert all(right + left <= 0 for _, right, left in line.robot.drives[before:])
+    assert pilot.halted is not None
+
+
+@pytest.mark.parametrize("forward", [0.1, -0.1, 0.0])
+@pytest.mark.parametrize("dropped", [protocol.Bumps.DROPPED_LEFT, protocol.Bumps.DROPPED_CASTER])
+def test_a_dropped_wheel_stops_it_until_it_stands(dropped: protocol.Bumps, forward: float) -> None:
+    line = Line()
+    pilot = line.flown()
+    drive(line, pilot, 0.2, forward, 0.2)
+    line.robot.touch(dropped)
+    drive(line, pilot, 0.2, forward, 0.2)
+    assert pilot.halted
+    assert pilot.halted.halt is Halt.WHEEL_DROP
+    pilot.release()
+    drive(line, pilot, 0.2, forward, 0.2)
+    assert pilot.halted is not None  # it hangs still
+    line.robot.touch(protocol.Bumps(0))
+    pilot.release()
+    drive(line, pilot, 0.2, forward, 0.2)
+    assert rolls(line.robot)
+
+
+def test_a_robot_that_left_safe_mode_is_brought_back_by_release_alone() -> None:
+    line = Line()
+    pilot = line.flown()
+    drive(line, pilot, 0.2, 0.1)
+    line.robot.touch(protocol.Bumps(0), cliff=True)
+    drive(line, pilot, 1.0, 0.1)
+    assert pilot.halted
+    assert pilot.halted.halt is Halt.LEFT_SAFE_MODE
+    assert line.robot.mode == protocol.Mode.PASSIVE
+    pilot.release()
+    drive(line, pilot, 0.2, 0.1)
+    assert line.robot.mode == protocol.Mode.SAFE
+    assert rolls(line.robot)
+
+
+def _lost(reply: bytes) -> bytes:
+    return b""
+
+
+def _garbled(reply: bytes) -> bytes:
+    return b"\xff" * 6
+
+
+@pytest.mark.parametrize(("mangle", "halt"), [(_lost, Halt.SILENT), (_garbled, Halt.GARBLED)])
+def test_a_lost_link_stops_the_wheels(mangle: Callable[[bytes], bytes], halt: Halt) -> None:
+    line = Line()
+    pilot = line.flown(silence=0.3)
+    drive(line, pilot, 0.5, 0.1)
+    line.mangle, since = mangle, line.now
+    while rolls(line.robot):
+        assert line.now - since <= 0.3 + 0.1 + 2 * PERIOD
+        drive(line, pilot, PERIOD, 0.1)
+    assert pilot.halted
+    assert pilot.halted.halt is halt
+    line.mangle = lambda reply: reply
+    drive(line, pilot, 0.5, 0.1)
+    assert not rolls(line.robot)  # nothing resumes by itself
+    pilot.release()
+    drive(line, pilot, 0.5, 0.1)
+    assert rolls(line.robot)
+
+
+def test_an_unplugged_port_is_final() -> None:
+    line = Line()
+    pilot = line.flown()
+    drive(line, pilot, 0.2, 0.1)
+    line.gone = True
+    drive(line, pilot, 0.2, 0.1)
+    assert pilot.halted
+    assert pilot.halted.halt is Halt.UNPLUGGED
+    with pytest.raises(Refused, match="unplugged"):
+        pilot.release()
+
+
+@given(
+    st.lists(st.sampled_from(["in time", "late", "behind"]), min_size=1, max_size=30), st.floats(-0.2, 0.2)
+)
+def test_a_late_reply_loses_nothing(fates: list[str], forward: float) -> None:
+    """`late`: it arrives before the next query; `behind`: after it, just before the next reply."""
+    line = Line()
+    pilot = line.flown(silence=5.0)
+    late, behind = [], []
+
+    def mangle(reply: bytes) -> bytes:
+        fate = fates.pop(0) if fates else "in time"
+        if fate == "late":
+            late.append(reply)
+        if fate == "behind":
+            behind.append(reply)
+        held = b"" if fate != "in time" else b"".join(behind)
+        behind[:] = behind if fate != "in time" else []
+        return held + (reply if fate == "in time" else b"")
+
+    line.mangle = mangle
+    while fates:
+        drive(line, pilot, PERIOD, forward)
+        while late:
+            line.arrive(late.pop(0))
+    for _ in range(3):
+        pilot.poll()
+    total = pilot.take()
+    assert abs(1000 * (total.dx - line.robot.base.travelled)) < 1 + 1e-6
+    assert pilot.counts.stray == 0
+    assert pilot.counts.lost == pilot.counts.late
+    assert not pilot.gap()
+
+
+@given(
+    st.lists(
+        st.one_of(
+            st.just(None),
+            st.tuples(st.just("before"), st.binary(max_size=40)),
+            st.tuples(st.just("instead"), st.binary(max_size=40)),
+            st.tuples(st.just("cut"), st.binary(max_size=5)),
+        ),
+        min_size=1,
+        max_size=25,
+    ),
+    st.floats(-0.2, 0.2),
+)
+def test_garbage_costs_no_more_than_the_replies_it_spoils(
+    noise: list[tuple[str, bytes] | None], forward: float
+) -> None:
+    line = Line()
+    pilot = line.flown(silence=5.0)
+    pending = [*noise, *[None] * 3]
+
+    def mangle(reply: bytes) -> bytes:
+        how, data = (pending and pending[0]) or ("before", b"")
+        return {"before": data + reply, "instead": data, "cut": reply[: len(data)]}[how]
+
+    line.mangle = mangle
+    spoilt, steps = 0.0, []
+    while pending:
+        before, lost = line.robot.base.travelled, pilot.counts.lost
+        drive(line, pilot, PERIOD, forward)
+        steps.append(abs(line.robot.base.travelled - before))
+        if pilot.counts.lost > lost:  # what it told is of the time since the reading before
+            spoilt += sum(steps[-2:])
+        pending.pop(0)
+    pilot.poll()
+    missing = line.robot.base.travelled - pilot.take().dx
+    assert abs(missing) <= spoilt + 1e-3 + 1e-9
+    assert pilot.gap() == (pilot.counts.lost > 0)
+    assert math.copysign(1, missing) == math.copysign(1, forward) or abs(missing) <= 1e-3 + 1e-9
+
+
+@given(st.integers(1, 40), st.sampled_from([b"\xff", b"\0"]), st.floats(-0.2, 0.2))
+@example(4, b"\xff", 0.125)  # noise and the way of 3 mm look like a reply of full mode
+def test_garbage_before_a_reply_costs_nothing(count: int, noise: bytes, forward: float) -> None:
+    line = Line()
+    pilot = line.flown()
+    line.mangle = lambda reply: noise * count + reply
+    drive(line, pilot, 1.0, forward)
+    drive(line, pilot, 0.1, 0.0)
+    assert pilot.halted is None
+    assert not pilot.gap()
+    assert pilot.counts.stray == count * pilot.counts.good - count  # the first came undisturbed
+    assert abs(1000 * (pilot.take().dx - line.robot.base.travelled)) < 1 + 1e-6
+
+
+def test_what_is_asked_for_while_it_is_read_is_looked_at_too() -> None:
+    line = Line()
+    pilot = line.flown()
+    line.robot.touch(protocol.Bumps.RIGHT)
+
+    def mangle(reply: bytes) -> bytes:
+        pilot.steer(0.1, 0.0)
+        return reply
+
+    line.mangle = mangle
+    pilot.poll()
+    assert pilot.halted
+    assert not rolls(line.robot)
+
+
+def test_nothing_asked_for_before_a_stop_is_done_after_its_release() -> None:
+    line = Line()
+    pilot = line.flown()
+    drive(line, pilot, 0.5, 0.1)
+    line.robot.touch(protocol.Bumps.RIGHT)
+    pilot.poll()
+    line.robot.touch(protocol.Bumps(0))
+    pilot.release()
+    for _ in range(3):
+        line.wait(PERIOD)
+        pilot.poll()
+        assert not rolls(line.robot)
+    assert pilot.halted is None
+
+
+def test_noise_behind_a_reply_casts_doubt_on_it() -> None:
+    line = Line()
+    pilot = line.flown()
+    drive(line, pilot, 0.2, 0.1)
+    assert not pilot.gap()
+    line.arrive(b"\0\0\0")
+    drive(line, pilot, 0.2, 0.1)
+    assert pilot.gap()
+    assert not pilot.gap()

@@ -1,0 +1,273 @@
+"""The driver against the emulator on a terminal: threads, processes and time are real."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from robot.drivers.create.config import CreateConfig
+from robot.drivers.create.driver import CreateDriver, NoAnswer, NotSafe
+from robot.drivers.create.serial_link import NoPort
+from robot.drivers.create.stop_reasons import Halt, Refused
+from tactile.base.errors import InputError
+from tests.robot.drivers.create.serial_lines import Emulated
+
+pytest.importorskip("serial", reason="needs pyserial")
+pytest.importorskip("termios", reason="needs pseudo-terminals")
+import serial
+
+
+@pytest.fixture
+def emulated() -> Iterator[Emulated]:
+    robot = Emulated()
+    try:
+        yield robot
+    finally:
+        robot.close()
+
+
+def create(emulated: Emulated, **settings: float) -> CreateDriver:
+    """Its driver; more patient with replies than usual, for the machine may be busy."""
+    return CreateDriver(CreateConfig(port=emulated.path, **{"silence": 2.0, **settings}))
+
+
+def until(true: Callable[[], object], seconds: float = 5.0) -> float:
+    """Waits for it: s it took."""
+    start = time.monotonic()
+    while not true():
+        assert time.monotonic() - start < seconds
+        time.sleep(0.01)
+    return time.monotonic() - start
+
+
+def renewed(driver: CreateDriver, seconds: float, forward: float, turn: float = 0.0) -> None:
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        driver.drive(forward, turn)
+        time.sleep(0.05)
+
+
+def settled(driver: CreateDriver) -> None:
+    """Stands, and its last millimetres are read."""
+    driver.stop()
+    good = driver.counts.good
+    until(lambda: driver.counts.good > good + 1)
+
+
+def test_odometry_is_the_truth_within_quantisation(emulated: Emulated) -> None:
+    with create(emulated) as driver:
+        total = 0.0
+        for forward, turn in ((0.15, 0.0), (0.1, 0.5), (0.0, -0.8), (-0.1, 0.0)):
+            renewed(driver, 0.4, forward, turn)
+            total += driver.odometry().dtheta
+        settled(driver)
+        last = driver.odometry()
+        truth = emulated.do("state")
+        assert driver.halted is None
+    assert abs(total + last.dtheta - truth["turned"]) < math.radians(1) + 1e-6
+    assert truth["unknown"] <= 4  # zeros of a stop in any circumstance
+    assert emulated.do("state")["mode"] == "PASSIVE"
+
+
+def test_a_straight_line_is_told_to_the_millimetre(emulated: Emulated) -> None:
+    with create(emulated) as driver:
+        renewed(driver, 0.8, 0.2)
+        settled(driver)
+        told = driver.odometry()
+        truth = emulated.do("state")
+    assert abs(told.dx - truth["x"]) < 1e-3 + 1e-9
+    assert told.dy == told.dtheta == 0
+    assert truth["x"] > 0.1
+    assert told.dt == pytest.approx(truth["time"], abs=2.0)
+    assert told.dt > 0.8
+
+
+def test_speeds_over_the_cap_never_reach_the_robot(emulated: Emulated) -> None:
+    with create(emulated, speed=0.12) as driver:
+        for forward, turn in ((0.121, 0), (0.1, 0.5), (math.nan, 0), (0, math.inf), (-1e300, 0), (0.12, 0)):
+            try:
+                driver.drive(forward, turn)
+            except Refused:
+                assert (forward, turn) != (0.12, 0)
+            time.sleep(0.06)
+        until(lambda: emulated.do("state")["wheels"] == [120, 120])
+    drives = emulated.do("state")["drives"]
+    assert max(max(abs(right), abs(left)) for _, right, left in drives) == 120
+
+
+def test_it_stops_when_it_is_forgotten(emulated: Emulated) -> None:
+    with create(emulated, patience=0.3) as driver:
+        driver.drive(0.1, 0.0)
+        until(lambda: emulated.do("state")["wheels"] == [100, 100])
+        until(lambda: emulated.do("state")["wheels"] == [0, 0], 1.5)
+        assert driver.halted is None
+
+
+def test_a_bump_stops_it(emulated: Emulated) -> None:
+    with create(emulated) as driver:
+        renewed(driver, 0.2, 0.1)
+        emulated.do("bump")
+        until(lambda: driver.halted)
+        until(lambda: emulated.do("state")["wheels"] == [0, 0], 0.5)
+        with pytest.raises(Refused, match="bumped"):
+            driver.drive(0.1, 0.0)
+        driver.release()
+        until(lambda: driver.drive(-0.1, 0.0) or emulated.do("state")["wheels"] == [-100, -100])
+
+
+def test_replies_in_pieces_are_whole(emulated: Emulated) -> None:
+    with create(emulated) as driver:
+        emulated.do("trickle", seconds=0.004)
+        renewed(driver, 0.6, 0.2)
+        settled(driver)
+        assert abs(driver.odometry().dx - emulated.do("state")["x"]) < 1e-3 + 1e-9
+
+
+def test_garbage_and_cut_replies_are_survived(emulated: Emulated) -> None:
+    with create(emulated) as driver:
+        for count in range(6):
+            emulated.do("garbage", bytes=7 * count + 1)
+            renewed(driver, 0.1, 0.1)
+            emulated.do("cut", bytes=count)
+            renewed(driver, 0.1, 0.1)
+        settled(driver)
+        told, truth, counts = driver.odometry(), emulated.do("state"), driver.counts
+        assert driver.halted is None
+        assert driver.gap()
+    assert counts.lost >= 6
+    assert counts.stray > 0
+    assert truth["x"] - 0.1 * 0.25 * counts.lost - 1e-3 <= told.dx <= truth["x"] + 1e-3
+
+
+def test_unplugged_while_driving(emulated: Emulated) -> None:
+    driver = create(emulated)
+    driver.start()
+    try:
+        renewed(driver, 0.2, 0.1)
+        emulated.do("unplug")
+        assert until(lambda: driver.halted) < 1.0
+        assert driver.halted
+        assert driver.halted.halt is Halt.UNPLUGGED
+        with pytest.raises(Refused, match="unplugged"):
+            driver.drive(0.1, 0.0)
+        driver.stop()
+        driver.odometry()
+    finally:
+        driver.close()
+    driver.close()
+    with pytest.raises(Refused, match="not started"):
+        driver.drive(0.1, 0.0)
+
+
+def test_switched_off_while_driving(emulated: Emulated) -> None:
+    with create(emulated, silence=0.3) as driver:
+        renewed(driver, 0.2, 0.1)
+        emulated.do("off")
+        assert until(lambda: driver.halted) < 1.5
+        assert driver.halted
+        assert driver.halted.halt is Halt.SILENT
+
+
+DRIVES = """
+import sys, time
+from robot.create.driver import CreateDriver
+from robot.create.settings import CreateConfig
+driver = CreateDriver(CreateConfig(port=sys.argv[1], patience=0.3))
+driver.start()
+while True:
+    driver.drive(0.1, 0.0)
+    time.sleep(0.05)
+"""
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_program_that_is_killed_or_hangs_is_stopped_by_its_guard(emulated: Emulated, how: int) -> None:
+    process = subprocess.Popen([sys.executable, "-c", DRIVES, emulated.path])
+    try:
+        until(lambda: emulated.do("state")["wheels"] == [100, 100], 10)
+        os.kill(process.pid, how)
+        took = until(lambda: emulated.do("state")["wheels"] == [0, 0])
+        assert took < 1.5
+        drives = len(emulated.do("state")["drives"])
+        time.sleep(0.3)
+        assert len(emulated.do("state")["drives"]) == drives  # said once, and by the guard
+    finally:
+        process.kill()
+        process.wait()
+
+
+def test_a_guard_that_has_ended_stops_it(emulated: Emulated) -> None:
+    with create(emulated) as driver:
+        driver.drive(0.1, 0.0)
+        assert driver._guard is not None
+        driver._guard._process.kill()
+        until(lambda: driver.halted)
+        assert driver.halted
+        assert driver.halted.halt is Halt.UNGUARDED
+        until(lambda: emulated.do("state")["wheels"] == [0, 0])
+
+
+def test_ports_that_are_no_create() -> None:
+    with pytest.raises(NoPort, match="no such port"):
+        CreateDriver(CreateConfig(port="/dev/ttyNONE")).start()
+    with pytest.raises(NoPort, match="/dev/null"):
+        CreateDriver(CreateConfig(port="/dev/null")).start()
+    master, slave = os.openpty()
+    try:
+        with pytest.raises(NoAnswer, match="switch it on"):
+            CreateDriver(CreateConfig(port=os.ttyname(slave))).start()
+    finally:
+        os.close(master)
+        os.close(slave)
+
+
+def test_two_programs_do_not_drive_one_robot(emulated: Emulated) -> None:
+    with create(emulated) as driver:
+        with pytest.raises(NoPort, match="another program"):
+            CreateDriver(CreateConfig(port=emulated.path)).start()
+        renewed(driver, 0.2, 0.1)
+        assert driver.halted is None
+    with create(emulated) as driver:  # and one after the other they do
+        assert driver.halted is None
+
+
+def test_a_robot_that_hangs_in_the_air_is_not_started(emulated: Emulated) -> None:
+    emulated.do("drop")
+    with pytest.raises(NotSafe, match="set it on all its wheels"):
+        CreateDriver(CreateConfig(port=emulated.path)).start()
+
+
+def test_without_pyserial_the_cure_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "serial", None)
+    with pytest.raises(InputError, match="pip install"):
+        CreateDriver(CreateConfig(port="/dev/ttyUSB0")).start()
+
+
+def test_importing_the_driver_does_not_need_pyserial() -> None:
+    code = (
+        "import sys, robot.create.driver, robot.emulators.create; print({'serial', 'jax'} & set(sys.modules))"
+    )
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "set()"
+
+
+def test_the_emulator_understands_one_speed_only(emulated: Emulated) -> None:
+    answers = []
+    for baud in (57600, 115200):
+        with serial.Serial(emulated.path, baud, timeout=0.5) as port:
+            port.write(bytes([128, 131, 149, 2, 35, 7]))
+            answers.append(port.read(2))
+    assert answers[0] == b"\x02\x00"
+    assert answers[1] != answers[0]
+
+
+def test_the_emulator_answers_nonsense_with_an_error(emulated: Emulated) -> None:
+    assert "error" in emulated.do("dance")
+    assert "error" in emulated.do("garbage")
+    assert emulated.do("state")["mode"] == "OFF"

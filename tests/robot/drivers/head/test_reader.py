@@ -1,0 +1,234 @@
+"""The thread at the wire: what comes is kept and told, what waits is sent, and whatever ends has a name."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from robot.drivers.head.config import HeadLinkConfig
+from robot.drivers.head.protocol import Command, Kind, Mode, Request
+from robot.drivers.head.reader import Link, Reader
+from robot.drivers.outcome import Outcome
+from tactile.base.errors import InputError
+from tests.robot.drivers.head.memory import WHISKERS, MemoryHead, until
+
+QUICK = HeadLinkConfig(silence=0.1, patience=0.4)
+DRIVE = Command(Kind.DRIVE, Mode.RCP, 1.0, 1.0)
+CENTRE = Command(Kind.CENTRE, numbers=np.array([3, 4], np.int16))
+
+
+@pytest.fixture
+def head():
+    return MemoryHead()
+
+
+@pytest.fixture
+def reader(head):
+    with Reader(head.connect, WHISKERS, QUICK) as reader:
+        yield reader
+
+
+def good(reader: Reader) -> int:
+    return reader.decoder.counts.good
+
+
+def kinds(head: MemoryHead) -> list[Kind]:
+    return [command.kind for command in head.commands]
+
+
+def test_samples_reach_the_ring_and_every_listener(head, reader):
+    told = []
+    reader.listeners.append(lambda frames, arrival: told.append((frames, arrival)))
+    began = time.monotonic()
+    for k in range(5):
+        head.send(10 * k)
+    until(lambda: good(reader) == 50)
+    assert reader.ring.between(0, 99).sequence.tolist() == list(range(50))
+    until(lambda: sum(len(frames.sequence) for frames, _ in told) == 50)
+    assert all(began <= arrival <= time.monotonic() for _, arrival in told)
+    assert reader.state.link == Link.STREAMING
+    assert reader.fault is None
+
+
+def test_times_are_the_clocks(head):
+    head.clock = 7 * 2**32 + 100
+    with Reader(head.connect, WHISKERS, QUICK) as reader:
+        head.send(0)
+        until(lambda: good(reader) == 10)
+        assert reader.ring.between(0, 9).time[0] == 7 * 2**32
+
+
+def test_it_is_started_and_stopped(head):
+    reader = Reader(head.connect, WHISKERS, QUICK)
+    assert reader.state.link == Link.CLOSED
+    with reader:
+        assert head.requests == [Request.IDENTITY, Request.CLOCK, Request.START]
+    assert head.requests[-1] == Request.STOP
+    assert (head.opened, head.closed) == (1, 1)
+    assert reader.state.link == Link.CLOSED
+    assert reader.fault is None
+
+
+def test_no_head_is_an_input_error(head):
+    head.unplug()
+    began = time.monotonic()
+    with pytest.raises(InputError, match="pulled out"):
+        Reader(head.connect, WHISKERS, QUICK).start()
+    assert time.monotonic() - began < 1.0
+
+
+def test_another_head_is_refused(head):
+    with pytest.raises(InputError, match="memory has 2 whiskers"):
+        Reader(head.connect, 18, QUICK).start()
+    assert head.closed == head.opened == 1
+
+
+def test_what_is_no_head_is_refused(head):
+    head.identity = {"name": "a printer"}
+    with pytest.raises(InputError, match="printer"):
+        Reader(head.connect, WHISKERS, QUICK).start()
+
+
+def test_a_head_is_kept_awake_only_while_it_is_to_whisk(head, reader):
+    time.sleep(0.3)
+    assert head.commands == []
+    reader.send(DRIVE)
+    until(lambda: len(head.commands) >= 4)
+    assert kinds(head)[:4] == [Kind.DRIVE, Kind.KEEP, Kind.KEEP, Kind.KEEP]
+    reader.rest()
+    time.sleep(0.05)
+    count = len(head.commands)
+    time.sleep(0.3)
+    assert len(head.commands) == count
+
+
+def test_keep_alives_come_in_time(head, reader):
+    reader.send(DRIVE)
+    begun, gaps, last = time.monotonic(), [], None
+    while time.monotonic() - begun < 1.2:
+        before = len(head.commands)
+        until(lambda before=before: len(head.commands) > before)
+        now = time.monotonic()
+        gaps += [now - last] if last else []
+        last = now
+    assert np.median(gaps) < 0.4  # a head waits for 0.5 s
+
+
+def test_only_the_newest_amplitudes_are_sent(head, reader):
+    head.stalls = 1
+    for k in range(20):
+        reader.send(Command(Kind.AMPLITUDES, numbers=np.array([k, k], np.int16)))
+    until(lambda: head.commands)
+    until(lambda: head.commands[-1].numbers.tolist() == [19, 19])
+    assert len(head.commands) < 20
+
+
+def test_a_head_that_comes_back_is_told_again_and_its_numbers_are_new(head, reader):
+    restarts = []
+    reader.on_restart.append(lambda clock, at: restarts.append(clock))
+    reader.send(CENTRE)
+    reader.send(DRIVE)
+    reader.send(Command(Kind.AMPLITUDES, numbers=np.array([1, 1], np.int16)))
+    head.send(0)
+    until(lambda: good(reader) == 10 and len(head.commands) >= 3)
+    head.unplug()
+    until(lambda: reader.state.link == Link.AWAY)
+    assert reader.fault is None
+    head.commands.clear()
+    head.clock, head.plugged = 12345, True
+    until(lambda: reader.state.link != Link.AWAY)
+    head.send(0)
+    until(lambda: good(reader) == 20)
+    until(lambda: len(head.commands) >= 2)
+    assert kinds(head)[:2] == [Kind.CENTRE, Kind.DRIVE]
+    assert Kind.AMPLITUDES not in kinds(head)
+    assert restarts == [12345]
+    assert reader.ring.newest is not None
+    assert reader.ring.newest[0] == 2**32 + 9
+    assert reader.decoder.counts.restarts == 1
+    assert reader.state.link == Link.STREAMING
+    assert reader.fault is None
+
+
+def test_a_head_that_stays_away_is_a_fault(head, reader):
+    head.send(0)
+    until(lambda: good(reader) == 10)
+    head.unplug()
+    until(lambda: reader.fault is not None)
+    assert reader.fault is not None
+    assert reader.fault.outcome == Outcome.HEAD_GONE
+    assert "pulled out" in reader.fault.detail
+    head.plugged = True
+    until(lambda: reader.state.link != Link.AWAY)
+    assert reader.fault.outcome == Outcome.HEAD_GONE  # once one, always one
+
+
+def test_silence_is_named_and_a_silent_head_is_started_again(head, reader):
+    head.send(0)
+    until(lambda: reader.state.link == Link.STREAMING)
+    until(lambda: reader.state.link == Link.SILENT)
+    assert reader.fault is None
+    until(lambda: reader.fault is not None)
+    assert reader.fault is not None
+    assert reader.fault.outcome == Outcome.HEAD_SILENT
+    assert head.requests.count(Request.START) >= 2
+
+
+def test_garbage_is_named(head, reader):
+    head.send(0)
+    until(lambda: good(reader) == 10)
+    end = time.monotonic() + 3
+    while reader.fault is None and time.monotonic() < end:
+        head.put(b"WHK1" + bytes(60))
+        time.sleep(0.01)
+    assert reader.fault is not None
+    assert reader.fault.outcome == Outcome.HEAD_GARBLED
+
+
+def test_a_stall_loses_nothing(head, reader):
+    reader.send(DRIVE)
+    until(lambda: head.commands)
+    head.commands.clear()
+    head.stalls = 5
+    reader.send(CENTRE)
+    head.send(0)
+    until(lambda: good(reader) == 10)
+    until(lambda: Kind.CENTRE in kinds(head))
+    assert reader.stalls == 5
+    assert reader.fault is None
+
+
+def test_a_thread_that_hangs_is_seen(head):
+    held = threading.Event()
+    with Reader(head.connect, WHISKERS, QUICK) as reader:
+        reader.listeners.append(lambda frames, arrival: held.wait(5))
+        head.send(0)
+        until(lambda: reader.state.link == Link.SILENT)
+        until(lambda: reader.fault is not None)
+        held.set()
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_thread_that_dies_is_a_fault(head, reader):
+    def broken(frames, arrival):
+        raise RuntimeError("a listener's bug")
+
+    reader.listeners.append(broken)
+    head.send(0)
+    until(lambda: reader.fault is not None)
+    assert reader.fault is not None
+    assert "a listener's bug" in reader.fault.detail
+    until(lambda: reader.state.link == Link.CLOSED)
+
+
+def test_overload_is_told_with_the_whisker(head):
+    told = []
+    with Reader(head.connect, WHISKERS, QUICK, on_overload=told.append) as reader:
+        values = np.zeros((10, WHISKERS, 3), np.int16)
+        values[4:6, 1, 2] = -20000
+        head.send(0, values=values)
+        until(lambda: good(reader) == 10)
+        until(lambda: told == [1])

@@ -1,0 +1,39 @@
+"""Numbers, with a head that holds so few frames that every way they can come is tried."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from robot.drivers.head import sequence_numbers
+from robot.drivers.head.sequence_numbers import Numbering
+from tests.robot.drivers.head import oracle
+
+STEPS = st.one_of(st.integers(-9, 12), st.sampled_from([1, 1, 1, 2**31 - 1, 2**31, -(2**31)]))
+
+
+@pytest.fixture(scope="module")
+def few():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(numbering, "LATE", 8)
+        patch.setattr(oracle, "LATE", 8)
+        yield
+
+
+@settings(max_examples=1000)
+@given(
+    st.sampled_from([0, 3, 2**32 - 5]), st.lists(STEPS, max_size=60), st.lists(st.integers(0, 60), max_size=6)
+)
+def test_every_way_to_come(few, first, steps, cuts):
+    raw = [(first + step) % 2**32 for step in itertools.accumulate(steps)]
+    mine, streams = Numbering(), []
+    for block in np.split(np.array(raw, np.uint32), sorted(cut for cut in cuts if cut <= len(raw))):
+        number, new = mine.take(block)
+        full = [oracle.placed(value, streams) for value in block.tolist()]
+        assert [n if taken else None for n, taken in zip(number.tolist(), new.tolist(), strict=True)] == full
+        assert mine.missing == sum(stream.missing for stream in streams)
+        assert mine.streams == len(streams)

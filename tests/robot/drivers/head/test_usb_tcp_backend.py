@@ -1,0 +1,236 @@
+"""Real pyusb on the emulator's socket: as on a bus, with its time-outs, stalls and pulled plugs."""
+
+from __future__ import annotations
+
+import errno
+import importlib
+import inspect
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from robot.drivers.head.decoder import Decoder, Frames
+from robot.drivers.head.protocol import (
+    ENDPOINT_IN,
+    ENDPOINT_OUT,
+    KEEP_ALIVE,
+    PRODUCT,
+    REQUEST_IN,
+    REQUEST_OUT,
+    VENDOR,
+    Flag,
+    Request,
+    pack,
+)
+from robot.drivers.head.usb_tcp_backend import SocketBackend, backend
+from robot.emulators.head.config import HeadEmulatorConfig
+from tests.helpers.live import Faults, until
+from tests.robot.emulators.head.heads import drive, running
+
+core = pytest.importorskip("usb.core", reason="pyusb is not installed: pip install 'ratslam[live]'")
+util = importlib.import_module("usb.util")
+
+
+@pytest.fixture(scope="module")
+def process(loopback: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Faults]:
+    config = HeadEmulatorConfig(host=loopback, path={"explore": 5}, follow=True)
+    with running(config, tmp_path_factory.mktemp("head")) as head:
+        yield head
+
+
+@pytest.fixture
+def head(process: Faults) -> Faults:
+    """Plugged in, and nothing wrong with it."""
+    process(do="plug")
+    return process
+
+
+def found(head: Faults) -> Any:
+    return core.find(backend=backend(head.host), idVendor=VENDOR, idProduct=PRODUCT)
+
+
+@pytest.fixture
+def device(head: Faults) -> Iterator[Any]:
+    one = found(head)
+    one.get_active_configuration()
+    try:
+        yield one
+    finally:
+        util.dispose_resources(one)
+
+
+def start(device: Any) -> None:
+    device.ctrl_transfer(REQUEST_OUT, Request.START, 0, 0, b"", 500)
+
+
+def read(device: Any, seconds: float, decoder: Decoder) -> Frames:
+    """What comes, 4 KiB at a time."""
+    end, got = time.monotonic() + seconds, b""
+    while time.monotonic() < end:
+        got += device.read(ENDPOINT_IN, 4096, 500).tobytes()
+    return decoder.feed(got)
+
+
+def test_it_is_a_backend() -> None:
+    backend = importlib.import_module("usb.backend").IBackend
+    asked = {
+        name: method
+        for name, method in inspect.getmembers(backend, inspect.isfunction)
+        if not name.startswith("_") and name != "finalize"
+    }
+    assert len(asked) > 20
+    for name, method in asked.items():
+        ours = list(inspect.signature(getattr(SocketBackend, name)).parameters)
+        if "transfer" not in ours:  # of kinds that the device has not
+            assert ours == list(inspect.signature(method).parameters), name
+
+
+def test_it_is_found_as_what_it_is(head: Faults, device: Any) -> None:
+    assert (device.idVendor, device.idProduct, device.speed) == (VENDOR, PRODUCT, util.SPEED_HIGH)
+    assert device.serial_number == "EMULATED"
+    (interface,) = device.get_active_configuration()
+    assert [end.bEndpointAddress for end in interface] == [ENDPOINT_IN, ENDPOINT_OUT]
+    assert util.endpoint_type(interface[0].bmAttributes) == util.ENDPOINT_TYPE_BULK
+    assert core.find(backend=backend(head.host), idVendor=0x1234) is None
+    assert found(Faults(head.process, "127.0.0.1", 0)) is None or head.host == "127.0.0.1"
+
+
+def test_a_second_program_is_told_that_it_is_in_use(head: Faults, device: Any) -> None:
+    util.claim_interface(device, 0)
+    other = found(head)
+    with pytest.raises(core.USBError) as caught:
+        util.claim_interface(other, 0)
+    assert caught.value.errno == errno.EBUSY
+    util.dispose_resources(device)
+    util.claim_interface(other, 0)
+    util.dispose_resources(other)
+
+
+def test_no_frame_is_lost_on_the_way(head: Faults, device: Any) -> None:
+    before = head(do="counts")
+    decoder = Decoder(18, 3)
+    start(device)
+    device.write(ENDPOINT_OUT, pack(drive()), 500)
+    parts = []
+    for _ in range(3):
+        parts.append(read(device, 0.4, decoder))
+        device.write(ENDPOINT_OUT, pack(KEEP_ALIVE), 500)
+    frames = Frames(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    assert (np.diff(frames.sequence) == 1).all()
+    assert (np.diff(frames.time) == 500).all()
+    assert np.count_nonzero(frames.flags & Flag.CYCLE) == 2
+    after = head(do="counts")
+    sent = after["sent"] - before["sent"]
+    assert sent == decoder.counts.good == len(frames.values)
+    assert after["lost"] == before["lost"]
+    clock = int.from_bytes(device.ctrl_transfer(REQUEST_IN, Request.CLOCK, 0, 0, 8, 500).tobytes(), "little")
+    assert 0 <= clock - frames.time[-1] < 200_000
+
+
+def test_the_process_may_stand_still_for_a_while(head: Faults, device: Any) -> None:
+    """What it could not do meanwhile it catches up with; the queue holds more than that."""
+    decoder = Decoder(18, 3)
+    start(device)
+    read(device, 0.1, decoder)
+    os.kill(head.process.pid, signal.SIGSTOP)
+    time.sleep(0.7)
+    os.kill(head.process.pid, signal.SIGCONT)
+    frames = read(device, 0.5, decoder)
+    assert len(frames.values) > 1400
+    assert decoder.counts.missing == 0
+    assert decoder.counts.overruns == 0
+
+
+def test_a_read_ends_when_its_time_is_up(head: Faults, device: Any) -> None:
+    device.ctrl_transfer(REQUEST_OUT, Request.STOP, 0, 0, b"", 500)
+    began = time.monotonic()
+    with pytest.raises(core.USBTimeoutError) as caught:
+        device.read(ENDPOINT_IN, 4096, 150)
+    assert caught.value.errno == errno.ETIMEDOUT
+    assert time.monotonic() - began >= 0.15
+
+
+def test_a_stalled_endpoint_is_cleared(head: Faults, device: Any) -> None:
+    start(device)
+    head(do="stall")
+    with pytest.raises(core.USBError) as caught:
+        device.read(ENDPOINT_IN, 4096, 500)
+    assert caught.value.errno == errno.EPIPE
+    with pytest.raises(core.USBError):
+        device.read(ENDPOINT_IN, 4096, 500)
+    device.clear_halt(ENDPOINT_IN)
+    assert len(device.read(ENDPOINT_IN, 4096, 500)) > 0
+
+
+def test_an_unknown_request_is_stalled(device: Any) -> None:
+    with pytest.raises(core.USBError) as caught:
+        device.ctrl_transfer(REQUEST_IN, 77, 0, 0, 8, 500)
+    assert caught.value.errno == errno.EPIPE
+
+
+def test_a_pulled_plug_is_told_and_another_one_is_another(head: Faults, device: Any) -> None:
+    start(device)
+    device.read(ENDPOINT_IN, 4096, 500)
+    head(do="unplug")
+    for _ in range(2):
+        with pytest.raises(core.USBError) as caught:
+            device.read(ENDPOINT_IN, 4096, 500)
+        assert caught.value.errno == errno.ENODEV
+    assert found(head) is None
+    head(do="plug")
+    with pytest.raises(core.USBError) as caught:
+        device.write(ENDPOINT_OUT, pack(KEEP_ALIVE), 500)
+    assert caught.value.errno == errno.ENODEV
+    again = until(lambda: found(head), 2.0)
+    start(again)
+    assert len(again.read(ENDPOINT_IN, 4096, 500)) > 0
+    util.dispose_resources(again)
+
+
+def test_a_read_that_waits_hears_of_the_pulled_plug_at_once(head: Faults, device: Any) -> None:
+    caught: list[int | None] = []
+
+    def wait() -> None:
+        try:
+            device.read(ENDPOINT_IN, 4096, 8000)
+        except core.USBError as error:
+            caught.append(error.errno)
+
+    device.ctrl_transfer(REQUEST_OUT, Request.STOP, 0, 0, b"", 500)
+    waiting = threading.Thread(target=wait)
+    waiting.start()
+    head(do="unplug")
+    waiting.join(4.0)
+    assert caught == [errno.ENODEV]
+
+
+def test_what_is_no_configuration_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from robot.emulators.head.__main__ import main
+
+    assert main(["--config", str(tmp_path / "none.json")]) == 2
+    (tmp_path / "bad.json").write_text('{"hots": "127.0.0.1"}')
+    assert main(["--config", str(tmp_path / "bad.json")]) == 2
+    (tmp_path / "wall.json").write_text('{"maze": {"heights": [0.3]}}')
+    assert main(["--config", str(tmp_path / "wall.json")]) == 2
+    said = capsys.readouterr().err
+    assert all(piece in said for piece in ("none.json", "hots", "simulation.maze.heights"))
+
+
+def test_an_emulator_that_dies_is_a_device_that_is_gone(tmp_path: Path, loopback: str) -> None:
+    host = f"127.0.1.{loopback.rsplit('.', 1)[1]}"
+    with running(HeadEmulatorConfig(host=host, path={"explore": 5}), tmp_path) as head:
+        device = found(head)
+        start(device)
+        head.die()
+        with pytest.raises(core.USBError) as caught:
+            read(device, 5.0, Decoder(18, 3))
+        assert caught.value.errno == errno.ENODEV
+        assert found(head) is None
+        util.dispose_resources(device)

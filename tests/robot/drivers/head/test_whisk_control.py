@@ -1,0 +1,134 @@
+"""What a head is told follows from the settings, and the host's feedback is the law's."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from robot.drivers.head.config import HeadLinkConfig
+from robot.drivers.head.decoder import Frames
+from robot.drivers.head.protocol import ANGLE, OFF, Flag, Kind, Mode, tally
+from robot.drivers.head.reader import Reader
+from robot.drivers.head.whisk_control import HeadDriver, HostRcp, commands
+from tactile.base.errors import InputError
+from tactile.whiskers.head_geometry import HeadConfig, ur10_head
+from tactile.whiskers.whisking import WhiskingConfig, command, still
+from tests.robot.drivers.head.memory import MemoryHead, until
+
+HEAD = ur10_head(HeadConfig())
+THRESHOLD = np.full(18, 0.04)
+CENTRE = np.linspace(-0.01, 0.01, 18)
+
+
+def whisks(count: int, touched: np.ndarray | None = None, start: int = 0) -> Frames:
+    """Samples of 2 kHz from the beginning of a whisk on, of 1 s each; y [N, 18], rad."""
+    number = start + np.arange(count)
+    values = np.zeros((count, 18, 3), np.int16)
+    values[..., 2] = tally(CENTRE + (0.0 if touched is None else touched))
+    flags = np.where(number % 2000 == 0, Flag.CYCLE, 0).astype(np.uint8)
+    return Frames(number, 500 * number, flags, values)
+
+
+def blocks(frames: Frames, cuts: list[int]) -> list[Frames]:
+    return [Frames(*columns) for columns in zip(*(np.split(column, cuts) for column in frames), strict=True)]
+
+
+@pytest.mark.parametrize(
+    ("mode", "rcp", "threshold", "told"),
+    [
+        ("open", "head", THRESHOLD, Mode.OPEN),
+        ("rcp", "head", THRESHOLD, Mode.RCP),
+        ("rcp", "head", None, Mode.OPEN),
+        ("rcp", "host", THRESHOLD, Mode.OPEN),
+        ("spread", "host", THRESHOLD, Mode.OPEN),
+    ],
+)
+def test_who_feeds_back(mode, rcp, threshold, told):
+    whisking = WhiskingConfig(mode=mode, rate=2.0, amplitude_deg=50, gain=3)
+    centre, drive = commands(whisking, threshold, CENTRE, rcp)
+    assert (centre.kind, drive.kind, drive.mode) == (Kind.CENTRE, Kind.DRIVE, told)
+    np.testing.assert_allclose(centre.numbers * ANGLE, CENTRE, atol=ANGLE)
+    assert drive.amplitude == np.radians(50)
+    assert (drive.frequency, drive.gain, drive.window) == (2.0, 3.0, 0.01)
+    assert len(drive.numbers) == (0 if threshold is None else 18)
+
+
+def test_whiskers_that_do_not_count_never_touch():
+    threshold = np.array([0.01, np.inf, 4.0])
+    drive = commands(WhiskingConfig(), threshold)[-1]
+    assert drive.numbers.tolist() == [int(tally(0.01)), OFF, OFF - 1]
+
+
+def test_a_head_knows_no_spread():
+    with pytest.raises(InputError, match="spread"):
+        commands(WhiskingConfig(mode="spread"), THRESHOLD, CENTRE, "head")
+
+
+@settings(max_examples=20)
+@given(
+    st.sampled_from(["rcp", "spread"]),
+    st.lists(st.integers(0, 900), max_size=5),
+    st.integers(0, 17),
+    st.floats(0.05, 0.3),
+)
+def test_the_host_feeds_back_as_the_law_does(mode, cuts, whisker, bend):
+    whisking = WhiskingConfig(mode=mode)
+    touched = np.zeros((900, 18))
+    touched[400:, whisker] = bend
+    frames = whisks(900, touched)
+    host, told = HostRcp(whisking, HEAD.shape, THRESHOLD, CENTRE), []
+    for block in blocks(frames, sorted(cuts)):
+        amplitudes = host.amplitudes(block)
+        told += [] if amplitudes is None else [amplitudes]
+
+    drive = still(18)
+    for k in range(900):
+        y = frames.values[k, :, 2] * ANGLE - CENTRE
+        aim, drive = command(whisking, drive, k / 2000, y, THRESHOLD, HEAD.shape)
+    share = (1 - np.cos(2 * np.pi * 899 / 2000)) / 2
+    np.testing.assert_allclose(told[-1] * ANGLE, aim / share, atol=ANGLE)
+    assert told[-1][whisker] < tally(np.radians(65))
+
+
+def test_a_free_whisk_is_told_once_and_each_cycle_anew():
+    host = HostRcp(WhiskingConfig(), HEAD.shape, THRESHOLD, CENTRE)
+    touched = np.zeros((6000, 18))
+    touched[500:900, 3] = 0.2
+    told = [host.amplitudes(block) for block in blocks(whisks(6000, touched), list(range(40, 6000, 40)))]
+    full = tally(np.radians(65))
+    assert told[0] is not None
+    assert (told[0] == full).all()
+    assert sum(one is not None for one in told[1:12]) == 0
+    assert min(one[3] for one in told if one is not None) < full
+    for k in (50, 100):  # the next cycles
+        assert told[k] is not None
+        assert (told[k] == full).all()
+        assert all(one is None for one in told[k + 1 : k + 50])
+
+
+def test_nothing_is_known_before_a_whisk_begins():
+    host = HostRcp(WhiskingConfig(), HEAD.shape, THRESHOLD, CENTRE)
+    assert host.amplitudes(whisks(100, start=30)) is None
+
+
+def test_the_driver_whisks_and_rests():
+    memory = MemoryHead(18)
+    with Reader(memory.connect, 18, HeadLinkConfig(rcp="host")) as reader:
+        driver = HeadDriver(reader, HEAD)
+        driver.whisk(WhiskingConfig(mode="spread"), THRESHOLD, CENTRE)
+        until(lambda: len(memory.commands) == 2)
+        frames = whisks(40)
+        memory.send(0, 40, frames.values, Flag.CYCLE)
+        until(lambda: memory.commands[-1].kind == Kind.AMPLITUDES)
+        driver.rest()
+        count = len(memory.commands)
+        memory.send(40, 40, frames.values, Flag.CYCLE)
+        until(lambda: reader.decoder.counts.good == 80)
+        assert len(memory.commands) == count
+
+
+def test_the_drives_limit_is_kept():
+    with pytest.raises(InputError, match="amplitude"):
+        HeadDriver(Reader(MemoryHead(18).connect, 18), HEAD).whisk(WhiskingConfig(amplitude_deg=90))

@@ -1,0 +1,75 @@
+"""An emulated controller for a whole module, put right before each test, and an armed arm at it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import numpy as np
+import pytest
+
+from robot.drivers.ur10.arm import Arm
+from robot.drivers.ur10.base_transform import tcp_of
+from robot.drivers.ur10.config import ArmConfig
+from robot.drivers.ur10.dashboard import Dashboard
+from tests.helpers.live import Faults, until, ur_emulator
+
+HOME = tcp_of(ArmConfig().placing, np.array([0.63, 0.45, 0.0]))
+AWAY = tcp_of(ArmConfig().placing, np.array([0.93, 0.45, 0.0]))  # 6 s away
+
+
+def settings(host: str, **others: Any) -> ArmConfig:
+    """Settings with more patience than the default has, for machines on which other tests run."""
+    patient = {"stale": 0.5, "heartbeat": 0.5, "watchdog_hz": 2.0}
+    return ArmConfig(host=host, **{**patient, **others})
+
+
+class Bench:
+    """One emulator after the other at one address."""
+
+    def __init__(self, host: str) -> None:
+        self.host = host
+        self._stack = ExitStack()
+        self._faults: Faults | None = None
+
+    def controller(self) -> Faults:
+        """A running one in good order, its tool at HOME."""
+        if self._faults is None or self._faults.process.poll() is not None:
+            self._stack.close()
+            self._faults = self._stack.enter_context(ur_emulator(self.host, HOME))
+        faults = self._faults
+        faults(do="clear")
+        faults(do="wall")
+        with Dashboard(self.host) as dashboard:
+            dashboard.stop()
+            if faults.state()["mode"] != "RUNNING":
+                dashboard.ask("power on")
+                dashboard.ask("brake release")
+        until(lambda: not faults.state()["moving"], 1.0)
+        faults(do="place", tcp=HOME.tolist())
+        return faults
+
+    def close(self) -> None:
+        self._stack.close()
+
+
+@pytest.fixture(scope="module")
+def bench(loopback: str) -> Iterator[Bench]:
+    bench = Bench(loopback)
+    yield bench
+    bench.close()
+
+
+@pytest.fixture
+def controller(bench: Bench) -> Faults:
+    """The emulated controller."""
+    return bench.controller()
+
+
+@pytest.fixture
+def arm(controller: Faults) -> Iterator[Arm]:
+    """An armed arm."""
+    with Arm(settings(controller.host)) as arm:
+        arm.start()
+        yield arm

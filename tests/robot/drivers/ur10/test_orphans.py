@@ -1,0 +1,76 @@
+"""A session that is killed or hangs in the midst of a motion: the arm stands, and nothing stays behind."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.helpers.live import ROOT, Faults, until
+from tests.robot.drivers.ur10.conftest import AWAY
+
+SESSION = """
+import sys, time
+import numpy as np
+from robot.ur10.arm import Arm
+from robot.ur10.settings import ArmConfig
+arm = Arm(ArmConfig(host=sys.argv[1]))
+arm.start()
+arm.move([float(number) for number in sys.argv[2:]])
+print(arm.pid, arm._board.name, flush=True)
+time.sleep(60)
+"""
+
+
+def runs(pid: int) -> bool:
+    """Whether a process does something; one that only waits to be buried does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+@pytest.mark.parametrize("what", ["killed", "hangs", "killed with the arm's process"])
+def test_a_session_that_ends_or_hangs(controller: Faults, what: str) -> None:
+    target = [repr(float(value)) for value in AWAY]
+    session = subprocess.Popen(
+        [sys.executable, "-c", SESSION, controller.host, *target],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        assert session.stdout is not None
+        pid, name = session.stdout.readline().split()
+        until(lambda: controller.state()["speed"][0] > 0.049, 2.0, "the arm moves")
+        bites = controller.state()["watchdog_stops"]
+        if what == "killed with the arm's process":
+            os.kill(int(pid), signal.SIGSTOP)  # it must not find out first
+        session.send_signal(signal.SIGSTOP if what == "hangs" else signal.SIGKILL)
+        if what == "killed with the arm's process":
+            os.kill(int(pid), signal.SIGKILL)
+        began = time.monotonic()
+        until(lambda: not controller.state()["moving"], 0.5, "a standstill")
+        assert time.monotonic() - began < 0.5
+        place = controller.state()["tcp"]
+        until(lambda: not runs(int(pid)), 2.0, "the arm's process ends")
+        until(lambda: controller.state()["runtime"] == "STOPPED", 0.5, "its program is ended")
+        assert controller.state()["tcp"] == place
+        if what == "killed with the arm's process":
+            assert controller.state()["watchdog_stops"] == bites + 1
+        if what != "hangs":
+            until(lambda: gone(name.decode()), 2.0, "the memory is taken away")
+    finally:
+        session.kill()
+        session.wait(5)
+        assert session.stdout is not None
+        session.stdout.close()
+
+
+def gone(name: str) -> bool:
+    return not Path("/dev/shm", name.removeprefix("/")).exists()

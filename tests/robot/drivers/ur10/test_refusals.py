@@ -1,0 +1,156 @@
+"""What an arm is not armed for: each reason is named with its cure, and nothing has moved."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import Any
+
+import numpy as np
+import pytest
+
+from robot.drivers.ur10 import dashboard
+from robot.drivers.ur10.arm import Arm
+from robot.drivers.ur10.config import ArmConfig, BoxConfig
+from robot.drivers.ur10.dashboard import PORT, Dashboard, Silent
+from robot.drivers.ur10.startup_checks import Refusal, admitted
+from tests.helpers.live import Faults, moves, until
+from tests.robot.drivers.ur10.conftest import HOME, settings
+
+GOOD = {
+    "PolyscopeVersion": "URSoftware 5.11.0.108249 (Apr 01 2021)",
+    "robotmode": "Robotmode: RUNNING",
+    "safetymode": "Safetymode: NORMAL",
+    "is in remote control": "true",
+    "running": "Program running: false",
+    "stop": "Stopped",
+}
+
+
+@contextmanager
+def answering(host: str, answers: dict[str, str]) -> Iterator[None]:
+    """A dashboard server that says what it is told to; to what it does not know, nothing."""
+    with socket.create_server((host, PORT)) as server:
+
+        def serve() -> None:
+            with suppress(OSError):
+                while True:
+                    connection, _ = server.accept()
+                    with connection, suppress(OSError):
+                        connection.sendall(b"Connected: Universal Robots Dashboard Server\n")
+                        for line in connection.makefile("r"):
+                            if line.strip() in answers:
+                                connection.sendall(answers[line.strip()].encode() + b"\n")
+
+        thread = threading.Thread(target=serve, daemon=True)
+        thread.start()
+        yield
+        server.shutdown(socket.SHUT_RDWR)
+        thread.join(2)
+
+
+@pytest.fixture
+def elsewhere(loopback: str) -> str:
+    """An address at which no emulator listens."""
+    return loopback.replace("127.0.0.", "127.0.1.")
+
+
+@pytest.mark.parametrize(
+    ("changed", "found"),
+    [
+        ({"PolyscopeVersion": "URSoftware 3.3.4.310 (May 09 2017)"}, "PolyScope 3.3"),
+        ({"PolyscopeVersion": "what?"}, "PolyScope 0.0"),
+        ({"robotmode": "Robotmode: POWER_OFF"}, "robot mode POWER_OFF"),
+        ({"safetymode": "Safetymode: PROTECTIVE_STOP"}, "safety mode PROTECTIVE_STOP"),
+        ({"is in remote control": "false"}, "under local control"),
+        ({"running": "Program running: true"}, "a program runs"),
+    ],
+)
+def test_what_speaks_against_starting(elsewhere: str, changed: dict[str, str], found: str) -> None:
+    with answering(elsewhere, GOOD | changed):
+        with pytest.raises(Refusal, match=found) as refusal:
+            admitted(ArmConfig(host=elsewhere))
+        assert refusal.value.cure or refusal.value.expected
+
+
+def test_a_good_controller_is_admitted_old_or_new(elsewhere: str) -> None:
+    with answering(elsewhere, GOOD):
+        assert admitted(ArmConfig(host=elsewhere)).remote is True
+    old = GOOD | {"PolyscopeVersion": "URSoftware 3.4.5.100 (Jan 01 2018)"}
+    del old["is in remote control"]  # a CB3 does not know the question
+    with answering(elsewhere, old):
+        controller = admitted(ArmConfig(host=elsewhere))
+        assert controller.version == (3, 4)
+        assert controller.remote is None
+
+
+def test_a_dashboard_that_does_not_answer_is_given_up(elsewhere: str) -> None:
+    began = time.monotonic()
+    with pytest.raises(Refusal, match="no dashboard server answers"):
+        admitted(ArmConfig(host=elsewhere))
+    assert dashboard.stop(elsewhere) == ""
+    with (
+        answering(elsewhere, {}),
+        Dashboard(elsewhere, timeout=0.2) as connection,
+        pytest.raises(Silent, match="robotmode"),
+    ):
+        connection.ask("robotmode")
+    assert time.monotonic() - began < 2.0
+
+
+def refused(controller: Faults, **others: Any) -> Refusal:
+    """Why an arm did not start; nothing has reached the controller that moves, and the process is gone."""
+    before = len(controller.state()["targets"])
+    with Arm(settings(controller.host, **{"connect": 4.0} | others)) as arm:
+        with pytest.raises(Refusal) as refusal:
+            arm.start()
+        assert arm.pid is None
+        assert arm.fault is None
+    assert moves(controller, before) == []
+    np.testing.assert_array_equal(controller.state()["tcp"], HOME)
+    return refusal.value
+
+
+def test_registers_in_use(controller: Faults) -> None:
+    controller(do="registers")
+    assert refused(controller).found == "registers in use"
+
+
+def test_a_slow_stream(controller: Faults) -> None:
+    controller(do="rate", hz=80)
+    assert refused(controller).found in {f"stream at {rate} of 125 Hz" for rate in range(72, 89)}
+
+
+def test_standing_outside_the_box(controller: Faults) -> None:
+    refusal = refused(controller, box=BoxConfig(low=tuple(HOME[:3] + 0.1), high=tuple(HOME[:3] + 0.2)))
+    assert "outside the box" in str(refusal)
+
+
+def test_a_controller_that_does_not_answer_on_its_other_ports(elsewhere: str) -> None:
+    with answering(elsewhere, GOOD), Arm(ArmConfig(host=elsewhere)) as arm, pytest.raises(Refusal):
+        arm.start()
+
+
+def test_an_arm_that_was_not_started_refuses_and_closes(loopback: str) -> None:
+    from robot.drivers.ur10.safety import Refused
+
+    with Arm(ArmConfig(host=loopback)) as arm:
+        with pytest.raises(Refused, match="not armed"):
+            arm.move(HOME)
+        assert arm.latest() is None
+        assert not arm.still()
+        assert not arm.arrived()
+        assert arm.age() == float("inf")
+
+
+def test_a_second_session_is_refused_and_the_first_unharmed(controller: Faults) -> None:
+    with Arm(settings(controller.host)) as first:
+        first.start()
+        refusal = refused(controller)
+        assert refusal.found == "a program runs on the controller"
+        first.move(HOME + [0.003, 0, 0, 0, 0, 0])
+        until(first.arrived, 2.0, "arrival")
+        assert first.fault is None

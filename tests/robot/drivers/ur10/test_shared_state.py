@@ -1,0 +1,89 @@
+"""States in shared memory: none torn, none twice, none out of order, and nothing left behind."""
+
+import subprocess
+import sys
+import time
+from multiprocessing import shared_memory
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from robot.drivers.ur10.shared_state import SLOTS, STATE, Board
+
+WRITER = """
+import sys, numpy as np
+from robot.ur10.states import STATE, Board
+board = Board(sys.argv[1])
+state = np.zeros((), STATE)
+for k in range(1, int(sys.argv[2]) + 1):
+    for name in ("host", "robot", "tcp", "speed", "force", "joints", "mode", "safety", "runtime"):
+        state[name] = k
+    board.publish(state)
+"""
+
+
+def write(board: Board, count: int) -> None:
+    state = np.zeros((), STATE)
+    for _ in range(count):
+        state["robot"] = board.newest + 1
+        board.publish(state)
+
+
+def test_states_come_in_order_and_once() -> None:
+    board = Board()
+    try:
+        assert board.latest() is None
+        assert len(board.since(0)) == 0
+        write(board, 10)
+        assert board.since(0)["counter"].tolist() == list(range(1, 11))
+        assert board.since(7)["counter"].tolist() == [8, 9, 10]
+        assert len(board.since(10)) == 0
+        assert len(board.since(99)) == 0
+        write(board, SLOTS)
+        states = board.since(3)
+        assert states["counter"][-1] == SLOTS + 10
+        assert np.diff(states["counter"]).tolist() == [1] * (SLOTS - 2)
+        np.testing.assert_array_equal(states["counter"], states["robot"])
+    finally:
+        board.close()
+
+
+def test_a_reader_beside_a_writer_sees_whole_states_only() -> None:
+    board, count = Board(), 60_000
+    writer = subprocess.Popen(
+        [sys.executable, "-c", WRITER, board.name, str(count)], cwd=Path(__file__).parents[4]
+    )
+    try:
+        seen, until = 0, time.monotonic() + 20
+        while seen < count and time.monotonic() < until:
+            states = board.since(seen)
+            if not len(states):
+                continue
+            counters = states["counter"].astype(float)
+            for name in ("host", "robot", "mode", "safety", "runtime"):
+                np.testing.assert_array_equal(states[name], counters)
+            for name in ("tcp", "speed", "force", "joints"):
+                np.testing.assert_array_equal(states[name], np.repeat(counters[:, None], 6, axis=1))
+            assert counters[0] > seen
+            assert (np.diff(counters) > 0).all()
+            seen = int(counters[-1])
+        assert seen == count
+        assert writer.wait(5) == 0
+        # Whoever opened the block and ended has not taken it away.
+        assert int(board.since(count - 1)["counter"][-1]) == count
+    finally:
+        writer.kill()
+        writer.wait()
+        board.close()
+
+
+def test_closing_takes_the_memory_away() -> None:
+    board = Board()
+    name = board.name
+    write(board, 3)
+    kept = board.since(0)
+    board.close()
+    with pytest.raises(FileNotFoundError):
+        shared_memory.SharedMemory(name)
+    assert kept["counter"].tolist() == [1, 2, 3]

@@ -1,0 +1,88 @@
+"""Emulated heads for tests: one in memory whose time the test tells, and one in a process of its own."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robot.drivers.head.decoder import Decoder, Frames
+from robot.drivers.head.protocol import (
+    KEEP_ALIVE,
+    REQUEST_OUT,
+    Command,
+    Kind,
+    Mode,
+    Request,
+    pack,
+    tally,
+)
+from robot.emulators.head.config import CONTROL_PORT, HeadEmulatorConfig
+from robot.emulators.head.device import BLOCK, Bridge
+from robot.emulators.head.pose_source import Along, Place
+from robot.world.scene import KidnapConfig, Scene, scene
+from robot.world.walls import Walls
+from tactile.whiskers.head_geometry import ur10_head
+from tests.helpers.live import Faults, emulator
+
+TABLE = Walls(np.array([[-9.0, -9.0, 9.0, 9.0]]), np.array([0.05]))
+"""Under the whole head: every whisker meets it with its tip."""
+EVER = 10**9
+"""More bytes than there ever are."""
+
+
+def drive(mode: Mode = Mode.RCP, threshold: float = 0.04, **changes: Any) -> Command:
+    """A whisk as the paper has it."""
+    numbers = np.full(18, tally(np.array(threshold)))
+    usual = {"amplitude": np.radians(65), "frequency": 1.0, "gain": 4.0, "window": 0.01}
+    return Command(Kind.DRIVE, mode, numbers=numbers, **usual | changes)
+
+
+def world(config: HeadEmulatorConfig) -> Scene:
+    """Of a configuration."""
+    return scene(config.maze, config.path, config.motion, KidnapConfig(), ur10_head(config.head), config.seed)
+
+
+class Told:
+    """A head in memory, and a host that reads it and keeps it awake, a block after the other."""
+
+    def __init__(
+        self, config: HeadEmulatorConfig | None = None, walls: Walls = TABLE, place: Place | None = None
+    ) -> None:
+        self.config = HeadEmulatorConfig() if config is None else config
+        here = Along(world(self.config).path._replace(time=np.zeros(1), pose=np.zeros((1, 3))))
+        self.bridge = Bridge(self.config, walls, here if place is None else place, 0.0)
+        whiskers = len(self.bridge.whiskers.head.length)
+        self.decoder, self.now = Decoder(whiskers, 3), 0.0
+
+    def start(self) -> None:
+        """Has it send frames."""
+        self.bridge.control(REQUEST_OUT, Request.START, 0, 0, self.now)
+
+    def send(self, command: Command) -> None:
+        self.bridge.bulk_out(pack(command), self.now)
+
+    def pass_by(self, seconds: float, awake: bool = True, read: bool = True) -> Frames:
+        """Time passes; what was read meanwhile."""
+        end, got = self.now + seconds, []
+        while self.now < end - 1e-9:
+            if awake:
+                self.send(KEEP_ALIVE)
+            self.now += BLOCK
+            while self.bridge.advance(self.now + 1e-6):
+                pass
+            if read:
+                got.append(self.bridge.bulk_in(EVER, self.now))
+        return self.decoder.feed(b"".join(got))
+
+    def do(self, fault: str, **told: Any) -> dict[str, Any]:
+        return self.bridge.do({"do": fault, **told}, self.now)
+
+
+def running(config: HeadEmulatorConfig, folder: Path) -> AbstractContextManager[Faults]:
+    """A head in a process of its own that listens, until the end of the block."""
+    file = folder / "head.json"
+    file.write_text(config.model_dump_json())
+    return emulator("robot.emulators.head", CONTROL_PORT, config.host, "--config", str(file))

@@ -1,0 +1,29 @@
+"""Two emulators together: the head is where the controller has its tool."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from robot.drivers.ur10.base_transform import PlacingConfig, tcp_of
+from robot.emulators.head.config import HeadEmulatorConfig
+from tests.helpers.live import until, ur_emulator
+from tests.robot.emulators.head.heads import running
+
+PLACING = PlacingConfig()
+
+
+def test_the_head_follows_the_tool(tmp_path: Path, loopback: str) -> None:
+    here, there = np.array([0.27, 0.27, 0.5]), np.array([0.63, 0.45, -2.0])
+    config = HeadEmulatorConfig(host=loopback, path={"explore": 5}, arm=loopback, placing=PLACING)
+    with ur_emulator(loopback, tcp_of(PLACING, here, 0.1)) as arm, running(config, tmp_path) as head:
+
+        def stands(pose: np.ndarray, lift: float) -> bool:
+            state = head(do="state")
+            told = state["lift"] is not None and abs(state["lift"] - lift) < 1e-6
+            return told and bool(np.allclose(state["pose"], pose, atol=1e-6))
+
+        until(lambda: stands(here, 0.1), 3.0, "where the arm began")
+        arm(do="place", tcp=tcp_of(PLACING, there).tolist())
+        until(lambda: stands(there, 0.0), 3.0, "where the arm was put")

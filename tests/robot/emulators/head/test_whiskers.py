@@ -1,0 +1,235 @@
+"""What an emulated head feels: the simulator's whiskers, wherever an arm or its own way has it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from robot.drivers.head.protocol import (
+    ANGLE,
+    SILENCE,
+    Command,
+    Flag,
+    Kind,
+    Mode,
+    counts,
+    radians,
+    tally,
+)
+from robot.drivers.ur10.base_transform import PlacingConfig, tcp_of
+from robot.emulators.head.config import HeadEmulatorConfig
+from robot.emulators.head.device import BLOCK
+from robot.emulators.head.pose_source import AHEAD, Along, Carried
+from robot.simulation.head.quasistatic import quasistatic
+from robot.simulation.head.whisk_stream import cycles
+from robot.world.head_trajectory import Path
+from robot.world.walls import Surroundings
+from tactile.base.random_streams import stream
+from tactile.whiskers.head_geometry import HeadConfig
+from tactile.whiskers.whisking import WhiskingConfig
+from tests.robot.emulators.head.heads import TABLE, Told, drive, world
+
+PLACING = PlacingConfig(x=-0.4, y=0.3, z=0.12, yaw_deg=30.0)
+ODD = 2100.0
+"""A rate with no sample in the middle of a block, where walls take over from each other: there, which of them
+it is depends on the last bit of the time."""
+
+
+class Arm:
+    """Told by the test."""
+
+    def __init__(self) -> None:
+        self.state: tuple[float, np.ndarray, np.ndarray] | None = None
+
+    def latest(self) -> tuple[float, np.ndarray, np.ndarray] | None:
+        return self.state
+
+    def put(self, time: float, pose: list[float], lift: float = 0.0) -> None:
+        self.state = (time, tcp_of(PLACING, np.array(pose), lift), np.zeros(6))
+
+
+@pytest.mark.parametrize("mode", [Mode.OPEN, Mode.RCP])
+@pytest.mark.parametrize("frequency", [1.0, 2.0])
+def test_a_head_on_its_way_feels_what_the_simulator_says(mode: Mode, frequency: float) -> None:
+    config = HeadEmulatorConfig(
+        follow=True, path={"explore": 9}, seed=3, stream={"rate": ODD}, head={"dead": (4,)}
+    )
+    made = world(config)
+    head = Told(config, made.surroundings.walls, Along(made.path))
+    told = drive(mode, frequency=frequency)
+    head.start()
+    head.send(told)
+    frames = head.pass_by(3.0)
+    samples = round(ODD / frequency)
+    assert np.flatnonzero(frames.flags & Flag.CYCLE).tolist() == list(range(0, len(frames.values), samples))
+
+    whisking = WhiskingConfig(mode=mode.name.lower(), rate=frequency, gain=told.gain)
+    start = np.arange(3 * frequency) / frequency
+    knots = {"batch": 1, "poses": samples // head.bridge.samples}
+    raw = cycles(
+        quasistatic,
+        config.stream.model_copy(update=knots),
+        config.mechanics,
+        whisking,
+        made.surroundings,
+        made.path,
+        start,
+        stream(config.seed, "sensor"),
+        told.numbers * ANGLE,
+    )
+    felt = np.concatenate([counts(cycle.angle, cycle.deflection) for cycle in raw])
+    off = np.abs(felt.astype(int) - frames.values)
+    assert np.abs(felt[..., 2] * ANGLE).max() > 0.05
+    assert off.max() <= 1
+    assert (off == 0).mean() > 0.999
+    assert (frames.flags & Flag.RCP).any() == (mode == Mode.RCP)
+
+
+def test_a_whisk_may_end_within_a_block() -> None:
+    head = Told()
+    head.start()
+    head.send(drive(Mode.OPEN, frequency=1.3))
+    frames = head.pass_by(3.0)
+    samples = round(2000 / 1.3)
+    assert samples % head.bridge.samples
+    assert np.flatnonzero(frames.flags & Flag.CYCLE).tolist() == list(range(0, 6000, samples))
+    angle = radians(frames.values)[0]
+    assert (angle[samples - 2 : samples + 2] < 0.02).all()
+
+
+@pytest.mark.parametrize("lift", [0.0, 0.02, -0.004])
+def test_an_arm_carries_the_head_as_if_it_stood_there(lift: float) -> None:
+    """Lifted, it feels what it would feel over walls that are so much lower."""
+    config = HeadEmulatorConfig(path={"explore": 9}, mechanics={"noise": 0.0})
+    walls = world(config).surroundings.walls
+    pose = np.array([0.63, 0.45, 2.0])
+    arm = Arm()
+    arm.put(0.0, pose.tolist(), lift)
+    lower = walls._replace(height=walls.height - lift)
+    stays = Along(Path(np.zeros(1), pose[None]))
+    found = []
+    for head in (Told(config, walls, Carried(arm, PLACING)), Told(config, lower, stays)):
+        head.start()
+        head.send(drive())
+        found.append(head.pass_by(1.0).values.astype(int))
+    assert np.abs(found[0] - found[1]).max() <= 1
+    felt = Surroundings(lower, head.bridge.whiskers.head).contact(pose[None]).angle[0] < np.radians(60)
+    assert felt.any() == ((found[0][..., 2] * ANGLE).max() > 0.05)
+
+
+def test_high_up_and_before_the_arm_tells_there_is_nothing() -> None:
+    arm = Arm()
+    head = Told(HeadEmulatorConfig(mechanics={"noise": 0.0}), TABLE, Carried(arm, PLACING))
+    head.start()
+    head.send(drive())
+    assert not radians(head.pass_by(1.0).values)[1].any()
+    arm.put(head.now, [0.0, 0.0, 0.0])
+    assert radians(head.pass_by(1.0).values)[1].max() > 0.05
+    arm.put(head.now, [0.0, 0.0, 0.0], 0.2)
+    assert not radians(head.pass_by(1.0).values)[1][50:].any()
+    assert head.do("state")["lift"] == pytest.approx(0.2)
+
+
+def test_between_states_the_arm_goes_on_by_its_speed() -> None:
+    arm, home = Arm(), np.array([0.5, 0.4, 3.1])
+    place = Carried(arm, PLACING)
+    tcp = tcp_of(PLACING, home)
+    arm.state = (10.0, tcp, np.array([0.03, -0.01, 0.02, 0.0, 0.0, 0.4]))
+    rows = [place.at(10.0 + ahead) for ahead in (0.0, 0.02, 0.05, AHEAD, 5.0)]
+    poses, lifts = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
+    np.testing.assert_allclose(poses[0], home, atol=1e-9)
+    times = np.array([0.0, 0.02, 0.05, AHEAD, AHEAD])
+    np.testing.assert_allclose(np.hypot(*(poses - home)[:, :2].T), np.hypot(0.03, 0.01) * times, atol=1e-9)
+    np.testing.assert_allclose((poses - home)[:, 2], 0.4 * times, atol=1e-9)
+    np.testing.assert_allclose(lifts, 0.02 * times, atol=1e-9)
+
+
+def test_without_commands_whiskers_go_back_and_stay() -> None:
+    head = Told(HeadEmulatorConfig(mechanics={"noise": 0.0}))
+    head.start()
+    head.send(drive(Mode.OPEN))
+    assert radians(head.pass_by(0.4).values)[0].max() > 0.5
+    frames = head.pass_by(2.0, awake=False)
+    angle = radians(frames.values)[0]
+    assert len(angle) == 4000  # it goes on sending
+    silent = round(SILENCE * 2000)
+    assert (angle[silent - 100] > 0.2).all()
+    assert (angle[silent + 500 :] == 0).all()
+    assert (np.diff(angle[silent + 60 : silent + 500], axis=0) <= 1e-9).all()
+    assert not (frames.flags[silent + 20 :] & Flag.CYCLE).any()
+    assert not radians(head.pass_by(1.0).values)[0].any()  # being kept awake is not being driven
+    head.send(drive(Mode.OPEN))
+    assert radians(head.pass_by(1.0).values)[0].max() > 0.5
+
+
+def test_a_new_drive_waits_for_the_cycle_to_end() -> None:
+    head = Told(HeadEmulatorConfig(mechanics={"noise": 0.0}))
+    head.start()
+    head.send(drive(Mode.OPEN))
+    head.pass_by(0.3)
+    head.send(drive(Mode.OPEN, frequency=2.0, amplitude=0.3, offset=0.2))
+    frames = head.pass_by(1.7)
+    begins = np.flatnonzero(frames.flags & Flag.CYCLE)
+    assert begins.tolist() == [1400, 2400]
+    angle = radians(frames.values)[0]
+    assert angle[:1400].max() > 0.8
+    assert angle[1400:].max() == pytest.approx(0.5, abs=0.01)
+    assert angle[1400:].min() == pytest.approx(0.2, abs=1e-3)
+
+
+def test_the_host_lowers_amplitudes_for_one_cycle() -> None:
+    head = Told(HeadEmulatorConfig(mechanics={"noise": 0.0}), TABLE._replace(height=np.array([0.0])))
+    head.start()
+    head.send(drive(Mode.OPEN))
+    head.pass_by(0.1)
+    lower = np.linspace(0.1, 0.9, 18)
+    head.send(Command(Kind.AMPLITUDES, numbers=tally(lower)))
+    angle = radians(head.pass_by(1.9).values)[0]
+    np.testing.assert_allclose(angle[:1800].max(axis=0), lower, atol=1e-3)
+    np.testing.assert_allclose(angle[1800:].max(axis=0), np.radians(65), atol=1e-3)
+
+
+def test_feedback_is_relative_to_the_centre() -> None:
+    most = []
+    for centre in (0.0, 0.3):
+        head = Told(HeadEmulatorConfig(mechanics={"noise": 0.0, "slip": 1.0}))
+        head.start()
+        head.send(Command(Kind.CENTRE, numbers=tally(np.full(18, centre))))
+        head.send(drive())
+        most.append(radians(head.pass_by(1.0).values)[1].max())
+    assert most[1] < 0.7 * most[0]  # taken for pressed from the beginning
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"frequency": 0.0},
+        {"frequency": -1.0},
+        {"frequency": 1e6},
+        {"amplitude": -0.1},
+        {"gain": -1.0},
+        {"window": 0.0},
+    ],
+)
+def test_what_no_drive_can_do_is_not_done(bad: dict[str, float]) -> None:
+    head = Told()
+    head.start()
+    head.send(drive(**bad))
+    assert np.abs(radians(head.pass_by(0.5).values)[0]).max() < 0.02
+
+
+def test_drives_stop_at_their_limit() -> None:
+    head = Told(HeadEmulatorConfig(head=HeadConfig(limit_deg=50.0), mechanics={"noise": 0.0}))
+    head.start()
+    head.send(drive(Mode.OPEN, offset=0.3))
+    angle = radians(head.pass_by(1.0).values)[0]
+    assert angle.max() <= np.radians(50) + ANGLE
+
+
+def test_nothing_is_felt_while_nobody_listens() -> None:
+    """A head that rests costs nothing, and its noise waits for the first frame."""
+    quick, late = Told(), Told()
+    late.pass_by(3 * BLOCK)
+    for head in (quick, late):
+        head.start()
+    assert np.array_equal(quick.pass_by(0.1).values, late.pass_by(0.1).values)

@@ -1,0 +1,114 @@
+"""What `test_umock` runs on a test bed: a host of the head on the system's libusb. Prints JSON."""
+
+from __future__ import annotations
+
+import json
+import socket
+import sys
+import time
+from typing import Any
+
+from robot.drivers.head.decoder import Decoder
+from robot.drivers.head.device import Bridge, Gone, Stalled, identity, open_bridge
+from robot.drivers.head.protocol import KEEP_ALIVE, Request, pack
+from robot.emulators.head.config import CONTROL_PORT
+from tests.robot.emulators.head.heads import drive
+
+
+def main(host: str) -> None:
+    """Reads, is stalled, stopped, unplugged and plugged in again."""
+    # The libusb that a package brings does not hear of unplugged devices here: it asks the kernel, not udev.
+    sys.modules["libusb_package"] = None  # type: ignore[assignment]
+    seen: dict[str, Any] = {}
+    bridge = open_bridge("usb")
+    decoder = Decoder(18, 3)
+    seen["whiskers"] = identity(bridge).whiskers
+    bridge.request(Request.START)
+    bridge.write(pack(drive()))
+    seen["frames"] = read(bridge, decoder, 3000)
+
+    asked(host, do="stall")
+    seen["stalls"] = 0
+    for _ in range(3):
+        try:
+            decoder.feed(bridge.read(4096, 0.5))
+        except Stalled:
+            seen["stalls"] += 1
+    read(bridge, decoder, 500)
+    seen["counts"] = decoder.counts._asdict()
+
+    bridge.request(Request.STOP)
+    began = time.monotonic()
+    seen["idle"] = len(bridge.read(4096, 0.2)), time.monotonic() - began
+    bridge.request(Request.START)
+
+    asked(host, do="unplug")
+    seen["gone"] = ended(bridge)
+    bridge.close()
+    seen["absent"] = absent()
+    asked(host, do="plug")
+    bridge = again(5.0)
+    bridge.request(Request.START)
+    decoder = Decoder(18, 3)
+    seen["again"] = read(bridge, decoder, 1000)
+    seen["missing"] = decoder.counts.missing
+    bridge.close()
+    print(json.dumps(seen))
+
+
+def read(bridge: Bridge, decoder: Decoder, frames: int) -> int:
+    """How many frames come, until they are so many or it takes too long."""
+    end, got = time.monotonic() + 10.0, 0
+    while got < frames and time.monotonic() < end:
+        got += len(decoder.feed(bridge.read(4096, 0.5)).values)
+        bridge.write(pack(KEEP_ALIVE))
+    return got
+
+
+def ended(bridge: Bridge) -> bool:
+    """Whether reading ends with a head that is gone."""
+    end = time.monotonic() + 5.0
+    try:
+        while time.monotonic() < end:
+            bridge.read(4096, 0.5)
+    except Gone:
+        return True
+    return False
+
+
+def absent() -> bool:
+    """Whether it comes to be known that no head is there."""
+    end = time.monotonic() + 5.0
+    while time.monotonic() < end:
+        try:
+            open_bridge("usb").close()
+        except Gone:
+            return True
+        except Stalled:
+            pass  # known to have been there, and not yet known to be gone
+        time.sleep(0.02)
+    return False
+
+
+def again(seconds: float) -> Bridge:
+    """The head, as soon as it is back."""
+    end = time.monotonic() + seconds
+    while True:
+        try:
+            return open_bridge("usb")
+        except (Gone, Stalled):
+            if time.monotonic() > end:
+                raise
+            time.sleep(0.02)
+
+
+def asked(host: str, **fault: Any) -> None:
+    """Begins a fault."""
+    with socket.create_connection((host, CONTROL_PORT), 5) as link, link.makefile("rw") as lines:
+        lines.write(json.dumps(fault) + "\n")
+        lines.flush()
+        assert json.loads(lines.readline())["ok"]
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

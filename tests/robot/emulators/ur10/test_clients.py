@@ -1,0 +1,294 @@
+"""The real client libraries against the emulator, and against a real controller where one is named.
+
+`RATSLAM_UR_HOST=192.168.56.101 pytest tests/robot/emulators/test_ur_clients.py` runs the tests that need no
+faults on that controller (or the vendor's simulator). They move the tool 20 mm upwards from where it stands
+and turn the last joint by 3 degrees: leave it room.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+import pytest
+
+from robot.drivers.ur10.pose_listener import PoseStream
+from tests.helpers.live import ROOT, Faults, until, ur_emulator
+
+REAL = os.environ.get("RATSLAM_UR_HOST", "")
+START = (0.6, 0.0, 0.3, math.pi, 0.0, 0.0)
+WAIT = 15.0  # s, for a client that may be slow to die
+
+pytestmark = pytest.mark.skipif(importlib.util.find_spec("rtde_receive") is None, reason="needs ur_rtde")
+emulated = pytest.mark.skipif(bool(REAL), reason="needs a controller that can be made to fail")
+
+
+class Bench:
+    """One emulator after another at one address."""
+
+    def __init__(self, host: str) -> None:
+        self.host = host
+        self.faults: Faults | None = None
+        self._stack = ExitStack()
+
+    def fresh(self, *arguments: str) -> Faults:
+        """A new one, in good order."""
+        self.close()
+        self.faults = self._stack.enter_context(ur_emulator(self.host, START, *arguments))
+        return self.faults
+
+    def good(self) -> Faults:
+        """The present one where it is still in good order, else a new one."""
+        if self.faults is None or self.faults.process.poll() is not None:
+            return self.fresh()
+        self.faults(do="clear")
+        return self.faults
+
+    def close(self) -> None:
+        self._stack.close()
+        self.faults = None
+
+
+@pytest.fixture(scope="module")
+def bench(loopback: str) -> Iterator[Bench]:
+    bench = Bench(loopback)
+    yield bench
+    bench.close()
+
+
+@pytest.fixture
+def faults(bench: Bench) -> Faults:
+    return bench.good()
+
+
+@contextmanager
+def client(host: str, scenario: str) -> Iterator[subprocess.Popen[str]]:
+    """A client's process; it ends with the block."""
+    command = [sys.executable, "-m", "tests.robot.emulators.ur10.client", host, scenario]
+    process = subprocess.Popen(
+        command, cwd=ROOT, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def at_the_word(process: subprocess.Popen[str]) -> None:
+    """Wait until a client is where the test wants to act."""
+    assert process.stdout is not None
+    for line in process.stdout:
+        if line.strip() == "here":
+            return
+    raise AssertionError(process.communicate()[1])
+
+
+def go_on(process: subprocess.Popen[str]) -> None:
+    """Let a client go on."""
+    assert process.stdin is not None
+    process.stdin.write("\n")
+    process.stdin.flush()
+
+
+def outcome(process: subprocess.Popen[str]) -> Any:
+    """What a client found out."""
+    said, complaint = process.communicate("\n", timeout=WAIT)
+    assert process.returncode == 0, complaint
+    return json.loads(said.splitlines()[-1])
+
+
+def found(host: str, scenario: str) -> Any:
+    with client(host, scenario) as process:
+        return outcome(process)
+
+
+VERSIONS = [
+    ("125", "3.4"),
+    pytest.param("125", "3.15.8", marks=pytest.mark.soak),
+    ("500", "5.11"),
+    pytest.param("500", "5.23", marks=pytest.mark.soak),
+]
+
+
+@emulated
+@pytest.mark.parametrize(("hz", "polyscope"), VERSIONS)
+def test_all_four_clients_agree_with_every_version(bench: Bench, hz: str, polyscope: str) -> None:
+    bench.fresh("--hz", hz, "--polyscope", polyscope)
+    seen = found(bench.host, "everyone")
+    assert seen["connected"] == [True] * 3
+    assert seen["program"]
+    assert seen["mode"] == "Robotmode: RUNNING"
+    assert polyscope in seen["version"]
+    assert seen["safety"] == [1, 1]
+    assert seen["offset"] == [0, 0, 0.1, 0, 0, 0]
+    assert max(map(abs, seen["forward_off"])) < 1e-9
+    assert seen["inverse_off"] < 1e-9
+    assert not seen["unreachable"]
+    assert seen["rate"] == pytest.approx(1.0, abs=0.1)
+    bench.close()
+
+
+def test_moves_arrive_and_stops_stop(bench: Bench) -> None:
+    if REAL:
+        host = REAL
+    else:
+        bench.good()
+        host = bench.host
+    seen = found(host, "moves")
+    assert seen["told"] == [True] * 6
+    assert seen["seen"] == [True] * 5
+    assert 0.001 < seen["under_way"] <= seen["stood"] < 0.015
+    assert seen["turned"] == pytest.approx(0.05, abs=1e-3)
+
+
+@pytest.mark.parametrize("watched", [True, False])
+@emulated
+def test_a_killed_client_stops_the_arm_only_by_the_watchdog(faults: Faults, watched: bool) -> None:
+    before = faults.state()
+    with client(faults.host, "drive watched" if watched else "drive") as process:
+        at_the_word(process)
+        until(lambda: faults.state()["speed"][1] == pytest.approx(0.01), 2.0, "the arm moves")
+        time.sleep(0.3)
+        assert faults.state()["moving"]
+        process.send_signal(signal.SIGKILL)
+        process.wait(WAIT)
+    if watched:
+        until(lambda: not faults.state()["moving"], 2.0, "the arm stands")
+    else:
+        time.sleep(0.5)
+        assert faults.state()["moving"]
+    after = faults.state()
+    assert after["watchdog_stops"] - before["watchdog_stops"] == watched
+    assert after["targets"][-1]["goal"][1] == 0.01
+
+
+@emulated
+def test_a_malformed_package_takes_the_client_down(faults: Faults) -> None:
+    with client(faults.host, "watch") as process:
+        at_the_word(process)
+        faults(do="malformed")
+        process.communicate("\n", timeout=WAIT)
+        assert process.returncode == -signal.SIGABRT
+
+
+@emulated
+@pytest.mark.soak
+def test_a_long_stall_takes_a_controlling_client_down(faults: Faults) -> None:
+    with client(faults.host, "solve") as process:
+        at_the_word(process)
+        faults(do="stall", seconds=3.5)
+        process.wait(WAIT)
+        assert process.returncode < 0
+
+
+@emulated
+def test_the_rate_can_be_too_low(faults: Faults) -> None:
+    def told() -> int:
+        with PoseStream(faults.host) as poses:
+            until(poses.newest, 2.0)
+            times = set()
+            end = poses.newest().robot_time + 0.5
+            while poses.newest().robot_time < end:
+                times.add(poses.newest().robot_time)
+                time.sleep(0.001)
+        return len(times)
+
+    faults(do="rate", hz=40)
+    assert 15 <= told() <= 25
+    faults(do="clear")
+    assert told() > 30
+
+
+@emulated
+@pytest.mark.parametrize(
+    ("fault", "sign"),
+    [
+        ({"do": "close"}, lambda seen: not seen["connected"]),
+        ({"do": "nan"}, lambda seen: all(seen["nan"])),
+        ({"do": "freeze"}, lambda seen: seen["went"] < 0.1),
+        ({"do": "stall", "seconds": 1.0}, lambda seen: seen["connected"] and seen["went"] < 0.1),
+        ({"do": "protective"}, lambda seen: seen["bits"] == 1 << 2 | 1 << 10),
+        pytest.param(
+            {"do": "safeguard"}, lambda seen: seen["bits"] == 1 << 4 | 1 << 10, marks=pytest.mark.soak
+        ),
+        ({"do": "slider", "fraction": 0.1}, lambda seen: seen["slider"] == pytest.approx(0.1)),
+        (
+            {"do": "wall", "z": 0.31, "solid": -1, "stiffness": 1e3},
+            lambda seen: seen["force"][2] == pytest.approx(10),
+        ),
+    ],
+    ids=lambda value: value["do"] if isinstance(value, dict) else "",
+)
+def test_a_fault_is_seen_by_the_client(bench: Bench, fault: dict[str, Any], sign: Any) -> None:
+    faults = bench.good()
+    faults(do="place", tcp=START)
+    faults(do="wall")
+    with client(bench.host, "watch") as process:
+        at_the_word(process)
+        faults(**fault)
+        go_on(process)
+        at_the_word(process)
+        faults(do="clear")
+        faults(do="wall")
+        during, after = outcome(process)
+    assert sign(during), during
+    assert fault["do"] == "close" or not sign(after), after
+
+
+@emulated
+def test_inverse_kinematics_that_fail_end_the_program(faults: Faults) -> None:
+    with client(faults.host, "solve") as process:
+        at_the_word(process)
+        faults(do="ik_fails")
+        seen = outcome(process)
+    assert len(seen["before"]) == 6
+    assert seen["after"] == []
+    assert not seen["moved"]
+    assert faults.state()["runtime"] == "STOPPED"
+
+
+@emulated
+def test_registers_have_one_master(faults: Faults) -> None:
+    seen = found(faults.host, "second")
+    assert "already in use" in seen["error"]
+    assert seen["unharmed"]
+    faults(do="registers")
+    assert "already in use" in found(faults.host, "refused")["error"]
+    faults(do="clear")
+    assert found(faults.host, "refused")["error"] == ""
+
+
+@emulated
+def test_an_e_series_wants_remote_control(bench: Bench) -> None:
+    faults = bench.fresh("--hz", "500")
+    faults(do="remote", on=False)
+    assert "remote control" in found(bench.host, "refused")["error"]
+    bench.close()
+
+
+@emulated
+def test_the_slider_moves_through_the_io_client(faults: Faults) -> None:
+    assert found(faults.host, "slide")["seen"]
+
+
+@emulated
+def test_nonsense_on_the_fault_port_is_answered(faults: Faults) -> None:
+    for request in (
+        {"do": "juggle"},
+        {"do": "stall"},
+        {"do": "place", "tcp": [1]},
+        {"do": "place", "tcp": [9.0] * 6},
+    ):
+        with pytest.raises(AssertionError):
+            faults(**request)
+    assert faults.state()["tcp"][:3] == pytest.approx(START[:3], abs=0.05)

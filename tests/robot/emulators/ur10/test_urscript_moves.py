@@ -1,0 +1,185 @@
+"""Both checks before the wire without a controller: the arm's process, and the session's side of it."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robot.drivers.outcome import Outcome
+from robot.drivers.ur10.arm import Arm
+from robot.drivers.ur10.base_transform import tcp_of
+from robot.drivers.ur10.command_thread import Governor, Order
+from robot.drivers.ur10.config import SPEED_CAP, ArmConfig
+from robot.drivers.ur10.safety import LEAST, Refused, inside
+from robot.drivers.ur10.shared_state import Board
+from tests.robot.drivers.ur10.conftest import HOME
+from tests.robot.drivers.ur10.test_safety import a_state
+
+CONFIG = ArmConfig()
+number = st.one_of(st.floats(allow_nan=True, allow_infinity=True), st.floats(-1.3, 1.3))
+poses = st.one_of(
+    st.lists(number, min_size=0, max_size=8),
+    st.tuples(st.floats(-0.3, 1.6), st.floats(-0.3, 1.2), st.floats(-4, 4), st.floats(-0.2, 0.5)).map(
+        lambda v: tcp_of(CONFIG.placing, np.array(v[:3]), v[3]).tolist()
+    ),
+)
+speeds = st.one_of(number, st.floats(0.001, 0.06), st.sampled_from([0.25, 0.2501, 0.05, 0.1, 0.0, -0.05]))
+
+
+class Control:
+    """Takes the place of the library's control interface and remembers."""
+
+    def __init__(self) -> None:
+        self.moves: list[tuple[Any, ...]] = []
+        self.stops = self.kicks = 0
+        self.reachable = True
+
+    def stopL(self, deceleration: float, asynchronous: bool) -> None:
+        self.stops += 1
+
+    def kickWatchdog(self) -> bool:
+        self.kicks += 1
+        return True
+
+    def isPoseWithinSafetyLimits(self, pose: list[float]) -> bool:
+        return self.reachable
+
+    def moveL(self, *call: Any) -> bool:
+        self.moves.append(call)
+        return True
+
+
+@pytest.fixture(scope="module")
+def board() -> Iterator[Board]:
+    board = Board()
+    board.publish(a_state())
+    yield board
+    board.close()
+
+
+def governed(board: Board) -> tuple[Governor, Control, list[dict[str, Any]]]:
+    """A governor of nothing, and what it tells the session."""
+    control, told = Control(), []
+    return Governor(CONFIG, board, control, lambda **fields: told.append(fields)), control, told
+
+
+@given(poses, speeds, st.sampled_from(["move", "retreat"]))
+def test_no_order_gets_a_bad_move_to_the_wire(board: Board, pose: list[float], speed: float, do: str) -> None:
+    governor, control, told = governed(board)
+    governor.execute(Order(do, 1, tuple(pose), speed, int(board.control["stops"])))
+    if not control.moves:
+        (fault,) = told
+        assert fault["say"] == "fault"
+        assert governor.held is not None
+        governor.execute(Order("move", 2, tuple(HOME), 0.01, int(board.control["stops"])))
+        assert not control.moves
+        return
+    ((target, speed, acceleration, asynchronous),) = control.moves
+    assert target == pose
+    assert len(target) == 6
+    assert np.isfinite(target).all()
+    assert inside(CONFIG, np.array(target))
+    assert 0 < speed <= SPEED_CAP
+    way = math.dist(target[:3], HOME[:3])
+    assert min(speed, math.sqrt(CONFIG.acceleration * way)) <= CONFIG.speed
+    assert way <= CONFIG.backoff + 0.002 or do == "move"
+    assert acceleration == CONFIG.acceleration
+    assert asynchronous is True
+
+
+def test_a_stop_revokes_the_orders_before_it(board: Board) -> None:
+    governor, control, _ = governed(board)
+    order = Order("move", 1, tuple(HOME), 0.01, int(board.control["stops"]))
+    board.control["stops"] += 1
+    governor.execute(order)
+    assert control.moves == []
+    governor._stopped = governor._wanted()
+    governor.execute(order)
+    assert control.moves == []
+    governor.execute(order._replace(stops=int(board.control["stops"])))
+    assert len(control.moves) == 1
+
+
+def test_the_watchdog_is_fed_only_while_the_session_lives(board: Board) -> None:
+    governor, control, _ = governed(board)
+    board.control["heartbeat"] = time.monotonic()
+    governor.act()
+    assert (control.kicks, control.stops) == (1, 0)
+    board.control["heartbeat"] = time.monotonic() - CONFIG.heartbeat - 0.001
+    governor.act()
+    assert control.kicks == 1
+
+
+def test_a_stop_comes_before_what_was_ordered(board: Board) -> None:
+    governor, control, _ = governed(board)
+    stops = int(board.control["stops"])
+    governor.put(Order("move", 1, tuple(HOME), 0.01, stops))
+    board.control["stops"] += 1
+    governor.put(Order("move", 2, tuple(HOME), 0.02, stops + 1))
+    governor.act()
+    assert control.stops == 1
+    assert [call[1] for call in control.moves] == [0.02]
+    governor.leaving = True
+    governor.put(Order("move", 3, tuple(HOME), 0.01, stops + 1))
+    governor.act()
+    assert len(control.moves) == 1
+
+
+def test_without_joints_nothing_is_told(board: Board) -> None:
+    governor, control, told = governed(board)
+    control.reachable = False
+    governor.execute(Order("move", 1, tuple(HOME), 0.01, int(board.control["stops"])))
+    assert control.moves == []
+    assert [fault["outcome"] for fault in told] == [Outcome.UNREACHABLE.name]
+
+
+class Link:
+    """Takes the place of the arm's process and remembers what it is ordered."""
+
+    def __init__(self) -> None:
+        self.orders: list[dict[str, Any]] = []
+
+    def order(self, **fields: Any) -> None:
+        self.orders.append(fields)
+
+    def end(self, patience: float) -> bool:
+        return True
+
+    def kill(self) -> None:
+        pass
+
+
+@pytest.fixture(scope="module")
+def linked() -> Iterator[tuple[Arm, Link]]:
+    """An arm that believes to be armed; its orders go nowhere."""
+    with Arm(CONFIG) as arm:
+        link = Link()
+        arm._board.publish(a_state())
+        arm._supervisor.process, arm._supervisor.armed = link, True  # type: ignore[assignment]
+        yield arm, link
+
+
+@given(poses, st.one_of(st.none(), speeds))
+def test_no_call_gets_a_bad_move_to_the_arms_process(
+    linked: tuple[Arm, Link], pose: list[float], speed: float | None
+) -> None:
+    arm, link = linked
+    link.orders.clear()
+    try:
+        move = arm.move(pose, speed)
+    except Refused:
+        assert link.orders == []
+        return
+    (order,) = link.orders
+    assert order["target"] == pose
+    assert np.isfinite(pose).all()
+    assert inside(CONFIG, np.array(pose))
+    assert speed is None or LEAST <= speed <= CONFIG.speed
+    assert 0 < order["speed"] == move.speed <= SPEED_CAP

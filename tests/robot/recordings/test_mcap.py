@@ -1,0 +1,539 @@
+"""Recordings: exactly what was written comes back, of a damaged file exactly what was before the damage."""
+
+from __future__ import annotations
+
+import signal
+import struct
+import subprocess
+import sys
+import textwrap
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from robot.recordings.cdr import decode, encode
+from robot.recordings.mcap_reader import Recording, record, recover
+from robot.recordings.mcap_scanner import FORMAT, Walk, _checksum
+from robot.recordings.npz_trace import read_stream
+from robot.recordings.recorder import Recorder
+from robot.recordings.schemas import CYCLE, OBSERVATION, REPORT, SCHEMAS, TOPICS, WHISK
+from robot.sources.source import Rigged, Sample, Source, rig_of
+from tactile.base.errors import InputError
+from tactile.base.types import Cycle, Observation, Odometry, Report, Whisk, observation
+
+SHAPE, WHISKERS = (2, 3, 2), 4
+NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
+
+
+def _numbers(
+    *shape: int, low: float | None = None, high: float | None = None
+) -> st.SearchStrategy[np.ndarray]:
+    return arrays(np.float64, shape, elements=st.floats(low, high, allow_nan=False, allow_infinity=False))
+
+
+def _bools(*shape: int) -> st.SearchStrategy[np.ndarray]:
+    return arrays(np.bool_, shape)
+
+
+ODOMETRIES = st.tuples(*[st.floats(-0.1, 0.1).map(np.float64)] * 3, st.just(np.float64(0.5))).map(
+    lambda values: Odometry(*values)
+)
+OBSERVATIONS = st.builds(
+    Observation,
+    odometry=ODOMETRIES,
+    motion=st.integers(0, 3).map(np.int32),
+    view=_numbers(*SHAPE, low=0, high=1),
+    view_seen=st.booleans().map(np.bool_),
+    label=st.integers(-1, 2**31 - 1).map(np.int32),
+    contact=_bools(WHISKERS),
+    alive=_bools(WHISKERS),
+    point=_numbers(WHISKERS, 2),
+    wall=st.booleans().map(np.bool_),
+    wall_point=_numbers(2),
+    wall_sd=NUMBERS.map(np.float64),
+)
+CYCLES = st.integers(0, 5).flatmap(
+    lambda t: st.builds(
+        Cycle,
+        time=_numbers(t),
+        angle=_numbers(t, WHISKERS),
+        deflection=_numbers(t, WHISKERS, 2),
+        odometry=ODOMETRIES,
+    )
+)
+WHISKS = st.builds(
+    Whisk,
+    odometry=ODOMETRIES,
+    alive=_bools(WHISKERS),
+    contact=_bools(WHISKERS),
+    touched=_numbers(WHISKERS),
+    held=_bools(WHISKERS),
+    highest=_numbers(WHISKERS),
+    reach=_numbers(WHISKERS),
+)
+REPORTS = st.integers(0, 5).flatmap(
+    lambda t: st.builds(
+        Report,
+        odometry=ODOMETRIES,
+        motion=st.integers(0, 3),
+        moment=st.integers(0, 3),
+        alive=_bools(WHISKERS),
+        contact=_bools(WHISKERS),
+        time=_numbers(t),
+        strain=_numbers(t, WHISKERS, 2),
+    )
+)
+RIG = {"head": {"rest_deg": 75.0}, "calibration": {"sd": [[1e-3, 0.1], [1e-300, -0.0]]}, "über": None}
+TRUTHS = st.none() | _numbers(3, low=-0.1, high=0.1)
+SAMPLES = st.lists(st.tuples(OBSERVATIONS | CYCLES | WHISKS | REPORTS, TRUTHS), min_size=1, max_size=12).map(
+    lambda parts: [Sample(100 + 0.5 * i, *part) for i, part in enumerate(parts)]
+)
+
+
+def _leaves(sample: Sample) -> list[Any]:
+    parts: list[Any] = [np.float64(sample.time), type(sample.reading), sample.truth is None]
+    odometry = sample.reading.odometry
+    rest = sample.reading._replace(odometry=None)
+    return [*parts, *odometry, *(part for part in rest if part is not None), sample.truth]
+
+
+def _same(one: Sequence[Sample], other: Sequence[Sample]) -> bool:
+    """Whether two runs of samples are equal in every bit, shape and dtype."""
+
+    def key(value: Any) -> Any:
+        if isinstance(value, (np.ndarray, np.generic)):
+            return np.asarray(value).tobytes(), np.shape(value), np.asarray(value).dtype
+        return value
+
+    return len(one) == len(other) and all(
+        list(map(key, _leaves(a))) == list(map(key, _leaves(b))) for a, b in zip(one, other, strict=True)
+    )
+
+
+def _write(path: Path, samples: Sequence[Sample], **options: Any) -> Path:
+    path.unlink(missing_ok=True)
+    options = {"rig": RIG} | options
+    with Recorder(path, view_shape=SHAPE, whiskers=WHISKERS, rate_hz=2.0, **options) as recorder:
+        for sample in samples:
+            recorder.write(sample)
+    return path
+
+
+def _samples(count: int, seed: int = 0) -> list[Sample]:
+    """Samples of all kinds with every field filled."""
+    rng = np.random.default_rng(seed)
+    samples = []
+    for i in range(count):
+        odometry = Odometry(*(np.float64(x) for x in (*rng.normal(0, 0.05, 3), 0.5)))
+        truth = rng.normal(size=3) if i % 3 else None
+        if i % 5 == 4:
+            flags, strain = rng.random((2, WHISKERS)) < 0.5, rng.normal(size=(3, WHISKERS, 2))
+            told = Report(odometry, 1, 2, *flags, time=np.arange(3) / 2000, strain=strain)
+            samples.append(Sample(0.5 * i, told, truth))
+        elif i % 4 == 3:
+            arrays_ = (rng.random(2), rng.normal(size=(2, WHISKERS)), rng.normal(size=(2, WHISKERS, 2)))
+            samples.append(Sample(0.5 * i, Cycle(*arrays_, odometry), truth))
+        elif i % 4 == 2:
+            truths, numbers = rng.random((3, WHISKERS)) < 0.5, rng.normal(size=(3, WHISKERS))
+            felt = Whisk(odometry, truths[0], truths[1], numbers[0], truths[2], *numbers[1:])
+            samples.append(Sample(0.5 * i, felt, truth))
+        else:
+            seen = observation(odometry, rng.random(SHAPE), label=i, whiskers=WHISKERS)
+            point = rng.normal(size=(WHISKERS, 2))
+            seen = seen._replace(point=point, contact=point[:, 0] > 0, alive=point[:, 1] > 0)
+            samples.append(Sample(0.5 * i, seen, truth))
+    return samples
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, list[Sample]]:
+    """A small recording of several chunks: its bytes and its samples."""
+    samples = _samples(9)
+    path = _write(tmp_path_factory.mktemp("small") / "small.mcap", samples, chunk_s=1.5)
+    return path.read_bytes(), samples
+
+
+@settings(max_examples=60)
+@given(SAMPLES)
+def test_what_is_written_comes_back_bit_for_bit(tmp_path_factory: Any, samples: list[Sample]) -> None:
+    path = _write(tmp_path_factory.getbasetemp() / "law.mcap", samples)
+    with Recording(path) as source:
+        assert isinstance(source, Source)
+        assert _same(list(source), samples)
+        assert _same(list(source), samples)  # and again
+        assert (source.length, source.view_shape, source.whiskers) == (len(samples), SHAPE, WHISKERS)
+        assert (source.truncated, source.warning, source.rate_hz) == (False, "", 2.0)
+        assert source.rig == rig_of(source) == RIG
+        assert source.whisked == any(not isinstance(sample.reading, Observation) for sample in samples)
+
+
+def test_the_file_depends_on_the_samples_alone(tmp_path: Path) -> None:
+    paths = [_write(tmp_path / name, _samples(9)) for name in ("a.mcap", "b.mcap")]
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+    sources = [Recording(path) for path in paths]
+    assert sources[0].digest == sources[1].digest
+    assert len(sources[0].digest) == 64
+    assert Recording(_write(tmp_path / "c.mcap", _samples(9, seed=1))).digest != sources[0].digest
+
+
+def test_a_source_is_recorded_as_it_is(trace: Path, tmp_path: Path) -> None:
+    with read_stream(trace) as source:
+        assert record(source, tmp_path / "copy.mcap") == source.length
+        copy = Recording(tmp_path / "copy.mcap")
+        assert _same(list(copy), list(source))
+        assert copy.rate_hz == source.rate_hz
+
+
+def _check_prefix(path: Path, samples: list[Sample]) -> int:
+    """Reads a damaged file: a prefix of the samples, or one InputError. How many samples."""
+    told: list[str] = []
+    source: Recording | None
+    try:
+        source = Recording(path, warn=told.append)
+    except InputError as error:
+        message = str(error)
+        source = None
+    if source is None:
+        assert str(path) in message
+        return 0
+    read = list(source)
+    assert _same(read, samples[: len(read)])
+    assert source.rig == RIG
+    assert source.length == len(read)
+    assert told == ([source.warning] if source.truncated else [])
+    assert source.truncated or len(read) == len(samples)
+    return len(read)
+
+
+def test_a_recording_may_be_cut_off_anywhere(small: tuple[bytes, list[Sample]], tmp_path: Path) -> None:
+    content, samples = small
+    path = tmp_path / "cut.mcap"
+    counts = []
+    last = content.rindex(b"\x28\xb5\x2f\xfd")  # behind it stands the table of contents
+    for size in [*range(last), *range(last, len(content), 7)]:
+        path.write_bytes(content[:size])
+        counts.append(_check_prefix(path, samples))
+    assert counts == sorted(counts)
+    assert {0, 1, len(samples)} < set(counts)
+
+
+def _fuzz(content: bytes, samples: list[Sample], path: Path, rounds: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    for _ in range(rounds):
+        bad = bytearray(content)
+        for place in rng.integers(0, len(bad), rng.integers(1, 4)):
+            match int(rng.integers(4)):
+                case 0:
+                    bad[place % len(bad)] ^= 1 << int(rng.integers(8))
+                case 1:
+                    bad[place : place + 8] = struct.pack("<Q", int(rng.integers(1 << 62)) << 1)
+                case 2:
+                    bad[place : place + int(rng.integers(1, 40))] = b""
+                case _:
+                    bad[place : place + 16] = bytes(16)
+        path.write_bytes(bad)
+        _check_prefix(path, samples)
+
+
+def test_every_damaged_byte_is_noticed(small: tuple[bytes, list[Sample]], tmp_path: Path) -> None:
+    content, samples = small
+    path = tmp_path / "bad.mcap"
+    for place in range(0, len(content), 3):
+        bad = bytearray(content)
+        bad[place] ^= 0x40
+        path.write_bytes(bad)
+        _check_prefix(path, samples)
+
+
+def test_random_damage(small: tuple[bytes, list[Sample]], tmp_path: Path) -> None:
+    _fuzz(*small, tmp_path / "bad.mcap", rounds=500, seed=1)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("seed", range(8))
+def test_much_random_damage(small: tuple[bytes, list[Sample]], tmp_path: Path, seed: int) -> None:
+    _fuzz(*small, tmp_path / "bad.mcap", rounds=5000, seed=seed + 100)
+
+
+def test_a_killed_recorder_loses_no_more_than_its_last_half_second(tmp_path: Path) -> None:
+    path = tmp_path / "killed.mcap"
+    code = f"""
+        import os, signal
+        from pathlib import Path
+        from robot.recorder import Recorder
+        from robot.source import Sample
+        from tactile.types import Odometry, observation
+        recorder = Recorder(Path({str(path)!r}))
+        for i in range(25):
+            recorder.write(Sample(0.1 * i, observation(Odometry(0.01, 0, 0, 0.1)), None))
+        os.kill(os.getpid(), signal.SIGKILL)
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code)], cwd=Path(__file__).parents[3], check=False
+    )
+    assert done.returncode == -signal.SIGKILL
+    source = Recording(path)
+    assert 20 <= source.length <= 25
+    assert source.truncated
+    assert f"{source.length} samples could be read, the rest is lost: it ends too early" in source.warning
+
+
+def test_recover_makes_a_whole_file(small: tuple[bytes, list[Sample]], tmp_path: Path) -> None:
+    content, samples = small
+    cut, whole = tmp_path / "cut.mcap", tmp_path / "whole.mcap"
+    cut.write_bytes(content[: len(content) * 2 // 3])
+    found = Recording(cut)
+    report = recover(cut, whole)
+    assert (report.samples, report.truncated, report.reason) == (found.length, True, "it ends too early")
+    again = Recording(whole)
+    assert not again.truncated
+    assert _same(list(again), samples[: found.length])
+    assert (again.view_shape, again.whiskers, again.rig) == (SHAPE, WHISKERS, RIG)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["cut.mcap", "whole.mcap"]
+    assert recover(whole, tmp_path / "third.mcap") == (found.length, False, "")
+
+
+def test_nothing_is_overwritten(
+    small: tuple[bytes, list[Sample]], tmp_path: Path, refused: Callable[..., InputError]
+) -> None:
+    path, old = tmp_path / "a.mcap", tmp_path / "old.mcap"
+    path.write_bytes(small[0])
+    old.write_bytes(b"precious")
+    refused(lambda: recover(path, old), str(old), "exists already", "another name")
+    refused(lambda: Recorder(old), str(old), "exists already", "another name")
+    refused(lambda: Recorder(tmp_path / "no" / "folder.mcap"), "cannot be written")
+    assert old.read_bytes() == b"precious"
+
+
+def test_a_recovery_that_fails_leaves_nothing(tmp_path: Path, refused: Callable[..., InputError]) -> None:
+    (tmp_path / "bad.mcap").write_bytes(b"not a recording")
+    refused(lambda: recover(tmp_path / "bad.mcap", tmp_path / "out.mcap"), "cannot be read as a recording")
+    assert [path.name for path in tmp_path.iterdir()] == ["bad.mcap"]
+
+
+def test_a_file_of_another_kind_is_named(tmp_path: Path, refused: Callable[..., InputError]) -> None:
+    from mcap.writer import Writer
+
+    path = tmp_path / "other.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2")
+        writer.add_message(writer.register_channel("/odom", "cdr", 0), 0, b"1234", 0)
+        writer.finish()
+    refused(
+        lambda: Recording(path), str(path), "does not say what it holds", "written by ratslam", "ROS bags"
+    )
+    Recorder(tmp_path / "none.mcap").close()
+    refused(lambda: Recording(tmp_path / "none.mcap"), "holds no samples", "at least one sample")
+
+
+def test_a_recorder_refuses_what_it_cannot_hold(tmp_path: Path, refused: Callable[..., InputError]) -> None:
+    good = _samples(1)[0]
+    path = tmp_path / "a.mcap"
+    wrong = {
+        "view: shape [1, 1, 1]; expected [2, 3, 2]": {"view": np.zeros((1, 1, 1))},
+        "label: int64 values; expected values that int32 holds": {"label": np.int64(2**40)},
+        "label: float64 values": {"label": 1.5},
+        "view: complex128 values": {"view": np.zeros(SHAPE, complex)},
+        "contact: int64 values; expected values that bool holds": {"contact": np.array([0, 1, 2, 0])},
+        "alive: shape [3]; expected [4]": {"alive": np.ones(3, bool)},
+    }
+    with Recorder(path, view_shape=SHAPE, whiskers=WHISKERS) as recorder:
+        for piece, change in wrong.items():
+            bad = good._replace(reading=good.reading._replace(**change))
+            refused(lambda bad=bad: recorder.write(bad), piece)
+        refused(lambda: recorder.write(good._replace(time=np.nan)), "time: nan")
+        refused(lambda: recorder.write(good._replace(truth=np.zeros(2))), "truth: shape [2]", "[3]")
+        recorder.write(good)
+        narrow = good.reading._replace(view=np.full(SHAPE, 0.5, np.float32), label=3)
+        recorder.write(good._replace(time=0.5, reading=narrow))
+    samples = list(Recording(path))
+    assert _same(samples[:1], [good])
+    assert samples[1].reading.label == 3
+    assert (samples[1].reading.view == 0.5).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "pieces"),
+    {
+        "backwards": ({"time": 1.0}, ["row 5", "time goes back from 2.0 to 1.0 s", "sort the rows"]),
+        "repeated": ({"time": 2.0}, ["row 5", "time repeats 2.0 s", "drop the repeated rows"]),
+        "odometry": ({"odometry": Odometry(np.nan, 0.0, 0.0, 0.5)}, ["row 5", "odometry is nan", "finite"]),
+        "negative": ({"odometry": Odometry(0.0, 0.0, 0.0, -0.5)}, ["row 5", "took -0.5 s", "0 s or more"]),
+        "view": ({"view": np.full(SHAPE, np.nan)}, ["row 5", "in the reading is nan", "finite"]),
+        "bytes": ({"view": np.full(SHAPE, 200.0)}, ["row 5", "view holds 200.0", "divide them by 255"]),
+        "point": ({"point": np.full((WHISKERS, 2), np.inf)}, ["row 5", "in the reading is inf"]),
+        "truth": ({"truth": np.full(3, np.nan)}, ["row 5", "truth is nan"]),
+    }.values(),
+)  # fmt: skip
+def test_faults_of_a_recording_are_named(
+    change: dict[str, Any], pieces: list[str], tmp_path: Path, refused: Callable[..., InputError]
+) -> None:
+    samples = _samples(10)
+    outer = {key: change[key] for key in change if key in Sample._fields}
+    inner = {key: change[key] for key in change if key not in outer}
+    bad = samples[5]
+    samples[5] = bad._replace(reading=bad.reading._replace(**inner), **outer)
+    path = _write(tmp_path / "bad.mcap", samples)
+    refused(lambda: Recording(path), str(path), *pieces)
+
+
+def test_a_file_that_changes_while_it_is_read_is_noticed(
+    small: tuple[bytes, list[Sample]], tmp_path: Path, refused: Callable[..., InputError]
+) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_bytes(small[0])
+    source = Recording(path)
+    path.write_bytes(small[0][:700])
+    refused(lambda: list(source), "had 9 samples and now has")
+
+
+def test_the_standard_reader_reads_it(small: tuple[bytes, list[Sample]], tmp_path: Path) -> None:
+    from mcap.reader import make_reader
+
+    content, samples = small
+    (tmp_path / "a.mcap").write_bytes(content)
+    with (tmp_path / "a.mcap").open("rb") as file:
+        reader = make_reader(file)
+        assert [m.metadata["view_shape"] for m in reader.iter_metadata() if m.name == "ratslam"] == ["2,3,2"]
+        found = [(schema.encoding, channel.topic) for schema, channel, _ in reader.iter_messages()]
+    topics = ("observation", "cycle", "whisk", "report", "truth")
+    assert set(found) == {("ros2msg", f"/ratslam/{name}") for name in topics}
+    assert len(found) == len(samples) + sum(sample.truth is not None for sample in samples)
+
+
+def test_ros_tools_read_the_messages() -> None:
+    pytest.importorskip("rosbags", reason="rosbags, an extra, is not installed")
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.EMPTY)
+    for name, text in SCHEMAS.items():
+        store.register(get_types_from_msg(text, name))
+    for sample in _samples(5):
+        name, message = encode(sample, SHAPE, WHISKERS)
+        read: Any = store.deserialize_cdr(message, name)
+        assert bytes(store.serialize_cdr(read, name)) == message
+        assert (read.time, read.dtheta) == (sample.time, sample.reading.odometry.dtheta)
+        if name == OBSERVATION:
+            assert (read.view.reshape(SHAPE) == sample.reading.view).all()
+            flags = sample.reading.contact + 2 * ~sample.reading.alive
+            assert (read.flags == flags).all()
+        elif name == WHISK:
+            felt = sample.reading
+            assert (
+                read.felt.reshape(WHISKERS, 3) == np.stack([felt.touched, felt.highest, felt.reach], 1)
+            ).all()
+            assert (read.flags == felt.alive + 2 * felt.contact + 4 * felt.held).all()
+        elif name == REPORT:
+            told = sample.reading
+            assert (read.motion, read.moment) == (told.motion, told.moment)
+            assert (read.strain.reshape(-1, WHISKERS, 2) == told.strain).all()
+        else:
+            assert name == CYCLE
+            assert (read.deflection.reshape(2, WHISKERS, 2) == sample.reading.deflection).all()
+        assert _same([Sample(*decode(name, message, SHAPE, WHISKERS), sample.truth)], [sample])
+
+
+def test_a_chunk_that_would_not_fit_into_memory_is_not_opened(
+    small: tuple[bytes, list[Sample]], tmp_path: Path
+) -> None:
+    """A frame header that promises 2^60 bytes; nobody allocates them."""
+    content, _ = small
+    frame = content.index(b"\x28\xb5\x2f\xfd")
+    bad = bytearray(content)
+    bad[frame + 4 : frame + 13] = b"\xe0" + struct.pack("<Q", 1 << 60)
+    path = tmp_path / "bomb.mcap"
+    path.write_bytes(bad)
+    walk = Walk(path)
+    assert list(walk) == []
+    assert "a chunk of 1152921504606846976 bytes" in walk.broken
+
+
+@given(
+    st.sampled_from(list(TOPICS)),
+    st.binary(max_size=200),
+    st.sampled_from(["2,3,2", "2,3", "0,1,1", "9999999,9999,9", "a,b,c", "-1,1,1"]),
+    st.integers(-1, 1 << 40),
+    st.sampled_from(["{}", "[]", "{", "1"]),
+)
+def test_a_valid_file_with_strange_contents_is_told_apart(
+    tmp_path_factory: Any, name: str, message: bytes, shape: str, whiskers: int, rig: str
+) -> None:
+    """Checksums in order, contents not ours."""
+    from mcap.writer import Writer
+
+    path = tmp_path_factory.getbasetemp() / "strange.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        metadata = {"format": FORMAT, "view_shape": shape, "whiskers": str(whiskers), "rate_hz": "1.0"}
+        metadata |= {"created_by": "somebody", "rig": rig}
+        writer.add_metadata("ratslam", metadata | {"crc32": _checksum(metadata)})
+        schema = writer.register_schema(name, "ros2msg", SCHEMAS[name].encode())
+        writer.add_message(writer.register_channel(TOPICS[name], "cdr", schema), 0, b"\0\1\0\0" + message, 0)
+        writer.finish()
+    with pytest.raises(InputError):
+        Recording(path)
+
+
+def test_a_file_of_another_version_is_named(
+    tmp_path: Path, refused: Callable[..., InputError], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    old = tmp_path / "old.mcap"
+    with monkeypatch.context() as patch:
+        patch.setattr("robot.walk.FORMAT", "1")
+        _write(old, _samples(3))
+    refused(lambda: Recording(old), str(old), "format '1' where '2' is the one known")
+    other = tmp_path / "other.mcap"
+    with monkeypatch.context() as patch:
+        patch.setitem(SCHEMAS, OBSERVATION, SCHEMAS[OBSERVATION] + "bool more\n")
+        _write(other, _samples(3))
+    refused(lambda: Recording(other), str(other), "/ratslam/observation", "defined otherwise than here")
+
+
+@pytest.mark.parametrize("rig", [{"a": np.nan}, {"a": object()}, {"a": np.zeros(2)}])
+def test_a_rig_that_is_no_document_is_refused_before_anything_is_written(tmp_path: Path, rig: Any) -> None:
+    with pytest.raises((ValueError, TypeError)):
+        Recorder(tmp_path / "a.mcap", rig=rig)
+    assert not (tmp_path / "a.mcap").exists()
+
+
+def test_a_rig_without_a_sample_to_it_is_not_lost(tmp_path: Path) -> None:
+    """It stands before the first sample, so a recorder killed at once leaves it."""
+    path = _write(tmp_path / "a.mcap", _samples(2))
+    content = path.read_bytes()
+    path.write_bytes(content[: content.index(b"\x28\xb5\x2f\xfd")])
+    walk = Walk(path)
+    assert list(walk) == []
+    assert walk.description is not None
+    assert walk.description.rig == RIG
+
+
+def test_what_knows_its_rig_says_so(find_trace: Callable[[str], Path], tmp_path: Path) -> None:
+    plain = read_stream(find_trace("a_square3"))
+    assert not isinstance(plain, Rigged)
+    assert rig_of(plain) == {}
+    record(plain, tmp_path / "plain.mcap")
+    assert rig_of(Recording(tmp_path / "plain.mcap")) == {}
+    _write(tmp_path / "a.mcap", _samples(5), rig={"params": {"pc_cell_x_size": 0.05}})
+    record(Recording(tmp_path / "a.mcap"), tmp_path / "b.mcap")
+    again = Recording(tmp_path / "b.mcap")
+    assert isinstance(again, Rigged)
+    assert again.params == {"pc_cell_x_size": 0.05}
+
+
+def test_a_truth_in_degrees_is_refused(tmp_path: Path, refused: Callable[..., InputError]) -> None:
+    """Recordings are judged by the same units as every other reader's (see test_units)."""
+    turning = Odometry(*(np.float64(value) for value in (0.05, 0.0, 0.3, 0.5)))
+    samples = [
+        Sample(0.5 * i, observation(turning, view_shape=SHAPE, whiskers=WHISKERS), np.array([0, 0, 17.0 * i]))
+        for i in range(40)
+    ]
+    path = _write(tmp_path / "degrees.mcap", samples)
+    refused(lambda: Recording(path), str(path), "the truth's heading runs from 0 to 663", "pi/180")

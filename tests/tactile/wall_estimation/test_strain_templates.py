@@ -1,0 +1,185 @@
+"""Strain templates of made-up walls: filtered causally, trained, kept, found again, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tactile.base.errors import InputError
+from tactile.base.random_streams import stream
+from tactile.wall_estimation.strain_templates import (
+    Drive,
+    StrainTemplates,
+    TemplateTraining,
+    load,
+    matched,
+    save,
+    smoothed,
+    train,
+)
+from tests.helpers.flat_walls import RATE, apart, wall
+
+TRAINING = TemplateTraining()
+
+
+def drives() -> list[Drive]:
+    random = stream(0, "training")
+    return [
+        Drive(float(angle), k, wall(float(angle), random), RATE)
+        for angle in TRAINING.angles
+        for k in range(TRAINING.repeats)
+    ]
+
+
+DRIVES = drives()
+
+
+@pytest.fixture(scope="module")
+def templates() -> StrainTemplates:
+    return train(DRIVES)
+
+
+def test_the_papers_fifteen_angles(templates: StrainTemplates) -> None:
+    np.testing.assert_allclose(np.degrees(templates.angle), np.arange(20, 161, 10))
+    assert templates.mean.shape == (15, 4000, 4, 2)
+    # What is told of the noise is that of one filtered drive, not of the mean of four.
+    quiet = np.std(smoothed(TRAINING, 4e-6 * stream(1, "noise").standard_normal((4000, 4, 2)))[400:])
+    np.testing.assert_allclose(np.median(templates.spread), quiet, rtol=0.08)
+
+
+@given(st.integers(0, 99), st.integers(1, 3999))
+def test_the_filter_looks_back_only_and_forgets_no_sample(seed: int, cut: int) -> None:
+    strain = stream(seed, "strain").standard_normal((4000, 2))
+    whole = smoothed(TRAINING, strain)
+    np.testing.assert_allclose(smoothed(TRAINING, strain[:cut]), whole[:cut], atol=1e-12)
+    later = strain.copy()
+    later[cut:] += 1.0
+    assert np.array_equal(smoothed(TRAINING, later)[:cut], whole[:cut])
+    assert (smoothed(TRAINING, later)[-1] != whole[-1]).any()
+
+
+@given(st.floats(-1, 1), st.integers(1, 100))
+def test_the_filter_starts_settled(level: float, count: int) -> None:
+    np.testing.assert_allclose(smoothed(TRAINING, np.full((count, 4, 2), level)), level, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("frequency", "least", "most"), [(2.0, 0.95, 1.01), (17.0, 0.65, 0.75), (60, 0, 0.1)]
+)
+def test_the_filter_passes_what_is_slower_than_seventeen_hertz(
+    frequency: float, least: float, most: float
+) -> None:
+    wave = np.sin(2 * np.pi * frequency * np.arange(8000) / RATE)
+    assert least < np.abs(smoothed(TRAINING, wave)[4000:]).max() < most
+
+
+def test_every_drive_is_of_its_own_template(templates: StrainTemplates) -> None:
+    random = stream(5, "held out")
+    for k, angle in enumerate(templates.angle):
+        read = smoothed(TRAINING, wall(float(angle), random))
+        match = matched(templates, read[:1600])
+        assert match.winner == k
+        assert match.angle == angle
+        assert match.relative < 0.03
+        # Eq. 5: a mean over the samples so far of the sum over channels.
+        by_hand = [((read[:1600] - mean[:1600]) ** 2).sum() / 1600 for mean in templates.mean]
+        np.testing.assert_allclose(match.error, by_hand)
+
+
+def test_the_parabola_is_nearer_than_the_winner(templates: StrainTemplates) -> None:
+    raw, refined = [], []
+    for angle in np.radians([63.0, 67.0, 83.0, 97.0, 117.0, 122.0]):
+        match = matched(templates, smoothed(TRAINING, wall(float(angle)))[:1600])
+        raw.append(apart(match.angle, float(angle)))
+        refined.append(apart(match.refined, float(angle)))
+        assert abs(match.refined - match.angle) <= np.radians(TRAINING.step_deg)
+    assert np.mean(refined) < np.mean(raw)
+
+
+def test_whiskers_that_do_not_report_are_left_out(templates: StrainTemplates) -> None:
+    read = smoothed(TRAINING, wall(np.radians(110.0)))[:1600]
+    broken = read.copy()
+    broken[:, 3] = 1.0
+    use = np.array([True, True, True, False])
+    assert matched(templates, broken, use).error.tolist() == matched(templates, read, use).error.tolist()
+    assert matched(templates, broken).relative > 0.5
+    with pytest.raises(ValueError, match="whiskers"):
+        matched(templates, read, np.zeros(4, bool))
+
+
+def test_a_file_gives_back_what_was_kept(templates: StrainTemplates, tmp_path: Path) -> None:
+    path = tmp_path / "templates.npz"
+    save(templates, path)
+    again = load(path)
+    assert again.training == templates.training
+    for name in ("angle", "mean", "spread"):
+        assert np.array_equal(getattr(again, name), getattr(templates, name))
+
+
+def _other_version(path: Path) -> None:
+    np.savez(path, strain_templates=99, training="{}", angle=[0.0], mean=[0.0], spread=[0.0])
+
+
+def _plain_array(path: Path) -> None:
+    with path.open("wb") as file:
+        np.save(file, np.zeros(3))
+
+
+def _cut(path: Path) -> None:
+    save(train(DRIVES), path)
+    path.write_bytes(path.read_bytes()[:9999])
+
+
+def _unfit(path: Path) -> None:
+    kept = train(DRIVES)
+    save(kept._replace(mean=kept.mean[:14]), path)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda path: None,
+        lambda path: path.write_bytes(b""),
+        lambda path: path.write_text("not a file of templates"),
+        lambda path: np.savez(path, other=np.zeros(3)),
+        _plain_array,
+        lambda path: path.mkdir(),
+        _other_version,
+        _cut,
+        _unfit,
+    ],
+)
+def test_any_other_file_is_one_clear_error(make: object, tmp_path: Path) -> None:
+    path = tmp_path / "wrong.npz"
+    make(path)  # type: ignore[operator]
+    with pytest.raises(InputError, match=r"wrong\.npz: no .*train-templates"):
+        load(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda kept: [], "no drives"),
+        (lambda kept: kept[1:], "too few drives: 3 at 20 degrees; expected 4"),
+        (lambda kept: [one for one in kept if one.repeat or one.angle < 2], "3 at 120 degrees, 3 at 130"),
+        (lambda kept: kept[4:], "0 at 20 degrees"),
+        (lambda kept: [kept[0]._replace(rate=1000.0), *kept[1:]], r"1000 samples per second; expected 2000"),
+        (lambda kept: [kept[0]._replace(strain=kept[0].strain[:3800]), *kept[1:]], r"drive 0 at 20.*1\.9 s"),
+        (lambda kept: [kept[0]._replace(strain=kept[0].strain * np.nan), *kept[1:]], "without a value"),
+        (lambda kept: [*kept, kept[0]._replace(angle=0.4)], "none of the angles"),
+        (lambda kept: [*kept, kept[0]._replace(strain=kept[0].strain[:, :3])], r"\(4000, 3, 2\)"),
+    ],
+)
+def test_unfit_drives_are_refused(change: object, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        train(change(DRIVES))  # type: ignore[operator]
+
+
+def test_unsound_settings_are_refused() -> None:
+    for unsound in ({"repeats": 1}, {"cutoff": 1000.0}, {"first_deg": 90.0, "last_deg": 80.0}):
+        with pytest.raises(ValueError, match=next(iter(unsound))):
+            TemplateTraining(**unsound)
