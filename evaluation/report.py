@@ -31,7 +31,7 @@ def save_map(
     walls: np.ndarray = NO_WALLS,
     closures: np.ndarray = NO_CLOSURES,
 ) -> None:
-    """Writes `evaluation.mappicture.draw_map` to a file; the same run gives the same bytes."""
+    """Writes `evaluation.plots.map_plot.draw_map` to a file; the same run gives the same bytes."""
     draw_map(run, card, walls, closures).savefig(path)
 
 

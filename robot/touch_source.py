@@ -13,7 +13,7 @@ from robot.simulation.create.template_training import trained
 from robot.sources.source import Rigged, Sample, Source, rig_of
 from tactile.base.errors import InputError
 from tactile.base.types import Observation
-from tactile.features.calibration import Calibration, arrays, from_arrays
+from tactile.features.calibration import Calibration, from_arrays
 from tactile.frontend import Frontend, TouchConfig
 from tactile.wall_estimation.report_frontend import Reporting, ReportsConfig
 from tactile.wall_estimation.strain_templates import StrainTemplates
@@ -97,17 +97,6 @@ def sensing(source: Source, config: TouchConfig) -> Source:
         return Sensing(source, lambda: Reporting(reports, templates), "touch.reports.mounts")
     frontend = Frontend(config, calibration_of(source))
     return Sensing(source, lambda: frontend, "touch.head")
-
-
-def kept(calibration: Calibration) -> dict[str, Any]:
-    """A calibration as JSON can hold it; what is infinite as text."""
-    return {name: _plain(array.tolist()) for name, array in arrays(calibration).items()}
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, list):
-        return [_plain(part) for part in value]
-    return value if isinstance(value, bool) or np.isfinite(value) else str(value)
 
 
 def calibration_of(source: Source) -> Calibration | None:

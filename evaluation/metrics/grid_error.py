@@ -67,7 +67,7 @@ class GridError(Settings):
 
 
 def grid_error(grid: Grid, truth: Truth, felt: Surface, convention: Convention = HEADLINE) -> GridError:
-    """The error of one map. `felt` is `evaluation.grid.surface(grid, truth)`."""
+    """The error of one map. `felt` is `evaluation.metrics.occupancy_grid.surface(grid, truth)`."""
     true = painted(truth, felt.wall, convention.outside)
     true = smoothed(true) if convention.smooth else true
     cells = truth.inside | felt.wall if convention.mask == "arena" else np.ones_like(truth.inside)

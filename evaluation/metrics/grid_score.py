@@ -57,7 +57,7 @@ class GridScore(Settings):
     trials: int = 1
     """So many maps; every value is the mean of theirs."""
     errors: tuple[GridError, ...]
-    """Equation 6, in the order of `evaluation.griderror.CONVENTIONS`."""
+    """Equation 6, in the order of `evaluation.metrics.grid_error.CONVENTIONS`."""
     quantities: dict[str, Quantity]
     """In the order of the table; a value is None where there is none, with a reason."""
 

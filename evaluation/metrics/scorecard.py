@@ -143,7 +143,8 @@ def score(
 
 
 def score_log(log: Log, name: str = "log", *, exm: ExmConfig = DEFAULT) -> Scorecard:
-    """The Experience Metric, in all modes, of any SLAM system's log (`evaluation.log.read_log`)."""
+    """The Experience Metric, in all modes, of any SLAM system's log
+    (`evaluation.metrics.experience_log.read_log`)."""
     findings = {
         "steps": _Found(len(log.time)),
         "duration": _Found(float(log.time[-1] - log.time[0])),

@@ -48,5 +48,5 @@ def relax(
 
 
 def _wrap(angle: float) -> float:
-    # As `tactile.frames.wrap`, but exact for angles in range already: sweeps must not add up rounding.
+    # As `tactile.base.se2.wrap`, but exact for angles in range already: sweeps must not add up rounding.
     return angle if -pi < angle <= pi else pi - (pi - angle) % (2 * pi)

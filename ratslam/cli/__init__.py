@@ -44,6 +44,6 @@ def _parser() -> argparse.ArgumentParser:
         added.set_defaults(command=does)
         return added
 
-    for group in (sessions, live, many, sweeps, frontier, touch, arena, watch):
+    for group in (run, live, ablation, studies, pareto, reproduce, create, watch):
         group.add(command)
     return parser

@@ -19,7 +19,7 @@ from tactile.whiskers.planar_whiskers import Feelers
 
 
 class GridMap:
-    """Folds what the grid filter reports (`ratslam.backend.Map`).
+    """Folds what the grid filter reports (`ratslam.core.backend.Map`).
 
     Args:
         feelers: the whiskers of the observations. side: of the map, cells.

@@ -67,7 +67,7 @@ HALT = Travel(np.zeros(3), 0.0, 0.0)
 
 
 class FrameMap:
-    """Folds what the unified filter reports (`ratslam.backend.Map`).
+    """Folds what the unified filter reports (`ratslam.core.backend.Map`).
 
     Args:
         cell: size of a pose cell, m. looks: empty appearances of frames. guard: newest frames that are never

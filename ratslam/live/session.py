@@ -27,11 +27,10 @@ from robot.live.selftest import reported, room, started
 from robot.live.whisk_loop import Handed, drive, free_whisks, go
 from robot.recordings.formats import RecordingConfig
 from robot.simulation.head.session import CELL_SIZE
-from robot.touch_source import kept
 from robot.world.head_trajectory import Path as Way
 from robot.world.maze import text
 from tactile.base.errors import InputError
-from tactile.features.calibration import Calibration, calibrated
+from tactile.features.calibration import Calibration, calibrated, to_json
 from tactile.features.whisker_image import view_shape
 from tactile.whiskers.head_geometry import ur10_head
 
@@ -71,7 +70,8 @@ def live(
 
     Args:
         folder: of the configuration file. directory: the new run directory. tell: is told a line at a time.
-        mapping: what the mapper's process does; None: `ratslam.live.mapper.mapping`. armed: is told the
+        mapping: what the mapper's process does; None: `ratslam.live.mapper_process.mapping`. armed: is
+        told the
             directory when the session begins.
 
     Returns:
@@ -129,7 +129,7 @@ def ordered(config: RunConfig, path: Way, calibration: Calibration, directory: P
         {
             "head": config.touch.head.model_dump(mode="json"),
             "live": config.live.model_dump(mode="json", exclude={"plan": {"maze": {"file"}}}),
-            "calibration": kept(calibration),
+            "calibration": to_json(calibration),
             "params": {"pc_cell_x_size": CELL_SIZE},
         }
         | ({} if config.live.waypoints else {"maze": text(world(config.live.plan, head).maze)}),

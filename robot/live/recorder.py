@@ -35,7 +35,7 @@ class Journal:
     `fault` alone: from then on everything is passed over, and the recording stays readable up to there.
 
     Args:
-        path: must not exist yet. view_shape, whiskers, rate_hz, rig: see `robot.tape.Tape`.
+        path: must not exist yet. view_shape, whiskers, rate_hz, rig: see `robot.recordings.mcap_writer.Tape`.
 
     Attributes:
         fault: why nothing is written any more; None while it is.
@@ -75,7 +75,7 @@ class Journal:
                 self._waited(arrival)
 
     def arm(self, states: np.ndarray) -> None:
-        """What the arm sent: states [N] (`robot.ur10.states.STATE`), oldest first."""
+        """What the arm sent: states [N] (`robot.drivers.ur10.shared_state.STATE`), oldest first."""
         if not len(states):
             return
         newest = float(states["host"][-1])

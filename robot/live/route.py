@@ -18,7 +18,7 @@ from tactile.whiskers.head_geometry import Head
 
 
 class Moves(Protocol):
-    """The part of `robot.ur10.arm.Arm` that a route needs."""
+    """The part of `robot.drivers.ur10.arm.Arm` that a route needs."""
 
     def move(self, tcp: np.ndarray, speed: float | None = None) -> object: ...
     def arrived(self) -> bool: ...

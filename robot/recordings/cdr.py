@@ -1,6 +1,7 @@
 """How a sample is written down: ROS 2 messages in little-endian CDR, which any ROS 2 or MCAP tool can read.
 
-A message is four bytes (00 01 00 00) and the fields of its schema (`robot.recordings.schemas`) back to back; an
+A message is four bytes (00 01 00 00) and the fields of its schema (`robot.recordings.schemas`) back to
+back; an
 unbounded array is preceded by its length (uint32). float64 is kept bit for bit.
 """
 

@@ -1,6 +1,7 @@
 """How a live session is written down: blocks of frames and of arm states, cuts, events.
 
-Messages as in `robot.recordings.cdr`. Frames lie channel by channel, as differences from frame to frame: small
+Messages as in `robot.recordings.cdr`. Frames lie channel by channel, as differences from frame to frame:
+small
 numbers, of which compression leaves little.
 """
 
@@ -78,7 +79,7 @@ def decode_frames(message: bytes, whiskers: int) -> tuple[float, Frames]:
 
 
 def encode_states(states: np.ndarray) -> bytes:
-    """A block of arm states [N] (`robot.ur10.states.STATE`), at least one."""
+    """A block of arm states [N] (`robot.drivers.ur10.shared_state.STATE`), at least one."""
     count = len(states)
     numbers = np.concatenate([states[name].reshape(count, -1) for name in NUMBERS], axis=1)
     words = np.stack([states[name].astype("<i4") for name in WORDS])

@@ -35,7 +35,7 @@ class Description(NamedTuple):
     Attributes:
         view_shape: (R, C, K). whiskers: W. rate_hz: as announced by who recorded it, 0 if unknown.
         created_by: program and version.
-        rig: a JSON document about the robot that was recorded (see `robot.source.Rigged`).
+        rig: a JSON document about the robot that was recorded (see `robot.sources.source.Rigged`).
     """
 
     view_shape: tuple[int, int, int]

@@ -33,7 +33,8 @@ class Tape:
     Args:
         path: must not exist yet.
         view_shape, whiskers: of every sample. rate_hz: how fast they come, if known; for readers' eyes only.
-        rig: by what the samples were made (see `robot.source.Rigged`): what JSON can hold. It stands at the
+        rig: by what the samples were made (see `robot.sources.source.Rigged`): what JSON can hold. It
+        stands at the
             start of the file, so one that is cut off still has it.
         chunk_bytes: a chunk is written when it is so large, before compression,
         chunk_s: or when its last message's time is so many seconds off the last one's of the chunk before.

@@ -23,7 +23,7 @@ class Made(ABC):
     """The part of a `Source` that every simulated session of N rows has; its simulator is the rest.
 
     Attributes:
-        time: [N] s. truth: [N, 3] m, m, rad. odometry: [N, 4] of each row, as `tactile.types.Odometry`.
+        time: [N] s. truth: [N, 3] m, m, rad. odometry: [N, 4] of each row, as `tactile.base.types.Odometry`.
     """
 
     whisked = True

@@ -7,7 +7,7 @@ so many standard deviations (Salman & Pearson 2016, III-E: twenty).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from pydantic import Field, PositiveFloat
@@ -130,6 +130,17 @@ def sample_rate(time: np.ndarray, slope_window: float, where: str) -> float:
 def arrays(calibration: Calibration) -> dict[str, np.ndarray]:
     """As plain arrays by name, to be kept with a session."""
     return {name: np.asarray(value) for name, value in calibration._asdict().items()}
+
+
+def to_json(calibration: Calibration) -> dict[str, Any]:
+    """The calibration as a JSON document; infinite values are written as text."""
+    return {name: _plain(array.tolist()) for name, array in arrays(calibration).items()}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_plain(part) for part in value]
+    return value if isinstance(value, bool) or np.isfinite(value) else str(value)
 
 
 def from_arrays(kept: Mapping[str, np.ndarray], where: str = "calibration") -> Calibration:

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from ratslam.classic.experience_map import ExperienceConfig, ExperienceMap
 from ratslam.core.types import Action, Estimate
-from ratslam.pose_graph import Edges, Ending, least_squares, linear_init
+from ratslam.pose_graph import Edges, Ending, least_squares, linear
 from tactile.base.se2 import between, integrate, wrap
 from tactile.base.types import Odometry, observation
 
@@ -169,7 +169,7 @@ def test_steps_without_a_closure(benchmark, size, monkeypatch):
     nodes = size(10_000)
     _, edges = measured("city", nodes)
     solves = []
-    monkeypatch.setattr("ratslam.experience.least_squares", lambda *a, **k: solves.append(1))
+    monkeypatch.setattr("ratslam.classic.experience_map.least_squares", lambda *a, **k: solves.append(1))
     fold(world, edges.motion[: nodes - 1])
     took, _ = timed(lambda: fold(world, edges.motion[:1000], start=nodes), 1)
     print(f"\na step without a closure: {took * 1e3:.1f} us")
@@ -196,7 +196,7 @@ def integrated(edges, count):
 
 
 def sweep(poses, edges, loops):
-    """`ratslam.relaxation.relax`, compiled: in the place of the classic C++."""
+    """`ratslam.classic.relaxation.relax`, compiled: in the place of the classic C++."""
     columns = [np.ascontiguousarray(column) for column in (*poses.T, edges.i, edges.j, *edges.motion.T)]
     compiled()(*columns, loops)
     return np.stack(columns[:3], axis=1)

@@ -21,7 +21,7 @@ from ratslam.pipeline.runner import readings, session_of
 from robot.touch_source import sensing
 from tactile.base.types import Observation
 
-FOLDER = Path(__file__).parent / "golden"
+FOLDER = Path(__file__).parent
 SESSIONS = ("touch_circuits", "touch_kidnap")
 
 

@@ -160,7 +160,7 @@ def compared(config: TemplateConfig, log: Log) -> Likeness:
 
 def differences(config: TemplateConfig, views: np.ndarray, others: np.ndarray) -> np.ndarray:
     """[N, M] mean absolute difference of views [N, R, C, K] from others [M, R, C, K], over all shifts that
-    the matcher tries the least (`ratslam.templates.match_view`)."""
+    the matcher tries the least (`ratslam.classic.view_templates.match_view`)."""
     columns = views.shape[2]
     if config.panoramic:
         shifted = [np.roll(others, -o, axis=2) for o in range(0, columns, config.shift_step)]

@@ -126,7 +126,7 @@ def _run(
     final: np.ndarray,
     places: list[int],
 ) -> Run:
-    """The session as arrays, as `evaluation.rundirectory.read_run` reads one from its files."""
+    """The session as arrays, as `evaluation.artifacts.run_directory.read_run` reads one from its files."""
     graph = session.map.graph()
     nodes = np.array([[row["x"], row["y"], row["heading"]] for _, row in sorted(graph.nodes(data=True))])
     nodes = nodes.reshape(-1, 3)

@@ -50,7 +50,7 @@ class Stopwatch:
         self._finishing += perf_counter() - began
 
     def told(self) -> dict[str, Any]:
-        """As `ratslam.sweeps.results.Timing` has it."""
+        """As `ratslam.experiments.studies.results.Timing` has it."""
         each = np.array([seconds / steps for steps, seconds in self._taken])
         usual = float(np.median(each)) if len(each) else None
         extra = sum(seconds - steps * (usual or 0.0) for steps, seconds in self._compiling)

@@ -30,7 +30,8 @@ def tune(
     """Tries as many sets of parameters as the study asks for, with those of earlier calls in this directory.
 
     Args:
-        directory, workers, scheduler: see `ratslam.sweeps.pool.results`. done: told of each run; None if it
+        directory, workers, scheduler: see `ratslam.experiments.studies.executor.results`. done: told of
+        each run; None if it
             is of a trial that was known before.
 
     Raises:

@@ -1,6 +1,7 @@
 """How two runs of the pose cells part that differ by next to nothing.
 
-    python -m ratslam.experiments.tables.chaos [--steps 100000] [--walks 3] [--pairs one-cell ...] [--motions drive]
+    python -m ratslam.experiments.tables.chaos [--steps 100000] [--walks 3] [--pairs one-cell ...]
+    [--motions drive]
 
 Each pair of runs is given the same motion and no views: `random`, half a cell and half a heading cell a step
 along each axis, or `drive`, a cell ahead and half a heading cell of turns. Printed is the largest difference
@@ -92,7 +93,8 @@ def _walk(config: PoseCellConfig, cells: PoseCells, motion: Any) -> tuple[PoseCe
     nowhere, nothing = jnp.zeros(3, dtype), jnp.zeros((), dtype)
 
     def step(cells: PoseCells, moved: Any) -> tuple[PoseCells, Any]:
-        odometry = Odometry(*(moved * unit), jnp.ones((), dtype))
+        dx, dy, dtheta = moved * unit
+        odometry = Odometry(dx, dy, dtheta, jnp.ones((), dtype))
         cells, _ = pose_cells.step(config, rungs, cells, odometry, nowhere, nothing)
         return cells, cells.pose
 
@@ -102,7 +104,7 @@ def _walk(config: PoseCellConfig, cells: PoseCells, motion: Any) -> tuple[PoseCe
 def walk(number: int, steps: int, motion: str = "random") -> np.ndarray:
     """[T, 3] motion, cells."""
     mean, deviation = MOTIONS[motion]
-    return stream(number, "ratslam.experiments.tables.chaos").normal(mean, deviation, (steps, 3))
+    return stream(number, "tests.chaos").normal(mean, deviation, (steps, 3))
 
 
 def main() -> None:

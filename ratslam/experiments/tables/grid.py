@@ -138,11 +138,12 @@ def _chart(session: Any, source: Any) -> tuple[float, ...]:
     grid = Grid(chart.occupancy(), corner, chart.config.cell)
     found = score_grid(grid, truth_of(source.arena, grid)).quantities
     names = ("map_auc", "map_brier_skill", "map_brier_skill_free", "map_chamfer_map", "map_chamfer_walls")
-    return tuple(float(np.nan if found[name].value is None else found[name].value) for name in names)
+    values = [found[name].value for name in names]
+    return tuple(np.nan if value is None else float(value) for value in values)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])  # type: ignore[union-attr]
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--arenas", type=int, default=10)
     parser.add_argument("--first", type=int, default=FIRST_ARENA)
     parser.add_argument("--workers", type=int, default=os.cpu_count())

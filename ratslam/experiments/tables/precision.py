@@ -105,9 +105,7 @@ def sessions(task: Task) -> dict[str, Figures]:
     simulation = SESSION | {"seed": task.seed, "maze": {"seed": task.seed}}
     given = {"simulation": simulation, "session": {"reserve": RESERVE}} | MATCHERS[task.matcher]
     config, log = session_log(RunConfig.model_validate(given))
-    off = 1 + ROUNDING * stream(task.seed, "ratslam.experiments.tables.precision").uniform(
-        -1, 1, (log.length, 3)
-    )
+    off = 1 + ROUNDING * stream(task.seed, "tests.precision").uniform(-1, 1, (log.length, 3))
     rounded = replace(log, motion=np.column_stack([log.motion[:, :3] * off, log.motion[:, 3]]))
     told: dict[str, Figures] = {}
     places = np.zeros(0)
@@ -205,7 +203,7 @@ def main() -> None:
     for matcher in given.matchers:
         found = measured(range(FIRST_SEED, FIRST_SEED + given.seeds), matcher, given.workers)
         if given.output is not None:
-            np.savez(given.output / f"{matcher}.npz", **found)
+            np.savez(given.output / f"{matcher}.npz", allow_pickle=True, **found)
         print("\n".join(lines(matcher, found)), flush=True)
 
 

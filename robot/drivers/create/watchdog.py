@@ -1,6 +1,7 @@
 """A process that stops the wheels when the one that drives has died or hangs: the Create has no watchdog.
 
-`python -m robot.drivers.create.watchdog PORT PATIENCE` is started by the driver and hears a beat, any byte, from it on
+`python -m robot.drivers.create.watchdog PORT PATIENCE` is started by the driver and hears a beat, any
+byte, from it on
 standard input. Without one for PATIENCE s, or with the end of the input, it stops the wheels. A `q` ends it.
 """
 

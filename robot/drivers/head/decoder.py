@@ -25,10 +25,11 @@ class Frames(NamedTuple):
     """Samples of a head, in the order in which they came.
 
     Attributes:
-        sequence: [N] int64 number, no two alike; modulo 2^32 what the head sent (`robot.drivers.head.sequence_numbers`).
+        sequence: [N] int64 number, no two alike; modulo 2^32 what the head sent
+        (`robot.drivers.head.sequence_numbers`).
         time: [N] int64 device time, us; modulo 2^32 what the head sent, and within 35 minutes of the sample
             before.
-        flags: [N] uint8 `robot.head.wire.Flag`. values: [N, W, C] int16 counts of theta, x and y.
+        flags: [N] uint8 `robot.drivers.head.protocol.Flag`. values: [N, W, C] int16 counts of theta, x and y.
     """
 
     sequence: np.ndarray

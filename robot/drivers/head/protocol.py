@@ -1,7 +1,7 @@
 """What goes over a whisker head's wire: frames from it, commands to it, and the requests beside them.
 
 All numbers are little-endian, angles int16 counts of `ANGLE`. The bridges of published heads (BIOTACT) are
-not documented, so this format is our own: another bridge brings another `robot.head.decoder.Decodes`.
+not documented, so this format is our own: another bridge brings another `robot.drivers.head.decoder.Decodes`.
 
 A frame, 20 + 2 n c bytes, 128 for 18 whiskers of 3 channels; each sample of the head is one:
 

@@ -62,7 +62,8 @@ class Reader:
 
     Args:
         connect: opens the bridge; called again whenever the head has gone. whiskers: that it must have.
-        config: when it counts as lost. decoder: of its stream; None for that of `robot.drivers.head.protocol`.
+        config: when it counts as lost. decoder: of its stream; None for that of
+        `robot.drivers.head.protocol`.
         alive: [W] whose overload counts; None for all. on_overload: told the whisker with every block of
             samples that shows one.
 
@@ -133,7 +134,8 @@ class Reader:
         self._outbox.put(command)
 
     def rest(self) -> None:
-        """Lets the head go to rest, within `robot.head.wire.SILENCE`: it is no longer kept awake."""
+        """Lets the head go to rest, within `robot.drivers.head.protocol.SILENCE`: it is no longer kept
+        awake."""
         self._outbox.rest()
 
     @property

@@ -46,7 +46,8 @@ def commands(
 
 
 class HostRcp:
-    """The feedback on the host: `tactile.whisking.command` on the samples that come, a block at a time.
+    """The feedback on the host: `tactile.whiskers.whisking.command` on the samples that come, a block at a
+    time.
 
     Args:
         shape: rows and columns of the head. threshold, centre: [W] of y, rad.
@@ -112,7 +113,8 @@ class HeadDriver:
         """Whisks so from the next cycle on; without a threshold (before the calibration) nothing is fed back.
 
         Args:
-            threshold, centre: [W] of y, rad, as `tactile.calibration.Calibration` has them in column 1.
+            threshold, centre: [W] of y, rad, as `tactile.features.calibration.Calibration` has them in
+            column 1.
 
         Raises:
             InputError: the drives cannot do it, or the head does not know the mode.

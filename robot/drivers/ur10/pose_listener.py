@@ -17,7 +17,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from robot.drivers.ur10 import rtde_protocol
-from robot.emulators.ur10.config import RTDE_PORT
+from robot.drivers.ur10.rtde_protocol import RTDE_PORT
 
 _FIELDS = ("timestamp", "actual_TCP_pose", "actual_TCP_speed")
 

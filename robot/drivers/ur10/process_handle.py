@@ -20,7 +20,8 @@ HUNG_UP = ("closed the connection", "Connection reset", "Connection refused", "E
 
 
 class Process:
-    """A running `robot.drivers.ur10.rtde_process`. Its end of the pipes closes with this process, however that ends."""
+    """A running `robot.drivers.ur10.rtde_process`. Its end of the pipes closes with this process, however
+    that ends."""
 
     def __init__(self, board: str, config: ArmConfig) -> None:
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115

@@ -26,7 +26,7 @@ class Place(Protocol):
 
 
 class Told(Protocol):
-    """An arm's newest state: `robot.emulators.ur10.poses.PoseStream`."""
+    """An arm's newest state: `robot.drivers.ur10.pose_listener.PoseStream`."""
 
     def latest(self) -> tuple[float, np.ndarray, np.ndarray] | None:
         """Host's time of receipt (s), tool pose [6] and its speed [6]; None before the first."""

@@ -94,7 +94,8 @@ class Server:
                 await asyncio.sleep(self.bridge.due - time.monotonic())
 
     async def usb(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """A connection of `robot.drivers.head.usb_tcp_protocol`; it belongs to the device as plugged in when it began."""
+        """A connection of `robot.drivers.head.usb_tcp_protocol`; it belongs to the device as plugged in
+        when it began."""
         plugs = self.bridge.faults.plugs
         try:
             while True:

@@ -118,7 +118,7 @@ class Drives:
         return balance
 
     def law(self, drive: Drive, time: float, told: np.ndarray) -> tuple[np.ndarray, Drive]:
-        """A `robot.quasistatic.Law`; time since the whisk or the retraction began."""
+        """A `robot.simulation.head.quasistatic.Law`; time since the whisk or the retraction began."""
         if self.whisk is None:
             share = 0.0 if self._from is None else max(1 - time / RETRACTION, 0.0)
             return np.zeros_like(told) + (0.0 if self._from is None else self._from * share), drive

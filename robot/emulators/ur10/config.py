@@ -8,7 +8,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from tactile.base.config import Settings
 
-RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999  # fixed: the client library knows no others
+SCRIPT_PORT, DASHBOARD_PORT = 30003, 29999  # fixed: the client library knows no others
 FAULT_PORT = 30098
 
 Vector6 = tuple[float, float, float, float, float, float]

@@ -15,10 +15,10 @@ from collections.abc import Callable
 from typing import Protocol
 
 from robot.drivers.process_priority import URGENT, ranked
+from robot.drivers.ur10.rtde_protocol import RTDE_PORT
 from robot.emulators.ur10.config import (
     DASHBOARD_PORT,
     FAULT_PORT,
-    RTDE_PORT,
     SCRIPT_PORT,
     UrEmulatorConfig,
 )

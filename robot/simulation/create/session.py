@@ -68,7 +68,7 @@ class Rover(Made):
     Attributes:
         config: what it was made from. arena: where it is. fan: its whiskers. steps: [N] what it did.
         time: [N] s, at the end of each step. truth: [N, 3] then. odometry: [N, 4] of each.
-        rig: what a recording of it keeps (see `robot.source.Rigged`).
+        rig: what a recording of it keeps (see `robot.sources.source.Rigged`).
     """
 
     name = "roving"

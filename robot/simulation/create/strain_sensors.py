@@ -1,6 +1,7 @@
 """Fixed whiskers of the Create and what their sensors read (Fox et al. 2012, II-A).
 
-Each whisker has two channels: horizontal strain at its base, from bending (`robot.simulation.create.whisker_bending`), its sign telling
+Each whisker has two channels: horizontal strain at its base, from bending
+(`robot.simulation.create.whisker_bending`), its sign telling
 the side; and vertical strain. A wall moved against level whiskers would not bend them up or down, but they
 droop a little, so what pushes along the shaft bends them down, and sensor axes are never quite level, so some
 of the horizontal strain shows there too. Sensors add noise, and the body shakes: as it starts moving and,

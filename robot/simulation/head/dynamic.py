@@ -1,6 +1,7 @@
 """The dynamic tier: drives with inertia, whiskers that vibrate in two bending modes, walls that push back.
 
-Each whisker is a linear system of six states, its angle and the two loads of `robot.mechanics.Beam` with
+Each whisker is a linear system of six states, its angle and the two loads of
+`robot.simulation.head.beam.Beam` with
 their rates, driven by the command, which is linear between samples, and by the force of the wall, which is
 held: one matrix exponential carries it exactly. The wall is a stiff spring whose force is taken at the end of
 the sample, which keeps it stable at any stiffness:
@@ -31,7 +32,7 @@ def dynamic(
     sweep: Sweep,
     threshold: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Angle, x and y, [T, N, W] rad: a `robot.sweep.Tier`."""
+    """Angle, x and y, [T, N, W] rad: a `robot.simulation.head.whisk_stream.Tier`."""
     model = beam(config.beam.shaft)
     step, push = _systems(config, mechanics, head, model)  # [W, 6, 8], [W, 6, 3]
     # How far along its way the point of contact goes with each of the first three states.

@@ -23,7 +23,7 @@ from tactile.whiskers.whisking import Drive, WhiskingConfig, command, still
 
 Law = Callable[[Drive, float, np.ndarray], tuple[np.ndarray, Drive]]
 """From drives, the time in the cycle (s) and the newest y [N, W] as sensors report it, to the protractions
-commanded [N, W] and the drives after it: `tactile.whisking.command`, say."""
+commanded [N, W] and the drives after it: `tactile.whiskers.whisking.command`, say."""
 
 
 class Balance(NamedTuple):
@@ -92,7 +92,7 @@ def quasistatic(
     sweep: Sweep,
     threshold: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Angle, x and y, [T, N, W] rad: a `robot.sweep.Tier`."""
+    """Angle, x and y, [T, N, W] rad: a `robot.simulation.head.whisk_stream.Tier`."""
     law = partial(_law, whisking, threshold, head.shape)
     return advance(config, mechanics, law, sweep, rest(*sweep.wall.shape[1:]))[0]
 

@@ -20,7 +20,6 @@ from robot.simulation.head.quasistatic import quasistatic
 from robot.simulation.head.whisk_stream import cycles, free_cycles
 from robot.sources.odometry import OdometryConfig, reckoned
 from robot.sources.simulated import STILL, Made, document_digest, placed
-from robot.touch_source import kept
 from robot.world.head_trajectory import MotionConfig, at
 from robot.world.maze import text
 from robot.world.scene import KidnapConfig, MazeConfig, PathConfig, another, scene
@@ -29,7 +28,7 @@ from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.types import Cycle, Whisk
-from tactile.features.calibration import Calibration, CalibrationConfig, calibrated
+from tactile.features.calibration import Calibration, CalibrationConfig, calibrated, to_json
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 from tactile.whiskers.whisking import WhiskingConfig, checked
 
@@ -112,7 +111,7 @@ class Simulation(Made):
         scene: maze, path and walls. calibration: of the head, None in the kinematic tier.
         time: [N] s. start: [N] s, when the whisk cycles began.
         truth: [N, 3]. odometry: [N, 4]. carried: [N] bool, the head was carried since the row before.
-        rig: what a recording of it keeps (see `robot.source.Rigged`).
+        rig: what a recording of it keeps (see `robot.sources.source.Rigged`).
     """
 
     name = "simulation"
@@ -153,7 +152,7 @@ class Simulation(Made):
             "params": dict(self.params),
         }
         if self.calibration is not None:
-            self.rig = {**self.rig, "calibration": kept(self.calibration)}
+            self.rig = {**self.rig, "calibration": to_json(self.calibration)}
 
     @property
     def rate_hz(self) -> float:

@@ -285,7 +285,7 @@ def test_a_full_disk_is_one_clear_error(tmp_path):
         "import resource, signal, sys\n"
         "from ratslam.__main__ import main\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
-        "import ratslam.run, matplotlib.figure\n"
+        "import ratslam.pipeline.run, matplotlib.figure\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))\n"
         f"sys.exit(main(['run', {SQUARE!r}, '-o', {str(tmp_path / 'run')!r}]))\n"
     )

@@ -59,7 +59,7 @@ class Moment(NamedTuple):
 
 
 class Circuit:
-    """A `robot.source.Source` that goes round and round, and measures the memory of its process."""
+    """A `robot.sources.source.Source` that goes round and round, and measures the memory of its process."""
 
     rate_hz, view_shape, whiskers, digest = 10.0, VIEW, 0, ""
 

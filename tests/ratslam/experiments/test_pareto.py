@@ -83,7 +83,7 @@ def stubbed(monkeypatch):
                     directory / FOLDER, found.model_copy(update={"hash": job.hash, "seed": job.seed})
                 )
 
-    monkeypatch.setattr(measuring, "_alone", alone)
+    monkeypatch.setattr(benchmark, "_alone", alone)
     return asked
 
 
@@ -227,7 +227,7 @@ def test_a_small_study_leaves_all_files_and_is_not_run_again(tmp_path, capsys, m
     kept = {each: each.read_bytes() for each in (output / FOLDER).iterdir()}
     assert len(kept) == 4
 
-    monkeypatch.setattr(measuring, "_alone", lambda *_: pytest.fail("something was run again"))
+    monkeypatch.setattr(benchmark, "_alone", lambda *_: pytest.fail("something was run again"))
     assert main(command) == 0
     again = capsys.readouterr().out
     assert again.splitlines()[:3] == first.splitlines()[:3]
@@ -276,7 +276,7 @@ def test_several_workers_are_said_to_disturb_each_other(tmp_path, capsys, stubbe
 
 def test_what_disturbed_a_measurement_is_not_forgotten(tmp_path, capsys, stubbed, monkeypatch):
     busy = iter([2.5, 0.1])
-    monkeypatch.setattr(measuring, "others", lambda: nullcontext(lambda: next(busy)))
+    monkeypatch.setattr(benchmark, "others", lambda: nullcontext(lambda: next(busy)))
     path, output = study(tmp_path), tmp_path / "out"
     assert main(["frontier", str(path), "-o", str(output)]) == 0
     assert "kept 2.5 cores busy" in capsys.readouterr().out

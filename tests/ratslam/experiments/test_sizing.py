@@ -167,7 +167,7 @@ def test_a_session_is_cut_to_about_so_many_cycles(tmp_path):
 @pytest.mark.soak
 def test_a_small_arena_is_sized(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(
-        "ratslam.sizing.trying.cheaper", lambda config: cheaper(config)[:1]
+        "ratslam.experiments.sizing.trial_runs.cheaper", lambda config: cheaper(config)[:1]
     )  # less to compile
     path = tmp_path / "arena.yaml"
     path.write_text("roving: {reports: 80}\nbackend: grid\nsession: {precision: float32}\n")
@@ -194,7 +194,7 @@ def stubbed(monkeypatch):
         em = Quantity(label="EM", value=float(job.config.pose_cells.cell_size), unit="")
         return Result(hash="", seed=0, steps=9, quantities={"energy_all": em})
 
-    monkeypatch.setattr("ratslam.sizing.trying.run_job", run_job)
+    monkeypatch.setattr("ratslam.experiments.sizing.trial_runs.run_job", run_job)
     return asked
 
 

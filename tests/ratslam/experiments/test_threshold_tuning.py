@@ -121,7 +121,7 @@ def test_why_none_wins_is_said():
 
 
 def test_views_that_tell_places_apart_are_tuned(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("ratslam.tune.THRESHOLDS", GRID)
+    monkeypatch.setattr("ratslam.experiments.salman2016.threshold_tuning.THRESHOLDS", GRID)
     config = tmp_path / "tiny.yaml"
     config.write_text(TINY)
     out = tmp_path / "out"
@@ -141,7 +141,7 @@ def test_parts_of_the_grid_are_shared_out_and_put_together(monkeypatch):
         seen.append((len(tasks), workers))
         return ([Tried(float(t), 0.0, 20, 0) for t in part] for *_, part in tasks)
 
-    monkeypatch.setattr("ratslam.tune.shared_out", shared_out)
+    monkeypatch.setattr("ratslam.experiments.salman2016.threshold_tuning.shared_out", shared_out)
     found = tune(parse(TINY, "tiny"), ROOT, workers=3)
     assert seen == [(3, 3)]
     assert [each.threshold for each in found.tried] == list(THRESHOLDS)
@@ -163,6 +163,8 @@ def test_views_must_be_there_and_truth_too(monkeypatch):
     truth = [[0, 0, 0], [1, 0, 0], [0, 0, 0]]
     blind = replace(log_of(truth, np.arange(3)), seen=np.array([True, False, True]))
     document = parse("simulation: {}\n", "here")
-    monkeypatch.setattr("ratslam.tune.session_log", lambda config: (config, blind))
+    monkeypatch.setattr(
+        "ratslam.experiments.salman2016.threshold_tuning.session_log", lambda config: (config, blind)
+    )
     with pytest.raises(InputError, match="without a view"):
         tune(document, ROOT)

@@ -38,8 +38,8 @@ def test_a_perturbed_copy_follows_from_its_seed(log):
 
 def test_without_noise_the_path_is_kept_whole_though_rows_are_dropped(log, monkeypatch):
     for name in ("VIEW_NOISE", "LENGTH_NOISE", "TURN_NOISE"):
-        monkeypatch.setattr(perturb, name, 0.0)
-    monkeypatch.setattr(perturb, "DROPPED", 0.5)
+        monkeypatch.setattr(perturbation, name, 0.0)
+    monkeypatch.setattr(perturbation, "DROPPED", 0.5)
     copy = perturbed(log, 3)
     rows = np.searchsorted(log.time, copy.time)
     assert len(rows) < 0.7 * len(log.time)

@@ -82,7 +82,7 @@ def test_memory_is_bounded_and_settled_paths_stay(monkeypatch, levels):
     for pose, share, _ in reports(200):
         rows.append((pose, share, np.full(COUNT, stream.integers(0, COUNT))))
     whole = told(rows).path()
-    monkeypatch.setattr(ancestry, "LEVELS", levels)
+    monkeypatch.setattr(genealogy, "LEVELS", levels)
     tree = told(rows)
     assert len(tree) == 200
     assert tree.arrays()["pose"].size // 3 <= max(levels, COUNT)
@@ -91,7 +91,7 @@ def test_memory_is_bounded_and_settled_paths_stay(monkeypatch, levels):
 
 
 def test_what_is_settled_early_is_the_mean_of_what_was_believed(monkeypatch):
-    monkeypatch.setattr(ancestry, "LEVELS", 20 * COUNT)
+    monkeypatch.setattr(genealogy, "LEVELS", 20 * COUNT)
     rows = list(reports(60, every=9))
     assert np.abs(told(rows).path() - by_copying(rows)).max() < 2
 
@@ -110,7 +110,7 @@ def test_headings_are_averaged_on_the_circle():
 
 @pytest.mark.parametrize("levels", [5 * COUNT, 10**6])
 def test_a_restored_one_continues_bit_for_bit(monkeypatch, levels):
-    monkeypatch.setattr(ancestry, "LEVELS", levels)
+    monkeypatch.setattr(genealogy, "LEVELS", levels)
     rows = list(reports(80, every=3))
     whole = told(rows)
     for stop in (0, 1, 16, 43):

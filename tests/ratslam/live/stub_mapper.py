@@ -15,7 +15,7 @@ SHORT = 64
 
 
 class Answer:
-    """Becomes `ratslam.live.mapper.Told` on its way, which this process need not know."""
+    """Becomes `ratslam.live.mapper_process.Told` on its way, which this process need not know."""
 
     def __init__(self, *fields: Any) -> None:
         self.fields = fields

@@ -1,4 +1,5 @@
-"""`python -m tests.ratslam.live.waiting_session`: a session that waits, with everything loaded, for what it is to do.
+"""`python -m tests.ratslam.live.waiting_session`: a session that waits, with everything loaded, for what
+it is to do.
 
 A line of JSON on its standard input tells the `arguments` of `python -m ratslam`, how long the stub in the
 mapper's place takes for a sample (`mapper`, s), and how long the self-test listens (`listened`, s).

@@ -20,7 +20,7 @@ from tactile.base.se2 import integrate
 from tactile.base.types import Odometry, observation
 from tests.helpers import scenes
 
-GOLDEN = Path(__file__).parent / "golden"
+GOLDEN = Path(__file__).parents[2] / "golden"
 
 
 def mapped(log: Log, precision: str = "float64", **parts) -> Session:

@@ -17,7 +17,7 @@ from ratslam.pose_graph import (
     geman_mcclure,
     huber,
     least_squares,
-    linear_init,
+    linear,
     logmap_error,
 )
 from ratslam.pose_graph.chains import chains

@@ -613,21 +613,14 @@ def test_ids_speak_for_and_against():
     same, other, new = (by_label(memory, label) for label in (ids[9], ids[30], 77))
 
     weighing = same[2]
-    assert observation_model.likelihood.shape == (1, CAPACITY)
-    assert set(np.flatnonzero(observation_model.likelihood[0] == observation_model.likelihood.max())) == {
-        8,
-        9,
-        10,
-        11,
-    }
-    assert observation_model.likelihood[0, 9] == pytest.approx(LABELS["same"] ** LABEL_TEMPER)
-    assert observation_model.novelty == pytest.approx((LABELS["new_known"] / known) ** LABEL_TEMPER)
-    assert (
-        observation_model.likelihood[0, 9] > observation_model.novelty > observation_model.likelihood[0, 30]
-    )
+    assert weighing.likelihood.shape == (1, CAPACITY)
+    assert set(np.flatnonzero(weighing.likelihood[0] == weighing.likelihood.max())) == {8, 9, 10, 11}
+    assert weighing.likelihood[0, 9] == pytest.approx(LABELS["same"] ** LABEL_TEMPER)
+    assert weighing.novelty == pytest.approx((LABELS["new_known"] / known) ** LABEL_TEMPER)
+    assert weighing.likelihood[0, 9] > weighing.novelty > weighing.likelihood[0, 30]
     assert new[2].likelihood[0, :40] == pytest.approx(LABELS["unknown"] ** LABEL_TEMPER)
     assert new[2].novelty > new[2].likelihood.max()
-    assert np.isnan(observation_model.background).all()
+    assert np.isnan(weighing.background).all()
 
     mass = [float(after.mass[after.anchor == 9].sum()) for after, *_ in (same, other, new)]
     assert mass[0] > 0.9

@@ -505,7 +505,7 @@ def test_a_cut_whose_frames_are_missing_is_told(tmp_path: Path, monkeypatch: pyt
     """No journal writes such a file."""
     with monkeypatch.context() as patch, opened(tmp_path / "a.mcap") as journal:
         patch.setattr(
-            "robot.live.journal.encode_cut", lambda cut: encode_cut(cut._replace(frames=cut.frames + 1))
+            "robot.live.recorder.encode_cut", lambda cut: encode_cut(cut._replace(frames=cut.frames + 1))
         )
         frames = some_frames(20)
         journal.cut(cut_of(0, START, START, frames, moved(0)), frames)

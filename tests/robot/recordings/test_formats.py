@@ -148,7 +148,7 @@ def test_the_readme_example_runs(tmp_path: Path) -> None:
 
 def test_nothing_heavy_is_imported_to_configure() -> None:
     code = (
-        "import sys, robot.formats;"
+        "import sys, robot.recordings.formats;"
         "heavy = {'mcap', 'zstandard', 'scipy', 'jax', 'ratslam'} & set(sys.modules);"
         "assert not heavy, heavy"
     )

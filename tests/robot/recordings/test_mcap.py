@@ -487,7 +487,7 @@ def test_a_file_of_another_version_is_named(
 ) -> None:
     old = tmp_path / "old.mcap"
     with monkeypatch.context() as patch:
-        patch.setattr("robot.walk.FORMAT", "1")
+        patch.setattr("robot.recordings.mcap_scanner.FORMAT", "1")
         _write(old, _samples(3))
     refused(lambda: Recording(old), str(old), "format '1' where '2' is the one known")
     other = tmp_path / "other.mcap"

@@ -97,7 +97,7 @@ def test_what_a_user_can_mend_is_a_result(tiny):
 
 
 def test_what_nobody_can_mend_is_not_hidden(tiny, monkeypatch):
-    monkeypatch.setattr("ratslam.sweeps.jobs.session_of", lambda *_: 1 / 0)
+    monkeypatch.setattr("ratslam.experiments.studies.run_job.session_of", lambda *_: 1 / 0)
     (job,) = jobs(read_study(tiny()))
     with pytest.raises(ZeroDivisionError):
         run_job(job)
@@ -105,7 +105,7 @@ def test_what_nobody_can_mend_is_not_hidden(tiny, monkeypatch):
 
 def test_a_stopwatch_keeps_compiling_out_of_the_steps(monkeypatch):
     now = [0.0]
-    monkeypatch.setattr("ratslam.sweeps.stopwatch.perf_counter", lambda: now[0])
+    monkeypatch.setattr("ratslam.experiments.studies.timing.perf_counter", lambda: now[0])
     watch = Stopwatch()
     with watch.preparing():
         now[0] += 3.0

@@ -251,9 +251,8 @@ def test_without_pyserial_the_cure_is_told(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_importing_the_driver_does_not_need_pyserial() -> None:
-    code = (
-        "import sys, robot.create.driver, robot.emulators.create; print({'serial', 'jax'} & set(sys.modules))"
-    )
+    modules = "sys, robot.drivers.create.driver, robot.emulators.create"
+    code = f"import {modules}; print({{'serial', 'jax'}} & set(sys.modules))"
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "set()"
 
 

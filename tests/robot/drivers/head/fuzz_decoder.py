@@ -1,4 +1,5 @@
-"""`python -m tests.robot.drivers.head.fuzz_decoder [-runs=N]`: libFuzzer looks for bytes that the decoder gets wrong.
+"""`python -m tests.robot.drivers.head.fuzz_decoder [-runs=N]`: libFuzzer looks for bytes that the decoder
+gets wrong.
 
 The first byte says how the rest is cut into pieces. Needs `pip install atheris`.
 """

@@ -77,7 +77,7 @@ class MemoryHead:
 
 
 class Wire:
-    """A `robot.head.device.Bridge`."""
+    """A `robot.drivers.head.device.Bridge`."""
 
     def __init__(self, head: MemoryHead) -> None:
         self.head = head

@@ -175,7 +175,8 @@ def test_missing_pyusb_is_told_with_the_cure(monkeypatch):
 def test_nothing_is_imported_before_it_is_needed():
     code = """
 import sys
-import robot.head.device, robot.head.reader, robot.head.whisk, robot.head.settings
+import robot.drivers.head.device, robot.drivers.head.reader
+import robot.drivers.head.whisk_control, robot.drivers.head.config
 print([name for name in ("usb", "libusb_package", "jax", "robot.emulators") if name in sys.modules])
 """
     done = subprocess.run(

@@ -19,7 +19,7 @@ STEPS = st.one_of(st.integers(-9, 12), st.sampled_from([1, 1, 1, 2**31 - 1, 2**3
 @pytest.fixture(scope="module")
 def few():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(numbering, "LATE", 8)
+        patch.setattr(sequence_numbers, "LATE", 8)
         patch.setattr(oracle, "LATE", 8)
         yield
 
