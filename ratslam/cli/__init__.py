@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
 
-# Only what parsing arguments needs is imported here: `--help` answers before jax would have loaded.
-from ratslam.cli import ablation, create, live, pareto, reproduce, run, studies, watch
-from ratslam.cli.common import INTERRUPTED, MENDABLE
+# Only what argparse needs is imported here, so that `--help` does not wait for JAX and NumPy.
+from ratslam.cli import ablation, create, files, live, look, pareto, reproduce, run, studies
+from ratslam.cli.common import INPUT_ERROR, INTERRUPTED, Commands
 from tactile.base.errors import InputError
+
+GROUPS = ("run", "live", "look", "study", "papers", "files")
+"""Headings of the help, in this order."""
+DESCRIPTION = "RatSLAM with whiskers, cameras or lasers: from a recording, simulation or robot to a map."
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Parses the arguments and runs one command; the exit code."""
-    arguments = _parser().parse_args(argv)
+    """Parses the arguments and runs one command; returns the exit code."""
+    arguments = build_parser().parse_args(argv)
     try:
         return arguments.command(arguments)
     except InputError as error:
@@ -23,27 +26,36 @@ def main(argv: list[str] | None = None) -> int:
         where = f"{error.filename}: " if error.filename else ""
         print(
             f"ratslam: error: {where}{error.strerror or error}; what was written so far is complete; "
-            "make room or choose another folder with -o",
+            "free some space or choose another folder with -o",
             file=sys.stderr,
         )
     except KeyboardInterrupt:
         print("ratslam: interrupted", file=sys.stderr)
         return INTERRUPTED
-    return MENDABLE
+    return INPUT_ERROR
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="ratslam",
-        description="Maps and localises by view or whisker: pose cells, recall, experience map.",
-    )
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+class Program(argparse.ArgumentParser):
+    """A parser whose help lists the commands by group, on one screen."""
 
-    def command(name: str, does: Callable[[argparse.Namespace], int], help: str) -> argparse.ArgumentParser:
-        added = commands.add_parser(name, help=help, description=help)
-        added.set_defaults(command=does)
-        return added
+    commands: Commands
 
-    for group in (run, live, ablation, studies, pareto, reproduce, create, watch):
-        group.add(command)
+    def format_help(self) -> str:
+        lines = ["usage: ratslam COMMAND ...", "", DESCRIPTION, ""]
+        for group in GROUPS:
+            heading = group
+            for entry in self.commands.entries:
+                if entry.group == group:
+                    lines.append(f"{heading:<8}{entry.name:<17}{entry.help}")
+                    heading = ""
+        lines += ["", "ratslam COMMAND --help shows the options of a command and an example."]
+        return "\n".join(lines) + "\n"
+
+
+def build_parser() -> Program:
+    """The parser of the whole program."""
+    parser = Program(prog="ratslam", description=DESCRIPTION)
+    parser.commands = Commands(parser)
+    for module in (run, live, look, ablation, studies, pareto, reproduce, create, files):
+        module.add_commands(parser.commands)
     return parser

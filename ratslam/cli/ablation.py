@@ -5,28 +5,39 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ratslam.cli.common import Add, configured, count, prepare_jax, shared
+from ratslam.cli.common import Commands, add_config, add_workers, positive_integer, prepare_jax
 from tactile.base.errors import InputError
 
 
-def add(command: Add) -> None:
-    """Adds them to the program."""
-    ablate = command(
-        "ablate", _ablate, "turn each part of recall and map off in turn and see what it carries"
+def add_commands(commands: Commands) -> None:
+    """Registers them."""
+    ablate = commands.add(
+        "ablate", _ablate, "switch off each part of recall and map in turn",
+        "ablate configs/square.yaml", "study",
+    )  # fmt: skip
+    vary = commands.add(
+        "vary", _vary, "vary each number of recall and map in turn", "vary configs/square.yaml", "study"
     )
-    vary = command("vary", _vary, "vary every number of recall and map, one at a time, up and down")
     vary.add_argument("--by", type=float, default=0.2, metavar="SHARE", help="by this share (default 0.2)")
     vary.add_argument(
         "--limit", type=float, metavar="M", help="final ATE that counts as kept (default 1.25 of the first)"
     )
-    spread = command("spread", _spread, "run perturbed copies of the recording: what was luck?")
-    spread.add_argument("-n", dest="runs", type=count, default=10, metavar="N", help="copies (default 10)")
+    spread = commands.add(
+        "spread", _spread, "run perturbed copies of a recording", "spread configs/square.yaml", "study"
+    )
+    spread.add_argument(
+        "-n", dest="runs", type=positive_integer, default=10, metavar="N", help="copies (default 10)"
+    )
     for several in (ablate, vary, spread):
-        configured(several)
-        shared(several)
+        add_config(several)
+        add_workers(several)
     for several in (ablate, vary):
         several.add_argument(
-            "--perturbed", type=count, default=0, metavar="N", help="run on N perturbed copies instead"
+            "--perturbed",
+            type=positive_integer,
+            default=0,
+            metavar="N",
+            help="run on N perturbed copies instead",
         )
 
 

@@ -1,4 +1,4 @@
-"""What the commands share: how they are added, numbers from arguments, and JAX set up."""
+"""What the commands share: registration, the configuration argument, number types, JAX settings."""
 
 from __future__ import annotations
 
@@ -6,66 +6,144 @@ import argparse
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-MENDABLE = 2
-"""Exit code after an error the user can mend."""
+if TYPE_CHECKING:
+    from ratslam.config.run_config import RunConfig
+
+INPUT_ERROR = 2
+"""Exit code after an error that the user can correct."""
 INTERRUPTED = 130
-"""Exit code after an interrupt; what was done by then is on disk."""
+"""Exit code after Ctrl-C; the results up to then are on disk."""
 
 
-class Add(Protocol):
-    """Adds a command to the program: its name, what it does (arguments to exit code) and what it is for."""
+class Entry(NamedTuple):
+    """A line of the program's help."""
 
-    def __call__(
-        self, name: str, does: Callable[[argparse.Namespace], int], help: str
-    ) -> argparse.ArgumentParser: ...
-
-
-def configured(parser: argparse.ArgumentParser) -> None:
-    """The arguments of a command that takes a configuration."""
-    parser.add_argument("config", help="the YAML file")
-    settable(parser)
+    group: str
+    name: str
+    help: str
 
 
-def settable(parser: argparse.ArgumentParser) -> None:
-    """The option to override settings."""
+class CommandParser(argparse.ArgumentParser):
+    """The parser of one command.
+
+    Attributes:
+        files: its arguments that are paths, which a shell completes with file names.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        self.files: list[argparse.Action] = []
+        super().__init__(**options)
+
+    def add_argument(self, *names: Any, **options: Any) -> argparse.Action:
+        action = super().add_argument(*names, **options)
+        if options.get("type") is Path:
+            self.files.append(action)
+        return action
+
+
+class Commands:
+    """The commands of a parser: of the program, or of a command that has commands of its own.
+
+    Attributes:
+        entries, parsers: one for each command, in the order of registration.
+    """
+
+    def __init__(self, parser: argparse.ArgumentParser) -> None:
+        self.entries: list[Entry] = []
+        self.parsers: list[CommandParser] = []
+        self._subparsers = parser.add_subparsers(
+            required=True, metavar="COMMAND", title="commands", parser_class=CommandParser
+        )
+
+    def add(
+        self,
+        name: str,
+        run: Callable[[argparse.Namespace], int] | None,
+        help: str,
+        example: str,
+        group: str = "",
+    ) -> CommandParser:
+        """Registers a command.
+
+        Args:
+            run: takes the parsed arguments, returns the exit code; None for a command with commands of its
+                own (`Commands(parser)` adds them).
+            help: one line, at most 60 characters.
+            example: the arguments of a call that works, without `ratslam`.
+            group: heading under which the program's help lists it.
+        """
+        self.entries.append(Entry(group, name, help))
+        description = f"{help[0].upper()}{help[1:]}."
+        parser: CommandParser = self._subparsers.add_parser(
+            name, help=help, description=description, epilog=f"Example: python -m ratslam {example}"
+        )
+        self.parsers.append(parser)
+        if run is not None:
+            parser.set_defaults(command=run)
+        return parser
+
+
+def add_config(parser: argparse.ArgumentParser) -> None:
+    """Adds the configuration file and `--set`."""
+    parser.add_argument("config", type=Path, metavar="CONFIG", help="configuration file (YAML)")
+    add_set(parser)
+
+
+def add_set(parser: argparse.ArgumentParser) -> None:
+    """Adds `--set`."""
     parser.add_argument(
-        "--set", action="append", default=[], metavar="a.b=value", help="override a setting; may be repeated"
+        "--set", action="append", default=[], metavar="a.b=value", help="replace a setting; may be repeated"
     )
 
 
-def shared(parser: argparse.ArgumentParser, processes: int = 0) -> None:
-    """The option to share work out among processes; 0: as many as there are cores."""
-    usual = processes or "cores"
+def add_workers(parser: argparse.ArgumentParser, processes: int = 0) -> None:
+    """Adds `--workers`; 0 processes mean one a core."""
+    default = processes or "number of cores"
     parser.add_argument(
-        "--workers", type=count, default=processes, metavar="N", help=f"processes (default: {usual})"
+        "--workers",
+        type=positive_integer,
+        default=processes,
+        metavar="N",
+        help=f"processes (default: {default})",
     )
 
 
-def count(text: str) -> int:
-    """A whole number from 1 on, for argparse."""
+def positive_integer(text: str) -> int:
+    """Argument type of an integer from 1 on."""
     if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is no whole number from 1 on")
+        raise argparse.ArgumentTypeError(f"{text!r} must be a positive integer")
     return int(text)
 
 
-def prepare_jax(lasting: bool = True) -> None:
-    """What must be settled before jax loads: one thread (more double the latency) and a lasting cache.
+def read_config(arguments: argparse.Namespace) -> RunConfig:
+    """The configuration that `add_config` asked for.
+
+    Raises:
+        InputErrors: what is wrong with it, and where.
+    """
+    from ratslam.config.run_config import load_config
+
+    return load_config(arguments.config, arguments.set)
+
+
+def prepare_jax(keep_compiled: bool = True) -> None:
+    """Sets what JAX reads when it is imported: one thread (more double the latency) and a disk cache.
 
     Args:
-        lasting: whether compiled kernels are kept on disk. Commands that run many sessions in one process
-            compile once anyway.
+        keep_compiled: whether compiled kernels are cached on disk; of no use to commands that run many
+            sessions in one process.
     """
     flag = "--xla_cpu_multi_thread_eigen=false"
     if flag not in os.environ.get("XLA_FLAGS", ""):
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flag}".strip()
-    if not lasting:
+    if not keep_compiled:
         return
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     wanted = {
         "jax_compilation_cache_dir": str(Path(home) / "ratslam" / "jax"),
-        # The defaults keep nothing that compiles as fast as our kernels do on a CPU.
+        # The defaults do not cache kernels that compile as fast as ours do on a CPU.
         "jax_persistent_cache_min_compile_time_secs": 0,
         "jax_persistent_cache_min_entry_size_bytes": -1,
     }

@@ -5,40 +5,36 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ratslam.cli.common import Add, configured, prepare_jax
+from ratslam.cli.common import Commands, add_config, prepare_jax, read_config
 from tactile.base.errors import InputError
 
 SETS = {"fox-fig4": 20, "fox-fig5": 2, "fox-fig6": 3}
 """Of the reproductions, known before jax is loaded: sets of each."""
 
 
-def add(command: Add) -> None:
-    """Adds them to the program."""
-    train = command(
-        "train-templates",
-        _train,
-        "drive a simulated Create into walls at fifteen angles and keep what its whiskers felt",
-    )
-    configured(train)
+def add_commands(commands: Commands) -> None:
+    """Registers them."""
+    train = commands.add(
+        "train-templates", _train, "record strain templates of a simulated Create",
+        "train-templates configs/create_arena.yaml -o runs/templates.npz", "papers",
+    )  # fmt: skip
+    add_config(train)
     train.add_argument("-o", "--output", type=Path, required=True, metavar="NPZ", help="the new file")
 
-    compare = command(
-        "compare", _compare, "run one session of whiskers through both backends, RatSLAM and the grid filter"
-    )
-    configured(compare)
+    compare = commands.add(
+        "compare", _compare, "run a whisker session through both backends",
+        "compare configs/create_arena.yaml", "study",
+    )  # fmt: skip
+    add_config(compare)
 
 
 def _train(arguments: argparse.Namespace) -> int:
-    from ratslam.config.run_config import RunConfig
-    from ratslam.config.strict_yaml import load, override, validate
     from ratslam.experiments.fox2012.template_training import held_out, report, schooled
-    from ratslam.pipeline.run import located
 
-    config = validate(override(load(arguments.config), arguments.set), RunConfig)
-    roving = located(config, Path(arguments.config).parent.resolve()).roving
+    roving = read_config(arguments).roving
     if roving is None:
         raise InputError(
-            arguments.config, "no `roving:`", "the Create to train", "`roving: {}` is the usual one"
+            str(arguments.config), "no `roving:`", "the Create to train", "`roving: {}` is the usual one"
         )
     templates = schooled(roving, arguments.output)
     print(report(held_out(roving, templates), templates.training.repeats))
@@ -49,11 +45,8 @@ def _train(arguments: argparse.Namespace) -> int:
 
 
 def _compare(arguments: argparse.Namespace) -> int:
-    prepare_jax(lasting=False)
-    from ratslam.config.run_config import RunConfig
-    from ratslam.config.strict_yaml import load, override, validate
+    prepare_jax(keep_compiled=False)
     from ratslam.experiments.backend_comparison import compared, report
 
-    config = validate(override(load(arguments.config), arguments.set), RunConfig)
-    print(report(compared(config, Path(arguments.config).parent)))
+    print(report(compared(read_config(arguments), arguments.config.parent)))
     return 0

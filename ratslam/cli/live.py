@@ -1,4 +1,4 @@
-"""The commands on robots: live, and emulate, which stands in for one."""
+"""The commands live and emulate."""
 
 from __future__ import annotations
 
@@ -7,33 +7,43 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
-from ratslam.cli.common import INTERRUPTED, MENDABLE, Add, configured, prepare_jax
+from ratslam.cli.common import INPUT_ERROR, INTERRUPTED, Commands, add_config, prepare_jax, read_config
+from ratslam.cli.run import add_run_directory, run_directory
 from tactile.base.errors import InputError
 
+if TYPE_CHECKING:
+    from ratslam.config.run_config import RunConfig
+    from robot.live.config import LiveConfig
 
-def add(command: Add) -> None:
-    """Adds them to the program."""
-    live = command("live", _live, "map while an arm carries a whisker head about")
-    configured(live)
-    live.add_argument(
-        "-o", "--output", type=Path, metavar="DIR", help="new run directory (default runs/<config>)"
-    )
+
+def add_commands(commands: Commands) -> None:
+    """Registers them."""
+    live = commands.add(
+        "live", _live, "map while a robot arm carries the whisker head",
+        "live configs/live_maze.yaml --set live.whisks=60", "live",
+    )  # fmt: skip
+    add_config(live)
+    add_run_directory(live)
     live.add_argument("--ur-host", metavar="HOST", help="address of the arm's controller")
     live.add_argument(
-        "--head", metavar="ADDRESS", help="usb, usb:VENDOR:PRODUCT[:SERIAL], or an emulator's HOST"
-    )
+        "--head", metavar="ADDRESS",
+        help="usb, usb:VENDOR:PRODUCT[:SERIAL], or the HOST of an emulated head",
+    )  # fmt: skip
 
-    emulate = command("emulate", _emulate, "stand in for an arm's controller, or for a whisker head")
+    emulate = commands.add(
+        "emulate", _emulate, "emulate the arm's controller or the whisker head",
+        "emulate ur10 configs/live_maze.yaml", "live",
+    )  # fmt: skip
     emulate.add_argument(
-        "what", choices=("ur10", "head"), help="the arm's controller, or the head in its maze"
+        "device", choices=("ur10", "head"), help="arm controller, or whisker head in its maze"
     )
-    configured(emulate)
+    add_config(emulate)
     emulate.add_argument(
-        "--host", metavar="HOST", help="loopback address to listen at (default: as configured)"
+        "--host", metavar="HOST", help="loopback address to listen on (default: from the configuration)"
     )
-    emulate.add_argument("--ur-host", metavar="HOST", help="of the arm that carries the head")
+    emulate.add_argument("--ur-host", metavar="HOST", help="address of the arm that carries the head")
 
 
 def _live(arguments: argparse.Namespace) -> int:
@@ -42,26 +52,26 @@ def _live(arguments: argparse.Namespace) -> int:
     from ratslam.live.session import live
     from robot.drivers.outcome import Outcome
 
-    config = _configured(arguments, arguments.ur_host, arguments.head)
-    directory = arguments.output or Path("runs") / Path(arguments.config).stem
+    config, _ = _read_live_config(arguments, arguments.head)
+    directory = run_directory(arguments)
     with _Monitor() as monitor:
-        ended, card = live(config, Path(arguments.config).parent, directory, _tell, armed=monitor.start)
+        ended, card = live(config, directory, _print, armed=monitor.start)
     if card is not None:
         print(table(card))
         print(f"\n{directory}/map.png shows the map, `run {directory}/config.yaml` maps the recording again")
-    _tell(str(ended))
+    _print(str(ended))
     if ended.outcome is Outcome.INTERRUPTED:
         return INTERRUPTED
-    return 0 if ended.outcome is Outcome.COMPLETE else MENDABLE
+    return 0 if ended.outcome is Outcome.COMPLETE else INPUT_ERROR
 
 
 def _emulate(arguments: argparse.Namespace) -> int:
-    config = _configured(arguments, arguments.ur_host, None)
+    config, session = _read_live_config(arguments, head_address=None)
     from robot.live.emulator_config import controller, whiskers
 
-    session, head = config.live, config.touch.head
+    head = config.touch.head
     try:
-        if arguments.what == "ur10":
+        if arguments.device == "ur10":
             from robot.emulators.ur10 import serve
 
             serve(controller(session, head, arguments.host))
@@ -75,22 +85,22 @@ def _emulate(arguments: argparse.Namespace) -> int:
 
 
 class _Monitor:
-    """`ratslam watch` of the session, in a process of its own that gives way to all others."""
+    """`ratslam watch` on the session, in a separate process of low priority."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self, directory: Path) -> None:
-        """From now on."""
+        """Starts it."""
         command = [sys.executable, "-m", "ratslam", "watch", str(directory)]
         nice = ["nice", "-n", "10"] if shutil.which("nice") else []
         self._process = subprocess.Popen(
             [*nice, *command],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
-            start_new_session=True,  # Ctrl-C is not for it
+            start_new_session=True,  # it gets no Ctrl-C
         )
-        _tell(f"{directory}/watch.png shows the map grow")
+        _print(f"{directory}/watch.png shows the map while it grows")
 
     def __enter__(self) -> _Monitor:
         return self
@@ -101,24 +111,24 @@ class _Monitor:
             self._process.wait()
 
 
-def _configured(arguments: argparse.Namespace, arm: str | None, head: str | None) -> Any:
-    """The configuration with addresses from the command line.
+def _read_live_config(
+    arguments: argparse.Namespace, head_address: str | None
+) -> tuple[RunConfig, LiveConfig]:
+    """The configuration with addresses from the command line, and its live part.
 
     Raises:
-        InputError: it is not one of a live session.
+        InputError: it has no live part.
     """
-    from ratslam.config.run_config import RunConfig
-    from ratslam.config.strict_yaml import load, override, validate
-    from ratslam.pipeline.run import located
-
-    given = [f"live.arm.host={arm}"] if arm else []
-    given += [f"live.head.address={head}"] if head else []
-    config = validate(override(load(arguments.config), [*arguments.set, *given]), RunConfig)
+    if arguments.ur_host:
+        arguments.set.append(f"live.arm.host={arguments.ur_host}")
+    if head_address:
+        arguments.set.append(f"live.head.address={head_address}")
+    config = read_config(arguments)
     if config.live is None:
         cure = "configs/live_maze.yaml is an example; `run` maps recordings and simulations"
-        raise InputError(f"{arguments.config}: live", "missing", "a session on a robot", cure)
-    return located(config, Path(arguments.config).parent.resolve())
+        raise InputError(f"{arguments.config}: live", "missing", "settings of a live session", cure)
+    return config, config.live
 
 
-def _tell(line: str) -> None:
+def _print(line: str) -> None:
     print(f"ratslam: {line}", file=sys.stderr, flush=True)

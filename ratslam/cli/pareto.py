@@ -5,7 +5,15 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ratslam.cli.common import Add, configured, count, prepare_jax, settable, shared
+from ratslam.cli.common import (
+    Commands,
+    add_config,
+    add_set,
+    add_workers,
+    positive_integer,
+    prepare_jax,
+    read_config,
+)
 from ratslam.cli.studies import Progress, settle_threads
 from tactile.base.errors import InputError
 
@@ -15,14 +23,15 @@ LEAST = 50
 """In fewer nothing is known again."""
 
 
-def add(command: Add) -> None:
-    """Adds them to the program."""
-    frontier = command(
-        "frontier", _frontier, "run a study and show speed against error: a table, a picture, the best rows"
-    )
+def add_commands(commands: Commands) -> None:
+    """Registers them."""
+    frontier = commands.add(
+        "frontier", _frontier, "run a study and compare speed with error",
+        "frontier configs/study_frontier.yaml", "study",
+    )  # fmt: skip
     frontier.add_argument("study", help="the YAML file, as for sweep")
-    settable(frontier)
-    shared(frontier, 1)
+    add_set(frontier)
+    add_workers(frontier, 1)
     frontier.add_argument(
         "--error", metavar="NAME",
         help="to hold speed against: em, ate, arr, arcr, exm (ARR x ARCR), map or any quantity of the "
@@ -33,12 +42,12 @@ def add(command: Add) -> None:
         help="where all goes, and results are taken from if they are there (default runs/frontier/<study>)",
     )  # fmt: skip
 
-    size = command(
-        "size", _size, "propose settings that fit a scene, and show what each cheaper one costs in error"
+    size = commands.add(
+        "size", _size, "recommend settings for a scene", "size configs/whisker_maze.yaml", "study"
     )
-    configured(size)
+    add_config(size)
     size.add_argument(
-        "--cycles", type=count, default=CYCLES, metavar="N",
+        "--cycles", type=positive_integer, default=CYCLES, metavar="N",
         help=f"of the session to try them on (default {CYCLES})",
     )  # fmt: skip
 
@@ -84,17 +93,13 @@ def _size(arguments: argparse.Namespace) -> int:
         raise InputError("--cycles", str(arguments.cycles), f"{LEAST} and more")
     settle_threads()
     prepare_jax()
-    from ratslam.config.run_config import RunConfig
-    from ratslam.config.strict_yaml import load, override, validate
     from ratslam.experiments.sizing.recommendation import proposals
     from ratslam.experiments.sizing.report import length_text, proposed_text, snippet, tried_text
     from ratslam.experiments.sizing.scene_statistics import cheapest, scene_of
     from ratslam.experiments.sizing.trial_runs import tried
-    from ratslam.pipeline.run import located, open_source
+    from ratslam.pipeline.run import open_source
 
-    path = Path(arguments.config)
-    config = validate(override(load(path), arguments.set), RunConfig)
-    config = located(config, path.parent.resolve())
+    path, config = arguments.config, read_config(arguments)
     with open_source(cheapest(config)) as source:
         scene, config = scene_of(source), config.completed(source)
     found = proposals(config, scene)

@@ -5,7 +5,15 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ratslam.cli.common import INTERRUPTED, Add, configured, count, prepare_jax, settable, shared
+from ratslam.cli.common import (
+    INTERRUPTED,
+    Commands,
+    add_config,
+    add_set,
+    add_workers,
+    positive_integer,
+    prepare_jax,
+)
 from ratslam.cli.create import SETS
 from tactile.base.errors import InputError
 
@@ -15,33 +23,41 @@ USUAL = 3
 """Sets of each."""
 
 
-def add(command: Add) -> None:
-    """Adds them to the program."""
-    reproduce = command(
-        "reproduce", _reproduce, "make a figure of the whisker papers again, controls beside it"
-    )
+def add_commands(commands: Commands) -> None:
+    """Registers them."""
+    reproduce = commands.add(
+        "reproduce", _reproduce, "reproduce a figure of a paper, with controls",
+        "reproduce fig2 --sets 1", "papers",
+    )  # fmt: skip
     every, usual = (*NAMES, *SETS), ", ".join(f"{name} {sets}" for name, sets in SETS.items())
     reproduce.add_argument("name", choices=every, metavar="NAME", help=", ".join(every))
     reproduce.add_argument(
-        "--sets", type=count, metavar="N", help=f"mazes or trials a condition (default {USUAL}; {usual})"
+        "--sets",
+        type=positive_integer,
+        metavar="N",
+        help=f"mazes or trials a condition (default {USUAL}; {usual})",
     )
     reproduce.add_argument("--seed", type=int, default=0, metavar="S", help="of all sets (default 0)")
     reproduce.add_argument(
         "-o", "--output", type=Path, default=Path("runs") / "reproduce", metavar="DIR",
         help="where NAME.csv and NAME.png go (default runs/reproduce)",
     )  # fmt: skip
-    settable(reproduce)
-    shared(reproduce)
+    add_set(reproduce)
+    add_workers(reproduce)
 
-    tune = command("tune", _tune, "choose the classic matcher's threshold as the whisker paper does")
-    configured(tune)
-    shared(tune, 1)
+    tune = commands.add(
+        "tune", _tune, "choose the classic matcher's threshold as the paper does",
+        "tune configs/whisker_maze.yaml", "papers",
+    )  # fmt: skip
+    add_config(tune)
+    add_workers(tune, 1)
     tune.add_argument("-o", "--output", type=Path, metavar="DIR", help="leave tune.png and tune.csv there")
 
-    tiers = command(
-        "tiers", _tiers, "run a scene through all tiers of simulation: what each costs and changes"
-    )
-    configured(tiers)
+    tiers = commands.add(
+        "tiers", _tiers, "run a scene through all tiers of simulation",
+        "tiers configs/whisker_maze.yaml --seconds 60", "study",
+    )  # fmt: skip
+    add_config(tiers)
     tiers.add_argument(
         "--seconds", type=float, default=600.0, metavar="S", help="of the session at most (default 600)"
     )
@@ -50,7 +66,7 @@ def add(command: Add) -> None:
 def _reproduce(arguments: argparse.Namespace) -> int:
     if arguments.seed < 0:
         raise InputError("--seed", str(arguments.seed), "a whole number from 0 on")
-    prepare_jax(lasting=False)
+    prepare_jax(keep_compiled=False)
     if arguments.name in SETS:
         from ratslam.experiments.fox2012 import reproduce
     else:
@@ -72,7 +88,7 @@ def _reproduce(arguments: argparse.Namespace) -> int:
 
 
 def _tune(arguments: argparse.Namespace) -> int:
-    prepare_jax(lasting=False)
+    prepare_jax(keep_compiled=False)
     from ratslam.config.strict_yaml import load, override
     from ratslam.experiments.salman2016.threshold_tuning import report, save, tune
 
@@ -88,7 +104,7 @@ def _tune(arguments: argparse.Namespace) -> int:
 def _tiers(arguments: argparse.Namespace) -> int:
     if not 0 < arguments.seconds < float("inf"):
         raise InputError("--seconds", str(arguments.seconds), "a time above 0 s")
-    prepare_jax(lasting=False)
+    prepare_jax(keep_compiled=False)
     from ratslam.config.strict_yaml import load, override
     from ratslam.experiments.fidelity_comparison import report, tiers
 

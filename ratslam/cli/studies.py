@@ -11,18 +11,21 @@ from typing import Any, Self
 
 from tqdm import tqdm
 
-from ratslam.cli.common import MENDABLE, Add, prepare_jax, settable, shared
+from ratslam.cli.common import INPUT_ERROR, Commands, add_set, add_workers, prepare_jax
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """How many threads NumPy sums with."""
 
 
-def add(command: Add) -> None:
-    """Adds it to the program."""
-    sweep = command("sweep", _sweep, "run every configuration of a study over its seeds, or tune parameters")
+def add_commands(commands: Commands) -> None:
+    """Registers it."""
+    sweep = commands.add(
+        "sweep", _sweep, "run the configurations of a study over seeds, or tune",
+        "sweep configs/study_maze.yaml", "study",
+    )  # fmt: skip
     sweep.add_argument("study", help="the YAML file")
-    settable(sweep)
-    shared(sweep)
+    add_set(sweep)
+    add_workers(sweep)
     sweep.add_argument(
         "--scheduler", metavar="tcp://HOST:PORT", help="of Dask, that has workers, instead of processes here"
     )
@@ -80,7 +83,7 @@ class Progress:
                 f"{self._directory}, remove the file there to try again",
                 file=sys.stderr,
             )
-        return MENDABLE if self.failed else 0
+        return INPUT_ERROR if self.failed else 0
 
 
 def settle_threads() -> None:
@@ -127,4 +130,4 @@ def _tune(arguments: argparse.Namespace, study: Any, directory: Path) -> int:
     if any(trial.values for trial in trials):
         return 0
     print("ratslam: error: no trial has a value of every objective", file=sys.stderr)
-    return progress.told() or MENDABLE
+    return progress.told() or INPUT_ERROR

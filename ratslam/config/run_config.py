@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Sequence
 from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -14,6 +16,7 @@ from ratslam.backends.classic import RatConfig
 from ratslam.classic.experience_map import ExperienceConfig
 from ratslam.classic.places import PlaceConfig
 from ratslam.classic.view_templates import TemplateConfig
+from ratslam.config.strict_yaml import load, override, validate
 from ratslam.grid.config import GridConfig
 from ratslam.keyframes.config import FrameMapConfig
 from ratslam.recall.filter import RecallConfig
@@ -131,6 +134,18 @@ class RunConfig(Settings):
             raise ValueError(f"{there}; give one of these four, and null for the others")
         return live
 
+    def with_absolute_paths(self, folder: Path) -> RunConfig:
+        """The same with relative paths taken from `folder`, so that it can be used from anywhere."""
+        relations = self.score.relations
+        parts = {
+            name: part and part.resolved(folder)
+            for name in ("recording", "simulation", "roving", "live")
+            for part in [getattr(self, name)]
+        }
+        parts["touch"] = self.touch.model_copy(update={"reports": self.touch.reports.resolved(folder)})
+        parts["score"] = self.score.model_copy(update={"relations": relations and folder / relations})
+        return self.model_copy(update=parts)
+
     def rat(self) -> RatConfig:
         """The rat backend's part."""
         return RatConfig(**{name: getattr(self, name) for name in RatConfig.model_fields})
@@ -173,6 +188,19 @@ class RunConfig(Settings):
             return self
         share, more = MARGIN
         return _filled(self, {"grid": {"side": round(2 * (share * reach + more), 2)}})
+
+
+def load_config(path: str | os.PathLike[str], assignments: Sequence[str] = ()) -> RunConfig:
+    """Reads a configuration file; its relative paths start at its folder.
+
+    Args:
+        assignments: settings to replace, each `a.b=value`.
+
+    Raises:
+        InputErrors: everything that is wrong with it, each with file, line and column.
+    """
+    config = validate(override(load(path), assignments), RunConfig)
+    return config.with_absolute_paths(Path(path).parent.resolve())
 
 
 def _filled(settings: Any, values: dict[str, Any]) -> Any:

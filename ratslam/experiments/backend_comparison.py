@@ -13,7 +13,7 @@ from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.trajectory import ate
 from ratslam.config.run_config import RunConfig
 from ratslam.core.session import CHUNK
-from ratslam.pipeline.run import located, open_source
+from ratslam.pipeline.run import open_source
 from ratslam.pipeline.runner import session_of
 from robot.sources.source import Sample, Source
 from robot.touch_source import observation_of, sensing
@@ -52,7 +52,7 @@ def compared(config: RunConfig, folder: Path) -> list[Compared]:
     Raises:
         InputError: it cannot be used, has no whiskers, or nobody knows where the robot was.
     """
-    config = located(config, folder.resolve())
+    config = config.with_absolute_paths(folder.resolve())
     found = [_played(config.model_copy(update={"backend": backend})) for backend in ("rat", "grid")]
     return [*(one for one, _ in found), found[0][1]]
 

@@ -18,7 +18,7 @@ from evaluation.metrics.scorecard import Scorecard
 from ratslam.config.run_config import RunConfig
 from ratslam.core.session import CHUNK
 from ratslam.live.mapper_process import Mapper, Order
-from ratslam.pipeline.run import interrupts, located
+from ratslam.pipeline.run import interrupts
 from robot.drivers.outcome import Fault, Outcome
 from robot.live.recorder import Journal
 from robot.live.rig import Faulted, Rig, Stopped
@@ -60,7 +60,6 @@ class Ended(NamedTuple):
 
 def live(
     config: RunConfig,
-    folder: Path,
     directory: Path,
     tell: Callable[[str], None],
     mapping: Callable[..., None] | None = None,
@@ -69,7 +68,7 @@ def live(
     """Tests arm and head, makes the calibration, goes the way and maps; then scores.
 
     Args:
-        folder: of the configuration file. directory: the new run directory. tell: is told a line at a time.
+        directory: the new run directory. tell: is told a line at a time.
         mapping: what the mapper's process does; None: `ratslam.live.mapper_process.mapping`. armed: is
         told the
             directory when the session begins.
@@ -80,7 +79,6 @@ def live(
     Raises:
         InputError: why nothing was armed.
     """
-    config = located(config, folder.resolve())
     assert config.live is not None
     path = way(config.live, ur10_head(config.touch.head))
     checked(config.live, path)

@@ -27,13 +27,11 @@ from tactile.base.types import Cycle, Whisk
 from tactile.frontend import Frontend
 
 
-def run(
-    config: RunConfig, folder: Path, directory: Path, resume: Path | None = None
-) -> tuple[Scorecard, bool]:
+def run(config: RunConfig, directory: Path, resume: Path | None = None) -> tuple[Scorecard, bool]:
     """Runs and scores.
 
     Args:
-        folder: of the configuration file; relative paths start there. resume: a checkpoint to go on from.
+        resume: a checkpoint to continue from.
 
     Returns:
         the scorecard, and whether the run was interrupted (its outputs are then of the part done).
@@ -42,7 +40,6 @@ def run(
         InputError: the recording, the simulation, the checkpoint or the run directory cannot be used.
         OSError: the disk is full.
     """
-    config = located(config, folder.resolve())
     with open_source(config, _tell) as source:
         config = config.completed(source)
         source = sensing(source, config.touch)
@@ -65,7 +62,7 @@ def replayed(play: Playing, source: Source) -> bool:
         return interrupted()
 
 
-def simulate(config: RunConfig, folder: Path, path: Path) -> tuple[int, bool]:
+def simulate(config: RunConfig, path: Path) -> tuple[int, bool]:
     """Writes the simulated session of a configuration to a recording: what each whisker felt, or its samples.
 
     Returns:
@@ -74,7 +71,6 @@ def simulate(config: RunConfig, folder: Path, path: Path) -> tuple[int, bool]:
     Raises:
         InputError: there is nothing to simulate, it cannot be simulated, or the file exists.
     """
-    config = located(config, folder.resolve())
     if config.simulation is None and config.roving is None:
         raise InputError("simulation", "missing", "what to simulate", "`simulation: {}` is a whole session")
     source = open_source(config, _tell)
@@ -120,7 +116,7 @@ def _kept(config: RunConfig, source: Source) -> Callable[[Sample], Sample]:
 
 
 def open_source(config: RunConfig, tell: Callable[[str], None] | None = None) -> Source:
-    """The recording of a configuration with whole paths, or its simulated session.
+    """The recording of a configuration, or its simulated session.
 
     Args:
         tell: called with one sentence on how much is simulated and why, or if only a part of a recording
@@ -140,21 +136,6 @@ def open_source(config: RunConfig, tell: Callable[[str], None] | None = None) ->
         cure = "`python -m ratslam live` runs it; here its recording can be run"
         raise InputError("live", "a session on a robot", "a recording, or what to simulate", cure)
     return open_recording(config.recording, tell and (lambda sentence: tell(f"warning: {sentence}")))
-
-
-def located(config: RunConfig, folder: Path) -> RunConfig:
-    """The configuration with whole paths, so that the copy in the run directory can be run again."""
-    judgement = config.score
-    if judgement.relations:
-        judgement = judgement.model_copy(update={"relations": folder / judgement.relations})
-    parts = {
-        "recording": config.recording and config.recording.resolved(folder),
-        "simulation": config.simulation and config.simulation.resolved(folder),
-        "roving": config.roving and config.roving.resolved(folder),
-        "live": config.live and config.live.resolved(folder),
-        "touch": config.touch.model_copy(update={"reports": config.touch.reports.resolved(folder)}),
-    }
-    return config.model_copy(update={**parts, "score": judgement})
 
 
 @contextmanager

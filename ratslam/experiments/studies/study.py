@@ -16,7 +16,6 @@ from ratslam.config.strict_yaml.reader import Reader
 from ratslam.experiments.studies.config_hash import digest_of, seed_key, with_seed
 from ratslam.experiments.studies.overrides import named, outermost_first, overlap, put
 from ratslam.experiments.studies.schema import StudyPlan, TunePlan
-from ratslam.pipeline.run import located
 from tactile.base.errors import InputError, InputErrors
 
 MOST = 100_000
@@ -124,7 +123,7 @@ def variant_of(
     document = study.base
     for key, value, at in settings:
         document = put(document, key, value, study.document, at)
-    config = located(validate(document, RunConfig), study.folder.resolve())
+    config = validate(document, RunConfig).with_absolute_paths(study.folder.resolve())
     everywhere: list[tuple[str, Any, KeyPath]] = [
         (key, value, ("set", key)) for key, value in study.plan.set.items()
     ]

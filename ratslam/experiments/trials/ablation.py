@@ -19,7 +19,7 @@ from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import Document, load, override, validate
 from ratslam.core.session import CHUNK, Session
 from ratslam.experiments.trials.process_pool import shared_out
-from ratslam.pipeline.run import located, open_source
+from ratslam.pipeline.run import open_source
 from ratslam.pipeline.runner import Anytimes, readings, session_of
 from robot.sources.in_memory import Log, collected
 from robot.sources.perturbation import perturbed
@@ -75,7 +75,7 @@ def trial(config: RunConfig, folder: Path, seed: int = 0) -> Trial:
     Raises:
         InputError: the recording cannot be used, or cannot be perturbed because it is not read as a whole.
     """
-    with open_source(located(config, folder.resolve())) as source:
+    with open_source(config.with_absolute_paths(folder.resolve())) as source:
         config = config.completed(source)
         source = sensing(source, config.touch)
         if seed:

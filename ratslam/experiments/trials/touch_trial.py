@@ -19,7 +19,7 @@ from ratslam.backends.recall import rat
 from ratslam.config.run_config import RunConfig, SessionConfig
 from ratslam.core.session import Session, capacity_at
 from ratslam.experiments.trials.controls import Control, controlled
-from ratslam.pipeline.run import located, open_source
+from ratslam.pipeline.run import open_source
 from robot.sources.in_memory import Log, collected
 from robot.touch_source import observation_of, sensing
 from tactile.base.errors import InputError
@@ -197,7 +197,7 @@ def room_for(steps: int) -> int:
 
 def whole(config: RunConfig, folder: Path) -> RunConfig:
     """The configuration with paths that hold wherever a worker stands."""
-    return located(config, folder.resolve())
+    return config.with_absolute_paths(folder.resolve())
 
 
 def _engine(config: RatConfig, settings: SessionConfig, shape: tuple[int, int, int], reserve: int) -> Session:

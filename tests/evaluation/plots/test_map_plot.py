@@ -13,9 +13,9 @@ from evaluation.artifacts.run_directory import read_walls
 from evaluation.artifacts.whisker_views import read_images
 from evaluation.report import redraw
 from ratslam.cli import main
-from ratslam.config.run_config import RunConfig
+from ratslam.config.run_config import RunConfig, load_config
 from ratslam.config.strict_yaml import load, validate
-from ratslam.pipeline.run import located, open_source
+from ratslam.pipeline.run import open_source
 from robot.touch_source import sensing
 from robot.world.scene import MazeConfig
 
@@ -70,7 +70,7 @@ def test_a_replayed_session_knows_its_maze_and_images(folder):
 
 
 def test_what_is_kept_is_what_was_felt_and_where(folder):
-    config = located(validate(load(folder / "config.yaml"), RunConfig), folder)
+    config = load_config(folder / "config.yaml")
     source = open_source(config)
     boxes = source.scene.surroundings.walls
     assert np.array_equal(read_walls(folder / "run"), np.column_stack(boxes))

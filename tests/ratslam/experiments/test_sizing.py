@@ -31,7 +31,7 @@ from ratslam.experiments.sizing.scene_statistics import Scene, cheapest, scene_o
 from ratslam.experiments.sizing.trial_runs import cheaper
 from ratslam.experiments.studies.results import Result
 from ratslam.grid.particle_maps import LAYERS
-from ratslam.pipeline.run import located, open_source
+from ratslam.pipeline.run import open_source
 
 ROOT = Path(__file__).parents[3]
 GOLDEN = ROOT / "tests" / "golden"
@@ -128,7 +128,7 @@ def test_a_cheaper_step_asks_for_less_of_one_thing(config):
 
 
 def configuration(**content):
-    return located(RunConfig.model_validate(content), ROOT)
+    return RunConfig.model_validate(content).with_absolute_paths(ROOT)
 
 
 def test_a_scene_is_what_its_odometry_tells():

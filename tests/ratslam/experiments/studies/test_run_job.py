@@ -25,7 +25,7 @@ SMALL = {"simulation.path": {"circuits": "CC"}}
 def test_a_job_has_the_figures_of_a_run(tiny, tmp_path, matcher):
     (job,) = jobs(read_study(tiny(set=SMALL | {"matcher": matcher}, seeds=[3])))
     result = run_job(job)
-    run(job.config, tmp_path, tmp_path / "run")
+    run(job.config, tmp_path / "run")
     card = read_card(tmp_path / "run")
     assert list(result.quantities) == list(card.quantities)
     for name, quantity in card.quantities.items():

@@ -1,0 +1,102 @@
+"""The commands that look at a run: watch, score."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from shutil import get_terminal_size
+
+from ratslam.cli.common import Commands
+from tactile.base.errors import InputError
+
+
+def add_commands(commands: Commands) -> None:
+    """Registers them."""
+    watch = commands.add(
+        "watch", _watch, "show the progress of a run in another process", "watch runs/square", "look"
+    )
+    watch.add_argument("directory", type=Path, metavar="RUN_DIR", help="run directory, running or finished")
+    watch.add_argument(
+        "--every", type=float, default=2.0, metavar="SECONDS", help="time between updates (default 2)"
+    )
+    watch.add_argument("--once", action="store_true", help="show the state once and exit")
+    watch.add_argument(
+        "--patience", type=float, default=300.0, metavar="SECONDS",
+        help="a run that writes nothing for this long counts as killed (default 300)",
+    )  # fmt: skip
+
+    score = commands.add(
+        "score", _score, "score a run directory or the log of any SLAM system", "score runs/square", "look"
+    )
+    score.add_argument("log", type=Path, metavar="LOG", help="run directory, or CSV with t, id, x, y, theta")
+    score.add_argument(
+        "--mode", choices=("strict", "paper", "or", "literal"), default="strict",
+        help="how the Experience Metric counts (default strict)",
+    )  # fmt: skip
+    score.add_argument(
+        "--base", type=int, metavar="STEP",
+        help="last step of the base set of the Experience Metric (default: the first return)",
+    )  # fmt: skip
+    score.add_argument(
+        "--relations", type=Path, metavar="CSV",
+        help="true relative poses (t1,t2,x,y,z,roll,pitch,yaw) for the Energy Metric",
+    )  # fmt: skip
+    score.add_argument("--json", action="store_true", help="print JSON instead of a table")
+
+
+def _watch(arguments: argparse.Namespace) -> int:
+    from evaluation.monitor.progress import PICTURE, RUNNING
+    from evaluation.monitor.watch import watch
+
+    for name in ("every", "patience"):
+        if not 0 < getattr(arguments, name) < float("inf"):
+            raise InputError(f"--{name}", str(getattr(arguments, name)), "a time above 0 s")
+    tell = _StatusLine()
+    try:
+        seen = watch(
+            arguments.directory, tell, every=arguments.every, patience=arguments.patience, once=arguments.once
+        )
+    finally:
+        tell.end()
+    if seen.status == RUNNING and not arguments.once:
+        cure = f"; `run --continue {arguments.directory / 'map.npz'}` goes on" if seen.saved else ""
+        print(f"no output for {seen.silent:.0f} s: the run was killed{cure}")
+    print(f"{arguments.directory / PICTURE} shows its map")
+    return 0
+
+
+def _score(arguments: argparse.Namespace) -> int:
+    from evaluation.artifacts.run_directory import read_run
+    from evaluation.metrics.energy_metric import read_relations
+    from evaluation.metrics.experience_log import read_log
+    from evaluation.metrics.experience_metric import ExmConfig
+    from evaluation.metrics.scorecard import score, score_log, table
+
+    exm = ExmConfig(mode=arguments.mode, base=arguments.base)
+    if arguments.log.is_dir():
+        relations = read_relations(arguments.relations) if arguments.relations else None
+        card = score(read_run(arguments.log), arguments.log.name, exm=exm, relations=relations)
+    else:
+        card = score_log(read_log(arguments.log), arguments.log.stem, exm=exm)
+    print(card.model_dump_json(indent=2) if arguments.json else table(card))
+    return 0
+
+
+class _StatusLine:
+    """Prints a line over the last one on a terminal; elsewhere prints each new line."""
+
+    def __init__(self) -> None:
+        self._last = ""
+
+    def __call__(self, line: str) -> None:
+        if sys.stdout.isatty():
+            width = get_terminal_size().columns - 1
+            print(f"\r{line[:width]:<{width}}", end="", flush=True)
+        elif line != self._last:
+            print(line, flush=True)
+        self._last = line
+
+    def end(self) -> None:
+        if self._last and sys.stdout.isatty():
+            print()
