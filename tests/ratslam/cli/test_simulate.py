@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from ratslam.cli import main
-from ratslam.config.run_config import RunConfig
+from ratslam.config.run_config import RunConfig, load_config
 from ratslam.experiments.trials.ablation import trial
 from ratslam.pipeline.run import open_source, simulate
 from robot.recordings.mcap_reader import Recording
@@ -182,12 +182,14 @@ def test_a_killed_session_is_readable(tmp_path):
     assert source.rig["simulation"]["seed"] == 0
 
 
-def test_a_maze_file_lies_beside_its_configuration(folder, tmp_path):
+def test_a_maze_file_lies_beside_its_configuration(tmp_path):
     (tmp_path / "maze.txt").write_text("o---o---o\n|       |\no   o   o\n|       |\no---o---o\n")
-    config = RunConfig.model_validate(
-        {"simulation": {"maze": {"file": "maze.txt"}, "path": {"loop": [(0, 0), (1, 0), (1, 1), (0, 1)]}}}
+    (tmp_path / "config.yaml").write_text(
+        "simulation: {maze: {file: maze.txt}, path: {loop: [[0, 0], [1, 0], [1, 1], [0, 1]]}}\n"
     )
-    assert simulate(config, tmp_path, tmp_path / "a.mcap") == (Recording(tmp_path / "a.mcap").length, False)
+    count, interrupted = simulate(load_config(tmp_path / "config.yaml"), tmp_path / "a.mcap")
+    assert count == Recording(tmp_path / "a.mcap").length
+    assert not interrupted
 
 
 def test_copies_of_a_session_are_perturbed(folder):
