@@ -14,10 +14,9 @@ from typing import Any
 
 
 def main() -> int:
-    import ratslam.live.session.session
-    from ratslam.live.session.session import live
-
+    import ratslam.live.session
     from ratslam.cli import main as program
+    from ratslam.live.session import live
     from robot.live import selftest
     from tests.ratslam.live import stub_mapper
 
