@@ -60,7 +60,7 @@ def _frontier(arguments: argparse.Namespace) -> int:
     from ratslam.experiments.pareto.error_metrics import error_named, usual_error
     from ratslam.experiments.pareto.report import Frontier, save, text
     from ratslam.experiments.pareto.summary import grouped, lines
-    from ratslam.experiments.studies.executor import FOLDER
+    from ratslam.experiments.studies.recorded_runs import FOLDER
     from ratslam.experiments.studies.report import remarks
     from ratslam.experiments.studies.study import jobs, read_study
 

@@ -103,7 +103,7 @@ def _sweep(arguments: argparse.Namespace) -> int:
 
 
 def _table(arguments: argparse.Namespace, study: Any, directory: Path) -> int:
-    from ratslam.experiments.studies.executor import FOLDER, results
+    from ratslam.experiments.studies.recorded_runs import FOLDER, results
     from ratslam.experiments.studies.report import remarks, rows, save, table
     from ratslam.experiments.studies.study import jobs
 
@@ -118,7 +118,7 @@ def _table(arguments: argparse.Namespace, study: Any, directory: Path) -> int:
 
 
 def _tune(arguments: argparse.Namespace, study: Any, directory: Path) -> int:
-    from ratslam.experiments.studies.executor import FOLDER
+    from ratslam.experiments.studies.recorded_runs import FOLDER
     from ratslam.experiments.studies.tuning import report, save, tune
 
     plan = study.plan

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ratslam.experiments.pareto.cpu_affinity import one_core, others
-from ratslam.experiments.studies.executor import FOLDER, results
+from ratslam.experiments.studies.recorded_runs import FOLDER, results
 from ratslam.experiments.studies.results import Result, read_result
 from ratslam.experiments.studies.study import Job, made
 

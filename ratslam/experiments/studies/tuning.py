@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from ratslam.experiments.studies.config_hash import digest_of
-from ratslam.experiments.studies.executor import Pool
 from ratslam.experiments.studies.optuna_storage import Trial, opened
+from ratslam.experiments.studies.recorded_runs import Pool
 from ratslam.experiments.studies.report import replace
 from ratslam.experiments.studies.results import Result
 from ratslam.experiments.studies.schema import TunePlan
@@ -30,7 +30,7 @@ def tune(
     """Tries as many sets of parameters as the study asks for, with those of earlier calls in this directory.
 
     Args:
-        directory, workers, scheduler: see `ratslam.experiments.studies.executor.results`. done: told of
+        directory, workers, scheduler: see `ratslam.experiments.studies.recorded_runs.results`. done: told of
         each run; None if it
             is of a trial that was known before.
 

@@ -23,7 +23,7 @@ from ratslam.experiments.pareto.cpu_affinity import one_core, others
 from ratslam.experiments.pareto.error_metrics import error_named, usual_error
 from ratslam.experiments.pareto.pareto_front import optimal
 from ratslam.experiments.pareto.summary import lines
-from ratslam.experiments.studies.executor import FOLDER
+from ratslam.experiments.studies.recorded_runs import FOLDER
 from ratslam.experiments.studies.results import Result, Timing, write_result
 from ratslam.experiments.studies.run_job import machine
 from ratslam.experiments.studies.study import read_study

@@ -53,5 +53,5 @@ def played(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         quantities = {name: Quantity(label=name, value=value, unit="") for name, value in values.items()}
         return Result(hash=job.hash, seed=job.seed, quantities=quantities, steps=1)
 
-    monkeypatch.setattr("ratslam.experiments.studies.executor.run_job", run_job)
+    monkeypatch.setattr("ratslam.experiments.studies.recorded_runs.run_job", run_job)
     return asked

@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ratslam.cli import main
-from ratslam.experiments.studies.executor import FOLDER, results
+from ratslam.experiments.studies.recorded_runs import FOLDER, results
 from ratslam.experiments.studies.results import Result, read_result
 from ratslam.experiments.studies.study import jobs, read_study
 from tactile.base.errors import InputError
@@ -122,7 +122,7 @@ def test_whatever_is_lost_is_run_again_and_nothing_else(data, scores, tmp_path_f
     (folder / "study.yaml").write_text(json.dumps({"base": "base.yaml", "rows": rows, "seeds": 2}))
     asked = jobs(read_study(folder / "study.yaml"))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("ratslam.experiments.studies.executor.run_job", counting(calls := []))
+        patch.setattr("ratslam.experiments.studies.recorded_runs.run_job", counting(calls := []))
         whole = list(results(asked, folder, workers=1))
         assert len(calls) == 2 * len(scores)  # twins are one
         assert [each.row for each in whole] == [job.row for job in asked]
@@ -178,7 +178,7 @@ def test_a_missing_dask_is_told(tiny, tmp_path, monkeypatch):
 
 
 def test_a_scheduler_that_is_not_there_is_told(tiny, tmp_path, monkeypatch):
-    monkeypatch.setattr("ratslam.experiments.studies.dask_cluster.PATIENCE", 0.3)
+    monkeypatch.setattr("ratslam.experiments.studies.executor.ANSWER_TIME", 0.3)
     asked = jobs(read_study(tiny(seeds=2)))
     for address in ("tcp://127.0.0.1:1", "nonsense://x"):
         with pytest.raises(InputError, match="--scheduler: no scheduler answers"):

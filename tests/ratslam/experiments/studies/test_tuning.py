@@ -10,8 +10,8 @@ import time
 import pytest
 
 from ratslam.cli import main
-from ratslam.experiments.studies.executor import FOLDER
 from ratslam.experiments.studies.optuna_storage import JOURNAL, Trial, opened
+from ratslam.experiments.studies.recorded_runs import FOLDER
 from ratslam.experiments.studies.study import read_study
 from ratslam.experiments.studies.tuning import report, tune
 from tactile.base.errors import InputError
