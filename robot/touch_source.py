@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from types import TracebackType
 from typing import Any, Protocol, Self
 
-import numpy as np
-
 from robot.simulation.create.session import RovingConfig
 from robot.simulation.create.template_training import trained
-from robot.sources.source import Rigged, Sample, Source, rig_of
+from robot.sources.source import Sample, Source
+from robot.sources.source_info import SourceInfo
 from tactile.base.errors import InputError
 from tactile.base.types import Observation
-from tactile.features.calibration import Calibration, from_arrays
 from tactile.frontend import Frontend, TouchConfig
 from tactile.wall_estimation.report_frontend import Reporting, ReportsConfig
 from tactile.wall_estimation.strain_templates import StrainTemplates
@@ -50,8 +48,6 @@ class Sensing:
         InputError: another number of whiskers than the sense has.
     """
 
-    whisked = False
-
     def __init__(self, source: Source, sense: Callable[[], Sense], where: str) -> None:
         first = sense()
         if source.whiskers != first.whiskers:
@@ -59,8 +55,7 @@ class Sensing:
         self.source, self.sense = source, sense
         self.name, self.rate_hz, self.digest = source.name, source.rate_hz, source.digest
         self.view_shape, self.whiskers, self.length = first.view_shape, source.whiskers, source.length
-        self.rig: Mapping[str, Any] = rig_of(source)
-        self.params: Mapping[str, Any] = getattr(source, "params", {})
+        self.info = source.info.model_copy(update={"raw_whiskers": False})
 
     def __iter__(self) -> Iterator[Sample]:
         sense = self.sense()
@@ -84,59 +79,42 @@ class Sensing:
 
 
 def sensing(source: Source, config: TouchConfig) -> Source:
-    """The source as one of observations, by the calibration that it brings along.
+    """The source, its whisker readings turned into observations.
 
     Raises:
-        InputError: it does not go with the head, or its calibration cannot be used.
+        InputError: the source has another number of whiskers than the configuration, or no calibration where
+            one is needed.
     """
-    if not isinstance(source, Rigged) or not source.whisked:
+    info = source.info
+    if not info.raw_whiskers:
         return source
-    if "roving" in source.rig:
-        reports = reports_of(source, config.reports)
+    if info.planar_whiskers is not None:
+        reports = reports_of(info, config.reports)
         templates = templates_of(source, reports)
         return Sensing(source, lambda: Reporting(reports, templates), "touch.reports.mounts")
-    frontend = Frontend(config, calibration_of(source))
+    frontend = Frontend(config, info.calibration)
     return Sensing(source, lambda: frontend, "touch.head")
 
 
-def calibration_of(source: Source) -> Calibration | None:
-    """The calibration kept with a source."""
-    found = rig_of(source).get("calibration")
-    if found is None:
-        return None
-    where = f"{source.name}: calibration"
-    try:
-        return from_arrays({name: np.asarray(value, _kind(name)) for name, value in found.items()}, where)
-    except (AttributeError, TypeError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(where, str(error), "a calibration as kept with a session") from None
-
-
-def _kind(name: str) -> type:
-    return bool if name == "alive" else float
-
-
-def head_of(source: Source, config: HeadConfig) -> HeadConfig:
-    """The head that a source was made with, but for what is set in the configuration.
+def head_of(info: SourceInfo, config: HeadConfig) -> HeadConfig:
+    """The head of a source, with all values that the configuration sets in place of its own.
 
     Raises:
-        InputError: the source's is none.
+        InputError: both together are not a valid head.
     """
-    found = rig_of(source).get("head")
-    if found is None:
+    if info.head is None:
         return config
     try:
-        return HeadConfig.model_validate({**found, **config.model_dump(exclude_unset=True)})
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{source.name}: head", str(error), "a head as kept with a session") from None
+        return HeadConfig.model_validate({**info.head.model_dump(), **config.model_dump(exclude_unset=True)})
+    except ValueError as error:
+        raise InputError("touch.head", str(error), "values that fit the head of the source") from None
 
 
 def observation_of(sample: Sample) -> Observation:
-    """The reading of a source of observations.
+    """The reading of a sample, which must be an observation.
 
     Raises:
-        InputError: it is none.
+        InputError: it is whisker data.
     """
     if not isinstance(sample.reading, Observation):
         raise InputError("recording.file", "whiskers", "observations", "process the whiskers first")
@@ -144,43 +122,34 @@ def observation_of(sample: Sample) -> Observation:
 
 
 def feelers_of(source: Source, config: TouchConfig) -> Feelers | None:
-    """A source's whiskers as a map of the floor sees them; None of one without.
-
-    Raises:
-        InputError: it does not say what whiskers it has.
-    """
+    """The whiskers of a source projected to the floor; None for a source without whiskers."""
     if not source.whiskers:
         return None
-    if "roving" in rig_of(source):
-        return reports_of(source, config.reports).feelers
-    return swept(ur10_head(head_of(source, config.head)), TALLEST)
+    if source.info.planar_whiskers is not None:
+        return reports_of(source.info, config.reports).feelers
+    return swept(ur10_head(head_of(source.info, config.head)), TALLEST)
 
 
-def reports_of(source: Source, config: ReportsConfig) -> ReportsConfig:
-    """The settings with the whiskers of a source of reports, but for what is set.
-
-    Raises:
-        InputError: it does not say what whiskers it has.
-    """
-    whiskers = _roving(source).whiskers
-    found = {
-        "mounts": tuple((mount.x, mount.y, mount.direction_deg) for mount in whiskers.mounts),
-        "length": whiskers.length,
-    }
+def reports_of(info: SourceInfo, config: ReportsConfig) -> ReportsConfig:
+    """The configuration, with the whiskers of a source wherever it does not set its own."""
+    found = info.planar_whiskers.model_dump() if info.planar_whiskers else {}
     return config.model_copy(update={k: v for k, v in found.items() if k not in config.model_fields_set})
 
 
 def templates_of(source: Source, config: ReportsConfig) -> StrainTemplates | None:
-    """Strain templates of a simulated Create, driven into walls as it was made; None where none are asked for
-    or a file has them."""
+    """Strain templates, trained by simulating the Create of a source; None if the configuration needs none or
+    names a file.
+
+    Raises:
+        InputError: the source does not state how its Create was simulated.
+    """
     if config.templates is not None or config.walls not in ("template", "fused"):
         return None
-    return trained(_roving(source))
-
-
-def _roving(source: Source) -> RovingConfig:
-    made = {name: value for name, value in rig_of(source)["roving"].items() if name != "sha256"}
     try:
-        return RovingConfig.model_validate(made)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{source.name}: roving", str(error), "a robot as kept with a session") from None
+        made = RovingConfig.model_validate(source.info.provenance.get("create_simulation"))
+    except ValueError as error:
+        raise InputError(
+            f"{source.name}: create_simulation", str(error), "the configuration of a simulated Create",
+            "train strain templates and name their file in touch.reports.templates",
+        ) from None  # fmt: skip
+    return trained(made)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -24,9 +23,8 @@ from robot.live.config import LiveConfig
 from robot.recordings.formats import RecordingConfig
 from robot.simulation.create.session import RovingConfig
 from robot.simulation.head.session import SimulationConfig
-from robot.sources.in_memory import Log
 from robot.sources.odometry_extent import extent
-from robot.sources.source import Source, rig_of
+from robot.sources.source import Source
 from robot.touch_source import head_of
 from tactile.base.config import Settings
 from tactile.frontend import TouchConfig
@@ -157,16 +155,13 @@ class RunConfig(Settings):
             InputError: the recording's head is none.
         """
         parts: dict[str, Settings] = {}
-        head = head_of(source, self.touch.head)
+        info = source.info
+        head = head_of(info, self.touch.head)
         if head != self.touch.head:
             parts["touch"] = self.touch.model_copy(update={"head": head})
-        params = getattr(source, "params", {})
-        cell = params.get("pc_cell_x_size")
-        stated = float(cell) if isinstance(cell, int | float) else 0.0
-        if "cell_size" not in self.pose_cells.model_fields_set and isfinite(stated) and stated > 0:
-            parts["pose_cells"] = self.pose_cells.model_copy(update={"cell_size": stated})
-        ids_only = isinstance(source, Log) and bool((source.label >= 0).any()) and not source.seen.any()
-        if "source" not in self.templates.model_fields_set and ids_only:
+        if "cell_size" not in self.pose_cells.model_fields_set and info.cell_size is not None:
+            parts["pose_cells"] = self.pose_cells.model_copy(update={"cell_size": info.cell_size})
+        if "source" not in self.templates.model_fields_set and info.labels_only:
             parts["templates"] = self.templates.model_copy(update={"source": "labels"})
         completed = self.model_copy(update=parts)
         if completed.backend == "grid":
@@ -177,7 +172,7 @@ class RunConfig(Settings):
 
     def _charted(self, source: Source) -> RunConfig:
         """The same, with what the grid filter should know of the source."""
-        completed = self if "roving" in rig_of(source) else _filled(self, ARM)
+        completed = self if source.info.planar_whiskers is not None else _filled(self, ARM)
         if completed.grid.side is not None or source.length is None:
             return completed
         return completed.covering(extent(source))

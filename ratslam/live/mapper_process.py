@@ -12,7 +12,7 @@ import queue
 import signal
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -26,6 +26,7 @@ from evaluation.metrics.scorecard import Scorecard
 from ratslam.config.run_config import RunConfig
 from robot.drivers.process_priority import PATIENT, ranked
 from robot.sources.source import Sample
+from robot.sources.source_info import SourceInfo
 from tactile.base.errors import InputError
 
 LOG = "mapper.log"
@@ -38,12 +39,12 @@ class Order(NamedTuple):
     """What is to be mapped.
 
     Attributes:
-        config: with `recording` being what the session is recorded to. rig: as in the recording.
+        config: with `recording` being what the session is recorded to. info: as in the recording.
         directory: the new run directory. view_shape, whiskers, rate_hz: of the samples.
     """
 
     config: RunConfig
-    rig: Mapping[str, Any]
+    info: SourceInfo
     directory: Path
     view_shape: tuple[int, int, int]
     whiskers: int
@@ -190,11 +191,11 @@ class Fed:
         interrupted: whether there was more to come, when it ends. received: when the last sample came, s.
     """
 
-    name, digest, whisked, length = "live", "", True, None
+    name, digest, length = "live", "", None
 
     def __init__(self, order: Order, line: Connection) -> None:
         self.rate_hz, self.view_shape, self.whiskers = order.rate_hz, order.view_shape, order.whiskers
-        self.rig, self.params = order.rig, order.rig.get("params", {})
+        self.info = order.info
         self.interrupted = True  # unless the parent says otherwise
         self.received = 0.0
         self._line = line

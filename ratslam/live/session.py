@@ -27,10 +27,11 @@ from robot.live.selftest import reported, room, started
 from robot.live.whisk_loop import Handed, drive, free_whisks, go
 from robot.recordings.formats import RecordingConfig
 from robot.simulation.head.session import CELL_SIZE
+from robot.sources.source_info import SourceInfo
 from robot.world.head_trajectory import Path as Way
-from robot.world.maze import text
+from robot.world.scene import maze_info
 from tactile.base.errors import InputError
-from tactile.features.calibration import Calibration, calibrated, to_json
+from tactile.features.calibration import Calibration, calibrated
 from tactile.features.whisker_image import view_shape
 from tactile.whiskers.head_geometry import ur10_head
 
@@ -112,7 +113,8 @@ def ordered(config: RunConfig, path: Way, calibration: Calibration, directory: P
     """What the mapper is to do, and what the recording says about the robot."""
     assert config.live is not None
     head = ur10_head(config.touch.head)
-    rate = config.live.plan.whisking.rate
+    plan = config.live.plan
+    rate = plan.whisking.rate
     rows = ceil(1.5 * path.duration * rate) if config.live.whisks is None else config.live.whisks
     session = config.session
     if not session.reserve:  # nothing compiles on the way
@@ -124,13 +126,14 @@ def ordered(config: RunConfig, path: Way, calibration: Calibration, directory: P
         mapped.covering(float(np.abs(path.pose[:, :2] - start[:2]).max()))
         if config.backend == "grid"
         else mapped,
-        {
-            "head": config.touch.head.model_dump(mode="json"),
-            "live": config.live.model_dump(mode="json", exclude={"plan": {"maze": {"file"}}}),
-            "calibration": to_json(calibration),
-            "params": {"pc_cell_x_size": CELL_SIZE},
-        }
-        | ({} if config.live.waypoints else {"maze": text(world(config.live.plan, head).maze)}),
+        SourceInfo(
+            raw_whiskers=True,
+            cell_size=CELL_SIZE,
+            head=config.touch.head,
+            calibration=calibration,
+            maze=None if config.live.waypoints else maze_info(world(plan, head).maze, plan.maze, plan.seed),
+            provenance={"live": config.live.model_dump(mode="json", exclude={"plan": {"maze": {"file"}}})},
+        ),
         directory,
         view_shape(config.touch.image, head),
         len(head.length),
@@ -145,7 +148,7 @@ def journal(order: Order) -> Journal:
         view_shape=order.view_shape,
         whiskers=order.whiskers,
         rate_hz=order.rate_hz,
-        rig=order.rig,
+        info=order.info,
     )
 
 

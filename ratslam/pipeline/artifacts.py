@@ -11,11 +11,9 @@ from evaluation.artifacts.whisker_views import Images, write_images
 from evaluation.metrics.grid_score import score_grid
 from evaluation.metrics.occupancy_grid import Grid, Truth, centres
 from ratslam.pipeline.run_directory import RunDirectory
-from robot.sources.source import Source, rig_of
+from robot.sources.source import Source
 from robot.world.arena import Arena, enclosed, occupied, read_arena, segments
 from robot.world.maze import read_maze, walls
-from robot.world.scene import MazeConfig
-from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose, inverse
 from tactile.frontend import TouchConfig
@@ -28,20 +26,13 @@ Felt = tuple[np.ndarray, np.ndarray]
 def keep_world(source: Source, store: RunDirectory) -> None:
     """maze.txt and walls.csv, for the pictures, of a source that knows its maze; arena.txt of one that knows
     its arena."""
-    rig = rig_of(source)
-    if isinstance(rig.get("arena"), str):
-        store.text("arena.txt", rig["arena"])
-    if not isinstance(rig.get("maze"), str):
+    if source.info.arena is not None:
+        store.text("arena.txt", source.info.arena)
+    maze = source.info.maze
+    if maze is None:
         return
-    store.text("maze.txt", rig["maze"])
-    try:
-        plan = rig["simulation"] if "simulation" in rig else rig["live"]["plan"]
-        made = MazeConfig.model_validate(plan["maze"])
-        seed = int(plan["seed"] if made.seed is None else made.seed)
-        random = stream(seed, "maze.heights")
-        boxes = walls(read_maze(store.path / "maze.txt"), random, made.heights)
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{source.name}: maze", str(error), "a maze as kept with a session") from None
+    store.text("maze.txt", maze.text)
+    boxes = walls(read_maze(store.path / "maze.txt"), stream(maze.seed, "maze.heights"), maze.heights)
     store.file("walls.csv", lambda path: write_walls(path, np.column_stack(boxes)))
 
 

@@ -20,8 +20,8 @@ from robot.recordings.formats import open_recording
 from robot.recordings.recorder import Recorder
 from robot.simulation.create.session import roving
 from robot.simulation.head.session import simulated
-from robot.sources.source import Sample, Source, rig_of
-from robot.touch_source import calibration_of, sensing
+from robot.sources.source import Sample, Source
+from robot.touch_source import sensing
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Whisk
 from tactile.frontend import Frontend
@@ -96,7 +96,7 @@ def recorder_of(path: Path, source: Source) -> Recorder:
         view_shape=source.view_shape,
         whiskers=source.whiskers,
         rate_hz=source.rate_hz,
-        rig=rig_of(source),
+        info=source.info,
         chunk_s=CHUNK / (source.rate_hz or 1.0),
     )
 
@@ -105,7 +105,7 @@ def _kept(config: RunConfig, source: Source) -> Callable[[Sample], Sample]:
     """What of a simulated sample goes into a recording: what whiskers felt, unless raw samples are wanted."""
     if config.simulation is None or config.simulation.raw:
         return lambda sample: sample
-    frontend = Frontend(config.touch, calibration_of(source))
+    frontend = Frontend(config.touch, source.info.calibration)
 
     def felt(sample: Sample) -> Sample:
         if not isinstance(sample.reading, Cycle | Whisk):

@@ -25,7 +25,7 @@ from ratslam.core.types import Action
 from ratslam.pipeline.artifacts import Felt, keep_chart, keep_images, keep_world
 from ratslam.pipeline.backend_registry import Telling, backend_of, telling
 from ratslam.pipeline.run_directory import RunDirectory, read_checkpoint
-from robot.sources.source import Sample, Source, rig_of
+from robot.sources.source import Sample, Source
 from robot.touch_source import feelers_of, observation_of
 from tactile.base.errors import InputError
 from tactile.base.se2 import compose, tum_line
@@ -241,14 +241,14 @@ def _check_length(source: Source, skip: int, resume: Path | None) -> None:
 
 
 def _manifest(config: RunConfig, text: str, source: Source, resume: Path | None) -> dict[str, Any]:
-    made = rig_of(source).get("simulation", {})
+    made = source.info.simulation
     packages = ("ratslam", "jax", "jaxlib", "numpy", "scipy", "networkx")
     return {
         "format": "ratslam-run-1",
         "versions": {name: version(name) for name in packages} | {"python": platform.python_version()},
         "machine": platform.machine(),
         "recording": {"name": source.name, "sha256": source.digest, "samples": source.length},
-        "simulation": {name: made.get(name) for name in ("sha256", "seed", "tier", "why")} if made else None,
+        "simulation": made and made.model_dump(),
         "config_sha256": hashlib.sha256(text.encode()).hexdigest(),
         "seeds": {"session": config.session.seed},
         "continued": resume is not None,

@@ -7,12 +7,12 @@ that.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Lock
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from robot.recordings.cdr import encode_truth
 from robot.recordings.cdr_live import Event, encode_cut, encode_event, encode_frames, encode_states
 from robot.recordings.mcap_writer import Tape, Unwritable
 from robot.recordings.schemas import ARM, CUT, EVENT, FRAMES, TRUTH
+from robot.sources.source_info import SourceInfo
 
 GATHERED = 0.15
 """How long frames and states wait for others, s."""
@@ -35,7 +36,7 @@ class Journal:
     `fault` alone: from then on everything is passed over, and the recording stays readable up to there.
 
     Args:
-        path: must not exist yet. view_shape, whiskers, rate_hz, rig: see `robot.recordings.mcap_writer.Tape`.
+        path: must not exist yet. view_shape, whiskers, rate_hz, info: see `Tape`.
 
     Attributes:
         fault: why nothing is written any more; None while it is.
@@ -51,10 +52,10 @@ class Journal:
         view_shape: tuple[int, int, int],
         whiskers: int,
         rate_hz: float = 0.0,
-        rig: Mapping[str, Any] | None = None,
+        info: SourceInfo,
     ) -> None:
         self.fault: Fault | None = None
-        self._tape = Tape(path, view_shape=view_shape, whiskers=whiskers, rate_hz=rate_hz, rig=rig)
+        self._tape = Tape(path, view_shape=view_shape, whiskers=whiskers, rate_hz=rate_hz, info=info)
         self._lock = Lock()
         self._frames: list[Frames] = []
         self._states: list[np.ndarray] = []

@@ -15,6 +15,7 @@ from robot.recordings.unit_check import ORDINARY, Limits, Track, headings, units
 from robot.sources.in_memory import Log
 from robot.sources.input_files import missing, refuse
 from robot.sources.odometry import from_poses, from_velocities
+from robot.sources.source_info import SourceInfo
 from tactile.base.errors import InputError
 
 
@@ -62,6 +63,7 @@ def read_table(path: Path, config: TableConfig, limits: Limits = ORDINARY) -> Lo
         seen=seen,
         label=label,
         truth=truth,
+        info=SourceInfo(labels_only=bool((label >= 0).any()) and not seen.any()),
     )
 
 

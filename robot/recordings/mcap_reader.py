@@ -5,12 +5,12 @@ from __future__ import annotations
 import hashlib
 import os
 from array import array
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from itertools import chain
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from robot.recordings.sanity_checks import clock, finite, views
 from robot.recordings.schemas import TRUTH
 from robot.recordings.unit_check import ORDINARY, Limits, Track, units
 from robot.sources.input_files import refuse, require_file, unreadable
-from robot.sources.source import Sample, Source, rate_of, rig_of
+from robot.sources.source import Sample, Source, rate_of
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Observation, Report, Whisk
 
@@ -40,8 +40,7 @@ class Recording:
         warning: that sentence, or ''.
         created_by: program and version that recorded it.
         events: what a live session noted: faults, discontinuities, dropped images.
-        rig: by what it was made, {} where the file does not say. whisked: whether some of its readings are
-            whiskers, which have no view yet. params: what the rig says for whoever reproduces a run on it.
+        info: devices, world and origin, as stored; `raw_whiskers` is set from the readings.
 
     Raises:
         InputError: no such recording, no sample in it that can be read, or values that cannot be.
@@ -60,11 +59,11 @@ class Recording:
         walk = Walk(path)
         columns = array("d")
         events: list[Event] = []
-        self.whisked = False
+        raw_whiskers = False
         for entry in walk.entries():
             if isinstance(entry.content, Sample):
                 columns.extend(_column(entry.content))
-                self.whisked |= not isinstance(entry.content.reading, Observation)
+                raw_whiskers |= not isinstance(entry.content.reading, Observation)
             elif isinstance(entry.content, Event):
                 events.append(entry.content)
         description = walk.description
@@ -72,7 +71,8 @@ class Recording:
             raise _nothing(walk)
         self.events = tuple(events)
         self.view_shape, self.whiskers = description.view_shape, description.whiskers
-        self.created_by, self.rig = description.created_by, description.rig
+        self.created_by = description.created_by
+        self.info = description.info.model_copy(update={"raw_whiskers": raw_whiskers})
         self.length = walk.count
         self.truncated = bool(walk.broken)
         self.warning = ""
@@ -82,11 +82,6 @@ class Recording:
         self.rate_hz = rate_of(time) or description.rate_hz
         if self.truncated and warn is not None:
             warn(self.warning)
-
-    @property
-    def params(self) -> Mapping[str, Any]:
-        params = self.rig.get("params")
-        return params if isinstance(params, dict) else {}
 
     def _check(self, columns: np.ndarray, limits: Limits) -> np.ndarray:
         """The times [N] s of the samples with odometry, after refusing what cannot be."""
@@ -147,7 +142,7 @@ def record(source: Source, path: Path) -> int:
         view_shape=source.view_shape,
         whiskers=source.whiskers,
         rate_hz=source.rate_hz,
-        rig=rig_of(source),
+        info=source.info,
     ) as recorder:
         for sample in source:
             recorder.write(sample)
@@ -174,7 +169,7 @@ def recover(path: Path, out: Path) -> Recovery:
     draft = out.with_name(f".{out.name}.{os.getpid()}.part")
     try:
         tape = Tape(draft, view_shape=described.view_shape, whiskers=described.whiskers,
-                    rate_hz=described.rate_hz, rig=described.rig)  # fmt: skip
+                    rate_hz=described.rate_hz, info=described.info)  # fmt: skip
         with closing(tape):
             for entry in chain([first], entries):
                 if entry.truth is not None:

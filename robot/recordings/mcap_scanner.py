@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, NamedTuple
 from zlib import crc32
 
 import numpy as np
@@ -24,9 +24,10 @@ from robot.recordings.mcap_records import BROKEN, records
 from robot.recordings.schemas import ARM, CUT, FRAMES, READINGS, SCHEMA_OF, SCHEMAS, TRUTH
 from robot.sources.input_files import unreadable
 from robot.sources.source import Sample
+from robot.sources.source_info import SourceInfo
 
 METADATA = "ratslam"
-FORMAT = "2"
+FORMAT = "3"
 
 
 class Description(NamedTuple):
@@ -35,24 +36,24 @@ class Description(NamedTuple):
     Attributes:
         view_shape: (R, C, K). whiskers: W. rate_hz: as announced by who recorded it, 0 if unknown.
         created_by: program and version.
-        rig: a JSON document about the robot that was recorded (see `robot.sources.source.Rigged`).
+        info: devices, world and origin of the session.
     """
 
     view_shape: tuple[int, int, int]
     whiskers: int
     rate_hz: float
     created_by: str
-    rig: Mapping[str, Any] = {}
+    info: SourceInfo
 
     def to_metadata(self) -> dict[str, str]:
-        """Raises `ValueError` for a rig that JSON cannot hold."""
+        """Raises `TypeError` or `ValueError` for provenance that is not JSON."""
         data = {
             "format": FORMAT,
             "view_shape": ",".join(map(str, self.view_shape)),
             "whiskers": str(self.whiskers),
             "rate_hz": repr(self.rate_hz),
             "created_by": self.created_by,
-            "rig": json.dumps(self.rig, allow_nan=False, sort_keys=True),
+            "info": self.info.to_json(),
         }
         return data | {"crc32": _checksum(data)}
 
@@ -60,20 +61,19 @@ class Description(NamedTuple):
     def from_metadata(cls, data: Mapping[str, str]) -> Description:
         """Raises `ValueError` for anything `to_metadata` cannot have written."""
         if data.get("format") != FORMAT:
-            raise Malformed(f"format {data.get('format')!r} where {FORMAT!r} is the one known")
+            raise Malformed(f"its format is {data.get('format')!r}, this version reads {FORMAT!r}")
         if data.get("crc32") != _checksum(data):
             raise Malformed("a description without its checksum")
         try:
             rows, columns, channels = (int(size) for size in data["view_shape"].split(","))
-            whiskers, rate_hz, rig = int(data["whiskers"]), float(data["rate_hz"]), json.loads(data["rig"])
-            found = cls((rows, columns, channels), whiskers, rate_hz, data["created_by"], rig)
+            whiskers, rate_hz = int(data["whiskers"]), float(data["rate_hz"])
+            info = SourceInfo.from_json(data["info"])
+            found = cls((rows, columns, channels), whiskers, rate_hz, data["created_by"], info)
         except KeyError as error:
             raise Malformed(f"a description without {error}") from error
         sizes = (*found.view_shape, found.whiskers + 1)
         if min(sizes) < 1 or rows * columns * channels + 3 * found.whiskers > MOST:
             raise Malformed(f"views of shape {found.view_shape} and {found.whiskers} whiskers")
-        if not isinstance(rig, dict):
-            raise Malformed("a rig that is no document")
         return found
 
 

@@ -5,7 +5,6 @@ zstd-compressed chunks with checksums, each handed to the operating system as a 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -16,6 +15,7 @@ from mcap.writer import CompressionType, Writer
 
 from robot.recordings.mcap_scanner import METADATA, Description
 from robot.recordings.schemas import READINGS, SCHEMAS, TOPICS, TRUTH
+from robot.sources.source_info import SourceInfo
 from tactile.base.errors import InputError
 
 
@@ -33,9 +33,7 @@ class Tape:
     Args:
         path: must not exist yet.
         view_shape, whiskers: of every sample. rate_hz: how fast they come, if known; for readers' eyes only.
-        rig: by what the samples were made (see `robot.sources.source.Rigged`): what JSON can hold. It
-        stands at the
-            start of the file, so one that is cut off still has it.
+        info: devices, world and origin; stored at the start of the file, so that a truncated one has it.
         chunk_bytes: a chunk is written when it is so large, before compression,
         chunk_s: or when its last message's time is so many seconds off the last one's of the chunk before.
 
@@ -44,7 +42,7 @@ class Tape:
 
     Raises:
         InputError: the file exists or cannot be made.
-        ValueError, TypeError: the rig is more than JSON can hold.
+        ValueError, TypeError: provenance in `info` is not JSON.
     """
 
     def __init__(
@@ -54,11 +52,11 @@ class Tape:
         view_shape: tuple[int, int, int],
         whiskers: int,
         rate_hz: float,
-        rig: Mapping[str, Any] | None,
+        info: SourceInfo,
         chunk_bytes: int = 1 << 16,
         chunk_s: float = 0.5,
     ) -> None:
-        self.description = Description(view_shape, whiskers, rate_hz, _program(), dict(rig or {}))
+        self.description = Description(view_shape, whiskers, rate_hz, _program(), info)
         metadata = self.description.to_metadata()
         Description.from_metadata(metadata)
         self.path = path
@@ -83,7 +81,7 @@ class Tape:
             compression=CompressionType.ZSTD,
             enable_data_crcs=True,
         )
-        self._writer.start(library=_program())
+        self._writer.start(profile="ros2", library=_program())
         self._writer.add_metadata(METADATA, metadata)
         self.flush()
 

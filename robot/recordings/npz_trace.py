@@ -24,6 +24,7 @@ from robot.recordings.unit_check import ORDINARY, Limits, Track, units
 from robot.sources.in_memory import Log
 from robot.sources.input_files import digest_of, missing, read_bytes, refuse
 from robot.sources.odometry import NEW_HEADING, from_velocities
+from robot.sources.source_info import SourceInfo
 from tactile.base.errors import InputError
 
 VIEW, ODOMETRY = 1, 2
@@ -36,7 +37,7 @@ _BROKEN = (zipfile.BadZipFile, zlib.error, ValueError, LookupError, EOFError, OS
 
 
 def read_stream(path: Path, limits: Limits = ORDINARY) -> Log:
-    """A reference stream as a `Source`; `params` holds its parameters, numbers as numbers.
+    """A reference stream as a `Source`; `info.provenance["parameters"]` holds its parameters.
 
     Raises:
         InputError: not such a file, arrays missing or of the wrong shape, or values that cannot be.
@@ -85,7 +86,7 @@ def read_stream(path: Path, limits: Limits = ORDINARY) -> Log:
         seen=np.zeros_like(seen) if given_ids else seen,
         label=label,
         truth=truth,
-        params=params,
+        info=_info(params, bool(given_ids and seen.any())),
     )
 
 
@@ -145,12 +146,23 @@ def _params(path: Path, text: np.ndarray) -> dict[str, float | int | str]:
     return {key: _number(value) for key, value in params.items()}
 
 
+def _info(params: dict[str, float | int | str], labels_only: bool) -> SourceInfo:
+    cell = params.get("pc_cell_x_size")
+    return SourceInfo(
+        labels_only=labels_only,
+        cell_size=float(cell) if isinstance(cell, int | float) and 0 < cell < np.inf else None,
+        provenance={"parameters": params},
+    )
+
+
 def _number(value: object) -> float | int | str:
     for kind in (int, float):
         try:
-            return kind(str(value))
+            number = kind(str(value))
         except ValueError:
             continue
+        if -np.inf < number < np.inf:
+            return number
     return str(value)
 
 

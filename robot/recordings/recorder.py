@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
@@ -13,6 +12,7 @@ from robot.recordings.cdr import encode, encode_truth
 from robot.recordings.mcap_writer import Tape
 from robot.recordings.schemas import TRUTH
 from robot.sources.source import Sample
+from robot.sources.source_info import SourceInfo
 from tactile.base.errors import InputError
 
 
@@ -23,7 +23,7 @@ class Recorder:
 
     Raises:
         InputError: the file exists or cannot be made.
-        ValueError, TypeError: the rig is more than JSON can hold.
+        ValueError, TypeError: provenance in `info` is not JSON.
     """
 
     def __init__(
@@ -33,7 +33,7 @@ class Recorder:
         view_shape: tuple[int, int, int] = (3, 6, 1),
         whiskers: int = 0,
         rate_hz: float = 0.0,
-        rig: Mapping[str, Any] | None = None,
+        info: SourceInfo | None = None,
         chunk_bytes: int = 1 << 16,
         chunk_s: float = 0.5,
     ) -> None:
@@ -42,7 +42,7 @@ class Recorder:
             view_shape=view_shape,
             whiskers=whiskers,
             rate_hz=rate_hz,
-            rig=rig,
+            info=info or SourceInfo(),
             chunk_bytes=chunk_bytes,
             chunk_s=chunk_s,
         )

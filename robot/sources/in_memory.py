@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import repeat
 from types import TracebackType
@@ -11,6 +11,7 @@ from typing import Self
 import numpy as np
 
 from robot.sources.source import Sample, Source, rate_of
+from robot.sources.source_info import SourceInfo
 from tactile.base.errors import InputError
 from tactile.base.types import Observation, Odometry, observation
 
@@ -25,8 +26,8 @@ class Log:
         views: [N, R, C, K] in 0..1, zero where not seen. seen: [N] whether there is a view.
         label: [N] given place id, -1 for none.
         truth: [N, 3] (x m, y m, heading rad), a row of NaN where unknown; None when nowhere known.
-        params: what the recording says about itself, for whoever wants to reproduce a run on it.
-        alive: [W] whiskers that report at all; none for cameras, lasers and given labels.
+        info: devices, world and origin.
+        alive: [W] whether each whisker works; empty for cameras, lasers and given labels.
     """
 
     name: str
@@ -38,7 +39,7 @@ class Log:
     seen: np.ndarray
     label: np.ndarray
     truth: np.ndarray | None = None
-    params: Mapping[str, float | int | str] = field(default_factory=dict)
+    info: SourceInfo = field(default_factory=SourceInfo)
     alive: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
 
     def __post_init__(self) -> None:
@@ -115,6 +116,6 @@ def collected(source: Source) -> Log:
         seen=np.array([reading.view_seen for reading in readings]),
         label=np.array([reading.label for reading in readings], np.int32),
         truth=None if np.isnan(truth).all() else truth,
-        params=getattr(source, "params", {}),
+        info=source.info.model_copy(update={"raw_whiskers": False}),
         alive=alive,
     )

@@ -26,7 +26,6 @@ class Made(ABC):
         time: [N] s. truth: [N, 3] m, m, rad. odometry: [N, 4] of each row, as `tactile.base.types.Odometry`.
     """
 
-    whisked = True
     time: np.ndarray
     truth: np.ndarray
     odometry: np.ndarray

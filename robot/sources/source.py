@@ -1,13 +1,14 @@
-"""What every recording, simulator and live robot looks like from outside."""
+"""The interface of every recording, simulator and live robot."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from types import TracebackType
-from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
+from typing import NamedTuple, Protocol, Self, runtime_checkable
 
 import numpy as np
 
+from robot.sources.source_info import SourceInfo
 from tactile.base.types import Cycle, Observation, Report, Whisk
 
 
@@ -15,11 +16,11 @@ class Sample(NamedTuple):
     """One step of a source.
 
     Attributes:
-        time: s, on the source's own clock; never goes back.
-        reading: what the robot sensed: an `Observation`, or whiskers, raw (`Cycle`), felt (`Whisk`) or of a
-            state machine (`Report`), of which the sense of touch makes one.
-        truth: [3] where the robot really was (x m, y m, heading rad), or None where that is unknown.
-            It travels beside the reading, never inside, so no engine can peek.
+        time: s, on the source's own clock; never decreases.
+        reading: sensor data: an `Observation`, or whisker data that a touch front end turns into one: raw
+            samples (`Cycle`), contact features (`Whisk`) or a motion of the Create (`Report`).
+        truth: [3] true pose (x m, y m, heading rad), or None where unknown. It is kept apart from the
+            reading so that no backend can use it.
     """
 
     time: float
@@ -29,15 +30,16 @@ class Sample(NamedTuple):
 
 @runtime_checkable
 class Source(Protocol):
-    """A context manager to iterate over. A recording may be iterated again, a live robot only once.
+    """An iterable context manager. A recording can be iterated several times, a live robot once.
 
     Attributes:
         name: short name for reports.
-        rate_hz: median number of samples per second; 0 where it is unknown.
+        rate_hz: median number of samples per second; 0 if unknown.
         view_shape: (R, C, K) of every view, seen or masked.
         whiskers: W, 0 for cameras, lasers and given labels.
-        length: number of samples; None where nobody knows yet.
-        digest: sha256 (hex) of everything read, so that a run can name its input; '' for a live robot.
+        length: number of samples; None if not known in advance.
+        digest: sha256 (hex) of all input, which identifies it in a run directory; '' for a live robot.
+        info: devices, world and origin.
     """
 
     @property
@@ -52,31 +54,13 @@ class Source(Protocol):
     def length(self) -> int | None: ...
     @property
     def digest(self) -> str: ...
+    @property
+    def info(self) -> SourceInfo: ...
     def __iter__(self) -> Iterator[Sample]: ...
     def __enter__(self) -> Self: ...
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None: ...
-
-
-@runtime_checkable
-class Rigged(Source, Protocol):
-    """A source that knows by what it was made.
-
-    Attributes:
-        rig: a JSON document: the head's configuration, the simulation's, calibrations; {} where unknown.
-        whisked: whether readings are whiskers, which have no view yet.
-    """
-
-    @property
-    def rig(self) -> Mapping[str, Any]: ...
-    @property
-    def whisked(self) -> bool: ...
-
-
-def rig_of(source: Source) -> Mapping[str, Any]:
-    """By what a source was made; {} where it does not know."""
-    return source.rig if isinstance(source, Rigged) else {}
 
 
 def rate_of(time: np.ndarray) -> float:

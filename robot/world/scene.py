@@ -8,6 +8,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
+from robot.sources.source_info import MazeInfo
 from robot.world.head_trajectory import MotionConfig, Path, at, carried, planned
 from robot.world.maze import (
     CELL,
@@ -19,6 +20,7 @@ from robot.world.maze import (
     random_loop,
     read_maze,
     scattered,
+    text,
     walls,
 )
 from robot.world.maze_routes import anticlockwise, checked, circuits, exploration
@@ -175,6 +177,11 @@ def around(boxes: Walls, head: Head, path: Path) -> Surroundings:
             "lower the walls, or hang the head higher (touch.head.rings)",
         )
     return surroundings
+
+
+def maze_info(maze: Maze, config: MazeConfig, seed: int) -> MazeInfo:
+    """The maze of a session with that seed, as its source states it."""
+    return MazeInfo(text=text(maze), heights=config.heights, seed=_maze_seed(config, seed))
 
 
 def _maze_seed(config: MazeConfig, seed: int) -> int:

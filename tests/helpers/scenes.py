@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from robot.sources.in_memory import Log
+from robot.sources.source_info import SourceInfo
 from tactile.base.se2 import between, wrap
 
 CELL = 0.1
@@ -92,5 +93,5 @@ def recorded(path: np.ndarray, motion: np.ndarray, views: np.ndarray) -> Log:
         seen=np.ones(count, bool),
         label=np.full(count, -1, np.int32),
         truth=np.column_stack([path[:, :2], wrap(path[:, 2])]),
-        params={"pc_cell_x_size": CELL},
+        info=SourceInfo(cell_size=CELL),
     )

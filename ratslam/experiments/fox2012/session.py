@@ -105,7 +105,7 @@ def felt(config: RunConfig, outing: Outing, seed: int) -> list[Observation]:
     Raises:
         InputError: templates that cannot be used.
     """
-    reports = reports_of(outing.source, config.touch.reports)
+    reports = reports_of(outing.source.info, config.touch.reports)
     templates = None
     if reports.templates is None and reports.walls in ("template", "fused"):
         made = outing.source.config
@@ -118,7 +118,7 @@ def mapped(
     config: RunConfig, outing: Outing, reports: list[Observation], stops: tuple[int, ...]
 ) -> list[Mapped]:
     """What the configuration's filter has made of the reports at each stop, a number of them."""
-    touch = reports_of(outing.source, config.touch.reports)
+    touch = reports_of(outing.source.info, config.touch.reports)
     grid = config.grid
     if grid.side is None:
         grid = grid.model_copy(update={"side": 2 * (span(outing.arena) + BEYOND)})

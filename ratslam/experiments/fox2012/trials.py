@@ -82,7 +82,7 @@ def results(job: Job) -> list[Result]:
     found: list[Result] = []
     for (method, mapper), config in job.variants.items():
         reports = felt(config, out, job.training)
-        marks, feelers = felt_marks(reports), reports_of(out.source, config.touch.reports).feelers
+        marks, feelers = felt_marks(reports), reports_of(out.source.info, config.touch.reports).feelers
         for stop, filtered in enumerate(mapped(config, out, reports, stops)):
             found.append(_judged(job, out, (method, mapper, FILTERED), stop, filtered))
             for name, whole in ((RECKONED, out.odometry), (TRUE, out.truth)):

@@ -33,7 +33,7 @@ from ratslam.experiments.studies.timing import Stopwatch
 from ratslam.pipeline.artifacts import truth_of
 from ratslam.pipeline.run import open_source
 from ratslam.pipeline.runner import Anytimes, readings, session_of
-from robot.sources.source import Source, rig_of
+from robot.sources.source import Source
 from robot.touch_source import sensing
 from robot.world.arena import read_arena
 from tactile.base.errors import InputError
@@ -147,8 +147,8 @@ def _run(
 
 def _chart(session: Session, source: Source) -> dict[str, Quantity]:
     """What is measured on a map that is a grid, of an arena that is known."""
-    write, arena = session.map.files().get("grid.npz"), rig_of(source).get("arena")
-    if write is None or not isinstance(arena, str):
+    write, arena = session.map.files().get("grid.npz"), source.info.arena
+    if write is None or arena is None:
         return {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

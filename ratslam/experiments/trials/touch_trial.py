@@ -187,7 +187,7 @@ def first(log: Log, steps: int) -> Log:
     """The log's first steps."""
     columns = ("time", "motion", "moved", "views", "seen", "label", "truth")
     cut = {name: getattr(log, name)[:steps] for name in columns if getattr(log, name) is not None}
-    return Log(name=log.name, digest=f"{log.digest}[:{steps}]", params=log.params, alive=log.alive, **cut)
+    return Log(name=log.name, digest=f"{log.digest}[:{steps}]", info=log.info, alive=log.alive, **cut)
 
 
 def room_for(steps: int) -> int:

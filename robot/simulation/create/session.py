@@ -6,9 +6,8 @@ behaviour, wheels, strain), so that changing one leaves what the others draw as 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path as File
-from typing import Any
 
 import numpy as np
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
@@ -26,6 +25,7 @@ from robot.simulation.create.strain_sensors import WhiskersConfig, fan
 from robot.simulation.create.wheel_odometry import WheelsConfig, reckoned
 from robot.sources.simulated import STILL, Made, document_digest, placed
 from robot.sources.source import rate_of
+from robot.sources.source_info import PlanarWhiskersInfo, SourceInfo
 from robot.world.arena import segments, text
 from robot.world.random_arena import ArenaConfig, arena
 from tactile.base.config import Settings
@@ -68,7 +68,6 @@ class Rover(Made):
     Attributes:
         config: what it was made from. arena: where it is. fan: its whiskers. steps: [N] what it did.
         time: [N] s, at the end of each step. truth: [N, 3] then. odometry: [N, 4] of each.
-        rig: what a recording of it keeps (see `robot.sources.source.Rigged`).
     """
 
     name = "roving"
@@ -89,10 +88,15 @@ class Rover(Made):
         kind = np.array([step.state.motion for step in steps])
         self.odometry = reckoned(config.wheels, motion, kind, stream(config.seed, "wheels"))
         plain = config.model_dump(mode="json", exclude={"arena": {"file"}})
-        document = {"roving": plain, "arena": text(self.arena)}
-        self.digest = document_digest(document)
-        self.params: Mapping[str, float | int | str] = {}
-        self.rig: Mapping[str, Any] = {**document, "roving": plain | {"sha256": self.digest}}
+        drawing = text(self.arena)
+        self.digest = document_digest({"roving": plain, "arena": drawing})
+        mounts = tuple((mount.x, mount.y, mount.direction_deg) for mount in config.whiskers.mounts)
+        self.info = SourceInfo(
+            raw_whiskers=True,
+            planar_whiskers=PlanarWhiskersInfo(mounts=mounts, length=config.whiskers.length),
+            arena=drawing,
+            provenance={"create_simulation": plain},
+        )
 
     @property
     def rate_hz(self) -> float:

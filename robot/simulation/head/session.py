@@ -6,9 +6,9 @@ odometry), so that changing one leaves the others as they were.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path as File
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field, NonNegativeInt
@@ -20,15 +20,16 @@ from robot.simulation.head.quasistatic import quasistatic
 from robot.simulation.head.whisk_stream import cycles, free_cycles
 from robot.sources.odometry import OdometryConfig, reckoned
 from robot.sources.simulated import STILL, Made, document_digest, placed
+from robot.sources.source_info import SimulationInfo, SourceInfo
 from robot.world.head_trajectory import MotionConfig, at
 from robot.world.maze import text
-from robot.world.scene import KidnapConfig, MazeConfig, PathConfig, another, scene
+from robot.world.scene import KidnapConfig, MazeConfig, PathConfig, another, maze_info, scene
 from robot.world.walls import Surroundings
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.types import Cycle, Whisk
-from tactile.features.calibration import Calibration, CalibrationConfig, calibrated, to_json
+from tactile.features.calibration import Calibration, CalibrationConfig, calibrated
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 from tactile.whiskers.whisking import WhiskingConfig, checked
 
@@ -111,7 +112,6 @@ class Simulation(Made):
         scene: maze, path and walls. calibration: of the head, None in the kinematic tier.
         time: [N] s. start: [N] s, when the whisk cycles began.
         truth: [N, 3]. odometry: [N, 4]. carried: [N] bool, the head was carried since the row before.
-        rig: what a recording of it keeps (see `robot.sources.source.Rigged`).
     """
 
     name = "simulation"
@@ -138,21 +138,24 @@ class Simulation(Made):
         self._felt = self._kinematic() if self.calibration is None else None
 
         plain = config.model_dump(mode="json", exclude={"maze": {"file"}})
-        document = {
-            "head": head_config.model_dump(mode="json"),
-            "simulation": plain,
-            "maze": text(self.scene.maze) if config.maze.file else "",
-        }
-        self.digest = document_digest(document)
-        self.params: Mapping[str, float | int | str] = {"pc_cell_x_size": CELL_SIZE}
-        self.rig: Mapping[str, Any] = {
-            "head": document["head"],
-            "simulation": plain | {"sha256": self.digest, "tier": self.tier.name, "why": self.tier.why},
-            "maze": text(self.scene.maze),
-            "params": dict(self.params),
-        }
-        if self.calibration is not None:
-            self.rig = {**self.rig, "calibration": to_json(self.calibration)}
+        self.digest = document_digest(
+            {
+                "head": head_config.model_dump(mode="json"),
+                "simulation": plain,
+                "maze": text(self.scene.maze) if config.maze.file else "",
+            }
+        )
+        self.info = SourceInfo(
+            raw_whiskers=True,
+            cell_size=CELL_SIZE,
+            head=head_config,
+            calibration=self.calibration,
+            maze=maze_info(self.scene.maze, config.maze, config.seed),
+            simulation=SimulationInfo(
+                sha256=self.digest, seed=config.seed, tier=self.tier.name, why=self.tier.why
+            ),
+            provenance={"simulation": plain},
+        )
 
     @property
     def rate_hz(self) -> float:

@@ -62,7 +62,7 @@ def test_a_manifest_names_the_simulation(folder):
         assert made["seed"] == 5
         assert made["tier"] == "kinematic"
         assert made["why"]
-        assert made["sha256"] == Recording(folder / "session.mcap").rig["simulation"]["sha256"]
+        assert made["sha256"] == Recording(folder / "session.mcap").info.simulation.sha256
         assert made["sha256"] != session.digest  # its head has a dead whisker
     assert (
         json.loads((folder / "direct" / "manifest.json").read_text())["recording"]["sha256"] == made["sha256"]
@@ -169,7 +169,7 @@ def test_an_interrupted_session_is_a_whole_file(tmp_path):
     assert not source.truncated
     assert 16 < source.length < 30_000
     assert f"{source.length} whisks" in out
-    assert source.rig["simulation"]["seed"] == 0
+    assert source.info.simulation.seed == 0
 
 
 def test_a_killed_session_is_readable(tmp_path):
@@ -179,7 +179,7 @@ def test_a_killed_session_is_readable(tmp_path):
     source = Recording(path)
     assert source.truncated
     assert source.length > 16
-    assert source.rig["simulation"]["seed"] == 0
+    assert source.info.simulation.seed == 0
 
 
 def test_a_maze_file_lies_beside_its_configuration(tmp_path):

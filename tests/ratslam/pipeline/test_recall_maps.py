@@ -25,7 +25,7 @@ GOLDEN = Path(__file__).parents[2] / "golden"
 
 def mapped(log: Log, precision: str = "float64", **parts) -> Session:
     """A session that has replayed the log with one setting for all, on pose cells small enough for a test."""
-    cells = {"cells_xy": 11, "cell_size": float(log.params["pc_cell_x_size"])}
+    cells = {"cells_xy": 11, "cell_size": log.info.cell_size}
     config = RatConfig.model_validate({"pose_cells": cells, **parts})
     session = Session(rat(config, log.view_shape, np.dtype(precision)), reserve=512, precision=precision)
     for _ in session.replay(sample.reading for sample in log):

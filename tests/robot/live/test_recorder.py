@@ -40,14 +40,16 @@ from robot.recordings.mcap_reader import Recording, recover
 from robot.recordings.mcap_scanner import Entry, Walk
 from robot.recordings.mcap_writer import _Whole
 from robot.recordings.schemas import SCHEMAS
+from robot.sources.source_info import SourceInfo
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Odometry
+from tactile.whiskers.head_geometry import HeadConfig
 
 ROOT = Path(__file__).parents[3]
 W, RATE = 4, 200
 START = 5e4
 """Of the session, on the host's clock, s."""
-RIG = {"head": {"rest_deg": 75.0}}
+INFO = SourceInfo(raw_whiskers=True, head=HeadConfig(rest_deg=74.0))
 
 
 def some_frames(count: int, seed: int = 0, first: int = 0) -> Frames:
@@ -92,7 +94,7 @@ def same(one: Any, other: Any) -> bool:
 
 def opened(path: Path) -> Journal:
     path.unlink(missing_ok=True)
-    return Journal(path, view_shape=(2, 2, 1), whiskers=W, rate_hz=1.0, rig=RIG)
+    return Journal(path, view_shape=(2, 2, 1), whiskers=W, rate_hz=1.0, info=INFO)
 
 
 def content(path: Path, kind: type) -> list[Any]:
@@ -130,9 +132,8 @@ def test_a_session_comes_back_bit_for_bit(tmp_path: Path) -> None:
     assert all(same(sample.reading, cycle) for sample, cycle in zip(samples, cycles, strict=True))
     assert [sample.time for sample in samples] == [START + 0.25, START + 1.25, START + 2.25]
     assert [sample.truth is None for sample in samples] == [False, False, True]
-    assert recording.whisked
     assert not recording.truncated
-    assert (recording.rig, recording.whiskers, recording.length) == (RIG, W, 3)
+    assert (recording.info, recording.whiskers, recording.length) == (INFO, W, 3)
     assert recording.events == (
         Event(START, "start", "emulated: a robot, über"), Event(START + 3, "dropped", "1 image")
     )  # fmt: skip
@@ -259,13 +260,14 @@ WRITER = """
 import mmap, struct, sys
 from pathlib import Path
 import numpy as np
-from robot.head.decoder import Frames
-from robot.live.cycle import cut_of
-from robot.live.journal import Journal
-from tactile.types import Odometry
+from robot.drivers.head.decoder import Frames
+from robot.drivers.head.cycle_assembly import cut_of
+from robot.live.recorder import Journal
+from robot.sources.source_info import SourceInfo
+from tactile.base.types import Odometry
 
 path, beside = map(Path, sys.argv[1:])
-journal = Journal(path, view_shape=(3, 6, 1), whiskers=18)
+journal = Journal(path, view_shape=(3, 6, 1), whiskers=18, info=SourceInfo())
 random = np.random.default_rng(0)
 pool = random.integers(-300, 300, (2000, 18, 3)).astype(np.int16)
 with beside.open("r+b") as file:
@@ -589,4 +591,6 @@ def test_an_unseen_cut_needs_no_frames(tmp_path: Path, refused: Callable[..., In
     assert len(sample.reading.time) == 0
     assert sample.reading.odometry == moved(0)
     assert isinstance(cut, Cut)
-    refused(lambda: Journal(tmp_path / "a.mcap", view_shape=(1, 1, 1), whiskers=1), "exists already")
+    refused(
+        lambda: Journal(tmp_path / "a.mcap", view_shape=(1, 1, 1), whiskers=1, info=INFO), "exists already"
+    )

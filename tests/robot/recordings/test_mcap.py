@@ -23,9 +23,12 @@ from robot.recordings.mcap_scanner import FORMAT, Walk, _checksum
 from robot.recordings.npz_trace import read_stream
 from robot.recordings.recorder import Recorder
 from robot.recordings.schemas import CYCLE, OBSERVATION, REPORT, SCHEMAS, TOPICS, WHISK
-from robot.sources.source import Rigged, Sample, Source, rig_of
+from robot.sources.source import Sample, Source
+from robot.sources.source_info import MazeInfo, SourceInfo
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Observation, Odometry, Report, Whisk, observation
+from tactile.features.calibration import Calibration
+from tactile.whiskers.head_geometry import HeadConfig
 
 SHAPE, WHISKERS = (2, 3, 2), 4
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
@@ -89,7 +92,20 @@ REPORTS = st.integers(0, 5).flatmap(
         strain=_numbers(t, WHISKERS, 2),
     )
 )
-RIG = {"head": {"rest_deg": 75.0}, "calibration": {"sd": [[1e-3, 0.1], [1e-300, -0.0]]}, "über": None}
+INFO = SourceInfo(
+    raw_whiskers=True,
+    head=HeadConfig(rest_deg=74.0),
+    calibration=Calibration(
+        mean=np.zeros((2, 2)),
+        sd=np.array([[1e-3, 0.1], [1e-300, -0.0]]),
+        threshold=np.array([[np.inf, 1 / 3], [0.1, 5e-324]]),
+        free=np.array([0.7, 0.0]),
+        alive=np.array([True, False]),
+        rate=2000.0,
+    ),
+    maze=MazeInfo(text="o---o\n|   |\no---o\n", heights=(0.05, 0.02), seed=3),
+    provenance={"über": None, "numbers": [0.1, -0.0]},
+)
 TRUTHS = st.none() | _numbers(3, low=-0.1, high=0.1)
 SAMPLES = st.lists(st.tuples(OBSERVATIONS | CYCLES | WHISKS | REPORTS, TRUTHS), min_size=1, max_size=12).map(
     lambda parts: [Sample(100 + 0.5 * i, *part) for i, part in enumerate(parts)]
@@ -118,7 +134,7 @@ def _same(one: Sequence[Sample], other: Sequence[Sample]) -> bool:
 
 def _write(path: Path, samples: Sequence[Sample], **options: Any) -> Path:
     path.unlink(missing_ok=True)
-    options = {"rig": RIG} | options
+    options = {"info": INFO} | options
     with Recorder(path, view_shape=SHAPE, whiskers=WHISKERS, rate_hz=2.0, **options) as recorder:
         for sample in samples:
             recorder.write(sample)
@@ -169,8 +185,8 @@ def test_what_is_written_comes_back_bit_for_bit(tmp_path_factory: Any, samples: 
         assert _same(list(source), samples)  # and again
         assert (source.length, source.view_shape, source.whiskers) == (len(samples), SHAPE, WHISKERS)
         assert (source.truncated, source.warning, source.rate_hz) == (False, "", 2.0)
-        assert source.rig == rig_of(source) == RIG
-        assert source.whisked == any(not isinstance(sample.reading, Observation) for sample in samples)
+        raw = any(not isinstance(sample.reading, Observation) for sample in samples)
+        assert source.info == INFO.model_copy(update={"raw_whiskers": raw})
 
 
 def test_the_file_depends_on_the_samples_alone(tmp_path: Path) -> None:
@@ -204,7 +220,7 @@ def _check_prefix(path: Path, samples: list[Sample]) -> int:
         return 0
     read = list(source)
     assert _same(read, samples[: len(read)])
-    assert source.rig == RIG
+    assert source.info == INFO.model_copy(update={"raw_whiskers": source.info.raw_whiskers})
     assert source.length == len(read)
     assert told == ([source.warning] if source.truncated else [])
     assert source.truncated or len(read) == len(samples)
@@ -266,9 +282,9 @@ def test_a_killed_recorder_loses_no_more_than_its_last_half_second(tmp_path: Pat
     code = f"""
         import os, signal
         from pathlib import Path
-        from robot.recorder import Recorder
-        from robot.source import Sample
-        from tactile.types import Odometry, observation
+        from robot.recordings.recorder import Recorder
+        from robot.sources.source import Sample
+        from tactile.base.types import Odometry, observation
         recorder = Recorder(Path({str(path)!r}))
         for i in range(25):
             recorder.write(Sample(0.1 * i, observation(Odometry(0.01, 0, 0, 0.1)), None))
@@ -294,7 +310,7 @@ def test_recover_makes_a_whole_file(small: tuple[bytes, list[Sample]], tmp_path:
     again = Recording(whole)
     assert not again.truncated
     assert _same(list(again), samples[: found.length])
-    assert (again.view_shape, again.whiskers, again.rig) == (SHAPE, WHISKERS, RIG)
+    assert (again.view_shape, again.whiskers, again.info) == (SHAPE, WHISKERS, INFO)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cut.mcap", "whole.mcap"]
     assert recover(whole, tmp_path / "third.mcap") == (found.length, False, "")
 
@@ -460,10 +476,10 @@ def test_a_chunk_that_would_not_fit_into_memory_is_not_opened(
     st.binary(max_size=200),
     st.sampled_from(["2,3,2", "2,3", "0,1,1", "9999999,9999,9", "a,b,c", "-1,1,1"]),
     st.integers(-1, 1 << 40),
-    st.sampled_from(["{}", "[]", "{", "1"]),
+    st.sampled_from(["{}", "[]", "{", "1", '{"cell_size": -1}', '{"calibration": {"mean": 1}}']),
 )
 def test_a_valid_file_with_strange_contents_is_told_apart(
-    tmp_path_factory: Any, name: str, message: bytes, shape: str, whiskers: int, rig: str
+    tmp_path_factory: Any, name: str, message: bytes, shape: str, whiskers: int, info: str
 ) -> None:
     """Checksums in order, contents not ours."""
     from mcap.writer import Writer
@@ -473,7 +489,7 @@ def test_a_valid_file_with_strange_contents_is_told_apart(
         writer = Writer(file)
         writer.start()
         metadata = {"format": FORMAT, "view_shape": shape, "whiskers": str(whiskers), "rate_hz": "1.0"}
-        metadata |= {"created_by": "somebody", "rig": rig}
+        metadata |= {"created_by": "somebody", "info": info}
         writer.add_metadata("ratslam", metadata | {"crc32": _checksum(metadata)})
         schema = writer.register_schema(name, "ros2msg", SCHEMAS[name].encode())
         writer.add_message(writer.register_channel(TOPICS[name], "cdr", schema), 0, b"\0\1\0\0" + message, 0)
@@ -487,9 +503,9 @@ def test_a_file_of_another_version_is_named(
 ) -> None:
     old = tmp_path / "old.mcap"
     with monkeypatch.context() as patch:
-        patch.setattr("robot.recordings.mcap_scanner.FORMAT", "1")
+        patch.setattr("robot.recordings.mcap_scanner.FORMAT", "2")
         _write(old, _samples(3))
-    refused(lambda: Recording(old), str(old), "format '1' where '2' is the one known")
+    refused(lambda: Recording(old), str(old), "its format is '2', this version reads '3'")
     other = tmp_path / "other.mcap"
     with monkeypatch.context() as patch:
         patch.setitem(SCHEMAS, OBSERVATION, SCHEMAS[OBSERVATION] + "bool more\n")
@@ -497,14 +513,16 @@ def test_a_file_of_another_version_is_named(
     refused(lambda: Recording(other), str(other), "/ratslam/observation", "defined otherwise than here")
 
 
-@pytest.mark.parametrize("rig", [{"a": np.nan}, {"a": object()}, {"a": np.zeros(2)}])
-def test_a_rig_that_is_no_document_is_refused_before_anything_is_written(tmp_path: Path, rig: Any) -> None:
+@pytest.mark.parametrize("value", [np.nan, object(), np.zeros(2)])
+def test_provenance_that_is_not_json_is_refused_before_anything_is_written(
+    tmp_path: Path, value: Any
+) -> None:
     with pytest.raises((ValueError, TypeError)):
-        Recorder(tmp_path / "a.mcap", rig=rig)
+        Recorder(tmp_path / "a.mcap", info=SourceInfo(provenance={"a": value}))
     assert not (tmp_path / "a.mcap").exists()
 
 
-def test_a_rig_without_a_sample_to_it_is_not_lost(tmp_path: Path) -> None:
+def test_source_info_is_stored_before_the_first_sample(tmp_path: Path) -> None:
     """It stands before the first sample, so a recorder killed at once leaves it."""
     path = _write(tmp_path / "a.mcap", _samples(2))
     content = path.read_bytes()
@@ -512,20 +530,18 @@ def test_a_rig_without_a_sample_to_it_is_not_lost(tmp_path: Path) -> None:
     walk = Walk(path)
     assert list(walk) == []
     assert walk.description is not None
-    assert walk.description.rig == RIG
+    assert walk.description.info == INFO
 
 
-def test_what_knows_its_rig_says_so(find_trace: Callable[[str], Path], tmp_path: Path) -> None:
+def test_a_copy_of_a_recording_keeps_the_source_info(
+    find_trace: Callable[[str], Path], tmp_path: Path
+) -> None:
     plain = read_stream(find_trace("a_square3"))
-    assert not isinstance(plain, Rigged)
-    assert rig_of(plain) == {}
-    record(plain, tmp_path / "plain.mcap")
-    assert rig_of(Recording(tmp_path / "plain.mcap")) == {}
-    _write(tmp_path / "a.mcap", _samples(5), rig={"params": {"pc_cell_x_size": 0.05}})
+    assert plain.info.cell_size == 0.1
+    assert not plain.info.labels_only
+    record(plain, tmp_path / "a.mcap")
     record(Recording(tmp_path / "a.mcap"), tmp_path / "b.mcap")
-    again = Recording(tmp_path / "b.mcap")
-    assert isinstance(again, Rigged)
-    assert again.params == {"pc_cell_x_size": 0.05}
+    assert Recording(tmp_path / "b.mcap").info == plain.info
 
 
 def test_a_truth_in_degrees_is_refused(tmp_path: Path, refused: Callable[..., InputError]) -> None:

@@ -38,8 +38,8 @@ def test_a_trace_is_read_row_by_row(trace: Path) -> None:
     assert (source.name, source.view_shape, source.whiskers) == (trace.stem, (3, 6, 1), 0)
     assert source.rate_hz == pytest.approx(2.0)
     assert all(sample.reading.view_seen for sample in samples)
-    assert source.params["exp_loops"] == 20
-    assert isinstance(source.params["vt_match_threshold"], float)
+    assert source.info.provenance["parameters"]["exp_loops"] == 20
+    assert isinstance(source.info.provenance["parameters"]["vt_match_threshold"], float)
     first = samples[0].reading
     assert isinstance(first, Observation)
     assert tuple(first.odometry) == (0, 0, 0, 0)

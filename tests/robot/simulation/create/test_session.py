@@ -12,7 +12,7 @@ import pytest
 
 from robot.simulation.create.session import Rover, RovingConfig, drive_into_wall, roving
 from robot.simulation.create.state_machine import State
-from robot.sources.source import Rigged, Sample, Source, rig_of
+from robot.sources.source import Sample, Source
 from robot.world.arena import inside, segments, text
 from robot.world.polygons import distance
 from tactile.base.errors import InputError
@@ -50,7 +50,6 @@ def bits(source: Source) -> list[list[bytes]]:
 def test_a_session_has_the_same_bits_every_time() -> None:
     one = made()
     assert isinstance(one, Source)
-    assert isinstance(one, Rigged)
     with one as source:
         first = bits(source)
         assert bits(source) == first
@@ -90,7 +89,7 @@ def test_the_digest_tells_what_was_asked_for(tmp_path: Path) -> None:
     sessions = [base, made(seed=3), made(whiskers={"noise": 1e-6}), filed, made(arena={"side": 2.5})]
     assert len({one.digest for one in sessions}) == len(sessions)
     assert made(arena={"file": again}).digest == filed.digest  # what is in the file counts, not where it lies
-    assert str(tmp_path) not in repr(rig_of(filed))
+    assert str(tmp_path) not in filed.info.to_json()
     config = RovingConfig.model_validate({"arena": {"file": "room.txt"}}).resolved(tmp_path)
     assert config.arena.file == path
     assert text(filed.arena) == text(room)
@@ -100,7 +99,7 @@ def test_a_session_is_what_its_samples_say() -> None:
     rover = session(0)
     samples = list(rover)
     assert len(samples) == rover.length
-    assert (rover.whiskers, rover.view_shape, rover.whisked) == (4, (1, 4, 1), True)
+    assert (rover.whiskers, rover.view_shape, rover.info.raw_whiskers) == (4, (1, 4, 1), True)
     assert rover.rate_hz == pytest.approx(2.0)
     assert samples[-1].time >= 360 > samples[-2].time
     before = rover.arena.start

@@ -15,7 +15,7 @@ from robot.recordings.mcap_reader import Recording, record
 from robot.simulation.head.session import Simulation, SimulationConfig, simulated, tier
 from robot.sources.in_memory import collected
 from robot.sources.odometry import OdometryConfig
-from robot.sources.source import Rigged, Sample, Source, rig_of
+from robot.sources.source import Sample, Source
 from robot.touch_source import head_of, sensing
 from robot.world.maze import CELL, text
 from tactile.base.errors import InputError
@@ -49,7 +49,6 @@ def bits(source: Source) -> list[list[bytes]]:
 def test_a_session_has_the_same_bits_every_time() -> None:
     one = made()
     assert isinstance(one, Source)
-    assert isinstance(one, Rigged)
     with one as source:
         first = bits(source)
         assert bits(source) == first
@@ -78,7 +77,7 @@ def test_the_digest_tells_what_was_asked_for(tmp_path: Path) -> None:
     moved = made(maze={"file": again}, path={"loop": loop, "circuits": "CA"})
     assert moved.digest == sessions[-1].digest  # what is in the file counts, not where it lies
     maze.write_text(maze.read_text().replace("|", " ", 1).replace(" ", "|", 1))
-    assert str(tmp_path) not in repr(moved.rig)
+    assert str(tmp_path) not in moved.info.to_json()
 
 
 def test_streams_are_independent() -> None:
@@ -304,7 +303,7 @@ def test_raw_sessions_have_the_same_bits_every_time_and_feel_what_the_others_do(
     felt = [np.array([s.reading.contact for s in sensing(source, TouchConfig())]) for source in (raw, simple)]
     assert (felt[0] == felt[1]).mean() > 0.85
     assert felt[0].mean() > 0.1
-    assert "calibration" in raw.rig
+    assert raw.info.calibration is not None
 
 
 @pytest.mark.parametrize(("radial", "raw"), list(product([False, True], repeat=2)))
@@ -314,11 +313,10 @@ def test_a_recorded_session_is_the_session(radial: bool, raw: bool, tmp_path: Pa
     record(session, tmp_path / "a.mcap")
     again = Recording(tmp_path / "a.mcap")
     assert bits(again) == bits(session)
-    assert again.rig == rig_of(session)
-    assert again.params == session.params
-    assert again.whisked
-    assert head_of(again, HeadConfig()) == head
-    assert head_of(again, HeadConfig(dead=(4,))) == head.model_copy(update={"dead": (4,)})
+    assert again.info == session.info
+    assert again.info.raw_whiskers
+    assert head_of(again.info, HeadConfig()) == head
+    assert head_of(again.info, HeadConfig(dead=(4,))) == head.model_copy(update={"dead": (4,)})
     touch = TouchConfig(head=head, image=ImageConfig(radial=radial))
     seen = [sensing(source, touch) for source in (session, again)]
     assert seen[0].view_shape == seen[1].view_shape == (3, 6, 1 + radial)
@@ -333,7 +331,8 @@ def test_a_session_in_memory_is_the_session() -> None:
     source = sensing(made(HeadConfig(dead=(5,))), TouchConfig())
     log = collected(source)
     assert (log.length, log.view_shape, log.whiskers) == (source.length, (3, 6, 1), 18)
-    assert log.params == {"pc_cell_x_size": 0.05}
+    assert log.info == source.info
+    assert log.info.cell_size == 0.05
     for one, two in zip(source, log, strict=True):
         assert (one.reading.view == two.reading.view).all()
         assert (one.reading.alive == two.reading.alive).all()

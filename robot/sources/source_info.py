@@ -1,0 +1,102 @@
+"""What a source states about itself: devices, world and origin, as one typed record."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field, NonNegativeInt, PlainSerializer, PlainValidator, PositiveFloat
+
+from tactile.base.config import Settings
+from tactile.features.calibration import Calibration, from_arrays, to_json
+from tactile.whiskers.head_geometry import HeadConfig
+
+
+def _read_calibration(value: Any) -> Calibration | None:
+    if value is None or isinstance(value, Calibration):
+        return value
+    try:
+        kinds = {name: bool if name == "alive" else float for name in value}
+        return from_arrays({name: np.asarray(array, kinds[name]) for name, array in value.items()})
+    except (AttributeError, TypeError) as error:
+        raise ValueError(f"not a calibration: {error}") from None
+
+
+class MazeInfo(Settings):
+    """The maze of a session on a whisker head."""
+
+    text: str
+    """Its drawing, in the format of a maze file."""
+    heights: Annotated[tuple[PositiveFloat, ...], Field(min_length=1)]
+    """Wall heights to draw from, m."""
+    seed: NonNegativeInt
+    """Seed of the wall heights."""
+
+
+class PlanarWhiskersInfo(Settings):
+    """The fixed whiskers of a Create."""
+
+    mounts: Annotated[tuple[tuple[float, float, float], ...], Field(min_length=1)]
+    """For each whisker the position of its base in base_link, x (m) and y (m), and its direction (degrees
+    counter-clockwise from ahead)."""
+    length: PositiveFloat
+    """Length of a whisker, m."""
+
+
+class SimulationInfo(Settings):
+    """How a session on a whisker head was simulated."""
+
+    sha256: str
+    """Hash (hex) of the generating configuration."""
+    seed: NonNegativeInt
+    """Seed of all its random streams."""
+    tier: str
+    """Fidelity: kinematic, quasistatic or dynamic."""
+    why: str
+    """Why this fidelity was chosen."""
+
+
+class SourceInfo(Settings):
+    """Facts about a source that consumers rely on; a recording stores them as one JSON document."""
+
+    raw_whiskers: bool = False
+    """Whether some readings are whisker data (`Cycle`, `Whisk`, `Report`), which a touch front end must turn
+    into observations."""
+    labels_only: bool = False
+    """Whether readings carry given place labels and never a view."""
+    cell_size: PositiveFloat | None = None
+    """Pose-cell side length that suits the data, m."""
+    head: HeadConfig | None = None
+    """The whisker head."""
+    calibration: Annotated[
+        Calibration | None, PlainValidator(_read_calibration), PlainSerializer(lambda c: c and to_json(c))
+    ] = None
+    """Free-whisking calibration of the head."""
+    planar_whiskers: PlanarWhiskersInfo | None = None
+    """Whiskers of a Create, whose readings are `Report`s."""
+    maze: MazeInfo | None = None
+    """The maze that surrounds a whisker head."""
+    arena: str | None = None
+    """The arena of a Create, in the format of an arena file."""
+    simulation: SimulationInfo | None = None
+    """Set if a session on a whisker head was simulated."""
+    provenance: dict[str, Any] = Field(default_factory=dict)
+    """Generating configuration under its key in a run configuration (`simulation`, `create_simulation`,
+    `live`), or `parameters` that came with a recording. Its reader validates it."""
+
+    def to_json(self) -> str:
+        """The record as a JSON document with sorted keys.
+
+        Raises:
+            TypeError, ValueError: a value in `provenance` is not JSON, or a number in it is not finite.
+        """
+        return json.dumps(self.model_dump(), allow_nan=False, sort_keys=True)
+
+    @classmethod
+    def from_json(cls, text: str) -> SourceInfo:
+        """Raises `ValueError` for text that `to_json` cannot have written."""
+        return cls.model_validate(json.loads(text))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, SourceInfo) and self.to_json() == other.to_json()  # arrays compare by value
