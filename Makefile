@@ -3,49 +3,57 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-READY := $(VENV)/.ready
+BASE := $(VENV)/.base
+DEV := $(VENV)/.dev
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-# One core where it can be chosen: timings that share a core with others say little.
+# A timing on one core that nothing else uses says more than one on a shared core.
 PINNED := $(shell taskset -c 0 true 2>/dev/null && echo taskset -c 0)
+
+# The soak runs in SOAK_PARTS parts of at most 60 minutes with two workers; `make soak PART=2` runs one of them.
+SOAK_PARTS := 4
 
 export OMP_NUM_THREADS := 1
 
 .PHONY: run test soak lint bench clean
 
-run: $(READY)
+run: $(BASE)
 	@n=1; while [ -e runs/whisker_maze-$$n ]; do n=$$((n + 1)); done; \
 	set -x; $(BIN)/python -m ratslam run configs/whisker_maze.yaml -o runs/whisker_maze-$$n
 
-test: $(READY)
+test: $(DEV)
 	$(BIN)/python -m pytest -n 2 --dist loadfile
 
-soak: $(READY)
-	$(BIN)/python -m pytest --soak -m soak -n 4 -v --timeout 3600
+soak: $(DEV)
+	$(BIN)/python -m pytest --soak -n 2 --dist loadfile -v --timeout 3600 $(if $(PART),--part $(PART)/$(SOAK_PARTS))
 
-lint: $(READY)
+lint: $(DEV)
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m ruff format --check .
 	$(BIN)/python -m mypy
 	$(BIN)/lint-imports --no-logo
 
-bench: $(READY)
+bench: $(DEV)
 	$(PINNED) $(BIN)/python -m pytest tests/benchmarks --benchmark-only
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .hypothesis .benchmarks .ruff_cache .mypy_cache .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
-# gtsam, which only one test compares with, has no wheel for some platforms.
-$(READY): pyproject.toml constraints.txt
+# The program alone.
+$(BASE): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 	  echo "ratslam needs Python 3.11 or newer, and $(PYTHON) is" \
 	    "$$($(PYTHON) --version 2>&1); choose another: make PYTHON=python3.11 ..." >&2; exit 1; }
 	@echo "Making the virtual environment $(VENV) ..."
 	@$(PYTHON) -m venv $(VENV)
 	@echo "Installing ratslam and what it needs (a minute or two) ..."
-	@$(INSTALL) --only-binary gtsam -e '.[dev,sweep,live,anchor]' || { \
-	  echo "That did not work; trying without gtsam (its test will be skipped) ..."; \
-	  $(INSTALL) -e '.[dev,sweep,live]'; }
+	@$(INSTALL) -e .
 	@touch $@
-	@echo "$(VENV) is ready."
+
+# With what its tests need. Only one test compares with gtsam, which has no wheel for some platforms.
+$(DEV): $(BASE)
+	@echo "Installing what the tests need ..."
+	@$(INSTALL) -e '.[dev]'
+	@$(INSTALL) --only-binary gtsam -e '.[anchor]' || echo "gtsam has no wheel here; its test is skipped."
+	@touch $@

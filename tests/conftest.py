@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import json
 import os
 import shutil
 import tempfile
@@ -37,23 +38,44 @@ settings.register_profile(
 settings.load_profile("ratslam")
 
 ROOT = Path(__file__).parents[1]
-REAL_TIME = ("live", "robot/live", "robot/ur10", "robot/head", "robot/create", "robot/emulators")
-"""Rooms whose tests keep real time, which a busy machine can take from them: what fails is tried twice more,
-and what is wrong fails each time."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--soak", action="store_true", help="run the tests marked soak as well")
+    parser.addoption("--soak", action="store_true", help="run the tests marked soak, and only these")
+    parser.addoption("--part", default="", metavar="K/N", help="run part K of N of the soak")
 
 
+@pytest.hookimpl(trylast=True)  # after benchmarks/conftest.py has marked its tests
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    for item in items:
-        if any(f"tests/{room}/" in item.path.as_posix() for room in REAL_TIME):
-            item.add_marker(pytest.mark.flaky(reruns=2))
-    if not config.getoption("--soak"):
-        for item in items:
-            if item.get_closest_marker("soak"):
-                item.add_marker(pytest.mark.skip(reason="a soak test; run with --soak"))
+    soak = config.getoption("--soak")
+    chosen = [item for item in items if bool(item.get_closest_marker("soak")) == soak]
+    if config.getoption("--part"):
+        modules = modules_of_part(config.getoption("--part"), {_module(item) for item in chosen})
+        chosen = [item for item in chosen if _module(item) in modules]
+    left = set(items) - set(chosen)
+    config.hook.pytest_deselected(items=[item for item in items if item in left])
+    items[:] = chosen
+
+
+def modules_of_part(part: str, modules: set[str]) -> set[str]:
+    """The test modules of part K of N ("K/N") of the soak.
+
+    Modules go, longest first, to the part that is shortest so far. Durations are those of
+    `soak_durations.json` (minutes of one worker); an unlisted module counts one minute.
+    """
+    number, count = (int(value) for value in part.split("/"))
+    minutes = json.loads((ROOT / "tests" / "soak_durations.json").read_text(encoding="utf-8"))
+    parts: list[list[str]] = [[] for _ in range(count)]
+    length = [0.0] * count
+    for module in sorted(modules, key=lambda name: (-minutes.get(name, 1.0), name)):
+        shortest = length.index(min(length))
+        parts[shortest].append(module)
+        length[shortest] += minutes.get(module, 1.0)
+    return set(parts[number - 1])
+
+
+def _module(item: pytest.Item) -> str:
+    return item.path.relative_to(ROOT).as_posix()
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,75 @@
+"""What the READMEs show works: Python blocks run, commands are understood, links lead somewhere."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from ratslam.cli import build_parser
+
+ROOT = Path(__file__).parents[1]
+READMES = sorted(
+    path
+    for path in ROOT.rglob("*.md")
+    if not {".venv", "runs", ".git"} & set(path.relative_to(ROOT).parts) and path.name != "CHANGELOG.md"
+)
+
+
+def blocks(text: str, *languages: str) -> list[str]:
+    """The fenced code blocks of a text in one of the languages."""
+    found = re.findall(r"^```(\w*)\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    return [body for language, body in found if language in languages]
+
+
+def commands(path: Path) -> Iterator[str]:
+    """Commands of the program in a README, comments removed."""
+    for block in blocks(path.read_text(encoding="utf-8"), "", "sh", "bash"):
+        for line in block.splitlines():
+            if line.startswith("python -m ratslam "):
+                yield line.split("  #")[0].strip()
+
+
+def name(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+PYTHON = [path for path in READMES if blocks(path.read_text(encoding="utf-8"), "python")]
+COMMANDS = [(name(path), command) for path in READMES for command in commands(path)]
+
+
+@pytest.fixture
+def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder that looks like the repository's root, in which blocks may write files."""
+    for part in ("configs", "tests"):
+        (tmp_path / part).symlink_to(ROOT / part)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("readme", PYTHON, ids=name)
+@pytest.mark.usefixtures("checkout")
+def test_python_blocks_run(readme: Path) -> None:
+    for block in blocks(readme.read_text(encoding="utf-8"), "python"):
+        exec(compile(block, name(readme), "exec"), {"__name__": "__main__"})
+
+
+@pytest.mark.parametrize(("readme", "command"), COMMANDS)
+def test_commands_are_understood(readme: str, command: str) -> None:
+    arguments = build_parser().parse_args(shlex.split(command)[3:])
+    assert callable(arguments.command)
+
+
+@pytest.mark.parametrize("readme", READMES, ids=name)
+def test_links_lead_somewhere(readme: Path) -> None:
+    text = re.sub(r"^```.*?^```", "", readme.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    targets = re.findall(r"\]\(([^)#\s]+)[^)]*\)", text)
+    missing = [
+        target
+        for target in targets
+        if not re.match(r"\w+:", target) and not (readme.parent / target).exists()
+    ]
+    assert missing == []

@@ -1,0 +1,76 @@
+"""The layout holds: every room explains itself, files and functions stay short, tests keep to public names."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("ratslam", "robot", "evaluation", "tactile")
+ROOMS = sorted(
+    path.parent
+    for package in PACKAGES
+    for path in (ROOT / package).glob("*/__init__.py")
+    if len(list(path.parent.rglob("*.py"))) > 1
+)
+LONGEST_FILE, LONGEST_FUNCTION, LONGEST_ROOT_README = 350, 50, 1500
+
+
+def sources() -> Iterator[tuple[str, str]]:
+    """Name and text of every source file of the four packages."""
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            yield path.relative_to(ROOT).as_posix(), path.read_text(encoding="utf-8")
+
+
+def test_files_are_short() -> None:
+    lengths = {name: text.count("\n") for name, text in sources()}
+    assert {name: n for name, n in lengths.items() if n > LONGEST_FILE} == {}
+
+
+def test_functions_are_short() -> None:
+    long = []
+    for name, text in sources():
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                length = (node.end_lineno or node.lineno) - node.lineno + 1
+                if length > LONGEST_FUNCTION:
+                    long.append((name, node.name, length))
+    assert long == []
+
+
+@pytest.mark.parametrize("room", ROOMS, ids=lambda room: room.relative_to(ROOT).as_posix())
+def test_every_room_has_a_readme_with_an_example(room: Path) -> None:
+    text = (room / "README.md").read_text(encoding="utf-8")
+    assert re.match(r"# .+\n+\w", text), "a title, then a paragraph that says what the room is for"
+    assert "```python" in text
+
+
+def test_root_readme_is_short() -> None:
+    words = (ROOT / "README.md").read_text(encoding="utf-8").split()
+    assert len(words) <= LONGEST_ROOT_README
+
+
+def test_no_test_reaches_for_a_private_name() -> None:
+    """Attributes and imports with a leading underscore; `_replace` and others of named tuples are public."""
+    allowed = {"_replace", "_asdict", "_fields", "_make"}
+    found = []
+    for path in sorted((ROOT / "tests").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names = []
+            if isinstance(node, ast.Attribute) and not (
+                isinstance(node.value, ast.Name) and node.value.id in ("self", "cls")
+            ):
+                names = [node.attr]
+            elif isinstance(node, ast.ImportFrom):
+                names = [alias.name for alias in node.names]
+            found += [
+                f"{path.relative_to(ROOT)}:{node.lineno}: {name}"
+                for name in names
+                if re.match(r"_[a-z]", name) and name not in allowed
+            ]
+    assert found == []
