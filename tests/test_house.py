@@ -1,4 +1,4 @@
-"""The layout holds: every room explains itself, files and functions stay short, tests keep to public names."""
+"""The layout holds: every room explains itself, files and functions are short, tests use public names."""
 
 from __future__ import annotations
 
