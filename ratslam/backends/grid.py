@@ -14,12 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.core.types import Action, Estimate
+from ratslam.core.types import Action, Estimate, Scalar
 from ratslam.grid import kernels, likelihoods, particle_maps, particles
 from ratslam.grid.config import GridConfig
 from ratslam.grid.map import GridMap
 from ratslam.grid.particle_maps import COSINE, EVIDENCE, SINE
 from ratslam.grid.particles import Particles
+from tactile.base.errors import InputError
 from tactile.base.types import Array, Motion, Observation, Odometry
 from tactile.whiskers.planar_whiskers import Feelers
 
@@ -37,6 +38,12 @@ WALL, COMPASS = 100.0, 40.0
 """Largest precision of a wall's direction against the field there, and against all walls."""
 
 
+LIVE_SIDE = 2.5
+"""Default side length of the map, m (Fox et al. 2012, II-D)."""
+MOST = 2**31 - 1
+"""Largest number of cells of all maps together: they are indexed in int32."""
+
+
 class Outcome(IntEnum):
     """How a step of the filter went."""
 
@@ -51,7 +58,7 @@ class Outcome(IntEnum):
     """Odometry or contacts were NaN, infinite or of no possible size; taken as no motion and no contact."""
 
 
-class State(NamedTuple):
+class GridState(NamedTuple):
     """All that the filter remembers.
 
     Attributes:
@@ -78,8 +85,8 @@ class GridEvidence(NamedTuple):
     ancestor: Array
     poses: Array
     weights: Array
-    effective: Array
-    outcome: Array
+    effective: Scalar
+    outcome: Scalar
 
 
 class Felt(NamedTuple):
@@ -102,11 +109,11 @@ class Felt(NamedTuple):
     sd: Array
 
 
-class GridFilter:
-    """The backend.
+class GridBackend:
+    """The grid particle filter as a backend (`ratslam.core.backend.Backend`).
 
     Args:
-        feelers: the whiskers of the observations. side: of the map, m. dtype: of all floating state.
+        feelers: whisker geometry of the observations. side: of the map, m. dtype: of all floating state.
     """
 
     def __init__(self, config: GridConfig, feelers: Feelers, side: float, dtype: Any = np.float64) -> None:
@@ -126,12 +133,12 @@ class GridFilter:
         tips = np.hypot(*feelers.points(np.ones(1))[:, 0].T).max(initial=0.0)
         self.near, self.far, self.long = (self._window(far) for far in (reach, tips + blob, along))
 
-    def init(self, key: Array, capacity: int) -> State:
+    def init(self, key: Array, capacity: int) -> GridState:
         """All particles at the origin of an empty map. Nothing grows, so `capacity` is not used."""
         del capacity
         count = self.config.particles
         first, key = jax.random.split(key)
-        return State(
+        return GridState(
             particles.start(self.config.drift, first, count, self.dtype),
             particle_maps.blank(count, self.side, self.dtype),
             jnp.zeros((count, 2), self.dtype),
@@ -140,22 +147,22 @@ class GridFilter:
             jax.random.key_data(key),
         )
 
-    def rows(self, state: State) -> int:
+    def rows(self, state: GridState) -> int:
         """None: nothing grows."""
         del state
         return 0
 
-    def grow(self, state: State, capacity: int) -> State:
+    def grow(self, state: GridState, capacity: int) -> GridState:
         """The same: nothing grows."""
         del capacity
         return state
 
-    def inform(self, state: State, guidance: Any) -> State:
+    def inform(self, state: GridState, guidance: Any) -> GridState:
         """The same: the filter asks nothing of its map."""
         del guidance
         return state
 
-    def kernel(self, state: State, observation: Observation) -> tuple[State, Estimate, GridEvidence]:
+    def kernel(self, state: GridState, observation: Observation) -> tuple[GridState, Estimate, GridEvidence]:
         """Move, weigh, draw anew, leave a mark."""
         key, draw, pick, jitter = jax.random.split(jax.random.wrap_key_data(state.key), 4)
         odometry, felt, clean = self._taken(state, observation)
@@ -180,14 +187,14 @@ class GridFilter:
         estimate = Estimate(pose, spread, place, place, jnp.int32(Action.NONE), vanished)
         evidence = GridEvidence(who.ancestor, poses, share, worth, outcome)
         touched = jnp.where(felt.told, felt.touching, False)
-        after = State(swarm, maps, compass, motion, touched, jax.random.key_data(key))
+        after = GridState(swarm, maps, compass, motion, touched, jax.random.key_data(key))
         return after, estimate, evidence
 
     def new_map(self) -> GridMap:
         """An empty map."""
         return GridMap(self.config, self.feelers, self.side)
 
-    def _taken(self, state: State, observation: Observation) -> tuple[Odometry, Felt, Array]:
+    def _taken(self, state: GridState, observation: Observation) -> tuple[Odometry, Felt, Array]:
         """Odometry and contacts with anything that is not a number masked, and whether nothing was."""
         odometry = Odometry(*(jnp.asarray(value, self.dtype) for value in observation.odometry))
         moves = jnp.stack(odometry[:3])
@@ -224,7 +231,7 @@ class GridFilter:
         )
         return Odometry(dx, dy, dtheta, odometry.dt), felt, clean
 
-    def _likelihood(self, state: State, pose: Array, felt: Felt) -> Array:
+    def _likelihood(self, state: GridState, pose: Array, felt: Felt) -> Array:
         config = self.config.likelihood
         if config.model != "evidence":
             return self._printed(state.maps, pose, felt)
@@ -240,7 +247,7 @@ class GridFilter:
             lambda: jnp.zeros_like(likelihood),
         )
 
-    def _met(self, state: State, pose: Array, felt: Felt) -> Array:
+    def _met(self, state: GridState, pose: Array, felt: Felt) -> Array:
         """[N] log-likelihood of new contacts, and of a wall's direction: as the map has it there, and as
         walls are at large."""
         config = self.config.likelihood
@@ -345,3 +352,22 @@ class GridFilter:
         x = pose[:, :1] + c * right - s * up
         y = pose[:, 1:2] + s * right + c * up
         return particle_maps.in_cells(jnp.stack([x, y], axis=2), self.config.cell, self.side)
+
+
+def build(config: GridConfig, feelers: Feelers | None, dtype: Any = np.float64) -> GridBackend:
+    """The backend for a session with these whiskers.
+
+    Raises:
+        InputError: there are no whiskers, or the maps have more cells than int32 can index.
+    """
+    if feelers is None:
+        raise InputError(
+            "backend", "grid, for a recording without whiskers", "recall, or a session of whiskers"
+        )
+    side = config.side or LIVE_SIDE
+    if config.particles * particle_maps.LAYERS * int(np.ceil(side / config.cell)) ** 2 > MOST:
+        found = f"{config.particles} particles with maps of {side:g} m in cells of {config.cell:g} m"
+        raise InputError(
+            "grid", found, "2^31 cells in all", "fewer particles, coarser cells or a smaller map"
+        )
+    return GridBackend(config, feelers, side, dtype)

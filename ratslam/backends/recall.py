@@ -1,4 +1,4 @@
-"""The rat with the unified filter: recall proposes, the frame map disposes, pose cells bridge."""
+"""RatSLAM backend with Bayesian recall and verified loop closures."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from jax import lax
 from ratslam.attractor import adaptive_window, pose_cells
 from ratslam.attractor.config import rings, units
 from ratslam.attractor.pose_cells import Outcome, PoseCells
-from ratslam.backends.classic import Rat, RatConfig, RatEvidence, finite
+from ratslam.backends.classic import finite
+from ratslam.backends.config import RecallBackendConfig
 from ratslam.classic import view_templates
-from ratslam.core.backend import Backend
-from ratslam.core.types import Action, Estimate
+from ratslam.core.types import Action, Estimate, Scalar
 from ratslam.keyframes.appearance import Appearance, Labels, Touch, Views
 from ratslam.keyframes.map import FrameMap
 from ratslam.recall import filter
@@ -28,7 +28,7 @@ HEALTH_RATE = 0.1
 """Share of the newest revisit in the running health."""
 
 
-class State(NamedTuple):
+class RecallState(NamedTuple):
     """All that the neural half remembers.
 
     Attributes:
@@ -45,34 +45,36 @@ class RecallEvidence(NamedTuple):
 
     Attributes:
         frame to background: see `Recollection`. energy: injected into the pose cells. packet: [3] decoded,
-            cells. health: see `State`. outcome: an `Outcome`, int32.
+            cells. health: see `RecallState`. outcome: an `Outcome`, int32.
     """
 
-    frame: Array
-    match: Array
-    shift: Array
-    mass: Array
-    gain: Array
-    novel: Array
-    entropy: Array
-    second: Array
-    agree: Array
+    frame: Scalar
+    match: Scalar
+    shift: Scalar
+    mass: Scalar
+    gain: Scalar
+    novel: Scalar
+    entropy: Scalar
+    second: Scalar
+    agree: Scalar
     background: Array
-    energy: Array
+    energy: Scalar
     packet: Array
-    rung: Array
-    health: Array
-    outcome: Array
+    rung: Scalar
+    health: Scalar
+    outcome: Scalar
 
 
-class RecallRat:
-    """The rat backend with recall under ambiguity, for views of one shape.
+class RecallBackend:
+    """Bayesian recall with verified loop closures, for views of one shape.
 
     Args:
         view_shape: (R, C, K) of the observations' views. dtype: of all floating state.
     """
 
-    def __init__(self, config: RatConfig, view_shape: tuple[int, int, int], dtype: Any = np.float64) -> None:
+    def __init__(
+        self, config: RecallBackendConfig, view_shape: tuple[int, int, int], dtype: Any = np.float64
+    ) -> None:
         labels = config.templates.source == "labels"
         self.config = config
         self.recall = config.recall.model_copy(update={"fan": "none"}) if labels else config.recall
@@ -87,20 +89,20 @@ class RecallRat:
         self.rings = rings(config.pose_cells, self.dtype)
         self.units = units(config.pose_cells, self.dtype)
 
-    def init(self, key: Array, capacity: int) -> State:
+    def init(self, key: Array, capacity: int) -> RecallState:
         """One packet in the middle of an empty world. Nothing here is random, so `key` is not used."""
         del key
-        return State(
+        return RecallState(
             pose_cells.start(self.config.pose_cells, self.dtype),
             filter.start(self.recall, self.size, capacity, self.dtype, self._groups()),
             jnp.ones((), self.dtype),
         )
 
-    def rows(self, state: State) -> int:
+    def rows(self, state: RecallState) -> int:
         """Frames."""
         return int(state.memory.count)
 
-    def grow(self, state: State, capacity: int) -> State:
+    def grow(self, state: RecallState, capacity: int) -> RecallState:
         """The same memories in larger arrays."""
 
         def enlarge(old: Array, new: Array) -> Array:
@@ -109,11 +111,13 @@ class RecallRat:
         empty = self.init(None, capacity).memory
         return state._replace(memory=jax.tree.map(enlarge, state.memory, empty))
 
-    def inform(self, state: State, guidance: Guidance) -> State:
+    def inform(self, state: RecallState, guidance: Guidance) -> RecallState:
         """The filter takes up the poses, bias and scales of the map."""
         return state._replace(memory=filter.inform(state.memory, guidance))
 
-    def kernel(self, state: State, observation: Observation) -> tuple[State, Estimate, RecallEvidence]:
+    def kernel(
+        self, state: RecallState, observation: Observation
+    ) -> tuple[RecallState, Estimate, RecallEvidence]:
         """Move, look, inject softly, learn."""
         odometry, view, seen, clean = finite(self.config.templates, self.dtype, observation)
         moved = jnp.stack([odometry.dx, odometry.dy, odometry.dtheta])
@@ -162,7 +166,7 @@ class RecallRat:
             health=health,
             outcome=outcome,
         )
-        return State(cells, memory, health), estimate, evidence
+        return RecallState(cells, memory, health), estimate, evidence
 
     def new_map(self) -> FrameMap:
         """An empty frame map."""
@@ -214,13 +218,3 @@ class RecallRat:
         packet = packet + jnp.stack([jnp.zeros_like(turned), jnp.zeros_like(turned), turned])
         energy = jnp.where(known, self.recall.energy * recollection.mass, 0.0)
         return packet % self.rings, energy
-
-
-def evidence_of(matcher: str) -> type[RecallEvidence] | type[RatEvidence]:
-    """What each step of such a matcher reports."""
-    return RecallEvidence if matcher == "recall" else RatEvidence
-
-
-def rat(config: RatConfig, view_shape: tuple[int, int, int], dtype: Any = np.float64) -> Backend:
-    """The rat with the matcher that the configuration names."""
-    return (RecallRat if config.matcher == "recall" else Rat)(config, view_shape, dtype)

@@ -91,7 +91,7 @@ def departure(relative: float) -> Travel:
 
 
 class ExperienceMap:
-    """Folds estimates and evidence of the rat backend (`ratslam.core.backend.Map`).
+    """Folds estimates and evidence of the classic backend (`ratslam.core.backend.Map`).
 
     The fields of `arrays()` are its whole state: node poses [M, 3] (x m, y m, heading rad), the place each
     node stands for, links with their measured motion, and for every folded step its node and the motion

@@ -10,15 +10,8 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, NonNegativeInt, ValidationInfo, field_validator
 
 from evaluation.metrics.experience_metric import ExmConfig
-from ratslam.attractor.config import PoseCellConfig
-from ratslam.backends.classic import RatConfig
-from ratslam.classic.experience_map import ExperienceConfig
-from ratslam.classic.places import PlaceConfig
-from ratslam.classic.view_templates import TemplateConfig
+from ratslam.backends.config import ClassicBackendConfig, GridBackendConfig, RecallBackendConfig
 from ratslam.config.strict_yaml import load, override, validate
-from ratslam.grid.config import GridConfig
-from ratslam.keyframes.config import FrameMapConfig
-from ratslam.recall.filter import RecallConfig
 from robot.live.config import LiveConfig
 from robot.recordings.formats import RecordingConfig
 from robot.simulation.create.session import RovingConfig
@@ -83,8 +76,8 @@ class ScoreConfig(Settings):
     """Relative true poses to judge by (t1,t2,x,y,z,roll,pitch,yaw); none: all but these figures."""
 
 
-class RunConfig(Settings):
-    """A run: `python -m ratslam run config.yaml`."""
+class SourceConfig(Settings):
+    """What a run reads: exactly one source, and how its whiskers become views."""
 
     recording: RecordingConfig | None = None
     """What to run on: a recording, or a session simulated as one of the two below say."""
@@ -96,30 +89,6 @@ class RunConfig(Settings):
     """Or a session on an arm, for `python -m ratslam live`."""
     touch: TouchConfig = TouchConfig()
     """How whiskers become views."""
-    backend: Literal["rat", "grid"] = "rat"
-    """The method: RatSLAM, or the grid particle filter."""
-    grid: GridConfig = GridConfig()
-    """The grid particle filter."""
-    matcher: Literal["recall", "classic"] = "recall"
-    """`recall`: the unified filter and the frame map; `classic`: winner takes all, as RatSLAM does."""
-    pose_cells: PoseCellConfig = PoseCellConfig()
-    """The attractor network."""
-    templates: TemplateConfig = TemplateConfig()
-    """View matching."""
-    places: PlaceConfig = PlaceConfig()
-    """When a place is made, reached or kept."""
-    experience: ExperienceConfig = ExperienceConfig()
-    """The classic map; `closures` holds for both."""
-    recall: RecallConfig = RecallConfig()
-    """The unified filter."""
-    frames: FrameMapConfig = FrameMapConfig()
-    """The map of frames, for the unified filter."""
-    lost: Annotated[float, Field(ge=0, le=1)] = 0.25
-    """Share of fitting revisits under which the robot calls itself lost."""
-    session: SessionConfig = SessionConfig()
-    """Precision, seed and memory."""
-    score: ScoreConfig = ScoreConfig()
-    """Judgement."""
 
     @field_validator("live", mode="after")
     @classmethod
@@ -132,6 +101,18 @@ class RunConfig(Settings):
             raise ValueError(f"{there}; give one of these four, and null for the others")
         return live
 
+
+class RunConfig(RecallBackendConfig, ClassicBackendConfig, GridBackendConfig, SourceConfig):
+    """A run: `python -m ratslam run config.yaml`. `ratslam.backends.config` has the methods' sections."""
+
+    backend: Literal["recall", "classic", "grid"] = "recall"
+    """The method: RatSLAM with Bayesian recall and a keyframe map, RatSLAM as published, or a grid particle
+    filter."""
+    session: SessionConfig = SessionConfig()
+    """Precision, seed and memory."""
+    score: ScoreConfig = ScoreConfig()
+    """Judgement."""
+
     def with_absolute_paths(self, folder: Path) -> RunConfig:
         """The same with relative paths taken from `folder`, so that it can be used from anywhere."""
         relations = self.score.relations
@@ -143,10 +124,6 @@ class RunConfig(Settings):
         parts["touch"] = self.touch.model_copy(update={"reports": self.touch.reports.resolved(folder)})
         parts["score"] = self.score.model_copy(update={"relations": relations and folder / relations})
         return self.model_copy(update=parts)
-
-    def rat(self) -> RatConfig:
-        """The rat backend's part."""
-        return RatConfig(**{name: getattr(self, name) for name in RatConfig.model_fields})
 
     def completed(self, source: Source) -> RunConfig:
         """The same, with what it leaves open and the source knows: head, cell size, given place ids.

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 from tactile.base.types import Array
+
+Scalar = Annotated[Array, "scalar"]
+"""An array of shape (). A field of a backend's evidence with this annotation is a column of `steps.csv`."""
 
 
 class Action(IntEnum):

@@ -53,7 +53,8 @@ def compared(config: RunConfig, folder: Path) -> list[Compared]:
         InputError: it cannot be used, has no whiskers, or nobody knows where the robot was.
     """
     config = config.with_absolute_paths(folder.resolve())
-    found = [_played(config.model_copy(update={"backend": backend})) for backend in ("rat", "grid")]
+    first = "recall" if config.backend == "grid" else config.backend
+    found = [_played(config.model_copy(update={"backend": backend})) for backend in (first, "grid")]
     return [*(one for one, _ in found), found[0][1]]
 
 
@@ -103,8 +104,7 @@ def _played(config: RunConfig) -> tuple[Compared, Compared]:
     whole = chunks[:-1] if len(reports) % CHUNK and len(chunks) > 1 else chunks
     usual = float(np.median(whole)) if whole else np.nan
     extra = sum(compiled) - (len(compiled) * usual if whole else 0.0)
-    name = "rat" if config.backend == "rat" else "grid"
-    ours = _judged(name, np.array(told), session.map.trajectory(), start, truth)
+    ours = _judged(config.backend, np.array(told), session.map.trajectory(), start, truth)
     return (
         ours._replace(rate=CHUNK / usual, compiling=extra),
         _judged(RECKONED, odometry, odometry, start, truth),

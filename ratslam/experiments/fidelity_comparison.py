@@ -20,8 +20,8 @@ from tactile.base.errors import InputError
 TIERS = ("kinematic", "quasistatic", "dynamic")
 """From the cheapest."""
 METHODS = {
-    "classic": ("matcher=classic", "templates.threshold=0.04", "templates.energy=0.05"),
-    "ours": ("matcher=recall",),
+    "classic": ("backend=classic", "templates.threshold=0.04", "templates.energy=0.05"),
+    "ours": ("backend=recall",),
 }
 """The matchers that the tiers are put before, at one setting each."""
 LEAST_LAPS = 2

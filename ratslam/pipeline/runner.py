@@ -17,13 +17,13 @@ from evaluation.metrics.energy_metric import read_relations
 from evaluation.metrics.scorecard import Scorecard, score
 from evaluation.metrics.trajectory import Anytime, present_error, summary, write_tum
 from evaluation.report import pictures
+from ratslam.backends.registry import BACKENDS, BackendEntry, Sensors, build
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import dump
 from ratslam.core.growable_array import Growing
 from ratslam.core.session import CHUNK, Session, Step
 from ratslam.core.types import Action
 from ratslam.pipeline.artifacts import Felt, keep_chart, keep_images, keep_world
-from ratslam.pipeline.backend_registry import Telling, backend_of, telling
 from ratslam.pipeline.run_directory import RunDirectory, read_checkpoint
 from robot.sources.source import Sample, Source
 from robot.touch_source import feelers_of, observation_of
@@ -54,7 +54,6 @@ class Playing:
     ) -> None:
         self.session, self.skipped = session, skipped
         self._config, self._source, self._store, self._manifest = config, source, store, manifest
-        self._told = telling(config)
         self._felt: list[Felt] = []
         self._reckoned = np.zeros(3)
         self._truth = Growing((3,), np.float64)
@@ -73,7 +72,7 @@ class Playing:
             reckoned.append(self._reckoned)
         for sample in samples:
             self._truth.append(np.nan if sample.truth is None else sample.truth)
-        self._store.append(_lines(samples, steps, reckoned, self._told))
+        self._store.append(_lines(samples, steps, reckoned, BACKENDS[self._config.backend]))
         error = self._present.see(self.session, self._truth.rows)
         if error is not None:
             self._store.append({"anytime.csv": iter([f"{float(samples[-1].time)!r},{error!r}\n"])})
@@ -127,7 +126,7 @@ def playing(
     session = session_of(config, source)
     skip = _resume(session, resume, source.digest) if resume else 0
     _check_length(source, skip, resume)
-    with RunDirectory(directory, list(telling(config).columns)) as store:
+    with RunDirectory(directory, list(BACKENDS[config.backend].columns())) as store:
         text = dump(config)
         store.text("config.yaml", text)
         manifest = _manifest(config, text, source, resume)
@@ -138,8 +137,9 @@ def playing(
 
 def session_of(config: RunConfig, source: Source) -> Session:
     """A fresh session for what a source gives."""
+    sensors = Sensors(source.view_shape, feelers_of(source, config.touch))
     return Session(
-        backend_of(config, source.view_shape, feelers_of(source, config.touch)),
+        build(config.backend, config, sensors, config.session.precision),
         seed=config.session.seed,
         reserve=config.session.reserve,
         precision=config.session.precision,
@@ -184,18 +184,18 @@ def readings(source: Source) -> Iterator[tuple[Sample, Observation]]:
 
 
 def _lines(
-    samples: list[Sample], steps: list[Step], reckoned: list[np.ndarray], told: Telling
+    samples: list[Sample], steps: list[Step], reckoned: list[np.ndarray], entry: BackendEntry
 ) -> dict[str, Iterator[str]]:
-    rows = list(zip(samples, steps, strict=True))
+    rows, columns = list(zip(samples, steps, strict=True)), entry.columns()
     return {
-        "steps.csv": (_step_line(sample.time, step, told) for sample, step in rows),
+        "steps.csv": (_step_line(sample.time, step, entry, columns) for sample, step in rows),
         "online.tum": (tum_line(sample.time, step.pose) for sample, step in rows),
         "odometry.tum": (tum_line(s.time, pose) for s, pose in zip(samples, reckoned, strict=True)),
         "truth.tum": (tum_line(s.time, s.truth) for s in samples if s.truth is not None),
     }
 
 
-def _step_line(time: float, step: Step, told: Telling) -> str:
+def _step_line(time: float, step: Step, entry: BackendEntry, columns: Sequence[str]) -> str:
     estimate = step.estimate
     cells = [
         repr(float(time)),
@@ -203,8 +203,8 @@ def _step_line(time: float, step: Step, told: Telling) -> str:
         Action(int(estimate.action)).name.lower(),
         *(repr(float(value)) for value in (*step.pose, *estimate.spread)),
         str(int(estimate.lost)),
-        told.outcomes(int(step.evidence.outcome)).name.lower(),
-        *(_cell(getattr(step.evidence, name)) for name in told.columns),
+        entry.outcomes(int(step.evidence.outcome)).name.lower(),
+        *(_cell(getattr(step.evidence, name)) for name in columns),
     ]
     return ",".join(cells) + "\n"
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from ratslam.backends.grid import GridFilter
+from ratslam.backends.grid import GridBackend
 from ratslam.core.session import Session
 from ratslam.grid.config import GridConfig
 from robot.simulation.create.session import RovingConfig, roving
@@ -25,7 +25,7 @@ def session():
 
 
 def backend(feelers, particles, dtype):
-    return GridFilter(GridConfig(particles=particles), feelers, 2.5, dtype)
+    return GridBackend(GridConfig(particles=particles), feelers, 2.5, dtype)
 
 
 @pytest.mark.parametrize(("particles", "dtype"), [

@@ -178,7 +178,7 @@ def test_steps_without_a_closure(benchmark, size, monkeypatch):
 
 
 class Evidence(NamedTuple):
-    """The part of the rat's evidence that a map reads."""
+    """The fields of `ClassicEvidence` that the map reads."""
 
     template: int
     relative: float = 0.0

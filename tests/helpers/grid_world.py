@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ratslam.backends.grid import GridEvidence, GridFilter, State
+from ratslam.backends.grid import GridBackend, GridEvidence, GridState
 from ratslam.core.packing import layout_of, room
 from ratslam.core.session import CHUNK, run_chunk
 from ratslam.core.types import Estimate
@@ -77,9 +77,9 @@ def report(
 @cache
 def filter_of(
     config: GridConfig, whiskers: int = len(MOUNTS), side: float = 2.5, dtype: Any = np.float64
-) -> GridFilter:
+) -> GridBackend:
     """The filter of a configuration, made and compiled once."""
-    return GridFilter(config, create(whiskers), side, dtype)
+    return GridBackend(config, create(whiskers), side, dtype)
 
 
 def settings(**parts: Any) -> GridConfig:
@@ -88,15 +88,15 @@ def settings(**parts: Any) -> GridConfig:
 
 
 @cache
-def _runner(backend: GridFilter) -> Any:
+def _runner(backend: GridBackend) -> Any:
     # Little optimised: most filters take few steps here, and compiling them is what takes long.
     options = {"xla_backend_optimization_level": 0}
     return jax.jit(partial(run_chunk, backend.kernel), compiler_options=options)
 
 
 def drive(
-    backend: GridFilter, state: State, reports: Sequence[Observation]
-) -> tuple[State, Estimate, GridEvidence]:
+    backend: GridBackend, state: GridState, reports: Sequence[Observation]
+) -> tuple[GridState, Estimate, GridEvidence]:
     """The state after the reports, and what was said at each of them: [T, ...]."""
     outputs = []
     for start in range(0, len(reports), CHUNK):
@@ -110,17 +110,17 @@ def drive(
     return state, estimate, evidence
 
 
-def begun(backend: GridFilter, seed: int = 0) -> State:
+def begun(backend: GridBackend, seed: int = 0) -> GridState:
     """The state before the first report."""
     return backend.init(jax.random.key(seed), 256)
 
 
-def standing(state: State, pose: Sequence[float]) -> State:
+def standing(state: GridState, pose: Sequence[float]) -> GridState:
     """All particles at one pose."""
     there = jnp.broadcast_to(jnp.asarray(pose, state.particles.pose.dtype)[None], state.particles.pose.shape)
     return state._replace(particles=state.particles._replace(pose=there))
 
 
-def remembering(state: State, evidence: np.ndarray) -> State:
+def remembering(state: GridState, evidence: np.ndarray) -> GridState:
     """All particles with one map of evidence [S, S] (rows are y)."""
     return state._replace(maps=state.maps.at[:, 0].set(jnp.asarray(evidence, state.maps.dtype)[None]))

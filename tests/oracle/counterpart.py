@@ -8,12 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from ratslam.backends.classic import Rat, RatConfig, from_parameters
+from ratslam.backends.classic import ClassicBackend
+from ratslam.backends.config import ClassicBackendConfig
 from ratslam.core.session import Session
 from robot.recordings.formats import RecordingConfig, open_recording
 from tactile.base.errors import InputError
 from tactile.base.types import Observation
 from tests.oracle.compare import Report
+from tests.oracle.parameters import settings_of
 from tests.oracle.plain import Input, PlainEngine, PlainStep, Settings
 from tests.oracle.trace import Trace, TraceError
 
@@ -21,7 +23,7 @@ PACKET = 1e-12
 BOUND_STEPS = 1000  # rounding grows along a stream; beyond this many steps the deviation is only reported
 
 
-def settings(config: RatConfig) -> Settings:
+def settings(config: ClassicBackendConfig) -> Settings:
     """What a reference stream has no parameter for: the engine's own defaults."""
     templates = config.templates
     return Settings(templates.recent, config.pose_cells.settle_steps, templates.column_angle)
@@ -37,9 +39,9 @@ def observed(observation: Observation) -> Input:
     )
 
 
-def jax_steps(rat: Rat, observations: list[Observation]) -> Iterator[PlainStep]:
+def jax_steps(backend: ClassicBackend, observations: list[Observation]) -> Iterator[PlainStep]:
     """The JAX engine's decisions, one a step."""
-    for estimate, evidence, *_ in Session(rat, precision="float64").replay(observations):
+    for estimate, evidence, *_ in Session(backend, precision="float64").replay(observations):
         x, y, h = (float(a) for a in evidence.packet)
         yield PlainStep(
             int(evidence.template),
@@ -58,11 +60,11 @@ def plain(trace: Trace, path: Path | str, steps: int | None = None) -> Report:
             view_shape = source.view_shape
     except InputError as error:
         raise TraceError(" ".join(str(error).split())) from error
-    config = from_parameters(trace.strings, labels=trace.labelled)
+    config = settings_of(trace.strings, labels=trace.labelled)
     engine = PlainEngine(trace.parameters, settings(config))
     report = Report(trace.name, {"packet": PACKET, "energy": PACKET})
     n, headings = trace.parameters.pc_dim_xy, trace.parameters.pc_dim_th
-    for index, theirs in enumerate(jax_steps(Rat(config, view_shape), observations)):
+    for index, theirs in enumerate(jax_steps(ClassicBackend(config, view_shape), observations)):
         seen = observed(observations[index])
         ours = engine.step(seen)
         late = "" if index < BOUND_STEPS else " later"

@@ -1,4 +1,4 @@
-"""The plain engine: "Semantics of the rat backend" in `ratslam/README.md`, steps 1 to 4.
+"""The plain engine: "Semantics of the classic backend" in `ratslam/README.md`, steps 1 to 4.
 
 It differs from the stock one in every step, so only the attractor, the sums of differences and the box around
 the peak are shared.

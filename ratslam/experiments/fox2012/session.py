@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from evaluation.metrics.occupancy_grid import Grid, Truth, centres
-from ratslam.backends.grid import GridFilter
+from ratslam.backends.grid import GridBackend
 from ratslam.config.run_config import RunConfig
 from ratslam.core.session import Session, capacity_at
 from ratslam.grid.config import GridConfig
@@ -183,8 +183,8 @@ def _compiled(grid: GridConfig, mounts: tuple[Mount, ...], length: float, precis
     feelers = ReportsConfig(mounts=mounts, length=length).feelers
     if precision == "float64":
         jax.config.update("jax_enable_x64", True)
-        return Session(GridFilter(grid, feelers, grid.side, np.float64))
-    return Session(GridFilter(grid, feelers, grid.side, np.float32), precision="float32")
+        return Session(GridBackend(grid, feelers, grid.side, np.float64))
+    return Session(GridBackend(grid, feelers, grid.side, np.float32), precision="float32")
 
 
 @lru_cache(maxsize=1)

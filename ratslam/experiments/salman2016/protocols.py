@@ -16,12 +16,12 @@ COMMON = (
 on the axis that moves."""
 METHODS: dict[str, tuple[str, ...]] = {
     "classic": (
-        "matcher=classic",
+        "backend=classic",
         "pose_cells.cells_xy=31",
         "templates.energy=0.05",
         "experience.solver.name=relaxation",
     ),
-    "ours": ("matcher=recall",),
+    "ours": ("backend=recall",),
 }
 """The matchers. The classic one is RatSLAM as published, with half of the iRat's energy (III-F), on a torus
 that the maze fits into."""

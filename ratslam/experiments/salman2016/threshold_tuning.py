@@ -26,7 +26,7 @@ from robot.sources.in_memory import Log
 from tactile.base.errors import InputError
 from tactile.base.se2 import wrap
 
-CLASSIC = ("matcher=classic", "templates.energy=0.05")
+CLASSIC = ("backend=classic", "templates.energy=0.05")
 """What is tuned: half of iRat's 0.1 (III-F; the value is Ball et al. 2013's)."""
 THRESHOLDS = tuple(np.round(np.arange(1, 33) * 0.005, 3).tolist())
 """The grid."""

@@ -9,11 +9,11 @@ import numpy as np
 
 from ratslam.attractor.adaptive_window import SETTLED, rungs
 from ratslam.attractor.config import PoseCellConfig
+from ratslam.backends.grid import LIVE_SIDE
 from ratslam.config.run_config import RunConfig
 from ratslam.experiments.sizing.scene_statistics import Scene
 from ratslam.grid.config import DriftConfig
 from ratslam.grid.particle_maps import LAYERS
-from ratslam.pipeline.backend_registry import LIVE_SIDE
 from robot.simulation.head.session import tier
 
 PART = 0.5
@@ -92,7 +92,7 @@ def _rat(config: RunConfig, scene: Scene) -> Iterator[Proposal]:
     yield _of(
         config, "pose_cells.cells_heading", cells.cells_heading, f"{np.degrees(step):.3g} degrees; {turns}"
     )
-    yield _of(config, "matcher", "recall", "weighs runs of views; classic takes the best single view")
+    yield _of(config, "backend", "recall", "weighs runs of views; classic takes the best single view")
     yield _of(config, "session.precision", "float64", "what the published figures are of")
 
 
@@ -112,12 +112,12 @@ def _cells_xy(config: RunConfig, scene: Scene, size: float) -> Proposal:
     now, span = config.pose_cells.cells_xy, max(scene.span)
     cover = min(covering(span, size), MOST)
     # What recall and its map do is the same on any torus: then the one there is will do.
-    value = now if config.matcher == "recall" and FEWEST <= now <= cover else cover
+    value = now if config.backend == "recall" and FEWEST <= now <= cover else cover
     wraps = span / (value * size)
     told = f"the path spans {span / size:.0f} cells: " + (
         f"wraps {wraps:.1f} x" if wraps > 1 else "none twice"
     )
-    free = ", which recall does not mind" if config.matcher == "recall" and wraps > 1 else ""
+    free = ", which recall does not mind" if config.backend == "recall" and wraps > 1 else ""
     return _of(config, "pose_cells.cells_xy", value, told + free)
 
 

@@ -99,8 +99,8 @@ def _less_rat(config: RunConfig) -> list[Step]:
     turns = max(12, round(cells.cells_heading / COARSER))
     if turns < cells.cells_heading:
         steps.append(Step(f"{turns} cells of heading", {"pose_cells.cells_heading": turns}))
-    if config.matcher == "recall":
-        classic: dict[str, Any] = {"matcher": "classic"}
+    if config.backend == "recall":
+        classic: dict[str, Any] = {"backend": "classic"}
         if config.recording is None and "energy" not in config.templates.model_fields_set:
             classic["templates.energy"] = ENERGY
         steps.append(Step("classic matcher", classic))

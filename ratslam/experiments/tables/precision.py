@@ -1,6 +1,6 @@
 """What float32 costs: the same whisker sessions in both precisions, seed by seed.
 
-    python -m ratslam.experiments.tables.precision [--seeds 20] [--matchers recall classic] [--workers N]
+    python -m ratslam.experiments.tables.precision [--seeds 20] [--backends recall classic] [--workers N]
 
 A seed is a maze never used for tuning, a route through it and its odometry; every arm sees the same whisks.
 Beside float32 runs a control: float64 whose odometry is off by one part in ten million, as it is when rounded
@@ -28,10 +28,10 @@ from tactile.base.random_streams import stream
 FIRST_SEED = 9200
 SEEDS = 20
 ARMS = "float64", "float32", "control"
-MATCHERS: dict[str, dict[str, Any]] = {
-    "recall": {"matcher": "recall"},
+BACKENDS: dict[str, dict[str, Any]] = {
+    "recall": {"backend": "recall"},
     "classic": {
-        "matcher": "classic",
+        "backend": "classic",
         "pose_cells": {"cells_xy": 31},
         "templates": {"energy": 0.05, "threshold": 0.05},
         "experience": {"solver": {"name": "relaxation"}},
@@ -68,9 +68,9 @@ JUDGED = Figures._fields[:-1]
 
 
 class Task(NamedTuple):
-    """All arms of one matcher and seed."""
+    """All arms of one backend and seed."""
 
-    matcher: str
+    backend: str
     seed: int
 
 
@@ -103,7 +103,7 @@ def sessions(task: Task) -> dict[str, Figures]:
     from ratslam.experiments.trials.touch_trial import figures, play, session_log
 
     simulation = SESSION | {"seed": task.seed, "maze": {"seed": task.seed}}
-    given = {"simulation": simulation, "session": {"reserve": RESERVE}} | MATCHERS[task.matcher]
+    given = {"simulation": simulation, "session": {"reserve": RESERVE}} | BACKENDS[task.backend]
     config, log = session_log(RunConfig.model_validate(given))
     off = 1 + ROUNDING * stream(task.seed, "tests.precision").uniform(-1, 1, (log.length, 3))
     rounded = replace(log, motion=np.column_stack([log.motion[:, :3] * off, log.motion[:, 3]]))
@@ -120,11 +120,11 @@ def sessions(task: Task) -> dict[str, Figures]:
     return told
 
 
-def measured(seeds: Sequence[int], matcher: str, workers: int = 1) -> dict[str, np.ndarray]:
+def measured(seeds: Sequence[int], backend: str, workers: int = 1) -> dict[str, np.ndarray]:
     """Of each arm [seeds, figures]."""
     from ratslam.experiments.trials.process_pool import shared_out
 
-    rows = list(shared_out(sessions, [Task(matcher, seed) for seed in seeds], workers))
+    rows = list(shared_out(sessions, [Task(backend, seed) for seed in seeds], workers))
     return {arm: np.array([row[arm] for row in rows], float) for arm in ARMS}
 
 
@@ -171,11 +171,11 @@ def accepted(differences: Sequence[Difference]) -> bool:
     return all(max(-found.low, found.high) <= MARGIN * found.spread for found in differences)
 
 
-def lines(matcher: str, found: dict[str, np.ndarray]) -> Iterator[str]:
-    """The table of a matcher."""
+def lines(backend: str, found: dict[str, np.ndarray]) -> Iterator[str]:
+    """The table of a backend."""
     before = found[ARMS[0]]
     heads = f"{'float64':>9s}{'spread':>8s}{'arm':>10s}{'mean difference':>22s}{'worst':>10s}"
-    yield f"{matcher}, {len(before)} seeds".ljust(29) + heads + f"{'median, its interval':>33s}{'equal':>7s}"
+    yield f"{backend}, {len(before)} seeds".ljust(29) + heads + f"{'median, its interval':>33s}{'equal':>7s}"
     for arm in ARMS[1:]:
         told = judged(found[arm], before)
         for k, (name, d) in enumerate(zip(JUDGED, told, strict=True)):
@@ -196,15 +196,15 @@ def lines(matcher: str, found: dict[str, np.ndarray]) -> Iterator[str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=SEEDS)
-    parser.add_argument("--matchers", nargs="*", choices=MATCHERS, default=list(MATCHERS))
+    parser.add_argument("--backends", nargs="*", choices=BACKENDS, default=list(BACKENDS))
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("-o", "--output", type=Path, help="a folder for NAME.npz of all figures")
     given = parser.parse_args()
-    for matcher in given.matchers:
-        found = measured(range(FIRST_SEED, FIRST_SEED + given.seeds), matcher, given.workers)
+    for backend in given.backends:
+        found = measured(range(FIRST_SEED, FIRST_SEED + given.seeds), backend, given.workers)
         if given.output is not None:
-            np.savez(given.output / f"{matcher}.npz", allow_pickle=True, **found)
-        print("\n".join(lines(matcher, found)), flush=True)
+            np.savez(given.output / f"{backend}.npz", allow_pickle=True, **found)
+        print("\n".join(lines(backend, found)), flush=True)
 
 
 if __name__ == "__main__":

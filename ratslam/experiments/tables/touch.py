@@ -86,7 +86,7 @@ class Figures(NamedTuple):
     recovery: tuple[int, ...]
 
 
-def run(row: str, maze: int, seed: int, matcher: str = "recall") -> Figures:
+def run(row: str, maze: int, seed: int, backend: str = "recall") -> Figures:
     """One session of a row."""
     from dataclasses import replace
 
@@ -105,7 +105,7 @@ def run(row: str, maze: int, seed: int, matcher: str = "recall") -> Figures:
 
     simulation, touch = ROWS[row]
     simulation = simulation | {"seed": seed, "maze": {"seed": maze} | simulation.get("maze", {})}
-    config = RunConfig.model_validate({"simulation": simulation, "touch": touch, "matcher": matcher})
+    config = RunConfig.model_validate({"simulation": simulation, "touch": touch, "backend": backend})
     source = open_source(config)
     carried = np.flatnonzero(source.carried)  # type: ignore[attr-defined]
     config = config.completed(source)
@@ -208,11 +208,11 @@ def main() -> None:
     parser.add_argument("--mazes", type=int, default=6)
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--workers", type=int, default=os.cpu_count())
-    parser.add_argument("--matcher", default="recall")
+    parser.add_argument("--backend", default="recall")
     parser.add_argument("--rows", nargs="*", default=list(ROWS))
     given = parser.parse_args()
     tasks = [
-        (row, FIRST_MAZE + maze, 100 * maze + seed, given.matcher)
+        (row, FIRST_MAZE + maze, 100 * maze + seed, given.backend)
         for row in given.rows
         for maze in range(given.mazes)
         for seed in range(given.seeds)

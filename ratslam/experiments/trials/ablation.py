@@ -32,7 +32,7 @@ SAME_PLACE = 2.5
 
 PARTS = {
     "nothing (all parts on)": (),
-    "recall: the classic matcher instead": ("matcher=classic",),
+    "recall: the classic matcher instead": ("backend=classic",),
     "sector shifts": ("recall.shifts=0",),
     "negative evidence of common views": ("recall.common=0.0",),
     "the map's pose as a hypothesis": ("recall.local=0.0",),

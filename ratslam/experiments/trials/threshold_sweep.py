@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.backends.classic import Rat, RatConfig, RatEvidence
+from ratslam.backends.classic import ClassicBackend, ClassicEvidence
+from ratslam.backends.config import ClassicBackendConfig, select_settings
 from ratslam.classic.experience_map import ExperienceMap
 from ratslam.config.run_config import RunConfig
 from ratslam.core.types import Estimate
@@ -35,24 +36,30 @@ class Batch(NamedTuple):
     threshold: np.ndarray
     place: np.ndarray
     estimate: Estimate
-    evidence: RatEvidence
+    evidence: ClassicEvidence
 
 
 def classics(config: RunConfig, log: Log, thresholds: np.ndarray) -> Batch:
     """Runs the classic matcher at thresholds [B] over the same views.
 
     Raises:
-        ValueError: the configuration's matcher is another.
+        ValueError: the configuration's backend is not `classic`.
     """
-    if config.matcher != "classic":
-        raise ValueError(f"thresholds are the classic matcher's, not {config.matcher}'s")
+    if config.backend != "classic":
+        raise ValueError(f"backend: {config.backend}; a sweep of thresholds needs backend: classic")
     dtype = np.dtype(config.session.precision)
     if dtype == np.float64:
         jax.config.update("jax_enable_x64", True)
     rows = room_for(log.length)
     readings = [observation_of(sample) for sample in log]
     chunk = stack(readings + readings[-1:] * (rows - len(readings)))  # steps beyond the last are cut off
-    found = _batch(config.rat(), log.view_shape, dtype.name, jnp.asarray(thresholds, dtype), chunk)
+    found = _batch(
+        select_settings(config, ClassicBackendConfig),
+        log.view_shape,
+        dtype.name,
+        jnp.asarray(thresholds, dtype),
+        chunk,
+    )
     estimate, evidence = jax.tree.map(lambda column: np.asarray(column)[:, : log.length], found)
     return Batch(np.asarray(thresholds), estimate.place, estimate, evidence)
 
@@ -68,15 +75,19 @@ def mapped(config: RunConfig, log: Log, batch: Batch, number: int) -> Played:
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
 def _batch(
-    config: RatConfig, shape: tuple[int, int, int], dtype: str, thresholds: Array, chunk: Observation
-) -> tuple[Estimate, RatEvidence]:
+    config: ClassicBackendConfig,
+    shape: tuple[int, int, int],
+    dtype: str,
+    thresholds: Array,
+    chunk: Observation,
+) -> tuple[Estimate, ClassicEvidence]:
     rows = chunk.label.shape[0]
 
-    def one(threshold: Array) -> tuple[Estimate, RatEvidence]:
+    def one(threshold: Array) -> tuple[Estimate, ClassicEvidence]:
         matching = config.templates.model_copy(update={"threshold": threshold})
-        backend = Rat(config.model_copy(update={"templates": matching}), shape, np.dtype(dtype))
+        backend = ClassicBackend(config.model_copy(update={"templates": matching}), shape, np.dtype(dtype))
 
-        def step(state: Any, observation: Observation) -> tuple[Any, tuple[Estimate, RatEvidence]]:
+        def step(state: Any, observation: Observation) -> tuple[Any, tuple[Estimate, ClassicEvidence]]:
             state, estimate, evidence = backend.kernel(state, observation)
             return state, (estimate, evidence)
 

@@ -14,14 +14,15 @@ import numpy as np
 
 from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.experience_metric import ExmConfig, ExperienceMetric, experience_metric
-from ratslam.backends.classic import RatConfig
-from ratslam.backends.recall import rat
+from ratslam.backends.config import select_settings
+from ratslam.backends.registry import BACKENDS, Sensors, build
 from ratslam.config.run_config import RunConfig, SessionConfig
 from ratslam.core.session import Session, capacity_at
 from ratslam.experiments.trials.controls import Control, controlled
 from ratslam.pipeline.run import open_source
 from robot.sources.in_memory import Log, collected
 from robot.touch_source import observation_of, sensing
+from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.se2 import integrate
 
@@ -116,7 +117,11 @@ def played(task: Task) -> Played:
 
 def play(config: RunConfig, log: Log) -> Played:
     """Runs a session that is in memory, with a configuration completed by its source."""
-    session = _engine(config.rat(), config.session, log.view_shape, room_for(log.length))
+    method = select_settings(config, BACKENDS[config.backend].config_class)
+    reserve = max(room_for(log.length), config.session.reserve)
+    session, start = _compiled(config.backend, method, config.session, log.view_shape, reserve)
+    session.map = session.backend.new_map()
+    session.restore(start)
     steps = list(session.replay(observation_of(sample) for sample in log))
     place = np.array([int(step.estimate.place) for step in steps])
     return told(log, place, session.map)
@@ -200,20 +205,13 @@ def whole(config: RunConfig, folder: Path) -> RunConfig:
     return config.with_absolute_paths(folder.resolve())
 
 
-def _engine(config: RatConfig, settings: SessionConfig, shape: tuple[int, int, int], reserve: int) -> Session:
-    """A session at its start, compiled already if one like it was asked for lately."""
-    session, start = _compiled(config, settings, shape, max(reserve, settings.reserve))
-    session.map = session.backend.new_map()
-    session.restore(start)
-    return session
-
-
 @lru_cache(maxsize=2)
 def _compiled(
-    config: RatConfig, settings: SessionConfig, shape: tuple[int, int, int], reserve: int
+    name: str, method: Settings, settings: SessionConfig, shape: tuple[int, int, int], reserve: int
 ) -> tuple[Session, dict[str, np.ndarray]]:
+    """A session for these settings and its state at the start; compiled functions are kept."""
     session = Session(
-        rat(config, shape, np.dtype(settings.precision)),
+        build(name, method, Sensors(shape), settings.precision),
         seed=settings.seed,
         reserve=reserve,
         precision=settings.precision,

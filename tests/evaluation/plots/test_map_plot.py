@@ -25,7 +25,7 @@ KEPT = ("walls.csv", "views.npz", "maze.txt")
 CONFIG = """
 simulation: {path: {explore: 40}, maze: {heights: [0.03, 0.05]}, seed: 3}
 touch: {head: {dead: [4]}}
-matcher: classic
+backend: classic
 """
 TOUCH = sorted(path.stem for path in (ROOT / "configs").glob("whisker_*.yaml"))
 
@@ -35,7 +35,7 @@ def folder(tmp_path_factory):
     """A tiny session on touch: run, and written to a file that is run."""
     path = tmp_path_factory.mktemp("pictures")
     (path / "config.yaml").write_text(CONFIG)
-    (path / "replay.yaml").write_text("recording: {file: session.mcap}\nmatcher: classic\n")
+    (path / "replay.yaml").write_text("recording: {file: session.mcap}\nbackend: classic\n")
     assert main(["simulate", str(path / "config.yaml"), "-o", str(path / "session.mcap")]) == 0
     assert main(["run", str(path / "config.yaml"), "-o", str(path / "run")]) == 0
     assert main(["run", str(path / "replay.yaml"), "-o", str(path / "replayed")]) == 0
@@ -96,7 +96,7 @@ def test_what_is_kept_is_small(folder):
 
 def test_a_session_without_whiskers_has_only_its_map(folder, tmp_path):
     square = ROOT / "configs" / "square.yaml"
-    assert main(["run", str(square), "-o", str(tmp_path / "run"), "--set", "matcher=classic"]) == 0
+    assert main(["run", str(square), "-o", str(tmp_path / "run"), "--set", "backend=classic"]) == 0
     assert [path.name for path in (tmp_path / "run").glob("*.png")] == ["map.png"]
     assert not {path.name for path in (tmp_path / "run").iterdir()} & set(KEPT)
 

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import importlib.util
 from functools import cache
-from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
-from ratslam.backends.classic import RatConfig
-from ratslam.backends.grid import GridFilter, Outcome
-from ratslam.backends.recall import rat
+from ratslam.backends.config import ClassicBackendConfig, RecallBackendConfig
+from ratslam.backends.grid import GridBackend, Outcome
+from ratslam.backends.registry import Sensors, build
 from ratslam.core.session import CHUNK, Session, capacity_at
 from ratslam.core.types import Action
 from ratslam.grid.config import GridConfig
 from tactile.base.types import Odometry, observation
 from tactile.whiskers.planar_whiskers import Feelers
+from tests.ratslam.backends.dead_reckoning import DeadReckoning
 
 VIEW = (3, 6, 1)
 WHISKERS = VIEW[0] * VIEW[1]
@@ -26,21 +25,13 @@ AROUND = np.stack([np.cos(BEARING), np.sin(BEARING)], axis=1)
 REACH = 0.2
 
 
-def _dead_reckoning():
-    spec = importlib.util.spec_from_file_location(
-        "deadreckoning", Path(__file__).with_name("deadreckoning.py")
-    )
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.DeadReckoning()
-
-
-def _rat(matcher, source, dtype=np.float64, **more):
-    # Both engines of the pose cells have to conform; each with one kind of either matcher.
+def _ratslam(name, source, dtype=np.float64, **more):
+    # Both engines of the pose cells have to conform; each with one source of views.
     engine = "window" if source == "views" and not more else "dense"
     cells = {"cells_xy": 11, "engine": engine}
-    parts = {"matcher": matcher, "pose_cells": cells, "templates": {"source": source}}
-    return lambda: rat(RatConfig.model_validate(parts | more), VIEW, dtype)
+    parts = {"pose_cells": cells, "templates": {"source": source}}
+    kind = {"recall": RecallBackendConfig, "classic": ClassicBackendConfig}[name]
+    return lambda: build(name, kind.model_validate(parts | more), Sensors(VIEW), dtype)
 
 
 def _grid(dtype=np.float64):
@@ -52,7 +43,7 @@ def _grid(dtype=np.float64):
     }
     config = GridConfig.model_validate({"particles": 20} | doubtful)
     feelers = Feelers(np.zeros((WHISKERS, 2)), AROUND, np.full(WHISKERS, REACH))
-    return lambda: GridFilter(config, feelers, 3.0, dtype)
+    return lambda: GridBackend(config, feelers, 3.0, dtype)
 
 
 # Weighs its runs every few frames, so that it does so in mid-run wherever one stops.
@@ -60,22 +51,22 @@ TOUCH = {"recall": {"fan": "whiskers"}, "frames": {"weigh_every": 15, "breaks": 
 
 
 BACKENDS = {
-    "recall": _rat("recall", "views"),
-    "recall-labels": _rat("recall", "labels"),
-    "touch": _rat("recall", "views", **TOUCH),
-    "classic": _rat("classic", "views"),
-    "classic-labels": _rat("classic", "labels"),
+    "recall": _ratslam("recall", "views"),
+    "recall-labels": _ratslam("recall", "labels"),
+    "touch": _ratslam("recall", "views", **TOUCH),
+    "classic": _ratslam("classic", "views"),
+    "classic-labels": _ratslam("classic", "labels"),
     "grid": _grid(),
-    "dead-reckoning": _dead_reckoning,
+    "dead-reckoning": DeadReckoning,
 }
 
 
 SINGLE = {
-    "recall": _rat("recall", "views", np.float32),
-    "recall-labels": _rat("recall", "labels", np.float32),
-    "touch": _rat("recall", "views", np.float32, **TOUCH),
-    "classic": _rat("classic", "views", np.float32),
-    "classic-labels": _rat("classic", "labels", np.float32),
+    "recall": _ratslam("recall", "views", np.float32),
+    "recall-labels": _ratslam("recall", "labels", np.float32),
+    "touch": _ratslam("recall", "views", np.float32, **TOUCH),
+    "classic": _ratslam("classic", "views", np.float32),
+    "classic-labels": _ratslam("classic", "labels", np.float32),
     "grid": _grid(np.float32),
 }
 

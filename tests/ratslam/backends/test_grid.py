@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from ratslam.backends.config import GridBackendConfig
 from ratslam.backends.grid import Outcome
-from ratslam.config.run_config import RunConfig
+from ratslam.backends.registry import Sensors, build
 from ratslam.core.session import Session
 from ratslam.grid import likelihoods, particle_maps
 from ratslam.grid.particle_maps import COSINE, EVIDENCE, SINE
-from ratslam.pipeline.backend_registry import backend_of
 from tactile.base.errors import InputError
 from tactile.base.se2 import wrap
 from tactile.base.types import Motion
@@ -552,10 +552,8 @@ def test_seeds_differ_and_repeat():
 
 
 def test_more_cells_than_can_be_counted_are_refused():
-    config = RunConfig.model_validate(
-        {"roving": {}, "backend": "grid", "grid": {"particles": 300_000, "side": 2.5}}
-    )
+    config = GridBackendConfig.model_validate({"grid": {"particles": 300_000, "side": 2.5}})
     with pytest.raises(InputError, match="fewer particles"):
-        backend_of(config, (1, 4, 1), create())
+        build("grid", config, Sensors((1, 4, 1), create()))
     with pytest.raises(InputError, match="without whiskers"):
-        backend_of(config, (1, 4, 1), None)
+        build("grid", config, Sensors((1, 4, 1)))

@@ -16,7 +16,7 @@ from tactile.base.types import Odometry, observation
 
 
 class Evidence(NamedTuple):
-    """The part of the rat's evidence that a map reads."""
+    """The fields of `ClassicEvidence` that the map reads."""
 
     template: int = 0
     relative: float = 0.0

@@ -51,7 +51,7 @@ sys.exit(main(sys.argv[2:]))
 
 
 def arguments(folder):
-    return ["run", SQUARE, "-o", str(folder), "--set", "matcher=classic"]
+    return ["run", SQUARE, "-o", str(folder), "--set", "backend=classic"]
 
 
 @pytest.fixture(scope="module")

@@ -114,8 +114,8 @@ def replayed(kind: str, steps: int, folder: Path) -> dict[str, Any]:
     import jax
 
     jax.config.update("jax_enable_x64", True)
+    from ratslam.backends.registry import BACKENDS
     from ratslam.config.run_config import RunConfig
-    from ratslam.pipeline.backend_registry import telling
     from ratslam.pipeline.run import replayed as through
     from ratslam.pipeline.run_directory import RunDirectory
     from ratslam.pipeline.runner import Playing, session_of
@@ -124,13 +124,13 @@ def replayed(kind: str, steps: int, folder: Path) -> dict[str, Any]:
     config = RunConfig.model_validate(
         {
             "recording": {"file": "circuit.npz"},
-            "matcher": "classic",
+            "backend": "classic",
             "templates": {"source": "labels" if kind == "labels" else "views"},
             "experience": {"solver": {"name": "relaxation", "loops": 1}},
         }
     )
-    session, told = session_of(config, source), telling(config)
-    with RunDirectory(folder, told.columns) as store:
+    session = session_of(config, source)
+    with RunDirectory(folder, BACKENDS[config.backend].columns()) as store:
         through(Playing(config, source, store, {}, session, 0), source)
     (_, early, late), rest = source.moments, 0.9 * steps
     with (folder / "steps.csv").open(encoding="utf-8") as lines:

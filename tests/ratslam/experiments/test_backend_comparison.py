@@ -29,7 +29,7 @@ SESSIONS = {
     "create": "roving: {reports: 40, seed: 3}\n",
     "arm": "simulation: {maze: {columns: 2, rows: 2, loop: 4}, path: {circuits: C}}\n",
 }
-QUICK = ["grid.particles=20", "matcher=classic", "pose_cells.cells_xy=11"]
+QUICK = ["grid.particles=20", "backend=classic", "pose_cells.cells_xy=11"]
 
 
 def walk(count: int = 60) -> np.ndarray:
@@ -67,7 +67,7 @@ def test_both_backends_see_the_same_session(
     (tmp_path / "c.yaml").write_text(SESSIONS[session])
     assert main(["compare", str(tmp_path / "c.yaml"), *(f"--set={one}" for one in QUICK)]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split("  ")[0] for line in lines[2:5]] == ["rat", "grid", RECKONED]
+    assert [line.split("  ")[0] for line in lines[2:5]] == ["classic", "grid", RECKONED]
     assert all(float(number) < 3 for line in lines[2:5] for number in line[16:52].split())
     steps = int(lines[0].split()[0])
     assert steps == 40 if session == "create" else steps > 20

@@ -36,7 +36,7 @@ TINY = {
     "simulation.whisking.rate": 0.5,
     "pose_cells.cells_xy": 11,
     "pose_cells.cells_heading": 12,
-    "matcher": "classic",
+    "backend": "classic",
 }
 CORES = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set()
 FEW = st.sampled_from([0.0, 1.0, 2.0, 3.0, np.nan])
@@ -301,7 +301,6 @@ def test_the_study_that_comes_along_covers_every_axis():
     configs = [variant.config for variant in read_study(ROOT / "configs" / "study_frontier.yaml").variants]
     for axis in (
         lambda config: config.backend,
-        lambda config: config.matcher,
         lambda config: config.pose_cells.engine,
         lambda config: config.pose_cells.cells_xy,
         lambda config: config.grid.particles,

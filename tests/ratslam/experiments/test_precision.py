@@ -39,12 +39,12 @@ def test_a_shift_of_all_seeds_is_refused_and_what_does_not_matter_accepted():
 
 @pytest.mark.soak
 @pytest.mark.timeout(3600)
-@pytest.mark.parametrize("matcher", precision.MATCHERS)
-def test_float32_maps_as_well_as_float64(matcher):
+@pytest.mark.parametrize("backend", precision.BACKENDS)
+def test_float32_maps_as_well_as_float64(backend):
     """Over 20 seeds. Were a figure's median off by more than the margin, one such table in 200 would pass."""
     seeds = range(precision.FIRST_SEED, precision.FIRST_SEED + precision.SEEDS)
-    found = precision.measured(seeds, matcher)
-    print("\n" + "\n".join(precision.lines(matcher, found)))
+    found = precision.measured(seeds, backend)
+    print("\n" + "\n".join(precision.lines(backend, found)))
     assert precision.accepted(precision.judged(found["float32"], found["float64"]))
 
 

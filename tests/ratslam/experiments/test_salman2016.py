@@ -69,7 +69,7 @@ def session(truth, **given):
 @pytest.fixture(scope="module")
 def tiny():
     data = {"path": {"circuits": "CCA"}, "maze": {"columns": 2, "rows": 2, "loop": 4}}
-    return session_log(RunConfig.model_validate({"simulation": data, "matcher": "classic"}))
+    return session_log(RunConfig.model_validate({"simulation": data, "backend": "classic"}))
 
 
 # Laps and sessions
@@ -144,7 +144,7 @@ def test_a_batch_of_thresholds_is_what_single_sessions_give(tiny):
 def test_thresholds_are_the_classic_matchers(tiny):
     config, log = tiny
     with pytest.raises(ValueError, match="classic"):
-        classics(config.model_copy(update={"matcher": "recall"}), log, np.array([0.1]))
+        classics(config.model_copy(update={"backend": "recall"}), log, np.array([0.1]))
 
 
 # Controls

@@ -47,16 +47,15 @@ def scenes(draw):
 
 
 CONFIGS = st.builds(
-    lambda backend, matcher, cells, size, fidelity, side: validate(
+    lambda backend, cells, size, fidelity, side: validate(
         override(
             parse("simulation: {}\n", "a"),
-            [f"backend={backend}", f"matcher={matcher}", f"pose_cells.cells_xy={cells}", f"grid.side={side}",
+            [f"backend={backend}", f"pose_cells.cells_xy={cells}", f"grid.side={side}",
              f"pose_cells.cell_size={size!r}", f"simulation.fidelity={fidelity}"],
         ),
         RunConfig,
     ),
-    st.sampled_from(["rat", "grid"]),
-    st.sampled_from(["recall", "classic"]),
+    st.sampled_from(["recall", "classic", "grid"]),
     st.integers(7, 301),
     LENGTHS,
     st.sampled_from(["auto", "quasistatic", "dynamic"]),
@@ -84,17 +83,17 @@ def test_a_covering_torus_does_not_wrap(span, cell):
 def test_what_is_proposed_fits_the_scene_and_is_proposed_again(config, scene):
     found = {each.key: each.value for each in proposals(config, scene)}
     proposed = with_settings(config, found)
-    if config.backend == "rat":
+    if config.backend != "grid":
         size, across = found["pose_cells.cell_size"], found["pose_cells.cells_xy"]
         assert scene.most / size <= PARTS / 2 + 1e-9
         assert scene.usual / size >= SLOW - 1e-9 or scene.most / size > 1
-        assert across * size >= max(scene.span) or across == MOST or config.matcher == "recall"
+        assert across * size >= max(scene.span) or across == MOST or config.backend == "recall"
         assert across >= FEWEST
     else:
         side = int(np.ceil(proposed.grid.side / proposed.grid.cell))
         assert PARTICLES[0] <= proposed.grid.particles <= PARTICLES[1]
         assert proposed.grid.particles * LAYERS * side**2 * 4 <= MEMORY * 2**20
-    fixed = config.model_copy(update={"matcher": proposed.matcher})  # what is proposed for recall, for recall
+    fixed = config.model_copy(update={"backend": proposed.backend})  # what is proposed for recall, for recall
     again = with_settings(fixed, {each.key: each.value for each in proposals(fixed, scene)})
     assert not [each.key for each in proposals(again, scene) if each.changed]
 
@@ -189,8 +188,8 @@ def stubbed(monkeypatch):
 
     def run_job(job):
         asked.append(job.config)
-        if job.config.matcher == "classic":
-            return Result(hash="", seed=0, error="matcher: cannot be had")
+        if job.config.backend == "classic":
+            return Result(hash="", seed=0, error="backend: cannot be had")
         em = Quantity(label="EM", value=float(job.config.pose_cells.cell_size), unit="")
         return Result(hash="", seed=0, steps=9, quantities={"energy_all": em})
 
@@ -209,9 +208,9 @@ def test_every_step_is_tried_on_the_same_short_session(tmp_path, capsys, stubbed
     assert second.simulation.fidelity == "dynamic"
     assert {config.simulation.path.circuits for config in stubbed} == {first.simulation.path.circuits}
     assert len(first.simulation.path.circuits) < 10
-    assert "classic" in [config.matcher for config in others]
+    assert "classic" in [config.backend for config in others]
     assert "float32" in [config.session.precision for config in others]
-    assert "matcher: cannot be had" in told  # and the rest is told all the same
+    assert "backend: cannot be had" in told  # and the rest is told all the same
     pasted = told.partition("For maze.yaml:")[2]
     changed = validate(parse(pasted, "a"), RunConfig)
     assert (changed.pose_cells, changed.simulation.fidelity) == (

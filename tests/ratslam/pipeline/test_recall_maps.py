@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from evaluation.metrics.trajectory import ate
-from ratslam.backends.classic import RatConfig
-from ratslam.backends.recall import rat
+from ratslam.backends.config import RecallBackendConfig
+from ratslam.backends.recall import RecallBackend
 from ratslam.core.session import Session
 from ratslam.keyframes.loop_closures import Verdict
 from robot.recordings.npz_trace import read_stream
@@ -26,8 +26,9 @@ GOLDEN = Path(__file__).parents[2] / "golden"
 def mapped(log: Log, precision: str = "float64", **parts) -> Session:
     """A session that has replayed the log with one setting for all, on pose cells small enough for a test."""
     cells = {"cells_xy": 11, "cell_size": log.info.cell_size}
-    config = RatConfig.model_validate({"pose_cells": cells, **parts})
-    session = Session(rat(config, log.view_shape, np.dtype(precision)), reserve=512, precision=precision)
+    config = RecallBackendConfig.model_validate({"pose_cells": cells, **parts})
+    backend = RecallBackend(config, log.view_shape, np.dtype(precision))
+    session = Session(backend, reserve=512, precision=precision)
     for _ in session.replay(sample.reading for sample in log):
         pass
     return session
@@ -160,7 +161,9 @@ def test_single_precision_maps_as_well():
 def test_a_kidnapped_robot_knows_that_it_is_lost_and_then_where_it_is():
     log = golden("e_kidnap")
     cells = {"cells_xy": 11, "cell_size": 0.1}
-    session = Session(rat(RatConfig.model_validate({"pose_cells": cells}), log.view_shape), reserve=512)
+    session = Session(
+        RecallBackend(RecallBackendConfig.model_validate({"pose_cells": cells}), log.view_shape), reserve=512
+    )
     lost = np.array([bool(s.estimate.lost) for s in session.replay(sample.reading for sample in log)])
     assert not lost[:127].any()
     assert lost[140:155].all()
@@ -187,8 +190,8 @@ def test_a_run_can_be_undone():
 
 def test_doubt_grows_on_the_way_and_falls_at_a_closure():
     log = golden("a_square3")
-    config = RatConfig.model_validate({"pose_cells": {"cells_xy": 11, "cell_size": 0.1}})
-    session = Session(rat(config, log.view_shape), reserve=512)
+    config = RecallBackendConfig.model_validate({"pose_cells": {"cells_xy": 11, "cell_size": 0.1}})
+    session = Session(RecallBackend(config, log.view_shape), reserve=512)
     rows, at = list(log), {}
     for start in range(0, 180, 20):
         list(session.replay(sample.reading for sample in rows[start : start + 20]))
@@ -198,8 +201,8 @@ def test_doubt_grows_on_the_way_and_falls_at_a_closure():
 
 
 def test_standing_still_costs_nothing():
-    config = RatConfig.model_validate({"pose_cells": {"cells_xy": 11}})
-    session = Session(rat(config, (3, 6, 1)), reserve=512)
+    config = RecallBackendConfig.model_validate({"pose_cells": {"cells_xy": 11}})
+    session = Session(RecallBackend(config, (3, 6, 1)), reserve=512)
     still = observation(Odometry(0.0, 0.0, 0.0, 0.1), np.full((3, 6, 1), 0.5))
     list(session.replay(still for _ in range(300)))
     assert len(session.map.arrays()["pose"]) == 1

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ratslam.backends.classic import RatConfig
-from ratslam.backends.recall import rat
+from ratslam.backends.config import RecallBackendConfig
+from ratslam.backends.recall import RecallBackend
 from ratslam.core.session import Session
 from ratslam.recall import filter, observation_model
 from ratslam.recall.filter import BASIN, FACING, SAMPLES, SUPPORT, Guidance, RecallConfig
@@ -690,7 +690,7 @@ def test_background_is_told_of_ruled_out_frames_each_once(count, since):
 
 def make_session(**settings):
     parts = {"pose_cells": {"cells_xy": 11, "cells_heading": 12}}
-    return Session(rat(RatConfig.model_validate(parts), (1, SIZE, 1)), **settings)
+    return Session(RecallBackend(RecallBackendConfig.model_validate(parts), (1, SIZE, 1)), **settings)
 
 
 def test_standing_still_makes_no_frames():

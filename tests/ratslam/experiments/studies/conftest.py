@@ -18,7 +18,7 @@ TINY = {
     "simulation.whisking.rate": 0.5,
     "pose_cells.cells_xy": 11,
     "pose_cells.cells_heading": 12,
-    "matcher": "classic",
+    "backend": "classic",
 }
 """Some 40 whisks."""
 

@@ -21,9 +21,9 @@ ROOT = Path(__file__).parents[4]
 SMALL = {"simulation.path": {"circuits": "CC"}}
 
 
-@pytest.mark.parametrize("matcher", ["classic", pytest.param("recall", marks=pytest.mark.soak)])
-def test_a_job_has_the_figures_of_a_run(tiny, tmp_path, matcher):
-    (job,) = jobs(read_study(tiny(set=SMALL | {"matcher": matcher}, seeds=[3])))
+@pytest.mark.parametrize("backend", ["classic", pytest.param("recall", marks=pytest.mark.soak)])
+def test_a_job_has_the_figures_of_a_run(tiny, tmp_path, backend):
+    (job,) = jobs(read_study(tiny(set=SMALL | {"backend": backend}, seeds=[3])))
     result = run_job(job)
     run(job.config, tmp_path / "run")
     card = read_card(tmp_path / "run")

@@ -22,7 +22,7 @@ SQUARE = ROOT / "configs" / "square.yaml"
 AXES = {
     "frames.score": st.floats(1, 50, allow_subnormal=False),
     "recall.modes": st.integers(1, 8),
-    "matcher": st.sampled_from(["recall", "classic"]),
+    "backend": st.sampled_from(["recall", "classic"]),
     "session.precision": st.sampled_from(["float32", "float64"]),
     "simulation.whisking.rate": st.floats(0.5, 4),
     "places": st.sampled_from([{}, {"radius": 1.0}, {"radius": 1.5}]),
@@ -219,7 +219,7 @@ def test_a_bad_study_is_refused_before_anything_runs(capsys, folder, content, sa
 def test_a_fault_is_told_once_and_all_faults_are_told(folder):
     with pytest.raises(InputError) as caught:
         read(
-            folder, vary={"matcher": ["recall", "classic"], "frames.scor": [1, 2]}, set={"recall.leave": "x"}
+            folder, vary={"backend": ["recall", "classic"], "frames.scor": [1, 2]}, set={"recall.leave": "x"}
         )
     lines = str(caught.value).splitlines()
     assert len(lines) == 2
@@ -231,13 +231,13 @@ def test_a_fault_is_told_once_and_all_faults_are_told(folder):
     ("override", "said"),
     [
         ("frames.scor=3", "--set frames.scor: unknown key"),
-        ("matcher=recall", "varied"),
+        ("backend=recall", "varied"),
         ("x", "no key and value"),
     ],
 )
 def test_a_bad_override_is_refused(folder, override, said):
     with pytest.raises(InputError, match=said):
-        read(folder, override, vary={"matcher": ["recall", "classic"]})
+        read(folder, override, vary={"backend": ["recall", "classic"]})
 
 
 def test_an_empty_file_and_a_missing_base_are_refused(folder):

@@ -136,7 +136,7 @@ def test_a_tuning_that_is_killed_again_and_again_ends_the_same(tiny, tmp_path):
     from tests.ratslam.experiments.studies.test_executor import start, wait_for
 
     plan = TUNE | {"trials": 10, "parameters": {"frames.score": {"low": 2.0, "high": 30.0}}}
-    study = tiny(tune=plan, set={"matcher": "recall"})
+    study = tiny(tune=plan, set={"backend": "recall"})
     whole = tune(read_study(study), tmp_path / "whole", workers=1)
     output = tmp_path / "out"
     for count in (0, 1, 3, 6):

@@ -1,0 +1,59 @@
+"""The sections of a configuration that each method reads; `RunConfig` inherits all of them."""
+
+from __future__ import annotations
+
+from typing import Annotated, TypeVar
+
+from pydantic import Field
+
+from ratslam.attractor.config import PoseCellConfig
+from ratslam.classic.experience_map import ExperienceConfig
+from ratslam.classic.places import PlaceConfig
+from ratslam.classic.view_templates import TemplateConfig
+from ratslam.grid.config import GridConfig
+from ratslam.keyframes.config import FrameMapConfig
+from ratslam.recall.filter import RecallConfig
+from tactile.base.config import Settings
+
+BackendConfig = TypeVar("BackendConfig", bound=Settings)
+
+
+class PoseCellBackendConfig(Settings):
+    """Sections common to the methods with pose cells."""
+
+    pose_cells: PoseCellConfig = PoseCellConfig()
+    """The attractor network."""
+    templates: TemplateConfig = TemplateConfig()
+    """View preprocessing and, for `backend: classic`, view matching."""
+    experience: ExperienceConfig = ExperienceConfig()
+    """The experience map of `backend: classic`; `closures` holds for `backend: recall` too."""
+
+
+class ClassicBackendConfig(PoseCellBackendConfig):
+    """Sections of `backend: classic`."""
+
+    places: PlaceConfig = PlaceConfig()
+    """When a place is created, reached or kept."""
+
+
+class RecallBackendConfig(PoseCellBackendConfig):
+    """Sections of `backend: recall`."""
+
+    recall: RecallConfig = RecallConfig()
+    """The Bayes filter over remembered frames."""
+    frames: FrameMapConfig = FrameMapConfig()
+    """The keyframe map."""
+    lost: Annotated[float, Field(ge=0, le=1)] = 0.25
+    """Share of fitting revisits below which the robot is reported lost (see `RecallEvidence.health`)."""
+
+
+class GridBackendConfig(Settings):
+    """Sections of `backend: grid`."""
+
+    grid: GridConfig = GridConfig()
+    """The grid particle filter."""
+
+
+def select_settings(config: Settings, kind: type[BackendConfig]) -> BackendConfig:
+    """The sections of `config` (for example a `RunConfig`) that are fields of `kind`."""
+    return kind(**{name: getattr(config, name) for name in kind.model_fields})
