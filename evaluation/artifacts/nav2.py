@@ -16,7 +16,7 @@ import numpy as np
 import yaml
 
 from evaluation.metrics.occupancy_grid import Grid, check_grid
-from tactile.base.atomic_write import in_one_piece
+from tactile.base.atomic_write import write_atomically
 from tactile.base.errors import InputError
 
 Mode = Literal["trinary", "scale"]
@@ -46,8 +46,8 @@ class Served(NamedTuple):
 
 def write_nav2(folder: Path, grid: Grid, mode: Mode = "trinary") -> None:
     """Writes map.pgm and map.yaml into a folder, each in one piece."""
-    in_one_piece(folder / "map.pgm", lambda path: write_image(path, grid, mode))
-    in_one_piece(folder / "map.yaml", lambda path: write_description(path, grid, mode))
+    write_atomically(folder / "map.pgm", lambda path: write_image(path, grid, mode))
+    write_atomically(folder / "map.yaml", lambda path: write_description(path, grid, mode))
 
 
 def write_image(path: str | Path, grid: Grid, mode: Mode = "trinary") -> None:

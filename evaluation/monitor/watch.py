@@ -15,7 +15,7 @@ import numpy as np
 from evaluation.artifacts.run_directory import read_walls
 from evaluation.monitor.plot import draw_watch
 from evaluation.monitor.progress import PICTURE, RUNNING, Progress, Watched, counted
-from tactile.base.atomic_write import in_one_piece
+from tactile.base.atomic_write import write_atomically
 from tactile.base.errors import InputError
 
 PATIENCE = 300.0
@@ -82,7 +82,7 @@ def distance(odometry: np.ndarray) -> float:
 def _draw(directory: Path, seen: Progress) -> None:
     figure = draw_watch(seen, read_walls(directory))
     try:
-        in_one_piece(directory / PICTURE, figure.savefig)
+        write_atomically(directory / PICTURE, figure.savefig)
     except OSError as error:
         found = f"cannot be written ({error.strerror or error})"
         raise InputError(str(directory / PICTURE), found, "a run directory that can be written to") from None

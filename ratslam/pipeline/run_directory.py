@@ -7,7 +7,6 @@ interrupt, a kill or a full disk leaves a readable prefix.
 from __future__ import annotations
 
 import json
-import os
 import zipfile
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
@@ -16,6 +15,7 @@ from typing import Any, TextIO
 
 import numpy as np
 
+from tactile.base.atomic_write import write_atomically, write_text_atomically
 from tactile.base.errors import InputError
 
 COLUMNS = (
@@ -71,7 +71,7 @@ class RunDirectory:
 
     def text(self, name: str, content: str) -> None:
         """A text file, in one piece."""
-        self._replace(name, lambda path: path.write_text(content, encoding="utf-8"))
+        write_text_atomically(self.path / name, content)
 
     def manifest(self, content: Mapping[str, Any]) -> None:
         """manifest.json, in one piece."""
@@ -84,20 +84,11 @@ class RunDirectory:
             with path.open("wb") as file:
                 np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
 
-        self._replace("map.npz", write)
+        write_atomically(self.path / "map.npz", write)
 
     def file(self, name: str, write: Any) -> None:
         """Any file in one piece; `write(path)` makes it under a temporary name of the same ending."""
-        self._replace(name, write)
-
-    def _replace(self, name: str, write: Any) -> None:
-        temporary = self.path / f".{name}"
-        try:
-            write(temporary)
-            os.replace(temporary, self.path / name)
-        finally:
-            with suppress(FileNotFoundError):
-                temporary.unlink()
+        write_atomically(self.path / name, write)
 
 
 def read_checkpoint(path: Path) -> dict[str, np.ndarray]:

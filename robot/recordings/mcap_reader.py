@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from array import array
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -23,6 +22,7 @@ from robot.recordings.schemas import TRUTH
 from robot.recordings.unit_check import ORDINARY, Limits, Track, units
 from robot.sources.input_files import refuse, require_file, unreadable
 from robot.sources.source import Sample, Source, rate_of
+from tactile.base.atomic_write import flush_to_disk, write_atomically
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Observation, Report, Whisk
 
@@ -166,9 +166,9 @@ def recover(path: Path, out: Path) -> Recovery:
     if first is None or walk.description is None:
         raise _nothing(walk)
     described = walk.description
-    draft = out.with_name(f".{out.name}.{os.getpid()}.part")
-    try:
-        tape = Tape(draft, view_shape=described.view_shape, whiskers=described.whiskers,
+
+    def write(path: Path) -> None:
+        tape = Tape(path, view_shape=described.view_shape, whiskers=described.whiskers,
                     rate_hz=described.rate_hz, info=described.info)  # fmt: skip
         with closing(tape):
             for entry in chain([first], entries):
@@ -177,11 +177,9 @@ def recover(path: Path, out: Path) -> Recovery:
                 tape.append(entry.name, entry.time, entry.message)
         if not walk.count:
             raise _nothing(walk)
-        with draft.open("rb") as file:
-            os.fsync(file.fileno())
-        os.replace(draft, out)
-    finally:
-        draft.unlink(missing_ok=True)
+        flush_to_disk(path)
+
+    write_atomically(out, write)
     return Recovery(walk.count, bool(walk.broken), walk.broken)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -13,7 +12,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from evaluation.plots.pareto_plot import Mark, draw_frontier
 from ratslam.experiments.pareto.error_metrics import ErrorOf
 from ratslam.experiments.pareto.summary import WHOLE, Line, Span
-from ratslam.experiments.studies.report import label, replace
+from ratslam.experiments.studies.report import label
+from tactile.base.atomic_write import write_atomically, write_text_atomically
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -84,14 +84,12 @@ def save(found: Frontier, directory: Path) -> list[Path]:
     """frontier.csv, .json, .md and .png, each in one piece; no picture where there is nothing to draw."""
     paths = [directory / f"frontier.{kind}" for kind in ("csv", "json", "md", "png")]
     for path, content in zip(paths, (_csv(found), _json(found), markdown(found)), strict=False):
-        replace(path, content)
+        write_text_atomically(path, content)
     figure = picture(found)
     if figure is None:
         paths.pop().unlink(missing_ok=True)  # of an earlier call, which had something to draw
         return paths
-    temporary = paths[-1].with_name(f".frontier.{os.getpid()}.png")
-    figure.savefig(temporary)
-    os.replace(temporary, paths[-1])
+    write_atomically(paths[-1], figure.savefig)
     return paths
 
 

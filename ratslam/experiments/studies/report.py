@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import os
 import statistics
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any, NamedTuple
 
 from ratslam.experiments.studies.metrics import DIRECTIONS, MAIN, MEASURED
 from ratslam.experiments.studies.results import Result
+from tactile.base.atomic_write import write_text_atomically
 
 SHORT = {
     "energy_all": "EM",
@@ -115,8 +115,8 @@ def save(found: Sequence[Row], directory: Path) -> list[Path]:
         for row in found
     ]
     paths = [directory / "table.csv", directory / "table.json"]
-    replace(paths[0], text.getvalue())
-    replace(paths[1], json.dumps(content, indent=1, allow_nan=False) + "\n")
+    write_text_atomically(paths[0], text.getvalue())
+    write_text_atomically(paths[1], json.dumps(content, indent=1, allow_nan=False) + "\n")
     return paths
 
 
@@ -134,16 +134,6 @@ def remarks(results: Sequence[Result], directory: Path) -> list[str]:
             "times are of several jobs at once, or of several machines: measure speed with --workers 1"
         )
     return told
-
-
-def replace(path: Path, content: str) -> None:
-    """Writes a file in one piece."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        temporary.write_text(content, encoding="utf-8")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _row(group: Sequence[Result]) -> Row:

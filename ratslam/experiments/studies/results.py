@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ from pydantic import Field
 
 from evaluation.metrics.scorecard import Quantity
 from ratslam.experiments.studies.metrics import MEASURED
+from tactile.base.atomic_write import flush_to_disk, write_atomically
 from tactile.base.config import Settings
 
 
@@ -116,14 +116,9 @@ def read_result(folder: Path, key: str) -> Result | None:
 
 def write_result(folder: Path, result: Result) -> None:
     """Leaves a result under its key: whoever looks finds all of it or nothing."""
-    path = folder / f"{result.key}.json"
-    # Two sweeps may share a folder; each writes its own file first.
-    temporary = folder / f".{result.key}.{os.getpid()}"
-    try:
-        with temporary.open("w", encoding="utf-8") as file:
-            file.write(result.model_dump_json(indent=1) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+
+    def write(path: Path) -> None:
+        path.write_text(result.model_dump_json(indent=1) + "\n", encoding="utf-8")
+        flush_to_disk(path)
+
+    write_atomically(folder / f"{result.key}.json", write)

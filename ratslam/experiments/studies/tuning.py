@@ -15,10 +15,10 @@ from typing import Any
 from ratslam.experiments.studies.config_hash import digest_of
 from ratslam.experiments.studies.optuna_storage import Trial, opened
 from ratslam.experiments.studies.recorded_runs import Pool
-from ratslam.experiments.studies.report import replace
 from ratslam.experiments.studies.results import Result
 from ratslam.experiments.studies.schema import TunePlan
 from ratslam.experiments.studies.study import Job, Study, made, seeded, tuned, variant_of
+from tactile.base.atomic_write import write_text_atomically
 from tactile.base.errors import InputError
 
 Done = Callable[[Result | None], None]
@@ -87,7 +87,9 @@ def report(trials: Sequence[Trial]) -> str:
 def save(trials: Sequence[Trial], directory: Path) -> Path:
     """trials.json: all of them."""
     path = directory / "trials.json"
-    replace(path, json.dumps([trial._asdict() for trial in trials], indent=1, allow_nan=False) + "\n")
+    write_text_atomically(
+        path, json.dumps([trial._asdict() for trial in trials], indent=1, allow_nan=False) + "\n"
+    )
     return path
 
 
