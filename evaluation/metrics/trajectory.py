@@ -13,7 +13,7 @@ import numpy as np
 
 from evaluation.metrics.text_table import read_table
 from tactile.base.errors import InputError
-from tactile.base.se2 import between, compose, fitted, tum_line, wrap
+from tactile.base.se2 import between, compose, fit_rigid_motion, tum_line, wrap
 
 _TUM = {name: () for name in ("t", "x", "y", "z", "qx", "qy", "qz", "qw")}
 
@@ -47,7 +47,7 @@ def align(estimate: np.ndarray, reference: np.ndarray) -> np.ndarray:
         InputError: when there is no row, or the two differ in length.
     """
     _positions(estimate, reference)
-    return fitted(estimate, reference)
+    return fit_rigid_motion(estimate, reference)
 
 
 def position_errors(estimate: np.ndarray, reference: np.ndarray) -> np.ndarray:

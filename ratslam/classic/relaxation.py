@@ -10,6 +10,8 @@ from math import cos, pi, sin
 
 import numpy as np
 
+from tactile.base.se2 import wrap
+
 
 def relax(
     poses: np.ndarray,
@@ -48,5 +50,5 @@ def relax(
 
 
 def _wrap(angle: float) -> float:
-    # As `tactile.base.se2.wrap`, but exact for angles in range already: sweeps must not add up rounding.
-    return angle if -pi < angle <= pi else pi - (pi - angle) % (2 * pi)
+    # Angles already in range stay exact: thousands of sweeps must not accumulate rounding.
+    return angle if -pi < angle <= pi else wrap(angle)

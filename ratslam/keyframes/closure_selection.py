@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.keyframes.optimizer import Chain, Closures, Fit, Prior, corrected, robust_cost, solve
-from tactile.base.se2 import between, compose, integrate, inverse
+from ratslam.keyframes.optimizer import Chain, Closures, Fit, Prior, robust_cost, solve
+from tactile.base.se2 import between, compose, correct_heading_bias, integrate, inverse
 
 KEPT = 0.25
 """Robust weight above which a run is believed: it then strains the map by less than its evidence."""
@@ -131,7 +131,7 @@ def _strain(case: Case, best: Judgement) -> np.ndarray:
         since, first = _since(case, best, run), int(case.first[run])
         if first <= since:
             continue
-        told = corrected(chain.motion[since:first], chain.length[since:first], best.fit.bias)
+        told = correct_heading_bias(chain.motion[since:first], chain.length[since:first], best.fit.bias)
         before, claimed = _claim(best, closures, since), _claim(best, closures, first, run)
         onwards = integrate(told, before)
         error = between(onwards[-1], claimed)
@@ -194,7 +194,7 @@ def _carried(
     """The frame between `since` and `first` before which to cut so that `first` comes to where it is claimed,
     and the poses that follow from that."""
     chain = case.chain
-    told = corrected(chain.motion[since:first], chain.length[since:first], best.fit.bias)
+    told = correct_heading_bias(chain.motion[since:first], chain.length[since:first], best.fit.bias)
     onwards = integrate(told, poses[since])  # of frames since + 1 ... first
     carried = compose(claimed, inverse(onwards[-1]))
     frame = where(poses, onwards, carried, since)

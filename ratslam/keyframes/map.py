@@ -29,14 +29,21 @@ from ratslam.keyframes.optimizer import (
     Closures,
     Fit,
     Prior,
-    corrected,
     relative_covariance,
     solve,
 )
 from ratslam.pose_graph import Edges
 from ratslam.pose_graph.io import write_g2o, write_json
 from ratslam.recall.filter import Guidance
-from tactile.base.se2 import between, compose, fitted, integrate, inverse, wrap
+from tactile.base.se2 import (
+    between,
+    compose,
+    correct_heading_bias,
+    fit_rigid_motion,
+    integrate,
+    inverse,
+    wrap,
+)
 from tactile.base.types import Observation
 
 LOOSE = 1e4
@@ -174,7 +181,7 @@ class FrameMap:
         return Edges(
             np.concatenate([steps, closures.i]),
             np.concatenate([steps + 1, closures.j]),
-            np.concatenate([corrected(chain.motion, chain.length, fit.bias), turned]),
+            np.concatenate([correct_heading_bias(chain.motion, chain.length, fit.bias), turned]),
             np.concatenate([1 / chain.variance, trust]),
         )
 
@@ -239,7 +246,7 @@ class FrameMap:
 
     def _retrace(self) -> None:
         """Dead reckoning of all frames with the present bias."""
-        motion = corrected(self._motion.rows, self._length.rows, self._bias)
+        motion = correct_heading_bias(self._motion.rows, self._length.rows, self._bias)
         for k in range(1, len(motion)):
             self._pose.rows[k] = compose(self._pose.rows[k - 1], motion[k])
 
@@ -290,7 +297,7 @@ class FrameMap:
             return
         before = self._pose.rows.copy()
         self._ledger, self._cut = settled.ledger, settled.cut
-        self._pose.rows[:] = compose(fitted(settled.fit.poses, before), settled.fit.poses)
+        self._pose.rows[:] = compose(fit_rigid_motion(settled.fit.poses, before), settled.fit.poses)
         self._bias, self._settled = settled.fit.bias, None
 
     def _weighed(self) -> Settled | None:
@@ -307,7 +314,9 @@ class FrameMap:
         for run in np.flatnonzero(ledger.verdicts() != Verdict.UNDONE).tolist():
             ledger.judge(run, Verdict.ACCEPTED if weighed[run] else Verdict.OPEN)
         chain, closures = self._chain(cut), self._closures(ledger)
-        path = integrate(corrected(chain.motion, chain.length, self._prior.mean), self._pose.rows[0])
+        path = integrate(
+            correct_heading_bias(chain.motion, chain.length, self._prior.mean), self._pose.rows[0]
+        )
         reckoned = Fit(np.concatenate([self._pose.rows[:1], path]), self._prior.mean, np.zeros(0))
         present = Fit(self._pose.rows.copy(), self._bias, np.zeros(0))
         case = Case(chain, closures, self._belief(), ledger.scores()[runs], *ledger.spans()[runs].T)
@@ -442,7 +451,7 @@ class FrameMap:
         before = self._pose.rows.copy()
         fit = self._solve(self.config.iterations)
         self._ledger.weigh(fit.weights)
-        moved = compose(fitted(fit.poses, before), fit.poses)
+        moved = compose(fit_rigid_motion(fit.poses, before), fit.poses)
         self._pose.rows[:] = moved
         self._bias = fit.bias
         self._settled = None
@@ -496,7 +505,7 @@ class FrameMap:
 
     def _steps(self, fit: Fit) -> np.ndarray:
         frame, motion = self._step_frame.rows, self._step_motion.rows
-        moved = corrected(motion[:, :3], motion[:, 3], fit.bias)
+        moved = correct_heading_bias(motion[:, :3], motion[:, 3], fit.bias)
         if not len(fit.poses):
             return moved
         origin = np.where(frame[:, None] >= 0, fit.poses[np.maximum(frame, 0)], 0.0)
@@ -504,7 +513,7 @@ class FrameMap:
 
     def _present(self) -> np.ndarray:
         origin = self._pose.rows[-1] if len(self._pose.rows) else np.zeros(3)
-        return compose(origin, corrected(self._travel.motion, self._travel.length, self._bias))
+        return compose(origin, correct_heading_bias(self._travel.motion, self._travel.length, self._bias))
 
     def _parts(self) -> dict[str, Ledger | Grouping | Appearance]:
         return {"ledger": self._ledger, "grouping": self._grouping, "looks": self._looks}

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import SuperLU, splu
 
-from tactile.base.se2 import between, wrap
+from tactile.base.se2 import between, correct_heading_bias, wrap
 
 
 class Chain(NamedTuple):
@@ -64,14 +64,6 @@ class Fit(NamedTuple):
     weights: np.ndarray
 
 
-def corrected(motion: np.ndarray, length: np.ndarray | float, bias: float) -> np.ndarray:
-    """Motions [..., 3] freed of a heading bias that built up evenly along their lengths [...]."""
-    turn = bias * np.asarray(length)
-    c, s = np.cos(turn / 2), np.sin(turn / 2)
-    x, y = motion[..., 0], motion[..., 1]
-    return np.stack([c * x - s * y, s * x + c * y, wrap(motion[..., 2] + turn)], axis=-1)
-
-
 def solve(
     poses: np.ndarray,
     bias: float,
@@ -105,7 +97,7 @@ def solve(
 
 def robust_cost(fit: Fit, chain: Chain, closures: Closures, prior: Prior) -> float:
     """What is left of the contradictions between odometry and closures under a fit: what `solve` lessens."""
-    told = corrected(chain.motion, chain.length, fit.bias)
+    told = correct_heading_bias(chain.motion, chain.length, fit.bias)
     apart = between(fit.poses[:-1], fit.poses[1:]) - told
     apart[:, 2] = wrap(apart[:, 2])
     odometry = float((apart**2 / chain.variance).sum())
@@ -211,7 +203,7 @@ class _System:
         a, b = fit.poses[self.i], fit.poses[self.j]
         c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
         dx, dy = (b - a)[:, 0], (b - a)[:, 1]
-        told = corrected(self.motion, self.length, fit.bias)
+        told = correct_heading_bias(self.motion, self.length, fit.bias)
         ahead, aside = c * dx + s * dy, c * dy - s * dx
         error = np.stack([ahead - told[:, 0], aside - told[:, 1], wrap(b[:, 2] - a[:, 2] - told[:, 2])], 1)
         chi2 = (error**2 * self.information).sum(axis=1)

@@ -23,7 +23,7 @@ from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, Pos
 
 from ratslam.recall.whisker_likelihood import LEVELS
 from tactile.base.config import Settings
-from tactile.base.se2 import wrap
+from tactile.base.se2 import compose, correct_heading_bias, wrap
 from tactile.base.types import Array
 
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -277,7 +277,7 @@ def inform(memory: Memory, guidance: Guidance) -> Memory:
 def travel(memory: Memory, odometry: Array) -> Memory:
     """Adds body-frame motion [3] (m, m, rad) to what has been travelled since the newest frame."""
     return memory._replace(
-        motion=_compose(memory.motion, odometry),
+        motion=compose(memory.motion, odometry),
         length=memory.length + jnp.hypot(odometry[0], odometry[1]),
         turn=memory.turn + jnp.abs(odometry[2]),
     )
@@ -291,7 +291,7 @@ def due(config: RecallConfig, cell: float, memory: Memory) -> Array:
 
 def present(memory: Memory) -> Array:
     """[3] the robot's pose in the map, as far as the kernel has been told."""
-    return _compose(memory.pose, _corrected(memory.motion, memory.length, memory.bias))
+    return compose(memory.pose, correct_heading_bias(memory.motion, memory.length, memory.bias))
 
 
 def spread(config: RecallConfig, cell: float, memory: Memory) -> tuple[Array, Array]:
@@ -411,10 +411,11 @@ def _align(
     """
     dtype = memory.x.dtype
     cells = allowed(offsets(config), memory)[:, None] & known[None]
-    moved = _corrected(memory.motion, memory.length, memory.bias)
+    moved = correct_heading_bias(memory.motion, memory.length, memory.bias)
     at = memory.anchor
-    anchors = jnp.stack([memory.x[at], memory.y[at], jnp.arctan2(memory.sine[at], memory.cosine[at])])
-    poses = _compose(_compose(anchors, memory.offset.T), jnp.broadcast_to(moved[:, None], anchors.shape))
+    heading = jnp.arctan2(memory.sine[at], memory.cosine[at])
+    anchors = jnp.stack([memory.x[at], memory.y[at], heading], axis=1)
+    poses = compose(compose(anchors, memory.offset), jnp.broadcast_to(moved, anchors.shape))
 
     def landing(pose: Array, sd: Array, sd_heading: Array) -> Array:
         apart = ((memory.x - pose[0]) ** 2 + (memory.y - pose[1]) ** 2) / sd**2
@@ -428,7 +429,7 @@ def _align(
 
     def carry(k: Array, sums: tuple[Array, Array]) -> tuple[Array, Array]:
         belief, novel = sums
-        fall = landing(poses[:, k], *reach)
+        fall = landing(poses[k], *reach)
         total = jnp.sum(fall) + config.nothing
         stay = memory.mass[k] * (1 - config.leave)
         belief = belief + (stay / total) * fall
@@ -532,17 +533,3 @@ def _second(masses: Array) -> Array:
         return jnp.zeros((), masses.dtype)
     ordered = jnp.sort(masses)
     return ordered[-2] / jnp.maximum(ordered[-1], 1e-9)
-
-
-def _corrected(motion: Array, length: Array, bias: Array) -> Array:
-    """Motion [3] freed of a heading bias that built up evenly along its length."""
-    turn = bias * length
-    c, s = jnp.cos(turn / 2), jnp.sin(turn / 2)
-    x, y = motion[0], motion[1]
-    return jnp.stack([c * x - s * y, s * x + c * y, wrap(motion[2] + turn)])
-
-
-def _compose(a: Array, b: Array) -> Array:
-    """a followed by b, b in the frame of a: [3, ...]."""
-    c, s = jnp.cos(a[2]), jnp.sin(a[2])
-    return jnp.stack([a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], wrap(a[2] + b[2])])

@@ -1,6 +1,7 @@
-"""Planar rigid motions (SE(2)) and the one place where angles are wrapped.
+"""Planar rigid motions (SE(2)) for NumPy and JAX, and the wrapping of angles.
 
-A pose is an array [..., 3] of x (m), y (m), heading (rad, counter-clockwise); REP-103 axes.
+A pose is an array [..., 3] of x (m), y (m), heading (rad, counter-clockwise); REP-103 axes. The functions
+compute in the namespace of the arrays they are given: JAX arrays give JAX arrays.
 """
 
 from __future__ import annotations
@@ -13,37 +14,57 @@ Array = Any
 
 
 def wrap(angle: Array) -> Array:
-    """The angle in (-pi, pi]. Operators only, so it serves floats, NumPy and JAX alike."""
+    """The angle in (-pi, pi], rad, of a float or an array."""
     return np.pi - (np.pi - angle) % (2 * np.pi)
 
 
-def compose(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """a followed by b, b in the frame of a: [..., 3]."""
-    a, b = np.asarray(a), np.asarray(b)
-    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+def compose(a: Array, b: Array) -> Array:
+    """[..., 3] the motion a followed by b, which is given in the frame of a."""
+    xp, a, b = _arrays(a, b)
+    c, s = xp.cos(a[..., 2]), xp.sin(a[..., 2])
     x = a[..., 0] + c * b[..., 0] - s * b[..., 1]
     y = a[..., 1] + s * b[..., 0] + c * b[..., 1]
-    return np.stack([x, y, wrap(a[..., 2] + b[..., 2])], axis=-1)
+    return xp.stack([x, y, wrap(a[..., 2] + b[..., 2])], axis=-1)
 
 
-def between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """b in the frame of a, so that compose(a, between(a, b)) == b: [..., 3]."""
-    a, b = np.asarray(a), np.asarray(b)
-    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+def between(a: Array, b: Array) -> Array:
+    """[..., 3] b in the frame of a, so that compose(a, between(a, b)) == b."""
+    xp, a, b = _arrays(a, b)
+    c, s = xp.cos(a[..., 2]), xp.sin(a[..., 2])
     dx, dy = b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]
-    return np.stack([c * dx + s * dy, c * dy - s * dx, wrap(b[..., 2] - a[..., 2])], axis=-1)
+    return xp.stack([c * dx + s * dy, c * dy - s * dx, wrap(b[..., 2] - a[..., 2])], axis=-1)
 
 
-def inverse(a: np.ndarray) -> np.ndarray:
-    """The motion that undoes a: [..., 3]."""
-    a = np.asarray(a)
-    return between(a, np.zeros_like(a))
+def inverse(a: Array) -> Array:
+    """[..., 3] the inverse motion."""
+    xp, a = _arrays(a)
+    return between(a, xp.zeros_like(a))
+
+
+def correct_heading_bias(motion: Array, length: Array, bias: Array) -> Array:
+    """Motions [..., 3] turned by a heading correction that grows evenly along the distance travelled.
+
+    Args:
+        length: [...] distance travelled in each motion, m. bias: correction, rad/m.
+    """
+    xp, motion = _arrays(motion)
+    turn = bias * xp.asarray(length)
+    c, s = xp.cos(turn / 2), xp.sin(turn / 2)
+    x, y = motion[..., 0], motion[..., 1]
+    return xp.stack([c * x - s * y, s * x + c * y, wrap(motion[..., 2] + turn)], axis=-1)
+
+
+def _arrays(*values: Array) -> tuple[Any, ...]:
+    """The array namespace of the values, NumPy unless an array has another, and the values as its arrays."""
+    spaces = {value.__array_namespace__() for value in values if hasattr(value, "__array_namespace__")}
+    xp = next(iter(spaces - {np}), np)
+    return xp, *(xp.asarray(value) for value in values)
 
 
 def integrate(motions: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
-    """Poses after each of the body-frame motions [N, 3], from `start` (default the origin): [N, 3].
+    """[N, 3] poses after each of the body-frame motions [N, 3], from `start` (default: the origin).
 
-    The running sum in closed form: heading first, then each motion turned by the heading before it.
+    Computed without a loop: cumulative headings first, then each motion rotated by the heading before it.
     """
     motions = np.asarray(motions, np.float64)
     start = np.zeros(3) if start is None else np.asarray(start, np.float64)
@@ -55,8 +76,8 @@ def integrate(motions: np.ndarray, start: np.ndarray | None = None) -> np.ndarra
     return np.stack([x, y, wrap(heading)], axis=-1)
 
 
-def fitted(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The rigid motion [3] that brings poses [N, 3] nearest to others by position: compose(fitted(a, b), a).
+def fit_rigid_motion(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """[3] the rigid motion m that aligns the positions of poses a [N, 3] with those of b: compose(m, a) ~ b.
 
     Least squares over rotation and translation, without scale (Umeyama 1991, in the plane).
     """
@@ -67,7 +88,7 @@ def fitted(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def tum_line(time: float, pose: np.ndarray) -> str:
-    """One line `t x y z qx qy qz qw` of a TUM trajectory; floats are written so that they read back equal."""
+    """One line `t x y z qx qy qz qw` of a TUM trajectory; floats are written exactly (repr)."""
     x, y, heading = map(float, pose)
     values = (float(time), x, y, 0.0, 0.0, 0.0, float(np.sin(heading / 2)), float(np.cos(heading / 2)))
     return " ".join(map(repr, values)) + "\n"

@@ -11,7 +11,7 @@ import pytest
 from ratslam.keyframes import closure_selection
 from ratslam.keyframes.closure_selection import CUT, KEPT, STEPS, Case, arbitrate
 from ratslam.keyframes.optimizer import Chain, Closures, Fit, Prior, robust_cost, solve
-from tactile.base.se2 import between, compose, fitted, integrate, wrap
+from tactile.base.se2 import between, compose, fit_rigid_motion, integrate, wrap
 
 LAP = 60
 STEP = 0.03
@@ -39,7 +39,7 @@ class World(NamedTuple):
     def where(self, poses, onwards, carried, since):
         """From which frame on the poses carried are nearer to the truth, as ideal views would tell."""
         frames = np.arange(since + 1, since + 1 + len(onwards))
-        truth = compose(fitted(self.truth[:LAP], poses[:LAP]), self.truth[frames])
+        truth = compose(fit_rigid_motion(self.truth[:LAP], poses[:LAP]), self.truth[frames])
         stays, goes = (
             np.minimum(np.hypot(*(rows - truth)[:, :2].T) / 0.1, 1.0)
             for rows in (onwards, compose(carried, onwards))
@@ -108,7 +108,7 @@ def world(
 
 def off(fit: Fit, truth: np.ndarray) -> float:
     """Largest distance from the truth, m."""
-    aligned = compose(fitted(fit.poses, truth), fit.poses)
+    aligned = compose(fit_rigid_motion(fit.poses, truth), fit.poses)
     return float(np.hypot(*(aligned - truth)[:, :2].T).max())
 
 
@@ -142,7 +142,9 @@ def test_a_run_that_is_false_is_outvoted(seed, evidence):
     assert off(judged.fit, made.truth) < 0.1
     within = world(seed).starts()[0]
     assert (
-        np.abs(compose(fitted(judged.fit.poses, within.poses), judged.fit.poses) - within.poses)[:, :2].max()
+        np.abs(compose(fit_rigid_motion(judged.fit.poses, within.poses), judged.fit.poses) - within.poses)[
+            :, :2
+        ].max()
         < 0.05
     )
 

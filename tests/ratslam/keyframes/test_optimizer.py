@@ -13,12 +13,11 @@ from ratslam.keyframes.optimizer import (
     Closures,
     Fit,
     Prior,
-    corrected,
     relative_covariance,
     robust_cost,
     solve,
 )
-from tactile.base.se2 import between, compose, integrate, wrap
+from tactile.base.se2 import between, compose, correct_heading_bias, integrate, wrap
 
 WIDE = Prior(0.0, 10.0)
 SURE = 1e12  # a robust scale at which no run ever loses weight
@@ -44,7 +43,7 @@ def laps(stream, bias=0.0, count=24, noise=0.0):
     truth = compose(truth, np.stack([0 * turn, 0 * turn, turn], axis=1))
     truth = compose(compose(START, between(truth[0], np.zeros(3))), truth)
     motion = between(truth[:-1], truth[1:])
-    chain = chained(corrected(motion, np.hypot(motion[:, 0], motion[:, 1]), -bias))
+    chain = chained(correct_heading_bias(motion, np.hypot(motion[:, 0], motion[:, 1]), -bias))
     chain = chain._replace(motion=chain.motion + noise * stream.normal(0, 1, motion.shape) * [1, 1, 0.5])
     i = np.arange(1, count, 2)
     run = np.arange(len(i)) * 3 // len(i)
@@ -57,7 +56,7 @@ def reckoned(chain, start=START):
 
 def parts(poses, bias, chain, closures):
     """Whitened residuals of the chain and of the closures, told by frames alone."""
-    odometry = between(poses[:-1], poses[1:]) - corrected(chain.motion, chain.length, bias)
+    odometry = between(poses[:-1], poses[1:]) - correct_heading_bias(chain.motion, chain.length, bias)
     recall = between(poses[closures.i], poses[closures.j])
     recall[:, 2] -= closures.turn
     for error in (odometry, recall):
@@ -96,16 +95,19 @@ def apart(a, b):
 )
 def test_corrections_undo_each_other_and_none_is_none(motion, length, bias):
     motion = np.array(motion)
-    assert np.allclose(corrected(motion, length, 0.0), motion, atol=1e-12)
-    there = corrected(motion, length, bias)
+    assert np.allclose(correct_heading_bias(motion, length, 0.0), motion, atol=1e-12)
+    there = correct_heading_bias(motion, length, bias)
     assert abs(wrap(there[2] - motion[2] - bias * length)) < 1e-12
-    assert np.allclose(corrected(there, length, -bias), motion, atol=1e-12)
+    assert np.allclose(correct_heading_bias(there, length, -bias), motion, atol=1e-12)
 
 
 @given(st.floats(0.5, 4), st.floats(-0.05, 0.05))
 def test_a_bias_builds_up_evenly(length, bias):
     straight = np.array([length, 0.0, 0.0])
-    whole, half = corrected(straight, length, bias), corrected(straight / 2, length / 2, bias)
+    whole, half = (
+        correct_heading_bias(straight, length, bias),
+        correct_heading_bias(straight / 2, length / 2, bias),
+    )
     gap = between(whole, compose(half, half))
     assert abs(gap[2]) < 1e-12
     # An arc is taken for its chord: an error of second order in the bend; a one-sided rule's is of first.
@@ -362,7 +364,7 @@ def test_the_first_frame_never_moves(seed):
 def test_a_chain_alone_is_dead_reckoning_with_the_prior_bias():
     _, chain, _ = laps(np.random.default_rng(4), 0.0)
     fit = solve(reckoned(chain), 0.0, chain, closed([]), Prior(0.03, 0.01), 30)
-    expected = np.vstack([START, integrate(corrected(chain.motion, chain.length, 0.03), START)])
+    expected = np.vstack([START, integrate(correct_heading_bias(chain.motion, chain.length, 0.03), START)])
     assert fit.bias == pytest.approx(0.03, abs=1e-9)
     assert apart(fit.poses, expected) < 1e-6
     assert fit.weights.shape == (0,)
