@@ -11,6 +11,7 @@ from pydantic import Field, NonNegativeInt, ValidationInfo, field_validator
 
 from evaluation.metrics.experience_metric import ExmConfig
 from ratslam.backends.config import ClassicBackendConfig, GridBackendConfig, RecallBackendConfig
+from ratslam.config.renamed_keys import RENAMED
 from ratslam.config.strict_yaml import load, override, validate
 from robot.live.config import LiveConfig
 from robot.recordings.formats import RecordingConfig
@@ -105,6 +106,7 @@ class SourceConfig(Settings):
 class RunConfig(RecallBackendConfig, ClassicBackendConfig, GridBackendConfig, SourceConfig):
     """A run: `python -m ratslam run config.yaml`. `ratslam.backends.config` has the methods' sections."""
 
+    renamed_keys = RENAMED
     backend: Literal["recall", "classic", "grid"] = "recall"
     """The method: RatSLAM with Bayesian recall and a keyframe map, RatSLAM as published, or a grid particle
     filter."""

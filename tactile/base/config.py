@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import ClassVar
+
 from pydantic import BaseModel, ConfigDict
 
 
 class Settings(BaseModel):
     """A part of the configuration, kept beside the code it configures."""
+
+    renamed_keys: ClassVar[Mapping[str, str]] = {}
+    """Old dotted path of a key in this section to the new one, or to a sentence that says what to write."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)

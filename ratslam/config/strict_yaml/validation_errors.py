@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from enum import Enum
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
@@ -12,7 +12,8 @@ from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_ori
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from ratslam.config.strict_yaml.document import Document, KeyPath, either, shown
+from ratslam.config.strict_yaml.document import Document, KeyPath, dotted, either, shown
+from tactile.base.config import Settings
 from tactile.base.errors import InputError
 
 _MAX_ERRORS = 50
@@ -27,14 +28,19 @@ _WORDS = {
 }
 
 
-def complaints(error: ValidationError, model: type[BaseModel], document: Document) -> list[InputError]:
+def complaints(error: ValidationError, model: type[Settings], document: Document) -> list[InputError]:
     """One error for each thing wrong, in the order of the file; the alternatives of a union in one."""
     order = {path: rank for rank, path in enumerate(document.places)}
     found = [(_spot(details["loc"], model), details) for details in error.errors(include_url=False)]
     found.sort(key=lambda pair: order[document.nearest(pair[0].path)])
     merged: dict[_Complaint, list[str]] = {}
-    for spot, details in found:
-        complaint = _complaint(details, spot, model, document)
+    complaints = [
+        complaint
+        for spot, details in found
+        for complaint in _renamed(details, spot.path, model, document)
+        or [_complaint(details, spot, model, document)]
+    ]
+    for complaint in complaints:
         expected = merged.setdefault(complaint._replace(expected=""), [])
         if complaint.expected not in expected:
             expected.append(complaint.expected)
@@ -69,7 +75,43 @@ class _Spot(NamedTuple):
     kinds: list[Any]
 
 
-def _complaint(details: ErrorDetails, spot: _Spot, model: type[BaseModel], document: Document) -> _Complaint:
+def _renamed(
+    details: ErrorDetails, path: KeyPath, model: type[Settings], document: Document
+) -> list[_Complaint]:
+    """The errors for an unknown key that was renamed: one for each key in it, if it is a section."""
+    if details["type"] != "extra_forbidden":
+        return []
+    renamed = {
+        f"{new.rpartition('.')[0]}.{old.rpartition('.')[2]}": new  # the old key in the renamed section
+        for old, new in model.renamed_keys.items()
+        if _is_path(new)
+    } | dict(model.renamed_keys)
+    return [
+        _Complaint(
+            document.at_key(tuple(old.split("."))), f"`{old}` is now `{new}`" if _is_path(new) else new
+        )
+        for old, new in _new_names(dotted(path), document.value(path), renamed)
+    ]
+
+
+def _new_names(old: str, value: Any, renamed: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+    """Old key and new key (or what to write instead), for each key of a section that has new names in it."""
+    parent = max((name for name in renamed if f"{old}.".startswith(f"{name}.")), key=len, default=None)
+    if parent is None:
+        return
+    if isinstance(value, dict) and value and any(name.startswith(f"{old}.") for name in renamed):
+        for key, part in value.items():
+            yield from _new_names(f"{old}.{key}", part, renamed)
+    else:
+        new = renamed[parent]
+        yield old, new + old.removeprefix(parent) if _is_path(new) else new
+
+
+def _is_path(text: str) -> bool:
+    return re.fullmatch(r"[\w.]+", text) is not None
+
+
+def _complaint(details: ErrorDetails, spot: _Spot, model: type[Settings], document: Document) -> _Complaint:
     """The words for one error of pydantic's."""
     path, owner, kinds = spot
     context = details.get("ctx", {})
@@ -128,7 +170,7 @@ def _did_you_mean(found: Any, words: Sequence[str]) -> str:
     return "".join(f"did you mean '{word}'?" for word in words if close and word.lower() == close[0])
 
 
-def _spot(loc: Sequence[str | int], model: type[BaseModel]) -> _Spot:
+def _spot(loc: Sequence[str | int], model: type[Settings]) -> _Spot:
     """Follows pydantic's location through the types.
 
     Pydantic puts the name of the alternative it tried between the keys wherever a union stands; only the

@@ -1,0 +1,108 @@
+"""Settings that were renamed: the error names the place of the old key and the new key."""
+
+from __future__ import annotations
+
+from types import NoneType
+from typing import Annotated, Any, ClassVar, get_args, get_origin
+
+import pytest
+from pydantic import BaseModel
+
+from ratslam.config.renamed_keys import RENAMED
+from ratslam.config.run_config import RunConfig
+from ratslam.config.strict_yaml import override, parse, validate
+from tactile.base.config import Settings
+from tactile.base.errors import InputError
+
+PATHS = {old: new for old, new in RENAMED.items() if " " not in new}
+
+
+class Inner(Settings):
+    """A renamed section."""
+
+    min_score: float = 1.0
+    same: int = 1
+
+
+class Outer(Settings):
+    """A configuration with renamed keys."""
+
+    renamed_keys: ClassVar = {
+        "frames": "keyframes",
+        "frames.score": "keyframes.min_score",
+        "matcher": "write `backend`",
+    }
+    keyframes: Inner = Inner()
+    seed: int = 0
+
+
+def errors_of(document, model=Outer) -> list[str]:
+    with pytest.raises(InputError) as refused:
+        validate(document, model)
+    return str(refused.value).splitlines()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            "seed: 1\nframes:\n  score: 2\n",
+            ["c.yaml:3:3: frames.score: `frames.score` is now `keyframes.min_score`"],
+        ),
+        (
+            "frames: {same: 2, score: 3, other: 4}\n",
+            [
+                "c.yaml:1:10: frames.same: `frames.same` is now `keyframes.same`",
+                "c.yaml:1:19: frames.score: `frames.score` is now `keyframes.min_score`",
+                "c.yaml:1:29: frames.other: `frames.other` is now `keyframes.other`",
+            ],
+        ),
+        ("frames: 3\n", ["c.yaml:1:1: frames: `frames` is now `keyframes`"]),
+        ("frames: {}\n", ["c.yaml:1:1: frames: `frames` is now `keyframes`"]),
+        (
+            "keyframes: {score: 1}\n",
+            ["c.yaml:1:13: keyframes.score: `keyframes.score` is now `keyframes.min_score`"],
+        ),
+        ("matcher: classic\n", ["c.yaml:1:1: matcher: write `backend`"]),
+    ],
+    ids=["nested", "section", "scalar", "empty", "half renamed", "sentence"],
+)  # fmt: skip
+def test_an_old_key_names_the_new_one(text: str, said: list[str]) -> None:
+    assert errors_of(parse(text, "c.yaml")) == said
+
+
+def test_an_old_key_of_an_option_names_the_new_one() -> None:
+    document = override(parse("seed: 1\n", "c.yaml"), ["frames.score=3"])
+    assert errors_of(document) == ["--set frames.score: `frames.score` is now `keyframes.min_score`"]
+
+
+def test_other_unknown_keys_are_reported_as_before() -> None:
+    assert errors_of(parse("sed: 1\n", "c.yaml")) == ["c.yaml:1:1: sed: unknown key; did you mean 'seed'?"]
+
+
+def members(kind: Any) -> list[type[BaseModel]]:
+    """The models a setting of this type may hold."""
+    if get_origin(kind) is Annotated:
+        return members(get_args(kind)[0])
+    if isinstance(kind, type) and get_origin(kind) is None:
+        return [kind] if issubclass(kind, BaseModel) else []
+    return [model for part in get_args(kind) if part is not NoneType for model in members(part)]
+
+
+def exists(model: type[BaseModel], path: list[str]) -> bool:
+    field = model.model_fields.get(path[0])
+    if field is None:
+        return False
+    return len(path) == 1 or any(exists(inner, path[1:]) for inner in members(field.annotation))
+
+
+@pytest.mark.parametrize("old", PATHS)
+def test_every_new_key_exists_and_no_old_one(old: str) -> None:
+    assert exists(RunConfig, PATHS[old].split("."))
+    assert not exists(RunConfig, old.split("."))
+
+
+@pytest.mark.parametrize("old", RENAMED)
+def test_every_old_key_is_refused_with_the_new_one(old: str) -> None:
+    document = override(parse("recording: {file: a.npz}\n", "c.yaml"), [f"{old}=1"])
+    assert any(f"--set {old}: " in line and RENAMED[old] in line for line in errors_of(document, RunConfig))
