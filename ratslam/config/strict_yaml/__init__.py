@@ -16,9 +16,10 @@ from ratslam.config.strict_yaml.document import Document, KeyPath, Place, dotted
 from ratslam.config.strict_yaml.dumper import Dumper
 from ratslam.config.strict_yaml.reader import Reader
 from ratslam.config.strict_yaml.validation_errors import complaints
+from tactile.base.config import Settings
 from tactile.base.errors import InputError, InputErrors
 
-Model = TypeVar("Model", bound=BaseModel)
+Model = TypeVar("Model", bound=Settings)
 
 _MAX_BYTES = 1 << 17  # a configuration is a few kB; the parser needs about a second for this much
 
