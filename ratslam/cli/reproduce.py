@@ -70,7 +70,7 @@ def _reproduce(arguments: argparse.Namespace) -> int:
     if arguments.name in SETS:
         from ratslam.experiments.fox2012 import reproduce
     else:
-        from ratslam.experiments.salman2016 import reproduce
+        from ratslam.experiments.salman2016.reproduction import reproduce
 
     text, interrupted = reproduce(
         arguments.name,
@@ -90,13 +90,13 @@ def _reproduce(arguments: argparse.Namespace) -> int:
 def _tune(arguments: argparse.Namespace) -> int:
     prepare_jax(keep_compiled=False)
     from ratslam.config.strict_yaml import load, override
-    from ratslam.experiments.salman2016.threshold_tuning import report, save, tune
+    from ratslam.experiments.salman2016.threshold_tuning import render_tuning, save_tuning, tune_threshold
 
     document = override(load(arguments.config), arguments.set)
-    found = tune(document, Path(arguments.config).parent, arguments.workers)
-    print(report(found))
+    found = tune_threshold(document, Path(arguments.config).parent, arguments.workers)
+    print(render_tuning(found))
     if arguments.output:
-        picture, table = save(found, arguments.output)
+        picture, table = save_tuning(found, arguments.output)
         print(f"\n{picture} shows the distances and thresholds, {table} holds them")
     return 0
 

@@ -13,7 +13,13 @@ import numpy as np
 
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import Document, override, validate
-from ratslam.experiments.trials.touch_trial import TouchTrial, figures, play, session_log, whole
+from ratslam.experiments.trials.touch_trial import (
+    TouchMetrics,
+    collect_session,
+    run_session,
+    touch_metrics,
+    whole,
+)
 from robot.simulation.head.session import SimulationConfig, simulated, tier
 from tactile.base.errors import InputError
 
@@ -43,7 +49,7 @@ class TierTrial(NamedTuple):
     cost: float
     contact: float
     height: float
-    trials: dict[str, TouchTrial]
+    trials: dict[str, TouchMetrics]
 
 
 def tiers(document: Document, folder: Path, seconds: float) -> tuple[list[TierTrial], str]:
@@ -68,15 +74,15 @@ def tiers(document: Document, folder: Path, seconds: float) -> tuple[list[TierTr
     logs, costs = {}, {}
     for name in TIERS:
         before = perf_counter()
-        logs[name] = session_log(_in_tier(short, name))[1]
+        logs[name] = collect_session(_in_tier(short, name))[1]
         costs[name] = perf_counter() - before
-    trials: dict[str, dict[str, TouchTrial]] = {name: {} for name in TIERS}
+    trials: dict[str, dict[str, TouchMetrics]] = {name: {} for name in TIERS}
     for method, sets in METHODS.items():
         config = whole(validate(override(document, sets), RunConfig), folder)
         config = config.model_copy(update={"simulation": short.simulation})
-        completed, _ = session_log(_in_tier(config, "kinematic"))
+        completed, _ = collect_session(_in_tier(config, "kinematic"))
         for name in TIERS:
-            trials[name][method] = figures(play(completed, logs[name]))
+            trials[name][method] = touch_metrics(run_session(completed, logs[name]))
     found = [
         TierTrial(
             name,

@@ -14,7 +14,7 @@ def spectrum(width: int, sigma: float, size: int) -> np.ndarray:
 
 
 class Fourier:
-    """As `yardstick.Yardstick`; only excitation, inhibition and threshold, which is what FFTs are for."""
+    """As `NumpyNetwork`, but only excitation, inhibition and threshold, the part that FFTs can do."""
 
     def __init__(self, n: int, k: int = 36) -> None:
         self.shape = (k, n, n)

@@ -83,7 +83,7 @@ def peak(p):
 
 
 class SparseLoop:
-    """As `yardstick.Yardstick`."""
+    """As `NumpyNetwork`."""
 
     def __init__(self, n: int, k: int = 36) -> None:
         self.shape = (k, n, n)

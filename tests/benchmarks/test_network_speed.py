@@ -1,4 +1,4 @@
-"""A step of the pose cells, in replay and live, beside the NumPy yardstick and other ways to do it.
+"""A step of the pose cells, in replay and live, beside the NumPy network and other ways to do it.
 
 All are timed in turns in one run, so that all see the same machine; only the ratios mean anything.
 """
@@ -12,16 +12,19 @@ from pathlib import Path
 from types import ModuleType
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ratslam.attractor import adaptive_window, pose_cells
-from ratslam.attractor.config import PoseCellConfig, rings, units
-from tactile.base.types import Odometry
+from ratslam.experiments.tables.speed import (
+    MOTION,
+    interleaved_medians,
+    network_calls,
+    network_step,
+    replay_network,
+)
 
 
-def beside(name: str) -> ModuleType:
+def load_beside(name: str) -> ModuleType:
     spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -29,56 +32,7 @@ def beside(name: str) -> ModuleType:
 
 
 FACTOR = {11: 3.4, 21: 2.4, 41: 2.8, 61: 3.8, 101: 3.7}
-"""How many times the C++ reference (-O3) is faster than the yardstick, measured once side by side."""
-ROUNDS = 5
-MOTION = 0.2, 0.1
-"""Cells ahead and cells of heading at each step."""
-
-
-def stepping(n: int, engine: str, dtype=float):
-    """A step of that engine as (cells, recall, energy) -> (cells, told), and its start."""
-    config, dtype = PoseCellConfig(cells_xy=n, engine=engine), np.dtype(dtype)
-    rungs, unit = adaptive_window.rungs(config, dtype), units(config, dtype)
-    moved = Odometry(*(jnp.asarray(v, dtype) for v in (MOTION[0] * unit[0], 0.0, MOTION[1] * unit[2], 1.0)))
-
-    def step(cells, recall, energy):
-        return pose_cells.step(config, rungs, cells, moved, recall, energy)
-
-    return step, pose_cells.start(config, dtype)
-
-
-def replaying(n: int, engine: str, steps: int, dtype=float, every: int = 0):
-    """A run of so many steps, every so many of them with a little injected at another packet, which moves
-    as the first does, half a torus away."""
-    step, start = stepping(n, engine, dtype)
-    ring = rings(PoseCellConfig(cells_xy=n), np.dtype(dtype))
-
-    @jax.jit
-    def run(cells):
-        def body(k, carry):
-            cells, above = carry
-            far = (cells.pose + ring / 2 * np.array([1, 1, 0], dtype)) % ring
-            inject = (k % every == every - 1) if every else jnp.bool_(False)
-            cells, told = step(cells, far, jnp.where(inject, 0.02, 0.0).astype(dtype))
-            return cells, above + (told.rung > 0).astype(jnp.int32)
-
-        return jax.lax.fori_loop(0, steps, body, (cells, jnp.int32(0)))
-
-    jax.block_until_ready(run(start))
-    return run, start
-
-
-def timed(call, count: int) -> float:
-    """us for each of so many."""
-    start = time.perf_counter()
-    jax.block_until_ready(call())
-    return (time.perf_counter() - start) / count * 1e6
-
-
-def in_turns(calls: dict) -> dict:
-    """Medians in us of {name: (call, how many it does)}."""
-    rounds = [{name: timed(*call) for name, call in calls.items()} for _ in range(ROUNDS)]
-    return {name: float(np.median([each[name] for each in rounds])) for name in calls}
+"""How many times the C++ reference (-O3) is faster than the NumPy network, measured once side by side."""
 
 
 def many(call, count: int):
@@ -87,34 +41,23 @@ def many(call, count: int):
 
 @pytest.mark.parametrize("n", [11, 21, 41, 61, 101, 201])
 def test_replay(benchmark, n):
-    """The moving window and the dense network, beside the yardstick, compiled loops and FFTs."""
+    """The moving window and the dense network, beside the NumPy network, compiled loops and FFTs."""
     enabled = benchmark.enabled
     if not enabled and n not in (11, 41):
         pytest.skip("timed by make bench only")
-    steps, few = (4000, max(5, 400 // n)) if enabled else (10, 1)
-    window, start = replaying(n, "window", steps)
-    calls = {"window": (partial(window, start), steps)}
     if enabled:
-        single, start32 = replaying(n, "window", steps, np.float32)
-        dense, whole = replaying(n, "dense", few)
-        plain, loop, fourier = (
-            getattr(beside(module), name)(n)
-            for module, name in (
-                ("yardstick", "Yardstick"),
-                ("sparseloop", "SparseLoop"),
-                ("fourier", "Fourier"),
-            )
+        calls, few = network_calls(n), max(5, 400 // n)
+        loop, fourier = (
+            getattr(load_beside(module), name)(n)
+            for module, name in (("sparseloop", "SparseLoop"), ("fourier", "Fourier"))
         )
         loop.step(*MOTION)
-        calls |= {
-            "window, float32": (partial(single, start32), steps),
-            "dense": (partial(dense, whole), few),
-            "numpy": (many(plain.step, few), few),
-            "loop": (many(loop.step, few), few),
-            "fft": (many(fourier.step, few), few),
-        }
-    us = in_turns(calls)
-    after, above = benchmark.pedantic(window, args=(start,), rounds=1)
+        calls |= {"loop": (many(loop.step, few), few), "fft": (many(fourier.step, few), few)}
+    else:
+        window, start = replay_network(n, "window", 10)
+        calls = {"window": (partial(window, start), 10)}
+    us = interleaved_medians(calls)
+    after, above = benchmark.pedantic(calls["window"][0], rounds=1)
     assert int(above) == 0
     assert np.isfinite(after.pose).all()
     if not enabled:
@@ -135,9 +78,9 @@ def test_two_packets(benchmark, n):
     if not benchmark.enabled:
         pytest.skip("timed by make bench only")
     steps = 2000
-    alone, start = replaying(n, "window", steps)
-    pairs, _ = replaying(n, "window", steps, every=4)
-    us = in_turns({"one": (partial(alone, start), steps), "two": (partial(pairs, start), steps)})
+    alone, start = replay_network(n, "window", steps)
+    pairs, _ = replay_network(n, "window", steps, every=4)
+    us = interleaved_medians({"one": (partial(alone, start), steps), "two": (partial(pairs, start), steps)})
     _, above = benchmark.pedantic(pairs, args=(start,), rounds=1)
     share = int(above) / steps
     assert share > 0.5
@@ -151,7 +94,7 @@ def test_live(benchmark, n):
     """One call for each step, its pose read back."""
     if not benchmark.enabled and n != 21:
         pytest.skip("timed by make bench only")
-    step, cells = stepping(n, "window")
+    step, cells = network_step(n, "window")
     live = jax.jit(step, donate_argnums=0)
     nowhere, nothing = np.zeros(3), np.zeros(())
     took = []

@@ -14,8 +14,8 @@ from ratslam.experiments.fox2012.plots import picture
 from ratslam.experiments.fox2012.protocols import PROTOCOLS, Protocol, World, configured
 from ratslam.experiments.fox2012.tables import table
 from ratslam.experiments.fox2012.trials import Job, Result, results
+from ratslam.experiments.studies.executor import run_tasks
 from ratslam.experiments.trials.csv_output import cells, filled, named, progress
-from ratslam.experiments.trials.process_pool import shared_out
 from tactile.base.random_streams import stream
 
 HEADING = ("world", "method", "mapper", "along", "set", "seed", "reports", *FIELDS)
@@ -50,7 +50,7 @@ def reproduce(
 
     def sessions() -> Iterator[Iterator[list[object]]]:
         with progress(name, len(jobs)) as bar:
-            for new in shared_out(results, jobs, workers):
+            for new in run_tasks(results, jobs, workers=workers):
                 found.extend(new)
                 yield map(_row, new)
                 bar.update()

@@ -122,7 +122,9 @@ def mapped(
     grid = config.grid
     if grid.side is None:
         grid = grid.model_copy(update={"side": 2 * (span(outing.arena) + BEYOND)})
-    session = _fresh(grid, touch.mounts, touch.length, config.session.precision, config.session.seed)
+    session = session_at_start(
+        grid, touch.mounts, touch.length, config.session.precision, config.session.seed
+    )
     start, marks = outing.arena.start, felt_marks(reports)
     told: list[np.ndarray] = []
     found = []
@@ -169,7 +171,9 @@ def _middle(arena: Arena) -> np.ndarray:
     return (arena.outer.min(axis=0) + arena.outer.max(axis=0)) / 2
 
 
-def _fresh(grid: GridConfig, mounts: tuple[Mount, ...], length: float, precision: str, seed: int) -> Session:
+def session_at_start(
+    grid: GridConfig, mounts: tuple[Mount, ...], length: float, precision: str, seed: int
+) -> Session:
     """A session at its start, compiled already if one like it was asked for lately."""
     session = _compiled(grid, mounts, length, precision)
     session.map, session.steps = session.backend.new_map(), 0

@@ -1,4 +1,4 @@
-"""What the figures say of the paper's claims: paired differences with bootstrap intervals, and tables."""
+"""Tests of the paper's claims: paired differences with bootstrap intervals; the table of a reproduction."""
 
 from __future__ import annotations
 
@@ -11,41 +11,42 @@ from evaluation.metrics.experience_metric import bootstrap
 from ratslam.experiments.salman2016.protocols import METHODS, Claim, Protocol
 
 ALIKE = 0.05
-"""Shares that differ by less are about the same."""
+"""Shares that differ by less count as equal."""
 SMALL = 0.1
-"""A share below is nearly nothing."""
+"""A share below counts as nearly zero."""
 DECISIVE = 6
-"""Sets from which on a difference of one sign in all of them is no accident (1 in 32)."""
-RATIOS = ("em", "em_places", "em_odometry", "ratio", "apart")
-"""Quantities that span powers of ten: compared by ratio, one false loop must not decide a mean."""
+"""Number of sets from which a difference of the same sign in all sets is significant (1 in 32)."""
+RATIOS = ("em", "em_experiences", "em_odometry", "em_ratio", "directions_apart")
+"""Quantities that span powers of ten, compared by ratio so that one false loop does not decide a mean."""
 LABELS = {
     "arr": "ARR",
     "arcr": "ARCR, strict",
-    "near": "ARCR without the chain",
+    "arcr_chain_free": "ARCR without the chain",
     "em": "EM, all pairs (m2 + rad2)",
-    "em_places": "EM through the experiences",
+    "em_experiences": "EM through the experiences",
     "em_odometry": "EM of odometry",
-    "ratio": "EM / dead reckoning's",
+    "em_ratio": "EM / dead reckoning's",
     "closures": "closures",
-    "false": "closures > 0.1 m apart in truth",
+    "false_closures": "closures > 0.1 m apart in truth",
     "experiences": "experiences",
-    "counterparts": "first anticlockwise lap, rightly",
+    "first_anticlockwise_correct": "first anticlockwise lap, correctly",
     "first_anticlockwise": "first anticlockwise lap associated",
     "last_anticlockwise": "last anticlockwise lap associated",
-    "rightly": "of these within 0.1 m",
-    "apart": "the two directions apart (m)",
+    "associated_correct": "of these within 0.1 m",
+    "directions_apart": "the two directions apart (m)",
     "across": "closures across the change",
     "across_share": "the same over those in one maze",
     "threshold": "threshold",
 }
+CONTROL_LABELS = {"none": "", "shuffled": "shuffled, ", "blank": "no images, "}
 
 
 class Row(NamedTuple):
     """One session of a reproduction.
 
     Attributes:
-        control: `as felt`, or what was done to the views beside the condition's own. number: of the set.
-        values: fields of `TouchTrial` and extras.
+        control: change of the views beside the condition's own. number: of the set. values: fields of
+            `TouchMetrics` and `direction_metrics`.
     """
 
     condition: str
@@ -57,22 +58,22 @@ class Row(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """A claim held against one method's sessions.
+    """The test of a claim with the sessions of one method.
 
     Attributes:
-        found: mean difference, geometric mean ratio or mean, as `words` puts it. low, high: 95 % interval.
-        word: `confirmed`, `refuted`, `not decided` or `cannot be told`.
+        estimate: mean difference, geometric mean ratio or mean, named in `text`. low, high: 95 % interval.
+        word: `confirmed`, `refuted`, `not decided` or `undefined`.
     """
 
-    found: float
+    estimate: float
     low: float
     high: float
     word: str
-    words: str
+    text: str
 
 
-def verdict(claim: Claim, here: np.ndarray, there: np.ndarray, seed: int = 0) -> Verdict:
-    """Holds a claim against the values [S] of its two conditions over the same sets."""
+def judge_claim(claim: Claim, here: np.ndarray, there: np.ndarray, seed: int = 0) -> Verdict:
+    """Tests a claim with the values [S] of its two conditions over the same sets."""
     if claim.kind == "small":
         values, name, back = here, "mean", lambda x: x
     elif claim.quantity in RATIOS:
@@ -82,9 +83,8 @@ def verdict(claim: Claim, here: np.ndarray, there: np.ndarray, seed: int = 0) ->
         values, name, back = there - here, "difference", lambda x: x
     values = values[np.isfinite(values)]
     if len(values) < 2:
-        return Verdict(np.nan, np.nan, np.nan, "cannot be told", "fewer than two sets have both figures")
+        return Verdict(np.nan, np.nan, np.nan, "undefined", "fewer than two sets have both figures")
     low, high = bootstrap(values, f"reproduce.{claim.text}", seed=seed)
-    mean = float(values.mean())
     if claim.kind == "small":
         yes, no = high < SMALL, low >= SMALL
     elif claim.kind == "alike":
@@ -92,12 +92,13 @@ def verdict(claim: Claim, here: np.ndarray, there: np.ndarray, seed: int = 0) ->
     else:
         yes, no = low > 0, high <= 0
     word = "confirmed" if yes else "refuted" if no else "not decided"
-    found, low, high = (float(back(x)) for x in (mean, low, high))
-    return Verdict(found, low, high, word, f"{name} {found:.3g} [{low:.3g}, {high:.3g}], {len(values)} sets")
+    estimate, low, high = (float(back(x)) for x in (float(values.mean()), low, high))
+    text = f"{name} {estimate:.3g} [{low:.3g}, {high:.3g}], {len(values)} sets"
+    return Verdict(estimate, low, high, word, text)
 
 
 def column(rows: Sequence[Row], condition: str, method: str, control: str, quantity: str) -> np.ndarray:
-    """[S] the values of a quantity over the sets, NaN where a set is missing."""
+    """[S] values of a quantity over the sets, NaN for missing sets."""
     count = 1 + max((row.number for row in rows), default=-1)
     values = np.full(count, np.nan)
     for row in rows:
@@ -106,62 +107,56 @@ def column(rows: Sequence[Row], condition: str, method: str, control: str, quant
     return values
 
 
-def table(protocol: Protocol, rows: Sequence[Row], sets: int) -> str:
-    """Paper, classic, ours, spread over the sets, controls; then what became of each claim."""
+def render_claims(protocol: Protocol, rows: Sequence[Row], sets: int) -> str:
+    """For each quantity the paper's value and the sessions' by method and control; then the claims."""
     done = 1 + max((row.number for row in rows), default=-1)
-    methods = [name for name in METHODS if any(row.method == name for row in rows)]
-    columns = [(method, "as felt") for method in methods]
-    if protocol.controls:
-        columns += [(m, c) for c in ("shuffled", "blank") for m in methods if _there(rows, m, c)]
-    heads = [_CONTROL.get(control, "") + method for method, control in columns]
+    columns = series(protocol, rows)
+    methods = [method for method, control in columns if control == "none"]
+    heads = [CONTROL_LABELS[control] + method for method, control in columns]
     width = max(34, *(len(condition.name) + 4 for condition in protocol.conditions))
     lines = [f"{protocol.title} ({protocol.source}); {done} of {sets} sets: median (least-most)"]
     for quantity in protocol.quantities:
         lines += ["", _line(LABELS[quantity], width, "paper", heads)]
         for condition in protocol.conditions:
-            stated = protocol.paper.get((condition.name, quantity))
+            paper = protocol.paper.get((condition.name, quantity))
             cells = [_cell(column(rows, condition.name, m, c, quantity)) for m, c in columns]
-            lines.append(
-                _line(f"  {condition.name}", width, "-" if stated is None else f"{stated:.4g}", cells)
+            lines.append(_line(f"  {condition.name}", width, "-" if paper is None else f"{paper:.4g}", cells))
+    lines.append("")
+    for claim in protocol.claims:
+        lines.append(f"claim: {claim.text} ({LABELS[claim.quantity]})")
+        for method in methods:
+            here, there = (
+                column(rows, name, method, "none", claim.quantity) for name in (claim.here, claim.there)
             )
-    lines += [""] + [line for claim in protocol.claims for line in _judged(claim, rows, methods)]
+            verdict = judge_claim(claim, here, there)
+            lines.append(f"  {method:<8} {verdict.word.upper()}: {verdict.text}")
     if protocol.claims and 1 < done < DECISIVE:
         lines.append(
-            f"Chance alone makes all {done} sets agree in {2.0 ** (1 - done):.0%} of cases; "
-            f"--sets {DECISIVE} brings that to {2.0 ** (1 - DECISIVE):.0%}."
+            f"By chance all {done} sets agree in {2.0 ** (1 - done):.0%} of cases; "
+            f"--sets {DECISIVE} lowers that to {2.0 ** (1 - DECISIVE):.0%}."
         )
     return "\n".join([*lines, *([protocol.note] if protocol.note else [])])
 
 
-def _line(name: str, width: int, stated: str, cells: Sequence[str]) -> str:
-    return f"{name:<{width}}{stated:>8}" + "".join(f"{cell:>24}" for cell in cells)
+def series(protocol: Protocol, rows: Sequence[Row]) -> list[tuple[str, str]]:
+    """Pairs of method and control with rows: first without controls, then the controls of the protocol."""
+    there = {(row.method, row.control) for row in rows}
+    methods = [method for method in METHODS if any(row.method == method for row in rows)]
+    controls = [(m, c) for c in ("shuffled", "blank") for m in methods if (m, c) in there]
+    return [(method, "none") for method in methods] + (controls if protocol.controls else [])
 
 
-_CONTROL = {"shuffled": "shuffled, ", "blank": "no images, "}
-
-
-def _there(rows: Sequence[Row], method: str, control: str) -> bool:
-    return any(row.method == method and row.control == control for row in rows)
-
-
-def _judged(claim: Claim, rows: Sequence[Row], methods: Sequence[str]) -> list[str]:
-    lines = [f"claim: {claim.text} ({LABELS[claim.quantity]})"]
-    for method in methods:
-        here, there = (
-            column(rows, name, method, "as felt", claim.quantity) for name in (claim.here, claim.there)
-        )
-        found = verdict(claim, here, there)
-        lines.append(f"  {method:<8} {found.word.upper()}: {found.words}")
-    return lines
+def _line(name: str, width: int, paper: str, cells: Sequence[str]) -> str:
+    return f"{name:<{width}}{paper:>8}" + "".join(f"{cell:>24}" for cell in cells)
 
 
 def _cell(values: np.ndarray) -> str:
     values = values[np.isfinite(values)]
     if not len(values):
         return "-"
-    middle, least, most = np.median(values), values.min(), values.max()
-    spread = _short(least, 2), _short(most, 2)
-    return _short(middle) if spread[0] == spread[1] else f"{_short(middle)} ({spread[0]}-{spread[1]})"
+    low, high = _short(values.min(), 2), _short(values.max(), 2)
+    middle = _short(np.median(values))
+    return middle if low == high else f"{middle} ({low}-{high})"
 
 
 def _short(value: float, digits: int = 3) -> str:

@@ -1,4 +1,4 @@
-"""What single reproductions measure besides `TouchTrial`; each takes a session and the word of its laps."""
+"""Metrics of laps in two directions, and of closures across a change of mazes."""
 
 from __future__ import annotations
 
@@ -6,84 +6,84 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from evaluation.metrics.experience_log import creation_rows
-from ratslam.experiments.salman2016.protocols import LATER
-from ratslam.experiments.trials.touch_trial import FALSE, Played, lap_ends
+from ratslam.experiments.salman2016.protocols import LATER_MAZE_START
+from ratslam.experiments.trials.touch_trial import FALSE_CLOSURE_DISTANCE, SessionResult, lap_ends
 
 BESIDE = 0.02
-"""Steps of the two directions so near in truth are at the same spot, m."""
+"""Steps of the two directions this near in truth count as the same spot, m."""
+DIRECTION_METRICS = (
+    "first_anticlockwise_correct", "first_anticlockwise", "last_anticlockwise", "associated_correct",
+    "directions_apart", "across",
+)  # fmt: skip
 
 
-def extras(result: Played, word: str) -> dict[str, float]:
-    """All of them; NaN where the laps do not allow one."""
-    return directions(result, word) | across(result)
+def direction_metrics(result: SessionResult, laps: str) -> dict[str, float]:
+    """How anticlockwise laps were associated with clockwise ones; NaN where the laps do not define a metric.
 
-
-def lap_of(truth: np.ndarray, count: int) -> np.ndarray:
-    """[T] the number of each step's lap, from 0; the way after the last return belongs to the last.
+    A step is associated with the clockwise step at which its experience was created or to which a closure
+    joins it; if that step is anticlockwise too, with the step that one is associated with. The association is
+    correct if the two steps are within `FALSE_CLOSURE_DISTANCE`.
 
     Args:
-        count: laps at most.
+        laps: direction of each lap, C or A.
+
+    Returns:
+        first_anticlockwise_correct: share of the first anticlockwise lap with a correct association.
+        first_anticlockwise, last_anticlockwise: share of the lap with an association. associated_correct:
+        share of the associations that are correct. directions_apart: median distance in the map of steps of
+        the two directions at the same spot, m. across: closures between the parts before and after the
+        change of mazes.
+    """
+    truth = result.truth
+    change = int(LATER_MAZE_START * len(truth))
+    later, earlier = result.closures.reshape(-1, 2).T
+    metrics = dict.fromkeys(DIRECTION_METRICS, np.nan)
+    metrics["across"] = float(((later >= change) & (earlier < change)).sum())
+    if not {"A", "C"} <= set(laps.upper()) or (clockwise := clockwise_steps(truth, laps)).all():
+        return metrics
+    lap = lap_of_step(truth, len(laps))
+    joined = _associate(result, clockwise)
+    known = ~clockwise & (joined >= 0)
+    correct = known & (np.hypot(*(truth - truth[joined])[:, :2].T) < FALSE_CLOSURE_DISTANCE)
+    first, last = np.unique(lap[~clockwise])[[0, -1]]
+    return metrics | {
+        "first_anticlockwise_correct": float(correct[lap == first].mean()),
+        "first_anticlockwise": float(known[lap == first].mean()),
+        "last_anticlockwise": float(known[lap == last].mean()),
+        "associated_correct": float(correct[known].mean()) if known.any() else np.nan,
+        "directions_apart": _directions_apart(result, clockwise),
+    }
+
+
+def lap_of_step(truth: np.ndarray, count: int) -> np.ndarray:
+    """[T] number of each step's lap, from 0; steps after the last return belong to the last lap.
+
+    Args:
+        count: largest number of laps.
     """
     ends = lap_ends(truth)
     return np.minimum(np.searchsorted(ends, np.arange(len(truth))), max(min(len(ends), count) - 1, 0))
 
 
-def clockwise_steps(truth: np.ndarray, word: str) -> np.ndarray:
-    """[T] whether a step is of a clockwise lap, by the laps' letters."""
-    return np.array([letter == "C" for letter in word.upper()])[lap_of(truth, len(word))]
+def clockwise_steps(truth: np.ndarray, laps: str) -> np.ndarray:
+    """[T] whether a step belongs to a clockwise lap."""
+    return np.array([letter == "C" for letter in laps.upper()])[lap_of_step(truth, len(laps))]
 
 
-def directions(result: Played, word: str) -> dict[str, float]:
-    """How laps the other way round were associated with clockwise ones.
-
-    A step is associated with the clockwise step at which its experience was made or which a closure joins it
-    to; where that is itself of an anticlockwise lap, with what that one is associated with. With its
-    counterpart it is, if that lies within `FALSE` of it.
-    """
-    nothing = dict.fromkeys(
-        ("counterparts", "first_anticlockwise", "last_anticlockwise", "rightly", "apart"), np.nan
-    )
-    if "A" not in word.upper() or "C" not in word.upper():
-        return nothing
-    truth, lap = result.truth, lap_of(result.truth, len(word))
-    clockwise = clockwise_steps(truth, word)
-    if clockwise.all():
-        return nothing
-    joined = _joined(result, clockwise)
-    known = ~clockwise & (joined >= 0)
-    near = known & (np.hypot(*(truth - truth[joined])[:, :2].T) < FALSE)
-    laps = np.unique(lap[~clockwise])
-    return {
-        "counterparts": float(near[lap == laps[0]].mean()),
-        "first_anticlockwise": float(known[lap == laps[0]].mean()),
-        "last_anticlockwise": float(known[lap == laps[-1]].mean()),
-        "rightly": float(near[known].mean()) if known.any() else np.nan,
-        "apart": _apart(result, clockwise),
-    }
-
-
-def across(result: Played) -> dict[str, float]:
-    """Closures that join what comes after the change of mazes with what came before."""
-    change = int(LATER * len(result.truth))
-    later, earlier = result.closures.reshape(-1, 2).T
-    return {"across": float(((later >= change) & (earlier < change)).sum())}
-
-
-def _joined(result: Played, clockwise: np.ndarray) -> np.ndarray:
+def _associate(result: SessionResult, clockwise: np.ndarray) -> np.ndarray:
     """[T] the clockwise step that each step is associated with, -1 for none; a clockwise one with itself."""
-    made = np.where(result.place >= 0, creation_rows(result.place), -1)
+    created = np.where(result.place >= 0, creation_rows(result.place), -1)
     earlier: dict[int, list[int]] = {}
     for step, before in result.closures.tolist():
         earlier.setdefault(step, []).append(before)
     joined = np.where(clockwise, np.arange(len(clockwise)), -1)
     for step in np.flatnonzero(~clockwise).tolist():
-        found = [joined[before] for before in (made[step], *earlier.get(step, [])) if 0 <= before < step]
-        joined[step] = max(found, default=-1)  # any; the newest of several
+        found = [joined[before] for before in (created[step], *earlier.get(step, [])) if 0 <= before < step]
+        joined[step] = max(found, default=-1)  # the newest of several
     return joined
 
 
-def _apart(result: Played, clockwise: np.ndarray) -> float:
-    """How far the map puts steps of the two directions apart that are at the same spot, median, m."""
+def _directions_apart(result: SessionResult, clockwise: np.ndarray) -> float:
     ahead = np.flatnonzero(clockwise)
     away, row = cKDTree(result.truth[ahead, :2]).query(result.truth[~clockwise, :2])
     beside = away < BESIDE

@@ -1,4 +1,4 @@
-"""The picture of each reproduction, from its rows and the sessions of its first set."""
+"""The figures of the reproductions."""
 
 from __future__ import annotations
 
@@ -19,38 +19,39 @@ from evaluation.plots.paper_figures import (
     draw_experiences,
     draw_measured,
 )
-from ratslam.experiments.salman2016.claims import LABELS, RATIOS, Row, column
-from ratslam.experiments.salman2016.direction_metrics import clockwise_steps, lap_of
-from ratslam.experiments.salman2016.protocols import METHODS, Protocol
-from ratslam.experiments.trials.touch_trial import Played, judged
+from ratslam.experiments.salman2016.claims import LABELS, RATIOS, Row, column, series
+from ratslam.experiments.salman2016.direction_metrics import clockwise_steps, lap_of_step
+from ratslam.experiments.salman2016.protocols import Protocol
+from ratslam.experiments.trials.touch_trial import SessionResult, experience_metric_if_defined
 from tactile.base.se2 import compose
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_FIRST = ("fig2", "fig3", "fig5")  # one session is drawn, not figures of all
+FIRST_SET_ONLY = ("fig2", "fig3", "fig5")
+"""Figures of a session of the first set instead of metrics over all sets."""
 SHOWN = ("arr", "arcr", "em")
-"""Quantities in a picture of dots."""
+"""Quantities of a dot plot."""
 
-Sessions = Mapping[tuple[str, str], tuple[str, Played]]
-"""By condition and method: the word of the laps, and what the first set's session led to."""
+Sessions = Mapping[tuple[str, str], tuple[str, SessionResult]]
+"""By condition and method: the directions of the laps, and the result of the first set's session."""
 
 
-def picture(name: str, protocol: Protocol, rows: Sequence[Row], sessions: Sessions) -> Figure:
-    """The figure of a reproduction."""
+def draw_reproduction(name: str, protocol: Protocol, rows: Sequence[Row], sessions: Sessions) -> Figure:
+    """The figure of a reproduction, from its rows and the sessions of its first set."""
     sets = 1 + max(row.number for row in rows)
     title = f"{name}: {protocol.title}"
     count = f"{sets} set{'s' if sets > 1 else ''}"
-    line = f"{protocol.source}  ·  {f'the first of {count}' if name in _FIRST else count}"
-    return _DRAWN.get(name, _dots)(title, line, protocol, rows, sessions)
+    line = f"{protocol.source}  ·  {f'the first of {count}' if name in FIRST_SET_ONLY else count}"
+    if name in _OF_SESSIONS:
+        return _OF_SESSIONS[name](title, line, sessions)
+    return (_curves if protocol.swept else _dots)(title, line, protocol, rows)
 
 
-def _dots(title: str, line: str, protocol: Protocol, rows: Sequence[Row], sessions: Sessions) -> Figure:
+def _dots(title: str, line: str, protocol: Protocol, rows: Sequence[Row]) -> Figure:
     names = [condition.name for condition in protocol.conditions]
-    series = [(method, "as felt") for method in METHODS if any(row.method == method for row in rows)]
-    if protocol.controls:
-        series += [("ours", "shuffled"), ("ours", "blank")]
-    labels = {"as felt": "", "shuffled": ", shuffled", "blank": ", no images"}
+    labels = {"none": "", "shuffled": ", shuffled", "blank": ", no images"}
+    shown = [(m, c) for m, c in series(protocol, rows) if c == "none" or m == "ours"]
     measured = [
         Measured(
             LABELS[quantity],
@@ -58,7 +59,7 @@ def _dots(title: str, line: str, protocol: Protocol, rows: Sequence[Row], sessio
                 method + labels[control]: np.array(
                     [column(rows, name, method, control, quantity) for name in names]
                 )
-                for method, control in series
+                for method, control in shown
             },
             np.array([protocol.paper.get((name, quantity), np.nan) for name in names]),
             quantity in RATIOS,
@@ -68,65 +69,59 @@ def _dots(title: str, line: str, protocol: Protocol, rows: Sequence[Row], sessio
     return draw_measured(title, line, names, measured)
 
 
-def _drift(title: str, line: str, protocol: Protocol, rows: Sequence[Row], sessions: Sessions) -> Figure:
-    paths = {}
+def _curves(title: str, line: str, protocol: Protocol, rows: Sequence[Row]) -> Figure:
+    curves: dict[str, dict[str, tuple[np.ndarray, np.ndarray]]] = {}
     for condition in protocol.conditions:
-        found = [value for (name, _), value in sessions.items() if name == condition.name]
-        if found:
-            word, result = found[0]
-            odometry = compose(result.truth[0], result.odometry)
-            paths[condition.name] = Path(
-                result.truth[:, :2], odometry[:, :2], lap_of(result.truth, len(word))
-            )
+        name, noise = condition.name.rsplit(", ", 1)
+        these = [row for row in rows if row.control == "sweep" and row.condition == condition.name]
+        numbers = sorted({row.number for row in these})
+        sets = [[row.values for row in these if row.number == number] for number in numbers]
+        if numbers:
+            arcr, arr = (np.array([[v[q] for v in values] for values in sets]) for q in ("arcr", "arr"))
+            curves.setdefault(noise, {})[name] = (arcr, arr)
+    return draw_curves(title, line, curves)
+
+
+def _drift(title: str, line: str, sessions: Sessions) -> Figure:
+    paths: dict[str, Path] = {}
+    for (name, _), (laps, result) in sessions.items():
+        odometry = compose(result.truth[0], result.odometry)
+        lap = lap_of_step(result.truth, len(laps))
+        paths.setdefault(name, Path(result.truth[:, :2], odometry[:, :2], lap))
     return draw_drift(title, line, paths)
 
 
-def _history(title: str, line: str, protocol: Protocol, rows: Sequence[Row], sessions: Sessions) -> Figure:
+def _history(title: str, line: str, sessions: Sessions) -> Figure:
     return draw_experiences(
         title, line, {method: _experiences(result) for (_, method), (_, result) in sessions.items()}
     )
 
 
-def _experiences(result: Played) -> Experiences:
-    metric, none = judged(result), np.zeros(len(result.place), bool)
+def _experiences(result: SessionResult) -> Experiences:
+    metric, none = experience_metric_if_defined(result), np.zeros(len(result.place), bool)
     if metric is None:
         return Experiences(result.place, none, none, none, 0)
     known = result.place >= 0
     counted, right, invalid = none.copy(), none.copy(), none.copy()
     counted[known], right[known] = metric.counted, metric.right
-    # An experience is valid if the last re-localisation before it was correct.
+    # An experience is invalid if the last re-localisation before it was wrong.
     last = np.maximum.accumulate(np.where(counted, np.arange(len(counted)), -1))
     wrong = (last >= 0) & ~right[last]
     invalid[known] = wrong[creation_rows(result.place[known])]
     return Experiences(result.place, counted, right, invalid, int(np.flatnonzero(known)[metric.base - 1]) + 1)
 
 
-def _directions(title: str, line: str, protocol: Protocol, rows: Sequence[Row], sessions: Sessions) -> Figure:
+def _directions(title: str, line: str, sessions: Sessions) -> Figure:
     maps = {}
-    for (name, method), (word, result) in sessions.items():
+    for (name, method), (laps, result) in sessions.items():
         position = compose(align(result.trajectory, result.truth), result.trajectory)[:, :2]
-        maps[f"{name}, {method}"] = position, clockwise_steps(result.truth, word)
+        maps[f"{name}, {method}"] = position, clockwise_steps(result.truth, laps)
     order = sorted(maps, key=lambda name: (name.rsplit(", ", 1)[1], list(maps).index(name)))
     return draw_directions(title, line, {name: maps[name] for name in order})
 
 
-def _curves(title: str, line: str, protocol: Protocol, rows: Sequence[Row], sessions: Sessions) -> Figure:
-    curves: dict[str, dict[str, tuple[np.ndarray, np.ndarray]]] = {}
-    sweeps = [row for row in rows if row.control == "sweep"]
-    for condition in protocol.conditions:
-        name, noise = condition.name.rsplit(", ", 1)
-        these = [row for row in sweeps if row.condition == condition.name]
-        numbers = sorted({row.number for row in these})
-        of = [[row.values for row in these if row.number == number] for number in numbers]
-        pair = tuple(np.array([[v[q] for v in values] for values in of]) for q in ("arcr", "arr"))
-        if numbers:
-            curves.setdefault(noise, {})[name] = (pair[0], pair[1])
-    return draw_curves(title, line, curves)
-
-
-_DRAWN: dict[str, Callable[[str, str, Protocol, Sequence[Row], Sessions], Figure]] = {
+_OF_SESSIONS: dict[str, Callable[[str, str, Sessions], Figure]] = {
     "fig2": _drift,
     "fig3": _history,
     "fig5": _directions,
-    "matched": _curves,
 }

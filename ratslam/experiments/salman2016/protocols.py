@@ -1,4 +1,4 @@
-"""What is reproduced of Salman & Pearson 2016: conditions, the paper's figures, and its claims."""
+"""The protocols: conditions, values printed in Salman & Pearson 2016, and its claims."""
 
 from __future__ import annotations
 
@@ -8,12 +8,9 @@ from typing import Literal, NamedTuple
 
 from ratslam.experiments.trials.controls import Control
 
-COMMON = (
-    "simulation.path.circuits=CCCAAACACA",
-    "simulation.odometry.noise=gated",
-)
-"""Of every session, unless a condition says otherwise: the paper's circuits (III-C), and its odometry's error
-on the axis that moves."""
+COMMON = ("simulation.path.circuits=CCCAAACACA", "simulation.odometry.noise=gated")
+"""Settings of all sessions unless a condition overrides them: the paper's circuits (III-C), and noise
+on the moving axis only."""
 METHODS: dict[str, tuple[str, ...]] = {
     "classic": (
         "backend=classic",
@@ -23,20 +20,23 @@ METHODS: dict[str, tuple[str, ...]] = {
     ),
     "ours": ("backend=recall",),
 }
-"""The matchers. The classic one is RatSLAM as published, with half of the iRat's energy (III-F), on a torus
-that the maze fits into."""
+"""The classic method is RatSLAM as published with half of the iRat's energy (III-F), on a torus larger than
+the maze."""
 THRESHOLDS = {"max_angle": 0.015, "contact_angle": 0.05}
-"""Of the classic matcher: most correct less incorrect re-localisations on laps 2 and 3, over four mazes that
-are not used here. Higher for contact_angle, as in the paper (IV-D)."""
+"""Matching thresholds of the classic method: most correct less incorrect re-localisations on laps 2 and 3 of
+four mazes that are not used here. Higher for contact_angle, as in the paper (IV-D)."""
 SWEPT = (0.005, 0.01, 0.015, 0.02, 0.025, 0.03, 0.04, 0.05, 0.06, 0.08)
-"""Thresholds at which conditions are matched."""
-LATER = 0.3
-"""Share of the session after which the later maze is felt: three of ten laps."""
+"""Thresholds from which matched ones are chosen."""
+LATER_MAZE_START = 0.3
+"""Share of the session before the change of mazes: three of ten laps."""
 
-OPEN_MAX = ("simulation.whisking.mode=open", "touch.image.transform=max_angle")
-RCP_MAX = ("simulation.whisking.mode=rcp", "touch.image.transform=max_angle")
-OPEN_CONTACT = ("simulation.whisking.mode=open", "touch.image.transform=contact_angle")
-RCP_CONTACT = ("simulation.whisking.mode=rcp", "touch.image.transform=contact_angle")
+
+def _views(mode: str, transform: str) -> tuple[str, ...]:
+    return f"simulation.whisking.mode={mode}", f"touch.image.transform={transform}"
+
+
+OPEN_MAX, OPEN_CONTACT = _views("open", "max_angle"), _views("open", "contact_angle")
+RCP_MAX, RCP_CONTACT = _views("rcp", "max_angle"), _views("rcp", "contact_angle")
 KIDNAPPED = ("simulation.kidnaps.count=8", "simulation.kidnaps.ahead=45.0")
 
 
@@ -44,21 +44,28 @@ class Condition(NamedTuple):
     """One way to run a session.
 
     Attributes:
-        sets: assignments. control: what is done to the views. laps: of the session; 0: all.
+        sets: overrides. control: change of the views. laps: number of laps to run; 0: all.
     """
 
     name: str
     sets: tuple[str, ...]
-    control: Control = "as felt"
+    control: Control = "none"
     laps: int = 0
+
+    @property
+    def transform(self) -> str:
+        """The image transform, which decides the classic method's threshold."""
+        return next(
+            value for key, _, value in (one.partition("=") for one in self.sets) if "transform" in key
+        )
 
 
 class Claim(NamedTuple):
-    """What the paper says, in figures that can prove it wrong.
+    """A claim as a test on two conditions.
 
     Attributes:
-        kind: `rises`: the quantity is larger in condition `there` than in `here`; `alike`: it is about the
-            same; `small`: it is nearly nothing in condition `here`.
+        text: also names the random stream of the test's bootstrap. kind: `rises`: the quantity is larger in
+            condition `there` than in `here`; `alike`: equal in both; `small`: nearly zero in `here`.
     """
 
     text: str
@@ -69,12 +76,12 @@ class Claim(NamedTuple):
 
 
 class Protocol(NamedTuple):
-    """A figure of the paper, or a test of what it says.
+    """A figure of the paper, or a test of one of its statements.
 
     Attributes:
-        source: where in which paper. quantities: shown, fields of `TouchTrial` or extras. paper: its figures,
-            by condition and quantity. controls: whether shuffled and blank views are put beside.
-        swept: whether the conditions are compared at matched ARCR. note: what to know when reading it.
+        source: section and figure. quantities: shown, fields of `TouchMetrics` or `direction_metrics`.
+        paper: printed values by condition and quantity. controls: whether to add sessions with shuffled and
+            blank views. swept: whether to compare conditions at matched ARCR. note: printed below the table.
     """
 
     title: str
@@ -87,11 +94,15 @@ class Protocol(NamedTuple):
     swept: bool = False
     note: str = ""
 
+    def same_noise(self, condition: Condition) -> list[str]:
+        """The names of the conditions to be matched with one: those after the comma are the same."""
+        return [c.name for c in self.conditions if c.name.split(", ")[1:] == condition.name.split(", ")[1:]]
 
-METRICS = ("arr", "arcr", "near", "em", "em_places", "ratio", "closures", "false")
+
+METRICS = ("arr", "arcr", "arcr_chain_free", "em", "em_experiences", "em_ratio", "closures", "false_closures")
 SAME_IMAGES = (
     "In the kinematic tier RCP acts after the contact, so open loop and RCP give the same contact_angle "
-    "images; --set simulation.fidelity=dynamic lets them differ."
+    "images; with --set simulation.fidelity=dynamic they can differ."
 )
 
 PROTOCOLS = {
@@ -103,9 +114,9 @@ PROTOCOLS = {
             Condition("gated", RCP_CONTACT, laps=3),
             Condition("telescoping", (*RCP_CONTACT, "simulation.odometry.noise=telescoping"), laps=3),
         ),
-        ("em_odometry", "em", "em_places", "closures", "false"),
-        note="The paper gives the size of the error, not its structure: white in every sample, gated to the "
-        "axis that moves, telescoping (of the poses, it does not add up).",
+        ("em_odometry", "em", "em_experiences", "closures", "false_closures"),
+        note="The paper gives the size of the error, not its structure: white (in every sample), gated (on "
+        "the moving axis), or telescoping (on the poses, so that it does not accumulate).",
         controls=False,
     ),
     "fig3": Protocol(
@@ -113,7 +124,7 @@ PROTOCOLS = {
         "Salman & Pearson 2016, III-G, Fig. 3 (there of the iRat's camera)",
         (Condition("RCP, contact_angle", RCP_CONTACT),),
         (*METRICS, "experiences"),
-        note="The figure defines the metric; the paper claims nothing by it.",
+        note="The figure defines the metric; the paper makes no claim with it.",
     ),
     "fig4": Protocol(
         "Kidnapped against not",
@@ -136,18 +147,21 @@ PROTOCOLS = {
             Condition("after 3 + 3 laps", OPEN_MAX, laps=6),
             Condition("after alternation", OPEN_MAX),
         ),
-        ("first_anticlockwise", "counterparts", "last_anticlockwise", "rightly", "apart", "em", "ratio"),
+        (
+            "first_anticlockwise", "first_anticlockwise_correct", "last_anticlockwise", "associated_correct",
+            "directions_apart", "em", "em_ratio",
+        ),
         (
             Claim("the first anticlockwise lap is not associated with its clockwise counterparts",
-                  "counterparts", "small", "after 3 + 3 laps"),
+                  "first_anticlockwise_correct", "small", "after 3 + 3 laps"),
             Claim("alternation associates later anticlockwise laps", "last_anticlockwise", "rises",
                   "after 3 + 3 laps", "after alternation"),
-            Claim("alternation makes the two loops overlap", "apart", "rises", "after alternation",
+            Claim("alternation makes the two loops overlap", "directions_apart", "rises", "after alternation",
                   "after 3 + 3 laps"),
         ),
-        note="Associated: the step's experience was made on a clockwise lap, or a closure joins it to one, "
-        "or to a step that is associated; rightly: within 0.1 m. Apart: in the map, from the clockwise step "
-        "that is truly nearest, median.",
+        note="Associated: the step's experience was created on a clockwise lap, or a closure joins it to one "
+        "or to a step that is associated; correctly: within 0.1 m. Apart: median distance in the map from "
+        "the clockwise step that is nearest in truth.",
     ),
     "fig6": Protocol(
         "Open loop against RCP, max_angle",
@@ -165,8 +179,8 @@ PROTOCOLS = {
             ("open loop", "em"): 0.1916,
             ("RCP", "em"): 0.1568,
         },
-        note="The paper does not say over which pairs its EM is taken: compare ratios (there RCP / open loop "
-        "0.82).",
+        note="The paper does not say over which pairs it takes EM: compare ratios (in the paper RCP / open "
+        "loop is 0.82).",
     ),
     "fig7": Protocol(
         "contact_angle against max_angle",
@@ -207,32 +221,34 @@ PROTOCOLS = {
             Claim("driving backwards costs no re-localisations", "arr", "alike", "forwards", "backwards"),
             Claim("driving backwards costs no correct ones", "arcr", "alike", "forwards", "backwards"),
         ),
-        note="The head looks away from where it goes; the claims are ours.",
+        note="The head faces away from the direction of motion; the claims are ours.",
     ),
     "controls": Protocol(
-        "What is owed to the images",
+        "What the images contribute",
         "not in the paper",
         (
-            Condition("as felt", RCP_CONTACT),
+            Condition("unchanged", RCP_CONTACT),
             Condition("shuffled", RCP_CONTACT, "shuffled"),
             Condition("no images", RCP_CONTACT, "blank"),
-            Condition("later laps in another maze", (*RCP_CONTACT, f"simulation.later_maze={LATER}")),
+            Condition("later laps in another maze",
+                      (*RCP_CONTACT, f"simulation.later_maze={LATER_MAZE_START}")),
             Condition("ideal views", RCP_CONTACT, "ideal"),
         ),
-        ("arr", "arcr", "near", "em", "ratio", "closures", "false", "across"),
+        ("arr", "arcr", "arcr_chain_free", "em", "em_ratio", "closures", "false_closures", "across"),
         (
-            Claim("the images carry ARR (more than shuffled ones)", "arr", "rises", "shuffled", "as felt"),
-            Claim("the images carry the map (EM lower than without)", "em", "rises", "as felt", "no images"),
+            Claim("the images carry ARR (more than shuffled ones)", "arr", "rises", "shuffled", "unchanged"),
+            Claim("the images carry the map (EM lower than without)", "em", "rises", "unchanged",
+                  "no images"),
             Claim("another maze is not taken for the first", "across_share", "small",
                   "later laps in another maze"),
         ),
         controls=False,
-        note="Across: closures of the last seven tenths with the first three; in another maze, only the way "
-        "and the outer walls are the same. Ideal: a view of its own for each 6 cm and 45 degrees; it changes "
-        "at once, as no image of whiskers does. The claims are ours.",
+        note="Across: closures of the last seven tenths with the first three; the other maze shares only the "
+        "path and the outer walls. Ideal: one view for each 6 cm and 45 degrees, with sharp changes that "
+        "whisker images do not have. The claims are ours.",
     ),
     "matched": Protocol(
-        "Conditions at matched ARCR, classic matcher",
+        "Conditions at matched ARCR, classic method",
         "Salman & Pearson 2016, IV-C and IV-D (there each at its own tuning)",
         tuple(
             Condition(f"{name}, {noise}", (*sets, f"simulation.odometry.noise={noise}"))
@@ -243,7 +259,7 @@ PROTOCOLS = {
                 ("RCP contact_angle", RCP_CONTACT),
             )
         ),
-        ("arr", "arcr", "near", "em", "threshold"),
+        ("arr", "arcr", "arcr_chain_free", "em", "threshold"),
         tuple(
             claim
             for noise in ("gated", "telescoping")

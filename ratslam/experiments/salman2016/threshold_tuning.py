@@ -1,9 +1,9 @@
-"""The paper's tuning made definite (Salman & Pearson 2016, III-F), for the classic matcher.
+"""The paper's tuning of the matching threshold (Salman & Pearson 2016, III-F), for the classic method.
 
-The energy of injection is half of the iRat's; the matching threshold is raised over a grid; wanted is the one
+The injection energy is half of the iRat's; the threshold is raised over a grid. The rule takes the threshold
 with the most correct re-localisations on the second and third lap, none incorrect and at least ten correct.
-Before any of that, the views themselves say what a threshold can tell apart: how unlike two views of one
-place are, and two of different places.
+Before any map, the views alone show what a threshold can separate: the differences of two views of the same
+place, and of two places.
 """
 
 from __future__ import annotations
@@ -19,40 +19,37 @@ from evaluation.plots.paper_figures import draw_tuning
 from ratslam.classic.view_templates import TemplateConfig
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import Document, override, validate
-from ratslam.experiments.trials.process_pool import shared_out
-from ratslam.experiments.trials.threshold_sweep import classics
-from ratslam.experiments.trials.touch_trial import first, lap_ends, session_log, whole
+from ratslam.experiments.studies.executor import run_tasks
+from ratslam.experiments.trials.threshold_sweep import sweep_thresholds
+from ratslam.experiments.trials.touch_trial import collect_session, lap_ends, truncate_log
 from robot.sources.in_memory import Log
 from tactile.base.errors import InputError
 from tactile.base.se2 import wrap
 
 CLASSIC = ("backend=classic", "templates.energy=0.05")
-"""What is tuned: half of iRat's 0.1 (III-F; the value is Ball et al. 2013's)."""
+"""The tuned method: half of the iRat's energy of 0.1 (III-F; the value is of Ball et al. 2013)."""
 THRESHOLDS = tuple(np.round(np.arange(1, 33) * 0.005, 3).tolist())
-"""The grid."""
 LAPS = 3
-"""Up to the end of this one."""
+"""Laps that are scored, the base set excepted."""
 ENOUGH = 10
-"""Correct re-localisations that a threshold must bring."""
-SAME, SAME_HEADING = 0.05, np.radians(15)
-"""Views taken so near each other are of the same place, m and rad,"""
-ANOTHER_VISIT = 60.0
-"""if so much time lies between them, s."""
-OTHER = 0.3
-"""Views taken farther apart are of different places, m."""
+"""Correct re-localisations that a threshold must give."""
+SAME_DISTANCE, SAME_HEADING, VISIT_GAP = 0.05, np.radians(15), 60.0
+"""Two views are of the same place if taken within this distance (m) and heading (rad) on two visits, at least
+this far apart in time (s)."""
+OTHER_DISTANCE = 0.3
+"""Two views are of different places if taken farther apart, m."""
 BINS = 60
-"""Of the histograms."""
 ROWS = 64
 """Views compared with all others at a time."""
 
 
-class Likeness(NamedTuple):
-    """How unlike views are, as the classic matcher measures it.
+class ViewDifferences(NamedTuple):
+    """Differences of pairs of views, as the classic method measures them.
 
     Attributes:
-        edge: [BINS + 1] of the histograms. same, other: [BINS] pairs of views of one place, of two.
-        auc: chance that two views of different places are less alike than two of the same; 0.5: views tell
-            nothing.
+        edge: [BINS + 1] of the histograms. same, other: [BINS] pairs of views of one place, of two places.
+        auc: probability that a pair of different places differs more than a pair of the same; 0.5: the views
+            do not separate places.
     """
 
     edge: np.ndarray
@@ -61,11 +58,11 @@ class Likeness(NamedTuple):
     auc: float
 
 
-class Tried(NamedTuple):
-    """What a threshold led to on the laps after the base set.
+class ThresholdScore(NamedTuple):
+    """The laps after the base set at one threshold.
 
     Attributes:
-        arr: re-localisations over steps. correct, incorrect: their numbers, by strict reading.
+        arr: re-localisations over steps. correct, incorrect: strict counts.
     """
 
     threshold: float
@@ -75,66 +72,72 @@ class Tried(NamedTuple):
 
 
 class Tuning(NamedTuple):
-    """Attributes:
-    winner: the threshold, None where none satisfies. why: a sentence on either. likeness: of the views.
-    tried: in the order of the grid. steps: that were judged, from and to.
-    """
+    """The chosen score or None, the reason, the views, all scores, and the scored steps (from, to)."""
 
-    winner: Tried | None
-    why: str
-    likeness: Likeness
-    tried: list[Tried]
+    winner: ThresholdScore | None
+    reason: str
+    views: ViewDifferences
+    scores: list[ThresholdScore]
     steps: tuple[int, int]
 
 
-def tune(document: Document, folder: Path, workers: int = 1) -> Tuning:
+def tune_threshold(document: Document, folder: Path, workers: int = 1) -> Tuning:
     """Tunes the threshold of a configuration.
 
     Args:
-        folder: of the configuration file. workers: processes that share out the grid.
+        folder: of the configuration file. workers: processes that share the grid.
 
     Raises:
         InputError: the source cannot be used, has no truth or no views, or never returns to its start.
     """
-    config = whole(validate(override(document, CLASSIC), RunConfig), folder)
-    config, log = session_log(config)
+    config = validate(override(document, CLASSIC), RunConfig).with_absolute_paths(folder.resolve())
+    config, log = collect_session(config)
     if config.templates.source == "labels" or not log.seen.all():
         raise InputError(log.name, "steps without a view", "a view at every step")
-    log, base = _judged_part(log)
-    likeness = compared(config.templates, log)
+    truth = np.asarray(log.truth)
+    base, ends = base_end(truth), lap_ends(truth)[:LAPS]
+    log = truncate_log(log, int(ends[-1]) + 1 if len(ends) == LAPS else log.length)
+    views = compare_views(config.templates, log)
     parts = [part for part in np.array_split(THRESHOLDS, workers) if len(part)]
-    found = shared_out(_tried, [(config, log, base, part) for part in parts], workers)
-    tried = [each for part in found for each in part]
-    winner, why = chosen(tried, likeness)
-    return Tuning(winner, why, likeness, tried, (base, log.length))
+    scored = run_tasks(_score_thresholds, [(config, log, base, part) for part in parts], workers=workers)
+    scores = [score for part in scored for score in part]
+    winner, reason = choose_threshold(scores, views)
+    return Tuning(winner, reason, views, scores, (base, log.length))
 
 
-def chosen(tried: Sequence[Tried], likeness: Likeness) -> tuple[Tried | None, str]:
-    """The threshold that the rule takes, and a sentence on why, or on why there is none."""
-    clean = [each for each in tried if not each.incorrect and each.correct >= ENOUGH]
+def choose_threshold(
+    scores: Sequence[ThresholdScore], views: ViewDifferences
+) -> tuple[ThresholdScore | None, str]:
+    """The score that the rule takes, or None, and the reason."""
+    enough = [score for score in scores if score.correct >= ENOUGH]
+    clean = [score for score in enough if not score.incorrect]
     if clean:
-        best = max(clean, key=lambda each: each.correct)  # the lowest of equals
-        return best, f"{len(clean)} thresholds bring at least {ENOUGH} correct and none incorrect"
-    enough = [each for each in tried if each.correct >= ENOUGH]
-    if not enough:
-        most = max(tried, key=lambda each: each.correct)
-        why = (
-            f"no threshold brings {ENOUGH} correct re-localisations; {most.threshold:g} brings {most.correct}"
-        )
-    else:
-        least = min(enough, key=lambda each: each.incorrect)
-        why = (
-            f"every threshold with {ENOUGH} correct re-localisations has incorrect ones; "
+        best = max(clean, key=lambda score: score.correct)  # the lowest of equal ones
+        return best, f"{len(clean)} thresholds give at least {ENOUGH} correct and none incorrect"
+    if enough:
+        least = min(enough, key=lambda score: score.incorrect)
+        reason = (
+            f"all thresholds with {ENOUGH} correct re-localisations have incorrect ones; "
             f"{least.threshold:g} has the fewest, {least.incorrect} beside {least.correct} correct"
         )
-    return None, f"{why}. {_ambiguity(likeness)}"
+    else:
+        most = max(scores, key=lambda score: score.correct)
+        reason = (
+            f"no threshold gives {ENOUGH} correct re-localisations; {most.threshold:g} gives {most.correct}"
+        )
+    half = _quantile(views.edge, views.same, 0.5)
+    below = np.interp(half, views.edge, np.concatenate([[0], np.cumsum(views.other)])) / views.other.sum()
+    return None, (
+        f"{reason}. A threshold of {half:.3f} accepts half of the view pairs of one place and {below:.1%} of "
+        f"those of different places (AUC {views.auc:.3f})"
+    )
 
 
-def compared(config: TemplateConfig, log: Log) -> Likeness:
-    """How unlike the views of a session are, of the same place and of different ones.
+def compare_views(config: TemplateConfig, log: Log) -> ViewDifferences:
+    """The differences of the views of a session, of the same place and of different ones.
 
     Raises:
-        InputError: no place was seen on two visits.
+        InputError: no place was visited twice.
     """
     truth, views = np.asarray(log.truth), log.views
     same, other = [np.zeros(0)], [np.zeros(0)]
@@ -143,112 +146,88 @@ def compared(config: TemplateConfig, log: Log) -> Likeness:
         later = np.arange(len(views)) > np.arange(len(views))[rows, None]
         apart = np.hypot(*(truth[None, :, :2] - truth[rows, None, :2]).transpose(2, 0, 1))
         turned = np.abs(wrap(truth[None, :, 2] - truth[rows, None, 2]))
-        again = np.abs(log.time - log.time[rows, None]) >= ANOTHER_VISIT
-        unlike = differences(config, views[rows], views)
-        same.append(unlike[later & again & (apart < SAME) & (turned < SAME_HEADING)])
-        other.append(unlike[later & (apart > OTHER)])
+        again = np.abs(log.time - log.time[rows, None]) >= VISIT_GAP
+        difference = view_differences(config, views[rows], views)
+        same.append(difference[later & again & (apart < SAME_DISTANCE) & (turned < SAME_HEADING)])
+        other.append(difference[later & (apart > OTHER_DISTANCE)])
     a, b = np.concatenate(same), np.concatenate(other)
     if not len(a) or not len(b):
-        raise InputError(
-            log.name,
-            "no place that is seen on two visits" if len(b) else "a path that stays at one place",
-            "a path that returns to where it has been",
-        )
+        found = "no place with views of two visits" if len(b) else "a path that stays at one place"
+        raise InputError(log.name, found, "a path that returns to earlier places")
     edge = np.linspace(0.0, max(a.max(), b.max(), 1e-9), BINS + 1)
-    return Likeness(edge, np.histogram(a, edge)[0], np.histogram(b, edge)[0], auc(a, b))
+    return ViewDifferences(edge, np.histogram(a, edge)[0], np.histogram(b, edge)[0], auc(a, b))
 
 
-def differences(config: TemplateConfig, views: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """[N, M] mean absolute difference of views [N, R, C, K] from others [M, R, C, K], over all shifts that
-    the matcher tries the least (`ratslam.classic.view_templates.match_view`)."""
+def view_differences(config: TemplateConfig, views: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """[N, M] smallest mean absolute difference of views [N, R, C, K] from others [M, R, C, K] over all shifts
+    that the classic method tries (`ratslam.classic.view_templates.match_view`)."""
     columns = views.shape[2]
     if config.panoramic:
         shifted = [np.roll(others, -o, axis=2) for o in range(0, columns, config.shift_step)]
-        seen = views
     else:
         width = columns - 2 * config.shift
         offsets = range(0, 2 * config.shift + 1, config.shift_step)
         shifted = [others[:, :, o : o + width] for o in offsets]
-        seen = views[:, :, config.shift : config.shift + width]
+        views = views[:, :, config.shift : config.shift + width]
     axes = (2, 3, 4)
-    return np.min([np.abs(seen[:, None] - other[None]).mean(axis=axes) for other in shifted], axis=0)
+    return np.min([np.abs(views[:, None] - other[None]).mean(axis=axes) for other in shifted], axis=0)
 
 
 def auc(same: np.ndarray, other: np.ndarray) -> float:
-    """The chance that one of `other` exceeds one of `same`, ties counted half (Mann & Whitney 1947)."""
+    """The probability that one of `other` exceeds one of `same`, ties counted half (Mann & Whitney 1947)."""
     ordered = np.sort(other)
     below = np.searchsorted(ordered, same, "left")
     up_to = np.searchsorted(ordered, same, "right")
     return float(1 - (below + up_to).mean() / 2 / len(other))
 
 
-def report(tuning: Tuning) -> str:
-    """The tuning as plain text."""
-    likeness, (start, stop) = tuning.likeness, tuning.steps
+def render_tuning(tuning: Tuning) -> str:
+    """The tuning as text."""
+    views, (start, stop) = tuning.views, tuning.steps
     lines = [
-        "before any map: how unlike two views are (mean absolute difference)",
+        "before any map: mean absolute difference of two views",
         f"  {'':<18}{'5 %':>8}{'median':>8}{'95 %':>8}{'pairs':>10}",
-        _spread("the same place", likeness.edge, likeness.same),
-        _spread("different places", likeness.edge, likeness.other),
-        f"  AUC {likeness.auc:.3f} (1: views tell places apart; 0.5: they tell nothing)",
+    ]
+    for name, counts in (("the same place", views.same), ("different places", views.other)):
+        cells = "".join(f"{_quantile(views.edge, counts, share):>8.3f}" for share in (0.05, 0.5, 0.95))
+        lines.append(f"  {name:<18}{cells}{counts.sum():>10}")
+    lines += [
+        f"  AUC {views.auc:.3f} (1: the views separate places; 0.5: they do not)",
         "",
         f"steps {start} to {stop}, after the base set up to the end of lap {LAPS} (or of the session)",
         f"  {'threshold':>9}{'ARR':>8}{'correct':>9}{'incorrect':>11}",
     ]
-    for each in tuning.tried:
-        mark = "  <- the winner" if each is tuning.winner else ""
-        lines.append(f"  {each.threshold:>9.3f}{each.arr:>8.3f}{each.correct:>9}{each.incorrect:>11}{mark}")
+    for one in tuning.scores:
+        mark = "  <- the winner" if one is tuning.winner else ""
+        lines.append(f"  {one.threshold:>9.3f}{one.arr:>8.3f}{one.correct:>9}{one.incorrect:>11}{mark}")
     verdict = (
         f"templates.threshold={tuning.winner.threshold:g}" if tuning.winner else "no threshold satisfies"
     )
-    return "\n".join([*lines, "", f"{verdict}: {tuning.why}"])
+    return "\n".join([*lines, "", f"{verdict}: {tuning.reason}"])
 
 
-def save(tuning: Tuning, directory: Path) -> list[Path]:
-    """The tuning as a picture and a table in a folder, made where there is none."""
+def save_tuning(tuning: Tuning, directory: Path) -> tuple[Path, Path]:
+    """Writes threshold.png and threshold.csv to a folder, created if missing."""
     directory.mkdir(parents=True, exist_ok=True)
-    picture, table = directory / "tune.png", directory / "tune.csv"
-    threshold, _, correct, incorrect = (np.array(column) for column in zip(*tuning.tried, strict=True))
-    taken = None if tuning.winner is None else tuning.winner.threshold
-    edge, same, other, area = tuning.likeness
-    draw_tuning(edge, same, other, area, threshold, correct, incorrect, taken).savefig(picture)
-    lines = [",".join(Tried._fields), *(",".join(map(repr, each)) for each in tuning.tried)]
+    plot, table = directory / "threshold.png", directory / "threshold.csv"
+    threshold, _, correct, incorrect = (np.array(column) for column in zip(*tuning.scores, strict=True))
+    winner = None if tuning.winner is None else tuning.winner.threshold
+    draw_tuning(*tuning.views, threshold, correct, incorrect, winner).savefig(plot)
+    lines = [",".join(ThresholdScore._fields), *(",".join(map(repr, each)) for each in tuning.scores)]
     table.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return [picture, table]
+    return plot, table
 
 
-def _judged_part(log: Log) -> tuple[Log, int]:
-    """The session up to the end of its third lap, if it has so many, and the steps of the base set."""
-    truth = np.asarray(log.truth)
-    base, ends = base_end(truth), lap_ends(truth)[:LAPS]
-    return first(log, int(ends[-1]) + 1 if len(ends) == LAPS else log.length), base
-
-
-def _tried(task: tuple[RunConfig, Log, int, np.ndarray]) -> list[Tried]:
+def _score_thresholds(task: tuple[RunConfig, Log, int, np.ndarray]) -> list[ThresholdScore]:
     config, log, base, thresholds = task
     exm = config.score.experience_metric.model_copy(update={"base": base, "mode": "strict", "log": "step"})
-    batch = classics(config, log, thresholds)
+    batch = sweep_thresholds(config, log, thresholds)
     results = [experience_metric(place, np.asarray(log.truth), exm) for place in batch.place]
     return [
-        Tried(float(threshold), r.arr, r.correct, r.relocalisations - r.correct)
+        ThresholdScore(float(threshold), r.arr, r.correct, r.relocalisations - r.correct)
         for threshold, r in zip(thresholds, results, strict=True)
     ]
 
 
-def _ambiguity(likeness: Likeness) -> str:
-    """Why a threshold cannot do: what share of different places look more alike than half the same ones."""
-    half = _quantile(likeness.edge, likeness.same, 0.5)
-    within = np.interp(half, likeness.edge, np.concatenate([[0], np.cumsum(likeness.other)]))
-    return (
-        f"A threshold of {half:.3f}, which half of the views of one place pass, lets pass "
-        f"{within / likeness.other.sum():.1%} of the views of different places (AUC {likeness.auc:.3f})"
-    )
-
-
 def _quantile(edge: np.ndarray, count: np.ndarray, share: float) -> float:
     return float(np.interp(share * count.sum(), np.concatenate([[0], np.cumsum(count)]), edge))
-
-
-def _spread(name: str, edge: np.ndarray, count: np.ndarray) -> str:
-    cells = "".join(f"{_quantile(edge, count, share):>8.3f}" for share in (0.05, 0.5, 0.95))
-    return f"  {name:<18}{cells}{count.sum():>10}"

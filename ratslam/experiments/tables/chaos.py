@@ -1,18 +1,14 @@
-"""How two runs of the pose cells part that differ by next to nothing.
+"""The chaos table: how fast two runs of the pose cells separate that differ by almost nothing.
 
-    python -m ratslam.experiments.tables.chaos [--steps 100000] [--walks 3] [--pairs one-cell ...]
-    [--motions drive]
-
-Each pair of runs is given the same motion and no views: `random`, half a cell and half a heading cell a step
-along each axis, or `drive`, a cell ahead and half a heading cell of turns. Printed is the largest difference
-of their decoded poses along any axis up to so many steps, cells, the short way round the torus (x and y are
-never farther apart than 10.5, headings than 18): the median over walks, and the largest.
+Both runs of a pair get the same motion and no views: `random`, half a cell and half a heading cell per step
+along each axis, or `drive`, one cell ahead and half a heading cell of turn. The table gives the largest
+difference of their decoded poses along any axis within so many steps, in cells, the short way round the torus
+(at most 10.5 in x and y and 18 in heading): median and largest over the walks.
 """
 
 from __future__ import annotations
 
-import argparse
-import time
+from collections.abc import Iterator, Sequence
 from functools import partial
 from itertools import product
 from typing import Any, NamedTuple
@@ -26,22 +22,23 @@ from ratslam.attractor import adaptive_window, pose_cells
 from ratslam.attractor.config import PoseCellConfig, rings, units
 from ratslam.attractor.pose_cells import PoseCells
 from ratslam.attractor.window import around
+from ratslam.experiments.tables.markdown import markdown_header, markdown_row
 from tactile.base.random_streams import stream
 from tactile.base.types import Odometry
 
 MARKS = 100, 1_000, 10_000, 20_000, 100_000
-"""Steps after which the difference is told."""
+"""Steps after which the difference is printed."""
 SETTLING = 50
-"""Steps at rest before anything is changed."""
+"""Steps at rest before the runs differ."""
 NUDGE = 1e-13
-"""What one cell is given, of an activity that sums to 1."""
+"""Activity added to one cell; all activity sums to 1."""
 MOTIONS = {"random": ((0.0, 0.0, 0.0), (0.5, 0.5, 0.5)), "drive": ((1.0, 0.0, 0.0), (0.0, 0.0, 0.5))}
-"""Mean and standard deviation of normal motion along each axis, cells a step."""
+"""Mean and standard deviation of the normally distributed motion along each axis, cells per step."""
 
 
-class Kind(NamedTuple):
-    """One run: its precision, its engine, whether what the packet lags behind is fed back, and what is added
-    to its strongest cell before it sets out."""
+class Variant(NamedTuple):
+    """One run: precision, engine, whether the lag of the packet is fed back, and the activity added to the
+    strongest cell before the first step."""
 
     dtype: str = "float64"
     engine: str = "window"
@@ -50,24 +47,27 @@ class Kind(NamedTuple):
 
 
 PAIRS = {
-    "one-cell": (Kind(), Kind(nudge=NUDGE)),
-    "one-cell, open loop": (Kind(fed_back=False), Kind(fed_back=False, nudge=NUDGE)),
-    "window, dense": (Kind(), Kind(engine="dense")),
-    "float64, float32": (Kind(), Kind("float32")),
+    "one-cell": (Variant(), Variant(nudge=NUDGE)),
+    "one-cell, open loop": (Variant(fed_back=False), Variant(fed_back=False, nudge=NUDGE)),
+    "window, dense": (Variant(), Variant(engine="dense")),
+    "float64, float32": (Variant(), Variant("float32")),
 }
 
 
-def parted(one: Kind, other: Kind, motion: np.ndarray) -> np.ndarray:
-    """[T] largest difference of two runs' decoded poses along any axis, after each step of motion [T, 3], in
-    cells as all is."""
+def separation(one: Variant, other: Variant, motion: np.ndarray) -> np.ndarray:
+    """[T] largest difference between the decoded poses of two runs along any axis, cells.
+
+    Args:
+        motion: [T, 3] cells per step.
+    """
     ring = rings(PoseCellConfig(), np.dtype(float))
-    return np.abs(around(decoded(one, motion) - decoded(other, motion), ring)).max(axis=1)
+    return np.abs(around(decoded_poses(one, motion) - decoded_poses(other, motion), ring)).max(axis=1)
 
 
-def decoded(kind: Kind, motion: np.ndarray) -> np.ndarray:
+def decoded_poses(kind: Variant, motion: np.ndarray) -> np.ndarray:
     """[T, 3] poses decoded after each step of motion [T, 3], all in cells."""
     config = PoseCellConfig.model_validate({"engine": kind.engine})
-    if not kind.fed_back:  # the lag is measured once the packet has settled: never
+    if not kind.fed_back:  # the lag is measured after settling, so never
         config = config.model_copy(update={"settle_steps": 2**31 - 1})
     dtype = np.dtype(kind.dtype)
     start = pose_cells.start(config, dtype)
@@ -102,28 +102,22 @@ def _walk(config: PoseCellConfig, cells: PoseCells, motion: Any) -> tuple[PoseCe
 
 
 def walk(number: int, steps: int, motion: str = "random") -> np.ndarray:
-    """[T, 3] motion, cells."""
+    """[T, 3] motion of a numbered walk, cells per step."""
     mean, deviation = MOTIONS[motion]
     return stream(number, "tests.chaos").normal(mean, deviation, (steps, 3))
 
 
-def main() -> None:
+def chaos_table(
+    pairs: Sequence[str] = tuple(PAIRS),
+    motions: Sequence[str] = tuple(MOTIONS),
+    steps: int = MARKS[-1],
+    walks: int = 3,
+) -> Iterator[str]:
+    """The lines of the table, each as soon as its walks are done."""
     jax.config.update("jax_enable_x64", True)
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--steps", type=int, default=MARKS[-1])
-    parser.add_argument("--walks", type=int, default=3)
-    parser.add_argument("--pairs", nargs="*", choices=PAIRS, default=list(PAIRS))
-    parser.add_argument("--motions", nargs="*", choices=MOTIONS, default=list(MOTIONS))
-    given = parser.parse_args()
-    marks = [mark for mark in MARKS if mark <= given.steps]
-    print(f"{'steps':30s}" + "".join(f"{mark:>20d}" for mark in marks), flush=True)
-    for motion, name in product(given.motions, given.pairs):
-        began = time.perf_counter()
-        gaps = np.array([parted(*PAIRS[name], walk(k, marks[-1], motion)) for k in range(given.walks)])
-        most = np.array([gaps[:, :mark].max(axis=1) for mark in marks])
-        told = "".join(f"{np.median(row):>10.1e} {row.max():>9.1e}" for row in most)
-        print(f"{motion:8s}{name:22s}{told}   ({time.perf_counter() - began:.0f} s)", flush=True)
-
-
-if __name__ == "__main__":
-    main()
+    marks = [mark for mark in MARKS if mark <= steps]
+    yield markdown_header(("motion", "pair", *(f"{mark} steps" for mark in marks)))
+    for motion, name in product(motions, pairs):
+        gaps = np.array([separation(*PAIRS[name], walk(k, marks[-1], motion)) for k in range(walks)])
+        most = [gaps[:, :mark].max(axis=1) for mark in marks]
+        yield markdown_row((motion, name, *(f"{np.median(row):.1e} ({row.max():.1e})" for row in most)))

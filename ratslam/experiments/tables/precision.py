@@ -1,28 +1,32 @@
-"""What float32 costs: the same whisker sessions in both precisions, seed by seed.
+"""The precision table: the same whisker sessions in float64 and float32, seed by seed.
 
-    python -m ratslam.experiments.tables.precision [--seeds 20] [--backends recall classic] [--workers N]
+A seed is a maze never used for tuning, a route through it and its odometry; all arms get the same whisks. The
+arm `control` is float64 with odometry changed by one part in ten million, as rounding to float32 changes it:
+the effect of any change of rounding.
 
-A seed is a maze never used for tuning, a route through it and its odometry; every arm sees the same whisks.
-Beside float32 runs a control: float64 whose odometry is off by one part in ten million, as it is when rounded
-to float32. What the control does to a figure is what any change of rounding does.
-
-Printed are medians and spread over seeds, the mean difference to float64 with its 95 % interval (Student's),
-the largest difference of a seed, the median difference with its 99 % interval (order statistics: it assumes
-nothing), and the verdict: an arm is accepted where that interval lies within 5 % of the spread over seeds for
-every figure. An arm whose median differed by more in any figure would be accepted at most once in 200 tables.
+The table gives medians and the spread over seeds, the mean difference from float64 with its 95 % interval
+(Student's t), the largest difference of a seed, and the median difference with its 99 % interval (order
+statistics, without assumptions on the distribution). An arm is accepted if that interval lies within 5 % of
+the spread over seeds for all figures; an arm whose median differs by more in one figure is accepted at most
+once in 200 tables.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from scipy import stats
 
+from evaluation.metrics.trajectory import ate
+from ratslam.config.run_config import RunConfig
+from ratslam.experiments.studies.executor import run_tasks
+from ratslam.experiments.tables.markdown import markdown_header, markdown_row
+from ratslam.experiments.trials.touch_trial import collect_session, run_session, touch_metrics
 from tactile.base.random_streams import stream
 
 FIRST_SEED = 9200
@@ -37,50 +41,58 @@ BACKENDS: dict[str, dict[str, Any]] = {
         "experience": {"solver": {"name": "relaxation"}},
     },
 }
-"""Ours, and RatSLAM as published (as in `ratslam.experiments.salman2016`)."""
+"""The recall filter, and RatSLAM as published (as in `ratslam.experiments.salman2016`)."""
 SESSION: dict[str, Any] = {
     "path": {"circuits": "CCAAC"},
     "motion": {"jitter": {"position": 0.005, "yaw_deg": 1.5, "speed": 0.05}},
 }
 ROUNDING = 1e-7
+"""Relative change of the odometry in the control arm."""
 RESERVE = 1024
-"""Rows of memory: one kernel for all seeds."""
+"""Memory rows reserved, so that all seeds share one kernel."""
 MARGIN = 0.05
-"""Median difference that does not matter, in standard deviations over seeds."""
+"""Largest acceptable median difference, in standard deviations over seeds."""
 LEVEL = 0.99
-"""Of the intervals of medians. All figures must pass, so none need be stricter for there being many."""
+"""Confidence level of the intervals of medians. All figures must pass, so no correction for their number."""
 
 
-class Figures(NamedTuple):
-    """Of one run. em: Energy Metric over all pairs, m2 + rad2. arr, arcr: Experience Metric, strict. ate: m.
-    closures: how many. alike: share of steps at which the place is that of float64."""
+class ArmFigures(NamedTuple):
+    """The figures of one run.
+
+    Attributes:
+        em: Energy Metric over all pairs, m^2 + rad^2. arr, arcr: strict Experience Metric. ate: m.
+        closures: count. same_place: share of steps with the same current place as in float64.
+    """
 
     em: float
     arr: float
     arcr: float
     ate: float
     closures: float
-    alike: float
+    same_place: float
 
 
-JUDGED = Figures._fields[:-1]
-"""What the verdict is on."""
+JUDGED = ArmFigures._fields[:-1]
+"""Figures that must pass."""
+COLUMNS = (
+    "arm", "figure", "float64", "arm's", "spread", "mean difference", "worst", "median difference", "equal"
+)  # fmt: skip
 
 
-class Task(NamedTuple):
-    """All arms of one backend and seed."""
+class ArmsTask(NamedTuple):
+    """The sessions of all arms of one backend and seed."""
 
     backend: str
     seed: int
 
 
 class Difference(NamedTuple):
-    """An arm against float64 in one figure, over N seeds that have it.
+    """The difference of an arm from float64 in one figure, over the seeds where both are defined.
 
     Attributes:
-        mean, half: of the paired differences, and half of its 95 % interval. worst: the largest, either way.
-        median, low, high: of the differences, and its interval. equal: share of seeds without any. spread:
-            of float64 over seeds.
+        mean, half: mean paired difference and half of its 95 % interval. worst: the largest difference of
+            either sign. median, low, high: median difference and its interval. equal: share of seeds without
+            a difference. spread: standard deviation of float64 over seeds.
     """
 
     mean: float
@@ -93,48 +105,42 @@ class Difference(NamedTuple):
     spread: float
 
 
-def sessions(task: Task) -> dict[str, Figures]:
+def run_arms(task: ArmsTask) -> dict[str, ArmFigures]:
     """The figures of each arm."""
-    import jax
-
     jax.config.update("jax_enable_x64", True)
-    from evaluation.metrics.trajectory import ate
-    from ratslam.config.run_config import RunConfig
-    from ratslam.experiments.trials.touch_trial import figures, play, session_log
-
     simulation = SESSION | {"seed": task.seed, "maze": {"seed": task.seed}}
     given = {"simulation": simulation, "session": {"reserve": RESERVE}} | BACKENDS[task.backend]
-    config, log = session_log(RunConfig.model_validate(given))
+    config, log = collect_session(RunConfig.model_validate(given))
     off = 1 + ROUNDING * stream(task.seed, "tests.precision").uniform(-1, 1, (log.length, 3))
     rounded = replace(log, motion=np.column_stack([log.motion[:, :3] * off, log.motion[:, 3]]))
-    told: dict[str, Figures] = {}
+    figures: dict[str, ArmFigures] = {}
     places = np.zeros(0)
     for arm in ARMS:
         single = "float32" if arm == "float32" else "float64"
         settings = config.session.model_copy(update={"precision": single})
-        played = play(config.model_copy(update={"session": settings}), rounded if arm == "control" else log)
-        found = figures(played)
+        played = run_session(
+            config.model_copy(update={"session": settings}), rounded if arm == "control" else log
+        )
+        found = touch_metrics(played)
         places = played.place if arm == ARMS[0] else places
         error, alike = ate(played.trajectory, played.truth), float((played.place == places).mean())
-        told[arm] = Figures(found.em, found.arr, found.arcr, error, found.closures, alike)
-    return told
+        figures[arm] = ArmFigures(found.em, found.arr, found.arcr, error, found.closures, alike)
+    return figures
 
 
-def measured(seeds: Sequence[int], backend: str, workers: int = 1) -> dict[str, np.ndarray]:
-    """Of each arm [seeds, figures]."""
-    from ratslam.experiments.trials.process_pool import shared_out
-
-    rows = list(shared_out(sessions, [Task(backend, seed) for seed in seeds], workers))
+def measure_arms(seeds: Sequence[int], backend: str, workers: int = 1) -> dict[str, np.ndarray]:
+    """[seeds, figures] of each arm."""
+    rows = list(run_tasks(run_arms, [ArmsTask(backend, seed) for seed in seeds], workers=workers))
     return {arm: np.array([row[arm] for row in rows], float) for arm in ARMS}
 
 
-def judged(arm: np.ndarray, against: np.ndarray) -> list[Difference]:
-    """Of every figure that is judged, from [seeds, figures] of both."""
+def differences(arm: np.ndarray, against: np.ndarray) -> list[Difference]:
+    """The difference in each figure of `JUDGED`, from [seeds, figures] of both arms."""
     return [difference(arm[:, k], against[:, k]) for k in range(len(JUDGED))]
 
 
 def difference(values: np.ndarray, against: np.ndarray) -> Difference:
-    """Of paired values [N]."""
+    """The difference of paired values [N]."""
     both = np.isfinite(values) & np.isfinite(against)
     apart = values[both] - against[both]
     if len(apart) < 2:
@@ -154,10 +160,10 @@ def difference(values: np.ndarray, against: np.ndarray) -> Difference:
 
 
 def median_interval(values: np.ndarray, level: float) -> tuple[float, float]:
-    """Holds the median of what the values [N] were drawn from, at least so often, whatever that is.
+    """A confidence interval of the median of a distribution from samples [N], for any distribution.
 
-    From order statistics: the k-th smallest is above it only if fewer than k values are below. Infinite
-    where so few values tell nothing at that level.
+    From order statistics: the k-th smallest sample is above the median only if fewer than k samples are below
+    it. Infinite where the samples are too few for the level.
     """
     values = np.sort(values)
     outside = int(stats.binom.ppf((1 - level) / 2, len(values), 0.5))  # P(B <= outside) >= (1 - level) / 2
@@ -166,46 +172,47 @@ def median_interval(values: np.ndarray, level: float) -> tuple[float, float]:
     return float(values[outside - 1]), float(values[len(values) - outside])
 
 
-def accepted(differences: Sequence[Difference]) -> bool:
-    """Whether every figure's median is shown to differ by no more than the margin."""
-    return all(max(-found.low, found.high) <= MARGIN * found.spread for found in differences)
+def is_accepted(found: Sequence[Difference]) -> bool:
+    """Whether the median interval of each figure lies within the margin."""
+    return all(max(-d.low, d.high) <= MARGIN * d.spread for d in found)
 
 
-def lines(backend: str, found: dict[str, np.ndarray]) -> Iterator[str]:
-    """The table of a backend."""
+def precision_table(
+    backends: Sequence[str], seeds: int = SEEDS, workers: int = 1, output: Path | None = None
+) -> Iterator[str]:
+    """The lines of the tables, one table for each backend as soon as it is done.
+
+    Args:
+        output: folder for BACKEND.npz with all figures.
+    """
+    for backend in backends:
+        found = measure_arms(range(FIRST_SEED, FIRST_SEED + seeds), backend, workers)
+        if output is not None:
+            output.mkdir(parents=True, exist_ok=True)
+            np.savez(output / f"{backend}.npz", allow_pickle=True, **found)
+        yield from render_arms(backend, found)
+
+
+def render_arms(backend: str, found: dict[str, np.ndarray]) -> Iterator[str]:
+    """The table of a backend, and the verdict on each arm."""
     before = found[ARMS[0]]
-    heads = f"{'float64':>9s}{'spread':>8s}{'arm':>10s}{'mean difference':>22s}{'worst':>10s}"
-    yield f"{backend}, {len(before)} seeds".ljust(29) + heads + f"{'median, its interval':>33s}{'equal':>7s}"
+    verdicts = []
+    yield f"{backend}, {len(before)} seeds\n\n{markdown_header(COLUMNS)}"
     for arm in ARMS[1:]:
-        told = judged(found[arm], before)
-        for k, (name, d) in enumerate(zip(JUDGED, told, strict=True)):
-            yield (
-                f"  {arm:8s} {name:18s}{np.nanmedian(before[:, k]):>9.4f}{d.spread:>8.3f}"
-                f"{np.nanmedian(found[arm][:, k]):>10.4f} {d.mean:>+10.1e} +- {d.half:>7.1e}{d.worst:>+10.1e}"
-                f"   {d.median:>+9.1e} [{d.low:>+8.1e}, {d.high:>+8.1e}]{d.equal:>7.2f}"
-            )
-        most = max(max(abs(d.low), abs(d.high)) / d.spread if d.spread else 0.0 for d in told)
+        compared = differences(found[arm], before)
+        for k, (name, d) in enumerate(zip(JUDGED, compared, strict=True)):
+            medians = (f"{np.nanmedian(values[:, k]):.4f}" for values in (before, found[arm]))
+            yield markdown_row(
+                (
+                    arm, name, *medians, f"{d.spread:.3f}", f"{d.mean:+.1e} +- {d.half:.1e}",
+                    f"{d.worst:+.1e}", f"{d.median:+.1e} [{d.low:+.1e}, {d.high:+.1e}]", f"{d.equal:.2f}",
+                )
+            )  # fmt: skip
+        most = max(max(abs(d.low), abs(d.high)) / d.spread if d.spread else 0.0 for d in compared)
         alike = found[arm][:, -1]
-        verdict = "accepted" if accepted(told) else "not accepted"
-        yield (
-            f"  {arm}: {verdict}: no median difference larger than {most:.1g} of the spread over seeds; "
-            f"steps at the same place: mean {alike.mean():.3f}, least {alike.min():.3f}"
+        verdicts.append(
+            f"{arm}: {'accepted' if is_accepted(compared) else 'not accepted'}: no median difference above "
+            f"{most:.1g} of the spread over seeds; steps at the same place: mean {alike.mean():.3f}, "
+            f"least {alike.min():.3f}"
         )
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seeds", type=int, default=SEEDS)
-    parser.add_argument("--backends", nargs="*", choices=BACKENDS, default=list(BACKENDS))
-    parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("-o", "--output", type=Path, help="a folder for NAME.npz of all figures")
-    given = parser.parse_args()
-    for backend in given.backends:
-        found = measured(range(FIRST_SEED, FIRST_SEED + given.seeds), backend, given.workers)
-        if given.output is not None:
-            np.savez(given.output / f"{backend}.npz", allow_pickle=True, **found)
-        print("\n".join(lines(backend, found)), flush=True)
-
-
-if __name__ == "__main__":
-    main()
+    yield "\n".join(["", *verdicts, ""])

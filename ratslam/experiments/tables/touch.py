@@ -1,232 +1,263 @@
-"""The table of touch: every condition on mazes never used for tuning, one setting for all.
+"""The touch table: whisker sessions in mazes never used for tuning, with one setting for all conditions.
 
-    python -m ratslam.experiments.tables.touch [--mazes 6] [--seeds 2] [--rows main clean ...] [--workers N]
-
-Each row is a condition, each run a maze and a seed. Figures are medians over the runs; a success is an
-Energy Metric (all pairs, m2 + rad2) under 0.25.
+Each row is a condition; each session of it has its own maze and seed. Values are medians over the sessions; a
+success is an Energy Metric (all pairs, m^2 + rad^2) below `SUCCESS`.
 """
 
 from __future__ import annotations
 
-import argparse
-import multiprocessing
-import os
-from concurrent.futures import ProcessPoolExecutor
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from evaluation.metrics.energy_metric import energy_all_pairs
+from evaluation.metrics.experience_metric import ExmConfig, ExperienceMetric, experience_metric
+from ratslam.config.run_config import RunConfig
+from ratslam.experiments.studies.executor import run_tasks
+from ratslam.experiments.tables.markdown import markdown_header, markdown_row
+from ratslam.experiments.trials.touch_trial import (
+    FALSE_CLOSURE_DISTANCE,
+    SessionResult,
+    closure_errors,
+    run_session,
+)
+from ratslam.pipeline.run import open_source
+from robot.sources.in_memory import Log, collected
+from robot.touch_source import sensing
+from tactile.base.errors import InputError
+
 FIRST_MAZE = 9000
+SUCCESS = 0.25
+CHANGE = 0.3
+"""Share of a session before the change of mazes."""
+RECOVERY_LIMIT = 45
+"""Whisks within which a place should be recognised after a kidnap."""
+REVISIT_GAP, REVISIT_DISTANCE = 60, 0.05
+"""A revisit is a step within this distance (m) of the position more than this many steps before."""
+
 MAIN: dict[str, Any] = {"motion": {"jitter": {"position": 0.005, "yaw_deg": 1.5, "speed": 0.05}}}
 ROUGH: dict[str, Any] = {"motion": {"jitter": {"position": 0.010, "yaw_deg": 3.0, "speed": 0.10}}}
+MAX_ANGLE = {"image": {"transform": "max_angle"}}
+OPEN_LOOP = {"whisking": {"mode": "open"}}
 
 
-def rings(*radii: float) -> dict[str, Any]:
-    """The head with rings of these base radii."""
+class Condition(NamedTuple):
+    """A row: its label in the table, and the settings `simulation` and `touch` of its sessions."""
+
+    label: str
+    simulation: dict[str, Any] = {}  # noqa: RUF012
+    touch: dict[str, Any] = {}  # noqa: RUF012
+
+
+def _head(*radii: float) -> dict[str, Any]:
+    """The head with these base radii of its rings, m."""
     lengths, heights = (0.05, 0.11, 0.16), (0.082, 0.12, 0.165)
     parts = zip(lengths, radii, heights, strict=True)
     return {"rings": [{"length": a, "radius": b, "height": c} for a, b, c in parts]}
 
 
-ROWS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
-    "main": (MAIN, {}),
-    "clean": ({}, {}),
-    "rough": (ROUGH, {}),
-    "rough, 3 % faults": (ROUGH | {"mechanics": {"missed": 0.03, "spurious": 0.03}}, {}),
-    "open, max_angle": ({"whisking": {"mode": "open"}}, {"image": {"transform": "max_angle"}}),
-    "open, contact_angle": ({"whisking": {"mode": "open"}}, {}),
-    "RCP, max_angle": ({}, {"image": {"transform": "max_angle"}}),
-    "white": ({"odometry": {"noise": "white"}}, {}),
-    "telescoping": ({"odometry": {"noise": "telescoping"}}, {}),
-    "exploration": ({"path": {"explore": 1500}}, {}),
-    "exploration, 3000": ({"path": {"explore": 3000}}, {}),
-    "5 x 5": ({"maze": {"columns": 5, "rows": 5, "loop": 12}}, {}),
-    "12 x 8": ({"maze": {"columns": 12, "rows": 8, "loop": 32}}, {}),
-    "radii + 20 %": ({}, {"head": rings(0.054, 0.078, 0.096)}),
-    "radii - 20 %": ({}, {"head": rings(0.036, 0.052, 0.064)}),
-    "rest 90": ({}, {"head": {"rest_deg": 90.0}}),
-    "rest 60": ({}, {"head": {"rest_deg": 60.0}}),
-    "15 mm/s": ({"motion": {"speed": 0.015}}, {}),
-    "1 dead": ({}, {"head": {"dead": [10]}}),
-    "3 dead": ({}, {"head": {"dead": [7, 10, 14]}}),
-    "6 dead": ({}, {"head": {"dead": [1, 6, 7, 10, 14, 17]}}),
-    "2 Hz": ({"whisking": {"rate": 2.0}}, {}),
-    "noise 1e-3": ({"mechanics": {"noise": 1e-3}}, {}),
-    "noise 5e-3": ({"mechanics": {"noise": 5e-3}}, {}),
-    "noise 1e-2": ({"mechanics": {"noise": 1e-2}}, {}),
-    "radial channel": ({}, {"image": {"radial": True}}),
-    "soft servo, open, max": (
-        {"whisking": {"mode": "open"}, "mechanics": {"servo": 0.3}},
-        {"image": {"transform": "max_angle"}},
+ROWS = {
+    "main": Condition("main: ten circuits, 5 mm / 1.5 deg / 5 %", MAIN),
+    "clean": Condition("clean: 2 mm / 0.5 deg"),
+    "rough": Condition("rough: 10 mm / 3 deg / 10 %", ROUGH),
+    "rough, 3 % faults": Condition(
+        "rough, 3 % contacts missed, 3 % spurious", ROUGH | {"mechanics": {"missed": 0.03, "spurious": 0.03}}
     ),
-    "soft servo, RCP, max": ({"mechanics": {"servo": 0.3}}, {"image": {"transform": "max_angle"}}),
-    "kidnaps": ({"kidnaps": {"count": 8, "ahead": 45.0}}, {}),
-    "control: shuffled": (MAIN, {}),
-    "control: no image": (MAIN, {}),
-    "control: other maze": (MAIN | {"later_maze": 0.3}, {}),
+    "open, max_angle": Condition("open loop, max_angle", OPEN_LOOP, MAX_ANGLE),
+    "white": Condition("white odometry noise", {"odometry": {"noise": "white"}}),
+    "telescoping": Condition("telescoping noise", {"odometry": {"noise": "telescoping"}}),
+    "exploration": Condition("free exploration, 1500 whisks", {"path": {"explore": 1500}}),
+    "exploration, 3000": Condition("free exploration, 3000 whisks", {"path": {"explore": 3000}}),
+    "5 x 5": Condition("5 x 5 cells", {"maze": {"columns": 5, "rows": 5, "loop": 12}}),
+    "12 x 8": Condition("12 x 8 cells", {"maze": {"columns": 12, "rows": 8, "loop": 32}}),
+    "3 dead": Condition("3 dead whiskers", {}, {"head": {"dead": [7, 10, 14]}}),
+    "15 mm/s": Condition("15 mm/s", {"motion": {"speed": 0.015}}),
+    "radii + 20 %": Condition("base radii + 20 %", {}, {"head": _head(0.054, 0.078, 0.096)}),
+    "radii - 20 %": Condition("base radii - 20 %", {}, {"head": _head(0.036, 0.052, 0.064)}),
+    "rest 90": Condition("rest angle + 20 %", {}, {"head": {"rest_deg": 90.0}}),
+    "rest 60": Condition("rest angle - 20 %", {}, {"head": {"rest_deg": 60.0}}),
+    "radial channel": Condition("with the radial channel", {}, {"image": {"radial": True}}),
+    "2 Hz": Condition("2 Hz whisking", {"whisking": {"rate": 2.0}}),
+    "RCP, max_angle": Condition("RCP, max_angle", {}, MAX_ANGLE),
+    "1 dead": Condition("1 dead whisker", {}, {"head": {"dead": [10]}}),
+    "6 dead": Condition("6 dead whiskers", {}, {"head": {"dead": [1, 6, 7, 10, 14, 17]}}),
+    "noise 1e-3": Condition("sensor noise 1e-3 rad", {"mechanics": {"noise": 1e-3}}),
+    "noise 1e-2": Condition("1e-2 rad", {"mechanics": {"noise": 1e-2}}),
+    "kidnaps": Condition("8 kidnaps of 45 s", {"kidnaps": {"count": 8, "ahead": 45.0}}),
+    "control: shuffled": Condition("control: shuffled images", MAIN),
+    "control: no image": Condition("control: no images", MAIN),
+    "control: other maze": Condition("control: later laps in another maze", MAIN | {"later_maze": CHANGE}),
+    "open, contact_angle": Condition("open loop, contact_angle", OPEN_LOOP),
+    "noise 5e-3": Condition("sensor noise 5e-3 rad", {"mechanics": {"noise": 5e-3}}),
+    "soft servo, open, max": Condition(
+        "soft servo, open loop, max_angle", OPEN_LOOP | {"mechanics": {"servo": 0.3}}, MAX_ANGLE
+    ),
+    "soft servo, RCP, max": Condition("soft servo, RCP, max_angle", {"mechanics": {"servo": 0.3}}, MAX_ANGLE),
 }
+DEFAULT_ROWS = tuple(ROWS)[:-4]
+"""The rows printed if none are chosen."""
+COLUMNS = (
+    "condition", "EM (worst)", "success", "through experiences", "odometry", "ARR",
+    "ARCR strict (worst), chain-free", "revisits closed", "false / closures",
+)  # fmt: skip
 
 
-class Figures(NamedTuple):
-    """Of one run. energy: of the frame graph; experiences: read through the experiences; odometry: of dead
-    reckoning. arr, arcr (strict), chain_free: Experience Metric. recall: share of revisits that were closed.
-    across: closures of the last seven tenths of a session with the first three. recovery: whisks from each
-    jump to the first true closure."""
+class TouchTask(NamedTuple):
+    """One session of a row."""
 
-    energy: float
-    experiences: float
-    odometry: float
+    row: str
+    maze: int
+    seed: int
+    backend: str = "recall"
+
+
+class SessionFigures(NamedTuple):
+    """The figures of one session; NaN where a figure is not defined.
+
+    Attributes:
+        em, em_experiences, em_odometry: Energy Metric of the map, of the map read through the experiences and
+            of dead reckoning. arr, arcr, chain_free: strict Experience Metric. revisits_closed: share of the
+            revisits with a true closure. across: closures between the parts before and after `CHANGE`.
+        recovery: whisks from each kidnap to the first true closure.
+    """
+
+    em: float
+    em_experiences: float
+    em_odometry: float
     arr: float
     arcr: float
     chain_free: float
     closures: int
-    false: int
-    recall: float
+    false_closures: int
+    revisits_closed: float
     across: int
     recovery: tuple[int, ...]
 
 
-def run(row: str, maze: int, seed: int, backend: str = "recall") -> Figures:
-    """One session of a row."""
-    from dataclasses import replace
+def touch_table(
+    rows: Sequence[str], mazes: int = 6, seeds: int = 2, workers: int = 0, backend: str = "recall"
+) -> Iterator[str]:
+    """The lines of the table, each as soon as its sessions are done."""
+    tasks = [
+        TouchTask(row, FIRST_MAZE + maze, 100 * maze + seed, backend)
+        for row in rows
+        for maze in range(mazes)
+        for seed in range(seeds)
+    ]
+    results = run_tasks(measure_session, tasks, workers=workers)
+    notes: list[str] = []
+    yield markdown_header(COLUMNS)
+    for row in rows:
+        found = [next(results) for _ in range(mazes * seeds)]
+        yield markdown_row([ROWS[row].label, *_cells(found)])
+        notes += _notes(row, found)
+    yield from ["", *notes] if notes else []
 
-    import jax
 
-    jax.config.update("jax_enable_x64", True)
-    from evaluation.metrics.energy_metric import energy_all_pairs
-    from evaluation.metrics.experience_metric import ExmConfig, experience_metric
-    from ratslam.config.run_config import RunConfig
-    from ratslam.pipeline.run import open_source
-    from ratslam.pipeline.runner import readings, session_of
-    from robot.sources.in_memory import collected
-    from robot.touch_source import sensing
-    from tactile.base.errors import InputError
-    from tactile.base.se2 import integrate
-
-    simulation, touch = ROWS[row]
-    simulation = simulation | {"seed": seed, "maze": {"seed": maze} | simulation.get("maze", {})}
-    config = RunConfig.model_validate({"simulation": simulation, "touch": touch, "backend": backend})
-    source = open_source(config)
-    carried = np.flatnonzero(source.carried)  # type: ignore[attr-defined]
-    config = config.completed(source)
-    source = sensing(source, config.touch)
-    if row == "control: shuffled":
-        log = collected(source)
-        order = np.random.default_rng(seed).permutation(len(log.views))
-        source = replace(log, views=log.views[order].copy())
-    if row == "control: no image":
-        log = collected(source)
-        source = replace(log, views=np.zeros_like(log.views))
-    rows = list(readings(source))
-    size = 1 << (len(rows) - 1).bit_length()
-    config = config.model_copy(update={"session": config.session.model_copy(update={"reserve": size})})
-    session = session_of(config, source)
-    steps = list(session.replay([reading for _, reading in rows]))
-    truth = np.array([sample.truth for sample, _ in rows])
-    motion = np.array([[o.odometry.dx, o.odometry.dy, o.odometry.dtheta] for _, o in rows])
-
-    def energy(path: np.ndarray) -> float:
-        parts = energy_all_pairs(path, truth)
-        return parts.trans2 + parts.rot2
-
-    place = np.array([int(step.estimate.place) for step in steps])
-    nodes, path = session.map.graph().nodes, session.map.trajectory()
-    read = np.array(
-        [
-            [nodes[p]["x"], nodes[p]["y"], nodes[p]["heading"]] if p >= 0 else path[k]
-            for k, p in enumerate(place)
-        ]
+def measure_session(task: TouchTask) -> SessionFigures:
+    """Runs and measures one session."""
+    log, config, kidnaps = _simulate(task)
+    result = run_session(config, log)
+    truth, errors = result.truth, closure_errors(result)
+    true_closures = result.closures[errors <= FALSE_CLOSURE_DISTANCE]
+    # A step without an experience is read at its own pose.
+    read = result.trajectory.copy()
+    read[result.place >= 0] = result.node[result.place[result.place >= 0]]
+    metric = _experience_metric(result)
+    change = int(CHANGE * log.length)
+    across = (result.closures[:, 0] >= change) & (result.closures[:, 1] < change)
+    return SessionFigures(
+        em=energy_all_pairs(result.trajectory, truth).total,
+        em_experiences=energy_all_pairs(read, truth).total,
+        em_odometry=energy_all_pairs(result.odometry, truth).total,
+        arr=metric.arr,
+        arcr=metric.arcr,
+        chain_free=float((metric.counted & metric.near).sum() / max(metric.counted.sum(), 1)),
+        closures=len(errors),
+        false_closures=len(errors) - len(true_closures),
+        revisits_closed=_revisits_closed(truth, true_closures),
+        across=int(across.sum()),
+        recovery=tuple(_recovery(jump, true_closures, log.length) for jump in kidnaps),
     )
+
+
+def _simulate(task: TouchTask) -> tuple[Log, RunConfig, list[int]]:
+    """The views of a session, its completed configuration, and the steps of its kidnaps."""
+    condition = ROWS[task.row]
+    simulation = condition.simulation | {"seed": task.seed}
+    simulation["maze"] = {"seed": task.maze} | simulation.get("maze", {})
+    given = {"simulation": simulation, "touch": condition.touch, "backend": task.backend}
+    config = RunConfig.model_validate(given)
+    with open_source(config) as source:
+        kidnaps = np.flatnonzero(source.carried).tolist()  # type: ignore[attr-defined]
+        config = config.completed(source)
+        log = collected(sensing(source, config.touch))
+    if task.row == "control: shuffled":
+        order = np.random.default_rng(task.seed).permutation(len(log.views))
+        log = replace(log, views=log.views[order].copy())
+    if task.row == "control: no image":
+        log = replace(log, views=np.zeros_like(log.views))
+    return log, config, kidnaps
+
+
+def _experience_metric(result: SessionResult) -> ExperienceMetric:
     try:
-        metric = experience_metric(place, truth)
-    except InputError:  # an exploration that does not come back to its start: a quarter is the base set
-        metric = experience_metric(place, truth, ExmConfig(base=len(truth) // 4))
-    closures = session.map.closures()
-    apart = np.hypot(*(truth[closures[:, 0]] - truth[closures[:, 1]])[:, :2].T)
-    change = int(0.3 * len(rows))
-    across = (closures[:, 0] >= change) & (closures[:, 1] < change)
-    recovery = []
-    for jump in carried.tolist():
-        after = np.sort(closures[(closures[:, 0] >= jump) & (closures[:, 1] < jump) & (apart <= 0.1), 0])
-        recovery.append(int(after[0] - jump) if len(after) else len(rows))
-    return Figures(
-        energy(path),
-        energy(read),
-        energy(integrate(motion)),
-        metric.arr,
-        metric.arcr,
-        float((metric.counted & metric.near).sum() / max(metric.counted.sum(), 1)),
-        len(closures),
-        int((apart > 0.1).sum()),
-        _recall(truth, closures, apart),
-        int(across.sum()),
-        tuple(recovery),
-    )
+        return experience_metric(result.place, result.truth)
+    except InputError:  # an exploration that never returns to its start: a quarter is the base set
+        return experience_metric(result.place, result.truth, ExmConfig(base=len(result.truth) // 4))
 
 
-def _recall(truth: np.ndarray, closures: np.ndarray, apart: np.ndarray) -> float:
-    """Share of the steps within 5 cm of where the robot was over 60 steps before that a true closure has."""
+def _revisits_closed(truth: np.ndarray, true_closures: np.ndarray) -> float:
+    """Share of the revisits that a true closure has found."""
     closed = np.zeros(len(truth), bool)
-    closed[closures[apart <= 0.1, 0]] = True
+    closed[true_closures[:, 0]] = True
     revisits = [
-        k for k in range(61, len(truth)) if (np.hypot(*(truth[: k - 60, :2] - truth[k, :2]).T) < 0.05).any()
+        k
+        for k in range(REVISIT_GAP + 1, len(truth))
+        if (np.hypot(*(truth[: k - REVISIT_GAP, :2] - truth[k, :2]).T) < REVISIT_DISTANCE).any()
     ]
     return float(closed[revisits].mean()) if revisits else np.nan
 
 
-def line(row: str, runs: list[Figures]) -> str:
-    """A row of the table."""
-
-    def median(name: str) -> float:
-        values = np.array([getattr(figures, name) for figures in runs], float)
-        return float(np.nanmedian(values)) if np.isfinite(values).any() else np.nan
-
-    energy = np.array([figures.energy for figures in runs])
-    closures, false = (sum(getattr(figures, name) for figures in runs) for name in ("closures", "false"))
-    strict = np.array([figures.arcr for figures in runs])
-    worst = np.nanmin(strict) if np.isfinite(strict).any() else np.nan
-    text = (
-        f"{row:22s} {np.median(energy):6.3f} {energy.max():6.2f} {(energy < 0.25).sum():3d}/{len(runs):<3d}"
-        f"{median('experiences'):6.3f} {median('odometry'):6.2f} {median('arr'):6.3f} {median('arcr'):6.3f}"
-        f" {worst:5.2f} {median('chain_free'):6.3f} {median('recall'):6.2f} {false:5d}/{closures:<6d}"
-    )
-    text += f" {sum(figures.across for figures in runs):6d}"
-    recovery = np.array([whisks for figures in runs for whisks in figures.recovery])
-    if len(recovery):
-        text += f" recovery: median {np.median(recovery):.0f}, within 45: {(recovery <= 45).mean():.2f}"
-    return text
+def _recovery(jump: int, true_closures: np.ndarray, steps: int) -> int:
+    """Whisks from a kidnap to the first true closure with a step before it; all of them if there is none."""
+    after = true_closures[(true_closures[:, 0] >= jump) & (true_closures[:, 1] < jump), 0]
+    return int(after.min() - jump) if len(after) else steps
 
 
-HEADER = (
-    f"{'row':22s} {'EM':>6s} {'worst':>6s} {'success':>7s}{'exp.':>6s} {'odom.':>6s} {'ARR':>6s} {'ARCR':>6s}"
-    f" {'worst':>5s} {'free':>6s} {'recall':>6s} {'false/closures':>12s} across"
-)
+def _cells(found: Sequence[SessionFigures]) -> list[str]:
+    def median(name: str, digits: int = 3) -> str:
+        values = np.array([getattr(figures, name) for figures in found], float)
+        return f"{np.nanmedian(values):.{digits}f}" if np.isfinite(values).any() else "-"
 
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--mazes", type=int, default=6)
-    parser.add_argument("--seeds", type=int, default=2)
-    parser.add_argument("--workers", type=int, default=os.cpu_count())
-    parser.add_argument("--backend", default="recall")
-    parser.add_argument("--rows", nargs="*", default=list(ROWS))
-    given = parser.parse_args()
-    tasks = [
-        (row, FIRST_MAZE + maze, 100 * maze + seed, given.backend)
-        for row in given.rows
-        for maze in range(given.mazes)
-        for seed in range(given.seeds)
+    em = np.array([figures.em for figures in found])
+    strict = np.array([figures.arcr for figures in found])
+    worst = np.nanmin(strict) if np.isfinite(strict).any() else math.nan
+    return [
+        f"{np.median(em):.3f} ({em.max():.2f})",
+        f"{(em < SUCCESS).sum()} of {len(found)}",
+        median("em_experiences"),
+        median("em_odometry", 2),
+        median("arr"),
+        f"{median('arcr')} ({worst:.2f}), {median('chain_free')}" if np.isfinite(worst) else "-",
+        median("revisits_closed", 2),
+        f"{sum(figures.false_closures for figures in found)} / {sum(figures.closures for figures in found)}",
     ]
-    print(HEADER, flush=True)
-    per_row = given.mazes * given.seeds
-    runs: list[Figures] = []
-    with ProcessPoolExecutor(given.workers, multiprocessing.get_context("spawn")) as pool:
-        for figures, task in zip(pool.map(run, *zip(*tasks, strict=True)), tasks, strict=True):
-            runs.append(figures)
-            if len(runs) == per_row:
-                print(line(task[0], runs), flush=True)
-                runs = []
 
 
-if __name__ == "__main__":
-    main()
+def _notes(row: str, found: Sequence[SessionFigures]) -> list[str]:
+    """What only some rows are for: closures across a change of mazes, recovery after kidnaps."""
+    notes = []
+    if row == "control: other maze":
+        across, closures = sum(one.across for one in found), sum(one.closures for one in found)
+        notes.append(f"{row}: {across} of {closures} closures join the parts before and after the change.")
+    recovery = np.array([whisks for figures in found for whisks in figures.recovery])
+    if len(recovery):
+        notes.append(
+            f"{row}: whisks to the first true closure, median {np.median(recovery):.0f}; "
+            f"within {RECOVERY_LIMIT}: {(recovery <= RECOVERY_LIMIT).mean():.0%}."
+        )
+    return notes

@@ -1,7 +1,7 @@
-"""What is done to a session's views to see how much of a result is owed to them.
+"""Control conditions: the views of a session replaced, its odometry and truth unchanged.
 
-Odometry and truth stay as they are. A map that closes loops on shuffled or blank views does so by its
-odometry alone; ideal views show what the rest can do at best.
+A method that closes loops on shuffled or blank views does so by odometry alone; ideal views give the upper
+bound of the rest of the method.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ import numpy as np
 from robot.sources.in_memory import Log
 from tactile.base.random_streams import stream
 
-Control = Literal["as felt", "shuffled", "blank", "ideal"]
-"""`shuffled`: the views in another order; `blank`: nothing was ever felt; `ideal`: a view for each spot."""
+Control = Literal["none", "shuffled", "blank", "ideal"]
+"""`none`: unchanged; `shuffled`: random order; `blank`: all zero; `ideal`: a distinct view for each spot."""
 SPOT = 0.06
-"""Side of a spot that has an ideal view of its own, m."""
+"""Side length of a spot with an ideal view, m."""
 SECTORS = 8
-"""Headings that each have one there: 45 degrees."""
+"""Heading sectors of a spot, each with its own ideal view."""
 LIT = 0.5
-"""Share of the pixels of an ideal view that are not black."""
+"""Share of non-zero pixels of an ideal view."""
 
 
-def controlled(log: Log, control: Control, seed: int) -> Log:
-    """The session with its views so changed; those never seen stay unseen."""
-    if control == "as felt":
+def apply_control(log: Log, control: Control, seed: int) -> Log:
+    """The session with replaced views; steps without a view stay without one."""
+    if control == "none":
         return log
     views = np.where(log.seen[:, None, None, None], _VIEWS[control](log, seed), log.views)
     return replace(log, digest=f"{log.digest}+{control}+{seed}", views=views)
@@ -44,7 +44,7 @@ def _blank(log: Log, seed: int) -> np.ndarray:
 
 
 def _ideal(log: Log, seed: int) -> np.ndarray:
-    """Views that nothing but the spot and the sector decide."""
+    """Random views, one for each pair of spot and heading sector."""
     assert log.truth is not None
     spot = np.round(log.truth[:, :2] / SPOT)
     sector = np.round(log.truth[:, 2] / (2 * np.pi / SECTORS)) % SECTORS

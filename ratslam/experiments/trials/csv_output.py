@@ -1,4 +1,4 @@
-"""NAME.csv of a reproduction: its rows, kept as soon as they are known, however it ends."""
+"""NAME.csv of a reproduction: rows are written as soon as they are known."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Protocol = TypeVar("Protocol")
 Cells = Sequence[object]
 
 
-def named(name: str, protocols: Mapping[str, Protocol]) -> Protocol:
+def find_protocol(name: str, protocols: Mapping[str, Protocol]) -> Protocol:
     """The protocol of a name.
 
     Raises:
@@ -27,11 +27,11 @@ def named(name: str, protocols: Mapping[str, Protocol]) -> Protocol:
     return protocols[name]
 
 
-def filled(path: Path, heading: Cells, batches: Iterable[Iterable[Cells]]) -> bool:
-    """Writes rows to a new file in a folder that is made where there is none, each batch as it comes.
+def write_rows(path: Path, heading: Cells, batches: Iterable[Iterable[Cells]]) -> bool:
+    """Writes rows to a new file, batch by batch; creates its folder if missing.
 
     Returns:
-        whether the user interrupted; what came before is written then.
+        whether the user interrupted; the earlier batches are in the file then.
 
     Raises:
         InputError: the file exists.
@@ -51,12 +51,12 @@ def filled(path: Path, heading: Cells, batches: Iterable[Iterable[Cells]]) -> bo
     return False
 
 
-def cells(values: Mapping[str, float | None], names: Iterable[str]) -> list[str]:
-    """A cell for each name, every digit of it; empty where there is no such figure, or none but NaN."""
-    told = (values.get(name) for name in names)
-    return ["" if value is None or value != value else repr(value) for value in told]
+def format_cells(values: Mapping[str, float | None], names: Iterable[str]) -> list[str]:
+    """A cell for each name with all digits; empty for a missing value or NaN."""
+    found = (values.get(name) for name in names)
+    return ["" if value is None or value != value else repr(value) for value in found]
 
 
-def progress(name: str, total: int) -> tqdm:
-    """The bar of a reproduction's sessions."""
+def progress_bar(name: str, total: int) -> tqdm:
+    """The progress bar of a reproduction's sessions."""
     return tqdm(total=total, unit="session", desc=name, file=sys.stderr, mininterval=0.5)

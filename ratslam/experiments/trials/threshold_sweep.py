@@ -1,7 +1,7 @@
-"""The classic matcher at many matching thresholds, in one compiled batch over one session.
+"""The classic method at many matching thresholds over one session, in one compiled batch.
 
-Which experience is current is decided in the kernel, so the Experience Metric needs no map; a map is folded
-only for a threshold that one is wanted of.
+The kernel decides which experience is current, so the Experience Metric needs no map; a map is built only for
+a threshold of interest.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from ratslam.backends.config import ClassicBackendConfig, select_settings
 from ratslam.classic.experience_map import ExperienceMap
 from ratslam.config.run_config import RunConfig
 from ratslam.core.types import Estimate
-from ratslam.experiments.trials.touch_trial import Played, room_for, told
+from ratslam.experiments.trials.touch_trial import SessionResult, capacity_for, session_result
 from robot.sources.in_memory import Log
 from robot.touch_source import observation_of
 from tactile.base.types import Array, Observation, stack
 
 
-class Batch(NamedTuple):
-    """A session at B thresholds; T steps.
+class ThresholdBatch(NamedTuple):
+    """A session of T steps at B thresholds.
 
     Attributes:
         threshold: [B]. place: [B, T] current experience. estimate, evidence: of all steps, leading axes
@@ -39,38 +39,33 @@ class Batch(NamedTuple):
     evidence: ClassicEvidence
 
 
-def classics(config: RunConfig, log: Log, thresholds: np.ndarray) -> Batch:
-    """Runs the classic matcher at thresholds [B] over the same views.
+def sweep_thresholds(config: RunConfig, log: Log, thresholds: np.ndarray) -> ThresholdBatch:
+    """Runs the classic method at thresholds [B] over the same views.
 
     Raises:
-        ValueError: the configuration's backend is not `classic`.
+        ValueError: the configuration has another method.
     """
     if config.backend != "classic":
         raise ValueError(f"backend: {config.backend}; a sweep of thresholds needs backend: classic")
     dtype = np.dtype(config.session.precision)
     if dtype == np.float64:
         jax.config.update("jax_enable_x64", True)
-    rows = room_for(log.length)
+    rows = capacity_for(log.length)
     readings = [observation_of(sample) for sample in log]
-    chunk = stack(readings + readings[-1:] * (rows - len(readings)))  # steps beyond the last are cut off
-    found = _batch(
-        select_settings(config, ClassicBackendConfig),
-        log.view_shape,
-        dtype.name,
-        jnp.asarray(thresholds, dtype),
-        chunk,
-    )
+    chunk = stack(readings + readings[-1:] * (rows - len(readings)))  # padding, cut off below
+    method = select_settings(config, ClassicBackendConfig)
+    found = _batch(method, log.view_shape, dtype.name, jnp.asarray(thresholds, dtype), chunk)
     estimate, evidence = jax.tree.map(lambda column: np.asarray(column)[:, : log.length], found)
-    return Batch(np.asarray(thresholds), estimate.place, estimate, evidence)
+    return ThresholdBatch(np.asarray(thresholds), estimate.place, estimate, evidence)
 
 
-def mapped(config: RunConfig, log: Log, batch: Batch, number: int) -> Played:
-    """What the session leads to at one of the thresholds, map and all."""
+def result_at_threshold(config: RunConfig, log: Log, batch: ThresholdBatch, number: int) -> SessionResult:
+    """The result of the session at one of the thresholds, with its map."""
     map = ExperienceMap(config.experience)
     for row, sample in enumerate(log):
         one: Any = jax.tree.map(lambda column, row=row: column[number, row], batch[2:])
         map.update(observation_of(sample), *one)
-    return told(log, batch.place[number], map)
+    return session_result(log, batch.place[number], map)
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
@@ -93,4 +88,4 @@ def _batch(
 
         return lax.scan(step, backend.init(None, rows), chunk)[1]
 
-    return lax.map(one, thresholds)  # in turn: side by side, all branches of the network would be computed
+    return lax.map(one, thresholds)  # sequential; vmap would compute all branches of the network

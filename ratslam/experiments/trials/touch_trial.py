@@ -1,13 +1,12 @@
-"""Trials of whisker sessions: one session through one matcher, and what the paper's metrics say of it.
+"""A whisker session through one backend, held in memory, and the metrics of the paper on the result.
 
-A process makes many sessions of the same kind with one compiled kernel: an engine is put back to its start
-for each.
+A process runs many sessions of one kind with one compiled kernel: a session object is reset to its start for
+each of them.
 """
 
 from __future__ import annotations
 
 from functools import lru_cache
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +17,7 @@ from ratslam.backends.config import select_settings
 from ratslam.backends.registry import BACKENDS, Sensors, build
 from ratslam.config.run_config import RunConfig, SessionConfig
 from ratslam.core.session import Session, capacity_at
-from ratslam.experiments.trials.controls import Control, controlled
+from ratslam.experiments.trials.controls import Control, apply_control
 from ratslam.pipeline.run import open_source
 from robot.sources.in_memory import Log, collected
 from robot.touch_source import observation_of, sensing
@@ -26,33 +25,33 @@ from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.se2 import integrate
 
-FALSE = 0.1
-"""A closure between steps farther apart in truth is false, m (the paper's threshold, III-G)."""
-HOME = 0.09
-"""Half a micromouse cell, m: a robot so near its start is back at it."""
+FALSE_CLOSURE_DISTANCE = 0.1
+"""A closure is false if its steps are farther apart in truth, m (Salman & Pearson 2016, III-G)."""
+HOME_RADIUS = 0.09
+"""A robot this near to its start has returned to it, m: half a micromouse cell."""
 
 
 class Task(NamedTuple):
     """One session to run.
 
     Attributes:
-        config: with whole paths. control: what is done to the views. seed: of the control. laps: how many of
-            the session's; 0: all.
+        config: with absolute paths. control: change of the views. seed: of the control. laps: number of laps
+            to run; 0: all.
     """
 
     config: RunConfig
-    control: Control = "as felt"
+    control: Control = "none"
     seed: int = 0
     laps: int = 0
 
 
-class Played(NamedTuple):
-    """What a session led to; T steps.
+class SessionResult(NamedTuple):
+    """The outcome of a session of T steps.
 
     Attributes:
-        truth, odometry, trajectory: [T, 3] true, reckoned and finally mapped poses. place: [T] current
-            experience. node: [M, 3] poses of the experiences in the final map. closures: [K, 2] the later and
-            the earlier step of each.
+        truth, odometry, trajectory: [T, 3] true, dead-reckoned and final mapped poses. place: [T] current
+            experience, -1 for none. node: [M, 3] poses of the experiences in the final map.
+        closures: [K, 2] later and earlier step of each loop closure.
     """
 
     truth: np.ndarray
@@ -63,76 +62,72 @@ class Played(NamedTuple):
     closures: np.ndarray
 
 
-class TouchTrial(NamedTuple):
-    """A session in figures; NaN where there is none.
+class TouchMetrics(NamedTuple):
+    """Metrics of one session; NaN where a metric is not defined.
 
     Attributes:
-        em: Energy Metric over all pairs of steps of the final map. em_places: the same read through the
-            experiences: a step lies where its experience does. em_odometry: of raw odometry. m^2 + rad^2.
-        arr, arcr: strict Experience Metric. near: share of the re-localisations that are within its
-            thresholds, whatever was wrong before them (ARCR without the chain of validity).
-        relocalisations: number of them. closures: number of them. false: of these, farther apart than `FALSE`
-            in truth. experiences: in the map. steps: of the session.
+        em: Energy Metric over all pairs of steps of the final map, m^2 + rad^2. em_experiences: the same with
+            each step at the pose of its experience. em_odometry: the same of dead reckoning.
+        arr, arcr: strict Experience Metric. arcr_chain_free: share of the re-localisations within its
+            thresholds, whether or not earlier ones were correct.
+        relocalisations, closures: counts. false_closures: closures beyond `FALSE_CLOSURE_DISTANCE`.
+        experiences: in the map. steps: of the session.
     """
 
     em: float
-    em_places: float
+    em_experiences: float
     em_odometry: float
     arr: float
     arcr: float
-    near: float
+    arcr_chain_free: float
     relocalisations: int
     closures: int
-    false: int
+    false_closures: int
     experiences: int
     steps: int
 
 
-def session_log(config: RunConfig) -> tuple[RunConfig, Log]:
-    """The source of a configuration as a whole in memory, and the configuration completed by it.
+def collect_session(config: RunConfig) -> tuple[RunConfig, Log]:
+    """The configuration completed by its source, and the whole source in memory.
 
     Raises:
-        InputError: it cannot be read or simulated, or it has no truth.
+        InputError: the source cannot be read or simulated, or lacks the true pose of a step.
     """
     with open_source(config) as source:
         config = config.completed(source)
         log = collected(sensing(source, config.touch))
     if log.truth is None or not np.isfinite(log.truth).all():
-        raise InputError(log.name, "steps without a true pose", "the truth of every step, to judge by")
+        raise InputError(log.name, "steps without a true pose", "the true pose of every step")
     return config, log
 
 
-def played(task: Task) -> Played:
+def run_task(task: Task) -> SessionResult:
     """Runs one session.
 
     Raises:
         InputError: its source cannot be used.
     """
-    config, log = session_log(task.config)
-    log = controlled(log, task.control, task.seed)
+    config, log = collect_session(task.config)
+    log = apply_control(log, task.control, task.seed)
     if task.laps:
-        log = first(log, int(lap_ends(np.asarray(log.truth))[task.laps - 1]) + 1)
-    return play(config, log)
+        log = truncate_log(log, int(lap_ends(np.asarray(log.truth))[task.laps - 1]) + 1)
+    return run_session(config, log)
 
 
-def play(config: RunConfig, log: Log) -> Played:
-    """Runs a session that is in memory, with a configuration completed by its source."""
-    method = select_settings(config, BACKENDS[config.backend].config_class)
-    reserve = max(room_for(log.length), config.session.reserve)
-    session, start = _compiled(config.backend, method, config.session, log.view_shape, reserve)
-    session.map = session.backend.new_map()
-    session.restore(start)
+def run_session(config: RunConfig, log: Log) -> SessionResult:
+    """Runs a session from memory, with a configuration completed by its source."""
+    session = _session_at_start(config, log.view_shape, capacity_for(log.length))
     steps = list(session.replay(observation_of(sample) for sample in log))
     place = np.array([int(step.estimate.place) for step in steps])
-    return told(log, place, session.map)
+    return session_result(log, place, session.map)
 
 
-def told(log: Log, place: np.ndarray, map: Any) -> Played:
-    """What a map holds after the last step of a log, whose experiences were `place` [T]."""
+def session_result(log: Log, place: np.ndarray, map: Any) -> SessionResult:
+    """The result of a session from its log, the current experience of each step [T] and the final map."""
     nodes = map.graph().nodes
     rows = (nodes[k] for k in range(len(nodes)))
     node = np.array([[row["x"], row["y"], row["heading"]] for row in rows]).reshape(-1, 3)
-    return Played(
+    return SessionResult(
         truth=np.asarray(log.truth),
         odometry=integrate(log.motion[:, :3]),
         trajectory=map.trajectory(),
@@ -142,79 +137,90 @@ def told(log: Log, place: np.ndarray, map: Any) -> Played:
     )
 
 
-def figures(result: Played, exm: ExmConfig | None = None) -> TouchTrial:
-    """Everything measured on one session."""
+def touch_metrics(result: SessionResult, exm: ExmConfig | None = None) -> TouchMetrics:
+    """All metrics of one session."""
     truth, place = result.truth, result.place
     known = place >= 0
-    metric = judged(result, exm)
-    apart = np.hypot(*(truth[result.closures[:, 0]] - truth[result.closures[:, 1]])[:, :2].T)
-    return TouchTrial(
+    metric = experience_metric_if_defined(result, exm)
+    return TouchMetrics(
         em=energy_all_pairs(result.trajectory, truth).total,
-        em_places=energy_all_pairs(result.node[place[known]], truth[known]).total,
+        em_experiences=energy_all_pairs(result.node[place[known]], truth[known]).total,
         em_odometry=energy_all_pairs(result.odometry, truth).total,
         arr=metric.arr if metric else np.nan,
         arcr=metric.arcr if metric else np.nan,
-        near=chain_free(metric) if metric else np.nan,
+        arcr_chain_free=arcr_without_chain(metric) if metric else np.nan,
         relocalisations=metric.relocalisations if metric else 0,
         closures=len(result.closures),
-        false=int((apart > FALSE).sum()),
+        false_closures=int((closure_errors(result) > FALSE_CLOSURE_DISTANCE).sum()),
         experiences=len(result.node),
         steps=len(truth),
     )
 
 
-def judged(result: Played, exm: ExmConfig | None = None) -> ExperienceMetric | None:
-    """The Experience Metric of a session; None where the robot never came back, or knew no place at all."""
+def closure_errors(result: SessionResult) -> np.ndarray:
+    """[K] true distance between the two steps of each closure, m."""
+    later, earlier = result.truth[result.closures[:, 0]], result.truth[result.closures[:, 1]]
+    return np.hypot(*(later - earlier)[:, :2].T)
+
+
+def experience_metric_if_defined(
+    result: SessionResult, exm: ExmConfig | None = None
+) -> ExperienceMetric | None:
+    """The Experience Metric; None where the robot never returned to its start or has no experience."""
     try:
         return experience_metric(result.place, result.truth, exm or ExmConfig())
     except InputError:
         return None
 
 
-def chain_free(metric: ExperienceMetric) -> float:
-    """ARCR without the chain of validity: the share of re-localisations that are near."""
+def arcr_without_chain(metric: ExperienceMetric) -> float:
+    """Share of the re-localisations that are near the truth, whether or not earlier ones were correct."""
     return float(metric.near[metric.counted].mean()) if metric.counted.any() else np.nan
 
 
 def lap_ends(truth: np.ndarray) -> np.ndarray:
-    """The rows [L] at which the robot was back where it started from, as near as on that visit.
+    """[L] steps at which the robot returned to its start: the nearest step of each visit.
 
     Args:
         truth: [T, 3] true poses.
     """
     away = np.hypot(*(truth[:, :2] - truth[0, :2]).T)
-    change = np.flatnonzero(np.diff((away < HOME).astype(int))) + 1
-    visits = np.split(np.arange(len(truth)), change)[2::2]  # at home it begins; then away, home, away ...
+    change = np.flatnonzero(np.diff((away < HOME_RADIUS).astype(int))) + 1
+    visits = np.split(np.arange(len(truth)), change)[2::2]  # the path alternates: home, away, home, ...
     return np.array([visit[np.argmin(away[visit])] for visit in visits], int)
 
 
-def first(log: Log, steps: int) -> Log:
-    """The log's first steps."""
+def truncate_log(log: Log, steps: int) -> Log:
+    """The first steps of a log."""
     columns = ("time", "motion", "moved", "views", "seen", "label", "truth")
     cut = {name: getattr(log, name)[:steps] for name in columns if getattr(log, name) is not None}
     return Log(name=log.name, digest=f"{log.digest}[:{steps}]", info=log.info, alive=log.alive, **cut)
 
 
-def room_for(steps: int) -> int:
-    """Rows of memory for a session: a power of two, so that sessions of about one length share a kernel."""
+def capacity_for(steps: int) -> int:
+    """Memory rows for a session: a power of two, so that sessions of similar length share a kernel."""
     return capacity_at(max(steps, 1) - 1)
 
 
-def whole(config: RunConfig, folder: Path) -> RunConfig:
-    """The configuration with paths that hold wherever a worker stands."""
-    return config.with_absolute_paths(folder.resolve())
+def _session_at_start(config: RunConfig, shape: tuple[int, int, int], reserve: int) -> Session:
+    """A session at its start; a recently compiled one is used again."""
+    method = select_settings(config, BACKENDS[config.backend].config_class)
+    reserve = max(reserve, config.session.reserve)
+    session, start = _compiled(config.backend, method, config.session, shape, reserve)
+    session.map = session.backend.new_map()
+    session.restore(start)
+    return session
 
 
 @lru_cache(maxsize=2)
 def _compiled(
     name: str, method: Settings, settings: SessionConfig, shape: tuple[int, int, int], reserve: int
 ) -> tuple[Session, dict[str, np.ndarray]]:
-    """A session for these settings and its state at the start; compiled functions are kept."""
     session = Session(
         build(name, method, Sensors(shape), settings.precision),
         seed=settings.seed,
         reserve=reserve,
         precision=settings.precision,
     )
-    # Copies: what `arrays` gives may be the very memory that the first step hands on.
+    # Copied, because the first step donates the memory that `arrays` may share.
     return session, {name: np.array(value) for name, value in session.arrays().items()}

@@ -31,10 +31,10 @@ def test_a_shift_of_all_seeds_is_refused_and_what_does_not_matter_accepted():
     wild = precision.difference(random.normal(0, 1, 20), before)
     same = precision.difference(before, before)
     assert same.equal == 1
-    assert precision.accepted([same, scattered])
-    assert not precision.accepted([same, shifted])
-    assert not precision.accepted([same, wild])
-    assert not precision.accepted([precision.difference(before[:4], before[:4] + 1e-3)])
+    assert precision.is_accepted([same, scattered])
+    assert not precision.is_accepted([same, shifted])
+    assert not precision.is_accepted([same, wild])
+    assert not precision.is_accepted([precision.difference(before[:4], before[:4] + 1e-3)])
 
 
 @pytest.mark.soak
@@ -43,15 +43,15 @@ def test_a_shift_of_all_seeds_is_refused_and_what_does_not_matter_accepted():
 def test_float32_maps_as_well_as_float64(backend):
     """Over 20 seeds. Were a figure's median off by more than the margin, one such table in 200 would pass."""
     seeds = range(precision.FIRST_SEED, precision.FIRST_SEED + precision.SEEDS)
-    found = precision.measured(seeds, backend)
-    print("\n" + "\n".join(precision.lines(backend, found)))
-    assert precision.accepted(precision.judged(found["float32"], found["float64"]))
+    found = precision.measure_arms(seeds, backend)
+    print("\n" + "\n".join(precision.render_arms(backend, found)))
+    assert precision.is_accepted(precision.differences(found["float32"], found["float64"]))
 
 
 @pytest.mark.soak
 def test_runs_that_differ_by_one_rounding_agree_for_a_thousand_steps():
-    """And no test may ask for much more: `python -m ratslam.experiments.tables.chaos` says when they part."""
+    """No test may require much more: `python -m ratslam reproduce tables chaos` shows when they separate."""
     walk = chaos.walk(0, 1000)
-    assert chaos.parted(*chaos.PAIRS["one-cell"], walk).max() < 1e-10
-    assert chaos.parted(*chaos.PAIRS["window, dense"], walk).max() < 1e-10
-    assert chaos.parted(*chaos.PAIRS["float64, float32"], walk).max() < 1e-2
+    assert chaos.separation(*chaos.PAIRS["one-cell"], walk).max() < 1e-10
+    assert chaos.separation(*chaos.PAIRS["window, dense"], walk).max() < 1e-10
+    assert chaos.separation(*chaos.PAIRS["float64, float32"], walk).max() < 1e-2

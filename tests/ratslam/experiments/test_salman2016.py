@@ -1,4 +1,4 @@
-"""The paper's figures made again: laps, controls, verdicts, batches, and a tiny reproduction end to end."""
+"""Reproductions of Salman & Pearson 2016: laps, controls, claims, threshold sweeps, a small reproduction."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import ratslam.experiments.salman2016
 from ratslam.cli import main
 from ratslam.cli.reproduce import NAMES
 from ratslam.config.run_config import RunConfig
-from ratslam.experiments.salman2016 import jobs_of, matched, reproduce
-from ratslam.experiments.salman2016.claims import Row, column, table, verdict
-from ratslam.experiments.salman2016.direction_metrics import across, directions, lap_of
+from ratslam.experiments.salman2016 import reproduction
+from ratslam.experiments.salman2016.claims import Row, column, judge_claim, render_claims
+from ratslam.experiments.salman2016.direction_metrics import direction_metrics, lap_of_step
 from ratslam.experiments.salman2016.protocols import PROTOCOLS, THRESHOLDS, Claim
-from ratslam.experiments.trials.controls import controlled
-from ratslam.experiments.trials.threshold_sweep import classics, mapped
+from ratslam.experiments.salman2016.reproduction import match_thresholds, plan_jobs, reproduce
+from ratslam.experiments.trials.controls import apply_control
+from ratslam.experiments.trials.threshold_sweep import result_at_threshold, sweep_thresholds
 from ratslam.experiments.trials.touch_trial import (
-    Played,
-    figures,
-    first,
+    SessionResult,
+    capacity_for,
+    collect_session,
     lap_ends,
-    play,
-    room_for,
-    session_log,
+    run_session,
+    touch_metrics,
+    truncate_log,
 )
 from tactile.base.errors import InputError
 from tactile.base.se2 import compose
@@ -63,13 +63,13 @@ def session(truth, **given):
         "node": truth,
         "closures": np.zeros((0, 2), int),
     }
-    return Played(**{**still, **given})
+    return SessionResult(**{**still, **given})
 
 
 @pytest.fixture(scope="module")
 def tiny():
     data = {"path": {"circuits": "CCA"}, "maze": {"columns": 2, "rows": 2, "loop": 4}}
-    return session_log(RunConfig.model_validate({"simulation": data, "backend": "classic"}))
+    return collect_session(RunConfig.model_validate({"simulation": data, "backend": "classic"}))
 
 
 # Laps and sessions
@@ -80,7 +80,7 @@ def test_laps_end_where_they_began(word):
     truth = square(word)
     ends = lap_ends(truth)
     assert ends.tolist() == [48 * (k + 1) for k in range(len(word))]
-    assert np.bincount(lap_of(truth, len(word))).tolist() == [49, *[48] * (len(word) - 1)]
+    assert np.bincount(lap_of_step(truth, len(word))).tolist() == [49, *[48] * (len(word) - 1)]
 
 
 def test_a_path_that_never_returns_has_no_laps():
@@ -92,87 +92,87 @@ def test_a_perfect_map_has_no_energy_wherever_it_lies():
     moved = compose(np.array([3.0, -1.0, 2.0]), truth)
     place = np.arange(len(truth)) % 48
     perfect = session(truth, trajectory=moved, place=place, node=moved[:48])
-    trial = figures(perfect)
+    trial = touch_metrics(perfect)
     assert trial.em == pytest.approx(0, abs=1e-9)
-    assert trial.em_places == pytest.approx(0, abs=1e-9)
-    assert (trial.arcr, trial.near) == (1, 1)
+    assert trial.em_experiences == pytest.approx(0, abs=1e-9)
+    assert (trial.arcr, trial.arcr_chain_free) == (1, 1)
     assert trial.arr > 0.9  # the base set ends a few steps before the places begin again
-    assert figures(session(truth)).arr == 0
+    assert touch_metrics(session(truth)).arr == 0
 
 
 def test_closures_are_false_from_ten_centimetres_on():
     truth = square("CC")
     closures = np.array([[48, 0], [50, 2], [60, 8], [60, 30]])
-    trial = figures(session(truth, closures=closures))
-    assert (trial.closures, trial.false) == (4, 2)
+    trial = touch_metrics(session(truth, closures=closures))
+    assert (trial.closures, trial.false_closures) == (4, 2)
 
 
 def test_a_step_lies_where_its_experience_does():
     truth = square("CC")
     spread = session(truth, place=np.arange(len(truth)) // 4, node=truth[::4])
-    trial = figures(spread)
-    assert trial.em == 0 < trial.em_places
+    trial = touch_metrics(spread)
+    assert trial.em == 0 < trial.em_experiences
 
 
-def test_sessions_in_one_engine_do_not_know_of_each_other(tiny):
+def test_sessions_that_share_a_compiled_kernel_are_independent(tiny):
     config, log = tiny
-    once = play(config, log)
-    play(config, first(log, 50))
-    again = play(config, log)
+    once = run_session(config, log)
+    run_session(config, truncate_log(log, 50))
+    again = run_session(config, log)
     assert all(np.array_equal(a, b) for a, b in zip(once, again, strict=True))
     assert len(once.truth) == log.length
 
 
 @given(st.integers(1, 5000))
-def test_rooms_are_powers_of_two_that_suffice(steps):
-    room = room_for(steps)
-    assert room >= steps
-    assert room & (room - 1) == 0
-    assert room < 2 * steps + 512
+def test_capacities_are_sufficient_powers_of_two(steps):
+    capacity = capacity_for(steps)
+    assert capacity >= steps
+    assert capacity & (capacity - 1) == 0
+    assert capacity < 2 * steps + 512
 
 
-def test_a_batch_of_thresholds_is_what_single_sessions_give(tiny):
+def test_a_threshold_sweep_equals_single_sessions(tiny):
     config, log = tiny
-    batch = classics(config, log, np.array([0.01, config.templates.threshold]))
+    batch = sweep_thresholds(config, log, np.array([0.01, config.templates.threshold]))
     assert len(np.unique(batch.place[0])) != len(np.unique(batch.place[1]))
-    alone, folded = play(config, log), mapped(config, log, batch, 1)
+    alone, folded = run_session(config, log), result_at_threshold(config, log, batch, 1)
     assert np.array_equal(batch.place[1], alone.place)
     assert np.allclose(folded.trajectory, alone.trajectory, atol=1e-9)
     assert np.array_equal(folded.closures, alone.closures)
 
 
-def test_thresholds_are_the_classic_matchers(tiny):
+def test_only_the_classic_method_has_thresholds(tiny):
     config, log = tiny
     with pytest.raises(ValueError, match="classic"):
-        classics(config.model_copy(update={"backend": "recall"}), log, np.array([0.1]))
+        sweep_thresholds(config.model_copy(update={"backend": "recall"}), log, np.array([0.1]))
 
 
 # Controls
 
 
 @pytest.mark.parametrize("control", ["shuffled", "blank", "ideal"])
-def test_controls_change_views_and_nothing_else(tiny, control):
+def test_controls_change_only_the_views(tiny, control):
     log = tiny[1]
-    changed = controlled(log, control, 1)
+    changed = apply_control(log, control, 1)
     assert changed.views.shape == log.views.shape
     assert not np.array_equal(changed.views, log.views)
     assert np.array_equal(changed.motion, log.motion)
     assert np.array_equal(changed.truth, log.truth)
-    assert np.array_equal(changed.views, controlled(log, control, 1).views)
+    assert np.array_equal(changed.views, apply_control(log, control, 1).views)
     assert 0 <= changed.views.min() <= changed.views.max() <= 1
-    assert controlled(log, "as felt", 1) is log
+    assert apply_control(log, "none", 1) is log
 
 
 def test_shuffled_views_are_the_same_views(tiny):
     log = tiny[1]
-    views, shuffled = (np.sort(x.views.reshape(-1)) for x in (log, controlled(log, "shuffled", 0)))
+    views, shuffled = (np.sort(x.views.reshape(-1)) for x in (log, apply_control(log, "shuffled", 0)))
     assert np.array_equal(views, shuffled)
-    assert not controlled(log, "blank", 0).views.any()
+    assert not apply_control(log, "blank", 0).views.any()
 
 
-def test_ideal_views_tell_spot_and_sector(tiny):
+def test_ideal_views_are_equal_exactly_at_one_spot_and_heading(tiny):
     log = tiny[1]
-    views = controlled(log, "ideal", 0).views.reshape(log.length, -1)
+    views = apply_control(log, "ideal", 0).views.reshape(log.length, -1)
     x, y, heading = np.asarray(log.truth).T
     spot = np.stack([np.round(x / 0.06), np.round(y / 0.06), np.round(heading / (np.pi / 4)) % 8], axis=1)
     same = (spot[:, None] == spot[None]).all(axis=2)
@@ -186,41 +186,43 @@ def test_ideal_views_tell_spot_and_sector(tiny):
 
 def test_laps_the_other_way_round_are_associated_by_experience_or_closure():
     word, truth = "CA", square("CA")
-    new = directions(session(truth), word)
-    assert (new["first_anticlockwise"], new["apart"]) == (0, 0)
+    new = direction_metrics(session(truth), word)
+    assert (new["first_anticlockwise"], new["directions_apart"]) == (0, 0)
     nearest = [int(np.argmin(np.hypot(*(truth[:49, :2] - p[:2]).T))) for p in truth]
-    known = directions(session(truth, place=np.array(nearest)), word)
-    assert known["first_anticlockwise"] == known["rightly"] == 1
-    wrong = directions(session(truth, place=np.where(np.arange(len(truth)) > 48, 24, nearest)), word)
-    assert wrong["first_anticlockwise"] == 1 > wrong["rightly"]
+    known = direction_metrics(session(truth, place=np.array(nearest)), word)
+    assert known["first_anticlockwise"] == known["associated_correct"] == 1
+    wrong = direction_metrics(session(truth, place=np.where(np.arange(len(truth)) > 48, 24, nearest)), word)
+    assert wrong["first_anticlockwise"] == 1 > wrong["associated_correct"]
     closures = np.array([[k, nearest[k]] for k in range(49, 73)])
-    half = directions(session(truth, closures=closures), word)
-    assert half["first_anticlockwise"] == half["counterparts"] == pytest.approx(0.5)
-    assert half["rightly"] == 1
-    assert wrong["counterparts"] < 0.5
+    half = direction_metrics(session(truth, closures=closures), word)
+    assert half["first_anticlockwise"] == half["first_anticlockwise_correct"] == pytest.approx(0.5)
+    assert half["associated_correct"] == 1
+    assert wrong["first_anticlockwise_correct"] < 0.5
 
 
-def test_what_joins_an_associated_step_is_associated_too():
+def test_a_step_closed_with_an_associated_step_is_associated():
     word, truth = "CAA", square("CAA")
     again = np.array([[k, k - 48] for k in range(97, 145)])
-    none = directions(session(truth, closures=again), word)
+    none = direction_metrics(session(truth, closures=again), word)
     assert none["last_anticlockwise"] == 0
     first_lap = np.array([[k, 0] for k in range(49, 97)])
-    all_of_it = directions(session(truth, closures=np.concatenate([first_lap, again])), word)
-    assert all_of_it["last_anticlockwise"] == 1 > all_of_it["rightly"]
+    all_of_it = direction_metrics(session(truth, closures=np.concatenate([first_lap, again])), word)
+    assert all_of_it["last_anticlockwise"] == 1 > all_of_it["associated_correct"]
 
 
-def test_directions_lie_apart_as_far_as_the_map_puts_them():
+def test_the_distance_of_the_two_directions_is_measured_in_the_map():
     truth = square("CA")
     moved = truth + np.where(np.arange(len(truth)) > 48, 1, 0)[:, None] * [0.3, 0, 0]
-    assert directions(session(truth, trajectory=moved), "CA")["apart"] == pytest.approx(0.3)
-    assert np.isnan(directions(session(truth), "CC")["apart"])
+    assert direction_metrics(session(truth, trajectory=moved), "CA")["directions_apart"] == pytest.approx(0.3)
+    assert np.isnan(direction_metrics(session(truth), "CC")["directions_apart"])
 
 
 def test_closures_across_the_change_are_counted():
     truth = square("CCC")
     closures = np.array([[90, 2], [100, 80], [30, 4], [44, 42]])
-    assert across(session(truth, closures=closures))["across"] == 2  # 145 steps: the change is at 43
+    assert (
+        direction_metrics(session(truth, closures=closures), "CCC")["across"] == 2
+    )  # 145 steps: the change is at 43
 
 
 # Verdicts
@@ -228,58 +230,58 @@ def test_closures_across_the_change_are_counted():
 
 def test_claims_are_confirmed_refuted_or_neither():
     low, high = np.array([0.1, 0.2, 0.3]), np.array([0.3, 0.4, 0.6])
-    assert verdict(RISES, low, high).word == "confirmed"
-    assert verdict(RISES, high, low).word == "refuted"
-    assert verdict(RISES, low, low).word == "refuted"
-    assert verdict(RISES, low, low[::-1]).word == "not decided"
-    assert verdict(RISES, low, np.array([0.2, np.nan, np.nan])).word == "cannot be told"
+    assert judge_claim(RISES, low, high).word == "confirmed"
+    assert judge_claim(RISES, high, low).word == "refuted"
+    assert judge_claim(RISES, low, low).word == "refuted"
+    assert judge_claim(RISES, low, low[::-1]).word == "not decided"
+    assert judge_claim(RISES, low, np.array([0.2, np.nan, np.nan])).word == "undefined"
     alike = RISES._replace(kind="alike")
-    assert verdict(alike, low, low + 0.01).word == "confirmed"
-    assert verdict(alike, low, high).word == "refuted"
+    assert judge_claim(alike, low, low + 0.01).word == "confirmed"
+    assert judge_claim(alike, low, high).word == "refuted"
     small = RISES._replace(kind="small")
-    assert verdict(small, low / 10, high).word == "confirmed"
-    assert verdict(small, high, low).word == "refuted"
+    assert judge_claim(small, low / 10, high).word == "confirmed"
+    assert judge_claim(small, high, low).word == "refuted"
 
 
 @given(st.lists(st.tuples(st.floats(0.01, 10), st.floats(0.01, 10)), min_size=2, max_size=6))
-def test_the_opposite_claim_gets_no_confirmation_too(pairs):
+def test_a_claim_and_its_opposite_are_not_both_confirmed(pairs):
     here, there = np.array(pairs).T
     for claim in (RISES, RISES._replace(quantity="em")):
-        forth, back = verdict(claim, here, there), verdict(claim, there, here)
+        forth, back = judge_claim(claim, here, there), judge_claim(claim, there, here)
         assert {forth.word, back.word} != {"confirmed"}
         if forth.word == "confirmed":
             assert back.word == "refuted"
-        slack = 1e-9 * (1 + abs(forth.found))
-        assert forth.low - slack <= forth.found <= forth.high + slack
+        slack = 1e-9 * (1 + abs(forth.estimate))
+        assert forth.low - slack <= forth.estimate <= forth.high + slack
 
 
 def test_energies_are_compared_by_ratio():
     em = RISES._replace(quantity="em")
-    found = verdict(em, np.array([0.01, 1.0]), np.array([0.02, 2.0]))
-    assert found.found == pytest.approx(2)
+    found = judge_claim(em, np.array([0.01, 1.0]), np.array([0.02, 2.0]))
+    assert found.estimate == pytest.approx(2)
     assert found.word == "confirmed"
 
 
 def test_sets_stay_paired_where_one_is_missing():
-    rows = [Row("a", "ours", "as felt", k, k, {"arr": k / 10}) for k in (0, 2)]
-    assert np.array_equal(column(rows, "a", "ours", "as felt", "arr"), [0, np.nan, 0.2], equal_nan=True)
+    rows = [Row("a", "ours", "none", k, k, {"arr": k / 10}) for k in (0, 2)]
+    assert np.array_equal(column(rows, "a", "ours", "none", "arr"), [0, np.nan, 0.2], equal_nan=True)
 
 
 @pytest.mark.parametrize(("sets", "said"), [(1, False), (3, True), (6, False)])
-def test_a_table_says_how_little_few_sets_prove(sets, said):
+def test_a_table_states_the_significance_of_few_sets(sets, said):
     protocol = PROTOCOLS["fig6"]
     rows = [
-        Row(condition.name, "ours", "as felt", k, k, {"arr": 0.1 * k + number / 10})
+        Row(condition.name, "ours", "none", k, k, {"arr": 0.1 * k + number / 10})
         for k in range(sets)
         for number, condition in enumerate(protocol.conditions)
     ]
-    text = table(protocol, rows, sets)
+    text = render_claims(protocol, rows, sets)
     assert ("in 25% of cases" in text) == said
     assert ("CONFIRMED: difference 0.1" in text) == (sets > 1)
     assert "0.1765" in text
 
 
-def test_matched_thresholds_reach_what_all_conditions_reach():
+def test_matched_thresholds_reach_the_arcr_that_all_conditions_reach():
     def row(name, arcr, arr):
         return Row(name, "classic", "sweep", 0, 0, {"arcr": arcr, "arr": arr, "threshold": arr})
 
@@ -290,22 +292,22 @@ def test_matched_thresholds_reach_what_all_conditions_reach():
         row("b", 0.7, 0.2),
         row("b", 0.6, 0.4),
     ]
-    found = matched([*rows, row("c", np.nan, 0.0)], ["a", "b", "c"])
+    found = match_thresholds([*rows, row("c", np.nan, 0.0)], ["a", "b", "c"])
     assert {name: r.values["arr"] for name, r in found.items()} == {"a": 0.3, "b": 0.2}
-    assert matched([], ["a"]) == {}
+    assert match_thresholds([], ["a"]) == {}
 
 
 # The reproductions themselves
 
 
-def test_the_program_knows_them_all():
+def test_the_program_lists_all_protocols():
     assert set(NAMES) == set(PROTOCOLS)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_condition_can_be_configured_and_sees_the_same_sets(name):
+def test_all_conditions_are_valid_and_run_on_the_same_sets(name):
     protocol = PROTOCOLS[name]
-    jobs = jobs_of(protocol, 2, 0)
+    jobs = plan_jobs(protocol, 2, 0)
     seeds = [{job.task.config.simulation.seed for job in jobs if job.number == n} for n in (0, 1)]
     assert [len(each) for each in seeds] == [1, 1]
     assert seeds[0] != seeds[1]
@@ -330,19 +332,21 @@ def test_a_tiny_reproduction_leaves_table_rows_and_figure(tmp_path, capsys):
     with (tmp_path / "fig6.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 2 * (2 + 3)
-    ours = [row for row in rows if row["method"] == "ours" and row["control"] != "as felt"]
-    assert all(row["closures"] == "0" and float(row["ratio"]) == pytest.approx(1, abs=0.05) for row in ours)
+    ours = [row for row in rows if row["method"] == "ours" and row["control"] != "none"]
+    assert all(
+        row["closures"] == "0" and float(row["em_ratio"]) == pytest.approx(1, abs=0.05) for row in ours
+    )
     assert (tmp_path / "fig6.png").read_bytes().startswith(b"\x89PNG")
     assert main(arguments) == 2
     assert "exists" in capsys.readouterr().err
 
 
-def test_an_interrupt_leaves_what_was_finished(tmp_path, monkeypatch):
+def test_an_interrupt_keeps_the_finished_sessions(tmp_path, monkeypatch):
     def interrupted(function, tasks, workers):
         yield from (session(square("CCC")) for _ in tasks[:2])
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(ratslam.experiments.salman2016, "shared_out", interrupted)
+    monkeypatch.setattr(reproduction, "run_tasks", interrupted)
     text, stopped = reproduce("fig2", tmp_path, sets=1, workers=1, assignments=TINY)
     assert stopped
     assert "Odometry drift" in text
@@ -350,7 +354,7 @@ def test_an_interrupt_leaves_what_was_finished(tmp_path, monkeypatch):
     assert not (tmp_path / "fig2.png").exists()
 
 
-def test_what_cannot_be_run_is_refused_before_anything_is_written(tmp_path, capsys):
+def test_invalid_arguments_are_refused_before_anything_is_written(tmp_path, capsys):
     assert main(["reproduce", "fig6", "-o", str(tmp_path / "a"), "--set", "recall.reach=-1"]) == 2
     assert "recall.reach" in capsys.readouterr().err
     assert main(["reproduce", "fig6", "-o", str(tmp_path / "a"), "--seed", "-1"]) == 2

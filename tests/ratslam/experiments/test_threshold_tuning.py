@@ -1,4 +1,4 @@
-"""Tuning: what views tell apart, the rule that takes a threshold, and the program."""
+"""Threshold tuning: differences of views, the rule that takes a threshold, and the command."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from ratslam.cli import main
 from ratslam.config.strict_yaml import parse
 from ratslam.experiments.salman2016.threshold_tuning import (
     THRESHOLDS,
-    Likeness,
-    Tried,
+    ThresholdScore,
+    ViewDifferences,
     auc,
-    chosen,
-    compared,
-    differences,
-    report,
-    tune,
+    choose_threshold,
+    compare_views,
+    render_tuning,
+    tune_threshold,
+    view_differences,
 )
 from robot.sources.in_memory import Log
 from tactile.base.errors import InputError
 
 ROOT = Path(__file__).parents[3]
-LIKENESS = Likeness(np.linspace(0, 1, 11), np.eye(10, dtype=int)[1] * 8, np.ones(10, int), 0.9)
+VIEWS = ViewDifferences(np.linspace(0, 1, 11), np.eye(10, dtype=int)[1] * 8, np.ones(10, int), 0.9)
 COUNTS = st.lists(st.integers(0, 5), min_size=1, max_size=9)
 GRID = (0.01, 0.02, 0.04, 0.08)
 TINY = """
@@ -42,8 +42,10 @@ simulation:
 """
 
 
-def tried(*results):
-    return [Tried(0.01 * k, 0.5, correct, incorrect) for k, (correct, incorrect) in enumerate(results)]
+def scores(*results):
+    return [
+        ThresholdScore(0.01 * k, 0.5, correct, incorrect) for k, (correct, incorrect) in enumerate(results)
+    ]
 
 
 def log_of(truth, views, step=10.0):
@@ -76,9 +78,9 @@ def test_auc_is_the_chance_that_other_places_look_less_alike(same, other):
 )
 @settings(max_examples=5)
 @given(views=arrays.arrays(float, (3, 3, 6, 2), elements=st.floats(0, 1)))
-def test_differences_are_the_matchers_own(how, views):
+def test_differences_equal_those_of_the_matcher(how, views):
     config = TemplateConfig(threshold=1.0, **how)
-    found = differences(config, views, views)
+    found = view_differences(config, views, views)
     store = view_templates.start(config, (3, 6, 2), 1, np.dtype(float))
     for i in range(3):
         kept = store._replace(view=jnp.asarray(views[i].reshape(-1, 1)), count=jnp.int32(1))
@@ -86,41 +88,41 @@ def test_differences_are_the_matchers_own(how, views):
         assert found[i - 1, i] == pytest.approx(float(match.error), abs=1e-12)
 
 
-def test_same_and_other_places_are_told_by_truth_and_time():
+def test_pairs_are_sorted_by_true_pose_and_time():
     truth = [[0, 0, 0], [1, 0, 0], [0.04, 0, 0.2], [0, 0, 2.0], [0.2, 0, 0], [0, 0, 0]]
-    found = compared(TemplateConfig(), log_of(truth, np.arange(6) / 10, step=40.0))
+    found = compare_views(TemplateConfig(), log_of(truth, np.arange(6) / 10, step=40.0))
     # same: 0-2 and 0-5 and 2-5 (15 degrees, 5 cm, 60 s apart); other: all with row 1
     assert found.same.sum() == 3
     assert found.other.sum() == 5
-    late = compared(TemplateConfig(), log_of(truth, np.arange(6) / 10, step=20.0))
+    late = compare_views(TemplateConfig(), log_of(truth, np.arange(6) / 10, step=20.0))
     assert late.same.sum() == 2  # 0-2 lie only 40 s apart
 
 
 def test_a_path_without_a_second_visit_has_nothing_to_compare():
     with pytest.raises(InputError, match="two visits"):
-        compared(TemplateConfig(), log_of([[k, 0, 0] for k in range(5)], np.arange(5)))
+        compare_views(TemplateConfig(), log_of([[k, 0, 0] for k in range(5)], np.arange(5)))
     with pytest.raises(InputError, match="one place"):
-        compared(TemplateConfig(), log_of(np.zeros((20, 3)), np.arange(20)))
+        compare_views(TemplateConfig(), log_of(np.zeros((20, 3)), np.arange(20)))
 
 
 def test_most_correct_with_none_incorrect_wins():
-    found = tried((9, 0), (12, 0), (30, 0), (30, 0), (99, 1))
-    winner, why = chosen(found, LIKENESS)
+    found = scores((9, 0), (12, 0), (30, 0), (30, 0), (99, 1))
+    winner, why = choose_threshold(found, VIEWS)
     assert winner is found[2]
     assert "3 thresholds" in why
 
 
-def test_why_none_wins_is_said():
-    few, why_few = chosen(tried((0, 0), (9, 0), (3, 5)), LIKENESS)
-    wrong, why_wrong = chosen(tried((12, 4), (50, 2), (9, 0)), LIKENESS)
+def test_the_reason_for_no_winner_is_given():
+    few, why_few = choose_threshold(scores((0, 0), (9, 0), (3, 5)), VIEWS)
+    wrong, why_wrong = choose_threshold(scores((12, 4), (50, 2), (9, 0)), VIEWS)
     assert few is wrong is None
-    assert "0.01 brings 9" in why_few
+    assert "0.01 gives 9" in why_few
     assert "0.01 has the fewest, 2 beside 50" in why_wrong
     assert "0.150" in why_wrong  # the median of views of the same place
     assert "15.0%" in why_wrong  # of the views of other places lie below
 
 
-def test_views_that_tell_places_apart_are_tuned(tmp_path, capsys, monkeypatch):
+def test_the_command_tunes_a_simulated_session(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("ratslam.experiments.salman2016.threshold_tuning.THRESHOLDS", GRID)
     config = tmp_path / "tiny.yaml"
     config.write_text(TINY)
@@ -130,26 +132,26 @@ def test_views_that_tell_places_apart_are_tuned(tmp_path, capsys, monkeypatch):
     assert len([line for line in text.splitlines() if line[:8].strip().startswith("0.")]) >= len(GRID)
     assert "AUC" in text
     assert "templates.threshold=" in text or "no threshold satisfies" in text
-    assert len((out / "tune.csv").read_text().splitlines()) == 1 + len(GRID)
-    assert (out / "tune.png").read_bytes().startswith(b"\x89PNG")
+    assert len((out / "threshold.csv").read_text().splitlines()) == 1 + len(GRID)
+    assert (out / "threshold.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_parts_of_the_grid_are_shared_out_and_put_together(monkeypatch):
+def test_parts_of_the_grid_are_run_tasks_and_put_together(monkeypatch):
     seen = []
 
-    def shared_out(function, tasks, workers):
+    def run_tasks(function, tasks, workers):
         seen.append((len(tasks), workers))
-        return ([Tried(float(t), 0.0, 20, 0) for t in part] for *_, part in tasks)
+        return ([ThresholdScore(float(t), 0.0, 20, 0) for t in part] for *_, part in tasks)
 
-    monkeypatch.setattr("ratslam.experiments.salman2016.threshold_tuning.shared_out", shared_out)
-    found = tune(parse(TINY, "tiny"), ROOT, workers=3)
+    monkeypatch.setattr("ratslam.experiments.salman2016.threshold_tuning.run_tasks", run_tasks)
+    found = tune_threshold(parse(TINY, "tiny"), ROOT, workers=3)
     assert seen == [(3, 3)]
-    assert [each.threshold for each in found.tried] == list(THRESHOLDS)
+    assert [each.threshold for each in found.scores] == list(THRESHOLDS)
     assert 0 < found.steps[0] < found.steps[1]
-    assert "<- the winner" in report(found)
+    assert "<- the winner" in render_tuning(found)
 
 
-def test_what_cannot_be_tuned_is_refused(tmp_path, capsys):
+def test_invalid_configurations_are_refused(tmp_path, capsys):
     config = tmp_path / "labels.yaml"
     config.write_text("recording: {file: missing.npz}\n")
     assert main(["tune", str(config)]) == 2
@@ -159,12 +161,12 @@ def test_what_cannot_be_tuned_is_refused(tmp_path, capsys):
     assert "templates.threshold" in capsys.readouterr().err
 
 
-def test_views_must_be_there_and_truth_too(monkeypatch):
+def test_all_steps_need_a_view(monkeypatch):
     truth = [[0, 0, 0], [1, 0, 0], [0, 0, 0]]
     blind = replace(log_of(truth, np.arange(3)), seen=np.array([True, False, True]))
     document = parse("simulation: {}\n", "here")
     monkeypatch.setattr(
-        "ratslam.experiments.salman2016.threshold_tuning.session_log", lambda config: (config, blind)
+        "ratslam.experiments.salman2016.threshold_tuning.collect_session", lambda config: (config, blind)
     )
     with pytest.raises(InputError, match="without a view"):
-        tune(document, ROOT)
+        tune_threshold(document, ROOT)

@@ -7,14 +7,14 @@ from functools import cache
 import numpy as np
 import pytest
 
-from ratslam.experiments.tables.grid import Figures, run
+from ratslam.experiments.tables.grid import GridFigures, GridTask, measure_session
 
 FEW, MANY = (9100, 9101), tuple(range(9100, 9108))
 
 
 @cache
-def sessions(row: str, arenas: tuple[int, ...] = FEW) -> list[Figures]:
-    return [run("A", row, arena) for arena in arenas]
+def sessions(row: str, arenas: tuple[int, ...] = FEW) -> list[GridFigures]:
+    return [measure_session(GridTask("A", row, arena)) for arena in arenas]
 
 
 def ratio(row: str, arenas: tuple[int, ...] = FEW) -> float:
@@ -64,7 +64,7 @@ def test_a_map_is_drawn_where_walls_are():
 
 def test_walls_are_told_as_they_run():
     found = sessions("bias")
-    off = np.degrees(np.concatenate([one.angle for one in found]))
+    off = np.degrees(np.concatenate([one.wall_errors for one in found]))
     assert off.mean() < 6
     assert (off > 15).mean() < 0.04
     assert len(off) > 0.45 * sum(one.contacts for one in found)

@@ -1,0 +1,29 @@
+"""Rows of a Markdown table, printed one at a time while the work goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from tactile.base.errors import InputError
+
+
+def markdown_row(cells: Iterable[object]) -> str:
+    """One row of a table."""
+    return f"| {' | '.join(map(str, cells))} |"
+
+
+def markdown_header(columns: Sequence[str]) -> str:
+    """The header and the rule below it."""
+    return f"{markdown_row(columns)}\n{'|---' * len(columns)}|"
+
+
+def select_rows(names: Sequence[str] | None, rows: Mapping[str, object], default: Sequence[str]) -> list[str]:
+    """The chosen rows of a table.
+
+    Raises:
+        InputError: a name that is not a row.
+    """
+    for name in names or ():
+        if name not in rows:
+            raise InputError("--rows", repr(name), f"one of: {'; '.join(rows)}")
+    return list(names or default)

@@ -1,0 +1,113 @@
+"""The speed table: microseconds a pose-cell step takes in replay, by size of the network.
+
+All columns of a row are timed in turns on one core, so that they share its state; only ratios carry over to
+other machines.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ratslam.attractor import adaptive_window, pose_cells
+from ratslam.attractor.config import PoseCellConfig, rings, units
+from ratslam.attractor.pose_cells import PoseCells
+from ratslam.experiments.tables.markdown import markdown_header, markdown_row
+from ratslam.experiments.tables.numpy_network import NumpyNetwork
+from tactile.base.types import Odometry
+
+SIZES = (11, 21, 41, 61, 101, 201)
+"""Cells along one side of the network."""
+ROUNDS = 5
+STEPS = 4000
+"""Steps of one timing of the moving window."""
+MOTION = 0.2, 0.1
+"""Cells forward and heading cells per step."""
+COLUMNS = ("cells a side", "ratslam", "float32", "whole torus", "NumPy", "NumPy / ratslam")
+
+Timed = Mapping[str, tuple[Callable[[], Any], int]]
+"""By name: a call, and the number of steps that it makes."""
+
+
+def speed_table(sizes: Sequence[int] = SIZES, rounds: int = ROUNDS) -> Iterator[str]:
+    """The lines of the table, each as soon as it is timed."""
+    jax.config.update("jax_enable_x64", True)
+    yield markdown_header(COLUMNS)
+    for n in sizes:
+        us = interleaved_medians(network_calls(n), rounds)
+        times = (f"{us[name]:.0f} us" for name in ("window", "window, float32", "dense", "numpy"))
+        yield markdown_row([n, *times, f"{us['numpy'] / us['window']:.0f}"])
+
+
+def network_calls(n: int, steps: int = STEPS) -> dict[str, tuple[Callable[[], Any], int]]:
+    """What is timed for networks of n x n x 36 cells, compiled."""
+    few = max(5, 400 // n)
+    window, start = replay_network(n, "window", steps)
+    single, start32 = replay_network(n, "window", steps, np.float32)
+    dense, whole = replay_network(n, "dense", few)
+    network = NumpyNetwork(n)
+    return {
+        "window": (partial(window, start), steps),
+        "window, float32": (partial(single, start32), steps),
+        "dense": (partial(dense, whole), few),
+        "numpy": (lambda: [network.step(*MOTION) for _ in range(few)], few),
+    }
+
+
+def network_step(n: int, engine: str, dtype: Any = float) -> tuple[Callable[..., Any], PoseCells]:
+    """A step of an engine as a function of cells, recall and energy, and the cells at the start."""
+    config, dtype = PoseCellConfig.model_validate({"cells_xy": n, "engine": engine}), np.dtype(dtype)
+    rungs, unit = adaptive_window.rungs(config, dtype), units(config, dtype)
+    moved = Odometry(*(jnp.asarray(v, dtype) for v in (MOTION[0] * unit[0], 0.0, MOTION[1] * unit[2], 1.0)))
+
+    def step(cells: PoseCells, recall: Any, energy: Any) -> Any:
+        return pose_cells.step(config, rungs, cells, moved, recall, energy)
+
+    return step, pose_cells.start(config, dtype)
+
+
+def replay_network(
+    n: int, engine: str, steps: int, dtype: Any = float, every: int = 0
+) -> tuple[Callable[..., Any], PoseCells]:
+    """A compiled replay of some steps, and the cells at its start.
+
+    Args:
+        every: interval of an injection at a second packet half a torus away, in steps; 0: one packet only.
+
+    Returns:
+        a function of the cells to the cells after the replay and the number of steps with two packets.
+    """
+    step, start = network_step(n, engine, dtype)
+    ring = rings(PoseCellConfig(cells_xy=n), np.dtype(dtype))
+
+    @jax.jit
+    def run(cells: PoseCells) -> Any:
+        def body(k: Any, carry: Any) -> Any:
+            cells, above = carry
+            far = (cells.pose + ring / 2 * np.array([1, 1, 0], dtype)) % ring
+            inject = (k % every == every - 1) if every else jnp.bool_(False)
+            cells, told = step(cells, far, jnp.where(inject, 0.02, 0.0).astype(dtype))
+            return cells, above + (told.rung > 0).astype(jnp.int32)
+
+        return jax.lax.fori_loop(0, steps, body, (cells, jnp.int32(0)))
+
+    jax.block_until_ready(run(start))
+    return run, start
+
+
+def interleaved_medians(calls: Timed, rounds: int = ROUNDS) -> dict[str, float]:
+    """Median microseconds per step of each call; each round times all calls in turn."""
+    times = [{name: _time(*call) for name, call in calls.items()} for _ in range(rounds)]
+    return {name: float(np.median([each[name] for each in times])) for name in calls}
+
+
+def _time(call: Callable[[], Any], count: int) -> float:
+    start = time.perf_counter()
+    jax.block_until_ready(call())
+    return (time.perf_counter() - start) / count * 1e6
