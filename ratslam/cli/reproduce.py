@@ -68,7 +68,7 @@ def _reproduce(arguments: argparse.Namespace) -> int:
         raise InputError("--seed", str(arguments.seed), "a whole number from 0 on")
     prepare_jax(keep_compiled=False)
     if arguments.name in SETS:
-        from ratslam.experiments.fox2012 import reproduce
+        from ratslam.experiments.fox2012.reproduction import reproduce
     else:
         from ratslam.experiments.salman2016.reproduction import reproduce
 

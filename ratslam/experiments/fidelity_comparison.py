@@ -18,7 +18,6 @@ from ratslam.experiments.trials.touch_trial import (
     collect_session,
     run_session,
     touch_metrics,
-    whole,
 )
 from robot.simulation.head.session import SimulationConfig, simulated, tier
 from tactile.base.errors import InputError
@@ -64,7 +63,7 @@ def tiers(document: Document, folder: Path, seconds: float) -> tuple[list[TierTr
     Raises:
         InputError: there is nothing to simulate, or it cannot be simulated.
     """
-    given = whole(validate(document, RunConfig), folder)
+    given = validate(document, RunConfig).with_absolute_paths(folder.resolve())
     if given.simulation is None:
         raise InputError(
             "simulation", "missing", "a scene to simulate", "`simulation: {}` is a whole session"
@@ -78,7 +77,7 @@ def tiers(document: Document, folder: Path, seconds: float) -> tuple[list[TierTr
         costs[name] = perf_counter() - before
     trials: dict[str, dict[str, TouchMetrics]] = {name: {} for name in TIERS}
     for method, sets in METHODS.items():
-        config = whole(validate(override(document, sets), RunConfig), folder)
+        config = validate(override(document, sets), RunConfig).with_absolute_paths(folder.resolve())
         config = config.model_copy(update={"simulation": short.simulation})
         completed, _ = collect_session(_in_tier(config, "kinematic"))
         for name in TIERS:

@@ -1,4 +1,4 @@
-"""The picture of each reproduction."""
+"""The figures of the reproductions."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def picture(name: str, protocol: Protocol, found: Sequence[Result]) -> Figure:
+def draw_reproduction(name: str, protocol: Protocol, found: Sequence[Result]) -> Figure:
     """The figure of a reproduction."""
     sets = len({one.number for one in found})
     count = f"{sets} set{'s' if sets > 1 else ''}"

@@ -112,9 +112,7 @@ PROTOCOLS = {
 }
 
 
-def configured(
-    protocol: Protocol, world: World, method: str, mapper: str, assignments: Sequence[str] = ()
-) -> RunConfig:
+def session_config(world: World, method: str, mapper: str, assignments: Sequence[str] = ()) -> RunConfig:
     """The configuration of a mapper in a world.
 
     Raises:

@@ -30,7 +30,7 @@ LEGEND = (
 _ALONG = {RECKONED: "on dead reckoning", TRUE: "on the true path"}
 
 
-def table(protocol: Protocol, found: Sequence[Result], sets: int) -> str:
+def render_results(protocol: Protocol, found: Sequence[Result], sets: int) -> str:
     """All that a reproduction has to say."""
     done = len({one.number for one in found})
     lines = [f"{protocol.title} ({protocol.source}); {done} of {sets} sets", ""]

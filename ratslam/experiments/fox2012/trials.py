@@ -68,7 +68,7 @@ class Result(NamedTuple):
     told: np.ndarray
 
 
-def results(job: Job) -> list[Result]:
+def run_job(job: Job) -> list[Result]:
     """All of a session's: what each variant's filter found, and its marks along paths that no filter found.
 
     Raises:

@@ -144,7 +144,7 @@ def measure_session(task: GridTask) -> GridFigures:
     if "BACK skipped" in task.row:
         still = observations[0].odometry._replace(dx=0.0, dy=0.0, dtheta=0.0, dt=BACK_DURATION)
         observations = [o._replace(odometry=still) if o.motion == Motion.BACK else o for o in observations]
-    touch = reports_of(source, config.touch.reports)
+    touch = reports_of(source.info, config.touch.reports)
     session = session_at_start(grid, touch.mounts, touch.length, "float32", config.session.seed)
     online = np.array([step.pose for step in session.replay(observations)])
 

@@ -12,13 +12,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import ratslam.experiments.fox2012
 from ratslam.cli import main
 from ratslam.cli.create import SETS
-from ratslam.experiments.fox2012 import jobs_of, reproduce
+from ratslam.experiments.fox2012 import reproduction
 from ratslam.experiments.fox2012.mapper_ranking import MEASURES, Measure, order, orders
 from ratslam.experiments.fox2012.metrics import AWAY, FIELDS, measured, revisits
 from ratslam.experiments.fox2012.protocols import FILTERED, MAPPERS, PAPERS, PROTOCOLS, RECKONED, TRUE
+from ratslam.experiments.fox2012.reproduction import plan_jobs, reproduce
 from ratslam.experiments.fox2012.session import (
     ROOM,
     chart,
@@ -30,7 +30,7 @@ from ratslam.experiments.fox2012.session import (
     started,
     truth_of,
 )
-from ratslam.experiments.fox2012.trials import Result, results
+from ratslam.experiments.fox2012.trials import Result, run_job
 from ratslam.grid.config import GridConfig
 from robot.world.arena import Arena, fits
 from robot.world.random_arena import ArenaConfig, arena
@@ -136,7 +136,7 @@ def test_charts_lie_on_the_truth_of_any_arena() -> None:
 
 
 def test_a_stop_on_the_way_changes_nothing(tiny: object) -> None:
-    job = jobs_of(PROTOCOLS["fox-fig4"], 1, 0, TINY)[0]
+    job = plan_jobs(PROTOCOLS["fox-fig4"], 1, 0, TINY)[0]
     config = job.variants["ours", "blob"]
     assert config.roving is not None
     out = outing(config.roving)
@@ -234,7 +234,7 @@ def test_the_program_knows_them_all() -> None:
 
 @pytest.mark.parametrize("name", PROTOCOLS)
 def test_all_variants_of_a_set_are_of_one_session(name: str) -> None:
-    jobs = jobs_of(PROTOCOLS[name], 2, 0)
+    jobs = plan_jobs(PROTOCOLS[name], 2, 0)
     assert len(jobs) == 2 * len(PROTOCOLS[name].worlds)
     assert all(len({config.roving for config in job.variants.values()}) == 1 for job in jobs)
     sessions = {
@@ -273,7 +273,7 @@ def test_all_see_the_same_sets_and_paths_without_a_filter_are_what_they_say(
 
 
 def test_a_set_gives_the_same_whatever_ran_before(rows: list[dict[str, str]]) -> None:
-    again = results(jobs_of(PROTOCOLS["fox-fig4"], 2, 0, TINY)[1])
+    again = run_job(plan_jobs(PROTOCOLS["fox-fig4"], 2, 0, TINY)[1])
     before = [row for row in rows if row["set"] == "1"]
     assert [repr(one.values["told"]) for one in again] == [row["told"] for row in before]
     assert [repr(one.values["map_auc"]) for one in again] == [row["map_auc"] for row in before]
@@ -286,7 +286,7 @@ def test_an_interrupt_leaves_what_was_finished(tmp_path: Path, monkeypatch: pyte
         ]
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(ratslam.experiments.fox2012, "shared_out", interrupted)
+    monkeypatch.setattr(reproduction, "run_tasks", interrupted)
     text, stopped = reproduce("fox-fig4", tmp_path, sets=3, workers=1)
     assert stopped
     assert "1 of 3 sets" in text
