@@ -26,9 +26,9 @@ from robot.live.route import approach, checked, descent, routed, way, world
 from robot.live.selftest import reported, room, started
 from robot.live.whisk_loop import Handed, drive, free_whisks, go
 from robot.recordings.formats import RecordingConfig
-from robot.simulation.head.session import CELL_SIZE
 from robot.sources.source_info import SourceInfo
 from robot.world.head_trajectory import Path as Way
+from robot.world.maze import POSE_CELL_SIZE
 from robot.world.scene import maze_info
 from tactile.base.errors import InputError
 from tactile.features.calibration import Calibration, calibrated
@@ -128,7 +128,7 @@ def ordered(config: RunConfig, path: Way, calibration: Calibration, directory: P
         else mapped,
         SourceInfo(
             raw_whiskers=True,
-            cell_size=CELL_SIZE,
+            cell_size=POSE_CELL_SIZE,
             head=config.touch.head,
             calibration=calibration,
             maze=None if config.live.waypoints else maze_info(world(plan, head).maze, plan.maze, plan.seed),

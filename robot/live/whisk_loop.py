@@ -15,10 +15,10 @@ from robot.drivers.outcome import Fault, Outcome
 from robot.drivers.ur10.safety import Refused
 from robot.live.rig import TICK, Faulted, Rig
 from robot.live.route import Route
-from robot.simulation.head.session import MIDDLE
 from robot.sources.source import Sample
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Odometry
+from tactile.whiskers.whisking import MID_PROTRACTION
 
 LONGEST = 120.0
 """How long a way without whisks may take, s."""
@@ -177,9 +177,9 @@ def _whisk(rig: Rig, streak: Streak, number: int, mapper: Maps) -> Handed | None
         return None
     frames = rig.head.ring.between(first, last)
     start = streak.start + streak.since(number)
-    stamp = streak.start + streak.since(number + MIDDLE)
+    stamp = streak.start + streak.since(number + MID_PROTRACTION)
     odometry, truth = rig.odometer.told(
-        stamp, float(rig.clock.host(streak.device + streak.since(number + MIDDLE)))
+        stamp, float(rig.clock.host(streak.device + streak.since(number + MID_PROTRACTION)))
     )
     whole, slow = _whole(frames, first, last, rig.config.gap), mapper.behind() > rig.config.budget
     cut = cut_of(number, stamp, start, frames, odometry, seen=whole and not slow)

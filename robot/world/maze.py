@@ -20,6 +20,8 @@ THICK = 0.012
 """Thickness of walls and posts, m (as above)."""
 TALL = 0.05
 """Their height, m (as above)."""
+POSE_CELL_SIZE = 0.05
+"""Side length of a pose cell that suits these mazes, m."""
 
 Cell = tuple[int, int]
 

@@ -18,6 +18,9 @@ from tactile.base.errors import InputError
 from tactile.base.types import Array
 from tactile.whiskers.head_geometry import Head
 
+MID_PROTRACTION = 0.25
+"""Phase of a whisk (share of its period) at which its pose and time stamp are taken: mid-protraction."""
+
 
 class WhiskingConfig(Settings):
     """One whisker's drive."""

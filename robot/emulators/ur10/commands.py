@@ -8,46 +8,42 @@ nothing and is answered with yes), external sensors (55 to 57), contact detectio
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
+from robot.emulators.ur10.control_program import ControlProgram
 from robot.emulators.ur10.motion import ZERO
 from robot.emulators.ur10.rotation import composed, inverse, quaternion, rotated
 from robot.emulators.ur10.urscript_moves import MoveJ, MoveL, Servo, SpeedJ, SpeedL, StopL
 
-if TYPE_CHECKING:
-    from robot.emulators.ur10.control_program import Program
-
-REALTIME = frozenset([6, 9, 10, 11, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70, 71])
 SERVO_C_LAG = 0.1  # s
 
 
-def _move_j(p: Program) -> None:
+def _move_j(p: ControlProgram) -> None:
     p.move([MoveJ(p.vector(), p.number(6), p.number(7))], "movej")
 
 
-def _move_j_ik(p: Program) -> None:
+def _move_j_ik(p: ControlProgram) -> None:
     joints = p.controller.solved(p.vector(), p.arm.state.joints)
     p.move([MoveJ(joints, p.number(6), p.number(7))], "movej")
 
 
-def _move_l(p: Program) -> None:
+def _move_l(p: ControlProgram) -> None:
     p.controller.solved(p.vector(), p.arm.state.joints)
     p.move([MoveL(p.vector(), p.number(6), p.number(7))], "movel")
 
 
-def _move_l_fk(p: Program) -> None:
+def _move_l_fk(p: ControlProgram) -> None:
     p.move([MoveL(p.arm.model.forward(p.vector()), p.number(6), p.number(7))], "movel")
 
 
-def _servo_to_pose(lag: float | None) -> Callable[[Program], None]:
-    def do(p: Program) -> None:
+def _servo_to_pose(lag: float | None) -> Callable[[ControlProgram], None]:
+    def do(p: ControlProgram) -> None:
         joints = p.controller.solved(p.vector(), p.arm.state.joints)
         p.repeat(Servo(joints, p.number(9) if lag is None else lag), "servol")
 
     return do
 
 
-def _jog(p: Program) -> None:
+def _jog(p: ControlProgram) -> None:
     """At a speed in the base (0), the tool's frame now (1) or a frame of its own (2)."""
     frame = {1: p.arm.state.tcp, 2: p.vector(8)}.get(int(p.number(6)), ZERO)
     turn = quaternion(frame[3:])
@@ -55,15 +51,15 @@ def _jog(p: Program) -> None:
     p.repeat(SpeedL(speed, p.number(7)), "jog")
 
 
-def _inverse(near: bool) -> Callable[[Program], None]:
+def _inverse(near: bool) -> Callable[[ControlProgram], None]:
     return lambda p: p.put(p.controller.solved(p.vector(), p.vector(6) if near else p.arm.state.joints))
 
 
-def _solvable(p: Program) -> None:
+def _solvable(p: ControlProgram) -> None:
     p.result(int(p.controller.solvable(p.vector())))
 
 
-COMMANDS: dict[int, Callable[[Program], None]] = {
+COMMANDS: dict[int, Callable[[ControlProgram], None]] = {
     1: _move_j,
     2: _move_j_ik,
     3: _move_l,

@@ -10,18 +10,16 @@ Source: the interface described by ur_rtde 1.6.5 (its control script and its doc
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable, Mapping
 
-from robot.emulators.ur10.commands import COMMANDS, REALTIME
+from robot.emulators.ur10.arm import Arm
+from robot.emulators.ur10.controller import Controller, Program
 from robot.emulators.ur10.rotation import Vector6
 from robot.emulators.ur10.urscript_moves import Order, SpeedJ, StopJ, StopL, orders_in
 
-if TYPE_CHECKING:
-    from robot.emulators.ur10.arm import Arm
-    from robot.emulators.ur10.controller import Controller
-
 READY, DONE = 1, 2
+REALTIME = frozenset([6, 9, 10, 11, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70, 71])
+"""Commands that the program carries out at every control step."""
 IDLE, END = 0, 255
 RUNNING_BIT = 1 << 15
 
@@ -29,17 +27,19 @@ _PATH = re.compile(r"# inject move path\n(.*?)^\s*end\s*$", re.DOTALL | re.MULTI
 _OFFSET = re.compile(r"# int register offset\n\s*(\d+)")
 
 
-class Program:
-    """A control program that runs.
+class ControlProgram:
+    """The running control program of ur_rtde.
 
     Args:
-        controller: what it runs on. text: as uploaded.
+        controller: on which it runs. text: as uploaded. commands: the action of each command number; other
+            numbers are accepted and have no effect.
 
     Attributes:
         path: the moves that were uploaded with it. offset: its first register of either kind.
     """
 
-    def __init__(self, controller: Controller, text: str) -> None:
+    def __init__(self, controller: Controller, text: str, commands: Commands) -> None:
+        self._commands = commands
         offset = _OFFSET.search(text)
         path = _PATH.search(text)
         self.offset: int = int(offset[1]) if offset else 0
@@ -146,10 +146,9 @@ class Program:
         return self._registers.ints[self.offset + 1] == 1
 
     def _do(self, command: int) -> None:
-        """Carry out a command; one that is not known is accepted and does nothing."""
-        do: Callable[[Program], None] | None = COMMANDS.get(command)
-        if do is not None:
-            do(self)
+        action = self._commands.get(command)
+        if action is not None:
+            action(self)
 
     def _answer(self, word: int) -> None:
         self._registers.put_int(self.offset, word)
@@ -195,3 +194,13 @@ class Script:
         if self._answers:
             self._controller.registers.put_int(0, DONE)
         return False
+
+
+Commands = Mapping[int, Callable[[ControlProgram], None]]
+
+
+def load_program(commands: Commands, controller: Controller, text: str) -> Program:
+    """Starts uploaded program text on a controller: ur_rtde's control program, or any other script."""
+    if "def rtde_control" in text:
+        return ControlProgram(controller, text, commands)
+    return Script(controller, text)

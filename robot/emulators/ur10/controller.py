@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
 
 from robot.emulators.ur10.arm import Arm, size
 from robot.emulators.ur10.config import UrEmulatorConfig
-from robot.emulators.ur10.control_program import Program, Script
 from robot.emulators.ur10.motion import Unreachable
 from robot.emulators.ur10.registers import Registers
 from robot.emulators.ur10.rotation import Vector6
@@ -18,15 +17,24 @@ from robot.emulators.ur10.urscript_moves import MoveJ, MoveL, Order, Servo, Spee
 KEPT = 10_000  # orders remembered: what "state" tells within a control step or two
 
 
+class Program(Protocol):
+    """An uploaded program while it runs."""
+
+    def step(self) -> bool:
+        """Runs one control step; False when the program has ended."""
+        ...
+
+
 class Controller:
     """An emulated controller. `tick` is one control step; all else is what clients do to it between steps."""
 
-    def __init__(self, config: UrEmulatorConfig) -> None:
+    def __init__(self, config: UrEmulatorConfig, load_program: Callable[[Controller, str], Program]) -> None:
         self.config = config
+        self._load_program = load_program
         self.dt: float = 1 / config.hz
         self.arm: Arm = Arm(config)
         self.registers = Registers()
-        self.program: Program | Script | None = None
+        self.program: Program | None = None
         self.safety = SafetyMode.NORMAL
         self.robot_mode = RobotMode.RUNNING
         self.runtime = Runtime.STOPPED
@@ -84,7 +92,7 @@ class Controller:
         self._uploaded = None
         self.programs += 1
         self.runtime = Runtime.PLAYING
-        self.program = Program(self, text) if "def rtde_control" in text else Script(self, text)
+        self.program = self._load_program(self, text)
 
     def stop_program(self) -> None:
         """The program ends and the arm comes to rest."""

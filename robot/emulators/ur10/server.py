@@ -12,16 +12,14 @@ import socket
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Protocol
 
 from robot.drivers.process_priority import URGENT, ranked
 from robot.drivers.ur10.rtde_protocol import RTDE_PORT
-from robot.emulators.ur10.config import (
-    DASHBOARD_PORT,
-    FAULT_PORT,
-    SCRIPT_PORT,
-    UrEmulatorConfig,
-)
+from robot.emulators.ur10.commands import COMMANDS
+from robot.emulators.ur10.config import DASHBOARD_PORT, FAULT_PORT, SCRIPT_PORT, UrEmulatorConfig
+from robot.emulators.ur10.control_program import load_program
 from robot.emulators.ur10.controller import Controller
 from robot.emulators.ur10.dashboard_server import WELCOME, DashboardSession
 from robot.emulators.ur10.fault_server import Faults, FaultSession
@@ -68,7 +66,7 @@ class Server:
     """Four listening ports around one controller."""
 
     def __init__(self, config: UrEmulatorConfig) -> None:
-        self.controller = Controller(config)
+        self.controller = emulated_controller(config)
         self.claims = Claims()
         self.faults = Faults(self)
         self.clients: list[Connection] = []
@@ -161,6 +159,11 @@ class Server:
             connection.send(data)
         except OSError:
             self.close(connection)
+
+
+def emulated_controller(config: UrEmulatorConfig) -> Controller:
+    """A controller that runs the control program of ur_rtde."""
+    return Controller(config, partial(load_program, COMMANDS))
 
 
 def serve(config: UrEmulatorConfig) -> None:

@@ -22,7 +22,7 @@ from robot.sources.odometry import OdometryConfig, reckoned
 from robot.sources.simulated import STILL, Made, document_digest, placed
 from robot.sources.source_info import SimulationInfo, SourceInfo
 from robot.world.head_trajectory import MotionConfig, at
-from robot.world.maze import text
+from robot.world.maze import POSE_CELL_SIZE, text
 from robot.world.scene import KidnapConfig, MazeConfig, PathConfig, another, maze_info, scene
 from robot.world.walls import Surroundings
 from tactile.base.config import Settings
@@ -31,14 +31,10 @@ from tactile.base.random_streams import stream
 from tactile.base.types import Cycle, Whisk
 from tactile.features.calibration import Calibration, CalibrationConfig, calibrated
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
-from tactile.whiskers.whisking import WhiskingConfig, checked
+from tactile.whiskers.whisking import MID_PROTRACTION, WhiskingConfig, checked
 
-CELL_SIZE = 0.05
-"""Side of a pose cell that suits these mazes, m."""
 RAW = {"quasistatic": quasistatic, "dynamic": dynamic}
 """The tiers that make raw samples."""
-MIDDLE = 0.25
-"""Where in a cycle its sample belongs, as a share of it: the middle of the protraction."""
 
 
 class SimulationConfig(Settings):
@@ -126,7 +122,7 @@ class Simulation(Made):
         if count < 1:
             raise InputError("simulation.path", f"{self.scene.duration:.3g} s", "time for one whisk at least")
         self.start = np.arange(count) / whisking.rate
-        self.time = self.start + MIDDLE / whisking.rate
+        self.time = self.start + MID_PROTRACTION / whisking.rate
         pose = at(self.scene.path, self.time)
         self.truth = placed(pose)
         self.carried = np.zeros(count, bool)
@@ -147,7 +143,7 @@ class Simulation(Made):
         )
         self.info = SourceInfo(
             raw_whiskers=True,
-            cell_size=CELL_SIZE,
+            cell_size=POSE_CELL_SIZE,
             head=head_config,
             calibration=self.calibration,
             maze=maze_info(self.scene.maze, config.maze, config.seed),

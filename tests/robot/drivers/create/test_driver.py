@@ -177,8 +177,8 @@ def test_switched_off_while_driving(emulated: Emulated) -> None:
 
 DRIVES = """
 import sys, time
-from robot.create.driver import CreateDriver
-from robot.create.settings import CreateConfig
+from robot.drivers.create.driver import CreateDriver
+from robot.drivers.create.config import CreateConfig
 driver = CreateDriver(CreateConfig(port=sys.argv[1], patience=0.3))
 driver.start()
 while True:

@@ -17,8 +17,8 @@ from tests.robot.drivers.ur10.conftest import AWAY
 SESSION = """
 import sys, time
 import numpy as np
-from robot.ur10.arm import Arm
-from robot.ur10.settings import ArmConfig
+from robot.drivers.ur10.arm import Arm
+from robot.drivers.ur10.config import ArmConfig
 arm = Arm(ArmConfig(host=sys.argv[1]))
 arm.start()
 arm.move([float(number) for number in sys.argv[2:]])

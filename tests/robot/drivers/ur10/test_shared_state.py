@@ -13,7 +13,7 @@ from robot.drivers.ur10.shared_state import SLOTS, STATE, Board
 
 WRITER = """
 import sys, numpy as np
-from robot.ur10.states import STATE, Board
+from robot.drivers.ur10.shared_state import STATE, Board
 board = Board(sys.argv[1])
 state = np.zeros((), STATE)
 for k in range(1, int(sys.argv[2]) + 1):

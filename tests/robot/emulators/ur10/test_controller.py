@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 
 from robot.drivers.ur10 import rtde_protocol
 from robot.emulators.ur10.config import UrEmulatorConfig
-from robot.emulators.ur10.controller import Controller
 from robot.emulators.ur10.dashboard_server import DashboardSession
 from robot.emulators.ur10.rtde_server import Claims, RtdeSession
 from robot.emulators.ur10.safety import RobotMode, Runtime, SafetyMode
 from robot.emulators.ur10.script_server import ScriptSession
+from robot.emulators.ur10.server import emulated_controller
 
 PROGRAM = (
     "def rtde_control():\n    global reg_offset_int = # int register offset\n0\n"
@@ -31,7 +31,7 @@ class Bench:
     """A controller, its clock, and a client that writes registers as the library does."""
 
     def __init__(self, path: str = "", **settings: object) -> None:
-        self.controller = Controller(UrEmulatorConfig.model_validate(settings))
+        self.controller = emulated_controller(UrEmulatorConfig.model_validate(settings))
         self.host = 0.0
         self.script = ScriptSession(self.controller)
         self.dashboard = DashboardSession(self.controller)
@@ -311,7 +311,7 @@ def test_recipes_are_told_by_type_and_states_follow_them() -> None:
 
 def test_an_input_has_one_master() -> None:
     claims = Claims()
-    controller = Controller(UrEmulatorConfig())
+    controller = emulated_controller(UrEmulatorConfig())
     first, second = RtdeSession(controller, claims), RtdeSession(controller, claims)
     registers = ["input_int_register_0", "input_double_register_3"]
     assert reply(first, rtde_protocol.INPUTS, names(registers)) == b"\1INT32,DOUBLE"
@@ -332,7 +332,7 @@ def test_an_input_has_one_master() -> None:
 
 @given(data=st.lists(st.binary(max_size=60), max_size=8))
 def test_no_bytes_bring_a_session_down(data: list[bytes]) -> None:
-    controller = Controller(UrEmulatorConfig())
+    controller = emulated_controller(UrEmulatorConfig())
     for session in (
         RtdeSession(controller, Claims()),
         ScriptSession(controller),
@@ -358,7 +358,7 @@ def test_no_bytes_bring_a_session_down(data: list[bytes]) -> None:
     body=st.binary(max_size=40),
 )
 def test_no_body_brings_the_wire_down(kind: int, body: bytes) -> None:
-    session = RtdeSession(Controller(UrEmulatorConfig()), Claims())
+    session = RtdeSession(emulated_controller(UrEmulatorConfig()), Claims())
     with contextlib.suppress(ValueError):
         session.received(rtde_protocol.packed(kind, body), 0.0)
     session.state({})
