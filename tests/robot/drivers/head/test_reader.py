@@ -211,8 +211,9 @@ def test_a_thread_that_hangs_is_seen(head):
         held.set()
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_thread_that_dies_is_a_fault(head, reader):
+def test_a_thread_that_dies_is_a_fault(head, reader, monkeypatch):
+    monkeypatch.setattr(threading, "excepthook", lambda arguments: None)  # the error is expected
+
     def broken(frames, arrival):
         raise RuntimeError("a listener's bug")
 
