@@ -49,36 +49,36 @@ def add_commands(commands: Commands) -> None:
 def _live(arguments: argparse.Namespace) -> int:
     prepare_jax()
     from evaluation.metrics.scorecard import table
-    from ratslam.live.session import live
-    from robot.drivers.outcome import Outcome
+    from ratslam.live.session import run_live_session
+    from robot.drivers.outcome import SessionOutcome
 
     config, _ = _read_live_config(arguments, arguments.head)
     directory = run_directory(arguments)
     with _Monitor() as monitor:
-        ended, card = live(config, directory, _print, armed=monitor.start)
+        ended, card = run_live_session(config, directory, _print, armed=monitor.start)
     if card is not None:
         print(table(card))
         print(f"\n{directory}/map.png shows the map, `run {directory}/config.yaml` maps the recording again")
     _print(str(ended))
-    if ended.outcome is Outcome.INTERRUPTED:
+    if ended.outcome is SessionOutcome.INTERRUPTED:
         return INTERRUPTED
-    return 0 if ended.outcome is Outcome.COMPLETE else INPUT_ERROR
+    return 0 if ended.outcome is SessionOutcome.COMPLETE else INPUT_ERROR
 
 
 def _emulate(arguments: argparse.Namespace) -> int:
     config, session = _read_live_config(arguments, head_address=None)
-    from robot.live.emulator_config import controller, whiskers
+    from robot.live.emulator_config import arm_emulator_config, head_emulator_config
 
     head = config.touch.head
     try:
         if arguments.device == "ur10":
             from robot.emulators.ur10 import serve
 
-            serve(controller(session, head, arguments.host))
+            serve(arm_emulator_config(session, head, arguments.host))
         else:
             from robot.emulators.head import serve as serve_head
 
-            serve_head(whiskers(session, head, arguments.host))
+            serve_head(head_emulator_config(session, head, arguments.host))
     except KeyboardInterrupt:
         return INTERRUPTED
     return 0

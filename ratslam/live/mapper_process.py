@@ -24,18 +24,18 @@ import numpy as np
 
 from evaluation.metrics.scorecard import Scorecard
 from ratslam.config.run_config import RunConfig
-from robot.drivers.process_priority import PATIENT, ranked
+from robot.drivers.process_priority import BACKGROUND, set_niceness
 from robot.sources.source import Sample
 from robot.sources.source_info import SourceInfo
 from tactile.base.errors import InputError
 
 LOG = "mapper.log"
 """In the run directory: what the mapper's process had to say."""
-END = 120.0
+FINISH_TIMEOUT = 120.0
 """How long it may take to score and draw, s."""
 
 
-class Order(NamedTuple):
+class MappingJob(NamedTuple):
     """What is to be mapped.
 
     Attributes:
@@ -51,7 +51,7 @@ class Order(NamedTuple):
     rate_hz: float
 
 
-class Told(NamedTuple):
+class MappedSample(NamedTuple):
     """What a sample led to.
 
     Attributes:
@@ -76,11 +76,11 @@ class Mapper:
     def __init__(self, process: Any = None) -> None:
         context = multiprocessing.get_context("spawn")
         self._line, theirs = context.Pipe()
-        target = process or mapping
+        target = process or run_mapper
         self._process = context.Process(target=target, args=(theirs,), daemon=True, name="ratslam mapper")
         self._process.start()
         theirs.close()
-        self.told: list[Told] = []
+        self.mapped: list[MappedSample] = []
         self._ready, self._failed = False, ""
         self._refusal: InputError | None = None
         self._card: Scorecard | None = None
@@ -89,7 +89,7 @@ class Mapper:
         self._sender = Thread(target=self._send, daemon=True, name="to mapper")
         self._sender.start()
 
-    def begin(self, order: Order) -> None:
+    def begin(self, order: MappingJob) -> None:
         """Has it make its directory and compile; returns at once, `ready` tells when it is done."""
         self._outbox.put(order)
 
@@ -99,7 +99,7 @@ class Mapper:
         Raises:
             InputError: what it was ordered cannot be done, or it is no more.
         """
-        self.hear()
+        self.receive()
         if self._refusal is not None:
             raise self._refusal
         if not self.alive:
@@ -113,12 +113,14 @@ class Mapper:
 
     def behind(self) -> float:
         """For how long the oldest sample that is not mapped yet has waited, s."""
-        self.hear()
+        self.receive()
         return (
-            time.monotonic() - self._offered[len(self.told)] if len(self.told) < len(self._offered) else 0.0
+            time.monotonic() - self._offered[len(self.mapped)]
+            if len(self.mapped) < len(self._offered)
+            else 0.0
         )
 
-    def hear(self) -> None:
+    def receive(self) -> None:
         """Takes in what it has told."""
         try:
             while self._line.poll():
@@ -143,15 +145,15 @@ class Mapper:
             interrupted: whether there was more to come.
         """
         self._outbox.put(interrupted)
-        due = time.monotonic() + END
+        due = time.monotonic() + FINISH_TIMEOUT
         while self._card is None and self.alive and time.monotonic() < due:
             self._line.poll(0.05)
-            self.hear()
+            self.receive()
         return self._card
 
     def _take(self, word: Any) -> None:
-        if isinstance(word, Told):
-            self.told.append(word)
+        if isinstance(word, MappedSample):
+            self.mapped.append(word)
         elif isinstance(word, Scorecard):
             self._card = word
         elif isinstance(word, InputError):
@@ -184,7 +186,7 @@ class Mapper:
         self._line.close()
 
 
-class Fed:
+class PipeSource:
     """Samples as they come down a line, as a source.
 
     Attributes:
@@ -193,7 +195,7 @@ class Fed:
 
     name, digest, length = "live", "", None
 
-    def __init__(self, order: Order, line: Connection) -> None:
+    def __init__(self, order: MappingJob, line: Connection) -> None:
         self.rate_hz, self.view_shape, self.whiskers = order.rate_hz, order.view_shape, order.whiskers
         self.info = order.info
         self.interrupted = True  # unless the parent says otherwise
@@ -219,18 +221,18 @@ class Fed:
         return None
 
 
-def mapping(line: Connection) -> None:
+def run_mapper(line: Connection) -> None:
     """What the mapper's process does."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to hear
-    ranked(PATIENT)  # compiling takes every core there is
+    set_niceness(BACKGROUND)  # compiling takes every core there is
     try:
         _map(line)
     except InputError as error:
-        _tell(line, error)
+        _send(line, error)
     except EOFError:
         pass  # nobody wants it any more
     except Exception as error:
-        _tell(line, f"{type(error).__name__}: {error}")
+        _send(line, f"{type(error).__name__}: {error}")
         raise
 
 
@@ -241,11 +243,11 @@ def _map(line: Connection) -> None:
     from tactile.base.types import Odometry, observation
 
     order = line.recv()
-    with Fed(order, line) as fed:
+    with PipeSource(order, line) as fed:
         config = order.config.completed(fed)
         source = sensing(fed, config.touch)
         with playing(config, source, order.directory) as play:
-            _log(order.directory / LOG)
+            _redirect_stderr(order.directory / LOG)
             blank = observation(
                 Odometry(0.0, 0.0, 0.0, 0.0), view_shape=source.view_shape, whiskers=source.whiskers
             )
@@ -255,17 +257,19 @@ def _map(line: Connection) -> None:
                 (step,) = play.feed([sample])
                 action = Action(int(step.estimate.action)).name.lower()
                 took = time.monotonic() - fed.received
-                _tell(line, Told(number, np.asarray(step.pose), int(step.estimate.place), action, took))
+                _send(
+                    line, MappedSample(number, np.asarray(step.pose), int(step.estimate.place), action, took)
+                )
             if play.session.steps:
-                _tell(line, play.finish(fed.interrupted))
+                _send(line, play.finish(fed.interrupted))
 
 
-def _tell(line: Connection, word: Any) -> None:
+def _send(line: Connection, word: Any) -> None:
     with suppress(OSError):  # nobody listens: the results are for the disk
         line.send(word)
 
 
-def _log(path: Path) -> None:
+def _redirect_stderr(path: Path) -> None:
     """What the process prints, tracebacks included, goes to a file: the terminal is the parent's."""
     with path.open("ab") as file:
         os.dup2(file.fileno(), sys.stderr.fileno())

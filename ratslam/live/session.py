@@ -17,14 +17,14 @@ from tqdm import tqdm
 from evaluation.metrics.scorecard import Scorecard
 from ratslam.config.run_config import RunConfig
 from ratslam.core.session import CHUNK
-from ratslam.live.mapper_process import Mapper, Order
+from ratslam.live.mapper_process import Mapper, MappingJob
 from ratslam.pipeline.run import interrupts
-from robot.drivers.outcome import Fault, Outcome
-from robot.live.recorder import Journal
-from robot.live.rig import Faulted, Rig, Stopped
-from robot.live.route import approach, checked, descent, routed, way, world
-from robot.live.selftest import reported, room, started
-from robot.live.whisk_loop import Handed, drive, free_whisks, go
+from robot.drivers.outcome import Fault, SessionOutcome
+from robot.live.recorder import LiveRecorder
+from robot.live.rig import OperatorStop, Rig, SessionFault
+from robot.live.route import approach_route, check_targets, descent_route, main_route, plan_path, plan_scene
+from robot.live.selftest import check_disk, reported, start_and_check
+from robot.live.whisk_loop import WhiskReport, follow_route, record_free_whisks, run_whisk_loop
 from robot.recordings.formats import RecordingConfig
 from robot.sources.source_info import SourceInfo
 from robot.world.head_trajectory import Path as Way
@@ -37,11 +37,11 @@ from tactile.whiskers.head_geometry import ur10_head
 
 RECORDING, REPORT = "session.mcap", "live.json"
 """In the run directory: what was recorded, and how the session went."""
-LONGEST = 300.0
+START_TIMEOUT = 300.0
 """How long the mapper may take to be ready, compilation included, s."""
 
 
-class Ended(NamedTuple):
+class SessionEnd(NamedTuple):
     """How a session ended.
 
     Attributes:
@@ -52,25 +52,25 @@ class Ended(NamedTuple):
     report: dict[str, Any]
 
     @property
-    def outcome(self) -> Outcome:
+    def outcome(self) -> SessionOutcome:
         return self.fault.outcome
 
     def __str__(self) -> str:
         return str(self.fault)
 
 
-def live(
+def run_live_session(
     config: RunConfig,
     directory: Path,
     tell: Callable[[str], None],
     mapping: Callable[..., None] | None = None,
     armed: Callable[[Path], None] = lambda directory: None,
-) -> tuple[Ended, Scorecard | None]:
+) -> tuple[SessionEnd, Scorecard | None]:
     """Tests arm and head, makes the calibration, goes the way and maps; then scores.
 
     Args:
         directory: the new run directory. tell: is told a line at a time.
-        mapping: what the mapper's process does; None: `ratslam.live.mapper_process.mapping`. armed: is
+        mapping: what the mapper's process does; None: `ratslam.live.mapper_process.run_mapper`. armed: is
         told the
             directory when the session begins.
 
@@ -81,35 +81,35 @@ def live(
         InputError: why nothing was armed.
     """
     assert config.live is not None
-    path = way(config.live, ur10_head(config.touch.head))
-    checked(config.live, path)
+    path = plan_path(config.live, ur10_head(config.touch.head))
+    check_targets(config.live, path)
     if directory.exists():
         raise InputError(str(directory), "exists already", "a new run directory", "choose another with -o")
-    tell(room(config.live, directory))
-    handed: list[Handed] = []
+    tell(check_disk(config.live, directory))
+    handed: list[WhiskReport] = []
     with interrupts("stopping the arm") as stopped, Mapper(mapping) as mapper:
         with Rig(config.live, config.touch.head, stopped) as rig:
             try:
-                calibration = _calibrated(rig, config, path, tell)
-                order = ordered(config, path, calibration, directory)
-                _armed(rig, path, calibration, mapper, order, tell)
+                calibration = _calibrate(rig, config, path, tell)
+                order = mapping_job(config, path, calibration, directory)
+                _arm(rig, path, calibration, mapper, order, tell)
                 armed(directory)
-                with journal(order) as rig.journal:
-                    _driven(rig, path, mapper, handed)
-                fault = Fault(Outcome.COMPLETE, f"{len(handed)} whisks", time.monotonic())
-            except Faulted as error:
+                with open_recorder(order) as rig.recorder:
+                    _run(rig, path, mapper, handed)
+                fault = Fault(SessionOutcome.COMPLETE, f"{len(handed)} whisks", time.monotonic())
+            except SessionFault as error:
                 fault = error.fault
-            except Stopped:
-                fault = Fault(Outcome.INTERRUPTED, f"after {len(handed)} whisks", time.monotonic())
+            except OperatorStop:
+                fault = Fault(SessionOutcome.INTERRUPTED, f"after {len(handed)} whisks", time.monotonic())
             standing = rig.rest(fault.detail)
             report = _report(fault, rig, mapper, handed, standing)
-        card = mapper.finish(fault.outcome is not Outcome.COMPLETE) if handed else None
+        card = mapper.finish(fault.outcome is not SessionOutcome.COMPLETE) if handed else None
     with suppress(OSError):  # a full disk has been told
         (directory / REPORT).write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
-    return Ended(fault, report), card
+    return SessionEnd(fault, report), card
 
 
-def ordered(config: RunConfig, path: Way, calibration: Calibration, directory: Path) -> Order:
+def mapping_job(config: RunConfig, path: Way, calibration: Calibration, directory: Path) -> MappingJob:
     """What the mapper is to do, and what the recording says about the robot."""
     assert config.live is not None
     head = ur10_head(config.touch.head)
@@ -122,7 +122,7 @@ def ordered(config: RunConfig, path: Way, calibration: Calibration, directory: P
     recording = RecordingConfig(file=directory.resolve() / RECORDING)
     mapped = config.model_copy(update={"live": None, "recording": recording, "session": session})
     start = path.pose[0]
-    return Order(
+    return MappingJob(
         mapped.covering(float(np.abs(path.pose[:, :2] - start[:2]).max()))
         if config.backend == "grid"
         else mapped,
@@ -131,7 +131,9 @@ def ordered(config: RunConfig, path: Way, calibration: Calibration, directory: P
             cell_size=POSE_CELL_SIZE,
             head=config.touch.head,
             calibration=calibration,
-            maze=None if config.live.waypoints else maze_info(world(plan, head).maze, plan.maze, plan.seed),
+            maze=None
+            if config.live.waypoints
+            else maze_info(plan_scene(plan, head).maze, plan.maze, plan.seed),
             provenance={"live": config.live.model_dump(mode="json", exclude={"plan": {"maze": {"file"}}})},
         ),
         directory,
@@ -141,9 +143,9 @@ def ordered(config: RunConfig, path: Way, calibration: Calibration, directory: P
     )
 
 
-def journal(order: Order) -> Journal:
+def open_recorder(order: MappingJob) -> LiveRecorder:
     """What the session is recorded to."""
-    return Journal(
+    return LiveRecorder(
         order.directory / RECORDING,
         view_shape=order.view_shape,
         whiskers=order.whiskers,
@@ -152,51 +154,56 @@ def journal(order: Order) -> Journal:
     )
 
 
-def _calibrated(rig: Rig, config: RunConfig, path: Way, tell: Callable[[str], None]) -> Calibration:
+def _calibrate(rig: Rig, config: RunConfig, path: Way, tell: Callable[[str], None]) -> Calibration:
     """Tests everything, and whisks in free air above the start of the way."""
     plan = rig.config.plan
-    reported(started(rig), tell)
+    reported(start_and_check(rig), tell)
     tell("arm: going above the start of the way")
-    go(rig, approach(rig.config, path))
+    follow_route(rig, approach_route(rig.config, path))
     count = ceil(plan.calibration.shortest * plan.whisking.rate)
     tell(f"head: {count} whisks in free air")
     rig.driver.whisk(plan.whisking.model_copy(update={"mode": "open"}))
-    record = free_whisks(rig, count)
+    record = record_free_whisks(rig, count)
     return calibrated(plan.calibration, record, config.touch.contact.slope_window, "free whisking")
 
 
-def _armed(
-    rig: Rig, path: Way, calibration: Calibration, mapper: Mapper, order: Order, tell: Callable[[str], None]
+def _arm(
+    rig: Rig,
+    path: Way,
+    calibration: Calibration,
+    mapper: Mapper,
+    order: MappingJob,
+    tell: Callable[[str], None],
 ) -> None:
     """Has the mapper compile, then lets the head down and whisk as the session does."""
     tell("mapper: compiling")
     mapper.begin(order)
-    rig.until(mapper.ready, LONGEST, Outcome.MAPPER_GONE, "the mapper's start")
-    go(rig, descent(rig.config, path))
+    rig.wait_until(mapper.ready, START_TIMEOUT, SessionOutcome.MAPPER_GONE, "the mapper's start")
+    follow_route(rig, descent_route(rig.config, path))
     rig.driver.whisk(rig.config.plan.whisking, calibration.threshold[:, 1], calibration.mean[:, 1])
     tell("armed")
 
 
-def _driven(rig: Rig, path: Way, mapper: Mapper, handed: list[Handed]) -> None:
+def _run(rig: Rig, path: Way, mapper: Mapper, handed: list[WhiskReport]) -> None:
     rate = rig.config.plan.whisking.rate
     total = rig.config.whisks or ceil(path.duration * rate)
     rig.begin()
     with tqdm(total=total, unit="whisk", desc="live", file=sys.stderr, mininterval=0.5) as bar:
 
-        def tell(whisk: Handed) -> None:
+        def tell(whisk: WhiskReport) -> None:
             handed.append(whisk)
             bar.update()
             bar.set_postfix_str(_status(rig, mapper, handed), refresh=False)
 
         try:
-            drive(rig, routed(rig.config, path), mapper, tell)
-        except Faulted as error:
-            rig.note("fault", str(error.fault))
+            run_whisk_loop(rig, main_route(rig.config, path), mapper, tell)
+        except SessionFault as error:
+            rig.record_event("fault", str(error.fault))
             raise
 
 
-def _status(rig: Rig, mapper: Mapper, handed: list[Handed]) -> str:
-    told = mapper.told[-1] if mapper.told else None
+def _status(rig: Rig, mapper: Mapper, handed: list[WhiskReport]) -> str:
+    told = mapper.mapped[-1] if mapper.mapped else None
     place = "" if told is None or told.place < 0 else f", place {told.place}"
     took = "" if told is None else f"map {1e3 * told.seconds:.0f} ms{place}, "
     dropped = sum(not whisk.seen for whisk in handed)
@@ -204,7 +211,9 @@ def _status(rig: Rig, mapper: Mapper, handed: list[Handed]) -> str:
     return f"{took}late {1e3 * handed[-1].lateness:.0f} ms, {lost} samples lost, {dropped} images dropped"
 
 
-def _report(fault: Fault, rig: Rig, mapper: Mapper, handed: list[Handed], standing: bool) -> dict[str, Any]:
+def _report(
+    fault: Fault, rig: Rig, mapper: Mapper, handed: list[WhiskReport], standing: bool
+) -> dict[str, Any]:
     return {
         "outcome": fault.outcome.name.lower(),
         "detail": fault.detail,
@@ -212,14 +221,14 @@ def _report(fault: Fault, rig: Rig, mapper: Mapper, handed: list[Handed], standi
         "whisks": len(handed),
         "dropped": sum(not whisk.seen for whisk in handed),
         "missing": sum(whisk.missing for whisk in handed),
-        "lateness_s": _spread([whisk.lateness for whisk in handed]),
-        "state_age_s": _spread(rig.ages),
-        "mapper_s": _spread([told.seconds for told in mapper.told]),
+        "lateness_s": _quantiles([whisk.lateness for whisk in handed]),
+        "state_age_s": _quantiles(rig.state_ages),
+        "mapper_s": _quantiles([told.seconds for told in mapper.mapped]),
         "head": rig.head.decoder.counts._asdict() | {"stalls": rig.head.stalls},
     }
 
 
-def _spread(values: list[float]) -> dict[str, float]:
+def _quantiles(values: list[float]) -> dict[str, float]:
     """Median, 99 % and largest of what is finite; nothing of nothing."""
     known = np.array(values)[np.isfinite(values)]
     if not len(known):

@@ -17,22 +17,22 @@ from tactile.base.types import Array
 
 WINDOW = 30.0
 """How long pairs count, s."""
-SCALE = 200e-6
+MAX_DRIFT = 200e-6
 """How far a device's second can be from the host's, as a share: quartzes stay within half of it."""
-PIECE = 0.25
+SEGMENT = 0.25
 """s of device time that enter and leave the window together."""
-AHEAD = 0.1
+JUMP = 0.1
 """An arrival so much before the line, s, tells that the device's clock went forward by itself. Less is what a
 host that was busy for long leaves: its line is too late until something comes in time again."""
-EARLY = 0.1
+RESIDUAL_QUANTILE = 0.1
 """Share of arrivals that should come as fast as they can."""
-SETTLED = 1.0
+MIN_SPAN = 1.0
 """s of pairs from which on the line is trusted to tell it."""
 
 Point = tuple[float, float]
 
 
-class Line(NamedTuple):
+class ClockFit(NamedTuple):
     """host = arrival + scale (device - `device`).
 
     Attributes:
@@ -47,7 +47,7 @@ class Line(NamedTuple):
         return self.arrival + self.scale * (device - self.device)
 
 
-class Clock:
+class ClockSync:
     """The line through what was observed; a jump of the device's clock starts it anew.
 
     It depends on the observations alone. One thread may observe while others ask.
@@ -58,7 +58,7 @@ class Clock:
     """
 
     def __init__(self) -> None:
-        self.jumped = 0
+        self.jumps = 0
         self._lock = Lock()
         self._restart()
 
@@ -67,11 +67,11 @@ class Clock:
         device, arrival = float(device), float(arrival)
         with self._lock:
             if self._has_jumped(device, arrival):
-                self.jumped += 1
+                self.jumps += 1
                 self._restart()
             self._newest = device
-            if not self._pieces or device - self._pieces[-1].begin >= PIECE:
-                self._pieces.append(_Piece(device))
+            if not self._pieces or device - self._pieces[-1].begin >= SEGMENT:
+                self._pieces.append(_Segment(device))
                 while self._pieces[0].begin < device - WINDOW:
                     self._pieces.popleft()
                 self._pieces[-1].add(device, arrival)
@@ -81,7 +81,7 @@ class Clock:
                 if arrival < self._line.at(device):
                     self._line = self._edge()
 
-    def host(self, device: Array) -> Array:
+    def to_host(self, device: Array) -> Array:
         """The host's time, s, of a device's [...] s.
 
         Raises:
@@ -105,16 +105,16 @@ class Clock:
             return 0.0
         device, arrival = np.array(points).T
         late = arrival - line.at(device)
-        return float(np.quantile(late, EARLY))
+        return float(np.quantile(late, RESIDUAL_QUANTILE))
 
-    def _known(self) -> Line:
+    def _known(self) -> ClockFit:
         if not self._pieces:
             raise ValueError("a clock that has observed nothing")
         return self._line
 
     def _restart(self) -> None:
-        self._pieces: deque[_Piece] = deque()
-        self._line = Line(0.0, 0.0, 1.0)
+        self._pieces: deque[_Segment] = deque()
+        self._line = ClockFit(0.0, 0.0, 1.0)
         self._newest = -np.inf
 
     def _has_jumped(self, device: float, arrival: float) -> bool:
@@ -123,30 +123,30 @@ class Clock:
         if device < self._newest:
             return True
         # Late arrivals tell nothing: a busy host is late for as long as it is busy.
-        settled = device - self._pieces[0].begin >= SETTLED
-        return settled and arrival - self._line.at(device) < -AHEAD
+        settled = device - self._pieces[0].begin >= MIN_SPAN
+        return settled and arrival - self._line.at(device) < -JUMP
 
-    def _edge(self) -> Line:
+    def _edge(self) -> ClockFit:
         """The line below all points that comes closest to them: it passes under their middle along an edge of
         their hull, or touches it where the scale cannot be that of a clock."""
         corners: list[Point] = []
         for piece in self._pieces:
             for point in piece.hull:
-                _extend(corners, point)
+                _extend_hull(corners, point)
         middle = (corners[0][0] + corners[-1][0]) / 2
         right = next((k for k, (device, _) in enumerate(corners) if device > middle), 0)
         if not right:
-            return Line(*corners[0], 1.0)
+            return ClockFit(*corners[0], 1.0)
         (x0, y0), (x1, y1) = corners[right - 1], corners[right]
         scale = (y1 - y0) / (x1 - x0)
-        if abs(scale - 1) <= SCALE:
-            return Line(x0, y0, scale)
-        scale = 1 + float(np.clip(scale - 1, -SCALE, SCALE))
+        if abs(scale - 1) <= MAX_DRIFT:
+            return ClockFit(x0, y0, scale)
+        scale = 1 + float(np.clip(scale - 1, -MAX_DRIFT, MAX_DRIFT))
         touched = min(corners, key=lambda corner: corner[1] - y0 - scale * (corner[0] - x0))
-        return Line(*touched, scale)
+        return ClockFit(*touched, scale)
 
 
-class _Piece:
+class _Segment:
     """Pairs of a moment: all, and the lower hull of them."""
 
     def __init__(self, begin: float) -> None:
@@ -156,10 +156,10 @@ class _Piece:
 
     def add(self, device: float, arrival: float) -> None:
         self.points.append((device, arrival))
-        _extend(self.hull, (device, arrival))
+        _extend_hull(self.hull, (device, arrival))
 
 
-def _extend(hull: list[Point], point: Point) -> None:
+def _extend_hull(hull: list[Point], point: Point) -> None:
     """The lower hull with one more point, which is not left of any."""
     x, y = point
     if hull and hull[-1][0] == x:

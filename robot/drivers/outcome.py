@@ -6,7 +6,7 @@ from enum import Enum
 from typing import NamedTuple
 
 
-class Outcome(Enum):
+class SessionOutcome(Enum):
     """How a live session ended; the value says what to do."""
 
     COMPLETE = "nothing is left to do"
@@ -37,7 +37,7 @@ class Fault(NamedTuple):
         outcome: which end. detail: what was found, one sentence. time: s, host's monotonic clock.
     """
 
-    outcome: Outcome
+    outcome: SessionOutcome
     detail: str
     time: float
 

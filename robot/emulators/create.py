@@ -34,7 +34,7 @@ class CreateEmulatorConfig(Settings):
     """Of the garbage."""
 
 
-class Base(NamedTuple):
+class WheelState(NamedTuple):
     """Where the robot is, m and rad, and what its wheels have done: the way ahead, m, and the turn, rad."""
 
     x: float = 0.0
@@ -43,13 +43,13 @@ class Base(NamedTuple):
     travelled: float = 0.0
     turned: float = 0.0
 
-    def moved(self, right: float, left: float, wheel_base: float, seconds: float) -> Base:
+    def advance(self, right: float, left: float, wheel_base: float, seconds: float) -> WheelState:
         """After wheels of these speeds, m/s: an arc."""
         way, turn = (right + left) / 2 * seconds, (right - left) / wheel_base * seconds
         half = turn / 2
         chord = way * (math.sin(half) / half if half else 1.0)
         middle = self.heading + half
-        return Base(
+        return WheelState(
             self.x + chord * math.cos(middle),
             self.y + chord * math.sin(middle),
             self.heading + turn,
@@ -58,12 +58,12 @@ class Base(NamedTuple):
         )
 
 
-class Create:
+class EmulatedCreate:
     """The robot behind its line, in a time of its own: bytes in, bytes out."""
 
     def __init__(self, config: CreateEmulatorConfig) -> None:
         self.config = config
-        self.base, self.mode, self.bumps = Base(), Mode.OFF, Bumps(0)
+        self.base, self.mode, self.bumps = WheelState(), Mode.OFF, Bumps(0)
         self.right = self.left = 0
         self.time = 0.0
         self.drives: list[tuple[float, int, int]] = []  # every command that reached it: s, mm/s, mm/s
@@ -73,7 +73,7 @@ class Create:
 
     def advance(self, seconds: float) -> None:
         """Time goes by."""
-        self.base = self.base.moved(self.right / 1000, self.left / 1000, self.config.wheel_base, seconds)
+        self.base = self.base.advance(self.right / 1000, self.left / 1000, self.config.wheel_base, seconds)
         self.time += seconds
 
     def touch(self, bumps: Bumps, *, cliff: bool = False) -> None:
@@ -95,11 +95,11 @@ class Create:
             if len(self._begun) < length:
                 break
             command, self._begun = self._begun[:length], self._begun[length:]
-            reply = self._obeyed(command[0], command[1:])
+            reply = self._execute(command[0], command[1:])
             replies += [reply] if reply else []
         return replies
 
-    def _obeyed(self, opcode: int, data: bytes) -> bytes:
+    def _execute(self, opcode: int, data: bytes) -> bytes:
         if opcode == 128:
             self.mode, self.right, self.left = Mode.PASSIVE, 0, 0
         elif self.mode == Mode.OFF:
@@ -129,7 +129,7 @@ class Create:
         return bytes([{7: int(self.bumps), 35: int(self.mode)}.get(number, 0)])
 
 
-class Faults:
+class LineFaults:
     """What the line does to replies."""
 
     def __init__(self, seed: int) -> None:
@@ -137,7 +137,7 @@ class Faults:
         self.garbage, self.lose, self.trickle = 0, 0, 0.0
         self.cut: int | None = None
 
-    def disturbed(self, reply: bytes) -> bytes:
+    def disturb(self, reply: bytes) -> bytes:
         """The reply as it arrives."""
         if self.lose:
             self.lose -= 1
@@ -179,7 +179,9 @@ class Terminal:
             os.close(self._slave)
 
 
-def ordered(order: dict[str, Any], robot: Create, faults: Faults, terminal: Terminal) -> dict[str, Any]:
+def handle_request(
+    order: dict[str, Any], robot: EmulatedCreate, faults: LineFaults, terminal: Terminal
+) -> dict[str, Any]:
     """Does what a line on standard input says, and answers."""
     do = order.get("do")
     if do == "bump":
@@ -215,16 +217,16 @@ def ordered(order: dict[str, Any], robot: Create, faults: Faults, terminal: Term
     return {"ok": True}
 
 
-def _answered(line: bytes, *of: Any) -> dict[str, Any]:
+def _answer(line: bytes, *of: Any) -> dict[str, Any]:
     try:
-        return ordered(json.loads(line), *of)
+        return handle_request(json.loads(line), *of)
     except (ValueError, KeyError, AttributeError, TypeError) as error:
         return {"error": repr(error)}
 
 
 def serve(config: CreateEmulatorConfig) -> None:
     """Serves until it is killed."""
-    robot, faults, terminal = Create(config), Faults(config.seed), Terminal()
+    robot, faults, terminal = EmulatedCreate(config), LineFaults(config.seed), Terminal()
     print(terminal.path, flush=True)
     out: list[tuple[float, bytes]] = []  # when each piece is due
     orders, last, listening = b"", time.monotonic(), True
@@ -237,7 +239,7 @@ def serve(config: CreateEmulatorConfig) -> None:
         last = now
         if terminal.master in ready and terminal.plugged:
             for whole in robot.receive(os.read(terminal.master, 4096)):
-                reply = faults.disturbed(whole if terminal.in_tune() else faults.noise(whole))
+                reply = faults.disturb(whole if terminal.in_tune() else faults.noise(whole))
                 step = faults.trickle
                 pieces = [reply[i : i + 1] for i in range(len(reply))] if step else [reply]
                 start = max(now, out[-1][0] if out else now)
@@ -247,7 +249,7 @@ def serve(config: CreateEmulatorConfig) -> None:
             listening = bool(data)
             *lines, orders = (orders + data).split(b"\n")
             for line in filter(None, lines):
-                print(json.dumps(_answered(line, robot, faults, terminal)), flush=True)
+                print(json.dumps(_answer(line, robot, faults, terminal)), flush=True)
         while out and out[0][0] <= time.monotonic():
             piece = out.pop(0)[1]
             if terminal.plugged:

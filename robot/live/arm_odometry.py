@@ -6,18 +6,18 @@ from collections import deque
 
 import numpy as np
 
-from robot.drivers.ur10.base_transform import heading_of, pose_of
+from robot.drivers.ur10.base_transform import pose_from_tcp, tcp_heading
 from robot.live.config import LiveConfig
 from robot.sources.odometry import MID_HEADING, from_velocities, reckoned
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose, wrap
 from tactile.base.types import Odometry
 
-KEPT = 10.0
+HISTORY = 10.0
 """s of states that are kept."""
 
 
-class Odometer:
+class ArmOdometry:
     """Collects the arm's states by host time, and tells poses and motions from them."""
 
     def __init__(self, config: LiveConfig) -> None:
@@ -29,7 +29,7 @@ class Odometer:
     def add(self, time: np.ndarray, tcp: np.ndarray, speed: np.ndarray) -> None:
         """States [N], their times (s, host) and [N, 6] tool poses and their rates in the base."""
         self._states.extend(zip(time.tolist(), tcp, speed, strict=True))
-        while self._states and self._states[0][0] < self._states[-1][0] - KEPT:
+        while self._states and self._states[0][0] < self._states[-1][0] - HISTORY:
             self._states.popleft()
 
     def pose(self, time: float) -> np.ndarray:
@@ -37,7 +37,7 @@ class Odometer:
         times = np.array([state[0] for state in self._states])
         k = int(np.clip(np.searchsorted(times, time), 1, len(times) - 1)) if len(times) > 1 else 0
         pair = [self._states[max(k - 1, 0)], self._states[k]]
-        poses, _ = pose_of(self._config.arm.placing, np.stack([state[1] for state in pair]))
+        poses, _ = pose_from_tcp(self._config.arm.placing, np.stack([state[1] for state in pair]))
         span = pair[1][0] - pair[0][0]
         share = float(np.clip((time - pair[0][0]) / span, 0, 1)) if span > 0 else 0.0
         step = poses[1] - poses[0]
@@ -46,7 +46,7 @@ class Odometer:
         pose[2] = wrap(pose[2])
         return pose
 
-    def told(self, stamp: float, time: float) -> tuple[Odometry, np.ndarray]:
+    def step(self, stamp: float, time: float) -> tuple[Odometry, np.ndarray]:
         """The motion since this was last asked for, with the errors that the settings add, and the pose now.
 
         Args:
@@ -70,7 +70,7 @@ class Odometer:
         if not states:
             return self._pose[-1]
         _, tcp, speed = (np.array(column) for column in zip(*states, strict=True))
-        heading = heading_of(tcp)
+        heading = tcp_heading(tcp)
         c, s = np.cos(heading), np.sin(heading)
         forward, left = c * speed[:, 0] + s * speed[:, 1], -s * speed[:, 0] + c * speed[:, 1]
         times = np.array([0.0, took])

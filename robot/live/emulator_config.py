@@ -5,24 +5,24 @@ from __future__ import annotations
 import numpy as np
 
 from robot.drivers.head.address import Address
-from robot.drivers.ur10.base_transform import tcp_of
+from robot.drivers.ur10.base_transform import tcp_from_pose
 from robot.emulators.head.config import HeadEmulatorConfig
 from robot.emulators.ur10.config import UrEmulatorConfig
 from robot.live.config import LiveConfig
-from robot.live.route import way
+from robot.live.route import plan_path
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 
 
-def controller(config: LiveConfig, head: HeadConfig, host: str | None = None) -> UrEmulatorConfig:
+def arm_emulator_config(config: LiveConfig, head: HeadConfig, host: str | None = None) -> UrEmulatorConfig:
     """A controller at the session's address, or another one; its arm hangs above where the way begins."""
-    start = way(config, ur10_head(head)).pose[0]
-    start = tcp_of(config.arm.placing, start, config.lift / 2)
+    start = plan_path(config, ur10_head(head)).pose[0]
+    start = tcp_from_pose(config.arm.placing, start, config.lift / 2)
     return UrEmulatorConfig(
         host=host or config.arm.host, hz=config.arm.hz, start=tuple(np.asarray(start).tolist())
     )
 
 
-def whiskers(config: LiveConfig, head: HeadConfig, host: str | None = None) -> HeadEmulatorConfig:
+def head_emulator_config(config: LiveConfig, head: HeadConfig, host: str | None = None) -> HeadEmulatorConfig:
     """A head in the maze of the session's plan, carried by its arm."""
     where = Address.parse(config.head.address)
     plan = config.plan

@@ -16,20 +16,20 @@ from typing import Self
 
 import numpy as np
 
-from robot.drivers.head.cycle_assembly import KEPT, Cut, within
+from robot.drivers.head.cycle_assembly import MAX_FRAMES, Cut, select_frames
 from robot.drivers.head.decoder import Frames
-from robot.drivers.outcome import Fault, Outcome
+from robot.drivers.outcome import Fault, SessionOutcome
 from robot.recordings.cdr import encode_truth
 from robot.recordings.cdr_live import Event, encode_cut, encode_event, encode_frames, encode_states
 from robot.recordings.mcap_writer import Tape, Unwritable
 from robot.recordings.schemas import ARM, CUT, EVENT, FRAMES, TRUTH
 from robot.sources.source_info import SourceInfo
 
-GATHERED = 0.15
+BLOCK_TIME = 0.15
 """How long frames and states wait for others, s."""
 
 
-class Journal:
+class LiveRecorder:
     """Writes a session to a new recording; a context manager.
 
     Any thread may hand something in, and waits as long as the disk does. A disk that takes no more is told by
@@ -60,14 +60,14 @@ class Journal:
         self._frames: list[Frames] = []
         self._states: list[np.ndarray] = []
         self._arrival = self._since = -np.inf  # of the newest frames; of the oldest that waits
-        self._known = np.full(KEPT, -1, np.int64)  # sequences that were handed in
+        self._known = np.full(MAX_FRAMES, -1, np.int64)  # sequences that were handed in
 
     @property
     def count(self) -> int:
         """Whisks so far."""
         return self._tape.count
 
-    def frames(self, frames: Frames, arrival: float) -> None:
+    def add_frames(self, frames: Frames, arrival: float) -> None:
         """What the head sent, which came at that time, s. Frames known already are passed over."""
         with self._writing(arrival) as able:
             if able:
@@ -75,8 +75,8 @@ class Journal:
                 self._gather(frames)
                 self._waited(arrival)
 
-    def arm(self, states: np.ndarray) -> None:
-        """What the arm sent: states [N] (`robot.drivers.ur10.shared_state.STATE`), oldest first."""
+    def add_states(self, states: np.ndarray) -> None:
+        """What the arm sent: states [N] (`robot.drivers.ur10.shared_state.ARM_STATE`), oldest first."""
         if not len(states):
             return
         newest = float(states["host"][-1])
@@ -85,7 +85,7 @@ class Journal:
                 self._states.append(states.copy())
                 self._waited(newest)
 
-    def cut(self, cut: Cut, frames: Frames, truth: np.ndarray | None = None) -> None:
+    def add_whisk(self, cut: Cut, frames: Frames, truth: np.ndarray | None = None) -> None:
         """A whisk, at once.
 
         Args:
@@ -95,8 +95,8 @@ class Journal:
         Raises:
             ValueError: the frames are not those of the cut.
         """
-        mine = within(frames, cut.first, cut.last)
-        if cut.seen and not 0 < len(mine.sequence) == cut.frames <= KEPT:
+        mine = select_frames(frames, cut.first, cut.last)
+        if cut.seen and not 0 < len(mine.sequence) == cut.frames <= MAX_FRAMES:
             raise ValueError(f"{len(mine.sequence)} frames for a whisk of {cut.frames}")
         with self._writing(cut.time) as able:
             if able:
@@ -108,7 +108,7 @@ class Journal:
                 self._tape.append(CUT, cut.time, encode_cut(cut))
                 self._tape.flush()
 
-    def event(self, time: float, name: str, text: str) -> None:
+    def add_event(self, time: float, name: str, text: str) -> None:
         """Something that happened, at once.
 
         Args:
@@ -129,7 +129,7 @@ class Journal:
             self._tape.close()
 
     def _gather(self, frames: Frames) -> None:
-        place = frames.sequence % KEPT
+        place = frames.sequence % MAX_FRAMES
         new = self._known[place] != frames.sequence
         self._known[place] = frames.sequence
         if new.any():
@@ -139,7 +139,7 @@ class Journal:
         """Something was handed in at that time: perhaps others have waited long enough."""
         if self._since == -np.inf:
             self._since = time
-        elif time - self._since >= GATHERED:
+        elif time - self._since >= BLOCK_TIME:
             self._write()
             self._tape.flush()
 
@@ -160,7 +160,7 @@ class Journal:
             try:
                 yield self.fault is None
             except Unwritable as error:
-                self.fault = Fault(Outcome.DISK_FULL, str(error), time)
+                self.fault = Fault(SessionOutcome.DISK_FULL, str(error), time)
 
     def __enter__(self) -> Self:
         return self

@@ -10,31 +10,31 @@ from typing import Self
 
 import numpy as np
 
-from robot.drivers.clock_sync import Clock
+from robot.drivers.clock_sync import ClockSync
 from robot.drivers.head.decoder import Frames
 from robot.drivers.head.device import open_bridge
-from robot.drivers.head.protocol import Flag
-from robot.drivers.head.reader import Link, Reader
+from robot.drivers.head.protocol import FrameFlag
+from robot.drivers.head.reader import HeadReader, LinkState
 from robot.drivers.head.whisk_control import HeadDriver
-from robot.drivers.outcome import Fault, Outcome
+from robot.drivers.outcome import Fault, SessionOutcome
 from robot.drivers.ur10 import dashboard
 from robot.drivers.ur10.arm import Arm
-from robot.live.arm_odometry import Odometer
+from robot.live.arm_odometry import ArmOdometry
 from robot.live.config import LiveConfig
-from robot.live.recorder import Journal
+from robot.live.recorder import LiveRecorder
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 
 TICK = 0.01
 """s between two looks."""
-STANDS, SETTLED = 2.0, 0.3
+MAX_REST_TIME, REST_TIME = 2.0, 0.3
 """How long an arm that was stopped is looked at, s: at most, and until it has stood for so long. After a
 contact it stands, and then backs off."""
 
-UNEVEN = 2e-3
+MAX_CLOCK_STEP = 2e-3
 """By how much a head's clock may step against its count of samples, s."""
 
 
-class Faulted(Exception):
+class SessionFault(Exception):
     """What ends a session, raised by whoever looks."""
 
     def __init__(self, fault: Fault) -> None:
@@ -42,7 +42,7 @@ class Faulted(Exception):
         self.fault = fault
 
 
-class Stopped(Exception):
+class OperatorStop(Exception):
     """The operator wants it to end."""
 
 
@@ -62,7 +62,7 @@ class Rig:
         self.config, self.shape = config, ur10_head(head)
         whiskers = len(self.shape.length)
         self.arm = Arm(config.arm)
-        self.head = Reader(
+        self.head = HeadReader(
             lambda: open_bridge(config.head.address),
             whiskers,
             config.head,
@@ -70,14 +70,14 @@ class Rig:
             on_overload=self._overload,
         )
         self.driver = HeadDriver(self.head, self.shape)
-        self.clock, self.odometer = Clock(), Odometer(config)
+        self.clock, self.odometer = ClockSync(), ArmOdometry(config)
         self.epoch = time.monotonic()
-        self.ages: list[float] = []
-        self.starts: list[int] = []
+        self.state_ages: list[float] = []
+        self.whisk_starts: list[int] = []
         self.restarts = 0
-        self.journal: Journal | None = None
+        self.recorder: LiveRecorder | None = None
         self._stopped = stopped
-        self._arm_clock = Clock()
+        self._arm_clock = ClockSync()
         self._seen = 0
         self._ahead: float | None = None  # s, of the head's clock before its count
         self._uneven = 0.0
@@ -89,7 +89,7 @@ class Rig:
         """s of the session."""
         return time.monotonic() - self.epoch
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Takes in what both devices have sent, and raises what ends the session.
 
         Raises:
@@ -97,19 +97,21 @@ class Rig:
         """
         self._take_frames()
         self._take_states()
-        fault = self.arm.fault or self.head.fault or (self.journal and self.journal.fault)
+        fault = self.arm.fault or self.head.fault or (self.recorder and self.recorder.fault)
         if fault:
-            raise Faulted(fault)
-        for jumped, whose in ((self.clock.jumped, "head"), (self._arm_clock.jumped, "controller")):
+            raise SessionFault(fault)
+        for jumped, whose in ((self.clock.jumps, "head"), (self._arm_clock.jumps, "controller")):
             if jumped:
-                raise Faulted(Fault(Outcome.CLOCK_JUMPED, f"the {whose}'s clock jumped", time.monotonic()))
-        if self._uneven > UNEVEN:
+                raise SessionFault(
+                    Fault(SessionOutcome.CLOCK_JUMPED, f"the {whose}'s clock jumped", time.monotonic())
+                )
+        if self._uneven > MAX_CLOCK_STEP:
             detail = f"the head's clock is {self._uneven * 1e3:.1f} ms off its samples' count"
-            raise Faulted(Fault(Outcome.CLOCK_JUMPED, detail, time.monotonic()))
+            raise SessionFault(Fault(SessionOutcome.CLOCK_JUMPED, detail, time.monotonic()))
         if self._stopped():
-            raise Stopped
+            raise OperatorStop
 
-    def until(self, done: Callable[[], bool], longest: float, late: Outcome, what: str) -> None:
+    def wait_until(self, done: Callable[[], bool], longest: float, late: SessionOutcome, what: str) -> None:
         """Looks until it is done.
 
         Args:
@@ -121,14 +123,14 @@ class Rig:
         due = time.monotonic() + longest
         while not done():
             if time.monotonic() > due:
-                raise Faulted(Fault(late, f"{what} took more than {longest:g} s", time.monotonic()))
-            self.look()
+                raise SessionFault(Fault(late, f"{what} took more than {longest:g} s", time.monotonic()))
+            self.poll()
             time.sleep(TICK)
 
     def begin(self) -> None:
         """Counts the session's time from now."""
         self.epoch = time.monotonic()
-        self.ages = []
+        self.state_ages = []
 
     def rest(self, reason: str) -> bool:
         """Stops the arm, unless a fault has, and retracts the whiskers; whether the arm was seen to stand."""
@@ -136,38 +138,38 @@ class Rig:
             self.arm.halt(reason)
         self.driver.rest()
         began = stood = now = time.monotonic()
-        while now - stood < SETTLED and now - began < STANDS:
+        while now - stood < REST_TIME and now - began < MAX_REST_TIME:
             time.sleep(TICK)
             now = time.monotonic()
             if not self.arm.still() and self.arm.age() <= self.config.arm.stale:
                 stood = now
         return self.arm.still()
 
-    def note(self, name: str, text: str) -> None:
+    def record_event(self, name: str, text: str) -> None:
         """Keeps with the recording that something happened."""
-        if self.journal is not None:
-            self.journal.event(self.now(), name, text)
+        if self.recorder is not None:
+            self.recorder.add_event(self.now(), name, text)
 
     @property
     def streaming(self) -> bool:
         """Whether samples come."""
-        return self.head.state.link is Link.STREAMING
+        return self.head.state.link is LinkState.STREAMING
 
     def _take_frames(self) -> None:
         while not self._blocks.empty():
             block = self._blocks.get()
             if block is None:  # a head was found: its clock may be another one
-                self.clock, self.starts = Clock(), []
+                self.clock, self.whisk_starts = ClockSync(), []
                 self.restarts += 1
                 self._ahead = None
                 continue
             frames, arrival = block
             self.clock.observe(float(frames.time.max()) * 1e-6, arrival)
             self._count(frames)
-            begins = (frames.flags & np.uint8(Flag.CYCLE)) > 0
-            self.starts += frames.sequence[begins].tolist()
-            if self.journal is not None:
-                self.journal.frames(frames, arrival - self.epoch)
+            begins = (frames.flags & np.uint8(FrameFlag.CYCLE)) > 0
+            self.whisk_starts += frames.sequence[begins].tolist()
+            if self.recorder is not None:
+                self.recorder.add_frames(frames, arrival - self.epoch)
 
     def _count(self, frames: Frames) -> None:
         """Holds the head's clock against its count of samples: they agree, whatever the host does."""
@@ -179,20 +181,20 @@ class Rig:
 
     def _take_states(self) -> None:
         states = self.arm.states(self._seen)
-        self.ages.append(self.arm.age())
+        self.state_ages.append(self.arm.age())
         if not len(states):
             return
         self._seen = int(states["counter"][-1])
         for robot, host in zip(states["robot"].tolist(), states["host"].tolist(), strict=True):
             self._arm_clock.observe(robot, host)
-        times = np.asarray(self._arm_clock.host(states["robot"]))
+        times = np.asarray(self._arm_clock.to_host(states["robot"]))
         self.odometer.add(times, states["tcp"], states["speed"])
-        if self.journal is not None:
+        if self.recorder is not None:
             states["host"] -= self.epoch
-            self.journal.arm(states)
+            self.recorder.add_states(states)
 
     def _overload(self, whisker: int) -> None:
-        self.arm.fail(Outcome.CONTACT, f"whisker {whisker} is bent as far as it can be")
+        self.arm.fail(SessionOutcome.CONTACT, f"whisker {whisker} is bent as far as it can be")
 
     def __enter__(self) -> Self:
         return self
@@ -201,6 +203,6 @@ class Rig:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if kind is KeyboardInterrupt:  # asked twice: the second way, at once
-            dashboard.stop(self.config.arm.host)
+            dashboard.stop_program(self.config.arm.host)
         self.arm.close()
         self.head.close()

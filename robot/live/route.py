@@ -6,9 +6,9 @@ from typing import Protocol
 
 import numpy as np
 
-from robot.drivers.ur10.base_transform import tcp_of
-from robot.drivers.ur10.safety import Refused
-from robot.drivers.ur10.safety import checked as allowed
+from robot.drivers.ur10.base_transform import tcp_from_pose
+from robot.drivers.ur10.safety import TargetRefused
+from robot.drivers.ur10.safety import check_target as allowed
 from robot.live.config import LiveConfig
 from robot.simulation.head.session import SimulationConfig
 from robot.world.head_trajectory import Path
@@ -17,7 +17,7 @@ from tactile.base.errors import InputError
 from tactile.whiskers.head_geometry import Head
 
 
-class Moves(Protocol):
+class MovableArm(Protocol):
     """The part of `robot.drivers.ur10.arm.Arm` that a route needs."""
 
     def move(self, tcp: np.ndarray, speed: float | None = None) -> object: ...
@@ -35,7 +35,7 @@ class Route:
     def length(self) -> int:
         return len(self.targets)
 
-    def advance(self, arm: Moves) -> bool:
+    def advance(self, arm: MovableArm) -> bool:
         """Sends the next target if the arm has arrived; whether it has arrived at the last one.
 
         Raises:
@@ -49,20 +49,20 @@ class Route:
         self.sent += 1
         return False
 
-    def again(self) -> None:
+    def resend_last(self) -> None:
         """Sends the last target once more, after the arm was stopped on its way."""
         self.sent = max(self.sent - 1, 0)
 
 
-def way(config: LiveConfig, head: Head) -> Path:
+def plan_path(config: LiveConfig, head: Head) -> Path:
     """The poses of the head in the map, in time if nothing holds it up.
 
     Raises:
         InputError: there is no such way, or it leads nowhere.
     """
     if config.waypoints:
-        return _along(config)
-    made = world(config.plan, head)
+        return _waypoint_path(config)
+    made = plan_scene(config.plan, head)
     if len(made.jumps):
         raise InputError(
             "live.plan.kidnaps", "a head that is carried", "0: an arm cannot be", "leave them out"
@@ -71,7 +71,7 @@ def way(config: LiveConfig, head: Head) -> Path:
     return Path(made.path.time[keep], made.path.pose[keep])
 
 
-def world(plan: SimulationConfig, head: Head) -> Scene:
+def plan_scene(plan: SimulationConfig, head: Head) -> Scene:
     """The maze of a plan and the path in it.
 
     Raises:
@@ -80,7 +80,7 @@ def world(plan: SimulationConfig, head: Head) -> Scene:
     return scene(plan.maze, plan.path, plan.motion, plan.kidnaps, head, plan.seed)
 
 
-def _along(config: LiveConfig) -> Path:
+def _waypoint_path(config: LiveConfig) -> Path:
     pose = np.array(config.waypoints)
     pose[:, 2] = np.unwrap(np.radians(pose[:, 2]))
     if len(pose) < 2:
@@ -91,39 +91,39 @@ def _along(config: LiveConfig) -> Path:
     return Path(np.concatenate([[0.0], np.cumsum(took)]), pose)
 
 
-def routed(config: LiveConfig, path: Path) -> Route:
+def main_route(config: LiveConfig, path: Path) -> Route:
     """The route along a way, without its first pose, where it starts."""
-    return Route(tcp_of(config.arm.placing, path.pose[1:]), speed_of(config))
+    return Route(tcp_from_pose(config.arm.placing, path.pose[1:]), route_speed(config))
 
 
-def approach(config: LiveConfig, path: Path) -> Route:
+def approach_route(config: LiveConfig, path: Path) -> Route:
     """From wherever the arm stands to above the first pose."""
-    return Route(tcp_of(config.arm.placing, path.pose[:1], config.lift), speed_of(config))
+    return Route(tcp_from_pose(config.arm.placing, path.pose[:1], config.lift), route_speed(config))
 
 
-def descent(config: LiveConfig, path: Path) -> Route:
+def descent_route(config: LiveConfig, path: Path) -> Route:
     """From there down to it."""
-    return Route(tcp_of(config.arm.placing, path.pose[:1]), speed_of(config))
+    return Route(tcp_from_pose(config.arm.placing, path.pose[:1]), route_speed(config))
 
 
-def checked(config: LiveConfig, path: Path) -> None:
+def check_targets(config: LiveConfig, path: Path) -> None:
     """Asks for every target whether the arm may go there, before it goes anywhere.
 
     Raises:
         InputError: it may not go to one; says to which and why.
     """
-    routes = approach(config, path), descent(config, path), routed(config, path)
+    routes = approach_route(config, path), descent_route(config, path), main_route(config, path)
     targets = np.concatenate([route.targets for route in routes])
     before = targets[0]
     for target in targets:
         try:
             allowed(config.arm, target, before)
-        except Refused as error:
+        except TargetRefused as error:
             where = "live.waypoints" if config.waypoints else "live.plan.path"
             raise InputError(where, str(error), cure="move them, or `live.arm.placing`") from None
         before = target
 
 
-def speed_of(config: LiveConfig) -> float:
+def route_speed(config: LiveConfig) -> float:
     """m/s, of the plan or what the arm may do, whichever is less."""
     return min(config.plan.motion.speed, config.arm.speed)

@@ -8,18 +8,18 @@ from pathlib import Path
 
 import numpy as np
 
-from robot.drivers.outcome import Outcome
+from robot.drivers.outcome import SessionOutcome
 from robot.live.config import LiveConfig
 from robot.live.rig import Rig
 from tactile.base.errors import InputError
 
-LISTENED = 1.5
+LISTEN_TIME = 1.5
 """How long both streams are listened to, s."""
-LEAST = 0.9
+MIN_RATE_SHARE = 0.9
 """Share of its nominal rate that a stream must have."""
 
 
-def room(config: LiveConfig, directory: Path) -> str:
+def check_disk(config: LiveConfig, directory: Path) -> str:
     """How much room the disk has.
 
     Raises:
@@ -35,12 +35,12 @@ def room(config: LiveConfig, directory: Path) -> str:
     return f"disk: {free / 1e9:.0f} GB free"
 
 
-def started(rig: Rig) -> Iterator[str]:
+def start_and_check(rig: Rig) -> Iterator[str]:
     """Starts both devices and listens to them; a line for each thing that is as it should be.
 
     Raises:
         InputError: one is not; says what and what to do.
-        robot.live.rig.Faulted, robot.live.rig.Stopped.
+        robot.live.rig.SessionFault, robot.live.rig.OperatorStop.
     """
     rig.head.start()
     identity = rig.head.identity
@@ -49,29 +49,32 @@ def started(rig: Rig) -> Iterator[str]:
     rig.arm.start()
     yield f"arm: {rig.config.arm.host}, admitted, states at {rig.config.arm.hz} Hz"
     before = rig.head.decoder.counts
-    _listened(rig)
+    _listen(rig)
     after = rig.head.decoder.counts
-    rate = (after.good - before.good) / LISTENED
-    if rate < LEAST * identity.rate:
+    rate = (after.good - before.good) / LISTEN_TIME
+    if rate < MIN_RATE_SHARE * identity.rate:
         raise InputError(
             "head", f"{rate:.0f} of {identity.rate:g} samples a second", "", "look at the USB hub and cable"
         )
     if after.bad > before.bad:
         raise InputError(
-            "head", f"{after.bad - before.bad} damaged samples in {LISTENED:g} s", "none", "change the cable"
+            "head",
+            f"{after.bad - before.bad} damaged samples in {LISTEN_TIME:g} s",
+            "none",
+            "change the cable",
         )
     if rig.clock.residual > rig.config.residual:
         found = f"its clock is known to {rig.clock.residual * 1e3:.1f} ms"
         raise InputError(
             "head", found, f"{rig.config.residual * 1e3:g} ms", "look at what else this machine does"
         )
-    age = float(np.median(rig.ages[-100:]))
+    age = float(np.median(rig.state_ages[-100:]))
     yield f"clocks: head {rig.clock.residual * 1e3:.1f} ms, newest state {age * 1e3:.0f} ms old"
 
 
-def _listened(rig: Rig) -> None:
-    end = rig.now() + LISTENED
-    rig.until(lambda: rig.now() >= end, LISTENED + 5.0, Outcome.HEAD_SILENT, "the self-test")
+def _listen(rig: Rig) -> None:
+    end = rig.now() + LISTEN_TIME
+    rig.wait_until(lambda: rig.now() >= end, LISTEN_TIME + 5.0, SessionOutcome.HEAD_SILENT, "the self-test")
 
 
 def reported(lines: Iterator[str], tell: Callable[[str], None]) -> None:

@@ -9,22 +9,22 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from robot.drivers.head.cycle_assembly import assembled, cut_of
+from robot.drivers.head.cycle_assembly import assemble_cycle, make_cut
 from robot.drivers.head.decoder import Frames
-from robot.drivers.outcome import Fault, Outcome
-from robot.drivers.ur10.safety import Refused
-from robot.live.rig import TICK, Faulted, Rig
+from robot.drivers.outcome import Fault, SessionOutcome
+from robot.drivers.ur10.safety import TargetRefused
+from robot.live.rig import TICK, Rig, SessionFault
 from robot.live.route import Route
 from robot.sources.source import Sample
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Odometry
 from tactile.whiskers.whisking import MID_PROTRACTION
 
-LONGEST = 120.0
+MAX_ROUTE_TIME = 120.0
 """How long a way without whisks may take, s."""
 
 
-class Maps(Protocol):
+class AsyncMapper(Protocol):
     """Whoever makes a map of samples, without being waited for."""
 
     @property
@@ -46,7 +46,7 @@ class Maps(Protocol):
         ...
 
 
-class Handed(NamedTuple):
+class WhiskReport(NamedTuple):
     """A whisk that was handed on.
 
     Attributes:
@@ -60,7 +60,7 @@ class Handed(NamedTuple):
     missing: int
 
 
-class Streak(NamedTuple):
+class WhiskSequence(NamedTuple):
     """Whisks one right after the other, by the head's own clock.
 
     Attributes:
@@ -75,32 +75,32 @@ class Streak(NamedTuple):
     samples: int
     period: float
 
-    def span(self, number: int) -> tuple[int, int]:
+    def frame_range(self, number: int) -> tuple[int, int]:
         """Sequences of a whisk's first and last frame."""
         first = self.first + (number - self.number) * self.samples
         return first, first + self.samples - 1
 
-    def since(self, number: float) -> float:
+    def start_of(self, number: float) -> float:
         """s since it began, of a whisk or a moment in one."""
         return (number - self.number) * self.period
 
 
-def drive(rig: Rig, route: Route, mapper: Maps, tell: Callable[[Handed], None]) -> None:
+def run_whisk_loop(rig: Rig, route: Route, mapper: AsyncMapper, tell: Callable[[WhiskReport], None]) -> None:
     """Goes the route, and hands on every whisk; ends with the whisk in which it arrives.
 
     While the head sends nothing, the arm stands.
 
     Raises:
-        robot.live.rig.Faulted: something ends it early. robot.live.rig.Stopped: the operator does.
+        robot.live.rig.SessionFault: something ends it early. robot.live.rig.OperatorStop: the operator does.
     """
     number, most = 0, rig.config.whisks
     arrived = False
     while not arrived and number != most:
-        streak, life = next_streak(rig, number), rig.restarts
+        sequence, life = next_sequence(rig, number), rig.restarts
         while rig.streaming and rig.restarts == life:
-            _look(rig, mapper)
-            arrived = arrived or _advanced(rig, route)
-            handed = _whisk(rig, streak, number, mapper)
+            _poll(rig, mapper)
+            arrived = arrived or _advance(rig, route)
+            handed = _hand_on(rig, sequence, number, mapper)
             if handed is None:
                 time.sleep(TICK)
                 continue
@@ -109,26 +109,26 @@ def drive(rig: Rig, route: Route, mapper: Maps, tell: Callable[[Handed], None]) 
             if arrived or number == most:
                 break
         else:
-            hold(rig, route)
+            wait_for_head(rig, route)
 
 
-def go(rig: Rig, route: Route) -> None:
+def follow_route(rig: Rig, route: Route) -> None:
     """Goes a route without whisking for anybody."""
-    rig.until(lambda: _advanced(rig, route), LONGEST, Outcome.NOT_ARRIVED, "the way")
+    rig.wait_until(lambda: _advance(rig, route), MAX_ROUTE_TIME, SessionOutcome.NOT_ARRIVED, "the way")
 
 
-def hold(rig: Rig, route: Route) -> None:
+def wait_for_head(rig: Rig, route: Route) -> None:
     """Stands until the head is back."""
     rig.arm.halt("the head sends nothing")
-    rig.note("held", "the head sends nothing")
+    rig.record_event("held", "the head sends nothing")
     # How long it is waited for is the reader's to say: it makes a fault of it.
-    rig.until(lambda: rig.streaming, float("inf"), Outcome.HEAD_GONE, "the head")
-    rig.note("resumed", "the head is back")
-    route.again()
+    rig.wait_until(lambda: rig.streaming, float("inf"), SessionOutcome.HEAD_GONE, "the head")
+    rig.record_event("resumed", "the head is back")
+    route.resend_last()
 
 
-def next_streak(rig: Rig, number: int) -> Streak:
-    """The streak that begins with the next whisk.
+def next_sequence(rig: Rig, number: int) -> WhiskSequence:
+    """The sequence that begins with the next whisk.
 
     Raises:
         InputError: the head makes no whole number of samples a whisk, or begins no whisk.
@@ -138,83 +138,87 @@ def next_streak(rig: Rig, number: int) -> Streak:
     count = rig.head.identity.rate / rate
     if abs(count - round(count)) > 1e-6:
         raise InputError("live.plan.whisking.rate", f"{count:g} samples a whisk", "a whole number of samples")
-    rig.look()  # what a head that was away has sent since may be waiting
-    known, life = len(rig.starts), rig.restarts
+    rig.poll()  # what a head that was away has sent since may be waiting
+    known, life = len(rig.whisk_starts), rig.restarts
 
     def begun() -> int | None:
         """The first frame of the first whisk to begin from now on, which may be that of a head found anew."""
-        return next(iter(rig.starts[known if rig.restarts == life else 0 :]), None)
+        return next(iter(rig.whisk_starts[known if rig.restarts == life else 0 :]), None)
 
     longest = rig.config.head.patience + 2 / rate + 1.0
-    rig.until(lambda: begun() is not None, longest, Outcome.HEAD_SILENT, "the beginning of a whisk")
+    rig.wait_until(
+        lambda: begun() is not None, longest, SessionOutcome.HEAD_SILENT, "the beginning of a whisk"
+    )
     first = begun()
     assert first is not None
     device = float(rig.head.ring.between(first, first).time[0]) * 1e-6
-    start = float(rig.clock.host(device)) - rig.epoch
-    return Streak(number, first, device, start, round(count), 1 / rate)
+    start = float(rig.clock.to_host(device)) - rig.epoch
+    return WhiskSequence(number, first, device, start, round(count), 1 / rate)
 
 
-def free_whisks(rig: Rig, count: int) -> list[Cycle]:
+def record_free_whisks(rig: Rig, count: int) -> list[Cycle]:
     """Whisks in free air, as they are, for the calibration."""
-    streak = next_streak(rig, 0)
+    sequence = next_sequence(rig, 0)
     record = []
     for number in range(count):
-        first, last = streak.span(number)
-        rig.until(partial(_complete, rig, last), 3 * streak.period + 1.0, Outcome.HEAD_SILENT, "a whisk")
+        first, last = sequence.frame_range(number)
+        rig.wait_until(
+            partial(_has_arrived, rig, last), 3 * sequence.period + 1.0, SessionOutcome.HEAD_SILENT, "a whisk"
+        )
         frames = rig.head.ring.between(first, last)
-        begin = streak.since(number)
-        cut = cut_of(number, begin, begin, frames, Odometry(0.0, 0.0, 0.0, 0.0))
-        record.append(assembled(frames, cut))
+        begin = sequence.start_of(number)
+        cut = make_cut(number, begin, begin, frames, Odometry(0.0, 0.0, 0.0, 0.0))
+        record.append(assemble_cycle(frames, cut))
     return record
 
 
-def _whisk(rig: Rig, streak: Streak, number: int, mapper: Maps) -> Handed | None:
+def _hand_on(rig: Rig, sequence: WhiskSequence, number: int, mapper: AsyncMapper) -> WhiskReport | None:
     """Hands on a whisk that is over, complete or waited for long enough; None while it is neither."""
-    first, last = streak.span(number)
-    due = float(rig.clock.host(streak.device + streak.since(number + 1)))
+    first, last = sequence.frame_range(number)
+    due = float(rig.clock.to_host(sequence.device + sequence.start_of(number + 1)))
     now = time.monotonic()
-    if not _complete(rig, last) and now < due + rig.config.grace:
+    if not _has_arrived(rig, last) and now < due + rig.config.grace:
         return None
     frames = rig.head.ring.between(first, last)
-    start = streak.start + streak.since(number)
-    stamp = streak.start + streak.since(number + MID_PROTRACTION)
-    odometry, truth = rig.odometer.told(
-        stamp, float(rig.clock.host(streak.device + streak.since(number + MID_PROTRACTION)))
+    start = sequence.start + sequence.start_of(number)
+    stamp = sequence.start + sequence.start_of(number + MID_PROTRACTION)
+    odometry, truth = rig.odometer.step(
+        stamp, float(rig.clock.to_host(sequence.device + sequence.start_of(number + MID_PROTRACTION)))
     )
-    whole, slow = _whole(frames, first, last, rig.config.gap), mapper.behind() > rig.config.budget
-    cut = cut_of(number, stamp, start, frames, odometry, seen=whole and not slow)
+    whole, slow = _is_complete(frames, first, last, rig.config.gap), mapper.behind() > rig.config.budget
+    cut = make_cut(number, stamp, start, frames, odometry, seen=whole and not slow)
     if not cut.seen:
-        rig.note(
+        rig.record_event(
             "dropped", f"whisk {number}: " + ("the mapper is behind" if whole else "samples are missing")
         )
-    if rig.journal is not None:
-        rig.journal.cut(cut, frames, truth)
-    mapper.offer(Sample(stamp, assembled(frames, cut), truth))
-    return Handed(number, time.monotonic() - due, cut.seen, streak.samples - len(frames.sequence))
+    if rig.recorder is not None:
+        rig.recorder.add_whisk(cut, frames, truth)
+    mapper.offer(Sample(stamp, assemble_cycle(frames, cut), truth))
+    return WhiskReport(number, time.monotonic() - due, cut.seen, sequence.samples - len(frames.sequence))
 
 
-def _advanced(rig: Rig, route: Route) -> bool:
+def _advance(rig: Rig, route: Route) -> bool:
     """Whether the arm has arrived at the end of the route; if at a target, it is sent to the next one."""
     try:
         return route.advance(rig.arm)
-    except Refused as error:  # for what ends it anyway, or for the target
-        fault = rig.arm.fault or Fault(Outcome.OUT_OF_BOX, str(error), time.monotonic())
-        raise Faulted(fault) from error
+    except TargetRefused as error:  # for what ends it anyway, or for the target
+        fault = rig.arm.fault or Fault(SessionOutcome.OUT_OF_BOX, str(error), time.monotonic())
+        raise SessionFault(fault) from error
 
 
-def _look(rig: Rig, mapper: Maps) -> None:
-    rig.look()
+def _poll(rig: Rig, mapper: AsyncMapper) -> None:
+    rig.poll()
     if not mapper.alive:
-        raise Faulted(Fault(Outcome.MAPPER_GONE, mapper.failure, time.monotonic()))
+        raise SessionFault(Fault(SessionOutcome.MAPPER_GONE, mapper.failure, time.monotonic()))
 
 
-def _complete(rig: Rig, last: int) -> bool:
+def _has_arrived(rig: Rig, last: int) -> bool:
     """Whether that sample has come, or a later one."""
     newest = rig.head.ring.newest
     return newest is not None and newest[0] >= last
 
 
-def _whole(frames: Frames, first: int, last: int, gap: int) -> bool:
+def _is_complete(frames: Frames, first: int, last: int, gap: int) -> bool:
     """Whether fewer than so many samples are missing anywhere on end, and their times are as even."""
     known = np.concatenate([[first - 1], frames.sequence, [last + 1]])
     step = np.diff(frames.time)

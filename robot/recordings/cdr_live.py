@@ -15,7 +15,7 @@ import numpy as np
 from robot.drivers.head.cycle_assembly import Cut
 from robot.drivers.head.decoder import Frames
 from robot.drivers.head.protocol import CHANNELS
-from robot.drivers.ur10.shared_state import STATE
+from robot.drivers.ur10.shared_state import ARM_STATE
 from robot.recordings.cdr import CDR, MOST, Malformed
 from tactile.base.types import Odometry
 
@@ -79,7 +79,7 @@ def decode_frames(message: bytes, whiskers: int) -> tuple[float, Frames]:
 
 
 def encode_states(states: np.ndarray) -> bytes:
-    """A block of arm states [N] (`robot.drivers.ur10.shared_state.STATE`), at least one."""
+    """A block of arm states [N] (`robot.drivers.ur10.shared_state.ARM_STATE`), at least one."""
     count = len(states)
     numbers = np.concatenate([states[name].reshape(count, -1) for name in NUMBERS], axis=1)
     words = np.stack([states[name].astype("<i4") for name in WORDS])
@@ -105,17 +105,17 @@ def decode_states(message: bytes) -> tuple[float, np.ndarray]:
     width = fields.size()
     words = fields.array("<i4", width * count).reshape(width, count)
     fields.end()
-    if width != len(WORDS) or rows != sum(STATE[name].itemsize // 8 for name in NUMBERS):
+    if width != len(WORDS) or rows != sum(ARM_STATE[name].itemsize // 8 for name in NUMBERS):
         raise Malformed(f"arm states of {rows} numbers and {width} words")
-    states = np.zeros(count, STATE)
+    states = np.zeros(count, ARM_STATE)
     states["counter"] = counter
     row = 0
     for name in NUMBERS:
-        wide = STATE[name].itemsize // 8
+        wide = ARM_STATE[name].itemsize // 8
         states[name] = numbers[row : row + wide].T.reshape(states[name].shape)
         row += wide
     for name, word in zip(WORDS, words, strict=True):
-        states[name] = word.astype(STATE[name])
+        states[name] = word.astype(ARM_STATE[name])
     return time, states
 
 

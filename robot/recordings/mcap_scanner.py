@@ -16,7 +16,7 @@ import numpy as np
 from mcap.exceptions import EndOfFile
 from mcap.records import Channel, Message, Metadata, Schema, Statistics
 
-from robot.drivers.head.cycle_assembly import Window, assembled, no_frames
+from robot.drivers.head.cycle_assembly import FrameWindow, assemble_cycle, empty_frames
 from robot.drivers.head.decoder import Frames
 from robot.recordings.cdr import MOST, Malformed, decode, decode_truth
 from robot.recordings.cdr_live import Event, decode_cut, decode_event, decode_frames, decode_states
@@ -113,7 +113,7 @@ class Walk:
         self.broken = "it was not read to its end"
         self.count = 0
         self._number = 0  # of the next message; a truth has its reading's
-        self._window: Window | None = None
+        self._window: FrameWindow | None = None
 
     def __iter__(self) -> Iterator[Sample]:
         return (entry.content for entry in self.entries() if isinstance(entry.content, Sample))
@@ -175,7 +175,7 @@ class Walk:
             time, reading = decode(name, message, self.description.view_shape, self.description.whiskers)
             return Sample(time, reading, where)
         cut = decode_cut(message)
-        return Sample(cut.time, assembled(self._frames.between(cut.first, cut.last), cut), where)
+        return Sample(cut.time, assemble_cycle(self._frames.between(cut.first, cut.last), cut), where)
 
     def _block(self, name: str, message: bytes) -> tuple[float, Frames | np.ndarray | Event]:
         assert self.description is not None
@@ -189,10 +189,10 @@ class Walk:
         return event.time, event
 
     @property
-    def _frames(self) -> Window:
+    def _frames(self) -> FrameWindow:
         if self._window is None:
             assert self.description is not None
-            self._window = Window(no_frames(self.description.whiskers))
+            self._window = FrameWindow(empty_frames(self.description.whiskers))
         return self._window
 
     def _compare(self, statistics: Statistics, names: Mapping[int, str]) -> None:

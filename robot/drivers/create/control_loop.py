@@ -9,16 +9,16 @@ from typing import NamedTuple
 
 from robot.drivers.create import protocol
 from robot.drivers.create.config import CreateConfig
-from robot.drivers.create.odometry import Odometer
-from robot.drivers.create.serial_link import Counts, Garbled, Link, Silent, Unplugged
-from robot.drivers.create.stop_reasons import Halt, Halted, Refused, objection, wheels
+from robot.drivers.create.odometry import CreateOdometry
+from robot.drivers.create.serial_link import BadReply, LinkCounts, NoReply, SerialLink, Unplugged
+from robot.drivers.create.stop_reasons import CommandRefused, StopEvent, StopReason, stop_reason, wheel_speeds
 from tactile.base.types import Odometry
 
 PAUSE = 0.03
 """s between commands that change the mode; within 20 ms of one the robot may miss the next."""
 
 
-class Asked(NamedTuple):
+class WheelCommand(NamedTuple):
     """What the wheels are asked for, mm/s, and when, s."""
 
     right: int
@@ -26,7 +26,7 @@ class Asked(NamedTuple):
     time: float
 
 
-class Pilot:
+class ControlLoop:
     """Reads, objects, drives: in this order, so that wheels never turn on what was not just looked at.
 
     One thread polls; others may `steer`, `take` and `release` at any time.
@@ -37,19 +37,19 @@ class Pilot:
         clock: s, monotonic.
     """
 
-    def __init__(self, config: CreateConfig, link: Link, clock: Callable[[], float]) -> None:
+    def __init__(self, config: CreateConfig, link: SerialLink, clock: Callable[[], float]) -> None:
         self._config, self._link, self._clock = config, link, clock
         self._lock = threading.Lock()
-        self._asked = Asked(0, 0, -math.inf)
+        self._asked = WheelCommand(0, 0, -math.inf)
         self._heard = clock()
-        self._odometer = Odometer(self._heard)
+        self._odometer = CreateOdometry(self._heard)
         self._owed = 0  # when last asked
         self._rearm, self._deaf = False, -math.inf
-        self.halted: Halted | None = None
-        self.sensed: protocol.Sensed | None = None
+        self.halted: StopEvent | None = None
+        self.sensed: protocol.SensorReply | None = None
 
     @property
-    def counts(self) -> Counts:
+    def counts(self) -> LinkCounts:
         """What became of the queries so far."""
         return self._link.counts
 
@@ -59,11 +59,11 @@ class Pilot:
         Raises:
             Refused: over the cap, not finite, or something has stopped it and was not released.
         """
-        right, left = wheels(self._config, forward, turn)
+        right, left = wheel_speeds(self._config, forward, turn)
         with self._lock:
             if self.halted and (right or left):
-                raise Refused(f"it was stopped, {self.halted}")
-            self._asked = Asked(right, left, self._clock())
+                raise CommandRefused(f"it was stopped, {self.halted}")
+            self._asked = WheelCommand(right, left, self._clock())
 
     def release(self) -> None:
         """Lets it be driven again after something stopped it; it stands until it is told to drive.
@@ -72,15 +72,15 @@ class Pilot:
             Refused: the port or the guard is gone; that takes a new driver.
         """
         with self._lock:
-            if self.halted and self.halted.halt in (Halt.UNPLUGGED, Halt.UNGUARDED):
-                raise Refused(f"cannot go on, {self.halted}")
+            if self.halted and self.halted.halt in (StopReason.UNPLUGGED, StopReason.UNGUARDED):
+                raise CommandRefused(f"cannot go on, {self.halted}")
             self._rearm = self.halted is not None
             self.halted = None
 
-    def take(self) -> Odometry:
+    def take_odometry(self) -> Odometry:
         """Motion since the last time it was taken."""
         with self._lock:
-            return self._odometer.take()
+            return self._odometer.take_odometry()
 
     def gap(self) -> bool:
         """Whether, since this was last asked, a reply was lost, and perhaps the motion it told."""
@@ -88,11 +88,11 @@ class Pilot:
             before, self._owed = self._owed, self._link.counts.owed
             return self._owed > before
 
-    def halt(self, halt: Halt, detail: str) -> None:
+    def halt(self, halt: StopReason, detail: str) -> None:
         """Stops it, at the latest with the next poll, until it is released. The first reason stays."""
         with self._lock:
-            self._asked = Asked(0, 0, -math.inf)
-            self.halted = self.halted or Halted(halt, detail, self._clock())
+            self._asked = WheelCommand(0, 0, -math.inf)
+            self.halted = self.halted or StopEvent(halt, detail, self._clock())
 
     def poll(self) -> None:
         """Reads, and tells the wheels what is allowed."""
@@ -105,22 +105,22 @@ class Pilot:
                 return
             found = self._read()
             asked = self._asked  # another thread may put a new one: what is looked at is what is sent
-            objected = objection(found, asked.right, asked.left) if found else None
+            objected = stop_reason(found, asked.right, asked.left) if found else None
             if objected:
                 self.halt(*objected)
             fresh = self._clock() - asked.time <= self._config.patience
             drives = fresh and self.halted is None
             self._link.send(protocol.drive(asked.right, asked.left) if drives else protocol.STOP)
         except Unplugged as error:
-            self.halt(Halt.UNPLUGGED, str(error))
+            self.halt(StopReason.UNPLUGGED, str(error))
 
-    def _read(self) -> protocol.Sensed | None:
+    def _read(self) -> protocol.SensorReply | None:
         try:
             found = self._link.ask(self._clock() - self._heard)
-        except (Silent, Garbled) as error:
+        except (NoReply, BadReply) as error:
             since = self._clock() - self._heard
             if since >= self._config.silence:
-                halt = Halt.SILENT if isinstance(error, Silent) else Halt.GARBLED
+                halt = StopReason.SILENT if isinstance(error, NoReply) else StopReason.GARBLED
                 self.halt(halt, f"{error} for {since:.2f} s")
             return None
         with self._lock:

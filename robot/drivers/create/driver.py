@@ -10,10 +10,10 @@ from typing import Self
 
 from robot.drivers.create import protocol
 from robot.drivers.create.config import CreateConfig
-from robot.drivers.create.control_loop import PAUSE, Pilot
-from robot.drivers.create.serial_link import Counts, Garbled, Link, Silent, Unplugged, open_port
-from robot.drivers.create.stop_reasons import Halt, Halted, Refused
-from robot.drivers.create.watchdog import Guard
+from robot.drivers.create.control_loop import PAUSE, ControlLoop
+from robot.drivers.create.serial_link import BadReply, LinkCounts, NoReply, SerialLink, Unplugged, open_port
+from robot.drivers.create.stop_reasons import CommandRefused, StopEvent, StopReason
+from robot.drivers.create.watchdog import Watchdog
 from tactile.base.errors import InputError
 from tactile.base.types import Odometry
 
@@ -38,9 +38,9 @@ class CreateDriver:
 
     def __init__(self, config: CreateConfig) -> None:
         self.config = config
-        self._pilot: Pilot | None = None
-        self._link: Link | None = None
-        self._guard: Guard | None = None
+        self._pilot: ControlLoop | None = None
+        self._link: SerialLink | None = None
+        self._guard: Watchdog | None = None
         self._thread: threading.Thread | None = None
         self._ending, self._wake, self._polled = (threading.Event() for _ in range(3))
 
@@ -52,11 +52,11 @@ class CreateDriver:
         """
         if self._link is not None:
             raise ValueError("a driver starts once")
-        self._link = Link(open_port(self.config.port))
+        self._link = SerialLink(open_port(self.config.port))
         try:
-            self._guard = Guard(self.config.port, self.config.patience)
-            self._rouse(self._link)
-            self._pilot = Pilot(self.config, self._link, time.monotonic)
+            self._guard = Watchdog(self.config.port, self.config.patience)
+            self._wake_up(self._link)
+            self._pilot = ControlLoop(self.config, self._link, time.monotonic)
         except BaseException:
             self.close()
             raise
@@ -69,12 +69,12 @@ class CreateDriver:
         Raises:
             Refused: a wheel over the cap, not finite, not started, or stopped by something not released.
         """
-        self._flown().steer(forward, turn)
+        self._running_loop().steer(forward, turn)
         self._wake.set()
 
     def stop(self) -> None:
         """Stops the wheels; when it returns, that was sent."""
-        self._flown().steer(0.0, 0.0)
+        self._running_loop().steer(0.0, 0.0)
         self._next_poll()
 
     def release(self) -> None:
@@ -83,31 +83,31 @@ class CreateDriver:
         Raises:
             Refused: nothing but a new driver can help.
         """
-        self._flown().release()
+        self._running_loop().release()
         self._next_poll()
 
     def odometry(self) -> Odometry:
         """Motion since the last call, up to the last reading; plain floats, the turn not wrapped."""
-        return self._flown().take()
+        return self._running_loop().take_odometry()
 
     def gap(self) -> bool:
         """Whether readings were lost since the last call: then some motion may be missing in the odometry."""
-        return self._flown().gap()
+        return self._running_loop().gap()
 
     @property
-    def halted(self) -> Halted | None:
+    def halted(self) -> StopEvent | None:
         """What stopped it, until it is released."""
         return self._pilot.halted if self._pilot else None
 
     @property
-    def sensed(self) -> protocol.Sensed | None:
+    def sensed(self) -> protocol.SensorReply | None:
         """The last reading."""
         return self._pilot.sensed if self._pilot else None
 
     @property
-    def counts(self) -> Counts:
+    def counts(self) -> LinkCounts:
         """What became of the queries so far."""
-        return self._link.counts if self._link else Counts()
+        return self._link.counts if self._link else LinkCounts()
 
     def close(self) -> None:
         """Stops the wheels, leaves safe mode, gives the port back. May be called more than once."""
@@ -133,12 +133,12 @@ class CreateDriver:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _flown(self) -> Pilot:
+    def _running_loop(self) -> ControlLoop:
         if self._pilot is None:
-            raise Refused("the driver is not started")
+            raise CommandRefused("the driver is not started")
         return self._pilot
 
-    def _rouse(self, link: Link) -> None:
+    def _wake_up(self, link: SerialLink) -> None:
         """Brings it into safe mode and clears its counters."""
         port = self.config.port
         found, last = None, ""
@@ -150,7 +150,7 @@ class CreateDriver:
                 try:
                     found = link.ask(math.inf)
                     break
-                except (Silent, Garbled) as error:
+                except (NoReply, BadReply) as error:
                     last = str(error)
         except Unplugged as error:
             last = str(error)
@@ -164,7 +164,7 @@ class CreateDriver:
         if found.bumps & protocol.Bumps.DROPPED or found.mode != protocol.Mode.SAFE:
             raise NotSafe(
                 port,
-                f"the Create stays in {found.mode.name.lower()} mode, {protocol.named(found.bumps)}",
+                f"the Create stays in {found.mode.name.lower()} mode, {protocol.describe_bumps(found.bumps)}",
                 "safe mode",
                 "set it on all its wheels, away from edges, and unplug its charger",
             )
@@ -178,14 +178,14 @@ class CreateDriver:
                 due = time.monotonic() + 1 / self.config.rate
                 pilot.poll()
                 self._polled.set()
-                if pilot.halted and pilot.halted.halt is Halt.UNPLUGGED:
+                if pilot.halted and pilot.halted.halt is StopReason.UNPLUGGED:
                     return
                 if not guard.beat():
-                    pilot.halt(Halt.UNGUARDED, "its guard does not hear")
+                    pilot.halt(StopReason.UNGUARDED, "its guard does not hear")
                 self._wake.wait(max(0.0, due - time.monotonic()))
                 self._wake.clear()
         finally:  # whatever ended it, nobody drives on; the guard stops the wheels
-            pilot.halt(Halt.UNGUARDED, "the thread that reads it has ended")
+            pilot.halt(StopReason.UNGUARDED, "the thread that reads it has ended")
 
     def _next_poll(self) -> None:
         """Waits until a poll has begun and ended after now."""

@@ -11,7 +11,7 @@ import math
 from tactile.base.types import Odometry
 
 
-class Odometer:
+class CreateOdometry:
     """Adds readings up until they are taken.
 
     Args:
@@ -32,7 +32,7 @@ class Odometer:
         self._degrees += degrees
         self._time = time
 
-    def take(self) -> Odometry:
+    def take_odometry(self) -> Odometry:
         """Motion since the last time it was taken; dt ends at the last reading. The turn is not wrapped."""
         told = Odometry(self._x, self._y, math.radians(self._degrees), self._time - self._taken)
         self._taken, self._x, self._y, self._degrees = self._time, 0.0, 0.0, 0

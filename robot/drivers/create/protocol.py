@@ -27,9 +27,9 @@ _WHEELS = struct.Struct(">Bhh")
 
 TURN_PER_SECOND = 222
 """Degrees: both wheels at `TOP_SPEED`, opposed."""
-GRACE = 0.1
+MAX_DELAY = 0.1
 """s of motion that a reply may tell beyond the time that has passed: it stood in a buffer on its way."""
-SLACK = 5
+NUDGE = 5
 """mm or degrees that a reply may tell of a robot that stands: it was nudged."""
 
 
@@ -57,7 +57,7 @@ class Bumps(IntFlag):
     DROPPED = DROPPED_RIGHT | DROPPED_LEFT | DROPPED_CASTER
 
 
-class Sensed(NamedTuple):
+class SensorReply(NamedTuple):
     """One reply. Distance and angle are what was driven since the reply before: reading clears them.
 
     Attributes:
@@ -82,7 +82,7 @@ STOP_ANYHOW = bytes(4) + STOP
 """Stops also after a command that broke off: the zeros are what it lacked, and by themselves mean nothing."""
 
 
-def sensed(data: bytes, elapsed: float) -> Sensed | None:
+def parse_reply(data: bytes, elapsed: float) -> SensorReply | None:
     """The reply, or None if no Create says so.
 
     Args:
@@ -91,16 +91,16 @@ def sensed(data: bytes, elapsed: float) -> Sensed | None:
     if len(data) != REPLY.size:
         return None
     millimetres, degrees, bumps, mode = REPLY.unpack(data)
-    time = elapsed + GRACE
+    time = elapsed + MAX_DELAY
     believable = (
         mode in (Mode.PASSIVE, Mode.SAFE, Mode.FULL)
         and bumps <= Bumps.BUMPED | Bumps.DROPPED
-        and abs(millimetres) <= TOP_SPEED * time + SLACK
-        and abs(degrees) <= TURN_PER_SECOND * time + SLACK
+        and abs(millimetres) <= TOP_SPEED * time + NUDGE
+        and abs(degrees) <= TURN_PER_SECOND * time + NUDGE
     )
-    return Sensed(millimetres, degrees, Bumps(bumps), Mode(mode)) if believable else None
+    return SensorReply(millimetres, degrees, Bumps(bumps), Mode(mode)) if believable else None
 
 
-def named(bumps: Bumps) -> str:
+def describe_bumps(bumps: Bumps) -> str:
     """Bumps and drops in words."""
     return " and ".join(str(bump.name).lower().replace("_", " ") for bump in bumps) or "nothing touched"

@@ -24,15 +24,15 @@ class Unplugged(Exception):
     """The port has gone."""
 
 
-class Silent(Exception):
+class NoReply(Exception):
     """No reply came."""
 
 
-class Garbled(Exception):
+class BadReply(Exception):
     """Something came that no Create says."""
 
 
-class Port(Protocol):
+class SerialPort(Protocol):
     """What is used of a `serial.Serial`."""
 
     timeout: float | None
@@ -44,7 +44,7 @@ class Port(Protocol):
     def close(self) -> None: ...
 
 
-class Counts(NamedTuple):
+class LinkCounts(NamedTuple):
     """What became of the queries.
 
     Attributes:
@@ -64,7 +64,7 @@ class Counts(NamedTuple):
         return self.lost - self.late
 
 
-def open_port(name: str, *, exclusive: bool = True) -> Port:
+def open_port(name: str, *, exclusive: bool = True) -> SerialPort:
     """The serial port, at the Create's speed.
 
     Raises:
@@ -78,13 +78,13 @@ def open_port(name: str, *, exclusive: bool = True) -> Port:
     # Without `exclusive` pyserial never asks for a lock; False would be refused on Windows.
     options = {"exclusive": True} if exclusive else {}
     try:
-        port: Port = serial.Serial(name, protocol.BAUD, timeout=ANSWER, write_timeout=ANSWER, **options)
+        port: SerialPort = serial.Serial(name, protocol.BAUD, timeout=ANSWER, write_timeout=ANSWER, **options)
     except OSError as error:
-        raise _explained(name, error) from None
+        raise _explain(name, error) from None
     return port
 
 
-def _explained(name: str, error: OSError) -> NoPort:
+def _explain(name: str, error: OSError) -> NoPort:
     """The error in words. pyserial tells most causes in its text alone."""
     cause = error.errno or getattr(error.__context__, "errno", None)
     if cause == errno.ENOENT:
@@ -99,35 +99,35 @@ def _explained(name: str, error: OSError) -> NoPort:
     return NoPort(name, f"cannot be opened ({error})", "a serial port")
 
 
-def _replies(data: bytes, elapsed: float, most: int) -> list[protocol.Sensed]:
+def _replies(data: bytes, elapsed: float, most: int) -> list[protocol.SensorReply]:
     """All of the bytes as replies, oldest first, the last `most`; or else the end of them as one, or none."""
     size = protocol.REPLY.size
-    pieces = [protocol.sensed(data[i : i + size], elapsed) for i in range(0, len(data), size)]
+    pieces = [protocol.parse_reply(data[i : i + size], elapsed) for i in range(0, len(data), size)]
     believed = [piece for piece in pieces if piece is not None]
     if len(believed) == len(pieces):
         return believed[-most:]
-    last = protocol.sensed(data[-size:], elapsed)
+    last = protocol.parse_reply(data[-size:], elapsed)
     return [] if last is None else [last]
 
 
-class Link:
+class SerialLink:
     """Query and reply.
 
     Replies carry no mark, and a reply clears what it tells. So one that comes after it was given up is
     added to the next, and of a disturbed one the end is looked at: noise mostly stands before it.
     """
 
-    def __init__(self, port: Port) -> None:
+    def __init__(self, port: SerialPort) -> None:
         self._port = port
-        self._early = (0, 0)
-        self.counts = Counts()
+        self._late_motion = (0, 0)
+        self.counts = LinkCounts()
 
     def send(self, command: bytes) -> None:
         """Writes a whole command."""
         with self._attached():
             self._port.write(command)
 
-    def ask(self, elapsed: float) -> protocol.Sensed:
+    def ask(self, elapsed: float) -> protocol.SensorReply:
         """What is sensed now.
 
         Args:
@@ -142,14 +142,14 @@ class Link:
             self._port.write(protocol.QUERY)
             data = self._port.read(protocol.REPLY.size)
             # Noise and the beginning of a reply can look like one: then there is more.
-            if data and (self._port.in_waiting or protocol.sensed(data, elapsed) is None):
+            if data and (self._port.in_waiting or protocol.parse_reply(data, elapsed) is None):
                 data += self._rest()
         found = _replies(data, elapsed, 1 + self.counts.owed)
         if not found:
             self._count(lost=1, stray=len(data))
-            raise Garbled(f"{len(data)} bytes: {data[:8].hex(' ')}") if data else Silent("no reply")
-        self._believe(found, late=len(found) - 1, stray=len(data) - protocol.REPLY.size * len(found))
-        (millimetres, degrees), self._early = self._early, (0, 0)
+            raise BadReply(f"{len(data)} bytes: {data[:8].hex(' ')}") if data else NoReply("no reply")
+        self._accept(found, late=len(found) - 1, stray=len(data) - protocol.REPLY.size * len(found))
+        (millimetres, degrees), self._late_motion = self._late_motion, (0, 0)
         return found[-1]._replace(millimetres=millimetres, degrees=degrees)
 
     def close(self) -> None:
@@ -161,13 +161,13 @@ class Link:
         data = self._port.read(self._port.in_waiting) if self._port.in_waiting else b""
         owed = self.counts.owed
         found = _replies(data, elapsed, owed) if owed else []
-        self._believe(found, late=len(found), stray=len(data) - protocol.REPLY.size * len(found))
+        self._accept(found, late=len(found), stray=len(data) - protocol.REPLY.size * len(found))
         self._count(lost=int(bool(data) and not found))
 
-    def _believe(self, found: list[protocol.Sensed], *, late: int, stray: int) -> None:
-        self._early = (
-            self._early[0] + sum(reply.millimetres for reply in found),
-            self._early[1] + sum(reply.degrees for reply in found),
+    def _accept(self, found: list[protocol.SensorReply], *, late: int, stray: int) -> None:
+        self._late_motion = (
+            self._late_motion[0] + sum(reply.millimetres for reply in found),
+            self._late_motion[1] + sum(reply.degrees for reply in found),
         )
         self._count(good=len(found), late=late, stray=stray)
 

@@ -7,10 +7,10 @@ from enum import Enum
 from typing import NamedTuple
 
 from robot.drivers.create.config import CreateConfig
-from robot.drivers.create.protocol import Bumps, Mode, Sensed, named
+from robot.drivers.create.protocol import Bumps, Mode, SensorReply, describe_bumps
 
 
-class Halt(Enum):
+class StopReason(Enum):
     """Why the wheels were stopped; the value says what to do."""
 
     BUMPED = "`release` it and drive back"
@@ -22,14 +22,14 @@ class Halt(Enum):
     UNGUARDED = "the process that stops it when this one is killed has ended: start again"
 
 
-class Halted(NamedTuple):
+class StopEvent(NamedTuple):
     """What stopped it.
 
     Attributes:
         halt: which reason. detail: what was found. time: s, host's monotonic clock.
     """
 
-    halt: Halt
+    halt: StopReason
     detail: str
     time: float
 
@@ -37,11 +37,11 @@ class Halted(NamedTuple):
         return f"{self.halt.name.lower()}: {self.detail}; {self.halt.value}"
 
 
-class Refused(ValueError):
+class CommandRefused(ValueError):
     """A command that is not carried out."""
 
 
-def wheels(config: CreateConfig, forward: float, turn: float) -> tuple[int, int]:
+def wheel_speeds(config: CreateConfig, forward: float, turn: float) -> tuple[int, int]:
     """Right and left wheel, mm/s.
 
     Args:
@@ -51,11 +51,11 @@ def wheels(config: CreateConfig, forward: float, turn: float) -> tuple[int, int]
         Refused: not finite, or a wheel would be faster than `config.speed`.
     """
     if not (math.isfinite(forward) and math.isfinite(turn)):
-        raise Refused(f"forward {forward} m/s, turn {turn} rad/s: not finite")
+        raise CommandRefused(f"forward {forward} m/s, turn {turn} rad/s: not finite")
     apart = turn * config.wheel_base / 2
     right, left = (1000 * speed for speed in (forward + apart, forward - apart))
     if max(abs(right), abs(left)) > 1000 * config.speed + 1e-6:
-        raise Refused(
+        raise CommandRefused(
             f"forward {forward:g} m/s, turn {turn:g} rad/s needs a wheel at"
             f" {max(abs(right), abs(left)) / 1000:g} m/s; the cap is {config.speed:g} (`speed`)"
         )
@@ -63,12 +63,12 @@ def wheels(config: CreateConfig, forward: float, turn: float) -> tuple[int, int]
     return max(-cap, min(cap, round(right))), max(-cap, min(cap, round(left)))
 
 
-def objection(sensed: Sensed, right: int, left: int) -> tuple[Halt, str] | None:
+def stop_reason(sensed: SensorReply, right: int, left: int) -> tuple[StopReason, str] | None:
     """Why the wheels may not turn like that, by what was sensed, or None. A bump leaves the way back open."""
     if sensed.bumps & Bumps.DROPPED:
-        return Halt.WHEEL_DROP, named(sensed.bumps & Bumps.DROPPED)
+        return StopReason.WHEEL_DROP, describe_bumps(sensed.bumps & Bumps.DROPPED)
     if sensed.mode != Mode.SAFE:
-        return Halt.LEFT_SAFE_MODE, f"it is in {sensed.mode.name.lower()} mode"
+        return StopReason.LEFT_SAFE_MODE, f"it is in {sensed.mode.name.lower()} mode"
     if sensed.bumps & Bumps.BUMPED and right + left > 0:
-        return Halt.BUMPED, named(sensed.bumps & Bumps.BUMPED)
+        return StopReason.BUMPED, describe_bumps(sensed.bumps & Bumps.BUMPED)
     return None

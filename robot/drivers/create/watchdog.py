@@ -22,11 +22,11 @@ START_LIMIT = 10.0
 """s that a guard may take to start."""
 
 
-class Unguarded(InputError):
+class WatchdogFailed(InputError):
     """The guard did not start."""
 
 
-class Guard:
+class Watchdog:
     """The driver's end: starts the process and beats."""
 
     def __init__(self, port: str, patience: float) -> None:
@@ -43,7 +43,7 @@ class Guard:
         ready.join(START_LIMIT)
         if self._heard != b"r":
             self.close()
-            raise Unguarded(port, "the process that guards it did not start")
+            raise WatchdogFailed(port, "the process that guards it did not start")
 
     def beat(self) -> bool:
         """Tells that all is well; False if nobody hears it."""

@@ -5,30 +5,30 @@ from __future__ import annotations
 import threading
 from collections import deque
 
-from robot.drivers.head.protocol import KEEP_ALIVE, Command, Kind
+from robot.drivers.head.protocol import KEEP_ALIVE, Command, CommandKind
 
-KEEP = 0.2
+KEEP_ALIVE_PERIOD = 0.2
 """s between commands, at most; a head left alone for 0.5 s retracts."""
-LASTING = (Kind.CENTRE, Kind.DRIVE)
+PERSISTENT = (CommandKind.CENTRE, CommandKind.DRIVE)
 """What stays true until it is told anew, in the order in which a head has to hear it."""
 
 
-class Outbox:
+class CommandQueue:
     """Any thread puts commands in; the reader's takes them out."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._waiting: deque[Command] = deque()
-        self._lasting: dict[Kind, Command] = {}
+        self._lasting: dict[CommandKind, Command] = {}
         self._awake = False
         self._sent = -float("inf")
 
     def put(self, command: Command) -> None:
         """A command to send. Of amplitudes only the newest are worth sending."""
         with self._lock:
-            if command.kind == Kind.AMPLITUDES:
+            if command.kind == CommandKind.AMPLITUDES:
                 self._waiting = deque(other for other in self._waiting if other.kind != command.kind)
-            if command.kind in LASTING:
+            if command.kind in PERSISTENT:
                 self._lasting[command.kind] = command
             self._waiting.append(command)
             self._awake = True
@@ -40,19 +40,19 @@ class Outbox:
             self._lasting.clear()
             self._awake = False
 
-    def again(self) -> None:
+    def resend_persistent(self) -> None:
         """The head has forgotten everything."""
         with self._lock:
-            self._waiting = deque(self._lasting[kind] for kind in LASTING if kind in self._lasting)
+            self._waiting = deque(self._lasting[kind] for kind in PERSISTENT if kind in self._lasting)
 
     def next(self, now: float) -> Command | None:
         """What to send now (s, host), if anything: a sign of life when there has been nothing else."""
         with self._lock:
             if self._waiting:
                 return self._waiting[0]
-            return KEEP_ALIVE if self._awake and now - self._sent >= KEEP else None
+            return KEEP_ALIVE if self._awake and now - self._sent >= KEEP_ALIVE_PERIOD else None
 
-    def sent(self, command: Command, now: float) -> None:
+    def mark_sent(self, command: Command, now: float) -> None:
         """It went through at that time."""
         with self._lock:
             self._sent = now

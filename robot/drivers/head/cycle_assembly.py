@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from robot.drivers.head.decoder import Frames
-from robot.drivers.head.protocol import CHANNELS, radians
+from robot.drivers.head.protocol import CHANNELS, to_radians
 from tactile.base.types import Cycle, Odometry
 
-KEPT = 1 << 16
+MAX_FRAMES = 1 << 16
 """Frames that are kept to be cut: half a minute at 2 kHz."""
 
 
@@ -36,7 +36,7 @@ class Cut(NamedTuple):
     seen: bool
 
 
-def cut_of(
+def make_cut(
     number: int, time: float, start: float, frames: Frames, odometry: Odometry, seen: bool = True
 ) -> Cut:
     """The cut that is exactly these frames; without any, nothing is seen."""
@@ -45,14 +45,14 @@ def cut_of(
     return Cut(number, float(time), float(start), first, last, count, odometry, bool(seen and count))
 
 
-def within(frames: Frames, first: int, last: int) -> Frames:
+def select_frames(frames: Frames, first: int, last: int) -> Frames:
     """The frames from first to last, both included, ordered by sequence."""
     rows = np.flatnonzero((frames.sequence >= first) & (frames.sequence <= last))
     rows = rows[np.argsort(frames.sequence[rows], kind="stable")]
     return Frames(*(np.ascontiguousarray(column[rows]) for column in frames))
 
 
-def assembled(frames: Frames, cut: Cut) -> Cycle:
+def assemble_cycle(frames: Frames, cut: Cut) -> Cycle:
     """The whisk; without samples if the cut is not `seen`.
 
     Args:
@@ -62,18 +62,18 @@ def assembled(frames: Frames, cut: Cut) -> Cycle:
         ValueError: some of the cut's frames are not among them.
     """
     if not cut.seen:
-        frames = within(frames, 0, -1)
-        return Cycle(np.zeros(0), *radians(frames.values), cut.odometry)
-    mine = within(frames, cut.first, cut.last)
+        frames = select_frames(frames, 0, -1)
+        return Cycle(np.zeros(0), *to_radians(frames.values), cut.odometry)
+    mine = select_frames(frames, cut.first, cut.last)
     if len(mine.sequence) != cut.frames:
         raise ValueError(f"a whisk of {cut.frames} frames, of which {len(mine.sequence)} are there")
     # The order in memory is part of the result: it decides in which order sums are taken.
-    angle, deflection = (np.ascontiguousarray(part) for part in radians(mine.values))
+    angle, deflection = (np.ascontiguousarray(part) for part in to_radians(mine.values))
     time = cut.start + (mine.time - mine.time[0]) * 1e-6
     return Cycle(time, angle, deflection, cut.odometry)
 
 
-def no_frames(whiskers: int) -> Frames:
+def empty_frames(whiskers: int) -> Frames:
     """No frame of a head with so many whiskers."""
     return Frames(
         np.zeros(0, np.int64),
@@ -83,7 +83,7 @@ def no_frames(whiskers: int) -> Frames:
     )
 
 
-class Window:
+class FrameWindow:
     """The frames of late, in blocks as they came.
 
     Args:
@@ -96,12 +96,12 @@ class Window:
         self._count = 0
 
     def add(self, block: Frames) -> None:
-        """The next block; the oldest ones go, but for the last `KEPT` frames."""
+        """The next block; the oldest ones go, but for the last `MAX_FRAMES` frames."""
         if not len(block.sequence):
             return
         self._blocks.append(block)
         self._count += len(block.sequence)
-        while self._count - len(self._blocks[0].sequence) >= KEPT:
+        while self._count - len(self._blocks[0].sequence) >= MAX_FRAMES:
             self._count -= len(self._blocks.popleft().sequence)
 
     def between(self, first: int, last: int) -> Frames:
@@ -110,4 +110,4 @@ class Window:
             block for block in self._blocks if block.sequence.min() <= last and block.sequence.max() >= first
         ]
         parts = zip(*(blocks or [self._empty]), strict=True)
-        return within(Frames(*(np.concatenate(part) for part in parts)), first, last)
+        return select_frames(Frames(*(np.concatenate(part) for part in parts)), first, last)

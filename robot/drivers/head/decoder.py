@@ -14,10 +14,10 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from robot.drivers.head.protocol import CHANNELS, MAGIC, VERSION, WRAP, Flag, frame_dtype
-from robot.drivers.head.sequence_numbers import HALF, Numbering
+from robot.drivers.head.protocol import CHANNELS, MAGIC, VERSION, WRAP, FrameFlag, frame_dtype
+from robot.drivers.head.sequence_numbers import HALF, SequenceUnwrapper
 
-RUN, LONGEST_RUN = 32, 1024
+BATCH, MAX_BATCH = 32, 1024
 """Frames judged at once: so many after a fault, twice as many after every run without one."""
 
 
@@ -25,11 +25,9 @@ class Frames(NamedTuple):
     """Samples of a head, in the order in which they came.
 
     Attributes:
-        sequence: [N] int64 number, no two alike; modulo 2^32 what the head sent
-        (`robot.drivers.head.sequence_numbers`).
-        time: [N] int64 device time, us; modulo 2^32 what the head sent, and within 35 minutes of the sample
-            before.
-        flags: [N] uint8 `robot.drivers.head.protocol.Flag`. values: [N, W, C] int16 counts of theta, x and y.
+        sequence: [N] int64 unique number; modulo 2^32 the number sent (`sequence_numbers`).
+        time: [N] int64 device time, us; modulo 2^32 the time sent, within 35 minutes of the previous sample.
+        flags: [N] uint8 `FrameFlag`. values: [N, W, C] int16 counts of theta, x and y.
     """
 
     sequence: np.ndarray
@@ -38,7 +36,7 @@ class Frames(NamedTuple):
     values: np.ndarray
 
 
-class Counts(NamedTuple):
+class DecoderCounts(NamedTuple):
     """What a decoder has met since it was made.
 
     Attributes:
@@ -62,11 +60,11 @@ class Counts(NamedTuple):
     restarts: int = 0
 
 
-class Decodes(Protocol):
+class FrameDecoder(Protocol):
     """What reads a bridge's stream; another bridge brings its own."""
 
     @property
-    def counts(self) -> Counts:
+    def counts(self) -> DecoderCounts:
         """So far."""
         ...
 
@@ -97,14 +95,14 @@ class Decoder:
         self._shape_at = self._type.fields["whiskers"][1]  # type: ignore[index]
         self._magic = int.from_bytes(MAGIC, "little")
         self._rest = b""
-        self._run = RUN
-        self._numbering = Numbering()
+        self._run = BATCH
+        self._numbering = SequenceUnwrapper()
         self._time: int | None = None
         self._good = self._bad = self._skipped = self._overruns = self._duplicates = 0
 
     @property
-    def counts(self) -> Counts:
-        return Counts(
+    def counts(self) -> DecoderCounts:
+        return DecoderCounts(
             good=self._good,
             bad=self._bad,
             missing=self._numbering.missing,
@@ -138,7 +136,7 @@ class Decoder:
                 self._bad += 1
                 self._skipped += 1
                 place += 1
-        end = start if start >= 0 else len(buffer) - _begun(buffer[max(place, len(buffer) - 3) :])
+        end = start if start >= 0 else len(buffer) - _partial_magic(buffer[max(place, len(buffer) - 3) :])
         self._skipped += end - place
         self._rest = buffer[end:]
         return self._accepted(np.frombuffer(b"".join(runs), self._type))
@@ -160,7 +158,7 @@ class Decoder:
             if zlib.crc32(raw[place : place + body]) != crc:
                 break
             whole += 1
-        self._run = min(2 * self._run, LONGEST_RUN) if whole == count else RUN
+        self._run = min(2 * self._run, MAX_BATCH) if whole == count else BATCH
         return whole
 
     def _accepted(self, frames: np.ndarray) -> Frames:
@@ -169,7 +167,7 @@ class Decoder:
             frames, number = frames[new], number[new]
         self._good += len(frames)
         self._duplicates += len(new) - len(frames)
-        self._overruns += int(np.count_nonzero(frames["flags"] & Flag.OVERRUN))
+        self._overruns += int(np.count_nonzero(frames["flags"] & FrameFlag.OVERRUN))
         return Frames(
             number, self._unwrapped(frames["time"]), frames["flags"].copy(), frames["values"].copy()
         )
@@ -185,6 +183,6 @@ class Decoder:
         return time
 
 
-def _begun(tail: bytes) -> int:
+def _partial_magic(tail: bytes) -> int:
     """Bytes at the end that may be the beginning of the magic."""
     return next((k for k in range(len(tail), 0, -1) if tail.endswith(MAGIC[:k])), 0)

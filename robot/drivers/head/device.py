@@ -1,6 +1,6 @@
 """The bridge between a head and this machine, by pyusb: over libusb, or over an emulator's socket.
 
-What goes wrong has three names: `Gone`, the device is not there (any more); `Stalled`, a transfer was
+What goes wrong has three names: `Disconnected`, the device is not there (any more); `Stalled`, a transfer was
 refused, and the endpoint is cleared by now; and `InputError`, nothing changes until the user does something.
 """
 
@@ -16,7 +16,7 @@ from robot.drivers.head.protocol import (
     ENDPOINT_IN,
     ENDPOINT_OUT,
     INTERFACE,
-    LONGEST,
+    MAX_ANSWER,
     REQUEST_IN,
     REQUEST_OUT,
     Request,
@@ -28,7 +28,7 @@ TIMEOUT = 500
 """ms for control requests and commands."""
 
 
-class Gone(OSError):
+class Disconnected(OSError):
     """The head is not, or no longer, there."""
 
 
@@ -36,7 +36,7 @@ class Stalled(OSError):
     """A transfer was refused; the next one may go through."""
 
 
-class Identity(NamedTuple):
+class HeadIdentity(NamedTuple):
     """Attributes:
     name, version: of the bridge. whiskers, channels: of a frame. rate: samples per second.
     """
@@ -80,7 +80,7 @@ class Bridge(Protocol):
         ...
 
 
-def identity(bridge: Bridge) -> Identity:
+def read_identity(bridge: Bridge) -> HeadIdentity:
     """What is at the other end.
 
     Raises:
@@ -90,7 +90,7 @@ def identity(bridge: Bridge) -> Identity:
     try:
         told = json.loads(answer)
         size = int(told["whiskers"]), int(told["channels"])
-        return Identity(str(told["name"]), str(told["version"]), *size, float(told["rate"]))
+        return HeadIdentity(str(told["name"]), str(told["version"]), *size, float(told["rate"]))
     except (ValueError, KeyError, TypeError):
         cure = "check the address, or the bridge's firmware"
         raise InputError(
@@ -109,12 +109,12 @@ def open_bridge(address: str) -> Bridge:
     backend = _libusb() if where.host is None else _socket(where.host, where.port)
     try:
         numbers = {"idVendor": where.vendor, "idProduct": where.product}
-        found = core.find(backend=backend, custom_match=_serial(where.serial), **numbers)
+        found = core.find(backend=backend, custom_match=_serial_filter(where.serial), **numbers)
         if found is None:
-            raise Gone(errno.ENODEV, f"no head at {where}")
+            raise Disconnected(errno.ENODEV, f"no head at {where}")
         return UsbBridge(found, str(where))
     except core.USBError as error:
-        raise _named(error, str(where)) from error
+        raise _translate(error, str(where)) from error
 
 
 class UsbBridge:
@@ -140,7 +140,7 @@ class UsbBridge:
         if request in (Request.START, Request.STOP):
             answer = self._try(lambda: self._device.ctrl_transfer(REQUEST_OUT, request, 0, 0, b"", TIMEOUT))
         else:
-            size = 8 if request == Request.CLOCK else LONGEST
+            size = 8 if request == Request.CLOCK else MAX_ANSWER
             answer = self._try(lambda: self._device.ctrl_transfer(REQUEST_IN, request, 0, 0, size, TIMEOUT))
         if answer is None:
             raise Stalled(errno.ETIMEDOUT, f"no answer to {request.name}")
@@ -168,16 +168,16 @@ class UsbBridge:
         except core.USBTimeoutError:
             return None
         except core.USBError as error:
-            fault = _named(error, self._where)
+            fault = _translate(error, self._where)
         if isinstance(fault, Stalled) and endpoint is not None:
             try:
                 self._device.clear_halt(endpoint)
             except core.USBError as error:
-                fault = _named(error, self._where)
+                fault = _translate(error, self._where)
         raise fault
 
 
-def _named(error: Any, where: str) -> OSError | InputError:
+def _translate(error: Any, where: str) -> OSError | InputError:
     """What a USBError is called here."""
     if error.errno == errno.EACCES:
         cure = "allow it by a udev rule, see robot/head/README.md"
@@ -188,11 +188,11 @@ def _named(error: Any, where: str) -> OSError | InputError:
         return Stalled(errno.EPIPE, f"{where} refused a transfer")
     # EIO and its like: what a device that is being pulled out answers with, just before ENODEV.
     if error.errno in (errno.ENODEV, errno.ENOENT, errno.ENXIO, errno.ESHUTDOWN, errno.EPROTO, errno.EIO):
-        return Gone(errno.ENODEV, f"{where} is gone")
+        return Disconnected(errno.ENODEV, f"{where} is gone")
     return Stalled(error.errno or errno.EIO, f"{where}: {error}")
 
 
-def _serial(serial: str | None) -> Callable[[Any], bool] | None:
+def _serial_filter(serial: str | None) -> Callable[[Any], bool] | None:
     if serial is None:
         return None
 
@@ -233,4 +233,4 @@ def _libusb() -> Any:
 def _socket(host: str, port: int) -> Any:
     from robot.drivers.head import usb_tcp_backend
 
-    return usb_tcp_backend.backend(host, port)
+    return usb_tcp_backend.tcp_backend(host, port)

@@ -6,11 +6,11 @@ import numpy as np
 
 from robot.drivers.head.protocol import ANGLE
 
-END = 32767
+FULL_SCALE = 32767
 """An angle that is not smaller, in counts, is at the end of its range: the sensor knows no more."""
 
 
-class Overload:
+class OverloadDetector:
     """Finds whiskers overloaded in two samples in a row; one alone is a fault of transmission or a knock.
 
     Args:
@@ -18,16 +18,16 @@ class Overload:
     """
 
     def __init__(self, limit: float, alive: np.ndarray) -> None:
-        self._limit = min(limit / ANGLE, END)
+        self._limit = min(limit / ANGLE, FULL_SCALE)
         self._alive = np.asarray(alive, bool)
         self._before = np.zeros(len(self._alive), bool)
 
-    def seen(self, values: np.ndarray) -> int | None:
+    def check(self, values: np.ndarray) -> int | None:
         """The first whisker that is overloaded in counts [N, W, 3] or between them and the ones before."""
         if not len(values):
             return None
         size = np.abs(values.astype(np.int32))  # int16 has no 32768
-        beyond = ((size[..., 0] >= END) | (size[..., 1:] >= self._limit).any(axis=-1)) & self._alive
+        beyond = ((size[..., 0] >= FULL_SCALE) | (size[..., 1:] >= self._limit).any(axis=-1)) & self._alive
         twice = beyond & np.concatenate([self._before[None], beyond[:-1]])
         self._before = beyond[-1]
         return int(np.flatnonzero(twice.any(axis=0))[0]) if twice.any() else None

@@ -1,22 +1,23 @@
-"""What goes over a whisker head's wire: frames from it, commands to it, and the requests beside them.
+"""Wire format of a whisker head: frames from it, commands to it, and USB control requests.
 
-All numbers are little-endian, angles int16 counts of `ANGLE`. The bridges of published heads (BIOTACT) are
-not documented, so this format is our own: another bridge brings another `robot.drivers.head.decoder.Decodes`.
+All numbers are little-endian; angles are int16 counts of `ANGLE`. The USB bridges of published heads
+(BIOTACT) are not documented, so this format is our own; another bridge needs its own
+`robot.drivers.head.decoder.FrameDecoder`.
 
-A frame, 20 + 2 n c bytes, 128 for 18 whiskers of 3 channels; each sample of the head is one:
+Each sample of the head is one frame of 20 + 2 n c bytes (128 for 18 whiskers of 3 channels):
 
     u32 magic "WHK1" | u32 sequence | u32 device time, us | u8 flags | u8 n whiskers | u8 c channels
     u8 version | int16[n][c] theta, x, y | u32 CRC-32 of all before it
 
-`sequence` counts the samples since the head has power, those it had to drop too, and wraps, as the time does.
+`sequence` counts all samples since power-on, including dropped ones. It wraps, and so does the device time.
 
 A command, 32 + 2 n bytes:
 
     u32 magic "WHKC" | u8 version | u8 kind | u8 mode | u8 n | f32 amplitude, rad | f32 frequency, Hz
     f32 gain | f32 window, s | f32 offset, rad | int16[n] of the kind | u32 CRC-32 of all before it
 
-A head executes whole and known commands and ignores others. Without any for `SILENCE` s it retracts its
-whiskers and stops its drives; it goes on sending.
+A head executes intact commands of a known kind and ignores all others. After `COMMAND_TIMEOUT` s without a
+command it retracts its whiskers and stops its drives, but continues to send frames.
 """
 
 from __future__ import annotations
@@ -41,13 +42,13 @@ CHANNELS = 3
 """theta, x, y"""
 ANGLE = np.pi / 32768
 """rad per count, of theta, x and y alike."""
-SILENCE = 0.5
+COMMAND_TIMEOUT = 0.5
 """s without a command after which a head retracts."""
 WRAP = 2**32
 """Sequence and device time begin at 0 again there."""
 
 
-class Flag(IntFlag):
+class FrameFlag(IntFlag):
     """What a frame says about the head."""
 
     OVERRUN = 1
@@ -60,13 +61,13 @@ class Flag(IntFlag):
     """The first sample of a whisk."""
 
 
-class Kind(IntEnum):
+class CommandKind(IntEnum):
     """What a command is for."""
 
     KEEP = 0
     """Stay awake: nothing else in it counts."""
     DRIVE = 1
-    """Whisk so from the next cycle on. The n numbers are the thresholds of y; `OFF` never touches."""
+    """Whisk with these parameters from the next cycle on. The n numbers are the contact thresholds of y."""
     AMPLITUDES = 2
     """In mode `OPEN`: the n numbers are the whiskers' amplitudes for the rest of this cycle; in the next one
     it is the common one again. What does not come in time does no harm."""
@@ -74,7 +75,7 @@ class Kind(IntEnum):
     """The n numbers are the mean of y in free air, which feedback in the head is relative to."""
 
 
-class Mode(IntEnum):
+class FeedbackMode(IntEnum):
     """Who lowers the amplitude when a whisker touches."""
 
     OPEN = 0
@@ -98,9 +99,9 @@ class Request(IntEnum):
 
 REQUEST_IN, REQUEST_OUT = 0xC0, 0x40
 """bmRequestType: vendor, device."""
-LONGEST = 1024
+MAX_ANSWER = 1024
 """Bytes of an answer, at most."""
-OFF = 32767
+NO_THRESHOLD = 32767
 """A threshold that no deflection reaches."""
 
 
@@ -113,8 +114,8 @@ class Command(NamedTuple):
         numbers: [n] int16 counts, what they are follows from the kind.
     """
 
-    kind: Kind
-    mode: Mode = Mode.OPEN
+    kind: CommandKind
+    mode: FeedbackMode = FeedbackMode.OPEN
     amplitude: float = 0.0
     frequency: float = 0.0
     gain: float = 0.0
@@ -126,7 +127,7 @@ class Command(NamedTuple):
 _COMMAND = struct.Struct("<4sBBBB5f")
 COMMAND_SIZE = _COMMAND.size + 4
 """Bytes of a command without numbers: 32."""
-KEEP_ALIVE = Command(Kind.KEEP)
+KEEP_ALIVE = Command(CommandKind.KEEP)
 
 
 def frame_dtype(whiskers: int, channels: int = CHANNELS) -> np.dtype:
@@ -146,11 +147,11 @@ def frame_dtype(whiskers: int, channels: int = CHANNELS) -> np.dtype:
     )
 
 
-def encode(sequence: Array, time: Array, flags: Array, values: Array) -> bytes:
+def pack_frames(sequence: Array, time: Array, flags: Array, values: Array) -> bytes:
     """The frames of N samples, back to back.
 
     Args:
-        sequence: [N] of any size. time: [N] us, of any size. flags: [N] `Flag`. values: [N, W, C] int16.
+        sequence: [N] of any size. time: [N] us, of any size. flags: [N] `FrameFlag`. values: [N, W, C] int16.
     """
     values = np.asarray(values)
     frames = np.empty(len(values), frame_dtype(*values.shape[1:]))
@@ -166,23 +167,23 @@ def encode(sequence: Array, time: Array, flags: Array, values: Array) -> bytes:
     return frames.tobytes()
 
 
-def counts(angle: Array, deflection: Array) -> np.ndarray:
+def frame_values(angle: Array, deflection: Array) -> np.ndarray:
     """[N, W, 3] int16 of angles [N, W] and deflections [N, W, 2], rad; clipped to what int16 holds."""
-    return tally(np.concatenate([np.asarray(angle)[..., None], np.asarray(deflection)], axis=-1))
+    return to_counts(np.concatenate([np.asarray(angle)[..., None], np.asarray(deflection)], axis=-1))
 
 
-def tally(value: Array) -> np.ndarray:
+def to_counts(value: Array) -> np.ndarray:
     """int16 counts of values in rad."""
     return np.clip(np.rint(np.asarray(value, float) / ANGLE), -32768, 32767).astype(np.int16)
 
 
-def radians(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def to_radians(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Angles [N, W] and deflections [N, W, 2], rad, of counts [N, W, 3]."""
     value = values * ANGLE
     return value[..., 0], value[..., 1:]
 
 
-def pack(command: Command) -> bytes:
+def pack_command(command: Command) -> bytes:
     """A command as it is sent."""
     numbers = np.asarray(command.numbers, "<i2")
     kind, mode, *drive = command[:-1]
@@ -190,7 +191,7 @@ def pack(command: Command) -> bytes:
     return body + struct.pack("<I", zlib.crc32(body))
 
 
-def unpack(packet: bytes) -> Command | None:
+def unpack_command(packet: bytes) -> Command | None:
     """The command in a packet; None if it is not a whole one of ours."""
     if len(packet) < COMMAND_SIZE or zlib.crc32(packet[:-4]) != int.from_bytes(packet[-4:], "little"):
         return None
@@ -198,8 +199,13 @@ def unpack(packet: bytes) -> Command | None:
         packet
     )
     drive = amplitude, frequency, gain, window, offset
-    known = magic == COMMAND_MAGIC and version == VERSION and kind in set(Kind) and mode in set(Mode)
+    known = (
+        magic == COMMAND_MAGIC
+        and version == VERSION
+        and kind in set(CommandKind)
+        and mode in set(FeedbackMode)
+    )
     if not known or len(packet) != COMMAND_SIZE + 2 * count or not np.isfinite(drive).all():
         return None
     numbers = np.frombuffer(packet, "<i2", count, _COMMAND.size).astype(np.int16)
-    return Command(Kind(kind), Mode(mode), *drive, numbers)
+    return Command(CommandKind(kind), FeedbackMode(mode), *drive, numbers)

@@ -14,25 +14,25 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robot.drivers.head.command_queue import Outbox
+from robot.drivers.head.command_queue import CommandQueue
 from robot.drivers.head.config import HeadLinkConfig
-from robot.drivers.head.decoder import Decoder, Decodes, Frames
-from robot.drivers.head.device import Bridge, Gone, Identity, Stalled, identity
-from robot.drivers.head.overload import Overload
-from robot.drivers.head.protocol import CHANNELS, Command, Request, pack
-from robot.drivers.head.ring_buffer import Ring
-from robot.drivers.outcome import Fault, Outcome
+from robot.drivers.head.decoder import Decoder, FrameDecoder, Frames
+from robot.drivers.head.device import Bridge, Disconnected, HeadIdentity, Stalled, read_identity
+from robot.drivers.head.overload import OverloadDetector
+from robot.drivers.head.protocol import CHANNELS, Command, Request, pack_command
+from robot.drivers.head.ring_buffer import RingBuffer
+from robot.drivers.outcome import Fault, SessionOutcome
 from tactile.base.errors import InputError
 
-READ = 4096
+READ_SIZE = 4096
 """Bytes asked for at once: 16 ms of 18 whiskers at 2 kHz."""
-WAIT = 0.02
+READ_TIMEOUT = 0.02
 """s that a read waits for bytes, and so about the longest that a command waits."""
-AGAIN = 0.25
+RETRY_PERIOD = 0.25
 """s between attempts to find a head that is away, or to start one that is silent."""
 
 
-class Link(Enum):
+class LinkState(Enum):
     """How it stands with the head."""
 
     STREAMING = "samples come"
@@ -42,22 +42,22 @@ class Link(Enum):
     CLOSED = "nobody reads"
 
 
-class State(NamedTuple):
+class LinkStatus(NamedTuple):
     """How it stands, and since when (s, host)."""
 
-    link: Link
+    link: LinkState
     since: float
 
 
 DEFAULT = HeadLinkConfig()
-ENDS = {
-    Link.SILENT: Outcome.HEAD_SILENT,
-    Link.GARBLED: Outcome.HEAD_GARBLED,
-    Link.AWAY: Outcome.HEAD_GONE,
+OUTCOMES = {
+    LinkState.SILENT: SessionOutcome.HEAD_SILENT,
+    LinkState.GARBLED: SessionOutcome.HEAD_GARBLED,
+    LinkState.AWAY: SessionOutcome.HEAD_GONE,
 }
 
 
-class Reader:
+class HeadReader:
     """Reads a head, from `start` until `close`.
 
     Args:
@@ -80,20 +80,22 @@ class Reader:
         whiskers: int,
         config: HeadLinkConfig = DEFAULT,
         *,
-        decoder: Decodes | None = None,
+        decoder: FrameDecoder | None = None,
         alive: np.ndarray | None = None,
         on_overload: Callable[[int], None] = lambda whisker: None,
     ) -> None:
         self.config = config
-        self.decoder: Decodes = Decoder(whiskers) if decoder is None else decoder
-        self.ring = Ring(whiskers)
+        self.decoder: FrameDecoder = Decoder(whiskers) if decoder is None else decoder
+        self.ring = RingBuffer(whiskers)
         self.listeners: list[Callable[[Frames, float], None]] = []
         self.on_restart: list[Callable[[int, float], None]] = []
-        self.identity: Identity | None = None
+        self.identity: HeadIdentity | None = None
         self.stalls = 0
         self._connect, self._whiskers, self._on_overload = connect, whiskers, on_overload
-        self._overload = Overload(config.overload, np.ones(whiskers, bool) if alive is None else alive)
-        self._outbox = Outbox()
+        self._overload = OverloadDetector(
+            config.overload, np.ones(whiskers, bool) if alive is None else alive
+        )
+        self._queue = CommandQueue()
         self._ending, self._tried = threading.Event(), threading.Event()
         self._refusal: Exception | None = None
         self._fault: Fault | None = None
@@ -101,7 +103,7 @@ class Reader:
         self._sample = self._bytes = self._streaming = -np.inf
         self._thread = threading.Thread(target=self._run, name="head reader", daemon=True)
 
-    def start(self, timeout: float = 5.0) -> Reader:
+    def start(self, timeout: float = 5.0) -> HeadReader:
         """Finds the head and starts its stream.
 
         Raises:
@@ -123,32 +125,31 @@ class Reader:
         if self._thread.is_alive() and self._thread is not threading.current_thread():
             self._thread.join(5.0)
 
-    def __enter__(self) -> Reader:
+    def __enter__(self) -> HeadReader:
         return self.start()
 
     def __exit__(self, *error: object) -> None:
         self.close()
 
     def send(self, command: Command) -> None:
-        """Has a command sent, within about `WAIT`. From now on the head is kept awake."""
-        self._outbox.put(command)
+        """Has a command sent, within about `READ_TIMEOUT`. From now on the head is kept awake."""
+        self._queue.put(command)
 
     def rest(self) -> None:
-        """Lets the head go to rest, within `robot.drivers.head.protocol.SILENCE`: it is no longer kept
-        awake."""
-        self._outbox.rest()
+        """Stops the keep-alive commands, so that the head retracts within `COMMAND_TIMEOUT`."""
+        self._queue.rest()
 
     @property
-    def state(self) -> State:
+    def state(self) -> LinkStatus:
         """How it stands with the head; right even while the thread hangs in a transfer."""
         now, sample, away = time.monotonic(), self._sample, self._away
         if self._ending.is_set() or not self._thread.is_alive():
-            return State(Link.CLOSED, sample)
+            return LinkStatus(LinkState.CLOSED, sample)
         if away is not None:
-            return State(Link.AWAY, away)
+            return LinkStatus(LinkState.AWAY, away)
         if now - sample <= self.config.silence:
-            return State(Link.STREAMING, self._streaming)
-        return State(Link.GARBLED if self._bytes > sample else Link.SILENT, sample)
+            return LinkStatus(LinkState.STREAMING, self._streaming)
+        return LinkStatus(LinkState.GARBLED if self._bytes > sample else LinkState.SILENT, sample)
 
     @property
     def age(self) -> float:
@@ -159,34 +160,34 @@ class Reader:
     def fault(self) -> Fault | None:
         """What the session cannot wait for any longer; once one, always one."""
         link = self.state.link
-        lost = link in ENDS and self.age > self.config.patience
+        lost = link in OUTCOMES and self.age > self.config.patience
         if self._fault is None and lost:
             why = f" ({self._refusal})" if self._refusal else ""
             detail = f"{link.value}{why}, {self.age:.1f} s after the last sample"
-            self._fault = Fault(ENDS[link], detail, time.monotonic())
+            self._fault = Fault(OUTCOMES[link], detail, time.monotonic())
         return self._fault
 
     def _run(self) -> None:
         try:
             while not self._ending.is_set():
                 try:
-                    with contextlib.closing(self._found()) as bridge:
+                    with contextlib.closing(self._open()) as bridge:
                         self._serve(bridge)
-                except (Gone, Stalled, InputError) as error:
+                except (Disconnected, Stalled, InputError) as error:
                     self._refusal = error
                 self._tried.set()
                 self._away = time.monotonic() if self._away is None else self._away
-                self._ending.wait(AGAIN)
+                self._ending.wait(RETRY_PERIOD)
         except Exception as error:
             detail = f"its reader ended: {type(error).__name__}: {error}"
-            self._fault = Fault(Outcome.HEAD_GONE, detail, time.monotonic())
+            self._fault = Fault(SessionOutcome.HEAD_GONE, detail, time.monotonic())
             raise
 
-    def _found(self) -> Bridge:
+    def _open(self) -> Bridge:
         """A bridge whose head is the right one, told all that it has to know."""
         bridge = self._connect()
         try:
-            self.identity = found = identity(bridge)
+            self.identity = found = read_identity(bridge)
             if (found.whiskers, found.channels) != (self._whiskers, CHANNELS):
                 shape = f"{found.whiskers} whiskers of {found.channels} channels"
                 raise InputError("head", f"{found.name} has {shape}", f"{self._whiskers} of {CHANNELS}")
@@ -194,7 +195,7 @@ class Reader:
             self.decoder.restart(clock)
             for told in self.on_restart:
                 told(clock, time.monotonic())
-            self._outbox.again()
+            self._queue.resend_persistent()
             bridge.request(Request.START)
         except BaseException:
             bridge.close()
@@ -208,30 +209,30 @@ class Reader:
         while not self._ending.is_set():
             data = b""
             with self._tolerant():
-                data = bridge.read(READ, WAIT)
+                data = bridge.read(READ_SIZE, READ_TIMEOUT)
             now = time.monotonic()
             if data:
                 self._bytes = now
-                self._take(self.decoder.feed(data), now)
-            elif now - max(started, self._sample) > max(AGAIN, self.config.silence):
+                self._accept(self.decoder.feed(data), now)
+            elif now - max(started, self._sample) > max(RETRY_PERIOD, self.config.silence):
                 started = now
                 with self._tolerant():
                     bridge.request(Request.START)
             with self._tolerant():
-                while (command := self._outbox.next(now)) is not None:
-                    bridge.write(pack(command))
-                    self._outbox.sent(command, now)
+                while (command := self._queue.next(now)) is not None:
+                    bridge.write(pack_command(command))
+                    self._queue.mark_sent(command, now)
         with self._tolerant():
             bridge.request(Request.STOP)
 
-    def _take(self, frames: Frames, now: float) -> None:
+    def _accept(self, frames: Frames, now: float) -> None:
         if not len(frames.sequence):
             return
         if now - self._sample > self.config.silence:
             self._streaming = now
         self._sample = now
         self.ring.append(frames, now)
-        whisker = self._overload.seen(frames.values)
+        whisker = self._overload.check(frames.values)
         if whisker is not None:
             self._on_overload(whisker)
         for told in self.listeners:

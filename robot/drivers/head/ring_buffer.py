@@ -11,10 +11,10 @@ from robot.drivers.head.protocol import CHANNELS
 
 SIZE = 2**16
 """Samples: 33 s at 2 kHz."""
-NEVER = -(2**62)
+EMPTY = -(2**62)
 
 
-class Ring:
+class RingBuffer:
     """The last samples; any thread may ask while another appends. What is handed out is the asker's own.
 
     Args:
@@ -25,18 +25,18 @@ class Ring:
         if size & (size - 1):
             raise ValueError(f"size {size}: must be a power of two")
         self._size = size
-        self._sequence = np.full(size, NEVER, np.int64)
+        self._sequence = np.full(size, EMPTY, np.int64)
         self._time = np.zeros(size, np.int64)
         self._flags = np.zeros(size, np.uint8)
         self._values = np.zeros((size, whiskers, channels), np.int16)
-        self._newest, self._latest, self._arrival = NEVER, NEVER, -np.inf
+        self._newest, self._latest, self._arrival = EMPTY, EMPTY, -np.inf
         self._lock = threading.Lock()
 
     @property
     def newest(self) -> tuple[int, int, float] | None:
         """Highest number, latest device time (us) and last arrival (s, host); None before any came."""
         with self._lock:
-            return None if self._newest == NEVER else (self._newest, self._latest, self._arrival)
+            return None if self._newest == EMPTY else (self._newest, self._latest, self._arrival)
 
     def append(self, frames: Frames, arrival: float) -> None:
         """Takes what arrived at a host time, s; but nothing from further back than the ring reaches."""

@@ -9,11 +9,11 @@ from robot.drivers.head.protocol import WRAP
 LATE = 4096
 """How far behind the newest a frame can be and still be late: a head holds no more of them."""
 HALF = WRAP // 2
-AT_ONCE = 1024
+BATCH = 1024
 """Numbers looked at together."""
 
 
-class Numbering:
+class SequenceUnwrapper:
     """The numbers of the frames accepted so far.
 
     A number less than `HALF` above the highest is ahead; one less than `LATE` below it is late; from further
@@ -50,7 +50,7 @@ class Numbering:
         number, new = np.empty_like(raw), np.ones(len(raw), bool)
         place = 0
         while place < len(raw):
-            some = slice(place, place + self._rising(raw[place : place + AT_ONCE]))
+            some = slice(place, place + self._rising(raw[place : place + BATCH]))
             if some.stop > place:
                 number[some] = self._highest + (raw[some] - self._highest) % WRAP
                 self._ahead(number[some])

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any, NoReturn, TypeVar
 
-from robot.drivers.head.usb_tcp_protocol import IN, PORT, Line, Op
+from robot.drivers.head.usb_tcp_protocol import IN, PORT, Op, UsbConnection
 
 T = TypeVar("T")
 
@@ -18,9 +18,9 @@ class Handle:
     """An open device: a connection for what waits for data, another for all else."""
 
     def __init__(self, host: str, port: int) -> None:
-        self.inwards = Line(host, port)
+        self.inwards = UsbConnection(host, port)
         try:
-            self.other = Line(host, port)
+            self.other = UsbConnection(host, port)
         except OSError:
             self.inwards.close()
             raise
@@ -31,7 +31,7 @@ class Handle:
 
 
 class SocketBackend:
-    """Behaves as a `usb.backend.IBackend` with at most one device, so it is one; make it with `backend`."""
+    """A `usb.backend.IBackend` (by its methods) of a bus with at most one device."""
 
     def __init__(self, host: str, port: int) -> None:
         self.host, self.port = host, port
@@ -39,7 +39,7 @@ class SocketBackend:
     def enumerate_devices(self) -> Iterator[bytes]:
         """The device's descriptors, if one is plugged in; they are its identification."""
         try:
-            line = Line(self.host, self.port)
+            line = UsbConnection(self.host, self.port)
         except OSError:
             return
         try:
@@ -58,38 +58,38 @@ class SocketBackend:
             "idVendor idProduct bcdDevice iManufacturer iProduct iSerialNumber bNumConfigurations"
         )
         whereabouts = {"bus": 1, "address": 1, "port_number": 1, "port_numbers": (1,), "speed": 3}
-        return SimpleNamespace(**_named("<BBHBBBBHHHBBBB", names, dev), **whereabouts)
+        return SimpleNamespace(**_fields("<BBHBBBBHHHBBBB", names, dev), **whereabouts)
 
     def get_configuration_descriptor(self, dev: bytes, config: int) -> SimpleNamespace:
-        _only(config)
+        _require_first(config)
         names = (
             "bLength bDescriptorType wTotalLength bNumInterfaces bConfigurationValue iConfiguration "
             "bmAttributes bMaxPower"
         )
-        return SimpleNamespace(**_named("<BBHBBBBB", names, _descriptors(dev, 2)[0]), extra_descriptors=[])
+        return SimpleNamespace(**_fields("<BBHBBBBB", names, _descriptors(dev, 2)[0]), extra_descriptors=[])
 
     def get_interface_descriptor(self, dev: bytes, intf: int, alt: int, config: int) -> SimpleNamespace:
-        _only(intf, alt, config)
+        _require_first(intf, alt, config)
         names = (
             "bLength bDescriptorType bInterfaceNumber bAlternateSetting bNumEndpoints bInterfaceClass "
             "bInterfaceSubClass bInterfaceProtocol iInterface"
         )
-        return SimpleNamespace(**_named("<9B", names, _descriptors(dev, 4)[0]), extra_descriptors=[])
+        return SimpleNamespace(**_fields("<9B", names, _descriptors(dev, 4)[0]), extra_descriptors=[])
 
     def get_endpoint_descriptor(
         self, dev: bytes, ep: int, intf: int, alt: int, config: int
     ) -> SimpleNamespace:
-        _only(intf, alt, config)
+        _require_first(intf, alt, config)
         names = "bLength bDescriptorType bEndpointAddress bmAttributes wMaxPacketSize bInterval"
         return SimpleNamespace(
-            **_named("<BBBBHB", names, _descriptors(dev, 5)[ep]),
+            **_fields("<BBBBHB", names, _descriptors(dev, 5)[ep]),
             bRefresh=0,
             bSynchAddress=0,
             extra_descriptors=[],
         )
 
     def open_device(self, dev: bytes) -> Handle:
-        return _usb(lambda: Handle(self.host, self.port))
+        return _as_usb_error(lambda: Handle(self.host, self.port))
 
     def close_device(self, dev_handle: Handle) -> None:
         dev_handle.close()
@@ -116,7 +116,7 @@ class SocketBackend:
 
     def bulk_read(self, dev_handle: Handle, ep: int, intf: int, buff: array[int], timeout: int) -> int:
         got = self._request(dev_handle, Op.BULK, ep, size=_size(buff), timeout=timeout)
-        return _filled(buff, got)
+        return _fill(buff, got)
 
     def ctrl_transfer(
         self,
@@ -131,7 +131,7 @@ class SocketBackend:
         setup = {"request": bRequest, "value": wValue, "index": wIndex, "timeout": timeout}
         if bmRequestType & IN:
             got = self._request(dev_handle, Op.CONTROL, bmRequestType, size=_size(data), **setup)
-            return _filled(data, got)
+            return _fill(data, got)
         self._request(dev_handle, Op.CONTROL, bmRequestType, data=data.tobytes(), **setup)
         return _size(data)
 
@@ -157,15 +157,15 @@ class SocketBackend:
 
     def _request(self, handle: Handle, op: Op, address: int = 0, **more: Any) -> bytes:
         line = handle.inwards if op == Op.BULK and address & IN else handle.other
-        return _usb(lambda: line.call(op, address, **more))
+        return _as_usb_error(lambda: line.call(op, address, **more))
 
 
-def backend(host: str, port: int = PORT) -> SocketBackend:
+def tcp_backend(host: str, port: int = PORT) -> SocketBackend:
     """A backend for pyusb whose bus is the emulator at that address: `usb.core.find(backend=...)`."""
     return SocketBackend(host, port)
 
 
-def _usb(action: Callable[[], T]) -> T:
+def _as_usb_error(action: Callable[[], T]) -> T:
     """The action, whose errors are told as libusb's are."""
     import usb.core
 
@@ -186,11 +186,11 @@ def _descriptors(dev: bytes, kind: int) -> list[bytes]:
     return found
 
 
-def _named(layout: str, names: str, descriptor: bytes) -> dict[str, int]:
+def _fields(layout: str, names: str, descriptor: bytes) -> dict[str, int]:
     return dict(zip(names.split(), struct.unpack_from(layout, descriptor), strict=True))
 
 
-def _only(*index: int) -> None:
+def _require_first(*index: int) -> None:
     if any(index):
         raise IndexError(f"descriptor {index}: the device has one of each")
 
@@ -199,6 +199,6 @@ def _size(buffer: array[int]) -> int:
     return len(buffer) * buffer.itemsize
 
 
-def _filled(buffer: array[int], data: bytes) -> int:
+def _fill(buffer: array[int], data: bytes) -> int:
     memoryview(buffer).cast("B")[: len(data)] = data
     return len(data)

@@ -45,7 +45,7 @@ class Op(IntEnum):
     RESET = 6
 
 
-class Line:
+class UsbConnection:
     """A connection to an emulated device; a thread at a time uses it, others wait.
 
     Raises:
@@ -57,7 +57,7 @@ class Line:
         try:
             self._socket = socket.create_connection((host, port), PATIENCE)
         except OSError:
-            raise gone() from None
+            raise no_device() from None
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def call(
@@ -88,7 +88,7 @@ class Line:
                 got = self._exactly(length)
             except OSError:
                 self._socket.close()  # an answer that comes late would be taken for another's
-                raise gone() from None
+                raise no_device() from None
         if status:
             raise OSError(-status, os.strerror(-status))
         return got
@@ -104,12 +104,12 @@ class Line:
         while size:
             part = self._socket.recv(size)
             if not part:
-                raise gone()
+                raise no_device()
             parts.append(part)
             size -= len(part)
         return b"".join(parts)
 
 
-def gone() -> OSError:
+def no_device() -> OSError:
     """What a transfer to a device that is not there ends with."""
     return OSError(errno.ENODEV, os.strerror(errno.ENODEV))

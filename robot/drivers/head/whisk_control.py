@@ -7,8 +7,16 @@ from typing import Literal
 import numpy as np
 
 from robot.drivers.head.decoder import Frames
-from robot.drivers.head.protocol import ANGLE, OFF, Command, Flag, Kind, Mode, tally
-from robot.drivers.head.reader import Reader
+from robot.drivers.head.protocol import (
+    ANGLE,
+    NO_THRESHOLD,
+    Command,
+    CommandKind,
+    FeedbackMode,
+    FrameFlag,
+    to_counts,
+)
+from robot.drivers.head.reader import HeadReader
 from tactile.base.errors import InputError
 from tactile.whiskers.head_geometry import Head
 from tactile.whiskers.whisking import WhiskingConfig, checked, command, phase, still
@@ -16,7 +24,7 @@ from tactile.whiskers.whisking import WhiskingConfig, checked, command, phase, s
 WHERE = "live.plan.whisking"
 
 
-def commands(
+def whisk_commands(
     whisking: WhiskingConfig,
     threshold: np.ndarray | None = None,
     centre: np.ndarray | None = None,
@@ -34,15 +42,17 @@ def commands(
     if whisking.mode == "spread" and rcp == "head":
         raise InputError(f"{WHERE}.mode", "spread", "rcp or open", "or set `live.head.rcp: host`")
     drive = Command(
-        Kind.DRIVE,
-        Mode.RCP if whisking.mode == "rcp" and rcp == "head" and threshold is not None else Mode.OPEN,
+        CommandKind.DRIVE,
+        FeedbackMode.RCP
+        if whisking.mode == "rcp" and rcp == "head" and threshold is not None
+        else FeedbackMode.OPEN,
         amplitude=float(np.radians(whisking.amplitude_deg)),
         frequency=whisking.rate,
         gain=whisking.gain,
         window=whisking.window,
         numbers=np.zeros(0, np.int16) if threshold is None else _thresholds(threshold),
     )
-    return [drive] if centre is None else [Command(Kind.CENTRE, numbers=tally(centre)), drive]
+    return [drive] if centre is None else [Command(CommandKind.CENTRE, numbers=to_counts(centre)), drive]
 
 
 class HostRcp:
@@ -71,7 +81,7 @@ class HostRcp:
         """
         y = frames.values[..., 2] * ANGLE - self._centre
         for time, flags, heard in zip(frames.time.tolist(), frames.flags.tolist(), y, strict=True):
-            if flags & Flag.CYCLE:
+            if flags & FrameFlag.CYCLE:
                 self._began = time
                 self._drive = still(len(self._threshold))
                 self._amplitude, self._told = self._full, None
@@ -85,7 +95,7 @@ class HostRcp:
             # At rest no amplitude can be told from the aim.
             if share > 1e-3:
                 self._amplitude = aim / share
-        told = tally(self._amplitude)
+        told = to_counts(self._amplitude)
         if self._began is None or (self._told is not None and (told == self._told).all()):
             return None
         self._told = told
@@ -99,7 +109,7 @@ class HeadDriver:
         reader: of the head; its settings say who feeds back. head: its geometry.
     """
 
-    def __init__(self, reader: Reader, head: Head) -> None:
+    def __init__(self, reader: HeadReader, head: Head) -> None:
         self._reader, self._head = reader, head
         self._feedback: HostRcp | None = None
         reader.listeners.append(self._heard)
@@ -121,7 +131,7 @@ class HeadDriver:
         """
         checked(whisking, self._head, WHERE)
         rcp = self._reader.config.rcp
-        told = commands(whisking, threshold, centre, rcp)
+        told = whisk_commands(whisking, threshold, centre, rcp)
         self._feedback = None
         if rcp == "host" and whisking.mode != "open" and threshold is not None:
             middle = np.zeros(len(threshold)) if centre is None else centre
@@ -138,11 +148,11 @@ class HeadDriver:
         feedback = self._feedback
         amplitude = None if feedback is None else feedback.amplitudes(frames)
         if amplitude is not None:
-            self._reader.send(Command(Kind.AMPLITUDES, Mode.OPEN, numbers=amplitude))
+            self._reader.send(Command(CommandKind.AMPLITUDES, FeedbackMode.OPEN, numbers=amplitude))
 
 
 def _thresholds(threshold: np.ndarray) -> np.ndarray:
     finite = np.isfinite(threshold)
-    return np.where(finite, np.minimum(tally(np.where(finite, threshold, 0.0)), OFF - 1), OFF).astype(
-        np.int16
-    )
+    return np.where(
+        finite, np.minimum(to_counts(np.where(finite, threshold, 0.0)), NO_THRESHOLD - 1), NO_THRESHOLD
+    ).astype(np.int16)

@@ -15,16 +15,16 @@ from typing import Any
 
 import numpy as np
 
-from robot.drivers.outcome import Fault, Outcome
+from robot.drivers.outcome import Fault, SessionOutcome
 from robot.drivers.ur10 import dashboard
 from robot.drivers.ur10.config import ArmConfig
-from robot.drivers.ur10.process_handle import Process
-from robot.drivers.ur10.safety import Finding, Move, Refused, planned
-from robot.drivers.ur10.shared_state import Board
-from robot.drivers.ur10.startup_checks import Refusal, accepted, admitted
+from robot.drivers.ur10.process_handle import ArmProcess
+from robot.drivers.ur10.safety import Finding, Move, TargetRefused, plan_move
+from robot.drivers.ur10.shared_state import SharedState
+from robot.drivers.ur10.startup_checks import StartupRefused, check_controller, check_states
 from robot.drivers.ur10.supervisor import TICK, Supervisor
 
-__all__ = ["Arm", "Refusal", "Refused"]
+__all__ = ["Arm", "StartupRefused", "TargetRefused"]
 
 
 class Arm:
@@ -34,8 +34,8 @@ class Arm:
         self.config = config
         self.reason = ""
         """Why it was last halted."""
-        self._board = Board()
-        self._supervisor = Supervisor(config, self._board)
+        self._shared = SharedState()
+        self._supervisor = Supervisor(config, self._shared)
 
     def __enter__(self) -> Arm:
         return self
@@ -45,24 +45,24 @@ class Arm:
 
     def start(self) -> None:
         """Check the controller, start the arm's process, check what it sees; raises Refusal."""
-        admitted(self.config)
-        first = self._board.newest + 1
-        self._board.control["first"] = first
-        self._board.control["heartbeat"] = time.monotonic()
-        process = Process(self._board.name, self.config)
+        check_controller(self.config)
+        first = self._shared.newest + 1
+        self._shared.control["first"] = first
+        self._shared.control["heartbeat"] = time.monotonic()
+        process = ArmProcess(self._shared.name, self.config)
         self._supervisor.watch(process)
         try:
             self._await_ready(process)
-            accepted(self.config, lambda: self.states(first - 1))
+            check_states(self.config, lambda: self.states(first - 1))
             self._supervisor.arm()
         except BaseException:
-            self._supervisor.bury()
+            self._supervisor.kill_process()
             raise
 
     def respawn(self) -> None:
         """Start anew after a fault, with all checks; the pose may be another one, so this is no odometry."""
-        self._supervisor.bury()
-        dashboard.stop(self.config.host)
+        self._supervisor.kill_process()
+        dashboard.stop_program(self.config.host)
         self.reason = ""
         self.start()
 
@@ -71,11 +71,11 @@ class Arm:
         supervisor = self._supervisor
         supervisor.armed = False
         if supervisor.process is not None and not supervisor.process.end(1.0):
-            supervisor.bury()
-            dashboard.stop(self.config.host)
-        supervisor.bury()
+            supervisor.kill_process()
+            dashboard.stop_program(self.config.host)
+        supervisor.kill_process()
         supervisor.close()
-        self._board.close()
+        self._shared.close()
 
     @property
     def fault(self) -> Fault | None:
@@ -90,11 +90,11 @@ class Arm:
 
     def states(self, after: int = 0) -> np.ndarray:
         """All states [N] (STATE) whose counter is larger, as far as the ring reaches back, oldest first."""
-        return self._board.since(after)
+        return self._shared.since(after)
 
     def latest(self) -> np.ndarray | None:
         """The newest state (STATE, one); None before the first."""
-        return self._board.latest()
+        return self._shared.latest()
 
     @property
     def history(self) -> np.ndarray:
@@ -119,14 +119,14 @@ class Arm:
         with supervisor.lock:  # a fault that is found meanwhile would not revoke the order
             state = self.latest()
             if self.fault is not None or not supervisor.armed or state is None:
-                raise Refused(f"the arm does not move: {self.fault or 'it is not armed'}")
-            move = planned(self.config, tcp, state["tcp"], speed)
+                raise TargetRefused(f"the arm does not move: {self.fault or 'it is not armed'}")
+            move = plan_move(self.config, tcp, state["tcp"], speed)
             supervisor.send(move)
         return move
 
     def arrived(self) -> bool:
         """Whether the last move has begun, has ended, and the arm stands where it was sent."""
-        errand = self._supervisor.errand
+        errand = self._supervisor.pending
         return errand is not None and self._supervisor.arrived(errand)
 
     def halt(self, reason: str) -> None:
@@ -134,25 +134,25 @@ class Arm:
         self.reason = reason
         self._supervisor.halt()
 
-    def fail(self, outcome: Outcome, detail: str) -> None:
+    def fail(self, outcome: SessionOutcome, detail: str) -> None:
         """Stop because of what somebody else found; on a contact the tool backs off the way it came."""
         self._supervisor.fail(Finding(outcome, detail))
 
-    def _await_ready(self, process: Process) -> None:
+    def _await_ready(self, process: ArmProcess) -> None:
         supervisor = self._supervisor
         patience = time.monotonic() + self.config.connect
         while not supervisor.ready:
             with supervisor.lock:
-                ended = process.ended()
+                ended = process.exit_finding()
                 if ended is not None:
-                    supervisor.hear(process)
+                    supervisor.read_reports(process)
                 refused = supervisor.refused
             if refused is not None:
                 raise refused
             if ended is not None:
-                raise Refusal(ended.detail, "", "look at the controller's ports 30003 and 30004")
+                raise StartupRefused(ended.detail, "", "look at the controller's ports 30003 and 30004")
             if time.monotonic() > patience:
-                raise Refusal(
+                raise StartupRefused(
                     f"the controller did not take the control script in {self.config.connect:g} s",
                     "",
                     "look at the pendant: remote control on, no message waiting",

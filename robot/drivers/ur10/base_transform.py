@@ -16,7 +16,7 @@ from tactile.base.config import Settings
 from tactile.base.se2 import between, compose
 
 
-class PlacingConfig(Settings):
+class BaseTransformConfig(Settings):
     """The map's origin and x axis in the arm's base frame.
 
     The default sets a maze of 7 x 5 micromouse cells before the base, within a UR-10's reach.
@@ -32,7 +32,9 @@ class PlacingConfig(Settings):
     """From the base's x axis to the map's, degrees."""
 
 
-def tcp_of(config: PlacingConfig, pose: np.ndarray, lift: float | np.ndarray = 0.0) -> np.ndarray:
+def tcp_from_pose(
+    config: BaseTransformConfig, pose: np.ndarray, lift: float | np.ndarray = 0.0
+) -> np.ndarray:
     """[..., 6] the tool pose that puts the head at a pose of the map.
 
     Args:
@@ -44,14 +46,14 @@ def tcp_of(config: PlacingConfig, pose: np.ndarray, lift: float | np.ndarray = 0
     return np.stack([x, y, z, *axis, np.zeros_like(x)], axis=-1)
 
 
-def pose_of(config: PlacingConfig, tcp: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def pose_from_tcp(config: BaseTransformConfig, tcp: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The head's pose in the map [..., 3], heading wrapped, and its lift above working height [...] m."""
     tcp = np.asarray(tcp, np.float64)
-    pose = np.stack([tcp[..., 0], tcp[..., 1], heading_of(tcp)], axis=-1)
+    pose = np.stack([tcp[..., 0], tcp[..., 1], tcp_heading(tcp)], axis=-1)
     return between(_origin(config), pose), tcp[..., 2] - config.z
 
 
-def heading_of(tcp: np.ndarray) -> np.ndarray:
+def tcp_heading(tcp: np.ndarray) -> np.ndarray:
     """[...] rad: where the tool's x axis points, seen from above, in the base frame."""
     axis, turn = _axis_angle(tcp)
     x, y, z = np.moveaxis(axis, -1, 0)
@@ -59,7 +61,7 @@ def heading_of(tcp: np.ndarray) -> np.ndarray:
     return np.arctan2(z * sin + x * y * (1 - cos), cos + x * x * (1 - cos))
 
 
-def tilt_of(tcp: np.ndarray) -> np.ndarray:
+def tcp_tilt(tcp: np.ndarray) -> np.ndarray:
     """[...] rad: the angle between the tool's z axis and straight down."""
     axis, turn = _axis_angle(tcp)
     up = np.cos(turn) + axis[..., 2] ** 2 * (1 - np.cos(turn))
@@ -73,5 +75,5 @@ def _axis_angle(tcp: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return vector / np.where(turn > 0, turn, 1.0)[..., None], turn
 
 
-def _origin(config: PlacingConfig) -> np.ndarray:
+def _origin(config: BaseTransformConfig) -> np.ndarray:
     return np.array([config.x, config.y, np.radians(config.yaw_deg)])

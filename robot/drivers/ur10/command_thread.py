@@ -15,22 +15,30 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from robot.drivers.outcome import Outcome
+from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10.config import ArmConfig
-from robot.drivers.ur10.safety import GENTLE, SLACK, Finding, Refused, Watch, allowed, judged
-from robot.drivers.ur10.shared_state import Board
+from robot.drivers.ur10.safety import (
+    MOVED_ON,
+    RETREAT_SPEED,
+    Finding,
+    StateMemory,
+    TargetRefused,
+    check_command,
+    check_state,
+)
+from robot.drivers.ur10.shared_state import SharedState
 
-MISSING = 3  # periods without a state that are no accident
-UNGOVERNED = {
-    Outcome.ARM_GONE,
-    Outcome.PROTECTIVE_STOP,
-    Outcome.SAFEGUARD_STOP,
-    Outcome.EMERGENCY_STOP,
+MAX_MISSING_STATES = 3  # periods without a state that are no accident
+SCRIPT_UNUSABLE = {
+    SessionOutcome.ARM_GONE,
+    SessionOutcome.PROTECTIVE_STOP,
+    SessionOutcome.SAFEGUARD_STOP,
+    SessionOutcome.EMERGENCY_STOP,
 }
 """Ends after which the control script is not spoken to: its watchdog goes hungry and ends it."""
 
 
-class Order(NamedTuple):
+class ArmCommand(NamedTuple):
     """What the session wants of the arm.
 
     Attributes:
@@ -45,43 +53,45 @@ class Order(NamedTuple):
     stops: int = 0
 
 
-class Governor:
+class CommandThread:
     """The control interface, what holds the arm, and what is still to be told.
 
     Attributes:
         held: why no more moves are taken. ungoverned: whether the control script is left alone.
     """
 
-    def __init__(self, config: ArmConfig, board: Board, control: Any, report: Callable[..., None]) -> None:
-        self.config, self.board, self.control, self.report = config, board, control, report
+    def __init__(
+        self, config: ArmConfig, shared: SharedState, control: Any, report: Callable[..., None]
+    ) -> None:
+        self.config, self.shared, self.control, self.report = config, shared, control, report
         self.held: Finding | None = None
-        self.ungoverned = False
+        self.script_unusable = False
         self.leaving = False
         self._retreating = False
-        self._watch = Watch()
+        self._watch = StateMemory()
         self._rest = np.zeros(6)
-        self._most = math.inf  # N; no contact is judged before the force at rest is known
+        self._force_limit = math.inf  # N; no contact is judged before the force at rest is known
         self._own_stops = 0
         self._stopped = self._wanted()
-        self._orders: queue.SimpleQueue[Order] = queue.SimpleQueue()
+        self._orders: queue.SimpleQueue[ArmCommand] = queue.SimpleQueue()
         self._wake = threading.Event()
 
     # What the thread that reads states calls.
 
-    def settle(self, rest: np.ndarray) -> None:
+    def set_rest_force(self, rest: np.ndarray) -> None:
         """From now on a contact counts; `rest` [6] is the force without one."""
-        self._rest, self._most = rest, self.config.force_limit
+        self._rest, self._force_limit = rest, self.config.force_limit
         self._watch = self._watch._replace(loaded=0)
 
-    def judge(self, state: np.ndarray) -> None:
+    def check_state(self, state: np.ndarray) -> None:
         """Stop if a state (STATE) says so."""
-        self._watch, finding = judged(self.config, self._watch, state, self._rest, self._most)
+        self._watch, finding = check_state(self.config, self._watch, state, self._rest, self._force_limit)
         if finding is not None:
             self.hold(finding)
 
     def hold(self, finding: Finding) -> None:
         """Stop, and take no more moves. What holds already and is no retreat has been stopped."""
-        self.ungoverned |= finding.outcome in UNGOVERNED
+        self.script_unusable |= finding.outcome in SCRIPT_UNUSABLE
         if self.held is not None and not self._retreating:
             return
         if self.held is None:
@@ -95,19 +105,19 @@ class Governor:
         self._own_stops += 1
         self._wake.set()
 
-    def put(self, order: Order) -> None:
+    def put(self, order: ArmCommand) -> None:
         self._orders.put(order)
         self._wake.set()
 
-    def look(self) -> None:
+    def check_stop_request(self) -> None:
         """See whether the session asks for a stop."""
         if self._wanted() != self._stopped:
             self._wake.set()
 
     @property
-    def obeyed(self) -> bool:
+    def stops_sent(self) -> bool:
         """Whether every stop has been told."""
-        return self.ungoverned or self._wanted() == self._stopped
+        return self.script_unusable or self._wanted() == self._stopped
 
     # What its own thread does.
 
@@ -116,7 +126,7 @@ class Governor:
         while True:
             self._wake.wait(0.3 / self.config.watchdog_hz)
             self._wake.clear()
-            if not self.ungoverned:
+            if not self.script_unusable:
                 self.act()
 
     def act(self) -> None:
@@ -127,48 +137,50 @@ class Governor:
             self._stopped = wanted
         while not (self._orders.empty() or self.leaving):
             self.execute(self._orders.get())
-        if time.monotonic() - float(self.board.control["heartbeat"]) <= self.config.heartbeat:
+        if time.monotonic() - float(self.shared.control["heartbeat"]) <= self.config.heartbeat:
             self.control.kickWatchdog()
 
-    def execute(self, order: Order) -> None:
+    def execute(self, order: ArmCommand) -> None:
         """Begin a move, if nothing speaks against it."""
-        here = self.board.latest()
+        here = self.shared.latest()
         if here is None or self._revoked(order):
             return
         try:
-            target = allowed(self.config, order.target, here["tcp"], order.speed)
+            target = check_command(self.config, order.target, here["tcp"], order.speed)
             if order.do == "retreat":
-                _gentle(self.config, target, here["tcp"], order.speed)
-        except Refused as refused:
-            self.hold(Finding(Outcome.NOT_ARRIVED, f"the arm's process refused: {refused}"))
+                _check_retreat(self.config, target, here["tcp"], order.speed)
+        except TargetRefused as refused:
+            self.hold(Finding(SessionOutcome.NOT_ARRIVED, f"the arm's process refused: {refused}"))
             return
         # moveL takes any target: one without joints ends the script on a real controller.
         if not self.control.isPoseWithinSafetyLimits(target.tolist()):
-            time.sleep(MISSING / self.config.hz)  # False means a stop as well: then a state says so
+            time.sleep(
+                MAX_MISSING_STATES / self.config.hz
+            )  # False means a stop as well: then a state says so
             places = ", ".join(f"{v:.3f}" for v in target)
-            self.hold(Finding(Outcome.UNREACHABLE, f"no joints for ({places})"))
+            self.hold(Finding(SessionOutcome.UNREACHABLE, f"no joints for ({places})"))
             return
         if self._revoked(order):
             return
         if order.do == "retreat":
             force = math.hypot(*(here["force"][:3] - self._rest[:3]))
-            self._most = max(force, self.config.force_limit) + self.config.force_limit
+            self._force_limit = max(force, self.config.force_limit) + self.config.force_limit
             self._watch = self._watch._replace(loaded=0)
             self._retreating = True
-        newest = self.board.latest()
+        newest = self.shared.latest()
         assert newest is not None
         self.report(say="moving", number=order.number, operation=int(newest["operation"]))
         self.control.moveL(target.tolist(), order.speed, self.config.acceleration, True)
 
-    def _revoked(self, order: Order) -> bool:
-        stopped = order.stops != int(self.board.control["stops"]) or self._wanted() != self._stopped
+    def _revoked(self, order: ArmCommand) -> bool:
+        stopped = order.stops != int(self.shared.control["stops"]) or self._wanted() != self._stopped
         return stopped or (self.held is not None and order.do != "retreat")
 
     def _wanted(self) -> tuple[int, int]:
-        return int(self.board.control["stops"]), self._own_stops
+        return int(self.shared.control["stops"]), self._own_stops
 
 
-def _gentle(config: ArmConfig, target: np.ndarray, here: np.ndarray, speed: float) -> None:
+def _check_retreat(config: ArmConfig, target: np.ndarray, here: np.ndarray, speed: float) -> None:
     way = math.dist(target[:3], here[:3])
-    if way > config.backoff + 2 * SLACK or speed > GENTLE:
-        raise Refused(f"backing off by {way:.3f} m at {speed:g} m/s")
+    if way > config.backoff + 2 * MOVED_ON or speed > RETREAT_SPEED:
+        raise TargetRefused(f"backing off by {way:.3f} m at {speed:g} m/s")

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, PositiveFloat, model_validator
 
-from robot.drivers.ur10.base_transform import PlacingConfig
+from robot.drivers.ur10.base_transform import BaseTransformConfig
 from tactile.base.config import Settings
 
 SPEED_CAP = 0.25  # m/s; ISO 10218-1's reduced speed. No setting reaches beyond it
@@ -37,7 +37,7 @@ class ArmConfig(Settings):
     """The controller's address; its ports are fixed. The default is the emulator's."""
     hz: Literal[125, 500] = 125
     """Rate of the state stream: 125 of a CB3, 500 of an e-Series (which does 125 as well)."""
-    placing: PlacingConfig = PlacingConfig()
+    placing: BaseTransformConfig = BaseTransformConfig()
     """Where the map lies in the base frame."""
     box: BoxConfig = BoxConfig()
     """Checked on every target and on every state."""

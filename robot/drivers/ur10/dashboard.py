@@ -11,14 +11,14 @@ from contextlib import suppress
 from typing import NamedTuple
 
 PORT = 29999
-OLDEST = (3, 4)  # PolyScope; older ones lack what the control script asks for
+MIN_POLYSCOPE = (3, 4)  # PolyScope; older ones lack what the control script asks for
 
 
-class Silent(ConnectionError):
+class DashboardSilent(ConnectionError):
     """Nobody answers as a dashboard server does."""
 
 
-class Controller(NamedTuple):
+class ControllerStatus(NamedTuple):
     """What a controller says of itself.
 
     Attributes:
@@ -45,7 +45,7 @@ class Dashboard:
             self._socket.settimeout(timeout)
             self._line()  # the greeting
         except OSError as error:
-            raise Silent(f"no dashboard server answers at {host}:{PORT} ({error})") from None
+            raise DashboardSilent(f"no dashboard server answers at {host}:{PORT} ({error})") from None
 
     def __enter__(self) -> Dashboard:
         return self
@@ -59,19 +59,19 @@ class Dashboard:
             self._socket.sendall(command.encode() + b"\n")
             return self._line()
         except OSError as error:
-            raise Silent(f"{self.host}:{PORT} did not answer `{command}` ({error})") from None
+            raise DashboardSilent(f"{self.host}:{PORT} did not answer `{command}` ({error})") from None
 
     def stop(self) -> str:
         """End the controller's program, which stops the arm."""
         return self.ask("stop")
 
-    def controller(self) -> Controller:
+    def controller(self) -> ControllerStatus:
         """What the controller says of itself."""
         version = _version(self.ask("PolyscopeVersion"))
         safety = self.ask("safetymode")
         remote = "true" in self.ask("is in remote control").lower() if version >= (5, 6) else None
         program = "true" in self.ask("running").lower()
-        return Controller(version, _value(self.ask("robotmode")), _value(safety), program, remote)
+        return ControllerStatus(version, _value(self.ask("robotmode")), _value(safety), program, remote)
 
     def close(self) -> None:
         """Hang up."""
@@ -90,10 +90,10 @@ class Dashboard:
         return line.decode(errors="replace").strip()
 
 
-def stop(host: str, timeout: float = 0.5, tries: int = 3) -> str:
+def stop_program(host: str, timeout: float = 0.5, tries: int = 3) -> str:
     """Stop the controller's program by a connection of its own; its answer, '' if nobody gives one."""
     for _ in range(tries):
-        with suppress(Silent), Dashboard(host, timeout) as dashboard:
+        with suppress(DashboardSilent), Dashboard(host, timeout) as dashboard:
             return dashboard.stop()
     return ""
 

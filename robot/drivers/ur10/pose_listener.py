@@ -22,7 +22,7 @@ from robot.drivers.ur10.rtde_protocol import RTDE_PORT
 _FIELDS = ("timestamp", "actual_TCP_pose", "actual_TCP_speed")
 
 
-class Pose(NamedTuple):
+class ToolPose(NamedTuple):
     """A tool's pose when it was told.
 
     Attributes:
@@ -36,7 +36,7 @@ class Pose(NamedTuple):
     robot_time: float
 
 
-class PoseStream:
+class PoseListener:
     """Listens in a thread of its own, and connects anew whenever the controller goes away.
 
     Args:
@@ -48,7 +48,7 @@ class PoseStream:
         self._address = (host, port)
         self._hz = hz
         self._patience = patience
-        self._latest: Pose | None = None
+        self._latest: ToolPose | None = None
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="tool poses", daemon=True)
         self._thread.start()
@@ -58,7 +58,7 @@ class PoseStream:
         pose = self._latest
         return None if pose is None else (pose.time, pose.tcp, pose.speed)
 
-    def newest(self) -> Pose | None:
+    def newest(self) -> ToolPose | None:
         """The newest state with the controller's time."""
         return self._latest
 
@@ -83,17 +83,17 @@ class PoseStream:
             self._closing.wait(0.1)
 
     def _listen(self) -> None:
-        layout = rtde_protocol.layout([rtde_protocol.OUTPUT_TYPES[name] for name in _FIELDS])
-        splitter = rtde_protocol.Splitter()
+        layout = rtde_protocol.data_layout([rtde_protocol.OUTPUT_TYPES[name] for name in _FIELDS])
+        splitter = rtde_protocol.PackageSplitter()
         with socket.create_connection(self._address, timeout=self._patience) as link:
             link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             link.sendall(
-                rtde_protocol.packed(rtde_protocol.PROTOCOL, struct.pack(">H", rtde_protocol.VERSION))
+                rtde_protocol.pack_package(rtde_protocol.PROTOCOL, struct.pack(">H", rtde_protocol.VERSION))
             )
             recipe = struct.pack(">d", self._hz) + ",".join(_FIELDS).encode()
             link.sendall(
-                rtde_protocol.packed(rtde_protocol.OUTPUTS, recipe)
-                + rtde_protocol.packed(rtde_protocol.START)
+                rtde_protocol.pack_package(rtde_protocol.OUTPUTS, recipe)
+                + rtde_protocol.pack_package(rtde_protocol.START)
             )
             while not self._closing.is_set():
                 data = link.recv(1 << 14)
@@ -103,4 +103,4 @@ class PoseStream:
                 for kind, body in splitter.feed(data):
                     if kind == rtde_protocol.DATA:
                         numbers = np.array(layout.unpack(body)[1:])
-                        self._latest = Pose(host, numbers[1:7], numbers[7:13], float(numbers[0]))
+                        self._latest = ToolPose(host, numbers[1:7], numbers[7:13], float(numbers[0]))

@@ -12,18 +12,18 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from robot.drivers.outcome import Outcome
+from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10.config import ArmConfig
 from robot.drivers.ur10.safety import Finding
 
-HUNG_UP = ("closed the connection", "Connection reset", "Connection refused", "End of file")
+CONNECTION_LOST = ("closed the connection", "Connection reset", "Connection refused", "End of file")
 
 
-class Process:
+class ArmProcess:
     """A running `robot.drivers.ur10.rtde_process`. Its end of the pipes closes with this process, however
     that ends."""
 
-    def __init__(self, board: str, config: ArmConfig) -> None:
+    def __init__(self, shared: str, config: ArmConfig) -> None:
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115
         paths = [str(Path(__file__).parents[3]), *filter(None, [os.environ.get("PYTHONPATH")])]
         environment = {
@@ -33,7 +33,7 @@ class Process:
             "OPENBLAS_NUM_THREADS": "1",
         }
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "robot.drivers.ur10.rtde_process", board, config.model_dump_json()],
+            [sys.executable, "-m", "robot.drivers.ur10.rtde_process", shared, config.model_dump_json()],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._errors,
@@ -51,7 +51,7 @@ class Process:
     def pid(self) -> int:
         return self._process.pid
 
-    def order(self, **fields: Any) -> None:
+    def send(self, **fields: Any) -> None:
         """Send an order; a process that is gone is found out elsewhere."""
         with contextlib.suppress(OSError, ValueError):  # ValueError: its end of the line is closed
             self._orders.write(json.dumps(fields).encode() + b"\n")
@@ -62,21 +62,21 @@ class Process:
         *lines, self._rest = (self._rest + data).split(b"\n")
         return [json.loads(line) for line in lines]
 
-    def ended(self) -> Finding | None:
+    def exit_finding(self) -> Finding | None:
         """How it ended; None while it runs."""
         code = self._process.poll()
         if code is None:
             return None
-        said = self.said()
+        said = self.stderr_tail()
         name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
         lines = [line for line in said.splitlines() if "what():" in line] or said.splitlines() or [""]
         last = lines[-1].replace("what():", "").strip()[-200:]
         detail = f"the arm's process ended ({name})" + (f": {last}" if last else "")
-        if code == -signal.SIGABRT and not any(word in said for word in HUNG_UP):
-            return Finding(Outcome.ARM_MALFORMED, detail)
-        return Finding(Outcome.ARM_GONE, detail)
+        if code == -signal.SIGABRT and not any(word in said for word in CONNECTION_LOST):
+            return Finding(SessionOutcome.ARM_MALFORMED, detail)
+        return Finding(SessionOutcome.ARM_GONE, detail)
 
-    def said(self) -> str:
+    def stderr_tail(self) -> str:
         """What it and the library printed."""
         # A position of our own: the file's is shared with the process that writes.
         size = os.fstat(self._errors.fileno()).st_size
@@ -84,7 +84,7 @@ class Process:
 
     def end(self, patience: float) -> bool:
         """Ask it to stop the arm and go; whether it did in time, s."""
-        self.order(do="end")
+        self.send(do="end")
         try:
             self._process.wait(patience)
         except subprocess.TimeoutExpired:

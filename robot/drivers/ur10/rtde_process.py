@@ -2,7 +2,7 @@
 
     python -m robot.drivers.ur10.rtde_process NAME CONFIG_JSON
 
-NAME is the session's board (states.py). Orders come as JSON lines on the standard input, reports leave as
+NAME is the session's shared (states.py). Orders come as JSON lines on the standard input, reports leave as
 JSON lines on the standard output, whatever the library prints goes to the standard error.
 
 The arm is stopped from here when a state says so, when the session asks for it, when it falls silent, and
@@ -22,18 +22,18 @@ from typing import Any
 
 import numpy as np
 
-from robot.drivers.outcome import Outcome
-from robot.drivers.process_priority import URGENT, ranked
+from robot.drivers.outcome import SessionOutcome
+from robot.drivers.process_priority import URGENT, set_niceness
 from robot.drivers.ur10 import dashboard
-from robot.drivers.ur10.command_thread import MISSING, Governor, Order
+from robot.drivers.ur10.command_thread import MAX_MISSING_STATES, ArmCommand, CommandThread
 from robot.drivers.ur10.config import ArmConfig
-from robot.drivers.ur10.safety import Finding, still
-from robot.drivers.ur10.shared_state import STATE, Board
+from robot.drivers.ur10.safety import Finding, at_rest
+from robot.drivers.ur10.shared_state import ARM_STATE, SharedState
 from tactile.base.errors import InputError
 
 PLAYING = 2  # runtime state
-SETTLE = 0.25  # s of states at rest from which the force at rest is taken, and the session takes the rate
-LEAVING = 0.4  # s that a last stop may take before the dashboard server is asked for it
+REST_TIME = 0.25  # s of states at rest from which the force at rest is taken, and the session takes the rate
+LAST_STOP = 0.4  # s that a last stop may take before the dashboard server is asked for it
 
 VARIABLES = [
     "timestamp",
@@ -47,14 +47,16 @@ VARIABLES = [
 ]
 
 
-class Child:
+class RtdeProcess:
     """Both interfaces of a controller: states are read, judged and passed on, the session is listened to."""
 
-    def __init__(self, config: ArmConfig, board: Board, receive: Any, control: Any, reports: int) -> None:
-        self.config, self.board, self.receive, self.control = config, board, receive, control
-        self.governor = Governor(config, board, control, self.report)
+    def __init__(
+        self, config: ArmConfig, shared: SharedState, receive: Any, control: Any, reports: int
+    ) -> None:
+        self.config, self.shared, self.receive, self.control = config, shared, receive, control
+        self.commands = CommandThread(config, shared, control, self.report)
         self._reports = reports
-        self._state = np.zeros((), STATE)
+        self._state = np.zeros((), ARM_STATE)
         self._settled = False
         self._leaving = math.inf
         self._input = b""
@@ -62,22 +64,25 @@ class Child:
     def run(self) -> None:
         """Until the session ends or is gone."""
         began = time.monotonic()
-        threading.Thread(target=self.governor.run, daemon=True).start()
-        while not self._left():
+        threading.Thread(target=self.commands.run, daemon=True).start()
+        while not self._finished():
             now = time.monotonic()
             if self._read(now):
-                self.governor.judge(self._state)
+                self.commands.check_state(self._state)
                 if self._settled and self._state["runtime"] != PLAYING:
                     self._lose("the control script ended on the controller")
-            elif now - self._state["host"] > MISSING / self.config.hz and not self.receive.isConnected():
+            elif (
+                now - self._state["host"] > MAX_MISSING_STATES / self.config.hz
+                and not self.receive.isConnected()
+            ):
                 self._lose("the controller closed the connection")
-            if not self._settled and self.board.newest and now - began > SETTLE:
+            if not self._settled and self.shared.newest and now - began > REST_TIME:
                 self._settle()
             self._listen()
-            silent = now - float(self.board.control["heartbeat"])
+            silent = now - float(self.shared.control["heartbeat"])
             if silent > self.config.heartbeat:
                 self._leave(f"the session was silent for {silent:.3f} s")
-            self.governor.look()
+            self.commands.check_stop_request()
             time.sleep(0.25 / self.config.hz)
 
     def report(self, **fields: Any) -> None:
@@ -109,18 +114,18 @@ class Child:
         state["operation"] = operation.operationId()
         state["progress"] = operation.progress() if operation.isAsyncOperationRunning() else -1
         state["host"] = now
-        self.board.publish(state)
+        self.shared.publish(state)
         return True
 
     def _settle(self) -> None:
         """The force at rest is the median of what was seen; the arm is ready."""
-        states = self.board.since(int(self.board.control["first"]) - 1)
-        self.governor.settle(np.median(states["force"], axis=0))
+        states = self.shared.since(int(self.shared.control["first"]) - 1)
+        self.commands.set_rest_force(np.median(states["force"], axis=0))
         self._settled = True
         self.report(say="ready")
 
     def _lose(self, detail: str) -> None:
-        self.governor.hold(Finding(Outcome.ARM_GONE, detail))
+        self.commands.hold(Finding(SessionOutcome.ARM_GONE, detail))
 
     def _listen(self) -> None:
         """Take orders; the end of the input is the end of the session."""
@@ -132,30 +137,30 @@ class Child:
             self._leave("the session is gone")
         *lines, self._input = (self._input + data).split(b"\n")
         for line in lines:
-            order = Order(**json.loads(line))
+            order = ArmCommand(**json.loads(line))
             if order.do == "end":
                 self._leave("told to end")
             else:
-                self.governor.put(order)
+                self.commands.put(order)
 
     def _leave(self, reason: str) -> None:
         """Begin to end: a last stop."""
         if math.isinf(self._leaving):
             print(reason, file=sys.stderr, flush=True)
-            self._leaving = time.monotonic() + LEAVING
-            self.governor.leaving = True
-            self.governor.stop()
+            self._leaving = time.monotonic() + LAST_STOP
+            self.commands.leaving = True
+            self.commands.stop()
 
-    def _left(self) -> bool:
+    def _finished(self) -> bool:
         """Whether the arm stands, or all was tried; the program on the controller is ended with it."""
-        stands = self.governor.leaving and self.governor.obeyed and still(self._state)
+        stands = self.commands.leaving and self.commands.stops_sent and at_rest(self._state)
         if stands or time.monotonic() > self._leaving:
-            dashboard.stop(self.config.host)
+            dashboard.stop_program(self.config.host)
             return True
         return False
 
 
-def connected(config: ArmConfig) -> tuple[Any, Any]:
+def connect(config: ArmConfig) -> tuple[Any, Any]:
     """The library's receive and control interfaces, with the tool set and the watchdog on."""
     try:
         import rtde_control
@@ -177,18 +182,18 @@ def main(name: str, text: str) -> None:
     os.dup2(2, 1)
     os.set_blocking(0, False)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the session decides what an interrupt means
-    ranked(URGENT)
+    set_niceness(URGENT)
     config = ArmConfig.model_validate_json(text)
-    board = Board(name)
+    shared = SharedState(name)
     # The constructors hold the interpreter's lock and may wait for ever; the alarm ends even that.
     signal.alarm(math.ceil(config.connect) + 1)
     try:
-        receive, control = connected(config)
+        receive, control = connect(config)
     except Exception as error:
         os.write(reports, json.dumps({"say": "refused", "detail": str(error)}).encode() + b"\n")
         os._exit(1)
     signal.alarm(0)
-    Child(config, board, receive, control, reports).run()
+    RtdeProcess(config, shared, receive, control, reports).run()
     os._exit(0)
 
 

@@ -72,17 +72,17 @@ class Package(NamedTuple):
     body: bytes
 
 
-def packed(kind: int, body: bytes = b"") -> bytes:
+def pack_package(kind: int, body: bytes = b"") -> bytes:
     """A package as it goes over the wire."""
     return HEADER.pack(HEADER.size + len(body), kind) + body
 
 
-def layout(types: Sequence[str]) -> struct.Struct:
+def data_layout(types: Sequence[str]) -> struct.Struct:
     """How a data package with these types is packed, its recipe's number first."""
     return struct.Struct(">B" + "".join(CODES[name] for name in types))
 
 
-class Splitter:
+class PackageSplitter:
     """Cuts a stream into packages."""
 
     def __init__(self) -> None:

@@ -10,31 +10,31 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from robot.drivers.outcome import Outcome
-from robot.drivers.ur10.base_transform import tilt_of
+from robot.drivers.outcome import SessionOutcome
+from robot.drivers.ur10.base_transform import tcp_tilt
 from robot.drivers.ur10.config import SPEED_CAP, TURN_CAP, ArmConfig
 
 REACH = 3.0  # m; a UR-10 has 1.3. A tool further away is no state of an arm
 JOINT_RANGE = 2.2 * np.pi  # rad; a UR joint turns by 2 pi either way
-IN_A_ROW = 2  # states that have to show a force before it counts: one may be noise
+MIN_LOADED = 2  # states that have to show a force before it counts: one may be noise
 ROUNDING = 1e-6  # m; what a pose may lie beyond the box because it was computed
-GENTLE = 0.02  # m/s; speed of backing off
-LEAST = 1e-3  # m/s; the slowest a move is worth waiting for
-SLACK = 1e-3  # m; the arm may have moved on since its session looked
+RETREAT_SPEED = 0.02  # m/s; speed of backing off
+MIN_SPEED = 1e-3  # m/s; the slowest a move is worth waiting for
+MOVED_ON = 1e-3  # m; the arm may have moved on since its session looked
 
 # Safety status bits of RTDE, gravest first.
 SAFETY_BITS = (
-    (0b11100000, Outcome.EMERGENCY_STOP, "an emergency stop is pressed"),
-    (1 << 2, Outcome.PROTECTIVE_STOP, "the controller made a protective stop"),
-    (1 << 4, Outcome.SAFEGUARD_STOP, "a safeguard is open"),
-    (1 << 3, Outcome.PROTECTIVE_STOP, "the controller is in recovery mode"),
-    (1 << 8, Outcome.PROTECTIVE_STOP, "the controller reports a safety violation"),
-    (1 << 9, Outcome.PROTECTIVE_STOP, "the controller reports a safety fault"),
-    (1 << 10, Outcome.PROTECTIVE_STOP, "the controller stopped for safety"),
+    (0b11100000, SessionOutcome.EMERGENCY_STOP, "an emergency stop is pressed"),
+    (1 << 2, SessionOutcome.PROTECTIVE_STOP, "the controller made a protective stop"),
+    (1 << 4, SessionOutcome.SAFEGUARD_STOP, "a safeguard is open"),
+    (1 << 3, SessionOutcome.PROTECTIVE_STOP, "the controller is in recovery mode"),
+    (1 << 8, SessionOutcome.PROTECTIVE_STOP, "the controller reports a safety violation"),
+    (1 << 9, SessionOutcome.PROTECTIVE_STOP, "the controller reports a safety fault"),
+    (1 << 10, SessionOutcome.PROTECTIVE_STOP, "the controller stopped for safety"),
 )
 
 
-class Refused(ValueError):
+class TargetRefused(ValueError):
     """A target that the arm is not sent to."""
 
 
@@ -55,11 +55,11 @@ class Move(NamedTuple):
 class Finding(NamedTuple):
     """Why the arm must stop: how that end is called, and what was found."""
 
-    outcome: Outcome
+    outcome: SessionOutcome
     detail: str
 
 
-class Watch(NamedTuple):
+class StateMemory(NamedTuple):
     """What is remembered from state to state.
 
     Attributes:
@@ -70,7 +70,7 @@ class Watch(NamedTuple):
     robot: float = -np.inf
 
 
-def checked(config: ArmConfig, target: Any, from_tcp: Any) -> np.ndarray:
+def check_target(config: ArmConfig, target: Any, from_tcp: Any) -> np.ndarray:
     """The target [6] if the arm may go there from where it stands, in a straight line; else raises Refused.
 
     A box is convex: a line between two points of it stays in it.
@@ -78,29 +78,29 @@ def checked(config: ArmConfig, target: Any, from_tcp: Any) -> np.ndarray:
     try:
         target = np.array(target, np.float64)
     except (TypeError, ValueError):
-        raise Refused(f"a target must be six numbers, not {target!r}") from None
+        raise TargetRefused(f"a target must be six numbers, not {target!r}") from None
     if target.shape != (6,):
-        raise Refused(f"a target must be six numbers, not of shape {target.shape}")
+        raise TargetRefused(f"a target must be six numbers, not of shape {target.shape}")
     if not np.isfinite(target).all():
-        raise Refused(f"a target must be finite: {target.tolist()}")
-    if not inside(config, target):
-        raise Refused(f"{_place(target)} lies outside the box {_box(config)}")
+        raise TargetRefused(f"a target must be finite: {target.tolist()}")
+    if not in_box(config, target):
+        raise TargetRefused(f"{_place(target)} lies outside the box {_box(config)}")
     if math.hypot(*target[3:]) > 2 * np.pi:
-        raise Refused(f"a rotation vector is at most one turn long: {target[3:].tolist()}")
-    if np.degrees(tilt_of(target)) > config.tilt_deg + ROUNDING:
-        raise Refused(
-            f"the tool would lean {np.degrees(tilt_of(target)):.1f} degrees from straight down; "
+        raise TargetRefused(f"a rotation vector is at most one turn long: {target[3:].tolist()}")
+    if np.degrees(tcp_tilt(target)) > config.tilt_deg + ROUNDING:
+        raise TargetRefused(
+            f"the tool would lean {np.degrees(tcp_tilt(target)):.1f} degrees from straight down; "
             f"{config.tilt_deg:g} are allowed"
         )
     start = np.asarray(from_tcp, np.float64)
-    if start.shape != (6,) or not np.isfinite(start).all() or not inside(config, start):
-        raise Refused(
+    if start.shape != (6,) or not np.isfinite(start).all() or not in_box(config, start):
+        raise TargetRefused(
             f"the tool stands at {_place(start)}, outside the box {_box(config)}: bring it in by hand"
         )
     return target
 
 
-def planned(config: ArmConfig, target: Any, from_tcp: Any, speed: float | None = None) -> Move:
+def plan_move(config: ArmConfig, target: Any, from_tcp: Any, speed: float | None = None) -> Move:
     """A checked move at a checked speed (m/s; none: the configured one).
 
     A controller is told the speed of the tool centre point, and makes a turning speed of it in its own way
@@ -108,13 +108,13 @@ def planned(config: ArmConfig, target: Any, from_tcp: Any, speed: float | None =
     tool gets no faster than `speed` on it; so does a millimetre. On longer ones a turn that were faster than
     1 rad/s slows the move down.
     """
-    target = checked(config, target, from_tcp)
+    target = check_target(config, target, from_tcp)
     speed = config.speed if speed is None else speed
-    if not (isinstance(speed, float | int) and LEAST <= speed <= config.speed):
-        raise Refused(f"a speed must be {LEAST:g} to {config.speed:g} m/s, not {speed!r}")
+    if not (isinstance(speed, float | int) and MIN_SPEED <= speed <= config.speed):
+        raise TargetRefused(f"a speed must be {MIN_SPEED:g} to {config.speed:g} m/s, not {speed!r}")
     start = np.asarray(from_tcp, np.float64)
-    way, turn = float(np.linalg.norm(target[:3] - start[:3])), turned(start, target)
-    if way <= max(speed**2 / config.acceleration, SLACK) and turn / config.turn_rate > way / speed:
+    way, turn = float(np.linalg.norm(target[:3] - start[:3])), rotation_angle(start, target)
+    if way <= max(speed**2 / config.acceleration, MOVED_ON) and turn / config.turn_rate > way / speed:
         told = config.turn_rate / config.turn_ratio
     else:
         told = min(speed, config.turn_rate / config.turn_ratio if turn > way else speed)
@@ -123,80 +123,80 @@ def planned(config: ArmConfig, target: Any, from_tcp: Any, speed: float | None =
     return Move(target, told, seconds, max(way, turn) / told + told / config.acceleration)
 
 
-def allowed(config: ArmConfig, target: Any, from_tcp: Any, told: float) -> np.ndarray:
+def check_command(config: ArmConfig, target: Any, from_tcp: Any, told: float) -> np.ndarray:
     """The last check before the wire: the target, if what is to be told keeps to every limit."""
-    target = checked(config, target, from_tcp)
+    target = check_target(config, target, from_tcp)
     way = float(np.linalg.norm(target[:3] - np.asarray(from_tcp, np.float64)[:3]))
-    short = way <= max(config.speed**2 / config.acceleration, SLACK) + SLACK
+    short = way <= max(config.speed**2 / config.acceleration, MOVED_ON) + MOVED_ON
     most = max(config.speed, config.turn_rate / config.turn_ratio) if short else config.speed
     if not (isinstance(told, float | int) and 0 < told <= min(most, SPEED_CAP)):
-        raise Refused(f"told {told!r} m/s on a way of {way:.3f} m; at most {most:g} are allowed")
+        raise TargetRefused(f"told {told!r} m/s on a way of {way:.3f} m; at most {most:g} are allowed")
     return target
 
 
-def turned(a: np.ndarray, b: np.ndarray) -> float:
+def rotation_angle(a: np.ndarray, b: np.ndarray) -> float:
     """The angle in [0, pi] between the rotations of two tool poses [6], rad."""
     p, q = _quaternion(a[3:]), _quaternion(b[3:])
     chord = min(np.linalg.norm(p - q), np.linalg.norm(p + q))  # q and -q are the same rotation
     return float(4 * np.arcsin(min(1.0, float(chord) / 2)))
 
 
-def arrived(config: ArmConfig, tcp: np.ndarray, target: np.ndarray) -> bool:
+def at_target(config: ArmConfig, tcp: np.ndarray, target: np.ndarray) -> bool:
     """Whether a tool pose is the target, as near as the settings ask."""
     near = float(np.linalg.norm(tcp[:3] - target[:3])) <= config.arrive
-    return near and np.degrees(turned(tcp, target)) <= config.arrive_turn_deg
+    return near and np.degrees(rotation_angle(tcp, target)) <= config.arrive_turn_deg
 
 
-def inside(config: ArmConfig, tcp: np.ndarray) -> bool:
+def in_box(config: ArmConfig, tcp: np.ndarray) -> bool:
     """Whether the tool centre point is in the box."""
     place = np.asarray(tcp, np.float64)[:3]
     low, high = np.array(config.box.low), np.array(config.box.high)
     return bool(((place >= low - ROUNDING) & (place <= high + ROUNDING)).all())
 
 
-def overloaded(config: ArmConfig, force: np.ndarray, rest: np.ndarray, most: float | None = None) -> bool:
+def exceeds_force(config: ArmConfig, force: np.ndarray, rest: np.ndarray, most: float | None = None) -> bool:
     """Whether a force [6] differs from that at rest by more than the limit (`most`; none: as configured)."""
     limit = config.force_limit if most is None else most
     return not math.hypot(*(force[:3] - rest[:3])) <= limit
 
 
-def still(state: np.ndarray) -> bool:
+def at_rest(state: np.ndarray) -> bool:
     """Whether a state (STATE) shows an arm at rest: under 0.5 mm/s and 0.3 degrees/s."""
     speed = state["speed"]
     return bool(np.linalg.norm(speed[:3]) < 0.5e-3 and np.linalg.norm(speed[3:]) < 5e-3)
 
 
-def judged(
-    config: ArmConfig, watch: Watch, state: np.ndarray, rest: np.ndarray, most: float | None = None
-) -> tuple[Watch, Finding | None]:
+def check_state(
+    config: ArmConfig, watch: StateMemory, state: np.ndarray, rest: np.ndarray, most: float | None = None
+) -> tuple[StateMemory, Finding | None]:
     """What one more state (STATE) says: the memory for the next one, and why the arm must stop, if it must.
 
     Args:
         rest: [6] force of the arm at rest. most: N, in place of the configured limit.
     """
     numbers = [state["robot"], *state["tcp"], *state["speed"], *state["force"], *state["joints"]]
-    loaded = watch.loaded + 1 if overloaded(config, state["force"], rest, most) else 0
-    after = Watch(loaded, float(state["robot"]))
+    loaded = watch.loaded + 1 if exceeds_force(config, state["force"], rest, most) else 0
+    after = StateMemory(loaded, float(state["robot"]))
     if not np.isfinite(numbers).all():
-        return after, Finding(Outcome.ARM_MALFORMED, "a state is not finite")
+        return after, Finding(SessionOutcome.ARM_MALFORMED, "a state is not finite")
     if np.abs(state["tcp"][:3]).max() > REACH or np.abs(state["joints"]).max() > JOINT_RANGE:
-        return after, Finding(Outcome.ARM_MALFORMED, f"no arm stands at {_place(state['tcp'])}")
+        return after, Finding(SessionOutcome.ARM_MALFORMED, f"no arm stands at {_place(state['tcp'])}")
     if state["robot"] <= watch.robot:
-        return after, Finding(Outcome.CLOCK_JUMPED, "the controller's clock went back")
+        return after, Finding(SessionOutcome.CLOCK_JUMPED, "the controller's clock went back")
     for bits, outcome, text in SAFETY_BITS:
         if int(state["safety"]) & bits:
             return after, Finding(outcome, text)
-    if not inside(config, state["tcp"]):
+    if not in_box(config, state["tcp"]):
         return after, Finding(
-            Outcome.OUT_OF_BOX, f"{_place(state['tcp'])} lies outside the box {_box(config)}"
+            SessionOutcome.OUT_OF_BOX, f"{_place(state['tcp'])} lies outside the box {_box(config)}"
         )
-    if loaded >= IN_A_ROW:
+    if loaded >= MIN_LOADED:
         force = math.hypot(*(state["force"][:3] - rest[:3]))
-        return after, Finding(Outcome.CONTACT, f"{force:.0f} N at the tool at {_place(state['tcp'])}")
+        return after, Finding(SessionOutcome.CONTACT, f"{force:.0f} N at the tool at {_place(state['tcp'])}")
     return after, None
 
 
-def retreat(config: ArmConfig, states: np.ndarray) -> np.ndarray | None:
+def retreat_target(config: ArmConfig, states: np.ndarray) -> np.ndarray | None:
     """Where to back off to: `backoff` from the newest state towards where the tool came from.
 
     Args:

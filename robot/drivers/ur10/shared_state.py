@@ -13,7 +13,7 @@ from multiprocessing import resource_tracker, shared_memory
 
 import numpy as np
 
-STATE = np.dtype(
+ARM_STATE = np.dtype(
     [
         ("counter", "u8"),  # of states since the session began, from 1
         ("host", "f8"),  # s, host's monotonic clock, when the state was seen
@@ -45,11 +45,11 @@ UNFINISHED = np.uint64(0)
 HEADER = 64  # bytes; keeps the ring on a cache line of its own
 
 
-class Board:
+class SharedState:
     """The ring and the few words beside it. `Board()` makes one, `Board(name)` opens another process's."""
 
     def __init__(self, name: str | None = None) -> None:
-        size = HEADER + SLOTS * STATE.itemsize
+        size = HEADER + SLOTS * ARM_STATE.itemsize
         self._made = name is None
         self._memory = shared_memory.SharedMemory(name, create=self._made, size=size if self._made else 0)
         if not self._made and sys.platform != "win32":
@@ -57,7 +57,7 @@ class Board:
             resource_tracker.unregister(self._memory._name, "shared_memory")  # type: ignore[attr-defined]
         self.name = self._memory.name
         self.control = np.ndarray((), CONTROL, self._memory.buf)
-        self._ring = np.ndarray(SLOTS, STATE, self._memory.buf, HEADER)
+        self._ring = np.ndarray(SLOTS, ARM_STATE, self._memory.buf, HEADER)
 
     @property
     def newest(self) -> int:
@@ -91,7 +91,7 @@ class Board:
     def close(self) -> None:
         """Let go of the memory; who made it also takes it away."""
         self.control = np.zeros((), CONTROL)
-        self._ring = np.zeros(1, STATE)
+        self._ring = np.zeros(1, ARM_STATE)
         with contextlib.suppress(BufferError):  # somebody still holds a view: it goes when the process does
             self._memory.close()
         if self._made:

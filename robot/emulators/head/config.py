@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
 
 from robot.drivers.head.usb_tcp_protocol import PORT
-from robot.drivers.ur10.base_transform import PlacingConfig
+from robot.drivers.ur10.base_transform import BaseTransformConfig
 from robot.simulation.head.beam import StreamConfig
 from robot.simulation.head.kinematic import MechanicsConfig
 from robot.world.head_trajectory import MotionConfig
@@ -47,7 +47,7 @@ class HeadEmulatorConfig(Settings):
     free air."""
     arm_hz: PositiveInt = 125
     """Of the arm's states."""
-    placing: PlacingConfig = PlacingConfig()
+    placing: BaseTransformConfig = BaseTransformConfig()
     """Where the map lies in the arm's base."""
     follow: bool = False
     """Without an arm: whether the head goes along the way from its first START on; else it stays where that

@@ -17,17 +17,17 @@ from robot.drivers.head.protocol import (
     CHANNELS,
     REQUEST_IN,
     VERSION,
-    Flag,
+    FrameFlag,
     Request,
-    counts,
-    encode,
-    unpack,
+    frame_values,
+    pack_frames,
+    unpack_command,
 )
 from robot.emulators.head import usb_descriptors
 from robot.emulators.head.config import HeadEmulatorConfig
-from robot.emulators.head.faults import Faults
+from robot.emulators.head.faults import HeadFaults
 from robot.emulators.head.fifo import Fifo
-from robot.emulators.head.pose_source import Along, Place
+from robot.emulators.head.pose_source import AlongPath, PoseSource
 from robot.emulators.head.whiskers import Block, Whiskers
 from robot.world.walls import Walls
 from tactile.base.random_streams import stream
@@ -39,7 +39,7 @@ STRING, CONFIGURE, CONFIGURED, ALTERNATE = (0x80, 6), (0x00, 9), (0x80, 8), (0x0
 """Standard requests that it answers, by bmRequestType and bRequest."""
 
 
-class Bridge:
+class EmulatedHead:
     """A head with power.
 
     Args:
@@ -50,7 +50,7 @@ class Bridge:
         streaming: whether it makes frames. heard: commands that came, by kind; "" for those it ignored.
     """
 
-    def __init__(self, config: HeadEmulatorConfig, walls: Walls, place: Place, now: float) -> None:
+    def __init__(self, config: HeadEmulatorConfig, walls: Walls, place: PoseSource, now: float) -> None:
         head = ur10_head(config.head)
         self.config, self.place, self.began = config, place, now
         self.samples = max(round(BLOCK * config.stream.rate), 2)
@@ -64,9 +64,9 @@ class Bridge:
             self.samples,
         )
         self.fifo = Fifo(config.fifo)
-        self.faults = Faults(len(head.length), stream(config.seed, "faults"))
+        self.faults = HeadFaults(len(head.length), stream(config.seed, "faults"))
         self.streaming = False
-        self.heard: Counter[str] = Counter()
+        self.received: Counter[str] = Counter()
         self._pace = 1 + config.drift_ppm * 1e-6  # of its clock
         self._made = 0  # samples
         self._first = round(config.age * config.stream.rate)
@@ -86,7 +86,7 @@ class Bridge:
             if self.streaming:
                 self._send(block, end)
         else:
-            self.whiskers.rested()
+            self.whiskers.skip_block()
         self._made += self.samples
         return True
 
@@ -100,12 +100,12 @@ class Bridge:
 
     def bulk_out(self, packet: bytes, now: float) -> None:
         """Takes a command; one that is none of ours is ignored."""
-        command = unpack(packet)
+        command = unpack_command(packet)
         if command is None:
-            self.heard[""] += 1
+            self.received[""] += 1
             return
-        self.heard[command.kind.name] += 1
-        self.whiskers.drives.hear(command, now)
+        self.received[command.kind.name] += 1
+        self.whiskers.drives.receive(command, now)
 
     def control(self, kind: int, request: int, value: int, size: int, now: float) -> bytes:
         """The answer to a control request, cut to the size.
@@ -175,7 +175,7 @@ class Bridge:
             "angle": self.whiskers.balance.before[0].tolist(),
             "pose": pose.tolist(),
             "lift": float(lift) if np.isfinite(lift) else None,
-            "commands": dict(self.heard),
+            "commands": dict(self.received),
             "sequence": self._first + self._made,
             "late": now - self.due + BLOCK / self._pace,
         }
@@ -184,7 +184,7 @@ class Bridge:
         if request == Request.START:
             self.fifo.clear()
             self.streaming = True
-            if isinstance(self.place, Along):
+            if isinstance(self.place, AlongPath):
                 self.place.begin(self._when(self._made))
         elif request == Request.STOP:
             self.halt()
@@ -203,21 +203,21 @@ class Bridge:
         return b""
 
     def _send(self, block: Block, now: float) -> None:
-        flags = np.where(block.begins, Flag.CYCLE, 0) | (Flag.RCP if block.fed_back else 0)
-        values = counts(block.angle, block.deflection)
-        values = self.faults.felt(values, self.config.stream.full_scale, now)
-        some = slice(self.samples - self.faults.kept(self.samples), None)
+        flags = np.where(block.begins, FrameFlag.CYCLE, 0) | (FrameFlag.RCP if block.fed_back else 0)
+        values = frame_values(block.angle, block.deflection)
+        values = self.faults.saturate_values(values, self.config.stream.full_scale, now)
+        some = slice(self.samples - self.faults.count_kept(self.samples), None)
         sample = self._made + np.arange(self.samples)[some]
         if len(sample) == 0:
             return
         flags = flags[some]
-        flags[0] |= Flag.OVERRUN if self.fifo.overran else 0
+        flags[0] |= FrameFlag.OVERRUN if self.fifo.overran else 0
         number = self._first + sample
         time = np.rint(number * (1e6 / self.config.stream.rate)).astype(np.int64) + self.faults.jump
-        raw = encode(number, time, flags, values[some])
+        raw = pack_frames(number, time, flags, values[some])
         size = len(raw) // len(sample)
         frames = [raw[k : k + size] for k in range(0, len(raw), size)]
-        self.fifo.push(self.faults.sent(frames))
+        self.fifo.push(self.faults.damage_frames(frames))
 
     def _clock(self, now: float) -> int:
         """us since it has power, by itself."""

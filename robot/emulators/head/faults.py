@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from robot.drivers.head.protocol import tally
+from robot.drivers.head.protocol import to_counts
 
 HEADER = 20 - 4
 """Bytes of a frame before its values."""
 
 
-class Faults:
+class HeadFaults:
     """Faults that are under way; times are the host's monotonic clock, s.
 
     Attributes:
@@ -70,23 +70,23 @@ class Faults:
         """As the host asks; while the cause lasts, it halts again."""
         self._halted = False
 
-    def felt(self, values: np.ndarray, full_scale: float, now: float) -> np.ndarray:
+    def saturate_values(self, values: np.ndarray, full_scale: float, now: float) -> np.ndarray:
         """[T, W, 3] counts, with whiskers that are pressed to their ends."""
         for whisker, until in list(self._saturated.items()):
             if now < until:
-                values[:, whisker, 1:] = tally(np.array(full_scale))
+                values[:, whisker, 1:] = to_counts(np.array(full_scale))
             else:
                 del self._saturated[whisker]
         return values
 
-    def kept(self, count: int) -> int:
+    def count_kept(self, count: int) -> int:
         """How many of the next frames, from the last one backwards, are not left out."""
         out = min(self._skip, count)
         self._skip -= out
         self.skipped += out
         return count - out
 
-    def sent(self, frames: list[bytes]) -> list[bytes]:
+    def damage_frames(self, frames: list[bytes]) -> list[bytes]:
         """The frames as they go out: their number stays."""
         for k in range(min(self._corrupt, len(frames))):
             place = HEADER + int(self._random.integers(len(frames[k]) - HEADER))

@@ -6,14 +6,14 @@ from typing import Protocol
 
 import numpy as np
 
-from robot.drivers.ur10.base_transform import PlacingConfig, pose_of
+from robot.drivers.ur10.base_transform import BaseTransformConfig, pose_from_tcp
 from robot.world.head_trajectory import Path, at
 
 AHEAD = 0.1
 """s for which an arm's speed is believed; then it counts as standing where that led."""
 
 
-class Place(Protocol):
+class PoseSource(Protocol):
     """Where the head is, as time goes on."""
 
     def at(self, time: float) -> tuple[np.ndarray, float]:
@@ -25,18 +25,18 @@ class Place(Protocol):
         ...
 
 
-class Told(Protocol):
-    """An arm's newest state: `robot.drivers.ur10.pose_listener.PoseStream`."""
+class ToolPoses(Protocol):
+    """An arm's newest state: `robot.drivers.ur10.pose_listener.ToolPoseStream`."""
 
     def latest(self) -> tuple[float, np.ndarray, np.ndarray] | None:
         """Host's time of receipt (s), tool pose [6] and its speed [6]; None before the first."""
         ...
 
 
-class Carried:
+class CarriedByArm:
     """By an arm: its newest pose, and onwards by its speed."""
 
-    def __init__(self, arm: Told, placing: PlacingConfig) -> None:
+    def __init__(self, arm: ToolPoses, placing: BaseTransformConfig) -> None:
         self.arm, self.placing = arm, placing
 
     def at(self, time: float) -> tuple[np.ndarray, float]:
@@ -47,12 +47,12 @@ class Carried:
         ahead = min(max(time - since, -AHEAD), AHEAD)
         tool = np.array(tcp, float)
         tool[:3] += ahead * np.asarray(speed)[:3]
-        pose, lift = pose_of(self.placing, tool)
+        pose, lift = pose_from_tcp(self.placing, tool)
         # The axes of turning and of the map's headings are both vertical.
         return pose + np.array([0.0, 0.0, ahead * float(speed[5])]), float(lift)
 
 
-class Along:
+class AlongPath:
     """Along a path, from a time on that `begin` tells once; before, where it begins."""
 
     def __init__(self, path: Path) -> None:

@@ -16,11 +16,11 @@ from collections.abc import Awaitable, Callable
 
 from robot.drivers.head.protocol import ENDPOINT_IN
 from robot.drivers.head.usb_tcp_protocol import ANSWER, IN, REQUEST, Op
-from robot.drivers.process_priority import URGENT, ranked
+from robot.drivers.process_priority import URGENT, set_niceness
 from robot.emulators.head import usb_descriptors
 from robot.emulators.head.config import HeadEmulatorConfig
-from robot.emulators.head.device import Bridge
-from robot.emulators.head.pose_source import Along, Carried, Place
+from robot.emulators.head.device import EmulatedHead
+from robot.emulators.head.pose_source import AlongPath, CarriedByArm, PoseSource
 from robot.world.head_trajectory import Path
 from robot.world.scene import KidnapConfig, scene
 from tactile.whiskers.head_geometry import ur10_head
@@ -36,36 +36,38 @@ def serve(config: HeadEmulatorConfig) -> None:
     Raises:
         InputError: there is no such maze or way. OSError: somebody else listens there.
     """
-    ranked(URGENT)
+    set_niceness(URGENT)
     head = ur10_head(config.head)
     made = scene(config.maze, config.path, config.motion, KidnapConfig(), head, config.seed)
     with contextlib.ExitStack() as stack:
-        bridge = Bridge(config, made.surroundings.walls, _place(config, made.path, stack), time.monotonic())
-        asyncio.run(_served(config, bridge))
+        bridge = EmulatedHead(
+            config, made.surroundings.walls, _place(config, made.path, stack), time.monotonic()
+        )
+        asyncio.run(_run_server(config, bridge))
 
 
-def _place(config: HeadEmulatorConfig, path: Path, stack: contextlib.ExitStack) -> Place:
+def _place(config: HeadEmulatorConfig, path: Path, stack: contextlib.ExitStack) -> PoseSource:
     if config.arm is None:
-        return Along(path if config.follow else Path(path.time[:1], path.pose[:1]))
-    from robot.drivers.ur10.pose_listener import PoseStream
+        return AlongPath(path if config.follow else Path(path.time[:1], path.pose[:1]))
+    from robot.drivers.ur10.pose_listener import PoseListener
 
-    arm = PoseStream(config.arm, hz=config.arm_hz)
+    arm = PoseListener(config.arm, hz=config.arm_hz)
     stack.callback(arm.close)
-    return Carried(arm, config.placing)
+    return CarriedByArm(arm, config.placing)
 
 
-async def _served(config: HeadEmulatorConfig, bridge: Bridge) -> None:
-    server = Server(bridge)
+async def _run_server(config: HeadEmulatorConfig, bridge: EmulatedHead) -> None:
+    server = HeadServer(bridge)
     async with contextlib.AsyncExitStack() as stack:
         for client, port in ((server.usb, config.port), (server.faults, config.control_port)):
             await stack.enter_async_context(
-                await asyncio.start_server(_polite(client), config.host, port, reuse_address=True)
+                await asyncio.start_server(_ignore_disconnects(client), config.host, port, reuse_address=True)
             )
         print("ready", flush=True)
         await server.run()
 
 
-def _polite(client: Client) -> Client:
+def _ignore_disconnects(client: Client) -> Client:
     """A client whose end is no error, nor that of the server."""
 
     async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -76,10 +78,10 @@ def _polite(client: Client) -> Client:
     return talk
 
 
-class Server:
+class HeadServer:
     """What clients say to a bridge."""
 
-    def __init__(self, bridge: Bridge) -> None:
+    def __init__(self, bridge: EmulatedHead) -> None:
         self.bridge = bridge
         self._changed = asyncio.Event()
         self._owner: tuple[object, int] | None = None  # of the interface, and when it was plugged in

@@ -10,7 +10,14 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import ValidationError
 
-from robot.drivers.head.protocol import ANGLE, OFF, SILENCE, Command, Kind, Mode
+from robot.drivers.head.protocol import (
+    ANGLE,
+    COMMAND_TIMEOUT,
+    NO_THRESHOLD,
+    Command,
+    CommandKind,
+    FeedbackMode,
+)
 from robot.simulation.head.quasistatic import Balance, rest
 from tactile.whiskers.head_geometry import Head
 from tactile.whiskers.whisking import Drive, WhiskingConfig, command, phase
@@ -19,7 +26,7 @@ RETRACTION = 0.2
 """s that whiskers take to go back to rest."""
 
 
-class Whisk(NamedTuple):
+class WhiskCommand(NamedTuple):
     """A whisk that was commanded.
 
     Attributes:
@@ -36,7 +43,7 @@ class Whisk(NamedTuple):
     amplitude: np.ndarray
 
 
-class Drives:
+class ServoDrives:
     """The drives of one head; a sample after the other.
 
     Attributes:
@@ -45,9 +52,9 @@ class Drives:
 
     def __init__(self, head: Head, rate: float) -> None:
         self.head, self.rate = head, rate
-        self.whisk: Whisk | None = None
+        self.whisk: WhiskCommand | None = None
         self.sample = 0
-        self._next: Whisk | None = None
+        self._next: WhiskCommand | None = None
         self._heard, self._stopped = -np.inf, False
         self._centre = np.zeros(len(head.length))
         self._from: np.ndarray | None = None  # where retraction began
@@ -68,15 +75,15 @@ class Drives:
     def _retraction(self) -> int:
         return round(RETRACTION * self.rate)
 
-    def hear(self, told: Command, time: float) -> None:
+    def receive(self, told: Command, time: float) -> None:
         """Takes a command that came at a time (s, of the clock that `begin` is told)."""
         self._heard = time
-        if told.kind == Kind.DRIVE:
+        if told.kind == CommandKind.DRIVE:
             self._next = self._made(told) or self._next
-        elif told.kind == Kind.CENTRE and len(told.numbers) == len(self._centre):
+        elif told.kind == CommandKind.CENTRE and len(told.numbers) == len(self._centre):
             self._centre = told.numbers * ANGLE
         elif (
-            told.kind == Kind.AMPLITUDES
+            told.kind == CommandKind.AMPLITUDES
             and self.whisk is not None
             and len(told.numbers) == len(self._centre)
             and not self.whisk.feedback
@@ -97,7 +104,7 @@ class Drives:
         Returns:
             where they are: still, at the beginning of a cycle.
         """
-        silent = time - self._heard > SILENCE
+        silent = time - self._heard > COMMAND_TIMEOUT
         self._next = None if silent else self._next
         stop, self._stopped = silent or self._stopped, False
         if self.whisk is not None and stop:
@@ -130,12 +137,12 @@ class Drives:
             aim = np.zeros_like(told) + whisk.amplitude * phase(whisk.whisking, time)
         return aim + whisk.offset if whisk.offset else aim, drive
 
-    def _made(self, told: Command) -> Whisk | None:
+    def _made(self, told: Command) -> WhiskCommand | None:
         """The whisk that a command asks for; None, to go on as before, if no drive could do it."""
         threshold = np.full(len(self._centre), np.inf)
         numbers = told.numbers[: len(threshold)]
-        threshold[: len(numbers)] = np.where(numbers == OFF, np.inf, numbers * ANGLE)
-        feedback = told.mode == Mode.RCP
+        threshold[: len(numbers)] = np.where(numbers == NO_THRESHOLD, np.inf, numbers * ANGLE)
+        feedback = told.mode == FeedbackMode.RCP
         offset = min(max(told.offset, 0.0), self.head.limit)
         amplitude = min(told.amplitude, self.head.limit - offset)
         try:
@@ -151,4 +158,4 @@ class Drives:
         samples = round(self.rate / whisking.rate)
         if samples < 2:
             return None
-        return Whisk(whisking, samples, offset, threshold, feedback, np.zeros(len(threshold)))
+        return WhiskCommand(whisking, samples, offset, threshold, feedback, np.zeros(len(threshold)))

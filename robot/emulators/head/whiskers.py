@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robot.emulators.head.pose_source import Place
-from robot.emulators.head.servo_drives import Drives
+from robot.emulators.head.pose_source import PoseSource
+from robot.emulators.head.servo_drives import ServoDrives
 from robot.simulation.head.beam import StreamConfig
 from robot.simulation.head.kinematic import MechanicsConfig
 from robot.simulation.head.quasistatic import advance, rest
@@ -46,13 +46,13 @@ class Whiskers:
         mechanics: MechanicsConfig,
         head: Head,
         walls: Walls,
-        place: Place,
+        place: PoseSource,
         random: np.random.Generator,
         samples: int,
     ) -> None:
         self.config, self.mechanics, self.head = config, mechanics, head
         self.walls, self.place, self.random, self.samples = walls, place, random, samples
-        self.drives = Drives(head, config.rate)
+        self.drives = ServoDrives(head, config.rate)
         self.balance = rest(1, len(head.length))
         self.pose: np.ndarray | None = None
         self.lift = np.inf
@@ -61,7 +61,7 @@ class Whiskers:
         # Above this, no tip comes down to the tallest wall.
         self._clear = float(walls.height.max() + (head.length - head.base[:, 2]).max())
 
-    def rested(self) -> None:
+    def skip_block(self) -> None:
         """A block passes in which nobody looks and nothing moves."""
         self.pose = None
 

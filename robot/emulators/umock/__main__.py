@@ -16,7 +16,7 @@ import sys
 import threading
 from typing import Any
 
-from robot.drivers.head.usb_tcp_protocol import PORT, Line, Op
+from robot.drivers.head.usb_tcp_protocol import PORT, Op, UsbConnection
 from robot.emulators.umock.usbfs import REAP, REAP_NOW, Usbfs
 
 LOOK = 20
@@ -45,7 +45,7 @@ class Bus:
 
     def _described(self) -> bytes:
         try:
-            line = Line(self._host, self._port)
+            line = UsbConnection(self._host, self._port)
         except OSError:
             return b""
         try:

@@ -13,7 +13,7 @@ import struct
 import threading
 from typing import Any
 
-from robot.drivers.head.usb_tcp_protocol import IN, Line, Op
+from robot.drivers.head.usb_tcp_protocol import IN, Op, UsbConnection
 
 SETINTERFACE, SETCONFIGURATION, GETDRIVER, SUBMIT, DISCARD, REAP, REAP_NOW = 4, 5, 8, 10, 11, 12, 13
 CLAIM, RELEASE, RESET, CLEAR, CAPABILITIES, CLAIM_AWAY, SPEED = 15, 16, 20, 21, 26, 27, 31
@@ -50,7 +50,7 @@ class Urb:
         """Whether it may wait for data."""
         return bool(self.endpoint & IN) and not self.control
 
-    def run(self, line: Line) -> None:
+    def run(self, line: UsbConnection) -> None:
         """Carries it over a line, until it ends."""
         try:
             if self.control:
@@ -68,7 +68,7 @@ class Urb:
         except OSError as error:
             self.status = -(error.errno or errno.EIO)
 
-    def _waited(self, line: Line) -> bytes:
+    def _waited(self, line: UsbConnection) -> bytes:
         while not self.discarded:
             try:
                 return line.call(Op.BULK, self.endpoint, size=self.size, timeout=SLICE)
@@ -88,11 +88,11 @@ class Usbfs:
     """One device's node, from when it is plugged in until it is pulled out."""
 
     def __init__(self, host: str, port: int) -> None:
-        self._control = Line(host, port)
+        self._control = UsbConnection(host, port)
         self._queues: dict[bool, queue.Queue[Urb | None]] = {True: queue.Queue(), False: queue.Queue()}
         self._under_way: dict[int, Urb] = {}
         self._done: queue.Queue[Urb] = queue.Queue()
-        lines = {True: Line(host, port), False: self._control}
+        lines = {True: UsbConnection(host, port), False: self._control}
         for way, line in lines.items():
             threading.Thread(target=self._carry, args=(self._queues[way], line), daemon=True).start()
 
@@ -127,7 +127,7 @@ class Usbfs:
         client.get_arg().resolve(0, 8).set_ptr(0, urb.block)
         return True
 
-    def _carry(self, waiting: queue.Queue[Urb | None], line: Line) -> None:
+    def _carry(self, waiting: queue.Queue[Urb | None], line: UsbConnection) -> None:
         while (urb := waiting.get()) is not None:
             urb.run(line)
             self._done.put(urb)

@@ -9,9 +9,18 @@ from collections.abc import Iterable
 from robot.emulators.ur10 import motion as motions
 from robot.emulators.ur10.config import UrEmulatorConfig, WallConfig
 from robot.emulators.ur10.kinematics import UR10, UR10E
-from robot.emulators.ur10.motion import ZERO, Drive, Line, Model, Motion, State, Swing, Unreachable
+from robot.emulators.ur10.motion import (
+    ZERO,
+    ArmModel,
+    JointMotion,
+    LinearMotion,
+    Motion,
+    MotionState,
+    ToolSpeedMotion,
+    Unreachable,
+)
 from robot.emulators.ur10.rotation import Vector6
-from robot.emulators.ur10.urscript_moves import Mark, MoveJ, MoveL, Order, StopL, begun, same_kind
+from robot.emulators.ur10.urscript_moves import Mark, MoveJ, MoveL, MoveOrder, StopL, renews, start_motion
 
 NEAR: Vector6 = (
     0.0,
@@ -23,7 +32,7 @@ NEAR: Vector6 = (
 )  # elbow up, tool down: which of eight postures it starts in
 
 
-class Arm:
+class EmulatedArm:
     """Joints and tool over time.
 
     Attributes:
@@ -32,7 +41,7 @@ class Arm:
     """
 
     def __init__(self, config: UrEmulatorConfig) -> None:
-        self.model: Model = Model(UR10 if config.version.major < 5 else UR10E)
+        self.model: ArmModel = ArmModel(UR10 if config.version.major < 5 else UR10E)
         self.walls = list(config.walls)
         self.turn_ratio = config.turn_ratio
         self.scale = 1.0
@@ -40,11 +49,11 @@ class Arm:
         self.penetration_max = 0.0
         self.marks: list[int] = []
         self._motion: Motion | None = None
-        self._order: Order | None = None
-        self._queue: deque[Order] = deque()
+        self._order: MoveOrder | None = None
+        self._queue: deque[MoveOrder] = deque()
         tcp = config.start
-        self.state: State = State(tcp, ZERO, self.model.backward(tcp, NEAR), ZERO)
-        self._feel()
+        self.state: MotionState = MotionState(tcp, ZERO, self.model.backward(tcp, NEAR), ZERO)
+        self._update_force()
 
     @property
     def busy(self) -> bool:
@@ -56,31 +65,31 @@ class Arm:
         return any(self.state.speed) or any(self.state.joint_speed)
 
     @property
-    def remaining(self) -> list[Order]:
+    def remaining(self) -> list[MoveOrder]:
         """What it has not finished."""
         return ([self._order] if self._order is not None else []) + list(self._queue)
 
     def place(self, tcp: Vector6) -> None:
         """Stand somewhere else at once, as if moved by hand. Raises `Unreachable`."""
-        self.state = State(tcp, ZERO, self.model.backward(tcp, self.state.joints), ZERO)
+        self.state = MotionState(tcp, ZERO, self.model.backward(tcp, self.state.joints), ZERO)
         self._motion, self._order = None, None
         self._queue.clear()
-        self._feel()
+        self._update_force()
 
     def set_tool(self, tool: Vector6) -> None:
         """Another tool's pose in the flange: the joints stay, the tool's pose is another."""
         self.model = self.model.with_tool(tool)
         self.state = self.state._replace(tcp=self.model.forward(self.state.joints))
 
-    def order(self, orders: Iterable[Order]) -> None:
+    def order(self, orders: Iterable[MoveOrder]) -> None:
         """Do these and nothing else. A move that finds the arm moving lets it stop first."""
         new = deque(orders)
         first = next((order for order in new if not isinstance(order, Mark)), None)
         if self.moving and isinstance(first, MoveL | MoveJ):  # these plan from rest
             new.appendleft(StopL(first.acceleration))
-        if self._motion is not None and new and same_kind(new[0], self._motion):
+        if self._motion is not None and new and renews(new[0], self._motion):
             self._order = new.popleft()
-            self._motion = begun(self._order, self.model, self.state, self.turn_ratio)
+            self._motion = start_motion(self._order, self.model, self.state, self.turn_ratio)
         else:
             self._motion, self._order = None, None
         self._queue = new
@@ -89,7 +98,7 @@ class Arm:
         """Forget all orders and come to rest, m/s^2."""
         self._queue.clear()
         self._order = None
-        self._motion = Drive(ZERO, acceleration, self.turn_ratio) if self.moving else None
+        self._motion = ToolSpeedMotion(ZERO, acceleration, self.turn_ratio) if self.moving else None
 
     def step(self, dt: float) -> None:
         """One control step. Raises `Unreachable`; the arm then stands."""
@@ -98,7 +107,7 @@ class Arm:
                 self._order = self._queue.popleft()
                 if isinstance(self._order, Mark):
                     self.marks.append(self._order.progress)
-                self._motion = begun(self._order, self.model, self.state, self.turn_ratio)
+                self._motion = start_motion(self._order, self.model, self.state, self.turn_ratio)
             if self._motion is not None:
                 self._advance(dt)
         except Unreachable:
@@ -106,17 +115,17 @@ class Arm:
             self._queue.clear()
             self._rest()
             raise
-        self._feel()
+        self._update_force()
 
     def _advance(self, dt: float) -> None:
         assert self._motion is not None
-        scale = self.scale if isinstance(self._motion, Line | Swing) else 1.0
+        scale = self.scale if isinstance(self._motion, LinearMotion | JointMotion) else 1.0
         if scale <= 0:
             self._rest()
             return
-        state, self._motion = self._motion.advanced(self.model, self.state, dt * scale)
+        state, self._motion = self._motion.advance(self.model, self.state, dt * scale)
         if scale != 1.0:
-            speed, rate = motions.scaled(state.speed, scale), motions.scaled(state.joint_speed, scale)
+            speed, rate = motions.scale(state.speed, scale), motions.scale(state.joint_speed, scale)
             state = state._replace(speed=speed, joint_speed=rate)
         self.state = state
         if self._motion is None:
@@ -126,28 +135,28 @@ class Arm:
     def _rest(self) -> None:
         self.state = self.state._replace(speed=ZERO, joint_speed=ZERO)
 
-    def _feel(self) -> None:
+    def _update_force(self) -> None:
         if not self.walls:
             self.force = ZERO
             return
-        self.force = felt(self.walls, self.state.tcp)
-        deepest = max(depth(wall, self.state.tcp) for wall in self.walls)
+        self.force = wall_force(self.walls, self.state.tcp)
+        deepest = max(penetration(wall, self.state.tcp) for wall in self.walls)
         self.penetration_max = max(self.penetration_max, deepest)
 
 
-def depth(wall: WallConfig, tcp: Vector6) -> float:
+def penetration(wall: WallConfig, tcp: Vector6) -> float:
     """How far the tool is in a wall, m; 0 where it is not."""
     return max(0.0, wall.solid * (tcp["xyz".index(wall.axis)] - wall.at))
 
 
-def felt(walls: Iterable[WallConfig], tcp: Vector6) -> Vector6:
+def wall_force(walls: Iterable[WallConfig], tcp: Vector6) -> Vector6:
     """The force of walls on the tool: springs that push it out, N."""
     force = [0.0, 0.0, 0.0]
     for wall in walls:
-        force["xyz".index(wall.axis)] -= wall.solid * wall.stiffness * depth(wall, tcp)
+        force["xyz".index(wall.axis)] -= wall.solid * wall.stiffness * penetration(wall, tcp)
     return force[0], force[1], force[2], 0.0, 0.0, 0.0
 
 
-def size(force: Vector6) -> float:
+def force_magnitude(force: Vector6) -> float:
     """Of a force, N."""
     return math.hypot(*force[:3])

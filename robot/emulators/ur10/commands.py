@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 from robot.emulators.ur10.control_program import ControlProgram
 from robot.emulators.ur10.motion import ZERO
-from robot.emulators.ur10.rotation import composed, inverse, quaternion, rotated
+from robot.emulators.ur10.rotation import compose_poses, invert_pose, quaternion, rotate
 from robot.emulators.ur10.urscript_moves import MoveJ, MoveL, Servo, SpeedJ, SpeedL, StopL
 
 SERVO_C_LAG = 0.1  # s
@@ -22,12 +22,12 @@ def _move_j(p: ControlProgram) -> None:
 
 
 def _move_j_ik(p: ControlProgram) -> None:
-    joints = p.controller.solved(p.vector(), p.arm.state.joints)
+    joints = p.controller.solve(p.vector(), p.arm.state.joints)
     p.move([MoveJ(joints, p.number(6), p.number(7))], "movej")
 
 
 def _move_l(p: ControlProgram) -> None:
-    p.controller.solved(p.vector(), p.arm.state.joints)
+    p.controller.solve(p.vector(), p.arm.state.joints)
     p.move([MoveL(p.vector(), p.number(6), p.number(7))], "movel")
 
 
@@ -37,7 +37,7 @@ def _move_l_fk(p: ControlProgram) -> None:
 
 def _servo_to_pose(lag: float | None) -> Callable[[ControlProgram], None]:
     def do(p: ControlProgram) -> None:
-        joints = p.controller.solved(p.vector(), p.arm.state.joints)
+        joints = p.controller.solve(p.vector(), p.arm.state.joints)
         p.repeat(Servo(joints, p.number(9) if lag is None else lag), "servol")
 
     return do
@@ -47,12 +47,12 @@ def _jog(p: ControlProgram) -> None:
     """At a speed in the base (0), the tool's frame now (1) or a frame of its own (2)."""
     frame = {1: p.arm.state.tcp, 2: p.vector(8)}.get(int(p.number(6)), ZERO)
     turn = quaternion(frame[3:])
-    speed = (*rotated(turn, p.vector()[:3]), *rotated(turn, p.vector()[3:]))
+    speed = (*rotate(turn, p.vector()[:3]), *rotate(turn, p.vector()[3:]))
     p.repeat(SpeedL(speed, p.number(7)), "jog")
 
 
 def _inverse(near: bool) -> Callable[[ControlProgram], None]:
-    return lambda p: p.put(p.controller.solved(p.vector(), p.vector(6) if near else p.arm.state.joints))
+    return lambda p: p.put(p.controller.solve(p.vector(), p.vector(6) if near else p.arm.state.joints))
 
 
 def _solvable(p: ControlProgram) -> None:
@@ -85,7 +85,7 @@ COMMANDS: dict[int, Callable[[ControlProgram], None]] = {
     36: _solvable,  # within the safety limits: what can be reached is
     37: lambda p: p.result(1),
     38: lambda p: p.put(ZERO),
-    39: lambda p: p.put(composed(p.vector(), p.vector(6))),
+    39: lambda p: p.put(compose_poses(p.vector(), p.vector(6))),
     40: lambda p: p.put(p.arm.model.tool),
     41: _jog,
     42: lambda p: p.stop(StopL(1.2)),
@@ -95,7 +95,7 @@ COMMANDS: dict[int, Callable[[ControlProgram], None]] = {
     46: _inverse(near=False),
     47: lambda p: p.result(int(not p.arm.moving)),
     54: lambda p: p.result(0),
-    58: lambda p: p.put(composed(p.arm.state.tcp, inverse(p.arm.model.tool))),
+    58: lambda p: p.put(compose_poses(p.arm.state.tcp, invert_pose(p.arm.model.tool))),
     60: _solvable,
     61: _solvable,
     63: lambda p: p.result(0),

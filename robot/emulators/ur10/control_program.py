@@ -12,10 +12,10 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Mapping
 
-from robot.emulators.ur10.arm import Arm
-from robot.emulators.ur10.controller import Controller, Program
+from robot.emulators.ur10.arm import EmulatedArm
+from robot.emulators.ur10.controller import EmulatedController, Program
 from robot.emulators.ur10.rotation import Vector6
-from robot.emulators.ur10.urscript_moves import Order, SpeedJ, StopJ, StopL, orders_in
+from robot.emulators.ur10.urscript_moves import MoveOrder, SpeedJ, StopJ, StopL, parse_orders
 
 READY, DONE = 1, 2
 REALTIME = frozenset([6, 9, 10, 11, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70, 71])
@@ -38,21 +38,21 @@ class ControlProgram:
         path: the moves that were uploaded with it. offset: its first register of either kind.
     """
 
-    def __init__(self, controller: Controller, text: str, commands: Commands) -> None:
+    def __init__(self, controller: EmulatedController, text: str, commands: Commands) -> None:
         self._commands = commands
         offset = _OFFSET.search(text)
         path = _PATH.search(text)
         self.offset: int = int(offset[1]) if offset else 0
-        self.path: list[Order] = orders_in(path[1]) if path else []
-        self.controller: Controller = controller
-        self.arm: Arm = controller.arm
+        self.path: list[MoveOrder] = parse_orders(path[1]) if path else []
+        self.controller: EmulatedController = controller
+        self.arm: EmulatedArm = controller.arm
         self._registers = controller.registers
         self._executing = False
         self._waiting = False  # for the arm, before a command is done
         self._moving = False  # an asynchronous move goes on
         self._stopping = False  # an asynchronous stop goes on
         self._stop_by_tool = False  # what a synchronous stop is, as the last asynchronous one left it
-        self._repeated: Order | None = None
+        self._repeated: MoveOrder | None = None
         self._writes = self._operation = 0
         self._progress(-1)
         self._answer(READY)
@@ -97,11 +97,11 @@ class ControlProgram:
         """A result that is a number or yes and no."""
         self._registers.put_int(self.offset + 1, value)
 
-    def move(self, orders: Iterable[Order], kind: str) -> None:
+    def move(self, orders: Iterable[MoveOrder], kind: str) -> None:
         """Give orders in place of the present ones; wait for their end unless the client asked not to."""
         orders = list(orders)
         self._drop_move()
-        self.controller.noted(kind, orders)
+        self.controller.record_target(kind, orders)
         self.arm.order(orders)
         if self._asynchronous:
             self._moving = True
@@ -109,10 +109,10 @@ class ControlProgram:
         else:
             self._waiting = True
 
-    def repeat(self, order: Order, kind: str) -> None:
+    def repeat(self, order: MoveOrder, kind: str) -> None:
         """An order that is given again at every step until it changes."""
         if order != self._repeated or not self.arm.busy:
-            self.controller.noted(kind, [order])
+            self.controller.record_target(kind, [order])
             self.arm.order([order])
         self._repeated = order
 
@@ -122,7 +122,7 @@ class ControlProgram:
 
     def stop(self, order: StopL | StopJ) -> None:
         """Stop and wait for it."""
-        self.controller.noted("stop", [order])
+        self.controller.record_target("stop", [order])
         self.arm.order([order])
         self._waiting = True
 
@@ -137,7 +137,7 @@ class ControlProgram:
             self.stop(StopL(rate) if self._stop_by_tool else StopJ(rate))
             return
         self._stop_by_tool = self._stopping = True
-        self.controller.noted("stop", [StopL(rate)])
+        self.controller.record_target("stop", [StopL(rate)])
         self.arm.order([StopL(rate)])
         self._progress(0)
 
@@ -177,14 +177,14 @@ class ControlProgram:
             self._progress(-1)
 
 
-class Script:
+class ScriptProgram:
     """Any other program: its moves and stops in order, then the end, with the 2 that clients wait for."""
 
-    def __init__(self, controller: Controller, text: str) -> None:
+    def __init__(self, controller: EmulatedController, text: str) -> None:
         self._controller = controller
         self._answers = "write_output_integer_register" in text
-        orders = orders_in(text)
-        controller.noted("script", orders)
+        orders = parse_orders(text)
+        controller.record_target("script", orders)
         controller.arm.order(orders)
 
     def step(self) -> bool:
@@ -199,8 +199,8 @@ class Script:
 Commands = Mapping[int, Callable[[ControlProgram], None]]
 
 
-def load_program(commands: Commands, controller: Controller, text: str) -> Program:
+def load_program(commands: Commands, controller: EmulatedController, text: str) -> Program:
     """Starts uploaded program text on a controller: ur_rtde's control program, or any other script."""
     if "def rtde_control" in text:
         return ControlProgram(controller, text, commands)
-    return Script(controller, text)
+    return ScriptProgram(controller, text)

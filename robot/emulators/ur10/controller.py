@@ -6,15 +6,15 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
-from robot.emulators.ur10.arm import Arm, size
+from robot.emulators.ur10.arm import EmulatedArm, force_magnitude
 from robot.emulators.ur10.config import UrEmulatorConfig
 from robot.emulators.ur10.motion import Unreachable
 from robot.emulators.ur10.registers import Registers
 from robot.emulators.ur10.rotation import Vector6
 from robot.emulators.ur10.safety import BITS, RobotMode, Runtime, SafetyMode, StatusBits
-from robot.emulators.ur10.urscript_moves import MoveJ, MoveL, Order, Servo, SpeedJ, SpeedL
+from robot.emulators.ur10.urscript_moves import MoveJ, MoveL, MoveOrder, Servo, SpeedJ, SpeedL
 
-KEPT = 10_000  # orders remembered: what "state" tells within a control step or two
+MAX_TARGETS = 10_000  # orders remembered: what "state" tells within a control step or two
 
 
 class Program(Protocol):
@@ -25,14 +25,16 @@ class Program(Protocol):
         ...
 
 
-class Controller:
+class EmulatedController:
     """An emulated controller. `tick` is one control step; all else is what clients do to it between steps."""
 
-    def __init__(self, config: UrEmulatorConfig, load_program: Callable[[Controller, str], Program]) -> None:
+    def __init__(
+        self, config: UrEmulatorConfig, load_program: Callable[[EmulatedController, str], Program]
+    ) -> None:
         self.config = config
         self._load_program = load_program
         self.dt: float = 1 / config.hz
-        self.arm: Arm = Arm(config)
+        self.arm: EmulatedArm = EmulatedArm(config)
         self.registers = Registers()
         self.program: Program | None = None
         self.safety = SafetyMode.NORMAL
@@ -41,11 +43,11 @@ class Controller:
         self.ik_fails = False
         self.time = 0.0
         self.remote = config.remote
-        self.targets: deque[dict[str, Any]] = deque(maxlen=KEPT)
+        self.targets: deque[dict[str, Any]] = deque(maxlen=MAX_TARGETS)
         self.waypoint: Vector6 = self.arm.state.tcp
         self.watchdog_stops = self.program_stops = self.programs = 0
         self._uploaded: tuple[float, str] | None = None  # when it starts, and what
-        self._resumed: list[Order] = []
+        self._resumed: list[MoveOrder] = []
         self._watchdog: tuple[float, int, float] | None = None  # s of patience, register, set at
         self._stopped_at = -1e9
         self.publish()
@@ -72,7 +74,10 @@ class Controller:
             self.arm.step(self.dt)
         except Unreachable:  # on its way: a real arm would stop for safety
             self.protective_stop()
-        if size(self.arm.force) > self.config.protective_force and self.safety is SafetyMode.NORMAL:
+        if (
+            force_magnitude(self.arm.force) > self.config.protective_force
+            and self.safety is SafetyMode.NORMAL
+        ):
             self.protective_stop()
         self.publish()
 
@@ -151,7 +156,7 @@ class Controller:
             if mode is not RobotMode.RUNNING:
                 self.stop_program()
 
-    def solved(self, tcp: Vector6, near: Vector6) -> Vector6:
+    def solve(self, tcp: Vector6, near: Vector6) -> Vector6:
         """Joints for a pose. Raises `Unreachable`."""
         if self.ik_fails:
             raise Unreachable("told to fail")
@@ -159,12 +164,12 @@ class Controller:
 
     def solvable(self, tcp: Vector6) -> bool:
         try:
-            self.solved(tcp, self.arm.state.joints)
+            self.solve(tcp, self.arm.state.joints)
         except Unreachable:
             return False
         return True
 
-    def noted(self, kind: str, new: Sequence[Order]) -> None:
+    def record_target(self, kind: str, new: Sequence[MoveOrder]) -> None:
         """Remember what was commanded, for whoever asks."""
         for order in new:
             if isinstance(order, MoveL):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from robot.emulators.ur10.controller import Controller
+from robot.emulators.ur10.controller import EmulatedController
 from robot.emulators.ur10.safety import RobotMode, Runtime, SafetyMode
 
 WELCOME = b"Connected: Universal Robots Dashboard Server\n"
@@ -17,20 +17,22 @@ SERIAL = "20163000000"
 class DashboardSession:
     """One client."""
 
-    def __init__(self, controller: Controller) -> None:
+    def __init__(self, controller: EmulatedController) -> None:
         self._controller = controller
         self._rest = b""
 
     def received(self, data: bytes, host: float) -> bytes:
         """The answers, a line each."""
         *lines, self._rest = (self._rest + data).split(b"\n")
-        return b"".join(f"{answer(self._controller, line.decode().strip())}\n".encode() for line in lines)
+        return b"".join(
+            f"{answer_command(self._controller, line.decode().strip())}\n".encode() for line in lines
+        )
 
     def closed(self) -> None:
         """Nothing depends on a dashboard client."""
 
 
-def answer(controller: Controller, command: str) -> str:
+def answer_command(controller: EmulatedController, command: str) -> str:
     """What a command does, and says."""
     version = controller.config.version
     known = dict(_COMMANDS)
@@ -49,19 +51,19 @@ def answer(controller: Controller, command: str) -> str:
     return f"could not understand: '{command}'"
 
 
-def _stop(controller: Controller) -> str:
+def _stop(controller: EmulatedController) -> str:
     controller.stop_program()
     return "Stopped"
 
 
-def _play(controller: Controller) -> str:
+def _play(controller: EmulatedController) -> str:
     if controller.program is None or controller.safety is not SafetyMode.NORMAL:
         return "Failed to execute: play"
     controller.runtime = Runtime.PLAYING
     return "Starting program"
 
 
-def _pause(controller: Controller) -> str:
+def _pause(controller: EmulatedController) -> str:
     if controller.runtime is not Runtime.PLAYING:
         return "Failed to execute: pause"
     controller.runtime = Runtime.PAUSED
@@ -69,25 +71,25 @@ def _pause(controller: Controller) -> str:
     return "Pausing program"
 
 
-def _unlock(controller: Controller) -> str:
+def _unlock(controller: EmulatedController) -> str:
     if controller.unlock():
         return "Protective stop releasing"
     return "Cannot unlock protective stop until 5s after occurrence. Always inspect cause of protective stop"
 
 
-def _power(mode: RobotMode, said: str) -> Callable[[Controller], str]:
-    def do(controller: Controller) -> str:
+def _power(mode: RobotMode, said: str) -> Callable[[EmulatedController], str]:
+    def do(controller: EmulatedController) -> str:
         controller.power(mode)
         return said
 
     return do
 
 
-def _program_state(controller: Controller) -> str:
+def _program_state(controller: EmulatedController) -> str:
     return f"{controller.runtime.name} rtde_control" if controller.program else "STOPPED <unnamed>"
 
 
-_COMMANDS: dict[str, Callable[[Controller], str]] = {
+_COMMANDS: dict[str, Callable[[EmulatedController], str]] = {
     "stop": _stop,
     "play": _play,
     "pause": _pause,
@@ -109,7 +111,7 @@ _COMMANDS: dict[str, Callable[[Controller], str]] = {
     "quit": lambda c: "Disconnected",
     "shutdown": lambda c: "Shutting down",
 }
-_E_SERIES: dict[str, Callable[[Controller], str]] = {
+_E_SERIES: dict[str, Callable[[EmulatedController], str]] = {
     "is in remote control": lambda c: str(c.remote).lower(),
     "get serial number": lambda c: SERIAL,
     "get robot model": lambda c: "UR10",

@@ -34,15 +34,15 @@ from robot.emulators.ur10.config import WallConfig
 from robot.emulators.ur10.registers import Value
 
 if TYPE_CHECKING:
-    from robot.emulators.ur10.server import Server
+    from robot.emulators.ur10.server import ControllerServer
 
 NAN: Value = (math.nan,) * 6
 
 
-class Faults:
+class ControllerFaults:
     """Which faults hold, and what they do to what is published."""
 
-    def __init__(self, server: Server) -> None:
+    def __init__(self, server: ControllerServer) -> None:
         self._server = server
         self._controller = server.controller
         self._stalled_until = -math.inf
@@ -188,7 +188,7 @@ class Faults:
 class FaultSession:
     """One client of the fault port."""
 
-    def __init__(self, faults: Faults) -> None:
+    def __init__(self, faults: ControllerFaults) -> None:
         self._faults = faults
         self._rest = b""
 

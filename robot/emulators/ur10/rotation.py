@@ -60,7 +60,7 @@ def matrix(rotation: Quaternion) -> Matrix:
     )
 
 
-def rotated(rotation: Quaternion, vector: Sequence[float]) -> Vector3:
+def rotate(rotation: Quaternion, vector: Sequence[float]) -> Vector3:
     """A vector, turned."""
     x, y, z = vector
     first, second, third = matrix(rotation)
@@ -71,27 +71,27 @@ def rotated(rotation: Quaternion, vector: Sequence[float]) -> Vector3:
     )
 
 
-def composed(frame: Sequence[float], pose: Sequence[float]) -> Vector6:
+def compose_poses(frame: Sequence[float], pose: Sequence[float]) -> Vector6:
     """`pose`, given in `frame`, where `frame` is given (URScript's pose_trans)."""
     rotation = quaternion(frame[3:6])
-    x, y, z = rotated(rotation, pose[:3])
-    turned = rotation_vector(product(rotation, quaternion(pose[3:6])))
-    return (frame[0] + x, frame[1] + y, frame[2] + z, *turned)
+    x, y, z = rotate(rotation, pose[:3])
+    rotate_by = rotation_vector(product(rotation, quaternion(pose[3:6])))
+    return (frame[0] + x, frame[1] + y, frame[2] + z, *rotate_by)
 
 
-def inverse(pose: Sequence[float]) -> Vector6:
+def invert_pose(pose: Sequence[float]) -> Vector6:
     """The pose that undoes a pose."""
     back = conjugate(quaternion(pose[3:6]))
-    x, y, z = rotated(back, pose[:3])
+    x, y, z = rotate(back, pose[:3])
     return (-x, -y, -z, *rotation_vector(back))
 
 
-def turn(start: Sequence[float], goal: Sequence[float]) -> Vector3:
+def rotation_between(start: Sequence[float], goal: Sequence[float]) -> Vector3:
     """The rotation vector, in the base, that turns pose `start` the short way into pose `goal`."""
     return rotation_vector(product(quaternion(goal[3:6]), conjugate(quaternion(start[3:6]))))
 
 
-def turned(pose: Sequence[float], vector: Sequence[float]) -> Vector3:
+def rotate_by(pose: Sequence[float], vector: Sequence[float]) -> Vector3:
     """A pose's rotation vector after a turn by a rotation vector in the base."""
     return rotation_vector(product(quaternion(vector), quaternion(pose[3:6])))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 
 from robot.drivers.ur10 import rtde_protocol
-from robot.emulators.ur10.controller import Controller
+from robot.emulators.ur10.controller import EmulatedController
 from robot.emulators.ur10.registers import Value
 
 
@@ -39,15 +39,15 @@ class RtdeSession:
         started: whether states are sent. every: one state in so many control steps.
     """
 
-    def __init__(self, controller: Controller, claims: Claims) -> None:
+    def __init__(self, controller: EmulatedController, claims: Claims) -> None:
         self.started = False
         self.every = 1
         self.ignored = 0
         self._controller = controller
         self._claims = claims
-        self._splitter = rtde_protocol.Splitter()
+        self._splitter = rtde_protocol.PackageSplitter()
         self._outputs: list[str] = []
-        self._layout = rtde_protocol.layout([])
+        self._layout = rtde_protocol.data_layout([])
         self._inputs: list[tuple[list[str], struct.Struct]] = []
 
     def received(self, data: bytes, host: float) -> bytes:
@@ -67,7 +67,7 @@ class RtdeSession:
         numbers: list[float] = []
         for name in self._outputs:
             numbers += overrides.get(name) or fields[name]
-        return rtde_protocol.packed(rtde_protocol.DATA, self._layout.pack(1, *numbers))
+        return rtde_protocol.pack_package(rtde_protocol.DATA, self._layout.pack(1, *numbers))
 
     def _answer(self, package: rtde_protocol.Package, host: float) -> bytes:
         kind, body = package
@@ -76,16 +76,16 @@ class RtdeSession:
             return b""
         if kind == rtde_protocol.PROTOCOL:
             (version,) = struct.unpack(">H", body)
-            return rtde_protocol.packed(kind, bytes([version == rtde_protocol.VERSION]))
+            return rtde_protocol.pack_package(kind, bytes([version == rtde_protocol.VERSION]))
         if kind == rtde_protocol.CONTROLLER:
-            return rtde_protocol.packed(kind, struct.pack(">4I", *self._controller.config.version, 0))
+            return rtde_protocol.pack_package(kind, struct.pack(">4I", *self._controller.config.version, 0))
         if kind == rtde_protocol.OUTPUTS:
-            return rtde_protocol.packed(kind, self._set_outputs(body))
+            return rtde_protocol.pack_package(kind, self._set_outputs(body))
         if kind == rtde_protocol.INPUTS:
-            return rtde_protocol.packed(kind, self._set_inputs(body))
+            return rtde_protocol.pack_package(kind, self._set_inputs(body))
         if kind in (rtde_protocol.START, rtde_protocol.PAUSE):
             self.started = kind == rtde_protocol.START
-            return rtde_protocol.packed(kind, b"\1")
+            return rtde_protocol.pack_package(kind, b"\1")
         return b""
 
     def _set_outputs(self, body: bytes) -> bytes:
@@ -96,7 +96,7 @@ class RtdeSession:
         types = [rtde_protocol.OUTPUT_TYPES.get(name, "NOT_FOUND") for name in names]
         known = "NOT_FOUND" not in types
         self._outputs = names if known else []
-        self._layout = rtde_protocol.layout(types if known else [])
+        self._layout = rtde_protocol.data_layout(types if known else [])
         return bytes([known]) + ",".join(types).encode()
 
     def _set_inputs(self, body: bytes) -> bytes:
@@ -110,7 +110,7 @@ class RtdeSession:
             return b"\0" + ",".join(types).encode()
         for name in names:
             self._claims.owners[name] = self
-        self._inputs.append((names, rtde_protocol.layout(types)))
+        self._inputs.append((names, rtde_protocol.data_layout(types)))
         return bytes([len(self._inputs)]) + ",".join(types).encode()
 
     def _take(self, body: bytes, host: float) -> None:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from robot.emulators.ur10.controller import Controller
+from robot.emulators.ur10.controller import EmulatedController
 
 
 class ScriptSession:
     """One client. A program is all from a line `def ...` to its `end` at the margin; so is a line alone."""
 
-    def __init__(self, controller: Controller) -> None:
+    def __init__(self, controller: EmulatedController) -> None:
         self._controller = controller
         self._rest = b""
         self._program: list[str] | None = None

@@ -15,14 +15,14 @@ from collections.abc import Callable
 from functools import partial
 from typing import Protocol
 
-from robot.drivers.process_priority import URGENT, ranked
+from robot.drivers.process_priority import URGENT, set_niceness
 from robot.drivers.ur10.rtde_protocol import RTDE_PORT
 from robot.emulators.ur10.commands import COMMANDS
 from robot.emulators.ur10.config import DASHBOARD_PORT, FAULT_PORT, SCRIPT_PORT, UrEmulatorConfig
 from robot.emulators.ur10.control_program import load_program
-from robot.emulators.ur10.controller import Controller
+from robot.emulators.ur10.controller import EmulatedController
 from robot.emulators.ur10.dashboard_server import WELCOME, DashboardSession
-from robot.emulators.ur10.fault_server import Faults, FaultSession
+from robot.emulators.ur10.fault_server import ControllerFaults, FaultSession
 from robot.emulators.ur10.motion import Unreachable
 from robot.emulators.ur10.rtde_server import Claims, RtdeSession
 from robot.emulators.ur10.script_server import ScriptSession
@@ -32,7 +32,7 @@ BACKLOG = 0.1  # s
 PENDING = 1 << 18  # bytes that a client may leave unread before states are kept from it
 
 
-class Session(Protocol):
+class ClientSession(Protocol):
     """One client's side of a port."""
 
     def received(self, data: bytes, host: float) -> bytes: ...
@@ -43,7 +43,7 @@ class Session(Protocol):
 class Connection:
     """A socket with its session and what could not be sent yet."""
 
-    def __init__(self, link: socket.socket, session: Session) -> None:
+    def __init__(self, link: socket.socket, session: ClientSession) -> None:
         link.setblocking(False)
         link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.link = link
@@ -62,17 +62,17 @@ class Connection:
             self._pending = data
 
 
-class Server:
+class ControllerServer:
     """Four listening ports around one controller."""
 
     def __init__(self, config: UrEmulatorConfig) -> None:
         self.controller = emulated_controller(config)
         self.claims = Claims()
-        self.faults = Faults(self)
+        self.faults = ControllerFaults(self)
         self.clients: list[Connection] = []
         self._selector = selectors.SelectSelector()  # microseconds; epoll's waits are whole milliseconds
         self._steps = 0
-        doors: dict[int, Callable[[], Session]] = {
+        doors: dict[int, Callable[[], ClientSession]] = {
             RTDE_PORT: lambda: RtdeSession(self.controller, self.claims),
             SCRIPT_PORT: lambda: ScriptSession(self.controller),
             DASHBOARD_PORT: lambda: DashboardSession(self.controller),
@@ -161,18 +161,18 @@ class Server:
             self.close(connection)
 
 
-def emulated_controller(config: UrEmulatorConfig) -> Controller:
+def emulated_controller(config: UrEmulatorConfig) -> EmulatedController:
     """A controller that runs the control program of ur_rtde."""
-    return Controller(config, partial(load_program, COMMANDS))
+    return EmulatedController(config, partial(load_program, COMMANDS))
 
 
 def serve(config: UrEmulatorConfig) -> None:
     """Emulate a controller until the process is ended; says "ready" on standard output when it listens."""
     try:
-        server = Server(config)
+        server = ControllerServer(config)
     except Unreachable as error:
         raise InputError("start", str(error), "a pose within 1.3 m of the base", "move it") from error
-    ranked(URGENT)
+    set_niceness(URGENT)
     sys.stdout.write("ready\n")
     sys.stdout.flush()
     server.run()

@@ -6,7 +6,17 @@ import contextlib
 import re
 from typing import NamedTuple
 
-from robot.emulators.ur10.motion import ZERO, Drive, Follow, Model, Motion, Spin, State, line, swing
+from robot.emulators.ur10.motion import (
+    ZERO,
+    ArmModel,
+    JointSpeedMotion,
+    Motion,
+    MotionState,
+    ServoMotion,
+    ToolSpeedMotion,
+    joint_motion,
+    linear_motion,
+)
 from robot.emulators.ur10.rotation import Vector6
 
 SMALL = 1e-9  # speeds and accelerations of 0 are let through by the client: they would never arrive
@@ -69,34 +79,36 @@ class Mark(NamedTuple):
     progress: int
 
 
-Order = MoveL | MoveJ | SpeedL | SpeedJ | Servo | StopL | StopJ | Mark
+MoveOrder = MoveL | MoveJ | SpeedL | SpeedJ | Servo | StopL | StopJ | Mark
 
 
-def begun(order: Order, model: Model, state: State, turn_ratio: float) -> Motion | None:
+def start_motion(order: MoveOrder, model: ArmModel, state: MotionState, turn_ratio: float) -> Motion | None:
     """The motion that an order is. Raises `Unreachable` where it leads nowhere."""
     if isinstance(order, MoveL):
         model.backward(order.goal, state.joints)
-        way = line(state, order.goal, max(order.speed, SMALL), max(order.acceleration, SMALL), turn_ratio)
+        way = linear_motion(
+            state, order.goal, max(order.speed, SMALL), max(order.acceleration, SMALL), turn_ratio
+        )
         return way if way.profile.length > 0 else None
     if isinstance(order, MoveJ):
-        way_q = swing(state, order.goal, max(order.speed, SMALL), max(order.acceleration, SMALL))
+        way_q = joint_motion(state, order.goal, max(order.speed, SMALL), max(order.acceleration, SMALL))
         return way_q if way_q.profile.length > 0 else None
     if isinstance(order, SpeedL):
-        return Drive(order.goal, order.acceleration, turn_ratio)
+        return ToolSpeedMotion(order.goal, order.acceleration, turn_ratio)
     if isinstance(order, SpeedJ):
-        return Spin(order.goal, order.acceleration)
+        return JointSpeedMotion(order.goal, order.acceleration)
     if isinstance(order, Servo):
-        return Follow(order.goal, max(order.lag, 1e-3))
+        return ServoMotion(order.goal, max(order.lag, 1e-3))
     if isinstance(order, StopL):
-        return Drive(ZERO, max(order.acceleration, SMALL), turn_ratio)
+        return ToolSpeedMotion(ZERO, max(order.acceleration, SMALL), turn_ratio)
     if isinstance(order, StopJ):
-        return Spin(ZERO, max(order.acceleration, SMALL))
+        return JointSpeedMotion(ZERO, max(order.acceleration, SMALL))
     return None
 
 
-def same_kind(order: Order, motion: Motion) -> bool:
+def renews(order: MoveOrder, motion: Motion) -> bool:
     """Whether an order only renews the goal of a motion that goes on."""
-    pairs = (SpeedL, Drive), (SpeedJ, Spin), (Servo, Follow)
+    pairs = (SpeedL, ToolSpeedMotion), (SpeedJ, JointSpeedMotion), (Servo, ServoMotion)
     return any(isinstance(order, told) and isinstance(motion, done) for told, done in pairs)
 
 
@@ -108,12 +120,12 @@ _ARGUMENT = re.compile(r"\b([avr])\s*=\s*([-+.\deE]+)")
 _DEFAULTS = {"movel": {"a": 1.2, "v": 0.25, "r": 0.0}, "movej": {"a": 1.4, "v": 1.05, "r": 0.0}}
 
 
-def orders_in(text: str) -> list[Order]:
+def parse_orders(text: str) -> list[MoveOrder]:
     """The moves, stops and marks in URScript text, as the client writes paths. Other lines are passed over.
 
     Moves to a pose become `MoveL` also where they are written movej: there is no joint target in the text.
     """
-    found: list[Order] = []
+    found: list[MoveOrder] = []
     for written in text.splitlines():
         match = _LINE.match(written)
         if match is not None:
@@ -122,7 +134,7 @@ def orders_in(text: str) -> list[Order]:
     return found
 
 
-def _order(match: re.Match[str]) -> Order:
+def _order(match: re.Match[str]) -> MoveOrder:
     """One line as an order. Raises ValueError where its numbers are none."""
     if match["mark"] is not None:
         return Mark(int(match["mark"]))

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from robot.drivers.head.decoder import Frames
-from robot.drivers.ur10.base_transform import PlacingConfig, tcp_of
+from robot.drivers.ur10.base_transform import BaseTransformConfig, tcp_from_pose
 from robot.drivers.ur10.dashboard import Dashboard
 from robot.emulators.head.config import HeadEmulatorConfig
 from robot.recordings.cdr_live import Event
@@ -28,8 +28,8 @@ SAMPLES = 2000.0
 """Frames of the head in a second."""
 LEGS = tuple((0.63 + 0.07 * x, 0.45 + 0.02 * (x % 2), 0.0) for x in (0, 1, 2, 3, 4, 5, 4, 3, 2, 1, 0))
 """Where quick sessions go: legs of 1.6 s."""
-START = tcp_of(PlacingConfig(), np.array(LEGS[0]), 0.005)
-HIGH = PlacingConfig(z=PlacingConfig().z - 0.3)
+START = tcp_from_pose(BaseTransformConfig(), np.array(LEGS[0]), 0.005)
+HIGH = BaseTransformConfig(z=BaseTransformConfig().z - 0.3)
 """Where the head believes the map to be in quick sessions: whiskers meet nothing."""
 
 

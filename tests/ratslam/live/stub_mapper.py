@@ -15,7 +15,7 @@ SHORT = 64
 
 
 class Answer:
-    """Becomes `ratslam.live.mapper_process.Told` on its way, which this process need not know."""
+    """Becomes `ratslam.live.mapper_process.MappedSample` on its way, which this process need not know."""
 
     def __init__(self, *fields: Any) -> None:
         self.fields = fields
@@ -28,9 +28,9 @@ def told(number: int, seconds: float) -> Any:
     """What a sample led to."""
     import numpy as np
 
-    from ratslam.live.mapper_process import Told
+    from ratslam.live.mapper_process import MappedSample
 
-    return Told(number, np.zeros(3), -1, "none", seconds)
+    return MappedSample(number, np.zeros(3), -1, "none", seconds)
 
 
 def mapping(directory: str, seconds: float, line: Connection) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 def main() -> int:
     import ratslam.live.session
     from ratslam.cli import main as program
-    from ratslam.live.session import live
+    from ratslam.live.session import run_live_session
     from robot.live import selftest
     from tests.ratslam.live import stub_mapper
 
@@ -24,8 +24,10 @@ def main() -> int:
     told: dict[str, Any] = json.loads(sys.stdin.readline())
     arguments = told["arguments"]
     directory = arguments[arguments.index("-o") + 1]
-    ratslam.live.session.live = partial(live, mapping=partial(stub_mapper.mapping, directory, told["mapper"]))
-    selftest.LISTENED = told["listened"]
+    ratslam.live.session.run_live_session = partial(
+        run_live_session, mapping=partial(stub_mapper.mapping, directory, told["mapper"])
+    )
+    selftest.LISTEN_TIME = told["listened"]
     return program(arguments)
 
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.drivers.clock_sync import AHEAD, EARLY, SCALE, WINDOW, Clock
+from robot.drivers.clock_sync import JUMP, MAX_DRIFT, RESIDUAL_QUANTILE, WINDOW, ClockSync
 from tactile.base.random_streams import stream
 
 SHORTEST = 2e-4
@@ -28,8 +28,8 @@ def pairs(
     return device, np.maximum.accumulate(host + delay), host
 
 
-def fed(device: np.ndarray, arrival: np.ndarray, clock: Clock | None = None) -> Clock:
-    clock = clock or Clock()
+def fed(device: np.ndarray, arrival: np.ndarray, clock: ClockSync | None = None) -> ClockSync:
+    clock = clock or ClockSync()
     for one, other in zip(device, arrival, strict=True):
         clock.observe(one, other)
     return clock
@@ -39,16 +39,16 @@ def fed(device: np.ndarray, arrival: np.ndarray, clock: Clock | None = None) -> 
 def test_time_is_found_within_the_shortest_delay(ppm: float, seed: int, rate: float) -> None:
     device, arrival, host = pairs(8, rate, ppm, seed=seed)
     clock = fed(device, arrival)
-    off = clock.host(device) - host - SHORTEST
+    off = clock.to_host(device) - host - SHORTEST
     assert np.abs(off[-round(2 * rate) :]).max() < 2e-4  # while single arrivals are up to 32 ms off
     assert abs(clock.scale - 1 / (1 + ppm * 1e-6)) < 6e-5
-    assert clock.jumped == 0
+    assert clock.jumps == 0
 
 
 @given(st.floats(-150, 150), st.integers(0, 30))
 def test_nothing_arrives_before_it_happened(ppm: float, seed: int) -> None:
     device, arrival, _ = pairs(5, ppm=ppm, seed=seed)
-    assert (arrival - fed(device, arrival).host(device)).min() > -1e-9
+    assert (arrival - fed(device, arrival).to_host(device)).min() > -1e-9
 
 
 @pytest.mark.parametrize("drift", [-0.8e-6, 0.8e-6])
@@ -56,39 +56,39 @@ def test_a_drifting_clock_is_followed(drift: float) -> None:
     """What is older than the window says nothing any more."""
     device, arrival, host = pairs(4 * WINDOW, 50.0, ppm=0)
     device = device + drift * (host - host[0]) ** 2  # by 192 ppm at the end
-    clock = Clock()
+    clock = ClockSync()
     off = []
     for one, other, real in zip(device, arrival, host, strict=True):
         clock.observe(one, other)
-        off.append(clock.host(one) - real - SHORTEST)
+        off.append(clock.to_host(one) - real - SHORTEST)
     assert np.abs(off[100:]).max() < 6e-4
-    assert clock.jumped == 0
+    assert clock.jumps == 0
 
 
 def test_it_depends_on_what_was_observed_alone() -> None:
     device, arrival, _ = pairs(3)
-    one, other = fed(device, arrival), Clock()
+    one, other = fed(device, arrival), ClockSync()
     for k in range(len(device)):
         other.observe(device[k], arrival[k])
-        other.host(1.0), other.residual
-    assert (one.host(50.0), one.scale, one.residual) == (other.host(50.0), other.scale, other.residual)
+        other.to_host(1.0), other.residual
+    assert (one.to_host(50.0), one.scale, one.residual) == (other.to_host(50.0), other.scale, other.residual)
 
 
 def test_a_scale_no_quartz_has_is_not_believed() -> None:
     device, arrival, _ = pairs(10, ppm=2000)
     clock = fed(device, arrival)
-    assert abs(clock.scale - 1) <= SCALE * 1.0001
-    assert (arrival - clock.host(device)).min() > -1e-9
+    assert abs(clock.scale - 1) <= MAX_DRIFT * 1.0001
+    assert (arrival - clock.to_host(device)).min() > -1e-9
 
 
 def test_the_residual_is_how_early_the_early_ones_come() -> None:
     device, arrival, host = pairs(20)
-    early = np.quantile(arrival - host - SHORTEST, EARLY)
+    early = np.quantile(arrival - host - SHORTEST, RESIDUAL_QUANTILE)
     assert fed(device, arrival).residual == pytest.approx(early, abs=5e-5)
     assert fed(device, host).residual < 1e-9
     lucky = host + np.where(np.arange(len(host)) % 50 == 0, 0.0, 0.02)
     assert fed(device, lucky).residual == pytest.approx(0.02, abs=1e-3)
-    assert Clock().residual == 0.0
+    assert ClockSync().residual == 0.0
 
 
 @pytest.mark.parametrize("jump", [-3600.0, -1.0, -0.05, 0.15, 1.0, 4295.0])
@@ -96,29 +96,29 @@ def test_jumps_are_told_at_once_and_lived_with(jump: float) -> None:
     device, arrival, host = pairs(20)
     half = len(device) // 2
     clock = fed(device[:half], arrival[:half])
-    assert clock.jumped == 0
-    late = int(np.argmax((arrival - host)[half:] < AHEAD / 5)) + 1
+    assert clock.jumps == 0
+    late = int(np.argmax((arrival - host)[half:] < JUMP / 5)) + 1
     fed(device[half : half + late] + jump, arrival[half : half + late], clock)
-    assert clock.jumped == 1
+    assert clock.jumps == 1
     fed(device[half + late :] + jump, arrival[half + late :], clock)
-    assert clock.jumped == 1
-    assert np.abs(clock.host(device[half + 200 :] + jump) - host[half + 200 :] - SHORTEST).max() < 2e-4
+    assert clock.jumps == 1
+    assert np.abs(clock.to_host(device[half + 200 :] + jump) - host[half + 200 :] - SHORTEST).max() < 2e-4
 
 
 def test_a_small_step_back_is_followed_in_a_while() -> None:
     device, arrival, host = pairs(20 + WINDOW, rate=20.0)
     clock = fed(device[:200], arrival[:200])
     fed(device[200:] - 0.04, arrival[200:], clock)
-    assert clock.jumped == 0
-    assert abs(clock.host(device[-1] - 0.04) - host[-1] - SHORTEST) < 1e-3
+    assert clock.jumps == 0
+    assert abs(clock.to_host(device[-1] - 0.04) - host[-1] - SHORTEST) < 1e-3
 
 
 def test_a_host_that_is_busy_for_long_is_no_jump() -> None:
     device, arrival, host = pairs(30)
     busy = (host > host[0] + 8) & (host < host[0] + 20)
     clock = fed(device, np.maximum.accumulate(arrival + np.where(busy, 0.04, 0.0)))
-    assert clock.jumped == 0
-    assert abs(clock.host(device[-1]) - host[-1] - SHORTEST) < 2e-4
+    assert clock.jumps == 0
+    assert abs(clock.to_host(device[-1]) - host[-1] - SHORTEST) < 2e-4
 
 
 @pytest.mark.parametrize("stall", [0.5, 2.0, 5.0])
@@ -129,8 +129,8 @@ def test_a_host_that_slept_is_no_jump(stall: float) -> None:
     arrival = arrival.copy()
     arrival[asleep] = host[0] + 8 + stall + 1e-4 * np.arange(asleep.sum())
     clock = fed(device, np.maximum.accumulate(arrival))
-    assert clock.jumped == 0
-    assert np.abs(clock.host(device[-200:]) - host[-200:] - SHORTEST).max() < 2e-4
+    assert clock.jumps == 0
+    assert np.abs(clock.to_host(device[-200:]) - host[-200:] - SHORTEST).max() < 2e-4
 
 
 def test_a_head_that_was_away_is_no_jump() -> None:
@@ -138,16 +138,16 @@ def test_a_head_that_was_away_is_no_jump() -> None:
     device, arrival, host = pairs(30)
     there = (host < host[0] + 5) | (host > host[0] + 25)
     clock = fed(device[there], arrival[there])
-    assert clock.jumped == 0
-    assert abs(clock.host(device[-1]) - host[-1] - SHORTEST) < 2e-4
+    assert clock.jumps == 0
+    assert abs(clock.to_host(device[-1]) - host[-1] - SHORTEST) < 2e-4
 
 
 def test_a_late_first_arrival_is_no_jump() -> None:
     device, arrival, host = pairs(5)
     arrival[0] += 0.009
     clock = fed(device, arrival)
-    assert clock.jumped == 0
-    assert abs(clock.host(device[-1]) - host[-1] - SHORTEST) < 2e-4
+    assert clock.jumps == 0
+    assert abs(clock.to_host(device[-1]) - host[-1] - SHORTEST) < 2e-4
 
 
 @pytest.mark.parametrize("step", [0.002, 0.05])
@@ -156,21 +156,21 @@ def test_stamps_that_repeat(step: float) -> None:
     device, arrival, _ = pairs(5, rate=500.0)
     device = np.floor(device / step) * step
     clock = fed(device, arrival)
-    assert (arrival - clock.host(device)).min() > -1e-9
-    assert clock.jumped == 0
+    assert (arrival - clock.to_host(device)).min() > -1e-9
+    assert clock.jumps == 0
 
 
 def test_before_anything_is_known_nothing_is_said() -> None:
     with pytest.raises(ValueError, match="observed nothing"):
-        Clock().host(1.0)
+        ClockSync().to_host(1.0)
     clock = fed(np.array([5.0]), np.array([105.0]))
-    assert clock.host(6.0) == 106.0
+    assert clock.to_host(6.0) == 106.0
 
 
 @given(st.lists(st.tuples(st.floats(0, 0.3), st.floats(0, 0.3)), min_size=1, max_size=40))
 def test_any_observations_are_borne(steps: list[tuple[float, float]]) -> None:
     device, arrival = np.cumsum(np.array(steps), axis=0).T
     clock = fed(device, arrival)
-    assert np.isfinite(clock.host(device)).all()
-    assert abs(clock.scale - 1) <= SCALE * 1.0001
+    assert np.isfinite(clock.to_host(device)).all()
+    assert abs(clock.scale - 1) <= MAX_DRIFT * 1.0001
     assert clock.residual >= 0

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.drivers.ur10.base_transform import tcp_of
-from robot.live.arm_odometry import Odometer
+from robot.drivers.ur10.base_transform import tcp_from_pose
+from robot.live.arm_odometry import ArmOdometry
 from robot.live.config import LiveConfig
 from robot.sources.odometry import OdometryConfig
 from tactile.base.se2 import compose, integrate
@@ -23,17 +23,17 @@ def arc(config: LiveConfig, seconds: float, speed: float, turn: float) -> tuple[
     step = np.stack([np.cos(heading), np.sin(heading)], axis=1) * speed / HZ
     place = np.array([0.2, 0.4]) + np.concatenate([np.zeros((1, 2)), np.cumsum(step[:-1], axis=0)])
     pose = np.column_stack([place, heading])
-    tcp = tcp_of(config.arm.placing, pose)
+    tcp = tcp_from_pose(config.arm.placing, pose)
     rate = np.zeros((len(time), 6))
     rate[:, :3] = np.gradient(tcp[:, :3], 1 / HZ, axis=0)
     rate[:, 5] = turn
     return time, pose, tcp, rate
 
 
-def odometer(config: LiveConfig, *motion: float) -> tuple[Odometer, np.ndarray, np.ndarray]:
+def odometer(config: LiveConfig, *motion: float) -> tuple[ArmOdometry, np.ndarray, np.ndarray]:
     """One that has seen an arc, and the arc's times and poses."""
     time, pose, tcp, rate = arc(config, *motion)
-    made = Odometer(config)
+    made = ArmOdometry(config)
     made.add(100.0 + time, tcp, rate)
     return made, 100.0 + time, pose
 
@@ -58,7 +58,7 @@ def test_poses_are_those_of_the_map_wherever_it_lies(x, yaw, speed, turn, when):
 @pytest.mark.parametrize(("speed", "turn"), [(0.05, 0.0), (0.0, 0.4), (0.04, -0.3)])
 def test_motions_lead_along_the_way(kind, speed, turn):
     made, _, pose = odometer(LiveConfig(odometry=kind), 9.0, speed, turn)
-    told, truth = zip(*(made.told(k, 100.0 + k) for k in range(9)), strict=True)
+    told, truth = zip(*(made.step(k, 100.0 + k) for k in range(9)), strict=True)
     moves = np.array([[m.dx, m.dy, m.dtheta] for m in told], float)
     assert not moves[0].any()
     assert np.allclose([m.dt for m in told[1:]], 1.0)
@@ -75,10 +75,10 @@ def test_errors_are_added_and_do_not_depend_on_what_follows():
     other, *_ = odometer(noisy.model_copy(update={"seed": 5}), 9.0, 0.05, 0.1)
     exact, *_ = odometer(LiveConfig(), 9.0, 0.05, 0.1)
     times = [(float(k), 100.0 + k) for k in range(8)]
-    first = [short.told(*t)[0] for t in times[:4]]
-    assert first == [long.told(*t)[0] for t in times][:4]
-    assert first != [other.told(*t)[0] for t in times][:4]
-    without = [exact.told(*t)[0] for t in times[:4]]
+    first = [short.step(*t)[0] for t in times[:4]]
+    assert first == [long.step(*t)[0] for t in times][:4]
+    assert first != [other.step(*t)[0] for t in times][:4]
+    without = [exact.step(*t)[0] for t in times[:4]]
     assert all(a.dx != b.dx and a.dy == b.dy for a, b in zip(first[1:], without[1:], strict=True))
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robot.drivers.ur10.base_transform import pose_of
+from robot.drivers.ur10.base_transform import pose_from_tcp
 from robot.live.config import LiveConfig
-from robot.live.route import approach, descent, routed, way
+from robot.live.route import approach_route, descent_route, main_route, plan_path
 from robot.world.head_trajectory import at
 from robot.world.scene import scene
 from tactile.base.errors import InputError
@@ -33,7 +33,7 @@ class Obedient:
 
 def test_a_target_is_sent_when_the_last_one_was_reached_and_once():
     config = LiveConfig(waypoints=((0.1, 0.1, 0.0), (0.2, 0.1, 0.0), (0.2, 0.1, 90.0)))
-    route, arm = routed(config, way(config, HEAD)), Obedient()
+    route, arm = main_route(config, plan_path(config, HEAD)), Obedient()
     assert [route.advance(arm) for _ in range(3)] == [False] * 3
     assert len(arm.sent) == 1
     arm.there = True
@@ -49,10 +49,10 @@ def test_a_target_is_sent_when_the_last_one_was_reached_and_once():
 
 def test_an_arm_that_was_stopped_is_sent_there_again():
     config = LiveConfig(waypoints=((0.1, 0.1, 0.0), (0.2, 0.1, 0.0)))
-    route, arm = routed(config, way(config, HEAD)), Obedient()
-    route.again()
+    route, arm = main_route(config, plan_path(config, HEAD)), Obedient()
+    route.resend_last()
     route.advance(arm)
-    route.again()
+    route.resend_last()
     assert not route.advance(arm)
     assert len(arm.sent) == 2
     assert np.array_equal(arm.sent[0], arm.sent[1])
@@ -60,22 +60,22 @@ def test_an_arm_that_was_stopped_is_sent_there_again():
 
 def test_the_way_is_that_of_the_simulated_session():
     config = LiveConfig()
-    plan, path = config.plan, way(config, HEAD)
+    plan, path = config.plan, plan_path(config, HEAD)
     made = scene(plan.maze, plan.path, plan.motion, plan.kidnaps, HEAD, plan.seed)
     assert np.array_equal(path.pose, at(made.path, path.time))
-    pose, lift = pose_of(config.arm.placing, routed(config, path).targets)
+    pose, lift = pose_from_tcp(config.arm.placing, main_route(config, path).targets)
     assert np.allclose(pose[:, :2], path.pose[1:, :2])
     assert np.allclose(np.cos(pose[:, 2] - path.pose[1:, 2]), 1.0)
     assert np.allclose(lift, 0.0)
-    for route, height in ((approach(config, path), config.lift), (descent(config, path), 0.0)):
-        pose, lift = pose_of(config.arm.placing, route.targets)
+    for route, height in ((approach_route(config, path), config.lift), (descent_route(config, path), 0.0)):
+        pose, lift = pose_from_tcp(config.arm.placing, route.targets)
         assert np.allclose(pose[0, :2], path.pose[0, :2])
         assert np.allclose(lift, height)
 
 
 def test_the_arm_goes_no_faster_than_it_may():
     config = LiveConfig.model_validate({"arm": {"speed": 0.02}, "plan": {"motion": {"speed": 0.2}}})
-    assert routed(config, way(config, HEAD)).speed == 0.02
+    assert main_route(config, plan_path(config, HEAD)).speed == 0.02
 
 
 @pytest.mark.parametrize(
@@ -87,4 +87,4 @@ def test_the_arm_goes_no_faster_than_it_may():
 )
 def test_ways_that_no_arm_can_go_are_refused(settings, key):
     with pytest.raises(InputError, match=key):
-        way(LiveConfig.model_validate(settings), HEAD)
+        plan_path(LiveConfig.model_validate(settings), HEAD)

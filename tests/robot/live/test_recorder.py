@@ -20,11 +20,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robot.drivers.head.cycle_assembly import KEPT, Cut, Window, assembled, cut_of, no_frames, within
+from robot.drivers.head.cycle_assembly import (
+    MAX_FRAMES,
+    Cut,
+    FrameWindow,
+    assemble_cycle,
+    empty_frames,
+    make_cut,
+    select_frames,
+)
 from robot.drivers.head.decoder import Frames
-from robot.drivers.outcome import Outcome
-from robot.drivers.ur10.shared_state import STATE
-from robot.live.recorder import Journal
+from robot.drivers.outcome import SessionOutcome
+from robot.drivers.ur10.shared_state import ARM_STATE
+from robot.live.recorder import LiveRecorder
 from robot.recordings.cdr_live import (
     Event,
     decode_cut,
@@ -63,10 +71,10 @@ def some_frames(count: int, seed: int = 0, first: int = 0) -> Frames:
 
 def some_states(count: int, seed: int = 0, begin: float = START) -> np.ndarray:
     random = np.random.default_rng(seed)
-    states = np.zeros(count, STATE)
-    for name in STATE.names or ():
+    states = np.zeros(count, ARM_STATE)
+    for name in ARM_STATE.names or ():
         shape = states[name].shape
-        if STATE[name].base.kind == "f":
+        if ARM_STATE[name].base.kind == "f":
             states[name] = random.normal(size=shape)
         else:
             states[name] = random.integers(0, 2**31, shape)
@@ -92,9 +100,9 @@ def same(one: Any, other: Any) -> bool:
     return alike and (a.shape, a.dtype, a.tobytes()) == (b.shape, b.dtype, b.tobytes())
 
 
-def opened(path: Path) -> Journal:
+def opened(path: Path) -> LiveRecorder:
     path.unlink(missing_ok=True)
-    return Journal(path, view_shape=(2, 2, 1), whiskers=W, rate_hz=1.0, info=INFO)
+    return LiveRecorder(path, view_shape=(2, 2, 1), whiskers=W, rate_hz=1.0, info=INFO)
 
 
 def content(path: Path, kind: type) -> list[Any]:
@@ -104,24 +112,24 @@ def content(path: Path, kind: type) -> list[Any]:
 def session(path: Path, whisks: int = 3) -> tuple[list[Cycle], Frames, np.ndarray]:
     """A session of whisks, arm states and two events; what was handed on, and all frames and states."""
     frames, states = some_frames(whisks * RATE, seed=whisks), some_states(whisks * 125)
-    journal = opened(path)
+    recorder = opened(path)
     cycles = []
-    journal.event(START, "start", "emulated: a robot, über")
+    recorder.add_event(START, "start", "emulated: a robot, über")
     for k in range(whisks):
         for block in np.split(np.arange(k * RATE, (k + 1) * RATE), RATE // 4):
-            journal.frames(rows(frames, block), START + block[-1] / RATE)
-            journal.arm(
+            recorder.add_frames(rows(frames, block), START + block[-1] / RATE)
+            recorder.add_states(
                 states[
                     (states["host"] > START + block[0] / RATE - 0.02)
                     & (states["host"] <= START + block[-1] / RATE)
                 ]
             )
         mine = rows(frames, slice(k * RATE, (k + 1) * RATE))
-        cut = cut_of(k, START + k + 0.25, START + k, mine, moved(k), seen=k != 1)
-        journal.cut(cut, mine, np.array([0.01 * k, 0.0, 0.05 * k]) if k != 2 else None)
-        cycles.append(assembled(mine, cut))
-    journal.event(START + whisks, "dropped", "1 image")
-    journal.close()
+        cut = make_cut(k, START + k + 0.25, START + k, mine, moved(k), seen=k != 1)
+        recorder.add_whisk(cut, mine, np.array([0.01 * k, 0.0, 0.05 * k]) if k != 2 else None)
+        cycles.append(assemble_cycle(mine, cut))
+    recorder.add_event(START + whisks, "dropped", "1 image")
+    recorder.close()
     return cycles, frames, states
 
 
@@ -147,14 +155,14 @@ def test_a_session_comes_back_bit_for_bit(tmp_path: Path) -> None:
 
 def test_a_whisk_says_what_its_frames_say() -> None:
     frames = some_frames(10, first=90)
-    cycle = assembled(frames, cut_of(0, 3.0, 2.5, rows(frames, slice(2, 7)), moved(0)))
+    cycle = assemble_cycle(frames, make_cut(0, 3.0, 2.5, rows(frames, slice(2, 7)), moved(0)))
     np.testing.assert_allclose(cycle.time, 2.5 + np.arange(5) / RATE, rtol=0, atol=1e-12)
     np.testing.assert_allclose(cycle.angle, frames.values[2:7, :, 0] * np.pi / 32768)
     np.testing.assert_allclose(cycle.deflection, frames.values[2:7, :, 1:] * np.pi / 32768)
     assert cycle.odometry == moved(0)
     assert all(part.flags.c_contiguous for part in cycle[:3])
     mixed = rows(frames, np.random.default_rng(0).permutation(10))
-    assert same(assembled(mixed, cut_of(0, 3.0, 2.5, rows(frames, slice(2, 7)), moved(0))), cycle)
+    assert same(assemble_cycle(mixed, make_cut(0, 3.0, 2.5, rows(frames, slice(2, 7)), moved(0))), cycle)
 
 
 @settings(max_examples=40)
@@ -168,21 +176,21 @@ def test_whatever_way_frames_come(tmp_path_factory: Any, data: st.DataObject) ->
     order = order[np.argsort(order + np.array([3 * (k % 4 == 0) for k in range(len(order))]), kind="stable")]
     came = rows(frames, order)
     cycles, at = [], 0
-    with opened(path) as journal:
+    with opened(path) as recorder:
         while True:
             step = data.draw(st.integers(1, 30))
             block = rows(came, slice(at, at + step))
-            ahead = rows(came, slice(0, at + step))  # the ring has them before the journal
+            ahead = rows(came, slice(0, at + step))  # the ring has them before the recorder
             first = int(frames.sequence[0]) + data.draw(st.integers(-5, 120)) if count else 0
-            mine = within(ahead, first, first + data.draw(st.integers(0, 60)))
-            cut = cut_of(len(cycles), START + at, START, mine, moved(at), seen=data.draw(st.booleans()))
+            mine = select_frames(ahead, first, first + data.draw(st.integers(0, 60)))
+            cut = make_cut(len(cycles), START + at, START, mine, moved(at), seen=data.draw(st.booleans()))
             early = data.draw(st.booleans())
             if early:
-                journal.cut(cut, mine)
-            journal.frames(block, START + 0.01 * at)
+                recorder.add_whisk(cut, mine)
+            recorder.add_frames(block, START + 0.01 * at)
             if not early:
-                journal.cut(cut, mine)
-            cycles.append(assembled(mine, cut))
+                recorder.add_whisk(cut, mine)
+            cycles.append(assemble_cycle(mine, cut))
             at += step
             if at >= len(order):
                 break
@@ -199,12 +207,12 @@ def test_whatever_way_frames_come(tmp_path_factory: Any, data: st.DataObject) ->
 def test_blocks_come_back(count: int, seed: int, first: int) -> None:
     frames, states = some_frames(count, seed, first), some_states(count + 1, seed)
     assert same(decode_frames(encode_frames(3.5, frames), W), (3.5, frames))
-    assert encode_frames(3.5, no_frames(W)) == encode_frames(3.5, rows(frames, slice(0)))
+    assert encode_frames(3.5, empty_frames(W)) == encode_frames(3.5, rows(frames, slice(0)))
     at, again = decode_states(encode_states(states))
     assert at == states["host"][-1]
-    assert again.dtype == STATE
-    assert all((again[name] == states[name]).all() for name in STATE.names or ())
-    cut = cut_of(count, 1.5, 1.0, frames, moved(seed))
+    assert again.dtype == ARM_STATE
+    assert all((again[name] == states[name]).all() for name in ARM_STATE.names or ())
+    cut = make_cut(count, 1.5, 1.0, frames, moved(seed))
     assert same(decode_cut(encode_cut(cut)), cut)
     assert cut.seen == (count > 0)
     event = Event(0.1, "fault", "ünder: way")
@@ -217,7 +225,7 @@ def test_no_bytes_are_believed(noise: bytes, kind: int, place: int, number: int)
     decode: Any = (lambda m: decode_frames(m, W), decode_states, decode_cut, decode_event)[kind]
     good = (
         encode_frames(1.0, frames), encode_states(some_states(2)),
-        encode_cut(cut_of(0, 1.0, 1.0, frames, moved(0))), encode_event(Event(1.0, "a", "b")),
+        encode_cut(make_cut(0, 1.0, 1.0, frames, moved(0))), encode_event(Event(1.0, "a", "b")),
     )[kind]  # fmt: skip
     place = place % len(good)
     for bad in (
@@ -237,13 +245,13 @@ def test_no_bytes_are_believed(noise: bytes, kind: int, place: int, number: int)
 def test_everything_is_on_its_way_within_a_fifth_of_a_second(tmp_path: Path) -> None:
     """Counted on the times handed in: the file is read after every call."""
     path = tmp_path / "a.mcap"
-    frames, journal = some_frames(RATE), opened(path)
+    frames, recorder = some_frames(RATE), opened(path)
     states = some_states(125)
     late = []
     for k in range(0, RATE, 2):
         now = START + (k + 1) / RATE
-        journal.frames(rows(frames, slice(k, k + 2)), now)
-        journal.arm(states[(states["host"] > now - 2 / RATE) & (states["host"] <= now)])
+        recorder.add_frames(rows(frames, slice(k, k + 2)), now)
+        recorder.add_states(states[(states["host"] > now - 2 / RATE) & (states["host"] <= now)])
         got = [part.sequence[-1] for part in content(path, Frames)]
         late.append(k + 1 - max(got, default=-1))
         known = content(path, np.ndarray)
@@ -251,9 +259,9 @@ def test_everything_is_on_its_way_within_a_fifth_of_a_second(tmp_path: Path) -> 
     assert max(late) / RATE < 0.2
     assert len(content(path, Frames)) >= 5  # and not one by one
     mine = rows(frames, slice(0, RATE))
-    journal.cut(cut_of(0, START + 1.0, START, mine, moved(0)), mine)
+    recorder.add_whisk(make_cut(0, START + 1.0, START, mine, moved(0)), mine)
     assert Walk(path).__iter__().__next__().reading.angle.shape == (RATE, W)
-    journal.close()
+    recorder.close()
 
 
 WRITER = """
@@ -261,13 +269,13 @@ import mmap, struct, sys
 from pathlib import Path
 import numpy as np
 from robot.drivers.head.decoder import Frames
-from robot.drivers.head.cycle_assembly import cut_of
-from robot.live.recorder import Journal
+from robot.drivers.head.cycle_assembly import make_cut
+from robot.live.recorder import LiveRecorder
 from robot.sources.source_info import SourceInfo
 from tactile.base.types import Odometry
 
 path, beside = map(Path, sys.argv[1:])
-journal = Journal(path, view_shape=(3, 6, 1), whiskers=18, info=SourceInfo())
+recorder = LiveRecorder(path, view_shape=(3, 6, 1), whiskers=18, info=SourceInfo())
 random = np.random.default_rng(0)
 pool = random.integers(-300, 300, (2000, 18, 3)).astype(np.int16)
 with beside.open("r+b") as file:
@@ -276,12 +284,12 @@ k = 0
 while True:
     number = np.arange(20 * k, 20 * k + 20)
     frames = Frames(number, number * 500, np.zeros(20, np.uint8), pool[number % 2000])
-    journal.frames(frames, 0.01 * k)
+    recorder.add_frames(frames, 0.01 * k)
     if k % 100 == 99:
         number = np.arange(20 * k - 1980, 20 * k + 20)
         mine = Frames(number, number * 500, np.zeros(2000, np.uint8), pool[number % 2000])
         motion = Odometry(0.01, 0.0, 0.0, 1.0)
-        journal.cut(cut_of(k // 100, 0.01 * k, 0.01 * k - 1, mine, motion), mine)
+        recorder.add_whisk(make_cut(k // 100, 0.01 * k, 0.01 * k - 1, mine, motion), mine)
     k += 1
     told[:16] = struct.pack("<qq", k, k // 100)
 """
@@ -332,27 +340,27 @@ def test_many_killed_sessions(tmp_path: Path) -> None:
 
 def test_a_full_disk_is_told_once_and_the_recording_stays_readable(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    frames, journal = some_frames(6 * RATE), opened(path)
+    frames, recorder = some_frames(6 * RATE), opened(path)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))
         sizes = []
         for k in range(6 * RATE // 4):
             mine = rows(frames, slice(4 * k, 4 * k + 4))
-            journal.frames(mine, START + 4 * k / RATE)
+            recorder.add_frames(mine, START + 4 * k / RATE)
             if k % 50 == 49:
                 mine = rows(frames, slice(4 * k - RATE + 4, 4 * k + 4))
-                journal.cut(cut_of(k, START + k, START, mine, moved(k)), mine)
+                recorder.add_whisk(make_cut(k, START + k, START, mine, moved(k)), mine)
             sizes.append(path.stat().st_size)
-        fault = journal.fault
-        journal.event(START, "late", "nobody hears it")
-        journal.close()
-        journal.close()
+        fault = recorder.fault
+        recorder.add_event(START, "late", "nobody hears it")
+        recorder.close()
+        recorder.close()
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert fault is not None
-    assert fault is journal.fault
-    assert fault.outcome is Outcome.DISK_FULL
+    assert fault is recorder.fault
+    assert fault.outcome is SessionOutcome.DISK_FULL
     assert str(path) in fault.detail
     assert "free room" in fault.detail
     assert max(sizes) < 20_000  # no half chunks: what could not be written whole was taken off
@@ -364,15 +372,15 @@ def test_a_full_disk_is_told_once_and_the_recording_stays_readable(tmp_path: Pat
 
 def test_room_that_comes_back_makes_a_whole_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.mcap"
-    frames, journal = some_frames(3 * RATE), opened(path)
+    frames, recorder = some_frames(3 * RATE), opened(path)
     with monkeypatch.context() as patch:
         for k in range(3):
             mine = rows(frames, slice(k * RATE, (k + 1) * RATE))
             if k == 1:
                 patch.setattr(_Whole, "flush", _no_room)
-            journal.cut(cut_of(k, START + k, START + k, mine, moved(k)), mine)
-    assert journal.fault is not None
-    journal.close()
+            recorder.add_whisk(make_cut(k, START + k, START + k, mine, moved(k)), mine)
+    assert recorder.fault is not None
+    recorder.close()
     recording = Recording(path)
     assert (recording.length, recording.truncated) == (1, False)
 
@@ -404,8 +412,8 @@ def test_recover_keeps_what_stands_beside_the_samples(tmp_path: Path) -> None:
 
 
 def test_a_recording_without_a_whisk_is_not_recovered(tmp_path: Path) -> None:
-    with opened(tmp_path / "a.mcap") as journal:
-        journal.frames(some_frames(5), START)
+    with opened(tmp_path / "a.mcap") as recorder:
+        recorder.add_frames(some_frames(5), START)
     for action in (
         lambda: recover(tmp_path / "a.mcap", tmp_path / "b.mcap"),
         lambda: Recording(tmp_path / "a.mcap"),
@@ -461,8 +469,8 @@ def test_a_chunk_that_is_passed_over_is_missed(tmp_path: Path, unsigned: bool) -
 @pytest.mark.parametrize("unsigned", [False, True])
 def test_a_chunk_that_was_all_is_missed(tmp_path: Path, unsigned: bool) -> None:
     """The channel went with it."""
-    with opened(tmp_path / "a.mcap") as journal:
-        journal.event(START, "start", "and end")
+    with opened(tmp_path / "a.mcap") as recorder:
+        recorder.add_event(START, "start", "and end")
     data = (tmp_path / "a.mcap").read_bytes()
     _check_passed_over(tmp_path, data, [data.index(b"\x28\xb5\x2f\xfd") - CHUNK_HEADER], [], unsigned)
 
@@ -489,41 +497,41 @@ CHUNK_HEADER = 1 + 8 + 3 * 8 + 4 + 8 + 8
 
 
 def test_a_cut_must_be_of_its_frames(tmp_path: Path) -> None:
-    frames, journal = some_frames(20), opened(tmp_path / "a.mcap")
-    cut = cut_of(0, START, START, frames, moved(0))
+    frames, recorder = some_frames(20), opened(tmp_path / "a.mcap")
+    cut = make_cut(0, START, START, frames, moved(0))
     for wrong in (cut._replace(frames=19), cut._replace(first=1), cut._replace(frames=0, first=50, last=60)):
         with pytest.raises(ValueError, match="frames for a whisk"):
-            journal.cut(wrong, frames)
+            recorder.add_whisk(wrong, frames)
     with pytest.raises(ValueError, match="a whisk of 20 frames"):
-        assembled(rows(frames, slice(1, 20)), cut)
+        assemble_cycle(rows(frames, slice(1, 20)), cut)
     with pytest.raises(ValueError, match="colon"):
-        journal.event(START, "a: b", "c")
-    journal.cut(cut, frames)
-    journal.close()
+        recorder.add_event(START, "a: b", "c")
+    recorder.add_whisk(cut, frames)
+    recorder.close()
     assert Recording(tmp_path / "a.mcap").length == 1
 
 
 def test_a_cut_whose_frames_are_missing_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No journal writes such a file."""
-    with monkeypatch.context() as patch, opened(tmp_path / "a.mcap") as journal:
+    """No recorder writes such a file."""
+    with monkeypatch.context() as patch, opened(tmp_path / "a.mcap") as recorder:
         patch.setattr(
             "robot.live.recorder.encode_cut", lambda cut: encode_cut(cut._replace(frames=cut.frames + 1))
         )
         frames = some_frames(20)
-        journal.cut(cut_of(0, START, START, frames, moved(0)), frames)
+        recorder.add_whisk(make_cut(0, START, START, frames, moved(0)), frames)
     walk = Walk(tmp_path / "a.mcap")
     assert list(walk) == []
     assert walk.broken == "a whisk of 21 frames, of which 20 are there"
 
 
 def test_the_window_holds_what_a_ring_would() -> None:
-    window = Window(no_frames(W))
+    window = FrameWindow(empty_frames(W))
     assert len(window.between(0, 10**9).sequence) == 0
     block = some_frames(1000)
     for k in range(100):
         window.add(block._replace(sequence=block.sequence + 1000 * k))
     kept = window.between(0, 10**9).sequence
-    assert KEPT <= len(kept) < KEPT + 1000
+    assert MAX_FRAMES <= len(kept) < MAX_FRAMES + 1000
     assert (np.diff(kept) == 1).all()
     assert kept[-1] == 99_999
     assert (window.between(99_990, 99_992).sequence == [99_990, 99_991, 99_992]).all()
@@ -531,20 +539,20 @@ def test_the_window_holds_what_a_ring_would() -> None:
 
 def test_three_threads_write_one_recording(tmp_path: Path) -> None:
     frames, states = some_frames(4 * RATE), some_states(500)
-    journal = opened(tmp_path / "a.mcap")
+    recorder = opened(tmp_path / "a.mcap")
 
     def head() -> None:
         for k in range(0, 4 * RATE, 4):
-            journal.frames(rows(frames, slice(k, k + 4)), START + k / RATE)
+            recorder.add_frames(rows(frames, slice(k, k + 4)), START + k / RATE)
 
     def arm() -> None:
         for k in range(0, 500, 5):
-            journal.arm(states[k : k + 5])
+            recorder.add_states(states[k : k + 5])
 
     def loop() -> None:
         for k in range(4):
             mine = rows(frames, slice(k * RATE, (k + 1) * RATE))
-            journal.cut(cut_of(k, START + k, START + k, mine, moved(k)), mine)
+            recorder.add_whisk(make_cut(k, START + k, START + k, mine, moved(k)), mine)
 
     threads = [threading.Thread(target=target) for target in (head, arm, loop)]
     interval = sys.getswitchinterval()
@@ -556,7 +564,7 @@ def test_three_threads_write_one_recording(tmp_path: Path) -> None:
             thread.join(10)
     finally:
         sys.setswitchinterval(interval)
-    journal.close()
+    recorder.close()
     walk = Walk(tmp_path / "a.mcap")
     entries = list(walk.entries())
     assert not walk.broken
@@ -582,15 +590,16 @@ def test_ros_tools_read_the_messages(tmp_path: Path) -> None:
 
 
 def test_an_unseen_cut_needs_no_frames(tmp_path: Path, refused: Callable[..., InputError]) -> None:
-    with opened(tmp_path / "a.mcap") as journal:
-        cut = cut_of(0, START, START, no_frames(W), moved(0))
+    with opened(tmp_path / "a.mcap") as recorder:
+        cut = make_cut(0, START, START, empty_frames(W), moved(0))
         assert not cut.seen
-        journal.cut(cut, no_frames(W))
+        recorder.add_whisk(cut, empty_frames(W))
     (sample,) = Recording(tmp_path / "a.mcap")
     assert isinstance(sample.reading, Cycle)
     assert len(sample.reading.time) == 0
     assert sample.reading.odometry == moved(0)
     assert isinstance(cut, Cut)
     refused(
-        lambda: Journal(tmp_path / "a.mcap", view_shape=(1, 1, 1), whiskers=1, info=INFO), "exists already"
+        lambda: LiveRecorder(tmp_path / "a.mcap", view_shape=(1, 1, 1), whiskers=1, info=INFO),
+        "exists already",
     )

@@ -9,10 +9,10 @@ from collections.abc import Callable
 from typing import Any
 
 from robot.drivers.create.config import CreateConfig
-from robot.drivers.create.control_loop import PAUSE, Pilot
+from robot.drivers.create.control_loop import PAUSE, ControlLoop
 from robot.drivers.create.protocol import SAFE, START
-from robot.drivers.create.serial_link import Link
-from robot.emulators.create import Create, CreateEmulatorConfig
+from robot.drivers.create.serial_link import SerialLink
+from robot.emulators.create import CreateEmulatorConfig, EmulatedCreate
 
 
 class Line:
@@ -23,7 +23,7 @@ class Line:
     """
 
     def __init__(self) -> None:
-        self.robot = Create(CreateEmulatorConfig())
+        self.robot = EmulatedCreate(CreateEmulatorConfig())
         self.now, self.timeout = 100.0, 0.0
         self.mangle: Callable[[bytes], bytes] = lambda reply: reply
         self.gone = False
@@ -64,14 +64,14 @@ class Line:
         if self.gone:
             raise OSError(5, "Input/output error")
 
-    def flown(self, **settings: Any) -> Pilot:
+    def control_loop(self, **settings: Any) -> ControlLoop:
         """A pilot of this robot, awake and in safe mode."""
-        link = Link(self)
+        link = SerialLink(self)
         for command in (START, SAFE):
             link.send(command)
             self.wait(PAUSE)
         link.ask(float("inf"))
-        return Pilot(CreateConfig(**settings), link, self.clock)
+        return ControlLoop(CreateConfig(**settings), link, self.clock)
 
 
 class Emulated:

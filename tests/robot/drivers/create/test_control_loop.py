@@ -11,25 +11,25 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from robot.drivers.create import protocol
-from robot.drivers.create.control_loop import Pilot
-from robot.drivers.create.stop_reasons import Halt, Refused
-from robot.emulators.create import Create
+from robot.drivers.create.control_loop import ControlLoop
+from robot.drivers.create.stop_reasons import CommandRefused, StopReason
+from robot.emulators.create import EmulatedCreate
 from tests.robot.drivers.create.serial_lines import Line
 
 PERIOD = 0.05
 NUMBER = st.one_of(st.floats(-0.3, 0.3), st.floats())
 
 
-def rolls(robot: Create) -> bool:
+def rolls(robot: EmulatedCreate) -> bool:
     return bool(robot.right or robot.left)
 
 
-def drive(line: Line, pilot: Pilot, seconds: float, forward: float, turn: float = 0.0) -> None:
+def drive(line: Line, pilot: ControlLoop, seconds: float, forward: float, turn: float = 0.0) -> None:
     """Drives on for so long; a driver that is refused goes on trying."""
     for _ in range(round(seconds / PERIOD)):
         try:
             pilot.steer(forward, turn)
-        except Refused:
+        except CommandRefused:
             assert pilot.halted
         pilot.poll()
         line.wait(PERIOD)
@@ -38,9 +38,9 @@ def drive(line: Line, pilot: Pilot, seconds: float, forward: float, turn: float 
 @given(st.floats(0.01, 0.5), st.lists(st.tuples(NUMBER, NUMBER), max_size=10))
 def test_no_speed_over_the_cap_reaches_the_wire(cap: float, wanted: list[tuple[float, float]]) -> None:
     line = Line()
-    pilot = line.flown(speed=cap)
+    pilot = line.control_loop(speed=cap)
     for forward, turn in wanted:
-        with contextlib.suppress(Refused):
+        with contextlib.suppress(CommandRefused):
             pilot.steer(forward, turn)
         pilot.poll()
         line.wait(PERIOD)
@@ -50,7 +50,7 @@ def test_no_speed_over_the_cap_reaches_the_wire(cap: float, wanted: list[tuple[f
 
 def test_what_is_not_renewed_ends() -> None:
     line = Line()
-    pilot = line.flown(patience=0.5)
+    pilot = line.control_loop(patience=0.5)
     pilot.steer(0.1, 0.0)
     rolled = []
     for _ in range(20):
@@ -66,15 +66,15 @@ def test_what_is_not_renewed_ends() -> None:
 
 def test_a_bump_stops_it_and_leaves_the_way_back() -> None:
     line = Line()
-    pilot = line.flown()
+    pilot = line.control_loop()
     drive(line, pilot, 0.5, 0.1)
     line.robot.touch(protocol.Bumps.LEFT)
     pilot.poll()
     assert not rolls(line.robot)
     assert pilot.halted
-    assert pilot.halted.halt is Halt.BUMPED
+    assert pilot.halted.halt is StopReason.BUMPED
     assert "left" in str(pilot.halted)
-    with pytest.raises(Refused, match="bumped"):
+    with pytest.raises(CommandRefused, match="bumped"):
         pilot.steer(-0.1, 0.0)
     pilot.release()
     drive(line, pilot, 0.5, -0.1)
@@ -89,12 +89,12 @@ def test_a_bump_stops_it_and_leaves_the_way_back() -> None:
 @pytest.mark.parametrize("dropped", [protocol.Bumps.DROPPED_LEFT, protocol.Bumps.DROPPED_CASTER])
 def test_a_dropped_wheel_stops_it_until_it_stands(dropped: protocol.Bumps, forward: float) -> None:
     line = Line()
-    pilot = line.flown()
+    pilot = line.control_loop()
     drive(line, pilot, 0.2, forward, 0.2)
     line.robot.touch(dropped)
     drive(line, pilot, 0.2, forward, 0.2)
     assert pilot.halted
-    assert pilot.halted.halt is Halt.WHEEL_DROP
+    assert pilot.halted.halt is StopReason.WHEEL_DROP
     pilot.release()
     drive(line, pilot, 0.2, forward, 0.2)
     assert pilot.halted is not None  # it hangs still
@@ -106,12 +106,12 @@ def test_a_dropped_wheel_stops_it_until_it_stands(dropped: protocol.Bumps, forwa
 
 def test_a_robot_that_left_safe_mode_is_brought_back_by_release_alone() -> None:
     line = Line()
-    pilot = line.flown()
+    pilot = line.control_loop()
     drive(line, pilot, 0.2, 0.1)
     line.robot.touch(protocol.Bumps(0), cliff=True)
     drive(line, pilot, 1.0, 0.1)
     assert pilot.halted
-    assert pilot.halted.halt is Halt.LEFT_SAFE_MODE
+    assert pilot.halted.halt is StopReason.LEFT_SAFE_MODE
     assert line.robot.mode == protocol.Mode.PASSIVE
     pilot.release()
     drive(line, pilot, 0.2, 0.1)
@@ -127,10 +127,10 @@ def _garbled(reply: bytes) -> bytes:
     return b"\xff" * 6
 
 
-@pytest.mark.parametrize(("mangle", "halt"), [(_lost, Halt.SILENT), (_garbled, Halt.GARBLED)])
-def test_a_lost_link_stops_the_wheels(mangle: Callable[[bytes], bytes], halt: Halt) -> None:
+@pytest.mark.parametrize(("mangle", "halt"), [(_lost, StopReason.SILENT), (_garbled, StopReason.GARBLED)])
+def test_a_lost_link_stops_the_wheels(mangle: Callable[[bytes], bytes], halt: StopReason) -> None:
     line = Line()
-    pilot = line.flown(silence=0.3)
+    pilot = line.control_loop(silence=0.3)
     drive(line, pilot, 0.5, 0.1)
     line.mangle, since = mangle, line.now
     while rolls(line.robot):
@@ -148,13 +148,13 @@ def test_a_lost_link_stops_the_wheels(mangle: Callable[[bytes], bytes], halt: Ha
 
 def test_an_unplugged_port_is_final() -> None:
     line = Line()
-    pilot = line.flown()
+    pilot = line.control_loop()
     drive(line, pilot, 0.2, 0.1)
     line.gone = True
     drive(line, pilot, 0.2, 0.1)
     assert pilot.halted
-    assert pilot.halted.halt is Halt.UNPLUGGED
-    with pytest.raises(Refused, match="unplugged"):
+    assert pilot.halted.halt is StopReason.UNPLUGGED
+    with pytest.raises(CommandRefused, match="unplugged"):
         pilot.release()
 
 
@@ -164,7 +164,7 @@ def test_an_unplugged_port_is_final() -> None:
 def test_a_late_reply_loses_nothing(fates: list[str], forward: float) -> None:
     """`late`: it arrives before the next query; `behind`: after it, just before the next reply."""
     line = Line()
-    pilot = line.flown(silence=5.0)
+    pilot = line.control_loop(silence=5.0)
     late, behind = [], []
 
     def mangle(reply: bytes) -> bytes:
@@ -184,7 +184,7 @@ def test_a_late_reply_loses_nothing(fates: list[str], forward: float) -> None:
             line.arrive(late.pop(0))
     for _ in range(3):
         pilot.poll()
-    total = pilot.take()
+    total = pilot.take_odometry()
     assert abs(1000 * (total.dx - line.robot.base.travelled)) < 1 + 1e-6
     assert pilot.counts.stray == 0
     assert pilot.counts.lost == pilot.counts.late
@@ -208,7 +208,7 @@ def test_garbage_costs_no_more_than_the_replies_it_spoils(
     noise: list[tuple[str, bytes] | None], forward: float
 ) -> None:
     line = Line()
-    pilot = line.flown(silence=5.0)
+    pilot = line.control_loop(silence=5.0)
     pending = [*noise, *[None] * 3]
 
     def mangle(reply: bytes) -> bytes:
@@ -225,7 +225,7 @@ def test_garbage_costs_no_more_than_the_replies_it_spoils(
             spoilt += sum(steps[-2:])
         pending.pop(0)
     pilot.poll()
-    missing = line.robot.base.travelled - pilot.take().dx
+    missing = line.robot.base.travelled - pilot.take_odometry().dx
     assert abs(missing) <= spoilt + 1e-3 + 1e-9
     assert pilot.gap() == (pilot.counts.lost > 0)
     assert math.copysign(1, missing) == math.copysign(1, forward) or abs(missing) <= 1e-3 + 1e-9
@@ -235,19 +235,19 @@ def test_garbage_costs_no_more_than_the_replies_it_spoils(
 @example(4, b"\xff", 0.125)  # noise and the way of 3 mm look like a reply of full mode
 def test_garbage_before_a_reply_costs_nothing(count: int, noise: bytes, forward: float) -> None:
     line = Line()
-    pilot = line.flown()
+    pilot = line.control_loop()
     line.mangle = lambda reply: noise * count + reply
     drive(line, pilot, 1.0, forward)
     drive(line, pilot, 0.1, 0.0)
     assert pilot.halted is None
     assert not pilot.gap()
     assert pilot.counts.stray == count * pilot.counts.good - count  # the first came undisturbed
-    assert abs(1000 * (pilot.take().dx - line.robot.base.travelled)) < 1 + 1e-6
+    assert abs(1000 * (pilot.take_odometry().dx - line.robot.base.travelled)) < 1 + 1e-6
 
 
 def test_what_is_asked_for_while_it_is_read_is_looked_at_too() -> None:
     line = Line()
-    pilot = line.flown()
+    pilot = line.control_loop()
     line.robot.touch(protocol.Bumps.RIGHT)
 
     def mangle(reply: bytes) -> bytes:
@@ -262,7 +262,7 @@ def test_what_is_asked_for_while_it_is_read_is_looked_at_too() -> None:
 
 def test_nothing_asked_for_before_a_stop_is_done_after_its_release() -> None:
     line = Line()
-    pilot = line.flown()
+    pilot = line.control_loop()
     drive(line, pilot, 0.5, 0.1)
     line.robot.touch(protocol.Bumps.RIGHT)
     pilot.poll()
@@ -277,7 +277,7 @@ def test_nothing_asked_for_before_a_stop_is_done_after_its_release() -> None:
 
 def test_noise_behind_a_reply_casts_doubt_on_it() -> None:
     line = Line()
-    pilot = line.flown()
+    pilot = line.control_loop()
     drive(line, pilot, 0.2, 0.1)
     assert not pilot.gap()
     line.arrive(b"\0\0\0")

@@ -15,7 +15,7 @@ import pytest
 from robot.drivers.create.config import CreateConfig
 from robot.drivers.create.driver import CreateDriver, NoAnswer, NotSafe
 from robot.drivers.create.serial_link import NoPort
-from robot.drivers.create.stop_reasons import Halt, Refused
+from robot.drivers.create.stop_reasons import CommandRefused, StopReason
 from tactile.base.errors import InputError
 from tests.robot.drivers.create.serial_lines import Emulated
 
@@ -94,7 +94,7 @@ def test_speeds_over_the_cap_never_reach_the_robot(emulated: Emulated) -> None:
         for forward, turn in ((0.121, 0), (0.1, 0.5), (math.nan, 0), (0, math.inf), (-1e300, 0), (0.12, 0)):
             try:
                 driver.drive(forward, turn)
-            except Refused:
+            except CommandRefused:
                 assert (forward, turn) != (0.12, 0)
             time.sleep(0.06)
         until(lambda: emulated.do("state")["wheels"] == [120, 120])
@@ -116,7 +116,7 @@ def test_a_bump_stops_it(emulated: Emulated) -> None:
         emulated.do("bump")
         until(lambda: driver.halted)
         until(lambda: emulated.do("state")["wheels"] == [0, 0], 0.5)
-        with pytest.raises(Refused, match="bumped"):
+        with pytest.raises(CommandRefused, match="bumped"):
             driver.drive(0.1, 0.0)
         driver.release()
         until(lambda: driver.drive(-0.1, 0.0) or emulated.do("state")["wheels"] == [-100, -100])
@@ -154,15 +154,15 @@ def test_unplugged_while_driving(emulated: Emulated) -> None:
         emulated.do("unplug")
         assert until(lambda: driver.halted) < 1.0
         assert driver.halted
-        assert driver.halted.halt is Halt.UNPLUGGED
-        with pytest.raises(Refused, match="unplugged"):
+        assert driver.halted.halt is StopReason.UNPLUGGED
+        with pytest.raises(CommandRefused, match="unplugged"):
             driver.drive(0.1, 0.0)
         driver.stop()
         driver.odometry()
     finally:
         driver.close()
     driver.close()
-    with pytest.raises(Refused, match="not started"):
+    with pytest.raises(CommandRefused, match="not started"):
         driver.drive(0.1, 0.0)
 
 
@@ -172,7 +172,7 @@ def test_switched_off_while_driving(emulated: Emulated) -> None:
         emulated.do("off")
         assert until(lambda: driver.halted) < 1.5
         assert driver.halted
-        assert driver.halted.halt is Halt.SILENT
+        assert driver.halted.halt is StopReason.SILENT
 
 
 DRIVES = """
@@ -210,7 +210,7 @@ def test_a_guard_that_has_ended_stops_it(emulated: Emulated) -> None:
         driver._guard._process.kill()
         until(lambda: driver.halted)
         assert driver.halted
-        assert driver.halted.halt is Halt.UNGUARDED
+        assert driver.halted.halt is StopReason.UNGUARDED
         until(lambda: emulated.do("state")["wheels"] == [0, 0])
 
 

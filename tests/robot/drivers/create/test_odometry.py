@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robot.drivers.create import protocol
-from robot.drivers.create.odometry import Odometer
-from robot.emulators.create import Create, CreateEmulatorConfig
+from robot.drivers.create.odometry import CreateOdometry
+from robot.emulators.create import CreateEmulatorConfig, EmulatedCreate
 from tactile.base.se2 import compose
 
 SPEED = st.integers(-protocol.TOP_SPEED, protocol.TOP_SPEED)
@@ -19,9 +19,9 @@ LEG = st.tuples(SPEED, SPEED, st.floats(0.005, 0.5), st.integers(1, 20))  # whee
 LEGS = st.lists(LEG, min_size=1, max_size=12)
 
 
-def readings(legs: list[tuple[int, int, float, int]]) -> tuple[Create, list[tuple[int, int, float]]]:
+def readings(legs: list[tuple[int, int, float, int]]) -> tuple[EmulatedCreate, list[tuple[int, int, float]]]:
     """A robot driven so, and what it told: mm, degrees, time."""
-    robot = Create(CreateEmulatorConfig())
+    robot = EmulatedCreate(CreateEmulatorConfig())
     robot.receive(protocol.START + protocol.SAFE)
     told = []
     for right, left, seconds, count in legs:
@@ -44,10 +44,10 @@ def test_sums_are_the_truth_within_what_is_not_told(legs: list[tuple[int, int, f
 @given(LEGS)
 def test_the_pose_is_the_truth_within_quantisation(legs: list[tuple[int, int, float, int]]) -> None:
     robot, told = readings(legs)
-    odometer = Odometer(0.0)
+    odometer = CreateOdometry(0.0)
     for reading in told:
         odometer.add(*reading)
-    dx, dy, dtheta, dt = odometer.take()
+    dx, dy, dtheta, dt = odometer.take_odometry()
     driven = sum(abs(right + left) / 2000 * s * n for right, left, s, n in legs)
     turned = math.radians(sum(abs(d) for _, d, _ in told))
     # A heading is off by a degree at most, all along; a millimetre is told late, in another direction.
@@ -62,24 +62,24 @@ def test_taking_it_in_parts_changes_nothing(
     legs: list[tuple[int, int, float, int]], taken: list[bool]
 ) -> None:
     _, told = readings(legs)
-    whole, parts = Odometer(0.0), Odometer(0.0)
+    whole, parts = CreateOdometry(0.0), CreateOdometry(0.0)
     pose, time = np.zeros(3), 0.0
     for reading, take in zip(told, taken, strict=False):
         whole.add(*reading)
         parts.add(*reading)
         if take:
-            *motion, dt = parts.take()
+            *motion, dt = parts.take_odometry()
             pose, time = compose(pose, np.array(motion)), time + dt
-    *motion, dt = parts.take()
+    *motion, dt = parts.take_odometry()
     pose, time = compose(pose, np.array(motion)), time + dt
-    total = whole.take()
+    total = whole.take_odometry()
     assert pose[:2] == pytest.approx(total[:2], abs=1e-9)
     assert math.cos(pose[2] - total.dtheta) == pytest.approx(1)
     assert time == pytest.approx(total.dt)
 
 
 def test_an_arc_is_an_arc() -> None:
-    odometer = Odometer(0.0)
+    odometer = CreateOdometry(0.0)
     odometer.add(1571, 90, 1.0)  # a quarter of a circle of 1 m
-    assert odometer.take() == pytest.approx((1.0, 1.0, math.pi / 2, 1.0), abs=2e-4)
-    assert odometer.take() == (0, 0, 0, 0)
+    assert odometer.take_odometry() == pytest.approx((1.0, 1.0, math.pi / 2, 1.0), abs=2e-4)
+    assert odometer.take_odometry() == (0, 0, 0, 0)

@@ -10,14 +10,14 @@ from hypothesis import strategies as st
 
 from robot.drivers.create import protocol
 from robot.drivers.create.config import CreateConfig
-from robot.drivers.create.stop_reasons import Refused, wheels
-from robot.emulators.create import Create, CreateEmulatorConfig
+from robot.drivers.create.stop_reasons import CommandRefused, wheel_speeds
+from robot.emulators.create import CreateEmulatorConfig, EmulatedCreate
 
 SPEED = st.integers(-protocol.TOP_SPEED, protocol.TOP_SPEED)
 
 
-def awake() -> Create:
-    robot = Create(CreateEmulatorConfig())
+def awake() -> EmulatedCreate:
+    robot = EmulatedCreate(CreateEmulatorConfig())
     assert robot.receive(protocol.START + protocol.SAFE) == []
     return robot
 
@@ -54,7 +54,7 @@ def test_what_a_create_says_is_believed(right: int, left: int, elapsed: float, b
     robot.touch(protocol.Bumps(bumps))
     robot.advance(elapsed)
     (reply,) = robot.receive(protocol.QUERY)
-    found = protocol.sensed(reply, elapsed)
+    found = protocol.parse_reply(reply, elapsed)
     assert found is not None
     assert found.bumps == bumps
     assert found.mode == (protocol.Mode.PASSIVE if bumps > 3 else protocol.Mode.SAFE)
@@ -70,7 +70,7 @@ def test_what_a_create_says_is_believed(right: int, left: int, elapsed: float, b
 @example(protocol.REPLY.pack(0, 0, 0, 0), 0.0)
 @example(protocol.REPLY.pack(0, 0, 0, 4), 0.0)
 def test_what_is_believed_is_possible(data: bytes, elapsed: float) -> None:
-    found = protocol.sensed(data, elapsed)
+    found = protocol.parse_reply(data, elapsed)
     if found is not None:
         assert protocol.REPLY.pack(*found) == data
         assert found.mode in (1, 2, 3)
@@ -91,8 +91,8 @@ def test_no_wheel_is_over_the_cap(cap: float, forward: float, turn: float) -> No
     apart = turn * config.wheel_base / 2
     fits = max(abs(forward + apart), abs(forward - apart)) <= cap  # False of NaN
     try:
-        right, left = wheels(config, forward, turn)
-    except Refused:
+        right, left = wheel_speeds(config, forward, turn)
+    except CommandRefused:
         assert not fits
         return
     assert max(abs(right), abs(left)) <= 1000 * cap + 1e-6
@@ -102,6 +102,6 @@ def test_no_wheel_is_over_the_cap(cap: float, forward: float, turn: float) -> No
 
 @given(st.floats(-0.1, 0.1), st.floats(-0.7, 0.7))
 def test_forward_and_turn_are_the_wheels_mean_and_difference(forward: float, turn: float) -> None:
-    right, left = wheels(CreateConfig(), forward, turn)
+    right, left = wheel_speeds(CreateConfig(), forward, turn)
     assert (right + left) / 2000 == pytest.approx(forward, abs=1e-3)
     assert (right - left) / 1000 / 0.258 == pytest.approx(turn, abs=4e-3)

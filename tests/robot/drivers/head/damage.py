@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from hypothesis import strategies as st
 
-from robot.drivers.head.protocol import encode
+from robot.drivers.head.protocol import pack_frames
 
 GARBAGE = (b"", b"\0", b"W", b"WH", b"WHK", b"WHK1", b"WHK1WHK1", b"WHKC", b"1", b"WWHK1", b"\xff" * 9)
 
@@ -27,7 +27,7 @@ class Head:
         self.sequence += ahead
         self.time += later
         values = self.random.integers(-32768, 32768, (1, *self.shape)).astype(np.int16)
-        self.sent.append(encode([self.sequence], [self.time], [flags], values))
+        self.sent.append(pack_frames([self.sequence], [self.time], [flags], values))
         return self.sent[-1]
 
     def foreign(self, field: int, value: int) -> bytes:

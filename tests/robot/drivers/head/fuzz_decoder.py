@@ -11,9 +11,9 @@ import sys
 import atheris
 
 with atheris.instrument_imports(include=["robot.drivers.head"]):
-    from robot.drivers.head.decoder import Counts, Decoder
+    from robot.drivers.head.decoder import Decoder, DecoderCounts
 
-from robot.drivers.head.protocol import encode
+from robot.drivers.head.protocol import pack_frames
 from tests.robot.drivers.head.oracle import told
 
 SHAPE = (2, 1)
@@ -28,7 +28,7 @@ def one(data: bytes) -> None:
     for place in range(0, len(stream), step):
         numbers += decoder.feed(stream[place : place + step]).sequence.tolist()
     story = told(stream, *SHAPE)
-    assert decoder.counts == Counts(*story.counts)
+    assert decoder.counts == DecoderCounts(*story.counts)
     assert numbers == [sample.sequence for sample in story.samples]
     assert decoder.pending == story.pending
 
@@ -38,7 +38,7 @@ def repaired(data: bytes) -> bytes:
     parts, place = [], 0
     while (found := data.find(b"F", place)) >= 0 and found + 10 <= len(data):
         number, time = (int.from_bytes(data[found + k : found + k + 4], "little") for k in (1, 5))
-        parts += [data[place:found], encode([number], [time], [data[found + 9]], [[[1], [2]]])]
+        parts += [data[place:found], pack_frames([number], [time], [data[found + 9]], [[[1], [2]]])]
         place = found + 10
     return b"".join([*parts, data[place:]])
 

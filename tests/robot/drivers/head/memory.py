@@ -10,8 +10,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from robot.drivers.head.device import Gone, Stalled
-from robot.drivers.head.protocol import CHANNELS, Command, Request, encode, unpack
+from robot.drivers.head.device import Disconnected, Stalled
+from robot.drivers.head.protocol import CHANNELS, Command, Request, pack_frames, unpack_command
 
 WHISKERS = 2
 
@@ -52,7 +52,7 @@ class MemoryHead:
         number = first + np.arange(count)
         if values is None:
             values = np.zeros((count, WHISKERS, CHANNELS), np.int16)
-        self.put(encode(number, 500 * number, np.full(count, flags), values))
+        self.put(pack_frames(number, 500 * number, np.full(count, flags), values))
 
     def unplug(self) -> None:
         with self._there:
@@ -62,7 +62,7 @@ class MemoryHead:
 
     def check(self) -> None:
         if not self.plugged:
-            raise Gone(errno.ENODEV, "pulled out")
+            raise Disconnected(errno.ENODEV, "pulled out")
         if self.stalls:
             self.stalls -= 1
             raise Stalled(errno.EPIPE, "refused")
@@ -87,7 +87,7 @@ class Wire:
 
     def write(self, data: bytes) -> None:
         self.head.check()
-        command = unpack(data)
+        command = unpack_command(data)
         assert command is not None
         self.head.commands.append(command)
 

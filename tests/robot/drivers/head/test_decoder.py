@@ -14,8 +14,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robot.drivers.head.decoder import Counts, Decoder, Frames
-from robot.drivers.head.protocol import Flag, encode
+from robot.drivers.head.decoder import Decoder, DecoderCounts, Frames
+from robot.drivers.head.protocol import FrameFlag, pack_frames
 from tests.robot.drivers.head.damage import damaged, soaked, streams
 from tests.robot.drivers.head.oracle import Sample, told
 
@@ -31,7 +31,7 @@ def stream(count: int, first: int = 0, shape: tuple[int, int] = (18, 3)) -> tupl
     """Frames in order, 500 us apart, and their values."""
     values = np.random.default_rng(first).integers(-32768, 32768, (count, *shape)).astype(np.int16)
     number = first + np.arange(count)
-    return encode(number, 500 * number, np.zeros(count), values), values
+    return pack_frames(number, 500 * number, np.zeros(count), values), values
 
 
 @settings(max_examples=600)
@@ -43,7 +43,7 @@ def test_every_prefix_is_what_the_oracle_makes_of_it(drawn):
         got += samples(decoder.feed(data[start:end]))
         story = told(data[:end], *shape)
         assert got == story.samples
-        assert decoder.counts == Counts(*story.counts)
+        assert decoder.counts == DecoderCounts(*story.counts)
         assert decoder.pending == story.pending
         size = 20 + 2 * shape[0] * shape[1]
         whole = decoder.counts.good + decoder.counts.duplicates
@@ -68,7 +68,7 @@ def test_a_clean_stream_comes_out_as_it_went_in():
     np.testing.assert_array_equal(frames.values, values)
     assert (frames.sequence.dtype, frames.time.dtype) == (np.int64, np.int64)
     assert (frames.flags.dtype, frames.values.dtype) == (np.uint8, np.int16)
-    assert decoder.counts == Counts(good=3000)
+    assert decoder.counts == DecoderCounts(good=3000)
 
 
 def test_a_damaged_frame_takes_nothing_with_it():
@@ -101,15 +101,15 @@ def test_a_frame_that_comes_late_is_no_longer_missing():
         missing.append(decoder.counts.missing)
     assert missing == [0, 0, 2, 1, 1, 1, 0, 0]
     assert got == [0, 1, 4, 3, 5, 2]
-    assert decoder.counts == Counts(good=6, duplicates=2)
+    assert decoder.counts == DecoderCounts(good=6, duplicates=2)
 
 
 def test_overruns_are_counted_once_each():
     values = np.zeros((5, 2, 1), np.int16)
-    flags = [Flag.OVERRUN, 0, Flag.OVERRUN | Flag.CYCLE, Flag.FAULT, Flag.RCP]
+    flags = [FrameFlag.OVERRUN, 0, FrameFlag.OVERRUN | FrameFlag.CYCLE, FrameFlag.FAULT, FrameFlag.RCP]
     decoder = Decoder(2, 1)
-    decoder.feed(encode([0, 1, 7, 8, 9], np.arange(5), flags, values))
-    assert decoder.counts == Counts(good=5, overruns=2, missing=5)
+    decoder.feed(pack_frames([0, 1, 7, 8, 9], np.arange(5), flags, values))
+    assert decoder.counts == DecoderCounts(good=5, overruns=2, missing=5)
 
 
 def test_a_new_stream_never_takes_a_number_again():
@@ -121,7 +121,7 @@ def test_a_new_stream_never_takes_a_number_again():
     assert len(set(got)) == len(got) == 147
     assert got == sorted(got)
     assert [n % 2**32 for n in got] == 3 * list(range(49))
-    assert decoder.counts == Counts(good=147, skipped_bytes=3 * 98, restarts=2)
+    assert decoder.counts == DecoderCounts(good=147, skipped_bytes=3 * 98, restarts=2)
 
 
 def test_a_restart_takes_its_time_from_the_clock():
@@ -136,7 +136,7 @@ def test_a_restart_takes_its_time_from_the_clock():
 
 def test_hostile_bytes_cost_no_more_than_their_number(monkeypatch):
     """Every byte is judged once, not once for every frame behind it."""
-    header = encode([1], [1], [0], np.zeros((1, 18, 3), np.int16))[:16]
+    header = pack_frames([1], [1], [0], np.zeros((1, 18, 3), np.int16))[:16]
     calls, real = [], zlib.crc32
     monkeypatch.setattr(zlib, "crc32", lambda *args: calls.append(1) or real(*args))
     Decoder(18).feed(20_000 * header)
@@ -171,7 +171,7 @@ def test_ten_million_bytes(record_property):
         got += samples(frames)
         place += step
     story = told(data, 18, 3)
-    assert decoder.counts == Counts(*story.counts)
+    assert decoder.counts == DecoderCounts(*story.counts)
     assert got == story.samples
     record_property("times_real", 10_000_000 / 256_000 / took)
     print(f"\n{decoder.counts}; {10_000_000 / 256_000 / took:.0f} x real time at 256 kB/s")
@@ -186,5 +186,5 @@ def test_a_long_stream_in_random_pieces():
         got += samples(decoder.feed(data[place : place + step]))
         place += step
     story = told(data, 18, 3)
-    assert decoder.counts == Counts(*story.counts)
+    assert decoder.counts == DecoderCounts(*story.counts)
     assert got == story.samples

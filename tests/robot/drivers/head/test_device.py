@@ -11,7 +11,14 @@ import pytest
 
 from robot.drivers.head.address import Address
 from robot.drivers.head.config import HeadLinkConfig
-from robot.drivers.head.device import Gone, Identity, Stalled, UsbBridge, identity, open_bridge
+from robot.drivers.head.device import (
+    Disconnected,
+    HeadIdentity,
+    Stalled,
+    UsbBridge,
+    open_bridge,
+    read_identity,
+)
 from robot.drivers.head.protocol import ENDPOINT_IN, ENDPOINT_OUT, REQUEST_IN, REQUEST_OUT, Request
 from tactile.base.errors import InputError
 from tests.robot.drivers.head.memory import MemoryHead
@@ -101,8 +108,8 @@ def test_waiting_in_vain_is_no_error_unless_it_was_for_an_answer(device, bridge)
 @pytest.mark.parametrize(
     ("number", "kind"),
     [
-        (errno.ENODEV, Gone),
-        (errno.EIO, Gone),
+        (errno.ENODEV, Disconnected),
+        (errno.EIO, Disconnected),
         (errno.EPIPE, Stalled),
         (errno.EOVERFLOW, Stalled),
         (errno.EACCES, InputError),
@@ -147,13 +154,13 @@ def test_what_is_no_address(text):
 
 
 def test_no_head_at_an_address():
-    with pytest.raises(Gone, match=r"127\.0\.0\.1:9"):
+    with pytest.raises(Disconnected, match=r"127\.0\.0\.1:9"):
         open_bridge("127.0.0.1:9")
 
 
 def test_usb_without_a_head():
     """With a real libusb: no head, or no right to look; never a traceback of its own."""
-    with pytest.raises((Gone, InputError)):
+    with pytest.raises((Disconnected, InputError)):
         open_bridge("usb:1209:0001:there-is-none")
 
 
@@ -187,8 +194,8 @@ print([name for name in ("usb", "libusb_package", "jax", "robot.emulators") if n
 
 def test_identities():
     bridge = MemoryHead(18).connect()
-    assert identity(bridge) == Identity("memory", "1", 18, 3, 2000.0)
+    assert read_identity(bridge) == HeadIdentity("memory", "1", 18, 3, 2000.0)
     for wrong in (b"", b"[]", b"{}", b'{"name": 1', b'{"name":"","version":"","whiskers":null}'):
         bridge.request = lambda request, wrong=wrong: wrong
         with pytest.raises(InputError, match="it calls itself"):
-            identity(bridge)
+            read_identity(bridge)

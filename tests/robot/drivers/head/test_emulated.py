@@ -13,8 +13,8 @@ import pytest
 
 from robot.drivers.head.config import HeadLinkConfig
 from robot.drivers.head.device import open_bridge
-from robot.drivers.head.protocol import ANGLE, Flag
-from robot.drivers.head.reader import Link, Reader
+from robot.drivers.head.protocol import ANGLE, FrameFlag
+from robot.drivers.head.reader import HeadReader, LinkState
 from robot.drivers.head.whisk_control import HeadDriver
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 from tactile.whiskers.whisking import WhiskingConfig
@@ -63,7 +63,7 @@ def emulator(loopback):
 def reader(loopback, emulator):
     config = HeadLinkConfig(address=loopback, silence=0.2, patience=5.0)
     told = []
-    with Reader(lambda: open_bridge(loopback), 18, config, on_overload=told.append) as reader:
+    with HeadReader(lambda: open_bridge(loopback), 18, config, on_overload=told.append) as reader:
         reader.overloaded = told  # type: ignore[attr-defined]
         until(lambda: reader.decoder.counts.good > 100)
         yield reader
@@ -102,21 +102,21 @@ def test_unplugged_and_plugged_in_again(reader, emulator):
     driver = HeadDriver(reader, HEAD)
     driver.whisk(WhiskingConfig(mode="open", rate=5.0))
     emulator("unplug")
-    until(lambda: reader.state.link == Link.AWAY, 2.0)
+    until(lambda: reader.state.link == LinkState.AWAY, 2.0)
     emulator("plug")
-    until(lambda: reader.state.link == Link.STREAMING, 2.0)
+    until(lambda: reader.state.link == LinkState.STREAMING, 2.0)
     assert reader.decoder.counts.restarts == 1
-    until(lambda: any(reader.ring.between(reader.ring.newest[0] - 50, 2**62).flags & Flag.CYCLE))
+    until(lambda: any(reader.ring.between(reader.ring.newest[0] - 50, 2**62).flags & FrameFlag.CYCLE))
     assert reader.fault is None
 
 
 def test_a_stall_and_a_silence_pass(reader, emulator):
     emulator("stall", seconds=0.3)
     until(lambda: reader.stalls > 0)
-    until(lambda: reader.state.link == Link.STREAMING)
+    until(lambda: reader.state.link == LinkState.STREAMING)
     emulator("silence", seconds=0.6)
-    until(lambda: reader.state.link == Link.SILENT)
-    until(lambda: reader.state.link == Link.STREAMING)
+    until(lambda: reader.state.link == LinkState.SILENT)
+    until(lambda: reader.state.link == LinkState.STREAMING)
     assert reader.fault is None
 
 
@@ -129,13 +129,13 @@ def test_a_whisker_pressed_to_its_end(reader, emulator):
 
 def whisk(host: str, mode: str, rcp: str) -> tuple[np.ndarray, np.ndarray, float]:
     """Largest angle and deflection [W], rad, of a whole whisk, and in how much of it the head fed back."""
-    with Reader(lambda: open_bridge(host), 18, HeadLinkConfig(address=host, rcp=rcp)) as reader:
+    with HeadReader(lambda: open_bridge(host), 18, HeadLinkConfig(address=host, rcp=rcp)) as reader:
         driver = HeadDriver(reader, HEAD)
         driver.whisk(WhiskingConfig(mode=mode, rate=4.0), np.full(18, 0.04), np.zeros(18))
 
         def starts() -> np.ndarray:
             frames = reader.ring.between(0, 2**62)
-            return frames.sequence[(frames.flags & Flag.CYCLE) > 0]
+            return frames.sequence[(frames.flags & FrameFlag.CYCLE) > 0]
 
         until(lambda: len(starts()) >= 3)
         assert set(np.diff(starts())) == {500}
@@ -145,9 +145,9 @@ def whisk(host: str, mode: str, rcp: str) -> tuple[np.ndarray, np.ndarray, float
         newest = reader.ring.newest[0]
         rest = reader.ring.between(newest - 100, newest).values[..., 0] * ANGLE
         assert np.abs(rest.mean(axis=0)).max() < 0.02
-        assert reader.state.link == Link.STREAMING
+        assert reader.state.link == LinkState.STREAMING
     size = np.abs(frames.values * ANGLE).max(axis=0)
-    return size[:, 0], size[:, 2], float(np.mean((frames.flags & Flag.RCP) > 0))
+    return size[:, 0], size[:, 2], float(np.mean((frames.flags & FrameFlag.RCP) > 0))
 
 
 def test_whiskers_that_touch_are_held_back_by_whom_the_settings_say(loopback, emulator):

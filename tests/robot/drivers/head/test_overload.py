@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.drivers.head.overload import Overload
+from robot.drivers.head.overload import OverloadDetector
 from robot.drivers.head.protocol import ANGLE
 
 LIMIT = 1000
 
 
-def watcher(alive: list[bool] | None = None) -> Overload:
-    return Overload(LIMIT * ANGLE, np.array([True] * 2 if alive is None else alive))
+def watcher(alive: list[bool] | None = None) -> OverloadDetector:
+    return OverloadDetector(LIMIT * ANGLE, np.array([True] * 2 if alive is None else alive))
 
 
 @given(
@@ -25,7 +25,7 @@ def test_in_any_blocks(rows, data):
     values[:, :, 2] = np.array(rows, np.int16).reshape(-1, 2)
     cuts = sorted(data.draw(st.lists(st.integers(0, len(rows)), max_size=4)))
     overload = watcher()
-    told = [overload.seen(block) for block in np.split(values, cuts)]
+    told = [overload.check(block) for block in np.split(values, cuts)]
     over = np.abs(values[..., 2]) >= LIMIT
     twice = over[1:] & over[:-1]
     assert {one for one in told if one is not None} <= set(np.flatnonzero(twice.any(axis=0)).tolist())
@@ -46,11 +46,11 @@ def test_in_any_blocks(rows, data):
 def test_what_counts(channel, value, found):
     values = np.zeros((2, 2, 3), np.int16)
     values[:, 1, channel] = value
-    assert watcher().seen(values) == (1 if found else None)
-    assert watcher([True, False]).seen(values) is None
+    assert watcher().check(values) == (1 if found else None)
+    assert watcher([True, False]).check(values) is None
 
 
 def test_two_whiskers_in_turn_are_no_overload():
     values = np.zeros((2, 2, 3), np.int16)
     values[0, 0, 1] = values[1, 1, 1] = 5000
-    assert watcher().seen(values) is None
+    assert watcher().check(values) is None

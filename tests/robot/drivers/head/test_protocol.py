@@ -14,15 +14,15 @@ from robot.drivers.head.protocol import (
     ANGLE,
     KEEP_ALIVE,
     Command,
-    Kind,
-    Mode,
-    counts,
-    encode,
+    CommandKind,
+    FeedbackMode,
     frame_dtype,
-    pack,
-    radians,
-    tally,
-    unpack,
+    frame_values,
+    pack_command,
+    pack_frames,
+    to_counts,
+    to_radians,
+    unpack_command,
 )
 
 NUMBERS = st.lists(st.integers(-32768, 32767), max_size=255)
@@ -31,18 +31,18 @@ FLOAT = st.floats(width=32, allow_nan=False, allow_infinity=False)
 
 def test_a_frame_is_what_the_document_says():
     values = np.arange(54, dtype=np.int16).reshape(1, 18, 3) - 20
-    frame = encode([2**32 + 7], [2**33 + 9], [5], values)
+    frame = pack_frames([2**32 + 7], [2**33 + 9], [5], values)
     body = struct.pack("<4sIIBBBB54h", b"WHK1", 7, 9, 5, 18, 3, 1, *values.ravel())
     assert frame == body + struct.pack("<I", zlib.crc32(body))
     assert len(frame) == frame_dtype(18).itemsize == 128
 
 
-@given(st.sampled_from(Kind), st.sampled_from(Mode), st.tuples(*[FLOAT] * 5), NUMBERS)
+@given(st.sampled_from(CommandKind), st.sampled_from(FeedbackMode), st.tuples(*[FLOAT] * 5), NUMBERS)
 def test_commands_come_back(kind, mode, drive, numbers):
     sent = Command(kind, mode, *drive, np.array(numbers, np.int16))
-    packet = pack(sent)
+    packet = pack_command(sent)
     assert len(packet) == 32 + 2 * len(numbers)
-    got = unpack(packet)
+    got = unpack_command(packet)
     assert got is not None
     assert got[:-1] == sent[:-1]
     assert got.numbers.tolist() == numbers
@@ -50,28 +50,30 @@ def test_commands_come_back(kind, mode, drive, numbers):
 
 @given(st.data())
 def test_damaged_commands_are_refused(data):
-    packet = bytearray(pack(Command(Kind.DRIVE, Mode.RCP, 1, 1, 4, 0.01, 0, np.arange(18))))
+    packet = bytearray(
+        pack_command(Command(CommandKind.DRIVE, FeedbackMode.RCP, 1, 1, 4, 0.01, 0, np.arange(18)))
+    )
     where = data.draw(st.integers(0, len(packet) - 1))
     packet[where] ^= data.draw(st.integers(1, 255))
-    assert unpack(bytes(packet)) is None
-    assert unpack(bytes(packet[:where])) is None
+    assert unpack_command(bytes(packet)) is None
+    assert unpack_command(bytes(packet[:where])) is None
 
 
 @pytest.mark.parametrize(
     ("place", "value"), [(0, b"WHK1"), (4, b"\2"), (5, b"\t"), (6, b"\2"), (7, b"\1"), (8, b"\0\0\xc0\x7f")]
 )
 def test_unknown_commands_are_refused(place, value):
-    body = bytearray(pack(KEEP_ALIVE)[:-4])
-    assert unpack(bytes(body) + struct.pack("<I", zlib.crc32(body))) is not None
+    body = bytearray(pack_command(KEEP_ALIVE)[:-4])
+    assert unpack_command(bytes(body) + struct.pack("<I", zlib.crc32(body))) is not None
     body[place : place + len(value)] = value
-    assert unpack(bytes(body) + struct.pack("<I", zlib.crc32(body))) is None
+    assert unpack_command(bytes(body) + struct.pack("<I", zlib.crc32(body))) is None
 
 
 @given(st.lists(st.integers(-32768, 32767), min_size=3, max_size=3))
 def test_counts_come_back_to_the_bit(values):
     values = np.array([[values]], np.int16)
-    np.testing.assert_array_equal(counts(*radians(values)), values)
+    np.testing.assert_array_equal(frame_values(*to_radians(values)), values)
 
 
 def test_counts_end_where_int16_does():
-    assert tally([-4.0, -np.pi, 0.0, ANGLE, np.pi, 4.0]).tolist() == [-32768, -32768, 0, 1, 32767, 32767]
+    assert to_counts([-4.0, -np.pi, 0.0, ANGLE, np.pi, 4.0]).tolist() == [-32768, -32768, 0, 1, 32767, 32767]

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from robot.drivers.head.config import HeadLinkConfig
-from robot.drivers.head.protocol import Command, Kind, Mode, Request
-from robot.drivers.head.reader import Link, Reader
-from robot.drivers.outcome import Outcome
+from robot.drivers.head.protocol import Command, CommandKind, FeedbackMode, Request
+from robot.drivers.head.reader import HeadReader, LinkState
+from robot.drivers.outcome import SessionOutcome
 from tactile.base.errors import InputError
 from tests.robot.drivers.head.memory import WHISKERS, MemoryHead, until
 
 QUICK = HeadLinkConfig(silence=0.1, patience=0.4)
-DRIVE = Command(Kind.DRIVE, Mode.RCP, 1.0, 1.0)
-CENTRE = Command(Kind.CENTRE, numbers=np.array([3, 4], np.int16))
+DRIVE = Command(CommandKind.DRIVE, FeedbackMode.RCP, 1.0, 1.0)
+CENTRE = Command(CommandKind.CENTRE, numbers=np.array([3, 4], np.int16))
 
 
 @pytest.fixture
@@ -27,15 +27,15 @@ def head():
 
 @pytest.fixture
 def reader(head):
-    with Reader(head.connect, WHISKERS, QUICK) as reader:
+    with HeadReader(head.connect, WHISKERS, QUICK) as reader:
         yield reader
 
 
-def good(reader: Reader) -> int:
+def good(reader: HeadReader) -> int:
     return reader.decoder.counts.good
 
 
-def kinds(head: MemoryHead) -> list[Kind]:
+def kinds(head: MemoryHead) -> list[CommandKind]:
     return [command.kind for command in head.commands]
 
 
@@ -49,26 +49,26 @@ def test_samples_reach_the_ring_and_every_listener(head, reader):
     assert reader.ring.between(0, 99).sequence.tolist() == list(range(50))
     until(lambda: sum(len(frames.sequence) for frames, _ in told) == 50)
     assert all(began <= arrival <= time.monotonic() for _, arrival in told)
-    assert reader.state.link == Link.STREAMING
+    assert reader.state.link == LinkState.STREAMING
     assert reader.fault is None
 
 
 def test_times_are_the_clocks(head):
     head.clock = 7 * 2**32 + 100
-    with Reader(head.connect, WHISKERS, QUICK) as reader:
+    with HeadReader(head.connect, WHISKERS, QUICK) as reader:
         head.send(0)
         until(lambda: good(reader) == 10)
         assert reader.ring.between(0, 9).time[0] == 7 * 2**32
 
 
 def test_it_is_started_and_stopped(head):
-    reader = Reader(head.connect, WHISKERS, QUICK)
-    assert reader.state.link == Link.CLOSED
+    reader = HeadReader(head.connect, WHISKERS, QUICK)
+    assert reader.state.link == LinkState.CLOSED
     with reader:
         assert head.requests == [Request.IDENTITY, Request.CLOCK, Request.START]
     assert head.requests[-1] == Request.STOP
     assert (head.opened, head.closed) == (1, 1)
-    assert reader.state.link == Link.CLOSED
+    assert reader.state.link == LinkState.CLOSED
     assert reader.fault is None
 
 
@@ -76,20 +76,20 @@ def test_no_head_is_an_input_error(head):
     head.unplug()
     began = time.monotonic()
     with pytest.raises(InputError, match="pulled out"):
-        Reader(head.connect, WHISKERS, QUICK).start()
+        HeadReader(head.connect, WHISKERS, QUICK).start()
     assert time.monotonic() - began < 1.0
 
 
 def test_another_head_is_refused(head):
     with pytest.raises(InputError, match="memory has 2 whiskers"):
-        Reader(head.connect, 18, QUICK).start()
+        HeadReader(head.connect, 18, QUICK).start()
     assert head.closed == head.opened == 1
 
 
 def test_what_is_no_head_is_refused(head):
     head.identity = {"name": "a printer"}
     with pytest.raises(InputError, match="printer"):
-        Reader(head.connect, WHISKERS, QUICK).start()
+        HeadReader(head.connect, WHISKERS, QUICK).start()
 
 
 def test_a_head_is_kept_awake_only_while_it_is_to_whisk(head, reader):
@@ -97,7 +97,7 @@ def test_a_head_is_kept_awake_only_while_it_is_to_whisk(head, reader):
     assert head.commands == []
     reader.send(DRIVE)
     until(lambda: len(head.commands) >= 4)
-    assert kinds(head)[:4] == [Kind.DRIVE, Kind.KEEP, Kind.KEEP, Kind.KEEP]
+    assert kinds(head)[:4] == [CommandKind.DRIVE, CommandKind.KEEP, CommandKind.KEEP, CommandKind.KEEP]
     reader.rest()
     time.sleep(0.05)
     count = len(head.commands)
@@ -120,7 +120,7 @@ def test_keep_alives_come_in_time(head, reader):
 def test_only_the_newest_amplitudes_are_sent(head, reader):
     head.stalls = 1
     for k in range(20):
-        reader.send(Command(Kind.AMPLITUDES, numbers=np.array([k, k], np.int16)))
+        reader.send(Command(CommandKind.AMPLITUDES, numbers=np.array([k, k], np.int16)))
     until(lambda: head.commands)
     until(lambda: head.commands[-1].numbers.tolist() == [19, 19])
     assert len(head.commands) < 20
@@ -131,25 +131,25 @@ def test_a_head_that_comes_back_is_told_again_and_its_numbers_are_new(head, read
     reader.on_restart.append(lambda clock, at: restarts.append(clock))
     reader.send(CENTRE)
     reader.send(DRIVE)
-    reader.send(Command(Kind.AMPLITUDES, numbers=np.array([1, 1], np.int16)))
+    reader.send(Command(CommandKind.AMPLITUDES, numbers=np.array([1, 1], np.int16)))
     head.send(0)
     until(lambda: good(reader) == 10 and len(head.commands) >= 3)
     head.unplug()
-    until(lambda: reader.state.link == Link.AWAY)
+    until(lambda: reader.state.link == LinkState.AWAY)
     assert reader.fault is None
     head.commands.clear()
     head.clock, head.plugged = 12345, True
-    until(lambda: reader.state.link != Link.AWAY)
+    until(lambda: reader.state.link != LinkState.AWAY)
     head.send(0)
     until(lambda: good(reader) == 20)
     until(lambda: len(head.commands) >= 2)
-    assert kinds(head)[:2] == [Kind.CENTRE, Kind.DRIVE]
-    assert Kind.AMPLITUDES not in kinds(head)
+    assert kinds(head)[:2] == [CommandKind.CENTRE, CommandKind.DRIVE]
+    assert CommandKind.AMPLITUDES not in kinds(head)
     assert restarts == [12345]
     assert reader.ring.newest is not None
     assert reader.ring.newest[0] == 2**32 + 9
     assert reader.decoder.counts.restarts == 1
-    assert reader.state.link == Link.STREAMING
+    assert reader.state.link == LinkState.STREAMING
     assert reader.fault is None
 
 
@@ -159,21 +159,21 @@ def test_a_head_that_stays_away_is_a_fault(head, reader):
     head.unplug()
     until(lambda: reader.fault is not None)
     assert reader.fault is not None
-    assert reader.fault.outcome == Outcome.HEAD_GONE
+    assert reader.fault.outcome == SessionOutcome.HEAD_GONE
     assert "pulled out" in reader.fault.detail
     head.plugged = True
-    until(lambda: reader.state.link != Link.AWAY)
-    assert reader.fault.outcome == Outcome.HEAD_GONE  # once one, always one
+    until(lambda: reader.state.link != LinkState.AWAY)
+    assert reader.fault.outcome == SessionOutcome.HEAD_GONE  # once one, always one
 
 
 def test_silence_is_named_and_a_silent_head_is_started_again(head, reader):
     head.send(0)
-    until(lambda: reader.state.link == Link.STREAMING)
-    until(lambda: reader.state.link == Link.SILENT)
+    until(lambda: reader.state.link == LinkState.STREAMING)
+    until(lambda: reader.state.link == LinkState.SILENT)
     assert reader.fault is None
     until(lambda: reader.fault is not None)
     assert reader.fault is not None
-    assert reader.fault.outcome == Outcome.HEAD_SILENT
+    assert reader.fault.outcome == SessionOutcome.HEAD_SILENT
     assert head.requests.count(Request.START) >= 2
 
 
@@ -185,7 +185,7 @@ def test_garbage_is_named(head, reader):
         head.put(b"WHK1" + bytes(60))
         time.sleep(0.01)
     assert reader.fault is not None
-    assert reader.fault.outcome == Outcome.HEAD_GARBLED
+    assert reader.fault.outcome == SessionOutcome.HEAD_GARBLED
 
 
 def test_a_stall_loses_nothing(head, reader):
@@ -196,17 +196,17 @@ def test_a_stall_loses_nothing(head, reader):
     reader.send(CENTRE)
     head.send(0)
     until(lambda: good(reader) == 10)
-    until(lambda: Kind.CENTRE in kinds(head))
+    until(lambda: CommandKind.CENTRE in kinds(head))
     assert reader.stalls == 5
     assert reader.fault is None
 
 
 def test_a_thread_that_hangs_is_seen(head):
     held = threading.Event()
-    with Reader(head.connect, WHISKERS, QUICK) as reader:
+    with HeadReader(head.connect, WHISKERS, QUICK) as reader:
         reader.listeners.append(lambda frames, arrival: held.wait(5))
         head.send(0)
-        until(lambda: reader.state.link == Link.SILENT)
+        until(lambda: reader.state.link == LinkState.SILENT)
         until(lambda: reader.fault is not None)
         held.set()
 
@@ -222,12 +222,12 @@ def test_a_thread_that_dies_is_a_fault(head, reader, monkeypatch):
     until(lambda: reader.fault is not None)
     assert reader.fault is not None
     assert "a listener's bug" in reader.fault.detail
-    until(lambda: reader.state.link == Link.CLOSED)
+    until(lambda: reader.state.link == LinkState.CLOSED)
 
 
 def test_overload_is_told_with_the_whisker(head):
     told = []
-    with Reader(head.connect, WHISKERS, QUICK, on_overload=told.append) as reader:
+    with HeadReader(head.connect, WHISKERS, QUICK, on_overload=told.append) as reader:
         values = np.zeros((10, WHISKERS, 3), np.int16)
         values[4:6, 1, 2] = -20000
         head.send(0, values=values)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robot.drivers.head.decoder import Frames
-from robot.drivers.head.ring_buffer import Ring
+from robot.drivers.head.ring_buffer import RingBuffer
 
 SIZE = 16
 
@@ -26,7 +26,7 @@ BLOCKS = st.lists(
 
 @given(BLOCKS, st.integers(0, 60), st.integers(0, 40))
 def test_what_is_kept(blocks, first, length):
-    ring, kept, highest = Ring(1, size=SIZE), {}, 2**32
+    ring, kept, highest = RingBuffer(1, size=SIZE), {}, 2**32
     for k, block in enumerate(blocks):
         numbers = [highest + step for step in block]
         highest = max([highest, *numbers]) if kept or numbers else highest
@@ -47,13 +47,13 @@ def test_what_is_kept(blocks, first, length):
 
 
 def test_an_empty_ring_has_nothing():
-    ring = Ring(1)
+    ring = RingBuffer(1)
     assert ring.newest is None
     assert not len(ring.between(0, 10).sequence)
 
 
 def test_what_is_handed_out_stays_as_it_was():
-    ring = Ring(1, size=SIZE)
+    ring = RingBuffer(1, size=SIZE)
     ring.append(frames(list(range(10))), 0.0)
     got = ring.between(0, 9)
     ring.append(frames(list(range(10, 30))), 0.0)
@@ -63,4 +63,4 @@ def test_what_is_handed_out_stays_as_it_was():
 
 def test_sizes():
     with pytest.raises(ValueError, match="power of two"):
-        Ring(1, size=100)
+        RingBuffer(1, size=100)

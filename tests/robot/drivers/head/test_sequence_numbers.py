@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robot.drivers.head import sequence_numbers
-from robot.drivers.head.sequence_numbers import Numbering
+from robot.drivers.head.sequence_numbers import SequenceUnwrapper
 from tests.robot.drivers.head import oracle
 
 STEPS = st.one_of(st.integers(-9, 12), st.sampled_from([1, 1, 1, 2**31 - 1, 2**31, -(2**31)]))
@@ -30,7 +30,7 @@ def few():
 )
 def test_every_way_to_come(few, first, steps, cuts):
     raw = [(first + step) % 2**32 for step in itertools.accumulate(steps)]
-    mine, streams = Numbering(), []
+    mine, streams = SequenceUnwrapper(), []
     for block in np.split(np.array(raw, np.uint32), sorted(cut for cut in cuts if cut <= len(raw))):
         number, new = mine.take(block)
         full = [oracle.placed(value, streams) for value in block.tolist()]

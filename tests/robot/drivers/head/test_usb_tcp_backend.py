@@ -25,11 +25,11 @@ from robot.drivers.head.protocol import (
     REQUEST_IN,
     REQUEST_OUT,
     VENDOR,
-    Flag,
+    FrameFlag,
     Request,
-    pack,
+    pack_command,
 )
-from robot.drivers.head.usb_tcp_backend import SocketBackend, backend
+from robot.drivers.head.usb_tcp_backend import SocketBackend, tcp_backend
 from robot.emulators.head.config import HeadEmulatorConfig
 from tests.helpers.live import Faults, until
 from tests.robot.emulators.head.heads import drive, running
@@ -53,7 +53,7 @@ def head(process: Faults) -> Faults:
 
 
 def found(head: Faults) -> Any:
-    return core.find(backend=backend(head.host), idVendor=VENDOR, idProduct=PRODUCT)
+    return core.find(backend=tcp_backend(head.host), idVendor=VENDOR, idProduct=PRODUCT)
 
 
 @pytest.fixture
@@ -79,10 +79,10 @@ def read(device: Any, seconds: float, decoder: Decoder) -> Frames:
 
 
 def test_it_is_a_backend() -> None:
-    backend = importlib.import_module("usb.backend").IBackend
+    tcp_backend = importlib.import_module("usb.backend").IBackend
     asked = {
         name: method
-        for name, method in inspect.getmembers(backend, inspect.isfunction)
+        for name, method in inspect.getmembers(tcp_backend, inspect.isfunction)
         if not name.startswith("_") and name != "finalize"
     }
     assert len(asked) > 20
@@ -98,7 +98,7 @@ def test_it_is_found_as_what_it_is(head: Faults, device: Any) -> None:
     (interface,) = device.get_active_configuration()
     assert [end.bEndpointAddress for end in interface] == [ENDPOINT_IN, ENDPOINT_OUT]
     assert util.endpoint_type(interface[0].bmAttributes) == util.ENDPOINT_TYPE_BULK
-    assert core.find(backend=backend(head.host), idVendor=0x1234) is None
+    assert core.find(backend=tcp_backend(head.host), idVendor=0x1234) is None
     assert found(Faults(head.process, "127.0.0.1", 0)) is None or head.host == "127.0.0.1"
 
 
@@ -117,15 +117,15 @@ def test_no_frame_is_lost_on_the_way(head: Faults, device: Any) -> None:
     before = head(do="counts")
     decoder = Decoder(18, 3)
     start(device)
-    device.write(ENDPOINT_OUT, pack(drive()), 500)
+    device.write(ENDPOINT_OUT, pack_command(drive()), 500)
     parts = []
     for _ in range(3):
         parts.append(read(device, 0.4, decoder))
-        device.write(ENDPOINT_OUT, pack(KEEP_ALIVE), 500)
+        device.write(ENDPOINT_OUT, pack_command(KEEP_ALIVE), 500)
     frames = Frames(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
     assert (np.diff(frames.sequence) == 1).all()
     assert (np.diff(frames.time) == 500).all()
-    assert np.count_nonzero(frames.flags & Flag.CYCLE) == 2
+    assert np.count_nonzero(frames.flags & FrameFlag.CYCLE) == 2
     after = head(do="counts")
     sent = after["sent"] - before["sent"]
     assert sent == decoder.counts.good == len(frames.values)
@@ -186,7 +186,7 @@ def test_a_pulled_plug_is_told_and_another_one_is_another(head: Faults, device: 
     assert found(head) is None
     head(do="plug")
     with pytest.raises(core.USBError) as caught:
-        device.write(ENDPOINT_OUT, pack(KEEP_ALIVE), 500)
+        device.write(ENDPOINT_OUT, pack_command(KEEP_ALIVE), 500)
     assert caught.value.errno == errno.ENODEV
     again = until(lambda: found(head), 2.0)
     start(again)

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from robot.drivers.head.config import HeadLinkConfig
 from robot.drivers.head.decoder import Frames
-from robot.drivers.head.protocol import ANGLE, OFF, Flag, Kind, Mode, tally
-from robot.drivers.head.reader import Reader
-from robot.drivers.head.whisk_control import HeadDriver, HostRcp, commands
+from robot.drivers.head.protocol import ANGLE, NO_THRESHOLD, CommandKind, FeedbackMode, FrameFlag, to_counts
+from robot.drivers.head.reader import HeadReader
+from robot.drivers.head.whisk_control import HeadDriver, HostRcp, whisk_commands
 from tactile.base.errors import InputError
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 from tactile.whiskers.whisking import WhiskingConfig, command, still
@@ -26,8 +26,8 @@ def whisks(count: int, touched: np.ndarray | None = None, start: int = 0) -> Fra
     """Samples of 2 kHz from the beginning of a whisk on, of 1 s each; y [N, 18], rad."""
     number = start + np.arange(count)
     values = np.zeros((count, 18, 3), np.int16)
-    values[..., 2] = tally(CENTRE + (0.0 if touched is None else touched))
-    flags = np.where(number % 2000 == 0, Flag.CYCLE, 0).astype(np.uint8)
+    values[..., 2] = to_counts(CENTRE + (0.0 if touched is None else touched))
+    flags = np.where(number % 2000 == 0, FrameFlag.CYCLE, 0).astype(np.uint8)
     return Frames(number, 500 * number, flags, values)
 
 
@@ -38,17 +38,17 @@ def blocks(frames: Frames, cuts: list[int]) -> list[Frames]:
 @pytest.mark.parametrize(
     ("mode", "rcp", "threshold", "told"),
     [
-        ("open", "head", THRESHOLD, Mode.OPEN),
-        ("rcp", "head", THRESHOLD, Mode.RCP),
-        ("rcp", "head", None, Mode.OPEN),
-        ("rcp", "host", THRESHOLD, Mode.OPEN),
-        ("spread", "host", THRESHOLD, Mode.OPEN),
+        ("open", "head", THRESHOLD, FeedbackMode.OPEN),
+        ("rcp", "head", THRESHOLD, FeedbackMode.RCP),
+        ("rcp", "head", None, FeedbackMode.OPEN),
+        ("rcp", "host", THRESHOLD, FeedbackMode.OPEN),
+        ("spread", "host", THRESHOLD, FeedbackMode.OPEN),
     ],
 )
 def test_who_feeds_back(mode, rcp, threshold, told):
     whisking = WhiskingConfig(mode=mode, rate=2.0, amplitude_deg=50, gain=3)
-    centre, drive = commands(whisking, threshold, CENTRE, rcp)
-    assert (centre.kind, drive.kind, drive.mode) == (Kind.CENTRE, Kind.DRIVE, told)
+    centre, drive = whisk_commands(whisking, threshold, CENTRE, rcp)
+    assert (centre.kind, drive.kind, drive.mode) == (CommandKind.CENTRE, CommandKind.DRIVE, told)
     np.testing.assert_allclose(centre.numbers * ANGLE, CENTRE, atol=ANGLE)
     assert drive.amplitude == np.radians(50)
     assert (drive.frequency, drive.gain, drive.window) == (2.0, 3.0, 0.01)
@@ -57,13 +57,13 @@ def test_who_feeds_back(mode, rcp, threshold, told):
 
 def test_whiskers_that_do_not_count_never_touch():
     threshold = np.array([0.01, np.inf, 4.0])
-    drive = commands(WhiskingConfig(), threshold)[-1]
-    assert drive.numbers.tolist() == [int(tally(0.01)), OFF, OFF - 1]
+    drive = whisk_commands(WhiskingConfig(), threshold)[-1]
+    assert drive.numbers.tolist() == [int(to_counts(0.01)), NO_THRESHOLD, NO_THRESHOLD - 1]
 
 
 def test_a_head_knows_no_spread():
     with pytest.raises(InputError, match="spread"):
-        commands(WhiskingConfig(mode="spread"), THRESHOLD, CENTRE, "head")
+        whisk_commands(WhiskingConfig(mode="spread"), THRESHOLD, CENTRE, "head")
 
 
 @settings(max_examples=20)
@@ -89,7 +89,7 @@ def test_the_host_feeds_back_as_the_law_does(mode, cuts, whisker, bend):
         aim, drive = command(whisking, drive, k / 2000, y, THRESHOLD, HEAD.shape)
     share = (1 - np.cos(2 * np.pi * 899 / 2000)) / 2
     np.testing.assert_allclose(told[-1] * ANGLE, aim / share, atol=ANGLE)
-    assert told[-1][whisker] < tally(np.radians(65))
+    assert told[-1][whisker] < to_counts(np.radians(65))
 
 
 def test_a_free_whisk_is_told_once_and_each_cycle_anew():
@@ -97,7 +97,7 @@ def test_a_free_whisk_is_told_once_and_each_cycle_anew():
     touched = np.zeros((6000, 18))
     touched[500:900, 3] = 0.2
     told = [host.amplitudes(block) for block in blocks(whisks(6000, touched), list(range(40, 6000, 40)))]
-    full = tally(np.radians(65))
+    full = to_counts(np.radians(65))
     assert told[0] is not None
     assert (told[0] == full).all()
     assert sum(one is not None for one in told[1:12]) == 0
@@ -115,20 +115,20 @@ def test_nothing_is_known_before_a_whisk_begins():
 
 def test_the_driver_whisks_and_rests():
     memory = MemoryHead(18)
-    with Reader(memory.connect, 18, HeadLinkConfig(rcp="host")) as reader:
+    with HeadReader(memory.connect, 18, HeadLinkConfig(rcp="host")) as reader:
         driver = HeadDriver(reader, HEAD)
         driver.whisk(WhiskingConfig(mode="spread"), THRESHOLD, CENTRE)
         until(lambda: len(memory.commands) == 2)
         frames = whisks(40)
-        memory.send(0, 40, frames.values, Flag.CYCLE)
-        until(lambda: memory.commands[-1].kind == Kind.AMPLITUDES)
+        memory.send(0, 40, frames.values, FrameFlag.CYCLE)
+        until(lambda: memory.commands[-1].kind == CommandKind.AMPLITUDES)
         driver.rest()
         count = len(memory.commands)
-        memory.send(40, 40, frames.values, Flag.CYCLE)
+        memory.send(40, 40, frames.values, FrameFlag.CYCLE)
         until(lambda: reader.decoder.counts.good == 80)
         assert len(memory.commands) == count
 
 
 def test_the_drives_limit_is_kept():
     with pytest.raises(InputError, match="amplitude"):
-        HeadDriver(Reader(MemoryHead(18).connect, 18), HEAD).whisk(WhiskingConfig(amplitude_deg=90))
+        HeadDriver(HeadReader(MemoryHead(18).connect, 18), HEAD).whisk(WhiskingConfig(amplitude_deg=90))

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from robot.drivers.ur10.arm import Arm
-from robot.drivers.ur10.base_transform import tcp_of
+from robot.drivers.ur10.base_transform import tcp_from_pose
 from robot.drivers.ur10.config import ArmConfig
 from robot.drivers.ur10.dashboard import Dashboard
 from tests.helpers.live import Faults, until, ur_emulator
 
-HOME = tcp_of(ArmConfig().placing, np.array([0.63, 0.45, 0.0]))
-AWAY = tcp_of(ArmConfig().placing, np.array([0.93, 0.45, 0.0]))  # 6 s away
+HOME = tcp_from_pose(ArmConfig().placing, np.array([0.63, 0.45, 0.0]))
+AWAY = tcp_from_pose(ArmConfig().placing, np.array([0.93, 0.45, 0.0]))  # 6 s away
 
 
 def settings(host: str, **others: Any) -> ArmConfig:

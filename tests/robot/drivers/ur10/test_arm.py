@@ -9,11 +9,11 @@ import time
 import numpy as np
 import pytest
 
-from robot.drivers.outcome import Outcome
+from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10.arm import Arm
 from robot.drivers.ur10.config import BoxConfig
 from robot.drivers.ur10.dashboard import Dashboard
-from robot.drivers.ur10.safety import Refused
+from robot.drivers.ur10.safety import TargetRefused
 from tests.helpers.live import Faults, moves, until
 from tests.robot.drivers.ur10.conftest import AWAY, HOME, settings
 
@@ -25,15 +25,15 @@ def under_way(arm: Arm, controller: Faults) -> None:
     assert arm.fault is None
 
 
-def ended(arm: Arm, controller: Faults, within: float = 0.5) -> Outcome:
+def ended(arm: Arm, controller: Faults, within: float = 0.5) -> SessionOutcome:
     """The fault's outcome, with the arm at a standstill at the emulator in time, and no way to move on."""
     fault = until(lambda: arm.fault, 3.0, "a fault")
     until(lambda: not controller.state()["moving"], within, "a standstill")
     place = controller.state()["tcp"]
-    with pytest.raises(Refused, match="does not move"):
+    with pytest.raises(TargetRefused, match="does not move"):
         arm.move(HOME)
     time.sleep(0.1)
-    if fault.outcome is not Outcome.CONTACT:
+    if fault.outcome is not SessionOutcome.CONTACT:
         assert controller.state()["tcp"] == place
     return fault.outcome
 
@@ -84,12 +84,12 @@ def test_it_goes_where_it_is_sent_and_says_when_it_is_there(arm: Arm, controller
 @pytest.mark.parametrize(
     ("stop", "outcome"),
     [
-        ("protective", Outcome.PROTECTIVE_STOP),
-        ("safeguard", Outcome.SAFEGUARD_STOP),
-        ("emergency", Outcome.EMERGENCY_STOP),
+        ("protective", SessionOutcome.PROTECTIVE_STOP),
+        ("safeguard", SessionOutcome.SAFEGUARD_STOP),
+        ("emergency", SessionOutcome.EMERGENCY_STOP),
     ],
 )
-def test_safety_stops(arm: Arm, controller: Faults, stop: str, outcome: Outcome) -> None:
+def test_safety_stops(arm: Arm, controller: Faults, stop: str, outcome: SessionOutcome) -> None:
     under_way(arm, controller)
     controller(do=stop)
     assert ended(arm, controller) is outcome
@@ -108,7 +108,7 @@ def test_a_stall(arm: Arm, controller: Faults, seconds: float) -> None:
     under_way(arm, controller)
     controller(do="stall", seconds=seconds)
     began = time.monotonic()
-    assert ended(arm, controller) is Outcome.ARM_STALE
+    assert ended(arm, controller) is SessionOutcome.ARM_STALE
     assert arm.fault.time - began < arm.config.stale + 0.3
     assert len(arm.history) > 10
 
@@ -117,45 +117,45 @@ def test_a_stall(arm: Arm, controller: Faults, seconds: float) -> None:
 def test_frames_that_are_none(arm: Arm, controller: Faults, frame: str) -> None:
     under_way(arm, controller)
     controller(do=frame)
-    assert ended(arm, controller) in (Outcome.ARM_MALFORMED, Outcome.ARM_STALE)
+    assert ended(arm, controller) in (SessionOutcome.ARM_MALFORMED, SessionOutcome.ARM_STALE)
     assert np.isfinite(arm.history["tcp"]).all()
 
 
 def test_a_state_that_is_not_finite(arm: Arm, controller: Faults) -> None:
     under_way(arm, controller)
     controller(do="nan")
-    assert ended(arm, controller) is Outcome.ARM_MALFORMED
+    assert ended(arm, controller) is SessionOutcome.ARM_MALFORMED
 
 
 def test_a_frozen_clock(arm: Arm, controller: Faults) -> None:
     under_way(arm, controller)
     controller(do="freeze")
-    assert ended(arm, controller) is Outcome.ARM_STALE
+    assert ended(arm, controller) is SessionOutcome.ARM_STALE
 
 
 def test_the_controller_dies(arm: Arm, controller: Faults) -> None:
     under_way(arm, controller)
     controller.die()
     fault = until(lambda: arm.fault, 1.0, "a fault")
-    assert fault.outcome in (Outcome.ARM_GONE, Outcome.ARM_STALE)
+    assert fault.outcome in (SessionOutcome.ARM_GONE, SessionOutcome.ARM_STALE)
 
 
 def test_somebody_ends_the_program(arm: Arm, controller: Faults) -> None:
     under_way(arm, controller)
     with Dashboard(controller.host) as dashboard:
         dashboard.stop()
-    assert ended(arm, controller) is Outcome.ARM_GONE
+    assert ended(arm, controller) is SessionOutcome.ARM_GONE
 
 
 @pytest.mark.parametrize(
     ("number", "outcome"),
     [
-        (signal.SIGSEGV, Outcome.ARM_GONE),
-        (signal.SIGKILL, Outcome.ARM_GONE),
-        (signal.SIGSTOP, Outcome.ARM_STALE),
+        (signal.SIGSEGV, SessionOutcome.ARM_GONE),
+        (signal.SIGKILL, SessionOutcome.ARM_GONE),
+        (signal.SIGSTOP, SessionOutcome.ARM_STALE),
     ],
 )
-def test_the_arms_process_is_gone(arm: Arm, controller: Faults, number: int, outcome: Outcome) -> None:
+def test_the_arms_process_is_gone(arm: Arm, controller: Faults, number: int, outcome: SessionOutcome) -> None:
     under_way(arm, controller)
     os.kill(arm.pid, number)
     assert ended(arm, controller) is outcome
@@ -183,7 +183,7 @@ def test_no_joints_for_a_target(arm: Arm, controller: Faults) -> None:
     first = len(controller.state()["targets"])
     controller(do="ik_fails")
     arm.move(AWAY)
-    assert ended(arm, controller) is Outcome.UNREACHABLE
+    assert ended(arm, controller) is SessionOutcome.UNREACHABLE
     assert moves(controller, first) == []
 
 
@@ -192,7 +192,7 @@ def test_it_does_not_get_there(controller: Faults) -> None:
         arm.start()
         arm.move(HOME + [0.01, 0, 0, 0, 0, 0])
         controller(do="slider", fraction=0.0)
-        assert ended(arm, controller) is Outcome.NOT_ARRIVED
+        assert ended(arm, controller) is SessionOutcome.NOT_ARRIVED
 
 
 def test_a_state_out_of_the_box(controller: Faults) -> None:
@@ -203,7 +203,7 @@ def test_a_state_out_of_the_box(controller: Faults) -> None:
         arm.start()
         under_way(arm, controller)
         controller(do="place", tcp=(HOME + [0, 0.21, 0, 0, 0, 0]).tolist())
-        assert ended(arm, controller) is Outcome.OUT_OF_BOX
+        assert ended(arm, controller) is SessionOutcome.OUT_OF_BOX
 
 
 def test_a_wall_is_hit(controller: Faults) -> None:
@@ -212,20 +212,20 @@ def test_a_wall_is_hit(controller: Faults) -> None:
         arm.start()
         controller(do="wall", x=at, stiffness=20_000)
         arm.move(AWAY)
-        assert ended(arm, controller, within=3.0) is Outcome.CONTACT
+        assert ended(arm, controller, within=3.0) is SessionOutcome.CONTACT
         assert controller.state()["penetration_max"] <= 0.003
         assert controller.state()["safety"] == "NORMAL"
         # Backed off the way it came: out of the wall, and no further than told.
         until(lambda: controller.state()["tcp"][0] < at - 0.006, 2.0, "it backs off")
         until(arm.still, 2.0)
         assert at - 0.0105 < controller.state()["tcp"][0]
-        assert arm.fault.outcome is Outcome.CONTACT
+        assert arm.fault.outcome is SessionOutcome.CONTACT
 
 
 def test_somebody_else_finds_a_contact(arm: Arm, controller: Faults) -> None:
     under_way(arm, controller)
     time.sleep(0.2)
-    arm.fail(Outcome.CONTACT, "a whisker is bent too far")
+    arm.fail(SessionOutcome.CONTACT, "a whisker is bent too far")
     furthest = until(lambda: (not controller.state()["moving"]) and controller.state()["tcp"][0], 1.0)
     until(lambda: controller.state()["tcp"][0] < furthest - 0.009, 2.0, "it backs off")
-    assert arm.fault.outcome is Outcome.CONTACT
+    assert arm.fault.outcome is SessionOutcome.CONTACT

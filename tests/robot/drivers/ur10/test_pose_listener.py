@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from robot.drivers.ur10.pose_listener import PoseStream
+from robot.drivers.ur10.pose_listener import PoseListener
 from tests.helpers.live import Faults, until, ur_emulator
 
 START = (0.6, 0.0, 0.3, math.pi, 0.0, 0.0)
@@ -23,7 +23,7 @@ def faults(loopback: str) -> Iterator[Faults]:
 
 
 def test_it_tells_the_pose_the_speed_and_when(faults: Faults) -> None:
-    with PoseStream(faults.host) as poses:
+    with PoseListener(faults.host) as poses:
         _, tcp, speed = until(poses.latest, 2.0)
         np.testing.assert_allclose(tcp, START)
         assert not speed.any()
@@ -44,14 +44,14 @@ def test_it_tells_the_pose_the_speed_and_when(faults: Faults) -> None:
 
 @pytest.mark.parametrize("fault", ["close", "malformed"])
 def test_it_comes_back_after_what_ends_a_connection(faults: Faults, fault: str) -> None:
-    with PoseStream(faults.host, patience=0.3) as poses:
+    with PoseListener(faults.host, patience=0.3) as poses:
         before = until(poses.newest, 2.0)
         faults(do=fault)
         until(lambda: poses.newest().robot_time > before.robot_time + 0.1, 3.0)
 
 
 def test_a_stall_is_no_new_pose_and_then_there_are_some(faults: Faults) -> None:
-    with PoseStream(faults.host, patience=0.3) as poses:
+    with PoseListener(faults.host, patience=0.3) as poses:
         until(poses.latest, 2.0)
         faults(do="stall", seconds=0.6)
         time.sleep(0.1)
@@ -62,7 +62,7 @@ def test_a_stall_is_no_new_pose_and_then_there_are_some(faults: Faults) -> None:
 
 
 def test_nobody_there_is_no_pose_and_closing_is_quick() -> None:
-    poses = PoseStream("127.0.0.1", port=1, patience=0.2)
+    poses = PoseListener("127.0.0.1", port=1, patience=0.2)
     time.sleep(0.1)
     assert poses.latest() is None
     began = time.monotonic()

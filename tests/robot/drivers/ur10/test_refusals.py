@@ -15,8 +15,8 @@ import pytest
 from robot.drivers.ur10 import dashboard
 from robot.drivers.ur10.arm import Arm
 from robot.drivers.ur10.config import ArmConfig, BoxConfig
-from robot.drivers.ur10.dashboard import PORT, Dashboard, Silent
-from robot.drivers.ur10.startup_checks import Refusal, admitted
+from robot.drivers.ur10.dashboard import PORT, Dashboard, DashboardSilent
+from robot.drivers.ur10.startup_checks import StartupRefused, check_controller
 from tests.helpers.live import Faults, moves, until
 from tests.robot.drivers.ur10.conftest import HOME, settings
 
@@ -71,41 +71,41 @@ def elsewhere(loopback: str) -> str:
 )
 def test_what_speaks_against_starting(elsewhere: str, changed: dict[str, str], found: str) -> None:
     with answering(elsewhere, GOOD | changed):
-        with pytest.raises(Refusal, match=found) as refusal:
-            admitted(ArmConfig(host=elsewhere))
+        with pytest.raises(StartupRefused, match=found) as refusal:
+            check_controller(ArmConfig(host=elsewhere))
         assert refusal.value.cure or refusal.value.expected
 
 
 def test_a_good_controller_is_admitted_old_or_new(elsewhere: str) -> None:
     with answering(elsewhere, GOOD):
-        assert admitted(ArmConfig(host=elsewhere)).remote is True
+        assert check_controller(ArmConfig(host=elsewhere)).remote is True
     old = GOOD | {"PolyscopeVersion": "URSoftware 3.4.5.100 (Jan 01 2018)"}
     del old["is in remote control"]  # a CB3 does not know the question
     with answering(elsewhere, old):
-        controller = admitted(ArmConfig(host=elsewhere))
+        controller = check_controller(ArmConfig(host=elsewhere))
         assert controller.version == (3, 4)
         assert controller.remote is None
 
 
 def test_a_dashboard_that_does_not_answer_is_given_up(elsewhere: str) -> None:
     began = time.monotonic()
-    with pytest.raises(Refusal, match="no dashboard server answers"):
-        admitted(ArmConfig(host=elsewhere))
-    assert dashboard.stop(elsewhere) == ""
+    with pytest.raises(StartupRefused, match="no dashboard server answers"):
+        check_controller(ArmConfig(host=elsewhere))
+    assert dashboard.stop_program(elsewhere) == ""
     with (
         answering(elsewhere, {}),
         Dashboard(elsewhere, timeout=0.2) as connection,
-        pytest.raises(Silent, match="robotmode"),
+        pytest.raises(DashboardSilent, match="robotmode"),
     ):
         connection.ask("robotmode")
     assert time.monotonic() - began < 2.0
 
 
-def refused(controller: Faults, **others: Any) -> Refusal:
+def refused(controller: Faults, **others: Any) -> StartupRefused:
     """Why an arm did not start; nothing has reached the controller that moves, and the process is gone."""
     before = len(controller.state()["targets"])
     with Arm(settings(controller.host, **{"connect": 4.0} | others)) as arm:
-        with pytest.raises(Refusal) as refusal:
+        with pytest.raises(StartupRefused) as refusal:
             arm.start()
         assert arm.pid is None
         assert arm.fault is None
@@ -130,15 +130,15 @@ def test_standing_outside_the_box(controller: Faults) -> None:
 
 
 def test_a_controller_that_does_not_answer_on_its_other_ports(elsewhere: str) -> None:
-    with answering(elsewhere, GOOD), Arm(ArmConfig(host=elsewhere)) as arm, pytest.raises(Refusal):
+    with answering(elsewhere, GOOD), Arm(ArmConfig(host=elsewhere)) as arm, pytest.raises(StartupRefused):
         arm.start()
 
 
 def test_an_arm_that_was_not_started_refuses_and_closes(loopback: str) -> None:
-    from robot.drivers.ur10.safety import Refused
+    from robot.drivers.ur10.safety import TargetRefused
 
     with Arm(ArmConfig(host=loopback)) as arm:
-        with pytest.raises(Refused, match="not armed"):
+        with pytest.raises(TargetRefused, match="not armed"):
             arm.move(HOME)
         assert arm.latest() is None
         assert not arm.still()

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 
 from robot.drivers.ur10.arm import Arm
 from robot.drivers.ur10.config import SPEED_CAP
-from robot.drivers.ur10.safety import Refused, inside
+from robot.drivers.ur10.safety import TargetRefused, in_box
 from tests.helpers.live import Faults, moves, until
 from tests.robot.emulators.ur10.test_urscript_moves import poses, speeds
 
@@ -29,7 +29,7 @@ def test_nothing_bad_is_told(arm: Arm, controller: Faults) -> None:
     def ask(pose: list[float], speed: float) -> None:
         try:
             arm.move(pose, speed)
-        except Refused:
+        except TargetRefused:
             return
         asked.append(pose)
         time.sleep(0.03)
@@ -43,7 +43,7 @@ def test_nothing_bad_is_told(arm: Arm, controller: Faults) -> None:
     for order in told:
         assert order["goal"] in asked
         assert np.isfinite(order["goal"]).all()
-        assert inside(arm.config, np.array(order["goal"]))
+        assert in_box(arm.config, np.array(order["goal"]))
         assert 0 < order["speed"] <= SPEED_CAP
         assert order["acceleration"] == arm.config.acceleration
     top = max(math.hypot(*state["speed"][:3]) for state in arm.states())

@@ -8,42 +8,42 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from robot.drivers.outcome import Outcome
-from robot.drivers.ur10.base_transform import tcp_of
+from robot.drivers.outcome import SessionOutcome
+from robot.drivers.ur10.base_transform import tcp_from_pose
 from robot.drivers.ur10.config import SPEED_CAP, ArmConfig, BoxConfig
 from robot.drivers.ur10.safety import (
-    LEAST,
+    MIN_SPEED,
+    MOVED_ON,
     REACH,
     SAFETY_BITS,
-    SLACK,
-    Refused,
-    Watch,
-    allowed,
-    arrived,
-    checked,
-    inside,
-    judged,
-    planned,
-    retreat,
-    turned,
+    StateMemory,
+    TargetRefused,
+    at_target,
+    check_command,
+    check_state,
+    check_target,
+    in_box,
+    plan_move,
+    retreat_target,
+    rotation_angle,
 )
-from robot.drivers.ur10.shared_state import STATE
+from robot.drivers.ur10.shared_state import ARM_STATE
 
 CONFIG = ArmConfig()
-HOME = tcp_of(CONFIG.placing, np.array([0.63, 0.45, 0.0]))
+HOME = tcp_from_pose(CONFIG.placing, np.array([0.63, 0.45, 0.0]))
 NORMAL = 1
 
 anything = st.floats(allow_nan=True, allow_infinity=True)
 near = st.one_of(anything, st.floats(-1.5, 1.5))
 targets = st.lists(near, min_size=6, max_size=6)
 down = st.tuples(st.floats(0.02, 1.2), st.floats(0.02, 0.85), st.floats(-4, 4), st.floats(0, 0.2)).map(
-    lambda v: tcp_of(CONFIG.placing, np.array(v[:3]), v[3])
+    lambda v: tcp_from_pose(CONFIG.placing, np.array(v[:3]), v[3])
 )
 
 
 def a_state(**fields: object) -> np.ndarray:
     """One state of an arm that stands at HOME in good order."""
-    state = np.zeros((), STATE)
+    state = np.zeros((), ARM_STATE)
     state["tcp"], state["safety"], state["runtime"], state["mode"] = HOME, NORMAL, 2, 7
     state["robot"] = state["host"] = 1.0
     for name, value in fields.items():
@@ -54,62 +54,62 @@ def a_state(**fields: object) -> np.ndarray:
 @given(targets)
 def test_only_finite_targets_in_the_box_with_the_tool_down_pass(target: list[float]) -> None:
     try:
-        passed = checked(CONFIG, target, HOME)
-    except Refused:
+        passed = check_target(CONFIG, target, HOME)
+    except TargetRefused:
         return
     assert np.isfinite(passed).all()
-    assert inside(CONFIG, passed)
+    assert in_box(CONFIG, passed)
     np.testing.assert_array_equal(passed, target)
 
 
 @given(st.integers(0, 5), st.sampled_from([math.nan, math.inf, -math.inf]), down)
 def test_a_number_that_is_none_never_passes(where: int, bad: float, target: np.ndarray) -> None:
-    checked(CONFIG, target, HOME)
+    check_target(CONFIG, target, HOME)
     target[where] = bad
     for check in (
-        lambda: checked(CONFIG, target, HOME),
-        lambda: planned(CONFIG, target, HOME),
-        lambda: allowed(CONFIG, target, HOME, 0.01),
+        lambda: check_target(CONFIG, target, HOME),
+        lambda: plan_move(CONFIG, target, HOME),
+        lambda: check_command(CONFIG, target, HOME, 0.01),
     ):
-        with pytest.raises(Refused):
+        with pytest.raises(TargetRefused):
             check()
 
 
 @given(st.sampled_from([0, 1, 2]), st.booleans(), st.floats(1e-5, 10), down)
 def test_outside_the_box_never_passes(axis: int, above: bool, by: float, target: np.ndarray) -> None:
     target[axis] = CONFIG.box.high[axis] + by if above else CONFIG.box.low[axis] - by
-    with pytest.raises(Refused, match="outside the box"):
-        checked(CONFIG, target, HOME)
-    with pytest.raises(Refused, match="bring it in by hand"):
-        checked(CONFIG, HOME, target)
+    with pytest.raises(TargetRefused, match="outside the box"):
+        check_target(CONFIG, target, HOME)
+    with pytest.raises(TargetRefused, match="bring it in by hand"):
+        check_target(CONFIG, HOME, target)
 
 
 @pytest.mark.parametrize("target", [None, "home", [0.0] * 5, [0.0] * 7, [[0.0] * 6], [], 3, ["x"] * 6])
 def test_what_is_no_pose_never_passes(target: object) -> None:
-    with pytest.raises(Refused):
-        checked(CONFIG, target, HOME)
+    with pytest.raises(TargetRefused):
+        check_target(CONFIG, target, HOME)
 
 
 def test_a_leaning_tool_is_refused() -> None:
-    with pytest.raises(Refused, match="lean"):
-        checked(CONFIG, [*HOME[:3], 0.0, 0.0, 0.0], HOME)
+    with pytest.raises(TargetRefused, match="lean"):
+        check_target(CONFIG, [*HOME[:3], 0.0, 0.0, 0.0], HOME)
 
 
 @given(st.one_of(anything, st.floats(0, 0.3)), down, down)
 def test_no_speed_beyond_the_settings_passes(speed: float, target: np.ndarray, start: np.ndarray) -> None:
     try:
-        move = planned(CONFIG, target, start, speed)
-    except Refused:
-        assert not LEAST <= speed <= CONFIG.speed
+        move = plan_move(CONFIG, target, start, speed)
+    except TargetRefused:
+        assert not MIN_SPEED <= speed <= CONFIG.speed
         return
-    assert LEAST <= speed <= CONFIG.speed
+    assert MIN_SPEED <= speed <= CONFIG.speed
     assert 0 < move.speed <= SPEED_CAP
     way = np.linalg.norm(target[:3] - start[:3])
     top = min(move.speed, math.sqrt(CONFIG.acceleration * way))  # of a triangle of speed over time
-    assert top <= max(speed, math.sqrt(CONFIG.acceleration * SLACK)) * (1 + 1e-9)
+    assert top <= max(speed, math.sqrt(CONFIG.acceleration * MOVED_ON)) * (1 + 1e-9)
     assert math.isfinite(move.seconds)
     assert move.seconds <= move.most
-    np.testing.assert_array_equal(allowed(CONFIG, move.target, start, move.speed), target)
+    np.testing.assert_array_equal(check_command(CONFIG, move.target, start, move.speed), target)
 
 
 @given(st.one_of(anything, st.floats(0.0501, 0.3)), down, down)
@@ -118,8 +118,8 @@ def test_the_last_check_lets_no_faster_one_through(
 ) -> None:
     assume(np.linalg.norm(target[:3] - start[:3]) > 0.01)
     assume(not 0 < told <= CONFIG.speed)
-    with pytest.raises(Refused):
-        allowed(CONFIG, target, start, told)
+    with pytest.raises(TargetRefused):
+        check_command(CONFIG, target, start, told)
 
 
 @pytest.mark.parametrize(
@@ -145,24 +145,26 @@ def test_a_turn_is_the_angle_between_two_tools(tool: np.ndarray, by: float) -> N
     from scipy.spatial.transform import Rotation
 
     after = (Rotation.from_euler("z", by) * Rotation.from_rotvec(tool[3:])).as_rotvec()
-    assert turned(tool, np.array([*tool[:3], *after])) == pytest.approx(abs(by), abs=1e-7)
-    assert turned(tool, tool) == 0
+    assert rotation_angle(tool, np.array([*tool[:3], *after])) == pytest.approx(abs(by), abs=1e-7)
+    assert rotation_angle(tool, tool) == 0
 
 
 def test_arrived_asks_for_place_and_turn() -> None:
-    target = tcp_of(CONFIG.placing, np.array([0.63, 0.45, 3.14159]))
+    target = tcp_from_pose(CONFIG.placing, np.array([0.63, 0.45, 3.14159]))
     turn = np.radians(0.4)
-    assert arrived(CONFIG, tcp_of(CONFIG.placing, np.array([0.6305, 0.45, -3.14159])), target)
-    assert arrived(CONFIG, tcp_of(CONFIG.placing, np.array([0.63, 0.45, 3.14159 + turn])), target)
-    assert not arrived(CONFIG, tcp_of(CONFIG.placing, np.array([0.632, 0.45, 3.14159])), target)
-    assert not arrived(CONFIG, tcp_of(CONFIG.placing, np.array([0.63, 0.45, 3.14159 + 2 * turn])), target)
-    assert not arrived(CONFIG, np.full(6, np.nan), target)
+    assert at_target(CONFIG, tcp_from_pose(CONFIG.placing, np.array([0.6305, 0.45, -3.14159])), target)
+    assert at_target(CONFIG, tcp_from_pose(CONFIG.placing, np.array([0.63, 0.45, 3.14159 + turn])), target)
+    assert not at_target(CONFIG, tcp_from_pose(CONFIG.placing, np.array([0.632, 0.45, 3.14159])), target)
+    assert not at_target(
+        CONFIG, tcp_from_pose(CONFIG.placing, np.array([0.63, 0.45, 3.14159 + 2 * turn])), target
+    )
+    assert not at_target(CONFIG, np.full(6, np.nan), target)
 
 
 def test_good_states_have_no_finding() -> None:
-    watch = Watch()
+    watch = StateMemory()
     for k in range(5):
-        watch, finding = judged(CONFIG, watch, a_state(robot=k + 1.0), np.zeros(6))
+        watch, finding = check_state(CONFIG, watch, a_state(robot=k + 1.0), np.zeros(6))
         assert finding is None
 
 
@@ -171,50 +173,50 @@ def test_good_states_have_no_finding() -> None:
 def test_one_number_that_is_none_is_found(field: str, where: int, bad: float) -> None:
     state = a_state()
     state[field][where] = bad
-    _, finding = judged(CONFIG, Watch(), state, np.zeros(6))
+    _, finding = check_state(CONFIG, StateMemory(), state, np.zeros(6))
     assert finding is not None
-    assert finding.outcome is Outcome.ARM_MALFORMED
+    assert finding.outcome is SessionOutcome.ARM_MALFORMED
 
 
 @given(st.lists(st.floats(-1e300, 1e300), min_size=3, max_size=3))
 def test_no_place_outside_the_box_goes_unnoticed(place: list[float]) -> None:
-    _, finding = judged(CONFIG, Watch(), a_state(tcp=[*place, *HOME[3:]]), np.zeros(6))
-    if inside(CONFIG, np.array(place)):
+    _, finding = check_state(CONFIG, StateMemory(), a_state(tcp=[*place, *HOME[3:]]), np.zeros(6))
+    if in_box(CONFIG, np.array(place)):
         assert finding is None
     else:
         assert finding is not None
         away = np.abs(place).max() > REACH
-        assert finding.outcome is (Outcome.ARM_MALFORMED if away else Outcome.OUT_OF_BOX)
+        assert finding.outcome is (SessionOutcome.ARM_MALFORMED if away else SessionOutcome.OUT_OF_BOX)
 
 
 @given(st.integers(0, 2**11 - 1))
 def test_every_bit_that_is_no_good_is_found_and_the_gravest_named(bits: int) -> None:
-    _, finding = judged(CONFIG, Watch(), a_state(safety=bits), np.zeros(6))
+    _, finding = check_state(CONFIG, StateMemory(), a_state(safety=bits), np.zeros(6))
     named = [outcome for mask, outcome, _ in SAFETY_BITS if bits & mask]
     assert (finding.outcome if finding else None) is (named[0] if named else None)
     assert bool(finding) == bool(bits & ~0b11)
     if bits & 0b11100000:
         assert finding is not None
-        assert finding.outcome is Outcome.EMERGENCY_STOP
+        assert finding.outcome is SessionOutcome.EMERGENCY_STOP
 
 
 @given(st.lists(st.booleans(), min_size=1, max_size=12))
 def test_a_force_counts_when_two_states_in_a_row_show_it(loads: list[bool]) -> None:
     rest = np.array([20.0, -40.0, 10.0, 1.0, 1.0, 1.0])
-    watch, before = Watch(), False
+    watch, before = StateMemory(), False
     for k, loaded in enumerate(loads):
         force = rest + [0, (CONFIG.force_limit + 1) if loaded else CONFIG.force_limit - 1, 0, 0, 0, 0]
-        watch, finding = judged(CONFIG, watch, a_state(robot=k + 1.0, force=force), rest)
-        assert (finding is not None and finding.outcome is Outcome.CONTACT) == (loaded and before)
+        watch, finding = check_state(CONFIG, watch, a_state(robot=k + 1.0, force=force), rest)
+        assert (finding is not None and finding.outcome is SessionOutcome.CONTACT) == (loaded and before)
         before = loaded
 
 
 def test_a_clock_that_does_not_go_on_is_found() -> None:
-    watch, _ = judged(CONFIG, Watch(), a_state(robot=2.0), np.zeros(6))
+    watch, _ = check_state(CONFIG, StateMemory(), a_state(robot=2.0), np.zeros(6))
     for robot in (2.0, 1.0):
-        _, finding = judged(CONFIG, watch, a_state(robot=robot), np.zeros(6))
+        _, finding = check_state(CONFIG, watch, a_state(robot=robot), np.zeros(6))
         assert finding is not None
-        assert finding.outcome is Outcome.CLOCK_JUMPED
+        assert finding.outcome is SessionOutcome.CLOCK_JUMPED
 
 
 @given(st.floats(0, 2 * math.pi), st.integers(2, 200), st.floats(0.0001, 0.002))
@@ -224,14 +226,14 @@ def test_backing_off_goes_the_way_the_tool_came_and_stays_in_the_box(
     states = np.stack([a_state() for _ in range(count)])
     way = np.array([math.cos(course), math.sin(course), 0.0])
     states["tcp"][:, :3] += np.arange(count)[:, None] * step * way
-    target = retreat(CONFIG, states)
+    target = retreat_target(CONFIG, states)
     if target is None:
         assert (count - 1) * step < 0.002
         return
     back = target[:3] - states[-1]["tcp"][:3]
     assert np.linalg.norm(back) <= CONFIG.backoff + 1e-9
-    assert inside(CONFIG, target)
-    if inside(CONFIG, states[-1]["tcp"] - 0.02 * np.array([*way, 0, 0, 0])) and inside(
+    assert in_box(CONFIG, target)
+    if in_box(CONFIG, states[-1]["tcp"] - 0.02 * np.array([*way, 0, 0, 0])) and in_box(
         CONFIG, states[-1]["tcp"]
     ):
         np.testing.assert_allclose(back, -CONFIG.backoff * way, atol=1e-9)

@@ -9,55 +9,55 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robot.drivers.ur10.shared_state import SLOTS, STATE, Board
+from robot.drivers.ur10.shared_state import ARM_STATE, SLOTS, SharedState
 
 WRITER = """
 import sys, numpy as np
-from robot.drivers.ur10.shared_state import STATE, Board
-board = Board(sys.argv[1])
-state = np.zeros((), STATE)
+from robot.drivers.ur10.shared_state import ARM_STATE, SharedState
+shared = SharedState(sys.argv[1])
+state = np.zeros((), ARM_STATE)
 for k in range(1, int(sys.argv[2]) + 1):
     for name in ("host", "robot", "tcp", "speed", "force", "joints", "mode", "safety", "runtime"):
         state[name] = k
-    board.publish(state)
+    shared.publish(state)
 """
 
 
-def write(board: Board, count: int) -> None:
-    state = np.zeros((), STATE)
+def write(shared: SharedState, count: int) -> None:
+    state = np.zeros((), ARM_STATE)
     for _ in range(count):
-        state["robot"] = board.newest + 1
-        board.publish(state)
+        state["robot"] = shared.newest + 1
+        shared.publish(state)
 
 
 def test_states_come_in_order_and_once() -> None:
-    board = Board()
+    shared = SharedState()
     try:
-        assert board.latest() is None
-        assert len(board.since(0)) == 0
-        write(board, 10)
-        assert board.since(0)["counter"].tolist() == list(range(1, 11))
-        assert board.since(7)["counter"].tolist() == [8, 9, 10]
-        assert len(board.since(10)) == 0
-        assert len(board.since(99)) == 0
-        write(board, SLOTS)
-        states = board.since(3)
+        assert shared.latest() is None
+        assert len(shared.since(0)) == 0
+        write(shared, 10)
+        assert shared.since(0)["counter"].tolist() == list(range(1, 11))
+        assert shared.since(7)["counter"].tolist() == [8, 9, 10]
+        assert len(shared.since(10)) == 0
+        assert len(shared.since(99)) == 0
+        write(shared, SLOTS)
+        states = shared.since(3)
         assert states["counter"][-1] == SLOTS + 10
         assert np.diff(states["counter"]).tolist() == [1] * (SLOTS - 2)
         np.testing.assert_array_equal(states["counter"], states["robot"])
     finally:
-        board.close()
+        shared.close()
 
 
 def test_a_reader_beside_a_writer_sees_whole_states_only() -> None:
-    board, count = Board(), 60_000
+    shared, count = SharedState(), 60_000
     writer = subprocess.Popen(
-        [sys.executable, "-c", WRITER, board.name, str(count)], cwd=Path(__file__).parents[4]
+        [sys.executable, "-c", WRITER, shared.name, str(count)], cwd=Path(__file__).parents[4]
     )
     try:
         seen, until = 0, time.monotonic() + 20
         while seen < count and time.monotonic() < until:
-            states = board.since(seen)
+            states = shared.since(seen)
             if not len(states):
                 continue
             counters = states["counter"].astype(float)
@@ -71,19 +71,19 @@ def test_a_reader_beside_a_writer_sees_whole_states_only() -> None:
         assert seen == count
         assert writer.wait(5) == 0
         # Whoever opened the block and ended has not taken it away.
-        assert int(board.since(count - 1)["counter"][-1]) == count
+        assert int(shared.since(count - 1)["counter"][-1]) == count
     finally:
         writer.kill()
         writer.wait()
-        board.close()
+        shared.close()
 
 
 def test_closing_takes_the_memory_away() -> None:
-    board = Board()
-    name = board.name
-    write(board, 3)
-    kept = board.since(0)
-    board.close()
+    shared = SharedState()
+    name = shared.name
+    write(shared, 3)
+    kept = shared.since(0)
+    shared.close()
     with pytest.raises(FileNotFoundError):
         shared_memory.SharedMemory(name)
     assert kept["counter"].tolist() == [1, 2, 3]

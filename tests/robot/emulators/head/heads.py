@@ -13,15 +13,15 @@ from robot.drivers.head.protocol import (
     KEEP_ALIVE,
     REQUEST_OUT,
     Command,
-    Kind,
-    Mode,
+    CommandKind,
+    FeedbackMode,
     Request,
-    pack,
-    tally,
+    pack_command,
+    to_counts,
 )
 from robot.emulators.head.config import CONTROL_PORT, HeadEmulatorConfig
-from robot.emulators.head.device import BLOCK, Bridge
-from robot.emulators.head.pose_source import Along, Place
+from robot.emulators.head.device import BLOCK, EmulatedHead
+from robot.emulators.head.pose_source import AlongPath, PoseSource
 from robot.world.scene import KidnapConfig, Scene, scene
 from robot.world.walls import Walls
 from tactile.whiskers.head_geometry import ur10_head
@@ -33,11 +33,11 @@ EVER = 10**9
 """More bytes than there ever are."""
 
 
-def drive(mode: Mode = Mode.RCP, threshold: float = 0.04, **changes: Any) -> Command:
+def drive(mode: FeedbackMode = FeedbackMode.RCP, threshold: float = 0.04, **changes: Any) -> Command:
     """A whisk as the paper has it."""
-    numbers = np.full(18, tally(np.array(threshold)))
+    numbers = np.full(18, to_counts(np.array(threshold)))
     usual = {"amplitude": np.radians(65), "frequency": 1.0, "gain": 4.0, "window": 0.01}
-    return Command(Kind.DRIVE, mode, numbers=numbers, **usual | changes)
+    return Command(CommandKind.DRIVE, mode, numbers=numbers, **usual | changes)
 
 
 def world(config: HeadEmulatorConfig) -> Scene:
@@ -49,11 +49,11 @@ class Told:
     """A head in memory, and a host that reads it and keeps it awake, a block after the other."""
 
     def __init__(
-        self, config: HeadEmulatorConfig | None = None, walls: Walls = TABLE, place: Place | None = None
+        self, config: HeadEmulatorConfig | None = None, walls: Walls = TABLE, place: PoseSource | None = None
     ) -> None:
         self.config = HeadEmulatorConfig() if config is None else config
-        here = Along(world(self.config).path._replace(time=np.zeros(1), pose=np.zeros((1, 3))))
-        self.bridge = Bridge(self.config, walls, here if place is None else place, 0.0)
+        here = AlongPath(world(self.config).path._replace(time=np.zeros(1), pose=np.zeros((1, 3))))
+        self.bridge = EmulatedHead(self.config, walls, here if place is None else place, 0.0)
         whiskers = len(self.bridge.whiskers.head.length)
         self.decoder, self.now = Decoder(whiskers, 3), 0.0
 
@@ -62,7 +62,7 @@ class Told:
         self.bridge.control(REQUEST_OUT, Request.START, 0, 0, self.now)
 
     def send(self, command: Command) -> None:
-        self.bridge.bulk_out(pack(command), self.now)
+        self.bridge.bulk_out(pack_command(command), self.now)
 
     def pass_by(self, seconds: float, awake: bool = True, read: bool = True) -> Frames:
         """Time passes; what was read meanwhile."""

@@ -6,18 +6,18 @@ from pathlib import Path
 
 import numpy as np
 
-from robot.drivers.ur10.base_transform import PlacingConfig, tcp_of
+from robot.drivers.ur10.base_transform import BaseTransformConfig, tcp_from_pose
 from robot.emulators.head.config import HeadEmulatorConfig
 from tests.helpers.live import until, ur_emulator
 from tests.robot.emulators.head.heads import running
 
-PLACING = PlacingConfig()
+PLACING = BaseTransformConfig()
 
 
 def test_the_head_follows_the_tool(tmp_path: Path, loopback: str) -> None:
     here, there = np.array([0.27, 0.27, 0.5]), np.array([0.63, 0.45, -2.0])
     config = HeadEmulatorConfig(host=loopback, path={"explore": 5}, arm=loopback, placing=PLACING)
-    with ur_emulator(loopback, tcp_of(PLACING, here, 0.1)) as arm, running(config, tmp_path) as head:
+    with ur_emulator(loopback, tcp_from_pose(PLACING, here, 0.1)) as arm, running(config, tmp_path) as head:
 
         def stands(pose: np.ndarray, lift: float) -> bool:
             state = head(do="state")
@@ -25,5 +25,5 @@ def test_the_head_follows_the_tool(tmp_path: Path, loopback: str) -> None:
             return told and bool(np.allclose(state["pose"], pose, atol=1e-6))
 
         until(lambda: stands(here, 0.1), 3.0, "where the arm began")
-        arm(do="place", tcp=tcp_of(PLACING, there).tolist())
+        arm(do="place", tcp=tcp_from_pose(PLACING, there).tolist())
         until(lambda: stands(there, 0.0), 3.0, "where the arm was put")

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.drivers.head.protocol import ANGLE, REQUEST_IN, REQUEST_OUT, WRAP, Flag, Request
+from robot.drivers.head.protocol import ANGLE, REQUEST_IN, REQUEST_OUT, WRAP, FrameFlag, Request
 from robot.emulators.head.config import HeadEmulatorConfig
 from robot.emulators.head.device import BLOCK
 from robot.emulators.head.fifo import Fifo
@@ -65,7 +65,7 @@ def test_what_nobody_reads_is_lost_exactly() -> None:
     assert found == {"made": 1400, "sent": 480, "queued": 0, "lost": 920, "dropped": 0, "skipped": 0}
     # 100 waited; what came next says that something is missing before it.
     assert rest.sequence.tolist() == [*range(200, 300), *range(1220, 1400)]
-    assert np.flatnonzero(rest.flags & Flag.OVERRUN).tolist() == [100]
+    assert np.flatnonzero(rest.flags & FrameFlag.OVERRUN).tolist() == [100]
     assert head.decoder.counts.missing == 920
     assert head.decoder.counts.bad == 0
 

@@ -7,19 +7,19 @@ import pytest
 
 from robot.drivers.head.protocol import (
     ANGLE,
-    SILENCE,
+    COMMAND_TIMEOUT,
     Command,
-    Flag,
-    Kind,
-    Mode,
-    counts,
-    radians,
-    tally,
+    CommandKind,
+    FeedbackMode,
+    FrameFlag,
+    frame_values,
+    to_counts,
+    to_radians,
 )
-from robot.drivers.ur10.base_transform import PlacingConfig, tcp_of
+from robot.drivers.ur10.base_transform import BaseTransformConfig, tcp_from_pose
 from robot.emulators.head.config import HeadEmulatorConfig
 from robot.emulators.head.device import BLOCK
-from robot.emulators.head.pose_source import AHEAD, Along, Carried
+from robot.emulators.head.pose_source import AHEAD, AlongPath, CarriedByArm
 from robot.simulation.head.quasistatic import quasistatic
 from robot.simulation.head.whisk_stream import cycles
 from robot.world.head_trajectory import Path
@@ -29,7 +29,7 @@ from tactile.whiskers.head_geometry import HeadConfig
 from tactile.whiskers.whisking import WhiskingConfig
 from tests.robot.emulators.head.heads import TABLE, Told, drive, world
 
-PLACING = PlacingConfig(x=-0.4, y=0.3, z=0.12, yaw_deg=30.0)
+PLACING = BaseTransformConfig(x=-0.4, y=0.3, z=0.12, yaw_deg=30.0)
 ODD = 2100.0
 """A rate with no sample in the middle of a block, where walls take over from each other: there, which of them
 it is depends on the last bit of the time."""
@@ -45,23 +45,25 @@ class Arm:
         return self.state
 
     def put(self, time: float, pose: list[float], lift: float = 0.0) -> None:
-        self.state = (time, tcp_of(PLACING, np.array(pose), lift), np.zeros(6))
+        self.state = (time, tcp_from_pose(PLACING, np.array(pose), lift), np.zeros(6))
 
 
-@pytest.mark.parametrize("mode", [Mode.OPEN, Mode.RCP])
+@pytest.mark.parametrize("mode", [FeedbackMode.OPEN, FeedbackMode.RCP])
 @pytest.mark.parametrize("frequency", [1.0, 2.0])
-def test_a_head_on_its_way_feels_what_the_simulator_says(mode: Mode, frequency: float) -> None:
+def test_a_head_on_its_way_feels_what_the_simulator_says(mode: FeedbackMode, frequency: float) -> None:
     config = HeadEmulatorConfig(
         follow=True, path={"explore": 9}, seed=3, stream={"rate": ODD}, head={"dead": (4,)}
     )
     made = world(config)
-    head = Told(config, made.surroundings.walls, Along(made.path))
+    head = Told(config, made.surroundings.walls, AlongPath(made.path))
     told = drive(mode, frequency=frequency)
     head.start()
     head.send(told)
     frames = head.pass_by(3.0)
     samples = round(ODD / frequency)
-    assert np.flatnonzero(frames.flags & Flag.CYCLE).tolist() == list(range(0, len(frames.values), samples))
+    assert np.flatnonzero(frames.flags & FrameFlag.CYCLE).tolist() == list(
+        range(0, len(frames.values), samples)
+    )
 
     whisking = WhiskingConfig(mode=mode.name.lower(), rate=frequency, gain=told.gain)
     start = np.arange(3 * frequency) / frequency
@@ -77,23 +79,23 @@ def test_a_head_on_its_way_feels_what_the_simulator_says(mode: Mode, frequency: 
         stream(config.seed, "sensor"),
         told.numbers * ANGLE,
     )
-    felt = np.concatenate([counts(cycle.angle, cycle.deflection) for cycle in raw])
+    felt = np.concatenate([frame_values(cycle.angle, cycle.deflection) for cycle in raw])
     off = np.abs(felt.astype(int) - frames.values)
     assert np.abs(felt[..., 2] * ANGLE).max() > 0.05
     assert off.max() <= 1
     assert (off == 0).mean() > 0.999
-    assert (frames.flags & Flag.RCP).any() == (mode == Mode.RCP)
+    assert (frames.flags & FrameFlag.RCP).any() == (mode == FeedbackMode.RCP)
 
 
 def test_a_whisk_may_end_within_a_block() -> None:
     head = Told()
     head.start()
-    head.send(drive(Mode.OPEN, frequency=1.3))
+    head.send(drive(FeedbackMode.OPEN, frequency=1.3))
     frames = head.pass_by(3.0)
     samples = round(2000 / 1.3)
     assert samples % head.bridge.samples
-    assert np.flatnonzero(frames.flags & Flag.CYCLE).tolist() == list(range(0, 6000, samples))
-    angle = radians(frames.values)[0]
+    assert np.flatnonzero(frames.flags & FrameFlag.CYCLE).tolist() == list(range(0, 6000, samples))
+    angle = to_radians(frames.values)[0]
     assert (angle[samples - 2 : samples + 2] < 0.02).all()
 
 
@@ -106,9 +108,9 @@ def test_an_arm_carries_the_head_as_if_it_stood_there(lift: float) -> None:
     arm = Arm()
     arm.put(0.0, pose.tolist(), lift)
     lower = walls._replace(height=walls.height - lift)
-    stays = Along(Path(np.zeros(1), pose[None]))
+    stays = AlongPath(Path(np.zeros(1), pose[None]))
     found = []
-    for head in (Told(config, walls, Carried(arm, PLACING)), Told(config, lower, stays)):
+    for head in (Told(config, walls, CarriedByArm(arm, PLACING)), Told(config, lower, stays)):
         head.start()
         head.send(drive())
         found.append(head.pass_by(1.0).values.astype(int))
@@ -119,21 +121,21 @@ def test_an_arm_carries_the_head_as_if_it_stood_there(lift: float) -> None:
 
 def test_high_up_and_before_the_arm_tells_there_is_nothing() -> None:
     arm = Arm()
-    head = Told(HeadEmulatorConfig(mechanics={"noise": 0.0}), TABLE, Carried(arm, PLACING))
+    head = Told(HeadEmulatorConfig(mechanics={"noise": 0.0}), TABLE, CarriedByArm(arm, PLACING))
     head.start()
     head.send(drive())
-    assert not radians(head.pass_by(1.0).values)[1].any()
+    assert not to_radians(head.pass_by(1.0).values)[1].any()
     arm.put(head.now, [0.0, 0.0, 0.0])
-    assert radians(head.pass_by(1.0).values)[1].max() > 0.05
+    assert to_radians(head.pass_by(1.0).values)[1].max() > 0.05
     arm.put(head.now, [0.0, 0.0, 0.0], 0.2)
-    assert not radians(head.pass_by(1.0).values)[1][50:].any()
+    assert not to_radians(head.pass_by(1.0).values)[1][50:].any()
     assert head.do("state")["lift"] == pytest.approx(0.2)
 
 
 def test_between_states_the_arm_goes_on_by_its_speed() -> None:
     arm, home = Arm(), np.array([0.5, 0.4, 3.1])
-    place = Carried(arm, PLACING)
-    tcp = tcp_of(PLACING, home)
+    place = CarriedByArm(arm, PLACING)
+    tcp = tcp_from_pose(PLACING, home)
     arm.state = (10.0, tcp, np.array([0.03, -0.01, 0.02, 0.0, 0.0, 0.4]))
     rows = [place.at(10.0 + ahead) for ahead in (0.0, 0.02, 0.05, AHEAD, 5.0)]
     poses, lifts = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
@@ -147,31 +149,31 @@ def test_between_states_the_arm_goes_on_by_its_speed() -> None:
 def test_without_commands_whiskers_go_back_and_stay() -> None:
     head = Told(HeadEmulatorConfig(mechanics={"noise": 0.0}))
     head.start()
-    head.send(drive(Mode.OPEN))
-    assert radians(head.pass_by(0.4).values)[0].max() > 0.5
+    head.send(drive(FeedbackMode.OPEN))
+    assert to_radians(head.pass_by(0.4).values)[0].max() > 0.5
     frames = head.pass_by(2.0, awake=False)
-    angle = radians(frames.values)[0]
+    angle = to_radians(frames.values)[0]
     assert len(angle) == 4000  # it goes on sending
-    silent = round(SILENCE * 2000)
+    silent = round(COMMAND_TIMEOUT * 2000)
     assert (angle[silent - 100] > 0.2).all()
     assert (angle[silent + 500 :] == 0).all()
     assert (np.diff(angle[silent + 60 : silent + 500], axis=0) <= 1e-9).all()
-    assert not (frames.flags[silent + 20 :] & Flag.CYCLE).any()
-    assert not radians(head.pass_by(1.0).values)[0].any()  # being kept awake is not being driven
-    head.send(drive(Mode.OPEN))
-    assert radians(head.pass_by(1.0).values)[0].max() > 0.5
+    assert not (frames.flags[silent + 20 :] & FrameFlag.CYCLE).any()
+    assert not to_radians(head.pass_by(1.0).values)[0].any()  # being kept awake is not being driven
+    head.send(drive(FeedbackMode.OPEN))
+    assert to_radians(head.pass_by(1.0).values)[0].max() > 0.5
 
 
 def test_a_new_drive_waits_for_the_cycle_to_end() -> None:
     head = Told(HeadEmulatorConfig(mechanics={"noise": 0.0}))
     head.start()
-    head.send(drive(Mode.OPEN))
+    head.send(drive(FeedbackMode.OPEN))
     head.pass_by(0.3)
-    head.send(drive(Mode.OPEN, frequency=2.0, amplitude=0.3, offset=0.2))
+    head.send(drive(FeedbackMode.OPEN, frequency=2.0, amplitude=0.3, offset=0.2))
     frames = head.pass_by(1.7)
-    begins = np.flatnonzero(frames.flags & Flag.CYCLE)
+    begins = np.flatnonzero(frames.flags & FrameFlag.CYCLE)
     assert begins.tolist() == [1400, 2400]
-    angle = radians(frames.values)[0]
+    angle = to_radians(frames.values)[0]
     assert angle[:1400].max() > 0.8
     assert angle[1400:].max() == pytest.approx(0.5, abs=0.01)
     assert angle[1400:].min() == pytest.approx(0.2, abs=1e-3)
@@ -180,11 +182,11 @@ def test_a_new_drive_waits_for_the_cycle_to_end() -> None:
 def test_the_host_lowers_amplitudes_for_one_cycle() -> None:
     head = Told(HeadEmulatorConfig(mechanics={"noise": 0.0}), TABLE._replace(height=np.array([0.0])))
     head.start()
-    head.send(drive(Mode.OPEN))
+    head.send(drive(FeedbackMode.OPEN))
     head.pass_by(0.1)
     lower = np.linspace(0.1, 0.9, 18)
-    head.send(Command(Kind.AMPLITUDES, numbers=tally(lower)))
-    angle = radians(head.pass_by(1.9).values)[0]
+    head.send(Command(CommandKind.AMPLITUDES, numbers=to_counts(lower)))
+    angle = to_radians(head.pass_by(1.9).values)[0]
     np.testing.assert_allclose(angle[:1800].max(axis=0), lower, atol=1e-3)
     np.testing.assert_allclose(angle[1800:].max(axis=0), np.radians(65), atol=1e-3)
 
@@ -194,9 +196,9 @@ def test_feedback_is_relative_to_the_centre() -> None:
     for centre in (0.0, 0.3):
         head = Told(HeadEmulatorConfig(mechanics={"noise": 0.0, "slip": 1.0}))
         head.start()
-        head.send(Command(Kind.CENTRE, numbers=tally(np.full(18, centre))))
+        head.send(Command(CommandKind.CENTRE, numbers=to_counts(np.full(18, centre))))
         head.send(drive())
-        most.append(radians(head.pass_by(1.0).values)[1].max())
+        most.append(to_radians(head.pass_by(1.0).values)[1].max())
     assert most[1] < 0.7 * most[0]  # taken for pressed from the beginning
 
 
@@ -215,14 +217,14 @@ def test_what_no_drive_can_do_is_not_done(bad: dict[str, float]) -> None:
     head = Told()
     head.start()
     head.send(drive(**bad))
-    assert np.abs(radians(head.pass_by(0.5).values)[0]).max() < 0.02
+    assert np.abs(to_radians(head.pass_by(0.5).values)[0]).max() < 0.02
 
 
 def test_drives_stop_at_their_limit() -> None:
     head = Told(HeadEmulatorConfig(head=HeadConfig(limit_deg=50.0), mechanics={"noise": 0.0}))
     head.start()
-    head.send(drive(Mode.OPEN, offset=0.3))
-    angle = radians(head.pass_by(1.0).values)[0]
+    head.send(drive(FeedbackMode.OPEN, offset=0.3))
+    angle = to_radians(head.pass_by(1.0).values)[0]
     assert angle.max() <= np.radians(50) + ANGLE
 
 

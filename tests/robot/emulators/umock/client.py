@@ -9,8 +9,8 @@ import time
 from typing import Any
 
 from robot.drivers.head.decoder import Decoder
-from robot.drivers.head.device import Bridge, Gone, Stalled, identity, open_bridge
-from robot.drivers.head.protocol import KEEP_ALIVE, Request, pack
+from robot.drivers.head.device import Bridge, Disconnected, Stalled, open_bridge, read_identity
+from robot.drivers.head.protocol import KEEP_ALIVE, Request, pack_command
 from robot.emulators.head.config import CONTROL_PORT
 from tests.robot.emulators.head.heads import drive
 
@@ -22,9 +22,9 @@ def main(host: str) -> None:
     seen: dict[str, Any] = {}
     bridge = open_bridge("usb")
     decoder = Decoder(18, 3)
-    seen["whiskers"] = identity(bridge).whiskers
+    seen["whiskers"] = read_identity(bridge).whiskers
     bridge.request(Request.START)
-    bridge.write(pack(drive()))
+    bridge.write(pack_command(drive()))
     seen["frames"] = read(bridge, decoder, 3000)
 
     asked(host, do="stall")
@@ -61,7 +61,7 @@ def read(bridge: Bridge, decoder: Decoder, frames: int) -> int:
     end, got = time.monotonic() + 10.0, 0
     while got < frames and time.monotonic() < end:
         got += len(decoder.feed(bridge.read(4096, 0.5)).values)
-        bridge.write(pack(KEEP_ALIVE))
+        bridge.write(pack_command(KEEP_ALIVE))
     return got
 
 
@@ -71,7 +71,7 @@ def ended(bridge: Bridge) -> bool:
     try:
         while time.monotonic() < end:
             bridge.read(4096, 0.5)
-    except Gone:
+    except Disconnected:
         return True
     return False
 
@@ -82,7 +82,7 @@ def absent() -> bool:
     while time.monotonic() < end:
         try:
             open_bridge("usb").close()
-        except Gone:
+        except Disconnected:
             return True
         except Stalled:
             pass  # known to have been there, and not yet known to be gone
@@ -96,7 +96,7 @@ def again(seconds: float) -> Bridge:
     while True:
         try:
             return open_bridge("usb")
-        except (Gone, Stalled):
+        except (Disconnected, Stalled):
             if time.monotonic() > end:
                 raise
             time.sleep(0.02)

@@ -21,7 +21,7 @@ from typing import Any
 
 import pytest
 
-from robot.drivers.ur10.pose_listener import PoseStream
+from robot.drivers.ur10.pose_listener import PoseListener
 from tests.helpers.live import ROOT, Faults, until, ur_emulator
 
 REAL = os.environ.get("RATSLAM_UR_HOST", "")
@@ -194,7 +194,7 @@ def test_a_long_stall_takes_a_controlling_client_down(faults: Faults) -> None:
 @emulated
 def test_the_rate_can_be_too_low(faults: Faults) -> None:
     def told() -> int:
-        with PoseStream(faults.host) as poses:
+        with PoseListener(faults.host) as poses:
             until(poses.newest, 2.0)
             times = set()
             end = poses.newest().robot_time + 0.5

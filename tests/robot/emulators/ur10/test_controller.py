@@ -284,7 +284,9 @@ def names(variables: list[str], frequency: float | None = None) -> bytes:
 
 
 def reply(session: RtdeSession, kind: int, body: bytes = b"") -> bytes:
-    (package,) = rtde_protocol.Splitter().feed(session.received(rtde_protocol.packed(kind, body), 0.0))
+    (package,) = rtde_protocol.PackageSplitter().feed(
+        session.received(rtde_protocol.pack_package(kind, body), 0.0)
+    )
     assert package.kind == kind
     return package.body
 
@@ -302,7 +304,7 @@ def test_recipes_are_told_by_type_and_states_follow_them() -> None:
     assert reply(session, rtde_protocol.OUTPUTS, names(wanted, 62.5)) == b"\1DOUBLE,VECTOR6D,INT32,INT32"
     assert session.every == 2
     assert reply(session, rtde_protocol.START) == b"\1"
-    (package,) = rtde_protocol.Splitter().feed(session.state({}))
+    (package,) = rtde_protocol.PackageSplitter().feed(session.state({}))
     recipe, time, *rest = struct.unpack(">Bd6dii", package.body)
     assert recipe == 1
     assert time == bench.controller.time
@@ -317,9 +319,9 @@ def test_an_input_has_one_master() -> None:
     assert reply(first, rtde_protocol.INPUTS, names(registers)) == b"\1INT32,DOUBLE"
     assert reply(first, rtde_protocol.INPUTS, names(registers[:1])) == b"\2INT32"
     assert reply(second, rtde_protocol.INPUTS, names(registers)) == b"\0IN_USE,IN_USE"
-    first.received(rtde_protocol.packed(rtde_protocol.DATA, struct.pack(">Bid", 1, 7, 0.5)), 3.0)
+    first.received(rtde_protocol.pack_package(rtde_protocol.DATA, struct.pack(">Bid", 1, 7, 0.5)), 3.0)
     first.received(
-        rtde_protocol.packed(rtde_protocol.DATA, struct.pack(">Bi", 1, 8)), 4.0
+        rtde_protocol.pack_package(rtde_protocol.DATA, struct.pack(">Bi", 1, 8)), 4.0
     )  # too short for its recipe
     assert (controller.registers.ints[0], controller.registers.doubles[3]) == (7, 0.5)
     assert controller.registers.written[0] == 3.0
@@ -360,12 +362,12 @@ def test_no_bytes_bring_a_session_down(data: list[bytes]) -> None:
 def test_no_body_brings_the_wire_down(kind: int, body: bytes) -> None:
     session = RtdeSession(emulated_controller(UrEmulatorConfig()), Claims())
     with contextlib.suppress(ValueError):
-        session.received(rtde_protocol.packed(kind, body), 0.0)
+        session.received(rtde_protocol.pack_package(kind, body), 0.0)
     session.state({})
 
 
 @given(data=st.binary(max_size=300), cut=st.integers(0, 300))
 def test_packages_do_not_depend_on_how_they_are_cut(data: bytes, cut: int) -> None:
-    stream = b"".join(rtde_protocol.packed(byte, data[:byte]) for byte in data[:20])
-    whole, parts = rtde_protocol.Splitter(), rtde_protocol.Splitter()
+    stream = b"".join(rtde_protocol.pack_package(byte, data[:byte]) for byte in data[:20])
+    whole, parts = rtde_protocol.PackageSplitter(), rtde_protocol.PackageSplitter()
     assert list(whole.feed(stream)) == [*parts.feed(stream[:cut]), *parts.feed(stream[cut:])]

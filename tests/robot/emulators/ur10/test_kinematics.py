@@ -11,7 +11,14 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from robot.emulators.ur10.kinematics import UR10, UR10E, Geometry, backward, forward, solutions
-from robot.emulators.ur10.rotation import composed, inverse, quaternion, rotation_vector, turn, turned
+from robot.emulators.ur10.rotation import (
+    compose_poses,
+    invert_pose,
+    quaternion,
+    rotate_by,
+    rotation_between,
+    rotation_vector,
+)
 
 ANGLE = st.floats(-3.1, 3.1)
 JOINTS = st.tuples(*[ANGLE] * 6)
@@ -81,18 +88,18 @@ def test_out_of_reach_has_no_joints(pose: tuple[float, ...]) -> None:
 @given(first=POSE, second=POSE)
 def test_poses_compose_as_frames_do(first: tuple[float, ...], second: tuple[float, ...]) -> None:
     np.testing.assert_allclose(
-        frame_of(composed(first, second)), frame_of(first) @ frame_of(second), atol=1e-9
+        frame_of(compose_poses(first, second)), frame_of(first) @ frame_of(second), atol=1e-9
     )
-    np.testing.assert_allclose(frame_of(inverse(first)), np.linalg.inv(frame_of(first)), atol=1e-9)
+    np.testing.assert_allclose(frame_of(invert_pose(first)), np.linalg.inv(frame_of(first)), atol=1e-9)
 
 
 @given(first=POSE, second=POSE)
 def test_a_turn_leads_from_one_pose_to_the_other_the_short_way(
     first: tuple[float, ...], second: tuple[float, ...]
 ) -> None:
-    vector = turn(first, second)
+    vector = rotation_between(first, second)
     assert math.hypot(*vector) <= math.pi + 1e-12
-    arrived = (*first[:3], *turned(first, vector))
+    arrived = (*first[:3], *rotate_by(first, vector))
     np.testing.assert_allclose(frame_of(arrived)[:3, :3], frame_of(second)[:3, :3], atol=1e-9)
 
 

@@ -9,21 +9,21 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from robot.emulators.ur10.arm import Arm
+from robot.emulators.ur10.arm import EmulatedArm
 from robot.emulators.ur10.config import UrEmulatorConfig, WallConfig
 from robot.emulators.ur10.motion import Profile, Unreachable
-from robot.emulators.ur10.rotation import turn
+from robot.emulators.ur10.rotation import rotation_between
 from robot.emulators.ur10.urscript_moves import (
     Mark,
     MoveJ,
     MoveL,
-    Order,
+    MoveOrder,
     Servo,
     SpeedJ,
     SpeedL,
     StopJ,
     StopL,
-    orders_in,
+    parse_orders,
 )
 
 DOWN = (math.pi, 0.0, 0.0)
@@ -32,7 +32,7 @@ SPEED, RATE = st.floats(0.03, 0.5), st.floats(0.05, 5.0)
 PLACE = st.tuples(st.floats(0.4, 0.8), st.floats(-0.3, 0.3), st.floats(0.2, 0.5))
 
 
-def run(arm: Arm, seconds: float, dt: float = 0.008) -> np.ndarray:
+def run(arm: EmulatedArm, seconds: float, dt: float = 0.008) -> np.ndarray:
     """(tool's pose and speed) at every step [T, 12], until it rests or the time is up."""
     rows = []
     for _ in range(round(seconds / dt)):
@@ -66,7 +66,7 @@ def test_a_linear_move_arrives_on_a_straight_line_within_its_limits(
     place: tuple[float, float, float], heading: float, speed: float, rate: float
 ) -> None:
     config = UrEmulatorConfig()
-    arm = Arm(config)
+    arm = EmulatedArm(config)
     start = arm.state.tcp
     goal = (*place, math.pi * math.cos(heading / 2), math.pi * math.sin(heading / 2), 0.0)
     arm.order([MoveL(goal, speed, rate)])
@@ -77,7 +77,7 @@ def test_a_linear_move_arrives_on_a_straight_line_within_its_limits(
     assert not arm.busy
     assert not arm.moving
     np.testing.assert_allclose(arm.state.tcp[:3], goal[:3], atol=1e-12)
-    assert math.hypot(*turn(arm.state.tcp, goal)) < 1e-9
+    assert math.hypot(*rotation_between(arm.state.tcp, goal)) < 1e-9
     way = np.subtract(goal[:3], start[:3])
     off = rows[:, :3] - start[:3]
     length = np.linalg.norm(way)
@@ -96,7 +96,7 @@ def test_a_linear_move_arrives_on_a_straight_line_within_its_limits(
 def test_a_new_move_in_the_midst_of_another_never_jumps(
     other: tuple[float, float, float], after: float, rate: float
 ) -> None:
-    arm = Arm(UrEmulatorConfig())
+    arm = EmulatedArm(UrEmulatorConfig())
     arm.order([MoveL((0.6, 0.25, 0.3, *DOWN), 0.1, rate)])
     first = run(arm, after)
     arm.order([MoveL((*other, *DOWN), 0.1, rate)])
@@ -115,7 +115,7 @@ def test_a_new_move_in_the_midst_of_another_never_jumps(
 def test_a_joint_move_arrives_with_no_joint_faster_than_allowed(
     joints: tuple[float, ...], speed: float, rate: float
 ) -> None:
-    arm = Arm(UrEmulatorConfig())
+    arm = EmulatedArm(UrEmulatorConfig())
     goal = tuple(np.add(arm.state.joints, joints))
     arm.order([MoveJ(goal, speed, rate)])
     fastest = 0.0
@@ -136,8 +136,8 @@ def test_a_joint_move_arrives_with_no_joint_faster_than_allowed(
         MoveL((0.6, 0.3, 0.3, *DOWN), 0.1, 1.0),
     ],
 )
-def test_whatever_it_does_it_comes_to_rest(go: Order, stop: Order) -> None:
-    arm = Arm(UrEmulatorConfig())
+def test_whatever_it_does_it_comes_to_rest(go: MoveOrder, stop: MoveOrder) -> None:
+    arm = EmulatedArm(UrEmulatorConfig())
     arm.order([go])
     run(arm, 0.5)
     assert arm.moving
@@ -149,7 +149,7 @@ def test_whatever_it_does_it_comes_to_rest(go: Order, stop: Order) -> None:
 
 
 def test_a_speed_is_kept_until_told_otherwise_and_a_servo_follows() -> None:
-    arm = Arm(UrEmulatorConfig())
+    arm = EmulatedArm(UrEmulatorConfig())
     arm.order([SpeedL((0.0, 0.05, 0.0, 0.0, 0.0, 0.0), 0.5)])
     run(arm, 2.0)
     assert arm.state.speed[1] == pytest.approx(0.05)
@@ -163,7 +163,7 @@ def test_a_speed_is_kept_until_told_otherwise_and_a_servo_follows() -> None:
 
 
 def test_a_wall_pushes_back_by_its_stiffness() -> None:
-    arm = Arm(UrEmulatorConfig(walls=(WallConfig(axis="x", at=0.65, stiffness=2000.0),)))
+    arm = EmulatedArm(UrEmulatorConfig(walls=(WallConfig(axis="x", at=0.65, stiffness=2000.0),)))
     assert arm.force == (0.0,) * 6
     arm.order([MoveL((0.66, 0.0, 0.3, *DOWN), 0.05, 1.0)])
     run(arm, 10.0)
@@ -176,7 +176,7 @@ def test_a_wall_pushes_back_by_its_stiffness() -> None:
 
 
 def test_out_of_reach_raises_and_the_arm_stands() -> None:
-    arm = Arm(UrEmulatorConfig())
+    arm = EmulatedArm(UrEmulatorConfig())
     arm.order([MoveL(NOWHERE, 0.1, 1.0)])
     with pytest.raises(Unreachable):
         arm.step(0.008)
@@ -188,7 +188,7 @@ def test_out_of_reach_raises_and_the_arm_stands() -> None:
 
 
 def test_the_speed_slider_slows_moves_and_not_stops() -> None:
-    arm = Arm(UrEmulatorConfig())
+    arm = EmulatedArm(UrEmulatorConfig())
     arm.scale = 0.1
     arm.order([MoveL((0.6, 0.3, 0.3, *DOWN), 0.2, 1.0)])
     rows = run(arm, 3.0)
@@ -202,7 +202,7 @@ def test_a_path_is_read_as_the_client_writes_it() -> None:
         "\tsignal_async_progress(0)\n\tmovel(p[0.6,0.1,0.3,3.14159,0,0],a=0.5,v=0.1,r=0.02)\n"
         "\tsignal_async_progress(1)\n\tmovej([0,-1.5,1e-05,0,0,0],a=2,v=1,r=0)\nstopl(2)\nsync()\n"
     )
-    assert orders_in(text) == [
+    assert parse_orders(text) == [
         Mark(0),
         MoveL((0.6, 0.1, 0.3, 3.14159, 0.0, 0.0), 0.1, 0.5, 0.02),
         Mark(1),
@@ -213,5 +213,5 @@ def test_a_path_is_read_as_the_client_writes_it() -> None:
 
 @given(text=st.text())
 def test_no_text_is_too_strange_to_read(text: str) -> None:
-    orders_in(text)
-    orders_in(f"movel(p[{text}],a={text})\nstopl({text})\nsignal_async_progress({text})")
+    parse_orders(text)
+    parse_orders(f"movel(p[{text}],a={text})\nstopl({text})\nsignal_async_progress({text})")

@@ -12,13 +12,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.drivers.outcome import Outcome
+from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10.arm import Arm
-from robot.drivers.ur10.base_transform import tcp_of
-from robot.drivers.ur10.command_thread import Governor, Order
+from robot.drivers.ur10.base_transform import tcp_from_pose
+from robot.drivers.ur10.command_thread import ArmCommand, CommandThread
 from robot.drivers.ur10.config import SPEED_CAP, ArmConfig
-from robot.drivers.ur10.safety import LEAST, Refused, inside
-from robot.drivers.ur10.shared_state import Board
+from robot.drivers.ur10.safety import MIN_SPEED, TargetRefused, in_box
+from robot.drivers.ur10.shared_state import SharedState
 from tests.robot.drivers.ur10.conftest import HOME
 from tests.robot.drivers.ur10.test_safety import a_state
 
@@ -27,7 +27,7 @@ number = st.one_of(st.floats(allow_nan=True, allow_infinity=True), st.floats(-1.
 poses = st.one_of(
     st.lists(number, min_size=0, max_size=8),
     st.tuples(st.floats(-0.3, 1.6), st.floats(-0.3, 1.2), st.floats(-4, 4), st.floats(-0.2, 0.5)).map(
-        lambda v: tcp_of(CONFIG.placing, np.array(v[:3]), v[3]).tolist()
+        lambda v: tcp_from_pose(CONFIG.placing, np.array(v[:3]), v[3]).tolist()
     ),
 )
 speeds = st.one_of(number, st.floats(0.001, 0.06), st.sampled_from([0.25, 0.2501, 0.05, 0.1, 0.0, -0.05]))
@@ -57,35 +57,37 @@ class Control:
 
 
 @pytest.fixture(scope="module")
-def board() -> Iterator[Board]:
-    board = Board()
-    board.publish(a_state())
-    yield board
-    board.close()
+def shared() -> Iterator[SharedState]:
+    shared = SharedState()
+    shared.publish(a_state())
+    yield shared
+    shared.close()
 
 
-def governed(board: Board) -> tuple[Governor, Control, list[dict[str, Any]]]:
+def governed(shared: SharedState) -> tuple[CommandThread, Control, list[dict[str, Any]]]:
     """A governor of nothing, and what it tells the session."""
     control, told = Control(), []
-    return Governor(CONFIG, board, control, lambda **fields: told.append(fields)), control, told
+    return CommandThread(CONFIG, shared, control, lambda **fields: told.append(fields)), control, told
 
 
 @given(poses, speeds, st.sampled_from(["move", "retreat"]))
-def test_no_order_gets_a_bad_move_to_the_wire(board: Board, pose: list[float], speed: float, do: str) -> None:
-    governor, control, told = governed(board)
-    governor.execute(Order(do, 1, tuple(pose), speed, int(board.control["stops"])))
+def test_no_order_gets_a_bad_move_to_the_wire(
+    shared: SharedState, pose: list[float], speed: float, do: str
+) -> None:
+    governor, control, told = governed(shared)
+    governor.execute(ArmCommand(do, 1, tuple(pose), speed, int(shared.control["stops"])))
     if not control.moves:
         (fault,) = told
         assert fault["say"] == "fault"
         assert governor.held is not None
-        governor.execute(Order("move", 2, tuple(HOME), 0.01, int(board.control["stops"])))
+        governor.execute(ArmCommand("move", 2, tuple(HOME), 0.01, int(shared.control["stops"])))
         assert not control.moves
         return
     ((target, speed, acceleration, asynchronous),) = control.moves
     assert target == pose
     assert len(target) == 6
     assert np.isfinite(target).all()
-    assert inside(CONFIG, np.array(target))
+    assert in_box(CONFIG, np.array(target))
     assert 0 < speed <= SPEED_CAP
     way = math.dist(target[:3], HOME[:3])
     assert min(speed, math.sqrt(CONFIG.acceleration * way)) <= CONFIG.speed
@@ -94,50 +96,50 @@ def test_no_order_gets_a_bad_move_to_the_wire(board: Board, pose: list[float], s
     assert asynchronous is True
 
 
-def test_a_stop_revokes_the_orders_before_it(board: Board) -> None:
-    governor, control, _ = governed(board)
-    order = Order("move", 1, tuple(HOME), 0.01, int(board.control["stops"]))
-    board.control["stops"] += 1
+def test_a_stop_revokes_the_orders_before_it(shared: SharedState) -> None:
+    governor, control, _ = governed(shared)
+    order = ArmCommand("move", 1, tuple(HOME), 0.01, int(shared.control["stops"]))
+    shared.control["stops"] += 1
     governor.execute(order)
     assert control.moves == []
     governor._stopped = governor._wanted()
     governor.execute(order)
     assert control.moves == []
-    governor.execute(order._replace(stops=int(board.control["stops"])))
+    governor.execute(order._replace(stops=int(shared.control["stops"])))
     assert len(control.moves) == 1
 
 
-def test_the_watchdog_is_fed_only_while_the_session_lives(board: Board) -> None:
-    governor, control, _ = governed(board)
-    board.control["heartbeat"] = time.monotonic()
+def test_the_watchdog_is_fed_only_while_the_session_lives(shared: SharedState) -> None:
+    governor, control, _ = governed(shared)
+    shared.control["heartbeat"] = time.monotonic()
     governor.act()
     assert (control.kicks, control.stops) == (1, 0)
-    board.control["heartbeat"] = time.monotonic() - CONFIG.heartbeat - 0.001
+    shared.control["heartbeat"] = time.monotonic() - CONFIG.heartbeat - 0.001
     governor.act()
     assert control.kicks == 1
 
 
-def test_a_stop_comes_before_what_was_ordered(board: Board) -> None:
-    governor, control, _ = governed(board)
-    stops = int(board.control["stops"])
-    governor.put(Order("move", 1, tuple(HOME), 0.01, stops))
-    board.control["stops"] += 1
-    governor.put(Order("move", 2, tuple(HOME), 0.02, stops + 1))
+def test_a_stop_comes_before_what_was_ordered(shared: SharedState) -> None:
+    governor, control, _ = governed(shared)
+    stops = int(shared.control["stops"])
+    governor.put(ArmCommand("move", 1, tuple(HOME), 0.01, stops))
+    shared.control["stops"] += 1
+    governor.put(ArmCommand("move", 2, tuple(HOME), 0.02, stops + 1))
     governor.act()
     assert control.stops == 1
     assert [call[1] for call in control.moves] == [0.02]
     governor.leaving = True
-    governor.put(Order("move", 3, tuple(HOME), 0.01, stops + 1))
+    governor.put(ArmCommand("move", 3, tuple(HOME), 0.01, stops + 1))
     governor.act()
     assert len(control.moves) == 1
 
 
-def test_without_joints_nothing_is_told(board: Board) -> None:
-    governor, control, told = governed(board)
+def test_without_joints_nothing_is_told(shared: SharedState) -> None:
+    governor, control, told = governed(shared)
     control.reachable = False
-    governor.execute(Order("move", 1, tuple(HOME), 0.01, int(board.control["stops"])))
+    governor.execute(ArmCommand("move", 1, tuple(HOME), 0.01, int(shared.control["stops"])))
     assert control.moves == []
-    assert [fault["outcome"] for fault in told] == [Outcome.UNREACHABLE.name]
+    assert [fault["outcome"] for fault in told] == [SessionOutcome.UNREACHABLE.name]
 
 
 class Link:
@@ -174,12 +176,12 @@ def test_no_call_gets_a_bad_move_to_the_arms_process(
     link.orders.clear()
     try:
         move = arm.move(pose, speed)
-    except Refused:
+    except TargetRefused:
         assert link.orders == []
         return
     (order,) = link.orders
     assert order["target"] == pose
     assert np.isfinite(pose).all()
-    assert inside(CONFIG, np.array(pose))
-    assert speed is None or LEAST <= speed <= CONFIG.speed
+    assert in_box(CONFIG, np.array(pose))
+    assert speed is None or MIN_SPEED <= speed <= CONFIG.speed
     assert 0 < order["speed"] == move.speed <= SPEED_CAP
