@@ -90,9 +90,9 @@ class ClassicBackend:
         memories = jax.tree.map(enlarge, (state.templates, state.places), (empty.templates, empty.places))
         return state._replace(templates=memories[0], places=memories[1])
 
-    def inform(self, state: ClassicState, guidance: None) -> ClassicState:
+    def apply_map_feedback(self, state: ClassicState, feedback: None) -> ClassicState:
         """The classic map tells its kernel nothing."""
-        del guidance
+        del feedback
         return state
 
     def kernel(

@@ -11,7 +11,7 @@ from ratslam.classic.experience_map import ExperienceConfig
 from ratslam.classic.places import PlaceConfig
 from ratslam.classic.view_templates import TemplateConfig
 from ratslam.grid.config import GridConfig
-from ratslam.keyframes.config import FrameMapConfig
+from ratslam.keyframes.config import KeyframeMapConfig
 from ratslam.recall.filter import RecallConfig
 from tactile.base.config import Settings
 
@@ -41,9 +41,9 @@ class RecallBackendConfig(PoseCellBackendConfig):
 
     recall: RecallConfig = RecallConfig()
     """The Bayes filter over remembered frames."""
-    frames: FrameMapConfig = FrameMapConfig()
+    keyframes: KeyframeMapConfig = KeyframeMapConfig()
     """The keyframe map."""
-    lost: Annotated[float, Field(ge=0, le=1)] = 0.25
+    min_fit_share: Annotated[float, Field(ge=0, le=1)] = 0.25
     """Share of fitting revisits below which the robot is reported lost (see `RecallEvidence.health`)."""
 
 

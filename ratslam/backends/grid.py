@@ -157,9 +157,9 @@ class GridBackend:
         del capacity
         return state
 
-    def inform(self, state: GridState, guidance: Any) -> GridState:
+    def apply_map_feedback(self, state: GridState, feedback: Any) -> GridState:
         """The same: the filter asks nothing of its map."""
-        del guidance
+        del feedback
         return state
 
     def kernel(self, state: GridState, observation: Observation) -> tuple[GridState, Estimate, GridEvidence]:

@@ -16,11 +16,12 @@ from ratslam.backends.classic import finite
 from ratslam.backends.config import RecallBackendConfig
 from ratslam.classic import view_templates
 from ratslam.core.types import Action, Estimate, Scalar
+from ratslam.keyframes.ablation import FULL, Ablation
 from ratslam.keyframes.appearance import Appearance, Labels, Touch, Views
-from ratslam.keyframes.map import FrameMap
+from ratslam.keyframes.map import KeyframeMap
 from ratslam.recall import filter
-from ratslam.recall.filter import Guidance, Memory, Recollection
-from ratslam.recall.observation_model import by_label, by_touch, by_view
+from ratslam.recall.filter import MapFeedback, Memory, RecallResult
+from ratslam.recall.observation_model import label_likelihood, touch_likelihood, view_likelihood
 from ratslam.recall.whisker_likelihood import levels, pixels
 from tactile.base.types import Array, Observation
 
@@ -44,7 +45,7 @@ class RecallEvidence(NamedTuple):
     """What one step adds to the map and to the record.
 
     Attributes:
-        frame to background: see `Recollection`. energy: injected into the pose cells. packet: [3] decoded,
+        frame to background: see `RecallResult`. energy: injected into the pose cells. packet: [3] decoded,
             cells. health: see `RecallState`. outcome: an `Outcome`, int32.
     """
 
@@ -73,16 +74,20 @@ class RecallBackend:
     """
 
     def __init__(
-        self, config: RecallBackendConfig, view_shape: tuple[int, int, int], dtype: Any = np.float64
+        self,
+        config: RecallBackendConfig,
+        view_shape: tuple[int, int, int],
+        dtype: Any = np.float64,
+        ablation: Ablation = FULL,
     ) -> None:
         labels = config.templates.source == "labels"
-        self.config = config
-        self.recall = config.recall.model_copy(update={"fan": "none"}) if labels else config.recall
-        if self.recall.fan == "whiskers" and view_shape[1] % 2:  # no whisker has one opposite
+        self.config, self.ablation = config, ablation
+        self.recall = config.recall.model_copy(update={"sector_fov": "none"}) if labels else config.recall
+        if self.recall.sector_fov == "whiskers" and view_shape[1] % 2:  # no whisker has one opposite
             self.recall = self.recall.model_copy(update={"shifts": 0})
         self.labels, self.view_shape = labels, view_shape
         self.size = 0 if labels else int(np.prod(view_shape))
-        self.pixels = pixels(view_shape) if self.recall.fan == "whiskers" else None
+        self.pixels = pixels(view_shape) if self.recall.sector_fov == "whiskers" else None
         self.dtype = np.dtype(dtype)
         self.cell = config.pose_cells.cell_size
         self.rungs = adaptive_window.rungs(config.pose_cells, self.dtype)
@@ -111,9 +116,9 @@ class RecallBackend:
         empty = self.init(None, capacity).memory
         return state._replace(memory=jax.tree.map(enlarge, state.memory, empty))
 
-    def inform(self, state: RecallState, guidance: Guidance) -> RecallState:
+    def apply_map_feedback(self, state: RecallState, feedback: MapFeedback) -> RecallState:
         """The filter takes up the poses, bias and scales of the map."""
-        return state._replace(memory=filter.inform(state.memory, guidance))
+        return state._replace(memory=filter.apply_map_feedback(state.memory, feedback))
 
     def kernel(
         self, state: RecallState, observation: Observation
@@ -156,7 +161,7 @@ class RecallBackend:
             place=place,
             previous=place,
             action=jnp.int32(Action.NONE),
-            lost=(health < self.config.lost) | (outcome == Outcome.TOO_FAST),
+            lost=(health < self.config.min_fit_share) | (outcome == Outcome.TOO_FAST),
         )
         evidence = RecallEvidence(
             **recollection._asdict(),
@@ -168,10 +173,17 @@ class RecallBackend:
         )
         return RecallState(cells, memory, health), estimate, evidence
 
-    def new_map(self) -> FrameMap:
+    def new_map(self) -> KeyframeMap:
         """An empty frame map."""
         guard, closures = self.recall.guard, self.config.experience.closures
-        return FrameMap(self.config.frames, self.cell, self._appearance(), guard=guard, closures=closures)
+        return KeyframeMap(
+            self.config.keyframes,
+            self.cell,
+            self._appearance(),
+            guard=guard,
+            closures=closures,
+            ablation=self.ablation,
+        )
 
     def _appearance(self) -> Appearance:
         if self.labels:
@@ -201,18 +213,18 @@ class RecallBackend:
         reports = jnp.repeat(reports[:, :, None], self.view_shape[2], axis=2).reshape(-1)
         return levels(flat, reports.astype(self.dtype)).astype(jnp.int32)
 
-    def _look(self, memory: Memory, view: Array, label: Array) -> tuple[Memory, Recollection]:
+    def _look(self, memory: Memory, view: Array, label: Array) -> tuple[Memory, RecallResult]:
         if self.labels:
-            weighing = by_label(self.recall, memory, label)
+            weighing = label_likelihood(self.recall, memory, label)
         elif self.pixels is not None:
-            memory, weighing = by_touch(self.recall, memory, view, self.pixels)
+            memory, weighing = touch_likelihood(self.recall, memory, view, self.pixels)
         else:
-            weighing = by_view(self.recall, self.cell, memory, view)
+            weighing = view_likelihood(self.recall, self.cell, memory, view)
         return filter.look(self.recall, self.cell, memory, weighing)
 
-    def _injection(self, memory: Memory, recollection: Recollection) -> tuple[Array, Array]:
+    def _injection(self, memory: Memory, recollection: RecallResult) -> tuple[Array, Array]:
         """Where a candidate's packet was, turned as the view is, and energy by its posterior."""
-        known = (recollection.frame >= 0) & (recollection.mass > self.config.frames.certain)
+        known = (recollection.frame >= 0) & (recollection.mass > self.config.keyframes.candidate_posterior)
         turned = -recollection.shift.astype(self.dtype) * memory.angle / self.units[2]
         packet = memory.packet[jnp.maximum(recollection.match, 0)]
         packet = packet + jnp.stack([jnp.zeros_like(turned), jnp.zeros_like(turned), turned])

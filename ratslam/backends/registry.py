@@ -21,6 +21,7 @@ from ratslam.backends.grid import GridEvidence
 from ratslam.backends.recall import RecallBackend, RecallEvidence
 from ratslam.core.backend import Backend
 from ratslam.core.types import Scalar
+from ratslam.keyframes.ablation import FULL, Ablation
 from tactile.base.config import Settings
 from tactile.whiskers.planar_whiskers import Feelers
 
@@ -41,13 +42,14 @@ class BackendEntry(NamedTuple):
 
     Attributes:
         name: value of `backend` in a configuration. config_class: sections of the configuration it reads.
-        build: makes the backend from a `config_class`, the sensors and the dtype of all floating state.
+        build: makes the backend from a `config_class`, the sensors, the dtype of all floating state
+            and what a study turns off.
         evidence: NamedTuple type of a step's evidence. outcomes: values of its field `outcome`.
     """
 
     name: str
     config_class: type[Settings]
-    build: Callable[[Any, Sensors, np.dtype], Backend]
+    build: Callable[[Any, Sensors, np.dtype, Ablation], Backend]
     evidence: type[Any]
     outcomes: type[IntEnum]
 
@@ -57,15 +59,17 @@ class BackendEntry(NamedTuple):
         return tuple(name for name, hint in hints.items() if hint == Scalar and name != "outcome")
 
 
-def _recall(config: RecallBackendConfig, sensors: Sensors, dtype: np.dtype) -> Backend:
-    return RecallBackend(config, sensors.view_shape, dtype)
+def _recall(config: RecallBackendConfig, sensors: Sensors, dtype: np.dtype, ablation: Ablation) -> Backend:
+    return RecallBackend(config, sensors.view_shape, dtype, ablation)
 
 
-def _classic(config: ClassicBackendConfig, sensors: Sensors, dtype: np.dtype) -> Backend:
+def _classic(config: ClassicBackendConfig, sensors: Sensors, dtype: np.dtype, ablation: Ablation) -> Backend:
+    del ablation  # nothing to turn off
     return ClassicBackend(config, sensors.view_shape, dtype)
 
 
-def _grid(config: GridBackendConfig, sensors: Sensors, dtype: np.dtype) -> Backend:
+def _grid(config: GridBackendConfig, sensors: Sensors, dtype: np.dtype, ablation: Ablation) -> Backend:
+    del ablation  # nothing to turn off
     return grid.build(config.grid, sensors.feelers, dtype)
 
 
@@ -80,14 +84,17 @@ BACKENDS: dict[str, BackendEntry] = {
 """Every method that `backend` may name."""
 
 
-def build(name: str, config: Settings, sensors: Sensors, dtype: Any = np.float64) -> Backend:
+def build(
+    name: str, config: Settings, sensors: Sensors, dtype: Any = np.float64, ablation: Ablation = FULL
+) -> Backend:
     """The backend `name` with its sections of `config`.
 
     Args:
         config: has the fields of the entry's `config_class`, for example a completed `RunConfig`.
+        ablation: parts of the keyframe map to turn off; other methods have none.
 
     Raises:
         InputError: the method needs whiskers and there are none, or its maps have too many cells.
     """
     entry = BACKENDS[name]
-    return entry.build(select_settings(config, entry.config_class), sensors, np.dtype(dtype))
+    return entry.build(select_settings(config, entry.config_class), sensors, np.dtype(dtype), ablation)

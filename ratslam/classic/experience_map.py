@@ -17,7 +17,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from ratslam.classic.relaxation import relax
 from ratslam.core.backend import Evidence
-from ratslam.core.growable_array import Growing
+from ratslam.core.growable_array import GrowableArray
 from ratslam.core.types import Action, Estimate
 from ratslam.pose_graph import Edges, geman_mcclure, huber, least_squares, no_kernel
 from ratslam.pose_graph.io import write_g2o, write_json
@@ -100,18 +100,18 @@ class ExperienceMap:
 
     def __init__(self, config: ExperienceConfig | None = None) -> None:
         self.config = config or ExperienceConfig()
-        self._pose = Growing((3,), np.float64)
-        self._node_of = Growing((), np.int64)  # place id -> node, -1 for ids that never became a node
-        self._template = Growing((), np.int64)
-        self._made = Growing((), np.int64)  # the step at which each node was made
-        self._ends = Growing((2,), np.int64)
-        self._motion = Growing((3,), np.float64)
-        self._information = Growing((3,), np.float64)
-        self._record = Growing((3,), np.float64)  # traversals, metres, seconds
-        self._closure = Growing((), np.bool_)
-        self._step_node = Growing((), np.int64)
-        self._step_motion = Growing((3,), np.float64)
-        self._reached = Growing((2,), np.int64)  # step, and the first step at the node reached
+        self._pose = GrowableArray((3,), np.float64)
+        self._node_of = GrowableArray((), np.int64)  # place id -> node, -1 for ids that never became a node
+        self._template = GrowableArray((), np.int64)
+        self._made = GrowableArray((), np.int64)  # the step at which each node was made
+        self._ends = GrowableArray((2,), np.int64)
+        self._motion = GrowableArray((3,), np.float64)
+        self._information = GrowableArray((3,), np.float64)
+        self._record = GrowableArray((3,), np.float64)  # traversals, metres, seconds
+        self._closure = GrowableArray((), np.bool_)
+        self._step_node = GrowableArray((), np.int64)
+        self._step_motion = GrowableArray((3,), np.float64)
+        self._reached = GrowableArray((2,), np.int64)  # step, and the first step at the node reached
         self._link_of: dict[tuple[int, int], int] = {}
         self._current = -1
         self._travel = departure(0.0)
@@ -142,7 +142,7 @@ class ExperienceMap:
         origin = np.where(node[:, None] >= 0, self._pose.rows[np.maximum(node, 0)], 0.0)
         return compose(origin, motion)
 
-    def so_far(self) -> np.ndarray:
+    def online_trajectory(self) -> np.ndarray:
         """[T, 3] the same: this map has nothing left to settle."""
         return self.trajectory()
 
@@ -174,7 +174,7 @@ class ExperienceMap:
 
     # What changes it
 
-    def guidance(self) -> None:
+    def feedback(self) -> None:
         """Nothing: the classic kernel knows no map."""
 
     def update(self, observation: Observation, estimate: Estimate, evidence: Evidence) -> Estimate:
@@ -295,8 +295,8 @@ class ExperienceMap:
 
     # What a checkpoint keeps
 
-    def _growing(self) -> dict[str, Growing]:
-        return {name[1:]: value for name, value in vars(self).items() if isinstance(value, Growing)}
+    def _growing(self) -> dict[str, GrowableArray]:
+        return {name[1:]: value for name, value in vars(self).items() if isinstance(value, GrowableArray)}
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Everything, so that `restore` continues bit for bit."""

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ratslam.cli.common import Commands, add_config, add_workers, positive_integer, prepare_jax
 from tactile.base.errors import InputError
+
+if TYPE_CHECKING:
+    from ratslam.experiments.trials.ablation import Variant
 
 
 def add_commands(commands: Commands) -> None:
@@ -52,16 +56,16 @@ def _ablate(arguments: argparse.Namespace) -> int:
 def _vary(arguments: argparse.Namespace) -> int:
     prepare_jax()
     from ratslam.config.strict_yaml import load, override
-    from ratslam.experiments.trials.ablation import variations
+    from ratslam.experiments.trials.ablation import Variant, variations
 
     if not 0 < arguments.by < 1:
         raise InputError("--by", str(arguments.by), "a share between 0 and 1")
     document = override(load(arguments.config), arguments.set)
     lines = [
-        (f"{name} = {value:.4g}", (f"{name}={value!r}",))
+        (f"{name} = {value:.4g}", Variant((f"{name}={value!r}",)))
         for name, value in variations(document, arguments.by)
     ]
-    finals = _table(arguments, [("as configured", ()), *lines])
+    finals = _table(arguments, [("as configured", Variant()), *lines])
     limit = 1.25 * finals[0] if arguments.limit is None else arguments.limit
     if finals[0] != finals[0]:
         print("the recording has no truth, so nothing can be said of what is kept")
@@ -73,10 +77,10 @@ def _vary(arguments: argparse.Namespace) -> int:
 
 def _spread(arguments: argparse.Namespace) -> int:
     prepare_jax()
-    from ratslam.experiments.trials.ablation import HEADER, compare, row
+    from ratslam.experiments.trials.ablation import HEADER, Variant, compare, row
 
     print(HEADER)
-    variants = [((), seed) for seed in range(arguments.runs + 1)]
+    variants = [(Variant(), seed) for seed in range(arguments.runs + 1)]
     trials = []
     for seed, trial in enumerate(compare(Path(arguments.config), arguments.set, variants, arguments.workers)):
         print(row(f"perturbed, seed {seed}" if seed else "as it is", [trial]), flush=True)
@@ -85,12 +89,12 @@ def _spread(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _table(arguments: argparse.Namespace, lines: list[tuple[str, tuple[str, ...]]]) -> list[float]:
+def _table(arguments: argparse.Namespace, lines: list[tuple[str, Variant]]) -> list[float]:
     """Prints a row as soon as all of its trials are done; returns the final errors."""
     from ratslam.experiments.trials.ablation import HEADER, compare, row
 
     seeds = range(1, arguments.perturbed + 1) if arguments.perturbed else (0,)
-    variants = [(sets, seed) for _, sets in lines for seed in seeds]
+    variants = [(variant, seed) for _, variant in lines for seed in seeds]
     trials = compare(Path(arguments.config), arguments.set, variants, arguments.workers)
     print(HEADER)
     finals = []

@@ -2,7 +2,29 @@
 
 from __future__ import annotations
 
-RENAMED: dict[str, str] = {"matcher": "write backend: recall or backend: classic"}
+RENAMED: dict[str, str] = {
+    "matcher": "write backend: recall or backend: classic",
+    "lost": "min_fit_share",
+    "frames": "keyframes",
+    "recall.fan": "recall.sector_fov",
+    "recall.leave": "recall.mode_decay",
+    "recall.nothing": "recall.miss_weight",
+    "keyframes.length": "keyframes.min_length",
+    "keyframes.score": "keyframes.min_score",
+    "keyframes.distance": "keyframes.max_distance",
+    "keyframes.gap": "keyframes.max_gap",
+    "keyframes.certain": "keyframes.candidate_posterior",
+    "keyframes.whole": "keyframes.sequence_agreement",
+    "keyframes.doubt": "keyframes.sequence_cost",
+    "keyframes.stray": "keyframes.closure_cost_limit",
+    "keyframes.facing": "keyframes.max_turn",
+    "keyframes.weigh_every": "keyframes.select_every",
+    "keyframes.weigh_score": "keyframes.select_score",
+    "keyframes.weigh_length": "keyframes.select_length",
+    "keyframes.verify": "only the ablation study turns verification off",
+    "keyframes.robust": "only the ablation study turns robust weights off",
+    "keyframes.bias_in_map": "only the ablation study turns the heading bias off",
+}
 """Old dotted path of a setting to the new one, or to a sentence that says what to write instead.
 
 A renamed section maps the keys in it as well; only those with new names of their own need a line."""

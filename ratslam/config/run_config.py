@@ -25,17 +25,17 @@ from tactile.frontend import TouchConfig
 
 TOUCH: dict[str, dict[str, Any]] = {
     "pose_cells": {"cell_size": 0.05, "cells_xy": 21},
-    "recall": {"fan": "whiskers", "leave": 0.003, "nothing": 0.01, "modes": 4},
-    "frames": {
+    "recall": {"sector_fov": "whiskers", "mode_decay": 0.003, "miss_weight": 0.01, "modes": 4},
+    "keyframes": {
         "noise": {"per_cell": 0.22, "heading_per_cell": 0.1, "heading_per_radian": 0.2},
         "bias_sd": 0.001,
-        "score": 12.0,
-        "distance": 60.0,
-        "whole": 0.2,
+        "min_score": 12.0,
+        "max_distance": 60.0,
+        "sequence_agreement": 0.2,
         "breaks": False,
-        "weigh_every": 50,
+        "select_every": 50,
         "solve_every": 20,
-        "facing": 0.6,
+        "max_turn": 0.6,
         "place_radius": 1.3,
         "place_heading": 0.17,
     },
@@ -145,7 +145,9 @@ class RunConfig(RecallBackendConfig, ClassicBackendConfig, GridBackendConfig, So
         completed = self.model_copy(update=parts)
         if completed.backend == "grid":
             return completed._charted(source)
-        if source.whiskers and ("fan" not in self.recall.model_fields_set or self.recall.fan == "whiskers"):
+        if source.whiskers and (
+            "sector_fov" not in self.recall.model_fields_set or self.recall.sector_fov == "whiskers"
+        ):
             return _filled(completed, TOUCH)
         return completed
 

@@ -2,7 +2,7 @@
 
 A backend is a pure kernel and a map that folds what the kernel reports. The kernel never sees the map and
 the map never sees the kernel's state, so the kernel can be scanned, batched and replayed bit for bit. One way
-leads back: at fixed counts of steps the map gives its guidance, a plain record, and the state takes it up.
+leads back: at fixed counts of steps the map gives its feedback, a plain record, and the state takes it up.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ State = Any
 """A pytree of arrays of fixed shapes and dtypes."""
 Evidence = Any
 """The backend's own fixed-shape record of one step, a NamedTuple of arrays."""
-Guidance = Any
-"""What a map tells its kernel, a record of host arrays; None where the kernel asks for nothing."""
+Feedback = Any
+"""What the kernel receives of the map: a record of host arrays, or None."""
 
 
 class Map(Protocol):
@@ -31,7 +31,7 @@ class Map(Protocol):
     def update(self, observation: Observation, estimate: Estimate, evidence: Evidence) -> Estimate:
         """Folds one step; returns the estimate with what only the map knows (places it has confirmed)."""
 
-    def guidance(self) -> Guidance:
+    def feedback(self) -> Feedback:
         """What the kernel may know of the map as it is now."""
 
     def pose(self, estimate: Estimate) -> np.ndarray:
@@ -40,7 +40,7 @@ class Map(Protocol):
     def trajectory(self) -> np.ndarray:
         """[T, 3] every folded step as the map sees it now."""
 
-    def so_far(self) -> np.ndarray:
+    def online_trajectory(self) -> np.ndarray:
         """[T, 3] the same, unsettled: what the robot acts on at this moment."""
 
     def closures(self) -> np.ndarray:
@@ -71,7 +71,7 @@ class Backend(Protocol):
     def grow(self, state: State, capacity: int) -> State:
         """The same state with more room."""
 
-    def inform(self, state: State, guidance: Guidance) -> State:
+    def apply_map_feedback(self, state: State, feedback: Feedback) -> State:
         """The state that has taken up what the map told; same shapes and dtypes."""
 
     def kernel(self, state: State, observation: Observation) -> tuple[State, Estimate, Evidence]:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 
-class Growing:
+class GrowableArray:
     """Rows of one shape and dtype; room doubles when it is used up, so n appends cost O(n)."""
 
     def __init__(self, shape: tuple[int, ...], dtype: Any) -> None:

@@ -82,7 +82,7 @@ class Session:
     def warm(self, observation: Observation) -> None:
         """Compiles for observations like this one; the first step stays what it would have been."""
         self._layout = self._layout or layout_of(observation)
-        self.state = self.backend.inform(self.state, self.map.guidance())
+        self.state = self.backend.apply_map_feedback(self.state, self.map.feedback())
         self.state, _ = self._run(self.state, room(self._layout, CHUNK), np.int32(0))
 
     def arrays(self) -> dict[str, np.ndarray]:
@@ -127,7 +127,7 @@ class Session:
             capacity = capacity_at(self.backend.rows(self.state) + CHUNK - 1, self.reserve)
             if capacity > self._capacity:
                 self.state, self._capacity = self.backend.grow(self.state, capacity), capacity
-            self.state = self.backend.inform(self.state, self.map.guidance())
+            self.state = self.backend.apply_map_feedback(self.state, self.map.feedback())
         count = len(observations)
         self._layout = self._layout or layout_of(observations[0])
         chunk = room(self._layout, CHUNK)

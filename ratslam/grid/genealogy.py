@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ratslam.core.growable_array import Growing
+from ratslam.core.growable_array import GrowableArray
 
 LEVELS = 4_000_000
 """Poses kept of reports that may still be told apart."""
@@ -19,9 +19,9 @@ class Ancestry:
 
     def __init__(self, count: int) -> None:
         self.count = count
-        self._settled = Growing((3,), np.float64)
-        self._ancestor = Growing((count,), np.int32)
-        self._pose = Growing((count, 3), np.float64)
+        self._settled = GrowableArray((3,), np.float64)
+        self._ancestor = GrowableArray((count,), np.int32)
+        self._pose = GrowableArray((count, 3), np.float64)
         self._weight = np.full(count, 1.0 / count)
 
     def __len__(self) -> int:

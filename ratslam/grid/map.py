@@ -9,7 +9,7 @@ from typing import Any
 import networkx
 import numpy as np
 
-from ratslam.core.growable_array import Growing
+from ratslam.core.growable_array import GrowableArray
 from ratslam.core.types import Estimate
 from ratslam.grid.config import GridConfig
 from ratslam.grid.genealogy import Ancestry
@@ -29,11 +29,11 @@ class GridMap:
         self.config, self.feelers, self.side = config, feelers, side
         whiskers = len(feelers.length)
         self._ancestry = Ancestry(config.particles)
-        self._online = Growing((3,), np.float64)
-        self._motion = Growing((), np.int64)
-        self._flags = Growing((whiskers, 2), bool)  # in contact, reports at all
-        self._point = Growing((whiskers, 2), np.float64)
-        self._wall = Growing((2,), np.float64)  # its nearest point; NaN: none
+        self._online = GrowableArray((3,), np.float64)
+        self._motion = GrowableArray((), np.int64)
+        self._flags = GrowableArray((whiskers, 2), bool)  # in contact, reports at all
+        self._point = GrowableArray((whiskers, 2), np.float64)
+        self._wall = GrowableArray((2,), np.float64)  # its nearest point; NaN: none
 
     def update(self, observation: Observation, estimate: Estimate, evidence: Any) -> Estimate:
         """Keeps the particles and what was felt."""
@@ -45,7 +45,7 @@ class GridMap:
         self._wall.append(observation.wall_point if observation.wall else [np.nan, np.nan])
         return estimate
 
-    def guidance(self) -> None:
+    def feedback(self) -> None:
         """The filter asks for nothing."""
 
     def pose(self, estimate: Estimate) -> np.ndarray:
@@ -56,7 +56,7 @@ class GridMap:
         """[T, 3] the weighted mean of the paths of the particles that are left."""
         return self._ancestry.path()
 
-    def so_far(self) -> np.ndarray:
+    def online_trajectory(self) -> np.ndarray:
         """[T, 3] the same: it needs no settling."""
         return self._ancestry.path()
 
@@ -98,5 +98,5 @@ class GridMap:
         prefix = "ancestry/"
         self._ancestry.restore({k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)})
 
-    def _growing(self) -> dict[str, Growing]:
-        return {name[1:]: value for name, value in vars(self).items() if isinstance(value, Growing)}
+    def _growing(self) -> dict[str, GrowableArray]:
+        return {name[1:]: value for name, value in vars(self).items() if isinstance(value, GrowableArray)}

@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from ratslam.core.backend import Evidence
-from ratslam.core.growable_array import Growing
+from ratslam.core.growable_array import GrowableArray
 from ratslam.keyframes.view_sectors import NOTHING, Fan, Slope
 from ratslam.recall.filter import NO_LIKENESS
 from ratslam.recall.whisker_likelihood import Pixels, background, levels, table, variation
@@ -41,7 +41,7 @@ UNTOLD = float(np.log(2))
 
 
 class Measure(NamedTuple):
-    """What recall compares by: see `Guidance`."""
+    """What recall compares by: see `MapFeedback`."""
 
     angle: float
     scale: float
@@ -83,7 +83,7 @@ class Labels:
     """Ids given with the recording."""
 
     def __init__(self) -> None:
-        self._label = Growing((), np.int64)
+        self._label = GrowableArray((), np.int64)
 
     def measure(self) -> Measure:
         return Measure(0.0, 0.0, NO_LIKENESS)
@@ -119,8 +119,8 @@ class Views:
     ) -> None:
         self._normalise = normalise
         self._fan = None if fan is None or not size else Fan(size, fan / size)
-        self._view = Growing((size,), np.float64)
-        self._background = Growing((), np.float64)
+        self._view = GrowableArray((size,), np.float64)
+        self._background = GrowableArray((), np.float64)
         self._scale = (0, 0.0)  # errors it was taken from, and the scale
 
     def measure(self) -> Measure:
@@ -194,7 +194,7 @@ class Touch:
         self, pixels: Pixels, temper: float, normalise: Callable[[np.ndarray], np.ndarray] = np.asarray
     ) -> None:
         self._pixels, self._temper, self._normalise = pixels, temper, normalise
-        self._level = Growing((len(pixels.group),), np.int64)
+        self._level = GrowableArray((len(pixels.group),), np.int64)
         self._likeness = NO_LIKENESS
 
     def measure(self) -> Measure:

@@ -70,7 +70,7 @@ tells for the frames after a frame, the motion [3] that carries the last of them
 frame."""
 
 
-def arbitrate(
+def select_closures(
     case: Case, starts: Sequence[Fit], where: Where, earlier: tuple[tuple[int, int], ...] = ()
 ) -> Judgement:
     """The judgement with the least cost.

@@ -7,7 +7,7 @@ from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveIn
 from tactile.base.config import Settings
 
 
-class FrameNoise(Settings):
+class KeyframeNoise(Settings):
     """How much the odometry between frames is believed; cells are pose cells."""
 
     per_cell: PositiveFloat = 0.05
@@ -22,13 +22,11 @@ class FrameNoise(Settings):
     """The same of heading, rad."""
 
 
-class FrameMapConfig(Settings):
+class KeyframeMapConfig(Settings):
     """The map of frames: what is believed, and how much. Lengths are in pose cells."""
 
-    noise: FrameNoise = FrameNoise()
+    noise: KeyframeNoise = KeyframeNoise()
     """Trust in odometry."""
-    bias_in_map: bool = True
-    """Whether the map solves for the heading bias."""
     bias_from_views: bool = True
     """Whether ordered views tell it beforehand."""
     bias_sd: PositiveFloat = 0.012
@@ -37,20 +35,20 @@ class FrameMapConfig(Settings):
     """The views are never believed better than this, rad per cell."""
     shrink: NonNegativeFloat = 3.0
     """Standard errors under which the views' bias is taken for none."""
-    certain: PositiveFloat = 0.5
+    candidate_posterior: PositiveFloat = 0.5
     """Posterior from which a recollection is a candidate."""
-    gap: PositiveInt = 3
+    max_gap: PositiveInt = 3
     """Frames from one candidate of a run to the next, at most."""
     agreement: PositiveFloat = 2.0
     """How far candidates of a run may differ from the odometry between them, cells (and a tenth of it)."""
     agreement_heading: PositiveFloat = 0.5
     """The same of heading, rad."""
-    length: PositiveInt = 2
+    min_length: PositiveInt = 2
     """Candidates that an accepted run has at least."""
-    score: PositiveFloat = 4.0
+    min_score: PositiveFloat = 4.0
     """Evidence it has at least, after half its squared Mahalanobis distance from the map is taken off and
     the log of how many times more frames the map allows than stand around one place."""
-    distance: PositiveFloat = 12.0
+    max_distance: PositiveFloat = 12.0
     """That squared distance is smaller than this."""
     gate_sd: PositiveFloat = 0.7
     """Standard deviation added to the map's own in that distance, cells."""
@@ -60,8 +58,6 @@ class FrameMapConfig(Settings):
     """Standard deviation of a closure, cells."""
     closure_heading: PositiveFloat = 0.12
     """The same of heading, rad."""
-    robust: bool = True
-    """Whether runs that disagree with the map lose weight."""
     robust_per_score: PositiveFloat = 0.5
     """Robust scale (mean squared deviation) for each unit of a run's evidence."""
     robust_least: PositiveFloat = 2.0
@@ -74,21 +70,19 @@ class FrameMapConfig(Settings):
     """Candidates in such a run."""
     break_score: PositiveFloat = 100.0
     """Evidence in it."""
-    verify: bool = True
-    """Whether runs are held against the map's covariance before they count."""
-    whole: NonNegativeFloat = 0.0
+    sequence_agreement: NonNegativeFloat = 0.0
     """How far the whole of a run may differ from the odometry, beside `agreement`, as a share of the way; 0:
     only from one candidate to the next."""
-    weigh_every: NonNegativeInt = 0
+    select_every: NonNegativeInt = 0
     """Frames after which all runs are weighed against each other anew, believed or not (see
     `ratslam.keyframes.closure_selection`); 0: never, a run once accepted stays."""
-    weigh_score: PositiveFloat = 12.0
+    select_score: PositiveFloat = 12.0
     """Evidence of the runs that are weighed."""
-    weigh_length: PositiveInt = 4
+    select_length: PositiveInt = 4
     """Candidates that they have at least."""
-    doubt: PositiveFloat = 6.0
+    sequence_cost: PositiveFloat = 6.0
     """Evidence that a weighed run must bring before it may strain the map at all."""
-    stray: PositiveFloat = 6.0
+    closure_cost_limit: PositiveFloat = 6.0
     """Chi-square that a single closure of a weighed run can cost at most."""
     solve_every: PositiveInt = 1
     """Frames between two solutions while a run goes on."""
@@ -96,7 +90,7 @@ class FrameMapConfig(Settings):
     """Solver steps when a loop closes."""
     settling: PositiveInt = 15
     """Solver steps for the final map."""
-    facing: PositiveFloat = 10.0
+    max_turn: PositiveFloat = 10.0
     """Share of `agreement_heading` by which a robot may be turned and still be in a known experience."""
     place_radius: PositiveFloat = 2.0
     """Reach of an experience, cells."""

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import networkx
 import numpy as np
 
-from ratslam.core.growable_array import Growing
+from ratslam.core.growable_array import GrowableArray
 from ratslam.core.types import Action
 from tactile.base.se2 import between, wrap
 
@@ -24,7 +24,7 @@ class Said(NamedTuple):
     action: Action
 
 
-class Grouping:
+class Experiences:
     """Which experience each frame belongs to.
 
     Args:
@@ -33,9 +33,9 @@ class Grouping:
 
     def __init__(self, radius: float, heading: float) -> None:
         self.radius, self.heading = radius, heading
-        self._frame = Growing((), np.int64)  # the frame each experience was made at
-        self._place = Growing((), np.int64)  # the experience of each frame
-        self._link = Growing((3,), np.int64)  # from, to, traversals
+        self._frame = GrowableArray((), np.int64)  # the frame each experience was made at
+        self._place = GrowableArray((), np.int64)  # the experience of each frame
+        self._link = GrowableArray((3,), np.int64)  # from, to, traversals
         self._link_of: dict[tuple[int, int], int] = {}
         self._current = -1
 

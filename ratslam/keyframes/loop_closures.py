@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.core.growable_array import Growing
+from ratslam.core.growable_array import GrowableArray
 from ratslam.keyframes.optimizer import Closures
 
 
@@ -37,15 +37,15 @@ class Candidate(NamedTuple):
     gain: float
 
 
-class Ledger:
+class ClosureLog:
     """All candidates and runs, in order of time."""
 
     def __init__(self) -> None:
-        self._candidate = Growing((4,), np.int64)  # frame, match, shift, run (-1: struck out)
-        self._evidence = Growing((2,), np.float64)  # mass, gain
-        self._verdict = Growing((), np.int64)
-        self._distance = Growing((), np.float64)
-        self._weight = Growing((), np.float64)
+        self._candidate = GrowableArray((4,), np.int64)  # frame, match, shift, run (-1: struck out)
+        self._evidence = GrowableArray((2,), np.float64)  # mass, gain
+        self._verdict = GrowableArray((), np.int64)
+        self._distance = GrowableArray((), np.float64)
+        self._weight = GrowableArray((), np.float64)
         self._lines: np.ndarray | None = None
 
     @property
@@ -174,5 +174,5 @@ class Ledger:
             rows.replace(arrays[name])
         self._lines = None
 
-    def _growing(self) -> dict[str, Growing]:
-        return {name[1:]: value for name, value in vars(self).items() if isinstance(value, Growing)}
+    def _growing(self) -> dict[str, GrowableArray]:
+        return {name[1:]: value for name, value in vars(self).items() if isinstance(value, GrowableArray)}

@@ -17,13 +17,14 @@ import networkx
 import numpy as np
 
 from ratslam.core.backend import Evidence
-from ratslam.core.growable_array import Growing
+from ratslam.core.growable_array import GrowableArray
 from ratslam.core.types import Estimate
+from ratslam.keyframes.ablation import FULL, Ablation
 from ratslam.keyframes.appearance import Appearance, Match
-from ratslam.keyframes.closure_selection import FINE, KEPT, STEPS, Case, arbitrate
-from ratslam.keyframes.config import FrameMapConfig
-from ratslam.keyframes.experiences import Grouping
-from ratslam.keyframes.loop_closures import Candidate, Ledger, Verdict
+from ratslam.keyframes.closure_selection import FINE, KEPT, STEPS, Case, select_closures
+from ratslam.keyframes.config import KeyframeMapConfig
+from ratslam.keyframes.experiences import Experiences
+from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
 from ratslam.keyframes.optimizer import (
     Chain,
     Closures,
@@ -34,7 +35,7 @@ from ratslam.keyframes.optimizer import (
 )
 from ratslam.pose_graph import Edges
 from ratslam.pose_graph.io import write_g2o, write_json
-from ratslam.recall.filter import Guidance
+from ratslam.recall.filter import MapFeedback
 from tactile.base.se2 import (
     between,
     compose,
@@ -66,14 +67,14 @@ class Settled(NamedTuple):
     """A map brought to an end: its fit, which runs it believes, and before which frames odometry is cut."""
 
     fit: Fit
-    ledger: Ledger
-    cut: Growing
+    ledger: ClosureLog
+    cut: GrowableArray
 
 
 HALT = Travel(np.zeros(3), 0.0, 0.0)
 
 
-class FrameMap:
+class KeyframeMap:
     """Folds what the unified filter reports (`ratslam.core.backend.Map`).
 
     Args:
@@ -83,25 +84,28 @@ class FrameMap:
 
     def __init__(
         self,
-        config: FrameMapConfig,
+        config: KeyframeMapConfig,
         cell: float,
         looks: Appearance,
         *,
         guard: int = 20,
         closures: bool = True,
+        ablation: Ablation = FULL,
     ) -> None:
         self.config, self.cell, self.bent = config, cell, closures
-        self.guard = guard
+        self.guard, self.ablation = guard, ablation
         self._looks = looks
-        self._ledger = Ledger()
-        self._grouping = Grouping(config.place_radius * cell, config.place_heading)
-        self._pose = Growing((3,), np.float64)
-        self._motion = Growing((3,), np.float64)  # into each frame, as odometry told it
-        self._length = Growing((), np.float64)
-        self._turn = Growing((), np.float64)
-        self._cut = Growing((), np.int64)  # the run that says the odometry broke before a frame, -1: none
-        self._step_frame = Growing((), np.int64)
-        self._step_motion = Growing((4,), np.float64)  # since that frame, and its length
+        self._ledger = ClosureLog()
+        self._grouping = Experiences(config.place_radius * cell, config.place_heading)
+        self._pose = GrowableArray((3,), np.float64)
+        self._motion = GrowableArray((3,), np.float64)  # into each frame, as odometry told it
+        self._length = GrowableArray((), np.float64)
+        self._turn = GrowableArray((), np.float64)
+        self._cut = GrowableArray(
+            (), np.int64
+        )  # the run that says the odometry broke before a frame, -1: none
+        self._step_frame = GrowableArray((), np.int64)
+        self._step_motion = GrowableArray((4,), np.float64)  # since that frame, and its length
         self._travel = HALT
         self._bias = 0.0
         self._prior = Prior(0.0, config.bias_sd / cell)
@@ -111,9 +115,9 @@ class FrameMap:
 
     # What it answers
 
-    def guidance(self) -> Guidance:
+    def feedback(self) -> MapFeedback:
         """What the filter may know of the map."""
-        return Guidance(self._pose.rows, self._bias, self._since, *self._looks.measure())
+        return MapFeedback(self._pose.rows, self._bias, self._since, *self._looks.measure())
 
     def pose(self, estimate: Estimate) -> np.ndarray:
         """[3] the newest frame's pose and the motion since."""
@@ -124,7 +128,7 @@ class FrameMap:
         """[T, 3] every folded step as the settled map sees it."""
         return self._steps(self._settle().fit)
 
-    def so_far(self) -> np.ndarray:
+    def online_trajectory(self) -> np.ndarray:
         """[T, 3] every folded step as the map sees it at this moment, unsettled: what the robot acts on."""
         return self._steps(Fit(self._pose.rows, self._bias, np.zeros(0)))
 
@@ -135,7 +139,7 @@ class FrameMap:
         return first[ledger.table()[ledger.accepted(), :2].astype(int)].reshape(-1, 2)
 
     def candidates(self) -> np.ndarray:
-        """[n, 9] all that recall proposed and what became of it, see `Ledger.table`."""
+        """[n, 9] all that recall proposed and what became of it, see `ClosureLog.table`."""
         return self._settle().ledger.table()
 
     def undo(self, run: int) -> None:
@@ -252,7 +256,7 @@ class FrameMap:
 
     def _consider(self, evidence: Evidence) -> int:
         """Files a candidate; the frame it was accepted as, or -1."""
-        if int(evidence.match) < 0 or float(evidence.mass) <= self.config.certain:
+        if int(evidence.match) < 0 or float(evidence.mass) <= self.config.candidate_posterior:
             return -1
         candidate = Candidate(
             len(self._pose.rows) - 1,
@@ -278,7 +282,7 @@ class FrameMap:
         pose, turn = self._pose.rows, -candidate.shift * self._angle()
         turned = wrap(pose[candidate.frame, 2] - pose[candidate.match, 2])
         drift = abs(wrap(turned - turn))
-        return bool(np.cos(turn) > 0 and drift < self.config.agreement_heading * self.config.facing)
+        return bool(np.cos(turn) > 0 and drift < self.config.agreement_heading * self.config.max_turn)
 
     def _sure(self) -> bool:
         """Whether little enough has been driven and turned since the last closure to know the experience."""
@@ -289,7 +293,7 @@ class FrameMap:
 
     def _weigh(self) -> None:
         """Now and then, weighs all runs against each other anew and takes up the map that comes of it."""
-        every = self.config.weigh_every
+        every = self.config.select_every
         if not every or not self.bent or len(self._pose.rows) % every:
             return
         settled = self._weighed()
@@ -303,7 +307,7 @@ class FrameMap:
     def _weighed(self) -> Settled | None:
         """The map with the runs that are best believed together; None where none is worth it."""
         config, ledger, cut = self.config, deepcopy(self._ledger), deepcopy(self._cut)
-        weighed = (ledger.scores() >= config.weigh_score) & (ledger.sizes() >= config.weigh_length)
+        weighed = (ledger.scores() >= config.select_score) & (ledger.sizes() >= config.select_length)
         weighed &= ledger.verdicts() != Verdict.UNDONE
         if not weighed.any():
             return None
@@ -320,7 +324,7 @@ class FrameMap:
         reckoned = Fit(np.concatenate([self._pose.rows[:1], path]), self._prior.mean, np.zeros(0))
         present = Fit(self._pose.rows.copy(), self._bias, np.zeros(0))
         case = Case(chain, closures, self._belief(), ledger.scores()[runs], *ledger.spans()[runs].T)
-        judged = arbitrate(case, [present, reckoned], self._where_broken, earlier)
+        judged = select_closures(case, [present, reckoned], self._where_broken, earlier)
         for run, weight in zip(runs.tolist(), judged.fit.weights.tolist(), strict=True):
             ledger.judge(run, Verdict.ACCEPTED if weight > KEPT else Verdict.OPEN)
         for frame, run in judged.cuts:
@@ -338,7 +342,7 @@ class FrameMap:
     def _follows(self, candidate: Candidate) -> bool:
         """Whether it continues the newest run: as far from its last candidate in memory as in odometry."""
         last, config = self._ledger.last(), self.config
-        if last is None or candidate.frame - last.frame > config.gap:
+        if last is None or candidate.frame - last.frame > config.max_gap:
             return False
         pose, angle = self._pose.rows, self._angle()
         remembered = between(_turned(pose[last.match], -last.shift * angle),
@@ -351,14 +355,16 @@ class FrameMap:
 
     def _agrees(self, candidate: Candidate) -> bool:
         """Whether it lies as far from the first candidate of the newest run as odometry says."""
-        if not self.config.whole:
+        if not self.config.sequence_agreement:
             return True
         pose, angle = self._pose.rows, self._angle()
         frame, match, shift, _ = self._ledger.members(self._ledger.runs - 1)[0]
         remembered = between(_turned(pose[match], -shift * angle),
                              _turned(pose[candidate.match], -candidate.shift * angle))  # fmt: skip
         travelled = between(pose[frame], pose[candidate.frame])
-        allowed = self.config.agreement * self.cell + self.config.whole * np.hypot(*travelled[:2])
+        allowed = self.config.agreement * self.cell + self.config.sequence_agreement * np.hypot(
+            *travelled[:2]
+        )
         turned = abs(wrap(remembered[2] - travelled[2]))
         return bool(
             np.hypot(*(remembered - travelled)[:2]) < allowed and turned < 2 * self.config.agreement_heading
@@ -367,13 +373,13 @@ class FrameMap:
     def _judge(self, run: int, candidate: Candidate) -> None:
         """Accepts a run with enough evidence where the map allows it; a long one that contradicts, cuts."""
         config, score, length = self.config, self._ledger.score(run), len(self._ledger.members(run))
-        if length < config.length or score < config.score:
+        if length < config.min_length or score < config.min_score:
             return
-        distance, room = self._distance(candidate) if config.verify else (0.0, 0.0)
-        fits = distance < config.distance and score - distance / 2 - room >= config.score
+        distance, room = self._distance(candidate) if self.ablation.verify else (0.0, 0.0)
+        fits = distance < config.max_distance and score - distance / 2 - room >= config.min_score
         self._ledger.judge(run, Verdict.ACCEPTED if fits else Verdict.OPEN, distance)
         broken = config.breaks and length >= config.break_length and score >= config.break_score
-        if not fits and broken and distance >= config.distance:
+        if not fits and broken and distance >= config.max_distance:
             self._break(run)
 
     def _distance(self, candidate: Candidate) -> tuple[float, float]:
@@ -420,7 +426,7 @@ class FrameMap:
         """The frame from which on the views fit better at the poses moved by `carried` [3]."""
         known = self._ledger.accepted()
         anchored = self._ledger.table()[known, 0]
-        since = int(anchored[anchored < first].max(initial=0)) - self.config.gap
+        since = int(anchored[anchored < first].max(initial=0)) - self.config.max_gap
         frames = np.arange(max(since, first - FAR_BACK, 1), first + 1)
         onwards = self._pose.rows[frames]
         return self._turning_point(frames, self._pose.rows, onwards, carried)
@@ -463,7 +469,7 @@ class FrameMap:
     def _settle(self) -> Settled:
         """The final map, as it would be if the recording ended here."""
         if self._settled is None:
-            settled = self._weighed() if self.config.weigh_every and self.bent else None
+            settled = self._weighed() if self.config.select_every and self.bent else None
             if settled is None:
                 fit = Fit(self._pose.rows.copy(), self._bias, np.zeros(0))
                 fit = self._solve(self.config.settling) if len(self._ledger.accepted()) else fit
@@ -479,9 +485,9 @@ class FrameMap:
 
     def _belief(self) -> Prior:
         """About the bias."""
-        return self._prior if self.config.bias_in_map else Prior(self._bias, 1e-9)
+        return self._prior if self.ablation.heading_bias else Prior(self._bias, 1e-9)
 
-    def _chain(self, cut: Growing) -> Chain:
+    def _chain(self, cut: GrowableArray) -> Chain:
         noise, cell = self.config.noise, self.cell
         length, turn, severed = self._length.rows[1:], self._turn.rows[1:], cut.rows[1:] >= 0
         along = noise.per_cell**2 * length * cell + (noise.least * cell) ** 2
@@ -491,17 +497,19 @@ class FrameMap:
         loose = np.array([LOOSE * cell, LOOSE * cell, LOOSE]) ** 2
         return Chain(self._motion.rows[1:], length, np.where(severed[:, None], loose, variance))
 
-    def _closures(self, ledger: Ledger) -> Closures:
+    def _closures(self, ledger: ClosureLog) -> Closures:
         config = self.config
         spread = config.closure_sd * self.cell
         variance = np.array([spread**2, spread**2, config.closure_heading**2])
         scales = (config.robust_per_score, config.robust_least, config.robust_most)
         closures = ledger.closures(self._angle(), variance, scales)
-        if config.weigh_every:
-            worth = 2 * np.maximum(closures.score - config.doubt, 1.0) / np.bincount(closures.run)
+        if config.select_every:
+            worth = 2 * np.maximum(closures.score - config.sequence_cost, 1.0) / np.bincount(closures.run)
             # A run must be able to cost more than it is worth, else it can never be refused.
-            return closures._replace(scale=worth, stray=np.maximum(config.stray, 1.5 * worth))
-        return closures if config.robust else closures._replace(scale=np.full_like(closures.scale, 1e12))
+            return closures._replace(scale=worth, stray=np.maximum(config.closure_cost_limit, 1.5 * worth))
+        return (
+            closures if self.ablation.robust else closures._replace(scale=np.full_like(closures.scale, 1e12))
+        )
 
     def _steps(self, fit: Fit) -> np.ndarray:
         frame, motion = self._step_frame.rows, self._step_motion.rows
@@ -515,14 +523,14 @@ class FrameMap:
         origin = self._pose.rows[-1] if len(self._pose.rows) else np.zeros(3)
         return compose(origin, correct_heading_bias(self._travel.motion, self._travel.length, self._bias))
 
-    def _parts(self) -> dict[str, Ledger | Grouping | Appearance]:
+    def _parts(self) -> dict[str, ClosureLog | Experiences | Appearance]:
         return {"ledger": self._ledger, "grouping": self._grouping, "looks": self._looks}
 
     def _angle(self) -> float:
         return self._looks.measure().angle
 
     def _write_closures(self, path: Path) -> None:
-        names = "frame,match,step,match_step,shift,mass,gain,run,distance,verdict,weight"
+        names = "keyframe,match,step,match_step,shift,mass,gain,sequence,distance,verdict,weight"
         first = np.searchsorted(self._step_frame.rows, np.arange(len(self._pose.rows)))
         lines = [names]
         for frame, match, shift, mass, gain, run, distance, verdict, weight in self.candidates().tolist():
@@ -567,8 +575,8 @@ class FrameMap:
         self._solved = int(run), int(frame)
         self._settled = None
 
-    def _growing(self) -> dict[str, Growing]:
-        return {name[1:]: value for name, value in vars(self).items() if isinstance(value, Growing)}
+    def _growing(self) -> dict[str, GrowableArray]:
+        return {name[1:]: value for name, value in vars(self).items() if isinstance(value, GrowableArray)}
 
 
 def _turned(pose: np.ndarray, angle: float) -> np.ndarray:

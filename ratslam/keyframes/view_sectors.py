@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.core.growable_array import Growing
+from ratslam.core.growable_array import GrowableArray
 
 FANS = np.radians([sign * width for width in (60, 90, 120, 180, 240, 270, 360) for sign in (1, -1)])
 """Widths of fans that sensors have and that views can tell apart, rad; negative: clockwise."""
@@ -49,10 +49,12 @@ class Fan:
 
     def __init__(self, size: int, angle: float) -> None:
         self.given = angle
-        self._view = Growing((size,), np.float64)
-        self._step = Growing((2,), np.float64)  # turn, length into the frame
-        self._gain = Growing((len(FANS),), np.float64)
-        self._still = Growing((len(FANS),), np.float64)  # the unshifted difference, where a fan would shift
+        self._view = GrowableArray((size,), np.float64)
+        self._step = GrowableArray((2,), np.float64)  # turn, length into the frame
+        self._gain = GrowableArray((len(FANS),), np.float64)
+        self._still = GrowableArray(
+            (len(FANS),), np.float64
+        )  # the unshifted difference, where a fan would shift
         self._pairs = _no_pairs()
         self._angle = angle
         self._due = 1
@@ -154,8 +156,8 @@ class Fan:
         self._pairs = _no_pairs()
 
 
-def _no_pairs() -> dict[int, Growing]:
-    return {lag: Growing((3,), np.float64) for lag in LAGS}
+def _no_pairs() -> dict[int, GrowableArray]:
+    return {lag: GrowableArray((3,), np.float64) for lag in LAGS}
 
 
 def _apart(now: np.ndarray, old: np.ndarray, shift: int) -> np.ndarray:

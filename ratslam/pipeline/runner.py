@@ -20,9 +20,10 @@ from evaluation.report import pictures
 from ratslam.backends.registry import BACKENDS, BackendEntry, Sensors, build
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import dump
-from ratslam.core.growable_array import Growing
+from ratslam.core.growable_array import GrowableArray
 from ratslam.core.session import CHUNK, Session, Step
 from ratslam.core.types import Action
+from ratslam.keyframes.ablation import FULL, Ablation
 from ratslam.pipeline.artifacts import Felt, keep_chart, keep_images, keep_world
 from ratslam.pipeline.run_directory import RunDirectory, read_checkpoint
 from robot.sources.source import Sample, Source
@@ -56,7 +57,7 @@ class Playing:
         self._config, self._source, self._store, self._manifest = config, source, store, manifest
         self._felt: list[Felt] = []
         self._reckoned = np.zeros(3)
-        self._truth = Growing((3,), np.float64)
+        self._truth = GrowableArray((3,), np.float64)
         self._present = Anytimes(session.steps)
         self._saved = session.steps
 
@@ -135,11 +136,11 @@ def playing(
         yield Playing(config, source, store, manifest, session, skip)
 
 
-def session_of(config: RunConfig, source: Source) -> Session:
+def session_of(config: RunConfig, source: Source, ablation: Ablation = FULL) -> Session:
     """A fresh session for what a source gives."""
     sensors = Sensors(source.view_shape, feelers_of(source, config.touch))
     return Session(
-        build(config.backend, config, sensors, config.session.precision),
+        build(config.backend, config, sensors, config.session.precision, ablation),
         seed=config.session.seed,
         reserve=config.session.reserve,
         precision=config.session.precision,
@@ -165,7 +166,7 @@ class Anytimes:
         self._due = session.steps + max(CHUNK, session.steps // 256)
         true = np.asarray(truth)
         known = np.isfinite(true).all(axis=1)
-        error = present_error(session.map.so_far()[self._skipped :][known], true[known])
+        error = present_error(session.map.online_trajectory()[self._skipped :][known], true[known])
         self.errors.append(error)
         return error
 

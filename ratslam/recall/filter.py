@@ -7,7 +7,7 @@ contradicts takes mass away. Odometry aligns, it is never evidence by itself. Wh
 robot's place enters as one more hypothesis, always weak: it proposes, views dispose.
 
 The kernel is pure and of fixed shapes. Poses, bias, sector angle and the scale of view errors come from the
-map as a `Guidance`; no closure verdict comes back otherwise. No constant is in units of the sensor: errors
+map as a `MapFeedback`; no closure verdict comes back otherwise. No constant is in units of the sensor: errors
 count in units of the scale, distances in pose cells. The filter is ours; its ancestors are Bayesian
 localisation (Fox et al. 1999) and the sequence matching of SeqSLAM (Milford & Wyeth 2012).
 """
@@ -45,7 +45,7 @@ FACING = float(np.cos(0.5))
 class RecallConfig(Settings):
     """The filter. Lengths are in pose cells, so that one setting serves every robot."""
 
-    fan: Literal["auto", "none", "whiskers"] | float = "auto"
+    sector_fov: Literal["auto", "none", "whiskers"] | float = "auto"
     """Whether a view is a fan of ordered sectors, so that a turned robot sees it shifted: its width in rad
     (counter-clockwise positive), `none`, `whiskers` (rows of whiskers all around the robot), or `auto` (also
     0): found out from the recording itself."""
@@ -59,7 +59,7 @@ class RecallConfig(Settings):
     guard: PositiveInt = 20
     """The newest frames, this many, are not recalled: the robot has hardly left them."""
     sharpness: PositiveFloat = 0.2
-    """Error that costs a factor e, in scales (see `Guidance`)."""
+    """Error that costs a factor e, in scales (see `MapFeedback`)."""
     floor: PositiveFloat = 1.27
     """Error that stands for a view never seen before, in scales."""
     common: NonNegativeFloat = 1.0
@@ -71,9 +71,9 @@ class RecallConfig(Settings):
     """Standard deviation of a frame's place against odometry, cells."""
     reach_heading: PositiveFloat = 0.25
     """The same of its heading, rad."""
-    nothing: PositiveFloat = 0.02
+    miss_weight: PositiveFloat = 0.02
     """Weight of there being no frame where odometry leads, against one just there."""
-    leave: Share = 0.01
+    mode_decay: Share = 0.01
     """Share of a hypothesis that is lost at every frame."""
     enter: Share = 0.05
     """Share of novelty that becomes hypotheses at every frame."""
@@ -101,7 +101,7 @@ class RecallConfig(Settings):
 NO_LIKENESS = np.zeros((0, 0, 0))
 
 
-class Guidance(NamedTuple):
+class MapFeedback(NamedTuple):
     """What the map tells the filter.
 
     Attributes:
@@ -130,7 +130,7 @@ class Memory(NamedTuple):
         anchor: [K] int32 frames that hypotheses stand at, offset: [K, 3] where in their frames (m, rad),
             mass: [K]. What they lack to 1 is novelty.
         pose: [3] of the newest frame. motion, length, turn: since then: [3], m, rad.
-        bias, since, angle, scale, likeness: see `Guidance`.
+        bias, since, angle, scale, likeness: see `MapFeedback`.
         before: [S, C] likelihoods of the image before, rest: [S, C] what is believed beside the hypotheses;
             both for whiskers only, else of no size.
     """
@@ -160,7 +160,7 @@ class Memory(NamedTuple):
     rest: Array
 
 
-class Recollection(NamedTuple):
+class RecallResult(NamedTuple):
     """What a view brought back.
 
     Attributes:
@@ -185,12 +185,12 @@ class Recollection(NamedTuple):
     background: Array
 
 
-class Weighing(NamedTuple):
+class ObservationLikelihood(NamedTuple):
     """What is seen, against what is remembered.
 
     Attributes:
         likelihood: [S or 1, C] of what is seen, at each shift and frame. novelty: the same where it is new.
-        background: see `Recollection`. certain: whether anything can be told yet. telling: whether what is
+        background: see `RecallResult`. certain: whether anything can be told yet. telling: whether what is
             seen speaks for or against a place (an id never given before does not).
     """
 
@@ -203,17 +203,17 @@ class Weighing(NamedTuple):
 
 def offsets(config: RecallConfig) -> np.ndarray:
     """[S] sectors by which views are shifted; whiskers: half turns."""
-    if config.fan == "whiskers":
+    if config.sector_fov == "whiskers":
         return np.arange(2 if config.shifts else 1, dtype=np.int32)
-    reach = 0 if config.fan == "none" else config.shifts
+    reach = 0 if config.sector_fov == "none" else config.shifts
     return np.arange(-reach, reach + 1, dtype=np.int32)
 
 
 def fan_width(config: RecallConfig) -> float | None:
     """Of the views, rad; 0: to be found out; None: they are no fan."""
-    if isinstance(config.fan, str):
-        return 0.0 if config.fan == "auto" else None
-    return config.fan
+    if isinstance(config.sector_fov, str):
+        return 0.0 if config.sector_fov == "auto" else None
+    return config.sector_fov
 
 
 def start(config: RecallConfig, size: int, capacity: int, dtype: np.dtype, groups: int = 0) -> Memory:
@@ -227,7 +227,7 @@ def start(config: RecallConfig, size: int, capacity: int, dtype: np.dtype, group
     def zeros(*shape: int) -> Array:  # one buffer each: the session donates them
         return jnp.zeros(shape, dtype)
 
-    touch = config.fan == "whiskers"
+    touch = config.sector_fov == "whiskers"
     return Memory(
         view=jnp.zeros((size, capacity), jnp.int32) if touch else zeros(size, capacity),
         label=jnp.full(capacity, -1, jnp.int32),
@@ -255,21 +255,21 @@ def start(config: RecallConfig, size: int, capacity: int, dtype: np.dtype, group
     )
 
 
-def inform(memory: Memory, guidance: Guidance) -> Memory:
+def apply_map_feedback(memory: Memory, feedback: MapFeedback) -> Memory:
     """The memory with the map's present poses in the place of older ones."""
-    dtype, count = memory.x.dtype, len(guidance.poses)
+    dtype, count = memory.x.dtype, len(feedback.poses)
     if not count:
         return memory
     full = np.zeros((4, memory.x.shape[0]))
-    x, y, heading = guidance.poses.T
+    x, y, heading = feedback.poses.T
     full[:, :count] = x, y, np.cos(heading), np.sin(heading)
     x, y, cosine, sine = (jnp.asarray(row, dtype) for row in full)
-    told = (guidance.bias, guidance.since, guidance.angle, guidance.scale)
+    told = (feedback.bias, feedback.since, feedback.angle, feedback.scale)
     bias, since, angle, scale = (jnp.asarray(value, dtype) for value in told)
-    if guidance.likeness.size:
-        memory = memory._replace(likeness=jnp.asarray(guidance.likeness, dtype))
+    if feedback.likeness.size:
+        memory = memory._replace(likeness=jnp.asarray(feedback.likeness, dtype))
     return memory._replace(
-        x=x, y=y, cosine=cosine, sine=sine, pose=jnp.asarray(guidance.poses[-1], dtype),
+        x=x, y=y, cosine=cosine, sine=sine, pose=jnp.asarray(feedback.poses[-1], dtype),
         bias=bias, since=since, angle=angle, scale=scale,
     )  # fmt: skip
 
@@ -304,8 +304,8 @@ def spread(config: RecallConfig, cell: float, memory: Memory) -> tuple[Array, Ar
 
 
 def look(
-    config: RecallConfig, cell: float, memory: Memory, weighing: Weighing
-) -> tuple[Memory, Recollection]:
+    config: RecallConfig, cell: float, memory: Memory, weighing: ObservationLikelihood
+) -> tuple[Memory, RecallResult]:
     """One frame: align what was believed, weigh it by what is seen, and name the best candidate.
 
     Args:
@@ -337,7 +337,7 @@ def look(
     )
 
     shares = jnp.concatenate([masses, jnp.maximum(1 - jnp.sum(masses, keepdims=True), 0.0)])
-    recollection = Recollection(
+    recollection = RecallResult(
         frame=memory.count,
         match=jnp.where(certain & (mass > 0), match, -1),
         shift=jnp.where(certain & (mass > 0), jnp.asarray(shifts)[shift], 0),
@@ -349,7 +349,7 @@ def look(
         agree=agree,
         background=weighing.background,
     )
-    if config.fan == "whiskers":
+    if config.sector_fov == "whiskers":
         memory = memory._replace(rest=jnp.where(rest[None] > 0, belief, 0.0))
     return memory._replace(anchor=anchor, offset=offset, mass=masses), recollection
 
@@ -377,10 +377,10 @@ def remember(memory: Memory, view: Array, label: Array, packet: Array) -> Memory
     )
 
 
-def nothing(memory: Memory) -> Recollection:
+def nothing(memory: Memory) -> RecallResult:
     """When no view became a frame."""
     zero = jnp.zeros_like(memory.length)
-    return Recollection(
+    return RecallResult(
         frame=jnp.int32(-1), match=jnp.int32(-1), shift=jnp.int32(0), mass=zero, gain=zero, novel=zero + 1,
         entropy=zero, second=zero, agree=jnp.int32(-1), background=jnp.full(SAMPLES, jnp.nan, zero.dtype),
     )  # fmt: skip
@@ -430,14 +430,14 @@ def _align(
     def carry(k: Array, sums: tuple[Array, Array]) -> tuple[Array, Array]:
         belief, novel = sums
         fall = landing(poses[k], *reach)
-        total = jnp.sum(fall) + config.nothing
-        stay = memory.mass[k] * (1 - config.leave)
+        total = jnp.sum(fall) + config.miss_weight
+        stay = memory.mass[k] * (1 - config.mode_decay)
         belief = belief + (stay / total) * fall
-        return belief, novel + stay * config.nothing / total + memory.mass[k] * config.leave
+        return belief, novel + stay * config.miss_weight / total + memory.mass[k] * config.mode_decay
 
     fresh = 1 - jnp.sum(memory.mass) - jnp.sum(memory.rest)
     shut = jnp.zeros(cells.shape, dtype), jnp.zeros((), dtype)
-    if config.fan == "whiskers":
+    if config.sector_fov == "whiskers":
         shut = _followed(config, cell, memory, angles, cells.astype(dtype), moved)
     belief, novel = lax.fori_loop(0, config.modes, carry, shut)
     near = landing(here, *spread(config, cell, memory))
@@ -476,13 +476,15 @@ def _followed(
             facing = ahead * near[2] + aside * near[3]
             inside = jnp.maximum(1 - (apart + (2 / config.reach_heading**2) * (1 - facing)) / SUPPORT, 0.0)
             falls.append(jnp.where(there, near[4] * inside**2 * inside**2, 0.0))
-        total = sum(falls, jnp.full_like(x, config.nothing))
-        stay = memory.rest[s] * (1 - config.leave)
+        total = sum(falls, jnp.full_like(x, config.miss_weight))
+        stay = memory.rest[s] * (1 - config.mode_decay)
         zero = jnp.zeros_like(x)
         beliefs.append(
             sum((jnp.roll(stay * fall / total, sign * step) for step, fall in enumerate(falls)), zero)
         )
-        novel = novel + jnp.sum(stay * config.nothing / total) + jnp.sum(memory.rest[s]) * config.leave
+        novel = (
+            novel + jnp.sum(stay * config.miss_weight / total) + jnp.sum(memory.rest[s]) * config.mode_decay
+        )
     return jnp.stack(beliefs), novel
 
 

@@ -1,4 +1,4 @@
-"""Weighing: how likely what is seen now is at every remembered frame, and where it is new.
+"""ObservationLikelihood: how likely what is seen now is at every remembered frame, and where it is new.
 
 A view is weighed by its error, in scales; a whisker image by its log-odds; a given id by what ids are worth.
 """
@@ -11,8 +11,8 @@ import numpy as np
 from ratslam.recall.filter import (
     SAMPLES,
     Memory,
+    ObservationLikelihood,
     RecallConfig,
-    Weighing,
     allowed,
     offsets,
     old,
@@ -30,7 +30,7 @@ STEPS = (0.02, 0.94, 0.02, 0.02)
 """How often, where images follow each other, the next is that of the same frame, the next one, and so on."""
 
 
-def by_view(config: RecallConfig, cell: float, memory: Memory, view: Array) -> Weighing:
+def view_likelihood(config: RecallConfig, cell: float, memory: Memory, view: Array) -> ObservationLikelihood:
     """Weighs all frames by a view [D]. A view that looks like many places makes all of them unlikely."""
     error = _errors(offsets(config), memory, view)
     frames = old(config, memory)
@@ -45,7 +45,7 @@ def by_view(config: RecallConfig, cell: float, memory: Memory, view: Array) -> W
     away = jnp.maximum(3 * cell, 3 * (0.5 * cell + 0.05 * (memory.since + memory.length)))
     here = present(memory)
     apart = (memory.x - here[0]) ** 2 + (memory.y - here[1]) ** 2
-    return Weighing(
+    return ObservationLikelihood(
         likelihood=jnp.where(known, likelihood, 1.0),
         novelty=jnp.where(known, novelty, 1.0),
         background=_background(jnp.min(error, axis=0), frames & (apart > away**2)),
@@ -54,7 +54,9 @@ def by_view(config: RecallConfig, cell: float, memory: Memory, view: Array) -> W
     )
 
 
-def by_touch(config: RecallConfig, memory: Memory, level: Array, pixels: Pixels) -> tuple[Memory, Weighing]:
+def touch_likelihood(
+    config: RecallConfig, memory: Memory, level: Array, pixels: Pixels
+) -> tuple[Memory, ObservationLikelihood]:
     """Weighs all frames by a whisker image: levels [D].
 
     Pixels are not independent, so their log-odds are tempered. A new place is as likely to look like this as
@@ -74,7 +76,7 @@ def by_touch(config: RecallConfig, memory: Memory, level: Array, pixels: Pixels)
     familiar = jnp.sum(expected * likelihood) / jnp.where(total > 0, total, 1.0)
     share = jnp.where(total > 0, config.familiar, 0.0)
     novelty = share * familiar + (1 - share) * jnp.exp(config.temper * memory.scale)
-    weighing = Weighing(
+    weighing = ObservationLikelihood(
         likelihood=jnp.where(certain, likelihood, 1.0),
         novelty=jnp.where(certain, novelty, 1.0),
         background=jnp.full(SAMPLES, jnp.nan, memory.x.dtype),
@@ -102,14 +104,14 @@ def _onwards(before: Array) -> Array:
     return jnp.stack(rows)
 
 
-def by_label(config: RecallConfig, memory: Memory, label: Array) -> Weighing:
+def label_likelihood(config: RecallConfig, memory: Memory, label: Array) -> ObservationLikelihood:
     """Weighs all frames by a given id."""
     known = jnp.any(memory.label == label)
     share = 1 / jnp.maximum(memory.distinct + (~known).astype(jnp.int32), 1).astype(memory.x.dtype)
     other = jnp.where(known, LABELS["other"] * share, LABELS["unknown"])
     likelihood = jnp.where(memory.label == label, LABELS["same"], other)
     novelty = jnp.where(known, LABELS["new_known"] * share, LABELS["new_unknown"])
-    return Weighing(
+    return ObservationLikelihood(
         likelihood=(likelihood**LABEL_TEMPER)[None],
         novelty=novelty**LABEL_TEMPER,
         background=jnp.full(SAMPLES, jnp.nan, memory.x.dtype),

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ratslam.recall import filter, observation_model
-from ratslam.recall.filter import Guidance, RecallConfig
+from ratslam.recall.filter import MapFeedback, RecallConfig
 
 CELL = 0.6
 
@@ -26,7 +26,7 @@ def remembered(config: RecallConfig, frames: int, size: int, dtype):
     memory = memory._replace(
         view=jnp.asarray(stream.random((size, capacity)), dtype), count=jnp.int32(frames - 1)
     )
-    return filter.inform(memory, Guidance(poses, 0.01, 5.0, np.pi / 18, 0.06))
+    return filter.apply_map_feedback(memory, MapFeedback(poses, 0.01, 5.0, np.pi / 18, 0.06))
 
 
 @pytest.mark.parametrize("shifts", [0, 3])
@@ -43,7 +43,7 @@ def test_a_look_back(benchmark, frames, shifts, dtype):
     def replay(memory):
         def look(k, memory):
             memory = filter.travel(memory, moved)
-            weighed = observation_model.by_view(config, CELL, memory, views[k % 64])
+            weighed = observation_model.view_likelihood(config, CELL, memory, views[k % 64])
             memory, _ = filter.look(config, CELL, memory, weighed)
             return memory._replace(motion=jnp.zeros_like(moved), length=jnp.zeros_like(memory.length))
 

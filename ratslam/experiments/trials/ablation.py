@@ -19,6 +19,7 @@ from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import Document, load, override, validate
 from ratslam.core.session import CHUNK, Session
 from ratslam.experiments.trials.process_pool import shared_out
+from ratslam.keyframes.ablation import FULL, Ablation
 from ratslam.pipeline.run import open_source
 from ratslam.pipeline.runner import Anytimes, readings, session_of
 from robot.sources.in_memory import Log, collected
@@ -30,21 +31,29 @@ from tactile.base.se2 import integrate
 SAME_PLACE = 2.5
 """Cells up to which two frames are the same place: farther apart in truth, a closure is false."""
 
+
+class Variant(NamedTuple):
+    """What differs from the configuration: overrides as `a.b=value`, and parts of the map turned off."""
+
+    sets: tuple[str, ...] = ()
+    ablation: Ablation = FULL
+
+
 PARTS = {
-    "nothing (all parts on)": (),
-    "recall: the classic matcher instead": ("backend=classic",),
-    "sector shifts": ("recall.shifts=0",),
-    "negative evidence of common views": ("recall.common=0.0",),
-    "the map's pose as a hypothesis": ("recall.local=0.0",),
-    "verification against the map": ("frames.verify=false",),
-    "runs (each candidate alone)": ("frames.length=1",),
-    "robust weights": ("frames.robust=false",),
-    "heading bias in the map": ("frames.bias_in_map=false",),
-    "heading bias from the views": ("frames.bias_from_views=false",),
-    "both": ("frames.bias_in_map=false", "frames.bias_from_views=false"),
-    "breaks": ("frames.breaks=false",),
-    "pose cells hear of candidates": ("recall.energy=1.0e-12",),
-    "closures (odometry alone)": ("experience.closures=false",),
+    "nothing (all parts on)": Variant(),
+    "Bayesian recall (classic backend instead)": Variant(("backend=classic",)),
+    "sector shifts": Variant(("recall.shifts=0",)),
+    "negative evidence of common views": Variant(("recall.common=0.0",)),
+    "the map's pose as a hypothesis": Variant(("recall.local=0.0",)),
+    "verification against the map": Variant(ablation=Ablation(verify=False)),
+    "closure sequences (single candidates)": Variant(("keyframes.min_length=1",)),
+    "robust weights": Variant(ablation=Ablation(robust=False)),
+    "heading bias in the map": Variant(ablation=Ablation(heading_bias=False)),
+    "heading bias from the views": Variant(("keyframes.bias_from_views=false",)),
+    "both": Variant(("keyframes.bias_from_views=false",), Ablation(heading_bias=False)),
+    "odometry breaks": Variant(("keyframes.breaks=false",)),
+    "injection into the pose cells": Variant(("recall.energy=1.0e-12",)),
+    "closures (odometry alone)": Variant(("experience.closures=false",)),
 }
 """What `ablate` turns off, and how."""
 
@@ -69,7 +78,7 @@ class Trial(NamedTuple):
     lost: float
 
 
-def trial(config: RunConfig, folder: Path, seed: int = 0) -> Trial:
+def trial(config: RunConfig, folder: Path, seed: int = 0, ablation: Ablation = FULL) -> Trial:
     """Runs once; a seed above 0 perturbs the recording, or what was simulated, first.
 
     Raises:
@@ -84,7 +93,7 @@ def trial(config: RunConfig, folder: Path, seed: int = 0) -> Trial:
             if not isinstance(source, Log):
                 raise InputError("recording.file", "a recording that is streamed", "a CSV or .npz recording")
             source = perturbed(source, seed)
-        session = session_of(config, source)
+        session = session_of(config, source, ablation)
         truth: list[np.ndarray] = []
         motion: list[list[float]] = []
         told: list[np.ndarray] = []
@@ -132,23 +141,24 @@ def _figures(
 
 
 def compare(
-    path: Path, assignments: Sequence[str], variants: Sequence[tuple[Sequence[str], int]], workers: int = 0
+    path: Path, assignments: Sequence[str], variants: Sequence[tuple[Variant, int]], workers: int = 0
 ) -> Iterator[Trial]:
     """Trials of one configuration file, in the order of the variants.
 
     Args:
-        assignments: overrides for all, as `a.b=value`. variants: further overrides and the perturbation's
-            seed (0: none) of each. workers: processes; 0: as many as there are cores.
+        assignments: overrides for all, as `a.b=value`. variants: what differs in each, and the seed
+            of its perturbation (0: none). workers: processes; 0: as many as there are cores.
     """
-    for sets, _ in variants:  # complain before anything runs
-        validate(override(load(path), [*assignments, *sets]), RunConfig)
-    tasks = [(path, (*assignments, *sets), seed) for sets, seed in variants]
+    for variant, _ in variants:  # complain before anything runs
+        validate(override(load(path), [*assignments, *variant.sets]), RunConfig)
+    tasks = [(path, tuple(assignments), variant, seed) for variant, seed in variants]
     return shared_out(_try, tasks, workers)
 
 
-def _try(task: tuple[Path, tuple[str, ...], int]) -> Trial:
-    path, assignments, seed = task
-    return trial(validate(override(load(path), assignments), RunConfig), path.parent, seed)
+def _try(task: tuple[Path, tuple[str, ...], Variant, int]) -> Trial:
+    path, assignments, variant, seed = task
+    config = validate(override(load(path), [*assignments, *variant.sets]), RunConfig)
+    return trial(config, path.parent, seed, variant.ablation)
 
 
 def numbers(config: RunConfig) -> list[tuple[str, float | int]]:
@@ -164,7 +174,7 @@ def numbers(config: RunConfig) -> list[tuple[str, float | int]]:
                 found.append((path + name, value))
 
     walk(config.recall, "recall.")
-    walk(config.frames, "frames.")
+    walk(config.keyframes, "keyframes.")
     return found
 
 

@@ -12,7 +12,7 @@ from evaluation.artifacts.run_directory import read_card, read_closures, read_wa
 from evaluation.metrics.scorecard import score
 from tactile.base.errors import InputError
 
-CLOSURES = """frame,match,step,match_step,verdict,weight
+CLOSURES = """keyframe,match,step,match_step,verdict,weight
 9,2,30,10,accepted,1.0
 9,3,31,12,open,0.0
 9,4,40,25,accepted,inf
@@ -52,7 +52,7 @@ def test_steps_before_the_checkpoint_are_not_in_the_directory(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "content", ["frame,match\n1,2\n", CLOSURES.replace("match_step", "other"), CLOSURES.replace("30", "x")]
+    "content", ["keyframe,match\n1,2\n", CLOSURES.replace("match_step", "other"), CLOSURES.replace("30", "x")]
 )
 def test_closures_that_are_none_are_refused(tmp_path, content):
     (tmp_path / "closures.csv").write_text(content)

@@ -33,8 +33,8 @@ class DeadReckoning:
         del capacity
         return state
 
-    def inform(self, state, guidance):
-        del guidance
+    def apply_map_feedback(self, state, feedback):
+        del feedback
         return state
 
     def kernel(self, state, observation):
@@ -67,7 +67,7 @@ class Reckoned:
         self.path.append(compose(self.path[-1], evidence.moved))
         return estimate
 
-    def guidance(self) -> None:
+    def feedback(self) -> None:
         return None
 
     def pose(self, estimate):
@@ -76,7 +76,7 @@ class Reckoned:
     def trajectory(self):
         return np.array(self.path[1:])
 
-    def so_far(self):
+    def online_trajectory(self):
         return self.trajectory()
 
     def closures(self):

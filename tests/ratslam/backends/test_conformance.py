@@ -47,7 +47,10 @@ def _grid(dtype=np.float64):
 
 
 # Weighs its runs every few frames, so that it does so in mid-run wherever one stops.
-TOUCH = {"recall": {"fan": "whiskers"}, "frames": {"weigh_every": 15, "breaks": False, "whole": 0.2}}
+TOUCH = {
+    "recall": {"sector_fov": "whiskers"},
+    "keyframes": {"select_every": 15, "breaks": False, "sequence_agreement": 0.2},
+}
 
 
 BACKENDS = {

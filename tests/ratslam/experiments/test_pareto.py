@@ -75,8 +75,8 @@ def stubbed(monkeypatch):
     def alone(row, directory):
         for job in row:
             asked.append(job.key)
-            score = job.config.frames.score
-            failed = "frames.score: too much" if score > 40 else None
+            score = job.config.keyframes.min_score
+            failed = "keyframes.min_score: too much" if score > 40 else None
             found = answer(time=1000 / score, error=failed, energy_all=score + job.seed)
             if not failed or job.seed:
                 write_result(
@@ -237,13 +237,13 @@ def test_a_small_study_leaves_all_files_and_is_not_run_again(tmp_path, capsys, m
 
 
 def test_what_fails_or_is_killed_is_told_and_the_rest_stands(tmp_path, capsys, stubbed):
-    path = study(tmp_path, vary={"frames.score": [5, 10, 20, 41]}, seeds=2)
+    path = study(tmp_path, vary={"keyframes.min_score": [5, 10, 20, 41]}, seeds=2)
     command = ["frontier", str(path), "-o", str(tmp_path / "out")]
     for _ in range(2):
         assert main(command) == 2
         told = capsys.readouterr()
         assert "score=41, seed 0: its process was killed" in told.err
-        assert "score=41, seed 1: frames.score: too much" in told.err
+        assert "score=41, seed 1: keyframes.min_score: too much" in told.err
         rows = json.loads((tmp_path / "out" / "frontier.json").read_text())["rows"]
         assert [row["optimal"] for row in rows] == [True, True, True, False]
         assert "0, 2 failed" in told.out

@@ -62,7 +62,7 @@ def test_some_ids_become_new_and_some_wrong():
 
 
 def test_every_part_can_be_turned_off():
-    for sets in PARTS.values():
+    for sets, _ in PARTS.values():
         validate(override(load(SQUARE), sets), RunConfig)
 
 
@@ -70,8 +70,8 @@ def test_every_number_is_varied_down_and_up_as_far_as_it_goes():
     document = override(load(SQUARE), ["recall.local=0.9"])
     found = variations(document, 0.2)
     names = [name for name, _ in found]
-    assert names.count("recall.reach") == names.count("frames.score") == 2
-    assert names.count("frames.noise.per_cell") == 2
+    assert names.count("recall.reach") == names.count("keyframes.min_score") == 2
+    assert names.count("keyframes.noise.per_cell") == 2
     assert names.count("recall.local") == 1  # a share: it cannot exceed 1
     assert ("recall.modes", 6) in found
     assert ("recall.modes", 10) in found

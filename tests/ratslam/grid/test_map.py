@@ -51,12 +51,12 @@ def felt(*reports, pose=(0.0, 0.0, 0.0)):
 
 def test_a_map_of_nothing_is_the_prior():
     grid = BACKEND.new_map()
-    assert grid.trajectory().shape == grid.so_far().shape == (0, 3)
+    assert grid.trajectory().shape == grid.online_trajectory().shape == (0, 3)
     assert grid.closures().shape == (0, 2)
     assert len(grid.graph()) == 0
     assert grid.occupancy() == pytest.approx(BACKEND.config.prior)
     assert grid.occupancy().shape == (51, 51)
-    assert grid.guidance() is None
+    assert grid.feedback() is None
 
 
 def test_obstacles_lie_where_they_were_felt():
@@ -149,6 +149,6 @@ def test_looking_changes_nothing():
     first, second = told(steps), BACKEND.new_map()
     for step in steps:
         second.update(*step)
-        second.trajectory(), second.occupancy(), second.so_far(), second.arrays()
+        second.trajectory(), second.occupancy(), second.online_trajectory(), second.arrays()
     assert np.array_equal(first.occupancy(), second.occupancy())
     assert np.array_equal(first.trajectory(), second.trajectory())

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ratslam.keyframes import closure_selection
-from ratslam.keyframes.closure_selection import CUT, KEPT, STEPS, Case, arbitrate
+from ratslam.keyframes.closure_selection import CUT, KEPT, STEPS, Case, select_closures
 from ratslam.keyframes.optimizer import Chain, Closures, Fit, Prior, robust_cost, solve
 from tactile.base.se2 import between, compose, fit_rigid_motion, integrate, wrap
 
@@ -119,7 +119,7 @@ def off(fit: Fit, truth: np.ndarray) -> float:
 def test_runs_that_are_all_true_are_solved_for(seed):
     made = world(seed)
     case, starts = made.case, made.starts()
-    judged = arbitrate(case, starts, made.where)
+    judged = select_closures(case, starts, made.where)
     assert (judged.fit.weights > KEPT).all()
     assert judged.cuts == ()
     plain = solve(
@@ -135,7 +135,7 @@ def test_runs_that_are_all_true_are_solved_for(seed):
 @pytest.mark.parametrize("seed", range(6))
 def test_a_run_that_is_false_is_outvoted(seed, evidence):
     made = world(seed, false=evidence)
-    judged = arbitrate(made.case, made.starts(), made.where)
+    judged = select_closures(made.case, made.starts(), made.where)
     assert judged.fit.weights[-1] < KEPT
     assert (judged.fit.weights[:-1] > KEPT).all()
     assert judged.cuts == ()
@@ -151,7 +151,7 @@ def test_a_run_that_is_false_is_outvoted(seed, evidence):
 
 def test_a_run_that_is_false_is_outvoted_however_strong_it_is():
     made = world(0, false=60.0)
-    judged = arbitrate(made.case, made.starts(), made.where)
+    judged = select_closures(made.case, made.starts(), made.where)
     assert judged.fit.weights[-1] < KEPT
 
 
@@ -164,7 +164,7 @@ def test_a_map_bent_by_a_false_run_is_set_right(seed):
     believing = closures._replace(scale=np.where(wrong, 1e12, 1e-3))
     path = made.reckoned()
     bent = solve(path.poses, 0.0, made.case.chain, believing, PRIOR, 40)
-    judged = arbitrate(made.case, [bent, path], made.where)
+    judged = select_closures(made.case, [bent, path], made.where)
     assert off(bent, made.truth) > 2 * off(judged.fit, made.truth)
     assert judged.fit.weights[-1] < KEPT
     assert off(judged.fit, made.truth) < 0.1
@@ -175,7 +175,7 @@ def test_a_hopeless_present_map_is_given_up(seed):
     made = world(seed)
     stream = np.random.default_rng(seed)
     lost = made.reckoned()._replace(poses=stream.uniform(-2, 2, made.truth.shape))
-    judged = arbitrate(made.case, [lost, made.reckoned()], made.where)
+    judged = select_closures(made.case, [lost, made.reckoned()], made.where)
     assert (judged.fit.weights > KEPT).all()
     assert off(judged.fit, made.truth) < 0.1
 
@@ -186,7 +186,7 @@ def test_the_more_evidence_the_more_a_run_may_strain_the_map():
     strict, lenient = (
         case._replace(closures=case.closures._replace(scale=case.closures.scale * by)) for by in (0.1, 10)
     )
-    weights = [arbitrate(one, made.starts(), made.where).fit.weights for one in (strict, case, lenient)]
+    weights = [select_closures(one, made.starts(), made.where).fit.weights for one in (strict, case, lenient)]
     assert (weights[0] < weights[1]).all()
     assert (weights[1] < weights[2]).all()
 
@@ -204,9 +204,9 @@ def test_the_cost_is_never_above_that_of_the_present_map(seed):
     present = present._replace(
         poses=present.poses + stream.normal(0, 0.02, present.poses.shape) * [1, 1, 0.2]
     )
-    judged = arbitrate(case, [present, made.reckoned()], made.where)
+    judged = select_closures(case, [present, made.reckoned()], made.where)
     assert judged.cost <= robust_cost(present, case.chain, case.closures, PRIOR)
-    again = arbitrate(case, [judged.fit, made.reckoned()], made.where, judged.cuts)
+    again = select_closures(case, [judged.fit, made.reckoned()], made.where, judged.cuts)
     assert again.cost <= judged.cost + 0.5  # solver steps, not another map
     severed = closure_selection._severed(case.chain, judged.cuts)
     whole = robust_cost(judged.fit, severed, case.closures, PRIOR) + CUT * len(judged.cuts)
@@ -229,7 +229,7 @@ def test_the_order_of_runs_does_not_matter(seed):
         ),
         case.prior, case.evidence[order], case.first[order], case.last[order],
     )  # fmt: skip
-    one, two = (arbitrate(c, made.starts(), made.where) for c in (case, renamed))
+    one, two = (select_closures(c, made.starts(), made.where) for c in (case, renamed))
     assert two.cost == pytest.approx(one.cost, rel=1e-6)
     assert np.allclose(two.fit.poses, one.fit.poses, atol=1e-6)
     assert np.allclose(two.fit.weights, one.fit.weights[order], atol=1e-6)
@@ -242,7 +242,7 @@ def test_the_order_of_runs_does_not_matter(seed):
 @pytest.mark.parametrize("seed", range(20))
 def test_nothing_is_cut_without_a_jump(seed):
     made = world(seed, false=50.0 * (seed % 2))
-    assert arbitrate(made.case, made.starts(), made.where).cuts == ()
+    assert select_closures(made.case, made.starts(), made.where).cuts == ()
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -250,7 +250,7 @@ def test_a_robot_that_was_carried_is_cut_where_it_was(seed):
     stream = np.random.default_rng(seed)
     jump = int(stream.integers(2 * LAP + 5, 3 * LAP)), int(stream.integers(15, 45))
     made = world(seed, jumps=(jump,))
-    judged = arbitrate(made.case, made.starts(), made.where)
+    judged = select_closures(made.case, made.starts(), made.where)
     assert [frame for frame, _ in judged.cuts] == [jump[0]]
     assert made.case.first[judged.cuts[0][1]] >= jump[0]
     assert (judged.fit.weights > KEPT).all()
@@ -263,7 +263,7 @@ def test_a_robot_carried_away_and_back_is_cut_twice(seed):
     stream = np.random.default_rng(seed)
     away, stay, places = 2 * LAP + 5 + 20 * int(stream.integers(3)), 60, int(stream.integers(15, 45))
     made = world(seed, laps=5, jumps=((away, places), (away + stay, -places)), least=35.0)
-    judged = arbitrate(made.case, made.starts(), made.where)
+    judged = select_closures(made.case, made.starts(), made.where)
     assert sorted(frame for frame, _ in judged.cuts) == [away, away + stay]
     assert (judged.fit.weights > KEPT).all()
     assert off(judged.fit, made.truth) < 0.1
@@ -272,7 +272,7 @@ def test_a_robot_carried_away_and_back_is_cut_twice(seed):
 def test_a_visit_may_be_told_by_runs_however_strong_they_are():
     jumps = ((2 * LAP + 45, 34), (2 * LAP + 85, -34))
     made = world(0, laps=5, jumps=jumps, least=44.0, most=45.0)
-    judged = arbitrate(made.case, made.starts(), made.where)
+    judged = select_closures(made.case, made.starts(), made.where)
     whole = closure_selection._settled(
         made.case, Fit(made.truth.copy(), 0.0, np.zeros(0)), ((jumps[0][0], 5), (jumps[1][0], 7))
     )
@@ -282,8 +282,8 @@ def test_a_visit_may_be_told_by_runs_however_strong_they_are():
 @pytest.mark.parametrize("seed", range(4))
 def test_a_cut_once_made_is_kept(seed):
     made = world(seed, jumps=((150, 25),))
-    first = arbitrate(made.case, made.starts(), made.where)
-    again = arbitrate(made.case, [first.fit, made.reckoned()], made.where, first.cuts)
+    first = select_closures(made.case, made.starts(), made.where)
+    again = select_closures(made.case, [first.fit, made.reckoned()], made.where, first.cuts)
     assert again.cuts == first.cuts
     assert np.allclose(again.fit.poses, first.fit.poses, atol=0.01)
 
@@ -291,7 +291,7 @@ def test_a_cut_once_made_is_kept(seed):
 @pytest.mark.parametrize("seed", range(4))
 def test_a_cut_that_serves_no_purpose_is_given_up(seed):
     made = world(seed)
-    plain = arbitrate(made.case, made.starts(), made.where)
-    judged = arbitrate(made.case, made.starts(), made.where, ((150, 4),))
+    plain = select_closures(made.case, made.starts(), made.where)
+    judged = select_closures(made.case, made.starts(), made.where, ((150, 4),))
     assert judged.cuts == ()
     assert judged.cost == pytest.approx(plain.cost, rel=1e-3)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ratslam.core.types import Action
-from ratslam.keyframes.experiences import Grouping, Said
+from ratslam.keyframes.experiences import Experiences, Said
 from tactile.base.se2 import compose, wrap
 
 RADIUS, HEADING = 1.0, 0.5
@@ -16,7 +16,7 @@ RADIUS, HEADING = 1.0, 0.5
 
 def walk(*frames, world=None):
     """Folds frames (x, y, heading, matched, sure); the world and what it said."""
-    world = world or Grouping(RADIUS, HEADING)
+    world = world or Experiences(RADIUS, HEADING)
     poses = np.array([frame[:3] for frame in frames], float)
     return world, [world.arrive(poses[: k + 1], k, *frames[k][3:]) for k in range(len(frames))], poses
 
@@ -26,7 +26,7 @@ def at(x, y=0.0, heading=0.0, matched=-1, sure=False):
 
 
 def test_the_first_frame_makes_an_experience():
-    world = Grouping(RADIUS, HEADING)
+    world = Experiences(RADIUS, HEADING)
     assert world.stay() == Said(-1, -1, Action.NONE)
     assert world.arrive(np.zeros((1, 3)), 0, -1, False) == Said(0, -1, Action.CREATE)
     assert world.stay() == Said(0, 0, Action.NONE)

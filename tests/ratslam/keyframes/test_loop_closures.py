@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ratslam.keyframes.loop_closures import Candidate, Ledger, Verdict
+from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
 
 VARIANCE = np.array([0.1, 0.1, 0.02])
 SCALES = (0.5, 2.0, 20.0)
@@ -23,7 +23,7 @@ steps = st.lists(
 
 def filled():
     """Runs of 2, 3 and 1 candidates at frames 50, 52, ..; run k's candidates have the gain k + 1."""
-    ledger = Ledger()
+    ledger = ClosureLog()
     for k, run in enumerate([0, 0, 1, 1, 1, 2]):
         first = k in (0, 2, 5)
         assert ledger.add(Candidate(50 + 2 * k, k, k - 3, 0.9, run + 1.0), not first) == run
@@ -32,7 +32,7 @@ def filled():
 
 @given(steps)
 def test_the_ledger_is_a_list_of_candidates(steps):
-    ledger, rows, verdicts, counts = Ledger(), [], [], []
+    ledger, rows, verdicts, counts = ClosureLog(), [], [], []
     for kind, a, b in steps:
         if kind == "add":
             follows = a and bool(verdicts)
@@ -76,7 +76,7 @@ def test_the_ledger_is_a_list_of_candidates(steps):
     assert np.allclose(closures.scale, [min(max(0.5 * ledger.score(run), 2), 20) for run in runs])
     assert closures.variance is VARIANCE
 
-    again = Ledger()
+    again = ClosureLog()
     again.add(Candidate(1, 0, 0, 1.0, 1.0), False)
     again.restore(ledger.arrays())
     assert np.array_equal(again.table(), table)
@@ -85,7 +85,7 @@ def test_the_ledger_is_a_list_of_candidates(steps):
 
 
 def test_an_empty_ledger_has_no_closures():
-    ledger = Ledger()
+    ledger = ClosureLog()
     assert ledger.last() is None
     assert ledger.runs == 0
     assert ledger.table().shape == (0, 9)
@@ -126,7 +126,7 @@ def test_a_break_strikes_out_what_was_said_after_it():
 
 @given(steps)
 def test_runs_are_summed_up_as_their_members_say(steps):
-    ledger = Ledger()
+    ledger = ClosureLog()
     for k, (kind, a, b) in enumerate(steps):
         if kind == "add":
             ledger.add(Candidate(50 + k, k, 0, 0.9, b), a and ledger.runs > 0)
@@ -176,7 +176,7 @@ def test_weights_go_to_the_runs_that_count():
 
 
 def test_the_table_tells_all_evidence():
-    ledger = Ledger()
+    ledger = ClosureLog()
     ledger.add(Candidate(30, 4, -2, 0.75, 6.5), False)
     ledger.add(Candidate(40, 5, 1, 0.5, -1.5), False)
     ledger.judge(0, Verdict.ACCEPTED, 2.25)

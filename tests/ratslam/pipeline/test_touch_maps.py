@@ -322,11 +322,11 @@ def test_whiskers_bring_their_own_settings() -> None:
     config = config_of(simulation=LAPS)
     assert config.simulation is not None
     completed = config.completed(simulated(config.simulation))
-    assert completed.recall.fan == "whiskers"
-    for name, value in TOUCH["frames"].items():
+    assert completed.recall.sector_fov == "whiskers"
+    for name, value in TOUCH["keyframes"].items():
         if name != "noise":
-            assert getattr(completed.frames, name) == value
-    assert completed.frames.noise.per_cell == TOUCH["frames"]["noise"]["per_cell"]
+            assert getattr(completed.keyframes, name) == value
+    assert completed.keyframes.noise.per_cell == TOUCH["keyframes"]["noise"]["per_cell"]
     assert completed.pose_cells.cells_xy == 11  # what was asked for stays
     again = RunConfig.model_validate(completed.model_dump(mode="json"))
     assert (
@@ -335,16 +335,16 @@ def test_whiskers_bring_their_own_settings() -> None:
 
 
 def test_what_is_set_goes_before_what_whiskers_bring() -> None:
-    config = config_of(simulation=LAPS, frames={"score": 7.0, "noise": {"per_cell": 0.5}})
+    config = config_of(simulation=LAPS, keyframes={"min_score": 7.0, "noise": {"per_cell": 0.5}})
     assert config.simulation is not None
-    frames = config.completed(simulated(config.simulation)).frames
-    assert (frames.score, frames.noise.per_cell) == (7.0, 0.5)
-    assert frames.weigh_every == TOUCH["frames"]["weigh_every"]
-    assert frames.noise.heading_per_cell == TOUCH["frames"]["noise"]["heading_per_cell"]
+    frames = config.completed(simulated(config.simulation)).keyframes
+    assert (frames.min_score, frames.noise.per_cell) == (7.0, 0.5)
+    assert frames.select_every == TOUCH["keyframes"]["select_every"]
+    assert frames.noise.heading_per_cell == TOUCH["keyframes"]["noise"]["heading_per_cell"]
 
 
 def test_saying_that_there_are_whiskers_changes_nothing() -> None:
-    plain, said = config_of(simulation=LAPS), config_of(simulation=LAPS, recall={"fan": "whiskers"})
+    plain, said = config_of(simulation=LAPS), config_of(simulation=LAPS, recall={"sector_fov": "whiskers"})
     assert plain.simulation is not None
     source = simulated(plain.simulation)
     assert said.completed(source) == plain.completed(source)

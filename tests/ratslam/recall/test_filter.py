@@ -16,7 +16,7 @@ from ratslam.backends.config import RecallBackendConfig
 from ratslam.backends.recall import RecallBackend
 from ratslam.core.session import Session
 from ratslam.recall import filter, observation_model
-from ratslam.recall.filter import BASIN, FACING, SAMPLES, SUPPORT, Guidance, RecallConfig
+from ratslam.recall.filter import BASIN, FACING, SAMPLES, SUPPORT, MapFeedback, RecallConfig
 from ratslam.recall.observation_model import LABEL_TEMPER, LABELS
 from tactile.base.se2 import between, compose, wrap
 from tactile.base.types import Odometry, observation
@@ -27,8 +27,8 @@ CAPACITY = 64
 GUARD = 5
 SEEDS = range(16)
 ANGLE = 0.15
-FAN = RecallConfig(fan="auto", guard=GUARD)
-FLAT = RecallConfig(fan="none", guard=GUARD)
+FAN = RecallConfig(sector_fov="auto", guard=GUARD)
+FLAT = RecallConfig(sector_fov="none", guard=GUARD)
 
 
 def filled(
@@ -56,7 +56,7 @@ def filled(
         count=jnp.int32(count),
         distinct=jnp.int32(len(set(ids[ids >= 0].tolist()))),
     )
-    return filter.inform(memory, Guidance(poses, bias, since, angle, scale))
+    return filter.apply_map_feedback(memory, MapFeedback(poses, bias, since, angle, scale))
 
 
 def believing(memory, frames, masses, offsets=None):
@@ -76,7 +76,7 @@ def believing(memory, frames, masses, offsets=None):
 def looker(config, cell=CELL):
     return jax.jit(
         lambda memory, view: filter.look(
-            config, cell, memory, observation_model.by_view(config, cell, memory, view)
+            config, cell, memory, observation_model.view_likelihood(config, cell, memory, view)
         )
     )
 
@@ -84,7 +84,7 @@ def looker(config, cell=CELL):
 @cache
 def labelled(config):
     def read(memory, label):
-        weighed = observation_model.by_label(config, memory, label)
+        weighed = observation_model.label_likelihood(config, memory, label)
         return *filter.look(config, CELL, memory, weighed), weighed
 
     return jax.jit(read)
@@ -127,7 +127,7 @@ def random_case(seed, config=FAN, angle=ANGLE, dtype=float):
 
 
 def errors_by_loops(config, m, view):
-    shifts = [0] if config.fan == "none" else range(-config.shifts, config.shifts + 1)
+    shifts = [0] if config.sector_fov == "none" else range(-config.shifts, config.shifts + 1)
     errors = {}
     for k in shifts:
         for c in range(int(m.count) - config.guard):
@@ -175,10 +175,10 @@ def look_by_loops(config, cell, memory, view):
         fall = landing(
             compose(compose(frame[anchor], offset), moved), config.reach * cell, config.reach_heading
         )
-        total = sum(fall.values()) + config.nothing
+        total = sum(fall.values()) + config.miss_weight
         for at in errors:
-            belief[at] += mass * (1 - config.leave) * fall[at] / total
-        novel += mass * config.leave + mass * (1 - config.leave) * config.nothing / total
+            belief[at] += mass * (1 - config.mode_decay) * fall[at] / total
+        novel += mass * config.mode_decay + mass * (1 - config.mode_decay) * config.miss_weight / total
     fresh = 1 - sum(m.mass)
     way = m.since + m.length
     near = landing(
@@ -377,7 +377,7 @@ def test_where_the_map_lies_does_not_matter():
         frames = np.stack([memory.x, memory.y, np.arctan2(memory.sine, memory.cosine)], axis=1)
         poses = compose(elsewhere, frames[: int(memory.count)])
         told = (float(memory.bias), float(memory.since), float(memory.angle), float(memory.scale))
-        moved = filter.inform(memory, Guidance(poses, *told))
+        moved = filter.apply_map_feedback(memory, MapFeedback(poses, *told))
         moved = moved._replace(pose=jnp.asarray(compose(elsewhere, memory.pose)))
         found, there = look(FAN, memory, view)[1], look(FAN, moved, view)[1]
         for name in found._fields:
@@ -556,7 +556,7 @@ def test_a_contradicting_view_takes_mass_away():
 def test_odometry_alone_is_never_evidence():
     # A straight way driven twice: odometry follows the first drive perfectly, yet nothing is seen.
     memory = filled(FLAT, np.zeros((40, SIZE)), spaced(40, 0.5), scale=0.1)
-    blank = filter.Weighing(
+    blank = filter.ObservationLikelihood(
         likelihood=jnp.ones((1, CAPACITY)), novelty=jnp.ones(()), background=jnp.full(SAMPLES, jnp.nan),
         certain=jnp.bool_(True), telling=jnp.bool_(False),
     )  # fmt: skip
@@ -602,7 +602,7 @@ def test_a_hypothesis_faces_as_one_of_its_frames_does():
 # Given ids
 
 
-def by_label(memory, label):
+def label_likelihood(memory, label):
     return jax.tree.map(np.asarray, labelled(FLAT)(memory, jnp.int32(label)))
 
 
@@ -610,7 +610,7 @@ def test_ids_speak_for_and_against():
     ids = np.arange(40) // 4
     memory = believing(filled(FLAT, np.zeros((40, 0)), spaced(40), labels=ids), [9], [0.6])
     known = len(set(ids.tolist()))
-    same, other, new = (by_label(memory, label) for label in (ids[9], ids[30], 77))
+    same, other, new = (label_likelihood(memory, label) for label in (ids[9], ids[30], 77))
 
     weighing = same[2]
     assert weighing.likelihood.shape == (1, CAPACITY)
@@ -634,7 +634,7 @@ def test_only_a_known_id_tells_whether_the_map_is_right():
     ids = np.arange(40)
     memory = filled(FLAT, np.zeros((40, 0)), spaced(40), labels=ids)
     memory = memory._replace(pose=jnp.asarray(spaced(40)[20]))
-    answers = {label: by_label(memory, label) for label in (20, 3, 77)}
+    answers = {label: label_likelihood(memory, label) for label in (20, 3, 77)}
     assert [bool(observation_model.telling) for *_, weighing in answers.values()] == [True, True, False]
     assert [int(found.agree) for _, found, _ in answers.values()] == [1, 0, -1]
 
@@ -650,9 +650,9 @@ def test_an_id_is_new_once():
 def test_the_newest_frames_are_not_recalled_by_id():
     ids = np.arange(40)
     memory = filled(FLAT, np.zeros((40, 0)), spaced(40), labels=ids)
-    assert by_label(memory, 40 - GUARD - 1)[1].match == 40 - GUARD - 1
+    assert label_likelihood(memory, 40 - GUARD - 1)[1].match == 40 - GUARD - 1
     for label in range(40 - GUARD, 40):
-        after, found, _ = by_label(memory, label)
+        after, found, _ = label_likelihood(memory, label)
         assert found.match < 40 - GUARD
         assert (after.anchor[after.mass > 0] < 40 - GUARD).all()
 

@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ratslam.recall import filter
-from ratslam.recall.filter import FOLLOWERS, SUPPORT, Guidance, RecallConfig
-from ratslam.recall.observation_model import STEPS, by_touch
+from ratslam.recall.filter import FOLLOWERS, SUPPORT, MapFeedback, RecallConfig
+from ratslam.recall.observation_model import STEPS, touch_likelihood
 from ratslam.recall.whisker_likelihood import (
     DEAD,
     HEIGHTS,
@@ -34,7 +34,7 @@ SIZE = len(PIXELS.group)
 GUARD = 5
 CAPACITY = 64
 NEVER = 3.0
-BOTH = RecallConfig(fan="whiskers", guard=GUARD)
+BOTH = RecallConfig(sector_fov="whiskers", guard=GUARD)
 AHEAD = BOTH.model_copy(update={"shifts": 0})
 SEEDS = range(8)
 seeds = st.integers(0, 10_000)
@@ -58,7 +58,7 @@ def filled(config, images, poses, likeness, *, scale=NEVER, dtype=float):
     store = np.zeros((SIZE, CAPACITY), np.int32)
     store[:, :count] = images.T
     memory = memory._replace(view=jnp.asarray(store), count=jnp.int32(count))
-    return filter.inform(memory, Guidance(poses, 0.0, 0.0, np.pi, scale, likeness))
+    return filter.apply_map_feedback(memory, MapFeedback(poses, 0.0, 0.0, np.pi, scale, likeness))
 
 
 def spaced(count, cells=4.0):
@@ -94,13 +94,13 @@ def random_case(seed, config=BOTH):
 
 @cache
 def weigher(config):
-    return jax.jit(lambda memory, level: by_touch(config, memory, level, PIXELS))
+    return jax.jit(lambda memory, level: touch_likelihood(config, memory, level, PIXELS))
 
 
 @cache
 def looker(config):
     def look(memory, level):
-        memory, weighing = by_touch(config, memory, level, PIXELS)
+        memory, weighing = touch_likelihood(config, memory, level, PIXELS)
         return filter.look(config, CELL, memory, weighing)
 
     return jax.jit(look)
@@ -165,11 +165,11 @@ def followed_by_loops(config, m):
                 deviation = (apart[0] ** 2 + apart[1] ** 2) / (config.reach * CELL) ** 2
                 deviation += 2 * (1 - math.cos(apart[2])) / config.reach_heading**2
                 falls[to] = max(1 - deviation / SUPPORT, 0) ** 4
-            total = sum(falls.values()) + config.nothing
-            stay = m.rest[s, c] * (1 - config.leave)
+            total = sum(falls.values()) + config.miss_weight
+            stay = m.rest[s, c] * (1 - config.mode_decay)
             for to, fall in falls.items():
                 belief[s, to] += stay * fall / total
-            novel += m.rest[s, c] * config.leave + stay * config.nothing / total
+            novel += m.rest[s, c] * config.mode_decay + stay * config.miss_weight / total
     return belief, novel
 
 
@@ -242,7 +242,9 @@ def test_mass_is_conserved_along_a_way(config, dtype):
     turn, tolerance = 2 * np.pi / 20, 1e-9 if dtype is float else 1e-4
     likeness = known(felt(stream, 200))
     memory = filter.start(config, SIZE, CAPACITY, np.dtype(dtype), len(likeness))
-    memory = filter.inform(memory, Guidance(np.zeros((1, 3)), 0.0, 0.0, np.pi, NEVER, likeness))
+    memory = filter.apply_map_feedback(
+        memory, MapFeedback(np.zeros((1, 3)), 0.0, 0.0, np.pi, NEVER, likeness)
+    )
     again = []
     for k in range(60):
         level = np.where(stream.random(SIZE) < 0.9, lap[k % 20], felt(stream, 1)[0])
@@ -348,7 +350,7 @@ def test_room_is_made_for_what_whiskers_need():
         assert memory.likeness.shape == (3, LEVELS, LEVELS)
         assert memory.view.dtype == np.int32
     for fan in ("auto", "none", 1.0):
-        memory = filter.start(RecallConfig(fan=fan), SIZE, CAPACITY, np.dtype(float))
+        memory = filter.start(RecallConfig(sector_fov=fan), SIZE, CAPACITY, np.dtype(float))
         assert memory.before.size == memory.rest.size == memory.likeness.size == 0
 
 

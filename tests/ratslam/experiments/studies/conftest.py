@@ -44,11 +44,11 @@ def played(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     def run_job(job: Job) -> Result:
         asked.append(job.key)
-        if job.config.frames.score > 40:
-            return Result(hash=job.hash, seed=job.seed, error="frames.score: too much")
+        if job.config.keyframes.min_score > 40:
+            return Result(hash=job.hash, seed=job.seed, error="keyframes.min_score: too much")
         values = {
-            "energy_all": (job.config.frames.score - 7) ** 2 + job.seed,
-            "exm_arr": 1 / (1 + abs(job.config.frames.score - 12) + job.config.recall.modes),
+            "energy_all": (job.config.keyframes.min_score - 7) ** 2 + job.seed,
+            "exm_arr": 1 / (1 + abs(job.config.keyframes.min_score - 12) + job.config.recall.modes),
         }
         quantities = {name: Quantity(label=name, value=value, unit="") for name, value in values.items()}
         return Result(hash=job.hash, seed=job.seed, quantities=quantities, steps=1)

@@ -118,7 +118,9 @@ def test_a_killed_sweep_runs_only_what_is_missing(tiny, tmp_path, played):
 def test_whatever_is_lost_is_run_again_and_nothing_else(data, scores, tmp_path_factory):
     folder = tmp_path_factory.mktemp("lost")
     (folder / "base.yaml").write_text("simulation: {}\n")
-    rows = {f"r{k}": {"frames.score": k} for k in scores} | {"twin": {"frames.score": scores[0]}}
+    rows = {f"r{k}": {"keyframes.min_score": k} for k in scores} | {
+        "twin": {"keyframes.min_score": scores[0]}
+    }
     (folder / "study.yaml").write_text(json.dumps({"base": "base.yaml", "rows": rows, "seeds": 2}))
     asked = jobs(read_study(folder / "study.yaml"))
     with pytest.MonkeyPatch.context() as patch:
@@ -139,17 +141,17 @@ def test_whatever_is_lost_is_run_again_and_nothing_else(data, scores, tmp_path_f
 def counting(calls):
     def run_job(job):
         calls.append(job.key)
-        return Result(hash=job.hash, seed=job.seed, steps=int(job.config.frames.score))
+        return Result(hash=job.hash, seed=job.seed, steps=int(job.config.keyframes.min_score))
 
     return run_job
 
 
 def test_what_fails_is_told_and_the_rest_goes_on(tiny, tmp_path, capsys, played):
-    study = tiny(vary={"frames.score": [5, 41, 6]}, seeds=2)
+    study = tiny(vary={"keyframes.min_score": [5, 41, 6]}, seeds=2)
     for _ in range(2):  # the second time nothing is run, and it is said again
         assert main(["sweep", str(study), "-o", str(tmp_path / "out"), "--workers", "1"]) == 2
         told = capsys.readouterr()
-        assert "score=41, seed 1: frames.score: too much" in told.err
+        assert "score=41, seed 1: keyframes.min_score: too much" in told.err
         assert "2 runs failed" in told.err
         assert "score=6" in told.out
         assert "0, 2 failed" in told.out

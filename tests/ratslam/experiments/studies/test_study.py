@@ -13,14 +13,14 @@ from ratslam.cli import main
 from ratslam.config.run_config import RunConfig
 from ratslam.experiments.studies.schema import StudyPlan
 from ratslam.experiments.studies.study import Study, jobs, read_study
-from ratslam.keyframes.config import FrameMapConfig
+from ratslam.keyframes.config import KeyframeMapConfig
 from tactile.base.errors import InputError
 
 ROOT = Path(__file__).parents[4]
 MAZE = ROOT / "configs" / "whisker_maze.yaml"
 SQUARE = ROOT / "configs" / "square.yaml"
 AXES = {
-    "frames.score": st.floats(1, 50, allow_subnormal=False),
+    "keyframes.min_score": st.floats(1, 50, allow_subnormal=False),
     "recall.modes": st.integers(1, 8),
     "backend": st.sampled_from(["recall", "classic"]),
     "session.precision": st.sampled_from(["float32", "float64"]),
@@ -53,7 +53,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @settings(max_examples=25)
 @given(grid=GRIDS, rows=st.lists(st.integers(1, 99), unique=True, max_size=3), seeds=st.integers(1, 4))
 def test_rows_by_combinations_by_seeds(folder, grid, rows, seeds):
-    named = {f"row {n}": {"frames.distance": n + 0.5} for n in rows}
+    named = {f"row {n}": {"keyframes.max_distance": n + 0.5} for n in rows}
     found = jobs(read(folder, vary=grid, rows=named, seeds=seeds))
     combinations = 1
     for values in grid.values():
@@ -66,8 +66,8 @@ def test_rows_by_combinations_by_seeds(folder, grid, rows, seeds):
         assert job.config.simulation.seed == job.seed
         for key, value in job.varied.items():
             assert value in grid[key]
-            if key == "frames.score":
-                assert job.config.frames.score == value
+            if key == "keyframes.min_score":
+                assert job.config.keyframes.min_score == value
 
 
 @settings(max_examples=25)
@@ -83,15 +83,15 @@ def test_hashes_follow_from_what_is_set_and_not_from_how_it_is_written(folder, g
 
 
 def test_a_row_that_equals_another_is_the_same_job(folder):
-    found = jobs(read(folder, rows={"a": None, "b": {}, "c": {"frames.score": 3.0}}))
+    found = jobs(read(folder, rows={"a": None, "b": {}, "c": {"keyframes.min_score": 3.0}}))
     assert [job.row for job in found] == ["a", "b", "c"]
     assert found[0].key == found[1].key != found[2].key
 
 
 def test_what_is_set_counts_even_if_it_is_the_default(folder):
-    """What nobody sets may be completed from the source: touch has a `frames.score` of its own."""
-    usual = FrameMapConfig().score
-    unset, default = jobs(read(folder, rows={"unset": {}, "default": {"frames.score": usual}}))
+    """What nobody sets may be completed from the source: touch has a `keyframes.min_score` of its own."""
+    usual = KeyframeMapConfig().min_score
+    unset, default = jobs(read(folder, rows={"unset": {}, "default": {"keyframes.min_score": usual}}))
     assert unset.config == default.config
     assert unset.key != default.key
 
@@ -140,48 +140,59 @@ def test_pace_counts_because_times_are_of_it(folder):
 
 def test_overrides_are_of_the_study_or_of_all_runs(folder):
     found = read(
-        folder, "seeds=3", "frames.score=9", "simulation.path.circuits=CC", set={"frames.score": 2.0}
+        folder,
+        "seeds=3",
+        "keyframes.min_score=9",
+        "simulation.path.circuits=CC",
+        set={"keyframes.min_score": 2.0},
     )
     assert len(jobs(found)) == 3
-    assert {job.config.frames.score for job in jobs(found)} == {9.0}
+    assert {job.config.keyframes.min_score for job in jobs(found)} == {9.0}
     assert {job.config.simulation.path.circuits for job in jobs(found)} == {"CC"}
-    whole = read(folder, "frames={distance: 9}", set={"frames.score": 2.0})
-    assert jobs(whole)[0].config.frames.model_fields_set == {"distance"}
+    whole = read(folder, "keyframes={max_distance: 9}", set={"keyframes.min_score": 2.0})
+    assert jobs(whole)[0].config.keyframes.model_fields_set == {"max_distance"}
 
 
 def test_a_section_is_set_before_what_is_in_it(folder):
-    written = {"frames.score": 2.0, "frames": {"distance": 9.0}}
+    written = {"keyframes.min_score": 2.0, "keyframes": {"max_distance": 9.0}}
     found = [jobs(read(folder, set=dict(items))) for items in (written.items(), reversed(written.items()))]
     assert found[0] == found[1]
-    assert found[0][0].config.frames.score == 2.0
+    assert found[0][0].config.keyframes.min_score == 2.0
 
 
 def test_no_key_of_studies_is_one_of_runs():
     assert not set(StudyPlan.model_fields) & set(RunConfig.model_fields)  # `--set` tells them apart by it
 
 
-GRID = {"frames.score": [3]}
+GRID = {"keyframes.min_score": [3]}
+
+
+def tuning(key: str, **parameter: object) -> dict[str, object]:
+    return {"tune": TUNE | {"parameters": {key: parameter}}}
 
 
 def tune(**parameter: object) -> dict[str, object]:
-    return {"tune": TUNE | {"parameters": {"frames.score": parameter}}}
+    return tuning("keyframes.min_score", **parameter)
 
 
-TUNE = {"parameters": {"frames.score": {"low": 1.0, "high": 2.0}}, "objectives": ["exm_arr"]}
+TUNE = {"parameters": {"keyframes.min_score": {"low": 1.0, "high": 2.0}}, "objectives": ["exm_arr"]}
 
 
 @pytest.mark.parametrize(
     ("content", "said"),
     [
         ({"base": "nowhere.yaml"}, ["nowhere.yaml", "No such file"]),
-        ({"vary": {"frames.scor": [1, 2]}}, ["study.yaml:1:", "frames.scor: unknown key", "'score'"]),
-        ({"rows": {"a": {"recall.leave": "x"}}}, ["recall.leave: 'x'", "a number"]),
-        ({"set": {"frames.score": [1]}}, ["frames.score: a list of 1"]),
-        ({"vary": {"frames.score": []}}, ["vary.frames.score", "at least 1"]),
-        ({"vary": {"frames.score": 3}}, ["vary.frames.score: 3", "a list"]),
-        ({"vary": {"frames.score": [3, 4, 3]}}, ["vary.frames.score.2: 3 given twice"]),
-        ({"vary": GRID, "rows": {"a": {"frames": {}}}}, ["rows.a.frames", "'frames.score' varies"]),
-        ({"vary": GRID | {"frames": [{}]}}, ["vary.frames", "'frames.score' varies"]),
+        ({"vary": {"keyframes.min_scor": [1, 2]}}, ["study.yaml:1:", "keyframes.min_scor: unknown key", "'min_score'"]),
+        ({"rows": {"a": {"recall.mode_decay": "x"}}}, ["recall.mode_decay: 'x'", "a number"]),
+        ({"set": {"keyframes.min_score": [1]}}, ["keyframes.min_score: a list of 1"]),
+        ({"vary": {"keyframes.min_score": []}}, ["vary.keyframes.min_score", "at least 1"]),
+        ({"vary": {"keyframes.min_score": 3}}, ["vary.keyframes.min_score: 3", "a list"]),
+        ({"vary": {"keyframes.min_score": [3, 4, 3]}}, ["vary.keyframes.min_score.2: 3 given twice"]),
+        (
+            {"vary": GRID, "rows": {"a": {"keyframes": {}}}},
+            ["rows.a.keyframes", "'keyframes.min_score' varies"],
+        ),
+        ({"vary": GRID | {"keyframes": [{}]}}, ["vary.keyframes", "'keyframes.min_score' varies"]),
         ({"vary": {"simulation.seed": [1, 2]}}, ["simulation.seed: a seed"]),
         ({"set": {"simulation.seed": 1}}, ["simulation.seed: a seed"]),
         ({"base": str(SQUARE), "rows": {"a": {"session.seed": 1}}}, ["session.seed: a seed"]),
@@ -190,15 +201,15 @@ TUNE = {"parameters": {"frames.score": {"low": 1.0, "high": 2.0}}, "objectives":
         ({"seeds": 0}, ["seeds: 0"]),
         ({"seeds": [1, 1]}, ["seeds", "twice"]),
         ({"seeds": [-1]}, ["seeds.0: -1"]),
-        ({"vary": {f"frames.{key}": list(range(1, 60)) for key in "abc"}}, ["205379 jobs"]),
+        ({"vary": {f"keyframes.{key}": list(range(1, 60)) for key in "abc"}}, ["205379 jobs"]),
         ({"sedes": 3}, ["sedes: unknown key", "'seeds'"]),
         ({"tune": TUNE | {"objectives": ["speed"]}}, ["objectives.0: 'speed'", "step_time"]),
         ({"tune": TUNE | {"objectives": ["steps"]}}, ["objectives.0: 'steps'", "minimise or maximise"]),
         ({"tune": TUNE | {"objectives": []}}, ["tune: no objectives"]),
         ({"tune": TUNE | {"minimise": ["exm_arr"]}}, ["tune: a quantity named twice"]),
         ({"tune": TUNE | {"parameters": {}}}, ["tune.parameters"]),
-        ({"tune": TUNE | {"parameters": {"frames.x": {"low": 1, "high": 2}}}}, ["frames.x: unknown key"]),
-        ({"tune": TUNE | {"parameters": {"recall.leave": {"low": 0.1, "high": 2.0}}}}, ["recall.leave: 2"]),
+        (tuning("keyframes.x", low=1, high=2), ["keyframes.x: unknown key"]),
+        (tuning("recall.mode_decay", low=0.1, high=2.0), ["recall.mode_decay: 2"]),
         (tune(low=2, high=2), ["low 2 is not below"]),
         (tune(low=0, high=2, log=True), ["log needs"]),
         (tune(low=2), ["give low and high, or choices"]),
@@ -219,18 +230,20 @@ def test_a_bad_study_is_refused_before_anything_runs(capsys, folder, content, sa
 def test_a_fault_is_told_once_and_all_faults_are_told(folder):
     with pytest.raises(InputError) as caught:
         read(
-            folder, vary={"backend": ["recall", "classic"], "frames.scor": [1, 2]}, set={"recall.leave": "x"}
+            folder,
+            vary={"backend": ["recall", "classic"], "keyframes.min_scor": [1, 2]},
+            set={"recall.mode_decay": "x"},
         )
     lines = str(caught.value).splitlines()
     assert len(lines) == 2
-    assert "recall.leave: 'x'" in str(caught.value)
-    assert "frames.scor: unknown key" in str(caught.value)
+    assert "recall.mode_decay: 'x'" in str(caught.value)
+    assert "keyframes.min_scor: unknown key" in str(caught.value)
 
 
 @pytest.mark.parametrize(
     ("override", "said"),
     [
-        ("frames.scor=3", "--set frames.scor: unknown key"),
+        ("keyframes.min_scor=3", "--set keyframes.min_scor: unknown key"),
         ("backend=recall", "varied"),
         ("x", "no key and value"),
     ],

@@ -19,7 +19,7 @@ from tactile.base.errors import InputError
 TUNE = {
     "trials": 14,
     "parameters": {
-        "frames.score": {"low": 1.0, "high": 39.0, "log": True},
+        "keyframes.min_score": {"low": 1.0, "high": 39.0, "log": True},
         "recall.modes": {"low": 1, "high": 8},
         "session.precision": {"choices": ["float32", "float64"]},
     },
@@ -43,9 +43,11 @@ def test_trials_are_within_bounds_and_the_optimal_ones_are_not_dominated(tiny, t
     trials = tune(read_study(tiny(tune=plan, seeds=2)), tmp_path / "out", workers=1)
     assert [trial.number for trial in trials] == list(range(14))
     for trial in trials:
-        assert 1 <= trial.parameters["frames.score"] <= 39
+        assert 1 <= trial.parameters["keyframes.min_score"] <= 39
         assert trial.parameters["recall.modes"] in range(1, 9)
-        assert trial.values["energy_all"] == pytest.approx((trial.parameters["frames.score"] - 7) ** 2 + 0.5)
+        assert trial.values["energy_all"] == pytest.approx(
+            (trial.parameters["keyframes.min_score"] - 7) ** 2 + 0.5
+        )
         others = [other.values for other in trials]
         assert trial.optimal == (not any(dominates(values, trial.values) for values in others))
     different = {json.dumps(trial.parameters) for trial in trials}
@@ -96,11 +98,11 @@ def test_more_trials_go_on_from_those_there_are(tiny, tmp_path, played):
 
 
 def test_a_failed_run_fails_its_trial_alone(tiny, tmp_path, played):
-    plan = TUNE | {"parameters": {"frames.score": {"low": 20.0, "high": 60.0}}}
+    plan = TUNE | {"parameters": {"keyframes.min_score": {"low": 20.0, "high": 60.0}}}
     trials = tune(read_study(tiny(tune=plan)), tmp_path / "out", workers=1)
     assert {trial.values is None for trial in trials} == {True, False}
     for trial in trials:
-        assert (trial.values is None) == (trial.parameters["frames.score"] > 40)
+        assert (trial.values is None) == (trial.parameters["keyframes.min_score"] > 40)
     assert "failed" in report(trials)
 
 
@@ -135,7 +137,7 @@ def test_the_program_tells_what_is_optimal(tiny, tmp_path, capsys, played):
 def test_a_tuning_that_is_killed_again_and_again_ends_the_same(tiny, tmp_path):
     from tests.ratslam.experiments.studies.test_executor import start, wait_for
 
-    plan = TUNE | {"trials": 10, "parameters": {"frames.score": {"low": 2.0, "high": 30.0}}}
+    plan = TUNE | {"trials": 10, "parameters": {"keyframes.min_score": {"low": 2.0, "high": 30.0}}}
     study = tiny(tune=plan, set={"backend": "recall"})
     whole = tune(read_study(study), tmp_path / "whole", workers=1)
     output = tmp_path / "out"
