@@ -182,7 +182,10 @@ TUNE = {"parameters": {"keyframes.min_score": {"low": 1.0, "high": 2.0}}, "objec
     ("content", "said"),
     [
         ({"base": "nowhere.yaml"}, ["nowhere.yaml", "No such file"]),
-        ({"vary": {"keyframes.min_scor": [1, 2]}}, ["study.yaml:1:", "keyframes.min_scor: unknown key", "'min_score'"]),
+        (
+            {"vary": {"keyframes.min_scor": [1, 2]}},
+            ["study.yaml:1:", "keyframes.min_scor: unknown key", "'min_score'"],
+        ),
         ({"rows": {"a": {"recall.mode_decay": "x"}}}, ["recall.mode_decay: 'x'", "a number"]),
         ({"set": {"keyframes.min_score": [1]}}, ["keyframes.min_score: a list of 1"]),
         ({"vary": {"keyframes.min_score": []}}, ["vary.keyframes.min_score", "at least 1"]),
