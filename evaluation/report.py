@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evaluation.artifacts.grid_npz import read_grid, read_truth
-from evaluation.artifacts.run_directory import read_card, read_closures, read_run, read_walls
-from evaluation.artifacts.whisker_views import read_images
+from evaluation.artifacts.grid_npz import read_grid, read_grid_truth
+from evaluation.artifacts.run_directory import read_closures, read_run, read_scorecard, read_walls
+from evaluation.artifacts.whisker_views import read_whisker_views
 from evaluation.metrics.grid_score import GridScore
-from evaluation.metrics.run_arrays import Run
+from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.scorecard import Scorecard
-from evaluation.plots.experience_plot import draw_history
-from evaluation.plots.grid_plot import Panel, Paths, draw_grid, headline
+from evaluation.plots.experience_plot import draw_experience_history
+from evaluation.plots.grid_plot import GridPanel, GridPaths, draw_grid, grid_headline
 from evaluation.plots.map_plot import NO_CLOSURES, NO_WALLS, draw_map
 from evaluation.plots.whisker_plot import draw_whiskers
 from tactile.base.se2 import between
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 def save_map(
     path: str | Path,
-    run: Run,
+    run: RunArrays,
     card: Scorecard,
     walls: np.ndarray = NO_WALLS,
     closures: np.ndarray = NO_CLOSURES,
@@ -35,7 +35,7 @@ def save_map(
     draw_map(run, card, walls, closures).savefig(path)
 
 
-def pictures(directory: Path) -> dict[str, Callable[[Path], None]]:
+def plot_writers(directory: Path) -> dict[str, Callable[[Path], None]]:
     """What to call with a path to have each picture of a scored run drawn, by file name.
 
     `map.png` of every run; of one with whiskers also `whiskers.png` and `experiences.png`; of one whose map
@@ -44,13 +44,13 @@ def pictures(directory: Path) -> dict[str, Callable[[Path], None]]:
     Raises:
         InputError: naming the file that is missing or malformed.
     """
-    run, card = read_run(directory), read_card(directory)
+    run, card = read_run(directory), read_scorecard(directory)
     walls, closures = read_walls(directory), read_closures(directory)
     drawn: dict[str, Callable[[], Figure]] = {"map.png": lambda: draw_map(run, card, walls, closures)}
     if (directory / "views.npz").exists():
-        images = read_images(directory / "views.npz")
+        images = read_whisker_views(directory / "views.npz")
         drawn["whiskers.png"] = lambda: draw_whiskers(run, card, images, walls)
-        drawn["experiences.png"] = lambda: draw_history(run, card)
+        drawn["experiences.png"] = lambda: draw_experience_history(run, card)
 
     if (directory / "grid.npz").exists():
         drawn["grid.png"] = lambda: draw_grid(_charted(directory, run))
@@ -61,22 +61,22 @@ def pictures(directory: Path) -> dict[str, Callable[[Path], None]]:
     return {name: saver(draw) for name, draw in drawn.items()}
 
 
-def _charted(directory: Path, run: Run) -> Panel:
+def _charted(directory: Path, run: RunArrays) -> GridPanel:
     """The grid of a run, with what is known of the truth."""
     grid = read_grid(directory / "grid.npz")
     if run.truth is None or not (directory / "arena.npz").exists():
-        return Panel(directory.name, "", grid)
-    truth, start = read_truth(directory / "arena.npz")
+        return GridPanel(directory.name, "", grid)
+    truth, start = read_grid_truth(directory / "arena.npz")
     told = GridScore.model_validate_json((directory / "gridscore.json").read_text(encoding="utf-8"))
-    paths = Paths(between(start, run.truth), run.online, run.odometry)
-    return Panel(directory.name, headline(told), grid, truth.segments, paths)
+    paths = GridPaths(between(start, run.truth), run.online, run.odometry)
+    return GridPanel(directory.name, grid_headline(told), grid, truth.segments, paths)
 
 
-def redraw(directory: Path) -> None:
+def redraw_plots(directory: Path) -> None:
     """Draws the pictures of a scored run again, over the old ones.
 
     Raises:
         InputError: naming the file that is missing or malformed.
     """
-    for name, save in pictures(directory).items():
+    for name, save in plot_writers(directory).items():
         save(directory / name)

@@ -13,10 +13,10 @@ from robot.sources.source_info import SourceInfo
 from tactile.base.errors import InputError
 from tactile.base.types import Observation
 from tactile.frontend import Frontend, TouchConfig
-from tactile.wall_estimation.report_frontend import Reporting, ReportsConfig
+from tactile.wall_estimation.report_frontend import ReportFrontend, ReportFrontendConfig
 from tactile.wall_estimation.strain_templates import StrainTemplates
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
-from tactile.whiskers.planar_whiskers import Feelers, swept
+from tactile.whiskers.planar_whiskers import PlanarWhiskers, project_to_plane
 
 TALLEST = 0.05
 """Of the walls of micromouse mazes, m."""
@@ -33,7 +33,7 @@ class Sense(Protocol):
     def view_shape(self) -> tuple[int, int, int]: ...
     @property
     def whiskers(self) -> int: ...
-    def observed(self, reading: Any) -> Observation | None:
+    def observe(self, reading: Any) -> Observation | None:
         """What an engine is given; None if the reading is kept for the next one."""
 
 
@@ -60,7 +60,7 @@ class Sensing:
     def __iter__(self) -> Iterator[Sample]:
         sense = self.sense()
         for sample in self.source:
-            reading = sense.observed(sample.reading)
+            reading = sense.observe(sample.reading)
             if reading is None:
                 continue
             if reading.view.shape != self.view_shape:
@@ -91,7 +91,7 @@ def sensing(source: Source, config: TouchConfig) -> Source:
     if info.planar_whiskers is not None:
         reports = reports_of(info, config.reports)
         templates = templates_of(source, reports)
-        return Sensing(source, lambda: Reporting(reports, templates), "touch.reports.mounts")
+        return Sensing(source, lambda: ReportFrontend(reports, templates), "touch.reports.mounts")
     frontend = Frontend(config, info.calibration)
     return Sensing(source, lambda: frontend, "touch.head")
 
@@ -121,22 +121,22 @@ def observation_of(sample: Sample) -> Observation:
     return sample.reading
 
 
-def feelers_of(source: Source, config: TouchConfig) -> Feelers | None:
+def feelers_of(source: Source, config: TouchConfig) -> PlanarWhiskers | None:
     """The whiskers of a source projected to the floor; None for a source without whiskers."""
     if not source.whiskers:
         return None
     if source.info.planar_whiskers is not None:
         return reports_of(source.info, config.reports).feelers
-    return swept(ur10_head(head_of(source.info, config.head)), TALLEST)
+    return project_to_plane(ur10_head(head_of(source.info, config.head)), TALLEST)
 
 
-def reports_of(info: SourceInfo, config: ReportsConfig) -> ReportsConfig:
+def reports_of(info: SourceInfo, config: ReportFrontendConfig) -> ReportFrontendConfig:
     """The configuration, with the whiskers of a source wherever it does not set its own."""
     found = info.planar_whiskers.model_dump() if info.planar_whiskers else {}
     return config.model_copy(update={k: v for k, v in found.items() if k not in config.model_fields_set})
 
 
-def templates_of(source: Source, config: ReportsConfig) -> StrainTemplates | None:
+def templates_of(source: Source, config: ReportFrontendConfig) -> StrainTemplates | None:
     """Strain templates, trained by simulating the Create of a source; None if the configuration needs none or
     names a file.
 

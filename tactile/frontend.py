@@ -6,9 +6,9 @@ from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Observation, Report, Whisk
 from tactile.features.calibration import Calibration
-from tactile.features.contact import ContactConfig, sensed
-from tactile.features.whisker_image import ImageConfig, observed, view_shape
-from tactile.wall_estimation.report_frontend import ReportsConfig
+from tactile.features.contact import ContactConfig, detect_contacts
+from tactile.features.whisker_image import ImageConfig, view_shape, whisk_observation
+from tactile.wall_estimation.report_frontend import ReportFrontendConfig
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 
 
@@ -21,7 +21,7 @@ class TouchConfig(Settings):
     """From raw samples to contacts."""
     image: ImageConfig = ImageConfig()
     """From contacts to a view."""
-    reports: ReportsConfig = ReportsConfig()
+    reports: ReportFrontendConfig = ReportFrontendConfig()
     """Of a Create: from reports of its steps to contacts and walls."""
 
 
@@ -41,7 +41,7 @@ class Frontend:
         self.view_shape = view_shape(config.image, self.head)
         self.whiskers = len(self.head.length)
 
-    def felt(self, reading: Cycle | Whisk) -> Whisk:
+    def features(self, reading: Cycle | Whisk) -> Whisk:
         """What each whisker felt; a whisker that the head's configuration calls dead does not report.
 
         Raises:
@@ -52,11 +52,11 @@ class Frontend:
                 raise InputError(
                     "calibration", "raw whisker samples without one", "a record of free whisking with them"
                 )
-            reading = sensed(self.config.contact, self.calibration, reading)
+            reading = detect_contacts(self.config.contact, self.calibration, reading)
         alive = reading.alive & self.head.alive
         return reading._replace(alive=alive, contact=reading.contact & alive, held=reading.held & alive)
 
-    def observed(self, reading: Observation | Cycle | Whisk | Report) -> Observation:
+    def observe(self, reading: Observation | Cycle | Whisk | Report) -> Observation:
         """What an engine is given; an observation stays as it is.
 
         Raises:
@@ -66,4 +66,4 @@ class Frontend:
             return reading
         if isinstance(reading, Report):
             raise InputError("recording.file", "reports of a Create", "whisk cycles of a head")
-        return observed(self.config.image, self.head, self.felt(reading))
+        return whisk_observation(self.config.image, self.head, self.features(reading))

@@ -7,18 +7,18 @@ from pathlib import Path
 
 import numpy as np
 
-from evaluation.metrics.occupancy_grid import Grid, Truth, check_grid
+from evaluation.metrics.occupancy_grid import GridTruth, OccupancyGrid, check_grid
 from tactile.base.errors import InputError
 
 
-def write_grid(path: str | Path, grid: Grid) -> None:
+def write_grid(path: str | Path, grid: OccupancyGrid) -> None:
     """Writes the arrays of a map to an .npz; the same map gives the same bytes."""
     check_grid(grid)
     with Path(path).open("wb") as file:
         np.savez_compressed(file, **{name: np.asarray(array) for name, array in grid._asdict().items()})  # type: ignore[arg-type]
 
 
-def read_grid(path: str | Path) -> Grid:
+def read_grid(path: str | Path) -> OccupancyGrid:
     """The inverse of `write_grid`.
 
     Raises:
@@ -27,8 +27,8 @@ def read_grid(path: str | Path) -> Grid:
     expected = "probability [H, W], origin [2] and cell"
     try:
         with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            probability, origin, cell = (archive[name] for name in Grid._fields)
-        grid = Grid(probability.astype(float), origin.astype(float).reshape(2), float(cell))
+            probability, origin, cell = (archive[name] for name in OccupancyGrid._fields)
+        grid = OccupancyGrid(probability.astype(float), origin.astype(float).reshape(2), float(cell))
         check_grid(grid)
     except FileNotFoundError:
         raise InputError(str(path), "no such file", expected) from None
@@ -37,15 +37,15 @@ def read_grid(path: str | Path) -> Grid:
     return grid
 
 
-def write_truth(path: str | Path, truth: Truth, start: np.ndarray) -> None:
+def write_grid_truth(path: str | Path, truth: GridTruth, start: np.ndarray) -> None:
     """Writes what is really there, in the frame of the map, and where that frame is: the pose [3] at which
     the robot started, in the frame of true poses."""
     with Path(path).open("wb") as file:
         np.savez_compressed(file, **truth._asdict(), start=start)
 
 
-def read_truth(path: str | Path) -> tuple[Truth, np.ndarray]:
-    """The inverse of `write_truth`.
+def read_grid_truth(path: str | Path) -> tuple[GridTruth, np.ndarray]:
+    """The inverse of `write_grid_truth`.
 
     Raises:
         InputError: it is no such file.
@@ -53,9 +53,9 @@ def read_truth(path: str | Path) -> tuple[Truth, np.ndarray]:
     expected = "the arena.npz of a run directory"
     try:
         with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            occupied, inside, segments, start = (archive[name] for name in (*Truth._fields, "start"))
+            occupied, inside, segments, start = (archive[name] for name in (*GridTruth._fields, "start"))
     except FileNotFoundError:
         raise InputError(str(path), "no such file", expected) from None
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(str(path), f"no truth of a map ({error})", expected) from None
-    return Truth(occupied, inside, segments.astype(float)), start.astype(float)
+    return GridTruth(occupied, inside, segments.astype(float)), start.astype(float)

@@ -15,11 +15,11 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import yaml
 
-from evaluation.metrics.occupancy_grid import Grid, check_grid
+from evaluation.metrics.occupancy_grid import OccupancyGrid, check_grid
 from tactile.base.atomic_write import write_atomically
 from tactile.base.errors import InputError
 
-Mode = Literal["trinary", "scale"]
+Nav2Mode = Literal["trinary", "scale"]
 """`trinary` tells occupied, free and unknown; `scale` every grade between, but then a PGM knows no unknown
 cell: the prior comes out as 24 of 100."""
 
@@ -31,7 +31,7 @@ _BLACK, _UNKNOWN, _WHITE = 0, 205, 254  # as map_saver writes them
 _HEAD = re.compile(rb"P5(?:\s+|#[^\n]*\n)+(\d+)(?:\s+|#[^\n]*\n)+(\d+)(?:\s+|#[^\n]*\n)+(\d+)\s")
 
 
-class Served(NamedTuple):
+class Nav2Map(NamedTuple):
     """A map as map_server tells it.
 
     Attributes:
@@ -44,13 +44,13 @@ class Served(NamedTuple):
     resolution: float
 
 
-def write_nav2(folder: Path, grid: Grid, mode: Mode = "trinary") -> None:
+def write_nav2(folder: Path, grid: OccupancyGrid, mode: Nav2Mode = "trinary") -> None:
     """Writes map.pgm and map.yaml into a folder, each in one piece."""
-    write_atomically(folder / "map.pgm", lambda path: write_image(path, grid, mode))
-    write_atomically(folder / "map.yaml", lambda path: write_description(path, grid, mode))
+    write_atomically(folder / "map.pgm", lambda path: write_pgm(path, grid, mode))
+    write_atomically(folder / "map.yaml", lambda path: write_map_yaml(path, grid, mode))
 
 
-def write_image(path: str | Path, grid: Grid, mode: Mode = "trinary") -> None:
+def write_pgm(path: str | Path, grid: OccupancyGrid, mode: Nav2Mode = "trinary") -> None:
     """Writes a binary PGM of 8 bits: dark is occupied."""
     check_grid(grid)
     if mode == "scale":
@@ -62,7 +62,9 @@ def write_image(path: str | Path, grid: Grid, mode: Mode = "trinary") -> None:
     Path(path).write_bytes(f"P5\n{width} {height}\n255\n".encode() + pixel[::-1].astype(np.uint8).tobytes())
 
 
-def write_description(path: str | Path, grid: Grid, mode: Mode = "trinary", image: str = "map.pgm") -> None:
+def write_map_yaml(
+    path: str | Path, grid: OccupancyGrid, mode: Nav2Mode = "trinary", image: str = "map.pgm"
+) -> None:
     """Writes the YAML beside the image; `image` is the image's name in the same folder."""
     x, y = (_number(value) for value in grid.origin)
     lines = (
@@ -77,7 +79,7 @@ def write_description(path: str | Path, grid: Grid, mode: Mode = "trinary", imag
     Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def read_nav2(path: str | Path) -> Served:
+def read_nav2(path: str | Path) -> Nav2Map:
     """A map.yaml and its image by map_server's rules (modes trinary, scale and raw; binary PGM of 8 bits).
 
     Raises:
@@ -108,7 +110,7 @@ def read_nav2(path: str | Path) -> Served:
         cell = np.where(occupancy > occupied, 100, np.where(occupancy < free, 0, between))
     else:
         raise InputError(f"{path}: mode", repr(mode), "trinary, scale or raw")
-    return Served(cell.astype(int), place, resolution)
+    return Nav2Map(cell.astype(int), place, resolution)
 
 
 def _number(value: float) -> str:

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
-from evaluation.metrics.run_arrays import Run
+from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.scorecard import Scorecard
-from evaluation.metrics.text_table import read_table
+from evaluation.metrics.text_table import read_text_table
 from evaluation.metrics.trajectory import read_tum
 from tactile.base.errors import InputError
 
 
-def read_run(path: Path) -> Run:
+def read_run(path: Path) -> RunArrays:
     """The run in a directory. Without a final trajectory (a killed run) the online one stands in for it.
 
     Raises:
@@ -37,7 +37,7 @@ def read_run(path: Path) -> Run:
     nodes, links = _map(path / "map.json")
     place = np.where(place[:steps] < len(nodes), place[:steps], -1)
     created = np.array([int(np.argmax(place == node)) for node in range(len(nodes))], int)
-    return Run(
+    return RunArrays(
         time=time,
         truth=true if known.any() else None,
         online=online[:steps],
@@ -47,11 +47,11 @@ def read_run(path: Path) -> Run:
         created=created,
         nodes=nodes,
         links=links,
-        anytime=_anytime(path / "anytime.csv"),
+        online_error=_online_errors(path / "online_error.csv"),
     )
 
 
-def read_card(path: Path) -> Scorecard:
+def read_scorecard(path: Path) -> Scorecard:
     """The scorecard in a run directory.
 
     Raises:
@@ -65,13 +65,13 @@ def read_card(path: Path) -> Scorecard:
         raise InputError(str(path / "scorecard.json"), f"no scorecard ({error})", "a scored run's") from None
 
 
-WALLS = ("west", "south", "east", "north", "height")
+WALL_COLUMNS = ("west", "south", "east", "north", "height")
 """The columns of walls.csv, m: boxes along the axes, in the frame of the truth."""
 
 
 def write_walls(path: str | Path, walls: np.ndarray) -> None:
     """Writes walls [B, 5] with repr-exact floats."""
-    lines = [",".join(WALLS), *(",".join(map(repr, row)) for row in walls.tolist())]
+    lines = [",".join(WALL_COLUMNS), *(",".join(map(repr, row)) for row in walls.tolist())]
     Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
@@ -83,8 +83,8 @@ def read_walls(path: Path) -> np.ndarray:
     """
     file = path / "walls.csv"
     if not file.exists():
-        return np.zeros((0, len(WALLS)))
-    return read_table(file, dict.fromkeys(WALLS, ())).values
+        return np.zeros((0, len(WALL_COLUMNS)))
+    return read_text_table(file, dict.fromkeys(WALL_COLUMNS, ())).values
 
 
 def read_closures(path: Path) -> np.ndarray:
@@ -139,7 +139,7 @@ def _places(path: Path) -> np.ndarray:
         raise InputError(str(path), "rows without a place", "the columns t,place,action,...") from None
 
 
-def _anytime(path: Path) -> np.ndarray:
+def _online_errors(path: Path) -> np.ndarray:
     """[A] the errors of a file `t,error`; none where it was never written. A cut-off last line is dropped."""
     if not path.exists():
         return np.zeros(0)
@@ -148,7 +148,7 @@ def _anytime(path: Path) -> np.ndarray:
     try:
         return np.array([float(line.split(",")[1]) for line in lines])
     except (ValueError, IndexError):
-        raise InputError(str(path), "a row that is not t,error", "the anytime.csv of a run") from None
+        raise InputError(str(path), "a row that is not t,error", "the online_error.csv of a run") from None
 
 
 def _map(path: Path) -> tuple[np.ndarray, np.ndarray]:

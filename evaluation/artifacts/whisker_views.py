@@ -13,7 +13,7 @@ from tactile.base.errors import InputError
 _WHITE = 255
 
 
-class Images(NamedTuple):
+class WhiskerViews(NamedTuple):
     """What the whiskers told; N steps, a head of R rings of C whiskers.
 
     Attributes:
@@ -31,7 +31,7 @@ class Images(NamedTuple):
     tallest: float
 
 
-def write_images(path: str | Path, images: Images) -> None:
+def write_whisker_views(path: str | Path, images: WhiskerViews) -> None:
     """Writes them to an .npz, brightness in 255 steps; the same images give the same bytes."""
     arrays = {name: np.asarray(array) for name, array in images._asdict().items()}
     # Rounded up: what was touched is never as dark as what was not.
@@ -40,17 +40,17 @@ def write_images(path: str | Path, images: Images) -> None:
         np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
 
 
-def read_images(path: str | Path) -> Images:
-    """The inverse of `write_images`, but for the rounding.
+def read_whisker_views(path: str | Path) -> WhiskerViews:
+    """The inverse of `write_whisker_views`, but for the rounding.
 
     Raises:
         InputError: it is no such file.
     """
     try:
         with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in Images._fields}
+            arrays = {name: archive[name] for name in WhiskerViews._fields}
         view = arrays["view"] / _WHITE
-        images = Images(**arrays | {"view": view, "tallest": float(arrays["tallest"])})
+        images = WhiskerViews(**arrays | {"view": view, "tallest": float(arrays["tallest"])})
     except FileNotFoundError:
         raise InputError(str(path), "no such file", "the views.npz of a run directory") from None
     except (OSError, ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile) as error:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.metrics.text_table import read_table
+from evaluation.metrics.text_table import read_text_table
 from evaluation.metrics.trajectory import interpolate, motion_errors
 from tactile.base.errors import InputError
 from tactile.base.se2 import between, wrap
@@ -64,7 +64,7 @@ class RelationErrors(NamedTuple):
     dropped: int
 
 
-def successive(count: int, step: int = 1) -> np.ndarray:
+def successive_pairs(count: int, step: int = 1) -> np.ndarray:
     """The pairs (i, i + step) of `count` rows: [P, 2]; step 1 the consecutive ones, step k those of gap k."""
     i = np.arange(max(0, count - step))
     return np.stack([i, i + step], axis=1)
@@ -75,7 +75,7 @@ def energy(estimate: np.ndarray, truth: np.ndarray, pairs: np.ndarray) -> Energy
 
     Args:
         estimate: [N, 3] poses. truth: [N, 3] true poses of the same rows.
-        pairs: [P, 2] row indices: `successive(...)`, the links of a map, or any others.
+        pairs: [P, 2] row indices: `successive_pairs(...)`, the links of a map, or any others.
     """
     if len(pairs) == 0:
         return Energy(np.nan, np.nan, 0)
@@ -117,7 +117,7 @@ def read_relations(path: str | Path) -> Relations:
     Raises:
         InputError: naming file and line.
     """
-    start, end, x, y, _, _, _, yaw = read_table(path, _RELATIONS).values.T
+    start, end, x, y, _, _, _, yaw = read_text_table(path, _RELATIONS).values.T
     return Relations(start, end, np.stack([x, y, yaw], axis=1))
 
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.metrics.text_table import read_table
+from evaluation.metrics.text_table import read_text_table
 from tactile.base.errors import InputError
 
 _COLUMNS = {
@@ -29,7 +29,7 @@ _COLUMNS = {
 }
 
 
-class Log(NamedTuple):
+class ExperienceLog(NamedTuple):
     """One row a step (a whisk cycle, a frame), of any SLAM system that tells which place it is at.
 
     Attributes:
@@ -41,7 +41,7 @@ class Log(NamedTuple):
     truth: np.ndarray
 
 
-def read_log(path: str | Path) -> Log:
+def read_experience_log(path: str | Path) -> ExperienceLog:
     """A log from a CSV of time (s), experience id, true x (m), y (m) and heading (rad).
 
     The header may say `t` or `time`, `id` or `experience`, `theta`, `th` or `heading`, and so on; without a
@@ -50,7 +50,7 @@ def read_log(path: str | Path) -> Log:
     Raises:
         InputError: naming file and line; also where an id is not a whole number.
     """
-    table = read_table(path, _COLUMNS)
+    table = read_text_table(path, _COLUMNS)
     time, experience, x, y, theta = table.values.T
     broken = np.flatnonzero(experience != np.round(experience))
     if len(broken):
@@ -58,10 +58,10 @@ def read_log(path: str | Path) -> Log:
         raise InputError(
             f"{path}:{table.line[row]}", f"experience id {experience[row]}", "a whole number, -1 for none"
         )
-    return Log(time, experience.astype(np.int64), np.stack([x, y, theta], axis=1))
+    return ExperienceLog(time, experience.astype(np.int64), np.stack([x, y, theta], axis=1))
 
 
-def changes(experience: np.ndarray) -> np.ndarray:
+def change_rows(experience: np.ndarray) -> np.ndarray:
     """The steps at which the current experience changed, the first step included: [M] rows.
 
     One row a graph action: the per-action form of a per-step log. An id of -1 is no experience; such steps

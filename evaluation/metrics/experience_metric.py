@@ -21,13 +21,13 @@ from zlib import crc32
 import numpy as np
 from pydantic import NonNegativeInt, PositiveFloat
 
-from evaluation.metrics.experience_log import changes, creation_rows
+from evaluation.metrics.experience_log import change_rows, creation_rows
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.se2 import wrap
 
-Mode = Literal["strict", "paper", "or", "literal"]
-MODES: tuple[Mode, ...] = ("strict", "paper", "or", "literal")
+ExmMode = Literal["strict", "paper", "or", "literal"]
+EXM_MODES: tuple[ExmMode, ...] = ("strict", "paper", "or", "literal")
 
 NO_RELOCALISATION = "nothing was re-localised: ARCR is 0/0"
 LITERAL_WARNING = "0 by construction: the printed line 26 never holds"
@@ -36,7 +36,7 @@ LITERAL_WARNING = "0 by construction: the printed line 26 never holds"
 class ExmConfig(Settings):
     """What Algorithm 1 is given besides the two logs."""
 
-    mode: Mode = "strict"
+    mode: ExmMode = "strict"
     """How the listing is read."""
     log: Literal["step", "action"] = "step"
     """One entry a step (the paper's), or one entry a change of experience. The values do not compare."""
@@ -48,7 +48,7 @@ class ExmConfig(Settings):
     """Heading threshold, degrees (as above)."""
 
 
-DEFAULT = ExmConfig()
+DEFAULT_EXM = ExmConfig()
 
 
 class ExperienceMetric(NamedTuple):
@@ -70,7 +70,7 @@ class ExperienceMetric(NamedTuple):
     relocalisations: int
     correct: int
     base: int
-    mode: Mode
+    mode: ExmMode
     log: str
     note: str
     counted: np.ndarray
@@ -78,7 +78,7 @@ class ExperienceMetric(NamedTuple):
     near: np.ndarray
 
 
-class Pool(NamedTuple):
+class PooledExperienceMetric(NamedTuple):
     """Several runs together.
 
     Attributes:
@@ -116,7 +116,7 @@ class _Reading(NamedTuple):
 
 
 def experience_metric(
-    experience: np.ndarray, truth: np.ndarray, config: ExmConfig = DEFAULT
+    experience: np.ndarray, truth: np.ndarray, config: ExmConfig = DEFAULT_EXM
 ) -> ExperienceMetric:
     """ARR and ARCR of one run (Algorithm 1).
 
@@ -196,7 +196,7 @@ def base_end(truth: np.ndarray, position: float = 0.1, heading_deg: float = 25.0
     return int(back[0])
 
 
-def pool(results: Sequence[ExperienceMetric], *, seed: int = 0) -> Pool:
+def pool_experience_metrics(results: Sequence[ExperienceMetric], *, seed: int = 0) -> PooledExperienceMetric:
     """Several runs (data sets, seeds) together; the paper's averages are the macro ones.
 
     Raises:
@@ -210,7 +210,7 @@ def pool(results: Sequence[ExperienceMetric], *, seed: int = 0) -> Pool:
     judged = arcr[np.isfinite(arcr)]
     arr = arr[np.isfinite(arr)]
     eta = sum(result.relocalisations for result in results)
-    return Pool(
+    return PooledExperienceMetric(
         arr=float(arr.mean()) if len(arr) else np.nan,
         arcr=float(judged.mean()) if len(judged) else np.nan,
         arr_interval=bootstrap(arr, "exm.arr", seed=seed),
@@ -260,7 +260,7 @@ def _checked_base(base: int, length: int) -> int:
 
 def _entries(experience: np.ndarray, log: str) -> np.ndarray:
     """The steps that are entries of such a log: [M] rows."""
-    return changes(experience) if log == "action" else np.flatnonzero(experience != -1)
+    return change_rows(experience) if log == "action" else np.flatnonzero(experience != -1)
 
 
 def _dwell(experience: np.ndarray) -> np.ndarray:
@@ -324,7 +324,7 @@ def _as_printed(angle: np.ndarray) -> np.ndarray:
 
 # The listing asks whether an experience is in R_c, the correct ones so far. In a dwell that is the verdict on
 # the entry before: were R_c never to lose a member, one right visit would excuse the rest of all wrong ones.
-_READINGS: dict[Mode, _Reading] = {
+_READINGS: dict[ExmMode, _Reading] = {
     "strict": _Reading(
         creation_rows, wrap, lambda first, dwell, before: before if dwell else first, _this_if_novel
     ),

@@ -13,24 +13,30 @@ from typing import Literal
 
 import numpy as np
 
-from evaluation.metrics.occupancy_grid import PRIOR, Grid, Surface, Truth, painted
+from evaluation.metrics.occupancy_grid import (
+    PRIOR_OCCUPANCY,
+    GridTruth,
+    OccupancyGrid,
+    TouchableSurface,
+    truth_occupancy,
+)
 from tactile.base.config import Settings
 
-Mask = Literal["grid", "arena"]
+CellMask = Literal["grid", "arena"]
 """Over which cells is averaged: all, or the arena's and its wall's."""
 SMOOTH_SD = 2.5
 """Of the 5 x 5 Gaussian that smooths the truth, cells: the paper gives no unit, but its filter in cells."""
 
 _TAPS = 2  # cells to either side
-_MASKS: tuple[Mask, ...] = ("grid", "arena")
+_MASKS: tuple[CellMask, ...] = ("grid", "arena")
 
 
 class Convention(Settings):
     """One reading of equation 6."""
 
-    outside: float = PRIOR
+    outside: float = PRIOR_OCCUPANCY
     """What the truth is outside the arena and its wall."""
-    mask: Mask = "grid"
+    mask: CellMask = "grid"
     """Over which cells is averaged."""
     smooth: bool = False
     """Whether the truth is smoothed. Then even a perfect map errs, and a blurred one errs less."""
@@ -38,12 +44,12 @@ class Convention(Settings):
 
 CONVENTIONS = tuple(
     Convention(outside=outside, mask=mask, smooth=smooth)
-    for smooth, mask, outside in product((False, True), _MASKS, (PRIOR, 0.0, 1.0))
+    for smooth, mask, outside in product((False, True), _MASKS, (PRIOR_OCCUPANCY, 0.0, 1.0))
 )
 """All of them. Within the arena, raw, `outside` makes no difference."""
-HEADLINE = Convention()
+MAIN_CONVENTION = Convention()
 """Unknown outside, all cells, raw: what a lost robot draws out there costs, and a perfect map scores 0."""
-PRINTED = Convention(smooth=True)
+PAPER_CONVENTION = Convention(smooth=True)
 """Nearest to the paper's words."""
 
 
@@ -66,10 +72,12 @@ class GridError(Settings):
     """1 - error / best; None where the best constant is right everywhere."""
 
 
-def grid_error(grid: Grid, truth: Truth, felt: Surface, convention: Convention = HEADLINE) -> GridError:
-    """The error of one map. `felt` is `evaluation.metrics.occupancy_grid.surface(grid, truth)`."""
-    true = painted(truth, felt.wall, convention.outside)
-    true = smoothed(true) if convention.smooth else true
+def grid_error(
+    grid: OccupancyGrid, truth: GridTruth, felt: TouchableSurface, convention: Convention = MAIN_CONVENTION
+) -> GridError:
+    """The error of one map. `felt` is `evaluation.metrics.occupancy_grid.touchable_surface(grid, truth)`."""
+    true = truth_occupancy(truth, felt.wall, convention.outside)
+    true = smooth_truth(true) if convention.smooth else true
     cells = truth.inside | felt.wall if convention.mask == "arena" else np.ones_like(truth.inside)
     if not cells.any():
         raise ValueError("a truth without an arena")
@@ -78,7 +86,7 @@ def grid_error(grid: Grid, truth: Truth, felt: Surface, convention: Convention =
     return GridError(
         convention=convention,
         error=error,
-        prior=_mean(np.abs(PRIOR - true)),
+        prior=_mean(np.abs(PRIOR_OCCUPANCY - true)),
         best=best,
         coin=_mean(0.5 * np.abs(true) + 0.5 * np.abs(1 - true)),
         skill=_skill(error, best),
@@ -102,7 +110,7 @@ def pool_errors(errors: Sequence[GridError]) -> GridError:
     )
 
 
-def smoothed(values: np.ndarray) -> np.ndarray:
+def smooth_truth(values: np.ndarray) -> np.ndarray:
     """[H, W] after the 5 x 5 Gaussian of `SMOOTH_SD`; beyond its edges the outermost cells go on."""
     from scipy.ndimage import correlate1d
 

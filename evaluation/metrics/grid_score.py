@@ -14,23 +14,23 @@ import numpy as np
 
 from evaluation.metrics.grid_error import CONVENTIONS, Convention, GridError, grid_error, pool_errors
 from evaluation.metrics.occupancy_grid import (
-    PRIOR,
-    Grid,
-    Surface,
-    Truth,
-    centres,
+    PRIOR_OCCUPANCY,
+    GridTruth,
+    OccupancyGrid,
+    TouchableSurface,
+    cell_centres,
     check_grid,
-    surface,
-    touched,
+    has_evidence,
+    touchable_surface,
 )
 from evaluation.metrics.scorecard import Quantity
 from tactile.base.config import Settings
 
 CLAMP = 1e-3
 """Probabilities are kept so far from 0 and 1 before their logarithm is taken."""
-OCCUPIED = 0.5
+OCCUPIED_ABOVE = 0.5
 """A cell above is drawn as occupied, for Chamfer."""
-PAPER = {"blob": 0.40, "geometric": 0.39, "template": 0.37}
+PAPER_ERRORS = {"blob": 0.40, "geometric": 0.39, "template": 0.37}
 """Equation 6 by mapper, as printed (Fox et al. 2012, III); it does not say under which convention."""
 
 _ROUNDING = 6  # decimals; closer probabilities tie
@@ -67,7 +67,12 @@ class GridScore(Settings):
 
 
 def score_grid(
-    grid: Grid, truth: Truth, name: str = "map", *, prior: float = PRIOR, occupied: float = OCCUPIED
+    grid: OccupancyGrid,
+    truth: GridTruth,
+    name: str = "map",
+    *,
+    prior: float = PRIOR_OCCUPANCY,
+    occupied: float = OCCUPIED_ABOVE,
 ) -> GridScore:
     """Scores one map where it lies: in the frame of the truth, not aligned to it.
 
@@ -78,7 +83,7 @@ def score_grid(
         ValueError: no map, or not on the cells of the truth.
     """
     check_grid(grid, truth)
-    felt = surface(grid, truth)
+    felt = touchable_surface(grid, truth)
     found = _cells(grid, felt, prior) | _chamfer(grid, truth, felt, prior, occupied)
     return GridScore(
         name=name,
@@ -97,7 +102,7 @@ def pool_grids(scores: Sequence[GridScore], name: str) -> GridScore:
     )
 
 
-def table(scores: Sequence[GridScore]) -> str:
+def render_grid_scores(scores: Sequence[GridScore]) -> str:
     """Scores of several mappers as plain text: equation 6 beside its baselines, then everything else."""
     width = max(len("mapper"), *(len(score.name) for score in scores))
     trials = ", ".join(str(n) for n in sorted({score.trials for score in scores}))
@@ -108,13 +113,13 @@ def table(scores: Sequence[GridScore]) -> str:
     ]
     for convention in CONVENTIONS:
         anywhere = convention.mask == "arena" and not convention.smooth
-        if anywhere and convention.outside != PRIOR:
+        if anywhere and convention.outside != PRIOR_OCCUPANCY:
             continue
         words = "any" if anywhere else f"{convention.outside:g}"
         label = f"{words:<9}{convention.mask:<7}{'smoothed' if convention.smooth else 'raw':<10}"
         for score in scores:
             error = score.under(convention)
-            printed, spread = _text(PAPER.get(score.name), 2), _text(error.spread)
+            printed, spread = _text(PAPER_ERRORS.get(score.name), 2), _text(error.spread)
             lines.append(
                 f"{label}{score.name:<{width + 2}}{printed:>6}{_text(error.error):>8}{spread:>8}"
                 f"{_text(error.prior):>14}{_text(error.best):>15}{_text(error.skill, 2):>8}"
@@ -133,7 +138,7 @@ def table(scores: Sequence[GridScore]) -> str:
     return "\n".join(line.rstrip() for line in lines)
 
 
-def _cells(grid: Grid, felt: Surface, prior: float) -> _Findings:
+def _cells(grid: OccupancyGrid, felt: TouchableSurface, prior: float) -> _Findings:
     """How well walls are told from free space.
 
     Much of a map's skill comes from where the robot drove, for which no whisker is needed. So a score stands
@@ -176,7 +181,9 @@ def _auc(ours: np.ndarray, wall: np.ndarray) -> float:
     return float((rank[wall].sum() - walls * (walls + 1) / 2) / (walls * free))
 
 
-def _chamfer(grid: Grid, truth: Truth, felt: Surface, prior: float, occupied: float) -> _Findings:
+def _chamfer(
+    grid: OccupancyGrid, truth: GridTruth, felt: TouchableSurface, prior: float, occupied: float
+) -> _Findings:
     """Mean distances between the centres of cells that the map draws as occupied and the true surfaces.
 
     Each way alone can be won: by one right cell, or by drawing all cells. Cells within objects, deeper than
@@ -185,9 +192,9 @@ def _chamfer(grid: Grid, truth: Truth, felt: Surface, prior: float, occupied: fl
     from scipy.spatial import cKDTree
 
     deep = truth.inside & truth.occupied & ~felt.wall
-    drawn = (grid.probability > occupied) & touched(grid, prior) & ~deep
+    drawn = (grid.probability > occupied) & has_evidence(grid, prior) & ~deep
     if len(felt.points) and drawn.any():
-        cells = centres(grid)[drawn]
+        cells = cell_centres(grid)[drawn]
         to_walls, to_cells = cKDTree(felt.points).query(cells)[0], cKDTree(cells).query(felt.points)[0]
         note = f"{len(cells)} cells above {occupied:g}"
         return {
@@ -215,12 +222,16 @@ def _pooled(quantities: Sequence[Quantity]) -> Quantity:
 
 def _order(scores: Sequence[GridScore], convention: Convention) -> list[str]:
     """The paper's mappers from the largest error to the smallest, and whether that is the paper's order."""
-    errors = {score.name: (score.under(convention), score.trials) for score in scores if score.name in PAPER}
+    errors = {
+        score.name: (score.under(convention), score.trials) for score in scores if score.name in PAPER_ERRORS
+    }
     if len(errors) < 2:
         return []
     names = sorted(errors, key=lambda name: -errors[name][0].error)
     verdict = (
-        "as in the paper" if names == sorted(names, key=lambda name: -PAPER[name]) else "not the paper's"
+        "as in the paper"
+        if names == sorted(names, key=lambda name: -PAPER_ERRORS[name])
+        else "not the paper's"
     )
     close = [
         f"{a} and {b}"

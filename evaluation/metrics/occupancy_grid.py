@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-PRIOR = 0.3
+PRIOR_OCCUPANCY = 0.3
 """Occupancy where nothing was felt (Fox et al. 2012, III)."""
-SPACING = 0.01
+SURFACE_SPACING = 0.01
 """Of the points that stand for the true walls, m."""
 
 _EVIDENCE = 1e-4  # a probability nearer to the prior was not touched: stamps are Gaussians, which end nowhere
@@ -17,7 +17,7 @@ _NEAR, _FAR = 0.45, 0.95  # cells; from a wall on their borders or centres neith
 _SKIN = 1 - 1e-6  # cells: a wall on the centres of cells has one layer, as one on their borders has
 
 
-class Grid(NamedTuple):
+class OccupancyGrid(NamedTuple):
     """An occupancy map.
 
     Attributes:
@@ -30,7 +30,7 @@ class Grid(NamedTuple):
     cell: float
 
 
-class Truth(NamedTuple):
+class GridTruth(NamedTuple):
     """What is really there, on the cells of a map and exactly.
 
     Attributes:
@@ -44,14 +44,14 @@ class Truth(NamedTuple):
     segments: np.ndarray
 
 
-class Surface(NamedTuple):
+class TouchableSurface(NamedTuple):
     """What of a truth can be felt from its free space.
 
     Attributes:
         free: [H, W] bool, cells inside the arena that hold nothing.
         wall: [H, W] bool, all others whose centre is within one cell of a surface that faces a free cell:
             the skin of objects, and one ring around the arena even where its wall has no thickness.
-        points: [K, 2] m, those surfaces, a point every `SPACING`.
+        points: [K, 2] m, those surfaces, a point every `SURFACE_SPACING`.
     """
 
     free: np.ndarray
@@ -59,19 +59,19 @@ class Surface(NamedTuple):
     points: np.ndarray
 
 
-def centres(grid: Grid) -> np.ndarray:
+def cell_centres(grid: OccupancyGrid) -> np.ndarray:
     """[H, W, 2] centres of the cells, m."""
     height, width = grid.probability.shape
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     return np.asarray(grid.origin) + grid.cell * np.stack([x, y], axis=-1)
 
 
-def touched(grid: Grid, prior: float = PRIOR) -> np.ndarray:
+def has_evidence(grid: OccupancyGrid, prior: float = PRIOR_OCCUPANCY) -> np.ndarray:
     """[H, W] bool, where evidence moved the map away from its prior."""
     return np.abs(grid.probability - prior) > _EVIDENCE
 
 
-def check_grid(grid: Grid, truth: Truth | None = None) -> None:
+def check_grid(grid: OccupancyGrid, truth: GridTruth | None = None) -> None:
     """Refuses a map that is none, or that lies on other cells than its truth (ValueError)."""
     shape = grid.probability.shape
     if len(shape) != 2 or 0 in shape:
@@ -88,7 +88,7 @@ def check_grid(grid: Grid, truth: Truth | None = None) -> None:
         raise ValueError("walls are segments [S, 4] of finite numbers")
 
 
-def surface(grid: Grid, truth: Truth) -> Surface:
+def touchable_surface(grid: OccupancyGrid, truth: GridTruth) -> TouchableSurface:
     """What of the truth can be felt, on the cells of the map.
 
     A surface faces free space where about half a cell or a whole one away from it, to either side, the cell
@@ -103,18 +103,18 @@ def surface(grid: Grid, truth: Truth) -> Surface:
         faces |= _at(free, grid, points + step * grid.cell * normals)
     points = points[faces]
     if len(points) == 0:
-        return Surface(free, np.zeros_like(free), points)
-    away, _ = cKDTree(points).query(centres(grid))
-    return Surface(free, ~free & (away < _SKIN * grid.cell), points)
+        return TouchableSurface(free, np.zeros_like(free), points)
+    away, _ = cKDTree(points).query(cell_centres(grid))
+    return TouchableSurface(free, ~free & (away < _SKIN * grid.cell), points)
 
 
-def painted(truth: Truth, wall: np.ndarray, outside: float = PRIOR) -> np.ndarray:
+def truth_occupancy(truth: GridTruth, wall: np.ndarray, outside: float = PRIOR_OCCUPANCY) -> np.ndarray:
     """[H, W] the truth as occupancy: 1 in objects and walls, 0 in free space, `outside` beyond (Fig. 3 of Fox
     et al. 2012)."""
     return np.where(wall | (truth.inside & truth.occupied), 1.0, np.where(truth.inside, 0.0, outside))
 
 
-def mean_grid(grids: Sequence[Grid]) -> Grid:
+def mean_grid(grids: Sequence[OccupancyGrid]) -> OccupancyGrid:
     """The mean of maps on the same cells (Fig. 4 of Fox et al. 2012)."""
     first = grids[0]
     for grid in grids:
@@ -130,7 +130,7 @@ def _points(segments: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points along segments [S, 4] and the unit normals there: [K, 2] each."""
     start, along = segments[:, :2], segments[:, 2:] - segments[:, :2]
     length = np.hypot(*along.T)
-    count = np.ceil(length / SPACING - 1e-6).astype(int)
+    count = np.ceil(length / SURFACE_SPACING - 1e-6).astype(int)
     row = np.repeat(np.arange(len(segments)), count)
     first = np.repeat(np.cumsum(count) - count, count)
     share = (np.arange(len(row)) - first + 0.5) / count[row]
@@ -138,7 +138,7 @@ def _points(segments: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return start[row] + share[:, None] * along[row], normal
 
 
-def _at(cells: np.ndarray, grid: Grid, points: np.ndarray) -> np.ndarray:
+def _at(cells: np.ndarray, grid: OccupancyGrid, points: np.ndarray) -> np.ndarray:
     """The value [K] of the cells [H, W] bool at points [K, 2]; False outside."""
     column, row = np.floor((points - grid.origin) / grid.cell).astype(int).T
     known = (row >= 0) & (row < cells.shape[0]) & (column >= 0) & (column < cells.shape[1])

@@ -9,7 +9,7 @@ import numpy as np
 from tactile.base.errors import InputError
 
 
-class Run(NamedTuple):
+class RunArrays(NamedTuple):
     """What was told, what became of it, and what was true; N steps, M experiences, L links.
 
     Attributes:
@@ -21,7 +21,7 @@ class Run(NamedTuple):
         created: [M] the step at which each experience was created.
         nodes: [M, 3] poses of the experiences in the final map, in the frame of `final`.
         links: [L, 2] experiences joined by a link.
-        anytime: [A] errors of the present pose in the map so far, in order of time, m; empty if unknown.
+        online_error: [A] position errors of the current pose in the map of that time, m; empty if unknown.
     """
 
     time: np.ndarray
@@ -33,10 +33,10 @@ class Run(NamedTuple):
     created: np.ndarray
     nodes: np.ndarray
     links: np.ndarray
-    anytime: np.ndarray = np.zeros(0)
+    online_error: np.ndarray = np.zeros(0)
 
 
-def check_run(run: Run) -> None:
+def check_run(run: RunArrays) -> None:
     """Refuses arrays that do not fit each other.
 
     Raises:
@@ -66,7 +66,7 @@ def check_run(run: Run) -> None:
             raise InputError(f"run.{name}", f"{index.min()} to {index.max()}", f"{low} to {high - 1}")
 
 
-def known(run: Run) -> np.ndarray:
+def truth_rows(run: RunArrays) -> np.ndarray:
     """The steps whose true pose is known: rows [K]."""
     if run.truth is None:
         return np.zeros(0, int)

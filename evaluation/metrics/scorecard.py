@@ -13,18 +13,18 @@ from evaluation.metrics.energy_metric import (
     energy,
     energy_all_pairs,
     relation_errors,
-    successive,
+    successive_pairs,
 )
-from evaluation.metrics.experience_log import Log, changes
+from evaluation.metrics.experience_log import ExperienceLog, change_rows
 from evaluation.metrics.experience_metric import (
-    DEFAULT,
-    MODES,
+    DEFAULT_EXM,
+    EXM_MODES,
     ExmConfig,
     base_end,
     experience_metric,
 )
-from evaluation.metrics.run_arrays import Run, check_run, known
-from evaluation.metrics.trajectory import anytime, ate, rpe, summary
+from evaluation.metrics.run_arrays import RunArrays, check_run, truth_rows
+from evaluation.metrics.trajectory import ate, online_error, rpe, summarize_errors
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
 
@@ -101,7 +101,7 @@ _SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
     "Experience Metric": {
         "exm_base": ("base set", "entries"),
         "exm_arr": ("ARR", ""),
-        **{f"exm_arcr_{mode}": (f"ARCR, {mode}", "") for mode in MODES},
+        **{f"exm_arcr_{mode}": (f"ARCR, {mode}", "") for mode in EXM_MODES},
         "exm_action_arr": ("ARR, per action", ""),
         "exm_action_arcr_strict": ("ARCR, strict, per action", ""),
     },
@@ -109,11 +109,11 @@ _SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
 _QUANTITIES = {name: words for names in _SECTIONS.values() for name, words in names.items()}
 
 
-def score(
-    run: Run,
+def score_run(
+    run: RunArrays,
     name: str = "run",
     *,
-    exm: ExmConfig = DEFAULT,
+    exm: ExmConfig = DEFAULT_EXM,
     relations: Relations | None = None,
     gap: int = 10,
 ) -> Scorecard:
@@ -127,7 +127,7 @@ def score(
         InputError: when the arrays do not fit each other.
     """
     check_run(run)
-    rows = known(run)
+    rows = truth_rows(run)
     findings = _extent(run, rows)
     if run.truth is None or len(rows) == 0:
         findings |= _experience(run.experience, None, exm)
@@ -142,9 +142,9 @@ def score(
     return _card(name, exm, names, findings)
 
 
-def score_log(log: Log, name: str = "log", *, exm: ExmConfig = DEFAULT) -> Scorecard:
+def score_log(log: ExperienceLog, name: str = "log", *, exm: ExmConfig = DEFAULT_EXM) -> Scorecard:
     """The Experience Metric, in all modes, of any SLAM system's log
-    (`evaluation.metrics.experience_log.read_log`)."""
+    (`evaluation.metrics.experience_log.read_experience_log`)."""
     findings = {
         "steps": _Found(len(log.time)),
         "duration": _Found(float(log.time[-1] - log.time[0])),
@@ -155,7 +155,7 @@ def score_log(log: Log, name: str = "log", *, exm: ExmConfig = DEFAULT) -> Score
     return _card(name, exm, [each for each in _QUANTITIES if each in findings], findings)
 
 
-def table(card: Scorecard) -> str:
+def render_scorecard(card: Scorecard) -> str:
     """The scorecard as plain text: quantity, value, unit, raw odometry beside it, note."""
     width = max(len(quantity.label) for quantity in card.quantities.values()) + 2
     lines = [f"{card.name:<{width + 2}}{'value':>9}  {'unit':<8} {'odometry':>9}"]
@@ -169,7 +169,7 @@ def table(card: Scorecard) -> str:
     return "\n".join(lines)
 
 
-def _extent(run: Run, rows: np.ndarray) -> _Findings:
+def _extent(run: RunArrays, rows: np.ndarray) -> _Findings:
     some = f"{len(rows)} of them with a true pose" if 0 < len(rows) < len(run.time) else ""
     path = {}
     if run.truth is not None and len(rows):
@@ -183,11 +183,14 @@ def _extent(run: Run, rows: np.ndarray) -> _Findings:
     }
 
 
-def _trajectories(run: Run, truth: np.ndarray, rows: np.ndarray) -> _Findings:
+def _trajectories(run: RunArrays, truth: np.ndarray, rows: np.ndarray) -> _Findings:
     truth, online, final, odometry = (poses[rows] for poses in (truth, run.online, run.final, run.odometry))
-    raw_ate, raw_rpe, raw_now = ate(odometry, truth), rpe(odometry, truth), anytime(odometry, truth)
-    now, step = summary(run.anytime) if len(run.anytime) else anytime(online, truth), rpe(final, truth)
-    note = "in the map so far" if len(run.anytime) else "of the poses told"
+    raw_ate, raw_rpe, raw_now = ate(odometry, truth), rpe(odometry, truth), online_error(odometry, truth)
+    now, step = (
+        summarize_errors(run.online_error) if len(run.online_error) else online_error(online, truth),
+        rpe(final, truth),
+    )
+    note = "in the map so far" if len(run.online_error) else "of the poses told"
     return {
         "ate_final": _Found(ate(final, truth), raw_ate),
         "ate_online": _Found(ate(online, truth), raw_ate),
@@ -199,7 +202,7 @@ def _trajectories(run: Run, truth: np.ndarray, rows: np.ndarray) -> _Findings:
     }
 
 
-def _relations(run: Run, relations: Relations) -> _Findings:
+def _relations(run: RunArrays, relations: Relations) -> _Findings:
     ours = relation_errors(run.time, run.final, relations)
     raw = relation_errors(run.time, run.odometry, relations)
     note = f"{ours.used} relations" + (f", {ours.dropped} outside the recording" if ours.dropped else "")
@@ -209,13 +212,13 @@ def _relations(run: Run, relations: Relations) -> _Findings:
     }
 
 
-def _energies(run: Run, truth: np.ndarray, rows: np.ndarray, gap: int) -> _Findings:
-    at = rows[changes(run.experience[rows])]
-    steps = successive(len(rows)), successive(len(rows), gap)
+def _energies(run: RunArrays, truth: np.ndarray, rows: np.ndarray, gap: int) -> _Findings:
+    at = rows[change_rows(run.experience[rows])]
+    steps = successive_pairs(len(rows)), successive_pairs(len(rows), gap)
     final, odometry, true = run.final[rows], run.odometry[rows], truth[rows]
     links = run.links[np.isin(run.created, rows)[run.links].all(axis=1)]
     born, raw_born = truth[run.created], run.odometry[run.created]
-    moves = successive(len(at))
+    moves = successive_pairs(len(at))
     return {
         **_energy(
             "change",
@@ -251,8 +254,8 @@ def _experience(experience: np.ndarray, truth: np.ndarray | None, config: ExmCon
         base = base_end(truth, config.position, config.heading_deg) if config.base is None else config.base
     except InputError as error:
         return {name: _Found(np.nan, note=str(error)) for name in names}
-    step = {mode: config.model_copy(update={"base": base, "log": "step", "mode": mode}) for mode in MODES}
-    results = {mode: experience_metric(experience, truth, step[mode]) for mode in MODES}
+    step = {mode: config.model_copy(update={"base": base, "log": "step", "mode": mode}) for mode in EXM_MODES}
+    results = {mode: experience_metric(experience, truth, step[mode]) for mode in EXM_MODES}
     strict = results["strict"]
     action = experience_metric(experience, truth, step["strict"].model_copy(update={"log": "action"}))
     return {

@@ -15,14 +15,14 @@ Columns = Mapping[str, tuple[str, ...]]
 """The wanted columns in order: name -> other names a header may give it (compared in lower case)."""
 
 
-class Table(NamedTuple):
+class TextTable(NamedTuple):
     """The rows of a file: `values` [N, columns] float64 and the `line` [N] each stood in, counted from 1."""
 
     values: np.ndarray
     line: np.ndarray
 
 
-def read_table(path: str | Path, columns: Columns) -> Table:
+def read_text_table(path: str | Path, columns: Columns) -> TextTable:
     """The wanted columns of a file.
 
     A first line that is not all numbers is a header and tells where the columns are; others in the file are
@@ -51,7 +51,7 @@ def read_table(path: str | Path, columns: Columns) -> Table:
             raise InputError(f"{path}:{number}", found, f"{len(names)} finite numbers: {' '.join(names)}")
     if not rows:
         raise InputError(str(path), "no rows", f"lines of {' '.join(columns)}")
-    return Table(np.array(rows), np.array(at))
+    return TextTable(np.array(rows), np.array(at))
 
 
 def _lines(path: str | Path) -> list[tuple[int, list[str], bool]]:

@@ -11,21 +11,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.metrics.text_table import read_table
+from evaluation.metrics.text_table import read_text_table
 from tactile.base.errors import InputError
 from tactile.base.se2 import between, compose, fit_rigid_motion, tum_line, wrap
 
 _TUM = {name: () for name in ("t", "x", "y", "z", "qx", "qy", "qz", "qw")}
 
 
-class Motions(NamedTuple):
+class MotionError(NamedTuple):
     """Root mean square errors of relative motions: translation in m, rotation in rad."""
 
     translation: float
     rotation: float
 
 
-class Anytime(NamedTuple):
+class OnlineError(NamedTuple):
     """How far off the robot's present pose was while it was told, all in m.
 
     Attributes:
@@ -73,14 +73,14 @@ def motion_errors(estimate: np.ndarray, reference: np.ndarray, pairs: np.ndarray
     return between(between(reference[i], reference[j]), between(estimate[i], estimate[j]))
 
 
-def rpe(estimate: np.ndarray, reference: np.ndarray, step: int = 1) -> Motions:
+def rpe(estimate: np.ndarray, reference: np.ndarray, step: int = 1) -> MotionError:
     """Relative pose error over `step` rows (Sturm et al. 2012); NaN when there are not so many."""
     i = np.arange(max(0, len(estimate) - step))
     error = motion_errors(estimate, reference, np.stack([i, i + step], axis=1))
-    return Motions(_rms(np.hypot(error[:, 0], error[:, 1])), _rms(error[:, 2]))
+    return MotionError(_rms(np.hypot(error[:, 0], error[:, 1])), _rms(error[:, 2]))
 
 
-def anytime_errors(online: np.ndarray, reference: np.ndarray) -> np.ndarray:
+def online_errors(online: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """Distance of each row from the reference, once the rows up to it are aligned to the reference's: [N] m.
 
     What the robot could have been blamed for at that moment: later rows do not help. The alignments of all
@@ -94,12 +94,12 @@ def anytime_errors(online: np.ndarray, reference: np.ndarray) -> np.ndarray:
     return np.abs(np.exp(1j * turn) * (a - mean_a) - (b - mean_b))
 
 
-def anytime(online: np.ndarray, reference: np.ndarray) -> Anytime:
-    """The summary of `anytime_errors`."""
-    return summary(anytime_errors(online, reference))
+def online_error(online: np.ndarray, reference: np.ndarray) -> OnlineError:
+    """The summary of `online_errors`."""
+    return summarize_errors(online_errors(online, reference))
 
 
-def present_error(path: np.ndarray, reference: np.ndarray) -> float:
+def current_error(path: np.ndarray, reference: np.ndarray) -> float:
     """Distance of the last row of a path [N, 3] from the reference's, once the whole path is aligned, m.
 
     With the map as it was at that moment: what a robot that acts on its map is off by.
@@ -107,10 +107,10 @@ def present_error(path: np.ndarray, reference: np.ndarray) -> float:
     return float(position_errors(path, reference)[-1])
 
 
-def summary(error: np.ndarray) -> Anytime:
+def summarize_errors(error: np.ndarray) -> OnlineError:
     """Of errors [N] at increasing moments."""
     jump = np.abs(np.diff(error)).max(initial=0.0)
-    return Anytime(float(np.median(error)), _rms(error[len(error) // 2 :]), float(jump))
+    return OnlineError(float(np.median(error)), _rms(error[len(error) // 2 :]), float(jump))
 
 
 def interpolate(time: np.ndarray, pose: np.ndarray, at: np.ndarray) -> np.ndarray:
@@ -148,7 +148,7 @@ def read_tum(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         InputError: naming file and line.
     """
-    table = read_table(path, _TUM)
+    table = read_text_table(path, _TUM)
     t, x, y, _, qx, qy, qz, qw = table.values.T
     norm = qx * qx + qy * qy + qz * qz + qw * qw
     if np.any(norm == 0):

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from evaluation.metrics.trajectory import align
-from evaluation.monitor.progress import Progress, counted
+from evaluation.monitor.progress import RunProgress, step_count
 from evaluation.plots import style
-from evaluation.plots.map_plot import NO_WALLS, broken, paint_walls
-from evaluation.plots.style import BLUE, FAINT, GREY, INK, QUIET, VERMILLION, WIDTH, YELLOW
+from evaluation.plots.map_plot import NO_WALLS, draw_walls, split_at_jumps
+from evaluation.plots.style import BLUE, GREY, INK, LABEL_GREY, LINE_GREY, VERMILLION, WIDTH, YELLOW
 from tactile.base.se2 import between, compose
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ _DRAWN = 5000  # steps of a long path: a monitor must not take long
 _ROUND = 2 * np.pi * np.arange(49) / 48
 
 
-def draw_watch(seen: Progress, walls: np.ndarray = NO_WALLS) -> Figure:
+def draw_watch(seen: RunProgress, walls: np.ndarray = NO_WALLS) -> Figure:
     """The path as told, over the truth where it is known, and the last pose with an ellipse of two standard
     deviations. With truth all lies in its frame: what was told is brought there by the best rigid fit so far,
     and odometry from where it began; it leaves the picture where it drifts far off.
@@ -30,30 +30,30 @@ def draw_watch(seen: Progress, walls: np.ndarray = NO_WALLS) -> Figure:
     Args:
         walls: [B, 5] west, south, east, north, height in m; drawn with truth.
     """
-    figure = style.blank(_HEIGHT, seen.name, _line(seen))
+    figure = style.new_figure(_HEIGHT, seen.name, _line(seen))
     inner = WIDTH - style.LEFT - style.RIGHT - _COUNTS
-    axes = style.plot(figure, style.LEFT, _BOTTOM, inner, _HEIGHT - style.TOP - _BOTTOM)
+    axes = style.add_axes(figure, style.LEFT, _BOTTOM, inner, _HEIGHT - style.TOP - _BOTTOM)
     axes.set_aspect("equal", adjustable="datalim")
     if len(seen.path):
         _paint(axes, seen, walls)
     axes.apply_aspect()
-    style.metric_grid(axes)
+    style.metre_grid(axes)
     _paint_counts(figure, seen, style.LEFT + inner + 0.25)
     if len(seen.path):
-        style.legend(figure, axes)
+        style.add_legend(figure, axes)
     return figure
 
 
-def _line(seen: Progress) -> str:
-    parts = [seen.status, counted(seen)]
+def _line(seen: RunProgress) -> str:
+    parts = [seen.status, step_count(seen)]
     if len(seen.path):
-        x, y, turn = seen.spread
+        x, y, turn = seen.sd
         parts.append(f"last pose ± {x:.2g} m, {y:.2g} m, {np.degrees(turn):.2g} degrees")
-    parts += [] if seen.off is None else [f"off by {seen.off:.3g} m"]
+    parts += [] if seen.online_error is None else [f"off by {seen.online_error:.3g} m"]
     return "  ·  ".join(parts)
 
 
-def _paint(axes: Axes, seen: Progress, walls: np.ndarray) -> None:
+def _paint(axes: Axes, seen: RunProgress, walls: np.ndarray) -> None:
     """The order of drawing is the order of the legend."""
     known = np.isfinite(seen.truth).all(axis=1)
     to_truth = align(seen.path[known], seen.truth[known]) if known.any() else np.zeros(3)
@@ -61,9 +61,9 @@ def _paint(axes: Axes, seen: Progress, walls: np.ndarray) -> None:
     path, truth = compose(to_truth, seen.path), seen.truth[rows]
     if known.any():
         if len(walls):
-            paint_walls(axes, walls)
-        axes.plot(*broken(truth, truth).T, color=YELLOW, lw=3.5, zorder=2, label="truth")
-    axes.plot(*broken(path[rows, :2], truth).T, color=BLUE, lw=0.9, zorder=4, label="path as told")
+            draw_walls(axes, walls)
+        axes.plot(*split_at_jumps(truth, truth).T, color=YELLOW, lw=3.5, zorder=2, label="truth")
+    axes.plot(*split_at_jumps(path[rows, :2], truth).T, color=BLUE, lw=0.9, zorder=4, label="path as told")
     _paint_now(axes, seen, to_truth)
     axes.margins(0.08)
     axes.apply_aspect()
@@ -73,23 +73,23 @@ def _paint(axes: Axes, seen: Progress, walls: np.ndarray) -> None:
     axes.plot(*reckoned[:, :2].T, color=GREY, lw=0.8, ls=dashed, zorder=1, label="raw odometry")
 
 
-def _paint_now(axes: Axes, seen: Progress, to_truth: np.ndarray) -> None:
+def _paint_now(axes: Axes, seen: RunProgress, to_truth: np.ndarray) -> None:
     x, y, heading = compose(to_truth, seen.path[-1])
-    around = np.column_stack([np.cos(_ROUND), np.sin(_ROUND)]) * 2 * seen.spread[:2]
+    around = np.column_stack([np.cos(_ROUND), np.sin(_ROUND)]) * 2 * seen.sd[:2]
     ellipse = compose(to_truth, np.column_stack([seen.path[-1, :2] + around, np.zeros(len(_ROUND))]))
     axes.plot(*ellipse[:, :2].T, color=VERMILLION, lw=1.2, zorder=6, label="now, two standard deviations")
     ahead = (3, 0, float(np.degrees(heading)) - 90.0)
     axes.plot(x, y, color=VERMILLION, ls="", marker=ahead, ms=11, mec="white", mew=0.8, zorder=7)
 
 
-def _paint_counts(figure: Figure, seen: Progress, left: float) -> None:
+def _paint_counts(figure: Figure, seen: RunProgress, left: float) -> None:
     """How many steps went how, right of the map."""
     counts = sorted(seen.outcomes.items(), key=lambda item: -item[1])
     counts += [("lost", seen.lost)] if seen.lost else []
     steps = max(1, len(seen.path))
     for row, (name, count) in enumerate(counts):
         low = _HEIGHT - style.TOP - 0.45 * (row + 1)
-        bar = style.plot(figure, left, low, _COUNTS - 0.3, 0.1)
-        bar.barh([0, 0], [1, count / steps], color=[FAINT, INK if name == "ok" else BLUE])
+        bar = style.add_axes(figure, left, low, _COUNTS - 0.3, 0.1)
+        bar.barh([0, 0], [1, count / steps], color=[LINE_GREY, INK if name == "ok" else BLUE])
         bar.set(xlim=(0, 1), ylim=(-0.4, 0.4), xticks=[], yticks=[])
-        bar.set_title(f"{name}  {count}", fontsize=8.5, color=QUIET, loc="left", pad=2)
+        bar.set_title(f"{name}  {count}", fontsize=8.5, color=LABEL_GREY, loc="left", pad=2)

@@ -17,13 +17,13 @@ from tactile.base.errors import InputError
 
 RUNNING = "running"
 """The status of a run that has not ended, or was killed."""
-PICTURE = "watch.png"
+WATCH_IMAGE = "watch.png"
 """What a monitor leaves in the directory; no sign of life of the run."""
 
 _NUMBERS = ("t", "x", "y", "heading", "sd_x", "sd_y", "sd_heading", "lost")
 
 
-class Progress(NamedTuple):
+class RunProgress(NamedTuple):
     """A run so far, N steps.
 
     Attributes:
@@ -40,23 +40,23 @@ class Progress(NamedTuple):
     status: str
     total: int | None
     path: np.ndarray
-    spread: np.ndarray
+    sd: np.ndarray
     odometry: np.ndarray
     truth: np.ndarray
     outcomes: Mapping[str, int]
     lost: int
-    off: float | None
-    saved: int
-    pace: float | None
-    silent: float
+    online_error: float | None
+    checkpoint: int
+    rate: float | None
+    silence: float
 
 
-def counted(seen: Progress) -> str:
+def step_count(seen: RunProgress) -> str:
     """How many steps were made, in words."""
     return f"{len(seen.path)} steps" if seen.total is None else f"{len(seen.path)} of {seen.total} steps"
 
 
-class Watched:
+class RunMonitor:
     """A run directory to look at again and again. Each line is read once, and no file is kept open.
 
     Raises:
@@ -69,16 +69,16 @@ class Watched:
             raise InputError(str(directory), "no such folder", "the directory of a run")
         if not any((directory / name).exists() for name in ("manifest.json", "steps.csv")):
             raise InputError(str(directory), "no run in it", "the directory of a run")
-        names = ("steps.csv", "odometry.tum", "truth.tum", "anytime.csv")
+        names = ("steps.csv", "odometry.tum", "truth.tum", "online_error.csv")
         self._steps, self._odometry, self._truth, self._errors = (_Lines(directory / name) for name in names)
         self._header: list[str] = []
         self._rows: list[list[float]] = []  # of _NUMBERS
         self._outcomes: list[str] = []
         self._reckoned: list[list[float]] = []  # x, y, heading
         self._true: dict[float, list[float]] = {}  # t: x, y
-        self._off: float | None = None
+        self._online_error: float | None = None
 
-    def look(self) -> Progress:
+    def read(self) -> RunProgress:
         """The run as it is now.
 
         Raises:
@@ -90,20 +90,20 @@ class Watched:
         rows = np.array(self._rows[:count], float).reshape(count, len(_NUMBERS))
         truth = [self._true.get(t, [np.nan, np.nan]) for t in rows[:, 0].tolist()]
         began, last = self._date("config.yaml"), self._date("steps.csv")
-        return Progress(
+        return RunProgress(
             name=self.directory.resolve().name,
             status=status,
             total=total,
             path=rows[:, 1:4],
-            spread=rows[-1, 4:7] if count else np.full(3, np.nan),
+            sd=rows[-1, 4:7] if count else np.full(3, np.nan),
             odometry=np.array(self._reckoned[:count], float).reshape(count, 3),
             truth=np.array(truth, float).reshape(count, 2),
             outcomes=Counter(self._outcomes[:count]),
             lost=int(rows[:, 7].sum()),
-            off=self._off,
-            saved=self._saved(),
-            pace=count / (last - began) if 0 < began < last else None,
-            silent=max(0.0, time.time() - self._date(*self._files())),
+            online_error=self._online_error,
+            checkpoint=self._saved(),
+            rate=count / (last - began) if 0 < began < last else None,
+            silence=max(0.0, time.time() - self._date(*self._files())),
         )
 
     def _read(self) -> None:
@@ -123,7 +123,7 @@ class Watched:
             self._true[t] = [x, y]
         for where, line in self._errors.new():
             if not line.startswith("t,"):
-                self._off = _numbers(where, line.split(","), 2)[1]
+                self._online_error = _numbers(where, line.split(","), 2)[1]
 
     def _manifest(self) -> tuple[str, int | None]:
         file = self.directory / "manifest.json"
@@ -146,7 +146,7 @@ class Watched:
     def _files(self) -> list[str]:
         """All but a monitor's own."""
         try:
-            return [path.name for path in self.directory.iterdir() if not path.name.endswith(PICTURE)]
+            return [path.name for path in self.directory.iterdir() if not path.name.endswith(WATCH_IMAGE)]
         except OSError as error:
             raise InputError(str(self.directory), f"gone ({error.strerror})", "a run's directory") from None
 

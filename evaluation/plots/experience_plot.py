@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from evaluation.metrics.experience_metric import ExperienceMetric, experience_metric
-from evaluation.metrics.run_arrays import Run, known
+from evaluation.metrics.run_arrays import RunArrays, truth_rows
 from evaluation.metrics.scorecard import Scorecard
 from evaluation.plots import style
-from evaluation.plots.style import BLUE, FAINT, GREY, INK, VERMILLION
+from evaluation.plots.style import BLUE, GREY, INK, LINE_GREY, VERMILLION
 from tactile.base.errors import InputError
 
 if TYPE_CHECKING:
@@ -19,18 +19,18 @@ if TYPE_CHECKING:
 _HEIGHT, _BOTTOM = 5.2, 1.05  # inches
 
 
-def draw_history(run: Run, card: Scorecard) -> Figure:
+def draw_experience_history(run: RunArrays, card: Scorecard) -> Figure:
     """Experience against step, the end of the base set, and what strict ExM says of each re-localisation.
 
     Without truth, or where the run never returns to its start, nobody can say; then all look the same.
     """
-    rows = known(run) if len(known(run)) else np.arange(len(run.time))
+    rows = truth_rows(run) if len(truth_rows(run)) else np.arange(len(run.time))
     judged, why = _judged(run, card, rows)
     rows = rows[run.experience[rows] >= 0]
     experience = run.experience[rows]
-    figure = style.blank(_HEIGHT, card.name, why if judged is None else _line(judged))
+    figure = style.new_figure(_HEIGHT, card.name, why if judged is None else _line(judged))
     inner = style.WIDTH - style.LEFT - style.RIGHT
-    axes = style.plot(figure, style.LEFT, _BOTTOM, inner, _HEIGHT - style.TOP - _BOTTOM)
+    axes = style.add_axes(figure, style.LEFT, _BOTTOM, inner, _HEIGHT - style.TOP - _BOTTOM)
     counted = np.zeros(len(rows), bool) if judged is None else judged.counted
     right = counted if judged is None else judged.right
     free = ~counted
@@ -50,16 +50,16 @@ def draw_history(run: Run, card: Scorecard) -> Figure:
     last = max(1, len(run.time) - 1)
     axes.set(xlim=(-0.01 * last, 1.01 * last), ylim=(-0.02 * max(1, len(run.nodes)), None))
     axes.locator_params(integer=True)
-    axes.grid(color=FAINT, lw=0.7)
+    axes.grid(color=LINE_GREY, lw=0.7)
     style.name_axes(axes, "step", "experience, in order of creation")
-    style.legend(figure, axes, columns=2)
+    style.add_legend(figure, axes, columns=2)
     return figure
 
 
-def _judged(run: Run, card: Scorecard, rows: np.ndarray) -> tuple[ExperienceMetric | None, str]:
+def _judged(run: RunArrays, card: Scorecard, rows: np.ndarray) -> tuple[ExperienceMetric | None, str]:
     """Strict ExM of the steps `rows`, of which those without an experience are no entries; or why there is
     none."""
-    if run.truth is None or len(known(run)) == 0:
+    if run.truth is None or len(truth_rows(run)) == 0:
         return None, "no ground truth: re-localisations cannot be judged"
     if (run.experience[rows] < 0).all():
         return None, "no experiences"

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from evaluation.metrics.grid_error import HEADLINE
+from evaluation.metrics.grid_error import MAIN_CONVENTION
 from evaluation.metrics.grid_score import GridScore
-from evaluation.metrics.occupancy_grid import Grid
+from evaluation.metrics.occupancy_grid import OccupancyGrid
 from evaluation.plots import style
-from evaluation.plots.style import GREEN, INK, QUIET, VERMILLION, WIDTH, YELLOW
+from evaluation.plots.style import GREEN, INK, LABEL_GREY, VERMILLION, WIDTH, YELLOW
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,7 +28,7 @@ _KEY, _BAR = 0.72, 0.15  # inches: right of the maps, and of the colours in it
 _HEAD, _GAP, _BOTTOM = 0.48, 0.42, 1.0  # inches above a small map, between two, and below all
 
 
-class Paths(NamedTuple):
+class GridPaths(NamedTuple):
     """Where the robot was in the end, [T, 2] or [T, 3] each, m; truth may have NaN rows.
 
     Attributes:
@@ -40,7 +40,7 @@ class Paths(NamedTuple):
     odometry: np.ndarray
 
 
-class Panel(NamedTuple):
+class GridPanel(NamedTuple):
     """A map to draw.
 
     Attributes:
@@ -50,26 +50,26 @@ class Panel(NamedTuple):
 
     name: str
     line: str
-    grid: Grid
+    grid: OccupancyGrid
     segments: np.ndarray = NO_SEGMENTS
-    paths: Paths | None = None
+    paths: GridPaths | None = None
 
 
-def draw_grid(panel: Panel) -> Figure:
+def draw_grid(panel: GridPanel) -> Figure:
     """One map, large, with its walls and paths (Fig. 6 of Fox et al. 2012)."""
     inner = WIDTH - style.LEFT - style.RIGHT - _KEY
     tall = inner * _aspect(panel.grid)
-    figure = style.blank(style.TOP + tall + _BOTTOM, panel.name, panel.line)
-    axes = style.plot(figure, style.LEFT, _BOTTOM, inner, tall)
+    figure = style.new_figure(style.TOP + tall + _BOTTOM, panel.name, panel.line)
+    axes = style.add_axes(figure, style.LEFT, _BOTTOM, inner, tall)
     _paint(axes, panel)
     if panel.paths is not None:
         _paint_paths(axes, panel.paths, told=True)
     _paint_key(figure, style.LEFT + inner, _BOTTOM, min(tall, 2.4))
-    style.legend(figure, axes, columns=3)
+    style.add_legend(figure, axes, columns=3)
     return figure
 
 
-def draw_grids(title: str, line: str, panels: Sequence[Panel], *, across: int = 3) -> Figure:
+def draw_grids(title: str, line: str, panels: Sequence[GridPanel], *, across: int = 3) -> Figure:
     """Maps side by side, `across` in a row (Figs. 4 and 5 of Fox et al. 2012)."""
     across = min(across, len(panels))
     rows = -(-len(panels) // across)
@@ -77,13 +77,13 @@ def draw_grids(title: str, line: str, panels: Sequence[Panel], *, across: int = 
     width = (inner - (across - 1) * _GAP) / across
     high = width * max(_aspect(panel.grid) for panel in panels)
     whole = style.TOP + rows * (_HEAD + high) + (rows - 1) * _GAP + _BOTTOM
-    figure = style.blank(whole, title, line)
+    figure = style.new_figure(whole, title, line)
     for number, panel in enumerate(panels):
         row, column = divmod(number, across)
         left = style.LEFT + column * (width + _GAP)
         top = whole - style.TOP - row * (_HEAD + high + _GAP) - _HEAD
         tall = width * _aspect(panel.grid)
-        axes = style.plot(figure, left, top - tall, width, tall)
+        axes = style.add_axes(figure, left, top - tall, width, tall)
         _paint(axes, panel)
         if panel.paths is not None:
             _paint_paths(axes, panel.paths)
@@ -95,16 +95,16 @@ def draw_grids(title: str, line: str, panels: Sequence[Panel], *, across: int = 
             axes.set_xlabel("")
         axes.tick_params(labelsize=7.5)
         figure.text(left / WIDTH, (top + 0.24) / whole, panel.name, fontsize=9.5, color=INK)
-        figure.text(left / WIDTH, (top + 0.08) / whole, panel.line, fontsize=8, color=QUIET)
+        figure.text(left / WIDTH, (top + 0.08) / whole, panel.line, fontsize=8, color=LABEL_GREY)
     _paint_key(figure, style.LEFT + inner, whole - style.TOP - _HEAD - high, min(high, 2.4))
     fullest = max(figure.axes, key=lambda axes: len(axes.get_legend_handles_labels()[1]))
-    style.legend(figure, fullest, columns=5)
+    style.add_legend(figure, fullest, columns=5)
     return figure
 
 
-def headline(score: GridScore) -> str:
+def grid_headline(score: GridScore) -> str:
     """The few figures that matter most, in one line."""
-    error, found = score.under(HEADLINE), score.quantities
+    error, found = score.under(MAIN_CONVENTION), score.quantities
     parts = [f"eq. 6: {error.error:.3f} (0.3 everywhere: {error.prior:.3f})"]
     skill, auc = found["map_brier_skill"].value, found["map_auc"].value
     ways = found["map_chamfer_map"].value, found["map_chamfer_walls"].value
@@ -114,18 +114,18 @@ def headline(score: GridScore) -> str:
     return "  ·  ".join(parts)
 
 
-def position_error(path: np.ndarray, truth: np.ndarray) -> float:
+def mean_position_error(path: np.ndarray, truth: np.ndarray) -> float:
     """Mean distance from the true positions, m, not aligned; NaN where none is known."""
     away = np.hypot(*(np.asarray(path)[:, :2] - np.asarray(truth)[:, :2]).T)
     return float(np.nanmean(away)) if np.isfinite(away).any() else float("nan")
 
 
-def _aspect(grid: Grid) -> float:
+def _aspect(grid: OccupancyGrid) -> float:
     height, width = grid.probability.shape
     return height / width
 
 
-def _paint(axes: Axes, panel: Panel) -> None:
+def _paint(axes: Axes, panel: GridPanel) -> None:
     """The map and the walls; the order of drawing is the order of the legend."""
     from matplotlib.collections import LineCollection
 
@@ -137,7 +137,7 @@ def _paint(axes: Axes, panel: Panel) -> None:
         interpolation="nearest", zorder=0.5,
     )  # fmt: skip
     axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", autoscale_on=False)
-    style.metric_grid(axes)
+    style.metre_grid(axes)
     axes.grid(visible=False)
     axes.tick_params(axis="x", pad=6)  # below the lowest number of the other axis
     if len(panel.segments):
@@ -147,12 +147,12 @@ def _paint(axes: Axes, panel: Panel) -> None:
         )
 
 
-def _paint_paths(axes: Axes, paths: Paths, *, told: bool = False) -> None:
+def _paint_paths(axes: Axes, paths: GridPaths, *, told: bool = False) -> None:
     """The paths, with their errors in the legend if `told`; what leaves the map is cut off."""
     truth, estimate, odometry = (np.asarray(path)[:, :2] for path in paths)
 
     def name(word: str, path: np.ndarray) -> str:
-        off = position_error(path, truth) if told else np.nan
+        off = mean_position_error(path, truth) if told else np.nan
         return word if np.isnan(off) else f"{word}, {off:.3f} m off"
 
     dashed = (0, (4, 2))
@@ -166,11 +166,11 @@ def _paint_paths(axes: Axes, paths: Paths, *, told: bool = False) -> None:
 
 def _paint_key(figure: Figure, left: float, bottom: float, tall: float) -> None:
     """Which grey is which occupancy, right of a map, in inches."""
-    bar = style.plot(figure, left + 0.2, bottom, _BAR, tall)
+    bar = style.add_axes(figure, left + 0.2, bottom, _BAR, tall)
     shades = np.linspace(0, 1, 256)[:, None]
     bar.imshow(shades, cmap="gray", vmin=0, vmax=1, extent=(0, 1, 0, 1), origin="lower", aspect="auto")
     bar.set_xticks([])
     bar.set_yticks([0, 0.3, 0.5, 1.0])
     bar.yaxis.tick_right()
     bar.tick_params(labelsize=7.5)
-    bar.set_title("occupied", fontsize=8, color=QUIET, loc="left", pad=9)
+    bar.set_title("occupied", fontsize=8, color=LABEL_GREY, loc="left", pad=9)

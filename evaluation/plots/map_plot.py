@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from evaluation.metrics.run_arrays import Run, known
+from evaluation.metrics.run_arrays import RunArrays, truth_rows
 from evaluation.metrics.scorecard import Scorecard
 from evaluation.metrics.trajectory import align
 from evaluation.plots import style
@@ -36,7 +36,7 @@ class _Layers(NamedTuple):
 
 
 def draw_map(
-    run: Run, card: Scorecard, walls: np.ndarray = NO_WALLS, closures: np.ndarray = NO_CLOSURES
+    run: RunArrays, card: Scorecard, walls: np.ndarray = NO_WALLS, closures: np.ndarray = NO_CLOSURES
 ) -> Figure:
     """Map over truth and raw odometry, equal axes in m.
 
@@ -55,21 +55,21 @@ def draw_map(
     box = _frame(layers, shown)
     width, height = box[1] - box[0]
     inner = style.WIDTH - style.LEFT - style.RIGHT
-    figure = style.blank(inner * height / width + style.TOP + _BOTTOM, card.name, headline(card))
-    axes = style.plot(figure, style.LEFT, _BOTTOM, inner, inner * height / width)
+    figure = style.new_figure(inner * height / width + style.TOP + _BOTTOM, card.name, map_headline(card))
+    axes = style.add_axes(figure, style.LEFT, _BOTTOM, inner, inner * height / width)
     axes.set(xlim=box[:, 0], ylim=box[:, 1], aspect="equal")
-    style.metric_grid(axes)
+    style.metre_grid(axes)
     if len(shown):
-        paint_walls(axes, shown)
+        draw_walls(axes, shown)
         _paint_laps(axes, run, layers, card.exm.position, closures)
     else:
         _paint(axes, run, layers)
     _paint_start(axes, layers)
-    style.legend(figure, axes)
+    style.add_legend(figure, axes)
     return figure
 
 
-def headline(card: Scorecard) -> str:
+def map_headline(card: Scorecard) -> str:
     """The few figures that matter most, in one line."""
     ate, online = card.quantities["ate_final"], card.quantities["ate_online"]
     parts = [f"{card.quantities['experiences'].value} experiences"]
@@ -85,7 +85,7 @@ def headline(card: Scorecard) -> str:
     return "  ·  ".join(parts)
 
 
-def paint_walls(axes: Axes, walls: np.ndarray) -> None:
+def draw_walls(axes: Axes, walls: np.ndarray) -> None:
     """Walls [B, 5] in grey, the taller the darker."""
     from matplotlib.collections import PatchCollection
     from matplotlib.patches import Rectangle
@@ -99,19 +99,19 @@ def paint_walls(axes: Axes, walls: np.ndarray) -> None:
     axes.add_collection(PatchCollection(boxes, facecolors=greys, linewidths=0, zorder=0.6))
 
 
-def corners(*points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def bounds(*points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The least and the greatest coordinates [2] of points [.., 2]."""
     every = np.concatenate(points)
     return np.nanmin(every, axis=0), np.nanmax(every, axis=0)
 
 
-def edges(walls: np.ndarray) -> np.ndarray:
+def wall_corners(walls: np.ndarray) -> np.ndarray:
     """[2 B, 2] two opposite corners of each wall."""
     return np.concatenate([walls[:, :2], walls[:, 2:4]])
 
 
-def _placed(run: Run) -> _Layers:
-    rows = known(run)
+def _placed(run: RunArrays) -> _Layers:
+    rows = truth_rows(run)
     if run.truth is None or len(rows) == 0:
         to_map = compose(run.final[0], between(run.odometry[0], np.zeros(3)))
         return _Layers(None, _xy(compose(to_map, run.odometry)), _xy(run.final), _xy(run.nodes))
@@ -130,10 +130,10 @@ def _frame(layers: _Layers, walls: np.ndarray) -> np.ndarray:
     """Corners [[left, bottom], [right, top]] in m: truth, walls and map, and what lies near them of the
     odometry."""
     truth = [] if layers.truth is None else [layers.truth]
-    low, high = corners(layers.final, layers.nodes, edges(walls), *truth)
+    low, high = bounds(layers.final, layers.nodes, wall_corners(walls), *truth)
     if len(walls) == 0:
         room = _ROOM * (high - low).max()
-        far_low, far_high = corners(layers.odometry)
+        far_low, far_high = bounds(layers.odometry)
         low = np.minimum(low, np.maximum(far_low, low - room))
         high = np.maximum(high, np.minimum(far_high, high + room))
     middle, size = (low + high) / 2, np.maximum(high - low + _MARGIN * (high - low).max(), 1e-3)
@@ -141,7 +141,7 @@ def _frame(layers: _Layers, walls: np.ndarray) -> np.ndarray:
     return np.stack([middle - size / 2, middle + size / 2])
 
 
-def _paint(axes: Axes, run: Run, layers: _Layers) -> None:
+def _paint(axes: Axes, run: RunArrays, layers: _Layers) -> None:
     """Draws the layers; the order of drawing is the order of the legend, `zorder` what covers what."""
     from matplotlib.collections import LineCollection
 
@@ -165,14 +165,16 @@ def _paint(axes: Axes, run: Run, layers: _Layers) -> None:
             )
 
 
-def _paint_laps(axes: Axes, run: Run, layers: _Layers, apart: float, closures: np.ndarray) -> None:
+def _paint_laps(axes: Axes, run: RunArrays, layers: _Layers, apart: float, closures: np.ndarray) -> None:
     """The same between walls. A closure is wrong where it joins places more than `apart` m apart in truth."""
     from matplotlib.collections import LineCollection
 
     truth, odometry, final, nodes = layers
     assert truth is not None
-    axes.plot(*broken(truth, truth).T, color=YELLOW, lw=5, solid_capstyle="butt", zorder=0.8, label="truth")
-    axes.plot(*broken(final, truth).T, color=BLUE, lw=0.7, zorder=3, label="path in the map")
+    axes.plot(
+        *split_at_jumps(truth, truth).T, color=YELLOW, lw=5, solid_capstyle="butt", zorder=0.8, label="truth"
+    )
+    axes.plot(*split_at_jumps(final, truth).T, color=BLUE, lw=0.7, zorder=3, label="path in the map")
     axes.plot(*odometry.T, color=GREY, lw=0.7, alpha=0.7, zorder=1, label="raw odometry")
     joined, place = (closures, final) if len(closures) else (run.links[_older(run.links)], nodes)
     steps = joined if len(closures) else run.created[joined]
@@ -193,7 +195,7 @@ def _older(links: np.ndarray) -> np.ndarray:
     return np.abs(links[:, 0] - links[:, 1]) > 1
 
 
-def broken(line: np.ndarray, truth: np.ndarray) -> np.ndarray:
+def split_at_jumps(line: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """The line [N, 2], interrupted where the true one was carried."""
     step = np.hypot(*np.diff(truth, axis=0).T)
     moving = step[np.isfinite(step) & (step > 0)]

@@ -10,12 +10,12 @@ import numpy as np
 from evaluation.plots import style
 from evaluation.plots.style import (
     BLUE,
-    FAINT,
     GREEN,
     GREY,
     INK,
+    LABEL_GREY,
+    LINE_GREY,
     PURPLE,
-    QUIET,
     VERMILLION,
     WIDTH,
     YELLOW,
@@ -25,13 +25,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-SERIES = (GREY, BLUE, VERMILLION, GREEN, PURPLE, YELLOW)
+SERIES_COLORS = (GREY, BLUE, VERMILLION, GREEN, PURPLE, YELLOW)
 """Colours of what is compared, in this order."""
 _GAP, _BOTTOM = 0.75, 0.9  # inches between panels, and below them
 _MEDIAN = 0.3  # of a mark's column
 
 
-class Path(NamedTuple):
+class DrivenPath(NamedTuple):
     """A path that was driven, and what odometry made of it.
 
     Attributes:
@@ -43,7 +43,7 @@ class Path(NamedTuple):
     lap: np.ndarray
 
 
-class Experiences(NamedTuple):
+class ExperienceHistory(NamedTuple):
     """Which experience was current at each step [T], and what the Experience Metric says of it.
 
     Attributes:
@@ -59,7 +59,7 @@ class Experiences(NamedTuple):
     base: int
 
 
-class Measured(NamedTuple):
+class MeasuredQuantity(NamedTuple):
     """One quantity of several conditions.
 
     Attributes:
@@ -73,7 +73,7 @@ class Measured(NamedTuple):
     log: bool = False
 
 
-def draw_drift(title: str, line: str, paths: Mapping[str, Path]) -> Figure:
+def draw_drift(title: str, line: str, paths: Mapping[str, DrivenPath]) -> Figure:
     """The path driven and the path that odometry tells, side by side for several kinds of error; later laps
     are darker (Salman & Pearson 2016, Fig. 2)."""
     figure, panels = _panels(title, line, len(paths), 3.2)
@@ -88,11 +88,11 @@ def draw_drift(title: str, line: str, paths: Mapping[str, Path]) -> Figure:
             axes.plot(*path.odometry[rows].T, "-", lw=1.2, color=VERMILLION, alpha=shade, label=label)
         axes.plot(*path.truth[0], "o", ms=9, mfc="none", mec=GREEN, mew=1.8, zorder=6, label="start")
         _map_axes(axes)
-    style.legend(figure, panels[0])
+    style.add_legend(figure, panels[0])
     return figure
 
 
-def draw_experiences(title: str, line: str, runs: Mapping[str, Experiences]) -> Figure:
+def draw_experiences(title: str, line: str, runs: Mapping[str, ExperienceHistory]) -> Figure:
     """The experience at each step, the end of the base set, and what became of each (Fig. 3)."""
     figure, panels = _panels(title, line, len(runs), 3.4)
     for axes, (name, run) in zip(panels, runs.items(), strict=True):
@@ -109,13 +109,15 @@ def draw_experiences(title: str, line: str, runs: Mapping[str, Experiences]) -> 
             axes.plot(steps, run.place[steps], mark, ms=2.6 if mark == "o" else 3.6,
                       mew=0.9 if mark == "x" else 0, color=color, label=label)  # fmt: skip
         axes.axvline(run.base - 0.5, color=INK, lw=1.1, ls=(0, (2, 2)), label="end of the base set")
-        axes.grid(color=FAINT, lw=0.7)
+        axes.grid(color=LINE_GREY, lw=0.7)
         style.name_axes(axes, "step", "experience")
-    style.legend(figure, panels[0], columns=3)
+    style.add_legend(figure, panels[0], columns=3)
     return figure
 
 
-def draw_measured(title: str, line: str, conditions: Sequence[str], measured: Sequence[Measured]) -> Figure:
+def draw_measured(
+    title: str, line: str, conditions: Sequence[str], measured: Sequence[MeasuredQuantity]
+) -> Figure:
     """A dot for each set, a bar for the median, a line where the paper has a figure (Figs. 4, 6 and 7)."""
     figure, panels = _panels(title, line, len(measured), 3.4, below=1.3)
     for axes, quantity in zip(panels, measured, strict=True):
@@ -123,7 +125,7 @@ def draw_measured(title: str, line: str, conditions: Sequence[str], measured: Se
         count = len(quantity.values)
         for k, (name, values) in enumerate(quantity.values.items()):
             at = np.arange(len(conditions)) + (k - (count - 1) / 2) * 0.8 / max(count, 1)
-            color = SERIES[k % len(SERIES)]
+            color = SERIES_COLORS[k % len(SERIES_COLORS)]
             where = np.repeat(at, values.shape[1])
             axes.plot(where, values.reshape(-1), "o", ms=4, mew=0, alpha=0.6, color=color, label=name)
             some = np.isfinite(values).any(axis=1)
@@ -143,9 +145,9 @@ def draw_measured(title: str, line: str, conditions: Sequence[str], measured: Se
             axes.tick_params(which="minor", length=0)
         else:
             axes.set_ylim(bottom=0)
-        axes.grid(color=FAINT, lw=0.7, axis="y")
+        axes.grid(color=LINE_GREY, lw=0.7, axis="y")
     fullest = max(panels, key=lambda axes: len(axes.get_legend_handles_labels()[1]))
-    style.legend(figure, fullest)
+    style.add_legend(figure, fullest)
     return figure
 
 
@@ -166,7 +168,7 @@ def draw_directions(title: str, line: str, maps: Mapping[str, tuple[np.ndarray, 
             part = np.where(rows[:, None], position, np.nan)
             axes.plot(*part.T, "-", lw=1.0, alpha=0.7, color=color, label=label)
         _map_axes(axes)
-    style.legend(figure, panels[0])
+    style.add_legend(figure, panels[0])
     return figure
 
 
@@ -181,13 +183,13 @@ def draw_curves(
     figure, panels = _panels(title, line, len(curves), 3.6)
     for axes, (panel, conditions) in zip(panels, curves.items(), strict=True):
         axes.set_title(panel, fontsize=9.5, color=INK, loc="left")
-        for color, (name, (arcr, arr)) in zip(SERIES[1:], conditions.items(), strict=False):
+        for color, (name, (arcr, arr)) in zip(SERIES_COLORS[1:], conditions.items(), strict=False):
             for number, (x, y) in enumerate(zip(arcr, arr, strict=True)):
                 axes.plot(x, y, "o-", ms=3, lw=0.9, alpha=0.7, color=color, label=None if number else name)
         axes.set(xlim=(0, 1.03), ylim=(0, None))
-        axes.grid(color=FAINT, lw=0.7)
+        axes.grid(color=LINE_GREY, lw=0.7)
         style.name_axes(axes, "ARCR, strict", "ARR")
-    style.legend(figure, panels[0])
+    style.add_legend(figure, panels[0])
     return figure
 
 
@@ -211,17 +213,17 @@ def draw_tuning(
     figure, (left, right) = _panels("Tuning of the classic matcher", f"AUC {auc:.3f}  ·  {taken}", 2, 3.4)
     for count, color, label in ((same, BLUE, "same place"), (other, VERMILLION, "different places")):
         left.stairs(count / max(count.sum(), 1), edge, color=color, fill=True, alpha=0.45, label=label)
-    left.grid(color=FAINT, lw=0.7)
+    left.grid(color=LINE_GREY, lw=0.7)
     style.name_axes(left, "difference of two views", "share of pairs")
     right.plot(threshold, correct, "o-", ms=3, lw=1.0, color=GREEN, label="correct")
     right.plot(threshold, incorrect, "x-", ms=4, lw=1.0, color=PURPLE, label="incorrect")
-    right.grid(color=FAINT, lw=0.7)
+    right.grid(color=LINE_GREY, lw=0.7)
     style.name_axes(right, "threshold", "re-localisations")
     for axes in (left, right):
         if winner is not None:
             axes.axvline(winner, color=INK, lw=1.1, ls=(0, (2, 2)), label="chosen")
     right.legend(frameon=False, fontsize=9, labelcolor=INK)
-    style.legend(figure, left)
+    style.add_legend(figure, left)
     return figure
 
 
@@ -232,19 +234,19 @@ def _panels(
     across = across or count
     rows = -(-count // across)
     whole = style.TOP + rows * height + (rows - 1) * _GAP + below
-    figure = style.blank(whole, title, line)
+    figure = style.new_figure(whole, title, line)
     width = (WIDTH - style.LEFT - style.RIGHT - (across - 1) * _GAP) / across
     panels = []
     for number in range(count):
         row, column = divmod(number, across)
         left = style.LEFT + column * (width + _GAP)
         bottom = whole - style.TOP - 0.2 - (row + 1) * height - row * _GAP + 0.2
-        panels.append(style.plot(figure, left, bottom, width, height - 0.2))
+        panels.append(style.add_axes(figure, left, bottom, width, height - 0.2))
     return figure, panels
 
 
 def _map_axes(axes: Axes) -> None:
     axes.set_aspect("equal", adjustable="datalim")
-    axes.grid(color=FAINT, lw=0.7)
-    axes.tick_params(labelcolor=QUIET)
+    axes.grid(color=LINE_GREY, lw=0.7)
+    axes.tick_params(labelcolor=LABEL_GREY)
     style.name_axes(axes, "x (m)", "y (m)")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from evaluation.plots import style
-from evaluation.plots.style import BLUE, FAINT, GREY, INK, QUIET, VERMILLION, WIDTH
+from evaluation.plots.style import BLUE, GREY, INK, LABEL_GREY, LINE_GREY, VERMILLION, WIDTH
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,7 +29,7 @@ _CROSSING, _MISTAKEN = (
 _SIZE = 7.6  # of labels, points
 
 
-class Mark(NamedTuple):
+class ParetoPoint(NamedTuple):
     """One choice.
 
     Attributes:
@@ -43,7 +43,7 @@ class Mark(NamedTuple):
     optimal: bool
 
 
-def draw_frontier(title: str, line: str, marks: Sequence[Mark], time: str, error: str) -> Figure:
+def draw_pareto(title: str, line: str, marks: Sequence[ParetoPoint], time: str, error: str) -> Figure:
     """Both axes logarithmic; bars from the least to the largest over seeds.
 
     Args:
@@ -51,8 +51,8 @@ def draw_frontier(title: str, line: str, marks: Sequence[Mark], time: str, error
     """
     inner = WIDTH - style.LEFT - style.RIGHT
     tall = _TALL + _EACH * max(0, len(marks) - 12)
-    figure = style.blank(style.TOP + tall + _BOTTOM, title, line)
-    axes = style.plot(figure, style.LEFT, _BOTTOM, inner, tall)
+    figure = style.new_figure(style.TOP + tall + _BOTTOM, title, line)
+    axes = style.add_axes(figure, style.LEFT, _BOTTOM, inner, tall)
     spans = np.array([[mark.time, mark.error] for mark in marks])  # [N, 2, 3]
     positive = spans[:, 1][spans[:, 1] > 0]
     floor = _FLOOR * positive.min() if len(positive) else 1.0
@@ -62,12 +62,12 @@ def draw_frontier(title: str, line: str, marks: Sequence[Mark], time: str, error
     _paint(axes, spans, best)
     none = bool((spans[:, 1] == floor).any())
     style.name_axes(axes, time, f"{error}{', 0 at the bottom' if none else ''}")
-    style.legend(figure, axes)
+    style.add_legend(figure, axes)
     _label(axes, [mark.name for mark in marks], spans, best)
     return figure
 
 
-def placed(
+def place_labels(
     size: np.ndarray, anchor: np.ndarray, area: np.ndarray, blocked: np.ndarray, crossed: np.ndarray
 ) -> np.ndarray:
     """[N, 2] lower left corners of labels, each as near to its anchor as is free when its turn comes.
@@ -128,7 +128,7 @@ def _frame(axes: Axes, spans: np.ndarray) -> None:
         axis.set_major_locator(LogLocator(subs=steps, numticks=30))
         axis.set_minor_locator(NullLocator())
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.10g}"))
-    axes.grid(color=FAINT, lw=0.7)
+    axes.grid(color=LINE_GREY, lw=0.7)
 
 
 def _front(axes: Axes, spans: np.ndarray, best: np.ndarray) -> np.ndarray:
@@ -171,7 +171,7 @@ def _label(axes: Axes, names: Sequence[str], spans: np.ndarray, best: np.ndarray
             (0, 0),
             xycoords="figure pixels",
             fontsize=_SIZE,
-            color=INK if top else QUIET,
+            color=INK if top else LABEL_GREY,
             path_effects=halo,
             zorder=5,
         )
@@ -190,7 +190,7 @@ def _label(axes: Axes, names: Sequence[str], spans: np.ndarray, best: np.ndarray
     bars = np.concatenate([across, up])
     order = np.lexsort((at[:, 0], ~best))
     frame = np.array(axes.get_window_extent().extents)
-    corners = placed(sizes[order], at[order], frame, blocked, bars)
+    corners = place_labels(sizes[order], at[order], frame, blocked, bars)
     for k, corner in zip(order, corners, strict=True):
         texts[k].xyann = tuple(corner - [boxes[k].x0, boxes[k].y0])
         near = np.clip(at[k], corner, corner + sizes[k])

@@ -12,8 +12,8 @@ if TYPE_CHECKING:
 
 # Okabe and Ito's colours keep apart for every common kind of colour vision
 INK = "#222222"
-QUIET = "#767676"
-FAINT = "#e6e6e6"
+LABEL_GREY = "#767676"
+LINE_GREY = "#e6e6e6"
 GREY = "#adadad"
 BLUE = "#0072b2"
 YELLOW = "#f0e442"
@@ -25,7 +25,7 @@ WIDTH, LEFT, RIGHT, TOP = 8.0, 0.62, 0.25, 0.90
 """Of every picture and its margins, inches."""
 
 
-def blank(height: float, title: str, line: str) -> Figure:
+def new_figure(height: float, title: str, line: str) -> Figure:
     """A figure of `WIDTH` and a height in inches, 1200 pixels wide, with a title and a line below it."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -34,38 +34,38 @@ def blank(height: float, title: str, line: str) -> Figure:
     FigureCanvasAgg(figure)
     left = LEFT / WIDTH
     figure.text(left, 1 - 0.42 / height, title, fontsize=15, weight="bold", color=INK)
-    figure.text(left, 1 - 0.70 / height, line, fontsize=9.2, color=QUIET)
+    figure.text(left, 1 - 0.70 / height, line, fontsize=9.2, color=LABEL_GREY)
     return figure
 
 
-def plot(figure: Figure, left: float, bottom: float, width: float, height: float) -> Axes:
+def add_axes(figure: Figure, left: float, bottom: float, width: float, height: float) -> Axes:
     """Axes at that place of the figure, in inches, without a frame."""
     across, up = figure.get_size_inches()
     axes = figure.add_axes((left / across, bottom / up, width / across, height / up))
     axes.set_axisbelow(True)
-    axes.tick_params(length=0, labelsize=8.5, labelcolor=QUIET)
+    axes.tick_params(length=0, labelsize=8.5, labelcolor=LABEL_GREY)
     axes.spines[:].set_visible(False)
     return axes
 
 
 def name_axes(axes: Axes, across: str, up: str) -> None:
     """Labels of the axes, with units."""
-    axes.set_xlabel(across, color=QUIET, fontsize=9)
-    axes.set_ylabel(up, color=QUIET, fontsize=9)
+    axes.set_xlabel(across, color=LABEL_GREY, fontsize=9)
+    axes.set_ylabel(up, color=LABEL_GREY, fontsize=9)
 
 
-def metric_grid(axes: Axes) -> None:
+def metre_grid(axes: Axes) -> None:
     """The same round steps on both axes, in m, and a faint grid."""
     from matplotlib.ticker import MaxNLocator, MultipleLocator
 
     step = MaxNLocator(7, steps=[1, 2, 5, 10]).tick_values(*axes.get_xlim())
     axes.xaxis.set_major_locator(MultipleLocator(step[1] - step[0]))
     axes.yaxis.set_major_locator(MultipleLocator(step[1] - step[0]))
-    axes.grid(color=FAINT, lw=0.7)
+    axes.grid(color=LINE_GREY, lw=0.7)
     name_axes(axes, "x (m)", "y (m)")
 
 
-def legend(figure: Figure, axes: Axes, *, columns: int = 4) -> None:
+def add_legend(figure: Figure, axes: Axes, *, columns: int = 4) -> None:
     """What the axes show, at the bottom left of the figure, in the order of drawing."""
     handles, labels = axes.get_legend_handles_labels()
     across, up = figure.get_size_inches()

@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evaluation.artifacts.whisker_views import Images
+from evaluation.artifacts.whisker_views import WhiskerViews
 from evaluation.metrics.experience_metric import base_end
-from evaluation.metrics.run_arrays import Run, known
+from evaluation.metrics.run_arrays import RunArrays, truth_rows
 from evaluation.metrics.scorecard import Scorecard
 from evaluation.plots import style
-from evaluation.plots.map_plot import NO_WALLS, broken, corners, edges, paint_walls
-from evaluation.plots.style import FAINT, GREY, INK, QUIET
+from evaluation.plots.map_plot import NO_WALLS, bounds, draw_walls, split_at_jumps, wall_corners
+from evaluation.plots.style import GREY, INK, LABEL_GREY, LINE_GREY
 from tactile.base.errors import InputError
 
 if TYPE_CHECKING:
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
 
-SHOWN = 12
+MAX_HEADS = 12
 """Images that are drawn where they were taken, at most."""
-COLUMNS = 540
+STRIP_COLUMNS = 540
 """Whisks side by side in one strip: two pixels each."""
-STRIPS = 3
+MAX_STRIPS = 3
 """Strips at most; of a longer session every so manieth whisk is shown."""
 
 _NOTHING, _DEAD = "#f3f3f3", "#8f8f8f"
@@ -35,7 +35,9 @@ _LARGEST, _LEAST = 0.08, 0.045  # the same as shares of the scene, where that is
 _HOLE = 0.28  # share of it that is the head itself
 
 
-def draw_whiskers(run: Run, card: Scorecard, images: Images, walls: np.ndarray = NO_WALLS) -> Figure:
+def draw_whiskers(
+    run: RunArrays, card: Scorecard, images: WhiskerViews, walls: np.ndarray = NO_WALLS
+) -> Figure:
     """Strips of time against whiskers, coloured by the height that was felt, and below them some of the
     images as rings around the head, where it was (in truth, else in the map) and as it looked.
 
@@ -48,7 +50,7 @@ def draw_whiskers(run: Run, card: Scorecard, images: Images, walls: np.ndarray =
     """
     if len(images.view) != len(run.time):
         raise InputError("views.npz", f"{len(images.view)} images", f"{len(run.time)}, one for each step")
-    rows = known(run)
+    rows = truth_rows(run)
     pose = run.final if len(rows) == 0 or run.truth is None else run.truth
     steps = np.arange(len(pose)) if len(rows) == 0 else rows
     shown = walls if len(rows) else NO_WALLS
@@ -56,28 +58,28 @@ def draw_whiskers(run: Run, card: Scorecard, images: Images, walls: np.ndarray =
     chosen = _spread(pose, _first_visit(pose, steps), 2.4 * reach)
 
     whiskers = images.view[0].size
-    strips = min(STRIPS, -(-len(run.time) // COLUMNS))
+    strips = min(MAX_STRIPS, -(-len(run.time) // STRIP_COLUMNS))
     inner = style.WIDTH - style.LEFT - style.RIGHT
     wide = inner - _KEY
     high = wide * (box[1, 1] - box[0, 1]) / (box[1, 0] - box[0, 0])
     tall = whiskers * _ROW
     total = style.TOP + _MARKS + strips * (tall + _GAP) + 0.25 + high + _BOTTOM
-    figure = style.blank(total, card.name, _line(images))
+    figure = style.new_figure(total, card.name, _line(images))
 
     colors = _colors()
     pixels, bottom = _pixels(images, colors), total - style.TOP - _MARKS + _GAP
     for part in np.array_split(np.arange(len(run.time)), strips):
         bottom -= tall + _GAP
-        axes = style.plot(figure, style.LEFT, bottom, inner, tall)
+        axes = style.add_axes(figure, style.LEFT, bottom, inner, tall)
         _paint_strip(axes, run.time, pixels, images, part, chosen)
     style.name_axes(axes, "time (s); of each ring, the whisker ahead is on top, then anticlockwise", "")
 
-    axes = style.plot(figure, style.LEFT, _BOTTOM, wide, high)
+    axes = style.add_axes(figure, style.LEFT, _BOTTOM, wide, high)
     axes.set(xlim=box[:, 0], ylim=box[:, 1], aspect="equal")
-    style.metric_grid(axes)
+    style.metre_grid(axes)
     if len(shown):
-        paint_walls(axes, shown)
-    axes.plot(*broken(pose[steps, :2], pose[steps, :2]).T, color=FAINT, lw=0.8, zorder=0.8)
+        draw_walls(axes, shown)
+    axes.plot(*split_at_jumps(pose[steps, :2], pose[steps, :2]).T, color=LINE_GREY, lw=0.8, zorder=0.8)
     for number, step in enumerate(chosen, start=1):
         _paint_head(axes, pose[step], reach, pixels[step], images)
         x, y, _ = pose[step]
@@ -86,7 +88,7 @@ def draw_whiskers(run: Run, card: Scorecard, images: Images, walls: np.ndarray =
     return figure
 
 
-def _line(images: Images) -> str:
+def _line(images: WhiskerViews) -> str:
     rings = ", ".join(f"{1000 * length:.0f}" for length in images.length)
     touched = (images.view > 0).sum() / max(1, images.alive.sum())
     parts = [
@@ -99,7 +101,7 @@ def _line(images: Images) -> str:
 
 def _frame(path: np.ndarray, walls: np.ndarray) -> tuple[np.ndarray, float]:
     """Corners [[left, bottom], [right, top]] in m, and how large a head is drawn."""
-    low, high = corners(path, edges(walls))
+    low, high = bounds(path, wall_corners(walls))
     extent = max((high - low).max(), 1e-3)
     reach = float(np.clip(_REACH, _LEAST * extent, _LARGEST * extent))
     middle, size = (low + high) / 2, high - low + (0.02 * extent if len(walls) else 2.6 * reach)
@@ -116,14 +118,14 @@ def _first_visit(pose: np.ndarray, steps: np.ndarray) -> np.ndarray:
 
 
 def _spread(pose: np.ndarray, steps: np.ndarray, apart: float) -> np.ndarray:
-    """Up to `SHOWN` of the steps, in order, as far from each other as can be and at least so far (m).
+    """Up to `MAX_HEADS` of the steps, in order, as far from each other as can be and at least so far (m).
 
     From the first on, each next one is the farthest from all before it.
     """
     chosen = [0]
     place = pose[steps, :2]
     away = np.hypot(*(place - place[0]).T)
-    while len(chosen) < SHOWN and away.max() >= apart:
+    while len(chosen) < MAX_HEADS and away.max() >= apart:
         chosen.append(int(away.argmax()))
         away = np.minimum(away, np.hypot(*(place - place[chosen[-1]]).T))
     return np.sort(steps[chosen])
@@ -135,7 +137,7 @@ def _colors() -> Colormap:
     return matplotlib.colormaps["viridis_r"]
 
 
-def _pixels(images: Images, colors: Colormap) -> np.ndarray:
+def _pixels(images: WhiskerViews, colors: Colormap) -> np.ndarray:
     """[N, R, C, 3] the colour of each whisker."""
     from matplotlib.colors import to_rgb
 
@@ -146,10 +148,15 @@ def _pixels(images: Images, colors: Colormap) -> np.ndarray:
 
 
 def _paint_strip(
-    axes: Axes, time: np.ndarray, pixels: np.ndarray, images: Images, part: np.ndarray, chosen: np.ndarray
+    axes: Axes,
+    time: np.ndarray,
+    pixels: np.ndarray,
+    images: WhiskerViews,
+    part: np.ndarray,
+    chosen: np.ndarray,
 ) -> None:
     rings, columns = images.view.shape[1:]
-    some = part[:: -(-len(part) // COLUMNS)]
+    some = part[:: -(-len(part) // STRIP_COLUMNS)]
     whisk = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
     start, end = float(time[part[0]]) - whisk / 2, float(time[part[-1]]) + whisk / 2
     strip = pixels[some].reshape(len(some), rings * columns, 3).swapaxes(0, 1)
@@ -170,7 +177,7 @@ def _paint_strip(
             )  # fmt: skip
 
 
-def _paint_head(axes: Axes, pose: np.ndarray, reach: float, pixels: np.ndarray, images: Images) -> None:
+def _paint_head(axes: Axes, pose: np.ndarray, reach: float, pixels: np.ndarray, images: WhiskerViews) -> None:
     """One image: its rows as rings around the head, the shortest whiskers inside; a tip points ahead."""
     from matplotlib.collections import PatchCollection
     from matplotlib.patches import Circle, Polygon, Wedge
@@ -195,18 +202,18 @@ def _paint_head(axes: Axes, pose: np.ndarray, reach: float, pixels: np.ndarray, 
     axes.add_patch(Polygon(tip, facecolor=INK, edgecolor="none", zorder=4))
 
 
-def _paint_key(figure: Figure, images: Images, colors: Colormap, left: float, high: float) -> None:
+def _paint_key(figure: Figure, images: WhiskerViews, colors: Colormap, left: float, high: float) -> None:
     """How to read a head, and which colour is how high."""
     from matplotlib.patches import Patch
 
     rings, columns = images.view.shape[1:]
     top, size = _BOTTOM + high, _KEY - 0.2
-    axes = style.plot(figure, left + 0.2, top - size, size, size)
+    axes = style.add_axes(figure, left + 0.2, top - size, size, size)
     axes.set(xlim=(-1.3, 1.3), ylim=(-1.3, 1.3), aspect="equal", xticks=[], yticks=[])
     shades = np.repeat(np.linspace(0.95, 0.8, rings), columns)
     pixels = np.repeat(shades[:, None], 3, axis=1).reshape(rings, columns, 3)
     _paint_head(axes, np.array([0.0, 0.0, np.pi / 2]), 1.0, pixels, images)
-    axes.text(0.16, 1.14, "ahead", fontsize=7.5, color=QUIET, va="center")
+    axes.text(0.16, 1.14, "ahead", fontsize=7.5, color=LABEL_GREY, va="center")
     for ring, length in enumerate(images.length):
         out = _HOLE + (ring + 0.5) * (1 - _HOLE) / rings
         axes.text(
@@ -214,18 +221,18 @@ def _paint_key(figure: Figure, images: Images, colors: Colormap, left: float, hi
         )
 
     tall = max(0.5, min(1.6, high - size - 1.0))
-    bar = style.plot(figure, left + 0.35, top - size - 0.35 - tall, 0.16, tall)
+    bar = style.add_axes(figure, left + 0.35, top - size - 0.35 - tall, 0.16, tall)
     shades = colors(np.linspace(0, 1, 256))[:, None, :3]
     bar.imshow(shades, extent=(0, 1, 0, 1000 * images.tallest), origin="lower", aspect="auto")
     bar.set_xticks([])
     bar.yaxis.tick_right()
-    bar.set_title("height felt (mm)", fontsize=8, color=QUIET, loc="left", pad=8)
+    bar.set_title("height felt (mm)", fontsize=8, color=LABEL_GREY, loc="left", pad=8)
     across, up = figure.get_size_inches()
-    handles = [Patch(facecolor=_NOTHING, edgecolor=QUIET, lw=0.4, label="nothing touched")]
+    handles = [Patch(facecolor=_NOTHING, edgecolor=LABEL_GREY, lw=0.4, label="nothing touched")]
     if not images.alive.all():
         handles.append(Patch(facecolor=_DEAD, label="does not report"))
     figure.legend(
-        handles=handles, loc="upper left", frameon=False, fontsize=8, labelcolor=QUIET, borderpad=0,
+        handles=handles, loc="upper left", frameon=False, fontsize=8, labelcolor=LABEL_GREY, borderpad=0,
         borderaxespad=0, handlelength=1.0, handletextpad=0.5,
         bbox_to_anchor=((left + 0.33) / across, (top - size - 0.5 - tall) / up),
     )  # fmt: skip

@@ -21,8 +21,8 @@ from ratslam.grid.map import GridMap
 from ratslam.grid.particle_maps import COSINE, EVIDENCE, SINE
 from ratslam.grid.particles import Particles
 from tactile.base.errors import InputError
-from tactile.base.types import Array, Motion, Observation, Odometry
-from tactile.whiskers.planar_whiskers import Feelers
+from tactile.base.types import Array, MotionKind, Observation, Odometry
+from tactile.whiskers.planar_whiskers import PlanarWhiskers
 
 FREE = (0.2, 0.5, 0.8)
 """Where along a whisker that meets nothing the map is told so, as shares of its length."""
@@ -116,7 +116,9 @@ class GridBackend:
         feelers: whisker geometry of the observations. side: of the map, m. dtype: of all floating state.
     """
 
-    def __init__(self, config: GridConfig, feelers: Feelers, side: float, dtype: Any = np.float64) -> None:
+    def __init__(
+        self, config: GridConfig, feelers: PlanarWhiskers, side: float, dtype: Any = np.float64
+    ) -> None:
         self.config, self.feelers, self.dtype = config, feelers, np.dtype(dtype)
         self.side = int(np.ceil(side / config.cell))
         self.whiskers = len(feelers.length)
@@ -142,7 +144,7 @@ class GridBackend:
             particles.start(self.config.drift, first, count, self.dtype),
             particle_maps.blank(count, self.side, self.dtype),
             jnp.zeros((count, 2), self.dtype),
-            jnp.int32(Motion.OTHER),
+            jnp.int32(MotionKind.OTHER),
             jnp.zeros(self.whiskers, bool),
             jax.random.key_data(key),
         )
@@ -207,10 +209,10 @@ class GridBackend:
         measured = jnp.all(jnp.isfinite(jnp.append(observation.wall_point, observation.wall_sd)))
         clean &= measured | ~observation.wall
 
-        turning = observation.motion == Motion.TURN
-        told = observation.motion != Motion.BACK
+        turning = observation.motion == MotionKind.TURN
+        told = observation.motion != MotionKind.BACK
         # Whiskers that whisk touch anew each time; fixed ones go on touching what they have met.
-        fresh = ~state.touched | (observation.motion == Motion.OTHER)
+        fresh = ~state.touched | (observation.motion == MotionKind.OTHER)
         foot = jnp.asarray(observation.wall_point, self.dtype)
         away = jnp.hypot(foot[0], foot[1])
         wall = observation.wall & told & measured & (away > 1e-6) & jnp.any(touching)
@@ -354,7 +356,7 @@ class GridBackend:
         return particle_maps.in_cells(jnp.stack([x, y], axis=2), self.config.cell, self.side)
 
 
-def build(config: GridConfig, feelers: Feelers | None, dtype: Any = np.float64) -> GridBackend:
+def build(config: GridConfig, feelers: PlanarWhiskers | None, dtype: Any = np.float64) -> GridBackend:
     """The backend for a session with these whiskers.
 
     Raises:

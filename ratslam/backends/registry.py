@@ -23,7 +23,7 @@ from ratslam.core.backend import Backend
 from ratslam.core.types import Scalar
 from ratslam.keyframes.ablation import FULL, Ablation
 from tactile.base.config import Settings
-from tactile.whiskers.planar_whiskers import Feelers
+from tactile.whiskers.planar_whiskers import PlanarWhiskers
 
 
 class Sensors(NamedTuple):
@@ -34,7 +34,7 @@ class Sensors(NamedTuple):
     """
 
     view_shape: tuple[int, int, int]
-    feelers: Feelers | None = None
+    feelers: PlanarWhiskers | None = None
 
 
 class BackendEntry(NamedTuple):

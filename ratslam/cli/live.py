@@ -48,7 +48,7 @@ def add_commands(commands: Commands) -> None:
 
 def _live(arguments: argparse.Namespace) -> int:
     prepare_jax()
-    from evaluation.metrics.scorecard import table
+    from evaluation.metrics.scorecard import render_scorecard
     from ratslam.live.session import run_live_session
     from robot.drivers.outcome import SessionOutcome
 
@@ -57,7 +57,7 @@ def _live(arguments: argparse.Namespace) -> int:
     with _Monitor() as monitor:
         ended, card = run_live_session(config, directory, _print, armed=monitor.start)
     if card is not None:
-        print(table(card))
+        print(render_scorecard(card))
         print(f"\n{directory}/map.png shows the map, `run {directory}/config.yaml` maps the recording again")
     _print(str(ended))
     if ended.outcome is SessionOutcome.INTERRUPTED:

@@ -46,40 +46,40 @@ def add_commands(commands: Commands) -> None:
 
 
 def _watch(arguments: argparse.Namespace) -> int:
-    from evaluation.monitor.progress import PICTURE, RUNNING
-    from evaluation.monitor.watch import watch
+    from evaluation.monitor.progress import RUNNING, WATCH_IMAGE
+    from evaluation.monitor.watch import watch_run
 
     for name in ("every", "patience"):
         if not 0 < getattr(arguments, name) < float("inf"):
             raise InputError(f"--{name}", str(getattr(arguments, name)), "a time above 0 s")
     tell = _StatusLine()
     try:
-        seen = watch(
+        seen = watch_run(
             arguments.directory, tell, every=arguments.every, patience=arguments.patience, once=arguments.once
         )
     finally:
         tell.end()
     if seen.status == RUNNING and not arguments.once:
-        cure = f"; `run --continue {arguments.directory / 'map.npz'}` goes on" if seen.saved else ""
-        print(f"no output for {seen.silent:.0f} s: the run was killed{cure}")
-    print(f"{arguments.directory / PICTURE} shows its map")
+        cure = f"; `run --continue {arguments.directory / 'map.npz'}` goes on" if seen.checkpoint else ""
+        print(f"no output for {seen.silence:.0f} s: the run was killed{cure}")
+    print(f"{arguments.directory / WATCH_IMAGE} shows its map")
     return 0
 
 
 def _score(arguments: argparse.Namespace) -> int:
     from evaluation.artifacts.run_directory import read_run
     from evaluation.metrics.energy_metric import read_relations
-    from evaluation.metrics.experience_log import read_log
+    from evaluation.metrics.experience_log import read_experience_log
     from evaluation.metrics.experience_metric import ExmConfig
-    from evaluation.metrics.scorecard import score, score_log, table
+    from evaluation.metrics.scorecard import render_scorecard, score_log, score_run
 
     exm = ExmConfig(mode=arguments.mode, base=arguments.base)
     if arguments.log.is_dir():
         relations = read_relations(arguments.relations) if arguments.relations else None
-        card = score(read_run(arguments.log), arguments.log.name, exm=exm, relations=relations)
+        card = score_run(read_run(arguments.log), arguments.log.name, exm=exm, relations=relations)
     else:
-        card = score_log(read_log(arguments.log), arguments.log.stem, exm=exm)
-    print(card.model_dump_json(indent=2) if arguments.json else table(card))
+        card = score_log(read_experience_log(arguments.log), arguments.log.stem, exm=exm)
+    print(card.model_dump_json(indent=2) if arguments.json else render_scorecard(card))
     return 0
 
 

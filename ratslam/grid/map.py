@@ -15,7 +15,7 @@ from ratslam.grid.config import GridConfig
 from ratslam.grid.genealogy import Ancestry
 from ratslam.grid.map_drawing import Marks, draw, marks_of
 from tactile.base.types import Observation
-from tactile.whiskers.planar_whiskers import Feelers
+from tactile.whiskers.planar_whiskers import PlanarWhiskers
 
 
 class GridMap:
@@ -25,7 +25,7 @@ class GridMap:
         feelers: the whiskers of the observations. side: of the map, cells.
     """
 
-    def __init__(self, config: GridConfig, feelers: Feelers, side: int) -> None:
+    def __init__(self, config: GridConfig, feelers: PlanarWhiskers, side: int) -> None:
         self.config, self.feelers, self.side = config, feelers, side
         whiskers = len(feelers.length)
         self._ancestry = Ancestry(config.particles)

@@ -15,8 +15,8 @@ from scipy.special import expit, logit
 
 from ratslam.grid.config import DrawingConfig, GridConfig
 from tactile.base.se2 import compose
-from tactile.base.types import Motion
-from tactile.whiskers.planar_whiskers import Feelers
+from tactile.base.types import MotionKind
+from tactile.whiskers.planar_whiskers import PlanarWhiskers
 
 FAR = 3.0
 """Standard deviations beyond which a mark is left out."""
@@ -45,10 +45,10 @@ def marks_of(
 ) -> Marks:
     """The marks of T reports: motion [T], contact and alive [T, W], point [T, W, 2], wall [T, 2]. A contact
     at no number is none, but its whisker does not count as free."""
-    told = motion != Motion.BACK
+    told = motion != MotionKind.BACK
     counts = alive & told[:, None]
     placed = np.isfinite(point).all(axis=2)
-    return Marks(told, contact & counts & placed, ~contact & counts, motion == Motion.TURN, point, wall)
+    return Marks(told, contact & counts & placed, ~contact & counts, motion == MotionKind.TURN, point, wall)
 
 
 class Fusion(NamedTuple):
@@ -113,7 +113,9 @@ class _Mark(NamedTuple):
     direction: float
 
 
-def draw(config: GridConfig, feelers: Feelers, side: int, path: np.ndarray, marks: Marks) -> np.ndarray:
+def draw(
+    config: GridConfig, feelers: PlanarWhiskers, side: int, path: np.ndarray, marks: Marks
+) -> np.ndarray:
     """[S, S] chance of an obstacle.
 
     Args:
@@ -145,7 +147,7 @@ def _shape(config: DrawingConfig, mark: _Mark, across: np.ndarray, up: np.ndarra
 
 
 def _marks(
-    config: DrawingConfig, body: float, feelers: Feelers, path: np.ndarray, marks: Marks
+    config: DrawingConfig, body: float, feelers: PlanarWhiskers, path: np.ndarray, marks: Marks
 ) -> list[_Mark]:
     """All marks in the order they were made."""
     middles = feelers.points(np.array([0.5]))[:, 0]

@@ -31,7 +31,7 @@ from robot.world.head_trajectory import Path as Way
 from robot.world.maze import POSE_CELL_SIZE
 from robot.world.scene import maze_info
 from tactile.base.errors import InputError
-from tactile.features.calibration import Calibration, calibrated
+from tactile.features.calibration import Calibration, calibrate
 from tactile.features.whisker_image import view_shape
 from tactile.whiskers.head_geometry import ur10_head
 
@@ -164,7 +164,7 @@ def _calibrate(rig: Rig, config: RunConfig, path: Way, tell: Callable[[str], Non
     tell(f"head: {count} whisks in free air")
     rig.driver.whisk(plan.whisking.model_copy(update={"mode": "open"}))
     record = record_free_whisks(rig, count)
-    return calibrated(plan.calibration, record, config.touch.contact.slope_window, "free whisking")
+    return calibrate(plan.calibration, record, config.touch.contact.slope_window, "free whisking")
 
 
 def _arm(

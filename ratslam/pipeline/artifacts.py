@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from evaluation.artifacts.grid_npz import read_grid, write_truth
+from evaluation.artifacts.grid_npz import read_grid, write_grid_truth
 from evaluation.artifacts.nav2 import write_nav2
 from evaluation.artifacts.run_directory import write_walls
-from evaluation.artifacts.whisker_views import Images, write_images
+from evaluation.artifacts.whisker_views import WhiskerViews, write_whisker_views
 from evaluation.metrics.grid_score import score_grid
-from evaluation.metrics.occupancy_grid import Grid, Truth, centres
+from evaluation.metrics.occupancy_grid import GridTruth, OccupancyGrid, cell_centres
 from ratslam.pipeline.run_directory import RunDirectory
 from robot.sources.source import Source
 from robot.world.arena import Arena, enclosed, occupied, read_arena, segments
@@ -42,14 +42,14 @@ def keep_images(felt: list[Felt], config: TouchConfig, store: RunDirectory) -> N
     if not felt or felt[0][0].shape[:2] != head.shape or len(felt[0][1]) != len(head.length):
         return
     columns = head.shape[1]
-    images = Images(
+    images = WhiskerViews(
         view=np.array([view[..., 0] for view, _ in felt]),
         alive=np.array([alive.reshape(head.shape) for _, alive in felt]),
         azimuth=np.arctan2(head.rest[:columns, 1], head.rest[:columns, 0]),
         length=head.length[::columns],
         tallest=config.image.tallest,
     )
-    store.file("views.npz", lambda path: write_images(path, images))
+    store.file("views.npz", lambda path: write_whisker_views(path, images))
 
 
 def keep_chart(source: Source, store: RunDirectory) -> None:
@@ -64,15 +64,15 @@ def keep_chart(source: Source, store: RunDirectory) -> None:
         return
     arena = read_arena(store.path / "arena.txt")
     truth = truth_of(arena, grid)
-    store.file("arena.npz", lambda path: write_truth(path, truth, arena.start))
+    store.file("arena.npz", lambda path: write_grid_truth(path, truth, arena.start))
     score = score_grid(grid, truth, store.path.name)
     store.text("gridscore.json", score.model_dump_json(indent=2) + "\n")
 
 
-def truth_of(arena: Arena, grid: Grid) -> Truth:
+def truth_of(arena: Arena, grid: OccupancyGrid) -> GridTruth:
     """What is really there, on the cells and in the frame of a map that begins where the robot starts."""
-    place = centres(grid)
+    place = cell_centres(grid)
     there = compose(arena.start, np.concatenate([place, np.zeros((*place.shape[:2], 1))], axis=2))[..., :2]
     ends = segments(arena).reshape(-1, 2)
     seen = compose(inverse(arena.start), np.column_stack([ends, np.zeros(len(ends))]))[:, :2]
-    return Truth(occupied(arena, there), enclosed(arena, there), seen.reshape(-1, 4))
+    return GridTruth(occupied(arena, there), enclosed(arena, there), seen.reshape(-1, 4))

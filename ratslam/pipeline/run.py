@@ -110,7 +110,7 @@ def _kept(config: RunConfig, source: Source) -> Callable[[Sample], Sample]:
     def felt(sample: Sample) -> Sample:
         if not isinstance(sample.reading, Cycle | Whisk):
             return sample
-        return sample._replace(reading=frontend.felt(sample.reading))
+        return sample._replace(reading=frontend.features(sample.reading))
 
     return felt
 

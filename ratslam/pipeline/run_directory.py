@@ -35,7 +35,7 @@ class RunDirectory:
         InputError: the directory exists already, or cannot be made.
     """
 
-    STREAMS = ("online.tum", "odometry.tum", "truth.tum", "steps.csv", "anytime.csv")
+    STREAMS = ("online.tum", "odometry.tum", "truth.tum", "steps.csv", "online_error.csv")
 
     def __init__(self, path: Path, columns: Iterable[str] = ()) -> None:
         self.path, self.columns = path, (*COLUMNS, *columns)
@@ -54,7 +54,7 @@ class RunDirectory:
             name: (self.path / name).open("x", encoding="utf-8", newline="") for name in self.STREAMS
         }
         self._streams["steps.csv"].write(",".join(self.columns) + "\n")
-        self._streams["anytime.csv"].write("t,error\n")
+        self._streams["online_error.csv"].write("t,error\n")
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -14,9 +14,9 @@ import numpy as np
 
 from evaluation.artifacts.run_directory import read_run
 from evaluation.metrics.energy_metric import read_relations
-from evaluation.metrics.scorecard import Scorecard, score
-from evaluation.metrics.trajectory import Anytime, present_error, summary, write_tum
-from evaluation.report import pictures
+from evaluation.metrics.scorecard import Scorecard, score_run
+from evaluation.metrics.trajectory import OnlineError, current_error, summarize_errors, write_tum
+from evaluation.report import plot_writers
 from ratslam.backends.registry import BACKENDS, BackendEntry, Sensors, build
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import dump
@@ -93,14 +93,14 @@ class Playing:
         _finish(self.session, store)
         keep_images(self._felt, config.touch, store)
         keep_chart(self._source, store)
-        card = score(
+        card = score_run(
             read_run(store.path),
             store.path.name,
             exm=config.score.experience_metric,
             relations=read_relations(config.score.relations) if config.score.relations else None,
         )
         store.text("scorecard.json", card.model_dump_json(indent=2) + "\n")
-        for name, save in pictures(store.path).items():
+        for name, save in plot_writers(store.path).items():
             store.file(name, save)
         status = "interrupted" if interrupted else "complete"
         store.manifest(self._manifest | {"status": status, "steps": self.session.steps})
@@ -166,13 +166,13 @@ class Anytimes:
         self._due = session.steps + max(CHUNK, session.steps // 256)
         true = np.asarray(truth)
         known = np.isfinite(true).all(axis=1)
-        error = present_error(session.map.online_trajectory()[self._skipped :][known], true[known])
+        error = current_error(session.map.online_trajectory()[self._skipped :][known], true[known])
         self.errors.append(error)
         return error
 
-    def summary(self) -> Anytime:
+    def summary(self) -> OnlineError:
         """Of all answers; NaN without any."""
-        return summary(np.array(self.errors)) if self.errors else Anytime(np.nan, np.nan, np.nan)
+        return summarize_errors(np.array(self.errors)) if self.errors else OnlineError(np.nan, np.nan, np.nan)
 
 
 def readings(source: Source) -> Iterator[tuple[Sample, Observation]]:

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field, NonNegativeInt, PlainSerializer, PlainValidator, PositiveFloat
 
 from tactile.base.config import Settings
-from tactile.features.calibration import Calibration, from_arrays, to_json
+from tactile.features.calibration import Calibration, calibration_from_arrays, calibration_json
 from tactile.whiskers.head_geometry import HeadConfig
 
 
@@ -18,7 +18,9 @@ def _read_calibration(value: Any) -> Calibration | None:
         return value
     try:
         kinds = {name: bool if name == "alive" else float for name in value}
-        return from_arrays({name: np.asarray(array, kinds[name]) for name, array in value.items()})
+        return calibration_from_arrays(
+            {name: np.asarray(array, kinds[name]) for name, array in value.items()}
+        )
     except (AttributeError, TypeError) as error:
         raise ValueError(f"not a calibration: {error}") from None
 
@@ -70,7 +72,9 @@ class SourceInfo(Settings):
     head: HeadConfig | None = None
     """The whisker head."""
     calibration: Annotated[
-        Calibration | None, PlainValidator(_read_calibration), PlainSerializer(lambda c: c and to_json(c))
+        Calibration | None,
+        PlainValidator(_read_calibration),
+        PlainSerializer(lambda c: c and calibration_json(c)),
     ] = None
     """Free-whisking calibration of the head."""
     planar_whiskers: PlanarWhiskersInfo | None = None

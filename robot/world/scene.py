@@ -28,7 +28,7 @@ from robot.world.walls import Surroundings, Walls
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
-from tactile.whiskers.head_geometry import Head, tip
+from tactile.whiskers.head_geometry import Head, tip_points
 
 WORD = "CCCAAACACA"
 """Seed 2's protocol (Salman & Pearson 2016, III-C)."""
@@ -160,7 +160,7 @@ def around(boxes: Walls, head: Head, path: Path) -> Surroundings:
             f"less than {hangs:g} m, where the head hangs",
         )
     surroundings = Surroundings(boxes, head)
-    if tip(head, np.zeros(len(head.length)))[:, 2].min() > tallest:
+    if tip_points(head, np.zeros(len(head.length)))[:, 2].min() > tallest:
         return surroundings  # at rest, whiskers are above everything
     time = _finely(path)
     pose = at(path, time)

@@ -15,7 +15,7 @@ import numpy as np
 Array = Any  # a NumPy or a JAX array
 
 
-class Motion(IntEnum):
+class MotionKind(IntEnum):
     """What the robot was doing during a step (the Create's state machine needs to know)."""
 
     OTHER = 0
@@ -73,7 +73,7 @@ class Whisk(NamedTuple):
     reach: np.ndarray
 
 
-class Moment(IntEnum):
+class StepEnd(IntEnum):
     """Where the Create's state machine stands at the end of a step (Fox et al. 2012, II-C)."""
 
     FREE = 0
@@ -90,7 +90,7 @@ class Report(NamedTuple):
     """One step of the Create's state machine as its fixed whiskers felt it.
 
     Attributes:
-        odometry: motion since the previous report. motion: a `Motion`. moment: a `Moment`, how it ended.
+        odometry: motion since the previous report. motion: a `MotionKind`. moment: a `StepEnd`, how it ended.
         alive: [W] bool, the whisker reports at all. contact: [W] bool, strained beyond the contact threshold
             at the end of the step.
         time: [T] s since the beginning of the step, evenly spaced. strain: [T, W, 2] horizontal and vertical,
@@ -111,7 +111,7 @@ class Observation(NamedTuple):
 
     Attributes:
         odometry: motion since the previous observation.
-        motion: a `Motion`, int32.
+        motion: a `MotionKind`, int32.
         view: [R, C, K] view, values in 0..1 (3 x 6 whiskers x channels, 20 x 60 x 1 for a camera).
         view_seen: whether `view` holds a view, bool.
         label: place-recognition id given by the recording, int32; -1 when there is none.
@@ -141,7 +141,7 @@ def observation(
     *,
     view_shape: tuple[int, int, int] = (3, 6, 1),
     label: int = -1,
-    motion: Motion = Motion.OTHER,
+    motion: MotionKind = MotionKind.OTHER,
     whiskers: int = 0,
 ) -> Observation:
     """An observation of a view and / or a given label, without contacts.

@@ -16,7 +16,7 @@ from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle
 
-FEWEST = 8
+MIN_WINDOW_SAMPLES = 8
 """Samples that a slope window has to hold: a line through fewer is mostly noise."""
 
 
@@ -52,7 +52,7 @@ class Calibration(NamedTuple):
     rate: float
 
 
-def calibrated(
+def calibrate(
     config: CalibrationConfig,
     record: Sequence[Cycle],
     slope_window: float = 0.01,
@@ -117,24 +117,24 @@ def sample_rate(time: np.ndarray, slope_window: float, where: str) -> float:
     if step.max() > 5 * usual:
         lost = f"{step.max() / usual:.0f} sample intervals without a sample"
         raise InputError(where, lost, "an unbroken stream", "leave this cycle out")
-    if slope_window / usual < FEWEST - 1e-6:
+    if slope_window / usual < MIN_WINDOW_SAMPLES - 1e-6:
         raise InputError(
             where,
             f"{1 / usual:.0f} samples per second",
-            f"at least {FEWEST / slope_window:.0f} for a slope window of {slope_window:g} s",
+            f"at least {MIN_WINDOW_SAMPLES / slope_window:.0f} for a slope window of {slope_window:g} s",
             "sample faster, or widen `contact.slope_window`",
         )
     return 1 / usual
 
 
-def arrays(calibration: Calibration) -> dict[str, np.ndarray]:
+def calibration_arrays(calibration: Calibration) -> dict[str, np.ndarray]:
     """As plain arrays by name, to be kept with a session."""
     return {name: np.asarray(value) for name, value in calibration._asdict().items()}
 
 
-def to_json(calibration: Calibration) -> dict[str, Any]:
+def calibration_json(calibration: Calibration) -> dict[str, Any]:
     """The calibration as a JSON document; infinite values are written as text."""
-    return {name: _plain(array.tolist()) for name, array in arrays(calibration).items()}
+    return {name: _plain(array.tolist()) for name, array in calibration_arrays(calibration).items()}
 
 
 def _plain(value: Any) -> Any:
@@ -143,8 +143,8 @@ def _plain(value: Any) -> Any:
     return value if isinstance(value, bool) or np.isfinite(value) else str(value)
 
 
-def from_arrays(kept: Mapping[str, np.ndarray], where: str = "calibration") -> Calibration:
-    """The calibration that `arrays` made these of.
+def calibration_from_arrays(kept: Mapping[str, np.ndarray], where: str = "calibration") -> Calibration:
+    """The calibration that `calibration_arrays` made these of.
 
     Raises:
         InputError: one is missing, or their shapes do not fit.

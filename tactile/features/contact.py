@@ -53,14 +53,16 @@ def stiffness(config: ShaftConfig, reach: Array) -> np.ndarray:
     return (1 / np.asarray(reach, float) - full) / (1 / config.reference - full)
 
 
-def reached(config: ShaftConfig, ratio: Array) -> np.ndarray:
+def radial_distance(config: ShaftConfig, ratio: Array) -> np.ndarray:
     """Where along it a whisker with that stiffness is pushed, as a share of its length: 1 at the tip."""
     full = 1 - config.taper
     nearness = np.asarray(ratio, float) * (1 / config.reference - full) + full
     return 1 / np.maximum(nearness, 1.0)
 
 
-def sensed(config: ContactConfig, calibration: Calibration, cycle: Cycle, where: str = "touch") -> Whisk:
+def detect_contacts(
+    config: ContactConfig, calibration: Calibration, cycle: Cycle, where: str = "touch"
+) -> Whisk:
     """What each whisker felt in one cycle.
 
     A whisker with a value missing anywhere in the cycle is not alive in it; in a cycle without samples, whose
@@ -146,8 +148,8 @@ def _reach(
     dy = (y - (weight * y).sum(axis=0) / count) * weight
     ratio = (da * dy).sum(axis=0) / np.maximum((da**2).sum(axis=0), 1e-12)
     # Too little was bent to tell: the tip, as if it were a point contact there.
-    return np.where(np.sqrt((da**2).sum(axis=0) / count) > LEAST_SWEEP, reached(config, ratio), 1.0)
+    return np.where(np.sqrt((da**2).sum(axis=0) / count) > MIN_SWEEP, radial_distance(config, ratio), 1.0)
 
 
-LEAST_SWEEP = 5e-3
+MIN_SWEEP = 5e-3
 """Standard deviation of the angle while pushing that tells the stiffness, rad."""

@@ -15,27 +15,33 @@ from pydantic import Field, PositiveFloat, model_validator
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.se2 import compose
-from tactile.base.types import Moment, Motion, Observation, Odometry, Report, observation
+from tactile.base.types import MotionKind, Observation, Odometry, Report, StepEnd, observation
 from tactile.wall_estimation.estimators import (
-    Meeting,
     Wall,
-    fused,
-    geometric,
-    nothing,
-    template,
-    touching,
+    WallContact,
+    contact_points,
+    fused_wall,
+    geometric_wall,
+    no_wall,
+    template_wall,
 )
-from tactile.wall_estimation.sliding_tip import learned
-from tactile.wall_estimation.strain_templates import StrainTemplates, load, matched, rate_of, smoothed
+from tactile.wall_estimation.sliding_tip import fit_tip_model
+from tactile.wall_estimation.strain_templates import (
+    StrainTemplates,
+    filter_strain,
+    match_template,
+    read_templates,
+    strain_sample_rate,
+)
 from tactile.whiskers.head_geometry import Degrees
-from tactile.whiskers.planar_whiskers import Feelers
+from tactile.whiskers.planar_whiskers import PlanarWhiskers
 
-Mount = tuple[float, float, Degrees]
+WhiskerMount = tuple[float, float, Degrees]
 RATE_TOLERANCE = 1e-2
 """By which sample rates may differ from the templates', as a share: clocks are never the same."""
 
 
-class ReportsConfig(Settings):
+class ReportFrontendConfig(Settings):
     """How reports of a Create become observations."""
 
     walls: Literal["none", "geometric", "template", "fused"] = "fused"
@@ -49,7 +55,7 @@ class ReportsConfig(Settings):
     null: it always does, as in the paper."""
     contact_radius: PositiveFloat = 0.13
     """Where along a whisker a contact is taken to be, m (Fox et al. 2012, II-D)."""
-    mounts: Annotated[tuple[Mount, ...], Field(min_length=1)] = (
+    mounts: Annotated[tuple[WhiskerMount, ...], Field(min_length=1)] = (
         (0.10, 0.08, 50.0),
         (0.13, 0.03, 15.0),
         (0.13, -0.03, -15.0),
@@ -71,19 +77,19 @@ class ReportsConfig(Settings):
             )
         return self
 
-    def resolved(self, folder: Path) -> ReportsConfig:
+    def resolved(self, folder: Path) -> ReportFrontendConfig:
         """The same with every relative path taken from the folder (of the configuration file, say)."""
         if self.templates is None:
             return self
         return self.model_copy(update={"templates": folder / self.templates})
 
     @property
-    def feelers(self) -> Feelers:
+    def feelers(self) -> PlanarWhiskers:
         """The whiskers."""
         base = np.array([mount[:2] for mount in self.mounts], np.float64)
         angle = np.radians([mount[2] for mount in self.mounts])
         direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        return Feelers(base, direction, np.full(len(base), self.length))
+        return PlanarWhiskers(base, direction, np.full(len(base), self.length))
 
 
 class _Slow(NamedTuple):
@@ -94,7 +100,7 @@ class _Slow(NamedTuple):
     strain: tuple[np.ndarray, ...]
 
 
-class Reporting:
+class ReportFrontend:
     """Turns reports, in their order, into observations.
 
     Args:
@@ -108,9 +114,9 @@ class Reporting:
         InputError: templates that are missing or of other whiskers.
     """
 
-    def __init__(self, config: ReportsConfig, templates: StrainTemplates | None = None) -> None:
+    def __init__(self, config: ReportFrontendConfig, templates: StrainTemplates | None = None) -> None:
         if config.templates is not None and config.walls in ("template", "fused"):
-            templates = load(config.templates)
+            templates = read_templates(config.templates)
         if config.walls == "template" and templates is None:
             raise InputError(
                 "walls",
@@ -122,12 +128,12 @@ class Reporting:
         self.feelers = config.feelers
         self.whiskers = len(config.mounts)
         self.view_shape = (1, self.whiskers, 1)
-        self.point = touching(self.feelers, config.contact_radius)
-        self._tip = learned(templates, self.feelers) if templates and config.walls == "fused" else None
+        self.point = contact_points(self.feelers, config.contact_radius)
+        self._tip = fit_tip_model(templates, self.feelers) if templates and config.walls == "fused" else None
         self._slow: _Slow | None = None
         self._back: Odometry | None = None
 
-    def observed(self, report: Report) -> Observation | None:
+    def observe(self, report: Report) -> Observation | None:
         """What an engine is given of the step; None for a BACK that is folded into the next one.
 
         A BACK tells of its motion alone. Walls are seen from where the robot stands at the end of the step.
@@ -141,12 +147,12 @@ class Reporting:
         wall = self._met(report)
         odometry = report.odometry if self._back is None else _joined(self._back, report.odometry)
         self._back = None
-        if report.motion == Motion.BACK:
+        if report.motion == MotionKind.BACK:
             if self.config.fold_back:
                 self._back = odometry
                 return None
             blind = observation(
-                odometry, view_shape=self.view_shape, motion=Motion.BACK, whiskers=self.whiskers
+                odometry, view_shape=self.view_shape, motion=MotionKind.BACK, whiskers=self.whiskers
             )
             return blind._replace(alive=np.zeros(self.whiskers, bool))
         contact = np.asarray(report.contact & report.alive, bool)
@@ -154,7 +160,7 @@ class Reporting:
             odometry,
             contact.reshape(self.view_shape).astype(np.float64) if contact.any() else None,
             view_shape=self.view_shape,
-            motion=Motion(report.motion),
+            motion=MotionKind(report.motion),
             whiskers=self.whiskers,
         )
         return plain._replace(
@@ -170,23 +176,23 @@ class Reporting:
         """The wall that is known at the end of the step; keeps what the next one needs."""
         slow, self._slow = self._slow, None
         contact = np.asarray(report.contact & report.alive, bool)
-        if report.moment == Moment.HIT1:
+        if report.moment == StepEnd.HIT1:
             self._slow = _Slow(contact, np.zeros(3), ())
-        if slow is None or report.motion != Motion.FORWARD or report.moment == Moment.HIT1:
-            return nothing()
+        if slow is None or report.motion != MotionKind.FORWARD or report.moment == StepEnd.HIT1:
+            return no_wall()
         slow = _Slow(
             slow.first,
             compose(slow.travel, np.array(report.odometry[:3], np.float64)),
             (*slow.strain, self._sampled(report)),
         )
-        if report.moment == Moment.FREE:
+        if report.moment == StepEnd.FREE:
             self._slow = slow
-            return nothing()
+            return no_wall()
         return self._wall(slow, contact, report)
 
     def _sampled(self, report: Report) -> np.ndarray:
         """[T, W, 2] the strain of a step, if its samples are what templates are made of."""
-        rate = rate_of(report)
+        rate = strain_sample_rate(report)
         if self.templates is not None and rate:
             usual = self.templates.training.rate
             if abs(rate - usual) > RATE_TOLERANCE * usual:
@@ -202,18 +208,18 @@ class Reporting:
         raw = np.concatenate(slow.strain)
         alive = np.asarray(report.alive, bool) & np.isfinite(raw).all(axis=(0, 2))
         raw = np.where(alive[:, None], raw, 0.0)
-        strain = smoothed(self.templates.training, raw) if self.templates else raw
-        meeting = Meeting(slow.first, contact, slow.travel, Moment(report.moment), strain, alive)
+        strain = filter_strain(self.templates.training, raw) if self.templates else raw
+        meeting = WallContact(slow.first, contact, slow.travel, StepEnd(report.moment), strain, alive)
         if not np.isfinite(slow.travel).all() or self.config.walls == "none":
-            return nothing()
+            return no_wall()
         if self._tip is not None:
-            return fused(self._tip, self.point, meeting)
+            return fused_wall(self._tip, self.point, meeting)
         if self.config.walls == "template" and self.templates is not None:
             if not len(strain) or not alive.any():
-                return nothing()
-            match = matched(self.templates, strain, alive)
-            return template(self.point, match, meeting, self.config.flat)
-        return geometric(self.point, meeting)
+                return no_wall()
+            match = match_template(self.templates, strain, alive)
+            return template_wall(self.point, match, meeting, self.config.flat)
+        return geometric_wall(self.point, meeting)
 
 
 def _joined(one: Odometry, other: Odometry) -> Odometry:

@@ -19,46 +19,46 @@ from typing import NamedTuple
 import numpy as np
 
 from tactile.base.errors import InputError
-from tactile.wall_estimation.strain_templates import WHERE, StrainTemplates
-from tactile.whiskers.planar_whiskers import Feelers
+from tactile.wall_estimation.strain_templates import TEMPLATES, StrainTemplates
+from tactile.whiskers.planar_whiskers import PlanarWhiskers
 
-RATE = 50.0
+SAMPLE_RATE = 50.0
 """Of the samples that are used, per second: what the low-pass leaves."""
-DIRECTIONS = np.radians(np.arange(4.0, 176.5, 1.0))
+WALL_DIRECTIONS = np.radians(np.arange(4.0, 176.5, 1.0))
 """Wall directions that are tried, rad."""
 SLANTS = np.radians(np.arange(0.0, 91.0, 7.5))
 """Between whisker and wall, at which shares are known, rad."""
-LOOSE = 0.02
+HORIZONTAL_MODEL_SD = 0.02
 """Standard deviation of what the law leaves out of the horizontal strain, as a share of it."""
-LOOSER = 0.04
+VERTICAL_MODEL_SD = 0.04
 """Of the vertical strain, as a share of the horizontal one."""
-UNEVEN = 2e-4
+SURFACE_SD = 2e-4
 """Of the wall, or of the tip's place along it, m."""
-LARGEST = 0.35
+MAX_TURN = 0.35
 """Turn of a whisker up to which its tip alone touches, rad."""
-SUDDEN = 0.2
+MAX_FIRST_TURN = 0.2
 """Turn at HIT1 from which it was no tip that met a wall: it grows slowly, but springs up at a corner, rad."""
-LEAST = 0.1
+MIN_SLANT = 0.1
 """Between a whisker and a wall that its tip can meet, rad."""
-EITHER = np.radians(3.0)
+RIGHT_ANGLE_MARGIN = np.radians(3.0)
 """About a right angle a whisker may turn to either side."""
-CLEAR = 30.0
+MIN_SIGNAL_SDS = 30.0
 """Noise that templates must exceed to be learned from, in standard deviations."""
-ENOUGH = 20
+MIN_CONTACT_SAMPLES = 20
 """Samples of a template that it takes."""
-FAITHLESS = 3.0
+MAX_TEMPLATE_MISFIT = 3.0
 """Misfit at which templates are not of such whiskers."""
-FRICTION = 0.2
+FRICTION_ANGLE = 0.2
 """Lean of a wall's push on a tip that slides, rad."""
-STEEPEST = 1.3
+MAX_PUSH_ANGLE = 1.3
 """Slant and lean together up to which a push along the shaft bends it, rad."""
-PUSHED = np.tan(np.minimum(SLANTS + FRICTION, STEEPEST))
+PUSH_RATIO = np.tan(np.minimum(SLANTS + FRICTION_ANGLE, MAX_PUSH_ANGLE))
 """Of a push, what goes along the shaft over what goes across it, at `SLANTS`."""
-STEADY = 0.03
+SHARE_SMOOTHING = 0.03
 """Weight of shares being in proportion to that, which tells them where nothing was felt."""
 
 
-class Tip(NamedTuple):
+class TipModel(NamedTuple):
     """The law.
 
     Attributes:
@@ -72,13 +72,13 @@ class Tip(NamedTuple):
     share: np.ndarray
     noise: np.ndarray
     time: np.ndarray
-    feelers: Feelers
+    feelers: PlanarWhiskers
     speed: float
     rate: float
 
 
-class Profile(NamedTuple):
-    """How well one whisker's strain goes with each wall direction, [K] of `DIRECTIONS`.
+class DirectionMisfit(NamedTuple):
+    """How well one whisker's strain goes with each wall direction, [K] of `WALL_DIRECTIONS`.
 
     Attributes:
         misfit: mean square over the two channels' standard deviations, added up: about 2 at most for a wall;
@@ -90,7 +90,7 @@ class Profile(NamedTuple):
     samples: int
 
 
-def learned(templates: StrainTemplates, feelers: Feelers) -> Tip:
+def fit_tip_model(templates: StrainTemplates, feelers: PlanarWhiskers) -> TipModel:
     """The law that these whiskers follow in the templates.
 
     Raises:
@@ -99,19 +99,19 @@ def learned(templates: StrainTemplates, feelers: Feelers) -> Tip:
     training = templates.training
     if templates.mean.shape[2] != len(feelers.length):
         found = f"templates of {templates.mean.shape[2]} whiskers"
-        raise InputError(WHERE, found, f"of {len(feelers.length)}")
+        raise InputError(TEMPLATES, found, f"of {len(feelers.length)}")
     rows = _rows(len(templates.spread), training.rate)
     noise, time = templates.spread[rows], (rows + 1) / training.rate
-    tip = Tip(1.0, 0.0, np.zeros(len(SLANTS)), noise, time, feelers, training.speed, training.rate)
+    tip = TipModel(1.0, 0.0, np.zeros(len(SLANTS)), noise, time, feelers, training.speed, training.rate)
     series = _series(tip, templates, rows)
     if len(series) < 2:
-        raise InputError(WHERE, "hardly any contact in them", "whiskers that touch walls")
+        raise InputError(TEMPLATES, "hardly any contact in them", "whiskers that touch walls")
     strongest = max(float(np.abs(one.across).max()) for one in series)
     gain, misfit = _scanned(tip, series, np.geomspace(strongest / 4, strongest / 0.1, 300))
     gain, misfit = _scanned(tip, series, gain * np.linspace(0.985, 1.015, 61))
-    if misfit > FAITHLESS:
+    if misfit > MAX_TEMPLATE_MISFIT:
         raise InputError(
-            WHERE,
+            TEMPLATES,
             "whiskers that do not turn in them as straight ones would that are mounted so",
             "the whiskers that they were trained with",
             "check mounts and length, or train again",
@@ -121,24 +121,24 @@ def learned(templates: StrainTemplates, feelers: Feelers) -> Tip:
     return tip._replace(crosstalk=crosstalk, share=share)
 
 
-def profile(tip: Tip, whisker: int, strain: np.ndarray) -> Profile:
+def direction_misfit(tip: TipModel, whisker: int, strain: np.ndarray) -> DirectionMisfit:
     """Of what that whisker read, filtered [N, 2], from HIT1 on."""
     rows = _rows(len(strain), tip.rate)[: len(tip.time)]
     across, down = strain[rows, whisker].T
     side = np.sign(across.sum())
-    nearer = _nearer(tip, whisker, DIRECTIONS, side)
+    nearer = _nearer(tip, whisker, WALL_DIRECTIONS, side)
     time, noise = tip.time[: len(rows)], tip.noise[: len(rows)]
-    fit = _sliding(tip, tip.gain, nearer, np.sin(DIRECTIONS), float(tip.feelers.length[whisker]), across)
+    fit = _sliding(tip, tip.gain, nearer, np.sin(WALL_DIRECTIONS), float(tip.feelers.length[whisker]), across)
     expected = tip.crosstalk * across - np.abs(across) * (_between(fit.slant) @ tip.share)
-    sd = np.hypot(noise[:, 1], LOOSER * across)
+    sd = np.hypot(noise[:, 1], VERTICAL_MODEL_SD * across)
     vertical = _mean(((down - expected) / sd) ** 2, fit.use)
     # Along the wall a whisker would lie on it, not meet it with its tip.
-    grazing = np.where(fit.use, fit.slant, np.inf).min(axis=1, initial=np.inf) < LEAST
-    possible = ~grazing & (nearer < np.pi / 2 + EITHER) & (fit.use.sum() >= 2)
-    possible &= bool(np.abs(across[:1]).max(initial=0.0) < SUDDEN * tip.gain)
+    grazing = np.where(fit.use, fit.slant, np.inf).min(axis=1, initial=np.inf) < MIN_SLANT
+    possible = ~grazing & (nearer < np.pi / 2 + RIGHT_ANGLE_MARGIN) & (fit.use.sum() >= 2)
+    possible &= bool(np.abs(across[:1]).max(initial=0.0) < MAX_FIRST_TURN * tip.gain)
     last = time[-1] if len(time) else 0.0
-    away = fit.away - tip.speed * np.sin(DIRECTIONS) * last
-    return Profile(np.where(possible, fit.misfit + vertical, np.inf), away, int(fit.use.sum()))
+    away = fit.away - tip.speed * np.sin(WALL_DIRECTIONS) * last
+    return DirectionMisfit(np.where(possible, fit.misfit + vertical, np.inf), away, int(fit.use.sum()))
 
 
 class _Series(NamedTuple):
@@ -162,11 +162,11 @@ class _Fit(NamedTuple):
 
 
 def _rows(count: int, rate: float) -> np.ndarray:
-    step = max(round(rate / RATE), 1)
+    step = max(round(rate / SAMPLE_RATE), 1)
     return np.arange(step - 1, count, step)
 
 
-def _nearer(tip: Tip, whisker: int, angle: np.ndarray, side: float) -> np.ndarray:
+def _nearer(tip: TipModel, whisker: int, angle: np.ndarray, side: float) -> np.ndarray:
     """From whisker to wall on the side to which it turns, rad."""
     x, y = tip.feelers.direction[whisker]
     beta = angle - np.arctan2(y, x)
@@ -174,7 +174,7 @@ def _nearer(tip: Tip, whisker: int, angle: np.ndarray, side: float) -> np.ndarra
 
 
 def _sliding(
-    tip: Tip,
+    tip: TipModel,
     gain: float,
     nearer: np.ndarray,
     slope: np.ndarray,
@@ -185,11 +185,11 @@ def _sliding(
     """How steadily the wall comes nearer [N] if it lies so [K]."""
     count = len(across)
     turn = np.abs(across) / gain
-    use = turn < LARGEST if touching is None else touching & (turn < LARGEST)
+    use = turn < MAX_TURN if touching is None else touching & (turn < MAX_TURN)
     slant = nearer[:, None] - turn
     distance = length * np.sin(slant) + tip.speed * slope[:, None] * tip.time[:count]
-    sd = length * np.cos(slant) * np.hypot(tip.noise[:count, 0] / gain, LOOSE * turn)
-    weight = use / (sd**2 + UNEVEN**2)
+    sd = length * np.cos(slant) * np.hypot(tip.noise[:count, 0] / gain, HORIZONTAL_MODEL_SD * turn)
+    weight = use / (sd**2 + SURFACE_SD**2)
     away = (weight * distance).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-300)
     return _Fit(_mean(weight * (distance - away[:, None]) ** 2, use), away, slant, use)
 
@@ -204,23 +204,23 @@ def _between(slant: np.ndarray) -> np.ndarray:
     return np.maximum(1 - np.abs(place[..., None] - np.arange(len(SLANTS))), 0.0)
 
 
-def _series(tip: Tip, templates: StrainTemplates, rows: np.ndarray) -> list[_Series]:
+def _series(tip: TipModel, templates: StrainTemplates, rows: np.ndarray) -> list[_Series]:
     series = []
-    threshold = CLEAR * float(np.median(tip.noise[:, 0]))
+    threshold = MIN_SIGNAL_SDS * float(np.median(tip.noise[:, 0]))
     for angle, mean in zip(templates.angle, templates.mean[:, rows], strict=True):
         for whisker in range(mean.shape[1]):
             across, down = mean[:, whisker].T
             touching = np.abs(across) > threshold
             # The first samples after onset are still the filter's.
-            touching &= np.cumsum(touching) > round(0.05 * RATE)
+            touching &= np.cumsum(touching) > round(0.05 * SAMPLE_RATE)
             nearer = float(_nearer(tip, whisker, angle, np.sign(across[touching].sum())))
             # About a right angle drives of one average may have turned to different sides.
-            if LEAST < nearer < np.pi / 2 - EITHER and touching.sum() >= ENOUGH:
+            if MIN_SLANT < nearer < np.pi / 2 - RIGHT_ANGLE_MARGIN and touching.sum() >= MIN_CONTACT_SAMPLES:
                 series.append(_Series(whisker, float(angle), nearer, across, down, touching))
     return series
 
 
-def _scanned(tip: Tip, series: list[_Series], gains: np.ndarray) -> tuple[float, float]:
+def _scanned(tip: TipModel, series: list[_Series], gains: np.ndarray) -> tuple[float, float]:
     """The gain with the least misfit, and that, a mean over series."""
     total = np.zeros(len(gains))
     for one in series:
@@ -229,23 +229,23 @@ def _scanned(tip: Tip, series: list[_Series], gains: np.ndarray) -> tuple[float,
         for k, gain in enumerate(gains):
             fit = _sliding(tip, gain, nearer, slope, length, one.across, one.touching)
             # So many turned too far already: no gain to speak of.
-            total[k] += min(fit.misfit[0], 10.0) if fit.use.sum() >= ENOUGH // 2 else 10.0
+            total[k] += min(fit.misfit[0], 10.0) if fit.use.sum() >= MIN_CONTACT_SAMPLES // 2 else 10.0
     best = int(total.argmin())
     return float(gains[best]), float(total[best] / len(series))
 
 
-def _vertical(tip: Tip, series: list[_Series]) -> tuple[float, np.ndarray]:
+def _vertical(tip: TipModel, series: list[_Series]) -> tuple[float, np.ndarray]:
     """Crosstalk and shares by least squares, each series counting the same."""
     rows, values = [], []
     for one in series:
-        use = one.touching & (np.abs(one.across) < LARGEST * tip.gain)
+        use = one.touching & (np.abs(one.across) < MAX_TURN * tip.gain)
         across, down = one.across[use], one.down[use]
         size = np.abs(across).max() * np.sqrt(len(across))
         slant = one.nearer - np.abs(across) / tip.gain
-        rows.append(np.column_stack([across, -np.abs(across)[:, None] * _between(slant) * PUSHED]) / size)
+        rows.append(np.column_stack([across, -np.abs(across)[:, None] * _between(slant) * PUSH_RATIO]) / size)
         values.append(down / size)
-    change = STEADY * np.diff(np.eye(len(SLANTS)), axis=0)
+    change = SHARE_SMOOTHING * np.diff(np.eye(len(SLANTS)), axis=0)
     rows.append(np.column_stack([np.zeros(len(change)), change]))
     values.append(np.zeros(len(change)))
     found = np.linalg.lstsq(np.concatenate(rows), np.concatenate(values), rcond=None)[0]
-    return float(found[0]), found[1:] * PUSHED
+    return float(found[0]), found[1:] * PUSH_RATIO

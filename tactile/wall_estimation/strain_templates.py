@@ -19,23 +19,23 @@ from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.types import Report
 
-VERSION = 1
+FILE_VERSION = 1
 """Of the file."""
-WHERE = "templates"
+TEMPLATES = "templates"
 """What errors call a training."""
-NEAR = np.radians(0.5)
+ANGLE_TOLERANCE = np.radians(0.5)
 """How far a drive may be from the angle that it is for, rad."""
-MEDIAN = 0.4549
+SQUARE_MEDIAN = 0.4549
 """Of the square of a standard normal variable."""
-Angle = Annotated[float, Field(gt=0, lt=180)]
+WallAngle = Annotated[float, Field(gt=0, lt=180)]
 
 
 class TemplateTraining(Settings):
     """How templates are trained; as in the paper, which leaves open what low-pass it is."""
 
-    first_deg: Angle = 20.0
+    first_deg: WallAngle = 20.0
     """Direction of the first wall."""
-    last_deg: Angle = 160.0
+    last_deg: WallAngle = 160.0
     """Of the last one."""
     step_deg: PositiveFloat = 10.0
     """Between two."""
@@ -74,7 +74,7 @@ class TemplateTraining(Settings):
         return round(self.duration * self.rate)
 
 
-class Drive(NamedTuple):
+class TrainingDrive(NamedTuple):
     """One drive into a wall.
 
     Attributes:
@@ -100,7 +100,7 @@ class StrainTemplates(NamedTuple):
     spread: np.ndarray
 
 
-class Match(NamedTuple):
+class TemplateMatch(NamedTuple):
     """Attributes:
     error: [A] of each template, eq. 5. winner: the number of the best one. angle: its direction, rad.
     refined: direction at the lowest point of the parabola through it and its neighbours, rad.
@@ -114,18 +114,18 @@ class Match(NamedTuple):
     relative: float
 
 
-def rate_of(report: Report) -> float:
+def strain_sample_rate(report: Report) -> float:
     """Samples per second of its strain; 0 where there are fewer than two."""
     count = len(report.time)
     return float((count - 1) / (report.time[-1] - report.time[0])) if count > 1 else 0.0
 
 
-def driven(angle: float, repeat: int, report: Report) -> Drive:
+def training_drive(angle: float, repeat: int, report: Report) -> TrainingDrive:
     """The drive that a report tells of."""
-    return Drive(angle, repeat, report.strain, rate_of(report))
+    return TrainingDrive(angle, repeat, report.strain, strain_sample_rate(report))
 
 
-def smoothed(training: TemplateTraining, strain: np.ndarray) -> np.ndarray:
+def filter_strain(training: TemplateTraining, strain: np.ndarray) -> np.ndarray:
     """[T, ...] Strain [T, ...] through the low-pass and the moving average.
 
     Both look back only: what is known at HIT2 must not depend on what comes later, nor templates be made
@@ -145,7 +145,9 @@ def smoothed(training: TemplateTraining, strain: np.ndarray) -> np.ndarray:
     return windows.mean(axis=-1).reshape(np.shape(strain))
 
 
-def train(drives: Iterable[Drive], training: TemplateTraining | None = None) -> StrainTemplates:
+def train_templates(
+    drives: Iterable[TrainingDrive], training: TemplateTraining | None = None
+) -> StrainTemplates:
     """Templates from drives into walls.
 
     Raises:
@@ -156,24 +158,28 @@ def train(drives: Iterable[Drive], training: TemplateTraining | None = None) -> 
     angles = training.angles
     _check(training, drives)
     given = np.array([drive.angle for drive in drives])
-    near = np.abs(given[:, None] - angles) < NEAR
+    near = np.abs(given[:, None] - angles) < ANGLE_TOLERANCE
     count = near.sum(axis=0)
     if (count < training.repeats).any():
         few = ", ".join(f"{count[k]} at {np.degrees(angles[k]):.3g} degrees" for k in _less(training, count))
-        raise InputError(WHERE, f"too few drives: {few}", f"{training.repeats} at each angle", "drive again")
+        raise InputError(
+            TEMPLATES, f"too few drives: {few}", f"{training.repeats} at each angle", "drive again"
+        )
     sets = []
     for at in near.T:
         chosen = [drives[k].strain[: training.samples] for k in np.flatnonzero(at)]
-        sets.append(np.stack([smoothed(training, strain) for strain in chosen]))
+        sets.append(np.stack([filter_strain(training, strain) for strain in chosen]))
     mean = np.stack([one.mean(axis=0) for one in sets])
     # Most channels feel nothing most of the time: the median is of those.
     square = np.concatenate(
         [((one - one.mean(axis=0)) ** 2).swapaxes(1, 2).reshape(-1, training.samples, 2) for one in sets]
     ) / (1 - 1 / count.min())
-    return StrainTemplates(training, angles, mean, np.sqrt(np.median(square, axis=0) / MEDIAN))
+    return StrainTemplates(training, angles, mean, np.sqrt(np.median(square, axis=0) / SQUARE_MEDIAN))
 
 
-def matched(templates: StrainTemplates, strain: np.ndarray, alive: np.ndarray | None = None) -> Match:
+def match_template(
+    templates: StrainTemplates, strain: np.ndarray, alive: np.ndarray | None = None
+) -> TemplateMatch:
     """Which template filtered strain [N, W, 2] since HIT1 is most like, by the whiskers that report, [W]."""
     count = min(len(strain), templates.mean.shape[1])
     use = np.ones(strain.shape[1], bool) if alive is None else np.asarray(alive, bool)
@@ -189,15 +195,15 @@ def matched(templates: StrainTemplates, strain: np.ndarray, alive: np.ndarray | 
         step = templates.angle[winner + 1] - templates.angle[winner]
         refined += float(step * (below - above) / (2 * bend)) if bend > 0 else 0.0
     power = float((read**2).sum(axis=(1, 2)).mean())
-    return Match(error, winner, angle, refined, float(error[winner] / max(power, 1e-300)))
+    return TemplateMatch(error, winner, angle, refined, float(error[winner] / max(power, 1e-300)))
 
 
-def save(templates: StrainTemplates, path: Path | str) -> None:
+def write_templates(templates: StrainTemplates, path: Path | str) -> None:
     """Write them to a file (.npz)."""
     with open(path, "wb") as file:
         np.savez_compressed(
             file,
-            strain_templates=np.int64(VERSION),
+            strain_templates=np.int64(FILE_VERSION),
             training=np.array(templates.training.model_dump_json()),
             angle=templates.angle,
             mean=templates.mean,
@@ -205,8 +211,8 @@ def save(templates: StrainTemplates, path: Path | str) -> None:
         )
 
 
-def load(path: Path | str) -> StrainTemplates:
-    """Read what `save` wrote.
+def read_templates(path: Path | str) -> StrainTemplates:
+    """Read what `write_templates` wrote.
 
     Raises:
         InputError: it cannot be read, or is something else.
@@ -214,7 +220,7 @@ def load(path: Path | str) -> StrainTemplates:
     try:
         # Opened here: np.load leaves a broken file open.
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as kept:
-            if "strain_templates" not in kept or int(kept["strain_templates"]) != VERSION:
+            if "strain_templates" not in kept or int(kept["strain_templates"]) != FILE_VERSION:
                 raise ValueError("not of this kind and version")
             training = TemplateTraining.model_validate_json(str(kept["training"]))
             templates = StrainTemplates(training, kept["angle"], kept["mean"], kept["spread"])
@@ -224,23 +230,25 @@ def load(path: Path | str) -> StrainTemplates:
         if not whole or templates.spread.shape != (count, 2) or not np.isfinite(templates.mean).all():
             raise ValueError("incomplete")
     except FileNotFoundError:
-        raise InputError(str(path), "no such file", "strain templates", CURE) from None
+        raise InputError(str(path), "no such file", "strain templates", TRAIN_HINT) from None
     except (OSError, ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile, ValidationError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         found = f"no strain templates ({reason})"
-        raise InputError(str(path), found, f"a file of version {VERSION}", CURE) from error
+        raise InputError(str(path), found, f"a file of version {FILE_VERSION}", TRAIN_HINT) from error
     return templates
 
 
-CURE = "make one with `python -m ratslam train-templates`"
+TRAIN_HINT = "make one with `python -m ratslam train-templates`"
 
 
-def _check(training: TemplateTraining, drives: list[Drive]) -> None:
+def _check(training: TemplateTraining, drives: list[TrainingDrive]) -> None:
     if not drives:
-        raise InputError(WHERE, "no drives", f"{training.repeats} at each of {len(training.angles)} angles")
+        raise InputError(
+            TEMPLATES, "no drives", f"{training.repeats} at each of {len(training.angles)} angles"
+        )
     whiskers = np.shape(drives[0].strain)[1:2]
     for drive in drives:
-        where = f"{WHERE}: drive {drive.repeat} at {np.degrees(drive.angle):.4g} degrees"
+        where = f"{TEMPLATES}: drive {drive.repeat} at {np.degrees(drive.angle):.4g} degrees"
         strain = np.asarray(drive.strain)
         if strain.ndim != 3 or strain.shape[1:] != (*whiskers, 2):
             raise InputError(where, f"strain of shape {strain.shape}", f"[T, {whiskers[0]}, 2]")
@@ -251,7 +259,7 @@ def _check(training: TemplateTraining, drives: list[Drive]) -> None:
             raise InputError(where, found, f"{training.duration:g} s from first contact on")
         if not np.isfinite(strain).all():
             raise InputError(where, "samples without a value", "numbers", "leave this drive out")
-        if np.abs(drive.angle - training.angles).min() >= NEAR:
+        if np.abs(drive.angle - training.angles).min() >= ANGLE_TOLERANCE:
             raise InputError(where, "none of the angles", f"{_listed(training.angles)} degrees")
 
 

@@ -132,18 +132,18 @@ def create_head(
     )
 
 
-def shaft(head: Head, angle: Array, along: Array) -> np.ndarray:
+def shaft_points(head: Head, angle: Array, along: Array) -> np.ndarray:
     """[..., W, 3] m, the points that lie `along` [..., W] m from the bases at protractions [..., W] rad."""
     angle, along = np.asarray(angle, float)[..., None], np.asarray(along, float)[..., None]
     return head.base + along * (np.cos(angle) * head.rest + np.sin(angle) * head.swing)
 
 
-def tip(head: Head, angle: Array) -> np.ndarray:
+def tip_points(head: Head, angle: Array) -> np.ndarray:
     """[..., W, 3] m, where the tips are at protractions [..., W] rad."""
-    return shaft(head, angle, head.length)
+    return shaft_points(head, angle, head.length)
 
 
-def height(head: Head, angle: Array) -> np.ndarray:
+def tip_height(head: Head, angle: Array) -> np.ndarray:
     """[..., W] m above the floor, of the tips: about as high as an obstacle met there (Salman & Pearson
     2016, III-D)."""
-    return tip(head, angle)[..., 2]
+    return tip_points(head, angle)[..., 2]

@@ -9,7 +9,7 @@ import numpy as np
 from tactile.whiskers.head_geometry import Head
 
 
-class Feelers(NamedTuple):
+class PlanarWhiskers(NamedTuple):
     """W whiskers in base_link.
 
     Attributes:
@@ -26,9 +26,9 @@ class Feelers(NamedTuple):
         return self.base[:, None] + along[..., None] * self.direction[:, None]
 
 
-def swept(head: Head, height: float) -> Feelers:
+def project_to_plane(head: Head, height: float) -> PlanarWhiskers:
     """The whiskers of a head over obstacles of a height, m: what each would touch of them lies in line with
     its base, from there to where its tip comes down to their tops."""
     outwards = head.rest[:, :2] / np.linalg.norm(head.rest[:, :2], axis=1, keepdims=True)
     drop = np.clip((head.base[:, 2] - height) / head.length, 0.0, 1.0)
-    return Feelers(head.base[:, :2], outwards, head.length * np.sqrt(1 - drop**2))
+    return PlanarWhiskers(head.base[:, :2], outwards, head.length * np.sqrt(1 - drop**2))

@@ -41,7 +41,7 @@ class WhiskingConfig(Settings):
     takes contacts from them: in a micromouse maze 3 % at 0.2, 40 % at 0.5."""
 
 
-class Drive(NamedTuple):
+class WhiskDrive(NamedTuple):
     """What the law remembers of the cycle so far.
 
     Attributes:
@@ -55,24 +55,24 @@ class Drive(NamedTuple):
     most: np.ndarray
 
 
-def still(*shape: int) -> Drive:
+def initial_drive(*shape: int) -> WhiskDrive:
     """The drives of whiskers [..., W] before their first cycle."""
-    return Drive(0.0, np.zeros(shape), np.zeros(shape))
+    return WhiskDrive(0.0, np.zeros(shape), np.zeros(shape))
 
 
-def phase(config: WhiskingConfig, time: Array) -> np.ndarray:
+def whisk_phase(config: WhiskingConfig, time: Array) -> np.ndarray:
     """Share of the amplitude commanded at each time, s: 0 at rest, 1 at full protraction."""
     return (1 - np.cos(2 * np.pi * config.rate * np.asarray(time, float))) / 2
 
 
-def command(
+def whisk_command(
     config: WhiskingConfig,
-    drive: Drive,
+    drive: WhiskDrive,
     time: float,
     deflection: np.ndarray,
     threshold: np.ndarray,
     shape: tuple[int, int],
-) -> tuple[np.ndarray, Drive]:
+) -> tuple[np.ndarray, WhiskDrive]:
     """Where the whiskers are to go now; called once a sample, with any axes before that of the whiskers.
 
     The perturbation is the mean size of y in excess of the contact threshold; `gain` times it lowers the
@@ -94,11 +94,13 @@ def command(
         last, mean, most = 0.0, np.zeros_like(mean), np.zeros_like(most)
     mean = mean + (1 - np.exp((last - time) / config.window)) * (np.abs(deflection) - mean)
     most = np.maximum(most, mean - threshold)
-    taken = most if config.mode == "rcp" else np.where(most > 0, most, config.follow * beside(most, shape))
-    return np.maximum(amplitude - config.gain * taken, 0.0) * share, Drive(time, mean, most)
+    taken = (
+        most if config.mode == "rcp" else np.where(most > 0, most, config.follow * neighbour_max(most, shape))
+    )
+    return np.maximum(amplitude - config.gain * taken, 0.0) * share, WhiskDrive(time, mean, most)
 
 
-def beside(value: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+def neighbour_max(value: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """[..., W] the largest value among each whisker's neighbours: its column, and the two next to it.
 
     Rows of a head with several are rings, whose ends meet. In rats, whiskers that do not touch lessen their
@@ -115,7 +117,7 @@ def beside(value: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     return near.reshape(value.shape)
 
 
-def checked(config: WhiskingConfig, head: Head, where: str = "simulation.whisking") -> None:
+def check_amplitude(config: WhiskingConfig, head: Head, where: str = "simulation.whisking") -> None:
     """Refuse what the drives cannot do.
 
     Raises:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.metrics.run_arrays import Run
+from evaluation.metrics.run_arrays import RunArrays
 from tactile.base.se2 import compose, integrate, inverse
 
 _ROOT = Path(__file__).parents[2]
@@ -62,7 +62,7 @@ def square() -> Callable[[int, int], tuple[np.ndarray, np.ndarray]]:
 
 
 @pytest.fixture(scope="session")
-def circle() -> Run:
+def circle() -> RunArrays:
     """Three laps of a circle of 36 places; a perfect map in a frame of its own, and drifting odometry."""
     laps, places = 3, 36
     turn = np.full(laps * places, 2 * np.pi / places)
@@ -73,7 +73,7 @@ def circle() -> Run:
     final = compose(elsewhere, compose(inverse(truth[0]), truth))
     places_ = np.arange(laps * places) % places
     links = np.stack([np.arange(places), (np.arange(places) + 1) % places], axis=1)
-    return Run(
+    return RunArrays(
         time=100.0 + np.arange(laps * places) / 2,
         truth=truth,
         online=final,

@@ -8,8 +8,8 @@ import sys
 import numpy as np
 import pytest
 
-from evaluation.metrics.scorecard import score
-from evaluation.plots.map_plot import broken, draw_map, headline
+from evaluation.metrics.scorecard import score_run
+from evaluation.plots.map_plot import draw_map, map_headline, split_at_jumps
 from evaluation.report import save_map
 
 
@@ -18,7 +18,7 @@ def labels(figure):
 
 
 def test_the_picture_shows_map_truth_and_odometry(circle, tmp_path):
-    figure = draw_map(circle, score(circle, "circle"))
+    figure = draw_map(circle, score_run(circle, "circle"))
     assert labels(figure)[:4] == ["truth", "raw odometry", "trajectory in the map", "experience"]
     assert "link to an older experience" in labels(figure)
     axes = figure.axes[0]
@@ -26,8 +26,8 @@ def test_the_picture_shows_map_truth_and_odometry(circle, tmp_path):
     (truth,) = (line for line in axes.lines if line.get_label() == "truth")
     (drawn,) = (line for line in axes.lines if line.get_label() == "trajectory in the map")
     assert np.array(drawn.get_data()) == pytest.approx(np.array(truth.get_data()), abs=1e-9)
-    save_map(tmp_path / "map.png", circle, score(circle, "circle"))
-    save_map(tmp_path / "again.png", circle, score(circle, "circle"))
+    save_map(tmp_path / "map.png", circle, score_run(circle, "circle"))
+    save_map(tmp_path / "again.png", circle, score_run(circle, "circle"))
     assert (tmp_path / "map.png").read_bytes() == (tmp_path / "again.png").read_bytes()
 
 
@@ -35,7 +35,7 @@ def test_a_metre_is_as_long_upwards_as_sideways(circle):
     flat = circle._replace(
         **{name: getattr(circle, name) * [1, 0.1, 1] for name in ("truth", "final", "nodes")}
     )
-    figure = draw_map(flat, score(flat))
+    figure = draw_map(flat, score_run(flat))
     axes = figure.axes[0]
     width, height = figure.get_size_inches() * axes.get_position().size
     assert np.ptp(axes.get_xlim()) / width == pytest.approx(np.ptp(axes.get_ylim()) / height)
@@ -43,14 +43,14 @@ def test_a_metre_is_as_long_upwards_as_sideways(circle):
 
 def test_without_truth_odometry_starts_where_the_map_does(circle):
     blind = circle._replace(truth=None)
-    figure = draw_map(blind, score(blind))
+    figure = draw_map(blind, score_run(blind))
     odometry, final = (
         next(line for line in figure.axes[0].lines if line.get_label() == name).get_xydata()[0]
         for name in ("raw odometry", "trajectory in the map")
     )
     assert odometry == pytest.approx(final)
     assert "truth" not in labels(figure)
-    assert "no ground truth" in headline(score(blind))
+    assert "no ground truth" in map_headline(score_run(blind))
 
 
 def test_a_run_without_places_or_motion_is_drawn(circle):
@@ -63,14 +63,14 @@ def test_a_run_without_places_or_motion_is_drawn(circle):
         nodes=np.zeros((0, 3)),
         links=np.zeros((0, 2), int),
     )
-    assert "experience" not in labels(draw_map(still, score(still)))
+    assert "experience" not in labels(draw_map(still, score_run(still)))
 
 
 def test_truth_with_holes_is_drawn(circle):
     truth = circle.truth.copy()
     truth[:5] = np.nan
     holed = circle._replace(truth=truth)
-    assert "truth" in labels(draw_map(holed, score(holed)))
+    assert "truth" in labels(draw_map(holed, score_run(holed)))
 
 
 WALLS = np.array([[-1.0, -1.0, 5.0, -0.9, 0.05], [-1.0, 4.0, 5.0, 4.1, 0.02]])
@@ -83,7 +83,7 @@ def drawn(figure, label):
 
 
 def test_walls_are_drawn_in_the_frame_of_the_truth(circle):
-    figure = draw_map(circle, score(circle), WALLS)
+    figure = draw_map(circle, score_run(circle), WALLS)
     axes = figure.axes[0]
     assert labels(figure)[:3] == ["truth", "path in the map", "raw odometry"]
     (boxes,) = (found for found in axes.collections if len(found.get_paths()) == len(WALLS))
@@ -97,28 +97,28 @@ def test_walls_are_drawn_in_the_frame_of_the_truth(circle):
 
 def test_a_closure_is_wrong_where_it_joins_places_far_apart(circle):
     right, wrong = [[0, 36], [5, 77], [36, 72]], [[0, 18], [3, 50]]
-    figure = draw_map(circle, score(circle), WALLS, np.array(right + wrong))
+    figure = draw_map(circle, score_run(circle), WALLS, np.array(right + wrong))
     for joined, label in ((right, "closure"), (wrong, "closure of places over 0.1 m apart")):
         ends = drawn(figure, label)
         assert ends == pytest.approx(circle.truth[np.array(joined)][..., :2], abs=1e-9)
 
 
 def test_without_a_list_of_closures_links_to_older_experiences_stand_for_them(circle):
-    figure = draw_map(circle, score(circle), WALLS)
+    figure = draw_map(circle, score_run(circle), WALLS)
     links = circle.links[np.abs(circle.links[:, 0] - circle.links[:, 1]) > 1]
     assert len(drawn(figure, "closure of places over 0.1 m apart")) == len(links) == 1  # 0.115 m apart
 
 
 def test_walls_need_a_truth_to_lie_in(circle):
     blind = circle._replace(truth=None)
-    assert labels(draw_map(blind, score(blind), WALLS)) == labels(draw_map(blind, score(blind)))
+    assert labels(draw_map(blind, score_run(blind), WALLS)) == labels(draw_map(blind, score_run(blind)))
 
 
 def test_a_line_is_interrupted_only_where_the_robot_was_carried(circle):
     path = circle.truth[:, :2].copy()
-    assert broken(path, path) is path or np.array_equal(broken(path, path), path)
+    assert split_at_jumps(path, path) is path or np.array_equal(split_at_jumps(path, path), path)
     path[50:] += 2.0
-    found = broken(path, path)
+    found = split_at_jumps(path, path)
     assert np.flatnonzero(np.isnan(found).all(axis=1)).tolist() == [50]
     assert np.array_equal(np.delete(found, 50, axis=0), path)
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from tactile.base.types import Moment, Motion, Odometry, Report
-from tactile.wall_estimation.report_frontend import ReportsConfig
+from tactile.base.types import MotionKind, Odometry, Report, StepEnd
+from tactile.wall_estimation.report_frontend import ReportFrontendConfig
 
 RATE, SPEED, CONTACT = 2000.0, 0.02, 2e-4
-FEELERS = ReportsConfig().feelers
+FEELERS = ReportFrontendConfig().feelers
 POINTING = np.arctan2(*FEELERS.direction.T[::-1])
 LENGTH = 0.14
 TAPER = (1 - 0.3 / 1.45) / LENGTH
@@ -67,9 +67,9 @@ def post(whisker: int, along: float, duration: float = 2.0) -> np.ndarray:
 
 
 def report(
-    moment: Moment = Moment.FREE,
+    moment: StepEnd = StepEnd.FREE,
     *,
-    motion: Motion = Motion.FORWARD,
+    motion: MotionKind = MotionKind.FORWARD,
     contact: tuple[int, ...] = (),
     strain: np.ndarray | None = None,
     odometry: Odometry | None = None,
@@ -100,8 +100,8 @@ def met(strain: np.ndarray, share: float = 0.4) -> tuple[Report, Report]:
     hit = len(second) > 0 and second[0] < last
     end = max(int(second[0]), 200) if hit else last
     now = tuple(np.flatnonzero(ever[end]).tolist())
-    slow = report(Moment.HIT2 if hit else Moment.ABORT, contact=now, strain=strain[:end])
-    return report(Moment.HIT1, contact=(first,)), slow
+    slow = report(StepEnd.HIT2 if hit else StepEnd.ABORT, contact=now, strain=strain[:end])
+    return report(StepEnd.HIT1, contact=(first,)), slow
 
 
 def apart(one: float, other: float) -> float:

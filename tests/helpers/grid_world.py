@@ -15,8 +15,8 @@ from ratslam.core.packing import layout_of, room
 from ratslam.core.session import CHUNK, run_chunk
 from ratslam.core.types import Estimate
 from ratslam.grid.config import GridConfig
-from tactile.base.types import Motion, Observation, Odometry, observation
-from tactile.whiskers.planar_whiskers import Feelers
+from tactile.base.types import MotionKind, Observation, Odometry, observation
+from tactile.whiskers.planar_whiskers import PlanarWhiskers
 
 MOUNTS = ((0.10, 0.08, 50), (0.13, 0.03, 15), (0.13, -0.03, -15), (0.10, -0.08, -50))
 """x m, y m, direction deg, of a Create's whiskers from left to right."""
@@ -29,12 +29,12 @@ BLANK = {"edge": 0.0, "blob": 0.0, "free": 0.0, "body": 0.0}
 """Of stamps: the map stays as it is."""
 
 
-def create(whiskers: int = len(MOUNTS)) -> Feelers:
+def create(whiskers: int = len(MOUNTS)) -> PlanarWhiskers:
     """The first few feelers of a Create."""
     mounts = np.array(MOUNTS)[:whiskers]
     angle = np.radians(mounts[:, 2])
     direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return Feelers(mounts[:, :2], direction, np.full(len(mounts), LENGTH))
+    return PlanarWhiskers(mounts[:, :2], direction, np.full(len(mounts), LENGTH))
 
 
 TIPS = create().points(np.array([RADIUS / LENGTH]))[:, 0]
@@ -49,7 +49,7 @@ def report(
     wall: tuple[float, float] | None = None,
     sd: float = 0.05,
     dead: Sequence[int] = (),
-    motion: Motion | None = None,
+    motion: MotionKind | None = None,
     whiskers: int = len(MOUNTS),
 ) -> Observation:
     """One report of a Create.
@@ -59,7 +59,13 @@ def report(
             point. sd: of its direction, rad. dead: whiskers that do not report. motion: what it looks like.
     """
     if motion is None:
-        motion = Motion.BACK if forward < 0 else Motion.TURN if turn and not forward else Motion.FORWARD
+        motion = (
+            MotionKind.BACK
+            if forward < 0
+            else MotionKind.TURN
+            if turn and not forward
+            else MotionKind.FORWARD
+        )
     plain = observation(Odometry(forward, 0.0, turn, 0.5), motion=motion, whiskers=whiskers)
     marked = np.arange(whiskers)
     contact = np.isin(marked, touching)

@@ -30,18 +30,18 @@ def a_whisk(alive: np.ndarray) -> Whisk:
 @pytest.mark.parametrize("settings", [{}, {"image": {"radial": True, "transform": "max_angle"}}])
 def test_a_dropped_whisk_is_motion_without_a_view(settings: dict[str, object]) -> None:
     frontend = Frontend(TouchConfig.model_validate(settings), CALIBRATION)
-    seen = frontend.observed(DROPPED)
+    seen = frontend.observe(DROPPED)
     assert not seen.view_seen
     assert tuple(seen.odometry) == tuple(MOTION)
     for part in (seen.view, seen.contact, seen.point, seen.wall):
         assert not np.any(part)
     assert not seen.alive.any()  # whiskers that were not read do not say that nothing is there
-    assert like(seen, frontend.observed(a_whisk(np.ones(W, bool))))
+    assert like(seen, frontend.observe(a_whisk(np.ones(W, bool))))
 
 
 def test_a_view_is_seen_where_any_whisker_reports() -> None:
     frontend = Frontend(TouchConfig(), CALIBRATION)
     for count in range(W + 1):
-        seen = frontend.observed(a_whisk(np.arange(W) < count))
+        seen = frontend.observe(a_whisk(np.arange(W) < count))
         assert bool(seen.view_seen) == (count > 0)
         assert seen.view_seen.dtype == bool

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evaluation.metrics.grid_error import HEADLINE
+from evaluation.metrics.grid_error import MAIN_CONVENTION
 from evaluation.metrics.occupancy_grid import mean_grid
-from evaluation.plots.grid_plot import Panel, Paths, draw_grids
+from evaluation.plots.grid_plot import GridPanel, GridPaths, draw_grids
 from ratslam.experiments.fox2012.metrics import word_of
 from ratslam.experiments.fox2012.protocols import FILTERED, Protocol
 from ratslam.experiments.fox2012.trials import Result
@@ -29,19 +29,19 @@ def draw_reproduction(name: str, protocol: Protocol, found: Sequence[Result]) ->
     return draw_grids(f"{name}: {protocol.title}", line, panels, across=across)
 
 
-def _means(protocol: Protocol, found: Sequence[Result]) -> tuple[int, list[Panel]]:
+def _means(protocol: Protocol, found: Sequence[Result]) -> tuple[int, list[GridPanel]]:
     """A mean map for each mapper, method below method."""
     panels = []
     for method in protocol.methods:
         for mapper in protocol.mappers:
             these = [one for one in found if (one.method, one.mapper) == (method, mapper)]
-            error = np.mean([one.values[word_of(HEADLINE)] for one in these])
+            error = np.mean([one.values[word_of(MAIN_CONVENTION)] for one in these])
             mean = mean_grid([one.grid for one in these])
             panels.append(_panel(mapper, f"{method}, {error:.3f}", these[0])._replace(grid=mean))
     return len(protocol.mappers), panels
 
 
-def _singles(protocol: Protocol, found: Sequence[Result]) -> tuple[int, list[Panel]]:
+def _singles(protocol: Protocol, found: Sequence[Result]) -> tuple[int, list[GridPanel]]:
     """A map for each mapper, set below set, with the paths."""
     panels = []
     for method in protocol.methods:
@@ -56,7 +56,7 @@ def _singles(protocol: Protocol, found: Sequence[Result]) -> tuple[int, list[Pan
     return len(protocol.mappers), panels
 
 
-def _worlds(protocol: Protocol, found: Sequence[Result]) -> tuple[int, list[Panel]]:
+def _worlds(protocol: Protocol, found: Sequence[Result]) -> tuple[int, list[GridPanel]]:
     """A map of the first set for each world and length, method below method."""
     panels = [
         _with_paths(f"{one.world}, {one.reports}", method, one)
@@ -67,13 +67,13 @@ def _worlds(protocol: Protocol, found: Sequence[Result]) -> tuple[int, list[Pane
     return len(panels) // len(protocol.methods), panels
 
 
-def _with_paths(name: str, method: str, one: Result) -> Panel:
+def _with_paths(name: str, method: str, one: Result) -> GridPanel:
     line = f"{method}, {one.values['told']:.3f} ({one.values['reckoned']:.3f})"
-    return _panel(name, line, one)._replace(paths=Paths(one.truth, one.told, one.odometry))
+    return _panel(name, line, one)._replace(paths=GridPaths(one.truth, one.told, one.odometry))
 
 
-def _panel(name: str, line: str, one: Result) -> Panel:
-    return Panel(name, line, one.grid, segments(one.arena))
+def _panel(name: str, line: str, one: Result) -> GridPanel:
+    return GridPanel(name, line, one.grid, segments(one.arena))
 
 
 _EXPLAINED = {
@@ -81,7 +81,7 @@ _EXPLAINED = {
     "fox-fig5": "below each: how it was filtered, position error (dead reckoning's), m",
     "fox-fig6": "odometry noise, reports; position error (dead reckoning's), m",
 }
-_DRAWN: dict[str, Callable[[Protocol, Sequence[Result]], tuple[int, list[Panel]]]] = {
+_DRAWN: dict[str, Callable[[Protocol, Sequence[Result]], tuple[int, list[GridPanel]]]] = {
     "fox-fig4": _means,
     "fox-fig5": _singles,
     "fox-fig6": _worlds,

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from evaluation.metrics.occupancy_grid import Grid, Truth, centres
+from evaluation.metrics.occupancy_grid import GridTruth, OccupancyGrid, cell_centres
 from ratslam.backends.grid import GridBackend
 from ratslam.config.run_config import RunConfig
 from ratslam.core.session import Session, capacity_at
@@ -28,9 +28,9 @@ from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose, integrate
 from tactile.base.types import Observation, stack
-from tactile.wall_estimation.report_frontend import Mount, Reporting, ReportsConfig
+from tactile.wall_estimation.report_frontend import ReportFrontend, ReportFrontendConfig, WhiskerMount
 from tactile.wall_estimation.strain_templates import StrainTemplates
-from tactile.whiskers.planar_whiskers import Feelers
+from tactile.whiskers.planar_whiskers import PlanarWhiskers
 
 ROOM = 0.2
 """Free space around a start, m: the robot's, and a little."""
@@ -64,7 +64,7 @@ class Mapped(NamedTuple):
 
     told: np.ndarray
     path: np.ndarray
-    grid: Grid
+    grid: OccupancyGrid
 
 
 def outing(config: RovingConfig) -> Outing:
@@ -110,7 +110,7 @@ def felt(config: RunConfig, outing: Outing, seed: int) -> list[Observation]:
     if reports.templates is None and reports.walls in ("template", "fused"):
         made = outing.source.config
         templates = _templates(RovingConfig(whiskers=made.whiskers, behaviour=made.behaviour, seed=seed))
-    source = Sensing(outing.source, lambda: Reporting(reports, templates), "touch.reports.mounts")
+    source = Sensing(outing.source, lambda: ReportFrontend(reports, templates), "touch.reports.mounts")
     return [observation_of(sample) for sample in source]
 
 
@@ -136,7 +136,9 @@ def mapped(
     return found
 
 
-def chart(config: GridConfig, feelers: Feelers, arena: Arena, path: np.ndarray, marks: Marks) -> Grid:
+def chart(
+    config: GridConfig, feelers: PlanarWhiskers, arena: Arena, path: np.ndarray, marks: Marks
+) -> OccupancyGrid:
     """The map drawn along a path [T, 3] in the frame of the arena, which it covers `OVERSPILL` times over.
 
     Args:
@@ -146,13 +148,13 @@ def chart(config: GridConfig, feelers: Feelers, arena: Arena, path: np.ndarray, 
     middle = _middle(arena)
     first = Marks(*(rows[: len(path)] for rows in marks))
     probability = draw(config, feelers, side, path - np.array([*middle, 0.0]), first)
-    return Grid(probability, middle - side * config.cell / 2, config.cell)
+    return OccupancyGrid(probability, middle - side * config.cell / 2, config.cell)
 
 
-def truth_of(arena: Arena, grid: Grid) -> Truth:
+def truth_of(arena: Arena, grid: OccupancyGrid) -> GridTruth:
     """What is really there, on the cells of a chart."""
-    place = centres(grid)
-    return Truth(occupied(arena, place), enclosed(arena, place), segments(arena))
+    place = cell_centres(grid)
+    return GridTruth(occupied(arena, place), enclosed(arena, place), segments(arena))
 
 
 def span(arena: Arena) -> float:
@@ -172,7 +174,7 @@ def _middle(arena: Arena) -> np.ndarray:
 
 
 def session_at_start(
-    grid: GridConfig, mounts: tuple[Mount, ...], length: float, precision: str, seed: int
+    grid: GridConfig, mounts: tuple[WhiskerMount, ...], length: float, precision: str, seed: int
 ) -> Session:
     """A session at its start, compiled already if one like it was asked for lately."""
     session = _compiled(grid, mounts, length, precision)
@@ -182,9 +184,9 @@ def session_at_start(
 
 
 @lru_cache(maxsize=4)
-def _compiled(grid: GridConfig, mounts: tuple[Mount, ...], length: float, precision: str) -> Session:
+def _compiled(grid: GridConfig, mounts: tuple[WhiskerMount, ...], length: float, precision: str) -> Session:
     assert grid.side is not None
-    feelers = ReportsConfig(mounts=mounts, length=length).feelers
+    feelers = ReportFrontendConfig(mounts=mounts, length=length).feelers
     if precision == "float64":
         jax.config.update("jax_enable_x64", True)
         return Session(GridBackend(grid, feelers, grid.side, np.float64))

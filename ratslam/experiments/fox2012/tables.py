@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from evaluation.metrics.grid_error import HEADLINE
+from evaluation.metrics.grid_error import MAIN_CONVENTION
 from evaluation.metrics.grid_score import pool_grids
-from evaluation.metrics.grid_score import table as full
+from evaluation.metrics.grid_score import render_grid_scores as full
 from ratslam.experiments.fox2012.mapper_ranking import orders
 from ratslam.experiments.fox2012.metrics import CLOSED, word_of
 from ratslam.experiments.fox2012.protocols import FILTERED, PAPERS, PATHS, RECKONED, TRUE, Protocol
@@ -78,8 +78,9 @@ def _line(name: str, found: Sequence[Result]) -> str:
     ratio = f"{told.mean() / reckoned.mean():.2f}" if filtered and reckoned.mean() > 0 else "-"
     better = f"{(told < reckoned).sum()} of {len(found)}" if filtered else "-"
     ways = f"{mean('map_chamfer_map')}, {mean('map_chamfer_walls')}"
+    error = word_of(MAIN_CONVENTION)
     return (
         f"{name:<30}{mean('told'):>7}{mean('final'):>7}{mean('heading', 1):>9}{ratio:>11}{better:>11}"
-        f"{mean('gap'):>7}{mean('closed', 2):>8}{mean(word_of(HEADLINE)):>8}{mean('map_brier_skill', 2):>11}"
+        f"{mean('gap'):>7}{mean('closed', 2):>8}{mean(error):>8}{mean('map_brier_skill', 2):>11}"
         f"{mean('map_auc', 2):>7}{ways:>15}"
     )

@@ -12,11 +12,16 @@ from robot.simulation.create.session import RovingConfig, drive_into_wall
 from robot.simulation.create.template_training import trained
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
-from tactile.base.types import Moment
-from tactile.wall_estimation.estimators import Meeting, fused, touching
-from tactile.wall_estimation.report_frontend import ReportsConfig
-from tactile.wall_estimation.sliding_tip import learned
-from tactile.wall_estimation.strain_templates import StrainTemplates, matched, save, smoothed
+from tactile.base.types import StepEnd
+from tactile.wall_estimation.estimators import WallContact, contact_points, fused_wall
+from tactile.wall_estimation.report_frontend import ReportFrontendConfig
+from tactile.wall_estimation.sliding_tip import fit_tip_model
+from tactile.wall_estimation.strain_templates import (
+    StrainTemplates,
+    filter_strain,
+    match_template,
+    write_templates,
+)
 
 SECONDS = (0.5, 1.0, 2.0)
 """Of the drive on after first contact that is shown to the estimators: in arenas it lasts 1 to 2 s mostly."""
@@ -49,7 +54,7 @@ def schooled(config: RovingConfig, path: Path) -> StrainTemplates:
         raise InputError(str(path), "exists", "a new file", "choose another name with -o")
     templates = trained(config)
     path.parent.mkdir(parents=True, exist_ok=True)
-    save(templates, path)
+    write_templates(templates, path)
     return templates
 
 
@@ -58,19 +63,24 @@ def held_out(config: RovingConfig, templates: StrainTemplates) -> list[Tried]:
     random = stream(config.seed, "templates.held out")
     angles = np.sort(np.concatenate([templates.angle, (templates.angle[1:] + templates.angle[:-1]) / 2]))
     mounts = tuple((mount.x, mount.y, mount.direction_deg) for mount in config.whiskers.mounts)
-    settings = ReportsConfig(mounts=mounts, length=config.whiskers.length)
-    points, tip = touching(settings.feelers, settings.contact_radius), learned(templates, settings.feelers)
+    settings = ReportFrontendConfig(mounts=mounts, length=config.whiskers.length)
+    points, tip = (
+        contact_points(settings.feelers, settings.contact_radius),
+        fit_tip_model(templates, settings.feelers),
+    )
     found = []
     for angle in angles.tolist():
         report = drive_into_wall(config, angle, random)
-        strain = smoothed(templates.training, report.strain)
+        strain = filter_strain(templates.training, report.strain)
         first = np.arange(strain.shape[1]) == np.abs(strain[0, :, 0]).argmax()
         errors = []
         for seconds in SECONDS:
             part = strain[: max(round(seconds * config.whiskers.rate), 1)]
-            match = matched(templates, part, report.alive)
+            match = match_template(templates, part, report.alive)
             travel = np.array([config.behaviour.slow * seconds, 0.0, 0.0])
-            wall = fused(tip, points, Meeting(first, first, travel, Moment.ABORT, part, report.alive))
+            wall = fused_wall(
+                tip, points, WallContact(first, first, travel, StepEnd.ABORT, part, report.alive)
+            )
             ways = match.angle, match.refined, wall.direction if wall.known else np.nan
             errors.append([_apart(way, angle) for way in ways])
         known = bool(np.isclose(templates.angle, angle).any())

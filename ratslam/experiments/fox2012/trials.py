@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.metrics.grid_score import GridScore, score_grid
-from evaluation.metrics.occupancy_grid import Grid
+from evaluation.metrics.occupancy_grid import OccupancyGrid
 from ratslam.config.run_config import RunConfig
 from ratslam.experiments.fox2012.metrics import measured, off, scored
 from ratslam.experiments.fox2012.protocols import FILTERED, RECKONED, TRUE
@@ -61,7 +61,7 @@ class Result(NamedTuple):
     reports: int
     values: dict[str, float | None]
     score: GridScore
-    grid: Grid
+    grid: OccupancyGrid
     arena: Arena
     truth: np.ndarray
     odometry: np.ndarray

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from evaluation.plots.pareto_plot import Mark, draw_frontier
+from evaluation.plots.pareto_plot import ParetoPoint, draw_pareto
 from ratslam.experiments.pareto.error_metrics import ErrorOf
 from ratslam.experiments.pareto.summary import WHOLE, Line, Span
 from ratslam.experiments.studies.report import label
@@ -69,7 +69,7 @@ def markdown(found: Frontier) -> str:
 def picture(found: Frontier) -> Figure | None:
     """Time against error; None if no row has both."""
     marks = [
-        Mark(label(line.row, line.varied), _ends(time), _ends(line.error), line.optimal)
+        ParetoPoint(label(line.row, line.varied), _ends(time), _ends(line.error), line.optimal)
         for line in found.lines
         if (time := line.spans.get("step_time")) is not None and line.error is not None
     ]
@@ -77,7 +77,7 @@ def picture(found: Frontier) -> Figure | None:
         return None
     below = "  ·  ".join(found.measured[name] for name in ("machine", "seeds", "build"))
     title = f"Speed against error: {found.study}"
-    return draw_frontier(title, below, marks, "time per cycle (us), median", found.error.label)
+    return draw_pareto(title, below, marks, "time per cycle (us), median", found.error.label)
 
 
 def save(found: Frontier, directory: Path) -> list[Path]:

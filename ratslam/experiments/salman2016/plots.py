@@ -10,9 +10,9 @@ import numpy as np
 from evaluation.metrics.experience_log import creation_rows
 from evaluation.metrics.trajectory import align
 from evaluation.plots.paper_figures import (
-    Experiences,
-    Measured,
-    Path,
+    DrivenPath,
+    ExperienceHistory,
+    MeasuredQuantity,
     draw_curves,
     draw_directions,
     draw_drift,
@@ -53,7 +53,7 @@ def _dots(title: str, line: str, protocol: Protocol, rows: Sequence[Row]) -> Fig
     labels = {"none": "", "shuffled": ", shuffled", "blank": ", no images"}
     shown = [(m, c) for m, c in series(protocol, rows) if c == "none" or m == "ours"]
     measured = [
-        Measured(
+        MeasuredQuantity(
             LABELS[quantity],
             {
                 method + labels[control]: np.array(
@@ -83,11 +83,11 @@ def _curves(title: str, line: str, protocol: Protocol, rows: Sequence[Row]) -> F
 
 
 def _drift(title: str, line: str, sessions: Sessions) -> Figure:
-    paths: dict[str, Path] = {}
+    paths: dict[str, DrivenPath] = {}
     for (name, _), (laps, result) in sessions.items():
         odometry = compose(result.truth[0], result.odometry)
         lap = lap_of_step(result.truth, len(laps))
-        paths.setdefault(name, Path(result.truth[:, :2], odometry[:, :2], lap))
+        paths.setdefault(name, DrivenPath(result.truth[:, :2], odometry[:, :2], lap))
     return draw_drift(title, line, paths)
 
 
@@ -97,10 +97,10 @@ def _history(title: str, line: str, sessions: Sessions) -> Figure:
     )
 
 
-def _experiences(result: SessionResult) -> Experiences:
+def _experiences(result: SessionResult) -> ExperienceHistory:
     metric, none = experience_metric_if_defined(result), np.zeros(len(result.place), bool)
     if metric is None:
-        return Experiences(result.place, none, none, none, 0)
+        return ExperienceHistory(result.place, none, none, none, 0)
     known = result.place >= 0
     counted, right, invalid = none.copy(), none.copy(), none.copy()
     counted[known], right[known] = metric.counted, metric.right
@@ -108,7 +108,9 @@ def _experiences(result: SessionResult) -> Experiences:
     last = np.maximum.accumulate(np.where(counted, np.arange(len(counted)), -1))
     wrong = (last >= 0) & ~right[last]
     invalid[known] = wrong[creation_rows(result.place[known])]
-    return Experiences(result.place, counted, right, invalid, int(np.flatnonzero(known)[metric.base - 1]) + 1)
+    return ExperienceHistory(
+        result.place, counted, right, invalid, int(np.flatnonzero(known)[metric.base - 1]) + 1
+    )
 
 
 def _directions(title: str, line: str, sessions: Sessions) -> Figure:

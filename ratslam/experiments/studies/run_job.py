@@ -20,10 +20,10 @@ import numpy as np
 
 from evaluation.artifacts.grid_npz import read_grid
 from evaluation.metrics.energy_metric import read_relations
-from evaluation.metrics.grid_error import HEADLINE
+from evaluation.metrics.grid_error import MAIN_CONVENTION
 from evaluation.metrics.grid_score import score_grid
-from evaluation.metrics.run_arrays import Run
-from evaluation.metrics.scorecard import Quantity, score
+from evaluation.metrics.run_arrays import RunArrays
+from evaluation.metrics.scorecard import Quantity, score_run
 from ratslam.config.run_config import RunConfig
 from ratslam.core.session import CHUNK, Session
 from ratslam.experiments.studies.memory import weighed
@@ -106,8 +106,8 @@ def _played(config: RunConfig, pace: str) -> dict[str, Any]:
         with watch.finishing():
             final = session.map.trajectory()
         run = _run(session, np.array(time), np.array(motion), np.array(truth), np.array(told), final, places)
-        card = score(
-            run._replace(anytime=np.array(present.errors)),
+        card = score_run(
+            run._replace(online_error=np.array(present.errors)),
             source.name,
             exm=config.score.experience_metric,
             relations=relations,
@@ -125,14 +125,14 @@ def _run(
     told: np.ndarray,
     final: np.ndarray,
     places: list[int],
-) -> Run:
+) -> RunArrays:
     """The session as arrays, as `evaluation.artifacts.run_directory.read_run` reads one from its files."""
     graph = session.map.graph()
     nodes = np.array([[row["x"], row["y"], row["heading"]] for _, row in sorted(graph.nodes(data=True))])
     nodes = nodes.reshape(-1, 3)
     place = np.array(places)
     place = np.where(place < len(nodes), place, -1)
-    return Run(
+    return RunArrays(
         time=time,
         truth=truth if np.isfinite(truth).all(axis=1).any() else None,
         online=told,
@@ -156,7 +156,7 @@ def _chart(session: Session, source: Source) -> dict[str, Quantity]:
         (folder / "arena.txt").write_text(arena, encoding="utf-8")
         grid = read_grid(folder / "grid.npz")
         found = score_grid(grid, truth_of(read_arena(folder / "arena.txt"), grid))
-    error = found.under(HEADLINE)
+    error = found.under(MAIN_CONVENTION)
     beside = f"0.3 everywhere {error.prior:.3g}, the best constant {error.best:.3g}"
     return {
         "map_error": Quantity(label="map error, eq. 6", value=error.error, unit="", note=beside)

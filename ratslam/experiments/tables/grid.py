@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from evaluation.metrics.grid_score import score_grid
-from evaluation.metrics.occupancy_grid import Grid
+from evaluation.metrics.occupancy_grid import OccupancyGrid
 from ratslam.config.run_config import RunConfig
 from ratslam.experiments.fox2012.session import session_at_start
 from ratslam.experiments.studies.executor import run_tasks
@@ -24,7 +24,7 @@ from robot.touch_source import reports_of, sensing
 from robot.world.arena import Arena, segments
 from robot.world.polygons import distance
 from tactile.base.se2 import compose, integrate
-from tactile.base.types import Motion, Observation
+from tactile.base.types import MotionKind, Observation
 
 FIRST_ARENA = 9000
 LARGE_ERROR_DEG = 15.0
@@ -143,7 +143,9 @@ def measure_session(task: GridTask) -> GridFigures:
     moves = np.array([observation.odometry[:3] for observation in observations])
     if "BACK skipped" in task.row:
         still = observations[0].odometry._replace(dx=0.0, dy=0.0, dtheta=0.0, dt=BACK_DURATION)
-        observations = [o._replace(odometry=still) if o.motion == Motion.BACK else o for o in observations]
+        observations = [
+            o._replace(odometry=still) if o.motion == MotionKind.BACK else o for o in observations
+        ]
     touch = reports_of(source.info, config.touch.reports)
     session = session_at_start(grid, touch.mounts, touch.length, "float32", config.session.seed)
     online = np.array([step.pose for step in session.replay(observations)])
@@ -162,7 +164,8 @@ def measure_session(task: GridTask) -> GridFigures:
             ]
         ),
         contacts=sum(
-            int(sample.reading.moment >= 2) and sample.reading.motion == Motion.FORWARD for sample in source
+            int(sample.reading.moment >= 2) and sample.reading.motion == MotionKind.FORWARD
+            for sample in source
         ),
         map=_map_scores(session.map, source.arena),
     )
@@ -183,7 +186,7 @@ def _wall_error(arena: Arena, pose: np.ndarray, observation: Observation) -> flo
 
 def _map_scores(map: Any, arena: Arena) -> tuple[float, ...]:
     corner = np.full(2, -map.side * map.config.cell / 2)
-    grid = Grid(map.occupancy(), corner, map.config.cell)
+    grid = OccupancyGrid(map.occupancy(), corner, map.config.cell)
     found = score_grid(grid, truth_of(arena, grid)).quantities
     names = ("map_auc", "map_brier_skill", "map_brier_skill_free", "map_chamfer_map", "map_chamfer_walls")
     values = [found[name].value for name in names]

@@ -19,7 +19,13 @@ from robot.drivers.head.protocol import (
 from robot.drivers.head.reader import HeadReader
 from tactile.base.errors import InputError
 from tactile.whiskers.head_geometry import Head
-from tactile.whiskers.whisking import WhiskingConfig, checked, command, phase, still
+from tactile.whiskers.whisking import (
+    WhiskingConfig,
+    check_amplitude,
+    initial_drive,
+    whisk_command,
+    whisk_phase,
+)
 
 WHERE = "live.plan.whisking"
 
@@ -56,7 +62,7 @@ def whisk_commands(
 
 
 class HostRcp:
-    """The feedback on the host: `tactile.whiskers.whisking.command` on the samples that come, a block at a
+    """The feedback on the host: `tactile.whiskers.whisking.whisk_command` on the samples, a block at a
     time.
 
     Args:
@@ -69,7 +75,7 @@ class HostRcp:
         self._whisking, self._shape = whisking, shape
         self._threshold, self._centre = threshold, centre
         self._full = np.full(len(threshold), np.radians(whisking.amplitude_deg))
-        self._drive = still(len(threshold))
+        self._drive = initial_drive(len(threshold))
         self._amplitude = self._full
         self._told: np.ndarray | None = None
         self._began: int | None = None
@@ -83,15 +89,15 @@ class HostRcp:
         for time, flags, heard in zip(frames.time.tolist(), frames.flags.tolist(), y, strict=True):
             if flags & FrameFlag.CYCLE:
                 self._began = time
-                self._drive = still(len(self._threshold))
+                self._drive = initial_drive(len(self._threshold))
                 self._amplitude, self._told = self._full, None
             if self._began is None:
                 continue
             since = (time - self._began) * 1e-6
-            aim, self._drive = command(
+            aim, self._drive = whisk_command(
                 self._whisking, self._drive, since, heard, self._threshold, self._shape
             )
-            share = float(phase(self._whisking, since))
+            share = float(whisk_phase(self._whisking, since))
             # At rest no amplitude can be told from the aim.
             if share > 1e-3:
                 self._amplitude = aim / share
@@ -129,7 +135,7 @@ class HeadDriver:
         Raises:
             InputError: the drives cannot do it, or the head does not know the mode.
         """
-        checked(whisking, self._head, WHERE)
+        check_amplitude(whisking, self._head, WHERE)
         rcp = self._reader.config.rcp
         told = whisk_commands(whisking, threshold, centre, rcp)
         self._feedback = None

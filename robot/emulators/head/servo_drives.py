@@ -20,7 +20,7 @@ from robot.drivers.head.protocol import (
 )
 from robot.simulation.head.quasistatic import Balance, rest
 from tactile.whiskers.head_geometry import Head
-from tactile.whiskers.whisking import Drive, WhiskingConfig, command, phase
+from tactile.whiskers.whisking import WhiskDrive, WhiskingConfig, whisk_command, whisk_phase
 
 RETRACTION = 0.2
 """s that whiskers take to go back to rest."""
@@ -124,7 +124,7 @@ class ServoDrives:
             return rest(*balance.before.shape)
         return balance
 
-    def law(self, drive: Drive, time: float, told: np.ndarray) -> tuple[np.ndarray, Drive]:
+    def law(self, drive: WhiskDrive, time: float, told: np.ndarray) -> tuple[np.ndarray, WhiskDrive]:
         """A `robot.simulation.head.quasistatic.Law`; time since the whisk or the retraction began."""
         if self.whisk is None:
             share = 0.0 if self._from is None else max(1 - time / RETRACTION, 0.0)
@@ -132,9 +132,9 @@ class ServoDrives:
         whisk = self.whisk
         if whisk.feedback:
             heard = told - self._centre
-            aim, drive = command(whisk.whisking, drive, time, heard, whisk.threshold, self.head.shape)
+            aim, drive = whisk_command(whisk.whisking, drive, time, heard, whisk.threshold, self.head.shape)
         else:
-            aim = np.zeros_like(told) + whisk.amplitude * phase(whisk.whisking, time)
+            aim = np.zeros_like(told) + whisk.amplitude * whisk_phase(whisk.whisking, time)
         return aim + whisk.offset if whisk.offset else aim, drive
 
     def _made(self, told: Command) -> WhiskCommand | None:

@@ -16,7 +16,7 @@ from robot.simulation.create.strain_sensors import (
     strained,
 )
 from robot.world.polygons import distance
-from tactile.base.types import Moment
+from tactile.base.types import StepEnd
 
 MOMENT = 1e-6
 """Shortest motion, s."""
@@ -32,7 +32,7 @@ class Step(NamedTuple):
     """
 
     state: State
-    moment: Moment
+    moment: StepEnd
     duration: float
     pose: np.ndarray
     side: np.ndarray
@@ -58,7 +58,7 @@ class Robot:
         """Standing at a pose, about to drive on."""
         free = np.zeros(len(self.fan.base), int)
         none = np.zeros((0, len(free), 2))
-        return Step(State.FWD1, Moment.FREE, 0.0, pose, free, free.astype(bool), none)
+        return Step(State.FWD1, StepEnd.FREE, 0.0, pose, free, free.astype(bool), none)
 
     def step(self, last: Step, state: State, told: Command) -> Step:
         """The motion that is told, until it ends by itself or early."""

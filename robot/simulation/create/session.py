@@ -32,7 +32,7 @@ from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.se2 import between
-from tactile.base.types import Moment, Odometry, Report
+from tactile.base.types import Odometry, Report, StepEnd
 
 
 class RovingConfig(Settings):
@@ -161,9 +161,9 @@ def drive_into_wall(config: RovingConfig, angle: float, random: np.random.Genera
     wall = np.concatenate([room * towards - along, room * towards + along])[None]
     robot = Robot(behaviour, whiskers, wall, random)
     step = robot.at(np.zeros(3))
-    while step.moment == Moment.FREE and step.pose[0] < 2 * AHEAD + whiskers.length:
+    while step.moment == StepEnd.FREE and step.pose[0] < 2 * AHEAD + whiskers.length:
         step = robot.step(step, State.FWD1, Command(behaviour.fast, 0.0, behaviour.step))
-    if step.moment != Moment.HIT1:
+    if step.moment != StepEnd.HIT1:
         raise InputError(
             "roving.behaviour.contact",
             f"no contact at a strain of {behaviour.contact:g} with a wall at {np.degrees(angle):.0f} degrees",

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
 from tactile.base.config import Settings
-from tactile.base.types import Moment, Motion
+from tactile.base.types import MotionKind, StepEnd
 
 Share = Annotated[float, Field(ge=0, le=1)]
 STRAIGHT = 1e-6
@@ -31,8 +31,8 @@ class State(IntEnum):
     TURN = 3
 
     @property
-    def motion(self) -> Motion:
-        return (Motion.FORWARD, Motion.FORWARD, Motion.BACK, Motion.TURN)[self]
+    def motion(self) -> MotionKind:
+        return (MotionKind.FORWARD, MotionKind.FORWARD, MotionKind.BACK, MotionKind.TURN)[self]
 
 
 class TurnConfig(Settings):
@@ -138,7 +138,7 @@ class End(NamedTuple):
     """How a motion ended: at which row of what was monitored, and at which moment of the machine."""
 
     row: int
-    moment: Moment
+    moment: StepEnd
 
 
 def ended(
@@ -153,23 +153,23 @@ def ended(
     last = len(strain) - 1
     level = np.abs(strain[..., 0])
     over = np.abs(strain).max(axis=2) > config.safety
-    ends: list[tuple[int, int, Moment]] = [(last, 9, Moment.ABORT if state == State.FWD2 else Moment.FREE)]
+    ends: list[tuple[int, int, StepEnd]] = [(last, 9, StepEnd.ABORT if state == State.FWD2 else StepEnd.FREE)]
     if state == State.BACK:
-        return End(_first(bumped, last), Moment.FREE)  # nothing to go back to
+        return End(_first(bumped, last), StepEnd.FREE)  # nothing to go back to
     if state == State.TURN:
         # What was strained too much already ends it only by getting worse.
         over &= level > 1.1 * level[0]
     stop = over.any(axis=1) | bumped
     if stop.any():
-        ends.append((_first(stop, last), 1, Moment.ABORT))
+        ends.append((_first(stop, last), 1, StepEnd.ABORT))
     touching = level > config.contact
     if state == State.FWD1 and touching.any():
-        ends.append((_first(touching.any(axis=1), last), 2, Moment.HIT1))
+        ends.append((_first(touching.any(axis=1), last), 2, StepEnd.HIT1))
     if state == State.FWD2:
         ever = np.logical_or.accumulate(touching | before, axis=0).sum(axis=1) >= 2
         ever[: min(round(config.least / config.period), last)] = False
         if ever.any():
-            ends.append((_first(ever, last), 2, Moment.HIT2))
+            ends.append((_first(ever, last), 2, StepEnd.HIT2))
     row, _, moment = min(ends)
     return End(row, moment)
 
@@ -179,14 +179,14 @@ def _first(flags: np.ndarray, otherwise: int) -> int:
 
 
 def following(
-    config: BehaviourConfig, doing: Doing, moment: Moment, turned: float, random: np.random.Generator
+    config: BehaviourConfig, doing: Doing, moment: StepEnd, turned: float, random: np.random.Generator
 ) -> Doing:
     """What is done after a step that ended so, having turned by so much (rad)."""
     if doing.state == State.BACK:
         return Doing(State.TURN, turn(config.turn, random))
-    if doing.state == State.FWD2 or moment == Moment.ABORT:
+    if doing.state == State.FWD2 or moment == StepEnd.ABORT:
         return Doing(State.BACK)
     rest = doing.rest - turned
     if doing.state == State.TURN and abs(rest) > STRAIGHT:
         return Doing(State.TURN, rest)
-    return Doing(State.FWD2 if moment == Moment.HIT1 else State.FWD1)
+    return Doing(State.FWD2 if moment == StepEnd.HIT1 else State.FWD1)

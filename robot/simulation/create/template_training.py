@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from robot.simulation.create.session import RovingConfig, drive_into_wall
 from tactile.base.random_streams import stream
-from tactile.wall_estimation.strain_templates import StrainTemplates, TemplateTraining, driven, train
+from tactile.wall_estimation.strain_templates import (
+    StrainTemplates,
+    TemplateTraining,
+    train_templates,
+    training_drive,
+)
 
 
 def trained(config: RovingConfig, training: TemplateTraining | None = None) -> StrainTemplates:
@@ -15,9 +20,9 @@ def trained(config: RovingConfig, training: TemplateTraining | None = None) -> S
     """
     training = training or TemplateTraining(rate=config.whiskers.rate, speed=config.behaviour.slow)
     random = stream(config.seed, "templates")
-    return train(
+    return train_templates(
         (
-            driven(angle, repeat, drive_into_wall(config, angle, random))
+            training_drive(angle, repeat, drive_into_wall(config, angle, random))
             for angle in training.angles.tolist()
             for repeat in range(training.repeats)
         ),

@@ -18,7 +18,7 @@ from robot.simulation.head.kinematic import MechanicsConfig
 from robot.simulation.head.whisk_stream import Sweep
 from tactile.features.contact import stiffness
 from tactile.whiskers.head_geometry import Head
-from tactile.whiskers.whisking import WhiskingConfig, command, still
+from tactile.whiskers.whisking import WhiskingConfig, initial_drive, whisk_command
 
 WALL = 300.0
 """Stiffness of a wall over that of a whisker."""
@@ -46,11 +46,11 @@ def dynamic(
 
     size = sweep.wall.shape[1:]
     state = np.zeros((size[1], 8, size[0]))  # of every whisker: six states, command and its rate
-    drive, told, aim = still(*size), np.zeros(size), np.zeros(size)
+    drive, told, aim = initial_drive(*size), np.zeros(size), np.zeros(size)
     touching, slipped = np.zeros(size, bool), np.zeros(size, bool)
     late, x, before = np.zeros(size), np.zeros(size), np.zeros(size)
     for k, time in enumerate(sweep.time):
-        last, (aim, drive) = aim, command(whisking, drive, time, told, threshold, head.shape)
+        last, (aim, drive) = aim, whisk_command(whisking, drive, time, told, threshold, head.shape)
         state[:, 6], state[:, 7] = last.T, (aim - last).T
         state[:, :6] = step @ state
         # A wall that comes upon a whisker from the side is met where the whisker is.

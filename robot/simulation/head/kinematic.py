@@ -18,7 +18,7 @@ from tactile.base.config import Settings
 from tactile.base.types import Odometry, Whisk
 from tactile.features.contact import ShaftConfig, stiffness
 from tactile.whiskers.head_geometry import Head
-from tactile.whiskers.whisking import WhiskingConfig, beside, phase
+from tactile.whiskers.whisking import WhiskingConfig, neighbour_max, whisk_phase
 
 SHAFT = ShaftConfig()
 """Of all whiskers."""
@@ -96,7 +96,10 @@ def _met(
     whiskers, count = len(surroundings.head.length), len(start)
     amplitude = np.radians(whisking.amplitude_deg)
     lag = (np.arange(config.poses) + 1) / config.poses / (2 * whisking.rate)
-    command, midway = amplitude * phase(whisking, lag), amplitude * phase(whisking, lag - lag[0] / 2)
+    command, midway = (
+        amplitude * whisk_phase(whisking, lag),
+        amplitude * whisk_phase(whisking, lag - lag[0] / 2),
+    )
     met = surroundings.contact(at(path, start[:, None] + lag).reshape(-1, 3))
     wall, along, box = (column.reshape(count, config.poses, whiskers) for column in met)
     touches = wall <= command[:, None]
@@ -148,7 +151,7 @@ def _fed_back(
     taken = gain * np.maximum(reading - limit, 0.0)
     if whisking.mode == "spread":
         led = taken == 0
-        taken = np.where(led, whisking.follow * beside(taken, head.shape), taken)
+        taken = np.where(led, whisking.follow * neighbour_max(taken, head.shape), taken)
         reading = np.where(led, np.maximum(reading - push * taken, 0.0), reading)
     return reading, taken
 

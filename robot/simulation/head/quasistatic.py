@@ -19,11 +19,11 @@ from robot.simulation.head.kinematic import MechanicsConfig
 from robot.simulation.head.whisk_stream import Sweep
 from tactile.features.contact import stiffness
 from tactile.whiskers.head_geometry import Head
-from tactile.whiskers.whisking import Drive, WhiskingConfig, command, still
+from tactile.whiskers.whisking import WhiskDrive, WhiskingConfig, initial_drive, whisk_command
 
-Law = Callable[[Drive, float, np.ndarray], tuple[np.ndarray, Drive]]
+Law = Callable[[WhiskDrive, float, np.ndarray], tuple[np.ndarray, WhiskDrive]]
 """From drives, the time in the cycle (s) and the newest y [N, W] as sensors report it, to the protractions
-commanded [N, W] and the drives after it: `tactile.whiskers.whisking.command`, say."""
+commanded [N, W] and the drives after it: `tactile.whiskers.whisking.whisk_command`, say."""
 
 
 class Balance(NamedTuple):
@@ -35,7 +35,7 @@ class Balance(NamedTuple):
         before: protraction at the last sample, rad.
     """
 
-    drive: Drive
+    drive: WhiskDrive
     told: np.ndarray
     touching: np.ndarray
     slipped: np.ndarray
@@ -47,7 +47,7 @@ class Balance(NamedTuple):
 def rest(*size: int) -> Balance:
     """Whiskers [N, W] before their first cycle, which touch nothing."""
     zero, no = np.zeros(size), np.zeros(size, bool)
-    return Balance(still(*size), zero, no, no, zero, zero, zero)
+    return Balance(initial_drive(*size), zero, no, no, zero, zero, zero)
 
 
 def advance(
@@ -101,8 +101,8 @@ def _law(
     whisking: WhiskingConfig,
     threshold: np.ndarray,
     shape: tuple[int, int],
-    drive: Drive,
+    drive: WhiskDrive,
     time: float,
     told: np.ndarray,
-) -> tuple[np.ndarray, Drive]:
-    return command(whisking, drive, time, told, threshold, shape)
+) -> tuple[np.ndarray, WhiskDrive]:
+    return whisk_command(whisking, drive, time, told, threshold, shape)

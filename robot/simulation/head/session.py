@@ -29,9 +29,9 @@ from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.types import Cycle, Whisk
-from tactile.features.calibration import Calibration, CalibrationConfig, calibrated
+from tactile.features.calibration import Calibration, CalibrationConfig, calibrate
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
-from tactile.whiskers.whisking import MID_PROTRACTION, WhiskingConfig, checked
+from tactile.whiskers.whisking import MID_PROTRACTION, WhiskingConfig, check_amplitude
 
 RAW = {"quasistatic": quasistatic, "dynamic": dynamic}
 """The tiers that make raw samples."""
@@ -116,7 +116,7 @@ class Simulation(Made):
         self.config, self.head_config, self.tier = config, head_config, tier(config)
         self.head = head = ur10_head(head_config)
         whisking, seed = config.whisking, config.seed
-        checked(whisking, head)
+        check_amplitude(whisking, head)
         self.scene = scene(config.maze, config.path, config.motion, config.kidnaps, head, seed)
         count = int(min(self.scene.duration, self.scene.path.duration) * whisking.rate)
         if count < 1:
@@ -193,7 +193,7 @@ class Simulation(Made):
         record = free_cycles(
             RAW[self.tier.name], config.stream, config.mechanics, config.whisking, self.head, count, random
         )
-        return calibrated(config.calibration, record, where="simulation")
+        return calibrate(config.calibration, record, where="simulation")
 
     def _readings(self) -> Iterator[Whisk | Cycle]:
         if self._felt is None:

@@ -17,20 +17,24 @@ from evaluation.artifacts.nav2 import (
     FREE_THRESH,
     OCCUPIED_THRESH,
     read_nav2,
-    write_description,
-    write_image,
+    write_map_yaml,
     write_nav2,
+    write_pgm,
 )
-from evaluation.metrics.occupancy_grid import PRIOR, Grid
+from evaluation.metrics.occupancy_grid import PRIOR_OCCUPANCY, OccupancyGrid
 from tactile.base.errors import InputError
 
 law = settings(max_examples=40)
 probabilities = arrays(np.float64, array_shapes(min_dims=2, max_dims=2, max_side=9), elements=st.floats(0, 1))
 places = st.floats(-1e3, 1e3)
 grids = st.builds(
-    lambda p, x, y, cell: Grid(p, np.array([x, y]), cell), probabilities, places, places, st.floats(1e-6, 2)
+    lambda p, x, y, cell: OccupancyGrid(p, np.array([x, y]), cell),
+    probabilities,
+    places,
+    places,
+    st.floats(1e-6, 2),
 )
-MAP = Grid(np.array([[0.0, 0.3, 1.0], [0.1, 0.5, 0.7]]), np.array([-1.25, 0.5]), 0.05)
+MAP = OccupancyGrid(np.array([[0.0, 0.3, 1.0], [0.1, 0.5, 0.7]]), np.array([-1.25, 0.5]), 0.05)
 """Two rows: the first one lies below."""
 
 
@@ -71,7 +75,7 @@ def test_scale_keeps_the_grades_between(grid):
 
 @given(st.floats(0.25, 0.6))
 def test_what_was_not_felt_is_unknown(prior):
-    served = back(Grid(np.full((3, 4), prior), np.zeros(2), 0.05), "trinary")
+    served = back(OccupancyGrid(np.full((3, 4), prior), np.zeros(2), 0.05), "trinary")
     assert (served.cell == -1).all()
 
 
@@ -81,7 +85,7 @@ def test_the_thresholds_themselves_are_unknown():
 
 
 def test_the_prior_is_the_customary_grey(tmp_path):
-    write_image(tmp_path / "map.pgm", Grid(np.full((3, 4), PRIOR), np.zeros(2), 0.05))
+    write_pgm(tmp_path / "map.pgm", OccupancyGrid(np.full((3, 4), PRIOR_OCCUPANCY), np.zeros(2), 0.05))
     assert (tmp_path / "map.pgm").read_bytes() == b"P5\n4 3\n255\n" + bytes([205]) * 12
 
 
@@ -96,7 +100,7 @@ def test_the_files_are_these(folder):
 
 
 def test_rows_are_not_mixed_up(tmp_path):
-    wall = np.full((4, 5), PRIOR)
+    wall = np.full((4, 5), PRIOR_OCCUPANCY)
     wall[0] = 1.0
     write_nav2(tmp_path, MAP._replace(probability=wall))
     pixels = np.frombuffer((tmp_path / "map.pgm").read_bytes()[-20:], np.uint8).reshape(4, 5)
@@ -110,7 +114,7 @@ def test_rows_are_not_mixed_up(tmp_path):
 def test_numbers_are_numbers_for_every_reader(grid):
     """PyYAML takes 1e-05 for a word."""
     with tempfile.TemporaryDirectory() as folder:
-        write_description(Path(folder) / "map.yaml", grid)
+        write_map_yaml(Path(folder) / "map.yaml", grid)
         given = yaml.safe_load((Path(folder) / "map.yaml").read_text())
     assert given["origin"] == [*grid.origin.tolist(), 0.0]
     assert given["resolution"] == grid.cell

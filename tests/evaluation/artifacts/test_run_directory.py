@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from evaluation.artifacts.run_directory import read_card, read_closures, read_walls, write_walls
-from evaluation.metrics.scorecard import score
+from evaluation.artifacts.run_directory import read_closures, read_scorecard, read_walls, write_walls
+from evaluation.metrics.scorecard import score_run
 from tactile.base.errors import InputError
 
 CLOSURES = """keyframe,match,step,match_step,verdict,weight
@@ -61,11 +61,11 @@ def test_closures_that_are_none_are_refused(tmp_path, content):
 
 
 def test_a_scorecard_comes_back(tmp_path, circle):
-    card = score(circle, "circle")
+    card = score_run(circle, "circle")
     (tmp_path / "scorecard.json").write_text(card.model_dump_json())
-    assert read_card(tmp_path) == card
+    assert read_scorecard(tmp_path) == card
     (tmp_path / "scorecard.json").write_text("{}")
     with pytest.raises(InputError, match="scorecard"):
-        read_card(tmp_path)
+        read_scorecard(tmp_path)
     with pytest.raises(InputError, match="no such file"):
-        read_card(tmp_path / "elsewhere")
+        read_scorecard(tmp_path / "elsewhere")

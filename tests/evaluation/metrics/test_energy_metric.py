@@ -15,7 +15,7 @@ from evaluation.metrics.energy_metric import (
     energy_all_pairs,
     read_relations,
     relation_errors,
-    successive,
+    successive_pairs,
 )
 from tactile.base.errors import InputError
 from tactile.base.se2 import between, compose
@@ -38,7 +38,7 @@ def every_pair(count):
 def test_energy_by_hand():
     truth = np.array([[0.0, 0, 0], [1, 0, 0]])
     estimate = np.array([[0.0, 0, 0], [1, 0.5, 0.2]])
-    found = energy(estimate, truth, successive(2))
+    found = energy(estimate, truth, successive_pairs(2))
     assert found == pytest.approx((0.25, 0.04, 1))
     assert found.total == pytest.approx(0.29)
 
@@ -50,7 +50,9 @@ def test_a_rigid_motion_of_the_truth_costs_nothing(pair, motion, step):
     moved = compose(motion, truth)
     assert energy_all_pairs(truth, moved)[:2] == pytest.approx((0, 0), abs=1e-10)
     if len(truth) > step:
-        assert energy(truth, moved, successive(len(truth), step))[:2] == pytest.approx((0, 0), abs=1e-10)
+        assert energy(truth, moved, successive_pairs(len(truth), step))[:2] == pytest.approx(
+            (0, 0), abs=1e-10
+        )
 
 
 @law
@@ -72,14 +74,14 @@ def test_rotation_errors_are_wrapped():
 
 
 def test_pairs_of_a_gap():
-    assert successive(3).tolist() == [[0, 1], [1, 2]]
-    assert successive(5, 3).tolist() == [[0, 3], [1, 4]]
-    assert successive(2, 3).shape == (0, 2)
+    assert successive_pairs(3).tolist() == [[0, 1], [1, 2]]
+    assert successive_pairs(5, 3).tolist() == [[0, 3], [1, 4]]
+    assert successive_pairs(2, 3).shape == (0, 2)
 
 
 def test_no_pairs_have_no_energy():
     pose = np.zeros((1, 3))
-    assert np.isnan(energy(pose, pose, successive(1)).total)
+    assert np.isnan(energy(pose, pose, successive_pairs(1)).total)
     assert np.isnan(energy_all_pairs(pose, pose).total)
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from evaluation.metrics.experience_log import read_log
-from evaluation.metrics.scorecard import score_log, table
+from evaluation.metrics.experience_log import read_experience_log
+from evaluation.metrics.scorecard import render_scorecard, score_log
 from tactile.base.errors import InputError
 
 ROWS = "0,7,0.1,0.2,3\n0.5,-1,0.1,0.2,-3\n"
@@ -23,7 +23,7 @@ ROWS = "0,7,0.1,0.2,3\n0.5,-1,0.1,0.2,-3\n"
 def test_headers_are_taken_as_they_come(tmp_path, head):
     path = tmp_path / "log.csv"
     path.write_text(head + ROWS)
-    log = read_log(path)
+    log = read_experience_log(path)
     assert log.time.tolist() == [0, 0.5]
     assert log.experience.tolist() == [7, -1]
     assert log.truth.tolist() == [[0.1, 0.2, 3], [0.1, 0.2, -3]]
@@ -32,7 +32,7 @@ def test_headers_are_taken_as_they_come(tmp_path, head):
 def test_columns_may_stand_in_any_order_among_others(tmp_path):
     path = tmp_path / "log.csv"
     path.write_text("heading,gain,y,x,id,t\n3,9,0.2,0.1,7,0\n")
-    log = read_log(path)
+    log = read_experience_log(path)
     assert (log.time[0], log.experience[0], log.truth[0].tolist()) == (0, 7, [0.1, 0.2, 3])
 
 
@@ -56,15 +56,15 @@ def test_malformed_logs_are_refused_with_their_line(tmp_path, text, message):
     path = tmp_path / "log.csv"
     path.write_text(text)
     with pytest.raises(InputError, match=message):
-        read_log(path)
+        read_experience_log(path)
 
 
 def test_missing_and_binary_files_are_refused(tmp_path):
     with pytest.raises(InputError, match="cannot be read"):
-        read_log(tmp_path / "none.csv")
+        read_experience_log(tmp_path / "none.csv")
     (tmp_path / "log.csv").write_bytes(b"\xff\xfe\x00\x81")
     with pytest.raises(InputError, match="cannot be read"):
-        read_log(tmp_path / "log.csv")
+        read_experience_log(tmp_path / "log.csv")
 
 
 def test_a_log_is_scored_in_all_modes(tmp_path, square):
@@ -73,7 +73,7 @@ def test_a_log_is_scored_in_all_modes(tmp_path, square):
     path = tmp_path / "log.csv"
     rows = [f"{t},{e},{x},{y},{th}" for t, (e, (x, y, th)) in enumerate(zip(ids, truth, strict=True))]
     path.write_text("\n".join(["t,id,x,y,theta", *rows]))
-    card = score_log(read_log(path), "my system")
+    card = score_log(read_experience_log(path), "my system")
     values = {name: quantity.value for name, quantity in card.quantities.items()}
     assert values["exm_base"] == 32
     assert values["exm_arr"] == 1.0
@@ -83,4 +83,4 @@ def test_a_log_is_scored_in_all_modes(tmp_path, square):
         0.96875,
         0,
     ]
-    assert "ARCR, strict" in table(card)
+    assert "ARCR, strict" in render_scorecard(card)

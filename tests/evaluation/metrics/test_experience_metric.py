@@ -7,16 +7,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evaluation.metrics.experience_log import changes, creation_poses
+from evaluation.metrics.experience_log import change_rows, creation_poses
 from evaluation.metrics.experience_metric import (
+    EXM_MODES,
     LITERAL_WARNING,
-    MODES,
     NO_RELOCALISATION,
     ExmConfig,
     base_end,
     bootstrap,
     experience_metric,
-    pool,
+    pool_experience_metrics,
     relocalisations,
 )
 from tactile.base.errors import InputError
@@ -24,7 +24,7 @@ from tactile.base.se2 import wrap
 
 
 def arcr(ids, truth, **config):
-    return {mode: experience_metric(ids, truth, ExmConfig(mode=mode, **config)).arcr for mode in MODES}
+    return {mode: experience_metric(ids, truth, ExmConfig(mode=mode, **config)).arcr for mode in EXM_MODES}
 
 
 @pytest.mark.parametrize("dwell", [1, 2, 4, 6, 9])
@@ -153,18 +153,18 @@ def test_creation_poses_are_those_of_the_first_entry():
 
 
 def test_changes_pass_over_steps_without_an_experience():
-    assert changes(np.array([-1, 4, 4, -1, 4, 2, 2, 4])).tolist() == [1, 5, 7]
-    assert changes(np.array([-1, -1])).tolist() == []
+    assert change_rows(np.array([-1, 4, 4, -1, 4, 2, 2, 4])).tolist() == [1, 5, 7]
+    assert change_rows(np.array([-1, -1])).tolist() == []
 
 
 def test_pooled_and_macro_averages(square):
     long, short = experience_metric(*square(4, 4)), experience_metric(np.arange(64), square(2, 4)[1])
-    both = pool([long, short])
+    both = pool_experience_metrics([long, short])
     assert (both.arr, both.arr_pooled) == (0.5, 96 / 128)
     assert (both.arcr, both.judged, both.runs) == (1.0, 1, 2)
     assert both.arr_interval == (0.0, 1.0)
     with pytest.raises(InputError, match="one mode"):
-        pool([long, experience_metric(*square(4, 4), ExmConfig(mode="or"))])
+        pool_experience_metrics([long, experience_metric(*square(4, 4), ExmConfig(mode="or"))])
 
 
 def test_bootstrap_is_fixed_by_seed_and_name():
@@ -199,7 +199,7 @@ law = settings(derandomize=True, deadline=None)
 def test_names_do_not_matter(walk, names):
     ids, truth, base = walk
     renamed = np.array(names)[ids] * 1000 - 7
-    for mode in MODES:
+    for mode in EXM_MODES:
         config = ExmConfig(mode=mode, base=base)
         before, after = experience_metric(ids, truth, config), experience_metric(renamed, truth, config)
         assert np.array_equal(before.counted, after.counted)
@@ -210,8 +210,8 @@ def test_names_do_not_matter(walk, names):
 @given(walks())
 def test_literal_arcr_is_zero_and_arr_is_the_same_in_all_modes(walk):
     ids, truth, base = walk
-    results = [experience_metric(ids, truth, ExmConfig(mode=mode, base=base)) for mode in MODES]
-    assert results[MODES.index("literal")].correct == 0
+    results = [experience_metric(ids, truth, ExmConfig(mode=mode, base=base)) for mode in EXM_MODES]
+    assert results[EXM_MODES.index("literal")].correct == 0
     assert len({result.relocalisations for result in results}) == 1
     assert all((result.right <= result.counted).all() for result in results)
 

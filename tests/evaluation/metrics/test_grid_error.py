@@ -12,23 +12,23 @@ from hypothesis import strategies as st
 
 from evaluation.metrics.grid_error import (
     CONVENTIONS,
-    HEADLINE,
-    PRINTED,
+    MAIN_CONVENTION,
+    PAPER_CONVENTION,
     Convention,
     grid_error,
     pool_errors,
-    smoothed,
+    smooth_truth,
 )
-from evaluation.metrics.grid_score import CLAMP, GridScore, pool_grids, score_grid, table
+from evaluation.metrics.grid_score import CLAMP, GridScore, pool_grids, render_grid_scores, score_grid
 from evaluation.metrics.occupancy_grid import (
-    PRIOR,
-    Grid,
-    Truth,
-    centres,
+    PRIOR_OCCUPANCY,
+    GridTruth,
+    OccupancyGrid,
+    cell_centres,
+    has_evidence,
     mean_grid,
-    painted,
-    surface,
-    touched,
+    touchable_surface,
+    truth_occupancy,
 )
 
 law = settings(max_examples=25)
@@ -53,13 +53,13 @@ def scene(boxes=((5, 5, 8, 8), (13, 12, 16, 15)), side=20, margin=6, cell=CELL):
     for west, south, east, north in boxes:
         occupied[margin + south : margin + north, margin + west : margin + east] = True
         walls.append(box(west, south, east, north))
-    empty = Grid(np.full((size, size), PRIOR), np.full(2, -margin * cell), cell)
-    return empty, Truth(occupied, inside, np.concatenate(walls) * cell)
+    empty = OccupancyGrid(np.full((size, size), PRIOR_OCCUPANCY), np.full(2, -margin * cell), cell)
+    return empty, GridTruth(occupied, inside, np.concatenate(walls) * cell)
 
 
-def true_grid(grid, truth, outside=PRIOR):
+def true_grid(grid, truth, outside=PRIOR_OCCUPANCY):
     """The truth as a map on the cells of another: what nothing can be better than."""
-    return grid._replace(probability=painted(truth, surface(grid, truth).wall, outside))
+    return grid._replace(probability=truth_occupancy(truth, touchable_surface(grid, truth).wall, outside))
 
 
 @st.composite
@@ -78,7 +78,9 @@ def noisy(empty, seed):
     """A map that holds anything, also where nothing was felt."""
     random = np.random.default_rng(seed)
     shape = empty.probability.shape
-    return empty._replace(probability=np.where(random.random(shape) < 0.3, PRIOR, random.random(shape)))
+    return empty._replace(
+        probability=np.where(random.random(shape) < 0.3, PRIOR_OCCUPANCY, random.random(shape))
+    )
 
 
 def values(score):
@@ -86,7 +88,7 @@ def values(score):
 
 
 def error(grid, truth, convention):
-    return grid_error(grid, truth, surface(grid, truth), convention)
+    return grid_error(grid, truth, touchable_surface(grid, truth), convention)
 
 
 seeds = st.integers(0, 2**32)
@@ -96,7 +98,7 @@ conventions = st.sampled_from(CONVENTIONS)
 
 def test_every_convention_is_there_once():
     assert len(set(CONVENTIONS)) == len(CONVENTIONS) == 12
-    assert {HEADLINE, PRINTED, ARENA} < set(CONVENTIONS)
+    assert {MAIN_CONVENTION, PAPER_CONVENTION, ARENA} < set(CONVENTIONS)
 
 
 @law
@@ -126,7 +128,7 @@ def test_a_perfect_map_is_perfect(scene):
             assert found.skill == 1
         else:  # and is not, if the truth is smoothed: a blurred one is
             assert found.error > 0
-            blurred = grid._replace(probability=smoothed(grid.probability))
+            blurred = grid._replace(probability=smooth_truth(grid.probability))
             assert error(blurred, truth, convention).error == pytest.approx(0, abs=1e-12)
     found = values(score_grid(true_grid(empty, truth), truth))
     assert found["map_brier"] == 0
@@ -169,7 +171,7 @@ def test_a_mirror_changes_nothing(scene, seed):
     grid = noisy(empty, seed)
     middle = 2 * empty.origin[0] + len(empty.probability) * CELL
     mirrored = truth.segments * [-1, 1, -1, 1] + [middle, 0, middle, 0]
-    other = Truth(truth.occupied[:, ::-1], truth.inside[:, ::-1], mirrored)
+    other = GridTruth(truth.occupied[:, ::-1], truth.inside[:, ::-1], mirrored)
     ours, theirs = (
         score_grid(grid, truth),
         score_grid(grid._replace(probability=grid.probability[:, ::-1]), other),
@@ -184,12 +186,14 @@ def test_a_mirror_changes_nothing(scene, seed):
 def test_whole_cells_further_on_nothing_changes(scene, seed, across, up):
     empty, truth = scene
     grid = noisy(empty, seed)
-    grid.probability[~np.pad(np.ones((26, 26), bool), 3)] = PRIOR  # nothing leaves the map by being moved
+    grid.probability[~np.pad(np.ones((26, 26), bool), 3)] = (
+        PRIOR_OCCUPANCY  # nothing leaves the map by being moved
+    )
 
     def rolled(cells):
         return np.roll(cells, (up, across), axis=(0, 1))
 
-    moved = Truth(
+    moved = GridTruth(
         rolled(truth.occupied), rolled(truth.inside), truth.segments + CELL * np.tile([across, up], 2)
     )
     ours = score_grid(grid, truth)
@@ -209,7 +213,7 @@ def test_a_displaced_map_is_worse(scene, by):
     empty, truth = scene
     perfect = true_grid(empty, truth)
     moved = perfect._replace(probability=np.roll(perfect.probability, by, axis=(0, 1)))
-    assert error(moved, truth, HEADLINE).error > 0
+    assert error(moved, truth, MAIN_CONVENTION).error > 0
     right, wrong = values(score_grid(perfect, truth)), values(score_grid(moved, truth))
     assert wrong["map_auc"] < right["map_auc"]
     assert wrong["map_brier_skill"] < right["map_brier_skill"]
@@ -221,7 +225,7 @@ def test_a_displaced_map_is_worse(scene, by):
 @given(scenes(), seeds)
 def test_auc_counts_pairs(scene, seed):
     empty, truth = scene
-    grid, felt = noisy(empty, seed), surface(empty, truth)
+    grid, felt = noisy(empty, seed), touchable_surface(empty, truth)
     walls, free = grid.probability[felt.wall][:, None], grid.probability[felt.free]
     pairs = (walls > free) + 0.5 * (walls == free)
     auc = values(score_grid(grid, truth))["map_auc"]
@@ -236,11 +240,11 @@ def test_auc_counts_pairs(scene, seed):
 @given(scenes(), seeds)
 def test_what_cannot_be_felt_does_not_count(scene, seed):
     empty, truth = scene
-    grid, felt = noisy(empty, seed), surface(empty, truth)
+    grid, felt = noisy(empty, seed), touchable_surface(empty, truth)
     hidden = ~(felt.free | felt.wall)
     deep = truth.occupied & ~felt.wall
     guessed = grid._replace(
-        probability=np.where(hidden, np.where(truth.occupied, 1.0, PRIOR), grid.probability)
+        probability=np.where(hidden, np.where(truth.occupied, 1.0, PRIOR_OCCUPANCY), grid.probability)
     )
     drawn = grid._replace(probability=np.where(deep, 1.0, grid.probability))
     ours = values(score_grid(grid, truth))
@@ -262,7 +266,7 @@ def test_what_is_said_to_be_solid_beyond_the_wall_makes_no_difference(scene, see
 
 def test_chamfer_is_won_one_way_only():
     empty, truth = scene()
-    felt = surface(empty, truth)
+    felt = touchable_surface(empty, truth)
     one = empty.probability.copy()
     one[tuple(np.argwhere(felt.wall)[0])] = 0.9
     to_walls, to_map = (values(score_grid(empty._replace(probability=one), truth))[name] for name in CHAMFER)
@@ -279,7 +283,7 @@ def test_walls_drawn_far_outside_cost():
     lost[0, :] = 1.0
     found = score_grid(perfect._replace(probability=lost), truth)
     assert values(found)["map_chamfer_map"] > values(score_grid(perfect, truth))["map_chamfer_map"] + 0.02
-    assert found.under(HEADLINE).error > 0
+    assert found.under(MAIN_CONVENTION).error > 0
     assert found.under(ARENA).error == 0
 
 
@@ -287,8 +291,8 @@ def test_only_cells_with_evidence_are_drawn():
     empty, truth = scene()
     score = score_grid(empty, truth, occupied=0.2)
     assert [values(score)[name] for name in CHAMFER] == [None, None]
-    assert not touched(empty).any()
-    assert touched(empty._replace(probability=empty.probability + 0.01)).all()
+    assert not has_evidence(empty).any()
+    assert has_evidence(empty._replace(probability=empty.probability + 0.01)).all()
 
 
 @law
@@ -296,7 +300,7 @@ def test_only_cells_with_evidence_are_drawn():
 def test_free_space_alone_is_the_map_cut_off_at_its_prior(scene, seed):
     empty, truth = scene
     grid = noisy(empty, seed)
-    blunt = grid._replace(probability=np.minimum(grid.probability, PRIOR))
+    blunt = grid._replace(probability=np.minimum(grid.probability, PRIOR_OCCUPANCY))
     ours, theirs = values(score_grid(grid, truth)), values(score_grid(blunt, truth))
     for name in ("map_auc", "map_brier_skill"):
         assert ours[f"{name}_free"] == theirs[f"{name}_free"] == theirs[name]
@@ -304,7 +308,7 @@ def test_free_space_alone_is_the_map_cut_off_at_its_prior(scene, seed):
 
 def test_certainty_of_what_is_wrong_is_finite():
     empty, truth = scene()
-    felt = surface(empty, truth)
+    felt = touchable_surface(empty, truth)
     wrong = empty._replace(probability=np.where(felt.wall, 0.0, 1.0))
     found = values(score_grid(wrong, truth))
     assert found["map_log_loss"] == pytest.approx(-np.log(CLAMP))
@@ -318,9 +322,9 @@ def test_a_wall_is_one_cell_thick_wherever_it_lies(offset, cell):
     """A wall without thickness, `offset` cells beyond a border, is one ring of cells that are not free."""
     side, margin = 20, 6
     low, high = -offset * cell, (side + offset) * cell
-    grid = Grid(np.full((side + 2 * margin,) * 2, PRIOR), np.full(2, -margin * cell), cell)
-    inside = ((centres(grid) > low + 1e-9) & (centres(grid) < high - 1e-9)).all(axis=-1)
-    felt = surface(grid, Truth(np.zeros_like(inside), inside, box(low, low, high, high)))
+    grid = OccupancyGrid(np.full((side + 2 * margin,) * 2, PRIOR_OCCUPANCY), np.full(2, -margin * cell), cell)
+    inside = ((cell_centres(grid) > low + 1e-9) & (cell_centres(grid) < high - 1e-9)).all(axis=-1)
+    felt = touchable_surface(grid, GridTruth(np.zeros_like(inside), inside, box(low, low, high, high)))
     across = int(inside.any(axis=0).sum())
     assert felt.wall.sum() - 4 * across in (0, 4)  # the cells beyond the corners may be too far off
     assert not (felt.wall & inside).any()
@@ -329,7 +333,7 @@ def test_a_wall_is_one_cell_thick_wherever_it_lies(offset, cell):
 def test_only_surfaces_that_face_free_space_count():
     # flush with the wall by its west side, and as large as to have an inside
     empty, truth = scene([(0, 6, 5, 12)])
-    felt = surface(empty, truth)
+    felt = touchable_surface(empty, truth)
     points = felt.points / CELL
     assert not (np.isclose(points[:, 0], 0) & (points[:, 1] > 6) & (points[:, 1] < 12)).any()
     assert (np.isclose(points[:, 0], 5) & (points[:, 1] > 6) & (points[:, 1] < 12)).sum() == 30
@@ -339,21 +343,21 @@ def test_only_surfaces_that_face_free_space_count():
     assert block[:, -1].all()
     assert not block[1:-1, :-1].any()
     assert not felt.wall[6 + 7 : 6 + 11, 5].any()  # the ring behind it is out of reach
-    assert painted(truth, felt.wall)[6 + 8, 7] == 1
+    assert truth_occupancy(truth, felt.wall)[6 + 8, 7] == 1
 
 
 def test_rotated_objects_have_a_skin():
     empty, truth = scene([])
     turn, middle = 0.4, 10 * CELL
     c, s = np.cos(turn), np.sin(turn)
-    away = centres(empty) - middle
+    away = cell_centres(empty) - middle
     along = np.stack([c * away[..., 0] + s * away[..., 1], c * away[..., 1] - s * away[..., 0]], axis=-1)
     corner = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * 0.15 @ np.array([[c, s], [-s, c]]) + middle
     sides = np.hstack([corner, np.roll(corner, -1, axis=0)])
     truth = truth._replace(
         occupied=(np.abs(along) < 0.15).all(axis=-1), segments=np.vstack([truth.segments, sides])
     )
-    felt = surface(empty, truth)
+    felt = touchable_surface(empty, truth)
     depth = 0.15 - np.abs(along).max(axis=-1)
     skin = felt.wall & truth.inside
     assert (skin == (truth.occupied & (depth < CELL)))[np.abs(depth - CELL) > 1e-3].all()
@@ -367,9 +371,9 @@ def test_trials_are_averaged_not_maps():
     random = np.random.default_rng(3)
     shape = empty.probability.shape
     maps = [empty._replace(probability=1.0 * (random.random(shape) < 0.5)) for _ in range(20)]
-    pooled = pool_grids([score_grid(grid, truth) for grid in maps], "coin").under(HEADLINE)
+    pooled = pool_grids([score_grid(grid, truth) for grid in maps], "coin").under(MAIN_CONVENTION)
     assert pooled.error == pytest.approx(0.5, abs=0.01)
-    assert error(mean_grid(maps), truth, HEADLINE).error < 0.4
+    assert error(mean_grid(maps), truth, MAIN_CONVENTION).error < 0.4
 
 
 @law
@@ -397,7 +401,7 @@ def test_a_pool_says_how_many_have_no_value():
 
 def test_a_score_is_json_and_never_silent():
     empty, truth = scene()
-    nowhere = Truth(np.zeros_like(truth.inside), np.ones_like(truth.inside), np.zeros((0, 4)))
+    nowhere = GridTruth(np.zeros_like(truth.inside), np.ones_like(truth.inside), np.zeros((0, 4)))
     for score in (score_grid(empty, truth), score_grid(empty, nowhere)):
         assert GridScore.model_validate_json(score.model_dump_json()) == score
         assert all(quantity.value is not None or quantity.note for quantity in score.quantities.values())
@@ -418,7 +422,7 @@ def mapper(name, error, spread=0.001):
 @pytest.mark.parametrize("order", list(itertools.permutations(("blob", "geometric", "template"))))
 def test_the_table_says_where_the_papers_order_holds(order):
     scores = {name: mapper(name, 0.2 - 0.05 * k) for k, name in enumerate(order)}
-    text = table([scores[name] for name in ("blob", "geometric", "template")])
+    text = render_grid_scores([scores[name] for name in ("blob", "geometric", "template")])
     said = [line.strip() for line in text.splitlines() if line.strip().startswith("order")]
     holds = "as in the paper" if order == ("blob", "geometric", "template") else "not the paper's"
     assert said == [f"order: {' > '.join(order)}, {holds}"] * 10
@@ -430,13 +434,15 @@ def test_the_table_says_where_the_papers_order_holds(order):
 
 def test_an_order_within_a_standard_error_is_said_to_be():
     # four trials each, so that the mean's standard error is half the spread
-    text = table([mapper("blob", 0.2, 0.05), mapper("geometric", 0.19, 0.05), mapper("template", 0.15, 0.05)])
+    text = render_grid_scores(
+        [mapper("blob", 0.2, 0.05), mapper("geometric", 0.19, 0.05), mapper("template", 0.15, 0.05)]
+    )
     assert text.count("within a standard error: blob and geometric\n") == 10
 
 
 def test_a_table_of_one_map_claims_no_order():
     empty, truth = scene()
-    text = table([score_grid(true_grid(empty, truth), truth, "perfect")])
+    text = render_grid_scores([score_grid(true_grid(empty, truth), truth, "perfect")])
     assert "order" not in text
     assert text.count(" 0.000 ") == text.count(" 1.00\n") == 2  # raw, unknown outside or within the arena
     assert all(line == line.rstrip() for line in text.splitlines())
@@ -460,6 +466,6 @@ def test_what_is_no_map_is_refused():
     for other in (empty._replace(cell=0.1), empty._replace(origin=empty.origin + 1)):
         with pytest.raises(ValueError, match="no mean"):
             mean_grid([empty, other])
-    felt = surface(empty, truth)
+    felt = touchable_surface(empty, truth)
     with pytest.raises(ValueError, match="different"):
-        pool_errors([grid_error(empty, truth, felt, each) for each in (HEADLINE, ARENA)])
+        pool_errors([grid_error(empty, truth, felt, each) for each in (MAIN_CONVENTION, ARENA)])

@@ -9,7 +9,7 @@ import pytest
 
 from evaluation.metrics.energy_metric import Relations
 from evaluation.metrics.experience_metric import ExmConfig
-from evaluation.metrics.scorecard import Scorecard, score, table
+from evaluation.metrics.scorecard import Scorecard, render_scorecard, score_run
 from tactile.base.errors import InputError
 
 
@@ -18,7 +18,7 @@ def values(card):
 
 
 def test_a_perfect_map_has_no_errors_and_odometry_has(circle):
-    card = score(circle, "circle")
+    card = score_run(circle, "circle")
     for name, quantity in card.quantities.items():
         if name.startswith(("ate", "anytime", "rpe", "energy")):
             assert quantity.value == pytest.approx(0, abs=1e-6), name
@@ -33,7 +33,7 @@ def test_a_perfect_map_has_no_errors_and_odometry_has(circle):
 
 
 def test_json_says_null_and_why(circle):
-    card = score(circle._replace(truth=None), "no truth")
+    card = score_run(circle._replace(truth=None), "no truth")
     again = json.loads(card.model_dump_json())
     assert again["quantities"]["ate_final"]["value"] is None
     assert again["quantities"]["ate_final"]["note"] == "no ground truth"
@@ -43,17 +43,17 @@ def test_json_says_null_and_why(circle):
 
 
 def test_without_truth_a_given_base_set_still_gives_arr(circle):
-    card = score(circle._replace(truth=None), exm=ExmConfig(base=36))
+    card = score_run(circle._replace(truth=None), exm=ExmConfig(base=36))
     assert values(card)["exm_arr"] == 1.0
     assert values(card)["exm_arcr_strict"] is None
     assert card.quantities["exm_arcr_strict"].note == "no ground truth"
-    assert "no base set" in score(circle._replace(truth=None)).quantities["exm_arr"].note
+    assert "no base set" in score_run(circle._replace(truth=None)).quantities["exm_arr"].note
 
 
 def test_rows_without_truth_are_left_out(circle):
     truth = circle.truth.copy()
     truth[::7] = np.nan
-    card = score(circle._replace(truth=truth), exm=ExmConfig(base=36))
+    card = score_run(circle._replace(truth=truth), exm=ExmConfig(base=36))
     assert card.quantities["steps"].note == f"{108 - len(truth[::7])} of them with a true pose"
     assert values(card)["ate_final"] == pytest.approx(0, abs=1e-9)
     assert values(card)["energy_links"] == pytest.approx(0, abs=1e-9)
@@ -68,7 +68,7 @@ def test_a_backend_without_places_has_no_experience_metric(circle):
         nodes=np.zeros((0, 3)),
         links=np.zeros((0, 2), int),
     )
-    card = score(none)
+    card = score_run(none)
     assert values(card)["exm_arr"] is None
     assert card.quantities["exm_arr"].note == "no experiences"
     assert card.quantities["energy_change"].note == "0 pairs"
@@ -83,22 +83,22 @@ def test_a_run_without_a_loop_says_so(circle):
         },
         **{"created": np.arange(30), "nodes": circle.nodes[:30], "links": circle.links[:29]},
     )
-    card = score(half)
+    card = score_run(half)
     assert values(card)["exm_arcr_paper"] is None
     assert "never returns" in card.quantities["exm_arcr_paper"].note
-    assert "as above" in table(card)
+    assert "as above" in render_scorecard(card)
 
 
 def test_relations_are_scored_where_there_are_some(circle):
     relations = Relations(np.array([101.0]), np.array([101.5]), np.array([[0.1, 0, 2 * np.pi / 36]]))
-    card = score(circle, relations=relations)
+    card = score_run(circle, relations=relations)
     assert values(card)["relations_translation"] == pytest.approx(0, abs=1e-9)
     assert card.quantities["relations_rotation_deg"].odometry == pytest.approx(0.3)
-    assert "relations_translation" not in score(circle).quantities
+    assert "relations_translation" not in score_run(circle).quantities
 
 
 def test_the_table_has_units_and_raw_odometry(circle):
-    lines = table(score(circle, "circle")).splitlines()
+    lines = render_scorecard(score_run(circle, "circle")).splitlines()
     assert lines[0].split() == ["circle", "value", "unit", "odometry"]
     (final,) = (line for line in lines if "ATE, final" in line)
     assert final.split()[3:][0] == "m"
@@ -118,4 +118,4 @@ def test_the_table_has_units_and_raw_odometry(circle):
 )
 def test_arrays_that_do_not_fit_are_refused(circle, change, message):
     with pytest.raises(InputError, match=message):
-        score(circle._replace(**change))
+        score_run(circle._replace(**change))

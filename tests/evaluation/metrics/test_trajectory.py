@@ -10,11 +10,11 @@ from scipy.optimize import minimize
 
 from evaluation.metrics.trajectory import (
     align,
-    anytime,
-    anytime_errors,
     associate,
     ate,
     interpolate,
+    online_error,
+    online_errors,
     position_errors,
     read_tum,
     rpe,
@@ -87,15 +87,15 @@ def test_relative_rotations_are_compared_across_half_a_turn():
 def test_anytime_errors_are_those_of_each_beginning(pair, motion):
     estimate, truth = pair
     slow = [position_errors(estimate[:n], truth[:n])[-1] for n in range(1, len(truth) + 1)]
-    assert anytime_errors(compose(motion, estimate), truth) == pytest.approx(np.array(slow), abs=1e-6)
+    assert online_errors(compose(motion, estimate), truth) == pytest.approx(np.array(slow), abs=1e-6)
 
 
 def test_anytime_summary():
     truth = np.array([[x, 0.0, 0.0] for x in range(5)])
     online = truth.copy()
-    assert anytime(online, truth) == pytest.approx((0, 0, 0), abs=1e-9)
+    assert online_error(online, truth) == pytest.approx((0, 0, 0), abs=1e-9)
     online[4, 0] = 9.0  # the last of five steps jumps 5 m ahead; the alignment makes up for a fifth
-    assert anytime(online, truth) == pytest.approx((0, 4 / np.sqrt(3), 4), abs=1e-9)
+    assert online_error(online, truth) == pytest.approx((0, 4 / np.sqrt(3), 4), abs=1e-9)
 
 
 def test_interpolation_goes_the_short_way_round():

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from evaluation.metrics.experience_metric import experience_metric
-from evaluation.metrics.scorecard import score
-from evaluation.plots.experience_plot import draw_history
+from evaluation.metrics.scorecard import score_run
+from evaluation.plots.experience_plot import draw_experience_history
 
 
 def marks(figure):
@@ -24,7 +24,7 @@ def confused(circle):
 
 
 def test_every_step_is_drawn_once_and_as_it_was_judged(confused):
-    figure = draw_history(confused, score(confused))
+    figure = draw_experience_history(confused, score_run(confused))
     found = marks(figure)
     base = found.pop("end of the base set")
     expected = experience_metric(confused.experience, confused.truth)
@@ -42,7 +42,10 @@ def test_every_step_is_drawn_once_and_as_it_was_judged(confused):
 
 def test_the_legend_counts(confused):
     found = experience_metric(confused.experience, confused.truth)
-    names = [text.get_text() for text in draw_history(confused, score(confused)).legends[0].get_texts()]
+    names = [
+        text.get_text()
+        for text in draw_experience_history(confused, score_run(confused)).legends[0].get_texts()
+    ]
     assert f"correct re-localisation ({found.correct})" in names
     assert f"incorrect re-localisation ({found.relocalisations - found.correct})" in names
 
@@ -57,7 +60,7 @@ def test_the_legend_counts(confused):
 )
 def test_what_cannot_be_judged_is_said_and_drawn_alike(circle, change, said):
     run = circle._replace(**change)
-    figure = draw_history(run, score(run))
+    figure = draw_experience_history(run, score_run(run))
     assert any(said in text.get_text() for text in figure.texts)
     assert set(marks(figure)) <= {"experience"}
 
@@ -68,8 +71,8 @@ def test_the_picture_and_the_scorecard_agree(confused):
     truth = confused.truth.copy()
     truth[5:9] = np.nan
     for run in (confused, late, late._replace(truth=truth)):
-        card = score(run)
-        figure = draw_history(run, card)
+        card = score_run(run)
+        figure = draw_experience_history(run, card)
         told = " ".join(text.get_text() for text in figure.texts)
         base = card.quantities["exm_base"].value
         assert f"base set of {base} steps" in told
@@ -83,7 +86,7 @@ def test_steps_without_truth_are_left_out(circle):
     truth = circle.truth.copy()
     truth[::7] = np.nan
     holed = circle._replace(truth=truth)
-    found = marks(draw_history(holed, score(holed)))
+    found = marks(draw_experience_history(holed, score_run(holed)))
     found.pop("end of the base set")
     steps = np.sort(np.concatenate([points[:, 0] for points in found.values()]))
     assert np.array_equal(steps, np.flatnonzero(np.isfinite(truth).all(axis=1)))

@@ -10,8 +10,15 @@ import pytest
 from matplotlib.collections import LineCollection
 
 from evaluation.metrics.grid_score import score_grid
-from evaluation.metrics.occupancy_grid import PRIOR, Grid, Truth
-from evaluation.plots.grid_plot import Panel, Paths, draw_grid, draw_grids, headline, position_error
+from evaluation.metrics.occupancy_grid import PRIOR_OCCUPANCY, GridTruth, OccupancyGrid
+from evaluation.plots.grid_plot import (
+    GridPanel,
+    GridPaths,
+    draw_grid,
+    draw_grids,
+    grid_headline,
+    mean_position_error,
+)
 from evaluation.plots.style import VERMILLION, YELLOW
 
 SIDE = np.array(
@@ -19,16 +26,16 @@ SIDE = np.array(
 )
 TURN = np.linspace(0, 9, 80)
 WAY = 0.4 * np.stack([np.cos(TURN), np.sin(TURN)], axis=1)
-PATHS = Paths(WAY, WAY + [0.03, 0.04], WAY * 3)
+PATHS = GridPaths(WAY, WAY + [0.03, 0.04], WAY * 3)
 
 
 def grid(height=50, width=50, seed=0):
     random = np.random.default_rng(seed)
-    return Grid(random.random((height, width)), np.array([-width, -height]) * 0.025, 0.05)
+    return OccupancyGrid(random.random((height, width)), np.array([-width, -height]) * 0.025, 0.05)
 
 
 def panel(number=0, **changes):
-    return Panel(f"trial {number}", "eq. 6: 0.065  ·  wall AUC 0.91", grid(seed=number), SIDE)._replace(
+    return GridPanel(f"trial {number}", "eq. 6: 0.065  ·  wall AUC 0.91", grid(seed=number), SIDE)._replace(
         **changes
     )
 
@@ -142,20 +149,20 @@ def test_unknown_truth_is_left_out():
     (axes,) = maps(draw_grid(panel(paths=PATHS._replace(truth=np.full_like(WAY, np.nan)))))
     assert [line.get_label() for line in axes.lines] == ["dead reckoning", "true path", "estimated path"]
     poses = np.column_stack([WAY, TURN])
-    assert position_error(poses + [0.3, 0.4, 9], poses) == pytest.approx(0.5)
+    assert mean_position_error(poses + [0.3, 0.4, 9], poses) == pytest.approx(0.5)
 
 
 def test_the_headline_says_what_there_is():
-    given = Grid(np.full((30, 30), PRIOR), np.array([-0.75, -0.75]), 0.05)
+    given = OccupancyGrid(np.full((30, 30), PRIOR_OCCUPANCY), np.array([-0.75, -0.75]), 0.05)
     inside = np.zeros((30, 30), bool)
     inside[3:27, 3:27] = True
-    truth = Truth(np.zeros_like(inside), inside, SIDE)
-    line = headline(score_grid(given, truth))
+    truth = GridTruth(np.zeros_like(inside), inside, SIDE)
+    line = grid_headline(score_grid(given, truth))
     assert line.startswith("eq. 6: ")
     assert "wall AUC 0.50" in line
     assert "Chamfer" not in line
     drawn = given._replace(probability=np.where(inside, 0.0, 1.0))
-    assert "Chamfer" in headline(score_grid(drawn, truth))
-    figure = draw_grid(panel(line=headline(score_grid(drawn, truth))))
+    assert "Chamfer" in grid_headline(score_grid(drawn, truth))
+    figure = draw_grid(panel(line=grid_headline(score_grid(drawn, truth))))
     (place,) = (place for text, place in words(figure) if text.startswith("eq. 6: "))
     assert place.x1 <= 1200

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from evaluation.artifacts.run_directory import read_walls
-from evaluation.artifacts.whisker_views import read_images
-from evaluation.report import redraw
+from evaluation.artifacts.whisker_views import read_whisker_views
+from evaluation.report import redraw_plots
 from ratslam.cli import main
 from ratslam.config.run_config import RunConfig, load_config
 from ratslam.config.strict_yaml import load, validate
@@ -59,7 +59,7 @@ def test_a_run_on_touch_leaves_pictures(folder, name):
 def test_pictures_are_drawn_again_from_the_directory_alone(folder, tmp_path):
     elsewhere = tmp_path / "moved"
     shutil.copytree(folder / "run", elsewhere, ignore=shutil.ignore_patterns("*.png"))
-    redraw(elsewhere)
+    redraw_plots(elsewhere)
     for name in PICTURES:
         assert (elsewhere / name).read_bytes() == (folder / "run" / name).read_bytes(), name
 
@@ -76,7 +76,7 @@ def test_what_is_kept_is_what_was_felt_and_where(folder):
     assert np.array_equal(read_walls(folder / "run"), np.column_stack(boxes))
     assert len(np.unique(boxes.height)) == 2
     given = [sample.reading for sample in sensing(source, config.touch)]
-    images = read_images(folder / "run" / "views.npz")
+    images = read_whisker_views(folder / "run" / "views.npz")
     assert np.abs(images.view - np.array([g.view[..., 0] for g in given])).max() <= 1 / 255
     assert np.array_equal(images.alive.reshape(-1, 18), np.array([g.alive for g in given]))
     assert not images.alive[:, 0, 4].any()

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from evaluation.plots.paper_figures import (
-    Experiences,
-    Measured,
-    Path,
+    DrivenPath,
+    ExperienceHistory,
+    MeasuredQuantity,
     draw_curves,
     draw_directions,
     draw_drift,
@@ -22,7 +22,7 @@ from evaluation.plots.paper_figures import (
 RANDOM = np.random.default_rng(0)
 WAY = np.cumsum(RANDOM.normal(size=(40, 2)), axis=0)
 NONE = np.zeros(6, bool)
-HISTORY = Experiences(
+HISTORY = ExperienceHistory(
     place=np.array([0, 1, 0, 2, 1, -1]),
     counted=np.array([0, 0, 1, 0, 1, 0], bool),
     right=np.array([0, 0, 1, 0, 0, 0], bool),
@@ -33,7 +33,7 @@ EDGE = np.linspace(0, 1, 11)
 
 
 def drift():
-    return draw_drift("a", "b", {"white": Path(WAY, WAY + 1, np.repeat([0, 1], 20))})
+    return draw_drift("a", "b", {"white": DrivenPath(WAY, WAY + 1, np.repeat([0, 1], 20))})
 
 
 def experiences():
@@ -43,7 +43,10 @@ def experiences():
 def measured():
     values = {"classic": np.array([[0.1, 0.2], [0.3, np.nan]]), "ours": np.full((2, 2), np.nan)}
     paper = np.array([0.15, np.nan])
-    quantities = [Measured("ARR", values, paper), Measured("EM", values, np.full(2, np.nan), log=True)]
+    quantities = [
+        MeasuredQuantity("ARR", values, paper),
+        MeasuredQuantity("EM", values, np.full(2, np.nan), log=True),
+    ]
     return draw_measured("a", "b", ["open", "RCP"], quantities)
 
 

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from matplotlib.collections import PatchCollection
 
-from evaluation.artifacts.whisker_views import Images, read_images, write_images
-from evaluation.metrics.scorecard import score
-from evaluation.plots.whisker_plot import SHOWN, draw_whiskers
+from evaluation.artifacts.whisker_views import WhiskerViews, read_whisker_views, write_whisker_views
+from evaluation.metrics.scorecard import score_run
+from evaluation.plots.whisker_plot import MAX_HEADS, draw_whiskers
 from tactile.base.errors import InputError
 
 AZIMUTH = np.arange(6) * np.pi / 3
@@ -24,7 +24,7 @@ def felt(steps=108, seed=0, dead=()):
     view = random.random((steps, 3, 6)) * (random.random((steps, 3, 6)) < 0.5)
     alive = np.ones((steps, 3, 6), bool)
     alive.reshape(steps, 18)[:, list(dead)] = False
-    return Images(view * alive, alive, AZIMUTH, LENGTH, 0.05)
+    return WhiskerViews(view * alive, alive, AZIMUTH, LENGTH, 0.05)
 
 
 def heads(figure):
@@ -42,8 +42,8 @@ def strips(figure):
 def test_images_come_back_within_a_step_of_brightness(tmp_path_factory, view):
     images = felt(4)._replace(view=view)
     path = tmp_path_factory.mktemp("images") / "views.npz"
-    write_images(path, images)
-    found = read_images(path)
+    write_whisker_views(path, images)
+    found = read_whisker_views(path)
     assert np.abs(found.view - view).max() <= 1 / 255
     assert np.array_equal(found.view > 0, view > 0)
     for name in ("alive", "azimuth", "length", "tallest"):
@@ -52,12 +52,12 @@ def test_images_come_back_within_a_step_of_brightness(tmp_path_factory, view):
 
 def test_the_same_images_are_the_same_bytes(tmp_path):
     for name in ("a", "b"):
-        write_images(tmp_path / name, felt())
+        write_whisker_views(tmp_path / name, felt())
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
 def test_other_files_are_refused(tmp_path):
-    write_images(tmp_path / "whole.npz", felt())
+    write_whisker_views(tmp_path / "whole.npz", felt())
     content = (tmp_path / "whole.npz").read_bytes()
     (tmp_path / "cut.npz").write_bytes(content[: len(content) // 2])
     (tmp_path / "text.npz").write_text("no images")
@@ -65,12 +65,12 @@ def test_other_files_are_refused(tmp_path):
     np.savez(tmp_path / "odd.npz", **felt()._replace(length=np.zeros(2))._asdict())
     for name in ("cut", "text", "other", "odd", "missing"):
         with pytest.raises(InputError, match=name):
-            read_images(tmp_path / f"{name}.npz")
+            read_whisker_views(tmp_path / f"{name}.npz")
 
 
 def test_a_column_is_an_image(circle):
     images = felt(dead=(4,))
-    figure = draw_whiskers(circle, score(circle), images)
+    figure = draw_whiskers(circle, score_run(circle), images)
     (strip,) = strips(figure)
     pixels = np.asarray(strip.get_array())
     assert pixels.shape == (18, 108, 3)
@@ -85,10 +85,10 @@ def test_a_column_is_an_image(circle):
 
 def test_heads_show_the_images_of_the_steps_they_stand_for(circle):
     images = felt(seed=1)
-    figure = draw_whiskers(circle, score(circle), images)
+    figure = draw_whiskers(circle, score_run(circle), images)
     strip = np.asarray(strips(figure)[0].get_array())
     drawn = heads(figure)
-    assert len(drawn) == SHOWN
+    assert len(drawn) == MAX_HEADS
     centres = np.array([np.mean([p.vertices.mean(axis=0) for p in paths], axis=0) for paths, _ in drawn])
     steps = [int(np.argmin(np.hypot(*(circle.truth[:36, :2] - centre).T))) for centre in centres]
     assert sorted(set(steps)) == steps
@@ -99,14 +99,14 @@ def test_heads_show_the_images_of_the_steps_they_stand_for(circle):
 @settings(max_examples=15)
 @given(st.floats(-7, 7), st.floats(-np.pi, np.pi))
 def test_a_sector_points_where_its_whisker_does(heading, first):
-    from evaluation.metrics.run_arrays import Run
+    from evaluation.metrics.run_arrays import RunArrays
 
     pose = np.array([[0.3, -0.2, heading]])
-    run = Run(
+    run = RunArrays(
         np.zeros(1), pose, pose, pose, pose, np.zeros(1, int), np.zeros(1, int), pose, np.zeros((0, 2), int)
     )
     images = felt(1)._replace(azimuth=AZIMUTH + first)
-    ((paths, _),) = heads(draw_whiskers(run, score(run), images))
+    ((paths, _),) = heads(draw_whiskers(run, score_run(run), images))
     radii = []
     for whisker, path in enumerate(paths):
         arc = path.vertices[np.hypot(*(path.vertices - pose[0, :2]).T) > 0] - pose[0, :2]
@@ -120,7 +120,7 @@ def test_a_sector_points_where_its_whisker_does(heading, first):
 def test_heads_do_not_cover_each_other(circle):
     still = circle._replace(truth=circle.truth * [0.2, 0.2, 1.0])
     for run in (circle, still):
-        drawn = heads(draw_whiskers(run, score(run), felt()))
+        drawn = heads(draw_whiskers(run, score_run(run), felt()))
         boxes = [np.concatenate([p.vertices for p in paths]) for paths, _ in drawn]
         centres = np.array([(box.min(axis=0) + box.max(axis=0)) / 2 for box in boxes])
         reach = max(np.ptp(box, axis=0).max() for box in boxes) / 2
@@ -139,7 +139,7 @@ def test_sessions_of_any_length_are_drawn(circle, steps):
         },
         created=np.minimum(circle.created, steps - 1),
     )
-    figure = draw_whiskers(run, score(run), felt(steps))
+    figure = draw_whiskers(run, score_run(run), felt(steps))
     across, down = figure.get_size_inches() * figure.dpi
     assert across == 1200
     assert 500 < down < 2500
@@ -152,7 +152,7 @@ def test_sessions_of_any_length_are_drawn(circle, steps):
 def test_without_truth_heads_stand_in_the_map(circle):
     blind = circle._replace(truth=None)
     walls = np.array([[0.0, 0.0, 9.0, 0.1, 0.05]])
-    figure = draw_whiskers(blind, score(blind), felt(), walls)
+    figure = draw_whiskers(blind, score_run(blind), felt(), walls)
     for paths, _ in heads(figure):
         centre = np.mean([path.vertices.mean(axis=0) for path in paths], axis=0)
         assert np.hypot(*(circle.final[:, :2] - centre).T).min() < 0.02
@@ -162,4 +162,4 @@ def test_without_truth_heads_stand_in_the_map(circle):
 
 def test_another_number_of_images_is_refused(circle):
     with pytest.raises(InputError, match=r"views\.npz: 7 images"):
-        draw_whiskers(circle, score(circle), felt(7))
+        draw_whiskers(circle, score_run(circle), felt(7))

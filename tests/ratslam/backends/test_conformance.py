@@ -15,7 +15,7 @@ from ratslam.core.session import CHUNK, Session, capacity_at
 from ratslam.core.types import Action
 from ratslam.grid.config import GridConfig
 from tactile.base.types import Odometry, observation
-from tactile.whiskers.planar_whiskers import Feelers
+from tactile.whiskers.planar_whiskers import PlanarWhiskers
 from tests.ratslam.backends.dead_reckoning import DeadReckoning
 
 VIEW = (3, 6, 1)
@@ -42,7 +42,7 @@ def _grid(dtype=np.float64):
         "resampling": {"effective": 0.9},
     }
     config = GridConfig.model_validate({"particles": 20} | doubtful)
-    feelers = Feelers(np.zeros((WHISKERS, 2)), AROUND, np.full(WHISKERS, REACH))
+    feelers = PlanarWhiskers(np.zeros((WHISKERS, 2)), AROUND, np.full(WHISKERS, REACH))
     return lambda: GridBackend(config, feelers, 3.0, dtype)
 
 

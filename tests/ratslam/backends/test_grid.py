@@ -17,7 +17,7 @@ from ratslam.grid import likelihoods, particle_maps
 from ratslam.grid.particle_maps import COSINE, EVIDENCE, SINE
 from tactile.base.errors import InputError
 from tactile.base.se2 import wrap
-from tactile.base.types import Motion
+from tactile.base.types import MotionKind
 from tests.helpers.grid_world import (
     BLANK,
     STEADY,
@@ -203,7 +203,7 @@ def test_dead_whiskers_say_nothing(backend):
     near = np.hypot(*np.mgrid[: backend.side, : backend.side] - (backend.side - 1) / 2) * 0.05 < numb + 0.1
     maps = jnp.where(jnp.asarray(near & (numb > 0))[None], 0.0, start.maps[:, EVIDENCE])
     start = begun(backend)._replace(maps=start.maps.at[:, EVIDENCE].set(maps))
-    _, _, evidence = drive(backend, start, [report(dead=ALL, motion=Motion.FORWARD)])
+    _, _, evidence = drive(backend, start, [report(dead=ALL, motion=MotionKind.FORWARD)])
     assert evidence.weights[0] == pytest.approx(1 / 30)
 
 
@@ -218,11 +218,11 @@ def test_particles_whose_map_explains_a_contact_weigh_more(backend):
     for k, x in enumerate((0.6 - tips, 0.9 - tips, 0.3 - tips)):  # on the wall, behind it, before it
         poses = poses.at[10 * k : 10 * k + 10, 0].set(float(x))
     start = start._replace(particles=start.particles._replace(pose=poses, run=0 * start.particles.run))
-    _, _, told = drive(backend, start, [report(touching=[1, 2], dead=[0, 3], motion=Motion.OTHER)])
+    _, _, told = drive(backend, start, [report(touching=[1, 2], dead=[0, 3], motion=MotionKind.OTHER)])
     wall, unknown, empty = told.weights[0].reshape(3, 10)
     assert wall.min() > 3 * unknown.max()
     assert unknown.min() > empty.max()
-    _, _, told = drive(backend, start, [report(dead=[0, 3], motion=Motion.OTHER)])
+    _, _, told = drive(backend, start, [report(dead=[0, 3], motion=MotionKind.OTHER)])
     wall, unknown, empty = told.weights[0].reshape(3, 10)
     assert wall.max() < unknown.min() <= empty.min() * 1.1
 
@@ -264,12 +264,12 @@ def corridor(backend, reports, spread):
         sd = spread * abs(float(o.odometry.dx))
         gap = (x[:, None] - x[None] - float(o.odometry.dx)) / sd
         belief = np.exp(-0.5 * gap**2) @ belief
-        if o.motion != Motion.BACK:
+        if o.motion != MotionKind.BACK:
             free = np.repeat(~o.contact, len(backend.free) // 2)
             logs = likelihoods.free(config.likelihood, evidence(backend.free), free)
             logs += likelihoods.contact(config.likelihood, evidence(TIPS[:2]), o.contact & ~touched)
             belief = belief * np.exp(np.asarray(logs))
-        touched = o.contact & (o.motion != Motion.BACK)
+        touched = o.contact & (o.motion != MotionKind.BACK)
         belief = belief / belief.sum()
         mean = belief @ x
         told.append([mean, belief @ (x - mean) ** 2])
@@ -299,7 +299,7 @@ def test_position_in_a_corridor_is_that_of_an_exact_filter():
     assert np.any(drawn, axis=1).all()
     blind = corridor(
         backend,
-        [o._replace(contact=np.zeros(2, bool), motion=np.int32(Motion.BACK)) for o in reports],
+        [o._replace(contact=np.zeros(2, bool), motion=np.int32(MotionKind.BACK)) for o in reports],
         spread,
     )
     assert (np.abs((blind - exact) / error)[checked[1:], 0] > 20).all()
@@ -388,7 +388,7 @@ def test_a_robot_may_leave_the_map_as_far_as_it_likes(backend):
 def test_odometry_that_is_no_number_is_no_motion(backend):
     start, *_ = drive(backend, begun(backend), [report(0.1)])
     odd, *_ = drive(backend, start, [ODD["odometry"](report(0.02, touching=[1]))])
-    still, *_ = drive(backend, start, [report(0.0, touching=[1], motion=Motion.FORWARD)])
+    still, *_ = drive(backend, start, [report(0.0, touching=[1], motion=MotionKind.FORWARD)])
     assert equal(odd, still)
 
 
@@ -419,7 +419,7 @@ def test_when_all_weights_vanish_they_are_kept(backend, odd):
 @pytest.mark.parametrize("backend", [FILTER, SINGLE], ids=["float64", "float32"])
 def test_contacts_outside_the_map_are_named_and_forgotten(backend):
     rim = standing(begun(backend), [1.15, 0.0, 0.0])
-    felt = report(touching=ALL, wall=(0.3, 0.0), motion=Motion.FORWARD)
+    felt = report(touching=ALL, wall=(0.3, 0.0), motion=MotionKind.FORWARD)
     state, _, told = drive(backend, rim, [felt])
     assert told.outcome[0] == Outcome.OUTSIDE
     assert finite((state, told))
@@ -480,8 +480,8 @@ def test_contact_in_every_report():
 def test_a_wall_is_believed_soon_after_much_that_was_free():
     """The clamp keeps what was found free from lasting for ever."""
     free, met = (
-        [report(0.0, motion=Motion.FORWARD)] * 20,
-        [report(touching=ALL, motion=Motion.FORWARD), report(-1e-6)],
+        [report(0.0, motion=MotionKind.FORWARD)] * 20,
+        [report(touching=ALL, motion=MotionKind.FORWARD), report(-1e-6)],
     )
     state, *_ = drive(SINGLE, begun(SINGLE), free)
     assert evidence_at(SINGLE, state, TIPS).mean() < -2

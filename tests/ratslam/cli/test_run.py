@@ -18,7 +18,7 @@ from ratslam.cli import main
 
 ROOT = Path(__file__).parents[3]
 FILES = {
-    "anytime.csv", "closures.csv", "config.yaml", "manifest.json", "map.g2o", "map.json", "map.npz",
+    "online_error.csv", "closures.csv", "config.yaml", "manifest.json", "map.g2o", "map.json", "map.npz",
     "map.png", "odometry.tum", "online.tum", "scorecard.json", "steps.csv", "trajectory.tum", "truth.tum",
 }  # fmt: skip
 SQUARE = str(ROOT / "configs" / "square.yaml")

@@ -1,4 +1,4 @@
-"""A run watched from another process: at work, done, killed; and what the watching changes of it: nothing."""
+"""A run monitor from another process: at work, done, killed; and what the watching changes of it: nothing."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from hypothesis import strategies as st
 
 from evaluation.artifacts.run_directory import read_run
 from evaluation.monitor.plot import draw_watch
-from evaluation.monitor.progress import RUNNING, Progress, Watched
-from evaluation.monitor.watch import distance, status_line, watch
+from evaluation.monitor.progress import RUNNING, RunMonitor, RunProgress
+from evaluation.monitor.watch import path_length, status_line, watch_run
 from ratslam.cli import main
 from tactile.base.errors import InputError
 from tactile.base.se2 import tum_line
@@ -34,7 +34,7 @@ PACED = """
 import sys, time
 from pathlib import Path
 from ratslam.__main__ import main
-from ratslam.storage import RunDirectory
+from ratslam.pipeline.run_directory import RunDirectory
 
 go, append, count = Path(sys.argv[1]), RunDirectory.append, []
 
@@ -100,7 +100,7 @@ def test_a_run_at_work_is_watched_to_its_end_and_does_not_notice(alone, tmp_path
             pictures.append((folder / "watch.png").read_bytes())
             go.touch()
 
-        seen = watch(folder, tell, every=0.1)
+        seen = watch_run(folder, tell, every=0.1)
         assert process.wait() == 0
     steps = int(re.search(r"run: running, (\d+) of 349 steps", told[0])[1])
     assert 0 < steps < 349
@@ -119,14 +119,14 @@ def test_a_run_that_is_done_is_seen_as_it_is_read(alone, tmp_path, capsys):
     line, shown = capsys.readouterr().out.splitlines()
     assert "run: complete" in line
     assert str(folder / "watch.png") in shown
-    seen, run = Watched(folder).look(), read_run(folder)
+    seen, run = RunMonitor(folder).read(), read_run(folder)
     assert np.allclose(seen.path, run.online, atol=1e-12)
     assert np.allclose(seen.odometry, run.odometry, atol=1e-12)
     assert np.array_equal(seen.truth, run.truth[:, :2], equal_nan=True)
-    assert seen.off == run.anytime[-1]
-    assert sum(seen.outcomes.values()) == len(run.time) == seen.saved
-    assert f"{distance(seen.odometry):.1f} m" in line
-    assert np.isfinite(seen.spread).all()
+    assert seen.online_error == run.online_error[-1]
+    assert sum(seen.outcomes.values()) == len(run.time) == seen.checkpoint
+    assert f"{path_length(seen.odometry):.1f} m" in line
+    assert np.isfinite(seen.sd).all()
 
 
 def test_a_killed_run_is_given_up_when_it_has_been_silent_for_long(killed, tmp_path, capsys):
@@ -143,7 +143,7 @@ def test_a_killed_run_is_given_up_when_it_has_been_silent_for_long(killed, tmp_p
     assert "silent for 100 s\n" in said
     assert "it was killed" in said
     assert before == {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "watch.png"}
-    assert 0 < len(Watched(folder).look().path) <= (folder / "steps.csv").read_text().count("\n") - 1
+    assert 0 < len(RunMonitor(folder).read().path) <= (folder / "steps.csv").read_text().count("\n") - 1
 
 
 def test_ctrl_c_ends_it_and_no_engine_is_loaded(killed):
@@ -197,7 +197,7 @@ def files(steps, random, truth=True):
         "steps.csv": "\n".join(rows) + "\n",
         "odometry.tum": tum[0],
         "truth.tum": known,
-        "anytime.csv": "t,error\n" + "".join(f"{k / 4},{k}\n" for k in range(0, steps, 3)),
+        "online_error.csv": "t,error\n" + "".join(f"{k / 4},{k}\n" for k in range(0, steps, 3)),
     }
 
 
@@ -216,16 +216,16 @@ def test_however_the_lines_come_the_same_is_seen(tmp_path_factory, steps, cuts, 
     """Cut anywhere, in mid-line too, and looked at in between."""
     folder = tmp_path_factory.mktemp("growing")
     content = {name: text.encode() for name, text in files(steps, np.random.default_rng(seed), truth).items()}
-    watched = None
+    monitor = None
     for cut in [*sorted(cuts), max(map(len, content.values()))]:
         for name, data in content.items():
             (folder / name).write_bytes(data[:cut])
-        watched = watched or Watched(folder)
-        seen = watched.look()
+        monitor = monitor or RunMonitor(folder)
+        seen = monitor.read()
         assert len(seen.path) == len(seen.odometry) == len(seen.truth) == sum(seen.outcomes.values()) <= steps
     assert len(seen.path) == steps
     assert seen.status == RUNNING
-    assert same(seen, Watched(folder).look())
+    assert same(seen, RunMonitor(folder).read())
     assert np.isfinite(seen.truth).all() == (truth or not steps)
     assert seen.lost == steps // 2
 
@@ -236,49 +236,49 @@ def test_every_sight_has_a_picture_and_the_same_one_each_time(steps, truth, tmp_
     for stream, text in files(steps, np.random.default_rng(1), truth).items():
         (tmp_path / stream).write_text(text)
     for name in ("a", "b")[: 1 + (steps == 9)]:
-        draw_watch(Watched(tmp_path).look()).savefig(tmp_path / f"{name}.png")
+        draw_watch(RunMonitor(tmp_path).read()).savefig(tmp_path / f"{name}.png")
     assert steps < 9 or (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
 @pytest.mark.parametrize(("name", "line"), [
     ("steps.csv", "1.0,x,none\n"), ("odometry.tum", "0 here 0 0 0 0 0 1\n"),
     ("odometry.tum", "0 0 1\n"), ("truth.tum", "noise\n"), ("truth.tum", "0.0 1.0\n"),
-    ("anytime.csv", "1.0,far\n"),
+    ("online_error.csv", "1.0,far\n"),
 ])  # fmt: skip
 def test_lines_that_no_run_writes_are_named(name, line, tmp_path):
     for stream, text in files(3, np.random.default_rng(0)).items():
         (tmp_path / stream).write_text(text)
-    watched = Watched(tmp_path)
-    watched.look()
+    monitor = RunMonitor(tmp_path)
+    monitor.read()
     count = (tmp_path / name).read_text().count("\n")
     with (tmp_path / name).open("a") as file:
         file.write(line)
     with pytest.raises(InputError, match=rf"{name}:{count + 1}"):
-        watched.look()
+        monitor.read()
 
 
 def test_a_run_that_is_taken_away_is_missed(tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()
     (folder / "steps.csv").touch()
-    watched = Watched(folder)
-    assert watched.look().status == RUNNING
+    monitor = RunMonitor(folder)
+    assert monitor.read().status == RUNNING
     shutil.rmtree(folder)
     with pytest.raises(InputError, match="gone"):
-        watched.look()
+        monitor.read()
 
 
 def test_silence_is_of_the_run_and_not_of_who_watches(tmp_path):
     (tmp_path / "steps.csv").touch()
     os.utime(tmp_path / "steps.csv", (0, time.time() - 100))
     (tmp_path / "watch.png").touch()
-    assert 99 < Watched(tmp_path).look().silent < 200
+    assert 99 < RunMonitor(tmp_path).read().silent < 200
 
 
 def test_it_tells_steps_distance_pace_and_outcomes():
     nothing = np.zeros((4, 2))
     way = np.array([[0.0, 1.0, 0.0], [0.0, 2.0, 1.0], [3.0, 2.0, 2.0], [3.0, 2.0, 3.0]])
-    seen = Progress(
+    seen = RunProgress(
         "name", RUNNING, 9, np.zeros((4, 3)), np.zeros(3), way, nothing,
         outcomes={"ok": 1, "reseeded": 3}, lost=2, off=0.5, saved=2, pace=None, silent=11.0,
     )  # fmt: skip

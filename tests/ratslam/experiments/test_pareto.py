@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evaluation.metrics.scorecard import Quantity
-from evaluation.plots.pareto_plot import Mark, draw_frontier, placed
+from evaluation.plots.pareto_plot import ParetoPoint, draw_pareto, place_labels
 from ratslam.cli import main
 from ratslam.experiments.pareto import benchmark
 from ratslam.experiments.pareto.cpu_affinity import one_core, others
@@ -114,7 +114,7 @@ def test_neither_order_nor_scale_changes_what_is_optimal(costs, order):
 def test_labels_lie_apart_inside_and_off_what_is_drawn(rows):
     rows = np.array(rows, float)
     area, blocked = np.array([0.0, 0.0, 600.0, 400.0]), np.array([[100.0, 100.0, 140.0, 400.0]])
-    corners = placed(rows[:, :2], rows[:, 2:], area, blocked, blocked + 50)
+    corners = place_labels(rows[:, :2], rows[:, 2:], area, blocked, blocked + 50)
     boxes = np.concatenate([np.concatenate([corners, corners + rows[:, :2]], axis=1), blocked])
     assert (boxes[:, :2] >= area[:2]).all()
     assert (boxes[:, 2:] <= area[2:]).all()
@@ -124,7 +124,7 @@ def test_labels_lie_apart_inside_and_off_what_is_drawn(rows):
 
 
 def test_a_label_without_room_still_gets_a_place():
-    corners = placed(
+    corners = place_labels(
         np.full((4, 2), 50.0), np.zeros((4, 2)), np.array([0.0, 0.0, 60.0, 60.0]), *[np.zeros((0, 4))] * 2
     )
     assert np.isfinite(corners).all()
@@ -132,11 +132,13 @@ def test_a_label_without_room_still_gets_a_place():
 
 @pytest.mark.parametrize("values", [[0.0, 0.0], [0.0, 0.2], [0.1, 0.1], [1e-9, 3e4]])
 def test_any_errors_can_be_drawn_and_come_out_the_same(values):
-    marks = [Mark(f"row {k}", (90.0, 100.0, 110.0), (v, v, 2 * v), k == 0) for k, v in enumerate(values)]
+    marks = [
+        ParetoPoint(f"row {k}", (90.0, 100.0, 110.0), (v, v, 2 * v), k == 0) for k, v in enumerate(values)
+    ]
 
     def drawn():
         told = io.BytesIO()
-        figure = draw_frontier("a", "b", marks, "time", "error")
+        figure = draw_pareto("a", "b", marks, "time", "error")
         figure.savefig(told)
         assert [text.get_text() for text in figure.axes[0].texts if text.get_text()] == ["row 0", "row 1"]
         return told.getvalue()

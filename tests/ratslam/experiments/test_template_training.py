@@ -14,7 +14,7 @@ from robot.simulation.create.session import RovingConfig, roving
 from robot.simulation.create.template_training import trained
 from robot.touch_source import observation_of, sensing
 from tactile.base.errors import InputError
-from tactile.wall_estimation.strain_templates import StrainTemplates, load
+from tactile.wall_estimation.strain_templates import StrainTemplates, read_templates
 
 CONFIG = RovingConfig(seed=4)
 
@@ -31,7 +31,7 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def templates(kept: Path) -> StrainTemplates:
-    return load(kept / "new" / "t.npz")
+    return read_templates(kept / "new" / "t.npz")
 
 
 def errors(tried: list[Tried], way: str, known: bool) -> np.ndarray:

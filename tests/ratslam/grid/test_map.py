@@ -8,7 +8,7 @@ import pytest
 from ratslam.backends.grid import GridEvidence
 from ratslam.core.types import Estimate
 from ratslam.grid import genealogy
-from tactile.base.types import Motion
+from tactile.base.types import MotionKind
 from tests.helpers.grid_world import TIPS, filter_of, report, settings
 
 COUNT = 5
@@ -74,7 +74,7 @@ def test_what_was_not_told_is_not_drawn():
     plain = felt(report(0.05)).occupancy()
     for silent in (
         report(-0.05, touching=[0, 1], wall=(0.3, 0.0)),
-        report(0.05, touching=[0, 1, 2, 3], dead=[0, 1, 2, 3], motion=Motion.BACK),
+        report(0.05, touching=[0, 1, 2, 3], dead=[0, 1, 2, 3], motion=MotionKind.BACK),
     ):
         assert np.array_equal(felt(report(0.05), silent).occupancy(), plain)
     dead = [felt(report(0.05, touching=touching, dead=[0])).occupancy() for touching in ([], [0])]

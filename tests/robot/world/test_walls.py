@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from robot.world.maze import random_loop, scattered, walls
 from robot.world.walls import FREE, Surroundings, Walls
 from tactile.base.random_streams import stream
-from tactile.whiskers.head_geometry import Head, HeadConfig, RingConfig, shaft, ur10_head
+from tactile.whiskers.head_geometry import Head, HeadConfig, RingConfig, shaft_points, ur10_head
 
 STEP = 1 / 600
 """Of the march, as a share of the sweep."""
@@ -38,7 +38,7 @@ def marched(head: Head, boxes: Walls, pose: np.ndarray, sweep: float) -> tuple[n
     angle = np.arange(0, sweep, sweep * STEP)
     shape = (len(angle), len(SHARES), len(head.length))
     along = SHARES[:, None] * head.length + np.zeros(shape)
-    point = shaft(head, np.broadcast_to(angle[:, None, None], shape), along)
+    point = shaft_points(head, np.broadcast_to(angle[:, None, None], shape), along)
     c, s = np.cos(pose[2]), np.sin(pose[2])
     x, y = pose[0] + c * point[..., 0] - s * point[..., 1], pose[1] + s * point[..., 0] + c * point[..., 1]
     inside = np.zeros(shape, bool)

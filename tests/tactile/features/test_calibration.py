@@ -13,9 +13,9 @@ from tactile.base.types import Cycle, Odometry
 from tactile.features.calibration import (
     Calibration,
     CalibrationConfig,
-    arrays,
-    calibrated,
-    from_arrays,
+    calibrate,
+    calibration_arrays,
+    calibration_from_arrays,
 )
 
 CONFIG = CalibrationConfig()
@@ -37,12 +37,12 @@ def record(
 
 def refused(cycles: list[Cycle], match: str, **options: float) -> None:
     with pytest.raises(InputError, match=match):
-        calibrated(CONFIG, cycles, **options)
+        calibrate(CONFIG, cycles, **options)
 
 
 @given(st.integers(0, 50), st.floats(1e-4, 1e-2))
 def test_it_finds_mean_noise_and_amplitude(seed: int, sd: float) -> None:
-    found = calibrated(CONFIG, record(sd=sd, seed=seed))
+    found = calibrate(CONFIG, record(sd=sd, seed=seed))
     np.testing.assert_allclose(found.mean, np.arange(6)[:, None] / 100 * [1, -1], atol=sd / 10)
     np.testing.assert_allclose(found.sd, sd, rtol=0.06)
     np.testing.assert_allclose(found.threshold, 20 * found.sd)
@@ -69,7 +69,7 @@ def test_a_whisker_that_always_rubs_is_refused() -> None:
 def test_one_spike_is_not_a_contact() -> None:
     cycles = record()
     cycles[0].deflection[77, 2, 0] += 0.5
-    assert calibrated(CONFIG, cycles).alive.all()
+    assert calibrate(CONFIG, cycles).alive.all()
 
 
 def test_dead_whiskers_are_found() -> None:
@@ -77,7 +77,7 @@ def test_dead_whiskers_are_found() -> None:
     for cycle in cycles:
         cycle.deflection[:, 0] = 0.0
         cycle.angle[:, 4], cycle.deflection[:, 4] = 0.3, 0.1
-    found = calibrated(CONFIG, cycles)
+    found = calibrate(CONFIG, cycles)
     assert found.alive.tolist() == [False, True, True, True, False, True]
     assert np.isinf(found.threshold[[0, 4]]).all()
 
@@ -118,7 +118,7 @@ def test_a_record_without_noise_is_refused() -> None:
 
 def test_sample_rates_too_low_for_the_slope_window_are_refused() -> None:
     refused(record(rate=500.0), "500 samples per second.*at least 800")
-    assert calibrated(CONFIG, record(rate=500.0), slope_window=0.016).rate == pytest.approx(500)
+    assert calibrate(CONFIG, record(rate=500.0), slope_window=0.016).rate == pytest.approx(500)
 
 
 def test_broken_time_is_refused() -> None:
@@ -134,17 +134,17 @@ def test_broken_time_is_refused() -> None:
 
 
 def test_it_survives_being_kept() -> None:
-    found = calibrated(CONFIG, record())
-    again = from_arrays(arrays(found))
+    found = calibrate(CONFIG, record())
+    again = calibration_from_arrays(calibration_arrays(found))
     for name, value in found._asdict().items():
         assert np.array_equal(getattr(again, name), value), name
 
 
 @pytest.mark.parametrize("name", Calibration._fields)
 def test_a_part_that_is_missing_or_of_another_shape_is_refused(name: str) -> None:
-    kept = arrays(calibrated(CONFIG, record()))
+    kept = calibration_arrays(calibrate(CONFIG, record()))
     with pytest.raises(InputError, match=name):
-        from_arrays({key: value for key, value in kept.items() if key != name})
+        calibration_from_arrays({key: value for key, value in kept.items() if key != name})
     if name != "alive":
         with pytest.raises(InputError, match=name):
-            from_arrays(kept | {name: np.zeros(7)})
+            calibration_from_arrays(kept | {name: np.zeros(7)})

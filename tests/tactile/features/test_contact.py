@@ -11,7 +11,7 @@ from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.types import Cycle, Odometry
 from tactile.features.calibration import Calibration
-from tactile.features.contact import ContactConfig, ShaftConfig, reached, sensed, stiffness
+from tactile.features.contact import ContactConfig, ShaftConfig, detect_contacts, radial_distance, stiffness
 
 AMPLITUDE = 1.134
 W = 18
@@ -44,7 +44,7 @@ FREE = np.full(W, np.inf)
 
 def test_nothing_is_felt_where_nothing_is() -> None:
     for seed in range(20):
-        felt = sensed(CONFIG, known(), whisk(FREE, seed=seed))
+        felt = detect_contacts(CONFIG, known(), whisk(FREE, seed=seed))
         assert not felt.contact.any()
         assert not felt.held.any()
         assert not felt.touched.any()
@@ -54,7 +54,7 @@ def test_nothing_is_felt_where_nothing_is() -> None:
 
 @given(st.integers(0, 100), st.floats(0.25, 0.6))
 def test_walls_are_found_where_they_are(seed: int, share: float) -> None:
-    felt = sensed(CONFIG, known(), whisk(WALLS, seed=seed, share=share))
+    felt = detect_contacts(CONFIG, known(), whisk(WALLS, seed=seed, share=share))
     assert felt.contact.all()
     assert felt.held.all()
     # Never before the wall, but for noise; late by the bend at which it shows.
@@ -66,25 +66,26 @@ def test_walls_are_found_where_they_are(seed: int, share: float) -> None:
 def test_no_more_than_a_promille_is_false_or_missed() -> None:
     at = stream(1, "walls").uniform(0.05, AMPLITUDE - 0.04, (60, W))
     assert (
-        sum((~sensed(CONFIG, known(), whisk(at[k], seed=k)).contact).sum() for k in range(60))
+        sum((~detect_contacts(CONFIG, known(), whisk(at[k], seed=k)).contact).sum() for k in range(60))
         <= 0.003 * at.size
     )
     assert (
-        sum(sensed(CONFIG, known(), whisk(FREE, seed=k)).contact.sum() for k in range(60)) <= 0.0013 * at.size
+        sum(detect_contacts(CONFIG, known(), whisk(FREE, seed=k)).contact.sum() for k in range(60))
+        <= 0.0013 * at.size
     )
 
 
 def test_a_whisker_that_slips_off_has_touched_but_is_not_held() -> None:
-    felt = sensed(CONFIG, known(), whisk(np.full(W, 0.3), slips=0.2))
+    felt = detect_contacts(CONFIG, known(), whisk(np.full(W, 0.3), slips=0.2))
     assert felt.contact.all()
     assert not felt.held.any()
     np.testing.assert_allclose(felt.touched, 0.31, atol=0.02)
 
 
 def test_it_feels_the_same_at_any_sample_rate() -> None:
-    usual = [sensed(CONFIG, known(), whisk(WALLS, seed=k)) for k in range(8)]
+    usual = [detect_contacts(CONFIG, known(), whisk(WALLS, seed=k)) for k in range(8)]
     for rate in (1000.0, 4000.0):
-        other = [sensed(CONFIG, known(), whisk(WALLS, rate=rate, seed=99 + k)) for k in range(8)]
+        other = [detect_contacts(CONFIG, known(), whisk(WALLS, rate=rate, seed=99 + k)) for k in range(8)]
         assert all(np.array_equal(a.contact, b.contact) for a, b in zip(usual, other, strict=True))
         off = np.array([a.touched - b.touched for a, b in zip(usual, other, strict=True)])
         # Two milliseconds of the fastest sweep.
@@ -94,13 +95,13 @@ def test_it_feels_the_same_at_any_sample_rate() -> None:
 @given(st.floats(0.3, 1.0), st.floats(0.05, 1.0))
 def test_the_radial_distance_inverts_the_stiffness(reach: float, taper: float) -> None:
     shaft = ShaftConfig(taper=taper)
-    assert reached(shaft, stiffness(shaft, reach)) == pytest.approx(reach)
+    assert radial_distance(shaft, stiffness(shaft, reach)) == pytest.approx(reach)
     assert stiffness(shaft, shaft.reference) == pytest.approx(1)
 
 
 @pytest.mark.parametrize("reach", [0.5, 0.65, 0.8, 1.0])
 def test_the_radial_distance_is_felt(reach: float) -> None:
-    felt = sensed(CONFIG, known(), whisk(np.linspace(0.1, 0.8, W), reach=reach))
+    felt = detect_contacts(CONFIG, known(), whisk(np.linspace(0.1, 0.8, W), reach=reach))
     np.testing.assert_allclose(felt.reach, reach, atol=0.05)
 
 
@@ -108,15 +109,17 @@ def test_offsets_of_the_sensors_are_taken_off() -> None:
     cycle = whisk(WALLS)
     shifted = cycle._replace(deflection=cycle.deflection + [0.3, -0.2])
     there = known()._replace(mean=np.tile([0.3, -0.2], (W, 1)))
-    for a, b in zip(sensed(CONFIG, known(), cycle)[1:], sensed(CONFIG, there, shifted)[1:], strict=True):
+    for a, b in zip(
+        detect_contacts(CONFIG, known(), cycle)[1:], detect_contacts(CONFIG, there, shifted)[1:], strict=True
+    ):
         np.testing.assert_allclose(a, b, atol=1e-9)
 
 
 def test_whiskers_that_do_not_report_say_nothing_and_disturb_nobody() -> None:
-    plain = sensed(CONFIG, known(), whisk(WALLS))
+    plain = detect_contacts(CONFIG, known(), whisk(WALLS))
     cycle = whisk(WALLS)
     cycle.angle[3, 2], cycle.deflection[700, 5, 0] = np.nan, np.inf
-    felt = sensed(CONFIG, known()._replace(alive=np.arange(W) != 9), cycle)
+    felt = detect_contacts(CONFIG, known()._replace(alive=np.arange(W) != 9), cycle)
     silent = np.isin(np.arange(W), [2, 5, 9])
     assert np.array_equal(felt.alive, ~silent)
     for name in ("contact", "touched", "held", "highest", "reach"):
@@ -127,22 +130,22 @@ def test_whiskers_that_do_not_report_say_nothing_and_disturb_nobody() -> None:
 
 def test_streams_too_coarse_for_the_slope_window_are_refused() -> None:
     with pytest.raises(InputError, match=r"500 samples per second.*slope_window"):
-        sensed(CONFIG, known(), whisk(FREE, rate=500.0))
+        detect_contacts(CONFIG, known(), whisk(FREE, rate=500.0))
 
 
 def test_broken_streams_are_refused() -> None:
     cycle = whisk(FREE)
     with pytest.raises(InputError, match="out of order"):
-        sensed(CONFIG, known(), cycle._replace(time=cycle.time * 0))
+        detect_contacts(CONFIG, known(), cycle._replace(time=cycle.time * 0))
     with pytest.raises(InputError, match="cut off"):
-        sensed(CONFIG, known(), Cycle(*(part[:10] for part in cycle[:3]), cycle.odometry))
+        detect_contacts(CONFIG, known(), Cycle(*(part[:10] for part in cycle[:3]), cycle.odometry))
 
 
 def test_a_whisk_without_samples_says_nothing() -> None:
     """Its stream was dropped; motion counts all the same."""
     whole = whisk(WALLS)
-    felt = sensed(CONFIG, known(), Cycle(*(part[:0] for part in whole[:3]), whole.odometry))
-    usual = sensed(CONFIG, known(), whole)
+    felt = detect_contacts(CONFIG, known(), Cycle(*(part[:0] for part in whole[:3]), whole.odometry))
+    usual = detect_contacts(CONFIG, known(), whole)
     assert felt.odometry == whole.odometry
     for part, other in zip(felt[1:], usual[1:], strict=True):
         assert (part.shape, part.dtype) == (other.shape, other.dtype)

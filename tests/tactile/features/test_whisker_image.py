@@ -11,9 +11,15 @@ from hypothesis.extra.numpy import arrays
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Odometry, Whisk, observation
 from tactile.features.calibration import Calibration
-from tactile.features.whisker_image import DARKEST, ImageConfig, image, observed, view_shape
+from tactile.features.whisker_image import (
+    MIN_BRIGHTNESS,
+    ImageConfig,
+    view_shape,
+    whisk_observation,
+    whisker_image,
+)
 from tactile.frontend import Frontend, TouchConfig
-from tactile.whiskers.head_geometry import HeadConfig, height, shaft, ur10_head
+from tactile.whiskers.head_geometry import HeadConfig, shaft_points, tip_height, ur10_head
 
 HEAD = ur10_head(HeadConfig())
 ODOMETRY = Odometry(0.03, 0.001, 0.02, 1.0)
@@ -40,14 +46,14 @@ def _whisks() -> st.SearchStrategy[Whisk]:
 
 @given(CONFIGS, _whisks())
 def test_black_is_nothing_and_nothing_else_is_black(config: ImageConfig, whisk: Whisk) -> None:
-    view = image(config, HEAD, whisk)
+    view = whisker_image(config, HEAD, whisk)
     assert view.shape == view_shape(config, HEAD) == (3, 6, 2 if config.radial else 1)
     assert ((view >= 0) & (view <= 1)).all()
     felt = whisk.contact if config.transform == "contact_angle" else whisk.held
     dark = (view == 0).all(axis=2).reshape(18)
     assert (dark == ~(felt & whisk.alive)).all()
     assert ((view == 0).any(axis=2).reshape(18) == dark).all()
-    assert (view[view > 0] >= DARKEST).all()
+    assert (view[view > 0] >= MIN_BRIGHTNESS).all()
 
 
 @given(_whisks())
@@ -57,9 +63,9 @@ def test_brightness_is_height(whisk: Whisk) -> None:
         ("max_angle", whisk.held, whisk.highest),
     ):
         config = ImageConfig(transform=transform, tallest=0.06)
-        view = image(config, HEAD, whisk).reshape(18)
-        high = height(HEAD, angle)
-        told = felt & whisk.alive & (high > DARKEST * 0.06) & (high < 0.06)
+        view = whisker_image(config, HEAD, whisk).reshape(18)
+        high = tip_height(HEAD, angle)
+        told = felt & whisk.alive & (high > MIN_BRIGHTNESS * 0.06) & (high < 0.06)
         assert np.allclose(view[told] * 0.06, high[told])
         assert (view[felt & whisk.alive & (high >= 0.06)] == 1).all()
 
@@ -68,11 +74,11 @@ def test_brightness_is_height(whisk: Whisk) -> None:
 def test_a_dead_whisker_changes_nothing(config: ImageConfig, whisk: Whisk, number: int) -> None:
     alive = whisk.alive.copy()
     alive[number] = False
-    one = observed(config, HEAD, whisk._replace(alive=alive))
+    one = whisk_observation(config, HEAD, whisk._replace(alive=alive))
     wild = {name: getattr(whisk, name).copy() for name in ("contact", "touched", "held", "highest", "reach")}
     for name, value in {"contact": True, "touched": 0.7, "held": True, "highest": 0.9, "reach": 0.5}.items():
         wild[name][number] = value
-    other = observed(config, HEAD, whisk._replace(alive=alive, **wild))
+    other = whisk_observation(config, HEAD, whisk._replace(alive=alive, **wild))
     assert (one.view == other.view).all()
     assert (one.point == other.point).all()
     assert not one.contact[number]
@@ -81,14 +87,14 @@ def test_a_dead_whisker_changes_nothing(config: ImageConfig, whisk: Whisk, numbe
 
 @given(_whisks())
 def test_what_an_engine_is_given(whisk: Whisk) -> None:
-    seen = observed(ImageConfig(), HEAD, whisk)
+    seen = whisk_observation(ImageConfig(), HEAD, whisk)
     plain = observation(ODOMETRY, np.zeros((3, 6, 1)), whiskers=18)
     for one, other in zip(seen[1:], plain[1:], strict=True):
         assert (np.shape(one), np.asarray(one).dtype) == (np.shape(other), np.asarray(other).dtype)
     assert seen.odometry == ODOMETRY
     assert (seen.contact == whisk.contact & whisk.alive).all()
     along = np.where(whisk.reach > 0, whisk.reach, 1.0) * HEAD.length
-    there = shaft(HEAD, whisk.touched, along)[:, :2]
+    there = shaft_points(HEAD, whisk.touched, along)[:, :2]
     assert np.allclose(seen.point[seen.contact], there[seen.contact])
     assert (seen.point[~seen.contact] == 0).all()
 
@@ -98,16 +104,16 @@ def test_the_front_end_is_the_image_of_what_was_felt(config: ImageConfig, whisk:
     frontend = Frontend(TouchConfig(image=config))
     assert frontend.view_shape == view_shape(config, HEAD)
     assert frontend.whiskers == 18
-    one, other = frontend.observed(whisk), observed(config, HEAD, whisk)
+    one, other = frontend.observe(whisk), whisk_observation(config, HEAD, whisk)
     for field, same in zip(one[1:], other[1:], strict=True):
         assert (np.asarray(field) == np.asarray(same)).all()
-    assert frontend.observed(other) is other
+    assert frontend.observe(other) is other
 
 
 @given(_whisks())
 def test_a_whisker_may_be_called_dead_later(whisk: Whisk) -> None:
     there, dead = Frontend(TouchConfig()), Frontend(TouchConfig(head=HeadConfig(dead=(3, 11))))
-    one, other = there.observed(whisk), dead.observed(whisk)
+    one, other = there.observe(whisk), dead.observe(whisk)
     assert not other.alive[[3, 11]].any()
     assert not other.contact[[3, 11]].any()
     assert (other.view.reshape(18)[[3, 11]] == 0).all()
@@ -119,9 +125,9 @@ def test_raw_samples_need_a_calibration() -> None:
     count = 2000
     cycle = Cycle(np.arange(count) / 2000, np.zeros((count, 18)), np.zeros((count, 18, 2)), ODOMETRY)
     with pytest.raises(InputError, match="calibration: raw whisker samples without one"):
-        Frontend(TouchConfig()).observed(cycle)
+        Frontend(TouchConfig()).observe(cycle)
     still = np.full((18, 2), 2e-3)
     known = Calibration(0 * still, still, 20 * still, np.full(18, SWEEP), np.ones(18, bool), 2000.0)
-    seen = Frontend(TouchConfig(), known).observed(cycle)
+    seen = Frontend(TouchConfig(), known).observe(cycle)
     assert seen.view_seen
     assert (seen.view == 0).all()

@@ -10,32 +10,32 @@ from hypothesis import strategies as st
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose
-from tactile.base.types import Moment
+from tactile.base.types import StepEnd
 from tactile.wall_estimation.estimators import (
-    DOUBT,
-    Meeting,
+    MAX_DIRECTION_SD,
     Wall,
-    across,
-    carried,
-    fused,
-    geometric,
-    meant,
-    template,
-    through,
-    touching,
+    WallContact,
+    contact_points,
+    first_whisker,
+    fused_wall,
+    geometric_wall,
+    template_wall,
+    to_final_frame,
+    wall_normal,
+    wall_through,
 )
-from tactile.wall_estimation.sliding_tip import Tip, learned
+from tactile.wall_estimation.sliding_tip import TipModel, fit_tip_model
 from tactile.wall_estimation.strain_templates import (
-    Drive,
     StrainTemplates,
     TemplateTraining,
-    matched,
-    smoothed,
-    train,
+    TrainingDrive,
+    filter_strain,
+    match_template,
+    train_templates,
 )
 from tests.helpers.flat_walls import FEELERS, RATE, SPEED, apart, met, post, wall
 
-POINTS = touching(FEELERS, 0.13)
+POINTS = contact_points(FEELERS, 0.13)
 TRAINING = TemplateTraining()
 EVERY = np.ones(4, bool)
 
@@ -43,26 +43,26 @@ EVERY = np.ones(4, bool)
 @pytest.fixture(scope="module")
 def templates() -> StrainTemplates:
     random = stream(0, "training")
-    return train(
-        Drive(float(angle), k, wall(float(angle), random), RATE)
+    return train_templates(
+        TrainingDrive(float(angle), k, wall(float(angle), random), RATE)
         for angle in TRAINING.angles
         for k in range(4)
     )
 
 
 @pytest.fixture(scope="module")
-def tip(templates: StrainTemplates) -> Tip:
-    return learned(templates, FEELERS)
+def tip(templates: StrainTemplates) -> TipModel:
+    return fit_tip_model(templates, FEELERS)
 
 
-def meeting(strain: np.ndarray, **changes: object) -> Meeting:
+def meeting(strain: np.ndarray, **changes: object) -> WallContact:
     hit, slow = met(strain)
-    whole = Meeting(
+    whole = WallContact(
         hit.contact,
         slow.contact,
         np.array(slow.odometry[:3], float),
-        Moment(slow.moment),
-        smoothed(TRAINING, slow.strain),
+        StepEnd(slow.moment),
+        filter_strain(TRAINING, slow.strain),
         EVERY,
     )
     return whole._replace(**changes)  # type: ignore[arg-type]
@@ -73,16 +73,16 @@ def is_none(wall: Wall) -> bool:
 
 
 def test_a_wall_straight_across_has_its_normal_ahead() -> None:
-    np.testing.assert_allclose(across(np.pi / 2), [1, 0], atol=1e-15)
-    ahead = through(np.array([0.3, 0.1]), np.pi / 2, 0.1)
+    np.testing.assert_allclose(wall_normal(np.pi / 2), [1, 0], atol=1e-15)
+    ahead = wall_through(np.array([0.3, 0.1]), np.pi / 2, 0.1)
     np.testing.assert_allclose(ahead.point, [0.3, 0.0], atol=1e-15)
-    left = through(np.array([0.3, 0.2]), 0.0, 0.1)
+    left = wall_through(np.array([0.3, 0.2]), 0.0, 0.1)
     np.testing.assert_allclose(left.point, [0.0, 0.2], atol=1e-15)
 
 
 @given(st.floats(-9, 9), st.floats(-1, 1), st.floats(-1, 1))
 def test_the_point_is_the_nearest_of_the_line_through(direction: float, x: float, y: float) -> None:
-    through_it = through(np.array([x, y]), direction, 0.1)
+    through_it = wall_through(np.array([x, y]), direction, 0.1)
     along = np.array([np.cos(direction), np.sin(direction)])
     assert 0 <= through_it.direction < np.pi
     assert apart(through_it.direction, direction) < 1e-9
@@ -94,7 +94,7 @@ def test_the_point_is_the_nearest_of_the_line_through(direction: float, x: float
 @given(st.floats(-0.1, 0.1), st.floats(-0.1, 0.1), st.floats(-3, 3))
 def test_points_are_carried_as_poses_are(x: float, y: float, turn: float) -> None:
     travel = np.array([x, y, turn])
-    there = carried(POINTS, meeting(wall(1.2), travel=travel))
+    there = to_final_frame(POINTS, meeting(wall(1.2), travel=travel))
     for before, after in zip(POINTS, there, strict=True):
         np.testing.assert_allclose(compose(travel, np.array([*after, 0.0]))[:2], before, atol=1e-12)
 
@@ -104,59 +104,61 @@ def test_two_contacts_give_the_line_through_them_with_the_motion_between(
     angle: float, first: int, second: int, ahead: float
 ) -> None:
     """The wall is put through the first contact; the robot then moves until the second lies on it too."""
-    normal, travel = across(angle), np.array([ahead, 0.02, 0.1])
-    there = carried(POINTS, meeting(wall(1.2), travel=travel))
+    normal, travel = wall_normal(angle), np.array([ahead, 0.02, 0.1])
+    there = to_final_frame(POINTS, meeting(wall(1.2), travel=travel))
     travel[:2] += normal * ((there[second] - there[first]) @ normal)
     hits = np.eye(4, dtype=bool)
     two = meeting(
-        wall(1.2), first=hits[first], now=hits[second] | hits[first], travel=travel, moment=Moment.HIT2
+        wall(1.2), first=hits[first], now=hits[second] | hits[first], travel=travel, moment=StepEnd.HIT2
     )
-    found = geometric(POINTS, two)
-    where = carried(POINTS, two)[first]
+    found = geometric_wall(POINTS, two)
+    where = to_final_frame(POINTS, two)[first]
     if first == second or np.linalg.norm(where - POINTS[second]) < 0.05:
         assert is_none(found)
         return
     line = POINTS[second] - where
     assert apart(found.direction, float(np.arctan2(line[1], line[0]))) < 1e-6
     for point in (where, POINTS[second]):
-        np.testing.assert_allclose(point @ across(found.direction), found.point @ across(found.direction))
-    assert is_none(geometric(POINTS, two._replace(moment=Moment.ABORT)))
+        np.testing.assert_allclose(
+            point @ wall_normal(found.direction), found.point @ wall_normal(found.direction)
+        )
+    assert is_none(geometric_wall(POINTS, two._replace(moment=StepEnd.ABORT)))
 
 
 @pytest.mark.parametrize("angle", [80.0, 90.0, 97.0])
 def test_the_line_is_along_a_wall_that_two_whiskers_meet(angle: float) -> None:
     strain = wall(np.radians(angle))
     hit, slow = met(strain, share=1.0)
-    assert slow.moment == Moment.HIT2
-    two = Meeting(hit.contact, slow.contact, np.array(slow.odometry[:3]), Moment.HIT2, strain[:2], EVERY)
-    assert apart(geometric(POINTS, two).direction, np.radians(angle)) < 6
+    assert slow.moment == StepEnd.HIT2
+    two = WallContact(hit.contact, slow.contact, np.array(slow.odometry[:3]), StepEnd.HIT2, strain[:2], EVERY)
+    assert apart(geometric_wall(POINTS, two).direction, np.radians(angle)) < 6
 
 
 def test_the_winner_is_told_through_the_first_contact(templates: StrainTemplates) -> None:
     for angle in np.radians([30.0, 60.0, 90.0, 150.0]):
         there = meeting(wall(angle))
-        match = matched(templates, there.strain)
-        found = template(POINTS, match, there, 0.3)
+        match = match_template(templates, there.strain)
+        found = template_wall(POINTS, match, there, 0.3)
         assert apart(found.direction, angle) < 0.1
-        at = POINTS[meant(there)] - [there.travel[0], 0]
-        np.testing.assert_allclose(found.point, (across(angle) @ at) * across(angle), atol=1e-9)
+        at = POINTS[first_whisker(there)] - [there.travel[0], 0]
+        np.testing.assert_allclose(found.point, (wall_normal(angle) @ at) * wall_normal(angle), atol=1e-9)
         unlike = match._replace(relative=0.31)
-        assert is_none(template(POINTS, unlike, there, 0.3))
-        assert template(POINTS, unlike, there, None).known
+        assert is_none(template_wall(POINTS, unlike, there, 0.3))
+        assert template_wall(POINTS, unlike, there, None).known
 
 
 @pytest.mark.parametrize("angle", np.arange(25.0, 156.0, 5.0))
-def test_flat_walls_are_known_to_a_degree_after_abort_too(tip: Tip, angle: float) -> None:
+def test_flat_walls_are_known_to_a_degree_after_abort_too(tip: TipModel, angle: float) -> None:
     for seed in range(3):
         there = meeting(wall(np.radians(angle), stream(seed, "noise")))
-        found = fused(tip, POINTS, there)
+        found = fused_wall(tip, POINTS, there)
         assert found.known
         assert apart(found.direction, np.radians(angle)) < 1.5
-        assert 0 < found.sd < DOUBT
+        assert 0 < found.sd < MAX_DIRECTION_SD
         # The wall lies where it is: touched by the first whisker's tip at first, nearer by what was driven.
-        whisker = meant(there)
+        whisker = first_whisker(there)
         assert whisker is not None
-        touched = across(np.radians(angle)) @ (FEELERS.base + 0.14 * FEELERS.direction)[whisker]
+        touched = wall_normal(np.radians(angle)) @ (FEELERS.base + 0.14 * FEELERS.direction)[whisker]
         driven = len(there.strain) / RATE * SPEED * np.sin(np.radians(angle))
         away = np.linalg.norm(found.point)
         assert touched - driven - 0.013 < away < touched - driven + 0.003
@@ -166,33 +168,33 @@ def test_flat_walls_are_known_to_a_degree_after_abort_too(tip: Tip, angle: float
     ("whisker", "angle"), [(0, 93.0), (3, 87.0), (0, 75.0), (3, 100.0), (1, 140.0), (2, 40.0)]
 )
 def test_a_short_wall_is_known_that_an_endless_one_would_have_hidden(
-    tip: Tip, templates: StrainTemplates, whisker: int, angle: float
+    tip: TipModel, templates: StrainTemplates, whisker: int, angle: float
 ) -> None:
     there = meeting(wall(np.radians(angle), stream(1, "noise"), first=whisker))
-    assert meant(there) == whisker
-    found = fused(tip, POINTS, there)
+    assert first_whisker(there) == whisker
+    found = fused_wall(tip, POINTS, there)
     assert apart(found.direction, np.radians(angle)) < 4
     # The nearest template is of another wall.
-    assert apart(matched(templates, there.strain).angle, np.radians(angle)) > 8
+    assert apart(match_template(templates, there.strain).angle, np.radians(angle)) > 8
 
 
 @pytest.mark.parametrize("whisker", range(4))
 @pytest.mark.parametrize("along", [0.05, 0.07, 0.09, 0.11])
-def test_a_post_is_no_wall(tip: Tip, whisker: int, along: float) -> None:
-    assert is_none(fused(tip, POINTS, meeting(post(whisker, along))))
+def test_a_post_is_no_wall(tip: TipModel, whisker: int, along: float) -> None:
+    assert is_none(fused_wall(tip, POINTS, meeting(post(whisker, along))))
 
 
-def test_what_bends_a_whisker_far_at_once_is_no_wall(tip: Tip) -> None:
+def test_what_bends_a_whisker_far_at_once_is_no_wall(tip: TipModel) -> None:
     there = meeting(wall(np.radians(30.0)))
-    whole = smoothed(TRAINING, wall(np.radians(30.0)))
+    whole = filter_strain(TRAINING, wall(np.radians(30.0)))
     level = np.abs(whole[:, 3, 0]) / tip.gain
     for start, known in ((0.15, True), (0.21, False)):
         late = there._replace(strain=whole[level > start])
         assert len(late.strain) > 800
-        assert fused(tip, POINTS, late).known is known
+        assert fused_wall(tip, POINTS, late).known is known
 
 
-def test_nothing_is_known_without_strain(tip: Tip) -> None:
+def test_nothing_is_known_without_strain(tip: TipModel) -> None:
     there = meeting(wall(1.2))
     for lacking in (
         there._replace(strain=there.strain[:0]),
@@ -201,27 +203,27 @@ def test_nothing_is_known_without_strain(tip: Tip) -> None:
         there._replace(first=np.zeros(4, bool)),
         there._replace(alive=np.zeros(4, bool)),
     ):
-        assert is_none(fused(tip, POINTS, lacking))
+        assert is_none(fused_wall(tip, POINTS, lacking))
 
 
-def test_a_contradicting_second_contact_does_not_turn_the_wall(tip: Tip) -> None:
-    there = meeting(wall(np.radians(40.0)), moment=Moment.HIT2)
+def test_a_contradicting_second_contact_does_not_turn_the_wall(tip: TipModel) -> None:
+    there = meeting(wall(np.radians(40.0)), moment=StepEnd.HIT2)
     hits = np.eye(4, dtype=bool)
     for other in range(3):
         crossed = there._replace(now=hits[other] | there.first)
-        assert apart(fused(tip, POINTS, crossed).direction, np.radians(40.0)) < 1.5
+        assert apart(fused_wall(tip, POINTS, crossed).direction, np.radians(40.0)) < 1.5
 
 
 def test_templates_of_other_whiskers_are_refused(templates: StrainTemplates) -> None:
     with pytest.raises(InputError, match="4 whiskers"):
-        learned(templates, type(FEELERS)(*(part[:3] for part in FEELERS)))
+        fit_tip_model(templates, type(FEELERS)(*(part[:3] for part in FEELERS)))
     with pytest.raises(InputError, match="hardly any contact"):
-        learned(templates._replace(mean=0 * templates.mean), FEELERS)
+        fit_tip_model(templates._replace(mean=0 * templates.mean), FEELERS)
     turned = FEELERS.direction @ np.array([[0.8, -0.6], [0.6, 0.8]])
     with pytest.raises(InputError, match="check mounts"):
-        learned(templates, FEELERS._replace(direction=turned))
+        fit_tip_model(templates, FEELERS._replace(direction=turned))
 
 
-def test_the_law_is_that_of_the_made_up_whiskers(tip: Tip) -> None:
+def test_the_law_is_that_of_the_made_up_whiskers(tip: TipModel) -> None:
     assert tip.gain == pytest.approx(3 * 0.725e-3 * (1 / 0.14 - (1 - 0.3 / 1.45) / 0.14), rel=0.01)
     assert tip.crosstalk == pytest.approx(0.08, abs=0.01)

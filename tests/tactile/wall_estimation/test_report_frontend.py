@@ -12,15 +12,15 @@ from hypothesis import strategies as st
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose
-from tactile.base.types import Moment, Motion, Observation, Odometry, Report, stack
-from tactile.wall_estimation.estimators import across
-from tactile.wall_estimation.report_frontend import Reporting, ReportsConfig
+from tactile.base.types import MotionKind, Observation, Odometry, Report, StepEnd, stack
+from tactile.wall_estimation.estimators import wall_normal
+from tactile.wall_estimation.report_frontend import ReportFrontend, ReportFrontendConfig
 from tactile.wall_estimation.strain_templates import (
-    Drive,
     StrainTemplates,
     TemplateTraining,
-    save,
-    train,
+    TrainingDrive,
+    train_templates,
+    write_templates,
 )
 from tests.helpers.flat_walls import RATE, apart, met, report, wall
 
@@ -31,15 +31,15 @@ ANGLE = np.radians(70.0)
 @pytest.fixture(scope="module")
 def templates() -> StrainTemplates:
     random = stream(0, "training")
-    return train(
-        Drive(float(angle), k, wall(float(angle), random), RATE)
+    return train_templates(
+        TrainingDrive(float(angle), k, wall(float(angle), random), RATE)
         for angle in TRAINING.angles
         for k in range(4)
     )
 
 
-def told(reporting: Reporting, *reports: Report) -> list[Observation]:
-    seen = [reporting.observed(one) for one in reports]
+def told(reporting: ReportFrontend, *reports: Report) -> list[Observation]:
+    seen = [reporting.observe(one) for one in reports]
     return [one for one in seen if one is not None]
 
 
@@ -56,8 +56,8 @@ def is_blind(seen: Observation) -> bool:
 
 @given(st.lists(st.booleans(), min_size=4, max_size=4), st.lists(st.booleans(), min_size=4, max_size=4))
 def test_contacts_are_told_where_whiskers_touch(contact: list[bool], alive: list[bool]) -> None:
-    reporting = Reporting(ReportsConfig(walls="none"))
-    step = report(Moment.HIT1)._replace(contact=np.array(contact), alive=np.array(alive))
+    reporting = ReportFrontend(ReportFrontendConfig(walls="none"))
+    step = report(StepEnd.HIT1)._replace(contact=np.array(contact), alive=np.array(alive))
     (seen,) = told(reporting, step)
     both = np.array(contact) & np.array(alive)
     assert seen.contact.tolist() == both.tolist()
@@ -67,39 +67,41 @@ def test_contacts_are_told_where_whiskers_touch(contact: list[bool], alive: list
     assert seen.view[0, :, 0].tolist() == both.tolist()
     assert seen.label == -1
     for k in range(4):
-        x, y, degrees = ReportsConfig().mounts[k]
+        x, y, degrees = ReportFrontendConfig().mounts[k]
         there = (x + 0.13 * np.cos(np.radians(degrees)), y + 0.13 * np.sin(np.radians(degrees)))
         np.testing.assert_allclose(seen.point[k], there if both[k] else (0, 0))
 
 
-@pytest.mark.parametrize("motion", [Motion.FORWARD, Motion.TURN, Motion.OTHER])
-def test_every_step_is_told_with_its_motion(motion: Motion) -> None:
+@pytest.mark.parametrize("motion", [MotionKind.FORWARD, MotionKind.TURN, MotionKind.OTHER])
+def test_every_step_is_told_with_its_motion(motion: MotionKind) -> None:
     odometry = Odometry(0.01, 0.02, 0.3, 0.5)
-    (seen,) = told(Reporting(ReportsConfig()), report(motion=motion, contact=(2,), odometry=odometry))
+    (seen,) = told(
+        ReportFrontend(ReportFrontendConfig()), report(motion=motion, contact=(2,), odometry=odometry)
+    )
     assert tuple(seen.odometry) == tuple(odometry)
     assert seen.motion == motion
     assert seen.contact[2]
 
 
 def test_back_tells_of_its_motion_alone() -> None:
-    back = report(motion=Motion.BACK, contact=(0, 1), odometry=Odometry(-0.025, 0, 0, 0.5))
-    (seen,) = told(Reporting(ReportsConfig()), back)
+    back = report(motion=MotionKind.BACK, contact=(0, 1), odometry=Odometry(-0.025, 0, 0, 0.5))
+    (seen,) = told(ReportFrontend(ReportFrontendConfig()), back)
     assert is_blind(seen)
     assert not seen.alive.any()
-    assert seen.motion == Motion.BACK
+    assert seen.motion == MotionKind.BACK
     assert seen.odometry.dx == -0.025
 
 
 @given(st.lists(st.tuples(*[st.floats(-0.5, 0.5)] * 3, st.booleans()), min_size=1, max_size=12))
 def test_folding_back_loses_no_motion(steps: list[tuple[float, float, float, bool]]) -> None:
     def path(fold: bool) -> np.ndarray:
-        reporting, pose, time = Reporting(ReportsConfig(fold_back=fold)), np.zeros(3), 0.0
-        kinds = [Motion.BACK if back else Motion.TURN for *_, back in steps] + [Motion.FORWARD]
+        reporting, pose, time = ReportFrontend(ReportFrontendConfig(fold_back=fold)), np.zeros(3), 0.0
+        kinds = [MotionKind.BACK if back else MotionKind.TURN for *_, back in steps] + [MotionKind.FORWARD]
         moves = [Odometry(*step[:3], 0.5) for step in steps] + [Odometry(0.025, 0.0, 0.0, 0.5)]
         seen = told(
             reporting, *(report(motion=kind, odometry=move) for kind, move in zip(kinds, moves, strict=True))
         )
-        assert len(seen) == (sum(kind != Motion.BACK for kind in kinds) if fold else len(kinds))
+        assert len(seen) == (sum(kind != MotionKind.BACK for kind in kinds) if fold else len(kinds))
         for one in seen:
             pose = compose(pose, np.array(one.odometry[:3]))
             time += one.odometry.dt
@@ -114,50 +116,53 @@ def test_folding_back_loses_no_motion(steps: list[tuple[float, float, float, boo
 def test_walls_are_told_at_the_end_of_the_slow_drive(
     walls: str, within: float, templates: StrainTemplates
 ) -> None:
-    reporting = Reporting(ReportsConfig(walls=walls), templates)  # type: ignore[arg-type]
+    reporting = ReportFrontend(ReportFrontendConfig(walls=walls), templates)  # type: ignore[arg-type]
     for angle in np.radians([40.0, 70.0, 90.0, 130.0]):
         hit, slow = told(reporting, *met(wall(angle)))
         assert not hit.wall
         assert apart(direction(slow), angle) < within
         assert 0.03 < slow.wall_sd < 0.15
         # The robot is some 2 dm from it, seen from where it stands now.
-        assert 0.1 < across(angle) @ slow.wall_point < 0.3
+        assert 0.1 < wall_normal(angle) @ slow.wall_point < 0.3
 
 
 def test_two_contacts_make_the_line_where_there_are_no_templates() -> None:
     hit, slow = met(wall(np.radians(85.0)), share=1.0)
-    assert slow.moment == Moment.HIT2
-    reporting, plain = Reporting(ReportsConfig(walls="geometric")), Reporting(ReportsConfig())
+    assert slow.moment == StepEnd.HIT2
+    reporting, plain = (
+        ReportFrontend(ReportFrontendConfig(walls="geometric")),
+        ReportFrontend(ReportFrontendConfig()),
+    )
     _, seen = told(reporting, hit, slow)
     assert apart(direction(seen), np.radians(85.0)) < 6
     assert direction(told(plain, hit, slow)[1]) == direction(seen)
     for other in (reporting, plain):
-        assert not told(other, hit, slow._replace(moment=int(Moment.ABORT)))[1].wall
+        assert not told(other, hit, slow._replace(moment=int(StepEnd.ABORT)))[1].wall
 
 
 def test_none_tells_of_no_wall(templates: StrainTemplates) -> None:
-    for seen in told(Reporting(ReportsConfig(walls="none"), templates), *met(wall(ANGLE))):
+    for seen in told(ReportFrontend(ReportFrontendConfig(walls="none"), templates), *met(wall(ANGLE))):
         assert not seen.wall
 
 
 def test_a_slow_drive_in_pieces_is_the_same(templates: StrainTemplates) -> None:
     hit, slow = met(wall(ANGLE))
-    whole = told(Reporting(ReportsConfig(), templates), hit, slow)[-1]
+    whole = told(ReportFrontend(ReportFrontendConfig(), templates), hit, slow)[-1]
     cut = 700
     pieces = [
-        report(Moment.FREE, contact=(2,), strain=slow.strain[:cut]),
-        report(Moment(slow.moment), strain=slow.strain[cut:])._replace(contact=slow.contact),
+        report(StepEnd.FREE, contact=(2,), strain=slow.strain[:cut]),
+        report(StepEnd(slow.moment), strain=slow.strain[cut:])._replace(contact=slow.contact),
     ]
-    parts = told(Reporting(ReportsConfig(), templates), hit, *pieces)
+    parts = told(ReportFrontend(ReportFrontendConfig(), templates), hit, *pieces)
     assert [bool(one.wall) for one in parts] == [False, False, True]
     np.testing.assert_allclose(parts[-1].wall_point, whole.wall_point, atol=1e-9)
 
 
 def test_only_what_follows_a_hit_tells_of_a_wall(templates: StrainTemplates) -> None:
-    reporting = Reporting(ReportsConfig(), templates)
+    reporting = ReportFrontend(ReportFrontendConfig(), templates)
     hit, slow = met(wall(ANGLE))
-    free, turn = report(), report(motion=Motion.TURN)
-    back = report(motion=Motion.BACK)
+    free, turn = report(), report(motion=MotionKind.TURN)
+    back = report(motion=MotionKind.BACK)
     assert not told(reporting, slow)[0].wall
     for between in (turn, back):
         assert not told(reporting, hit, between, slow)[-1].wall
@@ -172,18 +177,18 @@ def test_whiskers_without_values_disturb_nobody(templates: StrainTemplates) -> N
     broken = slow.strain.copy()
     broken[100, 0], broken[200, 1] = np.nan, np.inf
     for walls in ("fused", "template"):
-        reporting = Reporting(ReportsConfig(walls=walls), templates)
+        reporting = ReportFrontend(ReportFrontendConfig(walls=walls), templates)
         seen = told(reporting, hit, slow._replace(strain=broken))[-1]
         assert apart(direction(seen), ANGLE) < 1.5
         broken_all = slow._replace(strain=slow.strain * np.nan)
         assert not told(reporting, hit, broken_all)[-1].wall
     lost = slow._replace(odometry=Odometry(np.nan, 0.0, 0.0, 1.0))
-    assert not told(Reporting(ReportsConfig(), templates), hit, lost)[-1].wall
+    assert not told(ReportFrontend(ReportFrontendConfig(), templates), hit, lost)[-1].wall
 
 
 def test_observations_stack(templates: StrainTemplates) -> None:
-    reports = [report(), *met(wall(ANGLE)), report(motion=Motion.BACK), report(motion=Motion.TURN)]
-    chunk = stack(told(Reporting(ReportsConfig(), templates), *reports))
+    reports = [report(), *met(wall(ANGLE)), report(motion=MotionKind.BACK), report(motion=MotionKind.TURN)]
+    chunk = stack(told(ReportFrontend(ReportFrontendConfig(), templates), *reports))
     assert chunk.view.shape == (5, 1, 4, 1)
     assert chunk.point.shape == (5, 4, 2)
     for part in chunk[1:]:
@@ -192,18 +197,18 @@ def test_observations_stack(templates: StrainTemplates) -> None:
 
 def test_what_does_not_fit_is_refused(templates: StrainTemplates, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="3 whiskers"):
-        Reporting(ReportsConfig()).observed(report()._replace(contact=np.zeros(3, bool)))
+        ReportFrontend(ReportFrontendConfig()).observe(report()._replace(contact=np.zeros(3, bool)))
     with pytest.raises(InputError, match="train-templates"):
-        Reporting(ReportsConfig(walls="template"))
+        ReportFrontend(ReportFrontendConfig(walls="template"))
     with pytest.raises(InputError, match=r"nowhere\.npz: no such file"):
-        Reporting(ReportsConfig(templates=tmp_path / "nowhere.npz"))
+        ReportFrontend(ReportFrontendConfig(templates=tmp_path / "nowhere.npz"))
     path = tmp_path / "kept.npz"
-    save(templates, path)
+    write_templates(templates, path)
     hit, slow = met(wall(ANGLE))
-    kept = Reporting(ReportsConfig(templates=path))
+    kept = ReportFrontend(ReportFrontendConfig(templates=path))
     assert told(kept, hit, slow)[-1].wall
     half = slow._replace(strain=slow.strain[::2], time=slow.time[::2])
     with pytest.raises(InputError, match="1000 samples per second; expected 2000"):
         told(kept, hit, half)
     with pytest.raises(ValueError, match="contact_radius"):
-        ReportsConfig(contact_radius=0.2)
+        ReportFrontendConfig(contact_radius=0.2)

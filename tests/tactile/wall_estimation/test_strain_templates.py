@@ -12,24 +12,24 @@ from hypothesis import strategies as st
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.wall_estimation.strain_templates import (
-    Drive,
     StrainTemplates,
     TemplateTraining,
-    load,
-    matched,
-    save,
-    smoothed,
-    train,
+    TrainingDrive,
+    filter_strain,
+    match_template,
+    read_templates,
+    train_templates,
+    write_templates,
 )
 from tests.helpers.flat_walls import RATE, apart, wall
 
 TRAINING = TemplateTraining()
 
 
-def drives() -> list[Drive]:
+def drives() -> list[TrainingDrive]:
     random = stream(0, "training")
     return [
-        Drive(float(angle), k, wall(float(angle), random), RATE)
+        TrainingDrive(float(angle), k, wall(float(angle), random), RATE)
         for angle in TRAINING.angles
         for k in range(TRAINING.repeats)
     ]
@@ -40,31 +40,31 @@ DRIVES = drives()
 
 @pytest.fixture(scope="module")
 def templates() -> StrainTemplates:
-    return train(DRIVES)
+    return train_templates(DRIVES)
 
 
 def test_the_papers_fifteen_angles(templates: StrainTemplates) -> None:
     np.testing.assert_allclose(np.degrees(templates.angle), np.arange(20, 161, 10))
     assert templates.mean.shape == (15, 4000, 4, 2)
     # What is told of the noise is that of one filtered drive, not of the mean of four.
-    quiet = np.std(smoothed(TRAINING, 4e-6 * stream(1, "noise").standard_normal((4000, 4, 2)))[400:])
+    quiet = np.std(filter_strain(TRAINING, 4e-6 * stream(1, "noise").standard_normal((4000, 4, 2)))[400:])
     np.testing.assert_allclose(np.median(templates.spread), quiet, rtol=0.08)
 
 
 @given(st.integers(0, 99), st.integers(1, 3999))
 def test_the_filter_looks_back_only_and_forgets_no_sample(seed: int, cut: int) -> None:
     strain = stream(seed, "strain").standard_normal((4000, 2))
-    whole = smoothed(TRAINING, strain)
-    np.testing.assert_allclose(smoothed(TRAINING, strain[:cut]), whole[:cut], atol=1e-12)
+    whole = filter_strain(TRAINING, strain)
+    np.testing.assert_allclose(filter_strain(TRAINING, strain[:cut]), whole[:cut], atol=1e-12)
     later = strain.copy()
     later[cut:] += 1.0
-    assert np.array_equal(smoothed(TRAINING, later)[:cut], whole[:cut])
-    assert (smoothed(TRAINING, later)[-1] != whole[-1]).any()
+    assert np.array_equal(filter_strain(TRAINING, later)[:cut], whole[:cut])
+    assert (filter_strain(TRAINING, later)[-1] != whole[-1]).any()
 
 
 @given(st.floats(-1, 1), st.integers(1, 100))
 def test_the_filter_starts_settled(level: float, count: int) -> None:
-    np.testing.assert_allclose(smoothed(TRAINING, np.full((count, 4, 2), level)), level, atol=1e-9)
+    np.testing.assert_allclose(filter_strain(TRAINING, np.full((count, 4, 2), level)), level, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -74,14 +74,14 @@ def test_the_filter_passes_what_is_slower_than_seventeen_hertz(
     frequency: float, least: float, most: float
 ) -> None:
     wave = np.sin(2 * np.pi * frequency * np.arange(8000) / RATE)
-    assert least < np.abs(smoothed(TRAINING, wave)[4000:]).max() < most
+    assert least < np.abs(filter_strain(TRAINING, wave)[4000:]).max() < most
 
 
 def test_every_drive_is_of_its_own_template(templates: StrainTemplates) -> None:
     random = stream(5, "held out")
     for k, angle in enumerate(templates.angle):
-        read = smoothed(TRAINING, wall(float(angle), random))
-        match = matched(templates, read[:1600])
+        read = filter_strain(TRAINING, wall(float(angle), random))
+        match = match_template(templates, read[:1600])
         assert match.winner == k
         assert match.angle == angle
         assert match.relative < 0.03
@@ -93,7 +93,7 @@ def test_every_drive_is_of_its_own_template(templates: StrainTemplates) -> None:
 def test_the_parabola_is_nearer_than_the_winner(templates: StrainTemplates) -> None:
     raw, refined = [], []
     for angle in np.radians([63.0, 67.0, 83.0, 97.0, 117.0, 122.0]):
-        match = matched(templates, smoothed(TRAINING, wall(float(angle)))[:1600])
+        match = match_template(templates, filter_strain(TRAINING, wall(float(angle)))[:1600])
         raw.append(apart(match.angle, float(angle)))
         refined.append(apart(match.refined, float(angle)))
         assert abs(match.refined - match.angle) <= np.radians(TRAINING.step_deg)
@@ -101,20 +101,23 @@ def test_the_parabola_is_nearer_than_the_winner(templates: StrainTemplates) -> N
 
 
 def test_whiskers_that_do_not_report_are_left_out(templates: StrainTemplates) -> None:
-    read = smoothed(TRAINING, wall(np.radians(110.0)))[:1600]
+    read = filter_strain(TRAINING, wall(np.radians(110.0)))[:1600]
     broken = read.copy()
     broken[:, 3] = 1.0
     use = np.array([True, True, True, False])
-    assert matched(templates, broken, use).error.tolist() == matched(templates, read, use).error.tolist()
-    assert matched(templates, broken).relative > 0.5
+    assert (
+        match_template(templates, broken, use).error.tolist()
+        == match_template(templates, read, use).error.tolist()
+    )
+    assert match_template(templates, broken).relative > 0.5
     with pytest.raises(ValueError, match="whiskers"):
-        matched(templates, read, np.zeros(4, bool))
+        match_template(templates, read, np.zeros(4, bool))
 
 
 def test_a_file_gives_back_what_was_kept(templates: StrainTemplates, tmp_path: Path) -> None:
     path = tmp_path / "templates.npz"
-    save(templates, path)
-    again = load(path)
+    write_templates(templates, path)
+    again = read_templates(path)
     assert again.training == templates.training
     for name in ("angle", "mean", "spread"):
         assert np.array_equal(getattr(again, name), getattr(templates, name))
@@ -130,13 +133,13 @@ def _plain_array(path: Path) -> None:
 
 
 def _cut(path: Path) -> None:
-    save(train(DRIVES), path)
+    write_templates(train_templates(DRIVES), path)
     path.write_bytes(path.read_bytes()[:9999])
 
 
 def _unfit(path: Path) -> None:
-    kept = train(DRIVES)
-    save(kept._replace(mean=kept.mean[:14]), path)
+    kept = train_templates(DRIVES)
+    write_templates(kept._replace(mean=kept.mean[:14]), path)
 
 
 @pytest.mark.parametrize(
@@ -157,7 +160,7 @@ def test_any_other_file_is_one_clear_error(make: object, tmp_path: Path) -> None
     path = tmp_path / "wrong.npz"
     make(path)  # type: ignore[operator]
     with pytest.raises(InputError, match=r"wrong\.npz: no .*train-templates"):
-        load(path)
+        read_templates(path)
 
 
 @pytest.mark.parametrize(
@@ -176,7 +179,7 @@ def test_any_other_file_is_one_clear_error(make: object, tmp_path: Path) -> None
 )
 def test_unfit_drives_are_refused(change: object, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        train(change(DRIVES))  # type: ignore[operator]
+        train_templates(change(DRIVES))  # type: ignore[operator]
 
 
 def test_unsound_settings_are_refused() -> None:

@@ -14,9 +14,9 @@ from tactile.whiskers.head_geometry import (
     HeadConfig,
     RingConfig,
     create_head,
-    height,
-    shaft,
-    tip,
+    shaft_points,
+    tip_height,
+    tip_points,
     ur10_head,
 )
 
@@ -47,9 +47,9 @@ def test_rest_and_swing_are_unit_vectors_at_right_angles(head: Head) -> None:
 @given(HEADS, st.integers(0, 2**32 - 1))
 def test_a_whisker_never_changes_its_length(head: Head, seed: int) -> None:
     angle = np.random.default_rng(seed).uniform(-4, 4, (5, len(head.length)))
-    assert np.allclose(np.linalg.norm(tip(head, angle) - head.base, axis=-1), head.length, atol=1e-12)
-    half = shaft(head, angle, head.length / 2)
-    assert np.allclose(2 * (half - head.base), tip(head, angle) - head.base, atol=1e-12)
+    assert np.allclose(np.linalg.norm(tip_points(head, angle) - head.base, axis=-1), head.length, atol=1e-12)
+    half = shaft_points(head, angle, head.length / 2)
+    assert np.allclose(2 * (half - head.base), tip_points(head, angle) - head.base, atol=1e-12)
 
 
 @given(CONFIGS, st.data())
@@ -57,18 +57,18 @@ def test_protraction_lowers_the_tip_until_it_hangs_down(config: HeadConfig, data
     head = ur10_head(config)
     share = data.draw(arrays(float, 6, elements=st.floats(0, 1), unique=True).map(np.sort))
     angle = np.repeat((share * np.radians(config.rest_deg))[:, None], len(head.length), axis=1)
-    heights = height(head, angle)
+    heights = tip_height(head, angle)
     assert (np.diff(heights, axis=0) <= 0).all()
     apart = np.diff(share) > 1e-3
     assert (np.diff(heights, axis=0)[apart] < 0).all()
-    hanging = height(head, np.full(len(head.length), np.radians(config.rest_deg)))
+    hanging = tip_height(head, np.full(len(head.length), np.radians(config.rest_deg)))
     assert np.allclose(hanging, head.base[:, 2] - head.length, atol=1e-12)
 
 
 @given(CONFIGS)
 def test_rings_are_rows_and_directions_columns(config: HeadConfig) -> None:
     head = ur10_head(config)
-    tips = tip(head, np.zeros(len(head.length)))
+    tips = tip_points(head, np.zeros(len(head.length)))
     azimuth = np.arctan2(tips[:, 1], tips[:, 0]).reshape(head.shape)
     assert np.allclose(np.exp(1j * azimuth), np.exp(1j * azimuth[:1]), atol=1e-9)
     steps = np.exp(1j * (azimuth - np.radians(config.first_deg)))
@@ -84,14 +84,14 @@ def test_the_papers_head() -> None:
     head = ur10_head(HeadConfig())
     assert head.shape == (3, 6)
     assert np.allclose(head.length.reshape(3, 6), [[0.05], [0.11], [0.16]])
-    lowest = height(head, np.full(18, np.radians(65.0)))
+    lowest = tip_height(head, np.full(18, np.radians(65.0)))
     assert (lowest > 0).all()  # no whisker meets the floor
-    assert (height(head, np.zeros(18)) > 0.05).all()  # at rest they are above the walls
+    assert (tip_height(head, np.zeros(18)) > 0.05).all()  # at rest they are above the walls
 
 
 def test_the_create_sweeps_forwards_over_the_floor() -> None:
     head = create_head(height=0.04)
-    there = [tip(head, np.full(4, angle)) for angle in (0.0, 0.5, 1.0)]
+    there = [tip_points(head, np.full(4, angle)) for angle in (0.0, 0.5, 1.0)]
     assert np.allclose([points[:, 2] for points in there], 0.04)
     assert (np.diff([points[:, 0] for points in there], axis=0) > 0).all()
     assert np.allclose(there[1][:2] * [1, -1, 1], there[1][:1:-1])  # left and right are mirrored

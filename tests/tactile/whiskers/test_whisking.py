@@ -10,7 +10,14 @@ from hypothesis import strategies as st
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
-from tactile.whiskers.whisking import WhiskingConfig, beside, checked, command, phase, still
+from tactile.whiskers.whisking import (
+    WhiskingConfig,
+    check_amplitude,
+    initial_drive,
+    neighbour_max,
+    whisk_command,
+    whisk_phase,
+)
 
 SHAPE = (3, 6)
 THRESHOLD = np.full(18, 0.04)
@@ -19,9 +26,9 @@ MODES = st.sampled_from(["open", "rcp", "spread"])
 
 def driven(config: WhiskingConfig, y: np.ndarray, rate: float = 2000.0) -> np.ndarray:
     """[T, ..., W] what is commanded over one cycle of deflections [T, ..., W]."""
-    drive, angles = still(*y.shape[1:]), []
+    drive, angles = initial_drive(*y.shape[1:]), []
     for k in range(len(y)):
-        angle, drive = command(config, drive, k / rate, y[k], THRESHOLD, SHAPE)
+        angle, drive = whisk_command(config, drive, k / rate, y[k], THRESHOLD, SHAPE)
         angles.append(angle)
     return np.array(angles)
 
@@ -36,7 +43,7 @@ def touch(whisker: int, size: float, count: int = 1000, since: int = 200) -> np.
 def test_contact_lowers_the_amplitude_only(mode: str, size: float, whisker: int) -> None:
     config = WhiskingConfig(mode=mode)
     angles = driven(config, touch(whisker, size, count=100, since=10), rate=200.0)
-    free = np.radians(config.amplitude_deg) * phase(config, np.arange(100) / 200.0)[:, None]
+    free = np.radians(config.amplitude_deg) * whisk_phase(config, np.arange(100) / 200.0)[:, None]
     assert (angles[0] == 0).all()
     assert (angles >= 0).all()
     assert (angles <= free + 1e-12).all()
@@ -45,14 +52,14 @@ def test_contact_lowers_the_amplitude_only(mode: str, size: float, whisker: int)
 @given(MODES, st.floats(0, 0.04))
 def test_below_the_threshold_nothing_changes(mode: str, size: float) -> None:
     config = WhiskingConfig(mode=mode)
-    free = np.radians(config.amplitude_deg) * phase(config, np.arange(100) / 200.0)
+    free = np.radians(config.amplitude_deg) * whisk_phase(config, np.arange(100) / 200.0)
     np.testing.assert_allclose(driven(config, touch(3, -size, 100, 10), 200.0)[:, 3], free, atol=1e-12)
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_the_loss_is_the_gain_times_the_excess(sign: int) -> None:
     config = WhiskingConfig(gain=2.0)
-    top = driven(config, touch(4, sign * 0.1))[-1] / phase(config, 999 / 2000)
+    top = driven(config, touch(4, sign * 0.1))[-1] / whisk_phase(config, 999 / 2000)
     np.testing.assert_allclose(np.radians(65) - top[4], 2.0 * 0.06, rtol=1e-6)
     np.testing.assert_allclose(np.delete(top, 4), np.radians(65))
 
@@ -62,9 +69,11 @@ def test_a_whisker_does_not_spring_back_within_a_cycle_but_starts_the_next_afres
     y = touch(0, 0.1)
     y[400:] = 0
     assert driven(config, y)[-1, 0] < np.radians(65) - 0.2
-    drive = still(18)
+    drive = initial_drive(18)
     for time in (*np.arange(0, 1, 0.005), 0.0, 0.5):
-        angle, drive = command(config, drive, time, y[300] if 0 < time < 0.4 else y[0], THRESHOLD, SHAPE)
+        angle, drive = whisk_command(
+            config, drive, time, y[300] if 0 < time < 0.4 else y[0], THRESHOLD, SHAPE
+        )
     np.testing.assert_allclose(angle, np.radians(65))
 
 
@@ -88,7 +97,7 @@ def test_one_call_for_many_heads_is_many_calls() -> None:
 def test_free_whiskers_beside_follow_in_part(whisker: int, follow: float) -> None:
     config = WhiskingConfig(mode="spread", follow=follow)
     top = driven(config, touch(whisker, 0.1, 60, 10), 120.0)[-1]
-    loss = np.radians(65) * phase(config, 59 / 120) - top
+    loss = np.radians(65) * whisk_phase(config, 59 / 120) - top
     row, column = divmod(whisker, 6)
     near = {row * 6 + (column + 1) % 6, row * 6 + (column - 1) % 6, *(r * 6 + column for r in range(3))}
     for other in set(range(18)) - {whisker}:
@@ -96,11 +105,11 @@ def test_free_whiskers_beside_follow_in_part(whisker: int, follow: float) -> Non
 
 
 def test_a_single_row_has_ends() -> None:
-    assert beside(np.array([1.0, 0, 0, 0]), (1, 4)).tolist() == [1, 1, 0, 0]
+    assert neighbour_max(np.array([1.0, 0, 0, 0]), (1, 4)).tolist() == [1, 1, 0, 0]
 
 
 def test_more_than_the_drives_allow_is_refused() -> None:
     head = ur10_head(HeadConfig(limit_deg=70))
-    checked(WhiskingConfig(amplitude_deg=70), head)
+    check_amplitude(WhiskingConfig(amplitude_deg=70), head)
     with pytest.raises(InputError, match=r"simulation\.whisking\.amplitude_deg: 80 degrees.*70"):
-        checked(WhiskingConfig(amplitude_deg=80), head)
+        check_amplitude(WhiskingConfig(amplitude_deg=80), head)

@@ -8,7 +8,7 @@ from pathlib import Path
 import jax
 import pytest
 
-from evaluation.artifacts.run_directory import read_card
+from evaluation.artifacts.run_directory import read_scorecard
 from evaluation.metrics.grid_score import score_grid
 from ratslam.experiments.studies.memory import weighed
 from ratslam.experiments.studies.metrics import DIRECTIONS, MEASURED
@@ -26,7 +26,7 @@ def test_a_job_has_the_figures_of_a_run(tiny, tmp_path, backend):
     (job,) = jobs(read_study(tiny(set=SMALL | {"backend": backend}, seeds=[3])))
     result = run_job(job)
     run(job.config, tmp_path / "run")
-    card = read_card(tmp_path / "run")
+    card = read_scorecard(tmp_path / "run")
     assert list(result.quantities) == list(card.quantities)
     for name, quantity in card.quantities.items():
         ours = result.quantities[name]

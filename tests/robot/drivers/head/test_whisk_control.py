@@ -14,7 +14,7 @@ from robot.drivers.head.reader import HeadReader
 from robot.drivers.head.whisk_control import HeadDriver, HostRcp, whisk_commands
 from tactile.base.errors import InputError
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
-from tactile.whiskers.whisking import WhiskingConfig, command, still
+from tactile.whiskers.whisking import WhiskingConfig, initial_drive, whisk_command
 from tests.robot.drivers.head.memory import MemoryHead, until
 
 HEAD = ur10_head(HeadConfig())
@@ -83,10 +83,10 @@ def test_the_host_feeds_back_as_the_law_does(mode, cuts, whisker, bend):
         amplitudes = host.amplitudes(block)
         told += [] if amplitudes is None else [amplitudes]
 
-    drive = still(18)
+    drive = initial_drive(18)
     for k in range(900):
         y = frames.values[k, :, 2] * ANGLE - CENTRE
-        aim, drive = command(whisking, drive, k / 2000, y, THRESHOLD, HEAD.shape)
+        aim, drive = whisk_command(whisking, drive, k / 2000, y, THRESHOLD, HEAD.shape)
     share = (1 - np.cos(2 * np.pi * 899 / 2000)) / 2
     np.testing.assert_allclose(told[-1] * ANGLE, aim / share, atol=ANGLE)
     assert told[-1][whisker] < to_counts(np.radians(65))

@@ -18,7 +18,7 @@ from robot.world.polygons import distance
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.se2 import between, compose, wrap
-from tactile.base.types import Moment, Motion, Report
+from tactile.base.types import MotionKind, Report, StepEnd
 
 SHORT = {"reports": 150}
 
@@ -116,8 +116,8 @@ def test_a_session_is_what_its_samples_say() -> None:
         else:
             assert len(report.time) == 0
         moved = between(before, sample.truth)
-        assert (report.odometry.dx != 0) == (report.motion != Motion.TURN)
-        if report.motion == Motion.TURN:
+        assert (report.odometry.dx != 0) == (report.motion != MotionKind.TURN)
+        if report.motion == MotionKind.TURN:
             assert np.allclose(moved[:2], 0, atol=1e-12)
         else:
             assert abs(moved[2]) < 1e-12
@@ -145,17 +145,17 @@ def test_the_machine_goes_its_way(seed: int) -> None:
     rover = session(seed)
     state, moment, contact = (column(rover, name) for name in ("state", "moment", "contact"))
     follows = {
-        State.FWD1: {Moment.FREE: State.FWD1, Moment.HIT1: State.FWD2, Moment.ABORT: State.BACK},
-        State.FWD2: {Moment.HIT2: State.BACK, Moment.ABORT: State.BACK},
-        State.BACK: {Moment.FREE: State.TURN},
+        State.FWD1: {StepEnd.FREE: State.FWD1, StepEnd.HIT1: State.FWD2, StepEnd.ABORT: State.BACK},
+        State.FWD2: {StepEnd.HIT2: State.BACK, StepEnd.ABORT: State.BACK},
+        State.BACK: {StepEnd.FREE: State.TURN},
     }
     for now, how, then in zip(state[:-1], moment[:-1], state[1:], strict=True):
         if now == State.TURN:
-            assert then in ((State.TURN, State.FWD1) if how == Moment.FREE else (State.BACK,))
+            assert then in ((State.TURN, State.FWD1) if how == StepEnd.FREE else (State.BACK,))
         else:
             assert follows[now][how] == then
-    assert contact[moment == Moment.HIT1].any(axis=1).all()
-    assert not contact[(state == State.FWD1) & (moment == Moment.FREE)].any()
+    assert contact[moment == StepEnd.HIT1].any(axis=1).all()
+    assert not contact[(state == State.FWD1) & (moment == StepEnd.FREE)].any()
     durations = column(rover, "duration")
     assert durations[state != State.FWD2].max() <= 0.5 + 1e-9
     assert durations[state == State.FWD2].max() <= 2.0 + 1e-9
@@ -182,10 +182,10 @@ def test_six_minutes_are_as_in_the_paper() -> None:
         counts.append(
             [
                 rover.length,
-                (moment == Moment.HIT1).sum(),
+                (moment == StepEnd.HIT1).sum(),
                 (bearing[-1] - bearing[0]) / (2 * np.pi),
-                (moment[slow] == Moment.HIT2).mean(),
-                ((state == State.TURN) & (moment == Moment.ABORT)).sum(),
+                (moment[slow] == StepEnd.HIT2).mean(),
+                ((state == State.TURN) & (moment == StepEnd.ABORT)).sum(),
             ]
         )
     reports, hits, circuits, seconds, stuck = np.array(counts).T
@@ -204,7 +204,7 @@ def test_whiskers_that_are_dead_never_report() -> None:
     assert (next(iter(rover)).reading.alive == [False, True, True, False]).all()
     alone = made(whiskers={"dead": [0, 1, 2, 3]})  # nothing but its bumper
     assert not column(alone, "contact").any()
-    assert (column(alone, "moment") == Moment.ABORT).any()
+    assert (column(alone, "moment") == StepEnd.ABORT).any()
 
 
 def into(angle_deg: float, seed: int = 0, **changes: Any) -> Report:

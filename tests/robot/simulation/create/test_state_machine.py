@@ -22,7 +22,7 @@ from robot.simulation.create.state_machine import (
 )
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose
-from tactile.base.types import Moment, Motion
+from tactile.base.types import MotionKind, StepEnd
 
 CONFIG = BehaviourConfig()
 ROWS = 40
@@ -35,7 +35,7 @@ def quiet() -> np.ndarray:
 
 def end_of(
     state: State, strain: np.ndarray, bumped: int = ROWS, before: np.ndarray = NONE
-) -> tuple[int, Moment]:
+) -> tuple[int, StepEnd]:
     end = ended(CONFIG, state, strain, np.arange(ROWS) >= bumped, before)
     return end.row, end.moment
 
@@ -43,17 +43,17 @@ def end_of(
 @pytest.mark.parametrize(
     ("state", "moment", "then"),
     [
-        (State.FWD1, Moment.FREE, State.FWD1),
-        (State.FWD1, Moment.HIT1, State.FWD2),
-        (State.FWD1, Moment.ABORT, State.BACK),
-        (State.FWD2, Moment.HIT2, State.BACK),
-        (State.FWD2, Moment.ABORT, State.BACK),
-        (State.BACK, Moment.FREE, State.TURN),
-        (State.TURN, Moment.FREE, State.FWD1),
-        (State.TURN, Moment.ABORT, State.BACK),
+        (State.FWD1, StepEnd.FREE, State.FWD1),
+        (State.FWD1, StepEnd.HIT1, State.FWD2),
+        (State.FWD1, StepEnd.ABORT, State.BACK),
+        (State.FWD2, StepEnd.HIT2, State.BACK),
+        (State.FWD2, StepEnd.ABORT, State.BACK),
+        (State.BACK, StepEnd.FREE, State.TURN),
+        (State.TURN, StepEnd.FREE, State.FWD1),
+        (State.TURN, StepEnd.ABORT, State.BACK),
     ],
 )
-def test_what_follows_what(state: State, moment: Moment, then: State) -> None:
+def test_what_follows_what(state: State, moment: StepEnd, then: State) -> None:
     doing = following(CONFIG, Doing(state), moment, 0.0, stream(0, "behaviour"))
     assert doing.state == then
     assert (doing.rest != 0) == (then == State.TURN)
@@ -62,14 +62,14 @@ def test_what_follows_what(state: State, moment: Moment, then: State) -> None:
 def test_a_turn_is_made_in_steps_that_add_up() -> None:
     random = stream(0, "behaviour")
     for _ in range(50):
-        doing = following(CONFIG, Doing(State.BACK), Moment.FREE, 0.0, random)
+        doing = following(CONFIG, Doing(State.BACK), StepEnd.FREE, 0.0, random)
         whole, total, steps = doing.rest, 0.0, 0
         while doing.state == State.TURN:
             told = command(CONFIG, doing)
             assert told.speed == 0
             assert told.duration <= 0.5
             total += told.rate * told.duration
-            doing = following(CONFIG, doing, Moment.FREE, told.rate * told.duration, random)
+            doing = following(CONFIG, doing, StepEnd.FREE, told.rate * told.duration, random)
             steps += 1
         assert doing.state == State.FWD1
         assert total == pytest.approx(whole, abs=1e-5)
@@ -86,7 +86,12 @@ def test_speeds_and_times_are_the_papers() -> None:
     assert command(CONFIG, Doing(State.FWD1)) == (0.05, 0.0, 0.5)
     assert command(CONFIG, Doing(State.BACK)) == (-0.05, 0.0, 0.5)
     assert command(CONFIG, Doing(State.FWD2))[:2] == (0.02, 0.0)
-    assert [state.motion for state in State] == [Motion.FORWARD, Motion.FORWARD, Motion.BACK, Motion.TURN]
+    assert [state.motion for state in State] == [
+        MotionKind.FORWARD,
+        MotionKind.FORWARD,
+        MotionKind.BACK,
+        MotionKind.TURN,
+    ]
 
 
 def drawn(**changes: object) -> np.ndarray:
@@ -108,8 +113,8 @@ def test_turns_are_drawn_from_the_two_gaussians() -> None:
 
 def test_an_undisturbed_motion_ends_as_planned() -> None:
     for state in (State.FWD1, State.BACK, State.TURN):
-        assert end_of(state, quiet()) == (ROWS - 1, Moment.FREE)
-    assert end_of(State.FWD2, quiet()) == (ROWS - 1, Moment.ABORT)
+        assert end_of(state, quiet()) == (ROWS - 1, StepEnd.FREE)
+    assert end_of(State.FWD2, quiet()) == (ROWS - 1, StepEnd.ABORT)
 
 
 @given(st.integers(0, ROWS - 2), st.integers(0, ROWS - 2), st.integers(0, ROWS - 2), st.sampled_from([-1, 1]))
@@ -119,9 +124,9 @@ def test_the_first_thing_ends_it(touch: int, over: int, bump: int, sign: int) ->
     strain[over:, 2, 0] = sign * 1.5 * CONFIG.safety
     stop = min(over, bump)
     # What is over the safety threshold is over the contact threshold as well: too much comes first.
-    expected = (touch, Moment.HIT1) if touch < stop else (stop, Moment.ABORT)
+    expected = (touch, StepEnd.HIT1) if touch < stop else (stop, StepEnd.ABORT)
     assert end_of(State.FWD1, strain, bump) == expected
-    assert end_of(State.BACK, strain, bump) == (bump, Moment.FREE)
+    assert end_of(State.BACK, strain, bump) == (bump, StepEnd.FREE)
 
 
 @given(st.integers(0, 3), st.integers(0, 3), st.integers(10, ROWS - 2))
@@ -131,7 +136,7 @@ def test_a_second_whisker_is_another_one(first: int, second: int, row: int) -> N
     strain[:, first, 0] = 2 * CONFIG.contact
     strain[row:, second, 0] = -2 * CONFIG.contact
     other = second != first
-    expected = (row, Moment.HIT2) if other else (ROWS - 1, Moment.ABORT)
+    expected = (row, StepEnd.HIT2) if other else (ROWS - 1, StepEnd.ABORT)
     assert end_of(State.FWD2, strain, before=before) == expected
     # Also when the first one has slipped off by then.
     strain[row - 5 :, first] = 0
@@ -142,7 +147,7 @@ def test_a_second_whisker_is_another_one(first: int, second: int, row: int) -> N
 def test_two_whiskers_at_once_are_felt_for_a_while() -> None:
     before = np.array([False, True, True, False])
     row, moment = end_of(State.FWD2, quiet(), before=before)
-    assert moment == Moment.HIT2
+    assert moment == StepEnd.HIT2
     assert row == round(CONFIG.least / CONFIG.period)
 
 
@@ -150,16 +155,16 @@ def test_too_much_in_either_channel_ends_it() -> None:
     for channel in (0, 1):
         strain = quiet()
         strain[7:, 3, channel] = -1.1 * CONFIG.safety
-        assert end_of(State.FWD2, strain) == (7, Moment.ABORT)
+        assert end_of(State.FWD2, strain) == (7, StepEnd.ABORT)
 
 
 def test_a_turn_may_get_a_whisker_out_of_what_it_is_in() -> None:
     strain = quiet()
     strain[:, 1, 0] = np.linspace(2.0, 0.5, ROWS) * CONFIG.safety
-    assert end_of(State.TURN, strain) == (ROWS - 1, Moment.FREE)
+    assert end_of(State.TURN, strain) == (ROWS - 1, StepEnd.FREE)
     strain[:, 1, 0] = np.linspace(1.2, 2.0, ROWS) * CONFIG.safety
     row, moment = end_of(State.TURN, strain)
-    assert moment == Moment.ABORT
+    assert moment == StepEnd.ABORT
     assert 0 < row < ROWS - 1
 
 

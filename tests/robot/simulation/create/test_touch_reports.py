@@ -13,30 +13,30 @@ from robot.world.polygons import distance
 from robot.world.random_arena import ArenaConfig
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose
-from tactile.base.types import Moment, Odometry, Report
-from tactile.wall_estimation.estimators import touching
-from tactile.wall_estimation.report_frontend import Reporting, ReportsConfig
+from tactile.base.types import Odometry, Report, StepEnd
+from tactile.wall_estimation.estimators import contact_points
+from tactile.wall_estimation.report_frontend import ReportFrontend, ReportFrontendConfig
 from tactile.wall_estimation.strain_templates import (
     StrainTemplates,
     TemplateTraining,
-    driven,
-    matched,
-    smoothed,
-    train,
+    filter_strain,
+    match_template,
+    train_templates,
+    training_drive,
 )
 from tests.helpers.flat_walls import apart
 
 CONFIG = RovingConfig()
 TRAINING = TemplateTraining()
-POINTS = touching(ReportsConfig().feelers, 0.13)
+POINTS = contact_points(ReportFrontendConfig().feelers, 0.13)
 ARENAS = range(4)
 
 
 @pytest.fixture(scope="module")
 def templates() -> StrainTemplates:
     random = stream(0, "training")
-    return train(
-        driven(float(angle), k, drive_into_wall(CONFIG, float(angle), random))
+    return train_templates(
+        training_drive(float(angle), k, drive_into_wall(CONFIG, float(angle), random))
         for angle in TRAINING.angles
         for k in range(TRAINING.repeats)
     )
@@ -52,11 +52,11 @@ def slow(drive: Report, seconds: float) -> tuple[Report, Report]:
     first = int(np.abs(drive.strain[:20, :, 0].mean(axis=0)).argmax())
     contact = np.arange(4) == first
     none = drive.strain[:0]
-    hit = drive._replace(moment=int(Moment.HIT1), contact=contact, time=drive.time[:0], strain=none)
+    hit = drive._replace(moment=int(StepEnd.HIT1), contact=contact, time=drive.time[:0], strain=none)
     end = Odometry(0.02 * seconds, 0.0, 0.0, seconds)
     return hit, drive._replace(
         odometry=end,
-        moment=int(Moment.ABORT),
+        moment=int(StepEnd.ABORT),
         contact=contact,
         time=drive.time[:count],
         strain=drive.strain[:count],
@@ -65,14 +65,19 @@ def slow(drive: Report, seconds: float) -> tuple[Report, Report]:
 
 def test_held_out_walls_are_known_to_a_few_degrees(templates: StrainTemplates) -> None:
     """At every angle, those between templates too."""
-    random, reporting, off, raw = stream(9, "held out"), Reporting(ReportsConfig(), templates), [], []
+    random, reporting, off, raw = (
+        stream(9, "held out"),
+        ReportFrontend(ReportFrontendConfig(), templates),
+        [],
+        [],
+    )
     for degrees in np.arange(25.3, 156.0, 5.0):
         drive = drive_into_wall(CONFIG, float(np.radians(degrees)), random)
-        seen = [reporting.observed(report) for report in slow(drive, 1.0)][-1]
+        seen = [reporting.observe(report) for report in slow(drive, 1.0)][-1]
         assert seen is not None
         assert seen.wall, degrees
         off.append(apart(direction(seen.wall_point), np.radians(degrees)))
-        match = matched(templates, smoothed(TRAINING, drive.strain[:2000]))
+        match = match_template(templates, filter_strain(TRAINING, drive.strain[:2000]))
         raw.append(apart(match.angle, np.radians(degrees)))
     print(
         f"held-out flat walls: fused {np.mean(off):.2f} ({max(off):.1f}), winner {np.mean(raw):.1f} degrees"
@@ -92,10 +97,10 @@ class Score(NamedTuple):
 
 
 CONFIGS = {
-    "winner": ReportsConfig(walls="template", flat=None),
-    "template": ReportsConfig(walls="template"),
-    "geometric": ReportsConfig(walls="geometric"),
-    "fused": ReportsConfig(),
+    "winner": ReportFrontendConfig(walls="template", flat=None),
+    "template": ReportFrontendConfig(walls="template"),
+    "geometric": ReportFrontendConfig(walls="geometric"),
+    "fused": ReportFrontendConfig(),
 }
 
 
@@ -105,13 +110,13 @@ def scored(templates: StrainTemplates, side: float) -> dict[str, Score]:
     off: dict[str, list[float]] = {name: [] for name in CONFIGS}
     for seed in ARENAS:
         world = roving(RovingConfig(arena=ArenaConfig(side=side), reports=500, seed=seed))
-        reporting = {name: Reporting(config, templates) for name, config in CONFIGS.items()}
+        reporting = {name: ReportFrontend(config, templates) for name, config in CONFIGS.items()}
         walls = segments(world.arena)
         before: tuple[Report, np.ndarray] | None = None
         for _, reading, truth in world:
             assert isinstance(reading, Report)
             assert truth is not None
-            seen = {name: one.observed(reading) for name, one in reporting.items()}
+            seen = {name: one.observe(reading) for name, one in reporting.items()}
             if before is not None and len(reading.strain):
                 meetings += 1
                 hit, there = before

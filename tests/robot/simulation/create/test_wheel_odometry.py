@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from robot.simulation.create.wheel_odometry import WheelsConfig, reckoned
 from tactile.base.random_streams import stream
-from tactile.base.types import Motion
+from tactile.base.types import MotionKind
 
 KINDS = ("white", "move", "bias", "none")
 
@@ -17,10 +17,10 @@ KINDS = ("white", "move", "bias", "none")
 def driven(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Seven steps ahead, one back, two of turning, again and again: motions [N, 4] and kinds [N]."""
     phase = np.arange(count) % 10
-    kind = np.where(phase < 7, Motion.FORWARD, np.where(phase < 8, Motion.BACK, Motion.TURN))
+    kind = np.where(phase < 7, MotionKind.FORWARD, np.where(phase < 8, MotionKind.BACK, MotionKind.TURN))
     motion = np.zeros((count, 4))
-    motion[:, 0] = np.where(kind == Motion.FORWARD, 0.025, np.where(kind == Motion.BACK, -0.025, 0.0))
-    motion[:, 2] = np.where(kind == Motion.TURN, 0.15, 0.0)
+    motion[:, 0] = np.where(kind == MotionKind.FORWARD, 0.025, np.where(kind == MotionKind.BACK, -0.025, 0.0))
+    motion[:, 2] = np.where(kind == MotionKind.TURN, 0.15, 0.0)
     motion[:, 3] = 0.5
     return motion, kind
 
@@ -31,7 +31,7 @@ def scales(
     """Told over true, of what moves in each step, and the kinds."""
     motion, kind = driven(count)
     told = reckoned(WheelsConfig(noise=noise, level=level), motion, kind, stream(seed, "wheels"))
-    column = np.where(kind == Motion.TURN, 2, 0)
+    column = np.where(kind == MotionKind.TURN, 2, 0)
     rows = np.arange(count)
     return told[rows, column] / motion[rows, column], kind
 
@@ -77,7 +77,7 @@ def test_a_bias_lasts_the_run() -> None:
     lengths, turns = [], []
     for seed in range(300):
         scale, kind = scales("bias", 200, seed)
-        turned = kind == Motion.TURN
+        turned = kind == MotionKind.TURN
         assert scale[~turned].std() == pytest.approx(0.01, rel=0.3)
         lengths.append(scale[~turned].mean())
         turns.append(scale[turned].mean())

@@ -15,7 +15,7 @@ from robot.simulation.head.whisk_stream import Sweep
 from robot.world.walls import FREE
 from tactile.base.random_streams import stream
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
-from tactile.whiskers.whisking import Drive, WhiskingConfig, command
+from tactile.whiskers.whisking import WhiskDrive, WhiskingConfig, whisk_command
 
 HEAD = ur10_head(HeadConfig())
 SAMPLES, CYCLES = 80, 3
@@ -43,8 +43,8 @@ def test_a_cycle_in_parts_is_the_cycle(cuts: list[int], mode: str) -> None:
     config, mechanics, whole = StreamConfig(rate=SAMPLES), MechanicsConfig(slip=0.1), sweep()
     whisking, threshold = WhiskingConfig(mode=mode), np.full(18, 0.04)
 
-    def law(drive: Drive, time: float, told: np.ndarray) -> tuple[np.ndarray, Drive]:
-        return command(whisking, drive, time, told, threshold, HEAD.shape)
+    def law(drive: WhiskDrive, time: float, told: np.ndarray) -> tuple[np.ndarray, WhiskDrive]:
+        return whisk_command(whisking, drive, time, told, threshold, HEAD.shape)
 
     ends = [0, *sorted(cuts), SAMPLES]
     balance, parts = rest(CYCLES, 18), []
@@ -62,8 +62,8 @@ def test_a_beginning_is_not_used_up() -> None:
     config, mechanics, whole = StreamConfig(rate=SAMPLES), MechanicsConfig(slip=0.1), sweep()
     whisking = WhiskingConfig(mode="open")
 
-    def law(drive: Drive, time: float, told: np.ndarray) -> tuple[np.ndarray, Drive]:
-        return command(whisking, drive, time, told, np.full(18, 0.04), HEAD.shape)
+    def law(drive: WhiskDrive, time: float, told: np.ndarray) -> tuple[np.ndarray, WhiskDrive]:
+        return whisk_command(whisking, drive, time, told, np.full(18, 0.04), HEAD.shape)
 
     before = rest(CYCLES, 18)
     first = advance(config, mechanics, law, whole, before)

@@ -16,8 +16,8 @@ from robot.world.walls import Surroundings, Walls
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.types import Cycle
-from tactile.features.calibration import Calibration, CalibrationConfig, calibrated
-from tactile.features.contact import ContactConfig, ShaftConfig, sensed, stiffness
+from tactile.features.calibration import Calibration, CalibrationConfig, calibrate
+from tactile.features.contact import ContactConfig, ShaftConfig, detect_contacts, stiffness
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 from tactile.whiskers.whisking import WhiskingConfig
 
@@ -35,7 +35,7 @@ def calibration(
     tier: Tier, mechanics: MechanicsConfig = MECHANICS, config: StreamConfig = STREAM
 ) -> Calibration:
     record = free_cycles(tier, config, mechanics, OPEN, HEAD, 4, stream(9, "calibration"))
-    return calibrated(CalibrationConfig(), record)
+    return calibrate(CalibrationConfig(), record)
 
 
 def still(wall: Walls) -> tuple[Surroundings, Path]:
@@ -72,7 +72,7 @@ def felt(tier: Tier, count: int, whisking: WhiskingConfig, rate: float = 2000.0)
     raw = cycles(
         tier, config, MECHANICS, whisking, there, path, start, stream(1, "sensor"), known.threshold[:, 1]
     )
-    whisks = [sensed(ContactConfig(), known, cycle) for cycle in raw]
+    whisks = [detect_contacts(ContactConfig(), known, cycle) for cycle in raw]
     return Felt(*(np.array([getattr(whisk, name) for whisk in whisks]) for name in Felt._fields))
 
 
@@ -200,7 +200,7 @@ def test_where_drives_are_soft_feedback_brings_nothing() -> None:
             stream(1, "sensor"),
             known.threshold[:, 1],
         )
-        return np.array([sensed(ContactConfig(), known, cycle).held for cycle in raw])
+        return np.array([detect_contacts(ContactConfig(), known, cycle).held for cycle in raw])
 
     soft, stiff = (kept(servo, RCP).mean() - kept(servo, OPEN).mean() for servo in (0.3, 3.0))
     assert abs(soft) < 0.03
@@ -210,7 +210,7 @@ def test_where_drives_are_soft_feedback_brings_nothing() -> None:
 def test_dead_whiskers_send_nothing_and_are_known_as_dead() -> None:
     head = ur10_head(HeadConfig(dead=(3, 7)))
     record = free_cycles(quasistatic, STREAM, MECHANICS, OPEN, head, 4, stream(0, "calibration"))
-    assert np.flatnonzero(~calibrated(CalibrationConfig(), record).alive).tolist() == [3, 7]
+    assert np.flatnonzero(~calibrate(CalibrationConfig(), record).alive).tolist() == [3, 7]
 
 
 @TIERS
@@ -218,4 +218,4 @@ def test_a_record_among_walls_is_no_calibration(tier: Tier) -> None:
     there, path, start = maze(6)
     raw = cycles(tier, STREAM, MECHANICS, OPEN, there, path, start, stream(1, "s"), np.full(18, np.inf))
     with pytest.raises(InputError, match="contacts of whisker"):
-        calibrated(CalibrationConfig(), list(raw))
+        calibrate(CalibrationConfig(), list(raw))
