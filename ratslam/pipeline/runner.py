@@ -76,7 +76,7 @@ class Playing:
         self._store.append(_lines(samples, steps, reckoned, BACKENDS[self._config.backend]))
         error = self._present.see(self.session, self._truth.rows)
         if error is not None:
-            self._store.append({"anytime.csv": iter([f"{float(samples[-1].time)!r},{error!r}\n"])})
+            self._store.append({"online_error.csv": iter([f"{float(samples[-1].time)!r},{error!r}\n"])})
         if self.session.steps - self._saved >= max(CHECKPOINT_EVERY, self.session.steps // CHECKPOINT_SHARE):
             self._checkpoint()
             self._saved = self.session.steps
