@@ -15,8 +15,16 @@ GROUPS = ("run", "live", "look", "study", "papers", "files")
 DESCRIPTION = "RatSLAM with whiskers, cameras or lasers: from a recording, simulation or robot to a map."
 
 
+RETIRED = {"tune": "reproduce threshold"}
+"""Commands of earlier versions, and what replaces each."""
+
+
 def main(argv: list[str] | None = None) -> int:
     """Parses the arguments and runs one command; returns the exit code."""
+    argv = sys.argv[1:] if argv is None else argv
+    if argv and argv[0] in RETIRED:
+        print(f"ratslam: error: `{argv[0]}` is now `ratslam {RETIRED[argv[0]]}`", file=sys.stderr)
+        return INPUT_ERROR
     arguments = build_parser().parse_args(argv)
     try:
         return arguments.command(arguments)

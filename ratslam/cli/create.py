@@ -1,47 +1,28 @@
-"""The commands for the Create and for two backends: train-templates, compare; and names of reproductions."""
+"""The commands that compare methods and tiers of simulation: compare, tiers."""
 
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from ratslam.cli.common import Commands, add_config, prepare_jax, read_config
 from tactile.base.errors import InputError
 
-SETS = {"fox-fig4": 20, "fox-fig5": 2, "fox-fig6": 3}
-"""Of the reproductions, known before jax is loaded: sets of each."""
-
 
 def add_commands(commands: Commands) -> None:
     """Registers them."""
-    train = commands.add(
-        "train-templates", _train, "record strain templates of a simulated Create",
-        "train-templates configs/create_arena.yaml -o runs/templates.npz", "papers",
-    )  # fmt: skip
-    add_config(train)
-    train.add_argument("-o", "--output", type=Path, required=True, metavar="NPZ", help="the new file")
-
     compare = commands.add(
         "compare", _compare, "run a whisker session through both backends",
         "compare configs/create_arena.yaml", "study",
     )  # fmt: skip
     add_config(compare)
-
-
-def _train(arguments: argparse.Namespace) -> int:
-    from ratslam.experiments.fox2012.template_training import held_out, report, schooled
-
-    roving = read_config(arguments).roving
-    if roving is None:
-        raise InputError(
-            str(arguments.config), "no `roving:`", "the Create to train", "`roving: {}` is the usual one"
-        )
-    templates = schooled(roving, arguments.output)
-    print(report(held_out(roving, templates), templates.training.repeats))
-    print(
-        f"\n{arguments.output} holds the templates: `touch.reports.templates: {arguments.output}` uses them"
+    tiers = commands.add(
+        "tiers", _tiers, "run a scene through all tiers of simulation",
+        "tiers configs/whisker_maze.yaml --seconds 60", "study",
+    )  # fmt: skip
+    add_config(tiers)
+    tiers.add_argument(
+        "--seconds", type=float, default=600.0, metavar="S", help="of the session at most (default 600)"
     )
-    return 0
 
 
 def _compare(arguments: argparse.Namespace) -> int:
@@ -49,4 +30,16 @@ def _compare(arguments: argparse.Namespace) -> int:
     from ratslam.experiments.backend_comparison import compared, report
 
     print(report(compared(read_config(arguments), arguments.config.parent)))
+    return 0
+
+
+def _tiers(arguments: argparse.Namespace) -> int:
+    if not 0 < arguments.seconds < float("inf"):
+        raise InputError("--seconds", str(arguments.seconds), "a time above 0 s")
+    prepare_jax(keep_compiled=False)
+    from ratslam.config.strict_yaml import load, override
+    from ratslam.experiments.fidelity_comparison import report, tiers
+
+    document = override(load(arguments.config), arguments.set)
+    print(report(*tiers(document, arguments.config.parent, arguments.seconds)))
     return 0

@@ -1,8 +1,9 @@
-"""The commands for whiskers: reproduce, tune, tiers."""
+"""The command `reproduce`, for figures of the whisker papers and tables of results; and `train-templates`."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from ratslam.cli.common import (
@@ -13,101 +14,226 @@ from ratslam.cli.common import (
     add_workers,
     positive_integer,
     prepare_jax,
+    read_config,
 )
-from ratslam.cli.create import SETS
 from tactile.base.errors import InputError
 
-NAMES = ("fig2", "fig3", "fig4", "fig5", "fig6", "fig7", "reverse", "controls", "matched")
-"""Of the reproductions of Salman & Pearson 2016, known before jax is loaded; Fox et al.'s are in `SETS`."""
-USUAL = 3
-"""Sets of each."""
+SALMAN2016 = {
+    "fig2": "odometry drift over three clockwise laps",
+    "fig3": "experience history",
+    "fig4": "kidnapped against not",
+    "fig5": "clockwise and anticlockwise laps",
+    "fig6": "open loop against RCP, max_angle",
+    "fig7": "contact_angle against max_angle",
+    "reverse": "driving forwards and backwards (added)",
+    "controls": "the contribution of the images (added)",
+    "matched": "conditions at matched ARCR, classic matcher",
+}
+"""Reproductions of Salman & Pearson 2016."""
+FOX2012 = {
+    "fox-fig4": "mean maps of three mappers",
+    "fox-fig5": "maps of single trials",
+    "fox-fig6": "a larger arena at two levels of odometry noise",
+}
+"""Reproductions of Fox et al. 2012."""
+SETS = {"fox-fig4": 20, "fox-fig5": 2}
+"""Default number of sets where it is not `USUAL_SETS`."""
+USUAL_SETS = 3
+BACKENDS, MOTIONS = ("recall", "classic"), ("random", "drive")
+
+Lines = Callable[[argparse.Namespace], Iterator[str]]
 
 
 def add_commands(commands: Commands) -> None:
-    """Registers them."""
+    """Registers `reproduce` with a command for each figure and table, and `train-templates`."""
     reproduce = commands.add(
-        "reproduce", _reproduce, "reproduce a figure of a paper, with controls",
-        "reproduce fig2 --sets 1", "papers",
-    )  # fmt: skip
-    every, usual = (*NAMES, *SETS), ", ".join(f"{name} {sets}" for name, sets in SETS.items())
-    reproduce.add_argument("name", choices=every, metavar="NAME", help=", ".join(every))
-    reproduce.add_argument(
-        "--sets",
-        type=positive_integer,
-        metavar="N",
-        help=f"mazes or trials a condition (default {USUAL}; {usual})",
+        "reproduce", None, "reproduce a figure or table, with controls", "reproduce fig2 --sets 1", "papers"
     )
-    reproduce.add_argument("--seed", type=int, default=0, metavar="S", help="of all sets (default 0)")
-    reproduce.add_argument(
+    names = Commands(reproduce)
+    for paper, figures in (("Salman & Pearson", SALMAN2016), ("Fox et al.", FOX2012)):
+        for name, title in figures.items():
+            add_figure(names, name, f"{paper}: {title}")
+    threshold = names.add(
+        "threshold", _threshold, "Salman & Pearson: threshold tuning, classic method",
+        "reproduce threshold configs/whisker_maze.yaml -o runs/threshold",
+    )  # fmt: skip
+    add_config(threshold)
+    add_workers(threshold, 1)
+    threshold.add_argument(
+        "-o", "--output", type=Path, metavar="DIR", help="folder for threshold.png and threshold.csv"
+    )
+    tables = names.add(
+        "tables", None, "print a table of the results as Markdown", "reproduce tables laser --rows square"
+    )
+    add_tables(Commands(tables))
+    train = commands.add(
+        "train-templates", _train, "record strain templates of a simulated Create",
+        "train-templates configs/create_arena.yaml -o runs/templates.npz", "papers",
+    )  # fmt: skip
+    add_config(train)
+    train.add_argument("-o", "--output", type=Path, required=True, metavar="NPZ", help="the new file")
+
+
+def add_figure(names: Commands, name: str, title: str) -> None:
+    """Registers a figure."""
+    parser = names.add(name, _figure, title, f"reproduce {name} --sets 1")
+    sets = SETS.get(name, USUAL_SETS)
+    add_count(parser, "--sets", sets, "mazes or trials per condition")
+    parser.add_argument("--seed", type=int, default=0, metavar="S", help="seed of all sets (default 0)")
+    parser.add_argument(
         "-o", "--output", type=Path, default=Path("runs") / "reproduce", metavar="DIR",
-        help="where NAME.csv and NAME.png go (default runs/reproduce)",
+        help=f"folder for {name}.csv and {name}.png (default runs/reproduce)",
     )  # fmt: skip
-    add_set(reproduce)
-    add_workers(reproduce)
+    add_set(parser)
+    add_workers(parser)
+    parser.set_defaults(name=name)
 
-    tune = commands.add(
-        "tune", _tune, "choose the classic matcher's threshold as the paper does",
-        "tune configs/whisker_maze.yaml", "papers",
-    )  # fmt: skip
-    add_config(tune)
-    add_workers(tune, 1)
-    tune.add_argument("-o", "--output", type=Path, metavar="DIR", help="leave tune.png and tune.csv there")
 
-    tiers = commands.add(
-        "tiers", _tiers, "run a scene through all tiers of simulation",
-        "tiers configs/whisker_maze.yaml --seconds 60", "study",
-    )  # fmt: skip
-    add_config(tiers)
-    tiers.add_argument(
-        "--seconds", type=float, default=600.0, metavar="S", help="of the session at most (default 600)"
+def add_tables(tables: Commands) -> None:
+    """Registers the tables."""
+
+    def table(name: str, lines: Lines, help: str, example: str) -> argparse.ArgumentParser:
+        parser = tables.add(name, _print_table, help, f"reproduce tables {name} {example}")
+        parser.set_defaults(lines=lines)
+        return parser
+
+    touch = table("touch", _touch_lines, "whisker sessions under many conditions", "--rows main --mazes 1")
+    add_count(touch, "--mazes", 6, "mazes per row")
+    add_count(touch, "--seeds", 2, "sessions per maze")
+    touch.add_argument("--backend", choices=BACKENDS, default="recall", help="the method (default recall)")
+    grid = table("grid", _grid_lines, "the grid filter in arenas", "--rows bias --worlds A --arenas 1")
+    add_count(grid, "--arenas", 10, "arenas per row")
+    add_count(grid, "--first", 9000, "seed of the first arena")
+    grid.add_argument("--worlds", nargs="+", choices=("A", "B", "rotated"), help="only these kinds of arena")
+    laser = table("laser", _laser_lines, "recordings with laser views or given places", "--rows square")
+    add_count(laser, "--copies", 10, "perturbed copies per recording")
+    for parser in (touch, grid, laser):
+        parser.add_argument("--rows", nargs="+", metavar="ROW", help="only these rows")
+        add_workers(parser)
+    speed = table("speed", _speed_lines, "microseconds per pose-cell step by network size", "--rows 21 41")
+    speed.add_argument("--rows", nargs="+", type=positive_integer, metavar="N", help="cells along one side")
+    add_count(speed, "--rounds", 5, "repeats, of which the median is taken")
+    precision = table("precision", _precision_lines, "float32 against float64", "--seeds 2 --backends recall")
+    add_count(precision, "--seeds", 20, "sessions per method")
+    precision.add_argument("--backends", nargs="+", choices=BACKENDS, default=BACKENDS, help="the methods")
+    precision.add_argument("-o", "--output", type=Path, metavar="DIR", help="folder for BACKEND.npz")
+    add_workers(precision, 1)
+    chaos = table("chaos", _chaos_lines, "separation of two almost equal pose-cell runs", "--steps 1000")
+    add_count(chaos, "--steps", 100_000, "steps per walk")
+    add_count(chaos, "--walks", 3, "walks per row")
+    chaos.add_argument("--pairs", nargs="+", metavar="PAIR", help="only these pairs of runs")
+    chaos.add_argument("--motions", nargs="+", choices=MOTIONS, default=MOTIONS, help="only these motions")
+
+
+def add_count(parser: argparse.ArgumentParser, name: str, default: int, help: str) -> None:
+    """Adds an option for a positive integer."""
+    parser.add_argument(
+        name, type=positive_integer, default=default, metavar="N", help=f"{help} (default {default})"
     )
 
 
-def _reproduce(arguments: argparse.Namespace) -> int:
+def _figure(arguments: argparse.Namespace) -> int:
     if arguments.seed < 0:
-        raise InputError("--seed", str(arguments.seed), "a whole number from 0 on")
+        raise InputError("--seed", str(arguments.seed), "a non-negative integer")
     prepare_jax(keep_compiled=False)
-    if arguments.name in SETS:
+    if arguments.name in FOX2012:
         from ratslam.experiments.fox2012.reproduction import reproduce
     else:
         from ratslam.experiments.salman2016.reproduction import reproduce
 
+    name, folder = arguments.name, arguments.output
     text, interrupted = reproduce(
-        arguments.name,
-        arguments.output,
-        sets=arguments.sets or SETS.get(arguments.name, USUAL),
+        name,
+        folder,
+        sets=arguments.sets,
         workers=arguments.workers,
         seed=arguments.seed,
         assignments=arguments.set,
     )
-    print(text)
-    left = "the rows" if interrupted else f"the figure; {arguments.output / arguments.name}.csv the rows"
-    kind = "csv" if interrupted else "png"
-    print(f"\n{arguments.output / arguments.name}.{kind} holds {left}")
+    print(f"{text}\n\nwrote {folder / name}.csv" + ("" if interrupted else f" and {folder / name}.png"))
     return INTERRUPTED if interrupted else 0
 
 
-def _tune(arguments: argparse.Namespace) -> int:
+def _threshold(arguments: argparse.Namespace) -> int:
     prepare_jax(keep_compiled=False)
     from ratslam.config.strict_yaml import load, override
     from ratslam.experiments.salman2016.threshold_tuning import render_tuning, save_tuning, tune_threshold
 
     document = override(load(arguments.config), arguments.set)
-    found = tune_threshold(document, Path(arguments.config).parent, arguments.workers)
-    print(render_tuning(found))
+    tuning = tune_threshold(document, arguments.config.parent, arguments.workers)
+    print(render_tuning(tuning))
     if arguments.output:
-        picture, table = save_tuning(found, arguments.output)
-        print(f"\n{picture} shows the distances and thresholds, {table} holds them")
+        plot, table = save_tuning(tuning, arguments.output)
+        print(f"\nwrote {plot} and {table}")
     return 0
 
 
-def _tiers(arguments: argparse.Namespace) -> int:
-    if not 0 < arguments.seconds < float("inf"):
-        raise InputError("--seconds", str(arguments.seconds), "a time above 0 s")
+def _train(arguments: argparse.Namespace) -> int:
+    from ratslam.experiments.fox2012.template_training import held_out, report, schooled
+
+    roving = read_config(arguments).roving
+    if roving is None:
+        raise InputError(
+            str(arguments.config), "no `roving:`", "the Create to train", "`roving: {}` is the usual one"
+        )
+    templates = schooled(roving, arguments.output)
+    print(report(held_out(roving, templates), templates.training.repeats))
+    print(f"\nwrote {arguments.output}; `touch.reports.templates: {arguments.output}` uses it")
+    return 0
+
+
+def _print_table(arguments: argparse.Namespace) -> int:
     prepare_jax(keep_compiled=False)
-    from ratslam.config.strict_yaml import load, override
-    from ratslam.experiments.fidelity_comparison import report, tiers
-
-    document = override(load(arguments.config), arguments.set)
-    print(report(*tiers(document, Path(arguments.config).parent, arguments.seconds)))
+    for line in arguments.lines(arguments):
+        print(line, flush=True)
     return 0
+
+
+def _touch_lines(arguments: argparse.Namespace) -> Iterator[str]:
+    from ratslam.experiments.tables.markdown import select_rows
+    from ratslam.experiments.tables.touch import DEFAULT_ROWS, ROWS, touch_table
+
+    rows = select_rows(arguments.rows, ROWS, DEFAULT_ROWS)
+    return touch_table(rows, arguments.mazes, arguments.seeds, arguments.workers, arguments.backend)
+
+
+def _grid_lines(arguments: argparse.Namespace) -> Iterator[str]:
+    from ratslam.experiments.tables.grid import DEFAULT_ROWS, ODOMETRY_ERRORS, ROWS, grid_table
+    from ratslam.experiments.tables.markdown import select_rows
+
+    if arguments.rows or arguments.worlds:
+        names = select_rows(arguments.rows, ROWS, tuple(ODOMETRY_ERRORS))
+        rows = tuple((world, row) for world in arguments.worlds or "AB" for row in names)
+    else:
+        rows = DEFAULT_ROWS
+    return grid_table(rows, arguments.arenas, arguments.first, arguments.workers)
+
+
+def _laser_lines(arguments: argparse.Namespace) -> Iterator[str]:
+    from ratslam.experiments.tables.laser import ROWS, laser_table
+    from ratslam.experiments.tables.markdown import select_rows
+
+    return laser_table(select_rows(arguments.rows, ROWS, tuple(ROWS)), arguments.copies, arguments.workers)
+
+
+def _speed_lines(arguments: argparse.Namespace) -> Iterator[str]:
+    from ratslam.experiments.pareto.cpu_affinity import one_core
+
+    with one_core():
+        from ratslam.experiments.tables.speed import SIZES, speed_table
+
+        yield from speed_table(arguments.rows or SIZES, arguments.rounds)
+
+
+def _precision_lines(arguments: argparse.Namespace) -> Iterator[str]:
+    from ratslam.experiments.tables.precision import precision_table
+
+    return precision_table(arguments.backends, arguments.seeds, arguments.workers, arguments.output)
+
+
+def _chaos_lines(arguments: argparse.Namespace) -> Iterator[str]:
+    from ratslam.experiments.tables.chaos import PAIRS, chaos_table
+    from ratslam.experiments.tables.markdown import select_rows
+
+    pairs = select_rows(arguments.pairs, PAIRS, tuple(PAIRS))
+    return chaos_table(pairs, arguments.motions, arguments.steps, arguments.walks)

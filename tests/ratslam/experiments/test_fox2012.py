@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ratslam.cli import main
-from ratslam.cli.create import SETS
+from ratslam.cli.reproduce import FOX2012
 from ratslam.experiments.fox2012 import reproduction
 from ratslam.experiments.fox2012.mapper_ranking import MEASURES, Measure, order, orders
 from ratslam.experiments.fox2012.metrics import AWAY, FIELDS, measured, revisits
@@ -229,7 +229,7 @@ def test_a_constant_that_wins_is_named() -> None:
 
 
 def test_the_program_knows_them_all() -> None:
-    assert set(SETS) == set(PROTOCOLS)
+    assert set(FOX2012) == set(PROTOCOLS)
 
 
 @pytest.mark.parametrize("name", PROTOCOLS)

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ratslam.cli import main
-from ratslam.cli.reproduce import NAMES
+from ratslam.cli.reproduce import SALMAN2016
 from ratslam.config.run_config import RunConfig
 from ratslam.experiments.salman2016 import reproduction
 from ratslam.experiments.salman2016.claims import Row, column, judge_claim, render_claims
@@ -301,10 +301,10 @@ def test_matched_thresholds_reach_the_arcr_that_all_conditions_reach():
 
 
 def test_the_program_lists_all_protocols():
-    assert set(NAMES) == set(PROTOCOLS)
+    assert set(SALMAN2016) == set(PROTOCOLS)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", PROTOCOLS)
 def test_all_conditions_are_valid_and_run_on_the_same_sets(name):
     protocol = PROTOCOLS[name]
     jobs = plan_jobs(protocol, 2, 0)
@@ -367,7 +367,7 @@ def test_invalid_arguments_are_refused_before_anything_is_written(tmp_path, caps
 
 
 @pytest.mark.soak
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", PROTOCOLS)
 def test_reproductions_run_to_their_end(name, tmp_path):
     text, stopped = reproduce(name, tmp_path, sets=2, workers=4, assignments=TINY)
     assert not stopped

@@ -127,7 +127,7 @@ def test_the_command_tunes_a_simulated_session(tmp_path, capsys, monkeypatch):
     config = tmp_path / "tiny.yaml"
     config.write_text(TINY)
     out = tmp_path / "out"
-    assert main(["tune", str(config), "-o", str(out)]) == 0
+    assert main(["reproduce", "threshold", str(config), "-o", str(out)]) == 0
     text = capsys.readouterr().out
     assert len([line for line in text.splitlines() if line[:8].strip().startswith("0.")]) >= len(GRID)
     assert "AUC" in text
@@ -151,13 +151,18 @@ def test_parts_of_the_grid_are_run_tasks_and_put_together(monkeypatch):
     assert "<- the winner" in render_tuning(found)
 
 
+def test_the_former_command_names_the_new_one(capsys):
+    assert main(["tune", "tiny.yaml"]) == 2
+    assert "`ratslam reproduce threshold`" in capsys.readouterr().err
+
+
 def test_invalid_configurations_are_refused(tmp_path, capsys):
     config = tmp_path / "labels.yaml"
     config.write_text("recording: {file: missing.npz}\n")
-    assert main(["tune", str(config)]) == 2
+    assert main(["reproduce", "threshold", str(config)]) == 2
     assert "missing.npz" in capsys.readouterr().err
     config.write_text("simulation: {path: {circuits: C}}\ntemplates: {threshold: high}\n")
-    assert main(["tune", str(config)]) == 2
+    assert main(["reproduce", "threshold", str(config)]) == 2
     assert "templates.threshold" in capsys.readouterr().err
 
 
