@@ -1,7 +1,7 @@
-"""Many whole runs in one compiled call: parameter sets, seeds, noise levels.
+"""Many sessions in one compiled call: parameter sets, seeds, noise levels.
 
-Runs are taken a few at a time, each from its beginning to its end: all at once they would fall out of the
-processor's cache. On a GPU blocks may be as large as its memory.
+Sessions are computed a few at a time, each from beginning to end, because all at once exceed the processor's
+cache. On a GPU blocks may be as large as its memory.
 """
 
 from __future__ import annotations
@@ -14,21 +14,22 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.attractor import adaptive_window, pose_cells, window
+from ratslam.attractor import pose_cells, window
 from ratslam.attractor.config import PoseCellConfig
+from ratslam.attractor.levels import window_levels
 from ratslam.core.types import Estimate
 from tactile.base.types import Array, Observation, Odometry
 
 BLOCK = 8
-"""Runs of the pose cells at a time: what a processor's cache holds."""
+"""Sessions of the pose cells computed at a time; they fit into a processor's cache."""
 
 
 class Network(NamedTuple):
     """B parameter sets of the pose cells.
 
     Attributes:
-        excite_sigma, inhibit_sigma: [B] cells. global_inhibition: [B]. energy: [B] factor of what is
-            injected.
+        excite_sigma, inhibit_sigma: [B] cells. global_inhibition: [B]. energy: [B] factor on the injected
+            energy.
     """
 
     excite_sigma: Array
@@ -38,10 +39,11 @@ class Network(NamedTuple):
 
 
 class Course(NamedTuple):
-    """What the pose cells are given, step by step.
+    """Input of the pose cells over T steps.
 
     Attributes:
-        motion: [T, 3] body-frame odometry, m, m, rad. recall: [T, 3] cells. energy: [T] injected there.
+        motion: [T, 3] body-frame odometry, m, m, rad. recall: [T, 3] recalled poses, cells. energy: [T]
+            injected there.
     """
 
     motion: Array
@@ -50,21 +52,21 @@ class Course(NamedTuple):
 
 
 class Track(NamedTuple):
-    """What they made of it: pose [B, T, 3] cells; outcome and rung [B, T]."""
+    """Result: pose [B, T, 3] in cells, outcome [B, T] and window level [B, T]."""
 
     pose: Array
     outcome: Array
-    rung: Array
+    level: Array
 
 
 def networks(config: PoseCellConfig, sets: Network, course: Course, block: int = BLOCK) -> Track:
     """The pose cells with every parameter set over one course, in the precision of the course.
 
-    All are run on the lowest rung of the ladder; those that it could not hold all the way are run again with
-    the others at hand, which cost even where they are not climbed.
+    All sets are computed at the smallest window level first; those that needed a larger one are computed
+    again with all levels, which in a batch cost time even where they are not used.
     """
     track = jax.tree.map(np.array, _networks(config, 1, sets, course, block))
-    again = np.flatnonzero(np.any(track.rung > 0, axis=1))
+    again = np.flatnonzero(np.any(track.level > 0, axis=1))
     if len(again):
         room = np.resize(again, 1 << (len(again) - 1).bit_length())  # few shapes to compile
         chosen = jax.tree.map(lambda column: jnp.asarray(column)[room], sets)
@@ -74,30 +76,30 @@ def networks(config: PoseCellConfig, sets: Network, course: Course, block: int =
     return track
 
 
-@partial(jax.jit, static_argnames=("config", "rungs", "block"))
-def _networks(config: PoseCellConfig, rungs: int | None, sets: Network, course: Course, block: int) -> Track:
+@partial(jax.jit, static_argnames=("config", "levels", "block"))
+def _networks(config: PoseCellConfig, levels: int | None, sets: Network, course: Course, block: int) -> Track:
     dtype = np.dtype(course.motion.dtype)
-    steps = adaptive_window.rungs(config, dtype)[:rungs]
+    used = window_levels(config, dtype)[:levels]
 
     def run(network: Network) -> Track:
         kernels = network.excite_sigma, network.inhibit_sigma, network.global_inhibition
-        tuned = tuple(rung._replace(patch=window.tuned(rung.patch, *kernels)) for rung in steps)
+        tuned = tuple(level._replace(window=window.with_kernels(level.window, *kernels)) for level in used)
 
         def step(cells: Any, row: Course) -> Any:
             odometry = Odometry(row.motion[0], row.motion[1], row.motion[2], jnp.ones((), dtype))
             energy = row.energy * network.energy
-            cells, told = pose_cells.step(config, tuned, cells, odometry, row.recall, energy)
-            return cells, Track(cells.pose, told.outcome, told.rung)
+            cells, info = pose_cells.step(config, tuned, cells, odometry, row.recall, energy)
+            return cells, Track(cells.pose, info.outcome, info.level)
 
-        return lax.scan(step, pose_cells.start(config, dtype, steps), course)[1]
+        return lax.scan(step, pose_cells.start(config, dtype, used), course)[1]
 
     return lax.map(run, sets, batch_size=block)
 
 
 @partial(jax.jit, static_argnames=("kernel", "block"))
 def trials(kernel: Any, states: Any, observations: Observation, block: int = 1) -> Estimate:
-    """Estimates [B, T, ...] of one kernel from B states (other seeds) over B courses of observations [B, T]
-    (other noise)."""
+    """Estimates [B, T, ...] of one kernel from B states (one for each seed) over B courses of observations
+    [B, T] (one for each noise level)."""
 
     def run(trial: Any) -> Estimate:
         def step(state: Any, observation: Observation) -> Any:

@@ -1,4 +1,4 @@
-"""The configuration of the pose cells."""
+"""Settings of the pose cells."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tactile.base.config import Settings
 
 def _odd(width: int) -> int:
     if width % 2 == 0:
-        raise ValueError("must be odd, so that a kernel has a middle")
+        raise ValueError("must be odd, so that the kernel is centred on a cell")
     return width
 
 
@@ -20,14 +20,14 @@ Width = Annotated[int, Field(ge=3, le=15), AfterValidator(_odd)]
 
 
 class PoseCellConfig(Settings):
-    """The pose-cell network."""
+    """Settings of the pose-cell network."""
 
     cells_xy: Annotated[int, Field(ge=7, le=1001)] = 21
     """Cells along x and along y."""
     cells_heading: Annotated[int, Field(ge=7, le=720)] = 36
     """Cells around the heading ring."""
     cell_size: PositiveFloat = 0.1
-    """Side of a cell, m."""
+    """Cell side length, m."""
     excite_width: Width = 7
     """Cells across the excitation kernel, odd."""
     excite_sigma: PositiveFloat = 1.0
@@ -37,19 +37,19 @@ class PoseCellConfig(Settings):
     inhibit_sigma: PositiveFloat = 2.0
     """Standard deviation of inhibition, cells."""
     global_inhibition: Annotated[float, Field(ge=0, lt=0.1)] = 2e-5
-    """Activity taken from every cell at each sub-step."""
+    """Activity subtracted from every cell at each sub-step."""
     settle_steps: PositiveInt = 10
-    """Steps after an injection during which the packet's lag is not measured: it moves by recall then."""
+    """Steps after an injection during which the lag is not measured, because recall moves the packet then."""
     engine: Literal["window", "dense"] = "window"
-    """`window`: only the cells around the packet are worked on, more of them where that is not exact;
-    `dense`: always all. Both give the same."""
+    """`window`: compute the smallest window of cells that is exact; `dense`: always the whole torus. Both give
+    the same result."""
 
 
 def rings(config: PoseCellConfig, dtype: np.dtype) -> np.ndarray:
-    """[3] cells around x, y and heading."""
+    """[3] cells of the torus along x, y and heading."""
     return np.array([config.cells_xy, config.cells_xy, config.cells_heading], dtype)
 
 
 def units(config: PoseCellConfig, dtype: np.dtype) -> np.ndarray:
-    """[3] size of a cell along x, y and heading: m, m, rad."""
+    """[3] cell size along x, y and heading: m, m, rad."""
     return np.array([config.cell_size, config.cell_size, 2 * np.pi / config.cells_heading], dtype)

@@ -1,9 +1,8 @@
 """Pose cells: a continuous attractor network over (heading, y, x), each axis a ring.
 
-One packet of activity says where the robot is. A step is: inject what the view recalls, then for each
-sub-step excite, inhibit, threshold, normalise and integrate a part of the motion; then decode the packet.
-Sources: Milford & Wyeth 2004; Ball et al. 2013; the ways in which this differs from them are listed in
-`ratslam/README.md`.
+One packet of activity represents the robot's pose. A step injects energy at the recalled pose, then for each
+sub-step excites, inhibits, thresholds, normalises and integrates a part of the motion, then decodes the
+packet. Sources: Milford & Wyeth 2004; Ball et al. 2013; the differences are listed in this room's README.
 
 Activity is [K, N, N] over heading, y, x; poses in cells are [3] over x, y, heading, in [0, N) and [0, K).
 """
@@ -16,18 +15,26 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from ratslam.attractor import adaptive_window
-from ratslam.attractor.adaptive_window import Activity, Push, Rung
+from ratslam.attractor.adaptive_window import step_at_smallest_level
 from ratslam.attractor.config import PoseCellConfig, rings, units
-from ratslam.attractor.window import TIE, around, excited_share, turned
+from ratslam.attractor.level_step import StepInput
+from ratslam.attractor.levels import (
+    Activity,
+    Level,
+    from_full_torus,
+    point_activity,
+    to_full_torus,
+    window_levels,
+)
+from ratslam.attractor.window import TIE, deposit_gain, ring_difference, rotate
 from tactile.base.types import Array, Odometry
 
-LARGEST_PART = 0.5
-"""Cells one sub-step moves at most: a packet moved further at once shears into a ring."""
-MOST_PARTS = 256
-"""Sub-steps of one step at most: bounds the time of a step whatever odometry says."""
+LARGEST_SUBSTEP = 0.5
+"""Largest motion of one sub-step, cells: a packet that moves farther at once shears into a ring."""
+MOST_SUBSTEPS = 256
+"""Limit on the sub-steps of one step, which bounds its computing time for any odometry."""
 JUMP = 1.0
-"""A packet that moved this much otherwise than told (cells) has jumped; it has not lagged behind."""
+"""Difference between packet and odometry, cells, above which the packet has jumped instead of lagging."""
 
 
 class Outcome(IntEnum):
@@ -35,22 +42,22 @@ class Outcome(IntEnum):
 
     OK = 0
     RESEEDED = 1
-    """Activity had died out; one packet was put back where the last one had been."""
+    """Activity had died out; one packet was reseeded at the last decoded pose."""
     TOO_FAST = 2
-    """Odometry told of more motion than `MOST_PARTS` sub-steps can carry; the excess was dropped."""
+    """Odometry exceeded the motion of `MOST_SUBSTEPS` sub-steps; the excess was dropped."""
     NOT_FINITE = 3
     """Odometry or view was NaN or infinite and was taken as no motion and no view."""
     FULL = 4
-    """A new view or place had no room and was not kept."""
+    """A new view or place exceeded the capacity and was not stored."""
 
 
 class PoseCells(NamedTuple):
     """The network's state.
 
     Attributes:
-        activity: on the rung of the ladder that holds it; sums to 1 after every step.
+        activity: at one of the window levels; sums to 1 after every step.
         pose: [3] the decoded packet, cells.
-        lag: [3] motion told but not yet made by the packet, cells.
+        lag: [3] odometry that the packet has not followed yet, cells.
         settling: steps until the lag is measured again, int32.
     """
 
@@ -60,50 +67,46 @@ class PoseCells(NamedTuple):
     settling: Array
 
 
-class Told(NamedTuple):
-    """What a step says of itself.
-
-    Attributes:
-        spread: [3] of the packet, cells. outcome: an `Outcome`, int32. rung: of the ladder, int32.
-    """
+class StepInfo(NamedTuple):
+    """spread: [3] of the packet, cells. outcome: an `Outcome`, int32. level: the window level, int32."""
 
     spread: Array
     outcome: Array
-    rung: Array
+    level: Array
 
 
-def start(config: PoseCellConfig, dtype: np.dtype, rungs: tuple[Rung, ...] | None = None) -> PoseCells:
-    """One packet's seed, a single cell, in the middle; of the whole ladder or of these rungs."""
+def start(
+    config: PoseCellConfig, dtype: np.dtype, levels: tuple[Level, ...] | None = None
+) -> PoseCells:
+    """A single active cell in the middle of the torus; with all window levels, or with those given."""
     pose = jnp.asarray(rings(config, dtype) // 2)
-    activity = adaptive_window.seeded(rungs or adaptive_window.rungs(config, dtype), pose)
+    activity = point_activity(levels or window_levels(config, dtype), pose)
     return PoseCells(activity, pose, jnp.zeros(3, dtype), jnp.int32(0))
 
 
-def activity(config: PoseCellConfig, cells: PoseCells) -> Array:
+def full_activity(config: PoseCellConfig, cells: PoseCells) -> Array:
     """[K, N, N] the activity of the whole torus."""
-    return adaptive_window.spread_out(adaptive_window.rungs(config, cells.pose.dtype), cells.activity)
+    return to_full_torus(window_levels(config, cells.pose.dtype), cells.activity)
 
 
-def replaced(config: PoseCellConfig, cells: PoseCells, activity: Array) -> PoseCells:
-    """The same state with any activity [K, N, N] of the whole torus."""
-    return cells._replace(
-        activity=adaptive_window.whole(adaptive_window.rungs(config, cells.pose.dtype), activity)
-    )
+def with_activity(config: PoseCellConfig, cells: PoseCells, activity: Array) -> PoseCells:
+    """The same state with the activity [K, N, N] of the whole torus replaced."""
+    return cells._replace(activity=from_full_torus(window_levels(config, cells.pose.dtype), activity))
 
 
 def step(
     config: PoseCellConfig,
-    rungs: tuple[Rung, ...],
+    levels: tuple[Level, ...],
     cells: PoseCells,
     odometry: Odometry,
     recall: Array,
     energy: Array,
-) -> tuple[PoseCells, Told]:
+) -> tuple[PoseCells, StepInfo]:
     """One step of the network.
 
     Args:
-        rungs: see `ladder.rungs`. odometry: body-frame motion, m, m, rad (finite).
-        recall: [3] packet to inject at, cells. energy: how much, 0 for nothing.
+        levels: see `window_levels`. odometry: body-frame motion, m, m, rad (finite).
+        recall: [3] recalled pose, cells. energy: injected there, 0 for none.
     """
     dtype = cells.pose.dtype
     n, unit = rings(config, dtype), units(config, dtype)
@@ -112,19 +115,20 @@ def step(
     measured = settling == 0
     lag = jnp.where(measured, cells.lag, jnp.zeros_like(cells.lag))
 
-    told = jnp.stack([odometry.dx, odometry.dy, odometry.dtheta]) / unit
-    reach = jnp.maximum(jnp.hypot(told[0], told[1]) + jnp.hypot(lag[0], lag[1]), jnp.abs(told[2] + lag[2]))
-    wanted = jnp.maximum(jnp.ceil(reach / LARGEST_PART - TIE), 1.0)
-    parts = jnp.minimum(wanted, float(MOST_PARTS))
-    told, lag = told * (parts / wanted), lag * (parts / wanted)
+    moved = jnp.stack([odometry.dx, odometry.dy, odometry.dtheta]) / unit
+    reach = jnp.maximum(jnp.hypot(moved[0], moved[1]) + jnp.hypot(lag[0], lag[1]), jnp.abs(moved[2] + lag[2]))
+    wanted = jnp.maximum(jnp.ceil(reach / LARGEST_SUBSTEP - TIE), 1.0)
+    substeps = jnp.minimum(wanted, float(MOST_SUBSTEPS))
+    moved, lag = moved * (substeps / wanted), lag * (substeps / wanted)
 
-    energy = excited_share(rungs[0].patch, recall) * energy
-    push = Push(cells.pose, recall, energy, parts.astype(jnp.int32), told / parts, lag / parts, lag[2])
-    activity, (pose, spread, died, rung) = adaptive_window.climb(rungs, cells.activity, push)
+    energy = deposit_gain(levels[0].window, recall) * energy
+    parts = moved / substeps, lag / substeps
+    push = StepInput(cells.pose, recall, energy, substeps.astype(jnp.int32), *parts, lag[2])
+    activity, (pose, spread, died, level) = step_at_smallest_level(levels, cells.activity, push)
 
-    world = jnp.stack([*turned(told[0], told[1], (cells.pose[2] + lag[2]) * unit[2]), told[2]])
-    behind = around(world + lag - (pose - cells.pose), n)
+    world = jnp.stack([*rotate(moved[0], moved[1], (cells.pose[2] + lag[2]) * unit[2]), moved[2]])
+    behind = ring_difference(world + lag - (pose - cells.pose), n)
     jumped = died | (jnp.max(jnp.abs(behind)) > JUMP)
     lag = jnp.where(measured, jnp.where(jumped, jnp.zeros_like(lag), behind), cells.lag)
-    outcome = jnp.where(died, Outcome.RESEEDED, jnp.where(wanted > parts, Outcome.TOO_FAST, Outcome.OK))
-    return PoseCells(activity, pose, lag, settling), Told(spread, outcome.astype(jnp.int32), rung)
+    outcome = jnp.where(died, Outcome.RESEEDED, jnp.where(wanted > substeps, Outcome.TOO_FAST, Outcome.OK))
+    return PoseCells(activity, pose, lag, settling), StepInfo(spread, outcome.astype(jnp.int32), level)

@@ -1,8 +1,9 @@
-"""The attractor network on a patch: a box of cells cut out of the torus, or all of it.
+"""The attractor network on a window: a box of cells cut out of the torus, or the whole torus.
 
-Along each axis a patch is a piece of the ring or the whole of it; only the whole wraps. Where all activity
-lies a margin inside the pieces, a patch steps exactly as the torus does: excitation reaches no farther than
-the margin, and what inhibition would do beyond what is excited lies below the threshold.
+Along each axis a window covers a piece of the ring or all of it; only a full ring wraps. While all activity
+stays at least a margin away from the window's faces, a step on the window equals the step on the torus:
+excitation reaches no farther than the margin, and inhibition of cells that are not excited only makes them
+negative, which the threshold sets to 0.
 
 Activity is [H, Y, X] over heading, y, x; poses, origins and shifts are [3] over x, y, heading, in cells.
 """
@@ -22,29 +23,29 @@ from ratslam.attractor.config import PoseCellConfig
 from tactile.base.types import Array
 
 TIE = 1e-9
-"""Activities this close to the largest (as a share) tie with it: the first wins, whatever the rounding."""
-SMALL = 18
-"""Whole rings of fewer cells are worked on by matrices: loops over so few cost more than they do."""
+"""Relative difference below which activities are equal; the first cell wins, so rounding does not decide."""
+MATRIX_BELOW = 18
+"""Full rings with fewer cells use matrix products, which are faster there than shifted copies."""
 BOX = 3
 """The packet is decoded from the (2 BOX + 1)^3 cells around its peak."""
 
 
 class Axis(NamedTuple):
-    """One axis of a patch: size, ring: its cells and those of the torus. whole: the patch is the ring."""
+    """One axis of a window: cells in the window, cells of the torus, and whether the window is the full ring."""
 
     size: int
     ring: int
-    whole: bool
+    wraps: bool
 
 
-class Patch(NamedTuple):
-    """One shape, and the network's constants.
+class Window(NamedTuple):
+    """The shape of a window and the constants of the network.
 
     Attributes:
-        axes: heading, y, x. excite, inhibit: [w] kernels along any axis. sigma: of excitation, cells.
-            threshold: global inhibition. unit: of heading, rad. margin: cells that activity must lie inside.
-        shell: [H, Y, X] bool, the cells of the margin. gap: cells between packets that do not feel each
-            other.
+        axes: heading, y, x. excite, inhibit: [w] kernels, the same along every axis. sigma: of excitation,
+            cells. threshold: global inhibition. unit: rad per heading cell. margin: cells along each face
+            that must stay empty. margin_mask: [H, Y, X] bool, these cells. gap: distance in cells beyond
+            which two packets do not interact.
     """
 
     axes: tuple[Axis, Axis, Axis]
@@ -54,7 +55,7 @@ class Patch(NamedTuple):
     threshold: Any
     unit: float
     margin: int
-    shell: np.ndarray
+    margin_mask: np.ndarray
     gap: int
 
     @property
@@ -64,201 +65,202 @@ class Patch(NamedTuple):
         return heading, y, x
 
     @property
-    def all_whole(self) -> bool:
-        """Whether it is the torus."""
-        return all(axis.whole for axis in self.axes)
+    def is_torus(self) -> bool:
+        """Whether the window is the whole torus."""
+        return all(axis.wraps for axis in self.axes)
 
 
-def patch(config: PoseCellConfig, inner: int | None, dtype: np.dtype) -> Patch:
-    """A patch that shows exactly any activity that lies within `inner` cells along each axis; None: all."""
+def make_window(config: PoseCellConfig, inner: int | None, dtype: np.dtype) -> Window:
+    """A window that is exact for activity within `inner` cells along each axis; None: the whole torus."""
     margin = config.excite_width // 2
     gap = 2 * margin + config.inhibit_width // 2
-    axes, shell = [], np.zeros((1, 1, 1), bool)
+    axes, margin_mask = [], np.zeros((1, 1, 1), bool)
     for k, ring in enumerate((config.cells_heading, config.cells_xy, config.cells_xy)):
-        # Activity must not feel itself around the ring: inner cells, and the gap besides.
+        # A packet must not interact with itself around the ring.
         whole = inner is None or ring < inner + gap
         size = ring if whole or inner is None else inner + 2 * margin
         axes.append(Axis(size, ring, whole))
         at = np.arange(size)
         outer = np.zeros(size, bool) if whole else (at < margin) | (at >= size - margin)
-        shell = shell | outer.reshape([-1 if axis == k else 1 for axis in range(3)])
+        margin_mask = margin_mask | outer.reshape([-1 if axis == k else 1 for axis in range(3)])
     excite = _gaussian(config.excite_width, np.float64(config.excite_sigma)).astype(dtype)
     inhibit = _gaussian(config.inhibit_width, np.float64(config.inhibit_sigma)).astype(dtype)
     unit, (heading, y, x) = 2 * np.pi / config.cells_heading, axes
     sigma, threshold = config.excite_sigma, config.global_inhibition
-    return Patch((heading, y, x), excite, inhibit, sigma, threshold, unit, margin, shell, gap)
+    return Window((heading, y, x), excite, inhibit, sigma, threshold, unit, margin, margin_mask, gap)
 
 
-def tuned(patch: Patch, excite: Array, inhibit: Array, threshold: Array) -> Patch:
-    """The patch with other kernels of the same widths, traced.
+def with_kernels(window: Window, excite: Array, inhibit: Array, threshold: Array) -> Window:
+    """The window with kernels of the same widths but other standard deviations, which may be traced.
 
     Args:
-        excite, inhibit: their standard deviations, cells. threshold: global inhibition.
+        excite, inhibit: standard deviations, cells. threshold: global inhibition.
     """
-    return patch._replace(
-        excite=_gaussian(len(patch.excite), excite),
-        inhibit=_gaussian(len(patch.inhibit), inhibit),
+    return window._replace(
+        excite=_gaussian(len(window.excite), excite),
+        inhibit=_gaussian(len(window.inhibit), inhibit),
         sigma=excite,
         threshold=threshold,
     )
 
 
-def torus(patch: Patch) -> np.ndarray:
-    """[3] int32 cells around x, y and heading."""
-    return np.array([axis.ring for axis in patch.axes[::-1]], np.int32)
+def ring_sizes(window: Window) -> np.ndarray:
+    """[3] int32 cells of the torus along x, y and heading."""
+    return np.array([axis.ring for axis in window.axes[::-1]], np.int32)
 
 
-def origin_about(patch: Patch, pose: Array) -> Array:
-    """[3] int32 first cell of a patch whose middle is at a pose; 0 along whole rings."""
-    piece = np.array([not axis.whole for axis in patch.axes[::-1]])
-    return jnp.where(piece, (jnp.floor(pose).astype(jnp.int32) - half(patch)) % torus(patch), 0)
+def origin_centred_on(window: Window, pose: Array) -> Array:
+    """[3] int32 first cell of a window centred on a pose; 0 along full rings."""
+    piece = np.array([not axis.wraps for axis in window.axes[::-1]])
+    return jnp.where(piece, (jnp.floor(pose).astype(jnp.int32) - cells_before_centre(window)) % ring_sizes(window), 0)
 
 
-def half(patch: Patch) -> np.ndarray:
-    """[3] int32 cells before its middle, over x, y, heading."""
-    return np.array([axis.size // 2 - 1 for axis in patch.axes[::-1]], np.int32)
+def cells_before_centre(window: Window) -> np.ndarray:
+    """[3] int32 cells from the window's first cell to its centre, over x, y, heading."""
+    return np.array([axis.size // 2 - 1 for axis in window.axes[::-1]], np.int32)
 
 
-def kept(patch: Patch, activity: Array) -> Array:
-    """What excitation, inhibition and threshold leave; not normalised. Both kernels are separable."""
-    excited = _blurred(patch, patch.excite, activity)
-    left = excited - _blurred(patch, patch.inhibit, excited)
-    return jnp.where(left >= patch.threshold, left - patch.threshold, 0.0)
+def excite_and_inhibit(window: Window, activity: Array) -> Array:
+    """Activity after excitation, inhibition and threshold, not normalised. Both kernels are separable."""
+    excited = _convolve(window, window.excite, activity)
+    left = excited - _convolve(window, window.inhibit, excited)
+    return jnp.where(left >= window.threshold, left - window.threshold, 0.0)
 
 
-def integrate(patch: Patch, activity: Array, origin: Array, told: Array, lag: Array, shift: Array) -> Array:
-    """Path integration: every heading layer moves its own way.
+def integrate(window: Window, activity: Array, origin: Array, motion: Array, lag: Array, shift: Array) -> Array:
+    """Path integration: every heading layer moves in its own direction.
 
     Args:
-        told: [3] body-frame motion, cells: each layer moves along its own heading, then all turn. lag: [3]
-            in the network's frame, cells: every layer moves alike. Together less than a cell along each axis.
-        shift: [3] int32, -1 to 1, by which the patch itself moves.
+        motion: [3] body-frame motion, cells: each layer moves along its own heading, then all layers shift.
+            lag: [3] extra motion in the frame of the network, cells, the same for every layer. Together less
+            than a cell along each axis.
+        shift: [3] int32, -1 to 1, motion of the window itself.
     """
-    heading = patch.axes[0]
+    heading = window.axes[0]
     layer = (origin[2] + np.arange(heading.size, dtype=np.int32)) % heading.ring
-    along, across = turned(told[0], told[1], layer.astype(told.dtype) * patch.unit)
-    moved = shift.astype(told.dtype)
-    activity = _moved(patch, activity, 1, (across + (lag[1] - moved[1]))[:, None, None])
-    activity = _moved(patch, activity, 2, (along + (lag[0] - moved[0]))[:, None, None])
-    return _moved(patch, activity, 0, told[2] + lag[2] - moved[2])
+    along, across = rotate(motion[0], motion[1], layer.astype(motion.dtype) * window.unit)
+    moved = shift.astype(motion.dtype)
+    activity = _translate(window, activity, 1, (across + (lag[1] - moved[1]))[:, None, None])
+    activity = _translate(window, activity, 2, (along + (lag[0] - moved[0]))[:, None, None])
+    return _translate(window, activity, 0, motion[2] + lag[2] - moved[2])
 
 
-def deposit(patch: Patch, activity: Array, origin: Array, pose: Array, energy: Array) -> Array:
-    """Adds `energy` at a pose between cells, shared trilinearly among its eight neighbours; what lies beyond
-    the patch is lost."""
+def deposit(window: Window, activity: Array, origin: Array, pose: Array, energy: Array) -> Array:
+    """Adds `energy` at a pose, shared trilinearly among its eight neighbour cells; shares outside the window
+    are dropped."""
     low = jnp.floor(pose)
     share = pose - low
     low = low.astype(jnp.int32) - origin
     corner = np.array([[x, y, th] for th in (0, 1) for y in (0, 1) for x in (0, 1)], np.int32)
     weight = jnp.prod(jnp.where(corner == 1, share[None], 1 - share[None]), axis=1)
-    at = (low[None] + corner) % torus(patch)[None]
+    at = (low[None] + corner) % ring_sizes(window)[None]
     return activity.at[at[:, 2], at[:, 1], at[:, 0]].add(energy * weight, mode="drop")
 
 
-def inside(patch: Patch, origin: Array, pose: Array) -> Array:
-    """Whether a deposit at a pose lies within the margin of the patch, bool."""
-    low = (jnp.floor(pose).astype(jnp.int32) - origin) % torus(patch)
-    size = np.array([axis.size for axis in patch.axes[::-1]], np.int32)
-    piece = np.array([not axis.whole for axis in patch.axes[::-1]])
-    fits = (low >= patch.margin) & (low + 1 < size - patch.margin)
+def holds_deposit(window: Window, origin: Array, pose: Array) -> Array:
+    """bool: a deposit at the pose would leave the margin of the window empty."""
+    low = (jnp.floor(pose).astype(jnp.int32) - origin) % ring_sizes(window)
+    size = np.array([axis.size for axis in window.axes[::-1]], np.int32)
+    piece = np.array([not axis.wraps for axis in window.axes[::-1]])
+    fits = (low >= window.margin) & (low + 1 < size - window.margin)
     return jnp.all(fits | ~piece)
 
 
-def decode(patch: Patch, activity: Array, origin: Array) -> tuple[Array, Array]:
-    """The strongest packet: circular mean and circular standard deviation [3], [3] in cells.
+def decode(window: Window, activity: Array, origin: Array) -> tuple[Array, Array]:
+    """Circular mean and circular standard deviation of the strongest packet: [3], [3] in cells.
 
-    Only the box around the peak counts, so other packets do not pull the mean. The peak is found axis by
-    axis: one pass over the cells instead of a scalar search.
+    Only the box around the peak counts, so other packets do not bias the mean. The peak is found one axis at
+    a time, which needs one pass over the cells instead of a scalar search.
     """
     first = origin[::-1]
     box, low = activity, []
-    for k, (axis, at) in enumerate(zip(patch.axes, _peak(patch, activity, first), strict=True)):
-        box, begins = _around(axis, box, at, k)
+    for k, (axis, at) in enumerate(zip(window.axes, _peak(window, activity, first), strict=True)):
+        box, begins = _box_along(axis, box, at, k)
         low.append(begins)
     around = (first + jnp.stack(low))[:, None] + np.arange(2 * BOX + 1, dtype=np.int32)[None]
     marginals = jnp.stack([jnp.sum(box, (1, 2)), jnp.sum(box, (0, 2)), jnp.sum(box, (0, 1))])
-    ring = torus(patch)[::-1]
-    mean, spread = _circular(marginals, around % ring[:, None], ring.astype(activity.dtype))
+    ring = ring_sizes(window)[::-1]
+    mean, spread = _circular_moments(marginals, around % ring[:, None], ring.astype(activity.dtype))
     return mean[::-1], spread[::-1]
 
 
-def peak_number(patch: Patch, activity: Array, origin: Array) -> Array:
-    """int32, of the largest activity's cell, counted through the torus."""
-    first, ring = origin[::-1], torus(patch)[::-1]
-    heading, y, x = ((a + b) % n for a, b, n in zip(_peak(patch, activity, first), first, ring, strict=True))
+def peak_index(window: Window, activity: Array, origin: Array) -> Array:
+    """int32 index of the cell with the largest activity, in the flattened torus."""
+    first, ring = origin[::-1], ring_sizes(window)[::-1]
+    heading, y, x = ((a + b) % n for a, b, n in zip(_peak(window, activity, first), first, ring, strict=True))
     return (heading * ring[1] + y) * ring[2] + x
 
 
-def contained(patch: Patch, activity: Array) -> Array:
-    """Whether the margin is empty, bool."""
-    if patch.all_whole:
+def margin_is_empty(window: Window, activity: Array) -> Array:
+    """bool: no activity in the margin."""
+    if window.is_torus:
         return jnp.bool_(True)
-    return jnp.max(jnp.where(patch.shell, activity, 0.0)) <= 0
+    return jnp.max(jnp.where(window.margin_mask, activity, 0.0)) <= 0
 
 
-def turned(x: Array, y: Array, angle: Array) -> tuple[Array, Array]:
-    """A vector turned by an angle."""
+def rotate(x: Array, y: Array, angle: Array) -> tuple[Array, Array]:
+    """A vector rotated by an angle, rad."""
     c, s = jnp.cos(angle), jnp.sin(angle)
     return c * x - s * y, s * x + c * y
 
 
-def around(difference: Array, size: Array) -> Array:
-    """A difference of poses in cells the short way round, in [-size/2, size/2)."""
+def ring_difference(difference: Array, size: Array) -> Array:
+    """A difference of positions on a ring, in cells, wrapped to [-size/2, size/2)."""
     return (difference + size / 2) % size - size / 2
 
 
-def excited_share(patch: Patch, pose: Array) -> Array:
-    """How much more energy a deposit between cells needs to be excited as high as one on a cell.
+def deposit_gain(window: Window, pose: Array) -> Array:
+    """Factor on the energy of a deposit between cells that makes it excite as much as a deposit on a cell.
 
-    Along one axis, a share f on the next cell is excited to (1 - f) g(f) + f g(1 - f) of the whole at the
-    point itself, g the excitation kernel.
+    Along one axis, a deposit with share f on the next cell is excited at its own position to
+    (1 - f) g(f) + f g(1 - f) of its energy, where g is the excitation kernel.
     """
     f = pose - jnp.floor(pose)
-    sharp = -0.5 / patch.sigma**2
+    sharp = -0.5 / window.sigma**2
     return 1 / jnp.prod((1 - f) * jnp.exp(sharp * f**2) + f * jnp.exp(sharp * (1 - f) ** 2))
 
 
-def _blurred(patch: Patch, kernel: Array, activity: Array) -> Array:
-    """Convolved with an even kernel [w] along each axis."""
+def _convolve(window: Window, kernel: Array, activity: Array) -> Array:
+    """Activity convolved with an even kernel [w] along each axis."""
     half = len(kernel) // 2
     for k in (1, 0, 2):
-        if _small(patch.axes[k]):
-            activity = _product(
-                jnp.tensordot(kernel, _turns(patch.axes[k], half, kernel.dtype), 1), activity, k
+        if _uses_matrices(window.axes[k]):
+            activity = _multiply_along(
+                jnp.tensordot(kernel, _roll_matrices(window.axes[k], half, kernel.dtype), 1), activity, k
             )
             continue
-        shifted = _shifted(patch, activity, k, half)
+        shifted = _shifter(window, activity, k, half)
         activity = kernel[half] * shifted(0)
         for t in range(1, half + 1):
             activity = activity + kernel[half + t] * (shifted(t) + shifted(-t))
     return activity
 
 
-def _moved(patch: Patch, activity: Array, k: int, distance: Array) -> Array:
-    """Moved along one axis by a distance [] or [H, 1, 1], in parts of a cell linearly shared."""
-    reach = 1 if patch.axes[k].whole else 2
+def _translate(window: Window, activity: Array, k: int, distance: Array) -> Array:
+    """Activity moved along axis k by a distance [] or [H, 1, 1] in cells, with linear interpolation."""
+    reach = 1 if window.axes[k].wraps else 2
     share = [jnp.maximum(0.0, 1 - jnp.abs(distance - t)) for t in range(-reach, reach + 1)]
-    if _small(patch.axes[k]):
-        return _product(
-            jnp.tensordot(jnp.stack(share, -1), _turns(patch.axes[k], 1, activity.dtype), 1), activity, k
+    if _uses_matrices(window.axes[k]):
+        return _multiply_along(
+            jnp.tensordot(jnp.stack(share, -1), _roll_matrices(window.axes[k], 1, activity.dtype), 1), activity, k
         )
-    shifted = _shifted(patch, activity, k, reach)
+    shifted = _shifter(window, activity, k, reach)
     return reduce(
         jnp.add, (part * shifted(t) for t, part in zip(range(-reach, reach + 1), share, strict=True))
     )
 
 
-def _small(axis: Axis) -> bool:
-    return axis.whole and axis.size < SMALL
+def _uses_matrices(axis: Axis) -> bool:
+    return axis.wraps and axis.size < MATRIX_BELOW
 
 
-def _turns(axis: Axis, reach: int, dtype: np.dtype) -> np.ndarray:
-    """[2 reach + 1, size, size] matrices that move activity around a ring by -reach to reach cells."""
+def _roll_matrices(axis: Axis, reach: int, dtype: np.dtype) -> np.ndarray:
+    """[2 reach + 1, size, size] matrices that roll activity around a ring by -reach to reach cells."""
     return np.stack([np.roll(np.eye(axis.size, dtype=dtype), t, axis=0) for t in range(-reach, reach + 1)])
 
 
-def _product(matrix: Array, activity: Array, k: int) -> Array:
-    """A matrix [n, n], or one for each heading layer [H, 1, 1, n, n], along one axis."""
+def _multiply_along(matrix: Array, activity: Array, k: int) -> Array:
+    """Product along axis k with a matrix [n, n], or with one for each heading layer [H, 1, 1, n, n]."""
     h, n, m = activity.shape
     if k == 0:
         return (matrix @ activity.reshape(h, n * m)).reshape(h, n, m)
@@ -268,47 +270,47 @@ def _product(matrix: Array, activity: Array, k: int) -> Array:
     return jnp.matmul(activity, jnp.broadcast_to(jnp.swapaxes(matrix, 1, 2), (h, m, m)))
 
 
-def _shifted(patch: Patch, activity: Array, k: int, reach: int) -> Callable[[int], Array]:
-    """Activity moved by t cells along one axis, |t| up to the reach, as a function of t."""
+def _shifter(window: Window, activity: Array, k: int, reach: int) -> Callable[[int], Array]:
+    """A function of t that gives the activity moved by t cells along axis k, |t| <= reach."""
     size = activity.shape[k]
-    if patch.axes[k].whole:
+    if window.axes[k].wraps:
         before = lax.slice_in_dim(activity, size - reach, size, axis=k)
         after = lax.slice_in_dim(activity, 0, reach, axis=k)
     else:
         before = after = jnp.zeros(
             [reach if a == k else n for a, n in enumerate(activity.shape)], activity.dtype
         )
-    # Kept as an array: looked up through its three pieces, every cell would cost a branch.
+    # Forced into one array: reading through its three pieces would cost a branch per cell.
     padded = lax.optimization_barrier(jnp.concatenate([before, activity, after], axis=k))
     return lambda t: lax.slice_in_dim(padded, reach - t, reach - t + size, axis=k)
 
 
-def _peak(patch: Patch, activity: Array, first: Array) -> tuple[Array, Array, Array]:
+def _peak(window: Window, activity: Array, first: Array) -> tuple[Array, Array, Array]:
     """Indices of the largest activity: heading, y, x."""
-    heading = _first_peak(patch.axes[0], jnp.max(activity, axis=(1, 2)), first[0])
+    heading = _first_peak(window.axes[0], jnp.max(activity, axis=(1, 2)), first[0])
     layer = lax.dynamic_index_in_dim(activity, heading, 0, keepdims=False)
-    y = _first_peak(patch.axes[1], jnp.max(layer, axis=1), first[1])
+    y = _first_peak(window.axes[1], jnp.max(layer, axis=1), first[1])
     row = lax.dynamic_index_in_dim(layer, y, 0, keepdims=False)
-    return heading, y, _first_peak(patch.axes[2], row, first[2])
+    return heading, y, _first_peak(window.axes[2], row, first[2])
 
 
 def _first_peak(axis: Axis, marginal: Array, first: Array) -> Array:
-    """Where a marginal [size] is largest; of ties, the first cell of the torus."""
+    """Index of the largest value of a marginal [size]; among ties, the first cell of the torus."""
     at = (first + np.arange(axis.size, dtype=np.int32)) % axis.ring
     tied = marginal >= jnp.max(marginal) * (1 - TIE)
     return jnp.argmin(jnp.where(tied, at, axis.ring)).astype(jnp.int32)
 
 
-def _around(axis: Axis, activity: Array, peak: Array, k: int) -> tuple[Array, Array]:
-    """The cells about a peak along one axis, and where they begin."""
-    if axis.whole:
+def _box_along(axis: Axis, activity: Array, peak: Array, k: int) -> tuple[Array, Array]:
+    """The 2 BOX + 1 cells around a peak along axis k, and the index of the first."""
+    if axis.wraps:
         at = (peak + np.arange(-BOX, BOX + 1, dtype=np.int32)) % axis.size
         return jnp.take(activity, at, axis=k), peak - BOX
     low = jnp.clip(peak - BOX, 0, axis.size - 2 * BOX - 1)
     return lax.dynamic_slice_in_dim(activity, low, 2 * BOX + 1, k), low
 
 
-def _circular(mass: Array, at: Array, ring: np.ndarray) -> tuple[Array, Array]:
+def _circular_moments(mass: Array, at: Array, ring: np.ndarray) -> tuple[Array, Array]:
     unit = (2 * np.pi / ring).astype(mass.dtype)
     angle = at.astype(mass.dtype) * unit[:, None]
     s, c = jnp.sum(mass * jnp.sin(angle), 1), jnp.sum(mass * jnp.cos(angle), 1)

@@ -1,0 +1,182 @@
+"""One step of the network at one window level, and whether its result is that of the whole torus."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from ratslam.attractor import window
+from ratslam.attractor.levels import Block, Level, extent
+from ratslam.attractor.window import Window
+from tactile.base.types import Array
+
+LOSS = 64
+"""Tolerance on the sum of activity after a step, in units of rounding."""
+
+
+class StepInput(NamedTuple):
+    """Input of one step of the network.
+
+    Attributes:
+        pose: [3] of the packet, cells. injection: [3] where `energy` is injected, cells. substeps: int32.
+            motion: [3] body-frame motion of each sub-step, cells. lag: [3] lag made up in each, cells.
+            heading_lag: of the packet at the start, cells.
+    """
+
+    pose: Array
+    injection: Array
+    energy: Array
+    substeps: Array
+    motion: Array
+    lag: Array
+    heading_lag: Array
+
+
+class StepResult(NamedTuple):
+    """pose, spread: [3] of the strongest packet, cells. died: bool, activity died out and was reseeded.
+    level: int32, at which the step was computed."""
+
+    pose: Array
+    spread: Array
+    died: Array
+    level: Array
+
+
+def step_at(level: Level, block: Block, push: StepInput) -> tuple[Block, StepResult, Array]:
+    """Injection, then attractor dynamics and path integration for each sub-step, then decoding.
+
+    Returns:
+        the new activity, the result, and bool: both equal those of the whole torus.
+    """
+    block, exact = _inject(level, block, push)
+
+    def substep(s: Array, carry: Any) -> Any:
+        block, exact, died = carry
+        exact &= _packets_apart(level, block)
+        cells, dead = _attract(level, block, push.pose)
+        block, complete = _integrate(level, block._replace(activity=cells), push, s)
+        return block, exact & complete, died | dead
+
+    block, exact, died = lax.fori_loop(0, push.substeps, substep, (block, exact, jnp.bool_(False)))
+    block = _strongest_first(level, block)
+    pose, spread = window.decode(level.window, block.activity[0], block.origin[0])
+    return block, StepResult(pose, spread, died, jnp.int32(0)), exact
+
+
+def equal_sums(a: Array, b: Array | float) -> Array:
+    """bool: sums of activity that differ by rounding only."""
+    return jnp.abs(a - b) <= LOSS * jnp.finfo(a.dtype).eps
+
+
+def _inject(level: Level, block: Block, push: StepInput) -> tuple[Block, Array]:
+    """Energy goes into the window of the packet nearby, otherwise into a window of its own."""
+    shape, given = level.window, push.energy > 0
+    near = jax.vmap(lambda origin: window.holds_deposit(shape, origin, push.injection))(block.origin)
+    if level.windows == 1:
+        at, room, origin = jnp.int32(0), near[0], block.origin
+    else:
+        free = jnp.max(block.activity, axis=(1, 2, 3)) <= 0
+        open_new = ~jnp.any(near & ~free)
+        at = jnp.argmax(jnp.where(open_new, free, near & ~free)).astype(jnp.int32)
+        room = ~open_new | jnp.any(free)
+        centred = window.origin_centred_on(shape, push.injection)
+        fresh = jnp.where(open_new & given & room, centred, block.origin[at])
+        origin = block.origin.at[at].set(fresh)
+    cells = window.deposit(shape, block.activity[at], origin[at], push.injection, push.energy)
+    return Block(block.activity.at[at].set(cells), origin), room | ~given
+
+
+def _attract(level: Level, block: Block, seed: Array) -> tuple[Array, Array]:
+    """Activity after excitation and inhibition, normalised over all windows; where it dies out, unit activity
+    at `seed` [3] instead. And bool: it died out.
+
+    Uniform activity always dies out: both kernels sum to 1, so excitation and inhibition cancel.
+    """
+    cells = _each_window(level, partial(window.excite_and_inhibit, level.window), block.activity)
+    total = jnp.sum(cells)
+    dead = ~(total > 0)
+
+    def reseed() -> Array:
+        one = window.deposit(
+            level.window, jnp.zeros_like(cells[0]), block.origin[0], seed, jnp.ones_like(total)
+        )
+        return jnp.zeros_like(cells).at[0].set(one)
+
+    return lax.cond(dead, reseed, lambda: cells / jnp.where(dead, 1.0, total)), dead
+
+
+def _integrate(level: Level, block: Block, push: StepInput, s: Array) -> tuple[Block, Array]:
+    """Path integration of sub-step s, in which every window follows its packet; and bool: no activity was
+    lost."""
+    shape = level.window
+    unit, done = shape.unit, s.astype(push.motion.dtype)
+    # Odometry is given in the frame at the start of the step; the packet has turned since, and lags behind.
+    angle = push.heading_lag - done * (push.motion[2] + push.lag[2])
+    moved = jnp.stack([*window.rotate(push.motion[0], push.motion[1], angle * unit), push.motion[2]])
+    origin = block.origin
+    if not shape.is_torus:
+        if level.follows_pose:
+            middle = _predict(shape, push, done + 1, push.pose)[None]
+        else:
+            middle = jax.vmap(partial(_predict_middle, shape, push))(block)
+        origin = jax.vmap(partial(window.origin_centred_on, shape))(middle)
+    ring = window.ring_sizes(shape)[None]
+    # A window that is behind its packet catches up by one cell per sub-step.
+    shift = jnp.clip((origin - block.origin + ring // 2) % ring - ring // 2, -1, 1)
+    origin = (block.origin + shift) % ring
+
+    def translated(cells: Array, first: Array, by: Array) -> Array:
+        return window.integrate(shape, cells, first, moved, push.lag, by)
+
+    cells = _each_window(level, translated, block.activity, block.origin, shift)
+    complete = jnp.all(jax.vmap(partial(window.margin_is_empty, shape))(cells))
+    return Block(cells, origin), (complete & equal_sums(jnp.sum(cells), 1.0)) | shape.is_torus
+
+
+def _predict(shape: Window, push: StepInput, substeps: Array, pose: Array) -> Array:
+    """[3] approximate pose of a packet some sub-steps after it was at `pose` [3]."""
+    x, y = window.rotate(push.motion[0], push.motion[1], pose[2] * shape.unit)
+    return pose + substeps * (jnp.stack([x, y, push.motion[2]]) + push.lag)
+
+
+def _predict_middle(shape: Window, push: StepInput, block: Block) -> Array:
+    """[3] approximate middle of the activity of one window after this sub-step."""
+    low, high, some = extent(shape, block)
+    at = _predict(shape, push, jnp.ones_like(push.energy), (low + high) / 2)
+    unmoved = (block.origin + window.cells_before_centre(shape)).astype(low.dtype)
+    return jnp.where(some, at, unmoved)
+
+
+def _packets_apart(level: Level, block: Block) -> Array:
+    """bool: the packets are too far from each other to interact."""
+    if level.windows == 1:
+        return jnp.bool_(True)
+    shape = level.window
+    low, high, some = jax.vmap(partial(extent, shape))(block)
+    ring = window.ring_sizes(shape).astype(low.dtype)
+    middle, half = (low + high) / 2, (high - low) / 2
+    between = jnp.abs(window.ring_difference(middle[0] - middle[1], ring)) - half[0] - half[1]
+    return jnp.any(between > shape.gap) | ~jnp.all(some)
+
+
+def _strongest_first(level: Level, block: Block) -> Block:
+    """The windows in order of their strongest packets; of equals, the one whose peak is first in the torus."""
+    if level.windows == 1:
+        return block
+    peak = jnp.max(block.activity, axis=(1, 2, 3))
+    tied = peak >= jnp.max(peak) * (1 - window.TIE)
+    place = jax.vmap(partial(window.peak_index, level.window))(block.activity, block.origin)
+    front = jnp.argmin(jnp.where(tied, place, jnp.iinfo(jnp.int32).max))
+    return jax.tree.map(lambda leaf: jnp.roll(leaf, -front, axis=0), block)
+
+
+def _each_window(level: Level, function: Callable[..., Array], *blocks: Array) -> Array:
+    """The function of every window; a single one is not batched, which is faster."""
+    if level.windows == 1:
+        return function(*(block[0] for block in blocks))[None]
+    return jax.vmap(function)(*blocks)
