@@ -21,22 +21,22 @@ from tactile.base.types import Array
 
 
 def step_at_smallest_level(
-    levels: tuple[Level, ...], activity: Activity, push: StepInput
+    levels: tuple[Level, ...], activity: Activity, inputs: StepInput
 ) -> tuple[Activity, StepResult]:
     """One step of the network, at the smallest level where it is exact.
 
     With the smallest level alone, `level` is 1 from the first step that was not exact there.
     """
     if len(levels) == 1:
-        block, result, exact = step_at(levels[0], activity.blocks[0], push)
+        block, result, exact = step_at(levels[0], activity.blocks[0], inputs)
         missing = jnp.where(exact, activity.level, 1).astype(jnp.int32)
         return Activity((block,), missing), result._replace(level=missing)
-    zero = jnp.zeros_like(push.pose)
+    zero = jnp.zeros_like(inputs.pose)
     carry = (activity.level, activity.blocks[0], StepResult(zero, zero, jnp.bool_(False), jnp.int32(0)))
     # Loops of one round or none: XLA copies the result of a branch, but not what a loop leaves unchanged.
-    to_try, block, result = lax.while_loop(_is_smallest, partial(_smallest, levels, push), carry)
+    to_try, block, result = lax.while_loop(_is_smallest, partial(_smallest, levels, inputs), carry)
     now = Activity((block, *activity.blocks[1:]), jnp.int32(0))
-    larger = partial(_larger, levels, activity.blocks[0], activity.level, push)
+    larger = partial(_larger, levels, activity.blocks[0], activity.level, inputs)
     _, after, result = lax.while_loop(lambda carry: carry[0] < len(levels), larger, (to_try, now, result))
     return after, result
 
@@ -45,19 +45,21 @@ def _is_smallest(carry: Any) -> Array:
     return carry[0] == 0
 
 
-def _smallest(levels: tuple[Level, ...], push: StepInput, carry: Any) -> Any:
-    block, result, exact = step_at(levels[0], carry[1], push)
+def _smallest(levels: tuple[Level, ...], inputs: StepInput, carry: Any) -> Any:
+    block, result, exact = step_at(levels[0], carry[1], inputs)
     return jnp.where(exact, len(levels), 1).astype(jnp.int32), block, result
 
 
-def _larger(levels: tuple[Level, ...], smallest: Block, held: Array, push: StepInput, carry: Any) -> Any:
+def _larger(levels: tuple[Level, ...], smallest: Block, held: Array, inputs: StepInput, carry: Any) -> Any:
     for k in range(1, len(levels)):
-        attempt = partial(_attempt, levels, k, smallest, held, push)
+        attempt = partial(_attempt, levels, k, smallest, held, inputs)
         carry = lax.cond(carry[0] == k, attempt, lambda carry: carry, carry)
     return carry
 
 
-def _attempt(levels: tuple[Level, ...], k: int, smallest: Block, held: Array, push: StepInput, carry: Any) -> Any:
+def _attempt(
+    levels: tuple[Level, ...], k: int, smallest: Block, held: Array, inputs: StepInput, carry: Any
+) -> Any:
     """The step at level k; then back to the smallest level where that holds the result.
 
     Args:
@@ -67,8 +69,10 @@ def _attempt(levels: tuple[Level, ...], k: int, smallest: Block, held: Array, pu
     _, now, _ = carry
     level, last = levels[k], k == len(levels) - 1
     before = Activity((smallest, *now.blocks[1:]), held)
-    source = block_at(levels, k, before, window.origin_centred_on(level.window, _middle(levels, before, push)))
-    block, result, exact = step_at(level, source, push)
+    source = block_at(
+        levels, k, before, window.origin_centred_on(level.window, _middle(levels, before, inputs))
+    )
+    block, result, exact = step_at(level, source, inputs)
     exact = (exact & equal_sums(total(before), jnp.sum(source.activity))) | last
     low, fits = _at_smallest(levels, level, block, result.pose)
     blocks = list(now.blocks)
@@ -88,12 +92,12 @@ def _at_smallest(levels: tuple[Level, ...], level: Level, block: Block, pose: Ar
     return low, held & window.margin_is_empty(smallest.window, low.activity[0])
 
 
-def _middle(levels: tuple[Level, ...], activity: Activity, push: StepInput) -> Array:
+def _middle(levels: tuple[Level, ...], activity: Activity, inputs: StepInput) -> Array:
     """[3] midway between the packet and the second one, or else the position of the injection."""
-    ring = window.ring_sizes(levels[0].window).astype(push.pose.dtype)
-    other = jnp.where(push.energy > 0, push.injection, push.pose)
+    ring = window.ring_sizes(levels[0].window).astype(inputs.pose.dtype)
+    other = jnp.where(inputs.energy > 0, inputs.injection, inputs.pose)
     for k, level in enumerate(levels):
         if level.windows > 1:
             low, high, some = extent(level.window, jax.tree.map(lambda leaf: leaf[1], activity.blocks[k]))
             other = jnp.where((activity.level == k) & some, (low + high) / 2, other)
-    return push.pose + window.ring_difference(other - push.pose, ring) / 2
+    return inputs.pose + window.ring_difference(other - inputs.pose, ring) / 2

@@ -41,8 +41,8 @@ class PoseCellConfig(Settings):
     settle_steps: PositiveInt = 10
     """Steps after an injection during which the lag is not measured, because recall moves the packet then."""
     engine: Literal["window", "dense"] = "window"
-    """`window`: compute the smallest window of cells that is exact; `dense`: always the whole torus. Both give
-    the same result."""
+    """`window`: compute the smallest window of cells that is exact; `dense`: always the whole torus. The
+    results are equal."""
 
 
 def rings(config: PoseCellConfig, dtype: np.dtype) -> np.ndarray:

@@ -47,22 +47,22 @@ class StepResult(NamedTuple):
     level: Array
 
 
-def step_at(level: Level, block: Block, push: StepInput) -> tuple[Block, StepResult, Array]:
+def step_at(level: Level, block: Block, inputs: StepInput) -> tuple[Block, StepResult, Array]:
     """Injection, then attractor dynamics and path integration for each sub-step, then decoding.
 
     Returns:
         the new activity, the result, and bool: both equal those of the whole torus.
     """
-    block, exact = _inject(level, block, push)
+    block, exact = _inject(level, block, inputs)
 
     def substep(s: Array, carry: Any) -> Any:
         block, exact, died = carry
         exact &= _packets_apart(level, block)
-        cells, dead = _attract(level, block, push.pose)
-        block, complete = _integrate(level, block._replace(activity=cells), push, s)
+        cells, dead = _attract(level, block, inputs.pose)
+        block, complete = _integrate(level, block._replace(activity=cells), inputs, s)
         return block, exact & complete, died | dead
 
-    block, exact, died = lax.fori_loop(0, push.substeps, substep, (block, exact, jnp.bool_(False)))
+    block, exact, died = lax.fori_loop(0, inputs.substeps, substep, (block, exact, jnp.bool_(False)))
     block = _strongest_first(level, block)
     pose, spread = window.decode(level.window, block.activity[0], block.origin[0])
     return block, StepResult(pose, spread, died, jnp.int32(0)), exact
@@ -73,10 +73,10 @@ def equal_sums(a: Array, b: Array | float) -> Array:
     return jnp.abs(a - b) <= LOSS * jnp.finfo(a.dtype).eps
 
 
-def _inject(level: Level, block: Block, push: StepInput) -> tuple[Block, Array]:
+def _inject(level: Level, block: Block, inputs: StepInput) -> tuple[Block, Array]:
     """Energy goes into the window of the packet nearby, otherwise into a window of its own."""
-    shape, given = level.window, push.energy > 0
-    near = jax.vmap(lambda origin: window.holds_deposit(shape, origin, push.injection))(block.origin)
+    shape, given = level.window, inputs.energy > 0
+    near = jax.vmap(lambda origin: window.holds_deposit(shape, origin, inputs.injection))(block.origin)
     if level.windows == 1:
         at, room, origin = jnp.int32(0), near[0], block.origin
     else:
@@ -84,10 +84,10 @@ def _inject(level: Level, block: Block, push: StepInput) -> tuple[Block, Array]:
         open_new = ~jnp.any(near & ~free)
         at = jnp.argmax(jnp.where(open_new, free, near & ~free)).astype(jnp.int32)
         room = ~open_new | jnp.any(free)
-        centred = window.origin_centred_on(shape, push.injection)
+        centred = window.origin_centred_on(shape, inputs.injection)
         fresh = jnp.where(open_new & given & room, centred, block.origin[at])
         origin = block.origin.at[at].set(fresh)
-    cells = window.deposit(shape, block.activity[at], origin[at], push.injection, push.energy)
+    cells = window.deposit(shape, block.activity[at], origin[at], inputs.injection, inputs.energy)
     return Block(block.activity.at[at].set(cells), origin), room | ~given
 
 
@@ -110,20 +110,20 @@ def _attract(level: Level, block: Block, seed: Array) -> tuple[Array, Array]:
     return lax.cond(dead, reseed, lambda: cells / jnp.where(dead, 1.0, total)), dead
 
 
-def _integrate(level: Level, block: Block, push: StepInput, s: Array) -> tuple[Block, Array]:
+def _integrate(level: Level, block: Block, inputs: StepInput, s: Array) -> tuple[Block, Array]:
     """Path integration of sub-step s, in which every window follows its packet; and bool: no activity was
     lost."""
     shape = level.window
-    unit, done = shape.unit, s.astype(push.motion.dtype)
+    unit, done = shape.unit, s.astype(inputs.motion.dtype)
     # Odometry is given in the frame at the start of the step; the packet has turned since, and lags behind.
-    angle = push.heading_lag - done * (push.motion[2] + push.lag[2])
-    moved = jnp.stack([*window.rotate(push.motion[0], push.motion[1], angle * unit), push.motion[2]])
+    angle = inputs.heading_lag - done * (inputs.motion[2] + inputs.lag[2])
+    moved = jnp.stack([*window.rotate(inputs.motion[0], inputs.motion[1], angle * unit), inputs.motion[2]])
     origin = block.origin
     if not shape.is_torus:
         if level.follows_pose:
-            middle = _predict(shape, push, done + 1, push.pose)[None]
+            middle = _predict(shape, inputs, done + 1, inputs.pose)[None]
         else:
-            middle = jax.vmap(partial(_predict_middle, shape, push))(block)
+            middle = jax.vmap(partial(_predict_middle, shape, inputs))(block)
         origin = jax.vmap(partial(window.origin_centred_on, shape))(middle)
     ring = window.ring_sizes(shape)[None]
     # A window that is behind its packet catches up by one cell per sub-step.
@@ -131,23 +131,23 @@ def _integrate(level: Level, block: Block, push: StepInput, s: Array) -> tuple[B
     origin = (block.origin + shift) % ring
 
     def translated(cells: Array, first: Array, by: Array) -> Array:
-        return window.integrate(shape, cells, first, moved, push.lag, by)
+        return window.integrate(shape, cells, first, moved, inputs.lag, by)
 
     cells = _each_window(level, translated, block.activity, block.origin, shift)
     complete = jnp.all(jax.vmap(partial(window.margin_is_empty, shape))(cells))
     return Block(cells, origin), (complete & equal_sums(jnp.sum(cells), 1.0)) | shape.is_torus
 
 
-def _predict(shape: Window, push: StepInput, substeps: Array, pose: Array) -> Array:
+def _predict(shape: Window, inputs: StepInput, substeps: Array, pose: Array) -> Array:
     """[3] approximate pose of a packet some sub-steps after it was at `pose` [3]."""
-    x, y = window.rotate(push.motion[0], push.motion[1], pose[2] * shape.unit)
-    return pose + substeps * (jnp.stack([x, y, push.motion[2]]) + push.lag)
+    x, y = window.rotate(inputs.motion[0], inputs.motion[1], pose[2] * shape.unit)
+    return pose + substeps * (jnp.stack([x, y, inputs.motion[2]]) + inputs.lag)
 
 
-def _predict_middle(shape: Window, push: StepInput, block: Block) -> Array:
+def _predict_middle(shape: Window, inputs: StepInput, block: Block) -> Array:
     """[3] approximate middle of the activity of one window after this sub-step."""
     low, high, some = extent(shape, block)
-    at = _predict(shape, push, jnp.ones_like(push.energy), (low + high) / 2)
+    at = _predict(shape, inputs, jnp.ones_like(inputs.energy), (low + high) / 2)
     unmoved = (block.origin + window.cells_before_centre(shape)).astype(low.dtype)
     return jnp.where(some, at, unmoved)
 
@@ -165,7 +165,7 @@ def _packets_apart(level: Level, block: Block) -> Array:
 
 
 def _strongest_first(level: Level, block: Block) -> Block:
-    """The windows in order of their strongest packets; of equals, the one whose peak is first in the torus."""
+    """The windows in order of their strongest packets; of equals, the peak first in the torus."""
     if level.windows == 1:
         return block
     peak = jnp.max(block.activity, axis=(1, 2, 3))

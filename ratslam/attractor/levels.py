@@ -101,7 +101,7 @@ def block_at(levels: tuple[Level, ...], k: int, activity: Activity, origin: Arra
 
 
 def transfer(source: Level, block: Block, target: Level, origin: Array) -> Block:
-    """A block at another level: the same windows and empty ones, or one window that begins at `origin` [3]."""
+    """A block at another level: the same windows and empty ones, or one window from `origin` [3] on."""
     more = target.windows - source.windows
     if more > 0:
         return jax.tree.map(lambda leaf: jnp.pad(leaf, [(0, more)] + [(0, 0)] * (leaf.ndim - 1)), block)

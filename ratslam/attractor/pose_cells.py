@@ -75,9 +75,7 @@ class StepInfo(NamedTuple):
     level: Array
 
 
-def start(
-    config: PoseCellConfig, dtype: np.dtype, levels: tuple[Level, ...] | None = None
-) -> PoseCells:
+def start(config: PoseCellConfig, dtype: np.dtype, levels: tuple[Level, ...] | None = None) -> PoseCells:
     """A single active cell in the middle of the torus; with all window levels, or with those given."""
     pose = jnp.asarray(rings(config, dtype) // 2)
     activity = point_activity(levels or window_levels(config, dtype), pose)
@@ -123,8 +121,8 @@ def step(
 
     energy = deposit_gain(levels[0].window, recall) * energy
     parts = moved / substeps, lag / substeps
-    push = StepInput(cells.pose, recall, energy, substeps.astype(jnp.int32), *parts, lag[2])
-    activity, (pose, spread, died, level) = step_at_smallest_level(levels, cells.activity, push)
+    inputs = StepInput(cells.pose, recall, energy, substeps.astype(jnp.int32), *parts, lag[2])
+    activity, (pose, spread, died, level) = step_at_smallest_level(levels, cells.activity, inputs)
 
     world = jnp.stack([*rotate(moved[0], moved[1], (cells.pose[2] + lag[2]) * unit[2]), moved[2]])
     behind = ring_difference(world + lag - (pose - cells.pose), n)

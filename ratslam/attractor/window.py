@@ -31,7 +31,7 @@ BOX = 3
 
 
 class Axis(NamedTuple):
-    """One axis of a window: cells in the window, cells of the torus, and whether the window is the full ring."""
+    """One axis of a window: cells of the window and of the torus; wraps: the window is the full ring."""
 
     size: int
     ring: int
@@ -112,7 +112,9 @@ def ring_sizes(window: Window) -> np.ndarray:
 def origin_centred_on(window: Window, pose: Array) -> Array:
     """[3] int32 first cell of a window centred on a pose; 0 along full rings."""
     piece = np.array([not axis.wraps for axis in window.axes[::-1]])
-    return jnp.where(piece, (jnp.floor(pose).astype(jnp.int32) - cells_before_centre(window)) % ring_sizes(window), 0)
+    return jnp.where(
+        piece, (jnp.floor(pose).astype(jnp.int32) - cells_before_centre(window)) % ring_sizes(window), 0
+    )
 
 
 def cells_before_centre(window: Window) -> np.ndarray:
@@ -127,7 +129,9 @@ def excite_and_inhibit(window: Window, activity: Array) -> Array:
     return jnp.where(left >= window.threshold, left - window.threshold, 0.0)
 
 
-def integrate(window: Window, activity: Array, origin: Array, motion: Array, lag: Array, shift: Array) -> Array:
+def integrate(
+    window: Window, activity: Array, origin: Array, motion: Array, lag: Array, shift: Array
+) -> Array:
     """Path integration: every heading layer moves in its own direction.
 
     Args:
@@ -242,7 +246,9 @@ def _translate(window: Window, activity: Array, k: int, distance: Array) -> Arra
     share = [jnp.maximum(0.0, 1 - jnp.abs(distance - t)) for t in range(-reach, reach + 1)]
     if _uses_matrices(window.axes[k]):
         return _multiply_along(
-            jnp.tensordot(jnp.stack(share, -1), _roll_matrices(window.axes[k], 1, activity.dtype), 1), activity, k
+            jnp.tensordot(jnp.stack(share, -1), _roll_matrices(window.axes[k], 1, activity.dtype), 1),
+            activity,
+            k,
         )
     shifted = _shifter(window, activity, k, reach)
     return reduce(

@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ratslam.attractor import adaptive_window, pose_cells
+from ratslam.attractor import pose_cells
 from ratslam.attractor.config import rings, units
+from ratslam.attractor.levels import window_levels
 from ratslam.attractor.pose_cells import Outcome, PoseCells
 from ratslam.backends.config import ClassicBackendConfig
 from ratslam.classic import places, view_templates
@@ -36,8 +37,8 @@ class ClassicEvidence(NamedTuple):
 
     Attributes:
         template: current template, int32; -1 before the first view. error: of the best match. relative: see
-            `ClassicState`. energy: injected into the pose cells. packet: [3] decoded pose, cells. rung: level
-            of the adaptive window, int32. outcome: an `Outcome`, int32.
+            `ClassicState`. energy: injected into the pose cells. packet: [3] decoded pose, cells.
+            window_level: of the adaptive window, int32. outcome: an `Outcome`, int32.
     """
 
     template: Scalar
@@ -45,7 +46,7 @@ class ClassicEvidence(NamedTuple):
     relative: Scalar
     energy: Scalar
     packet: Array
-    rung: Scalar
+    window_level: Scalar
     outcome: Scalar
 
 
@@ -62,7 +63,7 @@ class ClassicBackend:
         self.config = config
         self.view_shape = view_shape
         self.dtype = np.dtype(dtype)
-        self.rungs = adaptive_window.rungs(config.pose_cells, self.dtype)
+        self.window_levels = window_levels(config.pose_cells, self.dtype)
         self.rings = rings(config.pose_cells, self.dtype)
         self.units = units(config.pose_cells, self.dtype)
 
@@ -115,7 +116,9 @@ class ClassicBackend:
         turned = jnp.stack([jnp.zeros_like(relative), jnp.zeros_like(relative), relative / self.units[2]])
 
         recalled = (memory.packet[jnp.maximum(match.template, 0)] + turned) % self.rings
-        cells, told = pose_cells.step(config.pose_cells, self.rungs, state.cells, odometry, recalled, energy)
+        cells, told = pose_cells.step(
+            config.pose_cells, self.window_levels, state.cells, odometry, recalled, energy
+        )
         canonical = (cells.pose - turned) % self.rings
         world, decision = places.decide(
             config.places, self.rings, state.places, canonical, memory.current, seen & (memory.current >= 0)
@@ -133,7 +136,7 @@ class ClassicBackend:
             lost=(outcome == Outcome.RESEEDED) | (outcome == Outcome.TOO_FAST),
         )
         evidence = ClassicEvidence(
-            memory.current, match.error, relative, energy, cells.pose, told.rung, outcome
+            memory.current, match.error, relative, energy, cells.pose, told.level, outcome
         )
         return ClassicState(cells, memory, world, relative), estimate, evidence
 

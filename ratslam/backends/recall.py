@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.attractor import adaptive_window, pose_cells
+from ratslam.attractor import pose_cells
 from ratslam.attractor.config import rings, units
+from ratslam.attractor.levels import window_levels
 from ratslam.attractor.pose_cells import Outcome, PoseCells
 from ratslam.backends.classic import finite
 from ratslam.backends.config import RecallBackendConfig
@@ -61,7 +62,7 @@ class RecallEvidence(NamedTuple):
     background: Array
     energy: Scalar
     packet: Array
-    rung: Scalar
+    window_level: Scalar
     health: Scalar
     outcome: Scalar
 
@@ -90,7 +91,7 @@ class RecallBackend:
         self.pixels = pixels(view_shape) if self.recall.sector_fov == "whiskers" else None
         self.dtype = np.dtype(dtype)
         self.cell = config.pose_cells.cell_size
-        self.rungs = adaptive_window.rungs(config.pose_cells, self.dtype)
+        self.window_levels = window_levels(config.pose_cells, self.dtype)
         self.rings = rings(config.pose_cells, self.dtype)
         self.units = units(config.pose_cells, self.dtype)
 
@@ -137,7 +138,7 @@ class RecallBackend:
         )
         recalled, energy = self._injection(memory, recollection)
         cells, told = pose_cells.step(
-            self.config.pose_cells, self.rungs, state.cells, odometry, recalled, energy
+            self.config.pose_cells, self.window_levels, state.cells, odometry, recalled, energy
         )
         memory = lax.cond(
             frame,
@@ -167,7 +168,7 @@ class RecallBackend:
             **recollection._asdict(),
             energy=energy,
             packet=cells.pose,
-            rung=told.rung,
+            window_level=told.level,
             health=health,
             outcome=outcome,
         )

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ratslam.attractor.adaptive_window import SETTLED, rungs
 from ratslam.attractor.config import PoseCellConfig
+from ratslam.attractor.levels import SETTLED, window_levels
 from ratslam.backends.grid import LIVE_SIDE
 from ratslam.config.run_config import RunConfig
 from ratslam.experiments.sizing.scene_statistics import Scene
@@ -122,12 +122,12 @@ def _cells_xy(config: RunConfig, scene: Scene, size: float) -> Proposal:
 
 
 def _engine(config: RunConfig, proposed: PoseCellConfig) -> Proposal:
-    ladder = rungs(proposed, np.dtype(float))
-    shapes = ["x".join(map(str, rung.patch.shape[::-1])) for rung in ladder]
-    if len(ladder) == 1:
+    levels = window_levels(proposed, np.dtype(float))
+    shapes = ["x".join(map(str, level.window.shape[::-1])) for level in levels]
+    if len(levels) == 1:
         return _of(config, "pose_cells.engine", "dense", f"{shapes[0]} cells are too few for a window")
-    share = np.prod(ladder[0].patch.shape) / np.prod(ladder[-1].patch.shape)
-    several = [f"{rung.patches} of " * (rung.patches > 1) for rung in ladder]
+    share = np.prod(levels[0].window.shape) / np.prod(levels[-1].window.shape)
+    several = [f"{level.windows} of " * (level.windows > 1) for level in levels]
     then = ", ".join(map("".join, zip(several[1:-1], shapes[1:-1], strict=True)))
     why = f"{shapes[0]} of {shapes[-1]} cells ({share:.0%}); where not exact, {then}{', ' if then else ''}all"
     return _of(config, "pose_cells.engine", "window", why)

@@ -18,10 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.attractor import adaptive_window, pose_cells
+from ratslam.attractor import pose_cells
 from ratslam.attractor.config import PoseCellConfig, rings, units
+from ratslam.attractor.levels import window_levels
 from ratslam.attractor.pose_cells import PoseCells
-from ratslam.attractor.window import around
+from ratslam.attractor.window import ring_difference
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
 from tactile.base.random_streams import stream
 from tactile.base.types import Odometry
@@ -61,7 +62,9 @@ def separation(one: Variant, other: Variant, motion: np.ndarray) -> np.ndarray:
         motion: [T, 3] cells per step.
     """
     ring = rings(PoseCellConfig(), np.dtype(float))
-    return np.abs(around(decoded_poses(one, motion) - decoded_poses(other, motion), ring)).max(axis=1)
+    return np.abs(ring_difference(decoded_poses(one, motion) - decoded_poses(other, motion), ring)).max(
+        axis=1
+    )
 
 
 def decoded_poses(kind: Variant, motion: np.ndarray) -> np.ndarray:
@@ -80,22 +83,22 @@ def decoded_poses(kind: Variant, motion: np.ndarray) -> np.ndarray:
 
 def _nudged(cells: PoseCells, by: float) -> PoseCells:
     blocks = list(cells.activity.blocks)
-    held = blocks[int(cells.activity.rung)]
+    held = blocks[int(cells.activity.level)]
     strongest = np.unravel_index(int(np.argmax(held.activity)), held.activity.shape)
-    blocks[int(cells.activity.rung)] = held._replace(activity=held.activity.at[strongest].add(by))
+    blocks[int(cells.activity.level)] = held._replace(activity=held.activity.at[strongest].add(by))
     return cells._replace(activity=cells.activity._replace(blocks=tuple(blocks)))
 
 
 @partial(jax.jit, static_argnums=0)
 def _walk(config: PoseCellConfig, cells: PoseCells, motion: Any) -> tuple[PoseCells, Any]:
     dtype = np.dtype(motion.dtype)
-    rungs, unit = adaptive_window.rungs(config, dtype), units(config, dtype)
+    levels, unit = window_levels(config, dtype), units(config, dtype)
     nowhere, nothing = jnp.zeros(3, dtype), jnp.zeros((), dtype)
 
     def step(cells: PoseCells, moved: Any) -> tuple[PoseCells, Any]:
         dx, dy, dtheta = moved * unit
         odometry = Odometry(dx, dy, dtheta, jnp.ones((), dtype))
-        cells, _ = pose_cells.step(config, rungs, cells, odometry, nowhere, nothing)
+        cells, _ = pose_cells.step(config, levels, cells, odometry, nowhere, nothing)
         return cells, cells.pose
 
     return lax.scan(step, cells, motion)

@@ -15,8 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ratslam.attractor import adaptive_window, pose_cells
+from ratslam.attractor import pose_cells
 from ratslam.attractor.config import PoseCellConfig, rings, units
+from ratslam.attractor.levels import window_levels
 from ratslam.attractor.pose_cells import PoseCells
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
 from ratslam.experiments.tables.numpy_network import NumpyNetwork
@@ -63,11 +64,11 @@ def network_calls(n: int, steps: int = STEPS) -> dict[str, tuple[Callable[[], An
 def network_step(n: int, engine: str, dtype: Any = float) -> tuple[Callable[..., Any], PoseCells]:
     """A step of an engine as a function of cells, recall and energy, and the cells at the start."""
     config, dtype = PoseCellConfig.model_validate({"cells_xy": n, "engine": engine}), np.dtype(dtype)
-    rungs, unit = adaptive_window.rungs(config, dtype), units(config, dtype)
+    levels, unit = window_levels(config, dtype), units(config, dtype)
     moved = Odometry(*(jnp.asarray(v, dtype) for v in (MOTION[0] * unit[0], 0.0, MOTION[1] * unit[2], 1.0)))
 
     def step(cells: PoseCells, recall: Any, energy: Any) -> Any:
-        return pose_cells.step(config, rungs, cells, moved, recall, energy)
+        return pose_cells.step(config, levels, cells, moved, recall, energy)
 
     return step, pose_cells.start(config, dtype)
 
@@ -93,7 +94,7 @@ def replay_network(
             far = (cells.pose + ring / 2 * np.array([1, 1, 0], dtype)) % ring
             inject = (k % every == every - 1) if every else jnp.bool_(False)
             cells, told = step(cells, far, jnp.where(inject, 0.02, 0.0).astype(dtype))
-            return cells, above + (told.rung > 0).astype(jnp.int32)
+            return cells, above + (told.level > 0).astype(jnp.int32)
 
         return jax.lax.fori_loop(0, steps, body, (cells, jnp.int32(0)))
 

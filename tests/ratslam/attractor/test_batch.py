@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ratslam.attractor import adaptive_window, pose_cells
+from ratslam.attractor import pose_cells
 from ratslam.attractor.batch import Course, Network, networks, trials
 from ratslam.attractor.config import PoseCellConfig, units
-from ratslam.attractor.window import around
+from ratslam.attractor.levels import window_levels
+from ratslam.attractor.window import ring_difference
 from ratslam.core.session import Session
 from tactile.base.types import Odometry, stack
 from tests.helpers.grid_world import filter_of, report, settings
@@ -27,12 +28,12 @@ def course(seed: int) -> Course:
 
 
 def alone(config: PoseCellConfig, given: Course, factor: float) -> np.ndarray:
-    rungs = adaptive_window.rungs(config, np.dtype(float))
+    levels = window_levels(config, np.dtype(float))
 
     def step(cells, row):
         motion, recall, energy = row
         odometry = Odometry(motion[0], motion[1], motion[2], jnp.ones(()))
-        cells, _ = pose_cells.step(config, rungs, cells, odometry, recall, energy * factor)
+        cells, _ = pose_cells.step(config, levels, cells, odometry, recall, energy * factor)
         return cells, cells.pose
 
     return np.asarray(
@@ -49,10 +50,12 @@ def test_parameter_sets_are_networks_of_those_parameters(block):
         config = CONFIG.model_copy(
             update={"excite_sigma": excite, "inhibit_sigma": inhibit, "global_inhibition": threshold}
         )
-        gap = around(np.asarray(track.pose[k]) - alone(config, given, factor), np.array([[21, 21, 36]]))
+        gap = ring_difference(
+            np.asarray(track.pose[k]) - alone(config, given, factor), np.array([[21, 21, 36]])
+        )
         assert np.abs(gap).max() <= 1e-9
-    assert np.asarray(track.rung[:, 30]).min() > 0
-    assert not np.any(track.rung[:, :30])
+    assert np.asarray(track.level[:, 30]).min() > 0
+    assert not np.any(track.level[:, :30])
 
 
 def test_trials_of_other_seeds_and_noise_are_sessions_of_their_own():

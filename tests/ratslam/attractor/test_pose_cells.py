@@ -11,10 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ratslam.attractor import adaptive_window, pose_cells, window
+from ratslam.attractor import pose_cells, window
 from ratslam.attractor.config import PoseCellConfig, rings, units
+from ratslam.attractor.levels import window_levels
 from ratslam.attractor.pose_cells import Outcome
-from ratslam.attractor.window import around
+from ratslam.attractor.window import ring_difference
 from tactile.base.se2 import integrate
 from tactile.base.types import Odometry
 
@@ -30,13 +31,13 @@ ROOMS = 256, 32768, 131072
 @partial(jax.jit, static_argnames="config")
 def run(config, cells, motion, recall, energy, count):
     """The first `count` of motion in cells [T, 3]: poses [T, 3], outcomes [T], spreads [T, 3]."""
-    rungs = adaptive_window.rungs(config, np.dtype(motion.dtype))
+    levels = window_levels(config, np.dtype(motion.dtype))
     unit = units(config, np.dtype(motion.dtype))
 
     def step(k, carry):
         cells, poses, outcomes, spreads = carry
         odometry = Odometry(*(motion[k] * unit), jnp.ones((), motion.dtype))
-        cells, told = pose_cells.step(config, rungs, cells, odometry, recall[k], energy[k])
+        cells, told = pose_cells.step(config, levels, cells, odometry, recall[k], energy[k])
         told = poses.at[k].set(cells.pose), outcomes.at[k].set(told.outcome), spreads.at[k].set(told.spread)
         return cells, *told
 
@@ -59,11 +60,11 @@ def go(motion, cells=None, injections=None, config=CONFIG, dtype=float):
 
 @jax.jit
 def whole(cells):
-    return pose_cells.activity(CONFIG, cells)
+    return pose_cells.full_activity(CONFIG, cells)
 
 
 def deposited(activity, at, energy):
-    torus = window.patch(CONFIG, None, np.dtype(float))
+    torus = window.make_window(CONFIG, None, np.dtype(float))
     return window.deposit(torus, activity, jnp.zeros(3, jnp.int32), at, jnp.asarray(energy))
 
 
@@ -124,7 +125,7 @@ def test_a_circle_closes(settled):
 def test_any_activity_becomes_a_distribution(seed, dx, dy, turn):
     stream = np.random.default_rng(seed)
     activity = stream.random((36, 21, 21)) * (stream.random((36, 21, 21)) < stream.random())
-    cells = pose_cells.replaced(CONFIG, pose_cells.start(CONFIG, np.dtype(float)), jnp.asarray(activity))
+    cells = pose_cells.with_activity(CONFIG, pose_cells.start(CONFIG, np.dtype(float)), jnp.asarray(activity))
     after, (poses, _, spread) = go([[dx, dy, turn]] * 3, cells)
     assert float(whole(after).sum()) == pytest.approx(1)
     assert float(whole(after).min()) >= 0
@@ -135,11 +136,11 @@ def test_any_activity_becomes_a_distribution(seed, dx, dy, turn):
 
 @pytest.mark.parametrize("level", [0.0, 1e-9, 1 / (36 * 21 * 21), 1.0])
 def test_uniform_activity_dies_and_is_put_back(settled, level):
-    cells = pose_cells.replaced(CONFIG, settled, jnp.full((36, 21, 21), level))
+    cells = pose_cells.with_activity(CONFIG, settled, jnp.full((36, 21, 21), level))
     after, (poses, outcomes, _) = go(np.zeros((3, 3)), cells)
     assert outcomes[0] == Outcome.RESEEDED
     assert not np.any(outcomes[1:])
-    assert np.abs(around(poses[-1] - np.asarray(settled.pose), RINGS)).max() < 0.01
+    assert np.abs(ring_difference(poses[-1] - np.asarray(settled.pose), RINGS)).max() < 0.01
     assert float(whole(after).sum()) == pytest.approx(1)
 
 
@@ -148,7 +149,7 @@ def test_uniform_activity_dies_and_is_put_back(settled, level):
 def test_a_deposit_between_cells_is_excited_like_one_on_a_cell(share):
     """The peak of a deposit at its own point, read off between cells, does not depend on where it falls."""
     pose = jnp.asarray([10.0, 10.0, 18.0]) + jnp.asarray(share)
-    energy = window.excited_share(window.patch(CONFIG, None, np.dtype(float)), pose)
+    energy = window.deposit_gain(window.make_window(CONFIG, None, np.dtype(float)), pose)
     assert 1 - 1e-9 <= float(energy) <= 1.5
     total = float(deposited(jnp.zeros((36, 21, 21)), pose % RINGS, 1.0).sum())
     assert total == pytest.approx(1)
@@ -160,13 +161,13 @@ def test_the_torus_has_no_edge(shift):
     stream = np.random.default_rng(1)
     motion = stream.normal(0, 0.7, (40, 3))
     here = pose_cells.start(CONFIG, np.dtype(float))
-    there = pose_cells.replaced(CONFIG, here, jnp.roll(whole(here), shift[::-1], (0, 1, 2)))
+    there = pose_cells.with_activity(CONFIG, here, jnp.roll(whole(here), shift[::-1], (0, 1, 2)))
     there = there._replace(pose=(here.pose + np.array(shift, float)) % RINGS)
     if shift[2]:
         motion[:, :2] = 0  # another heading moves elsewhere
     first, (a, _, _) = go(motion, here)
     second, (b, _, _) = go(motion, there)
-    assert np.abs(around(b - a - shift, RINGS)).max() < 1e-9
+    assert np.abs(ring_difference(b - a - shift, RINGS)).max() < 1e-9
     assert np.allclose(jnp.roll(whole(first), shift[::-1], (0, 1, 2)), whole(second), atol=1e-10)
 
 
@@ -193,7 +194,7 @@ def test_a_hundred_injections_at_once_settle():
     activity = whole(cells)
     for at in stream.random((100, 3)) * RINGS:
         activity = deposited(activity, jnp.asarray(at), 0.15)
-    after, (poses, outcomes, _) = go(np.zeros((150, 3)), pose_cells.replaced(CONFIG, cells, activity))
+    after, (poses, outcomes, _) = go(np.zeros((150, 3)), pose_cells.with_activity(CONFIG, cells, activity))
     assert float((whole(after) > 0).sum()) < 500
     assert np.isfinite(poses).all()
     assert not np.any(outcomes)
@@ -234,7 +235,7 @@ def test_float32_makes_the_same_step(settled):
         narrow = jax.tree.map(lambda leaf: leaf.astype(np.float32) if leaf.dtype == float else leaf, cells)
         low, (pose32, _, _) = go(motion, narrow, inject, dtype=np.float32)
         cells, (pose64, _, _) = go(motion, cells, inject)
-        gap = around(np.asarray(pose32[0], float) - np.asarray(pose64[0]), RINGS)
+        gap = ring_difference(np.asarray(pose32[0], float) - np.asarray(pose64[0]), RINGS)
         worst_pose = max(worst_pose, np.abs(gap).max())
         worst_activity = max(
             worst_activity, float(np.abs(np.asarray(whole(low), float) - np.asarray(whole(cells))).max())
