@@ -6,8 +6,7 @@ from collections.abc import Callable, Iterator
 from types import TracebackType
 from typing import Any, Protocol, Self
 
-from robot.simulation.create.session import RovingConfig
-from robot.simulation.create.template_training import trained
+from robot.simulation.create.session import CreateSimulationConfig, train_strain_templates
 from robot.sources.source import Sample, Source
 from robot.sources.source_info import SourceInfo
 from tactile.base.errors import InputError
@@ -18,11 +17,11 @@ from tactile.wall_estimation.strain_templates import StrainTemplates
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 from tactile.whiskers.planar_whiskers import PlanarWhiskers, project_to_plane
 
-TALLEST = 0.05
+MAZE_WALL_HEIGHT = 0.05
 """Of the walls of micromouse mazes, m."""
 
 
-class Sense(Protocol):
+class ReadingProcessor(Protocol):
     """Turns readings, in their order, into observations.
 
     Attributes:
@@ -37,7 +36,7 @@ class Sense(Protocol):
         """What an engine is given; None if the reading is kept for the next one."""
 
 
-class Sensing:
+class TouchSource:
     """A source whose readings are all observations.
 
     Args:
@@ -48,7 +47,7 @@ class Sensing:
         InputError: another number of whiskers than the sense has.
     """
 
-    def __init__(self, source: Source, sense: Callable[[], Sense], where: str) -> None:
+    def __init__(self, source: Source, sense: Callable[[], ReadingProcessor], where: str) -> None:
         first = sense()
         if source.whiskers != first.whiskers:
             raise InputError(where, f"{first.whiskers} whiskers", f"{source.whiskers}, as {source.name} has")
@@ -78,7 +77,7 @@ class Sensing:
         pass
 
 
-def sensing(source: Source, config: TouchConfig) -> Source:
+def open_touch_source(source: Source, config: TouchConfig) -> Source:
     """The source, its whisker readings turned into observations.
 
     Raises:
@@ -89,14 +88,14 @@ def sensing(source: Source, config: TouchConfig) -> Source:
     if not info.raw_whiskers:
         return source
     if info.planar_whiskers is not None:
-        reports = reports_of(info, config.reports)
-        templates = templates_of(source, reports)
-        return Sensing(source, lambda: ReportFrontend(reports, templates), "touch.reports.mounts")
+        reports = report_config_of(info, config.reports)
+        templates = strain_templates_of(source, reports)
+        return TouchSource(source, lambda: ReportFrontend(reports, templates), "touch.reports.mounts")
     frontend = Frontend(config, info.calibration)
-    return Sensing(source, lambda: frontend, "touch.head")
+    return TouchSource(source, lambda: frontend, "touch.head")
 
 
-def head_of(info: SourceInfo, config: HeadConfig) -> HeadConfig:
+def head_config_of(info: SourceInfo, config: HeadConfig) -> HeadConfig:
     """The head of a source, with all values that the configuration sets in place of its own.
 
     Raises:
@@ -121,22 +120,22 @@ def observation_of(sample: Sample) -> Observation:
     return sample.reading
 
 
-def feelers_of(source: Source, config: TouchConfig) -> PlanarWhiskers | None:
+def planar_whiskers_of(source: Source, config: TouchConfig) -> PlanarWhiskers | None:
     """The whiskers of a source projected to the floor; None for a source without whiskers."""
     if not source.whiskers:
         return None
     if source.info.planar_whiskers is not None:
-        return reports_of(source.info, config.reports).feelers
-    return project_to_plane(ur10_head(head_of(source.info, config.head)), TALLEST)
+        return report_config_of(source.info, config.reports).feelers
+    return project_to_plane(ur10_head(head_config_of(source.info, config.head)), MAZE_WALL_HEIGHT)
 
 
-def reports_of(info: SourceInfo, config: ReportFrontendConfig) -> ReportFrontendConfig:
+def report_config_of(info: SourceInfo, config: ReportFrontendConfig) -> ReportFrontendConfig:
     """The configuration, with the whiskers of a source wherever it does not set its own."""
     found = info.planar_whiskers.model_dump() if info.planar_whiskers else {}
     return config.model_copy(update={k: v for k, v in found.items() if k not in config.model_fields_set})
 
 
-def templates_of(source: Source, config: ReportFrontendConfig) -> StrainTemplates | None:
+def strain_templates_of(source: Source, config: ReportFrontendConfig) -> StrainTemplates | None:
     """Strain templates, trained by simulating the Create of a source; None if the configuration needs none or
     names a file.
 
@@ -146,10 +145,10 @@ def templates_of(source: Source, config: ReportFrontendConfig) -> StrainTemplate
     if config.templates is not None or config.walls not in ("template", "fused"):
         return None
     try:
-        made = RovingConfig.model_validate(source.info.provenance.get("create_simulation"))
+        made = CreateSimulationConfig.model_validate(source.info.provenance.get("create_simulation"))
     except ValueError as error:
         raise InputError(
             f"{source.name}: create_simulation", str(error), "the configuration of a simulated Create",
             "train strain templates and name their file in touch.reports.templates",
         ) from None  # fmt: skip
-    return trained(made)
+    return train_strain_templates(made)

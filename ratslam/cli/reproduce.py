@@ -171,13 +171,16 @@ def _threshold(arguments: argparse.Namespace) -> int:
 def _train(arguments: argparse.Namespace) -> int:
     from ratslam.experiments.fox2012.template_training import held_out, report, schooled
 
-    roving = read_config(arguments).roving
-    if roving is None:
+    create_simulation = read_config(arguments).create_simulation
+    if create_simulation is None:
         raise InputError(
-            str(arguments.config), "no `roving:`", "the Create to train", "`roving: {}` is the usual one"
+            str(arguments.config),
+            "no `create_simulation:`",
+            "the Create to train",
+            "`create_simulation: {}` is the usual one",
         )
-    templates = schooled(roving, arguments.output)
-    print(report(held_out(roving, templates), templates.training.repeats))
+    templates = schooled(create_simulation, arguments.output)
+    print(report(held_out(create_simulation, templates), templates.training.repeats))
     print(f"\nwrote {arguments.output}; `touch.reports.templates: {arguments.output}` uses it")
     return 0
 

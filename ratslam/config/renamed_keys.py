@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 RENAMED: dict[str, str] = {
+    "roving": "create_simulation",
     "matcher": "write backend: recall or backend: classic",
     "lost": "min_fit_share",
     "frames": "keyframes",

@@ -15,11 +15,11 @@ from ratslam.config.renamed_keys import RENAMED
 from ratslam.config.strict_yaml import load, override, validate
 from robot.live.config import LiveConfig
 from robot.recordings.formats import RecordingConfig
-from robot.simulation.create.session import RovingConfig
+from robot.simulation.create.session import CreateSimulationConfig
 from robot.simulation.head.session import SimulationConfig
-from robot.sources.odometry_extent import extent
+from robot.sources.odometry import odometry_extent
 from robot.sources.source import Source
-from robot.touch_source import head_of
+from robot.touch_source import head_config_of
 from tactile.base.config import Settings
 from tactile.frontend import TouchConfig
 
@@ -84,7 +84,7 @@ class SourceConfig(Settings):
     """What to run on: a recording, or a session simulated as one of the two below say."""
     simulation: SimulationConfig | None = None
     """Of an arm with a whisker head in a maze."""
-    roving: RovingConfig | None = None
+    create_simulation: CreateSimulationConfig | None = None
     """Of a whiskered Create in an arena."""
     live: Annotated[LiveConfig | None, Field(validate_default=True)] = None
     """Or a session on an arm, for `python -m ratslam live`."""
@@ -94,11 +94,13 @@ class SourceConfig(Settings):
     @field_validator("live", mode="after")
     @classmethod
     def _one_source(cls, live: LiveConfig | None, info: ValidationInfo) -> LiveConfig | None:
-        names = ("recording", "simulation", "roving")
+        names = ("recording", "simulation", "create_simulation")
         sources = {name: info.data.get(name) for name in names} | {"live": live}
         given = [name for name, source in sources.items() if source is not None]
         if all(name in info.data for name in names) and len(given) != 1:
-            there = " and ".join(given) if given else "neither recording, simulation, roving nor live"
+            there = (
+                " and ".join(given) if given else "neither recording, simulation, create_simulation nor live"
+            )
             raise ValueError(f"{there}; give one of these four, and null for the others")
         return live
 
@@ -120,7 +122,7 @@ class RunConfig(RecallBackendConfig, ClassicBackendConfig, GridBackendConfig, So
         relations = self.score.relations
         parts = {
             name: part and part.resolved(folder)
-            for name in ("recording", "simulation", "roving", "live")
+            for name in ("recording", "simulation", "create_simulation", "live")
             for part in [getattr(self, name)]
         }
         parts["touch"] = self.touch.model_copy(update={"reports": self.touch.reports.resolved(folder)})
@@ -135,7 +137,7 @@ class RunConfig(RecallBackendConfig, ClassicBackendConfig, GridBackendConfig, So
         """
         parts: dict[str, Settings] = {}
         info = source.info
-        head = head_of(info, self.touch.head)
+        head = head_config_of(info, self.touch.head)
         if head != self.touch.head:
             parts["touch"] = self.touch.model_copy(update={"head": head})
         if "cell_size" not in self.pose_cells.model_fields_set and info.cell_size is not None:
@@ -156,7 +158,7 @@ class RunConfig(RecallBackendConfig, ClassicBackendConfig, GridBackendConfig, So
         completed = self if source.info.planar_whiskers is not None else _filled(self, ARM)
         if completed.grid.side is not None or source.length is None:
             return completed
-        return completed.covering(extent(source))
+        return completed.covering(odometry_extent(source))
 
     def covering(self, reach: float) -> RunConfig:
         """The same with a grid that covers so many metres from the start, unless it says how large it is."""

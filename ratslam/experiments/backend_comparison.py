@@ -16,7 +16,7 @@ from ratslam.core.session import CHUNK
 from ratslam.pipeline.run import open_source
 from ratslam.pipeline.runner import session_of
 from robot.sources.source import Sample, Source
-from robot.touch_source import observation_of, sensing
+from robot.touch_source import observation_of, open_touch_source
 from tactile.base.errors import InputError
 from tactile.base.se2 import compose, integrate, inverse
 from tactile.base.types import Observation
@@ -86,7 +86,7 @@ def _played(config: RunConfig) -> tuple[Compared, Compared]:
             raise InputError(
                 source.name, "no whiskers", "a session of whiskers", "the grid filter needs them"
             )
-        source = sensing(source, config.touch)
+        source = open_touch_source(source, config.touch)
         samples = _known(source)
         session = session_of(config, source)
     reports: list[Observation] = [observation_of(sample) for sample in samples]

@@ -19,7 +19,7 @@ from ratslam.experiments.trials.touch_trial import (
     run_session,
     touch_metrics,
 )
-from robot.simulation.head.session import SimulationConfig, simulated, tier
+from robot.simulation.head.session import HeadSimulation, SimulationConfig, choose_tier
 from tactile.base.errors import InputError
 
 TIERS = ("kinematic", "quasistatic", "dynamic")
@@ -68,7 +68,7 @@ def tiers(document: Document, folder: Path, seconds: float) -> tuple[list[TierTr
         raise InputError(
             "simulation", "missing", "a scene to simulate", "`simulation: {}` is a whole session"
         )
-    chosen = tier(given.simulation.model_copy(update={"fidelity": "auto"}))
+    chosen = choose_tier(given.simulation.model_copy(update={"fidelity": "auto"}))
     short = shortened(given, seconds)
     logs, costs = {}, {}
     for name in TIERS:
@@ -148,4 +148,6 @@ def _in_tier(config: RunConfig, name: str) -> RunConfig:
 
 
 def _duration(simulation: SimulationConfig) -> float:
-    return float(simulated(simulation.model_copy(update={"fidelity": "kinematic", "raw": False})).time[-1])
+    return float(
+        HeadSimulation(simulation.model_copy(update={"fidelity": "kinematic", "raw": False})).time[-1]
+    )

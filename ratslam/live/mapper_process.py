@@ -239,13 +239,13 @@ def run_mapper(line: Connection) -> None:
 def _map(line: Connection) -> None:
     from ratslam.core.types import Action
     from ratslam.pipeline.runner import playing
-    from robot.touch_source import sensing
+    from robot.touch_source import open_touch_source
     from tactile.base.types import Odometry, observation
 
     order = line.recv()
     with PipeSource(order, line) as fed:
         config = order.config.completed(fed)
-        source = sensing(fed, config.touch)
+        source = open_touch_source(fed, config.touch)
         with playing(config, source, order.directory) as play:
             _redirect_stderr(order.directory / LOG)
             blank = observation(

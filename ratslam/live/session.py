@@ -27,7 +27,7 @@ from robot.live.selftest import check_disk, reported, start_and_check
 from robot.live.whisk_loop import WhiskReport, follow_route, record_free_whisks, run_whisk_loop
 from robot.recordings.formats import RecordingConfig
 from robot.sources.source_info import SourceInfo
-from robot.world.head_trajectory import Path as Way
+from robot.world.head_trajectory import HeadPath as Way
 from robot.world.maze import POSE_CELL_SIZE
 from robot.world.scene import maze_info
 from tactile.base.errors import InputError

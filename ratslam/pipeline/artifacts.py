@@ -12,8 +12,8 @@ from evaluation.metrics.grid_score import score_grid
 from evaluation.metrics.occupancy_grid import GridTruth, OccupancyGrid, cell_centres
 from ratslam.pipeline.run_directory import RunDirectory
 from robot.sources.source import Source
-from robot.world.arena import Arena, enclosed, occupied, read_arena, segments
-from robot.world.maze import read_maze, walls
+from robot.world.arena import Arena, is_enclosed, is_occupied, read_arena, wall_segments
+from robot.world.maze import read_maze, wall_boxes
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose, inverse
 from tactile.frontend import TouchConfig
@@ -32,7 +32,7 @@ def keep_world(source: Source, store: RunDirectory) -> None:
     if maze is None:
         return
     store.text("maze.txt", maze.text)
-    boxes = walls(read_maze(store.path / "maze.txt"), stream(maze.seed, "maze.heights"), maze.heights)
+    boxes = wall_boxes(read_maze(store.path / "maze.txt"), stream(maze.seed, "maze.heights"), maze.heights)
     store.file("walls.csv", lambda path: write_walls(path, np.column_stack(boxes)))
 
 
@@ -73,6 +73,6 @@ def truth_of(arena: Arena, grid: OccupancyGrid) -> GridTruth:
     """What is really there, on the cells and in the frame of a map that begins where the robot starts."""
     place = cell_centres(grid)
     there = compose(arena.start, np.concatenate([place, np.zeros((*place.shape[:2], 1))], axis=2))[..., :2]
-    ends = segments(arena).reshape(-1, 2)
+    ends = wall_segments(arena).reshape(-1, 2)
     seen = compose(inverse(arena.start), np.column_stack([ends, np.zeros(len(ends))]))[:, :2]
-    return GridTruth(occupied(arena, there), enclosed(arena, there), seen.reshape(-1, 4))
+    return GridTruth(is_occupied(arena, there), is_enclosed(arena, there), seen.reshape(-1, 4))

@@ -18,10 +18,10 @@ from ratslam.core.session import CHUNK
 from ratslam.pipeline.runner import Playing, playing
 from robot.recordings.formats import open_recording
 from robot.recordings.recorder import Recorder
-from robot.simulation.create.session import roving
-from robot.simulation.head.session import simulated
+from robot.simulation.create.session import CreateSimulation
+from robot.simulation.head.session import HeadSimulation
 from robot.sources.source import Sample, Source
-from robot.touch_source import sensing
+from robot.touch_source import open_touch_source
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Whisk
 from tactile.frontend import Frontend
@@ -42,7 +42,7 @@ def run(config: RunConfig, directory: Path, resume: Path | None = None) -> tuple
     """
     with open_source(config, _tell) as source:
         config = config.completed(source)
-        source = sensing(source, config.touch)
+        source = open_touch_source(source, config.touch)
         with playing(config, source, directory, resume) as play:
             interrupted = replayed(play, source)
             return play.finish(interrupted), interrupted
@@ -71,7 +71,7 @@ def simulate(config: RunConfig, path: Path) -> tuple[int, bool]:
     Raises:
         InputError: there is nothing to simulate, it cannot be simulated, or the file exists.
     """
-    if config.simulation is None and config.roving is None:
+    if config.simulation is None and config.create_simulation is None:
         raise InputError("simulation", "missing", "what to simulate", "`simulation: {}` is a whole session")
     source = open_source(config, _tell)
     keep = _kept(config, source)
@@ -125,10 +125,10 @@ def open_source(config: RunConfig, tell: Callable[[str], None] | None = None) ->
     Raises:
         InputError: it cannot be read, or not be simulated.
     """
-    if config.roving is not None:
-        return roving(config.roving)
+    if config.create_simulation is not None:
+        return CreateSimulation(config.create_simulation)
     if config.simulation is not None:
-        session = simulated(config.simulation, config.touch.head)
+        session = HeadSimulation(config.simulation, config.touch.head)
         if tell is not None:
             tell(f"simulating in the {session.tier.name} tier: {session.tier.why}")
         return session

@@ -27,7 +27,7 @@ from ratslam.keyframes.ablation import FULL, Ablation
 from ratslam.pipeline.artifacts import Felt, keep_chart, keep_images, keep_world
 from ratslam.pipeline.run_directory import RunDirectory, read_checkpoint
 from robot.sources.source import Sample, Source
-from robot.touch_source import feelers_of, observation_of
+from robot.touch_source import observation_of, planar_whiskers_of
 from tactile.base.errors import InputError
 from tactile.base.se2 import compose, tum_line
 from tactile.base.types import Observation
@@ -138,7 +138,7 @@ def playing(
 
 def session_of(config: RunConfig, source: Source, ablation: Ablation = FULL) -> Session:
     """A fresh session for what a source gives."""
-    sensors = Sensors(source.view_shape, feelers_of(source, config.touch))
+    sensors = Sensors(source.view_shape, planar_whiskers_of(source, config.touch))
     return Session(
         build(config.backend, config, sensors, config.session.precision, ablation),
         seed=config.session.seed,

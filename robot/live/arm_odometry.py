@@ -8,7 +8,7 @@ import numpy as np
 
 from robot.drivers.ur10.base_transform import pose_from_tcp, tcp_heading
 from robot.live.config import LiveConfig
-from robot.sources.odometry import MID_HEADING, from_velocities, reckoned
+from robot.sources.odometry import MIDPOINT, from_velocities, simulate_odometry
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose, wrap
 from tactile.base.types import Odometry
@@ -61,7 +61,7 @@ class ArmOdometry:
         self._time.append(stamp)
         random = stream(self._config.seed, "live.odometry")
         # Drawn from the start each time: the errors of a whisk do not depend on how many follow.
-        rows = reckoned(self._config.noise, np.array(self._time), np.array(self._pose), random)
+        rows = simulate_odometry(self._config.noise, np.array(self._time), np.array(self._pose), random)
         return Odometry(*rows[-1]), self.pose(time)
 
     def _driven(self, took: float, time: float) -> np.ndarray:
@@ -75,5 +75,5 @@ class ArmOdometry:
         forward, left = c * speed[:, 0] + s * speed[:, 1], -s * speed[:, 0] + c * speed[:, 1]
         times = np.array([0.0, took])
         mean = [np.array([0.0, part.mean()]) for part in (forward, left, speed[:, 5])]
-        motion = from_velocities(times, mean[0], mean[1], mean[2], MID_HEADING)[1, :3]
+        motion = from_velocities(times, mean[0], mean[1], mean[2], MIDPOINT)[1, :3]
         return compose(self._pose[-1], motion)

@@ -21,7 +21,7 @@ from robot.drivers.head.decoder import Frames
 from robot.drivers.outcome import Fault, SessionOutcome
 from robot.recordings.cdr import encode_truth
 from robot.recordings.cdr_live import Event, encode_cut, encode_event, encode_frames, encode_states
-from robot.recordings.mcap_writer import Tape, Unwritable
+from robot.recordings.mcap_writer import McapWriter, RecordingWriteError
 from robot.recordings.schemas import ARM, CUT, EVENT, FRAMES, TRUTH
 from robot.sources.source_info import SourceInfo
 
@@ -55,7 +55,7 @@ class LiveRecorder:
         info: SourceInfo,
     ) -> None:
         self.fault: Fault | None = None
-        self._tape = Tape(path, view_shape=view_shape, whiskers=whiskers, rate_hz=rate_hz, info=info)
+        self._tape = McapWriter(path, view_shape=view_shape, whiskers=whiskers, rate_hz=rate_hz, info=info)
         self._lock = Lock()
         self._frames: list[Frames] = []
         self._states: list[np.ndarray] = []
@@ -159,7 +159,7 @@ class LiveRecorder:
         with self._lock:
             try:
                 yield self.fault is None
-            except Unwritable as error:
+            except RecordingWriteError as error:
                 self.fault = Fault(SessionOutcome.DISK_FULL, str(error), time)
 
     def __enter__(self) -> Self:

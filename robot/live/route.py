@@ -11,8 +11,8 @@ from robot.drivers.ur10.safety import TargetRefused
 from robot.drivers.ur10.safety import check_target as allowed
 from robot.live.config import LiveConfig
 from robot.simulation.head.session import SimulationConfig
-from robot.world.head_trajectory import Path
-from robot.world.scene import Scene, scene
+from robot.world.head_trajectory import HeadPath
+from robot.world.scene import Scene, make_scene
 from tactile.base.errors import InputError
 from tactile.whiskers.head_geometry import Head
 
@@ -54,7 +54,7 @@ class Route:
         self.sent = max(self.sent - 1, 0)
 
 
-def plan_path(config: LiveConfig, head: Head) -> Path:
+def plan_path(config: LiveConfig, head: Head) -> HeadPath:
     """The poses of the head in the map, in time if nothing holds it up.
 
     Raises:
@@ -68,7 +68,7 @@ def plan_path(config: LiveConfig, head: Head) -> Path:
             "live.plan.kidnaps", "a head that is carried", "0: an arm cannot be", "leave them out"
         )
     keep = made.path.time <= made.duration
-    return Path(made.path.time[keep], made.path.pose[keep])
+    return HeadPath(made.path.time[keep], made.path.pose[keep])
 
 
 def plan_scene(plan: SimulationConfig, head: Head) -> Scene:
@@ -77,10 +77,10 @@ def plan_scene(plan: SimulationConfig, head: Head) -> Scene:
     Raises:
         InputError: there is no such scene.
     """
-    return scene(plan.maze, plan.path, plan.motion, plan.kidnaps, head, plan.seed)
+    return make_scene(plan.maze, plan.path, plan.motion, plan.kidnaps, head, plan.seed)
 
 
-def _waypoint_path(config: LiveConfig) -> Path:
+def _waypoint_path(config: LiveConfig) -> HeadPath:
     pose = np.array(config.waypoints)
     pose[:, 2] = np.unwrap(np.radians(pose[:, 2]))
     if len(pose) < 2:
@@ -88,25 +88,25 @@ def _waypoint_path(config: LiveConfig) -> Path:
     step = np.abs(np.diff(pose, axis=0))
     motion = config.plan.motion
     took = np.maximum(np.hypot(step[:, 0], step[:, 1]) / motion.speed, step[:, 2] / motion.turn_rate)
-    return Path(np.concatenate([[0.0], np.cumsum(took)]), pose)
+    return HeadPath(np.concatenate([[0.0], np.cumsum(took)]), pose)
 
 
-def main_route(config: LiveConfig, path: Path) -> Route:
+def main_route(config: LiveConfig, path: HeadPath) -> Route:
     """The route along a way, without its first pose, where it starts."""
     return Route(tcp_from_pose(config.arm.placing, path.pose[1:]), route_speed(config))
 
 
-def approach_route(config: LiveConfig, path: Path) -> Route:
+def approach_route(config: LiveConfig, path: HeadPath) -> Route:
     """From wherever the arm stands to above the first pose."""
     return Route(tcp_from_pose(config.arm.placing, path.pose[:1], config.lift), route_speed(config))
 
 
-def descent_route(config: LiveConfig, path: Path) -> Route:
+def descent_route(config: LiveConfig, path: HeadPath) -> Route:
     """From there down to it."""
     return Route(tcp_from_pose(config.arm.placing, path.pose[:1]), route_speed(config))
 
 
-def check_targets(config: LiveConfig, path: Path) -> None:
+def check_targets(config: LiveConfig, path: HeadPath) -> None:
     """Asks for every target whether the arm may go there, before it goes anywhere.
 
     Raises:

@@ -18,7 +18,7 @@ from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Observation, Odometry, Report, Whisk
 
 CDR = b"\x00\x01\x00\x00"
-MOST = 100_000_000  # numbers in one message; more is a damaged length
+MAX_NUMBERS = 100_000_000  # numbers in one message; more is a damaged length
 FELT = ("touched", "highest", "reach")
 """What `felt` of a whisk holds of each whisker."""
 FLAGS = {OBSERVATION: ("contact", "dead"), WHISK: ("alive", "contact", "held"), REPORT: ("alive", "contact")}
@@ -82,14 +82,14 @@ def decode(name: str, message: bytes, view_shape: tuple[int, int, int], whiskers
     """
     if name == CYCLE:
         samples = int.from_bytes(message[44:48], "little")
-        if samples * (1 + 3 * whiskers) > MOST:
+        if samples * (1 + 3 * whiskers) > MAX_NUMBERS:
             raise Malformed(f"a cycle of {samples} samples")
         layout = cycle_layout(samples, whiskers)
     elif name == WHISK:
         layout = whisk_layout(whiskers)
     elif name == REPORT:
         samples = int.from_bytes(message[56:60], "little")
-        if samples * (1 + 2 * whiskers) > MOST:
+        if samples * (1 + 2 * whiskers) > MAX_NUMBERS:
             raise Malformed(f"a report of {samples} samples")
         layout = report_layout(samples, whiskers)
     else:

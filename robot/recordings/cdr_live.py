@@ -16,7 +16,7 @@ from robot.drivers.head.cycle_assembly import Cut
 from robot.drivers.head.decoder import Frames
 from robot.drivers.head.protocol import CHANNELS
 from robot.drivers.ur10.shared_state import ARM_STATE
-from robot.recordings.cdr import CDR, MOST, Malformed
+from robot.recordings.cdr import CDR, MAX_NUMBERS, Malformed
 from tactile.base.types import Odometry
 
 NUMBERS = ("host", "robot", "tcp", "speed", "force", "joints")
@@ -193,7 +193,7 @@ class _Fields:
 
     def _take(self, kind: str, count: int) -> np.ndarray:
         size = np.dtype(kind).itemsize * count
-        if count > MOST or self._place + size > len(self._message):
+        if count > MAX_NUMBERS or self._place + size > len(self._message):
             raise Malformed("a message that ends too early")
         found = np.frombuffer(self._message, kind, count, self._place)
         self._place += size

@@ -2,30 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from robot.recordings.csv_config import LabelColumns, PairColumns, TruthColumns, ViewColumns
 from robot.recordings.csv_file import CsvFile
-from robot.recordings.match_pairs import labels_from_pairs
-from robot.recordings.sanity_checks import Place, clock, finite, views
-from robot.recordings.unit_check import Limits, headings
+from robot.recordings.sanity_checks import RowName, clock_errors, nonfinite_errors, view_errors
+from robot.recordings.unit_check import UnitLimits, heading_errors
 from tactile.base.errors import InputError
 
-FAR = 20.0  # times max_range: a median range beyond it is in another unit
+RANGE_UNIT_FACTOR = 20.0  # times max_range: a median range beyond it is in another unit
 
-Matched = tuple[np.ndarray, np.ndarray, list[InputError]]  # odometry rows [M], values [M, ...], faults
+AlignedRows = tuple[np.ndarray, np.ndarray, list[InputError]]  # odometry rows [M], values [M, ...], faults
 
 
-def views_of(
+def align_views(
     base: CsvFile,
     files: Mapping[Path, CsvFile],
     part: ViewColumns,
     time: np.ndarray,
     shape: tuple[int, int, int],
-) -> Matched:
+) -> AlignedRows:
     """Views [M, R, C, 1]: pixels as given, or the mean range of equal groups of consecutive beams."""
     file = files[part.file or base.path]
     values, empty = file.block(part.prefix)
@@ -39,37 +38,41 @@ def views_of(
         error = InputError(f"{file.path}:1", f"{width} columns {part.prefix}0, {part.prefix}1, ...", expected)
         return there, values, [error]
     if part.max_range is None:
-        errors = finite(values, what, place)
-        errors += views(values.min(axis=1), values.max(axis=1), what, place)
+        errors = nonfinite_errors(values, what, place)
+        errors += view_errors(values.min(axis=1), values.max(axis=1), what, place)
     else:
         values = np.where(np.isposinf(values), part.max_range, values)  # REP-117: nothing in reach
-        errors = finite(values, what, place) + _range_faults(values, part.max_range, what, place, file.path)
+        errors = nonfinite_errors(values, what, place) + _range_faults(
+            values, part.max_range, what, place, file.path
+        )
         groups = np.minimum(values, part.max_range).reshape(len(values), pixels, -1)
         values = groups.mean(axis=2) / part.max_range
     rows, faults = _rows(file, base, there, part.time, part.tolerance, time)
     return rows, values.reshape(-1, *shape), errors + faults
 
 
-def _range_faults(values: np.ndarray, reach: float, what: str, place: Place, path: Path) -> list[InputError]:
+def _range_faults(
+    values: np.ndarray, reach: float, what: str, place: RowName, path: Path
+) -> list[InputError]:
     errors = []
     negative = (values < 0).any(axis=1)
     if negative.any():
         row = int(negative.argmax())
         errors.append(InputError(place(row), f"{what} is {values[row].min()}", "ranges of 0 m or more"))
     typical = float(np.nanmedian(values)) if np.isfinite(values).any() else 0.0
-    if typical > FAR * reach:
+    if typical > RANGE_UNIT_FACTOR * reach:
         cure = "divide by 1000 if they are millimetres, else raise table.views.max_range"
         errors.append(InputError(str(path), f"half of the ranges are over {typical:.4g} m", "metres", cure))
     return errors
 
 
-def labels_of(
+def align_labels(
     base: CsvFile,
     files: Mapping[Path, CsvFile],
     labels: LabelColumns | None,
     pairs: PairColumns | None,
     time: np.ndarray,
-) -> Matched:
+) -> AlignedRows:
     """Place ids [M] int32, as given or from pairs."""
     if pairs is not None:
         return _paired(base, files[pairs.file], pairs, time)
@@ -87,7 +90,7 @@ def labels_of(
     return rows, ids.astype(np.int32), errors
 
 
-def _paired(base: CsvFile, file: CsvFile, part: PairColumns, time: np.ndarray) -> Matched:
+def _paired(base: CsvFile, file: CsvFile, part: PairColumns, time: np.ndarray) -> AlignedRows:
     later, earlier, score = (file.column(name) for name in (part.later, part.earlier, part.score))
     errors = file.faults(part.later, part.earlier, part.score)
     crossed = later <= earlier
@@ -103,8 +106,35 @@ def _paired(base: CsvFile, file: CsvFile, part: PairColumns, time: np.ndarray) -
     return rows, ids, errors
 
 
-def truth_of(
-    base: CsvFile, files: Mapping[Path, CsvFile], part: TruthColumns, time: np.ndarray, limits: Limits
+def labels_from_pairs(
+    later: Sequence[float], earlier: Sequence[float], score: Sequence[float], threshold: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Every time in the list is a view; its best earlier match passes on its id, else it is a new place.
+
+    Args:
+        later, earlier: s, each pair's two times, earlier before later. score: how alike they are.
+        threshold: least score of a match. Of equal scores the pair listed first wins.
+
+    Returns:
+        time: [V] s, increasing. label: [V] int32, places numbered as they are first seen.
+    """
+    best: dict[float, tuple[float, float]] = {}
+    for time, match, value in zip(later, earlier, score, strict=True):
+        if value >= threshold and (time not in best or value > best[time][0]):
+            best[time] = value, match
+    moments = np.unique(np.concatenate([later, earlier]))
+    ids: dict[float, int] = {}
+    places = 0
+    for moment in moments.tolist():
+        if moment in best:
+            ids[moment] = ids[best[moment][1]]
+        else:
+            ids[moment], places = places, places + 1
+    return moments, np.fromiter(ids.values(), np.int32, len(ids))
+
+
+def align_truth(
+    base: CsvFile, files: Mapping[Path, CsvFile], part: TruthColumns, time: np.ndarray, limits: UnitLimits
 ) -> tuple[np.ndarray, list[InputError]]:
     """[N, 3] at the odometry rows, NaN outside the truth's span."""
     file = files[part.file or base.path]
@@ -112,12 +142,12 @@ def truth_of(
     errors = file.faults(*names)
     truth = np.column_stack([file.column(name) for name in names])
     moments = time if file is base else file.column(part.time)
-    if faults := headings(truth[:, 2], moments, part.heading, str(file.path), limits):
+    if faults := heading_errors(truth[:, 2], moments, part.heading, str(file.path), limits):
         errors += faults
         truth[:, 2] = np.deg2rad(truth[:, 2])  # or every other check would say it again
     if file is base:
         return truth, errors
-    errors += file.faults(part.time) + clock(moments, part.time, file.place)
+    errors += file.faults(part.time) + clock_errors(moments, part.time, file.place)
     if errors:
         return np.full((len(time), 3), np.nan), errors
     truth[:, 2] = np.unwrap(truth[:, 2])
@@ -137,17 +167,17 @@ def _rows(
         return there, []
     moments = file.column(name)[there]
     place = _place(file, there)
-    errors = finite(moments, name, place) + clock(moments, name, place)
+    errors = nonfinite_errors(moments, name, place) + clock_errors(moments, name, place)
     return (there, errors) if errors else _nearest(moments, time, tolerance, place)
 
 
-def _place(file: CsvFile, there: np.ndarray) -> Place:
+def _place(file: CsvFile, there: np.ndarray) -> RowName:
     """Where those of a file's rows [M] stand."""
     return lambda row: file.place(int(there[row]))
 
 
 def _nearest(
-    moments: np.ndarray, time: np.ndarray, tolerance: float | None, place: Place
+    moments: np.ndarray, time: np.ndarray, tolerance: float | None, place: RowName
 ) -> tuple[np.ndarray, list[InputError]]:
     """The odometry row nearest in time to each of the moments [M], at most the tolerance away."""
     steps = np.diff(time)

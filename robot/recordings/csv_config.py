@@ -93,7 +93,7 @@ class TruthColumns(Settings):
     """Column of the heading, rad; wrapped or not."""
 
 
-class TableConfig(Settings):
+class CsvConfig(Settings):
     """Which column means what."""
 
     time: str = "t"

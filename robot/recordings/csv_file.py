@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from robot.recordings.sanity_checks import and_more, finite
-from robot.sources.input_files import digest_of, missing, read_bytes, refuse
+from robot.recordings.sanity_checks import count_others, nonfinite_errors
+from robot.sources.input_files import digest_of, missing_error, raise_errors, read_bytes
 from tactile.base.errors import InputError
 
-SHOWN = 8  # faults listed one by one before the rest is only counted
+MAX_LISTED = 8  # faults listed one by one before the rest is only counted
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,16 +45,18 @@ class CsvFile:
         for name in names:
             empty = self.empty[:, self.names.index(name)]
             if empty.any():
-                found = f"{name} is empty{and_more(empty)}"
+                found = f"{name} is empty{count_others(empty)}"
                 errors.append(InputError(self.place(int(empty.argmax())), found, "a number"))
-            errors += finite(self.column(name), name, self.place, ~empty)
+            errors += nonfinite_errors(self.column(name), name, self.place, ~empty)
         return errors
 
     def absences(self, wanted: Sequence[tuple[str, str]]) -> list[InputError]:
         """Faults for wanted (column, configuration key) that are not there."""
         where = f"{self.path}:1"
         return [
-            missing(where, "column", name, self.names, key) for name, key in wanted if name not in self.names
+            missing_error(where, "column", name, self.names, key)
+            for name, key in wanted
+            if name not in self.names
         ]
 
     def numbered(self, prefix: str) -> dict[int, int]:
@@ -140,9 +142,9 @@ def _cells(path: Path, names: tuple[str, ...], kept: list[tuple[int, str]]) -> t
                 values[row, column] = float(cell)
             else:
                 errors.append(InputError(f"{path}:{number}", f"{names[column]} is {cell[:40]!r}", "a number"))
-    if len(errors) > SHOWN:
-        errors[SHOWN:] = [InputError(str(path), f"{len(errors) - SHOWN} more faults like these")]
-    refuse(errors)
+    if len(errors) > MAX_LISTED:
+        errors[MAX_LISTED:] = [InputError(str(path), f"{len(errors) - MAX_LISTED} more faults like these")]
+    raise_errors(errors)
     return values, empty
 
 

@@ -7,19 +7,19 @@ from pathlib import Path
 
 import numpy as np
 
-from robot.recordings.csv_alignment import labels_of, truth_of, views_of
-from robot.recordings.csv_config import PoseColumns, TableConfig, ViewColumns
+from robot.recordings.csv_alignment import align_labels, align_truth, align_views
+from robot.recordings.csv_config import CsvConfig, PoseColumns, ViewColumns
 from robot.recordings.csv_file import CsvFile, digest_of_files, read_csv
-from robot.recordings.sanity_checks import clock
-from robot.recordings.unit_check import ORDINARY, Limits, Track, headings, units
-from robot.sources.in_memory import Log
-from robot.sources.input_files import missing, refuse
+from robot.recordings.sanity_checks import clock_errors
+from robot.recordings.unit_check import DEFAULT_LIMITS, MotionTrack, UnitLimits, heading_errors, unit_errors
+from robot.sources.in_memory import InMemorySource
+from robot.sources.input_files import missing_error, raise_errors
 from robot.sources.odometry import from_poses, from_velocities
 from robot.sources.source_info import SourceInfo
 from tactile.base.errors import InputError
 
 
-def read_table(path: Path, config: TableConfig, limits: Limits = ORDINARY) -> Log:
+def read_csv_recording(path: Path, config: CsvConfig, limits: UnitLimits = DEFAULT_LIMITS) -> InMemorySource:
     """A CSV recording as a `Source`: one sample per row of the odometry file.
 
     Raises:
@@ -29,31 +29,31 @@ def read_table(path: Path, config: TableConfig, limits: Limits = ORDINARY) -> Lo
     paths = [path, *(part.file for part in parts if part is not None and part.file is not None)]
     files = {name: read_csv(name) for name in dict.fromkeys(paths)}
     base = files[path]
-    refuse(_absences(base, files, config))
+    raise_errors(_absences(base, files, config))
 
     time = base.column(config.time)
     everywhere = np.ones(len(time), bool)
-    errors = base.faults(config.time) + clock(time, config.time, base.place)
+    errors = base.faults(config.time) + clock_errors(time, config.time, base.place)
     motion, faults = _motion(base, time, config, limits)
     errors += faults
     shape = (config.rows, config.columns, 1)
     pictures, seen = np.zeros((len(time), *shape)), np.zeros(len(time), bool)
     label, truth = np.full(len(time), -1, np.int32), None
     if config.views is not None:
-        rows, values, faults = views_of(base, files, config.views, time, shape)
+        rows, values, faults = align_views(base, files, config.views, time, shape)
         errors += faults
         if not faults:
             pictures[rows], seen[rows] = values, True
     if config.labels is not None or config.pairs is not None:
-        rows, values, faults = labels_of(base, files, config.labels, config.pairs, time)
+        rows, values, faults = align_labels(base, files, config.labels, config.pairs, time)
         errors += faults
         if not faults:
             label[rows] = values
     if config.truth is not None:
-        truth, faults = truth_of(base, files, config.truth, time, limits)
+        truth, faults = align_truth(base, files, config.truth, time, limits)
         errors += faults
-    refuse(errors + units(Track(time, everywhere, motion, truth), str(path), limits))
-    return Log(
+    raise_errors(errors + unit_errors(MotionTrack(time, everywhere, motion, truth), str(path), limits))
+    return InMemorySource(
         name=path.stem,
         digest=digest_of_files(list(files.values())),
         time=time,
@@ -67,7 +67,7 @@ def read_table(path: Path, config: TableConfig, limits: Limits = ORDINARY) -> Lo
     )
 
 
-def _absences(base: CsvFile, files: Mapping[Path, CsvFile], config: TableConfig) -> list[InputError]:
+def _absences(base: CsvFile, files: Mapping[Path, CsvFile], config: CsvConfig) -> list[InputError]:
     """Columns that a configuration key names and the file lacks, and choices that were not made."""
     errors = base.absences([(config.time, "table.time")])
     if (config.pose is None) == (config.velocity is None):
@@ -102,11 +102,11 @@ def _gap(file: CsvFile, prefix: str) -> list[InputError]:
     )
     if absent is None:
         return []
-    return [missing(f"{file.path}:1", "column", f"{prefix}{absent}", file.names, "table.views.prefix")]
+    return [missing_error(f"{file.path}:1", "column", f"{prefix}{absent}", file.names, "table.views.prefix")]
 
 
 def _motion(
-    base: CsvFile, time: np.ndarray, config: TableConfig, limits: Limits
+    base: CsvFile, time: np.ndarray, config: CsvConfig, limits: UnitLimits
 ) -> tuple[np.ndarray, list[InputError]]:
     """[N, 4] and the faults of its columns."""
     part = config.pose or config.velocity
@@ -117,7 +117,7 @@ def _motion(
     with np.errstate(all="ignore"):  # faulty values were just reported
         if isinstance(part, PoseColumns):
             poses = np.column_stack([columns[name] for name in names])
-            if faults := headings(poses[:, 2], time, part.heading, str(base.path), limits):
+            if faults := heading_errors(poses[:, 2], time, part.heading, str(base.path), limits):
                 errors += faults
                 poses[:, 2] = np.deg2rad(poses[:, 2])  # or every other check would say it again
             return from_poses(time, poses), errors

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from robot.recordings.csv_config import TableConfig
-from robot.recordings.unit_check import ORDINARY, Limits
+from robot.recordings.csv_config import CsvConfig
+from robot.recordings.unit_check import DEFAULT_LIMITS, UnitLimits
 from robot.sources.input_files import require_file
 from robot.sources.source import Source
 from tactile.base.config import Settings
@@ -20,9 +20,9 @@ class RecordingConfig(Settings):
 
     file: Path
     """The recording: `.mcap` (ours), `.npz` (a reference stream) or `.csv` (odometry)."""
-    table: TableConfig = TableConfig()
+    table: CsvConfig = CsvConfig()
     """For `.csv`: which column means what."""
-    limits: Limits = ORDINARY
+    limits: UnitLimits = DEFAULT_LIMITS
     """What the numbers may claim before they are refused as wrong units."""
 
     def resolved(self, folder: Path) -> RecordingConfig:
@@ -43,15 +43,15 @@ def _open_mcap(config: RecordingConfig, warn: Warn) -> Source:
 
 
 def _open_npz(config: RecordingConfig, warn: Warn) -> Source:
-    from robot.recordings.npz_trace import read_stream
+    from robot.recordings.npz_trace import read_trace
 
-    return read_stream(config.file, config.limits)
+    return read_trace(config.file, config.limits)
 
 
 def _open_csv(config: RecordingConfig, warn: Warn) -> Source:
-    from robot.recordings.csv_reader import read_table
+    from robot.recordings.csv_reader import read_csv_recording
 
-    return read_table(config.file, config.table, config.limits)
+    return read_csv_recording(config.file, config.table, config.limits)
 
 
 # ROS bags (a folder with metadata.yaml, or .bag) go here: a reader that returns a Source, and one line.

@@ -14,13 +14,13 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from robot.recordings.cdr_live import Event
-from robot.recordings.mcap_scanner import Walk
-from robot.recordings.mcap_writer import Tape
+from robot.recordings.mcap_scanner import McapScanner
+from robot.recordings.mcap_writer import McapWriter
 from robot.recordings.recorder import Recorder
-from robot.recordings.sanity_checks import clock, finite, views
+from robot.recordings.sanity_checks import clock_errors, nonfinite_errors, view_errors
 from robot.recordings.schemas import TRUTH
-from robot.recordings.unit_check import ORDINARY, Limits, Track, units
-from robot.sources.input_files import refuse, require_file, unreadable
+from robot.recordings.unit_check import DEFAULT_LIMITS, MotionTrack, UnitLimits, unit_errors
+from robot.sources.input_files import raise_errors, require_file, unreadable_error
 from robot.sources.source import Sample, Source, rate_of
 from tactile.base.atomic_write import flush_to_disk, write_atomically
 from tactile.base.errors import InputError
@@ -50,13 +50,13 @@ class Recording:
     view_shape: tuple[int, int, int]
 
     def __init__(
-        self, path: Path, limits: Limits = ORDINARY, warn: Callable[[str], None] | None = None
+        self, path: Path, limits: UnitLimits = DEFAULT_LIMITS, warn: Callable[[str], None] | None = None
     ) -> None:
         require_file(path)
         self.path = path
         self.name = path.stem
         self.digest = _digest(path)
-        walk = Walk(path)
+        walk = McapScanner(path)
         columns = array("d")
         events: list[Event] = []
         raw_whiskers = False
@@ -83,7 +83,7 @@ class Recording:
         if self.truncated and warn is not None:
             warn(self.warning)
 
-    def _check(self, columns: np.ndarray, limits: Limits) -> np.ndarray:
+    def _check(self, columns: np.ndarray, limits: UnitLimits) -> np.ndarray:
         """The times [N] s of the samples with odometry, after refusing what cannot be."""
         time, motion, truth = columns[:, 0], columns[:, 1:5], columns[:, 5:8]
         low, high, odd, told = columns[:, 8:].T
@@ -93,19 +93,21 @@ class Recording:
         def place(row: int) -> str:
             return f"{self.path}, row {row}"
 
-        errors = finite(time, "time", place) + clock(time, "time", place, moved)
-        errors += finite(motion, "odometry", place) + views(low, high, "view", place)
-        errors += finite(odd, "a number in the reading", place) + finite(truth, "truth", place, told > 0)
+        errors = nonfinite_errors(time, "time", place) + clock_errors(time, "time", place, moved)
+        errors += nonfinite_errors(motion, "odometry", place) + view_errors(low, high, "view", place)
+        errors += nonfinite_errors(odd, "a number in the reading", place) + nonfinite_errors(
+            truth, "truth", place, told > 0
+        )
         back = motion[:, 3] < 0
         if back.any():
             row = int(back.argmax())
             errors.append(InputError(place(row), f"odometry took {motion[row, 3]} s", "dt of 0 s or more"))
-        track = Track(time, moved, motion, truth if told.any() else None)
-        refuse(errors + units(track, str(self.path), limits))
+        track = MotionTrack(time, moved, motion, truth if told.any() else None)
+        raise_errors(errors + unit_errors(track, str(self.path), limits))
         return time[moved]
 
     def __iter__(self) -> Iterator[Sample]:
-        walk = Walk(self.path)
+        walk = McapScanner(self.path)
         for sample in walk:
             yield sample
             if walk.count == self.length:
@@ -135,7 +137,7 @@ class Recovery(NamedTuple):
     reason: str
 
 
-def record(source: Source, path: Path) -> int:
+def record_source(source: Source, path: Path) -> int:
     """Write all samples of a source to a new recording; their number."""
     with Recorder(
         path,
@@ -160,7 +162,7 @@ def recover(path: Path, out: Path) -> Recovery:
     require_file(path)
     if out.exists():
         raise InputError(str(out), "exists already", "a new file", "choose another name or move it")
-    walk = Walk(path)
+    walk = McapScanner(path)
     entries = walk.entries()
     first = next(entries, None)
     if first is None or walk.description is None:
@@ -168,7 +170,7 @@ def recover(path: Path, out: Path) -> Recovery:
     described = walk.description
 
     def write(path: Path) -> None:
-        tape = Tape(path, view_shape=described.view_shape, whiskers=described.whiskers,
+        tape = McapWriter(path, view_shape=described.view_shape, whiskers=described.whiskers,
                     rate_hz=described.rate_hz, info=described.info)  # fmt: skip
         with closing(tape):
             for entry in chain([first], entries):
@@ -183,7 +185,7 @@ def recover(path: Path, out: Path) -> Recovery:
     return Recovery(walk.count, bool(walk.broken), walk.broken)
 
 
-def _nothing(walk: Walk) -> InputError:
+def _nothing(walk: McapScanner) -> InputError:
     """The refusal of a walked file without a description or without samples."""
     if walk.description is None:
         found = f"cannot be read as a recording: {walk.broken or 'it does not say what it holds'}"
@@ -218,4 +220,4 @@ def _digest(path: Path) -> str:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
-        raise unreadable(path, error) from error
+        raise unreadable_error(path, error) from error

@@ -20,7 +20,7 @@ from robot.recordings.cdr import Malformed
 CHUNK_LIMIT = 1 << 28  # bytes; ours hold 64 kB, or one sample if that is larger
 
 # What the MCAP and zstd libraries, and we, raise about bytes that are not what they should be.
-BROKEN = (McapError, zstandard.ZstdError, struct.error, ValueError, OverflowError)
+DAMAGE_ERRORS = (McapError, zstandard.ZstdError, struct.error, ValueError, OverflowError)
 
 
 class _Bounded:
@@ -41,8 +41,8 @@ class _Bounded:
         return content
 
 
-def records(file: IO[bytes]) -> Iterator[McapRecord]:
-    """Every record in order, chunks opened; raises one of `BROKEN`."""
+def read_records(file: IO[bytes]) -> Iterator[McapRecord]:
+    """Every record in order, chunks opened; raises one of `DAMAGE_ERRORS`."""
     reader = StreamReader(cast(Any, _Bounded(file)), emit_chunks=True, validate_crcs=True)
     for record in reader.records:
         if isinstance(record, Chunk):

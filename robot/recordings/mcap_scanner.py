@@ -18,11 +18,11 @@ from mcap.records import Channel, Message, Metadata, Schema, Statistics
 
 from robot.drivers.head.cycle_assembly import FrameWindow, assemble_cycle, empty_frames
 from robot.drivers.head.decoder import Frames
-from robot.recordings.cdr import MOST, Malformed, decode, decode_truth
+from robot.recordings.cdr import MAX_NUMBERS, Malformed, decode, decode_truth
 from robot.recordings.cdr_live import Event, decode_cut, decode_event, decode_frames, decode_states
-from robot.recordings.mcap_records import BROKEN, records
+from robot.recordings.mcap_records import DAMAGE_ERRORS, read_records
 from robot.recordings.schemas import ARM, CUT, FRAMES, READINGS, SCHEMA_OF, SCHEMAS, TRUTH
-from robot.sources.input_files import unreadable
+from robot.sources.input_files import unreadable_error
 from robot.sources.source import Sample
 from robot.sources.source_info import SourceInfo
 
@@ -30,7 +30,7 @@ METADATA = "ratslam"
 FORMAT = "3"
 
 
-class Description(NamedTuple):
+class RecordingDescription(NamedTuple):
     """What a recording says about itself before its first sample.
 
     Attributes:
@@ -58,7 +58,7 @@ class Description(NamedTuple):
         return data | {"crc32": _checksum(data)}
 
     @classmethod
-    def from_metadata(cls, data: Mapping[str, str]) -> Description:
+    def from_metadata(cls, data: Mapping[str, str]) -> RecordingDescription:
         """Raises `ValueError` for anything `to_metadata` cannot have written."""
         if data.get("format") != FORMAT:
             raise Malformed(f"its format is {data.get('format')!r}, this version reads {FORMAT!r}")
@@ -72,7 +72,7 @@ class Description(NamedTuple):
         except KeyError as error:
             raise Malformed(f"a description without {error}") from error
         sizes = (*found.view_shape, found.whiskers + 1)
-        if min(sizes) < 1 or rows * columns * channels + 3 * found.whiskers > MOST:
+        if min(sizes) < 1 or rows * columns * channels + 3 * found.whiskers > MAX_NUMBERS:
             raise Malformed(f"views of shape {found.view_shape} and {found.whiskers} whiskers")
         return found
 
@@ -82,7 +82,7 @@ def _checksum(data: Mapping[str, str]) -> str:
     return str(crc32(json.dumps({**data, "crc32": ""}, sort_keys=True).encode()))
 
 
-class Entry(NamedTuple):
+class RecordingEntry(NamedTuple):
     """What a file holds, one after the other.
 
     Attributes:
@@ -98,7 +98,7 @@ class Entry(NamedTuple):
     content: Sample | Frames | np.ndarray | Event
 
 
-class Walk:
+class McapScanner:
     """One pass over a file; iterate once, over its samples or over all its `entries`.
 
     Attributes:
@@ -109,7 +109,7 @@ class Walk:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.description: Description | None = None
+        self.description: RecordingDescription | None = None
         self.broken = "it was not read to its end"
         self.count = 0
         self._number = 0  # of the next message; a truth has its reading's
@@ -118,22 +118,22 @@ class Walk:
     def __iter__(self) -> Iterator[Sample]:
         return (entry.content for entry in self.entries() if isinstance(entry.content, Sample))
 
-    def entries(self) -> Iterator[Entry]:
+    def entries(self) -> Iterator[RecordingEntry]:
         """Samples and what was written beside them, in their order."""
         try:
             with self.path.open("rb") as file:
                 yield from self._entries(file)
         except OSError as error:
-            raise unreadable(self.path, error) from error
+            raise unreadable_error(self.path, error) from error
 
-    def _entries(self, file: IO[bytes]) -> Iterator[Entry]:
+    def _entries(self, file: IO[bytes]) -> Iterator[RecordingEntry]:
         schemas: dict[int, Schema] = {}
         names: dict[int, str] = {}  # of channels told; '': not one of ours
         truth: bytes | None = None
         try:
-            for record in records(file):
+            for record in read_records(file):
                 if isinstance(record, Metadata) and record.name == METADATA and self.description is None:
-                    self.description = Description.from_metadata(record.metadata)
+                    self.description = RecordingDescription.from_metadata(record.metadata)
                 elif isinstance(record, Schema):
                     schemas[record.id] = record
                 elif isinstance(record, Channel):
@@ -154,14 +154,14 @@ class Walk:
                     if name in READINGS:
                         sample = self._sample(name, record.data, truth)
                         self.count += 1
-                        yield Entry(name, sample.time, record.data, truth, sample)
+                        yield RecordingEntry(name, sample.time, record.data, truth, sample)
                         truth = None
                     else:
                         time, content = self._block(name, record.data)
-                        yield Entry(name, time, record.data, None, content)
+                        yield RecordingEntry(name, time, record.data, None, content)
                 elif isinstance(record, Statistics):
                     self._compare(record, names)
-        except BROKEN as error:
+        except DAMAGE_ERRORS as error:
             self.broken = (
                 "it ends too early" if isinstance(error, EndOfFile) else str(error) or type(error).__name__
             )

@@ -13,13 +13,13 @@ from typing import Any, cast
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
-from robot.recordings.mcap_scanner import METADATA, Description
+from robot.recordings.mcap_scanner import METADATA, RecordingDescription
 from robot.recordings.schemas import READINGS, SCHEMAS, TOPICS, TRUTH
 from robot.sources.source_info import SourceInfo
 from tactile.base.errors import InputError
 
 
-class Unwritable(InputError):
+class RecordingWriteError(InputError):
     """The operating system takes no more of a recording."""
 
     def __init__(self, path: Path, error: OSError) -> None:
@@ -27,7 +27,7 @@ class Unwritable(InputError):
         super().__init__(str(path), f"cannot be written on ({error.strerror or error})", "", cure)
 
 
-class Tape:
+class McapWriter:
     """Appends messages to a new file.
 
     Args:
@@ -56,9 +56,9 @@ class Tape:
         chunk_bytes: int = 1 << 16,
         chunk_s: float = 0.5,
     ) -> None:
-        self.description = Description(view_shape, whiskers, rate_hz, _program(), info)
+        self.description = RecordingDescription(view_shape, whiskers, rate_hz, _program(), info)
         metadata = self.description.to_metadata()
-        Description.from_metadata(metadata)
+        RecordingDescription.from_metadata(metadata)
         self.path = path
         try:
             self._file = _Whole(path)
@@ -113,7 +113,7 @@ class Tape:
             self._writer.flush()
         except OSError as error:
             self._failed = True
-            raise Unwritable(self.path, error) from error
+            raise RecordingWriteError(self.path, error) from error
         self._pending = 0
 
     def close(self) -> None:
@@ -129,7 +129,7 @@ class Tape:
             self._file.flush()
         except OSError as error:
             if not self._failed:
-                raise Unwritable(self.path, error) from error
+                raise RecordingWriteError(self.path, error) from error
         finally:
             self._file.close()
 

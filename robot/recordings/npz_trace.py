@@ -19,11 +19,11 @@ from pathlib import Path
 
 import numpy as np
 
-from robot.recordings.sanity_checks import Place, clock, finite, views
-from robot.recordings.unit_check import ORDINARY, Limits, Track, units
-from robot.sources.in_memory import Log
-from robot.sources.input_files import digest_of, missing, read_bytes, refuse
-from robot.sources.odometry import NEW_HEADING, from_velocities
+from robot.recordings.sanity_checks import RowName, clock_errors, nonfinite_errors, view_errors
+from robot.recordings.unit_check import DEFAULT_LIMITS, MotionTrack, UnitLimits, unit_errors
+from robot.sources.in_memory import InMemorySource
+from robot.sources.input_files import digest_of, missing_error, raise_errors, read_bytes
+from robot.sources.odometry import TURN_THEN_MOVE, from_velocities
 from robot.sources.source_info import SourceInfo
 from tactile.base.errors import InputError
 
@@ -36,7 +36,7 @@ _BROKEN = (zipfile.BadZipFile, zlib.error, ValueError, LookupError, EOFError, OS
            RuntimeError, SyntaxError)  # fmt: skip
 
 
-def read_stream(path: Path, limits: Limits = ORDINARY) -> Log:
+def read_trace(path: Path, limits: UnitLimits = DEFAULT_LIMITS) -> InMemorySource:
     """A reference stream as a `Source`; `info.provenance["parameters"]` holds its parameters.
 
     Raises:
@@ -44,7 +44,7 @@ def read_stream(path: Path, limits: Limits = ORDINARY) -> Log:
     """
     content = read_bytes(path)
     arrays = _arrays(path, content)
-    refuse(_shape_faults(path, arrays))
+    raise_errors(_shape_faults(path, arrays))
     params = _params(path, arrays["params_json"])
     shape, given_ids = _view_shape(path, params, arrays["in_view"].shape[1])
 
@@ -55,20 +55,24 @@ def read_stream(path: Path, limits: Limits = ORDINARY) -> Log:
     truth = arrays["truth"].astype(np.float64) if "truth" in arrays else None
     motion = np.zeros((len(time), 4))
     with np.errstate(all="ignore"):  # faulty values are reported below
-        motion[moved] = from_velocities(time[moved], speed[moved], 0.0, turn[moved], NEW_HEADING)
+        motion[moved] = from_velocities(time[moved], speed[moved], 0.0, turn[moved], TURN_THEN_MOVE)
 
     place = _place(path)
-    errors = [*_flag_faults(flags, place), *finite(time, "in_t", place), *clock(time, "in_t", place, moved)]
-    errors += finite(speed, "in_v", place, moved) + finite(turn, "in_w", place, moved)
-    errors += finite(view, "in_view", place, seen)
+    errors = [
+        *_flag_faults(flags, place),
+        *nonfinite_errors(time, "in_t", place),
+        *clock_errors(time, "in_t", place, moved),
+    ]
+    errors += nonfinite_errors(speed, "in_v", place, moved) + nonfinite_errors(turn, "in_w", place, moved)
+    errors += nonfinite_errors(view, "in_view", place, seen)
     if given_ids:
         errors += _id_faults(view, seen, place)
     else:
         low = np.where(seen, view.min(axis=1), np.nan)
-        errors += views(low, np.where(seen, view.max(axis=1), np.nan), "in_view", place)
+        errors += view_errors(low, np.where(seen, view.max(axis=1), np.nan), "in_view", place)
     if truth is not None:
-        errors += finite(truth, "truth", place)
-    refuse(errors + units(Track(time, moved, motion, truth), str(path), limits))
+        errors += nonfinite_errors(truth, "truth", place)
+    raise_errors(errors + unit_errors(MotionTrack(time, moved, motion, truth), str(path), limits))
 
     label = np.full(len(time), -1, np.int32)
     picture = np.zeros((len(time), *shape))
@@ -76,7 +80,7 @@ def read_stream(path: Path, limits: Limits = ORDINARY) -> Log:
         label[seen] = view[seen, 0].astype(np.int32)
     else:
         picture[seen] = view[seen].reshape(-1, *shape)
-    return Log(
+    return InMemorySource(
         name=path.stem,
         digest=digest_of([content]),
         time=time,
@@ -90,7 +94,7 @@ def read_stream(path: Path, limits: Limits = ORDINARY) -> Log:
     )
 
 
-def _place(path: Path) -> Place:
+def _place(path: Path) -> RowName:
     return lambda row: f"{path}, row {row}"
 
 
@@ -100,7 +104,7 @@ def _arrays(path: Path, content: bytes) -> dict[str, np.ndarray]:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             there = [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
             if absent := [name for name in NEEDED if name not in there]:
-                refuse([missing(str(path), "array", name, there) for name in absent])
+                raise_errors([missing_error(str(path), "array", name, there) for name in absent])
             return {name: _array(archive, name) for name in (*NEEDED, "truth") if name in there}
     except InputError:
         raise
@@ -172,7 +176,7 @@ def _view_shape(path: Path, params: dict, width: int) -> tuple[tuple[int, int, i
     size = []
     for name in ("template_y_size", "template_x_size"):
         if name not in params:
-            raise missing(where, "key", name, list(params))
+            raise missing_error(where, "key", name, list(params))
         value = params[name]
         if not isinstance(value, int) or not 0 < value < 10_000:
             raise InputError(where, f"{name} is {value!r}", "a whole number of pixels")
@@ -186,7 +190,7 @@ def _view_shape(path: Path, params: dict, width: int) -> tuple[tuple[int, int, i
     return (rows, columns, 1), width != rows * columns
 
 
-def _flag_faults(flags: np.ndarray, place: Place) -> list[InputError]:
+def _flag_faults(flags: np.ndarray, place: RowName) -> list[InputError]:
     bad = ~np.isin(flags, (VIEW, ODOMETRY, VIEW | ODOMETRY))
     if not bad.any():
         return []
@@ -194,7 +198,7 @@ def _flag_faults(flags: np.ndarray, place: Place) -> list[InputError]:
     return [InputError(place(row), f"in_flags is {flags[row]}", "1 (view), 2 (odometry) or 3 (both)")]
 
 
-def _id_faults(view: np.ndarray, seen: np.ndarray, place: Place) -> list[InputError]:
+def _id_faults(view: np.ndarray, seen: np.ndarray, place: RowName) -> list[InputError]:
     """Ids are small whole numbers, and the heading of a match is not ours to use."""
     ids, relative = np.nan_to_num(view).T
     errors = []

@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 
 from robot.recordings.cdr import encode, encode_truth
-from robot.recordings.mcap_writer import Tape
+from robot.recordings.mcap_writer import McapWriter
 from robot.recordings.schemas import TRUTH
 from robot.sources.source import Sample
 from robot.sources.source_info import SourceInfo
@@ -37,7 +37,7 @@ class Recorder:
         chunk_bytes: int = 1 << 16,
         chunk_s: float = 0.5,
     ) -> None:
-        self._tape = Tape(
+        self._tape = McapWriter(
             path,
             view_shape=view_shape,
             whiskers=whiskers,

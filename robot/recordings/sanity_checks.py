@@ -13,10 +13,12 @@ import numpy as np
 
 from tactile.base.errors import InputError
 
-Place = Callable[[int], str]  # where a row stands in the user's file
+RowName = Callable[[int], str]  # where a row stands in the user's file
 
 
-def finite(values: np.ndarray, what: str, place: Place, rows: np.ndarray | None = None) -> list[InputError]:
+def nonfinite_errors(
+    values: np.ndarray, what: str, place: RowName, rows: np.ndarray | None = None
+) -> list[InputError]:
     """Faults where values [N, ...] of the given rows [N] bool are NaN or infinite."""
     flat = values.reshape(len(values), -1)
     bad = ~np.isfinite(flat)
@@ -24,11 +26,13 @@ def finite(values: np.ndarray, what: str, place: Place, rows: np.ndarray | None 
     if not hit.any():
         return []
     row = int(hit.argmax())
-    found = f"{what} is {flat[row][bad[row]][0]}{and_more(hit)}"
+    found = f"{what} is {flat[row][bad[row]][0]}{count_others(hit)}"
     return [InputError(place(row), found, "a finite number", "mend or drop the row")]
 
 
-def clock(time: np.ndarray, what: str, place: Place, moved: np.ndarray | None = None) -> list[InputError]:
+def clock_errors(
+    time: np.ndarray, what: str, place: RowName, moved: np.ndarray | None = None
+) -> list[InputError]:
     """Faults where time [N] s goes back, or where two rows with odometry (`moved` [N]; all) share one."""
     errors = []
     rows = np.flatnonzero(np.isfinite(time))
@@ -36,19 +40,19 @@ def clock(time: np.ndarray, what: str, place: Place, moved: np.ndarray | None = 
     if back.any():
         first = int(back.argmax())
         was, now = time[rows[first : first + 2]].tolist()
-        found = f"{what} goes back from {was!r} to {now!r} s{and_more(back)}"
+        found = f"{what} goes back from {was!r} to {now!r} s{count_others(back)}"
         place_of = place(int(rows[first + 1]))
         errors.append(InputError(place_of, found, "times that increase", "sort the rows by time"))
     rows = rows if moved is None else rows[moved[rows]]
     same = np.diff(time[rows]) == 0
     if same.any():
         row = int(rows[int(same.argmax()) + 1])
-        found = f"{what} repeats {float(time[row])!r} s{and_more(same)}"
+        found = f"{what} repeats {float(time[row])!r} s{count_others(same)}"
         errors.append(InputError(place(row), found, "times that increase", "drop the repeated rows"))
     return errors
 
 
-def views(low: np.ndarray, high: np.ndarray, what: str, place: Place) -> list[InputError]:
+def view_errors(low: np.ndarray, high: np.ndarray, what: str, place: RowName) -> list[InputError]:
     """Faults where a view's smallest and largest values [N] leave 0..1; NaN stands for no view."""
     hit = (low < 0) | (high > 1)
     if not hit.any():
@@ -57,10 +61,10 @@ def views(low: np.ndarray, high: np.ndarray, what: str, place: Place) -> list[In
     worst = float(high[row] if high[row] > 1 else low[row])
     most = 255 if np.nanmax(high) <= 255 else f"their largest possible value, at least {np.nanmax(high):g}"
     cure = "shift and scale them" if np.nanmin(low) < 0 else f"divide them by {most}"
-    return [InputError(place(row), f"{what} holds {worst!r}{and_more(hit)}", "view values in 0..1", cure)]
+    return [InputError(place(row), f"{what} holds {worst!r}{count_others(hit)}", "view values in 0..1", cure)]
 
 
-def and_more(hit: np.ndarray) -> str:
+def count_others(hit: np.ndarray) -> str:
     """' (and ...)' for the rows [N] bool after the first one told; '' when there are none."""
     others = int(hit.sum()) - 1
     return f" (and so in {others} more row{'s' * (others > 1)})" if others else ""

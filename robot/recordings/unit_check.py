@@ -25,7 +25,7 @@ RULER = 0.05  # m: the truth's path is measured in steps of at least this, or it
 STRETCHES = 50  # turning is compared net over so many, or its noise would add up
 
 
-class Limits(Settings):
+class UnitLimits(Settings):
     """What a recording may claim before it is refused. Raise a limit if your robot really does that."""
 
     speed: float = Field(default=25.0, gt=0)
@@ -36,10 +36,10 @@ class Limits(Settings):
     """Longest median step, s: 100 ms taken for seconds is 100."""
 
 
-ORDINARY = Limits()
+DEFAULT_LIMITS = UnitLimits()
 
 
-class Track(NamedTuple):
+class MotionTrack(NamedTuple):
     """The part of a recording that units can be judged by.
 
     Attributes:
@@ -53,7 +53,7 @@ class Track(NamedTuple):
     truth: np.ndarray | None
 
 
-class Typical(NamedTuple):
+class TypicalMotion(NamedTuple):
     """How a robot moves most of the time.
 
     Attributes:
@@ -71,7 +71,7 @@ class Typical(NamedTuple):
     turning: tuple[float, float]
 
 
-def typical(track: Track) -> Typical:
+def typical_motion(track: MotionTrack) -> TypicalMotion:
     """How the robot of this track moves; faulty rows are looked past."""
     steps = np.diff(track.time[track.moved & np.isfinite(track.time)])
     interval = float(np.median(steps)) if len(steps) else 0.0
@@ -79,7 +79,7 @@ def typical(track: Track) -> Typical:
     good = np.isfinite(track.motion).all(axis=1) & (dt > 0) & (dt <= PAUSE * interval)
     length, turn = np.hypot(track.motion[good, 0], track.motion[good, 1]), np.abs(track.motion[good, 2])
     true_speed, path, turning = _beside_truth(track, good)
-    return Typical(
+    return TypicalMotion(
         interval=interval,
         speed=_typical(length, dt[good]),
         turn_rate=_typical(turn, dt[good]),
@@ -90,17 +90,17 @@ def typical(track: Track) -> Typical:
     )
 
 
-def units(track: Track, where: str, limits: Limits = ORDINARY) -> list[InputError]:
+def unit_errors(track: MotionTrack, where: str, limits: UnitLimits = DEFAULT_LIMITS) -> list[InputError]:
     """Faults of the recording as a whole: times not in s, motion not in m or rad, odometry unlike truth.
 
     Each cause is told once: the truth is asked only about what nothing else has shown to be wrong.
     """
     errors = []
     if track.truth is not None:
-        errors = headings(track.truth[:, 2], track.time, "the truth's heading", where, limits)
+        errors = heading_errors(track.truth[:, 2], track.time, "the truth's heading", where, limits)
         if errors:
             track = track._replace(truth=track.truth * (1, 1, np.pi / 180))
-    robot = typical(track)
+    robot = typical_motion(track)
     rushes, truth_rushes = robot.speed > limits.speed, robot.true_speed > limits.speed
     spins = robot.turn_rate > limits.turn_rate or robot.turn > np.pi
     faults = (
@@ -144,8 +144,8 @@ def units(track: Track, where: str, limits: Limits = ORDINARY) -> list[InputErro
     return errors + [InputError(where, *words) for wrong, *words in faults if wrong]
 
 
-def headings(
-    heading: np.ndarray, time: np.ndarray, what: str, where: str, limits: Limits = ORDINARY
+def heading_errors(
+    heading: np.ndarray, time: np.ndarray, what: str, where: str, limits: UnitLimits = DEFAULT_LIMITS
 ) -> list[InputError]:
     """Faults of a heading column [N] that must be degrees: wider than a turn, too fast for radians."""
     good = np.isfinite(heading) & np.isfinite(time)
@@ -169,7 +169,9 @@ def _typical(amount: np.ndarray, duration: np.ndarray) -> float:
     return float(rate[order][np.searchsorted(done, done[-1] / 2)]) if len(done) and done[-1] > 0 else 0.0
 
 
-def _beside_truth(track: Track, good: np.ndarray) -> tuple[float, tuple[float, float], tuple[float, float]]:
+def _beside_truth(
+    track: MotionTrack, good: np.ndarray
+) -> tuple[float, tuple[float, float], tuple[float, float]]:
     """The truth's speed; path and net turning of odometry and truth where there is a truth, else NaN."""
     nothing = np.nan, (np.nan, np.nan), (np.nan, np.nan)
     if track.truth is None:
@@ -207,7 +209,7 @@ def _unlike(a: float, b: float) -> bool:
     return least > LEAST and most > MOST and most > RATIO * least
 
 
-def _else(name: str, limits: Limits) -> str:
+def _else(name: str, limits: UnitLimits) -> str:
     return f"if it really is so, raise limits.{name} ({getattr(limits, name):g})"
 
 

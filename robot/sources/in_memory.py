@@ -17,7 +17,7 @@ from tactile.base.types import Observation, Odometry, observation
 
 
 @dataclass(frozen=True, eq=False)
-class Log:
+class InMemorySource:
     """A `Source` over N rows of observations without contacts.
 
     Attributes:
@@ -91,7 +91,7 @@ class Log:
         pass
 
 
-def collected(source: Source) -> Log:
+def load_into_memory(source: Source) -> InMemorySource:
     """A source of observations as a whole in memory; where whiskers touched is not kept.
 
     Raises:
@@ -106,7 +106,7 @@ def collected(source: Source) -> Log:
         raise InputError(source.name, "whiskers that come alive or die", "a head that stays the same")
     unknown = np.full(3, np.nan)
     truth = np.array([unknown if sample.truth is None else sample.truth for sample in samples])
-    return Log(
+    return InMemorySource(
         name=source.name,
         digest=source.digest,
         time=np.array([sample.time for sample in samples]),

@@ -25,10 +25,10 @@ def require_file(path: Path) -> None:
             if not file.read(1):
                 raise InputError(str(path), "is empty", "a recording", "was it copied completely?")
     except OSError as error:
-        raise unreadable(path, error) from error
+        raise unreadable_error(path, error) from error
 
 
-def unreadable(path: Path, error: OSError) -> InputError:
+def unreadable_error(path: Path, error: OSError) -> InputError:
     """The operating system's refusal in our words."""
     cure = "make it readable for this user" if isinstance(error, PermissionError) else ""
     return InputError(str(path), f"cannot be read ({error.strerror or error})", cure=cure)
@@ -44,7 +44,7 @@ def read_bytes(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise unreadable(path, error) from error
+        raise unreadable_error(path, error) from error
 
 
 def digest_of(contents: Iterable[bytes]) -> str:
@@ -55,7 +55,7 @@ def digest_of(contents: Iterable[bytes]) -> str:
     return total.hexdigest()
 
 
-def missing(where: str, kind: str, name: str, there: Sequence[str], key: str = "") -> InputError:
+def missing_error(where: str, kind: str, name: str, there: Sequence[str], key: str = "") -> InputError:
     """The error about something a file does not hold: says what is there and what may have been meant.
 
     Args:
@@ -68,7 +68,7 @@ def missing(where: str, kind: str, name: str, there: Sequence[str], key: str = "
     return InputError(where, f"no {kind} {name!r}", f"it among {_few(there)}", cure)
 
 
-def refuse(errors: Sequence[InputError]) -> None:
+def raise_errors(errors: Sequence[InputError]) -> None:
     """Raise what was found: nothing, the one error, or all of them together."""
     if len(errors) == 1:
         raise errors[0]

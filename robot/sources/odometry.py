@@ -11,14 +11,15 @@ from typing import Literal
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat
 
+from robot.sources.source import Source
 from tactile.base.config import Settings
-from tactile.base.se2 import between, wrap
+from tactile.base.se2 import between, integrate, wrap
 
-NEW_HEADING = 1.0  # OpenRatSLAM: turn first, then move
-MID_HEADING = 0.5  # second order: exact to O(turn^2) for a constant twist over the step
-DRIVES = 1e-3
+TURN_THEN_MOVE = 1.0  # OpenRatSLAM: turn first, then move
+MIDPOINT = 0.5  # second order: exact to O(turn^2) for a constant twist over the step
+DRIVING_SPEED = 1e-3
 """m/s above which a robot is driving."""
-TURNS = 0.06
+TURNING_RATE = 0.06
 """rad/s above which it is turning."""
 
 
@@ -27,14 +28,14 @@ def from_velocities(
     forward: np.ndarray,
     left: np.ndarray | float,
     turn: np.ndarray,
-    heading: float = MID_HEADING,
+    heading: float = MIDPOINT,
 ) -> np.ndarray:
     """Motions [N, 4] of a robot that had row i's velocities since row i - 1.
 
     Args:
         time: [N] s. forward, left: [N] m/s in the body frame. turn: [N] rad/s, counter-clockwise.
-        heading: the share of the step's turn made before the robot moves: `MID_HEADING`, or
-            `NEW_HEADING` as in OpenRatSLAM.
+        heading: the share of the step's turn made before the robot moves: `MIDPOINT`, or
+            `TURN_THEN_MOVE` as in OpenRatSLAM.
     """
     dt = np.diff(time, prepend=time[:1])
     dtheta = turn * dt
@@ -66,7 +67,7 @@ class OdometryConfig(Settings):
     """Of a heading error that grows with the way in a run, rad/m."""
 
 
-def reckoned(
+def simulate_odometry(
     config: OdometryConfig,
     time: np.ndarray,
     pose: np.ndarray,
@@ -114,6 +115,13 @@ def _errors(
             amount = np.abs(np.stack([np.hypot(motion[:, 0], motion[:, 1]), motion[:, 2]], axis=1))
             total = np.concatenate([np.zeros((1, 2)), np.cumsum(amount, axis=0)])
             moved = np.stack([np.diff(np.interp(ticks, time, column)) for column in total.T], axis=1)
-            gate = moved * config.rate > [DRIVES, TURNS]
+            gate = moved * config.rate > [DRIVING_SPEED, TURNING_RATE]
         total = np.concatenate([np.zeros((1, 2)), np.cumsum(error[1:] * gate, axis=0)])
     return np.stack([np.diff(np.interp(time, ticks, column)) for column in total.T], axis=1)
+
+
+def odometry_extent(source: Source) -> float:
+    """Largest distance from the start along either axis of the frame that it starts in, m."""
+    moves = np.array([sample.reading.odometry[:3] for sample in source], float).reshape(-1, 3)
+    path = integrate(np.where(np.isfinite(moves), moves, 0.0), np.zeros(3))
+    return float(np.abs(path[:, :2]).max(initial=0.0))

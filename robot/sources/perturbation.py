@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from robot.sources.in_memory import Log
+from robot.sources.in_memory import InMemorySource
 from tactile.base.se2 import compose
 
 VIEW_NOISE = 0.01
@@ -27,7 +27,7 @@ NEW_IDS, WRONG_IDS = 0.1, 0.05
 """Shares of given ids that are made new, and replaced by another frame's."""
 
 
-def perturbed(log: Log, seed: int) -> Log:
+def perturb(log: InMemorySource, seed: int) -> InMemorySource:
     """A perturbed copy; the digest is the original's with the seed behind it.
 
     Rows whose view is dropped go; their motion is added to the next row's, so the path stays whole.

@@ -15,11 +15,11 @@ from robot.sources.source import Sample
 from tactile.base.se2 import wrap
 from tactile.base.types import Cycle, Odometry, Report, Whisk
 
-STILL = Odometry(0.0, 0.0, 0.0, 0.0)
+NO_ODOMETRY = Odometry(0.0, 0.0, 0.0, 0.0)
 """Of a reading that does not know its own yet."""
 
 
-class Made(ABC):
+class SimulatedSource(ABC):
     """The part of a `Source` that every simulated session of N rows has; its simulator is the rest.
 
     Attributes:
@@ -52,11 +52,11 @@ class Made(ABC):
         return None  # nothing is open
 
 
-def placed(pose: np.ndarray) -> np.ndarray:
+def wrap_headings(pose: np.ndarray) -> np.ndarray:
     """[N, 3] poses as truth is told: the heading wrapped."""
     return np.column_stack([pose[:, :2], wrap(pose[:, 2])])
 
 
-def document_digest(document: Mapping[str, Any]) -> str:
+def digest_of_document(document: Mapping[str, Any]) -> str:
     """sha256 (hex) of all that a session was made from, which JSON can hold."""
     return digest_of([json.dumps(document, sort_keys=True).encode()])

@@ -17,17 +17,24 @@ from typing import NamedTuple
 import numpy as np
 
 from robot.sources.input_files import read_bytes
-from robot.world.polygons import area, contains, crossing, distance, edges, square
+from robot.world.polygons import (
+    polygon_area,
+    polygon_contains,
+    polygon_edges,
+    segment_distance,
+    segments_cross,
+    square,
+)
 from tactile.base.errors import InputError
 
-FORMS = {
+LINE_FORMS = {
     "outer": "outer x y x y x y ...",
     "square": "square x y side angle",
     "polygon": "polygon x y x y x y ...",
     "start": "start x y heading",
 }
-NEEDED = {"outer": "the walls", "start": "where the robot starts"}
-ROOM = 0.17
+REQUIRED_LINES = {"outer": "the walls", "start": "where the robot starts"}
+START_CLEARANCE = 0.17
 """Radius of the robot that must fit at the start, m."""
 
 
@@ -43,32 +50,34 @@ class Arena(NamedTuple):
     start: np.ndarray
 
 
-def segments(arena: Arena) -> np.ndarray:
+def wall_segments(arena: Arena) -> np.ndarray:
     """[S, 4] x1, y1, x2, y2, m: every wall that can be touched."""
-    return np.vstack([edges(arena.outer), *(edges(polygon) for polygon in arena.objects)])
+    return np.vstack([polygon_edges(arena.outer), *(polygon_edges(polygon) for polygon in arena.objects)])
 
 
-def enclosed(arena: Arena, points: np.ndarray) -> np.ndarray:
+def is_enclosed(arena: Arena, points: np.ndarray) -> np.ndarray:
     """[...] bool, which points [..., 2] are within the outer walls, objects or not."""
-    return contains(arena.outer, points)
+    return polygon_contains(arena.outer, points)
 
 
-def inside(arena: Arena, points: np.ndarray) -> np.ndarray:
+def in_free_space(arena: Arena, points: np.ndarray) -> np.ndarray:
     """[...] bool, which points [..., 2] are in free space."""
-    free = enclosed(arena, points)
+    free = is_enclosed(arena, points)
     for polygon in arena.objects:
-        free &= ~contains(polygon, points)
+        free &= ~polygon_contains(polygon, points)
     return free
 
 
-def occupied(arena: Arena, centres: np.ndarray) -> np.ndarray:
+def is_occupied(arena: Arena, centres: np.ndarray) -> np.ndarray:
     """[...] bool, which cells with those centres [..., 2] are not free: in an object or beyond the walls."""
-    return ~inside(arena, centres)
+    return ~in_free_space(arena, centres)
 
 
-def fits(arena: Arena, places: np.ndarray, radius: float) -> np.ndarray:
+def has_clearance(arena: Arena, places: np.ndarray, radius: float) -> np.ndarray:
     """[...] bool, whether a disc of that radius (m) at places [..., 2] is all in free space."""
-    return inside(arena, places) & (distance(segments(arena), places).min(axis=-1) >= radius)
+    return in_free_space(arena, places) & (
+        segment_distance(wall_segments(arena), places).min(axis=-1) >= radius
+    )
 
 
 def read_arena(path: File) -> Arena:
@@ -84,32 +93,32 @@ def read_arena(path: File) -> Arena:
     read = [line for number, content in enumerate(lines, 1) if (line := _parsed(path, number, content))]
     single: dict[str, _Line] = {}
     for line in read:
-        if line.word in NEEDED and line.word in single:
+        if line.word in REQUIRED_LINES and line.word in single:
             raise InputError(line.places[0], f"another `{line.word}`", "one", "remove one of them")
         single[line.word] = line
-    for word, meaning in NEEDED.items():
+    for word, meaning in REQUIRED_LINES.items():
         if word not in single:
-            raise InputError(str(path), f"no line `{word}`", f"`{FORMS[word]}`, {meaning}")
+            raise InputError(str(path), f"no line `{word}`", f"`{LINE_FORMS[word]}`, {meaning}")
     outer = _polygon(single["outer"])
     objects: list[np.ndarray] = []
     for line in read:
-        if line.word not in NEEDED:
+        if line.word not in REQUIRED_LINES:
             polygon = _polygon(line)
             _placed(line, polygon, outer, objects)
             objects.append(polygon)
     x, y, heading = single["start"].values
     made = Arena(path.stem, outer, tuple(objects), np.array([x, y, np.radians(heading)]))
-    if not fits(made, made.start[:2], ROOM):
+    if not has_clearance(made, made.start[:2], START_CLEARANCE):
         raise InputError(
             single["start"].places[1],
             f"a start at {x:g} {y:g} that is not free",
-            f"{ROOM:g} m of free space around it",
+            f"{START_CLEARANCE:g} m of free space around it",
             "move it away from walls and objects",
         )
     return made
 
 
-def text(arena: Arena) -> str:
+def arena_text(arena: Arena) -> str:
     """The arena as such a file; the inverse of `read_arena`."""
 
     def line(word: str, values: np.ndarray) -> str:
@@ -137,8 +146,8 @@ def _parsed(path: File, number: int, content: str) -> _Line | None:
         return None
     places = [f"{path}:{number}:{column}" for _, column in words]
     word = words[0][0]
-    if word not in FORMS:
-        raise InputError(places[0], f"{word!r}", f"one of {', '.join(FORMS)}")
+    if word not in LINE_FORMS:
+        raise InputError(places[0], f"{word!r}", f"one of {', '.join(LINE_FORMS)}")
     values = []
     for (told, _), place in zip(words[1:], places[1:], strict=True):
         try:
@@ -146,14 +155,14 @@ def _parsed(path: File, number: int, content: str) -> _Line | None:
         except ValueError:
             value = np.nan
         if not np.isfinite(value):
-            raise InputError(place, f"{told!r}", "a number", f"`{FORMS[word]}`")
+            raise InputError(place, f"{told!r}", "a number", f"`{LINE_FORMS[word]}`")
         values.append(value)
     count = len(values)
     wanted = {"square": 4, "start": 3}.get(word)
     if wanted is None and (count % 2 or count < 6):
         raise InputError(places[0], f"{count} numbers", "three corners or more, two numbers each")
     if wanted is not None and count != wanted:
-        raise InputError(places[0], f"{count} numbers", f"`{FORMS[word]}`")
+        raise InputError(places[0], f"{count} numbers", f"`{LINE_FORMS[word]}`")
     if word == "square" and values[2] <= 0:
         raise InputError(places[3], f"a side of {values[2]:g} m", "one above 0")
     return _Line(word, np.array(values), places)
@@ -164,7 +173,7 @@ def _polygon(line: _Line) -> np.ndarray:
     if line.word == "square":
         return square(line.values[:2], line.values[2], np.radians(line.values[3]))
     corners = line.values.reshape(-1, 2)
-    sides = edges(corners)
+    sides = polygon_edges(corners)
     short = np.hypot(*(sides[:, 2:] - sides[:, :2]).T) < 1e-9
     if short.any():
         again = (int(np.argmax(short)) + 1) % len(corners)
@@ -174,7 +183,7 @@ def _polygon(line: _Line) -> np.ndarray:
             "corners apart from one another",
             "leave it out: the last corner is joined to the first by itself",
         )
-    crosses = np.argwhere(crossing(sides, sides))
+    crosses = np.argwhere(segments_cross(sides, sides))
     if len(crosses):
         one, other = sorted(crosses[0].tolist())
         raise InputError(
@@ -182,7 +191,7 @@ def _polygon(line: _Line) -> np.ndarray:
             f"walls that cross: side {one + 1} and side {other + 1}",
             "corners in order around what they bound",
         )
-    if abs(area(corners)) < 1e-9:
+    if abs(polygon_area(corners)) < 1e-9:
         raise InputError(line.places[0], "corners in one line", "walls that bound something")
     return corners
 
@@ -191,11 +200,18 @@ def _placed(line: _Line, polygon: np.ndarray, outer: np.ndarray, others: list[np
     """Refuses an object that is not in the arena, or not by itself."""
     middle = (polygon + np.roll(polygon, -1, axis=0)) / 2
     probe = np.vstack([polygon, middle]) * (1 - 1e-6) + polygon.mean(axis=0) * 1e-6  # may touch the wall
-    if crossing(edges(polygon), edges(outer)).any() or not contains(outer, probe).all():
+    if (
+        segments_cross(polygon_edges(polygon), polygon_edges(outer)).any()
+        or not polygon_contains(outer, probe).all()
+    ):
         raise InputError(line.places[0], "an object outside the walls", "objects within `outer`")
     for number, other in enumerate(others, 1):
-        over = crossing(edges(polygon), edges(other)).any()
-        if over or contains(other, probe).any() or contains(polygon, other.mean(axis=0)[None]).any():
+        over = segments_cross(polygon_edges(polygon), polygon_edges(other)).any()
+        if (
+            over
+            or polygon_contains(other, probe).any()
+            or polygon_contains(polygon, other.mean(axis=0)[None]).any()
+        ):
             raise InputError(
                 line.places[0],
                 f"an object over object {number}",

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat
 
-from robot.world.maze import Cell, centre
+from robot.world.maze import Cell, cell_centre
 from tactile.base.config import Settings
 from tactile.base.se2 import wrap
 
@@ -37,7 +37,7 @@ class MotionConfig(Settings):
     """From visit to visit."""
 
 
-class Path(NamedTuple):
+class HeadPath(NamedTuple):
     """Poses in order of time; between two of them the motion is even.
 
     Attributes:
@@ -52,14 +52,14 @@ class Path(NamedTuple):
         return float(self.time[-1])
 
 
-def planned(config: MotionConfig, way: Sequence[Cell], random: np.random.Generator) -> Path:
+def plan_path(config: MotionConfig, way: Sequence[Cell], random: np.random.Generator) -> HeadPath:
     """The path along cells: straight on from middle to middle, turning on the spot."""
     jitter = config.jitter
     count = len(way)
     offset = jitter.position * random.standard_normal((count, 2))
     yaw = np.radians(jitter.yaw_deg) * random.standard_normal(count)
     pace = config.speed * np.clip(1 + jitter.speed * random.standard_normal(count), 0.2, 5.0)
-    middle = np.array([centre(cell) for cell in way])
+    middle = np.array([cell_centre(cell) for cell in way])
     step = np.diff(middle, axis=0)
     course = np.arctan2(step[:, 1], step[:, 0]) + (np.pi if config.backwards else 0.0)
     heading = np.concatenate([course[:1], course[:1] + np.cumsum(wrap(np.diff(course)))])
@@ -73,15 +73,15 @@ def planned(config: MotionConfig, way: Sequence[Cell], random: np.random.Generat
             pose.append([*place[k], heading[k] + yaw[k]])
         time.append(time[-1] + float(np.hypot(*step[k])) / pace[k])
         pose.append([*place[k + 1], heading[k] + yaw[k + 1]])
-    return Path(np.array(time), np.array(pose))
+    return HeadPath(np.array(time), np.array(pose))
 
 
-def at(path: Path, time: np.ndarray) -> np.ndarray:
+def poses_at(path: HeadPath, time: np.ndarray) -> np.ndarray:
     """[..., 3] the poses at times [...] s; before and after the path, its ends."""
     return np.stack([np.interp(time, path.time, path.pose[:, k]) for k in range(3)], axis=-1)
 
 
-def carried(path: Path, at_times: Sequence[float], ahead: float) -> tuple[Path, np.ndarray]:
+def add_kidnaps(path: HeadPath, at_times: Sequence[float], ahead: float) -> tuple[HeadPath, np.ndarray]:
     """The path with kidnaps: at each of these times the head is set down where it would be `ahead` s later.
 
     Returns:
@@ -94,10 +94,10 @@ def carried(path: Path, at_times: Sequence[float], ahead: float) -> tuple[Path, 
         inner = (path.time > start) & (path.time < stop)
         part = np.concatenate([[start], path.time[inner], [stop]])
         times.append(part - start + done)
-        poses.append(at(path, part))
+        poses.append(poses_at(path, part))
         done += stop - start
         start = stop + ahead
         if start >= path.duration or not np.isfinite(when):
             break
         jumps.append(done)
-    return Path(np.concatenate(times), np.concatenate(poses)), np.array(jumps)
+    return HeadPath(np.concatenate(times), np.concatenate(poses)), np.array(jumps)

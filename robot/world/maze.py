@@ -14,11 +14,11 @@ import numpy as np
 from robot.world.walls import Walls
 from tactile.base.errors import InputError
 
-CELL = 0.18
+CELL_SIDE = 0.18
 """Side of a cell, m (IEEE micromouse rules)."""
-THICK = 0.012
+WALL_THICKNESS = 0.012
 """Thickness of walls and posts, m (as above)."""
-TALL = 0.05
+WALL_HEIGHT = 0.05
 """Their height, m (as above)."""
 POSE_CELL_SIZE = 0.05
 """Side length of a pose cell that suits these mazes, m."""
@@ -44,12 +44,12 @@ class Maze(NamedTuple):
         return self.along.shape[0]
 
 
-def closed(columns: int, rows: int) -> Maze:
+def closed_maze(columns: int, rows: int) -> Maze:
     """A maze in which every cell is walled in."""
     return Maze(np.ones((rows + 1, columns), bool), np.ones((rows, columns + 1), bool))
 
 
-def scattered(columns: int, rows: int, loop: list[Cell], share: float, random: np.random.Generator) -> Maze:
+def random_maze(columns: int, rows: int, loop: list[Cell], share: float, random: np.random.Generator) -> Maze:
     """A maze with its outer walls, the given loop open, and that share of all other walls."""
     maze = Maze(random.random((rows + 1, columns)) < share, random.random((rows, columns + 1)) < share)
     maze.across[[0, -1]] = True
@@ -163,23 +163,29 @@ def _inside(maze: Maze, cell: Cell) -> bool:
     return 0 <= cell[0] < maze.columns and 0 <= cell[1] < maze.rows
 
 
-def centre(cell: Cell) -> np.ndarray:
+def cell_centre(cell: Cell) -> np.ndarray:
     """[2] m, the middle of a cell; the south-west corner post of the maze stands at the origin."""
-    return (np.array(cell, float) + 0.5) * CELL
+    return (np.array(cell, float) + 0.5) * CELL_SIDE
 
 
-def walls(maze: Maze, random: np.random.Generator, heights: tuple[float, ...] = (TALL,)) -> Walls:
+def wall_boxes(maze: Maze, random: np.random.Generator, heights: tuple[float, ...] = (WALL_HEIGHT,)) -> Walls:
     """The maze as boxes: a post at every corner, walls between them, each of one of the heights (m)."""
-    half = THICK / 2
+    half = WALL_THICKNESS / 2
     boxes = []
     for j, i in np.argwhere(maze.across).tolist():
-        boxes.append((i * CELL + half, j * CELL - half, (i + 1) * CELL - half, j * CELL + half))
+        boxes.append(
+            (i * CELL_SIDE + half, j * CELL_SIDE - half, (i + 1) * CELL_SIDE - half, j * CELL_SIDE + half)
+        )
     for j, i in np.argwhere(maze.along).tolist():
-        boxes.append((i * CELL - half, j * CELL + half, i * CELL + half, (j + 1) * CELL - half))
+        boxes.append(
+            (i * CELL_SIDE - half, j * CELL_SIDE + half, i * CELL_SIDE + half, (j + 1) * CELL_SIDE - half)
+        )
     count = len(boxes)
     for j in range(maze.rows + 1):
         for i in range(maze.columns + 1):
-            boxes.append((i * CELL - half, j * CELL - half, i * CELL + half, j * CELL + half))
+            boxes.append(
+                (i * CELL_SIDE - half, j * CELL_SIDE - half, i * CELL_SIDE + half, j * CELL_SIDE + half)
+            )
     height = np.concatenate(
         [random.choice(heights, count) if len(heights) > 1 else np.full(count, heights[0]),
          np.full(len(boxes) - count, max(heights))]
@@ -187,9 +193,9 @@ def walls(maze: Maze, random: np.random.Generator, heights: tuple[float, ...] = 
     return Walls(np.array(boxes), height)
 
 
-def named(walls: Walls, number: int) -> str:
+def describe_box(walls: Walls, number: int) -> str:
     """A box of a maze in words."""
-    x, y = (walls.box[number, :2] + walls.box[number, 2:]) / 2 / CELL
+    x, y = (walls.box[number, :2] + walls.box[number, 2:]) / 2 / CELL_SIDE
     at_post = abs(x - round(x)) < 0.25, abs(y - round(y)) < 0.25
     if all(at_post):
         return f"the post at corner ({round(x)}, {round(y)})"
@@ -263,7 +269,7 @@ def _sealed(path: Path, maze: Maze, skipped: int) -> None:
             )
 
 
-def text(maze: Maze) -> str:
+def maze_text(maze: Maze) -> str:
     """The maze as such a file; the inverse of `read_maze`."""
     lines = []
     for row in range(maze.rows, -1, -1):

@@ -15,7 +15,7 @@ from robot.world.maze import Cell, Maze, is_open, neighbours
 from tactile.base.errors import InputError
 
 
-def circuits(loop: Sequence[Cell], word: str) -> list[Cell]:
+def circuit_route(loop: Sequence[Cell], word: str) -> list[Cell]:
     """A loop travelled once for each letter: C as clockwise seen from above, A anticlockwise.
 
     Args:
@@ -34,7 +34,7 @@ def circuits(loop: Sequence[Cell], word: str) -> list[Cell]:
     return way
 
 
-def exploration(maze: Maze, start: Cell, cells: int, random: np.random.Generator) -> list[Cell]:
+def exploration_route(maze: Maze, start: Cell, cells: int, random: np.random.Generator) -> list[Cell]:
     """So many cells of a way that chooses at random where it can, and turns back only in dead ends.
 
     Raises:
@@ -52,7 +52,7 @@ def exploration(maze: Maze, start: Cell, cells: int, random: np.random.Generator
     return way
 
 
-def anticlockwise(loop: Sequence[Cell]) -> list[Cell]:
+def make_anticlockwise(loop: Sequence[Cell]) -> list[Cell]:
     """The loop that way round, from the same cell.
 
     Raises:
@@ -67,7 +67,7 @@ def anticlockwise(loop: Sequence[Cell]) -> list[Cell]:
     return list(loop) if area > 0 else [loop[0], *loop[:0:-1]]
 
 
-def checked(maze: Maze, way: Sequence[Cell], where: str = "simulation.path.cells") -> None:
+def check_route(maze: Maze, way: Sequence[Cell], where: str = "simulation.path.cells") -> None:
     """Refuses a way that leaves the maze or goes through a wall.
 
     Args:

@@ -8,21 +8,21 @@ from __future__ import annotations
 import numpy as np
 
 
-def edges(polygon: np.ndarray) -> np.ndarray:
+def polygon_edges(polygon: np.ndarray) -> np.ndarray:
     """[N, 4] the sides of a polygon."""
     return np.hstack([polygon, np.roll(polygon, -1, axis=0)])
 
 
-def area(polygon: np.ndarray) -> float:
+def polygon_area(polygon: np.ndarray) -> float:
     """m2; positive where the corners go counter-clockwise."""
     x, y = polygon.T
     return float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) / 2)
 
 
-def contains(polygon: np.ndarray, points: np.ndarray) -> np.ndarray:
+def polygon_contains(polygon: np.ndarray, points: np.ndarray) -> np.ndarray:
     """[...] bool, which points [..., 2] are inside, by counting the sides to their right."""
     points = np.asarray(points, np.float64)[..., None, :]
-    x1, y1, x2, y2 = edges(polygon).T
+    x1, y1, x2, y2 = polygon_edges(polygon).T
     x, y = points[..., 0], points[..., 1]
     spans = (y1 > y) != (y2 > y)
     run = np.where(y2 == y1, 1.0, y2 - y1)  # a level side spans nothing
@@ -30,7 +30,7 @@ def contains(polygon: np.ndarray, points: np.ndarray) -> np.ndarray:
     return np.logical_xor.reduce(spans & right, axis=-1)
 
 
-def distance(segments: np.ndarray, points: np.ndarray) -> np.ndarray:
+def segment_distance(segments: np.ndarray, points: np.ndarray) -> np.ndarray:
     """[..., S] m, from points [..., 2] to segments [S, 4]."""
     points = np.asarray(points, np.float64)[..., None, :]
     start, along = segments[:, :2], segments[:, 2:] - segments[:, :2]
@@ -40,7 +40,7 @@ def distance(segments: np.ndarray, points: np.ndarray) -> np.ndarray:
     return np.linalg.norm(away - share[..., None] * along, axis=-1)
 
 
-def crossing(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+def segments_cross(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """[S, R] bool, which segments [S, 4] and [R, 4] cross; to touch is not to cross."""
 
     def side(segments: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -55,12 +55,12 @@ def crossing(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return there & back.T
 
 
-def gap(one: np.ndarray, other: np.ndarray) -> float:
+def polygon_gap(one: np.ndarray, other: np.ndarray) -> float:
     """m between the outlines of two polygons; 0 where they cross or touch."""
-    sides, others = edges(one), edges(other)
-    if crossing(sides, others).any():
+    sides, others = polygon_edges(one), polygon_edges(other)
+    if segments_cross(sides, others).any():
         return 0.0
-    return float(min(distance(sides, other).min(), distance(others, one).min()))
+    return float(min(segment_distance(sides, other).min(), segment_distance(others, one).min()))
 
 
 def square(centre: np.ndarray, side: float, angle: float) -> np.ndarray:

@@ -12,18 +12,18 @@ from typing import Annotated, Self
 import numpy as np
 from pydantic import Field, NonNegativeInt, PositiveFloat, model_validator
 
-from robot.world.arena import Arena, fits, read_arena
-from robot.world.polygons import contains, gap, square
+from robot.world.arena import Arena, has_clearance, read_arena
+from robot.world.polygons import polygon_contains, polygon_gap, square
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 
 Share = Annotated[float, Field(ge=0, le=1)]
-PLACES = 200
+MAX_OBJECT_TRIES = 200
 """Tried for the objects of an arena."""
-ROUNDS = 50
+MAX_RESTARTS = 50
 """Of starting over when they found none."""
-STARTS = 400
+MAX_START_TRIES = 400
 """Places looked at for a start."""
 
 
@@ -62,7 +62,7 @@ class ArenaConfig(Settings):
         return round(2.4 * self.side) + 1 if self.objects is None else self.objects
 
 
-def arena(config: ArenaConfig, seed: int) -> Arena:
+def make_arena(config: ArenaConfig, seed: int) -> Arena:
     """The arena of a configuration; `seed` counts where it has none of its own.
 
     Raises:
@@ -73,7 +73,7 @@ def arena(config: ArenaConfig, seed: int) -> Arena:
     seed = config.seed if config.seed is not None else seed
     random = stream(seed, "arena")
     outer = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]) * config.side
-    for _ in range(ROUNDS):
+    for _ in range(MAX_RESTARTS):
         objects = _placed(config, random)
         if objects is None:
             continue
@@ -82,7 +82,7 @@ def arena(config: ArenaConfig, seed: int) -> Arena:
         if start is not None:
             return made._replace(start=start)
     raise InputError(
-        "roving.arena.objects",
+        "create_simulation.arena.objects",
         f"{config.count} objects of {config.smallest:g} to {config.largest:g} m",
         f"what fits {config.side:g} m with ways of {config.passage:g} m",
         "fewer or smaller objects, or a larger side",
@@ -92,7 +92,7 @@ def arena(config: ArenaConfig, seed: int) -> Arena:
 def _placed(config: ArenaConfig, random: np.random.Generator) -> list[np.ndarray] | None:
     """[4, 2] each, put down one by one; None where one found no place."""
     objects: list[np.ndarray] = []
-    for _ in range(PLACES):
+    for _ in range(MAX_OBJECT_TRIES):
         if len(objects) == config.count:
             return objects
         drawn = _drawn(config, random)
@@ -121,13 +121,16 @@ def _allowed(polygon: np.ndarray, config: ArenaConfig, others: list[np.ndarray])
     room = np.concatenate([polygon.min(axis=0), config.side - polygon.max(axis=0)])
     if ((room > 1e-9) & (room < config.passage)).any():
         return False
-    return all(gap(polygon, other) >= config.passage and not contains(other, polygon[0]) for other in others)
+    return all(
+        polygon_gap(polygon, other) >= config.passage and not polygon_contains(other, polygon[0])
+        for other in others
+    )
 
 
 def _start(arena: Arena, room: float, random: np.random.Generator) -> np.ndarray | None:
     """[3] A pose with room around it, m; None where there is none."""
     low, high = arena.outer.min(axis=0), arena.outer.max(axis=0)
-    places = random.uniform(low, high, (STARTS, 2))
+    places = random.uniform(low, high, (MAX_START_TRIES, 2))
     heading = random.uniform(-np.pi, np.pi)
-    there = np.flatnonzero(fits(arena, places, room))
+    there = np.flatnonzero(has_clearance(arena, places, room))
     return None if not len(there) else np.array([*places[there[0]], heading])

@@ -9,30 +9,30 @@ import numpy as np
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
 from robot.sources.source_info import MazeInfo
-from robot.world.head_trajectory import MotionConfig, Path, at, carried, planned
+from robot.world.head_trajectory import HeadPath, MotionConfig, add_kidnaps, plan_path, poses_at
 from robot.world.maze import (
-    CELL,
-    TALL,
+    CELL_SIDE,
+    WALL_HEIGHT,
     Cell,
     Maze,
-    closed,
-    named,
+    closed_maze,
+    describe_box,
+    maze_text,
     random_loop,
+    random_maze,
     read_maze,
-    scattered,
-    text,
-    walls,
+    wall_boxes,
 )
-from robot.world.maze_routes import anticlockwise, checked, circuits, exploration
+from robot.world.maze_routes import check_route, circuit_route, exploration_route, make_anticlockwise
 from robot.world.walls import Surroundings, Walls
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.whiskers.head_geometry import Head, tip_points
 
-WORD = "CCCAAACACA"
+PAPER_CIRCUITS = "CCCAAACACA"
 """Seed 2's protocol (Salman & Pearson 2016, III-C)."""
-FINE = 0.005
+POSE_STEP = 0.005
 """Distance (m) between the poses at which whiskers at rest must be free; turns count 10 cm for each rad."""
 
 
@@ -49,7 +49,7 @@ class MazeConfig(Settings):
     """Of walls that stand between cells, but for the loop."""
     file: File | None = None
     """A text file to take the maze from instead: posts `o` or `+`, walls `---` and `|`."""
-    heights: Annotated[tuple[PositiveFloat, ...], Field(min_length=1)] = (TALL,)
+    heights: Annotated[tuple[PositiveFloat, ...], Field(min_length=1)] = (WALL_HEIGHT,)
     """Of walls, m; each wall has one of them by chance, posts have the largest."""
     seed: NonNegativeInt | None = None
     """Of the maze; the simulation's own where there is none."""
@@ -58,7 +58,7 @@ class MazeConfig(Settings):
 class PathConfig(Settings):
     """Where the head goes: circuits, or free exploration, or given cells."""
 
-    circuits: str = WORD
+    circuits: str = PAPER_CIRCUITS
     """A letter for each time around the loop: C clockwise seen from above, A anticlockwise; '' for none."""
     explore: NonNegativeFloat = 0.0
     """Seconds of free exploration instead, from the first cell of the loop."""
@@ -97,13 +97,13 @@ class Scene(NamedTuple):
 
     maze: Maze
     loop: list[Cell]
-    path: Path
+    path: HeadPath
     duration: float
     jumps: np.ndarray
     surroundings: Surroundings
 
 
-def scene(
+def make_scene(
     maze_config: MazeConfig,
     path_config: PathConfig,
     motion: MotionConfig,
@@ -121,7 +121,7 @@ def scene(
     carriage = kidnaps.count * kidnaps.ahead
     explored = path_config.explore + carriage if path_config.explore else 0.0
     way = _way(path_config, maze, loop, explored, motion, seed)
-    path = planned(motion, way, stream(seed, "motion"))
+    path = plan_path(motion, way, stream(seed, "motion"))
     duration = path_config.explore or path.duration - carriage
     if duration <= 0:
         raise InputError(
@@ -132,21 +132,23 @@ def scene(
     jumps = np.zeros(0)
     if kidnaps.count:
         when = np.linspace(0.25, 0.95, kidnaps.count) * duration
-        path, jumps = carried(path, when.tolist(), kidnaps.ahead)
-    boxes = walls(maze, stream(_maze_seed(maze_config, seed), "maze.heights"), maze_config.heights)
-    surroundings = around(boxes, head, path)
+        path, jumps = add_kidnaps(path, when.tolist(), kidnaps.ahead)
+    boxes = wall_boxes(maze, stream(_maze_seed(maze_config, seed), "maze.heights"), maze_config.heights)
+    surroundings = check_surroundings(boxes, head, path)
     return Scene(maze, loop, path, duration, jumps, surroundings)
 
 
-def another(scene: Scene, config: MazeConfig, head: Head, seed: int) -> Surroundings:
+def other_surroundings(scene: Scene, config: MazeConfig, head: Head, seed: int) -> Surroundings:
     """What whiskers meet along the same path in another maze of the same size."""
     columns, rows = scene.maze.columns, scene.maze.rows
-    maze = scattered(columns, rows, scene.loop, config.share, stream(_maze_seed(config, seed), "later.walls"))
-    boxes = walls(maze, stream(_maze_seed(config, seed), "later.heights"), config.heights)
-    return around(boxes, head, scene.path)
+    maze = random_maze(
+        columns, rows, scene.loop, config.share, stream(_maze_seed(config, seed), "later.walls")
+    )
+    boxes = wall_boxes(maze, stream(_maze_seed(config, seed), "later.heights"), config.heights)
+    return check_surroundings(boxes, head, scene.path)
 
 
-def around(boxes: Walls, head: Head, path: Path) -> Surroundings:
+def check_surroundings(boxes: Walls, head: Head, path: HeadPath) -> Surroundings:
     """The walls, checked: along the path, no whisker at rest is inside one of them.
 
     Raises:
@@ -163,16 +165,16 @@ def around(boxes: Walls, head: Head, path: Path) -> Surroundings:
     if tip_points(head, np.zeros(len(head.length)))[:, 2].min() > tallest:
         return surroundings  # at rest, whiskers are above everything
     time = _finely(path)
-    pose = at(path, time)
+    pose = poses_at(path, time)
     met = surroundings.contact(pose)
     inside = met.angle <= 0
     if inside.any():
         row, whisker = (int(k) for k in np.argwhere(inside)[0])
-        cell = tuple(int(k) for k in np.floor(pose[row, :2] / CELL))
+        cell = tuple(int(k) for k in np.floor(pose[row, :2] / CELL_SIDE))
         raise InputError(
             "simulation.path",
             f"at {time[row]:.1f} s, in cell {cell}, whisker {whisker} at rest is inside "
-            f"{named(boxes, int(met.wall[row, whisker]))}",
+            f"{describe_box(boxes, int(met.wall[row, whisker]))}",
             "whiskers that start free",
             "lower the walls, or hang the head higher (touch.head.rings)",
         )
@@ -181,7 +183,7 @@ def around(boxes: Walls, head: Head, path: Path) -> Surroundings:
 
 def maze_info(maze: Maze, config: MazeConfig, seed: int) -> MazeInfo:
     """The maze of a session with that seed, as its source states it."""
-    return MazeInfo(text=text(maze), heights=config.heights, seed=_maze_seed(config, seed))
+    return MazeInfo(text=maze_text(maze), heights=config.heights, seed=_maze_seed(config, seed))
 
 
 def _maze_seed(config: MazeConfig, seed: int) -> int:
@@ -191,11 +193,11 @@ def _maze_seed(config: MazeConfig, seed: int) -> int:
 def _world(config: MazeConfig, path: PathConfig, seed: int) -> tuple[Maze, list[Cell]]:
     seed = _maze_seed(config, seed)
     loop: list[Cell] = []
-    maze = read_maze(config.file) if config.file else closed(config.columns, config.rows)
+    maze = read_maze(config.file) if config.file else closed_maze(config.columns, config.rows)
     if path.loop:
         empty = Maze(np.zeros_like(maze.across), np.zeros_like(maze.along))
-        checked(maze if config.file else empty, [*path.loop, path.loop[0]], "simulation.path.loop")
-        loop = anticlockwise(path.loop)
+        check_route(maze if config.file else empty, [*path.loop, path.loop[0]], "simulation.path.loop")
+        loop = make_anticlockwise(path.loop)
     if config.file:
         if path.circuits and not loop:
             raise InputError(
@@ -206,28 +208,30 @@ def _world(config: MazeConfig, path: PathConfig, seed: int) -> tuple[Maze, list[
             )
         return maze, loop
     loop = loop or random_loop(config.columns, config.rows, config.loop, stream(seed, "maze.loop"))
-    return scattered(config.columns, config.rows, loop, config.share, stream(seed, "maze.walls")), loop
+    return random_maze(config.columns, config.rows, loop, config.share, stream(seed, "maze.walls")), loop
 
 
 def _way(
     config: PathConfig, maze: Maze, loop: list[Cell], explored: float, motion: MotionConfig, seed: int
 ) -> list[Cell]:
     if config.circuits:
-        way = circuits(loop, config.circuits)
+        way = circuit_route(loop, config.circuits)
     elif config.cells:
         way = list(config.cells)
         if len(way) < 2:
             raise InputError("simulation.path.cells", "one cell", "at least two")
     else:
-        cells = int(1.2 * explored * motion.speed / CELL) + 20  # more than can be reached by then
-        way = exploration(maze, loop[0] if loop else (0, 0), cells, stream(seed, "path"))
-    checked(maze, way)
+        cells = int(1.2 * explored * motion.speed / CELL_SIDE) + 20  # more than can be reached by then
+        way = exploration_route(maze, loop[0] if loop else (0, 0), cells, stream(seed, "path"))
+    check_route(maze, way)
     return way
 
 
-def _finely(path: Path) -> np.ndarray:
-    """Times (s) along a path between which it moves by `FINE` at most."""
+def _finely(path: HeadPath) -> np.ndarray:
+    """Times (s) along a path between which it moves by `POSE_STEP` at most."""
     step = np.abs(np.diff(path.pose, axis=0))
-    parts = np.maximum(np.ceil((np.hypot(step[:, 0], step[:, 1]) + 0.1 * step[:, 2]) / FINE), 1).astype(int)
+    parts = np.maximum(np.ceil((np.hypot(step[:, 0], step[:, 1]) + 0.1 * step[:, 2]) / POSE_STEP), 1).astype(
+        int
+    )
     ends = zip(path.time[:-1], path.time[1:], parts, strict=True)
     return np.concatenate([*(np.linspace(a, b, n, endpoint=False) for a, b, n in ends), path.time[-1:]])

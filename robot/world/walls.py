@@ -14,9 +14,9 @@ import numpy as np
 
 from tactile.whiskers.head_geometry import Head
 
-BUCKET = 0.18
+BUCKET_SIDE = 0.18
 """Side of the squares that remember which boxes are near, m."""
-FREE = np.inf
+NO_CONTACT = np.inf
 """The protraction of a whisker that meets nothing."""
 
 
@@ -66,9 +66,11 @@ class Surroundings:
         """What each whisker would meet first if the head stood still at poses [P, 3] (m, m, rad)."""
         pose = np.asarray(pose, float)
         count, whiskers = len(pose), len(self._radius)
-        angle = np.full((count, whiskers), FREE)
+        angle = np.full((count, whiskers), NO_CONTACT)
         reach, wall = np.zeros((count, whiskers)), np.full((count, whiskers), -1)
-        places, place = np.unique(np.floor(pose[:, :2] / BUCKET).astype(int), axis=0, return_inverse=True)
+        places, place = np.unique(
+            np.floor(pose[:, :2] / BUCKET_SIDE).astype(int), axis=0, return_inverse=True
+        )
         for k, (i, j) in enumerate(places.tolist()):
             near, rows = self._boxes(i, j), np.flatnonzero(place.reshape(-1) == k)
             if len(near):
@@ -78,7 +80,10 @@ class Surroundings:
     def _boxes(self, i: int, j: int) -> np.ndarray:
         """The boxes within range of somewhere in a bucket."""
         if (i, j) not in self._near:
-            low, high = np.array([i, j]) * BUCKET - self.range, np.array([i + 1, j + 1]) * BUCKET + self.range
+            low, high = (
+                np.array([i, j]) * BUCKET_SIDE - self.range,
+                np.array([i + 1, j + 1]) * BUCKET_SIDE + self.range,
+            )
             box = self.walls.box
             inside = (box[:, 0] <= high[0]) & (box[:, 2] >= low[0])
             inside &= (box[:, 1] <= high[1]) & (box[:, 3] >= low[1])
@@ -87,7 +92,10 @@ class Surroundings:
 
     def _met(self, pose: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         enter, leave = self._crossed(pose, self.walls.box[near])  # [P, A, B]
-        met, reach = np.full((len(pose), len(self._radius)), FREE), np.zeros((len(pose), len(self._radius)))
+        met, reach = (
+            np.full((len(pose), len(self._radius)), NO_CONTACT),
+            np.zeros((len(pose), len(self._radius))),
+        )
         wall = np.full(met.shape, -1)
         row, ray, box = np.nonzero((leave > enter) & (leave > 0) & (enter < self.range))
         d1, d2, top = enter[row, ray, box], leave[row, ray, box], self.walls.height[near[box]]
@@ -133,5 +141,5 @@ class Surroundings:
         over = np.where(inside, np.arcsin(np.clip((d2 - radius) / length, -1, 1)), over)
         found = np.where(by_tip, opening, np.where(by_edge, over, -np.inf))
         share = np.where(by_tip | inside, 1.0, edge / length)
-        angle = np.where(found > -np.inf, np.maximum(rest - found, 0.0), FREE)
+        angle = np.where(found > -np.inf, np.maximum(rest - found, 0.0), NO_CONTACT)
         return angle, np.where(np.isfinite(angle), np.clip(share, 0, 1), 0.0)

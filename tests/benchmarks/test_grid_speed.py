@@ -10,8 +10,8 @@ from jax import lax
 from ratslam.backends.grid import GridBackend
 from ratslam.core.session import Session
 from ratslam.grid.config import GridConfig
-from robot.simulation.create.session import RovingConfig, roving
-from robot.touch_source import feelers_of, sensing
+from robot.simulation.create.session import CreateSimulation, CreateSimulationConfig
+from robot.touch_source import open_touch_source, planar_whiskers_of
 from tactile.base.types import stack
 from tactile.frontend import TouchConfig
 
@@ -19,9 +19,9 @@ from tactile.frontend import TouchConfig
 @pytest.fixture(scope="module")
 def session():
     """What a Create felt in 512 steps, and its feelers."""
-    source = roving(RovingConfig(reports=512, seed=5))
+    source = CreateSimulation(CreateSimulationConfig(reports=512, seed=5))
     touch = TouchConfig()
-    return [sample.reading for sample in sensing(source, touch)], feelers_of(source, touch)
+    return [sample.reading for sample in open_touch_source(source, touch)], planar_whiskers_of(source, touch)
 
 
 def backend(feelers, particles, dtype):

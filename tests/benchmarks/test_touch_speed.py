@@ -12,7 +12,7 @@ from evaluation.metrics.experience_metric import experience_metric
 from ratslam.config.run_config import RunConfig
 from ratslam.pipeline.run import open_source
 from ratslam.pipeline.runner import readings, session_of
-from robot.touch_source import sensing
+from robot.touch_source import open_touch_source
 
 JITTER = {"position": 0.005, "yaw_deg": 1.5, "speed": 0.05}
 
@@ -26,7 +26,7 @@ def sensed(settings):
     """All observations and truths of a session, and the source."""
     source = open_source(settings)
     settings = settings.completed(source)
-    seen = sensing(source, settings.touch)
+    seen = open_touch_source(source, settings.touch)
     rows = list(readings(seen))
     return settings, seen, [reading for _, reading in rows], np.array([sample.truth for sample, _ in rows])
 

@@ -18,7 +18,7 @@ from ratslam.config.run_config import RunConfig
 from ratslam.core.types import Action
 from ratslam.pipeline.run import open_source
 from ratslam.pipeline.runner import readings, session_of
-from robot.touch_source import sensing
+from robot.touch_source import open_touch_source
 from tactile.base.types import Observation
 
 FOLDER = Path(__file__).parent
@@ -31,7 +31,7 @@ def decisions(name: str) -> dict[str, Any]:
     config = RunConfig.model_validate({"recording": {"file": FOLDER / f"{name}.mcap"}})
     with open_source(config) as source:
         config = config.completed(source)
-        source = sensing(source, config.touch)
+        source = open_touch_source(source, config.touch)
         session = session_of(config, source)
         rows: list[tuple[Any, Observation]] = list(readings(source))
         steps = list(session.replay([reading for _, reading in rows]))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from robot.sources.in_memory import Log
+from robot.sources.in_memory import InMemorySource
 from robot.sources.source_info import SourceInfo
 from tactile.base.se2 import between, wrap
 
@@ -17,7 +17,7 @@ CELL = 0.1
 STEP = 0.05
 
 
-def square(seed: int, laps: int = 3, jumps: tuple[tuple[int, int], ...] = ()) -> Log:
+def square(seed: int, laps: int = 3, jumps: tuple[tuple[int, int], ...] = ()) -> InMemorySource:
     """Laps of a 1 m square, turning on the spot at its corners, like a_square3.
 
     Args:
@@ -32,14 +32,14 @@ def square(seed: int, laps: int = 3, jumps: tuple[tuple[int, int], ...] = ()) ->
     return sensed(path[rows], seed, carried=[row for row, _ in jumps])
 
 
-def figure_eight(seed: int, laps: int = 6, shared: float = 1 / 3) -> Log:
+def figure_eight(seed: int, laps: int = 6, shared: float = 1 / 3) -> InMemorySource:
     """Two circles in turn, like b_figure8_alias: a share of the second one's places look like the first's."""
     left, right = [(STEP, np.pi / 18)] * 36, [(STEP, -np.pi / 18)] * 36
     path = followed((left + right) * laps)
     return sensed(path, seed, shared=shared)
 
 
-def corridor(seed: int, length: int = 400) -> Log:
+def corridor(seed: int, length: int = 400) -> InMemorySource:
     """Straight on into the unknown: nothing ever comes back."""
     return sensed(followed([(STEP, 0.0)] * length), seed)
 
@@ -53,7 +53,9 @@ def followed(moves: list[tuple[float, float]]) -> np.ndarray:
     return np.stack([x, y, heading], axis=1)
 
 
-def sensed(path: np.ndarray, seed: int, carried: list[int] | None = None, shared: float = 0.0) -> Log:
+def sensed(
+    path: np.ndarray, seed: int, carried: list[int] | None = None, shared: float = 0.0
+) -> InMemorySource:
     """What a robot on a path [N, 3] reports.
 
     Args:
@@ -80,10 +82,10 @@ def sensed(path: np.ndarray, seed: int, carried: list[int] | None = None, shared
     return recorded(path, motion, views)
 
 
-def recorded(path: np.ndarray, motion: np.ndarray, views: np.ndarray) -> Log:
+def recorded(path: np.ndarray, motion: np.ndarray, views: np.ndarray) -> InMemorySource:
     """A log of these rows."""
     count = len(path)
-    return Log(
+    return InMemorySource(
         name="scene",
         digest="",
         time=0.5 * np.arange(count),

@@ -13,7 +13,7 @@ from evaluation.plots.grid_plot import GridPanel, GridPaths, draw_grids
 from ratslam.experiments.fox2012.metrics import word_of
 from ratslam.experiments.fox2012.protocols import FILTERED, Protocol
 from ratslam.experiments.fox2012.trials import Result
-from robot.world.arena import segments
+from robot.world.arena import wall_segments
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -73,7 +73,7 @@ def _with_paths(name: str, method: str, one: Result) -> GridPanel:
 
 
 def _panel(name: str, line: str, one: Result) -> GridPanel:
-    return GridPanel(name, line, one.grid, segments(one.arena))
+    return GridPanel(name, line, one.grid, wall_segments(one.arena))
 
 
 _EXPLAINED = {

@@ -83,7 +83,7 @@ class Protocol(NamedTuple):
 
 
 _SMALL = (World("1.25 m arena", 0.05),)
-_LARGE = ("roving.arena.side=2.5", "roving.reports=1500")
+_LARGE = ("create_simulation.arena.side=2.5", "create_simulation.reports=1500")
 
 PROTOCOLS = {
     "fox-fig4": Protocol(
@@ -118,7 +118,7 @@ def session_config(world: World, method: str, mapper: str, assignments: Sequence
     Raises:
         InputError: an assignment that cannot be.
     """
-    level = (f"roving.wheels.level={world.level}",)
+    level = (f"create_simulation.wheels.level={world.level}",)
     believed = (f"grid.drift.step={world.level}",) if method == "as printed" else ()
     every = ("backend=grid", *level, *world.sets, *METHODS[method], *believed, *MAPPERS[mapper], *assignments)
-    return validate(override(parse("roving: {}\n", "the reproduction"), every), RunConfig)
+    return validate(override(parse("create_simulation: {}\n", "the reproduction"), every), RunConfig)

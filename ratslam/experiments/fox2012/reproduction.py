@@ -65,7 +65,7 @@ def plan_jobs(protocol: Protocol, sets: int, seed: int, assignments: Sequence[st
 def _job(protocol: Protocol, world: World, number: int, seed: int, assignments: Sequence[str]) -> Job:
     own = int(stream(seed, f"arenas.set.{number}").integers(2**31))
     arena = seed if protocol.one_arena else own
-    seeds = (f"roving.seed={own}", f"roving.arena.seed={arena}", f"session.seed={own}")
+    seeds = (f"create_simulation.seed={own}", f"create_simulation.arena.seed={arena}", f"session.seed={own}")
     variants = {
         (method, mapper): session_config(world, method, mapper, (*seeds, *assignments))
         for method in protocol.methods

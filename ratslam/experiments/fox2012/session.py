@@ -19,11 +19,10 @@ from ratslam.config.run_config import RunConfig
 from ratslam.core.session import Session, capacity_at
 from ratslam.grid.config import GridConfig
 from ratslam.grid.map_drawing import Marks, draw, marks_of
-from robot.simulation.create.session import Rover, RovingConfig, roving
-from robot.simulation.create.template_training import trained
-from robot.touch_source import Sensing, observation_of, reports_of
-from robot.world.arena import Arena, enclosed, fits, occupied, segments, text
-from robot.world.random_arena import arena
+from robot.simulation.create.session import CreateSimulation, CreateSimulationConfig, train_strain_templates
+from robot.touch_source import TouchSource, observation_of, report_config_of
+from robot.world.arena import Arena, arena_text, has_clearance, is_enclosed, is_occupied, wall_segments
+from robot.world.random_arena import make_arena
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose, integrate
@@ -48,7 +47,7 @@ class Outing(NamedTuple):
             report, true and reckoned from the start.
     """
 
-    source: Rover
+    source: CreateSimulation
     arena: Arena
     truth: np.ndarray
     odometry: np.ndarray
@@ -67,17 +66,19 @@ class Mapped(NamedTuple):
     grid: OccupancyGrid
 
 
-def outing(config: RovingConfig) -> Outing:
+def outing(config: CreateSimulationConfig) -> Outing:
     """The session, from a start that its seed draws.
 
     Raises:
         InputError: it cannot be simulated.
     """
-    made = started(arena(config.arena, config.seed), config.seed)
+    made = started(make_arena(config.arena, config.seed), config.seed)
     with TemporaryDirectory() as folder:
         file = Path(folder) / "arena.txt"
-        file.write_text(text(made), encoding="utf-8")
-        source = roving(config.model_copy(update={"arena": config.arena.model_copy(update={"file": file})}))
+        file.write_text(arena_text(made), encoding="utf-8")
+        source = CreateSimulation(
+            config.model_copy(update={"arena": config.arena.model_copy(update={"file": file})})
+        )
     return Outing(source, made, source.truth, compose(made.start, integrate(source.odometry[:, :3])))
 
 
@@ -90,9 +91,11 @@ def started(arena: Arena, seed: int) -> Arena:
     random = stream(seed, "start")
     low, high = arena.outer.min(axis=0), arena.outer.max(axis=0)
     places, heading = random.uniform(low, high, (1000, 2)), random.uniform(-np.pi, np.pi)
-    there = places[fits(arena, places, ROOM)]
+    there = places[has_clearance(arena, places, ROOM)]
     if not len(there):
-        raise InputError("roving.arena", "no room for a start", f"{ROOM:g} m of free space somewhere")
+        raise InputError(
+            "create_simulation.arena", "no room for a start", f"{ROOM:g} m of free space somewhere"
+        )
     return arena._replace(start=np.array([*there[0], heading]))
 
 
@@ -105,12 +108,14 @@ def felt(config: RunConfig, outing: Outing, seed: int) -> list[Observation]:
     Raises:
         InputError: templates that cannot be used.
     """
-    reports = reports_of(outing.source.info, config.touch.reports)
+    reports = report_config_of(outing.source.info, config.touch.reports)
     templates = None
     if reports.templates is None and reports.walls in ("template", "fused"):
         made = outing.source.config
-        templates = _templates(RovingConfig(whiskers=made.whiskers, behaviour=made.behaviour, seed=seed))
-    source = Sensing(outing.source, lambda: ReportFrontend(reports, templates), "touch.reports.mounts")
+        templates = _templates(
+            CreateSimulationConfig(whiskers=made.whiskers, behaviour=made.behaviour, seed=seed)
+        )
+    source = TouchSource(outing.source, lambda: ReportFrontend(reports, templates), "touch.reports.mounts")
     return [observation_of(sample) for sample in source]
 
 
@@ -118,7 +123,7 @@ def mapped(
     config: RunConfig, outing: Outing, reports: list[Observation], stops: tuple[int, ...]
 ) -> list[Mapped]:
     """What the configuration's filter has made of the reports at each stop, a number of them."""
-    touch = reports_of(outing.source.info, config.touch.reports)
+    touch = report_config_of(outing.source.info, config.touch.reports)
     grid = config.grid
     if grid.side is None:
         grid = grid.model_copy(update={"side": 2 * (span(outing.arena) + BEYOND)})
@@ -154,7 +159,7 @@ def chart(
 def truth_of(arena: Arena, grid: OccupancyGrid) -> GridTruth:
     """What is really there, on the cells of a chart."""
     place = cell_centres(grid)
-    return GridTruth(occupied(arena, place), enclosed(arena, place), segments(arena))
+    return GridTruth(is_occupied(arena, place), is_enclosed(arena, place), wall_segments(arena))
 
 
 def span(arena: Arena) -> float:
@@ -194,6 +199,6 @@ def _compiled(grid: GridConfig, mounts: tuple[WhiskerMount, ...], length: float,
 
 
 @lru_cache(maxsize=1)
-def _templates(config: RovingConfig) -> StrainTemplates:
+def _templates(config: CreateSimulationConfig) -> StrainTemplates:
     """Of a robot: as off-line in the paper, for all sessions."""
-    return trained(config)
+    return train_strain_templates(config)

@@ -8,8 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robot.simulation.create.session import RovingConfig, drive_into_wall
-from robot.simulation.create.template_training import trained
+from robot.simulation.create.session import CreateSimulationConfig, drive_into_wall, train_strain_templates
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.types import StepEnd
@@ -44,7 +43,7 @@ class Tried(NamedTuple):
     error: np.ndarray
 
 
-def schooled(config: RovingConfig, path: Path) -> StrainTemplates:
+def schooled(config: CreateSimulationConfig, path: Path) -> StrainTemplates:
     """Trains the templates of a session's robot and writes them.
 
     Raises:
@@ -52,13 +51,13 @@ def schooled(config: RovingConfig, path: Path) -> StrainTemplates:
     """
     if path.exists():
         raise InputError(str(path), "exists", "a new file", "choose another name with -o")
-    templates = trained(config)
+    templates = train_strain_templates(config)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_templates(templates, path)
     return templates
 
 
-def held_out(config: RovingConfig, templates: StrainTemplates) -> list[Tried]:
+def held_out(config: CreateSimulationConfig, templates: StrainTemplates) -> list[Tried]:
     """One more drive at each angle, and one half-way between each two."""
     random = stream(config.seed, "templates.held out")
     angles = np.sort(np.concatenate([templates.angle, (templates.angle[1:] + templates.angle[:-1]) / 2]))

@@ -22,7 +22,7 @@ from ratslam.experiments.fox2012.session import (
     outing,
     truth_of,
 )
-from robot.touch_source import reports_of
+from robot.touch_source import report_config_of
 from robot.world.arena import Arena
 
 
@@ -75,14 +75,14 @@ def run_job(job: Job) -> list[Result]:
         InputError: it cannot be simulated.
     """
     some = next(iter(job.variants.values()))
-    assert some.roving is not None
-    out = outing(some.roving)
+    assert some.create_simulation is not None
+    out = outing(some.create_simulation)
     count = len(out.truth)
     stops = tuple(min(stop, count) if stop else count for stop in job.stops)
     found: list[Result] = []
     for (method, mapper), config in job.variants.items():
         reports = felt(config, out, job.training)
-        marks, feelers = felt_marks(reports), reports_of(out.source.info, config.touch.reports).feelers
+        marks, feelers = felt_marks(reports), report_config_of(out.source.info, config.touch.reports).feelers
         for stop, filtered in enumerate(mapped(config, out, reports, stops)):
             found.append(_judged(job, out, (method, mapper, FILTERED), stop, filtered))
             for name, whole in ((RECKONED, out.odometry), (TRUE, out.truth)):

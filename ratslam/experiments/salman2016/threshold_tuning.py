@@ -22,7 +22,7 @@ from ratslam.config.strict_yaml import Document, override, validate
 from ratslam.experiments.studies.executor import run_tasks
 from ratslam.experiments.trials.threshold_sweep import sweep_thresholds
 from ratslam.experiments.trials.touch_trial import collect_session, lap_ends, truncate_log
-from robot.sources.in_memory import Log
+from robot.sources.in_memory import InMemorySource
 from tactile.base.errors import InputError
 from tactile.base.se2 import wrap
 
@@ -133,7 +133,7 @@ def choose_threshold(
     )
 
 
-def compare_views(config: TemplateConfig, log: Log) -> ViewDifferences:
+def compare_views(config: TemplateConfig, log: InMemorySource) -> ViewDifferences:
     """The differences of the views of a session, of the same place and of different ones.
 
     Raises:
@@ -218,7 +218,7 @@ def save_tuning(tuning: Tuning, directory: Path) -> tuple[Path, Path]:
     return plot, table
 
 
-def _score_thresholds(task: tuple[RunConfig, Log, int, np.ndarray]) -> list[ThresholdScore]:
+def _score_thresholds(task: tuple[RunConfig, InMemorySource, int, np.ndarray]) -> list[ThresholdScore]:
     config, log, base, thresholds = task
     exm = config.score.experience_metric.model_copy(update={"base": base, "mode": "strict", "log": "step"})
     batch = sweep_thresholds(config, log, thresholds)

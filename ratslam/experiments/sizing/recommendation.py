@@ -14,7 +14,7 @@ from ratslam.config.run_config import RunConfig
 from ratslam.experiments.sizing.scene_statistics import Scene
 from ratslam.grid.config import DriftConfig
 from ratslam.grid.particle_maps import LAYERS
-from robot.simulation.head.session import tier
+from robot.simulation.head.session import choose_tier
 
 PART = 0.5
 """Cells that the packet moves in one sub-step at most."""
@@ -156,7 +156,7 @@ def _tier(config: RunConfig) -> Iterator[Proposal]:
     simulation = config.simulation
     if simulation is None:
         return
-    chosen = tier(simulation.model_copy(update={"fidelity": "auto"}))
+    chosen = choose_tier(simulation.model_copy(update={"fidelity": "auto"}))
     value = "auto" if simulation.fidelity == "auto" else chosen.name
     named = f"{chosen.name}: " if value == "auto" else ""
     why = f"{named}{chosen.why}; `tiers` shows what each changes"

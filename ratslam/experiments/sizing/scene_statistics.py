@@ -91,9 +91,13 @@ def short(config: RunConfig, cycles: int, folder: Path) -> RunConfig:
     Raises:
         InputError: the recording cannot be read.
     """
-    if config.roving is not None:
+    if config.create_simulation is not None:
         return config.model_copy(
-            update={"roving": config.roving.model_copy(update={"reports": _reports(config, cycles)})}
+            update={
+                "create_simulation": config.create_simulation.model_copy(
+                    update={"reports": _reports(config, cycles)}
+                )
+            }
         )
     if config.simulation is not None:
         return shortened(config, cycles / config.simulation.whisking.rate)
@@ -105,5 +109,5 @@ def short(config: RunConfig, cycles: int, folder: Path) -> RunConfig:
 
 
 def _reports(config: RunConfig, cycles: int) -> int:
-    assert config.roving is not None
-    return min(config.roving.reports or cycles, cycles)
+    assert config.create_simulation is not None
+    return min(config.create_simulation.reports or cycles, cycles)

@@ -10,7 +10,11 @@ from typing import Any
 
 from ratslam.config.run_config import RunConfig
 
-SEEDS = {"simulation": "simulation.seed", "roving": "roving.seed", "recording": "session.seed"}
+SEEDS = {
+    "simulation": "simulation.seed",
+    "create_simulation": "create_simulation.seed",
+    "recording": "session.seed",
+}
 """What `seeds` sets, by what is run on."""
 DIGITS = 16
 """Of a configuration's hash, in hexadecimal."""

@@ -34,7 +34,7 @@ from ratslam.pipeline.artifacts import truth_of
 from ratslam.pipeline.run import open_source
 from ratslam.pipeline.runner import Anytimes, readings, session_of
 from robot.sources.source import Source
-from robot.touch_source import sensing
+from robot.touch_source import open_touch_source
 from robot.world.arena import read_arena
 from tactile.base.errors import InputError
 from tactile.base.se2 import integrate
@@ -83,7 +83,7 @@ def _played(config: RunConfig, pace: str) -> dict[str, Any]:
     relations = read_relations(config.score.relations) if config.score.relations else None
     with open_source(config) as source:
         config = config.completed(source)
-        source = sensing(source, config.touch)
+        source = open_touch_source(source, config.touch)
         watch = Stopwatch()
         with watch.preparing():
             session = session_of(config, source)

@@ -20,9 +20,9 @@ from ratslam.experiments.tables.markdown import markdown_header, markdown_row
 from ratslam.pipeline.artifacts import truth_of
 from ratslam.pipeline.run import open_source
 from ratslam.pipeline.runner import readings
-from robot.touch_source import reports_of, sensing
-from robot.world.arena import Arena, segments
-from robot.world.polygons import distance
+from robot.touch_source import open_touch_source, report_config_of
+from robot.world.arena import Arena, wall_segments
+from robot.world.polygons import segment_distance
 from tactile.base.se2 import compose, integrate
 from tactile.base.types import MotionKind, Observation
 
@@ -130,13 +130,17 @@ def measure_session(task: GridTask) -> GridFigures:
 
     jax.config.update("jax_enable_x64", True)
     noise, changes = ROWS[task.row]
-    roving = WORLDS[task.world] | {"wheels": {"noise": noise}, "seed": task.arena}
-    given = {"roving": roving, "backend": "grid", "session": {"precision": "float32"}} | changes
+    create_simulation = WORLDS[task.world] | {"wheels": {"noise": noise}, "seed": task.arena}
+    given = {
+        "create_simulation": create_simulation,
+        "backend": "grid",
+        "session": {"precision": "float32"},
+    } | changes
     config = RunConfig.model_validate(given)
     source: Any = open_source(config)
     config = config.completed(source)
     grid = config.grid.model_copy(update={"side": MAP_SIDES[task.world]})
-    rows = list(readings(sensing(source, config.touch)))
+    rows = list(readings(open_touch_source(source, config.touch)))
     truth = np.array([sample.truth for sample, _ in rows])
     observations = [observation for _, observation in rows]
     start = source.arena.start
@@ -146,7 +150,7 @@ def measure_session(task: GridTask) -> GridFigures:
         observations = [
             o._replace(odometry=still) if o.motion == MotionKind.BACK else o for o in observations
         ]
-    touch = reports_of(source.info, config.touch.reports)
+    touch = report_config_of(source.info, config.touch.reports)
     session = session_at_start(grid, touch.mounts, touch.length, "float32", config.session.seed)
     online = np.array([step.pose for step in session.replay(observations)])
 
@@ -177,8 +181,8 @@ def _wall_error(arena: Arena, pose: np.ndarray, observation: Observation) -> flo
     normal = foot / np.hypot(*foot)
     middle = observation.point[observation.contact].mean(axis=0)
     contact = compose(pose, np.array([*(middle + normal * (np.hypot(*foot) - normal @ middle)), 0.0]))[:2]
-    walls = segments(arena)
-    wall = walls[int(np.argmin(distance(walls, contact[None])[0]))]
+    walls = wall_segments(arena)
+    wall = walls[int(np.argmin(segment_distance(walls, contact[None])[0]))]
     true = np.arctan2(wall[3] - wall[1], wall[2] - wall[0])
     error = pose[2] + np.arctan2(normal[1], normal[0]) + np.pi / 2 - true
     return float(abs((error + np.pi / 2) % np.pi - np.pi / 2))

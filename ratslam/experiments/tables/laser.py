@@ -21,9 +21,9 @@ from ratslam.experiments.studies.executor import run_tasks
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
 from ratslam.pipeline.run import open_source
 from ratslam.pipeline.runner import session_of
-from robot.sources.in_memory import collected
-from robot.sources.perturbation import perturbed
-from robot.touch_source import observation_of, sensing
+from robot.sources.in_memory import load_into_memory
+from robot.sources.perturbation import perturb
+from robot.touch_source import observation_of, open_touch_source
 from tactile.base.errors import InputError
 from tactile.base.se2 import integrate
 
@@ -123,11 +123,11 @@ def measure_recording(task: RecordingTask) -> RecordingFigures:
     """
     with open_source(task.config) as source:
         config = task.config.completed(source)
-        log = collected(sensing(source, config.touch))
+        log = load_into_memory(open_touch_source(source, config.touch))
     if log.truth is None:
         raise InputError(log.name, "no true poses", "a recording with truth")
     if task.seed:
-        log = perturbed(log, task.seed)
+        log = perturb(log, task.seed)
     session = session_of(config, log)
     for _ in session.replay(observation_of(sample) for sample in log):
         pass

@@ -25,8 +25,8 @@ from ratslam.experiments.trials.touch_trial import (
     run_session,
 )
 from ratslam.pipeline.run import open_source
-from robot.sources.in_memory import Log, collected
-from robot.touch_source import sensing
+from robot.sources.in_memory import InMemorySource, load_into_memory
+from robot.touch_source import open_touch_source
 from tactile.base.errors import InputError
 
 FIRST_MAZE = 9000
@@ -184,7 +184,7 @@ def measure_session(task: TouchTask) -> SessionFigures:
     )
 
 
-def _simulate(task: TouchTask) -> tuple[Log, RunConfig, list[int]]:
+def _simulate(task: TouchTask) -> tuple[InMemorySource, RunConfig, list[int]]:
     """The views of a session, its completed configuration, and the steps of its kidnaps."""
     condition = ROWS[task.row]
     simulation = condition.simulation | {"seed": task.seed}
@@ -194,7 +194,7 @@ def _simulate(task: TouchTask) -> tuple[Log, RunConfig, list[int]]:
     with open_source(config) as source:
         kidnaps = np.flatnonzero(source.carried).tolist()  # type: ignore[attr-defined]
         config = config.completed(source)
-        log = collected(sensing(source, config.touch))
+        log = load_into_memory(open_touch_source(source, config.touch))
     if task.row == "control: shuffled":
         order = np.random.default_rng(task.seed).permutation(len(log.views))
         log = replace(log, views=log.views[order].copy())

@@ -22,9 +22,9 @@ from ratslam.experiments.trials.process_pool import shared_out
 from ratslam.keyframes.ablation import FULL, Ablation
 from ratslam.pipeline.run import open_source
 from ratslam.pipeline.runner import Anytimes, readings, session_of
-from robot.sources.in_memory import Log, collected
-from robot.sources.perturbation import perturbed
-from robot.touch_source import sensing
+from robot.sources.in_memory import InMemorySource, load_into_memory
+from robot.sources.perturbation import perturb
+from robot.touch_source import open_touch_source
 from tactile.base.errors import InputError
 from tactile.base.se2 import integrate
 
@@ -86,13 +86,13 @@ def trial(config: RunConfig, folder: Path, seed: int = 0, ablation: Ablation = F
     """
     with open_source(config.with_absolute_paths(folder.resolve())) as source:
         config = config.completed(source)
-        source = sensing(source, config.touch)
+        source = open_touch_source(source, config.touch)
         if seed:
             if config.simulation is not None:
-                source = collected(source)
-            if not isinstance(source, Log):
+                source = load_into_memory(source)
+            if not isinstance(source, InMemorySource):
                 raise InputError("recording.file", "a recording that is streamed", "a CSV or .npz recording")
-            source = perturbed(source, seed)
+            source = perturb(source, seed)
         session = session_of(config, source, ablation)
         truth: list[np.ndarray] = []
         motion: list[list[float]] = []

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from robot.sources.in_memory import Log
+from robot.sources.in_memory import InMemorySource
 from tactile.base.random_streams import stream
 
 Control = Literal["none", "shuffled", "blank", "ideal"]
@@ -25,7 +25,7 @@ LIT = 0.5
 """Share of non-zero pixels of an ideal view."""
 
 
-def apply_control(log: Log, control: Control, seed: int) -> Log:
+def apply_control(log: InMemorySource, control: Control, seed: int) -> InMemorySource:
     """The session with replaced views; steps without a view stay without one."""
     if control == "none":
         return log
@@ -33,17 +33,17 @@ def apply_control(log: Log, control: Control, seed: int) -> Log:
     return replace(log, digest=f"{log.digest}+{control}+{seed}", views=views)
 
 
-def _shuffled(log: Log, seed: int) -> np.ndarray:
+def _shuffled(log: InMemorySource, seed: int) -> np.ndarray:
     rows, views = np.flatnonzero(log.seen), log.views.copy()
     views[rows] = log.views[stream(seed, "control.shuffled").permutation(rows)]
     return views
 
 
-def _blank(log: Log, seed: int) -> np.ndarray:
+def _blank(log: InMemorySource, seed: int) -> np.ndarray:
     return np.zeros_like(log.views)
 
 
-def _ideal(log: Log, seed: int) -> np.ndarray:
+def _ideal(log: InMemorySource, seed: int) -> np.ndarray:
     """Random views, one for each pair of spot and heading sector."""
     assert log.truth is not None
     spot = np.round(log.truth[:, :2] / SPOT)
@@ -54,7 +54,7 @@ def _ideal(log: Log, seed: int) -> np.ndarray:
     return (random.random(shape) * (random.random(shape) < LIT))[row.reshape(-1)]
 
 
-_VIEWS: dict[str, Callable[[Log, int], np.ndarray]] = {
+_VIEWS: dict[str, Callable[[InMemorySource, int], np.ndarray]] = {
     "shuffled": _shuffled,
     "blank": _blank,
     "ideal": _ideal,

@@ -20,7 +20,7 @@ from ratslam.classic.experience_map import ExperienceMap
 from ratslam.config.run_config import RunConfig
 from ratslam.core.types import Estimate
 from ratslam.experiments.trials.touch_trial import SessionResult, capacity_for, session_result
-from robot.sources.in_memory import Log
+from robot.sources.in_memory import InMemorySource
 from robot.touch_source import observation_of
 from tactile.base.types import Array, Observation, stack
 
@@ -39,7 +39,7 @@ class ThresholdBatch(NamedTuple):
     evidence: ClassicEvidence
 
 
-def sweep_thresholds(config: RunConfig, log: Log, thresholds: np.ndarray) -> ThresholdBatch:
+def sweep_thresholds(config: RunConfig, log: InMemorySource, thresholds: np.ndarray) -> ThresholdBatch:
     """Runs the classic method at thresholds [B] over the same views.
 
     Raises:
@@ -59,7 +59,9 @@ def sweep_thresholds(config: RunConfig, log: Log, thresholds: np.ndarray) -> Thr
     return ThresholdBatch(np.asarray(thresholds), estimate.place, estimate, evidence)
 
 
-def result_at_threshold(config: RunConfig, log: Log, batch: ThresholdBatch, number: int) -> SessionResult:
+def result_at_threshold(
+    config: RunConfig, log: InMemorySource, batch: ThresholdBatch, number: int
+) -> SessionResult:
     """The result of the session at one of the thresholds, with its map."""
     map = ExperienceMap(config.experience)
     for row, sample in enumerate(log):

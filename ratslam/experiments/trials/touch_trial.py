@@ -19,8 +19,8 @@ from ratslam.config.run_config import RunConfig, SessionConfig
 from ratslam.core.session import Session, capacity_at
 from ratslam.experiments.trials.controls import Control, apply_control
 from ratslam.pipeline.run import open_source
-from robot.sources.in_memory import Log, collected
-from robot.touch_source import observation_of, sensing
+from robot.sources.in_memory import InMemorySource, load_into_memory
+from robot.touch_source import observation_of, open_touch_source
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.se2 import integrate
@@ -87,7 +87,7 @@ class TouchMetrics(NamedTuple):
     steps: int
 
 
-def collect_session(config: RunConfig) -> tuple[RunConfig, Log]:
+def collect_session(config: RunConfig) -> tuple[RunConfig, InMemorySource]:
     """The configuration completed by its source, and the whole source in memory.
 
     Raises:
@@ -95,7 +95,7 @@ def collect_session(config: RunConfig) -> tuple[RunConfig, Log]:
     """
     with open_source(config) as source:
         config = config.completed(source)
-        log = collected(sensing(source, config.touch))
+        log = load_into_memory(open_touch_source(source, config.touch))
     if log.truth is None or not np.isfinite(log.truth).all():
         raise InputError(log.name, "steps without a true pose", "the true pose of every step")
     return config, log
@@ -114,7 +114,7 @@ def run_task(task: Task) -> SessionResult:
     return run_session(config, log)
 
 
-def run_session(config: RunConfig, log: Log) -> SessionResult:
+def run_session(config: RunConfig, log: InMemorySource) -> SessionResult:
     """Runs a session from memory, with a configuration completed by its source."""
     session = _session_at_start(config, log.view_shape, capacity_for(log.length))
     steps = list(session.replay(observation_of(sample) for sample in log))
@@ -122,7 +122,7 @@ def run_session(config: RunConfig, log: Log) -> SessionResult:
     return session_result(log, place, session.map)
 
 
-def session_result(log: Log, place: np.ndarray, map: Any) -> SessionResult:
+def session_result(log: InMemorySource, place: np.ndarray, map: Any) -> SessionResult:
     """The result of a session from its log, the current experience of each step [T] and the final map."""
     nodes = map.graph().nodes
     rows = (nodes[k] for k in range(len(nodes)))
@@ -190,11 +190,13 @@ def lap_ends(truth: np.ndarray) -> np.ndarray:
     return np.array([visit[np.argmin(away[visit])] for visit in visits], int)
 
 
-def truncate_log(log: Log, steps: int) -> Log:
+def truncate_log(log: InMemorySource, steps: int) -> InMemorySource:
     """The first steps of a log."""
     columns = ("time", "motion", "moved", "views", "seen", "label", "truth")
     cut = {name: getattr(log, name)[:steps] for name in columns if getattr(log, name) is not None}
-    return Log(name=log.name, digest=f"{log.digest}[:{steps}]", info=log.info, alive=log.alive, **cut)
+    return InMemorySource(
+        name=log.name, digest=f"{log.digest}[:{steps}]", info=log.info, alive=log.alive, **cut
+    )
 
 
 def capacity_for(steps: int) -> int:

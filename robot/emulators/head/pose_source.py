@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 
 from robot.drivers.ur10.base_transform import BaseTransformConfig, pose_from_tcp
-from robot.world.head_trajectory import Path, at
+from robot.world.head_trajectory import HeadPath, poses_at
 
 AHEAD = 0.1
 """s for which an arm's speed is believed; then it counts as standing where that led."""
@@ -55,7 +55,7 @@ class CarriedByArm:
 class AlongPath:
     """Along a path, from a time on that `begin` tells once; before, where it begins."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: HeadPath) -> None:
         self.path = path
         self.began: float | None = None
 
@@ -65,4 +65,4 @@ class AlongPath:
 
     def at(self, time: float) -> tuple[np.ndarray, float]:
         since = 0.0 if self.began is None else time - self.began
-        return at(self.path, np.array(since)), 0.0
+        return poses_at(self.path, np.array(since)), 0.0

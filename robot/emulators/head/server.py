@@ -21,8 +21,8 @@ from robot.emulators.head import usb_descriptors
 from robot.emulators.head.config import HeadEmulatorConfig
 from robot.emulators.head.device import EmulatedHead
 from robot.emulators.head.pose_source import AlongPath, CarriedByArm, PoseSource
-from robot.world.head_trajectory import Path
-from robot.world.scene import KidnapConfig, scene
+from robot.world.head_trajectory import HeadPath
+from robot.world.scene import KidnapConfig, make_scene
 from tactile.whiskers.head_geometry import ur10_head
 
 Client = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
@@ -38,7 +38,7 @@ def serve(config: HeadEmulatorConfig) -> None:
     """
     set_niceness(URGENT)
     head = ur10_head(config.head)
-    made = scene(config.maze, config.path, config.motion, KidnapConfig(), head, config.seed)
+    made = make_scene(config.maze, config.path, config.motion, KidnapConfig(), head, config.seed)
     with contextlib.ExitStack() as stack:
         bridge = EmulatedHead(
             config, made.surroundings.walls, _place(config, made.path, stack), time.monotonic()
@@ -46,9 +46,9 @@ def serve(config: HeadEmulatorConfig) -> None:
         asyncio.run(_run_server(config, bridge))
 
 
-def _place(config: HeadEmulatorConfig, path: Path, stack: contextlib.ExitStack) -> PoseSource:
+def _place(config: HeadEmulatorConfig, path: HeadPath, stack: contextlib.ExitStack) -> PoseSource:
     if config.arm is None:
-        return AlongPath(path if config.follow else Path(path.time[:1], path.pose[:1]))
+        return AlongPath(path if config.follow else HeadPath(path.time[:1], path.pose[:1]))
     from robot.drivers.ur10.pose_listener import PoseListener
 
     arm = PoseListener(config.arm, hz=config.arm_hz)

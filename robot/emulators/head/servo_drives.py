@@ -18,7 +18,7 @@ from robot.drivers.head.protocol import (
     CommandKind,
     FeedbackMode,
 )
-from robot.simulation.head.quasistatic import Balance, rest
+from robot.simulation.head.quasistatic import WhiskerBalance, whiskers_at_rest
 from tactile.whiskers.head_geometry import Head
 from tactile.whiskers.whisking import WhiskDrive, WhiskingConfig, whisk_command, whisk_phase
 
@@ -95,7 +95,7 @@ class ServoDrives:
         """Retracts, whatever it heard before."""
         self._stopped, self._next = True, None
 
-    def begin(self, time: float, balance: Balance) -> Balance:
+    def begin(self, time: float, balance: WhiskerBalance) -> WhiskerBalance:
         """What is to be done from here on; called at each beginning of a block and wherever `left` ended.
 
         Args:
@@ -113,7 +113,7 @@ class ServoDrives:
             if self.sample < self._retraction:
                 return balance
             self._from, self.sample = None, 0
-            balance = rest(*balance.before.shape)
+            balance = whiskers_at_rest(*balance.before.shape)
         ended = self.whisk is not None and self.sample >= self.whisk.samples
         if (self.whisk is None and self._next is not None) or ended:
             if self._next is not None:
@@ -121,11 +121,11 @@ class ServoDrives:
             assert self.whisk is not None
             common = np.full(len(self._centre), np.radians(self.whisk.whisking.amplitude_deg))
             self.whisk, self.sample = self.whisk._replace(amplitude=common), 0
-            return rest(*balance.before.shape)
+            return whiskers_at_rest(*balance.before.shape)
         return balance
 
     def law(self, drive: WhiskDrive, time: float, told: np.ndarray) -> tuple[np.ndarray, WhiskDrive]:
-        """A `robot.simulation.head.quasistatic.Law`; time since the whisk or the retraction began."""
+        """A `robot.simulation.head.quasistatic.WhiskingLaw`; time since the whisk or the retraction began."""
         if self.whisk is None:
             share = 0.0 if self._from is None else max(1 - time / RETRACTION, 0.0)
             return np.zeros_like(told) + (0.0 if self._from is None else self._from * share), drive

@@ -10,9 +10,9 @@ from robot.emulators.head.pose_source import PoseSource
 from robot.emulators.head.servo_drives import ServoDrives
 from robot.simulation.head.beam import StreamConfig
 from robot.simulation.head.kinematic import MechanicsConfig
-from robot.simulation.head.quasistatic import advance, rest
-from robot.simulation.head.whisk_stream import Sweep, passed, reported
-from robot.world.walls import FREE, Surroundings, Walls
+from robot.simulation.head.quasistatic import advance_balance, whiskers_at_rest
+from robot.simulation.head.whisk_stream import WallSweep, sensor_readings, sweep_walls
+from robot.world.walls import NO_CONTACT, Surroundings, Walls
 from tactile.whiskers.head_geometry import Head
 
 STEP = 1e-4
@@ -53,7 +53,7 @@ class Whiskers:
         self.config, self.mechanics, self.head = config, mechanics, head
         self.walls, self.place, self.random, self.samples = walls, place, random, samples
         self.drives = ServoDrives(head, config.rate)
-        self.balance = rest(1, len(head.length))
+        self.balance = whiskers_at_rest(1, len(head.length))
         self.pose: np.ndarray | None = None
         self.lift = np.inf
         self._around: Surroundings | None = None
@@ -85,18 +85,20 @@ class Whiskers:
             knots = np.array([first - done, first - done + size]) / rate
             time = (first + np.arange(count)) / rate
             sweep = self._sweep(pose, knots, time, noise[:, done : done + count])
-            truth, self.balance = advance(self.config, self.mechanics, self.drives.law, sweep, self.balance)
-            parts.append(reported(self.config, self.head, truth, sweep.noise))
+            truth, self.balance = advance_balance(
+                self.config, self.mechanics, self.drives.law, sweep, self.balance
+            )
+            parts.append(sensor_readings(self.config, self.head, truth, sweep.noise))
             self.drives.sample = 0 if left is None else first + count
             done += count
         angle, deflection = (np.concatenate([part[k][0] for part in parts]) for k in range(2))
         return Block(angle, deflection, begins, bool((self.balance.drive.most > 0).any()))
 
-    def _sweep(self, pose: np.ndarray, knots: np.ndarray, time: np.ndarray, noise: np.ndarray) -> Sweep:
+    def _sweep(self, pose: np.ndarray, knots: np.ndarray, time: np.ndarray, noise: np.ndarray) -> WallSweep:
         if self.lift < self._clear:
-            return passed(self._surroundings(), pose, knots, time, noise)
+            return sweep_walls(self._surroundings(), pose, knots, time, noise)
         nothing = np.zeros((len(time), 1, len(self.head.length)))
-        return Sweep(time, nothing + FREE, nothing + 1.0, nothing, noise)
+        return WallSweep(time, nothing + NO_CONTACT, nothing + 1.0, nothing, noise)
 
     def _surroundings(self) -> Surroundings:
         """The walls as a head sees them that is lifted: so much lower."""

@@ -12,30 +12,36 @@ from pathlib import Path as File
 import numpy as np
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 
-from robot.simulation.create.robot import Robot, Step
+from robot.simulation.create.robot import CreateRobot, CreateStep
 from robot.simulation.create.state_machine import (
     BehaviourConfig,
-    Command,
-    Doing,
-    State,
-    command,
-    following,
+    CreateState,
+    MachineState,
+    WheelCommand,
+    next_state,
+    wheel_command,
 )
-from robot.simulation.create.strain_sensors import WhiskersConfig, fan
-from robot.simulation.create.wheel_odometry import WheelsConfig, reckoned
-from robot.sources.simulated import STILL, Made, document_digest, placed
+from robot.simulation.create.strain_sensors import WhiskersConfig, fixed_whiskers
+from robot.simulation.create.wheel_odometry import WheelsConfig, simulate_wheel_odometry
+from robot.sources.simulated import NO_ODOMETRY, SimulatedSource, digest_of_document, wrap_headings
 from robot.sources.source import rate_of
 from robot.sources.source_info import PlanarWhiskersInfo, SourceInfo
-from robot.world.arena import segments, text
-from robot.world.random_arena import ArenaConfig, arena
+from robot.world.arena import arena_text, wall_segments
+from robot.world.random_arena import ArenaConfig, make_arena
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.se2 import between
 from tactile.base.types import Odometry, Report, StepEnd
+from tactile.wall_estimation.strain_templates import (
+    StrainTemplates,
+    TemplateTraining,
+    train_templates,
+    training_drive,
+)
 
 
-class RovingConfig(Settings):
+class CreateSimulationConfig(Settings):
     """A session of the Create to simulate. What the paper leaves open are these defaults."""
 
     arena: ArenaConfig = ArenaConfig()
@@ -53,7 +59,7 @@ class RovingConfig(Settings):
     seed: NonNegativeInt = 0
     """Of everything random."""
 
-    def resolved(self, folder: File) -> RovingConfig:
+    def resolved(self, folder: File) -> CreateSimulationConfig:
         """The same with every relative path taken from the folder (of the configuration file, say)."""
         if self.arena.file is None:
             return self
@@ -62,34 +68,39 @@ class RovingConfig(Settings):
         )
 
 
-class Rover(Made):
-    """A simulated session of the Create as a `Source`; make one with `roving`.
+class CreateSimulation(SimulatedSource):
+    """A simulated session of the Create as a `Source`.
 
     Attributes:
         config: what it was made from. arena: where it is. fan: its whiskers. steps: [N] what it did.
         time: [N] s, at the end of each step. truth: [N, 3] then. odometry: [N, 4] of each.
+
+    Raises:
+        InputError: the configuration cannot be simulated; says what and where.
     """
 
-    name = "roving"
+    name = "create_simulation"
     view_shape = (1, 4, 1)
 
-    def __init__(self, config: RovingConfig) -> None:
+    def __init__(self, config: CreateSimulationConfig) -> None:
         self.config = config
-        self.arena = arena(config.arena, config.seed)
-        robot = Robot(config.behaviour, config.whiskers, segments(self.arena), stream(config.seed, "strain"))
+        self.arena = make_arena(config.arena, config.seed)
+        robot = CreateRobot(
+            config.behaviour, config.whiskers, wall_segments(self.arena), stream(config.seed, "strain")
+        )
         self.fan = robot.fan
         start = robot.at(self.arena.start)
         self.steps = steps = list(_driven(config, robot, start))
         duration = np.array([step.duration for step in steps])
         self.time = np.cumsum(duration)
         pose = np.array([start.pose, *(step.pose for step in steps)])
-        self.truth = placed(pose[1:])
+        self.truth = wrap_headings(pose[1:])
         motion = np.column_stack([between(pose[:-1], pose[1:])[:, :2], np.diff(pose[:, 2]), duration])
         kind = np.array([step.state.motion for step in steps])
-        self.odometry = reckoned(config.wheels, motion, kind, stream(config.seed, "wheels"))
+        self.odometry = simulate_wheel_odometry(config.wheels, motion, kind, stream(config.seed, "wheels"))
         plain = config.model_dump(mode="json", exclude={"arena": {"file"}})
-        drawing = text(self.arena)
-        self.digest = document_digest({"roving": plain, "arena": drawing})
+        drawing = arena_text(self.arena)
+        self.digest = digest_of_document({"create_simulation": plain, "arena": drawing})
         mounts = tuple((mount.x, mount.y, mount.direction_deg) for mount in config.whiskers.mounts)
         self.info = SourceInfo(
             raw_whiskers=True,
@@ -107,43 +118,34 @@ class Rover(Made):
         return len(self.fan.base)
 
     def _readings(self) -> Iterator[Report]:
-        return (report(self.config, step, STILL) for step in self.steps)
+        return (make_report(self.config, step, NO_ODOMETRY) for step in self.steps)
 
 
-def _driven(config: RovingConfig, robot: Robot, start: Step) -> Iterator[Step]:
+def _driven(config: CreateSimulationConfig, robot: CreateRobot, start: CreateStep) -> Iterator[CreateStep]:
     random = stream(config.seed, "behaviour")
-    step, doing, time, count = start, Doing(State.FWD1), 0.0, 0
+    step, doing, time, count = start, MachineState(CreateState.FWD1), 0.0, 0
     while (count < config.reports) if config.reports else (time < 60 * config.minutes):
         before = step
-        step = robot.step(before, doing.state, command(config.behaviour, doing))
+        step = robot.step(before, doing.state, wheel_command(config.behaviour, doing))
         time, count = time + step.duration, count + 1
         turned = float(step.pose[2] - before.pose[2])
-        doing = following(config.behaviour, doing, step.moment, turned, random)
+        doing = next_state(config.behaviour, doing, step.moment, turned, random)
         yield step
 
 
-def roving(config: RovingConfig) -> Rover:
-    """The session of a configuration.
-
-    Raises:
-        InputError: what is asked for cannot be simulated; says what and where.
-    """
-    return Rover(config)
-
-
-LONG = 10.0
+HALF_WALL = 10.0
 """Half of a wall that is as good as endless, m."""
-AHEAD = 0.015
+APPROACH = 0.015
 """How far away it is at most when the robot sets out, m."""
-RECORD = 2.0
+RECORD_TIME = 2.0
 """Length of what is kept, s (Fox et al. 2012, II-G)."""
 
 
-def drive_into_wall(config: RovingConfig, angle: float, random: np.random.Generator) -> Report:
+def drive_into_wall(config: CreateSimulationConfig, angle: float, random: np.random.Generator) -> Report:
     """What whiskers feel as the robot drives into one flat wall, for templates.
 
-    It drives on to the first contact as in FWD1, then for `RECORD` as in FWD2, whatever the strain. That is
-    what is told, its first sample taken at contact.
+    It drives on to the first contact as in FWD1, then for `RECORD_TIME` as in FWD2, whatever the strain.
+    The report is of this second motion; its first sample is taken at contact.
 
     Args:
         angle: of the wall's direction in base_link, rad, counter-clockwise from ahead: 90 degrees is a wall
@@ -156,34 +158,57 @@ def drive_into_wall(config: RovingConfig, angle: float, random: np.random.Genera
     if towards[0] < 0.05:
         raise ValueError(f"the robot does not drive into a wall at {angle:g} rad")
     whiskers, behaviour = config.whiskers, config.behaviour
-    room = float((fan(whiskers).tip @ towards).max()) + AHEAD * random.uniform(0.5, 1.0) * towards[0]
-    along = LONG * np.array([np.cos(angle), np.sin(angle)])
+    room = (
+        float((fixed_whiskers(whiskers).tip @ towards).max())
+        + APPROACH * random.uniform(0.5, 1.0) * towards[0]
+    )
+    along = HALF_WALL * np.array([np.cos(angle), np.sin(angle)])
     wall = np.concatenate([room * towards - along, room * towards + along])[None]
-    robot = Robot(behaviour, whiskers, wall, random)
+    robot = CreateRobot(behaviour, whiskers, wall, random)
     step = robot.at(np.zeros(3))
-    while step.moment == StepEnd.FREE and step.pose[0] < 2 * AHEAD + whiskers.length:
-        step = robot.step(step, State.FWD1, Command(behaviour.fast, 0.0, behaviour.step))
+    while step.moment == StepEnd.FREE and step.pose[0] < 2 * APPROACH + whiskers.length:
+        step = robot.step(step, CreateState.FWD1, WheelCommand(behaviour.fast, 0.0, behaviour.step))
     if step.moment != StepEnd.HIT1:
         raise InputError(
-            "roving.behaviour.contact",
+            "create_simulation.behaviour.contact",
             f"no contact at a strain of {behaviour.contact:g} with a wall at {np.degrees(angle):.0f} degrees",
             "a lower strain, or whiskers that reach beyond the body",
         )
-    patient = behaviour.model_copy(update={"safety": np.inf, "least": RECORD})
-    told = Command(behaviour.slow, 0.0, RECORD)
-    felt = Robot(patient, whiskers, wall, random).step(step, State.FWD2, told)
-    odometry = Odometry(behaviour.slow * RECORD, 0.0, 0.0, RECORD)
-    return report(config, felt, odometry)
+    patient = behaviour.model_copy(update={"safety": np.inf, "least": RECORD_TIME})
+    told = WheelCommand(behaviour.slow, 0.0, RECORD_TIME)
+    felt = CreateRobot(patient, whiskers, wall, random).step(step, CreateState.FWD2, told)
+    odometry = Odometry(behaviour.slow * RECORD_TIME, 0.0, 0.0, RECORD_TIME)
+    return make_report(config, felt, odometry)
 
 
-def report(config: RovingConfig, step: Step, odometry: Odometry) -> Report:
+def make_report(config: CreateSimulationConfig, step: CreateStep, odometry: Odometry) -> Report:
     """A step as it is told."""
     return Report(
         odometry=odometry,
         motion=int(step.state.motion),
         moment=int(step.moment),
-        alive=fan(config.whiskers).alive,
+        alive=fixed_whiskers(config.whiskers).alive,
         contact=step.contact.copy(),
         time=np.arange(len(step.strain)) / config.whiskers.rate,
         strain=step.strain.copy(),
+    )
+
+
+def train_strain_templates(
+    config: CreateSimulationConfig, training: TemplateTraining | None = None
+) -> StrainTemplates:
+    """Templates of the robot of a session; from its seed, always the same.
+
+    Raises:
+        InputError: the robot's whiskers are sampled otherwise than the training says.
+    """
+    training = training or TemplateTraining(rate=config.whiskers.rate, speed=config.behaviour.slow)
+    random = stream(config.seed, "templates")
+    return train_templates(
+        (
+            training_drive(angle, repeat, drive_into_wall(config, angle, random))
+            for angle in training.angles.tolist()
+            for repeat in range(training.repeats)
+        ),
+        training,
     )

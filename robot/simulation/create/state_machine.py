@@ -18,11 +18,11 @@ from tactile.base.config import Settings
 from tactile.base.types import MotionKind, StepEnd
 
 Share = Annotated[float, Field(ge=0, le=1)]
-STRAIGHT = 1e-6
+MIN_TURN = 1e-6
 """Turn that is not worth a step, rad."""
 
 
-class State(IntEnum):
+class CreateState(IntEnum):
     """What the robot is doing."""
 
     FWD1 = 0
@@ -89,7 +89,7 @@ class BehaviourConfig(Settings):
         return self
 
 
-class Command(NamedTuple):
+class WheelCommand(NamedTuple):
     """A motion: m/s ahead, rad/s counter-clockwise, for s at most."""
 
     speed: float
@@ -97,28 +97,28 @@ class Command(NamedTuple):
     duration: float
 
 
-class Doing(NamedTuple):
+class MachineState(NamedTuple):
     """The machine's state, and how far it has yet to turn, rad (0 but in TURN)."""
 
-    state: State
+    state: CreateState
     rest: float = 0.0
 
 
-def command(config: BehaviourConfig, doing: Doing) -> Command:
+def wheel_command(config: BehaviourConfig, doing: MachineState) -> WheelCommand:
     """What the wheels are told to do for a step."""
-    if doing.state == State.FWD1:
-        return Command(config.fast, 0.0, config.step)
-    if doing.state == State.FWD2:
-        return Command(config.slow, 0.0, config.patience)
-    if doing.state == State.BACK:
-        return Command(-config.fast, 0.0, config.step)
+    if doing.state == CreateState.FWD1:
+        return WheelCommand(config.fast, 0.0, config.step)
+    if doing.state == CreateState.FWD2:
+        return WheelCommand(config.slow, 0.0, config.patience)
+    if doing.state == CreateState.BACK:
+        return WheelCommand(-config.fast, 0.0, config.step)
     whole = abs(doing.rest) / config.turn.rate
-    return Command(
+    return WheelCommand(
         0.0, float(np.copysign(config.turn.rate, doing.rest)), min(whole, config.turn.step or whole)
     )
 
 
-def turn(config: TurnConfig, random: np.random.Generator) -> float:
+def draw_turn(config: TurnConfig, random: np.random.Generator) -> float:
     """How far to turn, rad: half a turn at most either way."""
     which, normal = random.random(), random.standard_normal()
     small = which < config.share
@@ -127,23 +127,23 @@ def turn(config: TurnConfig, random: np.random.Generator) -> float:
     return float(np.clip(mean + sd * normal, -np.pi, np.pi))
 
 
-def moved(command: Command, pose: np.ndarray, time: np.ndarray) -> np.ndarray:
+def drive(command: WheelCommand, pose: np.ndarray, time: np.ndarray) -> np.ndarray:
     """[T, 3] the poses at times [T] s of a motion from a pose: straight or on the spot."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     ahead, turned = command.speed * time, command.rate * time
     return np.column_stack([pose[0] + c * ahead, pose[1] + s * ahead, pose[2] + turned])
 
 
-class End(NamedTuple):
+class MotionEnd(NamedTuple):
     """How a motion ended: at which row of what was monitored, and at which moment of the machine."""
 
     row: int
     moment: StepEnd
 
 
-def ended(
-    config: BehaviourConfig, state: State, strain: np.ndarray, bumped: np.ndarray, before: np.ndarray
-) -> End:
+def motion_end(
+    config: BehaviourConfig, state: CreateState, strain: np.ndarray, bumped: np.ndarray, before: np.ndarray
+) -> MotionEnd:
     """When a motion in a state ends.
 
     Args:
@@ -153,40 +153,42 @@ def ended(
     last = len(strain) - 1
     level = np.abs(strain[..., 0])
     over = np.abs(strain).max(axis=2) > config.safety
-    ends: list[tuple[int, int, StepEnd]] = [(last, 9, StepEnd.ABORT if state == State.FWD2 else StepEnd.FREE)]
-    if state == State.BACK:
-        return End(_first(bumped, last), StepEnd.FREE)  # nothing to go back to
-    if state == State.TURN:
+    ends: list[tuple[int, int, StepEnd]] = [
+        (last, 9, StepEnd.ABORT if state == CreateState.FWD2 else StepEnd.FREE)
+    ]
+    if state == CreateState.BACK:
+        return MotionEnd(_first(bumped, last), StepEnd.FREE)  # nothing to go back to
+    if state == CreateState.TURN:
         # What was strained too much already ends it only by getting worse.
         over &= level > 1.1 * level[0]
     stop = over.any(axis=1) | bumped
     if stop.any():
         ends.append((_first(stop, last), 1, StepEnd.ABORT))
     touching = level > config.contact
-    if state == State.FWD1 and touching.any():
+    if state == CreateState.FWD1 and touching.any():
         ends.append((_first(touching.any(axis=1), last), 2, StepEnd.HIT1))
-    if state == State.FWD2:
+    if state == CreateState.FWD2:
         ever = np.logical_or.accumulate(touching | before, axis=0).sum(axis=1) >= 2
         ever[: min(round(config.least / config.period), last)] = False
         if ever.any():
             ends.append((_first(ever, last), 2, StepEnd.HIT2))
     row, _, moment = min(ends)
-    return End(row, moment)
+    return MotionEnd(row, moment)
 
 
 def _first(flags: np.ndarray, otherwise: int) -> int:
     return int(np.argmax(flags)) if flags.any() else otherwise
 
 
-def following(
-    config: BehaviourConfig, doing: Doing, moment: StepEnd, turned: float, random: np.random.Generator
-) -> Doing:
+def next_state(
+    config: BehaviourConfig, doing: MachineState, moment: StepEnd, turned: float, random: np.random.Generator
+) -> MachineState:
     """What is done after a step that ended so, having turned by so much (rad)."""
-    if doing.state == State.BACK:
-        return Doing(State.TURN, turn(config.turn, random))
-    if doing.state == State.FWD2 or moment == StepEnd.ABORT:
-        return Doing(State.BACK)
+    if doing.state == CreateState.BACK:
+        return MachineState(CreateState.TURN, draw_turn(config.turn, random))
+    if doing.state == CreateState.FWD2 or moment == StepEnd.ABORT:
+        return MachineState(CreateState.BACK)
     rest = doing.rest - turned
-    if doing.state == State.TURN and abs(rest) > STRAIGHT:
-        return Doing(State.TURN, rest)
-    return Doing(State.FWD2 if moment == StepEnd.HIT1 else State.FWD1)
+    if doing.state == CreateState.TURN and abs(rest) > MIN_TURN:
+        return MachineState(CreateState.TURN, rest)
+    return MachineState(CreateState.FWD2 if moment == StepEnd.HIT1 else CreateState.FWD1)

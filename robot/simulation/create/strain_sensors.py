@@ -16,11 +16,11 @@ import numpy as np
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, model_validator
 from scipy.signal import lfilter
 
-from robot.simulation.create.whisker_bending import Bent, Shaft, base_strain, bent
+from robot.simulation.create.whisker_bending import Bending, Shaft, base_strain, bend_shafts
 from tactile.base.config import Settings
 from tactile.whiskers.head_geometry import Degrees
 
-STEEPEST = np.radians(75.0)
+MAX_LEAN = np.radians(75.0)
 """Lean up to which a push along the shaft is passed on; beyond, a whisker buckles instead."""
 
 
@@ -91,7 +91,7 @@ class WhiskersConfig(Settings):
         return self
 
 
-class Fan(NamedTuple):
+class FixedWhiskers(NamedTuple):
     """Whiskers fixed to a body.
 
     Attributes:
@@ -115,34 +115,34 @@ class Fan(NamedTuple):
         return self.base + self.shaft.length * way
 
 
-def fan(config: WhiskersConfig) -> Fan:
+def fixed_whiskers(config: WhiskersConfig) -> FixedWhiskers:
     """The whiskers of a configuration."""
     base = np.array([[mount.x, mount.y] for mount in config.mounts])
     direction = np.radians([mount.direction_deg for mount in config.mounts])
     taper = (1 - config.tip_diameter / config.base_diameter) / config.length
     alive = np.ones(len(base), bool)
     alive[list(config.dead)] = False
-    return Fan(base, direction, Shaft(config.length, config.base_diameter / 2, taper), alive)
+    return FixedWhiskers(base, direction, Shaft(config.length, config.base_diameter / 2, taper), alive)
 
 
-def among(fan: Fan, pose: np.ndarray, segments: np.ndarray, side: np.ndarray) -> Bent:
+def bend_whiskers(fan: FixedWhiskers, pose: np.ndarray, segments: np.ndarray, side: np.ndarray) -> Bending:
     """How whiskers are bent at poses [T, 3], in order of time, among walls [S, 4]; `side` as in `bent`."""
     c, s = np.cos(pose[:, 2:]), np.sin(pose[:, 2:])
     x, y = fan.base.T
     base = np.stack([pose[:, :1] + c * x - s * y, pose[:, 1:2] + s * x + c * y], axis=-1)
-    return bent(fan.shaft, base, pose[:, 2:] + fan.direction, segments, side)
+    return bend_shafts(fan.shaft, base, pose[:, 2:] + fan.direction, segments, side)
 
 
-def strained(config: WhiskersConfig, fan: Fan, bent: Bent) -> np.ndarray:
+def base_strains(config: WhiskersConfig, fan: FixedWhiskers, bent: Bending) -> np.ndarray:
     """[T, W, 2] the strain of bent whiskers, horizontal and vertical, without noise."""
     across = base_strain(fan.shaft, bent.turn, bent.reach)
     # Of a push, what goes along the shaft has the droop for its lever, what goes across the shaft itself.
-    along = np.tan(np.minimum(bent.lean + np.arctan(config.friction), STEEPEST))
+    along = np.tan(np.minimum(bent.lean + np.arctan(config.friction), MAX_LEAN))
     down = np.tan(np.radians(config.droop_deg)) * np.abs(across) * along
     return np.stack([across, config.crosstalk * across - down], axis=-1) * fan.alive[:, None]
 
 
-def shaken(config: ShakeConfig, count: int, rate: float, random: np.random.Generator) -> np.ndarray:
+def body_vibration(config: ShakeConfig, count: int, rate: float, random: np.random.Generator) -> np.ndarray:
     """[T, 2] strain that the body's vibration adds from the start of a motion on: as it sways and as it
     nods."""
     time = np.arange(count) / rate
@@ -162,17 +162,17 @@ def _gain(back: list[float]) -> float:
     return float(np.sqrt((1 + b) / ((1 - b) * ((1 + b) ** 2 - a**2))))
 
 
-def sampled(
+def sample_strain(
     config: WhiskersConfig, strain: np.ndarray, alive: np.ndarray, random: np.random.Generator
 ) -> np.ndarray:
     """[T, W, 2] what sensors read of strain [T, W, 2], sampled at the sensors' rate from the start of a
     motion on."""
-    shake = shaken(config.shake, len(strain), config.rate, random)
+    shake = body_vibration(config.shake, len(strain), config.rate, random)
     read = strain + shake[:, None] + config.noise * random.standard_normal(strain.shape)
     return np.where(alive[:, None], read, 0.0)
 
 
-def monitored(
+def monitor_strain(
     config: WhiskersConfig, strain: np.ndarray, alive: np.ndarray, period: float, random: np.random.Generator
 ) -> np.ndarray:
     """[T, W, 2] what a monitor knows of strain [T, W, 2]: means over a period (s) before each row. The body's

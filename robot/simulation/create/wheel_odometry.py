@@ -10,7 +10,7 @@ from pydantic import NonNegativeFloat
 
 from tactile.base.config import Settings
 
-KEPT_WHITE = 0.2
+BIAS_WHITE_SHARE = 0.2
 """White noise beside a bias, as a share of the level: 1 % beside 5 %."""
 
 
@@ -24,7 +24,7 @@ class WheelsConfig(Settings):
     """Standard deviation of the scale."""
 
 
-def reckoned(
+def simulate_wheel_odometry(
     config: WheelsConfig, motion: np.ndarray, kind: np.ndarray, random: np.random.Generator
 ) -> np.ndarray:
     """[N, 4] (dx m, dy m, dtheta rad, dt s) as the wheels tell it.
@@ -44,7 +44,7 @@ def reckoned(
         begins = np.concatenate([[True], kind[1:] != kind[:-1]])
         error = white[np.flatnonzero(begins)[np.cumsum(begins) - 1]]
     else:
-        error = run + KEPT_WHITE * white
+        error = run + BIAS_WHITE_SHARE * white
     scale = 1 + config.level * error
     told[:, :2] *= scale[:, :1]
     told[:, 2] *= scale[:, 1]

@@ -16,11 +16,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-CHAIN = 4
+MAX_JOINED_WALLS = 4
 """Walls, one beginning where the other ends, that a whisker may have to get clear of."""
-TOUCHING = 1e-9
+JOINED_ANGLE = 1e-9
 """Turn under which two walls count as joined, rad."""
-HALVINGS = 24
+BISECTIONS = 24
 """Of the stretch in which the contact with a wall is looked for: to 10 nm."""
 
 
@@ -34,7 +34,7 @@ class Shaft(NamedTuple):
     taper: float
 
 
-class Bent(NamedTuple):
+class Bending(NamedTuple):
     """Whiskers [T, W] as they are bent; where free, zero, and the reach is the length.
 
     Attributes:
@@ -48,9 +48,9 @@ class Bent(NamedTuple):
     lean: np.ndarray
     side: np.ndarray
 
-    def at(self, row: int) -> Bent:
+    def at(self, row: int) -> Bending:
         """One row, as one of one."""
-        return Bent(*(column[row : row + 1] for column in self))
+        return Bending(*(column[row : row + 1] for column in self))
 
 
 def base_strain(shaft: Shaft, turn: np.ndarray, reach: np.ndarray) -> np.ndarray:
@@ -58,23 +58,23 @@ def base_strain(shaft: Shaft, turn: np.ndarray, reach: np.ndarray) -> np.ndarray
     return 3 * shaft.radius * (1 / reach - shaft.taper) * turn
 
 
-def tilt(shaft: Shaft, reach: np.ndarray) -> np.ndarray:
+def shaft_tilt(shaft: Shaft, reach: np.ndarray) -> np.ndarray:
     """Turn of the shaft at the contact over that of the line from base to contact."""
     narrow = shaft.taper * reach
     return (3 - 2 * narrow) / (2 * (1 - narrow))
 
 
-def bent(
+def bend_shafts(
     shaft: Shaft, base: np.ndarray, direction: np.ndarray, segments: np.ndarray, side: np.ndarray
-) -> Bent:
+) -> Bending:
     """Whiskers among walls.
 
     Args:
         base: [T, W, 2] m, where they are mounted, in order of time. direction: [T, W] rad, straight ones.
-        segments: [S, 4] m. side: [W] as in `Bent`, before the first row.
+        segments: [S, 4] m. side: [W] as in `Bending`, before the first row.
     """
     free, no_side = np.zeros(direction.shape), np.zeros(direction.shape, int)
-    nothing = Bent(free, free + shaft.length, free, no_side)
+    nothing = Bending(free, free + shaft.length, free, no_side)
     if not len(segments):
         return nothing
     low, high = _shadows(shaft, base, direction, segments)
@@ -94,7 +94,7 @@ def bent(
     reach += shaft.length
     angle, reach[row, whisker], lean[row, whisker] = _held(shaft, chosen)
     turn[row, whisker] = way * angle
-    return Bent(turn, reach, lean, sides)
+    return Bending(turn, reach, lean, sides)
 
 
 class _Ends(NamedTuple):
@@ -143,11 +143,11 @@ def _mirrored(ends: _Ends) -> _Ends:
 def _cleared(low: _Ends, high: _Ends) -> _Ends:
     """[K] The end at which whiskers, all blocked, get clear counter-clockwise; from ends [K, S]."""
     angle = np.zeros(len(low.angle))
-    for _ in range(CHAIN):
-        joined = low.angle <= angle[:, None] + TOUCHING
+    for _ in range(MAX_JOINED_WALLS):
+        joined = low.angle <= angle[:, None] + JOINED_ANGLE
         angle = np.maximum(angle, np.where(joined, high.angle, 0.0).max(axis=1))
     # Of walls that end together (a corner) the nearest holds it.
-    last = np.abs(high.angle - angle[:, None]) <= TOUCHING
+    last = np.abs(high.angle - angle[:, None]) <= JOINED_ANGLE
     which = np.argmin(np.where(last, high.radius, np.inf), axis=1)[:, None]
     radius, near, away = (np.take_along_axis(column, which, axis=1)[:, 0] for column in high[1:])
     return _Ends(angle, radius, near, away)
@@ -168,17 +168,17 @@ def _held(shaft: Shaft, end: _Ends) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     tip = end.radius >= shaft.length * (1 - 1e-9)
     away = np.minimum(end.away, reach * (1 - 1e-12))
     slant = np.arcsin(away / reach)  # between the line to the contact and the wall
-    lean = np.where(tip, slant, (tilt(shaft, reach) - 1) * turn)
-    flat = np.flatnonzero(tip & ((tilt(shaft, reach) - 1) * turn > slant))
+    lean = np.where(tip, slant, (shaft_tilt(shaft, reach) - 1) * turn)
+    flat = np.flatnonzero(tip & ((shaft_tilt(shaft, reach) - 1) * turn > slant))
     if len(flat):
         wall = turn[flat] + slant[flat]  # between the straight shaft and the wall
         near, far = end.near[flat], np.full(len(flat), shaft.length)
-        for _ in range(HALVINGS):
+        for _ in range(BISECTIONS):
             middle = (near + far) / 2
             slope = np.arcsin(np.minimum(away[flat] / middle, 1.0))
-            beyond = (tilt(shaft, middle) - 1) * (wall - slope) > slope
+            beyond = (shaft_tilt(shaft, middle) - 1) * (wall - slope) > slope
             near, far = np.where(beyond, near, middle), np.where(beyond, middle, far)
         reach[flat] = far
         turn[flat] = wall - np.arcsin(np.minimum(away[flat] / far, 1.0))
-        lean[flat] = (tilt(shaft, far) - 1) * turn[flat]
+        lean[flat] = (shaft_tilt(shaft, far) - 1) * turn[flat]
     return turn, reach, lean

@@ -11,9 +11,9 @@ from scipy.linalg import eigh
 from tactile.base.config import Settings
 from tactile.features.contact import ShaftConfig
 
-LINE = np.linspace(0.0, 1.0, 401)
+SHAFT_SHARES = np.linspace(0.0, 1.0, 401)
 """Shares of a whisker's length at which it is integrated."""
-LOADS = (1.0, 0.65)
+LOAD_SHARES = (1.0, 0.65)
 """Shares at which the two shapes are loaded: the tip, and where walls push most. Between them stiffness is
 off by 6 % at most and the moment at the base by 10 %."""
 
@@ -64,7 +64,7 @@ class Beam(NamedTuple):
     loads bend it. Statics are exact under these loads, and the shapes hold the two slowest bending modes.
 
     Attributes:
-        shapes: [2, S] deflection at `LINE` per unit load. stiffness, mass: [2, 2] of the loads.
+        shapes: [2, S] deflection at `SHAFT_SHARES` per unit load. stiffness, mass: [2, 2] of the loads.
         coupled: [2] inertia shared with turning. inertia: of the straight whisker about its base.
         moment: [2] at the base per unit load. unit: stiffness of turning against a push at the reference.
     """
@@ -79,7 +79,7 @@ class Beam(NamedTuple):
 
     def at(self, reach: np.ndarray) -> np.ndarray:
         """[2, ...] the two shapes at shares of the length."""
-        return np.stack([np.interp(reach, LINE, shape) for shape in self.shapes])
+        return np.stack([np.interp(reach, SHAFT_SHARES, shape) for shape in self.shapes])
 
     @property
     def modes(self) -> np.ndarray:
@@ -87,32 +87,32 @@ class Beam(NamedTuple):
         return np.sqrt(eigh(self.stiffness, self.mass, eigvals_only=True))
 
 
-def beam(config: ShaftConfig) -> Beam:
+def make_beam(config: ShaftConfig) -> Beam:
     """The two-shape model of a tapered whisker."""
-    loads = np.array(LOADS)
-    thick = 1 - (1 - config.taper) * LINE
-    bent = np.maximum(loads[:, None] - LINE, 0.0) / thick**4
+    loads = np.array(LOAD_SHARES)
+    thick = 1 - (1 - config.taper) * SHAFT_SHARES
+    bent = np.maximum(loads[:, None] - SHAFT_SHARES, 0.0) / thick**4
     shapes = _summed(_summed(bent))
     line = thick**2
     return Beam(
         shapes=shapes,
         stiffness=_inner(bent * thick**4, bent),
         mass=_inner(line * shapes, shapes),
-        coupled=_summed(line * LINE * shapes)[:, -1],
-        inertia=float(_summed(line * LINE**2)[-1]),
+        coupled=_summed(line * SHAFT_SHARES * shapes)[:, -1],
+        inertia=float(_summed(line * SHAFT_SHARES**2)[-1]),
         moment=loads,
         unit=3 * (1 / config.reference - (1 - config.taper)),
     )
 
 
-def clock(config: BeamConfig, length: float) -> float:
+def beam_time_unit(config: BeamConfig, length: float) -> float:
     """The unit of time of a unit beam, s."""
     return float(length**2 * 2 / config.radius * np.sqrt(config.density / config.modulus))
 
 
 def _summed(value: np.ndarray) -> np.ndarray:
     """Running integral along the whisker (trapezoids)."""
-    steps = (value[..., 1:] + value[..., :-1]) / 2 * np.diff(LINE)
+    steps = (value[..., 1:] + value[..., :-1]) / 2 * np.diff(SHAFT_SHARES)
     return np.concatenate([np.zeros((*value.shape[:-1], 1)), np.cumsum(steps, axis=-1)], axis=-1)
 
 

@@ -13,32 +13,32 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import expm
 
-from robot.simulation.head.beam import Beam, StreamConfig, beam, clock
+from robot.simulation.head.beam import Beam, StreamConfig, beam_time_unit, make_beam
 from robot.simulation.head.kinematic import MechanicsConfig
-from robot.simulation.head.whisk_stream import Sweep
+from robot.simulation.head.whisk_stream import WallSweep
 from tactile.features.contact import stiffness
 from tactile.whiskers.head_geometry import Head
 from tactile.whiskers.whisking import WhiskingConfig, initial_drive, whisk_command
 
-WALL = 300.0
+WALL_STIFFNESS = 300.0
 """Stiffness of a wall over that of a whisker."""
 
 
-def dynamic(
+def simulate_dynamic(
     config: StreamConfig,
     mechanics: MechanicsConfig,
     whisking: WhiskingConfig,
     head: Head,
-    sweep: Sweep,
+    sweep: WallSweep,
     threshold: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Angle, x and y, [T, N, W] rad: a `robot.simulation.head.whisk_stream.Tier`."""
-    model = beam(config.beam.shaft)
+    """Angle, x and y, [T, N, W] rad: a `robot.simulation.head.whisk_stream.MechanicsModel`."""
+    model = make_beam(config.beam.shaft)
     step, push = _systems(config, mechanics, head, model)  # [W, 6, 8], [W, 6, 3]
     # How far along its way the point of contact goes with each of the first three states.
     arm = np.concatenate([sweep.reach[None], model.at(sweep.reach)])  # [3, T, N, W]
     give = np.einsum("itnw,wij,jtnw->tnw", arm, push[:, :3], arm, optimize=True)
-    spring = WALL * model.unit
+    spring = WALL_STIFFNESS * model.unit
     force_per = 1 / (1 / spring + give)
     heard = sweep.noise[..., 2].swapaxes(0, 1)
     slide, hard = sweep.drift / config.rate, stiffness(config.beam.shaft, sweep.reach)
@@ -84,7 +84,7 @@ def _systems(
     lengths, which = np.unique(head.length, return_inverse=True)
     steps, pushes = [], []
     for length in lengths:
-        unit = clock(config.beam, float(length))
+        unit = beam_time_unit(config.beam, float(length))
         sample = 1 / (config.rate * unit)
         rotor = servo / (2 * np.pi * config.servo.frequency * unit) ** 2
         mass = np.zeros((3, 3))

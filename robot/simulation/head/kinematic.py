@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 
-from robot.world.head_trajectory import Path, at
+from robot.world.head_trajectory import HeadPath, poses_at
 from robot.world.walls import Surroundings
 from tactile.base.config import Settings
 from tactile.base.types import Odometry, Whisk
@@ -22,11 +22,11 @@ from tactile.whiskers.whisking import WhiskingConfig, neighbour_max, whisk_phase
 
 SHAFT = ShaftConfig()
 """Of all whiskers."""
-SHORTEST = 0.05
+MIN_REACH = 0.05
 """Reach, as a share of the shaft, under which a contact counts as this far out."""
-SDS = 20.0
+HEEDED_SDS = 20.0
 """Noise that a reading must exceed for the whisking law to heed it, in standard deviations (the paper's)."""
-MEAN = 0.3
+MEAN_NOISE_SHARE = 0.3
 """Noise of the largest angle, which is a mean over 10 ms, as a share of one sample's."""
 
 
@@ -51,7 +51,7 @@ class MechanicsConfig(Settings):
     """Of the head along a protraction, at which contact is looked for."""
 
 
-class Felt(NamedTuple):
+class WhiskColumns(NamedTuple):
     """What every whisker felt in every cycle: the columns [N, W] of `Whisk`."""
 
     contact: np.ndarray
@@ -61,14 +61,14 @@ class Felt(NamedTuple):
     reach: np.ndarray
 
 
-def felt(
+def simulate_kinematic(
     config: MechanicsConfig,
     whisking: WhiskingConfig,
     surroundings: Surroundings,
-    path: Path,
+    path: HeadPath,
     start: np.ndarray,
     random: np.random.Generator,
-) -> Felt:
+) -> WhiskColumns:
     """Whisk cycles that start at times [N] s along a path."""
     met = _met(config, whisking, surroundings, path, start)
     felt = _pushed(config, whisking, surroundings.head, met)
@@ -90,7 +90,7 @@ def _met(
     config: MechanicsConfig,
     whisking: WhiskingConfig,
     surroundings: Surroundings,
-    path: Path,
+    path: HeadPath,
     start: np.ndarray,
 ) -> _Met:
     whiskers, count = len(surroundings.head.length), len(start)
@@ -100,7 +100,7 @@ def _met(
         amplitude * whisk_phase(whisking, lag),
         amplitude * whisk_phase(whisking, lag - lag[0] / 2),
     )
-    met = surroundings.contact(at(path, start[:, None] + lag).reshape(-1, 3))
+    met = surroundings.contact(poses_at(path, start[:, None] + lag).reshape(-1, 3))
     wall, along, box = (column.reshape(count, config.poses, whiskers) for column in met)
     touches = wall <= command[:, None]
     contact, first = touches.any(axis=1), np.argmax(touches, axis=1)
@@ -114,12 +114,12 @@ def _met(
     before = np.concatenate([[0.0], command[:-1]])
     stands = np.where(contact, then(wall, first), 0.0)
     touched = np.where(contact, np.maximum(stands, np.where(new, midway[first], before[first])), 0.0)
-    reach = np.where(contact, np.maximum(then(along, first), SHORTEST), 1.0)
+    reach = np.where(contact, np.maximum(then(along, first), MIN_REACH), 1.0)
     last = wall[:, -1] + touched - stands
     return _Met(contact, touched, reach, last, np.where(np.isfinite(last), along[:, -1], 1.0))
 
 
-def _pushed(config: MechanicsConfig, whisking: WhiskingConfig, head: Head, met: _Met) -> Felt:
+def _pushed(config: MechanicsConfig, whisking: WhiskingConfig, head: Head, met: _Met) -> WhiskColumns:
     """What the drives make of it: how far whiskers bend and turn. A whisker touched near its base is stiffer:
     it bends less and its sensor reads more."""
     amplitude = np.radians(whisking.amplitude_deg)
@@ -129,13 +129,15 @@ def _pushed(config: MechanicsConfig, whisking: WhiskingConfig, head: Head, met: 
     reading, taken = _fed_back(config, whisking, head, reading, push)
     there = np.isfinite(met.last)
     last = np.where(there, met.last, 0.0)
-    hard_last = stiffness(SHAFT, np.maximum(met.last_reach, SHORTEST))
+    hard_last = stiffness(SHAFT, np.maximum(met.last_reach, MIN_REACH))
     bend = np.where(there, config.servo / (config.servo + hard_last) * (amplitude - taken - last), 0.0)
     noticed = met.contact & (np.maximum(reading, hard_last * bend) > config.dead_zone)
     # Slip is a matter of the angle at the end; whether contact still shows then, of the reading.
     held = noticed & there & (bend <= config.slip) & (hard_last * bend > config.dead_zone)
     highest = np.where(held, last + bend, amplitude - taken)
-    return Felt(noticed, np.where(noticed, met.touched + config.dead_zone, 0.0), held, highest, met.reach)
+    return WhiskColumns(
+        noticed, np.where(noticed, met.touched + config.dead_zone, 0.0), held, highest, met.reach
+    )
 
 
 def _fed_back(
@@ -145,7 +147,7 @@ def _fed_back(
     the contact threshold lowers the amplitude, which lowers the reading, and so on to the balance."""
     if whisking.mode == "open":
         return reading, np.zeros_like(reading)
-    limit, gain = SDS * config.noise, whisking.gain
+    limit, gain = HEEDED_SDS * config.noise, whisking.gain
     over = reading > limit
     reading = np.where(over, (reading + push * gain * limit) / (1 + push * gain), reading)
     taken = gain * np.maximum(reading - limit, 0.0)
@@ -157,19 +159,25 @@ def _fed_back(
 
 
 def _sensed(
-    config: MechanicsConfig, whisking: WhiskingConfig, head: Head, felt: Felt, random: np.random.Generator
-) -> Felt:
+    config: MechanicsConfig,
+    whisking: WhiskingConfig,
+    head: Head,
+    felt: WhiskColumns,
+    random: np.random.Generator,
+) -> WhiskColumns:
     """With the sensors' noise and faults."""
     shape, alive = felt.contact.shape, head.alive
     missed = random.random(shape) < config.missed
     spurious = ~felt.contact & (random.random(shape) < config.spurious)
     anywhere = random.random(shape) * np.radians(whisking.amplitude_deg)
-    noise = config.noise * random.standard_normal((2, *shape)) * np.array([1.0, MEAN])[:, None, None]
+    noise = (
+        config.noise * random.standard_normal((2, *shape)) * np.array([1.0, MEAN_NOISE_SHARE])[:, None, None]
+    )
     smeared = config.reach_noise * random.standard_normal(shape)
     contact = ((felt.contact & ~missed) | spurious) & alive
     touched = np.where(spurious, anywhere, felt.touched)
     highest = np.where(spurious, anywhere, felt.highest + noise[1])
-    return Felt(
+    return WhiskColumns(
         contact=contact,
         touched=np.where(contact, touched + noise[0], 0.0),
         held=((felt.held & ~missed) | spurious) & alive,
@@ -178,6 +186,6 @@ def _sensed(
     )
 
 
-def whisk(head: Head, felt: Felt, row: int, odometry: Odometry) -> Whisk:
+def whisk_of_row(head: Head, felt: WhiskColumns, row: int, odometry: Odometry) -> Whisk:
     """One cycle of them."""
     return Whisk(odometry, head.alive, *(column[row] for column in felt))

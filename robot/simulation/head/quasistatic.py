@@ -16,17 +16,17 @@ import numpy as np
 
 from robot.simulation.head.beam import StreamConfig
 from robot.simulation.head.kinematic import MechanicsConfig
-from robot.simulation.head.whisk_stream import Sweep
+from robot.simulation.head.whisk_stream import WallSweep
 from tactile.features.contact import stiffness
 from tactile.whiskers.head_geometry import Head
 from tactile.whiskers.whisking import WhiskDrive, WhiskingConfig, initial_drive, whisk_command
 
-Law = Callable[[WhiskDrive, float, np.ndarray], tuple[np.ndarray, WhiskDrive]]
+WhiskingLaw = Callable[[WhiskDrive, float, np.ndarray], tuple[np.ndarray, WhiskDrive]]
 """From drives, the time in the cycle (s) and the newest y [N, W] as sensors report it, to the protractions
 commanded [N, W] and the drives after it: `tactile.whiskers.whisking.whisk_command`, say."""
 
 
-class Balance(NamedTuple):
+class WhiskerBalance(NamedTuple):
     """Whiskers between two samples, [N, W] each.
 
     Attributes:
@@ -44,15 +44,19 @@ class Balance(NamedTuple):
     before: np.ndarray
 
 
-def rest(*size: int) -> Balance:
+def whiskers_at_rest(*size: int) -> WhiskerBalance:
     """Whiskers [N, W] before their first cycle, which touch nothing."""
     zero, no = np.zeros(size), np.zeros(size, bool)
-    return Balance(initial_drive(*size), zero, no, no, zero, zero, zero)
+    return WhiskerBalance(initial_drive(*size), zero, no, no, zero, zero, zero)
 
 
-def advance(
-    config: StreamConfig, mechanics: MechanicsConfig, law: Law, sweep: Sweep, balance: Balance
-) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], Balance]:
+def advance_balance(
+    config: StreamConfig,
+    mechanics: MechanicsConfig,
+    law: WhiskingLaw,
+    sweep: WallSweep,
+    balance: WhiskerBalance,
+) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], WhiskerBalance]:
     """The samples of a sweep, which may be any part of a cycle, from where the whiskers were.
 
     Returns:
@@ -80,21 +84,21 @@ def advance(
         side = np.minimum(np.maximum(side + slide[k], -limit), limit)
         angle[k], bent[k], aside[k] = before, bend, side
         told = hard[k] * bend + heard[k]
-    after = Balance(drive, told, touching, slipped, late, side, before)
+    after = WhiskerBalance(drive, told, touching, slipped, late, side, before)
     return (angle, hard * aside, hard * bent), after
 
 
-def quasistatic(
+def simulate_quasistatic(
     config: StreamConfig,
     mechanics: MechanicsConfig,
     whisking: WhiskingConfig,
     head: Head,
-    sweep: Sweep,
+    sweep: WallSweep,
     threshold: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Angle, x and y, [T, N, W] rad: a `robot.simulation.head.whisk_stream.Tier`."""
+    """Angle, x and y, [T, N, W] rad: a `robot.simulation.head.whisk_stream.MechanicsModel`."""
     law = partial(_law, whisking, threshold, head.shape)
-    return advance(config, mechanics, law, sweep, rest(*sweep.wall.shape[1:]))[0]
+    return advance_balance(config, mechanics, law, sweep, whiskers_at_rest(*sweep.wall.shape[1:]))[0]
 
 
 def _law(

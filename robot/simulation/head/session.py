@@ -14,16 +14,16 @@ import numpy as np
 from pydantic import Field, NonNegativeInt
 
 from robot.simulation.head.beam import StreamConfig
-from robot.simulation.head.dynamic import dynamic
-from robot.simulation.head.kinematic import Felt, MechanicsConfig, felt, whisk
-from robot.simulation.head.quasistatic import quasistatic
-from robot.simulation.head.whisk_stream import cycles, free_cycles
-from robot.sources.odometry import OdometryConfig, reckoned
-from robot.sources.simulated import STILL, Made, document_digest, placed
+from robot.simulation.head.dynamic import simulate_dynamic
+from robot.simulation.head.kinematic import MechanicsConfig, WhiskColumns, simulate_kinematic, whisk_of_row
+from robot.simulation.head.quasistatic import simulate_quasistatic
+from robot.simulation.head.whisk_stream import simulate_cycles, simulate_free_cycles
+from robot.sources.odometry import OdometryConfig, simulate_odometry
+from robot.sources.simulated import NO_ODOMETRY, SimulatedSource, digest_of_document, wrap_headings
 from robot.sources.source_info import SimulationInfo, SourceInfo
-from robot.world.head_trajectory import MotionConfig, at
-from robot.world.maze import POSE_CELL_SIZE, text
-from robot.world.scene import KidnapConfig, MazeConfig, PathConfig, another, maze_info, scene
+from robot.world.head_trajectory import MotionConfig, poses_at
+from robot.world.maze import POSE_CELL_SIZE, maze_text
+from robot.world.scene import KidnapConfig, MazeConfig, PathConfig, make_scene, maze_info, other_surroundings
 from robot.world.walls import Surroundings
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
@@ -33,7 +33,7 @@ from tactile.features.calibration import Calibration, CalibrationConfig, calibra
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 from tactile.whiskers.whisking import MID_PROTRACTION, WhiskingConfig, check_amplitude
 
-RAW = {"quasistatic": quasistatic, "dynamic": dynamic}
+RAW_TIERS = {"quasistatic": simulate_quasistatic, "dynamic": simulate_dynamic}
 """The tiers that make raw samples."""
 
 
@@ -76,14 +76,14 @@ class SimulationConfig(Settings):
         return self.model_copy(update={"maze": maze})
 
 
-class Tier(NamedTuple):
+class ChosenTier(NamedTuple):
     """How much is modelled, and why."""
 
     name: Literal["kinematic", "quasistatic", "dynamic"]
     why: str
 
 
-def tier(config: SimulationConfig) -> Tier:
+def choose_tier(config: SimulationConfig) -> ChosenTier:
     """The cheapest tier that gives what is wanted, or the one that was named.
 
     Raises:
@@ -94,51 +94,57 @@ def tier(config: SimulationConfig) -> Tier:
             "simulation.fidelity", "kinematic, which makes no raw samples", "auto, quasistatic or dynamic"
         )
     if config.fidelity != "auto":
-        return Tier(config.fidelity, "it was named")
+        return ChosenTier(config.fidelity, "it was named")
     if config.raw:
-        return Tier("quasistatic", "raw samples are wanted, bending modes and overshoot are not")
-    return Tier("kinematic", "angles of contact are all that is wanted")
+        return ChosenTier("quasistatic", "raw samples are wanted, bending modes and overshoot are not")
+    return ChosenTier("kinematic", "angles of contact are all that is wanted")
 
 
-class Simulation(Made):
-    """A simulated session as a `Source`; make one with `simulated`.
+class HeadSimulation(SimulatedSource):
+    """A simulated session as a `Source`.
 
     Attributes:
         config, head_config: what it was made from. tier: how much was modelled, and why.
         scene: maze, path and walls. calibration: of the head, None in the kinematic tier.
         time: [N] s. start: [N] s, when the whisk cycles began.
         truth: [N, 3]. odometry: [N, 4]. carried: [N] bool, the head was carried since the row before.
+
+    Raises:
+        InputError: the configuration cannot be simulated; says what and where.
     """
 
     name = "simulation"
 
-    def __init__(self, config: SimulationConfig, head_config: HeadConfig) -> None:
-        self.config, self.head_config, self.tier = config, head_config, tier(config)
+    def __init__(self, config: SimulationConfig, head_config: HeadConfig | None = None) -> None:
+        head_config = head_config or HeadConfig()
+        self.config, self.head_config, self.tier = config, head_config, choose_tier(config)
         self.head = head = ur10_head(head_config)
         whisking, seed = config.whisking, config.seed
         check_amplitude(whisking, head)
-        self.scene = scene(config.maze, config.path, config.motion, config.kidnaps, head, seed)
+        self.scene = make_scene(config.maze, config.path, config.motion, config.kidnaps, head, seed)
         count = int(min(self.scene.duration, self.scene.path.duration) * whisking.rate)
         if count < 1:
             raise InputError("simulation.path", f"{self.scene.duration:.3g} s", "time for one whisk at least")
         self.start = np.arange(count) / whisking.rate
         self.time = self.start + MID_PROTRACTION / whisking.rate
-        pose = at(self.scene.path, self.time)
-        self.truth = placed(pose)
+        pose = poses_at(self.scene.path, self.time)
+        self.truth = wrap_headings(pose)
         self.carried = np.zeros(count, bool)
         rows = np.searchsorted(self.time, self.scene.jumps)
         self.carried[rows[rows < count]] = True
-        self.odometry = reckoned(config.odometry, self.time, pose, stream(seed, "odometry"), self.carried)
+        self.odometry = simulate_odometry(
+            config.odometry, self.time, pose, stream(seed, "odometry"), self.carried
+        )
         self._parts = self._surroundings()
         self.calibration = None if self.tier.name == "kinematic" else self._calibrated()
         self._felt = self._kinematic() if self.calibration is None else None
 
         plain = config.model_dump(mode="json", exclude={"maze": {"file"}})
-        self.digest = document_digest(
+        self.digest = digest_of_document(
             {
                 "head": head_config.model_dump(mode="json"),
                 "simulation": plain,
-                "maze": text(self.scene.maze) if config.maze.file else "",
+                "maze": maze_text(self.scene.maze) if config.maze.file else "",
             }
         )
         self.info = SourceInfo(
@@ -171,42 +177,48 @@ class Simulation(Made):
         if later is None:
             return [(self.scene.surroundings, slice(None))]
         change = int(later * self.length)
-        other = another(self.scene, self.config.maze, self.head, self.config.seed)
+        other = other_surroundings(self.scene, self.config.maze, self.head, self.config.seed)
         return [(self.scene.surroundings, slice(change)), (other, slice(change, None))]
 
-    def _kinematic(self) -> Felt:
+    def _kinematic(self) -> WhiskColumns:
         config = self.config
         parts = []
         for surroundings, rows in self._parts:
             random = stream(config.seed, "sensor")  # the whole session's noise, whatever is around
-            all_of_it = felt(
+            all_of_it = simulate_kinematic(
                 config.mechanics, config.whisking, surroundings, self.scene.path, self.start, random
             )
             parts.append([column[rows] for column in all_of_it])
-        return Felt(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+        return WhiskColumns(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
     def _calibrated(self) -> Calibration:
         """What the head's sensors report in free air, before the session."""
         config = self.config
         count = int(np.ceil(config.calibration.shortest * config.whisking.rate))
         random = stream(config.seed, "calibration")
-        record = free_cycles(
-            RAW[self.tier.name], config.stream, config.mechanics, config.whisking, self.head, count, random
+        record = simulate_free_cycles(
+            RAW_TIERS[self.tier.name],
+            config.stream,
+            config.mechanics,
+            config.whisking,
+            self.head,
+            count,
+            random,
         )
         return calibrate(config.calibration, record, where="simulation")
 
     def _readings(self) -> Iterator[Whisk | Cycle]:
         if self._felt is None:
             return self._cycles()
-        return (whisk(self.head, self._felt, row, STILL) for row in range(self.length))
+        return (whisk_of_row(self.head, self._felt, row, NO_ODOMETRY) for row in range(self.length))
 
     def _cycles(self) -> Iterator[Cycle]:
         """Raw samples of each cycle, without its odometry."""
         assert self.calibration is not None
         config, random = self.config, stream(self.config.seed, "sensor")
-        model, threshold = RAW[self.tier.name], self.calibration.threshold[:, 1]
+        model, threshold = RAW_TIERS[self.tier.name], self.calibration.threshold[:, 1]
         for surroundings, rows in self._parts:
-            yield from cycles(
+            yield from simulate_cycles(
                 model,
                 config.stream,
                 config.mechanics,
@@ -217,12 +229,3 @@ class Simulation(Made):
                 random,
                 threshold,
             )
-
-
-def simulated(config: SimulationConfig, head_config: HeadConfig | None = None) -> Simulation:
-    """The session of a configuration.
-
-    Raises:
-        InputError: what is asked for cannot be simulated; says what and where.
-    """
-    return Simulation(config, head_config or HeadConfig())

@@ -9,15 +9,15 @@ import numpy as np
 
 from robot.simulation.head.beam import StreamConfig
 from robot.simulation.head.kinematic import MechanicsConfig
-from robot.world.head_trajectory import Path, at
-from robot.world.walls import FREE, Surroundings
+from robot.world.head_trajectory import HeadPath, poses_at
+from robot.world.walls import NO_CONTACT, Surroundings
 from tactile.base.se2 import between
 from tactile.base.types import Cycle, Odometry
 from tactile.whiskers.head_geometry import Head
 from tactile.whiskers.whisking import WhiskingConfig
 
 
-class Sweep(NamedTuple):
+class WallSweep(NamedTuple):
     """Cycles side by side.
 
     Attributes:
@@ -34,7 +34,7 @@ class Sweep(NamedTuple):
     noise: np.ndarray
 
 
-class Tier(Protocol):
+class MechanicsModel(Protocol):
     """A model of the mechanics."""
 
     def __call__(
@@ -43,20 +43,20 @@ class Tier(Protocol):
         mechanics: MechanicsConfig,
         whisking: WhiskingConfig,
         head: Head,
-        sweep: Sweep,
+        sweep: WallSweep,
         threshold: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The true angle, x and y of every sample, [T, N, W] rad; the law is told y with its noise."""
         ...
 
 
-def cycles(
-    tier: Tier,
+def simulate_cycles(
+    tier: MechanicsModel,
     config: StreamConfig,
     mechanics: MechanicsConfig,
     whisking: WhiskingConfig,
     surroundings: Surroundings,
-    path: Path,
+    path: HeadPath,
     start: np.ndarray,
     random: np.random.Generator,
     threshold: np.ndarray,
@@ -77,8 +77,8 @@ def cycles(
         )
 
 
-def free_cycles(
-    tier: Tier,
+def simulate_free_cycles(
+    tier: MechanicsModel,
     config: StreamConfig,
     mechanics: MechanicsConfig,
     whisking: WhiskingConfig,
@@ -95,30 +95,30 @@ def free_cycles(
         time = _times(config, whisking)
         nothing = np.zeros((len(time), len(some), len(head.length)))
         noise = mechanics.noise * random.standard_normal((len(some), len(time), len(head.length), 3))
-        sweep = Sweep(time, nothing + FREE, nothing + 1.0, nothing, noise)
+        sweep = WallSweep(time, nothing + NO_CONTACT, nothing + 1.0, nothing, noise)
         threshold, still = np.full(len(head.length), np.inf), np.zeros((len(some), 4))
         record += _run(tier, config, mechanics, whisking, head, sweep, threshold, some, still)
     return record
 
 
 def _run(
-    tier: Tier,
+    tier: MechanicsModel,
     config: StreamConfig,
     mechanics: MechanicsConfig,
     whisking: WhiskingConfig,
     head: Head,
-    sweep: Sweep,
+    sweep: WallSweep,
     threshold: np.ndarray,
     start: np.ndarray,
     odometry: np.ndarray,
 ) -> Iterator[Cycle]:
     truth = tier(config, mechanics, whisking, head, sweep, threshold)
-    angle, deflection = reported(config, head, truth, sweep.noise)
+    angle, deflection = sensor_readings(config, head, truth, sweep.noise)
     for k in range(len(start)):
         yield Cycle(start[k] + sweep.time, angle[k], deflection[k], Odometry(*odometry[k]))
 
 
-def reported(
+def sensor_readings(
     config: StreamConfig, head: Head, truth: tuple[np.ndarray, np.ndarray, np.ndarray], noise: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """What sensors make of what a tier found: angles [N, T, W] and deflections [N, T, W, 2], rad."""
@@ -136,20 +136,20 @@ def _swept(
     mechanics: MechanicsConfig,
     whisking: WhiskingConfig,
     surroundings: Surroundings,
-    path: Path,
+    path: HeadPath,
     start: np.ndarray,
     random: np.random.Generator,
-) -> Sweep:
+) -> WallSweep:
     time = _times(config, whisking)
     knots = np.linspace(0.0, 1 / whisking.rate, config.poses + 1)
     whiskers = len(surroundings.head.length)
     noise = mechanics.noise * random.standard_normal((len(start), len(time), whiskers, 3))
-    return passed(surroundings, at(path, start[:, None] + knots), knots, time, noise)
+    return sweep_walls(surroundings, poses_at(path, start[:, None] + knots), knots, time, noise)
 
 
-def passed(
+def sweep_walls(
     surroundings: Surroundings, pose: np.ndarray, knots: np.ndarray, time: np.ndarray, noise: np.ndarray
-) -> Sweep:
+) -> WallSweep:
     """What is in the way while heads move evenly from pose to pose.
 
     Args:
@@ -169,7 +169,7 @@ def passed(
     drift = _drift(head, pose, step, wall, reach)
     with np.errstate(invalid="ignore"):
         mixed = wall[place] + share * (wall[place + 1] - wall[place])
-    return Sweep(
+    return WallSweep(
         time=time,
         wall=np.where(share == 0, wall[place], np.where(share == 1, wall[place + 1], mixed)),
         reach=np.maximum(reach[place] + share * (reach[place + 1] - reach[place]), 0.05),
@@ -183,7 +183,9 @@ def _drift(head: Head, pose: np.ndarray, step: float, wall: np.ndarray, reach: n
     motion = between(pose[:, :-1].reshape(-1, 3), pose[:, 1:].reshape(-1, 3)).reshape(*pose[:, 1:].shape)
     speed = motion.swapaxes(0, 1)[:, :, None] / step
     outwards = head.rest[:, :2] / np.linalg.norm(head.rest[:, :2], axis=1, keepdims=True)
-    opening = np.arctan2(np.hypot(*head.rest[:, :2].T), -head.rest[:, 2]) - np.where(wall < FREE, wall, 0.0)
+    opening = np.arctan2(np.hypot(*head.rest[:, :2].T), -head.rest[:, 2]) - np.where(
+        wall < NO_CONTACT, wall, 0.0
+    )
     arm = np.maximum(reach, 0.05) * head.length
     out = np.hypot(*head.base[:, :2].T) + arm * np.sin(opening)
     sideways = speed[..., 1] * outwards[:, 0] - speed[..., 0] * outwards[:, 1] + speed[..., 2] * out[:-1]

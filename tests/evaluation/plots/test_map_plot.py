@@ -16,7 +16,7 @@ from ratslam.cli import main
 from ratslam.config.run_config import RunConfig, load_config
 from ratslam.config.strict_yaml import load, validate
 from ratslam.pipeline.run import open_source
-from robot.touch_source import sensing
+from robot.touch_source import open_touch_source
 from robot.world.scene import MazeConfig
 
 ROOT = Path(__file__).parents[3]
@@ -75,7 +75,7 @@ def test_what_is_kept_is_what_was_felt_and_where(folder):
     boxes = source.scene.surroundings.walls
     assert np.array_equal(read_walls(folder / "run"), np.column_stack(boxes))
     assert len(np.unique(boxes.height)) == 2
-    given = [sample.reading for sample in sensing(source, config.touch)]
+    given = [sample.reading for sample in open_touch_source(source, config.touch)]
     images = read_whisker_views(folder / "run" / "views.npz")
     assert np.abs(images.view - np.array([g.view[..., 0] for g in given])).max() <= 1 / 255
     assert np.array_equal(images.alive.reshape(-1, 18), np.array([g.alive for g in given]))

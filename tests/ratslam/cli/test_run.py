@@ -298,10 +298,10 @@ def test_a_full_disk_is_one_clear_error(tmp_path):
 
 def test_a_cut_recording_is_recovered_and_run(capsys, tmp_path):
     from robot.recordings.formats import RecordingConfig, open_recording
-    from robot.recordings.mcap_reader import record
+    from robot.recordings.mcap_reader import record_source
 
     with open_recording(RecordingConfig(file=ROOT / "tests" / "golden" / "a_square3.npz")) as source:
-        record(source, tmp_path / "whole.mcap")
+        record_source(source, tmp_path / "whole.mcap")
     content = (tmp_path / "whole.mcap").read_bytes()
     (tmp_path / "cut.mcap").write_bytes(content[: len(content) * 6 // 10])
     assert main(["recover", str(tmp_path / "cut.mcap"), "-o", str(tmp_path / "good.mcap")]) == 0

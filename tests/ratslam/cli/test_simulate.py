@@ -17,8 +17,8 @@ from ratslam.config.run_config import RunConfig, load_config
 from ratslam.experiments.trials.ablation import trial
 from ratslam.pipeline.run import open_source, simulate
 from robot.recordings.mcap_reader import Recording
-from robot.simulation.head.session import simulated
-from robot.touch_source import sensing
+from robot.simulation.head.session import HeadSimulation
+from robot.touch_source import open_touch_source
 
 ROOT = Path(__file__).parents[3]
 CONFIG = "simulation: {path: {explore: 150}, seed: 5}\ntouch: {head: {dead: [4]}}\n"
@@ -56,7 +56,7 @@ def test_a_replayed_session_is_the_session(folder):
 
 def test_a_manifest_names_the_simulation(folder):
     config = RunConfig.model_validate({"simulation": {"path": {"explore": 150}, "seed": 5}})
-    session = simulated(config.simulation)
+    session = HeadSimulation(config.simulation)
     for name in ("direct", "replayed"):
         made = json.loads((folder / name / "manifest.json").read_text())["simulation"]
         assert made["seed"] == 5
@@ -103,7 +103,7 @@ def test_a_session_of_raw_samples_is_given_to_the_engine_as_if_live(raw, tmp_pat
     given = []
     for config in (live, replay):
         source = open_source(config)
-        given.append([sample.reading for sample in sensing(source, config.completed(source).touch)])
+        given.append([sample.reading for sample in open_touch_source(source, config.completed(source).touch)])
     assert len(given[0]) == len(given[1]) == 12
     for one, other in zip(*given, strict=True):
         assert one.odometry == other.odometry
@@ -129,7 +129,7 @@ def test_there_must_be_something_to_simulate(capsys, folder, tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("touch: {}\n", ["neither recording, simulation, roving nor live"]),
+        ("touch: {}\n", ["neither recording, simulation, create_simulation nor live"]),
         ("recording: {file: a.npz}\nsimulation: {}\n", ["recording and simulation; give one"]),
         ("simulation: {sed: 1}\n", ["did you mean 'seed'"]),
         ("simulation: {path: {circuits: CA, explore: 3}}\n", ["circuits and explore", "exactly one"]),

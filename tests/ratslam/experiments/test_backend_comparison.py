@@ -26,7 +26,7 @@ ROOT = Path(__file__).parents[3]
 ORIGIN = np.zeros(3)
 POSES = st.tuples(st.floats(-2, 2), st.floats(-2, 2), st.floats(-3, 3)).map(np.array)
 SESSIONS = {
-    "create": "roving: {reports: 40, seed: 3}\n",
+    "create": "create_simulation: {reports: 40, seed: 3}\n",
     "arm": "simulation: {maze: {columns: 2, rows: 2, loop: 4}, path: {circuits: C}}\n",
 }
 QUICK = ["grid.particles=20", "backend=classic", "pose_cells.cells_xy=11"]
@@ -77,7 +77,9 @@ def test_both_backends_see_the_same_session(
 
 def test_perfect_odometry_leaves_nothing_to_reckon() -> None:
     settings = {"reports": 20, "seed": 3, "wheels": {"noise": "none"}}
-    config = RunConfig.model_validate({"roving": settings, "grid": {"particles": 20}, "backend": "grid"})
+    config = RunConfig.model_validate(
+        {"create_simulation": settings, "grid": {"particles": 20}, "backend": "grid"}
+    )
     _, reckoned = _played(config)
     assert reckoned.name == RECKONED
     assert np.allclose([reckoned.told, reckoned.final, reckoned.ate, reckoned.energy], 0, atol=1e-9)
@@ -97,10 +99,10 @@ def test_what_cannot_be_compared_is_refused(tmp_path: Path, capsys: pytest.Captu
 
 
 def test_a_recording_without_truth_is_refused(tmp_path: Path) -> None:
-    from robot.recordings.mcap_reader import record
-    from robot.simulation.create.session import RovingConfig, roving
+    from robot.recordings.mcap_reader import record_source
+    from robot.simulation.create.session import CreateSimulation, CreateSimulationConfig
 
-    source = roving(RovingConfig(reports=5))
+    source = CreateSimulation(CreateSimulationConfig(reports=5))
 
     class Blind:
         def __getattr__(self, name: str):
@@ -109,7 +111,7 @@ def test_a_recording_without_truth_is_refused(tmp_path: Path) -> None:
         def __iter__(self):
             return (sample._replace(truth=None) for sample in source)
 
-    record(Blind(), tmp_path / "blind.mcap")  # type: ignore[arg-type]
+    record_source(Blind(), tmp_path / "blind.mcap")  # type: ignore[arg-type]
     config = RunConfig.model_validate({"recording": {"file": "blind.mcap"}})
     with pytest.raises(InputError, match="true pose"):
         compared(config, tmp_path)

@@ -32,12 +32,12 @@ from ratslam.experiments.fox2012.session import (
 )
 from ratslam.experiments.fox2012.trials import Result, run_job
 from ratslam.grid.config import GridConfig
-from robot.world.arena import Arena, fits
-from robot.world.random_arena import ArenaConfig, arena
+from robot.world.arena import Arena, has_clearance
+from robot.world.random_arena import ArenaConfig, make_arena
 from tactile.base.errors import InputError
 from tests.helpers.grid_world import TIPS, create, report
 
-TINY = ("roving.reports=40", "grid.particles=20")
+TINY = ("create_simulation.reports=40", "grid.particles=20")
 ROOMY = Arena("roomy", np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]), (), np.zeros(3))
 BRIER = next(measure for measure in MEASURES if measure.key == "map_brier_skill")
 EVERYWHERE = MEASURES[0]
@@ -97,9 +97,9 @@ def of(
 
 @given(st.integers(0, 50))
 def test_trials_of_one_arena_start_anywhere_that_is_free(seed: int) -> None:
-    place = arena(ArenaConfig(seed=1), 0)
+    place = make_arena(ArenaConfig(seed=1), 0)
     one, other = started(place, seed), started(place, seed + 1)
-    assert fits(one, one.start[None, :2], ROOM).all()
+    assert has_clearance(one, one.start[None, :2], ROOM).all()
     assert not np.allclose(one.start, other.start)
     assert one.objects is place.objects
 
@@ -124,7 +124,7 @@ def test_what_was_felt_is_drawn_where_it_was() -> None:
 
 
 def test_charts_lie_on_the_truth_of_any_arena() -> None:
-    place = arena(ArenaConfig(seed=2), 0)
+    place = make_arena(ArenaConfig(seed=2), 0)
     empty = chart(GridConfig(), create(), place, np.zeros((0, 3)), felt_marks([report()]))
     truth = truth_of(place, empty)
     assert truth.inside.mean() == pytest.approx(0.25)
@@ -138,8 +138,8 @@ def test_charts_lie_on_the_truth_of_any_arena() -> None:
 def test_a_stop_on_the_way_changes_nothing(tiny: object) -> None:
     job = plan_jobs(PROTOCOLS["fox-fig4"], 1, 0, TINY)[0]
     config = job.variants["ours", "blob"]
-    assert config.roving is not None
-    out = outing(config.roving)
+    assert config.create_simulation is not None
+    out = outing(config.create_simulation)
     reports = felt(config, out, 0)
     early, late = mapped(config, out, reports, (23, len(reports)))
     (whole,) = mapped(config, out, reports, (len(reports),))
@@ -236,12 +236,20 @@ def test_the_program_knows_them_all() -> None:
 def test_all_variants_of_a_set_are_of_one_session(name: str) -> None:
     jobs = plan_jobs(PROTOCOLS[name], 2, 0)
     assert len(jobs) == 2 * len(PROTOCOLS[name].worlds)
-    assert all(len({config.roving for config in job.variants.values()}) == 1 for job in jobs)
+    assert all(len({config.create_simulation for config in job.variants.values()}) == 1 for job in jobs)
     sessions = {
-        (job.number, config.roving.seed) for job in jobs for config in job.variants.values() if config.roving
+        (job.number, config.create_simulation.seed)
+        for job in jobs
+        for config in job.variants.values()
+        if config.create_simulation
     }
     assert len(sessions) == 2
-    arenas = {config.roving.arena.seed for job in jobs for config in job.variants.values() if config.roving}
+    arenas = {
+        config.create_simulation.arena.seed
+        for job in jobs
+        for config in job.variants.values()
+        if config.create_simulation
+    }
     assert len(arenas) == (1 if PROTOCOLS[name].one_arena else 2)
 
 
@@ -300,7 +308,7 @@ def test_what_cannot_be_run_is_refused_before_anything_is_written(
     folder = tmp_path / "a"
     for assignment, said in (
         ("grid.cell=-1", "grid.cell"),
-        ("roving.arena.sides=2", "side"),
+        ("create_simulation.arena.sides=2", "side"),
         ("touch.reports.walls=edges", "walls"),
     ):
         assert main(["reproduce", "fox-fig6", "-o", str(folder), "--set", assignment]) == 2

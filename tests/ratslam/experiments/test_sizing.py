@@ -146,7 +146,7 @@ def test_a_session_is_cut_to_about_so_many_cycles(tmp_path):
     config = configuration(simulation={"path": {"explore": 400.0}})
     with open_source(short(config, 100, tmp_path)) as source:
         assert 80 <= source.length <= 110
-    config = configuration(roving={"reports": 500})
+    config = configuration(create_simulation={"reports": 500})
     with open_source(short(config, 60, tmp_path)) as source:
         assert source.length == 60
     for name in ("a_square3.npz", "touch_circuits.mcap"):
@@ -169,7 +169,7 @@ def test_a_small_arena_is_sized(tmp_path, capsys, monkeypatch):
         "ratslam.experiments.sizing.trial_runs.cheaper", lambda config: cheaper(config)[:1]
     )  # less to compile
     path = tmp_path / "arena.yaml"
-    path.write_text("roving: {reports: 80}\nbackend: grid\nsession: {precision: float32}\n")
+    path.write_text("create_simulation: {reports: 80}\nbackend: grid\nsession: {precision: float32}\n")
     assert main(["size", str(path), "--cycles", "60"]) == 0
     told = capsys.readouterr().out
     assert "60 of 80 cycles" in told

@@ -10,20 +10,19 @@ import pytest
 from ratslam.cli import main
 from ratslam.config.run_config import RunConfig
 from ratslam.experiments.fox2012.template_training import SECONDS, WAYS, Tried, held_out, report
-from robot.simulation.create.session import RovingConfig, roving
-from robot.simulation.create.template_training import trained
-from robot.touch_source import observation_of, sensing
+from robot.simulation.create.session import CreateSimulation, CreateSimulationConfig, train_strain_templates
+from robot.touch_source import observation_of, open_touch_source
 from tactile.base.errors import InputError
 from tactile.wall_estimation.strain_templates import StrainTemplates, read_templates
 
-CONFIG = RovingConfig(seed=4)
+CONFIG = CreateSimulationConfig(seed=4)
 
 
 @pytest.fixture(scope="module")
 def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a configuration and the templates that the program made of it."""
     folder = tmp_path_factory.mktemp("templates")
-    (folder / "create.yaml").write_text("roving: {seed: 4}\n")
+    (folder / "create.yaml").write_text("create_simulation: {seed: 4}\n")
     arguments = ["train-templates", str(folder / "create.yaml"), "-o", str(folder / "new" / "t.npz")]
     assert main(arguments) == 0
     return folder
@@ -40,11 +39,13 @@ def errors(tried: list[Tried], way: str, known: bool) -> np.ndarray:
 
 
 def test_the_file_holds_what_the_seed_gives(templates: StrainTemplates) -> None:
-    again = trained(CONFIG)
+    again = train_strain_templates(CONFIG)
     assert len(templates.angle) == 15
     assert np.array_equal(templates.mean, again.mean)
     assert templates.training == again.training
-    assert not np.array_equal(templates.mean, trained(CONFIG.model_copy(update={"seed": 5})).mean)
+    assert not np.array_equal(
+        templates.mean, train_strain_templates(CONFIG.model_copy(update={"seed": 5})).mean
+    )
 
 
 def test_walls_that_were_not_trained_on_are_known(templates: StrainTemplates) -> None:
@@ -85,15 +86,15 @@ def test_the_report_marks_what_is_far_off_and_what_is_not_known() -> None:
 def test_sessions_use_the_file(kept: Path, templates: StrainTemplates) -> None:
     config = RunConfig.model_validate(
         {
-            "roving": {"reports": 60, "seed": 1},
+            "create_simulation": {"reports": 60, "seed": 1},
             "touch": {"reports": {"walls": "template", "templates": kept / "new" / "t.npz", "flat": None}},
         }
     )
-    assert config.roving is not None
+    assert config.create_simulation is not None
     walls = []
     for reports in (config.touch.reports, config.touch.reports.model_copy(update={"templates": None})):
         touch = config.touch.model_copy(update={"reports": reports})
-        samples = sensing(roving(config.roving), touch)
+        samples = open_touch_source(CreateSimulation(config.create_simulation), touch)
         walls.append([observation_of(sample).wall_point for sample in samples if observation_of(sample).wall])
     assert len(walls[0]) == len(walls[1]) > 0
     directions = [np.degrees(np.arctan2(*np.array(points).T[::-1])) for points in walls]
@@ -113,9 +114,9 @@ def test_what_is_there_is_not_overwritten(kept: Path, capsys: pytest.CaptureFixt
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("simulation: {}\n", "roving"),
-        ("roving: {seed: -1}\n", "roving.seed"),
-        ("roving: {behaviour: {contact: 0.0019}, whiskers: {length: 0.01}}\n", "no contact"),
+        ("simulation: {}\n", "create_simulation"),
+        ("create_simulation: {seed: -1}\n", "create_simulation.seed"),
+        ("create_simulation: {behaviour: {contact: 0.0019}, whiskers: {length: 0.01}}\n", "no contact"),
     ],
 )
 def test_what_cannot_be_trained_is_refused(

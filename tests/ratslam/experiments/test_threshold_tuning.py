@@ -27,7 +27,7 @@ from ratslam.experiments.salman2016.threshold_tuning import (
     tune_threshold,
     view_differences,
 )
-from robot.sources.in_memory import Log
+from robot.sources.in_memory import InMemorySource
 from tactile.base.errors import InputError
 
 ROOT = Path(__file__).parents[3]
@@ -50,7 +50,7 @@ def scores(*results):
 
 def log_of(truth, views, step=10.0):
     count = len(truth)
-    return Log(
+    return InMemorySource(
         name="made up",
         digest="",
         time=step * np.arange(count),

@@ -11,9 +11,9 @@ from ratslam.cli import main
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import load, override, validate
 from ratslam.experiments.trials.ablation import PARTS, Trial, row, trial, variations
-from robot.recordings.npz_trace import read_stream
+from robot.recordings.npz_trace import read_trace
 from robot.sources import perturbation
-from robot.sources.perturbation import perturbed
+from robot.sources.perturbation import perturb
 from tactile.base.errors import InputError
 from tactile.base.se2 import between, integrate
 
@@ -24,11 +24,11 @@ ROTATION = f"recording.file={ROOT / 'tests' / 'golden' / 'd1_rotation_generic.np
 
 @pytest.fixture
 def log():
-    return read_stream(ROOT / "tests" / "golden" / "a_square3.npz")
+    return read_trace(ROOT / "tests" / "golden" / "a_square3.npz")
 
 
 def test_a_perturbed_copy_follows_from_its_seed(log):
-    first, again, other = perturbed(log, 1), perturbed(log, 1), perturbed(log, 2)
+    first, again, other = perturb(log, 1), perturb(log, 1), perturb(log, 2)
     assert np.array_equal(first.motion, again.motion)
     assert np.array_equal(first.views, again.views)
     assert not np.array_equal(first.views[:50], other.views[:50])
@@ -40,7 +40,7 @@ def test_without_noise_the_path_is_kept_whole_though_rows_are_dropped(log, monke
     for name in ("VIEW_NOISE", "LENGTH_NOISE", "TURN_NOISE"):
         monkeypatch.setattr(perturbation, name, 0.0)
     monkeypatch.setattr(perturbation, "DROPPED", 0.5)
-    copy = perturbed(log, 3)
+    copy = perturb(log, 3)
     rows = np.searchsorted(log.time, copy.time)
     assert len(rows) < 0.7 * len(log.time)
     whole, part = integrate(log.motion[:, :3]), integrate(copy.motion[:, :3])
@@ -117,9 +117,9 @@ def test_parts_are_turned_off_one_by_one(capsys):
 
 
 def test_streamed_recordings_are_not_perturbed(tmp_path, log):
-    from robot.recordings.mcap_reader import record
+    from robot.recordings.mcap_reader import record_source
 
-    record(log, tmp_path / "a.mcap")
+    record_source(log, tmp_path / "a.mcap")
     config = validate(override(load(SQUARE), [f"recording.file={tmp_path / 'a.mcap'}"]), RunConfig)
     with pytest.raises(InputError, match="streamed"):
         trial(config, tmp_path, seed=1)

@@ -20,7 +20,7 @@ from robot.drivers.ur10.base_transform import BaseTransformConfig, tcp_from_pose
 from robot.drivers.ur10.dashboard import Dashboard
 from robot.emulators.head.config import HeadEmulatorConfig
 from robot.recordings.cdr_live import Event
-from robot.recordings.mcap_scanner import Walk
+from robot.recordings.mcap_scanner import McapScanner
 from robot.sources.source import Sample
 from tests.helpers.live import HEAD_FAULTS, ROOT, Faults, emulator, until, ur_emulator
 
@@ -66,7 +66,7 @@ def undisturbed(pid: int) -> None:
 
 def kept(path: Path) -> Kept:
     """Reads a recording, whole or not."""
-    walk = Walk(path)
+    walk = McapScanner(path)
     sequence, robot, samples, events = [], [], [], []
     for entry in walk.entries():
         if isinstance(entry.content, Frames):

@@ -13,9 +13,9 @@ from ratslam.backends.config import RecallBackendConfig
 from ratslam.backends.recall import RecallBackend
 from ratslam.core.session import Session
 from ratslam.keyframes.loop_closures import Verdict
-from robot.recordings.npz_trace import read_stream
-from robot.sources.in_memory import Log
-from robot.sources.perturbation import perturbed
+from robot.recordings.npz_trace import read_trace
+from robot.sources.in_memory import InMemorySource
+from robot.sources.perturbation import perturb
 from tactile.base.se2 import integrate
 from tactile.base.types import Odometry, observation
 from tests.helpers import scenes
@@ -23,7 +23,7 @@ from tests.helpers import scenes
 GOLDEN = Path(__file__).parents[2] / "golden"
 
 
-def mapped(log: Log, precision: str = "float64", **parts) -> Session:
+def mapped(log: InMemorySource, precision: str = "float64", **parts) -> Session:
     """A session that has replayed the log with one setting for all, on pose cells small enough for a test."""
     cells = {"cells_xy": 11, "cell_size": log.info.cell_size}
     config = RecallBackendConfig.model_validate({"pose_cells": cells, **parts})
@@ -34,11 +34,11 @@ def mapped(log: Log, precision: str = "float64", **parts) -> Session:
     return session
 
 
-def error(session: Session, log: Log) -> float:
+def error(session: Session, log: InMemorySource) -> float:
     return ate(session.map.trajectory(), log.truth)
 
 
-def odometry_error(log: Log) -> float:
+def odometry_error(log: InMemorySource) -> float:
     return ate(integrate(log.motion[:, :3]), log.truth)
 
 
@@ -47,8 +47,8 @@ def cuts(session: Session) -> list[int]:
     return np.flatnonzero(session.map.arrays()["cut"] >= 0).tolist()
 
 
-def golden(name: str) -> Log:
-    return read_stream(GOLDEN / f"{name}.npz")
+def golden(name: str) -> InMemorySource:
+    return read_trace(GOLDEN / f"{name}.npz")
 
 
 @pytest.mark.parametrize(
@@ -87,7 +87,7 @@ def test_regenerated_streams_behave_as_the_published_ones(seed):
 
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.soak)])
 def test_a_perturbed_recording_is_mapped_as_well(seed):
-    log = perturbed(golden("b_figure8_alias"), seed)
+    log = perturb(golden("b_figure8_alias"), seed)
     assert error(mapped(log), log) <= 0.05
 
 
@@ -113,19 +113,19 @@ def test_a_lap_the_other_way_round_joins_where_it_turns():
 # Controls
 
 
-def shuffled(log: Log) -> Log:
+def shuffled(log: InMemorySource) -> InMemorySource:
     return replace(log, views=np.random.default_rng(0).permutation(log.views))
 
 
-def blank(log: Log) -> Log:
+def blank(log: InMemorySource) -> InMemorySource:
     return replace(log, views=np.zeros_like(log.views))
 
 
-def alike(log: Log) -> Log:
+def alike(log: InMemorySource) -> InMemorySource:
     return replace(log, views=np.broadcast_to(log.views[:1], log.views.shape).copy())
 
 
-def different(log: Log) -> Log:
+def different(log: InMemorySource) -> InMemorySource:
     return replace(log, views=np.random.default_rng(0).random(log.views.shape))
 
 

@@ -14,8 +14,8 @@ from ratslam.config.run_config import TOUCH, RunConfig
 from ratslam.core.session import Session
 from ratslam.keyframes.loop_closures import Verdict
 from ratslam.pipeline.runner import readings, session_of
-from robot.simulation.head.session import simulated
-from robot.touch_source import sensing
+from robot.simulation.head.session import HeadSimulation
+from robot.touch_source import open_touch_source
 from tactile.base.se2 import integrate
 from tactile.base.types import Observation
 
@@ -52,9 +52,9 @@ def config_of(**parts: Any) -> RunConfig:
 def _compiled(reserve: int) -> tuple[Session, dict[str, np.ndarray]]:
     config = config_of(simulation=LAPS, session={"reserve": reserve})
     assert config.simulation is not None
-    source = simulated(config.simulation)
+    source = HeadSimulation(config.simulation)
     config = config.completed(source)
-    session = session_of(config, sensing(source, config.touch))
+    session = session_of(config, open_touch_source(source, config.touch))
     return session, session.arrays()
 
 
@@ -69,8 +69,8 @@ def way(seed: int, dead: Sequence[int] = (), **simulation: Any) -> Way:
     """A session simulated and sensed."""
     config = config_of(simulation={"seed": seed} | LAPS | simulation, touch={"head": {"dead": tuple(dead)}})
     assert config.simulation is not None
-    source = simulated(config.simulation, config.touch.head)
-    felt = [reading for _, reading in readings(sensing(source, config.completed(source).touch))]
+    source = HeadSimulation(config.simulation, config.touch.head)
+    felt = [reading for _, reading in readings(open_touch_source(source, config.completed(source).touch))]
     return Way(felt, source.truth)
 
 
@@ -321,7 +321,7 @@ def test_every_run_that_is_told_as_accepted_can_be_undone() -> None:
 def test_whiskers_bring_their_own_settings() -> None:
     config = config_of(simulation=LAPS)
     assert config.simulation is not None
-    completed = config.completed(simulated(config.simulation))
+    completed = config.completed(HeadSimulation(config.simulation))
     assert completed.recall.sector_fov == "whiskers"
     for name, value in TOUCH["keyframes"].items():
         if name != "noise":
@@ -330,14 +330,14 @@ def test_whiskers_bring_their_own_settings() -> None:
     assert completed.pose_cells.cells_xy == 11  # what was asked for stays
     again = RunConfig.model_validate(completed.model_dump(mode="json"))
     assert (
-        again.completed(simulated(config.simulation)) == completed
+        again.completed(HeadSimulation(config.simulation)) == completed
     )  # a written configuration is the same run
 
 
 def test_what_is_set_goes_before_what_whiskers_bring() -> None:
     config = config_of(simulation=LAPS, keyframes={"min_score": 7.0, "noise": {"per_cell": 0.5}})
     assert config.simulation is not None
-    frames = config.completed(simulated(config.simulation)).keyframes
+    frames = config.completed(HeadSimulation(config.simulation)).keyframes
     assert (frames.min_score, frames.noise.per_cell) == (7.0, 0.5)
     assert frames.select_every == TOUCH["keyframes"]["select_every"]
     assert frames.noise.heading_per_cell == TOUCH["keyframes"]["noise"]["heading_per_cell"]
@@ -346,7 +346,7 @@ def test_what_is_set_goes_before_what_whiskers_bring() -> None:
 def test_saying_that_there_are_whiskers_changes_nothing() -> None:
     plain, said = config_of(simulation=LAPS), config_of(simulation=LAPS, recall={"sector_fov": "whiskers"})
     assert plain.simulation is not None
-    source = simulated(plain.simulation)
+    source = HeadSimulation(plain.simulation)
     assert said.completed(source) == plain.completed(source)
 
 

@@ -8,8 +8,8 @@ import pytest
 from robot.drivers.ur10.base_transform import pose_from_tcp
 from robot.live.config import LiveConfig
 from robot.live.route import approach_route, descent_route, main_route, plan_path
-from robot.world.head_trajectory import at
-from robot.world.scene import scene
+from robot.world.head_trajectory import poses_at
+from robot.world.scene import make_scene
 from tactile.base.errors import InputError
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 
@@ -61,8 +61,8 @@ def test_an_arm_that_was_stopped_is_sent_there_again():
 def test_the_way_is_that_of_the_simulated_session():
     config = LiveConfig()
     plan, path = config.plan, plan_path(config, HEAD)
-    made = scene(plan.maze, plan.path, plan.motion, plan.kidnaps, HEAD, plan.seed)
-    assert np.array_equal(path.pose, at(made.path, path.time))
+    made = make_scene(plan.maze, plan.path, plan.motion, plan.kidnaps, HEAD, plan.seed)
+    assert np.array_equal(path.pose, poses_at(made.path, path.time))
     pose, lift = pose_from_tcp(config.arm.placing, main_route(config, path).targets)
     assert np.allclose(pose[:, :2], path.pose[1:, :2])
     assert np.allclose(np.cos(pose[:, 2] - path.pose[1:, 2]), 1.0)

@@ -45,7 +45,7 @@ from robot.recordings.cdr_live import (
     encode_states,
 )
 from robot.recordings.mcap_reader import Recording, recover
-from robot.recordings.mcap_scanner import Entry, Walk
+from robot.recordings.mcap_scanner import McapScanner, RecordingEntry
 from robot.recordings.mcap_writer import _Whole
 from robot.recordings.schemas import SCHEMAS
 from robot.sources.source_info import SourceInfo
@@ -106,7 +106,7 @@ def opened(path: Path) -> LiveRecorder:
 
 
 def content(path: Path, kind: type) -> list[Any]:
-    return [entry.content for entry in Walk(path).entries() if isinstance(entry.content, kind)]
+    return [entry.content for entry in McapScanner(path).entries() if isinstance(entry.content, kind)]
 
 
 def session(path: Path, whisks: int = 3) -> tuple[list[Cycle], Frames, np.ndarray]:
@@ -194,7 +194,7 @@ def test_whatever_way_frames_come(tmp_path_factory: Any, data: st.DataObject) ->
             at += step
             if at >= len(order):
                 break
-    walk = Walk(path)
+    walk = McapScanner(path)
     entries = list(walk.entries())
     assert not walk.broken
     samples = [entry.content for entry in entries if hasattr(entry.content, "reading")]
@@ -260,7 +260,7 @@ def test_everything_is_on_its_way_within_a_fifth_of_a_second(tmp_path: Path) -> 
     assert len(content(path, Frames)) >= 5  # and not one by one
     mine = rows(frames, slice(0, RATE))
     recorder.add_whisk(make_cut(0, START + 1.0, START, mine, moved(0)), mine)
-    assert Walk(path).__iter__().__next__().reading.angle.shape == (RATE, W)
+    assert McapScanner(path).__iter__().__next__().reading.angle.shape == (RATE, W)
     recorder.close()
 
 
@@ -315,7 +315,7 @@ def killed(folder: Path, seconds: float) -> tuple[int, int, Path]:
 
 def check_killed(folder: Path, seconds: float) -> None:
     blocks, whisks, path = killed(folder, seconds)
-    walk = Walk(path)
+    walk = McapScanner(path)
     newest = -1
     for entry in walk.entries():
         if isinstance(entry.content, Frames):
@@ -389,8 +389,8 @@ def _no_room(_: Any) -> None:
     raise OSError(28, "No space left on device")
 
 
-def _entries(path: Path) -> list[Entry]:
-    return list(Walk(path).entries())
+def _entries(path: Path) -> list[RecordingEntry]:
+    return list(McapScanner(path).entries())
 
 
 def test_recover_keeps_what_stands_beside_the_samples(tmp_path: Path) -> None:
@@ -447,7 +447,7 @@ def test_of_a_damaged_file_exactly_a_prefix_is_read(tmp_path: Path, rounds: int)
     lengths = set()
     for bad in damaged((tmp_path / "a.mcap").read_bytes(), rounds, rounds):
         (tmp_path / "bad.mcap").write_bytes(bad)
-        walk = Walk(tmp_path / "bad.mcap")
+        walk = McapScanner(tmp_path / "bad.mcap")
         found = [entry[:4] for entry in walk.entries()]
         assert found == whole[: len(found)]
         assert walk.broken or len(found) == len(whole)
@@ -486,7 +486,7 @@ def _check_passed_over(
             end = data.index(b"\x0f" + struct.pack("<Q", 4), chunks[-1])
             bad[end + 9 : end + 13] = bytes(4)
         (folder / "bad.mcap").write_bytes(bad)
-        walk = Walk(folder / "bad.mcap")
+        walk = McapScanner(folder / "bad.mcap")
         found = [entry[:4] for entry in walk.entries()]
         assert found == whole[: len(found)]
         assert walk.broken
@@ -519,7 +519,7 @@ def test_a_cut_whose_frames_are_missing_is_told(tmp_path: Path, monkeypatch: pyt
         )
         frames = some_frames(20)
         recorder.add_whisk(make_cut(0, START, START, frames, moved(0)), frames)
-    walk = Walk(tmp_path / "a.mcap")
+    walk = McapScanner(tmp_path / "a.mcap")
     assert list(walk) == []
     assert walk.broken == "a whisk of 21 frames, of which 20 are there"
 
@@ -565,7 +565,7 @@ def test_three_threads_write_one_recording(tmp_path: Path) -> None:
     finally:
         sys.setswitchinterval(interval)
     recorder.close()
-    walk = Walk(tmp_path / "a.mcap")
+    walk = McapScanner(tmp_path / "a.mcap")
     entries = list(walk.entries())
     assert not walk.broken
     numbers = np.concatenate([e.content.sequence for e in entries if isinstance(e.content, Frames)])

@@ -11,24 +11,24 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from robot.recordings.csv_alignment import labels_from_pairs
 from robot.recordings.csv_config import (
+    CsvConfig,
     LabelColumns,
     PairColumns,
     PoseColumns,
-    TableConfig,
     TruthColumns,
     VelocityColumns,
     ViewColumns,
 )
 from robot.recordings.csv_file import read_csv
-from robot.recordings.csv_reader import read_table
-from robot.recordings.match_pairs import labels_from_pairs
-from robot.recordings.npz_trace import read_stream
+from robot.recordings.csv_reader import read_csv_recording
+from robot.recordings.npz_trace import read_trace
 from robot.sources.source import Source
 from tactile.base.errors import InputError, InputErrors
 from tactile.base.se2 import integrate
 
-VELOCITY = TableConfig(velocity=VelocityColumns(), rows=1, columns=3)
+VELOCITY = CsvConfig(velocity=VelocityColumns(), rows=1, columns=3)
 ODOMETRY = "t,vx,w\n0.0,0.2,0.0\n0.5,0.2,0.1\n1.0,0.2,0.0\n1.5,0.2,0.0\n"
 Write = Callable[..., Path]
 
@@ -45,12 +45,12 @@ def write(tmp_path: Path) -> Write:
     return to_file
 
 
-def with_parts(**parts: Any) -> TableConfig:
+def with_parts(**parts: Any) -> CsvConfig:
     return VELOCITY.model_copy(update=parts)
 
 
 def test_velocities_are_driven_along_the_mid_heading(write: Write) -> None:
-    source = read_table(write(ODOMETRY), VELOCITY)
+    source = read_csv_recording(write(ODOMETRY), VELOCITY)
     assert isinstance(source, Source)
     assert (source.name, source.length, source.rate_hz, source.view_shape) == ("odometry", 4, 2.0, (1, 3, 1))
     odometry = [sample.reading.odometry for sample in source]
@@ -61,15 +61,15 @@ def test_velocities_are_driven_along_the_mid_heading(write: Write) -> None:
 
 def test_poses_are_differenced(write: Write) -> None:
     path = write("time, px, py, th\n1,0,0,1.5707963267948966\n2,0,1,1.5707963267948966\n3,-0.5,1,3.3\n")
-    config = TableConfig(time="time", pose=PoseColumns(x="px", y="py", heading="th"))
-    odometry = [sample.reading.odometry for sample in read_table(path, config)]
+    config = CsvConfig(time="time", pose=PoseColumns(x="px", y="py", heading="th"))
+    odometry = [sample.reading.odometry for sample in read_csv_recording(path, config)]
     assert tuple(odometry[1]) == pytest.approx((1, 0, 0, 1))
     assert tuple(odometry[2]) == pytest.approx((0, 0.5, 3.3 - np.pi / 2, 1))  # sideways
 
 
 def test_ranges_become_pixels(write: Write) -> None:
     path = write("t,vx,w,r0,r1,r2,r3,r4,r5\n0,0.1,0,1,3,8,9,inf,4\n1,0.1,0,,,,,,\n")
-    first, second = read_table(path, with_parts(views=ViewColumns(max_range=8.0)))
+    first, second = read_csv_recording(path, with_parts(views=ViewColumns(max_range=8.0)))
     assert first.reading.view.ravel().tolist() == [0.25, 1.0, 0.75]
     assert not second.reading.view_seen
     assert second.reading.view.shape == (1, 3, 1)
@@ -78,24 +78,24 @@ def test_ranges_become_pixels(write: Write) -> None:
 def test_pixels_in_a_file_of_their_own_go_to_the_nearest_row(write: Write) -> None:
     views = write("stamp,p2,p1,p3\n0.1,.2,.1,.3\n0.9,.5,.4,.6\n", "views.csv")
     config = with_parts(views=ViewColumns(file=views, time="stamp", prefix="p", tolerance=0.11))
-    samples = list(read_table(write(ODOMETRY), config))
+    samples = list(read_csv_recording(write(ODOMETRY), config))
     assert [bool(sample.reading.view_seen) for sample in samples] == [True, False, True, False]
     assert samples[2].reading.view.ravel().tolist() == [0.4, 0.5, 0.6]
 
 
 def test_labels_beside_the_odometry(write: Write) -> None:
     path = write("t,vx,w,place\n0,0.1,0,3\n1,0.1,0,\n2,0.1,0,-1\n3,0.1,0,0\n")
-    samples = read_table(path, with_parts(labels=LabelColumns(column="place")))
+    samples = read_csv_recording(path, with_parts(labels=LabelColumns(column="place")))
     assert [int(sample.reading.label) for sample in samples] == [3, -1, -1, 0]
     assert not any(sample.reading.view_seen for sample in samples)
 
 
 def test_labels_from_a_file_and_from_pairs(write: Write) -> None:
     labels = write("t,label\n0.51,7\n1.49,8\n", "labels.csv")
-    samples = read_table(write(ODOMETRY), with_parts(labels=LabelColumns(file=labels)))
+    samples = read_csv_recording(write(ODOMETRY), with_parts(labels=LabelColumns(file=labels)))
     assert [int(sample.reading.label) for sample in samples] == [-1, 7, -1, 8]
     pairs = write("t1,t2,score\n1.0,0.5,0.9\n1.5,1.0,0.7\n", "pairs.csv")
-    samples = read_table(write(ODOMETRY), with_parts(pairs=PairColumns(file=pairs)))
+    samples = read_csv_recording(write(ODOMETRY), with_parts(pairs=PairColumns(file=pairs)))
     assert [int(sample.reading.label) for sample in samples] == [-1, 0, 0, 1]
 
 
@@ -117,7 +117,7 @@ def test_ids_follow_the_best_earlier_match(triples: list[tuple[int, int, float]]
 
 def test_truth_is_interpolated_and_unwrapped(write: Write) -> None:
     truth = write("t,x,y,heading\n0.25,0,0,3.0\n1.25,1,2,-3.0\n", "truth.csv")
-    samples = list(read_table(write(ODOMETRY), with_parts(truth=TruthColumns(file=truth))))
+    samples = list(read_csv_recording(write(ODOMETRY), with_parts(truth=TruthColumns(file=truth))))
     assert [sample.truth is None for sample in samples] == [True, False, False, True]
     assert samples[1].truth == pytest.approx([0.25, 0.5, 3.0 + 0.25 * (2 * np.pi - 6)])
     assert samples[2].truth == pytest.approx([0.75, 1.5, 3.0 + 0.75 * (2 * np.pi - 6)])
@@ -125,7 +125,7 @@ def test_truth_is_interpolated_and_unwrapped(write: Write) -> None:
 
 def test_truth_beside_the_odometry(write: Write) -> None:
     path = write("t,vx,w,x,y,heading\n0,0.1,0,1,2,3\n1,0.1,0,1.1,2,3\n")
-    samples = list(read_table(path, with_parts(truth=TruthColumns())))
+    samples = list(read_csv_recording(path, with_parts(truth=TruthColumns())))
     assert [sample.truth.tolist() for sample in samples if sample.truth is not None] == [
         [1, 2, 3],
         [1.1, 2, 3],
@@ -135,22 +135,22 @@ def test_truth_beside_the_odometry(write: Write) -> None:
 def test_the_digest_covers_every_file(write: Write) -> None:
     truth = write("t,x,y,heading\n0,0,0,0\n2,1,0,0\n", "truth.csv")
     config = with_parts(truth=TruthColumns(file=truth))
-    one = read_table(write(ODOMETRY), config).digest
+    one = read_csv_recording(write(ODOMETRY), config).digest
     truth.write_text("t,x,y,heading\n0,0,0,0\n2,1,0,0.0\n")
-    assert read_table(write(ODOMETRY), config).digest != one
-    assert read_table(write(ODOMETRY), VELOCITY).digest != one
+    assert read_csv_recording(write(ODOMETRY), config).digest != one
+    assert read_csv_recording(write(ODOMETRY), VELOCITY).digest != one
 
 
 def test_the_lecture_hall_is_reproduced(reference_data: Path) -> None:
     """Every label of the reference stream follows from the pairs; truth differs by the files' rounding."""
     data = reference_data / "data"
-    config = TableConfig(
+    config = CsvConfig(
         velocity=VelocityColumns(left="vy"),
         pairs=PairColumns(file=data / "tuc_lecture_hall_loops.csv"),
         truth=TruthColumns(file=data / "tuc_lecture_hall_gt.csv", heading="th"),
     )
-    log = read_table(data / "tuc_lecture_hall_odom.csv", config)
-    stream = read_stream(reference_data / "traces" / "f_real_tuc_lecture_hall.npz")
+    log = read_csv_recording(data / "tuc_lecture_hall_odom.csv", config)
+    stream = read_trace(reference_data / "traces" / "f_real_tuc_lecture_hall.npz")
     assert (log.label >= 0).sum() == 551
     np.testing.assert_array_equal(log.label, stream.label)
     np.testing.assert_allclose(log.time, stream.time - 100, atol=1e-9)
@@ -164,13 +164,13 @@ def test_the_lecture_hall_is_reproduced(reference_data: Path) -> None:
 def test_the_intel_laser_is_reproduced(reference_data: Path) -> None:
     """180 beams as 3 x 6 pixels, equal in every bit; the sideways part of the motion is not lost."""
     data = reference_data / "data"
-    config = TableConfig(
+    config = CsvConfig(
         pose=PoseColumns(x="odo_x", y="odo_y", heading="odo_th"),
         views=ViewColumns(file=data / "intel_scans.csv", max_range=8.0),
         truth=TruthColumns(x="gt_x", y="gt_y", heading="gt_th"),
     )
-    log = read_table(data / "intel_odom_gt.csv", config)
-    stream = read_stream(reference_data / "traces" / "f_real_intel_laser3x6.npz")
+    log = read_csv_recording(data / "intel_odom_gt.csv", config)
+    stream = read_trace(reference_data / "traces" / "f_real_intel_laser3x6.npz")
     np.testing.assert_array_equal(log.views, stream.views)
     np.testing.assert_array_equal(log.time, stream.time)
     assert log.truth is not None
@@ -217,7 +217,7 @@ def test_faults_are_named(
     content: str, parts: dict[str, Any], pieces: list[str], write: Write, refused: Callable[..., InputError]
 ) -> None:
     path = write(content)
-    refused(lambda: read_table(path, with_parts(**parts)), str(path), *pieces)
+    refused(lambda: read_csv_recording(path, with_parts(**parts)), str(path), *pieces)
 
 
 OTHERS: dict[str, tuple[str, Callable[[Path], dict[str, Any]], list[str]]] = {
@@ -254,18 +254,18 @@ def test_faults_of_other_files_are_named(
     refused: Callable[..., InputError],
 ) -> None:
     path = write(content, "other.csv")
-    refused(lambda: read_table(write(ODOMETRY), with_parts(**parts(path))), *pieces)
+    refused(lambda: read_csv_recording(write(ODOMETRY), with_parts(**parts(path))), *pieces)
 
 
 def test_all_faults_are_told_together(write: Write, refused: Callable[..., InputError]) -> None:
     path = write("t,vx,w,r0,r1,r2\n0,1,0,0,0,0\n1,nan,0,0,0,300\n1,1,0,0,0,0\n")
     error = refused(
-        lambda: read_table(path, with_parts(views=ViewColumns())), "vx is nan", "repeats", "300.0"
+        lambda: read_csv_recording(path, with_parts(views=ViewColumns())), "vx is nan", "repeats", "300.0"
     )
     assert isinstance(error, InputErrors)
     assert len(error.errors) == 3
     path = write("t,vx,w\n" + "0,x,1\n" * 20)
-    error = refused(lambda: read_table(path, VELOCITY), ":9:", "12 more faults like these")
+    error = refused(lambda: read_csv_recording(path, VELOCITY), ":9:", "12 more faults like these")
     assert str(error).count("\n") == 8
 
 
@@ -277,7 +277,7 @@ def test_no_text_is_more_than_one_clear_error(tmp_path_factory: Any, text: str |
         path.write_bytes(data)
         told = str(path)
         try:
-            read_table(path, VELOCITY)
+            read_csv_recording(path, VELOCITY)
         except InputError as error:
             told = str(error)
         assert str(path) in told

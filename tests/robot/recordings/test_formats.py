@@ -14,14 +14,14 @@ import pytest
 from pydantic import ValidationError
 
 from robot.recordings.csv_config import (
+    CsvConfig,
     PairColumns,
-    TableConfig,
     TruthColumns,
     VelocityColumns,
     ViewColumns,
 )
 from robot.recordings.formats import FORMATS, RecordingConfig, open_recording
-from robot.recordings.mcap_reader import record
+from robot.recordings.mcap_reader import record_source
 from robot.sources.input_files import read_bytes
 from robot.sources.source import Source
 from tactile.base.errors import InputError
@@ -33,9 +33,9 @@ Refused = Callable[..., InputError]
 def test_every_format_opens_as_the_same_kind_of_source(stream: Callable[..., Path], tmp_path: Path) -> None:
     config = RecordingConfig(file=stream())
     with open_recording(config) as source:
-        record(source, tmp_path / "copy.MCAP")
+        record_source(source, tmp_path / "copy.MCAP")
         (tmp_path / "odometry.csv").write_text("t,vx,w\n0,0.1,0\n0.5,0.1,0\n")
-        table = TableConfig(velocity=VelocityColumns())
+        table = CsvConfig(velocity=VelocityColumns())
         others = [
             open_recording(RecordingConfig(file=tmp_path / "copy.MCAP")),
             open_recording(RecordingConfig(file=tmp_path / "odometry.csv", table=table)),
@@ -50,7 +50,7 @@ def test_every_format_opens_as_the_same_kind_of_source(stream: Callable[..., Pat
 def test_a_cut_recording_warns(stream: Callable[..., Path], tmp_path: Path) -> None:
     path = tmp_path / "cut.mcap"
     with open_recording(RecordingConfig(file=stream())) as source:
-        record(source, path)
+        record_source(source, path)
     path.write_bytes(path.read_bytes()[:-300])
     told: list[str] = []
     opened = open_recording(RecordingConfig(file=path), told.append)
@@ -109,7 +109,7 @@ def test_an_unknown_format_is_named(tmp_path: Path, refused: Refused) -> None:
 
 
 def test_relative_paths_are_taken_from_a_folder() -> None:
-    table = TableConfig(
+    table = CsvConfig(
         views=ViewColumns(), pairs=PairColumns(file=Path("b.csv")), truth=TruthColumns(file=Path("/c.csv"))
     )
     config = RecordingConfig(file=Path("a.csv"), table=table).resolved(Path("/data"))
@@ -163,7 +163,7 @@ def test_the_lecture_hall_opens_in_no_time(reference_data: Path, tmp_path: Path)
     source = open_recording(RecordingConfig(file=file))
     assert sum(1 for _ in source) == 13_838
     assert time.perf_counter() - start < 1
-    record(source, tmp_path / "copy.mcap")
+    record_source(source, tmp_path / "copy.mcap")
     start = time.perf_counter()
     assert sum(1 for _ in open_recording(RecordingConfig(file=tmp_path / "copy.mcap"))) == 13_838
     assert time.perf_counter() - start < 4

@@ -18,9 +18,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from robot.recordings.cdr import decode, encode
-from robot.recordings.mcap_reader import Recording, record, recover
-from robot.recordings.mcap_scanner import FORMAT, Walk, _checksum
-from robot.recordings.npz_trace import read_stream
+from robot.recordings.mcap_reader import Recording, record_source, recover
+from robot.recordings.mcap_scanner import FORMAT, McapScanner, _checksum
+from robot.recordings.npz_trace import read_trace
 from robot.recordings.recorder import Recorder
 from robot.recordings.schemas import CYCLE, OBSERVATION, REPORT, SCHEMAS, TOPICS, WHISK
 from robot.sources.source import Sample, Source
@@ -199,8 +199,8 @@ def test_the_file_depends_on_the_samples_alone(tmp_path: Path) -> None:
 
 
 def test_a_source_is_recorded_as_it_is(trace: Path, tmp_path: Path) -> None:
-    with read_stream(trace) as source:
-        assert record(source, tmp_path / "copy.mcap") == source.length
+    with read_trace(trace) as source:
+        assert record_source(source, tmp_path / "copy.mcap") == source.length
         copy = Recording(tmp_path / "copy.mcap")
         assert _same(list(copy), list(source))
         assert copy.rate_hz == source.rate_hz
@@ -466,7 +466,7 @@ def test_a_chunk_that_would_not_fit_into_memory_is_not_opened(
     bad[frame + 4 : frame + 13] = b"\xe0" + struct.pack("<Q", 1 << 60)
     path = tmp_path / "bomb.mcap"
     path.write_bytes(bad)
-    walk = Walk(path)
+    walk = McapScanner(path)
     assert list(walk) == []
     assert "a chunk of 1152921504606846976 bytes" in walk.broken
 
@@ -527,7 +527,7 @@ def test_source_info_is_stored_before_the_first_sample(tmp_path: Path) -> None:
     path = _write(tmp_path / "a.mcap", _samples(2))
     content = path.read_bytes()
     path.write_bytes(content[: content.index(b"\x28\xb5\x2f\xfd")])
-    walk = Walk(path)
+    walk = McapScanner(path)
     assert list(walk) == []
     assert walk.description is not None
     assert walk.description.info == INFO
@@ -536,11 +536,11 @@ def test_source_info_is_stored_before_the_first_sample(tmp_path: Path) -> None:
 def test_a_copy_of_a_recording_keeps_the_source_info(
     find_trace: Callable[[str], Path], tmp_path: Path
 ) -> None:
-    plain = read_stream(find_trace("a_square3"))
+    plain = read_trace(find_trace("a_square3"))
     assert plain.info.cell_size == 0.1
     assert not plain.info.labels_only
-    record(plain, tmp_path / "a.mcap")
-    record(Recording(tmp_path / "a.mcap"), tmp_path / "b.mcap")
+    record_source(plain, tmp_path / "a.mcap")
+    record_source(Recording(tmp_path / "a.mcap"), tmp_path / "b.mcap")
     assert Recording(tmp_path / "b.mcap").info == plain.info
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robot.recordings.npz_trace import read_stream
+from robot.recordings.npz_trace import read_trace
 from robot.sources.source import Source
 from tactile.base.errors import InputError, InputErrors
 from tactile.base.se2 import integrate
@@ -25,7 +25,7 @@ def ate(path: np.ndarray, truth: np.ndarray) -> float:
 
 
 def test_a_trace_is_read_row_by_row(trace: Path) -> None:
-    source = read_stream(trace)
+    source = read_trace(trace)
     assert isinstance(source, Source)
     samples = list(source)
     with np.load(trace) as arrays:
@@ -52,7 +52,7 @@ def test_a_trace_is_read_row_by_row(trace: Path) -> None:
 def test_raw_odometry_errs_as_published(
     name: str, expected: float, find_trace: Callable[[str], Path]
 ) -> None:
-    source = read_stream(find_trace(name))
+    source = read_trace(find_trace(name))
     assert source.truth is not None
     assert ate(integrate(source.motion[:, :3]), source.truth) == pytest.approx(expected, rel=3e-3)
 
@@ -60,7 +60,7 @@ def test_raw_odometry_errs_as_published(
 def test_rows_without_odometry_do_not_advance_its_clock(stream: Callable[..., Path]) -> None:
     flags = np.full(12, 3.0)
     flags[[0, 4, 5]], flags[7] = 1, 2
-    source = read_stream(stream(in_flags=flags, in_v=np.where(flags == 1, np.nan, 0.1)))
+    source = read_trace(stream(in_flags=flags, in_v=np.where(flags == 1, np.nan, 0.1)))
     dt = [float(sample.reading.odometry.dt) for sample in source]
     assert dt == [0, 0, 0.5, 0.5, 0, 0, 1.5, 0.5, 0.5, 0.5, 0.5, 0.5]
     assert [bool(sample.reading.view_seen) for sample in source] == [i != 7 for i in range(12)]
@@ -70,14 +70,14 @@ def test_rows_without_odometry_do_not_advance_its_clock(stream: Callable[..., Pa
 
 def test_a_view_may_share_its_time_with_odometry(stream: Callable[..., Path]) -> None:
     time, flags = 100 + 0.5 * (np.arange(12) // 2), np.tile([1.0, 2.0], 6)
-    source = read_stream(stream(in_t=time, in_flags=flags))
+    source = read_trace(stream(in_t=time, in_flags=flags))
     assert source.rate_hz == 2.0
 
 
 def test_two_columns_are_given_ids(stream: Callable[..., Path]) -> None:
     ids = np.column_stack([np.arange(12) // 3, np.zeros(12)])
     ids[4] = np.nan
-    source = read_stream(stream(in_view=ids, in_flags=np.where(np.isnan(ids[:, 0]), 2.0, 3.0)))
+    source = read_trace(stream(in_view=ids, in_flags=np.where(np.isnan(ids[:, 0]), 2.0, 3.0)))
     samples = list(source)
     assert [int(sample.reading.label) for sample in samples] == [0, 0, 0, 1, -1, 1, 2, 2, 2, 3, 3, 3]
     assert not any(sample.reading.view_seen for sample in samples)
@@ -86,13 +86,13 @@ def test_two_columns_are_given_ids(stream: Callable[..., Path]) -> None:
 
 def test_a_template_of_two_pixels_is_no_id(stream: Callable[..., Path]) -> None:
     params = '{"template_x_size": 2, "template_y_size": 1}'
-    source = read_stream(stream(in_view=np.full((12, 2), 0.25), params_json=params, truth=None))
+    source = read_trace(stream(in_view=np.full((12, 2), 0.25), params_json=params, truth=None))
     assert [float(sample.reading.view.sum()) for sample in source] == [0.5] * 12
     assert all(sample.truth is None for sample in source)
 
 
 def test_samples_share_nothing_that_could_be_spoilt(stream: Callable[..., Path]) -> None:
-    source = read_stream(stream())
+    source = read_trace(stream())
     sample = next(iter(source))
     assert sample.truth is not None
     sample.truth[:] = 9
@@ -104,9 +104,9 @@ def test_samples_share_nothing_that_could_be_spoilt(stream: Callable[..., Path])
 
 
 def test_the_digest_names_the_content(stream: Callable[..., Path]) -> None:
-    one = read_stream(stream()).digest
-    assert read_stream(stream()).digest == one
-    assert read_stream(stream(in_v=np.full(12, 0.11))).digest != one
+    one = read_trace(stream()).digest
+    assert read_trace(stream()).digest == one
+    assert read_trace(stream(in_v=np.full(12, 0.11))).digest != one
 
 
 def _with(array: Any, row: int, value: Any) -> np.ndarray:
@@ -155,7 +155,7 @@ def test_faults_are_named(
     refused: Callable[..., InputError],
 ) -> None:
     path = stream(**changes)
-    refused(lambda: read_stream(path), str(path), *pieces)
+    refused(lambda: read_trace(path), str(path), *pieces)
 
 
 def test_all_faults_are_told_together(
@@ -167,7 +167,7 @@ def test_all_faults_are_told_together(
         in_w=_with(np.zeros(12), 3, np.nan),
         in_view=255 * VIEW,
     )
-    error = refused(lambda: read_stream(path), "repeats", "in_w is nan", "127.5", "over 1000 m/s")
+    error = refused(lambda: read_trace(path), "repeats", "in_w is nan", "127.5", "over 1000 m/s")
     assert isinstance(error, InputErrors)
     assert len(error.errors) == 4  # each cause once: the truth, too, disagrees about the speed
 
@@ -179,11 +179,11 @@ def test_a_broken_archive_is_one_clear_error(
     path = tmp_path / "bad.npz"
     for size in [*range(1, len(content) - 1, 97), len(content) - 1]:
         path.write_bytes(content[:size])
-        refused(lambda: read_stream(path), str(path), "cannot be read as .npz", "a NumPy archive")
-    refused(lambda: read_stream(path), "cut off or damaged: copy it again")
+        refused(lambda: read_trace(path), str(path), "cannot be read as .npz", "a NumPy archive")
+    refused(lambda: read_trace(path), "cut off or damaged: copy it again")
     np.save(tmp_path / "single.npy", np.zeros(3))
     (tmp_path / "single.npy").rename(path)
-    refused(lambda: read_stream(path), "cannot be read as .npz", "write it with numpy.savez")
+    refused(lambda: read_trace(path), "cannot be read as .npz", "write it with numpy.savez")
 
 
 def _fuzz(content: bytes, path: Path, rounds: int, seed: int) -> None:
@@ -195,7 +195,7 @@ def _fuzz(content: bytes, path: Path, rounds: int, seed: int) -> None:
         path.write_bytes(bad)
         told = str(path)
         try:
-            read_stream(path)
+            read_trace(path)
         except InputError as error:
             told = str(error)
         assert str(path) in told

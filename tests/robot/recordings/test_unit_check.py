@@ -8,12 +8,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robot.recordings.csv_config import PoseColumns, TableConfig, TruthColumns, VelocityColumns
-from robot.recordings.csv_reader import read_table
+from robot.recordings.csv_config import CsvConfig, PoseColumns, TruthColumns, VelocityColumns
+from robot.recordings.csv_reader import read_csv_recording
 from robot.recordings.formats import RecordingConfig, open_recording
-from robot.recordings.npz_trace import read_stream
-from robot.recordings.unit_check import ORDINARY, RATIO, Limits, Track, headings, typical, units
-from robot.sources.in_memory import Log
+from robot.recordings.npz_trace import read_trace
+from robot.recordings.unit_check import (
+    DEFAULT_LIMITS,
+    RATIO,
+    MotionTrack,
+    UnitLimits,
+    heading_errors,
+    typical_motion,
+    unit_errors,
+)
+from robot.sources.in_memory import InMemorySource
 from tactile.base.errors import InputError
 
 REAL = ("f_real_intel_laser3x6", "f_real_tuc_lecture_hall")
@@ -27,33 +35,33 @@ def real(request: pytest.FixtureRequest, find_trace: Callable[[str], Path]) -> P
 
 
 @pytest.fixture(params=["intel", "lecture hall"])
-def table(request: pytest.FixtureRequest, reference_data: Path) -> tuple[Path, TableConfig]:
+def table(request: pytest.FixtureRequest, reference_data: Path) -> tuple[Path, CsvConfig]:
     """Each real recording as CSV, without its views."""
     data = reference_data / "data"
     if request.param == "intel":
         truth = TruthColumns(x="gt_x", y="gt_y", heading="gt_th")
         pose = PoseColumns(x="odo_x", y="odo_y", heading="odo_th")
-        return data / "intel_odom_gt.csv", TableConfig(pose=pose, truth=truth)
+        return data / "intel_odom_gt.csv", CsvConfig(pose=pose, truth=truth)
     truth = TruthColumns(file=data / "tuc_lecture_hall_gt.csv", heading="th")
-    return data / "tuc_lecture_hall_odom.csv", TableConfig(velocity=VelocityColumns(left="vy"), truth=truth)
+    return data / "tuc_lecture_hall_odom.csv", CsvConfig(velocity=VelocityColumns(left="vy"), truth=truth)
 
 
-def _margins(log: Log) -> dict[str, float]:
+def _margins(log: InMemorySource) -> dict[str, float]:
     """How many times below its limit each quantity is."""
-    robot = typical(Track(log.time, log.moved, log.motion, log.truth))
+    robot = typical_motion(MotionTrack(log.time, log.moved, log.motion, log.truth))
     ratios = [max(pair) / min(pair) if min(pair) else 1.0 for pair in (robot.path, robot.turning)]
     return {
-        "interval": ORDINARY.interval / robot.interval,
-        "speed": ORDINARY.speed / robot.speed,
-        "true_speed": ORDINARY.speed / robot.true_speed,
-        "turn_rate": ORDINARY.turn_rate / robot.turn_rate,
+        "interval": DEFAULT_LIMITS.interval / robot.interval,
+        "speed": DEFAULT_LIMITS.speed / robot.speed,
+        "true_speed": DEFAULT_LIMITS.speed / robot.true_speed,
+        "turn_rate": DEFAULT_LIMITS.turn_rate / robot.turn_rate,
         "turn": np.pi / robot.turn,
         "path": RATIO / ratios[0],
         "turning": RATIO / ratios[1],
     }
 
 
-def _check_margins(log: Log) -> None:
+def _check_margins(log: InMemorySource) -> None:
     margins = _margins(log)
     print(log.name, {name: round(margin, 1) for name, margin in margins.items()})
     assert min(margins.values()) > 5
@@ -61,15 +69,15 @@ def _check_margins(log: Log) -> None:
 
 
 def test_traces_pass_with_a_margin(trace: Path) -> None:
-    _check_margins(read_stream(trace))
+    _check_margins(read_trace(trace))
 
 
 def test_real_traces_pass_with_a_margin(real: Path) -> None:
-    _check_margins(read_stream(real))
+    _check_margins(read_trace(real))
 
 
-def test_real_tables_pass_with_a_margin(table: tuple[Path, TableConfig]) -> None:
-    _check_margins(read_table(*table))
+def test_real_tables_pass_with_a_margin(table: tuple[Path, CsvConfig]) -> None:
+    _check_margins(read_csv_recording(*table))
 
 
 PLANTED = {
@@ -105,7 +113,7 @@ def test_a_wrong_unit_is_refused(
     refused: Callable[..., InputError],
 ) -> None:
     path = _plant(trace, tmp_path / "planted.npz", array, factor)
-    refused(lambda: read_stream(path), str(path), expected)
+    refused(lambda: read_trace(path), str(path), expected)
 
 
 @pytest.mark.parametrize(("array", "factor", "expected"), PLANTED.values(), ids=PLANTED.keys())
@@ -120,7 +128,7 @@ def test_a_wrong_unit_of_a_real_recording_is_refused(
     if array == "in_view" and "lecture" in real.stem:
         pytest.skip("its views are ids")
     path = _plant(real, tmp_path / "planted.npz", array, factor)
-    refused(lambda: read_stream(path), str(path), expected)
+    refused(lambda: read_trace(path), str(path), expected)
 
 
 @pytest.mark.parametrize(("array", "factor", "expected"), list(PLANTED.values())[:2], ids=list(PLANTED)[:2])
@@ -134,9 +142,9 @@ def test_a_wrong_unit_is_refused_without_truth(
 ) -> None:
     path = _plant(trace, tmp_path / "planted.npz", array, factor, drop=("truth",))
     if array == "in_w" and trace.stem == "j_reverse_stop":
-        read_stream(path)  # turns by 1.1 degrees a second: nobody could tell
+        read_trace(path)  # turns by 1.1 degrees a second: nobody could tell
     else:
-        refused(lambda: read_stream(path), str(path), expected)
+        refused(lambda: read_trace(path), str(path), expected)
 
 
 @pytest.mark.parametrize(
@@ -146,7 +154,7 @@ def test_a_wrong_unit_is_refused_without_truth(
      ("w", DEGREES, "in radians"), ("vx", MILLIMETRES, "in metres")],
 )  # fmt: skip
 def test_a_wrong_unit_of_a_table_is_refused(
-    table: tuple[Path, TableConfig],
+    table: tuple[Path, CsvConfig],
     column: str,
     factor: float,
     expected: str,
@@ -161,9 +169,9 @@ def test_a_wrong_unit_of_a_table_is_refused(
     values[:, header.split(",").index(column)] *= factor
     planted = tmp_path / "planted.csv"
     np.savetxt(planted, values, "%.6f", ",", header=header, comments="")
-    refused(lambda: read_table(planted, config), str(planted), expected)
-    refused(lambda: read_table(planted, config.model_copy(update={"truth": None})) if column != "gt_th"
-            else read_table(planted, config), expected)  # fmt: skip
+    refused(lambda: read_csv_recording(planted, config), str(planted), expected)
+    without_truth = config if column == "gt_th" else config.model_copy(update={"truth": None})
+    refused(lambda: read_csv_recording(planted, without_truth), expected)
 
 
 def test_one_row_decides_nothing(trace: Path, tmp_path: Path) -> None:
@@ -177,19 +185,19 @@ def test_one_row_decides_nothing(trace: Path, tmp_path: Path) -> None:
         kept[name] = kept[name].copy()
         kept[name][[40, 41]] = value, -value
     np.savez(tmp_path / "wild.npz", **kept)
-    assert read_stream(tmp_path / "wild.npz").length == len(kept["in_t"])
+    assert read_trace(tmp_path / "wild.npz").length == len(kept["in_t"])
 
 
 def test_the_real_row_of_five_milliseconds_passes(find_trace: Callable[[str], Path]) -> None:
-    log = read_stream(find_trace("f_real_intel_laser3x6"))
+    log = read_trace(find_trace("f_real_intel_laser3x6"))
     rate = np.abs(log.motion[1:, 2]) / log.motion[1:, 3]
     assert rate.max() > 90
 
 
 def test_a_limit_may_be_raised(stream: Callable[..., Path], refused: Callable[..., InputError]) -> None:
     path = stream(in_v=np.full(12, 40.0), truth=None)
-    refused(lambda: read_stream(path), "over 40 m/s", "if it really is so, raise limits.speed (25)")
-    config = RecordingConfig(file=path, limits=Limits(speed=50.0))
+    refused(lambda: read_trace(path), "over 40 m/s", "if it really is so, raise limits.speed (25)")
+    config = RecordingConfig(file=path, limits=UnitLimits(speed=50.0))
     assert open_recording(config).length == 12
 
 
@@ -199,15 +207,17 @@ def test_headings_of_any_span_are_told_from_degrees(turns: float) -> None:
     time = np.arange(200) * 0.5
     heading = np.linspace(0, 2 * np.pi * turns, 200) - 1.0
     wrapped = (heading + np.pi) % (2 * np.pi) - np.pi
-    limits = Limits(turn_rate=0.5) if turns < 1 else ORDINARY  # a slow one needs to be told
+    limits = UnitLimits(turn_rate=0.5) if turns < 1 else DEFAULT_LIMITS  # a slow one needs to be told
     for column in (heading, wrapped):
-        assert headings(column, time, "th", "file", limits) == []
-        (error,) = headings(np.rad2deg(column), time, "th", "file", limits)
+        assert heading_errors(column, time, "th", "file", limits) == []
+        (error,) = heading_errors(np.rad2deg(column), time, "th", "file", limits)
         assert "multiply by pi/180" in str(error)
 
 
 def test_nothing_to_judge_is_nothing_to_refuse() -> None:
     for rows in (0, 1, 2, 3):
-        still = Track(np.arange(rows) * 1.0, np.ones(rows, bool), np.zeros((rows, 4)), np.zeros((rows, 3)))
-        assert units(still, "file") == []
-        assert units(still._replace(moved=np.zeros(rows, bool), truth=None), "file") == []
+        still = MotionTrack(
+            np.arange(rows) * 1.0, np.ones(rows, bool), np.zeros((rows, 4)), np.zeros((rows, 3))
+        )
+        assert unit_errors(still, "file") == []
+        assert unit_errors(still._replace(moved=np.zeros(rows, bool), truth=None), "file") == []

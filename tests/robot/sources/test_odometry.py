@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from robot.sources.odometry import MID_HEADING, NEW_HEADING, from_poses, from_velocities
+from robot.sources.odometry import MIDPOINT, TURN_THEN_MOVE, from_poses, from_velocities
 from tactile.base.se2 import integrate, wrap
 
 STEPS = st.integers(1, 30)
@@ -26,7 +26,7 @@ def test_poses_give_back_their_motions(motions: np.ndarray) -> None:
     assert (found[1:, 3] == 0.5).all()
 
 
-@given(MOTIONS, st.sampled_from([MID_HEADING, NEW_HEADING]))
+@given(MOTIONS, st.sampled_from([MIDPOINT, TURN_THEN_MOVE]))
 def test_the_first_row_only_sets_the_clock(velocities: np.ndarray, heading: float) -> None:
     motion = from_velocities(np.arange(len(velocities)) + 7.0, *velocities.T, heading)
     assert (motion[0] == 0).all()
@@ -40,7 +40,7 @@ def test_the_mid_heading_closes_a_circle() -> None:
     turn = np.full(41, np.pi / 10)
     ends = [
         integrate(from_velocities(time, np.full(41, 0.1), 0.0, turn, heading)[:, :3])
-        for heading in (MID_HEADING, NEW_HEADING)
+        for heading in (MIDPOINT, TURN_THEN_MOVE)
     ]
     radius = 0.1 / (np.pi / 10)
     for poses in ends:

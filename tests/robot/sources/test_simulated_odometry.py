@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.sources.odometry import OdometryConfig, reckoned
+from robot.sources.odometry import OdometryConfig, simulate_odometry
 from tactile.base.random_streams import stream
 from tactile.base.se2 import between, integrate, wrap
 
@@ -34,7 +34,7 @@ def driven(count: int) -> tuple[np.ndarray, np.ndarray]:
 def errors(kind: str, scene: tuple[np.ndarray, np.ndarray], seed: int = 0, **changes: Any) -> np.ndarray:
     """[N - 1, 3] told motion less true motion."""
     time, pose = scene
-    told = reckoned(OdometryConfig(noise=kind, **changes), time, pose, stream(seed, "odometry"))
+    told = simulate_odometry(OdometryConfig(noise=kind, **changes), time, pose, stream(seed, "odometry"))
     error = told[1:, :3] - between(pose[:-1], pose[1:])
     return np.column_stack([error[:, :2], wrap(error[:, 2])])
 
@@ -101,7 +101,7 @@ def test_biases_belong_to_the_run() -> None:
     scales, bends = [], []
     for seed in range(300):
         config = OdometryConfig(noise="none", length_bias=0.02, heading_bias=0.1)
-        told = reckoned(config, time, pose, stream(seed, "odometry"))[1:]
+        told = simulate_odometry(config, time, pose, stream(seed, "odometry"))[1:]
         true = between(pose[:-1], pose[1:])
         ahead = true[:, 0] > 0.01
         scale, bend = told[ahead, 0] / true[ahead, 0], (told[ahead, 2] - true[ahead, 2]) / true[ahead, 0]
@@ -122,9 +122,9 @@ def test_who_is_carried_is_told_the_motion_before() -> None:
     hidden = np.zeros(100, bool)
     hidden[50] = True
     random = stream(0, "odometry")
-    told = reckoned(OdometryConfig(noise="none"), time, pose, random, hidden)
+    told = simulate_odometry(OdometryConfig(noise="none"), time, pose, random, hidden)
     assert np.allclose(told[50, :3], told[49, :3])
-    open_ = reckoned(OdometryConfig(noise="none"), time, pose, stream(0, "odometry"))
+    open_ = simulate_odometry(OdometryConfig(noise="none"), time, pose, stream(0, "odometry"))
     assert np.hypot(*open_[50, :2]) > 0.5
     assert (np.delete(told, 50, 0) == np.delete(open_, 50, 0)).all()
 
@@ -132,8 +132,8 @@ def test_who_is_carried_is_told_the_motion_before() -> None:
 def test_the_first_row_only_sets_the_clock() -> None:
     time, pose = driven(10)
     for kind in (*KINDS, "none"):
-        told = reckoned(OdometryConfig(noise=kind), time + 7.0, pose, stream(0, "odometry"))
+        told = simulate_odometry(OdometryConfig(noise=kind), time + 7.0, pose, stream(0, "odometry"))
         assert (told[0] == 0).all()
         assert (told[1:, 3] == 1).all()
-        one = reckoned(OdometryConfig(noise=kind), time[:1], pose[:1], stream(0, "odometry"))
+        one = simulate_odometry(OdometryConfig(noise=kind), time[:1], pose[:1], stream(0, "odometry"))
         assert (one == 0).all()

@@ -12,9 +12,26 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 from scipy.ndimage import label
 
-from robot.world.arena import Arena, enclosed, fits, inside, occupied, read_arena, segments, text
-from robot.world.polygons import area, contains, crossing, distance, edges, gap, square
-from robot.world.random_arena import ArenaConfig, arena
+from robot.world.arena import (
+    Arena,
+    arena_text,
+    has_clearance,
+    in_free_space,
+    is_enclosed,
+    is_occupied,
+    read_arena,
+    wall_segments,
+)
+from robot.world.polygons import (
+    polygon_area,
+    polygon_contains,
+    polygon_edges,
+    polygon_gap,
+    segment_distance,
+    segments_cross,
+    square,
+)
+from robot.world.random_arena import ArenaConfig, make_arena
 from tactile.base.errors import InputError
 
 SEEDS = st.integers(0, 10**6)
@@ -33,30 +50,30 @@ start 1 1 90
 @settings(max_examples=25)
 @given(SEEDS, KINDS)
 def test_ways_are_wide_enough(seed: int, config: ArenaConfig) -> None:
-    made = arena(config, seed)
+    made = make_arena(config, seed)
     assert len(made.objects) == config.count
     for number, one in enumerate(made.objects):
-        assert config.smallest**2 <= area(one) * (1 + 1e-9) <= config.largest**2 * (1 + 2e-9)
-        room = gap(one, made.outer)
+        assert config.smallest**2 <= polygon_area(one) * (1 + 1e-9) <= config.largest**2 * (1 + 2e-9)
+        room = polygon_gap(one, made.outer)
         assert room < 1e-9 or room >= config.passage
         for other in made.objects[:number]:
-            assert gap(one, other) >= config.passage
-    assert fits(made, made.start[:2], 0.2)
+            assert polygon_gap(one, other) >= config.passage
+    assert has_clearance(made, made.start[:2], 0.2)
 
 
 @settings(max_examples=12)
 @given(SEEDS, KINDS)
 def test_the_robot_can_reach_every_place_that_it_fits_in(seed: int, config: ArenaConfig) -> None:
-    made = arena(config, seed)
+    made = make_arena(config, seed)
     axis = np.arange(0.005, config.side, 0.02)
     places = np.stack(np.meshgrid(axis, axis), axis=-1)
-    _, regions = label(fits(made, places, 0.18))
+    _, regions = label(has_clearance(made, places, 0.18))
     assert regions == 1
 
 
 def test_rotated_objects_are_turned_and_others_are_not() -> None:
     def slants(rotated: bool) -> np.ndarray:
-        made = arena(ArenaConfig(side=2.5, rotated=rotated), 3)
+        made = make_arena(ArenaConfig(side=2.5, rotated=rotated), 3)
         along = np.array([one[1] - one[0] for one in made.objects])
         return np.degrees(np.arctan2(along[:, 1], along[:, 0])) % 90
 
@@ -66,8 +83,8 @@ def test_rotated_objects_are_turned_and_others_are_not() -> None:
 
 def test_objects_stand_at_walls_as_often_as_asked() -> None:
     def share(against: float) -> float:
-        made = [arena(ArenaConfig(side=2.5, objects=4, against=against), seed) for seed in range(8)]
-        return float(np.mean([gap(one, room.outer) < 1e-9 for room in made for one in room.objects]))
+        made = [make_arena(ArenaConfig(side=2.5, objects=4, against=against), seed) for seed in range(8)]
+        return float(np.mean([polygon_gap(one, room.outer) < 1e-9 for room in made for one in room.objects]))
 
     assert share(0.0) == 0
     assert share(1.0) == 1
@@ -76,19 +93,24 @@ def test_objects_stand_at_walls_as_often_as_asked() -> None:
 
 def test_an_arena_follows_from_its_seed() -> None:
     config = ArenaConfig()
-    one, again, other = (arena(config, seed) for seed in (4, 4, 5))
-    assert text(one) == text(again) != text(other)
-    assert text(arena(ArenaConfig(seed=4), 9)) == text(one)
+    one, again, other = (make_arena(config, seed) for seed in (4, 4, 5))
+    assert arena_text(one) == arena_text(again) != arena_text(other)
+    assert arena_text(make_arena(ArenaConfig(seed=4), 9)) == arena_text(one)
 
 
 def test_the_sizes_of_the_paper_have_four_and_seven_objects() -> None:
     assert ArenaConfig().count == 4
     assert ArenaConfig(side=2.5).count == 7
-    assert arena(ArenaConfig(objects=0), 0).objects == ()
+    assert make_arena(ArenaConfig(objects=0), 0).objects == ()
 
 
 def test_what_does_not_fit_is_refused(refused: Callable[..., InputError]) -> None:
-    refused(lambda: arena(ArenaConfig(objects=30), 0), "roving.arena.objects", "30 objects", "fewer")
+    refused(
+        lambda: make_arena(ArenaConfig(objects=30), 0),
+        "create_simulation.arena.objects",
+        "30 objects",
+        "fewer",
+    )
     with pytest.raises(ValidationError, match="smallest"):
         ArenaConfig(smallest=0.3)
     with pytest.raises(ValidationError, match="largest"):
@@ -99,22 +121,22 @@ def test_what_does_not_fit_is_refused(refused: Callable[..., InputError]) -> Non
 @given(SEEDS, KINDS)
 def test_a_line_from_inside_to_outside_crosses_an_odd_number_of_walls(seed: int, config: ArenaConfig) -> None:
     """The walls that are touched and the space that is free are the same arena."""
-    made = arena(config, seed)
+    made = make_arena(config, seed)
     points = np.random.default_rng(seed).uniform(-0.2, config.side + 0.2, (40, 2, 2))
-    crossings = crossing(points.reshape(-1, 4), segments(made)).sum(axis=1)
-    free = inside(made, points)
+    crossings = segments_cross(points.reshape(-1, 4), wall_segments(made)).sum(axis=1)
+    free = in_free_space(made, points)
     assert ((crossings % 2 == 1) == (free[:, 0] != free[:, 1])).all()
-    assert (occupied(made, points) == ~free).all()
-    assert (free <= enclosed(made, points)).all()
+    assert (is_occupied(made, points) == ~free).all()
+    assert (free <= is_enclosed(made, points)).all()
 
 
 def test_the_share_that_is_occupied_is_that_of_the_objects() -> None:
-    made = arena(ArenaConfig(rotated=True), 2)
+    made = make_arena(ArenaConfig(rotated=True), 2)
     axis = (np.arange(250) + 0.5) / 250 * 1.25
     cells = np.stack(np.meshgrid(axis, axis), axis=-1)
-    expected = sum(area(one) for one in made.objects) / 1.25**2
-    assert occupied(made, cells).mean() == pytest.approx(expected, rel=0.01)
-    assert occupied(made, cells + 5).all()
+    expected = sum(polygon_area(one) for one in made.objects) / 1.25**2
+    assert is_occupied(made, cells).mean() == pytest.approx(expected, rel=0.01)
+    assert is_occupied(made, cells + 5).all()
 
 
 @given(SEEDS)
@@ -124,25 +146,25 @@ def test_distances_are_those_of_the_nearest_point(seed: int) -> None:
     share = np.linspace(0, 1, 2001)[:, None, None]
     along = walls[:, :2] + share * (walls[:, 2:] - walls[:, :2])
     sampled = np.linalg.norm(points[:, None, None] - along, axis=-1).min(axis=1)
-    assert np.allclose(distance(walls, points), sampled, atol=1e-3)
-    assert (distance(walls, points) <= sampled + 1e-12).all()
+    assert np.allclose(segment_distance(walls, points), sampled, atol=1e-3)
+    assert (segment_distance(walls, points) <= sampled + 1e-12).all()
 
 
 @given(SEEDS, st.floats(-10, 10))
 def test_squares_are_square_however_they_are_turned(seed: int, angle: float) -> None:
     one = square(np.array([0.3, -0.2]), 0.4, angle)
-    assert area(one) == pytest.approx(0.16)
-    assert contains(one, np.array([0.3, -0.2]))
+    assert polygon_area(one) == pytest.approx(0.16)
+    assert polygon_contains(one, np.array([0.3, -0.2]))
     points = np.random.default_rng(seed).uniform(-0.5, 0.5, (50, 2))
     c, s = np.cos(angle), np.sin(angle)
     u, v = np.abs((points - [0.3, -0.2]) @ np.array([[c, -s], [s, c]])).T
-    assert (contains(one, points) == (np.maximum(u, v) < 0.2)).all()
+    assert (polygon_contains(one, points) == (np.maximum(u, v) < 0.2)).all()
 
 
 def test_to_touch_is_not_to_cross() -> None:
-    sides = edges(square(np.zeros(2), 1.0, 0.0))
-    assert not crossing(sides, sides).any()
-    assert crossing(sides, np.array([[0.0, 0.0, 2.0, 0.1]])).sum() == 1
+    sides = polygon_edges(square(np.zeros(2), 1.0, 0.0))
+    assert not segments_cross(sides, sides).any()
+    assert segments_cross(sides, np.array([[0.0, 0.0, 2.0, 0.1]])).sum() == 1
 
 
 @settings(max_examples=20)
@@ -150,12 +172,12 @@ def test_to_touch_is_not_to_cross() -> None:
 def test_an_arena_survives_its_text(
     tmp_path_factory: pytest.TempPathFactory, seed: int, config: ArenaConfig
 ) -> None:
-    made = arena(config, seed)
+    made = make_arena(config, seed)
     path = tmp_path_factory.getbasetemp() / "room.txt"
-    path.write_text(text(made))
+    path.write_text(arena_text(made))
     read = read_arena(path)
     assert read.name == "room"
-    assert (segments(read) == segments(made)).all()
+    assert (wall_segments(read) == wall_segments(made)).all()
     assert np.allclose(read.start, made.start)
 
 
@@ -166,11 +188,11 @@ def test_a_text_says_what_stands_where(tmp_path: Path) -> None:
     assert isinstance(read, Arena)
     assert len(read.objects) == 2
     assert np.allclose(read.start, [1, 1, np.pi / 2])
-    assert area(read.objects[0]) == pytest.approx(0.04)
-    assert not inside(read, np.array([0.3, 1.7]))
-    assert not inside(read, np.array([1.9, 1.2]))
+    assert polygon_area(read.objects[0]) == pytest.approx(0.04)
+    assert not in_free_space(read, np.array([0.3, 1.7]))
+    assert not in_free_space(read, np.array([1.9, 1.2]))
     path.write_text(GOOD.replace("outer 0 0  2 0  2 2  0 2", "outer 0 2  2 2  2 0  0 0"))  # clockwise
-    assert (inside(read_arena(path), np.array([[1.0, 1.0], [1.9, 1.2]])) == [True, False]).all()
+    assert (in_free_space(read_arena(path), np.array([[1.0, 1.0], [1.9, 1.2]])) == [True, False]).all()
 
 
 @pytest.mark.parametrize(

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robot.world.head_trajectory import JitterConfig, MotionConfig, Path, at, carried, planned
-from robot.world.maze import CELL, centre, random_loop
-from robot.world.maze_routes import circuits
+from robot.world.head_trajectory import HeadPath, JitterConfig, MotionConfig, add_kidnaps, plan_path, poses_at
+from robot.world.maze import CELL_SIDE, cell_centre, random_loop
+from robot.world.maze_routes import circuit_route
 from tactile.base.random_streams import stream
 from tactile.base.se2 import wrap
 
@@ -17,17 +17,17 @@ SEEDS = st.integers(0, 1000)
 STEADY = JitterConfig(position=0, yaw_deg=0, speed=0)
 
 
-def path_of(seed: int, word: str = "CA", **changes: object) -> Path:
-    way = circuits(random_loop(7, 5, 20, stream(seed, "maze.loop")), word)
-    return planned(MotionConfig(**changes), way, stream(seed, "motion"))
+def path_of(seed: int, word: str = "CA", **changes: object) -> HeadPath:
+    way = circuit_route(random_loop(7, 5, 20, stream(seed, "maze.loop")), word)
+    return plan_path(MotionConfig(**changes), way, stream(seed, "motion"))
 
 
 @given(SEEDS)
 def test_without_jitter_the_head_goes_straight_from_middle_to_middle_and_looks_ahead(seed: int) -> None:
     path = path_of(seed, jitter=STEADY)
-    way = circuits(random_loop(7, 5, 20, stream(seed, "maze.loop")), "CA")
+    way = circuit_route(random_loop(7, 5, 20, stream(seed, "maze.loop")), "CA")
     passed = path.pose[np.concatenate([[True], np.abs(np.diff(path.pose[:, :2], axis=0)).sum(axis=1) > 1e-9])]
-    assert np.allclose(passed[:, :2], [centre(cell) for cell in way], atol=1e-12)
+    assert np.allclose(passed[:, :2], [cell_centre(cell) for cell in way], atol=1e-12)
     step, took = np.diff(path.pose, axis=0), np.diff(path.time)
     driven = np.hypot(step[:, 0], step[:, 1])
     straight = driven > 1e-9
@@ -38,18 +38,18 @@ def test_without_jitter_the_head_goes_straight_from_middle_to_middle_and_looks_a
     )
     assert np.allclose(np.abs(step[~straight, 2]) / took[~straight], 0.4)
     assert (np.abs(step[:, 2]) <= np.pi + 1e-12).all()
-    assert np.isclose(path.duration, 40 * CELL / 0.03 + np.abs(step[:, 2]).sum() / 0.4)
+    assert np.isclose(path.duration, 40 * CELL_SIDE / 0.03 + np.abs(step[:, 2]).sum() / 0.4)
 
 
 @given(SEEDS)
 def test_backwards_is_the_way_there_looked_at_the_other_way(seed: int) -> None:
     """Going a way backwards looks at every place as coming the other way along it does."""
-    way = circuits(random_loop(7, 5, 20, stream(seed, "maze.loop")), "A")
-    there = planned(MotionConfig(jitter=STEADY), way, stream(seed, "motion"))
-    back = planned(MotionConfig(jitter=STEADY, backwards=True), way[::-1], stream(seed, "motion"))
+    way = circuit_route(random_loop(7, 5, 20, stream(seed, "maze.loop")), "A")
+    there = plan_path(MotionConfig(jitter=STEADY), way, stream(seed, "motion"))
+    back = plan_path(MotionConfig(jitter=STEADY, backwards=True), way[::-1], stream(seed, "motion"))
     assert np.isclose(there.duration, back.duration)
     time = np.linspace(0, there.duration, 200)
-    one, other = at(there, time), at(back, there.duration - time)
+    one, other = poses_at(there, time), poses_at(back, there.duration - time)
     assert np.allclose(one[:, :2], other[:, :2], atol=1e-9)
     assert np.allclose(wrap(one[:, 2] - other[:, 2]), 0, atol=1e-9)
 
@@ -78,7 +78,7 @@ def test_a_path_follows_from_its_seed(seed: int, other: int) -> None:
 def test_time_only_goes_on_and_ends_are_kept() -> None:
     path = path_of(3)
     assert (np.diff(path.time) > 0).all()
-    assert (at(path, np.array([-5.0, 1e9])) == path.pose[[0, -1]]).all()
+    assert (poses_at(path, np.array([-5.0, 1e9])) == path.pose[[0, -1]]).all()
 
 
 @settings(max_examples=40)
@@ -88,7 +88,7 @@ def test_a_kidnapped_head_goes_on_from_where_it_would_have_been(
 ) -> None:
     path = path_of(seed)
     when = [share * path.duration for share in shares]
-    there, jumps = carried(path, when, ahead)
+    there, jumps = add_kidnaps(path, when, ahead)
     assert len(jumps) <= len(when)
     assert (np.diff(there.time) >= 0).all()
     assert np.allclose(jumps, sorted(when)[: len(jumps)])
@@ -96,11 +96,11 @@ def test_a_kidnapped_head_goes_on_from_where_it_would_have_been(
     time = np.linspace(0, there.duration, 300)
     skipped = ahead * (time[:, None] > jumps).sum(axis=1)
     away = np.abs(time[:, None] - jumps).min(axis=1) > 1e-6
-    assert np.allclose(at(there, time)[away], at(path, time + skipped)[away], atol=1e-9)
+    assert np.allclose(poses_at(there, time)[away], poses_at(path, time + skipped)[away], atol=1e-9)
 
 
 def test_who_is_carried_past_the_end_has_arrived() -> None:
     path = path_of(0)
-    there, jumps = carried(path, [path.duration - 10.0], 45.0)
+    there, jumps = add_kidnaps(path, [path.duration - 10.0], 45.0)
     assert there.duration == pytest.approx(path.duration - 10.0)
     assert len(jumps) == 0

@@ -11,19 +11,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robot.world.maze import (
-    CELL,
-    TALL,
-    THICK,
+    CELL_SIDE,
+    WALL_HEIGHT,
+    WALL_THICKNESS,
     Maze,
-    centre,
+    cell_centre,
+    describe_box,
     is_open,
-    named,
+    maze_text,
     neighbours,
     random_loop,
+    random_maze,
     read_maze,
-    scattered,
-    text,
-    walls,
+    wall_boxes,
 )
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
@@ -33,7 +33,7 @@ SEEDS = st.integers(0, 10**6)
 
 def made(seed: int, columns: int = 7, rows: int = 5, length: int = 20, share: float = 0.6) -> Maze:
     loop = random_loop(columns, rows, length, stream(seed, "maze.loop"))
-    return scattered(columns, rows, loop, share, stream(seed, "maze.walls"))
+    return random_maze(columns, rows, loop, share, stream(seed, "maze.walls"))
 
 
 @given(SEEDS, st.sampled_from([(7, 5, 20), (5, 5, 20), (12, 8, 20), (12, 8, 40), (2, 2, 4), (3, 2, 6)]))
@@ -70,13 +70,13 @@ def test_a_loop_that_cannot_be_is_refused(
 @given(SEEDS)
 def test_the_loop_is_open_and_the_rest_is_walled_in(seed: int) -> None:
     loop = random_loop(7, 5, 20, stream(seed, "maze.loop"))
-    maze = scattered(7, 5, loop, 1.0, stream(seed, "maze.walls"))
+    maze = random_maze(7, 5, loop, 1.0, stream(seed, "maze.walls"))
     assert maze.across[[0, -1]].all()
     assert maze.along[:, [0, -1]].all()
     for k, cell in enumerate(loop):
         assert set(neighbours(maze, cell)) == {loop[k - 1], loop[(k + 1) % 20]}
     assert (~maze.across).sum() + (~maze.along).sum() == 20
-    bare = scattered(7, 5, loop, 0.0, stream(seed, "maze.walls"))
+    bare = random_maze(7, 5, loop, 0.0, stream(seed, "maze.walls"))
     assert bare.across.sum() + bare.along.sum() == 2 * 7 + 2 * 5
 
 
@@ -94,10 +94,10 @@ def test_a_maze_survives_its_text(
     maze = made(seed, *size, length=4, share=share)
     path = tmp_path_factory.getbasetemp() / "maze.txt"
     for written in (
-        text(maze),
-        text(maze).replace("o", "+"),
-        "\n\n" + text(maze) + "\n",
-        text(maze).rstrip(),
+        maze_text(maze),
+        maze_text(maze).replace("o", "+"),
+        "\n\n" + maze_text(maze) + "\n",
+        maze_text(maze).rstrip(),
     ):
         path.write_text(written)
         read = read_maze(path)
@@ -149,17 +149,17 @@ def test_a_file_that_is_no_text_is_refused(tmp_path: Path, refused: Callable[...
 @given(SEEDS)
 def test_boxes_stand_where_the_maze_has_walls(seed: int) -> None:
     maze = made(seed)
-    boxes = walls(maze, stream(seed, "maze.heights"))
+    boxes = wall_boxes(maze, stream(seed, "maze.heights"))
     posts = 8 * 6
     assert len(boxes.box) == maze.across.sum() + maze.along.sum() + posts
-    assert (boxes.height == TALL).all()
+    assert (boxes.height == WALL_HEIGHT).all()
     size = boxes.box[:, 2:] - boxes.box[:, :2]
-    assert np.allclose(size.min(axis=1), THICK)
-    assert np.allclose(size[:-posts].max(axis=1), CELL - THICK)
+    assert np.allclose(size.min(axis=1), WALL_THICKNESS)
+    assert np.allclose(size[:-posts].max(axis=1), CELL_SIDE - WALL_THICKNESS)
     # Between two cells there is a box exactly where there is a wall.
     inside = boxes.box[:-posts]
     for a, b in (((2, 2), (3, 2)), ((2, 2), (2, 3)), ((0, 0), (1, 0)), ((6, 3), (6, 4))):
-        x, y = (centre(a) + centre(b)) / 2
+        x, y = (cell_centre(a) + cell_centre(b)) / 2
         hit = (inside[:, 0] < x) & (x < inside[:, 2]) & (inside[:, 1] < y) & (y < inside[:, 3])
         assert hit.any() != is_open(maze, a, b)
     # No two boxes overlap.
@@ -171,15 +171,15 @@ def test_boxes_stand_where_the_maze_has_walls(seed: int) -> None:
 
 
 def test_walls_have_the_given_heights_and_posts_the_largest() -> None:
-    boxes = walls(made(0), stream(0, "maze.heights"), (0.03, 0.05, 0.04))
+    boxes = wall_boxes(made(0), stream(0, "maze.heights"), (0.03, 0.05, 0.04))
     assert set(boxes.height[:-48]) == {0.03, 0.04, 0.05}
     assert set(boxes.height[-48:]) == {0.05}
 
 
 def test_boxes_have_names() -> None:
     maze = made(0, share=1.0)
-    boxes = walls(maze, stream(0, "maze.heights"))
-    names = [named(boxes, k) for k in range(len(boxes.box))]
+    boxes = wall_boxes(maze, stream(0, "maze.heights"))
+    names = [describe_box(boxes, k) for k in range(len(boxes.box))]
     assert len(set(names)) == len(names)
     assert names[0] == "the wall south of cell (0, 0)"
     assert names[-1] == "the post at corner (7, 5)"

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.world.maze import Maze, closed, is_open, neighbours, random_loop, scattered
-from robot.world.maze_routes import anticlockwise, checked, circuits, exploration
+from robot.world.maze import Maze, closed_maze, is_open, neighbours, random_loop, random_maze
+from robot.world.maze_routes import check_route, circuit_route, exploration_route, make_anticlockwise
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 
@@ -19,13 +19,13 @@ SQUARE = [(0, 0), (1, 0), (1, 1), (0, 1)]
 
 def world(seed: int) -> tuple[Maze, list[tuple[int, int]]]:
     loop = random_loop(7, 5, 20, stream(seed, "maze.loop"))
-    return scattered(7, 5, loop, 0.6, stream(seed, "maze.walls")), loop
+    return random_maze(7, 5, loop, 0.6, stream(seed, "maze.walls")), loop
 
 
 @given(st.text("CAca", min_size=1, max_size=12), st.integers(0, 1000))
 def test_each_letter_is_once_around(word: str, seed: int) -> None:
     _, loop = world(seed)
-    way = circuits(loop, word)
+    way = circuit_route(loop, word)
     assert len(way) == len(word) * len(loop) + 1
     for k, letter in enumerate(word.upper()):
         lap = way[k * len(loop) : (k + 1) * len(loop) + 1]
@@ -36,10 +36,10 @@ def test_each_letter_is_once_around(word: str, seed: int) -> None:
 @given(st.integers(0, 1000))
 def test_what_is_made_passes_no_wall(seed: int) -> None:
     maze, loop = world(seed)
-    checked(maze, circuits(loop, "CA"))
-    way = exploration(maze, loop[0], 300, stream(seed, "path"))
+    check_route(maze, circuit_route(loop, "CA"))
+    way = exploration_route(maze, loop[0], 300, stream(seed, "path"))
     assert len(way) == 300
-    checked(maze, way)
+    check_route(maze, way)
     for before, here, after in zip(way, way[1:], way[2:], strict=False):
         assert after != before or neighbours(maze, here) == [before]
 
@@ -50,12 +50,12 @@ def test_exploration_goes_everywhere_it_can() -> None:
     while edge:
         edge = [cell for here in edge for cell in neighbours(maze, here) if cell not in there]
         there.update(edge)
-    assert set(exploration(maze, loop[0], 20_000, stream(1, "path"))) == there
+    assert set(exploration_route(maze, loop[0], 20_000, stream(1, "path"))) == there
 
 
 @pytest.mark.parametrize("word", ["", "CAB", "C A"])
 def test_another_word_is_refused(word: str, refused: Callable[..., InputError]) -> None:
-    refused(lambda: circuits(SQUARE, word), "simulation.path.circuits", repr(word))
+    refused(lambda: circuit_route(SQUARE, word), "simulation.path.circuits", repr(word))
 
 
 def test_a_way_through_a_wall_is_named(refused: Callable[..., InputError]) -> None:
@@ -63,24 +63,26 @@ def test_a_way_through_a_wall_is_named(refused: Callable[..., InputError]) -> No
     rows = [[(x, y) for x in range(7)] for y in range(5)]
     blocked = next([a, b] for row in rows for a, b in pairwise(row) if not is_open(maze, a, b))
     said = f"the wall between cells {blocked[0]} and {blocked[1]}"
-    refused(lambda: checked(maze, blocked), "simulation.path.cells[0] to [1]", said)
-    refused(lambda: checked(maze, [(0, 0), (7, 0)]), "cells[1]", "cell (7, 0)", "columns 0 to 6")
-    refused(lambda: checked(maze, [(0, -1), (0, 0)]), "cells[0]", "cell (0, -1)", "rows 0 to 4")
-    refused(lambda: checked(maze, [(0, 0), (0, 0)]), "cells[0] to [1]", "neighbouring")
-    refused(lambda: checked(maze, [*loop[:2], loop[5]], "here"), "here[1] to [2]", "neighbouring")
+    refused(lambda: check_route(maze, blocked), "simulation.path.cells[0] to [1]", said)
+    refused(lambda: check_route(maze, [(0, 0), (7, 0)]), "cells[1]", "cell (7, 0)", "columns 0 to 6")
+    refused(lambda: check_route(maze, [(0, -1), (0, 0)]), "cells[0]", "cell (0, -1)", "rows 0 to 4")
+    refused(lambda: check_route(maze, [(0, 0), (0, 0)]), "cells[0] to [1]", "neighbouring")
+    refused(lambda: check_route(maze, [*loop[:2], loop[5]], "here"), "here[1] to [2]", "neighbouring")
 
 
 def test_there_is_no_way_out_of_a_closed_cell(refused: Callable[..., InputError]) -> None:
-    refused(lambda: exploration(closed(3, 3), (1, 1), 5, stream(0, "path")), "cell (1, 1) is walled in")
+    refused(
+        lambda: exploration_route(closed_maze(3, 3), (1, 1), 5, stream(0, "path")), "cell (1, 1) is walled in"
+    )
 
 
 @given(st.integers(0, 1000))
 def test_a_loop_is_turned_the_right_way_round(seed: int) -> None:
     _, loop = world(seed)
-    assert anticlockwise(loop) == loop
-    assert anticlockwise([loop[0], *loop[:0:-1]]) == loop
+    assert make_anticlockwise(loop) == loop
+    assert make_anticlockwise([loop[0], *loop[:0:-1]]) == loop
 
 
 def test_a_loop_is_four_different_cells_at_least(refused: Callable[..., InputError]) -> None:
-    refused(lambda: anticlockwise([*SQUARE, *SQUARE]), "simulation.path.loop", "cell (0, 0) twice")
-    refused(lambda: anticlockwise([]), "0 cells")
+    refused(lambda: make_anticlockwise([*SQUARE, *SQUARE]), "simulation.path.loop", "cell (0, 0) twice")
+    refused(lambda: make_anticlockwise([]), "0 cells")

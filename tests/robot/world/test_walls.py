@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robot.world.maze import random_loop, scattered, walls
-from robot.world.walls import FREE, Surroundings, Walls
+from robot.world.maze import random_loop, random_maze, wall_boxes
+from robot.world.walls import NO_CONTACT, Surroundings, Walls
 from tactile.base.random_streams import stream
 from tactile.whiskers.head_geometry import Head, HeadConfig, RingConfig, shaft_points, ur10_head
 
@@ -30,7 +30,9 @@ HEADS = {
 
 def maze_of(seed: int, heights: tuple[float, ...] = (0.05,)) -> Walls:
     loop = random_loop(3, 3, 8, stream(seed, "maze.loop"))
-    return walls(scattered(3, 3, loop, 0.6, stream(seed, "maze.walls")), stream(seed, "heights"), heights)
+    return wall_boxes(
+        random_maze(3, 3, loop, 0.6, stream(seed, "maze.walls")), stream(seed, "heights"), heights
+    )
 
 
 def marched(head: Head, boxes: Walls, pose: np.ndarray, sweep: float) -> tuple[np.ndarray, np.ndarray]:
@@ -46,7 +48,7 @@ def marched(head: Head, boxes: Walls, pose: np.ndarray, sweep: float) -> tuple[n
         inside |= (west < x) & (x < east) & (south < y) & (y < north) & (point[..., 2] < height)
     hit = inside.any(axis=1)
     first = np.argmax(hit, axis=0)
-    return np.where(hit.any(axis=0), angle[first], FREE), inside[first, :, np.arange(shape[2])].T
+    return np.where(hit.any(axis=0), angle[first], NO_CONTACT), inside[first, :, np.arange(shape[2])].T
 
 
 @pytest.mark.parametrize("name", HEADS)
@@ -89,8 +91,8 @@ def test_a_lone_wall_is_met_by_the_tip_on_its_top_and_by_the_shaft_behind_it() -
     assert (angle, reach) == pytest.approx((np.pi / 2 - np.arccos(0.6), 1.0))
     angle, reach = met(0.02, 0.03, 0.06)  # the edge 3 cm out and 4 cm below the base
     assert (angle, reach) == pytest.approx((np.pi / 2 - np.arctan2(0.03, 0.04), 0.5))
-    assert met(0.09, 0.2, 0.04)[0] == FREE  # the tip lands short of it
-    assert met(-0.2, -0.1, 0.04)[0] == FREE  # behind
+    assert met(0.09, 0.2, 0.04)[0] == NO_CONTACT  # the tip lands short of it
+    assert met(-0.2, -0.1, 0.04)[0] == NO_CONTACT  # behind
 
 
 @settings(max_examples=30)
@@ -122,5 +124,5 @@ def test_many_questions_have_the_answers_of_each(seed: int, count: int) -> None:
 
 def test_far_from_everything_nothing_is_met() -> None:
     contact = Surroundings(maze_of(0), ur10_head(HeadConfig())).contact(np.array([[30.0, -20.0, 1.0]]))
-    assert (contact.angle == FREE).all()
+    assert (contact.angle == NO_CONTACT).all()
     assert (contact.wall == -1).all()

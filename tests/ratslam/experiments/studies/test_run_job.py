@@ -66,7 +66,7 @@ def test_pace_and_what_ran_before_change_no_figure(tiny):
 
 def test_the_grid_filter_is_judged_by_its_map(tmp_path):
     (tmp_path / "study.yaml").write_text(
-        f"base: {ROOT}/configs/create_arena.yaml\nset: {{roving.reports: 30, grid.particles: 8}}\n"
+        f"base: {ROOT}/configs/create_arena.yaml\nset: {{create_simulation.reports: 30, grid.particles: 8}}\n"
     )
     (job,) = jobs(read_study(tmp_path / "study.yaml"))
     result = run_job(job)

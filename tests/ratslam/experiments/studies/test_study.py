@@ -108,7 +108,11 @@ def test_seeds_are_no_part_of_the_hash_and_the_base_may_have_any(folder):
 
 @pytest.mark.parametrize(
     ("base", "section"),
-    [("whisker_maze.yaml", "simulation"), ("create_arena.yaml", "roving"), ("square.yaml", "session")],
+    [
+        ("whisker_maze.yaml", "simulation"),
+        ("create_arena.yaml", "create_simulation"),
+        ("square.yaml", "session"),
+    ],
 )
 def test_seeds_are_of_what_is_run_on(folder, base, section):
     found = jobs(read(folder, base=ROOT / "configs" / base, seeds=[3, 8]))

@@ -22,7 +22,7 @@ from robot.drivers.head.protocol import (
 from robot.emulators.head.config import CONTROL_PORT, HeadEmulatorConfig
 from robot.emulators.head.device import BLOCK, EmulatedHead
 from robot.emulators.head.pose_source import AlongPath, PoseSource
-from robot.world.scene import KidnapConfig, Scene, scene
+from robot.world.scene import KidnapConfig, Scene, make_scene
 from robot.world.walls import Walls
 from tactile.whiskers.head_geometry import ur10_head
 from tests.helpers.live import Faults, emulator
@@ -42,7 +42,9 @@ def drive(mode: FeedbackMode = FeedbackMode.RCP, threshold: float = 0.04, **chan
 
 def world(config: HeadEmulatorConfig) -> Scene:
     """Of a configuration."""
-    return scene(config.maze, config.path, config.motion, KidnapConfig(), ur10_head(config.head), config.seed)
+    return make_scene(
+        config.maze, config.path, config.motion, KidnapConfig(), ur10_head(config.head), config.seed
+    )
 
 
 class Told:

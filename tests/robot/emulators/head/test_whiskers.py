@@ -20,9 +20,9 @@ from robot.drivers.ur10.base_transform import BaseTransformConfig, tcp_from_pose
 from robot.emulators.head.config import HeadEmulatorConfig
 from robot.emulators.head.device import BLOCK
 from robot.emulators.head.pose_source import AHEAD, AlongPath, CarriedByArm
-from robot.simulation.head.quasistatic import quasistatic
-from robot.simulation.head.whisk_stream import cycles
-from robot.world.head_trajectory import Path
+from robot.simulation.head.quasistatic import simulate_quasistatic
+from robot.simulation.head.whisk_stream import simulate_cycles
+from robot.world.head_trajectory import HeadPath
 from robot.world.walls import Surroundings
 from tactile.base.random_streams import stream
 from tactile.whiskers.head_geometry import HeadConfig
@@ -68,8 +68,8 @@ def test_a_head_on_its_way_feels_what_the_simulator_says(mode: FeedbackMode, fre
     whisking = WhiskingConfig(mode=mode.name.lower(), rate=frequency, gain=told.gain)
     start = np.arange(3 * frequency) / frequency
     knots = {"batch": 1, "poses": samples // head.bridge.samples}
-    raw = cycles(
-        quasistatic,
+    raw = simulate_cycles(
+        simulate_quasistatic,
         config.stream.model_copy(update=knots),
         config.mechanics,
         whisking,
@@ -108,7 +108,7 @@ def test_an_arm_carries_the_head_as_if_it_stood_there(lift: float) -> None:
     arm = Arm()
     arm.put(0.0, pose.tolist(), lift)
     lower = walls._replace(height=walls.height - lift)
-    stays = AlongPath(Path(np.zeros(1), pose[None]))
+    stays = AlongPath(HeadPath(np.zeros(1), pose[None]))
     found = []
     for head in (Told(config, walls, CarriedByArm(arm, PLACING)), Told(config, lower, stays)):
         head.start()

@@ -10,11 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robot.simulation.create.session import Rover, RovingConfig, drive_into_wall, roving
-from robot.simulation.create.state_machine import State
+from robot.simulation.create.session import (
+    CreateSimulation,
+    CreateSimulationConfig,
+    drive_into_wall,
+)
+from robot.simulation.create.state_machine import CreateState
 from robot.sources.source import Sample, Source
-from robot.world.arena import inside, segments, text
-from robot.world.polygons import distance
+from robot.world.arena import arena_text, in_free_space, wall_segments
+from robot.world.polygons import segment_distance
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.se2 import between, compose, wrap
@@ -23,17 +27,17 @@ from tactile.base.types import MotionKind, Report, StepEnd
 SHORT = {"reports": 150}
 
 
-def made(**changes: Any) -> Rover:
-    return roving(RovingConfig.model_validate(SHORT | changes))
+def made(**changes: Any) -> CreateSimulation:
+    return CreateSimulation(CreateSimulationConfig.model_validate(SHORT | changes))
 
 
 @cache
-def session(seed: int, side: float = 1.25) -> Rover:
-    return roving(RovingConfig.model_validate({"seed": seed, "arena": {"side": side}}))
+def session(seed: int, side: float = 1.25) -> CreateSimulation:
+    return CreateSimulation(CreateSimulationConfig.model_validate({"seed": seed, "arena": {"side": side}}))
 
 
-def column(rover: Rover, name: str) -> np.ndarray:
-    return np.array([getattr(step, name) for step in rover.steps])
+def column(simulation: CreateSimulation, name: str) -> np.ndarray:
+    return np.array([getattr(step, name) for step in simulation.steps])
 
 
 def leaves(sample: Sample) -> Iterator[bytes]:
@@ -72,10 +76,10 @@ def test_streams_are_independent() -> None:
     assert (other.truth == base.truth).all()
     assert all((a.strain == b.strain).all() for a, b in zip(base.steps, other.steps, strict=True))
     elsewhere = made(behaviour={"turn": {"share": 0.0}})
-    assert text(elsewhere.arena) == text(base.arena)
+    assert arena_text(elsewhere.arena) == arena_text(base.arena)
     assert (elsewhere.truth != base.truth).any()
     one, two = (made(seed=seed, arena={"seed": 7}) for seed in (1, 2))
-    assert text(one.arena) == text(two.arena)
+    assert arena_text(one.arena) == arena_text(two.arena)
     assert (one.odometry[:20] != two.odometry[:20]).any()
 
 
@@ -83,34 +87,34 @@ def test_the_digest_tells_what_was_asked_for(tmp_path: Path) -> None:
     base = made()
     path, again = tmp_path / "room.txt", tmp_path / "copy.txt"
     room = base.arena._replace(objects=base.arena.objects[1:])
-    path.write_text(text(room))
-    again.write_text("# the same\n" + text(room))
+    path.write_text(arena_text(room))
+    again.write_text("# the same\n" + arena_text(room))
     filed = made(arena={"file": path})
     sessions = [base, made(seed=3), made(whiskers={"noise": 1e-6}), filed, made(arena={"side": 2.5})]
     assert len({one.digest for one in sessions}) == len(sessions)
     assert made(arena={"file": again}).digest == filed.digest  # what is in the file counts, not where it lies
     assert str(tmp_path) not in filed.info.to_json()
-    config = RovingConfig.model_validate({"arena": {"file": "room.txt"}}).resolved(tmp_path)
+    config = CreateSimulationConfig.model_validate({"arena": {"file": "room.txt"}}).resolved(tmp_path)
     assert config.arena.file == path
-    assert text(filed.arena) == text(room)
+    assert arena_text(filed.arena) == arena_text(room)
 
 
 def test_a_session_is_what_its_samples_say() -> None:
-    rover = session(0)
-    samples = list(rover)
-    assert len(samples) == rover.length
-    assert (rover.whiskers, rover.view_shape, rover.info.raw_whiskers) == (4, (1, 4, 1), True)
-    assert rover.rate_hz == pytest.approx(2.0)
+    simulation = session(0)
+    samples = list(simulation)
+    assert len(samples) == simulation.length
+    assert (simulation.whiskers, simulation.view_shape, simulation.info.raw_whiskers) == (4, (1, 4, 1), True)
+    assert simulation.rate_hz == pytest.approx(2.0)
     assert samples[-1].time >= 360 > samples[-2].time
-    before = rover.arena.start
-    for sample, step in zip(samples, rover.steps, strict=True):
+    before = simulation.arena.start
+    for sample, step in zip(samples, simulation.steps, strict=True):
         report = sample.reading
         assert isinstance(report, Report)
         assert report.motion == step.state.motion
         assert report.odometry.dt == pytest.approx(step.duration)
         assert report.contact.shape == report.alive.shape == (4,)
         assert report.strain.shape == (len(report.time), 4, 2)
-        if step.state == State.FWD2:
+        if step.state == CreateState.FWD2:
             assert len(report.time) == round(step.duration * 2000) > 0
             assert np.allclose(report.time, np.arange(len(report.time)) / 2000)
         else:
@@ -123,17 +127,17 @@ def test_a_session_is_what_its_samples_say() -> None:
             assert abs(moved[2]) < 1e-12
             assert np.sign(moved[0]) == np.sign(report.odometry.dx)
         before = sample.truth
-    assert (np.abs(rover.truth[:, 2]) <= np.pi).all()
+    assert (np.abs(simulation.truth[:, 2]) <= np.pi).all()
     samples[0].truth[:] = 9  # a reader's own copy
     samples[0].reading.contact[:] = True
-    assert not np.all(next(iter(rover)).truth == 9)
-    assert not next(iter(rover)).reading.contact.all()
+    assert not np.all(next(iter(simulation)).truth == 9)
+    assert not next(iter(simulation)).reading.contact.all()
 
 
 def test_without_noise_odometry_leads_along_the_truth() -> None:
-    rover = made(wheels={"noise": "none"})
-    pose = rover.arena.start
-    for sample in rover:
+    simulation = made(wheels={"noise": "none"})
+    pose = simulation.arena.start
+    for sample in simulation:
         pose = compose(pose, np.array(sample.reading.odometry[:3]))
         assert np.allclose(pose[:2], sample.truth[:2], atol=1e-9)
         assert abs(wrap(pose[2] - sample.truth[2])) < 1e-9
@@ -142,31 +146,37 @@ def test_without_noise_odometry_leads_along_the_truth() -> None:
 @pytest.mark.parametrize("seed", range(4))
 def test_the_machine_goes_its_way(seed: int) -> None:
     """Forward until contact, on slowly, back, a turn, forward; moments are told where they belong."""
-    rover = session(seed)
-    state, moment, contact = (column(rover, name) for name in ("state", "moment", "contact"))
+    simulation = session(seed)
+    state, moment, contact = (column(simulation, name) for name in ("state", "moment", "contact"))
     follows = {
-        State.FWD1: {StepEnd.FREE: State.FWD1, StepEnd.HIT1: State.FWD2, StepEnd.ABORT: State.BACK},
-        State.FWD2: {StepEnd.HIT2: State.BACK, StepEnd.ABORT: State.BACK},
-        State.BACK: {StepEnd.FREE: State.TURN},
+        CreateState.FWD1: {
+            StepEnd.FREE: CreateState.FWD1,
+            StepEnd.HIT1: CreateState.FWD2,
+            StepEnd.ABORT: CreateState.BACK,
+        },
+        CreateState.FWD2: {StepEnd.HIT2: CreateState.BACK, StepEnd.ABORT: CreateState.BACK},
+        CreateState.BACK: {StepEnd.FREE: CreateState.TURN},
     }
     for now, how, then in zip(state[:-1], moment[:-1], state[1:], strict=True):
-        if now == State.TURN:
-            assert then in ((State.TURN, State.FWD1) if how == StepEnd.FREE else (State.BACK,))
+        if now == CreateState.TURN:
+            assert then in (
+                (CreateState.TURN, CreateState.FWD1) if how == StepEnd.FREE else (CreateState.BACK,)
+            )
         else:
             assert follows[now][how] == then
     assert contact[moment == StepEnd.HIT1].any(axis=1).all()
-    assert not contact[(state == State.FWD1) & (moment == StepEnd.FREE)].any()
-    durations = column(rover, "duration")
-    assert durations[state != State.FWD2].max() <= 0.5 + 1e-9
-    assert durations[state == State.FWD2].max() <= 2.0 + 1e-9
+    assert not contact[(state == CreateState.FWD1) & (moment == StepEnd.FREE)].any()
+    durations = column(simulation, "duration")
+    assert durations[state != CreateState.FWD2].max() <= 0.5 + 1e-9
+    assert durations[state == CreateState.FWD2].max() <= 2.0 + 1e-9
     assert durations.min() > 0
 
 
 @pytest.mark.parametrize(("seed", "side"), [(0, 1.25), (1, 1.25), (2, 2.5), (3, 2.5)])
 def test_the_body_stays_out_of_walls(seed: int, side: float) -> None:
-    rover = session(seed, side)
-    assert inside(rover.arena, rover.truth[:, :2]).all()
-    room = distance(segments(rover.arena), rover.truth[:, :2]).min()
+    simulation = session(seed, side)
+    assert in_free_space(simulation.arena, simulation.truth[:, :2]).all()
+    room = segment_distance(wall_segments(simulation.arena), simulation.truth[:, :2]).min()
     assert room > 0.17 - 0.05 * 0.01 - 1e-6  # one look's way
 
 
@@ -174,18 +184,18 @@ def test_six_minutes_are_as_in_the_paper() -> None:
     """About 30 contacts and more, 3 to 4 circuits, anticlockwise, not all of them with a second contact."""
     counts = []
     for seed in range(12):
-        rover = session(seed)
-        state, moment = column(rover, "state"), column(rover, "moment")
-        middle = rover.arena.outer.mean(axis=0)
-        bearing = np.unwrap(np.arctan2(*(rover.truth[:, :2] - middle).T[::-1]))
-        slow = state == State.FWD2
+        simulation = session(seed)
+        state, moment = column(simulation, "state"), column(simulation, "moment")
+        middle = simulation.arena.outer.mean(axis=0)
+        bearing = np.unwrap(np.arctan2(*(simulation.truth[:, :2] - middle).T[::-1]))
+        slow = state == CreateState.FWD2
         counts.append(
             [
-                rover.length,
+                simulation.length,
                 (moment == StepEnd.HIT1).sum(),
                 (bearing[-1] - bearing[0]) / (2 * np.pi),
                 (moment[slow] == StepEnd.HIT2).mean(),
-                ((state == State.TURN) & (moment == StepEnd.ABORT)).sum(),
+                ((state == CreateState.TURN) & (moment == StepEnd.ABORT)).sum(),
             ]
         )
     reports, hits, circuits, seconds, stuck = np.array(counts).T
@@ -199,16 +209,16 @@ def test_six_minutes_are_as_in_the_paper() -> None:
 
 
 def test_whiskers_that_are_dead_never_report() -> None:
-    rover = made(whiskers={"dead": [0, 3]})
-    assert not column(rover, "contact")[:, [0, 3]].any()
-    assert (next(iter(rover)).reading.alive == [False, True, True, False]).all()
+    simulation = made(whiskers={"dead": [0, 3]})
+    assert not column(simulation, "contact")[:, [0, 3]].any()
+    assert (next(iter(simulation)).reading.alive == [False, True, True, False]).all()
     alone = made(whiskers={"dead": [0, 1, 2, 3]})  # nothing but its bumper
     assert not column(alone, "contact").any()
     assert (column(alone, "moment") == StepEnd.ABORT).any()
 
 
 def into(angle_deg: float, seed: int = 0, **changes: Any) -> Report:
-    config = RovingConfig.model_validate(changes)
+    config = CreateSimulationConfig.model_validate(changes)
     return drive_into_wall(config, np.radians(angle_deg), stream(seed, "templates"))
 
 
@@ -256,4 +266,6 @@ def test_a_wall_that_cannot_be_driven_into_is_refused(refused: Callable[..., Inp
     for angle in (0, 180, 270):
         with pytest.raises(ValueError, match="does not drive"):
             into(angle)
-    refused(lambda: into(90, behaviour={"contact": 0.9, "safety": 1.0}), "roving.behaviour.contact")
+    refused(
+        lambda: into(90, behaviour={"contact": 0.9, "safety": 1.0}), "create_simulation.behaviour.contact"
+    )

@@ -10,15 +10,15 @@ from pydantic import ValidationError
 
 from robot.simulation.create.state_machine import (
     BehaviourConfig,
-    Command,
-    Doing,
-    State,
+    CreateState,
+    MachineState,
     TurnConfig,
-    command,
-    ended,
-    following,
-    moved,
-    turn,
+    WheelCommand,
+    draw_turn,
+    drive,
+    motion_end,
+    next_state,
+    wheel_command,
 )
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose
@@ -34,59 +34,59 @@ def quiet() -> np.ndarray:
 
 
 def end_of(
-    state: State, strain: np.ndarray, bumped: int = ROWS, before: np.ndarray = NONE
+    state: CreateState, strain: np.ndarray, bumped: int = ROWS, before: np.ndarray = NONE
 ) -> tuple[int, StepEnd]:
-    end = ended(CONFIG, state, strain, np.arange(ROWS) >= bumped, before)
+    end = motion_end(CONFIG, state, strain, np.arange(ROWS) >= bumped, before)
     return end.row, end.moment
 
 
 @pytest.mark.parametrize(
     ("state", "moment", "then"),
     [
-        (State.FWD1, StepEnd.FREE, State.FWD1),
-        (State.FWD1, StepEnd.HIT1, State.FWD2),
-        (State.FWD1, StepEnd.ABORT, State.BACK),
-        (State.FWD2, StepEnd.HIT2, State.BACK),
-        (State.FWD2, StepEnd.ABORT, State.BACK),
-        (State.BACK, StepEnd.FREE, State.TURN),
-        (State.TURN, StepEnd.FREE, State.FWD1),
-        (State.TURN, StepEnd.ABORT, State.BACK),
+        (CreateState.FWD1, StepEnd.FREE, CreateState.FWD1),
+        (CreateState.FWD1, StepEnd.HIT1, CreateState.FWD2),
+        (CreateState.FWD1, StepEnd.ABORT, CreateState.BACK),
+        (CreateState.FWD2, StepEnd.HIT2, CreateState.BACK),
+        (CreateState.FWD2, StepEnd.ABORT, CreateState.BACK),
+        (CreateState.BACK, StepEnd.FREE, CreateState.TURN),
+        (CreateState.TURN, StepEnd.FREE, CreateState.FWD1),
+        (CreateState.TURN, StepEnd.ABORT, CreateState.BACK),
     ],
 )
-def test_what_follows_what(state: State, moment: StepEnd, then: State) -> None:
-    doing = following(CONFIG, Doing(state), moment, 0.0, stream(0, "behaviour"))
+def test_what_follows_what(state: CreateState, moment: StepEnd, then: CreateState) -> None:
+    doing = next_state(CONFIG, MachineState(state), moment, 0.0, stream(0, "behaviour"))
     assert doing.state == then
-    assert (doing.rest != 0) == (then == State.TURN)
+    assert (doing.rest != 0) == (then == CreateState.TURN)
 
 
 def test_a_turn_is_made_in_steps_that_add_up() -> None:
     random = stream(0, "behaviour")
     for _ in range(50):
-        doing = following(CONFIG, Doing(State.BACK), StepEnd.FREE, 0.0, random)
+        doing = next_state(CONFIG, MachineState(CreateState.BACK), StepEnd.FREE, 0.0, random)
         whole, total, steps = doing.rest, 0.0, 0
-        while doing.state == State.TURN:
-            told = command(CONFIG, doing)
+        while doing.state == CreateState.TURN:
+            told = wheel_command(CONFIG, doing)
             assert told.speed == 0
             assert told.duration <= 0.5
             total += told.rate * told.duration
-            doing = following(CONFIG, doing, StepEnd.FREE, told.rate * told.duration, random)
+            doing = next_state(CONFIG, doing, StepEnd.FREE, told.rate * told.duration, random)
             steps += 1
-        assert doing.state == State.FWD1
+        assert doing.state == CreateState.FWD1
         assert total == pytest.approx(whole, abs=1e-5)
         assert steps == max(1, int(np.ceil(abs(whole) / 0.15 - 1e-4)))
 
 
 def test_a_turn_can_be_one_step() -> None:
     config = BehaviourConfig(turn=TurnConfig(step=None))
-    told = command(config, Doing(State.TURN, -1.2))
-    assert told == Command(0.0, -0.3, pytest.approx(4.0))
+    told = wheel_command(config, MachineState(CreateState.TURN, -1.2))
+    assert told == WheelCommand(0.0, -0.3, pytest.approx(4.0))
 
 
 def test_speeds_and_times_are_the_papers() -> None:
-    assert command(CONFIG, Doing(State.FWD1)) == (0.05, 0.0, 0.5)
-    assert command(CONFIG, Doing(State.BACK)) == (-0.05, 0.0, 0.5)
-    assert command(CONFIG, Doing(State.FWD2))[:2] == (0.02, 0.0)
-    assert [state.motion for state in State] == [
+    assert wheel_command(CONFIG, MachineState(CreateState.FWD1)) == (0.05, 0.0, 0.5)
+    assert wheel_command(CONFIG, MachineState(CreateState.BACK)) == (-0.05, 0.0, 0.5)
+    assert wheel_command(CONFIG, MachineState(CreateState.FWD2))[:2] == (0.02, 0.0)
+    assert [state.motion for state in CreateState] == [
         MotionKind.FORWARD,
         MotionKind.FORWARD,
         MotionKind.BACK,
@@ -96,7 +96,7 @@ def test_speeds_and_times_are_the_papers() -> None:
 
 def drawn(**changes: object) -> np.ndarray:
     config, random = TurnConfig.model_validate(changes), stream(1, "behaviour")
-    return np.array([turn(config, random) for _ in range(4000)])
+    return np.array([draw_turn(config, random) for _ in range(4000)])
 
 
 def test_turns_are_drawn_from_the_two_gaussians() -> None:
@@ -112,9 +112,9 @@ def test_turns_are_drawn_from_the_two_gaussians() -> None:
 
 
 def test_an_undisturbed_motion_ends_as_planned() -> None:
-    for state in (State.FWD1, State.BACK, State.TURN):
+    for state in (CreateState.FWD1, CreateState.BACK, CreateState.TURN):
         assert end_of(state, quiet()) == (ROWS - 1, StepEnd.FREE)
-    assert end_of(State.FWD2, quiet()) == (ROWS - 1, StepEnd.ABORT)
+    assert end_of(CreateState.FWD2, quiet()) == (ROWS - 1, StepEnd.ABORT)
 
 
 @given(st.integers(0, ROWS - 2), st.integers(0, ROWS - 2), st.integers(0, ROWS - 2), st.sampled_from([-1, 1]))
@@ -125,8 +125,8 @@ def test_the_first_thing_ends_it(touch: int, over: int, bump: int, sign: int) ->
     stop = min(over, bump)
     # What is over the safety threshold is over the contact threshold as well: too much comes first.
     expected = (touch, StepEnd.HIT1) if touch < stop else (stop, StepEnd.ABORT)
-    assert end_of(State.FWD1, strain, bump) == expected
-    assert end_of(State.BACK, strain, bump) == (bump, StepEnd.FREE)
+    assert end_of(CreateState.FWD1, strain, bump) == expected
+    assert end_of(CreateState.BACK, strain, bump) == (bump, StepEnd.FREE)
 
 
 @given(st.integers(0, 3), st.integers(0, 3), st.integers(10, ROWS - 2))
@@ -137,16 +137,16 @@ def test_a_second_whisker_is_another_one(first: int, second: int, row: int) -> N
     strain[row:, second, 0] = -2 * CONFIG.contact
     other = second != first
     expected = (row, StepEnd.HIT2) if other else (ROWS - 1, StepEnd.ABORT)
-    assert end_of(State.FWD2, strain, before=before) == expected
+    assert end_of(CreateState.FWD2, strain, before=before) == expected
     # Also when the first one has slipped off by then.
     strain[row - 5 :, first] = 0
     strain[row:, second, 0] = -2 * CONFIG.contact
-    assert end_of(State.FWD2, strain, before=before) == expected
+    assert end_of(CreateState.FWD2, strain, before=before) == expected
 
 
 def test_two_whiskers_at_once_are_felt_for_a_while() -> None:
     before = np.array([False, True, True, False])
-    row, moment = end_of(State.FWD2, quiet(), before=before)
+    row, moment = end_of(CreateState.FWD2, quiet(), before=before)
     assert moment == StepEnd.HIT2
     assert row == round(CONFIG.least / CONFIG.period)
 
@@ -155,15 +155,15 @@ def test_too_much_in_either_channel_ends_it() -> None:
     for channel in (0, 1):
         strain = quiet()
         strain[7:, 3, channel] = -1.1 * CONFIG.safety
-        assert end_of(State.FWD2, strain) == (7, StepEnd.ABORT)
+        assert end_of(CreateState.FWD2, strain) == (7, StepEnd.ABORT)
 
 
 def test_a_turn_may_get_a_whisker_out_of_what_it_is_in() -> None:
     strain = quiet()
     strain[:, 1, 0] = np.linspace(2.0, 0.5, ROWS) * CONFIG.safety
-    assert end_of(State.TURN, strain) == (ROWS - 1, StepEnd.FREE)
+    assert end_of(CreateState.TURN, strain) == (ROWS - 1, StepEnd.FREE)
     strain[:, 1, 0] = np.linspace(1.2, 2.0, ROWS) * CONFIG.safety
-    row, moment = end_of(State.TURN, strain)
+    row, moment = end_of(CreateState.TURN, strain)
     assert moment == StepEnd.ABORT
     assert 0 < row < ROWS - 1
 
@@ -173,8 +173,8 @@ def test_motions_are_straight_or_on_the_spot(
     x: float, y: float, heading: float, how: tuple[float, float]
 ) -> None:
     pose, time = np.array([x, y, heading]), np.linspace(0.0, 2.0, 9)
-    told = Command(*how, 2.0)
-    poses = moved(told, pose, time)
+    told = WheelCommand(*how, 2.0)
+    poses = drive(told, pose, time)
     steps = np.column_stack([how[0] * time, 0 * time, how[1] * time])
     there = compose(pose, steps)
     assert np.allclose(poses[:, :2], there[:, :2])

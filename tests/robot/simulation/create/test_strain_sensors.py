@@ -11,38 +11,38 @@ from pydantic import ValidationError
 from robot.simulation.create.strain_sensors import (
     ShakeConfig,
     WhiskersConfig,
-    among,
-    fan,
-    sampled,
-    shaken,
-    strained,
+    base_strains,
+    bend_whiskers,
+    body_vibration,
+    fixed_whiskers,
+    sample_strain,
 )
-from robot.simulation.create.whisker_bending import Bent, Shaft, base_strain, bent, tilt
-from robot.world.arena import Arena, fits, segments
-from robot.world.polygons import crossing, distance, edges, square
-from robot.world.random_arena import ArenaConfig, arena
+from robot.simulation.create.whisker_bending import Bending, Shaft, base_strain, bend_shafts, shaft_tilt
+from robot.world.arena import Arena, has_clearance, wall_segments
+from robot.world.polygons import polygon_edges, segment_distance, segments_cross, square
+from robot.world.random_arena import ArenaConfig, make_arena
 from tactile.base.random_streams import stream
 from tactile.features.contact import ShaftConfig, stiffness
 
 SEEDS = st.integers(0, 10**6)
 CONFIG = WhiskersConfig()
-FAN = fan(CONFIG)
+FAN = fixed_whiskers(CONFIG)
 LENGTH = FAN.shaft.length
 FREE = np.zeros(4, int)
 
 
 def placed(seed: int) -> tuple[Arena, np.ndarray]:
     """An arena with rotated objects and free poses [50, 3] in it, most of them near walls."""
-    made, random = arena(ArenaConfig(rotated=True), seed % 20), np.random.default_rng(seed)
+    made, random = make_arena(ArenaConfig(rotated=True), seed % 20), np.random.default_rng(seed)
     poses = random.uniform([0, 0, -np.pi], [1.25, 1.25, np.pi], (4000, 3))
-    near = distance(segments(made), poses[:, :2]).min(axis=1) < 0.25
-    return made, poses[near & fits(made, poses[:, :2], 0.17)][:50]
+    near = segment_distance(wall_segments(made), poses[:, :2]).min(axis=1) < 0.25
+    return made, poses[near & has_clearance(made, poses[:, :2], 0.17)][:50]
 
 
-def each(poses: np.ndarray, walls: np.ndarray) -> Bent:
+def each(poses: np.ndarray, walls: np.ndarray) -> Bending:
     """Whiskers at poses that have nothing to do with one another."""
-    alone = [among(FAN, pose[None], walls, FREE) for pose in poses]
-    return Bent(*(np.concatenate(column) for column in zip(*alone, strict=True)))
+    alone = [bend_whiskers(FAN, pose[None], walls, FREE) for pose in poses]
+    return Bending(*(np.concatenate(column) for column in zip(*alone, strict=True)))
 
 
 def lines(poses: np.ndarray, turn: np.ndarray, reach: np.ndarray) -> np.ndarray:
@@ -58,9 +58,9 @@ def lines(poses: np.ndarray, turn: np.ndarray, reach: np.ndarray) -> np.ndarray:
 @given(SEEDS)
 def test_whiskers_are_bent_where_they_would_enter_walls(seed: int) -> None:
     made, poses = placed(seed)
-    walls, felt = segments(made), each(poses, segments(made))
+    walls, felt = wall_segments(made), each(poses, wall_segments(made))
     straight = lines(poses, np.zeros((len(poses), 4)), np.full((len(poses), 4), LENGTH))
-    assert ((felt.turn != 0) == crossing(straight, walls).any(axis=1).reshape(-1, 4)).all()
+    assert ((felt.turn != 0) == segments_cross(straight, walls).any(axis=1).reshape(-1, 4)).all()
     assert (np.sign(felt.turn) == felt.side).all()
     assert (felt.turn != 0).sum() > 10
 
@@ -69,13 +69,13 @@ def test_whiskers_are_bent_where_they_would_enter_walls(seed: int) -> None:
 @given(SEEDS)
 def test_a_bent_whisker_touches_a_wall_and_enters_none(seed: int) -> None:
     made, poses = placed(seed)
-    walls, felt = segments(made), each(poses, segments(made))
+    walls, felt = wall_segments(made), each(poses, wall_segments(made))
     held = (felt.turn != 0).ravel()
     reached = lines(poses, felt.turn, felt.reach)[held]
-    assert distance(walls, reached[:, 2:]).min(axis=1).max() < 1e-6
+    assert segment_distance(walls, reached[:, 2:]).min(axis=1).max() < 1e-6
     # A hair shorter and turned a hair further, the line to the contact crosses nothing.
     clear = lines(poses, felt.turn + 1e-7 * felt.side, felt.reach - 1e-5)[held]
-    assert not crossing(clear, walls).any()
+    assert not segments_cross(clear, walls).any()
     assert (felt.reach <= LENGTH * (1 + 1e-9)).all()
 
 
@@ -84,19 +84,21 @@ def test_a_bent_whisker_touches_a_wall_and_enters_none(seed: int) -> None:
 def test_it_gives_way_by_the_least_turn(seed: int) -> None:
     """With any lesser turn, to either side, the straight shaft would be in a wall; with more it would not."""
     made, poses = placed(seed)
-    walls, felt = segments(made), each(poses, segments(made))
+    walls, felt = wall_segments(made), each(poses, wall_segments(made))
     held, whole = felt.turn != 0, np.full(felt.turn.shape, LENGTH)
     for share in np.linspace(-0.999, 0.999, 14):
-        blocked = crossing(lines(poses, share * felt.turn, whole), walls).any(axis=1).reshape(-1, 4)
+        blocked = segments_cross(lines(poses, share * felt.turn, whole), walls).any(axis=1).reshape(-1, 4)
         assert blocked[held].all()
-    beyond = crossing(lines(poses, felt.turn + 1e-6 * felt.side, whole), walls).any(axis=1).reshape(-1, 4)
+    beyond = (
+        segments_cross(lines(poses, felt.turn + 1e-6 * felt.side, whole), walls).any(axis=1).reshape(-1, 4)
+    )
     assert not beyond[felt.reach > LENGTH - 1e-9].any()
     assert flat(felt)[beyond].all()  # lying along a wall takes less
 
 
-def flat(felt: Bent) -> np.ndarray:
+def flat(felt: Bending) -> np.ndarray:
     """Whiskers of which the shaft lies along what it touches, a wall or a corner."""
-    return np.isclose((tilt(FAN.shaft, felt.reach) - 1) * np.abs(felt.turn), felt.lean, atol=1e-6)
+    return np.isclose((shaft_tilt(FAN.shaft, felt.reach) - 1) * np.abs(felt.turn), felt.lean, atol=1e-6)
 
 
 @settings(max_examples=15)
@@ -105,9 +107,9 @@ def test_it_does_not_matter_where_the_world_is(seed: int, x: float, y: float, an
     made, poses = placed(seed)
     c, s = np.cos(angle), np.sin(angle)
     turn = np.array([[c, -s], [s, c]])
-    walls = (segments(made).reshape(-1, 2) @ turn.T + [x, y]).reshape(-1, 4)
+    walls = (wall_segments(made).reshape(-1, 2) @ turn.T + [x, y]).reshape(-1, 4)
     moved = np.column_stack([poses[:, :2] @ turn.T + [x, y], poses[:, 2] + angle])
-    here, there = each(poses, segments(made)), each(moved, walls)
+    here, there = each(poses, wall_segments(made)), each(moved, walls)
     assert np.allclose(here.turn, there.turn, atol=1e-7)
     assert np.allclose(here.reach, there.reach, atol=1e-7)
 
@@ -117,11 +119,11 @@ def test_it_does_not_matter_where_the_world_is(seed: int, x: float, y: float, an
 def test_a_mirrored_world_is_felt_mirrored(seed: int) -> None:
     made, poses = placed(seed)
     mirror = np.array([1.0, -1.0])
-    walls = (segments(made).reshape(-1, 2) * mirror).reshape(-1, 4)
-    here = each(poses, segments(made))
+    walls = (wall_segments(made).reshape(-1, 2) * mirror).reshape(-1, 4)
+    here = each(poses, wall_segments(made))
     there = each(poses * [1, -1, -1], walls)
     assert np.allclose(here.turn, -there.turn[:, ::-1], atol=1e-9)  # the fan is symmetric
-    one, other = strained(CONFIG, FAN, here), strained(CONFIG, FAN, there)
+    one, other = base_strains(CONFIG, FAN, here), base_strains(CONFIG, FAN, there)
     assert np.allclose(one[..., 0], -other[:, ::-1, 0], atol=1e-12)
 
 
@@ -132,9 +134,9 @@ def test_a_motion_can_be_cut_anywhere(seed: int, cut: int) -> None:
     made, poses = placed(seed)
     assume(len(poses) > 0)
     way = poses[0] + np.linspace(0, 1, 60)[:, None] * [0.03, -0.02, 1.5]
-    whole = among(FAN, way, segments(made), FREE)
-    first = among(FAN, way[:cut], segments(made), FREE)
-    second = among(FAN, way[cut:], segments(made), first.side[-1])
+    whole = bend_whiskers(FAN, way, wall_segments(made), FREE)
+    first = bend_whiskers(FAN, way[:cut], wall_segments(made), FREE)
+    second = bend_whiskers(FAN, way[cut:], wall_segments(made), first.side[-1])
     for column, one, two in zip(whole, first, second, strict=True):
         assert (column == np.concatenate([one, two])).all()
 
@@ -144,7 +146,7 @@ def test_a_whisker_keeps_to_its_side() -> None:
     base, direction = np.zeros((40, 1, 2)), np.zeros((40, 1))
     tips = np.radians(np.linspace(85, 95, 40))
     turns = [
-        bent(
+        bend_shafts(
             FAN.shaft,
             base[:1],
             direction[:1],
@@ -158,16 +160,16 @@ def test_a_whisker_keeps_to_its_side() -> None:
     assert (np.array(turns[40:]) < 0).all()
     # Turned on the spot before one wall, from one side of straight on to the other.
     wall = np.array([[0.13, -1.0, 0.13, 1.0]])
-    felt = bent(FAN.shaft, base, np.linspace(0.1, -0.1, 40)[:, None], wall, np.zeros(1, int))
+    felt = bend_shafts(FAN.shaft, base, np.linspace(0.1, -0.1, 40)[:, None], wall, np.zeros(1, int))
     assert (felt.side == 1).all()
-    assert bent(FAN.shaft, base[:1], -np.full((1, 1), 0.1), wall, np.zeros(1, int)).side[0, 0] == -1
+    assert bend_shafts(FAN.shaft, base[:1], -np.full((1, 1), 0.1), wall, np.zeros(1, int)).side[0, 0] == -1
 
 
 def test_a_tip_slides_a_shaft_lies_flat_and_a_corner_is_slipped_off() -> None:
     wall = np.array([[-1.0, 0.0, 1.0, 0.0]])
     height = np.linspace(0.0999, 0.02, 400)  # of the base above the wall, seen at 45 degrees
     base = np.stack([np.zeros(400), height], axis=1)[:, None]
-    felt = bent(FAN.shaft, base, np.full((400, 1), -np.pi / 4), wall, np.zeros(1, int))
+    felt = bend_shafts(FAN.shaft, base, np.full((400, 1), -np.pi / 4), wall, np.zeros(1, int))
     turn, reach = felt.turn[:, 0], felt.reach[:, 0]
     touching = turn != 0
     assert touching.argmax() > 0
@@ -181,12 +183,14 @@ def test_a_tip_slides_a_shaft_lies_flat_and_a_corner_is_slipped_off() -> None:
     assert (np.diff(reach[lies]) < 0).all()
     assert np.abs(np.diff(reach)).max() < 3e-3  # nothing jumps
     # Where it lies on the wall it has turned into the wall's direction.
-    assert np.allclose(turn[lies] * tilt(FAN.shaft, reach[lies]), np.pi / 4)
+    assert np.allclose(turn[lies] * shaft_tilt(FAN.shaft, reach[lies]), np.pi / 4)
 
     # Swept past the corner of an object: held back further and further by it, then free at once.
-    sides = edges(square(np.array([0.12, 0.1]), 0.2, np.pi / 4))
+    sides = polygon_edges(square(np.array([0.12, 0.1]), 0.2, np.pi / 4))
     sweep = np.linspace(-0.7, 0.7, 400)
-    felt = bent(FAN.shaft, np.zeros((400, 1, 2)), sweep[:, None], sides + [0.09, -0.1] * 2, np.zeros(1, int))
+    felt = bend_shafts(
+        FAN.shaft, np.zeros((400, 1, 2)), sweep[:, None], sides + [0.09, -0.1] * 2, np.zeros(1, int)
+    )
     turn, reach = felt.turn[:, 0], felt.reach[:, 0]
     held = turn != 0
     assert held.any()
@@ -200,10 +204,10 @@ def test_a_tip_slides_a_shaft_lies_flat_and_a_corner_is_slipped_off() -> None:
 
 def test_a_wall_out_of_reach_is_not_felt() -> None:
     wall = np.array([[0.0, 0.5, 1.0, 0.5]])
-    felt = among(FAN, np.zeros((3, 3)), wall, FREE)
+    felt = bend_whiskers(FAN, np.zeros((3, 3)), wall, FREE)
     for column, value in zip(felt, (0.0, LENGTH, 0.0, 0), strict=True):
         assert (column == value).all()
-    nothing = among(FAN, np.zeros((3, 3)), np.zeros((0, 4)), FREE)
+    nothing = bend_whiskers(FAN, np.zeros((3, 3)), np.zeros((0, 4)), FREE)
     for one, other in zip(felt, nothing, strict=True):
         assert (one == other).all()
 
@@ -220,7 +224,7 @@ def test_moments_are_those_of_a_tapered_beam(reach: float, taper: float) -> None
 
     slope = integral(curvature)
     turn = integral(slope)[-1] / reach
-    assert tilt(shaft, np.array(reach)) == pytest.approx(slope[-1] / turn, rel=1e-4)
+    assert shaft_tilt(shaft, np.array(reach)) == pytest.approx(slope[-1] / turn, rel=1e-4)
     assert base_strain(shaft, np.array(turn), np.array(reach)) == pytest.approx(
         0.7e-3 * curvature[0], rel=1e-4
     )
@@ -239,8 +243,8 @@ def test_horizontal_strain_tells_the_side_and_vertical_the_slant() -> None:
     def felt(angle: float) -> np.ndarray:
         """[2] of a whisker pointing down at the wall by the angle, its tip bent aside by 0.1 rad."""
         base = np.array([[[0.0, LENGTH * np.sin(angle - 0.1)]]])
-        one = bent(FAN.shaft, base, np.array([[-angle]]), wall, np.zeros(1, int))
-        return strained(CONFIG, FAN._replace(alive=np.ones(1, bool)), one)[0, 0]
+        one = bend_shafts(FAN.shaft, base, np.array([[-angle]]), wall, np.zeros(1, int))
+        return base_strains(CONFIG, FAN._replace(alive=np.ones(1, bool)), one)[0, 0]
 
     steep, slanting = felt(1.2), felt(0.5)
     assert steep[0] == pytest.approx(slanting[0])
@@ -251,19 +255,19 @@ def test_horizontal_strain_tells_the_side_and_vertical_the_slant() -> None:
 
 def test_dead_whiskers_feel_nothing() -> None:
     config = WhiskersConfig(dead=(1, 2))
-    one = fan(config)
-    felt = among(one, np.zeros((5, 3)), np.array([[0.25, -1.0, 0.25, 1.0]]), FREE)
-    strain = strained(config, one, felt)
+    one = fixed_whiskers(config)
+    felt = bend_whiskers(one, np.zeros((5, 3)), np.array([[0.25, -1.0, 0.25, 1.0]]), FREE)
+    strain = base_strains(config, one, felt)
     assert (felt.turn[:, 1:3] != 0).all()
     assert (strain[:, 1:3] == 0).all()
-    read = sampled(config, np.ones((9, 4, 2)), one.alive, stream(0, "strain"))
+    read = sample_strain(config, np.ones((9, 4, 2)), one.alive, stream(0, "strain"))
     assert (read[:, 1:3] == 0).all()
     assert (read[:, [0, 3]] != 1).all()
 
 
 def test_the_body_shakes_at_its_frequency_and_calms_down() -> None:
     config = ShakeConfig()
-    shakes = np.array([shaken(config, 4000, 2000.0, stream(seed, "strain")) for seed in range(60)])
+    shakes = np.array([body_vibration(config, 4000, 2000.0, stream(seed, "strain")) for seed in range(60)])
     power = (np.abs(np.fft.rfft(shakes, axis=1)) ** 2).mean(axis=(0, 2))
     frequency = np.fft.rfftfreq(4000, 1 / 2000.0)
     assert abs(frequency[power.argmax()] - config.frequency) < 2
@@ -271,17 +275,19 @@ def test_the_body_shakes_at_its_frequency_and_calms_down() -> None:
     late = shakes[:, 2000:].std()
     assert late == pytest.approx(config.rumble, rel=0.1)
     assert shakes[:, :100].std() > 2 * late
-    assert shaken(config, 0, 2000.0, stream(0, "strain")).shape == (0, 2)
+    assert body_vibration(config, 0, 2000.0, stream(0, "strain")).shape == (0, 2)
 
 
 def test_sensors_add_the_noise_that_was_asked_for() -> None:
     calm = CONFIG.model_copy(update={"shake": ShakeConfig(start=0.0, rumble=0.0)})
     true = np.linspace(0, 1e-3, 3000)[:, None, None] * np.ones((1, 4, 2))
-    error = sampled(calm, true, FAN.alive, stream(0, "strain")) - true
+    error = sample_strain(calm, true, FAN.alive, stream(0, "strain")) - true
     assert error.std() == pytest.approx(calm.noise, rel=0.03)
     assert abs(error.mean()) < 0.05 * calm.noise
     # The body's vibration is the same for all whiskers, each channel with its own.
-    shaking = sampled(CONFIG.model_copy(update={"noise": 0.0}), true, FAN.alive, stream(0, "strain")) - true
+    shaking = (
+        sample_strain(CONFIG.model_copy(update={"noise": 0.0}), true, FAN.alive, stream(0, "strain")) - true
+    )
     assert np.allclose(shaking, shaking[:, :1])
     assert not np.allclose(shaking[..., 0], shaking[..., 1])
 

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from robot.simulation.create.session import RovingConfig, drive_into_wall, roving
-from robot.world.arena import segments
-from robot.world.polygons import distance
+from robot.simulation.create.session import CreateSimulation, CreateSimulationConfig, drive_into_wall
+from robot.world.arena import wall_segments
+from robot.world.polygons import segment_distance
 from robot.world.random_arena import ArenaConfig
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose
@@ -26,7 +26,7 @@ from tactile.wall_estimation.strain_templates import (
 )
 from tests.helpers.flat_walls import apart
 
-CONFIG = RovingConfig()
+CONFIG = CreateSimulationConfig()
 TRAINING = TemplateTraining()
 POINTS = contact_points(ReportFrontendConfig().feelers, 0.13)
 ARENAS = range(4)
@@ -109,9 +109,9 @@ def scored(templates: StrainTemplates, side: float) -> dict[str, Score]:
     meetings = 0
     off: dict[str, list[float]] = {name: [] for name in CONFIGS}
     for seed in ARENAS:
-        world = roving(RovingConfig(arena=ArenaConfig(side=side), reports=500, seed=seed))
+        world = CreateSimulation(CreateSimulationConfig(arena=ArenaConfig(side=side), reports=500, seed=seed))
         reporting = {name: ReportFrontend(config, templates) for name, config in CONFIGS.items()}
-        walls = segments(world.arena)
+        walls = wall_segments(world.arena)
         before: tuple[Report, np.ndarray] | None = None
         for _, reading, truth in world:
             assert isinstance(reading, Report)
@@ -122,7 +122,7 @@ def scored(templates: StrainTemplates, side: float) -> dict[str, Score]:
                 hit, there = before
                 level = np.abs(reading.strain[:20, :, 0].mean(axis=0)) * hit.contact
                 point = compose(there, np.array([*POINTS[int(level.argmax())], 0.0]))[:2]
-                x1, y1, x2, y2 = walls[distance(walls, point[None])[0].argmin()]
+                x1, y1, x2, y2 = walls[segment_distance(walls, point[None])[0].argmin()]
                 true = float(np.arctan2(y2 - y1, x2 - x1) - truth[2])
                 for name, one in seen.items():
                     assert one is not None

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.simulation.create.wheel_odometry import WheelsConfig, reckoned
+from robot.simulation.create.wheel_odometry import WheelsConfig, simulate_wheel_odometry
 from tactile.base.random_streams import stream
 from tactile.base.types import MotionKind
 
@@ -30,7 +30,9 @@ def scales(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Told over true, of what moves in each step, and the kinds."""
     motion, kind = driven(count)
-    told = reckoned(WheelsConfig(noise=noise, level=level), motion, kind, stream(seed, "wheels"))
+    told = simulate_wheel_odometry(
+        WheelsConfig(noise=noise, level=level), motion, kind, stream(seed, "wheels")
+    )
     column = np.where(kind == MotionKind.TURN, 2, 0)
     rows = np.arange(count)
     return told[rows, column] / motion[rows, column], kind
@@ -40,20 +42,20 @@ def scales(
 def test_only_what_moves_is_told_wrong(seed: int, noise: str) -> None:
     motion, kind = driven(40)
     config = WheelsConfig(noise=noise)
-    told = reckoned(config, motion, kind, stream(seed, "wheels"))
+    told = simulate_wheel_odometry(config, motion, kind, stream(seed, "wheels"))
     assert (told[motion == 0] == 0).all()
     assert (told[:, 3] == motion[:, 3]).all()
-    assert (told == reckoned(config, motion, kind, stream(seed, "wheels"))).all()
+    assert (told == simulate_wheel_odometry(config, motion, kind, stream(seed, "wheels"))).all()
     if noise != "none":
-        assert (told != reckoned(config, motion, kind, stream(seed + 1, "wheels"))).any()
+        assert (told != simulate_wheel_odometry(config, motion, kind, stream(seed + 1, "wheels"))).any()
     assert (motion == driven(40)[0]).all()
 
 
 def test_without_noise_it_is_the_truth() -> None:
     motion, kind = driven(30)
     for config in (WheelsConfig(noise="none"), WheelsConfig(noise="move", level=0.0)):
-        assert (reckoned(config, motion, kind, stream(0, "wheels")) == motion).all()
-    assert reckoned(WheelsConfig(), motion[:0], kind[:0], stream(0, "wheels")).shape == (0, 4)
+        assert (simulate_wheel_odometry(config, motion, kind, stream(0, "wheels")) == motion).all()
+    assert simulate_wheel_odometry(WheelsConfig(), motion[:0], kind[:0], stream(0, "wheels")).shape == (0, 4)
 
 
 def test_white_noise_is_of_its_level_and_independent() -> None:

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from robot.simulation.head.beam import StreamConfig
 from robot.simulation.head.kinematic import MechanicsConfig
-from robot.simulation.head.quasistatic import advance, quasistatic, rest
-from robot.simulation.head.whisk_stream import Sweep
-from robot.world.walls import FREE
+from robot.simulation.head.quasistatic import advance_balance, simulate_quasistatic, whiskers_at_rest
+from robot.simulation.head.whisk_stream import WallSweep
+from robot.world.walls import NO_CONTACT
 from tactile.base.random_streams import stream
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 from tactile.whiskers.whisking import WhiskDrive, WhiskingConfig, whisk_command
@@ -21,19 +21,19 @@ HEAD = ur10_head(HeadConfig())
 SAMPLES, CYCLES = 80, 3
 
 
-def sweep() -> Sweep:
+def sweep() -> WallSweep:
     """Walls that come, go and slide."""
     random = stream(0, "walls")
     size = (SAMPLES, CYCLES, 18)
     wall = np.repeat(random.uniform(0.2, 1.4, (8, CYCLES, 18)), SAMPLES // 8, axis=0)
-    wall = np.where(random.random((1, CYCLES, 18)) < 0.3, FREE, wall)
+    wall = np.where(random.random((1, CYCLES, 18)) < 0.3, NO_CONTACT, wall)
     noise = 2e-3 * random.standard_normal((CYCLES, SAMPLES, 18, 3))
     reach, drift = random.uniform(0.3, 1.0, size), random.normal(0, 0.2, size)
-    return Sweep(np.arange(SAMPLES) / SAMPLES, wall, reach, drift, noise)
+    return WallSweep(np.arange(SAMPLES) / SAMPLES, wall, reach, drift, noise)
 
 
-def part(whole: Sweep, some: slice) -> Sweep:
-    return Sweep(*(column[some] for column in whole[:-1]), whole.noise[:, some])
+def part(whole: WallSweep, some: slice) -> WallSweep:
+    return WallSweep(*(column[some] for column in whole[:-1]), whole.noise[:, some])
 
 
 @given(
@@ -47,11 +47,11 @@ def test_a_cycle_in_parts_is_the_cycle(cuts: list[int], mode: str) -> None:
         return whisk_command(whisking, drive, time, told, threshold, HEAD.shape)
 
     ends = [0, *sorted(cuts), SAMPLES]
-    balance, parts = rest(CYCLES, 18), []
+    balance, parts = whiskers_at_rest(CYCLES, 18), []
     for first, last in itertools.pairwise(ends):
-        found, balance = advance(config, mechanics, law, part(whole, slice(first, last)), balance)
+        found, balance = advance_balance(config, mechanics, law, part(whole, slice(first, last)), balance)
         parts.append(found)
-    once = quasistatic(config, mechanics, whisking, HEAD, whole, threshold)
+    once = simulate_quasistatic(config, mechanics, whisking, HEAD, whole, threshold)
     assert (once[2] > 0).any()
     assert balance.slipped.any()
     for k, column in enumerate(once):
@@ -65,9 +65,9 @@ def test_a_beginning_is_not_used_up() -> None:
     def law(drive: WhiskDrive, time: float, told: np.ndarray) -> tuple[np.ndarray, WhiskDrive]:
         return whisk_command(whisking, drive, time, told, np.full(18, 0.04), HEAD.shape)
 
-    before = rest(CYCLES, 18)
-    first = advance(config, mechanics, law, whole, before)
-    second = advance(config, mechanics, law, whole, before)
+    before = whiskers_at_rest(CYCLES, 18)
+    first = advance_balance(config, mechanics, law, whole, before)
+    second = advance_balance(config, mechanics, law, whole, before)
     assert all(np.array_equal(a, b) for a, b in zip(first[0], second[0], strict=True))
     assert not before.touching.any()
     assert not before.slipped.any()

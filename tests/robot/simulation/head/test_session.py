@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from robot.recordings.mcap_reader import Recording, record
-from robot.simulation.head.session import Simulation, SimulationConfig, simulated, tier
-from robot.sources.in_memory import collected
+from robot.recordings.mcap_reader import Recording, record_source
+from robot.simulation.head.session import HeadSimulation, SimulationConfig, choose_tier
+from robot.sources.in_memory import load_into_memory
 from robot.sources.odometry import OdometryConfig
 from robot.sources.source import Sample, Source
-from robot.touch_source import head_of, sensing
-from robot.world.maze import CELL, text
+from robot.touch_source import head_config_of, open_touch_source
+from robot.world.maze import CELL_SIDE, maze_text
 from tactile.base.errors import InputError
 from tactile.base.se2 import between, wrap
 from tactile.base.types import Cycle, Observation, Whisk
@@ -28,8 +28,8 @@ from tactile.whiskers.head_geometry import HeadConfig, RingConfig
 SHORT = {"path": {"circuits": "CA"}}
 
 
-def made(head: HeadConfig | None = None, **changes: Any) -> Simulation:
-    return simulated(SimulationConfig.model_validate(SHORT | changes), head)
+def made(head: HeadConfig | None = None, **changes: Any) -> HeadSimulation:
+    return HeadSimulation(SimulationConfig.model_validate(SHORT | changes), head)
 
 
 def leaves(sample: Sample) -> Iterator[bytes]:
@@ -62,7 +62,7 @@ def test_a_session_has_the_same_bits_every_time() -> None:
 
 def test_the_digest_tells_what_was_asked_for(tmp_path: Path) -> None:
     maze = tmp_path / "maze.txt"
-    maze.write_text(text(made().scene.maze))
+    maze.write_text(maze_text(made().scene.maze))
     loop = made().scene.loop
     sessions = [
         made(),
@@ -93,13 +93,13 @@ def test_streams_are_independent() -> None:
     assert fuller.scene.loop == base.scene.loop
     assert (fuller.truth == base.truth).all()
     rough = made(motion={"jitter": {"position": 0.005}})
-    assert text(rough.scene.maze) == text(base.scene.maze)
+    assert maze_text(rough.scene.maze) == maze_text(base.scene.maze)
     assert (rough.truth != base.truth).any()
 
 
 def test_one_maze_can_have_many_sessions() -> None:
     one, two = (made(seed=seed, maze={"seed": 7}) for seed in (1, 2))
-    assert text(one.scene.maze) == text(two.scene.maze)
+    assert maze_text(one.scene.maze) == maze_text(two.scene.maze)
     assert one.scene.loop == two.scene.loop
     assert (one.odometry[:99] != two.odometry[:99]).any()
 
@@ -114,7 +114,7 @@ def test_a_session_is_what_its_samples_say() -> None:
     assert session.view_shape == (3, 6, 1)
     truth = np.array([sample.truth for sample in samples])
     assert (truth[:, :2] > 0).all()
-    assert (truth[:, :2] < [7 * CELL, 5 * CELL]).all()
+    assert (truth[:, :2] < [7 * CELL_SIDE, 5 * CELL_SIDE]).all()
     assert (np.abs(truth[:, 2]) <= np.pi).all()
     felt = [sample.reading for sample in samples]
     assert all(isinstance(reading, Whisk) for reading in felt)
@@ -179,7 +179,7 @@ def test_later_another_maze_is_felt() -> None:
 def test_exploration_lasts_as_long_as_asked() -> None:
     session = made(path={"explore": 400.0})
     assert session.length == 400
-    cells = {tuple(cell) for cell in np.floor(session.truth[:, :2] / CELL).astype(int)}
+    cells = {tuple(cell) for cell in np.floor(session.truth[:, :2] / CELL_SIDE).astype(int)}
     assert len(cells) > 12
     carried = made(path={"explore": 400.0}, kidnaps={"count": 2, "ahead": 60.0})
     assert carried.length == 400
@@ -191,7 +191,7 @@ def test_given_cells_are_gone_through(tmp_path: Path) -> None:
     (tmp_path / "maze.txt").write_text("o---o---o\n|       |\no   o   o\n|   |   |\no---o---o\n")
     cells = [(0, 0), (0, 1), (1, 1), (1, 0)]
     session = made(maze={"file": tmp_path / "maze.txt"}, path={"cells": cells})
-    passed = [tuple(cell) for cell in np.floor(session.truth[:, :2] / CELL).astype(int).tolist()]
+    passed = [tuple(cell) for cell in np.floor(session.truth[:, :2] / CELL_SIDE).astype(int).tolist()]
     assert list(dict.fromkeys(passed)) == cells
     assert made(maze={"file": tmp_path / "maze.txt"}, path={"explore": 60}).length == 60
 
@@ -252,7 +252,7 @@ def test_what_cannot_be_simulated_is_named(
     for name, drawing in {"ROOM": ROOM, "BLOCKED": BLOCKED}.items():
         (tmp_path / name).write_text(drawing)
     config = SimulationConfig.model_validate(changes).resolved(tmp_path)
-    refused(lambda: simulated(config, head), *said)
+    refused(lambda: HeadSimulation(config, head), *said)
 
 
 def test_a_low_head_may_go_where_its_whiskers_are_free(tmp_path: Path) -> None:
@@ -280,10 +280,10 @@ def test_a_configuration_written_out_asks_for_the_same() -> None:
 
 
 def test_the_cheapest_tier_that_serves_is_taken() -> None:
-    assert tier(SimulationConfig()).name == "kinematic"
-    assert tier(SimulationConfig(raw=True)).name == "quasistatic"
-    assert tier(SimulationConfig(fidelity="dynamic")).name == "dynamic"
-    assert all(tier(SimulationConfig(raw=raw)).why for raw in (False, True))
+    assert choose_tier(SimulationConfig()).name == "kinematic"
+    assert choose_tier(SimulationConfig(raw=True)).name == "quasistatic"
+    assert choose_tier(SimulationConfig(fidelity="dynamic")).name == "dynamic"
+    assert all(choose_tier(SimulationConfig(raw=raw)).why for raw in (False, True))
 
 
 @pytest.mark.parametrize("name", ["quasistatic", "dynamic"])
@@ -300,7 +300,10 @@ def test_raw_sessions_have_the_same_bits_every_time_and_feel_what_the_others_do(
     simple = made(**changes | {"fidelity": "kinematic"})
     assert (raw.truth == simple.truth).all()
     assert (raw.odometry == simple.odometry).all()
-    felt = [np.array([s.reading.contact for s in sensing(source, TouchConfig())]) for source in (raw, simple)]
+    felt = [
+        np.array([s.reading.contact for s in open_touch_source(source, TouchConfig())])
+        for source in (raw, simple)
+    ]
     assert (felt[0] == felt[1]).mean() > 0.85
     assert felt[0].mean() > 0.1
     assert raw.info.calibration is not None
@@ -310,26 +313,26 @@ def test_raw_sessions_have_the_same_bits_every_time_and_feel_what_the_others_do(
 def test_a_recorded_session_is_the_session(radial: bool, raw: bool, tmp_path: Path) -> None:
     head = HeadConfig(dead=(2,), rest_deg=70.0)
     session = made(head, raw=raw, path={"explore": 6.0 if raw else 60.0})
-    record(session, tmp_path / "a.mcap")
+    record_source(session, tmp_path / "a.mcap")
     again = Recording(tmp_path / "a.mcap")
     assert bits(again) == bits(session)
     assert again.info == session.info
     assert again.info.raw_whiskers
-    assert head_of(again.info, HeadConfig()) == head
-    assert head_of(again.info, HeadConfig(dead=(4,))) == head.model_copy(update={"dead": (4,)})
+    assert head_config_of(again.info, HeadConfig()) == head
+    assert head_config_of(again.info, HeadConfig(dead=(4,))) == head.model_copy(update={"dead": (4,)})
     touch = TouchConfig(head=head, image=ImageConfig(radial=radial))
-    seen = [sensing(source, touch) for source in (session, again)]
+    seen = [open_touch_source(source, touch) for source in (session, again)]
     assert seen[0].view_shape == seen[1].view_shape == (3, 6, 1 + radial)
     assert bits(seen[0]) == bits(seen[1])
     observed = next(iter(seen[0])).reading
     assert isinstance(observed, Observation)
     assert not observed.alive[2]
-    assert sensing(seen[0], touch) is seen[0]
+    assert open_touch_source(seen[0], touch) is seen[0]
 
 
 def test_a_session_in_memory_is_the_session() -> None:
-    source = sensing(made(HeadConfig(dead=(5,))), TouchConfig())
-    log = collected(source)
+    source = open_touch_source(made(HeadConfig(dead=(5,))), TouchConfig())
+    log = load_into_memory(source)
     assert (log.length, log.view_shape, log.whiskers) == (source.length, (3, 6, 1), 18)
     assert log.info == source.info
     assert log.info.cell_size == 0.05
@@ -341,16 +344,16 @@ def test_a_session_in_memory_is_the_session() -> None:
 
 
 def test_whiskers_are_not_taken_for_observations(refused: Callable[..., InputError]) -> None:
-    refused(lambda: collected(made()), "simulation", "nothing but whiskers")
+    refused(lambda: load_into_memory(made()), "simulation", "nothing but whiskers")
 
 
 def test_another_head_than_the_recorded_one_is_refused(
     tmp_path: Path, refused: Callable[..., InputError]
 ) -> None:
-    record(made(path={"explore": 3.0}), tmp_path / "a.mcap")
+    record_source(made(path={"explore": 3.0}), tmp_path / "a.mcap")
     source = Recording(tmp_path / "a.mcap")
     refused(
-        lambda: sensing(source, TouchConfig(head=HeadConfig(whiskers=5))),
+        lambda: open_touch_source(source, TouchConfig(head=HeadConfig(whiskers=5))),
         "touch.head",
         "15 whiskers",
         "18, as a has",

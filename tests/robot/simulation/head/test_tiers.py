@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robot.simulation.head.beam import BeamConfig, StreamConfig, beam, clock
-from robot.simulation.head.dynamic import dynamic
-from robot.simulation.head.kinematic import Felt, MechanicsConfig
-from robot.simulation.head.quasistatic import quasistatic
-from robot.simulation.head.whisk_stream import Tier, cycles, free_cycles
-from robot.world.head_trajectory import MotionConfig, Path, planned
-from robot.world.maze import random_loop, scattered, walls
+from robot.simulation.head.beam import BeamConfig, StreamConfig, beam_time_unit, make_beam
+from robot.simulation.head.dynamic import simulate_dynamic
+from robot.simulation.head.kinematic import MechanicsConfig, WhiskColumns
+from robot.simulation.head.quasistatic import simulate_quasistatic
+from robot.simulation.head.whisk_stream import MechanicsModel, simulate_cycles, simulate_free_cycles
+from robot.world.head_trajectory import HeadPath, MotionConfig, plan_path
+from robot.world.maze import random_loop, random_maze, wall_boxes
 from robot.world.walls import Surroundings, Walls
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
@@ -28,57 +28,65 @@ STREAM, MECHANICS, OPEN, RCP = (
     WhiskingConfig(mode="open"),
     WhiskingConfig(),
 )
-TIERS = pytest.mark.parametrize("tier", [quasistatic, dynamic])
+TIERS = pytest.mark.parametrize("tier", [simulate_quasistatic, simulate_dynamic])
 
 
 def calibration(
-    tier: Tier, mechanics: MechanicsConfig = MECHANICS, config: StreamConfig = STREAM
+    tier: MechanicsModel, mechanics: MechanicsConfig = MECHANICS, config: StreamConfig = STREAM
 ) -> Calibration:
-    record = free_cycles(tier, config, mechanics, OPEN, HEAD, 4, stream(9, "calibration"))
+    record = simulate_free_cycles(tier, config, mechanics, OPEN, HEAD, 4, stream(9, "calibration"))
     return calibrate(CalibrationConfig(), record)
 
 
-def still(wall: Walls) -> tuple[Surroundings, Path]:
-    return Surroundings(wall, HEAD), Path(np.array([0.0, 100.0]), np.zeros((2, 3)))
+def still(wall: Walls) -> tuple[Surroundings, HeadPath]:
+    return Surroundings(wall, HEAD), HeadPath(np.array([0.0, 100.0]), np.zeros((2, 3)))
 
 
 def one(
-    tier: Tier, wall: Walls, whisking: WhiskingConfig, mechanics: MechanicsConfig, path: Path | None = None
+    tier: MechanicsModel,
+    wall: Walls,
+    whisking: WhiskingConfig,
+    mechanics: MechanicsConfig,
+    path: HeadPath | None = None,
 ) -> Cycle:
     there, stays = still(wall)
     limit = np.full(18, 0.04)
     start, random = np.zeros(1), stream(0, "sensor")
-    return next(iter(cycles(tier, STREAM, mechanics, whisking, there, path or stays, start, random, limit)))
+    return next(
+        iter(simulate_cycles(tier, STREAM, mechanics, whisking, there, path or stays, start, random, limit))
+    )
 
 
 LOW = Walls(np.array([[-1.0, -1.0, 1.0, 1.0]]), np.array([0.05]))
 """A table under the whole head: every whisker meets it with its tip."""
 
 
-def maze(count: int) -> tuple[Surroundings, Path, np.ndarray]:
+def maze(count: int) -> tuple[Surroundings, HeadPath, np.ndarray]:
     loop = random_loop(4, 3, 8, stream(0, "maze.loop"))
-    built = walls(scattered(4, 3, loop, 0.6, stream(0, "maze.walls")), stream(0, "maze.heights"))
+    built = wall_boxes(random_maze(4, 3, loop, 0.6, stream(0, "maze.walls")), stream(0, "maze.heights"))
     return (
         Surroundings(built, HEAD),
-        planned(MotionConfig(), loop, stream(0, "motion")),
+        plan_path(MotionConfig(), loop, stream(0, "motion")),
         np.arange(count) * 1.0,
     )
 
 
-def felt(tier: Tier, count: int, whisking: WhiskingConfig, rate: float = 2000.0) -> Felt:
+def felt(tier: MechanicsModel, count: int, whisking: WhiskingConfig, rate: float = 2000.0) -> WhiskColumns:
     config = StreamConfig(rate=rate)
     there, path, start = maze(count)
     known = calibration(tier, config=config)
-    raw = cycles(
+    raw = simulate_cycles(
         tier, config, MECHANICS, whisking, there, path, start, stream(1, "sensor"), known.threshold[:, 1]
     )
     whisks = [detect_contacts(ContactConfig(), known, cycle) for cycle in raw]
-    return Felt(*(np.array([getattr(whisk, name) for whisk in whisks]) for name in Felt._fields))
+    return WhiskColumns(
+        *(np.array([getattr(whisk, name) for whisk in whisks]) for name in WhiskColumns._fields)
+    )
 
 
 @pytest.mark.parametrize("taper", [0.1, 0.2, 0.6])
 def test_the_beam_is_as_stiff_as_theory_where_it_is_loaded(taper: float) -> None:
-    model = beam(ShaftConfig(taper=taper))
+    model = make_beam(ShaftConfig(taper=taper))
     for reach in (1.0, 0.65):
         shape = model.at(np.array(reach))
         loads = np.linalg.solve(model.stiffness, shape)
@@ -88,15 +96,15 @@ def test_the_beam_is_as_stiff_as_theory_where_it_is_loaded(taper: float) -> None
 
 
 def test_a_straight_whisker_rings_as_a_cantilever_does() -> None:
-    first, second = beam(ShaftConfig(taper=1.0)).modes
+    first, second = make_beam(ShaftConfig(taper=1.0)).modes
     # Two shapes can only be stiffer than the whole (Rayleigh and Ritz).
     assert 1.8751**2 <= first < 1.01 * 1.8751**2
     assert 4.6941**2 <= second < 1.1 * 4.6941**2
-    assert clock(BeamConfig(), 0.2) == pytest.approx(4 * clock(BeamConfig(), 0.1))
+    assert beam_time_unit(BeamConfig(), 0.2) == pytest.approx(4 * beam_time_unit(BeamConfig(), 0.1))
 
 
 @TIERS
-def test_free_whiskers_follow_the_command_and_feel_nothing(tier: Tier) -> None:
+def test_free_whiskers_follow_the_command_and_feel_nothing(tier: MechanicsModel) -> None:
     found = calibration(tier)
     np.testing.assert_allclose(found.free, np.radians(65), atol=0.02)
     # Beyond the sensor's noise, the inertia of the long whiskers.
@@ -107,7 +115,9 @@ def test_free_whiskers_follow_the_command_and_feel_nothing(tier: Tier) -> None:
 
 @TIERS
 @pytest.mark.parametrize("servo", [0.2, 1.0])
-def test_drive_and_whisker_share_what_is_commanded_beyond_the_wall(tier: Tier, servo: float) -> None:
+def test_drive_and_whisker_share_what_is_commanded_beyond_the_wall(
+    tier: MechanicsModel, servo: float
+) -> None:
     mechanics = MechanicsConfig(servo=servo, noise=0.0, slip=1.0)
     whisking = WhiskingConfig(mode="open", rate=0.25)
     cycle = one(tier, LOW, whisking, mechanics)
@@ -121,7 +131,7 @@ def test_drive_and_whisker_share_what_is_commanded_beyond_the_wall(tier: Tier, s
 
 
 @TIERS
-def test_whiskers_bent_too_far_slip_off(tier: Tier) -> None:
+def test_whiskers_bent_too_far_slip_off(tier: MechanicsModel) -> None:
     cycle = one(tier, LOW, OPEN, MechanicsConfig(noise=0.0, slip=0.1))
     met = still(LOW)[0].contact(np.zeros((1, 3))).angle[0]
     half = len(cycle.time) // 2
@@ -131,7 +141,7 @@ def test_whiskers_bent_too_far_slip_off(tier: Tier) -> None:
 
 
 @TIERS
-def test_feedback_lessens_the_push(tier: Tier) -> None:
+def test_feedback_lessens_the_push(tier: MechanicsModel) -> None:
     quiet = MechanicsConfig(noise=0.0, slip=1.0)
     most = [one(tier, LOW, whisking, quiet).deflection[..., 1].max(axis=0) for whisking in (OPEN, RCP)]
     assert (most[1] < 0.8 * most[0]).all()
@@ -139,8 +149,8 @@ def test_feedback_lessens_the_push(tier: Tier) -> None:
 
 
 @TIERS
-def test_a_head_that_moves_drags_its_whiskers_sideways_until_they_slide(tier: Tier) -> None:
-    ahead = Path(np.array([0.0, 1.0]), np.array([[0.0, 0, 0], [0.05, 0, 0]]))
+def test_a_head_that_moves_drags_its_whiskers_sideways_until_they_slide(tier: MechanicsModel) -> None:
+    ahead = HeadPath(np.array([0.0, 1.0]), np.array([[0.0, 0, 0], [0.05, 0, 0]]))
     cycle = one(tier, LOW, OPEN, MechanicsConfig(noise=0.0, slip=1.0), ahead)
     x, y = np.abs(cycle.deflection[1000]).T
     across = np.abs(HEAD.swing[:, 1]) > 0.1
@@ -150,11 +160,15 @@ def test_a_head_that_moves_drags_its_whiskers_sideways_until_they_slide(tier: Ti
 
 
 @TIERS
-def test_what_is_felt_does_not_depend_on_how_cycles_are_batched(tier: Tier) -> None:
+def test_what_is_felt_does_not_depend_on_how_cycles_are_batched(tier: MechanicsModel) -> None:
     there, path, start = maze(5)
     limit = np.full(18, 0.04)
     runs = [
-        list(cycles(tier, StreamConfig(batch=n), MECHANICS, RCP, there, path, start, stream(1, "s"), limit))
+        list(
+            simulate_cycles(
+                tier, StreamConfig(batch=n), MECHANICS, RCP, there, path, start, stream(1, "s"), limit
+            )
+        )
         for n in (2, 5)
     ]
     for a, b in zip(*runs, strict=True):
@@ -165,7 +179,9 @@ def test_what_is_felt_does_not_depend_on_how_cycles_are_batched(tier: Tier) -> N
 
 @pytest.mark.parametrize("mode", ["open", "rcp", "spread"])
 def test_the_tiers_tell_of_one_world(mode: str) -> None:
-    slow, quick = (felt(tier, 40, WhiskingConfig(mode=mode)) for tier in (dynamic, quasistatic))
+    slow, quick = (
+        felt(tier, 40, WhiskingConfig(mode=mode)) for tier in (simulate_dynamic, simulate_quasistatic)
+    )
     assert slow.contact.mean() > 0.1
     assert (slow.contact != quick.contact).mean() < 0.02
     assert (slow.held != quick.held).mean() < 0.03
@@ -174,7 +190,7 @@ def test_the_tiers_tell_of_one_world(mode: str) -> None:
 
 
 @TIERS
-def test_the_sample_rate_does_not_matter(tier: Tier) -> None:
+def test_the_sample_rate_does_not_matter(tier: MechanicsModel) -> None:
     usual = felt(tier, 16, RCP)
     for rate in (1000.0, 4000.0):
         other = felt(tier, 16, RCP, rate)
@@ -188,9 +204,9 @@ def test_where_drives_are_soft_feedback_brings_nothing() -> None:
     def kept(servo: float, whisking: WhiskingConfig) -> np.ndarray:
         mechanics = MechanicsConfig(servo=servo)
         there, path, start = maze(30)
-        known = calibration(quasistatic, mechanics)
-        raw = cycles(
-            quasistatic,
+        known = calibration(simulate_quasistatic, mechanics)
+        raw = simulate_cycles(
+            simulate_quasistatic,
             STREAM,
             mechanics,
             whisking,
@@ -209,13 +225,17 @@ def test_where_drives_are_soft_feedback_brings_nothing() -> None:
 
 def test_dead_whiskers_send_nothing_and_are_known_as_dead() -> None:
     head = ur10_head(HeadConfig(dead=(3, 7)))
-    record = free_cycles(quasistatic, STREAM, MECHANICS, OPEN, head, 4, stream(0, "calibration"))
+    record = simulate_free_cycles(
+        simulate_quasistatic, STREAM, MECHANICS, OPEN, head, 4, stream(0, "calibration")
+    )
     assert np.flatnonzero(~calibrate(CalibrationConfig(), record).alive).tolist() == [3, 7]
 
 
 @TIERS
-def test_a_record_among_walls_is_no_calibration(tier: Tier) -> None:
+def test_a_record_among_walls_is_no_calibration(tier: MechanicsModel) -> None:
     there, path, start = maze(6)
-    raw = cycles(tier, STREAM, MECHANICS, OPEN, there, path, start, stream(1, "s"), np.full(18, np.inf))
+    raw = simulate_cycles(
+        tier, STREAM, MECHANICS, OPEN, there, path, start, stream(1, "s"), np.full(18, np.inf)
+    )
     with pytest.raises(InputError, match="contacts of whisker"):
         calibrate(CalibrationConfig(), list(raw))
