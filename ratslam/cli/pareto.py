@@ -15,6 +15,7 @@ from ratslam.cli.common import (
     read_config,
 )
 from ratslam.cli.studies import Progress, settle_threads
+from ratslam.config.completion import complete
 from tactile.base.errors import InputError
 
 CYCLES = 800
@@ -97,11 +98,11 @@ def _size(arguments: argparse.Namespace) -> int:
     from ratslam.experiments.sizing.report import length_text, proposed_text, snippet, tried_text
     from ratslam.experiments.sizing.scene_statistics import cheapest, scene_of
     from ratslam.experiments.sizing.trial_runs import tried
-    from ratslam.pipeline.run import open_source
+    from ratslam.pipeline.source import open_source
 
     path, config = arguments.config, read_config(arguments)
     with open_source(cheapest(config)) as source:
-        scene, config = scene_of(source), config.completed(source)
+        scene, config = scene_of(source), complete(config, source)
     found = proposals(config, scene)
     print(f"{scene.told()}\n\n{proposed_text(found)}\n", flush=True)
     steps = tried(config, found, arguments.cycles)

@@ -11,10 +11,11 @@ import numpy as np
 
 from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.trajectory import ate
+from ratslam.config.completion import complete
 from ratslam.config.run_config import RunConfig
 from ratslam.core.session import CHUNK
-from ratslam.pipeline.run import open_source
-from ratslam.pipeline.runner import session_of
+from ratslam.pipeline.runner import build_session
+from ratslam.pipeline.source import open_source
 from robot.sources.source import Sample, Source
 from robot.touch_source import observation_of, open_touch_source
 from tactile.base.errors import InputError
@@ -81,14 +82,14 @@ def report(found: Sequence[Compared]) -> str:
 def _played(config: RunConfig) -> tuple[Compared, Compared]:
     """What a configuration's backend made of its session, and what dead reckoning makes of it."""
     with open_source(config) as source:
-        config = config.completed(source)
+        config = complete(config, source)
         if not source.whiskers:
             raise InputError(
                 source.name, "no whiskers", "a session of whiskers", "the grid filter needs them"
             )
         source = open_touch_source(source, config.touch)
         samples = _known(source)
-        session = session_of(config, source)
+        session = build_session(config, source)
     reports: list[Observation] = [observation_of(sample) for sample in samples]
     told: list[np.ndarray] = []
     chunks: list[float] = []

@@ -41,6 +41,7 @@ class MappingJob(NamedTuple):
     Attributes:
         config: with `recording` being what the session is recorded to. info: as in the recording.
         directory: the new run directory. view_shape, whiskers, rate_hz: of the samples.
+        extent_m: largest distance from the start along x or y on the planned path, m.
     """
 
     config: RunConfig
@@ -49,6 +50,7 @@ class MappingJob(NamedTuple):
     view_shape: tuple[int, int, int]
     whiskers: int
     rate_hz: float
+    extent_m: float
 
 
 class MappedSample(NamedTuple):
@@ -237,31 +239,32 @@ def run_mapper(line: Connection) -> None:
 
 
 def _map(line: Connection) -> None:
+    from ratslam.config.completion import complete
     from ratslam.core.types import Action
-    from ratslam.pipeline.runner import playing
+    from ratslam.pipeline.runner import open_runner
     from robot.touch_source import open_touch_source
     from tactile.base.types import Odometry, observation
 
     order = line.recv()
     with PipeSource(order, line) as fed:
-        config = order.config.completed(fed)
+        config = complete(order.config, fed, order.extent_m)
         source = open_touch_source(fed, config.touch)
-        with playing(config, source, order.directory) as play:
+        with open_runner(config, source, order.directory) as runner:
             _redirect_stderr(order.directory / LOG)
             blank = observation(
                 Odometry(0.0, 0.0, 0.0, 0.0), view_shape=source.view_shape, whiskers=source.whiskers
             )
-            play.session.warm(blank)
+            runner.session.warm(blank)
             line.send(True)
             for number, sample in enumerate(source):
-                (step,) = play.feed([sample])
+                (step,) = runner.process([sample])
                 action = Action(int(step.estimate.action)).name.lower()
                 took = time.monotonic() - fed.received
                 _send(
                     line, MappedSample(number, np.asarray(step.pose), int(step.estimate.place), action, took)
                 )
-            if play.session.steps:
-                _send(line, play.finish(fed.interrupted))
+            if runner.session.steps:
+                _send(line, runner.finish(fed.interrupted))
 
 
 def _send(line: Connection, word: Any) -> None:

@@ -18,7 +18,7 @@ from evaluation.metrics.scorecard import Scorecard
 from ratslam.config.run_config import RunConfig
 from ratslam.core.session import CHUNK
 from ratslam.live.mapper_process import Mapper, MappingJob
-from ratslam.pipeline.run import interrupts
+from ratslam.pipeline.run import catch_interrupt
 from robot.drivers.outcome import Fault, SessionOutcome
 from robot.live.recorder import LiveRecorder
 from robot.live.rig import OperatorStop, Rig, SessionFault
@@ -87,7 +87,7 @@ def run_live_session(
         raise InputError(str(directory), "exists already", "a new run directory", "choose another with -o")
     tell(check_disk(config.live, directory))
     handed: list[WhiskReport] = []
-    with interrupts("stopping the arm") as stopped, Mapper(mapping) as mapper:
+    with catch_interrupt("stopping the arm") as stopped, Mapper(mapping) as mapper:
         with Rig(config.live, config.touch.head, stopped) as rig:
             try:
                 calibration = _calibrate(rig, config, path, tell)
@@ -121,11 +121,8 @@ def mapping_job(config: RunConfig, path: Way, calibration: Calibration, director
         session = session.model_copy(update={"reserve": rows + CHUNK})
     recording = RecordingConfig(file=directory.resolve() / RECORDING)
     mapped = config.model_copy(update={"live": None, "recording": recording, "session": session})
-    start = path.pose[0]
     return MappingJob(
-        mapped.covering(float(np.abs(path.pose[:, :2] - start[:2]).max()))
-        if config.backend == "grid"
-        else mapped,
+        mapped,
         SourceInfo(
             raw_whiskers=True,
             cell_size=POSE_CELL_SIZE,
@@ -140,6 +137,7 @@ def mapping_job(config: RunConfig, path: Way, calibration: Calibration, director
         view_shape(config.touch.image, head),
         len(head.length),
         rate,
+        float(np.abs(path.pose[:, :2] - path.pose[0, :2]).max()),
     )
 
 

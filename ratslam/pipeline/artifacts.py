@@ -1,4 +1,4 @@
-"""What a run directory keeps of the world and of what was felt, for scores and pictures."""
+"""Writes the world, the whisker views and the grid map to a run directory, for scores and plots."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from evaluation.artifacts.whisker_views import WhiskerViews, write_whisker_views
 from evaluation.metrics.grid_score import score_grid
 from evaluation.metrics.occupancy_grid import GridTruth, OccupancyGrid, cell_centres
 from ratslam.pipeline.run_directory import RunDirectory
-from robot.sources.source import Source
+from robot.sources.source_info import SourceInfo
 from robot.world.arena import Arena, is_enclosed, is_occupied, read_arena, wall_segments
 from robot.world.maze import read_maze, wall_boxes
 from tactile.base.random_streams import stream
@@ -19,58 +19,59 @@ from tactile.base.se2 import compose, inverse
 from tactile.frontend import TouchConfig
 from tactile.whiskers.head_geometry import ur10_head
 
-Felt = tuple[np.ndarray, np.ndarray]
-"""A whisker image: brightness [R, C, K], and which whiskers [W] report at all."""
+WhiskerView = tuple[np.ndarray, np.ndarray]
+"""A whisker image: brightness [R, C, K] in 0..1, and which whiskers work, bool [W]."""
 
 
-def keep_world(source: Source, store: RunDirectory) -> None:
-    """maze.txt and walls.csv, for the pictures, of a source that knows its maze; arena.txt of one that knows
-    its arena."""
-    if source.info.arena is not None:
-        store.text("arena.txt", source.info.arena)
-    maze = source.info.maze
+def save_world(info: SourceInfo, directory: RunDirectory) -> None:
+    """Writes maze.txt and walls.csv of a source in a maze, arena.txt of one in an arena."""
+    if info.arena is not None:
+        directory.text("arena.txt", info.arena)
+    maze = info.maze
     if maze is None:
         return
-    store.text("maze.txt", maze.text)
-    boxes = wall_boxes(read_maze(store.path / "maze.txt"), stream(maze.seed, "maze.heights"), maze.heights)
-    store.file("walls.csv", lambda path: write_walls(path, np.column_stack(boxes)))
+    directory.text("maze.txt", maze.text)
+    boxes = wall_boxes(
+        read_maze(directory.path / "maze.txt"), stream(maze.seed, "maze.heights"), maze.heights
+    )
+    directory.file("walls.csv", lambda path: write_walls(path, np.column_stack(boxes)))
 
 
-def keep_images(felt: list[Felt], config: TouchConfig, store: RunDirectory) -> None:
-    """views.npz, for the pictures, of a source whose views are whisker images."""
+def save_whisker_views(views: list[WhiskerView], config: TouchConfig, directory: RunDirectory) -> None:
+    """Writes views.npz, if the views are images of the whiskers of a head."""
     head = ur10_head(config.head)
-    if not felt or felt[0][0].shape[:2] != head.shape or len(felt[0][1]) != len(head.length):
+    if not views or views[0][0].shape[:2] != head.shape or len(views[0][1]) != len(head.length):
         return
     columns = head.shape[1]
     images = WhiskerViews(
-        view=np.array([view[..., 0] for view, _ in felt]),
-        alive=np.array([alive.reshape(head.shape) for _, alive in felt]),
+        view=np.array([view[..., 0] for view, _ in views]),
+        alive=np.array([alive.reshape(head.shape) for _, alive in views]),
         azimuth=np.arctan2(head.rest[:columns, 1], head.rest[:columns, 0]),
         length=head.length[::columns],
         tallest=config.image.tallest,
     )
-    store.file("views.npz", lambda path: write_whisker_views(path, images))
+    directory.file("views.npz", lambda path: write_whisker_views(path, images))
 
 
-def keep_chart(source: Source, store: RunDirectory) -> None:
-    """map.pgm and map.yaml of a run whose map is a grid; with a known arena also arena.npz, what is really
-    there in the frame of the map, and gridscore.json."""
-    file = store.path / "grid.npz"
+def save_grid_map(directory: RunDirectory) -> None:
+    """Writes map.pgm and map.yaml if the map is a grid; if the arena is known also arena.npz (the true grid)
+    and gridscore.json."""
+    file = directory.path / "grid.npz"
     if not file.exists():
         return
     grid = read_grid(file)
-    write_nav2(store.path, grid)
-    if not (store.path / "arena.txt").exists():
+    write_nav2(directory.path, grid)
+    if not (directory.path / "arena.txt").exists():
         return
-    arena = read_arena(store.path / "arena.txt")
-    truth = truth_of(arena, grid)
-    store.file("arena.npz", lambda path: write_grid_truth(path, truth, arena.start))
-    score = score_grid(grid, truth, store.path.name)
-    store.text("gridscore.json", score.model_dump_json(indent=2) + "\n")
+    arena = read_arena(directory.path / "arena.txt")
+    truth = true_grid(arena, grid)
+    directory.file("arena.npz", lambda path: write_grid_truth(path, truth, arena.start))
+    score = score_grid(grid, truth, directory.path.name)
+    directory.text("gridscore.json", score.model_dump_json(indent=2) + "\n")
 
 
-def truth_of(arena: Arena, grid: OccupancyGrid) -> GridTruth:
-    """What is really there, on the cells and in the frame of a map that begins where the robot starts."""
+def true_grid(arena: Arena, grid: OccupancyGrid) -> GridTruth:
+    """The arena on the cells of a grid whose frame is the robot's start pose."""
     place = cell_centres(grid)
     there = compose(arena.start, np.concatenate([place, np.zeros((*place.shape[:2], 1))], axis=2))[..., :2]
     ends = wall_segments(arena).reshape(-1, 2)

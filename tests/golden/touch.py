@@ -16,9 +16,8 @@ import numpy as np
 from evaluation.metrics.experience_metric import experience_metric
 from ratslam.config.run_config import RunConfig
 from ratslam.core.types import Action
-from ratslam.pipeline.run import open_source
-from ratslam.pipeline.runner import readings, session_of
-from robot.touch_source import open_touch_source
+from ratslam.pipeline.runner import build_session
+from ratslam.pipeline.source import open_observations, read_observations
 from tactile.base.types import Observation
 
 FOLDER = Path(__file__).parent
@@ -29,11 +28,9 @@ def decisions(name: str) -> dict[str, Any]:
     """What was decided on a session: experiences as [id, steps] in order, how often each action was taken,
     closures as [later, earlier] steps, and the Experience Metric's counts."""
     config = RunConfig.model_validate({"recording": {"file": FOLDER / f"{name}.mcap"}})
-    with open_source(config) as source:
-        config = config.completed(source)
-        source = open_touch_source(source, config.touch)
-        session = session_of(config, source)
-        rows: list[tuple[Any, Observation]] = list(readings(source))
+    with open_observations(config) as (config, source):
+        session = build_session(config, source)
+        rows: list[tuple[Any, Observation]] = list(read_observations(source))
         steps = list(session.replay([reading for _, reading in rows]))
     place = [int(step.estimate.place) for step in steps]
     actions = [Action(int(step.estimate.action)).name.lower() for step in steps]

@@ -10,7 +10,8 @@ import numpy as np
 
 from ratslam.config.run_config import RunConfig
 from ratslam.experiments.fidelity_comparison import shortened
-from ratslam.pipeline.run import open_source, recorder_of
+from ratslam.pipeline.run import open_recorder
+from ratslam.pipeline.source import open_source
 from robot.recordings.formats import RecordingConfig
 from robot.sources.source import Source
 from tactile.base.errors import InputError
@@ -102,7 +103,7 @@ def short(config: RunConfig, cycles: int, folder: Path) -> RunConfig:
     if config.simulation is not None:
         return shortened(config, cycles / config.simulation.whisking.rate)
     path = folder / "beginning.mcap"
-    with open_source(config) as source, recorder_of(path, source) as recorder:
+    with open_source(config) as source, open_recorder(path, source) as recorder:
         for sample in islice(source, cycles):
             recorder.write(sample)
     return config.model_copy(update={"recording": RecordingConfig(file=path)})

@@ -14,7 +14,7 @@ from ratslam.experiments.sizing.scene_statistics import short
 from ratslam.experiments.studies.results import Result
 from ratslam.experiments.studies.run_job import run_job
 from ratslam.experiments.studies.study import Job
-from ratslam.pipeline.run import open_source
+from ratslam.pipeline.source import open_source
 from tactile.base.errors import InputError
 
 COARSER = 1.5

@@ -30,11 +30,11 @@ from ratslam.experiments.studies.memory import weighed
 from ratslam.experiments.studies.results import Machine, Result, Timing
 from ratslam.experiments.studies.study import Job
 from ratslam.experiments.studies.timing import Stopwatch
-from ratslam.pipeline.artifacts import truth_of
-from ratslam.pipeline.run import open_source
-from ratslam.pipeline.runner import Anytimes, readings, session_of
+from ratslam.pipeline.artifacts import true_grid
+from ratslam.pipeline.online_error import OnlineErrorLog
+from ratslam.pipeline.runner import build_session
+from ratslam.pipeline.source import open_observations, read_observations
 from robot.sources.source import Source
-from robot.touch_source import open_touch_source
 from robot.world.arena import read_arena
 from tactile.base.errors import InputError
 from tactile.base.se2 import integrate
@@ -81,15 +81,13 @@ def _played(config: RunConfig, pace: str) -> dict[str, Any]:
     """The fields of a result that come of playing a configuration."""
     began = perf_counter()
     relations = read_relations(config.score.relations) if config.score.relations else None
-    with open_source(config) as source:
-        config = config.completed(source)
-        source = open_touch_source(source, config.touch)
+    with open_observations(config) as (config, source):
         watch = Stopwatch()
         with watch.preparing():
-            session = session_of(config, source)
+            session = build_session(config, source)
         time, motion, truth, told, places = [], [], [], [], []
-        present = Anytimes()
-        rows = readings(source)
+        present = OnlineErrorLog()
+        rows = read_observations(source)
         while chunk := list(islice(rows, CHUNK)):
             steps = []
             for part in [chunk] if pace == "replay" else [[row] for row in chunk]:
@@ -100,7 +98,7 @@ def _played(config: RunConfig, pace: str) -> dict[str, Any]:
             truth += [np.full(3, np.nan) if sample.truth is None else sample.truth for sample, _ in chunk]
             told += [step.pose for step in steps]
             places += [int(step.estimate.place) for step in steps]
-            present.see(session, truth)
+            present.update(session, truth)
         if not time:
             raise InputError(source.name, "no samples", "a session")
         with watch.finishing():
@@ -155,7 +153,7 @@ def _chart(session: Session, source: Source) -> dict[str, Quantity]:
         write(folder / "grid.npz")
         (folder / "arena.txt").write_text(arena, encoding="utf-8")
         grid = read_grid(folder / "grid.npz")
-        found = score_grid(grid, truth_of(read_arena(folder / "arena.txt"), grid))
+        found = score_grid(grid, true_grid(read_arena(folder / "arena.txt"), grid))
     error = found.under(MAIN_CONVENTION)
     beside = f"0.3 everywhere {error.prior:.3g}, the best constant {error.best:.3g}"
     return {

@@ -13,13 +13,13 @@ import numpy as np
 
 from evaluation.metrics.grid_score import score_grid
 from evaluation.metrics.occupancy_grid import OccupancyGrid
+from ratslam.config.completion import complete
 from ratslam.config.run_config import RunConfig
 from ratslam.experiments.fox2012.session import session_at_start
 from ratslam.experiments.studies.executor import run_tasks
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
-from ratslam.pipeline.artifacts import truth_of
-from ratslam.pipeline.run import open_source
-from ratslam.pipeline.runner import readings
+from ratslam.pipeline.artifacts import true_grid
+from ratslam.pipeline.source import open_source, read_observations
 from robot.touch_source import open_touch_source, report_config_of
 from robot.world.arena import Arena, wall_segments
 from robot.world.polygons import segment_distance
@@ -138,9 +138,9 @@ def measure_session(task: GridTask) -> GridFigures:
     } | changes
     config = RunConfig.model_validate(given)
     source: Any = open_source(config)
-    config = config.completed(source)
+    config = complete(config, source)
     grid = config.grid.model_copy(update={"side": MAP_SIDES[task.world]})
-    rows = list(readings(open_touch_source(source, config.touch)))
+    rows = list(read_observations(open_touch_source(source, config.touch)))
     truth = np.array([sample.truth for sample, _ in rows])
     observations = [observation for _, observation in rows]
     start = source.arena.start
@@ -191,7 +191,7 @@ def _wall_error(arena: Arena, pose: np.ndarray, observation: Observation) -> flo
 def _map_scores(map: Any, arena: Arena) -> tuple[float, ...]:
     corner = np.full(2, -map.side * map.config.cell / 2)
     grid = OccupancyGrid(map.occupancy(), corner, map.config.cell)
-    found = score_grid(grid, truth_of(arena, grid)).quantities
+    found = score_grid(grid, true_grid(arena, grid)).quantities
     names = ("map_auc", "map_brier_skill", "map_brier_skill_free", "map_chamfer_map", "map_chamfer_walls")
     values = [found[name].value for name in names]
     return tuple(np.nan if value is None else float(value) for value in values)

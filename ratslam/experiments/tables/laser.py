@@ -15,12 +15,13 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.metrics.trajectory import ate
+from ratslam.config.completion import complete
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import load, override, validate
 from ratslam.experiments.studies.executor import run_tasks
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
-from ratslam.pipeline.run import open_source
-from ratslam.pipeline.runner import session_of
+from ratslam.pipeline.runner import build_session
+from ratslam.pipeline.source import open_source
 from robot.sources.in_memory import load_into_memory
 from robot.sources.perturbation import perturb
 from robot.touch_source import observation_of, open_touch_source
@@ -122,13 +123,13 @@ def measure_recording(task: RecordingTask) -> RecordingFigures:
         InputError: the recording cannot be used, or has no truth.
     """
     with open_source(task.config) as source:
-        config = task.config.completed(source)
+        config = complete(task.config, source)
         log = load_into_memory(open_touch_source(source, config.touch))
     if log.truth is None:
         raise InputError(log.name, "no true poses", "a recording with truth")
     if task.seed:
         log = perturb(log, task.seed)
-    session = session_of(config, log)
+    session = build_session(config, log)
     for _ in session.replay(observation_of(sample) for sample in log):
         pass
     truth = np.asarray(log.truth)

@@ -15,6 +15,7 @@ import numpy as np
 
 from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.experience_metric import ExmConfig, ExperienceMetric, experience_metric
+from ratslam.config.completion import complete
 from ratslam.config.run_config import RunConfig
 from ratslam.experiments.studies.executor import run_tasks
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
@@ -24,7 +25,7 @@ from ratslam.experiments.trials.touch_trial import (
     closure_errors,
     run_session,
 )
-from ratslam.pipeline.run import open_source
+from ratslam.pipeline.source import open_source
 from robot.sources.in_memory import InMemorySource, load_into_memory
 from robot.touch_source import open_touch_source
 from tactile.base.errors import InputError
@@ -193,7 +194,7 @@ def _simulate(task: TouchTask) -> tuple[InMemorySource, RunConfig, list[int]]:
     config = RunConfig.model_validate(given)
     with open_source(config) as source:
         kidnaps = np.flatnonzero(source.carried).tolist()  # type: ignore[attr-defined]
-        config = config.completed(source)
+        config = complete(config, source)
         log = load_into_memory(open_touch_source(source, config.touch))
     if task.row == "control: shuffled":
         order = np.random.default_rng(task.seed).permutation(len(log.views))

@@ -20,11 +20,11 @@ from ratslam.config.strict_yaml import Document, load, override, validate
 from ratslam.core.session import CHUNK, Session
 from ratslam.experiments.trials.process_pool import shared_out
 from ratslam.keyframes.ablation import FULL, Ablation
-from ratslam.pipeline.run import open_source
-from ratslam.pipeline.runner import Anytimes, readings, session_of
+from ratslam.pipeline.online_error import OnlineErrorLog
+from ratslam.pipeline.runner import build_session
+from ratslam.pipeline.source import open_observations, read_observations
 from robot.sources.in_memory import InMemorySource, load_into_memory
 from robot.sources.perturbation import perturb
-from robot.touch_source import open_touch_source
 from tactile.base.errors import InputError
 from tactile.base.se2 import integrate
 
@@ -84,36 +84,34 @@ def trial(config: RunConfig, folder: Path, seed: int = 0, ablation: Ablation = F
     Raises:
         InputError: the recording cannot be used, or cannot be perturbed because it is not read as a whole.
     """
-    with open_source(config.with_absolute_paths(folder.resolve())) as source:
-        config = config.completed(source)
-        source = open_touch_source(source, config.touch)
+    with open_observations(config.with_absolute_paths(folder.resolve())) as (config, source):
         if seed:
             if config.simulation is not None:
                 source = load_into_memory(source)
             if not isinstance(source, InMemorySource):
                 raise InputError("recording.file", "a recording that is streamed", "a CSV or .npz recording")
             source = perturb(source, seed)
-        session = session_of(config, source, ablation)
+        session = build_session(config, source, ablation)
         truth: list[np.ndarray] = []
         motion: list[list[float]] = []
         told: list[np.ndarray] = []
         lost: list[bool] = []
-        present = Anytimes()
-        rows = readings(source)
+        present = OnlineErrorLog()
+        rows = read_observations(source)
         while chunk := list(islice(rows, CHUNK)):
             steps = list(session.replay([reading for _, reading in chunk]))
             truth += [np.full(3, np.nan) if sample.truth is None else sample.truth for sample, _ in chunk]
             motion += [[o.odometry.dx, o.odometry.dy, o.odometry.dtheta] for _, o in chunk]
             told += [step.pose for step in steps]
             lost += [bool(step.estimate.lost) for step in steps]
-            present.see(session, truth)
+            present.update(session, truth)
     return _figures(config, session, present, np.array(truth), np.array(motion), np.array(told), lost)
 
 
 def _figures(
     config: RunConfig,
     session: Session,
-    present: Anytimes,
+    present: OnlineErrorLog,
     truth: np.ndarray,
     motion: np.ndarray,
     told: np.ndarray,

@@ -15,10 +15,11 @@ from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.experience_metric import ExmConfig, ExperienceMetric, experience_metric
 from ratslam.backends.config import select_settings
 from ratslam.backends.registry import BACKENDS, Sensors, build
+from ratslam.config.completion import complete
 from ratslam.config.run_config import RunConfig, SessionConfig
 from ratslam.core.session import Session, capacity_at
 from ratslam.experiments.trials.controls import Control, apply_control
-from ratslam.pipeline.run import open_source
+from ratslam.pipeline.source import open_source
 from robot.sources.in_memory import InMemorySource, load_into_memory
 from robot.touch_source import observation_of, open_touch_source
 from tactile.base.config import Settings
@@ -94,7 +95,7 @@ def collect_session(config: RunConfig) -> tuple[RunConfig, InMemorySource]:
         InputError: the source cannot be read or simulated, or lacks the true pose of a step.
     """
     with open_source(config) as source:
-        config = config.completed(source)
+        config = complete(config, source)
         log = load_into_memory(open_touch_source(source, config.touch))
     if log.truth is None or not np.isfinite(log.truth).all():
         raise InputError(log.name, "steps without a true pose", "the true pose of every step")

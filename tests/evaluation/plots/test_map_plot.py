@@ -15,7 +15,7 @@ from evaluation.report import redraw_plots
 from ratslam.cli import main
 from ratslam.config.run_config import RunConfig, load_config
 from ratslam.config.strict_yaml import load, validate
-from ratslam.pipeline.run import open_source
+from ratslam.pipeline.source import open_source
 from robot.touch_source import open_touch_source
 from robot.world.scene import MazeConfig
 

@@ -13,9 +13,11 @@ import numpy as np
 import pytest
 
 from ratslam.cli import main
+from ratslam.config.completion import complete
 from ratslam.config.run_config import RunConfig, load_config
 from ratslam.experiments.trials.ablation import trial
-from ratslam.pipeline.run import open_source, simulate
+from ratslam.pipeline.run import simulate
+from ratslam.pipeline.source import open_source
 from robot.recordings.mcap_reader import Recording
 from robot.simulation.head.session import HeadSimulation
 from robot.touch_source import open_touch_source
@@ -103,7 +105,7 @@ def test_a_session_of_raw_samples_is_given_to_the_engine_as_if_live(raw, tmp_pat
     given = []
     for config in (live, replay):
         source = open_source(config)
-        given.append([sample.reading for sample in open_touch_source(source, config.completed(source).touch)])
+        given.append([sample.reading for sample in open_touch_source(source, complete(config, source).touch)])
     assert len(given[0]) == len(given[1]) == 12
     for one, other in zip(*given, strict=True):
         assert one.odometry == other.odometry

@@ -102,7 +102,7 @@ class Circuit:
         _forget()
 
 
-def replayed(kind: str, steps: int, folder: Path) -> dict[str, Any]:
+def process_source(kind: str, steps: int, folder: Path) -> dict[str, Any]:
     """Replays so many steps into a run directory; what it took.
 
     Returns:
@@ -116,9 +116,9 @@ def replayed(kind: str, steps: int, folder: Path) -> dict[str, Any]:
     jax.config.update("jax_enable_x64", True)
     from ratslam.backends.registry import BACKENDS
     from ratslam.config.run_config import RunConfig
-    from ratslam.pipeline.run import replayed as through
+    from ratslam.pipeline.run import process_source
     from ratslam.pipeline.run_directory import RunDirectory
-    from ratslam.pipeline.runner import Playing, session_of
+    from ratslam.pipeline.runner import Runner, build_session
 
     source = Circuit(kind, steps)
     config = RunConfig.model_validate(
@@ -129,9 +129,9 @@ def replayed(kind: str, steps: int, folder: Path) -> dict[str, Any]:
             "experience": {"solver": {"name": "relaxation", "loops": 1}},
         }
     )
-    session = session_of(config, source)
+    session = build_session(config, source)
     with RunDirectory(folder, BACKENDS[config.backend].columns()) as store:
-        through(Playing(config, source, store, {}, session, 0), source)
+        process_source(Runner(config, source, store, {}, session, 0), source)
     (_, early, late), rest = source.moments, 0.9 * steps
     with (folder / "steps.csv").open(encoding="utf-8") as lines:
         written = sum(1 for _ in lines) - 1
@@ -205,7 +205,7 @@ def main() -> None:
     parser.add_argument("--folder", type=Path)
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
-        print(json.dumps(replayed(given.kind, given.steps, given.folder or Path(scratch) / "run")))
+        print(json.dumps(process_source(given.kind, given.steps, given.folder or Path(scratch) / "run")))
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ from ratslam.experiments.sizing.scene_statistics import Scene, cheapest, scene_o
 from ratslam.experiments.sizing.trial_runs import cheaper
 from ratslam.experiments.studies.results import Result
 from ratslam.grid.particle_maps import LAYERS
-from ratslam.pipeline.run import open_source
+from ratslam.pipeline.source import open_source
 
 ROOT = Path(__file__).parents[3]
 GOLDEN = ROOT / "tests" / "golden"

@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 
 from evaluation.metrics.energy_metric import energy_all_pairs
-from ratslam.config.run_config import TOUCH, RunConfig
+from ratslam.config.completion import complete
+from ratslam.config.presets import PRESETS
+from ratslam.config.run_config import RunConfig
 from ratslam.core.session import Session
 from ratslam.keyframes.loop_closures import Verdict
-from ratslam.pipeline.runner import readings, session_of
+from ratslam.pipeline.runner import build_session
+from ratslam.pipeline.source import read_observations
 from robot.simulation.head.session import HeadSimulation
 from robot.touch_source import open_touch_source
 from tactile.base.se2 import integrate
@@ -53,8 +56,8 @@ def _compiled(reserve: int) -> tuple[Session, dict[str, np.ndarray]]:
     config = config_of(simulation=LAPS, session={"reserve": reserve})
     assert config.simulation is not None
     source = HeadSimulation(config.simulation)
-    config = config.completed(source)
-    session = session_of(config, open_touch_source(source, config.touch))
+    config = complete(config, source)
+    session = build_session(config, open_touch_source(source, config.touch))
     return session, session.arrays()
 
 
@@ -70,7 +73,9 @@ def way(seed: int, dead: Sequence[int] = (), **simulation: Any) -> Way:
     config = config_of(simulation={"seed": seed} | LAPS | simulation, touch={"head": {"dead": tuple(dead)}})
     assert config.simulation is not None
     source = HeadSimulation(config.simulation, config.touch.head)
-    felt = [reading for _, reading in readings(open_touch_source(source, config.completed(source).touch))]
+    felt = [
+        reading for _, reading in read_observations(open_touch_source(source, complete(config, source).touch))
+    ]
     return Way(felt, source.truth)
 
 
@@ -321,33 +326,35 @@ def test_every_run_that_is_told_as_accepted_can_be_undone() -> None:
 def test_whiskers_bring_their_own_settings() -> None:
     config = config_of(simulation=LAPS)
     assert config.simulation is not None
-    completed = config.completed(HeadSimulation(config.simulation))
+    completed = complete(config, HeadSimulation(config.simulation))
     assert completed.recall.sector_fov == "whiskers"
-    for name, value in TOUCH["keyframes"].items():
+    for name, value in PRESETS["touch"].settings["keyframes"].items():
         if name != "noise":
             assert getattr(completed.keyframes, name) == value
-    assert completed.keyframes.noise.per_cell == TOUCH["keyframes"]["noise"]["per_cell"]
+    assert completed.keyframes.noise.per_cell == PRESETS["touch"].settings["keyframes"]["noise"]["per_cell"]
     assert completed.pose_cells.cells_xy == 11  # what was asked for stays
     again = RunConfig.model_validate(completed.model_dump(mode="json"))
     assert (
-        again.completed(HeadSimulation(config.simulation)) == completed
+        complete(again, HeadSimulation(config.simulation)) == completed
     )  # a written configuration is the same run
 
 
 def test_what_is_set_goes_before_what_whiskers_bring() -> None:
     config = config_of(simulation=LAPS, keyframes={"min_score": 7.0, "noise": {"per_cell": 0.5}})
     assert config.simulation is not None
-    frames = config.completed(HeadSimulation(config.simulation)).keyframes
+    frames = complete(config, HeadSimulation(config.simulation)).keyframes
     assert (frames.min_score, frames.noise.per_cell) == (7.0, 0.5)
-    assert frames.select_every == TOUCH["keyframes"]["select_every"]
-    assert frames.noise.heading_per_cell == TOUCH["keyframes"]["noise"]["heading_per_cell"]
+    assert frames.select_every == PRESETS["touch"].settings["keyframes"]["select_every"]
+    assert (
+        frames.noise.heading_per_cell == PRESETS["touch"].settings["keyframes"]["noise"]["heading_per_cell"]
+    )
 
 
 def test_saying_that_there_are_whiskers_changes_nothing() -> None:
     plain, said = config_of(simulation=LAPS), config_of(simulation=LAPS, recall={"sector_fov": "whiskers"})
     assert plain.simulation is not None
     source = HeadSimulation(plain.simulation)
-    assert said.completed(source) == plain.completed(source)
+    assert complete(said, source) == complete(plain, source)
 
 
 # Large

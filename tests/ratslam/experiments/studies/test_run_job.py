@@ -97,7 +97,7 @@ def test_what_a_user_can_mend_is_a_result(tiny):
 
 
 def test_what_nobody_can_mend_is_not_hidden(tiny, monkeypatch):
-    monkeypatch.setattr("ratslam.experiments.studies.run_job.session_of", lambda *_: 1 / 0)
+    monkeypatch.setattr("ratslam.experiments.studies.run_job.build_session", lambda *_: 1 / 0)
     (job,) = jobs(read_study(tiny()))
     with pytest.raises(ZeroDivisionError):
         run_job(job)
