@@ -1,25 +1,25 @@
-"""SE(2) pose graphs: exact linear start, damped and robust least squares, chains of odometry eliminated.
+"""SE(2) pose graphs: linear initialization, robust nonlinear least squares, elimination of odometry chains.
 
-Node 0 is held where it is. Sources: Kuemmerle et al. 2011 (g2o: the plain error), Dellaert & Kaess 2017
-(the logarithmic one), Carlone et al. 2014 (headings first, then positions).
+Node 0 is fixed. Sources: Kuemmerle et al. 2011 (g2o: the error of an edge), Dellaert & Kaess 2017 (gtsam: the
+logarithmic error), Carlone et al. 2014 (headings first, then positions).
 """
 
-from ratslam.pose_graph.edges import Edges, Error, difference_error, logmap_error
-from ratslam.pose_graph.least_squares import Ending, Solution, least_squares
-from ratslam.pose_graph.linear_init import linear
+from ratslam.pose_graph.edges import Edges, ErrorFunction, difference_error, logmap_error
+from ratslam.pose_graph.least_squares import Solution, Termination, least_squares
+from ratslam.pose_graph.linear_init import linear_initialization
 from ratslam.pose_graph.robust_kernels import Kernel, geman_mcclure, huber, no_kernel
 
 __all__ = [
     "Edges",
-    "Ending",
-    "Error",
+    "ErrorFunction",
     "Kernel",
     "Solution",
+    "Termination",
     "difference_error",
     "geman_mcclure",
     "huber",
     "least_squares",
-    "linear",
+    "linear_initialization",
     "logmap_error",
     "no_kernel",
 ]

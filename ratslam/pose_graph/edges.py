@@ -1,4 +1,4 @@
-"""What is measured between nodes, and by how much poses disagree with it."""
+"""Edges of a pose graph and their error functions."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from tactile.base.se2 import wrap
 
 
 class Edges(NamedTuple):
-    """Relative poses measured between nodes.
+    """E relative poses measured between nodes.
 
     Attributes:
-        i, j: [E] nodes. motion: [E, 3] pose of j in the frame of i (m, m, rad).
+        i, j: [E] int, nodes. motion: [E, 3] measured pose of j in the frame of i (m, m, rad).
         information: [E, 3] inverse variances, or [E, 3, 3] inverse covariances.
     """
 
@@ -24,14 +24,17 @@ class Edges(NamedTuple):
     information: np.ndarray
 
 
-Error = Callable[[np.ndarray, Edges], tuple[np.ndarray, np.ndarray, np.ndarray]]
-"""The errors [E, 3] of poses [N, 3], and their Jacobians [E, 3, 3] by the poses of i and of j. An error may
-depend on nothing but where j lies in the frame of i."""
+ErrorFunction = Callable[[np.ndarray, Edges], tuple[np.ndarray, np.ndarray, np.ndarray]]
+"""Errors [E, 3] of poses [N, 3], and their Jacobians [E, 3, 3] by the poses of i and of j. An error must
+depend only on the pose of j in the frame of i."""
 
 
 def difference_error(poses: np.ndarray, edges: Edges) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The error of g2o, [E, 3]: position and heading of j in i's frame against what was measured, seen from
-    the measured pose. With its Jacobians [E, 3, 3] by the poses of i and of j."""
+    """The error of g2o: the pose of j in the frame of i, minus the measured one, in the measured frame.
+
+    Returns:
+        errors [E, 3] and their Jacobians [E, 3, 3] by the poses of i and of j.
+    """
     a, b, motion = poses[edges.i], poses[edges.j], edges.motion
     angle = a[:, 2] + motion[:, 2]
     c, s = np.cos(angle), np.sin(angle)
@@ -50,7 +53,7 @@ def difference_error(poses: np.ndarray, edges: Edges) -> tuple[np.ndarray, np.nd
 
 
 def logmap_error(poses: np.ndarray, edges: Edges) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The error of gtsam: the SE(2) logarithm of the plain one."""
+    """The error of gtsam: the SE(2) logarithm of `difference_error`."""
     error, by_a, by_b = difference_error(poses, edges)
     angle, x, y = error[:, 2], error[:, 0].copy(), error[:, 1].copy()
     half = angle / 2
@@ -69,11 +72,11 @@ def logmap_error(poses: np.ndarray, edges: Edges) -> tuple[np.ndarray, np.ndarra
     return log, outer @ by_a, outer @ by_b
 
 
-def diagonal(information: np.ndarray) -> np.ndarray:
-    """[E, 3] the diagonals of informations of either form."""
+def information_diagonals(information: np.ndarray) -> np.ndarray:
+    """[E, 3] the diagonals of information in either form."""
     return information if information.ndim == 2 else np.diagonal(information, axis1=1, axis2=2)
 
 
-def full(information: np.ndarray) -> np.ndarray:
-    """[E, 3, 3] informations of either form as matrices."""
+def information_matrices(information: np.ndarray) -> np.ndarray:
+    """[E, 3, 3] information in either form as matrices."""
     return information if information.ndim == 3 else information[:, :, None] * np.eye(3)

@@ -1,4 +1,4 @@
-"""Maps as files others read: g2o pose graphs and node-link JSON."""
+"""Pose graphs as g2o files, and graphs as node-link JSON."""
 
 from __future__ import annotations
 
@@ -8,28 +8,26 @@ from pathlib import Path
 import networkx
 import numpy as np
 
-from ratslam.pose_graph import Edges
+from ratslam.pose_graph.edges import Edges, information_matrices
 from tactile.base.errors import InputError
 
 UPPER = tuple(zip(*np.triu_indices(3), strict=True))
 
 
 def write_g2o(path: Path, poses: np.ndarray, edges: Edges) -> None:
-    """VERTEX_SE2 and EDGE_SE2 lines with repr-exact floats: the same map gives the same bytes."""
+    """Writes VERTEX_SE2 and EDGE_SE2 lines; floats are exact (repr), so equal graphs give equal bytes."""
     lines = [f"VERTEX_SE2 {k} {_floats(pose)}" for k, pose in enumerate(poses)]
-    information = edges.information
-    if information.ndim == 2:
-        information = information[:, :, None] * np.eye(3)
+    information = information_matrices(edges.information)
     for i, j, motion, weight in zip(edges.i, edges.j, edges.motion, information, strict=True):
         lines.append(f"EDGE_SE2 {int(i)} {int(j)} {_floats(motion)} {_floats(weight[k] for k in UPPER)}")
     Path(path).write_text("".join(line + "\n" for line in lines), encoding="utf-8")
 
 
 def read_g2o(path: Path) -> tuple[np.ndarray, Edges]:
-    """Poses [N, 3] in order of id, and the edges with full information [E, 3, 3]. Other lines are left out.
+    """Reads poses [N, 3] in order of id, and edges with information [E, 3, 3]; ignores other lines.
 
     Raises:
-        InputError: naming file and line.
+        InputError: a malformed line, or an edge to an unknown vertex.
     """
     poses: dict[int, list[float]] = {}
     rows: list[tuple[int, int, list[float]]] = []
@@ -54,7 +52,7 @@ def read_g2o(path: Path) -> tuple[np.ndarray, Edges]:
     unknown = next((node for i, j, _ in rows for node in (i, j) if node not in row), None)
     if unknown is not None:
         raise InputError(
-            str(path), f"an edge to node {unknown}, which has no vertex", "a vertex for every node"
+            str(path), f"an edge to node {unknown}, which has no vertex", "a VERTEX_SE2 line for every node"
         )
     measured = np.array([values for _, _, values in rows]).reshape(-1, 9)
     information = np.zeros((len(rows), 3, 3))
@@ -68,22 +66,24 @@ def read_g2o(path: Path) -> tuple[np.ndarray, Edges]:
 
 
 def write_json(path: Path, graph: networkx.DiGraph) -> None:
-    """Node-link JSON, as `networkx.node_link_graph` reads it."""
+    """Writes node-link JSON, which `networkx.node_link_graph` reads."""
     content = networkx.node_link_data(graph, edges="edges")
     Path(path).write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def read_json(path: Path) -> networkx.DiGraph:
-    """The graph of a node-link file.
+    """Reads a node-link JSON file.
 
     Raises:
-        InputError: it is not one.
+        InputError: the file is not node-link JSON.
     """
     try:
         content = json.loads(Path(path).read_text(encoding="utf-8"))
         return networkx.DiGraph(networkx.node_link_graph(content, edges="edges"))
     except (ValueError, KeyError, TypeError, AttributeError, networkx.NetworkXException) as error:
-        raise InputError(str(path), f"not a node-link graph ({error})", "the map.json of a run") from None
+        raise InputError(
+            str(path), f"not a node-link graph ({error})", "a map.json written by ratslam"
+        ) from None
 
 
 def _floats(values) -> str:

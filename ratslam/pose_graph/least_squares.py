@@ -1,4 +1,4 @@
-"""SE(2) least squares: damped, robust, from wherever the poses are."""
+"""Robust nonlinear least squares over SE(2) pose graphs: Levenberg-Marquardt from an initial guess."""
 
 from __future__ import annotations
 
@@ -7,30 +7,31 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.pose_graph.edges import Edges, Error, difference_error, full
-from ratslam.pose_graph.normal_equations import Folded, Whole
+from ratslam.pose_graph.edges import Edges, ErrorFunction, difference_error, information_matrices
+from ratslam.pose_graph.normal_equations import FullEquations, ReducedEquations
 from ratslam.pose_graph.robust_kernels import Kernel, no_kernel
 from tactile.base.se2 import wrap
 
-FOLDED_FROM = 2000
-"""Graphs of so many nodes are solved over their forks; smaller ones are done sooner than folded."""
+ELIMINATE_FROM = 2000
+"""Number of nodes from which chains are eliminated; smaller graphs are solved sooner without."""
+INITIAL_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e-12, 1e12
 
 
-class Ending(Enum):
-    """Why a solve ended."""
+class Termination(Enum):
+    """Why the solver stopped."""
 
     CONVERGED = "converged"
-    ITERATIONS = "the iterations ran out; allow more or start nearer"
-    STUCK = "no step lowers the cost; the start may be in another basin: start from `linear`"
-    SINGULAR = "the equations have no unique solution; check that every node is tied to node 0"
+    ITERATION_LIMIT = "the iteration limit was reached; raise it or start nearer"
+    NO_DECREASE = "no step lowers the cost; start from `linear_initialization`, another basin may be lower"
+    SINGULAR = "the equations are singular; check that every node is connected to node 0"
     NOT_FINITE = "a pose, a measurement or its information is not finite"
 
 
 class Solution(NamedTuple):
-    """Poses [N, 3], why the solve ended, steps taken, final cost, and the robust weight [E] of each edge."""
+    """Poses [N, 3], why the solver stopped, steps taken, final cost, and robust weights [E] of the edges."""
 
     poses: np.ndarray
-    ending: Ending
+    termination: Termination
     iterations: int
     cost: float
     weights: np.ndarray
@@ -42,70 +43,98 @@ def least_squares(
     *,
     kernel: Kernel = no_kernel,
     robust: np.ndarray | None = None,
-    error: Error = difference_error,
+    error: ErrorFunction = difference_error,
     iterations: int = 50,
     tolerance: float = 1e-9,
-    folded: bool | None = None,
+    eliminate_chains: bool | None = None,
 ) -> Solution:
-    """Levenberg-Marquardt from the given poses [N, 3]; node 0 is held where it is.
+    """Levenberg-Marquardt from the given poses [N, 3]; node 0 is fixed.
 
     Args:
-        kernel: applied to the edges of `robust` [E] bool (None: all), the others count in full.
-        tolerance: the largest change of a step that ends the solve, m and rad.
-        folded: whether chains of odometry are eliminated (`Folded`); None: in graphs of `FOLDED_FROM` nodes.
-            Both ways end in an optimum of the same cost.
+        kernel: applied to the edges of `robust` [E] bool (None: to all); other edges have weight 1.
+        tolerance: the largest change of a step at convergence, m and rad.
+        eliminate_chains: solve over the junctions only (`ReducedEquations`); None: with `ELIMINATE_FROM`
+            nodes or more. Both ways reach an optimum of the same cost.
 
     Returns:
-        from finite poses never NaN: where nothing better was found, the poses are those given.
+        a solution whose poses are finite if the given poses are; without any improvement, the given poses.
     """
-    poses = np.array(poses, float)
-    if not (
-        np.isfinite(poses).all() and np.isfinite(edges.motion).all() and np.isfinite(edges.information).all()
-    ):
-        return Solution(poses, Ending.NOT_FINITE, 0, np.inf, np.ones(len(edges.i)))
+    poses, unit = np.array(poses, float), np.ones(len(edges.i))
+    if not all(np.isfinite(values).all() for values in (poses, edges.motion, edges.information)):
+        return Solution(poses, Termination.NOT_FINITE, 0, np.inf, unit)
     if len(edges.i) == 0 or len(poses) < 2:
-        return Solution(poses, Ending.CONVERGED, 0, 0.0, np.ones(len(edges.i)))
-    information = full(edges.information)
-    tamed = np.ones(len(edges.i), bool) if robust is None else np.asarray(robust, bool)
-    if folded if folded is not None else len(poses) >= FOLDED_FROM:
-        system: Folded | Whole = Folded(len(poses), edges, tamed & (kernel is not no_kernel))
+        return Solution(poses, Termination.CONVERGED, 0, 0.0, unit)
+    robust = np.ones(len(edges.i), bool) if robust is None else np.asarray(robust, bool)
+    problem = _Problem(edges, information_matrices(edges.information), kernel, robust, error)
+    start = problem.evaluate(poses)
+    if not np.isfinite(start.cost):
+        return Solution(poses, Termination.NOT_FINITE, 0, np.inf, unit)
+    if len(poses) >= ELIMINATE_FROM if eliminate_chains is None else eliminate_chains:
+        equations: _Equations = ReducedEquations(len(poses), edges, robust & (kernel is not no_kernel))
     else:
-        system = Whole(len(poses), edges)
+        equations = FullEquations(len(poses), edges)
+    return _minimise(problem, equations, poses, start, iterations, tolerance)
 
-    def judge(at: np.ndarray):
-        errors = error(at, edges)
+
+_Equations = FullEquations | ReducedEquations
+
+
+class _Evaluation(NamedTuple):
+    """Errors with Jacobians, robust weights [E], and cost at some poses."""
+
+    errors: tuple[np.ndarray, np.ndarray, np.ndarray]
+    weights: np.ndarray
+    cost: float
+
+
+class _Problem(NamedTuple):
+    """The cost to be minimised; see `least_squares`."""
+
+    edges: Edges
+    information: np.ndarray
+    kernel: Kernel
+    robust: np.ndarray
+    error: ErrorFunction
+
+    def evaluate(self, poses: np.ndarray) -> _Evaluation:
+        errors = self.error(poses, self.edges)
         with np.errstate(over="ignore", invalid="ignore"):
-            chi2 = np.einsum("ea,eab,eb->e", errors[0], information, errors[0])
-            weights = np.where(tamed, kernel.weight(chi2), 1.0)
-            return errors, weights, float(np.where(tamed, kernel.loss(chi2), chi2).sum())
+            chi2 = np.einsum("ea,eab,eb->e", errors[0], self.information, errors[0])
+            weights = np.where(self.robust, self.kernel.weight(chi2), 1.0)
+            cost = float(np.where(self.robust, self.kernel.loss(chi2), chi2).sum())
+        return _Evaluation(errors, weights, cost)
 
-    state = judge(poses)
-    if not np.isfinite(state[-1]):
-        return Solution(poses, Ending.NOT_FINITE, 0, np.inf, np.ones(len(edges.i)))
-    damping, taken = 1e-9, 0
-    ending = Ending.ITERATIONS
+
+def _minimise(
+    problem: _Problem,
+    equations: _Equations,
+    poses: np.ndarray,
+    current: _Evaluation,
+    iterations: int,
+    tolerance: float,
+) -> Solution:
+    """Damped steps until one of them ends the search; damping rises after a step that raises the cost."""
+    damping, taken, schedule = INITIAL_DAMPING, 0, equations.damping
+    termination = Termination.ITERATION_LIMIT
     while taken < iterations:
-        errors, weights, _ = state
-        step = system.step(poses, errors, weights[:, None, None] * information, damping)
+        information = current.weights[:, None, None] * problem.information
+        step = equations.step(poses, current.errors, information, damping)
         if step is None:
-            ending = Ending.SINGULAR
+            termination = Termination.SINGULAR
             break
         moved = poses + step
         moved[:, 2] = wrap(moved[:, 2])
-        judged = judge(moved)
-        if judged[-1] <= state[-1] * (1 + 1e-12) + 1e-300:
+        small, trial = np.abs(step).max() < tolerance, problem.evaluate(moved)
+        if trial.cost <= current.cost * (1 + 1e-12) + 1e-300:
             taken += 1
-            gained = state[-1] - judged[-1]
-            poses, state, damping = moved, judged, max(damping / system.damping.factor, 1e-12)
-            if np.abs(step).max() < tolerance or gained <= 1e-12 * state[-1]:
-                ending = Ending.CONVERGED
-                break
-        elif np.abs(step).max() < tolerance:
-            ending = Ending.CONVERGED
+            small = small or current.cost - trial.cost <= 1e-12 * current.cost
+            poses, current, damping = moved, trial, max(damping / schedule.factor, LEAST_DAMPING)
+        elif not small:
+            damping = max(damping, schedule.first) * schedule.factor
+        if small:
+            termination = Termination.CONVERGED
             break
-        else:
-            damping = max(damping, system.damping.first) * system.damping.factor
-            if damping > 1e12:
-                ending = Ending.STUCK
-                break
-    return Solution(poses, ending, taken, state[-1], state[1])
+        if damping > MOST_DAMPING:
+            termination = Termination.NO_DECREASE
+            break
+    return Solution(poses, termination, taken, current.cost, current.weights)

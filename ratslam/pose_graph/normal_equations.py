@@ -1,4 +1,4 @@
-"""The equations of a damped Gauss-Newton step: of all nodes, or of the forks between chains alone."""
+"""The equations of a damped Gauss-Newton step: over all nodes, or over the junctions between chains."""
 
 from __future__ import annotations
 
@@ -9,29 +9,30 @@ from scipy.sparse import csc_matrix, csr_matrix
 from scipy.sparse.csgraph import breadth_first_order
 from scipy.sparse.linalg import splu
 
-from ratslam.pose_graph.chains import chains
-from ratslam.pose_graph.edges import Edges, diagonal
-from ratslam.pose_graph.sparsity import Pattern, unreached
+from ratslam.pose_graph.chains import find_chains
+from ratslam.pose_graph.edges import Edges, information_diagonals
+from ratslam.pose_graph.sparsity import SparseEquations, component_roots
 
 
 class Damping(NamedTuple):
-    """How damping goes up when a step fails (to `first` * `factor` at least) and down when one succeeds."""
+    """Damping is multiplied by `factor`, to `first` * `factor` at least, when a step fails; divided when it
+    succeeds."""
 
     first: float
     factor: float
 
 
-class Whole:
-    """The normal equations of all nodes: where every block goes is worked out once.
+class FullEquations:
+    """The normal equations of all nodes; their sparsity pattern is computed once.
 
-    Damping holds every node where it is.
+    Damping acts on the change of every node.
     """
 
     damping = Damping(first=1e-6, factor=10.0)
 
     def __init__(self, count: int, edges: Edges) -> None:
         self.size = 3 * (count - 1)
-        ends = np.stack([edges.i, edges.j], axis=1) - 1  # node 0 is held: its rows are left out
+        ends = np.stack([edges.i, edges.j], axis=1) - 1  # node 0 is fixed: its rows are omitted
         row = (3 * ends[:, :, None] + np.arange(3)).reshape(len(ends), 6)
         free = np.repeat(ends >= 0, 3, axis=1)
         rows = np.broadcast_to(row[:, :, None], (len(row), 6, 6))
@@ -47,7 +48,7 @@ class Whole:
         self.indptr = np.searchsorted(places // self.size, np.arange(self.size + 1)).astype(np.int32)
 
     def step(self, poses, errors, information, damping) -> np.ndarray | None:
-        """The damped Gauss-Newton step [N, 3], or None where the equations are singular."""
+        """The damped Gauss-Newton step [N, 3], or None if the equations are singular."""
         residual, by_i, by_j = errors
         jacobian = np.concatenate([by_i, by_j], axis=2)
         weighted = np.swapaxes(jacobian, 1, 2) @ information
@@ -65,110 +66,119 @@ class Whole:
         return np.concatenate([np.zeros((1, 3)), change.reshape(-1, 3)])
 
 
-class Folded:
-    """The normal equations of the forks: undamped, its steps are those of `Whole`.
+class ReducedEquations:
+    """The normal equations of the junctions, chains eliminated; undamped steps equal `FullEquations`.
 
-    Seen as twists about one point of the plane, changes of poses make the error of an edge a plain
-    difference: e = r + t_j - t_i, with weight W. So along a chain the r add up, and so do the covariances
-    W^-1, turned to that point: the chain is one edge. What it is strained by, all its edges feel alike.
+    As twists about one point of the plane, changes of poses turn the error of an edge into a difference:
+    e = r + t_j - t_i, with weight W. So along a chain the residuals r add up, and so do the covariances W^-1
+    transported to that point: the chain is one edge. All edges of a chain transmit the same wrench.
 
-    Damping holds the edges of chains, and of a tree over the forks, at the lengths and angles they have: far
-    nodes may move far as long as the map bends little anywhere, which noise in the headings asks for.
+    Damping acts on the change in shape of the edges of chains and of a spanning tree over the junctions:
+    distant nodes may move far while the map bends little anywhere, which heading noise requires.
     """
 
     damping = Damping(first=1 / 3, factor=3.0)
 
-    def __init__(self, count: int, edges: Edges, tamed: np.ndarray) -> None:
-        determined = (diagonal(edges.information) > 0).all(axis=1)
-        if edges.information.ndim == 3:  # what hardly has an inverse had better not be inverted
-            alone = diagonal(edges.information).prod(axis=1)
-            determined &= np.linalg.det(edges.information) > 1e-6 * alone
+    def __init__(self, count: int, edges: Edges, robust: np.ndarray) -> None:
+        determined = (information_diagonals(edges.information) > 0).all(axis=1)
+        if edges.information.ndim == 3:  # nearly singular information is not inverted
+            product = information_diagonals(edges.information).prod(axis=1)
+            determined &= np.linalg.det(edges.information) > 1e-6 * product
         self.count, self.to = count, edges.j
-        self.found = found = chains(count, edges.i, edges.j, determined & ~tamed)
-        self.pattern = Pattern(len(found.forks), found.a, found.b)
-        self.held = unreached(len(found.forks), found.a, found.b)
+        self.chains = chains = find_chains(count, edges.i, edges.j, determined & ~robust)
+        size = len(chains.junctions)
+        self.equations = SparseEquations(size, chains.start, chains.end)
+        self.fixed = component_roots(size, chains.start, chains.end)
         self.stiff = np.zeros(len(edges.i), bool)
-        self.stiff[found.edge] = True
-        self.stiff[found.loose[_tree(found.a, found.b, len(found.forks))[len(found.first) :]]] = True
+        self.stiff[chains.edge] = True
+        tree = _spanning_tree(chains.start, chains.end, size)
+        self.stiff[chains.direct[tree[len(chains.first) :]]] = True
 
     def step(self, poses, errors, information, damping) -> np.ndarray | None:
-        """The damped Gauss-Newton step [N, 3], or None where the equations are singular."""
-        found, (x, y) = self.found, poses.T[:2]
-        weight, pull = self._weigh(errors, information, damping)
+        """The damped Gauss-Newton step [N, 3], or None if the equations are singular."""
+        chains, (x, y) = self.chains, poses.T[:2]
+        weight, wrench = self._weigh(errors, information, damping)
 
         # Chains: residuals and covariances as twists about the node at the end, added up.
-        inside, end = found.edge, found.forks[found.b[found.chain]]
+        inside, end = chains.edge, chains.junctions[chains.end[chains.chain]]
         to = self.to[inside]
+        dx, dy = x[to] - x[end], y[to] - y[end]
         covariance = _inverse(weight[:, :, inside])
-        residual = _times(covariance, pull[:, inside])
-        residual = found.sign * _carried(residual, x[to] - x[end], y[to] - y[end])
-        covariance = _carried(covariance, x[to] - x[end], y[to] - y[end])
-        covariance = _carried(covariance.swapaxes(0, 1), x[to] - x[end], y[to] - y[end])
-        apart, tight = found.total(residual), _inverse(found.total(covariance))
+        residual = chains.sign * _transport_twist(_matvec(covariance, wrench[:, inside]), dx, dy)
+        covariance = _transport_twist(_transport_twist(covariance, dx, dy).swapaxes(0, 1), dx, dy)
+        chain_residual, chain_weight = chains.sums(residual), _inverse(chains.sums(covariance))
 
-        # Forks: what is left of chains, and the loose edges.
-        a, b = found.forks[found.a], found.forks[found.b]
+        # Junctions: one edge for each chain, and the direct edges.
+        a, b = chains.junctions[chains.start], chains.junctions[chains.end]
         dx, dy = x[a] - x[b], y[a] - y[b]
-        weight = np.concatenate([tight, weight[:, :, found.loose]], axis=2)
-        pull = np.concatenate([_times(tight, apart), pull[:, found.loose]], axis=1)
-        across = _given(weight.swapaxes(0, 1), dx, dy).swapaxes(0, 1)
-        entries = np.concatenate([_given(across, dx, dy), weight, -across.swapaxes(0, 1), -across], axis=2)
-        size = len(found.forks)
-        right = [
-            np.bincount(found.a, back, size) - np.bincount(found.b, on, size)
-            for on, back in zip(pull, _given(pull, dx, dy), strict=True)
-        ]
-        moved = self.pattern.solve(entries, self.held, np.stack(right, axis=1), again=True)
+        weight = np.concatenate([chain_weight, weight[:, :, chains.direct]], axis=2)
+        wrench = np.concatenate([_matvec(chain_weight, chain_residual), wrench[:, chains.direct]], axis=1)
+        moved = self._solve_junctions(weight, wrench, dx, dy)
         if moved is None:
             return None
 
         # Back to the inner nodes.
         change = np.zeros((3, self.count))
-        change[:, found.forks] = moved.T
-        chained = len(found.first)
-        start = _carried(moved.T[:, found.a[:chained]], dx[:chained], dy[:chained])
-        tension = _times(tight, apart + moved.T[:, found.b[:chained]] - start)
-        twist = found.along(start, _times(covariance, tension[:, found.chain]) - residual)
-        end = end[found.into]
-        change[:, found.inner] = _carried(twist, x[end] - x[found.inner], y[end] - y[found.inner])
+        change[:, chains.junctions] = moved.T
+        chained = len(chains.first)
+        start = _transport_twist(moved.T[:, chains.start[:chained]], dx[:chained], dy[:chained])
+        tension = _matvec(chain_weight, chain_residual + moved.T[:, chains.end[:chained]] - start)
+        twist = chains.inner_values(start, _matvec(covariance, tension[:, chains.chain]) - residual)
+        end = end[chains.into]
+        change[:, chains.inner] = _transport_twist(twist, x[end] - x[chains.inner], y[end] - y[chains.inner])
         return change.T if np.isfinite(change).all() else None
 
+    def _solve_junctions(
+        self, weight: np.ndarray, wrench: np.ndarray, dx: np.ndarray, dy: np.ndarray
+    ) -> np.ndarray | None:
+        """[J, 3] changes of the junctions, from the weights [3, 3, C + L] and wrenches [3, C + L] of the
+        reduced edges, whose starts lie (dx, dy) [C + L] from their ends."""
+        start, end, size = self.chains.start, self.chains.end, len(self.chains.junctions)
+        across = _transport_wrench(weight.swapaxes(0, 1), dx, dy).swapaxes(0, 1)
+        blocks = [_transport_wrench(across, dx, dy), weight, -across.swapaxes(0, 1), -across]
+        right = [
+            np.bincount(start, back, size) - np.bincount(end, on, size)
+            for on, back in zip(wrench, _transport_wrench(wrench, dx, dy), strict=True)
+        ]
+        entries = np.concatenate(blocks, axis=2)
+        return self.equations.solve(entries, self.fixed, np.stack(right, axis=1), reuse_factor=True)
+
     def _weigh(self, errors, information, damping) -> tuple[np.ndarray, np.ndarray]:
-        """Weights [3, 3, E] and their products with the residuals [3, E], by the pose of j, as damped."""
+        """Damped weights [3, 3, E] and wrenches [3, E] (weight times residual), by the pose of j."""
         residual, _, by_j = errors
         by_j, information = (np.ascontiguousarray(m.transpose(1, 2, 0)) for m in (by_j, information))
-        back = _product(by_j.swapaxes(0, 1), information)
-        # Twice as stiff and half as far off pulls as much, and gives way half as far.
-        return _product(back, by_j) * np.where(self.stiff, 1 + damping, 1.0), _times(back, residual.T)
+        back = _matmul(by_j.swapaxes(0, 1), information)
+        # With twice the stiffness and half the residual the wrench is equal and the change half as large.
+        return _matmul(back, by_j) * np.where(self.stiff, 1 + damping, 1.0), _matvec(back, residual.T)
 
 
-def _tree(a: np.ndarray, b: np.ndarray, count: int) -> np.ndarray:
-    """[M] which edges a-b of nodes 0..count - 1 join what a tree from node 0 joins."""
+def _spanning_tree(a: np.ndarray, b: np.ndarray, count: int) -> np.ndarray:
+    """[M] bool: edges a-b of nodes 0..count - 1 that join the same nodes as an edge of a tree from node 0."""
     ties = csr_matrix((np.ones(len(a), np.int8), (a, b)), (count, count))
     _, parent = breadth_first_order(ties, 0, directed=False)
     return (parent[a] == b) | (parent[b] == a)
 
 
-def _carried(twist: np.ndarray, dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
-    """Movements [3, ..., E] of points, told as twists about others that lie (dx, dy) back."""
+def _transport_twist(twist: np.ndarray, dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
+    """Twists [3, ..., E] about points (dx, dy) away, from twists about the original points."""
     return np.stack([twist[0] + dy * twist[2], twist[1] - dx * twist[2], twist[2]])
 
 
-def _given(force: np.ndarray, dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
-    """What pulls at twists [3, ..., E] as what pulls at the points: the transpose of `_carried`."""
+def _transport_wrench(force: np.ndarray, dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
+    """Wrenches [3, ..., E] transported to points (dx, dy) away: the transpose of `_transport_twist`."""
     return np.stack([force[0], force[1], force[2] + dy * force[0] - dx * force[1]])
 
 
-def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _matmul(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.einsum("abe,bce->ace", a, b)
 
 
-def _times(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _matvec(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.einsum("abe,be->ae", a, b)
 
 
 def _inverse(m: np.ndarray) -> np.ndarray:
-    """Inverses of symmetric positive matrices [3, 3, E], by elimination: cofactors would cancel."""
+    """Inverses of symmetric positive matrices [3, 3, E], by elimination; cofactors would lose digits."""
     (a, b, c), (_, d, e), (_, _, f) = m
     x, y = c / f, e / f
     a, b, d = a - x * c, b - x * e, d - y * e

@@ -1,4 +1,4 @@
-"""Robust kernels: how much an edge counts that disagrees with the rest."""
+"""Robust kernels: weights that reduce the influence of edges that disagree with the rest."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 
 class Kernel(NamedTuple):
-    """A robust kernel over squared Mahalanobis errors: the weight of an edge and what it costs."""
+    """A robust kernel: weight and cost of an edge as functions of its squared Mahalanobis error."""
 
     weight: Callable[[np.ndarray], np.ndarray]
     loss: Callable[[np.ndarray], np.ndarray]
@@ -20,7 +20,7 @@ no_kernel = Kernel(np.ones_like, lambda chi2: chi2)
 
 
 def huber(scale: float) -> Kernel:
-    """Linear beyond `scale` standard deviations: a disagreeing edge pulls, but not the harder the farther."""
+    """Cost linear beyond `scale` standard deviations, so the influence of an edge is bounded (Huber 1964)."""
     return Kernel(
         lambda chi2: np.minimum(1.0, scale / np.sqrt(np.maximum(chi2, 1e-300))),
         lambda chi2: np.where(chi2 <= scale**2, chi2, 2 * scale * np.sqrt(chi2) - scale**2),
@@ -28,5 +28,5 @@ def huber(scale: float) -> Kernel:
 
 
 def geman_mcclure(mu: float) -> Kernel:
-    """Bounded: an edge that disagrees far beyond sqrt(mu) standard deviations is as good as cut."""
+    """Cost bounded by mu: an error far beyond sqrt(mu) standard deviations has no influence (Geman 1985)."""
     return Kernel(lambda chi2: (mu / (mu + chi2)) ** 2, lambda chi2: mu * chi2 / (mu + chi2))

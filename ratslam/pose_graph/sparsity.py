@@ -1,4 +1,4 @@
-"""Symmetric sparse equations over the nodes of a graph, ordered once for factors with few entries."""
+"""Symmetric sparse equations over the nodes of a graph, ordered once for low fill-in."""
 
 from __future__ import annotations
 
@@ -7,19 +7,20 @@ from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import LinearOperator, SuperLU, cg, splu
 
-TRIES = 6
-"""Steps of conjugate gradients that cost less than another factor, for equations of moderate fill."""
+CG_STEPS = 6
+"""Steps of conjugate gradients that cost less than a new factorization, for moderate fill-in."""
 
 
-class Pattern:
-    """Where the entries stand that edges a-b add to the equations of nodes 0..count - 1; node 0 is known.
+class SparseEquations:
+    """The sparsity pattern of equations over nodes 0..count - 1 with edges a-b, and their factor; node 0 is
+    fixed at 0.
 
     An edge adds to four places: (a, a), (b, b), (a, b) and (b, a), in this order.
     """
 
     def __init__(self, count: int, a: np.ndarray, b: np.ndarray) -> None:
         size = count - 1
-        place = _places(count, a, b)
+        place = _elimination_order(count, a, b)
         rows = np.concatenate([place[a], place[b], place[a], place[b]])
         columns = np.concatenate([place[a], place[b], place[b], place[a]])
         self.used = (rows >= 0) & (columns >= 0)
@@ -32,16 +33,16 @@ class Pattern:
         self.indptr = np.searchsorted(found, np.arange(size + 1) * size).astype(np.int32)
 
     def solve(
-        self, entries: np.ndarray, held: np.ndarray, right: np.ndarray, again: bool = False
+        self, entries: np.ndarray, fixed: np.ndarray, right: np.ndarray, reuse_factor: bool = False
     ) -> np.ndarray | None:
-        """[count, D] the unknowns, 0 at node 0; None where they are not determined.
+        """[count, D] the unknowns, 0 at node 0; None if the equations are singular.
 
         Args:
             entries: [4 E] numbers, or [3, 3, 4 E] blocks that act on the D = 3 columns of a node.
-            held: nodes that nothing ties to node 0 and that are to stay at 0.
+            fixed: nodes to hold at 0, one of each component that is not connected to node 0.
             right: [count, D] right-hand sides.
-            again: these blocks may have changed little since the last solve. Then six digits will do,
-                by conjugate gradients from the last factor where they get there soon.
+            reuse_factor: solve to six digits by conjugate gradients, preconditioned with the last factor,
+                if that converges in `CG_STEPS`; for blocks that changed little since the last solve.
         """
         answer = np.zeros(right.shape, np.result_type(entries, right))
         if self.size == 0:
@@ -49,17 +50,17 @@ class Pattern:
         entries = entries[..., self.used]
         blocks = entries.shape[:-1]
         summed = np.stack([self._sum(row) for row in entries.reshape(-1, entries.shape[-1])], axis=-1)
-        summed[self.diagonal[held - 1]] += np.eye(*blocks).ravel() if blocks else 1.0
+        summed[self.diagonal[fixed - 1]] += np.eye(*blocks).ravel() if blocks else 1.0
         if blocks:
             shape = (3 * self.size, 3 * self.size)
             rows = bsr_matrix((summed.reshape(-1, 3, 3), self.indices, self.indptr), shape).tocsr()
-            # The matrix is its own transpose, so its rows may be taken for columns.
+            # The matrix is symmetric, so its rows are its columns.
             matrix = csc_matrix((rows.data, rows.indices, rows.indptr), shape)
         else:
             rows = csr_matrix((summed[:, 0], self.indices, self.indptr), (self.size, self.size))
             matrix = rows.tocsc()
         ordered = right[self.node].astype(answer.dtype).reshape(matrix.shape[0], -1)
-        found = self._again(matrix, ordered[:, 0]) if again else None
+        found = self._refine(matrix, ordered[:, 0]) if reuse_factor else None
         if found is None:
             try:
                 self.factor = splu(
@@ -71,11 +72,11 @@ class Pattern:
         answer[self.node] = found.reshape(self.size, -1)
         return answer if np.isfinite(answer).all() else None
 
-    def _again(self, matrix: csc_matrix, right: np.ndarray) -> np.ndarray | None:
+    def _refine(self, matrix: csc_matrix, right: np.ndarray) -> np.ndarray | None:
         if self.factor is None:
             return None
-        nearly = LinearOperator(matrix.shape, self.factor.solve)
-        found, unfinished = cg(matrix, right, rtol=1e-6, maxiter=TRIES, M=nearly)
+        inverse = LinearOperator(matrix.shape, self.factor.solve)
+        found, unfinished = cg(matrix, right, rtol=1e-6, maxiter=CG_STEPS, M=inverse)
         return None if unfinished else found
 
     def _sum(self, values: np.ndarray) -> np.ndarray:
@@ -84,21 +85,22 @@ class Pattern:
         return np.bincount(self.slot, values, self.count)
 
 
-def unreached(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The first node of every part of a graph that does not hang together with node 0."""
+def component_roots(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The first node of every connected component that does not contain node 0."""
     ties = csr_matrix((np.ones(len(a), np.int8), (a, b)), (count, count))
     _, part = connected_components(ties, directed=False)
     _, first = np.unique(part, return_index=True)
     return first[first > 0]
 
 
-def _places(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """[count] where nodes stand among the unknowns; -1 for node 0.
+def _elimination_order(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """[count] positions of the nodes among the unknowns; -1 for node 0.
 
-    An approximate minimum degree order, by the trick of SYMAMD (Davis et al. 2004): COLAMD orders the columns
-    of the graph's incidence matrix for its normal equations, and these have the entries of ours. One row more
-    for every node and one column more for every edge make it square and triangular, which costs nothing to
-    factor and changes no degree. Given our own matrix COLAMD orders for its square, and factors fill up.
+    An approximate minimum degree order, computed as SYMAMD does (Davis et al. 2004): COLAMD orders the
+    columns of the graph's incidence matrix for its normal equations, which have the sparsity of ours. One
+    extra row for every node and one extra column for every edge make that matrix square and triangular,
+    which costs nothing to factor and changes no degree. Applied to our matrix directly, COLAMD orders for
+    its square, which has more fill-in.
     """
     tied = a != b
     low, high = np.minimum(a, b)[tied] - 1, np.maximum(a, b)[tied] - 1
@@ -106,7 +108,7 @@ def _places(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     free = low >= 0
     row = np.concatenate([nodes, rows, rows[free], rows])
     column = np.concatenate([nodes, high, low[free], rows])
-    # The entries of nodes are the largest of their columns, so they are the pivots.
+    # The entries of nodes are the largest in their columns, so they become the pivots.
     value = np.ones(len(row))
     value[:size] = 4.0
     if size == 0:

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from ratslam.classic.experience_map import ExperienceConfig, ExperienceMap
 from ratslam.core.types import Action, Estimate
-from ratslam.pose_graph import Edges, Ending, least_squares, linear
+from ratslam.pose_graph import Edges, Termination, least_squares, linear_initialization
 from tactile.base.se2 import between, integrate, wrap
 from tactile.base.types import Odometry, observation
 
@@ -93,14 +93,16 @@ def test_two_stages(benchmark, size, name, count):
     """Beside the classic sweep, compiled: 100 sweeps from odometry."""
     truth, edges = measured(name, count := size(count))
     sweep(truth[:2].copy(), Edges(*(column[:1] for column in edges)), 1)
-    took, poses = timed(lambda: linear(count, edges))
+    took, poses = timed(lambda: linear_initialization(count, edges))
     swept, relaxed = timed(lambda: sweep(integrated(edges, count), edges, 100), 1)
     print(
         f"\n{name}, {count} nodes: two stages {took * 1e3:.1f} ms, misfit {misfit(poses, edges):.3g}; "
         f"100 sweeps {swept * 1e3:.0f} ms, misfit {misfit(relaxed, edges):.3g}"
     )
     benchmark.extra_info["ms"] = took * 1e3
-    assert misfit(benchmark.pedantic(linear, args=(count, edges), rounds=1), edges) < misfit(relaxed, edges)
+    assert misfit(benchmark.pedantic(linear_initialization, args=(count, edges), rounds=1), edges) < misfit(
+        relaxed, edges
+    )
 
 
 @pytest.mark.parametrize("name", PATHS)
@@ -109,11 +111,11 @@ def test_cold(benchmark, size, name):
     truth, edges = measured(name, size(10_000))
 
     def cold(**how):
-        return least_squares(linear(len(truth), edges), edges, **how)
+        return least_squares(linear_initialization(len(truth), edges), edges, **how)
 
     took, solved = timed(cold)
-    whole, plain = timed(lambda: cold(folded=False), 1)
-    theirs, rest = gtsam_optimum(linear(len(truth), edges), edges)
+    whole, plain = timed(lambda: cold(eliminate_chains=False), 1)
+    theirs, rest = gtsam_optimum(linear_initialization(len(truth), edges), edges)
     print(
         f"\n{name}: cold {took * 1e3:.0f} ms, {solved.iterations} iterations, misfit "
         f"{misfit(solved.poses, edges):.4f}; all nodes {whole * 1e3:.0f} ms, "
@@ -121,7 +123,7 @@ def test_cold(benchmark, size, name):
     )
     benchmark.extra_info["ms"] = took * 1e3
     solved = benchmark.pedantic(cold, rounds=1)
-    assert solved.ending is Ending.CONVERGED
+    assert solved.termination is Termination.CONVERGED
     assert solved.cost == pytest.approx(plain.cost, rel=1e-9)
 
 
@@ -130,19 +132,19 @@ def test_warm(benchmark, size, name):
     """One more closure in a solved map, beside the same without elimination."""
     truth, edges = measured(name, size(10_000))
     before = Edges(*(column[:-1] for column in edges))
-    start = least_squares(linear(len(truth), before), before).poses
+    start = least_squares(linear_initialization(len(truth), before), before).poses
 
     def warm(**how):
         return least_squares(start, edges, tolerance=1e-3, **how)
 
     took, solved = timed(warm, 11)
-    whole, _ = timed(lambda: warm(folded=False), 1)
+    whole, _ = timed(lambda: warm(eliminate_chains=False), 1)
     print(
         f"\n{name}: warm {took * 1e3:.1f} ms, {solved.iterations} iterations; all nodes {whole * 1e3:.0f} ms"
     )
     benchmark.extra_info["ms"] = took * 1e3
     solved = benchmark.pedantic(warm, rounds=1)
-    assert solved.ending is Ending.CONVERGED
+    assert solved.termination is Termination.CONVERGED
     assert solved.iterations <= 3
 
 
@@ -150,9 +152,9 @@ def test_warm(benchmark, size, name):
 def test_cold_with_a_tenth_of_a_radian_a_step(benchmark, size, name):
     """Headings are lost within a hundred steps: damping decides where a solve ends."""
     truth, edges = measured(name, size(10_000), NOISE * [1, 1, 10])
-    start = linear(len(truth), edges)
+    start = linear_initialization(len(truth), edges)
     took, solved = timed(lambda: least_squares(start, edges, iterations=100), 1)
-    whole, plain = timed(lambda: least_squares(start, edges, iterations=20, folded=False), 1)
+    whole, plain = timed(lambda: least_squares(start, edges, iterations=20, eliminate_chains=False), 1)
     theirs, rest = gtsam_optimum(start, edges)
     print(
         f"\n{name}: {took * 1e3:.0f} ms, {solved.iterations} iterations, misfit "

@@ -1,4 +1,4 @@
-"""Laws of the pose-graph solvers, and the graphs everybody knows."""
+"""Laws of the pose-graph solvers, and their optimum on the M3500 graph."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from hypothesis import strategies as st
 from ratslam.classic.relaxation import relax
 from ratslam.pose_graph import (
     Edges,
-    Ending,
+    Termination,
     difference_error,
     geman_mcclure,
     huber,
     least_squares,
-    linear,
+    linear_initialization,
     logmap_error,
 )
-from ratslam.pose_graph.chains import chains
-from ratslam.pose_graph.edges import full
+from ratslam.pose_graph.chains import find_chains
+from ratslam.pose_graph.edges import information_matrices
 from ratslam.pose_graph.io import read_g2o, write_g2o
-from ratslam.pose_graph.normal_equations import Folded
+from ratslam.pose_graph.normal_equations import ReducedEquations
 from tactile.base.errors import InputError
 from tactile.base.se2 import between, compose, integrate, inverse, wrap
 
@@ -92,7 +92,7 @@ def plainly(edges, count, heading):
 
 
 @given(st.integers(0, 1000), st.integers(5, 60), st.sampled_from([0.01, 0.1]))
-def test_linear_is_the_plain_two_stage_solve(seed, closures, noise):
+def test_linear_initialization_is_the_dense_two_stage_solve(seed, closures, noise):
     stream = np.random.default_rng(seed)
     truth, edges = loops(stream, 120, closures, (0.02, noise))
     turned = stream.random(len(edges.i)) < 0.3  # some measured the other way round
@@ -100,49 +100,49 @@ def test_linear_is_the_plain_two_stage_solve(seed, closures, noise):
     motion[turned] = inverse(motion[turned])
     i, j = np.where(turned, edges.j, edges.i), np.where(turned, edges.i, edges.j)
     edges = Edges(i, j, motion, stream.uniform(50, 500, (len(i), 3)))
-    found = linear(len(truth), edges)
+    found = linear_initialization(len(truth), edges)
     positions, left = plainly(edges, len(truth), found[:, 2])
     assert left < 1e-9  # no change of headings would fit them better
     assert np.abs(found[:, :2] - positions).max() < 1e-9
 
 
-def test_linear_hangs_parts_on_nothing_at_the_start():
+def test_linear_initialization_places_unconnected_parts_at_the_start():
     edges = Edges(np.array([0, 2, 3]), np.array([1, 3, 4]), np.tile([1.0, 0, 0], (3, 1)), np.ones((3, 3)))
-    assert np.allclose(linear(6, edges, np.array([5, 5, np.pi / 2])), [
+    assert np.allclose(linear_initialization(6, edges, np.array([5, 5, np.pi / 2])), [
         [5, 5, np.pi / 2], [5, 6, np.pi / 2],
         [5, 5, np.pi / 2], [5, 6, np.pi / 2], [5, 7, np.pi / 2], [5, 5, np.pi / 2],
     ])  # fmt: skip
 
 
 @given(st.integers(0, 1000), st.booleans())
-def test_exact_graphs_stay_and_linear_finds_them(seed, folded):
+def test_exact_graphs_are_solved_exactly(seed, reduced):
     truth, edges = loops(np.random.default_rng(seed))
-    solved = least_squares(truth, edges, folded=folded)
-    assert solved.ending is Ending.CONVERGED
+    solved = least_squares(truth, edges, eliminate_chains=reduced)
+    assert solved.termination is Termination.CONVERGED
     assert np.abs(solved.poses - truth).max() < 1e-9
-    found = linear(len(truth), edges)
+    found = linear_initialization(len(truth), edges)
     assert np.abs(found[:, :2] - truth[:, :2]).max() < 1e-6
 
 
 @given(st.integers(0, 1000), st.integers(2, 60))
-def test_chains_lead_from_fork_to_fork(seed, count):
+def test_chains_lead_from_junction_to_junction(seed, count):
     truth, edges = tangle(np.random.default_rng(seed), count)
-    solid = np.random.default_rng(seed + 1).random(len(edges.i)) < 0.9
-    found = chains(len(truth), edges.i, edges.j, solid)
-    assert sorted([*found.forks, *found.inner]) == list(range(len(truth)))
-    assert sorted([*found.edge, *found.loose]) == list(range(len(edges.i)))
-    assert solid[found.edge].all()
-    assert found.forks[0] == 0
+    reducible = np.random.default_rng(seed + 1).random(len(edges.i)) < 0.9
+    found = find_chains(len(truth), edges.i, edges.j, reducible)
+    assert sorted([*found.junctions, *found.inner]) == list(range(len(truth)))
+    assert sorted([*found.edge, *found.direct]) == list(range(len(edges.i)))
+    assert reducible[found.edge].all()
+    assert found.junctions[0] == 0
     start = np.where(found.sign > 0, edges.i[found.edge], edges.j[found.edge])
     stop = np.where(found.sign > 0, edges.j[found.edge], edges.i[found.edge])
     begins = np.isin(np.arange(len(start)), found.first)
-    assert np.array_equal(start[begins], found.forks[found.a[: len(found.first)]])
-    assert np.array_equal(stop[np.roll(begins, -1)], found.forks[found.b[: len(found.first)]])
+    assert np.array_equal(start[begins], found.junctions[found.start[: len(found.first)]])
+    assert np.array_equal(stop[np.roll(begins, -1)], found.junctions[found.end[: len(found.first)]])
     assert np.array_equal(start[~begins], found.inner)
     assert np.array_equal(stop[found.into], found.inner)
-    # None is left: whoever is tied to two others by solid edges is in a chain, but for rings on their own.
+    # Every node with two reducible edges is in a chain, except in isolated rings.
     degree = np.bincount(edges.i, minlength=len(truth)) + np.bincount(edges.j, minlength=len(truth))
-    degree[edges.i[~solid]] = degree[edges.j[~solid]] = degree[edges.i[edges.i == edges.j]] = 9
+    degree[edges.i[~reducible]] = degree[edges.j[~reducible]] = degree[edges.i[edges.i == edges.j]] = 9
     assert set(np.flatnonzero(degree[:-2] == 2)) - {0} <= {*found.inner, *ring(edges)}
 
 
@@ -154,12 +154,12 @@ def ring(edges):
 
 
 @given(st.integers(0, 1000), st.integers(2, 60), st.sampled_from([difference_error, logmap_error]))
-def test_a_folded_step_balances_the_whole_graph(seed, count, error):
+def test_a_step_with_chains_eliminated_balances_the_full_graph(seed, count, error):
     truth, edges = tangle(np.random.default_rng(seed), count)
     at = truth + np.random.default_rng(seed + 1).normal(0, 0.2, truth.shape)
     errors = error(at, edges)
-    folded = Folded(len(at), edges, np.zeros(len(edges.i), bool))
-    short = folded.step(at, errors, full(edges.information), 0.0)
+    reduced = ReducedEquations(len(at), edges, np.zeros(len(edges.i), bool))
+    short = reduced.step(at, errors, information_matrices(edges.information), 0.0)
     residual, by_i, by_j = errors
     # Least squares of the linearised errors, gauge free parts and all: what is left must be as little.
     change = (
@@ -167,7 +167,7 @@ def test_a_folded_step_balances_the_whole_graph(seed, count, error):
         + np.einsum("eab,eb->ea", by_i, short[edges.i])
         + np.einsum("eab,eb->ea", by_j, short[edges.j])
     )
-    force = np.einsum("eab,eb->ea", full(edges.information), change)
+    force = np.einsum("eab,eb->ea", information_matrices(edges.information), change)
     balance = np.zeros_like(at)
     np.add.at(balance, edges.i, np.einsum("eba,eb->ea", by_i, force))
     np.add.at(balance, edges.j, np.einsum("eba,eb->ea", by_j, force))
@@ -186,30 +186,30 @@ def test_a_moved_graph_has_the_moved_solution(seed, by):
 
 @given(st.integers(0, 1000), st.sampled_from([0.01, 0.03]), st.sampled_from([difference_error, logmap_error]))
 @settings(max_examples=40)
-def test_folded_ends_where_whole_does(seed, noise, error):
+def test_eliminating_chains_reaches_the_same_optimum(seed, noise, error):
     truth, edges = loops(np.random.default_rng(seed), 200, 40, (0.02, noise))
-    start = linear(len(truth), edges)
-    whole, folded = (least_squares(start, edges, error=error, folded=f) for f in (False, True))
-    assert whole.ending is folded.ending is Ending.CONVERGED
-    assert folded.cost == pytest.approx(whole.cost, rel=1e-9)
-    assert np.abs(between(whole.poses, folded.poses)).max() < 1e-5
+    start = linear_initialization(len(truth), edges)
+    whole, reduced = (least_squares(start, edges, error=error, eliminate_chains=f) for f in (False, True))
+    assert whole.termination is reduced.termination is Termination.CONVERGED
+    assert reduced.cost == pytest.approx(whole.cost, rel=1e-9)
+    assert np.abs(between(whole.poses, reduced.poses)).max() < 1e-5
 
 
-def test_noise_of_a_tenth_of_a_radian_a_step():
-    """What is left is what noise leaves: chi-square of as many degrees of freedom."""
+def test_the_cost_under_heavy_heading_noise_is_chi_square():
+    """0.1 rad per step: the final cost is chi-square with as many degrees of freedom."""
     for seed in range(5):
         truth, edges = loops(np.random.default_rng(seed), 1200, 150, (0.02, 0.1))
-        start = linear(len(truth), edges)
-        folded = least_squares(start, edges, folded=True)
-        assert folded.ending is Ending.CONVERGED
+        start = linear_initialization(len(truth), edges)
+        reduced = least_squares(start, edges, eliminate_chains=True)
+        assert reduced.termination is Termination.CONVERGED
         free = 3 * (len(edges.i) - len(truth) + 1)
-        assert folded.cost < free + 5 * np.sqrt(2 * free)
-        whole = least_squares(start, edges, folded=False, iterations=folded.iterations)
-        assert folded.cost <= whole.cost * (1 + 1e-9)
+        assert reduced.cost < free + 5 * np.sqrt(2 * free)
+        whole = least_squares(start, edges, eliminate_chains=False, iterations=reduced.iterations)
+        assert reduced.cost <= whole.cost * (1 + 1e-9)
 
 
-@pytest.mark.parametrize("folded", [False, True])
-def test_a_robust_kernel_shrugs_off_a_false_closure(folded):
+@pytest.mark.parametrize("reduced", [False, True])
+def test_robust_kernels_limit_the_influence_of_a_false_closure(reduced):
     truth, edges = loops(np.random.default_rng(0), noise=(0.02, 0.005))
     false = Edges(
         *(np.concatenate([a, b]) for a, b in zip(edges, ([3], [110], [[0, 0, 0]], [[1e4] * 3]), strict=True))
@@ -217,26 +217,26 @@ def test_a_robust_kernel_shrugs_off_a_false_closure(folded):
     robust = np.arange(len(false.i)) >= len(truth) - 1
     harm = {}
     for name, kernel in {"huber": huber(1.0), "geman": geman_mcclure(9.0)}.items():
-        poses = least_squares(truth, false, kernel=kernel, robust=robust, folded=folded).poses
+        poses = least_squares(truth, false, kernel=kernel, robust=robust, eliminate_chains=reduced).poses
         harm[name] = np.abs(poses - truth)[:, :2].max()
-    plain = np.abs(least_squares(truth, false, folded=folded).poses - truth)[:, :2].max()
+    plain = np.abs(least_squares(truth, false, eliminate_chains=reduced).poses - truth)[:, :2].max()
     assert harm["geman"] < plain / 5
     assert harm["huber"] < plain / 5
 
 
-def test_heavy_heading_noise_ends_with_a_name_and_no_nan():
+def test_heavy_heading_noise_terminates_without_nan():
     stream = np.random.default_rng(1)
     _, edges = loops(stream, 400, 60, (0.02, 0.1))
     start = np.vstack([np.zeros(3), integrate(edges.motion[:399])])
     solved = least_squares(start, edges, iterations=200)
     assert np.isfinite(solved.poses).all()
-    assert solved.ending in (Ending.CONVERGED, Ending.STUCK)
-    better = least_squares(linear(400, edges), edges, iterations=200)
+    assert solved.termination in (Termination.CONVERGED, Termination.NO_DECREASE)
+    better = least_squares(linear_initialization(400, edges), edges, iterations=200)
     assert np.isfinite(better.poses).all()
     assert better.cost <= solved.cost * 1.001
 
 
-def test_heading_drift_beyond_a_turn_is_unrolled():
+def test_heading_drift_of_more_than_half_a_turn_is_corrected():
     count = 400
     truth = np.vstack([np.zeros(3), integrate(np.tile([0.1, 0, 0.05], (count - 1, 1)))])
     i, j = np.arange(count - 1), np.arange(1, count)
@@ -246,21 +246,21 @@ def test_heading_drift_beyond_a_turn_is_unrolled():
         np.vstack([measured, between(truth[np.arange(0, 260, 10)], truth[np.arange(0, 260, 10) + 126])]),
         np.vstack([np.tile([1e4, 1e4, 1e3], (count - 1, 1)), np.tile([1e4, 1e4, 1e4], (26, 1))]),
     )  # fmt: skip
-    solved = least_squares(linear(count, edges), edges)
+    solved = least_squares(linear_initialization(count, edges), edges)
     assert np.abs(solved.poses - truth)[:380, :2].max() < 0.5
 
 
-def test_endings_have_names():
+def test_degenerate_graphs_terminate():
     nothing = Edges(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3)))
-    assert least_squares(np.zeros((1, 3)), nothing).ending is Ending.CONVERGED
+    assert least_squares(np.zeros((1, 3)), nothing).termination is Termination.CONVERGED
     one = Edges(np.array([0]), np.array([1]), np.array([[np.nan, 0, 0]]), np.ones((1, 3)))
-    assert least_squares(np.zeros((2, 3)), one).ending is Ending.NOT_FINITE
+    assert least_squares(np.zeros((2, 3)), one).termination is Termination.NOT_FINITE
     apart = Edges(np.array([0, 3]), np.array([1, 4]), np.ones((2, 3)), np.ones((2, 3)))
-    for folded in (False, True):
-        solved = least_squares(np.zeros((5, 3)), apart, folded=folded)
+    for reduced in (False, True):
+        solved = least_squares(np.zeros((5, 3)), apart, eliminate_chains=reduced)
         assert np.isfinite(solved.poses).all()
-        assert solved.ending is Ending.CONVERGED
-    assert np.isfinite(linear(5, apart)).all()
+        assert solved.termination is Termination.CONVERGED
+    assert np.isfinite(linear_initialization(5, apart)).all()
 
 
 @pytest.fixture(scope="module")
@@ -273,7 +273,7 @@ def m3500(reference_data):
     return start, Edges(table[:, 0].astype(int), table[:, 1].astype(int), table[:, 2:5], information)
 
 
-def test_m3500_ends_where_gtsam_ends(m3500):
+def test_m3500_reaches_the_optimum_of_gtsam(m3500):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         gtsam = pytest.importorskip("gtsam")
@@ -291,9 +291,9 @@ def test_m3500_ends_where_gtsam_ends(m3500):
     solved = gtsam.LevenbergMarquardtOptimizer(graph, values, settings).optimize()
     theirs = np.array([[solved.atPose2(k).x(), solved.atPose2(k).y()] for k in range(len(start))])
     for error, near in ((logmap_error, 1e-6), (difference_error, 1e-4)):
-        for folded in (False, True):
-            ours = least_squares(start, edges, error=error, folded=folded)
-            assert ours.ending is Ending.CONVERGED
+        for reduced in (False, True):
+            ours = least_squares(start, edges, error=error, eliminate_chains=reduced)
+            assert ours.termination is Termination.CONVERGED
             assert np.hypot(*(ours.poses[:, :2] - theirs).T).max() <= near
 
 
