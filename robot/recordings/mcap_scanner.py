@@ -55,14 +55,14 @@ class RecordingDescription(NamedTuple):
             "created_by": self.created_by,
             "info": self.info.to_json(),
         }
-        return data | {"crc32": _checksum(data)}
+        return data | {"crc32": metadata_checksum(data)}
 
     @classmethod
     def from_metadata(cls, data: Mapping[str, str]) -> RecordingDescription:
         """Raises `ValueError` for anything `to_metadata` cannot have written."""
         if data.get("format") != FORMAT:
             raise Malformed(f"its format is {data.get('format')!r}, this version reads {FORMAT!r}")
-        if data.get("crc32") != _checksum(data):
+        if data.get("crc32") != metadata_checksum(data):
             raise Malformed("a description without its checksum")
         try:
             rows, columns, channels = (int(size) for size in data["view_shape"].split(","))
@@ -77,8 +77,8 @@ class RecordingDescription(NamedTuple):
         return found
 
 
-def _checksum(data: Mapping[str, str]) -> str:
-    """Of all of a description but the checksum; outside chunks, MCAP itself has none."""
+def metadata_checksum(data: Mapping[str, str]) -> str:
+    """CRC-32 of all metadata but the checksum itself; MCAP has no checksum outside chunks."""
     return str(crc32(json.dumps({**data, "crc32": ""}, sort_keys=True).encode()))
 
 

@@ -44,7 +44,7 @@ def read_trace(path: Path, limits: UnitLimits = DEFAULT_LIMITS) -> InMemorySourc
     """
     content = read_bytes(path)
     arrays = _arrays(path, content)
-    raise_errors(_shape_faults(path, arrays))
+    raise_errors(_shape_errors(path, arrays))
     params = _params(path, arrays["params_json"])
     shape, given_ids = _view_shape(path, params, arrays["in_view"].shape[1])
 
@@ -57,22 +57,9 @@ def read_trace(path: Path, limits: UnitLimits = DEFAULT_LIMITS) -> InMemorySourc
     with np.errstate(all="ignore"):  # faulty values are reported below
         motion[moved] = from_velocities(time[moved], speed[moved], 0.0, turn[moved], TURN_THEN_MOVE)
 
-    place = _place(path)
-    errors = [
-        *_flag_faults(flags, place),
-        *nonfinite_errors(time, "in_t", place),
-        *clock_errors(time, "in_t", place, moved),
-    ]
-    errors += nonfinite_errors(speed, "in_v", place, moved) + nonfinite_errors(turn, "in_w", place, moved)
-    errors += nonfinite_errors(view, "in_view", place, seen)
-    if given_ids:
-        errors += _id_faults(view, seen, place)
-    else:
-        low = np.where(seen, view.min(axis=1), np.nan)
-        errors += view_errors(low, np.where(seen, view.max(axis=1), np.nan), "in_view", place)
-    if truth is not None:
-        errors += nonfinite_errors(truth, "truth", place)
-    raise_errors(errors + unit_errors(MotionTrack(time, moved, motion, truth), str(path), limits))
+    track = MotionTrack(time, moved, motion, truth)
+    errors = _value_errors(lambda row: f"{path}, row {row}", arrays, track, view, seen, given_ids)
+    raise_errors(errors + unit_errors(track, str(path), limits))
 
     label = np.full(len(time), -1, np.int32)
     picture = np.zeros((len(time), *shape))
@@ -94,8 +81,26 @@ def read_trace(path: Path, limits: UnitLimits = DEFAULT_LIMITS) -> InMemorySourc
     )
 
 
-def _place(path: Path) -> RowName:
-    return lambda row: f"{path}, row {row}"
+def _value_errors(
+    place: RowName,
+    arrays: dict[str, np.ndarray],
+    track: MotionTrack,
+    view: np.ndarray,
+    seen: np.ndarray,
+    given_ids: bool,
+) -> list[InputError]:
+    """Errors of single rows: flags, times, velocities, views or place ids, true poses."""
+    errors = _flag_errors(arrays["in_flags"], place) + nonfinite_errors(track.time, "in_t", place)
+    errors += clock_errors(track.time, "in_t", place, track.moved)
+    for name in ("in_v", "in_w"):
+        errors += nonfinite_errors(arrays[name].astype(np.float64), name, place, track.moved)
+    errors += nonfinite_errors(view, "in_view", place, seen)
+    if given_ids:
+        errors += _id_errors(view, seen, place)
+    else:
+        low, high = (np.where(seen, most, np.nan) for most in (view.min(axis=1), view.max(axis=1)))
+        errors += view_errors(low, high, "in_view", place)
+    return errors if track.truth is None else errors + nonfinite_errors(track.truth, "truth", place)
 
 
 def _arrays(path: Path, content: bytes) -> dict[str, np.ndarray]:
@@ -119,7 +124,7 @@ def _array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
     return np.lib.format.read_array(io.BytesIO(archive.read(f"{name}.npy")), allow_pickle=False)
 
 
-def _shape_faults(path: Path, arrays: dict[str, np.ndarray]) -> list[InputError]:
+def _shape_errors(path: Path, arrays: dict[str, np.ndarray]) -> list[InputError]:
     """Wrong dtypes, dimensions and lengths, and no rows at all."""
     rows = arrays["in_t"].size
     wanted: dict[str, tuple[str, ...]] = {name: ("N",) for name in COLUMNS} | {"in_view": ("N", "V")}
@@ -190,7 +195,7 @@ def _view_shape(path: Path, params: dict, width: int) -> tuple[tuple[int, int, i
     return (rows, columns, 1), width != rows * columns
 
 
-def _flag_faults(flags: np.ndarray, place: RowName) -> list[InputError]:
+def _flag_errors(flags: np.ndarray, place: RowName) -> list[InputError]:
     bad = ~np.isin(flags, (VIEW, ODOMETRY, VIEW | ODOMETRY))
     if not bad.any():
         return []
@@ -198,7 +203,7 @@ def _flag_faults(flags: np.ndarray, place: RowName) -> list[InputError]:
     return [InputError(place(row), f"in_flags is {flags[row]}", "1 (view), 2 (odometry) or 3 (both)")]
 
 
-def _id_faults(view: np.ndarray, seen: np.ndarray, place: RowName) -> list[InputError]:
+def _id_errors(view: np.ndarray, seen: np.ndarray, place: RowName) -> list[InputError]:
     """Ids are small whole numbers, and the heading of a match is not ours to use."""
     ids, relative = np.nan_to_num(view).T
     errors = []

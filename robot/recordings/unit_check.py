@@ -100,10 +100,15 @@ def unit_errors(track: MotionTrack, where: str, limits: UnitLimits = DEFAULT_LIM
         errors = heading_errors(track.truth[:, 2], track.time, "the truth's heading", where, limits)
         if errors:
             track = track._replace(truth=track.truth * (1, 1, np.pi / 180))
-    robot = typical_motion(track)
+    found = _unit_faults(typical_motion(track), limits)
+    return errors + [InputError(where, *words) for wrong, *words in found if wrong]
+
+
+def _unit_faults(robot: TypicalMotion, limits: UnitLimits) -> tuple[tuple[bool, str, str, str], ...]:
+    """Each possible fault: whether it is there, what was found, what is expected, the cure."""
     rushes, truth_rushes = robot.speed > limits.speed, robot.true_speed > limits.speed
     spins = robot.turn_rate > limits.turn_rate or robot.turn > np.pi
-    faults = (
+    return (
         (
             robot.interval > limits.interval,
             f"half of the steps take over {robot.interval:.4g} s",
@@ -141,7 +146,6 @@ def unit_errors(track: MotionTrack, where: str, limits: UnitLimits = DEFAULT_LIM
             _DEGREES,
         ),
     )
-    return errors + [InputError(where, *words) for wrong, *words in faults if wrong]
 
 
 def heading_errors(

@@ -137,7 +137,7 @@ class HeadSimulation(SimulatedSource):
         )
         self._parts = self._surroundings()
         self.calibration = None if self.tier.name == "kinematic" else self._calibrated()
-        self._felt = self._kinematic() if self.calibration is None else None
+        self.features = self._kinematic() if self.calibration is None else None
 
         plain = config.model_dump(mode="json", exclude={"maze": {"file"}})
         self.digest = digest_of_document(
@@ -208,9 +208,9 @@ class HeadSimulation(SimulatedSource):
         return calibrate(config.calibration, record, where="simulation")
 
     def _readings(self) -> Iterator[Whisk | Cycle]:
-        if self._felt is None:
+        if self.features is None:
             return self._cycles()
-        return (whisk_of_row(self.head, self._felt, row, NO_ODOMETRY) for row in range(self.length))
+        return (whisk_of_row(self.head, self.features, row, NO_ODOMETRY) for row in range(self.length))
 
     def _cycles(self) -> Iterator[Cycle]:
         """Raw samples of each cycle, without its odometry."""

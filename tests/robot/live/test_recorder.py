@@ -47,7 +47,7 @@ from robot.recordings.cdr_live import (
 from robot.recordings.mcap_reader import Recording, recover
 from robot.recordings.mcap_scanner import McapScanner, RecordingEntry
 from robot.recordings.mcap_writer import _Whole
-from robot.recordings.schemas import SCHEMAS
+from robot.recordings.schemas import TRUTH
 from robot.sources.source_info import SourceInfo
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Odometry
@@ -389,7 +389,7 @@ def _no_room(_: Any) -> None:
     raise OSError(28, "No space left on device")
 
 
-def _entries(path: Path) -> list[RecordingEntry]:
+def entries_of(path: Path) -> list[RecordingEntry]:
     return list(McapScanner(path).entries())
 
 
@@ -397,10 +397,10 @@ def test_recover_keeps_what_stands_beside_the_samples(tmp_path: Path) -> None:
     session(tmp_path / "whole.mcap")
     data = (tmp_path / "whole.mcap").read_bytes()
     (tmp_path / "cut.mcap").write_bytes(data[: data.rindex(b"\x28\xb5\x2f\xfd")])  # in its last chunk
-    before = _entries(tmp_path / "cut.mcap")
+    before = entries_of(tmp_path / "cut.mcap")
     report = recover(tmp_path / "cut.mcap", tmp_path / "good.mcap")
     assert report == (3, True, "it ends too early")
-    after = _entries(tmp_path / "good.mcap")
+    after = entries_of(tmp_path / "good.mcap")
     assert [entry[:4] for entry in after] == [entry[:4] for entry in before]
     assert len({entry.name for entry in after}) == 4
     again = Recording(tmp_path / "good.mcap")
@@ -443,7 +443,7 @@ def damaged(data: bytes, seed: int, rounds: int) -> Iterator[bytes]:
 @pytest.mark.parametrize("rounds", [150, pytest.param(5000, marks=pytest.mark.soak)])
 def test_of_a_damaged_file_exactly_a_prefix_is_read(tmp_path: Path, rounds: int) -> None:
     session(tmp_path / "a.mcap", whisks=2)
-    whole = [entry[:4] for entry in _entries(tmp_path / "a.mcap")]
+    whole = [entry[:4] for entry in entries_of(tmp_path / "a.mcap")]
     lengths = set()
     for bad in damaged((tmp_path / "a.mcap").read_bytes(), rounds, rounds):
         (tmp_path / "bad.mcap").write_bytes(bad)
@@ -459,7 +459,7 @@ def test_of_a_damaged_file_exactly_a_prefix_is_read(tmp_path: Path, rounds: int)
 def test_a_chunk_that_is_passed_over_is_missed(tmp_path: Path, unsigned: bool) -> None:
     """Its type is damaged; and perhaps the checksum of the whole has gone too (0: there is none)."""
     session(tmp_path / "a.mcap", whisks=2)
-    whole = [entry[:4] for entry in _entries(tmp_path / "a.mcap")]
+    whole = [entry[:4] for entry in entries_of(tmp_path / "a.mcap")]
     data = (tmp_path / "a.mcap").read_bytes()
     chunks = [found.start() - CHUNK_HEADER for found in re.finditer(re.escape(b"\x28\xb5\x2f\xfd"), data)]
     assert len(chunks) > 10
@@ -575,18 +575,18 @@ def test_three_threads_write_one_recording(tmp_path: Path) -> None:
     assert walk.count == 4
 
 
-def test_ros_tools_read_the_messages(tmp_path: Path) -> None:
-    pytest.importorskip("rosbags", reason="rosbags, an extra, is not installed")
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+def test_rosbags_reads_a_live_recording(tmp_path: Path) -> None:
+    from rosbags.highlevel import AnyReader
 
-    store: Any = get_typestore(Stores.EMPTY)
-    for name, text in SCHEMAS.items():
-        store.register(get_types_from_msg(text, name))
     session(tmp_path / "a.mcap")
-    for entry in _entries(tmp_path / "a.mcap"):
-        read = store.deserialize_cdr(entry.message, entry.name)
-        assert bytes(store.serialize_cdr(read, entry.name)) == entry.message
-        assert read.time == entry.time
+    entries = entries_of(tmp_path / "a.mcap")
+    written = [(entry.name, entry.message) for entry in entries]
+    written += [(TRUTH, entry.truth) for entry in entries if entry.truth is not None]
+    with AnyReader([tmp_path / "a.mcap"]) as reader:
+        read = [(connection.msgtype, bytes(data)) for connection, _, data in reader.messages()]
+        assert sorted(read) == sorted(written)
+        for name, data in read:
+            assert bytes(reader.typestore.serialize_cdr(reader.deserialize(data, name), name)) == data
 
 
 def test_an_unseen_cut_needs_no_frames(tmp_path: Path, refused: Callable[..., InputError]) -> None:

@@ -19,10 +19,10 @@ from hypothesis.extra.numpy import arrays
 
 from robot.recordings.cdr import decode, encode
 from robot.recordings.mcap_reader import Recording, record_source, recover
-from robot.recordings.mcap_scanner import FORMAT, McapScanner, _checksum
+from robot.recordings.mcap_scanner import FORMAT, McapScanner, metadata_checksum
 from robot.recordings.npz_trace import read_trace
 from robot.recordings.recorder import Recorder
-from robot.recordings.schemas import CYCLE, OBSERVATION, REPORT, SCHEMAS, TOPICS, WHISK
+from robot.recordings.schemas import CYCLE, OBSERVATION, REPORT, SCHEMAS, TOPICS, TRUTH, WHISK
 from robot.sources.source import Sample, Source
 from robot.sources.source_info import MazeInfo, SourceInfo
 from tactile.base.errors import InputError
@@ -34,13 +34,13 @@ SHAPE, WHISKERS = (2, 3, 2), 4
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
 
 
-def _numbers(
+def numbers(
     *shape: int, low: float | None = None, high: float | None = None
 ) -> st.SearchStrategy[np.ndarray]:
     return arrays(np.float64, shape, elements=st.floats(low, high, allow_nan=False, allow_infinity=False))
 
 
-def _bools(*shape: int) -> st.SearchStrategy[np.ndarray]:
+def flags_of(*shape: int) -> st.SearchStrategy[np.ndarray]:
     return arrays(np.bool_, shape)
 
 
@@ -51,34 +51,34 @@ OBSERVATIONS = st.builds(
     Observation,
     odometry=ODOMETRIES,
     motion=st.integers(0, 3).map(np.int32),
-    view=_numbers(*SHAPE, low=0, high=1),
+    view=numbers(*SHAPE, low=0, high=1),
     view_seen=st.booleans().map(np.bool_),
     label=st.integers(-1, 2**31 - 1).map(np.int32),
-    contact=_bools(WHISKERS),
-    alive=_bools(WHISKERS),
-    point=_numbers(WHISKERS, 2),
+    contact=flags_of(WHISKERS),
+    alive=flags_of(WHISKERS),
+    point=numbers(WHISKERS, 2),
     wall=st.booleans().map(np.bool_),
-    wall_point=_numbers(2),
+    wall_point=numbers(2),
     wall_sd=NUMBERS.map(np.float64),
 )
 CYCLES = st.integers(0, 5).flatmap(
     lambda t: st.builds(
         Cycle,
-        time=_numbers(t),
-        angle=_numbers(t, WHISKERS),
-        deflection=_numbers(t, WHISKERS, 2),
+        time=numbers(t),
+        angle=numbers(t, WHISKERS),
+        deflection=numbers(t, WHISKERS, 2),
         odometry=ODOMETRIES,
     )
 )
 WHISKS = st.builds(
     Whisk,
     odometry=ODOMETRIES,
-    alive=_bools(WHISKERS),
-    contact=_bools(WHISKERS),
-    touched=_numbers(WHISKERS),
-    held=_bools(WHISKERS),
-    highest=_numbers(WHISKERS),
-    reach=_numbers(WHISKERS),
+    alive=flags_of(WHISKERS),
+    contact=flags_of(WHISKERS),
+    touched=numbers(WHISKERS),
+    held=flags_of(WHISKERS),
+    highest=numbers(WHISKERS),
+    reach=numbers(WHISKERS),
 )
 REPORTS = st.integers(0, 5).flatmap(
     lambda t: st.builds(
@@ -86,10 +86,10 @@ REPORTS = st.integers(0, 5).flatmap(
         odometry=ODOMETRIES,
         motion=st.integers(0, 3),
         moment=st.integers(0, 3),
-        alive=_bools(WHISKERS),
-        contact=_bools(WHISKERS),
-        time=_numbers(t),
-        strain=_numbers(t, WHISKERS, 2),
+        alive=flags_of(WHISKERS),
+        contact=flags_of(WHISKERS),
+        time=numbers(t),
+        strain=numbers(t, WHISKERS, 2),
     )
 )
 INFO = SourceInfo(
@@ -106,20 +106,20 @@ INFO = SourceInfo(
     maze=MazeInfo(text="o---o\n|   |\no---o\n", heights=(0.05, 0.02), seed=3),
     provenance={"über": None, "numbers": [0.1, -0.0]},
 )
-TRUTHS = st.none() | _numbers(3, low=-0.1, high=0.1)
+TRUTHS = st.none() | numbers(3, low=-0.1, high=0.1)
 SAMPLES = st.lists(st.tuples(OBSERVATIONS | CYCLES | WHISKS | REPORTS, TRUTHS), min_size=1, max_size=12).map(
     lambda parts: [Sample(100 + 0.5 * i, *part) for i, part in enumerate(parts)]
 )
 
 
-def _leaves(sample: Sample) -> list[Any]:
+def leaves(sample: Sample) -> list[Any]:
     parts: list[Any] = [np.float64(sample.time), type(sample.reading), sample.truth is None]
     odometry = sample.reading.odometry
     rest = sample.reading._replace(odometry=None)
     return [*parts, *odometry, *(part for part in rest if part is not None), sample.truth]
 
 
-def _same(one: Sequence[Sample], other: Sequence[Sample]) -> bool:
+def same_bits(one: Sequence[Sample], other: Sequence[Sample]) -> bool:
     """Whether two runs of samples are equal in every bit, shape and dtype."""
 
     def key(value: Any) -> Any:
@@ -128,11 +128,11 @@ def _same(one: Sequence[Sample], other: Sequence[Sample]) -> bool:
         return value
 
     return len(one) == len(other) and all(
-        list(map(key, _leaves(a))) == list(map(key, _leaves(b))) for a, b in zip(one, other, strict=True)
+        list(map(key, leaves(a))) == list(map(key, leaves(b))) for a, b in zip(one, other, strict=True)
     )
 
 
-def _write(path: Path, samples: Sequence[Sample], **options: Any) -> Path:
+def write_recording(path: Path, samples: Sequence[Sample], **options: Any) -> Path:
     path.unlink(missing_ok=True)
     options = {"info": INFO} | options
     with Recorder(path, view_shape=SHAPE, whiskers=WHISKERS, rate_hz=2.0, **options) as recorder:
@@ -141,7 +141,7 @@ def _write(path: Path, samples: Sequence[Sample], **options: Any) -> Path:
     return path
 
 
-def _samples(count: int, seed: int = 0) -> list[Sample]:
+def some_samples(count: int, seed: int = 0) -> list[Sample]:
     """Samples of all kinds with every field filled."""
     rng = np.random.default_rng(seed)
     samples = []
@@ -170,19 +170,19 @@ def _samples(count: int, seed: int = 0) -> list[Sample]:
 @pytest.fixture(scope="module")
 def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, list[Sample]]:
     """A small recording of several chunks: its bytes and its samples."""
-    samples = _samples(9)
-    path = _write(tmp_path_factory.mktemp("small") / "small.mcap", samples, chunk_s=1.5)
+    samples = some_samples(9)
+    path = write_recording(tmp_path_factory.mktemp("small") / "small.mcap", samples, chunk_s=1.5)
     return path.read_bytes(), samples
 
 
 @settings(max_examples=60)
 @given(SAMPLES)
 def test_what_is_written_comes_back_bit_for_bit(tmp_path_factory: Any, samples: list[Sample]) -> None:
-    path = _write(tmp_path_factory.getbasetemp() / "law.mcap", samples)
+    path = write_recording(tmp_path_factory.getbasetemp() / "law.mcap", samples)
     with Recording(path) as source:
         assert isinstance(source, Source)
-        assert _same(list(source), samples)
-        assert _same(list(source), samples)  # and again
+        assert same_bits(list(source), samples)
+        assert same_bits(list(source), samples)  # and again
         assert (source.length, source.view_shape, source.whiskers) == (len(samples), SHAPE, WHISKERS)
         assert (source.truncated, source.warning, source.rate_hz) == (False, "", 2.0)
         raw = any(not isinstance(sample.reading, Observation) for sample in samples)
@@ -190,23 +190,25 @@ def test_what_is_written_comes_back_bit_for_bit(tmp_path_factory: Any, samples: 
 
 
 def test_the_file_depends_on_the_samples_alone(tmp_path: Path) -> None:
-    paths = [_write(tmp_path / name, _samples(9)) for name in ("a.mcap", "b.mcap")]
+    paths = [write_recording(tmp_path / name, some_samples(9)) for name in ("a.mcap", "b.mcap")]
     assert paths[0].read_bytes() == paths[1].read_bytes()
     sources = [Recording(path) for path in paths]
     assert sources[0].digest == sources[1].digest
     assert len(sources[0].digest) == 64
-    assert Recording(_write(tmp_path / "c.mcap", _samples(9, seed=1))).digest != sources[0].digest
+    assert (
+        Recording(write_recording(tmp_path / "c.mcap", some_samples(9, seed=1))).digest != sources[0].digest
+    )
 
 
 def test_a_source_is_recorded_as_it_is(trace: Path, tmp_path: Path) -> None:
     with read_trace(trace) as source:
         assert record_source(source, tmp_path / "copy.mcap") == source.length
         copy = Recording(tmp_path / "copy.mcap")
-        assert _same(list(copy), list(source))
+        assert same_bits(list(copy), list(source))
         assert copy.rate_hz == source.rate_hz
 
 
-def _check_prefix(path: Path, samples: list[Sample]) -> int:
+def check_prefix(path: Path, samples: list[Sample]) -> int:
     """Reads a damaged file: a prefix of the samples, or one InputError. How many samples."""
     told: list[str] = []
     source: Recording | None
@@ -219,7 +221,7 @@ def _check_prefix(path: Path, samples: list[Sample]) -> int:
         assert str(path) in message
         return 0
     read = list(source)
-    assert _same(read, samples[: len(read)])
+    assert same_bits(read, samples[: len(read)])
     assert source.info == INFO.model_copy(update={"raw_whiskers": source.info.raw_whiskers})
     assert source.length == len(read)
     assert told == ([source.warning] if source.truncated else [])
@@ -234,12 +236,12 @@ def test_a_recording_may_be_cut_off_anywhere(small: tuple[bytes, list[Sample]], 
     last = content.rindex(b"\x28\xb5\x2f\xfd")  # behind it stands the table of contents
     for size in [*range(last), *range(last, len(content), 7)]:
         path.write_bytes(content[:size])
-        counts.append(_check_prefix(path, samples))
+        counts.append(check_prefix(path, samples))
     assert counts == sorted(counts)
     assert {0, 1, len(samples)} < set(counts)
 
 
-def _fuzz(content: bytes, samples: list[Sample], path: Path, rounds: int, seed: int) -> None:
+def fuzz(content: bytes, samples: list[Sample], path: Path, rounds: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     for _ in range(rounds):
         bad = bytearray(content)
@@ -254,7 +256,7 @@ def _fuzz(content: bytes, samples: list[Sample], path: Path, rounds: int, seed: 
                 case _:
                     bad[place : place + 16] = bytes(16)
         path.write_bytes(bad)
-        _check_prefix(path, samples)
+        check_prefix(path, samples)
 
 
 def test_every_damaged_byte_is_noticed(small: tuple[bytes, list[Sample]], tmp_path: Path) -> None:
@@ -264,17 +266,17 @@ def test_every_damaged_byte_is_noticed(small: tuple[bytes, list[Sample]], tmp_pa
         bad = bytearray(content)
         bad[place] ^= 0x40
         path.write_bytes(bad)
-        _check_prefix(path, samples)
+        check_prefix(path, samples)
 
 
 def test_random_damage(small: tuple[bytes, list[Sample]], tmp_path: Path) -> None:
-    _fuzz(*small, tmp_path / "bad.mcap", rounds=500, seed=1)
+    fuzz(*small, tmp_path / "bad.mcap", rounds=500, seed=1)
 
 
 @pytest.mark.soak
 @pytest.mark.parametrize("seed", range(8))
 def test_much_random_damage(small: tuple[bytes, list[Sample]], tmp_path: Path, seed: int) -> None:
-    _fuzz(*small, tmp_path / "bad.mcap", rounds=5000, seed=seed + 100)
+    fuzz(*small, tmp_path / "bad.mcap", rounds=5000, seed=seed + 100)
 
 
 def test_a_killed_recorder_loses_no_more_than_its_last_half_second(tmp_path: Path) -> None:
@@ -309,7 +311,7 @@ def test_recover_makes_a_whole_file(small: tuple[bytes, list[Sample]], tmp_path:
     assert (report.samples, report.truncated, report.reason) == (found.length, True, "it ends too early")
     again = Recording(whole)
     assert not again.truncated
-    assert _same(list(again), samples[: found.length])
+    assert same_bits(list(again), samples[: found.length])
     assert (again.view_shape, again.whiskers, again.info) == (SHAPE, WHISKERS, INFO)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cut.mcap", "whole.mcap"]
     assert recover(whole, tmp_path / "third.mcap") == (found.length, False, "")
@@ -350,7 +352,7 @@ def test_a_file_of_another_kind_is_named(tmp_path: Path, refused: Callable[..., 
 
 
 def test_a_recorder_refuses_what_it_cannot_hold(tmp_path: Path, refused: Callable[..., InputError]) -> None:
-    good = _samples(1)[0]
+    good = some_samples(1)[0]
     path = tmp_path / "a.mcap"
     wrong = {
         "view: shape [1, 1, 1]; expected [2, 3, 2]": {"view": np.zeros((1, 1, 1))},
@@ -370,7 +372,7 @@ def test_a_recorder_refuses_what_it_cannot_hold(tmp_path: Path, refused: Callabl
         narrow = good.reading._replace(view=np.full(SHAPE, 0.5, np.float32), label=3)
         recorder.write(good._replace(time=0.5, reading=narrow))
     samples = list(Recording(path))
-    assert _same(samples[:1], [good])
+    assert same_bits(samples[:1], [good])
     assert samples[1].reading.label == 3
     assert (samples[1].reading.view == 0.5).all()
 
@@ -391,12 +393,12 @@ def test_a_recorder_refuses_what_it_cannot_hold(tmp_path: Path, refused: Callabl
 def test_faults_of_a_recording_are_named(
     change: dict[str, Any], pieces: list[str], tmp_path: Path, refused: Callable[..., InputError]
 ) -> None:
-    samples = _samples(10)
+    samples = some_samples(10)
     outer = {key: change[key] for key in change if key in Sample._fields}
     inner = {key: change[key] for key in change if key not in outer}
     bad = samples[5]
     samples[5] = bad._replace(reading=bad.reading._replace(**inner), **outer)
-    path = _write(tmp_path / "bad.mcap", samples)
+    path = write_recording(tmp_path / "bad.mcap", samples)
     refused(lambda: Recording(path), str(path), *pieces)
 
 
@@ -424,36 +426,55 @@ def test_the_standard_reader_reads_it(small: tuple[bytes, list[Sample]], tmp_pat
     assert len(found) == len(samples) + sum(sample.truth is not None for sample in samples)
 
 
-def test_ros_tools_read_the_messages() -> None:
-    pytest.importorskip("rosbags", reason="rosbags, an extra, is not installed")
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+def test_rosbags_reads_every_message_bit_for_bit(tmp_path: Path) -> None:
+    from rosbags.highlevel import AnyReader
 
-    store = get_typestore(Stores.EMPTY)
-    for name, text in SCHEMAS.items():
-        store.register(get_types_from_msg(text, name))
-    for sample in _samples(5):
-        name, message = encode(sample, SHAPE, WHISKERS)
-        read: Any = store.deserialize_cdr(message, name)
-        assert bytes(store.serialize_cdr(read, name)) == message
-        assert (read.time, read.dtheta) == (sample.time, sample.reading.odometry.dtheta)
-        if name == OBSERVATION:
-            assert (read.view.reshape(SHAPE) == sample.reading.view).all()
-            flags = sample.reading.contact + 2 * ~sample.reading.alive
-            assert (read.flags == flags).all()
-        elif name == WHISK:
-            felt = sample.reading
-            assert (
-                read.felt.reshape(WHISKERS, 3) == np.stack([felt.touched, felt.highest, felt.reach], 1)
-            ).all()
-            assert (read.flags == felt.alive + 2 * felt.contact + 4 * felt.held).all()
-        elif name == REPORT:
-            told = sample.reading
-            assert (read.motion, read.moment) == (told.motion, told.moment)
-            assert (read.strain.reshape(-1, WHISKERS, 2) == told.strain).all()
-        else:
-            assert name == CYCLE
-            assert (read.deflection.reshape(2, WHISKERS, 2) == sample.reading.deflection).all()
-        assert _same([Sample(*decode(name, message, SHAPE, WHISKERS), sample.truth)], [sample])
+    samples = some_samples(10)
+    with AnyReader([write_recording(tmp_path / "a.mcap", samples)]) as reader:
+        read = [(connection.msgtype, data, reader.deserialize(data, connection.msgtype))
+                for connection, _, data in reader.messages()]  # fmt: skip
+        for name, data, message in read:
+            assert bytes(reader.typestore.serialize_cdr(message, name)) == data
+    readings = [part for part in read if part[0] != TRUTH]
+    assert [data for _, data, _ in readings] == [encode(sample, SHAPE, WHISKERS)[1] for sample in samples]
+    for sample, (name, data, message) in zip(samples, readings, strict=True):
+        check_fields(sample, name, message)
+        assert same_bits([Sample(*decode(name, data, SHAPE, WHISKERS), sample.truth)], [sample])
+
+
+def test_mcap_ros2_reads_every_message(tmp_path: Path) -> None:
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    samples = some_samples(10)
+    with write_recording(tmp_path / "a.mcap", samples).open("rb") as file:
+        read = list(make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages())
+    readings = [part for part in read if part.schema.name != TRUTH]
+    for sample, part in zip(samples, readings, strict=True):
+        check_fields(sample, part.schema.name, part.decoded_message)
+
+
+def check_fields(sample: Sample, name: str, message: Any) -> None:
+    """A ROS tool's message has the values of the sample."""
+    reading = sample.reading
+    assert (message.time, message.dtheta) == (sample.time, reading.odometry.dtheta)
+    if isinstance(reading, Observation):
+        assert name == OBSERVATION
+        assert (np.reshape(message.view, SHAPE) == reading.view).all()
+        assert (np.array(list(message.flags)) == reading.contact + 2 * ~reading.alive).all()
+    elif isinstance(reading, Whisk):
+        assert name == WHISK
+        features = np.stack([reading.touched, reading.highest, reading.reach], 1)
+        assert (np.reshape(message.felt, (WHISKERS, 3)) == features).all()
+        flags = reading.alive + 2 * reading.contact + 4 * reading.held
+        assert (np.array(list(message.flags)) == flags).all()
+    elif isinstance(reading, Report):
+        assert name == REPORT
+        assert (message.motion, message.moment) == (reading.motion, reading.moment)
+        assert (np.reshape(message.strain, (-1, WHISKERS, 2)) == reading.strain).all()
+    else:
+        assert name == CYCLE
+        assert (np.reshape(message.deflection, (2, WHISKERS, 2)) == reading.deflection).all()
 
 
 def test_a_chunk_that_would_not_fit_into_memory_is_not_opened(
@@ -490,7 +511,7 @@ def test_a_valid_file_with_strange_contents_is_told_apart(
         writer.start()
         metadata = {"format": FORMAT, "view_shape": shape, "whiskers": str(whiskers), "rate_hz": "1.0"}
         metadata |= {"created_by": "somebody", "info": info}
-        writer.add_metadata("ratslam", metadata | {"crc32": _checksum(metadata)})
+        writer.add_metadata("ratslam", metadata | {"crc32": metadata_checksum(metadata)})
         schema = writer.register_schema(name, "ros2msg", SCHEMAS[name].encode())
         writer.add_message(writer.register_channel(TOPICS[name], "cdr", schema), 0, b"\0\1\0\0" + message, 0)
         writer.finish()
@@ -504,12 +525,12 @@ def test_a_file_of_another_version_is_named(
     old = tmp_path / "old.mcap"
     with monkeypatch.context() as patch:
         patch.setattr("robot.recordings.mcap_scanner.FORMAT", "2")
-        _write(old, _samples(3))
+        write_recording(old, some_samples(3))
     refused(lambda: Recording(old), str(old), "its format is '2', this version reads '3'")
     other = tmp_path / "other.mcap"
     with monkeypatch.context() as patch:
         patch.setitem(SCHEMAS, OBSERVATION, SCHEMAS[OBSERVATION] + "bool more\n")
-        _write(other, _samples(3))
+        write_recording(other, some_samples(3))
     refused(lambda: Recording(other), str(other), "/ratslam/observation", "defined otherwise than here")
 
 
@@ -524,7 +545,7 @@ def test_provenance_that_is_not_json_is_refused_before_anything_is_written(
 
 def test_source_info_is_stored_before_the_first_sample(tmp_path: Path) -> None:
     """It stands before the first sample, so a recorder killed at once leaves it."""
-    path = _write(tmp_path / "a.mcap", _samples(2))
+    path = write_recording(tmp_path / "a.mcap", some_samples(2))
     content = path.read_bytes()
     path.write_bytes(content[: content.index(b"\x28\xb5\x2f\xfd")])
     walk = McapScanner(path)
@@ -551,5 +572,5 @@ def test_a_truth_in_degrees_is_refused(tmp_path: Path, refused: Callable[..., In
         Sample(0.5 * i, observation(turning, view_shape=SHAPE, whiskers=WHISKERS), np.array([0, 0, 17.0 * i]))
         for i in range(40)
     ]
-    path = _write(tmp_path / "degrees.mcap", samples)
+    path = write_recording(tmp_path / "degrees.mcap", samples)
     refused(lambda: Recording(path), str(path), "the truth's heading runs from 0 to 663", "pi/180")

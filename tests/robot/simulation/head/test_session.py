@@ -85,10 +85,10 @@ def test_streams_are_independent() -> None:
     base = made()
     other = made(odometry={"noise": "white"})
     assert (base.odometry != other.odometry).any()
-    assert all((one == two).all() for one, two in zip(base._felt, other._felt, strict=True))
+    assert all((one == two).all() for one, two in zip(base.features, other.features, strict=True))
     noisy = made(mechanics={"noise": 5e-3})
     assert (noisy.odometry == base.odometry).all()
-    assert (noisy._felt.touched != base._felt.touched).any()
+    assert (noisy.features.touched != base.features.touched).any()
     fuller = made(maze={"share": 0.9})
     assert fuller.scene.loop == base.scene.loop
     assert (fuller.truth == base.truth).all()
@@ -145,8 +145,8 @@ def test_a_session_backwards_sees_the_same_places_from_the_same_side() -> None:
     away = np.hypot(gap[..., 0], gap[..., 1]) + 0.1 * np.abs(gap[..., 2])
     nearest = away.argmin(axis=1)
     assert away.min(axis=1).max() < 0.04  # half a step, or half a turn's
-    same = there._felt.contact == back._felt.contact[nearest]
-    apart = there._felt.contact == back._felt.contact[np.roll(nearest, 40)]
+    same = there.features.contact == back.features.contact[nearest]
+    apart = there.features.contact == back.features.contact[np.roll(nearest, 40)]
     assert same.mean() > 0.9 > apart.mean()
 
 
@@ -169,9 +169,9 @@ def test_kidnaps_are_spread_and_hidden_from_odometry() -> None:
 def test_later_another_maze_is_felt() -> None:
     base, control = made(), made(later_maze=0.5)
     half = base.length // 2
-    for one, two in zip(base._felt, control._felt, strict=True):
+    for one, two in zip(base.features, control.features, strict=True):
         assert (one[:half] == two[:half]).all()
-    assert (base._felt.contact[half:] != control._felt.contact[half:]).mean() > 0.05
+    assert (base.features.contact[half:] != control.features.contact[half:]).mean() > 0.05
     assert (base.truth == control.truth).all()
     assert (base.odometry == control.odometry).all()
 
@@ -262,7 +262,7 @@ def test_a_low_head_may_go_where_its_whiskers_are_free(tmp_path: Path) -> None:
     (tmp_path / "maze.txt").write_text(drawing.replace("   o" * 6 + "\n|", "   o" * 6 + "\n|"))
     short = HeadConfig(rings=(RingConfig(length=0.04, radius=0.02, height=0.055),))
     session = made(short, maze={"file": tmp_path / "maze.txt"}, path={"cells": [(2, 2), (3, 2), (3, 3)]})
-    assert not session._felt.contact.any()
+    assert not session.features.contact.any()
 
 
 @pytest.mark.parametrize(
