@@ -17,7 +17,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from ratslam.classic.relaxation import relax
 from ratslam.core.backend import Evidence
-from ratslam.core.growable_array import GrowableArray
+from ratslam.core.growable_array import GrowableArray, copy_arrays, restore_arrays
 from ratslam.core.types import Action, Estimate
 from ratslam.pose_graph import Edges, geman_mcclure, huber, least_squares, no_kernel
 from ratslam.pose_graph.io import write_g2o, write_json
@@ -295,21 +295,17 @@ class ExperienceMap:
 
     # What a checkpoint keeps
 
-    def _growing(self) -> dict[str, GrowableArray]:
-        return {name[1:]: value for name, value in vars(self).items() if isinstance(value, GrowableArray)}
-
     def arrays(self) -> dict[str, np.ndarray]:
         """Everything, so that `restore` continues bit for bit."""
         travel = self._travel
-        return {name: rows.rows.copy() for name, rows in self._growing().items()} | {
+        return copy_arrays(self) | {
             "current": np.array(self._current),
             "travel": np.concatenate([travel.motion, travel.variance, [travel.length, travel.duration]]),
         }
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Takes the place of everything folded so far."""
-        for name, rows in self._growing().items():
-            rows.replace(arrays[name])
+        restore_arrays(self, arrays)
         self._current = int(arrays["current"])
         travel = np.asarray(arrays["travel"])
         self._travel = Travel(travel[:3].copy(), travel[3:6].copy(), float(travel[6]), float(travel[7]))

@@ -1,8 +1,8 @@
 """The seam: what a SLAM method has to provide.
 
-A backend is a pure kernel and a map that folds what the kernel reports. The kernel never sees the map and
-the map never sees the kernel's state, so the kernel can be scanned, batched and replayed bit for bit. One way
-leads back: at fixed counts of steps the map gives its feedback, a plain record, and the state takes it up.
+A backend is a pure kernel and a map that folds the kernel's results. The kernel has no access to the map and
+the map none to the kernel's state, so the kernel can be scanned, batched and replayed bit for bit. One way
+leads back: at fixed step counts the map's feedback, a plain record, is applied to the state.
 """
 
 from __future__ import annotations
@@ -20,40 +20,41 @@ from tactile.base.types import Array, Observation
 State = Any
 """A pytree of arrays of fixed shapes and dtypes."""
 Evidence = Any
-"""The backend's own fixed-shape record of one step, a NamedTuple of arrays."""
+"""The backend's own record of one step: a NamedTuple of arrays of fixed shapes with at least `outcome`.
+Fields annotated `ratslam.core.types.Scalar` are columns of `steps.csv`."""
 Feedback = Any
 """What the kernel receives of the map: a record of host arrays, or None."""
 
 
 class Map(Protocol):
-    """The host side: folds one step at a time and answers in the map frame."""
+    """The map on the host: folds one step at a time; poses are in the map frame."""
 
     def update(self, observation: Observation, estimate: Estimate, evidence: Evidence) -> Estimate:
-        """Folds one step; returns the estimate with what only the map knows (places it has confirmed)."""
+        """Folds one step; returns the estimate completed by the map (confirmed places)."""
 
     def feedback(self) -> Feedback:
-        """What the kernel may know of the map as it is now."""
+        """The record that the kernel takes over, or None."""
 
     def pose(self, estimate: Estimate) -> np.ndarray:
-        """[3] the robot's present pose in the map frame: x m, y m, heading rad."""
+        """[3] the robot's current pose in the map frame: x m, y m, heading rad."""
 
     def trajectory(self) -> np.ndarray:
-        """[T, 3] every folded step as the map sees it now."""
+        """[T, 3] poses of all folded steps in the optimised map."""
 
     def online_trajectory(self) -> np.ndarray:
-        """[T, 3] the same, unsettled: what the robot acts on at this moment."""
+        """[T, 3] the same in the map as it is online, without final optimisation."""
 
     def closures(self) -> np.ndarray:
-        """[M, 2] steps that the map takes to be at one place: the later and the earlier of each pair."""
+        """[M, 2] pairs of steps joined by accepted loop closures: the later and the earlier."""
 
     def graph(self) -> networkx.DiGraph:
         """The map as a graph (empty for maps without nodes)."""
 
     def files(self) -> dict[str, Callable[[Path], None]]:
-        """What the map leaves in a run directory: names, and how each is written."""
+        """Files of the map in a run directory: names, and a function that writes each."""
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """All of its state, for a checkpoint."""
+        """The whole state, for a checkpoint."""
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `arrays`."""
@@ -63,19 +64,19 @@ class Backend(Protocol):
     """A SLAM method."""
 
     def init(self, key: Array, capacity: int) -> State:
-        """The state before the first step, with room for `capacity` rows of whatever grows."""
+        """The state before the first step, with `capacity` rows in the arrays that grow."""
 
     def rows(self, state: State) -> int:
-        """Rows in use of whatever grows most; a step adds one at most."""
+        """Largest number of rows in use; a step adds at most one."""
 
     def grow(self, state: State, capacity: int) -> State:
-        """The same state with more room."""
+        """The same state with a larger capacity."""
 
     def apply_map_feedback(self, state: State, feedback: Feedback) -> State:
-        """The state that has taken up what the map told; same shapes and dtypes."""
+        """The state after the map's feedback; same shapes and dtypes."""
 
     def kernel(self, state: State, observation: Observation) -> tuple[State, Estimate, Evidence]:
-        """One step, pure: it can be jitted, scanned and vmapped."""
+        """One step; pure, so that it can be jitted, scanned and vmapped."""
 
     def new_map(self) -> Map:
         """An empty map."""

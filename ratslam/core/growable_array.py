@@ -1,4 +1,4 @@
-"""An array that grows at its end."""
+"""An append-only array."""
 
 from __future__ import annotations
 
@@ -8,27 +8,43 @@ import numpy as np
 
 
 class GrowableArray:
-    """Rows of one shape and dtype; room doubles when it is used up, so n appends cost O(n)."""
+    """Rows of one shape and dtype; the capacity doubles when it is used up, so n appends cost O(n)."""
 
     def __init__(self, shape: tuple[int, ...], dtype: Any) -> None:
-        self._room = np.zeros((16, *shape), dtype)
+        self._buffer = np.zeros((16, *shape), dtype)
         self._count = 0
 
     @property
     def rows(self) -> np.ndarray:
-        """[count, ...] a view: writing to it changes the array, appending may detach it."""
-        return self._room[: self._count]
+        """[count, ...] a view: writing to it changes the array; `append` may replace the buffer under it."""
+        return self._buffer[: self._count]
 
     def append(self, row: Any) -> None:
-        """Adds one row."""
-        if self._count == len(self._room):
-            self._room = np.concatenate([self._room, np.zeros_like(self._room)])
-        self._room[self._count] = row
+        """Appends one row."""
+        if self._count == len(self._buffer):
+            self._buffer = np.concatenate([self._buffer, np.zeros_like(self._buffer)])
+        self._buffer[self._count] = row
         self._count += 1
 
     def replace(self, rows: np.ndarray) -> None:
-        """Starts over with the given rows."""
+        """Replaces all rows."""
         capacity = max(16, 1 << (len(rows) - 1).bit_length())
-        self._room = np.zeros((capacity, *self._room.shape[1:]), self._room.dtype)
-        self._room[: len(rows)] = rows
+        self._buffer = np.zeros((capacity, *self._buffer.shape[1:]), self._buffer.dtype)
+        self._buffer[: len(rows)] = rows
         self._count = len(rows)
+
+
+def growable_arrays(owner: object) -> dict[str, GrowableArray]:
+    """The attributes of `owner` that are growable arrays, by name without the leading underscore."""
+    return {name[1:]: value for name, value in vars(owner).items() if isinstance(value, GrowableArray)}
+
+
+def copy_arrays(owner: object) -> dict[str, np.ndarray]:
+    """Copies of the rows of all growable arrays of `owner`, for a checkpoint."""
+    return {name: array.rows.copy() for name, array in growable_arrays(owner).items()}
+
+
+def restore_arrays(owner: object, saved: dict[str, np.ndarray]) -> None:
+    """Replaces the rows of all growable arrays of `owner` by those of a checkpoint."""
+    for name, array in growable_arrays(owner).items():
+        array.replace(saved[name])

@@ -1,7 +1,7 @@
-"""Many records of one kind as a few arrays: one for each dtype, a row for each record.
+"""Many records of one kind packed into a few arrays: one array per dtype, one row per record.
 
-What goes to a compiled function and comes back costs by the array, not by the number. The records' shapes and
-names travel as the static part of a pytree.
+The transfer to and from a compiled function costs time per array, not per number. The shapes and names of the
+records are the static part of a pytree.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from tactile.base.types import Array
 
 
 class Leaf(NamedTuple):
-    """Where one array of a record lies: which array of the rows, its columns, its shape."""
+    """Place of one array of a record: index of the packed array, columns first to last, shape."""
 
     array: int
     first: int
@@ -27,7 +27,7 @@ class Leaf(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """Of one kind of record. dtypes, widths: of the arrays."""
+    """Layout of one kind of record; dtypes and widths are those of the packed arrays."""
 
     tree: Any
     leaves: tuple[Leaf, ...]
@@ -35,19 +35,19 @@ class Layout(NamedTuple):
     widths: tuple[int, ...]
 
 
-class Rows:
-    """Records as arrays [T, width]; a pytree, the layout its static part."""
+class PackedRecords:
+    """T records as arrays [T, width]; a pytree with the layout as its static part."""
 
     def __init__(self, layout: Layout, arrays: tuple[Array, ...]) -> None:
         self.layout, self.arrays = layout, arrays
 
     def at(self, k: Array) -> Any:
-        """The record in row k, traced."""
+        """The record in row k (traced)."""
         rows = [lax.dynamic_index_in_dim(array, k, 0, keepdims=False) for array in self.arrays]
         return _record(self.layout, rows)
 
-    def put(self, k: Array, record: Any) -> Rows:
-        """The same with another record in row k, traced."""
+    def put(self, k: Array, record: Any) -> PackedRecords:
+        """A copy with `record` in row k (traced)."""
         parts: list[list[Array]] = [[] for _ in self.arrays]
         for leaf, value in zip(self.layout.leaves, jax.tree.leaves(record), strict=True):
             parts[leaf.array].append(jnp.reshape(value, -1))
@@ -55,40 +55,40 @@ class Rows:
             lax.dynamic_update_index_in_dim(array, jnp.concatenate(part), k, 0)
             for array, part in zip(self.arrays, parts, strict=True)
         )
-        return Rows(self.layout, tuple(arrays))
+        return PackedRecords(self.layout, tuple(arrays))
 
     def write(self, k: int, record: Any) -> None:
-        """Another record in row k, host NumPy in place.
+        """Writes `record` to row k in place (host NumPy).
 
         Raises:
-            ValueError: the record is of another shape.
+            ValueError: the record has another shape.
         """
         for leaf, value in zip(self.layout.leaves, jax.tree.leaves(record), strict=True):
             if np.shape(value) != leaf.shape:
-                raise ValueError(f"a record of another shape: {np.shape(value)} instead of {leaf.shape}")
+                raise ValueError(f"record with an array of shape {np.shape(value)}, expected {leaf.shape}")
             self.arrays[leaf.array][k, leaf.first : leaf.last] = np.reshape(value, -1)
 
     def records(self, count: int) -> Iterator[Any]:
-        """The first `count`, host NumPy."""
+        """The first `count` records, host NumPy."""
         arrays = [np.asarray(array) for array in self.arrays]
         for k in range(count):
             yield _record(self.layout, [array[k] for array in arrays])
 
 
-def room(layout: Layout, count: int) -> Rows:
-    """Rows of zeros, host NumPy."""
+def allocate(layout: Layout, count: int) -> PackedRecords:
+    """`count` records of zeros, host NumPy."""
     sizes = zip(layout.widths, layout.dtypes, strict=True)
-    return Rows(layout, tuple(np.zeros((count, width), dtype) for width, dtype in sizes))
+    return PackedRecords(layout, tuple(np.zeros((count, width), dtype) for width, dtype in sizes))
 
 
-def empty(layout: Layout, count: int) -> Rows:
-    """The same, traced."""
+def allocate_traced(layout: Layout, count: int) -> PackedRecords:
+    """`count` records of zeros, inside a compiled function."""
     sizes = zip(layout.widths, layout.dtypes, strict=True)
-    return Rows(layout, tuple(jnp.zeros((count, width), dtype) for width, dtype in sizes))
+    return PackedRecords(layout, tuple(jnp.zeros((count, width), dtype) for width, dtype in sizes))
 
 
 def layout_of(example: Any) -> Layout:
-    """How records like the example are laid out; of it only shapes and dtypes are asked for."""
+    """The layout of records like the example, of which only shapes and dtypes are used."""
     values, tree = jax.tree.flatten(example)
     dtypes: list[np.dtype] = []
     widths: list[int] = []
@@ -110,12 +110,12 @@ def _record(layout: Layout, arrays: Sequence[Array]) -> Any:
     return jax.tree.unflatten(layout.tree, values)
 
 
-def _flattened(rows: Rows) -> tuple[tuple[Array, ...], Layout]:
+def _flattened(rows: PackedRecords) -> tuple[tuple[Array, ...], Layout]:
     return rows.arrays, rows.layout
 
 
-def _unflattened(layout: Layout, arrays: tuple[Array, ...]) -> Rows:
-    return Rows(layout, tuple(arrays))
+def _unflattened(layout: Layout, arrays: tuple[Array, ...]) -> PackedRecords:
+    return PackedRecords(layout, tuple(arrays))
 
 
-jax.tree_util.register_pytree_node(Rows, _flattened, _unflattened)
+jax.tree_util.register_pytree_node(PackedRecords, _flattened, _unflattened)

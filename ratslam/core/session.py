@@ -1,8 +1,8 @@
-"""The session: the one loop, and the one object that changes.
+"""The session: feeds observations to a backend's kernel and folds its results into the map.
 
 Live and replay run the same compiled function over a chunk of fixed length with a traced count: live passes
-one observation, replay many, and both give the same bits. Memory grows to powers of two that depend on the
-rows in use alone, before a chunk that could need more; at the start of a chunk the kernel hears of the map.
+one observation, replay up to `CHUNK`, and both give the same bits. At the start of a chunk the capacity grows
+to a power of two that depends only on the rows in use, and the kernel takes over the map's feedback.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from functools import partial
 from itertools import islice
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,19 +18,20 @@ import numpy as np
 from jax import lax
 
 from ratslam.core.backend import Backend, Evidence, Map
-from ratslam.core.packing import Layout, Rows, empty, layout_of, room
+from ratslam.core.packing import Layout, PackedRecords, allocate, allocate_traced, layout_of
+from ratslam.core.precision import Precision, check_precision
 from ratslam.core.types import Estimate
 from tactile.base.types import Observation
 
 CHUNK = 16
-"""Observations per compiled call; capacities change and the map guides only at multiples of it."""
+"""Observations per compiled call. Capacity and map feedback change only at multiples of it."""
 
 
 class Step(NamedTuple):
-    """What one observation led to.
+    """Result of one observation.
 
     Attributes:
-        estimate, evidence: of the backend, host NumPy. pose: [3] in the map frame as it was known then.
+        estimate, evidence: of the backend, host NumPy. pose: [3] in the map frame at that time, m, m, rad.
     """
 
     estimate: Estimate
@@ -39,14 +40,14 @@ class Step(NamedTuple):
 
 
 class Session:
-    """Feeds observations to a backend and folds what it says into its map.
+    """A backend with its state and its map.
 
     Args:
-        seed: of the backend's random stream. reserve: rows of memory made room for at the start, so that a
-            live session does not compile in mid-run. precision: of the kernel; float64 needs JAX's x64.
+        seed: of the backend's random stream. reserve: rows of memory allocated at the start, so that a live
+            session does not recompile while it runs. precision: dtype of the kernel's floating state.
 
     Raises:
-        ValueError: JAX is not set up for the precision asked for.
+        ValueError: `precision` is float64 and JAX's 64-bit types are disabled (`ratslam.core.precision`).
     """
 
     def __init__(
@@ -55,38 +56,41 @@ class Session:
         *,
         seed: int = 0,
         reserve: int = 0,
-        precision: Literal["float64", "float32"] = "float64",
+        precision: Precision = "float64",
     ) -> None:
-        if precision == "float64":
-            jax.config.update("jax_enable_x64", True)
+        check_precision(precision)
         self.backend = backend
-        self.map: Map = backend.new_map()
-        self.steps = 0
         self.reserve = reserve
-        self._capacity = capacity_at(0, reserve)
-        self.state = backend.init(jax.random.key(seed), self._capacity)
         self._layout: Layout | None = None
-        self._run = jax.jit(partial(run_chunk, backend.kernel), donate_argnums=0)
+        self._run_chunk = jax.jit(partial(run_chunk, backend.kernel), donate_argnums=0)
+        self.restart(seed)
+
+    def restart(self, seed: int = 0) -> None:
+        """Goes back to the start with an empty map; the compiled functions are kept."""
+        self.map: Map = self.backend.new_map()
+        self.steps = 0
+        self._capacity = capacity_at(0, self.reserve)
+        self.state = self.backend.init(jax.random.key(seed), self._capacity)
 
     def step(self, observation: Observation) -> Step:
-        """One observation, live."""
+        """Folds one observation, live."""
         return self._advance([observation])[0]
 
     def replay(self, observations: Iterable[Observation]) -> Iterator[Step]:
-        """Many observations, a chunk at a time; the same bits as `step` by `step`."""
+        """Folds many observations, a chunk at a time; bit-identical to `step` for each."""
         remaining = iter(observations)
-        # Chunks end where capacities may change, wherever the session stands when the replay begins.
+        # Chunks end at multiples of CHUNK, wherever the session stands when the replay begins.
         while chunk := list(islice(remaining, CHUNK - self.steps % CHUNK)):
             yield from self._advance(chunk)
 
     def warm(self, observation: Observation) -> None:
-        """Compiles for observations like this one; the first step stays what it would have been."""
+        """Compiles for observations like this one; results of later steps do not change."""
         self._layout = self._layout or layout_of(observation)
         self.state = self.backend.apply_map_feedback(self.state, self.map.feedback())
-        self.state, _ = self._run(self.state, room(self._layout, CHUNK), np.int32(0))
+        self.state, _ = self._run_chunk(self.state, allocate(self._layout, CHUNK), np.int32(0))
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The whole session for a checkpoint: a restored one continues bit for bit."""
+        """The whole session for a checkpoint; a restored session continues bit for bit."""
         leaves = jax.tree.leaves(self.state)
         return (
             {f"state/{k}": np.asarray(leaf) for k, leaf in enumerate(leaves)}
@@ -99,10 +103,10 @@ class Session:
         )
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Takes up where `arrays` was taken.
+        """Continues from a checkpoint made by `arrays`.
 
         Raises:
-            ValueError: the arrays are of a session with another backend or other shapes.
+            ValueError: the checkpoint has another backend or other shapes.
         """
         steps, reserve = int(arrays["steps"]), int(arrays["reserve"])
         capacity = int(arrays["capacity"])
@@ -111,51 +115,54 @@ class Session:
         saved = [arrays.get(f"state/{k}") for k in range(len(leaves))]
         for leaf, value in zip(leaves, saved, strict=True):
             if value is None or value.shape != leaf.shape or value.dtype != leaf.dtype:
-                raise ValueError("the checkpoint is of another configuration or view shape")
+                raise ValueError("the checkpoint was made with another configuration or view shape")
         self.state = jax.tree.unflatten(jax.tree.structure(like), [jnp.asarray(value) for value in saved])
         prefix = "map/"
         self.map.restore({k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)})
         self.steps, self.reserve, self._capacity = steps, reserve, capacity
 
     def compilations(self) -> int:
-        """How often the chunk function was compiled: once per capacity."""
-        return self._run._cache_size()  # type: ignore[attr-defined]
+        """Number of compilations of the chunk function: one per capacity."""
+        return self._run_chunk._cache_size()  # type: ignore[attr-defined]
 
     def _advance(self, observations: list[Observation]) -> list[Step]:
         if self.steps % CHUNK == 0:
-            # A step fills one row at most.
+            # Each step adds at most one row.
             capacity = capacity_at(self.backend.rows(self.state) + CHUNK - 1, self.reserve)
             if capacity > self._capacity:
                 self.state, self._capacity = self.backend.grow(self.state, capacity), capacity
             self.state = self.backend.apply_map_feedback(self.state, self.map.feedback())
         count = len(observations)
         self._layout = self._layout or layout_of(observations[0])
-        chunk = room(self._layout, CHUNK)
+        chunk = allocate(self._layout, CHUNK)
         for k, observation in enumerate(observations):
             chunk.write(k, observation)
-        self.state, told = self._run(self.state, chunk, np.int32(count))
+        self.state, results = self._run_chunk(self.state, chunk, np.int32(count))
         steps = []
-        for observation, (estimate, proof) in zip(observations, told.records(count), strict=True):
-            estimate = self.map.update(observation, estimate, proof)
-            steps.append(Step(estimate, proof, self.map.pose(estimate)))
+        for observation, (estimate, evidence) in zip(observations, results.records(count), strict=True):
+            estimate = self.map.update(observation, estimate, evidence)
+            steps.append(Step(estimate, evidence, self.map.pose(estimate)))
         self.steps += count
         return steps
 
 
 def capacity_at(row: int, reserve: int = 0) -> int:
-    """Rows of memory where `row` may be filled: a power of two that holds its whole chunk."""
+    """Capacity while row `row` is filled: a power of two, at least 256, that holds the row's whole chunk."""
     end = (row // CHUNK + 1) * CHUNK
     return 1 << (max(end, reserve, 256) - 1).bit_length()
 
 
-def run_chunk(kernel: Any, state: Any, chunk: Rows, count: Any) -> tuple[Any, Rows]:
-    """The kernel over the first `count` observations of a chunk: the state after them, and what each step
-    told, (estimate, evidence); rows beyond are zero."""
+def run_chunk(kernel: Any, state: Any, chunk: PackedRecords, count: Any) -> tuple[Any, PackedRecords]:
+    """The kernel over the first `count` observations of a chunk.
+
+    Returns:
+        the state after them, and (estimate, evidence) of each step; further rows are zero.
+    """
 
     def body(k: Any, carry: Any) -> Any:
-        state, told = carry
+        state, results = carry
         state, *output = kernel(state, chunk.at(k))
-        return state, told.put(k, tuple(output))
+        return state, results.put(k, tuple(output))
 
     _, *output = jax.eval_shape(kernel, state, jax.eval_shape(chunk.at, jnp.int32(0)))
-    return lax.fori_loop(0, count, body, (state, empty(layout_of(tuple(output)), CHUNK)))
+    return lax.fori_loop(0, count, body, (state, allocate_traced(layout_of(tuple(output)), CHUNK)))

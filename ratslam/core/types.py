@@ -1,4 +1,4 @@
-"""What an engine says at each step."""
+"""The estimate of one step, and what happened to the robot's place."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ Scalar = Annotated[Array, "scalar"]
 
 
 class Action(IntEnum):
-    """What happened to the robot's place at a step."""
+    """Change of the robot's place in a step."""
 
     NONE = 0
-    """The place is still the same, or nothing was recognised."""
+    """The place is the same as before, or no place was recognised."""
     CREATE = 1
-    """A new place was made here."""
+    """A new place was created here."""
     LINK = 2
-    """A known place was reached by a way not travelled before."""
+    """A known place was reached by a new link."""
     SET = 3
-    """A known place was reached by a way already linked, or without a way at all (after a break)."""
+    """A known place was reached by an existing link, or without a link (after an odometry break)."""
 
 
 class Estimate(NamedTuple):
-    """What any backend reports at a step.
+    """Estimate of any backend after one step.
 
     Attributes:
-        pose: [3] x m, y m, heading rad, in the backend's own frame (for the pose cells: on their torus).
+        pose: [3] x m, y m, heading rad, in the backend's own frame (pose cells: on their torus).
         spread: [3] standard deviation of the pose, m, m, rad.
         place: id of the current place, int32; -1 before the first and for backends without places.
         previous: id of the place before this step, int32.
         action: an `Action`, int32.
-        lost: whether the backend knows that it does not know where it is, bool.
+        lost: whether the backend cannot tell where the robot is, bool.
     """
 
     pose: Array

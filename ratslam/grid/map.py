@@ -9,7 +9,7 @@ from typing import Any
 import networkx
 import numpy as np
 
-from ratslam.core.growable_array import GrowableArray
+from ratslam.core.growable_array import GrowableArray, copy_arrays, restore_arrays
 from ratslam.core.types import Estimate
 from ratslam.grid.config import GridConfig
 from ratslam.grid.genealogy import Ancestry
@@ -87,16 +87,12 @@ class GridMap:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Everything, so that `restore` continues bit for bit."""
-        return {name: rows.rows.copy() for name, rows in self._growing().items()} | {
+        return copy_arrays(self) | {
             f"ancestry/{name}": rows for name, rows in self._ancestry.arrays().items()
         }
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Takes the place of everything folded so far."""
-        for name, rows in self._growing().items():
-            rows.replace(arrays[name])
+        restore_arrays(self, arrays)
         prefix = "ancestry/"
         self._ancestry.restore({k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)})
-
-    def _growing(self) -> dict[str, GrowableArray]:
-        return {name[1:]: value for name, value in vars(self).items() if isinstance(value, GrowableArray)}

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.core.growable_array import GrowableArray
+from ratslam.core.growable_array import GrowableArray, copy_arrays, restore_arrays
 from ratslam.keyframes.optimizer import Closures
 
 
@@ -166,13 +166,9 @@ class ClosureLog:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Its whole state."""
-        return {name: rows.rows.copy() for name, rows in self._growing().items()}
+        return copy_arrays(self)
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `arrays`."""
-        for name, rows in self._growing().items():
-            rows.replace(arrays[name])
+        restore_arrays(self, arrays)
         self._lines = None
-
-    def _growing(self) -> dict[str, GrowableArray]:
-        return {name[1:]: value for name, value in vars(self).items() if isinstance(value, GrowableArray)}

@@ -21,6 +21,7 @@ from ratslam.backends.registry import BACKENDS, BackendEntry, Sensors, build
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import dump
 from ratslam.core.growable_array import GrowableArray
+from ratslam.core.precision import prepare_precision
 from ratslam.core.session import CHUNK, Session, Step
 from ratslam.core.types import Action
 from ratslam.keyframes.ablation import FULL, Ablation
@@ -142,11 +143,12 @@ def open_runner(
 
 
 def build_session(config: RunConfig, source: Source, ablation: Ablation = FULL) -> Session:
-    """A new session for a completed configuration and its source of observations.
+    """A new session for a completed configuration and its source of observations; prepares JAX's precision.
 
     Args:
         ablation: parts of the keyframe map to switch off.
     """
+    prepare_precision(config.session.precision)
     sensors = Sensors(source.view_shape, planar_whiskers_of(source, config.touch))
     return Session(
         build(config.backend, config, sensors, config.session.precision, ablation),

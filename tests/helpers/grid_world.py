@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ratslam.backends.grid import GridBackend, GridEvidence, GridState
-from ratslam.core.packing import layout_of, room
+from ratslam.core.packing import allocate, layout_of
 from ratslam.core.session import CHUNK, run_chunk
 from ratslam.core.types import Estimate
 from ratslam.grid.config import GridConfig
@@ -107,7 +107,7 @@ def drive(
     outputs = []
     for start in range(0, len(reports), CHUNK):
         chunk = list(reports[start : start + CHUNK])
-        rows = room(layout_of(chunk[0]), CHUNK)
+        rows = allocate(layout_of(chunk[0]), CHUNK)
         for k, report in enumerate(chunk):
             rows.write(k, report)
         state, told = _runner(backend)(state, rows, np.int32(len(chunk)))

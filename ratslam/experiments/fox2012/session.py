@@ -10,13 +10,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
 from evaluation.metrics.occupancy_grid import GridTruth, OccupancyGrid, cell_centres
 from ratslam.backends.grid import GridBackend
 from ratslam.config.run_config import RunConfig
-from ratslam.core.session import Session, capacity_at
+from ratslam.core.precision import Precision, prepare_precision
+from ratslam.core.session import Session
 from ratslam.grid.config import GridConfig
 from ratslam.grid.map_drawing import Marks, draw, marks_of
 from robot.simulation.create.session import CreateSimulation, CreateSimulationConfig, train_strain_templates
@@ -179,23 +179,22 @@ def _middle(arena: Arena) -> np.ndarray:
 
 
 def session_at_start(
-    grid: GridConfig, mounts: tuple[WhiskerMount, ...], length: float, precision: str, seed: int
+    grid: GridConfig, mounts: tuple[WhiskerMount, ...], length: float, precision: Precision, seed: int
 ) -> Session:
     """A session at its start, compiled already if one like it was asked for lately."""
     session = _compiled(grid, mounts, length, precision)
-    session.map, session.steps = session.backend.new_map(), 0
-    session.state = session.backend.init(jax.random.key(seed), capacity_at(0))
+    session.restart(seed)
     return session
 
 
 @lru_cache(maxsize=4)
-def _compiled(grid: GridConfig, mounts: tuple[WhiskerMount, ...], length: float, precision: str) -> Session:
+def _compiled(
+    grid: GridConfig, mounts: tuple[WhiskerMount, ...], length: float, precision: Precision
+) -> Session:
     assert grid.side is not None
     feelers = ReportFrontendConfig(mounts=mounts, length=length).feelers
-    if precision == "float64":
-        jax.config.update("jax_enable_x64", True)
-        return Session(GridBackend(grid, feelers, grid.side, np.float64))
-    return Session(GridBackend(grid, feelers, grid.side, np.float32), precision="float32")
+    prepare_precision(precision)
+    return Session(GridBackend(grid, feelers, grid.side, precision), precision=precision)
 
 
 @lru_cache(maxsize=1)

@@ -18,6 +18,7 @@ from ratslam.backends.classic import ClassicBackend, ClassicEvidence
 from ratslam.backends.config import ClassicBackendConfig, select_settings
 from ratslam.classic.experience_map import ExperienceMap
 from ratslam.config.run_config import RunConfig
+from ratslam.core.precision import prepare_precision
 from ratslam.core.types import Estimate
 from ratslam.experiments.trials.touch_trial import SessionResult, capacity_for, session_result
 from robot.sources.in_memory import InMemorySource
@@ -48,8 +49,7 @@ def sweep_thresholds(config: RunConfig, log: InMemorySource, thresholds: np.ndar
     if config.backend != "classic":
         raise ValueError(f"backend: {config.backend}; a sweep of thresholds needs backend: classic")
     dtype = np.dtype(config.session.precision)
-    if dtype == np.float64:
-        jax.config.update("jax_enable_x64", True)
+    prepare_precision(config.session.precision)
     rows = capacity_for(log.length)
     readings = [observation_of(sample) for sample in log]
     chunk = stack(readings + readings[-1:] * (rows - len(readings)))  # padding, cut off below

@@ -17,6 +17,7 @@ from ratslam.backends.config import select_settings
 from ratslam.backends.registry import BACKENDS, Sensors, build
 from ratslam.config.completion import complete
 from ratslam.config.run_config import RunConfig, SessionConfig
+from ratslam.core.precision import prepare_precision
 from ratslam.core.session import Session, capacity_at
 from ratslam.experiments.trials.controls import Control, apply_control
 from ratslam.pipeline.source import open_source
@@ -209,21 +210,19 @@ def _session_at_start(config: RunConfig, shape: tuple[int, int, int], reserve: i
     """A session at its start; a recently compiled one is used again."""
     method = select_settings(config, BACKENDS[config.backend].config_class)
     reserve = max(reserve, config.session.reserve)
-    session, start = _compiled(config.backend, method, config.session, shape, reserve)
-    session.map = session.backend.new_map()
-    session.restore(start)
+    session = _compiled(config.backend, method, config.session, shape, reserve)
+    session.restart(config.session.seed)
     return session
 
 
 @lru_cache(maxsize=2)
 def _compiled(
     name: str, method: Settings, settings: SessionConfig, shape: tuple[int, int, int], reserve: int
-) -> tuple[Session, dict[str, np.ndarray]]:
-    session = Session(
+) -> Session:
+    prepare_precision(settings.precision)
+    return Session(
         build(name, method, Sensors(shape), settings.precision),
         seed=settings.seed,
         reserve=reserve,
         precision=settings.precision,
     )
-    # Copied, because the first step donates the memory that `arrays` may share.
-    return session, {name: np.array(value) for name, value in session.arrays().items()}

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ratslam.core.packing import Rows, empty, layout_of, room
+from ratslam.core.packing import PackedRecords, allocate, allocate_traced, layout_of
 
 DTYPES = [np.dtype(name) for name in ("float64", "float32", "int32", "uint32", "bool")]
 
@@ -45,7 +45,7 @@ def same(one, other):
 @given(kinds(), st.integers(1, 5))
 def test_what_is_written_is_read(kind, count):
     records = [record(kind, seed) for seed in range(count)]
-    rows = room(layout_of(records[0]), count + 2)
+    rows = allocate(layout_of(records[0]), count + 2)
     for k, each in enumerate(records):
         rows.write(k, each)
     assert len(rows.arrays) == len({dtype for _, dtype in kind})
@@ -60,13 +60,13 @@ def test_compiled_code_reads_and_writes_the_same(seed):
     dtypes = [DTYPES[k] for k in stream.integers(0, len(DTYPES), 4)]
     kind = [(tuple(stream.integers(1, 4, stream.integers(0, 3))), dtype) for dtype in dtypes]
     records = [record(kind, k) for k in range(3)]
-    rows = room(layout_of(records[0]), 3)
+    rows = allocate(layout_of(records[0]), 3)
     for k, each in enumerate(records):
         rows.write(k, each)
 
     @jax.jit
-    def turned(rows: Rows) -> Rows:
-        out = empty(rows.layout, 3)
+    def turned(rows: PackedRecords) -> PackedRecords:
+        out = allocate_traced(rows.layout, 3)
         for k in range(3):
             out = out.put(jnp.int32(2 - k), rows.at(jnp.int32(k)))
         return out
@@ -76,8 +76,8 @@ def test_compiled_code_reads_and_writes_the_same(seed):
 
 
 def test_a_record_of_another_shape_is_refused():
-    rows = room(layout_of(Inner(np.zeros(3), np.zeros((2, 2)))), 1)
-    with pytest.raises(ValueError, match="another shape"):
+    rows = allocate(layout_of(Inner(np.zeros(3), np.zeros((2, 2)))), 1)
+    with pytest.raises(ValueError, match="expected"):
         rows.write(0, Inner(np.zeros(3), np.zeros(4)))
-    with pytest.raises(ValueError, match="another shape"):
+    with pytest.raises(ValueError, match="expected"):
         rows.write(0, Inner(np.zeros(1), np.zeros((2, 2))))
