@@ -13,7 +13,7 @@ from evaluation.metrics.experience_metric import ExmConfig
 from ratslam.backends.config import ClassicBackendConfig, GridBackendConfig, RecallBackendConfig
 from ratslam.config.presets import PresetName
 from ratslam.config.renamed_keys import RENAMED
-from ratslam.config.strict_yaml import load, override, validate
+from ratslam.config.strict_yaml import load, validate
 from robot.live.config import LiveConfig
 from robot.recordings.formats import RecordingConfig
 from robot.simulation.create.session import CreateSimulationConfig
@@ -108,5 +108,5 @@ def load_config(path: str | os.PathLike[str], assignments: Sequence[str] = ()) -
     Raises:
         InputErrors: everything that is wrong with it, each with file, line and column.
     """
-    config = validate(override(load(path), assignments), RunConfig)
+    config = validate(load(path, assignments), RunConfig)
     return config.with_absolute_paths(Path(path).parent.resolve())

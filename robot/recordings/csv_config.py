@@ -35,7 +35,8 @@ class ViewColumns(Settings):
     """Views of rows x columns pixels from numbered columns (r0, r1, ...)."""
 
     file: Path | None = None
-    """Their file; none if they stand beside the odometry, empty cells in rows without a view."""
+    """Their file; a `*` in its name stands for the beginning of the recording's file name. Null: they stand
+    beside the odometry, with empty cells in rows without a view."""
     time: str = "t"
     """Column of the time, s, in that file."""
     prefix: str = "r"

@@ -26,14 +26,33 @@ class RecordingConfig(Settings):
     """What the numbers may claim before they are refused as wrong units."""
 
     def resolved(self, folder: Path) -> RecordingConfig:
-        """The same with every relative path taken from the folder (of the configuration file, say)."""
+        """The same with absolute paths; relative ones start at `folder`.
+
+        One `*` in the file name of a part of the table stands for the beginning of the recording's file name:
+        beside `aces_odom_gt.csv`, `*_scans.csv` is `aces_scans.csv`.
+        """
+        recording = folder / self.file
         parts = {
-            key: part.model_copy(update={"file": folder / part.file})
+            key: part.model_copy(update={"file": _companion(recording, folder, part.file)})
             for key in ("views", "labels", "pairs", "truth")
             if (part := getattr(self.table, key)) is not None and part.file is not None
         }
         table = self.table.model_copy(update=parts)
-        return self.model_copy(update={"file": folder / self.file, "table": table})
+        return self.model_copy(update={"file": recording, "table": table})
+
+
+def _companion(recording: Path, folder: Path, file: Path) -> Path:
+    """The path of a part of the table: in `folder`, or beside the recording if its name has a `*`."""
+    if file.name.count("*") != 1:
+        return folder / file
+    before, after = file.name.split("*")
+    beside = recording.parent / file.parent
+    found = [
+        path
+        for path in beside.glob(file.name)
+        if recording.name.startswith(path.name[len(before) : -len(after) or None])
+    ]
+    return max(found, key=lambda path: len(path.name), default=beside / file.name)
 
 
 def _open_mcap(config: RecordingConfig, warn: Warn) -> Source:

@@ -24,8 +24,12 @@ Model = TypeVar("Model", bound=Settings)
 _MAX_BYTES = 1 << 17  # a configuration is a few kB; the parser needs about a second for this much
 
 
-def load(path: str | os.PathLike[str]) -> Document:
+def load(path: str | os.PathLike[str], assignments: Sequence[str] = ()) -> Document:
     """The document in a file, with `${NAME}` in its texts replaced by environment variables.
+
+    Args:
+        assignments: values to replace, as `override` does. The value in the file may then name an environment
+            variable that is not set.
 
     Raises:
         InputError: with file, line and column, whatever is wrong with the file.
@@ -45,12 +49,18 @@ def load(path: str | os.PathLike[str]) -> Document:
     except UnicodeDecodeError as error:
         line = content.count(b"\n", 0, error.start) + 1
         raise InputError(f"{name}:{line}", f"byte 0x{content[error.start]:02x}", "text in UTF-8") from None
-    return parse(text, name)
+    replaced = [assignment.partition("=")[0] for assignment in assignments]
+    return override(parse(text, name, replaced), assignments)
 
 
-def parse(text: str, name: str) -> Document:
-    """The document in a text; `name` is what messages call its file."""
-    reader = Reader(text, lambda line, column: f"{name}:{line}:{column}:")
+def parse(text: str, name: str, replaced: Sequence[str] = ()) -> Document:
+    """The document in a text.
+
+    Args:
+        name: of the file, for messages. replaced: dotted paths whose values may name unset environment
+            variables, because they will be replaced.
+    """
+    reader = Reader(text, lambda line, column: f"{name}:{line}:{column}:", replaced=replaced)
     data = reader.read()
     if not isinstance(data, dict):
         where = reader.places[()].value.rstrip(":")

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import yaml
 
-from ratslam.config.strict_yaml.document import KeyPath, Place, label, shown
+from ratslam.config.strict_yaml.document import KeyPath, Place, dotted, label, shown
 from ratslam.config.strict_yaml.scalars import Refused, plain
 from tactile.base.errors import InputError, InputErrors
 
@@ -29,13 +29,21 @@ class Reader:
         text: the YAML; `${NAME}` in its texts becomes the environment variable, `$${` a literal `${`.
         place: what to call a line and column (from 1), ending in a colon if it should.
         root: the key path of the text's value.
+        replaced: dotted paths of values that may name unset environment variables.
 
     Attributes:
         places: of every key path read so far.
     """
 
-    def __init__(self, text: str, place: Callable[[int, int], str], root: KeyPath = ()) -> None:
+    def __init__(
+        self,
+        text: str,
+        place: Callable[[int, int], str],
+        root: KeyPath = (),
+        replaced: Sequence[str] = (),
+    ) -> None:
         self.places: dict[KeyPath, Place] = {}
+        self._replaced = replaced
         self._text = text
         self._place = place
         self._root = root
@@ -168,7 +176,7 @@ class Reader:
             self._errors.append(error)
             return ""
         value = os.environ.get(name, "")
-        if not value:
+        if not value and not any(f"{dotted(path)}.".startswith(f"{key}.") for key in self._replaced):
             cure = _RECORDINGS if name == "RATSLAM_DATA" else f"set {name} or write the value out"
             self._errors.append(self._error(path, f"the environment variable {name} is not set", cure=cure))
         return value

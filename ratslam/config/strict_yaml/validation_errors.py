@@ -81,30 +81,35 @@ def _renamed(
     """The errors for an unknown key that was renamed: one for each key in it, if it is a section."""
     if details["type"] != "extra_forbidden":
         return []
-    renamed = {
-        f"{new.rpartition('.')[0]}.{old.rpartition('.')[2]}": new  # the old key in the renamed section
-        for old, new in model.renamed_keys.items()
-        if _is_path(new)
-    } | dict(model.renamed_keys)
     return [
         _Complaint(
             document.at_key(tuple(old.split("."))), f"`{old}` is now `{new}`" if _is_path(new) else new
         )
-        for old, new in _new_names(dotted(path), document.value(path), renamed)
+        for old, new in _new_names(dotted(path), document.value(path), model.renamed_keys)
     ]
 
 
 def _new_names(old: str, value: Any, renamed: Mapping[str, str]) -> Iterator[tuple[str, str]]:
     """Old key and new key (or what to write instead), for each key of a section that has new names in it."""
-    parent = max((name for name in renamed if f"{old}.".startswith(f"{name}.")), key=len, default=None)
-    if parent is None:
+    new = _new_name(old, renamed)
+    if new == old:
         return
-    if isinstance(value, dict) and value and any(name.startswith(f"{old}.") for name in renamed):
+    if isinstance(value, dict) and value and any(name.startswith((f"{old}.", f"{new}.")) for name in renamed):
         for key, part in value.items():
             yield from _new_names(f"{old}.{key}", part, renamed)
     else:
-        new = renamed[parent]
-        yield old, new + old.removeprefix(parent) if _is_path(new) else new
+        yield old, new
+
+
+def _new_name(path: str, renamed: Mapping[str, str]) -> str:
+    """Follows renames of the key or of a section above it to the last name, or to what to write instead."""
+    for _ in range(len(renamed)):
+        above = max((name for name in renamed if f"{path}.".startswith(f"{name}.")), key=len, default=None)
+        if above is None or not _is_path(path):
+            break
+        new = renamed[above]
+        path = new + path.removeprefix(above) if _is_path(new) else new
+    return path
 
 
 def _is_path(text: str) -> bool:

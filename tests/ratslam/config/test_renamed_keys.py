@@ -29,7 +29,7 @@ class Outer(Settings):
 
     renamed_keys: ClassVar = {
         "frames": "keyframes",
-        "frames.score": "keyframes.min_score",
+        "keyframes.score": "keyframes.min_score",
         "matcher": "write `backend`",
     }
     keyframes: Inner = Inner()
