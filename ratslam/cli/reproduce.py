@@ -169,7 +169,7 @@ def _threshold(arguments: argparse.Namespace) -> int:
 
 
 def _train(arguments: argparse.Namespace) -> int:
-    from ratslam.experiments.fox2012.template_training import held_out, report, schooled
+    from ratslam.experiments.fox2012.template_training import drive_held_out, render_drives, train_to_file
 
     create_simulation = read_config(arguments).create_simulation
     if create_simulation is None:
@@ -179,8 +179,8 @@ def _train(arguments: argparse.Namespace) -> int:
             "the Create to train",
             "`create_simulation: {}` is the usual one",
         )
-    templates = schooled(create_simulation, arguments.output)
-    print(report(held_out(create_simulation, templates), templates.training.repeats))
+    templates = train_to_file(create_simulation, arguments.output)
+    print(render_drives(drive_held_out(create_simulation, templates), templates.training.repeats))
     print(f"\nwrote {arguments.output}; `touch.reports.templates: {arguments.output}` uses it")
     return 0
 

@@ -1,8 +1,8 @@
-"""The order of the paper's mappers, held against the same sets under every way to score a map.
+"""Tests of the paper's ranking of its mappers, on the same sets and under all ways to score a map.
 
-The paper ranks its mappers by one number. What that is worth is told by a constant, for which nobody had to
-touch anything, and by the same marks drawn along dead reckoning and along the true path: an order that holds
-there too is one of marks, not of filters.
+The paper ranks its mappers by one number. Two baselines show what that number means: the best constant map,
+which needs no contact, and the same marks drawn along dead reckoning and along the true path. A ranking that
+holds there too is one of the marks, not of the filters.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ import numpy as np
 
 from evaluation.metrics.experience_metric import bootstrap
 from evaluation.metrics.grid_error import CONVENTIONS, Convention
-from ratslam.experiments.fox2012.metrics import word_of
+from ratslam.experiments.fox2012.metrics import eq6_column
 from ratslam.experiments.fox2012.protocols import FILTERED, PAPERS, RECKONED, TRUE
-from ratslam.experiments.fox2012.trials import Result
+from ratslam.experiments.fox2012.trials import MapperResult
 
 FEW = 6
-"""Sets under which intervals are too narrow."""
+"""Number of sets below which the intervals are too narrow."""
 
 
 class Measure(NamedTuple):
     """A way to score a map.
 
     Attributes:
-        key: of `figures.FIELDS`. sign: 1 where more is worse, -1 where it is better. trivial: what a map gets
-            that knows nothing of the place; None for the best constant under `convention`.
+        key: of `metrics.FIELDS`. sign: 1 if larger is worse, else -1. trivial: score of a map without
+            information; None: that of the best constant under `convention`.
     """
 
     name: str
@@ -38,12 +38,13 @@ class Measure(NamedTuple):
     convention: Convention | None = None
 
 
-class Order(NamedTuple):
-    """Two neighbours after the other in the paper's order, from the worst to the best.
+class Ranking(NamedTuple):
+    """The test of the paper's ranking under one measure.
 
     Attributes:
-        steps: by how much the first is worse: mean, low and high end of the 95 % interval. word: `holds`,
-            `does not hold` or `not decided`. beaten: whether a map that knows nothing is as good as the best.
+        steps: for each pair of neighbours from worst to best, the mean difference and its 95 % interval.
+            word: `holds`, `does not hold` or `not decided`. beaten: whether a map without information is as
+            good as the best mapper.
     """
 
     steps: tuple[tuple[float, float, float], ...]
@@ -56,13 +57,13 @@ def _measures() -> tuple[Measure, ...]:
     for convention in CONVENTIONS:
         if convention.mask == "arena" and not convention.smooth:
             if convention != Convention(mask="arena"):
-                continue  # what is outside makes no difference
+                continue  # the outside value does not matter
             outside = "any"
         else:
             outside = f"{convention.outside:g}"
         truth = "smoothed" if convention.smooth else "raw"
         name = f"eq. 6  {outside:<5}{convention.mask:<7}{truth}"
-        found.append(Measure(name, word_of(convention), 1, None, convention))
+        found.append(Measure(name, eq6_column(convention), 1, None, convention))
     return (
         *found,
         Measure("Brier skill", "map_brier_skill", -1, 0.0),
@@ -73,12 +74,13 @@ def _measures() -> tuple[Measure, ...]:
 
 
 MEASURES = _measures()
-"""All ways. Each Chamfer alone is won by a map that knows nothing: by hardly any cell, or by all."""
+"""All measures. A map without information wins either Chamfer distance alone: with few cells, or with all."""
 
 
-def order(found: Sequence[Result], method: str, measure: Measure, along: str = FILTERED) -> Order | None:
-    """Whether the paper's order holds for a method's marks along a path; None with less than two sets in
-    which all have a score."""
+def rank_mappers(
+    found: Sequence[MapperResult], method: str, measure: Measure, along: str = FILTERED
+) -> Ranking | None:
+    """Tests the paper's ranking for a method's marks along a path; None with fewer than two complete sets."""
     score = measure.sign * np.array([_column(found, (method, name, along), measure.key) for name in PAPERS])
     score = score[:, np.isfinite(score).all(axis=0)]
     if score.shape[1] < 2:
@@ -95,34 +97,34 @@ def order(found: Sequence[Result], method: str, measure: Measure, along: str = F
     if trivial is None and measure.convention is not None:
         trivial = float(np.mean([one.score.under(measure.convention).best for one in found]))
     best = float(score.mean(axis=1).min())
-    return Order(steps, word, trivial is not None and measure.sign * trivial <= best)
+    return Ranking(steps, word, trivial is not None and measure.sign * trivial <= best)
 
 
-def orders(method: str, found: Sequence[Result]) -> list[str]:
+def render_rankings(method: str, found: Sequence[MapperResult]) -> list[str]:
     """A line for each measure."""
     first, second, third = PAPERS
     lines = [
-        f"{first} worse than {second} worse than {third}? {method}: by how much, mean and 95 %, paired",
+        f"{first} worse than {second} worse than {third}? {method}: paired differences, 95 % intervals",
         f"{'scored by':<29}{f'{first} - {second}':<29}{f'{second} - {third}':<29}{'verdict':<15}"
         f"{f'on {RECKONED}':<19}on the {TRUE}",
     ]
     for measure in MEASURES:
-        held = order(found, method, measure)
+        held = rank_mappers(found, method, measure)
         if held is None:
-            lines.append(f"{measure.name:<29}too few sets in which all three have one")
+            lines.append(f"{measure.name:<29}too few sets with a score of all three")
             continue
         steps = "".join(f"{f'{d:+.4f} [{low:+.4f}, {high:+.4f}]':<29}" for d, low, high in held.steps)
-        others = (order(found, method, measure, along) for along in (RECKONED, TRUE))
+        others = (rank_mappers(found, method, measure, along) for along in (RECKONED, TRUE))
         words = [other.word if other else "-" for other in others]
-        beaten = "a map that knows nothing is as good" if held.beaten else ""
+        beaten = "a map without information is as good" if held.beaten else ""
         lines.append(f"{measure.name:<29}{steps}{held.word:<15}{words[0]:<19}{words[1]:<18}{beaten}".rstrip())
     if len({one.number for one in found}) < FEW:
-        lines.append(f"Intervals of less than {FEW} sets are too narrow.")
+        lines.append(f"Intervals of fewer than {FEW} sets are too narrow.")
     return lines
 
 
-def _column(found: Sequence[Result], which: tuple[str, str, str], key: str) -> np.ndarray:
-    """[S] a figure of a method, a mapper and a path over the sets, NaN where a set is missing."""
+def _column(found: Sequence[MapperResult], which: tuple[str, str, str], key: str) -> np.ndarray:
+    """[S] a metric of a method, a mapper and a path over the sets, NaN for missing sets."""
     values = np.full(1 + max(one.number for one in found), np.nan)
     for one in found:
         value = one.values.get(key)

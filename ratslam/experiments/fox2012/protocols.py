@@ -1,4 +1,4 @@
-"""What is reproduced of Fox et al. 2012: worlds, mappers, and two ways to filter."""
+"""The protocols of Fox et al. 2012: worlds, mappers and two filters."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ MAPPERS = {
     "template": ("touch.reports.walls=template",),
     "fused": ("touch.reports.walls=fused",),
 }
-"""The paper's three, which differ in what they know of walls (II-E to II-G), and ours."""
+"""The paper's three mappers, which differ in the estimate of wall directions (II-E to II-G), and ours."""
 PAPERS = ("blob", "geometric", "template")
-"""Of these, the paper's, from the worst to the best as printed (III)."""
+"""The paper's mappers from worst to best as printed (III)."""
 METHODS: dict[str, tuple[str, ...]] = {
     "as printed": (
         "touch.reports.flat=null",
@@ -43,20 +43,19 @@ METHODS: dict[str, tuple[str, ...]] = {
     ),
     "ours": (),
 }
-"""As printed (Algorithm 1, eq. 1 to 5) but for what cannot work: a contact's own cell does not deny it, marks
-are neutral far from where they are made, and those resampled have moved. Its stamps are the log-odds of 0.8
-and 0.4. Every template is believed. Ours are the defaults."""
+"""As printed (Algorithm 1, eq. 1 to 5) except where that cannot work: the cell of a contact does not
+contradict it, marks are neutral far from where they are made, and resampled particles have moved. Its stamps
+are the log-odds of 0.8 and 0.4, and all templates are accepted. Ours are the defaults."""
 FILTERED, RECKONED, TRUE = "filter", "dead reckoning", "true path"
-"""Along which a method's marks are drawn: the filter's path, and two that no filter found: what filtering
-must beat, and what it can reach."""
+"""Paths along which a method's marks are drawn: the filter's, a lower bound and an upper bound."""
 PATHS = (FILTERED, RECKONED, TRUE)
 
 
 class World(NamedTuple):
-    """Where and how the robot goes.
+    """An arena and the odometry noise in it.
 
     Attributes:
-        level: of the odometry's noise; the printed filter takes it for the noise of each step.
+        level: of the odometry noise; the printed filter uses it as the noise of each step. sets: overrides.
     """
 
     name: str
@@ -68,8 +67,8 @@ class Protocol(NamedTuple):
     """A figure of the paper.
 
     Attributes:
-        source: where. stops: numbers of reports after which is judged; 0: all. one_arena: of all sets; else
-            each has its own. note: what to know when reading it.
+        source: section and figure. stops: numbers of reports after which the result is scored; 0: all.
+            one_arena: whether all sets share an arena. note: printed below the table.
     """
 
     title: str
@@ -90,21 +89,21 @@ PROTOCOLS = {
         "Mean maps of three mappers",
         "Fox et al. 2012, III, Fig. 4",
         _SMALL,
-        note="One arena, six minutes from another start each time. The paper's arena, its whiskers' mounts "
-        "and its likelihoods' constants are not printed: compare orders, not values.",
+        note="One arena, six minutes from a different start in each trial. The paper does not print its "
+        "arena, whisker mounts and likelihood constants: compare rankings, not values.",
     ),
     "fox-fig5": Protocol(
         "Maps of single trials",
         "Fox et al. 2012, IV, Fig. 5",
         _SMALL,
-        note="The trials of fox-fig4 by the same numbers.",
+        note="The trials of fox-fig4 with the same numbers.",
     ),
     "fox-fig6": Protocol(
         "A larger arena at two levels of odometry noise",
         "Fox et al. 2012, III, Fig. 6",
         (World("2 % noise", 0.02, _LARGE), World("5 % noise", 0.05, _LARGE)),
-        note="The paper: tracked for 200 steps at 2 %, loops not closed at 5 %. Noise is one scale error for "
-        "each straight line or turn; every set has an arena of its own.",
+        note="The paper: tracked for 200 steps at 2 %, loops not closed at 5 %. The noise is one scale error "
+        "for each straight line or turn; each set has its own arena.",
         mappers=("geometric",),
         stops=(200, 1500),
         one_arena=False,
@@ -119,6 +118,14 @@ def session_config(world: World, method: str, mapper: str, assignments: Sequence
         InputError: an assignment that cannot be.
     """
     level = (f"create_simulation.wheels.level={world.level}",)
-    believed = (f"grid.drift.step={world.level}",) if method == "as printed" else ()
-    every = ("backend=grid", *level, *world.sets, *METHODS[method], *believed, *MAPPERS[mapper], *assignments)
+    step_noise = (f"grid.drift.step={world.level}",) if method == "as printed" else ()
+    every = (
+        "backend=grid",
+        *level,
+        *world.sets,
+        *METHODS[method],
+        *step_noise,
+        *MAPPERS[mapper],
+        *assignments,
+    )
     return validate(override(parse("create_simulation: {}\n", "the reproduction"), every), RunConfig)

@@ -12,8 +12,8 @@ from pathlib import Path
 from ratslam.experiments.fox2012.metrics import FIELDS
 from ratslam.experiments.fox2012.plots import draw_reproduction
 from ratslam.experiments.fox2012.protocols import PROTOCOLS, Protocol, World, session_config
-from ratslam.experiments.fox2012.tables import render_results
-from ratslam.experiments.fox2012.trials import Job, Result, run_job
+from ratslam.experiments.fox2012.report import render_results
+from ratslam.experiments.fox2012.trials import MapperResult, SessionJob, run_job
 from ratslam.experiments.studies.executor import run_tasks
 from ratslam.experiments.trials.csv_output import find_protocol, format_cells, progress_bar, write_rows
 from tactile.base.random_streams import stream
@@ -34,7 +34,7 @@ def reproduce(
     """As `ratslam.experiments.salman2016.reproduction.reproduce`, with sets per world."""
     protocol = find_protocol(name, PROTOCOLS)
     jobs = plan_jobs(protocol, sets, seed, assignments)
-    found: list[Result] = []
+    found: list[MapperResult] = []
 
     def batches() -> Iterator[Iterator[list[object]]]:
         with progress_bar(name, len(jobs)) as bar:
@@ -49,7 +49,7 @@ def reproduce(
     return render_results(protocol, found, sets), interrupted
 
 
-def plan_jobs(protocol: Protocol, sets: int, seed: int, assignments: Sequence[str] = ()) -> list[Job]:
+def plan_jobs(protocol: Protocol, sets: int, seed: int, assignments: Sequence[str] = ()) -> list[SessionJob]:
     """All sessions of a reproduction, set by set.
 
     Raises:
@@ -62,7 +62,7 @@ def plan_jobs(protocol: Protocol, sets: int, seed: int, assignments: Sequence[st
     ]
 
 
-def _job(protocol: Protocol, world: World, number: int, seed: int, assignments: Sequence[str]) -> Job:
+def _job(protocol: Protocol, world: World, number: int, seed: int, assignments: Sequence[str]) -> SessionJob:
     own = int(stream(seed, f"arenas.set.{number}").integers(2**31))
     arena = seed if protocol.one_arena else own
     seeds = (f"create_simulation.seed={own}", f"create_simulation.arena.seed={arena}", f"session.seed={own}")
@@ -71,9 +71,9 @@ def _job(protocol: Protocol, world: World, number: int, seed: int, assignments: 
         for method in protocol.methods
         for mapper in protocol.mappers
     }
-    return Job(world.name, number, own, seed, protocol.stops, variants)
+    return SessionJob(world.name, number, own, seed, protocol.stops, variants)
 
 
-def _row(one: Result) -> list[object]:
+def _row(one: MapperResult) -> list[object]:
     keys = (one.world, one.method, one.mapper, one.along, one.number, one.seed, one.reports)
     return [*keys, *format_cells(one.values, FIELDS)]

@@ -1,6 +1,6 @@
-"""A session of the simulated Create, and what a grid filter makes of it, in the frame of the arena.
+"""A session of the simulated Create and its result by a grid filter, in the frame of the arena.
 
-Sessions of one arena begin at different places. One process makes many of them with few compiled filters.
+Sessions in one arena start at different places. A process runs many sessions with few compiled filters.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ from tactile.wall_estimation.report_frontend import ReportFrontend, ReportFronte
 from tactile.wall_estimation.strain_templates import StrainTemplates
 from tactile.whiskers.planar_whiskers import PlanarWhiskers
 
-ROOM = 0.2
-"""Free space around a start, m: the robot's, and a little."""
-OVERSPILL = 2.0
-"""A chart covers the arena so many times over, in each direction (Fox et al. 2012, II-D)."""
-BEYOND = 0.4
-"""Of the filter's map, whose middle is the start: so much more than the arena to every side, m."""
+START_CLEARANCE = 0.2
+"""Free space around a start, m: slightly more than the robot's radius."""
+MAP_SCALE = 2.0
+"""Side of a drawn map over the side of the arena (Fox et al. 2012, II-D)."""
+MAP_MARGIN = 0.4
+"""Margin of the filter's map, which is centred on the start, beyond the arena, m."""
 
 
-class Outing(NamedTuple):
+class ArenaSession(NamedTuple):
     """A session of T reports.
 
     Attributes:
-        source: of its reports. arena: with the robot's start. truth, odometry: [T, 3] poses after each
-            report, true and reckoned from the start.
+        source: of the reports. arena: with the robot's start. truth, odometry: [T, 3] true and dead-reckoned
+            poses after each report.
     """
 
     source: CreateSimulation
@@ -53,135 +53,129 @@ class Outing(NamedTuple):
     odometry: np.ndarray
 
 
-class Mapped(NamedTuple):
-    """What a filter made of the first T reports; all in the frame of the arena.
+class FilterResult(NamedTuple):
+    """The result of a filter after T reports, in the frame of the arena.
 
     Attributes:
-        told: [T, 3] poses as told at the time. path: [T, 3] as known in the end. grid: the map drawn along
-            that path.
+        online: [T, 3] poses as estimated at the time. path: [T, 3] final poses. grid: the map drawn along
+            `path`.
     """
 
-    told: np.ndarray
+    online: np.ndarray
     path: np.ndarray
     grid: OccupancyGrid
 
 
-def outing(config: CreateSimulationConfig) -> Outing:
-    """The session, from a start that its seed draws.
+def simulate_session(config: CreateSimulationConfig) -> ArenaSession:
+    """A session from a random start.
 
     Raises:
         InputError: it cannot be simulated.
     """
-    made = started(make_arena(config.arena, config.seed), config.seed)
+    made = place_start(make_arena(config.arena, config.seed), config.seed)
     with TemporaryDirectory() as folder:
         file = Path(folder) / "arena.txt"
         file.write_text(arena_text(made), encoding="utf-8")
         source = CreateSimulation(
             config.model_copy(update={"arena": config.arena.model_copy(update={"file": file})})
         )
-    return Outing(source, made, source.truth, compose(made.start, integrate(source.odometry[:, :3])))
+    return ArenaSession(source, made, source.truth, compose(made.start, integrate(source.odometry[:, :3])))
 
 
-def started(arena: Arena, seed: int) -> Arena:
-    """The arena with another start, anywhere that the robot fits in.
+def place_start(arena: Arena, seed: int) -> Arena:
+    """The arena with a random start where the robot fits.
 
     Raises:
-        InputError: it fits in nowhere.
+        InputError: it fits nowhere.
     """
     random = stream(seed, "start")
     low, high = arena.outer.min(axis=0), arena.outer.max(axis=0)
     places, heading = random.uniform(low, high, (1000, 2)), random.uniform(-np.pi, np.pi)
-    there = places[has_clearance(arena, places, ROOM)]
+    there = places[has_clearance(arena, places, START_CLEARANCE)]
     if not len(there):
         raise InputError(
-            "create_simulation.arena", "no room for a start", f"{ROOM:g} m of free space somewhere"
+            "create_simulation.arena", "no room for a start", f"{START_CLEARANCE:g} m of free space"
         )
     return arena._replace(start=np.array([*there[0], heading]))
 
 
-def felt(config: RunConfig, outing: Outing, seed: int) -> list[Observation]:
-    """What the filter is given of a session by the configuration's estimator of walls.
+def observe_session(config: RunConfig, session: ArenaSession, seed: int) -> list[Observation]:
+    """The filter's observations of a session, with the configured wall estimator.
 
     Args:
-        seed: of the drives into walls that strain templates are trained with.
+        seed: of the drives for the training of strain templates.
 
     Raises:
         InputError: templates that cannot be used.
     """
-    reports = report_config_of(outing.source.info, config.touch.reports)
+    reports = report_config_of(session.source.info, config.touch.reports)
     templates = None
     if reports.templates is None and reports.walls in ("template", "fused"):
-        made = outing.source.config
+        made = session.source.config
         templates = _templates(
             CreateSimulationConfig(whiskers=made.whiskers, behaviour=made.behaviour, seed=seed)
         )
-    source = TouchSource(outing.source, lambda: ReportFrontend(reports, templates), "touch.reports.mounts")
+    source = TouchSource(session.source, lambda: ReportFrontend(reports, templates), "touch.reports.mounts")
     return [observation_of(sample) for sample in source]
 
 
-def mapped(
-    config: RunConfig, outing: Outing, reports: list[Observation], stops: tuple[int, ...]
-) -> list[Mapped]:
-    """What the configuration's filter has made of the reports at each stop, a number of them."""
-    touch = report_config_of(outing.source.info, config.touch.reports)
+def run_filter(
+    config: RunConfig, session: ArenaSession, reports: list[Observation], stops: tuple[int, ...]
+) -> list[FilterResult]:
+    """The result of the configured filter after each number of reports in `stops`."""
+    touch = report_config_of(session.source.info, config.touch.reports)
     grid = config.grid
     if grid.side is None:
-        grid = grid.model_copy(update={"side": 2 * (span(outing.arena) + BEYOND)})
-    session = session_at_start(
-        grid, touch.mounts, touch.length, config.session.precision, config.session.seed
-    )
-    start, marks = outing.arena.start, felt_marks(reports)
-    told: list[np.ndarray] = []
+        grid = grid.model_copy(update={"side": 2 * (arena_side(session.arena) + MAP_MARGIN)})
+    slam = session_at_start(grid, touch.mounts, touch.length, config.session.precision, config.session.seed)
+    start, marks = session.arena.start, collect_marks(reports)
+    online: list[np.ndarray] = []
     found = []
     for stop in stops:
-        told += [step.pose for step in session.replay(reports[len(told) : stop])]
-        path = compose(start, session.map.trajectory())
-        drawn = chart(grid, touch.feelers, outing.arena, path, marks)
-        found.append(Mapped(compose(start, np.array(told)), path, drawn))
+        online += [step.pose for step in slam.replay(reports[len(online) : stop])]
+        path = compose(start, slam.map.trajectory())
+        drawn = draw_map(grid, touch.feelers, session.arena, path, marks)
+        found.append(FilterResult(compose(start, np.array(online)), path, drawn))
     return found
 
 
-def chart(
+def draw_map(
     config: GridConfig, feelers: PlanarWhiskers, arena: Arena, path: np.ndarray, marks: Marks
 ) -> OccupancyGrid:
-    """The map drawn along a path [T, 3] in the frame of the arena, which it covers `OVERSPILL` times over.
+    """The map drawn along a path [T, 3], in the frame of the arena; `MAP_SCALE` gives its side.
 
     Args:
-        marks: of T reports or more.
+        marks: of at least T reports.
     """
-    side = round(OVERSPILL * span(arena) / config.cell)
-    middle = _middle(arena)
+    side = round(MAP_SCALE * arena_side(arena) / config.cell)
+    middle = (arena.outer.min(axis=0) + arena.outer.max(axis=0)) / 2
     first = Marks(*(rows[: len(path)] for rows in marks))
     probability = draw(config, feelers, side, path - np.array([*middle, 0.0]), first)
     return OccupancyGrid(probability, middle - side * config.cell / 2, config.cell)
 
 
-def truth_of(arena: Arena, grid: OccupancyGrid) -> GridTruth:
-    """What is really there, on the cells of a chart."""
+def arena_truth(arena: Arena, grid: OccupancyGrid) -> GridTruth:
+    """The ground truth on the cells of a map."""
     place = cell_centres(grid)
     return GridTruth(is_occupied(arena, place), is_enclosed(arena, place), wall_segments(arena))
 
 
-def span(arena: Arena) -> float:
-    """Its larger side, m."""
+def arena_side(arena: Arena) -> float:
+    """The larger side of an arena, m."""
     return float(np.ptp(arena.outer, axis=0).max())
 
 
-def felt_marks(reports: list[Observation]) -> Marks:
-    """What there is to draw of them."""
+def collect_marks(reports: list[Observation]) -> Marks:
+    """The marks that the reports add to a map."""
     rows = stack(reports)
     wall = np.where(rows.wall[:, None], rows.wall_point, np.nan)
     return marks_of(rows.motion, rows.contact, rows.alive, rows.point, wall)
 
 
-def _middle(arena: Arena) -> np.ndarray:
-    return (arena.outer.min(axis=0) + arena.outer.max(axis=0)) / 2
-
-
 def session_at_start(
     grid: GridConfig, mounts: tuple[WhiskerMount, ...], length: float, precision: Precision, seed: int
 ) -> Session:
-    """A session at its start, compiled already if one like it was asked for lately."""
+    """A session at its start; a recently compiled one is used again."""
     session = _compiled(grid, mounts, length, precision)
     session.restart(seed)
     return session
@@ -199,5 +193,5 @@ def _compiled(
 
 @lru_cache(maxsize=1)
 def _templates(config: CreateSimulationConfig) -> StrainTemplates:
-    """Of a robot: as off-line in the paper, for all sessions."""
+    """Templates of a robot, trained once for all sessions as in the paper."""
     return train_strain_templates(config)

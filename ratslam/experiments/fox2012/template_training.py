@@ -1,4 +1,4 @@
-"""Strain templates trained, kept, and tried at once on walls that they were not trained on."""
+"""Training of strain templates, with a test on drives that they were not trained on."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from tactile.wall_estimation.strain_templates import (
     write_templates,
 )
 
-SECONDS = (0.5, 1.0, 2.0)
-"""Of the drive on after first contact that is shown to the estimators: in arenas it lasts 1 to 2 s mostly."""
-WAYS = ("winner", "between", "fused")
-"""What is asked: eq. 5; the lowest point of a parabola through the best and its neighbours; ours."""
-FAR = 10.0
-"""An error beyond is marked, degrees: a template's step."""
+DURATIONS = (0.5, 1.0, 2.0)
+"""Durations of the drive after first contact given to the estimators, s; in arenas it is mostly 1 to 2 s."""
+ESTIMATORS = ("winner", "between", "fused")
+"""Eq. 5; the minimum of a parabola through the best template and its neighbours; ours."""
+LARGE_ERROR_DEG = 10.0
+"""Errors beyond are marked, degrees: the step between templates."""
 
 
-class Tried(NamedTuple):
-    """One drive into a wall that no template was made of.
+class HeldOutDrive(NamedTuple):
+    """One drive into a wall that no template was trained on.
 
     Attributes:
-        angle: the wall's direction in base_link, degrees. known: whether templates are of that angle.
-        error: [S, 3] degrees, by `SECONDS` and `WAYS`; NaN where no wall was known.
+        angle: direction of the wall in base_link, degrees. known: whether there are templates of that angle.
+        error: [S, 3] degrees, by `DURATIONS` and `ESTIMATORS`; NaN where no wall was found.
     """
 
     angle: float
@@ -43,11 +43,11 @@ class Tried(NamedTuple):
     error: np.ndarray
 
 
-def schooled(config: CreateSimulationConfig, path: Path) -> StrainTemplates:
-    """Trains the templates of a session's robot and writes them.
+def train_to_file(config: CreateSimulationConfig, path: Path) -> StrainTemplates:
+    """Trains the templates of a session's robot and writes them to a file.
 
     Raises:
-        InputError: the file exists, or whiskers that feel nothing.
+        InputError: the file exists, or the whiskers have no contact.
     """
     if path.exists():
         raise InputError(str(path), "exists", "a new file", "choose another name with -o")
@@ -57,8 +57,8 @@ def schooled(config: CreateSimulationConfig, path: Path) -> StrainTemplates:
     return templates
 
 
-def held_out(config: CreateSimulationConfig, templates: StrainTemplates) -> list[Tried]:
-    """One more drive at each angle, and one half-way between each two."""
+def drive_held_out(config: CreateSimulationConfig, templates: StrainTemplates) -> list[HeldOutDrive]:
+    """Tests templates on one more drive at each angle and one half-way between neighbours."""
     random = stream(config.seed, "templates.held out")
     angles = np.sort(np.concatenate([templates.angle, (templates.angle[1:] + templates.angle[:-1]) / 2]))
     mounts = tuple((mount.x, mount.y, mount.direction_deg) for mount in config.whiskers.mounts)
@@ -73,7 +73,7 @@ def held_out(config: CreateSimulationConfig, templates: StrainTemplates) -> list
         strain = filter_strain(templates.training, report.strain)
         first = np.arange(strain.shape[1]) == np.abs(strain[0, :, 0]).argmax()
         errors = []
-        for seconds in SECONDS:
+        for seconds in DURATIONS:
             part = strain[: max(round(seconds * config.whiskers.rate), 1)]
             match = match_template(templates, part, report.alive)
             travel = np.array([config.behaviour.slow * seconds, 0.0, 0.0])
@@ -83,43 +83,42 @@ def held_out(config: CreateSimulationConfig, templates: StrainTemplates) -> list
             ways = match.angle, match.refined, wall.direction if wall.known else np.nan
             errors.append([_apart(way, angle) for way in ways])
         known = bool(np.isclose(templates.angle, angle).any())
-        found.append(Tried(float(np.degrees(angle)), known, np.array(errors)))
+        found.append(HeldOutDrive(float(np.degrees(angle)), known, np.array(errors)))
     return found
 
 
-def report(tried: Sequence[Tried], repeats: int) -> str:
-    """A line for each wall, and the means."""
-    heads = [f"{way}, {seconds:g} s" for seconds in SECONDS for way in WAYS]
+def render_drives(drives: Sequence[HeldOutDrive], repeats: int) -> str:
+    """A line for each drive, and the means."""
+    heads = [f"{way}, {seconds:g} s" for seconds in DURATIONS for way in ESTIMATORS]
     lines = [
-        "Error of the wall's direction on drives that were not trained on, degrees "
-        f"({repeats} drives a template)",
+        f"Error of the wall direction on drives without training, degrees ({repeats} drives a template)",
         f"{'wall':>8}" + "".join(f"{head:>16}" for head in heads),
     ]
-    for one in tried:
+    for one in drives:
         cells = "".join(f"{_cell(error):>16}" for error in one.error.reshape(-1))
         lines.append(f"{one.angle:>6.0f}{' ' if one.known else '~'} {cells}")
     for name, known in (("trained", True), ("~ between", False)):
-        errors = np.array([one.error.reshape(-1) for one in tried if one.known == known])
+        errors = np.array([one.error.reshape(-1) for one in drives if one.known == known])
         if len(errors):
             lines.append(f"{name:<9}".ljust(8) + "".join(f"{_mean(column):>16}" for column in errors.T))
     return "\n".join(
         [
             *lines,
-            f"~ between two trained angles; ! off by more than {FAR:g}; - no wall was known. Winner: eq. 5 "
-            "of Fox et al. 2012; between: the\nlowest point of a parabola through it and its neighbours; "
-            "fused: how the first whisker's tip slides (`touch.reports.walls`).",
+            f"~ between two trained angles; ! off by more than {LARGE_ERROR_DEG:g}; - no wall was found. "
+            "Winner: eq. 5 of Fox et al. 2012; between: the\nminimum of a parabola through it and its "
+            "neighbours; fused: from the sliding tip of the first whisker (`touch.reports.walls`).",
         ]
     )
 
 
 def _apart(one: float, other: float) -> float:
-    """Between two directions, degrees: 0 to 90."""
+    """Angle between two wall directions, degrees: 0 to 90."""
     off = (one - other + np.pi / 2) % np.pi - np.pi / 2
     return float(np.degrees(abs(off)))
 
 
 def _cell(error: float) -> str:
-    return "-" if np.isnan(error) else f"{'! ' if error > FAR else ''}{error:.1f}"
+    return "-" if np.isnan(error) else f"{'! ' if error > LARGE_ERROR_DEG else ''}{error:.1f}"
 
 
 def _mean(errors: np.ndarray) -> str:

@@ -1,4 +1,4 @@
-"""One session through every mapper and method, as one piece of work for a process."""
+"""One session with all mappers and methods: the task of one process."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ import numpy as np
 from evaluation.metrics.grid_score import GridScore, score_grid
 from evaluation.metrics.occupancy_grid import OccupancyGrid
 from ratslam.config.run_config import RunConfig
-from ratslam.experiments.fox2012.metrics import measured, off, scored
+from ratslam.experiments.fox2012.metrics import map_metrics, path_metrics, position_error
 from ratslam.experiments.fox2012.protocols import FILTERED, RECKONED, TRUE
 from ratslam.experiments.fox2012.session import (
-    Mapped,
-    Outing,
-    chart,
-    felt,
-    felt_marks,
-    mapped,
-    outing,
-    truth_of,
+    ArenaSession,
+    FilterResult,
+    arena_truth,
+    collect_marks,
+    draw_map,
+    observe_session,
+    run_filter,
+    simulate_session,
 )
 from robot.touch_source import report_config_of
 from robot.world.arena import Arena
 
 
-class Job(NamedTuple):
-    """A session.
+class SessionJob(NamedTuple):
+    """A session to simulate and filter.
 
     Attributes:
-        seed: of the session. training: of the strain templates. stops: numbers of reports after which is
-            judged; 0: all. variants: by method and mapper; all of one session.
+        seed: of the session. training: seed of the strain templates. stops: numbers of reports after which
+            the result is scored; 0: all. variants: configurations by method and mapper.
     """
 
     world: str
@@ -42,13 +42,13 @@ class Job(NamedTuple):
     variants: Mapping[tuple[str, str], RunConfig]
 
 
-class Result(NamedTuple):
-    """What came of a method and a mapper after so many reports of a session.
+class MapperResult(NamedTuple):
+    """The result of a method and a mapper after a number of reports of a session.
 
     Attributes:
-        along: the path its marks are drawn along and that is judged: one of `protocols.PATHS`. stop: the
-        number of the stop. values: by the names of `figures.FIELDS`; None where there is none. score: of the
-        map. truth, odometry, told: [T, 3] poses in the frame of the arena.
+        along: the scored path, along which the map is drawn: one of `protocols.PATHS`. stop: index of the
+            stop. values: by the names of `metrics.FIELDS`; None where undefined. score: of the map.
+        truth, odometry, online: [T, 3] poses in the frame of the arena.
     """
 
     world: str
@@ -65,39 +65,43 @@ class Result(NamedTuple):
     arena: Arena
     truth: np.ndarray
     odometry: np.ndarray
-    told: np.ndarray
+    online: np.ndarray
 
 
-def run_job(job: Job) -> list[Result]:
-    """All of a session's: what each variant's filter found, and its marks along paths that no filter found.
+def run_job(job: SessionJob) -> list[MapperResult]:
+    """The results of all variants on a session, and of their marks along paths without a filter.
 
     Raises:
-        InputError: it cannot be simulated.
+        InputError: the session cannot be simulated.
     """
     some = next(iter(job.variants.values()))
     assert some.create_simulation is not None
-    out = outing(some.create_simulation)
-    count = len(out.truth)
+    session = simulate_session(some.create_simulation)
+    count = len(session.truth)
     stops = tuple(min(stop, count) if stop else count for stop in job.stops)
-    found: list[Result] = []
+    found: list[MapperResult] = []
     for (method, mapper), config in job.variants.items():
-        reports = felt(config, out, job.training)
-        marks, feelers = felt_marks(reports), report_config_of(out.source.info, config.touch.reports).feelers
-        for stop, filtered in enumerate(mapped(config, out, reports, stops)):
-            found.append(_judged(job, out, (method, mapper, FILTERED), stop, filtered))
-            for name, whole in ((RECKONED, out.odometry), (TRUE, out.truth)):
+        reports = observe_session(config, session, job.training)
+        marks = collect_marks(reports)
+        feelers = report_config_of(session.source.info, config.touch.reports).feelers
+        for stop, filtered in enumerate(run_filter(config, session, reports, stops)):
+            found.append(_score(job, session, (method, mapper, FILTERED), stop, filtered))
+            for name, whole in ((RECKONED, session.odometry), (TRUE, session.truth)):
                 path = whole[: stops[stop]]
-                drawn = Mapped(path, path, chart(config.grid, feelers, out.arena, path, marks))
-                found.append(_judged(job, out, (method, mapper, name), stop, drawn))
+                drawn = FilterResult(path, path, draw_map(config.grid, feelers, session.arena, path, marks))
+                found.append(_score(job, session, (method, mapper, name), stop, drawn))
     return found
 
 
-def _judged(job: Job, out: Outing, which: tuple[str, str, str], stop: int, one: Mapped) -> Result:
+def _score(
+    job: SessionJob, session: ArenaSession, which: tuple[str, str, str], stop: int, one: FilterResult
+) -> MapperResult:
     count = len(one.path)
-    truth, odometry = out.truth[:count], out.odometry[:count]
-    score = score_grid(one.grid, truth_of(out.arena, one.grid), which[1])
-    values = measured(one.told, one.path, truth) | {"reckoned": off(odometry, truth)} | scored(score)
-    return Result(
-        job.world, *which, job.number, job.seed, stop, count, values, score, one.grid, out.arena,
-        truth, odometry, one.told,
+    truth, odometry = session.truth[:count], session.odometry[:count]
+    score = score_grid(one.grid, arena_truth(session.arena, one.grid), which[1])
+    values = path_metrics(one.online, one.path, truth) | map_metrics(score)
+    values["odometry_error"] = position_error(odometry, truth)
+    return MapperResult(
+        job.world, *which, job.number, job.seed, stop, count, values, score, one.grid, session.arena,
+        truth, odometry, one.online,
     )  # fmt: skip

@@ -76,7 +76,7 @@ DEFAULT_ROWS = (
 )
 COLUMNS = (
     "arenas, odometry errors", "dead reckoning", "ratslam", "ratio", "below half, below",
-    "wall angle off, beyond 15 degrees, told",
+    "wall angle off, beyond 15 degrees, estimated",
     "wall AUC, Brier skill (free), Chamfer both ways",
 )  # fmt: skip
 

@@ -93,8 +93,8 @@ def replay_network(
             cells, above = carry
             far = (cells.pose + ring / 2 * np.array([1, 1, 0], dtype)) % ring
             inject = (k % every == every - 1) if every else jnp.bool_(False)
-            cells, told = step(cells, far, jnp.where(inject, 0.02, 0.0).astype(dtype))
-            return cells, above + (told.level > 0).astype(jnp.int32)
+            cells, report = step(cells, far, jnp.where(inject, 0.02, 0.0).astype(dtype))
+            return cells, above + (report.level > 0).astype(jnp.int32)
 
         return jax.lax.fori_loop(0, steps, body, (cells, jnp.int32(0)))
 

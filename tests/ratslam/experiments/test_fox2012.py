@@ -1,4 +1,4 @@
-"""The figures of Fox et al. 2012 made again: charts, loops, orders, and a tiny reproduction end to end."""
+"""Reproductions of Fox et al. 2012: maps, revisits, rankings, and a small reproduction."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from hypothesis import strategies as st
 from ratslam.cli import main
 from ratslam.cli.reproduce import FOX2012
 from ratslam.experiments.fox2012 import reproduction
-from ratslam.experiments.fox2012.mapper_ranking import MEASURES, Measure, order, orders
-from ratslam.experiments.fox2012.metrics import AWAY, FIELDS, measured, revisits
+from ratslam.experiments.fox2012.mapper_ranking import MEASURES, Measure, rank_mappers, render_rankings
+from ratslam.experiments.fox2012.metrics import FIELDS, LEAVE_DISTANCE, find_revisits, path_metrics
 from ratslam.experiments.fox2012.protocols import FILTERED, MAPPERS, PAPERS, PROTOCOLS, RECKONED, TRUE
 from ratslam.experiments.fox2012.reproduction import plan_jobs, reproduce
 from ratslam.experiments.fox2012.session import (
-    ROOM,
-    chart,
-    felt,
-    felt_marks,
-    mapped,
-    outing,
-    span,
-    started,
-    truth_of,
+    START_CLEARANCE,
+    arena_side,
+    arena_truth,
+    collect_marks,
+    draw_map,
+    observe_session,
+    place_start,
+    run_filter,
+    simulate_session,
 )
-from ratslam.experiments.fox2012.trials import Result, run_job
+from ratslam.experiments.fox2012.trials import MapperResult, run_job
 from ratslam.grid.config import GridConfig
 from robot.world.arena import Arena, has_clearance
 from robot.world.random_arena import ArenaConfig, make_arena
@@ -59,11 +59,11 @@ def rows(tiny: tuple[Path, str, bool]) -> list[dict[str, str]]:
 
 def made(
     mapper: str, number: int, key: str, value: float, along: str = FILTERED, best: float = 0.0
-) -> Result:
+) -> MapperResult:
     """A result of which nothing matters but one figure."""
     score: Any = SimpleNamespace(under=lambda convention: SimpleNamespace(best=best))
     nothing: Any = None
-    return Result(
+    return MapperResult(
         "",
         "ours",
         mapper,
@@ -84,7 +84,7 @@ def made(
 
 def of(
     measure: Measure, table: dict[str, list[float]], along: str = FILTERED, best: float = 0.0
-) -> list[Result]:
+) -> list[MapperResult]:
     return [
         made(mapper, k, measure.key, value, along, best)
         for mapper, values in table.items()
@@ -98,54 +98,54 @@ def of(
 @given(st.integers(0, 50))
 def test_trials_of_one_arena_start_anywhere_that_is_free(seed: int) -> None:
     place = make_arena(ArenaConfig(seed=1), 0)
-    one, other = started(place, seed), started(place, seed + 1)
-    assert has_clearance(one, one.start[None, :2], ROOM).all()
+    one, other = place_start(place, seed), place_start(place, seed + 1)
+    assert has_clearance(one, one.start[None, :2], START_CLEARANCE).all()
     assert not np.allclose(one.start, other.start)
     assert one.objects is place.objects
 
 
-def test_a_start_needs_room() -> None:
+def test_a_start_needs_free_space() -> None:
     with pytest.raises(InputError, match="no room"):
-        started(ROOMY._replace(outer=0.3 * ROOMY.outer), 0)
+        place_start(ROOMY._replace(outer=0.3 * ROOMY.outer), 0)
 
 
-def test_what_was_felt_is_drawn_where_it_was() -> None:
+def test_a_contact_is_drawn_at_its_place() -> None:
     reports = [report(forward=0.02), report(forward=0.02, touching=[1])]
     path = np.array([[0.4, 0.5, np.pi / 2], [0.4, 0.52, np.pi / 2]])
-    grid = chart(GridConfig(body=0.0), create(), ROOMY, path, felt_marks(reports))
+    grid = draw_map(GridConfig(body=0.0), create(), ROOMY, path, collect_marks(reports))
     assert grid.probability.shape == (40, 40)
     assert np.allclose(grid.origin, -0.5)
     row, column = np.unravel_index(grid.probability.argmax(), grid.probability.shape)
     there = grid.origin + grid.cell * (np.array([column, row]) + 0.5)
     assert np.abs(there - [0.4 - TIPS[1, 1], 0.52 + TIPS[1, 0]]).max() <= grid.cell / 2 + 1e-9
     # What came later is not drawn.
-    first = chart(GridConfig(body=0.0), create(), ROOMY, path[:1], felt_marks(reports))
+    first = draw_map(GridConfig(body=0.0), create(), ROOMY, path[:1], collect_marks(reports))
     assert first.probability.max() == pytest.approx(0.3)
 
 
-def test_charts_lie_on_the_truth_of_any_arena() -> None:
+def test_maps_and_truth_share_cells_in_any_arena() -> None:
     place = make_arena(ArenaConfig(seed=2), 0)
-    empty = chart(GridConfig(), create(), place, np.zeros((0, 3)), felt_marks([report()]))
-    truth = truth_of(place, empty)
+    empty = draw_map(GridConfig(), create(), place, np.zeros((0, 3)), collect_marks([report()]))
+    truth = arena_truth(place, empty)
     assert truth.inside.mean() == pytest.approx(0.25)
     assert (truth.occupied | truth.inside).all()
-    assert span(place) == 1.25
+    assert arena_side(place) == 1.25
     moved = place._replace(outer=place.outer + 3.0, objects=tuple(p + 3.0 for p in place.objects))
-    grid = chart(GridConfig(), create(), moved, np.zeros((0, 3)), felt_marks([report()]))
-    assert np.array_equal(truth_of(moved, grid).occupied, truth.occupied)
+    grid = draw_map(GridConfig(), create(), moved, np.zeros((0, 3)), collect_marks([report()]))
+    assert np.array_equal(arena_truth(moved, grid).occupied, truth.occupied)
 
 
-def test_a_stop_on_the_way_changes_nothing(tiny: object) -> None:
+def test_an_intermediate_stop_does_not_change_the_result(tiny: object) -> None:
     job = plan_jobs(PROTOCOLS["fox-fig4"], 1, 0, TINY)[0]
     config = job.variants["ours", "blob"]
     assert config.create_simulation is not None
-    out = outing(config.create_simulation)
-    reports = felt(config, out, 0)
-    early, late = mapped(config, out, reports, (23, len(reports)))
-    (whole,) = mapped(config, out, reports, (len(reports),))
-    assert np.array_equal(late.told, whole.told)
+    out = simulate_session(config.create_simulation)
+    reports = observe_session(config, out, 0)
+    early, late = run_filter(config, out, reports, (23, len(reports)))
+    (whole,) = run_filter(config, out, reports, (len(reports),))
+    assert np.array_equal(late.online, whole.online)
     assert np.array_equal(late.grid.probability, whole.grid.probability)
-    assert np.array_equal(early.told, whole.told[:23])
+    assert np.array_equal(early.online, whole.online[:23])
     assert len(early.path) == 23
 
 
@@ -157,50 +157,50 @@ def there_and_back(count: int = 40, far: float = 1.0) -> np.ndarray:
     return np.column_stack([x, np.zeros_like(x), np.zeros_like(x)])
 
 
-def test_a_robot_that_comes_back_is_there_again() -> None:
+def test_returns_are_found_as_revisits() -> None:
     truth = there_and_back()
-    later, earlier = revisits(truth).T
+    later, earlier = find_revisits(truth).T
     assert (later >= 40).all()
     assert np.abs(truth[later, 0] - truth[earlier, 0]).max() < 0.02
-    assert truth[later, 0].max() < 1 - AWAY / 2 + 0.03  # near the turn it was never away
-    assert len(revisits(truth[:40])) == 0
-    assert len(revisits(there_and_back(far=AWAY))) == 0
+    assert truth[later, 0].max() < 1 - LEAVE_DISTANCE / 2 + 0.03  # near the turn it was never away
+    assert len(find_revisits(truth[:40])) == 0
+    assert len(find_revisits(there_and_back(far=LEAVE_DISTANCE))) == 0
 
 
-def test_loops_are_closed_by_where_visits_lie_to_each_other() -> None:
+def test_revisits_are_closed_by_the_offset_of_the_two_visits() -> None:
     truth = there_and_back()
     shifted = truth + [3.0, -4.0, 0.1]
-    found = measured(shifted, shifted, truth)
-    assert found["told"] == found["final"] == pytest.approx(5)
-    assert found["gap"] == pytest.approx(0, abs=1e-12)
-    assert found["closed"] == 1
-    assert found["heading"] == pytest.approx(np.degrees(0.1))
+    found = path_metrics(shifted, shifted, truth)
+    assert found["online_error"] == found["final_error"] == pytest.approx(5)
+    assert found["revisit_gap"] == pytest.approx(0, abs=1e-12)
+    assert found["revisits_closed"] == 1
+    assert found["online_heading_error_deg"] == pytest.approx(np.degrees(0.1))
     drifted = truth + np.column_stack([np.zeros(80), np.linspace(0, 1, 80), np.zeros(80)])
-    assert measured(truth, drifted, truth)["closed"] == 0
-    assert measured(truth[:9], truth[:9], truth[:9])["closed"] is None
+    assert path_metrics(truth, drifted, truth)["revisits_closed"] == 0
+    assert path_metrics(truth[:9], truth[:9], truth[:9])["revisits_closed"] is None
 
 
 # Orders
 
 
-def test_the_papers_order_holds_or_not() -> None:
+def test_the_ranking_of_the_paper_holds_or_not() -> None:
     falling = {"blob": [0.5, 0.6, 0.7], "geometric": [0.4, 0.5, 0.6], "template": [0.3, 0.4, 0.5]}
     rising = dict(zip(falling, list(falling.values())[::-1], strict=True))
     mixed = falling | {"geometric": [0.4, 0.7, 0.6]}
-    words = [order(of(EVERYWHERE, table), "ours", EVERYWHERE) for table in (falling, rising, mixed)]
+    words = [rank_mappers(of(EVERYWHERE, table), "ours", EVERYWHERE) for table in (falling, rising, mixed)]
     assert [one.word for one in words if one] == ["holds", "does not hold", "not decided"]
     # More skill is better, so the same numbers say the opposite.
-    better = [order(of(BRIER, table), "ours", BRIER) for table in (falling, rising)]
+    better = [rank_mappers(of(BRIER, table), "ours", BRIER) for table in (falling, rising)]
     assert [one.word for one in better if one] == ["does not hold", "holds"]
-    assert order(of(EVERYWHERE, {name: [0.1] for name in PAPERS}), "ours", EVERYWHERE) is None
-    assert order(of(EVERYWHERE, falling), "as printed", EVERYWHERE) is None
+    assert rank_mappers(of(EVERYWHERE, {name: [0.1] for name in PAPERS}), "ours", EVERYWHERE) is None
+    assert rank_mappers(of(EVERYWHERE, falling), "as printed", EVERYWHERE) is None
 
 
 @given(st.lists(st.tuples(*[st.floats(0, 1)] * 3), min_size=2, max_size=6))
-def test_an_order_and_its_reverse_do_not_both_hold(sets: list[tuple[float, float, float]]) -> None:
+def test_a_ranking_and_its_reverse_do_not_both_hold(sets: list[tuple[float, float, float]]) -> None:
     columns = [list(column) for column in zip(*sets, strict=True)]
     forth, back = (
-        order(of(EVERYWHERE, dict(zip(PAPERS, each, strict=True))), "ours", EVERYWHERE)
+        rank_mappers(of(EVERYWHERE, dict(zip(PAPERS, each, strict=True))), "ours", EVERYWHERE)
         for each in (columns, columns[::-1])
     )
     assert forth is not None
@@ -210,30 +210,32 @@ def test_an_order_and_its_reverse_do_not_both_hold(sets: list[tuple[float, float
         assert back.word == "does not hold"
 
 
-def test_a_constant_that_wins_is_named() -> None:
+def test_a_constant_map_that_wins_is_reported() -> None:
     falling = {"blob": [0.5, 0.6], "geometric": [0.4, 0.5], "template": [0.3, 0.4]}
-    beaten, good = (order(of(EVERYWHERE, falling, best=b), "ours", EVERYWHERE) for b in (0.2, 0.5))
+    beaten, good = (rank_mappers(of(EVERYWHERE, falling, best=b), "ours", EVERYWHERE) for b in (0.2, 0.5))
     assert beaten is not None
     assert good is not None
     assert (beaten.beaten, good.beaten) == (True, False)
-    skill = order(of(BRIER, {name: [-0.1, -0.2] for name in PAPERS}), "ours", BRIER)
+    skill = rank_mappers(of(BRIER, {name: [-0.1, -0.2] for name in PAPERS}), "ours", BRIER)
     assert skill is not None
     assert skill.beaten
-    lines = orders("ours", of(EVERYWHERE, falling, best=0.2) + of(EVERYWHERE, falling, RECKONED, best=0.2))
+    lines = render_rankings(
+        "ours", of(EVERYWHERE, falling, best=0.2) + of(EVERYWHERE, falling, RECKONED, best=0.2)
+    )
     assert lines[2].count("holds") == 2  # also along dead reckoning; the true path is not known here
-    assert lines[2].endswith("knows nothing is as good")
-    assert lines[-1].startswith("Intervals of less than")
+    assert lines[2].endswith("without information is as good")
+    assert lines[-1].startswith("Intervals of fewer than")
 
 
 # The reproductions themselves
 
 
-def test_the_program_knows_them_all() -> None:
+def test_the_program_lists_all_protocols() -> None:
     assert set(FOX2012) == set(PROTOCOLS)
 
 
 @pytest.mark.parametrize("name", PROTOCOLS)
-def test_all_variants_of_a_set_are_of_one_session(name: str) -> None:
+def test_all_variants_of_a_set_share_a_session(name: str) -> None:
     jobs = plan_jobs(PROTOCOLS[name], 2, 0)
     assert len(jobs) == 2 * len(PROTOCOLS[name].worlds)
     assert all(len({config.create_simulation for config in job.variants.values()}) == 1 for job in jobs)
@@ -268,29 +270,30 @@ def test_a_tiny_reproduction_leaves_table_rows_and_figure(
     assert "exists" in capsys.readouterr().err
 
 
-def test_all_see_the_same_sets_and_paths_without_a_filter_are_what_they_say(
+def test_variants_share_sets_and_the_baseline_paths_have_the_expected_errors(
     rows: list[dict[str, str]],
 ) -> None:
-    reckoned = [{row["reckoned"] for row in rows if row["set"] == number} for number in "01"]
+    reckoned = [{row["odometry_error"] for row in rows if row["set"] == number} for number in "01"]
     assert [len(each) for each in reckoned] == [1, 1]
     assert reckoned[0] != reckoned[1]
-    assert all(row["told"] == row["reckoned"] for row in rows if row["along"] == RECKONED)
-    assert all(float(row["told"]) == 0 for row in rows if row["along"] == TRUE)
-    filtered = [row["told"] for row in rows if row["along"] == FILTERED and row["set"] == "0"]
+    assert all(row["online_error"] == row["odometry_error"] for row in rows if row["along"] == RECKONED)
+    assert all(float(row["online_error"]) == 0 for row in rows if row["along"] == TRUE)
+    filtered = [row["online_error"] for row in rows if row["along"] == FILTERED and row["set"] == "0"]
     assert len(set(filtered)) > 2
 
 
-def test_a_set_gives_the_same_whatever_ran_before(rows: list[dict[str, str]]) -> None:
+def test_a_set_is_independent_of_earlier_sessions(rows: list[dict[str, str]]) -> None:
     again = run_job(plan_jobs(PROTOCOLS["fox-fig4"], 2, 0, TINY)[1])
     before = [row for row in rows if row["set"] == "1"]
-    assert [repr(one.values["told"]) for one in again] == [row["told"] for row in before]
+    assert [repr(one.values["online_error"]) for one in again] == [row["online_error"] for row in before]
     assert [repr(one.values["map_auc"]) for one in again] == [row["map_auc"] for row in before]
 
 
-def test_an_interrupt_leaves_what_was_finished(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupt_keeps_the_finished_sessions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(function, tasks, workers):
         yield [
-            made(mapper, 0, "told", 0.1)._replace(values={"told": 0.1, "reckoned": 0.2}) for mapper in PAPERS
+            made(mapper, 0, "online_error", 0.1)._replace(values={"online_error": 0.1, "odometry_error": 0.2})
+            for mapper in PAPERS
         ]
         raise KeyboardInterrupt
 
@@ -302,7 +305,7 @@ def test_an_interrupt_leaves_what_was_finished(tmp_path: Path, monkeypatch: pyte
     assert not (tmp_path / "fox-fig4.png").exists()
 
 
-def test_what_cannot_be_run_is_refused_before_anything_is_written(
+def test_invalid_arguments_are_refused_before_anything_is_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "a"

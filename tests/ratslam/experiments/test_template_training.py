@@ -1,4 +1,4 @@
-"""Strain templates from the program: trained, kept, tried on other walls, used, and refused."""
+"""Strain templates: training by the command, tests on other walls, use in sessions, refusals."""
 
 from __future__ import annotations
 
@@ -9,7 +9,13 @@ import pytest
 
 from ratslam.cli import main
 from ratslam.config.run_config import RunConfig
-from ratslam.experiments.fox2012.template_training import SECONDS, WAYS, Tried, held_out, report
+from ratslam.experiments.fox2012.template_training import (
+    DURATIONS,
+    ESTIMATORS,
+    HeldOutDrive,
+    drive_held_out,
+    render_drives,
+)
 from robot.simulation.create.session import CreateSimulation, CreateSimulationConfig, train_strain_templates
 from robot.touch_source import observation_of, open_touch_source
 from tactile.base.errors import InputError
@@ -19,7 +25,7 @@ CONFIG = CreateSimulationConfig(seed=4)
 
 
 @pytest.fixture(scope="module")
-def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a configuration and the templates that the program made of it."""
     folder = tmp_path_factory.mktemp("templates")
     (folder / "create.yaml").write_text("create_simulation: {seed: 4}\n")
@@ -29,13 +35,13 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def templates(kept: Path) -> StrainTemplates:
-    return read_templates(kept / "new" / "t.npz")
+def templates(folder: Path) -> StrainTemplates:
+    return read_templates(folder / "new" / "t.npz")
 
 
-def errors(tried: list[Tried], way: str, known: bool) -> np.ndarray:
-    """[drives, SECONDS] of one way, at trained angles or between."""
-    return np.array([one.error[:, WAYS.index(way)] for one in tried if one.known == known])
+def errors(drives: list[HeldOutDrive], way: str, known: bool) -> np.ndarray:
+    """[drives, DURATIONS] of one way, at trained angles or between."""
+    return np.array([one.error[:, ESTIMATORS.index(way)] for one in drives if one.known == known])
 
 
 def test_the_file_holds_what_the_seed_gives(templates: StrainTemplates) -> None:
@@ -48,8 +54,8 @@ def test_the_file_holds_what_the_seed_gives(templates: StrainTemplates) -> None:
     )
 
 
-def test_walls_that_were_not_trained_on_are_known(templates: StrainTemplates) -> None:
-    tried = held_out(CONFIG, templates)
+def test_walls_without_training_are_recognised(templates: StrainTemplates) -> None:
+    tried = drive_held_out(CONFIG, templates)
     assert [one.known for one in tried] == [True, False] * 14 + [True]
     assert np.allclose([one.angle for one in tried], np.arange(20, 161, 5))
     assert errors(tried, "winner", True).mean() < 2
@@ -60,22 +66,23 @@ def test_walls_that_were_not_trained_on_are_known(templates: StrainTemplates) ->
     assert np.nanmean(errors(tried, "fused", False)) < 1
 
 
-def test_bad_templates_are_seen_at_once(templates: StrainTemplates) -> None:
+def test_bad_templates_have_large_errors(templates: StrainTemplates) -> None:
     # One angle's drives went wrong: its template is another one's.
     mean = templates.mean.copy()
     mean[5] = mean[12]
-    tried = held_out(CONFIG, templates._replace(mean=mean))
+    tried = drive_held_out(CONFIG, templates._replace(mean=mean))
     assert (errors(tried, "winner", True)[5] > 5).all()
     with pytest.raises(InputError, match="do not turn"):
-        held_out(CONFIG, templates._replace(mean=templates.mean[::-1].copy()))
+        drive_held_out(CONFIG, templates._replace(mean=templates.mean[::-1].copy()))
 
 
-def test_the_report_marks_what_is_far_off_and_what_is_not_known() -> None:
-    error = np.full((len(SECONDS), len(WAYS)), 1.0)
+def test_the_report_marks_large_errors_and_missing_walls() -> None:
+    error = np.full((len(DURATIONS), len(ESTIMATORS)), 1.0)
     far, unknown = error.copy(), error.copy()
     far[0, 0], unknown[:, 2] = 12.3, np.nan
-    lines = report(
-        [Tried(20.0, True, far), Tried(25.0, False, unknown), Tried(30.0, True, error)], 4
+    lines = render_drives(
+        [HeldOutDrive(20.0, True, far), HeldOutDrive(25.0, False, unknown), HeldOutDrive(30.0, True, error)],
+        4,
     ).splitlines()
     assert lines[2].split()[:3] == ["20", "!", "12.3"]
     assert lines[3].split()[:4] == ["25~", "1.0", "1.0", "-"]
@@ -83,11 +90,11 @@ def test_the_report_marks_what_is_far_off_and_what_is_not_known() -> None:
     assert lines[6].split()[-1] == "-"
 
 
-def test_sessions_use_the_file(kept: Path, templates: StrainTemplates) -> None:
+def test_sessions_use_the_file(folder: Path, templates: StrainTemplates) -> None:
     config = RunConfig.model_validate(
         {
             "create_simulation": {"reports": 60, "seed": 1},
-            "touch": {"reports": {"walls": "template", "templates": kept / "new" / "t.npz", "flat": None}},
+            "touch": {"reports": {"walls": "template", "templates": folder / "new" / "t.npz", "flat": None}},
         }
     )
     assert config.create_simulation is not None
@@ -101,10 +108,10 @@ def test_sessions_use_the_file(kept: Path, templates: StrainTemplates) -> None:
     assert np.allclose(directions[0], directions[1], atol=10.01)
 
 
-def test_what_is_there_is_not_overwritten(kept: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file = kept / "new" / "t.npz"
+def test_an_existing_file_is_not_overwritten(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = folder / "new" / "t.npz"
     before = file.read_bytes()
-    assert main(["train-templates", str(kept / "create.yaml"), "-o", str(file)]) == 2
+    assert main(["train-templates", str(folder / "create.yaml"), "-o", str(file)]) == 2
     error = capsys.readouterr().err
     assert error.count("ratslam: error:") == 1
     assert "exists" in error
@@ -119,7 +126,7 @@ def test_what_is_there_is_not_overwritten(kept: Path, capsys: pytest.CaptureFixt
         ("create_simulation: {behaviour: {contact: 0.0019}, whiskers: {length: 0.01}}\n", "no contact"),
     ],
 )
-def test_what_cannot_be_trained_is_refused(
+def test_invalid_sessions_are_refused(
     text: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     config = tmp_path / "c.yaml"
