@@ -1,5 +1,5 @@
-"""Touch: what a whisker array senses, and the types every source and engine share."""
+"""Whisker touch: from raw samples to observations, and the types shared by sources and backends."""
 
-# `ratslam.__main__` reads this before anything else: other distributions install packages of the same
-# name (Robot Framework's `robot`), and whichever came first on the path would silently be imported.
+# `ratslam.__main__` checks this first: other distributions install packages of the same name (for example
+# Robot Framework's `robot`), and the first one on the path would be imported silently.
 RATSLAM_PACKAGE = "tactile"

@@ -1,4 +1,4 @@
-"""The sense of touch as a whole: from what a head reports to what an engine is given."""
+"""The tactile front end: from readings of a whisker head to observations for a SLAM backend."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 
 
 class TouchConfig(Settings):
-    """How touch is sensed."""
+    """Settings of the tactile front end."""
 
     head: HeadConfig = HeadConfig()
-    """The whiskers; a recording that knows its own goes before what is not set here."""
+    """The whisker head; a recording's own head replaces settings that are not given here."""
     contact: ContactConfig = ContactConfig()
-    """From raw samples to contacts."""
+    """Contact detection."""
     image: ImageConfig = ImageConfig()
-    """From contacts to a view."""
+    """Whisker image."""
     reports: ReportFrontendConfig = ReportFrontendConfig()
-    """Of a Create: from reports of its steps to contacts and walls."""
+    """Front end of a Create's reports: contacts and wall directions."""
 
 
 class Frontend:
-    """Turns readings of whiskers into observations, each for itself.
+    """Turns readings of a whisker head into observations, without memory between readings.
 
     Args:
-        calibration: of the head, for raw readings.
+        calibration: of the head; needed for raw readings.
 
     Attributes:
-        view_shape: of the views. whiskers: W.
+        view_shape: shape of the views. whiskers: W.
     """
 
     def __init__(self, config: TouchConfig, calibration: Calibration | None = None) -> None:
@@ -42,25 +42,25 @@ class Frontend:
         self.whiskers = len(self.head.length)
 
     def features(self, reading: Cycle | Whisk) -> Whisk:
-        """What each whisker felt; a whisker that the head's configuration calls dead does not report.
+        """The contact features of a reading; whiskers configured as dead are not alive.
 
         Raises:
-            InputError: raw samples without a calibration, or that cannot be used.
+            InputError: raw samples without a calibration, or with gaps.
         """
         if isinstance(reading, Cycle):
             if self.calibration is None:
                 raise InputError(
-                    "calibration", "raw whisker samples without one", "a record of free whisking with them"
+                    "calibration", "raw whisker samples without a calibration", "a free-whisking record"
                 )
             reading = detect_contacts(self.config.contact, self.calibration, reading)
         alive = reading.alive & self.head.alive
         return reading._replace(alive=alive, contact=reading.contact & alive, held=reading.held & alive)
 
     def observe(self, reading: Observation | Cycle | Whisk | Report) -> Observation:
-        """What an engine is given; an observation stays as it is.
+        """The observation of a reading; an `Observation` is returned unchanged.
 
         Raises:
-            InputError: the report of another robot.
+            InputError: a report of the Create (see `wall_estimation.report_frontend`).
         """
         if isinstance(reading, Observation):
             return reading

@@ -49,7 +49,7 @@ def _line(seen: RunProgress) -> str:
     if len(seen.path):
         x, y, turn = seen.sd
         parts.append(f"last pose ± {x:.2g} m, {y:.2g} m, {np.degrees(turn):.2g} degrees")
-    parts += [] if seen.online_error is None else [f"off by {seen.online_error:.3g} m"]
+    parts += [] if seen.online_error is None else [f"error {seen.online_error:.3g} m"]
     return "  ·  ".join(parts)
 
 

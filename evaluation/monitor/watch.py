@@ -66,7 +66,7 @@ def status_line(seen: RunProgress, pace: float | None) -> str:
     """A run in one line; `pace`: steps a second."""
     parts = [f"{seen.name}: {seen.status}", step_count(seen), f"{path_length(seen.odometry):.1f} m"]
     parts += [] if pace is None else [f"{pace:.0f} steps/s"]
-    parts += [] if seen.online_error is None else [f"off by {seen.online_error:.3g} m"]
+    parts += [] if seen.online_error is None else [f"error {seen.online_error:.3g} m"]
     parts += [f"{count} {name}" for name, count in sorted(seen.outcomes.items(), key=lambda item: -item[1])]
     parts += [f"{seen.lost} lost"] if seen.lost else []
     parts += [f"checkpoint at {seen.checkpoint}"] if seen.checkpoint else []

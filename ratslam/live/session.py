@@ -158,7 +158,7 @@ def _calibrate(rig: Rig, config: RunConfig, path: Way, tell: Callable[[str], Non
     reported(start_and_check(rig), tell)
     tell("arm: going above the start of the way")
     follow_route(rig, approach_route(rig.config, path))
-    count = ceil(plan.calibration.shortest * plan.whisking.rate)
+    count = ceil(plan.calibration.min_duration * plan.whisking.rate)
     tell(f"head: {count} whisks in free air")
     rig.driver.whisk(plan.whisking.model_copy(update={"mode": "open"}))
     record = record_free_whisks(rig, count)

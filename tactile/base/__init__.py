@@ -1,1 +1,1 @@
-"""Foundations that every package may import: types, SE(2), errors, settings, random streams."""
+"""Foundations for all packages: types, SE(2), errors, settings, random streams, atomic file writes."""

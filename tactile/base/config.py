@@ -1,4 +1,4 @@
-"""The base of every configuration model: immutable, unknown keys refused, defaults a working system."""
+"""Base class of all configuration models."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict
 
 
 class Settings(BaseModel):
-    """A part of the configuration, kept beside the code it configures."""
+    """Base class of configuration sections: immutable, rejects unknown keys and non-finite numbers."""
 
     renamed_keys: ClassVar[Mapping[str, str]] = {}
     """Old dotted path of a key in this section to the new one, or to a sentence that says what to write."""

@@ -1,4 +1,4 @@
-"""The one error a user's input can cause, with everything needed to mend it."""
+"""Errors in user input: place, finding, expectation and cure."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from typing import Any
 
 
 class InputError(ValueError):
-    """Input that cannot be used. The program prints it without a traceback and exits with code 2.
+    """Invalid user input. The program prints the error without a traceback and exits with code 2.
 
     Args:
-        where: the place, as `file`, `file:line`, `file:line:column` or a key path.
-        found: what is there.
-        expected: what would have been right ('' if `found` says it all).
-        cure: what the user can do about it ('' if obvious).
+        where: place of the error: `file`, `file:line`, `file:line:column` or a key path.
+        found: the input found there.
+        expected: valid input ('' if `found` suffices).
+        cure: what to do ('' if obvious).
     """
 
     def __init__(self, where: str, found: str, expected: str = "", cure: str = "") -> None:
@@ -28,12 +28,12 @@ class InputError(ValueError):
         super().__init__("; ".join(parts))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Rebuilt from its parts: it has to come whole out of a worker process."""
+        """Pickles the parts, so that the error survives its way out of a worker process."""
         return type(self), (self.where, self.found, self.expected, self.cure)
 
 
 class InputErrors(InputError):
-    """Several errors found in one pass over the same input, reported together."""
+    """Several errors of one input, reported together."""
 
     def __init__(self, errors: list[InputError]) -> None:
         self.errors = errors

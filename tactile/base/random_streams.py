@@ -1,4 +1,4 @@
-"""Named random streams: everything random follows from one seed, and nothing from what else was drawn."""
+"""Named random streams of one seed, independent of each other and of the order of their use."""
 
 from __future__ import annotations
 
@@ -8,5 +8,5 @@ import numpy as np
 
 
 def stream(seed: int, name: str) -> np.random.Generator:
-    """The random stream of that name; streams of different names are independent."""
+    """The random generator of a name; generators of different names are independent."""
     return np.random.default_rng([seed, crc32(name.encode())])

@@ -1,7 +1,7 @@
-"""The seam between a robot, its sense of touch and an engine.
+"""Types shared by robots, the tactile front end and SLAM backends: readings and observations.
 
-Everything here is a NamedTuple of arrays with fixed shapes and dtypes, so that it is a JAX pytree without
-this package knowing JAX. A leading axis turns one into a chunk of many.
+Each type is a NamedTuple of arrays with fixed shapes and dtypes, hence a JAX pytree without an import of JAX.
+With a leading axis it is a chunk of several.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ Array = Any  # a NumPy or a JAX array
 
 
 class MotionKind(IntEnum):
-    """What the robot was doing during a step (the Create's state machine needs to know)."""
+    """The kind of motion of a step, from the Create's state machine."""
 
     OTHER = 0
     FORWARD = 1
@@ -38,7 +38,7 @@ class Odometry(NamedTuple):
 
 
 class Cycle(NamedTuple):
-    """One whisk cycle as the head reports it; host NumPy, the number of samples T may vary.
+    """The raw samples of one whisk cycle (NumPy; the number of samples T varies).
 
     Attributes:
         time: [T] s. angle: [T, W] whisker angles, rad. deflection: [T, W, 2] base deflections.
@@ -52,16 +52,16 @@ class Cycle(NamedTuple):
 
 
 class Whisk(NamedTuple):
-    """One whisk cycle as each whisker felt it: what is kept of a `Cycle`, or simulated without one.
+    """The contact features of one whisk cycle, detected in a `Cycle` or simulated directly.
 
-    Angles are protractions from rest. Values of whiskers that did not feel it are 0.
+    Angles are protractions from rest. Values of whiskers without contact are 0.
 
     Attributes:
         odometry: motion since the previous cycle.
-        alive: [W] bool, the whisker reports at all. contact: [W] bool, it touched something on its way.
-        touched: [W] angle at first contact, rad. held: [W] bool, it still touched at the end of the
-            protraction. highest: [W] largest angle, rad. reach: [W] how far along the shaft it was touched,
-            as a share of its length.
+        alive: [W] bool, the whisker has a signal. contact: [W] bool, it touched something during protraction.
+        touched: [W] angle at first contact, rad. held: [W] bool, still in contact at the end of the
+            protraction. highest: [W] largest angle, rad. reach: [W] radial distance of the contact, as a
+            share of the whisker's length.
     """
 
     odometry: Odometry
@@ -74,24 +74,24 @@ class Whisk(NamedTuple):
 
 
 class StepEnd(IntEnum):
-    """Where the Create's state machine stands at the end of a step (Fox et al. 2012, II-C)."""
+    """How a step of the Create's state machine ended (Fox et al. 2012, II-C)."""
 
     FREE = 0
-    """The step ended as planned, and nothing was met."""
+    """As planned, without a contact."""
     HIT1 = 1
-    """A whisker has met something: the drive on (FWD1) ended."""
+    """First contact of a whisker; ends the fast drive (FWD1)."""
     HIT2 = 2
-    """A second one has: the slow drive on (FWD2) ended."""
+    """Contact of a second whisker; ends the slow drive (FWD2)."""
     ABORT = 3
-    """The strain of a whisker passed what is safe, and the step ended early."""
+    """The strain of a whisker exceeded the safe limit."""
 
 
 class Report(NamedTuple):
-    """One step of the Create's state machine as its fixed whiskers felt it.
+    """One step of the Create's state machine with the signals of its fixed whiskers.
 
     Attributes:
-        odometry: motion since the previous report. motion: a `MotionKind`. moment: a `StepEnd`, how it ended.
-        alive: [W] bool, the whisker reports at all. contact: [W] bool, strained beyond the contact threshold
+        odometry: motion since the previous report. motion: a `MotionKind`. moment: a `StepEnd`.
+        alive: [W] bool, the whisker has a signal. contact: [W] bool, strained beyond the contact threshold
             at the end of the step.
         time: [T] s since the beginning of the step, evenly spaced. strain: [T, W, 2] horizontal and vertical,
             during the slow drive between HIT1 and HIT2 or ABORT; T is 0 for every other step.
@@ -107,19 +107,19 @@ class Report(NamedTuple):
 
 
 class Observation(NamedTuple):
-    """What an engine is given at one step. Absent things are masked, never NaN.
+    """The input of a SLAM backend at one step. Absent values are masked, never NaN.
 
     Attributes:
         odometry: motion since the previous observation.
         motion: a `MotionKind`, int32.
         view: [R, C, K] view, values in 0..1 (3 x 6 whiskers x channels, 20 x 60 x 1 for a camera).
         view_seen: whether `view` holds a view, bool.
-        label: place-recognition id given by the recording, int32; -1 when there is none.
-        contact: [W] bool, whiskers that touched something. alive: [W] bool, whiskers that report at all; a
-            pixel of the view that belongs to another one says nothing.
-        point: [W, 2] m in base_link, where they touched.
-        wall: bool, whether a wall orientation was measured; wall_point: [2] its nearest point, m in
-            base_link; wall_sd: standard deviation of its direction, rad.
+        label: place id given by the recording, int32; -1 for none.
+        contact: [W] bool, whiskers in contact. alive: [W] bool, whiskers with a signal; pixels of other
+            whiskers are to be ignored.
+        point: [W, 2] contact points in base_link, m.
+        wall: bool, whether a wall direction was measured; wall_point: [2] nearest point of that wall in
+            base_link, m; wall_sd: standard deviation of its direction, rad.
     """
 
     odometry: Odometry
@@ -144,11 +144,11 @@ def observation(
     motion: MotionKind = MotionKind.OTHER,
     whiskers: int = 0,
 ) -> Observation:
-    """An observation of a view and / or a given label, without contacts.
+    """An observation with a view, a place label or both, and without contacts.
 
     Args:
-        view: [R, C, K], or None when nothing was seen; then `view_shape` gives its shape.
-        whiskers: W, the number of whiskers of the (masked) contact fields.
+        view: [R, C, K], or None for no view; then `view_shape` gives its shape.
+        whiskers: W, the length of the (masked) contact fields.
     """
     seen = view is not None
     return Observation(
@@ -167,7 +167,7 @@ def observation(
 
 
 def stack(observations: Sequence[Observation]) -> Observation:
-    """A chunk: the observations stacked along a new leading axis."""
+    """A chunk: observations stacked along a new leading axis."""
     first = observations[0]
     odometry = Odometry(
         *(np.stack(column) for column in zip(*(o.odometry for o in observations), strict=True))

@@ -1,1 +1,1 @@
-"""From raw signals to contact features and whisker images."""
+"""Contact detection, free-whisking calibration and whisker images."""

@@ -1,7 +1,7 @@
-"""What whiskers report when they touch nothing: the record that every threshold is made from.
+"""Calibration of a whisker head from a record of free whisking (whiskers touch nothing).
 
-A head whisks in free air; mean and standard deviation of each deflection follow, and a contact threshold of
-so many standard deviations (Salman & Pearson 2016, III-E: twenty).
+The record gives mean and standard deviation of each deflection; the contact threshold is a multiple of the
+standard deviation (20 in Salman & Pearson 2016, III-E).
 """
 
 from __future__ import annotations
@@ -17,31 +17,33 @@ from tactile.base.errors import InputError
 from tactile.base.types import Cycle
 
 MIN_WINDOW_SAMPLES = 8
-"""Samples that a slope window has to hold: a line through fewer is mostly noise."""
+"""Least number of samples in a slope window; the slope of fewer is mostly noise."""
 
 
 class CalibrationConfig(Settings):
-    """What a free-whisking record has to be."""
+    """Contact threshold of a calibration, and checks of its free-whisking record."""
 
-    sds: PositiveFloat = 20.0
+    threshold_sds: PositiveFloat = 20.0
     """Contact threshold, in standard deviations of the free deflection."""
-    shortest: PositiveFloat = 4.0
-    """Duration that is enough, s."""
+    min_duration: PositiveFloat = 4.0
+    """Shortest record, s."""
     full_scale: PositiveFloat = 1.5
     """Deflection at which the sensors saturate, rad."""
-    tail_sds: PositiveFloat = 6.0
-    """Robust standard deviations beyond which a sample is no noise."""
-    tail: Annotated[float, Field(gt=0, lt=1)] = 5e-4
-    """Share of such samples that betrays contacts."""
-    louder: PositiveFloat = 6.0
-    """A whisker whose deflection varies so many times more than the middle one's is not free."""
+    outlier_sds: PositiveFloat = 6.0
+    """A sample further from the median than this many robust standard deviations is an outlier."""
+    max_outlier_share: Annotated[float, Field(gt=0, lt=1)] = 5e-4
+    """A whisker with a larger share of outliers had contacts."""
+    max_sd_ratio: PositiveFloat = 6.0
+    """A whisker whose standard deviation exceeds the median whisker's by this factor had contacts."""
 
 
 class Calibration(NamedTuple):
-    """Attributes:
-    mean, sd: [W, 2] of the free deflections, rad. threshold: [W, 2] rad from
-    the mean that is contact, infinite for whiskers that are not alive.
-    free: [W] largest protraction in free air, rad. alive: [W] bool. rate: samples per second.
+    """Free-whisking statistics of W whiskers.
+
+    Attributes:
+        mean, sd: [W, 2] mean and standard deviation of the deflections, rad.
+        threshold: [W, 2] distance from the mean that counts as contact, rad; infinite where not alive.
+        free: [W] largest protraction in free air, rad. alive: [W] bool. rate: samples per second.
     """
 
     mean: np.ndarray
@@ -58,17 +60,17 @@ def calibrate(
     slope_window: float = 0.01,
     where: str = "calibration",
 ) -> Calibration:
-    """The calibration that a free-whisking record gives.
+    """Calibrates a head from a free-whisking record.
 
-    A whisker is dead if its angle stands still and its deflection too, or if its deflection is exactly zero
+    A whisker is dead if neither its angle nor its deflection changes, or if its deflection is exactly zero
     throughout.
 
     Args:
-        slope_window: s, of the contact detection that it is for. where: what errors call the record.
+        slope_window: window of the contact detection, s. where: name of the record in errors.
 
     Raises:
-        InputError: it is too short or too coarse in time, has channels without values or at their limits, no
-            whisker that lives, no noise at all, or contacts.
+        InputError: the record is too short, is sampled too slowly, has channels with NaN or at their limits,
+            or contacts, or no whisker is alive.
     """
     rate = _rate(config, record, slope_window, where)
     angle = np.concatenate([cycle.angle for cycle in record])
@@ -76,28 +78,28 @@ def calibrate(
     missing = ~(np.isfinite(angle).all(axis=0) & np.isfinite(deflection).all(axis=(0, 2)))
     if missing.any():
         raise InputError(
-            where, f"values missing (NaN) of {_named(missing)}", "", "check these channels' wires"
+            where, f"{_named(missing)}: NaN samples", "finite samples", "check the wiring of these channels"
         )
     stuck = np.ptp(deflection, axis=0) == 0
     alive = ~(stuck.all(axis=1) & ((np.ptp(angle, axis=0) == 0) | (deflection == 0).all(axis=(0, 2))))
     if not alive.any():
         cure = "whisk while recording; a simulated head needs sensor noise above 0 (`mechanics.noise`)"
-        raise InputError(where, "no whisker reports any signal", "", cure)
+        raise InputError(where, "no whisker has a signal", "at least one live whisker", cure)
     _refuse_saturated(config, deflection, alive, where)
 
     middle = np.median(deflection, axis=0)
     robust = 1.4826 * np.median(np.abs(deflection - middle), axis=0)
-    outside = np.abs(deflection - middle) > config.tail_sds * robust
-    touched = (outside.mean(axis=0) > config.tail).any(axis=1)
+    outside = np.abs(deflection - middle) > config.outlier_sds * robust
+    touched = (outside.mean(axis=0) > config.max_outlier_share).any(axis=1)
     sd = deflection.std(axis=0)
-    touched |= (sd > config.louder * np.median(sd[alive], axis=0)).any(axis=1)
+    touched |= (sd > config.max_sd_ratio * np.median(sd[alive], axis=0)).any(axis=1)
     if (touched & alive).any():
-        cure = "record it again with nothing within reach"
-        raise InputError(where, f"contacts of {_named(touched & alive)}", "a record of free whisking", cure)
+        cure = "record again with nothing within reach"
+        raise InputError(where, f"contacts of {_named(touched & alive)}", "free whisking", cure)
     return Calibration(
         mean=np.where(alive[:, None], deflection.mean(axis=0), 0.0),
         sd=np.where(alive[:, None], sd, 0.0),
-        threshold=np.where(alive[:, None], config.sds * sd, np.inf),
+        threshold=np.where(alive[:, None], config.threshold_sds * sd, np.inf),
         free=np.where(alive, np.mean([cycle.angle.max(axis=0) for cycle in record], axis=0), 0.0),
         alive=alive,
         rate=rate,
@@ -105,18 +107,18 @@ def calibrate(
 
 
 def sample_rate(time: np.ndarray, slope_window: float, where: str) -> float:
-    """Samples per second of a stream.
+    """Sample rate of a stream with times [T], per second.
 
     Raises:
-        InputError: times missing, not in order or uneven, or too few samples for the slope window.
+        InputError: times are NaN, not increasing or have gaps, or the slope window holds too few samples.
     """
     step = np.diff(time)
     if len(step) == 0 or not np.isfinite(time).all() or (step <= 0).any():
-        raise InputError(where, "times are missing or out of order", "increasing times, s")
+        raise InputError(where, "times are NaN or not increasing", "increasing times, s")
     usual = float(np.median(step))
     if step.max() > 5 * usual:
-        lost = f"{step.max() / usual:.0f} sample intervals without a sample"
-        raise InputError(where, lost, "an unbroken stream", "leave this cycle out")
+        gap = f"a gap of {step.max() / usual:.0f} sample intervals"
+        raise InputError(where, gap, "a stream without gaps", "leave this cycle out")
     if slope_window / usual < MIN_WINDOW_SAMPLES - 1e-6:
         raise InputError(
             where,
@@ -128,12 +130,12 @@ def sample_rate(time: np.ndarray, slope_window: float, where: str) -> float:
 
 
 def calibration_arrays(calibration: Calibration) -> dict[str, np.ndarray]:
-    """As plain arrays by name, to be kept with a session."""
+    """The fields as arrays by name, for storage with a session; `calibration_from_arrays` reads them."""
     return {name: np.asarray(value) for name, value in calibration._asdict().items()}
 
 
 def calibration_json(calibration: Calibration) -> dict[str, Any]:
-    """The calibration as a JSON document; infinite values are written as text."""
+    """The calibration as a JSON object; infinite values are strings."""
     return {name: _plain(array.tolist()) for name, array in calibration_arrays(calibration).items()}
 
 
@@ -143,47 +145,47 @@ def _plain(value: Any) -> Any:
     return value if isinstance(value, bool) or np.isfinite(value) else str(value)
 
 
-def calibration_from_arrays(kept: Mapping[str, np.ndarray], where: str = "calibration") -> Calibration:
-    """The calibration that `calibration_arrays` made these of.
+def calibration_from_arrays(stored: Mapping[str, np.ndarray], where: str = "calibration") -> Calibration:
+    """The inverse of `calibration_arrays`.
 
     Raises:
-        InputError: one is missing, or their shapes do not fit.
+        InputError: an array is missing or has the wrong shape.
     """
-    lacking = [name for name in Calibration._fields if name not in kept]
+    lacking = [name for name in Calibration._fields if name not in stored]
     if lacking:
-        raise InputError(where, f"no {', '.join(lacking)}", "a calibration as kept with a session")
-    whiskers = len(np.atleast_1d(kept["alive"]))
+        raise InputError(where, f"{', '.join(lacking)} missing", "all arrays of a calibration")
+    whiskers = len(np.atleast_1d(stored["alive"]))
     shapes: dict[str, tuple[int, ...]] = {name: (whiskers, 2) for name in ("mean", "sd", "threshold")}
     shapes |= {"free": (whiskers,), "alive": (whiskers,), "rate": ()}
     for name, shape in shapes.items():
-        if np.shape(kept[name]) != shape:
-            raise InputError(f"{where}.{name}", f"shape {np.shape(kept[name])}", str(shape))
-    values = {name: np.asarray(kept[name], float) for name in Calibration._fields[:4]}
-    return Calibration(**values, alive=np.asarray(kept["alive"], bool), rate=float(kept["rate"]))
+        if np.shape(stored[name]) != shape:
+            raise InputError(f"{where}.{name}", f"shape {np.shape(stored[name])}", str(shape))
+    values = {name: np.asarray(stored[name], float) for name in Calibration._fields[:4]}
+    return Calibration(**values, alive=np.asarray(stored["alive"], bool), rate=float(stored["rate"]))
 
 
 def _rate(config: CalibrationConfig, record: Sequence[Cycle], slope_window: float, where: str) -> float:
     if not record:
-        raise InputError(where, "an empty record", f"at least {config.shortest:g} s of free whisking")
+        raise InputError(where, "an empty record", f"at least {config.min_duration:g} s of free whisking")
     rates = [sample_rate(cycle.time, slope_window, where) for cycle in record]
     duration = sum(len(cycle.time) / rate for cycle, rate in zip(record, rates, strict=True))
-    if duration < config.shortest - 1e-6:
-        raise InputError(where, f"{duration:.2g} s", f"at least {config.shortest:g} s of free whisking")
+    if duration < config.min_duration - 1e-6:
+        raise InputError(where, f"{duration:.2g} s", f"at least {config.min_duration:g} s of free whisking")
     return float(np.median(rates))
 
 
 def _refuse_saturated(
     config: CalibrationConfig, deflection: np.ndarray, alive: np.ndarray, where: str
 ) -> None:
-    # A clipped channel spends its time at one of its own extremes.
+    # A clipped channel stays at one of its own extremes.
     at_end = np.maximum(
         (deflection == deflection.max(axis=0)).mean(axis=0),
         (deflection == deflection.min(axis=0)).mean(axis=0),
     )
     bad = ((at_end > 0.05) | (np.abs(deflection) >= config.full_scale).any(axis=0)).any(axis=1) & alive
     if bad.any():
-        found = f"deflections of {_named(bad)} stand still or at their limits"
-        raise InputError(where, found, "", "check the sensors, or declare the whiskers dead")
+        found = f"deflections of {_named(bad)} are constant or at their limits"
+        raise InputError(where, found, "unclipped samples", "check the sensors or list the whiskers as dead")
 
 
 def _named(which: np.ndarray) -> str:

@@ -1,8 +1,9 @@
-"""From a whisk's raw stream to what each whisker felt.
+"""Contact detection: from the raw samples of one whisk cycle to the contact features of each whisker.
 
-Contact is decided by the size of the deflection, averaged over a short window; where it began is told by its
-slope over the same window (Salman & Pearson 2016, III-D: when the first derivative crossed a threshold; of
-raw samples it is all noise). All thresholds are angles and times, so they mean the same at any sample rate.
+A whisker is in contact when its mean deflection over a short window exceeds a threshold. The onset is where
+the slope of the deflection over the same window exceeds another one (Salman & Pearson 2016, III-D, use the
+first derivative; the derivative of single samples is mostly noise). Thresholds are angles and times, so they
+do not depend on the sample rate.
 """
 
 from __future__ import annotations
@@ -19,32 +20,32 @@ from tactile.features.calibration import Calibration, sample_rate
 
 
 class ShaftConfig(Settings):
-    """How a whisker's stiffness depends on where along it one pushes."""
+    """Stiffness of a whisker as a function of the point of contact."""
 
     taper: Annotated[float, Field(gt=0, le=1)] = 0.2
     """Radius at the tip over radius at the base; the taper is linear (Fox et al. 2012: 0.3 mm / 1.45 mm)."""
     reference: Annotated[float, Field(gt=0, le=1)] = 0.75
-    """Where the deflection reads the angle of the push, as a share of the length; walls mostly meet it
-    there."""
+    """Point of contact at which the deflection equals the angle of the push, as a share of the length; most
+    contacts with walls are near it."""
 
 
 class ContactConfig(Settings):
-    """When a deflection is a contact. In standard deviations of the free-whisking record."""
+    """Contact detection; `_sds` thresholds are in standard deviations of the free-whisking record."""
 
     slope_window: PositiveFloat = 0.01
-    """Time over which slopes and means are taken, s."""
-    steep: PositiveFloat = 20.0
-    """Rise of the deflection within `rise` that tells when contact began."""
-    rise: PositiveFloat = 0.05
-    """s"""
-    least: PositiveFloat = 7.5
-    """Mean deflection that is contact."""
+    """Window of slopes and means, s."""
+    onset_sds: PositiveFloat = 20.0
+    """Rise of the deflection within `rise_time` that marks the onset of a contact."""
+    rise_time: PositiveFloat = 0.05
+    """Time of that rise, s; the onset is searched for this long before the contact is detected."""
+    contact_sds: PositiveFloat = 7.5
+    """Contact threshold of the mean deflection."""
     shaft: ShaftConfig = ShaftConfig()
-    """Of the whiskers, for the radial distance."""
+    """Stiffness of the whiskers, for the radial distance."""
 
 
 def stiffness(config: ShaftConfig, reach: Array) -> np.ndarray:
-    """Moment at the base for an angle of push, over that at the reference, when pushed at a share `reach`.
+    """Base moment per angle of push at a share `reach` of the length, relative to that at the reference.
 
     A cone of length L whose apex would lie at L / (1 - taper), pushed at a by a small angle, has the base
     moment 3 E I (1 / a - (1 - taper) / L) times it (beam theory, exact for small angles).
@@ -54,7 +55,8 @@ def stiffness(config: ShaftConfig, reach: Array) -> np.ndarray:
 
 
 def radial_distance(config: ShaftConfig, ratio: Array) -> np.ndarray:
-    """Where along it a whisker with that stiffness is pushed, as a share of its length: 1 at the tip."""
+    """The point of contact for a relative stiffness, as a share of the length (1 at the tip); the inverse of
+    `stiffness`."""
     full = 1 - config.taper
     nearness = np.asarray(ratio, float) * (1 / config.reference - full) + full
     return 1 / np.maximum(nearness, 1.0)
@@ -63,19 +65,20 @@ def radial_distance(config: ShaftConfig, ratio: Array) -> np.ndarray:
 def detect_contacts(
     config: ContactConfig, calibration: Calibration, cycle: Cycle, where: str = "touch"
 ) -> Whisk:
-    """What each whisker felt in one cycle.
+    """The contact features of one whisk cycle.
 
-    A whisker with a value missing anywhere in the cycle is not alive in it; in a cycle without samples, whose
-    stream was dropped, none is.
+    A whisker with a NaN sample counts as not alive for the cycle; in a cycle without samples (its stream was
+    dropped) no whisker is alive.
 
     Args:
-        where: what errors call the stream.
+        where: name of the stream in errors.
 
     Raises:
-        InputError: the stream is broken, cut off or too coarse for the slope window.
+        InputError: the stream has gaps, is cut off or is sampled too slowly for the slope window.
     """
     if not len(cycle.time):
-        return _nothing(cycle, len(calibration.alive))
+        no, zero = np.zeros(len(calibration.alive), bool), np.zeros(len(calibration.alive))
+        return Whisk(cycle.odometry, no, no, zero, no, zero, zero)
     rate = sample_rate(cycle.time, config.slope_window, where)
     window = round(config.slope_window * rate)
     if len(cycle.time) < 2 * window:
@@ -91,36 +94,41 @@ def detect_contacts(
     mean, slope = _line(deflection, window)
     level, slope = np.hypot(*np.moveaxis(mean, -1, 0)), np.hypot(*np.moveaxis(slope, -1, 0)) * rate
     smooth = _line(angle, window)[0]
-    # All whiskers are driven together: the protraction ends when the array as a whole is furthest. A whisker
-    # alone may come further later, when its wall moves away. Rows count from the first full window.
+    # All whiskers are driven together, so the protraction ends where the sum of their angles is largest. A
+    # single whisker may go further later, when its wall moves away. Rows count from the first full window.
     last = int(np.argmax(smooth.sum(axis=1)))
-    row = np.arange(len(level))[:, None]
-    beyond = (level > config.least * sd) & (row <= last)
-    contact = beyond.any(axis=0)
-    shown = np.argmax(beyond, axis=0)
-    # It began where it first got steep, not long before it showed and already away from rest (noise gets
-    # steep too). A slow touch is never steep: then it began where it showed.
-    near = (row <= shown) & (row >= shown - config.rise * rate)
-    steep = near & (slope > config.steep * sd / config.rise) & (level > sd)
-    began = np.where(steep.any(axis=0), np.argmax(steep, axis=0), shown)
-
-    column = np.arange(len(alive))
-    held = contact & beyond[last]
-    reach = _reach(config.shaft, angle[window - 1 :], deflection[window - 1 :, :, 1], level, began, last)
+    beyond = (level > config.contact_sds * sd) & (np.arange(len(level))[:, None] <= last)
+    contact, onset = beyond.any(axis=0), _onset(config, rate, sd, level, slope, beyond)
+    held, column = contact & beyond[last], np.arange(len(alive))
+    reach = _reach(config.shaft, angle[window - 1 :], deflection[window - 1 :, :, 1], level, onset, last)
     return Whisk(
         odometry=cycle.odometry,
         alive=alive,
         contact=contact,
-        touched=np.where(contact, angle[window - 1 :][began, column], 0.0),
+        touched=np.where(contact, angle[window - 1 :][onset, column], 0.0),
         held=held,
         highest=np.where(alive, np.where(held, smooth[last], smooth.max(axis=0)), 0.0),
         reach=np.where(contact, reach, 0.0),
     )
 
 
-def _nothing(cycle: Cycle, whiskers: int) -> Whisk:
-    no, zero = np.zeros(whiskers, bool), np.zeros(whiskers)
-    return Whisk(cycle.odometry, no, no, zero, no, zero, zero)
+def _onset(
+    config: ContactConfig,
+    rate: float,
+    sd: np.ndarray,
+    level: np.ndarray,
+    slope: np.ndarray,
+    beyond: np.ndarray,
+) -> np.ndarray:
+    """[W] the row at which each contact began.
+
+    That is the first steep row within `rise_time` before the contact is detected at which the whisker has
+    left its rest (noise is steep too), or the row of detection if the deflection rises slowly.
+    """
+    row, detected = np.arange(len(level))[:, None], np.argmax(beyond, axis=0)
+    near = (row <= detected) & (row >= detected - config.rise_time * rate)
+    steep = near & (slope > config.onset_sds * sd / config.rise_time) & (level > sd)
+    return np.where(steep.any(axis=0), np.argmax(steep, axis=0), detected)
 
 
 def _line(value: np.ndarray, window: int) -> tuple[np.ndarray, np.ndarray]:
@@ -136,20 +144,23 @@ def _line(value: np.ndarray, window: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _reach(
-    config: ShaftConfig, angle: np.ndarray, y: np.ndarray, level: np.ndarray, began: np.ndarray, last: int
+    config: ShaftConfig, angle: np.ndarray, y: np.ndarray, level: np.ndarray, onset: np.ndarray, last: int
 ) -> np.ndarray:
-    """[W] From the slope of moment over angle while the deflection grew, by least squares."""
+    """[W] radial distance of the contacts, as a share of the length.
+
+    It follows from the stiffness: the least-squares slope of moment over angle while the deflection grows.
+    """
     row = np.arange(len(level))[:, None]
-    pushing = (row >= began) & (row <= last)
+    pushing = (row >= onset) & (row <= last)
     peak = np.argmax(np.where(pushing, level, -1.0), axis=0)
     weight = (pushing & (row <= peak)).astype(float)
     count = np.maximum(weight.sum(axis=0), 1.0)
     da = (angle - (weight * angle).sum(axis=0) / count) * weight
     dy = (y - (weight * y).sum(axis=0) / count) * weight
     ratio = (da * dy).sum(axis=0) / np.maximum((da**2).sum(axis=0), 1e-12)
-    # Too little was bent to tell: the tip, as if it were a point contact there.
+    # A whisker that bent too little for a slope counts as touched at its tip.
     return np.where(np.sqrt((da**2).sum(axis=0) / count) > MIN_SWEEP, radial_distance(config, ratio), 1.0)
 
 
 MIN_SWEEP = 5e-3
-"""Standard deviation of the angle while pushing that tells the stiffness, rad."""
+"""Least standard deviation of the angle during the push for an estimate of the stiffness, rad."""

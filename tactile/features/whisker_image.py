@@ -1,7 +1,8 @@
-"""The whisker image: one pixel a whisker, as bright as what it met is high (Salman & Pearson 2016, III-D).
+"""The whisker image: one pixel per whisker, whose value is the height of the touched obstacle (Salman &
+Pearson 2016, III-D).
 
-`max_angle` takes the whisker's angle at the end of the protraction, if it was still held there;
-`contact_angle` the angle at which it first touched. A whisker that touched nothing is 0: black, not low.
+The height follows from the whisker's angle: `contact_angle` uses the angle at first contact, `max_angle` the
+angle at the end of the protraction if the whisker is still in contact there. A whisker without contact is 0.
 """
 
 from __future__ import annotations
@@ -16,18 +17,18 @@ from tactile.base.types import Observation, Whisk, observation
 from tactile.whiskers.head_geometry import Head, shaft_points, tip_height
 
 MIN_BRIGHTNESS = 0.02
-"""The least brightness of a whisker that touched: never as dark as one that did not."""
+"""Least pixel value of a whisker in contact, so that it differs from one without."""
 
 
 class ImageConfig(Settings):
-    """How touch becomes an image."""
+    """From contact features to a whisker image."""
 
     transform: Literal["max_angle", "contact_angle"] = "contact_angle"
-    """Which angle tells the height."""
+    """The angle from which the height is computed."""
     tallest: PositiveFloat = 0.05
-    """Height that is white, m: a micromouse wall."""
+    """Height of pixel value 1, m; default the wall of a micromouse maze."""
     radial: bool = False
-    """Whether a second channel tells how far along its shaft each whisker was touched."""
+    """Whether a second channel holds the radial distance of each contact."""
 
 
 def view_shape(config: ImageConfig, head: Head) -> tuple[int, int, int]:
@@ -36,7 +37,7 @@ def view_shape(config: ImageConfig, head: Head) -> tuple[int, int, int]:
 
 
 def whisker_image(config: ImageConfig, head: Head, whisk: Whisk) -> np.ndarray:
-    """[R, C, K] the image of one cycle, values in 0..1."""
+    """The image of one whisk cycle: [R, C, K], values in 0..1."""
     if config.transform == "contact_angle":
         seen, angle = whisk.contact, whisk.touched
     else:
@@ -48,9 +49,9 @@ def whisker_image(config: ImageConfig, head: Head, whisk: Whisk) -> np.ndarray:
 
 
 def whisk_observation(config: ImageConfig, head: Head, whisk: Whisk) -> Observation:
-    """What an engine is given of one cycle; points of contact where the whiskers were touched.
+    """The observation of one whisk cycle: view, contacts and contact points.
 
-    There is no view where no whisker reports.
+    Without a live whisker the observation has no view.
     """
     plain = observation(whisk.odometry, whisker_image(config, head, whisk), whiskers=len(head.length))
     seen = whisk.contact & whisk.alive

@@ -1,1 +1,1 @@
-"""Walls from the strain of a Create's whiskers."""
+"""Wall direction from the contacts and strain of the Create's whiskers (Fox et al. 2012)."""

@@ -1,7 +1,7 @@
-"""How the wall lies that whiskers have met, between HIT1 and HIT2 or ABORT (Fox et al. 2012, II-F and II-G).
+"""Estimators of the direction of a wall from one contact (Fox et al. 2012, II-F and II-G).
 
-Estimators are pure: from a `WallContact` to a `Wall`, in base_link as the robot stands at its end.
-Directions are those *along* the wall, counter-clockwise from ahead, modulo half a turn.
+Each is a pure function from a `WallContact` (HIT1 to HIT2 or ABORT) to a `Wall` in base_link at the end of
+the contact. A direction is that *along* the wall, counter-clockwise from ahead, modulo half a turn.
 """
 
 from __future__ import annotations
@@ -17,30 +17,30 @@ from tactile.wall_estimation.strain_templates import TemplateMatch
 from tactile.whiskers.planar_whiskers import PlanarWhiskers
 
 MIN_SEPARATION = 0.05
-"""Two contacts closer than this have no line through them, m."""
+"""Least distance of two contacts for a line through them, m."""
 LINE_SD = 0.05
-"""Of the direction of the line through two contacts, rad."""
+"""Standard deviation of the direction of a line through two contacts, rad."""
 TEMPLATE_SD = 0.10
-"""Of a template's, rad."""
+"""Standard deviation of the direction of a matched template, rad."""
 TIP_SD = 0.04
-"""Of what a whisker's tip tells at best, rad."""
+"""Least standard deviation of a direction from a sliding tip, rad."""
 MAX_DIRECTION_SD = 0.15
-"""Standard deviation from which a direction is none, rad."""
+"""A direction with a larger standard deviation is discarded, rad."""
 MAX_WALL_MISFIT = 3.0
-"""From which it was no wall, in variances."""
+"""A contact with a larger misfit (in variances) is not one with a straight wall."""
 MAX_INDEPENDENT_SAMPLES = 6
-"""Samples at most that a series of strain is worth: what the law leaves out lasts."""
+"""Upper limit of the effective sample count of a strain series, since model errors are correlated."""
 OTHER_WALL_PROBABILITY = 0.1
-"""Chance that the second contact is with another wall."""
+"""Probability that the second contact is with another wall."""
 
 
 class WallContact(NamedTuple):
-    """What passed between HIT1 and HIT2 or ABORT.
+    """The data of one contact with a wall, from HIT1 to HIT2 or ABORT.
 
     Attributes:
-        first, now: [W] bool, the contacts at its beginning and end. travel: [3] the motion between, in the
-            frame at its beginning. moment: how it ended.
-        strain: [N, W, 2] filtered, since HIT1. alive: [W] bool, whiskers whose strain can be used.
+        first, now: [W] bool, contacts at HIT1 and at the end. travel: [3] motion between them, in the frame
+            at HIT1. moment: how the contact ended.
+        strain: [N, W, 2] filtered strain since HIT1. alive: [W] bool, whiskers with usable strain.
     """
 
     first: np.ndarray
@@ -52,9 +52,12 @@ class WallContact(NamedTuple):
 
 
 class Wall(NamedTuple):
-    """Attributes:
-    known: whether anything is. direction: along the wall, rad in [0, pi). point: [2] m, the point of its line
-    nearest to base_link's origin. sd: of the direction, rad. All 0 where nothing is known.
+    """An estimated wall; all fields are 0 if there is no estimate.
+
+    Attributes:
+        known: whether there is an estimate. direction: along the wall, rad in [0, pi).
+        point: [2] m, the point of the wall's line nearest to base_link's origin.
+        sd: standard deviation of the direction, rad.
     """
 
     known: bool
@@ -64,53 +67,53 @@ class Wall(NamedTuple):
 
 
 def no_wall() -> Wall:
-    """No wall is known."""
+    """The `Wall` without an estimate."""
     return Wall(False, 0.0, np.zeros(2), 0.0)
 
 
 def wall_normal(direction: float) -> np.ndarray:
-    """[2] The unit normal of a wall of that direction, ahead of the robot: the one place where walls and
-    normals are turned into each other. A wall straight across (90 degrees) has its normal ahead (0)."""
+    """The unit normal [2] of a wall, pointing ahead: 90 degrees (a wall straight across) gives 0 degrees."""
     return np.array([np.sin(direction), -np.cos(direction)])
 
 
 def wall_through(point: np.ndarray, direction: float, sd: float) -> Wall:
-    """The wall of a direction that passes through a point [2]."""
+    """The wall with a direction (rad) through a point [2]."""
     normal = wall_normal(direction)
     return Wall(True, float(direction % np.pi % np.pi), (normal @ point) * normal, float(sd))
 
 
 def contact_points(feelers: PlanarWhiskers, radius: float) -> np.ndarray:
-    """[W, 2] m, where whiskers touch if they do: at a fixed radius along them (II-D)."""
+    """Assumed contact points [W, 2], m: at a fixed radius along the whiskers (II-D)."""
     return feelers.base + radius * feelers.direction
 
 
-def first_whisker(meeting: WallContact) -> int | None:
-    """The whisker that met the wall at HIT1; the one more strained of several. None if none can be used."""
-    may = meeting.first & meeting.alive
-    if not may.any() or not len(meeting.strain):
+def first_whisker(contact: WallContact) -> int | None:
+    """The whisker in contact at HIT1, of several the most strained one; None without usable strain."""
+    may = contact.first & contact.alive
+    if not may.any() or not len(contact.strain):
         return None
-    return int(np.argmax(np.where(may, np.abs(meeting.strain[0, :, 0]), -1.0)))
+    return int(np.argmax(np.where(may, np.abs(contact.strain[0, :, 0]), -1.0)))
 
 
-def to_final_frame(points: np.ndarray, meeting: WallContact) -> np.ndarray:
-    """[..., 2] Points as they lay at HIT1, seen from where the robot stands at the end."""
-    x, y, turn = inverse(meeting.travel)
+def to_final_frame(points: np.ndarray, contact: WallContact) -> np.ndarray:
+    """Points [..., 2] in the frame at HIT1, transformed to the frame at the end."""
+    x, y, turn = inverse(contact.travel)
     c, s = np.cos(turn), np.sin(turn)
     return points @ np.array([[c, s], [-s, c]]) + np.array([x, y])
 
 
-def geometric_wall(points: np.ndarray, meeting: WallContact) -> Wall:
-    """The line through the contacts of HIT1 and HIT2 (II-F), by total least squares if they are more than
-    two; none if it came to no HIT2 or they are too close.
+def geometric_wall(points: np.ndarray, contact: WallContact) -> Wall:
+    """The line through the contacts of HIT1 and HIT2 (II-F), by total least squares for more than two.
+
+    There is no estimate without HIT2 or with contacts closer than `MIN_SEPARATION`.
 
     Args:
-        points: [W, 2] m, where whiskers touch if they do.
+        points: [W, 2] assumed contact points, m.
     """
-    if meeting.moment != StepEnd.HIT2:
+    if contact.moment != StepEnd.HIT2:
         return no_wall()
     there = np.concatenate(
-        [to_final_frame(points[meeting.first], meeting), points[meeting.now & ~meeting.first]]
+        [to_final_frame(points[contact.first], contact), points[contact.now & ~contact.first]]
     )
     apart = np.linalg.norm(there[:, None] - there, axis=-1).max(initial=0.0)
     if apart < MIN_SEPARATION:
@@ -120,45 +123,47 @@ def geometric_wall(points: np.ndarray, meeting: WallContact) -> Wall:
     return wall_through(middle, float(np.arctan2(along[1], along[0])), LINE_SD)
 
 
-def template_wall(points: np.ndarray, match: TemplateMatch, meeting: WallContact, flat: float | None) -> Wall:
-    """The winner's direction through the contact of HIT1 (II-G), after ABORT too.
+def template_wall(
+    points: np.ndarray, match: TemplateMatch, contact: WallContact, max_error: float | None
+) -> Wall:
+    """The direction of the best template, through the contact of HIT1 (II-G); also after ABORT.
 
     Args:
-        flat: relative error from which it was no flat wall; None: every contact is one, as in the paper.
+        max_error: relative error of the match above which there is no estimate; None: no limit (the paper).
     """
-    whisker = first_whisker(meeting)
-    if whisker is None or (flat is not None and match.relative >= flat):
+    whisker = first_whisker(contact)
+    if whisker is None or (max_error is not None and match.relative >= max_error):
         return no_wall()
-    return wall_through(to_final_frame(points[whisker], meeting), match.angle, TEMPLATE_SD)
+    return wall_through(to_final_frame(points[whisker], contact), match.angle, TEMPLATE_SD)
 
 
-def fused_wall(tip: TipModel, points: np.ndarray, meeting: WallContact) -> Wall:
-    """The direction most likely by how the whisker that met the wall turned, and by the second contact if it
-    came to HIT2; none where no straight wall turns it so, or several would.
+def fused_wall(tip: TipModel, points: np.ndarray, contact: WallContact) -> Wall:
+    """The most likely direction by the sliding tip of the first whisker and, after HIT2, the second contact.
 
-    The wall passes through that whisker's tip.
+    There is no estimate if no straight wall fits the strain, or walls of too different directions do. The
+    wall passes through the tip of the first whisker.
     """
-    whisker = first_whisker(meeting)
+    whisker = first_whisker(contact)
     if whisker is None:
         return no_wall()
-    felt = direction_misfit(tip, whisker, meeting.strain)
-    best = felt.misfit.min()
+    fit = direction_misfit(tip, whisker, contact.strain)
+    best = fit.misfit.min()
     if not best < MAX_WALL_MISFIT:
         return no_wall()
-    log = -0.5 * min(felt.samples, MAX_INDEPENDENT_SAMPLES) * (felt.misfit - best)
-    line = geometric_wall(points, meeting)
+    log = -0.5 * min(fit.samples, MAX_INDEPENDENT_SAMPLES) * (fit.misfit - best)
+    line = geometric_wall(points, contact)
     if line.known:
         off = np.sin(WALL_DIRECTIONS - line.direction) / line.sd
         log += np.log(OTHER_WALL_PROBABILITY + (1 - OTHER_WALL_PROBABILITY) * np.exp(-0.5 * off**2))
-    chance = np.exp(log - log.max())
-    likely = int(chance.argmax())
-    if not felt.misfit[likely] < MAX_WALL_MISFIT:
+    weight = np.exp(log - log.max())
+    likely = int(weight.argmax())
+    if not fit.misfit[likely] < MAX_WALL_MISFIT:
         return no_wall()
-    # Directions repeat after half a turn, so they are spread on the circle at twice the angle.
-    length = abs((chance @ np.exp(2j * WALL_DIRECTIONS)) / chance.sum())
+    # Circular standard deviation at twice the angle, since directions repeat after half a turn.
+    length = abs((weight @ np.exp(2j * WALL_DIRECTIONS)) / weight.sum())
     spread = np.sqrt(max(-2 * np.log(max(length, 1e-300)), 0.0)) / 2
     if spread > MAX_DIRECTION_SD:
         return no_wall()
     direction = float(WALL_DIRECTIONS[likely])
-    reached = tip.feelers.base[whisker] + felt.away[likely] * wall_normal(direction)
+    reached = tip.feelers.base[whisker] + fit.away[likely] * wall_normal(direction)
     return wall_through(reached, direction, float(np.hypot(TIP_SD, spread)))

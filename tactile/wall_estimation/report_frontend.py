@@ -1,7 +1,7 @@
-"""From reports of the Create's steps to observations: what each step felt, and how the wall lies that it met.
+"""Front end of the Create: from reports of its steps to observations with contacts and wall directions.
 
-A wall takes two reports or more: HIT1, and the slow drive (FWD2) up to HIT2 or ABORT. That is all that is
-kept from one report to the next.
+A wall is estimated from the reports of HIT1 and of the slow drive (FWD2) up to HIT2 or ABORT; the front end
+stores only that between reports.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from tactile.wall_estimation.estimators import (
 )
 from tactile.wall_estimation.sliding_tip import fit_tip_model
 from tactile.wall_estimation.strain_templates import (
+    TRAIN_HINT,
     StrainTemplates,
     filter_strain,
     match_template,
@@ -38,54 +39,54 @@ from tactile.whiskers.planar_whiskers import PlanarWhiskers
 
 WhiskerMount = tuple[float, float, Degrees]
 RATE_TOLERANCE = 1e-2
-"""By which sample rates may differ from the templates', as a share: clocks are never the same."""
+"""Largest relative difference of the sample rate from that of the templates (clocks differ slightly)."""
 
 
 class ReportFrontendConfig(Settings):
-    """How reports of a Create become observations."""
+    """Front end of the Create's reports."""
 
     walls: Literal["none", "geometric", "template", "fused"] = "fused"
-    """Where walls' directions come from: `geometric` the line through two contacts; `template` the nearest
-    template of their strain; `fused` how the first whisker's tip slides, and the second contact. Without
-    templates `fused` is `geometric`."""
+    """Estimator of wall directions: `geometric` uses the line through two contacts; `template` the nearest
+    strain template; `fused` the sliding tip of the first whisker and the second contact. Without templates
+    `fused` equals `geometric`."""
     templates: Path | None = None
-    """File of strain templates; null: those of the source if it has any."""
-    flat: PositiveFloat | None = 0.3
-    """Error of the nearest template, as a share of the strain's power, from which `template` knows no wall;
-    null: it always does, as in the paper."""
+    """File of strain templates; null: those of the source, if any."""
+    max_template_error: PositiveFloat | None = 0.3
+    """Error of the nearest template, as a share of the strain's power, above which `template` gives no wall;
+    null: no limit, as in the paper."""
     contact_radius: PositiveFloat = 0.13
-    """Where along a whisker a contact is taken to be, m (Fox et al. 2012, II-D)."""
+    """Assumed distance of contacts from the whisker's base, m (Fox et al. 2012, II-D)."""
     mounts: Annotated[tuple[WhiskerMount, ...], Field(min_length=1)] = (
         (0.10, 0.08, 50.0),
         (0.13, 0.03, 15.0),
         (0.13, -0.03, -15.0),
         (0.10, -0.08, -50.0),
     )
-    """Of each whisker, from left to right: x (m), y (m) of its base in base_link, and the direction in which
-    it points, degrees counter-clockwise from ahead."""
+    """For each whisker, from left to right: x (m), y (m) of its base in base_link, and its direction, degrees
+    counter-clockwise from ahead."""
     length: PositiveFloat = 0.14
-    """Of a whisker, m."""
+    """Length of the whiskers, m."""
     fold_back: bool = False
-    """Whether a BACK is no observation of its own but added to the motion of the next one, as in the paper,
-    which reports none."""
+    """Whether the motion of a BACK step is added to the next observation instead of making an observation of
+    its own (the paper does not report BACK)."""
 
     @model_validator(mode="after")
     def _within(self) -> Self:
         if self.contact_radius > self.length:
             raise ValueError(
-                f"contact_radius: {self.contact_radius:g} m is beyond a whisker of {self.length:g} m"
+                f"contact_radius: {self.contact_radius:g} m exceeds the whisker length of {self.length:g} m"
             )
         return self
 
     def resolved(self, folder: Path) -> ReportFrontendConfig:
-        """The same with every relative path taken from the folder (of the configuration file, say)."""
+        """A copy with relative paths resolved against a folder."""
         if self.templates is None:
             return self
         return self.model_copy(update={"templates": folder / self.templates})
 
     @property
     def feelers(self) -> PlanarWhiskers:
-        """The whiskers."""
+        """The whiskers in the plane."""
         base = np.array([mount[:2] for mount in self.mounts], np.float64)
         angle = np.radians([mount[2] for mount in self.mounts])
         direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -93,7 +94,7 @@ class ReportFrontendConfig(Settings):
 
 
 class _Slow(NamedTuple):
-    """FWD2 so far: first, the contacts [W] at HIT1; travel [3] since; the strain of its steps."""
+    """The current FWD2: contacts [W] at HIT1, motion [3] since, strain of each step."""
 
     first: np.ndarray
     travel: np.ndarray
@@ -101,17 +102,17 @@ class _Slow(NamedTuple):
 
 
 class ReportFrontend:
-    """Turns reports, in their order, into observations.
+    """Turns consecutive reports into observations.
 
     Args:
-        templates: those to use if the configuration names no file.
+        templates: used if the configuration names no file.
 
     Attributes:
-        feelers: the whiskers. point: [W, 2] m in base_link, where they touch if they do.
-        view_shape: of the views, one pixel a whisker. whiskers: W.
+        feelers: the whiskers. point: [W, 2] assumed contact points in base_link, m.
+        view_shape: shape of the views, one pixel per whisker. whiskers: W.
 
     Raises:
-        InputError: templates that are missing or of other whiskers.
+        InputError: templates are missing or were trained with other whiskers.
     """
 
     def __init__(self, config: ReportFrontendConfig, templates: StrainTemplates | None = None) -> None:
@@ -121,8 +122,8 @@ class ReportFrontend:
             raise InputError(
                 "walls",
                 "`template` without strain templates",
-                "`templates`: a file of them",
-                "make one with `python -m ratslam train-templates`, or take `geometric`",
+                "`templates`: a file of strain templates",
+                f"{TRAIN_HINT}, or use `geometric`",
             )
         self.config, self.templates = config, templates
         self.feelers = config.feelers
@@ -134,12 +135,12 @@ class ReportFrontend:
         self._back: Odometry | None = None
 
     def observe(self, report: Report) -> Observation | None:
-        """What an engine is given of the step; None for a BACK that is folded into the next one.
+        """The observation of a step; None for a BACK step that is added to the next one.
 
-        A BACK tells of its motion alone. Walls are seen from where the robot stands at the end of the step.
+        The observation of a BACK step holds its motion only. Walls are in base_link at the end of the step.
 
         Raises:
-            InputError: other whiskers than configured, or strain sampled otherwise than the templates.
+            InputError: another number of whiskers than configured, or another sample rate than the templates.
         """
         if len(report.contact) != self.whiskers:
             found = f"a report of {len(report.contact)} whiskers"
@@ -173,7 +174,7 @@ class ReportFrontend:
         )
 
     def _met(self, report: Report) -> Wall:
-        """The wall that is known at the end of the step; keeps what the next one needs."""
+        """Estimates the wall at the end of the step and stores the state for the next one."""
         slow, self._slow = self._slow, None
         contact = np.asarray(report.contact & report.alive, bool)
         if report.moment == StepEnd.HIT1:
@@ -191,7 +192,7 @@ class ReportFrontend:
         return self._wall(slow, contact, report)
 
     def _sampled(self, report: Report) -> np.ndarray:
-        """[T, W, 2] the strain of a step, if its samples are what templates are made of."""
+        """The strain [T, W, 2] of a step, checked against the sample rate of the templates."""
         rate = strain_sample_rate(report)
         if self.templates is not None and rate:
             usual = self.templates.training.rate
@@ -200,7 +201,7 @@ class ReportFrontend:
                     "strain",
                     f"{rate:.5g} samples per second",
                     f"{usual:g}, as in the templates",
-                    "train them anew",
+                    "train templates at this rate",
                 )
         return np.asarray(report.strain, np.float64)
 
@@ -218,11 +219,11 @@ class ReportFrontend:
             if not len(strain) or not alive.any():
                 return no_wall()
             match = match_template(self.templates, strain, alive)
-            return template_wall(self.point, match, meeting, self.config.flat)
+            return template_wall(self.point, match, meeting, self.config.max_template_error)
         return geometric_wall(self.point, meeting)
 
 
 def _joined(one: Odometry, other: Odometry) -> Odometry:
-    """One motion and then the other; turns are added up, not wrapped."""
+    """The composition of two motions; turns are added without wrapping."""
     x, y, _ = compose(np.array(one[:3], np.float64), np.array(other[:3], np.float64))
     return Odometry(x, y, one.dtheta + other.dtheta, one.dt + other.dt)

@@ -1,15 +1,15 @@
-"""The law of a whisker whose tip slides along a straight wall, learned from strain templates.
+"""Model of a whisker whose tip slides along a straight wall, fitted to strain templates.
 
-As the robot drives on, the distance d of a whisker's base from the wall falls steadily. Its tip stays on the
-wall, so the whisker turns by tau until
+While the robot drives on, the distance d of a whisker's base from the wall falls steadily. The tip stays on
+the wall, so the whisker turns by tau:
 
     L sin(beta - tau) = d - (speed x time) sin(phi)
 
-where phi is the wall's direction and beta that of the whisker to it, whichever side is nearer. Horizontal
-strain is gain x tau; vertical strain is some of it for crosstalk, less a share of its size that depends on
-the slant, beta - tau, of the line to the tip against the wall. Gain, crosstalk and shares are fitted to the
-templates, all whiskers together. They so tell of angles at which a whisker was never first to touch a wall in
-training, as happens at short walls; and what turns otherwise than along a straight wall is found out.
+phi is the wall's direction and beta the angle between whisker and wall on the nearer side. Horizontal strain
+is gain x tau. Vertical strain is crosstalk x horizontal strain minus a share of its size, which depends on
+the slant beta - tau (the angle between wall and the line from base to tip). Gain, crosstalk and shares are
+fitted to the templates of all whiskers together. The model therefore also covers angles at which a whisker
+was never the first to touch in training, and detects contacts with anything but a straight wall.
 """
 
 from __future__ import annotations
@@ -23,48 +23,48 @@ from tactile.wall_estimation.strain_templates import TEMPLATES, StrainTemplates
 from tactile.whiskers.planar_whiskers import PlanarWhiskers
 
 SAMPLE_RATE = 50.0
-"""Of the samples that are used, per second: what the low-pass leaves."""
+"""Rate of the samples used, per second; the low-pass filter leaves no faster signal."""
 WALL_DIRECTIONS = np.radians(np.arange(4.0, 176.5, 1.0))
-"""Wall directions that are tried, rad."""
+"""Candidate wall directions, rad."""
 SLANTS = np.radians(np.arange(0.0, 91.0, 7.5))
-"""Between whisker and wall, at which shares are known, rad."""
+"""Slants at which the shares are given, rad."""
 HORIZONTAL_MODEL_SD = 0.02
-"""Standard deviation of what the law leaves out of the horizontal strain, as a share of it."""
+"""Standard deviation of the model error of horizontal strain, as a share of it."""
 VERTICAL_MODEL_SD = 0.04
-"""Of the vertical strain, as a share of the horizontal one."""
+"""Standard deviation of the model error of vertical strain, as a share of horizontal strain."""
 SURFACE_SD = 2e-4
-"""Of the wall, or of the tip's place along it, m."""
+"""Standard deviation of the wall's surface and of the tip's position on it, m."""
 MAX_TURN = 0.35
-"""Turn of a whisker up to which its tip alone touches, rad."""
+"""Largest turn of a whisker at which only its tip touches, rad."""
 MAX_FIRST_TURN = 0.2
-"""Turn at HIT1 from which it was no tip that met a wall: it grows slowly, but springs up at a corner, rad."""
+"""Largest turn at HIT1, rad: the turn of a tip on a wall grows slowly, at a corner it jumps."""
 MIN_SLANT = 0.1
-"""Between a whisker and a wall that its tip can meet, rad."""
+"""Least angle between a whisker and a wall that its tip can touch, rad."""
 RIGHT_ANGLE_MARGIN = np.radians(3.0)
-"""About a right angle a whisker may turn to either side."""
+"""A whisker within this angle of a right angle may turn to either side, rad."""
 MIN_SIGNAL_SDS = 30.0
-"""Noise that templates must exceed to be learned from, in standard deviations."""
+"""Signal that template samples need for the fit, in standard deviations of the noise."""
 MIN_CONTACT_SAMPLES = 20
-"""Samples of a template that it takes."""
+"""Least number of contact samples of a template for the fit."""
 MAX_TEMPLATE_MISFIT = 3.0
-"""Misfit at which templates are not of such whiskers."""
+"""Templates with a larger misfit were recorded with other whiskers."""
 FRICTION_ANGLE = 0.2
-"""Lean of a wall's push on a tip that slides, rad."""
+"""Angle between the wall's force on a sliding tip and the wall's normal, rad."""
 MAX_PUSH_ANGLE = 1.3
-"""Slant and lean together up to which a push along the shaft bends it, rad."""
+"""Upper limit of slant plus friction angle in `PUSH_RATIO`, rad."""
 PUSH_RATIO = np.tan(np.minimum(SLANTS + FRICTION_ANGLE, MAX_PUSH_ANGLE))
-"""Of a push, what goes along the shaft over what goes across it, at `SLANTS`."""
+"""Force along the shaft over force across it, at `SLANTS`."""
 SHARE_SMOOTHING = 0.03
-"""Weight of shares being in proportion to that, which tells them where nothing was felt."""
+"""Weight of the prior that shares are proportional to `PUSH_RATIO`; it decides slants without data."""
 
 
 class TipModel(NamedTuple):
-    """The law.
+    """The fitted model.
 
     Attributes:
-        gain: strain a radian. crosstalk: of horizontal in vertical strain. share: [K] at `SLANTS`.
-        noise: [T, 2] of the filtered channels at `time` [T] s. feelers: the whiskers. speed: m/s. rate:
-            samples per second of what it is compared with.
+        gain: strain per radian. crosstalk: horizontal strain in the vertical one. share: [K] at `SLANTS`.
+        noise: [T, 2] standard deviations of the filtered channels at `time` [T] s. feelers: the whiskers.
+        speed: of the robot, m/s. rate: samples per second of the strain it is compared with.
     """
 
     gain: float
@@ -78,11 +78,12 @@ class TipModel(NamedTuple):
 
 
 class DirectionMisfit(NamedTuple):
-    """How well one whisker's strain goes with each wall direction, [K] of `WALL_DIRECTIONS`.
+    """Misfit of one whisker's strain for each of the K `WALL_DIRECTIONS`.
 
     Attributes:
-        misfit: mean square over the two channels' standard deviations, added up: about 2 at most for a wall;
-            infinite where impossible. away: m from the whisker's base to the wall now. samples: used at most.
+        misfit: [K] mean squared normalised error, summed over both channels; at most about 2 for a wall,
+            infinite for impossible directions.
+        away: [K] distance of the whisker's base from the wall at the last sample, m. samples: number used.
     """
 
     misfit: np.ndarray
@@ -91,10 +92,10 @@ class DirectionMisfit(NamedTuple):
 
 
 def fit_tip_model(templates: StrainTemplates, feelers: PlanarWhiskers) -> TipModel:
-    """The law that these whiskers follow in the templates.
+    """Fits the model to strain templates.
 
     Raises:
-        InputError: the templates are of other whiskers, or those lie elsewhere.
+        InputError: the templates were recorded with other whiskers or mounts, or hold hardly any contact.
     """
     training = templates.training
     if templates.mean.shape[2] != len(feelers.length):
@@ -105,15 +106,15 @@ def fit_tip_model(templates: StrainTemplates, feelers: PlanarWhiskers) -> TipMod
     tip = TipModel(1.0, 0.0, np.zeros(len(SLANTS)), noise, time, feelers, training.speed, training.rate)
     series = _series(tip, templates, rows)
     if len(series) < 2:
-        raise InputError(TEMPLATES, "hardly any contact in them", "whiskers that touch walls")
+        raise InputError(TEMPLATES, "hardly any contacts", "contacts with walls")
     strongest = max(float(np.abs(one.across).max()) for one in series)
     gain, misfit = _scanned(tip, series, np.geomspace(strongest / 4, strongest / 0.1, 300))
     gain, misfit = _scanned(tip, series, gain * np.linspace(0.985, 1.015, 61))
     if misfit > MAX_TEMPLATE_MISFIT:
         raise InputError(
             TEMPLATES,
-            "whiskers that do not turn in them as straight ones would that are mounted so",
-            "the whiskers that they were trained with",
+            "the strain does not fit straight whiskers with these mounts",
+            "the whiskers that the templates were trained with",
             "check mounts and length, or train again",
         )
     tip = tip._replace(gain=gain)
@@ -122,7 +123,7 @@ def fit_tip_model(templates: StrainTemplates, feelers: PlanarWhiskers) -> TipMod
 
 
 def direction_misfit(tip: TipModel, whisker: int, strain: np.ndarray) -> DirectionMisfit:
-    """Of what that whisker read, filtered [N, 2], from HIT1 on."""
+    """Compares a whisker's filtered strain ([N, W, 2], from HIT1 on) with the model for all directions."""
     rows = _rows(len(strain), tip.rate)[: len(tip.time)]
     across, down = strain[rows, whisker].T
     side = np.sign(across.sum())
@@ -132,7 +133,7 @@ def direction_misfit(tip: TipModel, whisker: int, strain: np.ndarray) -> Directi
     expected = tip.crosstalk * across - np.abs(across) * (_between(fit.slant) @ tip.share)
     sd = np.hypot(noise[:, 1], VERTICAL_MODEL_SD * across)
     vertical = _mean(((down - expected) / sd) ** 2, fit.use)
-    # Along the wall a whisker would lie on it, not meet it with its tip.
+    # A whisker nearly parallel to the wall would lie on it instead of touching it with its tip.
     grazing = np.where(fit.use, fit.slant, np.inf).min(axis=1, initial=np.inf) < MIN_SLANT
     possible = ~grazing & (nearer < np.pi / 2 + RIGHT_ANGLE_MARGIN) & (fit.use.sum() >= 2)
     possible &= bool(np.abs(across[:1]).max(initial=0.0) < MAX_FIRST_TURN * tip.gain)
@@ -142,7 +143,7 @@ def direction_misfit(tip: TipModel, whisker: int, strain: np.ndarray) -> Directi
 
 
 class _Series(NamedTuple):
-    """One whisker of one template while it touches."""
+    """The samples of one whisker in one template."""
 
     whisker: int
     angle: float
@@ -153,7 +154,7 @@ class _Series(NamedTuple):
 
 
 class _Fit(NamedTuple):
-    """Of K walls: misfit [K], base's distance at HIT1 [K] m, slant [K, N] rad, samples used [N]."""
+    """Fit of K walls: misfit [K], distance of the base at HIT1 [K] m, slant [K, N] rad, samples used [N]."""
 
     misfit: np.ndarray
     away: np.ndarray
@@ -167,7 +168,7 @@ def _rows(count: int, rate: float) -> np.ndarray:
 
 
 def _nearer(tip: TipModel, whisker: int, angle: np.ndarray, side: float) -> np.ndarray:
-    """From whisker to wall on the side to which it turns, rad."""
+    """Angle from whisker to wall on the side to which the whisker turns, rad."""
     x, y = tip.feelers.direction[whisker]
     beta = angle - np.arctan2(y, x)
     return beta if side > 0 else np.pi - beta
@@ -182,7 +183,7 @@ def _sliding(
     across: np.ndarray,
     touching: np.ndarray | None = None,
 ) -> _Fit:
-    """How steadily the wall comes nearer [N] if it lies so [K]."""
+    """Fits the distance of the wall at HIT1 for K angles `nearer` and directions (`slope`: their sines)."""
     count = len(across)
     turn = np.abs(across) / gain
     use = turn < MAX_TURN if touching is None else touching & (turn < MAX_TURN)
@@ -199,7 +200,7 @@ def _mean(square: np.ndarray, use: np.ndarray) -> np.ndarray:
 
 
 def _between(slant: np.ndarray) -> np.ndarray:
-    """[..., K] weights of the two `SLANTS` that each is between."""
+    """Linear interpolation weights [..., K] of each slant between two of `SLANTS`."""
     place = np.clip(slant / SLANTS[1], 0.0, len(SLANTS) - 1.0)
     return np.maximum(1 - np.abs(place[..., None] - np.arange(len(SLANTS))), 0.0)
 
@@ -211,31 +212,31 @@ def _series(tip: TipModel, templates: StrainTemplates, rows: np.ndarray) -> list
         for whisker in range(mean.shape[1]):
             across, down = mean[:, whisker].T
             touching = np.abs(across) > threshold
-            # The first samples after onset are still the filter's.
+            # The first samples after onset are dominated by the filter.
             touching &= np.cumsum(touching) > round(0.05 * SAMPLE_RATE)
             nearer = float(_nearer(tip, whisker, angle, np.sign(across[touching].sum())))
-            # About a right angle drives of one average may have turned to different sides.
+            # Near a right angle the averaged drives may have turned to different sides.
             if MIN_SLANT < nearer < np.pi / 2 - RIGHT_ANGLE_MARGIN and touching.sum() >= MIN_CONTACT_SAMPLES:
                 series.append(_Series(whisker, float(angle), nearer, across, down, touching))
     return series
 
 
 def _scanned(tip: TipModel, series: list[_Series], gains: np.ndarray) -> tuple[float, float]:
-    """The gain with the least misfit, and that, a mean over series."""
+    """The gain with the least mean misfit over all series, and that misfit."""
     total = np.zeros(len(gains))
     for one in series:
         nearer, slope = np.array([one.nearer]), np.sin([one.angle])
         length = float(tip.feelers.length[one.whisker])
         for k, gain in enumerate(gains):
             fit = _sliding(tip, gain, nearer, slope, length, one.across, one.touching)
-            # So many turned too far already: no gain to speak of.
+            # With this gain, too many samples would be turned further than `MAX_TURN`.
             total[k] += min(fit.misfit[0], 10.0) if fit.use.sum() >= MIN_CONTACT_SAMPLES // 2 else 10.0
     best = int(total.argmin())
     return float(gains[best]), float(total[best] / len(series))
 
 
 def _vertical(tip: TipModel, series: list[_Series]) -> tuple[float, np.ndarray]:
-    """Crosstalk and shares by least squares, each series counting the same."""
+    """Crosstalk and shares by least squares with equal weights of all series."""
     rows, values = [], []
     for one in series:
         use = one.touching & (np.abs(one.across) < MAX_TURN * tip.gain)

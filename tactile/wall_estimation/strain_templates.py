@@ -1,8 +1,8 @@
-"""Strain templates: what all channels of all whiskers read as the robot drives into a wall at fifteen angles
-(Fox et al. 2012, II-G), their training, their file, and which one a contact is like (eq. 5).
+"""Strain templates (Fox et al. 2012, II-G): training, file format and matching (eq. 5).
 
-An angle here is always the wall's *direction* in base_link, counter-clockwise from ahead, modulo half a turn:
-90 degrees is a wall straight across. The paper speaks of normals; those are at right angles to it.
+A template is the mean strain of all whiskers while the robot drives into a wall at one of fifteen angles. An
+angle is the wall's *direction* in base_link, counter-clockwise from ahead, modulo half a turn: 90 degrees is
+a wall straight across. (The paper uses normals, which are at right angles to it.)
 """
 
 from __future__ import annotations
@@ -20,57 +20,59 @@ from tactile.base.errors import InputError
 from tactile.base.types import Report
 
 FILE_VERSION = 1
-"""Of the file."""
+"""Version of the file format."""
 TEMPLATES = "templates"
-"""What errors call a training."""
+"""Name of the templates in errors."""
 ANGLE_TOLERANCE = np.radians(0.5)
-"""How far a drive may be from the angle that it is for, rad."""
+"""Largest difference between the angle of a drive and that of its template, rad."""
 SQUARE_MEDIAN = 0.4549
-"""Of the square of a standard normal variable."""
+"""Median of the square of a standard normal variable."""
 WallAngle = Annotated[float, Field(gt=0, lt=180)]
 
 
 class TemplateTraining(Settings):
-    """How templates are trained; as in the paper, which leaves open what low-pass it is."""
+    """Training of strain templates; defaults from the paper, which does not specify the low-pass filter."""
 
     first_deg: WallAngle = 20.0
     """Direction of the first wall."""
     last_deg: WallAngle = 160.0
-    """Of the last one."""
+    """Direction of the last wall."""
     step_deg: PositiveFloat = 10.0
-    """Between two."""
+    """Angle between successive walls."""
     repeats: Annotated[int, Field(ge=2)] = 4
-    """Drives at each angle, which are averaged."""
+    """Number of drives at each angle; a template is their mean."""
     rate: PositiveFloat = 2000.0
     """Samples per second."""
     duration: PositiveFloat = 2.0
-    """What is kept from first contact (HIT1) on, s."""
+    """Length of a template from first contact (HIT1) on, s."""
     speed: PositiveFloat = 0.02
-    """Of the drive, m/s: that of FWD2."""
+    """Speed of the drive, m/s; that of FWD2."""
     cutoff: PositiveFloat = 17.0
-    """Of the low-pass, Hz."""
+    """Cutoff frequency of the low-pass filter, Hz."""
     order: PositiveInt = 2
-    """Of the low-pass (Butterworth)."""
+    """Order of the low-pass filter (Butterworth)."""
     window: PositiveInt = 5
-    """Samples of the moving average."""
+    """Length of the moving average, samples."""
 
     @model_validator(mode="after")
     def _sound(self) -> Self:
         if self.last_deg < self.first_deg:
             raise ValueError(f"last_deg: {self.last_deg:g} is less than first_deg, {self.first_deg:g}")
         if 2 * self.cutoff >= self.rate:
-            raise ValueError(f"cutoff: {self.cutoff:g} Hz is more than {self.rate:g} samples a second hold")
+            raise ValueError(
+                f"cutoff: {self.cutoff:g} Hz exceeds half the rate of {self.rate:g} samples per second"
+            )
         return self
 
     @property
     def angles(self) -> np.ndarray:
-        """[A] rad."""
+        """Wall directions [A], rad."""
         count = int((self.last_deg - self.first_deg) / self.step_deg + 1e-9) + 1
         return np.radians(self.first_deg + self.step_deg * np.arange(count))
 
     @property
     def samples(self) -> int:
-        """T, of a template."""
+        """Number of samples T of a template."""
         return round(self.duration * self.rate)
 
 
@@ -78,8 +80,8 @@ class TrainingDrive(NamedTuple):
     """One drive into a wall.
 
     Attributes:
-        angle: the wall's direction in base_link, rad. repeat: which of those at this angle.
-        strain: [T, W, 2] raw, from first contact on. rate: samples per second.
+        angle: the wall's direction in base_link, rad. repeat: number of the drive at this angle.
+        strain: [T, W, 2] raw strain from first contact on. rate: samples per second.
     """
 
     angle: float
@@ -89,9 +91,11 @@ class TrainingDrive(NamedTuple):
 
 
 class StrainTemplates(NamedTuple):
-    """Attributes:
-    training: how they were made. angle: [A] rad, wall directions. mean: [A, T, W, 2] the templates.
-    spread: [T, 2] standard deviation of one drive's filtered channels about them, but for its contacts.
+    """Trained templates of A wall directions, T samples and W whiskers.
+
+    Attributes:
+        training: settings of the training. angle: [A] wall directions, rad. mean: [A, T, W, 2] templates.
+        spread: [T, 2] standard deviation of the filtered channels of one drive without contacts.
     """
 
     training: TemplateTraining
@@ -101,10 +105,13 @@ class StrainTemplates(NamedTuple):
 
 
 class TemplateMatch(NamedTuple):
-    """Attributes:
-    error: [A] of each template, eq. 5. winner: the number of the best one. angle: its direction, rad.
-    refined: direction at the lowest point of the parabola through it and its neighbours, rad.
-    relative: its error over the mean square of what was read: near 0 for walls, near 1 for anything else.
+    """Result of template matching.
+
+    Attributes:
+        error: [A] error of each template, eq. 5. winner: index of the best one. angle: its direction, rad.
+        refined: direction at the minimum of the parabola through the errors of it and its neighbours, rad.
+        relative: error of the best one over the mean square of the strain: near 0 for straight walls, near 1
+            for other objects.
     """
 
     error: np.ndarray
@@ -115,22 +122,21 @@ class TemplateMatch(NamedTuple):
 
 
 def strain_sample_rate(report: Report) -> float:
-    """Samples per second of its strain; 0 where there are fewer than two."""
+    """Samples per second of a report's strain; 0 for fewer than two samples."""
     count = len(report.time)
     return float((count - 1) / (report.time[-1] - report.time[0])) if count > 1 else 0.0
 
 
 def training_drive(angle: float, repeat: int, report: Report) -> TrainingDrive:
-    """The drive that a report tells of."""
+    """The training drive recorded in a report."""
     return TrainingDrive(angle, repeat, report.strain, strain_sample_rate(report))
 
 
 def filter_strain(training: TemplateTraining, strain: np.ndarray) -> np.ndarray:
-    """[T, ...] Strain [T, ...] through the low-pass and the moving average.
+    """Applies the low-pass filter and the moving average to strain [T, ...]; the same shape.
 
-    Both look back only: what is known at HIT2 must not depend on what comes later, nor templates be made
-    otherwise than what is compared with them. Both begin as if the first sample had lasted for ever, so that
-    nothing rings at the start.
+    Both are causal, since a match at HIT2 cannot use later samples and templates need the same filter. Both
+    start in the steady state of the first sample, which avoids a transient.
     """
     from scipy.signal import butter, sosfilt, sosfilt_zi  # slow to import
 
@@ -148,11 +154,11 @@ def filter_strain(training: TemplateTraining, strain: np.ndarray) -> np.ndarray:
 def train_templates(
     drives: Iterable[TrainingDrive], training: TemplateTraining | None = None
 ) -> StrainTemplates:
-    """Templates from drives into walls.
+    """Trains templates from drives into walls.
 
     Raises:
-        InputError: angles without enough drives, at none of the angles, of another sample rate, too short, of
-            other whiskers than the first, or with channels that have no values.
+        InputError: too few drives at an angle, or a drive at another angle, of another sample rate or count
+            of whiskers, too short, or with NaN samples.
     """
     training, drives = training or TemplateTraining(), list(drives)
     angles = training.angles
@@ -163,14 +169,14 @@ def train_templates(
     if (count < training.repeats).any():
         few = ", ".join(f"{count[k]} at {np.degrees(angles[k]):.3g} degrees" for k in _less(training, count))
         raise InputError(
-            TEMPLATES, f"too few drives: {few}", f"{training.repeats} at each angle", "drive again"
+            TEMPLATES, f"too few drives: {few}", f"{training.repeats} at each angle", "add drives"
         )
     sets = []
     for at in near.T:
         chosen = [drives[k].strain[: training.samples] for k in np.flatnonzero(at)]
         sets.append(np.stack([filter_strain(training, strain) for strain in chosen]))
     mean = np.stack([one.mean(axis=0) for one in sets])
-    # Most channels feel nothing most of the time: the median is of those.
+    # Most channels have no contact most of the time, so the median measures noise.
     square = np.concatenate(
         [((one - one.mean(axis=0)) ** 2).swapaxes(1, 2).reshape(-1, training.samples, 2) for one in sets]
     ) / (1 - 1 / count.min())
@@ -180,7 +186,7 @@ def train_templates(
 def match_template(
     templates: StrainTemplates, strain: np.ndarray, alive: np.ndarray | None = None
 ) -> TemplateMatch:
-    """Which template filtered strain [N, W, 2] since HIT1 is most like, by the whiskers that report, [W]."""
+    """Matches filtered strain since HIT1 [N, W, 2] with the templates (eq. 5) by whiskers `alive` [W]."""
     count = min(len(strain), templates.mean.shape[1])
     use = np.ones(strain.shape[1], bool) if alive is None else np.asarray(alive, bool)
     if not count or not use.any():
@@ -199,7 +205,7 @@ def match_template(
 
 
 def write_templates(templates: StrainTemplates, path: Path | str) -> None:
-    """Write them to a file (.npz)."""
+    """Writes templates to an .npz file."""
     with open(path, "wb") as file:
         np.savez_compressed(
             file,
@@ -212,18 +218,18 @@ def write_templates(templates: StrainTemplates, path: Path | str) -> None:
 
 
 def read_templates(path: Path | str) -> StrainTemplates:
-    """Read what `write_templates` wrote.
+    """Reads a file of `write_templates`.
 
     Raises:
-        InputError: it cannot be read, or is something else.
+        InputError: the file is missing, cannot be read or holds something else.
     """
     try:
-        # Opened here: np.load leaves a broken file open.
-        with open(path, "rb") as file, np.load(file, allow_pickle=False) as kept:
-            if "strain_templates" not in kept or int(kept["strain_templates"]) != FILE_VERSION:
-                raise ValueError("not of this kind and version")
-            training = TemplateTraining.model_validate_json(str(kept["training"]))
-            templates = StrainTemplates(training, kept["angle"], kept["mean"], kept["spread"])
+        # Opened here because np.load does not close a malformed file.
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
+            if "strain_templates" not in stored or int(stored["strain_templates"]) != FILE_VERSION:
+                raise ValueError("another kind or version of file")
+            training = TemplateTraining.model_validate_json(str(stored["training"]))
+            templates = StrainTemplates(training, stored["angle"], stored["mean"], stored["spread"])
         angles, count, _, channels = templates.mean.shape
         whole = (angles, count, channels) == (len(training.angles), training.samples, 2)
         whole &= templates.angle.shape == (angles,)
@@ -233,7 +239,7 @@ def read_templates(path: Path | str) -> StrainTemplates:
         raise InputError(str(path), "no such file", "strain templates", TRAIN_HINT) from None
     except (OSError, ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile, ValidationError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        found = f"no strain templates ({reason})"
+        found = f"not strain templates ({reason})"
         raise InputError(str(path), found, f"a file of version {FILE_VERSION}", TRAIN_HINT) from error
     return templates
 
@@ -244,7 +250,7 @@ TRAIN_HINT = "make one with `python -m ratslam train-templates`"
 def _check(training: TemplateTraining, drives: list[TrainingDrive]) -> None:
     if not drives:
         raise InputError(
-            TEMPLATES, "no drives", f"{training.repeats} at each of {len(training.angles)} angles"
+            TEMPLATES, "no drives", f"{training.repeats} drives at each of {len(training.angles)} angles"
         )
     whiskers = np.shape(drives[0].strain)[1:2]
     for drive in drives:
@@ -258,9 +264,11 @@ def _check(training: TemplateTraining, drives: list[TrainingDrive]) -> None:
             found = f"{len(strain) / training.rate:.3g} s"
             raise InputError(where, found, f"{training.duration:g} s from first contact on")
         if not np.isfinite(strain).all():
-            raise InputError(where, "samples without a value", "numbers", "leave this drive out")
+            raise InputError(where, "NaN samples", "finite samples", "leave this drive out")
         if np.abs(drive.angle - training.angles).min() >= ANGLE_TOLERANCE:
-            raise InputError(where, "none of the angles", f"{_listed(training.angles)} degrees")
+            raise InputError(
+                where, "not one of the training angles", f"one of {_listed(training.angles)} degrees"
+            )
 
 
 def _less(training: TemplateTraining, count: np.ndarray) -> list[int]:

@@ -1,7 +1,7 @@
-"""Whisker arrays as data: where each whisker is mounted, how it swings, and what its angle says.
+"""Geometry of whisker arrays: mounts, rest directions, swing planes and forward kinematics.
 
-A whisker turns in a plane: at angle 0, its rest, it points along `rest`; a protraction by an angle turns it
-towards `swing`. Coordinates are those of base_link with z counted from the floor.
+A whisker turns in a plane: at angle 0 it points along `rest`; a protraction turns it towards `swing`.
+Coordinates are those of base_link, with z = 0 on the floor.
 """
 
 from __future__ import annotations
@@ -23,33 +23,33 @@ class RingConfig(Settings):
     """Whiskers of one length, evenly spread around the head's axis."""
 
     length: PositiveFloat
-    """Of a whisker, m."""
+    """Whisker length, m."""
     radius: PositiveFloat
-    """Of its base from the head's axis, m."""
+    """Distance of the bases from the head's axis, m."""
     height: PositiveFloat
-    """Of its base above the floor, m."""
+    """Height of the bases above the floor, m."""
 
 
 class HeadConfig(Settings):
-    """The UR-10 head of Salman & Pearson 2016, III-A: rings around a vertical axis, whiskers hanging out and
-    down, protracting towards the axis. Lengths are the paper's; what it leaves open are these defaults."""
+    """The UR-10 head of Salman & Pearson 2016, III-A: rings of whiskers around a vertical axis that point
+    outwards and down and protract towards the axis. Lengths are from the paper; other defaults are ours."""
 
     rings: Annotated[tuple[RingConfig, ...], Field(min_length=1)] = (
         RingConfig(length=0.05, radius=0.045, height=0.082),
         RingConfig(length=0.11, radius=0.065, height=0.12),
         RingConfig(length=0.16, radius=0.08, height=0.165),
     )
-    """From the inner to the outer one: the rows of the whisker image."""
+    """Rings from the inside out: the rows of the whisker image."""
     whiskers: PositiveInt = 6
-    """In each ring: the columns of the image."""
+    """Whiskers per ring: the columns of the image."""
     first_deg: Degrees = 0.0
     """Direction of the first column, counter-clockwise from ahead."""
     rest_deg: Opening = 75.0
-    """Of a whisker at rest from the axis that points down."""
+    """Angle between a whisker at rest and the downward axis."""
     limit_deg: Annotated[float, Field(gt=0, lt=180)] = 70.0
-    """Largest protraction that the drives allow."""
+    """Largest protraction of the drives."""
     dead: tuple[NonNegativeInt, ...] = ()
-    """Whiskers that do not report, by number (row by row)."""
+    """Indices of whiskers without signal, row by row."""
 
     @model_validator(mode="after")
     def _known(self) -> HeadConfig:
@@ -63,7 +63,7 @@ class Head(NamedTuple):
     """A whisker array.
 
     Attributes:
-        base: [W, 3] m, where each whisker is mounted. rest, swing: [W, 3] unit vectors at right angles.
+        base: [W, 3] positions of the bases, m. rest, swing: [W, 3] orthogonal unit vectors.
         length: [W] m. limit: largest protraction, rad. shape: rows and columns of the whisker image.
         alive: [W] bool.
     """
@@ -78,7 +78,7 @@ class Head(NamedTuple):
 
 
 def ur10_head(config: HeadConfig) -> Head:
-    """The head of that geometry."""
+    """The head with this geometry."""
     rows, columns = len(config.rings), config.whiskers
     azimuth = np.radians(config.first_deg) + np.arange(columns) * (2 * np.pi / columns)
     outwards = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(columns)], axis=1)
@@ -111,12 +111,12 @@ def create_head(
         (0.14, -0.09, -100.0),
     ),
 ) -> Head:
-    """The four-whisker head of Fox et al. 2012 on a Create: whiskers swing forward in a plane over the floor.
+    """The four-whisker head of Fox et al. 2012 on a Create: whiskers protract forwards in a horizontal plane.
 
     Args:
-        length: m. height: of that plane, m. mounts: of each whisker: x (m), y (m) of its base in base_link,
-            and its direction at rest, degrees counter-clockwise from ahead; it protracts towards ahead.
-            The paper does not give the mounts; these are ours.
+        length: of a whisker, m. height: of the plane above the floor, m. mounts: for each whisker x (m) and y
+            (m) of its base in base_link, and its direction at rest, degrees counter-clockwise from ahead. The
+            paper does not give the mounts; these are ours.
     """
     x, y, direction = np.array(mounts, float).T
     angle, side = np.radians(direction), np.sign(direction)
@@ -133,17 +133,17 @@ def create_head(
 
 
 def shaft_points(head: Head, angle: Array, along: Array) -> np.ndarray:
-    """[..., W, 3] m, the points that lie `along` [..., W] m from the bases at protractions [..., W] rad."""
+    """Points [..., W, 3] at distances `along` [..., W] from the bases, m, at protractions [..., W], rad."""
     angle, along = np.asarray(angle, float)[..., None], np.asarray(along, float)[..., None]
     return head.base + along * (np.cos(angle) * head.rest + np.sin(angle) * head.swing)
 
 
 def tip_points(head: Head, angle: Array) -> np.ndarray:
-    """[..., W, 3] m, where the tips are at protractions [..., W] rad."""
+    """Positions [..., W, 3] (m) of the tips at protractions [..., W] (rad)."""
     return shaft_points(head, angle, head.length)
 
 
 def tip_height(head: Head, angle: Array) -> np.ndarray:
-    """[..., W] m above the floor, of the tips: about as high as an obstacle met there (Salman & Pearson
-    2016, III-D)."""
+    """Heights [..., W] of the tips above the floor, m: about the height of an obstacle touched there (Salman
+    & Pearson 2016, III-D)."""
     return tip_points(head, angle)[..., 2]

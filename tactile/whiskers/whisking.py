@@ -1,9 +1,8 @@
-"""How whiskers are driven: a sinusoid, and what contact makes of its amplitude.
+"""Whisking control: a sinusoidal protraction whose amplitude is reduced by contact.
 
-One pure law, for simulated and real heads alike. The command is a protraction
+One pure function for simulated and real heads. The command is the protraction
     amplitude (1 - cos(2 pi rate t)) / 2,
-which starts at rest in every cycle; feedback lowers the amplitude only, so the start stays where it is
-(Salman & Pearson 2016, III-E).
+which starts at rest in every cycle; feedback changes only the amplitude (Salman & Pearson 2016, III-E).
 """
 
 from __future__ import annotations
@@ -23,31 +22,31 @@ MID_PROTRACTION = 0.25
 
 
 class WhiskingConfig(Settings):
-    """One whisker's drive."""
+    """Whisking control."""
 
     mode: Literal["open", "rcp", "spread"] = "rcp"
-    """`open`: the sinusoid; `rcp`: contact lowers the amplitude (rapid cessation of protraction); `spread`:
-    and whiskers beside one that touched follow it (spread reduction)."""
+    """`open`: the sinusoid without feedback; `rcp`: contact lowers the amplitude (rapid cessation of
+    protraction); `spread`: neighbours of a whisker in contact also lower theirs (spread reduction)."""
     rate: PositiveFloat = 1.0
     """Whisks per second."""
     amplitude_deg: Annotated[float, Field(gt=0, le=180)] = 65.0
-    """Of the protraction."""
+    """Amplitude of the protraction."""
     gain: NonNegativeFloat = 4.0
-    """Amplitude taken off for each unit of deflection above the contact threshold, rad per rad."""
+    """Reduction of the amplitude per deflection above the contact threshold, rad per rad."""
     window: PositiveFloat = 0.01
-    """Time over which the deflection is averaged, s."""
+    """Time constant of the mean deflection, s."""
     follow: Annotated[float, Field(ge=0, le=1)] = 0.2
-    """Share of a touching whisker's loss of amplitude that free ones beside it take over, in `spread`. More
-    takes contacts from them: in a micromouse maze 3 % at 0.2, 40 % at 0.5."""
+    """Share of the amplitude reduction that free neighbours of a whisker in contact follow, in `spread`.
+    Larger values cost contacts: in a micromouse maze 3 % at 0.2, 40 % at 0.5."""
 
 
 class WhiskDrive(NamedTuple):
-    """What the law remembers of the cycle so far.
+    """State of the control within a cycle.
 
     Attributes:
-        time: s in the cycle, of the last sample. mean: [..., W] running mean of the size of y, rad.
-        most: [..., W] the largest perturbation so far, rad: amplitude that was taken off stays off until the
-            cycle ends, for a whisker that sprang back would knock on the wall.
+        time: of the last sample, s since the cycle began. mean: [..., W] running mean of |y|, rad.
+        most: [..., W] largest perturbation so far, rad; the amplitude stays reduced until the cycle ends,
+            since a whisker that springs back would hit the wall again.
     """
 
     time: float
@@ -56,12 +55,12 @@ class WhiskDrive(NamedTuple):
 
 
 def initial_drive(*shape: int) -> WhiskDrive:
-    """The drives of whiskers [..., W] before their first cycle."""
+    """The state of whiskers [..., W] before their first cycle."""
     return WhiskDrive(0.0, np.zeros(shape), np.zeros(shape))
 
 
 def whisk_phase(config: WhiskingConfig, time: Array) -> np.ndarray:
-    """Share of the amplitude commanded at each time, s: 0 at rest, 1 at full protraction."""
+    """Commanded share of the amplitude at times (s since the cycle began): 0 at rest, 1 at the peak."""
     return (1 - np.cos(2 * np.pi * config.rate * np.asarray(time, float))) / 2
 
 
@@ -73,17 +72,17 @@ def whisk_command(
     threshold: np.ndarray,
     shape: tuple[int, int],
 ) -> tuple[np.ndarray, WhiskDrive]:
-    """Where the whiskers are to go now; called once a sample, with any axes before that of the whiskers.
+    """Commanded protractions; called once per sample, with any axes before that of the whiskers.
 
-    The perturbation is the mean size of y in excess of the contact threshold; `gain` times it lowers the
-    amplitude. A time before the last one begins a new cycle.
+    The perturbation is the mean of |y| above the contact threshold; `gain` times it lowers the amplitude. A
+    time before the previous one starts a new cycle.
 
     Args:
-        time: s since the cycle began. deflection: [..., W] the newest y, less its mean in free whisking, rad.
+        time: s since the cycle began. deflection: [..., W] newest y minus its free-whisking mean, rad.
         threshold: [W] contact threshold of y, rad. shape: rows and columns of the head.
 
     Returns:
-        [..., W] protractions, rad, and the drives after it.
+        [..., W] protractions, rad, and the new state.
     """
     share = (1 - np.cos(2 * np.pi * config.rate * time)) / 2
     amplitude = np.radians(config.amplitude_deg)
@@ -101,11 +100,11 @@ def whisk_command(
 
 
 def neighbour_max(value: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """[..., W] the largest value among each whisker's neighbours: its column, and the two next to it.
+    """The largest value [..., W] among each whisker's neighbours: its column and the adjacent columns.
 
-    Rows of a head with several are rings, whose ends meet. In rats, whiskers that do not touch lessen their
-    spread towards those that do (Mitchinson & Prescott 2013); all of ours start together, so the spread is
-    the difference of amplitudes, and they follow by giving up part of theirs.
+    The rows of a head with several are rings, so the last column is next to the first. Rats reduce the spread
+    between whiskers with and without contact (Mitchinson & Prescott 2013); here all whiskers start together,
+    so the spread is the difference of their amplitudes.
     """
     grid = value.reshape(*value.shape[:-1], *shape)
     near = np.broadcast_to(grid.max(axis=-2, keepdims=True), grid.shape).copy()
@@ -118,10 +117,10 @@ def neighbour_max(value: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 
 
 def check_amplitude(config: WhiskingConfig, head: Head, where: str = "simulation.whisking") -> None:
-    """Refuse what the drives cannot do.
+    """Checks the amplitude against the head.
 
     Raises:
-        InputError: the amplitude is beyond their limit.
+        InputError: the amplitude exceeds the head's limit.
     """
     if np.radians(config.amplitude_deg) > head.limit + 1e-9:
         raise InputError(

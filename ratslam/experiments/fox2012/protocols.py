@@ -19,7 +19,7 @@ PAPERS = ("blob", "geometric", "template")
 """The paper's mappers from worst to best as printed (III)."""
 METHODS: dict[str, tuple[str, ...]] = {
     "as printed": (
-        "touch.reports.flat=null",
+        "touch.reports.max_template_error=null",
         "grid.likelihood.model=distinct",
         "grid.resampling.when=always",
         "grid.resampling.how=multinomial",

@@ -194,7 +194,7 @@ class HeadSimulation(SimulatedSource):
     def _calibrated(self) -> Calibration:
         """What the head's sensors report in free air, before the session."""
         config = self.config
-        count = int(np.ceil(config.calibration.shortest * config.whisking.rate))
+        count = int(np.ceil(config.calibration.min_duration * config.whisking.rate))
         random = stream(config.seed, "calibration")
         record = simulate_free_cycles(
             RAW_TIERS[self.tier.name],

@@ -134,14 +134,14 @@ def test_a_killed_run_is_given_up_when_it_has_been_silent_for_long(killed, tmp_p
     shutil.copytree(killed, folder)
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     assert main(["watch", str(folder), "--once"]) == 0
-    assert "it was killed" not in capsys.readouterr().out
+    assert "the run was killed" not in capsys.readouterr().out
     for path in folder.iterdir():
         os.utime(path, (0, time.time() - 100))
     assert main(["watch", str(folder), "--patience", "50"]) == 0
     said = capsys.readouterr().out
     assert "run: running" in said
     assert "silent for 100 s\n" in said
-    assert "it was killed" in said
+    assert "the run was killed" in said
     assert before == {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "watch.png"}
     assert 0 < len(RunMonitor(folder).read().path) <= (folder / "steps.csv").read_text().count("\n") - 1
 
@@ -203,7 +203,7 @@ def files(steps, random, truth=True):
 
 def same(one, other):
     """Whether two sights are of the same steps, whatever the clock says."""
-    rest = {"pace": None, "silent": 0.0}
+    rest = {"rate": None, "silence": 0.0}
     parts = zip(one._replace(**rest), other._replace(**rest), strict=True)
     return all(
         np.array_equal(a, b, equal_nan=True) if isinstance(a, np.ndarray) else a == b for a, b in parts
@@ -272,7 +272,7 @@ def test_silence_is_of_the_run_and_not_of_who_watches(tmp_path):
     (tmp_path / "steps.csv").touch()
     os.utime(tmp_path / "steps.csv", (0, time.time() - 100))
     (tmp_path / "watch.png").touch()
-    assert 99 < RunMonitor(tmp_path).read().silent < 200
+    assert 99 < RunMonitor(tmp_path).read().silence < 200
 
 
 def test_it_tells_steps_distance_pace_and_outcomes():
@@ -280,9 +280,9 @@ def test_it_tells_steps_distance_pace_and_outcomes():
     way = np.array([[0.0, 1.0, 0.0], [0.0, 2.0, 1.0], [3.0, 2.0, 2.0], [3.0, 2.0, 3.0]])
     seen = RunProgress(
         "name", RUNNING, 9, np.zeros((4, 3)), np.zeros(3), way, nothing,
-        outcomes={"ok": 1, "reseeded": 3}, lost=2, off=0.5, saved=2, pace=None, silent=11.0,
+        outcomes={"ok": 1, "reseeded": 3}, lost=2, online_error=0.5, checkpoint=2, rate=None, silence=11.0,
     )  # fmt: skip
     assert status_line(seen, 8.2) == (
-        "name: running, 4 of 9 steps, 5.0 m, 8 steps/s, off by 0.5 m, 3 reseeded, 1 ok, 2 lost, "
+        "name: running, 4 of 9 steps, 5.0 m, 8 steps/s, error 0.5 m, 3 reseeded, 1 ok, 2 lost, "
         "checkpoint at 2, silent for 11 s"
     )

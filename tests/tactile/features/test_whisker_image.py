@@ -124,7 +124,7 @@ def test_a_whisker_may_be_called_dead_later(whisk: Whisk) -> None:
 def test_raw_samples_need_a_calibration() -> None:
     count = 2000
     cycle = Cycle(np.arange(count) / 2000, np.zeros((count, 18)), np.zeros((count, 18, 2)), ODOMETRY)
-    with pytest.raises(InputError, match="calibration: raw whisker samples without one"):
+    with pytest.raises(InputError, match="calibration: raw whisker samples without a calibration"):
         Frontend(TouchConfig()).observe(cycle)
     still = np.full((18, 2), 2e-3)
     known = Calibration(0 * still, still, 20 * still, np.full(18, SWEEP), np.ones(18, bool), 2000.0)

@@ -159,7 +159,7 @@ def _unfit(path: Path) -> None:
 def test_any_other_file_is_one_clear_error(make: object, tmp_path: Path) -> None:
     path = tmp_path / "wrong.npz"
     make(path)  # type: ignore[operator]
-    with pytest.raises(InputError, match=r"wrong\.npz: no .*train-templates"):
+    with pytest.raises(InputError, match=r"wrong\.npz: no.*train-templates"):
         read_templates(path)
 
 
@@ -172,8 +172,8 @@ def test_any_other_file_is_one_clear_error(make: object, tmp_path: Path) -> None
         (lambda kept: kept[4:], "0 at 20 degrees"),
         (lambda kept: [kept[0]._replace(rate=1000.0), *kept[1:]], r"1000 samples per second; expected 2000"),
         (lambda kept: [kept[0]._replace(strain=kept[0].strain[:3800]), *kept[1:]], r"drive 0 at 20.*1\.9 s"),
-        (lambda kept: [kept[0]._replace(strain=kept[0].strain * np.nan), *kept[1:]], "without a value"),
-        (lambda kept: [*kept, kept[0]._replace(angle=0.4)], "none of the angles"),
+        (lambda kept: [kept[0]._replace(strain=kept[0].strain * np.nan), *kept[1:]], "NaN samples"),
+        (lambda kept: [*kept, kept[0]._replace(angle=0.4)], "not one of the training angles"),
         (lambda kept: [*kept, kept[0]._replace(strain=kept[0].strain[:, :3])], r"\(4000, 3, 2\)"),
     ],
 )

@@ -97,7 +97,7 @@ class Score(NamedTuple):
 
 
 CONFIGS = {
-    "winner": ReportFrontendConfig(walls="template", flat=None),
+    "winner": ReportFrontendConfig(walls="template", max_template_error=None),
     "template": ReportFrontendConfig(walls="template"),
     "geometric": ReportFrontendConfig(walls="geometric"),
     "fused": ReportFrontendConfig(),
