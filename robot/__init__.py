@@ -1,3 +1,3 @@
-"""Sources of whisk cycles and observations: recordings, simulators and live robots."""
+"""Sources of readings: recordings, simulations and live robots."""
 
 RATSLAM_PACKAGE = "robot"  # see tactile/__init__.py

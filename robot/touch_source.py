@@ -1,4 +1,4 @@
-"""A source of whiskers seen through the sense of touch: a source of observations."""
+"""Turns the whisker readings of a source into observations."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 from tactile.whiskers.planar_whiskers import PlanarWhiskers, project_to_plane
 
 MAZE_WALL_HEIGHT = 0.05
-"""Of the walls of micromouse mazes, m."""
+"""Wall height of micromouse mazes, m."""
 
 
 class ReadingProcessor(Protocol):
-    """Turns readings, in their order, into observations.
+    """A touch front end: converts readings, in order, into observations.
 
     Attributes:
-        view_shape: of the views. whiskers: W.
+        view_shape: (R, C, K) of the views. whiskers: number of whiskers.
     """
 
     @property
@@ -33,38 +33,40 @@ class ReadingProcessor(Protocol):
     @property
     def whiskers(self) -> int: ...
     def observe(self, reading: Any) -> Observation | None:
-        """What an engine is given; None if the reading is kept for the next one."""
+        """The observation of a reading, or None if its motion is added to the next one."""
 
 
 class TouchSource:
-    """A source whose readings are all observations.
+    """A source of observations made from a source of whisker readings.
 
     Args:
-        source: of whiskers, at least in part. sense: makes a sense that has felt nothing yet. where: what
-            configures its whiskers.
+        source: the source of readings. start: returns a new front end; called for every iteration.
+        where: configuration key of the whiskers, for errors.
 
     Raises:
-        InputError: another number of whiskers than the sense has.
+        InputError: source and front end differ in the number of whiskers.
     """
 
-    def __init__(self, source: Source, sense: Callable[[], ReadingProcessor], where: str) -> None:
-        first = sense()
+    def __init__(self, source: Source, start: Callable[[], ReadingProcessor], where: str) -> None:
+        first = start()
         if source.whiskers != first.whiskers:
             raise InputError(where, f"{first.whiskers} whiskers", f"{source.whiskers}, as {source.name} has")
-        self.source, self.sense = source, sense
+        self.source, self._start = source, start
         self.name, self.rate_hz, self.digest = source.name, source.rate_hz, source.digest
         self.view_shape, self.whiskers, self.length = first.view_shape, source.whiskers, source.length
         self.info = source.info.model_copy(update={"raw_whiskers": False})
 
     def __iter__(self) -> Iterator[Sample]:
-        sense = self.sense()
+        frontend = self._start()
         for sample in self.source:
-            reading = sense.observe(sample.reading)
+            reading = frontend.observe(sample.reading)
             if reading is None:
                 continue
             if reading.view.shape != self.view_shape:
                 raise InputError(
-                    self.name, f"a view of shape {reading.view.shape}", f"{self.view_shape}, as of whiskers"
+                    self.name,
+                    f"a view of shape {reading.view.shape}",
+                    f"{self.view_shape}, the shape of whisker images",
                 )
             yield sample._replace(reading=reading)
 
@@ -116,7 +118,9 @@ def observation_of(sample: Sample) -> Observation:
         InputError: it is whisker data.
     """
     if not isinstance(sample.reading, Observation):
-        raise InputError("recording.file", "whiskers", "observations", "process the whiskers first")
+        raise InputError(
+            "recording.file", "whisker readings", "observations", "open it with open_touch_source"
+        )
     return sample.reading
 
 

@@ -1,8 +1,7 @@
-"""How a sample is written down: ROS 2 messages in little-endian CDR, which any ROS 2 or MCAP tool can read.
+"""Samples as ROS 2 messages in little-endian CDR, which any ROS 2 or MCAP tool can read.
 
-A message is four bytes (00 01 00 00) and the fields of its schema (`robot.recordings.schemas`) back to
-back; an
-unbounded array is preceded by its length (uint32). float64 is kept bit for bit.
+A message has four bytes (00 01 00 00) and the fields of its schema (`robot.recordings.schemas`) back to
+back; an unbounded array is preceded by its length (uint32). float64 values keep every bit.
 """
 
 from __future__ import annotations
@@ -18,24 +17,24 @@ from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Observation, Odometry, Report, Whisk
 
 CDR = b"\x00\x01\x00\x00"
-MAX_NUMBERS = 100_000_000  # numbers in one message; more is a damaged length
+MAX_NUMBERS = 100_000_000  # in one message; a larger number is a damaged length
 FELT = ("touched", "highest", "reach")
-"""What `felt` of a whisk holds of each whisker."""
+"""Values of each whisker in the field `felt` of a Whisk message."""
 FLAGS = {OBSERVATION: ("contact", "dead"), WHISK: ("alive", "contact", "held"), REPORT: ("alive", "contact")}
-"""What the bits of `flags` mean, from the lowest."""
+"""Meaning of the bits of `flags`, from the lowest."""
 
 
 class Malformed(ValueError):
-    """A message that is not what its schema says."""
+    """A message that does not fit its schema."""
 
 
 class Layout(NamedTuple):
-    """Where a message's fields are.
+    """Byte layout of a message.
 
     Attributes:
-        dtype: the whole message as a packed record. blank: one with its lengths and shapes filled in.
-        fixed: (start, stop, bytes) of everything that is the same in all messages of this layout.
-        fields: the others.
+        dtype: the message as a packed record. blank: a message with lengths and shapes filled in.
+        fixed: (start, stop, bytes) of all parts that are equal in every message of this layout.
+        fields: names of the variable fields.
     """
 
     dtype: np.dtype
@@ -48,7 +47,7 @@ def encode(sample: Sample, view_shape: tuple[int, int, int], whiskers: int) -> t
     """A sample's reading as (schema, message).
 
     Raises:
-        InputError: a field of another shape, or with values that float64, int32 or bool cannot hold exactly.
+        InputError: a field has another shape, or values that its type cannot hold exactly.
     """
     reading = sample.reading
     values: dict[str, Any] = {**reading._asdict(), **reading.odometry._asdict()}
@@ -78,7 +77,7 @@ def decode(name: str, message: bytes, view_shape: tuple[int, int, int], whiskers
     """(time, reading) of a message; the inverse of `encode`.
 
     Raises:
-        Malformed: the message is not one of this schema with this view shape and so many whiskers.
+        Malformed: the message does not fit this schema, view shape and number of whiskers.
     """
     if name == CYCLE:
         samples = int.from_bytes(message[44:48], "little")
@@ -95,9 +94,9 @@ def decode(name: str, message: bytes, view_shape: tuple[int, int, int], whiskers
     else:
         layout = observation_layout(view_shape, whiskers)
     if len(message) != layout.dtype.itemsize:
-        raise Malformed(f"a message of {len(message)} bytes where {layout.dtype.itemsize} were due")
+        raise Malformed(f"a message of {len(message)} bytes where {layout.dtype.itemsize} were expected")
     if any(message[start:stop] != content for start, stop, content in layout.fixed):
-        raise Malformed("a message of another shape than the recording's")
+        raise Malformed("a message with another shape than the recording's")
     record = np.frombuffer(message, layout.dtype)[0]
     odometry = Odometry(record["dx"], record["dy"], record["dtheta"], record["dt"])
     if name == CYCLE:
@@ -114,7 +113,7 @@ def decode(name: str, message: bytes, view_shape: tuple[int, int, int], whiskers
     return float(record["time"]), Observation(
         odometry=odometry,
         motion=record["motion"],
-        view=record["view"].copy(),  # copies are aligned and the caller's own
+        view=record["view"].copy(),  # copies are aligned and writable
         view_seen=record["view_seen"],
         label=record["label"],
         contact=flags["contact"],
@@ -134,7 +133,7 @@ def encode_truth(time: float, truth: np.ndarray) -> bytes:
 def decode_truth(message: bytes) -> tuple[float, np.ndarray]:
     """(time, truth [3]); raises `Malformed`."""
     if len(message) != 36 or not message.startswith(CDR):
-        raise Malformed("a truth that is no truth")
+        raise Malformed("malformed Truth message")
     time, *pose = np.frombuffer(message, "<f8", offset=4)
     return float(time), np.array(pose)
 
@@ -171,7 +170,7 @@ def observation_layout(view_shape: tuple[int, int, int], whiskers: int) -> Layou
 
 @lru_cache(maxsize=16)
 def whisk_layout(whiskers: int) -> Layout:
-    """The packed form of the Whisk schema for so many whiskers."""
+    """The packed form of the Whisk schema for this number of whiskers."""
     return _layout(
         [
             *_ODOMETRY,
@@ -256,7 +255,7 @@ def _layout(fields: list[Any], **fixed: Any) -> Layout:
 
 
 def _packed(values: dict[str, Any], names: tuple[str, ...], whiskers: int) -> np.ndarray:
-    """[W] uint8, the truths [W] of these names as bits."""
+    """[W] uint8, the boolean arrays [W] of these names as bits."""
     flags = np.zeros(whiskers, np.uint8)
     for bit, name in enumerate(names):
         flags |= _exactly(name, values[name], np.dtype(("?", (whiskers,)))).astype(np.uint8) << bit
@@ -266,12 +265,14 @@ def _packed(values: dict[str, Any], names: tuple[str, ...], whiskers: int) -> np
 def _unpacked(flags: np.ndarray, names: tuple[str, ...]) -> dict[str, np.ndarray]:
     """The inverse of `_packed`."""
     if (flags >> len(names)).any():
-        raise Malformed(f"whisker flags {int(flags.max())} where {2 ** len(names) - 1} is the largest known")
+        raise Malformed(
+            f"whisker flags {int(flags.max())} where {2 ** len(names) - 1} is the largest possible"
+        )
     return {name: (flags >> bit & 1).astype(bool) for bit, name in enumerate(names)}
 
 
 def _exactly(name: str, value: Any, dtype: np.dtype) -> np.ndarray:
-    """The value as that dtype and shape, or an error if it is not exactly that."""
+    """The value with that dtype and shape; `InputError` if it cannot be held exactly."""
     array = np.asarray(value)
     base, shape = dtype.base, dtype.shape
     if array.shape != shape:

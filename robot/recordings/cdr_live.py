@@ -1,8 +1,6 @@
-"""How a live session is written down: blocks of frames and of arm states, cuts, events.
+"""Live data as messages (see `robot.recordings.cdr`): blocks of frames and of arm states, cuts, events.
 
-Messages as in `robot.recordings.cdr`. Frames lie channel by channel, as differences from frame to frame:
-small
-numbers, of which compression leaves little.
+Frames are stored channel by channel as differences from frame to frame: small numbers, which compress well.
 """
 
 from __future__ import annotations
@@ -21,14 +19,14 @@ from tactile.base.types import Odometry
 
 NUMBERS = ("host", "robot", "tcp", "speed", "force", "joints")
 WORDS = ("mode", "safety", "runtime", "operation", "progress")
-"""Which fields of a state are numbers, which words, in the order in which they are written."""
+"""Fields of an arm state that are numbers and words, in the order of the message."""
 
 
 class Event(NamedTuple):
-    """Something that happened, for whoever reads the recording.
+    """An event of a live session.
 
     Attributes:
-        time: s. name: one word, as `fault` or `discontinuity`. text: what was found.
+        time: s. name: one word, such as `fault` or `discontinuity`. text: details.
     """
 
     time: float
@@ -37,7 +35,7 @@ class Event(NamedTuple):
 
 
 def encode_frames(time: float, frames: Frames) -> bytes:
-    """A block of frames, the newest of which came at that time, s."""
+    """Encode a block of frames; `time` is the arrival of the newest one, s."""
     count, whiskers, channels = frames.values.shape
     planes = frames.values.reshape(count, whiskers * channels).T
     parts = [
@@ -54,16 +52,16 @@ def encode_frames(time: float, frames: Frames) -> bytes:
 
 
 def decode_frames(message: bytes, whiskers: int) -> tuple[float, Frames]:
-    """The inverse of `encode_frames`, for a head with so many whiskers; raises `Malformed`."""
+    """Decode (time, frames) of a head with this number of whiskers; raises `Malformed`."""
     fields = _Fields(message)
     time = fields.number("<d")
     count = fields.size()
     sequence = fields.array("<i8", count)
     if fields.size() != whiskers:
-        raise Malformed(f"frames of another head than the recording's, which has {whiskers} whiskers")
+        raise Malformed(f"frames with another number of whiskers than the recording, {whiskers}")
     device = fields.array("<i8", count)
     if fields.size() != CHANNELS:
-        raise Malformed(f"frames of other than {CHANNELS} channels")
+        raise Malformed(f"frames without exactly {CHANNELS} channels")
     flags = fields.array("<u4", count)
     planes = fields.array("<i2", count * whiskers * CHANNELS).reshape(whiskers * CHANNELS, count)
     fields.end()
@@ -79,7 +77,7 @@ def decode_frames(message: bytes, whiskers: int) -> tuple[float, Frames]:
 
 
 def encode_states(states: np.ndarray) -> bytes:
-    """A block of arm states [N] (`robot.drivers.ur10.shared_state.ARM_STATE`), at least one."""
+    """Encode arm states [N], N > 0 (`robot.drivers.ur10.shared_state.ARM_STATE`)."""
     count = len(states)
     numbers = np.concatenate([states[name].reshape(count, -1) for name in NUMBERS], axis=1)
     words = np.stack([states[name].astype("<i4") for name in WORDS])
@@ -95,7 +93,7 @@ def encode_states(states: np.ndarray) -> bytes:
 
 
 def decode_states(message: bytes) -> tuple[float, np.ndarray]:
-    """(time, states [N]), the inverse of `encode_states`; raises `Malformed`."""
+    """Decode (time, states [N]); raises `Malformed`."""
     fields = _Fields(message)
     time = fields.number("<d")
     count = fields.size()
@@ -123,23 +121,23 @@ _CUT = struct.Struct("<4s6d3qI?")
 
 
 def encode_cut(cut: Cut) -> bytes:
-    """A cut as a message."""
+    """Encode a cut."""
     return _CUT.pack(
         CDR, cut.time, *cut.odometry, cut.start, cut.number, cut.first, cut.last, cut.frames, cut.seen
     )
 
 
 def decode_cut(message: bytes) -> Cut:
-    """The inverse of `encode_cut`; raises `Malformed`."""
+    """Decode a cut; raises `Malformed`."""
     if len(message) != _CUT.size or not message.startswith(CDR):
-        raise Malformed("a cut that is no cut")
+        raise Malformed("malformed Cut message")
     _, time, *motion, start, number, first, last, frames, seen = _CUT.unpack(message)
     odometry = Odometry(*(np.float64(value) for value in motion))
     return Cut(number, time, start, first, last, frames, odometry, seen)
 
 
 def encode_event(event: Event) -> bytes:
-    """An event as a message."""
+    """Encode an event."""
     if ": " in event.name:
         raise ValueError(f"an event's name {event.name!r} with a colon in it")
     text = f"{event.name}: {event.text}".encode() + b"\0"
@@ -147,7 +145,7 @@ def encode_event(event: Event) -> bytes:
 
 
 def decode_event(message: bytes) -> Event:
-    """The inverse of `encode_event`; raises `Malformed`."""
+    """Decode an event; raises `Malformed`."""
     fields = _Fields(message)
     time = fields.number("<d")
     text = fields.array("u1", None).tobytes()
@@ -159,37 +157,37 @@ def decode_event(message: bytes) -> Event:
 
 
 def _steps(value: np.ndarray, kind: str) -> bytes:
-    """The first along the last axis, then differences, which wrap as the numbers do."""
+    """The first value along the last axis, then differences; both wrap around."""
     return np.diff(value, axis=-1, prepend=value.dtype.type(0)).astype(kind).tobytes()
 
 
 class _Fields:
-    """A message's fields, one after the other."""
+    """Reads the fields of a message in order."""
 
     def __init__(self, message: bytes) -> None:
         if not message.startswith(CDR):
-            raise Malformed("a message in another encoding")
+            raise Malformed("a message with another encoding than little-endian CDR")
         self._message, self._place = message, len(CDR)
 
     def number(self, kind: str) -> float:
-        """One number."""
+        """Read one number."""
         return float(self._take(kind, 1)[0])
 
     def size(self) -> int:
-        """A uint32."""
+        """Read a uint32."""
         return int(self._take("<u4", 1)[0])
 
     def array(self, kind: str, count: int | None) -> np.ndarray:
-        """An array that must have so many numbers (None: any number of them)."""
+        """Read an array, which must have `count` numbers if that is given."""
         found = self.size()
         if count is not None and found != count:
-            raise Malformed(f"an array of {found} numbers where {count} were due")
+            raise Malformed(f"an array of {found} numbers where {count} were expected")
         return self._take(kind, found)
 
     def end(self) -> None:
-        """There must be no more."""
+        """Require the end of the message."""
         if self._place != len(self._message):
-            raise Malformed(f"{len(self._message) - self._place} bytes more than a message has")
+            raise Malformed(f"{len(self._message) - self._place} bytes after the end of the message")
 
     def _take(self, kind: str, count: int) -> np.ndarray:
         size = np.dtype(kind).itemsize * count

@@ -1,4 +1,4 @@
-"""What is attached to a table's odometry rows: views, place ids and truth, in its own file or in others."""
+"""Assigns views, place labels and truth, from the same or other files, to odometry rows."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from robot.recordings.sanity_checks import RowName, clock_errors, nonfinite_erro
 from robot.recordings.unit_check import UnitLimits, heading_errors
 from tactile.base.errors import InputError
 
-RANGE_UNIT_FACTOR = 20.0  # times max_range: a median range beyond it is in another unit
+RANGE_UNIT_FACTOR = 20.0  # times max_range: a larger median range has another unit
 
-AlignedRows = tuple[np.ndarray, np.ndarray, list[InputError]]  # odometry rows [M], values [M, ...], faults
+AlignedRows = tuple[np.ndarray, np.ndarray, list[InputError]]  # odometry rows [M], values [M, ...], errors
 
 
 def align_views(
@@ -41,7 +41,7 @@ def align_views(
         errors = nonfinite_errors(values, what, place)
         errors += view_errors(values.min(axis=1), values.max(axis=1), what, place)
     else:
-        values = np.where(np.isposinf(values), part.max_range, values)  # REP-117: nothing in reach
+        values = np.where(np.isposinf(values), part.max_range, values)  # REP-117: no object in range
         errors = nonfinite_errors(values, what, place) + _range_faults(
             values, part.max_range, what, place, file.path
         )
@@ -73,7 +73,7 @@ def align_labels(
     pairs: PairColumns | None,
     time: np.ndarray,
 ) -> AlignedRows:
-    """Place ids [M] int32, as given or from pairs."""
+    """Place labels [M] int32, given or derived from pairs."""
     if pairs is not None:
         return _paired(base, files[pairs.file], pairs, time)
     assert labels is not None
@@ -85,7 +85,7 @@ def align_labels(
     bad = ~((ids >= 0) & (ids <= np.iinfo(np.int32).max) & (ids == np.round(ids)))
     if bad.any():
         row = int(bad.argmax())
-        found, expected = f"{labels.column} is {ids[row]}", "a whole number from 0, or -1 or nothing for none"
+        found, expected = f"{labels.column} is {ids[row]}", "an integer from 0; -1 or an empty cell for none"
         return rows, ids, [InputError(file.place(int(there[row])), found, expected), *errors]
     return rows, ids.astype(np.int32), errors
 
@@ -109,14 +109,16 @@ def _paired(base: CsvFile, file: CsvFile, part: PairColumns, time: np.ndarray) -
 def labels_from_pairs(
     later: Sequence[float], earlier: Sequence[float], score: Sequence[float], threshold: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Every time in the list is a view; its best earlier match passes on its id, else it is a new place.
+    """Place labels from pairs of times that a place recogniser matched.
+
+    Every time is a view; its best earlier match passes on its label, without one the view is a new place.
 
     Args:
-        later, earlier: s, each pair's two times, earlier before later. score: how alike they are.
-        threshold: least score of a match. Of equal scores the pair listed first wins.
+        later, earlier: s, the two times of each pair. score: similarity of each pair.
+        threshold: smallest score of a match. Of equal scores the first pair is used.
 
     Returns:
-        time: [V] s, increasing. label: [V] int32, places numbered as they are first seen.
+        time: [V] s, increasing. label: [V] int32, places numbered in order of appearance.
     """
     best: dict[float, tuple[float, float]] = {}
     for time, match, value in zip(later, earlier, score, strict=True):
@@ -136,7 +138,7 @@ def labels_from_pairs(
 def align_truth(
     base: CsvFile, files: Mapping[Path, CsvFile], part: TruthColumns, time: np.ndarray, limits: UnitLimits
 ) -> tuple[np.ndarray, list[InputError]]:
-    """[N, 3] at the odometry rows, NaN outside the truth's span."""
+    """True poses [N, 3] at the odometry rows, NaN outside the time span of the truth."""
     file = files[part.file or base.path]
     names = (part.x, part.y, part.heading)
     errors = file.faults(*names)
@@ -144,7 +146,7 @@ def align_truth(
     moments = time if file is base else file.column(part.time)
     if faults := heading_errors(truth[:, 2], moments, part.heading, str(file.path), limits):
         errors += faults
-        truth[:, 2] = np.deg2rad(truth[:, 2])  # or every other check would say it again
+        truth[:, 2] = np.deg2rad(truth[:, 2])  # or every other check would report it again
     if file is base:
         return truth, errors
     errors += file.faults(part.time) + clock_errors(moments, part.time, file.place)
@@ -162,7 +164,7 @@ def align_truth(
 def _rows(
     file: CsvFile, base: CsvFile, there: np.ndarray, name: str, tolerance: float | None, time: np.ndarray
 ) -> tuple[np.ndarray, list[InputError]]:
-    """The odometry rows of a file's rows [M]: the same ones, or the nearest in time."""
+    """Odometry rows of the rows [M] of a file: the same, or the nearest in time."""
     if file is base:
         return there, []
     moments = file.column(name)[there]
@@ -172,17 +174,17 @@ def _rows(
 
 
 def _place(file: CsvFile, there: np.ndarray) -> RowName:
-    """Where those of a file's rows [M] stand."""
+    """Positions of rows [M] of a file, for errors."""
     return lambda row: file.place(int(there[row]))
 
 
 def _nearest(
     moments: np.ndarray, time: np.ndarray, tolerance: float | None, place: RowName
 ) -> tuple[np.ndarray, list[InputError]]:
-    """The odometry row nearest in time to each of the moments [M], at most the tolerance away."""
+    """The odometry row nearest in time to each of the times [M], at most the tolerance away."""
     steps = np.diff(time)
     if not (steps > 0).all():
-        return np.zeros(len(moments), int), []  # the clock's fault is already reported
+        return np.zeros(len(moments), int), []  # the error of the clock is already reported
     rows = np.searchsorted(time[:-1] + steps / 2, moments)
     reach = float(np.median(steps)) if tolerance is None and len(steps) else tolerance or 0.0
     away = np.abs(time[rows] - moments)

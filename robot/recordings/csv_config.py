@@ -1,4 +1,4 @@
-"""Which column of which CSV file means what."""
+"""Settings that assign columns of CSV files."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tactile.base.config import Settings
 
 
 class PoseColumns(Settings):
-    """Odometry as poses of a world frame; their differences are the motion, the sideways part kept."""
+    """Odometry as poses in a world frame; motion is their difference, including sideways motion."""
 
     x: str = "x"
     """Column of the position, m."""
@@ -21,12 +21,12 @@ class PoseColumns(Settings):
 
 
 class VelocityColumns(Settings):
-    """Odometry as body velocities over the interval since the row before, along the heading halfway."""
+    """Odometry as body velocities since the row before, along the heading half-way through the turn."""
 
     forward: str = "vx"
     """Column of the forward speed, m/s."""
     left: str | None = None
-    """Column of the speed to the left, m/s; none for a robot that cannot slide."""
+    """Column of the speed to the left, m/s; null for a robot that cannot move sideways."""
     turn: str = "w"
     """Column of the turn rate, rad/s, counter-clockwise."""
 
@@ -35,55 +35,55 @@ class ViewColumns(Settings):
     """Views of rows x columns pixels from numbered columns (r0, r1, ...)."""
 
     file: Path | None = None
-    """Their file; a `*` in its name stands for the beginning of the recording's file name. Null: they stand
-    beside the odometry, with empty cells in rows without a view."""
+    """File of the views; a `*` in its name stands for the beginning of the recording's file name. Null: the
+    odometry file, with empty cells in rows without a view."""
     time: str = "t"
     """Column of the time, s, in that file."""
     prefix: str = "r"
-    """The columns' name before the number."""
+    """Name of the columns before the number."""
     max_range: float | None = Field(default=None, gt=0)
     """Laser ranges, m: each pixel is the mean of min(range, max_range) / max_range over an equal share
-    of consecutive beams, so beams must be a multiple of the pixels. None: pixel values in 0..1."""
+    of consecutive beams, so their number must be a multiple of the pixels. Null: pixel values in 0..1."""
     tolerance: float | None = Field(default=None, ge=0)
-    """A view belongs to the nearest odometry row, at most so far away, s; none: a median step."""
+    """Largest time between a view and its nearest odometry row, s; null: the median step."""
 
 
 class LabelColumns(Settings):
-    """Place ids that somebody gives with the recording."""
+    """Place labels given with the recording."""
 
     file: Path | None = None
-    """Their file; none if they stand beside the odometry."""
+    """File of the labels; null: the odometry file."""
     time: str = "t"
     """Column of the time, s, in that file."""
     column: str = "label"
-    """Column of the ids, whole numbers from 0; empty or -1 for none."""
+    """Column of the labels, integers from 0; empty or -1 for none."""
     tolerance: float | None = Field(default=None, ge=0)
     """As for views."""
 
 
 class PairColumns(Settings):
-    """Pairs of times found alike: the best earlier match with at least the threshold passes on its id,
-    else the view is a new place."""
+    """Pairs of times matched by a place recogniser: the best earlier match above the threshold passes on its
+    label; without one the view is a new place."""
 
     file: Path
-    """The file of pairs; every time in it is a view."""
+    """File of the pairs; every time in it is a view."""
     later: str = "t1"
     """Column of the later view's time, s."""
     earlier: str = "t2"
     """Column of the earlier view's time, s."""
     score: str = "score"
-    """Column that says how alike they are."""
+    """Column of the match score."""
     threshold: float = 0.75
-    """The least score of a match."""
+    """Smallest score of a match."""
     tolerance: float | None = Field(default=None, ge=0)
     """As for views."""
 
 
 class TruthColumns(Settings):
-    """Where the robot really was, interpolated to the odometry rows; none outside the time it spans."""
+    """True poses, interpolated to the odometry rows; none outside their time span."""
 
     file: Path | None = None
-    """Its file; none if it stands beside the odometry."""
+    """File of the true poses; null: the odometry file."""
     time: str = "t"
     """Column of the time, s, in that file."""
     x: str = "x"
@@ -95,23 +95,23 @@ class TruthColumns(Settings):
 
 
 class CsvConfig(Settings):
-    """Which column means what."""
+    """Columns of a CSV recording."""
 
     time: str = "t"
     """Column of the time, s."""
     pose: PoseColumns | None = None
-    """Odometry as poses; give either these or velocities."""
+    """Odometry as poses; give either poses or velocities."""
     velocity: VelocityColumns | None = None
     """Odometry as velocities."""
     rows: int = Field(default=3, gt=0)
-    """R, rows of a view; of the masked view, too, where there are only labels."""
+    """R, rows of a view, also of the masked view of a recording with labels only."""
     columns: int = Field(default=6, gt=0)
     """C, columns of a view."""
     views: ViewColumns | None = None
-    """Views, if there are any."""
+    """Views, if any."""
     labels: LabelColumns | None = None
-    """Place ids, if they are given."""
+    """Place labels, if any."""
     pairs: PairColumns | None = None
-    """Pairs of views found alike, to make place ids of."""
+    """Matched pairs of views, from which place labels follow."""
     truth: TruthColumns | None = None
-    """The true path, if it is known."""
+    """True poses, if known."""

@@ -1,4 +1,4 @@
-"""A CSV file of numbers under a header row, remembering which line each row came from."""
+"""A CSV file of numbers with a header row, with the line number of each row."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from robot.recordings.sanity_checks import count_others, nonfinite_errors
 from robot.sources.input_files import digest_of, missing_error, raise_errors, read_bytes
 from tactile.base.errors import InputError
 
-MAX_LISTED = 8  # faults listed one by one before the rest is only counted
+MAX_LISTED = 8  # errors listed one by one; the others are counted
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,11 +36,11 @@ class CsvFile:
         return f"{self.path}:{self.lines[row]}"
 
     def column(self, name: str) -> np.ndarray:
-        """[N] the named column, which `absences` found there."""
+        """[N] the named column, which must exist (see `absences`)."""
         return self.values[:, self.names.index(name)]
 
     def faults(self, *names: str) -> list[InputError]:
-        """Faults where a named column is empty, NaN or infinite."""
+        """Errors where a named column is empty, NaN or infinite."""
         errors = []
         for name in names:
             empty = self.empty[:, self.names.index(name)]
@@ -51,7 +51,7 @@ class CsvFile:
         return errors
 
     def absences(self, wanted: Sequence[tuple[str, str]]) -> list[InputError]:
-        """Faults for wanted (column, configuration key) that are not there."""
+        """Errors for (column, configuration key) pairs whose column is missing."""
         where = f"{self.path}:1"
         return [
             missing_error(where, "column", name, self.names, key)
@@ -60,7 +60,7 @@ class CsvFile:
         ]
 
     def numbered(self, prefix: str) -> dict[int, int]:
-        """The columns called prefix0, prefix1, ...: their numbers, increasing, and where they stand."""
+        """Columns prefix0, prefix1, ...: their numbers in increasing order, and their positions."""
         numbers = {
             int(name[len(prefix) :]): place
             for place, name in enumerate(self.names)
@@ -69,14 +69,15 @@ class CsvFile:
         return dict(sorted(numbers.items()))
 
     def block(self, prefix: str) -> tuple[np.ndarray, np.ndarray]:
-        """Those columns in the order of their numbers: values [N, B], empty [N, B]."""
+        """The numbered columns in order: values [N, B], empty [N, B]."""
         columns = list(self.numbered(prefix).values())
         return self.values[:, columns], self.empty[:, columns]
 
 
 def read_csv(path: Path) -> CsvFile:
     """Raises:
-    InputError: no such file, no header, no rows, rows of another length, cells that are no numbers.
+    InputError: the file, its header or rows are missing, or a row has another length or a cell that is not a
+    number.
     """
     content = read_bytes(path)
     try:
@@ -96,7 +97,7 @@ def read_csv(path: Path) -> CsvFile:
 
 
 def digest_of_files(files: Sequence[CsvFile]) -> str:
-    """sha256 (hex) of the files' bytes in the order they were named, each file once."""
+    """SHA-256 (hex) of the contents of the files in order, each file once."""
     return digest_of({file.path: file.content for file in files}.values())
 
 
@@ -116,7 +117,7 @@ def _header(path: Path, line: str) -> tuple[str, ...]:
 
 
 def _numbers(lines: list[str], width: int) -> np.ndarray | None:
-    """[N, C] in one go, or None where something needs a closer look."""
+    """[N, C] parsed at once, or None if a cell needs separate treatment."""
     try:
         values = np.loadtxt(lines, delimiter=",", comments=None, ndmin=2)
     except ValueError:
@@ -125,7 +126,7 @@ def _numbers(lines: list[str], width: int) -> np.ndarray | None:
 
 
 def _cells(path: Path, names: tuple[str, ...], kept: list[tuple[int, str]]) -> tuple[np.ndarray, np.ndarray]:
-    """[N, C] values and which cells are empty, cell by cell, refusing what is no number."""
+    """[N, C] values and empty flags, parsed cell by cell; raises the errors of cells that are not numbers."""
     values = np.full((len(kept), len(names)), np.nan)
     empty = np.zeros(values.shape, bool)
     errors = []
@@ -151,7 +152,7 @@ def _cells(path: Path, names: tuple[str, ...], kept: list[tuple[int, str]]) -> t
 def _split(line: str) -> list[str]:
     try:
         return next(csv.reader([line]), [])
-    except csv.Error:  # a cell beyond the module's size limit: no number in any case
+    except csv.Error:  # a cell beyond the size limit of the csv module is not a number
         return line.split(",")
 
 

@@ -1,4 +1,4 @@
-"""Plain CSV recordings: odometry in one file; views, place ids and truth in the same or in others."""
+"""CSV recordings: odometry in one file; views, place labels and truth in the same or in other files."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def read_csv_recording(path: Path, config: CsvConfig, limits: UnitLimits = DEFAU
     """A CSV recording as a `Source`: one sample per row of the odometry file.
 
     Raises:
-        InputError: files or columns missing, cells that are no numbers, or values that cannot be.
+        InputError: files or columns are missing, cells are not numbers, or values are impossible.
     """
     parts = (config.views, config.labels, config.pairs, config.truth)
     paths = [path, *(part.file for part in parts if part is not None and part.file is not None)]
@@ -68,7 +68,7 @@ def read_csv_recording(path: Path, config: CsvConfig, limits: UnitLimits = DEFAU
 
 
 def _absences(base: CsvFile, files: Mapping[Path, CsvFile], config: CsvConfig) -> list[InputError]:
-    """Columns that a configuration key names and the file lacks, and choices that were not made."""
+    """Errors for missing columns and for settings that contradict each other."""
     errors = base.absences([(config.time, "table.time")])
     if (config.pose is None) == (config.velocity is None):
         found = "neither table.pose nor table.velocity is given" if config.pose is None else "both are given"
@@ -87,7 +87,7 @@ def _absences(base: CsvFile, files: Mapping[Path, CsvFile], config: CsvConfig) -
             exclude={"file", "tolerance", "threshold", "prefix", "max_range"}, exclude_none=True
         )
         if file is base:
-            named.pop("time", None)  # there it is the odometry's
+            named.pop("time", None)  # the time of the odometry is used there
         errors += file.absences([(column, f"table.{key}.{field}") for field, column in named.items()])
         if isinstance(part, ViewColumns):
             errors += _gap(file, part.prefix)
@@ -95,7 +95,7 @@ def _absences(base: CsvFile, files: Mapping[Path, CsvFile], config: CsvConfig) -
 
 
 def _gap(file: CsvFile, prefix: str) -> list[InputError]:
-    """The fault of a view whose columns do not count up without a gap."""
+    """The error for view columns whose numbers have a gap."""
     there = list(file.numbered(prefix))
     absent = (
         next((number for number in range(there[0], there[-1]) if number not in there), None) if there else 0
@@ -108,18 +108,18 @@ def _gap(file: CsvFile, prefix: str) -> list[InputError]:
 def _motion(
     base: CsvFile, time: np.ndarray, config: CsvConfig, limits: UnitLimits
 ) -> tuple[np.ndarray, list[InputError]]:
-    """[N, 4] and the faults of its columns."""
+    """Motions [N, 4] and the errors of their columns."""
     part = config.pose or config.velocity
-    assert part is not None  # `_absences` saw to it
+    assert part is not None  # checked by `_absences`
     names = [name for name in part.model_dump().values() if name is not None]
     columns = {name: base.column(name) for name in names}
     errors = base.faults(*names)
-    with np.errstate(all="ignore"):  # faulty values were just reported
+    with np.errstate(all="ignore"):  # faulty values are already reported
         if isinstance(part, PoseColumns):
             poses = np.column_stack([columns[name] for name in names])
             if faults := heading_errors(poses[:, 2], time, part.heading, str(base.path), limits):
                 errors += faults
-                poses[:, 2] = np.deg2rad(poses[:, 2])  # or every other check would say it again
+                poses[:, 2] = np.deg2rad(poses[:, 2])  # or every other check would report it again
             return from_poses(time, poses), errors
         left = columns[part.left] if part.left is not None else 0.0
         return from_velocities(time, columns[part.forward], left, columns[part.turn]), errors

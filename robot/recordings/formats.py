@@ -1,4 +1,4 @@
-"""Which reader opens which file: the one list to add a format to."""
+"""Recording formats: the settings of a recording, and one entry per format in `FORMATS`."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ class RecordingConfig(Settings):
     """A recording to run on."""
 
     file: Path
-    """The recording: `.mcap` (ours), `.npz` (a reference stream) or `.csv` (odometry)."""
+    """The recording: `.mcap` (written by ratslam), `.npz` (reference trace) or `.csv` (odometry)."""
     table: CsvConfig = CsvConfig()
-    """For `.csv`: which column means what."""
+    """Columns of a `.csv` recording."""
     limits: UnitLimits = DEFAULT_LIMITS
-    """What the numbers may claim before they are refused as wrong units."""
+    """Limits of the unit check, beyond which a recording is refused."""
 
     def resolved(self, folder: Path) -> RecordingConfig:
-        """The same with absolute paths; relative ones start at `folder`.
+        """A copy with absolute paths; relative ones start at `folder`.
 
         One `*` in the file name of a part of the table stands for the beginning of the recording's file name:
         beside `aces_odom_gt.csv`, `*_scans.csv` is `aces_scans.csv`.
@@ -73,7 +73,6 @@ def _open_csv(config: RecordingConfig, warn: Warn) -> Source:
     return read_csv_recording(config.file, config.table, config.limits)
 
 
-# ROS bags (a folder with metadata.yaml, or .bag) go here: a reader that returns a Source, and one line.
 FORMATS: dict[str, Callable[[RecordingConfig, Warn], Source]] = {
     ".mcap": _open_mcap,
     ".npz": _open_npz,
@@ -82,13 +81,13 @@ FORMATS: dict[str, Callable[[RecordingConfig, Warn], Source]] = {
 
 
 def open_recording(config: RecordingConfig, warn: Warn = None) -> Source:
-    """The recording as a source, read by its suffix and checked as a whole.
+    """Open a recording, in the format of its suffix, and check all of it.
 
     Args:
-        warn: called with one sentence if only a part of the recording could be read.
+        warn: called with one sentence if only a part of the recording is readable.
 
     Raises:
-        InputError: no such file, a format we do not read, or faults in it.
+        InputError: the file is missing, its format is unknown, or it has errors.
     """
     opener = FORMATS.get(config.file.suffix.lower())
     if opener is None:

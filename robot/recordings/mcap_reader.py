@@ -1,4 +1,4 @@
-"""Reading our recordings, whole or cut off, and making a cut one whole again."""
+"""Reads complete and truncated MCAP recordings, copies sources to recordings and recovers truncated ones."""
 
 from __future__ import annotations
 
@@ -28,22 +28,22 @@ from tactile.base.types import Cycle, Observation, Report, Whisk
 
 
 class Recording:
-    """A recorded file as a `Source`. It is checked as a whole first, then read again sample by sample, so
-    that raw whisker recordings larger than the memory can be replayed.
+    """An MCAP recording as a `Source`. All samples are checked first; iteration then reads them one by one,
+    so that raw recordings larger than the memory can be replayed.
 
     Args:
-        path: an `.mcap` file written by `Recorder`, finished or not.
-        warn: called with one sentence if the file is cut off or damaged.
+        path: an `.mcap` file written by `Recorder`, complete or not.
+        warn: called with one sentence if the file is truncated or damaged.
 
     Attributes:
-        truncated: whether the file ends before its proper end; `length` samples are read all the same.
+        truncated: whether the file ends early; the first `length` samples are readable all the same.
         warning: that sentence, or ''.
         created_by: program and version that recorded it.
-        events: what a live session noted: faults, discontinuities, dropped images.
+        events: events of a live session: faults, discontinuities, dropped images.
         info: devices, world and origin, as stored; `raw_whiskers` is set from the readings.
 
     Raises:
-        InputError: no such recording, no sample in it that can be read, or values that cannot be.
+        InputError: the file is missing, has no readable sample, or has impossible values.
     """
 
     whiskers: int
@@ -77,18 +77,18 @@ class Recording:
         self.truncated = bool(walk.broken)
         self.warning = ""
         if self.truncated:
-            self.warning = f"{path}: {self.length} samples could be read, the rest is lost: {walk.broken}"
+            self.warning = f"{path}: {self.length} samples are readable, the rest is lost: {walk.broken}"
         time = self._check(np.frombuffer(columns).reshape(walk.count, -1), limits)
         self.rate_hz = rate_of(time) or description.rate_hz
         if self.truncated and warn is not None:
             warn(self.warning)
 
     def _check(self, columns: np.ndarray, limits: UnitLimits) -> np.ndarray:
-        """The times [N] s of the samples with odometry, after refusing what cannot be."""
+        """Times [N] s of the samples with odometry; raises the errors of all columns."""
         time, motion, truth = columns[:, 0], columns[:, 1:5], columns[:, 5:8]
         low, high, odd, told = columns[:, 8:].T
         moved = (motion != 0).any(axis=1)
-        moved[0] = True  # it sets the clock
+        moved[0] = True  # the first row sets the clock
 
         def place(row: int) -> str:
             return f"{self.path}, row {row}"
@@ -101,7 +101,7 @@ class Recording:
         back = motion[:, 3] < 0
         if back.any():
             row = int(back.argmax())
-            errors.append(InputError(place(row), f"odometry took {motion[row, 3]} s", "dt of 0 s or more"))
+            errors.append(InputError(place(row), f"odometry has dt {motion[row, 3]} s", "at least 0 s"))
         track = MotionTrack(time, moved, motion, truth if told.any() else None)
         raise_errors(errors + unit_errors(track, str(self.path), limits))
         return time[moved]
@@ -113,7 +113,9 @@ class Recording:
             if walk.count == self.length:
                 return
         raise InputError(
-            str(self.path), f"had {self.length} samples and now has {walk.count}", "a file at rest"
+            str(self.path),
+            f"had {self.length} samples and now has {walk.count}",
+            "a file that does not change while it is read",
         )
 
     def __enter__(self) -> Self:
@@ -126,10 +128,10 @@ class Recording:
 
 
 class Recovery(NamedTuple):
-    """What `recover` saved.
+    """Result of `recover`.
 
     Attributes:
-        samples: how many. truncated: whether the old file was incomplete. reason: why its reading ended.
+        samples: number of samples. truncated: whether the old file was incomplete, and reason: why.
     """
 
     samples: int
@@ -138,7 +140,7 @@ class Recovery(NamedTuple):
 
 
 def record_source(source: Source, path: Path) -> int:
-    """Write all samples of a source to a new recording; their number."""
+    """Write all samples of a source to a new recording; returns their number."""
     with Recorder(
         path,
         view_shape=source.view_shape,
@@ -152,12 +154,12 @@ def record_source(source: Source, path: Path) -> int:
 
 
 def recover(path: Path, out: Path) -> Recovery:
-    """Write every readable message of a cut or damaged recording as it is to a new, whole one.
+    """Copy every readable message of a truncated or damaged recording, unchanged, to a new, complete one.
 
-    The new file appears under its name only when it is complete. Nothing is judged but readability.
+    The new file appears under its name only when it is complete. Values are not checked.
 
     Raises:
-        InputError: nothing readable in `path`, or `out` exists.
+        InputError: `path` has no readable sample, or `out` exists.
     """
     require_file(path)
     if out.exists():
@@ -186,18 +188,21 @@ def recover(path: Path, out: Path) -> Recovery:
 
 
 def _nothing(walk: McapScanner) -> InputError:
-    """The refusal of a walked file without a description or without samples."""
+    """The error for a file without a description or without samples."""
     if walk.description is None:
-        found = f"cannot be read as a recording: {walk.broken or 'it does not say what it holds'}"
+        found = f"cannot be read as a recording: {walk.broken or 'it has no ratslam metadata'}"
         return InputError(
-            str(walk.path), found, "an MCAP file written by ratslam", "ROS bags are not read yet"
+            str(walk.path), found, "an MCAP file written by this version of ratslam", "record it again"
         )
     found = f"holds no samples{': ' + walk.broken if walk.broken else ''}"
-    return InputError(str(walk.path), found, "at least one sample", "nothing can be recovered from it")
+    return InputError(
+        str(walk.path), found, "at least one sample", "record it again: nothing can be recovered"
+    )
 
 
 def _column(sample: Sample) -> tuple[float, ...]:
-    """What is checked of a sample: time, odometry, truth, the view's extremes, any odd number, has truth."""
+    """The checked columns of a sample: time, odometry, truth, smallest and largest view value, one non-finite
+    number or 0, and whether there is a truth."""
     reading = sample.reading
     truth = (np.nan,) * 3 if sample.truth is None else sample.truth
     low = high = np.nan

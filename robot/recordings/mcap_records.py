@@ -1,7 +1,7 @@
-"""The records of an MCAP file in the order in which they were written, none of them believed.
+"""The records of an MCAP file in the order in which they were written, checked against damage.
 
-MCAP's own reader wants the table of contents at the end, which a killed writer never wrote. Lengths are
-bounded by what is left of the file, and chunks must have their checksum.
+MCAP's own reader needs the index at the end of the file, which a killed writer did not write. Lengths are
+bounded by the rest of the file, and chunks must match their checksum.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 
 from robot.recordings.cdr import Malformed
 
-CHUNK_LIMIT = 1 << 28  # bytes; ours hold 64 kB, or one sample if that is larger
+CHUNK_LIMIT = 1 << 28  # bytes; ratslam writes 64 kB, or one sample if that is larger
 
-# What the MCAP and zstd libraries, and we, raise about bytes that are not what they should be.
+# What the MCAP and zstd libraries and this package raise for damaged bytes.
 DAMAGE_ERRORS = (McapError, zstandard.ZstdError, struct.error, ValueError, OverflowError)
 
 
 class _Bounded:
-    """A file that neither pretends to be longer than it is nor hands out half of what was asked for."""
+    """A file whose `read` returns exactly the requested bytes or raises `EndOfFile`."""
 
     def __init__(self, file: IO[bytes]) -> None:
         self._file = file
@@ -36,18 +36,18 @@ class _Bounded:
             raise EndOfFile
         content = self._file.read(size)
         if len(content) != size:
-            raise EndOfFile  # it shrank while we read
+            raise EndOfFile  # the file shrank meanwhile
         self._left -= size
         return content
 
 
 def read_records(file: IO[bytes]) -> Iterator[McapRecord]:
-    """Every record in order, chunks opened; raises one of `DAMAGE_ERRORS`."""
+    """All records in order, those in chunks included; raises one of `DAMAGE_ERRORS`."""
     reader = StreamReader(cast(Any, _Bounded(file)), emit_chunks=True, validate_crcs=True)
     for record in reader.records:
         if isinstance(record, Chunk):
             yield from _opened(record)
-        elif not isinstance(record, (Message, Channel, Schema)):  # outside a chunk they have no checksum
+        elif not isinstance(record, (Message, Channel, Schema)):  # without a checksum outside a chunk
             yield record
 
 

@@ -1,7 +1,7 @@
-"""Reading a recording from its first byte to its last, or to the first that is broken.
+"""Reads a recording from its first byte to its end, or to the first damaged byte.
 
-Nothing a damaged file says is believed: messages must be what their schemas say and have their number in the
-sequence, so what is read is exactly a prefix of what was written.
+Every message must fit its schema and have the next sequence number, so that what is read of a damaged file is
+exactly a prefix of what was written.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ FORMAT = "3"
 
 
 class RecordingDescription(NamedTuple):
-    """What a recording says about itself before its first sample.
+    """The metadata of a recording.
 
     Attributes:
-        view_shape: (R, C, K). whiskers: W. rate_hz: as announced by who recorded it, 0 if unknown.
+        view_shape: (R, C, K). whiskers: W. rate_hz: nominal rate, 0 if unknown.
         created_by: program and version.
         info: devices, world and origin of the session.
     """
@@ -59,18 +59,18 @@ class RecordingDescription(NamedTuple):
 
     @classmethod
     def from_metadata(cls, data: Mapping[str, str]) -> RecordingDescription:
-        """Raises `ValueError` for anything `to_metadata` cannot have written."""
+        """Raises `ValueError` for metadata that `to_metadata` cannot have written."""
         if data.get("format") != FORMAT:
             raise Malformed(f"its format is {data.get('format')!r}, this version reads {FORMAT!r}")
         if data.get("crc32") != metadata_checksum(data):
-            raise Malformed("a description without its checksum")
+            raise Malformed("its metadata do not match their checksum")
         try:
             rows, columns, channels = (int(size) for size in data["view_shape"].split(","))
             whiskers, rate_hz = int(data["whiskers"]), float(data["rate_hz"])
             info = SourceInfo.from_json(data["info"])
             found = cls((rows, columns, channels), whiskers, rate_hz, data["created_by"], info)
         except KeyError as error:
-            raise Malformed(f"a description without {error}") from error
+            raise Malformed(f"its metadata lack {error}") from error
         sizes = (*found.view_shape, found.whiskers + 1)
         if min(sizes) < 1 or rows * columns * channels + 3 * found.whiskers > MAX_NUMBERS:
             raise Malformed(f"views of shape {found.view_shape} and {found.whiskers} whiskers")
@@ -83,12 +83,12 @@ def metadata_checksum(data: Mapping[str, str]) -> str:
 
 
 class RecordingEntry(NamedTuple):
-    """What a file holds, one after the other.
+    """One entry of a recording.
 
     Attributes:
         name: its schema. time: s, of the reading or of the newest part of a block.
-        message: as it is written. truth: the message that belongs to it, of a reading.
-        content: what it says: a sample, a head's frames, an arm's states [N], or an event.
+        message: the encoded message. truth: the encoded truth of a reading, or None.
+        content: the decoded message: a sample, frames of a head, arm states [N], or an event.
     """
 
     name: str
@@ -99,27 +99,27 @@ class RecordingEntry(NamedTuple):
 
 
 class McapScanner:
-    """One pass over a file; iterate once, over its samples or over all its `entries`.
+    """One pass over a file: iterate once, over its samples or over all its `entries`.
 
     Attributes:
-        description: None until the file's has been read.
-        broken: why the walk ended before the file's proper end; '' if it did not.
-        count: samples so far.
+        description: the metadata, None until they have been read.
+        broken: why reading ended before the end of the file, '' if it did not.
+        count: samples read so far.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.description: RecordingDescription | None = None
-        self.broken = "it was not read to its end"
+        self.broken = "it has not been read to its end"
         self.count = 0
-        self._number = 0  # of the next message; a truth has its reading's
+        self._number = 0  # of the next message; a truth has the number of its reading
         self._window: FrameWindow | None = None
 
     def __iter__(self) -> Iterator[Sample]:
         return (entry.content for entry in self.entries() if isinstance(entry.content, Sample))
 
     def entries(self) -> Iterator[RecordingEntry]:
-        """Samples and what was written beside them, in their order."""
+        """All samples and other entries, in their order."""
         try:
             with self.path.open("rb") as file:
                 yield from self._entries(file)
@@ -128,7 +128,7 @@ class McapScanner:
 
     def _entries(self, file: IO[bytes]) -> Iterator[RecordingEntry]:
         schemas: dict[int, Schema] = {}
-        names: dict[int, str] = {}  # of channels told; '': not one of ours
+        names: dict[int, str] = {}  # schema of each channel; '': not a ratslam topic
         truth: bytes | None = None
         try:
             for record in read_records(file):
@@ -143,9 +143,9 @@ class McapScanner:
                     if not name:
                         continue
                     if self.description is None:
-                        raise Malformed("a sample before the recording's description")
+                        raise Malformed("a message before the metadata")
                     if record.sequence != self._number % (1 << 32):
-                        raise Malformed(f"message {record.sequence} where {self._number} was due")
+                        raise Malformed(f"message {record.sequence} where {self._number} was expected")
                     if name == TRUTH:
                         decode_truth(record.data)
                         truth = record.data
@@ -196,17 +196,18 @@ class McapScanner:
         return self._window
 
     def _compare(self, statistics: Statistics, names: Mapping[int, str]) -> None:
-        """A chunk whose very type is damaged is passed over as unknown: then the numbers differ."""
+        """Compare counts: a chunk with a damaged type is skipped as an unknown record, so messages are
+        missing."""
         counts = statistics.channel_message_counts
         others = {channel for channel, name in names.items() if name in ("", TRUTH)}
         written = sum(count for channel, count in counts.items() if channel not in others)
         if written != self._number:
-            raise Malformed(f"{self._number} samples and blocks where {written} were written")
+            raise Malformed(f"{self._number} messages where {written} were written")
 
 
 def _known(channel: Channel, schemas: Mapping[int, Schema]) -> str:
-    """The schema of a topic of ours; raises `Malformed` for one that other versions wrote."""
+    """The schema name of a ratslam topic; raises `Malformed` if another version defined it differently."""
     name, schema = SCHEMA_OF[channel.topic], schemas.get(channel.schema_id)
     if schema is None or schema.data != SCHEMAS[name].encode():
-        raise Malformed(f"messages on {channel.topic} that are defined otherwise than here")
+        raise Malformed(f"messages on {channel.topic} with another definition than this version's")
     return name

@@ -1,6 +1,6 @@
-"""A recording being written: an MCAP file that stays readable when the process is killed or the disk is full.
+"""Writes MCAP files that stay readable when the process is killed or the disk is full.
 
-zstd-compressed chunks with checksums, each handed to the operating system as a whole.
+Chunks are zstd-compressed, have checksums, and reach the operating system as a whole.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from tactile.base.errors import InputError
 
 
 class RecordingWriteError(InputError):
-    """The operating system takes no more of a recording."""
+    """The operating system refuses to write to a recording."""
 
     def __init__(self, path: Path, error: OSError) -> None:
-        cure = "free room on the disk; what was written until then can be read"
-        super().__init__(str(path), f"cannot be written on ({error.strerror or error})", "", cure)
+        cure = "free space on the disk; the file is readable up to here"
+        super().__init__(str(path), f"cannot be written any further ({error.strerror or error})", "", cure)
 
 
 class McapWriter:
@@ -32,13 +32,13 @@ class McapWriter:
 
     Args:
         path: must not exist yet.
-        view_shape, whiskers: of every sample. rate_hz: how fast they come, if known; for readers' eyes only.
+        view_shape, whiskers: of every sample. rate_hz: nominal rate, 0 if unknown; for information.
         info: devices, world and origin; stored at the start of the file, so that a truncated one has it.
-        chunk_bytes: a chunk is written when it is so large, before compression,
-        chunk_s: or when its last message's time is so many seconds off the last one's of the chunk before.
+        chunk_bytes, chunk_s: a chunk is written when it has this size before compression, or when the time of
+            its last message differs from that of the chunk before by this many seconds.
 
     Attributes:
-        count: readings so far.
+        count: readings written so far.
 
     Raises:
         InputError: the file exists or cannot be made.
@@ -86,10 +86,10 @@ class McapWriter:
         self.flush()
 
     def append(self, name: str, time: float, message: bytes) -> None:
-        """Append a message of that schema; the truth of a reading goes before it.
+        """Append a message with that schema; the truth of a reading precedes it.
 
         Raises:
-            Unwritable: the operating system takes no more.
+            RecordingWriteError: the operating system refuses to write.
         """
         # MCAP's clock has no negative times.
         stamp = min(max(round(time * 1e9), 0), (1 << 63) - 1) if np.isfinite(time) else 0
@@ -104,10 +104,10 @@ class McapWriter:
             self._flushed = time
 
     def flush(self) -> None:
-        """Hand everything so far to the operating system.
+        """Hand all messages so far to the operating system.
 
         Raises:
-            Unwritable: it does not take it.
+            RecordingWriteError: the operating system refuses to write.
         """
         try:
             self._writer.flush()
@@ -117,10 +117,11 @@ class McapWriter:
         self._pending = 0
 
     def close(self) -> None:
-        """Finish the file; closing twice is fine. What was unwritable before is tried once more, silently.
+        """Finish the file; may be called again. A rest that could not be written before is tried once more,
+        without an error.
 
         Raises:
-            Unwritable: the operating system does not take the rest.
+            RecordingWriteError: the operating system refuses to write the rest.
         """
         if self._file.closed:
             return
@@ -141,7 +142,7 @@ class McapWriter:
 
 
 class _Whole:
-    """A new file that is written at `flush`, all of what is waiting or nothing."""
+    """A new file that is written at `flush`: all waiting bytes or none."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("xb", buffering=0)

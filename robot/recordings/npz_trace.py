@@ -1,12 +1,12 @@
-"""The reference streams: one `.npz` a run, with the inputs that were given to OpenRatSLAM.
+"""Reference traces: `.npz` files with the inputs of OpenRatSLAM sessions.
 
 Arrays, N rows: `in_t` s, `in_v` m/s, `in_w` rad/s, `in_flags` (1 = the row has a view, 2 = it has odometry,
 3 = both), `in_view` (a template, row-major [rows, columns], or two columns: place id and relative angle),
 `truth` [N, 3] (x m, y m, heading rad; optional) and `params_json` (a JSON object; its `template_y_size` and
-`template_x_size` give the template's shape). Values of a row that its flag does not announce are ignored.
+`template_x_size` are the shape of a template). Values that the flag of a row does not announce are ignored.
 
-A row's speed is driven along the heading *after* its turn, as OpenRatSLAM does. The first odometry row only
-sets the clock; a row without odometry does not advance it.
+Motion is along the heading after the turn of a row, as in OpenRatSLAM. The first odometry row only sets the
+clock; a row without odometry does not advance it.
 """
 
 from __future__ import annotations
@@ -31,16 +31,17 @@ VIEW, ODOMETRY = 1, 2
 COLUMNS = ("in_t", "in_v", "in_w", "in_flags")
 NEEDED = (*COLUMNS, "in_view", "params_json")
 
-# What NumPy and zipfile raise about a file that is damaged, cut off or something else altogether.
+# What NumPy and zipfile raise for a file that is damaged, truncated or of another type.
 _BROKEN = (zipfile.BadZipFile, zlib.error, ValueError, LookupError, EOFError, OSError, MemoryError,
            RuntimeError, SyntaxError)  # fmt: skip
 
 
 def read_trace(path: Path, limits: UnitLimits = DEFAULT_LIMITS) -> InMemorySource:
-    """A reference stream as a `Source`; `info.provenance["parameters"]` holds its parameters.
+    """Read a reference trace; `info.provenance["parameters"]` holds its parameters.
 
     Raises:
-        InputError: not such a file, arrays missing or of the wrong shape, or values that cannot be.
+        InputError: the file is not readable, arrays are missing or have a wrong shape, or values are
+            impossible.
     """
     content = read_bytes(path)
     arrays = _arrays(path, content)
@@ -104,7 +105,7 @@ def _value_errors(
 
 
 def _arrays(path: Path, content: bytes) -> dict[str, np.ndarray]:
-    """The arrays we know of, by name."""
+    """The known arrays by name."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             there = [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
@@ -115,17 +116,17 @@ def _arrays(path: Path, content: bytes) -> dict[str, np.ndarray]:
         raise
     except _BROKEN as error:
         cut = content.startswith(b"PK") and isinstance(error, zipfile.BadZipFile)
-        cure = "it seems cut off or damaged: copy it again" if cut else "write it with numpy.savez"
+        cure = "it seems truncated or damaged: copy it again" if cut else "write it with numpy.savez"
         raise InputError(str(path), f"cannot be read as .npz ({error})", "a NumPy archive", cure) from error
 
 
 def _array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
-    """One array; its checksum is verified before NumPy sees it, and nothing pickled is ever loaded."""
+    """One array; its checksum is verified first, and pickled objects are refused."""
     return np.lib.format.read_array(io.BytesIO(archive.read(f"{name}.npy")), allow_pickle=False)
 
 
 def _shape_errors(path: Path, arrays: dict[str, np.ndarray]) -> list[InputError]:
-    """Wrong dtypes, dimensions and lengths, and no rows at all."""
+    """Errors of dtypes, dimensions and lengths, and of an empty trace."""
     rows = arrays["in_t"].size
     wanted: dict[str, tuple[str, ...]] = {name: ("N",) for name in COLUMNS} | {"in_view": ("N", "V")}
     if "truth" in arrays:
@@ -145,11 +146,11 @@ def _shape_errors(path: Path, arrays: dict[str, np.ndarray]) -> list[InputError]
 
 
 def _params(path: Path, text: np.ndarray) -> dict[str, float | int | str]:
-    """The parameters, numeric text made numbers."""
+    """The parameters, numeric text converted to numbers."""
     try:
         params = json.loads(str(text[()]))
     except (ValueError, RecursionError) as error:
-        raise InputError(str(path), f"params_json is no JSON ({error})", "a JSON object") from error
+        raise InputError(str(path), f"params_json is not JSON ({error})", "a JSON object") from error
     if not isinstance(params, dict):
         raise InputError(str(path), f"params_json holds {type(params).__name__}", "a JSON object")
     return {key: _number(value) for key, value in params.items()}
@@ -176,7 +177,7 @@ def _number(value: object) -> float | int | str:
 
 
 def _view_shape(path: Path, params: dict, width: int) -> tuple[tuple[int, int, int], bool]:
-    """(R, C, 1), and whether `in_view` holds place ids instead of templates that are so large."""
+    """(R, C, 1), and whether `in_view` holds place labels instead of templates of that shape."""
     where = f"{path}: params_json"
     size = []
     for name in ("template_y_size", "template_x_size"):
@@ -184,7 +185,7 @@ def _view_shape(path: Path, params: dict, width: int) -> tuple[tuple[int, int, i
             raise missing_error(where, "key", name, list(params))
         value = params[name]
         if not isinstance(value, int) or not 0 < value < 10_000:
-            raise InputError(where, f"{name} is {value!r}", "a whole number of pixels")
+            raise InputError(where, f"{name} is {value!r}", "an integer number of pixels below 10000")
         size.append(value)
     rows, columns = size
     if width not in (rows * columns, 2):
@@ -204,13 +205,13 @@ def _flag_errors(flags: np.ndarray, place: RowName) -> list[InputError]:
 
 
 def _id_errors(view: np.ndarray, seen: np.ndarray, place: RowName) -> list[InputError]:
-    """Ids are small whole numbers, and the heading of a match is not ours to use."""
+    """Errors of place labels, which are integers; relative angles of matches are not supported."""
     ids, relative = np.nan_to_num(view).T
     errors = []
     bad = seen & ((ids < 0) | (ids != np.round(ids)) | (ids > np.iinfo(np.int32).max))
     if bad.any():
         row = int(bad.argmax())
-        errors.append(InputError(place(row), f"in_view's place id is {ids[row]}", "a whole number from 0"))
+        errors.append(InputError(place(row), f"in_view's place id is {ids[row]}", "an integer from 0"))
     turned = seen & (relative != 0)
     if turned.any():
         row = int(turned.argmax())

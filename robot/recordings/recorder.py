@@ -1,4 +1,4 @@
-"""Writing samples to a recording."""
+"""Writes samples to a recording."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tactile.base.errors import InputError
 class Recorder:
     """Writes samples to a new file; a context manager.
 
-    Args: see `Tape`.
+    Args: see `McapWriter`.
 
     Raises:
         InputError: the file exists or cannot be made.
@@ -56,19 +56,21 @@ class Recorder:
         """Append a sample.
 
         Raises:
-            InputError: a shape, dtype or time that the recording cannot hold; nothing is written then. Or the
-                disk is full.
+            InputError: a shape, dtype or time that the recording cannot hold (nothing is written then), or
+                the disk is full.
         """
         if not np.isfinite(sample.time):
             raise InputError("time", f"{sample.time}", "a finite number of seconds")
         described = self._tape.description
         name, message = encode(sample, described.view_shape, described.whiskers)
-        if sample.truth is not None:  # first, so that a reading that survives has its truth
+        if (
+            sample.truth is not None
+        ):  # before its reading, so that no truncated file has a reading without its truth
             self._tape.append(TRUTH, sample.time, encode_truth(sample.time, sample.truth))
         self._tape.append(name, sample.time, message)
 
     def flush(self) -> None:
-        """Hand everything so far to the operating system."""
+        """Hand all samples so far to the operating system."""
         self._tape.flush()
 
     def close(self) -> None:

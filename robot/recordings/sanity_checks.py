@@ -1,8 +1,8 @@
-"""Row by row: is every number finite, every time later than the one before, every view in 0..1?
+"""Checks of rows: numbers are finite, times increase, view values are in 0..1.
 
-Asked of a whole recording before anything is run on it. Each check returns the faults it found and never
-raises, so that a reader can report all of them at once. Non-finite values are one check's business; the
-others look past them. Whether the units can be right is asked in `robot.recordings.unit_check`.
+A whole recording is checked before it is used. Each check returns its errors instead of raising them, so
+that a reader can report all at once. Only `nonfinite_errors` reports non-finite values; the other checks
+ignore them. For units see `robot.recordings.unit_check`.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ import numpy as np
 
 from tactile.base.errors import InputError
 
-RowName = Callable[[int], str]  # where a row stands in the user's file
+RowName = Callable[[int], str]  # position of a row in the user's file, for errors
 
 
 def nonfinite_errors(
     values: np.ndarray, what: str, place: RowName, rows: np.ndarray | None = None
 ) -> list[InputError]:
-    """Faults where values [N, ...] of the given rows [N] bool are NaN or infinite."""
+    """Errors where values [N, ...] in the given rows [N] bool (default all) are NaN or infinite."""
     flat = values.reshape(len(values), -1)
     bad = ~np.isfinite(flat)
     hit = bad.any(axis=1) if rows is None else bad.any(axis=1) & rows
@@ -27,13 +27,13 @@ def nonfinite_errors(
         return []
     row = int(hit.argmax())
     found = f"{what} is {flat[row][bad[row]][0]}{count_others(hit)}"
-    return [InputError(place(row), found, "a finite number", "mend or drop the row")]
+    return [InputError(place(row), found, "a finite number", "correct or drop the row")]
 
 
 def clock_errors(
     time: np.ndarray, what: str, place: RowName, moved: np.ndarray | None = None
 ) -> list[InputError]:
-    """Faults where time [N] s goes back, or where two rows with odometry (`moved` [N]; all) share one."""
+    """Errors where time [N] s decreases, or is equal in two rows with odometry (`moved` [N], default all)."""
     errors = []
     rows = np.flatnonzero(np.isfinite(time))
     back = np.diff(time[rows]) < 0
@@ -53,7 +53,7 @@ def clock_errors(
 
 
 def view_errors(low: np.ndarray, high: np.ndarray, what: str, place: RowName) -> list[InputError]:
-    """Faults where a view's smallest and largest values [N] leave 0..1; NaN stands for no view."""
+    """Errors where the smallest or largest view value [N] is outside 0..1; NaN means no view."""
     hit = (low < 0) | (high > 1)
     if not hit.any():
         return []
@@ -65,6 +65,6 @@ def view_errors(low: np.ndarray, high: np.ndarray, what: str, place: RowName) ->
 
 
 def count_others(hit: np.ndarray) -> str:
-    """' (and ...)' for the rows [N] bool after the first one told; '' when there are none."""
+    """Text ' (and ...)' that counts the rows [N] bool after the first one; '' if there are none."""
     others = int(hit.sum()) - 1
     return f" (and so in {others} more row{'s' * (others > 1)})" if others else ""

@@ -1,6 +1,6 @@
-"""What the messages of a recording hold, as ROS 2 defines messages; these texts are stored in every file.
+"""ROS 2 definitions of the messages in a recording; every file stores these texts.
 
-Fields are ordered so that CDR's alignment never needs padding.
+Fields are ordered so that CDR needs no padding. A changed text, even in a comment, is another format.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ string event        # its name, ': ', what was found
 }
 (OBSERVATION, CYCLE, WHISK, REPORT, TRUTH, CUT, FRAMES, ARM, EVENT) = SCHEMAS
 READINGS = (OBSERVATION, CYCLE, WHISK, REPORT, CUT)
-"""What a sample is made of; the others stand beside them."""
+"""Messages that make a sample."""
 TOPICS = {
     OBSERVATION: "/ratslam/observation",
     CYCLE: "/ratslam/cycle",

@@ -1,10 +1,10 @@
-"""Can a recording be in seconds, metres and radians? Judged by what most of the motion does.
+"""Checks whether a recording is in seconds, metres and radians, from most of its motion.
 
-The *typical* speed is the one above which half of the path was covered, the typical turn rate the one above
-which half of all turning was done. Standing still and sensor noise weigh nothing in them, and the two
-fastest steps have no vote, so that a single glitch decides nothing. A robot given in millimetres drives a
-thousand times too fast; one given in degrees turns 57 times too fast, unless it is very slow: then only a
-truth to compare with can tell.
+The typical speed is the one above which half of the path was covered; the typical turn rate the one above
+which half of all turning was done. Standing still and sensor noise do not affect them, and the two fastest
+steps are ignored, so that a single glitch has no effect. Data in millimetres are a thousand times too fast,
+data in degrees turn 57 times too fast. Of a very slow robot this is detectable only by comparison with the
+truth.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from pydantic import Field
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
 
-GLITCHES = 2  # fastest steps without a vote
-PAUSE = 1000.0  # median steps: a longer one is a fault of the clock, no motion to judge
-RATIO = 30.0  # odometry : truth, either way; real ones are near 1, a wrong unit makes it 57 or 1000
-LEAST, MOST = 0.3, 5.0  # m or rad: the smaller and the larger total below which a ratio says nothing
-RULER = 0.05  # m: the truth's path is measured in steps of at least this, or its noise would add up
-STRETCHES = 50  # turning is compared net over so many, or its noise would add up
+GLITCHES = 2  # number of fastest steps that are ignored
+PAUSE = 1000.0  # median steps: a longer step is an error of the clock and is ignored
+RATIO = 30.0  # of odometry and truth; correct data are near 1, a wrong unit gives 57 or 1000
+LEAST, MOST = 0.3, 5.0  # m or rad: smaller and larger total below which the ratio is not judged
+RULER = 0.05  # m: smallest step in measuring the true path, so that noise does not add up
+STRETCHES = 50  # net turning is compared over this many, so that noise does not add up
 
 
 class UnitLimits(Settings):
-    """What a recording may claim before it is refused. Raise a limit if your robot really does that."""
+    """Limits of the unit check. Raise one if your robot really exceeds it."""
 
     speed: float = Field(default=25.0, gt=0)
-    """Fastest typical speed, m/s: a car in town does 15, a 30 mm/s arm taken for m/s does 30."""
+    """Largest typical speed, m/s: a car in town drives 15; an arm of 30 mm/s, read as m/s, 30."""
     turn_rate: float = Field(default=6.0, gt=0)
-    """Fastest typical turn rate, rad/s: robots do 0.2 to 1, which in degrees is 11 to 57."""
+    """Largest typical turn rate, rad/s: robots turn at 0.2 to 1, which in degrees is 11 to 57."""
     interval: float = Field(default=60.0, gt=0)
     """Longest median step, s: 100 ms taken for seconds is 100."""
 
@@ -40,10 +40,10 @@ DEFAULT_LIMITS = UnitLimits()
 
 
 class MotionTrack(NamedTuple):
-    """The part of a recording that units can be judged by.
+    """The part of a recording from which units are judged.
 
     Attributes:
-        time: [N] s. moved: [N] rows that carry odometry. motion: [N, 4] (dx m, dy m, dtheta rad, dt s).
+        time: [N] s. moved: [N] rows with odometry. motion: [N, 4] (dx m, dy m, dtheta rad, dt s).
         truth: [N, 3] (x m, y m, heading rad), NaN where unknown; or None.
     """
 
@@ -54,12 +54,12 @@ class MotionTrack(NamedTuple):
 
 
 class TypicalMotion(NamedTuple):
-    """How a robot moves most of the time.
+    """Typical motion of a robot.
 
     Attributes:
         interval: median time between rows, s. speed: m/s. turn_rate: rad/s. turn: rad in one step.
-        true_speed: the truth's, m/s. path, turning: (odometry's, truth's) totals, m and net rad.
-            NaN without a truth.
+        true_speed: of the truth, m/s. path, turning: totals (odometry, truth), m and net rad. NaN without
+            truth.
     """
 
     interval: float
@@ -72,7 +72,7 @@ class TypicalMotion(NamedTuple):
 
 
 def typical_motion(track: MotionTrack) -> TypicalMotion:
-    """How the robot of this track moves; faulty rows are looked past."""
+    """The typical motion in a track; rows with errors are ignored."""
     steps = np.diff(track.time[track.moved & np.isfinite(track.time)])
     interval = float(np.median(steps)) if len(steps) else 0.0
     dt = track.motion[:, 3]
@@ -91,9 +91,10 @@ def typical_motion(track: MotionTrack) -> TypicalMotion:
 
 
 def unit_errors(track: MotionTrack, where: str, limits: UnitLimits = DEFAULT_LIMITS) -> list[InputError]:
-    """Faults of the recording as a whole: times not in s, motion not in m or rad, odometry unlike truth.
+    """Errors of a whole recording: times not in s, motion not in m or rad, odometry that disagrees with
+    truth.
 
-    Each cause is told once: the truth is asked only about what nothing else has shown to be wrong.
+    Each cause is reported once: the truth is compared only where no other check has found an error.
     """
     errors = []
     if track.truth is not None:
@@ -151,11 +152,11 @@ def _unit_faults(robot: TypicalMotion, limits: UnitLimits) -> tuple[tuple[bool, 
 def heading_errors(
     heading: np.ndarray, time: np.ndarray, what: str, where: str, limits: UnitLimits = DEFAULT_LIMITS
 ) -> list[InputError]:
-    """Faults of a heading column [N] that must be degrees: wider than a turn, too fast for radians."""
+    """Errors of a heading column [N] that must be in degrees: wider than a turn and too fast for radians."""
     good = np.isfinite(heading) & np.isfinite(time)
     heading, dt = heading[good], np.diff(time[good])
     if not len(heading) or np.abs(heading).max() <= 2 * np.pi + 0.1:
-        return []  # wrapped radians, or so few degrees that nobody could tell
+        return []  # wrapped radians, or too few degrees to decide
     turn = np.abs(np.diff(heading))
     turn = np.minimum(turn, np.abs(360 - turn))[dt > 0]
     rate = _typical(turn, dt[dt > 0])
@@ -166,7 +167,7 @@ def heading_errors(
 
 
 def _typical(amount: np.ndarray, duration: np.ndarray) -> float:
-    """The rate above which half of the total amount [N] was done."""
+    """The rate above which half of the total amount [N] falls."""
     rate = amount / duration
     order = np.argsort(rate)[: max(len(rate) - GLITCHES, 0)]
     done = np.cumsum(amount[order])
@@ -176,7 +177,7 @@ def _typical(amount: np.ndarray, duration: np.ndarray) -> float:
 def _beside_truth(
     track: MotionTrack, good: np.ndarray
 ) -> tuple[float, tuple[float, float], tuple[float, float]]:
-    """The truth's speed; path and net turning of odometry and truth where there is a truth, else NaN."""
+    """Speed of the truth; path and net turning of odometry and truth. NaN without truth."""
     nothing = np.nan, (np.nan, np.nan), (np.nan, np.nan)
     if track.truth is None:
         return nothing
@@ -194,7 +195,7 @@ def _beside_truth(
 
 
 def _ruled(points: np.ndarray) -> np.ndarray:
-    """Lengths of the steps in which a ruler of length `RULER` is laid along the points [N, 2]."""
+    """Lengths of steps of at least `RULER` along the points [N, 2]."""
     steps, last = [0.0], complex(*points[0])
     for point in (points[:, 0] + 1j * points[:, 1]).tolist():
         if (step := abs(point - last)) >= RULER:
@@ -208,7 +209,7 @@ def _most_of(amounts: np.ndarray) -> float:
 
 
 def _unlike(a: float, b: float) -> bool:
-    """Odometry drifts by some per cent; a factor beyond `RATIO` is a unit. NaN is like everything."""
+    """Whether two totals differ by more than `RATIO`, as with a wrong unit; never for NaN."""
     least, most = min(a, b), max(a, b)
     return least > LEAST and most > MOST and most > RATIO * least
 

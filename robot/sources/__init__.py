@@ -1,1 +1,1 @@
-"""What a source of samples is, and sources held in memory."""
+"""The interface of all sources of readings, and sources in memory."""

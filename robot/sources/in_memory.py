@@ -1,4 +1,4 @@
-"""A recording held in memory as columns; its samples are made as they are asked for."""
+"""A source held in memory as columns; samples are built during iteration."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ class InMemorySource:
 
     Attributes:
         time: [N] s. motion: [N, 4] (dx m, dy m, dtheta rad, dt s) since the row before.
-        moved: [N] whether the row carries odometry (else its motion is zero).
-        views: [N, R, C, K] in 0..1, zero where not seen. seen: [N] whether there is a view.
-        label: [N] given place id, -1 for none.
-        truth: [N, 3] (x m, y m, heading rad), a row of NaN where unknown; None when nowhere known.
+        moved: [N] whether the row has odometry (otherwise its motion is zero).
+        views: [N, R, C, K] in 0..1, zero without a view. seen: [N] whether there is a view.
+        label: [N] given place label, -1 for none.
+        truth: [N, 3] (x m, y m, heading rad), rows of NaN where unknown; None if never known.
         info: devices, world and origin.
         alive: [W] whether each whisker works; empty for cameras, lasers and given labels.
     """
@@ -43,7 +43,7 @@ class InMemorySource:
     alive: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
 
     def __post_init__(self) -> None:
-        self.views.flags.writeable = False  # samples hand out slices of it
+        self.views.flags.writeable = False  # samples share slices of it
 
     @property
     def rate_hz(self) -> float:
@@ -92,18 +92,21 @@ class InMemorySource:
 
 
 def load_into_memory(source: Source) -> InMemorySource:
-    """A source of observations as a whole in memory; where whiskers touched is not kept.
+    """A source of observations, read into memory; contact points are not kept.
 
     Raises:
-        InputError: it holds whiskers that nobody has made observations of, or whiskers that died on the way.
+        InputError: some readings are whisker data, there are no samples, or a whisker changes its `alive`
+            flag.
     """
     samples = list(source)
     readings = [sample.reading for sample in samples if isinstance(sample.reading, Observation)]
     if len(readings) < len(samples) or not samples:
-        raise InputError(source.name, "nothing but whiskers" if samples else "no samples", "observations")
+        raise InputError(source.name, "whisker readings" if samples else "no samples", "observations")
     alive = readings[0].alive
     if any((reading.alive != alive).any() for reading in readings):
-        raise InputError(source.name, "whiskers that come alive or die", "a head that stays the same")
+        raise InputError(
+            source.name, "whiskers whose `alive` flag changes", "a constant flag for each whisker"
+        )
     unknown = np.full(3, np.nan)
     truth = np.array([unknown if sample.truth is None else sample.truth for sample in samples])
     return InMemorySource(

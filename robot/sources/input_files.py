@@ -1,4 +1,4 @@
-"""Reading what a user names: one clear error for every way in which a file can be absent or unusable."""
+"""Reading files named by the user, with one clear error for each way in which a file is unusable."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tactile.base.errors import InputError, InputErrors
 
 def require_file(path: Path) -> None:
     """Raises:
-    InputError: nothing there, not a regular file, not readable, or empty.
+    InputError: the file is missing, not a regular file, not readable, or empty.
     """
     try:
         if path.is_dir():
@@ -29,13 +29,13 @@ def require_file(path: Path) -> None:
 
 
 def unreadable_error(path: Path, error: OSError) -> InputError:
-    """The operating system's refusal in our words."""
+    """An `InputError` for an error of the operating system."""
     cure = "make it readable for this user" if isinstance(error, PermissionError) else ""
     return InputError(str(path), f"cannot be read ({error.strerror or error})", cure=cure)
 
 
 def read_bytes(path: Path) -> bytes:
-    """The whole content of a file, at least one byte.
+    """The content of a file, at least one byte.
 
     Raises:
         InputError: see `require_file`.
@@ -48,7 +48,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def digest_of(contents: Iterable[bytes]) -> str:
-    """sha256 (hex) of all contents, in order."""
+    """SHA-256 (hex) of the concatenated contents."""
     total = hashlib.sha256()
     for content in contents:
         total.update(content)
@@ -56,12 +56,11 @@ def digest_of(contents: Iterable[bytes]) -> str:
 
 
 def missing_error(where: str, kind: str, name: str, there: Sequence[str], key: str = "") -> InputError:
-    """The error about something a file does not hold: says what is there and what may have been meant.
+    """The error for a name that a file lacks; it lists the existing names and suggests a similar one.
 
     Args:
-        kind: what is missing, 'column' or 'array'.
-        there: the names that exist.
-        key: the configuration key that named it, if any.
+        kind: what is missing, such as 'column' or 'array'. there: the existing names.
+        key: configuration key in which the name was given, if any.
     """
     close = get_close_matches(name, there, n=1)
     cure = f"did you mean {close[0]!r}?" if close else (f"name the {kind} with {key}" if key else "")
@@ -69,7 +68,7 @@ def missing_error(where: str, kind: str, name: str, there: Sequence[str], key: s
 
 
 def raise_errors(errors: Sequence[InputError]) -> None:
-    """Raise what was found: nothing, the one error, or all of them together."""
+    """Raise the error, or all errors together as `InputErrors`; do nothing without any."""
     if len(errors) == 1:
         raise errors[0]
     if errors:
@@ -85,5 +84,5 @@ def _neighbours(path: Path) -> str:
     try:
         close = get_close_matches(path.name, [other.name for other in path.parent.iterdir()], n=1)
     except OSError:
-        return f"there is no folder {path.parent} either"
+        return f"the folder {path.parent} does not exist"
     return f"did you mean {close[0]!r}?" if close else ""

@@ -1,7 +1,7 @@
-"""Body-frame motions: of what robots log, velocities or poses, and of what a simulated one believes.
+"""Body-frame motion from logged velocities or poses, and simulated odometry errors.
 
-A motion is a row (dx m, dy m, dtheta rad, dt s), the pose after a step in the frame of the pose before
-it. The first row of a log only sets the clock: its motion is zero and took no time.
+A motion is a row (dx m, dy m, dtheta rad, dt s): the pose after a step in the frame of the pose before it.
+The first row only sets the clock: its motion and duration are zero.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from robot.sources.source import Source
 from tactile.base.config import Settings
 from tactile.base.se2 import between, integrate, wrap
 
-TURN_THEN_MOVE = 1.0  # OpenRatSLAM: turn first, then move
-MIDPOINT = 0.5  # second order: exact to O(turn^2) for a constant twist over the step
+TURN_THEN_MOVE = 1.0  # share of the turn before the robot moves: all of it, as in OpenRatSLAM
+MIDPOINT = 0.5  # half of it: second order, exact to O(turn^2) for a constant twist
 DRIVING_SPEED = 1e-3
-"""m/s above which a robot is driving."""
+"""Speed above which a robot counts as driving, m/s."""
 TURNING_RATE = 0.06
-"""rad/s above which it is turning."""
+"""Turn rate above which a robot counts as turning, rad/s."""
 
 
 def from_velocities(
@@ -30,12 +30,12 @@ def from_velocities(
     turn: np.ndarray,
     heading: float = MIDPOINT,
 ) -> np.ndarray:
-    """Motions [N, 4] of a robot that had row i's velocities since row i - 1.
+    """Motions [N, 4] for velocities that hold from row i - 1 to row i.
 
     Args:
         time: [N] s. forward, left: [N] m/s in the body frame. turn: [N] rad/s, counter-clockwise.
-        heading: the share of the step's turn made before the robot moves: `MIDPOINT`, or
-            `TURN_THEN_MOVE` as in OpenRatSLAM.
+        heading: share of the step's turn made before the robot moves, `MIDPOINT` or
+            `TURN_THEN_MOVE`.
     """
     dt = np.diff(time, prepend=time[:1])
     dtheta = turn * dt
@@ -44,27 +44,27 @@ def from_velocities(
 
 
 def from_poses(time: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """Motions [N, 4] between successive poses [N, 3] of a world frame, the sideways part kept."""
+    """Motions [N, 4] between successive poses [N, 3] of a world frame, including sideways motion."""
     steps = between(poses[:-1], poses[1:])
     return np.column_stack([np.vstack([np.zeros((1, 3)), steps]), np.diff(time, prepend=time[:1])])
 
 
 class OdometryConfig(Settings):
-    """Errors of the UR-10's odometry (Salman & Pearson 2016, III-C, where their structure is left open)."""
+    """Odometry errors of the UR-10 (Salman & Pearson 2016, III-C, which leaves their structure open)."""
 
     noise: Literal["white", "gated", "telescoping", "none"] = "gated"
-    """`white`: in every sample; `gated`: only along what moves; `telescoping`: of the poses, so that it does
-    not add up (jitter of time stamps)."""
+    """`white`: in every sample; `gated`: only in the part (forward, turn) that moves; `telescoping`: of the
+    poses, so that errors do not accumulate, as with time stamp jitter."""
     rate: PositiveFloat = 1.0
-    """Samples per second."""
+    """Odometry samples per second."""
     length: NonNegativeFloat = 8.2e-3
-    """Standard deviation of a sample, m."""
+    """Standard deviation of the forward motion in a sample, m."""
     heading: NonNegativeFloat = 0.103
-    """Of its turn, rad."""
+    """Standard deviation of the turn in a sample, rad."""
     length_bias: NonNegativeFloat = 0.0
-    """Standard deviation of a scale error of all lengths of a run, as a share."""
+    """Standard deviation of one scale error of all lengths in a session, as a fraction."""
     heading_bias: NonNegativeFloat = 0.0
-    """Of a heading error that grows with the way in a run, rad/m."""
+    """Standard deviation of one heading error per distance in a session, rad/m."""
 
 
 def simulate_odometry(
@@ -72,18 +72,18 @@ def simulate_odometry(
     time: np.ndarray,
     pose: np.ndarray,
     random: np.random.Generator,
-    carried: np.ndarray | None = None,
+    kidnapped: np.ndarray | None = None,
 ) -> np.ndarray:
-    """[N, 4] (dx m, dy m, dtheta rad, dt s) since the row before, as the odometry tells it.
+    """[N, 4] odometry (dx m, dy m, dtheta rad, dt s) since the row before, with errors.
 
     Args:
-        time: [N] s. pose: [N, 3] true, headings not wrapped. carried: [N] bool, the robot was carried since
-            the row before, unknown to its odometry: told is the motion of the row before that.
+        time: [N] s. pose: [N, 3] true poses, headings not wrapped. kidnapped: [N] bool, the robot was moved
+            by hand since the row before; its odometry then repeats the motion of the row before.
     """
     motion = between(pose[:-1], pose[1:])
     motion[:, 2] = np.diff(pose[:, 2])
-    if carried is not None:
-        for row in np.flatnonzero(carried[1:]):
+    if kidnapped is not None:
+        for row in np.flatnonzero(kidnapped[1:]):
             motion[row] = motion[row - 1] if row else 0.0
     scale = 1 + config.length_bias * random.standard_normal()
     bent = config.heading_bias * random.standard_normal()
@@ -100,8 +100,8 @@ def simulate_odometry(
 def _errors(
     config: OdometryConfig, time: np.ndarray, motion: np.ndarray, random: np.random.Generator
 ) -> np.ndarray:
-    """[N - 1, 2] errors ahead (m) and of the turn (rad). Samples have their own rate: what falls between two
-    rows is shared out evenly."""
+    """[N - 1, 2] errors of forward motion (m) and turn (rad). Errors are drawn at the odometry rate and
+    interpolated to the rows."""
     if config.noise == "none" or len(time) < 2:
         return np.zeros((len(motion), 2))
     count = int(np.ceil((time[-1] - time[0]) * config.rate)) + 1
@@ -121,7 +121,7 @@ def _errors(
 
 
 def odometry_extent(source: Source) -> float:
-    """Largest distance from the start along either axis of the frame that it starts in, m."""
+    """Largest distance from the start along either axis of the start frame, from odometry, m."""
     moves = np.array([sample.reading.odometry[:3] for sample in source], float).reshape(-1, 3)
     path = integrate(np.where(np.isfinite(moves), moves, 0.0), np.zeros(3))
     return float(np.abs(path[:, :2]).max(initial=0.0))

@@ -1,7 +1,6 @@
-"""The same recording a little different: what a result must not hang on.
+"""Perturbed copies of a recording, to test the robustness of results.
 
-Another start, other noise, dropped frames: a map that is good on one recording and bad on its perturbed
-copies was lucky. All randomness follows from one seed.
+A copy has another start, additional noise, dropped views and wrong place labels, all drawn from one seed.
 """
 
 from __future__ import annotations
@@ -14,23 +13,23 @@ from robot.sources.in_memory import InMemorySource
 from tactile.base.se2 import compose
 
 VIEW_NOISE = 0.01
-"""Standard deviation added to every value of a view."""
+"""Standard deviation of the noise added to view values."""
 LENGTH_NOISE = 0.02
-"""Of every motion, as a share of it."""
+"""Standard deviation of the scale of each forward motion."""
 TURN_NOISE = 0.01
-"""Of the turn between two views, rad."""
+"""Standard deviation added to the turn between two views, rad."""
 START = (10, 80)
-"""Views left out at the start, at least and at most."""
+"""Smallest and largest number of views left out at the start."""
 DROPPED = 0.05
-"""Share of the views that are dropped."""
+"""Fraction of views that are dropped."""
 NEW_IDS, WRONG_IDS = 0.1, 0.05
-"""Shares of given ids that are made new, and replaced by another frame's."""
+"""Fractions of given place labels that become new ones, and those of other rows."""
 
 
 def perturb(log: InMemorySource, seed: int) -> InMemorySource:
-    """A perturbed copy; the digest is the original's with the seed behind it.
+    """A perturbed copy; its digest is that of the original followed by the seed.
 
-    Rows whose view is dropped go; their motion is added to the next row's, so the path stays whole.
+    Rows with a dropped view are removed and their motion is added to the next row, so the path is complete.
     """
     stream = np.random.default_rng(seed)
     looks = np.flatnonzero(log.seen | (log.label >= 0))
@@ -67,7 +66,7 @@ def perturb(log: InMemorySource, seed: int) -> InMemorySource:
 
 
 def _wrong(label: np.ndarray, stream: np.random.Generator) -> np.ndarray:
-    """Ids [N] of which some are new and some another frame's."""
+    """Labels [N], some replaced by new ones and some by those of other rows."""
     given = np.flatnonzero(label >= 0)
     label, chance = label.copy(), stream.random(len(given))
     new, wrong = given[chance < NEW_IDS], given[(chance >= NEW_IDS) & (chance < NEW_IDS + WRONG_IDS)]
@@ -77,7 +76,7 @@ def _wrong(label: np.ndarray, stream: np.random.Generator) -> np.ndarray:
 
 
 def _merged(motion: np.ndarray, rows: np.ndarray, first: int) -> np.ndarray:
-    """Motions [M, 4] into the rows that are kept, those of left-out rows in between composed into them."""
+    """Motions [M, 4] between the remaining rows, composed of all motions in between."""
     merged = np.zeros((len(rows), 4))
     at = 0
     since = np.zeros(4)

@@ -1,4 +1,4 @@
-"""A session that was simulated before anybody asks for it, as a source: rows that are all known."""
+"""Base class of simulated sources, which compute all poses and odometry when they are made."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from tactile.base.se2 import wrap
 from tactile.base.types import Cycle, Odometry, Report, Whisk
 
 NO_ODOMETRY = Odometry(0.0, 0.0, 0.0, 0.0)
-"""Of a reading that does not know its own yet."""
+"""Placeholder in a reading until its row's odometry is filled in."""
 
 
 class SimulatedSource(ABC):
-    """The part of a `Source` that every simulated session of N rows has; its simulator is the rest.
+    """A simulated session of N rows; subclasses add the remaining attributes of a `Source`.
 
     Attributes:
-        time: [N] s. truth: [N, 3] m, m, rad. odometry: [N, 4] of each row, as `tactile.base.types.Odometry`.
+        time: [N] s. truth: [N, 3] m, m, rad. odometry: [N, 4] as in `tactile.base.types.Odometry`.
     """
 
     time: np.ndarray
@@ -32,7 +32,7 @@ class SimulatedSource(ABC):
 
     @abstractmethod
     def _readings(self) -> Iterator[Cycle | Whisk | Report]:
-        """What whiskers felt in each row; its odometry is not looked at."""
+        """The whisker reading of each row; its odometry is overwritten."""
 
     @property
     def length(self) -> int:
@@ -53,10 +53,10 @@ class SimulatedSource(ABC):
 
 
 def wrap_headings(pose: np.ndarray) -> np.ndarray:
-    """[N, 3] poses as truth is told: the heading wrapped."""
+    """Poses [N, 3] with wrapped headings."""
     return np.column_stack([pose[:, :2], wrap(pose[:, 2])])
 
 
 def digest_of_document(document: Mapping[str, Any]) -> str:
-    """sha256 (hex) of all that a session was made from, which JSON can hold."""
+    """SHA-256 (hex) of a JSON document."""
     return digest_of([json.dumps(document, sort_keys=True).encode()])

@@ -64,7 +64,7 @@ class Source(Protocol):
 
 
 def rate_of(time: np.ndarray) -> float:
-    """Median rate of the times [N] s, Hz; 0 where there are fewer than two different ones."""
+    """Median rate of times [N] s, Hz; 0 with fewer than two different times."""
     steps = np.diff(time)
     steps = steps[steps > 0]
     return float(1.0 / np.median(steps)) if len(steps) else 0.0

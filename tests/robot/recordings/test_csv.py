@@ -207,7 +207,7 @@ FAULTS: dict[str, tuple[str, dict[str, Any], list[str]]] = {
     "half view": ("t,vx,w,r0,r1,r2\n0,1,0,0,,1\n", {"views": ViewColumns()}, [":2: r* is nan"]),
     "behind": ("t,vx,w,r0,r1,r2\n0,1,0,0,-1,1\n", {"views": RANGES}, [":2: r* is -1.0", "0 m or more"]),
     "mm": ("t,vx,w,r0,r1,r2\n0,1,0,900,800,700\n", {"views": RANGES}, ["over 800 m", "by 1000"]),
-    "label": ("t,vx,w,label\n0,1,0,1.5\n", {"labels": LabelColumns()}, [":2: label is 1.5", "a whole"]),
+    "label": ("t,vx,w,label\n0,1,0,1.5\n", {"labels": LabelColumns()}, [":2: label is 1.5", "an integer"]),
     "truth": ("t,vx,w,x,y,heading\n0,1,0,1,,1\n", {"truth": TruthColumns()}, [":2: y is empty"]),
 }  # fmt: skip
 

@@ -120,7 +120,7 @@ IDS = np.column_stack([np.arange(12), np.zeros(12)])
 FAULTS: dict[str, tuple[dict[str, Any], list[str]]] = {
     "backwards": ({"in_t": _with(TIME, 5, 100.25)}, ["row 5: in_t goes back from 102.0 to 100.25 s", "sort"]),
     "repeated": ({"in_t": _with(TIME, 5, 102)}, ["row 5: in_t repeats 102.0 s", "drop the repeated"]),
-    "nan time": ({"in_t": _with(TIME, 5, np.nan)}, ["row 5: in_t is nan", "a finite number", "mend or drop"]),
+    "nan time": ({"in_t": _with(TIME, 5, np.nan)}, ["row 5: in_t is nan", "correct or drop"]),
     "inf speed": ({"in_v": _with(np.ones(12), 3, np.inf)}, ["row 3: in_v is inf", "a finite number"]),
     "nan turn": ({"in_w": _with(np.ones(12), 3, np.nan)}, ["row 3: in_w is nan"]),
     "nan view": ({"in_view": _with(VIEW, 7, np.nan)}, ["row 7: in_view is nan"]),
@@ -138,7 +138,7 @@ FAULTS: dict[str, tuple[dict[str, Any], list[str]]] = {
     "absent": ({"in_veiw": VIEW, "in_view": None}, ["no array 'in_view'", "among 'in_t'", "mean 'in_veiw'?"]),
     "two absent": ({"in_v": None, "in_w": None}, ["no array 'in_v'", "no array 'in_w'"]),
     "no rows": ({"in_t": np.zeros(0)}, ["in_t has no rows", "at least one sample"]),
-    "json": ({"params_json": "{"}, ["params_json is no JSON", "a JSON object"]),
+    "json": ({"params_json": "{"}, ["params_json is not JSON", "a JSON object"]),
     "list": ({"params_json": "[1]"}, ["params_json holds list"]),
     "key": ({"params_json": '{"template_ysize": "3"}'}, ["no key 'template_y_size'", "'template_ysize'?"]),
     "size": ({"params_json": '{"template_y_size": "x"}'}, ["template_y_size is 'x'", "of pixels"]),
@@ -180,7 +180,7 @@ def test_a_broken_archive_is_one_clear_error(
     for size in [*range(1, len(content) - 1, 97), len(content) - 1]:
         path.write_bytes(content[:size])
         refused(lambda: read_trace(path), str(path), "cannot be read as .npz", "a NumPy archive")
-    refused(lambda: read_trace(path), "cut off or damaged: copy it again")
+    refused(lambda: read_trace(path), "truncated or damaged: copy it again")
     np.save(tmp_path / "single.npy", np.zeros(3))
     (tmp_path / "single.npy").rename(path)
     refused(lambda: read_trace(path), "cannot be read as .npz", "write it with numpy.savez")

@@ -344,7 +344,7 @@ def test_a_session_in_memory_is_the_session() -> None:
 
 
 def test_whiskers_are_not_taken_for_observations(refused: Callable[..., InputError]) -> None:
-    refused(lambda: load_into_memory(made()), "simulation", "nothing but whiskers")
+    refused(lambda: load_into_memory(made()), "simulation", "whisker readings")
 
 
 def test_another_head_than_the_recorded_one_is_refused(
