@@ -32,8 +32,8 @@ from ratslam.experiments.trials.csv_output import find_protocol, format_cells, p
 from ratslam.experiments.trials.threshold_sweep import sweep_thresholds
 from ratslam.experiments.trials.touch_trial import (
     SessionResult,
-    Task,
     TouchMetrics,
+    TrialTask,
     arcr_without_chain,
     collect_session,
     run_task,
@@ -46,14 +46,14 @@ FIELDS = (*TouchMetrics._fields, "em_ratio", *DIRECTION_METRICS, "across_share",
 HEADING = ("condition", "method", "control", "set", "seed", *FIELDS)
 
 
-class Job(NamedTuple):
+class TrialJob(NamedTuple):
     """One session of a reproduction; `laps` holds the direction of each lap, C or A."""
 
     condition: Condition
     method: str
     control: str
     number: int
-    task: Task
+    task: TrialTask
     laps: str
 
 
@@ -97,7 +97,7 @@ def reproduce(
     return render_claims(protocol, rows, sets), interrupted
 
 
-def plan_jobs(protocol: Protocol, sets: int, seed: int, assignments: Sequence[str] = ()) -> list[Job]:
+def plan_jobs(protocol: Protocol, sets: int, seed: int, assignments: Sequence[str] = ()) -> list[TrialJob]:
     """All sessions of a reproduction, set by set.
 
     Raises:
@@ -114,8 +114,8 @@ def plan_jobs(protocol: Protocol, sets: int, seed: int, assignments: Sequence[st
                 laps = laps[: condition.laps] if condition.laps else laps
                 for control in _controls(protocol, method):
                     change = condition.control if control == "none" else control
-                    task = Task(config, change, set_seed, len(laps) if condition.laps else 0)
-                    jobs.append(Job(condition, method, control, number, task, laps))
+                    task = TrialTask(config, change, set_seed, len(laps) if condition.laps else 0)
+                    jobs.append(TrialJob(condition, method, control, number, task, laps))
     return jobs
 
 
@@ -152,15 +152,15 @@ def match_thresholds(rows: Sequence[Row], conditions: Sequence[str]) -> dict[str
     }
 
 
-Outcome = tuple[Row, Job, SessionResult | None]
+Outcome = tuple[Row, TrialJob, SessionResult | None]
 
 
-def _run_sessions(name: str, protocol: Protocol, jobs: Sequence[Job], workers: int) -> Iterator[Outcome]:
+def _run_sessions(name: str, protocol: Protocol, jobs: Sequence[TrialJob], workers: int) -> Iterator[Outcome]:
     for job, result in _results(run_task, name, jobs, workers):
         yield _row(job, result), job, result
 
 
-def _run_sweeps(name: str, protocol: Protocol, jobs: Sequence[Job], workers: int) -> Iterator[Outcome]:
+def _run_sweeps(name: str, protocol: Protocol, jobs: Sequence[TrialJob], workers: int) -> Iterator[Outcome]:
     """First the sweeps over all thresholds, then a session at the matched threshold of each condition."""
     swept: list[Row] = []
     for job, found in _results(_sweep, f"{name}, thresholds", jobs, workers):
@@ -184,8 +184,8 @@ def _run_sweeps(name: str, protocol: Protocol, jobs: Sequence[Job], workers: int
 
 
 def _results(
-    function: Callable[[Task], Any], title: str, jobs: Sequence[Job], workers: int
-) -> Iterator[tuple[Job, Any]]:
+    function: Callable[[TrialTask], Any], title: str, jobs: Sequence[TrialJob], workers: int
+) -> Iterator[tuple[TrialJob, Any]]:
     """The function's result for the task of each job, in order, with a progress bar."""
     with progress_bar(title, len(jobs)) as bar:
         for job, result in zip(
@@ -195,7 +195,7 @@ def _results(
             bar.update()
 
 
-def _sweep(task: Task) -> list[dict[str, float]]:
+def _sweep(task: TrialTask) -> list[dict[str, float]]:
     """The Experience Metric of the classic method at all thresholds, without maps."""
     config, log = collect_session(task.config)
     batch = sweep_thresholds(config, log, np.array(SWEPT))
@@ -213,7 +213,7 @@ def _sweep(task: Task) -> list[dict[str, float]]:
     ]
 
 
-def _row(job: Job, result: SessionResult) -> Row:
+def _row(job: TrialJob, result: SessionResult) -> Row:
     metrics = touch_metrics(result, job.task.config.score.experience_metric)
     ratio = metrics.em / metrics.em_odometry if metrics.em_odometry else np.nan
     values = {**metrics._asdict(), "em_ratio": ratio, **direction_metrics(result, job.laps)}

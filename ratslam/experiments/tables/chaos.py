@@ -23,6 +23,7 @@ from ratslam.attractor.config import PoseCellConfig, rings, units
 from ratslam.attractor.levels import window_levels
 from ratslam.attractor.pose_cells import PoseCells
 from ratslam.attractor.window import ring_difference
+from ratslam.core.precision import prepare_precision
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
 from tactile.base.random_streams import stream
 from tactile.base.types import Odometry
@@ -117,7 +118,7 @@ def chaos_table(
     walks: int = 3,
 ) -> Iterator[str]:
     """The lines of the table, each as soon as its walks are done."""
-    jax.config.update("jax_enable_x64", True)
+    prepare_precision("float64")
     marks = [mark for mark in MARKS if mark <= steps]
     yield markdown_header(("motion", "pair", *(f"{mark} steps" for mark in marks)))
     for motion, name in product(motions, pairs):

@@ -15,6 +15,7 @@ from evaluation.metrics.grid_score import score_grid
 from evaluation.metrics.occupancy_grid import OccupancyGrid
 from ratslam.config.completion import complete
 from ratslam.config.run_config import RunConfig
+from ratslam.core.precision import prepare_precision
 from ratslam.experiments.fox2012.session import session_at_start
 from ratslam.experiments.studies.executor import run_tasks
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
@@ -126,9 +127,8 @@ def grid_table(
 
 def measure_session(task: GridTask) -> GridFigures:
     """Runs and measures one session."""
-    import jax
 
-    jax.config.update("jax_enable_x64", True)
+    prepare_precision("float64")
     noise, changes = ROWS[task.row]
     create_simulation = WORLDS[task.world] | {"wheels": {"noise": noise}, "seed": task.arena}
     given = {

@@ -18,12 +18,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from scipy import stats
 
 from evaluation.metrics.trajectory import ate
 from ratslam.config.run_config import RunConfig
+from ratslam.core.precision import prepare_precision
 from ratslam.experiments.studies.executor import run_tasks
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
 from ratslam.experiments.trials.touch_trial import collect_session, run_session, touch_metrics
@@ -107,7 +107,7 @@ class Difference(NamedTuple):
 
 def run_arms(task: ArmsTask) -> dict[str, ArmFigures]:
     """The figures of each arm."""
-    jax.config.update("jax_enable_x64", True)
+    prepare_precision("float64")
     simulation = SESSION | {"seed": task.seed, "maze": {"seed": task.seed}}
     given = {"simulation": simulation, "session": {"reserve": RESERVE}} | BACKENDS[task.backend]
     config, log = collect_session(RunConfig.model_validate(given))

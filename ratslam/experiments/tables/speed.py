@@ -19,6 +19,7 @@ from ratslam.attractor import pose_cells
 from ratslam.attractor.config import PoseCellConfig, rings, units
 from ratslam.attractor.levels import window_levels
 from ratslam.attractor.pose_cells import PoseCells
+from ratslam.core.precision import prepare_precision
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
 from ratslam.experiments.tables.numpy_network import NumpyNetwork
 from tactile.base.types import Odometry
@@ -38,7 +39,7 @@ Timed = Mapping[str, tuple[Callable[[], Any], int]]
 
 def speed_table(sizes: Sequence[int] = SIZES, rounds: int = ROUNDS) -> Iterator[str]:
     """The lines of the table, each as soon as it is timed."""
-    jax.config.update("jax_enable_x64", True)
+    prepare_precision("float64")
     yield markdown_header(COLUMNS)
     for n in sizes:
         us = interleaved_medians(network_calls(n), rounds)

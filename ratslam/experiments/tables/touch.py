@@ -45,7 +45,7 @@ MAX_ANGLE = {"image": {"transform": "max_angle"}}
 OPEN_LOOP = {"whisking": {"mode": "open"}}
 
 
-class Condition(NamedTuple):
+class TouchRow(NamedTuple):
     """A row: its label in the table, and the settings `simulation` and `touch` of its sessions."""
 
     label: str
@@ -61,42 +61,42 @@ def _head(*radii: float) -> dict[str, Any]:
 
 
 ROWS = {
-    "main": Condition("main: ten circuits, 5 mm / 1.5 deg / 5 %", MAIN),
-    "clean": Condition("clean: 2 mm / 0.5 deg"),
-    "rough": Condition("rough: 10 mm / 3 deg / 10 %", ROUGH),
-    "rough, 3 % faults": Condition(
+    "main": TouchRow("main: ten circuits, 5 mm / 1.5 deg / 5 %", MAIN),
+    "clean": TouchRow("clean: 2 mm / 0.5 deg"),
+    "rough": TouchRow("rough: 10 mm / 3 deg / 10 %", ROUGH),
+    "rough, 3 % faults": TouchRow(
         "rough, 3 % contacts missed, 3 % spurious", ROUGH | {"mechanics": {"missed": 0.03, "spurious": 0.03}}
     ),
-    "open, max_angle": Condition("open loop, max_angle", OPEN_LOOP, MAX_ANGLE),
-    "white": Condition("white odometry noise", {"odometry": {"noise": "white"}}),
-    "telescoping": Condition("telescoping noise", {"odometry": {"noise": "telescoping"}}),
-    "exploration": Condition("free exploration, 1500 whisks", {"path": {"explore": 1500}}),
-    "exploration, 3000": Condition("free exploration, 3000 whisks", {"path": {"explore": 3000}}),
-    "5 x 5": Condition("5 x 5 cells", {"maze": {"columns": 5, "rows": 5, "loop": 12}}),
-    "12 x 8": Condition("12 x 8 cells", {"maze": {"columns": 12, "rows": 8, "loop": 32}}),
-    "3 dead": Condition("3 dead whiskers", {}, {"head": {"dead": [7, 10, 14]}}),
-    "15 mm/s": Condition("15 mm/s", {"motion": {"speed": 0.015}}),
-    "radii + 20 %": Condition("base radii + 20 %", {}, {"head": _head(0.054, 0.078, 0.096)}),
-    "radii - 20 %": Condition("base radii - 20 %", {}, {"head": _head(0.036, 0.052, 0.064)}),
-    "rest 90": Condition("rest angle + 20 %", {}, {"head": {"rest_deg": 90.0}}),
-    "rest 60": Condition("rest angle - 20 %", {}, {"head": {"rest_deg": 60.0}}),
-    "radial channel": Condition("with the radial channel", {}, {"image": {"radial": True}}),
-    "2 Hz": Condition("2 Hz whisking", {"whisking": {"rate": 2.0}}),
-    "RCP, max_angle": Condition("RCP, max_angle", {}, MAX_ANGLE),
-    "1 dead": Condition("1 dead whisker", {}, {"head": {"dead": [10]}}),
-    "6 dead": Condition("6 dead whiskers", {}, {"head": {"dead": [1, 6, 7, 10, 14, 17]}}),
-    "noise 1e-3": Condition("sensor noise 1e-3 rad", {"mechanics": {"noise": 1e-3}}),
-    "noise 1e-2": Condition("1e-2 rad", {"mechanics": {"noise": 1e-2}}),
-    "kidnaps": Condition("8 kidnaps of 45 s", {"kidnaps": {"count": 8, "ahead": 45.0}}),
-    "control: shuffled": Condition("control: shuffled images", MAIN),
-    "control: no image": Condition("control: no images", MAIN),
-    "control: other maze": Condition("control: later laps in another maze", MAIN | {"later_maze": CHANGE}),
-    "open, contact_angle": Condition("open loop, contact_angle", OPEN_LOOP),
-    "noise 5e-3": Condition("sensor noise 5e-3 rad", {"mechanics": {"noise": 5e-3}}),
-    "soft servo, open, max": Condition(
+    "open, max_angle": TouchRow("open loop, max_angle", OPEN_LOOP, MAX_ANGLE),
+    "white": TouchRow("white odometry noise", {"odometry": {"noise": "white"}}),
+    "telescoping": TouchRow("telescoping noise", {"odometry": {"noise": "telescoping"}}),
+    "exploration": TouchRow("free exploration, 1500 whisks", {"path": {"explore": 1500}}),
+    "exploration, 3000": TouchRow("free exploration, 3000 whisks", {"path": {"explore": 3000}}),
+    "5 x 5": TouchRow("5 x 5 cells", {"maze": {"columns": 5, "rows": 5, "loop": 12}}),
+    "12 x 8": TouchRow("12 x 8 cells", {"maze": {"columns": 12, "rows": 8, "loop": 32}}),
+    "3 dead": TouchRow("3 dead whiskers", {}, {"head": {"dead": [7, 10, 14]}}),
+    "15 mm/s": TouchRow("15 mm/s", {"motion": {"speed": 0.015}}),
+    "radii + 20 %": TouchRow("base radii + 20 %", {}, {"head": _head(0.054, 0.078, 0.096)}),
+    "radii - 20 %": TouchRow("base radii - 20 %", {}, {"head": _head(0.036, 0.052, 0.064)}),
+    "rest 90": TouchRow("rest angle + 20 %", {}, {"head": {"rest_deg": 90.0}}),
+    "rest 60": TouchRow("rest angle - 20 %", {}, {"head": {"rest_deg": 60.0}}),
+    "radial channel": TouchRow("with the radial channel", {}, {"image": {"radial": True}}),
+    "2 Hz": TouchRow("2 Hz whisking", {"whisking": {"rate": 2.0}}),
+    "RCP, max_angle": TouchRow("RCP, max_angle", {}, MAX_ANGLE),
+    "1 dead": TouchRow("1 dead whisker", {}, {"head": {"dead": [10]}}),
+    "6 dead": TouchRow("6 dead whiskers", {}, {"head": {"dead": [1, 6, 7, 10, 14, 17]}}),
+    "noise 1e-3": TouchRow("sensor noise 1e-3 rad", {"mechanics": {"noise": 1e-3}}),
+    "noise 1e-2": TouchRow("1e-2 rad", {"mechanics": {"noise": 1e-2}}),
+    "kidnaps": TouchRow("8 kidnaps of 45 s", {"kidnaps": {"count": 8, "ahead": 45.0}}),
+    "control: shuffled": TouchRow("control: shuffled images", MAIN),
+    "control: no image": TouchRow("control: no images", MAIN),
+    "control: other maze": TouchRow("control: later laps in another maze", MAIN | {"later_maze": CHANGE}),
+    "open, contact_angle": TouchRow("open loop, contact_angle", OPEN_LOOP),
+    "noise 5e-3": TouchRow("sensor noise 5e-3 rad", {"mechanics": {"noise": 5e-3}}),
+    "soft servo, open, max": TouchRow(
         "soft servo, open loop, max_angle", OPEN_LOOP | {"mechanics": {"servo": 0.3}}, MAX_ANGLE
     ),
-    "soft servo, RCP, max": Condition("soft servo, RCP, max_angle", {"mechanics": {"servo": 0.3}}, MAX_ANGLE),
+    "soft servo, RCP, max": TouchRow("soft servo, RCP, max_angle", {"mechanics": {"servo": 0.3}}, MAX_ANGLE),
 }
 DEFAULT_ROWS = tuple(ROWS)[:-4]
 """The rows printed if none are chosen."""

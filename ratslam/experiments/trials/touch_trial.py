@@ -33,7 +33,7 @@ HOME_RADIUS = 0.09
 """A robot this near to its start has returned to it, m: half a micromouse cell."""
 
 
-class Task(NamedTuple):
+class TrialTask(NamedTuple):
     """One session to run.
 
     Attributes:
@@ -103,7 +103,7 @@ def collect_session(config: RunConfig) -> tuple[RunConfig, InMemorySource]:
     return config, log
 
 
-def run_task(task: Task) -> SessionResult:
+def run_task(task: TrialTask) -> SessionResult:
     """Runs one session.
 
     Raises:
