@@ -49,7 +49,7 @@ class Arm:
         first = self._shared.newest + 1
         self._shared.control["first"] = first
         self._shared.control["heartbeat"] = time.monotonic()
-        process = ArmProcess(self._shared.name, self.config)
+        process = ArmProcess(self._shared.fd, self.config)
         self._supervisor.watch(process)
         try:
             self._await_ready(process)

@@ -23,7 +23,7 @@ class ArmProcess:
     """A running `robot.drivers.ur10.rtde_process`. Its end of the pipes closes with this process, however
     that ends."""
 
-    def __init__(self, shared: str, config: ArmConfig) -> None:
+    def __init__(self, shared: int, config: ArmConfig) -> None:
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115
         paths = [str(Path(__file__).parents[3]), *filter(None, [os.environ.get("PYTHONPATH")])]
         environment = {
@@ -33,7 +33,8 @@ class ArmProcess:
             "OPENBLAS_NUM_THREADS": "1",
         }
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "robot.drivers.ur10.rtde_process", shared, config.model_dump_json()],
+            [sys.executable, "-m", "robot.drivers.ur10.rtde_process", str(shared), config.model_dump_json()],
+            pass_fds=[shared],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._errors,

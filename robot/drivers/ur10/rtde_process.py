@@ -1,8 +1,8 @@
 """The arm's own process: the only one that loads ur_rtde, which aborts, hangs and faults when controllers do.
 
-    python -m robot.drivers.ur10.rtde_process NAME CONFIG_JSON
+    python -m robot.drivers.ur10.rtde_process FD CONFIG_JSON
 
-NAME is the session's shared (states.py). Orders come as JSON lines on the standard input, reports leave as
+FD is the inherited descriptor of the shared memory (shared_state.py). Commands come as JSON lines on the standard input, reports leave as
 JSON lines on the standard output, whatever the library prints goes to the standard error.
 
 The arm is stopped from here when a state says so, when the session asks for it, when it falls silent, and
@@ -176,7 +176,7 @@ def connect(config: ArmConfig) -> tuple[Any, Any]:
     return receive, control
 
 
-def main(name: str, text: str) -> None:
+def main(shared_fd: str, text: str) -> None:
     """The process; ends without destructors, for the library aborts in them when the controller is gone."""
     reports = os.dup(1)
     os.dup2(2, 1)
@@ -184,7 +184,7 @@ def main(name: str, text: str) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the session decides what an interrupt means
     set_niceness(URGENT)
     config = ArmConfig.model_validate_json(text)
-    shared = SharedState(name)
+    shared = SharedState(int(shared_fd))
     # The constructors hold the interpreter's lock and may wait for ever; the alarm ends even that.
     signal.alarm(math.ceil(config.connect) + 1)
     try:

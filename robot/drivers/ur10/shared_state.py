@@ -1,22 +1,23 @@
-"""States of the arm in shared memory: one process writes them, others read, nobody waits.
+"""Arm states in shared memory: a lock-free ring buffer with one writer and several readers.
 
-A ring of slots. Its writer marks a slot as unfinished, fills it, writes the state's number into it, and only
-then tells that number as the newest; a reader copies and then looks whether the numbers are still what they
-were. Stores have to be seen in the order in which they were made; x86-64, where ur_rtde runs, does that.
+The writer marks a slot as unfinished, fills it, writes the state's counter into it and then publishes that
+counter as the newest. A reader copies slots and then checks that their counters have not changed. This needs
+stores to become visible in program order, which x86-64 guarantees (the only platform of ur_rtde).
 """
 
 from __future__ import annotations
 
 import contextlib
-import sys
-from multiprocessing import resource_tracker, shared_memory
+import mmap
+import os
+import tempfile
 
 import numpy as np
 
 ARM_STATE = np.dtype(
     [
-        ("counter", "u8"),  # of states since the session began, from 1
-        ("host", "f8"),  # s, host's monotonic clock, when the state was seen
+        ("counter", "u8"),  # number of the state in the session, from 1
+        ("host", "f8"),  # s, host's monotonic clock at receipt
         ("robot", "f8"),  # s, the controller's clock
         ("tcp", "f8", 6),  # tool pose in the base frame: m, rotation vector rad
         ("speed", "f8", 6),  # its rate: m/s, rad/s
@@ -26,38 +27,44 @@ ARM_STATE = np.dtype(
         ("safety", "u4"),  # safety status bits
         ("runtime", "i4"),  # of the controller's program: 2 is playing
         ("operation", "i4"),  # number of the newest asynchronous operation, 0..127
-        ("progress", "i4"),  # of it; -1: it has ended
+        ("progress", "i4"),  # progress of that operation; -1: it has ended
     ],
     align=True,
 )
 
 CONTROL = np.dtype(
     [
-        ("newest", "u8"),  # counter of the newest whole state; written by the arm's process
+        ("newest", "u8"),  # counter of the newest complete state; written by the RTDE process
         ("heartbeat", "f8"),  # s, host's monotonic clock; written by the session
-        ("stops", "u8"),  # how often the session has asked for a stop
-        ("first", "u8"),  # counter of the first state of the arm's present process
+        ("stops", "u8"),  # number of stops that the session has requested
+        ("first", "u8"),  # counter of the first state of the present RTDE process
     ]
 )
 
 SLOTS = 4096  # 8 s at 500 Hz
 UNFINISHED = np.uint64(0)
-HEADER = 64  # bytes; keeps the ring on a cache line of its own
+HEADER = 64  # bytes; keeps the ring on its own cache line
 
 
 class SharedState:
-    """The ring and the few words beside it. `Board()` makes one, `Board(name)` opens another process's."""
+    """The ring buffer of states and the control words beside it.
 
-    def __init__(self, name: str | None = None) -> None:
+    The memory is an anonymous file: it has no name that could stay behind, and the kernel frees it when the
+    last process that has it open ends, however it ends.
+
+    Args:
+        fd: file descriptor inherited from the process that created the memory; None creates it.
+
+    Attributes:
+        fd: file descriptor, to be passed to the other process. control: CONTROL, one.
+    """
+
+    def __init__(self, fd: int | None = None) -> None:
         size = HEADER + SLOTS * ARM_STATE.itemsize
-        self._made = name is None
-        self._memory = shared_memory.SharedMemory(name, create=self._made, size=size if self._made else 0)
-        if not self._made and sys.platform != "win32":
-            # Before Python 3.13 whoever opens a block also takes it away when it ends.
-            resource_tracker.unregister(self._memory._name, "shared_memory")  # type: ignore[attr-defined]
-        self.name = self._memory.name
-        self.control = np.ndarray((), CONTROL, self._memory.buf)
-        self._ring = np.ndarray(SLOTS, ARM_STATE, self._memory.buf, HEADER)
+        self.fd = _anonymous_file(size) if fd is None else fd
+        self._memory = mmap.mmap(self.fd, size)
+        self.control = np.ndarray((), CONTROL, self._memory)
+        self._ring = np.ndarray(SLOTS, ARM_STATE, self._memory, HEADER)
 
     @property
     def newest(self) -> int:
@@ -65,7 +72,7 @@ class SharedState:
         return int(self.control["newest"])
 
     def publish(self, state: np.ndarray) -> None:
-        """Append a state (STATE, one); its counter is set here. For one writer only."""
+        """Appends a state (ARM_STATE, one) and sets its counter. For one writer only."""
         counter = self.newest + 1
         slot = self._ring[counter % SLOTS]
         slot["counter"] = UNFINISHED
@@ -75,7 +82,7 @@ class SharedState:
         self.control["newest"] = counter
 
     def since(self, counter: int) -> np.ndarray:
-        """All states [N] after that counter which are still in the ring, oldest first."""
+        """Copies of all states [N] after a counter that are still in the ring, oldest first."""
         newest = self.newest
         wanted = np.arange(max(counter + 1, newest - SLOTS + 2, 1), newest + 1, dtype=np.uint64)
         slots = wanted % np.uint64(SLOTS)
@@ -84,16 +91,26 @@ class SharedState:
         return states[whole]
 
     def latest(self) -> np.ndarray | None:
-        """The newest state (STATE, one), or None before the first."""
+        """The newest state (ARM_STATE, one); None before the first."""
         states = self.since(self.newest - 1)
         return states[-1] if len(states) else None
 
     def close(self) -> None:
-        """Let go of the memory; who made it also takes it away."""
+        """Releases the memory in this process."""
         self.control = np.zeros((), CONTROL)
         self._ring = np.zeros(1, ARM_STATE)
-        with contextlib.suppress(BufferError):  # somebody still holds a view: it goes when the process does
+        with contextlib.suppress(BufferError):  # a view is still in use: released when the process ends
             self._memory.close()
-        if self._made:
-            with contextlib.suppress(FileNotFoundError):
-                self._memory.unlink()
+        with contextlib.suppress(OSError):  # closed before
+            os.close(self.fd)
+
+
+def _anonymous_file(size: int) -> int:
+    """Descriptor of a file without a name."""
+    if hasattr(os, "memfd_create"):
+        fd = os.memfd_create("arm states")
+    else:
+        with tempfile.TemporaryFile() as file:
+            fd = os.dup(file.fileno())
+    os.ftruncate(fd, size)
+    return fd
