@@ -38,7 +38,7 @@ class LiveConfig(Settings):
     """Above working height whiskers meet nothing: there the free record is made, m."""
     budget: PositiveFloat = 0.6
     """A whisk that finds the mapper this far behind loses its image, never its odometry, s."""
-    grace: Annotated[float, Field(gt=0, le=0.1)] = 0.045
+    grace: Annotated[float, Field(gt=0, le=1.0)] = 0.045
     """How long frames of a whisk that is over are waited for, s."""
     gap: PositiveInt = 5
     """An image with so many samples missing on end is not used."""

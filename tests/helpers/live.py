@@ -1,4 +1,4 @@
-"""What tests of live parts share: emulators in processes of their own, their fault ports, patience."""
+"""Shared by tests of live parts: emulator processes, their fault ports, and waiting for a condition."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from typing import Any
 
 ROOT = Path(__file__).parents[2]
 UR_FAULTS, HEAD_FAULTS = 30098, 30099
+PATIENCE = 60.0
+"""s that a test waits for something that a busy machine may delay; an idle one never needs them."""
 
 
 class Faults:
@@ -30,7 +32,7 @@ class Faults:
 
     def __call__(self, **request: Any) -> dict[str, Any]:
         if self._stream is None:
-            self._stream = socket.create_connection((self.host, self._port), 2.0)
+            self._stream = socket.create_connection((self.host, self._port), PATIENCE)
         self._stream.sendall(json.dumps(request).encode() + b"\n")
         while b"\n" not in self._rest:
             data = self._stream.recv(1 << 20)
@@ -50,7 +52,7 @@ class Faults:
         """End the emulator in the midst of everything; it does not answer any more."""
         with suppress(OSError, ValueError):
             self(do="die")
-        self.process.wait(5)
+        self.process.wait(PATIENCE)
 
     def close(self) -> None:
         if self._stream is not None:
@@ -71,7 +73,7 @@ def emulator(module: str, port: int, host: str, *arguments: str) -> Iterator[Fau
     finally:
         faults.close()
         process.kill()
-        process.wait(5)
+        process.wait(PATIENCE)
         assert process.stdout is not None
         process.stdout.close()
 
@@ -87,8 +89,8 @@ def moves(controller: Faults, after: int = 0) -> list[dict[str, Any]]:
     return [order for order in controller.state()["targets"][after:] if not order["order"].startswith("Stop")]
 
 
-def until(condition: Callable[[], Any], seconds: float, what: str = "") -> Any:
-    """What a condition gives once it is true; fails when that takes longer."""
+def until(condition: Callable[[], Any], what: str = "", seconds: float = PATIENCE) -> Any:
+    """Polls a condition and returns its value once it is true; fails after some seconds."""
     end = time.monotonic() + seconds
     while True:
         found = condition()

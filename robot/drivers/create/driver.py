@@ -40,7 +40,7 @@ class CreateDriver:
         self.config = config
         self._pilot: ControlLoop | None = None
         self._link: SerialLink | None = None
-        self._guard: Watchdog | None = None
+        self.watchdog: Watchdog | None = None
         self._thread: threading.Thread | None = None
         self._ending, self._wake, self._polled = (threading.Event() for _ in range(3))
 
@@ -54,7 +54,7 @@ class CreateDriver:
             raise ValueError("a driver starts once")
         self._link = SerialLink(open_port(self.config.port))
         try:
-            self._guard = Watchdog(self.config.port, self.config.patience)
+            self.watchdog = Watchdog(self.config.port, self.config.patience)
             self._wake_up(self._link)
             self._pilot = ControlLoop(self.config, self._link, time.monotonic)
         except BaseException:
@@ -121,9 +121,9 @@ class CreateDriver:
                 self._link.send(protocol.STOP_ANYHOW)
                 self._link.send(protocol.START)
             self._link.close()
-        if self._guard is not None:
-            self._guard.close()
-            self._guard = None
+        if self.watchdog is not None:
+            self.watchdog.close()
+            self.watchdog = None
         self._pilot = None
 
     def __enter__(self) -> Self:
@@ -170,7 +170,7 @@ class CreateDriver:
             )
 
     def _run(self) -> None:
-        pilot, guard = self._pilot, self._guard
+        pilot, guard = self._pilot, self.watchdog
         assert pilot is not None
         assert guard is not None
         try:

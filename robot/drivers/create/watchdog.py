@@ -45,6 +45,11 @@ class Watchdog:
             self.close()
             raise WatchdogFailed(port, "the process that guards it did not start")
 
+    @property
+    def pid(self) -> int:
+        """Process id of the watchdog."""
+        return self._process.pid
+
     def beat(self) -> bool:
         """Tells that all is well; False if nobody hears it."""
         try:

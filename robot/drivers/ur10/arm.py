@@ -34,8 +34,8 @@ class Arm:
         self.config = config
         self.reason = ""
         """Why it was last halted."""
-        self._shared = SharedState()
-        self._supervisor = Supervisor(config, self._shared)
+        self.shared = SharedState()
+        self.supervisor = Supervisor(config, self.shared)
 
     def __enter__(self) -> Arm:
         return self
@@ -46,68 +46,68 @@ class Arm:
     def start(self) -> None:
         """Check the controller, start the arm's process, check what it sees; raises Refusal."""
         check_controller(self.config)
-        first = self._shared.newest + 1
-        self._shared.control["first"] = first
-        self._shared.control["heartbeat"] = time.monotonic()
-        process = ArmProcess(self._shared.fd, self.config)
-        self._supervisor.watch(process)
+        first = self.shared.newest + 1
+        self.shared.control["first"] = first
+        self.shared.control["heartbeat"] = time.monotonic()
+        process = ArmProcess(self.shared.fd, self.config)
+        self.supervisor.watch(process)
         try:
             self._await_ready(process)
             check_states(self.config, lambda: self.states(first - 1))
-            self._supervisor.arm()
+            self.supervisor.arm()
         except BaseException:
-            self._supervisor.kill_process()
+            self.supervisor.kill_process()
             raise
 
     def respawn(self) -> None:
         """Start anew after a fault, with all checks; the pose may be another one, so this is no odometry."""
-        self._supervisor.kill_process()
+        self.supervisor.kill_process()
         dashboard.stop_program(self.config.host)
         self.reason = ""
         self.start()
 
     def close(self) -> None:
         """Stop the arm, end its process, let go of everything."""
-        supervisor = self._supervisor
+        supervisor = self.supervisor
         supervisor.armed = False
         if supervisor.process is not None and not supervisor.process.end(1.0):
             supervisor.kill_process()
             dashboard.stop_program(self.config.host)
         supervisor.kill_process()
         supervisor.close()
-        self._shared.close()
+        self.shared.close()
 
     @property
     def fault(self) -> Fault | None:
         """What ended the motion; None while all is well."""
-        return self._supervisor.fault
+        return self.supervisor.fault
 
     @property
     def pid(self) -> int | None:
         """Of the arm's process, while there is one."""
-        process = self._supervisor.process
+        process = self.supervisor.process
         return None if process is None else process.pid
 
     def states(self, after: int = 0) -> np.ndarray:
         """All states [N] (STATE) whose counter is larger, as far as the ring reaches back, oldest first."""
-        return self._shared.since(after)
+        return self.shared.since(after)
 
     def latest(self) -> np.ndarray | None:
         """The newest state (STATE, one); None before the first."""
-        return self._shared.latest()
+        return self.shared.latest()
 
     @property
     def history(self) -> np.ndarray:
         """The last 5 s of states [N] (STATE): what to keep of a fault."""
-        return self._supervisor.history()
+        return self.supervisor.history()
 
     def age(self) -> float:
         """s since the newest state was seen; infinite before the first."""
-        return self._supervisor.age()
+        return self.supervisor.age()
 
     def still(self) -> bool:
         """Whether the newest state is fresh and shows an arm at rest."""
-        return self._supervisor.still()
+        return self.supervisor.still()
 
     def move(self, tcp: Any, speed: float | None = None) -> Move:
         """Send the tool to a pose [6] in a straight line; returns at once. A newer move replaces an older.
@@ -115,7 +115,7 @@ class Arm:
         Raises:
             Refused: the target is not one, or the arm is not armed, or has a fault.
         """
-        supervisor = self._supervisor
+        supervisor = self.supervisor
         with supervisor.lock:  # a fault that is found meanwhile would not revoke the order
             state = self.latest()
             if self.fault is not None or not supervisor.armed or state is None:
@@ -126,20 +126,20 @@ class Arm:
 
     def arrived(self) -> bool:
         """Whether the last move has begun, has ended, and the arm stands where it was sent."""
-        errand = self._supervisor.pending
-        return errand is not None and self._supervisor.arrived(errand)
+        errand = self.supervisor.pending
+        return errand is not None and self.supervisor.arrived(errand)
 
     def halt(self, reason: str) -> None:
         """Stop, controlled; by the dashboard server if the arm does not stand in time. Moves may follow."""
         self.reason = reason
-        self._supervisor.halt()
+        self.supervisor.halt()
 
     def fail(self, outcome: SessionOutcome, detail: str) -> None:
         """Stop because of what somebody else found; on a contact the tool backs off the way it came."""
-        self._supervisor.fail(Finding(outcome, detail))
+        self.supervisor.fail(Finding(outcome, detail))
 
     def _await_ready(self, process: ArmProcess) -> None:
-        supervisor = self._supervisor
+        supervisor = self.supervisor
         patience = time.monotonic() + self.config.connect
         while not supervisor.ready:
             with supervisor.lock:

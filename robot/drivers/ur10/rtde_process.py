@@ -2,7 +2,8 @@
 
     python -m robot.drivers.ur10.rtde_process FD CONFIG_JSON
 
-FD is the inherited descriptor of the shared memory (shared_state.py). Commands come as JSON lines on the standard input, reports leave as
+FD is the inherited descriptor of the shared memory (shared_state.py). Commands come as JSON lines on the
+standard input, reports leave as
 JSON lines on the standard output, whatever the library prints goes to the standard error.
 
 The arm is stopped from here when a state says so, when the session asks for it, when it falls silent, and

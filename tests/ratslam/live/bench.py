@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -22,7 +23,7 @@ from robot.emulators.head.config import HeadEmulatorConfig
 from robot.recordings.cdr_live import Event
 from robot.recordings.mcap_scanner import McapScanner
 from robot.sources.source import Sample
-from tests.helpers.live import HEAD_FAULTS, ROOT, Faults, emulator, until, ur_emulator
+from tests.helpers.live import HEAD_FAULTS, PATIENCE, ROOT, Faults, emulator, until, ur_emulator
 
 SAMPLES = 2000.0
 """Frames of the head in a second."""
@@ -80,39 +81,92 @@ def kept(path: Path) -> Kept:
     return Kept(np.concatenate(sequence), np.concatenate(robot), samples, events, walk.broken)
 
 
-class Session:
-    """A session's process. It waits with everything loaded until `begin`.
+class Forked:
+    """A process started by a `SessionServer`; as a `subprocess.Popen`, as far as tests need it."""
 
-    Attributes:
-        directory: of its run. log: what it says.
-    """
+    def __init__(self, pid: int, code: Path) -> None:
+        self.pid, self._code = pid, code
+
+    def poll(self) -> int | None:
+        return int(self._code.read_text()) if self._code.exists() else None
+
+    def wait(self, timeout: float) -> int:
+        end = time.monotonic() + timeout
+        while (code := self.poll()) is None:
+            if time.monotonic() > end:
+                raise subprocess.TimeoutExpired("session", timeout)
+            time.sleep(0.005)
+        return code
+
+    def send_signal(self, number: int) -> None:
+        os.kill(self.pid, number)
+
+    def kill(self) -> None:
+        self.send_signal(signal.SIGKILL)
+
+
+class SessionServer:
+    """A process that has loaded everything and forks sessions."""
 
     def __init__(self, folder: Path) -> None:
-        folder.mkdir()
-        self.directory, self.log = folder / "run", folder / "log"
-        with self.log.open("wb") as log:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "tests.ratslam.live.waiting_session"],
-                cwd=ROOT,
-                stdin=subprocess.PIPE,
-                stdout=log,
-                stderr=log,
-                start_new_session=True,
-            )
+        self._folder, self._count = folder, 0
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "tests.ratslam.live.session_server"],
+            cwd=ROOT,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            bufsize=1,
+        )
+        assert self._process.stdout is not None
+        assert self._process.stdout.readline() == "ready\n"
 
-    def begin(self, arguments: list[str], **others: Any) -> None:
-        """Has it run the program with these arguments, in its own directory."""
-        undisturbed(self.process.pid)
-        assert self.process.stdin is not None
-        told = {"arguments": [*arguments, "-o", str(self.directory)], "mapper": 0.0, "listened": 0.7}
-        self.process.stdin.write(json.dumps(told | others).encode() + b"\n")
-        self.process.stdin.flush()
+    def start(self, section: dict[str, Any], mapper: float) -> Session:
+        """Begins a session.
+
+        Args:
+            section: `live` of its configuration. mapper: s that the stub takes for each sample.
+        """
+        self._count += 1
+        folder = self._folder / str(self._count)
+        folder.mkdir()
+        config, log, code = folder / "config.yaml", folder / "log", folder / "code"
+        config.write_text(json.dumps({"live": section}))
+        log.touch()
+        order = {
+            "arguments": ["live", str(config), "-o", str(folder / "run")],
+            "log": str(log),
+            "code": str(code),
+            "mapper": mapper,
+            "listened": 0.3,
+        }
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write(json.dumps(order) + "\n")
+        session = Session(folder, Forked(int(self._process.stdout.readline()), code))
+        undisturbed(session.process.pid)
+        return session
+
+    def close(self) -> None:
+        self._process.kill()
+        self._process.communicate()
+
+
+class Session:
+    """A session's process.
+
+    Attributes:
+        directory: of its run. log: its output.
+    """
+
+    def __init__(self, folder: Path, process: Forked) -> None:
+        self.directory, self.log, self.process = folder / "run", folder / "log", process
 
     def said(self) -> str:
         return self.log.read_text(errors="replace")
 
-    def until(self, condition: Callable[[], Any], seconds: float, what: str) -> Any:
-        """As `live_helpers.until`, but a session that has ended ends the waiting too."""
+    def until(self, condition: Callable[[], Any], what: str) -> Any:
+        """As `tests.helpers.live.until`; fails at once when the session has ended."""
 
         def met() -> Any:
             found = condition()
@@ -120,16 +174,16 @@ class Session:
             return found
 
         try:
-            return until(met, seconds, what)
+            return until(met, what)
         except AssertionError:
             print(self.said())
             raise
 
-    def says(self, text: str, seconds: float = 30.0) -> None:
+    def says(self, text: str) -> None:
         """Waits until it has said something."""
-        self.until(lambda: text in self.said(), seconds, f"{text!r} is said")
+        self.until(lambda: text in self.said(), f"{text!r} is said")
 
-    def code(self, seconds: float = 20.0) -> int:
+    def code(self, seconds: float = 2 * PATIENCE) -> int:
         """Its exit code, once it ends."""
         try:
             return self.process.wait(seconds)
@@ -174,10 +228,7 @@ class Session:
         """Nothing of it stays."""
         with suppress(ProcessLookupError):
             os.killpg(self.process.pid, signal.SIGKILL)
-        self.process.wait(5)
-        assert self.process.stdin is not None
-        with suppress(OSError):
-            self.process.stdin.close()
+        self.process.wait(PATIENCE)
 
 
 def _runs(folder: Path) -> bool:
@@ -185,33 +236,11 @@ def _runs(folder: Path) -> bool:
     return (folder / "stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
 
 
-class Queue:
-    """A session that waits for its turn, and behind it always another one."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder, self._count = folder, 0
-        self._waiting: Session | None = None
-
-    def take(self) -> Session:
-        """The one whose turn it is; whoever takes it ends it."""
-        session, self._waiting = self._waiting or self._next(), self._next()
-        session.until(lambda: "waiting" in session.said(), 60.0, "it has loaded everything")
-        return session
-
-    def close(self) -> None:
-        if self._waiting is not None:
-            self._waiting.end()
-
-    def _next(self) -> Session:
-        self._count += 1
-        return Session(self._folder / str(self._count))
-
-
 class Bench:
     """An address with an emulated arm and head, started when they are wanted and as often as it takes."""
 
-    def __init__(self, host: str, queue: Queue, folder: Path) -> None:
-        self.host, self._queue, self._folder = host, queue, folder
+    def __init__(self, host: str, server: SessionServer, folder: Path) -> None:
+        self.host, self._server, self._folder = host, server, folder
         self._arm, self._head = ExitStack(), ExitStack()
         self._faults: dict[str, Faults] = {}
         self.starved = 0  # stops by the controller's watchdog, before the test
@@ -242,7 +271,7 @@ class Bench:
             if self.arm.state()["mode"] != "RUNNING":
                 dashboard.ask("power on")
                 dashboard.ask("brake release")
-        until(self.still, 2.0, "the arm stands")
+        until(self.still, "the arm stands")
         self.arm(do="place", tcp=START.tolist())
         self.starved = self.arm.state()["watchdog_stops"]
         self.head(do="plug")
@@ -255,11 +284,8 @@ class Bench:
         Args:
             mapper: s that it takes for each sample. settings: of the section `live`.
         """
-        session = self._queue.take()
+        session = self._server.start(self.quick(**settings), mapper)
         try:
-            config = session.directory.parent / "config.yaml"
-            config.write_text(json.dumps({"live": self.quick(**settings)}))
-            session.begin(["live", str(config)], mapper=mapper)
             yield session
         finally:
             session.end()
@@ -269,20 +295,31 @@ class Bench:
         """The same, some whisks later, with the arm at full speed."""
         with self.session(**settings) as session:
             session.says("armed")
-            began = time.monotonic()
-            session.until(lambda: time.monotonic() - began > 0.8 and self.moves(), 10.0, "the arm moves")
+            session.until(
+                lambda: self.whisked(session) >= 2 and self.moves(), "two whisks and an arm that moves"
+            )
             yield session
 
     def quick(self, **settings: Any) -> dict[str, Any]:
-        """The section `live` of a session that takes a few seconds and, of a busy machine, much."""
-        arm = {"host": self.host, "stale": 0.5, "heartbeat": 0.5, "watchdog_hz": 4.0}
+        """The section `live` of a session of a few seconds, with time-outs for a busy machine."""
+        arm = {"host": self.host, "stale": 1.0, "heartbeat": 1.0, "watchdog_hz": 2.0} | {
+            "patience": PATIENCE,
+            "connect": PATIENCE,
+        }
         plan = {
             "whisking": {"rate": 4.0},
             "calibration": {"shortest": 1.0},
             "motion": {"speed": 0.05},
         }
-        head = {"address": self.host, "patience": 0.6, "silence": 0.25}
-        usual = {"waypoints": LEGS, "lift": 0.01, "residual": 1.0, "room": 0.0}
+        head = {"address": self.host, "patience": 1.5, "silence": 0.5}
+        usual = {
+            "waypoints": LEGS,
+            "lift": 0.01,
+            "residual": 1.0,
+            "room": 0.0,
+            "grace": 1.0,
+            "budget": PATIENCE,
+        }
         given = {
             name: value | settings.pop(name, {})
             for name, value in {"arm": arm, "head": head, "plan": plan}.items()
@@ -301,10 +338,14 @@ class Bench:
         """Whether it goes at full speed."""
         return float(np.linalg.norm(self.arm.state()["speed"][:3])) > 0.045
 
+    def whisked(self, session: Session) -> int:
+        """Whisks that a session has recorded, as far as its progress bar says."""
+        return max(map(int, re.findall(r"(\d+)/\d+ \[", session.said())), default=0)
+
     def worn(self) -> None:
         """The head cannot be put right: the next test gets another one."""
         self.head.process.kill()
-        self.head.process.wait(5)
+        self.head.process.wait(PATIENCE)
 
     def close(self) -> None:
         self._arm.close()

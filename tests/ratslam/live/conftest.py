@@ -1,4 +1,4 @@
-"""A bench for a whole module, put right before each test, and sessions that wait for all of them."""
+"""Emulators for each module, reset before each test, and a server that starts sessions for all modules."""
 
 from __future__ import annotations
 
@@ -6,27 +6,26 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.ratslam.live.bench import Bench, Queue
+from tests.ratslam.live.bench import Bench, SessionServer
 
 
 @pytest.fixture(scope="session")
-def queue(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Queue]:
-    """Sessions that have loaded everything."""
-    queue = Queue(tmp_path_factory.mktemp("sessions"))
-    yield queue
-    queue.close()
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SessionServer]:
+    server = SessionServer(tmp_path_factory.mktemp("sessions"))
+    yield server
+    server.close()
 
 
 @pytest.fixture(scope="module")
-def table(loopback: str, queue: Queue, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
-    """Emulators of this worker; no longer than a module, for others need its address."""
-    bench = Bench(loopback, queue, tmp_path_factory.mktemp("bench"))
+def table(loopback: str, server: SessionServer, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    """Emulators of this worker; other modules need the address."""
+    bench = Bench(loopback, server, tmp_path_factory.mktemp("bench"))
     yield bench
     bench.close()
 
 
 @pytest.fixture
 def bench(table: Bench) -> Bench:
-    """They, in good order."""
+    """Emulators in their initial state."""
     table.ready()
     return table

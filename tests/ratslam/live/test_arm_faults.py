@@ -13,38 +13,34 @@ from tests.ratslam.live.expected_outcomes import ended, stands
 BLIND = {"stall", "malformed", "truncated", "huge", "nan", "freeze", "die"}
 """Faults after which the session does not see the arm any more."""
 OFTEN = pytest.mark.soak
-"""The arm alone meets these in every run of the suite (`tests/robot/ur10`), whole sessions in `make soak`."""
+"""The arm alone meets these in every run of the suite (`tests/robot/drivers/ur10`), whole sessions in `make soak`."""
 
 
 @pytest.mark.parametrize(
-    ("fault", "outcomes"),
+    ("fault", "outcome"),
     [
-        pytest.param({"do": "stall", "seconds": 1.0}, {"arm_stale"}, marks=OFTEN),
-        ({"do": "stall", "seconds": 3.0}, {"arm_stale"}),
-        ({"do": "malformed"}, {"arm_malformed"}),
-        # What half a frame and one without an end are taken for is the library's affair.
-        pytest.param({"do": "truncated"}, {"arm_malformed", "arm_stale"}, marks=OFTEN),
-        pytest.param({"do": "huge"}, {"arm_malformed", "arm_stale"}, marks=OFTEN),
-        pytest.param({"do": "nan"}, {"arm_malformed"}, marks=OFTEN),
-        pytest.param({"do": "freeze"}, {"arm_stale"}, marks=OFTEN),
-        ({"do": "protective"}, {"protective_stop"}),
-        pytest.param({"do": "safeguard"}, {"safeguard_stop"}, marks=OFTEN),
-        pytest.param({"do": "emergency"}, {"emergency_stop"}, marks=OFTEN),
-        ({"do": "ik_fails"}, {"unreachable"}),
-        ({"do": "die"}, {"arm_gone", "arm_stale"}),
+        pytest.param({"do": "stall", "seconds": 1.5}, "arm_stale", marks=OFTEN),
+        ({"do": "stall", "seconds": 60}, "arm_stale"),
+        ({"do": "malformed"}, "arm_malformed"),
+        pytest.param({"do": "truncated"}, "arm_malformed", marks=OFTEN),
+        pytest.param({"do": "huge"}, "arm_stale", marks=OFTEN),
+        pytest.param({"do": "nan"}, "arm_malformed", marks=OFTEN),
+        pytest.param({"do": "freeze"}, "arm_stale", marks=OFTEN),
+        ({"do": "protective"}, "protective_stop"),
+        pytest.param({"do": "safeguard"}, "safeguard_stop", marks=OFTEN),
+        pytest.param({"do": "emergency"}, "emergency_stop", marks=OFTEN),
+        ({"do": "ik_fails"}, "unreachable"),
+        ({"do": "die"}, "arm_gone"),
     ],
     ids=lambda value: "-".join(map(str, value.values())) if isinstance(value, dict) else "",
 )
-def test_a_fault_of_the_controller(bench: Bench, fault: dict, outcomes: set[str]) -> None:
+def test_a_fault_of_the_controller(bench: Bench, fault: dict, outcome: str) -> None:
     with bench.under_way() as session:
         at = bench.moment()
         if fault["do"] == "die":
             bench.arm.die()
         else:
             bench.arm(**fault)
-        session.code()
-        outcome = session.report()["outcome"]
-        assert outcome in outcomes
         report, kept = ended(bench, session, outcome, at)
         assert report["standing"] or fault["do"] in BLIND
         assert kept.events[-1].name == "fault"

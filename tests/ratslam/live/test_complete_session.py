@@ -86,7 +86,7 @@ def lived(host: str, folder: Path, *settings: str, longest: float, freeze: float
             )
             undisturbed(process.pid)
             try:
-                if freeze and until(partial(_begun, process, folder / "log"), longest, "the third whisk"):
+                if freeze and until(partial(_begun, process, folder / "log"), "the third whisk"):
                     mapper = mapper_of(process.pid)
                     os.kill(mapper, signal.SIGSTOP)
                     time.sleep(freeze)

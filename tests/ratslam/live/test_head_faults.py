@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import time
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from tests.helpers.live import until
+from tests.helpers.live import PATIENCE, until
 from tests.ratslam.live.bench import LEGS, START, Bench, Kept
-from tests.ratslam.live.expected_outcomes import ended, stands
+from tests.ratslam.live.expected_outcomes import ended
 
 
 def gaps(kept: Kept) -> int:
@@ -32,7 +31,7 @@ def test_a_head_that_stays_away_ends_it(bench: Bench, fault: dict, outcome: str)
     with bench.under_way() as session:
         at = bench.moment()
         bench.head(**fault)
-        until(bench.still, 1.5, "the arm stands while the head sends nothing")
+        until(bench.still, "the arm stands while the head sends nothing")
         report, kept = ended(bench, session, outcome, at)
         assert report["standing"]
         assert kept.names()[-2:] == ["held", "fault"]
@@ -46,16 +45,15 @@ def test_a_head_that_stays_away_ends_it(bench: Bench, fault: dict, outcome: str)
     "fault",
     [
         {"do": "unplug"},
-        {"do": "stall", "seconds": 0.7},
-        pytest.param({"do": "silence", "seconds": 0.7}, marks=pytest.mark.soak),
+        {"do": "stall", "seconds": 1.5},
+        pytest.param({"do": "silence", "seconds": 1.5}, marks=pytest.mark.soak),
     ],
     ids=lambda fault: fault["do"],
 )
 def test_a_head_that_comes_back_is_waited_for(bench: Bench, fault: dict) -> None:
-    with bench.under_way(head={"patience": 20.0}, waypoints=LEGS[:2]) as session:
+    with bench.under_way(head={"patience": PATIENCE}, waypoints=LEGS[:2]) as session:
         bench.head(**fault)
-        until(bench.still, 1.5, "the arm stands")
-        stands(bench)
+        until(bench.still, "the arm stands")
         bench.head(do="plug")
         report, kept = ended(bench, session, "complete", bench.moment()._replace(robot=0.0, sample=0))
         assert report["standing"]
@@ -75,7 +73,7 @@ def test_a_head_that_comes_back_is_waited_for(bench: Bench, fault: dict) -> None
 
 def test_what_is_damaged_is_counted(bench: Bench) -> None:
     """Garbage, damaged frames, frames left out and out of sequence: exact numbers, and it goes on."""
-    with bench.under_way(whisks=12, budget=60.0) as session:
+    with bench.under_way(whisks=12, head={"patience": PATIENCE}) as session:
         before = bench.head(do="counts")
         bench.head(do="corrupt", frames=7)
         bench.head(do="garbage", bytes=100_000)
@@ -96,7 +94,7 @@ def test_what_is_damaged_is_counted(bench: Bench) -> None:
 
 
 def test_frames_lost_to_an_overrun_are_counted(bench: Bench) -> None:
-    with bench.under_way(head={"silence": 5.0, "patience": 20.0}, whisks=16) as session:
+    with bench.under_way(head={"silence": 10.0, "patience": PATIENCE}, whisks=16) as session:
         before = bench.head(do="counts")
         bench.head(do="silence", seconds=2.4)  # more than its FIFO holds
         report, kept = ended(bench, session, "complete", bench.moment()._replace(robot=0.0, sample=0))
@@ -121,10 +119,9 @@ def test_its_clock_jumps(bench: Bench, jump: int) -> None:
 
 def test_a_whisker_pressed_to_its_end(bench: Bench) -> None:
     with bench.under_way() as session:
-        time.sleep(0.3)  # 10 mm to back off
         at = bench.moment()
         bench.head(do="saturate", whisker=11, seconds=0.3)
-        furthest = until(lambda: bench.still() and bench.arm.state()["tcp"], 1.0, "a standstill")
+        furthest = until(lambda: bench.still() and bench.arm.state()["tcp"], "a standstill")
         report, _ = ended(bench, session, "contact", at)
         assert "whisker 11" in report["detail"]
         back = np.linalg.norm(np.subtract(bench.arm.state()["tcp"], furthest))

@@ -302,13 +302,13 @@ def killed(folder: Path, seconds: float) -> tuple[int, int, Path]:
     beside.write_bytes(bytes(16))
     process = subprocess.Popen([sys.executable, "-c", WRITER, path, beside], cwd=ROOT)
     try:
-        patience = time.monotonic() + 8
+        patience = time.monotonic() + 60
         while not beside.read_bytes()[0] and time.monotonic() < patience:
             time.sleep(0.01)
         time.sleep(seconds)
     finally:
         process.send_signal(signal.SIGKILL)
-        process.wait(10)
+        process.wait(60)
     blocks, whisks = struct.unpack("<qq", beside.read_bytes())
     return blocks, whisks, path
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import errno
 import json
 import threading
-import time
-from collections.abc import Callable
 
 import numpy as np
 
@@ -100,11 +98,3 @@ class Wire:
 
     def close(self) -> None:
         self.head.closed += 1
-
-
-def until(true: Callable[[], object], timeout: float = 5.0) -> None:
-    """Waits for something to become true; fails if it does not."""
-    end = time.monotonic() + timeout
-    while not true():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.002)

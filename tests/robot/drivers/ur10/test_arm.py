@@ -14,22 +14,27 @@ from robot.drivers.ur10.arm import Arm
 from robot.drivers.ur10.config import BoxConfig
 from robot.drivers.ur10.dashboard import Dashboard
 from robot.drivers.ur10.safety import TargetRefused
-from tests.helpers.live import Faults, moves, until
+from tests.helpers.live import PATIENCE, Faults, moves, until
 from tests.robot.drivers.ur10.conftest import AWAY, HOME, settings
 
 
 def under_way(arm: Arm, controller: Faults) -> None:
     """Send the arm off and wait until it is at full speed."""
     arm.move(AWAY)
-    until(lambda: arm.fault or controller.state()["speed"][0] > 0.049, 2.0, "the arm moves")
+    until(lambda: arm.fault or controller.state()["speed"][0] > 0.049, "the arm moves")
     assert arm.fault is None
 
 
-def ended(arm: Arm, controller: Faults, within: float = 0.5) -> SessionOutcome:
-    """The fault's outcome, with the arm at a standstill at the emulator in time, and no way to move on."""
-    fault = until(lambda: arm.fault, 3.0, "a fault")
-    until(lambda: not controller.state()["moving"], within, "a standstill")
+def ended(arm: Arm, controller: Faults, within: float = PATIENCE) -> SessionOutcome:
+    """Outcome of the fault; the arm has stopped before its target, and refuses to move.
+
+    Args:
+        within: s from the fault to the standstill.
+    """
+    fault = until(lambda: arm.fault, "a fault")
+    until(lambda: not controller.state()["moving"], "a standstill", within)
     place = controller.state()["tcp"]
+    assert place[0] < AWAY[0] - 1e-3, "the arm went on to its target"
     with pytest.raises(TargetRefused, match="does not move"):
         arm.move(HOME)
     time.sleep(0.1)
@@ -38,45 +43,58 @@ def ended(arm: Arm, controller: Faults, within: float = 0.5) -> SessionOutcome:
     return fault.outcome
 
 
-def test_it_goes_where_it_is_sent_and_says_when_it_is_there(arm: Arm, controller: Faults) -> None:
+TARGET = HOME + [0.01, 0.02, 0.0, 0.0, 0.0, 0.0]
+
+
+def test_a_move_arrives(arm: Arm, controller: Faults) -> None:
     first = len(controller.state()["targets"])
-    target = HOME + [0.01, 0.02, 0.0, 0.0, 0.0, 0.0]
     assert not arm.arrived()
-    move = arm.move(target)
+    move = arm.move(TARGET)
     assert not arm.arrived()
     began = time.monotonic()
-    until(arm.arrived, move.most + 1, "arrival")
+    until(arm.arrived, "arrival")
     assert time.monotonic() - began > 0.5 * move.seconds
-    np.testing.assert_allclose(controller.state()["tcp"], target, atol=1e-9)
+    np.testing.assert_allclose(controller.state()["tcp"], TARGET, atol=1e-9)
     (reached,) = moves(controller, first)
-    np.testing.assert_array_equal(reached["goal"], target)
+    np.testing.assert_array_equal(reached["goal"], TARGET)
     assert reached["speed"] == arm.config.speed
+    assert arm.fault is None
+
+
+def test_states_are_in_order(arm: Arm, controller: Faults) -> None:
+    until(lambda: len(arm.states()) > 100, "states")
     states = arm.states()
     assert (np.diff(states["counter"].astype(int)) == 1).all()
     assert (np.diff(states["host"]) > 0).all()
-    # The library drops a state when two arrive together, which a busy machine makes happen.
+    # The library skips states that arrive together: periods are whole multiples.
     periods = np.diff(states["robot"]) * 125
     np.testing.assert_allclose(periods, np.round(periods), atol=1e-6)
     assert periods.min() > 0.5
-    assert periods.mean() < 1.1
-    assert len(arm.history) == len(states)
+    assert len(arm.history) >= len(states)
     assert len(arm.states(after=int(states["counter"][-1]) - 3)) >= 3
-    # A second move to where it stands is one as well; a halt is not the end.
-    arm.move(target)
-    until(arm.arrived, 2.0, "arrival without a way")
-    arm.move(AWAY)
-    until(lambda: not arm.still(), 1.0)
-    arm.halt("a test")
-    until(lambda: not controller.state()["moving"], 0.3, "a standstill")
-    assert not arm.arrived()
-    arm.move(target)
-    until(arm.arrived, 3.0)
-    # A newer move replaces an older one.
+
+
+def test_a_move_to_the_present_pose_arrives(arm: Arm) -> None:
+    arm.move(HOME)
+    until(arm.arrived, "arrival without a way")
+
+
+def test_a_move_after_a_halt(arm: Arm, controller: Faults) -> None:
     under_way(arm, controller)
-    back = target + [0.03, 0.0, 0.0, 0.0, 0.0, 0.0]
-    arm.move(back)
-    until(arm.arrived, 4.0, "arrival")
-    np.testing.assert_allclose(controller.state()["tcp"], back, atol=1e-9)
+    arm.halt("a test")
+    until(lambda: not controller.state()["moving"], "a standstill")
+    assert controller.state()["tcp"][0] < AWAY[0] - 1e-3
+    assert not arm.arrived()
+    arm.move(TARGET)
+    until(arm.arrived, "arrival")
+    assert arm.fault is None
+
+
+def test_a_newer_move_replaces_an_older(arm: Arm, controller: Faults) -> None:
+    under_way(arm, controller)
+    arm.move(TARGET)
+    until(arm.arrived, "arrival")
+    np.testing.assert_allclose(controller.state()["tcp"], TARGET, atol=1e-9)
     assert arm.fault is None
     assert controller.state()["watchdog_stops"] == 0
 
@@ -94,8 +112,8 @@ def test_safety_stops(arm: Arm, controller: Faults, stop: str, outcome: SessionO
     controller(do=stop)
     assert ended(arm, controller) is outcome
     # States still come, so the pose can be read again; and when the stop is released nothing goes on.
-    assert arm.age() < 0.05
-    until(lambda: controller.state()["runtime"] == "STOPPED", 0.5, "the program is ended")
+    until(lambda: arm.age() < 0.05, "a fresh state")
+    until(lambda: controller.state()["runtime"] == "STOPPED", "the program is ended")
     place = controller.state()["tcp"]
     controller(do="clear")
     time.sleep(0.15)
@@ -103,21 +121,38 @@ def test_safety_stops(arm: Arm, controller: Faults, stop: str, outcome: SessionO
     np.testing.assert_allclose(arm.latest()["tcp"], place, atol=1e-9)
 
 
-@pytest.mark.parametrize("seconds", [1.0, 3.0])
-def test_a_stall(arm: Arm, controller: Faults, seconds: float) -> None:
+def test_a_stall(arm: Arm, controller: Faults) -> None:
     under_way(arm, controller)
-    controller(do="stall", seconds=seconds)
-    began = time.monotonic()
+    controller(do="stall", seconds=PATIENCE)
     assert ended(arm, controller) is SessionOutcome.ARM_STALE
-    assert arm.fault.time - began < arm.config.stale + 0.3
     assert len(arm.history) > 10
 
 
-@pytest.mark.parametrize("frame", ["malformed", "truncated", "huge"])
-def test_frames_that_are_none(arm: Arm, controller: Faults, frame: str) -> None:
+@pytest.mark.soak
+@pytest.mark.parametrize("seconds", [1.0, 3.0])
+def test_a_stall_is_found_in_time(controller: Faults, seconds: float) -> None:
+    with Arm(settings(controller.host, stale=0.5)) as arm:
+        arm.start()
+        under_way(arm, controller)
+        controller(do="stall", seconds=seconds)
+        began = time.monotonic()
+        assert ended(arm, controller, within=0.5) is SessionOutcome.ARM_STALE
+        assert arm.fault is not None
+        assert arm.fault.time - began < arm.config.stale + 0.3
+
+
+@pytest.mark.parametrize(
+    ("frame", "outcome"),
+    [
+        ("malformed", SessionOutcome.ARM_MALFORMED),
+        ("truncated", SessionOutcome.ARM_MALFORMED),
+        ("huge", SessionOutcome.ARM_STALE),
+    ],
+)
+def test_invalid_frames(arm: Arm, controller: Faults, frame: str, outcome: SessionOutcome) -> None:
     under_way(arm, controller)
     controller(do=frame)
-    assert ended(arm, controller) in (SessionOutcome.ARM_MALFORMED, SessionOutcome.ARM_STALE)
+    assert ended(arm, controller) is outcome
     assert np.isfinite(arm.history["tcp"]).all()
 
 
@@ -136,8 +171,8 @@ def test_a_frozen_clock(arm: Arm, controller: Faults) -> None:
 def test_the_controller_dies(arm: Arm, controller: Faults) -> None:
     under_way(arm, controller)
     controller.die()
-    fault = until(lambda: arm.fault, 1.0, "a fault")
-    assert fault.outcome in (SessionOutcome.ARM_GONE, SessionOutcome.ARM_STALE)
+    fault = until(lambda: arm.fault, "a fault")
+    assert fault.outcome is SessionOutcome.ARM_GONE
 
 
 def test_somebody_ends_the_program(arm: Arm, controller: Faults) -> None:
@@ -162,20 +197,20 @@ def test_the_arms_process_is_gone(arm: Arm, controller: Faults, number: int, out
     if number == signal.SIGKILL:
         arm.respawn()
         assert arm.fault is None
-        move = arm.move(HOME + [0.005, 0, 0, 0, 0, 0])
-        until(arm.arrived, move.most + 1, "arrival after a respawn")
+        arm.move(HOME + [0.005, 0, 0, 0, 0, 0])
+        until(arm.arrived, "arrival after a respawn")
 
 
-def test_a_halt_that_does_not_show_is_asked_for_the_second_way(controller: Faults) -> None:
-    with Arm(settings(controller.host, stale=1.0)) as arm:
+def test_a_stop_that_has_no_effect_is_repeated_by_the_dashboard(controller: Faults) -> None:
+    with Arm(settings(controller.host)) as arm:
         arm.start()
         under_way(arm, controller)
-        bites, ends = (controller.state()[name] for name in ("watchdog_stops", "program_stops"))
+        ends = controller.state()["program_stops"]
         os.kill(arm.pid, signal.SIGSTOP)
-        arm.halt("nobody listens")
-        until(lambda: not controller.state()["moving"], 0.45, "a standstill")
-        assert controller.state()["program_stops"] == ends + 1
-        assert controller.state()["watchdog_stops"] == bites
+        arm.halt("the process does not respond")
+        until(lambda: not controller.state()["moving"], "a standstill")
+        assert controller.state()["program_stops"] > ends
+        assert controller.state()["tcp"][0] < AWAY[0] - 1e-3
         os.kill(arm.pid, signal.SIGKILL)
 
 
@@ -212,20 +247,20 @@ def test_a_wall_is_hit(controller: Faults) -> None:
         arm.start()
         controller(do="wall", x=at, stiffness=20_000)
         arm.move(AWAY)
-        assert ended(arm, controller, within=3.0) is SessionOutcome.CONTACT
+        assert ended(arm, controller) is SessionOutcome.CONTACT
         assert controller.state()["penetration_max"] <= 0.003
         assert controller.state()["safety"] == "NORMAL"
         # Backed off the way it came: out of the wall, and no further than told.
-        until(lambda: controller.state()["tcp"][0] < at - 0.006, 2.0, "it backs off")
-        until(arm.still, 2.0)
+        until(lambda: controller.state()["tcp"][0] < at - 0.006, "it backs off")
+        until(arm.still)
         assert at - 0.0105 < controller.state()["tcp"][0]
         assert arm.fault.outcome is SessionOutcome.CONTACT
 
 
 def test_somebody_else_finds_a_contact(arm: Arm, controller: Faults) -> None:
     under_way(arm, controller)
-    time.sleep(0.2)
+    until(lambda: controller.state()["tcp"][0] > HOME[0] + 0.012, "a way to back off")
     arm.fail(SessionOutcome.CONTACT, "a whisker is bent too far")
-    furthest = until(lambda: (not controller.state()["moving"]) and controller.state()["tcp"][0], 1.0)
-    until(lambda: controller.state()["tcp"][0] < furthest - 0.009, 2.0, "it backs off")
+    furthest = until(lambda: arm.still() and controller.state()["tcp"][0], "a standstill")
+    until(lambda: controller.state()["tcp"][0] < furthest - 0.009, "it backs off")
     assert arm.fault.outcome is SessionOutcome.CONTACT

@@ -1,4 +1,4 @@
-"""A session that is killed or hangs in the midst of a motion: the arm stands, and nothing stays behind."""
+"""A session that is killed or hangs during a motion: the arm stops, and no process or memory stays behind."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -16,19 +15,18 @@ from tests.robot.drivers.ur10.conftest import AWAY
 
 SESSION = """
 import sys, time
-import numpy as np
 from robot.drivers.ur10.arm import Arm
-from robot.drivers.ur10.config import ArmConfig
-arm = Arm(ArmConfig(host=sys.argv[1]))
+from tests.robot.drivers.ur10.conftest import settings
+arm = Arm(settings(sys.argv[1]))
 arm.start()
 arm.move([float(number) for number in sys.argv[2:]])
 print(arm.pid, flush=True)
-time.sleep(60)
+time.sleep(600)
 """
 
 
 def runs(pid: int) -> bool:
-    """Whether a process does something; one that only waits to be buried does not."""
+    """Whether a process runs; a zombie does not."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
     except (FileNotFoundError, ProcessLookupError):
@@ -48,19 +46,18 @@ def test_a_session_that_ends_or_hangs(controller: Faults, what: str) -> None:
         assert session.stdout is not None
         pid = session.stdout.readline()
         shared = shared_memory(session.pid)
-        until(lambda: controller.state()["speed"][0] > 0.049, 2.0, "the arm moves")
+        until(lambda: controller.state()["speed"][0] > 0.049, "the arm moves")
         bites = controller.state()["watchdog_stops"]
         if what == "killed with the arm's process":
             os.kill(int(pid), signal.SIGSTOP)  # it must not find out first
         session.send_signal(signal.SIGSTOP if what == "hangs" else signal.SIGKILL)
         if what == "killed with the arm's process":
             os.kill(int(pid), signal.SIGKILL)
-        began = time.monotonic()
-        until(lambda: not controller.state()["moving"], 0.5, "a standstill")
-        assert time.monotonic() - began < 0.5
+        until(lambda: not controller.state()["moving"], "a standstill")
         place = controller.state()["tcp"]
-        until(lambda: not runs(int(pid)), 2.0, "the arm's process ends")
-        until(lambda: controller.state()["runtime"] == "STOPPED", 0.5, "its program is ended")
+        assert place[0] < AWAY[0] - 1e-3, "the arm went on to its target"
+        until(lambda: not runs(int(pid)), "the arm's process ends")
+        until(lambda: controller.state()["runtime"] == "STOPPED", "its program is ended")
         assert controller.state()["tcp"] == place
         if what == "killed with the arm's process":
             assert controller.state()["watchdog_stops"] == bites + 1
@@ -69,7 +66,7 @@ def test_a_session_that_ends_or_hangs(controller: Faults, what: str) -> None:
             assert not [name for name in shared if Path(name).exists()], "shared memory stays behind"
     finally:
         session.kill()
-        session.wait(5)
+        session.wait(30)
         assert session.stdout is not None
         session.stdout.close()
 

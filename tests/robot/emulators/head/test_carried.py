@@ -24,6 +24,6 @@ def test_the_head_follows_the_tool(tmp_path: Path, loopback: str) -> None:
             told = state["lift"] is not None and abs(state["lift"] - lift) < 1e-6
             return told and bool(np.allclose(state["pose"], pose, atol=1e-6))
 
-        until(lambda: stands(here, 0.1), 3.0, "where the arm began")
+        until(lambda: stands(here, 0.1), "where the arm began")
         arm(do="place", tcp=tcp_from_pose(PLACING, there).tolist())
-        until(lambda: stands(there, 0.0), 3.0, "where the arm was put")
+        until(lambda: stands(there, 0.0), "where the arm was put")

@@ -157,13 +157,13 @@ def test_a_killed_client_stops_the_arm_only_by_the_watchdog(faults: Faults, watc
     before = faults.state()
     with client(faults.host, "drive watched" if watched else "drive") as process:
         at_the_word(process)
-        until(lambda: faults.state()["speed"][1] == pytest.approx(0.01), 2.0, "the arm moves")
+        until(lambda: faults.state()["speed"][1] == pytest.approx(0.01), "the arm moves")
         time.sleep(0.3)
         assert faults.state()["moving"]
         process.send_signal(signal.SIGKILL)
         process.wait(WAIT)
     if watched:
-        until(lambda: not faults.state()["moving"], 2.0, "the arm stands")
+        until(lambda: not faults.state()["moving"], "the arm stands")
     else:
         time.sleep(0.5)
         assert faults.state()["moving"]
@@ -195,7 +195,7 @@ def test_a_long_stall_takes_a_controlling_client_down(faults: Faults) -> None:
 def test_the_rate_can_be_too_low(faults: Faults) -> None:
     def told() -> int:
         with PoseListener(faults.host) as poses:
-            until(poses.newest, 2.0)
+            until(poses.newest)
             times = set()
             end = poses.newest().robot_time + 0.5
             while poses.newest().robot_time < end:

@@ -1,0 +1,73 @@
+"""`python -m tests.ratslam.live.session_server`: forks sessions from a process that has loaded everything.
+
+Each line of JSON on its standard input starts one; the process id is printed. The line gives the `arguments`
+of `python -m ratslam`, files for the output (`log`) and the exit code (`code`), how long the stub mapper
+takes for a sample (`mapper`, s), and how long the self-test listens (`listened`, s).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import warnings
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+
+def main() -> None:
+    # Everything that a session loads is loaded here, once.
+    from ratslam.cli import main as program  # isort: skip
+
+    print("ready", flush=True)
+    for line in sys.stdin:
+        with suppress(ChildProcessError):
+            while os.waitpid(-1, os.WNOHANG)[0]:
+                pass
+        if not _fork():
+            session = _fork()
+            if not session:
+                _become_session(json.loads(line), program)
+            print(session, flush=True)
+            code = os.waitstatus_to_exitcode(os.waitpid(session, 0)[1])
+            file = Path(json.loads(line)["code"])
+            file.with_suffix(".new").write_text(str(code))
+            file.with_suffix(".new").rename(file)
+            os._exit(0)
+
+
+def _fork() -> int:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # JAX is loaded, but has started no threads
+        return os.fork()
+
+
+def _become_session(told: dict[str, Any], program: Any) -> None:
+    """Runs the program in a session of processes of its own; does not return."""
+    import ratslam.live.session
+    from robot.live import selftest
+    from tests.ratslam.live import stub_mapper
+
+    os.setsid()
+    log = os.open(told["log"], os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    for fd, target in ((os.open(os.devnull, os.O_RDONLY), 0), (log, 1), (log, 2)):
+        os.dup2(fd, target)
+    arguments = told["arguments"]
+    mapping = partial(stub_mapper.mapping, arguments[arguments.index("-o") + 1], told["mapper"])
+    run = ratslam.live.session.run_live_session
+    # No program that draws the map beside it.
+    ratslam.live.session.run_live_session = lambda *given, armed: run(*given, mapping=mapping)
+    selftest.LISTEN_TIME = told["listened"]
+    code = 1
+    try:
+        code = program(arguments)
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+
+
+if __name__ == "__main__":
+    main()
