@@ -7,6 +7,7 @@ takes for a sample (`mapper`, s), and how long the self-test listens (`listened`
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import sys
@@ -16,10 +17,23 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+LOADED = (
+    "ratslam.cli.live",
+    "ratslam.live.session",
+    "ratslam.live.mapper_process",
+    "robot.live.whisk_loop",
+    "robot.drivers.head.usb_tcp_backend",
+    "evaluation.metrics.scorecard",
+    "usb.core",
+    "usb.util",
+)
+"""All that a session loads."""
+
 
 def main() -> None:
-    # Everything that a session loads is loaded here, once.
-    from ratslam.cli import main as program  # isort: skip
+    for name in LOADED:
+        importlib.import_module(name)
+    from ratslam.cli import main as program
 
     print("ready", flush=True)
     for line in sys.stdin:

@@ -13,7 +13,8 @@ from tests.ratslam.live.expected_outcomes import ended, stands
 BLIND = {"stall", "malformed", "truncated", "huge", "nan", "freeze", "die"}
 """Faults after which the session does not see the arm any more."""
 OFTEN = pytest.mark.soak
-"""The arm alone meets these in every run of the suite (`tests/robot/drivers/ur10`), whole sessions in `make soak`."""
+"""Every run of the suite tests the arm alone with these (`tests/robot/drivers/ur10`),
+`make soak` whole sessions."""
 
 
 @pytest.mark.parametrize(
