@@ -34,7 +34,7 @@ REACH = 2.5
 """Standard deviations of a stamp that are drawn."""
 LARGEST = 1e6
 """Motion of one step from which on it is no motion, m or rad."""
-WALL, COMPASS = 100.0, 40.0
+WALL, WALL_DIRECTIONS = 100.0, 40.0
 """Largest precision of a wall's direction against the field there, and against all walls."""
 
 
@@ -62,13 +62,14 @@ class GridState(NamedTuple):
     """All that the filter remembers.
 
     Attributes:
-        maps: [N, layers, S, S]. compass: [N, 2] sums of unit vectors of four times each wall's direction.
+        maps: [N, layers, S, S]. wall_directions: [N, 2] sums of unit vectors
+            at four times the direction of each wall.
         motion: the last report's `Motion`. touched: [W] its contacts. key: data of the random stream's key.
     """
 
     particles: Particles
     maps: Array
-    compass: Array
+    wall_directions: Array
     motion: Array
     touched: Array
     key: Array
@@ -114,11 +115,18 @@ class GridBackend:
 
     Args:
         feelers: whisker geometry of the observations. side: of the map, m. dtype: of all floating state.
+        counted: selects the free points that count in eq. 2 (`likelihood.model: literal`).
     """
 
     def __init__(
-        self, config: GridConfig, feelers: PlanarWhiskers, side: float, dtype: Any = np.float64
+        self,
+        config: GridConfig,
+        feelers: PlanarWhiskers,
+        side: float,
+        dtype: Any = np.float64,
+        counted: likelihoods.CountedCells = likelihoods.all_cells,
     ) -> None:
+        self.counted = counted
         self.config, self.feelers, self.dtype = config, feelers, np.dtype(dtype)
         self.side = int(np.ceil(side / config.cell))
         self.whiskers = len(feelers.length)
@@ -127,9 +135,12 @@ class GridBackend:
         angle = np.arange(RIM) * 2 * np.pi / RIM
         rim = 0.85 * config.body * np.stack([np.cos(angle), np.sin(angle)], axis=1)
         self.body = np.concatenate([np.zeros((1, 2)), rim]).astype(self.dtype)
-        self.blob_sd, self.free_sd = config.stamps.blob_sd / config.cell, config.stamps.free_sd / config.cell
+        self.blob_sd, self.free_sd = (
+            config.footprint.blob_sd / config.cell,
+            config.footprint.free_sd / config.cell,
+        )
         blob, free, along = (
-            REACH * sd for sd in (config.stamps.blob_sd, config.stamps.free_sd, config.stamps.along)
+            REACH * sd for sd in (config.footprint.blob_sd, config.footprint.free_sd, config.footprint.along)
         )
         reach = max(np.hypot(*self.free.T).max(initial=0.0) + free, config.body)
         tips = np.hypot(*feelers.points(np.ones(1))[:, 0].T).max(initial=0.0)
@@ -142,7 +153,7 @@ class GridBackend:
         first, key = jax.random.split(key)
         return GridState(
             particles.start(self.config.drift, first, count, self.dtype),
-            particle_maps.blank(count, self.side, self.dtype),
+            particle_maps.empty_maps(count, self.side, self.dtype),
             jnp.zeros((count, 2), self.dtype),
             jnp.int32(MotionKind.OTHER),
             jnp.zeros(self.whiskers, bool),
@@ -169,17 +180,17 @@ class GridBackend:
         key, draw, pick, jitter = jax.random.split(jax.random.wrap_key_data(state.key), 4)
         odometry, felt, clean = self._taken(state, observation)
         motion = jnp.asarray(observation.motion, jnp.int32)
-        swarm = particles.moved(self.config.drift, state.particles, odometry, motion != state.motion, draw)
-        swarm, vanished = particles.weighed(swarm, self._likelihood(state, swarm.pose, felt))
-        share = particles.shares(swarm.weight)
-        worth = particles.effective(share)
-        pose, spread = particles.mean(swarm.pose, share)
+        swarm = particles.move(self.config.drift, state.particles, odometry, motion != state.motion, draw)
+        swarm, vanished = particles.weigh(swarm, self._likelihood(state, swarm.pose, felt))
+        share = particles.normalised_weights(swarm.weight)
+        worth = particles.effective_count(share)
+        pose, spread = particles.weighted_mean(swarm.pose, share)
         poses = swarm.pose
 
         swarm, who = self._drawn(swarm, share, worth, felt.told, pick, jitter)
-        maps = particles.copied_rows(state.maps, who)
-        compass = state.compass[who.ancestor]
-        maps, compass, outside = self._marked(maps, compass, swarm.pose, felt)
+        maps = particles.copy_rows(state.maps, who)
+        wall_directions = state.wall_directions[who.ancestor]
+        maps, wall_directions, outside = self._marked(maps, wall_directions, swarm.pose, felt)
 
         outcome = jnp.where(who.copies > 0, Outcome.RESAMPLED, Outcome.OK)
         outcome = jnp.where(outside, Outcome.OUTSIDE, outcome)
@@ -189,7 +200,7 @@ class GridBackend:
         estimate = Estimate(pose, spread, place, place, jnp.int32(Action.NONE), vanished)
         evidence = GridEvidence(who.ancestor, poses, share, worth, outcome)
         touched = jnp.where(felt.told, felt.touching, False)
-        after = GridState(swarm, maps, compass, motion, touched, jax.random.key_data(key))
+        after = GridState(swarm, maps, wall_directions, motion, touched, jax.random.key_data(key))
         return after, estimate, evidence
 
     def new_map(self) -> GridMap:
@@ -238,10 +249,10 @@ class GridBackend:
         if config.model != "evidence":
             return self._printed(state.maps, pose, felt)
         points = jnp.concatenate([jnp.asarray(self.free), jnp.asarray(self.body)])
-        evidence = particle_maps.read(state.maps, EVIDENCE, self._placed(pose, points))
+        evidence = particle_maps.interpolate(state.maps, EVIDENCE, self._placed(pose, points))
         shafts = jnp.repeat(felt.free, len(FREE))
         body = jnp.broadcast_to(felt.told & (self.config.body > 0), len(self.body))
-        likelihood = likelihoods.free(config, evidence, jnp.concatenate([shafts, body]))
+        likelihood = likelihoods.free_space(config, evidence, jnp.concatenate([shafts, body]))
         # Few reports tell of a contact: the rest is worked out for those alone.
         return likelihood + lax.cond(
             jnp.any(felt.new) | felt.wall,
@@ -253,95 +264,107 @@ class GridBackend:
         """[N] log-likelihood of new contacts, and of a wall's direction: as the map has it there, and as
         walls are at large."""
         config = self.config.likelihood
-        evidence = particle_maps.read(state.maps, EVIDENCE, self._placed(pose, felt.point))
+        evidence = particle_maps.interpolate(state.maps, EVIDENCE, self._placed(pose, felt.point))
         likelihood = likelihoods.contact(config, evidence, felt.new)
         place = self._placed(pose, felt.on_wall[None])
-        field = [particle_maps.read(state.maps, layer, place) for layer in (COSINE, SINE)]
+        field = [particle_maps.interpolate(state.maps, layer, place) for layer in (COSINE, SINE)]
         direction = pose[:, 2] + felt.direction
         sharp = jnp.minimum(WALL, 1 / (4 * felt.sd**2))
-        aligned = likelihoods.direction(config, jnp.concatenate(field, axis=1), 2 * direction, sharp)
-        if config.compass:
-            sharp = jnp.minimum(COMPASS, 1 / (16 * felt.sd**2))
-            aligned += likelihoods.direction(config, state.compass, 4 * direction, sharp)
+        aligned = likelihoods.wall_direction(config, jnp.concatenate(field, axis=1), 2 * direction, sharp)
+        if config.wall_direction_prior:
+            sharp = jnp.minimum(WALL_DIRECTIONS, 1 / (16 * felt.sd**2))
+            aligned += likelihoods.wall_direction(config, state.wall_directions, 4 * direction, sharp)
         return likelihood + jnp.where(felt.wall, aligned, 0.0)
 
     def _printed(self, maps: Array, pose: Array, felt: Felt) -> Array:
         cell = jnp.round(self._placed(pose, jnp.asarray(self.shafts)))
-        evidence = particle_maps.read(maps, EVIDENCE, cell)
+        evidence = particle_maps.interpolate(maps, EVIDENCE, cell)
         shape = (len(pose), self.whiskers, SEGMENTS)
-        likelihood = likelihoods.printed(
-            self.config.likelihood, self.config.prior,
-            evidence.reshape(shape), cell.reshape(*shape, 2), felt.touching, felt.free | felt.touching,
+        likelihood = likelihoods.printed_likelihood(
+            self.config.prior, evidence.reshape(shape), cell.reshape(*shape, 2),
+            felt.touching, felt.free | felt.touching, self.counted,
         )  # fmt: skip
         return jnp.where(felt.told, likelihood, 0.0)
 
     def _drawn(
         self, swarm: Particles, share: Array, worth: Array, told: Array, pick: Array, jitter: Array
-    ) -> tuple[Particles, particles.Drawn]:
+    ) -> tuple[Particles, particles.Resampling]:
         config = self.config.resampling
-        needed = worth < config.effective * self.config.particles if config.when == "needed" else told
+        needed = (
+            worth < config.min_effective_share * self.config.particles
+            if config.schedule == "needed"
+            else told
+        )
 
-        def anew() -> tuple[Particles, particles.Drawn]:
-            who = particles.drawn(config, share, pick)
-            return particles.copied(config, swarm, who, jitter), who
+        def anew() -> tuple[Particles, particles.Resampling]:
+            who = particles.resample(config, share, pick)
+            return particles.copy_particles(config, swarm, who, jitter), who
 
-        return lax.cond(needed, anew, lambda: (swarm, particles.spared(self.config.particles)))
+        return lax.cond(needed, anew, lambda: (swarm, particles.identity(self.config.particles)))
 
-    def _marked(self, maps: Array, compass: Array, pose: Array, felt: Felt) -> tuple[Array, Array, Array]:
+    def _marked(
+        self, maps: Array, wall_directions: Array, pose: Array, felt: Felt
+    ) -> tuple[Array, Array, Array]:
         """Every particle's map with what was felt left in it; and whether any of it lies outside."""
-        config, cell = self.config.stamps, self.config.cell
+        config, cell = self.config.footprint, self.config.cell
         middle = self._placed(pose, jnp.zeros((1, 2), self.dtype))
-        windows = particle_maps.around(middle[:, 0], self.side, self.near)
+        windows = particle_maps.windows_around(middle[:, 0], self.side, self.near)
         amount = -config.free * jnp.repeat(felt.free, len(FREE)).astype(self.dtype)
-        place = particle_maps.within(self._placed(pose, jnp.asarray(self.free)), windows)
-        stamp = kernels.blobs(place, amount, self.free_sd, windows.size)
+        place = particle_maps.to_window(self._placed(pose, jnp.asarray(self.free)), windows)
+        stamp = kernels.gaussian_blobs(place, amount, self.free_sd, windows.size)
         if self.config.body:
             body = kernels.disc(
-                particle_maps.within(middle, windows)[:, 0], self.config.body / cell, windows.size
+                particle_maps.to_window(middle, windows)[:, 0], self.config.body / cell, windows.size
             )
             stamp -= jnp.where(felt.told, config.body, 0.0) * body
         maps = self._added(maps, EVIDENCE, windows, stamp)
 
         met = jnp.any(felt.new) | (felt.wall & (config.wall != "blob"))
-        maps, compass = lax.cond(
-            met, lambda: self._met_marked(maps, compass, pose, felt), lambda: (maps, compass)
+        maps, wall_directions = lax.cond(
+            met, lambda: self._met_marked(maps, wall_directions, pose, felt), lambda: (maps, wall_directions)
         )
         ends = self._placed(pose, felt.point)
         beyond = jnp.any((ends < 0) | (ends > self.side - 1), axis=-1)
-        return maps, compass, jnp.any(beyond & felt.touching[None])
+        return maps, wall_directions, jnp.any(beyond & felt.touching[None])
 
-    def _met_marked(self, maps: Array, compass: Array, pose: Array, felt: Felt) -> tuple[Array, Array]:
+    def _met_marked(
+        self, maps: Array, wall_directions: Array, pose: Array, felt: Felt
+    ) -> tuple[Array, Array]:
         """With contacts and a wall drawn in."""
-        config, cell = self.config.stamps, self.config.cell
+        config, cell = self.config.footprint, self.config.cell
         ends = self._placed(pose, felt.point)
-        windows = particle_maps.around(
+        windows = particle_maps.windows_around(
             self._placed(pose, jnp.zeros((1, 2), self.dtype))[:, 0], self.side, self.far
         )
         amount = config.blob * felt.new.astype(self.dtype)
-        stamp = kernels.blobs(particle_maps.within(ends, windows), amount, self.blob_sd, windows.size)
+        stamp = kernels.gaussian_blobs(
+            particle_maps.to_window(ends, windows), amount, self.blob_sd, windows.size
+        )
         maps = self._added(maps, EVIDENCE, windows, stamp)
         if config.wall == "blob":
-            return maps, compass
+            return maps, wall_directions
         place = self._placed(pose, felt.on_wall[None])
-        windows = particle_maps.around(place[:, 0], self.side, self.long)
-        place = particle_maps.within(place, windows)[:, 0]
+        windows = particle_maps.windows_around(place[:, 0], self.side, self.long)
+        place = particle_maps.to_window(place, windows)[:, 0]
         direction = pose[:, 2] + felt.direction
         if config.wall == "edge":
-            shape = kernels.fan(place, direction, config.along / cell, config.fan, windows.size)
+            shape = kernels.wall_sector(place, direction, config.along / cell, config.sector, windows.size)
         else:
-            shape = kernels.edge(place, direction, config.along / cell, config.across / cell, windows.size)
+            shape = kernels.wall_edge(
+                place, direction, config.along / cell, config.across / cell, windows.size
+            )
         shape = jnp.where(felt.wall, shape, 0.0)
         maps = self._added(maps, EVIDENCE, windows, config.edge * shape)
         for layer, part in ((COSINE, jnp.cos(2 * direction)), (SINE, jnp.sin(2 * direction))):
-            field = particle_maps.cut(maps, windows, layer) + shape * part[:, None, None]
-            maps = particle_maps.put(maps, windows, layer, field)
+            field = particle_maps.read_window(maps, windows, layer) + shape * part[:, None, None]
+            maps = particle_maps.write_window(maps, windows, layer, field)
         pointing = jnp.stack([jnp.cos(4 * direction), jnp.sin(4 * direction)], axis=1)
-        return maps, compass + jnp.where(felt.wall, pointing, 0.0)
+        return maps, wall_directions + jnp.where(felt.wall, pointing, 0.0)
 
     def _added(self, maps: Array, layer: int, windows: particle_maps.Windows, stamp: Array) -> Array:
-        most = self.config.stamps.most
-        evidence = jnp.clip(particle_maps.cut(maps, windows, layer) + stamp, -most, most)
-        return particle_maps.put(maps, windows, layer, evidence)
+        most = self.config.footprint.max_log_odds
+        evidence = jnp.clip(particle_maps.read_window(maps, windows, layer) + stamp, -most, most)
+        return particle_maps.write_window(maps, windows, layer, evidence)
 
     def _window(self, reach: float) -> int:
         """Cells a side of a window that shows so far, m, on every side of the place that it is about."""
@@ -353,7 +376,7 @@ class GridBackend:
         right, up = points.T[:, None]
         x = pose[:, :1] + c * right - s * up
         y = pose[:, 1:2] + s * right + c * up
-        return particle_maps.in_cells(jnp.stack([x, y], axis=2), self.config.cell, self.side)
+        return particle_maps.to_cells(jnp.stack([x, y], axis=2), self.config.cell, self.side)
 
 
 def build(config: GridConfig, feelers: PlanarWhiskers | None, dtype: Any = np.float64) -> GridBackend:

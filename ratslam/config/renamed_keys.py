@@ -34,6 +34,17 @@ RENAMED: dict[str, str] = {
     "keyframes.verify": "only the ablation study turns verification off",
     "keyframes.robust": "only the ablation study turns robust weights off",
     "keyframes.bias_in_map": "only the ablation study turns the heading bias off",
+    "grid.stamps": "grid.footprint",
+    "grid.stamps.fan": "grid.footprint.sector",
+    "grid.stamps.most": "grid.footprint.max_log_odds",
+    "grid.drawing.edge_fan": "grid.drawing.edge_sector",
+    "grid.drawing.most": "grid.drawing.max_log_odds",
+    "grid.drawing.fusion": "maps are always fused by adding log-odds",
+    "grid.drift.run": "grid.drift.session",
+    "grid.likelihood.compass": "grid.likelihood.wall_direction_prior",
+    "grid.resampling.when": "grid.resampling.schedule",
+    "grid.resampling.how": "grid.resampling.scheme",
+    "grid.resampling.effective": "grid.resampling.min_effective_share",
 }
 """Old dotted path of a setting to the new one, or to a sentence that says what to write instead.
 

@@ -1,4 +1,4 @@
-"""The configuration of the grid particle filter."""
+"""Settings of the grid particle filter."""
 
 from __future__ import annotations
 
@@ -12,129 +12,127 @@ Share = Annotated[float, Field(gt=0, lt=1)]
 
 
 class DriftConfig(Settings):
-    """What particles believe of the odometry's errors: of a turn or a distance d, d (1 + run + move + step).
+    """The filter's model of odometry errors: a turn or a distance d becomes d (1 + session + move + step).
 
-    Errors of scale last; a filter that takes them for noise of each step cannot follow them.
+    Scale errors persist, and a filter that models them as independent noise of each step cannot track them.
     """
 
-    run: NonNegativeFloat = 0.04
-    """Standard deviation of the scale error that lasts the whole run, as a share."""
+    session: NonNegativeFloat = 0.04
+    """Standard deviation of the relative scale error that is constant over the session."""
     move: NonNegativeFloat = 0.03
-    """Of the one that lasts one straight or one turn."""
+    """Standard deviation of the relative scale error that is constant over one straight or one turn."""
     step: NonNegativeFloat = 0.02
-    """Of the one of each step."""
+    """Standard deviation of the relative scale error of one step."""
     heading: NonNegativeFloat = 5e-4
-    """Of the heading at each step, rad."""
+    """Standard deviation of the heading error of one step, rad."""
 
 
 class ResamplingConfig(Settings):
-    """When and how particles are drawn anew."""
+    """When and how particles are resampled."""
 
-    when: Literal["needed", "always"] = "needed"
-    """`needed`: when the effective number falls; `always`: at every report with evidence (Algorithm 1)."""
-    how: Literal["systematic", "multinomial"] = "systematic"
-    """`systematic`: each particle within one of its share, survivors stay where they are."""
-    effective: Share = 0.5
-    """Share of effective particles under which they are drawn anew."""
+    schedule: Literal["needed", "always"] = "needed"
+    """`needed`: when the effective number of particles is low; `always`: at every report with evidence (Fox
+    et al. 2012, Algorithm 1)."""
+    scheme: Literal["systematic", "multinomial"] = "systematic"
+    """`systematic`: low variance, the copies of a particle differ by less than one from its share."""
+    min_effective_share: Share = 0.5
+    """Effective particles, as a share of all, below which `needed` resamples."""
     length: NonNegativeFloat = 1e-3
-    """Standard deviation by which copies are moved, m."""
+    """Standard deviation of the displacement of copies, m."""
     heading: NonNegativeFloat = 1e-3
-    """By which they are turned, rad."""
+    """Standard deviation of the rotation of copies, rad."""
     scale: NonNegativeFloat = 3e-3
-    """By which their belief of the odometry's scale is changed, as a share."""
+    """Standard deviation of the change of the session's scale error in copies."""
 
 
 class LikelihoodConfig(Settings):
-    """How particles are weighed."""
+    """The likelihood of a report given a particle's pose and map."""
 
-    model: Literal["evidence", "distinct", "exclusive", "literal"] = "evidence"
-    """`evidence`: unexplored space says nothing, empty shafts little, new contacts much; the others: Fox et
-    al. 2012, eq. 2, on distinct cells without that of the contact; without it; as printed."""
+    model: Literal["evidence", "literal"] = "evidence"
+    """`evidence`: unexplored cells are neutral, free whisker shafts weigh little and new contacts much;
+    `literal`: Fox et al. 2012, eq. 1 and 2, as printed."""
     unexplored: Share = 0.03
-    """Chance of an obstacle where nothing was felt, for `evidence`."""
+    """Probability of an obstacle in unexplored cells, for `evidence`."""
     free: NonNegativeFloat = 0.05
-    """Weight of each point of a shaft, or of the body, that meets nothing."""
+    """Weight of each free point of a whisker or of the robot's body."""
     contact: NonNegativeFloat = 0.8
     """Weight of a new contact."""
     surprise: Share = 0.1
-    """Chance of a contact where the map has nothing."""
+    """Probability of a contact in a cell without an obstacle."""
     wall: Annotated[float, Field(ge=0, le=1)] = 0.7
-    """Weight of a wall's direction against the field of directions there, and of all walls to each other."""
-    compass: bool = True
-    """Whether walls are expected to be parallel or at right angles to each other, whatever the axes are."""
+    """Weight of a wall's direction, against the directions in the map there and against all directions."""
+    wall_direction_prior: bool = True
+    """Assume that walls are parallel or perpendicular to each other, in any common orientation."""
 
 
-class StampConfig(Settings):
-    """What a report adds to the map of each particle, in log-odds."""
+class FootprintConfig(Settings):
+    """The log-odds that a report adds to the map of each particle."""
 
     wall: Literal["anisotropic", "edge", "blob"] = "anisotropic"
-    """`anisotropic`: a Gaussian along the wall; `edge`: Fox et al. 2012, eq. 4; `blob`: eq. 3."""
+    """Footprint of a wall of known direction. `anisotropic`: a Gaussian along the wall; `edge`: Fox et al.
+    2012, eq. 4; `blob`: eq. 3."""
     edge: NonNegativeFloat = 1.0
-    """At a contact with a wall of known direction."""
+    """Log-odds at a contact with a wall of known direction."""
     along: PositiveFloat = 0.18
     """Standard deviation along the wall, m."""
     across: PositiveFloat = 0.05
-    """Across it, m."""
-    fan: PositiveFloat = 0.2617993877991494
-    """Of the direction seen from the contact, for `edge`, rad: pi / 12."""
+    """Standard deviation across the wall, m."""
+    sector: PositiveFloat = 0.2617993877991494
+    """Standard deviation of the direction from the contact, for `edge`, rad: pi / 12."""
     blob: NonNegativeFloat = 4.0
-    """At a contact."""
+    """Log-odds at a contact."""
     blob_sd: PositiveFloat = 0.05
-    """m"""
+    """Standard deviation of a contact's footprint, m."""
     free: NonNegativeFloat = 0.5
-    """Taken off at each point of a shaft that meets nothing."""
+    """Log-odds subtracted at each point of a free whisker."""
     free_sd: PositiveFloat = 0.02
-    """Standard deviation there, m: wider ones reach beyond the shaft and wipe out walls felt before."""
+    """Standard deviation of a free point's footprint, m; wider ones erase walls beside the whisker."""
     body: NonNegativeFloat = 1.0
-    """Taken off where the robot stands."""
-    most: PositiveFloat = 6.0
-    """Largest evidence of a cell, for or against."""
+    """Log-odds subtracted under the robot."""
+    max_log_odds: PositiveFloat = 6.0
+    """Limit on the log-odds of a cell, positive or negative."""
 
 
 class DrawingConfig(Settings):
-    """How the map is drawn (Fox et al. 2012, eq. 3 and 4), along the path that the filter has found. Edges
-    are shorter and surer than the paper's, which run on beyond the ends of walls."""
+    """The map drawn along the path of the filter (Fox et al. 2012, eq. 3 and 4).
+
+    Edges are shorter and more certain than in the paper, where they extend beyond the ends of walls.
+    """
 
     contact: Share = 0.95
-    """Chance of an obstacle where one was felt."""
+    """Probability of an obstacle at a contact."""
     blob_sd: PositiveFloat = 0.04
     """Standard deviation of a contact without a known wall, m."""
     edge_sd: PositiveFloat = 0.14
-    """Of one with a wall, along it, m; 0.25 in the paper."""
-    edge_fan: PositiveFloat = 0.35
-    """Of the direction in which it is seen from the contact, rad; pi / 12 in the paper."""
+    """Standard deviation of a wall along its direction, m; 0.25 in the paper."""
+    edge_sector: PositiveFloat = 0.35
+    """Standard deviation of the direction from the contact, rad; pi / 12 in the paper."""
     free: Share = 0.4
-    """Chance of an obstacle at the middle of a whisker that meets nothing."""
+    """Probability of an obstacle at the middle of a free whisker."""
     free_sd: PositiveFloat = 0.05
-    """m"""
+    """Standard deviation of a free whisker's footprint, m."""
     body: Share = 0.4
-    """Where the robot stands."""
-    most: PositiveFloat = 3.5
-    """Largest evidence of a cell, for or against, log-odds."""
-    fusion: Literal["log_odds", "literal", "max", "average"] = "log_odds"
-    """How a mark is fused with what is there, the others for study: `log_odds`: their evidence is added;
-    `literal`: eq. 3 and 4 as printed, likelihoods that fall to 0 far from where they were made, multiplied
-    into the whole map: one contact erases it; `max`: the stronger of the two evidences, so that nothing
-    counts twice; `average`: the mean of the map's chance and of what the mark alone would draw, so that old
-    marks fade."""
+    """Probability of an obstacle under the robot."""
+    max_log_odds: PositiveFloat = 3.5
+    """Limit on the log-odds of a cell, positive or negative."""
 
 
 class GridConfig(Settings):
-    """The grid particle filter (Fox et al. 2012, made to work)."""
+    """The grid particle filter of Fox et al. 2012, with corrections."""
 
     particles: Annotated[int, Field(ge=2, le=1_000_000)] = 100
-    """How many."""
+    """Number of particles."""
     cell: PositiveFloat = 0.05
-    """Side of a cell, m."""
+    """Cell side length, m."""
     side: PositiveFloat | None = None
-    """Of the map, whose middle is where the robot starts, m; null: what the recording's odometry covers and
-    whiskers reach, 2.5 for a live robot."""
+    """Side length of the map, centred on the start, m; null: the extent of the recording's odometry plus the
+    reach of the whiskers, 2.5 for a live robot."""
     prior: Share = 0.3
-    """Chance of an obstacle where nothing was felt, as the map is drawn (and in eq. 2)."""
+    """Prior probability of an obstacle, in the drawn map and in eq. 2."""
     body: NonNegativeFloat = 0.12
-    """Radius of the robot, m; 0 for an arm that stands nowhere."""
+    """Radius of the robot, m; 0 for an arm."""
     drift: DriftConfig = DriftConfig()
     resampling: ResamplingConfig = ResamplingConfig()
     likelihood: LikelihoodConfig = LikelihoodConfig()
-    stamps: StampConfig = StampConfig()
+    footprint: FootprintConfig = FootprintConfig()
     drawing: DrawingConfig = DrawingConfig()

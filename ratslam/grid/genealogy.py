@@ -1,7 +1,6 @@
-"""Where the ancestors of particles have been: the paths of those that survived.
+"""The genealogy of particles: the paths of the ancestors of the particles that survived.
 
-Memory is bounded: what lies further back than `LEVELS` poses' worth of reports is settled as the mean of the
-paths that lead there.
+Memory is bounded: of more than `MAX_POSES` poses, the older half is replaced by the weighted mean path.
 """
 
 from __future__ import annotations
@@ -10,12 +9,12 @@ import numpy as np
 
 from ratslam.core.growable_array import GrowableArray
 
-LEVELS = 4_000_000
-"""Poses kept of reports that may still be told apart."""
+MAX_POSES = 4_000_000
+"""Poses stored for individual particles."""
 
 
-class Ancestry:
-    """Poses of N particles and whom they descend from, report by report."""
+class Genealogy:
+    """Poses and ancestors of N particles at each report."""
 
     def __init__(self, count: int) -> None:
         self.count = count
@@ -28,18 +27,18 @@ class Ancestry:
         return len(self._settled.rows) + len(self._pose.rows)
 
     def append(self, poses: np.ndarray, weights: np.ndarray, ancestor: np.ndarray) -> None:
-        """A report: poses [N, 3] and shares [N], and [N] of whom each particle is a copy from now on."""
+        """Adds a report: poses [N, 3], normalised weights [N], and the next ancestors [N]."""
         self._pose.append(poses)
         self._ancestor.append(ancestor)
         self._weight = np.asarray(weights, float)
-        if len(self._pose.rows) * self.count > LEVELS and len(self._pose.rows) > 1:
+        if len(self._pose.rows) * self.count > MAX_POSES and len(self._pose.rows) > 1:
             self._settle(len(self._pose.rows) // 2)
 
     def path(self) -> np.ndarray:
-        """[T, 3] the weighted mean of the paths that lead to where the particles are now."""
-        return np.concatenate([self._settled.rows, self._followed()])
+        """[T, 3] the weighted mean of the ancestral paths of the present particles."""
+        return np.concatenate([self._settled.rows, self._mean_path()])
 
-    def _followed(self) -> np.ndarray:
+    def _mean_path(self) -> np.ndarray:
         pose, ancestor = self._pose.rows, self._ancestor.rows
         path = np.zeros((len(pose), 3))
         here = np.arange(self.count)
@@ -50,13 +49,13 @@ class Ancestry:
         return path
 
     def _settle(self, reports: int) -> None:
-        for pose in self._followed()[:reports]:
+        for pose in self._mean_path()[:reports]:
             self._settled.append(pose)
         self._pose.replace(self._pose.rows[reports:].copy())
         self._ancestor.replace(self._ancestor.rows[reports:].copy())
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Everything, so that `restore` continues bit for bit."""
+        """The whole state, for `restore`."""
         return {
             "settled": self._settled.rows.copy(),
             "ancestor": self._ancestor.rows.copy(),
@@ -65,7 +64,7 @@ class Ancestry:
         }
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Takes the place of everything so far."""
+        """Replaces the whole state."""
         self._settled.replace(arrays["settled"])
         self._ancestor.replace(arrays["ancestor"])
         self._pose.replace(arrays["pose"])

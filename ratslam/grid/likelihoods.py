@@ -1,9 +1,8 @@
-"""How well what was felt goes with a particle's map (Fox et al. 2012, eq. 1 and 2, and what works better).
-
-All are sums over whiskers of logarithms of chances, for N particles at once.
-"""
+"""Log-likelihoods of a report given the maps of N particles (Fox et al. 2012, eq. 1 and 2, and others)."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -12,60 +11,67 @@ import numpy as np
 from ratslam.grid.config import LikelihoodConfig
 from tactile.base.types import Array
 
-FIRM = 0.5
-"""Length of the direction field at which it counts half."""
+HALF_WEIGHT_LENGTH = 0.5
+"""Length of the direction field at which its weight is one half."""
 
 
-def free(config: LikelihoodConfig, evidence: Array, among: Array) -> Array:
-    """[N] of points [N, K] of evidence that were found free; `among` [K] bool says which count."""
+def free_space(config: LikelihoodConfig, evidence: Array, among: Array) -> Array:
+    """[N] of free points with log-odds `evidence` [N, K]; `among` [K] bool: points that count."""
     return -config.free * (_soft(evidence + _logit(config.unexplored)) @ among.astype(evidence.dtype))
 
 
 def contact(config: LikelihoodConfig, evidence: Array, among: Array) -> Array:
-    """[N] of contacts at points [N, K] of evidence; unexplained ones happen too."""
+    """[N] of contacts at points with log-odds `evidence` [N, K]; `among` [K] bool: points that count."""
     chance = jax.nn.sigmoid(evidence + _logit(config.unexplored))
     logs = jnp.log(config.surprise + (1 - config.surprise) * chance)
     return config.contact * (logs @ among.astype(evidence.dtype))
 
 
-def direction(config: LikelihoodConfig, field: Array, angle: Array, precision: Array) -> Array:
-    """[N] of directions felt against fields of directions.
+def wall_direction(config: LikelihoodConfig, field: Array, angle: Array, precision: Array) -> Array:
+    """[N] of measured wall directions given fields of wall directions.
 
     Args:
-        field: [N, 2] sums of unit vectors at some multiple of the direction. angle: [N] that multiple of
-            the direction felt, rad. precision: of its cosine.
+        field: [N, 2] sums of unit vectors at a multiple of the direction. angle: [N] the same multiple of the
+            measured direction, rad. precision: of its cosine.
     """
     length = jnp.hypot(field[:, 0], field[:, 1])
     along = field[:, 0] * jnp.cos(angle) + field[:, 1] * jnp.sin(angle)
     agreement = along / jnp.maximum(length, 1e-9)
-    known = length / (length + FIRM)
+    known = length / (length + HALF_WEIGHT_LENGTH)
     peak = jnp.sqrt(2 * np.pi * jnp.maximum(precision, 0.16))
     likely = (1 - known) + known * jnp.exp(precision * (agreement - 1)) * peak
     return jnp.log(1 - config.wall + config.wall * likely)
 
 
-def printed(
-    config: LikelihoodConfig, prior: float, evidence: Array, cell: Array, felt: Array, alive: Array
+CountedCells = Callable[[Array, Array], Array]
+"""Of cells [N, W, G, 2] along whiskers and contacts [W]: bool [N, W, G], the free points that count."""
+
+
+def all_cells(cell: Array, contact: Array) -> Array:
+    """Eq. 2 as printed: every point counts, also the tip of a whisker in contact."""
+    del contact
+    return jnp.ones(cell.shape[:-1], bool)
+
+
+def printed_likelihood(
+    prior: float,
+    evidence: Array,
+    cell: Array,
+    contact: Array,
+    alive: Array,
+    counted: CountedCells = all_cells,
 ) -> Array:
     """[N] eq. 1 and 2.
 
     Args:
-        evidence: [N, W, G] at the points along each whisker, from base to tip. cell: [N, W, G, 2] their
-            cells. felt: [W] bool, contacts, which are all at the tip. alive: [W] bool, whiskers that count.
+        evidence: [N, W, G] log-odds at the points along each whisker, from base to tip. cell: [N, W, G, 2]
+            their cells. contact: [W] bool, contacts, all at the tip. alive: [W] bool, whiskers that report.
+        counted: selects the free points that count.
     """
     chance = jnp.clip(jax.nn.sigmoid(evidence + _logit(prior)), 1e-6, 1 - 1e-6)
-    count = evidence.shape[2]
-    tip = jnp.arange(count) == count - 1
-    counted = jnp.broadcast_to(alive[None, :, None], evidence.shape)
-    if config.model != "literal":
-        counted = ~(tip[None] & felt[:, None])[None] & counted
-    if config.model == "distinct":
-        same = jnp.all(cell[:, :, :, None] == cell[:, :, None], axis=-1)  # [N, W, G, G]
-        earlier = np.tri(count, k=-1, dtype=bool)
-        again = jnp.any(same & earlier[None, None], axis=-1)
-        counted &= ~again & ~(same[..., -1] & felt[None, :, None])
-    clear = jnp.sum(jnp.where(counted, jnp.log1p(-chance), 0.0), axis=(1, 2))
-    return clear + jnp.log(chance[:, :, -1]) @ felt.astype(evidence.dtype)
+    among = counted(cell, contact) & alive[None, :, None]
+    clear = jnp.sum(jnp.where(among, jnp.log1p(-chance), 0.0), axis=(1, 2))
+    return clear + jnp.log(chance[:, :, -1]) @ contact.astype(evidence.dtype)
 
 
 def _soft(value: Array) -> Array:

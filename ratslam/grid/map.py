@@ -1,4 +1,4 @@
-"""The map of the grid filter: the path of the particles that survived, and what was felt drawn along it."""
+"""The map of the grid filter: the mean path of the surviving particles, and contacts drawn along it."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ import numpy as np
 from ratslam.core.growable_array import GrowableArray, copy_arrays, restore_arrays
 from ratslam.core.types import Estimate
 from ratslam.grid.config import GridConfig
-from ratslam.grid.genealogy import Ancestry
-from ratslam.grid.map_drawing import Marks, draw, marks_of
+from ratslam.grid.genealogy import Genealogy
+from ratslam.grid.map_drawing import ContactLog, contact_log, draw_occupancy
 from tactile.base.types import Observation
 from tactile.whiskers.planar_whiskers import PlanarWhiskers
 
 
 class GridMap:
-    """Folds what the grid filter reports (`ratslam.core.backend.Map`).
+    """The map of the grid filter (`ratslam.core.backend.Map`).
 
     Args:
         feelers: the whiskers of the observations. side: of the map, cells.
@@ -28,16 +28,16 @@ class GridMap:
     def __init__(self, config: GridConfig, feelers: PlanarWhiskers, side: int) -> None:
         self.config, self.feelers, self.side = config, feelers, side
         whiskers = len(feelers.length)
-        self._ancestry = Ancestry(config.particles)
+        self._genealogy = Genealogy(config.particles)
         self._online = GrowableArray((3,), np.float64)
         self._motion = GrowableArray((), np.int64)
-        self._flags = GrowableArray((whiskers, 2), bool)  # in contact, reports at all
+        self._flags = GrowableArray((whiskers, 2), bool)  # in contact, alive
         self._point = GrowableArray((whiskers, 2), np.float64)
-        self._wall = GrowableArray((2,), np.float64)  # its nearest point; NaN: none
+        self._wall = GrowableArray((2,), np.float64)  # nearest point; NaN: unknown
 
     def update(self, observation: Observation, estimate: Estimate, evidence: Any) -> Estimate:
-        """Keeps the particles and what was felt."""
-        self._ancestry.append(evidence.poses, evidence.weights, evidence.ancestor)
+        """Stores the particles and the contacts."""
+        self._genealogy.append(evidence.poses, evidence.weights, evidence.ancestor)
         self._online.append(estimate.pose)
         self._motion.append(int(observation.motion))
         self._flags.append(np.stack([observation.contact, observation.alive], axis=1))
@@ -53,15 +53,15 @@ class GridMap:
         return np.asarray(estimate.pose, float)
 
     def trajectory(self) -> np.ndarray:
-        """[T, 3] the weighted mean of the paths of the particles that are left."""
-        return self._ancestry.path()
+        """[T, 3] the weighted mean path of the surviving particles."""
+        return self._genealogy.path()
 
     def online_trajectory(self) -> np.ndarray:
         """[T, 3] the same: it needs no settling."""
-        return self._ancestry.path()
+        return self._genealogy.path()
 
     def closures(self) -> np.ndarray:
-        """[0, 2]: a grid joins no steps."""
+        """[0, 2]: a grid has no loop closures."""
         return np.zeros((0, 2), int)
 
     def graph(self) -> networkx.DiGraph:
@@ -69,9 +69,8 @@ class GridMap:
         return networkx.DiGraph()
 
     def occupancy(self) -> np.ndarray:
-        """[S, S] chance of an obstacle in each cell (rows are y, columns x; the robot started in the middle),
-        as Fox et al. 2012 draw it: wide stamps along the path."""
-        return draw(self.config, self.feelers, self.side, self.trajectory(), self._marks())
+        """[S, S] probability of an obstacle in each cell; rows are y, columns x, the start is central."""
+        return draw_occupancy(self.config, self.feelers, self.side, self.trajectory(), self._contact_log())
 
     def files(self) -> dict[str, Callable[[Path], None]]:
         """The map as arrays: probability [S, S], origin [2] m of its lower left corner, cell m."""
@@ -81,18 +80,20 @@ class GridMap:
         corner = np.full(2, -self.side * self.config.cell / 2)
         np.savez_compressed(path, probability=self.occupancy(), origin=corner, cell=self.config.cell)
 
-    def _marks(self) -> Marks:
+    def _contact_log(self) -> ContactLog:
         contact, alive = np.moveaxis(self._flags.rows, 2, 0)
-        return marks_of(self._motion.rows, contact, alive, self._point.rows, self._wall.rows)
+        return contact_log(self._motion.rows, contact, alive, self._point.rows, self._wall.rows)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Everything, so that `restore` continues bit for bit."""
+        """The whole state, for `restore`."""
         return copy_arrays(self) | {
-            f"ancestry/{name}": rows for name, rows in self._ancestry.arrays().items()
+            f"genealogy/{name}": rows for name, rows in self._genealogy.arrays().items()
         }
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Takes the place of everything folded so far."""
+        """Replaces the whole state."""
         restore_arrays(self, arrays)
-        prefix = "ancestry/"
-        self._ancestry.restore({k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)})
+        prefix = "genealogy/"
+        self._genealogy.restore(
+            {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
+        )

@@ -1,13 +1,12 @@
-"""What was felt, drawn along a path: the maps of Fox et al. 2012, II-E and II-F.
+"""The map drawn from contacts along a path (Fox et al. 2012, II-E and II-F).
 
-The three mappers are one: wherever a wall's direction is known an edge is drawn, elsewhere a blob. Each mark
-is a likelihood that is neutral, 0.5, far from where it was made (eq. 3 and 4 as printed fall to 0 there and
-would erase the map), and marks are added as log-odds; other ways to fuse them are there for study.
+A wall of known direction is drawn as an edge (eq. 4), other contacts as blobs (eq. 3). Each footprint is a
+probability that tends to 0.5 far away, where eq. 3 and 4 as printed tend to 0 and would erase the map;
+footprints are added as log-odds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -19,20 +18,19 @@ from tactile.base.types import MotionKind
 from tactile.whiskers.planar_whiskers import PlanarWhiskers
 
 FAR = 3.0
-"""Standard deviations beyond which a mark is left out."""
-NEARLY = 1e-3
-"""No chance comes nearer to 0 or 1 than this by the literal fusion, which knows no other limit."""
+"""Standard deviations beyond which a footprint is 0."""
 
 
-class Marks(NamedTuple):
-    """T reports.
+class ContactLog(NamedTuple):
+    """Contacts of T reports with W whiskers.
 
     Attributes:
-        told: [T] bool, counts as evidence. contact, free: [T, W] bool. turning: [T] bool. point: [T, W, 2] m
-            in base_link. wall: [T, 2] m, its nearest point; NaN where none is known.
+        valid: [T] bool, the report counts as evidence. contact, free: [T, W] bool. turning: [T] bool. point:
+            [T, W, 2] contacts in base_link, m. wall: [T, 2] nearest point of the wall in base_link, m; NaN
+            where unknown.
     """
 
-    told: np.ndarray
+    valid: np.ndarray
     contact: np.ndarray
     free: np.ndarray
     turning: np.ndarray
@@ -40,72 +38,22 @@ class Marks(NamedTuple):
     wall: np.ndarray
 
 
-def marks_of(
+def contact_log(
     motion: np.ndarray, contact: np.ndarray, alive: np.ndarray, point: np.ndarray, wall: np.ndarray
-) -> Marks:
-    """The marks of T reports: motion [T], contact and alive [T, W], point [T, W, 2], wall [T, 2]. A contact
-    at no number is none, but its whisker does not count as free."""
-    told = motion != MotionKind.BACK
-    counts = alive & told[:, None]
-    placed = np.isfinite(point).all(axis=2)
-    return Marks(told, contact & counts & placed, ~contact & counts, motion == MotionKind.TURN, point, wall)
+) -> ContactLog:
+    """The log of T reports: motion [T], contact and alive [T, W], point [T, W, 2], wall [T, 2].
 
-
-class Fusion(NamedTuple):
-    """How marks become a map.
-
-    Attributes:
-        chance: what a mark tells of the cells around it: the chance of an obstacle, from that in its middle
-            and its shape there, 1 in the middle and 0 far away.
-        fuse: the evidence of cells, log-odds beyond the prior, once a mark's chances are fused with it.
-        far: standard deviations beyond which a mark is left out.
+    A contact without a finite point is dropped, and its whisker does not count as free.
     """
-
-    chance: Callable[[float, np.ndarray], np.ndarray]
-    fuse: Callable[[np.ndarray, np.ndarray, GridConfig], np.ndarray]
-    far: float = FAR
-
-
-def _neutral(middle: float, shape: np.ndarray) -> np.ndarray:
-    return 0.5 + (middle - 0.5) * shape
+    valid = motion != MotionKind.BACK
+    counts = alive & valid[:, None]
+    finite = np.isfinite(point).all(axis=2)
+    turning = motion == MotionKind.TURN
+    return ContactLog(valid, contact & counts & finite, ~contact & counts, turning, point, wall)
 
 
-def _printed(middle: float, shape: np.ndarray) -> np.ndarray:
-    return middle * shape
-
-
-def _added(there: np.ndarray, chance: np.ndarray, config: GridConfig) -> np.ndarray:
-    most = config.drawing.most
-    return np.clip(there + logit(chance), -most, most)
-
-
-def _multiplied(there: np.ndarray, chance: np.ndarray, config: GridConfig) -> np.ndarray:
-    """m l / (m l + (1 - m)(1 - l)), which is a sum of log-odds."""
-    prior, most = logit(config.prior), -logit(NEARLY)
-    return np.clip(there + prior + logit(chance), -most, most) - prior
-
-
-def _stronger(there: np.ndarray, chance: np.ndarray, config: GridConfig) -> np.ndarray:
-    told, most = logit(chance), config.drawing.most
-    return np.clip(np.where(np.abs(told) > np.abs(there), told, there), -most, most)
-
-
-def _averaged(there: np.ndarray, chance: np.ndarray, config: GridConfig) -> np.ndarray:
-    prior = logit(config.prior)
-    return logit((expit(there + prior) + expit(logit(chance) + prior)) / 2) - prior
-
-
-FUSIONS: Mapping[str, Fusion] = {
-    "log_odds": Fusion(_neutral, _added),
-    "literal": Fusion(_printed, _multiplied, np.inf),
-    "max": Fusion(_neutral, _stronger),
-    "average": Fusion(_neutral, _averaged),
-}
-"""By the names of `DrawingConfig.fusion`, which says what each does."""
-
-
-class _Mark(NamedTuple):
-    """One stamp: its middle [2] m, its chance there, and a wall's direction or NaN."""
+class _Footprint(NamedTuple):
+    """Centre [2] in m, probability there, standard deviation in m, and a wall's direction in rad or NaN."""
 
     place: np.ndarray
     chance: float
@@ -113,72 +61,75 @@ class _Mark(NamedTuple):
     direction: float
 
 
-def draw(
-    config: GridConfig, feelers: PlanarWhiskers, side: int, path: np.ndarray, marks: Marks
+def draw_occupancy(
+    config: GridConfig, whiskers: PlanarWhiskers, side: int, path: np.ndarray, log: ContactLog
 ) -> np.ndarray:
-    """[S, S] chance of an obstacle.
+    """[S, S] probability of an obstacle in each cell.
 
     Args:
-        side: S, cells. path: [T, 3] where each report was made, from the middle of the map.
+        side: S, cells. path: [T, 3] pose at each report, relative to the middle of the map.
     """
-    drawing, cell = config.drawing, config.cell
-    fusion = FUSIONS[drawing.fusion]
+    drawing, cell, most = config.drawing, config.cell, config.drawing.max_log_odds
     evidence = np.zeros((side, side))
-    for mark in _marks(drawing, config.body, feelers, path, marks):
-        reach = fusion.far * (drawing.edge_sd if np.isfinite(mark.direction) else mark.sd)
-        place = mark.place / cell + (side - 1) / 2
+    for footprint in _footprints(drawing, config.body, whiskers, path, log):
+        reach = FAR * (drawing.edge_sd if np.isfinite(footprint.direction) else footprint.sd)
+        place = footprint.place / cell + (side - 1) / 2
         low = np.clip(np.ceil(place - reach / cell), 0, side).astype(int)
         high = np.clip(np.floor(place + reach / cell) + 1, 0, side).astype(int)
         across, up = (np.arange(low[k], high[k]) * cell - place[k] * cell for k in (0, 1))
-        shape = _shape(drawing, mark, across[None, :], up[:, None])
+        chance = 0.5 + (footprint.chance - 0.5) * _shape(drawing, footprint, across[None, :], up[:, None])
         rows = slice(low[1], high[1]), slice(low[0], high[0])
-        evidence[rows] = fusion.fuse(evidence[rows], fusion.chance(mark.chance, shape), config)
+        evidence[rows] = np.clip(evidence[rows] + logit(chance), -most, most)
     return expit(evidence + logit(config.prior))
 
 
-def _shape(config: DrawingConfig, mark: _Mark, across: np.ndarray, up: np.ndarray) -> np.ndarray:
+def _shape(config: DrawingConfig, footprint: _Footprint, across: np.ndarray, up: np.ndarray) -> np.ndarray:
     away = across**2 + up**2
-    if not np.isfinite(mark.direction):
-        return np.exp(-away / (2 * mark.sd**2))
-    # Seen from the contact, modulo half a turn: the edge goes both ways.
-    off = np.mod(np.arctan2(up, across) - mark.direction + np.pi / 2, np.pi) - np.pi / 2
+    if not np.isfinite(footprint.direction):
+        return np.exp(-away / (2 * footprint.sd**2))
+    # Direction from the contact modulo pi, so that the edge extends both ways.
+    off = np.mod(np.arctan2(up, across) - footprint.direction + np.pi / 2, np.pi) - np.pi / 2
     off = np.where(away > 0, off, 0.0)
-    return np.exp(-away / (2 * config.edge_sd**2) - off**2 / (2 * config.edge_fan**2))
+    return np.exp(-away / (2 * config.edge_sd**2) - off**2 / (2 * config.edge_sector**2))
 
 
-def _marks(
-    config: DrawingConfig, body: float, feelers: PlanarWhiskers, path: np.ndarray, marks: Marks
-) -> list[_Mark]:
-    """All marks in the order they were made."""
-    middles = feelers.points(np.array([0.5]))[:, 0]
-    made: list[_Mark] = []
-    before = np.zeros(marks.contact.shape[1], bool)
-    pending: list[_Mark] = []
+def _footprints(
+    config: DrawingConfig, body: float, whiskers: PlanarWhiskers, path: np.ndarray, log: ContactLog
+) -> list[_Footprint]:
+    """All footprints in order of time; a contact's blob gives way to a later edge of its wall."""
+    middles = whiskers.points(np.array([0.5]))[:, 0]
+    made: list[_Footprint] = []
+    before = np.zeros(log.contact.shape[1], bool)
+    pending: list[_Footprint] = []
     for k, pose in enumerate(path):
-        if not marks.told[k]:
+        contact = log.contact[k]
+        if not log.valid[k]:
             made += pending
             pending, before = [], np.zeros_like(before)
             continue
-        for point in middles[marks.free[k]]:
-            made.append(_Mark(_at(pose, point), config.free, config.free_sd, np.nan))
+        made += [_Footprint(_at(pose, p), config.free, config.free_sd, np.nan) for p in middles[log.free[k]]]
         if body:
-            made.append(_Mark(pose[:2], config.body, body, np.nan))
-        if not marks.contact[k].any():
+            made.append(_Footprint(pose[:2], config.body, body, np.nan))
+        if not contact.any():
             made += pending
             pending = []
-        new = marks.contact[k] & ~before & ~marks.turning[k]
-        pending += [_Mark(_at(pose, p), config.contact, config.blob_sd, np.nan) for p in marks.point[k][new]]
-        foot = marks.wall[k]
-        away = np.hypot(*foot)
-        if np.isfinite(away) and away > 1e-6 and marks.contact[k].any():
-            pending = []  # the edge says what these contacts were of
-            normal = foot / away
-            middle = marks.point[k][marks.contact[k]].mean(axis=0)
-            place = _at(pose, middle + normal * (away - normal @ middle))
-            direction = pose[2] + np.arctan2(normal[1], normal[0]) + np.pi / 2
-            made.append(_Mark(place, config.contact, config.blob_sd, float(direction)))
-        before = marks.contact[k]
+        new = log.point[k][contact & ~before & ~log.turning[k]]
+        pending += [_Footprint(_at(pose, p), config.contact, config.blob_sd, np.nan) for p in new]
+        distance = np.hypot(*log.wall[k])
+        if np.isfinite(distance) and distance > 1e-6 and contact.any():
+            pending = []
+            made.append(_edge(config, pose, log.wall[k], log.point[k][contact].mean(axis=0)))
+        before = contact
     return made + pending
+
+
+def _edge(config: DrawingConfig, pose: np.ndarray, foot: np.ndarray, middle: np.ndarray) -> _Footprint:
+    """The edge of a wall with its nearest point at `foot` [2] and contacts around `middle` [2], base_link."""
+    distance = np.hypot(*foot)
+    normal = foot / distance
+    place = _at(pose, middle + normal * (distance - normal @ middle))
+    direction = pose[2] + np.arctan2(normal[1], normal[0]) + np.pi / 2
+    return _Footprint(place, config.contact, config.blob_sd, float(direction))
 
 
 def _at(pose: np.ndarray, point: np.ndarray) -> np.ndarray:

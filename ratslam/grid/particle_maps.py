@@ -1,8 +1,7 @@
-"""Maps of many particles, read and written through small windows: work follows what is touched, not the map.
+"""The maps of N particles, read and written through small windows, so that work is independent of map size.
 
-A map holds evidence (log-odds, 0 where nothing was felt) and the doubled directions of walls as a field of
-vectors. Places are in cells. What lies near a particle is changed in a window that is cut out of its map and
-put back. What lies outside the map is unexplored for ever.
+A map holds evidence (log-odds, 0 where unexplored) and a vector field of doubled wall directions. Places are
+in cells. Cells outside the map always count as unexplored.
 """
 
 from __future__ import annotations
@@ -20,30 +19,30 @@ LAYERS = 3
 
 
 class Windows(NamedTuple):
-    """Where each particle's window lies: [N, 2] int32 first column and row."""
+    """One window per particle: corner [N, 2] int32, first column and row, and size in cells."""
 
     corner: Array
     size: int
 
 
-def blank(count: int, side: int, dtype: jnp.dtype) -> Array:
+def empty_maps(count: int, side: int, dtype: jnp.dtype) -> Array:
     """[N, layers, side, side] empty maps; rows are y, columns x."""
     return jnp.zeros((count, LAYERS, side, side), dtype)
 
 
-def in_cells(point: Array, cell: float, side: int) -> Array:
-    """[..., 2] m as places in the map, in cells from the middle of the first one."""
+def to_cells(point: Array, cell: float, side: int) -> Array:
+    """[..., 2] positions in m as places in cells, from the middle of the first cell."""
     return point / cell + (side - 1) / 2
 
 
-def around(place: Array, side: int, size: int) -> Windows:
-    """The windows of `size` cells a side about places [N, 2] in cells, inside the map."""
+def windows_around(place: Array, side: int, size: int) -> Windows:
+    """Windows of `size` x `size` cells around places [N, 2] in cells, moved to lie inside the map."""
     size = min(size, side)
     corner = jnp.floor(place).astype(jnp.int32) - (size // 2 - 1)
     return Windows(jnp.clip(corner, 0, side - size), size)
 
 
-def cut(maps: Array, windows: Windows, layer: int) -> Array:
+def read_window(maps: Array, windows: Windows, layer: int) -> Array:
     """[N, size, size] one layer of the maps inside the windows."""
 
     def one(rows: Array, corner: Array) -> Array:
@@ -52,7 +51,7 @@ def cut(maps: Array, windows: Windows, layer: int) -> Array:
     return jax.vmap(one)(maps, windows.corner)
 
 
-def put(maps: Array, windows: Windows, layer: int, values: Array) -> Array:
+def write_window(maps: Array, windows: Windows, layer: int, values: Array) -> Array:
     """The maps with one layer inside the windows replaced by values [N, size, size]."""
     zero = jnp.int32(layer)
 
@@ -62,13 +61,13 @@ def put(maps: Array, windows: Windows, layer: int, values: Array) -> Array:
     return jax.vmap(one)(maps, windows.corner, values)
 
 
-def within(place: Array, windows: Windows) -> Array:
-    """Places [N, K, 2] in cells of the map as places in the windows."""
+def to_window(place: Array, windows: Windows) -> Array:
+    """[N, K, 2] places in the windows, from places in the map; cells."""
     return place - windows.corner[:, None, :].astype(place.dtype)
 
 
-def read(maps: Array, layer: int, place: Array) -> Array:
-    """[N, K] bilinear values of one layer at places [N, K, 2] in cells; at the rim and outside it is 0."""
+def interpolate(maps: Array, layer: int, place: Array) -> Array:
+    """[N, K] one layer at places [N, K, 2] in cells, interpolated bilinearly; 0 at the rim and outside."""
     count, layers, side, _ = maps.shape
     low = jnp.floor(place)
     inside = jnp.all((low >= 0) & (low < side - 1), axis=2)

@@ -1,7 +1,7 @@
-"""Particles: how they move, how their weights are kept, and how they are drawn anew.
+"""Particles: motion, weights and resampling.
 
-Each carries along what it believes of the odometry's scale errors: those that last for the run, and those
-that last for one movement.
+Each particle carries estimates of the odometry's scale errors: one constant over the session, one constant
+over a movement.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ from tactile.base.types import Array, Odometry
 
 
 class Particles(NamedTuple):
-    """N hypotheses.
+    """N particles.
 
     Attributes:
-        pose: [N, 3] m, m, rad. run, move: [N, 2] scale errors of distances and turns, of the run and of the
-            movement in progress. weight: [N] log.
+        pose: [N, 3] m, m, rad. session, move: [N, 2] relative scale errors of distances and turns, over the
+            session and over the present movement. weight: [N] logarithms.
     """
 
     pose: Array
-    run: Array
+    session: Array
     move: Array
     weight: Array
 
 
-class Drawn(NamedTuple):
-    """Who takes whose place.
+class Resampling(NamedTuple):
+    """The particles after resampling, as copies of those before.
 
     Attributes:
-        ancestor: [N] int32, whom each is a copy of. source, target: [N] int32, the copies to make, the first
-            `copies` of them.
+        ancestor: [N] int32, the particle that each is a copy of. source, target: [N] int32, the copies to
+            make, of which the first `copies` are valid.
     """
 
     ancestor: Array
@@ -45,113 +45,115 @@ class Drawn(NamedTuple):
 
 
 def start(config: DriftConfig, key: Array, count: int, dtype: jnp.dtype) -> Particles:
-    """All at the origin, with different beliefs of the odometry."""
-    run = config.run * jax.random.normal(key, (count, 2), dtype)
-    return Particles(jnp.zeros((count, 3), dtype), run, jnp.zeros_like(run), jnp.zeros(count, dtype))
+    """N particles at the origin, with random scale errors."""
+    session = config.session * jax.random.normal(key, (count, 2), dtype)
+    return Particles(jnp.zeros((count, 3), dtype), session, jnp.zeros_like(session), jnp.zeros(count, dtype))
 
 
-def moved(
+def move(
     config: DriftConfig, particles: Particles, odometry: Odometry, changed: Array, key: Array
 ) -> Particles:
-    """After an odometry reading.
+    """The particles after an odometry reading.
 
     Args:
-        changed: bool, another movement has begun; its scale errors are drawn.
+        changed: bool, a new movement has begun, whose scale errors are drawn at random.
     """
     dtype = particles.pose.dtype
     draws = jax.random.normal(key, (5, *particles.weight.shape), dtype)
     move = jnp.where(changed, config.move * draws[:2].T, particles.move)
-    scale = 1 + particles.run + move + config.step * draws[2:4].T
+    scale = 1 + particles.session + move + config.step * draws[2:4].T
     x, y, heading = particles.pose.T
     error = odometry.dtheta * (scale[:, 1] - 1) + config.heading * draws[4]
-    on = heading + error / 2  # odometry tells of the way in the old frame; its errors build up along it
+    on = heading + error / 2  # odometry is in the old frame; its heading error grows along the step
     c, s = jnp.cos(on), jnp.sin(on)
     dx, dy = odometry.dx * scale[:, 0], odometry.dy * scale[:, 0]
     turned = heading + odometry.dtheta + error
-    turned -= 2 * jnp.pi * jnp.round(turned / (2 * jnp.pi))  # large angles are coarse in float32
+    turned -= 2 * jnp.pi * jnp.round(turned / (2 * jnp.pi))  # large angles lose precision in float32
     pose = jnp.stack([x + c * dx - s * dy, y + s * dx + c * dy, turned], axis=1)
     return particles._replace(pose=pose, move=move)
 
 
-def weighed(particles: Particles, likelihood: Array) -> tuple[Particles, Array]:
-    """With log-likelihoods [N] added, the largest weight 0; and whether no weight was left, when all keep
-    what they had."""
+def weigh(particles: Particles, likelihood: Array) -> tuple[Particles, Array]:
+    """Adds log-likelihoods [N]; the largest weight becomes 0. Also bool: all weights vanished, in which case
+    they are left unchanged."""
     weight = particles.weight + likelihood
     most = jnp.max(weight)
     vanished = ~jnp.isfinite(most) | jnp.any(jnp.isnan(weight))
     return particles._replace(weight=jnp.where(vanished, particles.weight, weight - most)), vanished
 
 
-def shares(weight: Array) -> Array:
-    """[N] weights that sum to 1, of log weights."""
+def normalised_weights(weight: Array) -> Array:
+    """[N] weights that sum to 1, from logarithms [N]."""
     share = jnp.exp(weight - jnp.max(weight))
     return share / jnp.sum(share)
 
 
-def effective(share: Array) -> Array:
-    """How many particles weights [N] are worth."""
+def effective_count(share: Array) -> Array:
+    """Effective number of particles of normalised weights [N]."""
     return 1 / jnp.sum(share**2)
 
 
-def drawn(config: ResamplingConfig, share: Array, key: Array) -> Drawn:
-    """Draws as many as there are, by their shares [N]."""
+def resample(config: ResamplingConfig, share: Array, key: Array) -> Resampling:
+    """Draws N particles by their normalised weights [N]."""
     count = share.shape[0]
     total = jnp.cumsum(share)
     total = total / total[-1]
-    if config.how == "multinomial":
+    if config.scheme == "multinomial":
         at = jnp.sort(jax.random.uniform(key, (count,), share.dtype))
     else:
         at = (jnp.arange(count, dtype=share.dtype) + jax.random.uniform(key, (), share.dtype)) / count
-    at = jnp.minimum(at, 1 - jnp.finfo(share.dtype).epsneg)  # where it was rounded up to 1
-    # How many points fall below the end of each particle's stretch, so how many copies it gets.
+    at = jnp.minimum(at, 1 - jnp.finfo(share.dtype).epsneg)  # rounding may give 1
+    # Points below the end of each particle's interval; the differences are the numbers of copies.
     below = jnp.searchsorted(at, total, side="left").astype(jnp.int32)
     offspring = jnp.diff(below, prepend=jnp.int32(0))
-    return placed(offspring)
+    return assign_copies(offspring)
 
 
-def placed(offspring: Array) -> Drawn:
-    """Survivors stay where they are, and what they have more of fills the gaps of the others."""
+def assign_copies(offspring: Array) -> Resampling:
+    """The copies for given numbers of offspring [N]: survivors stay, extra copies fill the gaps."""
     count = offspring.shape[0]
     target = jnp.nonzero(offspring == 0, size=count, fill_value=count)[0].astype(jnp.int32)
     surplus = jnp.cumsum(jnp.maximum(offspring - 1, 0)).astype(jnp.int32)
     rank = jnp.arange(count, dtype=jnp.int32)
     source = jnp.minimum(jnp.searchsorted(surplus, rank, side="right").astype(jnp.int32), count - 1)
     ancestor = rank.at[target].set(source, mode="drop")
-    return Drawn(ancestor, source, target, jnp.sum(offspring == 0).astype(jnp.int32))
+    return Resampling(ancestor, source, target, jnp.sum(offspring == 0).astype(jnp.int32))
 
 
-def spared(count: int) -> Drawn:
-    """Nobody takes anybody's place."""
+def identity(count: int) -> Resampling:
+    """No resampling: every particle remains."""
     rank = jnp.arange(count, dtype=jnp.int32)
-    return Drawn(rank, rank, rank, jnp.int32(0))
+    return Resampling(rank, rank, rank, jnp.int32(0))
 
 
-def copied(config: ResamplingConfig, particles: Particles, who: Drawn, key: Array) -> Particles:
-    """The particles drawn, of equal weight; copies differ a little from whom they are copies of."""
+def copy_particles(
+    config: ResamplingConfig, particles: Particles, drawn: Resampling, key: Array
+) -> Particles:
+    """The resampled particles with equal weights; copies are displaced by small random amounts."""
     dtype = particles.pose.dtype
-    new = (who.ancestor != jnp.arange(len(who.ancestor), dtype=jnp.int32)).astype(dtype)[:, None]
-    draws = jax.random.normal(key, (len(who.ancestor), 5), dtype) * new
+    new = (drawn.ancestor != jnp.arange(len(drawn.ancestor), dtype=jnp.int32)).astype(dtype)[:, None]
+    draws = jax.random.normal(key, (len(drawn.ancestor), 5), dtype) * new
     spread = jnp.array([config.length, config.length, config.heading], dtype)
     return Particles(
-        particles.pose[who.ancestor] + spread[None] * draws[:, :3],
-        particles.run[who.ancestor] + config.scale * draws[:, 3:],
-        particles.move[who.ancestor],
+        particles.pose[drawn.ancestor] + spread[None] * draws[:, :3],
+        particles.session[drawn.ancestor] + config.scale * draws[:, 3:],
+        particles.move[drawn.ancestor],
         jnp.zeros_like(particles.weight),
     )
 
 
-def copied_rows(rows: Array, who: Drawn) -> Array:
-    """[N, ...] what belongs to the particles, copied in place: nothing else is touched."""
+def copy_rows(rows: Array, drawn: Resampling) -> Array:
+    """[N, ...] rows that belong to the particles, resampled in place; only copies are written."""
 
     def copy(k: Array, rows: Array) -> Array:
-        row = lax.dynamic_index_in_dim(rows, who.source[k], keepdims=True)
-        return lax.dynamic_update_index_in_dim(rows, row, who.target[k], 0)
+        row = lax.dynamic_index_in_dim(rows, drawn.source[k], keepdims=True)
+        return lax.dynamic_update_index_in_dim(rows, row, drawn.target[k], 0)
 
-    return lax.fori_loop(jnp.int32(0), who.copies, copy, rows)
+    return lax.fori_loop(jnp.int32(0), drawn.copies, copy, rows)
 
 
-def mean(pose: Array, share: Array) -> tuple[Array, Array]:
-    """[3] the weighted mean pose, and [3] its standard deviations (m, m, rad)."""
+def weighted_mean(pose: Array, share: Array) -> tuple[Array, Array]:
+    """[3] the mean pose by normalised weights [N], and [3] its standard deviations (m, m, rad)."""
     middle = share @ pose[:, :2]
     c, s = share @ jnp.cos(pose[:, 2]), share @ jnp.sin(pose[:, 2])
     spread = jnp.sqrt(share @ (pose[:, :2] - middle[None]) ** 2)

@@ -23,10 +23,10 @@ MOUNTS = ((0.10, 0.08, 50), (0.13, 0.03, 15), (0.13, -0.03, -15), (0.10, -0.08, 
 LENGTH = 0.14
 RADIUS = 0.13
 """Where along a whisker a contact is told, m (Fox et al. 2012, II-D)."""
-STEADY = {"run": 0.0, "move": 0.0, "step": 0.0, "heading": 0.0}
+STEADY = {"session": 0.0, "move": 0.0, "step": 0.0, "heading": 0.0}
 """Of a drift: odometry is believed to the letter."""
 BLANK = {"edge": 0.0, "blob": 0.0, "free": 0.0, "body": 0.0}
-"""Of stamps: the map stays as it is."""
+"""Of footprint: the map stays as it is."""
 
 
 def create(whiskers: int = len(MOUNTS)) -> PlanarWhiskers:

@@ -20,32 +20,33 @@ PAPERS = ("blob", "geometric", "template")
 METHODS: dict[str, tuple[str, ...]] = {
     "as printed": (
         "touch.reports.max_template_error=null",
-        "grid.likelihood.model=distinct",
-        "grid.resampling.when=always",
-        "grid.resampling.how=multinomial",
+        "grid.likelihood.model=literal",
+        "grid.resampling.schedule=always",
+        "grid.resampling.scheme=multinomial",
         "grid.resampling.length=0.0",
         "grid.resampling.heading=0.0",
         "grid.resampling.scale=0.0",
-        "grid.drift.run=0.0",
+        "grid.drift.session=0.0",
         "grid.drift.move=0.0",
         "grid.drift.heading=0.0",
-        "grid.stamps.wall=edge",
-        "grid.stamps.edge=1.386",
-        "grid.stamps.blob=1.386",
-        "grid.stamps.along=0.25",
-        "grid.stamps.free=0.405",
-        "grid.stamps.body=0.405",
-        "grid.stamps.most=3.5",
+        "grid.footprint.wall=edge",
+        "grid.footprint.edge=1.386",
+        "grid.footprint.blob=1.386",
+        "grid.footprint.along=0.25",
+        "grid.footprint.free=0.405",
+        "grid.footprint.body=0.405",
+        "grid.footprint.max_log_odds=3.5",
         "grid.drawing.contact=0.8",
         "grid.drawing.blob_sd=0.05",
         "grid.drawing.edge_sd=0.25",
-        "grid.drawing.edge_fan=0.2617993877991494",
+        "grid.drawing.edge_sector=0.2617993877991494",
     ),
     "ours": (),
 }
-"""As printed (Algorithm 1, eq. 1 to 5) except where that cannot work: the cell of a contact does not
-contradict it, marks are neutral far from where they are made, and resampled particles have moved. Its stamps
-are the log-odds of 0.8 and 0.4, and all templates are accepted. Ours are the defaults."""
+"""As printed (Algorithm 1, eq. 1 to 5), except where the printed form cannot work: each cell counts once in
+eq. 2 and not as free where the contact is (`likelihood.distinct_cells`), footprints are neutral far away, and
+resampled particles have moved. Footprints are the log-odds of 0.8 and 0.4. All templates are used. Ours are
+the defaults."""
 FILTERED, RECKONED, TRUE = "filter", "dead reckoning", "true path"
 """Paths along which a method's marks are drawn: the filter's, a lower bound and an upper bound."""
 PATHS = (FILTERED, RECKONED, TRUE)

@@ -17,8 +17,9 @@ from ratslam.backends.grid import GridBackend
 from ratslam.config.run_config import RunConfig
 from ratslam.core.precision import Precision, prepare_precision
 from ratslam.core.session import Session
+from ratslam.experiments.fox2012.likelihood import distinct_cells
 from ratslam.grid.config import GridConfig
-from ratslam.grid.map_drawing import Marks, draw, marks_of
+from ratslam.grid.map_drawing import ContactLog, contact_log, draw_occupancy
 from robot.simulation.create.session import CreateSimulation, CreateSimulationConfig, train_strain_templates
 from robot.touch_source import TouchSource, observation_of, report_config_of
 from robot.world.arena import Arena, arena_text, has_clearance, is_enclosed, is_occupied, wall_segments
@@ -140,7 +141,7 @@ def run_filter(
 
 
 def draw_map(
-    config: GridConfig, feelers: PlanarWhiskers, arena: Arena, path: np.ndarray, marks: Marks
+    config: GridConfig, feelers: PlanarWhiskers, arena: Arena, path: np.ndarray, marks: ContactLog
 ) -> OccupancyGrid:
     """The map drawn along a path [T, 3], in the frame of the arena; `MAP_SCALE` gives its side.
 
@@ -149,8 +150,8 @@ def draw_map(
     """
     side = round(MAP_SCALE * arena_side(arena) / config.cell)
     middle = (arena.outer.min(axis=0) + arena.outer.max(axis=0)) / 2
-    first = Marks(*(rows[: len(path)] for rows in marks))
-    probability = draw(config, feelers, side, path - np.array([*middle, 0.0]), first)
+    first = ContactLog(*(rows[: len(path)] for rows in marks))
+    probability = draw_occupancy(config, feelers, side, path - np.array([*middle, 0.0]), first)
     return OccupancyGrid(probability, middle - side * config.cell / 2, config.cell)
 
 
@@ -165,11 +166,11 @@ def arena_side(arena: Arena) -> float:
     return float(np.ptp(arena.outer, axis=0).max())
 
 
-def collect_marks(reports: list[Observation]) -> Marks:
+def collect_marks(reports: list[Observation]) -> ContactLog:
     """The marks that the reports add to a map."""
     rows = stack(reports)
     wall = np.where(rows.wall[:, None], rows.wall_point, np.nan)
-    return marks_of(rows.motion, rows.contact, rows.alive, rows.point, wall)
+    return contact_log(rows.motion, rows.contact, rows.alive, rows.point, wall)
 
 
 def session_at_start(
@@ -188,7 +189,7 @@ def _compiled(
     assert grid.side is not None
     feelers = ReportFrontendConfig(mounts=mounts, length=length).feelers
     prepare_precision(precision)
-    return Session(GridBackend(grid, feelers, grid.side, precision), precision=precision)
+    return Session(GridBackend(grid, feelers, grid.side, precision, distinct_cells), precision=precision)
 
 
 @lru_cache(maxsize=1)

@@ -135,7 +135,7 @@ def _engine(config: RunConfig, proposed: PoseCellConfig) -> Proposal:
 
 def _grid(config: RunConfig, scene: Scene) -> Iterator[Proposal]:
     grid, side = config.grid, config.grid.side or LIVE_SIDE
-    blob, cell = grid.stamps.blob_sd, nice(grid.stamps.blob_sd)
+    blob, cell = grid.footprint.blob_sd, nice(grid.footprint.blob_sd)
     across = int(np.ceil(side / cell))
     off = _drifted(grid.drift, scene) / cell
     wanted = int(np.clip(_step(PER_CELL * off), *PARTICLES))
@@ -172,7 +172,7 @@ def _drifted(drift: DriftConfig, scene: Scene) -> float:
     """Standard deviation of odometry after crossing the scene, as the filter believes it, m."""
     span = max(scene.span)
     cycles = max(span / scene.usual, 1.0)
-    lasting = np.hypot(drift.run, drift.move)
+    lasting = np.hypot(drift.session, drift.move)
     along = span * np.hypot(lasting, drift.step / np.sqrt(cycles))
     aside = span * drift.heading * np.sqrt(cycles / 3)
     return float(np.hypot(along, aside))

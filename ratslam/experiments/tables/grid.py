@@ -41,10 +41,10 @@ WORLDS: dict[str, dict[str, Any]] = {
 MAP_SIDES = {"A": 2.5, "B": 5.0, "rotated": 2.5}
 """Side of the filter's map by world, m: one size for all arenas, so that the filter compiles once."""
 AS_PRINTED = {
-    "likelihood": {"model": "distinct"},
-    "drift": {"run": 0.0, "move": 0.0, "step": 0.05},
-    "resampling": {"when": "always", "how": "multinomial"},
-    "stamps": {"wall": "edge", "along": 0.25},
+    "likelihood": {"model": "literal"},
+    "drift": {"session": 0.0, "move": 0.0, "step": 0.05},
+    "resampling": {"schedule": "always", "scheme": "multinomial"},
+    "footprint": {"wall": "edge", "along": 0.25},
 }
 ODOMETRY_ERRORS = {
     "bias": "one scale for the run",
@@ -61,13 +61,13 @@ ROWS: dict[str, tuple[str, dict[str, Any]]] = {
     "move, geometric": ("move", {"touch": {"reports": {"walls": "geometric"}}}),
     "bias, as printed": ("bias", {"grid": AS_PRINTED}),
     "move, as printed": ("move", {"grid": AS_PRINTED}),
-    "bias without run errors": ("bias", {"grid": {"drift": {"run": 0.0}}}),
+    "bias without run errors": ("bias", {"grid": {"drift": {"session": 0.0}}}),
     "move, temper 1, prior 0.3": ("move", {"grid": {"likelihood": {"free": 1.0, "unexplored": 0.3}}}),
     "bias, BACK skipped": ("bias", {}),
     "move, BACK skipped": ("move", {}),
     "bias, 1000 particles": ("bias", {"grid": {"particles": 1000}}),
     "move, 1000 particles": ("move", {"grid": {"particles": 1000}}),
-    "move, no compass": ("move", {"grid": {"likelihood": {"compass": False}}}),
+    "move, no compass": ("move", {"grid": {"likelihood": {"wall_direction_prior": False}}}),
 }
 """Model of the odometry errors, and settings."""
 DEFAULT_ROWS = (

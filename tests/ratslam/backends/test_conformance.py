@@ -39,7 +39,7 @@ def _grid(dtype=np.float64):
     doubtful = {
         "drift": {"step": 0.3, "heading": 0.05},
         "likelihood": {"free": 0.5, "contact": 4.0},
-        "resampling": {"effective": 0.9},
+        "resampling": {"min_effective_share": 0.9},
     }
     config = GridConfig.model_validate({"particles": 20} | doubtful)
     feelers = PlanarWhiskers(np.zeros((WHISKERS, 2)), AROUND, np.full(WHISKERS, REACH))

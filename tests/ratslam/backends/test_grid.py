@@ -33,17 +33,17 @@ from tests.helpers.grid_world import (
 )
 
 FILTER = filter_of(settings())
-MOST = FILTER.config.stamps.most
+MOST = FILTER.config.footprint.max_log_odds
 AS_PRINTED = {
     "likelihood": {"model": "literal"},
-    "stamps": {"wall": "edge"},
-    "resampling": {"when": "always", "how": "multinomial"},
+    "footprint": {"wall": "edge"},
+    "resampling": {"schedule": "always", "scheme": "multinomial"},
 }
 PRINTED = filter_of(settings(**AS_PRINTED))
 SINGLE = filter_of(settings(), dtype=np.float32)
 CORRIDOR = filter_of(
     settings(
-        particles=1000, cell=0.1, body=0.0, stamps=BLANK, drift=STEADY | {"step": 0.3},
+        particles=1000, cell=0.1, body=0.0, footprint=BLANK, drift=STEADY | {"step": 0.3},
         resampling={"length": 0.0, "heading": 0.0, "scale": 0.0},
         likelihood={"free": 0.3, "contact": 1.0},
     ),
@@ -59,13 +59,13 @@ def placed(backend, pose, point):
     c, s = np.cos(pose[:, 2, None]), np.sin(pose[:, 2, None])
     x = pose[:, :1] + c * point[:, 0] - s * point[:, 1]
     y = pose[:, 1:2] + s * point[:, 0] + c * point[:, 1]
-    return np.asarray(particle_maps.in_cells(np.stack([x, y], axis=2), backend.config.cell, backend.side))
+    return np.asarray(particle_maps.to_cells(np.stack([x, y], axis=2), backend.config.cell, backend.side))
 
 
 def evidence_at(backend, state, point, layer=EVIDENCE):
     """[N, K] what each particle's map holds at points [K, 2] of base_link."""
     place = placed(backend, state.particles.pose, point).astype(backend.dtype)
-    return np.asarray(particle_maps.read(state.maps, layer, place))
+    return np.asarray(particle_maps.interpolate(state.maps, layer, place))
 
 
 def column_of_wall(backend, x, *, before=-3.0, wall=4.0, width=0.1):
@@ -105,18 +105,18 @@ def test_what_meets_nothing_is_found_free():
     state, *_ = drive(FILTER, begun(FILTER), [report(0.02)])
     shafts = np.asarray(FILTER.free)
     # Between cells the bottom of a narrow mark is cut.
-    assert (evidence_at(FILTER, state, shafts) < -0.4 * FILTER.config.stamps.free).all()
-    assert (evidence_at(FILTER, state, np.zeros((1, 2))) <= -0.99 * FILTER.config.stamps.body).all()
+    assert (evidence_at(FILTER, state, shafts) < -0.4 * FILTER.config.footprint.free).all()
+    assert (evidence_at(FILTER, state, np.zeros((1, 2))) <= -0.99 * FILTER.config.footprint.body).all()
     assert (evidence_at(FILTER, state, np.array([[0.45, 0.0], [-0.25, 0.0], [0.0, 0.3]])) > -0.01).all()
     assert not np.any(state.maps[:, COSINE:])
-    assert not np.any(state.compass)
+    assert not np.any(state.wall_directions)
     assert float(state.maps.max()) <= 0
 
 
 @pytest.mark.parametrize("cell", [0.05, 0.02])
 def test_a_contact_leaves_evidence_where_it_was_felt(cell):
     backend = FILTER if cell == 0.05 else filter_of(settings(particles=2, cell=cell))
-    blob = FILTER.config.stamps.blob
+    blob = FILTER.config.footprint.blob
     for heading in (0.0, 0.8, -2.0):
         start = standing(begun(backend), [0.2, -0.1, heading])
         state, *_ = drive(backend, start, [report(0.02, touching=[0, 2], dead=[1, 3])])
@@ -144,7 +144,7 @@ def test_a_wall_is_drawn_along_itself_with_its_direction():
     for layer, part in ((COSINE, np.cos(2 * turned)), (SINE, np.sin(2 * turned))):
         field = evidence_at(FILTER, state, foot[None], layer)
         assert field == pytest.approx(np.broadcast_to(part, field.shape), abs=0.2)
-    assert np.asarray(state.compass) == pytest.approx(
+    assert np.asarray(state.wall_directions) == pytest.approx(
         np.concatenate([np.cos(4 * turned), np.sin(4 * turned)], axis=1)
     )
 
@@ -155,7 +155,7 @@ def test_a_wall_says_the_same_from_wherever_it_is_felt():
     for heading in (0.0, 1.0, 2.5, np.pi):
         start = standing(begun(FILTER), [0.0, 0.0, heading])
         state, *_ = drive(FILTER, start, [report(touching=[1, 2], wall=(0.3, 1.2 - heading), sd=0.05)])
-        fields.append(np.asarray(state.compass).mean(axis=0))
+        fields.append(np.asarray(state.wall_directions).mean(axis=0))
         assert wrap(np.asarray(state.particles.pose)[:, 2] - heading) == pytest.approx(0, abs=0.01)
     assert np.array(fields) == pytest.approx(np.tile(fields[0], (4, 1)), abs=0.01)
 
@@ -164,7 +164,7 @@ def test_backing_off_brings_no_evidence_but_moves():
     start, *_ = drive(FILTER, begun(FILTER), [report(0.02)] * 3 + [report(0.02, touching=[1, 2])])
     state, *_ = drive(FILTER, start, [report(-0.025, touching=[0, 1], wall=(0.3, 0.0))])
     assert np.array_equal(state.maps, start.maps)
-    assert np.array_equal(state.compass, start.compass)
+    assert np.array_equal(state.wall_directions, start.wall_directions)
     assert np.array_equal(state.particles.weight, start.particles.weight)
     moved = np.asarray(state.particles.pose - start.particles.pose)[:, 0]
     assert moved == pytest.approx(-0.025, rel=0.5)
@@ -188,7 +188,7 @@ def test_contacts_are_told_once():
     assert np.array_equal(told.weights, expected.weights)
     # But again after the robot has backed off.
     again, *_ = drive(FILTER, start, [report(-0.01, touching=[0, 1]), report(0.01, touching=[0, 1])])
-    assert (evidence_at(FILTER, again, TIPS[:2]) > 1.3 * FILTER.config.stamps.blob).all()
+    assert (evidence_at(FILTER, again, TIPS[:2]) > 1.3 * FILTER.config.footprint.blob).all()
 
 
 @pytest.mark.parametrize("backend", [FILTER, PRINTED], ids=["evidence", "printed"])
@@ -217,7 +217,9 @@ def test_particles_whose_map_explains_a_contact_weigh_more(backend):
     tips = TIPS[1, 0]
     for k, x in enumerate((0.6 - tips, 0.9 - tips, 0.3 - tips)):  # on the wall, behind it, before it
         poses = poses.at[10 * k : 10 * k + 10, 0].set(float(x))
-    start = start._replace(particles=start.particles._replace(pose=poses, run=0 * start.particles.run))
+    start = start._replace(
+        particles=start.particles._replace(pose=poses, session=0 * start.particles.session)
+    )
     _, _, told = drive(backend, start, [report(touching=[1, 2], dead=[0, 3], motion=MotionKind.OTHER)])
     wall, unknown, empty = told.weights[0].reshape(3, 10)
     assert wall.min() > 3 * unknown.max()
@@ -250,7 +252,7 @@ def corridor(backend, reports, spread):
     x = np.arange(-0.3, 1.2, fine)
     pose = np.stack([x, 0 * x, 0 * x], axis=1)
     maps = (
-        particle_maps.blank(1, backend.side, np.dtype(float))
+        particle_maps.empty_maps(1, backend.side, np.dtype(float))
         .at[0, EVIDENCE]
         .set(column_of_wall(backend, 0.65))
     )
@@ -258,7 +260,7 @@ def corridor(backend, reports, spread):
 
     def evidence(points):
         place = placed(backend, pose, points).reshape(1, -1, 2)
-        return np.asarray(particle_maps.read(maps, EVIDENCE, place)).reshape(len(x), len(points))
+        return np.asarray(particle_maps.interpolate(maps, EVIDENCE, place)).reshape(len(x), len(points))
 
     for o in reports:
         sd = spread * abs(float(o.odometry.dx))
@@ -266,7 +268,7 @@ def corridor(backend, reports, spread):
         belief = np.exp(-0.5 * gap**2) @ belief
         if o.motion != MotionKind.BACK:
             free = np.repeat(~o.contact, len(backend.free) // 2)
-            logs = likelihoods.free(config.likelihood, evidence(backend.free), free)
+            logs = likelihoods.free_space(config.likelihood, evidence(backend.free), free)
             logs += likelihoods.contact(config.likelihood, evidence(TIPS[:2]), o.contact & ~touched)
             belief = belief * np.exp(np.asarray(logs))
         touched = o.contact & (o.motion != MotionKind.BACK)
@@ -313,9 +315,9 @@ def test_maps_follow_their_particles():
     names = jnp.arange(1.0, 1001.0)
     state = state._replace(
         maps=state.maps + 1e-6 * names[:, None, None, None],
-        compass=jnp.stack([names, -names], axis=1),
+        wall_directions=jnp.stack([names, -names], axis=1),
         particles=state.particles._replace(
-            weight=-0.05 * names, run=1e-9 * jnp.stack([names, names], axis=1)
+            weight=-0.05 * names, session=1e-9 * jnp.stack([names, names], axis=1)
         ),
     )
     after, _, told = drive(CORRIDOR, state, [report(0.02, whiskers=2)])
@@ -323,8 +325,8 @@ def test_maps_follow_their_particles():
     assert told.outcome[0] == Outcome.RESAMPLED
     assert 20 < len(np.unique(ancestor)) < 500
     assert np.array_equal(after.maps, state.maps[ancestor])
-    assert np.array_equal(after.compass, state.compass[ancestor])
-    assert np.array_equal(after.particles.run, state.particles.run[ancestor])
+    assert np.array_equal(after.wall_directions, state.wall_directions[ancestor])
+    assert np.array_equal(after.particles.session, state.particles.session[ancestor])
     assert np.array_equal(after.particles.pose, told.poses[0][ancestor])
     assert not np.any(after.particles.weight)
     # Weights are told as they were before.
@@ -474,7 +476,7 @@ def test_contact_in_every_report():
     assert sound(state, estimate, told)
     assert Outcome.RESAMPLED in told.outcome
     assert not np.isin(told.outcome, [Outcome.VANISHED, Outcome.NOT_FINITE]).any()
-    assert finite(state.compass)
+    assert finite(state.wall_directions)
 
 
 def test_a_wall_is_believed_soon_after_much_that_was_free():

@@ -1,4 +1,4 @@
-"""Laws of ancestry: whose path is told, and that forgetting what is settled changes nothing."""
+"""Laws of the genealogy: the mean path, and its independence of the bound on memory."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ratslam.grid import genealogy
-from ratslam.grid.genealogy import Ancestry
+from ratslam.grid.genealogy import Genealogy
 from tactile.base.se2 import wrap
 
 COUNT = 6
@@ -22,7 +22,7 @@ def reports(count, *, every=1, seed=0):
 
 
 def told(rows, count=COUNT):
-    tree = Ancestry(count)
+    tree = Genealogy(count)
     for row in rows:
         tree.append(*row)
     return tree
@@ -82,7 +82,7 @@ def test_memory_is_bounded_and_settled_paths_stay(monkeypatch, levels):
     for pose, share, _ in reports(200):
         rows.append((pose, share, np.full(COUNT, stream.integers(0, COUNT))))
     whole = told(rows).path()
-    monkeypatch.setattr(genealogy, "LEVELS", levels)
+    monkeypatch.setattr(genealogy, "MAX_POSES", levels)
     tree = told(rows)
     assert len(tree) == 200
     assert tree.arrays()["pose"].size // 3 <= max(levels, COUNT)
@@ -90,8 +90,8 @@ def test_memory_is_bounded_and_settled_paths_stay(monkeypatch, levels):
     assert_same(whole, by_copying(rows))
 
 
-def test_what_is_settled_early_is_the_mean_of_what_was_believed(monkeypatch):
-    monkeypatch.setattr(genealogy, "LEVELS", 20 * COUNT)
+def test_poses_beyond_the_bound_are_weighted_means(monkeypatch):
+    monkeypatch.setattr(genealogy, "MAX_POSES", 20 * COUNT)
     rows = list(reports(60, every=9))
     assert np.abs(told(rows).path() - by_copying(rows)).max() < 2
 
@@ -110,7 +110,7 @@ def test_headings_are_averaged_on_the_circle():
 
 @pytest.mark.parametrize("levels", [5 * COUNT, 10**6])
 def test_a_restored_one_continues_bit_for_bit(monkeypatch, levels):
-    monkeypatch.setattr(genealogy, "LEVELS", levels)
+    monkeypatch.setattr(genealogy, "MAX_POSES", levels)
     rows = list(reports(80, every=3))
     whole = told(rows)
     for stop in (0, 1, 16, 43):

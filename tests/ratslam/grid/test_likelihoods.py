@@ -1,4 +1,4 @@
-"""Laws of the likelihoods, and what their printed forms lead to."""
+"""Laws of the likelihoods, and consequences of their printed forms."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import expit, logit
 
+from ratslam.experiments.fox2012.likelihood import distinct_cells
 from ratslam.grid import likelihoods
 from ratslam.grid.config import LikelihoodConfig
 from tests.helpers.grid_world import LENGTH
@@ -17,18 +18,18 @@ from tests.helpers.grid_world import LENGTH
 CONFIG = LikelihoodConfig()
 PRIOR = 0.3
 SEGMENTS = 5
-MODELS = {name: LikelihoodConfig(model=name) for name in ("distinct", "exclusive", "literal")}
+MODELS = {"literal": likelihoods.all_cells, "distinct": distinct_cells}
 EVIDENCE = st.floats(-30, 30)
 
-free = jax.jit(likelihoods.free, static_argnums=0)
+free = jax.jit(likelihoods.free_space, static_argnums=0)
 contact = jax.jit(likelihoods.contact, static_argnums=0)
-direction = jax.jit(likelihoods.direction, static_argnums=0)
-weighing = jax.jit(likelihoods.printed, static_argnums=(0, 1))
+direction = jax.jit(likelihoods.wall_direction, static_argnums=0)
+weighing = jax.jit(likelihoods.printed_likelihood, static_argnums=(0, 5))
 
 
-def printed(config, evidence, cell, felt, alive=None):
-    """[N] as of whiskers that all report unless told otherwise."""
-    return weighing(config, PRIOR, evidence, cell, felt, np.ones_like(felt) if alive is None else alive)
+def printed(counted, evidence, cell, felt, alive=None):
+    """[N] log-likelihoods; all whiskers report unless `alive` is given."""
+    return weighing(PRIOR, evidence, cell, felt, np.ones_like(felt) if alive is None else alive, counted)
 
 
 def by_loops(model, evidence, cell, felt, alive):
@@ -65,17 +66,16 @@ def walls(model, chance, whiskers):
 # Eq. 1 and 2
 
 
-def test_as_printed_two_contacts_push_a_filter_off_its_own_map():
-    """On a well-mapped wall (0.9) they weigh (0.9 * 0.1 / 0.3 / 0.7) ** 2 = 0.18 of what they do on cells
-    that nothing is known of (0.3)."""
+def test_as_printed_two_contacts_contradict_a_correct_map():
+    """On a mapped wall (0.9) their likelihood is (0.9 * 0.1 / 0.3 / 0.7) ** 2 = 0.18 of that on unexplored
+    cells (0.3)."""
     assert walls("literal", 0.9, 2) == pytest.approx(0.1837, abs=1e-4)
-    assert walls("exclusive", 0.9, 2) == pytest.approx(9)
     assert walls("distinct", 0.9, 2) == pytest.approx(9)
 
 
 @pytest.mark.parametrize("model", MODELS)
 @given(st.integers(0, 2**32 - 1))
-def test_printed_likelihoods_are_the_products_told(model, seed):
+def test_printed_likelihoods_are_the_products_of_eq_1_and_2(model, seed):
     stream = np.random.default_rng(seed)
     evidence = stream.normal(0, 2, (2, 3, SEGMENTS))
     cell = np.cumsum(stream.integers(0, 2, (2, 3, SEGMENTS, 2)), axis=2).astype(float)
@@ -97,7 +97,6 @@ def test_the_last_free_point_in_the_contact_cell_does_not_count():
     }
     wall = expit(9 + logit(PRIOR))
     assert np.exp(logs["distinct"]) == pytest.approx(0.7**3 * wall)
-    assert np.exp(logs["exclusive"]) == pytest.approx(0.7**3 * wall * (1 - wall))
     assert np.exp(logs["literal"]) == pytest.approx(0.7**3 * wall * (1 - wall) ** 2)
 
 
@@ -117,7 +116,6 @@ def test_five_points_on_a_whisker_hit_three_to_four_cells():
         for name, config in MODELS.items()
     }
     assert (half["literal"] == SEGMENTS).all()
-    assert (half["exclusive"] == SEGMENTS).all()
     assert half["distinct"].mean() == pytest.approx(
         3.45, abs=0.005 + 4 * half["distinct"].std() / np.sqrt(count)
     )

@@ -129,7 +129,7 @@ def test_files_hold_the_map_and_where_it_lies(tmp_path):
 @pytest.mark.parametrize("levels", [8 * COUNT, 10**6])
 @pytest.mark.parametrize("stop", [0, 1, 30])
 def test_a_restored_map_continues_bit_for_bit(monkeypatch, levels, stop):
-    monkeypatch.setattr(genealogy, "LEVELS", levels)
+    monkeypatch.setattr(genealogy, "MAX_POSES", levels)
     steps = list(random_steps(50))
     whole, second = told(steps), told(random_steps(3, seed=7))
     second.restore({name: value.copy() for name, value in told(steps[:stop]).arrays().items()})

@@ -1,4 +1,4 @@
-"""Laws of particles: how they move, how they are weighed, and how they are drawn anew."""
+"""Laws of particles: motion, weights and resampling."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from tactile.base.types import Odometry
 from tests.helpers.grid_world import STEADY
 
 SYSTEMATIC = ResamplingConfig()
-MULTINOMIAL = ResamplingConfig(how="multinomial")
+MULTINOMIAL = ResamplingConfig(scheme="multinomial")
 COUNT = 16
 WEIGHTS = st.lists(st.sampled_from([0.0, 1e-9, 0.01, 0.3, 1.0, 1.0, 7.0]), min_size=COUNT, max_size=COUNT)
 
-moved = jax.jit(particles.moved, static_argnums=0)
-weighed = jax.jit(particles.weighed)
-drawing = jax.jit(particles.drawn, static_argnums=0)
-placing = jax.jit(particles.placed)
-averaged = jax.jit(particles.mean)
+moved = jax.jit(particles.move, static_argnums=0)
+weighed = jax.jit(particles.weigh)
+drawing = jax.jit(particles.resample, static_argnums=0)
+placing = jax.jit(particles.assign_copies)
+averaged = jax.jit(particles.weighted_mean)
 
 
 def drawn(config, share, seed):
@@ -43,9 +43,9 @@ def copies(who):
     return np.bincount(who.ancestor, minlength=len(who.ancestor))
 
 
-def swarm(poses, dtype=float, run=0.0, weight=0.0):
+def swarm(poses, dtype=float, session=0.0, weight=0.0):
     poses = np.atleast_2d(np.asarray(poses, dtype))
-    scales = np.full((len(poses), 2), run, dtype)
+    scales = np.full((len(poses), 2), session, dtype)
     return jax.tree.map(
         jnp.asarray, Particles(poses, scales, np.zeros_like(scales), np.full(len(poses), weight, dtype))
     )
@@ -93,7 +93,7 @@ def test_rows_are_copied_from_the_ancestors(shape):
     for seed in range(20):
         who = drawn(SYSTEMATIC, stream.dirichlet(np.full(COUNT, 0.2)), seed)
         assert who.copies > 0
-        after = jax.jit(particles.copied_rows)(rows, who)
+        after = jax.jit(particles.copy_rows)(rows, who)
         assert np.array_equal(after, rows[who.ancestor])
 
 
@@ -111,7 +111,7 @@ def test_one_heavy_particle_takes_all(config, heavy):
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("count", [2, 30, 100])
 def test_equal_weights_change_nothing(count, dtype):
-    share = np.asarray(particles.shares(jnp.full(count, -3.0, dtype)))
+    share = np.asarray(particles.normalised_weights(jnp.full(count, -3.0, dtype)))
     for seed in range(10):
         who = drawn(SYSTEMATIC, share, seed)
         assert who.copies == 0
@@ -121,7 +121,7 @@ def test_equal_weights_change_nothing(count, dtype):
 def test_a_weightless_last_particle_is_never_drawn():
     """Among so many that in float32 the last point of a systematic draw is often rounded up to 1."""
     count = 100_000
-    share = particles.shares(jnp.zeros(count, np.float32).at[-1].set(-jnp.inf))
+    share = particles.normalised_weights(jnp.zeros(count, np.float32).at[-1].set(-jnp.inf))
     assert share[-1] == 0
     assert all(
         drawn(SYSTEMATIC, share, seed).ancestor[-1] != count - 1 for seed in [*range(20), 65, 178, 881]
@@ -135,7 +135,7 @@ def test_drawing_is_unbiased(config):
     within 4.5 standard errors of 3 % (heaviest particle)."""
     share, draws = np.array([0.01, 0.03, 0.05, 0.08, 0.1, 0.1, 0.12, 0.15, 0.16, 0.2]), 4000
     keys = jax.random.split(jax.random.key(3), draws)
-    who = jax.jit(jax.vmap(partial(particles.drawn, config, share)))(keys)
+    who = jax.jit(jax.vmap(partial(particles.resample, config, share)))(keys)
     counts = np.stack([np.bincount(row, minlength=10) for row in np.asarray(who.ancestor)])
     spread = np.sqrt(10 * share * (1 - share) / draws)
     assert (np.abs(counts.mean(axis=0) - 10 * share) <= 4.5 * spread).all()
@@ -149,24 +149,24 @@ def test_copies_differ_a_little_and_survivors_not_at_all():
     """Size: standard deviations of 15 numbers, each of 20 000 copies, within 4.5 standard errors: 1e-4."""
     count = 20_001
     config = ResamplingConfig(length=0.01, heading=0.02, scale=0.03)
-    before = swarm(np.arange(3 * count).reshape(count, 3), run=0.1)
+    before = swarm(np.arange(3 * count).reshape(count, 3), session=0.1)
     before = before._replace(
-        move=before.run + jnp.arange(count, dtype=float)[:, None], weight=-before.pose[:, 0]
+        move=before.session + jnp.arange(count, dtype=float)[:, None], weight=-before.pose[:, 0]
     )
     who = placed(np.where(np.arange(count) == 7, count, 0))
-    after = jax.jit(particles.copied, static_argnums=0)(config, before, who, jax.random.key(0))
+    after = jax.jit(particles.copy_particles, static_argnums=0)(config, before, who, jax.random.key(0))
     before, after = (jax.tree.map(np.asarray, group) for group in (before, after))
     assert np.array_equal(after.pose[7], before.pose[7])
-    assert np.array_equal(after.run[7], before.run[7])
+    assert np.array_equal(after.session[7], before.session[7])
     assert np.array_equal(after.move, np.tile(before.move[7], (count, 1)))
     assert not np.any(after.weight)
-    jitter = np.concatenate([after.pose - before.pose[7], after.run - before.run[7]], axis=1)
+    jitter = np.concatenate([after.pose - before.pose[7], after.session - before.session[7]], axis=1)
     jitter = np.delete(jitter, 7, axis=0) / [0.01, 0.01, 0.02, 0.03, 0.03]
     assert np.abs(np.cov(jitter.T) - np.eye(5)).max() < 4.5 * np.sqrt(2 / count)
 
 
 def test_sparing_copies_nobody():
-    who = particles.spared(COUNT)
+    who = particles.identity(COUNT)
     assert who.copies == 0
     assert np.array_equal(who.ancestor, np.arange(COUNT))
 
@@ -177,10 +177,12 @@ def test_sparing_copies_nobody():
 @settings(max_examples=50)
 @given(st.lists(st.floats(-1e4, 1e4), min_size=COUNT, max_size=COUNT), st.floats(-1e3, 1e3))
 def test_shares_are_a_distribution_whatever_is_added_to_all(logs, shift):
-    share = particles.shares(jnp.asarray(logs))
+    share = particles.normalised_weights(jnp.asarray(logs))
     assert float(share.sum()) == pytest.approx(1)
-    assert share == pytest.approx(np.asarray(particles.shares(jnp.asarray(logs) + shift)), abs=1e-9)
-    assert 1 - 1e-9 <= float(particles.effective(share)) <= COUNT + 1e-9
+    assert share == pytest.approx(
+        np.asarray(particles.normalised_weights(jnp.asarray(logs) + shift)), abs=1e-9
+    )
+    assert 1 - 1e-9 <= float(particles.effective_count(share)) <= COUNT + 1e-9
 
 
 def test_likelihoods_multiply_weights():
@@ -188,10 +190,10 @@ def test_likelihoods_multiply_weights():
     first, second = np.random.default_rng(0).normal(0, 3, (2, COUNT))
     after, vanished = weighed(weighed(before, first)[0], second)
     expected = np.exp(first + second) / np.exp(first + second).sum()
-    assert np.asarray(particles.shares(after.weight)) == pytest.approx(expected)
+    assert np.asarray(particles.normalised_weights(after.weight)) == pytest.approx(expected)
     assert float(after.weight.max()) == 0
     assert not vanished
-    assert particles.effective(particles.shares(before.weight)) == pytest.approx(COUNT)
+    assert particles.effective_count(particles.normalised_weights(before.weight)) == pytest.approx(COUNT)
 
 
 @pytest.mark.parametrize(
@@ -209,7 +211,7 @@ def test_one_particle_that_explains_what_was_felt_is_enough():
     likelihood[5] = -1e6
     after, vanished = weighed(swarm(np.zeros((COUNT, 3))), likelihood)
     assert not vanished
-    assert np.array_equal(particles.shares(after.weight), np.arange(COUNT) == 5)
+    assert np.array_equal(particles.normalised_weights(after.weight), np.arange(COUNT) == 5)
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(-7, 7))
@@ -252,7 +254,7 @@ def test_odometry_believed_is_composed(motions):
 def test_a_particle_scales_odometry_by_what_it_believes():
     config = DriftConfig(**STEADY)
     group = swarm([[0, 0, np.pi / 2]] * 2)._replace(
-        run=jnp.array([[0.1, -0.2], [0.0, 0.0]]), move=jnp.array([[0.05, 0.1], [-0.5, 0.0]])
+        session=jnp.array([[0.1, -0.2], [0.0, 0.0]]), move=jnp.array([[0.05, 0.1], [-0.5, 0.0]])
     )
     still = jnp.bool_(False)
     driven = moved(config, group, odometry(2, 0, 0), still, jax.random.key(0))
@@ -266,7 +268,7 @@ def test_a_particle_scales_odometry_by_what_it_believes():
 def test_scale_errors_last_as_long_as_they_should():
     """Size: 12 variances and correlations of 40 000 particles within 4.5 standard errors: 1e-4."""
     count = 40_000
-    config = DriftConfig(run=0.05, move=0.03, step=0.0, heading=0.0)
+    config = DriftConfig(session=0.05, move=0.03, step=0.0, heading=0.0)
     group = particles.start(config, jax.random.key(0), count, np.dtype(float))
     assert not np.any(group.pose)
     scales, groups = [], []
@@ -276,7 +278,7 @@ def test_scale_errors_last_as_long_as_they_should():
         scales.append(np.asarray(group.pose - before)[:, 0] - 1)
         groups.append(group)
     first, second, third = groups
-    assert np.array_equal(first.run, third.run)
+    assert np.array_equal(first.session, third.session)
     assert np.array_equal(first.move, second.move)
     assert np.all(first.move != third.move)
     assert scales[1] == pytest.approx(scales[0], abs=1e-12)
@@ -284,7 +286,7 @@ def test_scale_errors_last_as_long_as_they_should():
     covariance = 0.05**2 * np.ones((2, 2)) + 0.03**2 * np.eye(2)
     sizes = np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)) + covariance**2)
     assert (np.abs(np.cov(scales[0], scales[2]) - covariance) <= error * sizes).all()
-    for scale, sd in ((first.run, 0.05), (first.move, 0.03)):
+    for scale, sd in ((first.session, 0.05), (first.move, 0.03)):
         assert np.corrcoef(scale.T)[0, 1] == pytest.approx(0, abs=error)
         assert np.std(scale, axis=0) == pytest.approx(sd, rel=error)
 
@@ -292,7 +294,7 @@ def test_scale_errors_last_as_long_as_they_should():
 def test_noise_of_each_step_has_the_scale_told():
     """Size: 8 means and variances of 40 000 particles within 4.5 standard errors: 1e-4."""
     count = 40_000
-    config = DriftConfig(run=0.0, move=0.0, step=0.02, heading=5e-4)
+    config = DriftConfig(session=0.0, move=0.0, step=0.02, heading=5e-4)
     error = 4.5 / np.sqrt(count)
 
     def after(dx, dtheta):
@@ -318,7 +320,7 @@ def test_turning_on_the_spot_for_ever_keeps_the_heading_in_float32():
     config = DriftConfig(**STEADY)
 
     def step(k, group):
-        return particles.moved(config, group, odometry(0, 0, turn, np.float32), jnp.bool_(False), key)
+        return particles.move(config, group, odometry(0, 0, turn, np.float32), jnp.bool_(False), key)
 
     key = jax.random.key(0)
     group = jax.jit(lambda group: jax.lax.fori_loop(0, count, step, group))(
