@@ -48,8 +48,8 @@ PRESETS: dict[PresetName, Preset] = {
                 "particles": 300,
                 "cell": 0.02,
                 "body": 0.0,
-                "drift": {"run": 0.0, "move": 0.0, "step": 0.27, "heading": 2e-3},
-                "stamps": {"blob_sd": 0.015, "along": 0.05, "across": 0.015},
+                "drift": {"session": 0.0, "move": 0.0, "step": 0.27, "heading": 2e-3},
+                "footprint": {"blob_sd": 0.015, "along": 0.05, "across": 0.015},
             }
         },
     ),
