@@ -1,6 +1,6 @@
-"""Arenas with walls all around and objects in them (Fox et al. 2012, II-C and fig. 2), as data and as text.
+"""Walled arenas with objects (Fox et al. 2012, II-C and fig. 2), as data and as text.
 
-As text: one thing a line, lengths in m, angles in degrees, `#` before comments.
+As text: one item per line, lengths in m, angles in degrees, `#` before comments.
 
     outer 0 0  1.25 0  1.25 1.25  0 1.25    # corners of the walls, in order
     square 0.6 0.7 0.2 30                   # middle, side, angle
@@ -35,13 +35,13 @@ LINE_FORMS = {
 }
 REQUIRED_LINES = {"outer": "the walls", "start": "where the robot starts"}
 START_CLEARANCE = 0.17
-"""Radius of the robot that must fit at the start, m."""
+"""Radius of free space required at the start, m."""
 
 
 class Arena(NamedTuple):
     """Attributes:
-    name: for reports. outer: [N, 2] corners of the walls, m. objects: of [M, 2], their corners.
-    start: [3] where the robot starts (x m, y m, heading rad).
+    name: for reports. outer: [N, 2] corners of the outer wall, m. objects: corners [M, 2] of each, m.
+    start: [3] start pose of the robot (x m, y m, heading rad).
     """
 
     name: str
@@ -51,17 +51,17 @@ class Arena(NamedTuple):
 
 
 def wall_segments(arena: Arena) -> np.ndarray:
-    """[S, 4] x1, y1, x2, y2, m: every wall that can be touched."""
+    """All wall segments [S, 4], x1, y1, x2, y2, m, those of objects included."""
     return np.vstack([polygon_edges(arena.outer), *(polygon_edges(polygon) for polygon in arena.objects)])
 
 
 def is_enclosed(arena: Arena, points: np.ndarray) -> np.ndarray:
-    """[...] bool, which points [..., 2] are within the outer walls, objects or not."""
+    """[...] bool, whether points [..., 2] are inside the outer wall, in objects or not."""
     return polygon_contains(arena.outer, points)
 
 
 def in_free_space(arena: Arena, points: np.ndarray) -> np.ndarray:
-    """[...] bool, which points [..., 2] are in free space."""
+    """[...] bool, whether points [..., 2] are in free space."""
     free = is_enclosed(arena, points)
     for polygon in arena.objects:
         free &= ~polygon_contains(polygon, points)
@@ -69,27 +69,27 @@ def in_free_space(arena: Arena, points: np.ndarray) -> np.ndarray:
 
 
 def is_occupied(arena: Arena, centres: np.ndarray) -> np.ndarray:
-    """[...] bool, which cells with those centres [..., 2] are not free: in an object or beyond the walls."""
+    """[...] bool, whether cells with these centres [..., 2] are in an object or outside the outer wall."""
     return ~in_free_space(arena, centres)
 
 
 def has_clearance(arena: Arena, places: np.ndarray, radius: float) -> np.ndarray:
-    """[...] bool, whether a disc of that radius (m) at places [..., 2] is all in free space."""
+    """[...] bool, whether a disc of this radius (m) at places [..., 2] is entirely in free space."""
     return in_free_space(arena, places) & (
         segment_distance(wall_segments(arena), places).min(axis=-1) >= radius
     )
 
 
 def read_arena(path: File) -> Arena:
-    """An arena from a text file.
+    """Read an arena file.
 
     Raises:
-        InputError: what cannot be an arena; says where and why.
+        InputError: the file is not a valid arena; names line and column.
     """
     try:
         lines = read_bytes(path).decode("utf-8").splitlines()
     except UnicodeDecodeError as error:
-        raise InputError(str(path), f"is no text ({error})", "an arena") from None
+        raise InputError(str(path), f"is not text ({error})", "an arena file in UTF-8") from None
     read = [line for number, content in enumerate(lines, 1) if (line := _parsed(path, number, content))]
     single: dict[str, _Line] = {}
     for line in read:
@@ -98,7 +98,7 @@ def read_arena(path: File) -> Arena:
         single[line.word] = line
     for word, meaning in REQUIRED_LINES.items():
         if word not in single:
-            raise InputError(str(path), f"no line `{word}`", f"`{LINE_FORMS[word]}`, {meaning}")
+            raise InputError(str(path), f"has no line `{word}`", f"`{LINE_FORMS[word]}`, {meaning}")
     outer = _polygon(single["outer"])
     objects: list[np.ndarray] = []
     for line in read:
@@ -111,7 +111,7 @@ def read_arena(path: File) -> Arena:
     if not has_clearance(made, made.start[:2], START_CLEARANCE):
         raise InputError(
             single["start"].places[1],
-            f"a start at {x:g} {y:g} that is not free",
+            f"a start at {x:g} {y:g} too close to a wall or object",
             f"{START_CLEARANCE:g} m of free space around it",
             "move it away from walls and objects",
         )
@@ -119,7 +119,7 @@ def read_arena(path: File) -> Arena:
 
 
 def arena_text(arena: Arena) -> str:
-    """The arena as such a file; the inverse of `read_arena`."""
+    """The arena in the file format; the inverse of `read_arena`."""
 
     def line(word: str, values: np.ndarray) -> str:
         return " ".join([word, *(repr(float(value)) for value in values)])
@@ -132,7 +132,7 @@ def arena_text(arena: Arena) -> str:
 
 
 class _Line(NamedTuple):
-    """A line: its word, its numbers, and where each of them stands."""
+    """A line: its keyword, its numbers, and the position of each word."""
 
     word: str
     values: np.ndarray
@@ -140,7 +140,7 @@ class _Line(NamedTuple):
 
 
 def _parsed(path: File, number: int, content: str) -> _Line | None:
-    """A line, or None where there is nothing on it."""
+    """A parsed line, or None if it is empty."""
     words = [(found[0], found.start() + 1) for found in re.finditer(r"\S+", content.split("#")[0])]
     if not words:
         return None
@@ -160,16 +160,16 @@ def _parsed(path: File, number: int, content: str) -> _Line | None:
     count = len(values)
     wanted = {"square": 4, "start": 3}.get(word)
     if wanted is None and (count % 2 or count < 6):
-        raise InputError(places[0], f"{count} numbers", "three corners or more, two numbers each")
+        raise InputError(places[0], f"{count} numbers", "at least three corners with two numbers each")
     if wanted is not None and count != wanted:
         raise InputError(places[0], f"{count} numbers", f"`{LINE_FORMS[word]}`")
     if word == "square" and values[2] <= 0:
-        raise InputError(places[3], f"a side of {values[2]:g} m", "one above 0")
+        raise InputError(places[3], f"a side of {values[2]:g} m", "a side above 0 m")
     return _Line(word, np.array(values), places)
 
 
 def _polygon(line: _Line) -> np.ndarray:
-    """Its corners, checked to bound something."""
+    """The corners of a line's polygon, checked to enclose an area."""
     if line.word == "square":
         return square(line.values[:2], line.values[2], np.radians(line.values[3]))
     corners = line.values.reshape(-1, 2)
@@ -180,8 +180,8 @@ def _polygon(line: _Line) -> np.ndarray:
         raise InputError(
             line.places[1 + 2 * again],
             "the same corner twice in a row",
-            "corners apart from one another",
-            "leave it out: the last corner is joined to the first by itself",
+            "different successive corners",
+            "leave it out: the polygon is closed automatically",
         )
     crosses = np.argwhere(segments_cross(sides, sides))
     if len(crosses):
@@ -189,15 +189,15 @@ def _polygon(line: _Line) -> np.ndarray:
         raise InputError(
             line.places[1 + 2 * one],
             f"walls that cross: side {one + 1} and side {other + 1}",
-            "corners in order around what they bound",
+            "corners in order around the area",
         )
     if abs(polygon_area(corners)) < 1e-9:
-        raise InputError(line.places[0], "corners in one line", "walls that bound something")
+        raise InputError(line.places[0], "corners on one line", "corners that enclose an area")
     return corners
 
 
 def _placed(line: _Line, polygon: np.ndarray, outer: np.ndarray, others: list[np.ndarray]) -> None:
-    """Refuses an object that is not in the arena, or not by itself."""
+    """Raise an error for an object outside the arena or overlapping another one."""
     middle = (polygon + np.roll(polygon, -1, axis=0)) / 2
     probe = np.vstack([polygon, middle]) * (1 - 1e-6) + polygon.mean(axis=0) * 1e-6  # may touch the wall
     if (
@@ -214,7 +214,7 @@ def _placed(line: _Line, polygon: np.ndarray, outer: np.ndarray, others: list[np
         ):
             raise InputError(
                 line.places[0],
-                f"an object over object {number}",
-                "objects apart from one another",
+                f"an object that overlaps object {number}",
+                "objects that do not overlap",
                 "move one of them",
             )

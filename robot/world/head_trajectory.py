@@ -1,4 +1,4 @@
-"""How the head moves along a way: the pose at any time, varied from visit to visit as a real robot's is."""
+"""Poses of the head over time along a route, with random variation between visits."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ from tactile.base.se2 import wrap
 
 
 class JitterConfig(Settings):
-    """How one visit differs from the next, standard deviations. Drawn anew in every cell."""
+    """Random variation between visits, as standard deviations; drawn anew in every cell."""
 
     position: NonNegativeFloat = 0.002
-    """Off the middle of the way, m, each axis."""
+    """Position off the cell centre along each axis, m."""
     yaw_deg: NonNegativeFloat = 0.5
-    """Off the direction of travel, degrees."""
+    """Heading off the direction of travel, degrees."""
     speed: NonNegativeFloat = 0.0
-    """Share of the speed."""
+    """Speed, as a fraction of it."""
 
 
 class MotionConfig(Settings):
-    """The arm's motion."""
+    """Motion of the arm."""
 
     speed: PositiveFloat = 0.03
-    """m/s"""
+    """Speed along the route, m/s."""
     turn_rate: PositiveFloat = 0.4
-    """On the spot, rad/s."""
+    """Turn rate on the spot, rad/s."""
     backwards: bool = False
-    """Whether the head looks away from where it goes (reverse tracking)."""
+    """Whether the head faces backwards (reverse tracking)."""
     jitter: JitterConfig = JitterConfig()
-    """From visit to visit."""
+    """Variation between visits."""
 
 
 class HeadPath(NamedTuple):
-    """Poses in order of time; between two of them the motion is even.
+    """Poses in order of time, with uniform motion in between.
 
     Attributes:
         time: [K] s. pose: [K, 3] m, m, rad; headings are not wrapped.
@@ -53,7 +53,7 @@ class HeadPath(NamedTuple):
 
 
 def plan_path(config: MotionConfig, way: Sequence[Cell], random: np.random.Generator) -> HeadPath:
-    """The path along cells: straight on from middle to middle, turning on the spot."""
+    """The path along cells: straight from centre to centre, with turns on the spot."""
     jitter = config.jitter
     count = len(way)
     offset = jitter.position * random.standard_normal((count, 2))
@@ -77,15 +77,15 @@ def plan_path(config: MotionConfig, way: Sequence[Cell], random: np.random.Gener
 
 
 def poses_at(path: HeadPath, time: np.ndarray) -> np.ndarray:
-    """[..., 3] the poses at times [...] s; before and after the path, its ends."""
+    """Poses [..., 3] at times [...] s; clamped to the ends of the path."""
     return np.stack([np.interp(time, path.time, path.pose[:, k]) for k in range(3)], axis=-1)
 
 
 def add_kidnaps(path: HeadPath, at_times: Sequence[float], ahead: float) -> tuple[HeadPath, np.ndarray]:
-    """The path with kidnaps: at each of these times the head is set down where it would be `ahead` s later.
+    """The path with kidnaps: at each of these times the head jumps to its pose `ahead` s later.
 
     Returns:
-        the path, and the times [J] s at which it was carried.
+        the path, and the times [J] of the kidnaps, s.
     """
     times, poses, start, done = [], [], 0.0, 0.0
     jumps = []

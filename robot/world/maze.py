@@ -1,7 +1,7 @@
-"""Micromouse mazes: cells of 18 cm, walls of plastic between posts; from a seed or from a text file.
+"""Micromouse mazes with cells of 18 cm, random or from a text file.
 
-Cell (column, row) counts from the south-west. A maze is what is between its cells, so it stays small however
-it is used; `walls` makes boxes of it. Text files are the usual ones: posts `o` or `+`, walls `---` and `|`.
+A cell is (column, row), counted from the south-west. A maze stores the walls between its cells; `walls`
+converts them to boxes. Text files have posts `o` or `+`, walls `---` and `|`.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from robot.world.walls import Walls
 from tactile.base.errors import InputError
 
 CELL_SIDE = 0.18
-"""Side of a cell, m (IEEE micromouse rules)."""
+"""Side length of a cell, m (IEEE micromouse rules)."""
 WALL_THICKNESS = 0.012
 """Thickness of walls and posts, m (as above)."""
 WALL_HEIGHT = 0.05
-"""Their height, m (as above)."""
+"""Height of walls and posts, m (as above)."""
 POSE_CELL_SIZE = 0.05
 """Side length of a pose cell that suits these mazes, m."""
 
@@ -28,8 +28,8 @@ Cell = tuple[int, int]
 
 class Maze(NamedTuple):
     """Attributes:
-    across: [rows + 1, columns] bool, the wall south of each cell (and north of the last row's).
-    along: [rows, columns + 1] bool, the wall west of each cell (and east of the last column's).
+    across: [rows + 1, columns] bool, walls south of each cell, and north of the last row.
+    along: [rows, columns + 1] bool, walls west of each cell, and east of the last column.
     """
 
     across: np.ndarray
@@ -45,12 +45,12 @@ class Maze(NamedTuple):
 
 
 def closed_maze(columns: int, rows: int) -> Maze:
-    """A maze in which every cell is walled in."""
+    """A maze with all walls."""
     return Maze(np.ones((rows + 1, columns), bool), np.ones((rows, columns + 1), bool))
 
 
 def random_maze(columns: int, rows: int, loop: list[Cell], share: float, random: np.random.Generator) -> Maze:
-    """A maze with its outer walls, the given loop open, and that share of all other walls."""
+    """A maze with all outer walls, an open loop, and each other wall with this probability."""
     maze = Maze(random.random((rows + 1, columns)) < share, random.random((rows, columns + 1)) < share)
     maze.across[[0, -1]] = True
     maze.along[:, [0, -1]] = True
@@ -60,13 +60,13 @@ def random_maze(columns: int, rows: int, loop: list[Cell], share: float, random:
 
 
 def random_loop(columns: int, rows: int, length: int, random: np.random.Generator) -> list[Cell]:
-    """A closed path of that many different cells, counter-clockwise.
+    """A closed counter-clockwise path of this many different cells.
 
-    The outline of a blob on the lattice of the cells' centres, grown square by square where that keeps it a
-    single outline, until it has that length.
+    It is the outline of a region on the lattice of the cell centres, which grows square by square, with a
+    single outline, until the outline has this length.
 
     Raises:
-        InputError: no such loop fits.
+        InputError: no such loop was found.
     """
     most = columns * rows - (columns * rows) % 2
     if length % 2 or not 4 <= length <= most or min(columns, rows) < 2:
@@ -76,7 +76,7 @@ def random_loop(columns: int, rows: int, length: int, random: np.random.Generato
             f"an even number from 4 to {most} in {columns} x {rows}",
         )
     for _ in range(1000):
-        blob = np.zeros((columns + 1, rows + 1), bool)  # squares between centres, with a margin
+        blob = np.zeros((columns + 1, rows + 1), bool)  # squares between cell centres, with a margin
         blob[1 + int(random.integers(columns - 1)), 1 + int(random.integers(rows - 1))] = True
         for _ in range(8 * columns * rows):
             if _outline(blob) == length:
@@ -95,7 +95,7 @@ def _outline(blob: np.ndarray) -> int:
 
 
 def _simple(blob: np.ndarray, i: int, j: int) -> bool:
-    """Whether a square joined to the blob leaves one outline: its neighbours in it hang together."""
+    """Whether adding a square keeps a single outline: its neighbours in the region are connected."""
     padded = np.pad(blob, 1)
     ring = [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)]
     around = [bool(padded[i + 1 + di, j + 1 + dj]) for di, dj in ring]
@@ -109,8 +109,8 @@ def _simple(blob: np.ndarray, i: int, j: int) -> bool:
 
 
 def _walked(blob: np.ndarray, random: np.random.Generator) -> list[Cell]:
-    """The outline as cells in order, counter-clockwise, from a random one of them."""
-    # Square (i, j) lies between the centres of cells i - 1 and i, j - 1 and j. Blob to the left of the way.
+    """The cells of the outline in counter-clockwise order from a random one."""
+    # Square (i, j) lies between the centres of cells i - 1 and i, j - 1 and j; the region is on the left.
     ways: dict[Cell, Cell] = {}
     for i, j in np.argwhere(blob).tolist():
         padded = np.pad(blob, 1)
@@ -135,25 +135,25 @@ def _remove(maze: Maze, a: Cell, b: Cell) -> None:
 
 
 def between_cells(maze: Maze, a: Cell, b: Cell) -> tuple[np.ndarray, tuple[int, int]]:
-    """The array and the place in it of the wall between neighbouring cells.
+    """The array and index of the wall between two neighbouring cells.
 
     Raises:
-        ValueError: they are no neighbours.
+        ValueError: the cells are not neighbours.
     """
     (x, y), (u, v) = a, b
     if abs(x - u) + abs(y - v) != 1:
-        raise ValueError(f"cells {a} and {b} are no neighbours")
+        raise ValueError(f"cells {a} and {b} are not neighbours")
     return (maze.along, (y, max(x, u))) if y == v else (maze.across, (max(y, v), x))
 
 
 def is_open(maze: Maze, a: Cell, b: Cell) -> bool:
-    """Whether one can go from a cell to its neighbour."""
+    """Whether no wall separates two neighbouring cells."""
     wall, place = between_cells(maze, a, b)
     return not wall[place]
 
 
 def neighbours(maze: Maze, cell: Cell) -> list[Cell]:
-    """The cells that one can go to from a cell: east, north, west, south."""
+    """Reachable neighbours of a cell, in the order east, north, west, south."""
     x, y = cell
     beside = [(x + 1, y), (x, y + 1), (x - 1, y), (x, y - 1)]
     return [b for b in beside if _inside(maze, b) and is_open(maze, cell, b)]
@@ -164,12 +164,13 @@ def _inside(maze: Maze, cell: Cell) -> bool:
 
 
 def cell_centre(cell: Cell) -> np.ndarray:
-    """[2] m, the middle of a cell; the south-west corner post of the maze stands at the origin."""
+    """Centre [2] of a cell, m; the south-west corner post of the maze is at the origin."""
     return (np.array(cell, float) + 0.5) * CELL_SIDE
 
 
 def wall_boxes(maze: Maze, random: np.random.Generator, heights: tuple[float, ...] = (WALL_HEIGHT,)) -> Walls:
-    """The maze as boxes: a post at every corner, walls between them, each of one of the heights (m)."""
+    """The maze as boxes: a post at every corner with the largest height (m), and walls with random
+    heights."""
     half = WALL_THICKNESS / 2
     boxes = []
     for j, i in np.argwhere(maze.across).tolist():
@@ -194,7 +195,7 @@ def wall_boxes(maze: Maze, random: np.random.Generator, heights: tuple[float, ..
 
 
 def describe_box(walls: Walls, number: int) -> str:
-    """A box of a maze in words."""
+    """A text that names a box of a maze."""
     x, y = (walls.box[number, :2] + walls.box[number, 2:]) / 2 / CELL_SIDE
     at_post = abs(x - round(x)) < 0.25, abs(y - round(y)) < 0.25
     if all(at_post):
@@ -204,10 +205,10 @@ def describe_box(walls: Walls, number: int) -> str:
 
 
 def read_maze(path: Path) -> Maze:
-    """A maze from a text file.
+    """Read a maze file.
 
     Raises:
-        InputError: no such file, a character where there should be none, or an outer wall that is missing.
+        InputError: the file is unreadable, has an unexpected character, or lacks an outer wall.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -251,7 +252,7 @@ def read_maze(path: Path) -> Maze:
 
 
 def _sealed(path: Path, maze: Maze, skipped: int) -> None:
-    """Refuses a maze that leaks."""
+    """Raise an error for a gap in the outer wall."""
     last = skipped + 2 * maze.rows + 1
     for side, present, place in (
         ("south", maze.across[0], lambda k: (last, 4 * k + 2)),
@@ -263,14 +264,14 @@ def _sealed(path: Path, maze: Maze, skipped: int) -> None:
             line, column = place(int(np.argmin(present)))
             raise InputError(
                 f"{path}:{line}:{column}",
-                f"a gap in the {side} wall: the maze leaks",
-                "a wall all around",
+                f"a gap in the {side} wall",
+                "a closed outer wall",
                 "close it",
             )
 
 
 def maze_text(maze: Maze) -> str:
-    """The maze as such a file; the inverse of `read_maze`."""
+    """The maze in the file format; the inverse of `read_maze`."""
     lines = []
     for row in range(maze.rows, -1, -1):
         lines.append("o" + "".join(("---" if wall else "   ") + "o" for wall in maze.across[row]))

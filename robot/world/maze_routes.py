@@ -1,7 +1,7 @@
-"""Ways through a maze: circuits spelled as a word, free exploration, given cells; each a list of cells.
+"""Routes through a maze as lists of cells: circuits around a loop, and free exploration.
 
-`CCCAAACACA` is seed 2's protocol: three circuits one way, three the other, two of each in turn. The head
-looks where it goes, and turns on the spot.
+`CCCAAACACA` is the protocol of Salman & Pearson 2016: three circuits clockwise, three anticlockwise, then
+four in alternating directions.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from tactile.base.errors import InputError
 
 
 def circuit_route(loop: Sequence[Cell], word: str) -> list[Cell]:
-    """A loop travelled once for each letter: C as clockwise seen from above, A anticlockwise.
+    """Circuits around a loop, one per letter: C clockwise seen from above, A anticlockwise.
 
     Args:
-        loop: its cells, anticlockwise, not repeating the first.
+        loop: its cells in anticlockwise order, without repeating the first.
 
     Raises:
-        InputError: another letter, or none.
+        InputError: the word is empty or has another letter.
     """
     if not word or set(word.upper()) - set("CA"):
         raise InputError(
@@ -35,10 +35,10 @@ def circuit_route(loop: Sequence[Cell], word: str) -> list[Cell]:
 
 
 def exploration_route(maze: Maze, start: Cell, cells: int, random: np.random.Generator) -> list[Cell]:
-    """So many cells of a way that chooses at random where it can, and turns back only in dead ends.
+    """A random route of this many cells, which turns back only in dead ends.
 
     Raises:
-        InputError: the start lies outside, or there is no way out of it.
+        InputError: the start is outside the maze or walled in.
     """
     way = [start]
     before: Cell | None = None
@@ -53,10 +53,10 @@ def exploration_route(maze: Maze, start: Cell, cells: int, random: np.random.Gen
 
 
 def make_anticlockwise(loop: Sequence[Cell]) -> list[Cell]:
-    """The loop that way round, from the same cell.
+    """The loop in anticlockwise order from the same cell.
 
     Raises:
-        InputError: it passes a cell twice, or holds fewer than four.
+        InputError: it has a cell twice, or fewer than four cells.
     """
     if len(loop) < 4 or len(set(loop)) < len(loop):
         twice = next((cell for k, cell in enumerate(loop) if cell in loop[:k]), None)
@@ -68,13 +68,13 @@ def make_anticlockwise(loop: Sequence[Cell]) -> list[Cell]:
 
 
 def check_route(maze: Maze, way: Sequence[Cell], where: str = "simulation.path.cells") -> None:
-    """Refuses a way that leaves the maze or goes through a wall.
+    """Check that a route stays in the maze and passes no wall.
 
     Args:
-        where: what messages call the way.
+        where: name of the route in errors.
 
     Raises:
-        InputError: naming the leg and the wall.
+        InputError: the route is not possible; names the step and the wall.
     """
     for number, cell in enumerate(way):
         if not (0 <= cell[0] < maze.columns and 0 <= cell[1] < maze.rows):
@@ -90,7 +90,7 @@ def check_route(maze: Maze, way: Sequence[Cell], where: str = "simulation.path.c
         if not is_open(maze, a, b):
             raise InputError(
                 leg,
-                f"a way through the wall between cells {tuple(a)} and {tuple(b)}",
+                f"a step through the wall between cells {tuple(a)} and {tuple(b)}",
                 "a way around the walls",
                 "take the wall out of the maze or lead the path around it",
             )

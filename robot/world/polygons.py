@@ -1,6 +1,6 @@
-"""Polygons in the plane: what is inside, how far things are apart, what crosses what.
+"""Polygons in the plane: containment, distances and crossings.
 
-A polygon is [N, 2] corners in order, m, closed by itself; a segment is a row x1, y1, x2, y2.
+A polygon is [N, 2] corners in order, m, implicitly closed; a segment is a row x1, y1, x2, y2.
 """
 
 from __future__ import annotations
@@ -9,29 +9,29 @@ import numpy as np
 
 
 def polygon_edges(polygon: np.ndarray) -> np.ndarray:
-    """[N, 4] the sides of a polygon."""
+    """The sides [N, 4] of a polygon."""
     return np.hstack([polygon, np.roll(polygon, -1, axis=0)])
 
 
 def polygon_area(polygon: np.ndarray) -> float:
-    """m2; positive where the corners go counter-clockwise."""
+    """Area of a polygon, m^2; positive if its corners are in counter-clockwise order."""
     x, y = polygon.T
     return float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) / 2)
 
 
 def polygon_contains(polygon: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """[...] bool, which points [..., 2] are inside, by counting the sides to their right."""
+    """[...] bool, whether points [..., 2] are inside, by the number of sides to their right."""
     points = np.asarray(points, np.float64)[..., None, :]
     x1, y1, x2, y2 = polygon_edges(polygon).T
     x, y = points[..., 0], points[..., 1]
     spans = (y1 > y) != (y2 > y)
-    run = np.where(y2 == y1, 1.0, y2 - y1)  # a level side spans nothing
+    run = np.where(y2 == y1, 1.0, y2 - y1)  # a horizontal side spans nothing
     right = x < x1 + (y - y1) * (x2 - x1) / run
     return np.logical_xor.reduce(spans & right, axis=-1)
 
 
 def segment_distance(segments: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """[..., S] m, from points [..., 2] to segments [S, 4]."""
+    """Distances [..., S] from points [..., 2] to segments [S, 4], m."""
     points = np.asarray(points, np.float64)[..., None, :]
     start, along = segments[:, :2], segments[:, 2:] - segments[:, :2]
     away = points - start
@@ -41,7 +41,7 @@ def segment_distance(segments: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def segments_cross(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """[S, R] bool, which segments [S, 4] and [R, 4] cross; to touch is not to cross."""
+    """[S, R] bool, whether segments [S, 4] and [R, 4] cross; touching does not count."""
 
     def side(segments: np.ndarray, points: np.ndarray) -> np.ndarray:
         start, along = segments[:, None, :2], segments[:, None, 2:] - segments[:, None, :2]
@@ -56,7 +56,7 @@ def segments_cross(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def polygon_gap(one: np.ndarray, other: np.ndarray) -> float:
-    """m between the outlines of two polygons; 0 where they cross or touch."""
+    """Distance between the outlines of two polygons, m; 0 if they cross or touch."""
     sides, others = polygon_edges(one), polygon_edges(other)
     if segments_cross(sides, others).any():
         return 0.0
@@ -64,7 +64,7 @@ def polygon_gap(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def square(centre: np.ndarray, side: float, angle: float) -> np.ndarray:
-    """[4, 2] a square, its sides turned by the angle (rad)."""
+    """Corners [4, 2] of a square that is rotated by an angle (rad)."""
     corner = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]) * side / 2
     c, s = np.cos(angle), np.sin(angle)
     return np.asarray(centre, np.float64) + corner @ np.array([[c, s], [-s, c]])

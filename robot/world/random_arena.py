@@ -1,7 +1,7 @@
-"""Arenas from a seed: square, with square objects, of which the robot can get around every one.
+"""Random square arenas with square objects, all of whose free space the robot can reach.
 
-An object touches the wall, or stands so far from it and from other objects that the robot passes between
-them. So the robot can reach every place that it fits in.
+An object either touches the wall or leaves a passage to the wall and to other objects wide enough for the
+robot.
 """
 
 from __future__ import annotations
@@ -20,34 +20,35 @@ from tactile.base.random_streams import stream
 
 Share = Annotated[float, Field(ge=0, le=1)]
 MAX_OBJECT_TRIES = 200
-"""Tried for the objects of an arena."""
+"""Largest number of positions drawn for the objects of an arena."""
 MAX_RESTARTS = 50
-"""Of starting over when they found none."""
+"""Largest number of restarts when the objects did not fit."""
 MAX_START_TRIES = 400
-"""Places looked at for a start."""
+"""Number of positions drawn for the start."""
 
 
 class ArenaConfig(Settings):
-    """A square arena with square objects, its south-west corner at the origin; or any, from a text file."""
+    """A random square arena with square objects, its south-west corner at the origin, or an arena file."""
 
     side: PositiveFloat = 1.25
-    """Of the arena, m; the paper's second one has 2.5."""
+    """Side length of the arena, m; the second one of the paper has 2.5."""
     objects: NonNegativeInt | None = None
-    """How many; as many as suit the side where it is left out: 4 on 1.25 m, 7 on 2.5 m."""
+    """Number of objects; null: proportional to the side, 4 on 1.25 m and 7 on 2.5 m."""
     smallest: PositiveFloat = 0.12
-    """Side of an object, m."""
+    """Smallest side of an object, m."""
     largest: PositiveFloat = 0.25
-    """The same."""
+    """Largest side of an object, m."""
     rotated: bool = False
-    """Whether objects are turned by any angle."""
+    """Whether objects are rotated by random angles."""
     against: Share = 0.75
-    """Of objects that touch the wall."""
+    """Fraction of objects that touch the wall."""
     passage: PositiveFloat = 0.47
-    """Narrowest way between what does not touch, m; the robot is 0.34 m wide, its whiskers sweep 0.54 m."""
+    """Narrowest passage between objects and walls that do not touch, m; the robot is 0.34 m wide, with its
+    whiskers 0.54 m."""
     file: File | None = None
-    """A text file to take the arena from instead (see `read_arena`)."""
+    """An arena file to use instead (see `read_arena`)."""
     seed: NonNegativeInt | None = None
-    """Of the arena; the session's own where there is none."""
+    """Seed of the arena; null: that of the session."""
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -63,10 +64,10 @@ class ArenaConfig(Settings):
 
 
 def make_arena(config: ArenaConfig, seed: int) -> Arena:
-    """The arena of a configuration; `seed` counts where it has none of its own.
+    """The arena of a configuration; `seed` is used if it has none of its own.
 
     Raises:
-        InputError: objects that do not fit, or a file that cannot be used.
+        InputError: the objects do not fit, or the file is not a valid arena.
     """
     if config.file is not None:
         return read_arena(config.file)
@@ -84,13 +85,13 @@ def make_arena(config: ArenaConfig, seed: int) -> Arena:
     raise InputError(
         "create_simulation.arena.objects",
         f"{config.count} objects of {config.smallest:g} to {config.largest:g} m",
-        f"what fits {config.side:g} m with ways of {config.passage:g} m",
+        f"objects that fit in {config.side:g} m with passages of {config.passage:g} m",
         "fewer or smaller objects, or a larger side",
     )
 
 
 def _placed(config: ArenaConfig, random: np.random.Generator) -> list[np.ndarray] | None:
-    """[4, 2] each, put down one by one; None where one found no place."""
+    """Corners [4, 2] of each object, placed one by one; None if they do not fit."""
     objects: list[np.ndarray] = []
     for _ in range(MAX_OBJECT_TRIES):
         if len(objects) == config.count:
@@ -102,7 +103,7 @@ def _placed(config: ArenaConfig, random: np.random.Generator) -> list[np.ndarray
 
 
 def _drawn(config: ArenaConfig, random: np.random.Generator) -> np.ndarray:
-    """[4, 2] A square somewhere in the arena; some shares of them at a wall, or in a corner."""
+    """Corners [4, 2] of a random square in the arena, some of them at a wall or in a corner."""
     angle = random.uniform(0, np.pi / 2) if config.rotated else 0.0
     corners = square(np.zeros(2), random.uniform(config.smallest, config.largest), angle)
     low, high = -corners.min(axis=0), config.side - corners.max(axis=0)
@@ -117,7 +118,7 @@ def _drawn(config: ArenaConfig, random: np.random.Generator) -> np.ndarray:
 
 
 def _allowed(polygon: np.ndarray, config: ArenaConfig, others: list[np.ndarray]) -> bool:
-    """Whether it leaves every way wide enough."""
+    """Whether an object leaves all passages wide enough."""
     room = np.concatenate([polygon.min(axis=0), config.side - polygon.max(axis=0)])
     if ((room > 1e-9) & (room < config.passage)).any():
         return False
@@ -128,7 +129,7 @@ def _allowed(polygon: np.ndarray, config: ArenaConfig, others: list[np.ndarray])
 
 
 def _start(arena: Arena, room: float, random: np.random.Generator) -> np.ndarray | None:
-    """[3] A pose with room around it, m; None where there is none."""
+    """A random pose [3] with this free radius (m), or None if none was found."""
     low, high = arena.outer.min(axis=0), arena.outer.max(axis=0)
     places = random.uniform(low, high, (MAX_START_TRIES, 2))
     heading = random.uniform(-np.pi, np.pi)

@@ -1,4 +1,4 @@
-"""Where a simulated robot goes: a maze, a way through it, and how the head moves along."""
+"""The scene of a head session from its settings: maze, route, head trajectory, kidnaps and walls."""
 
 from __future__ import annotations
 
@@ -31,46 +31,46 @@ from tactile.base.random_streams import stream
 from tactile.whiskers.head_geometry import Head, tip_points
 
 PAPER_CIRCUITS = "CCCAAACACA"
-"""Seed 2's protocol (Salman & Pearson 2016, III-C)."""
+"""Circuits of the protocol of Salman & Pearson 2016, III-C."""
 POSE_STEP = 0.005
-"""Distance (m) between the poses at which whiskers at rest must be free; turns count 10 cm for each rad."""
+"""Distance between the poses at which whiskers at rest must be free, m; a turn of 1 rad counts as 10 cm."""
 
 
 class MazeConfig(Settings):
-    """A micromouse maze, from a seed or from a text file."""
+    """A micromouse maze, random or from a text file."""
 
     columns: Annotated[int, Field(ge=2, le=64)] = 7
-    """Cells from west to east; with the rows below it fits the paper's 1.35 m x 1 m."""
+    """Cells from west to east; 7 x 5 cells fit the 1.35 m x 1 m of the paper."""
     rows: Annotated[int, Field(ge=2, le=64)] = 5
     """Cells from south to north."""
     loop: PositiveInt = 20
-    """Cells of the loop that is open for circuits."""
+    """Length of the open loop for circuits, cells."""
     share: Annotated[float, Field(ge=0, le=1)] = 0.6
-    """Of walls that stand between cells, but for the loop."""
+    """Probability of each wall between cells outside the loop."""
     file: File | None = None
-    """A text file to take the maze from instead: posts `o` or `+`, walls `---` and `|`."""
+    """A maze file to use instead: posts `o` or `+`, walls `---` and `|`."""
     heights: Annotated[tuple[PositiveFloat, ...], Field(min_length=1)] = (WALL_HEIGHT,)
-    """Of walls, m; each wall has one of them by chance, posts have the largest."""
+    """Wall heights, m, chosen at random for each wall; posts have the largest."""
     seed: NonNegativeInt | None = None
-    """Of the maze; the simulation's own where there is none."""
+    """Seed of the maze; null: that of the simulation."""
 
 
 class PathConfig(Settings):
-    """Where the head goes: circuits, or free exploration, or given cells."""
+    """Route of the head: circuits, free exploration or given cells."""
 
     circuits: str = PAPER_CIRCUITS
-    """A letter for each time around the loop: C clockwise seen from above, A anticlockwise; '' for none."""
+    """One letter per circuit: C clockwise seen from above, A anticlockwise; '' for none."""
     explore: NonNegativeFloat = 0.0
-    """Seconds of free exploration instead, from the first cell of the loop."""
+    """Duration of a free exploration instead, from the first cell of the loop, s."""
     cells: tuple[Cell, ...] = ()
-    """Cells (column, row), counted from the south-west, to go through instead, in order."""
+    """Cells (column, row), counted from the south-west, to visit instead, in order."""
     loop: tuple[Cell, ...] = ()
-    """Cells of the loop that circuits go around, for a maze from a file; else one is made."""
+    """Cells of the loop for circuits in a maze from a file; a random maze has its own loop."""
 
     @model_validator(mode="after")
     def _one(self) -> PathConfig:
         if "circuits" not in self.model_fields_set and (self.explore or self.cells):
-            self.__dict__["circuits"] = ""  # they are what is done when nothing else is asked for
+            self.__dict__["circuits"] = ""  # the default applies only without explore and cells
         asked = [name for name in ("circuits", "explore", "cells") if getattr(self, name)]
         if len(asked) != 1:
             there = " and ".join(asked) or "none"
@@ -79,20 +79,20 @@ class PathConfig(Settings):
 
 
 class KidnapConfig(Settings):
-    """Times at which the head is carried along its path unknown to its odometry, over the last three quarters
-    of the session."""
+    """Kidnaps: jumps of the head along its path that its odometry does not measure, evenly spread over the
+    last three quarters of the session."""
 
     count: NonNegativeInt = 0
-    """How often."""
+    """Number of kidnaps."""
     ahead: PositiveFloat = 45.0
-    """How far, seconds of the path."""
+    """Length of a jump as duration of the path, s."""
 
 
 class Scene(NamedTuple):
     """Attributes:
-    maze, loop: the world; the loop is anticlockwise, empty where there is none.
-    path: the head's way. duration: how much of it is the session, s. jumps: [J] s, when it was carried.
-    surroundings: what whiskers may meet.
+    maze: the maze. loop: its cells in anticlockwise order, empty without a loop.
+    path: poses of the head. duration: of the session, s. jumps: [J] times of the kidnaps, s.
+    surroundings: walls for contact queries.
     """
 
     maze: Maze
@@ -111,11 +111,11 @@ def make_scene(
     head: Head,
     seed: int,
 ) -> Scene:
-    """The scene of a seed.
+    """The scene of a session.
 
     Raises:
-        InputError: a maze that leaks, a path through walls, a whisker at rest inside one, walls higher than
-            the head hangs, or kidnaps that the path is too short for.
+        InputError: a gap in the outer wall, a path through walls, a whisker at rest inside one, walls higher
+            than the head, or a path too short for the kidnaps.
     """
     maze, loop = _world(maze_config, path_config, seed)
     carriage = kidnaps.count * kidnaps.ahead
@@ -139,7 +139,7 @@ def make_scene(
 
 
 def other_surroundings(scene: Scene, config: MazeConfig, head: Head, seed: int) -> Surroundings:
-    """What whiskers meet along the same path in another maze of the same size."""
+    """Walls of another maze of the same size, checked along the same path."""
     columns, rows = scene.maze.columns, scene.maze.rows
     maze = random_maze(
         columns, rows, scene.loop, config.share, stream(_maze_seed(config, seed), "later.walls")
@@ -149,21 +149,21 @@ def other_surroundings(scene: Scene, config: MazeConfig, head: Head, seed: int) 
 
 
 def check_surroundings(boxes: Walls, head: Head, path: HeadPath) -> Surroundings:
-    """The walls, checked: along the path, no whisker at rest is inside one of them.
+    """Walls for contact queries, after checking that no whisker at rest is inside a wall along the path.
 
     Raises:
-        InputError: naming time, cell, whisker and wall; or walls that are higher than the head hangs.
+        InputError: names time, cell, whisker and wall; or the walls are higher than the head.
     """
     hangs, tallest = float(head.base[:, 2].min()), float(boxes.height.max())
     if tallest >= hangs:
         raise InputError(
             "simulation.maze.heights",
             f"a wall of {tallest:g} m",
-            f"less than {hangs:g} m, where the head hangs",
+            f"less than {hangs:g} m, the height of the head",
         )
     surroundings = Surroundings(boxes, head)
     if tip_points(head, np.zeros(len(head.length)))[:, 2].min() > tallest:
-        return surroundings  # at rest, whiskers are above everything
+        return surroundings  # at rest, whiskers are above all walls
     time = _finely(path)
     pose = poses_at(path, time)
     met = surroundings.contact(pose)
@@ -175,8 +175,8 @@ def check_surroundings(boxes: Walls, head: Head, path: HeadPath) -> Surroundings
             "simulation.path",
             f"at {time[row]:.1f} s, in cell {cell}, whisker {whisker} at rest is inside "
             f"{describe_box(boxes, int(met.wall[row, whisker]))}",
-            "whiskers that start free",
-            "lower the walls, or hang the head higher (touch.head.rings)",
+            "whiskers at rest without contact",
+            "lower the walls, or raise the head (touch.head.rings)",
         )
     return surroundings
 
@@ -204,7 +204,7 @@ def _world(config: MazeConfig, path: PathConfig, seed: int) -> tuple[Maze, list[
                 "simulation.path.loop",
                 "circuits without a loop",
                 "the cells of a loop in the maze",
-                "give them, or explore",
+                "set the loop, or explore instead of circuits",
             )
         return maze, loop
     loop = loop or random_loop(config.columns, config.rows, config.loop, stream(seed, "maze.loop"))
@@ -221,14 +221,14 @@ def _way(
         if len(way) < 2:
             raise InputError("simulation.path.cells", "one cell", "at least two")
     else:
-        cells = int(1.2 * explored * motion.speed / CELL_SIDE) + 20  # more than can be reached by then
+        cells = int(1.2 * explored * motion.speed / CELL_SIDE) + 20  # more than can be visited in that time
         way = exploration_route(maze, loop[0] if loop else (0, 0), cells, stream(seed, "path"))
     check_route(maze, way)
     return way
 
 
 def _finely(path: HeadPath) -> np.ndarray:
-    """Times (s) along a path between which it moves by `POSE_STEP` at most."""
+    """Times (s) along a path with a motion of at most `POSE_STEP` in between."""
     step = np.abs(np.diff(path.pose, axis=0))
     parts = np.maximum(np.ceil((np.hypot(step[:, 0], step[:, 1]) + 0.1 * step[:, 2]) / POSE_STEP), 1).astype(
         int

@@ -1,9 +1,8 @@
-"""Walls as boxes, and where a whisker of the UR-10 head meets them: contact in closed form.
+"""Walls as boxes, and the first contact of whiskers of the UR-10 head with them, in closed form.
 
-Each whisker swings in a vertical plane through the head's axis, from outside down and inwards. What it can
-meet are the tops of boxes (with its tip) and their far upper edges (with its shaft): of a straight stick
-that comes down over a box, the lowest point above the box is the outermost one. A box nearer to the axis than
-its base it meets beyond the vertical, with the tip against the far face.
+A whisker swings in a vertical plane through the axis of the head, from outside down and inwards. It first
+touches the top of a box with its tip, or the far upper edge with its shaft. A box nearer to the axis than the
+whisker's base is touched beyond the vertical, by the tip on the far face.
 """
 
 from __future__ import annotations
@@ -15,13 +14,13 @@ import numpy as np
 from tactile.whiskers.head_geometry import Head
 
 BUCKET_SIDE = 0.18
-"""Side of the squares that remember which boxes are near, m."""
+"""Side length of the squares of the box index, m."""
 NO_CONTACT = np.inf
-"""The protraction of a whisker that meets nothing."""
+"""Protraction of a whisker without contact."""
 
 
 class Walls(NamedTuple):
-    """Boxes standing on the floor along the axes.
+    """Axis-aligned boxes on the floor.
 
     Attributes:
         box: [B, 4] west, south, east, north, m. height: [B] m.
@@ -32,12 +31,12 @@ class Walls(NamedTuple):
 
 
 class Contact(NamedTuple):
-    """Where whiskers would first touch.
+    """First contacts of whiskers.
 
     Attributes:
-        angle: [P, W] protraction, rad; infinite where nothing is met.
-        reach: [P, W] how far along the shaft, as a share of its length; 1 at the tip.
-        wall: [P, W] the box, -1 for none.
+        angle: [P, W] protraction, rad; infinite without contact.
+        reach: [P, W] contact position along the shaft, as a fraction of its length; 1 at the tip.
+        wall: [P, W] index of the box, -1 without contact.
     """
 
     angle: np.ndarray
@@ -46,10 +45,10 @@ class Contact(NamedTuple):
 
 
 class Surroundings:
-    """Walls made ready for many questions.
+    """Walls with an index for repeated contact queries.
 
     Args:
-        head: with all whisker planes through the vertical axis of base_link.
+        head: all whisker planes must contain the vertical axis of base_link.
     """
 
     def __init__(self, walls: Walls, head: Head) -> None:
@@ -63,7 +62,7 @@ class Surroundings:
         self._near: dict[tuple[int, int], np.ndarray] = {}
 
     def contact(self, pose: np.ndarray) -> Contact:
-        """What each whisker would meet first if the head stood still at poses [P, 3] (m, m, rad)."""
+        """First contacts of all whiskers of a resting head at poses [P, 3] (m, m, rad)."""
         pose = np.asarray(pose, float)
         count, whiskers = len(pose), len(self._radius)
         angle = np.full((count, whiskers), NO_CONTACT)
@@ -78,7 +77,7 @@ class Surroundings:
         return Contact(angle, reach, wall)
 
     def _boxes(self, i: int, j: int) -> np.ndarray:
-        """The boxes within range of somewhere in a bucket."""
+        """Boxes within range of any point of an index square."""
         if (i, j) not in self._near:
             low, high = (
                 np.array([i, j]) * BUCKET_SIDE - self.range,
@@ -99,11 +98,11 @@ class Surroundings:
         wall = np.full(met.shape, -1)
         row, ray, box = np.nonzero((leave > enter) & (leave > 0) & (enter < self.range))
         d1, d2, top = enter[row, ray, box], leave[row, ray, box], self.walls.height[near[box]]
-        # What a ray crosses is met by every whisker that lies in it.
+        # A box that a ray crosses concerns every whisker in that direction.
         crossing, whisker = np.nonzero(ray[:, None] == self._ray)
         row, box = row[crossing], box[crossing]
         angle, share = self._down(whisker, d1[crossing], d2[crossing], top[crossing])
-        # Of several boxes the one met first counts: the smallest protraction, which is written last.
+        # Of several boxes the first contact counts: the smallest protraction, which is written last.
         order = np.argsort(-angle, kind="stable")
         place = row[order], whisker[order]
         met[place], reach[place], wall[place] = angle[order], share[order], near[box[order]]
@@ -112,7 +111,7 @@ class Surroundings:
         return met, reach, wall
 
     def _crossed(self, pose: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Distances at which each ray from each head enters and leaves each box: [P, A, B] twice."""
+        """Distances [P, A, B] at which each ray of each pose enters and leaves each box."""
         heading = pose[:, 2:3] + self._rays
         far = []
         for axis, direction in enumerate((np.cos(heading), np.sin(heading))):
@@ -124,19 +123,20 @@ class Surroundings:
     def _down(
         self, w: np.ndarray, d1: np.ndarray, d2: np.ndarray, top: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Protraction at which whiskers w [N] meet boxes from d1 to d2 m away, and where along them."""
+        """Protraction at which whiskers w [N] touch boxes d1 to d2 m away, and the position along the
+        shaft."""
         radius, length, rest = self._radius[w], self.head.length[w], self._opening[w]
         drop = self.head.base[w, 2] - top
-        # With the tip as high as the top, how far out is it?
+        # Distance of the tip from the axis when it is as high as the top of the box.
         opening = np.arccos(np.clip(drop / length, -1, 1))
         out = radius + length * np.sin(opening)
         low = np.abs(drop) <= length
         by_tip = low & (out >= d1) & (out <= d2)
         edge = np.hypot(drop, d2 - radius)
         by_edge = (low & (out > d2)) & (edge <= length)
-        # A head that hangs below the tops, or over a box, meets its walls at once: protraction 0.
+        # A head below the tops, or above a box, touches at once: protraction 0.
         over = np.arctan2(d2 - radius, drop)
-        # Past the vertical the tip leads: it runs into the far face below that edge.
+        # Beyond the vertical the tip touches the far face below that edge.
         inside = d2 < radius
         over = np.where(inside, np.arcsin(np.clip((d2 - radius) / length, -1, 1)), over)
         found = np.where(by_tip, opening, np.where(by_edge, over, -np.inf))

@@ -207,16 +207,16 @@ def test_a_text_says_what_stands_where(tmp_path: Path) -> None:
         (("  2 2  0 2", "  0 2 2 2"), "room.txt:2:12", "walls that cross"),
         (("  2 2  0 2", "  2 0 2 2 0 2"), "room.txt:2:17", "the same corner twice"),
         (("  2 2  0 2", "  2 2  0 2  0 0"), "room.txt:2:7", "the same corner twice"),
-        (("  2 2  0 2", "  3 0  1 0"), "room.txt:2:1", "in one line"),
+        (("  2 2  0 2", "  3 0  1 0"), "room.txt:2:1", "on one line"),
         (("start 1 1 90\n", ""), "room.txt", "no line `start`"),
         (("outer 0 0  2 0  2 2  0 2", ""), "room.txt", "no line `outer`"),
         (("start 1 1 90", "start 1 1 90\nstart 1 1 80"), "room.txt:7:1", "another `start`"),
         (("square 0.3 1.7", "square 2.3 1.7"), "room.txt:3:1", "outside the walls"),
         (("square 0.3 1.7", "square 2 1.8"), "room.txt:3:1", "outside the walls"),
-        (("square 0.3 1.7", "square 1.85 1.2"), "room.txt:5:1", "an object over object 1"),
-        (("square 0.3 1.7 0.2", "square 1.85 1.2 0.05"), "room.txt:5:1", "an object over object 1"),
-        (("start 1 1 90", "start 0.3 1.7 90"), "room.txt:6:7", "not free"),
-        (("start 1 1 90", "start 0.1 1 90"), "room.txt:6:7", "not free"),
+        (("square 0.3 1.7", "square 1.85 1.2"), "room.txt:5:1", "an object that overlaps object 1"),
+        (("square 0.3 1.7 0.2", "square 1.85 1.2 0.05"), "room.txt:5:1", "an object that overlaps object 1"),
+        (("start 1 1 90", "start 0.3 1.7 90"), "room.txt:6:7", "too close"),
+        (("start 1 1 90", "start 0.1 1 90"), "room.txt:6:7", "too close"),
         (("start 1 1 90", "start inf 1 90"), "room.txt:6:7", "'inf'"),
     ],
 )
@@ -232,4 +232,4 @@ def test_a_faulty_text_is_refused(
 def test_a_file_that_is_no_text_is_refused(tmp_path: Path, refused: Callable[..., InputError]) -> None:
     refused(lambda: read_arena(tmp_path / "none.txt"), "none.txt", "no such file")
     (tmp_path / "bytes.txt").write_bytes(b"\xff\xfe\x00")
-    refused(lambda: read_arena(tmp_path / "bytes.txt"), "bytes.txt", "is no text")
+    refused(lambda: read_arena(tmp_path / "bytes.txt"), "bytes.txt", "is not text")

@@ -187,5 +187,5 @@ def test_boxes_have_names() -> None:
 
 
 def test_cells_that_are_no_neighbours_are_a_fault_of_the_program() -> None:
-    with pytest.raises(ValueError, match="no neighbours"):
+    with pytest.raises(ValueError, match="not neighbours"):
         is_open(made(0), (0, 0), (1, 1))
