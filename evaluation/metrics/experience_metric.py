@@ -16,12 +16,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
-from zlib import crc32
 
 import numpy as np
 from pydantic import NonNegativeInt, PositiveFloat
 
 from evaluation.metrics.experience_log import change_rows, creation_rows
+from evaluation.metrics.statistics import bootstrap
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.se2 import wrap
@@ -220,22 +220,6 @@ def pool_experience_metrics(results: Sequence[ExperienceMetric], *, seed: int = 
         runs=len(results),
         judged=len(judged),
     )
-
-
-def bootstrap(
-    values: np.ndarray, stream: str, *, level: float = 0.95, draws: int = 10_000, seed: int = 0
-) -> tuple[float, float]:
-    """Percentile interval of the mean of `values` [R] over resampled runs; NaN when there is no run.
-
-    Args:
-        stream: name of the random stream; with `seed` it fixes the draws, whatever else was drawn before.
-    """
-    if len(values) == 0:
-        return np.nan, np.nan
-    random = np.random.default_rng([seed, crc32(stream.encode())])
-    means = values[random.integers(0, len(values), (draws, len(values)))].mean(axis=1)
-    low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
-    return float(low), float(high)
 
 
 def _checked(experience: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

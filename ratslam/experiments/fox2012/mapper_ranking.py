@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.metrics.experience_metric import bootstrap
 from evaluation.metrics.grid_error import CONVENTIONS, Convention
+from evaluation.metrics.statistics import bootstrap
 from ratslam.experiments.fox2012.metrics import eq6_column
 from ratslam.experiments.fox2012.protocols import FILTERED, PAPERS, RECKONED, TRUE
 from ratslam.experiments.fox2012.trials import MapperResult

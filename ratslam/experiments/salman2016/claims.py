@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.metrics.experience_metric import bootstrap
+from evaluation.metrics.statistics import bootstrap
 from ratslam.experiments.salman2016.protocols import METHODS, Claim, Protocol
 
 ALIKE = 0.05

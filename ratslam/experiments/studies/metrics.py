@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from evaluation.metrics.grid_metrics import GRID_METRICS
+from evaluation.metrics.metric import Direction
+from evaluation.metrics.run_metrics import RUN_METRICS
 
-Direction = Literal["low", "high"] | None
-
-_ENERGIES = [
-    f"energy_{pairs}{part}"
-    for pairs in ("change", "consecutive", "gap", "links", "all")
-    for part in ("", "_trans2", "_rot2")
-]
-_ARCR = [f"exm_arcr_{mode}" for mode in ("strict", "paper", "or", "literal")]
 MEASURED: dict[str, tuple[str, str]] = {
     "step_time": ("time per step, median", "us"),
     "step_time_p99": ("time per step, 99 %", "us"),
@@ -20,17 +14,8 @@ MEASURED: dict[str, tuple[str, str]] = {
 }
 """What depends on the machine and on what else runs there: label and unit."""
 DIRECTIONS: dict[str, Direction] = {
-    **dict.fromkeys(("steps", "duration", "path", "experiences", "links", "exm_base")),
-    **dict.fromkeys(("ate_final", "ate_online", "anytime_median", "anytime_late", "anytime_jump"), "low"),
-    **dict.fromkeys(("rpe_translation", "rpe_rotation_deg"), "low"),
-    **dict.fromkeys(("relations_translation", "relations_rotation_deg"), "low"),
-    **dict.fromkeys(_ENERGIES, "low"),
-    **dict.fromkeys(("exm_arr", *_ARCR), "high"),
-    **dict.fromkeys(("exm_action_arr", "exm_action_arcr_strict"), "high"),
-    **dict.fromkeys(("map_error", "map_brier", "map_log_loss"), "low"),
-    **dict.fromkeys(("map_chamfer_map", "map_chamfer_walls"), "low"),
-    **dict.fromkeys(("map_brier_skill", "map_brier_skill_free", "map_auc", "map_auc_free"), "high"),
-    "map_log_loss_constant": None,
+    **{metric.name: metric.direction for metric in (*RUN_METRICS, *GRID_METRICS)},
+    "map_error": "low",
     **dict.fromkeys(MEASURED, "low"),
 }
 """Every quantity: whether low or high values are better; None where neither is."""

@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import Field
 
-from evaluation.metrics.scorecard import Quantity
+from evaluation.metrics.metric import Quantity
 from ratslam.experiments.studies.metrics import MEASURED
 from tactile.base.atomic_write import flush_to_disk, write_atomically
 from tactile.base.config import Settings

@@ -22,8 +22,9 @@ from evaluation.artifacts.grid_npz import read_grid
 from evaluation.metrics.energy_metric import read_relations
 from evaluation.metrics.grid_error import MAIN_CONVENTION
 from evaluation.metrics.grid_score import score_grid
+from evaluation.metrics.metric import Quantity
 from evaluation.metrics.run_arrays import RunArrays
-from evaluation.metrics.scorecard import Quantity, score_run
+from evaluation.metrics.scorecard import score_run
 from ratslam.config.run_config import RunConfig
 from ratslam.core.session import CHUNK, Session
 from ratslam.experiments.studies.memory import weighed

@@ -14,11 +14,11 @@ from evaluation.metrics.experience_metric import (
     NO_RELOCALISATION,
     ExmConfig,
     base_end,
-    bootstrap,
     experience_metric,
     pool_experience_metrics,
     relocalisations,
 )
+from evaluation.metrics.statistics import bootstrap
 from tactile.base.errors import InputError
 from tactile.base.se2 import wrap
 

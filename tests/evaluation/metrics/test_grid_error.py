@@ -19,7 +19,8 @@ from evaluation.metrics.grid_error import (
     pool_errors,
     smooth_truth,
 )
-from evaluation.metrics.grid_score import CLAMP, GridScore, pool_grids, render_grid_scores, score_grid
+from evaluation.metrics.grid_metrics import CLAMP
+from evaluation.metrics.grid_score import GridScore, pool_grids, render_grid_scores, score_grid
 from evaluation.metrics.occupancy_grid import (
     PRIOR_OCCUPANCY,
     GridTruth,

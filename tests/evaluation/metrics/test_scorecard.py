@@ -9,6 +9,8 @@ import pytest
 
 from evaluation.metrics.energy_metric import Relations
 from evaluation.metrics.experience_metric import ExmConfig
+from evaluation.metrics.metric import Finding, Metric
+from evaluation.metrics.run_metrics import REGISTERED_METRICS, register_metric
 from evaluation.metrics.scorecard import Scorecard, render_scorecard, score_run
 from tactile.base.errors import InputError
 
@@ -119,3 +121,16 @@ def test_the_table_has_units_and_raw_odometry(circle):
 def test_arrays_that_do_not_fit_are_refused(circle, change, message):
     with pytest.raises(InputError, match=message):
         score_run(circle._replace(**change))
+
+
+def test_a_registered_metric_is_on_the_scorecard(circle):
+    metric = Metric("my_last", "my last x", "m", "low", "Mine", lambda data: Finding(data.run.final[-1, 0]))
+    register_metric(metric)
+    try:
+        with pytest.raises(ValueError, match="exists already"):
+            register_metric(metric)
+        card = score_run(circle)
+        assert card.quantities["my_last"].value == circle.final[-1, 0]
+        assert "Mine\n  my last x" in render_scorecard(card)
+    finally:
+        REGISTERED_METRICS.remove(metric)

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evaluation.metrics.scorecard import Quantity
+from evaluation.metrics.metric import Quantity
 from evaluation.plots.pareto_plot import ParetoPoint, draw_pareto, place_labels
 from ratslam.cli import main
 from ratslam.experiments.pareto import benchmark

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evaluation.metrics.scorecard import Quantity
+from evaluation.metrics.metric import Quantity
 from ratslam.cli import main
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import override, parse, validate

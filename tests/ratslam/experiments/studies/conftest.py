@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from evaluation.metrics.scorecard import Quantity
+from evaluation.metrics.metric import Quantity
 from ratslam.experiments.studies.results import Result
 from ratslam.experiments.studies.study import Job
 

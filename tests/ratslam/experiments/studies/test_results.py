@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evaluation.metrics.scorecard import Quantity
+from evaluation.metrics.metric import Quantity
 from ratslam.experiments.studies.metrics import DIRECTIONS, MAIN
 from ratslam.experiments.studies.report import SHORT, label, rows, save, spread, table
 from ratslam.experiments.studies.results import Memory, Result, Timing, read_result, write_result

@@ -9,7 +9,7 @@ import jax
 import pytest
 
 from evaluation.artifacts.run_directory import read_scorecard
-from evaluation.metrics.grid_score import score_grid
+from evaluation.metrics.grid_metrics import GRID_METRICS
 from ratslam.experiments.studies.memory import weighed
 from ratslam.experiments.studies.metrics import DIRECTIONS, MEASURED
 from ratslam.experiments.studies.run_job import run_job
@@ -85,7 +85,7 @@ def test_every_quantity_of_the_scorecards_is_known(tiny, tmp_path):
     assert told.error is None
     maps = {name for name in DIRECTIONS if name.startswith("map_")}
     assert set(told.quantities) | maps | set(MEASURED) == set(DIRECTIONS)
-    assert maps - {"map_error"} == set(score_grid.__globals__["_QUANTITIES"])
+    assert maps - {"map_error"} == {metric.name for metric in GRID_METRICS}
 
 
 def test_what_a_user_can_mend_is_a_result(tiny):

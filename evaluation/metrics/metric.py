@@ -1,0 +1,65 @@
+"""The record of a metric and the types of its results."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import isfinite
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from tactile.base.config import Settings
+
+Direction = Literal["low", "high"] | None
+"""Which values are better; None where neither is."""
+
+
+class Quantity(Settings):
+    """One measured value."""
+
+    label: str
+    """Its name in words."""
+    value: float | int | None
+    """The value; None (null in JSON) if undefined, with the reason in `note`."""
+    unit: str
+    """SI, or degrees as `deg`; '' for a ratio or a count."""
+    odometry: float | int | None = None
+    """The value for raw odometry, if defined."""
+    note: str = ""
+    """Why there is no value, or a remark on it."""
+
+
+class Finding(NamedTuple):
+    """A computed value, the value for raw odometry and a note; a value may be NaN."""
+
+    value: float | int
+    odometry: float | int | None = None
+    note: str = ""
+
+
+MISSING_TRUTH = Finding(np.nan, note="no ground truth")
+
+
+class Metric(NamedTuple):
+    """One metric.
+
+    Attributes:
+        name: key in `scorecard.json`. label: in words. unit: SI, `deg`, or ''.
+        direction: which values are better. section: heading in the table.
+        compute: the finding from the data of a run (`run_metrics.RunData`) or of a grid map
+            (`grid_metrics.GridData`); None without the ground truth that it needs.
+    """
+
+    name: str
+    label: str
+    unit: str
+    direction: Direction
+    section: str
+    compute: Callable[[Any], Finding | None]
+
+    def quantity(self, finding: Finding) -> Quantity:
+        """The value as written to a scorecard; NaN becomes None."""
+        value = finding.value if isfinite(finding.value) else None
+        raw = finding.odometry if finding.odometry is not None and isfinite(finding.odometry) else None
+        note = finding.note if value is not None or finding.note else "undefined"
+        return Quantity(label=self.label, value=value, unit=self.unit, odometry=raw, note=note)

@@ -1,0 +1,256 @@
+"""Metrics of a run: extent, trajectory errors, Energy Metric and Experience Metric."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+
+from evaluation.metrics.energy_metric import (
+    Energy,
+    Relations,
+    energy,
+    energy_all_pairs,
+    relation_errors,
+    successive_pairs,
+)
+from evaluation.metrics.experience_log import change_rows
+from evaluation.metrics.experience_metric import (
+    EXM_MODES,
+    ExmConfig,
+    base_end,
+    experience_metric,
+)
+from evaluation.metrics.metric import Direction, Finding, Metric
+from evaluation.metrics.run_arrays import RunArrays, truth_rows
+from evaluation.metrics.trajectory import ate, online_error, rpe, summarize_errors
+from tactile.base.errors import InputError
+
+
+class RunData:
+    """The input of run metrics; findings that share work are computed together, once.
+
+    Args:
+        relations: true relative motions of the recording, if any. gap: distance of the pairs of
+            `energy_gap`, steps.
+
+    Attributes:
+        run, exm: as given. rows: [K] steps with a true pose.
+    """
+
+    def __init__(self, run: RunArrays, exm: ExmConfig, relations: Relations | None, gap: int) -> None:
+        self.run, self.exm, self.rows = run, exm, truth_rows(run)
+        self._relations, self._gap = relations, gap
+
+    @cached_property
+    def extent(self) -> dict[str, Finding]:
+        """Numbers of steps, experiences and links, duration, length of the path."""
+        return _extent(self.run, self.rows)
+
+    @cached_property
+    def trajectory(self) -> dict[str, Finding]:
+        """ATE, RPE and online error; empty without truth."""
+        truth = self.run.truth
+        return _trajectories(self.run, truth, self.rows) if truth is not None and len(self.rows) else {}
+
+    @cached_property
+    def relations(self) -> dict[str, Finding]:
+        """Errors of given relative motions; empty if none are given."""
+        return {} if self._relations is None else _relations(self.run, self._relations)
+
+    @cached_property
+    def energy(self) -> dict[str, Finding]:
+        """The Energy Metric over all kinds of pairs; empty without truth."""
+        truth = self.run.truth
+        return (
+            _energies(self.run, truth, self.rows, self._gap) if truth is not None and len(self.rows) else {}
+        )
+
+    @cached_property
+    def experience(self) -> dict[str, Finding]:
+        """The Experience Metric in all modes."""
+        run, rows, base = self.run, self.rows, self.exm.base
+        if run.truth is None or len(rows) == 0:
+            return experience_findings(run.experience, None, self.exm)
+        inside = self.exm.model_copy(
+            update={"base": None if base is None else int(np.searchsorted(rows, base))}
+        )
+        return experience_findings(run.experience[rows], run.truth[rows], inside)
+
+
+def _metric(group: str, section: str, direction: Direction, name: str, label: str, unit: str) -> Metric:
+    return Metric(name, label, unit, direction, section, lambda data: getattr(data, group).get(name))
+
+
+_PAIRS = {
+    "change": "successive experience changes",
+    "consecutive": "consecutive steps",
+    "gap": "steps at a gap",
+    "links": "linked experiences",
+    "all": "all pairs of steps",
+}
+RUN_METRICS: tuple[Metric, ...] = (
+    _metric("extent", "Extent", None, "steps", "steps", ""),
+    _metric("extent", "Extent", None, "duration", "duration", "s"),
+    _metric("extent", "Extent", None, "path", "length of the true path", "m"),
+    _metric("extent", "Extent", None, "experiences", "experiences", ""),
+    _metric("extent", "Extent", None, "links", "links", ""),
+    *(
+        _metric("trajectory", "Trajectory", "low", name, label, unit)
+        for name, label, unit in (
+            ("ate_final", "ATE, final", "m"),
+            ("ate_online", "ATE, online", "m"),
+            ("anytime_median", "online error, median", "m"),
+            ("anytime_late", "online error, RMS of the second half", "m"),
+            ("anytime_jump", "online error, largest jump", "m"),
+            ("rpe_translation", "RPE over one step, translation", "m"),
+            ("rpe_rotation_deg", "RPE over one step, rotation", "deg"),
+        )
+    ),
+    _metric("relations", "Trajectory", "low", "relations_translation", "relations file, translation", "m"),
+    _metric("relations", "Trajectory", "low", "relations_rotation_deg", "relations file, rotation", "deg"),
+    *(
+        _metric("energy", "Energy Metric", "low", f"energy_{pairs}{suffix}", label + part, unit)
+        for pairs, label in _PAIRS.items()
+        for suffix, part, unit in (
+            ("", "", "m2+rad2"),
+            ("_trans2", ", trans", "m2"),
+            ("_rot2", ", rot", "rad2"),
+        )
+    ),
+    _metric("experience", "Experience Metric", None, "exm_base", "base set", "entries"),
+    _metric("experience", "Experience Metric", "high", "exm_arr", "ARR", ""),
+    *(
+        _metric("experience", "Experience Metric", "high", f"exm_arcr_{mode}", f"ARCR, {mode}", "")
+        for mode in EXM_MODES
+    ),
+    _metric("experience", "Experience Metric", "high", "exm_action_arr", "ARR, per action", ""),
+    _metric(
+        "experience", "Experience Metric", "high", "exm_action_arcr_strict", "ARCR, strict, per action", ""
+    ),
+)
+"""In the order of the scorecard."""
+_EXPERIENCE = [metric.name for metric in RUN_METRICS if metric.section == "Experience Metric"]
+REGISTERED_METRICS: list[Metric] = []
+"""Metrics added by `register_metric`."""
+
+
+def register_metric(metric: Metric) -> None:
+    """Adds a metric to every scorecard of a run; its `compute` is called with a `RunData`.
+
+    Raises:
+        ValueError: the name is taken.
+    """
+    if any(metric.name == other.name for other in run_metrics()):
+        raise ValueError(f"metric {metric.name!r} exists already; choose another name")
+    REGISTERED_METRICS.append(metric)
+
+
+def run_metrics() -> tuple[Metric, ...]:
+    """The metrics of a run: `RUN_METRICS` and the registered ones."""
+    return (*RUN_METRICS, *REGISTERED_METRICS)
+
+
+def _extent(run: RunArrays, rows: np.ndarray) -> dict[str, Finding]:
+    some = f"{len(rows)} of them with a true pose" if 0 < len(rows) < len(run.time) else ""
+    path = {}
+    if run.truth is not None and len(rows):
+        path["path"] = Finding(path_length(run.truth[rows]), path_length(run.odometry[rows]))
+    return {
+        "steps": Finding(len(run.time), note=some),
+        "duration": Finding(float(run.time[-1] - run.time[0])),
+        **path,
+        "experiences": Finding(len(run.nodes)),
+        "links": Finding(len(run.links)),
+    }
+
+
+def _trajectories(run: RunArrays, truth: np.ndarray, rows: np.ndarray) -> dict[str, Finding]:
+    truth, online, final, odometry = (poses[rows] for poses in (truth, run.online, run.final, run.odometry))
+    raw_ate, raw_rpe, raw_now = ate(odometry, truth), rpe(odometry, truth), online_error(odometry, truth)
+    now, step = (
+        summarize_errors(run.online_error) if len(run.online_error) else online_error(online, truth),
+        rpe(final, truth),
+    )
+    note = "in the map of that time" if len(run.online_error) else "of the online poses"
+    return {
+        "ate_final": Finding(ate(final, truth), raw_ate),
+        "ate_online": Finding(ate(online, truth), raw_ate),
+        "anytime_median": Finding(now.median, raw_now.median, note),
+        "anytime_late": Finding(now.late, raw_now.late, note),
+        "anytime_jump": Finding(now.jump, raw_now.jump, note),
+        "rpe_translation": Finding(step.translation, raw_rpe.translation),
+        "rpe_rotation_deg": Finding(float(np.degrees(step.rotation)), float(np.degrees(raw_rpe.rotation))),
+    }
+
+
+def _relations(run: RunArrays, relations: Relations) -> dict[str, Finding]:
+    ours = relation_errors(run.time, run.final, relations)
+    raw = relation_errors(run.time, run.odometry, relations)
+    note = f"{ours.used} relations" + (f", {ours.dropped} outside the recording" if ours.dropped else "")
+    return {
+        "relations_translation": Finding(ours.translation, raw.translation, note),
+        "relations_rotation_deg": Finding(ours.rotation_deg, raw.rotation_deg, note),
+    }
+
+
+def _energies(run: RunArrays, truth: np.ndarray, rows: np.ndarray, gap: int) -> dict[str, Finding]:
+    at = rows[change_rows(run.experience[rows])]
+    steps = successive_pairs(len(rows)), successive_pairs(len(rows), gap)
+    final, odometry, true = run.final[rows], run.odometry[rows], truth[rows]
+    links = run.links[np.isin(run.created, rows)[run.links].all(axis=1)]
+    born, raw_born = truth[run.created], run.odometry[run.created]
+    moves = successive_pairs(len(at))
+    return {
+        **_energy(
+            "change",
+            energy(run.nodes[run.experience[at]], truth[at], moves),
+            energy(run.odometry[at], truth[at], moves),
+        ),
+        **_energy("consecutive", energy(final, true, steps[0]), energy(odometry, true, steps[0])),
+        **_energy("gap", energy(final, true, steps[1]), energy(odometry, true, steps[1]), f"k = {gap}; "),
+        **_energy("links", energy(run.nodes, born, links), energy(raw_born, born, links)),
+        **_energy("all", energy_all_pairs(final, true), energy_all_pairs(odometry, true)),
+    }
+
+
+def _energy(pairs: str, ours: Energy, raw: Energy, note: str = "") -> dict[str, Finding]:
+    return {
+        f"energy_{pairs}": Finding(ours.total, raw.total, f"{note}{ours.pairs} pairs"),
+        f"energy_{pairs}_trans2": Finding(ours.trans2, raw.trans2),
+        f"energy_{pairs}_rot2": Finding(ours.rot2, raw.rot2),
+    }
+
+
+def experience_findings(
+    experience: np.ndarray, truth: np.ndarray | None, config: ExmConfig
+) -> dict[str, Finding]:
+    """The Experience Metric in all modes; without truth only ARR, and only with a given base set."""
+    names = _EXPERIENCE
+    if np.all(experience == -1):
+        return {name: Finding(np.nan, note="no experiences") for name in names}
+    if truth is None and config.base is None:
+        return {name: Finding(np.nan, note="no ground truth, and no base set given") for name in names}
+    if truth is None:  # ARR does not depend on poses
+        found = experience_findings(experience, np.zeros((len(experience), 3)), config)
+        return {name: value for name, value in found.items() if "arcr" not in name}
+    try:
+        base = base_end(truth, config.position, config.heading_deg) if config.base is None else config.base
+    except InputError as error:
+        return {name: Finding(np.nan, note=str(error)) for name in names}
+    step = {mode: config.model_copy(update={"base": base, "log": "step", "mode": mode}) for mode in EXM_MODES}
+    results = {mode: experience_metric(experience, truth, step[mode]) for mode in EXM_MODES}
+    strict = results["strict"]
+    action = experience_metric(experience, truth, step["strict"].model_copy(update={"log": "action"}))
+    return {
+        "exm_base": Finding(strict.base, note="per-step log"),
+        "exm_arr": Finding(strict.arr, note=f"{strict.relocalisations} of {strict.entries} entries"),
+        **{f"exm_arcr_{mode}": Finding(result.arcr, note=result.note) for mode, result in results.items()},
+        "exm_action_arr": Finding(action.arr, note=f"{action.relocalisations} of {action.entries} entries"),
+        "exm_action_arcr_strict": Finding(action.arcr, note=action.note),
+    }
+
+
+def path_length(pose: np.ndarray) -> float:
+    """Length of a path [N, 3], m."""
+    return float(np.sum(np.hypot(*np.diff(pose[:, :2], axis=0).T)))
