@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -61,6 +64,18 @@ def test_python_blocks_run(readme: Path) -> None:
 def test_commands_are_understood(readme: str, command: str) -> None:
     arguments = build_parser().parse_args(shlex.split(command)[3:])
     assert callable(arguments.command)
+
+
+@pytest.mark.soak
+def test_commands_of_the_root_readme_run(tmp_path: Path) -> None:
+    """In a fresh copy of the repository, one after another, as a reader would type them."""
+    clone = tmp_path / "clone"
+    subprocess.run(["git", "clone", "--quiet", "--depth=1", ROOT.as_uri(), str(clone)], check=True)
+    environment = os.environ | {"PYTHONPATH": str(clone)}
+    for command in commands(clone / "README.md"):
+        arguments = [sys.executable, *shlex.split(command)[1:]]
+        done = subprocess.run(arguments, cwd=clone, env=environment, capture_output=True, text=True)
+        assert done.returncode == 0, f"{command}\n{done.stderr}"
 
 
 @pytest.mark.parametrize("readme", READMES, ids=name)
