@@ -1,9 +1,9 @@
-"""Long replays: every step is on the disk, and memory grows by what a final map needs of each step alone.
+"""Long replays: all steps are written, and memory grows only by what the final map needs of each step.
 
     python -m tests.ratslam.core.test_long_replay labels | views | blind [--steps 1000000] [--folder FOLDER]
 
-replays laps of a small circuit through the classic rat into run files, as `ratslam run` does, and prints what
-it took.
+replays laps of a small circuit with the classic backend into a run directory, as `ratslam run` does, and
+prints its time and memory.
 """
 
 from __future__ import annotations

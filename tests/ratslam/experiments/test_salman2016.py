@@ -11,12 +11,16 @@ from hypothesis import strategies as st
 
 from ratslam.cli import main
 from ratslam.cli.reproduce import SALMAN2016
-from ratslam.config.run_config import RunConfig
 from ratslam.experiments.salman2016 import reproduction
 from ratslam.experiments.salman2016.claims import Row, column, judge_claim, render_claims
 from ratslam.experiments.salman2016.direction_metrics import direction_metrics, lap_of_step
 from ratslam.experiments.salman2016.protocols import PROTOCOLS, THRESHOLDS, Claim
-from ratslam.experiments.salman2016.reproduction import match_thresholds, plan_jobs, reproduce
+from ratslam.experiments.salman2016.reproduction import (
+    match_thresholds,
+    plan_jobs,
+    reproduce,
+    session_config,
+)
 from ratslam.experiments.trials.controls import apply_control
 from ratslam.experiments.trials.threshold_sweep import result_at_threshold, sweep_thresholds
 from ratslam.experiments.trials.touch_trial import (
@@ -68,8 +72,8 @@ def session(truth, **given):
 
 @pytest.fixture(scope="module")
 def tiny():
-    data = {"path": {"circuits": "CCA"}, "maze": {"columns": 2, "rows": 2, "loop": 4}}
-    return collect_session(RunConfig.model_validate({"simulation": data, "backend": "classic"}))
+    """A session of the small reproduction below, which shares its compiled kernel."""
+    return collect_session(session_config(PROTOCOLS["fig6"].conditions[1], "classic", 0, TINY))
 
 
 # Laps and sessions
@@ -133,7 +137,7 @@ def test_capacities_are_sufficient_powers_of_two(steps):
 
 def test_a_threshold_sweep_equals_single_sessions(tiny):
     config, log = tiny
-    batch = sweep_thresholds(config, log, np.array([0.01, config.templates.threshold]))
+    batch = sweep_thresholds(config, log, np.array([0.06, config.templates.threshold]))
     assert len(np.unique(batch.place[0])) != len(np.unique(batch.place[1]))
     alone, folded = run_session(config, log), result_at_threshold(config, log, batch, 1)
     assert np.array_equal(batch.place[1], alone.place)
