@@ -12,7 +12,7 @@ from evaluation.metrics.occupancy_grid import OccupancyGrid
 from ratslam.config.run_config import RunConfig
 from ratslam.experiments.fox2012.metrics import map_metrics, path_metrics, position_error
 from ratslam.experiments.fox2012.protocols import FILTERED, RECKONED, TRUE
-from ratslam.experiments.fox2012.session import (
+from ratslam.experiments.trials.arena_trial import (
     ArenaSession,
     FilterResult,
     arena_truth,

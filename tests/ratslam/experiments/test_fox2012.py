@@ -19,7 +19,8 @@ from ratslam.experiments.fox2012.mapper_ranking import MEASURES, Measure, rank_m
 from ratslam.experiments.fox2012.metrics import FIELDS, LEAVE_DISTANCE, find_revisits, path_metrics
 from ratslam.experiments.fox2012.protocols import FILTERED, MAPPERS, PAPERS, PROTOCOLS, RECKONED, TRUE
 from ratslam.experiments.fox2012.reproduction import plan_jobs, reproduce
-from ratslam.experiments.fox2012.session import (
+from ratslam.experiments.fox2012.trials import MapperResult, run_job
+from ratslam.experiments.trials.arena_trial import (
     START_CLEARANCE,
     arena_side,
     arena_truth,
@@ -30,7 +31,6 @@ from ratslam.experiments.fox2012.session import (
     run_filter,
     simulate_session,
 )
-from ratslam.experiments.fox2012.trials import MapperResult, run_job
 from ratslam.grid.config import GridConfig
 from robot.world.arena import Arena, has_clearance
 from robot.world.random_arena import ArenaConfig, make_arena
