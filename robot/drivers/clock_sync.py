@@ -1,8 +1,8 @@
-"""A device's clock as seen from the host: when did happen what the device stamped?
+"""Clock synchronisation: maps device time stamps to the host's clock.
 
-What a device stamped arrives later than it happened, never earlier: by at least the way's shortest delay,
-often by much more. So the line along the lower edge of the pairs (device's time, time of arrival) is the
-device's clock in the host's time, up to that shortest delay, however late single pairs come.
+A message arrives later than its time stamp, by at least the shortest transmission delay and often by much
+more. The line along the lower edge of the pairs (device time, arrival time) is therefore the device's clock
+in host time, up to that shortest delay, and independent of how late single messages arrive.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ import numpy as np
 from tactile.base.types import Array
 
 WINDOW = 30.0
-"""How long pairs count, s."""
+"""Time span of the pairs that count, s."""
 MAX_DRIFT = 200e-6
-"""How far a device's second can be from the host's, as a share: quartzes stay within half of it."""
+"""Largest relative drift of a device's clock; quartz oscillators stay within half of it."""
 SEGMENT = 0.25
-"""s of device time that enter and leave the window together."""
+"""Pairs enter and leave the window in segments of this length, s of device time."""
 JUMP = 0.1
-"""An arrival so much before the line, s, tells that the device's clock went forward by itself. Less is what a
-host that was busy for long leaves: its line is too late until something comes in time again."""
+"""An arrival earlier than the fitted line by this much, s, means that the device's clock jumped forward.
+Smaller differences occur after a busy host has received everything late for a while."""
 RESIDUAL_QUANTILE = 0.1
-"""Share of arrivals that should come as fast as they can."""
+"""Quantile of the delays above the line that is reported as the residual."""
 MIN_SPAN = 1.0
-"""s of pairs from which on the line is trusted to tell it."""
+"""Jumps are detected once the pairs span this time, s."""
 
 Point = tuple[float, float]
 
@@ -36,7 +36,7 @@ class ClockFit(NamedTuple):
     """host = arrival + scale (device - `device`).
 
     Attributes:
-        device, arrival: s, a point of it. scale: host's seconds in a device's second.
+        device, arrival: s, a point on the line. scale: host seconds per device second.
     """
 
     device: float
@@ -48,13 +48,13 @@ class ClockFit(NamedTuple):
 
 
 class ClockSync:
-    """The line through what was observed; a jump of the device's clock starts it anew.
+    """Fits host time as a line over device time; a jump of the device's clock restarts the fit.
 
-    It depends on the observations alone. One thread may observe while others ask.
+    The result depends on the observations only. One thread may observe while others read.
 
-    Attributes:
-        jumped: how often the device's clock went back or ahead. A step back by less than the time between two
-            observations is not told; it is followed as the pairs before it leave the window.
+        Attributes:
+            jumps: number of jumps of the device's clock. A step back by less than the time between two
+                observations is not detected; the fit follows it as older pairs leave the window.
     """
 
     def __init__(self) -> None:
@@ -63,7 +63,7 @@ class ClockSync:
         self._restart()
 
     def observe(self, device: float, arrival: float) -> None:
-        """What the device stamped so has arrived then; both s, arrivals in their order."""
+        """Adds a pair of device time and arrival time, s; arrivals in order."""
         device, arrival = float(device), float(arrival)
         with self._lock:
             if self._has_jumped(device, arrival):
@@ -82,22 +82,22 @@ class ClockSync:
                     self._line = self._edge()
 
     def to_host(self, device: Array) -> Array:
-        """The host's time, s, of a device's [...] s.
+        """Host time, s, of device times [...] s.
 
         Raises:
-            ValueError: nothing was observed yet.
+            ValueError: no observation yet.
         """
         return self._known().at(device)
 
     @property
     def scale(self) -> float:
-        """Host's seconds in a device's second; 1 before anything was observed."""
+        """Host seconds per device second; 1 before the first observation."""
         return self._line.scale
 
     @property
     def residual(self) -> float:
-        """How far above the line the earliest tenth of arrivals lies, s; 0 before any. Where it is large the
-        line hangs on a few lucky ones; how late the others come does not matter."""
+        """The 10 % quantile of the delays above the line, s; 0 before any. A large value means that few
+        messages define the line; the delay of the others does not matter."""
         with self._lock:
             points = [point for piece in self._pieces for point in piece.points]
             line = self._line
@@ -109,7 +109,7 @@ class ClockSync:
 
     def _known(self) -> ClockFit:
         if not self._pieces:
-            raise ValueError("a clock that has observed nothing")
+            raise ValueError("no observation of the device's clock yet")
         return self._line
 
     def _restart(self) -> None:
@@ -122,13 +122,13 @@ class ClockSync:
             return False
         if device < self._newest:
             return True
-        # Late arrivals tell nothing: a busy host is late for as long as it is busy.
+        # Only early arrivals count: a busy host receives everything late.
         settled = device - self._pieces[0].begin >= MIN_SPAN
         return settled and arrival - self._line.at(device) < -JUMP
 
     def _edge(self) -> ClockFit:
-        """The line below all points that comes closest to them: it passes under their middle along an edge of
-        their hull, or touches it where the scale cannot be that of a clock."""
+        """The lower edge: the hull edge below the middle of the points, or, where its slope is beyond the
+        drift limit, the line of limited slope that touches the hull."""
         corners: list[Point] = []
         for piece in self._pieces:
             for point in piece.hull:
@@ -147,7 +147,7 @@ class ClockSync:
 
 
 class _Segment:
-    """Pairs of a moment: all, and the lower hull of them."""
+    """A short span of pairs, with its lower convex hull."""
 
     def __init__(self, begin: float) -> None:
         self.begin = begin
@@ -160,7 +160,7 @@ class _Segment:
 
 
 def _extend_hull(hull: list[Point], point: Point) -> None:
-    """The lower hull with one more point, which is not left of any."""
+    """Appends a point, not left of any other, to a lower convex hull."""
     x, y = point
     if hull and hull[-1][0] == x:
         if hull[-1][1] <= y:

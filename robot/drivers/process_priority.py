@@ -1,4 +1,4 @@
-"""Who goes first on a busy machine: what moves or stands for a robot, before what can wait."""
+"""CPU priority of processes: those that control the robot before mapping and drawing."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import contextlib
 import os
 
 URGENT, BACKGROUND = -10, 10
-"""Of processes that keep a robot's pace; of those that think or draw."""
+"""Nice levels: of processes that control a robot or emulate one, and of those that map or draw."""
 
 
 def set_niceness(niceness: int) -> None:
-    """Gives this process that niceness, where the system knows and allows it."""
+    """Sets the nice level of this process; without effect where the system does not allow it."""
     with contextlib.suppress(OSError, AttributeError):
         os.setpriority(os.PRIO_PROCESS, 0, niceness)

@@ -1,1 +1,1 @@
-"""A session on real devices, or on emulated ones."""
+"""Live sessions on real or emulated devices."""

@@ -1,4 +1,4 @@
-"""What the arm says of its motion: poses at any time, and the motion from whisk to whisk."""
+"""Odometry of the arm: poses at any time, and the motion from whisk to whisk."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from tactile.base.se2 import compose, wrap
 from tactile.base.types import Odometry
 
 HISTORY = 10.0
-"""s of states that are kept."""
+"""Time span of states that are kept, s."""
 
 
 class ArmOdometry:
-    """Collects the arm's states by host time, and tells poses and motions from them."""
+    """Collects the arm's states by host time and interpolates poses and motions."""
 
     def __init__(self, config: LiveConfig) -> None:
         self._config = config
@@ -27,13 +27,17 @@ class ArmOdometry:
         self._pose: list[np.ndarray] = []
 
     def add(self, time: np.ndarray, tcp: np.ndarray, speed: np.ndarray) -> None:
-        """States [N], their times (s, host) and [N, 6] tool poses and their rates in the base."""
+        """Adds states.
+
+        Args:
+            time: [N] s, host. tcp, speed: [N, 6] tool poses and their rates in the base frame."""
         self._states.extend(zip(time.tolist(), tcp, speed, strict=True))
         while self._states and self._states[0][0] < self._states[-1][0] - HISTORY:
             self._states.popleft()
 
     def pose(self, time: float) -> np.ndarray:
-        """[3] of the head in the map at a time, between two states; the nearest one's beyond them."""
+        """Pose of the head in the map [3] at a time, interpolated between two states; beyond them, that of
+        the nearest."""
         times = np.array([state[0] for state in self._states])
         k = int(np.clip(np.searchsorted(times, time), 1, len(times) - 1)) if len(times) > 1 else 0
         pair = [self._states[max(k - 1, 0)], self._states[k]]
@@ -47,25 +51,28 @@ class ArmOdometry:
         return pose
 
     def step(self, stamp: float, time: float) -> tuple[Odometry, np.ndarray]:
-        """The motion since this was last asked for, with the errors that the settings add, and the pose now.
+        """The motion since the last call, with the configured errors, and the pose now.
 
         Args:
-            stamp: of the whisk, s. time: the same moment on the host's clock.
+            stamp: time stamp of the whisk, s. time: the same moment on the host's clock, s.
         """
         pose = self.pose(time)
         if self._config.odometry == "velocity" and self._time:
             pose = self._driven(stamp - self._time[-1], time)
-        # Headings run on, for errors go by how far it turned.
+        # Headings are not wrapped: errors depend on the total turn.
         last = self._pose[-1][2] if self._pose else pose[2]
         self._pose.append(np.array([*pose[:2], last + wrap(pose[2] - last)]))
         self._time.append(stamp)
         random = stream(self._config.seed, "live.odometry")
-        # Drawn from the start each time: the errors of a whisk do not depend on how many follow.
-        rows = simulate_odometry(self._config.noise, np.array(self._time), np.array(self._pose), random)
+        # Errors are drawn from the start each time, so that those of a whisk do not depend on the whisks
+        that
+        follow.rows = simulate_odometry(
+            self._config.noise, np.array(self._time), np.array(self._pose), random
+        )
         return Odometry(*rows[-1]), self.pose(time)
 
     def _driven(self, took: float, time: float) -> np.ndarray:
-        """Where the mean velocity since the last whisk leads from where that was."""
+        """Pose reached from the last one at the mean velocity since then."""
         states = [state for state in self._states if time - took < state[0] <= time]
         if not states:
             return self._pose[-1]

@@ -1,4 +1,4 @@
-"""What a live session is: the arm, the head, where they go, and what is asked of both before they move."""
+"""Settings of a live session: arm, head, route, and checks before anything moves."""
 
 from __future__ import annotations
 
@@ -18,37 +18,39 @@ class LiveConfig(Settings):
     """A session on an arm with a whisker head: `python -m ratslam live config.yaml`."""
 
     arm: ArmConfig = ArmConfig()
-    """The arm, and what it may do."""
+    """The arm and its limits."""
     head: HeadLinkConfig = HeadLinkConfig()
-    """The link to the whiskers."""
+    """The link to the whisker head."""
     plan: SimulationConfig = SimulationConfig()
-    """Where to go (maze, path, motion) and how to whisk, as a simulated session has it, with what makes the
-    calibration. The emulators take the rest of it for the world; `odometry` and `kidnaps` count for neither.
+    """Route (maze, path, motion), whisking and calibration, as in a simulated session. The emulators take the
+    rest for their world; `odometry` and `kidnaps` have no effect.
     """
     waypoints: tuple[tuple[float, float, float], ...] = ()
-    """Where to go instead: x, y (m) and heading (degrees) in the map."""
+    """Route instead of the plan's: x, y (m) and heading (degrees) in the map."""
     whisks: PositiveInt | None = None
-    """How many; none: until the way is done."""
+    """Number of whisks; None: until the end of the route."""
     odometry: Literal["pose", "velocity"] = "pose"
-    """From the arm's poses at the middle of two protractions, or the mean velocity between them."""
+    """Odometry from the arm's poses at the middle of two protractions, or from the mean velocity between
+    them."""
     noise: OdometryConfig = OdometryConfig(noise="none")
-    """Errors added to the arm's odometry, which is better than any robot's that needs a map (Salman & Pearson
-    2016, III-C). Truth is what the arm says."""
+    """Errors added to the arm's odometry, which is more accurate than that of a mobile robot (Salman &
+    Pearson 2016, III-C). Ground truth is the pose reported by the arm."""
     lift: NonNegativeFloat = 0.1
-    """Above working height whiskers meet nothing: there the free record is made, m."""
+    """Height above working height at which whiskers touch nothing: the free record is made there, m."""
     budget: PositiveFloat = 0.6
-    """A whisk that finds the mapper this far behind loses its image, never its odometry, s."""
+    """Lag of the mapper beyond which a whisk is handed on without its image (its odometry is always kept), s.
+    """
     grace: Annotated[float, Field(gt=0, le=1.0)] = 0.045
-    """How long frames of a whisk that is over are waited for, s."""
+    """Waiting time for the frames of a whisk after its end, s."""
     gap: PositiveInt = 5
-    """An image with so many samples missing on end is not used."""
+    """Number of consecutive missing samples from which an image is not used."""
     residual: PositiveFloat = 5e-3
-    """Of the clocks' alignment, beyond which the session does not start, s."""
+    """Largest residual of the clock synchronisation with which a session starts, s."""
     room: NonNegativeFloat = 2e9
-    """On the disk, without which it does not start, bytes."""
+    """Free disk space required to start, bytes."""
     seed: int = 0
-    """Of the errors added to the odometry."""
+    """Random seed of the errors added to the odometry."""
 
     def resolved(self, folder: Path) -> LiveConfig:
-        """The same with every relative path taken from the folder (of the configuration file, say)."""
+        """A copy with relative paths taken from the folder (of the configuration file)."""
         return self.model_copy(update={"plan": self.plan.resolved(folder)})

@@ -1,4 +1,4 @@
-"""The emulators that fit a live session: an arm above the start of its way, a head in its maze."""
+"""Configurations of emulators for a live session: an arm above the start of its route, a head in its maze."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 
 
 def arm_emulator_config(config: LiveConfig, head: HeadConfig, host: str | None = None) -> UrEmulatorConfig:
-    """A controller at the session's address, or another one; its arm hangs above where the way begins."""
+    """A controller at the session's address, or another one; the arm starts above the first pose of the
+    route."""
     start = plan_path(config, ur10_head(head)).pose[0]
     start = tcp_from_pose(config.arm.placing, start, config.lift / 2)
     return UrEmulatorConfig(

@@ -1,8 +1,8 @@
-"""A live session on its way into a recording, while it happens.
+"""Recorder of a live session.
 
-Frames and arm states are gathered for a moment and written as a block. Everything is with the operating
-system within 0.2 s, counted on the times that are handed in: whoever kills the process takes no more than
-that.
+Frames and arm states are collected for a short time and written as a block. All data are handed to the
+operating system within 0.2 s, counted on the times that are passed in, so a killed process loses no more
+than that.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ from robot.recordings.schemas import ARM, CUT, EVENT, FRAMES, TRUTH
 from robot.sources.source_info import SourceInfo
 
 BLOCK_TIME = 0.15
-"""How long frames and states wait for others, s."""
+"""Time for which frames and states are collected into a block, s."""
 
 
 class LiveRecorder:
     """Writes a session to a new recording; a context manager.
 
-    Any thread may hand something in, and waits as long as the disk does. A disk that takes no more is told by
-    `fault` alone: from then on everything is passed over, and the recording stays readable up to there.
+    Any thread may add data and waits for the disk. When the disk is full, `fault` is set, all further data
+    are ignored, and the recording stays readable up to that point.
 
     Args:
         path: must not exist yet. view_shape, whiskers, rate_hz, info: see `Tape`.
 
     Attributes:
-        fault: why nothing is written any more; None while it is.
+        fault: why writing has ended; None while it continues.
 
     Raises:
         InputError: the file exists or cannot be made.
@@ -64,11 +64,11 @@ class LiveRecorder:
 
     @property
     def count(self) -> int:
-        """Whisks so far."""
+        """Number of whisks so far."""
         return self._tape.count
 
     def add_frames(self, frames: Frames, arrival: float) -> None:
-        """What the head sent, which came at that time, s. Frames known already are passed over."""
+        """Adds frames that arrived at a time, s; frames added before are ignored."""
         with self._writing(arrival) as able:
             if able:
                 self._arrival = arrival
@@ -76,7 +76,7 @@ class LiveRecorder:
                 self._waited(arrival)
 
     def add_states(self, states: np.ndarray) -> None:
-        """What the arm sent: states [N] (`robot.drivers.ur10.shared_state.ARM_STATE`), oldest first."""
+        """Adds arm states [N] (`robot.drivers.ur10.shared_state.ARM_STATE`), oldest first."""
         if not len(states):
             return
         newest = float(states["host"][-1])
@@ -86,11 +86,11 @@ class LiveRecorder:
                 self._waited(newest)
 
     def add_whisk(self, cut: Cut, frames: Frames, truth: np.ndarray | None = None) -> None:
-        """A whisk, at once.
+        """Adds a whisk and flushes the file.
 
         Args:
-            frames: of the whisk, all; those that `frames` has not brought yet are written before it.
-            truth: [3] where the head really was.
+            frames: all of the whisk; those not added yet are written before it. truth: [3] true pose of the
+            head.
 
         Raises:
             ValueError: the frames are not those of the cut.
@@ -109,10 +109,10 @@ class LiveRecorder:
                 self._tape.flush()
 
     def add_event(self, time: float, name: str, text: str) -> None:
-        """Something that happened, at once.
+        """Adds an event and flushes the file.
 
         Args:
-            time: s. name: one word. text: what was found.
+            time: s. name: one word. text: details.
         """
         message = encode_event(Event(time, name, text))
         with self._writing(time) as able:
@@ -122,7 +122,7 @@ class LiveRecorder:
                 self._tape.flush()
 
     def close(self) -> None:
-        """Write what waits and finish the file; closing twice is fine."""
+        """Writes pending data and finishes the file; may be called more than once."""
         with self._writing(self._arrival) as able:
             if able:
                 self._write()
@@ -136,7 +136,7 @@ class LiveRecorder:
             self._frames.append(Frames(*(column[new] for column in frames)))
 
     def _waited(self, time: float) -> None:
-        """Something was handed in at that time: perhaps others have waited long enough."""
+        """Writes the collected block if it is old enough at this time."""
         if self._since == -np.inf:
             self._since = time
         elif time - self._since >= BLOCK_TIME:
@@ -155,7 +155,7 @@ class LiveRecorder:
 
     @contextmanager
     def _writing(self, time: float) -> Iterator[bool]:
-        """Alone with the tape; whether it still takes something."""
+        """Holds the lock on the file; yields whether it still accepts data."""
         with self._lock:
             try:
                 yield self.fault is None

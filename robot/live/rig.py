@@ -1,4 +1,4 @@
-"""Arm and head as one thing: looked after a hundred times a second, with one clock for both."""
+"""Arm and head of a live session, polled a hundred times a second, with one clock for both."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ from robot.live.recorder import LiveRecorder
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 
 TICK = 0.01
-"""s between two looks."""
+"""Period of the poll, s."""
 MAX_REST_TIME, REST_TIME = 2.0, 0.3
-"""How long an arm that was stopped is looked at, s: at most, and until it has stood for so long. After a
-contact it stands, and then backs off."""
+"""How long a stopped arm is watched, s: at most, and until it has been at rest for this long. After a contact
+it stops and then backs off."""
 
 MAX_CLOCK_STEP = 2e-3
-"""By how much a head's clock may step against its count of samples, s."""
+"""Largest step of the head's clock against its sample count, s."""
 
 
 class SessionFault(Exception):
-    """What ends a session, raised by whoever looks."""
+    """A fault ends the session."""
 
     def __init__(self, fault: Fault) -> None:
         super().__init__(str(fault))
@@ -43,14 +43,14 @@ class SessionFault(Exception):
 
 
 class OperatorStop(Exception):
-    """The operator wants it to end."""
+    """The operator ends the session."""
 
 
 class Rig:
     """The two devices of a session; a context manager that leaves both at rest.
 
     Args:
-        stopped: whether the operator wants it to end.
+        stopped: whether the operator has requested the end.
 
     Attributes:
         arm, head, driver: the devices. clock: of the head. odometer: of the arm. epoch: time 0 of the session
@@ -90,7 +90,7 @@ class Rig:
         return time.monotonic() - self.epoch
 
     def poll(self) -> None:
-        """Takes in what both devices have sent, and raises what ends the session.
+        """Reads the data of both devices, and raises the reason if the session must end.
 
         Raises:
             Faulted, Stopped.
@@ -112,10 +112,10 @@ class Rig:
             raise OperatorStop
 
     def wait_until(self, done: Callable[[], bool], longest: float, late: SessionOutcome, what: str) -> None:
-        """Looks until it is done.
+        """Polls until a condition is true.
 
         Args:
-            longest: s. late, what: how the session ends if it takes longer, and what was waited for.
+            longest: s. late, what: outcome if it takes longer, and what was awaited.
 
         Raises:
             Faulted, Stopped.
@@ -128,12 +128,12 @@ class Rig:
             time.sleep(TICK)
 
     def begin(self) -> None:
-        """Counts the session's time from now."""
+        """Sets time 0 of the session to now."""
         self.epoch = time.monotonic()
         self.state_ages = []
 
     def rest(self, reason: str) -> bool:
-        """Stops the arm, unless a fault has, and retracts the whiskers; whether the arm was seen to stand."""
+        """Stops the arm, unless a fault has, and retracts the whiskers; whether the arm was seen at rest."""
         if self.arm.fault is None:
             self.arm.halt(reason)
         self.driver.rest()
@@ -146,19 +146,19 @@ class Rig:
         return self.arm.still()
 
     def record_event(self, name: str, text: str) -> None:
-        """Keeps with the recording that something happened."""
+        """Records an event."""
         if self.recorder is not None:
             self.recorder.add_event(self.now(), name, text)
 
     @property
     def streaming(self) -> bool:
-        """Whether samples come."""
+        """Whether the head sends samples."""
         return self.head.state.link is LinkState.STREAMING
 
     def _take_frames(self) -> None:
         while not self._blocks.empty():
             block = self._blocks.get()
-            if block is None:  # a head was found: its clock may be another one
+            if block is None:  # the head was reconnected: its clock may have changed
                 self.clock, self.whisk_starts = ClockSync(), []
                 self.restarts += 1
                 self._ahead = None
@@ -172,7 +172,7 @@ class Rig:
                 self.recorder.add_frames(frames, arrival - self.epoch)
 
     def _count(self, frames: Frames) -> None:
-        """Holds the head's clock against its count of samples: they agree, whatever the host does."""
+        """Checks the head's clock against its sample count; they agree whatever the load of the host."""
         assert self.head.identity is not None
         ahead = frames.time * 1e-6 - frames.sequence / self.head.identity.rate
         before = ahead[0] if self._ahead is None else self._ahead
@@ -202,7 +202,7 @@ class Rig:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is KeyboardInterrupt:  # asked twice: the second way, at once
+        if kind is KeyboardInterrupt:  # second interrupt: stop by the dashboard server at once
             dashboard.stop_program(self.config.arm.host)
         self.arm.close()
         self.head.close()

@@ -1,4 +1,4 @@
-"""Where the arm goes: targets one after the other, each sent when it has arrived at the one before."""
+"""Route of the arm: a sequence of targets, each sent after arrival at the one before."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class MovableArm(Protocol):
 
 
 class Route:
-    """Targets [K, 6] in the arm's base, at a speed (m/s)."""
+    """Targets [K, 6] in the arm's base frame, at a speed (m/s)."""
 
     def __init__(self, targets: np.ndarray, speed: float) -> None:
         self.targets, self.speed = targets, speed
@@ -39,7 +39,7 @@ class Route:
         """Sends the next target if the arm has arrived; whether it has arrived at the last one.
 
         Raises:
-            robot.ur10.safety.Refused: the arm may not go there.
+            robot.drivers.ur10.safety.TargetRefused: the target is rejected.
         """
         if self.sent and not arm.arrived():
             return False
@@ -50,15 +50,15 @@ class Route:
         return False
 
     def resend_last(self) -> None:
-        """Sends the last target once more, after the arm was stopped on its way."""
+        """Lets the last target be sent again, after a stop on the way to it."""
         self.sent = max(self.sent - 1, 0)
 
 
 def plan_path(config: LiveConfig, head: Head) -> HeadPath:
-    """The poses of the head in the map, in time if nothing holds it up.
+    """Poses of the head in the map over time, for motion without interruptions.
 
     Raises:
-        InputError: there is no such way, or it leads nowhere.
+        InputError: the path cannot be planned or is empty.
     """
     if config.waypoints:
         return _waypoint_path(config)
@@ -92,25 +92,25 @@ def _waypoint_path(config: LiveConfig) -> HeadPath:
 
 
 def main_route(config: LiveConfig, path: HeadPath) -> Route:
-    """The route along a way, without its first pose, where it starts."""
+    """The route along a path, without its first pose, where the arm starts."""
     return Route(tcp_from_pose(config.arm.placing, path.pose[1:]), route_speed(config))
 
 
 def approach_route(config: LiveConfig, path: HeadPath) -> Route:
-    """From wherever the arm stands to above the first pose."""
+    """The route from the present pose of the arm to above the first pose."""
     return Route(tcp_from_pose(config.arm.placing, path.pose[:1], config.lift), route_speed(config))
 
 
 def descent_route(config: LiveConfig, path: HeadPath) -> Route:
-    """From there down to it."""
+    """The route from there down to the first pose."""
     return Route(tcp_from_pose(config.arm.placing, path.pose[:1]), route_speed(config))
 
 
 def check_targets(config: LiveConfig, path: HeadPath) -> None:
-    """Asks for every target whether the arm may go there, before it goes anywhere.
+    """Checks every target before the arm moves.
 
     Raises:
-        InputError: it may not go to one; says to which and why.
+        InputError: a target is rejected; says which and why.
     """
     routes = approach_route(config, path), descent_route(config, path), main_route(config, path)
     targets = np.concatenate([route.targets for route in routes])
@@ -125,5 +125,5 @@ def check_targets(config: LiveConfig, path: HeadPath) -> None:
 
 
 def route_speed(config: LiveConfig) -> float:
-    """m/s, of the plan or what the arm may do, whichever is less."""
+    """The lower of the plan's and the arm's speed, m/s."""
     return min(config.plan.motion.speed, config.arm.speed)

@@ -1,4 +1,4 @@
-"""What is asked of both devices, and of this machine, before anything moves."""
+"""Self-test of both devices and of this machine before anything moves."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from robot.live.rig import Rig
 from tactile.base.errors import InputError
 
 LISTEN_TIME = 1.5
-"""How long both streams are listened to, s."""
+"""Time for which both streams are observed, s."""
 MIN_RATE_SHARE = 0.9
-"""Share of its nominal rate that a stream must have."""
+"""Required share of a stream's nominal rate."""
 
 
 def check_disk(config: LiveConfig, directory: Path) -> str:
-    """How much room the disk has.
+    """Checks the free disk space; returns it in words.
 
     Raises:
-        InputError: too little.
+        InputError: not enough free space.
     """
     there = next(folder for folder in (directory, *directory.resolve().parents) if folder.exists())
     free = shutil.disk_usage(there).free
@@ -36,10 +36,10 @@ def check_disk(config: LiveConfig, directory: Path) -> str:
 
 
 def start_and_check(rig: Rig) -> Iterator[str]:
-    """Starts both devices and listens to them; a line for each thing that is as it should be.
+    """Starts both devices and checks their streams; yields a line for each check that has passed.
 
     Raises:
-        InputError: one is not; says what and what to do.
+        InputError: a check failed; says which and what to do.
         robot.live.rig.SessionFault, robot.live.rig.OperatorStop.
     """
     rig.head.start()
@@ -54,7 +54,7 @@ def start_and_check(rig: Rig) -> Iterator[str]:
     rate = (after.good - before.good) / LISTEN_TIME
     if rate < MIN_RATE_SHARE * identity.rate:
         raise InputError(
-            "head", f"{rate:.0f} of {identity.rate:g} samples a second", "", "look at the USB hub and cable"
+            "head", f"{rate:.0f} of {identity.rate:g} samples a second", "", "check the USB hub and cable"
         )
     if after.bad > before.bad:
         raise InputError(
@@ -65,9 +65,7 @@ def start_and_check(rig: Rig) -> Iterator[str]:
         )
     if rig.clock.residual > rig.config.residual:
         found = f"its clock is known to {rig.clock.residual * 1e3:.1f} ms"
-        raise InputError(
-            "head", found, f"{rig.config.residual * 1e3:g} ms", "look at what else this machine does"
-        )
+        raise InputError("head", found, f"{rig.config.residual * 1e3:g} ms", "check the load of this machine")
     age = float(np.median(rig.state_ages[-100:]))
     yield f"clocks: head {rig.clock.residual * 1e3:.1f} ms, newest state {age * 1e3:.0f} ms old"
 
@@ -78,6 +76,6 @@ def _listen(rig: Rig) -> None:
 
 
 def reported(lines: Iterator[str], tell: Callable[[str], None]) -> None:
-    """Tells every line as it comes."""
+    """Prints every line as it comes."""
     for line in lines:
         tell(line)

@@ -1,4 +1,4 @@
-"""A session under way: along the route, and whisk by whisk to the journal and to whoever maps."""
+"""The whisk loop: moves along the route and passes each whisk to recorder and mapper."""
 
 from __future__ import annotations
 
@@ -21,37 +21,37 @@ from tactile.base.types import Cycle, Odometry
 from tactile.whiskers.whisking import MID_PROTRACTION
 
 MAX_ROUTE_TIME = 120.0
-"""How long a way without whisks may take, s."""
+"""Longest duration of a route without whisks, s."""
 
 
 class AsyncMapper(Protocol):
-    """Whoever makes a map of samples, without being waited for."""
+    """Asynchronous mapper interface."""
 
     @property
     def alive(self) -> bool:
-        """Whether it still does."""
+        """Whether the mapper works."""
         ...
 
     @property
     def failure(self) -> str:
-        """Why not."""
+        """Why the mapper has ended."""
         ...
 
     def behind(self) -> float:
-        """For how long the oldest sample that it has not done has waited, s."""
+        """Waiting time of the oldest sample that is not mapped yet, s."""
         ...
 
     def offer(self, sample: Sample) -> None:
-        """The next sample."""
+        """Passes the next sample; returns at once."""
         ...
 
 
 class WhiskReport(NamedTuple):
-    """A whisk that was handed on.
+    """How a whisk was passed on.
 
     Attributes:
-        number: of the whisk. lateness: s, from its end to then. seen: whether its image went with it.
-        missing: frames that had not come by then.
+        number: of the whisk. lateness: s from its end until then. seen: whether its image was included.
+        missing: number of frames that had not arrived by then.
     """
 
     number: int
@@ -61,7 +61,7 @@ class WhiskReport(NamedTuple):
 
 
 class WhiskSequence(NamedTuple):
-    """Whisks one right after the other, by the head's own clock.
+    """A sequence of consecutive whisks, timed by the head's own clock.
 
     Attributes:
         number: of its first one. first: sequence of its first frame. device: s, that frame's time.
@@ -76,22 +76,22 @@ class WhiskSequence(NamedTuple):
     period: float
 
     def frame_range(self, number: int) -> tuple[int, int]:
-        """Sequences of a whisk's first and last frame."""
+        """Sequence numbers of the first and last frame of a whisk."""
         first = self.first + (number - self.number) * self.samples
         return first, first + self.samples - 1
 
     def start_of(self, number: float) -> float:
-        """s since it began, of a whisk or a moment in one."""
+        """Time of a whisk, or of a moment in one, since the start of the sequence, s."""
         return (number - self.number) * self.period
 
 
 def run_whisk_loop(rig: Rig, route: Route, mapper: AsyncMapper, tell: Callable[[WhiskReport], None]) -> None:
-    """Goes the route, and hands on every whisk; ends with the whisk in which it arrives.
+    """Moves along the route and passes on every whisk; ends with the whisk in which the arm arrives.
 
-    While the head sends nothing, the arm stands.
+    The arm stands while the head sends no samples.
 
     Raises:
-        robot.live.rig.SessionFault: something ends it early. robot.live.rig.OperatorStop: the operator does.
+        robot.live.rig.SessionFault, robot.live.rig.OperatorStop.
     """
     number, most = 0, rig.config.whisks
     arrived = False
@@ -113,36 +113,36 @@ def run_whisk_loop(rig: Rig, route: Route, mapper: AsyncMapper, tell: Callable[[
 
 
 def follow_route(rig: Rig, route: Route) -> None:
-    """Goes a route without whisking for anybody."""
+    """Moves along a route without whisks."""
     rig.wait_until(lambda: _advance(rig, route), MAX_ROUTE_TIME, SessionOutcome.NOT_ARRIVED, "the way")
 
 
 def wait_for_head(rig: Rig, route: Route) -> None:
-    """Stands until the head is back."""
+    """Stops the arm until the head is back."""
     rig.arm.halt("the head sends nothing")
     rig.record_event("held", "the head sends nothing")
-    # How long it is waited for is the reader's to say: it makes a fault of it.
+    # The reader limits the waiting time and turns it into a fault.
     rig.wait_until(lambda: rig.streaming, float("inf"), SessionOutcome.HEAD_GONE, "the head")
     rig.record_event("resumed", "the head is back")
     route.resend_last()
 
 
 def next_sequence(rig: Rig, number: int) -> WhiskSequence:
-    """The sequence that begins with the next whisk.
+    """The sequence that starts with the next whisk.
 
     Raises:
-        InputError: the head makes no whole number of samples a whisk, or begins no whisk.
+        InputError: the samples per whisk are not a whole number.
     """
     rate = rig.config.plan.whisking.rate
     assert rig.head.identity is not None
     count = rig.head.identity.rate / rate
     if abs(count - round(count)) > 1e-6:
         raise InputError("live.plan.whisking.rate", f"{count:g} samples a whisk", "a whole number of samples")
-    rig.poll()  # what a head that was away has sent since may be waiting
+    rig.poll()  # samples sent since the head came back may be waiting
     known, life = len(rig.whisk_starts), rig.restarts
 
     def begun() -> int | None:
-        """The first frame of the first whisk to begin from now on, which may be that of a head found anew."""
+        """First frame of the first whisk to start from now on, also of a reconnected head."""
         return next(iter(rig.whisk_starts[known if rig.restarts == life else 0 :]), None)
 
     longest = rig.config.head.patience + 2 / rate + 1.0
@@ -157,7 +157,7 @@ def next_sequence(rig: Rig, number: int) -> WhiskSequence:
 
 
 def record_free_whisks(rig: Rig, count: int) -> list[Cycle]:
-    """Whisks in free air, as they are, for the calibration."""
+    """Whisks in free air, unprocessed, for the calibration."""
     sequence = next_sequence(rig, 0)
     record = []
     for number in range(count):
@@ -173,7 +173,7 @@ def record_free_whisks(rig: Rig, count: int) -> list[Cycle]:
 
 
 def _hand_on(rig: Rig, sequence: WhiskSequence, number: int, mapper: AsyncMapper) -> WhiskReport | None:
-    """Hands on a whisk that is over, complete or waited for long enough; None while it is neither."""
+    """Passes on a whisk that is complete or was awaited long enough; None while it is neither."""
     first, last = sequence.frame_range(number)
     due = float(rig.clock.to_host(sequence.device + sequence.start_of(number + 1)))
     now = time.monotonic()
@@ -198,7 +198,7 @@ def _hand_on(rig: Rig, sequence: WhiskSequence, number: int, mapper: AsyncMapper
 
 
 def _advance(rig: Rig, route: Route) -> bool:
-    """Whether the arm has arrived at the end of the route; if at a target, it is sent to the next one."""
+    """Whether the arm has arrived at the end of the route; at a target, the next one is sent."""
     try:
         return route.advance(rig.arm)
     except TargetRefused as error:  # for what ends it anyway, or for the target
@@ -213,13 +213,13 @@ def _poll(rig: Rig, mapper: AsyncMapper) -> None:
 
 
 def _has_arrived(rig: Rig, last: int) -> bool:
-    """Whether that sample has come, or a later one."""
+    """Whether that sample or a later one has arrived."""
     newest = rig.head.ring.newest
     return newest is not None and newest[0] >= last
 
 
 def _is_complete(frames: Frames, first: int, last: int, gap: int) -> bool:
-    """Whether fewer than so many samples are missing anywhere on end, and their times are as even."""
+    """Whether fewer than `gap` consecutive samples are missing, and the times have no larger gap either."""
     known = np.concatenate([[first - 1], frames.sequence, [last + 1]])
     step = np.diff(frames.time)
     even = len(step) > 0 and step.min() > 0 and step.max() <= gap * np.median(step)

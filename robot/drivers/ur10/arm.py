@@ -1,11 +1,11 @@
-"""The arm as a session knows it: started after checks, moved, watched by a thread, stopped by two ways.
+"""The arm as seen by a session: start after checks, move, halt, faults.
 
     with Arm(ArmConfig(host="192.168.1.10")) as arm:
-        arm.start()                       # raises Refusal: it never moved, and why
+        arm.start()                       # StartupRefused: a check failed, nothing has moved
         arm.move(tcp_of(config.placing, pose))
         while not arm.arrived() and arm.fault is None: ...
 
-Whatever ends a session's motion becomes `fault`, once; nothing moves after it until `respawn`.
+The first reason to stop becomes `fault`; every move is refused after it until `respawn`.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ __all__ = ["Arm", "StartupRefused", "TargetRefused"]
 
 
 class Arm:
-    """One arm. Its methods are for one thread; what they tell, a supervisor keeps up to date in another."""
+    """One arm. Its methods are for one thread; a supervisor thread keeps its state up to date."""
 
     def __init__(self, config: ArmConfig) -> None:
         self.config = config
         self.reason = ""
-        """Why it was last halted."""
+        """Reason of the last halt."""
         self.shared = SharedState()
         self.supervisor = Supervisor(config, self.shared)
 
@@ -44,7 +44,10 @@ class Arm:
         self.close()
 
     def start(self) -> None:
-        """Check the controller, start the arm's process, check what it sees; raises Refusal."""
+        """Checks the controller, starts the RTDE process and checks its first states.
+
+        Raises:
+            StartupRefused: a check failed; nothing has moved."""
         check_controller(self.config)
         first = self.shared.newest + 1
         self.shared.control["first"] = first
@@ -60,14 +63,15 @@ class Arm:
             raise
 
     def respawn(self) -> None:
-        """Start anew after a fault, with all checks; the pose may be another one, so this is no odometry."""
+        """Starts again after a fault, with all checks. The pose may differ: the motion between is not
+        odometry."""
         self.supervisor.kill_process()
         dashboard.stop_program(self.config.host)
         self.reason = ""
         self.start()
 
     def close(self) -> None:
-        """Stop the arm, end its process, let go of everything."""
+        """Stops the arm, ends its process and releases everything."""
         supervisor = self.supervisor
         supervisor.armed = False
         if supervisor.process is not None and not supervisor.process.end(1.0):
@@ -79,44 +83,44 @@ class Arm:
 
     @property
     def fault(self) -> Fault | None:
-        """What ended the motion; None while all is well."""
+        """Why the arm was stopped; None without a fault."""
         return self.supervisor.fault
 
     @property
     def pid(self) -> int | None:
-        """Of the arm's process, while there is one."""
+        """Process id of the RTDE process; None without one."""
         process = self.supervisor.process
         return None if process is None else process.pid
 
     def states(self, after: int = 0) -> np.ndarray:
-        """All states [N] (STATE) whose counter is larger, as far as the ring reaches back, oldest first."""
+        """All states [N] (ARM_STATE) after a counter that are still in the ring buffer, oldest first."""
         return self.shared.since(after)
 
     def latest(self) -> np.ndarray | None:
-        """The newest state (STATE, one); None before the first."""
+        """The newest state (ARM_STATE, one); None before the first."""
         return self.shared.latest()
 
     @property
     def history(self) -> np.ndarray:
-        """The last 5 s of states [N] (STATE): what to keep of a fault."""
+        """States [N] of the last 5 s, for the report of a fault."""
         return self.supervisor.history()
 
     def age(self) -> float:
-        """s since the newest state was seen; infinite before the first."""
+        """Age of the newest state, s; infinite before the first."""
         return self.supervisor.age()
 
     def still(self) -> bool:
-        """Whether the newest state is fresh and shows an arm at rest."""
+        """Whether the newest state is recent and shows an arm at rest."""
         return self.supervisor.still()
 
     def move(self, tcp: Any, speed: float | None = None) -> Move:
-        """Send the tool to a pose [6] in a straight line; returns at once. A newer move replaces an older.
+        """Starts a straight move of the tool to a pose [6] and returns at once. It replaces a move under way.
 
         Raises:
-            Refused: the target is not one, or the arm is not armed, or has a fault.
+            TargetRefused: the target is invalid, or the arm is not armed or has a fault.
         """
         supervisor = self.supervisor
-        with supervisor.lock:  # a fault that is found meanwhile would not revoke the order
+        with supervisor.lock:  # a fault found in between would not revoke the command
             state = self.latest()
             if self.fault is not None or not supervisor.armed or state is None:
                 raise TargetRefused(f"the arm does not move: {self.fault or 'it is not armed'}")
@@ -125,17 +129,17 @@ class Arm:
         return move
 
     def arrived(self) -> bool:
-        """Whether the last move has begun, has ended, and the arm stands where it was sent."""
+        """Whether the last move has started and ended and the arm is at its target."""
         errand = self.supervisor.pending
         return errand is not None and self.supervisor.arrived(errand)
 
     def halt(self, reason: str) -> None:
-        """Stop, controlled; by the dashboard server if the arm does not stand in time. Moves may follow."""
+        """Stops the arm, by the dashboard server where it does not stop in time. Moves may follow."""
         self.reason = reason
         self.supervisor.halt()
 
     def fail(self, outcome: SessionOutcome, detail: str) -> None:
-        """Stop because of what somebody else found; on a contact the tool backs off the way it came."""
+        """Stops the arm for a reason found elsewhere; after a contact the tool backs off the way it came."""
         self.supervisor.fail(Finding(outcome, detail))
 
     def _await_ready(self, process: ArmProcess) -> None:
@@ -150,11 +154,11 @@ class Arm:
             if refused is not None:
                 raise refused
             if ended is not None:
-                raise StartupRefused(ended.detail, "", "look at the controller's ports 30003 and 30004")
+                raise StartupRefused(ended.detail, "", "check the controller's ports 30003 and 30004")
             if time.monotonic() > patience:
                 raise StartupRefused(
                     f"the controller did not take the control script in {self.config.connect:g} s",
                     "",
-                    "look at the pendant: remote control on, no message waiting",
+                    "check the pendant: remote control on, no message waiting",
                 )
             time.sleep(TICK)

@@ -1,4 +1,4 @@
-"""Where the plane of the map lies in the arm's base: poses of the head become poses of the tool, and back.
+"""Transform between poses of the head in the map and tool poses in the arm's base frame.
 
 A tool pose is an array [..., 6] as UR controllers write it: x, y, z of the tool centre point in the base
 frame, m, and a rotation vector, rad. The tool points down: its rotation is Rz(heading) Rx(pi), half a turn
@@ -17,25 +17,25 @@ from tactile.base.se2 import between, compose
 
 
 class BaseTransformConfig(Settings):
-    """The map's origin and x axis in the arm's base frame.
+    """Pose of the map in the arm's base frame.
 
     The default sets a maze of 7 x 5 micromouse cells before the base, within a UR-10's reach.
     """
 
     x: float = -0.63
-    """Of the map's origin, m."""
+    """x of the map's origin, m."""
     y: float = 0.22
-    """Of the map's origin, m."""
+    """y of the map's origin, m."""
     z: float = 0.1
-    """Of the tool centre point at working height, m."""
+    """Height of the tool centre point at working height, m."""
     yaw_deg: Annotated[float, Field(ge=-180, le=180)] = 0.0
-    """From the base's x axis to the map's, degrees."""
+    """Angle from the base's x axis to the map's, degrees."""
 
 
 def tcp_from_pose(
     config: BaseTransformConfig, pose: np.ndarray, lift: float | np.ndarray = 0.0
 ) -> np.ndarray:
-    """[..., 6] the tool pose that puts the head at a pose of the map.
+    """Tool poses [..., 6] for poses of the head in the map.
 
     Args:
         pose: [..., 3] x, y (m) and heading (rad) in the map. lift: [...] m above working height.
@@ -47,14 +47,14 @@ def tcp_from_pose(
 
 
 def pose_from_tcp(config: BaseTransformConfig, tcp: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The head's pose in the map [..., 3], heading wrapped, and its lift above working height [...] m."""
+    """Pose of the head in the map [..., 3], heading wrapped, and its lift above working height [...] m."""
     tcp = np.asarray(tcp, np.float64)
     pose = np.stack([tcp[..., 0], tcp[..., 1], tcp_heading(tcp)], axis=-1)
     return between(_origin(config), pose), tcp[..., 2] - config.z
 
 
 def tcp_heading(tcp: np.ndarray) -> np.ndarray:
-    """[...] rad: where the tool's x axis points, seen from above, in the base frame."""
+    """Heading of the tool's x axis in the base frame, seen from above, [...] rad."""
     axis, turn = _axis_angle(tcp)
     x, y, z = np.moveaxis(axis, -1, 0)
     cos, sin = np.cos(turn), np.sin(turn)
@@ -62,14 +62,14 @@ def tcp_heading(tcp: np.ndarray) -> np.ndarray:
 
 
 def tcp_tilt(tcp: np.ndarray) -> np.ndarray:
-    """[...] rad: the angle between the tool's z axis and straight down."""
+    """Angle between the tool's z axis and straight down, [...] rad."""
     axis, turn = _axis_angle(tcp)
     up = np.cos(turn) + axis[..., 2] ** 2 * (1 - np.cos(turn))
     return np.arccos(np.clip(-up, -1.0, 1.0))
 
 
 def _axis_angle(tcp: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The rotation's axis [..., 3], unit (any for no rotation), and its angle [...] rad."""
+    """Rotation axis [..., 3] of unit length (any for no rotation) and angle [...] rad."""
     vector = np.asarray(tcp, np.float64)[..., 3:]
     turn = np.linalg.norm(vector, axis=-1)
     return vector / np.where(turn > 0, turn, 1.0)[..., None], turn

@@ -1,7 +1,7 @@
-"""Who speaks to the arm: stops first, then moves, then food for the watchdog; in a thread of its own.
+"""Command thread of the RTDE process. Priority: stop, move, watchdog reset.
 
-A call of the control interface takes some 20 ms, and for ever when the controller stalls. States are read and
-judged beside it, in the thread that owns the process (child.py).
+A call of the control interface takes some 20 ms, and never returns when the controller stalls. The main
+thread of the process (rtde_process.py) therefore reads and checks states.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ from robot.drivers.ur10.safety import (
 )
 from robot.drivers.ur10.shared_state import SharedState
 
-MAX_MISSING_STATES = 3  # periods without a state that are no accident
+MAX_MISSING_STATES = 3  # state periods without a state that count as an interruption
 SCRIPT_UNUSABLE = {
     SessionOutcome.ARM_GONE,
     SessionOutcome.PROTECTIVE_STOP,
     SessionOutcome.SAFEGUARD_STOP,
     SessionOutcome.EMERGENCY_STOP,
 }
-"""Ends after which the control script is not spoken to: its watchdog goes hungry and ends it."""
+"""Outcomes after which the control script gets no more commands: its watchdog times out and ends it."""
 
 
 class ArmCommand(NamedTuple):
-    """What the session wants of the arm.
+    """A command from the session.
 
     Attributes:
-        do: `move`, `retreat` or `end`. number: of the order. target: [6] tool pose. speed: as the controller
-            is told. stops: how many stops the session had asked for; a later stop revokes the order.
+        do: `move`, `retreat` or `end`. number: of the command. target: [6] tool pose. speed: m/s, as sent to
+            the controller. stops: number of stops requested before; a later stop revokes the command.
     """
 
     do: str
@@ -54,7 +54,7 @@ class ArmCommand(NamedTuple):
 
 
 class CommandThread:
-    """The control interface, what holds the arm, and what is still to be told.
+    """Sends commands to the control interface, and decides whether to stop.
 
     Attributes:
         held: why no more moves are taken. ungoverned: whether the control script is left alone.
@@ -70,27 +70,28 @@ class CommandThread:
         self._retreating = False
         self._watch = StateMemory()
         self._rest = np.zeros(6)
-        self._force_limit = math.inf  # N; no contact is judged before the force at rest is known
+        self._force_limit = math.inf  # N; contacts are detected once the force at rest is known
         self._own_stops = 0
         self._stopped = self._wanted()
         self._orders: queue.SimpleQueue[ArmCommand] = queue.SimpleQueue()
         self._wake = threading.Event()
 
-    # What the thread that reads states calls.
+    # Called by the thread that reads states.
 
     def set_rest_force(self, rest: np.ndarray) -> None:
-        """From now on a contact counts; `rest` [6] is the force without one."""
+        """Sets the force without contact [6] and starts the detection of contacts."""
         self._rest, self._force_limit = rest, self.config.force_limit
         self._watch = self._watch._replace(loaded=0)
 
     def check_state(self, state: np.ndarray) -> None:
-        """Stop if a state (STATE) says so."""
+        """Stops if a state (ARM_STATE) requires it."""
         self._watch, finding = check_state(self.config, self._watch, state, self._rest, self._force_limit)
         if finding is not None:
             self.hold(finding)
 
     def hold(self, finding: Finding) -> None:
-        """Stop, and take no more moves. What holds already and is no retreat has been stopped."""
+        """Stops and refuses further moves, unless a finding already did so. A retreat under way is stopped
+        too."""
         self.script_unusable |= finding.outcome in SCRIPT_UNUSABLE
         if self.held is not None and not self._retreating:
             return
@@ -101,7 +102,7 @@ class CommandThread:
         self.stop()
 
     def stop(self) -> None:
-        """Ask for one more stop."""
+        """Requests a stop."""
         self._own_stops += 1
         self._wake.set()
 
@@ -110,19 +111,19 @@ class CommandThread:
         self._wake.set()
 
     def check_stop_request(self) -> None:
-        """See whether the session asks for a stop."""
+        """Wakes the thread if the session has requested a stop."""
         if self._wanted() != self._stopped:
             self._wake.set()
 
     @property
     def stops_sent(self) -> bool:
-        """Whether every stop has been told."""
+        """Whether every requested stop has been sent."""
         return self.script_unusable or self._wanted() == self._stopped
 
-    # What its own thread does.
+    # Called by the command thread.
 
     def run(self) -> None:
-        """For ever; the process ends without it."""
+        """Runs until the process ends."""
         while True:
             self._wake.wait(0.3 / self.config.watchdog_hz)
             self._wake.clear()
@@ -130,7 +131,8 @@ class CommandThread:
                 self.act()
 
     def act(self) -> None:
-        """Stop if asked to, then begin what was ordered; feed the watchdog while the session lives."""
+        """Sends a requested stop, then starts queued moves; resets the watchdog while the session's heartbeat
+        is recent."""
         wanted = self._wanted()
         if wanted != self._stopped:
             self.control.stopL(self.config.deceleration, True)
@@ -141,7 +143,7 @@ class CommandThread:
             self.control.kickWatchdog()
 
     def execute(self, order: ArmCommand) -> None:
-        """Begin a move, if nothing speaks against it."""
+        """Starts a move after the last checks."""
         here = self.shared.latest()
         if here is None or self._revoked(order):
             return
@@ -150,15 +152,15 @@ class CommandThread:
             if order.do == "retreat":
                 _check_retreat(self.config, target, here["tcp"], order.speed)
         except TargetRefused as refused:
-            self.hold(Finding(SessionOutcome.NOT_ARRIVED, f"the arm's process refused: {refused}"))
+            self.hold(Finding(SessionOutcome.NOT_ARRIVED, f"the RTDE process refused the target: {refused}"))
             return
-        # moveL takes any target: one without joints ends the script on a real controller.
+        # moveL accepts any target; one without joint solution ends the script on a real controller.
         if not self.control.isPoseWithinSafetyLimits(target.tolist()):
             time.sleep(
                 MAX_MISSING_STATES / self.config.hz
-            )  # False means a stop as well: then a state says so
+            )  # False is also returned during a stop, which a state then shows
             places = ", ".join(f"{v:.3f}" for v in target)
-            self.hold(Finding(SessionOutcome.UNREACHABLE, f"no joints for ({places})"))
+            self.hold(Finding(SessionOutcome.UNREACHABLE, f"no joint solution for ({places})"))
             return
         if self._revoked(order):
             return
@@ -183,4 +185,4 @@ class CommandThread:
 def _check_retreat(config: ArmConfig, target: np.ndarray, here: np.ndarray, speed: float) -> None:
     way = math.dist(target[:3], here[:3])
     if way > config.backoff + 2 * MOVED_ON or speed > RETREAT_SPEED:
-        raise TargetRefused(f"backing off by {way:.3f} m at {speed:g} m/s")
+        raise TargetRefused(f"a retreat of {way:.3f} m at {speed:g} m/s exceeds the limits")

@@ -1,6 +1,6 @@
-"""The controller's dashboard server: a line asked, a line answered. The second way to stop the arm.
+"""Client of the controller's dashboard server (a line of text per request): the second way to stop the arm.
 
-An own client, because it has to answer or give up within a time, whatever the controller does.
+Our own client: it always returns within a time limit, whatever the controller does.
 """
 
 from __future__ import annotations
@@ -11,20 +11,20 @@ from contextlib import suppress
 from typing import NamedTuple
 
 PORT = 29999
-MIN_POLYSCOPE = (3, 4)  # PolyScope; older ones lack what the control script asks for
+MIN_POLYSCOPE = (3, 4)  # PolyScope; older versions lack functions that the control script uses
 
 
 class DashboardSilent(ConnectionError):
-    """Nobody answers as a dashboard server does."""
+    """No dashboard server answers."""
 
 
 class ControllerStatus(NamedTuple):
-    """What a controller says of itself.
+    """Status of a controller.
 
     Attributes:
         version: of PolyScope, as (5, 11). mode: robot mode, as `RUNNING`. safety: safety mode, as `NORMAL`.
         program: whether a program runs. remote: whether it is under remote control; None where it has no such
-            switch (CB3, PolyScope before 5.6).
+            switch (CB3, or PolyScope before 5.6).
     """
 
     version: tuple[int, ...]
@@ -54,7 +54,7 @@ class Dashboard:
         self.close()
 
     def ask(self, command: str) -> str:
-        """The answer to a command, one line."""
+        """Sends a command and returns the answer, one line."""
         try:
             self._socket.sendall(command.encode() + b"\n")
             return self._line()
@@ -62,11 +62,11 @@ class Dashboard:
             raise DashboardSilent(f"{self.host}:{PORT} did not answer `{command}` ({error})") from None
 
     def stop(self) -> str:
-        """End the controller's program, which stops the arm."""
+        """Ends the controller's program, which stops the arm."""
         return self.ask("stop")
 
     def controller(self) -> ControllerStatus:
-        """What the controller says of itself."""
+        """Asks for the status of the controller."""
         version = _version(self.ask("PolyscopeVersion"))
         safety = self.ask("safetymode")
         remote = "true" in self.ask("is in remote control").lower() if version >= (5, 6) else None
@@ -74,7 +74,7 @@ class Dashboard:
         return ControllerStatus(version, _value(self.ask("robotmode")), _value(safety), program, remote)
 
     def close(self) -> None:
-        """Hang up."""
+        """Closes the connection."""
         with suppress(OSError):
             self._socket.close()
 
@@ -82,16 +82,16 @@ class Dashboard:
         while b"\n" not in self._rest:
             data = self._socket.recv(4096)
             if not data:
-                raise OSError("it hung up")
+                raise OSError("the server closed the connection")
             self._rest += data
             if len(self._rest) > 65536:
-                raise OSError("it answers without end")
+                raise OSError("an answer without end")
         line, self._rest = self._rest.split(b"\n", 1)
         return line.decode(errors="replace").strip()
 
 
 def stop_program(host: str, timeout: float = 0.5, tries: int = 3) -> str:
-    """Stop the controller's program by a connection of its own; its answer, '' if nobody gives one."""
+    """Ends the controller's program over a new connection; returns the answer, '' without one."""
     for _ in range(tries):
         with suppress(DashboardSilent), Dashboard(host, timeout) as dashboard:
             return dashboard.stop()

@@ -1,7 +1,7 @@
-"""Where the tool of a controller is, as a stream: a small RTDE client that only listens.
+"""Listener for the tool pose of a controller: a small RTDE client that only reads.
 
-It writes nothing to the controller and claims none of its registers, so it can listen beside whoever moves
-the arm; it speaks to an emulated controller and to a real one alike.
+It writes nothing to the controller and claims no registers, so it can run beside the program that moves the
+arm, with a real or an emulated controller.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _FIELDS = ("timestamp", "actual_TCP_pose", "actual_TCP_speed")
 
 
 class ToolPose(NamedTuple):
-    """A tool's pose when it was told.
+    """A tool pose with its time.
 
     Attributes:
         time: s, host's monotonic clock at receipt. tcp: [6] m and rotation vector in the base.
@@ -37,11 +37,11 @@ class ToolPose(NamedTuple):
 
 
 class PoseListener:
-    """Listens in a thread of its own, and connects anew whenever the controller goes away.
+    """Reads poses in a separate thread, and reconnects when the connection is lost.
 
     Args:
-        host: the controller. hz: states a second to ask for. patience: s without a state after which it
-            connects anew. port: RTDE's.
+        host: of the controller. hz: requested state rate. patience: s without a state after which it
+            reconnects. port: of RTDE.
     """
 
     def __init__(self, host: str, hz: float = 125, patience: float = 1.0, port: int = RTDE_PORT) -> None:
@@ -59,11 +59,11 @@ class PoseListener:
         return None if pose is None else (pose.time, pose.tcp, pose.speed)
 
     def newest(self) -> ToolPose | None:
-        """The newest state with the controller's time."""
+        """The newest state, with the controller's time."""
         return self._latest
 
     def close(self) -> None:
-        """Stop listening."""
+        """Ends the thread."""
         self._closing.set()
         self._thread.join(self._patience + 1.0)
 
@@ -77,7 +77,7 @@ class PoseListener:
 
     def _run(self) -> None:
         while not self._closing.is_set():
-            # A package that cannot be one, too: the connection is of no more use.
+            # also an invalid package: the connection cannot be used any further
             with contextlib.suppress(OSError, ValueError, struct.error):
                 self._listen()
             self._closing.wait(0.1)

@@ -1,4 +1,4 @@
-"""The arm's process seen from the session: started, given orders, heard, buried."""
+"""Handle of the RTDE subprocess, for the session."""
 
 from __future__ import annotations
 
@@ -20,8 +20,11 @@ CONNECTION_LOST = ("closed the connection", "Connection reset", "Connection refu
 
 
 class ArmProcess:
-    """A running `robot.drivers.ur10.rtde_process`. Its end of the pipes closes with this process, however
-    that ends."""
+    """A running `robot.drivers.ur10.rtde_process`. The pipes close with this process, however it ends; the
+    subprocess then stops the arm and ends.
+
+    Args:
+        shared: file descriptor of the shared memory."""
 
     def __init__(self, shared: int, config: ArmConfig) -> None:
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115
@@ -53,18 +56,18 @@ class ArmProcess:
         return self._process.pid
 
     def send(self, **fields: Any) -> None:
-        """Send an order; a process that is gone is found out elsewhere."""
-        with contextlib.suppress(OSError, ValueError):  # ValueError: its end of the line is closed
+        """Sends a command. A process that has ended is detected elsewhere."""
+        with contextlib.suppress(OSError, ValueError):  # ValueError: the pipe is closed
             self._orders.write(json.dumps(fields).encode() + b"\n")
 
     def reports(self) -> list[dict[str, Any]]:
-        """What it has told since the last time."""
+        """Reports since the last call."""
         data = self._reports.read(65536) or b""
         *lines, self._rest = (self._rest + data).split(b"\n")
         return [json.loads(line) for line in lines]
 
     def exit_finding(self) -> Finding | None:
-        """How it ended; None while it runs."""
+        """Why it ended; None while it runs."""
         code = self._process.poll()
         if code is None:
             return None
@@ -72,19 +75,19 @@ class ArmProcess:
         name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
         lines = [line for line in said.splitlines() if "what():" in line] or said.splitlines() or [""]
         last = lines[-1].replace("what():", "").strip()[-200:]
-        detail = f"the arm's process ended ({name})" + (f": {last}" if last else "")
+        detail = f"the RTDE process ended ({name})" + (f": {last}" if last else "")
         if code == -signal.SIGABRT and not any(word in said for word in CONNECTION_LOST):
             return Finding(SessionOutcome.ARM_MALFORMED, detail)
         return Finding(SessionOutcome.ARM_GONE, detail)
 
     def stderr_tail(self) -> str:
-        """What it and the library printed."""
-        # A position of our own: the file's is shared with the process that writes.
+        """The last 4 kB that the process and the library printed."""
+        # pread: the file position is shared with the process that writes
         size = os.fstat(self._errors.fileno()).st_size
         return os.pread(self._errors.fileno(), 4096, max(0, size - 4096)).decode(errors="replace")
 
     def end(self, patience: float) -> bool:
-        """Ask it to stop the arm and go; whether it did in time, s."""
+        """Asks the process to stop the arm and end; False if it has not ended within `patience` s."""
         self.send(do="end")
         try:
             self._process.wait(patience)
@@ -93,7 +96,7 @@ class ArmProcess:
         return True
 
     def kill(self) -> None:
-        """Make sure that it is gone."""
+        """Kills the process."""
         self._process.kill()
         self._process.wait()
         for file in (self._orders, self._reports, self._errors):

@@ -1,13 +1,13 @@
-"""The arm's own process: the only one that loads ur_rtde, which aborts, hangs and faults when controllers do.
+"""The RTDE process: the only one that loads ur_rtde, which aborts, hangs or crashes on controller faults.
 
     python -m robot.drivers.ur10.rtde_process FD CONFIG_JSON
 
 FD is the inherited descriptor of the shared memory (shared_state.py). Commands come as JSON lines on the
-standard input, reports leave as
-JSON lines on the standard output, whatever the library prints goes to the standard error.
+standard input, reports leave as JSON lines on the standard output; the output of the library goes to the
+standard error.
 
-The arm is stopped from here when a state says so, when the session asks for it, when it falls silent, and
-when it is gone. Should this process be gone as well, the controller's watchdog goes hungry and stops the arm.
+This process stops the arm when a state requires it, when the session requests it, and when the session hangs
+or has ended. If this process ends as well, the controller's watchdog times out and stops the arm.
 """
 
 from __future__ import annotations
@@ -33,8 +33,10 @@ from robot.drivers.ur10.shared_state import ARM_STATE, SharedState
 from tactile.base.errors import InputError
 
 PLAYING = 2  # runtime state
-REST_TIME = 0.25  # s of states at rest from which the force at rest is taken, and the session takes the rate
-LAST_STOP = 0.4  # s that a last stop may take before the dashboard server is asked for it
+REST_TIME = (
+    0.25  # s of states at rest over which the force at rest is averaged and the session measures the rate
+)
+LAST_STOP = 0.4  # s that the last stop may take before the dashboard server is asked to stop
 
 VARIABLES = [
     "timestamp",
@@ -49,7 +51,7 @@ VARIABLES = [
 
 
 class RtdeProcess:
-    """Both interfaces of a controller: states are read, judged and passed on, the session is listened to."""
+    """Reads and checks states, publishes them, and watches the session."""
 
     def __init__(
         self, config: ArmConfig, shared: SharedState, receive: Any, control: Any, reports: int
@@ -63,7 +65,7 @@ class RtdeProcess:
         self._input = b""
 
     def run(self) -> None:
-        """Until the session ends or is gone."""
+        """Runs until the session has ended."""
         began = time.monotonic()
         threading.Thread(target=self.commands.run, daemon=True).start()
         while not self._finished():
@@ -87,14 +89,14 @@ class RtdeProcess:
             time.sleep(0.25 / self.config.hz)
 
     def report(self, **fields: Any) -> None:
-        """Tell the session; if it is gone, nobody."""
+        """Sends a report to the session."""
         try:
             os.write(self._reports, json.dumps(fields).encode() + b"\n")
         except OSError:
-            self._leave("the session does not listen")
+            self._leave("the session has closed its pipe")
 
     def _read(self, now: float) -> bool:
-        """Take over a new state, all of one packet; whether there was one."""
+        """Reads a state, all fields from one packet; whether it was a new one."""
         receive, state = self.receive, self._state
         stamp = receive.getTimestamp()
         if stamp == state["robot"]:
@@ -119,7 +121,7 @@ class RtdeProcess:
         return True
 
     def _settle(self) -> None:
-        """The force at rest is the median of what was seen; the arm is ready."""
+        """Takes the median force as the force at rest and reports that the arm is ready."""
         states = self.shared.since(int(self.shared.control["first"]) - 1)
         self.commands.set_rest_force(np.median(states["force"], axis=0))
         self._settled = True
@@ -129,13 +131,13 @@ class RtdeProcess:
         self.commands.hold(Finding(SessionOutcome.ARM_GONE, detail))
 
     def _listen(self) -> None:
-        """Take orders; the end of the input is the end of the session."""
+        """Reads commands; the end of the input means the end of the session."""
         try:
             data = os.read(0, 65536)
         except BlockingIOError:
             return
         if not data:
-            self._leave("the session is gone")
+            self._leave("the session has ended")
         *lines, self._input = (self._input + data).split(b"\n")
         for line in lines:
             order = ArmCommand(**json.loads(line))
@@ -145,7 +147,7 @@ class RtdeProcess:
                 self.commands.put(order)
 
     def _leave(self, reason: str) -> None:
-        """Begin to end: a last stop."""
+        """Starts to end: requests a last stop."""
         if math.isinf(self._leaving):
             print(reason, file=sys.stderr, flush=True)
             self._leaving = time.monotonic() + LAST_STOP
@@ -153,7 +155,7 @@ class RtdeProcess:
             self.commands.stop()
 
     def _finished(self) -> bool:
-        """Whether the arm stands, or all was tried; the program on the controller is ended with it."""
+        """Whether the arm stands or the last stop has timed out; also ends the program on the controller."""
         stands = self.commands.leaving and self.commands.stops_sent and at_rest(self._state)
         if stands or time.monotonic() > self._leaving:
             dashboard.stop_program(self.config.host)
@@ -162,7 +164,7 @@ class RtdeProcess:
 
 
 def connect(config: ArmConfig) -> tuple[Any, Any]:
-    """The library's receive and control interfaces, with the tool set and the watchdog on."""
+    """The receive and control interfaces of the library, with tool and watchdog set."""
     try:
         import rtde_control
         import rtde_receive
@@ -178,15 +180,15 @@ def connect(config: ArmConfig) -> tuple[Any, Any]:
 
 
 def main(shared_fd: str, text: str) -> None:
-    """The process; ends without destructors, for the library aborts in them when the controller is gone."""
+    """The process. It ends without destructors, in which the library aborts when the connection is lost."""
     reports = os.dup(1)
     os.dup2(2, 1)
     os.set_blocking(0, False)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the session decides what an interrupt means
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the session handles interrupts
     set_niceness(URGENT)
     config = ArmConfig.model_validate_json(text)
     shared = SharedState(int(shared_fd))
-    # The constructors hold the interpreter's lock and may wait for ever; the alarm ends even that.
+    # The constructors hold the interpreter's lock and may never return; the alarm ends even those.
     signal.alarm(math.ceil(config.connect) + 1)
     try:
         receive, control = connect(config)

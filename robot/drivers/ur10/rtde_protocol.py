@@ -1,4 +1,4 @@
-"""RTDE, version 2: packages, the variables a controller knows and how they are packed. For both ends of it.
+"""RTDE protocol, version 2: packages, variables and their binary layout, for clients and the emulator.
 
 Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide". Everything is big-endian; a package is a
 length of 2 bytes (which counts itself), a kind of 1 byte and a body.
@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 VERSION = 2
-RTDE_PORT = 30004  # fixed: the client library knows no other
+RTDE_PORT = 30004  # fixed: the client library supports no other
 HEADER = struct.Struct(">HB")
 PROTOCOL, CONTROLLER, TEXT = ord("V"), ord("v"), ord("M")
 OUTPUTS, INPUTS, START, PAUSE, DATA = ord("O"), ord("I"), ord("S"), ord("P"), ord("U")
@@ -66,30 +66,33 @@ INPUT_TYPES = _types("input", _INPUTS)
 
 
 class Package(NamedTuple):
-    """One package: its kind (a letter's code) and its body."""
+    """One package: its kind (character code) and body."""
 
     kind: int
     body: bytes
 
 
 def pack_package(kind: int, body: bytes = b"") -> bytes:
-    """A package as it goes over the wire."""
+    """The bytes of a package."""
     return HEADER.pack(HEADER.size + len(body), kind) + body
 
 
 def data_layout(types: Sequence[str]) -> struct.Struct:
-    """How a data package with these types is packed, its recipe's number first."""
+    """Layout of a data package with variables of these types, after its recipe number."""
     return struct.Struct(">B" + "".join(CODES[name] for name in types))
 
 
 class PackageSplitter:
-    """Cuts a stream into packages."""
+    """Splits a byte stream into packages."""
 
     def __init__(self) -> None:
         self._rest = bytearray()
 
     def feed(self, data: bytes) -> Iterator[Package]:
-        """The packages that are whole now. Raises ValueError where a length cannot be."""
+        """The packages completed by these bytes.
+
+        Raises:
+            ValueError: an invalid length."""
         self._rest += data
         while len(self._rest) >= HEADER.size:
             length, kind = HEADER.unpack_from(self._rest)

@@ -1,6 +1,6 @@
-"""What the arm may do, and what it must not go on after: pure functions, asked in both processes.
+"""Checks of targets and states: pure functions, used in both processes.
 
-They add to the robot's own safety configuration and never replace it.
+They complement the robot's own safety configuration and do not replace it.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10.base_transform import tcp_tilt
 from robot.drivers.ur10.config import SPEED_CAP, TURN_CAP, ArmConfig
 
-REACH = 3.0  # m; a UR-10 has 1.3. A tool further away is no state of an arm
+REACH = 3.0  # m; a UR-10 reaches 1.3. A tool further away means an invalid state
 JOINT_RANGE = 2.2 * np.pi  # rad; a UR joint turns by 2 pi either way
-MIN_LOADED = 2  # states that have to show a force before it counts: one may be noise
-ROUNDING = 1e-6  # m; what a pose may lie beyond the box because it was computed
+MIN_LOADED = 2  # consecutive states with too large a force that count as a contact
+ROUNDING = 1e-6  # m; tolerance of the box for rounding
 RETREAT_SPEED = 0.02  # m/s; speed of backing off
-MIN_SPEED = 1e-3  # m/s; the slowest a move is worth waiting for
-MOVED_ON = 1e-3  # m; the arm may have moved on since its session looked
+MIN_SPEED = 1e-3  # m/s; lowest speed of a move
+MOVED_ON = 1e-3  # m; possible motion of the arm since the session read a state
 
-# Safety status bits of RTDE, gravest first.
+# Safety status bits of RTDE, most severe first.
 SAFETY_BITS = (
     (0b11100000, SessionOutcome.EMERGENCY_STOP, "an emergency stop is pressed"),
     (1 << 2, SessionOutcome.PROTECTIVE_STOP, "the controller made a protective stop"),
@@ -35,15 +35,15 @@ SAFETY_BITS = (
 
 
 class TargetRefused(ValueError):
-    """A target that the arm is not sent to."""
+    """A target that is rejected."""
 
 
 class Move(NamedTuple):
-    """A checked motion along a straight line.
+    """A checked straight move.
 
     Attributes:
-        target: [6] tool pose. speed: m/s as the controller is told. seconds: it should take.
-        most: s it takes a controller that turns by 1 rad/s for every m/s told.
+        target: [6] tool pose. speed: m/s, as sent to the controller. seconds: expected duration.
+        most: duration on a controller that turns by 1 rad/s for every m/s, s.
     """
 
     target: np.ndarray
@@ -53,17 +53,17 @@ class Move(NamedTuple):
 
 
 class Finding(NamedTuple):
-    """Why the arm must stop: how that end is called, and what was found."""
+    """Why the arm must stop: the outcome and what was found."""
 
     outcome: SessionOutcome
     detail: str
 
 
 class StateMemory(NamedTuple):
-    """What is remembered from state to state.
+    """Memory from state to state.
 
     Attributes:
-        loaded: states in a row with too large a force. robot: s, the last state's clock.
+        loaded: consecutive states with too large a force. robot: controller time of the last state, s.
     """
 
     loaded: int = 0
@@ -71,9 +71,14 @@ class StateMemory(NamedTuple):
 
 
 def check_target(config: ArmConfig, target: Any, from_tcp: Any) -> np.ndarray:
-    """The target [6] if the arm may go there from where it stands, in a straight line; else raises Refused.
+    """Checks that the arm may move to a target in a straight line from its present pose; returns the target
+    [6].
 
-    A box is convex: a line between two points of it stays in it.
+
+    The box is convex: a line between two points in it stays in it.
+
+    Raises:
+        TargetRefused: the target or the present pose is invalid.
     """
     try:
         target = np.array(target, np.float64)
@@ -101,12 +106,12 @@ def check_target(config: ArmConfig, target: Any, from_tcp: Any) -> np.ndarray:
 
 
 def plan_move(config: ArmConfig, target: Any, from_tcp: Any, speed: float | None = None) -> Move:
-    """A checked move at a checked speed (m/s; none: the configured one).
+    """Plans a checked move at a checked speed (m/s; None: the configured one).
 
-    A controller is told the speed of the tool centre point, and makes a turning speed of it in its own way
-    (`turn_ratio`). A way shorter than speed^2 / acceleration counts as on the spot: whatever is told, the
-    tool gets no faster than `speed` on it; so does a millimetre. On longer ones a turn that were faster than
-    1 rad/s slows the move down.
+    A controller gets the speed of the tool centre point only, and derives the turning rate from it
+    (`turn_ratio`). A path shorter than speed^2 / acceleration, or than 1 mm, counts as a turn on the spot:
+    the tool cannot exceed `speed` on it at any commanded speed. On longer paths the move is slowed down so
+    that it turns by at most 1 rad/s.
     """
     target = check_target(config, target, from_tcp)
     speed = config.speed if speed is None else speed
@@ -124,25 +129,27 @@ def plan_move(config: ArmConfig, target: Any, from_tcp: Any, speed: float | None
 
 
 def check_command(config: ArmConfig, target: Any, from_tcp: Any, told: float) -> np.ndarray:
-    """The last check before the wire: the target, if what is to be told keeps to every limit."""
+    """The last check before a command is sent: returns the target if the command keeps every limit."""
     target = check_target(config, target, from_tcp)
     way = float(np.linalg.norm(target[:3] - np.asarray(from_tcp, np.float64)[:3]))
     short = way <= max(config.speed**2 / config.acceleration, MOVED_ON) + MOVED_ON
     most = max(config.speed, config.turn_rate / config.turn_ratio) if short else config.speed
     if not (isinstance(told, float | int) and 0 < told <= min(most, SPEED_CAP)):
-        raise TargetRefused(f"told {told!r} m/s on a way of {way:.3f} m; at most {most:g} are allowed")
+        raise TargetRefused(
+            f"a commanded speed of {told!r} m/s over {way:.3f} m; at most {most:g} is allowed"
+        )
     return target
 
 
 def rotation_angle(a: np.ndarray, b: np.ndarray) -> float:
-    """The angle in [0, pi] between the rotations of two tool poses [6], rad."""
+    """Angle in [0, pi] between the rotations of two tool poses [6], rad."""
     p, q = _quaternion(a[3:]), _quaternion(b[3:])
     chord = min(np.linalg.norm(p - q), np.linalg.norm(p + q))  # q and -q are the same rotation
     return float(4 * np.arcsin(min(1.0, float(chord) / 2)))
 
 
 def at_target(config: ArmConfig, tcp: np.ndarray, target: np.ndarray) -> bool:
-    """Whether a tool pose is the target, as near as the settings ask."""
+    """Whether a tool pose is at the target, within the configured tolerances."""
     near = float(np.linalg.norm(tcp[:3] - target[:3])) <= config.arrive
     return near and np.degrees(rotation_angle(tcp, target)) <= config.arrive_turn_deg
 
@@ -155,13 +162,13 @@ def in_box(config: ArmConfig, tcp: np.ndarray) -> bool:
 
 
 def exceeds_force(config: ArmConfig, force: np.ndarray, rest: np.ndarray, most: float | None = None) -> bool:
-    """Whether a force [6] differs from that at rest by more than the limit (`most`; none: as configured)."""
+    """Whether a force [6] differs from that at rest by more than a limit (`most`; None: as configured)."""
     limit = config.force_limit if most is None else most
     return not math.hypot(*(force[:3] - rest[:3])) <= limit
 
 
 def at_rest(state: np.ndarray) -> bool:
-    """Whether a state (STATE) shows an arm at rest: under 0.5 mm/s and 0.3 degrees/s."""
+    """Whether a state (ARM_STATE) shows an arm at rest: under 0.5 mm/s and 0.3 degrees/s."""
     speed = state["speed"]
     return bool(np.linalg.norm(speed[:3]) < 0.5e-3 and np.linalg.norm(speed[3:]) < 5e-3)
 
@@ -169,7 +176,7 @@ def at_rest(state: np.ndarray) -> bool:
 def check_state(
     config: ArmConfig, watch: StateMemory, state: np.ndarray, rest: np.ndarray, most: float | None = None
 ) -> tuple[StateMemory, Finding | None]:
-    """What one more state (STATE) says: the memory for the next one, and why the arm must stop, if it must.
+    """Checks one more state (ARM_STATE): the memory for the next one, and why the arm must stop, if it must.
 
     Args:
         rest: [6] force of the arm at rest. most: N, in place of the configured limit.
@@ -178,9 +185,11 @@ def check_state(
     loaded = watch.loaded + 1 if exceeds_force(config, state["force"], rest, most) else 0
     after = StateMemory(loaded, float(state["robot"]))
     if not np.isfinite(numbers).all():
-        return after, Finding(SessionOutcome.ARM_MALFORMED, "a state is not finite")
+        return after, Finding(SessionOutcome.ARM_MALFORMED, "a state has values that are not finite")
     if np.abs(state["tcp"][:3]).max() > REACH or np.abs(state["joints"]).max() > JOINT_RANGE:
-        return after, Finding(SessionOutcome.ARM_MALFORMED, f"no arm stands at {_place(state['tcp'])}")
+        return after, Finding(
+            SessionOutcome.ARM_MALFORMED, f"an impossible state: tool at {_place(state['tcp'])}"
+        )
     if state["robot"] <= watch.robot:
         return after, Finding(SessionOutcome.CLOCK_JUMPED, "the controller's clock went back")
     for bits, outcome, text in SAFETY_BITS:
@@ -197,13 +206,13 @@ def check_state(
 
 
 def retreat_target(config: ArmConfig, states: np.ndarray) -> np.ndarray | None:
-    """Where to back off to: `backoff` from the newest state towards where the tool came from.
+    """Target of the retreat after a contact: `backoff` from the newest state towards earlier positions.
 
     Args:
         states: [N] STATE, oldest first, up to the contact.
 
     Returns:
-        [6] tool pose in the box; None where the states do not show a way back.
+        [6] tool pose in the box; None where the states do not show the motion before the contact.
     """
     here = states[-1]["tcp"]
     away = np.linalg.norm(states["tcp"][:, :3] - here[:3], axis=1)

@@ -1,4 +1,4 @@
-"""Whether an arm may be armed: what its controller says of itself, and what its first states show."""
+"""Checks before the arm is armed: status of the controller and its first states."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from robot.drivers.ur10.config import ArmConfig
 from robot.drivers.ur10.safety import in_box
 from tactile.base.errors import InputError
 
-MIN_RATE_SHARE = 0.9  # of the nominal rate of states
-RATE_WINDOW = 0.25  # s of states that the rate is taken from
-RATE_TIMEOUT = 1.5  # s in which it must have been enough once
+MIN_RATE_SHARE = 0.9  # share of the nominal state rate that is required
+RATE_WINDOW = 0.25  # s of states over which the rate is measured
+RATE_TIMEOUT = 1.5  # s within which the rate must reach that share
 
 
 class StartupRefused(InputError):
-    """Why the arm was not armed; it never moved."""
+    """A startup check failed; the arm has not moved."""
 
     def __init__(self, found: str, expected: str = "", cure: str = "", *_: str, where: str = "arm") -> None:
         super().__init__(where, found, expected, cure)
@@ -30,17 +30,20 @@ class StartupRefused(InputError):
 
 
 def check_controller(config: ArmConfig) -> dashboard.ControllerStatus:
-    """What the controller says of itself, if that speaks for starting; else raises Refusal."""
+    """Asks for the status of the controller and checks it.
+
+    Raises:
+        StartupRefused: the controller is not ready."""
     try:
         with dashboard.Dashboard(config.host) as connection:
             controller = connection.controller()
             with contextlib.suppress(dashboard.DashboardSilent):
-                if controller.program:  # a program that was just stopped may still be ending
+                if controller.program:  # a stopped program may still be ending
                     time.sleep(0.3)
                     controller = connection.controller()
     except dashboard.DashboardSilent as silent:
         raise StartupRefused(
-            str(silent), "", "look at the cable, the address and that the controller is on"
+            str(silent), "", "check the cable, the address and that the controller is on"
         ) from None
     version = ".".join(map(str, controller.version))
     if controller.version < dashboard.MIN_POLYSCOPE:
@@ -63,12 +66,15 @@ def check_controller(config: ArmConfig) -> dashboard.ControllerStatus:
 
 
 def check_states(config: ArmConfig, states: Callable[[], np.ndarray]) -> None:
-    """Look at the newest states: their rate, where the arm stands; raises Refusal.
+    """Checks the rate of the newest states and the position of the tool.
 
-    A host that was busy for a moment gets a second one; a controller that is slow stays so.
+    Raises:
+        StartupRefused: the stream is too slow, or the tool is outside the box.
+
+    The rate may recover within `RATE_TIMEOUT`: the host may have been busy.
 
     Args:
-        states: gives the states [N] (STATE) since the arm's process began.
+        states: returns the states [N] (ARM_STATE) since the start of the RTDE process.
     """
     until = time.monotonic() + RATE_TIMEOUT
     while (rate := state_rate(states(), config.hz)) < MIN_RATE_SHARE * config.hz:
@@ -76,23 +82,25 @@ def check_states(config: ArmConfig, states: Callable[[], np.ndarray]) -> None:
             raise StartupRefused(
                 f"stream at {rate:.0f} of {config.hz} Hz",
                 "",
-                "a CB3 has 125 Hz only; look at the network and what else runs on this machine",
+                "a CB3 has 125 Hz only; check the network and the load of this machine",
             )
         time.sleep(0.05)
     here = states()[-1]["tcp"]
     if not in_box(config, here):
         place = ", ".join(f"{v:.3f}" for v in here[:3])
-        raise StartupRefused(f"the tool stands at ({place}) m, outside the box", "", "bring it in by hand")
+        raise StartupRefused(
+            f"the tool stands at ({place}) m, outside the box", "", "move it into the box by hand"
+        )
 
 
 def state_rate(states: np.ndarray, hz: int) -> float:
-    """Hz, over the newest states, as many as should come in the measuring time."""
+    """State rate over the last `RATE_WINDOW`, Hz."""
     recent = states["host"][-int(RATE_WINDOW * hz) :]
     return (len(recent) - 1) / float(np.ptp(recent)) if len(recent) > 1 else 0.0
 
 
 def explain_refusal(detail: str) -> StartupRefused:
-    """The refusal for what the library says."""
+    """The refusal that explains an error message of the library."""
     if "in use" in detail:
         return StartupRefused(
             "registers in use",

@@ -1,4 +1,4 @@
-"""The thread that watches an arm's process and its states, and sees that the arm stands when it must."""
+"""Supervisor thread: watches the RTDE process and its states, and makes sure that the arm stops."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from robot.drivers.ur10.shared_state import SharedState
 from robot.drivers.ur10.startup_checks import StartupRefused, explain_refusal
 
 TICK = 0.005  # s
-DASHBOARD_DELAY = 0.3  # s that a stop may take before the dashboard server is asked for it
-ELSEWHERE_TIME = 0.5  # s for which an arm must stand elsewhere than sent to count as not arrived
-HISTORY = 5.0  # s of states kept for the log of a fault
+DASHBOARD_DELAY = 0.3  # s that a stop may take before the dashboard server is asked to stop
+ELSEWHERE_TIME = 0.5  # s at rest away from the target after which a move counts as not arrived
+HISTORY = 5.0  # s of states that a fault report includes
 PROCESS_LOST = {
     SessionOutcome.ARM_STALE,
     SessionOutcome.ARM_MALFORMED,
     SessionOutcome.ARM_GONE,
     SessionOutcome.CLOCK_JUMPED,
 }
-"""Ends after which nothing that the arm's process says is believed: it is killed."""
+"""Outcomes after which the RTDE process cannot be trusted: it is killed."""
 SAFETY_STOPS = {SessionOutcome.PROTECTIVE_STOP, SessionOutcome.SAFEGUARD_STOP, SessionOutcome.EMERGENCY_STOP}
-"""Ends after which a controller may resume its program by itself: the program is ended."""
+"""Outcomes after which a controller may resume its program automatically: the program is ended."""
 
 
 class PendingMove(NamedTuple):
     """A move under way.
 
     Attributes:
-        number: of the order. move: what was asked. deadline: s, host's clock.
+        number: of the command. move: as planned. deadline: s, host's clock.
     """
 
     number: int
@@ -44,11 +44,11 @@ class PendingMove(NamedTuple):
 
 
 class Supervisor:
-    """What is known of the arm's process, and the thread that finds out.
+    """State of the RTDE process, and the thread that keeps it up to date.
 
     Attributes:
-        fault: what ended the motion; the first finding stays. ready: whether the process has settled.
-        refused: why it could not connect. armed: whether findings count. lock: held to read and then act.
+        fault: the first reason to stop. ready: whether the process has measured the force at rest. refused:
+            why it could not connect. armed: whether findings become faults. lock: held to read and then act.
     """
 
     def __init__(self, config: ArmConfig, shared: SharedState) -> None:
@@ -69,7 +69,7 @@ class Supervisor:
         self._thread = threading.Thread(target=self._run, name="arm", daemon=True)
 
     def watch(self, process: ArmProcess) -> None:
-        """Forget what was and watch this process."""
+        """Clears all findings and watches a new process."""
         with self.lock:
             self.fault, self.refused, self.pending, self._stop_by = None, None, None, None
             self.ready = self._retreat_pending = False
@@ -78,7 +78,10 @@ class Supervisor:
             self._thread.start()
 
     def arm(self) -> None:
-        """From now on a finding is a fault; one that came before is a reason not to start, and raised."""
+        """Lets findings become faults from now on.
+
+        Raises:
+            StartupRefused: there was a finding before."""
         with self.lock:
             if self.process is not None:
                 self.read_reports(self.process)
@@ -87,7 +90,7 @@ class Supervisor:
             self.armed = True
 
     def kill_process(self) -> None:
-        """End the process, whatever it does."""
+        """Kills the process."""
         with self.lock:
             self.armed = False
             if self.process is not None:
@@ -95,26 +98,26 @@ class Supervisor:
                 self.process = None
 
     def close(self) -> None:
-        """End the thread."""
+        """Ends the thread."""
         self._closing.set()
         if self._thread.is_alive():
             self._thread.join()
 
     def send(self, move: Move) -> None:
-        """Order a move. To be called with the lock held."""
+        """Sends a move command. The caller holds the lock."""
         deadline = time.monotonic() + move.most + self.config.patience
         self._elsewhere = None
         self.pending = PendingMove(self._order("move", move.target, move.speed), move, deadline)
 
     def halt(self) -> None:
-        """Revoke all orders and stop; the second way if the arm does not stand in time."""
+        """Revokes all commands and stops, by the dashboard server where the arm does not stop in time."""
         with self.lock:
             self.pending = None
             self.shared.control["stops"] += 1
             self._stop_by = time.monotonic() + DASHBOARD_DELAY
 
     def fail(self, finding: Finding) -> None:
-        """Make a finding the fault, if it is the first, and see that the arm stands."""
+        """Makes a finding the fault, if it is the first, and stops the arm."""
         with self.lock:
             if self.fault is not None:
                 return
@@ -122,25 +125,25 @@ class Supervisor:
             self.halt()
             if finding.outcome in PROCESS_LOST:
                 self.kill_process()
-                # Nobody is left to show that the arm stands. Its watchdog has gone hungry as well.
-                self._stop_by = None
+                # No process is left to show that the arm stands; the controller's watchdog has timed out as
+                well.self._stop_by = None
                 self._stop_by_dashboard()
             elif finding.outcome in SAFETY_STOPS:
                 self._stop_by_dashboard()
             self._retreat_pending = finding.outcome is SessionOutcome.CONTACT
 
     def still(self) -> bool:
-        """Whether the newest state is fresh and shows an arm at rest."""
+        """Whether the newest state is recent and shows an arm at rest."""
         state = self.shared.latest()
         return state is not None and self.age() <= self.config.stale and at_rest(state)
 
     def age(self) -> float:
-        """s since the newest state was seen; infinite before the first."""
+        """Age of the newest state, s; infinite before the first."""
         state = self.shared.latest()
         return float("inf") if state is None else time.monotonic() - float(state["host"])
 
     def arrived(self, errand: PendingMove) -> bool:
-        """Whether an errand has begun and ended and the arm stands where it was sent."""
+        """Whether a move has started and ended and the arm is at its target."""
         return self._ended(errand) and self._deviation(errand) is None
 
     def _run(self) -> None:
@@ -157,7 +160,7 @@ class Supervisor:
                 self._follow_up(now)
 
     def read_reports(self, process: ArmProcess) -> None:
-        """Take in what the process has told."""
+        """Reads the reports of the process."""
         for report in process.reports():
             if report["say"] == "ready":
                 self.ready = True
@@ -173,7 +176,7 @@ class Supervisor:
                     self.refused = StartupRefused(detail, "", outcome.value)
 
     def _check_lateness(self, now: float) -> Finding | None:
-        """Whether states are late, or the arm where it was sent."""
+        """A finding if states are late, or the arm has not arrived in time."""
         age, errand = self.age(), self.pending
         if age > self.config.stale:
             return Finding(SessionOutcome.ARM_STALE, f"no new state for {age:.3f} s")
@@ -183,7 +186,7 @@ class Supervisor:
         if off is None and self._ended(errand):
             self._done = errand.number
         elif off is not None and now > errand.deadline:
-            return Finding(SessionOutcome.NOT_ARRIVED, f"late, {off}")
+            return Finding(SessionOutcome.NOT_ARRIVED, f"not in time, {off}")
         elif off is not None and self._ended(errand):
             self._elsewhere = self._elsewhere or now
             if now - self._elsewhere > ELSEWHERE_TIME:
@@ -191,7 +194,7 @@ class Supervisor:
         return None
 
     def _ended(self, errand: PendingMove) -> bool:
-        """Whether the errand's operation has begun and ended and the arm is at rest."""
+        """Whether the operation of a move has started and ended and the arm is at rest."""
         state = self.shared.latest()
         number, before = self._started
         if state is None or number != errand.number or int(state["operation"]) == before:
@@ -199,7 +202,7 @@ class Supervisor:
         return int(state["progress"]) < 0 and self.still()
 
     def _deviation(self, errand: PendingMove) -> str | None:
-        """How far the arm is from where it was sent; None if it is there."""
+        """Distance of the arm from its target, in words; None at the target."""
         state = self.shared.latest()
         if state is None or at_target(self.config, state["tcp"], errand.move.target):
             return None
@@ -207,7 +210,7 @@ class Supervisor:
         return f"{way * 1e3:.1f} mm from its target"
 
     def _follow_up(self, now: float) -> None:
-        """A stop that does not show is asked for the second way; after a contact comes the way back."""
+        """Repeats a stop without effect by the dashboard server; starts the retreat after a contact."""
         if self._stop_by is None:
             return
         if self.still():
@@ -222,15 +225,15 @@ class Supervisor:
             self._stop_by = now + 2 * DASHBOARD_DELAY
 
     def history(self) -> np.ndarray:
-        """The last 5 s of states [N] (STATE)."""
+        """States [N] (ARM_STATE) of the last 5 s."""
         return self.shared.since(max(0, self.shared.newest - int(HISTORY * self.config.hz)))
 
     def _stop_by_dashboard(self) -> None:
-        """In a thread of its own: the heart has to go on beating."""
+        """Stops by the dashboard server, in a separate thread, so that the heartbeat never blocks."""
         threading.Thread(target=dashboard.stop_program, args=(self.config.host,), daemon=True).start()
 
     def _order(self, do: str, target: np.ndarray, speed: float) -> int:
-        """Send an order that the next stop revokes; its number."""
+        """Sends a command that the next stop revokes; returns its number."""
         self._number += 1
         stops = int(self.shared.control["stops"])
         if self.process is not None:

@@ -308,7 +308,7 @@ class Bench:
         }
         plan = {
             "whisking": {"rate": 4.0},
-            "calibration": {"shortest": 1.0},
+            "calibration": {"min_duration": 1.0},
             "motion": {"speed": 0.05},
         }
         head = {"address": self.host, "patience": 1.5, "silence": 0.5}
