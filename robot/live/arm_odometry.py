@@ -35,6 +35,11 @@ class ArmOdometry:
         while self._states and self._states[0][0] < self._states[-1][0] - HISTORY:
             self._states.popleft()
 
+    @property
+    def span(self) -> float:
+        """Time span of the states that are kept, s."""
+        return self._states[-1][0] - self._states[0][0] if self._states else 0.0
+
     def pose(self, time: float) -> np.ndarray:
         """Pose of the head in the map [3] at a time, interpolated between two states; beyond them, that of
         the nearest."""
@@ -64,11 +69,11 @@ class ArmOdometry:
         self._pose.append(np.array([*pose[:2], last + wrap(pose[2] - last)]))
         self._time.append(stamp)
         random = stream(self._config.seed, "live.odometry")
-        # Errors are drawn from the start each time, so that those of a whisk do not depend on the whisks
-        that
-        follow.rows = simulate_odometry(
-            self._config.noise, np.array(self._time), np.array(self._pose), random
-        )
+        # Without noise a row depends on two poses only. Errors are drawn from the start each time, so that
+        # those of a whisk do not depend on the whisks that follow.
+        first = -2 if self._config.noise.noise == "none" else 0
+        time_stamps, poses = np.array(self._time[first:]), np.array(self._pose[first:])
+        rows = simulate_odometry(self._config.noise, time_stamps, poses, random)
         return Odometry(*rows[-1]), self.pose(time)
 
     def _driven(self, took: float, time: float) -> np.ndarray:

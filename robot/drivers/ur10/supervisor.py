@@ -125,8 +125,8 @@ class Supervisor:
             self.halt()
             if finding.outcome in PROCESS_LOST:
                 self.kill_process()
-                # No process is left to show that the arm stands; the controller's watchdog has timed out as
-                well.self._stop_by = None
+                # No process is left to show a standstill; the controller's watchdog times out as well.
+                self._stop_by = None
                 self._stop_by_dashboard()
             elif finding.outcome in SAFETY_STOPS:
                 self._stop_by_dashboard()
