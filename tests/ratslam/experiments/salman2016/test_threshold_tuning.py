@@ -30,7 +30,7 @@ from ratslam.experiments.salman2016.threshold_tuning import (
 from robot.sources.in_memory import InMemorySource
 from tactile.base.errors import InputError
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[4]
 VIEWS = ViewDifferences(np.linspace(0, 1, 11), np.eye(10, dtype=int)[1] * 8, np.ones(10, int), 0.9)
 COUNTS = st.lists(st.integers(0, 5), min_size=1, max_size=9)
 GRID = (0.01, 0.02, 0.04, 0.08)
