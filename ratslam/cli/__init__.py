@@ -6,7 +6,7 @@ import argparse
 import sys
 
 # Only what argparse needs is imported here, so that `--help` does not wait for JAX and NumPy.
-from ratslam.cli import ablation, create, files, live, look, pareto, reproduce, run, studies
+from ratslam.cli import files, live, look, reproduce, run, studies
 from ratslam.cli.common import INPUT_ERROR, INTERRUPTED, Commands
 from tactile.base.errors import InputError
 
@@ -15,7 +15,7 @@ GROUPS = ("run", "live", "look", "study", "papers", "files")
 DESCRIPTION = "RatSLAM with whiskers, cameras or lasers: from a recording, simulation or robot to a map."
 
 
-RETIRED = {"tune": "reproduce threshold"}
+RETIRED = {"tune": "reproduce threshold", **studies.REPLACED}
 """Commands of earlier versions, and what replaces each."""
 
 
@@ -64,6 +64,6 @@ def build_parser() -> Program:
     """The parser of the whole program."""
     parser = Program(prog="ratslam", description=DESCRIPTION)
     parser.commands = Commands(parser)
-    for module in (run, live, look, ablation, studies, pareto, reproduce, create, files):
+    for module in (run, live, look, studies, reproduce, files):
         module.add_commands(parser.commands)
     return parser

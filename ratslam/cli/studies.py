@@ -1,4 +1,4 @@
-"""The command on studies: sweep, and with it tuning on several objectives."""
+"""The commands that run a configuration many times: study, size."""
 
 from __future__ import annotations
 
@@ -11,52 +11,97 @@ from typing import Any, Self
 
 from tqdm import tqdm
 
-from ratslam.cli.common import INPUT_ERROR, Commands, add_set, add_workers, prepare_jax
+from ratslam.cli.common import (
+    INPUT_ERROR,
+    Commands,
+    add_config,
+    add_set,
+    positive_integer,
+    prepare_jax,
+    read_config,
+)
+from tactile.base.errors import InputError
 
+REPLACED = {
+    "sweep": "study FILE",
+    "frontier": "study FILE, with `report: pareto` in it",
+    "ablate": "study --preset ablate CONFIG",
+    "vary": "study --preset vary CONFIG",
+    "spread": "study --preset spread CONFIG",
+    "tiers": "study --preset tiers CONFIG",
+    "compare": "study --preset backends CONFIG",
+}
+"""What to type in place of commands of earlier versions."""
+PRESETS = ("ablate", "vary", "spread", "tiers", "backends", "pareto")
+"""Names of presets, known before JAX is loaded."""
+CYCLES = 800
+"""Cycles of the session that `size` tries settings on."""
+FEWEST_CYCLES = 50
+"""In fewer cycles nothing is recognised."""
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-"""How many threads NumPy sums with."""
+"""Variables for the number of threads of NumPy."""
 
 
 def add_commands(commands: Commands) -> None:
-    """Registers it."""
-    sweep = commands.add(
-        "sweep", _sweep, "run the configurations of a study over seeds, or tune",
-        "sweep configs/study_maze.yaml", "study",
+    """Registers them."""
+    study = commands.add(
+        "study", _study, "run many configurations over seeds and compare them",
+        "study configs/study_maze.yaml", "study",
     )  # fmt: skip
-    sweep.add_argument("study", help="the YAML file")
-    add_set(sweep)
-    add_workers(sweep)
-    sweep.add_argument(
-        "--scheduler", metavar="tcp://HOST:PORT", help="of Dask, that has workers, instead of processes here"
+    study.add_argument("file", type=Path, help="study file, or a configuration with --preset (YAML)")
+    study.add_argument("--preset", choices=PRESETS, help="make the study from a configuration")
+    study.add_argument(
+        "--search", action="store_true", help="choose parameters as the study's `tune` section says"
     )
-    sweep.add_argument(
-        "-o", "--output", type=Path, metavar="DIR",
-        help="where results are kept, and taken from if they are there (default runs/<study>)",
+    add_set(study)
+    study.add_argument(
+        "--workers", type=positive_integer, metavar="N",
+        help="processes (default: number of cores; 1 for report: pareto, which measures speed)",
     )  # fmt: skip
-    sweep.add_argument("--tune", action="store_true", help="choose parameters as the study's `tune` says")
+    study.add_argument("--scheduler", metavar="tcp://HOST:PORT", help="Dask scheduler to use instead")
+    study.add_argument(
+        "-o", "--output", type=Path, metavar="DIR",
+        help="folder of records and tables; recorded runs are not repeated (default runs/STUDY)",
+    )  # fmt: skip
+    study.add_argument(
+        "--error", metavar="NAME", help="of the Pareto front: em, ate, exm, map, ... or a quantity"
+    )
+    study.add_argument(
+        "--by", type=float, default=0.2, metavar="SHARE", help="of --preset vary (default 0.2)"
+    )
+    study.add_argument(
+        "--seconds", type=float, default=600.0, metavar="S", help="of --preset tiers (default 600)"
+    )
+
+    size = commands.add(
+        "size", _size, "recommend settings for a scene", "size configs/whisker_maze.yaml", "study"
+    )
+    add_config(size)
+    size.add_argument(
+        "--cycles", type=positive_integer, default=CYCLES, metavar="N",
+        help=f"of the session to try them on (default {CYCLES})",
+    )  # fmt: skip
 
 
 class Progress:
-    """A bar for the runs of a study; it hears of each that is done, and keeps what failed.
+    """A progress bar over runs, which collects the failed ones.
 
     Args:
-        total: runs. directory: of their results.
+        total: number of runs. path: of the file of records.
     """
 
-    def __init__(self, total: int | None, directory: Path) -> None:
+    def __init__(self, total: int | None, path: Path) -> None:
         self.failed: list[Any] = []
-        self._directory = directory
-        self._bar = tqdm(
-            total=total, unit="run", desc=directory.name, file=sys.stderr, mininterval=0.5, delay=1.0
-        )
+        self._path = path
+        self._bar = tqdm(total=total, unit="run", file=sys.stderr, mininterval=0.5, delay=1.0)
 
     def __enter__(self) -> Self:
         return self
 
-    def __call__(self, result: Any = None) -> None:
-        """A run is done; without its result if that was not looked at."""
-        if result is not None and result.error is not None:
-            self.failed.append(result)
+    def __call__(self, record: Any) -> None:
+        """Counts a run."""
+        if record.error is not None:
+            self.failed.append(record)
         self._bar.update()
 
     def __exit__(
@@ -65,69 +110,123 @@ class Progress:
         self._bar.close()
         if kind is KeyboardInterrupt:
             print(
-                f"ratslam: {self._bar.n} runs are kept in {self._directory}; the same command goes on",
+                f"ratslam: {self._bar.n} runs are kept in {self._path}; the same command continues",
                 file=sys.stderr,
             )
 
-    def told(self) -> int:
-        """Says what failed; the exit code."""
+    def report_failures(self) -> int:
+        """Prints the failed runs; returns the exit code."""
         from ratslam.experiments.studies.report import label
 
-        for result in self.failed:
-            where = f"{label(result.row, result.varied)}, seed {result.seed}"
-            for line in result.error.splitlines():
+        for record in self.failed:
+            copy = f", copy {record.copy_number}" if record.copy_number else ""
+            where = f"{label(record.row, record.varied)}, seed {record.seed}{copy}"
+            for line in record.error.splitlines():
                 print(f"ratslam: error: {where}: {line}", file=sys.stderr)
         if self.failed:
             print(
-                f"ratslam: {len(self.failed)} runs failed; where that is kept in "
-                f"{self._directory}, remove the file there to try again",
+                f"ratslam: {len(self.failed)} runs failed; delete their lines in {self._path} to repeat them",
                 file=sys.stderr,
             )
         return INPUT_ERROR if self.failed else 0
 
 
 def settle_threads() -> None:
-    """One thread for NumPy, as workers have, so that results are the same; call it before NumPy loads."""
+    """Limits NumPy to one thread in this process and its workers, so that results are equal.
+
+    Call it before NumPy is loaded.
+    """
     for name in THREADS:
         os.environ.setdefault(name, "1")
 
 
-def _sweep(arguments: argparse.Namespace) -> int:
+def _study(arguments: argparse.Namespace) -> int:
     settle_threads()
     prepare_jax()
+    from ratslam.experiments.studies.metrics import find_error
+    from ratslam.experiments.studies.presets import PresetOptions, preset_study
+    from ratslam.experiments.studies.records import RunLog
     from ratslam.experiments.studies.study import read_study
 
-    study = read_study(arguments.study, arguments.set)
-    directory = arguments.output or Path("runs") / study.name
-    return (_tune if arguments.tune else _table)(arguments, study, directory)
+    remarks: list[str] = []
+    if arguments.preset:
+        options = PresetOptions(arguments.by, arguments.seconds)
+        study, remarks = preset_study(arguments.preset, arguments.file, arguments.set, options)
+    else:
+        study = read_study(arguments.file, arguments.set)
+    error = find_error(arguments.error) if arguments.error else None
+    if arguments.search and study.plan.tune is None:
+        where = study.document.at_key(("tune",))
+        raise InputError(where, "missing", "the parameters and objectives of the search")
+    log = RunLog(arguments.output or Path("runs") / study.name)
+    return (
+        _search(arguments, study, log) if arguments.search else _table(arguments, study, log, error, remarks)
+    )
 
 
-def _table(arguments: argparse.Namespace, study: Any, directory: Path) -> int:
-    from ratslam.experiments.studies.recorded_runs import FOLDER, results
-    from ratslam.experiments.studies.report import remarks, rows, save, table
-    from ratslam.experiments.studies.study import jobs
+def _table(arguments: argparse.Namespace, study: Any, log: Any, error: Any, remarks: list[str]) -> int:
+    from ratslam.experiments.studies.executor import Executor
+    from ratslam.experiments.studies.report import make_report, render_text, save_report
+    from ratslam.experiments.studies.study import list_jobs
+    from ratslam.experiments.studies.study_runner import measure_jobs, run_jobs
 
-    asked = jobs(study)
-    with Progress(len({job.key for job in asked}), directory / FOLDER) as progress:
-        found = list(results(asked, directory, arguments.workers, arguments.scheduler, progress))
-    lines = rows(found)
-    paths = save(lines, directory)
-    print("\n\n".join([table(lines), *remarks(found, directory / FOLDER)]))
-    print(f"\n{paths[0]} and {paths[1].name} hold all quantities, {directory / FOLDER} every run")
-    return progress.told()
+    jobs = list_jobs(study)
+    alone = study.plan.report == "pareto" and arguments.scheduler is None and arguments.workers in (None, 1)
+    with (
+        Progress(len({job.key for job in jobs}), log.path) as progress,
+        Executor(arguments.workers, arguments.scheduler) as executor,
+    ):
+        records = (
+            measure_jobs(jobs, log, progress) if alone else list(run_jobs(jobs, log, executor, progress))
+        )
+    report = make_report(study.name, study.plan, records, error)
+    report = report._replace(remarks=[*report.remarks, *remarks])
+    paths = save_report(report, log.path.parent)
+    print(render_text(report))
+    print(f"\n{log.path} holds every run, {', '.join(path.name for path in paths)} the table")
+    return progress.report_failures()
 
 
-def _tune(arguments: argparse.Namespace, study: Any, directory: Path) -> int:
-    from ratslam.experiments.studies.recorded_runs import FOLDER
-    from ratslam.experiments.studies.tuning import report, save, tune
+def _search(arguments: argparse.Namespace, study: Any, log: Any) -> int:
+    from ratslam.experiments.studies.executor import Executor
+    from ratslam.experiments.studies.search import render_trials, save_trials, search
 
-    plan = study.plan
-    total = plan.tune and plan.tune.trials * len(plan.every_seed())
-    with Progress(total, directory / FOLDER) as progress:
-        trials = tune(study, directory, arguments.workers, arguments.scheduler, progress)
-    print(report(trials))
-    print(f"\n{save(trials, directory)} holds all trials; the same command with more of them goes on")
+    plan = study.plan.tune
+    runs = len(study.plan.every_seed()) * len(study.plan.every_copy())
+    with (
+        Progress(plan.trials * runs, log.path) as progress,
+        Executor(arguments.workers, arguments.scheduler, plan.batch * runs) as executor,
+    ):
+        trials = search(study, log, executor, progress)
+    print(render_trials(trials))
+    print(f"\n{save_trials(trials, log.path.parent)} holds all trials; with more `tune.trials` it continues")
     if any(trial.values for trial in trials):
         return 0
     print("ratslam: error: no trial has a value of every objective", file=sys.stderr)
-    return progress.told() or INPUT_ERROR
+    return progress.report_failures() or INPUT_ERROR
+
+
+def _size(arguments: argparse.Namespace) -> int:
+    if arguments.cycles < FEWEST_CYCLES:
+        raise InputError("--cycles", str(arguments.cycles), f"{FEWEST_CYCLES} or more")
+    settle_threads()
+    prepare_jax()
+    from ratslam.config.completion import complete
+    from ratslam.experiments.sizing.recommendation import proposals
+    from ratslam.experiments.sizing.report import length_text, proposed_text, snippet, tried_text
+    from ratslam.experiments.sizing.scene_statistics import scene_of
+    from ratslam.experiments.sizing.trial_runs import tried
+    from ratslam.experiments.studies.fidelity import with_tier
+    from ratslam.pipeline.source import open_source
+
+    path, config = arguments.config, read_config(arguments)
+    with open_source(with_tier(config, "kinematic")) as source:
+        scene, config = scene_of(source), complete(config, source)
+    found = proposals(config, scene)
+    print(f"{scene.told()}\n\n{proposed_text(found)}\n", flush=True)
+    steps = tried(config, found, arguments.cycles)
+    print(f"What each cheaper step costs, over {length_text(steps[0].result, scene.cycles)}:\n")
+    print(tried_text(steps))
+    text = snippet(found)
+    print(f"\nFor {path.name}:\n\n{text}" if text else f"\n{path.name} has it like that already")
+    return 0

@@ -1,4 +1,4 @@
-"""Settings of the keyframe map. Lengths are in pose cells."""
+"""The settings of the frame map: what is believed, and how much. Lengths are in pose cells."""
 
 from __future__ import annotations
 
@@ -8,92 +8,91 @@ from tactile.base.config import Settings
 
 
 class KeyframeNoise(Settings):
-    """Noise of the odometry between keyframes."""
+    """How much the odometry between frames is believed; cells are pose cells."""
 
     per_cell: PositiveFloat = 0.05
-    """Standard deviation of position after one cell, cells; grows with the root of the distance."""
+    """Standard deviation of position after one cell, cells; grows with the root of the way."""
     heading_per_cell: NonNegativeFloat = 0.02
     """Standard deviation of heading after one cell, rad."""
     heading_per_radian: NonNegativeFloat = 0.04
     """Standard deviation of heading after a turn of one radian, rad."""
     least: PositiveFloat = 0.02
-    """Least standard deviation of position between two keyframes, cells."""
+    """Standard deviation between any two frames, cells."""
     least_heading: PositiveFloat = 0.005
-    """Least standard deviation of heading between two keyframes, rad."""
+    """The same of heading, rad."""
 
 
 class KeyframeMapConfig(Settings):
-    """Settings of the keyframe map. Lengths are in pose cells."""
+    """The map of frames: what is believed, and how much. Lengths are in pose cells."""
 
     noise: KeyframeNoise = KeyframeNoise()
-    """Noise of the odometry."""
+    """Trust in odometry."""
     bias_from_views: bool = True
-    """Whether ordered views give a prior of the heading bias."""
+    """Whether ordered views tell it beforehand."""
     bias_sd: PositiveFloat = 0.012
-    """Standard deviation of the heading bias without views, rad per cell."""
+    """Standard deviation of the bias where views tell nothing, rad per cell."""
     bias_least: PositiveFloat = 0.003
-    """Least standard deviation of the views' heading bias, rad per cell."""
+    """The views are never believed better than this, rad per cell."""
     shrink: NonNegativeFloat = 3.0
-    """Number of standard errors below which the views' heading bias counts as zero."""
+    """Standard errors under which the views' bias is taken for none."""
     candidate_posterior: PositiveFloat = 0.5
-    """Posterior above which a recalled keyframe is a closure candidate."""
+    """Posterior from which a recollection is a candidate."""
     max_gap: PositiveInt = 3
-    """Largest number of keyframes between two candidates of a closure sequence."""
+    """Frames from one candidate of a run to the next, at most."""
     agreement: PositiveFloat = 2.0
-    """Largest difference between the candidates of a sequence and the odometry between them, cells (plus a
-    tenth of the distance)."""
+    """How far candidates of a run may differ from the odometry between them, cells (and a tenth of it)."""
     agreement_heading: PositiveFloat = 0.5
-    """Largest difference in heading between the candidates of a sequence and the odometry, rad."""
+    """The same of heading, rad."""
     min_length: PositiveInt = 2
-    """Least number of candidates of an accepted sequence."""
+    """Candidates that an accepted run has at least."""
     min_score: PositiveFloat = 4.0
-    """Least evidence of an accepted sequence, after subtraction of half its squared Mahalanobis distance from
-    the map and of the log of the number of alternatives that the map allows."""
+    """Evidence it has at least, after half its squared Mahalanobis distance from the map is taken off and
+    the log of how many times more frames the map allows than stand around one place."""
     max_distance: PositiveFloat = 12.0
-    """Upper limit of that squared Mahalanobis distance."""
+    """That squared distance is smaller than this."""
     gate_sd: PositiveFloat = 0.7
-    """Standard deviation of position added to the map's own in that distance, cells."""
+    """Standard deviation added to the map's own in that distance, cells."""
     gate_heading: PositiveFloat = 0.2
-    """Standard deviation of heading added to the map's own in that distance, rad."""
+    """The same of heading, rad."""
     closure_sd: PositiveFloat = 0.8
-    """Standard deviation of a closure's position, cells."""
+    """Standard deviation of a closure, cells."""
     closure_heading: PositiveFloat = 0.12
-    """Standard deviation of a closure's heading, rad."""
+    """The same of heading, rad."""
     robust_per_score: PositiveFloat = 0.5
-    """Robust scale (mean squared deviation) per unit of a sequence's evidence."""
+    """Robust scale (mean squared deviation) for each unit of a run's evidence."""
     robust_least: PositiveFloat = 2.0
-    """Least robust scale."""
+    """The least such scale."""
     robust_most: PositiveFloat = 20.0
-    """Largest robust scale."""
+    """The largest."""
     breaks: bool = True
-    """Whether long sequences that contradict the map break the odometry."""
+    """Whether long runs that contradict the map cut the odometry."""
     break_length: PositiveInt = 32
-    """Least number of candidates of a sequence that breaks the odometry."""
+    """Candidates in such a run."""
     break_score: PositiveFloat = 100.0
-    """Least evidence of a sequence that breaks the odometry."""
+    """Evidence in it."""
     sequence_agreement: NonNegativeFloat = 0.0
-    """Largest difference between a whole sequence and the odometry, beside `agreement`, as a share of the
-    distance; 0: compared only from one candidate to the next."""
+    """How far the whole of a run may differ from the odometry, beside `agreement`, as a share of the way; 0:
+    only from one candidate to the next."""
     select_every: NonNegativeInt = 0
-    """Keyframes after which all sequences, accepted or not, are selected anew against each other (see
-    `ratslam.keyframes.closure_selection`); 0: never, an accepted sequence stays."""
+    """Frames after which all runs are weighed against each other anew, believed or not (see
+    `ratslam.keyframes.closure_selection`); 0: never, a run once accepted stays."""
     select_score: PositiveFloat = 12.0
-    """Least evidence of the sequences to select from."""
+    """Evidence of the runs that are weighed."""
     select_length: PositiveInt = 4
-    """Least number of candidates of the sequences to select from."""
+    """Candidates that they have at least."""
     sequence_cost: PositiveFloat = 6.0
-    """Evidence that a sequence to select from needs before it may strain the map."""
+    """Evidence that a weighed run must bring before it may strain the map at all."""
     closure_cost_limit: PositiveFloat = 6.0
-    """Largest chi-square of a single closure in the selection."""
+    """Chi-square that a single closure of a weighed run can cost at most."""
     solve_every: PositiveInt = 1
-    """Keyframes between two optimisations while a sequence goes on."""
+    """Frames between two solutions while a run goes on."""
     iterations: PositiveInt = 4
-    """Solver iterations when a loop closes."""
+    """Solver steps when a loop closes."""
     settling: PositiveInt = 15
-    """Solver iterations for the final map."""
+    """Solver steps for the final map."""
     max_turn: PositiveFloat = 10.0
     """Share of `agreement_heading` by which a robot may be turned and still be in a known experience."""
     place_radius: PositiveFloat = 2.0
-    """Radius of an experience, cells."""
+    """Reach of an experience, cells."""
     place_heading: PositiveFloat = 0.35
-    """Largest difference in heading within an experience, rad."""
+    """The same of heading, rad."""

@@ -16,7 +16,7 @@ from ratslam.core.types import Action
 from tactile.base.se2 import between, wrap
 
 
-class ExperienceChange(NamedTuple):
+class Said(NamedTuple):
     """The experience now, the one before, and how it was come by."""
 
     place: int
@@ -39,11 +39,11 @@ class Experiences:
         self._link_of: dict[tuple[int, int], int] = {}
         self._current = -1
 
-    def stay(self) -> ExperienceChange:
+    def stay(self) -> Said:
         """Nothing happened."""
-        return ExperienceChange(self._current, self._current, Action.NONE)
+        return Said(self._current, self._current, Action.NONE)
 
-    def arrive(self, poses: np.ndarray, frame: int, matched: int, sure: bool) -> ExperienceChange:
+    def arrive(self, poses: np.ndarray, frame: int, matched: int, sure: bool) -> Said:
         """The experience of a new frame.
 
         Args:
@@ -63,7 +63,7 @@ class Experiences:
         if place != previous and previous >= 0:
             self._traverse(previous, place)
         self._current = place
-        return ExperienceChange(place, previous, action)
+        return Said(place, previous, action)
 
     def graph(self, poses: np.ndarray) -> networkx.DiGraph:
         """Nodes with x, y (m), heading (rad), frame; links with dx, dy, dtheta and traversals."""

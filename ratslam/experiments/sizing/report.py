@@ -8,34 +8,28 @@ from typing import Any
 import yaml
 
 from ratslam.config.strict_yaml.dumper import Dumper
-from ratslam.experiments.pareto.report import number
-from ratslam.experiments.pareto.summary import run_time
 from ratslam.experiments.sizing.recommendation import Proposal
 from ratslam.experiments.sizing.trial_runs import Tried
-from ratslam.experiments.studies.results import Result
+from ratslam.experiments.studies.metrics import HEADINGS
+from ratslam.experiments.studies.records import RunRecord
+from ratslam.experiments.studies.report import align, number
 
-ERRORS = {
-    "energy_all": "EM",
-    "ate_final": "ATE m",
-    "exm_arr": "ARR",
-    "exm_arcr_strict": "ARCR",
-    "map_error": "map error",
-}
-"""Headings."""
+ERRORS = ("energy_all", "ate_final", "exm_arr", "exm_arcr_strict", "map_error")
+"""Columns of errors."""
 
 
 def proposed_text(found: Sequence[Proposal]) -> str:
     """Every setting: what it is, what is proposed, why."""
     rows = [["setting", "now", "proposed", "why"]]
     rows += [[each.key, _plain(each.now), _plain(each.value), each.why] for each in found]
-    return _aligned(rows, "<>><")
+    return align(rows, "<>><")
 
 
 def tried_text(found: Sequence[Tried]) -> str:
     """What each step costs and saves, beside the first."""
     first = found[0].result.value("step_time")
     names = [name for name in ERRORS if any(one.result.value(name) is not None for one in found)]
-    rows = [["", "us a cycle", "99 %", "of proposed", "whole run", *(ERRORS[name] for name in names)]]
+    rows = [["", "us a cycle", "99 %", "of proposed", "whole run", *(HEADINGS[name] for name in names)]]
     for step, result in found:
         if result.error is not None:
             rows.append([step.name, "-", "-", "-", "-", *("-" for _ in names)])
@@ -44,14 +38,14 @@ def tried_text(found: Sequence[Tried]) -> str:
         share = f"{time / first:.2f}" if time and first else "-"
         errors = [number(result.value(name)) for name in names]
         rows.append([step.name, number(time), number(result.value("step_time_p99")), share,
-                     number(run_time(result)), *errors])  # fmt: skip
+                     number(result.value("run_time")), *errors])  # fmt: skip
     failed = [f"{step.name}: {result.error}" for step, result in found if result.error is not None]
-    return "\n".join([_aligned(rows, "<" + ">" * (len(rows[0]) - 1)), *failed])
+    return "\n".join([align(rows, "<" + ">" * (len(rows[0]) - 1)), *failed])
 
 
-def length_text(result: Result, whole: int) -> str:
+def length_text(result: RunRecord, whole: int) -> str:
     """Of how much of the session that is."""
-    return f"{result.steps} of {whole} cycles, one seed (`frontier` tells what is chance)"
+    return f"{result.steps} of {whole} cycles, one seed (`study --preset pareto` shows what is chance)"
 
 
 def snippet(found: Sequence[Proposal]) -> str:
@@ -69,12 +63,3 @@ def snippet(found: Sequence[Proposal]) -> str:
 
 def _plain(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
-
-
-def _aligned(rows: Sequence[Sequence[str]], sides: str) -> str:
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = [
-        "  ".join(f"{cell:{side}{width}}" for cell, side, width in zip(row, sides, widths, strict=True))
-        for row in rows
-    ]
-    return "\n".join(line.rstrip() for line in lines)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ratslam.config.run_config import RunConfig
-from ratslam.experiments.fidelity_comparison import shortened
+from ratslam.experiments.studies.fidelity import shortened
 from ratslam.pipeline.run import open_recorder
 from ratslam.pipeline.source import open_source
 from robot.recordings.formats import RecordingConfig
@@ -48,14 +48,6 @@ class Scene(NamedTuple):
             f"{self.span[1]:.3g} m, {self.usual:.2g} m a cycle (95 %: {self.most:.2g}), turns up to "
             f"{self.turn:.2g} rad (95 %)"
         )
-
-
-def cheapest(config: RunConfig) -> RunConfig:
-    """The configuration with as little simulated as odometry needs."""
-    if config.simulation is None:
-        return config
-    update = {"fidelity": "kinematic", "raw": False}
-    return config.model_copy(update={"simulation": config.simulation.model_copy(update=update)})
 
 
 def scene_of(source: Source) -> Scene:

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ratslam.config.run_config import RunConfig
-from ratslam.experiments.pareto.cpu_affinity import one_core
 from ratslam.experiments.sizing.recommendation import FEWEST, Proposal, with_settings
 from ratslam.experiments.sizing.scene_statistics import short
-from ratslam.experiments.studies.results import Result
+from ratslam.experiments.studies.environment import one_core
+from ratslam.experiments.studies.records import RunRecord
 from ratslam.experiments.studies.run_job import run_job
 from ratslam.experiments.studies.study import Job
 from ratslam.pipeline.source import open_source
@@ -36,7 +36,7 @@ class Tried(NamedTuple):
     """A step, and what came of it."""
 
     step: Step
-    result: Result
+    result: RunRecord
 
 
 def cheaper(config: RunConfig) -> list[Step]:
@@ -116,5 +116,5 @@ def _less_grid(config: RunConfig) -> list[Step]:
     return [*steps, Step(f"cells of {size:g} m", {"grid.cell": size})]
 
 
-def _run(config: RunConfig) -> Result:
-    return run_job(Job("", {}, config, "", 0, "live"))
+def _run(config: RunConfig) -> RunRecord:
+    return run_job(Job("", {}, config, "", 0, pace="live"))

@@ -6,6 +6,7 @@ This module loads without JAX, whose environment must be set before a worker pro
 from __future__ import annotations
 
 import logging
+import multiprocessing
 import os
 import pickle
 import signal
@@ -16,6 +17,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, closing, contextmanager
 from importlib.util import find_spec
+from multiprocessing.connection import Connection
 from types import TracebackType
 from typing import Any, Self, TypeVar
 from uuid import uuid4
@@ -89,11 +91,14 @@ class Executor:
             installed, else 1.
         scheduler: address of a Dask scheduler whose workers are used instead.
         most: largest number of tasks asked for at once, where that is known before.
+        fresh: run every task in a new process of this machine, one after another.
     """
 
-    def __init__(self, workers: int | None = None, scheduler: str | None = None, most: int = 0) -> None:
+    def __init__(
+        self, workers: int | None = None, scheduler: str | None = None, most: int = 0, fresh: bool = False
+    ) -> None:
         usual = (os.cpu_count() or 1) if find_spec("distributed") else 1
-        self._workers, self._scheduler, self._most = workers or usual, scheduler, most
+        self._workers, self._scheduler, self._most, self._fresh = workers or usual, scheduler, most, fresh
         self._client: Any = None
         self._open = ExitStack()
 
@@ -122,6 +127,10 @@ class Executor:
             killed: gives the result of a task whose process was killed `DEATHS` + 1 times, e.g. for lack of
                 memory; None: this raises an `InputError`.
         """
+        if self._fresh:
+            for index, task in enumerate(tasks):
+                yield index, _in_new_process(function, task, killed)
+            return
         count = min(self._workers, max(len(tasks), self._most))
         if self._scheduler is None and (count <= 1 or (len(tasks) <= 1 and self._client is None)):
             yield from enumerate(map(function, tasks))
@@ -137,6 +146,41 @@ def call_in_worker(environment: dict[str, str], packed: bytes) -> Any:
         os.environ.setdefault(name, value)
     function, task = pickle.loads(packed)
     return function(task)
+
+
+def _in_new_process(
+    function: Callable[[Task], Result], task: Task, killed: Callable[[Task], Result] | None
+) -> Result:
+    context = multiprocessing.get_context("spawn")
+    answer, send = context.Pipe(duplex=False)
+    process = context.Process(target=_send_result, args=(send, function, task), daemon=True)
+    with _ignoring_interrupts():
+        process.start()
+    send.close()
+    try:
+        result, error = answer.recv()
+    except EOFError:
+        return _after_kill(task, killed, 1)
+    finally:
+        process.kill()
+        process.join()
+    if error is not None:
+        raise error
+    return result
+
+
+def _send_result(send: Connection, function: Callable[[Task], Result], task: Task) -> None:
+    try:
+        send.send((function(task), None))
+    except Exception as error:
+        send.send((None, error))
+
+
+def _after_kill(task: Task, killed: Callable[[Task], Result] | None, times: int) -> Result:
+    if killed is not None:
+        return killed(task)
+    found = f"a process was killed {times} times, for lack of memory for example"
+    raise InputError("--workers", found, "memory for all", "ask for fewer")
 
 
 def _answers(
@@ -166,10 +210,7 @@ def _answers(
         try:
             result: Result = future.result()
         except KilledWorker:
-            if killed is None:
-                found = f"a process was killed {DEATHS + 1} times, for lack of memory for example"
-                raise InputError("--workers", found, "memory for all", "ask for fewer") from None
-            result = killed(tasks[index])
+            result = _after_kill(tasks[index], killed, DEATHS + 1)
         except (ImportError, RuntimeError) as error:
             if isinstance(error, ImportError) or "deserialization" in str(error):
                 found = f"its processes cannot load ratslam ({error})".splitlines()[0]

@@ -1,4 +1,4 @@
-"""Settings put into a configuration from elsewhere, so that complaints point to where they were written."""
+"""Settings put into a configuration from a study, so that error messages name their place in the study."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ def put(document: Document, key: str, value: Any, origin: Document, at: KeyPath)
     """The document with a value at a dotted key.
 
     Args:
-        origin, at: the document that the value was written in, and the path of it (or of what gave it) there.
+        origin, at: the document that the value was written in, and its path there.
 
     Raises:
-        InputError: the key leads nowhere.
+        InputError: there is no such key.
     """
     where = origin.at_key(at)
     if "=" in key or not all(key.split(".")):
-        raise InputError(where, "no key path", "names joined by dots, such as pose_cells.cells_xy")
+        raise InputError(where, "not a key path", "names joined by dots, such as pose_cells.cells_xy")
     try:
         changed = override(document, [f"{key}=null"])
     except InputError as error:
@@ -45,22 +45,22 @@ def put(document: Document, key: str, value: Any, origin: Document, at: KeyPath)
 
 
 def named(at: KeyPath) -> KeyPath:
-    """Of one of a list of values: the path of what they are values of."""
+    """The path without the index of a value in a list."""
     return at[:-1] if isinstance(at[-1], int) else at
 
 
 def overlap(first: str, second: str) -> bool:
-    """Whether one key path is the other, or leads to a section that holds it."""
+    """Whether one key path equals the other or is a section that contains it."""
     return f"{first}.".startswith(f"{second}.") or f"{second}.".startswith(f"{first}.")
 
 
 def outermost_first(keys: Iterable[str]) -> list[str]:
-    """Sections before what is in them, so that the order of writing is no matter."""
+    """Sections before their keys, so that the result does not depend on the order of writing."""
     return sorted(keys, key=lambda key: (key.count("."), key))
 
 
 def _steps(data: Any, key: str) -> KeyPath:
-    """The key path of a dotted key: numbers where lists are."""
+    """The key path of a dotted key, with integers as list indices."""
     path: KeyPath = ()
     for name in key.split("."):
         step = int(name) if isinstance(data, list) else name

@@ -1,19 +1,14 @@
-"""One job: a session played in memory, judged, timed and weighed."""
+"""One run of a study: a session played in memory, scored and timed."""
 
 from __future__ import annotations
 
-import hashlib
-import platform
-import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import lru_cache
-from importlib.metadata import version
 from itertools import islice
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -27,116 +22,131 @@ from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.scorecard import score_run
 from ratslam.config.run_config import RunConfig
 from ratslam.core.session import CHUNK, Session
-from ratslam.experiments.studies.memory import weighed
-from ratslam.experiments.studies.results import Machine, Result, Timing
+from ratslam.experiments.studies.environment import machine, other_load, peak_memory
+from ratslam.experiments.studies.fidelity import compare_with_tier
+from ratslam.experiments.studies.records import RunRecord, Timing
 from ratslam.experiments.studies.study import Job
 from ratslam.experiments.studies.timing import Stopwatch
 from ratslam.pipeline.artifacts import true_grid
 from ratslam.pipeline.online_error import OnlineErrorLog
 from ratslam.pipeline.runner import build_session
 from ratslam.pipeline.source import open_observations, read_observations
+from robot.sources.in_memory import InMemorySource, load_into_memory
+from robot.sources.perturbation import perturb
 from robot.sources.source import Source
 from robot.world.arena import read_arena
 from tactile.base.errors import InputError
-from tactile.base.se2 import integrate
+from tactile.base.se2 import compose, integrate, inverse
 
-PACKAGES = ("ratslam", "tactile", "robot", "evaluation")
-
-
-def run_job(job: Job) -> Result:
-    """Runs a job in this process. What a user can mend is told in the result, so that a study goes on."""
-    blank = Result(hash=job.hash, seed=job.seed, row=job.row, varied=job.varied, machine=machine())
-    try:
-        with _precision(job.config.session.precision), weighed() as memory:
-            found = _played(job.config, job.pace)
-    except InputError as error:
-        return blank.model_copy(update={"error": str(error)})
-    return blank.model_copy(update=found | {"memory": memory()})
+SAME_PLACE = 2.5
+"""Largest true distance between the ends of a true loop closure, pose cells."""
 
 
-@lru_cache(maxsize=1)
-def machine() -> Machine:
-    """This one."""
-    device = jax.devices()[0]
-    return Machine(
-        processor=_processor(),
-        device="cpu" if device.platform == "cpu" else device.device_kind,
-        versions={name: version(name) for name in ("jax", "jaxlib", "numpy")}
-        | {"python": platform.python_version()},
-        build=build(),
+def run_job(job: Job) -> RunRecord:
+    """Runs a job in this process. An `InputError` is recorded, so that the study continues."""
+    blank = RunRecord(
+        hash=job.hash, seed=job.seed, copy_number=job.copy_number, row=job.row, varied=job.varied
     )
+    with other_load() as load:
+        try:
+            with _precision(job.config.session.precision), peak_memory() as memory:
+                found = _play(job)
+        except InputError as error:
+            return blank.model_copy(update={"error": str(error), "machine": machine()})
+        here = machine().model_copy(update={"other_load": load()})
+    return blank.model_copy(update=found | {"memory": memory(), "machine": here})
 
 
-@lru_cache(maxsize=1)
-def build() -> str:
-    """The beginning of the sha256 of all our code: what was made by other code may come out otherwise."""
-    total = hashlib.sha256()
-    for name in PACKAGES:
-        folder = Path(str(sys.modules[name].__file__)).parent
-        for path in sorted(folder.rglob("*.py")):
-            total.update(f"{name}/{path.relative_to(folder).as_posix()}\n".encode() + path.read_bytes())
-    return total.hexdigest()[:12]
+def run_job_alone(task: tuple[Job, Path]) -> RunRecord:
+    """Runs a job in a fresh process, with a cache of compiled kernels in the given folder."""
+    job, kernels = task
+    jax.config.update("jax_compilation_cache_dir", str(kernels))
+    return run_job(job)
 
 
-def _played(config: RunConfig, pace: str) -> dict[str, Any]:
-    """The fields of a result that come of playing a configuration."""
-    began = perf_counter()
+class _Steps(NamedTuple):
+    """Arrays over the steps of a session, as `Run` has them, and whether the pose was lost."""
+
+    time: np.ndarray
+    odometry: np.ndarray
+    truth: np.ndarray
+    online: np.ndarray
+    place: np.ndarray
+    lost: np.ndarray
+
+
+def _play(job: Job) -> dict[str, Any]:
+    """The fields of a record that follow from playing a job's configuration."""
+    began, config = perf_counter(), job.config
     relations = read_relations(config.score.relations) if config.score.relations else None
     with open_observations(config) as (config, source):
-        watch = Stopwatch()
+        extra: dict[str, Quantity] = {}
+        if job.reference_tier is not None:
+            source = load_into_memory(source)
+            extra = compare_with_tier(config, source, perf_counter() - began, job.reference_tier)
+        if job.copy_number:
+            source = _perturbed(source, config, job.copy_number)
+        watch, present = Stopwatch(), OnlineErrorLog()
         with watch.preparing():
-            session = build_session(config, source)
-        time, motion, truth, told, places = [], [], [], [], []
-        present = OnlineErrorLog()
-        rows = read_observations(source)
-        while chunk := list(islice(rows, CHUNK)):
-            steps = []
-            for part in [chunk] if pace == "replay" else [[row] for row in chunk]:
-                with watch.taking(len(part)):
-                    steps += list(session.replay([reading for _, reading in part]))
-            time += [float(sample.time) for sample, _ in chunk]
-            motion += [np.asarray(reading.odometry[:3], float) for _, reading in chunk]
-            truth += [np.full(3, np.nan) if sample.truth is None else sample.truth for sample, _ in chunk]
-            told += [step.pose for step in steps]
-            places += [int(step.estimate.place) for step in steps]
-            present.update(session, truth)
-        if not time:
-            raise InputError(source.name, "no samples", "a session")
+            session = build_session(config, source, job.ablation)
+        steps = _take(session, source, job.pace, watch, present)
         with watch.finishing():
             final = session.map.trajectory()
-        run = _run(session, np.array(time), np.array(motion), np.array(truth), np.array(told), final, places)
+        run = _run(session, steps, final)
         card = score_run(
             run._replace(online_error=np.array(present.errors)),
             source.name,
             exm=config.score.experience_metric,
             relations=relations,
         )
-        quantities = card.quantities | _chart(session, source)
-    timing = Timing(pace=pace, **watch.told(), total_s=perf_counter() - began)
-    return {"steps": len(time), "source": source.digest, "quantities": quantities, "timing": timing}
+        cell = config.pose_cells.cell_size
+        extra |= _closures(session, steps, cell) | _anchored(steps, final) | _chart(session, source)
+    timing = Timing(pace=job.pace, **watch.summary(), total_s=perf_counter() - began)
+    quantities = card.quantities | extra
+    return {"steps": len(steps.time), "source": source.digest, "quantities": quantities, "timing": timing}
 
 
-def _run(
-    session: Session,
-    time: np.ndarray,
-    motion: np.ndarray,
-    truth: np.ndarray,
-    told: np.ndarray,
-    final: np.ndarray,
-    places: list[int],
-) -> RunArrays:
+def _perturbed(source: Source, config: RunConfig, copy_number: int) -> InMemorySource:
+    if config.recording is None:
+        source = load_into_memory(source)
+    if not isinstance(source, InMemorySource):
+        raise InputError("recording.file", "a recording that is streamed", "a CSV or .npz recording")
+    return perturb(source, copy_number)
+
+
+def _take(session: Session, source: Source, pace: str, watch: Stopwatch, present: OnlineErrorLog) -> _Steps:
+    time, motion, truth, online, places, lost = [], [], [], [], [], []
+    rows = read_observations(source)
+    while chunk := list(islice(rows, CHUNK)):
+        steps = []
+        for part in [chunk] if pace == "replay" else [[row] for row in chunk]:
+            with watch.taking(len(part)):
+                steps += list(session.replay([reading for _, reading in part]))
+        time += [float(sample.time) for sample, _ in chunk]
+        motion += [np.asarray(reading.odometry[:3], float) for _, reading in chunk]
+        truth += [np.full(3, np.nan) if sample.truth is None else sample.truth for sample, _ in chunk]
+        online += [step.pose for step in steps]
+        places += [int(step.estimate.place) for step in steps]
+        lost += [bool(step.estimate.lost) for step in steps]
+        present.update(session, truth)
+    if not time:
+        raise InputError(source.name, "no samples", "a session")
+    every = np.array(time), integrate(np.array(motion)), np.array(truth), np.array(online)
+    return _Steps(*every, np.array(places), np.array(lost))
+
+
+def _run(session: Session, steps: _Steps, final: np.ndarray) -> RunArrays:
     """The session as arrays, as `evaluation.artifacts.run_directory.read_run` reads one from its files."""
     graph = session.map.graph()
     nodes = np.array([[row["x"], row["y"], row["heading"]] for _, row in sorted(graph.nodes(data=True))])
     nodes = nodes.reshape(-1, 3)
-    place = np.array(places)
-    place = np.where(place < len(nodes), place, -1)
+    place = np.where(steps.place < len(nodes), steps.place, -1)
     return RunArrays(
-        time=time,
-        truth=truth if np.isfinite(truth).all(axis=1).any() else None,
-        online=told,
+        time=steps.time,
+        truth=steps.truth if np.isfinite(steps.truth).all(axis=1).any() else None,
+        online=steps.online,
         final=final,
-        odometry=integrate(motion),
+        odometry=steps.odometry,
         experience=place,
         created=np.array([int(np.argmax(place == node)) for node in range(len(nodes))], int),
         nodes=nodes,
@@ -144,8 +154,41 @@ def _run(
     )
 
 
+def _closures(session: Session, steps: _Steps, cell: float) -> dict[str, Quantity]:
+    """Number of loop closures, of false ones, and share of steps with a lost pose."""
+    closures, truth = session.map.closures(), steps.truth
+    false = None
+    if np.isfinite(truth).all(axis=1).any():
+        apart = np.hypot(*(truth[closures[:, 0]] - truth[closures[:, 1]])[:, :2].T)
+        false = int((apart > SAME_PLACE * cell).sum())
+    return {
+        "closures": Quantity(label="loop closures", value=len(closures), unit=""),
+        "false_closures": Quantity(label="false loop closures", value=false, unit=""),
+        "lost_share": Quantity(label="share of steps lost", value=float(steps.lost.mean()), unit=""),
+    }
+
+
+def _anchored(steps: _Steps, final: np.ndarray) -> dict[str, Quantity]:
+    """Mean position errors where the first true pose is given and paths are not aligned."""
+    if not np.isfinite(steps.truth).all():
+        return {}
+    # All backends take the first step from odometry, so its error is not theirs.
+    start = compose(steps.truth[0], inverse(steps.odometry[0]))
+
+    def error(path: np.ndarray) -> float:
+        return float(np.hypot(*(compose(start, path) - steps.truth)[:, :2].T).mean())
+
+    odometry = error(steps.odometry)
+    return {
+        f"error_{name}": Quantity(
+            label=f"position error, {name}", value=error(path), unit="m", odometry=odometry
+        )
+        for name, path in (("online", steps.online), ("final", final))
+    }
+
+
 def _chart(session: Session, source: Source) -> dict[str, Quantity]:
-    """What is measured on a map that is a grid, of an arena that is known."""
+    """Scores of a grid map of a known arena."""
     write, arena = session.map.files().get("grid.npz"), source.info.arena
     if write is None or arena is None:
         return {}
@@ -164,19 +207,10 @@ def _chart(session: Session, source: Source) -> dict[str, Quantity]:
 
 @contextmanager
 def _precision(wanted: str) -> Iterator[None]:
-    """JAX as a fresh process of that precision has it, whatever ran in this one before."""
+    """JAX with the precision of a fresh process, whatever ran in this one before."""
     before = jax.config.read("jax_enable_x64")
     jax.config.update("jax_enable_x64", wanted == "float64")
     try:
         yield
     finally:
         jax.config.update("jax_enable_x64", before)
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        lines = []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()

@@ -1,4 +1,4 @@
-"""What a study file may say."""
+"""The keys of a study file."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, NonNegativeInt, field_validator, model_validator
 
-from ratslam.experiments.studies.metrics import DIRECTIONS, MAIN
+from ratslam.experiments.studies.metrics import COLUMNS, DIRECTIONS
+from ratslam.keyframes.ablation import FULL, Ablation
 from tactile.base.config import Settings
 
 
 def _known(name: str) -> str:
     if name not in DIRECTIONS:
         near = get_close_matches(name, DIRECTIONS, n=1)
-        cure = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(MAIN)} and others"
+        cure = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(COLUMNS['means'])} and others"
         raise ValueError(f"no quantity of that name; {cure}")
     return name
 
@@ -28,21 +29,23 @@ def _directed(name: str) -> str:
 
 Values = Annotated[tuple[Any, ...], Field(min_length=1)]
 Seeds = Annotated[tuple[NonNegativeInt, ...], Field(min_length=1)]
+MOST_COPIES = 10_000
+Copies = Annotated[int, Field(ge=0, le=MOST_COPIES)]
 Known = Annotated[str, AfterValidator(_known)]
 Directed = Annotated[Known, AfterValidator(_directed)]
 
 
 class Parameter(Settings):
-    """A setting to choose: a number from `low` to `high`, whole if both are written whole, or a choice."""
+    """Range of a searched setting: numbers from `low` to `high` (integers if both are), or `choices`."""
 
     low: int | float | None = None
     """Smallest value."""
     high: int | float | None = None
     """Largest value."""
     log: bool = False
-    """Whether orders of magnitude count alike."""
+    """Whether to sample the logarithm uniformly."""
     choices: Annotated[tuple[bool | int | float | str, ...], Field(min_length=2)] | None = None
-    """These values, in no order."""
+    """Unordered values."""
 
     @model_validator(mode="after")
     def _either(self) -> Parameter:
@@ -56,41 +59,36 @@ class Parameter(Settings):
         return self
 
     @property
-    def whole(self) -> bool:
-        """Whether it is a whole number."""
-        return isinstance(self.low, int) and isinstance(self.high, int)
-
-    @property
     def extremes(self) -> tuple[Any, ...]:
-        """The ends, or all choices: what has to be possible."""
+        """The ends of the range, or all choices."""
         return (self.low, self.high) if self.choices is None else self.choices
 
 
-class TunePlan(Settings):
-    """What `--tune` looks for."""
+class SearchPlan(Settings):
+    """What `--search` optimises."""
 
     trials: Annotated[int, Field(ge=1, le=100_000)] = 50
-    """Sets of parameters to try."""
+    """Number of parameter sets to try."""
     parameters: Annotated[dict[str, Parameter], Field(min_length=1)]
-    """Which settings to choose, by key path, and out of what."""
+    """Searched settings by key path, each with its range."""
     objectives: tuple[Directed, ...] = ()
-    """Quantities to better, of which it is known whether large or small is better."""
+    """Quantities to improve in their known direction."""
     minimise: tuple[Known, ...] = ()
-    """Quantities to make small."""
+    """Quantities to minimise."""
     maximise: tuple[Known, ...] = ()
-    """Quantities to make large."""
+    """Quantities to maximise."""
     sampler: Literal["tpe", "nsga2"] = "tpe"
     """Tree-structured Parzen estimators (Bergstra et al. 2011), or a genetic algorithm (Deb et al. 2002)."""
     population: Annotated[int, Field(ge=2, le=10_000)] = 16
-    """Of the genetic algorithm."""
+    """Population of the genetic algorithm."""
     batch: Annotated[int, Field(ge=1, le=1000)] = 4
-    """Sets chosen at a time, before any of them has run. What is chosen depends on it, and not on how many
-    workers there are."""
+    """Parameter sets chosen at a time, before any of them has run. The choices depend on it, and not on the
+    number of workers."""
     seed: NonNegativeInt = 0
-    """Of the sampler."""
+    """Seed of the sampler."""
 
     @model_validator(mode="after")
-    def _some(self) -> TunePlan:
+    def _some(self) -> SearchPlan:
         every = (*self.objectives, *self.minimise, *self.maximise)
         if not every:
             raise ValueError("no objectives; name quantities in objectives, minimise or maximise")
@@ -99,29 +97,39 @@ class TunePlan(Settings):
         return self
 
     def directions(self) -> dict[str, Literal["minimize", "maximize"]]:
-        """Each objective, and whether to `minimize` or `maximize` it."""
+        """Optuna's direction of each objective."""
         high = {*self.maximise, *(name for name in self.objectives if DIRECTIONS[name] == "high")}
         every = (*self.objectives, *self.minimise, *self.maximise)
         return {name: "maximize" if name in high else "minimize" for name in every}
 
 
 class StudyPlan(Settings):
-    """A study: `python -m ratslam sweep study.yaml`."""
+    """A study: `python -m ratslam study FILE`."""
 
     base: Path
-    """The configuration of a run that all is varied from; a relative path starts at the study file."""
+    """Configuration that all runs start from; a relative path starts at the study file."""
     set: dict[str, Any] = Field(default_factory=dict)
     """Settings of all runs, by key path. Relative paths in them start at the base, as its own do."""
     rows: dict[str, dict[str, Any] | None] = Field(default_factory=dict)
-    """Named settings to compare, each by key path."""
+    """Named sets of settings to compare, by key path. A row may also hold `copies`, in place of the study's,
+    and `ablation`: parts of the keyframe map that are off, such as {verify: false}."""
     vary: dict[str, Values] = Field(default_factory=dict)
-    """Settings to combine, each with its values: all combinations are run, of every row."""
+    """Settings to combine, each with its values: every row runs with all combinations."""
     seeds: int | Seeds = 1
-    """How many seeds, from 0 on, or which: of what is simulated, or of the session where nothing is."""
+    """Number of seeds from 0 on, or a list of them: of the simulation, or of the session on a recording."""
+    copies: Copies = 0
+    """Number of perturbed copies of each session to run in place of the session itself; 0: the session."""
     pace: Literal["replay", "live"] = "replay"
-    """Whether steps are taken and timed one at a time, as live, or a chunk at a time."""
-    tune: TunePlan | None = None
-    """What `--tune` looks for, from the base and `set`; rows and combinations are not part of it."""
+    """`live`: steps are taken and timed one at a time; `replay`: a chunk at a time."""
+    report: Literal["means", "medians", "differences", "tiers", "pareto"] = "means"
+    """The table: means over seeds, medians over seeds, differences from the first row, cost of simulation, or
+    speed against error; for the last, runs are measured one at a time in processes of their own."""
+    limit: float | None = None
+    """Largest final ATE of a row that counts as kept in `differences`, m; default 1.25 of the first row's."""
+    reference_tier: Literal["kinematic", "quasistatic", "dynamic"] | None = None
+    """Fidelity of simulation whose images the images of each run are compared with."""
+    tune: SearchPlan | None = None
+    """What `--search` optimises, from the base and `set`; rows and combinations are not part of it."""
 
     @field_validator("seeds", mode="after")
     @classmethod
@@ -133,6 +141,30 @@ class StudyPlan(Settings):
             raise ValueError("a seed given twice")
         return seeds
 
+    @field_validator("rows", mode="after")
+    @classmethod
+    def _beside_settings(cls, rows: dict[str, dict[str, Any] | None]) -> dict[str, dict[str, Any] | None]:
+        for name, row in rows.items():
+            copies, parts = (row or {}).get("copies", 0), (row or {}).get("ablation", {})
+            if type(copies) is not int or not 0 <= copies <= MOST_COPIES:
+                raise ValueError(
+                    f"copies {copies!r} of row {name!r} is not an integer from 0 to {MOST_COPIES}"
+                )
+            if not isinstance(parts, dict) or not set(parts) <= set(FULL._fields):
+                raise ValueError(f"ablation of row {name!r} has other parts than {', '.join(FULL._fields)}")
+            if not all(isinstance(on, bool) for on in parts.values()):
+                raise ValueError(f"ablation of row {name!r}: give true or false for each part")
+        return rows
+
     def every_seed(self) -> tuple[int, ...]:
         """The seeds themselves."""
         return tuple(range(self.seeds)) if isinstance(self.seeds, int) else self.seeds
+
+    def ablation(self, row: str) -> Ablation:
+        """Parts of the keyframe map that are on in a row."""
+        return Ablation(**(self.rows.get(row) or {}).get("ablation", {}))
+
+    def every_copy(self, row: str = "") -> tuple[int, ...]:
+        """Seeds of a row's perturbed copies; (0,): the session itself."""
+        copies = (self.rows.get(row) or {}).get("copies", self.copies)
+        return tuple(range(1, copies + 1)) or (0,)

@@ -1,4 +1,4 @@
-"""A study: a configuration, what is varied of it, and the jobs that come of that."""
+"""A study: a base configuration, its variations, and the runs that follow from them."""
 
 from __future__ import annotations
 
@@ -15,19 +15,24 @@ from ratslam.config.strict_yaml.document import KeyPath, Place
 from ratslam.config.strict_yaml.reader import Reader
 from ratslam.experiments.studies.config_hash import digest_of, seed_key, with_seed
 from ratslam.experiments.studies.overrides import named, outermost_first, overlap, put
-from ratslam.experiments.studies.schema import StudyPlan, TunePlan
+from ratslam.experiments.studies.records import run_key
+from ratslam.experiments.studies.schema import SearchPlan, StudyPlan
+from ratslam.keyframes.ablation import FULL, Ablation
 from tactile.base.errors import InputError, InputErrors
 
 MOST = 100_000
-"""Jobs of a study."""
+"""Largest number of jobs of a study."""
+ROW_KEYS = ("copies", "ablation")
+"""Keys of a row that are not settings."""
 
 
 class Variant(NamedTuple):
     """One configuration of a study.
 
     Attributes:
-        row: its name, '' where a study names none. varied: the combination, by key path. config: with whole
-            paths, under some seed. hash: of the configuration without its seed, and of the files it names.
+        row: name of its row; '' if the study has no rows. varied: combination of `vary`, by key path.
+        config: with absolute paths, under any seed. hash: of the configuration without its seed, and of the
+            files it names.
     """
 
     row: str
@@ -37,10 +42,11 @@ class Variant(NamedTuple):
 
 
 class Job(NamedTuple):
-    """One run of a study; attributes as of a `Variant`, the configuration under this seed.
+    """One run of a study: a `Variant` with a seed.
 
     Attributes:
-        pace: `replay` or `live`.
+        copy_number: seed of the perturbed copy; 0: none. pace, reference_tier: see `StudyPlan`. ablation:
+            parts of the keyframe map that are on.
     """
 
     row: str
@@ -48,21 +54,24 @@ class Job(NamedTuple):
     config: RunConfig
     hash: str
     seed: int
+    copy_number: int = 0
     pace: str = "replay"
+    reference_tier: str | None = None
+    ablation: Ablation = FULL
 
     @property
     def key(self) -> str:
-        """The name of its result: two jobs of one key are the same."""
-        return f"{self.hash}-{self.seed}"
+        """Identifies the run: two jobs with one key are the same."""
+        return run_key(self.hash, self.seed, self.copy_number)
 
 
 class Study(NamedTuple):
-    """A study that has been checked.
+    """A checked study.
 
     Attributes:
-        name: the file's, without its ending. plan: what the file says, overrides included. document: the
-            same, with places. base: the base with `set` applied, with places. folder: of the base; its
-            relative paths start there. variants: all configurations.
+        name: file name without its ending. plan: content of the file with overrides. document: the same, with
+            places. base: the base with `set` applied, with places. folder: folder of the base, where its
+            relative paths start. variants: all configurations.
     """
 
     name: str
@@ -74,36 +83,47 @@ class Study(NamedTuple):
 
 
 def read_study(path: str | Path, overrides: Sequence[str] = ()) -> Study:
-    """The study in a file, every configuration of it checked.
+    """The study in a file; see `check_study`."""
+    return check_study(Path(path).stem, load(path), Path(path).parent, overrides)
+
+
+def check_study(name: str, document: Document, folder: Path, overrides: Sequence[str] = ()) -> Study:
+    """A study all of whose configurations are valid.
 
     Args:
-        overrides: each `a.b=value`: of the study itself where `a` is one of its keys, else of all runs.
+        folder: start of a relative path of `base`. overrides: each `a.b=value`: a key of the study where `a`
+            is one, else a setting of all runs.
 
     Raises:
-        InputError: it cannot be read, or some configuration of it is none; nothing has run by then.
+        InputError: the file, the base or one of the configurations is invalid.
     """
-    document = _overridden(load(path), overrides)
+    document = _overridden(document, overrides)
     plan = validate(document, StudyPlan)
     _unambiguous(plan, document)
-    file = Path(path).parent / plan.base
+    file = folder / plan.base
     base = load(file)
     for key in outermost_first(plan.set):
         base = put(base, key, plan.set[key], document, ("set", key))
-    study = Study(Path(path).stem, plan, document, base, file.parent, ())
+    study = Study(name, plan, document, base, file.parent, ())
     if plan.tune is not None:
-        _check_tuning(study, plan.tune)
+        _check_search(study, plan.tune)
     return study._replace(variants=tuple(_variants(study)))
 
 
-def jobs(study: Study) -> list[Job]:
-    """All jobs of a study: rows, in each all combinations, in each all seeds."""
-    return [job for variant in study.variants for job in seeded(variant, study.plan)]
+def list_jobs(study: Study) -> list[Job]:
+    """All jobs of a study: by row, combination, seed and perturbed copy."""
+    return [job for variant in study.variants for job in jobs_of(variant, study.plan)]
 
 
-def seeded(variant: Variant, plan: StudyPlan) -> list[Job]:
-    """A configuration under every seed."""
+def jobs_of(variant: Variant, plan: StudyPlan) -> list[Job]:
+    """A configuration under every seed and copy."""
     row, varied, config, digest = variant
-    return [Job(row, varied, with_seed(config, seed), digest, seed, plan.pace) for seed in plan.every_seed()]
+    how = plan.pace, plan.reference_tier, plan.ablation(row)
+    return [
+        Job(row, varied, with_seed(config, seed), digest, seed, copy_number, *how)
+        for seed in plan.every_seed()
+        for copy_number in plan.every_copy(row)
+    ]
 
 
 def variant_of(
@@ -118,7 +138,7 @@ def variant_of(
         settings: key path, value, and where in the study file that was written.
 
     Raises:
-        InputError: that is no configuration.
+        InputError: the result is not a valid configuration.
     """
     document = study.base
     for key, value, at in settings:
@@ -130,41 +150,32 @@ def variant_of(
     for key, _, at in [*everywhere, *settings]:
         if key == seed_key(config):
             raise InputError(study.document.at_key(named(at)), "a seed", "the study's `seeds`")
-    return Variant(row, varied or {}, config, digest_of(config, study.plan.pace))
+    ablation = study.plan.ablation(row)
+    parts = (study.plan.pace, study.plan.reference_tier, "" if ablation == FULL else repr(ablation))
+    how = " ".join(filter(None, parts))
+    return Variant(row, varied or {}, config, digest_of(config, how))
 
 
-def tuned(study: Study, parameters: dict[str, Any]) -> Variant:
-    """The study's base with a choice of what it tunes, by key path.
+def searched_variant(study: Study, parameters: dict[str, Any]) -> Variant:
+    """The study's base with chosen parameters, by key path.
 
     Raises:
-        InputError: these cannot be together.
+        InputError: they contradict each other.
     """
     settings = [(key, value, ("tune", "parameters", key)) for key, value in parameters.items()]
     return variant_of(study, settings, "tune", parameters)
 
 
-def made(directory: Path) -> None:
-    """Makes a directory where there is none.
-
-    Raises:
-        InputError: it cannot be made.
-    """
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        found = f"cannot be made ({error.strerror})"
-        raise InputError(str(directory), found, "a folder to write to") from None
-
-
 def _variants(study: Study) -> Iterator[Variant]:
     plan = study.plan
     rows = plan.rows or {"": {}}
-    total = len(rows) * prod(map(len, plan.vary.values())) * len(plan.every_seed())
+    copies = sum(len(plan.every_copy(name)) for name in rows)
+    total = copies * prod(map(len, plan.vary.values())) * len(plan.every_seed())
     if total > MOST:
         raise InputError(study.document.at_key(()), f"{total} jobs", f"at most {MOST}", "vary less at a time")
     wrong: dict[str, InputError] = {}
     for name, row in rows.items():
-        row = row or {}
+        row = {key: value for key, value in (row or {}).items() if key not in ROW_KEYS}
         fixed = [(key, row[key], ("rows", name, key)) for key in outermost_first(row)]
         for chosen in product(*(range(len(values)) for values in plan.vary.values())):
             picked = dict(zip(plan.vary, chosen, strict=True))
@@ -183,16 +194,16 @@ def _variants(study: Study) -> Iterator[Variant]:
         raise InputErrors(list(wrong.values()))
 
 
-def _check_tuning(study: Study, plan: TunePlan) -> None:
-    """Every parameter at the ends of what it may be, or at each of its choices; the others at their first."""
+def _check_search(study: Study, plan: SearchPlan) -> None:
+    """Validates each parameter at its extremes, with the others at their first."""
     first = {key: parameter.extremes[0] for key, parameter in plan.parameters.items()}
     for key, parameter in plan.parameters.items():
         for value in parameter.extremes:
-            tuned(study, first | {key: value})
+            searched_variant(study, first | {key: value})
 
 
 def _overridden(document: Document, overrides: Sequence[str]) -> Document:
-    """The study with overrides; those of runs are put under `set`, in the place of what they replace."""
+    """The study with overrides; those of runs replace settings under `set`."""
     own = [text for text in overrides if text.partition("=")[0].split(".")[0] in StudyPlan.model_fields]
     document = override(document, own)
     runs = [text for text in overrides if text not in own]
@@ -214,7 +225,7 @@ def _overridden(document: Document, overrides: Sequence[str]) -> Document:
 
 
 def _unambiguous(plan: StudyPlan, document: Document) -> None:
-    """Refuses settings that would overwrite each other."""
+    """Refuses settings that overwrite each other."""
     tuned = plan.tune.parameters if plan.tune else {}
     rows = {name: row or {} for name, row in plan.rows.items()}
     several: list[tuple[str, KeyPath]] = [(key, ("vary", key)) for key in plan.vary]

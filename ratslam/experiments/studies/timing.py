@@ -1,4 +1,4 @@
-"""Time per step, with compiling kept apart."""
+"""Time per step, separate from compilation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _COMPILED = "/jax/core/compile/backend_compile_duration"
 
 
 class Stopwatch:
-    """Times calls that take one or more steps."""
+    """Measures calls of one or more steps."""
 
     def __init__(self) -> None:
         self._counted = _compilations()
@@ -26,7 +26,7 @@ class Stopwatch:
 
     @contextmanager
     def preparing(self) -> Iterator[None]:
-        """Around what is done before the first step."""
+        """Surrounds the work before the first step."""
         before, began = self._counted[0], perf_counter()
         yield
         self._preparing += perf_counter() - began
@@ -34,7 +34,7 @@ class Stopwatch:
 
     @contextmanager
     def taking(self, steps: int) -> Iterator[None]:
-        """Around so many steps."""
+        """Surrounds the given number of steps."""
         before, began = self._counted[0], perf_counter()
         yield
         taken = steps, perf_counter() - began
@@ -44,13 +44,13 @@ class Stopwatch:
 
     @contextmanager
     def finishing(self) -> Iterator[None]:
-        """Around what is done after the last step."""
+        """Surrounds the work after the last step."""
         began = perf_counter()
         yield
         self._finishing += perf_counter() - began
 
-    def told(self) -> dict[str, Any]:
-        """As `ratslam.experiments.studies.results.Timing` has it."""
+    def summary(self) -> dict[str, Any]:
+        """Fields of `ratslam.experiments.studies.records.Timing`."""
         each = np.array([seconds / steps for steps, seconds in self._taken])
         usual = float(np.median(each)) if len(each) else None
         extra = sum(seconds - steps * (usual or 0.0) for steps, seconds in self._compiling)
@@ -65,12 +65,12 @@ class Stopwatch:
 
 @lru_cache(maxsize=1)
 def _compilations() -> list[int]:
-    """[how many kernels this process has compiled or fetched since this was first asked]."""
+    """[number of kernels that this process has compiled or fetched since the first call]."""
     count = [0]
 
-    def heard(event: str, duration_secs: float, **_: str | int) -> None:
+    def count_event(event: str, duration_secs: float, **_: str | int) -> None:
         if event == _COMPILED:
             count[0] += 1
 
-    jax.monitoring.register_event_duration_secs_listener(heard)
+    jax.monitoring.register_event_duration_secs_listener(count_event)
     return count

@@ -15,7 +15,6 @@ import pytest
 from ratslam.cli import main
 from ratslam.config.completion import complete
 from ratslam.config.run_config import RunConfig, load_config
-from ratslam.experiments.trials.ablation import trial
 from ratslam.pipeline.run import simulate
 from ratslam.pipeline.source import open_source
 from robot.recordings.mcap_reader import Recording
@@ -192,9 +191,3 @@ def test_a_maze_file_lies_beside_its_configuration(tmp_path):
     count, interrupted = simulate(load_config(tmp_path / "config.yaml"), tmp_path / "a.mcap")
     assert count == Recording(tmp_path / "a.mcap").length
     assert not interrupted
-
-
-def test_copies_of_a_session_are_perturbed(folder):
-    config = RunConfig.model_validate({"simulation": {"path": {"explore": 120}}})
-    plain, copy = (trial(config, folder, seed) for seed in (0, 1))
-    assert copy.odometry != plain.odometry

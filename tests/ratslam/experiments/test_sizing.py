@@ -27,9 +27,10 @@ from ratslam.experiments.sizing.recommendation import (
     with_settings,
 )
 from ratslam.experiments.sizing.report import snippet
-from ratslam.experiments.sizing.scene_statistics import Scene, cheapest, scene_of, short
+from ratslam.experiments.sizing.scene_statistics import Scene, scene_of, short
 from ratslam.experiments.sizing.trial_runs import cheaper
-from ratslam.experiments.studies.results import Result
+from ratslam.experiments.studies.fidelity import with_tier
+from ratslam.experiments.studies.records import RunRecord
 from ratslam.grid.particle_maps import LAYERS
 from ratslam.pipeline.source import open_source
 
@@ -133,7 +134,7 @@ def configuration(**content):
 def test_a_scene_is_what_its_odometry_tells():
     motion = {"speed": 0.04, "jitter": {"speed": 0.0, "position": 0.0, "yaw_deg": 0.0}}
     config = configuration(simulation={"motion": motion, "path": {"circuits": "C"}})
-    with open_source(cheapest(config)) as source:
+    with open_source(with_tier(config, "kinematic")) as source:
         scene = scene_of(source)
         moves = np.array([sample.reading.odometry[:3] for sample in source])
     assert scene.cycles == source.length == len(moves)
@@ -189,9 +190,9 @@ def stubbed(monkeypatch):
     def run_job(job):
         asked.append(job.config)
         if job.config.backend == "classic":
-            return Result(hash="", seed=0, error="backend: cannot be had")
+            return RunRecord(hash="", seed=0, error="backend: cannot be had")
         em = Quantity(label="EM", value=float(job.config.pose_cells.cell_size), unit="")
-        return Result(hash="", seed=0, steps=9, quantities={"energy_all": em})
+        return RunRecord(hash="", seed=0, steps=9, quantities={"energy_all": em})
 
     monkeypatch.setattr("ratslam.experiments.sizing.trial_runs.run_job", run_job)
     return asked

@@ -1,4 +1,4 @@
-"""Studies of sessions that take a moment, and jobs that take none."""
+"""Studies of short sessions, and runs without sessions."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from evaluation.metrics.metric import Quantity
-from ratslam.experiments.studies.results import Result
+from ratslam.experiments.studies.environment import machine
+from ratslam.experiments.studies.records import RunRecord, Timing
 from ratslam.experiments.studies.study import Job
 
 TINY = {
@@ -21,6 +22,20 @@ TINY = {
     "backend": "classic",
 }
 """Some 40 whisks."""
+
+
+def record(row="", seed=0, time=100.0, error=None, varied=None, odometry=None, hash=None, **values):
+    """A record without a run."""
+    quantities = {
+        name: Quantity(label=name, value=value, unit="", odometry=odometry) for name, value in values.items()
+    }
+    timing = Timing(
+        pace="live", median_us=time, p99_us=2 * time, compile_s=1.0, compilations=1, finish_s=0.0, total_s=3.0
+    )
+    return RunRecord(
+        hash=hash or row or "none", seed=seed, row=row, varied=varied or {}, steps=10, quantities=quantities,
+        timing=timing, error=error, machine=machine(), memory=400.0,
+    )  # fmt: skip
 
 
 @pytest.fixture
@@ -38,20 +53,20 @@ def tiny(tmp_path: Path) -> Callable[..., Path]:
 
 
 @pytest.fixture
-def played(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Jobs are not run: their answers follow from settings and seed. The keys asked for."""
+def stubbed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Replaces runs by records that follow from settings and seed; the keys of the runs."""
     asked: list[str] = []
 
-    def run_job(job: Job) -> Result:
+    def run_job(job: Job) -> RunRecord:
         asked.append(job.key)
-        if job.config.keyframes.min_score > 40:
-            return Result(hash=job.hash, seed=job.seed, error="keyframes.min_score: too much")
+        score = job.config.keyframes.min_score
+        failed = "keyframes.min_score: too much" if score > 40 else None
         values = {
-            "energy_all": (job.config.keyframes.min_score - 7) ** 2 + job.seed,
-            "exm_arr": 1 / (1 + abs(job.config.keyframes.min_score - 12) + job.config.recall.modes),
+            "energy_all": (score - 7) ** 2 + job.seed,
+            "exm_arr": 1 / (1 + abs(score - 12) + job.config.recall.modes),
         }
-        quantities = {name: Quantity(label=name, value=value, unit="") for name, value in values.items()}
-        return Result(hash=job.hash, seed=job.seed, quantities=quantities, steps=1)
+        found = record(time=1000 / score, error=failed, **({} if failed else values))
+        return found.model_copy(update={"hash": job.hash, "seed": job.seed, "copy_number": job.copy_number})
 
-    monkeypatch.setattr("ratslam.experiments.studies.recorded_runs.run_job", run_job)
+    monkeypatch.setattr("ratslam.experiments.studies.study_runner.run_job", run_job)
     return asked

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from pathlib import Path
 
 import jax
@@ -10,12 +11,16 @@ import pytest
 
 from evaluation.artifacts.run_directory import read_scorecard
 from evaluation.metrics.grid_metrics import GRID_METRICS
-from ratslam.experiments.studies.memory import weighed
+from ratslam.experiments.studies.environment import one_core, other_load, peak_memory
 from ratslam.experiments.studies.metrics import DIRECTIONS, MEASURED
 from ratslam.experiments.studies.run_job import run_job
-from ratslam.experiments.studies.study import jobs, read_study
+from ratslam.experiments.studies.study import list_jobs, read_study
 from ratslam.experiments.studies.timing import Stopwatch
+from ratslam.keyframes.ablation import FULL
 from ratslam.pipeline.run import run
+from robot.recordings.mcap_reader import record_source
+from robot.recordings.npz_trace import read_trace
+from tactile.base.errors import InputError
 
 ROOT = Path(__file__).parents[4]
 SMALL = {"simulation.path": {"circuits": "CC"}}
@@ -23,11 +28,11 @@ SMALL = {"simulation.path": {"circuits": "CC"}}
 
 @pytest.mark.parametrize("backend", ["classic", pytest.param("recall", marks=pytest.mark.soak)])
 def test_a_job_has_the_figures_of_a_run(tiny, tmp_path, backend):
-    (job,) = jobs(read_study(tiny(set=SMALL | {"backend": backend}, seeds=[3])))
+    (job,) = list_jobs(read_study(tiny(set=SMALL | {"backend": backend}, seeds=[3])))
     result = run_job(job)
     run(job.config, tmp_path / "run")
     card = read_scorecard(tmp_path / "run")
-    assert list(result.quantities) == list(card.quantities)
+    assert list(result.quantities)[: len(card.quantities)] == list(card.quantities)
     for name, quantity in card.quantities.items():
         ours = result.quantities[name]
         assert (ours.label, ours.unit) == (quantity.label, quantity.unit)
@@ -38,22 +43,22 @@ def test_a_job_has_the_figures_of_a_run(tiny, tmp_path, backend):
 
 
 def test_a_job_is_timed_with_compiling_apart_and_weighed(tiny):
-    (job,) = jobs(read_study(tiny(set=SMALL)))
+    (job,) = list_jobs(read_study(tiny(set=SMALL)))
     result = run_job(job)
-    timing, memory = result.timing, result.memory
+    timing = result.timing
     assert 0 < timing.median_us <= timing.p99_us
     assert timing.compilations > 0
     assert timing.compile_s + 1e-6 * timing.median_us * result.steps < timing.total_s * 1.2
     assert timing.compile_s > 100e-6 * timing.median_us  # not hidden among the steps
-    assert 0 < memory.before <= memory.peak
+    assert result.memory > 100
     assert result.machine.versions["jax"] == jax.__version__
     assert all(result.value(name) > 0 for name in MEASURED)
 
 
 def test_pace_and_what_ran_before_change_no_figure(tiny):
     vary = {"session.precision": ["float32", "float64"]}
-    single, double = jobs(read_study(tiny(vary=vary)))
-    (live, _) = jobs(read_study(tiny(vary=vary, pace="live")))
+    single, double = list_jobs(read_study(tiny(vary=vary)))
+    (live, _) = list_jobs(read_study(tiny(vary=vary, pace="live")))
     first, before = run_job(single), jax.config.jax_enable_x64
     wide = run_job(double)
     stepwise = run_job(live)
@@ -68,7 +73,7 @@ def test_the_grid_filter_is_judged_by_its_map(tmp_path):
     (tmp_path / "study.yaml").write_text(
         f"base: {ROOT}/configs/create_arena.yaml\nset: {{create_simulation.reports: 30, grid.particles: 8}}\n"
     )
-    (job,) = jobs(read_study(tmp_path / "study.yaml"))
+    (job,) = list_jobs(read_study(tmp_path / "study.yaml"))
     result = run_job(job)
     assert result.error is None
     assert 0 < result.value("map_error") < 1
@@ -77,11 +82,12 @@ def test_the_grid_filter_is_judged_by_its_map(tmp_path):
 
 
 def test_every_quantity_of_the_scorecards_is_known(tiny, tmp_path):
-    """Otherwise it could not be tuned for, and its worst would not be told."""
-    (job,) = jobs(read_study(tiny()))
+    """A search needs the direction of each quantity, and a table its worst value."""
+    (job,) = list_jobs(read_study(tiny()))
     (tmp_path / "relations").write_text("2.5,4.5,0,0,0,0,0,0\n2.5,6.5,0,0,0,0,0,0\n")
     score = job.config.score.model_copy(update={"relations": tmp_path / "relations"})
-    told = run_job(job._replace(config=job.config.model_copy(update={"score": score})))
+    config = job.config.model_copy(update={"score": score})
+    told = run_job(job._replace(config=config, reference_tier="kinematic"))
     assert told.error is None
     maps = {name for name in DIRECTIONS if name.startswith("map_")}
     assert set(told.quantities) | maps | set(MEASURED) == set(DIRECTIONS)
@@ -89,7 +95,7 @@ def test_every_quantity_of_the_scorecards_is_known(tiny, tmp_path):
 
 
 def test_what_a_user_can_mend_is_a_result(tiny):
-    (job,) = jobs(read_study(tiny(set={"simulation.maze": {"file": "nowhere.txt"}})))
+    (job,) = list_jobs(read_study(tiny(set={"simulation.maze": {"file": "nowhere.txt"}})))
     result = run_job(job)
     assert "nowhere.txt" in result.error
     assert result.quantities == {}
@@ -98,7 +104,7 @@ def test_what_a_user_can_mend_is_a_result(tiny):
 
 def test_what_nobody_can_mend_is_not_hidden(tiny, monkeypatch):
     monkeypatch.setattr("ratslam.experiments.studies.run_job.build_session", lambda *_: 1 / 0)
-    (job,) = jobs(read_study(tiny()))
+    (job,) = list_jobs(read_study(tiny()))
     with pytest.raises(ZeroDivisionError):
         run_job(job)
 
@@ -113,7 +119,7 @@ def test_a_stopwatch_keeps_compiling_out_of_the_steps(monkeypatch):
         with watch.taking(16):
             now[0] += seconds
             watch._counted[0] += compiles
-    told = watch.told()
+    told = watch.summary()
     assert told["median_us"] == pytest.approx(1000)
     assert told["p99_us"] == pytest.approx(2000, rel=0.02)
     assert told["compile_s"] == pytest.approx(18.0)
@@ -129,19 +135,73 @@ def test_a_stopwatch_counts_what_jax_compiles():
     for _ in range(3):
         with watch.taking(1):
             kept(1.0).block_until_ready()
-    assert watch.told()["compilations"] >= 3
+    assert watch.summary()["compilations"] >= 3
     assert len(watch._taken) == 2
 
 
 def test_memory_is_of_this_piece_of_work():
-    with weighed() as memory:
+    with peak_memory() as before:
+        pass
+    with peak_memory() as memory:
         large = bytearray(200 << 20)
         large[::4096] = b"x" * len(large[::4096])
         del large
-    told = memory()
-    with weighed() as after:
+    peak = memory()
+    with peak_memory() as after:
         pass
-    if told.exact:
-        assert told.peak - told.before > 150
-        assert after().peak < told.peak - 100
-    assert told.peak >= told.before > 0
+    assert peak >= before() > 0
+    if Path("/proc/self/clear_refs").exists():
+        assert peak - before() > 150
+        assert after() < peak - 100
+
+
+def test_measuring_keeps_to_one_core_and_lets_go_of_it():
+    if not hasattr(os, "sched_getaffinity"):
+        pytest.skip("this system does not say on which cores a process runs")
+    cores = os.sched_getaffinity(0)
+    with one_core(), other_load() as load:
+        assert len(os.sched_getaffinity(0)) == 1
+        assert os.sched_getaffinity(0) <= cores
+    assert os.sched_getaffinity(0) == cores
+    found = load()
+    assert found is None or found >= 0
+
+
+def test_a_perturbed_copy_is_another_session(tiny):
+    plain, copy = list_jobs(read_study(tiny(rows={"plain": {}, "copy": {"copies": 1}})))
+    first, second = run_job(plain), run_job(copy)
+    assert second.source == f"{first.source}+1"
+    assert second.quantities["ate_final"].odometry != first.quantities["ate_final"].odometry
+
+
+def test_a_streamed_recording_is_not_perturbed(tmp_path):
+    record_source(read_trace(ROOT / "tests" / "golden" / "a_square3.npz"), tmp_path / "a.mcap")
+    (tmp_path / "base.yaml").write_text("recording: {file: a.mcap}\n")
+    (tmp_path / "study.yaml").write_text("base: base.yaml\ncopies: 1\n")
+    (job,) = list_jobs(read_study(tmp_path / "study.yaml"))
+    assert "streamed" in run_job(job).error
+
+
+def test_closures_true_and_false_are_counted(tmp_path):
+    (tmp_path / "study.yaml").write_text(f"base: {ROOT}/configs/square.yaml\n")
+    (job,) = list_jobs(read_study(tmp_path / "study.yaml"))
+    found = run_job(job)
+    assert found.value("ate_final") < 0.02 < found.quantities["ate_final"].odometry
+    assert found.value("closures") > 150
+    assert found.value("false_closures") == 0
+    assert found.value("anytime_median") < found.quantities["ate_final"].odometry
+    assert found.value("lost_share") < 0.5
+
+
+def test_an_ablation_reaches_the_session(tiny, monkeypatch):
+    given = []
+
+    def build_session(config, source, ablation):
+        given.append(ablation)
+        raise InputError("a", "b", "c")
+
+    monkeypatch.setattr("ratslam.experiments.studies.run_job.build_session", build_session)
+    rows = {"plain": {}, "off": {"ablation": {"verify": False}}}
+    for job in list_jobs(read_study(tiny(rows=rows))):
+        run_job(job)
+    assert given == [FULL, FULL._replace(verify=False)]

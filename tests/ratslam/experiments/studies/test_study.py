@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,8 @@ from hypothesis import strategies as st
 from ratslam.cli import main
 from ratslam.config.run_config import RunConfig
 from ratslam.experiments.studies.schema import StudyPlan
-from ratslam.experiments.studies.study import Study, jobs, read_study
+from ratslam.experiments.studies.study import Study, list_jobs, read_study
+from ratslam.keyframes.ablation import FULL
 from ratslam.keyframes.config import KeyframeMapConfig
 from tactile.base.errors import InputError
 
@@ -54,7 +56,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @given(grid=GRIDS, rows=st.lists(st.integers(1, 99), unique=True, max_size=3), seeds=st.integers(1, 4))
 def test_rows_by_combinations_by_seeds(folder, grid, rows, seeds):
     named = {f"row {n}": {"keyframes.max_distance": n + 0.5} for n in rows}
-    found = jobs(read(folder, vary=grid, rows=named, seeds=seeds))
+    found = list_jobs(read(folder, vary=grid, rows=named, seeds=seeds))
     combinations = 1
     for values in grid.values():
         combinations *= len(values)
@@ -75,15 +77,15 @@ def test_rows_by_combinations_by_seeds(folder, grid, rows, seeds):
 def test_hashes_follow_from_what_is_set_and_not_from_how_it_is_written(folder, grid, data):
     first = {key: values[0] for key, values in grid.items()}
     shuffled = {key: grid[key] for key in data.draw(st.permutations(sorted(grid)))}
-    expected = {job.key for job in jobs(read(folder, vary=grid, seeds=2))}
-    assert {job.key for job in jobs(read(folder, vary=shuffled, seeds=2))} == expected
-    as_row = jobs(read(folder, rows={"one": {key: first[key] for key in shuffled}}, seeds=2))
-    as_set = jobs(read(folder, set={key: first[key] for key in shuffled}, seeds=[1, 0]))
+    expected = {job.key for job in list_jobs(read(folder, vary=grid, seeds=2))}
+    assert {job.key for job in list_jobs(read(folder, vary=shuffled, seeds=2))} == expected
+    as_row = list_jobs(read(folder, rows={"one": {key: first[key] for key in shuffled}}, seeds=2))
+    as_set = list_jobs(read(folder, set={key: first[key] for key in shuffled}, seeds=[1, 0]))
     assert {job.key for job in as_row} == {job.key for job in as_set} <= expected
 
 
 def test_a_row_that_equals_another_is_the_same_job(folder):
-    found = jobs(read(folder, rows={"a": None, "b": {}, "c": {"keyframes.min_score": 3.0}}))
+    found = list_jobs(read(folder, rows={"a": None, "b": {}, "c": {"keyframes.min_score": 3.0}}))
     assert [job.row for job in found] == ["a", "b", "c"]
     assert found[0].key == found[1].key != found[2].key
 
@@ -91,7 +93,7 @@ def test_a_row_that_equals_another_is_the_same_job(folder):
 def test_what_is_set_counts_even_if_it_is_the_default(folder):
     """What nobody sets may be completed from the source: touch has a `keyframes.min_score` of its own."""
     usual = KeyframeMapConfig().min_score
-    unset, default = jobs(read(folder, rows={"unset": {}, "default": {"keyframes.min_score": usual}}))
+    unset, default = list_jobs(read(folder, rows={"unset": {}, "default": {"keyframes.min_score": usual}}))
     assert unset.config == default.config
     assert unset.key != default.key
 
@@ -101,7 +103,7 @@ def test_seeds_are_no_part_of_the_hash_and_the_base_may_have_any(folder):
     base.write_text("simulation: {seed: 77}\n")
     plain = folder / "plain.yaml"
     plain.write_text("simulation: {}\n")
-    seeded, bare = (jobs(read(folder, base=path, seeds=[5])) for path in (base, plain))
+    seeded, bare = (list_jobs(read(folder, base=path, seeds=[5])) for path in (base, plain))
     assert seeded[0].key == bare[0].key
     assert seeded[0].config.simulation.seed == 5
 
@@ -115,7 +117,7 @@ def test_seeds_are_no_part_of_the_hash_and_the_base_may_have_any(folder):
     ],
 )
 def test_seeds_are_of_what_is_run_on(folder, base, section):
-    found = jobs(read(folder, base=ROOT / "configs" / base, seeds=[3, 8]))
+    found = list_jobs(read(folder, base=ROOT / "configs" / base, seeds=[3, 8]))
     assert [getattr(job.config, section).seed for job in found] == [3, 8]
 
 
@@ -127,19 +129,36 @@ def test_the_content_of_a_file_counts_and_not_where_it_lies(folder):
         (folder / name / "run.npz").write_bytes(golden.read_bytes() + more)
         (folder / name / "base.yaml").write_text("recording: {file: run.npz}\n")
         (folder / name / "study.yaml").write_text("base: base.yaml\n")
-        keys.append(jobs(read_study(folder / name / "study.yaml"))[0].key)
+        keys.append(list_jobs(read_study(folder / name / "study.yaml"))[0].key)
     assert keys[0] == keys[1] != keys[2]
 
 
 def test_paths_of_the_base_start_at_the_base(folder):
-    (job,) = jobs(read(folder, base=SQUARE))
+    (job,) = list_jobs(read(folder, base=SQUARE))
     assert job.config.recording.file.samefile(ROOT / "tests" / "golden" / "a_square3.npz")
 
 
 def test_pace_counts_because_times_are_of_it(folder):
-    (replay,), (live,) = (jobs(read(folder, pace=pace)) for pace in ("replay", "live"))
+    (replay,), (live,) = (list_jobs(read(folder, pace=pace)) for pace in ("replay", "live"))
     assert (replay.pace, live.pace) == ("replay", "live")
     assert replay.key != live.key
+
+
+def test_a_row_may_turn_parts_off_and_ask_for_perturbed_copies(folder):
+    rows = {"all": {}, "off": {"ablation": {"verify": False}}, "copies": {"copies": 2}}
+    every, off, first, second = list_jobs(read(folder, rows=rows))
+    assert every.ablation == FULL
+    assert off.ablation == FULL._replace(verify=False)
+    assert (every.copy_number, first.copy_number, second.copy_number) == (0, 1, 2)
+    assert every.config == off.config == first.config
+    assert len({every.key, off.key, first.key, second.key}) == 4
+    assert [job.copy_number for job in list_jobs(read(folder, "copies=3"))] == [1, 2, 3]
+
+
+def test_a_reference_tier_is_part_of_the_run(folder):
+    (plain,), (compared,) = (list_jobs(read(folder, **more)) for more in ({}, {"reference_tier": "dynamic"}))
+    assert compared.reference_tier == "dynamic"
+    assert plain.key != compared.key
 
 
 def test_overrides_are_of_the_study_or_of_all_runs(folder):
@@ -150,16 +169,18 @@ def test_overrides_are_of_the_study_or_of_all_runs(folder):
         "simulation.path.circuits=CC",
         set={"keyframes.min_score": 2.0},
     )
-    assert len(jobs(found)) == 3
-    assert {job.config.keyframes.min_score for job in jobs(found)} == {9.0}
-    assert {job.config.simulation.path.circuits for job in jobs(found)} == {"CC"}
+    assert len(list_jobs(found)) == 3
+    assert {job.config.keyframes.min_score for job in list_jobs(found)} == {9.0}
+    assert {job.config.simulation.path.circuits for job in list_jobs(found)} == {"CC"}
     whole = read(folder, "keyframes={max_distance: 9}", set={"keyframes.min_score": 2.0})
-    assert jobs(whole)[0].config.keyframes.model_fields_set == {"max_distance"}
+    assert list_jobs(whole)[0].config.keyframes.model_fields_set == {"max_distance"}
 
 
 def test_a_section_is_set_before_what_is_in_it(folder):
     written = {"keyframes.min_score": 2.0, "keyframes": {"max_distance": 9.0}}
-    found = [jobs(read(folder, set=dict(items))) for items in (written.items(), reversed(written.items()))]
+    found = [
+        list_jobs(read(folder, set=dict(items))) for items in (written.items(), reversed(written.items()))
+    ]
     assert found[0] == found[1]
     assert found[0][0].config.keyframes.min_score == 2.0
 
@@ -203,7 +224,7 @@ TUNE = {"parameters": {"keyframes.min_score": {"low": 1.0, "high": 2.0}}, "objec
         ({"vary": {"simulation.seed": [1, 2]}}, ["simulation.seed: a seed"]),
         ({"set": {"simulation.seed": 1}}, ["simulation.seed: a seed"]),
         ({"base": str(SQUARE), "rows": {"a": {"session.seed": 1}}}, ["session.seed: a seed"]),
-        ({"set": {"a..b": 3}}, ["a..b: no key path"]),
+        ({"set": {"a..b": 3}}, ["a..b: not a key path"]),
         ({"set": {"touch.image.levels.x": 3}}, ["touch.image.levels"]),
         ({"seeds": 0}, ["seeds: 0"]),
         ({"seeds": [1, 1]}, ["seeds", "twice"]),
@@ -217,6 +238,11 @@ TUNE = {"parameters": {"keyframes.min_score": {"low": 1.0, "high": 2.0}}, "objec
         ({"tune": TUNE | {"parameters": {}}}, ["tune.parameters"]),
         (tuning("keyframes.x", low=1, high=2), ["keyframes.x: unknown key"]),
         (tuning("recall.mode_decay", low=0.1, high=2.0), ["recall.mode_decay: 2"]),
+        ({"rows": {"a": {"copies": -1}}}, ["copies -1 of row 'a'"]),
+        ({"rows": {"a": {"ablation": {"whiskers": False}}}}, ["ablation of row 'a'", "verify"]),
+        ({"rows": {"a": {"ablation": {"verify": 0}}}}, ["ablation of row 'a'", "true or false"]),
+        ({"copies": -1}, ["copies: -1"]),
+        ({"report": "medium"}, ["report"]),
         (tune(low=2, high=2), ["low 2 is not below"]),
         (tune(low=0, high=2, log=True), ["log needs"]),
         (tune(low=2), ["give low and high, or choices"]),
@@ -225,7 +251,7 @@ TUNE = {"parameters": {"keyframes.min_score": {"low": 1.0, "high": 2.0}}, "objec
 )  # fmt: skip
 def test_a_bad_study_is_refused_before_anything_runs(capsys, folder, content, said):
     output = folder / "never"
-    assert main(["sweep", str(study(folder, **content)), "-o", str(output)]) == 2
+    assert main(["study", str(study(folder, **content)), "-o", str(output)]) == 2
     error = capsys.readouterr().err
     assert "Traceback" not in error
     assert error.startswith("ratslam: error: ")
@@ -267,12 +293,28 @@ def test_an_empty_file_and_a_missing_base_are_refused(folder):
             read_study(folder / "study.yaml")
 
 
-def test_nothing_to_tune_is_refused(capsys, folder):
-    assert main(["sweep", str(study(folder)), "-o", str(folder / "never"), "--tune"]) == 2
+def test_nothing_to_search_is_refused(capsys, folder):
+    assert main(["study", str(study(folder)), "-o", str(folder / "never"), "--search"]) == 2
     assert "tune: missing" in capsys.readouterr().err
     assert not (folder / "never").exists()
 
 
 def test_the_examples_are_studies():
     for path in (ROOT / "configs").glob("study_*.yaml"):
-        assert jobs(read_study(path))
+        assert list_jobs(read_study(path))
+
+
+def test_the_pareto_study_covers_every_axis():
+    study = read_study(ROOT / "configs" / "study_pareto.yaml")
+    assert study.plan.report == "pareto"
+    configs = [variant.config for variant in study.variants]
+    for axis in (
+        lambda config: config.backend,
+        lambda config: config.pose_cells.engine,
+        lambda config: config.pose_cells.cells_xy,
+        lambda config: config.grid.particles,
+        lambda config: config.session.precision,
+        lambda config: config.simulation.fidelity,
+    ):
+        assert len(set(map(axis, configs))) >= 2
+    assert all(a != b for a, b in pairwise(configs))

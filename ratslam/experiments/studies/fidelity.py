@@ -1,0 +1,90 @@
+"""Cost of simulation, and how images differ between its tiers of fidelity; shortened sessions."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from evaluation.metrics.metric import Quantity
+from ratslam.config.run_config import RunConfig
+from ratslam.pipeline.source import open_observations
+from robot.simulation.head.session import HeadSimulation, SimulationConfig
+from robot.sources.in_memory import InMemorySource, load_into_memory
+from tactile.base.errors import InputError
+
+FEWEST_LAPS = 2
+"""Laps of a shortened session: fewer give nothing to recognise."""
+
+
+def compare_with_tier(config: RunConfig, log: InMemorySource, cost: float, tier: str) -> dict[str, Quantity]:
+    """Cost of a simulated session, and the difference of its images from those of another tier.
+
+    Args:
+        config: completed by the source. cost: time that simulation and images took, s.
+
+    Raises:
+        InputError: the session is not simulated, or has no images.
+    """
+    if config.simulation is None or log.views is None:
+        expected = "a session of whisker images to simulate"
+        raise InputError("simulation", "missing", expected, "`simulation: {}` is a whole session")
+    reference = _reference_views(with_tier(config, tier).model_dump_json())
+    contact, height = image_difference(log.views, reference, config.touch.image.tallest)
+    duration = float(log.time[-1] - log.time[0])
+    return {
+        "simulation_time": Quantity(label="simulation per second", value=1e6 * cost / duration, unit="us"),
+        "contact_difference": Quantity(label=f"contact pixels unlike {tier}", value=contact, unit=""),
+        "height_difference": Quantity(
+            label=f"height unlike {tier}", value=1e3 * height if np.isfinite(height) else None, unit="mm"
+        ),
+    }
+
+
+def image_difference(views: np.ndarray, reference: np.ndarray, tallest: float) -> tuple[float, float]:
+    """Difference of images [N, R, C, K] in their first channel.
+
+    Args:
+        tallest: height of a white pixel, m.
+
+    Returns:
+        share of pixels whose contact state differs; mean absolute height difference where both have contact,
+        m, NaN where none do.
+    """
+    a, b = views[..., 0], reference[..., 0]
+    both = (a > 0) & (b > 0)
+    height = float(np.abs(a - b)[both].mean() * tallest) if both.any() else np.nan
+    return float(((a > 0) != (b > 0)).mean()), height
+
+
+def with_tier(config: RunConfig, tier: str) -> RunConfig:
+    """The configuration with another fidelity of simulation and without raw samples, if it simulates."""
+    if config.simulation is None:
+        return config
+    update = {"fidelity": tier, "raw": False}
+    return config.model_copy(update={"simulation": config.simulation.model_copy(update=update)})
+
+
+def shortened(config: RunConfig, seconds: float) -> RunConfig:
+    """The configuration with fewer circuits, two at least, or less exploration; a path of cells stays."""
+    simulation = config.simulation
+    assert simulation is not None
+    path = simulation.path
+    if path.explore:
+        path = path.model_copy(update={"explore": min(path.explore, seconds)})
+    elif path.circuits:
+        lap = _duration(simulation) / len(path.circuits)
+        path = path.model_copy(update={"circuits": path.circuits[: max(FEWEST_LAPS, int(seconds / lap))]})
+    return config.model_copy(update={"simulation": simulation.model_copy(update={"path": path})})
+
+
+@lru_cache(maxsize=1)
+def _reference_views(config: str) -> np.ndarray:
+    with open_observations(RunConfig.model_validate_json(config)) as (_, source):
+        return load_into_memory(source).views
+
+
+def _duration(simulation: SimulationConfig) -> float:
+    return float(
+        HeadSimulation(simulation.model_copy(update={"fidelity": "kinematic", "raw": False})).time[-1]
+    )

@@ -1,0 +1,198 @@
+"""Studies made of a configuration: functions from a configuration to the content of a study file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pydantic import BaseModel
+
+from ratslam.config.run_config import RunConfig
+from ratslam.config.strict_yaml import Document, load, override, validate
+from ratslam.config.strict_yaml.document import Place
+from ratslam.experiments.studies.config_hash import seed_key
+from ratslam.experiments.studies.fidelity import shortened
+from ratslam.experiments.studies.schema import StudyPlan
+from ratslam.experiments.studies.study import Study, check_study
+from robot.simulation.head.session import choose_tier
+from tactile.base.errors import InputError
+
+PARTS: dict[str, dict[str, Any]] = {
+    "all parts on": {},
+    "classic backend": {"backend": "classic"},
+    "without sector shifts": {"recall.shifts": 0},
+    "without negative evidence of common views": {"recall.common": 0.0},
+    "without the map's pose as a hypothesis": {"recall.local": 0.0},
+    "without verification against the map": {"ablation": {"verify": False}},
+    "without closure sequences": {"keyframes.min_length": 1},
+    "without robust weights": {"ablation": {"robust": False}},
+    "without heading bias in the map": {"ablation": {"heading_bias": False}},
+    "without heading bias from views": {"keyframes.bias_from_views": False},
+    "without both heading biases": {"keyframes.bias_from_views": False, "ablation": {"heading_bias": False}},
+    "without odometry breaks": {"keyframes.breaks": False},
+    "without injection into the pose cells": {"recall.energy": 1.0e-12},
+    "without loop closures": {"experience.closures": False},
+}
+"""Parts that `ablate` turns off, by setting."""
+CLASSIC: dict[str, Any] = {"backend": "classic", "templates.energy": 0.05}
+"""The classic backend for whiskers."""
+CHOICES: dict[str, dict[str, Any]] = {
+    "as configured": {},
+    "11 cells": {"backend": "recall", "pose_cells.cells_xy": 11},
+    "41 cells": {"backend": "recall", "pose_cells.cells_xy": 41},
+    "dense": {"backend": "recall", "pose_cells.engine": "dense"},
+    "float32": {"session.precision": "float32"},
+    "classic": CLASSIC,
+}
+"""Rows of `pareto`."""
+PARTICLES = (30, 100, 300)
+"""Particles of the grid filter in `pareto`, for simulated whiskers."""
+TIERS = ("kinematic", "quasistatic", "dynamic")
+"""Fidelities of simulation, the cheapest first."""
+METHODS: dict[str, dict[str, Any]] = {
+    "classic": CLASSIC | {"templates.threshold": 0.04},
+    "recall": {"backend": "recall"},
+}
+"""Backends that `tiers` runs on the images of each tier."""
+
+
+class PresetOptions(NamedTuple):
+    """Options of presets: share that `vary` changes numbers by; length of the session of `tiers`, s."""
+
+    by: float = 0.2
+    seconds: float = 600.0
+
+
+def preset_study(
+    name: str, path: Path, overrides: Sequence[str], options: PresetOptions
+) -> tuple[Study, list[str]]:
+    """The study of a preset on a configuration file, and remarks for its report.
+
+    Args:
+        name: a key of `PRESETS`. overrides: of the study or of all runs, as for `read_study`.
+
+    Raises:
+        InputError: the configuration is invalid or does not suit the preset.
+    """
+    runs = [text for text in overrides if text.partition("=")[0].split(".")[0] not in StudyPlan.model_fields]
+    document = override(load(path), runs)
+    config = validate(document, RunConfig)
+    content, remarks = PRESETS[name](document, config, options)
+    section, _, key = seed_key(config).partition(".")
+    seed = getattr(getattr(config, section), key)
+    content = {"base": str(path.resolve()), "seeds": [seed]} | content
+    option = f"--preset {name}"
+    made = Document(content, {(): Place(option, option)})
+    overrides = [text for text in overrides if not text.startswith(f"{section}.{key}=")]
+    return check_study(f"{path.stem}-{name}", made, Path(), overrides), remarks
+
+
+def _ablate(
+    document: Document, config: RunConfig, options: PresetOptions
+) -> tuple[dict[str, Any], list[str]]:
+    return {"rows": PARTS, "report": "differences"}, []
+
+
+def _vary(document: Document, config: RunConfig, options: PresetOptions) -> tuple[dict[str, Any], list[str]]:
+    if not 0 < options.by < 1:
+        raise InputError("--by", str(options.by), "a share between 0 and 1")
+    rows: dict[str, dict[str, Any]] = {"as configured": {}}
+    rows |= {f"{key} = {value:.4g}": {key: value} for key, value in variations(document, options.by)}
+    return {"rows": rows, "report": "differences"}, []
+
+
+def _spread(
+    document: Document, config: RunConfig, options: PresetOptions
+) -> tuple[dict[str, Any], list[str]]:
+    rows: dict[str, dict[str, Any]] = {"as recorded": {"copies": 0}, "perturbed": {}}
+    return {"rows": rows, "copies": 10, "report": "medians"}, []
+
+
+def _backends(
+    document: Document, config: RunConfig, options: PresetOptions
+) -> tuple[dict[str, Any], list[str]]:
+    first = "recall" if config.backend == "grid" else config.backend
+    return {"rows": {first: {"backend": first}, "grid": {"backend": "grid"}}, "report": "medians"}, []
+
+
+def _tiers(document: Document, config: RunConfig, options: PresetOptions) -> tuple[dict[str, Any], list[str]]:
+    if not 0 < options.seconds < float("inf"):
+        raise InputError("--seconds", str(options.seconds), "a time above 0 s")
+    if config.simulation is None:
+        expected = "a scene to simulate"
+        raise InputError("simulation", "missing", expected, "`simulation: {}` is a whole session")
+    chosen = choose_tier(config.simulation.model_copy(update={"fidelity": "auto"}))
+    short = shortened(config, options.seconds).simulation
+    assert short is not None
+    length = {"explore": short.path.explore} if short.path.explore else {"circuits": short.path.circuits}
+    rows: dict[str, dict[str, Any]] = {
+        f"{name}, {method}": settings | {"simulation.fidelity": name, "simulation.raw": False}
+        for name in TIERS
+        for method, settings in METHODS.items()
+    }
+    content = {
+        "set": {f"simulation.path.{key}": value for key, value in length.items() if value},
+        "rows": rows, "report": "tiers", "reference_tier": TIERS[-1],
+    }  # fmt: skip
+    return content, [f"fidelity: auto takes {chosen.name}: {chosen.why}"]
+
+
+def _pareto(
+    document: Document, config: RunConfig, options: PresetOptions
+) -> tuple[dict[str, Any], list[str]]:
+    rows = dict(CHOICES)
+    if config.recording is None:
+        rows |= {
+            f"grid, {count}": {"backend": "grid", "grid.particles": count, "session.precision": "float32"}
+            for count in PARTICLES
+        }
+    if config.simulation is not None:
+        rows["quasistatic"] = {"simulation.fidelity": "quasistatic"}
+    return {"rows": rows, "seeds": 3, "pace": "live", "report": "pareto"}, []
+
+
+PRESETS: dict[str, Callable[[Document, RunConfig, PresetOptions], tuple[dict[str, Any], list[str]]]] = {
+    "ablate": _ablate,
+    "vary": _vary,
+    "spread": _spread,
+    "tiers": _tiers,
+    "backends": _backends,
+    "pareto": _pareto,
+}
+"""Functions from a configuration to the content of a study file, and remarks."""
+
+
+def variations(document: Document, by: float) -> list[tuple[str, float | int]]:
+    """Every number of recall and its map moved down and up by a share; invalid values are left out."""
+    found = []
+    for key, value in _numbers(validate(document, RunConfig)):
+        for moved in (_scaled(value, 1 - by), _scaled(value, 1 + by)):
+            try:
+                validate(override(document, [f"{key}={moved!r}"]), RunConfig)
+            except InputError:
+                continue
+            if moved != value:
+                found.append((key, moved))
+    return found
+
+
+def _numbers(config: RunConfig) -> Iterator[tuple[str, float | int]]:
+    def walk(model: BaseModel, path: str) -> Iterator[tuple[str, float | int]]:
+        for name in type(model).model_fields:
+            value = getattr(model, name)
+            if isinstance(value, BaseModel):
+                yield from walk(value, f"{path}{name}.")
+            elif isinstance(value, int | float) and not isinstance(value, bool):
+                yield path + name, value
+
+    yield from walk(config.recall, "recall.")
+    yield from walk(config.keyframes, "keyframes.")
+
+
+def _scaled(value: float | int, factor: float) -> float | int:
+    """The value times the factor; integers move by one at least."""
+    if isinstance(value, int):
+        moved = round(value * factor)
+        return moved if moved != value else value + (1 if factor > 1 else -1)
+    return value * factor

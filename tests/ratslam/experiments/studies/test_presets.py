@@ -1,0 +1,195 @@
+"""Presets: the studies that they make of a configuration."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from ratslam.cli import main
+from ratslam.cli.studies import PRESETS as NAMES
+from ratslam.config.run_config import RunConfig
+from ratslam.config.strict_yaml import load, override
+from ratslam.experiments.studies.fidelity import image_difference, shortened
+from ratslam.experiments.studies.presets import (
+    METHODS,
+    PARTS,
+    PRESETS,
+    TIERS,
+    PresetOptions,
+    preset_study,
+    variations,
+)
+from ratslam.experiments.studies.records import RunLog
+from ratslam.experiments.studies.study import list_jobs
+from tactile.base.errors import InputError
+
+ROOT = Path(__file__).parents[4]
+SQUARE, MAZE = ROOT / "configs" / "square.yaml", ROOT / "configs" / "whisker_maze.yaml"
+SMALL = """
+simulation: {maze: {columns: 3, rows: 2, loop: 6}, path: {circuits: C}, whisking: {rate: 0.5}}
+pose_cells: {cells_xy: 11, cells_heading: 12}
+backend: classic
+"""
+TINY = "simulation: {maze: {columns: 2, rows: 2, loop: 4}, path: {circuits: CC}, raw: true}\n"
+VIEWS = arrays.arrays(float, (5, 3, 6, 1), elements=st.sampled_from([0.0, 0.02, 0.5, 1.0]))
+
+
+def preset(name, path=SQUARE, *overrides, **options):
+    return preset_study(name, path, overrides, PresetOptions(**options))
+
+
+def test_the_program_knows_all_presets():
+    assert set(NAMES) == set(PRESETS)
+
+
+@pytest.mark.parametrize("name", sorted(set(PRESETS) - {"tiers"}))
+def test_a_preset_keeps_the_seed_of_the_configuration_and_takes_overrides(name):
+    study, _ = preset(name, SQUARE, "session.seed=7", "recall.modes=3")
+    assert study.name == f"square-{name}"
+    jobs = list_jobs(study)
+    assert {job.seed for job in jobs} == ({0, 1, 2} if name == "pareto" else {7})
+    assert {job.config.recall.modes for job in jobs} & {3}
+    if name != "vary":
+        assert {job.config.recall.modes for job in jobs} == {3}
+
+
+def test_every_part_is_turned_off_in_a_row_of_its_own():
+    study, _ = preset("ablate", SQUARE)
+    jobs = list_jobs(study)
+    assert [job.row for job in jobs] == list(PARTS)
+    assert len({job.key for job in jobs}) == len(PARTS)
+    assert "classic" in {job.config.backend for job in jobs}
+    assert len(list_jobs(preset("ablate", SQUARE, "copies=3")[0])) == 3 * len(PARTS)
+
+
+def test_every_number_is_varied_down_and_up_as_far_as_it_goes():
+    found = variations(override(load(SQUARE), ["recall.local=0.9"]), 0.2)
+    names = [name for name, _ in found]
+    assert names.count("recall.reach") == names.count("keyframes.min_score") == 2
+    assert names.count("keyframes.noise.per_cell") == 2
+    assert names.count("recall.local") == 1  # a share: it cannot exceed 1
+    assert ("recall.modes", 6) in found
+    assert ("recall.modes", 10) in found
+    assert len(list_jobs(preset("vary")[0])) == 1 + len(variations(load(SQUARE), 0.2))
+    with pytest.raises(InputError, match="--by"):
+        preset("vary", by=1.0)
+
+
+def test_backends_are_recall_or_the_configured_one_and_the_grid():
+    assert [job.config.backend for job in list_jobs(preset("backends", MAZE)[0])] == ["recall", "grid"]
+    configured, _ = preset("backends", ROOT / "configs" / "create_arena.yaml")
+    assert [job.config.backend for job in list_jobs(configured)] == ["recall", "grid"]
+
+
+def test_perturbed_copies_are_run_beside_the_session(tmp_path, capsys):
+    output = tmp_path / "out"
+    (tmp_path / "c.yaml").write_text(SMALL)
+    command = ["study", "--preset", "spread", str(tmp_path / "c.yaml"), "--set", "copies=2"]
+    assert main([*command, "-o", str(output), "--workers", "1"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split("  ")[0] for line in lines[1:4]] == ["as recorded", "perturbed", "dead reckoning"]
+    copies = [each.copy_number for each in RunLog(output).records.values()]
+    assert copies == [0, 1, 2]
+
+
+def test_both_backends_see_the_same_session(tmp_path, capsys):
+    (tmp_path / "c.yaml").write_text("create_simulation: {reports: 40, seed: 3}\nbackend: classic\n")
+    quick = ["grid.particles=8", "pose_cells.cells_xy=11", "pose_cells.cells_heading=12"]
+    command = ["study", "--preset", "backends", str(tmp_path / "c.yaml"), *(f"--set={one}" for one in quick)]
+    assert main([*command, "-o", str(tmp_path / "out"), "--workers", "1"]) == 0
+    content = json.loads((tmp_path / "out" / "table.json").read_text())
+    rat, grid, reckoned = content["rows"]
+    assert [row["row"] for row in content["rows"]] == ["classic", "grid", "dead reckoning"]
+    assert len({each.source for each in RunLog(tmp_path / "out").records.values()}) == 1
+    for row in (rat, grid, reckoned):
+        assert row["steps"] == 40
+        assert 0 < row["spreads"]["error_final"]["median"] < 3
+        assert 0 < row["spreads"]["ate_final"]["median"] < 3
+    assert "step_time" not in reckoned["spreads"]
+
+
+def test_tiers_are_compared_by_cost_and_images(tmp_path, capsys, monkeypatch):
+    monkeypatch.delitem(METHODS, "recall")  # one kernel less to compile
+    (tmp_path / "tiny.yaml").write_text(TINY)
+    command = ["study", "--preset", "tiers", str(tmp_path / "tiny.yaml"), "--seconds", "60"]
+    assert main([*command, "-o", str(tmp_path / "out"), "--workers", "1"]) == 0
+    rows = json.loads((tmp_path / "out" / "table.json").read_text())["rows"]
+    assert [row["row"] for row in rows] == [f"{name}, classic" for name in TIERS]
+    cost, contact, height = (
+        [row["spreads"][name]["median"] for row in rows]
+        for name in ("simulation_time", "contact_difference", "height_difference")
+    )
+    assert cost[0] < cost[1] / 3
+    assert cost[0] < cost[2] / 3
+    assert contact[2] == height[2] == 0
+    assert 0 < height[0] < 5
+    assert contact[0] < 0.04
+    assert "Fidelity: auto takes quasistatic: raw samples" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("command", "expected"),
+    [
+        (["tiers", "recorded.yaml"], "a scene to simulate"),
+        (["tiers", "recorded.yaml", "--seconds", "0"], "--seconds"),
+        (["ablate", str(SQUARE), "--set", "recall.reach=-1"], "recall.reach"),
+        (["spread", "none.yaml"], "none.yaml"),
+        (["vary", str(SQUARE), "--by", "0"], "--by"),
+    ],
+)
+def test_bad_input_is_refused_before_anything_runs(tmp_path, capsys, monkeypatch, command, expected):
+    monkeypatch.chdir(tmp_path)
+    Path("recorded.yaml").write_text("recording: {file: a.npz}\n")
+    assert main(["study", "--preset", *command]) == 2
+    assert expected in capsys.readouterr().err
+    assert not Path("runs").exists()
+
+
+def test_a_fault_of_a_run_comes_out_as_it_is(tmp_path, capsys):
+    command = ["study", "--preset", "backends", str(SQUARE), "-o", str(tmp_path / "out"), "--workers", "1"]
+    assert main([*command, "--set", "recording.file=nothing.npz"]) == 2
+    assert "nothing.npz" in capsys.readouterr().err
+
+
+@given(VIEWS, VIEWS)
+def test_images_differ_by_contacts_and_by_heights(a, b):
+    contact, height = image_difference(a, b, 0.05)
+    assert image_difference(a, a, 0.05)[0] == 0
+    assert contact == image_difference(b, a, 0.05)[0] == np.mean((a > 0) != (b > 0))
+    both = (a > 0) & (b > 0)
+    if both.any():
+        assert height == pytest.approx(0.05 * np.abs(a - b)[both].mean())
+    else:
+        assert np.isnan(height)
+
+
+def test_only_heights_count_where_both_touch():
+    a = np.zeros((1, 3, 6, 2))
+    b = a.copy()
+    a[0, 0, 0, 0], b[0, 0, 0, 0] = 0.4, 0.6
+    a[0, 1, 0, 0] = 1.0
+    b[..., 1] = 0.7  # the radial channel says nothing about contacts
+    contact, height = image_difference(a, b, 0.05)
+    assert contact == pytest.approx(1 / 18)
+    assert height == pytest.approx(0.01)
+
+
+def test_sessions_are_shortened_to_whole_laps_or_to_a_time():
+    def path(seconds, **given):
+        config = RunConfig.model_validate({"simulation": {"path": given}})
+        return shortened(config, seconds).simulation.path
+
+    whole = path(1e9, circuits="CCCAAACACA").circuits
+    assert whole == "CCCAAACACA"
+    some = path(700.0, circuits=whole).circuits
+    assert whole.startswith(some)
+    assert 3 <= len(some) <= 5
+    assert len(path(1.0, circuits=whole).circuits) == 2
+    assert path(100.0, explore=500.0).explore == 100
+    assert path(100.0, explore=50.0).explore == 50

@@ -1,0 +1,141 @@
+"""Searches: the choices follow from the study alone, whatever was killed meanwhile."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+
+import pytest
+
+from ratslam.cli import main
+from ratslam.experiments.studies.executor import Executor
+from ratslam.experiments.studies.records import FILE, RunLog
+from ratslam.experiments.studies.search import Trial, render_trials, search
+from ratslam.experiments.studies.study import read_study
+from tactile.base.errors import InputError
+from tests.ratslam.experiments.studies.test_study_runner import start, wait_for
+
+TUNE = {
+    "trials": 14,
+    "parameters": {
+        "keyframes.min_score": {"low": 1.0, "high": 39.0, "log": True},
+        "recall.modes": {"low": 1, "high": 8},
+        "session.precision": {"choices": ["float32", "float64"]},
+    },
+    "objectives": ["energy_all", "exm_arr"],
+}
+
+
+class Killed(Exception):
+    """Stands for SIGKILL in this process."""
+
+
+def tune(study, folder, done=None):
+    with Executor(1) as executor:
+        return search(study, RunLog(folder), executor, done)
+
+
+def dominates(a, b):
+    """Of (energy_all, exm_arr): low and high values are better."""
+    better = (a["energy_all"] <= b["energy_all"], a["exm_arr"] >= b["exm_arr"])
+    return all(better) and a != b
+
+
+@pytest.mark.parametrize("sampler", ["tpe", "nsga2"])
+def test_trials_are_within_bounds_and_the_optimal_ones_are_not_dominated(tiny, tmp_path, stubbed, sampler):
+    plan = TUNE | {"sampler": sampler, "population": 4, "batch": 3}
+    trials = tune(read_study(tiny(tune=plan, seeds=2)), tmp_path / "out")
+    assert [trial.number for trial in trials] == list(range(14))
+    for trial in trials:
+        score = trial.parameters["keyframes.min_score"]
+        assert 1 <= score <= 39
+        assert trial.parameters["recall.modes"] in range(1, 9)
+        assert trial.values["energy_all"] == pytest.approx((score - 7) ** 2 + 0.5)
+        others = [other.values for other in trials]
+        assert trial.optimal == (not any(dominates(values, trial.values) for values in others))
+    different = {json.dumps(trial.parameters) for trial in trials}
+    assert len(different) > 8
+    assert len(stubbed) == len(set(stubbed)) == 2 * len(different)
+
+
+@pytest.mark.parametrize("sampler", ["tpe", "nsga2"])
+@pytest.mark.parametrize("kills", [[1], [2, 3, 5], [7, 1, 1]])
+def test_a_killed_search_goes_on_as_if_it_had_not_been(tiny, tmp_path, stubbed, sampler, kills):
+    study = read_study(tiny(tune=TUNE | {"sampler": sampler, "population": 4}))
+    whole = tune(study, tmp_path / "whole")
+    every = list(stubbed)
+    stubbed.clear()
+    for count in kills:
+        limit = len(stubbed) + count
+
+        def done(record, limit=limit):
+            if len(stubbed) >= limit:
+                raise Killed
+
+        with pytest.raises(Killed):
+            tune(study, tmp_path / "out", done)
+    assert tune(study, tmp_path / "out") == whole
+    assert sorted(stubbed) == sorted(every)  # no run twice
+
+
+def test_more_trials_go_on_from_those_there_are(tiny, tmp_path, stubbed):
+    few = tune(read_study(tiny(tune=TUNE | {"trials": 8})), tmp_path / "out")
+    runs = len(stubbed)
+    more = tune(read_study(tiny(tune=TUNE | {"trials": 12})), tmp_path / "out")
+    assert [trial[:3] for trial in more[:8]] == [trial[:3] for trial in few]
+    assert len(more) == 12
+    assert len(stubbed) - runs <= 4
+    other = tune(read_study(tiny(tune=TUNE | {"trials": 4, "seed": 1})), tmp_path / "out")
+    assert other[0].parameters != more[0].parameters
+
+
+def test_a_failed_run_fails_its_trial_alone(tiny, tmp_path, stubbed):
+    plan = TUNE | {"parameters": {"keyframes.min_score": {"low": 20.0, "high": 60.0}}}
+    trials = tune(read_study(tiny(tune=plan)), tmp_path / "out")
+    assert {trial.values is None for trial in trials} == {True, False}
+    for trial in trials:
+        assert (trial.values is None) == (trial.parameters["keyframes.min_score"] > 40)
+    assert "failed" in render_trials(trials)
+
+
+def test_a_missing_optuna_is_reported(tiny, tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "optuna", None)
+    with pytest.raises(InputError, match=r"pip install 'ratslam\[sweep\]'"):
+        tune(read_study(tiny(tune=TUNE)), tmp_path / "out")
+
+
+def test_the_program_lists_the_optimal_trials(tiny, tmp_path, capsys, stubbed):
+    output = tmp_path / "out"
+    command = [
+        str(tiny(tune=TUNE | {"minimise": ["steps"]})),
+        "-o",
+        str(output),
+        "--workers",
+        "1",
+        "--search",
+    ]
+    assert main(["study", *command]) == 2
+    assert "14 trials, 0 of them Pareto-optimal, 14 failed" in capsys.readouterr().out  # no `steps` in stubs
+    tiny(tune=TUNE)
+    assert main(["study", *command]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    trials = [Trial(**trial) for trial in json.loads((output / "trials.json").read_text())]
+    best = {trial.number for trial in trials if trial.optimal}
+    assert f"14 trials, {len(best)} of them Pareto-optimal" in lines
+    assert {int(line.split()[0]) for line in lines[2 : 2 + len(best)]} == best
+
+
+@pytest.mark.soak
+def test_a_search_that_is_killed_again_and_again_ends_the_same(tiny, tmp_path):
+    plan = TUNE | {"trials": 10, "parameters": {"keyframes.min_score": {"low": 2.0, "high": 30.0}}}
+    study = tiny(tune=plan, set={"backend": "recall"})
+    whole = tune(read_study(study), tmp_path / "whole")
+    output = tmp_path / "out"
+    for count in (1, 3, 6):
+        process = start(study, output, "--search", "--workers", "2")
+        wait_for(count, output, process)
+        os.kill(process.pid, signal.SIGKILL)
+        process.communicate()
+    assert tune(read_study(study), output) == whole
+    assert len((output / FILE).read_text().splitlines()) == 10
