@@ -12,7 +12,7 @@ from ratslam.classic.places import PlaceConfig
 from ratslam.classic.view_templates import TemplateConfig
 from ratslam.grid.config import GridConfig
 from ratslam.keyframes.config import KeyframeMapConfig
-from ratslam.recall.filter import RecallConfig
+from ratslam.recall.config import RecallConfig
 from tactile.base.config import Settings
 
 BackendConfig = TypeVar("BackendConfig", bound=Settings)

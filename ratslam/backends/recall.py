@@ -18,10 +18,13 @@ from ratslam.backends.config import RecallBackendConfig
 from ratslam.classic import view_templates
 from ratslam.core.types import Action, Estimate, Scalar
 from ratslam.keyframes.ablation import FULL, Ablation
-from ratslam.keyframes.appearance import Appearance, Labels, Touch, Views
+from ratslam.keyframes.appearance import Appearance, LabelAppearance, ViewAppearance, WhiskerAppearance
 from ratslam.keyframes.map import KeyframeMap
 from ratslam.recall import filter
-from ratslam.recall.filter import MapFeedback, Memory, RecallResult
+from ratslam.recall import memory as recall_memory
+from ratslam.recall.config import fan_width
+from ratslam.recall.filter import RecallResult
+from ratslam.recall.memory import MapFeedback, Memory
 from ratslam.recall.observation_model import label_likelihood, touch_likelihood, view_likelihood
 from ratslam.recall.whisker_likelihood import levels, pixels
 from tactile.base.types import Array, Observation
@@ -100,7 +103,7 @@ class RecallBackend:
         del key
         return RecallState(
             pose_cells.start(self.config.pose_cells, self.dtype),
-            filter.start(self.recall, self.size, capacity, self.dtype, self._groups()),
+            recall_memory.init_memory(self.recall, self.size, capacity, self.dtype, self._groups()),
             jnp.ones((), self.dtype),
         )
 
@@ -119,7 +122,7 @@ class RecallBackend:
 
     def apply_map_feedback(self, state: RecallState, feedback: MapFeedback) -> RecallState:
         """The filter takes up the poses, bias and scales of the map."""
-        return state._replace(memory=filter.apply_map_feedback(state.memory, feedback))
+        return state._replace(memory=recall_memory.apply_map_feedback(state.memory, feedback))
 
     def kernel(
         self, state: RecallState, observation: Observation
@@ -127,14 +130,14 @@ class RecallBackend:
         """Move, look, inject softly, learn."""
         odometry, view, seen, clean = finite(self.config.templates, self.dtype, observation)
         moved = jnp.stack([odometry.dx, odometry.dy, odometry.dtheta])
-        memory = filter.travel(state.memory, moved)
-        frame = seen & filter.due(self.recall, self.cell, memory)
+        memory = recall_memory.accumulate_motion(state.memory, moved)
+        frame = seen & recall_memory.is_keyframe_due(self.recall, self.cell, memory)
         looks = self._looks(view, observation)
 
         memory, recollection = lax.cond(
             frame,
             lambda: self._look(memory, looks, observation.label),
-            lambda: (memory, filter.nothing(memory)),
+            lambda: (memory, filter.empty_result(memory)),
         )
         recalled, energy = self._injection(memory, recollection)
         cells, told = pose_cells.step(
@@ -142,7 +145,7 @@ class RecallBackend:
         )
         memory = lax.cond(
             frame,
-            lambda: filter.remember(memory, looks, observation.label, cells.pose),
+            lambda: recall_memory.store_keyframe(memory, looks, observation.label, cells.pose),
             lambda: memory,
         )
         health = jnp.where(
@@ -154,10 +157,10 @@ class RecallBackend:
         room = memory.count < memory.label.shape[0]
         outcome = jnp.where(room | ~seen, told.outcome, Outcome.FULL)
         outcome = jnp.where(clean, outcome, Outcome.NOT_FINITE).astype(jnp.int32)
-        sd, sd_heading = filter.spread(self.recall, self.cell, memory)
+        sd, sd_heading = recall_memory.pose_spread(self.recall, self.cell, memory)
         place = jnp.int32(-1)  # places are for the map to say: it knows which recollections hold
         estimate = Estimate(
-            pose=filter.present(memory),
+            pose=recall_memory.current_pose(memory),
             spread=jnp.stack([sd, sd, sd_heading]),
             place=place,
             previous=place,
@@ -188,10 +191,10 @@ class RecallBackend:
 
     def _appearance(self) -> Appearance:
         if self.labels:
-            return Labels()
+            return LabelAppearance()
         if self.pixels is not None:
-            return Touch(self.pixels, self.recall.temper, self._normalised)
-        return Views(self.size, filter.fan_width(self.recall), self._normalised)
+            return WhiskerAppearance(self.pixels, self.recall.temper, self._normalised)
+        return ViewAppearance(self.size, fan_width(self.recall), self._normalised)
 
     def _groups(self) -> int:
         return 0 if self.pixels is None else int(self.pixels.group.max()) + 1
@@ -221,7 +224,7 @@ class RecallBackend:
             memory, weighing = touch_likelihood(self.recall, memory, view, self.pixels)
         else:
             weighing = view_likelihood(self.recall, self.cell, memory, view)
-        return filter.look(self.recall, self.cell, memory, weighing)
+        return filter.recognise(self.recall, self.cell, memory, weighing)
 
     def _injection(self, memory: Memory, recollection: RecallResult) -> tuple[Array, Array]:
         """Where a candidate's packet was, turned as the view is, and energy by its posterior."""

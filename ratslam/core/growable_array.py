@@ -36,7 +36,11 @@ class GrowableArray:
 
 def growable_arrays(owner: object) -> dict[str, GrowableArray]:
     """The attributes of `owner` that are growable arrays, by name without the leading underscore."""
-    return {name[1:]: value for name, value in vars(owner).items() if isinstance(value, GrowableArray)}
+    return {
+        name.removeprefix("_"): value
+        for name, value in vars(owner).items()
+        if isinstance(value, GrowableArray)
+    }
 
 
 def copy_arrays(owner: object) -> dict[str, np.ndarray]:

@@ -13,8 +13,8 @@ import numpy as np
 
 from ratslam.core.backend import Evidence
 from ratslam.core.growable_array import GrowableArray
-from ratslam.keyframes.view_sectors import NOTHING, Fan, Slope
-from ratslam.recall.filter import NO_LIKENESS
+from ratslam.keyframes.view_sectors import NO_ESTIMATE, BiasEstimate, SectorFan
+from ratslam.recall.memory import NO_LIKENESS
 from ratslam.recall.whisker_likelihood import Pixels, background, levels, table, variation
 from tactile.base.types import Observation
 
@@ -40,7 +40,7 @@ UNTOLD = float(np.log(2))
 """The same for whisker images: what one misfits that says nothing."""
 
 
-class Measure(NamedTuple):
+class ViewMetric(NamedTuple):
     """What recall compares by: see `MapFeedback`."""
 
     angle: float
@@ -48,7 +48,7 @@ class Measure(NamedTuple):
     likeness: np.ndarray
 
 
-class Match(NamedTuple):
+class ConfirmedPairs(NamedTuple):
     """Pairs of frames [P] that the map takes for one place, and whether one was turned about [P] bool."""
 
     frame: np.ndarray
@@ -59,13 +59,13 @@ class Match(NamedTuple):
 class Appearance(Protocol):
     """The looks of all frames."""
 
-    def measure(self) -> Measure:
+    def measure(self) -> ViewMetric:
         """What recall compares by now."""
 
     def append(self, observation: Observation, turn: float, length: float) -> None:
         """One more frame: what was seen, and turn (rad) and way (m) since the one before."""
 
-    def learn(self, evidence: Evidence, known: Callable[[], Match]) -> Slope:
+    def learn(self, evidence: Evidence, known: Callable[[], ConfirmedPairs]) -> BiasEstimate:
         """Takes up what the newest frame's recollection tells, and asks, now and then, for pairs that the map
         is sure of; answers the heading bias that the views show, if it was looked at."""
 
@@ -79,20 +79,20 @@ class Appearance(Protocol):
         """The inverse of `arrays`."""
 
 
-class Labels:
+class LabelAppearance:
     """Ids given with the recording."""
 
     def __init__(self) -> None:
         self._label = GrowableArray((), np.int64)
 
-    def measure(self) -> Measure:
-        return Measure(0.0, 0.0, NO_LIKENESS)
+    def measure(self) -> ViewMetric:
+        return ViewMetric(0.0, 0.0, NO_LIKENESS)
 
     def append(self, observation: Observation, turn: float, length: float) -> None:
         self._label.append(int(observation.label))
 
-    def learn(self, evidence: Evidence, known: Callable[[], Match]) -> Slope:
-        return NOTHING
+    def learn(self, evidence: Evidence, known: Callable[[], ConfirmedPairs]) -> BiasEstimate:
+        return NO_ESTIMATE
 
     def misfit(self, frame: int, near: np.ndarray, about: np.ndarray) -> float:
         if not len(near):
@@ -106,7 +106,7 @@ class Labels:
         self._label.replace(arrays["label"])
 
 
-class Views:
+class ViewAppearance:
     """Views that are compared by their mean absolute difference.
 
     Args:
@@ -118,13 +118,13 @@ class Views:
         self, size: int, fan: float | None, normalise: Callable[[np.ndarray], np.ndarray] = np.asarray
     ) -> None:
         self._normalise = normalise
-        self._fan = None if fan is None or not size else Fan(size, fan / size)
+        self._fan = None if fan is None or not size else SectorFan(size, fan / size)
         self._view = GrowableArray((size,), np.float64)
         self._background = GrowableArray((), np.float64)
         self._scale = (0, 0.0)  # errors it was taken from, and the scale
 
-    def measure(self) -> Measure:
-        return Measure(self._fan.angle if self._fan else 0.0, self._scale[1], NO_LIKENESS)
+    def measure(self) -> ViewMetric:
+        return ViewMetric(self._fan.angle if self._fan else 0.0, self._scale[1], NO_LIKENESS)
 
     def append(self, observation: Observation, turn: float, length: float) -> None:
         size = self._view.rows.shape[1]
@@ -133,13 +133,13 @@ class Views:
         if self._fan:
             self._fan.append(self._view.rows[-1], turn, length)
 
-    def learn(self, evidence: Evidence, known: Callable[[], Match]) -> Slope:
+    def learn(self, evidence: Evidence, known: Callable[[], ConfirmedPairs]) -> BiasEstimate:
         for error in np.asarray(evidence.background)[np.isfinite(evidence.background)]:
             self._background.append(error)
         self._rescale()
         count = len(self._view.rows) - 1
         if self._fan is None or count % EVERY or count < EARLIEST:
-            return NOTHING
+            return NO_ESTIMATE
         before, told = self._fan.angle, self._fan.estimate()
         if not before and self._fan.angle:
             # Errors are smaller now that views may shift: those known so far are of another kind.
@@ -182,7 +182,7 @@ class Views:
             )
 
 
-class Touch:
+class WhiskerAppearance:
     """Whisker images, compared by log-odds that are learned from the session.
 
     Args:
@@ -197,21 +197,21 @@ class Touch:
         self._level = GrowableArray((len(pixels.group),), np.int64)
         self._likeness = NO_LIKENESS
 
-    def measure(self) -> Measure:
-        return Measure(np.pi, NEVER if self._likeness.size else 0.0, self._likeness)
+    def measure(self) -> ViewMetric:
+        return ViewMetric(np.pi, NEVER if self._likeness.size else 0.0, self._likeness)
 
     def append(self, observation: Observation, turn: float, length: float) -> None:
         view = self._normalise(np.asarray(observation.view, float))
         self._level.append(levels(view.reshape(-1), alive(observation).reshape(-1)).astype(np.int64))
 
-    def learn(self, evidence: Evidence, known: Callable[[], Match]) -> Slope:
+    def learn(self, evidence: Evidence, known: Callable[[], ConfirmedPairs]) -> BiasEstimate:
         if len(self._level.rows) >= EARLIEST and len(self._level.rows) % LEARN == 0:
             frame, match, about = known()
             image, pixels = self._level.rows, self._pixels
             then = np.where(about[:, None], image[match][:, pixels.behind], image[match])
             common = background(image, pixels.group)
             self._likeness = table(common, variation(image[frame], then))
-        return NOTHING
+        return NO_ESTIMATE
 
     def misfit(self, frame: int, near: np.ndarray, about: np.ndarray) -> float:
         """By how much the image is less likely there than the likeliest there is, at most."""

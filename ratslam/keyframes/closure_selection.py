@@ -1,11 +1,10 @@
-"""Which runs of closures to believe: all are weighed against each other and against the odometry.
+"""Selection of closure sequences: all are weighed against each other and against the odometry.
 
-A run that is wrong costs its evidence, one that is right costs the strain it puts on the map; so the robust
-cost of a run can never exceed twice its evidence (in chi-square), and what is believed is the set that leaves
-the least cost in all. The cost has many valleys: it is descended from several starts. What no single map
-can explain, a robot that was carried away may: odometry is cut where that saves more than a cut costs. The
-rules are ours; robust weights by Geman & McClure 1985, several starts after Latif et al. 2013.
-"""
+Refusing a sequence costs its evidence, accepting it costs the strain on the map. So the robust cost of a
+sequence is at most twice its evidence (in chi-square), and the sequences of the map with the least total cost
+are selected. The cost has many local minima, so it is minimised from several starts. The odometry is cut (the
+robot was carried away) where that saves more than the cost of a cut. The rules are ours; robust weights by
+Geman & McClure 1985, several starts after Latif et al. 2013."""
 
 from __future__ import annotations
 
@@ -14,185 +13,192 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.keyframes.optimizer import Chain, Closures, Fit, Prior, robust_cost, solve
+from ratslam.keyframes.optimizer import BiasPrior, LoopClosures, MapFit, OdometryChain, robust_cost, solve
 from tactile.base.se2 import between, compose, correct_heading_bias, integrate, inverse
 
 KEPT = 0.25
-"""Robust weight above which a run is believed: it then strains the map by less than its evidence."""
+"""Robust weight above which a sequence is accepted: its strain is then less than its evidence."""
 STRONG = (20.0, 40.0)
-"""Evidence of the runs that the further starts are made from."""
+"""Least evidence of the sequences from which further starts are made."""
 STEPS = 12
-"""Solver steps from each start."""
+"""Solver iterations from each start."""
 FINE = 1e-3
-"""m and rad that a solver step moves at most when a map counts as settled."""
+"""Largest change per solver iteration at convergence, m and rad."""
 CUT = 30.0
-"""What cutting the odometry costs, in chi-square: robots are seldom carried away."""
+"""Cost of a cut of the odometry, chi-square; robots are seldom carried away."""
 PLAUSIBLE = 3.0
-"""Squared deviation up to which odometry does not contradict a run."""
+"""Squared deviation up to which a sequence agrees with the odometry."""
 TELLING = 16.0
-"""Squared deviation from which a cut is tried."""
+"""Least squared deviation at which a cut is tried."""
 TRIES = 5
-"""Places where a cut is tried before the best of them is taken."""
+"""Number of sequences at which a cut is tried before the best is taken."""
 ALIKE = 0.5
-"""Difference in cost, in chi-square, that tells nothing of where a cut belongs."""
+"""Difference in cost, chi-square, below which two cuts count as equally good."""
 LOOSE = 1e4
-"""Standard deviation of a cut, m and rad."""
+"""Standard deviation of the odometry at a cut, m and rad."""
 
 
-class Case(NamedTuple):
-    """What is to be judged.
+class SelectionProblem(NamedTuple):
+    """The sequences to select from, and the odometry.
 
     Attributes:
-        chain, closures, prior: see `solve`; closures of all runs in question, R of them. evidence: [R].
-        first, last: [R] first and last frame of each run.
+        chain, closures, prior: see `solve`; closures of all R sequences. evidence: [R] log-likelihood ratios.
+        first, last: [R] first and last keyframe of each sequence.
     """
 
-    chain: Chain
-    closures: Closures
-    prior: Prior
+    chain: OdometryChain
+    closures: LoopClosures
+    prior: BiasPrior
     evidence: np.ndarray
     first: np.ndarray
     last: np.ndarray
 
 
-class Judgement(NamedTuple):
-    """The best map found: its fit with a weight for each run, its cost, and (frame, run) of each cut before a
-    frame, with the run that tells of it."""
+class Selection(NamedTuple):
+    """The best map found: its fit with a weight for each sequence, its cost (chi-square), and the cuts of the
+    odometry: (keyframe after the cut, sequence that shows it)."""
 
-    fit: Fit
+    fit: MapFit
     cost: float
     cuts: tuple[tuple[int, int], ...]
 
 
 Where = Callable[[np.ndarray, np.ndarray, np.ndarray, int], int]
-"""Finds the frame before which the odometry is cut: given all poses [N, 3], those [n, 3] that odometry alone
-tells for the frames after a frame, the motion [3] that carries the last of them where it belongs, and that
-frame."""
+"""Finds the keyframe before which the odometry is cut. Arguments: all poses [N, 3]; poses [n, 3] by odometry
+of the keyframes that follow a keyframe; the motion [3] that moves the last of them to where it was
+recognised; the number of that keyframe."""
 
 
 def select_closures(
-    case: Case, starts: Sequence[Fit], where: Where, earlier: tuple[tuple[int, int], ...] = ()
-) -> Judgement:
-    """The judgement with the least cost.
+    case: SelectionProblem, starts: Sequence[MapFit], where: Where, earlier: tuple[tuple[int, int], ...] = ()
+) -> Selection:
+    """The selection with the least cost.
 
     Args:
-        starts: maps to begin from; the first is the present one, the last odometry's own. where: see `Where`.
-        earlier: cuts (frame, run) of the present map.
+        starts: maps to start from; the first is the current map, the last dead reckoning. where: see `Where`.
+        earlier: cuts (keyframe, sequence) of the current map.
     """
-    best = _settled(case, starts[0], earlier)
-    if earlier:  # they may serve no purpose any more
-        best = min(best, _settled(case, starts[0], ()), key=_cost)
+    best = optimise_with_cuts(case, starts[0], earlier)
+    if earlier:  # they may no longer be needed
+        best = min(best, optimise_with_cuts(case, starts[0], ()), key=_cost)
     if not (best.fit.weights > KEPT).all():
         best = min([best, *_anew(case, starts)], key=_cost)
     return _with_cuts(case, best, where)
 
 
-def _anew(case: Case, starts: Sequence[Fit]) -> list[Judgement]:
-    """Maps without cuts from all starts, and from those that only strong runs make of the last one."""
+def _anew(case: SelectionProblem, starts: Sequence[MapFit]) -> list[Selection]:
+    """Maps without cuts from all starts, and from the last one optimised with strong sequences only."""
     begin, path = list(starts), starts[-1]
     for least in STRONG:
         strong = case.evidence >= least
         if strong.any() and not strong.all():
             alone = _only(case.closures, strong)
             begin.append(solve(path.poses, path.bias, case.chain, alone, case.prior, STEPS, FINE))
-    return [_settled(case, start, ()) for start in begin]
+    return [optimise_with_cuts(case, start, ()) for start in begin]
 
 
-def _cost(judgement: Judgement) -> float:
-    return judgement.cost
+def _cost(selection: Selection) -> float:
+    return selection.cost
 
 
-def _with_cuts(case: Case, best: Judgement, where: Where) -> Judgement:
-    """Cuts the odometry where it is strained or contradicted most, as long as that pays."""
+def _with_cuts(case: SelectionProblem, best: Selection, where: Where) -> Selection:
+    """Cuts the odometry where it is strained or contradicted most, while that lowers the cost."""
     while True:
         strain = _strain(case, best)
-        tempting = [run for run in np.argsort(-strain)[:TRIES].tolist() if strain[run] >= TELLING]
-        found = [judgement for run in tempting for judgement in _cut(case, best, run, where)]
+        tempting = [
+            sequence for sequence in np.argsort(-strain)[:TRIES].tolist() if strain[sequence] >= TELLING
+        ]
+        found = [selection for sequence in tempting for selection in _cut(case, best, sequence, where)]
         cut = _nearest(case, best, found) if found else best
         if cut.cost >= best.cost:
             return best
         best = cut
 
 
-def _nearest(case: Case, best: Judgement, found: list[Judgement]) -> Judgement:
-    """The cheapest; of those that cost the same, that told of by the run that begins first: between two runs
-    a cut costs the same wherever it is, and the less odometry lies between, the surer views tell where."""
-    least = min(judgement.cost for judgement in found)
-    alike = [judgement for judgement in found if judgement.cost <= least + ALIKE]
-    return min(alike, key=lambda judgement: case.first[judgement.cuts[len(best.cuts)][1]])
+def _nearest(case: SelectionProblem, best: Selection, found: list[Selection]) -> Selection:
+    """The cheapest selection; of equally good ones the one whose cut is shown by the earliest sequence. A cut
+    costs the same anywhere between two sequences, and views locate it better where less odometry lies
+    between."""
+    least = min(selection.cost for selection in found)
+    alike = [selection for selection in found if selection.cost <= least + ALIKE]
+    return min(alike, key=lambda selection: case.first[selection.cuts[len(best.cuts)][1]])
 
 
-def _strain(case: Case, best: Judgement) -> np.ndarray:
-    """[R] squared deviation of where each run begins from where odometry leads since the last closure that is
-    believed, both by what they claim alone: a map that has bent to a jump does not hide it."""
-    chain, closures = _severed(case.chain, best.cuts), case.closures
+def _strain(case: SelectionProblem, best: Selection) -> np.ndarray:
+    """[R] squared deviation between the start of each sequence and the odometry since the last accepted
+    closure. Both poses are those of the closures alone, so that a map deformed by a jump does not hide it."""
+    chain, closures = cut_chain(case.chain, best.cuts), case.closures
     strain = np.zeros(len(case.evidence))
-    for run in range(len(strain)):
-        since, first = _since(case, best, run), int(case.first[run])
+    for sequence in range(len(strain)):
+        since, first = _since(case, best, sequence), int(case.first[sequence])
         if first <= since:
             continue
         told = correct_heading_bias(chain.motion[since:first], chain.length[since:first], best.fit.bias)
-        before, claimed = _claim(best, closures, since), _claim(best, closures, first, run)
+        before, claimed = _claim(best, closures, since), _claim(best, closures, first, sequence)
         onwards = integrate(told, before)
         error = between(onwards[-1], claimed)
         variance = chain.variance[since:first]
         lever = ((onwards[:, :2] - onwards[-1, :2]) ** 2).sum(axis=1) / 2
         allowed = variance.sum(axis=0) + 2 * closures.variance
         allowed[:2] += (variance[:, 2] * lever).sum()
-        strain[run] = (error**2 / allowed).sum()
+        strain[sequence] = (error**2 / allowed).sum()
     contradicts = (best.fit.weights <= KEPT) & (strain > PLAUSIBLE)
     return np.where(contradicts, np.maximum(strain, case.evidence), strain)
 
 
-def _claim(best: Judgement, closures: Closures, frame: int, run: int | None = None) -> np.ndarray:
-    """[3] where closures alone put a frame; where none speaks of it, where the map has it."""
+def _claim(best: Selection, closures: LoopClosures, frame: int, sequence: int | None = None) -> np.ndarray:
+    """[3] pose of a keyframe by its closures alone; without any, its pose in the map."""
     among = closures.j == frame
-    among &= (closures.run == run) if run is not None else (best.fit.weights > KEPT)[closures.run]
+    among &= (
+        (closures.sequence == sequence)
+        if sequence is not None
+        else (best.fit.weights > KEPT)[closures.sequence]
+    )
     if not among.any():
         return best.fit.poses[frame]
     member = int(np.flatnonzero(among)[0])
     return compose(best.fit.poses[closures.i[member]], np.array([0.0, 0.0, closures.turn[member]]))
 
 
-def _since(case: Case, best: Judgement, run: int) -> int:
-    """The last frame before a run that a believed run ties to the map."""
-    earlier = (best.fit.weights > KEPT) & (case.last < case.first[run])
+def _since(case: SelectionProblem, best: Selection, sequence: int) -> int:
+    """The last keyframe before a sequence that an accepted sequence joins to the map."""
+    earlier = (best.fit.weights > KEPT) & (case.last < case.first[sequence])
     return int(case.last[earlier].max(initial=0))
 
 
-def _cut(case: Case, best: Judgement, run: int, where: Where) -> list[Judgement]:
-    """The map with the odometry cut somewhere between a run and what is believed before it; and the same with
-    what is believed after it left where it is, by a second cut: a robot carried twice."""
+def _cut(case: SelectionProblem, best: Selection, sequence: int, where: Where) -> list[Selection]:
+    """The map with a cut between a sequence and the accepted one before it; and the same with a second cut
+    after the sequence, so that later accepted sequences stay in place: a robot carried twice."""
     poses = best.fit.poses
-    since, first = _since(case, best, run), int(case.first[run])
+    since, first = _since(case, best, sequence), int(case.first[sequence])
     if first <= since:
         return []
-    claimed = _claim(best, case.closures, first, run)
+    claimed = _claim(best, case.closures, first, sequence)
     frame, moved = _carried(case, best, since, first, claimed, poses, where)
-    cuts = (*best.cuts, (frame, run))
-    found = [_settled(case, best.fit._replace(poses=moved), cuts)]
-    believed = best.fit.weights > KEPT
-    later = np.flatnonzero(believed & (case.first > case.last[run]))
-    if believed[run] or not len(later):
+    cuts = (*best.cuts, (frame, sequence))
+    found = [optimise_with_cuts(case, best.fit._replace(poses=moved), cuts)]
+    accepted = best.fit.weights > KEPT
+    later = np.flatnonzero(accepted & (case.first > case.last[sequence]))
+    if accepted[sequence] or not len(later):
         return found
     following = int(later[np.argmin(case.first[later])])
-    end, back = int(case.last[run]), int(case.first[following])
+    end, back = int(case.last[sequence]), int(case.first[following])
     again, twice = _carried(case, best, end, back, poses[back], moved, where)
     twice[back:] = poses[back:]
-    return [*found, _settled(case, best.fit._replace(poses=twice), (*cuts, (again, following)))]
+    return [*found, optimise_with_cuts(case, best.fit._replace(poses=twice), (*cuts, (again, following)))]
 
 
 def _carried(
-    case: Case,
-    best: Judgement,
+    case: SelectionProblem,
+    best: Selection,
     since: int,
     first: int,
     claimed: np.ndarray,
     poses: np.ndarray,
     where: Where,
 ) -> tuple[int, np.ndarray]:
-    """The frame between `since` and `first` before which to cut so that `first` comes to where it is claimed,
-    and the poses that follow from that."""
+    """The keyframe between `since` and `first` before which to cut so that `first` comes to the pose
+    `claimed`, and the resulting poses."""
     chain = case.chain
     told = correct_heading_bias(chain.motion[since:first], chain.length[since:first], best.fit.bias)
     onwards = integrate(told, poses[since])  # of frames since + 1 ... first
@@ -205,7 +211,7 @@ def _carried(
     return frame, moved
 
 
-def _severed(chain: Chain, cuts: tuple[tuple[int, int], ...]) -> Chain:
+def cut_chain(chain: OdometryChain, cuts: tuple[tuple[int, int], ...]) -> OdometryChain:
     if not cuts:
         return chain
     variance = chain.variance.copy()
@@ -213,22 +219,22 @@ def _severed(chain: Chain, cuts: tuple[tuple[int, int], ...]) -> Chain:
     return chain._replace(variance=variance)
 
 
-def _settled(case: Case, start: Fit, cuts: tuple[tuple[int, int], ...]) -> Judgement:
-    chain = _severed(case.chain, cuts)
+def optimise_with_cuts(case: SelectionProblem, start: MapFit, cuts: tuple[tuple[int, int], ...]) -> Selection:
+    chain = cut_chain(case.chain, cuts)
     fit = solve(start.poses, start.bias, chain, case.closures, case.prior, STEPS, FINE)
     cost = robust_cost(fit, chain, case.closures, case.prior) + CUT * len(cuts)
-    return Judgement(fit, cost, cuts)
+    return Selection(fit, cost, cuts)
 
 
-def _only(closures: Closures, runs: np.ndarray) -> Closures:
-    """The closures of some runs [R] bool."""
-    rows = runs[closures.run]
-    number = np.cumsum(runs) - 1
+def _only(closures: LoopClosures, sequences: np.ndarray) -> LoopClosures:
+    """The closures of the sequences marked in [R] bool."""
+    rows = sequences[closures.sequence]
+    number = np.cumsum(sequences) - 1
     return closures._replace(
         i=closures.i[rows],
         j=closures.j[rows],
         turn=closures.turn[rows],
-        run=number[closures.run[rows]],
-        scale=closures.scale[runs],
-        stray=np.broadcast_to(closures.stray, closures.scale.shape)[runs],
+        sequence=number[closures.sequence[rows]],
+        scale=closures.scale[sequences],
+        stray=np.broadcast_to(closures.stray, closures.scale.shape)[sequences],
     )

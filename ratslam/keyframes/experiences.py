@@ -16,7 +16,7 @@ from ratslam.core.types import Action
 from tactile.base.se2 import between, wrap
 
 
-class Said(NamedTuple):
+class ExperienceChange(NamedTuple):
     """The experience now, the one before, and how it was come by."""
 
     place: int
@@ -39,11 +39,11 @@ class Experiences:
         self._link_of: dict[tuple[int, int], int] = {}
         self._current = -1
 
-    def stay(self) -> Said:
+    def stay(self) -> ExperienceChange:
         """Nothing happened."""
-        return Said(self._current, self._current, Action.NONE)
+        return ExperienceChange(self._current, self._current, Action.NONE)
 
-    def arrive(self, poses: np.ndarray, frame: int, matched: int, sure: bool) -> Said:
+    def arrive(self, poses: np.ndarray, frame: int, matched: int, sure: bool) -> ExperienceChange:
         """The experience of a new frame.
 
         Args:
@@ -63,7 +63,7 @@ class Experiences:
         if place != previous and previous >= 0:
             self._traverse(previous, place)
         self._current = place
-        return Said(place, previous, action)
+        return ExperienceChange(place, previous, action)
 
     def graph(self, poses: np.ndarray) -> networkx.DiGraph:
         """Nodes with x, y (m), heading (rad), frame; links with dx, dy, dtheta and traversals."""

@@ -1,10 +1,9 @@
-"""A chain of frames with closures in runs and one heading bias: robust SE(2) least squares.
+"""A chain of frames with closures in sequences and one heading bias: robust SE(2) least squares.
 
 Odometry that always pulls to one side is one number, not many errors: the bias, in radians per metre, is
-solved for with the poses. Closures that were recognised together stand or fall together: a run has one robust
-weight. Frame 0 is held where it is. Sources: Geman & McClure 1985 (the kernel); Kuemmerle et al. 2011 (the
-error); the bias and the weights by run are ours.
-"""
+solved for with the poses. Closures that were recognised together stand or fall together: a sequence has one
+robust weight. Frame 0 is held where it is. Sources: Geman & McClure 1985 (the kernel); Kuemmerle et al. 2011
+(the error); the bias and the weights by sequence are ours."""
 
 from __future__ import annotations
 
@@ -17,7 +16,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from tactile.base.se2 import between, correct_heading_bias, wrap
 
 
-class Chain(NamedTuple):
+class OdometryChain(NamedTuple):
     """What odometry says from each frame to the next.
 
     Attributes:
@@ -30,34 +29,34 @@ class Chain(NamedTuple):
     variance: np.ndarray
 
 
-class Closures(NamedTuple):
+class LoopClosures(NamedTuple):
     """What recall says: frame j stands where frame i does, turned by `turn`.
 
     Attributes:
-        i, j: [M] frames. turn: [M] rad. run: [M] which run each belongs to, 0..R - 1. variance: [3] of each.
-        scale: [R] mean chi-square at which the weight of a run has fallen to a quarter. score: [R] evidence.
-        stray: [R] or for all runs, chi-square that one closure counts at most.
+        i, j: [M] frames. turn: [M] rad. sequence: [M] which sequence each belongs to, 0..R - 1. variance: [3]
+        of each. scale: [R] mean chi-square at which the weight of a sequence has fallen to a quarter. score:
+        [R] evidence. stray: [R] or for all sequences, chi-square that one closure counts at most.
     """
 
     i: np.ndarray
     j: np.ndarray
     turn: np.ndarray
-    run: np.ndarray
+    sequence: np.ndarray
     variance: np.ndarray
     scale: np.ndarray
     score: np.ndarray = np.zeros(0)
     stray: np.ndarray | float = np.inf
 
 
-class Prior(NamedTuple):
+class BiasPrior(NamedTuple):
     """What is known of the heading bias beforehand, rad/m."""
 
     mean: float
     sd: float
 
 
-class Fit(NamedTuple):
-    """Poses [N, 3], heading bias rad/m, the weight [R] of each run."""
+class MapFit(NamedTuple):
+    """Poses [N, 3], heading bias rad/m, the weight [R] of each sequence."""
 
     poses: np.ndarray
     bias: float
@@ -67,20 +66,20 @@ class Fit(NamedTuple):
 def solve(
     poses: np.ndarray,
     bias: float,
-    chain: Chain,
-    closures: Closures,
-    prior: Prior,
+    chain: OdometryChain,
+    closures: LoopClosures,
+    prior: BiasPrior,
     iterations: int,
     tolerance: float = 1e-4,
-) -> Fit:
-    """Gauss-Newton with weights by run, from the given poses [N, 3] and bias.
+) -> MapFit:
+    """Gauss-Newton with weights by sequence, from the given poses [N, 3] and bias.
 
     Returns:
         the fit after the last step that changed anything by more than the tolerance (m, rad), `iterations` at
         most; where the equations cannot be solved, what it had before.
     """
     system = _System(chain, closures, prior)
-    fit = Fit(np.array(poses, float), bias, np.ones(len(closures.scale)))
+    fit = MapFit(np.array(poses, float), bias, np.ones(len(closures.scale)))
     for _ in range(iterations):
         equations = system.linearise(fit)
         fit = fit._replace(weights=equations.weights)
@@ -95,25 +94,25 @@ def solve(
     return fit
 
 
-def robust_cost(fit: Fit, chain: Chain, closures: Closures, prior: Prior) -> float:
+def robust_cost(fit: MapFit, chain: OdometryChain, closures: LoopClosures, prior: BiasPrior) -> float:
     """What is left of the contradictions between odometry and closures under a fit: what `solve` lessens."""
-    told = correct_heading_bias(chain.motion, chain.length, fit.bias)
-    apart = between(fit.poses[:-1], fit.poses[1:]) - told
+    measured = correct_heading_bias(chain.motion, chain.length, fit.bias)
+    apart = between(fit.poses[:-1], fit.poses[1:]) - measured
     apart[:, 2] = wrap(apart[:, 2])
     odometry = float((apart**2 / chain.variance).sum())
     error = between(fit.poses[closures.i], fit.poses[closures.j])
     error[:, 2] = wrap(error[:, 2] - closures.turn)
     spread = np.broadcast_to(closures.variance, error.shape)
-    members = np.bincount(closures.run, minlength=len(closures.scale))
+    members = np.bincount(closures.sequence, minlength=len(closures.scale))
     _, tamed = _tamed((error**2 / spread).sum(axis=1), closures)
-    total = np.bincount(closures.run, tamed, len(closures.scale))
+    total = np.bincount(closures.sequence, tamed, len(closures.scale))
     mean = total / np.maximum(members, 1)
     lost = members * closures.scale * mean / (closures.scale + mean)
     return odometry + float(lost.sum()) + ((fit.bias - prior.mean) / prior.sd) ** 2
 
 
 def relative_covariance(
-    fit: Fit, chain: Chain, closures: Closures, prior: Prior, i: int, j: int, turn: float
+    fit: MapFit, chain: OdometryChain, closures: LoopClosures, prior: BiasPrior, i: int, j: int, turn: float
 ) -> np.ndarray:
     """[3, 3] covariance of frame j seen from frame i turned by `turn`, under everything the map knows.
 
@@ -130,10 +129,10 @@ def relative_covariance(
     return equations.covariance(change[1:])
 
 
-def _tamed(chi2: np.ndarray, closures: Closures) -> tuple[np.ndarray, np.ndarray]:
+def _tamed(chi2: np.ndarray, closures: LoopClosures) -> tuple[np.ndarray, np.ndarray]:
     """Weights of single closures, and their chi-squares [M] when none can cost more than `stray`: one that is
-    astray must not take its run with it."""
-    most = np.broadcast_to(closures.stray, closures.scale.shape)[closures.run]
+    astray must not take its sequence with it."""
+    most = np.broadcast_to(closures.stray, closures.scale.shape)[closures.sequence]
     if not np.isfinite(most).all():
         return np.ones_like(chi2), chi2
     share = most / (most + chi2)
@@ -176,7 +175,7 @@ class _Equations(NamedTuple):
 class _System:
     """Where every block of the normal equations goes, worked out once for a set of edges."""
 
-    def __init__(self, chain: Chain, closures: Closures, prior: Prior) -> None:
+    def __init__(self, chain: OdometryChain, closures: LoopClosures, prior: BiasPrior) -> None:
         count, steps = len(chain.length) + 1, np.arange(len(chain.length))
         self.i, self.j = np.concatenate([steps, closures.i]), np.concatenate([steps + 1, closures.j])
         self.motion = np.concatenate([chain.motion, np.zeros((len(closures.i), 3))])
@@ -185,7 +184,7 @@ class _System:
         spread = np.broadcast_to(closures.variance, (len(closures.i), 3))
         self.information = 1 / np.concatenate([chain.variance, spread])
         self.closures, self.prior, self.chained = closures, prior, len(steps)
-        self.members = np.bincount(closures.run, minlength=len(closures.scale))
+        self.members = np.bincount(closures.sequence, minlength=len(closures.scale))
 
         self.size = 3 * (count - 1)
         self.order = _order(self.i, self.j, count)
@@ -199,16 +198,18 @@ class _System:
         self.count, self.indices = len(places), (places % self.size).astype(np.int32)
         self.indptr = np.searchsorted(places // self.size, np.arange(self.size + 1)).astype(np.int32)
 
-    def linearise(self, fit: Fit) -> _Equations:
+    def linearise(self, fit: MapFit) -> _Equations:
         a, b = fit.poses[self.i], fit.poses[self.j]
         c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
         dx, dy = (b - a)[:, 0], (b - a)[:, 1]
-        told = correct_heading_bias(self.motion, self.length, fit.bias)
+        measured = correct_heading_bias(self.motion, self.length, fit.bias)
         ahead, aside = c * dx + s * dy, c * dy - s * dx
-        error = np.stack([ahead - told[:, 0], aside - told[:, 1], wrap(b[:, 2] - a[:, 2] - told[:, 2])], 1)
+        error = np.stack(
+            [ahead - measured[:, 0], aside - measured[:, 1], wrap(b[:, 2] - a[:, 2] - measured[:, 2])], 1
+        )
         chi2 = (error**2 * self.information).sum(axis=1)
         keep, tamed = _tamed(chi2[self.chained :], self.closures)
-        total = np.bincount(self.closures.run, tamed, len(self.members))
+        total = np.bincount(self.closures.sequence, tamed, len(self.members))
         mean = total / np.maximum(self.members, 1)
         weights = (self.closures.scale / (self.closures.scale + mean)) ** 2
 
@@ -217,10 +218,12 @@ class _System:
         jacobian[:, 1, :3] = np.stack([s, -c, -ahead], axis=1)
         jacobian[:, 0, 3], jacobian[:, 0, 4], jacobian[:, 1, 3], jacobian[:, 1, 4] = c, s, -s, c
         jacobian[:, 2, 2], jacobian[:, 2, 5] = -1.0, 1.0
-        by_bias = np.stack([told[:, 1] / 2, -told[:, 0] / 2, -np.ones(len(a))], 1) * self.length[:, None]
+        by_bias = (
+            np.stack([measured[:, 1] / 2, -measured[:, 0] / 2, -np.ones(len(a))], 1) * self.length[:, None]
+        )
 
         trust = self.information.copy()
-        trust[self.chained :] *= (keep * weights[self.closures.run])[:, None]
+        trust[self.chained :] *= (keep * weights[self.closures.sequence])[:, None]
         weighted = np.swapaxes(jacobian, 1, 2) * trust[:, None, :]
         data = np.bincount(self.slot, (weighted @ jacobian)[self.used], self.count)
         pulled = weighted @ np.stack([error, by_bias], axis=2)

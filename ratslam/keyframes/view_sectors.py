@@ -14,7 +14,7 @@ import numpy as np
 
 from ratslam.core.growable_array import GrowableArray
 
-FANS = np.radians([sign * width for width in (60, 90, 120, 180, 240, 270, 360) for sign in (1, -1)])
+FIELDS_OF_VIEW = np.radians([sign * width for width in (60, 90, 120, 180, 240, 270, 360) for sign in (1, -1)])
 """Widths of fans that sensors have and that views can tell apart, rad; negative: clockwise."""
 SURE = 3.0
 """Standard errors by which shifted views must agree better than unshifted ones."""
@@ -30,17 +30,17 @@ BLOCKS = 12
 """Parts of a recording that are left out in turn to tell the standard error (jackknife)."""
 
 
-class Slope(NamedTuple):
+class BiasEstimate(NamedTuple):
     """Heading error by way, rad/m, and its standard error."""
 
     value: float
     error: float
 
 
-NOTHING = Slope(0.0, np.inf)
+NO_ESTIMATE = BiasEstimate(0.0, np.inf)
 
 
-class Fan:
+class SectorFan:
     """What the views of consecutive frames tell; one row for each frame.
 
     Args:
@@ -51,9 +51,9 @@ class Fan:
         self.given = angle
         self._view = GrowableArray((size,), np.float64)
         self._step = GrowableArray((2,), np.float64)  # turn, length into the frame
-        self._gain = GrowableArray((len(FANS),), np.float64)
+        self._gain = GrowableArray((len(FIELDS_OF_VIEW),), np.float64)
         self._still = GrowableArray(
-            (len(FANS),), np.float64
+            (len(FIELDS_OF_VIEW),), np.float64
         )  # the unshifted difference, where a fan would shift
         self._pairs = _no_pairs()
         self._angle = angle
@@ -73,15 +73,15 @@ class Fan:
             self._gain.append(gain)
             self._still.append(still)
 
-    def estimate(self) -> Slope:
+    def estimate(self) -> BiasEstimate:
         """The heading bias that the views show: what has to be added to the odometry's turn."""
         self._find()
         if not self._angle or len(self._view.rows) < 2 * FEWEST:
-            return NOTHING
+            return NO_ESTIMATE
         answers = [_slope(self._measured(lag), abs(self._angle)) for lag in LAGS]
         value = float(np.mean([answer.value for answer in answers]))
         error = np.mean([answer.error**2 for answer in answers]) + (answers[0].value - answers[1].value) ** 2
-        return Slope(value, float(np.sqrt(error)))
+        return BiasEstimate(value, float(np.sqrt(error)))
 
     def _find(self) -> None:
         """Calls the views a fan once shifting by the turn explains them far better than leaving them; looks
@@ -94,7 +94,7 @@ class Fan:
         best = int(np.argmax(np.where(count >= FEWEST, total, -np.inf)))
         plain = total[best] > PLAIN * self._still.rows[:, best].sum()
         if count[best] >= FEWEST and sure[best] > SURE and plain:
-            self._angle = float(FANS[best] / self._view.rows.shape[1])
+            self._angle = float(FIELDS_OF_VIEW[best] / self._view.rows.shape[1])
             self._due = 2 * len(gain)
             self._pairs = _no_pairs()
 
@@ -103,7 +103,7 @@ class Fan:
         they differ unshifted; 0 where a fan demands no shift."""
         old, now = self._view.rows[-2], self._view.rows[-1]
         size = len(now)
-        shift = np.round(-self._step.rows[-1, 0] / (FANS / size)).astype(int)
+        shift = np.round(-self._step.rows[-1, 0] / (FIELDS_OF_VIEW / size)).astype(int)
         still = np.abs(now - old).mean()
         moves = (shift != 0) & (np.abs(shift) <= size // 2)
         gain = [still - _apart(now, old, k) if moved else 0.0 for k, moved in zip(shift, moves, strict=True)]
@@ -179,11 +179,11 @@ def _between(now: np.ndarray, old: np.ndarray, shift: np.ndarray) -> np.ndarray:
     return np.where(count >= size // 2, apart.sum(axis=1) / np.maximum(count, 1), np.nan)
 
 
-def _slope(pairs: np.ndarray, angle: float) -> Slope:
+def _slope(pairs: np.ndarray, angle: float) -> BiasEstimate:
     """Robust line through the origin (Huber, a quarter sector) and its jackknife error over blocks."""
     turned, trust, length = pairs.T
     if np.count_nonzero(trust) < FEWEST:
-        return NOTHING
+        return NO_ESTIMATE
     value = 0.0
     for _ in range(12):
         weight = trust / np.maximum(np.abs(turned - value * length), angle / 4)
@@ -192,6 +192,6 @@ def _slope(pairs: np.ndarray, angle: float) -> Slope:
     parts = np.array_split(np.arange(len(pairs)), BLOCKS)
     rest = np.array([bottom.sum() - bottom[part].sum() for part in parts])
     if rest.min() <= 1e-9 * bottom.sum():
-        return NOTHING  # all of it was seen in one stretch: nothing to compare it with
+        return NO_ESTIMATE  # all of it was seen in one stretch: nothing to compare it with
     without = np.array([top.sum() - top[part].sum() for part in parts]) / rest
-    return Slope(value, float(np.sqrt((1 - 1 / BLOCKS) * ((without - without.mean()) ** 2).sum())))
+    return BiasEstimate(value, float(np.sqrt((1 - 1 / BLOCKS) * ((without - without.mean()) ** 2).sum())))

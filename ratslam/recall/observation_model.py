@@ -5,22 +5,18 @@ A view is weighed by its error, in scales; a whisker image by its log-odds; a gi
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
 import numpy as np
 
-from ratslam.recall.filter import (
-    SAMPLES,
-    Memory,
-    ObservationLikelihood,
-    RecallConfig,
-    allowed,
-    offsets,
-    old,
-    present,
-)
+from ratslam.recall.config import RecallConfig, sector_shifts
+from ratslam.recall.memory import Memory, allowed_shifts, current_pose, recallable
 from ratslam.recall.whisker_likelihood import Pixels
 from tactile.base.types import Array
 
+SAMPLES = 20
+"""Number of errors against ruled-out keyframes reported to the map at each keyframe, for calibration."""
 LABELS = {"same": 0.6, "unknown": 0.35, "other": 0.05, "new_unknown": 0.9, "new_known": 0.1}
 """How likely a given id is where its frame was, and where it is new: ids are right more often than not, a new
 id says little (the giver may have failed to recognise), and another known id speaks against."""
@@ -30,10 +26,26 @@ STEPS = (0.02, 0.94, 0.02, 0.02)
 """How often, where images follow each other, the next is that of the same frame, the next one, and so on."""
 
 
+class ObservationLikelihood(NamedTuple):
+    """Likelihoods of an observation.
+
+    Attributes:
+        likelihood: [S or 1, C] at each shift and keyframe. novelty: likelihood at a new place.
+        background: see `RecallResult`. certain: whether the filter can decide yet. telling: whether the
+            observation is evidence about the current place (a label never given before is not).
+    """
+
+    likelihood: Array
+    novelty: Array
+    background: Array
+    certain: Array
+    telling: Array
+
+
 def view_likelihood(config: RecallConfig, cell: float, memory: Memory, view: Array) -> ObservationLikelihood:
     """Weighs all frames by a view [D]. A view that looks like many places makes all of them unlikely."""
-    error = _errors(offsets(config), memory, view)
-    frames = old(config, memory)
+    error = _errors(sector_shifts(config), memory, view)
+    frames = recallable(config, memory)
     width = config.sharpness * memory.scale
     known = width > jnp.finfo(width.dtype).tiny
     width = jnp.where(known, width, 1.0)
@@ -43,7 +55,7 @@ def view_likelihood(config: RecallConfig, cell: float, memory: Memory, view: Arr
     floor = jnp.exp(-config.floor * memory.scale / width)
     novelty = config.common * mean + config.fresh * floor
     away = jnp.maximum(3 * cell, 3 * (0.5 * cell + 0.05 * (memory.since + memory.length)))
-    here = present(memory)
+    here = current_pose(memory)
     apart = (memory.x - here[0]) ** 2 + (memory.y - here[1]) ** 2
     return ObservationLikelihood(
         likelihood=jnp.where(known, likelihood, 1.0),
@@ -65,9 +77,9 @@ def touch_likelihood(
     Returns:
         the memory, which has to know this image at the next one, too.
     """
-    frames = old(config, memory)
+    frames = recallable(config, memory)
     row = memory.likeness[pixels.group, level]
-    then = [memory.view, memory.view[pixels.behind]][: len(offsets(config))]
+    then = [memory.view, memory.view[pixels.behind]][: len(sector_shifts(config))]
     odds = jnp.stack([jnp.sum(jnp.take_along_axis(row, levels, axis=1), axis=0) for levels in then])
     certain = (memory.scale != 0) & jnp.any(frames)
     likelihood = jnp.where(frames[None] & certain, jnp.exp(config.temper * odds), 0.0)
@@ -76,14 +88,14 @@ def touch_likelihood(
     familiar = jnp.sum(expected * likelihood) / jnp.where(total > 0, total, 1.0)
     share = jnp.where(total > 0, config.familiar, 0.0)
     novelty = share * familiar + (1 - share) * jnp.exp(config.temper * memory.scale)
-    weighing = ObservationLikelihood(
+    observation = ObservationLikelihood(
         likelihood=jnp.where(certain, likelihood, 1.0),
         novelty=jnp.where(certain, novelty, 1.0),
         background=jnp.full(SAMPLES, jnp.nan, memory.x.dtype),
         certain=certain,
         telling=certain,
     )
-    return memory._replace(before=likelihood), weighing
+    return memory._replace(before=likelihood), observation
 
 
 def _onwards(before: Array) -> Array:
@@ -115,7 +127,7 @@ def label_likelihood(config: RecallConfig, memory: Memory, label: Array) -> Obse
         likelihood=(likelihood**LABEL_TEMPER)[None],
         novelty=novelty**LABEL_TEMPER,
         background=jnp.full(SAMPLES, jnp.nan, memory.x.dtype),
-        certain=jnp.any(old(config, memory)),
+        certain=jnp.any(recallable(config, memory)),
         telling=known,
     )
 
@@ -134,7 +146,7 @@ def _errors(shifts: np.ndarray, memory: Memory, view: Array) -> Array:
         # Written out, one pass over the frames adds all values; a reduction over them takes twice as long.
         apart = sum((jnp.abs(stored[i] - seen[i]) for i in range(len(stored))), jnp.zeros_like(stored[0]))
         rows.append(apart / len(stored))
-    return jnp.where(allowed(shifts, memory)[:, None], jnp.stack(rows), jnp.inf)
+    return jnp.where(allowed_shifts(shifts, memory)[:, None], jnp.stack(rows), jnp.inf)
 
 
 def _background(error: Array, away: Array) -> Array:

@@ -1,4 +1,5 @@
-"""A closure in a map of 1000 frames: solving, and holding a run against the map's covariance; on one core."""
+"""A closure in a map of 1000 frames: solving, and holding a sequence against the map's covariance; on one
+core."""
 
 from __future__ import annotations
 
@@ -6,7 +7,14 @@ import time
 
 import numpy as np
 
-from ratslam.keyframes.optimizer import Chain, Closures, Fit, Prior, relative_covariance, solve
+from ratslam.keyframes.optimizer import (
+    BiasPrior,
+    LoopClosures,
+    MapFit,
+    OdometryChain,
+    relative_covariance,
+    solve,
+)
 from tactile.base.se2 import integrate
 
 
@@ -17,10 +25,10 @@ def laps(frames: int, closures: int):
     true = np.column_stack([np.full(frames - 1, 0.5), np.zeros(frames - 1), turn])
     told = true - [0, 0, 0.001] + stream.normal(0, [0.01, 0.01, 0.005], true.shape)
     later = stream.integers(60, frames, closures)
-    chain = Chain(told, np.full(frames - 1, 0.5), np.tile([0.01, 0.01, 0.001], (frames - 1, 1)))
+    chain = OdometryChain(told, np.full(frames - 1, 0.5), np.tile([0.01, 0.01, 0.001], (frames - 1, 1)))
     path = np.concatenate([np.zeros((1, 3)), integrate(true)])
-    links = Closures(
-        i=later % 48, j=later, turn=(path[later] - path[later % 48])[:, 2], run=np.arange(closures) // 5,
+    links = LoopClosures(
+        i=later % 48, j=later, turn=(path[later] - path[later % 48])[:, 2], sequence=np.arange(closures) // 5,
         variance=np.array([0.1, 0.1, 0.02]), scale=np.full(closures // 5, 6.0),
     )  # fmt: skip
     return np.concatenate([np.zeros((1, 3)), integrate(told)]), chain, links
@@ -28,9 +36,9 @@ def laps(frames: int, closures: int):
 
 def test_a_closure_among_1000_frames(benchmark):
     poses, chain, links = laps(1000, 400)
-    prior = Prior(0.0, 0.01)
+    prior = BiasPrior(0.0, 0.01)
     solving, checking = [], []
-    fit = Fit(poses, 0.0, np.ones(80))
+    fit = MapFit(poses, 0.0, np.ones(80))
     for _ in range(9):
         start = time.perf_counter()
         fit = solve(poses, 0.0, chain, links, prior, iterations=4)

@@ -9,8 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ratslam.recall import filter, observation_model
-from ratslam.recall.filter import MapFeedback, RecallConfig
+from ratslam.recall import observation_model
+from ratslam.recall.config import RecallConfig
+from ratslam.recall.filter import recognise
+from ratslam.recall.memory import MapFeedback, accumulate_motion, apply_map_feedback, init_memory
 
 CELL = 0.6
 
@@ -19,14 +21,14 @@ def remembered(config: RecallConfig, frames: int, size: int, dtype):
     """A memory of a random walk with random views, with hypotheses under way."""
     stream = np.random.default_rng(0)
     capacity = 1 << (frames - 1).bit_length()
-    memory = filter.start(config, size, capacity, np.dtype(dtype))
+    memory = init_memory(config, size, capacity, np.dtype(dtype))
     turns = np.cumsum(stream.normal(0, 0.3, frames))
     steps = 0.5 * np.stack([np.cos(turns), np.sin(turns)], axis=1)
     poses = np.column_stack([np.cumsum(steps, axis=0), turns])
     memory = memory._replace(
         view=jnp.asarray(stream.random((size, capacity)), dtype), count=jnp.int32(frames - 1)
     )
-    return filter.apply_map_feedback(memory, MapFeedback(poses, 0.01, 5.0, np.pi / 18, 0.06))
+    return apply_map_feedback(memory, MapFeedback(poses, 0.01, 5.0, np.pi / 18, 0.06))
 
 
 @pytest.mark.parametrize("shifts", [0, 3])
@@ -42,9 +44,9 @@ def test_a_look_back(benchmark, frames, shifts, dtype):
     @jax.jit
     def replay(memory):
         def look(k, memory):
-            memory = filter.travel(memory, moved)
+            memory = accumulate_motion(memory, moved)
             weighed = observation_model.view_likelihood(config, CELL, memory, views[k % 64])
-            memory, _ = filter.look(config, CELL, memory, weighed)
+            memory, _ = recognise(config, CELL, memory, weighed)
             return memory._replace(motion=jnp.zeros_like(moved), length=jnp.zeros_like(memory.length))
 
         return jax.lax.fori_loop(0, looks, look, memory)

@@ -16,13 +16,13 @@ from ratslam.keyframes.appearance import (
     LEARN,
     NEVER,
     UNTOLD,
-    Labels,
-    Match,
-    Touch,
-    Views,
+    ConfirmedPairs,
+    LabelAppearance,
+    ViewAppearance,
+    WhiskerAppearance,
     alive,
 )
-from ratslam.keyframes.view_sectors import NOTHING
+from ratslam.keyframes.view_sectors import NO_ESTIMATE
 from ratslam.recall.whisker_likelihood import (
     DEAD,
     HEIGHTS,
@@ -46,7 +46,7 @@ seeds = st.integers(0, 10_000)
 
 def no_pairs():
     none = np.zeros(0, int)
-    return Match(none, none, none.astype(bool))
+    return ConfirmedPairs(none, none, none.astype(bool))
 
 
 def seen(view=None, label=-1, dead=()):
@@ -63,7 +63,7 @@ def felt(stream, count):
 
 def touched(views, known=no_pairs, dead=()):
     """Frames of these images, learned from as they came."""
-    looks = Touch(PIXELS, TEMPER)
+    looks = WhiskerAppearance(PIXELS, TEMPER)
     for view in views:
         looks.append(seen(view, dead=dead), 0.0, 0.1)
         looks.learn(SILENT, known)
@@ -71,7 +71,7 @@ def touched(views, known=no_pairs, dead=()):
 
 
 def viewed(views, errors=(), fan=None):
-    looks = Views(SIZE, fan)
+    looks = ViewAppearance(SIZE, fan)
     for view in views:
         looks.append(seen(view), 0.0, 0.1)
     for k in range(0, len(errors), 20):
@@ -80,7 +80,7 @@ def viewed(views, errors=(), fan=None):
 
 
 def labelled(labels):
-    looks = Labels()
+    looks = LabelAppearance()
     for label in labels:
         looks.append(seen(label=label), 0.0, 0.1)
     return looks
@@ -95,7 +95,7 @@ def alone(near):
 
 def test_whiskers_are_compared_once_there_is_enough_to_learn_from():
     asked = []
-    looks = Touch(PIXELS, TEMPER)
+    looks = WhiskerAppearance(PIXELS, TEMPER)
     for k, view in enumerate(felt(np.random.default_rng(0), 200), start=1):
         looks.append(seen(view), 0.0, 0.1)
 
@@ -103,7 +103,7 @@ def test_whiskers_are_compared_once_there_is_enough_to_learn_from():
             asked.append(k)
             return no_pairs()
 
-        assert looks.learn(SILENT, known) == NOTHING
+        assert looks.learn(SILENT, known) == NO_ESTIMATE
         measure = looks.measure()
         assert measure.angle == np.pi
         assert measure.scale == (NEVER if k >= EARLIEST else 0.0)
@@ -116,7 +116,7 @@ def test_what_is_learned_is_what_images_and_pairs_tell():
     views = felt(np.random.default_rng(0), 2 * LEARN)
     frame, match = np.arange(50, 70), np.arange(10, 30)
     about = np.arange(20) % 3 == 0
-    likeness = touched(views, lambda: Match(frame[:0], match[:0], about[:0])).measure().likeness
+    likeness = touched(views, lambda: ConfirmedPairs(frame[:0], match[:0], about[:0])).measure().likeness
     level = levels(views.reshape(len(views), -1), np.ones(SIZE)).astype(int)
     known = background(level, PIXELS.group)
     assert np.array_equal(likeness, table(known, variation(level[:0], level[:0])))
@@ -124,10 +124,10 @@ def test_what_is_learned_is_what_images_and_pairs_tell():
 
     then = level[match].copy()
     then[about] = then[about][:, PIXELS.behind]
-    looks = Touch(PIXELS, TEMPER)
+    looks = WhiskerAppearance(PIXELS, TEMPER)
     for view in views:
         looks.append(seen(view), 0.0, 0.1)
-    looks.learn(SILENT, lambda: Match(frame, match, about))
+    looks.learn(SILENT, lambda: ConfirmedPairs(frame, match, about))
     assert np.array_equal(looks.measure().likeness, table(known, variation(level[frame], then)))
 
 
@@ -198,7 +198,9 @@ def test_where_there_is_nothing_to_compare_with_there_is_doubt(kind):
     views = felt(np.random.default_rng(0), LEARN)
     looks = {"touch": touched(views), "views": viewed(views), "labels": labelled([1] * 5)}[kind]
     none = np.zeros(0, int)
-    assert looks.misfit(3, none, none.astype(bool)) == (UNTOLD if isinstance(looks, Touch) else DOUBT)
+    assert looks.misfit(3, none, none.astype(bool)) == (
+        UNTOLD if isinstance(looks, WhiskerAppearance) else DOUBT
+    )
 
 
 def test_whiskers_that_nobody_speaks_of_report():
@@ -241,7 +243,7 @@ def test_a_scale_needs_enough_errors_and_grows_with_the_sensors_unit():
 
 
 def test_views_are_kept_as_recall_compares_them():
-    looks = Views(SIZE, None, lambda view: view / 2)
+    looks = ViewAppearance(SIZE, None, lambda view: view / 2)
     views = np.random.default_rng(0).random((3, *SHAPE))
     for view in views:
         looks.append(seen(view), 0.0, 0.1)
@@ -265,7 +267,7 @@ def test_ids_fit_where_they_were_given():
     assert looks.misfit(2, *alone(1)) == 1
     assert looks.misfit(2, np.array([1, 3, 0]), np.zeros(3, bool)) == 0
     assert looks.measure().scale == looks.measure().angle == 0
-    assert looks.learn(SILENT, no_pairs) == NOTHING
+    assert looks.learn(SILENT, no_pairs) == NO_ESTIMATE
 
 
 # All
@@ -273,10 +275,10 @@ def test_ids_fit_where_they_were_given():
 
 def fresh(kind):
     return {
-        "touch": lambda: Touch(PIXELS, TEMPER),
-        "views": lambda: Views(SIZE, None),
-        "fan": lambda: Views(SIZE, 0.0),
-        "labels": Labels,
+        "touch": lambda: WhiskerAppearance(PIXELS, TEMPER),
+        "views": lambda: ViewAppearance(SIZE, None),
+        "fan": lambda: ViewAppearance(SIZE, 0.0),
+        "labels": LabelAppearance,
     }[kind]()
 
 
@@ -286,7 +288,10 @@ def test_looks_that_were_kept_go_on_as_if_never_stopped(kind, stop):
     stream = np.random.default_rng(0)
     views, label = felt(stream, 120), stream.integers(0, 9, 120)
     errors = stream.uniform(0.1, 0.5, (120, 20))
-    turn, pairs = stream.normal(0, 0.2, 120), Match(np.arange(20, 30), np.arange(10), np.arange(10) % 2 == 0)
+    turn, pairs = (
+        stream.normal(0, 0.2, 120),
+        ConfirmedPairs(np.arange(20, 30), np.arange(10), np.arange(10) % 2 == 0),
+    )
 
     def follow(looks, rows):
         told = []

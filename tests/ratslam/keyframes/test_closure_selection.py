@@ -1,4 +1,4 @@
-"""Laws of arbitration: the set of runs that leaves the least cost, and odometry cut where it broke."""
+"""Laws of arbitration: the set of sequences that leaves the least cost, and odometry cut where it broke."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from ratslam.keyframes import closure_selection
-from ratslam.keyframes.closure_selection import CUT, KEPT, STEPS, Case, select_closures
-from ratslam.keyframes.optimizer import Chain, Closures, Fit, Prior, robust_cost, solve
+from ratslam.keyframes.closure_selection import CUT, KEPT, STEPS, SelectionProblem, select_closures
+from ratslam.keyframes.optimizer import BiasPrior, LoopClosures, MapFit, OdometryChain, robust_cost, solve
 from tactile.base.se2 import between, compose, fit_rigid_motion, integrate, wrap
 
 LAP = 60
 STEP = 0.03
 NOISE = np.array([0.006, 0.006, 0.012])  # of odometry, at each frame
 SPREAD = np.array([0.03, 0.03, 0.08])  # of closures
-PRIOR = Prior(0.0, 0.02)
+PRIOR = BiasPrior(0.0, 0.02)
 RUN = 12
 
 
@@ -25,13 +25,13 @@ class World(NamedTuple):
     """A robot on a loop: true poses [N, 3], and what there is to be judged."""
 
     truth: np.ndarray
-    case: Case
+    case: SelectionProblem
 
-    def reckoned(self) -> Fit:
+    def reckoned(self) -> MapFit:
         poses = integrate(self.case.chain.motion, self.truth[0])
-        return Fit(np.vstack([self.truth[:1], poses]), 0.0, np.zeros(0))
+        return MapFit(np.vstack([self.truth[:1], poses]), 0.0, np.zeros(0))
 
-    def starts(self) -> list[Fit]:
+    def starts(self) -> list[MapFit]:
         path = self.reckoned()
         chain, closures = self.case.chain, self.case.closures
         return [solve(path.poses, 0.0, chain, closures, PRIOR, STEPS), path]
@@ -66,11 +66,12 @@ def world(
     least: float = 25.0,
     most: float = 40.0,
 ) -> World:
-    """Laps with noise, and true runs of closures with the first lap, every 20 frames.
+    """Laps with noise, and true sequences of closures with the first lap, every 20 frames.
 
     Args:
-        jumps: (frame, places) by which the robot is carried ahead before a frame. false: evidence of one run
-            more, that joins places half a lap apart. least, most: evidence of the true runs.
+        jumps: (frame, places) by which the robot is carried ahead before a frame. false: evidence of one
+        sequence
+            more, that joins places half a lap apart. least, most: evidence of the true sequences.
     """
     stream = np.random.default_rng(seed)
     count = laps * LAP
@@ -84,29 +85,29 @@ def world(
         true[frame - 1] = steps[frame - 1]  # what odometry tells: nothing has happened
     told = true + stream.normal(0, NOISE, true.shape)
     told[:, 2] = wrap(told[:, 2])
-    chain = Chain(told, np.hypot(told[:, 0], told[:, 1]), np.tile(NOISE**2, (count - 1, 1)))
+    chain = OdometryChain(told, np.hypot(told[:, 0], told[:, 1]), np.tile(NOISE**2, (count - 1, 1)))
 
     edges = sorted({*range(LAP, count + 1, 20), *(frame for frame, _ in jumps)})
     spans = [(first + int(stream.integers(0, 4)), end) for first, end in pairwise(edges)]
-    runs = [np.arange(first, min(first + RUN, end)) for first, end in spans if end - first >= 8]
-    match = [place[frames] % LAP for frames in runs]
-    evidence = stream.uniform(least, most, len(runs))
+    sequences = [np.arange(first, min(first + RUN, end)) for first, end in spans if end - first >= 8]
+    match = [place[frames] % LAP for frames in sequences]
+    evidence = stream.uniform(least, most, len(sequences))
     if false:
-        runs.append(np.arange(2 * LAP + 6, 2 * LAP + 6 + RUN))
-        match.append((place[runs[-1]] + LAP // 2) % LAP)
+        sequences.append(np.arange(2 * LAP + 6, 2 * LAP + 6 + RUN))
+        match.append((place[sequences[-1]] + LAP // 2) % LAP)
         evidence = np.append(evidence, false)
-    members = np.array([len(frames) for frames in runs])
-    closures = Closures(
-        i=np.concatenate(match), j=np.concatenate(runs), turn=np.zeros(members.sum()),
-        run=np.repeat(np.arange(len(runs)), members), variance=SPREAD**2,
+    members = np.array([len(frames) for frames in sequences])
+    closures = LoopClosures(
+        i=np.concatenate(match), j=np.concatenate(sequences), turn=np.zeros(members.sum()),
+        sequence=np.repeat(np.arange(len(sequences)), members), variance=SPREAD**2,
         scale=2 * (evidence - 6) / members, score=evidence,
         stray=np.maximum(6.0, 3 * (evidence - 6) / members),
     )  # fmt: skip
-    first, last = np.array([[frames[0], frames[-1]] for frames in runs]).T
-    return World(truth, Case(chain, closures, PRIOR, evidence, first, last))
+    first, last = np.array([[frames[0], frames[-1]] for frames in sequences]).T
+    return World(truth, SelectionProblem(chain, closures, PRIOR, evidence, first, last))
 
 
-def off(fit: Fit, truth: np.ndarray) -> float:
+def off(fit: MapFit, truth: np.ndarray) -> float:
     """Largest distance from the truth, m."""
     aligned = compose(fit_rigid_motion(fit.poses, truth), fit.poses)
     return float(np.hypot(*(aligned - truth)[:, :2].T).max())
@@ -208,24 +209,24 @@ def test_the_cost_is_never_above_that_of_the_present_map(seed):
     assert judged.cost <= robust_cost(present, case.chain, case.closures, PRIOR)
     again = select_closures(case, [judged.fit, made.reckoned()], made.where, judged.cuts)
     assert again.cost <= judged.cost + 0.5  # solver steps, not another map
-    severed = closure_selection._severed(case.chain, judged.cuts)
+    severed = closure_selection.cut_chain(case.chain, judged.cuts)
     whole = robust_cost(judged.fit, severed, case.closures, PRIOR) + CUT * len(judged.cuts)
     assert judged.cost == pytest.approx(whole, rel=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_the_order_of_runs_does_not_matter(seed):
+def test_the_order_of_sequences_does_not_matter(seed):
     made = world(seed, jumps=((150, 25),) if seed % 2 else (), false=45.0)
     case, closures = made.case, made.case.closures
     order = np.random.default_rng(seed).permutation(len(case.evidence))
     number = np.argsort(order)
-    among = np.random.default_rng(seed + 1).permutation(len(closures.run))
-    renamed = Case(
+    among = np.random.default_rng(seed + 1).permutation(len(closures.sequence))
+    renamed = SelectionProblem(
         case.chain,
         closures._replace(
             i=closures.i[among], j=closures.j[among], turn=closures.turn[among],
-            run=number[closures.run[among]], scale=closures.scale[order], score=closures.score[order],
-            stray=np.asarray(closures.stray)[order],
+            sequence=number[closures.sequence[among]], scale=closures.scale[order],
+            score=closures.score[order], stray=np.asarray(closures.stray)[order],
         ),
         case.prior, case.evidence[order], case.first[order], case.last[order],
     )  # fmt: skip
@@ -233,7 +234,7 @@ def test_the_order_of_runs_does_not_matter(seed):
     assert two.cost == pytest.approx(one.cost, rel=1e-6)
     assert np.allclose(two.fit.poses, one.fit.poses, atol=1e-6)
     assert np.allclose(two.fit.weights, one.fit.weights[order], atol=1e-6)
-    assert [(frame, order[run]) for frame, run in two.cuts] == list(one.cuts)
+    assert [(frame, order[sequence]) for frame, sequence in two.cuts] == list(one.cuts)
 
 
 # Cuts
@@ -273,8 +274,8 @@ def test_a_visit_may_be_told_by_runs_however_strong_they_are():
     jumps = ((2 * LAP + 45, 34), (2 * LAP + 85, -34))
     made = world(0, laps=5, jumps=jumps, least=44.0, most=45.0)
     judged = select_closures(made.case, made.starts(), made.where)
-    whole = closure_selection._settled(
-        made.case, Fit(made.truth.copy(), 0.0, np.zeros(0)), ((jumps[0][0], 5), (jumps[1][0], 7))
+    whole = closure_selection.optimise_with_cuts(
+        made.case, MapFit(made.truth.copy(), 0.0, np.zeros(0)), ((jumps[0][0], 5), (jumps[1][0], 7))
     )
     assert judged.cost <= whole.cost + 1
 

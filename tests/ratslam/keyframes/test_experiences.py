@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ratslam.core.types import Action
-from ratslam.keyframes.experiences import Experiences, Said
+from ratslam.keyframes.experiences import ExperienceChange, Experiences
 from tactile.base.se2 import compose, wrap
 
 RADIUS, HEADING = 1.0, 0.5
@@ -27,9 +27,9 @@ def at(x, y=0.0, heading=0.0, matched=-1, sure=False):
 
 def test_the_first_frame_makes_an_experience():
     world = Experiences(RADIUS, HEADING)
-    assert world.stay() == Said(-1, -1, Action.NONE)
-    assert world.arrive(np.zeros((1, 3)), 0, -1, False) == Said(0, -1, Action.CREATE)
-    assert world.stay() == Said(0, 0, Action.NONE)
+    assert world.stay() == ExperienceChange(-1, -1, Action.NONE)
+    assert world.arrive(np.zeros((1, 3)), 0, -1, False) == ExperienceChange(0, -1, Action.CREATE)
+    assert world.stay() == ExperienceChange(0, 0, Action.NONE)
 
 
 @pytest.mark.parametrize(
@@ -47,7 +47,9 @@ def test_the_first_frame_makes_an_experience():
 def test_an_experience_reaches_as_far_as_its_radius(to, stays, facing):
     there = (*to[:2], wrap(to[2] + facing), *to[3:])
     _, said, _ = walk(at(0, 0, facing), there)
-    assert said[1] == (Said(0, 0, Action.NONE) if stays else Said(1, 0, Action.CREATE))
+    assert said[1] == (
+        ExperienceChange(0, 0, Action.NONE) if stays else ExperienceChange(1, 0, Action.CREATE)
+    )
 
 
 def test_reach_is_from_the_frame_it_was_made_at():
@@ -57,8 +59,8 @@ def test_reach_is_from_the_frame_it_was_made_at():
 
 def test_a_matched_frame_reaches_its_experience_however_far():
     _, said, _ = walk(at(0), at(5), at(10), at(15.2, matched=1), at(20), at(15, matched=1))
-    assert said[3] == Said(1, 2, Action.SET)  # by the way from 1 to 2, the other way round
-    assert said[5] == Said(1, 3, Action.SET)
+    assert said[3] == ExperienceChange(1, 2, Action.SET)  # by the way from 1 to 2, the other way round
+    assert said[5] == ExperienceChange(1, 3, Action.SET)
 
 
 def test_a_way_not_travelled_before_is_a_link_and_then_known():
@@ -70,17 +72,17 @@ def test_a_way_not_travelled_before_is_a_link_and_then_known():
 
 def test_a_match_goes_to_the_experience_of_the_frame_not_to_its_number():
     _, said, _ = walk(at(0), at(0.5), at(5), at(10), at(0, matched=1))
-    assert said[4] == Said(0, 2, Action.LINK)
+    assert said[4] == ExperienceChange(0, 2, Action.LINK)
 
 
 def test_only_a_sure_pose_finds_known_experiences():
     frames = [at(0), at(5), at(10), at(0.9, sure=True)]
     _, said, _ = walk(*frames)
-    assert said[3] == Said(0, 2, Action.LINK)
+    assert said[3] == ExperienceChange(0, 2, Action.LINK)
     _, said, _ = walk(*frames[:3], at(0.9))
-    assert said[3] == Said(3, 2, Action.CREATE)
+    assert said[3] == ExperienceChange(3, 2, Action.CREATE)
     _, said, _ = walk(*frames[:3], at(1.1, sure=True))
-    assert said[3] == Said(3, 2, Action.CREATE)
+    assert said[3] == ExperienceChange(3, 2, Action.CREATE)
 
 
 def test_it_finds_the_nearest_but_stays_where_it_is_within_reach():

@@ -22,11 +22,12 @@ steps = st.lists(
 
 
 def filled():
-    """Runs of 2, 3 and 1 candidates at frames 50, 52, ..; run k's candidates have the gain k + 1."""
+    """Sequences of 2, 3 and 1 candidates at frames 50, 52, ..; sequence k's candidates have the gain k +
+    1."""
     ledger = ClosureLog()
-    for k, run in enumerate([0, 0, 1, 1, 1, 2]):
+    for k, sequence in enumerate([0, 0, 1, 1, 1, 2]):
         first = k in (0, 2, 5)
-        assert ledger.add(Candidate(50 + 2 * k, k, k - 3, 0.9, run + 1.0), not first) == run
+        assert ledger.add(Candidate(50 + 2 * k, k, k - 3, 0.9, sequence + 1.0), not first) == sequence
     return ledger
 
 
@@ -53,27 +54,35 @@ def test_the_ledger_is_a_list_of_candidates(steps):
                 if row[0].frame >= frame and accepted and row[1] != spare:
                     row[1] = -1
         # After every step, so that nothing once looked up outlives a change.
-        counts = [k for k, (_, run) in enumerate(rows) if run >= 0 and verdicts[run] == Verdict.ACCEPTED]
+        counts = [
+            k
+            for k, (_, sequence) in enumerate(rows)
+            if sequence >= 0 and verdicts[sequence] == Verdict.ACCEPTED
+        ]
         assert ledger.accepted().tolist() == counts
-    assert ledger.runs == len(verdicts)
-    assert [ledger.verdict(run) for run in range(ledger.runs)] == verdicts
-    for run in range(ledger.runs):
-        mine = [candidate for candidate, of in rows if of == run]
-        assert ledger.members(run).tolist() == [[*c[:3], run] for c in mine]
-        assert ledger.score(run) == pytest.approx(sum(c.gain for c in mine))
+    assert ledger.sequences == len(verdicts)
+    assert [ledger.verdict(sequence) for sequence in range(ledger.sequences)] == verdicts
+    for sequence in range(ledger.sequences):
+        mine = [candidate for candidate, of in rows if of == sequence]
+        assert ledger.members(sequence).tolist() == [[*c[:3], sequence] for c in mine]
+        assert ledger.score(sequence) == pytest.approx(sum(c.gain for c in mine))
     table = ledger.table()
     assert table.shape == (len(rows), 9)
-    assert table[:, :6].tolist() == [[*candidate, run] for candidate, run in rows]
-    assert table[:, 7].tolist() == [verdicts[run] if run >= 0 else Verdict.UNDONE for _, run in rows]
+    assert table[:, :6].tolist() == [[*candidate, sequence] for candidate, sequence in rows]
+    assert table[:, 7].tolist() == [
+        verdicts[sequence] if sequence >= 0 else Verdict.UNDONE for _, sequence in rows
+    ]
 
     closures = ledger.closures(0.2, VARIANCE, SCALES)
     mine = [rows[k] for k in counts]
-    runs = sorted({run for _, run in mine})
+    sequences = sorted({sequence for _, sequence in mine})
     assert closures.i.tolist() == [candidate.match for candidate, _ in mine]
     assert closures.j.tolist() == [candidate.frame for candidate, _ in mine]
     assert np.allclose(closures.turn, [-0.2 * candidate.shift for candidate, _ in mine])
-    assert closures.run.tolist() == [runs.index(run) for _, run in mine]
-    assert np.allclose(closures.scale, [min(max(0.5 * ledger.score(run), 2), 20) for run in runs])
+    assert closures.sequence.tolist() == [sequences.index(sequence) for _, sequence in mine]
+    assert np.allclose(
+        closures.scale, [min(max(0.5 * ledger.score(sequence), 2), 20) for sequence in sequences]
+    )
     assert closures.variance is VARIANCE
 
     again = ClosureLog()
@@ -81,13 +90,13 @@ def test_the_ledger_is_a_list_of_candidates(steps):
     again.restore(ledger.arrays())
     assert np.array_equal(again.table(), table)
     assert np.array_equal(again.accepted(), ledger.accepted())
-    assert (again.runs, again.last()) == (ledger.runs, ledger.last())
+    assert (again.sequences, again.last()) == (ledger.sequences, ledger.last())
 
 
 def test_an_empty_ledger_has_no_closures():
     ledger = ClosureLog()
     assert ledger.last() is None
-    assert ledger.runs == 0
+    assert ledger.sequences == 0
     assert ledger.table().shape == (0, 9)
     assert [len(rows) for rows in ledger.closures(0.1, VARIANCE, SCALES)[:4]] == [0] * 4
     assert ledger.closures(0.1, VARIANCE, SCALES).scale.shape == (0,)
@@ -100,24 +109,31 @@ def test_a_run_counts_while_it_is_accepted():
     assert len(ledger.accepted()) == 0
     ledger.judge(1, Verdict.ACCEPTED, 3.0)
     assert ledger.accepted().tolist() == [2, 3, 4]
-    ledger.add(Candidate(62, 9, 0, 0.9, 1.0), True)  # of the open run 2
+    ledger.add(Candidate(62, 9, 0, 0.9, 1.0), True)  # of the open sequence 2
     ledger.judge(2, Verdict.ACCEPTED)
     assert ledger.accepted().tolist() == [2, 3, 4, 5, 6]
-    ledger.add(Candidate(64, 9, 0, 0.9, 1.0), True)  # of a run accepted already
+    ledger.add(Candidate(64, 9, 0, 0.9, 1.0), True)  # of a sequence accepted already
     assert ledger.accepted().tolist() == [2, 3, 4, 5, 6, 7]
     ledger.judge(1, Verdict.UNDONE)
     assert ledger.accepted().tolist() == [5, 6, 7]
-    assert ledger.closures(0.1, VARIANCE, SCALES).run.tolist() == [0, 0, 0]
+    assert ledger.closures(0.1, VARIANCE, SCALES).sequence.tolist() == [0, 0, 0]
 
 
 def test_a_break_strikes_out_what_was_said_after_it():
     ledger = filled()
-    for run in (0, 1):
-        ledger.judge(run, Verdict.ACCEPTED)
+    for sequence in (0, 1):
+        ledger.judge(sequence, Verdict.ACCEPTED)
     ledger.strike(56, 2)
-    assert ledger.accepted().tolist() == [0, 1, 2]  # run 1 keeps what it said before the break
+    assert ledger.accepted().tolist() == [0, 1, 2]  # sequence 1 keeps what it said before the break
     assert ledger.score(1) == 2.0
-    assert ledger.table()[:, 5].tolist() == [0, 0, 1, -1, -1, 2]  # an open run is spared, accepted or not
+    assert ledger.table()[:, 5].tolist() == [
+        0,
+        0,
+        1,
+        -1,
+        -1,
+        2,
+    ]  # an open sequence is spared, accepted or not
     assert ledger.table()[3, 6:].tolist() == [np.inf, Verdict.UNDONE, 0.0]
     ledger.judge(2, Verdict.ACCEPTED)
     ledger.strike(0, 2)
@@ -129,16 +145,18 @@ def test_runs_are_summed_up_as_their_members_say(steps):
     ledger = ClosureLog()
     for k, (kind, a, b) in enumerate(steps):
         if kind == "add":
-            ledger.add(Candidate(50 + k, k, 0, 0.9, b), a and ledger.runs > 0)
-        elif kind == "judge" and ledger.runs:
-            ledger.judge(a % ledger.runs, b)
-        elif kind == "strike" and ledger.runs:
-            ledger.strike(50 + a, b % ledger.runs)
-    members = [ledger.members(run) for run in range(ledger.runs)]
+            ledger.add(Candidate(50 + k, k, 0, 0.9, b), a and ledger.sequences > 0)
+        elif kind == "judge" and ledger.sequences:
+            ledger.judge(a % ledger.sequences, b)
+        elif kind == "strike" and ledger.sequences:
+            ledger.strike(50 + a, b % ledger.sequences)
+    members = [ledger.members(sequence) for sequence in range(ledger.sequences)]
     assert ledger.sizes().tolist() == [len(rows) for rows in members]
-    assert ledger.scores() == pytest.approx([ledger.score(run) for run in range(ledger.runs)], abs=1e-12)
-    assert ledger.verdicts().tolist() == [ledger.verdict(run) for run in range(ledger.runs)]
-    assert ledger.spans().shape == (ledger.runs, 2)
+    assert ledger.scores() == pytest.approx(
+        [ledger.score(sequence) for sequence in range(ledger.sequences)], abs=1e-12
+    )
+    assert ledger.verdicts().tolist() == [ledger.verdict(sequence) for sequence in range(ledger.sequences)]
+    assert ledger.spans().shape == (ledger.sequences, 2)
     for (first, last), rows in zip(ledger.spans().tolist(), members, strict=True):
         if len(rows):
             assert (first, last) == (rows[0, 0], rows[-1, 0])
@@ -148,24 +166,24 @@ def test_runs_are_summed_up_as_their_members_say(steps):
 
 def test_closures_bring_the_evidence_of_their_runs():
     ledger = filled()
-    for run in (0, 2):
-        ledger.judge(run, Verdict.ACCEPTED)
+    for sequence in (0, 2):
+        ledger.judge(sequence, Verdict.ACCEPTED)
     closures = ledger.closures(0.1, VARIANCE, SCALES)
     assert closures.score.tolist() == [2.0, 3.0]
-    assert closures.run.tolist() == [0, 0, 1]
+    assert closures.sequence.tolist() == [0, 0, 1]
 
 
 def test_scales_grow_with_the_score_between_their_limits():
     ledger = filled()
-    for run in range(3):
-        ledger.judge(run, Verdict.ACCEPTED)
+    for sequence in range(3):
+        ledger.judge(sequence, Verdict.ACCEPTED)
     assert np.allclose(ledger.closures(0.1, VARIANCE, (1.0, 2.5, 4.0)).scale, [2.5, 4.0, 3.0])
 
 
 def test_weights_go_to_the_runs_that_count():
     ledger = filled()
-    for run in (0, 2):
-        ledger.judge(run, Verdict.ACCEPTED)
+    for sequence in (0, 2):
+        ledger.judge(sequence, Verdict.ACCEPTED)
     assert ledger.weights().tolist() == [1, 1, 1]
     ledger.weigh(np.array([0.25, 0.75]))
     assert ledger.weights().tolist() == [0.25, 0.25, 0.75]

@@ -1,4 +1,4 @@
-"""Laws of the chain with closures in runs and one heading bias."""
+"""Laws of the chain with closures in sequences and one heading bias."""
 
 from __future__ import annotations
 
@@ -9,34 +9,37 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
 from ratslam.keyframes.optimizer import (
-    Chain,
-    Closures,
-    Fit,
-    Prior,
+    BiasPrior,
+    LoopClosures,
+    MapFit,
+    OdometryChain,
     relative_covariance,
     robust_cost,
     solve,
 )
 from tactile.base.se2 import between, compose, correct_heading_bias, integrate, wrap
 
-WIDE = Prior(0.0, 10.0)
-SURE = 1e12  # a robust scale at which no run ever loses weight
+WIDE = BiasPrior(0.0, 10.0)
+SURE = 1e12  # a robust scale at which no sequence ever loses weight
 CLOSURE = np.array([0.02, 0.02, 0.01]) ** 2
 START = np.array([2.0, -1.0, 3.0])  # not the origin, and near the seam of the angles
 seeds = st.integers(0, 1000)
 
 
 def chained(motion, sd=(0.02, 0.02, 0.01)):
-    return Chain(motion, np.hypot(motion[:, 0], motion[:, 1]), np.tile(np.square(sd), (len(motion), 1)))
+    return OdometryChain(
+        motion, np.hypot(motion[:, 0], motion[:, 1]), np.tile(np.square(sd), (len(motion), 1))
+    )
 
 
-def closed(pairs, turn=(), run=(), scale=()):
+def closed(pairs, turn=(), sequence=(), scale=()):
     i, j = np.array(pairs, int).reshape(-1, 2).T
-    return Closures(i, j, np.array(turn, float), np.array(run, int), CLOSURE, np.array(scale, float))
+    return LoopClosures(i, j, np.array(turn, float), np.array(sequence, int), CLOSURE, np.array(scale, float))
 
 
 def laps(stream, bias=0.0, count=24, noise=0.0):
-    """Two laps of an ellipse, the second seen turned: truth, what odometry tells, true closures in 3 runs."""
+    """Two laps of an ellipse, the second seen turned: truth, what odometry tells, true closures in 3
+    sequences."""
     at = 2 * np.pi * np.arange(2 * count) / count
     truth = np.stack([3 * np.cos(at), 2 * np.sin(at), wrap(at + np.pi / 2)], axis=1)
     turn = np.where(np.arange(2 * count) < count, 0.0, stream.uniform(-0.6, 0.6, 2 * count))
@@ -46,8 +49,8 @@ def laps(stream, bias=0.0, count=24, noise=0.0):
     chain = chained(correct_heading_bias(motion, np.hypot(motion[:, 0], motion[:, 1]), -bias))
     chain = chain._replace(motion=chain.motion + noise * stream.normal(0, 1, motion.shape) * [1, 1, 0.5])
     i = np.arange(1, count, 2)
-    run = np.arange(len(i)) * 3 // len(i)
-    return truth, chain, closed(np.stack([i, i + count], 1), turn[i + count], run, [SURE] * 3)
+    sequence = np.arange(len(i)) * 3 // len(i)
+    return truth, chain, closed(np.stack([i, i + count], 1), turn[i + count], sequence, [SURE] * 3)
 
 
 def reckoned(chain, start=START):
@@ -65,8 +68,8 @@ def parts(poses, bias, chain, closures):
 
 
 def run_means(recall, closures):
-    runs = range(len(closures.scale))
-    return np.array([(recall[closures.run == k] ** 2).sum(axis=1).mean() for k in runs])
+    sequences = range(len(closures.scale))
+    return np.array([(recall[closures.sequence == k] ** 2).sum(axis=1).mean() for k in sequences])
 
 
 def unknowns(poses, bias):
@@ -76,7 +79,7 @@ def unknowns(poses, bias):
 def residuals(x, first, chain, closures, prior, weights):
     poses = np.vstack([first, x[:-1].reshape(-1, 3)])
     odometry, recall = parts(poses, x[-1], chain, closures)
-    recall = recall * np.sqrt(weights)[closures.run][:, None]
+    recall = recall * np.sqrt(weights)[closures.sequence][:, None]
     return np.concatenate([odometry.ravel(), recall.ravel(), [(x[-1] - prior.mean) / prior.sd]])
 
 
@@ -127,7 +130,7 @@ def test_true_closures_tell_the_bias_and_all_poses(bias):
 
 def test_a_certain_prior_holds_the_bias():
     truth, chain, closures = laps(np.random.default_rng(0), 0.05)
-    fit = solve(reckoned(chain), 0.0, chain, closures, Prior(0.02, 1e-9), 30)
+    fit = solve(reckoned(chain), 0.0, chain, closures, BiasPrior(0.02, 1e-9), 30)
     assert fit.bias == pytest.approx(0.02, abs=1e-9)
     assert apart(fit.poses, truth) > 0.05
 
@@ -138,7 +141,7 @@ def test_a_step_is_gauss_newtons(seed, scale):
     stream = np.random.default_rng(seed)
     truth, chain, closures = laps(stream, 0.04, 8, 0.02)
     closures = closures._replace(scale=np.full(3, scale))
-    start, bias, prior = truth + stream.normal(0, 0.03, truth.shape), 0.01, Prior(0.03, 0.02)
+    start, bias, prior = truth + stream.normal(0, 0.03, truth.shape), 0.01, BiasPrior(0.03, 0.02)
     weights = (scale / (scale + run_means(parts(start, bias, chain, closures)[1], closures))) ** 2
     x = unknowns(start, bias)
 
@@ -156,7 +159,7 @@ def test_a_step_is_gauss_newtons(seed, scale):
 def test_without_robust_weights_it_is_least_squares(seed):
     stream = np.random.default_rng(seed)
     _, chain, closures = laps(stream, 0.04, 8, 0.03)
-    prior, start = Prior(0.02, 0.02), reckoned(chain)
+    prior, start = BiasPrior(0.02, 0.02), reckoned(chain)
     fit = solve(start, 0.0, chain, closures, prior, 50)
     found = least_squares(
         residuals,
@@ -173,8 +176,8 @@ def test_without_robust_weights_it_is_least_squares(seed):
 def test_with_robust_weights_it_is_geman_mcclure_by_run():
     stream = np.random.default_rng(3)
     _, chain, closures = laps(stream, 0.04, 8, 0.02)
-    # One run is moderately off, so that its weight, neither 0 nor 1, decides where the optimum lies.
-    closures = closures._replace(scale=np.full(3, 4.0), turn=closures.turn + 0.03 * (closures.run == 1))
+    # One sequence is moderately off, so that its weight, neither 0 nor 1, decides where the optimum lies.
+    closures = closures._replace(scale=np.full(3, 4.0), turn=closures.turn + 0.03 * (closures.sequence == 1))
     fit = solve(reckoned(chain), 0.04, chain, closures, WIDE, 500)
     assert ((fit.weights > 0.1) & (fit.weights < 0.999)).any()
 
@@ -182,7 +185,7 @@ def test_with_robust_weights_it_is_geman_mcclure_by_run():
         odometry, recall = parts(
             np.vstack([fit.poses[0], x[:-1].reshape(-1, 3)]), float(x[-1]), chain, closures
         )
-        mean, members = run_means(recall, closures), np.bincount(closures.run)
+        mean, members = run_means(recall, closures), np.bincount(closures.sequence)
         kernel = (members * closures.scale * mean / (closures.scale + mean)).sum()
         return (odometry**2).sum() + kernel + (x[-1] / WIDE.sd) ** 2
 
@@ -198,7 +201,7 @@ def test_a_run_that_is_far_off_counts_for_nothing(bias):
     closures = closures._replace(scale=np.full(3, 10.0))
     right = solve(reckoned(chain), bias, chain, closures, WIDE, 50)
     false = closed([(k, k + 12) for k in range(2, 8)], np.zeros(6), np.full(6, 3), [10.0])
-    both = Closures(
+    both = LoopClosures(
         *(np.concatenate([a, b]) for a, b in zip(closures[:4], false[:4], strict=True)),
         CLOSURE,
         np.full(4, 10.0),
@@ -213,21 +216,21 @@ def test_a_run_that_is_far_off_counts_for_nothing(bias):
 
 
 def robust_case(seed, stray, count=8):
-    """Laps with noise, a start that is off, and runs of which the second is astray."""
+    """Laps with noise, a start that is off, and sequences of which the second is astray."""
     stream = np.random.default_rng(seed)
     truth, chain, closures = laps(stream, 0.04, count, 0.02)
-    turn = closures.turn + (closures.run == 1) * stream.uniform(-0.5, 0.5)
+    turn = closures.turn + (closures.sequence == 1) * stream.uniform(-0.5, 0.5)
     closures = closures._replace(scale=stream.uniform(1, 20, 3), stray=stray, turn=turn)
     start = truth + stream.normal(0, 0.05, truth.shape)
     start[0] = truth[0]
-    return start, chain, closures, Prior(0.03, 0.02)
+    return start, chain, closures, BiasPrior(0.03, 0.02)
 
 
 def cost_by_loops(fit, chain, closures, prior):
     odometry, recall = parts(fit.poses, fit.bias, chain, closures)
     cost = (odometry**2).sum() + ((fit.bias - prior.mean) / prior.sd) ** 2
-    for run, scale in enumerate(closures.scale):
-        each = [(recall[k] ** 2).sum() for k in np.flatnonzero(closures.run == run)]
+    for sequence, scale in enumerate(closures.scale):
+        each = [(recall[k] ** 2).sum() for k in np.flatnonzero(closures.sequence == sequence)]
         if np.isfinite(closures.stray):
             each = [closures.stray * chi2 / (closures.stray + chi2) for chi2 in each]
         mean = sum(each) / max(len(each), 1)
@@ -238,7 +241,7 @@ def cost_by_loops(fit, chain, closures, prior):
 @given(seeds, st.sampled_from([np.inf, 6.0, 0.5]))
 def test_the_robust_cost_is_what_odometry_and_runs_lack(seed, stray):
     start, chain, closures, prior = robust_case(seed, stray)
-    fit = Fit(start, 0.01, np.zeros(3))
+    fit = MapFit(start, 0.01, np.zeros(3))
     assert robust_cost(fit, chain, closures, prior) == pytest.approx(
         cost_by_loops(fit, chain, closures, prior), rel=1e-9
     )
@@ -246,16 +249,18 @@ def test_the_robust_cost_is_what_odometry_and_runs_lack(seed, stray):
 
 def test_the_robust_cost_of_a_perfect_map_is_none():
     truth, chain, closures = laps(np.random.default_rng(0), 0.03)
-    assert robust_cost(Fit(truth, 0.03, np.zeros(3)), chain, closures, Prior(0.03, 1.0)) < 1e-12
+    assert robust_cost(MapFit(truth, 0.03, np.zeros(3)), chain, closures, BiasPrior(0.03, 1.0)) < 1e-12
     alone = closed([])
-    assert robust_cost(Fit(truth, 0.03, np.zeros(0)), chain, alone, Prior(0.02, 0.01)) == pytest.approx(1.0)
+    assert robust_cost(
+        MapFit(truth, 0.03, np.zeros(0)), chain, alone, BiasPrior(0.02, 0.01)
+    ) == pytest.approx(1.0)
 
 
 @given(seeds, st.sampled_from([np.inf, 20.0, 6.0]))
 @settings(max_examples=40)
 def test_every_step_lessens_the_robust_cost(seed, stray):
     start, chain, closures, prior = robust_case(seed, stray)
-    fit = Fit(start, 0.0, np.zeros(3))
+    fit = MapFit(start, 0.0, np.zeros(3))
     costs = [robust_cost(fit, chain, closures, prior)]
     for _ in range(25):
         fit = solve(fit.poses, fit.bias, chain, closures, prior, 1)
@@ -284,9 +289,9 @@ def test_one_closure_astray_does_not_take_its_run_with_it():
     astray = closures._replace(i=np.where(np.arange(len(closures.i)) == 5, 20, closures.i))
     strict = solve(reckoned(chain), 0.0, chain, astray, WIDE, 50)
     lenient = solve(reckoned(chain), 0.0, chain, astray._replace(stray=6.0), WIDE, 50)
-    run = closures.run[5]
-    assert strict.weights[run] < 0.01
-    assert lenient.weights[run] > 0.25
+    sequence = closures.sequence[5]
+    assert strict.weights[sequence] < 0.01
+    assert lenient.weights[sequence] > 0.25
     assert apart(lenient.poses, truth) < 0.1
 
 
@@ -308,8 +313,8 @@ def test_relative_covariance_is_the_marginal_of_the_whole_information(seed):
     stream = np.random.default_rng(seed)
     truth, chain, closures = laps(stream, 0.02, 6, 0.02)
     closures = closures._replace(scale=np.array([2.0, 5.0, 20.0]))
-    prior = Prior(0.0, 0.05)
-    fit = Fit(truth + stream.normal(0, 0.02, truth.shape), 0.01, np.zeros(3))
+    prior = BiasPrior(0.0, 0.05)
+    fit = MapFit(truth + stream.normal(0, 0.02, truth.shape), 0.01, np.zeros(3))
     i, j = stream.choice(len(truth), 2, replace=False).tolist()
     turn = stream.uniform(-3, 3)
     mean = run_means(parts(fit.poses, fit.bias, chain, closures)[1], closures)
@@ -332,18 +337,18 @@ def test_relative_covariance_is_the_marginal_of_the_whole_information(seed):
 
 def test_covariance_is_one_grows_along_the_chain_and_shrinks_with_closures():
     _, chain, closures = laps(np.random.default_rng(2), 0.0)
-    fit, none = Fit(reckoned(chain), 0.0, np.zeros(0)), closed([])
+    fit, none = MapFit(reckoned(chain), 0.0, np.zeros(0)), closed([])
     for pair in [(0, 47), (5, 30), (40, 3)]:
-        prior = Prior(0.0, 0.02)
+        prior = BiasPrior(0.0, 0.02)
         free = relative_covariance(fit, chain, none, prior, *pair, 0.3)
         bound = relative_covariance(fit, chain, closures, prior, *pair, 0.3)
         for covariance in (free, bound, free - bound):
             assert np.allclose(covariance, covariance.T, rtol=0, atol=1e-9 * np.trace(free))
             assert np.linalg.eigvalsh(covariance).min() > 0
-        told = relative_covariance(fit, chain, none, Prior(0.0, 0.001), *pair, 0.3)
+        told = relative_covariance(fit, chain, none, BiasPrior(0.0, 0.001), *pair, 0.3)
         assert np.linalg.eigvalsh(free - told).max() > 0.1 * np.trace(free - told) > 0
     straight = chained(np.tile([0.5, 0.0, 0.0], (20, 1)))
-    fit = Fit(reckoned(straight), 0.0, np.zeros(0))
+    fit = MapFit(reckoned(straight), 0.0, np.zeros(0))
     along = np.array(
         [np.diag(relative_covariance(fit, straight, none, WIDE, 0, k, 0.0)) for k in range(1, 21)]
     )
@@ -363,7 +368,7 @@ def test_the_first_frame_never_moves(seed):
 
 def test_a_chain_alone_is_dead_reckoning_with_the_prior_bias():
     _, chain, _ = laps(np.random.default_rng(4), 0.0)
-    fit = solve(reckoned(chain), 0.0, chain, closed([]), Prior(0.03, 0.01), 30)
+    fit = solve(reckoned(chain), 0.0, chain, closed([]), BiasPrior(0.03, 0.01), 30)
     expected = np.vstack([START, integrate(correct_heading_bias(chain.motion, chain.length, 0.03), START)])
     assert fit.bias == pytest.approx(0.03, abs=1e-9)
     assert apart(fit.poses, expected) < 1e-6
@@ -372,7 +377,7 @@ def test_a_chain_alone_is_dead_reckoning_with_the_prior_bias():
 
 def test_a_single_frame_is_a_map():
     chain = chained(np.zeros((0, 3)))
-    fit = solve(START[None], 0.01, chain, closed([]), Prior(0.03, 0.01), 5)
+    fit = solve(START[None], 0.01, chain, closed([]), BiasPrior(0.03, 0.01), 5)
     assert np.allclose(fit.poses, START[None], rtol=0, atol=1e-14)
     assert np.isfinite(fit.bias)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ratslam.keyframes.view_sectors import NOTHING, Fan
+from ratslam.keyframes.view_sectors import NO_ESTIMATE, SectorFan
 
 SIZE = 18
 
@@ -36,7 +36,7 @@ def shown(fan, view, turn, length):
 @pytest.mark.parametrize("width", [180, -180, 270, -270])
 @pytest.mark.parametrize("seed", range(4))
 def test_the_width_and_the_sense_of_a_fan_are_found(width, seed):
-    fan = shown(Fan(SIZE, 0.0), *drive(seed, width))
+    fan = shown(SectorFan(SIZE, 0.0), *drive(seed, width))
     assert fan.angle == 0
     fan.estimate()
     assert fan.angle == pytest.approx(np.radians(width) / SIZE)
@@ -45,7 +45,7 @@ def test_the_width_and_the_sense_of_a_fan_are_found(width, seed):
 @pytest.mark.parametrize("seed", range(4))
 def test_mirrored_views_are_a_fan_the_other_way(seed):
     view, turn, length = drive(seed, 180)
-    there, back = (shown(Fan(SIZE, 0.0), rows, turn, length) for rows in (view, view[:, ::-1]))
+    there, back = (shown(SectorFan(SIZE, 0.0), rows, turn, length) for rows in (view, view[:, ::-1]))
     ahead, mirrored = there.estimate(), back.estimate()
     assert there.angle == -back.angle > 0
     assert mirrored == pytest.approx(ahead, rel=1e-6, abs=1e-9)
@@ -64,10 +64,10 @@ def test_views_without_order_are_no_fan(kind, seed):
         "stays": places[np.cumsum(stream.random(count) < 0.3)] + noise,
         "slow": np.cumsum(noise, axis=0),
     }[kind]
-    fan = Fan(SIZE, 0.0)
+    fan = SectorFan(SIZE, 0.0)
     for row in zip(view, turn, length, strict=True):
         fan.append(*row)
-        assert fan.estimate() == NOTHING
+        assert fan.estimate() == NO_ESTIMATE
     assert fan.angle == 0
 
 
@@ -76,7 +76,7 @@ def mistaken(changed):
     found = []
     for seed in range(60):
         view, turn, length = drive(seed, 180)
-        fan = Fan(SIZE, 0.0)
+        fan = SectorFan(SIZE, 0.0)
         view = changed(np.random.default_rng(seed + 1000), view)
         for k, row in enumerate(zip(view, turn, length, strict=True)):
             fan.append(*row)
@@ -94,14 +94,16 @@ def test_views_new_at_every_frame_are_no_fan():
 @pytest.mark.parametrize("bias", [0.0, 0.1, -0.05])
 @pytest.mark.parametrize("seed", range(3))
 def test_the_bias_is_what_the_odometrys_turn_lacks(width, bias, seed):
-    told = shown(Fan(SIZE, 0.0), *drive(seed, width, bias=bias)).estimate()
+    told = shown(SectorFan(SIZE, 0.0), *drive(seed, width, bias=bias)).estimate()
     assert abs(told.value - bias) < 3 * told.error
     assert told.error < 0.02  # of no use were it as large as the biases
 
 
 def test_more_noise_is_less_sure():
     errors = [
-        np.median([shown(Fan(SIZE, 0.0), *drive(k, 180, noise=noise)).estimate().error for k in range(5)])
+        np.median(
+            [shown(SectorFan(SIZE, 0.0), *drive(k, 180, noise=noise)).estimate().error for k in range(5)]
+        )
         for noise in (0.01, 0.1)
     ]
     assert errors[1] > 2 * errors[0] > 0
@@ -110,7 +112,7 @@ def test_more_noise_is_less_sure():
 @pytest.mark.parametrize("given", [np.radians(10), -np.radians(3)])
 def test_a_given_angle_is_never_changed(given):
     view, turn, length = drive(0, 270)
-    fan = Fan(SIZE, given)
+    fan = SectorFan(SIZE, given)
     for row in zip(view, turn, length, strict=True):
         assert fan.angle == given
         fan.append(*row)
@@ -119,14 +121,14 @@ def test_a_given_angle_is_never_changed(given):
 
 
 def test_a_given_angle_tells_the_bias_without_finding():
-    told = shown(Fan(SIZE, np.radians(10)), *drive(1, 180, 60, bias=0.1)).estimate()
+    told = shown(SectorFan(SIZE, np.radians(10)), *drive(1, 180, 60, bias=0.1)).estimate()
     assert abs(told.value - 0.1) < 3 * told.error < 0.3
 
 
 def test_too_little_tells_nothing():
-    assert Fan(SIZE, 0.0).estimate() == NOTHING
-    fan = shown(Fan(SIZE, 0.0), *drive(0, 180, 15))
-    assert fan.estimate() == NOTHING
+    assert SectorFan(SIZE, 0.0).estimate() == NO_ESTIMATE
+    fan = shown(SectorFan(SIZE, 0.0), *drive(0, 180, 15))
+    assert fan.estimate() == NO_ESTIMATE
     assert fan.angle == 0
 
 
@@ -134,14 +136,14 @@ def test_too_little_tells_nothing():
 @pytest.mark.parametrize("cut", [1, 90])
 def test_a_restored_fan_goes_on_the_same(given, cut):
     rows = list(zip(*drive(2, 270, 150, bias=0.05), strict=True))
-    whole = Fan(SIZE, given)
+    whole = SectorFan(SIZE, given)
     for k, row in enumerate(rows):
         whole.append(*row)
         if k % 16 == 0:
             whole.estimate()
         if k == cut:
             kept = {name: array.copy() for name, array in whole.arrays().items()}
-    again = Fan(SIZE, given)
+    again = SectorFan(SIZE, given)
     for row in rows[:7]:  # what it held before gives way
         again.append(*row)
     again.restore(kept)
@@ -149,7 +151,7 @@ def test_a_restored_fan_goes_on_the_same(given, cut):
         again.append(*row)
         if k % 16 == 0:
             again.estimate()
-    assert again.estimate() == whole.estimate() != NOTHING
+    assert again.estimate() == whole.estimate() != NO_ESTIMATE
     assert again.angle == whole.angle != 0
     assert all(np.array_equal(again.arrays()[name], rows) for name, rows in whole.arrays().items())
 
@@ -157,5 +159,5 @@ def test_a_restored_fan_goes_on_the_same(given, cut):
 def test_a_bias_seen_in_one_stretch_only_is_no_fault():
     view, turn, length = drive(0, 180, 480)
     view[:445] = 0.5  # nothing in reach, say
-    told = shown(Fan(SIZE, np.radians(10)), view, turn, length).estimate()
+    told = shown(SectorFan(SIZE, np.radians(10)), view, turn, length).estimate()
     assert told.error > 0  # unsure or endlessly so, but a number

@@ -170,7 +170,7 @@ def test_a_kidnapped_robot_knows_that_it_is_lost_and_then_where_it_is():
     assert not lost[-60:].any()
 
 
-def test_a_run_can_be_undone():
+def test_a_closure_sequence_can_be_undone():
     log = golden("a_square3")
     session = mapped(log)
     frames = session.map
@@ -179,7 +179,7 @@ def test_a_run_can_be_undone():
     frames.undo(int(accepted[0]))
     assert len(frames.closures()) < len(before)
     assert not np.array_equal(frames.trajectory(), path)
-    with pytest.raises(ValueError, match="not an accepted run"):
+    with pytest.raises(ValueError, match="not an accepted closure sequence"):
         frames.undo(int(accepted[0]))
     for run in accepted[1:]:
         frames.undo(int(run))

@@ -82,7 +82,7 @@ def way(seed: int, dead: Sequence[int] = (), **simulation: Any) -> Way:
 def follow(session: Session, felt: Sequence[Observation]) -> Mapped:
     for _ in session.replay(felt):
         pass
-    settled = session.map._settle()
+    settled = session.map.solution()
     first = np.searchsorted(session.map.arrays()["step_frame"], np.arange(len(settled.cut.rows)))
     cuts = first[settled.cut.rows >= 0].tolist()
     return Mapped(session.map.trajectory(), session.map.closures(), cuts)
@@ -166,7 +166,7 @@ def test_a_session_that_feels_as_recall_remembers() -> None:
     """What the map learns from are the very levels that the kernel compares."""
     made, session = way(1, dead=(4,)), fresh()
     follow(session, made.felt)
-    level = session.map.arrays()["looks/level"]
+    level = session.map.arrays()["appearance/level"]
     assert np.array_equal(np.asarray(session.state.memory.view)[:, : len(level)].T, level)
 
 
@@ -291,11 +291,11 @@ def test_a_map_with_cuts_goes_on_as_if_never_stopped(stop: int) -> None:
     assert all(np.array_equal(again[name], whole[name], equal_nan=True) for name in whole)
 
 
-def test_a_run_that_is_undone_stays_undone() -> None:
+def test_an_undone_closure_sequence_stays_undone() -> None:
     made, session = way(2), fresh()
     follow(session, made.felt[:200])
     frames = session.map
-    before = frames._ledger.table()
+    before = frames.candidates()
     runs = np.unique(before[before[:, 7] == Verdict.ACCEPTED, 5]).astype(int)
     run = int(runs[0])
     frames.undo(run)
@@ -306,7 +306,7 @@ def test_a_run_that_is_undone_stays_undone() -> None:
         first = np.searchsorted(frames.arrays()["step_frame"], table[table[:, 5] == run, :2])
         joined = set(map(tuple, frames.closures().tolist()))
         assert not joined & set(map(tuple, first.tolist()))
-    with pytest.raises(ValueError, match="not an accepted run"):
+    with pytest.raises(ValueError, match="not an accepted closure sequence"):
         frames.undo(run)
 
 

@@ -15,9 +15,19 @@ from hypothesis import strategies as st
 from ratslam.backends.config import RecallBackendConfig
 from ratslam.backends.recall import RecallBackend
 from ratslam.core.session import Session
-from ratslam.recall import filter, observation_model
-from ratslam.recall.filter import BASIN, FACING, SAMPLES, SUPPORT, MapFeedback, RecallConfig
-from ratslam.recall.observation_model import LABEL_TEMPER, LABELS
+from ratslam.recall import observation_model
+from ratslam.recall.config import RecallConfig
+from ratslam.recall.filter import BASIN, FACING, recognise
+from ratslam.recall.memory import (
+    MapFeedback,
+    accumulate_motion,
+    apply_map_feedback,
+    current_pose,
+    init_memory,
+    store_keyframe,
+)
+from ratslam.recall.observation_model import LABEL_TEMPER, LABELS, SAMPLES, ObservationLikelihood
+from ratslam.recall.transition import SUPPORT
 from tactile.base.se2 import between, compose, wrap
 from tactile.base.types import Odometry, observation
 
@@ -50,13 +60,13 @@ def filled(
     store[:, :count] = views.T
     ids = np.full(capacity, -1, np.int32)
     ids[:count] = -1 if labels is None else labels
-    memory = filter.start(config, views.shape[1], capacity, np.dtype(dtype))._replace(
+    memory = init_memory(config, views.shape[1], capacity, np.dtype(dtype))._replace(
         view=jnp.asarray(store, dtype),
         label=jnp.asarray(ids),
         count=jnp.int32(count),
         distinct=jnp.int32(len(set(ids[ids >= 0].tolist()))),
     )
-    return filter.apply_map_feedback(memory, MapFeedback(poses, bias, since, angle, scale))
+    return apply_map_feedback(memory, MapFeedback(poses, bias, since, angle, scale))
 
 
 def believing(memory, frames, masses, offsets=None):
@@ -75,7 +85,7 @@ def believing(memory, frames, masses, offsets=None):
 @cache
 def looker(config, cell=CELL):
     return jax.jit(
-        lambda memory, view: filter.look(
+        lambda memory, view: recognise(
             config, cell, memory, observation_model.view_likelihood(config, cell, memory, view)
         )
     )
@@ -85,7 +95,7 @@ def looker(config, cell=CELL):
 def labelled(config):
     def read(memory, label):
         weighed = observation_model.label_likelihood(config, memory, label)
-        return *filter.look(config, CELL, memory, weighed), weighed
+        return *recognise(config, CELL, memory, weighed), weighed
 
     return jax.jit(read)
 
@@ -117,8 +127,8 @@ def random_case(seed, config=FAN, angle=ANGLE, dtype=float):
     masses = stream.dirichlet(np.full(config.modes + 1, 0.7))[:-1]
     frames = stream.integers(0, count - GUARD, config.modes)
     memory = believing(memory, frames, masses, stream.normal(0, 0.5 * CELL, (config.modes, 3)) * [1, 1, 4])
-    memory = filter.travel(memory, jnp.asarray(stream.normal(0, [CELL, 0.2 * CELL, 0.1]), dtype))
-    memory = filter.travel(memory, jnp.asarray(stream.normal(0, [CELL, 0.2 * CELL, 0.1]), dtype))
+    memory = accumulate_motion(memory, jnp.asarray(stream.normal(0, [CELL, 0.2 * CELL, 0.1]), dtype))
+    memory = accumulate_motion(memory, jnp.asarray(stream.normal(0, [CELL, 0.2 * CELL, 0.1]), dtype))
     near = np.roll(views[frames[int(masses.argmax())]], int(stream.choice([-2, -1, 0, 0, 0, 1, 2])))
     return memory, np.clip(0.6 * near + 0.4 * stream.random(SIZE), 0, 1)
 
@@ -317,7 +327,7 @@ def test_single_precision_has_no_nan(stored, scale):
     memory = believing(memory, [3, 20], [0.7, 0.3])
     for value in (0.0, 0.5, 1.0, None, 1.0, 0.0):
         seen = stream.random(SIZE) if value is None else np.full(SIZE, value)
-        memory = filter.travel(memory, jnp.asarray([0.5 * CELL, 0, 0.01], jnp.float32))
+        memory = accumulate_motion(memory, jnp.asarray([0.5 * CELL, 0, 0.01], jnp.float32))
         after, found = look(FAN, memory, seen)
         told = found._replace(background=np.zeros(0))  # there NaN says none
         assert not any(np.isnan(leaf).any() for leaf in [*after, *told])
@@ -377,7 +387,7 @@ def test_where_the_map_lies_does_not_matter():
         frames = np.stack([memory.x, memory.y, np.arctan2(memory.sine, memory.cosine)], axis=1)
         poses = compose(elsewhere, frames[: int(memory.count)])
         told = (float(memory.bias), float(memory.since), float(memory.angle), float(memory.scale))
-        moved = filter.apply_map_feedback(memory, MapFeedback(poses, *told))
+        moved = apply_map_feedback(memory, MapFeedback(poses, *told))
         moved = moved._replace(pose=jnp.asarray(compose(elsewhere, memory.pose)))
         found, there = look(FAN, memory, view)[1], look(FAN, moved, view)[1]
         for name in found._fields:
@@ -431,7 +441,7 @@ def test_a_turned_hypothesis_moves_the_way_it_faces():
     views[13] = views[12]  # the view alone cannot tell these two
     memory = filled(FAN, views, poses, angle=ANGLE, scale=0.02)
     after, _ = look(FAN, memory, seen(11, robot))
-    memory = filter.travel(jax.tree.map(jnp.asarray, after), jnp.asarray([3 * CELL, 0, 0.0]))
+    memory = accumulate_motion(jax.tree.map(jnp.asarray, after), jnp.asarray([3 * CELL, 0, 0.0]))
     _, found = look(FAN, memory, views[12])
     assert found.match == 12
     assert found.shift == 0
@@ -483,8 +493,8 @@ def test_without_a_scale_nothing_is_recalled_but_all_is_remembered():
     assert found.frame == 40
     assert look(FAN, memory._replace(scale=jnp.asarray(0.1)), views[7])[1].match == 7
 
-    memory = filter.travel(jax.tree.map(jnp.asarray, after), jnp.asarray([CELL, 0.0, 0.5]))
-    memory = filter.remember(memory, jnp.asarray(views[7]), jnp.int32(5), jnp.asarray([1.0, 2.0, 3.0]))
+    memory = accumulate_motion(jax.tree.map(jnp.asarray, after), jnp.asarray([CELL, 0.0, 0.5]))
+    memory = store_keyframe(memory, jnp.asarray(views[7]), jnp.int32(5), jnp.asarray([1.0, 2.0, 3.0]))
     assert int(memory.count) == 41
     assert np.array_equal(memory.view[:, 40], views[7])
     assert np.array_equal(memory.packet[40], [1, 2, 3])
@@ -556,11 +566,11 @@ def test_a_contradicting_view_takes_mass_away():
 def test_odometry_alone_is_never_evidence():
     # A straight way driven twice: odometry follows the first drive perfectly, yet nothing is seen.
     memory = filled(FLAT, np.zeros((40, SIZE)), spaced(40, 0.5), scale=0.1)
-    blank = filter.ObservationLikelihood(
+    blank = ObservationLikelihood(
         likelihood=jnp.ones((1, CAPACITY)), novelty=jnp.ones(()), background=jnp.full(SAMPLES, jnp.nan),
         certain=jnp.bool_(True), telling=jnp.bool_(False),
     )  # fmt: skip
-    blind = jax.jit(partial(filter.look, FLAT, CELL))
+    blind = jax.jit(partial(recognise, FLAT, CELL))
     # A view that all frames share: by views, too, nothing is told.
     same = np.full(SIZE, FLAT.floor * 0.1)
     for sure in (0.0, 0.3, 1.0):
@@ -570,11 +580,9 @@ def test_odometry_alone_is_never_evidence():
             belief, limit = start, sure
             for _ in range(20):
                 limit = limit * (1 - FLAT.leave) + (1 - limit) * FLAT.enter
-                belief = filter.travel(belief, jnp.asarray([0.5 * CELL, 0.0, 0.0]))
+                belief = accumulate_motion(belief, jnp.asarray([0.5 * CELL, 0.0, 0.0]))
                 belief, _ = looker(FLAT)(belief, jnp.asarray(same)) if seeing else blind(belief, blank)
-                belief = belief._replace(
-                    pose=filter.present(belief), motion=jnp.zeros(3), length=jnp.zeros(())
-                )
+                belief = belief._replace(pose=current_pose(belief), motion=jnp.zeros(3), length=jnp.zeros(()))
                 assert float(belief.mass.sum()) <= limit + 1e-9
             # Neither is it evidence against: what was believed is still there.
             assert seeing or float(belief.mass.sum()) > 0.5 * limit
@@ -583,8 +591,8 @@ def test_odometry_alone_is_never_evidence():
 def test_a_hypothesis_that_comes_to_no_frame_is_lost():
     memory = believing(filled(FLAT, np.zeros((40, SIZE)), spaced(40, 1.0), scale=0.1), [9], [1.0])
     view = np.full(SIZE, FLAT.floor * 0.1)
-    on_way = filter.travel(memory, jnp.asarray([CELL, 0.0, 0.0]))
-    aside = filter.travel(memory, jnp.asarray([0.0, 4 * CELL, 0.0]))
+    on_way = accumulate_motion(memory, jnp.asarray([CELL, 0.0, 0.0]))
+    aside = accumulate_motion(memory, jnp.asarray([0.0, 4 * CELL, 0.0]))
     assert look(FLAT, on_way, view)[1].novel < 0.05
     assert look(FLAT, aside, view)[1].novel == pytest.approx(1, abs=1e-9)
 
@@ -643,7 +651,7 @@ def test_an_id_is_new_once():
     memory = filled(FLAT, np.zeros((2, 0)), spaced(2), labels=[4, 4])
     given_then = [(9, 2), (9, 2), (-1, 2), (4, 2), (0, 3)]
     for label, distinct in given_then:
-        memory = filter.remember(memory, jnp.zeros(0), jnp.int32(label), jnp.zeros(3))
+        memory = store_keyframe(memory, jnp.zeros(0), jnp.int32(label), jnp.zeros(3))
         assert int(memory.distinct) == distinct
 
 

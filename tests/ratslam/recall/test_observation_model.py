@@ -12,9 +12,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ratslam.recall import filter
-from ratslam.recall.filter import FOLLOWERS, SUPPORT, MapFeedback, RecallConfig
+from ratslam.recall.config import RecallConfig, sector_shifts
+from ratslam.recall.filter import recognise
+from ratslam.recall.memory import (
+    MapFeedback,
+    accumulate_motion,
+    apply_map_feedback,
+    init_memory,
+    store_keyframe,
+)
 from ratslam.recall.observation_model import STEPS, touch_likelihood
+from ratslam.recall.transition import FOLLOWERS, SUPPORT, follow_keyframes
 from ratslam.recall.whisker_likelihood import (
     DEAD,
     HEIGHTS,
@@ -54,11 +62,11 @@ def known(images):
 def filled(config, images, poses, likeness, *, scale=NEVER, dtype=float):
     """A memory of frames [N, D] at poses [N, 3]; the robot stands at the newest, everything is new."""
     count = len(poses)
-    memory = filter.start(config, SIZE, CAPACITY, np.dtype(dtype), len(likeness))
+    memory = init_memory(config, SIZE, CAPACITY, np.dtype(dtype), len(likeness))
     store = np.zeros((SIZE, CAPACITY), np.int32)
     store[:, :count] = images.T
     memory = memory._replace(view=jnp.asarray(store), count=jnp.int32(count))
-    return filter.apply_map_feedback(memory, MapFeedback(poses, 0.0, 0.0, np.pi, scale, likeness))
+    return apply_map_feedback(memory, MapFeedback(poses, 0.0, 0.0, np.pi, scale, likeness))
 
 
 def spaced(count, cells=4.0):
@@ -75,7 +83,7 @@ def random_case(seed, config=BOTH):
     images = felt(stream, count, dead=0.05)
     memory = filled(config, images, poses, known(images))
     old = max(count - GUARD, 0)
-    rows = len(filter.offsets(config))
+    rows = len(sector_shifts(config))
     before, rest = np.zeros((2, rows, CAPACITY))
     before[:, :old] = stream.exponential(1, (rows, old))
     before[:, CAPACITY // 3] = 0.0
@@ -87,7 +95,7 @@ def random_case(seed, config=BOTH):
         anchor=jnp.asarray(stream.integers(0, max(old, 1), config.modes), jnp.int32),
         offset=jnp.asarray(offset),
     )  # fmt: skip
-    memory = filter.travel(memory, jnp.asarray(stream.normal(0, [CELL, 0.2 * CELL, 0.1])))
+    memory = accumulate_motion(memory, jnp.asarray(stream.normal(0, [CELL, 0.2 * CELL, 0.1])))
     near = images[stream.integers(0, max(old, 1))]
     return memory, np.where(stream.random(SIZE) < 0.7, near, felt(stream, 1)[0])
 
@@ -101,7 +109,7 @@ def weigher(config):
 def looker(config):
     def look(memory, level):
         memory, weighing = touch_likelihood(config, memory, level, PIXELS)
-        return filter.look(config, CELL, memory, weighing)
+        return recognise(config, CELL, memory, weighing)
 
     return jax.jit(look)
 
@@ -193,10 +201,10 @@ def test_an_image_weighs_what_loops_find(config, seed):
 def test_what_is_left_of_belief_follows_the_frames(config, seed):
     memory, _ = random_case(seed, config)
     m = host(memory)
-    shifts = filter.offsets(config)
+    shifts = sector_shifts(config)
     cells = np.ones((len(shifts), 1)) * (np.arange(CAPACITY) < int(m.count) - GUARD)
     angles = jnp.asarray(-shifts * np.pi)
-    belief, novel = filter._followed(config, CELL, memory, angles, jnp.asarray(cells), memory.motion)
+    belief, novel = follow_keyframes(config, CELL, memory, angles, jnp.asarray(cells), memory.motion)
     expected, lost = followed_by_loops(config, m)
     assert np.allclose(belief, expected, atol=1e-12)
     assert float(novel) == pytest.approx(lost, abs=1e-12)
@@ -241,21 +249,19 @@ def test_mass_is_conserved_along_a_way(config, dtype):
     lap = felt(stream, 20)
     turn, tolerance = 2 * np.pi / 20, 1e-9 if dtype is float else 1e-4
     likeness = known(felt(stream, 200))
-    memory = filter.start(config, SIZE, CAPACITY, np.dtype(dtype), len(likeness))
-    memory = filter.apply_map_feedback(
-        memory, MapFeedback(np.zeros((1, 3)), 0.0, 0.0, np.pi, NEVER, likeness)
-    )
+    memory = init_memory(config, SIZE, CAPACITY, np.dtype(dtype), len(likeness))
+    memory = apply_map_feedback(memory, MapFeedback(np.zeros((1, 3)), 0.0, 0.0, np.pi, NEVER, likeness))
     again = []
     for k in range(60):
         level = np.where(stream.random(SIZE) < 0.9, lap[k % 20], felt(stream, 1)[0])
-        memory = filter.travel(memory, jnp.asarray([0.6 * CELL, 0.0, turn], memory.x.dtype))
+        memory = accumulate_motion(memory, jnp.asarray([0.6 * CELL, 0.0, turn], memory.x.dtype))
         after, found = look(config, memory, level)
         assert not any(np.isnan(leaf).any() for leaf in [*after, *found[:-1]])
         assert {leaf.dtype for leaf in [*after, *found]} == {np.dtype(dtype), np.dtype(np.int32)}
         total = after.mass.sum() + after.rest.sum() + found.novel
         assert total == pytest.approx(1, abs=tolerance)
         again.append(found.match >= 0 and (k - found.match) % 20 == 0 and found.mass > 0.1)
-        memory = filter.remember(
+        memory = store_keyframe(
             jax.tree.map(jnp.asarray, after), jnp.asarray(level, jnp.int32), jnp.int32(-1),
             jnp.zeros(3, memory.x.dtype),
         )  # fmt: skip
@@ -345,12 +351,12 @@ def test_nothing_is_certain_before_anything_is_known(config):
 
 def test_room_is_made_for_what_whiskers_need():
     for config, rows in ((BOTH, 2), (AHEAD, 1)):
-        memory = filter.start(config, SIZE, CAPACITY, np.dtype(float), 3)
+        memory = init_memory(config, SIZE, CAPACITY, np.dtype(float), 3)
         assert memory.before.shape == memory.rest.shape == (rows, CAPACITY)
         assert memory.likeness.shape == (3, LEVELS, LEVELS)
         assert memory.view.dtype == np.int32
     for fan in ("auto", "none", 1.0):
-        memory = filter.start(RecallConfig(sector_fov=fan), SIZE, CAPACITY, np.dtype(float))
+        memory = init_memory(RecallConfig(sector_fov=fan), SIZE, CAPACITY, np.dtype(float))
         assert memory.before.size == memory.rest.size == memory.likeness.size == 0
 
 
@@ -381,10 +387,10 @@ def test_belief_goes_on_the_way_the_head_faces(turned):
     rest = np.zeros((2, CAPACITY))
     rest[int(turned), 20] = 0.5
     memory = memory._replace(rest=jnp.asarray(rest))
-    memory = filter.travel(memory, jnp.asarray([CELL, 0.0, 0.0]))
+    memory = accumulate_motion(memory, jnp.asarray([CELL, 0.0, 0.0]))
     shifts = jnp.asarray([0.0, -np.pi])
     cells = jnp.asarray(np.ones((2, CAPACITY)))
-    belief, _ = filter._followed(BOTH, CELL, memory, shifts, cells, memory.motion)
+    belief, _ = follow_keyframes(BOTH, CELL, memory, shifts, cells, memory.motion)
     assert np.unravel_index(np.argmax(belief), belief.shape) == (int(turned), 19 if turned else 21)
 
 

@@ -1,0 +1,144 @@
+"""The keyframes' poses and odometry, and the least-squares problem that joins them to the loop closures."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ratslam.core.growable_array import GrowableArray
+from ratslam.keyframes.ablation import Ablation
+from ratslam.keyframes.appearance import Appearance
+from ratslam.keyframes.config import KeyframeMapConfig
+from ratslam.keyframes.loop_closures import ClosureLog
+from ratslam.keyframes.optimizer import (
+    BiasPrior,
+    LoopClosures,
+    MapFit,
+    OdometryChain,
+    relative_covariance,
+    solve,
+)
+from ratslam.pose_graph import Edges
+from tactile.base.se2 import compose, correct_heading_bias, fit_rigid_motion
+
+LOOSE = 1e4
+"""Standard deviation of odometry across a break, cells and rad."""
+NO_ROBUST_SCALE = 1e12
+"""Robust scale at which no closure sequence loses weight."""
+
+
+class KeyframeGraph:
+    """Keyframes as a chain of odometry with breaks, and the heading bias of the odometry.
+
+    Args:
+        cell: size of a pose cell, m. appearance: of the keyframes. guard: newest keyframes that are never
+            recalled.
+
+    Attributes:
+        pose: [N, 3] in the map, m, m, rad. motion: [N, 3] odometry into each keyframe. length: [N] distance
+            travelled into it, m. turn: [N] sum of absolute turns into it, rad. cut: [N] the closure sequence
+            that shows a break of the odometry before the keyframe, -1 for none. bias: heading bias of the
+            odometry, rad/m. prior: of the bias.
+    """
+
+    def __init__(
+        self, config: KeyframeMapConfig, cell: float, appearance: Appearance, guard: int, ablation: Ablation
+    ) -> None:
+        self.config, self.cell, self.guard, self.ablation = config, cell, guard, ablation
+        self.appearance = appearance
+        self.pose = GrowableArray((3,), np.float64)
+        self.motion = GrowableArray((3,), np.float64)
+        self.length = GrowableArray((), np.float64)
+        self.turn = GrowableArray((), np.float64)
+        self.cut = GrowableArray((), np.int64)
+        self.bias = 0.0
+        self.prior = BiasPrior(0.0, config.bias_sd / cell)
+
+    @property
+    def count(self) -> int:
+        """Number of keyframes."""
+        return len(self.pose.rows)
+
+    @property
+    def sector_angle(self) -> float:
+        """Turn per sector shift of a view, rad; 0 while unknown."""
+        return self.appearance.measure().angle
+
+    def append(self, pose: np.ndarray, motion: np.ndarray, length: float, turn: float) -> None:
+        """Adds a keyframe at `pose` [3], reached by `motion` [3]."""
+        self.pose.append(pose)
+        self.motion.append(motion)
+        self.length.append(length)
+        self.turn.append(turn)
+        self.cut.append(-1)
+
+    def dead_reckon(self) -> None:
+        """Replaces all poses by odometry corrected by the current bias."""
+        motion = correct_heading_bias(self.motion.rows, self.length.rows, self.bias)
+        for k in range(1, len(motion)):
+            self.pose.rows[k] = compose(self.pose.rows[k - 1], motion[k])
+
+    def move_to(self, fit: MapFit) -> None:
+        """Takes over a fit, moved as a whole so that the keyframes move as little as possible."""
+        before = self.pose.rows.copy()
+        self.pose.rows[:] = compose(fit_rigid_motion(fit.poses, before), fit.poses)
+        self.bias = fit.bias
+
+    def fit(self) -> MapFit:
+        """The current poses (not copied) and bias."""
+        return MapFit(self.pose.rows, self.bias, np.zeros(0))
+
+    def bias_prior(self) -> BiasPrior:
+        """Prior of the heading bias in the optimisation."""
+        return self.prior if self.ablation.heading_bias else BiasPrior(self.bias, 1e-9)
+
+    def odometry(self, cut: GrowableArray) -> OdometryChain:
+        """The odometry between keyframes with its variances, loose at the breaks `cut`."""
+        noise, cell = self.config.noise, self.cell
+        length, turn, severed = self.length.rows[1:], self.turn.rows[1:], cut.rows[1:] >= 0
+        along = noise.per_cell**2 * length * cell + (noise.least * cell) ** 2
+        heading = noise.heading_per_cell**2 * length / cell + noise.heading_per_radian**2 * turn
+        heading = heading + noise.least_heading**2
+        variance = np.stack([along, along, heading], axis=1)
+        loose = np.array([LOOSE * cell, LOOSE * cell, LOOSE]) ** 2
+        return OdometryChain(self.motion.rows[1:], length, np.where(severed[:, None], loose, variance))
+
+    def closures(self, log: ClosureLog) -> LoopClosures:
+        """The accepted loop closures with their variances and robust scales."""
+        config = self.config
+        spread = config.closure_sd * self.cell
+        variance = np.array([spread**2, spread**2, config.closure_heading**2])
+        scales = (config.robust_per_score, config.robust_least, config.robust_most)
+        closures = log.closures(self.sector_angle, variance, scales)
+        if config.select_every:
+            worth = (
+                2 * np.maximum(closures.score - config.sequence_cost, 1.0) / np.bincount(closures.sequence)
+            )
+            # A sequence must be able to cost more than its evidence, else it could never be refused.
+            return closures._replace(scale=worth, stray=np.maximum(config.closure_cost_limit, 1.5 * worth))
+        if not self.ablation.robust:
+            return closures._replace(scale=np.full_like(closures.scale, NO_ROBUST_SCALE))
+        return closures
+
+    def solve(self, log: ClosureLog, iterations: int) -> MapFit:
+        """The optimised map, from the current poses."""
+        chain, closures = self.odometry(self.cut), self.closures(log)
+        return solve(self.pose.rows, self.bias, chain, closures, self.bias_prior(), iterations)
+
+    def relative_covariance(self, log: ClosureLog, i: int, j: int, turn: float) -> np.ndarray:
+        """[3, 3] covariance of keyframe j in the frame of keyframe i turned by `turn`."""
+        chain, closures = self.odometry(self.cut), self.closures(log)
+        return relative_covariance(self.fit(), chain, closures, self.bias_prior(), i, j, turn)
+
+    def edges(self, fit: MapFit, log: ClosureLog, cut: GrowableArray) -> Edges:
+        """Edges of a solution: odometry corrected by its bias, and closures with their robust weights."""
+        chain, closures = self.odometry(cut), self.closures(log)
+        steps = np.arange(len(chain.length))
+        zero = np.zeros(len(closures.i))
+        turned = np.stack([zero, zero, closures.turn], axis=1)
+        trust = log.weights()[:, None] / closures.variance
+        return Edges(
+            np.concatenate([steps, closures.i]),
+            np.concatenate([steps + 1, closures.j]),
+            np.concatenate([correct_heading_bias(chain.motion, chain.length, fit.bias), turned]),
+            np.concatenate([1 / chain.variance, trust]),
+        )

@@ -1,0 +1,90 @@
+"""The final map: the optimised poses, the closure sequences selected, and the odometry breaks."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from ratslam.core.growable_array import GrowableArray
+from ratslam.keyframes.closure_selection import (
+    FINE,
+    KEPT,
+    STEPS,
+    Selection,
+    SelectionProblem,
+    select_closures,
+)
+from ratslam.keyframes.keyframe_graph import KeyframeGraph
+from ratslam.keyframes.loop_closures import ClosureLog, Verdict
+from ratslam.keyframes.odometry_breaks import find_break
+from ratslam.keyframes.optimizer import MapFit, solve
+from tactile.base.se2 import correct_heading_bias, integrate
+
+
+class MapSolution(NamedTuple):
+    """Optimised poses and bias, the closure log with its verdicts, and the odometry breaks ([N]
+    sequences)."""
+
+    fit: MapFit
+    log: ClosureLog
+    cut: GrowableArray
+
+
+def final_solution(graph: KeyframeGraph, log: ClosureLog, closures: bool) -> MapSolution:
+    """The map as it would be if the session ended now.
+
+    Args:
+        closures: False for odometry alone.
+    """
+    solution = selected_solution(graph, log) if graph.config.select_every and closures else None
+    if solution is not None:
+        return solution
+    fit = MapFit(graph.pose.rows.copy(), graph.bias, np.zeros(0))
+    fit = graph.solve(log, graph.config.settling) if len(log.accepted()) else fit
+    return MapSolution(fit, log, graph.cut)
+
+
+def selected_solution(graph: KeyframeGraph, log: ClosureLog) -> MapSolution | None:
+    """The map with the closure sequences that are best accepted together; None where none has evidence."""
+    config, log, cut = graph.config, deepcopy(log), deepcopy(graph.cut)
+    candidates = (log.scores() >= config.select_score) & (log.sizes() >= config.select_length)
+    candidates &= log.verdicts() != Verdict.UNDONE
+    if not candidates.any():
+        return None
+    sequences = np.flatnonzero(candidates)
+    broken = np.flatnonzero(np.isin(cut.rows, sequences))
+    earlier = tuple((frame, int(np.searchsorted(sequences, cut.rows[frame]))) for frame in broken.tolist())
+    cut.rows[:] = -1
+    for sequence in np.flatnonzero(log.verdicts() != Verdict.UNDONE).tolist():
+        log.judge(sequence, Verdict.ACCEPTED if candidates[sequence] else Verdict.OPEN)
+    selection = _select(graph, log, cut, sequences, earlier)
+    for sequence, weight in zip(sequences.tolist(), selection.fit.weights.tolist(), strict=True):
+        log.judge(sequence, Verdict.ACCEPTED if weight > KEPT else Verdict.OPEN)
+    for frame, sequence in selection.cuts:
+        cut.rows[frame] = sequences[sequence]
+    # Solved once more without the refused sequences, which removes their remaining pull.
+    chain, closures = graph.odometry(cut), graph.closures(log)
+    fit = solve(*selection.fit[:2], chain, closures, graph.bias_prior(), STEPS, FINE)
+    log.weigh(fit.weights)
+    return MapSolution(fit, log, cut)
+
+
+def _select(
+    graph: KeyframeGraph,
+    log: ClosureLog,
+    cut: GrowableArray,
+    sequences: np.ndarray,
+    earlier: tuple[tuple[int, int], ...],
+) -> Selection:
+    """Selects among the sequences `sequences`, starting from the current map and from dead reckoning."""
+    chain, closures, pose = graph.odometry(cut), graph.closures(log), graph.pose.rows
+    path = integrate(correct_heading_bias(chain.motion, chain.length, graph.prior.mean), pose[0])
+    reckoned = MapFit(np.concatenate([pose[:1], path]), graph.prior.mean, np.zeros(0))
+    present = MapFit(pose.copy(), graph.bias, np.zeros(0))
+    case = SelectionProblem(
+        chain, closures, graph.bias_prior(), log.scores()[sequences], *log.spans()[sequences].T
+    )
+    return select_closures(case, [present, reckoned], partial(find_break, graph), earlier)

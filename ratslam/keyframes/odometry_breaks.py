@@ -1,0 +1,69 @@
+"""Where the odometry broke, because the robot was carried away: found from the views, and mended by a
+closure."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ratslam.keyframes.keyframe_graph import KeyframeGraph
+from ratslam.keyframes.loop_closures import ClosureLog, Verdict
+from ratslam.keyframes.verification import turned
+from tactile.base.se2 import compose, inverse
+
+SEARCH = 400
+"""Number of keyframes among which a break is searched."""
+
+
+def break_odometry(graph: KeyframeGraph, log: ClosureLog, sequence: int) -> None:
+    """Cuts the odometry where the views show the break, and joins the parts by the sequence."""
+    members, pose = log.members(sequence), graph.pose.rows
+    middle = members[len(members) // 2]
+    found = turned(pose[middle[1]], -middle[2] * graph.sector_angle)
+    carried = compose(found, inverse(pose[middle[0]]))
+    at = _first_carried(graph, log, carried, int(members[0, 0]))
+    graph.cut.rows[at] = sequence
+    pose[at:] = compose(carried, pose[at:])
+    log.strike(at, sequence)
+    log.judge(sequence, Verdict.ACCEPTED)
+
+
+def find_break(
+    graph: KeyframeGraph, poses: np.ndarray, onwards: np.ndarray, carried: np.ndarray, since: int
+) -> int:
+    """The keyframe before which the odometry is cut; see `closure_selection.Where`."""
+    frames = np.arange(since + 1, since + 1 + len(onwards))[-SEARCH:]
+    return _turning_point(graph, frames, poses, onwards[-SEARCH:], carried)
+
+
+def _first_carried(graph: KeyframeGraph, log: ClosureLog, carried: np.ndarray, first: int) -> int:
+    """The first keyframe whose views fit better at the poses moved by `carried` [3]."""
+    anchored = log.table()[log.accepted(), 0]
+    since = int(anchored[anchored < first].max(initial=0)) - graph.config.max_gap
+    frames = np.arange(max(since, first - SEARCH, 1), first + 1)
+    return _turning_point(graph, frames, graph.pose.rows, graph.pose.rows[frames], carried)
+
+
+def _turning_point(
+    graph: KeyframeGraph, frames: np.ndarray, poses: np.ndarray, onwards: np.ndarray, carried: np.ndarray
+) -> int:
+    """The keyframe of `frames` [n] from which views fit better at the carried poses than at the odometry's.
+
+    Args:
+        poses: [N, 3] of older keyframes. onwards: [n, 3] poses of `frames` by odometry.
+    """
+    stays, goes = (
+        np.array(
+            [_misfit(graph, frame, pose, poses) for frame, pose in zip(frames.tolist(), rows, strict=True)]
+        )
+        for rows in (onwards, compose(carried, onwards))
+    )
+    # With a break before frames[k], those before k stay and the others are carried.
+    cost = np.concatenate([[0], np.cumsum(stays)[:-1]]) + np.cumsum(goes[::-1])[::-1]
+    return int(frames[len(cost) - 1 - np.argmin(cost[::-1])])
+
+
+def _misfit(graph: KeyframeGraph, frame: int, pose: np.ndarray, poses: np.ndarray) -> float:
+    """Misfit of a keyframe's view at `pose` [3] against the older keyframes near it, at poses [N, 3]."""
+    old = poses[: max(frame - graph.guard, 0)]
+    near = np.flatnonzero(np.hypot(*(old - pose)[:, :2].T) < 1.5 * graph.cell)
+    return graph.appearance.misfit(frame, near, np.cos(old[near, 2] - pose[2]) < 0)

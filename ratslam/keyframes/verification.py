@@ -1,0 +1,108 @@
+"""Tests of closure candidates: whether they continue a sequence, and whether a sequence fits the map."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ratslam.keyframes.keyframe_graph import KeyframeGraph
+from ratslam.keyframes.loop_closures import Candidate, ClosureLog
+from tactile.base.se2 import between, compose, wrap
+
+
+class SequenceTest(NamedTuple):
+    """Result of a test of a closure sequence against the map.
+
+    Attributes:
+        fits: it is accepted. distance: squared Mahalanobis distance of its newest candidate. breaks_odometry:
+            it contradicts the map and is so long that the odometry must be broken.
+    """
+
+    fits: bool
+    distance: float
+    breaks_odometry: bool
+
+
+def turned(pose: np.ndarray, angle: float) -> np.ndarray:
+    """The pose [3] turned on the spot by `angle`, rad."""
+    return compose(pose, np.array([0.0, 0.0, angle]))
+
+
+def continues_sequence(graph: KeyframeGraph, log: ClosureLog, candidate: Candidate) -> bool:
+    """Whether the candidate moved from the newest one by the same motion in memory as in odometry."""
+    last, config = log.last(), graph.config
+    if last is None or candidate.frame - last.frame > config.max_gap:
+        return False
+    remembered, travelled = _motions(graph, last, candidate)
+    apart = np.hypot(*(remembered - travelled)[:2])
+    allowed = config.agreement * graph.cell + 0.1 * np.hypot(*travelled[:2])
+    near = bool(apart < allowed and abs(wrap(remembered[2] - travelled[2])) < config.agreement_heading)
+    return near and _agrees_with_whole(graph, log, candidate)
+
+
+def verify_sequence(
+    graph: KeyframeGraph, log: ClosureLog, sequence: int, candidate: Candidate
+) -> SequenceTest | None:
+    """Tests a sequence whose newest member is `candidate`; None while its evidence is too small."""
+    config, score, length = graph.config, log.score(sequence), len(log.members(sequence))
+    if length < config.min_length or score < config.min_score:
+        return None
+    distance, chance = _distance(graph, log, candidate) if graph.ablation.verify else (0.0, 0.0)
+    fits = distance < config.max_distance and score - distance / 2 - chance >= config.min_score
+    broken = config.breaks and length >= config.break_length and score >= config.break_score
+    return SequenceTest(fits, distance, not fits and broken and distance >= config.max_distance)
+
+
+def _motions(graph: KeyframeGraph, first: Candidate, candidate: Candidate) -> tuple[np.ndarray, np.ndarray]:
+    """[3] motion from one candidate to a later one: between the remembered poses, and in the map."""
+    pose, angle = graph.pose.rows, graph.sector_angle
+    remembered = between(
+        turned(pose[first.match], -first.shift * angle),
+        turned(pose[candidate.match], -candidate.shift * angle),
+    )
+    return remembered, between(pose[first.frame], pose[candidate.frame])
+
+
+def _agrees_with_whole(graph: KeyframeGraph, log: ClosureLog, candidate: Candidate) -> bool:
+    """Whether the motion from the first member of the newest sequence agrees with odometry."""
+    config = graph.config
+    if not config.sequence_agreement:
+        return True
+    frame, match, shift, _ = log.members(log.sequences - 1)[0]
+    remembered, travelled = _motions(graph, Candidate(frame, match, shift, 0.0, 0.0), candidate)
+    allowed = config.agreement * graph.cell + config.sequence_agreement * np.hypot(*travelled[:2])
+    rotation = abs(wrap(remembered[2] - travelled[2]))
+    return bool(np.hypot(*(remembered - travelled)[:2]) < allowed and rotation < 2 * config.agreement_heading)
+
+
+def _distance(graph: KeyframeGraph, log: ClosureLog, candidate: Candidate) -> tuple[float, float]:
+    """Distance of the candidate's claim from the map.
+
+    Returns:
+        the squared Mahalanobis distance, and the log of the number of alternatives (`_alternatives`).
+    """
+    turn = -candidate.shift * graph.sector_angle
+    pose = graph.pose.rows
+    error = between(turned(pose[candidate.match], turn), pose[candidate.frame])
+    gate = graph.config.gate_sd * graph.cell
+    allowed = graph.relative_covariance(log, candidate.match, candidate.frame, turn)
+    least = np.diag([gate**2, gate**2, graph.config.gate_heading**2])
+    allowed = allowed + least
+    alternatives = _alternatives(graph, candidate, turn, allowed[:2, :2], gate)
+    return float(error @ np.linalg.solve(allowed, error)), float(alternatives)
+
+
+def _alternatives(
+    graph: KeyframeGraph, candidate: Candidate, turn: float, allowed: np.ndarray, gate: float
+) -> float:
+    """Log of the ratio of keyframes in the region that the map allows to those around one place."""
+    pose = graph.pose.rows
+    old = pose[: candidate.frame - graph.guard]
+    origin = turned(pose[candidate.match], turn)
+    centre = between(origin, pose[candidate.frame])[:2]
+    frames = between(origin, old)[:, :2]
+    apart = frames - centre
+    inside = np.exp(-np.einsum("na,ab,nb->n", apart, np.linalg.inv(allowed), apart) / 2).sum()
+    around = np.exp(-(frames**2).sum(axis=1) / (2 * gate**2)).sum()
+    return float(np.log(max(inside / max(around, 1.0), 1.0)))

@@ -1,0 +1,87 @@
+"""Settings of recall."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+
+from tactile.base.config import Settings
+
+Share = Annotated[float, Field(ge=0, le=1)]
+
+
+class RecallConfig(Settings):
+    """Settings of the recall filter. Lengths are in pose cells, so that one setting serves every robot.
+
+    A *scale* is the error below which views of different places seldom come (`MapFeedback.scale`).
+    """
+
+    sector_fov: Literal["auto", "none", "whiskers"] | float = "auto"
+    """Field of view, rad (counter-clockwise positive), of views that are ordered sectors, so that a turned
+    robot sees them shifted; `none`: not ordered; `whiskers`: rows of whiskers around the robot; `auto` (also
+    0): estimated from the session."""
+    shifts: NonNegativeInt = 3
+    """Largest sector shift in either direction. With whiskers, any value but 0 compares views turned by half
+    a turn too, where each whisker is compared with the opposite one."""
+    frame_distance: PositiveFloat = 0.3
+    """Distance after which a view becomes a keyframe, cells. A robot at rest stores nothing."""
+    frame_turn: PositiveFloat = 0.15
+    """Turn after which a view becomes a keyframe, rad."""
+    guard: PositiveInt = 20
+    """Number of newest keyframes that are not recalled, because the robot is still near them."""
+    sharpness: PositiveFloat = 0.2
+    """Error that divides the likelihood by e, in scales."""
+    floor: PositiveFloat = 1.27
+    """Error that stands for a view never seen before, in scales."""
+    common: NonNegativeFloat = 1.0
+    """Weight of the mean likelihood over all keyframes in the likelihood of novelty; with 1, a view that all
+    places share is no evidence."""
+    fresh: NonNegativeFloat = 0.3
+    """Weight of a view at `floor` in the likelihood of novelty."""
+    reach: PositiveFloat = 0.85
+    """Standard deviation of a keyframe's position relative to odometry, cells."""
+    reach_heading: PositiveFloat = 0.25
+    """Standard deviation of a keyframe's heading relative to odometry, rad."""
+    miss_weight: PositiveFloat = 0.02
+    """Weight of no keyframe being where odometry leads, relative to a keyframe exactly there."""
+    mode_decay: Share = 0.01
+    """Share of a mode's mass that is lost at every keyframe."""
+    enter: Share = 0.05
+    """Share of novelty that becomes new modes at every keyframe."""
+    local: Share = 0.3
+    """Share of `enter` placed around the map's pose; the rest is spread over all keyframes."""
+    local_sd: PositiveFloat = 1.0
+    """Standard deviation of the map's position after a closure, cells."""
+    local_rate: NonNegativeFloat = 0.05
+    """Growth of the position's standard deviation per metre travelled since, m."""
+    local_heading: PositiveFloat = 0.3
+    """Standard deviation of the map's heading after a closure, rad."""
+    local_heading_rate: NonNegativeFloat = 0.006
+    """Growth of the heading's standard deviation per cell travelled since, rad."""
+    temper: PositiveFloat = 0.25
+    """Whiskers: factor on the log-odds of an image, because pixels are not independent."""
+    familiar: Share = 0.8
+    """Whiskers: weight, in the likelihood of novelty, of the successors of keyframes that looked like the
+    previous image, relative to `floor`."""
+    energy: PositiveFloat = 3.0
+    """Activity injected into the pose cells for a candidate of posterior 1; the packet's activity is 1. With
+    less, two packets compete for longer, which takes time and gains nothing."""
+    modes: PositiveInt = 8
+    """Number of modes kept between keyframes; the mass of the others goes to novelty."""
+
+
+def sector_shifts(config: RecallConfig) -> np.ndarray:
+    """[S] sector shifts at which views are compared; whiskers: half turns."""
+    if config.sector_fov == "whiskers":
+        return np.arange(2 if config.shifts else 1, dtype=np.int32)
+    reach = 0 if config.sector_fov == "none" else config.shifts
+    return np.arange(-reach, reach + 1, dtype=np.int32)
+
+
+def fan_width(config: RecallConfig) -> float | None:
+    """Field of view of the sectors, rad; 0: to be estimated; None: the views are not ordered sectors."""
+    if isinstance(config.sector_fov, str):
+        return 0.0 if config.sector_fov == "auto" else None
+    return config.sector_fov

@@ -1,0 +1,195 @@
+"""The memory of recall: all keyframes, the modes of the posterior, and the map's feedback."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from ratslam.recall.config import RecallConfig, sector_shifts
+from ratslam.recall.whisker_likelihood import LEVELS
+from tactile.base.se2 import compose, correct_heading_bias
+from tactile.base.types import Array
+
+NO_LIKENESS = np.zeros((0, 0, 0))
+
+
+class MapFeedback(NamedTuple):
+    """What the filter takes over from the map.
+
+    Attributes:
+        poses: [N, 3] of all keyframes, m, m, rad. bias: heading bias, rad/m. since: distance travelled since
+            the last closure, m. angle: turn per sector shift, rad, 0 while unknown; whiskers: half a turn.
+            scale: view error below which different places seldom come; whiskers: log-odds that stand for an
+            image never seen before; 0 while unknown. likeness: [G, L, L] see `log_odds_table`; empty except
+            for whiskers.
+    """
+
+    poses: np.ndarray
+    bias: float
+    since: float
+    angle: float
+    scale: float
+    likeness: np.ndarray = NO_LIKENESS
+
+
+class Memory(NamedTuple):
+    """All keyframes, rows in order of time, and the posterior over them.
+
+    Attributes:
+        view: [D, C]; whiskers: levels, int32. label: [C] int32. packet: [C, 3] pose-cell packet when the
+            keyframe was taken, cells.
+        x, y, cosine, sine: [C] poses in the map. count, distinct: number of keyframes and of known labels,
+            int32.
+        anchor: [K] int32 keyframes of the modes, offset: [K, 3] pose of each mode in its keyframe's frame
+            (m, m, rad), mass: [K]. The missing mass to 1 is novelty.
+        pose: [3] of the newest keyframe. motion, length, turn: odometry since then: [3], m, rad.
+        bias, since, angle, scale, likeness: see `MapFeedback`.
+        before: [S, C] likelihoods of the previous image, rest: [S, C] posterior outside the modes; both for
+            whiskers only, else of size 0.
+    """
+
+    view: Array
+    label: Array
+    packet: Array
+    x: Array
+    y: Array
+    cosine: Array
+    sine: Array
+    count: Array
+    distinct: Array
+    anchor: Array
+    offset: Array
+    mass: Array
+    pose: Array
+    motion: Array
+    length: Array
+    turn: Array
+    bias: Array
+    since: Array
+    angle: Array
+    scale: Array
+    likeness: Array
+    before: Array
+    rest: Array
+
+
+def init_memory(config: RecallConfig, size: int, capacity: int, dtype: np.dtype, groups: int = 0) -> Memory:
+    """A memory without keyframes.
+
+    Args:
+        size: number of values of a view, D; 0 for recordings with given place ids. groups: number of whisker
+            groups, G, see `log_odds_table`.
+    """
+
+    def zeros(*shape: int) -> Array:  # one buffer each, because the session donates them
+        return jnp.zeros(shape, dtype)
+
+    touch = config.sector_fov == "whiskers"
+    return Memory(
+        view=jnp.zeros((size, capacity), jnp.int32) if touch else zeros(size, capacity),
+        label=jnp.full(capacity, -1, jnp.int32),
+        packet=zeros(capacity, 3),
+        x=zeros(capacity),
+        y=zeros(capacity),
+        cosine=zeros(capacity),
+        sine=zeros(capacity),
+        count=jnp.int32(0),
+        distinct=jnp.int32(0),
+        anchor=jnp.zeros(config.modes, jnp.int32),
+        offset=zeros(config.modes, 3),
+        mass=zeros(config.modes),
+        pose=zeros(3),
+        motion=zeros(3),
+        length=zeros(),
+        turn=zeros(),
+        bias=zeros(),
+        since=zeros(),
+        angle=zeros(),
+        scale=zeros(),
+        likeness=zeros(groups, LEVELS, LEVELS) if touch else zeros(0, 0, 0),
+        before=zeros(*(shape := (len(sector_shifts(config)), capacity if touch else 0))),
+        rest=zeros(*shape),
+    )
+
+
+def apply_map_feedback(memory: Memory, feedback: MapFeedback) -> Memory:
+    """The memory with the map's current poses and view metric."""
+    dtype, count = memory.x.dtype, len(feedback.poses)
+    if not count:
+        return memory
+    full = np.zeros((4, memory.x.shape[0]))
+    x, y, heading = feedback.poses.T
+    full[:, :count] = x, y, np.cos(heading), np.sin(heading)
+    x, y, cosine, sine = (jnp.asarray(row, dtype) for row in full)
+    values = (feedback.bias, feedback.since, feedback.angle, feedback.scale)
+    bias, since, angle, scale = (jnp.asarray(value, dtype) for value in values)
+    if feedback.likeness.size:
+        memory = memory._replace(likeness=jnp.asarray(feedback.likeness, dtype))
+    return memory._replace(
+        x=x, y=y, cosine=cosine, sine=sine, pose=jnp.asarray(feedback.poses[-1], dtype),
+        bias=bias, since=since, angle=angle, scale=scale,
+    )  # fmt: skip
+
+
+def accumulate_motion(memory: Memory, odometry: Array) -> Memory:
+    """Adds body-frame motion [3] (m, m, rad) to the odometry since the newest keyframe."""
+    return memory._replace(
+        motion=compose(memory.motion, odometry),
+        length=memory.length + jnp.hypot(odometry[0], odometry[1]),
+        turn=memory.turn + jnp.abs(odometry[2]),
+    )
+
+
+def is_keyframe_due(config: RecallConfig, cell: float, memory: Memory) -> Array:
+    """Whether a view seen now becomes a keyframe."""
+    moved = (memory.length >= config.frame_distance * cell) | (memory.turn > config.frame_turn)
+    return (memory.count < memory.label.shape[0]) & (moved | (memory.count == 0))
+
+
+def current_pose(memory: Memory) -> Array:
+    """[3] the robot's pose in the map at the last feedback, moved on by odometry."""
+    return compose(memory.pose, correct_heading_bias(memory.motion, memory.length, memory.bias))
+
+
+def pose_spread(config: RecallConfig, cell: float, memory: Memory) -> tuple[Array, Array]:
+    """Standard deviation of the current pose: position, m, and heading, rad."""
+    since = memory.since + memory.length
+    return (
+        config.local_sd * cell + config.local_rate * since,
+        config.local_heading + config.local_heading_rate / cell * since,
+    )
+
+
+def store_keyframe(memory: Memory, view: Array, label: Array, packet: Array) -> Memory:
+    """Stores the newest view as a keyframe at the robot's current pose."""
+    row, pose = memory.count, current_pose(memory)
+    zero = jnp.zeros_like(memory.length)
+    known = jnp.any(memory.label == label) | (label < 0)
+    return memory._replace(
+        view=memory.view.at[:, row].set(view[: memory.view.shape[0]]),
+        label=memory.label.at[row].set(label),
+        packet=memory.packet.at[row].set(packet),
+        x=memory.x.at[row].set(pose[0]),
+        y=memory.y.at[row].set(pose[1]),
+        cosine=memory.cosine.at[row].set(jnp.cos(pose[2])),
+        sine=memory.sine.at[row].set(jnp.sin(pose[2])),
+        count=memory.count + 1,
+        distinct=memory.distinct + (~known).astype(jnp.int32),
+        pose=pose,
+        motion=jnp.zeros_like(memory.motion),
+        since=memory.since + memory.length,
+        length=zero,
+        turn=zero,
+    )
+
+
+def recallable(config: RecallConfig, memory: Memory) -> Array:
+    """[C] bool, the keyframes that may be recalled."""
+    return jnp.arange(memory.label.shape[0], dtype=jnp.int32) < memory.count - config.guard
+
+
+def allowed_shifts(shifts: np.ndarray, memory: Memory) -> Array:
+    """[S] bool, the shifts to compare: all once the sectors are known to be ordered, else 0 alone."""
+    return (shifts == 0) | (memory.angle != 0)
