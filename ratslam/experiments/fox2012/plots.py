@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,36 +24,33 @@ def draw_reproduction(name: str, protocol: Protocol, found: Sequence[MapperResul
     """The figure of a reproduction."""
     sets = len({one.number for one in found})
     count = f"{sets} set{'s' if sets > 1 else ''}"
-    across, panels = _DRAWN[name](protocol, [one for one in found if one.along == FILTERED])
+    draw, explanation = _FIGURES[name]
+    across, panels = draw(protocol, [one for one in found if one.along == FILTERED])
     many = f"the first of {count}" if name == "fox-fig6" and sets > 1 else count
-    line = f"{protocol.source}  ·  {many}  ·  {_EXPLAINED[name]}"
+    line = f"{protocol.source}  ·  {many}  ·  {explanation}"
     return draw_grids(f"{name}: {protocol.title}", line, panels, across=across)
 
 
 def _means(protocol: Protocol, found: Sequence[MapperResult]) -> tuple[int, list[GridPanel]]:
     """A mean map for each mapper, method below method."""
     panels = []
-    for method in protocol.methods:
-        for mapper in protocol.mappers:
-            these = [one for one in found if (one.method, one.mapper) == (method, mapper)]
-            error = np.mean([one.values[eq6_column(MAIN_CONVENTION)] for one in these])
-            mean = mean_grid([one.grid for one in these])
-            panels.append(_panel(mapper, f"{method}, {error:.3f}", these[0])._replace(grid=mean))
+    for method, mapper in product(protocol.methods, protocol.mappers):
+        these = [one for one in found if (one.method, one.mapper) == (method, mapper)]
+        error = np.mean([one.values[eq6_column(MAIN_CONVENTION)] for one in these])
+        mean = mean_grid([one.grid for one in these])
+        panels.append(_panel(mapper, f"{method}, {error:.3f}", these[0])._replace(grid=mean))
     return len(protocol.mappers), panels
 
 
 def _singles(protocol: Protocol, found: Sequence[MapperResult]) -> tuple[int, list[GridPanel]]:
     """A map for each mapper, set below set, with the paths."""
-    panels = []
-    for method in protocol.methods:
-        for number in sorted({one.number for one in found}):
-            for mapper in protocol.mappers:
-                which = (method, number, mapper)
-                panels += [
-                    _with_paths(f"{mapper}, trial {number + 1}", method, one)
-                    for one in found
-                    if (one.method, one.number, one.mapper) == which
-                ]
+    numbers = sorted({one.number for one in found})
+    panels = [
+        _with_paths(f"{mapper}, trial {number + 1}", method, one)
+        for method, number, mapper in product(protocol.methods, numbers, protocol.mappers)
+        for one in found
+        if (one.method, one.number, one.mapper) == (method, number, mapper)
+    ]
     return len(protocol.mappers), panels
 
 
@@ -76,13 +74,8 @@ def _panel(name: str, line: str, one: MapperResult) -> GridPanel:
     return GridPanel(name, line, one.grid, wall_segments(one.arena))
 
 
-_EXPLAINED = {
-    "fox-fig4": "below each mapper: how it was filtered, eq. 6 (mean of the trials' errors)",
-    "fox-fig5": "below each: how it was filtered, position error (dead reckoning's), m",
-    "fox-fig6": "odometry noise, reports; position error (dead reckoning's), m",
-}
-_DRAWN: dict[str, Callable[[Protocol, Sequence[MapperResult]], tuple[int, list[GridPanel]]]] = {
-    "fox-fig4": _means,
-    "fox-fig5": _singles,
-    "fox-fig6": _worlds,
+_FIGURES: dict[str, tuple[Callable[[Protocol, Sequence[MapperResult]], tuple[int, list[GridPanel]]], str]] = {
+    "fox-fig4": (_means, "below each mapper: the filter, eq. 6 (mean of the trials' errors)"),
+    "fox-fig5": (_singles, "below each: the filter, position error (dead reckoning's), m"),
+    "fox-fig6": (_worlds, "odometry noise, reports; position error (dead reckoning's), m"),
 }

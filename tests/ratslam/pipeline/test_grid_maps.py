@@ -1,4 +1,4 @@
-"""The grid filter on whole sessions: it beats dead reckoning, and what carries it does."""
+"""The grid filter on whole sessions: its error against dead reckoning, the parts that matter, the map."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ def ratio(row: str, arenas: tuple[int, ...] = FEW) -> float:
 
 
 @pytest.mark.soak
-def test_errors_that_last_are_taken_out():
+def test_scale_errors_of_a_run_are_corrected():
     assert ratio("bias") < 0.3
 
 
 @pytest.mark.soak
-def test_errors_of_single_moves_are_made_good_in_part():
+def test_errors_of_single_moves_are_partly_corrected():
     assert ratio("move", MANY) < 0.85
 
 
 @pytest.mark.soak
-def test_contacts_alone_take_out_errors_that_last():
+def test_contacts_alone_correct_scale_errors():
     assert ratio("bias, blobs only", MANY) < 0.5
 
 
@@ -43,26 +43,27 @@ def test_contacts_alone_take_out_errors_that_last():
     ("move, temper 1, prior 0.3", 1.0), ("move, BACK skipped", 1.0), ("bias, as printed", 0.6),
     ("move, as printed", 1.0),
 ])  # fmt: skip
-def test_what_carries_it_does(row, least):
-    """A way back left out; unknown space as obstacles; the paper's filter: dead reckoning again."""
+def test_moves_are_not_corrected_without_the_essential_parts(row, least):
+    """Without odometry of BACK motions, with unknown space as obstacles, or with the filter as printed, the
+    error is near or above dead reckoning's."""
     assert ratio(row, MANY) > least
 
 
 @pytest.mark.soak
 @pytest.mark.parametrize(("row", "times"), [("bias without run errors", 1.5), ("bias, BACK skipped", 2.0)])
-def test_what_carries_it_against_errors_that_last(row, times):
-    """They are no noise, and the way back is part of the way."""
+def test_scale_errors_need_their_noise_model_and_the_back_motions(row, times):
+    """Without either the error is a multiple of the filter's."""
     assert ratio(row, MANY) > times * ratio("bias", MANY)
 
 
-def test_a_map_is_drawn_where_walls_are():
+def test_the_map_agrees_with_the_walls():
     auc, skill, free, there, back = np.mean([one.map for one in sessions("bias")], axis=0)
     assert auc > 0.85
     assert skill > max(0.25, free)
     assert max(there, back) < 0.08
 
 
-def test_walls_are_told_as_they_run():
+def test_wall_directions_are_estimated_from_contacts():
     found = sessions("bias")
     off = np.degrees(np.concatenate([one.wall_errors for one in found]))
     assert off.mean() < 6
