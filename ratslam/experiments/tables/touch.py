@@ -193,7 +193,7 @@ def _simulate(task: TouchTask) -> tuple[InMemorySource, RunConfig, list[int]]:
     given = {"simulation": simulation, "touch": condition.touch, "backend": task.backend}
     config = RunConfig.model_validate(given)
     with open_source(config) as source:
-        kidnaps = np.flatnonzero(source.carried).tolist()  # type: ignore[attr-defined]
+        kidnaps = np.flatnonzero(source.kidnapped).tolist()  # type: ignore[attr-defined]
         config = complete(config, source)
         log = load_into_memory(open_touch_source(source, config.touch))
     if task.row == "control: shuffled":

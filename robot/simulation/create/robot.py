@@ -1,4 +1,4 @@
-"""The Create among walls: one motion after the other, each as told until whiskers or body object."""
+"""The Create among walls: executes motions, each until its end or until contact of whiskers or body."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from robot.world.polygons import segment_distance
 from tactile.base.types import StepEnd
 
 MIN_DURATION = 1e-6
-"""Shortest motion, s."""
+"""Shortest duration of a motion, s."""
 
 
 class CreateStep(NamedTuple):
     """One motion of the robot.
 
     Attributes:
-        state: what it was doing. moment: how that ended. duration: s. pose: [3] at its end, heading not
-            wrapped. side: [W] to which side whiskers were bent then. contact: [W] bool, which touched then.
-        strain: [T, W, 2] during FWD2, else of no samples.
+        state: of the state machine. moment: how it ended. duration: s. pose: [3] at its end, heading not
+            wrapped. side: [W] bending side of the whiskers at its end. contact: [W] bool at its end.
+        strain: [T, W, 2] during FWD2, otherwise without samples.
     """
 
     state: CreateState
@@ -47,7 +47,11 @@ class CreateStep(NamedTuple):
 
 
 class CreateRobot:
-    """The Create among walls [S, 4]: makes one motion after the other."""
+    """The Create among walls [S, 4].
+
+    Attributes:
+        whiskers: its whiskers.
+    """
 
     def __init__(
         self,
@@ -56,26 +60,26 @@ class CreateRobot:
         walls: np.ndarray,
         random: np.random.Generator,
     ) -> None:
-        self.behaviour, self.whiskers, self.walls = behaviour, whiskers, walls
-        self.fan = fixed_whiskers(whiskers)
+        self.behaviour, self.sensors, self.walls = behaviour, whiskers, walls
+        self.whiskers = fixed_whiskers(whiskers)
         self._random = random
 
     def at(self, pose: np.ndarray) -> CreateStep:
-        """Standing at a pose, about to drive on."""
-        free = np.zeros(len(self.fan.base), int)
+        """The state before the first motion from a pose."""
+        free = np.zeros(len(self.whiskers.base), int)
         none = np.zeros((0, len(free), 2))
         return CreateStep(CreateState.FWD1, StepEnd.FREE, 0.0, pose, free, free.astype(bool), none)
 
     def step(self, last: CreateStep, state: CreateState, told: WheelCommand) -> CreateStep:
-        """The motion that is told, until it ends by itself or early."""
+        """Execute a motion until its planned or early end."""
         config = self.behaviour
         count = max(int(np.ceil(told.duration / config.period - 1e-9)), 1)
         time = np.minimum(np.arange(1, count + 1) * config.period, max(told.duration, MIN_DURATION))
         near = self._near(last.pose, told)
         poses = drive(told, last.pose, time)
-        bent = bend_whiskers(self.fan, poses, near, last.side)
-        strain = base_strains(self.whiskers, self.fan, bent)
-        known = monitor_strain(self.whiskers, strain, self.fan.alive, config.period, self._random)
+        bent = bend_whiskers(self.whiskers, poses, near, last.side)
+        strain = base_strains(self.sensors, self.whiskers, bent)
+        known = monitor_strain(self.sensors, strain, self.whiskers.alive, config.period, self._random)
         end = motion_end(config, state, known, self._bumps(last.pose, poses, near), last.contact)
         duration = float(time[end.row])
         return CreateStep(
@@ -89,21 +93,21 @@ class CreateRobot:
         )
 
     def _near(self, pose: np.ndarray, told: WheelCommand) -> np.ndarray:
-        """The walls that can be touched or bumped into."""
-        room = max(self.fan.reach, self.behaviour.body) + abs(told.speed) * told.duration
+        """Walls within reach of whiskers or body during a motion."""
+        room = max(self.whiskers.reach, self.behaviour.body) + abs(told.speed) * told.duration
         return self.walls[segment_distance(self.walls, pose[:2]) < room]
 
     def _bumps(self, start: np.ndarray, poses: np.ndarray, near: np.ndarray) -> np.ndarray:
-        """[T] bool, the body is as near to a wall as it can get, and getting nearer."""
+        """[T] bool, whether the body touches a wall and approaches it."""
         if not len(near):
             return np.zeros(len(poses), bool)
         room = segment_distance(near, np.vstack([start, poses])[:, :2]).min(axis=1)
         return (room[1:] < self.behaviour.body) & (np.diff(room) < 0)
 
     def _felt(self, last: CreateStep, near: np.ndarray, told: WheelCommand, duration: float) -> np.ndarray:
-        time = np.arange(round(duration * self.whiskers.rate)) / self.whiskers.rate
+        time = np.arange(round(duration * self.sensors.rate)) / self.sensors.rate
         if not len(time):
-            return np.zeros((0, len(self.fan.base), 2))
-        bent = bend_whiskers(self.fan, drive(told, last.pose, time), near, last.side)
-        strain = base_strains(self.whiskers, self.fan, bent)
-        return sample_strain(self.whiskers, strain, self.fan.alive, self._random)
+            return np.zeros((0, len(self.whiskers.base), 2))
+        bent = bend_whiskers(self.whiskers, drive(told, last.pose, time), near, last.side)
+        strain = base_strains(self.sensors, self.whiskers, bent)
+        return sample_strain(self.sensors, strain, self.whiskers.alive, self._random)

@@ -1,7 +1,7 @@
-"""A simulated session of the whiskered Create as a source: the same bits every time, from one seed.
+"""A simulated session of the whiskered Create as a source, bit-identical for the same settings.
 
-Every step of the state machine is one `Report`. Every part draws from a stream of its own name (arena,
-behaviour, wheels, strain), so that changing one leaves what the others draw as it was.
+Every step of the state machine is one `Report`. Every part draws from its own random stream (arena,
+behaviour, wheels, strain), so that changing one part leaves the others unchanged.
 """
 
 from __future__ import annotations
@@ -42,25 +42,25 @@ from tactile.wall_estimation.strain_templates import (
 
 
 class CreateSimulationConfig(Settings):
-    """A session of the Create to simulate. What the paper leaves open are these defaults."""
+    """A simulated session of the Create. The defaults fill in what Fox et al. 2012 leave open."""
 
     arena: ArenaConfig = ArenaConfig()
-    """The world."""
+    """Arena."""
     behaviour: BehaviourConfig = BehaviourConfig()
-    """What the robot does."""
+    """State machine."""
     whiskers: WhiskersConfig = WhiskersConfig()
-    """What it feels with."""
+    """Whiskers and strain sensors."""
     wheels: WheelsConfig = WheelsConfig()
-    """What it believes of its motion."""
+    """Odometry errors."""
     minutes: PositiveFloat = 6.0
-    """How long it goes on."""
+    """Duration, min."""
     reports: PositiveInt | None = None
-    """How many steps it makes instead."""
+    """Number of steps, instead of a duration."""
     seed: NonNegativeInt = 0
-    """Of everything random."""
+    """Seed of all random streams."""
 
     def resolved(self, folder: File) -> CreateSimulationConfig:
-        """The same with every relative path taken from the folder (of the configuration file, say)."""
+        """A copy with relative paths taken from the folder, such as that of the configuration file."""
         if self.arena.file is None:
             return self
         return self.model_copy(
@@ -72,8 +72,8 @@ class CreateSimulation(SimulatedSource):
     """A simulated session of the Create as a `Source`.
 
     Attributes:
-        config: what it was made from. arena: where it is. fan: its whiskers. steps: [N] what it did.
-        time: [N] s, at the end of each step. truth: [N, 3] then. odometry: [N, 4] of each.
+        config: its settings. arena: its arena. steps: [N] motions of the robot.
+        time: [N] s, end of each step. truth: [N, 3] at these times. odometry: [N, 4].
 
     Raises:
         InputError: the configuration cannot be simulated; says what and where.
@@ -88,7 +88,7 @@ class CreateSimulation(SimulatedSource):
         robot = CreateRobot(
             config.behaviour, config.whiskers, wall_segments(self.arena), stream(config.seed, "strain")
         )
-        self.fan = robot.fan
+        self.whiskers = len(robot.whiskers.base)
         start = robot.at(self.arena.start)
         self.steps = steps = list(_driven(config, robot, start))
         duration = np.array([step.duration for step in steps])
@@ -113,10 +113,6 @@ class CreateSimulation(SimulatedSource):
     def rate_hz(self) -> float:
         return rate_of(self.time)
 
-    @property
-    def whiskers(self) -> int:
-        return len(self.fan.base)
-
     def _readings(self) -> Iterator[Report]:
         return (make_report(self.config, step, NO_ODOMETRY) for step in self.steps)
 
@@ -134,25 +130,25 @@ def _driven(config: CreateSimulationConfig, robot: CreateRobot, start: CreateSte
 
 
 HALF_WALL = 10.0
-"""Half of a wall that is as good as endless, m."""
+"""Half the length of a wall that the robot cannot drive around, m."""
 APPROACH = 0.015
-"""How far away it is at most when the robot sets out, m."""
+"""Largest distance of the wall at the start, m."""
 RECORD_TIME = 2.0
-"""Length of what is kept, s (Fox et al. 2012, II-G)."""
+"""Duration of the recorded strain, s (Fox et al. 2012, II-G)."""
 
 
 def drive_into_wall(config: CreateSimulationConfig, angle: float, random: np.random.Generator) -> Report:
-    """What whiskers feel as the robot drives into one flat wall, for templates.
+    """The report of a drive into one flat wall, for strain templates.
 
-    It drives on to the first contact as in FWD1, then for `RECORD_TIME` as in FWD2, whatever the strain.
+    The robot drives to the first contact as in FWD1, then for `RECORD_TIME` as in FWD2, regardless of strain.
     The report is of this second motion; its first sample is taken at contact.
 
     Args:
-        angle: of the wall's direction in base_link, rad, counter-clockwise from ahead: 90 degrees is a wall
-            straight across, a lesser one it has to its right, a larger one to its left.
+        angle: direction of the wall in base_link, rad, counter-clockwise from ahead: pi / 2 is perpendicular
+            to the motion, with a smaller angle the wall is on the right, with a larger one on the left.
 
     Raises:
-        InputError: whiskers that never report a contact.
+        InputError: the whiskers report no contact.
     """
     towards = np.array([np.sin(angle), -np.cos(angle)])
     if towards[0] < 0.05:
@@ -182,7 +178,7 @@ def drive_into_wall(config: CreateSimulationConfig, angle: float, random: np.ran
 
 
 def make_report(config: CreateSimulationConfig, step: CreateStep, odometry: Odometry) -> Report:
-    """A step as it is told."""
+    """A step as a reading."""
     return Report(
         odometry=odometry,
         motion=int(step.state.motion),
@@ -197,10 +193,10 @@ def make_report(config: CreateSimulationConfig, step: CreateStep, odometry: Odom
 def train_strain_templates(
     config: CreateSimulationConfig, training: TemplateTraining | None = None
 ) -> StrainTemplates:
-    """Templates of the robot of a session; from its seed, always the same.
+    """Strain templates of the robot of a session, from its seed (Fox et al. 2012, II-G).
 
     Raises:
-        InputError: the robot's whiskers are sampled otherwise than the training says.
+        InputError: the training has another sample rate than the whiskers.
     """
     training = training or TemplateTraining(rate=config.whiskers.rate, speed=config.behaviour.slow)
     random = stream(config.seed, "templates")

@@ -1,9 +1,9 @@
-"""The Create's finite state machine (Fox et al. 2012, II-C): what it does next, and when a motion ends.
+"""The finite state machine of the Create (Fox et al. 2012, II-C): transitions, motions and how they end.
 
     FWD1 -> FWD1 ... HIT1 -> FWD2 -> HIT2 or ABORT -> BACK -> TURN -> FWD1
 
-Driving on until a whisker touches; on, slowly, until a second one does or any is strained too much; back; a
-turn. Whatever strains a whisker too much, or bumps the body, ends a motion early and has it go back.
+Forward until a whisker touches; slowly forward until a second one does or one is strained too much; back; a
+turn. Excessive strain or contact of the body ends a motion early and is followed by BACK.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from tactile.base.types import MotionKind, StepEnd
 
 Share = Annotated[float, Field(ge=0, le=1)]
 MIN_TURN = 1e-6
-"""Turn that is not worth a step, rad."""
+"""Smallest turn that is executed, rad."""
 
 
 class CreateState(IntEnum):
-    """What the robot is doing."""
+    """State of the machine."""
 
     FWD1 = 0
     FWD2 = 1
@@ -36,48 +36,49 @@ class CreateState(IntEnum):
 
 
 class TurnConfig(Settings):
-    """How far it turns: one of two Gaussians by chance, positive being anticlockwise. The paper gives them as
-    N(0.14 pi, 0) and N(0.3 pi, 0.25 pi), not how often each is drawn."""
+    """Turn angles: drawn from one of two Gaussians, anticlockwise positive. The paper gives N(0.14 pi, 0) and
+    N(0.3 pi, 0.25 pi), but not the probability of each."""
 
     rate: PositiveFloat = 0.3
-    """rad/s"""
+    """Turn rate, rad/s."""
     small: float = 0.14 * np.pi
-    """Mean of the one that follows walls, rad."""
+    """Mean of the small turn, which follows walls, rad."""
     small_spread: NonNegativeFloat = 0.0
     """Its second number, rad or rad2."""
     large: float = 0.3 * np.pi
-    """Mean of the one that leaves them."""
+    """Mean of the large turn, which leaves walls, rad."""
     large_spread: NonNegativeFloat = 0.25 * np.pi
     """Its second number, rad or rad2."""
     spread: Literal["sd", "variance"] = "sd"
-    """What the second numbers are; the paper says variance of a quantity in rad."""
+    """Meaning of the spreads: standard deviation or variance; the paper says variance."""
     share: Share = 0.8
-    """Of turns drawn from the small one. This many give the paper's circuits."""
+    """Probability of a small turn. The default reproduces the circuits of the paper."""
     step: PositiveFloat | None = 0.5
-    """Duration of a step of it, s, as of all others; none: a turn is one step, however long."""
+    """Duration of a step of a turn, s; null: a turn is one step of any duration."""
 
 
 class BehaviourConfig(Settings):
-    """The state machine; speeds, times and angles are the paper's, the rest is left open there."""
+    """Settings of the state machine; speeds, times and angles are those of the paper, the rest is open
+    there."""
 
     fast: PositiveFloat = 0.05
     """Speed of FWD1 and BACK, m/s."""
     slow: PositiveFloat = 0.02
-    """Of FWD2, m/s."""
+    """Speed of FWD2, m/s."""
     step: PositiveFloat = 0.5
     """Duration of FWD1 and BACK, s."""
     least: NonNegativeFloat = 0.1
-    """Shortest FWD2, s: whiskers that touch at once are two contacts from the start."""
+    """Shortest FWD2, s: two whiskers that touch at once are two contacts from the start."""
     patience: PositiveFloat = 2.0
-    """Longest FWD2, s; it is given up (ABORT) without a second contact by then."""
+    """Longest FWD2, s; without a second contact it ends with ABORT."""
     turn: TurnConfig = TurnConfig()
-    """TURN."""
+    """Turns."""
     period: PositiveFloat = 0.01
-    """Time between looks at the strains within a motion, s."""
+    """Period of the strain monitor during a motion, s."""
     contact: PositiveFloat = 2e-4
-    """Strain that is a contact: a tip bent aside by 9 mm, less nearer to the base."""
+    """Strain of a contact: a tip deflection of 9 mm, less nearer to the base."""
     safety: PositiveFloat = 2e-3
-    """Strain that is too much."""
+    """Strain beyond which a motion is aborted."""
     body: PositiveFloat = 0.17
     """Radius of the robot, m."""
 
@@ -90,7 +91,7 @@ class BehaviourConfig(Settings):
 
 
 class WheelCommand(NamedTuple):
-    """A motion: m/s ahead, rad/s counter-clockwise, for s at most."""
+    """A motion: speed ahead (m/s), turn rate (rad/s counter-clockwise), longest duration (s)."""
 
     speed: float
     rate: float
@@ -98,14 +99,14 @@ class WheelCommand(NamedTuple):
 
 
 class MachineState(NamedTuple):
-    """The machine's state, and how far it has yet to turn, rad (0 but in TURN)."""
+    """State of the machine, and the remaining turn, rad (0 except in TURN)."""
 
     state: CreateState
     rest: float = 0.0
 
 
 def wheel_command(config: BehaviourConfig, doing: MachineState) -> WheelCommand:
-    """What the wheels are told to do for a step."""
+    """The wheel command of a step."""
     if doing.state == CreateState.FWD1:
         return WheelCommand(config.fast, 0.0, config.step)
     if doing.state == CreateState.FWD2:
@@ -119,7 +120,7 @@ def wheel_command(config: BehaviourConfig, doing: MachineState) -> WheelCommand:
 
 
 def draw_turn(config: TurnConfig, random: np.random.Generator) -> float:
-    """How far to turn, rad: half a turn at most either way."""
+    """A random turn angle, rad, limited to half a turn either way."""
     which, normal = random.random(), random.standard_normal()
     small = which < config.share
     mean, spread = (config.small, config.small_spread) if small else (config.large, config.large_spread)
@@ -128,14 +129,14 @@ def draw_turn(config: TurnConfig, random: np.random.Generator) -> float:
 
 
 def drive(command: WheelCommand, pose: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """[T, 3] the poses at times [T] s of a motion from a pose: straight or on the spot."""
+    """Poses [T, 3] at times [T] s of a motion from a pose, straight or on the spot."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     ahead, turned = command.speed * time, command.rate * time
     return np.column_stack([pose[0] + c * ahead, pose[1] + s * ahead, pose[2] + turned])
 
 
 class MotionEnd(NamedTuple):
-    """How a motion ended: at which row of what was monitored, and at which moment of the machine."""
+    """End of a motion: row of the monitored strain, and kind of end."""
 
     row: int
     moment: StepEnd
@@ -144,11 +145,11 @@ class MotionEnd(NamedTuple):
 def motion_end(
     config: BehaviourConfig, state: CreateState, strain: np.ndarray, bumped: np.ndarray, before: np.ndarray
 ) -> MotionEnd:
-    """When a motion in a state ends.
+    """The end of a motion in a state.
 
     Args:
-        strain: [T, W, 2] and bumped: [T] bool, as monitored in it every `period`; the last row is the end as
-            planned. before: [W] bool, whiskers that touched as it began.
+        strain: [T, W, 2] and bumped: [T] bool, monitored every `period`; the last row is the planned end.
+            before: [W] bool, whiskers in contact at its start.
     """
     last = len(strain) - 1
     level = np.abs(strain[..., 0])
@@ -157,9 +158,9 @@ def motion_end(
         (last, 9, StepEnd.ABORT if state == CreateState.FWD2 else StepEnd.FREE)
     ]
     if state == CreateState.BACK:
-        return MotionEnd(_first(bumped, last), StepEnd.FREE)  # nothing to go back to
+        return MotionEnd(_first(bumped, last), StepEnd.FREE)  # BACK only ends early when the body touches
     if state == CreateState.TURN:
-        # What was strained too much already ends it only by getting worse.
+        # Whiskers strained too much from the start end a turn only if their strain increases.
         over &= level > 1.1 * level[0]
     stop = over.any(axis=1) | bumped
     if stop.any():
@@ -183,7 +184,7 @@ def _first(flags: np.ndarray, otherwise: int) -> int:
 def next_state(
     config: BehaviourConfig, doing: MachineState, moment: StepEnd, turned: float, random: np.random.Generator
 ) -> MachineState:
-    """What is done after a step that ended so, having turned by so much (rad)."""
+    """The next state after a step that ended at `moment` and turned by `turned` rad."""
     if doing.state == CreateState.BACK:
         return MachineState(CreateState.TURN, draw_turn(config.turn, random))
     if doing.state == CreateState.FWD2 or moment == StepEnd.ABORT:

@@ -1,11 +1,10 @@
-"""Fixed whiskers of the Create and what their sensors read (Fox et al. 2012, II-A).
+"""Fixed whiskers of the Create and the readings of their strain sensors (Fox et al. 2012, II-A).
 
-Each whisker has two channels: horizontal strain at its base, from bending
-(`robot.simulation.create.whisker_bending`), its sign telling
-the side; and vertical strain. A wall moved against level whiskers would not bend them up or down, but they
-droop a little, so what pushes along the shaft bends them down, and sensor axes are never quite level, so some
-of the horizontal strain shows there too. Sensors add noise, and the body shakes: as it starts moving and,
-less, for as long as it does. That is why the paper filters at 17 Hz.
+Each whisker has two channels: the horizontal strain at its base from bending (see `whisker_bending`), whose
+sign tells the side, and the vertical strain. Whiskers droop a little, so a force along the shaft bends them
+down; sensor axes are not exactly level, so part of the horizontal strain appears in the vertical channel.
+Sensors add noise, and the body vibrates at the start of a motion and, less, throughout it, which is why the paper
+filters at 17 Hz.
 """
 
 from __future__ import annotations
@@ -21,31 +20,31 @@ from tactile.base.config import Settings
 from tactile.whiskers.head_geometry import Degrees
 
 MAX_LEAN = np.radians(75.0)
-"""Lean up to which a push along the shaft is passed on; beyond, a whisker buckles instead."""
+"""Largest lean at which a force along the shaft is transmitted; beyond it a whisker buckles."""
 
 
 class MountConfig(Settings):
-    """Where a whisker is fixed, in base_link."""
+    """Mounting of a whisker in base_link."""
 
     x: float
-    """Of its base, m ahead."""
+    """Position of the base ahead, m."""
     y: float
-    """m to the left."""
+    """Position of the base to the left, m."""
     direction_deg: Degrees
-    """In which it points, counter-clockwise from ahead."""
+    """Direction, degrees counter-clockwise from ahead."""
 
 
 class ShakeConfig(Settings):
     """Vibration of the body on its wheels, the same for all whiskers."""
 
     frequency: PositiveFloat = 28.0
-    """Hz"""
+    """Frequency, Hz."""
     decay: PositiveFloat = 0.12
-    """Time in which it falls to 1/e, s."""
+    """Decay time to 1/e, s."""
     start: NonNegativeFloat = 4e-5
-    """Standard deviation of its amplitude as a motion starts, strain."""
+    """Standard deviation of its amplitude at the start of a motion, strain."""
     rumble: NonNegativeFloat = 8e-6
-    """Standard deviation of what the wheels keep up, strain."""
+    """Standard deviation of the continuous vibration by the wheels, strain."""
 
 
 class WhiskersConfig(Settings):
@@ -60,25 +59,25 @@ class WhiskersConfig(Settings):
     )
     """From left to right."""
     length: PositiveFloat = 0.14
-    """m"""
+    """Length of a whisker, m."""
     base_diameter: PositiveFloat = 1.45e-3
-    """m"""
+    """Diameter at the base, m."""
     tip_diameter: PositiveFloat = 0.3e-3
-    """m"""
+    """Diameter at the tip, m."""
     droop_deg: Annotated[float, Field(ge=0, lt=45)] = 10.0
     """Of a whisker below the level of its base."""
     friction: NonNegativeFloat = 0.2
-    """Of whiskers on walls."""
+    """Friction coefficient of whiskers on walls."""
     crosstalk: float = 0.08
-    """Share of the horizontal strain that shows in the vertical channel."""
+    """Fraction of the horizontal strain in the vertical channel."""
     noise: NonNegativeFloat = 3e-6
-    """Standard deviation of a sample, strain."""
+    """Standard deviation of the noise of a sample, strain."""
     shake: ShakeConfig = ShakeConfig()
-    """Of the body."""
+    """Vibration of the body."""
     rate: PositiveFloat = 2000.0
     """Samples per second."""
     dead: tuple[NonNegativeInt, ...] = ()
-    """Whiskers that do not report, by number, from 0."""
+    """Numbers of dead whiskers, from 0."""
 
     @model_validator(mode="after")
     def _sound(self) -> Self:
@@ -92,10 +91,10 @@ class WhiskersConfig(Settings):
 
 
 class FixedWhiskers(NamedTuple):
-    """Whiskers fixed to a body.
+    """Whiskers fixed to the body.
 
     Attributes:
-        base: [W, 2] m. direction: [W] rad, both in base_link. shaft: of each. alive: [W] bool.
+        base: [W, 2] m and direction: [W] rad in base_link. shaft: of all whiskers. alive: [W] bool.
     """
 
     base: np.ndarray
@@ -105,12 +104,12 @@ class FixedWhiskers(NamedTuple):
 
     @property
     def reach(self) -> float:
-        """How far from the middle of the body anything can be touched, m."""
+        """Largest distance of a contact from the centre of the body, m."""
         return float(np.hypot(self.base[:, 0], self.base[:, 1]).max()) + self.shaft.length
 
     @property
     def tip(self) -> np.ndarray:
-        """[W, 2] m in base_link, of straight whiskers."""
+        """Tips [W, 2] of straight whiskers in base_link, m."""
         way = np.stack([np.cos(self.direction), np.sin(self.direction)], axis=1)
         return self.base + self.shaft.length * way
 
@@ -126,7 +125,7 @@ def fixed_whiskers(config: WhiskersConfig) -> FixedWhiskers:
 
 
 def bend_whiskers(fan: FixedWhiskers, pose: np.ndarray, segments: np.ndarray, side: np.ndarray) -> Bending:
-    """How whiskers are bent at poses [T, 3], in order of time, among walls [S, 4]; `side` as in `bent`."""
+    """Bending of whiskers at poses [T, 3] in order of time among walls [S, 4]; `side` as in `bend_shafts`."""
     c, s = np.cos(pose[:, 2:]), np.sin(pose[:, 2:])
     x, y = fan.base.T
     base = np.stack([pose[:, :1] + c * x - s * y, pose[:, 1:2] + s * x + c * y], axis=-1)
@@ -134,24 +133,23 @@ def bend_whiskers(fan: FixedWhiskers, pose: np.ndarray, segments: np.ndarray, si
 
 
 def base_strains(config: WhiskersConfig, fan: FixedWhiskers, bent: Bending) -> np.ndarray:
-    """[T, W, 2] the strain of bent whiskers, horizontal and vertical, without noise."""
+    """Horizontal and vertical strain [T, W, 2] of bent whiskers, without noise."""
     across = base_strain(fan.shaft, bent.turn, bent.reach)
-    # Of a push, what goes along the shaft has the droop for its lever, what goes across the shaft itself.
+    # The force along the shaft bends it by the lever of its droop, the force across it by its length.
     along = np.tan(np.minimum(bent.lean + np.arctan(config.friction), MAX_LEAN))
     down = np.tan(np.radians(config.droop_deg)) * np.abs(across) * along
     return np.stack([across, config.crosstalk * across - down], axis=-1) * fan.alive[:, None]
 
 
 def body_vibration(config: ShakeConfig, count: int, rate: float, random: np.random.Generator) -> np.ndarray:
-    """[T, 2] strain that the body's vibration adds from the start of a motion on: as it sways and as it
-    nods."""
+    """Horizontal and vertical strain [T, 2] from vibration of the body, from the start of a motion."""
     time = np.arange(count) / rate
     damped = np.exp(-time / config.decay)
     amplitude, phase = config.start * random.standard_normal(2), random.uniform(0, 2 * np.pi, 2)
     ringing = amplitude * damped[:, None] * np.sin(2 * np.pi * config.frequency * time[:, None] + phase)
     pole = np.exp((-1 / config.decay + 2j * np.pi * config.frequency) / rate)
     back = [1.0, -2 * pole.real, abs(pole) ** 2]
-    lead = int(5 * config.decay * rate)  # by then it has forgotten how it began
+    lead = int(5 * config.decay * rate)  # until the transient has decayed
     rumble = lfilter([1.0], back, random.standard_normal((lead + count, 2)), axis=0)[lead:]
     return ringing + config.rumble / _gain(back) * rumble
 
@@ -165,8 +163,7 @@ def _gain(back: list[float]) -> float:
 def sample_strain(
     config: WhiskersConfig, strain: np.ndarray, alive: np.ndarray, random: np.random.Generator
 ) -> np.ndarray:
-    """[T, W, 2] what sensors read of strain [T, W, 2], sampled at the sensors' rate from the start of a
-    motion on."""
+    """Sensor readings [T, W, 2] of strain [T, W, 2] at the sensor rate, from the start of a motion."""
     shake = body_vibration(config.shake, len(strain), config.rate, random)
     read = strain + shake[:, None] + config.noise * random.standard_normal(strain.shape)
     return np.where(alive[:, None], read, 0.0)
@@ -175,7 +172,6 @@ def sample_strain(
 def monitor_strain(
     config: WhiskersConfig, strain: np.ndarray, alive: np.ndarray, period: float, random: np.random.Generator
 ) -> np.ndarray:
-    """[T, W, 2] what a monitor knows of strain [T, W, 2]: means over a period (s) before each row. The body's
-    vibration is filtered out of it."""
+    """Monitored strain [T, W, 2]: means over a period (s) before each row, without vibration of the body."""
     noise = config.noise / np.sqrt(max(config.rate * period, 1.0))
     return np.where(alive[:, None], strain + noise * random.standard_normal(strain.shape), 0.0)

@@ -1,5 +1,4 @@
-"""What the Create's wheels tell of its motion: to 5 % of any straight line or turn on the spot
-(Fox et al. 2012, II-B). All errors are of scale: what does not move is known to stand."""
+"""Wheel odometry of the Create: scale errors of 5 % of every straight or turn (Fox et al. 2012, II-B)."""
 
 from __future__ import annotations
 
@@ -11,32 +10,32 @@ from pydantic import NonNegativeFloat
 from tactile.base.config import Settings
 
 BIAS_WHITE_SHARE = 0.2
-"""White noise beside a bias, as a share of the level: 1 % beside 5 %."""
+"""White noise in addition to a bias, as a fraction of the level: 1 % with 5 %."""
 
 
 class WheelsConfig(Settings):
-    """Errors of wheel odometry, of lengths and of turns, each by itself."""
+    """Errors of wheel odometry, independent for lengths and turns."""
 
     noise: Literal["white", "move", "bias", "none"] = "move"
-    """`white`: in every step anew; `move`: one error for each straight line or turn, drawn anew when what is
-    done changes; `bias`: one for the whole run, and a fifth as much in every step."""
+    """`white`: a new error in every step; `move`: one for each straight or turn; `bias`: one for the whole
+    session, plus a fifth of it anew in every step."""
     level: NonNegativeFloat = 0.05
-    """Standard deviation of the scale."""
+    """Standard deviation of the scale error."""
 
 
 def simulate_wheel_odometry(
     config: WheelsConfig, motion: np.ndarray, kind: np.ndarray, random: np.random.Generator
 ) -> np.ndarray:
-    """[N, 4] (dx m, dy m, dtheta rad, dt s) as the wheels tell it.
+    """Odometry [N, 4] (dx m, dy m, dtheta rad, dt s) with errors.
 
     Args:
-        motion: [N, 4] the same, true. kind: [N] a `Motion` of each step.
+        motion: [N, 4] true motion. kind: [N] `Motion` of each step.
     """
     count = len(motion)
     told = np.array(motion, np.float64)
     if config.noise == "none" or not count:
         return told
-    # All are drawn whatever the noise is, so that two structures differ in nothing else.
+    # All are drawn for every kind of noise, so that kinds differ in nothing else.
     white, run = random.standard_normal((count, 2)), random.standard_normal(2)
     if config.noise == "white":
         error = white

@@ -1,13 +1,13 @@
-"""How a fixed, tapered whisker bends where its straight shaft would enter a wall: statics, in closed form.
+"""Static bending of a fixed, tapered whisker whose straight shaft would enter a wall, in closed form.
 
-A whisker gives way by the smallest turn about its base that frees it, and keeps to that side for as long as
-it touches. It is then held at a point of its shaft: by the tip sliding on a wall, by a wall that it lies
-along, or by the corner of an object. It slips off, and springs back, as soon as it would be free straight.
+A whisker is rotated about its base by the smallest angle that frees it, and stays on that side while in
+contact. The contact is its tip on a wall, a wall along its shaft, or the corner of an object. It springs
+back as soon as the straight shaft would be free.
 
-Beam theory for a cone, exact for small turns: radius r0 (1 - k x) at x along the shaft. A turn of the line
-from base to contact at a by an angle takes the base moment 3 E I (1 / a - k) times it, and there the shaft
-has turned by (3 - 2 k a) / (2 (1 - k a)) times it. A shaft cannot turn into a wall: from where its tip would
-lie flat on, the contact moves towards the base. That this line gets shorter by bending is left out.
+Beam theory for a cone, exact for small angles: radius r0 (1 - k x) at x along the shaft. A rotation of the
+line from base to contact at a needs the base moment 3 E I (1 / a - k) times the angle, and the shaft there
+is tilted by (3 - 2 k a) / (2 (1 - k a)) times the angle. Once the tip lies flat on the wall, the contact
+moves towards the base. The shortening of the line by bending is neglected.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from typing import NamedTuple
 import numpy as np
 
 MAX_JOINED_WALLS = 4
-"""Walls, one beginning where the other ends, that a whisker may have to get clear of."""
+"""Largest number of adjacent walls that can block a whisker."""
 JOINED_ANGLE = 1e-9
-"""Turn under which two walls count as joined, rad."""
+"""Largest angle between adjacent walls, rad."""
 BISECTIONS = 24
-"""Of the stretch in which the contact with a wall is looked for: to 10 nm."""
+"""Bisection steps in the search of the contact position, accurate to 10 nm."""
 
 
 class Shaft(NamedTuple):
@@ -35,12 +35,12 @@ class Shaft(NamedTuple):
 
 
 class Bending(NamedTuple):
-    """Whiskers [T, W] as they are bent; where free, zero, and the reach is the length.
+    """Bending of whiskers [T, W]; zero where free, with the length as reach.
 
     Attributes:
-        turn: of the line from base to contact, rad, counter-clockwise. reach: length of it, m.
-        lean: of that line against a perpendicular push, rad: the wall pushes along the shaft with the tangent
-            of it times what it pushes across. side: 1 counter-clockwise, -1 clockwise, 0 free.
+        turn: rotation of the line from base to contact, rad, counter-clockwise. reach: its length, m.
+        lean: angle of the contact force against the perpendicular of that line, rad: its tangent is the
+            ratio of the forces along and across the shaft. side: 1 counter-clockwise, -1 clockwise, 0 free.
     """
 
     turn: np.ndarray
@@ -49,17 +49,17 @@ class Bending(NamedTuple):
     side: np.ndarray
 
     def at(self, row: int) -> Bending:
-        """One row, as one of one."""
+        """One row, with T = 1."""
         return Bending(*(column[row : row + 1] for column in self))
 
 
 def base_strain(shaft: Shaft, turn: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """Surface strain at the base, signed as the turn: M r0 / (E I)."""
+    """Surface strain at the base, M r0 / (E I), with the sign of the rotation."""
     return 3 * shaft.radius * (1 / reach - shaft.taper) * turn
 
 
 def shaft_tilt(shaft: Shaft, reach: np.ndarray) -> np.ndarray:
-    """Turn of the shaft at the contact over that of the line from base to contact."""
+    """Ratio of the shaft's tilt at the contact to the rotation of the line from base to contact."""
     narrow = shaft.taper * reach
     return (3 - 2 * narrow) / (2 * (1 - narrow))
 
@@ -67,10 +67,10 @@ def shaft_tilt(shaft: Shaft, reach: np.ndarray) -> np.ndarray:
 def bend_shafts(
     shaft: Shaft, base: np.ndarray, direction: np.ndarray, segments: np.ndarray, side: np.ndarray
 ) -> Bending:
-    """Whiskers among walls.
+    """Bending of whiskers among walls.
 
     Args:
-        base: [T, W, 2] m, where they are mounted, in order of time. direction: [T, W] rad, straight ones.
+        base: [T, W, 2] positions of the bases in order of time, m. direction: [T, W] of straight shafts, rad.
         segments: [S, 4] m. side: [W] as in `Bending`, before the first row.
     """
     free, no_side = np.zeros(direction.shape), np.zeros(direction.shape, int)
@@ -98,8 +98,9 @@ def bend_shafts(
 
 
 class _Ends(NamedTuple):
-    """One end of the angles at which a whisker would touch a wall: the angle, rad; how far from the base it
-    would, m; how far the wall's nearest point in reach is, and the wall's line, m."""
+    """One end of the range of angles in which a wall blocks a whisker: the angle, rad; the distance of the
+    contact from the base, m; the distances of the nearest reachable point of the wall and of the wall's
+    line, m."""
 
     angle: np.ndarray
     radius: np.ndarray
@@ -110,13 +111,13 @@ class _Ends(NamedTuple):
 def _shadows(
     shaft: Shaft, base: np.ndarray, direction: np.ndarray, segments: np.ndarray
 ) -> tuple[_Ends, _Ends]:
-    """[T, W, S] The lower and upper ends of the directions, from the straight one, that walls block. Where a
-    wall is out of reach the lower end is above the upper one."""
+    """Lower and upper ends [T, W, S] of the angles, relative to the straight shaft, that walls block. For a
+    wall out of reach the lower end is above the upper one."""
     c, s = np.cos(direction)[..., None], np.sin(direction)[..., None]
     x, y = segments[:, 0] - base[..., :1], segments[:, 1] - base[..., 1:]
     u, v = segments[:, 2] - segments[:, 0], segments[:, 3] - segments[:, 1]
     x, y, u, v = c * x + s * y, c * y - s * x, c * u + s * v, c * v - s * u
-    # The part of each wall within a whisker's length of the base.
+    # The part of each wall within reach of the base.
     square, middle = u * u + v * v, -(x * u + y * v)
     inner = middle**2 - square * (x * x + y * y - shaft.length**2)
     half = np.sqrt(np.maximum(inner, 0.0))
@@ -141,12 +142,12 @@ def _mirrored(ends: _Ends) -> _Ends:
 
 
 def _cleared(low: _Ends, high: _Ends) -> _Ends:
-    """[K] The end at which whiskers, all blocked, get clear counter-clockwise; from ends [K, S]."""
+    """The end [K] at which blocked whiskers become free counter-clockwise, from ends [K, S]."""
     angle = np.zeros(len(low.angle))
     for _ in range(MAX_JOINED_WALLS):
         joined = low.angle <= angle[:, None] + JOINED_ANGLE
         angle = np.maximum(angle, np.where(joined, high.angle, 0.0).max(axis=1))
-    # Of walls that end together (a corner) the nearest holds it.
+    # Of walls with the same end (a corner) the nearest one is the contact.
     last = np.abs(high.angle - angle[:, None]) <= JOINED_ANGLE
     which = np.argmin(np.where(last, high.radius, np.inf), axis=1)[:, None]
     radius, near, away = (np.take_along_axis(column, which, axis=1)[:, 0] for column in high[1:])
@@ -154,7 +155,7 @@ def _cleared(low: _Ends, high: _Ends) -> _Ends:
 
 
 def _kept(blocked: np.ndarray, easier: np.ndarray, side: np.ndarray) -> np.ndarray:
-    """[T, W] The side of each whisker: the easier one when it is first touched, then that one."""
+    """The bending side [T, W] of each whisker: the easier one at first contact, constant afterwards."""
     was = np.vstack([side != 0, blocked[:-1]])
     row = np.arange(len(blocked))[:, None]
     onset = np.maximum.accumulate(np.where(blocked & ~was, row, -1), axis=0)
@@ -163,15 +164,15 @@ def _kept(blocked: np.ndarray, easier: np.ndarray, side: np.ndarray) -> np.ndarr
 
 
 def _held(shaft: Shaft, end: _Ends) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """[K] turn, reach and lean of whiskers held at that end."""
+    """Rotation, reach and lean [K] of whiskers in contact at that end."""
     turn, reach = end.angle.copy(), end.radius.copy()
     tip = end.radius >= shaft.length * (1 - 1e-9)
     away = np.minimum(end.away, reach * (1 - 1e-12))
-    slant = np.arcsin(away / reach)  # between the line to the contact and the wall
+    slant = np.arcsin(away / reach)  # angle between the line to the contact and the wall
     lean = np.where(tip, slant, (shaft_tilt(shaft, reach) - 1) * turn)
     flat = np.flatnonzero(tip & ((shaft_tilt(shaft, reach) - 1) * turn > slant))
     if len(flat):
-        wall = turn[flat] + slant[flat]  # between the straight shaft and the wall
+        wall = turn[flat] + slant[flat]  # angle between the straight shaft and the wall
         near, far = end.near[flat], np.full(len(flat), shaft.length)
         for _ in range(BISECTIONS):
             middle = (near + far) / 2

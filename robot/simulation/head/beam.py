@@ -1,4 +1,4 @@
-"""What the raw tiers know of drives, whiskers and sensors beyond `MechanicsConfig`."""
+"""Whiskers as tapered beams, and settings of the raw fidelities beyond `MechanicsConfig`."""
 
 from __future__ import annotations
 
@@ -12,61 +12,62 @@ from tactile.base.config import Settings
 from tactile.features.contact import ShaftConfig
 
 SHAFT_SHARES = np.linspace(0.0, 1.0, 401)
-"""Shares of a whisker's length at which it is integrated."""
+"""Positions along a whisker for integration, as fractions of its length."""
 LOAD_SHARES = (1.0, 0.65)
-"""Shares at which the two shapes are loaded: the tip, and where walls push most. Between them stiffness is
-off by 6 % at most and the moment at the base by 10 %."""
+"""Load positions of the two shapes: the tip, and where walls push most often. In between, stiffness errs by
+at most 6 % and the base moment by 10 %."""
 
 
 class BeamConfig(Settings):
-    """A whisker as a tapered beam. None of it is in the paper: a printed (ABS) whisker of the same lab."""
+    """A whisker as a tapered beam: a printed (ABS) whisker of the same lab; the paper gives no values."""
 
     shaft: ShaftConfig = ShaftConfig()
-    """Its taper, and where along it the sensor's angle is true."""
+    """Taper, and the position at which the sensor reads the true angle."""
     radius: PositiveFloat = 0.75e-3
-    """At the base, m."""
+    """Radius at the base, m."""
     modulus: PositiveFloat = 2.3e9
-    """Of elasticity, Pa."""
+    """Young's modulus, Pa."""
     density: PositiveFloat = 1040.0
-    """kg/m^3"""
+    """Density, kg/m^3."""
     damping: NonNegativeFloat = 0.1
-    """Of the first bending mode, as a share of critical; that of the second grows with its frequency."""
+    """Damping ratio of the first bending mode; that of the second is proportional to its frequency."""
     friction: NonNegativeFloat = 0.3
-    """Of a whisker on a wall (Coulomb): the lateral force it can take before it slides."""
+    """Coulomb friction coefficient of a whisker on a wall."""
 
 
 class ServoConfig(Settings):
     """A drive as a spring and damper on a rotor; its stiffness is `MechanicsConfig.servo`."""
 
     frequency: PositiveFloat = 15.0
-    """Of the drive without a whisker, Hz."""
+    """Natural frequency of the drive without a whisker, Hz."""
     damping: PositiveFloat = 1.0
-    """As a share of critical, whisker included."""
+    """Damping ratio, whisker included."""
 
 
 class StreamConfig(Settings):
-    """The raw stream of a simulated head."""
+    """Raw samples of a simulated head."""
 
     rate: PositiveFloat = 2000.0
     """Samples per second (Salman & Pearson 2016, III-C)."""
     full_scale: PositiveFloat = 1.5
     """Deflection at which the sensors saturate, rad."""
     poses: PositiveInt = 16
-    """Of the head along a cycle, at which walls are looked for."""
+    """Number of head poses per cycle at which contacts with walls are computed."""
     batch: PositiveInt = 16
-    """Cycles simulated side by side; only speed depends on it."""
+    """Number of cycles simulated in parallel; affects only speed."""
     beam: BeamConfig = BeamConfig()
     servo: ServoConfig = ServoConfig()
 
 
 class Beam(NamedTuple):
-    """A whisker of unit length, flexural rigidity and mass per length at its base, as two shapes: how two
-    loads bend it. Statics are exact under these loads, and the shapes hold the two slowest bending modes.
+    """A whisker of unit length, unit flexural rigidity and unit mass per length at its base, reduced to the
+    two shapes into which two loads bend it. Statics are exact for these loads; the shapes span the two
+    slowest modes.
 
     Attributes:
         shapes: [2, S] deflection at `SHAFT_SHARES` per unit load. stiffness, mass: [2, 2] of the loads.
-        coupled: [2] inertia shared with turning. inertia: of the straight whisker about its base.
-        moment: [2] at the base per unit load. unit: stiffness of turning against a push at the reference.
+        coupled: [2] inertia coupled with rotation. inertia: of the straight whisker about its base.
+        moment: [2] base moment per unit load. unit: rotational stiffness for a push at the reference.
     """
 
     shapes: np.ndarray
@@ -78,12 +79,12 @@ class Beam(NamedTuple):
     unit: float
 
     def at(self, reach: np.ndarray) -> np.ndarray:
-        """[2, ...] the two shapes at shares of the length."""
+        """The two shapes [2, ...] at fractions of the length."""
         return np.stack([np.interp(reach, SHAFT_SHARES, shape) for shape in self.shapes])
 
     @property
     def modes(self) -> np.ndarray:
-        """[2] angular frequencies of bending with the base held."""
+        """Angular frequencies [2] of the bending modes with a clamped base."""
         return np.sqrt(eigh(self.stiffness, self.mass, eigvals_only=True))
 
 
@@ -106,12 +107,12 @@ def make_beam(config: ShaftConfig) -> Beam:
 
 
 def beam_time_unit(config: BeamConfig, length: float) -> float:
-    """The unit of time of a unit beam, s."""
+    """Time unit of the unit beam, s."""
     return float(length**2 * 2 / config.radius * np.sqrt(config.density / config.modulus))
 
 
 def _summed(value: np.ndarray) -> np.ndarray:
-    """Running integral along the whisker (trapezoids)."""
+    """Cumulative integral along the whisker (trapezoidal rule)."""
     steps = (value[..., 1:] + value[..., :-1]) / 2 * np.diff(SHAFT_SHARES)
     return np.concatenate([np.zeros((*value.shape[:-1], 1)), np.cumsum(steps, axis=-1)], axis=-1)
 

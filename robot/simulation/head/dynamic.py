@@ -1,10 +1,10 @@
-"""The dynamic tier: drives with inertia, whiskers that vibrate in two bending modes, walls that push back.
+"""The dynamic fidelity: drives with inertia, whiskers with two bending modes, elastic walls.
 
 Each whisker is a linear system of six states, its angle and the two loads of
-`robot.simulation.head.beam.Beam` with
-their rates, driven by the command, which is linear between samples, and by the force of the wall, which is
-held: one matrix exponential carries it exactly. The wall is a stiff spring whose force is taken at the end of
-the sample, which keeps it stable at any stiffness:
+`robot.simulation.head.beam.Beam` with their
+rates, driven by the command (linear between samples) and the force of the wall (constant between samples),
+and is integrated exactly by a matrix exponential. The wall is a stiff spring whose force is taken at the end
+of the sample (implicit, stable at any stiffness):
     force = spring x (depth without force) / (1 + spring x give).
 """
 
@@ -21,7 +21,7 @@ from tactile.whiskers.head_geometry import Head
 from tactile.whiskers.whisking import WhiskingConfig, initial_drive, whisk_command
 
 WALL_STIFFNESS = 300.0
-"""Stiffness of a wall over that of a whisker."""
+"""Ratio of wall stiffness to whisker stiffness."""
 
 
 def simulate_dynamic(
@@ -35,7 +35,7 @@ def simulate_dynamic(
     """Angle, x and y, [T, N, W] rad: a `robot.simulation.head.whisk_stream.MechanicsModel`."""
     model = make_beam(config.beam.shaft)
     step, push = _systems(config, mechanics, head, model)  # [W, 6, 8], [W, 6, 3]
-    # How far along its way the point of contact goes with each of the first three states.
+    # Displacement of the contact point per unit of each of the first three states.
     arm = np.concatenate([sweep.reach[None], model.at(sweep.reach)])  # [3, T, N, W]
     give = np.einsum("itnw,wij,jtnw->tnw", arm, push[:, :3], arm, optimize=True)
     spring = WALL_STIFFNESS * model.unit
@@ -45,7 +45,7 @@ def simulate_dynamic(
     angle, side, moment = (np.zeros(sweep.wall.shape) for _ in range(3))
 
     size = sweep.wall.shape[1:]
-    state = np.zeros((size[1], 8, size[0]))  # of every whisker: six states, command and its rate
+    state = np.zeros((size[1], 8, size[0]))  # for each whisker: six states, command, rate of the command
     drive, told, aim = initial_drive(*size), np.zeros(size), np.zeros(size)
     touching, slipped = np.zeros(size, bool), np.zeros(size, bool)
     late, x, before = np.zeros(size), np.zeros(size), np.zeros(size)
@@ -53,7 +53,7 @@ def simulate_dynamic(
         last, (aim, drive) = aim, whisk_command(whisking, drive, time, told, threshold, head.shape)
         state[:, 6], state[:, 7] = last.T, (aim - last).T
         state[:, :6] = step @ state
-        # A wall that comes upon a whisker from the side is met where the whisker is.
+        # A wall that reaches a whisker from the side is touched where the whisker is.
         late = np.where(touching, late, np.maximum(before - sweep.wall[k], 0.0))
         wall = sweep.wall[k] + late
         place = arm[:, k]
@@ -75,9 +75,10 @@ def simulate_dynamic(
 def _systems(
     config: StreamConfig, mechanics: MechanicsConfig, head: Head, model: Beam
 ) -> tuple[np.ndarray, np.ndarray]:
-    """One sample's step [W, 6, 8] and what forces along the first three states do in it [W, 6, 3].
+    """State transition of one sample [W, 6, 8], and the effect of forces along the first three states [W, 6,
+    3].
 
-    In units of each whisker's length, rigidity and mass; rates are per unit of time of its beam, but that of
+    Units are the length, rigidity and mass of each whisker; rates are per time unit of its beam, the rate of
     the command is per sample.
     """
     servo = mechanics.servo * model.unit

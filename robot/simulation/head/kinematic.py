@@ -1,8 +1,8 @@
-"""The kinematic tier: whisk cycles in closed form, without a stream of samples.
+"""The kinematic fidelity: contact features of whisk cycles in closed form, without raw samples.
 
-The head is looked at in a few poses along each protraction. A whisker meets the first obstacle on its way;
-from there its drive pushes on against it: of what is commanded beyond the contact, a stiff drive bends the
-whisker by the share `servo / (1 + servo)`. A whisker bent too far slips off.
+Contacts are computed at a few head poses along each protraction. From the first contact on, the drive bends
+the whisker by the fraction `servo / (1 + servo)` of the commanded angle beyond it. A whisker bent too far
+slips off.
 """
 
 from __future__ import annotations
@@ -21,38 +21,38 @@ from tactile.whiskers.head_geometry import Head
 from tactile.whiskers.whisking import WhiskingConfig, neighbour_max, whisk_phase
 
 SHAFT = ShaftConfig()
-"""Of all whiskers."""
+"""Shaft of all whiskers."""
 MIN_REACH = 0.05
-"""Reach, as a share of the shaft, under which a contact counts as this far out."""
+"""Smallest reach of a contact, as a fraction of the shaft."""
 HEEDED_SDS = 20.0
-"""Noise that a reading must exceed for the whisking law to heed it, in standard deviations (the paper's)."""
+"""Threshold of the whisking law, in standard deviations of the noise (Salman & Pearson 2016)."""
 MEAN_NOISE_SHARE = 0.3
-"""Noise of the largest angle, which is a mean over 10 ms, as a share of one sample's."""
+"""Noise of the largest angle, a mean over 10 ms, as a fraction of that of one sample."""
 
 
 class MechanicsConfig(Settings):
-    """Drives, whiskers and sensors of the simulated head; the paper gives none of these."""
+    """Drives, whiskers and sensors of the simulated head; the paper gives no values."""
 
     servo: PositiveFloat = 1.0
-    """Stiffness of a drive over that of its whisker."""
+    """Ratio of drive stiffness to whisker stiffness."""
     slip: PositiveFloat = 0.25
     """Deflection at which a whisker slips off, rad."""
     noise: NonNegativeFloat = 2e-3
     """Standard deviation of angles and deflections, rad."""
     dead_zone: NonNegativeFloat = 0.015
-    """Deflection that passes unnoticed, rad."""
+    """Largest deflection that is not detected, rad."""
     missed: NonNegativeFloat = 0.0
-    """Share of contacts that are missed."""
+    """Fraction of contacts that are missed."""
     spurious: NonNegativeFloat = 0.0
-    """Share of free whiskers that report one."""
+    """Fraction of free whiskers that report a contact."""
     reach_noise: NonNegativeFloat = 0.1
-    """Standard deviation of the radial distance, as a share of the whisker's length."""
+    """Standard deviation of the contact position along the shaft, as a fraction of its length."""
     poses: PositiveInt = 8
-    """Of the head along a protraction, at which contact is looked for."""
+    """Number of head poses per protraction at which contacts are computed."""
 
 
 class WhiskColumns(NamedTuple):
-    """What every whisker felt in every cycle: the columns [N, W] of `Whisk`."""
+    """Contact features of all cycles: the columns [N, W] of `Whisk`."""
 
     contact: np.ndarray
     touched: np.ndarray
@@ -69,15 +69,15 @@ def simulate_kinematic(
     start: np.ndarray,
     random: np.random.Generator,
 ) -> WhiskColumns:
-    """Whisk cycles that start at times [N] s along a path."""
+    """Contact features of whisk cycles that start at times [N] s along a path."""
     met = _met(config, whisking, surroundings, path, start)
     felt = _pushed(config, whisking, surroundings.head, met)
     return _sensed(config, whisking, surroundings.head, felt, random)
 
 
 class _Met(NamedTuple):
-    """What whiskers meet [N, W]: whether anything on their way, the protraction at which, where along the
-    shaft, and the same two (infinite where free) at the end of the protraction."""
+    """Contacts [N, W]: whether there is one, its protraction and position along the shaft, and the same two
+    values (infinite where free) at the end of the protraction."""
 
     contact: np.ndarray
     touched: np.ndarray
@@ -108,8 +108,8 @@ def _met(
     def then(column: np.ndarray, row: np.ndarray) -> np.ndarray:
         return np.take_along_axis(column, row[:, None], axis=1)[:, 0]
 
-    # A wall that the head's own motion brought into the sweep is met where the whisker is by then: about
-    # half-way between two poses. That it was met late stays for the whole cycle.
+    # A wall that enters the sweep by the motion of the head is touched where the whisker is by then, about
+    # half-way between two poses. The delay holds for the whole cycle.
     new = (first > 0) & (then(box, np.maximum(first - 1, 0)) != then(box, first))
     before = np.concatenate([[0.0], command[:-1]])
     stands = np.where(contact, then(wall, first), 0.0)
@@ -120,8 +120,8 @@ def _met(
 
 
 def _pushed(config: MechanicsConfig, whisking: WhiskingConfig, head: Head, met: _Met) -> WhiskColumns:
-    """What the drives make of it: how far whiskers bend and turn. A whisker touched near its base is stiffer:
-    it bends less and its sensor reads more."""
+    """Bend and rotation of whiskers in contact. A whisker touched near its base is stiffer: it bends less
+    and its sensor reads more."""
     amplitude = np.radians(whisking.amplitude_deg)
     hard = stiffness(SHAFT, met.reach)
     push = hard * config.servo / (config.servo + hard)  # reading for each radian commanded beyond contact
@@ -132,7 +132,7 @@ def _pushed(config: MechanicsConfig, whisking: WhiskingConfig, head: Head, met: 
     hard_last = stiffness(SHAFT, np.maximum(met.last_reach, MIN_REACH))
     bend = np.where(there, config.servo / (config.servo + hard_last) * (amplitude - taken - last), 0.0)
     noticed = met.contact & (np.maximum(reading, hard_last * bend) > config.dead_zone)
-    # Slip is a matter of the angle at the end; whether contact still shows then, of the reading.
+    # Slip depends on the bend at the end; a contact is held if its reading still exceeds the dead zone.
     held = noticed & there & (bend <= config.slip) & (hard_last * bend > config.dead_zone)
     highest = np.where(held, last + bend, amplitude - taken)
     return WhiskColumns(
@@ -143,8 +143,8 @@ def _pushed(config: MechanicsConfig, whisking: WhiskingConfig, head: Head, met: 
 def _fed_back(
     config: MechanicsConfig, whisking: WhiskingConfig, head: Head, reading: np.ndarray, push: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Readings [N, W] and the amplitude taken off, rad, once the whisking law has had its say: what exceeds
-    the contact threshold lowers the amplitude, which lowers the reading, and so on to the balance."""
+    """Readings [N, W] and the reduction of the amplitude, rad, at the equilibrium of the whisking law: a
+    reading above the contact threshold reduces the amplitude, which reduces the reading."""
     if whisking.mode == "open":
         return reading, np.zeros_like(reading)
     limit, gain = HEEDED_SDS * config.noise, whisking.gain
@@ -165,7 +165,7 @@ def _sensed(
     felt: WhiskColumns,
     random: np.random.Generator,
 ) -> WhiskColumns:
-    """With the sensors' noise and faults."""
+    """Add noise and faults of the sensors."""
     shape, alive = felt.contact.shape, head.alive
     missed = random.random(shape) < config.missed
     spurious = ~felt.contact & (random.random(shape) < config.spurious)
@@ -187,5 +187,5 @@ def _sensed(
 
 
 def whisk_of_row(head: Head, felt: WhiskColumns, row: int, odometry: Odometry) -> Whisk:
-    """One cycle of them."""
+    """The features of one cycle as a reading."""
     return Whisk(odometry, head.alive, *(column[row] for column in felt))

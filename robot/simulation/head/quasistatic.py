@@ -1,9 +1,9 @@
-"""The quasistatic tier: whiskers and drives in balance at every sample, sensors and feedback in full.
+"""The quasistatic fidelity: whiskers and drives in static equilibrium at every sample, with sensors and
+feedback.
 
-A drive pushed back by a bent whisker gives way: of the command beyond the wall the whisker takes the share
-servo / (servo + k), k being its stiffness where it is pushed over that at the reference. The sensor reads the
-moment, k times the bend. A whisker bent too far slips off, and stays off until the cycle ends: it passes its
-wall again without force on its way back.
+Of the commanded angle beyond the wall the whisker bends by the fraction servo / (servo + k), where k is its
+stiffness at the contact relative to that at the reference. The sensor reads the moment, k times the bend. A
+whisker bent too far slips off until the cycle ends.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from tactile.whiskers.head_geometry import Head
 from tactile.whiskers.whisking import WhiskDrive, WhiskingConfig, initial_drive, whisk_command
 
 WhiskingLaw = Callable[[WhiskDrive, float, np.ndarray], tuple[np.ndarray, WhiskDrive]]
-"""From drives, the time in the cycle (s) and the newest y [N, W] as sensors report it, to the protractions
-commanded [N, W] and the drives after it: `tactile.whiskers.whisking.whisk_command`, say."""
+"""Whisking law: from drive states, time in the cycle (s) and newest sensor reading y [N, W] to the commanded
+protractions [N, W] and the next drive states, such as `tactile.whiskers.whisking.whisk_command`, say."""
 
 
 class WhiskerBalance(NamedTuple):
-    """Whiskers between two samples, [N, W] each.
+    """State of whiskers between two samples, [N, W] each.
 
     Attributes:
-        drive: what the law remembers. told: y as last reported, rad. touching, slipped: bool.
-        late: protraction by which a wall is met later than it stands, rad. side: sideways bend, rad.
+        drive: state of the whisking law. told: last reported y, rad. touching, slipped: bool.
+        late: protraction by which a contact is delayed, rad. side: sideways bend, rad.
         before: protraction at the last sample, rad.
     """
 
@@ -45,7 +45,7 @@ class WhiskerBalance(NamedTuple):
 
 
 def whiskers_at_rest(*size: int) -> WhiskerBalance:
-    """Whiskers [N, W] before their first cycle, which touch nothing."""
+    """Whiskers [N, W] before their first cycle, without contact."""
     zero, no = np.zeros(size), np.zeros(size, bool)
     return WhiskerBalance(initial_drive(*size), zero, no, no, zero, zero, zero)
 
@@ -57,10 +57,10 @@ def advance_balance(
     sweep: WallSweep,
     balance: WhiskerBalance,
 ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], WhiskerBalance]:
-    """The samples of a sweep, which may be any part of a cycle, from where the whiskers were.
+    """The samples of a sweep, which may be any part of a cycle, continuing from a state.
 
     Returns:
-        angle, x and y, [T, N, W] rad, and where the whiskers are after the last of them.
+        angle, x and y, [T, N, W] rad, and the state after the last sample.
     """
     hard = stiffness(config.beam.shaft, sweep.reach)
     share = mechanics.servo / (mechanics.servo + hard)
@@ -71,7 +71,7 @@ def advance_balance(
     drive, told, touching, slipped, late, side, before = balance
     for k, time in enumerate(sweep.time.tolist()):
         aim, drive = law(drive, time, told)
-        # A wall that comes upon a whisker from the side is met where the whisker is.
+        # A wall that reaches a whisker from the side is touched where the whisker is.
         late = np.where(touching, late, np.maximum(before - sweep.wall[k], 0.0))
         wall = sweep.wall[k] + late
         bend = share[k] * (aim - wall)

@@ -1,7 +1,7 @@
-"""A simulated session of a whiskered head as a source: the same bits every time, from one seed.
+"""A simulated session of the whisker head as a source, bit-identical for the same settings.
 
-Every part draws from a stream of its own name (maze.loop, maze.walls, maze.heights, path, motion, sensor,
-odometry), so that changing one leaves the others as they were.
+Every part draws from its own random stream (maze.loop, maze.walls, maze.heights, path, motion, sensor,
+odometry), so that changing one part leaves the others unchanged.
 """
 
 from __future__ import annotations
@@ -34,42 +34,42 @@ from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 from tactile.whiskers.whisking import MID_PROTRACTION, WhiskingConfig, check_amplitude
 
 RAW_TIERS = {"quasistatic": simulate_quasistatic, "dynamic": simulate_dynamic}
-"""The tiers that make raw samples."""
+"""Mechanics models that give raw samples."""
 
 
 class SimulationConfig(Settings):
-    """A session to simulate. What the paper leaves open are these defaults."""
+    """A simulated session of the whisker head. The defaults fill in what Salman & Pearson 2016 leave open."""
 
     maze: MazeConfig = MazeConfig()
-    """The world."""
+    """Maze."""
     path: PathConfig = PathConfig()
-    """Where the head goes."""
+    """Route of the head."""
     motion: MotionConfig = MotionConfig()
-    """How it moves."""
+    """Speed and variation of its motion."""
     kidnaps: KidnapConfig = KidnapConfig()
-    """When it is carried."""
+    """Kidnaps."""
     odometry: OdometryConfig = OdometryConfig()
-    """What it believes of its motion."""
+    """Odometry errors."""
     whisking: WhiskingConfig = WhiskingConfig()
-    """How whiskers are driven."""
+    """Drive of the whiskers."""
     mechanics: MechanicsConfig = MechanicsConfig()
     """Drives, whiskers and sensors."""
     stream: StreamConfig = StreamConfig()
-    """What the raw tiers know of them besides."""
+    """Further mechanics of the raw fidelities."""
     calibration: CalibrationConfig = CalibrationConfig()
-    """The free whisking before the session, for the raw tiers."""
+    """Free whisking before the session, for the raw fidelities."""
     later_maze: Annotated[float, Field(gt=0, lt=1)] | None = None
-    """Share of the session after which whiskers feel another maze, as a control: nothing there can be known
-    again."""
+    """Fraction of the session after which the maze is replaced by another one: a control in which no later
+    place can be recognised."""
     seed: NonNegativeInt = 0
-    """Of everything random."""
+    """Seed of all random streams."""
     fidelity: Literal["auto", "kinematic", "quasistatic", "dynamic"] = "auto"
-    """How much is modelled; `auto`: as little as the wanted outputs need."""
+    """Model of the mechanics; `auto`: the cheapest one that gives the wanted data."""
     raw: bool = False
-    """Whether raw whisker samples are wanted, 2000 a second."""
+    """Whether to give raw whisker samples, 2000 per second."""
 
     def resolved(self, folder: File) -> SimulationConfig:
-        """The same with every relative path taken from the folder (of the configuration file, say)."""
+        """A copy with relative paths taken from the folder, such as that of the configuration file."""
         if self.maze.file is None:
             return self
         maze = self.maze.model_copy(update={"file": folder / self.maze.file})
@@ -77,37 +77,38 @@ class SimulationConfig(Settings):
 
 
 class ChosenTier(NamedTuple):
-    """How much is modelled, and why."""
+    """A fidelity and the reason for it."""
 
     name: Literal["kinematic", "quasistatic", "dynamic"]
     why: str
 
 
 def choose_tier(config: SimulationConfig) -> ChosenTier:
-    """The cheapest tier that gives what is wanted, or the one that was named.
+    """The fidelity in the configuration, or for `auto` the cheapest one that gives the wanted data.
 
     Raises:
-        InputError: the one that was named cannot give it.
+        InputError: the configured fidelity has no raw samples but they are wanted.
     """
     if config.fidelity == "kinematic" and config.raw:
         raise InputError(
             "simulation.fidelity", "kinematic, which makes no raw samples", "auto, quasistatic or dynamic"
         )
     if config.fidelity != "auto":
-        return ChosenTier(config.fidelity, "it was named")
+        return ChosenTier(config.fidelity, "set by simulation.fidelity")
     if config.raw:
-        return ChosenTier("quasistatic", "raw samples are wanted, bending modes and overshoot are not")
-    return ChosenTier("kinematic", "angles of contact are all that is wanted")
+        return ChosenTier("quasistatic", "raw samples are wanted, without bending modes and overshoot")
+    return ChosenTier("kinematic", "only contact features are wanted")
 
 
 class HeadSimulation(SimulatedSource):
     """A simulated session as a `Source`.
 
     Attributes:
-        config, head_config: what it was made from. tier: how much was modelled, and why.
-        scene: maze, path and walls. calibration: of the head, None in the kinematic tier.
-        time: [N] s. start: [N] s, when the whisk cycles began.
-        truth: [N, 3]. odometry: [N, 4]. carried: [N] bool, the head was carried since the row before.
+        config, head_config: its settings. tier: the fidelity and its reason.
+        scene: maze, path and walls. calibration: of the head, None in the kinematic fidelity.
+        time: [N] s. start: [N] s, start of each whisk cycle.
+        truth: [N, 3]. odometry: [N, 4]. kidnapped: [N] bool, whether there was a kidnap since the row before.
+        features: contact features [N, W], None in the raw fidelities.
 
     Raises:
         InputError: the configuration cannot be simulated; says what and where.
@@ -124,16 +125,16 @@ class HeadSimulation(SimulatedSource):
         self.scene = make_scene(config.maze, config.path, config.motion, config.kidnaps, head, seed)
         count = int(min(self.scene.duration, self.scene.path.duration) * whisking.rate)
         if count < 1:
-            raise InputError("simulation.path", f"{self.scene.duration:.3g} s", "time for one whisk at least")
+            raise InputError("simulation.path", f"{self.scene.duration:.3g} s", "at least one whisk")
         self.start = np.arange(count) / whisking.rate
         self.time = self.start + MID_PROTRACTION / whisking.rate
         pose = poses_at(self.scene.path, self.time)
         self.truth = wrap_headings(pose)
-        self.carried = np.zeros(count, bool)
+        self.kidnapped = np.zeros(count, bool)
         rows = np.searchsorted(self.time, self.scene.jumps)
-        self.carried[rows[rows < count]] = True
+        self.kidnapped[rows[rows < count]] = True
         self.odometry = simulate_odometry(
-            config.odometry, self.time, pose, stream(seed, "odometry"), self.carried
+            config.odometry, self.time, pose, stream(seed, "odometry"), self.kidnapped
         )
         self._parts = self._surroundings()
         self.calibration = None if self.tier.name == "kinematic" else self._calibrated()
@@ -172,7 +173,7 @@ class HeadSimulation(SimulatedSource):
         return len(self.head.length)
 
     def _surroundings(self) -> list[tuple[Surroundings, slice]]:
-        """What is around in which cycles."""
+        """Walls, and the cycles in which they stand."""
         later = self.config.later_maze
         if later is None:
             return [(self.scene.surroundings, slice(None))]
@@ -184,15 +185,15 @@ class HeadSimulation(SimulatedSource):
         config = self.config
         parts = []
         for surroundings, rows in self._parts:
-            random = stream(config.seed, "sensor")  # the whole session's noise, whatever is around
-            all_of_it = simulate_kinematic(
+            random = stream(config.seed, "sensor")  # the noise of the whole session, whichever maze it is
+            columns = simulate_kinematic(
                 config.mechanics, config.whisking, surroundings, self.scene.path, self.start, random
             )
-            parts.append([column[rows] for column in all_of_it])
+            parts.append([column[rows] for column in columns])
         return WhiskColumns(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
     def _calibrated(self) -> Calibration:
-        """What the head's sensors report in free air, before the session."""
+        """Calibration from free whisking before the session."""
         config = self.config
         count = int(np.ceil(config.calibration.min_duration * config.whisking.rate))
         random = stream(config.seed, "calibration")
@@ -213,7 +214,7 @@ class HeadSimulation(SimulatedSource):
         return (whisk_of_row(self.head, self.features, row, NO_ODOMETRY) for row in range(self.length))
 
     def _cycles(self) -> Iterator[Cycle]:
-        """Raw samples of each cycle, without its odometry."""
+        """Raw samples of each cycle, without odometry."""
         assert self.calibration is not None
         config, random = self.config, stream(self.config.seed, "sensor")
         model, threshold = RAW_TIERS[self.tier.name], self.calibration.threshold[:, 1]

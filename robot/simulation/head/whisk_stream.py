@@ -1,4 +1,4 @@
-"""What is in the way of whiskers, sample by sample, and the cycles that a tier makes of it."""
+"""Walls in the sweep of whiskers at every sample, and cycles of raw samples from a mechanics model."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from tactile.whiskers.whisking import WhiskingConfig
 
 
 class WallSweep(NamedTuple):
-    """Cycles side by side.
+    """Walls in the sweep of parallel cycles.
 
     Attributes:
-        time: [T] s since the cycle began. wall: [T, N, W] protraction at which a whisker would touch, rad;
-            infinite where nothing is met. reach: [T, N, W] where along its shaft, as a share.
-        drift: [T, N, W] rad/s, how fast the wall moves sideways as seen from the whisker's base.
-        noise: [N, T, W, 3] rad, of angle, x and y.
+        time: [T] s since the start of the cycle. wall: [T, N, W] protraction at contact, rad; infinite
+            without contact. reach: [T, N, W] contact position, as a fraction of the shaft.
+        drift: [T, N, W] sideways angular speed of the wall as seen from the base of the whisker, rad/s.
+        noise: [N, T, W, 3] noise of angle, x and y, rad.
     """
 
     time: np.ndarray
@@ -46,7 +46,7 @@ class MechanicsModel(Protocol):
         sweep: WallSweep,
         threshold: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The true angle, x and y of every sample, [T, N, W] rad; the law is told y with its noise."""
+        """True angle, x and y of every sample, [T, N, W] rad; the whisking law reads y with noise."""
         ...
 
 
@@ -62,11 +62,10 @@ def simulate_cycles(
     threshold: np.ndarray,
     odometry: np.ndarray | None = None,
 ) -> Iterator[Cycle]:
-    """The raw cycles that start at times [N] s along a path. Whiskers are still when a cycle starts.
+    """Raw cycles that start at times [N] s along a path. Whiskers are at rest at the start of each cycle.
 
     Args:
-        threshold: [W] contact threshold of y, from a calibration, rad. odometry: [N, 4] dx, dy, dtheta, dt of
-            each cycle.
+        threshold: [W] contact threshold of y from a calibration, rad. odometry: [N, 4] dx, dy, dtheta, dt.
     """
     told = np.zeros((len(start), 4)) if odometry is None else odometry
     for k in range(0, len(start), config.batch):
@@ -86,7 +85,7 @@ def simulate_free_cycles(
     count: int,
     random: np.random.Generator,
 ) -> list[Cycle]:
-    """A record for calibration: that many cycles, in free air and open loop."""
+    """A calibration record: `count` cycles in free air with open-loop whisking."""
     whisking = whisking.model_copy(update={"mode": "open"})
     start = np.arange(count) / whisking.rate
     record: list[Cycle] = []
@@ -121,7 +120,7 @@ def _run(
 def sensor_readings(
     config: StreamConfig, head: Head, truth: tuple[np.ndarray, np.ndarray, np.ndarray], noise: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What sensors make of what a tier found: angles [N, T, W] and deflections [N, T, W, 2], rad."""
+    """Sensor readings for true values of a model: angles [N, T, W] and deflections [N, T, W, 2], rad."""
     # A dead whisker sends zeros.
     seen = (np.stack([part.swapaxes(0, 1) for part in truth], axis=-1) + noise) * head.alive[:, None]
     return seen[..., 0], np.clip(seen[..., 1:], -config.full_scale, config.full_scale)
@@ -150,18 +149,18 @@ def _swept(
 def sweep_walls(
     surroundings: Surroundings, pose: np.ndarray, knots: np.ndarray, time: np.ndarray, noise: np.ndarray
 ) -> WallSweep:
-    """What is in the way while heads move evenly from pose to pose.
+    """Walls in the sweep while heads move uniformly from pose to pose.
 
     Args:
-        pose: [N, K + 1, 3] m, m, rad; headings may be wrapped. knots: [K + 1] s, evenly spaced, when they are
-            reached. time: [T] s, of the samples. noise: [N, T, W, 3] rad.
+        pose: [N, K + 1, 3] m, m, rad; headings may be wrapped. knots: [K + 1] times of the poses, evenly
+            spaced, s. time: [T] sample times, s. noise: [N, T, W, 3] rad.
     """
     head, step = surroundings.head, knots[1] - knots[0]
     met = surroundings.contact(pose.reshape(-1, 3))
     shape = (len(pose), len(knots), len(head.length))
     wall, reach, box = (column.reshape(shape).swapaxes(0, 1) for column in met)
 
-    # Between two poses a wall's angle changes evenly; where another wall takes over, half-way.
+    # Between two poses the angle of a wall changes linearly; a change of wall happens half-way.
     place = np.clip(np.searchsorted(knots, time, side="right") - 1, 0, len(knots) - 2)
     share = ((time - knots[place]) / step)[:, None, None]
     same = (box[:-1] == box[1:]) & (box[1:] >= 0)
@@ -179,7 +178,7 @@ def sweep_walls(
 
 
 def _drift(head: Head, pose: np.ndarray, step: float, wall: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """[K, N, W] rad/s between one pose and the next."""
+    """Sideways angular speed [K, N, W] of walls between successive poses, rad/s."""
     motion = between(pose[:, :-1].reshape(-1, 3), pose[:, 1:].reshape(-1, 3)).reshape(*pose[:, 1:].shape)
     speed = motion.swapaxes(0, 1)[:, :, None] / step
     outwards = head.rest[:, :2] / np.linalg.norm(head.rest[:, :2], axis=1, keepdims=True)

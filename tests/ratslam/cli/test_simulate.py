@@ -113,7 +113,7 @@ def test_a_session_of_raw_samples_is_given_to_the_engine_as_if_live(raw, tmp_pat
 
 def test_the_tier_is_told_and_why(capsys, folder, tmp_path):
     assert main(["simulate", str(folder / "config.yaml"), "-o", str(tmp_path / "a.mcap")]) == 0
-    assert "in the kinematic tier: angles of contact" in capsys.readouterr().err
+    assert "in the kinematic tier: only contact features" in capsys.readouterr().err
 
 
 def test_nothing_is_overwritten(capsys, folder):

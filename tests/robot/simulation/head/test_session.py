@@ -153,7 +153,7 @@ def test_a_session_backwards_sees_the_same_places_from_the_same_side() -> None:
 def test_kidnaps_are_spread_and_hidden_from_odometry() -> None:
     whole = made(path={"circuits": "CACA"})
     session = made(path={"circuits": "CACA"}, kidnaps={"count": 3, "ahead": 30.0}, odometry={"noise": "none"})
-    rows = np.flatnonzero(session.carried)
+    rows = np.flatnonzero(session.kidnapped)
     assert len(rows) == 3
     assert (rows >= session.length // 4 - 1).all()
     assert abs(session.length - (whole.length - 90)) <= 1
@@ -163,7 +163,7 @@ def test_kidnaps_are_spread_and_hidden_from_odometry() -> None:
     assert set(wrong) <= set(rows - 1)
     assert len(wrong) >= 2  # where it is set down may look like going on
     assert (told[rows - 1] == told[rows - 2]).all()
-    assert made().carried.sum() == 0
+    assert made().kidnapped.sum() == 0
 
 
 def test_later_another_maze_is_felt() -> None:
@@ -183,7 +183,7 @@ def test_exploration_lasts_as_long_as_asked() -> None:
     assert len(cells) > 12
     carried = made(path={"explore": 400.0}, kidnaps={"count": 2, "ahead": 60.0})
     assert carried.length == 400
-    assert carried.carried.sum() == 2
+    assert carried.kidnapped.sum() == 2
     assert made(path={"explore": 400.0}, seed=1).truth[-1].tolist() != session.truth[-1].tolist()
 
 
