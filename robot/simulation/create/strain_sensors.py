@@ -3,8 +3,8 @@
 Each whisker has two channels: the horizontal strain at its base from bending (see `whisker_bending`), whose
 sign tells the side, and the vertical strain. Whiskers droop a little, so a force along the shaft bends them
 down; sensor axes are not exactly level, so part of the horizontal strain appears in the vertical channel.
-Sensors add noise, and the body vibrates at the start of a motion and, less, throughout it, which is why the paper
-filters at 17 Hz.
+Sensors add noise, and the body vibrates at the start of a motion and, less, throughout it: the paper
+therefore filters at 17 Hz.
 """
 
 from __future__ import annotations
