@@ -1,4 +1,4 @@
-"""Where a head is: on a USB, or an emulated one behind a socket."""
+"""Address of a whisker head: on USB, or an emulated one behind a socket."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ class Address(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> Address:
-        """The address that is written so.
+        """Parses an address.
 
         Raises:
-            ValueError: it is none.
+            ValueError: not an address.
         """
         if found := _USB.fullmatch(text):
             vendor, product, serial = found.groups()
@@ -38,7 +38,7 @@ class Address(NamedTuple):
         if found and not text.lower().startswith("usb") and int(found[2] or 0) < 65536:
             return cls(host=found[1], port=int(found[2] or EMULATOR_PORT))
         known = "usb, usb:1209:0001, usb:1209:0001:SERIAL or HOST:PORT"
-        raise ValueError(f"{text!r} is no address of a head; these are: {known}")
+        raise ValueError(f"{text!r} is not an address of a head; examples: {known}")
 
     def __str__(self) -> str:
         if self.host is not None:

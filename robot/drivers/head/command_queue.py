@@ -1,4 +1,4 @@
-"""Commands that wait to be sent to a head, and those that a head that comes back is told again."""
+"""Queue of commands to a head, and of those to repeat when a head reconnects."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from collections import deque
 from robot.drivers.head.protocol import KEEP_ALIVE, Command, CommandKind
 
 KEEP_ALIVE_PERIOD = 0.2
-"""s between commands, at most; a head left alone for 0.5 s retracts."""
+"""Longest time between commands, s; a head retracts 0.5 s after the last one."""
 PERSISTENT = (CommandKind.CENTRE, CommandKind.DRIVE)
-"""What stays true until it is told anew, in the order in which a head has to hear it."""
+"""Commands that stay valid until replaced, in the order in which they are sent again."""
 
 
 class CommandQueue:
-    """Any thread puts commands in; the reader's takes them out."""
+    """Any thread adds commands; the reader's thread sends them."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -24,7 +24,7 @@ class CommandQueue:
         self._sent = -float("inf")
 
     def put(self, command: Command) -> None:
-        """A command to send. Of amplitudes only the newest are worth sending."""
+        """Adds a command. Amplitudes replace older ones that wait."""
         with self._lock:
             if command.kind == CommandKind.AMPLITUDES:
                 self._waiting = deque(other for other in self._waiting if other.kind != command.kind)
@@ -34,26 +34,26 @@ class CommandQueue:
             self._awake = True
 
     def rest(self) -> None:
-        """Says no more: the head retracts by itself."""
+        """Ends the keep-alive commands, so that the head retracts."""
         with self._lock:
             self._waiting.clear()
             self._lasting.clear()
             self._awake = False
 
     def resend_persistent(self) -> None:
-        """The head has forgotten everything."""
+        """Sends the persistent commands again: the head has lost them."""
         with self._lock:
             self._waiting = deque(self._lasting[kind] for kind in PERSISTENT if kind in self._lasting)
 
     def next(self, now: float) -> Command | None:
-        """What to send now (s, host), if anything: a sign of life when there has been nothing else."""
+        """Command to send now (s, host), if any: a keep-alive when nothing else was sent."""
         with self._lock:
             if self._waiting:
                 return self._waiting[0]
             return KEEP_ALIVE if self._awake and now - self._sent >= KEEP_ALIVE_PERIOD else None
 
     def mark_sent(self, command: Command, now: float) -> None:
-        """It went through at that time."""
+        """Removes a command that was sent at that time."""
         with self._lock:
             self._sent = now
             if self._waiting and self._waiting[0] is command:

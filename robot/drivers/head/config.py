@@ -1,4 +1,4 @@
-"""The settings of the link to a whisker head."""
+"""Settings of the link to a whisker head."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ def _readable(address: str) -> str:
 
 
 class HeadLinkConfig(Settings):
-    """How a whisker head is reached, and what is no longer accepted of it."""
+    """Address and time limits of a whisker head."""
 
     address: Annotated[str, AfterValidator(_readable)] = "usb"
-    """`usb` for the only head plugged in, `usb:1209:0001` or `usb:1209:0001:SERIAL` for a certain one, or
-    HOST or HOST:PORT of an emulated one."""
+    """`usb` for the only head connected, `usb:1209:0001` or `usb:1209:0001:SERIAL` for a certain one, or HOST
+    or HOST:PORT of an emulated one."""
     patience: PositiveFloat = 20.0
-    """How long a head that is away, silent or cannot be read is waited for, with the arm still, s."""
+    """Time for which a disconnected, silent or unreadable head is awaited, with the arm at rest, s."""
     silence: PositiveFloat = 0.1
-    """Time without a sample after which the head counts as silent, and the arm stops, s."""
+    """Time without a sample after which the head counts as silent and the arm stops, s."""
     overload: PositiveFloat = 0.6
-    """Deflection of a whisker beyond which the arm stops and backs off, rad: three times what whisking on
-    a wall does to a simulated one in open loop, and under half of what its sensors report."""
+    """Deflection of a whisker beyond which the arm stops and backs off, rad: three times that of a simulated
+    one whisking on a wall in open loop, and less than half the range of its sensors."""
     rcp: Literal["head", "host"] = "head"
-    """Who lowers the amplitude of whiskers that touch, in the modes that do. The host answers a block of
-    samples late, so it bends whiskers more; only it knows `spread`."""
+    """Where contact feedback (RCP) is computed, in the modes that have it. The host reacts a block of samples
+    later, so whiskers bend more; only the host supports `spread`."""

@@ -1,4 +1,4 @@
-"""From a head's frames to the cycle of one whisk: the same function live and when a recording is read."""
+"""Assembles the frames of one whisk into a cycle: the same function live and in replay."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from robot.drivers.head.protocol import CHANNELS, to_radians
 from tactile.base.types import Cycle, Odometry
 
 MAX_FRAMES = 1 << 16
-"""Frames that are kept to be cut: half a minute at 2 kHz."""
+"""Number of frames kept for whisks to come: half a minute at 2 kHz."""
 
 
 class Cut(NamedTuple):
-    """Which frames are a whisk, and what else is known of it.
+    """The frames of a whisk, with its times and odometry.
 
     Attributes:
-        number: of the whisk. time: of its sample, s. start: when it began, s, on the same clock.
-        first, last: sequences of its first and last frame. frames: how many from first to last came.
-        odometry: motion since the cut before.
-        seen: whether its frames become a reading; False where its image was dropped: the motion counts all
-            the same.
+        number: of the whisk. time: of its sample, s. start: of the whisk, s, on the same clock.
+        first, last: sequence numbers of its first and last frame. frames: how many of these arrived.
+        odometry: motion since the whisk before.
+        seen: whether its frames become a reading; False where its image was dropped, which does not affect
+            the motion.
     """
 
     number: int
@@ -39,14 +39,14 @@ class Cut(NamedTuple):
 def make_cut(
     number: int, time: float, start: float, frames: Frames, odometry: Odometry, seen: bool = True
 ) -> Cut:
-    """The cut that is exactly these frames; without any, nothing is seen."""
+    """The cut of exactly these frames; not `seen` without frames."""
     count = len(frames.sequence)
     first, last = (int(frames.sequence.min()), int(frames.sequence.max())) if count else (0, -1)
     return Cut(number, float(time), float(start), first, last, count, odometry, bool(seen and count))
 
 
 def select_frames(frames: Frames, first: int, last: int) -> Frames:
-    """The frames from first to last, both included, ordered by sequence."""
+    """The frames from first to last, both included, ordered by sequence number."""
     rows = np.flatnonzero((frames.sequence >= first) & (frames.sequence <= last))
     rows = rows[np.argsort(frames.sequence[rows], kind="stable")]
     return Frames(*(np.ascontiguousarray(column[rows]) for column in frames))
@@ -56,10 +56,10 @@ def assemble_cycle(frames: Frames, cut: Cut) -> Cycle:
     """The whisk; without samples if the cut is not `seen`.
 
     Args:
-        frames: those of the cut, and perhaps others; in any order.
+        frames: those of the cut, in any order; others are ignored.
 
     Raises:
-        ValueError: some of the cut's frames are not among them.
+        ValueError: frames of the cut are missing.
     """
     if not cut.seen:
         frames = select_frames(frames, 0, -1)
@@ -67,14 +67,14 @@ def assemble_cycle(frames: Frames, cut: Cut) -> Cycle:
     mine = select_frames(frames, cut.first, cut.last)
     if len(mine.sequence) != cut.frames:
         raise ValueError(f"a whisk of {cut.frames} frames, of which {len(mine.sequence)} are there")
-    # The order in memory is part of the result: it decides in which order sums are taken.
+    # The memory layout matters: it decides the order of summation.
     angle, deflection = (np.ascontiguousarray(part) for part in to_radians(mine.values))
     time = cut.start + (mine.time - mine.time[0]) * 1e-6
     return Cycle(time, angle, deflection, cut.odometry)
 
 
 def empty_frames(whiskers: int) -> Frames:
-    """No frame of a head with so many whiskers."""
+    """Frames of a head with that many whiskers: none."""
     return Frames(
         np.zeros(0, np.int64),
         np.zeros(0, np.int64),
@@ -84,10 +84,10 @@ def empty_frames(whiskers: int) -> Frames:
 
 
 class FrameWindow:
-    """The frames of late, in blocks as they came.
+    """The most recent frames, in blocks as they arrived.
 
     Args:
-        empty: a block without frames, which tells the head's shape.
+        empty: a block without frames, for the shape.
     """
 
     def __init__(self, empty: Frames) -> None:
@@ -96,7 +96,7 @@ class FrameWindow:
         self._count = 0
 
     def add(self, block: Frames) -> None:
-        """The next block; the oldest ones go, but for the last `MAX_FRAMES` frames."""
+        """Adds a block; drops the oldest ones beyond the last `MAX_FRAMES` frames."""
         if not len(block.sequence):
             return
         self._blocks.append(block)
@@ -105,7 +105,7 @@ class FrameWindow:
             self._count -= len(self._blocks.popleft().sequence)
 
     def between(self, first: int, last: int) -> Frames:
-        """Those of the frames from first to last that are there, ordered by sequence."""
+        """The frames from first to last that are present, ordered by sequence number."""
         blocks = [
             block for block in self._blocks if block.sequence.min() <= last and block.sequence.max() >= first
         ]

@@ -1,10 +1,10 @@
-"""From the bytes of a head's stream to frames, through whatever happens to bytes on their way.
+"""Decodes a head's byte stream into frames, whatever happens to the bytes on the way.
 
-Bytes are read from left to right. Where the magic stands, as many bytes as a frame has are awaited and
-judged: a whole frame is stepped over; a refused one costs a byte, and the search for the magic goes on behind
-it. So a damaged frame takes nothing with it, where a stream was cut into pieces makes no difference, and
+The decoder searches for the magic, waits for the bytes of a frame and checks them. A valid frame is consumed;
+after an invalid one the search continues at the next byte. A damaged frame therefore costs no other frame,
+the result does not depend on how the stream was cut into pieces, and
 
-    bytes fed = frame size x (good + duplicates) + skipped_bytes + `pending`: those the next ones decide on
+    bytes fed = frame size x (good + duplicates) + skipped_bytes + `pending` (bytes not decided yet)
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from robot.drivers.head.protocol import CHANNELS, MAGIC, VERSION, WRAP, FrameFla
 from robot.drivers.head.sequence_numbers import HALF, SequenceUnwrapper
 
 BATCH, MAX_BATCH = 32, 1024
-"""Frames judged at once: so many after a fault, twice as many after every run without one."""
+"""Frames checked at once: the first number after a fault, doubled after every batch without one."""
 
 
 class Frames(NamedTuple):
-    """Samples of a head, in the order in which they came.
+    """Samples of a head, in order of arrival.
 
     Attributes:
         sequence: [N] int64 unique number; modulo 2^32 the number sent (`sequence_numbers`).
@@ -37,17 +37,17 @@ class Frames(NamedTuple):
 
 
 class DecoderCounts(NamedTuple):
-    """What a decoder has met since it was made.
+    """Counts of a decoder since it was made.
 
     Attributes:
-        good: frames accepted, which are those handed out.
-        bad: places where the magic stood, but no frame of this head: another version or shape, a wrong CRC.
+        good: frames accepted and returned.
+        bad: occurrences of the magic without a valid frame: wrong version, shape or CRC.
         missing: numbers between the first and the highest accepted of a stream that were not accepted, summed
-            over the streams. A frame that comes late takes its number off again.
-        skipped_bytes: bytes that belong to no whole frame, counted when they are passed by.
-        overruns: accepted frames that say the head dropped some before them.
-        duplicates: whole frames that were not handed out, for their number was accepted already or lies
-            before the first of its stream.
+            over the streams. Decreases when a frame arrives late.
+        skipped_bytes: bytes that belong to no valid frame, counted when they are skipped.
+        overruns: accepted frames that report dropped frames before them.
+        duplicates: valid frames that were not returned: their number was accepted before, or lies before the
+            first of its stream.
         restarts: streams after the first.
     """
 
@@ -61,11 +61,11 @@ class DecoderCounts(NamedTuple):
 
 
 class FrameDecoder(Protocol):
-    """What reads a bridge's stream; another bridge brings its own."""
+    """A decoder of a bridge's stream; another bridge brings its own."""
 
     @property
     def counts(self) -> DecoderCounts:
-        """So far."""
+        """Counts so far."""
         ...
 
     def feed(self, data: bytes) -> Frames:
@@ -73,19 +73,19 @@ class FrameDecoder(Protocol):
         ...
 
     def restart(self, time: int | None = None) -> None:
-        """What comes next is a new stream; a frame begun is given up.
+        """Starts a new stream; a partial frame is dropped.
 
         Args:
-            time: the device's clock about now, us; None: the next frame's time is taken as it stands.
+            time: approximate device clock now, us; None: the time of the next frame is used as it is.
         """
         ...
 
 
 class Decoder:
-    """Reads the frames of `robot.drivers.head.protocol`.
+    """Decodes the frames of `robot.drivers.head.protocol`.
 
     Args:
-        whiskers: of the head. channels: of a whisker.
+        whiskers: number on the head. channels: per whisker.
     """
 
     def __init__(self, whiskers: int, channels: int = CHANNELS) -> None:
@@ -114,7 +114,7 @@ class Decoder:
 
     @property
     def pending(self) -> int:
-        """Bytes whose fate the next ones decide; fewer than a frame has."""
+        """Bytes not decided yet; fewer than a frame."""
         return len(self._rest)
 
     def restart(self, time: int | None = None) -> None:
@@ -142,7 +142,7 @@ class Decoder:
         return self._accepted(np.frombuffer(b"".join(runs), self._type))
 
     def _whole(self, buffer: bytes, start: int) -> int:
-        """How many whole frames stand back to back from there, of those that are judged at once."""
+        """Number of consecutive valid frames from there, among those checked at once."""
         shape_at = start + self._shape_at
         if buffer[shape_at : shape_at + 3] != self._shape:
             return 0
@@ -184,5 +184,5 @@ class Decoder:
 
 
 def _partial_magic(tail: bytes) -> int:
-    """Bytes at the end that may be the beginning of the magic."""
+    """Number of bytes at the end that may be the start of the magic."""
     return next((k for k in range(len(tail), 0, -1) if tail.endswith(MAGIC[:k])), 0)

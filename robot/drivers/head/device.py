@@ -1,7 +1,7 @@
-"""The bridge between a head and this machine, by pyusb: over libusb, or over an emulator's socket.
+"""USB bridge of a head by pyusb: over libusb, or over the socket of an emulator.
 
-What goes wrong has three names: `Disconnected`, the device is not there (any more); `Stalled`, a transfer was
-refused, and the endpoint is cleared by now; and `InputError`, nothing changes until the user does something.
+Errors: `Disconnected` (no such device, or no longer), `Stalled` (a transfer failed; the endpoint has been
+cleared), `InputError` (the user has to act).
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from tactile.base.errors import InputError
 
 T = TypeVar("T")
 TIMEOUT = 500
-"""ms for control requests and commands."""
+"""Time-out of control requests and commands, ms."""
 
 
 class Disconnected(OSError):
-    """The head is not, or no longer, there."""
+    """The head is not connected."""
 
 
 class Stalled(OSError):
-    """A transfer was refused; the next one may go through."""
+    """A transfer failed; the next one may succeed."""
 
 
 class HeadIdentity(NamedTuple):
@@ -49,13 +49,13 @@ class HeadIdentity(NamedTuple):
 
 
 class Bridge(Protocol):
-    """A head's end of the wire. Used by one thread at a time."""
+    """Connection to a head. Used by one thread at a time."""
 
     def read(self, size: int, timeout: float) -> bytes:
-        """Some of the stream, at most so many bytes; none if none come within `timeout` s.
+        """Reads at most `size` bytes of the stream; none if none arrive within `timeout` s.
 
         Raises:
-            Gone, Stalled.
+            Disconnected, Stalled.
         """
         ...
 
@@ -63,28 +63,28 @@ class Bridge(Protocol):
         """Sends a command.
 
         Raises:
-            Gone, Stalled: nobody takes it.
+            Disconnected, Stalled.
         """
         ...
 
     def request(self, request: Request) -> bytes:
-        """The answer to a control request.
+        """Sends a control request and returns the answer.
 
         Raises:
-            Gone, Stalled: the head does not know it, or does not answer.
+            Disconnected, Stalled: unknown request, or no answer.
         """
         ...
 
     def close(self) -> None:
-        """Lets go of the device."""
+        """Releases the device."""
         ...
 
 
 def read_identity(bridge: Bridge) -> HeadIdentity:
-    """What is at the other end.
+    """Asks the device for its identity.
 
     Raises:
-        Gone, Stalled. InputError: it is something else than a head.
+        Disconnected, Stalled. InputError: the device is not a head.
     """
     answer = bridge.request(Request.IDENTITY)
     try:
@@ -93,16 +93,14 @@ def read_identity(bridge: Bridge) -> HeadIdentity:
         return HeadIdentity(str(told["name"]), str(told["version"]), *size, float(told["rate"]))
     except (ValueError, KeyError, TypeError):
         cure = "check the address, or the bridge's firmware"
-        raise InputError(
-            "head", f"it calls itself {answer[:80]!r}", "name, version, shape, rate", cure
-        ) from None
+        raise InputError("head", f"identity {answer[:80]!r}", "name, version, shape, rate", cure) from None
 
 
 def open_bridge(address: str) -> Bridge:
-    """The bridge at an address as `HeadLinkConfig` has it.
+    """Opens the bridge at an address (`HeadLinkConfig.address`).
 
     Raises:
-        Gone: none is there. InputError: this machine cannot reach any: libraries, rights, another program.
+        Disconnected: no such device. InputError: library or permission missing, or device in use.
     """
     where = Address.parse(address)
     core = _pyusb()
@@ -118,7 +116,7 @@ def open_bridge(address: str) -> Bridge:
 
 
 class UsbBridge:
-    """A device of pyusb as a `Bridge`. Takes its interface for itself."""
+    """A pyusb device as a `Bridge`; claims the interface."""
 
     def __init__(self, device: Any, where: str) -> None:
         self._device, self._where = device, where
@@ -152,7 +150,7 @@ class UsbBridge:
         util.dispose_resources(self._device)
 
     def _configured(self) -> None:
-        # Choosing a configuration resets a device that runs, so only one that has none is given one.
+        # Setting a configuration resets a running device, so it is set only where there is none.
         try:
             configured = self._device.get_active_configuration() is not None
         except _pyusb().USBError:
@@ -161,7 +159,7 @@ class UsbBridge:
             self._device.set_configuration()
 
     def _try(self, action: Callable[[], T], endpoint: int | None = None) -> T | None:
-        """What a transfer gives; None when its time ran out."""
+        """Result of a transfer; None after its time-out."""
         core = _pyusb()
         try:
             return action()
@@ -178,15 +176,15 @@ class UsbBridge:
 
 
 def _translate(error: Any, where: str) -> OSError | InputError:
-    """What a USBError is called here."""
+    """Translates a USBError."""
     if error.errno == errno.EACCES:
-        cure = "allow it by a udev rule, see robot/head/README.md"
+        cure = "add a udev rule, see robot/drivers/head/README.md"
         return InputError("head", f"{where} may not be opened by this user", "", cure)
     if error.errno == errno.EBUSY:
-        return InputError("head", f"{where} is in use", "", "end the other program that reads it")
+        return InputError("head", f"{where} is in use", "", "end the other program that uses it")
     if error.errno == errno.EPIPE:
         return Stalled(errno.EPIPE, f"{where} refused a transfer")
-    # EIO and its like: what a device that is being pulled out answers with, just before ENODEV.
+    # EIO and similar: returned while a device is being pulled out, just before ENODEV.
     if error.errno in (errno.ENODEV, errno.ENOENT, errno.ENXIO, errno.ESHUTDOWN, errno.EPROTO, errno.EIO):
         return Disconnected(errno.ENODEV, f"{where} is gone")
     return Stalled(error.errno or errno.EIO, f"{where}: {error}")
@@ -199,7 +197,7 @@ def _serial_filter(serial: str | None) -> Callable[[Any], bool] | None:
     def matches(device: Any) -> bool:
         try:
             return device.serial_number == serial
-        except (ValueError, _pyusb().USBError):  # no rights to ask, or no serial: another device
+        except (ValueError, _pyusb().USBError):  # no permission, or no serial number: another device
             return False
 
     return matches
@@ -214,7 +212,7 @@ def _pyusb() -> Any:
 
 
 def _libusb() -> Any:
-    """The backend of libusb: the one that the package brings, else the system's."""
+    """The libusb backend: of libusb-package, else the system's."""
     from usb.backend import libusb1
 
     try:

@@ -1,4 +1,4 @@
-"""When whiskers are bent so far that the arm must not go on."""
+"""Detects whiskers bent so far that the arm must stop."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import numpy as np
 from robot.drivers.head.protocol import ANGLE
 
 FULL_SCALE = 32767
-"""An angle that is not smaller, in counts, is at the end of its range: the sensor knows no more."""
+"""Counts from which an angle is at the end of the sensor's range."""
 
 
 class OverloadDetector:
-    """Finds whiskers overloaded in two samples in a row; one alone is a fault of transmission or a knock.
+    """Finds whiskers overloaded in two consecutive samples; a single one is a transmission error or a knock.
 
     Args:
         limit: deflection, rad, of x or y. alive: [W] whiskers that count.
@@ -23,7 +23,8 @@ class OverloadDetector:
         self._before = np.zeros(len(self._alive), bool)
 
     def check(self, values: np.ndarray) -> int | None:
-        """The first whisker that is overloaded in counts [N, W, 3] or between them and the ones before."""
+        """The first whisker overloaded in values [N, W, 3], or in the last ones before and the first of
+        these."""
         if not len(values):
             return None
         size = np.abs(values.astype(np.int32))  # int16 has no 32768

@@ -32,7 +32,7 @@ import numpy as np
 from tactile.base.types import Array
 
 VENDOR, PRODUCT = 0x1209, 0x0001
-"""The USB numbers that pid.codes keeps for tests."""
+"""USB ids that pid.codes reserves for tests."""
 ENDPOINT_IN, ENDPOINT_OUT = 0x81, 0x01
 """Bulk: frames to the host, commands to the head."""
 INTERFACE = 0
@@ -43,18 +43,18 @@ CHANNELS = 3
 ANGLE = np.pi / 32768
 """rad per count, of theta, x and y alike."""
 COMMAND_TIMEOUT = 0.5
-"""s without a command after which a head retracts."""
+"""Time without a command after which a head retracts, s."""
 WRAP = 2**32
-"""Sequence and device time begin at 0 again there."""
+"""Sequence numbers and device times wrap at this value."""
 
 
 class FrameFlag(IntFlag):
-    """What a frame says about the head."""
+    """Status flags of a frame."""
 
     OVERRUN = 1
-    """Frames were dropped just before this one: nobody read them."""
+    """Frames were dropped just before this one: the host did not read them."""
     RCP = 2
-    """The head's own feedback lowers an amplitude now."""
+    """Feedback in the head reduces an amplitude."""
     FAULT = 4
     """A drive reports a fault."""
     CYCLE = 8
@@ -62,37 +62,37 @@ class FrameFlag(IntFlag):
 
 
 class CommandKind(IntEnum):
-    """What a command is for."""
+    """Kind of a command."""
 
     KEEP = 0
-    """Stay awake: nothing else in it counts."""
+    """Keep-alive; all other fields are ignored."""
     DRIVE = 1
     """Whisk with these parameters from the next cycle on. The n numbers are the contact thresholds of y."""
     AMPLITUDES = 2
-    """In mode `OPEN`: the n numbers are the whiskers' amplitudes for the rest of this cycle; in the next one
-    it is the common one again. What does not come in time does no harm."""
+    """In mode `OPEN`: the n numbers are the amplitudes of the whiskers for the rest of this cycle; in the
+    next one the common amplitude applies again, so a late command does no harm."""
     CENTRE = 3
-    """The n numbers are the mean of y in free air, which feedback in the head is relative to."""
+    """The n numbers are the means of y in free air, the reference of feedback in the head."""
 
 
 class FeedbackMode(IntEnum):
-    """Who lowers the amplitude when a whisker touches."""
+    """Where the amplitude is reduced on contact."""
 
     OPEN = 0
-    """Nobody in the head: the host may, by `Kind.AMPLITUDES`."""
+    """Not in the head; the host may, by `CommandKind.AMPLITUDES`."""
     RCP = 1
-    """The head, as `tactile.whiskers.whisking` has it."""
+    """In the head, by the law of `tactile.whiskers.whisking`."""
 
 
 class Request(IntEnum):
-    """Vendor control requests to the device; answers in parentheses."""
+    """Vendor control requests; answers in parentheses."""
 
     START = 1
-    """Send frames, from now on (nothing)."""
+    """Start sending frames (no answer)."""
     STOP = 2
-    """Retract, stop the drives, send no more frames (nothing)."""
+    """Retract, stop the drives and stop sending frames (no answer)."""
     CLOCK = 3
-    """(u64: the device's time, us, of which frames carry the lower 32 bits.)"""
+    """(u64: device time, us; frames carry its lower 32 bits.)"""
     IDENTITY = 4
     """(JSON: name, version, whiskers, channels, rate in Hz.)"""
 
@@ -100,18 +100,17 @@ class Request(IntEnum):
 REQUEST_IN, REQUEST_OUT = 0xC0, 0x40
 """bmRequestType: vendor, device."""
 MAX_ANSWER = 1024
-"""Bytes of an answer, at most."""
+"""Maximum length of an answer, bytes."""
 NO_THRESHOLD = 32767
-"""A threshold that no deflection reaches."""
+"""Contact threshold of whiskers without feedback."""
 
 
 class Command(NamedTuple):
     """One command.
 
     Attributes:
-        kind: what for. mode: who feeds back. amplitude, offset: rad; a whisk protracts from the offset.
-            frequency: Hz. gain: rad per rad. window: s, over which deflections are averaged.
-        numbers: [n] int16 counts, what they are follows from the kind.
+        kind, mode: see there. amplitude, offset: rad; a whisk protracts from the offset. frequency: Hz.
+        gain: rad per rad. window: averaging time of deflections, s. numbers: [n] int16, meaning by kind.
     """
 
     kind: CommandKind
@@ -126,12 +125,12 @@ class Command(NamedTuple):
 
 _COMMAND = struct.Struct("<4sBBBB5f")
 COMMAND_SIZE = _COMMAND.size + 4
-"""Bytes of a command without numbers: 32."""
+"""Length of a command without numbers, bytes: 32."""
 KEEP_ALIVE = Command(CommandKind.KEEP)
 
 
 def frame_dtype(whiskers: int, channels: int = CHANNELS) -> np.dtype:
-    """A frame as it lies in memory, without padding."""
+    """Memory layout of a frame, without padding."""
     return np.dtype(
         [
             ("magic", "<u4"),
@@ -148,7 +147,7 @@ def frame_dtype(whiskers: int, channels: int = CHANNELS) -> np.dtype:
 
 
 def pack_frames(sequence: Array, time: Array, flags: Array, values: Array) -> bytes:
-    """The frames of N samples, back to back.
+    """The bytes of the frames of N samples.
 
     Args:
         sequence: [N] of any size. time: [N] us, of any size. flags: [N] `FrameFlag`. values: [N, W, C] int16.
@@ -168,7 +167,7 @@ def pack_frames(sequence: Array, time: Array, flags: Array, values: Array) -> by
 
 
 def frame_values(angle: Array, deflection: Array) -> np.ndarray:
-    """[N, W, 3] int16 of angles [N, W] and deflections [N, W, 2], rad; clipped to what int16 holds."""
+    """Values [N, W, 3] int16 of angles [N, W] and deflections [N, W, 2], rad; clipped to int16."""
     return to_counts(np.concatenate([np.asarray(angle)[..., None], np.asarray(deflection)], axis=-1))
 
 
@@ -184,7 +183,7 @@ def to_radians(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def pack_command(command: Command) -> bytes:
-    """A command as it is sent."""
+    """The bytes of a command."""
     numbers = np.asarray(command.numbers, "<i2")
     kind, mode, *drive = command[:-1]
     body = _COMMAND.pack(COMMAND_MAGIC, VERSION, kind, mode, len(numbers), *drive) + numbers.tobytes()
@@ -192,7 +191,7 @@ def pack_command(command: Command) -> bytes:
 
 
 def unpack_command(packet: bytes) -> Command | None:
-    """The command in a packet; None if it is not a whole one of ours."""
+    """The command in a packet; None if it is not a valid one."""
     if len(packet) < COMMAND_SIZE or zlib.crc32(packet[:-4]) != int.from_bytes(packet[-4:], "little"):
         return None
     magic, version, kind, mode, count, amplitude, frequency, gain, window, offset = _COMMAND.unpack_from(

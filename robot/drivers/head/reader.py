@@ -1,6 +1,6 @@
-"""The thread that a head's wire belongs to: samples in, commands out, and a head that goes and comes back.
+"""Reader thread of a head: reads samples, sends commands, reconnects.
 
-Only this thread touches the bridge: it reads what is there, hands it on, and sends what waits.
+Only this thread uses the bridge.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from robot.drivers.outcome import Fault, SessionOutcome
 from tactile.base.errors import InputError
 
 READ_SIZE = 4096
-"""Bytes asked for at once: 16 ms of 18 whiskers at 2 kHz."""
+"""Bytes requested by a read: 16 ms of 18 whiskers at 2 kHz."""
 READ_TIMEOUT = 0.02
-"""s that a read waits for bytes, and so about the longest that a command waits."""
+"""Time-out of a read, and so about the longest delay of a command, s."""
 RETRY_PERIOD = 0.25
-"""s between attempts to find a head that is away, or to start one that is silent."""
+"""Time between attempts to find a disconnected head or to start a silent one, s."""
 
 
 class LinkState(Enum):
-    """How it stands with the head."""
+    """State of the link."""
 
-    STREAMING = "samples come"
-    SILENT = "the head is there, and sends nothing"
-    GARBLED = "bytes come, and no sample can be made of them"
-    AWAY = "the head is not there"
-    CLOSED = "nobody reads"
+    STREAMING = "the head sends samples"
+    SILENT = "the head is connected but sends nothing"
+    GARBLED = "the head sends no valid samples"
+    AWAY = "the head is not connected"
+    CLOSED = "the reader is closed"
 
 
 class LinkStatus(NamedTuple):
-    """How it stands, and since when (s, host)."""
+    """State of the link, and since when (s, host)."""
 
     link: LinkState
     since: float
@@ -58,20 +58,20 @@ OUTCOMES = {
 
 
 class HeadReader:
-    """Reads a head, from `start` until `close`.
+    """Reads a head from `start` to `close`.
 
     Args:
-        connect: opens the bridge; called again whenever the head has gone. whiskers: that it must have.
-        config: when it counts as lost. decoder: of its stream; None for that of
-        `robot.drivers.head.protocol`.
-        alive: [W] whose overload counts; None for all. on_overload: told the whisker with every block of
-            samples that shows one.
+        connect: opens the bridge; called again when the head was disconnected. whiskers: required number.
+        config: time limits. decoder: of the stream; None for that of `robot.drivers.head.protocol`.
+        alive: [W] whiskers checked for overload; None for all. on_overload: called with the whisker for every
+            block of samples that shows one.
 
     Attributes:
-        ring: the newest samples. listeners: told every block of samples, and when it arrived (s, host).
-            on_restart: told the device's clock (us) and the host's (s) whenever a head was found: its numbers
-            and its clock may have begun anew. All are called on the reader's thread, and must be quick.
-        identity: of the head found last. stalls: transfers refused so far.
+        ring: the newest samples. listeners: called with every block of samples and its arrival time (s,
+            host). on_restart: called with the device clock (us) and the host's (s) after each connection:
+            numbers and clock may have restarted. All are called on the reader's thread and must return
+            quickly.
+        identity: of the head connected last. stalls: number of failed transfers.
     """
 
     def __init__(
@@ -104,10 +104,10 @@ class HeadReader:
         self._thread = threading.Thread(target=self._run, name="head reader", daemon=True)
 
     def start(self, timeout: float = 5.0) -> HeadReader:
-        """Finds the head and starts its stream.
+        """Connects to the head and starts its stream.
 
         Raises:
-            InputError: there is none within `timeout` s, or it is not the one wanted.
+            InputError: no head within `timeout` s, or the wrong one.
         """
         self._sample = self._away = time.monotonic()
         self._thread.start()
@@ -120,7 +120,7 @@ class HeadReader:
         return self
 
     def close(self) -> None:
-        """Stops the head, and lets go of it."""
+        """Stops the head and releases it."""
         self._ending.set()
         if self._thread.is_alive() and self._thread is not threading.current_thread():
             self._thread.join(5.0)
@@ -132,7 +132,7 @@ class HeadReader:
         self.close()
 
     def send(self, command: Command) -> None:
-        """Has a command sent, within about `READ_TIMEOUT`. From now on the head is kept awake."""
+        """Queues a command, to be sent within about `READ_TIMEOUT`; the head is kept awake from now on."""
         self._queue.put(command)
 
     def rest(self) -> None:
@@ -141,7 +141,7 @@ class HeadReader:
 
     @property
     def state(self) -> LinkStatus:
-        """How it stands with the head; right even while the thread hangs in a transfer."""
+        """State of the link; also correct while the thread hangs in a transfer."""
         now, sample, away = time.monotonic(), self._sample, self._away
         if self._ending.is_set() or not self._thread.is_alive():
             return LinkStatus(LinkState.CLOSED, sample)
@@ -153,12 +153,12 @@ class HeadReader:
 
     @property
     def age(self) -> float:
-        """Of the newest sample, s."""
+        """Age of the newest sample, s."""
         return time.monotonic() - self._sample
 
     @property
     def fault(self) -> Fault | None:
-        """What the session cannot wait for any longer; once one, always one."""
+        """Why the session must end; a fault stays."""
         link = self.state.link
         lost = link in OUTCOMES and self.age > self.config.patience
         if self._fault is None and lost:
@@ -179,12 +179,12 @@ class HeadReader:
                 self._away = time.monotonic() if self._away is None else self._away
                 self._ending.wait(RETRY_PERIOD)
         except Exception as error:
-            detail = f"its reader ended: {type(error).__name__}: {error}"
+            detail = f"the reader thread ended: {type(error).__name__}: {error}"
             self._fault = Fault(SessionOutcome.HEAD_GONE, detail, time.monotonic())
             raise
 
     def _open(self) -> Bridge:
-        """A bridge whose head is the right one, told all that it has to know."""
+        """Opens the bridge, checks the head and sends it the persistent commands."""
         bridge = self._connect()
         try:
             self.identity = found = read_identity(bridge)
@@ -240,7 +240,7 @@ class HeadReader:
 
     @contextlib.contextmanager
     def _tolerant(self) -> Iterator[None]:
-        """Gives up a transfer that was refused, and waits a moment, for the next one may be too."""
+        """Ignores a failed transfer and waits a moment: the next one may fail too."""
         try:
             yield
         except Stalled:

@@ -1,4 +1,4 @@
-"""The newest samples of a head, kept by their number."""
+"""Ring buffer of the newest samples of a head, by sequence number."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from robot.drivers.head.decoder import Frames
 from robot.drivers.head.protocol import CHANNELS
 
 SIZE = 2**16
-"""Samples: 33 s at 2 kHz."""
+"""Number of samples: 33 s at 2 kHz."""
 EMPTY = -(2**62)
 
 
 class RingBuffer:
-    """The last samples; any thread may ask while another appends. What is handed out is the asker's own.
+    """The last samples. Any thread may read while another appends; results are copies.
 
     Args:
-        whiskers, channels: of the head. size: samples kept, a power of two.
+        whiskers, channels: of the head. size: number of samples, a power of two.
     """
 
     def __init__(self, whiskers: int, channels: int = CHANNELS, size: int = SIZE) -> None:
@@ -34,12 +34,12 @@ class RingBuffer:
 
     @property
     def newest(self) -> tuple[int, int, float] | None:
-        """Highest number, latest device time (us) and last arrival (s, host); None before any came."""
+        """Highest number, its device time (us) and the last arrival (s, host); None before any."""
         with self._lock:
             return None if self._newest == EMPTY else (self._newest, self._latest, self._arrival)
 
     def append(self, frames: Frames, arrival: float) -> None:
-        """Takes what arrived at a host time, s; but nothing from further back than the ring reaches."""
+        """Adds frames that arrived at a host time, s; those older than the ring reaches are ignored."""
         with self._lock:
             if not len(frames.sequence):
                 return
@@ -54,7 +54,7 @@ class RingBuffer:
             self._latest = int(self._time[newest % self._size])
 
     def between(self, first: int, last: int) -> Frames:
-        """Those numbered `first` to `last`, both included, that are there; in order."""
+        """The frames numbered `first` to `last`, both included, that are present; in order."""
         with self._lock:
             number = np.arange(max(first, self._newest - self._size + 1), min(last, self._newest) + 1)
             return self._at(number[self._sequence[number % self._size] == number] % self._size)

@@ -1,4 +1,4 @@
-"""Numbers of 32 bits continued without a wrap: which frames are new, which miss, where a stream begins."""
+"""Unwraps 32-bit sequence numbers; finds new, missing and repeated frames and restarts of the stream."""
 
 from __future__ import annotations
 
@@ -7,23 +7,23 @@ import numpy as np
 from robot.drivers.head.protocol import WRAP
 
 LATE = 4096
-"""How far behind the newest a frame can be and still be late: a head holds no more of them."""
+"""Largest distance of a late frame behind the newest; a head buffers no more frames."""
 HALF = WRAP // 2
 BATCH = 1024
-"""Numbers looked at together."""
+"""Numbers processed at once."""
 
 
 class SequenceUnwrapper:
     """The numbers of the frames accepted so far.
 
-    A number less than `HALF` above the highest is ahead; one less than `LATE` below it is late; from further
-    below speaks a head that began to count anew, and a new stream begins. Its numbers are put into the next
-    2^32, so that no two frames share one.
+    A number less than `HALF` above the highest is ahead; one less than `LATE` below it is late; one further
+    below means that the head has restarted its count, and a new stream begins. Its numbers continue in the
+    next 2^32, so that all numbers are unique.
     """
 
     def __init__(self) -> None:
         self.streams = 0
-        """Streams begun."""
+        """Number of streams."""
         self._begun = False
         self._first = self._highest = self._held = 0
         self._before = 0
@@ -35,16 +35,16 @@ class SequenceUnwrapper:
         return self._before + self._lacking()
 
     def restart(self) -> None:
-        """The next frame begins a stream."""
+        """Lets the next frame start a stream."""
         self._before += self._lacking()
         self._begun = False
 
     def take(self, raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Frames with the numbers raw [N], in the order of their arrival.
+        """Unwraps raw numbers [N], in order of arrival.
 
         Returns:
-            [N] int64 full numbers, and [N] bool, those to accept: the number is new, and not before the first
-            of its stream.
+            [N] int64 unwrapped numbers, and [N] bool, those to accept: new, and not before the first of the
+            stream.
         """
         raw = raw.astype(np.int64)
         number, new = np.empty_like(raw), np.ones(len(raw), bool)
@@ -61,7 +61,7 @@ class SequenceUnwrapper:
         return number, new
 
     def _rising(self, raw: np.ndarray) -> int:
-        """How many of these each lie ahead of the one before."""
+        """Length of the leading part in which each number is ahead of the one before."""
         if not self._begun:
             return 0
         ahead = (raw - self._highest) % WRAP
@@ -71,7 +71,7 @@ class SequenceUnwrapper:
         return len(raw) if rising.all() else int(rising.argmin())
 
     def _other(self, raw: int) -> tuple[int, bool]:
-        """A number that is not ahead, and whether it is to be accepted."""
+        """A number that is not ahead, unwrapped, and whether it is to be accepted."""
         number = self._highest - (self._highest - raw) % WRAP
         if not self._begun or number <= self._highest - LATE:
             self.restart()
@@ -90,7 +90,7 @@ class SequenceUnwrapper:
         return number
 
     def _ahead(self, number: np.ndarray) -> None:
-        """Increasing numbers, all above the highest."""
+        """Accepts increasing numbers, all above the highest."""
         last = int(number[-1])
         self._seen[np.arange(max(self._highest, last - LATE) + 1, last + 1) % LATE] = False
         self._seen[number[number > last - LATE] % LATE] = True

@@ -1,4 +1,4 @@
-"""A pyusb backend whose bus is an emulator's socket: real pyusb, no kernel, no libusb."""
+"""A pyusb backend for an emulated device behind a socket: no kernel, no libusb."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ T = TypeVar("T")
 
 
 class Handle:
-    """An open device: a connection for what waits for data, another for all else."""
+    """An open device: one connection for transfers that wait for data, another for all others."""
 
     def __init__(self, host: str, port: int) -> None:
         self.inwards = UsbConnection(host, port)
@@ -37,7 +37,7 @@ class SocketBackend:
         self.host, self.port = host, port
 
     def enumerate_devices(self) -> Iterator[bytes]:
-        """The device's descriptors, if one is plugged in; they are its identification."""
+        """The device's descriptors, if it is plugged in; they identify it."""
         try:
             line = UsbConnection(self.host, self.port)
         except OSError:
@@ -50,7 +50,7 @@ class SocketBackend:
             line.close()
 
     def get_parent(self, dev: bytes) -> None:
-        """None is known."""
+        """There is no parent."""
 
     def get_device_descriptor(self, dev: bytes) -> SimpleNamespace:
         names = (
@@ -161,12 +161,12 @@ class SocketBackend:
 
 
 def tcp_backend(host: str, port: int = PORT) -> SocketBackend:
-    """A backend for pyusb whose bus is the emulator at that address: `usb.core.find(backend=...)`."""
+    """A pyusb backend for the emulator at that address: `usb.core.find(backend=...)`."""
     return SocketBackend(host, port)
 
 
 def _as_usb_error(action: Callable[[], T]) -> T:
-    """The action, whose errors are told as libusb's are."""
+    """Runs an action; translates errors to those of libusb."""
     import usb.core
 
     try:
@@ -177,7 +177,7 @@ def _as_usb_error(action: Callable[[], T]) -> T:
 
 
 def _descriptors(dev: bytes, kind: int) -> list[bytes]:
-    """The descriptors of a kind: each begins with its length and its kind."""
+    """The descriptors of a kind; each starts with its length and kind."""
     found, place = [], 0
     while place < len(dev):
         if dev[place + 1] == kind:

@@ -1,15 +1,15 @@
-"""USB over TCP: what is said on a connection to an emulated device, and the client's end of it.
+"""USB over TCP: protocol of a connection to an emulated device, and its client.
 
-A client sends requests one after another and waits for each answer, so transfers that may have to wait for
-each other take connections of their own. Little-endian:
+A client waits for each answer before the next request, so concurrent transfers need separate connections.
+Little-endian:
 
     request: u8 op | u8 address | u8 request | u8 0 | u16 value | u16 index | u32 timeout, ms | u32 length
              and the data
     answer:  i32 status | u32 length | data
 
-`address` is that of an endpoint, or bmRequestType of a control transfer; its highest bit says that data comes
-in, and then the request carries none. The status is 0 or an errno, negative. Only the standard library is
-used: interpreters without this project's packages have to speak it too.
+`address` is that of an endpoint, or bmRequestType of a control transfer; its highest bit marks data to the
+host, where the request carries none. The status is 0 or a negative errno. Only the standard library is used,
+so that interpreters without this project's packages can use it.
 """
 
 from __future__ import annotations
@@ -25,28 +25,28 @@ from enum import IntEnum
 PORT = 30100
 REQUEST, ANSWER = struct.Struct("<BBBxHHII"), struct.Struct("<iI")
 IN = 0x80
-"""The bit of an address that says that data comes in."""
+"""Bit of an address that marks data to the host."""
 PATIENCE = 2.0
-"""s that an answer may take beyond the time-out of its transfer, before the device counts as gone."""
+"""Time beyond a transfer's time-out after which the device counts as disconnected, s."""
 
 
 class Op(IntEnum):
-    """What is asked for."""
+    """Kinds of request."""
 
     DESCRIBE = 0
-    """The device's and the configuration's descriptors, as they are on a bus."""
+    """The descriptors of device and configuration, as on a bus."""
     CLAIM = 1
-    """The interface, until released or the connection ends; EBUSY while another has it."""
+    """Claim the interface until release or the end of the connection; EBUSY while claimed by another."""
     RELEASE = 2
     CONTROL = 3
     BULK = 4
     CLEAR = 5
-    """The halt of an endpoint."""
+    """Clear the halt of an endpoint."""
     RESET = 6
 
 
 class UsbConnection:
-    """A connection to an emulated device; a thread at a time uses it, others wait.
+    """A connection to an emulated device; threads use it in turn.
 
     Raises:
         OSError: ENODEV where nothing listens, or the device has been unplugged since.
@@ -71,13 +71,13 @@ class UsbConnection:
         size: int = 0,
         timeout: int = 1000,
     ) -> bytes:
-        """What a request is answered with.
+        """Sends a request and returns the answer.
 
         Args:
             data: to send. size: bytes wanted, where data comes in. timeout: ms, 0 waits for ever.
 
         Raises:
-            OSError: as the transfer ended; ENODEV when the emulator is gone.
+            OSError: error of the transfer; ENODEV without an emulator.
         """
         length = len(data) or size
         with self._lock:
@@ -87,15 +87,15 @@ class UsbConnection:
                 status, length = ANSWER.unpack(self._exactly(ANSWER.size))
                 got = self._exactly(length)
             except OSError:
-                self._socket.close()  # an answer that comes late would be taken for another's
+                self._socket.close()  # a late answer would be taken for that of another request
                 raise no_device() from None
         if status:
             raise OSError(-status, os.strerror(-status))
         return got
 
     def close(self) -> None:
-        """Ends it; a thread that waits in `call` gets ENODEV."""
-        with contextlib.suppress(OSError):  # the other end may have been faster
+        """Closes the connection; a thread that waits in `call` gets ENODEV."""
+        with contextlib.suppress(OSError):  # the other end may have closed first
             self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
 
@@ -111,5 +111,5 @@ class UsbConnection:
 
 
 def no_device() -> OSError:
-    """What a transfer to a device that is not there ends with."""
+    """The error of a transfer to a disconnected device."""
     return OSError(errno.ENODEV, os.strerror(errno.ENODEV))

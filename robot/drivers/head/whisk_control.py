@@ -1,4 +1,4 @@
-"""How a head is told to whisk, and what the host adds where the head feeds nothing back."""
+"""Whisking commands of a head, and contact feedback on the host."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ def whisk_commands(
     centre: np.ndarray | None = None,
     rcp: Literal["head", "host"] = "head",
 ) -> list[Command]:
-    """What a head is told, in that order.
+    """The commands that start whisking, in order.
 
     Args:
-        threshold: [W] of y, rad from the centre, infinite for whiskers that do not count; None: none does.
-        centre: [W] mean of y in free air, rad. rcp: who feeds back, where the mode does.
+        threshold: [W] contact thresholds of y, rad from the centre, infinite for whiskers without feedback;
+            None: no feedback. centre: [W] mean of y in free air, rad. rcp: where feedback is computed.
 
     Raises:
-        InputError: the head does not know that mode.
+        InputError: the head does not support the mode.
     """
     if whisking.mode == "spread" and rcp == "head":
         raise InputError(f"{WHERE}.mode", "spread", "rcp or open", "or set `live.head.rcp: host`")
@@ -62,8 +62,7 @@ def whisk_commands(
 
 
 class HostRcp:
-    """The feedback on the host: `tactile.whiskers.whisking.whisk_command` on the samples, a block at a
-    time.
+    """Feedback on the host: the whisking law of `tactile.whiskers.whisking`, a block of samples at a time.
 
     Args:
         shape: rows and columns of the head. threshold, centre: [W] of y, rad.
@@ -81,9 +80,10 @@ class HostRcp:
         self._began: int | None = None
 
     def amplitudes(self, frames: Frames) -> np.ndarray | None:
-        """[W] int16 amplitudes to whisk with now; None while the head has been told, or no whisk begun.
+        """Amplitudes [W] int16 to send; None without a change, or before the first whisk.
 
-        They are told anew in every cycle: what was told late in the one before may have come in this one.
+        They are sent again in every cycle, since a late command of the cycle before may have arrived in this
+        one.
         """
         y = frames.values[..., 2] * ANGLE - self._centre
         for time, flags, heard in zip(frames.time.tolist(), frames.flags.tolist(), y, strict=True):
@@ -98,7 +98,7 @@ class HostRcp:
                 self._whisking, self._drive, since, heard, self._threshold, self._shape
             )
             share = float(whisk_phase(self._whisking, since))
-            # At rest no amplitude can be told from the aim.
+            # At rest the amplitude does not follow from the aim.
             if share > 1e-3:
                 self._amplitude = aim / share
         told = to_counts(self._amplitude)
@@ -109,10 +109,10 @@ class HostRcp:
 
 
 class HeadDriver:
-    """Has a head whisk.
+    """Controls the whisking of a head.
 
     Args:
-        reader: of the head; its settings say who feeds back. head: its geometry.
+        reader: of the head; its settings say where feedback is computed. head: its geometry.
     """
 
     def __init__(self, reader: HeadReader, head: Head) -> None:
@@ -126,14 +126,14 @@ class HeadDriver:
         threshold: np.ndarray | None = None,
         centre: np.ndarray | None = None,
     ) -> None:
-        """Whisks so from the next cycle on; without a threshold (before the calibration) nothing is fed back.
+        """Starts whisking with the next cycle; without a threshold (before calibration) there is no feedback.
 
         Args:
             threshold, centre: [W] of y, rad, as `tactile.features.calibration.Calibration` has them in
             column 1.
 
         Raises:
-            InputError: the drives cannot do it, or the head does not know the mode.
+            InputError: beyond the limits of the drives, or a mode that the head does not support.
         """
         check_amplitude(whisking, self._head, WHERE)
         rcp = self._reader.config.rcp
@@ -146,7 +146,7 @@ class HeadDriver:
             self._reader.send(one)
 
     def rest(self) -> None:
-        """Retracts the whiskers; samples go on coming."""
+        """Retracts the whiskers; samples continue."""
         self._feedback = None
         self._reader.rest()
 
