@@ -1,1 +1,1 @@
-"""A live session on an arm: the robot's loop, and the mapper in a process of its own."""
+"""Live mapping: the robot's loop in this process, the mapper in another."""

@@ -1,7 +1,7 @@
-"""The engine in a process of its own: samples go in as they come, steps come back when they are done.
+"""The mapper in a separate process: receives samples as they come and returns a report for each.
 
-The process that moves the robot never waits for it, and a fault in one does not end the other: without its
-parent, the mapper ends the run directory with what it has.
+The process that controls the robot never waits for it, and a fault in one does not end the other: without its
+parent, the mapper completes the run directory with the samples so far.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from robot.sources.source_info import SourceInfo
 from tactile.base.errors import InputError
 
 LOG = "mapper.log"
-"""In the run directory: what the mapper's process had to say."""
+"""Log of the mapper process, in the run directory."""
 FINISH_TIMEOUT = 120.0
-"""How long it may take to score and draw, s."""
+"""Time limit of scoring and plotting, s."""
 
 
 class MappingJob(NamedTuple):
-    """What is to be mapped.
+    """What the mapper needs before the first sample.
 
     Attributes:
         config: with `recording` being what the session is recorded to. info: as in the recording.
@@ -54,7 +54,7 @@ class MappingJob(NamedTuple):
 
 
 class MappedSample(NamedTuple):
-    """What a sample led to.
+    """The result of a sample.
 
     Attributes:
         number: of the sample. pose: [3] as estimated then, in the map. place: -1 without one. action: by
@@ -69,10 +69,10 @@ class MappedSample(NamedTuple):
 
 
 class Mapper:
-    """The mapper's process from outside; a context manager. It starts at once, to be ready when it is needed.
+    """Handle of the mapper process; a context manager. The process starts at once, to be ready early.
 
     Attributes:
-        told: of every sample that was mapped, in order.
+        mapped: results of all samples mapped so far, in order.
     """
 
     def __init__(self, process: Any = None) -> None:
@@ -92,14 +92,14 @@ class Mapper:
         self._sender.start()
 
     def begin(self, order: MappingJob) -> None:
-        """Has it make its directory and compile; returns at once, `ready` tells when it is done."""
+        """Lets the process make its directory and compile; returns at once. `ready` tells when it is done."""
         self._outbox.put(order)
 
     def ready(self) -> bool:
-        """Whether samples may come.
+        """Whether the mapper is ready for samples.
 
         Raises:
-            InputError: what it was ordered cannot be done, or it is no more.
+            InputError: the job was refused, or the process has ended.
         """
         self.receive()
         if self._refusal is not None:
@@ -109,12 +109,12 @@ class Mapper:
         return self._ready
 
     def offer(self, sample: Sample) -> None:
-        """The next sample; returns at once."""
+        """Passes the next sample; returns at once."""
         self._offered.append(time.monotonic())
         self._outbox.put(sample)
 
     def behind(self) -> float:
-        """For how long the oldest sample that is not mapped yet has waited, s."""
+        """Waiting time of the oldest sample that is not mapped yet, s."""
         self.receive()
         return (
             time.monotonic() - self._offered[len(self.mapped)]
@@ -123,28 +123,28 @@ class Mapper:
         )
 
     def receive(self) -> None:
-        """Takes in what it has told."""
+        """Reads the messages of the process."""
         try:
             while self._line.poll():
                 self._take(self._line.recv())
         except (EOFError, OSError):
-            self._failed = self._failed or "its line broke"
+            self._failed = self._failed or "its connection broke"
 
     @property
     def alive(self) -> bool:
-        """Whether it can still map."""
+        """Whether the mapper works."""
         return self._process.is_alive() and not self._failed and self._refusal is None
 
     @property
     def failure(self) -> str:
-        """Why it cannot, as far as is known."""
+        """Why the mapper has ended, as far as known."""
         return self._failed or str(self._refusal or f"it ended with code {self._process.exitcode}")
 
     def finish(self, interrupted: bool) -> Scorecard | None:
-        """The score of what was mapped; None if it is no more, or mapped nothing.
+        """Waits for the score; None if the process has ended or mapped nothing.
 
         Args:
-            interrupted: whether there was more to come.
+            interrupted: whether the session ended early.
         """
         self._outbox.put(interrupted)
         due = time.monotonic() + FINISH_TIMEOUT
@@ -189,10 +189,10 @@ class Mapper:
 
 
 class PipeSource:
-    """Samples as they come down a line, as a source.
+    """The samples that come through a pipe, as a source.
 
     Attributes:
-        interrupted: whether there was more to come, when it ends. received: when the last sample came, s.
+        interrupted: whether the session ended early. received: arrival of the last sample, s.
     """
 
     name, digest, length = "live", "", None
@@ -200,7 +200,7 @@ class PipeSource:
     def __init__(self, order: MappingJob, line: Connection) -> None:
         self.rate_hz, self.view_shape, self.whiskers = order.rate_hz, order.view_shape, order.whiskers
         self.info = order.info
-        self.interrupted = True  # unless the parent says otherwise
+        self.interrupted = True  # until the parent says otherwise
         self.received = 0.0
         self._line = line
 
@@ -209,7 +209,7 @@ class PipeSource:
             try:
                 word = self._line.recv()
             except (EOFError, OSError):
-                return  # nobody is there any more
+                return  # the parent has ended
             if isinstance(word, bool):
                 self.interrupted = word
                 return
@@ -224,15 +224,15 @@ class PipeSource:
 
 
 def run_mapper(line: Connection) -> None:
-    """What the mapper's process does."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to hear
-    set_niceness(BACKGROUND)  # compiling takes every core there is
+    """The main function of the mapper process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
+    set_niceness(BACKGROUND)  # compilation uses all cores
     try:
         _map(line)
     except InputError as error:
         _send(line, error)
     except EOFError:
-        pass  # nobody wants it any more
+        pass  # the parent has ended
     except Exception as error:
         _send(line, f"{type(error).__name__}: {error}")
         raise
@@ -268,11 +268,11 @@ def _map(line: Connection) -> None:
 
 
 def _send(line: Connection, word: Any) -> None:
-    with suppress(OSError):  # nobody listens: the results are for the disk
+    with suppress(OSError):  # the parent has ended: results go to the disk only
         line.send(word)
 
 
 def _redirect_stderr(path: Path) -> None:
-    """What the process prints, tracebacks included, goes to a file: the terminal is the parent's."""
+    """Sends the output of the process, including tracebacks, to a file: the terminal is the parent's."""
     with path.open("ab") as file:
         os.dup2(file.fileno(), sys.stderr.fileno())

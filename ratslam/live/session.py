@@ -1,4 +1,4 @@
-"""A live session: arm and head in this process, the engine in another; recorded before it is used."""
+"""A live session: arm and head in this process, the mapper in another; all data are recorded before use."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ from tactile.features.whisker_image import view_shape
 from tactile.whiskers.head_geometry import ur10_head
 
 RECORDING, REPORT = "session.mcap", "live.json"
-"""In the run directory: what was recorded, and how the session went."""
+"""Files in the run directory: the recording, and the report of the session."""
 START_TIMEOUT = 300.0
-"""How long the mapper may take to be ready, compilation included, s."""
+"""Time limit of the mapper's start, with compilation, s."""
 
 
 class SessionEnd(NamedTuple):
-    """How a session ended.
+    """The end of a session.
 
     Attributes:
-        fault: which end, and what was found. report: how it went (`live.json`).
+        fault: outcome and finding. report: statistics of the session (`live.json`).
     """
 
     fault: Fault
@@ -66,7 +66,7 @@ def run_live_session(
     mapping: Callable[..., None] | None = None,
     armed: Callable[[Path], None] = lambda directory: None,
 ) -> tuple[SessionEnd, Scorecard | None]:
-    """Tests arm and head, makes the calibration, goes the way and maps; then scores.
+    """Tests arm and head, calibrates, moves along the route, maps and scores.
 
     Args:
         directory: the new run directory. tell: is told a line at a time.
@@ -75,7 +75,7 @@ def run_live_session(
             directory when the session begins.
 
     Returns:
-        how it ended, and the score of what was mapped, if anything was.
+        the end of the session, and the score of the map, if there is one.
 
     Raises:
         InputError: why nothing was armed.
@@ -104,20 +104,20 @@ def run_live_session(
             standing = rig.rest(fault.detail)
             report = _report(fault, rig, mapper, handed, standing)
         card = mapper.finish(fault.outcome is not SessionOutcome.COMPLETE) if handed else None
-    with suppress(OSError):  # a full disk has been told
+    with suppress(OSError):  # a full disk has been reported
         (directory / REPORT).write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     return SessionEnd(fault, report), card
 
 
 def mapping_job(config: RunConfig, path: Way, calibration: Calibration, directory: Path) -> MappingJob:
-    """What the mapper is to do, and what the recording says about the robot."""
+    """The job of the mapper, with the description of the robot for the recording."""
     assert config.live is not None
     head = ur10_head(config.touch.head)
     plan = config.live.plan
     rate = plan.whisking.rate
     rows = ceil(1.5 * path.duration * rate) if config.live.whisks is None else config.live.whisks
     session = config.session
-    if not session.reserve:  # nothing compiles on the way
+    if not session.reserve:  # no compilation during the session
         session = session.model_copy(update={"reserve": rows + CHUNK})
     recording = RecordingConfig(file=directory.resolve() / RECORDING)
     mapped = config.model_copy(update={"live": None, "recording": recording, "session": session})
@@ -142,7 +142,7 @@ def mapping_job(config: RunConfig, path: Way, calibration: Calibration, director
 
 
 def open_recorder(order: MappingJob) -> LiveRecorder:
-    """What the session is recorded to."""
+    """The recorder of the session."""
     return LiveRecorder(
         order.directory / RECORDING,
         view_shape=order.view_shape,
@@ -153,7 +153,7 @@ def open_recorder(order: MappingJob) -> LiveRecorder:
 
 
 def _calibrate(rig: Rig, config: RunConfig, path: Way, tell: Callable[[str], None]) -> Calibration:
-    """Tests everything, and whisks in free air above the start of the way."""
+    """Tests both devices, and records free whisks above the start of the route for the calibration."""
     plan = rig.config.plan
     reported(start_and_check(rig), tell)
     tell("arm: going above the start of the way")
@@ -173,7 +173,7 @@ def _arm(
     order: MappingJob,
     tell: Callable[[str], None],
 ) -> None:
-    """Has the mapper compile, then lets the head down and whisk as the session does."""
+    """Lets the mapper compile, then lowers the head and starts whisking."""
     tell("mapper: compiling")
     mapper.begin(order)
     rig.wait_until(mapper.ready, START_TIMEOUT, SessionOutcome.MAPPER_GONE, "the mapper's start")
@@ -227,7 +227,7 @@ def _report(
 
 
 def _quantiles(values: list[float]) -> dict[str, float]:
-    """Median, 99 % and largest of what is finite; nothing of nothing."""
+    """Median, 99 % quantile and maximum of the finite values; empty without any."""
     known = np.array(values)[np.isfinite(values)]
     if not len(known):
         return {}

@@ -1,1 +1,1 @@
-"""An iRobot Create on its serial line: Open Interface, odometry, and what stops it."""
+"""Driver of an iRobot Create on a serial line (Open Interface)."""

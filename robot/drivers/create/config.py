@@ -1,4 +1,4 @@
-"""How a Create is reached, and how far it is trusted."""
+"""Settings of a Create: port, speed and time limits."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ class CreateConfig(Settings):
     """A Create on a serial port."""
 
     port: str = "/dev/ttyUSB0"
-    """The serial port, on Windows `COM3` or the like."""
+    """Serial port; on Windows `COM3` or the like."""
     speed: Annotated[float, Field(gt=0, le=TOP_SPEED / 1000)] = 0.2
-    """No wheel is ever told to be faster, m/s."""
+    """Speed limit of each wheel, m/s."""
     wheel_base: PositiveFloat = WHEEL_BASE
-    """Between the wheels, m."""
+    """Distance between the wheels, m."""
     rate: Annotated[float, Field(ge=5, le=50)] = 20.0
-    """How often sensors are read, Hz. Between two readings it is taken to drive an arc."""
+    """Rate of sensor readings, Hz; the motion between two readings is taken as an arc."""
     patience: Annotated[float, Field(ge=0.1, le=5)] = 0.5
-    """A command to drive that is not renewed for so long ends, s; a program that is killed or hangs is
-    noticed as late."""
+    """Time after which a drive command ends unless renewed, s; also the time in which a killed or hanging
+    program is detected."""
     silence: Annotated[float, Field(ge=0.1, le=5)] = 0.3
-    """Without a reply for so long the link is lost, and the wheels are stopped, s."""
+    """Time without a reply after which the link counts as lost and the wheels are stopped, s."""
 
     @model_validator(mode="after")
     def _replies_fit(self) -> CreateConfig:

@@ -1,4 +1,4 @@
-"""One reading of the Create after the other, and what the wheels are told after it."""
+"""Control loop of the Create: read sensors, check, command the wheels."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from robot.drivers.create.stop_reasons import CommandRefused, StopEvent, StopRea
 from tactile.base.types import Odometry
 
 PAUSE = 0.03
-"""s between commands that change the mode; within 20 ms of one the robot may miss the next."""
+"""Pause between commands that change the mode, s; within 20 ms of one the robot may miss the next."""
 
 
 class WheelCommand(NamedTuple):
-    """What the wheels are asked for, mm/s, and when, s."""
+    """Requested wheel speeds, mm/s, and the time of the request, s."""
 
     right: int
     left: int
@@ -27,11 +27,10 @@ class WheelCommand(NamedTuple):
 
 
 class ControlLoop:
-    """Reads, objects, drives: in this order, so that wheels never turn on what was not just looked at.
+    """Reads, checks, drives, in this order, so that wheels never move without a fresh reading.
 
-    One thread polls; others may `steer`, `take` and `release` at any time.
-
-    The robot is awake, in safe mode, and its counters were cleared just now.
+    One thread polls; others may call `steer`, `take_odometry` and `release` at any time. The robot must be
+    awake, in safe mode, with its counters just cleared.
 
     Args:
         clock: s, monotonic.
@@ -50,14 +49,14 @@ class ControlLoop:
 
     @property
     def counts(self) -> LinkCounts:
-        """What became of the queries so far."""
+        """Counts of queries so far."""
         return self._link.counts
 
     def steer(self, forward: float, turn: float) -> None:
-        """Asks for a motion, m/s and rad/s; it ends by itself after `patience`.
+        """Requests a motion, m/s and rad/s; it ends after `patience`.
 
         Raises:
-            Refused: over the cap, not finite, or something has stopped it and was not released.
+            CommandRefused: above the speed limit, not finite, or stopped and not released.
         """
         right, left = wheel_speeds(self._config, forward, turn)
         with self._lock:
@@ -66,10 +65,10 @@ class ControlLoop:
             self._asked = WheelCommand(right, left, self._clock())
 
     def release(self) -> None:
-        """Lets it be driven again after something stopped it; it stands until it is told to drive.
+        """Allows driving again after a stop; the robot stands until the next command.
 
         Raises:
-            Refused: the port or the guard is gone; that takes a new driver.
+            CommandRefused: port or watchdog are lost, which requires a new driver.
         """
         with self._lock:
             if self.halted and self.halted.halt in (StopReason.UNPLUGGED, StopReason.UNGUARDED):
@@ -78,24 +77,24 @@ class ControlLoop:
             self.halted = None
 
     def take_odometry(self) -> Odometry:
-        """Motion since the last time it was taken."""
+        """Motion since the last call."""
         with self._lock:
             return self._odometer.take_odometry()
 
     def gap(self) -> bool:
-        """Whether, since this was last asked, a reply was lost, and perhaps the motion it told."""
+        """Whether a reply was lost since the last call, possibly with its motion."""
         with self._lock:
             before, self._owed = self._owed, self._link.counts.owed
             return self._owed > before
 
     def halt(self, halt: StopReason, detail: str) -> None:
-        """Stops it, at the latest with the next poll, until it is released. The first reason stays."""
+        """Stops the robot, at the latest with the next poll, until release. The first reason stays."""
         with self._lock:
             self._asked = WheelCommand(0, 0, -math.inf)
             self.halted = self.halted or StopEvent(halt, detail, self._clock())
 
     def poll(self) -> None:
-        """Reads, and tells the wheels what is allowed."""
+        """Reads the sensors and commands the wheels."""
         if self._clock() < self._deaf:
             return
         try:
@@ -104,7 +103,7 @@ class ControlLoop:
                 self._link.send(protocol.SAFE)
                 return
             found = self._read()
-            asked = self._asked  # another thread may put a new one: what is looked at is what is sent
+            asked = self._asked  # another thread may replace it: what is checked is what is sent
             objected = stop_reason(found, asked.right, asked.left) if found else None
             if objected:
                 self.halt(*objected)

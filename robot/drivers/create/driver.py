@@ -1,4 +1,4 @@
-"""Drives a Create: a thread that reads and steers, and a guard for when even that ends."""
+"""Driver of a Create: a control thread, and a watchdog process in case even that ends."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from tactile.base.errors import InputError
 from tactile.base.types import Odometry
 
 TRIES = 5
-"""Queries until a Create has to have answered."""
+"""Number of queries in which a Create must have answered."""
 
 
 class NoAnswer(InputError):
-    """Nothing on the port answers as a Create does."""
+    """No Create answers on the port."""
 
 
 class NotSafe(InputError):
-    """It answers, but does not go into safe mode."""
+    """The Create does not enter safe mode."""
 
 
 class CreateDriver:
-    """A Create that drives while it is told to, and stops by itself otherwise.
+    """A Create that drives while commands are renewed, and stops otherwise.
 
     Times are of `time.monotonic()`. All methods return at once, except `start`, `stop` and `close` (at most
     some tenths of a second), and may be called from any thread.
@@ -45,10 +45,10 @@ class CreateDriver:
         self._ending, self._wake, self._polled = (threading.Event() for _ in range(3))
 
     def start(self) -> None:
-        """Opens the port, brings the robot into safe mode, clears its counters, starts reading.
+        """Opens the port, enters safe mode, clears the counters and starts reading.
 
         Raises:
-            InputError: `NoPort`, `NoAnswer`, `NotSafe` or `Unguarded`, each with its cure.
+            InputError: `NoPort`, `NoAnswer`, `NotSafe` or `WatchdogFailed`.
         """
         if self._link is not None:
             raise ValueError("a driver starts once")
@@ -64,39 +64,39 @@ class CreateDriver:
         self._thread.start()
 
     def drive(self, forward: float, turn: float) -> None:
-        """Drives, m/s and rad/s counter-clockwise, for at most `patience`: call it again to go on.
+        """Drives, m/s and rad/s counter-clockwise, for at most `patience`; call it again to continue.
 
         Raises:
-            Refused: a wheel over the cap, not finite, not started, or stopped by something not released.
+            CommandRefused: a wheel over the cap, not finite, not started, or stopped by something not released.
         """
         self._running_loop().steer(forward, turn)
         self._wake.set()
 
     def stop(self) -> None:
-        """Stops the wheels; when it returns, that was sent."""
+        """Stops the wheels; returns once that was sent."""
         self._running_loop().steer(0.0, 0.0)
         self._next_poll()
 
     def release(self) -> None:
-        """Lets it be driven again after something stopped it, and brings it back into safe mode.
+        """Allows driving again after a stop and enters safe mode again.
 
         Raises:
-            Refused: nothing but a new driver can help.
+            CommandRefused: a new driver is required.
         """
         self._running_loop().release()
         self._next_poll()
 
     def odometry(self) -> Odometry:
-        """Motion since the last call, up to the last reading; plain floats, the turn not wrapped."""
+        """Motion from the last call to the last reading; the turn is not wrapped."""
         return self._running_loop().take_odometry()
 
     def gap(self) -> bool:
-        """Whether readings were lost since the last call: then some motion may be missing in the odometry."""
+        """Whether readings were lost since the last call, so that motion may be missing."""
         return self._running_loop().gap()
 
     @property
     def halted(self) -> StopEvent | None:
-        """What stopped it, until it is released."""
+        """What stopped the robot, until release."""
         return self._pilot.halted if self._pilot else None
 
     @property
@@ -106,11 +106,11 @@ class CreateDriver:
 
     @property
     def counts(self) -> LinkCounts:
-        """What became of the queries so far."""
+        """Counts of queries so far."""
         return self._link.counts if self._link else LinkCounts()
 
     def close(self) -> None:
-        """Stops the wheels, leaves safe mode, gives the port back. May be called more than once."""
+        """Stops the wheels, leaves safe mode and closes the port. May be called more than once."""
         self._ending.set()
         self._wake.set()
         if self._thread is not None:
@@ -139,7 +139,7 @@ class CreateDriver:
         return self._pilot
 
     def _wake_up(self, link: SerialLink) -> None:
-        """Brings it into safe mode and clears its counters."""
+        """Enters safe mode and clears the counters."""
         port = self.config.port
         found, last = None, ""
         try:
@@ -181,14 +181,14 @@ class CreateDriver:
                 if pilot.halted and pilot.halted.halt is StopReason.UNPLUGGED:
                     return
                 if not guard.beat():
-                    pilot.halt(StopReason.UNGUARDED, "its guard does not hear")
+                    pilot.halt(StopReason.UNGUARDED, "the watchdog process does not respond")
                 self._wake.wait(max(0.0, due - time.monotonic()))
                 self._wake.clear()
-        finally:  # whatever ended it, nobody drives on; the guard stops the wheels
+        finally:  # whatever ended the loop: the watchdog stops the wheels
             pilot.halt(StopReason.UNGUARDED, "the thread that reads it has ended")
 
     def _next_poll(self) -> None:
-        """Waits until a poll has begun and ended after now."""
+        """Waits until a poll has started and ended after now."""
         thread = self._thread
         for _ in range(2):  # the first may have begun before
             self._polled.clear()

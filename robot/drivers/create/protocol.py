@@ -1,7 +1,7 @@
-"""The Create's Open Interface as bytes: the few commands that are sent, and the one reply that is read.
+"""Byte protocol of the Create's Open Interface: the commands sent and the one reply read.
 
 Source: iRobot Create Open Interface (2006): 57600 baud, 8N1; numbers are big-endian. Neither commands nor
-replies carry a header or a checksum, so a reply is believed only if it is one that the robot can give.
+replies have a header or a checksum, so a reply is accepted only if its values are possible.
 """
 
 from __future__ import annotations
@@ -12,35 +12,35 @@ from typing import NamedTuple
 
 BAUD = 57600
 TOP_SPEED = 500
-"""mm/s of a wheel, the most the interface takes."""
+"""Highest wheel speed of the interface, mm/s."""
 WHEEL_BASE = 0.258
-"""m between the wheels."""
+"""Distance between the wheels, m."""
 
 START = bytes([128])
-"""Wakes the interface; from any other mode it leads to `PASSIVE`, where the motors are off."""
+"""Starts the interface; from any other mode it enters `PASSIVE`, with motors off."""
 SAFE = bytes([131])
 DRIVE_DIRECT = 145
 QUERY = bytes([149, 4, 19, 20, 7, 35])
-"""Asks for distance, angle, bumps and wheel drops, and mode."""
+"""Query of distance, angle, bumps and wheel drops, and mode."""
 REPLY = struct.Struct(">hhBB")
 _WHEELS = struct.Struct(">Bhh")
 
 TURN_PER_SECOND = 222
-"""Degrees: both wheels at `TOP_SPEED`, opposed."""
+"""Highest turning rate, degrees/s: both wheels at `TOP_SPEED`, opposed."""
 MAX_DELAY = 0.1
-"""s of motion that a reply may tell beyond the time that has passed: it stood in a buffer on its way."""
+"""Motion time that a reply may report beyond the time elapsed, s: it waited in a buffer."""
 NUDGE = 5
-"""mm or degrees that a reply may tell of a robot that stands: it was nudged."""
+"""Motion that a reply of a standing robot may report, mm or degrees."""
 
 
 class Mode(IntEnum):
-    """What the interface allows."""
+    """Modes of the interface."""
 
     OFF = 0
     PASSIVE = 1
     """Sensors only; the motors are off."""
     SAFE = 2
-    """All, until a wheel drops, a cliff is seen or the charger is plugged in: then `PASSIVE`."""
+    """Full control until a wheel drops, a cliff is seen or the charger is connected: then `PASSIVE`."""
     FULL = 3
 
 
@@ -58,7 +58,7 @@ class Bumps(IntFlag):
 
 
 class SensorReply(NamedTuple):
-    """One reply. Distance and angle are what was driven since the reply before: reading clears them.
+    """One reply; distance and angle are those since the reply before.
 
     Attributes:
         millimetres: mean of both wheels, forward. degrees: counter-clockwise.
@@ -71,7 +71,7 @@ class SensorReply(NamedTuple):
 
 
 def drive(right: int, left: int) -> bytes:
-    """The command that sets both wheels, mm/s. It holds until the next: the robot has no watchdog."""
+    """The command that sets both wheel speeds, mm/s. It holds until the next: the robot has no watchdog."""
     if max(abs(right), abs(left)) > TOP_SPEED:
         raise ValueError(f"wheels at {right} and {left} mm/s; the Create takes {TOP_SPEED} at most")
     return _WHEELS.pack(DRIVE_DIRECT, right, left)
@@ -79,14 +79,14 @@ def drive(right: int, left: int) -> bytes:
 
 STOP = drive(0, 0)
 STOP_ANYHOW = bytes(4) + STOP
-"""Stops also after a command that broke off: the zeros are what it lacked, and by themselves mean nothing."""
+"""Stops even after an incomplete command: the zeros complete it, and have no effect otherwise."""
 
 
 def parse_reply(data: bytes, elapsed: float) -> SensorReply | None:
-    """The reply, or None if no Create says so.
+    """The reply; None if it cannot be one of a Create.
 
     Args:
-        elapsed: s since the last reply that was believed; inf if there is none.
+        elapsed: s since the last accepted reply; inf without one.
     """
     if len(data) != REPLY.size:
         return None
@@ -102,5 +102,5 @@ def parse_reply(data: bytes, elapsed: float) -> SensorReply | None:
 
 
 def describe_bumps(bumps: Bumps) -> str:
-    """Bumps and drops in words."""
+    """Bumps and wheel drops in words."""
     return " and ".join(str(bump.name).lower().replace("_", " ") for bump in bumps) or "nothing touched"

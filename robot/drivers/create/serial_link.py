@@ -1,4 +1,4 @@
-"""The line to the Create: a query and its reply, whatever the line does to them."""
+"""Serial link to the Create: a query and its reply over an unreliable line."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from robot.drivers.create import protocol
 from tactile.base.errors import InputError
 
 ANSWER = 0.1
-"""s within which a reply has to come; a USB adapter holds it back for up to 16 ms."""
+"""Time-out of a reply, s; a USB adapter delays it by up to 16 ms."""
 QUIET = 0.02
-"""s without a byte after which a line has nothing more to say."""
+"""Time without a byte after which a transmission counts as complete, s."""
 
 
 class NoPort(InputError):
@@ -21,19 +21,19 @@ class NoPort(InputError):
 
 
 class Unplugged(Exception):
-    """The port has gone."""
+    """The port was disconnected."""
 
 
 class NoReply(Exception):
-    """No reply came."""
+    """No reply."""
 
 
 class BadReply(Exception):
-    """Something came that no Create says."""
+    """An invalid reply."""
 
 
 class SerialPort(Protocol):
-    """What is used of a `serial.Serial`."""
+    """The part of `serial.Serial` that is used."""
 
     timeout: float | None
 
@@ -45,11 +45,11 @@ class SerialPort(Protocol):
 
 
 class LinkCounts(NamedTuple):
-    """What became of the queries.
+    """Counts of queries.
 
     Attributes:
-        good: replies believed. late: of these, after they had been given up. lost: given up, or in doubt
-            because noise came behind it; unless it still came late, the motion it told is lost.
+        good: accepted replies. late: of these, after their time-out. lost: timed out, or doubtful because
+            noise followed; unless such a reply arrives late, its motion is lost.
             stray: bytes that belonged to no reply.
     """
 
@@ -60,12 +60,12 @@ class LinkCounts(NamedTuple):
 
     @property
     def owed(self) -> int:
-        """Replies that were lost and have not come late."""
+        """Lost replies that have not arrived late."""
         return self.lost - self.late
 
 
 def open_port(name: str, *, exclusive: bool = True) -> SerialPort:
-    """The serial port, at the Create's speed.
+    """Opens the serial port at the Create's speed.
 
     Raises:
         NoPort: with what is wrong with it.
@@ -75,7 +75,7 @@ def open_port(name: str, *, exclusive: bool = True) -> SerialPort:
         import serial
     except ImportError:
         raise InputError("serial", "pyserial is not installed", "", "pip install 'ratslam[live]'") from None
-    # Without `exclusive` pyserial never asks for a lock; False would be refused on Windows.
+    # Without `exclusive` pyserial takes no lock; False is refused on Windows.
     options = {"exclusive": True} if exclusive else {}
     try:
         port: SerialPort = serial.Serial(name, protocol.BAUD, timeout=ANSWER, write_timeout=ANSWER, **options)
@@ -85,7 +85,7 @@ def open_port(name: str, *, exclusive: bool = True) -> SerialPort:
 
 
 def _explain(name: str, error: OSError) -> NoPort:
-    """The error in words. pyserial tells most causes in its text alone."""
+    """Translates an error of pyserial, whose cause is mostly in its text only."""
     cause = error.errno or getattr(error.__context__, "errno", None)
     if cause == errno.ENOENT:
         from serial.tools.list_ports import comports
@@ -100,7 +100,7 @@ def _explain(name: str, error: OSError) -> NoPort:
 
 
 def _replies(data: bytes, elapsed: float, most: int) -> list[protocol.SensorReply]:
-    """All of the bytes as replies, oldest first, the last `most`; or else the end of them as one, or none."""
+    """All bytes as replies, oldest first, the last `most`; else the end of them as one, or none."""
     size = protocol.REPLY.size
     pieces = [protocol.parse_reply(data[i : i + size], elapsed) for i in range(0, len(data), size)]
     believed = [piece for piece in pieces if piece is not None]
@@ -111,10 +111,10 @@ def _replies(data: bytes, elapsed: float, most: int) -> list[protocol.SensorRepl
 
 
 class SerialLink:
-    """Query and reply.
+    """Sends queries and reads replies.
 
-    Replies carry no mark, and a reply clears what it tells. So one that comes after it was given up is
-    added to the next, and of a disturbed one the end is looked at: noise mostly stands before it.
+    Replies have no identifier, and a reply clears the counters it reports. A late one is therefore added to
+    the next; of a disturbed one the end is tried, since noise mostly precedes it.
     """
 
     def __init__(self, port: SerialPort) -> None:
@@ -123,15 +123,15 @@ class SerialLink:
         self.counts = LinkCounts()
 
     def send(self, command: bytes) -> None:
-        """Writes a whole command."""
+        """Sends a command."""
         with self._attached():
             self._port.write(command)
 
     def ask(self, elapsed: float) -> protocol.SensorReply:
-        """What is sensed now.
+        """Sends a query and returns the reply.
 
         Args:
-            elapsed: s since the last reply; inf if there was none.
+            elapsed: s since the last reply; inf without one.
 
         Raises:
             Silent, Garbled, Unplugged: no reply that can be believed.
@@ -141,7 +141,7 @@ class SerialLink:
             self._port.timeout = ANSWER
             self._port.write(protocol.QUERY)
             data = self._port.read(protocol.REPLY.size)
-            # Noise and the beginning of a reply can look like one: then there is more.
+            # Noise and the start of a reply can look like a reply: then more bytes follow.
             if data and (self._port.in_waiting or protocol.parse_reply(data, elapsed) is None):
                 data += self._rest()
         found = _replies(data, elapsed, 1 + self.counts.owed)
@@ -153,11 +153,11 @@ class SerialLink:
         return found[-1]._replace(millimetres=millimetres, degrees=degrees)
 
     def close(self) -> None:
-        """Gives the port back."""
+        """Closes the port."""
         self._port.close()
 
     def _catch_up(self, elapsed: float) -> None:
-        """Takes what came after it was given up. Anything else casts doubt on the reply before it."""
+        """Accepts late replies. Any other bytes make the reply before them doubtful."""
         data = self._port.read(self._port.in_waiting) if self._port.in_waiting else b""
         owed = self.counts.owed
         found = _replies(data, elapsed, owed) if owed else []
@@ -172,7 +172,7 @@ class SerialLink:
         self._count(good=len(found), late=late, stray=stray)
 
     def _rest(self) -> bytes:
-        """Everything until the line is quiet; at most what it can carry in the time of an answer."""
+        """All bytes until the line is quiet, at most those of one time-out."""
         self._port.timeout = QUIET
         data = b""
         while len(data) < protocol.BAUD // 10 * ANSWER and (

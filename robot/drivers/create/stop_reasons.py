@@ -1,4 +1,4 @@
-"""What stops a Create by itself, each with a name; its sentence tells the cure."""
+"""Reasons that stop a Create, each with its cure; the speed limit."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from robot.drivers.create.protocol import Bumps, Mode, SensorReply, describe_bum
 
 
 class StopReason(Enum):
-    """Why the wheels were stopped; the value says what to do."""
+    """Why the wheels were stopped; the value tells what to do."""
 
     BUMPED = "`release` it and drive back"
     WHEEL_DROP = "set it on its wheels, then `release` it"
@@ -23,7 +23,7 @@ class StopReason(Enum):
 
 
 class StopEvent(NamedTuple):
-    """What stopped it.
+    """A stop of the robot.
 
     Attributes:
         halt: which reason. detail: what was found. time: s, host's monotonic clock.
@@ -38,17 +38,17 @@ class StopEvent(NamedTuple):
 
 
 class CommandRefused(ValueError):
-    """A command that is not carried out."""
+    """A command that is rejected."""
 
 
 def wheel_speeds(config: CreateConfig, forward: float, turn: float) -> tuple[int, int]:
-    """Right and left wheel, mm/s.
+    """Speeds of right and left wheel, mm/s.
 
     Args:
         forward: m/s. turn: rad/s, counter-clockwise.
 
     Raises:
-        Refused: not finite, or a wheel would be faster than `config.speed`.
+        CommandRefused: not finite, or a wheel faster than `config.speed`.
     """
     if not (math.isfinite(forward) and math.isfinite(turn)):
         raise CommandRefused(f"forward {forward} m/s, turn {turn} rad/s: not finite")
@@ -59,12 +59,12 @@ def wheel_speeds(config: CreateConfig, forward: float, turn: float) -> tuple[int
             f"forward {forward:g} m/s, turn {turn:g} rad/s needs a wheel at"
             f" {max(abs(right), abs(left)) / 1000:g} m/s; the cap is {config.speed:g} (`speed`)"
         )
-    cap = math.floor(1000 * config.speed + 1e-6)  # what is below the cap must not be rounded above it
+    cap = math.floor(1000 * config.speed + 1e-6)  # rounding must not exceed the limit
     return max(-cap, min(cap, round(right))), max(-cap, min(cap, round(left)))
 
 
 def stop_reason(sensed: SensorReply, right: int, left: int) -> tuple[StopReason, str] | None:
-    """Why the wheels may not turn like that, by what was sensed, or None. A bump leaves the way back open."""
+    """Why the wheels must stop, from a reading, or None. After a bump, driving back is allowed."""
     if sensed.bumps & Bumps.DROPPED:
         return StopReason.WHEEL_DROP, describe_bumps(sensed.bumps & Bumps.DROPPED)
     if sensed.mode != Mode.SAFE:

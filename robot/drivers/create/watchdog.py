@@ -1,4 +1,5 @@
-"""A process that stops the wheels when the one that drives has died or hangs: the Create has no watchdog.
+"""Watchdog process: stops the wheels when the driving process has died or hangs. The Create has no watchdog
+of its own.
 
 `python -m robot.drivers.create.watchdog PORT PATIENCE` is started by the driver and hears a beat, any
 byte, from it on
@@ -19,15 +20,15 @@ from robot.drivers.create.serial_link import open_port
 from tactile.base.errors import InputError
 
 START_LIMIT = 10.0
-"""s that a guard may take to start."""
+"""Time limit of the watchdog's start, s."""
 
 
 class WatchdogFailed(InputError):
-    """The guard did not start."""
+    """The watchdog process did not start."""
 
 
 class Watchdog:
-    """The driver's end: starts the process and beats."""
+    """Starts the watchdog process and sends its heartbeat."""
 
     def __init__(self, port: str, patience: float) -> None:
         self._process = subprocess.Popen(
@@ -43,7 +44,7 @@ class Watchdog:
         ready.join(START_LIMIT)
         if self._heard != b"r":
             self.close()
-            raise WatchdogFailed(port, "the process that guards it did not start")
+            raise WatchdogFailed(port, "the watchdog process did not start")
 
     @property
     def pid(self) -> int:
@@ -51,7 +52,7 @@ class Watchdog:
         return self._process.pid
 
     def beat(self) -> bool:
-        """Tells that all is well; False if nobody hears it."""
+        """Sends a heartbeat; False if the process has ended."""
         try:
             assert self._process.stdin is not None
             self._process.stdin.write(b".")
@@ -60,7 +61,7 @@ class Watchdog:
         return True
 
     def close(self) -> None:
-        """Ends it; the wheels are left as they are."""
+        """Ends the process; the wheels are left as they are."""
         with contextlib.suppress(subprocess.TimeoutExpired, OSError):
             self._process.communicate(b"q", timeout=1)
         if self._process.poll() is None:
@@ -77,7 +78,7 @@ class Watchdog:
 
 
 def watch(port: str, patience: float) -> None:
-    """The process: stops the wheels once for each time the beat fails."""
+    """The process: stops the wheels once for each time-out of the heartbeat."""
     line = open_port(port, exclusive=False)
     beats: queue.SimpleQueue[bytes] = queue.SimpleQueue()
 
@@ -88,7 +89,7 @@ def watch(port: str, patience: float) -> None:
 
     threading.Thread(target=hear, daemon=True).start()
     print("r", end="", flush=True)
-    beating = False  # until the first beat nothing drives
+    beating = False  # nothing drives before the first heartbeat
     while True:
         try:
             data = beats.get(timeout=patience if beating else None)
@@ -101,7 +102,7 @@ def watch(port: str, patience: float) -> None:
             continue
         try:
             line.write(protocol.STOP_ANYHOW)
-        except OSError:  # nobody to stop
+        except OSError:  # the port is gone
             return
         if data is not None:
             return

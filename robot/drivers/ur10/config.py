@@ -75,4 +75,4 @@ class ArmConfig(Settings):
     patience: PositiveFloat = 3.0
     """Time beyond the expected duration of a move before it counts as not arrived, s."""
     connect: PositiveFloat = 10.0
-    """Time-out of the connection and of the start of the control script, s."""
+    """Time-out of the connection, of the start of the control script and of the full state rate, s."""

@@ -16,7 +16,6 @@ from tactile.base.errors import InputError
 
 MIN_RATE_SHARE = 0.9  # share of the nominal state rate that is required
 RATE_WINDOW = 0.25  # s of states over which the rate is measured
-RATE_TIMEOUT = 1.5  # s within which the rate must reach that share
 
 
 class StartupRefused(InputError):
@@ -71,12 +70,12 @@ def check_states(config: ArmConfig, states: Callable[[], np.ndarray]) -> None:
     Raises:
         StartupRefused: the stream is too slow, or the tool is outside the box.
 
-    The rate may recover within `RATE_TIMEOUT`: the host may have been busy.
+    The rate may recover within `config.connect` s: the host may have been busy.
 
     Args:
         states: returns the states [N] (ARM_STATE) since the start of the RTDE process.
     """
-    until = time.monotonic() + RATE_TIMEOUT
+    until = time.monotonic() + config.connect
     while (rate := state_rate(states(), config.hz)) < MIN_RATE_SHARE * config.hz:
         if time.monotonic() > until:
             raise StartupRefused(
