@@ -93,7 +93,7 @@ class Rig:
         """Reads the data of both devices, and raises the reason if the session must end.
 
         Raises:
-            Faulted, Stopped.
+            SessionFault, OperatorStop.
         """
         self._take_frames()
         self._take_states()
@@ -118,7 +118,7 @@ class Rig:
             longest: s. late, what: outcome if it takes longer, and what was awaited.
 
         Raises:
-            Faulted, Stopped.
+            SessionFault, OperatorStop.
         """
         due = time.monotonic() + longest
         while not done():

@@ -67,7 +67,8 @@ class CreateDriver:
         """Drives, m/s and rad/s counter-clockwise, for at most `patience`; call it again to continue.
 
         Raises:
-            CommandRefused: a wheel over the cap, not finite, not started, or stopped by something not released.
+            CommandRefused: a wheel over the cap, not finite, not started, or stopped by something not
+            released.
         """
         self._running_loop().steer(forward, turn)
         self._wake.set()

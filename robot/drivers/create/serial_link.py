@@ -134,7 +134,7 @@ class SerialLink:
             elapsed: s since the last reply; inf without one.
 
         Raises:
-            Silent, Garbled, Unplugged: no reply that can be believed.
+            NoReply, BadReply, Unplugged: no valid reply.
         """
         with self._attached():
             self._catch_up(elapsed)
