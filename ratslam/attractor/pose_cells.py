@@ -2,7 +2,7 @@
 
 One packet of activity represents the robot's pose. A step injects energy at the recalled pose, then for each
 sub-step excites, inhibits, thresholds, normalises and integrates a part of the motion, then decodes the
-packet. Sources: Milford & Wyeth 2004; Ball et al. 2013; the differences are listed in this room's README.
+packet. Sources: Milford & Wyeth 2004; Ball et al. 2013; differences: `ratslam/classic/README.md`.
 
 Activity is [K, N, N] over heading, y, x; poses in cells are [3] over x, y, heading, in [0, N) and [0, K).
 """

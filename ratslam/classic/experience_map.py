@@ -1,8 +1,8 @@
-"""The experience map: where places lie, from the odometry between them.
+"""The experience map: a pose graph of places, connected by the odometry between them.
 
-Growable arrays are the truth; networkx is how others see them. Motion accumulates in the body frame of the
-current node and is cleared whenever the node changes, so a link holds whatever the solver later does to the
-node it starts from. Source: Milford & Wyeth 2004; Ball et al. 2013, section 6.
+The growable arrays are the state; networkx graphs are made from them on request. Motion accumulates in the
+body frame of the current node and restarts at every new node, so a link remains valid when the solver moves
+its nodes. Source: Milford & Wyeth 2004; Ball et al. 2013, section 6.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from tactile.base.types import Observation
 
 
 class OdometryNoise(Settings):
-    """How much the odometry between two nodes is believed: variances grow along the way."""
+    """Uncertainty of the odometry between two nodes; variances grow with distance and turn."""
 
     per_metre: PositiveFloat = 0.05
     """Standard deviation of position after one metre, m."""
@@ -36,48 +36,48 @@ class OdometryNoise(Settings):
     heading_per_radian: NonNegativeFloat = 0.05
     """Standard deviation of heading after a turn of one radian, rad."""
     least: PositiveFloat = 0.005
-    """Standard deviation of any link, m and rad: no link is exact."""
+    """Least standard deviation of a link, m and rad."""
 
 
 class LeastSquares(Settings):
-    """Exact SE(2) least squares, solved when a loop closes."""
+    """SE(2) least squares, solved at every loop closure."""
 
     name: Literal["least_squares"] = "least_squares"
-    """This solver's name."""
+    """Selects this solver."""
     kernel: Literal["none", "huber", "geman_mcclure"] = "huber"
-    """What tames closures that disagree with the rest of the map."""
+    """Robust kernel on loop closures."""
     scale: PositiveFloat = 1.0
-    """The kernel's scale, in standard deviations."""
+    """Scale of the kernel, in standard deviations."""
 
 
 class Relaxation(Settings):
-    """The classic sweep after every action: each link moves both of its ends a little."""
+    """The relaxation of Ball et al. 2013 after every action: each link in turn moves both of its ends."""
 
     name: Literal["relaxation"] = "relaxation"
-    """This solver's name."""
+    """Selects this solver."""
     loops: PositiveInt = 20
     """Sweeps per action."""
     correction: Annotated[float, Field(gt=0, le=1)] = 0.5
-    """Share of a link's error that each end takes."""
+    """Share of a link's error by which each end moves."""
 
 
 class ExperienceConfig(Settings):
     """The experience map."""
 
     solver: Annotated[LeastSquares | Relaxation, Field(discriminator="name")] = LeastSquares()
-    """How the map gives way to closures."""
+    """Solver that makes the map consistent."""
     closures: bool = True
-    """Whether recognised places bend the map; without, it is raw odometry."""
+    """Use loop closures; without them the map is raw odometry."""
     noise: OdometryNoise = OdometryNoise()
-    """Trust in odometry."""
+    """Uncertainty of the odometry."""
     match_sd: PositiveFloat = 0.1
-    """Standard deviation of where the robot stands when it recognises a place, m."""
+    """Standard deviation of the position at a recognised place, m."""
     match_sd_heading: PositiveFloat = 0.1
-    """The same for its heading, rad."""
+    """Standard deviation of the heading at a recognised place, rad."""
 
 
 class Travel(NamedTuple):
-    """Motion since the current node: pose [3] in its frame, variance [3], metres and seconds."""
+    """Motion since the current node: pose [3] in its frame, variance [3], length in m, duration in s."""
 
     motion: np.ndarray
     variance: np.ndarray
@@ -85,17 +85,17 @@ class Travel(NamedTuple):
     duration: float
 
 
-def departure(relative: float) -> Travel:
-    """At a node, seen from `relative` rad off the heading at which it was stored."""
+def travel_from_node(relative: float) -> Travel:
+    """No travel yet: at a node, with a heading that differs by `relative` rad from the stored one."""
     return Travel(np.array([0.0, 0.0, relative]), np.zeros(3), 0.0, 0.0)
 
 
 class ExperienceMap:
-    """Folds estimates and evidence of the classic backend (`ratslam.core.backend.Map`).
+    """The map of the classic backend (`ratslam.core.backend.Map`).
 
     The fields of `arrays()` are its whole state: node poses [M, 3] (x m, y m, heading rad), the place each
-    node stands for, links with their measured motion, and for every folded step its node and the motion
-    since, from which the final trajectory follows.
+    node stands for, links with their measured motion, and for every step its node and the motion
+    since, which give the final trajectory.
     """
 
     def __init__(self, config: ExperienceConfig | None = None) -> None:
@@ -114,9 +114,7 @@ class ExperienceMap:
         self._reached = GrowableArray((2,), np.int64)  # step, and the first step at the node reached
         self._link_of: dict[tuple[int, int], int] = {}
         self._current = -1
-        self._travel = departure(0.0)
-
-    # What it answers
+        self._travel = travel_from_node(0.0)
 
     def pose(self, estimate: Estimate) -> np.ndarray:
         """[3] the current node's pose and the motion since; before the first node, dead reckoning."""
@@ -135,7 +133,7 @@ class ExperienceMap:
         )
 
     def trajectory(self) -> np.ndarray:
-        """[T, 3] every folded step as the map sees it now: final pose of its node and the motion since."""
+        """[T, 3] poses of all steps: present pose of the step's node, and the motion since."""
         node, motion = self._step_node.rows, self._step_motion.rows
         if not len(self._pose.rows):
             return motion.copy()
@@ -143,15 +141,15 @@ class ExperienceMap:
         return compose(origin, motion)
 
     def online_trajectory(self) -> np.ndarray:
-        """[T, 3] the same: this map has nothing left to settle."""
+        """[T, 3] equal to `trajectory`."""
         return self.trajectory()
 
     def closures(self) -> np.ndarray:
-        """[M, 2] the steps at which a known node was reached, and the first step at it."""
+        """[M, 2] steps at which a known node was reached, and the step at which it was created."""
         return self._reached.rows.copy()
 
     def graph(self) -> networkx.DiGraph:
-        """Nodes with x, y (m), heading (rad), template; links with dx, dy, dtheta and their evidence."""
+        """Nodes with x, y (m), heading (rad), template; links with dx, dy, dtheta, and their traversals."""
         graph: networkx.DiGraph = networkx.DiGraph()
         for node, (pose, template) in enumerate(zip(self._pose.rows, self._template.rows, strict=True)):
             x, y, heading = map(float, pose)
@@ -172,13 +170,11 @@ class ExperienceMap:
             "map.g2o": lambda path: write_g2o(path, self.nodes(), self.edges()),
         }
 
-    # What changes it
-
     def feedback(self) -> None:
-        """Nothing: the classic kernel knows no map."""
+        """None: the classic kernel does not use the map."""
 
     def update(self, observation: Observation, estimate: Estimate, evidence: Evidence) -> Estimate:
-        """Moves along the odometry, then creates, links or sets as the estimate says."""
+        """Adds the odometry, then creates, links or reaches a node by the action of the estimate."""
         self._advance(observation.odometry)
         action, place = int(estimate.action), int(estimate.place)
         relative = float(evidence.relative)
@@ -193,7 +189,7 @@ class ExperienceMap:
     def _advance(self, odometry) -> None:
         moved = np.array([float(odometry.dx), float(odometry.dy), float(odometry.dtheta)])
         if not np.isfinite(moved).all():
-            return  # the kernel has named this outcome; a map of NaN would help nobody
+            return  # the kernel reports NOT_FINITE
         noise, length = self.config.noise, float(np.hypot(moved[0], moved[1]))
         heading = noise.heading_per_metre**2 * length + noise.heading_per_radian**2 * abs(moved[2])
         along = noise.per_metre**2 * length
@@ -230,10 +226,10 @@ class ExperienceMap:
 
     def _arrive(self, node: int, relative: float) -> None:
         self._current = node
-        self._travel = departure(relative)
+        self._travel = travel_from_node(relative)
 
     def _link(self, node: int, measured: np.ndarray, closure: bool) -> None:
-        """A new link, or another traversal of one: the inverse-variance mean of what they measured."""
+        """Adds a link, or merges another traversal of a known one by the inverse-variance mean."""
         information = 1 / self._variance(closure)
         evidence = np.array([1.0, self._travel.length, self._travel.duration])
         known = self._link_of.get((self._current, node))
@@ -293,10 +289,8 @@ class ExperienceMap:
     def _known(self, place: int) -> int:
         return int(self._node_of.rows[place]) if 0 <= place < len(self._node_of.rows) else -1
 
-    # What a checkpoint keeps
-
     def arrays(self) -> dict[str, np.ndarray]:
-        """Everything, so that `restore` continues bit for bit."""
+        """The whole state, for `restore`."""
         travel = self._travel
         return copy_arrays(self) | {
             "current": np.array(self._current),
@@ -304,7 +298,7 @@ class ExperienceMap:
         }
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Takes the place of everything folded so far."""
+        """Replaces the whole state."""
         restore_arrays(self, arrays)
         self._current = int(arrays["current"])
         travel = np.asarray(arrays["travel"])

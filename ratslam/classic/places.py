@@ -1,7 +1,7 @@
-"""Places (experiences): where a template was seen with the packet in a certain spot.
+"""Places (experiences): pairs of a view template and a pose of the packet.
 
-A place is created when a view is new there, linked when a known place is reached by a new way, set when it
-is reached by a known one. Source: Milford & Wyeth 2004; Ball et al. 2013, section 5.
+A place is created when a view is new at a pose, linked when a known place is reached by a new link, and set
+when it is reached by a known one. Source: Milford & Wyeth 2004; Ball et al. 2013, section 5.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ from tactile.base.config import Settings
 from tactile.base.types import Array
 
 TIE = 1e-9
-"""Distances this close to each other or to the radius tie, whatever the rounding."""
+"""Distances, in radii, that differ by less are equal, so rounding does not decide."""
 
 
 class PlaceConfig(Settings):
-    """How far a place reaches."""
+    """Size of places."""
 
     radius: PositiveFloat = 2.0
-    """Reach along x and y, cells."""
+    """Radius along x and y, cells."""
     radius_heading: PositiveFloat = 2.0
-    """Reach along heading, cells."""
+    """Radius along heading, cells."""
 
 
 class Places(NamedTuple):
-    """The store, rows in order of creation.
+    """The stored places, rows in order of creation.
 
     Attributes:
-        packet: [C, 3] packet at creation, cells, its heading turned back by the view's relative heading.
+        packet: [C, 3] pose of the packet at creation, cells, minus the relative heading of the view.
         template: [C] int32. count, current: int32; current is -1 before the first place.
-        link: [C, 2] int32 pairs of places joined so far; links: their number, int32.
+        link: [C, 2] int32, linked pairs of places; links: their number, int32.
     """
 
     packet: Array
@@ -47,7 +47,7 @@ class Places(NamedTuple):
 
 
 class Decision(NamedTuple):
-    """What a step did: the current place after it, the one before, an `Action`, and whether it had room."""
+    """The current place after a step, the one before, an `Action`, and bool: the store was not full."""
 
     place: Array
     previous: Array
@@ -56,7 +56,7 @@ class Decision(NamedTuple):
 
 
 def start(capacity: int, dtype: np.dtype) -> Places:
-    """No places yet."""
+    """An empty store."""
     return Places(
         packet=jnp.zeros((capacity, 3), dtype),
         template=jnp.full(capacity, -1, jnp.int32),
@@ -68,7 +68,7 @@ def start(capacity: int, dtype: np.dtype) -> Places:
 
 
 def distance(config: PlaceConfig, rings: np.ndarray, store: Places, packet: Array) -> Array:
-    """[C] distance of a packet [3] from every place, in radii, the short way round each ring."""
+    """[C] distances of a packet [3] from all places, in radii, wrapped along each ring."""
     apart = jnp.abs(store.packet - packet[None, :])
     apart = jnp.minimum(apart, rings[None, :] - apart)
     reach = np.array([[config.radius, config.radius, config.radius_heading]], apart.dtype)
@@ -78,7 +78,7 @@ def distance(config: PlaceConfig, rings: np.ndarray, store: Places, packet: Arra
 def decide(
     config: PlaceConfig, rings: np.ndarray, store: Places, packet: Array, template: Array, seen: Array
 ) -> tuple[Places, Decision]:
-    """Keeps, reaches or makes a place after a view was seen as `template` with the packet at [3]."""
+    """Keeps, reaches or creates a place, given the template and the packet [3] of a view."""
     capacity = store.template.shape[0]
     row = jnp.arange(capacity, dtype=jnp.int32)
     previous, origin = store.current, jnp.maximum(store.current, 0)

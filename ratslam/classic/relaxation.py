@@ -1,7 +1,7 @@
-"""The classic relaxation of an experience map: every link moves both of its ends a little, in turn.
+"""The relaxation of RatSLAM: every link in turn moves both of its ends towards its measurement.
 
-Source: Ball et al. 2013, section 6 (Gauss-Seidel in order of creation, no node held, no weights). Kept for
-comparison: it takes thousands of sweeps to do what `ratslam.pose_graph` does in one solve.
+Source: Ball et al. 2013, section 6 (Gauss-Seidel in order of creation, no fixed node, no weights). For
+comparison: it needs thousands of sweeps for the result of one solve by `ratslam.pose_graph`.
 """
 
 from __future__ import annotations
@@ -26,10 +26,11 @@ def relax(
     """Poses [N, 3] after `loops` sweeps over the links [L], from node `start` to node `end`.
 
     Args:
-        distance, heading: where `end` lies in the frame of `start`, m and rad. facing: its heading, rad.
-        correction: share of a link's error that each of its ends takes.
+        distance, heading: [L] polar position of `end` in the frame of `start`, m and rad. facing: [L] heading
+            of `end` in that frame, rad.
+        correction: share of a link's error by which each end moves.
     """
-    # Plain floats: every link needs what the one before has moved, so there is nothing to vectorise.
+    # Plain floats: every link depends on the one before, so the loop cannot be vectorised.
     x, y, th = (column.tolist() for column in np.asarray(poses, float).T)
     links = list(
         zip(*(np.asarray(column).tolist() for column in (start, end, distance, heading, facing)), strict=True)

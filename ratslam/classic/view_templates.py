@@ -1,6 +1,6 @@
-"""View templates: what has been seen, and which of it a view looks like.
+"""View templates: stored views, and the search for the one most similar to a new view.
 
-A template never changes. The best match within a threshold wins; anything else is a new template. Source:
+Templates never change. The best match within a threshold wins; otherwise the view becomes a template. Source:
 Milford & Wyeth 2004; Ball et al. 2013, section 3.
 """
 
@@ -17,52 +17,52 @@ from tactile.base.config import Settings
 from tactile.base.types import Array
 
 TIE = 1e-9
-"""Errors this close tie, whatever the rounding: the earliest template at the lowest offset wins."""
+"""Errors that differ by less are equal: the earliest template at the lowest offset wins."""
 
 
 class TemplateConfig(Settings):
-    """Matching of views, and what a match injects."""
+    """Matching of views, and the energy of a match."""
 
     source: Literal["views", "labels"] = "views"
-    """`views`: compare images; `labels`: trust the place ids given by the recording."""
+    """`views`: compare images; `labels`: use the place ids of the recording."""
     threshold: Annotated[float, Field(ge=0, le=1)] = 0.05
     """Largest mean absolute difference of a match, in units of a view's values (0..1)."""
     shift: NonNegativeInt = 0
-    """Columns by which a view may be shifted either way; 0 compares in place."""
+    """Largest shift of a view in either direction, columns."""
     shift_step: PositiveInt = 1
-    """Columns between tried shifts."""
+    """Step between shifts, columns."""
     column_angle: float = 0.0
-    """Heading difference that a shift by one column means, rad (counter-clockwise columns: positive);
-    0 when unknown. Panoramic views know it: a full turn over the columns."""
+    """Heading difference of a shift by one column, rad, positive where columns run counter-clockwise; 0:
+    unknown. Panoramic views ignore it: their columns cover a full turn."""
     panoramic: bool = False
-    """Whether the columns close into a ring; then all shifts are tried and `shift` is not used."""
+    """Columns form a ring: all shifts are compared and `shift` is ignored."""
     normalise_mean: NonNegativeFloat = 0.0
-    """Scale views to this mean; 0 leaves them. For cameras."""
+    """Mean to which camera views are scaled; 0: not scaled."""
     patch: NonNegativeInt = 0
-    """Normalise each value by mean and deviation of the (2 patch + 1)^2 values around it; 0 leaves them."""
+    """Half width of the (2 patch + 1)^2 values whose mean and deviation normalise each value; 0: none."""
     patch_sd: NonNegativeFloat = 0.0
-    """Patches that vary less than this are flat: 0.5."""
+    """Standard deviation below which a patch is uniform and becomes 0.5."""
     recent: NonNegativeInt = 10
-    """The newest templates, this many, recall nothing: the robot has not left them yet."""
+    """Number of newest templates that inject no energy, because the robot is still near them."""
     energy: PositiveFloat = 0.15
-    """Activity injected by a fresh match (before habituation takes its share)."""
+    """Activity injected by a match without habituation."""
     habituation: NonNegativeFloat = 1.0
-    """What each further sight in a row adds to a template's habituation."""
+    """Increase of a template's habituation at each consecutive match."""
     recovery: NonNegativeFloat = 0.05
-    """What each view takes from the habituation of all templates."""
+    """Decrease of all habituations at each view."""
 
 
-MUTE = 3.0
-"""Habituation never exceeds this: beyond ln(30) / 1.2 = 2.83 a template injects nothing, and the longer it
-was seen the longer it would stay mute."""
+MAX_HABITUATION = 3.0
+"""Limit on habituation: above ln(30) / 1.2 = 2.83 a template injects no energy, and without a limit it would
+stay silent for as long as it was seen."""
 
 
 class Templates(NamedTuple):
-    """The store, rows in order of creation; columns of `view` so that matching runs along rows.
+    """The stored templates in order of creation; templates are columns of `view`, for fast matching.
 
     Attributes:
         view: [D, C] values. label: [C] int32 given ids. packet: [C, 3] decoded packet at creation, cells.
-        habituation: [C]. count: templates known, int32. current: the last one seen, int32, -1 before.
+        habituation: [C]. count: number of templates, int32. current: template of the last view, int32, or -1.
     """
 
     view: Array
@@ -74,11 +74,11 @@ class Templates(NamedTuple):
 
 
 class Match(NamedTuple):
-    """A view's best template.
+    """The best match of a view.
 
     Attributes:
-        template: int32, -1 for none within the threshold. error: of the best, whether it matched or not;
-            infinite when there is nothing to compare. relative: the robot's heading less the heading at
+        template: int32, -1 if none is within the threshold. error: smallest mean absolute difference, also
+            above the threshold; infinite without templates. relative: heading of the robot minus that at
             which the template was stored, rad.
     """
 
@@ -88,7 +88,7 @@ class Match(NamedTuple):
 
 
 def start(config: TemplateConfig, shape: tuple[int, int, int], capacity: int, dtype: np.dtype) -> Templates:
-    """An empty store. Given labels need no views, so none are kept."""
+    """An empty store; with labels, views are not stored."""
     size = int(np.prod(shape)) if config.source == "views" else 0
     return Templates(
         view=jnp.zeros((size, capacity), dtype),
@@ -101,7 +101,7 @@ def start(config: TemplateConfig, shape: tuple[int, int, int], capacity: int, dt
 
 
 def normalise(config: TemplateConfig, view: Array) -> Array:
-    """The view [R, C, K] as it is stored and compared (Ball et al. 2013: global, then patch)."""
+    """The view [R, C, K] normalised for comparison (Ball et al. 2013: globally, then by patches)."""
     if config.normalise_mean:
         mean = jnp.mean(view)
         view = jnp.where(
@@ -115,7 +115,7 @@ def normalise(config: TemplateConfig, view: Array) -> Array:
 def match_view(config: TemplateConfig, shape: tuple[int, int, int], store: Templates, view: Array) -> Match:
     """The template with the smallest mean absolute difference over all allowed shifts.
 
-    Exact: no template is skipped by its mean, which would hide matches of shifted views.
+    Templates are not preselected by their mean, which would miss matches of shifted views.
     """
     rows, columns, channels = shape
     capacity = store.view.shape[1]
@@ -145,8 +145,8 @@ def match_view(config: TemplateConfig, shape: tuple[int, int, int], store: Templ
 
 
 def match_label(store: Templates, label: Array) -> Match:
-    """The template that carries the given label."""
-    same = (store.label == label) & (label >= 0)  # empty rows carry -1
+    """The template with the given label."""
+    same = (store.label == label) & (label >= 0)  # unused rows have label -1
     matched = jnp.any(same)
     zero = jnp.zeros((), store.packet.dtype)
     template = jnp.where(matched, jnp.argmax(same).astype(jnp.int32), -1)
@@ -154,16 +154,16 @@ def match_label(store: Templates, label: Array) -> Match:
 
 
 def recall(config: TemplateConfig, store: Templates, match: Match, seen: Array) -> tuple[Templates, Array]:
-    """Habituates what is seen again and says with how much energy a match is injected.
+    """Updates habituation, and the energy that a match injects.
 
     Returns:
-        the store with habituation and `current` updated (for known templates), and the energy.
+        the store with new habituation and `current` (for known templates), and the energy.
     """
     known = seen & (match.template >= 0)
     row = jnp.maximum(match.template, 0)
     again = known & (match.template == store.current)
     level = store.habituation[row] + jnp.where(again, config.habituation, 0.0)
-    level = jnp.minimum(level, jnp.maximum(MUTE, config.habituation))
+    level = jnp.minimum(level, jnp.maximum(MAX_HABITUATION, config.habituation))
     energy = config.energy / 30 * (30 - jnp.exp(1.2 * level))
     old = match.template + config.recent < store.count
     energy = jnp.where(known & old, jnp.maximum(energy, 0.0), 0.0)
@@ -181,7 +181,7 @@ def recall(config: TemplateConfig, store: Templates, match: Match, seen: Array) 
 def learn(
     store: Templates, view: Array, label: Array, packet: Array, novel: Array
 ) -> tuple[Templates, Array]:
-    """Stores a novel view [D] where the packet [3] was; returns the store and whether it had room."""
+    """Stores a novel view [D] with the packet [3]; returns the store and bool: it was not full."""
     capacity = store.label.shape[0]
     room = store.count < capacity
     kept = novel & room
@@ -206,7 +206,7 @@ def _patch_normalise(view: Array, half: int, flat: float) -> Array:
     window = range(2 * half + 1)
     patches = jnp.stack([padded[y : y + rows, x : x + columns] for y in window for x in window])
     mean, sd = jnp.mean(patches, axis=0), jnp.std(patches, axis=0)
-    # Rounding leaves a constant patch with a deviation near 1e-17: that is flat, not one sigma.
+    # Rounding gives a constant patch a deviation near 1e-17, which is not a signal.
     varied = sd > max(flat, 1e-6)
     scaled = (view - mean) / jnp.where(varied, sd, 1.0)
     return jnp.where(varied, jnp.clip((scaled + 3) / 6, 0, 1), 0.5)

@@ -1,4 +1,4 @@
-"""Benchmarks are for `make bench` and `make soak`: in the suite they would tell nothing."""
+"""Benchmarks run with `make bench` and `make soak`, not with the test suite."""
 
 from __future__ import annotations
 

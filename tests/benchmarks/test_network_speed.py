@@ -74,7 +74,7 @@ def test_replay(benchmark, n):
 
 @pytest.mark.parametrize("n", [41, 101])
 def test_two_packets(benchmark, n):
-    """Two packets that are kept alive: each step on two patches, beside a step on one."""
+    """Two persistent packets: a step on two windows, beside a step on one."""
     if not benchmark.enabled:
         pytest.skip("timed by make bench only")
     steps = 2000

@@ -1,4 +1,4 @@
-"""Run the stock engine on a trace and measure how far it is from what the file says."""
+"""Comparison of the stock engine with a recorded trace."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from tests.oracle.engine import Step, StockEngine
 from tests.oracle.trace import Array, Trace, TraceError
 
 POSE, ACTIVITY, ERROR = 1e-9, 1e-12, 1e-12
-KNIFE = 1e-6  # a stored coordinate that close to an integer does not decide its own cell
-DUST = 1e-12  # a cell that small can be exactly zero in another order of additions
+KNIFE = 1e-6  # coordinates this close to an integer may truncate to either cell
+DUST = 1e-12  # smaller activity may be exactly 0 in another order of additions
 OUTPUTS = (
     "vt", "vt_err", "rel_rad", "inj_energy", "inj_x", "inj_y", "inj_th", "best_x", "best_y", "best_th",
     "max_act", "total", "min_act", "nnz", "vt_delta_pc_th", "delta_pc", "action", "src", "dest", "pc_exp",
@@ -21,7 +21,7 @@ OUTPUTS = (
 )  # fmt: skip
 NEEDED = {f"out_{name}" for name in OUTPUTS}
 NEEDED |= {"cells_final_idx_kyx", "cells_final_val", "map_final", "links", "vt_final"}
-HUGE = 1e300  # what a matching error is when nothing was compared
+HUGE = 1e300  # matching error where nothing was compared
 
 
 @dataclass
@@ -89,11 +89,11 @@ TOLERANCES = {
 
 
 class Follower:
-    """Chooses the cell of an injection, taking the file's where the coordinate is on the knife edge (Q2)."""
+    """Chooses the cell of an injection: the recorded one where truncation is ambiguous (Q2)."""
 
     def __init__(self, trace: Trace) -> None:
         names = ("out_inj_x", "out_inj_y", "out_inj_th")
-        self.told = np.stack([trace.arrays[name] for name in names], axis=1).astype(int)
+        self.recorded = np.stack([trace.arrays[name] for name in names], axis=1).astype(int)
         p = trace.parameters
         self.rings = (p.pc_dim_xy, p.pc_dim_xy, p.pc_dim_th)
         self.followed = 0
@@ -102,9 +102,9 @@ class Follower:
     def __call__(self, pose: Pose) -> Cell:
         own = truncated(pose)
         chosen = []
-        told = self.told[self.step]
-        outside = bool((told < 0).any())
-        for coordinate, cell, theirs, n in zip(pose, own, told, self.rings, strict=True):
+        recorded = self.recorded[self.step]
+        outside = bool((recorded < 0).any())
+        for coordinate, cell, theirs, n in zip(pose, own, recorded, self.rings, strict=True):
             near = round(coordinate)
             if abs(coordinate - near) < KNIFE:
                 if outside and near % n == 0:
@@ -117,7 +117,7 @@ class Follower:
 
 
 def stock(trace: Trace, steps: int | None = None) -> Report:
-    """The stock engine on (the first `steps` of) a trace, compared with what the file holds."""
+    """Compares the stock engine with (the first `steps` of) a trace."""
     if missing := sorted(NEEDED - trace.arrays.keys()):
         raise TraceError(f"{trace.name}: nothing to compare with: no {', '.join(missing)} in the file")
     engine, follow = StockEngine(trace.parameters), Follower(trace)
@@ -193,7 +193,7 @@ def row_of(
 
 
 def dusty(activity: Array, count: int) -> bool:
-    """Whether a count of nonzero cells can be ours but for cells that rounding makes or unmakes."""
+    """Whether a count of nonzero cells differs from ours only by cells that rounding decides."""
     solid = np.abs(activity) > DUST
     reach = solid
     for axis in range(3):
@@ -240,7 +240,7 @@ def nodes(report: Report, trace: Trace, engine: StockEngine, name: str) -> None:
 
 
 def final(report: Report, trace: Trace, engine: StockEngine) -> None:
-    """Compare what is left at the end: network, map, links and templates."""
+    """Compare the final network, map, links and templates."""
     cells(report, trace, engine, "final")
     nodes(report, trace, engine, "final")
     theirs = np.asarray(trace.arrays["links"], float)

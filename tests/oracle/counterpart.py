@@ -24,13 +24,13 @@ BOUND_STEPS = 1000  # rounding grows along a stream; beyond this many steps the 
 
 
 def settings(config: ClassicBackendConfig) -> Settings:
-    """What a reference stream has no parameter for: the engine's own defaults."""
+    """The engine's defaults for settings that a reference stream does not have."""
     templates = config.templates
     return Settings(templates.recent, config.pose_cells.settle_steps, templates.column_angle)
 
 
 def observed(observation: Observation) -> Input:
-    """The observation as the plain engine takes it."""
+    """The observation as input of the plain engine."""
     motion = observation.odometry
     view = np.asarray(observation.view, float)[:, :, 0] if observation.view_seen else None
     label = int(observation.label)

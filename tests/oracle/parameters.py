@@ -8,7 +8,7 @@ from ratslam.backends.config import ClassicBackendConfig
 
 
 def settings_of(params: dict[str, Any], labels: bool) -> ClassicBackendConfig:
-    """The configuration that a reference stream's parameters ask for (`ratslam/README.md` has the table).
+    """The configuration of a reference stream's parameters (`ratslam/classic/README.md` has the table).
 
     Args:
         params: names and values of OpenRatSLAM's [ratslam] section; missing ones take its defaults.

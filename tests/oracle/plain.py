@@ -1,7 +1,6 @@
-"""The plain engine: "Semantics of the classic backend" in `ratslam/README.md`, steps 1 to 4.
+"""The plain engine: "Semantics of the classic backend" in `ratslam/classic/README.md`, steps 1 to 4.
 
-It differs from the stock one in every step, so only the attractor, the sums of differences and the box around
-the peak are shared.
+It shares only the attractor, the sums of differences and the box around the peak with the stock engine.
 """
 
 from __future__ import annotations
@@ -18,14 +17,14 @@ from tests.oracle.trace import Array, Parameters
 from tests.oracle.views import Match, compared_pixels, offsets, summed_differences, wrapped
 
 VIEW_TIE = PLACE_TIE = PEAK_TIE = 1e-9
-WORN_OUT = 3.0  # beyond this habituation nothing is injected, so it need not rise further
+WORN_OUT = 3.0  # habituation above this injects no energy
 LONGEST_PART, MOST_PARTS = 0.5, 256
-LOST = 1.0  # a lag beyond a cell is not a lag but a jump
+LOST = 1.0  # a difference above one cell is a jump, not a lag
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What the plain engine has beyond the stock one's parameters."""
+    """Parameters that the stock engine does not have."""
 
     recent: int
     settle_steps: int
@@ -53,7 +52,7 @@ class PlainStep:
 
 
 def around(d: float, n: float) -> float:
-    """A difference taken the short way round a ring."""
+    """A difference wrapped to half a ring."""
     return (d + n / 2) % n - n / 2
 
 
@@ -64,7 +63,7 @@ def on_ring(a: float, n: float) -> float:
 
 
 class PlainTemplates:
-    """Step 1: no gate on the mean, and ties are decided by order rather than by the last bit."""
+    """Step 1: no preselection by the mean; ties within a tolerance go to the earliest template."""
 
     def __init__(self, parameters: Parameters, settings: Settings) -> None:
         self.parameters, self.settings = parameters, settings
@@ -111,7 +110,7 @@ def corners(pose: Pose, lengths: Cell) -> Iterator[tuple[Cell, float]]:
 
 
 def shifted(layers: Array, shifts: Array, axis: int) -> Array:
-    """Each layer shifted by its own real number of cells along an axis, linearly and around."""
+    """Each layer shifted by its own number of cells along an axis, circularly, by linear interpolation."""
     n = layers.shape[axis]
     low = np.floor(shifts).astype(int)
     fraction = (shifts - low)[:, None, None]
@@ -144,7 +143,7 @@ class PlainCells:
             self.activity[k, j, i] += energy * share
 
     def inject(self, energy: float, packet: Pose, relative: float) -> None:
-        """Step 2: so much energy that the excited peak is as high as on a whole cell."""
+        """Step 2: energy scaled so that the excited peak is as high as for a deposit on a cell."""
         turned = (packet[0], packet[1], packet[2] + relative / self.heading_cell)
         pose = tuple(on_ring(a, n) for a, n in zip(turned, self.rings, strict=True))
         spread = 2 * self.parameters.pc_w_e_var**2
@@ -156,21 +155,25 @@ class PlainCells:
     def move(self, motion: Pose, injected: bool) -> None:
         """Step 3."""
         size = self.parameters.pc_cell_x_size
-        told = np.array([motion[0] / size, motion[1] / size, motion[2] / self.heading_cell])
+        moved_cells = np.array([motion[0] / size, motion[1] / size, motion[2] / self.heading_cell])
         self.settling = self.settings.settle_steps if injected else max(self.settling - 1, 0)
         measured = self.settling == 0
         lag = np.array(self.lag) if measured else np.zeros(3)
-        reach = max(math.hypot(*told[:2]) + math.hypot(*lag[:2]), abs(told[2] + lag[2]))
+        reach = max(math.hypot(*moved_cells[:2]) + math.hypot(*lag[:2]), abs(moved_cells[2] + lag[2]))
         parts = max(1, math.ceil(reach / LONGEST_PART - 1e-9))
         if parts > MOST_PARTS:
-            told, lag, parts = told * (MOST_PARTS / parts), lag * (MOST_PARTS / parts), MOST_PARTS
+            moved_cells, lag, parts = (
+                moved_cells * (MOST_PARTS / parts),
+                lag * (MOST_PARTS / parts),
+                MOST_PARTS,
+            )
         before, died = self.best, False
         for part in range(parts):
             died |= self.settle(before)
-            self.shift(told / parts, lag / parts, lag[2] - part * (told[2] + lag[2]) / parts)
+            self.shift(moved_cells / parts, lag / parts, lag[2] - part * (moved_cells[2] + lag[2]) / parts)
         self.best = self.decoded()
         if measured:
-            self.lag = self.behind(told, lag, before, died)
+            self.lag = self.behind(moved_cells, lag, before, died)
 
     def settle(self, fallback: Pose) -> bool:
         """Excite, inhibit and normalise; true if nothing was left and the network was restarted."""
@@ -182,13 +185,13 @@ class PlainCells:
         self.activity /= total
         return False
 
-    def shift(self, told: Array, lag: Array, aside: float) -> None:
+    def shift(self, moved_cells: Array, lag: Array, aside: float) -> None:
         """Translate each heading layer `aside` (heading cells) of its own heading, then turn."""
-        turn = told[2] + lag[2]
+        turn = moved_cells[2] + lag[2]
         layers = np.flatnonzero((self.activity != 0).any(axis=(1, 2)))
         angle = (layers + aside) * self.heading_cell
-        along_x = told[0] * np.cos(angle) - told[1] * np.sin(angle) + lag[0]
-        along_y = told[0] * np.sin(angle) + told[1] * np.cos(angle) + lag[1]
+        along_x = moved_cells[0] * np.cos(angle) - moved_cells[1] * np.sin(angle) + lag[0]
+        along_y = moved_cells[0] * np.sin(angle) + moved_cells[1] * np.cos(angle) + lag[1]
         self.activity[layers] = shifted(shifted(self.activity[layers], along_x, 2), along_y, 1)
         low = math.floor(turn)
         f = turn - low
@@ -213,13 +216,13 @@ class PlainCells:
             pose.append(on_ring(mean * n / (2 * math.pi), n))
         return pose[0], pose[1], pose[2]
 
-    def behind(self, told: Array, lag: Array, before: Pose, died: bool) -> Pose:
-        """How far the decoded pose stayed behind what was wanted of it."""
+    def behind(self, moved_cells: Array, lag: Array, before: Pose, died: bool) -> Pose:
+        """Difference between the commanded and the decoded motion."""
         angle = (before[2] + lag[2]) * self.heading_cell
         wanted = (
-            told[0] * math.cos(angle) - told[1] * math.sin(angle) + lag[0],
-            told[0] * math.sin(angle) + told[1] * math.cos(angle) + lag[1],
-            told[2] + lag[2],
+            moved_cells[0] * math.cos(angle) - moved_cells[1] * math.sin(angle) + lag[0],
+            moved_cells[0] * math.sin(angle) + moved_cells[1] * math.cos(angle) + lag[1],
+            moved_cells[2] + lag[2],
         )
         moved = (a - b for a, b in zip(self.best, before, strict=True))
         rest = [around(float(w - m), n) for w, m, n in zip(wanted, moved, self.rings, strict=True)]

@@ -1,4 +1,4 @@
-"""The slow reference: against the compiled reference's traces, and the JAX engine against it."""
+"""The stock engine against recorded traces, and the JAX engine against the plain engine."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_stock_intel() -> None:
 
 
 def test_stock_lecture_hall() -> None:
-    """It leaves the reference at step 235 unless the file decides there which cell is injected into."""
+    """At step 235 truncation is ambiguous, and the file decides the cell of the injection."""
     report = compare.stock(load(real(LECTURE_HALL)), steps=400)
     assert report.agrees, report.line()
     assert report.knife_edges == 1
@@ -91,8 +91,8 @@ def changed(folder: Path, **changes: object) -> Path:
     return path
 
 
-def test_program(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """One line a file; 0, 1 and 2 as exit codes."""
+def test_the_program_prints_one_line_per_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Exit codes 0, 1 and 2."""
     golden = GOLDEN / "j_reverse_stop.npz"
     assert main([str(golden)]) == 0
     actions = load(golden).arrays["out_action"].copy()
@@ -131,8 +131,8 @@ def test_rows_without_a_view_or_odometry(tmp_path: Path) -> None:
     assert report.agrees, report.line()
 
 
-def test_labels(tmp_path: Path) -> None:
-    """Two columns are template ids decided elsewhere."""
+def test_templates_given_as_labels(tmp_path: Path) -> None:
+    """A view of two columns is a template id and its turn."""
     golden = load(GOLDEN / "j_reverse_stop.npz")
     ids = np.stack([golden.arrays["out_vt"], np.zeros(len(golden))], axis=1)
     path = changed(tmp_path, in_view=ids)
@@ -175,7 +175,7 @@ def test_engine_agrees_on_other_shapes(tmp_path: Path, parameters: dict[str, int
     assert report.agrees, report.line()
 
 
-def test_parameters_are_text() -> None:
+def test_parameters_are_read_from_text() -> None:
     """Strings, with the defaults of the specification."""
     parameters = Parameters.from_strings(
         {"pc_dim_xy": "11", "exp_initial_em_deg": "-26.5", "camera_hz": "10"}
@@ -184,8 +184,8 @@ def test_parameters_are_text() -> None:
     assert (parameters.vt_shift_match, parameters.exp_loops, parameters.pc_w_i_var) == (25, 10, 2)
 
 
-def test_attractor_is_the_dense_one() -> None:
-    """The restriction to the occupied box leaves nothing out, across the edges of the torus too."""
+def test_the_attractor_equals_the_dense_one() -> None:
+    """Computing the occupied box alone is exact, also across the edges of the torus."""
     p = Parameters(pc_dim_xy=12, pc_dim_th=16)
     activity = np.zeros((16, 12, 12))
     activity[15, 0, 11], activity[1, 3, 10] = 0.7, 0.3
@@ -232,7 +232,7 @@ def test_translation_is_mirrored_and_leaks() -> None:
 
 
 def test_rotation() -> None:
-    """Whole cells go whole, parts of cells are shared, to either side."""
+    """Shifts by cells are exact, shifts by parts of cells interpolate, in both directions."""
     activity = np.zeros((8, 3, 3))
     activity[0, 1, 1] = 1.0
     cell = math.pi / 4
@@ -249,7 +249,7 @@ def test_decoding() -> None:
     assert circular_mean(np.array([1.0]), np.array([3]), 9) == pytest.approx(3.0)
 
 
-def test_truncation_and_the_knife_edge() -> None:
+def test_injection_truncates_the_pose() -> None:
     """Energy goes to the cell below, and out of the grid at its upper edge."""
     p = Parameters(pc_dim_xy=9, pc_dim_th=12)
     cells = StockCells(p)
@@ -266,7 +266,7 @@ def test_truncation_and_the_knife_edge() -> None:
 
 
 def test_recent_templates() -> None:
-    """With fewer than ten templates the unsigned guard lets everything through, with ten nothing."""
+    """With fewer than ten templates all pass the unsigned comparison, with ten none."""
     places = StockPlaces(Parameters())
     pose = (1.0, 1.0, 1.0)
     for template in range(9):
@@ -279,8 +279,8 @@ def test_recent_templates() -> None:
         places.see(12, 0.0, pose)
 
 
-def test_energies_of_a_long_look() -> None:
-    """0.889 and 0.633 of the full energy, then nothing."""
+def test_energy_falls_with_consecutive_matches() -> None:
+    """0.889 and 0.633 of the full energy, then 0."""
     places = StockPlaces(Parameters(pc_vt_inject_energy=1.0))
     for template in range(2):
         places.see(template, 0.0, (1.0, 1.0, 1.0))
@@ -301,7 +301,7 @@ def test_actions() -> None:
 
 
 def test_map_double_counts_its_first_link() -> None:
-    """Going to node 0 clears nothing, so the first link is longer than the way."""
+    """Reaching node 0 does not reset the accumulators, so the first link is too long."""
     graph = StockMap(Parameters(exp_initial_em_deg=0.0, exp_loops=0))
     for target in range(3):
         graph.move(1.0, 0.0, 1.0)
@@ -323,7 +323,7 @@ def test_relaxation_halves_a_contradiction() -> None:
 
 
 def test_template_gate() -> None:
-    """The gate on the mean hides a match inside the shifted window; the plain engine has none."""
+    """Preselection by the mean misses a shifted match; the plain engine does not preselect."""
     p = Parameters(template_x_size=6, template_y_size=1, vt_shift_match=1, vt_step_match=1)
     first = np.array([[0.0, 0.5, 0.2, 0.6, 0.1, 0.0]])
     second = first.copy()
@@ -347,7 +347,7 @@ def test_panoramic_turn() -> None:
 
 
 def test_plain_shift_is_circular() -> None:
-    """Nothing is lost at any edge, forwards or backwards."""
+    """Activity is conserved at the edges, in both directions."""
     layers = np.zeros((2, 5, 5))
     layers[:, 0, 4] = 1.0
     moved = shifted(layers, np.array([0.25, -0.25]), 2)
@@ -358,7 +358,7 @@ def test_plain_shift_is_circular() -> None:
 
 
 def test_plain_network_restarts() -> None:
-    """Uniform activity dies, and comes back where it was decoded before."""
+    """Uniform activity dies out and is reseeded at the last decoded pose."""
     cells = PlainCells(Parameters(pc_dim_xy=9, pc_dim_th=12), SETTINGS)
     cells.activity[:] = 1.0 / cells.activity.size
     cells.best = (3.0, 4.0, 5.0)

@@ -22,37 +22,41 @@ CELLS = {11: 2, 21: 2, 41: 3, 61: 4}
 
 
 @partial(jax.jit, static_argnames="config")
-def run(config, cells, motion, recall, energy):
-    """Motion in cells [T, 3]: poses, spreads [T, 3], outcomes and window levels [T]."""
+def run(config, cells, motion, recall, energy, count):
+    """The first `count` steps of motion in cells [T, 3]: poses, spreads [T, 3], outcomes and levels [T]."""
     used, unit = window_levels(config, np.dtype(float)), units(config, np.dtype(float))
 
-    def step(cells, row):
-        moved, at, how_much = row
-        odometry = Odometry(*(moved * unit), jnp.ones(()))
-        cells, told = pose_cells.step(config, used, cells, odometry, at, how_much)
-        return cells, (cells.pose, *told)
+    def step(k, carry):
+        cells, *rows = carry
+        odometry = Odometry(*(motion[k] * unit), jnp.ones(()))
+        cells, info = pose_cells.step(config, used, cells, odometry, recall[k], energy[k])
+        return cells, *(row.at[k].set(value) for row, value in zip(rows, (cells.pose, *info), strict=True))
 
-    return jax.lax.scan(step, cells, (motion, recall, energy))
+    whole = jnp.zeros(len(motion), jnp.int32)
+    return jax.lax.fori_loop(
+        0, count, step, (cells, jnp.zeros_like(motion), jnp.zeros_like(motion), whole, whole)
+    )
 
 
 full_activity = jax.jit(pose_cells.full_activity, static_argnums=0)
 
 
 def compare(n, motion, recall, energy):
-    """Both engines, for as many steps as fill a compiled run of 1000; returns the window levels."""
+    """Both engines, in compiled runs with room for 1000 steps; returns the window levels."""
     count = len(motion)
     motion, recall = (np.pad(rows, ((0, 1000 - count), (0, 0))) for rows in (motion, recall))
     energy = np.pad(energy, (0, 1000 - count))
     moving = PoseCellConfig(cells_xy=n)
     dense = moving.model_copy(update={"engine": "dense"})
-    start = [pose_cells.start(config, np.dtype(float)) for config in (moving, dense)]
-    one, (pose, spread, outcome, level) = run(moving, start[0], motion, recall, energy)
-    all_, (whole_pose, whole_spread, whole_outcome, whole_rung) = run(dense, start[1], motion, recall, energy)
+    (one, pose, spread, outcome, level), (all_, whole_pose, whole_spread, whole_outcome, whole_level) = (
+        run(config, pose_cells.start(config, np.dtype(float)), motion, recall, energy, np.int32(count))
+        for config in (moving, dense)
+    )
     ring = rings(moving, np.dtype(float))
     assert np.abs(window.ring_difference(np.asarray(pose) - np.asarray(whole_pose), ring)).max() <= 1e-12
     assert np.nanmax(np.abs(np.asarray(spread) - np.asarray(whole_spread))) <= 1e-9
     assert np.array_equal(outcome, whole_outcome)
-    assert not np.any(whole_rung)
+    assert not np.any(whole_level)
     gap = full_activity(moving, one) - full_activity(dense, all_)
     assert float(jnp.abs(gap).max()) <= 1e-14
     return np.asarray(level)[:count]

@@ -1,4 +1,4 @@
-"""Laws of places: made, kept, reached."""
+"""Laws of places: creation, linking, reaching."""
 
 from __future__ import annotations
 
