@@ -1,4 +1,4 @@
-"""The grid filter: microseconds a report, in replay and live, on one core, after compilation."""
+"""The grid filter: microseconds per report, in replay and live, on one core, after compilation."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tactile.frontend import TouchConfig
 
 @pytest.fixture(scope="module")
 def session():
-    """What a Create felt in 512 steps, and its feelers."""
+    """512 reports of a simulated Create, and its whiskers."""
     source = CreateSimulation(CreateSimulationConfig(reports=512, seed=5))
     touch = TouchConfig()
     return [sample.reading for sample in open_touch_source(source, touch)], planar_whiskers_of(source, touch)

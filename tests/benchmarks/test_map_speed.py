@@ -1,4 +1,4 @@
-"""Maps of 10 000 nodes and 1 000 closures, and ten times as many: a solve, and others' beside it."""
+"""Solving maps of 10 000 and 100 000 nodes with a tenth as many closures, beside other solvers."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ NOISE = np.array([0.02, 0.02, 0.01])
 
 
 def city(count, stream):
-    """A walk along the streets of a grid of 1 m."""
+    """A random walk on a square grid of 1 m."""
     heading = np.cumsum(stream.choice([0, 0, 0, np.pi / 2, -np.pi / 2], count))
     steps = np.stack([np.cos(heading[:-1]), np.sin(heading[:-1])], axis=1)
     return np.column_stack([np.vstack([np.zeros(2), np.cumsum(steps, axis=0)]), wrap(heading)]), 1.1
@@ -38,7 +38,7 @@ def serpentine(count, stream):
 
 
 def arena(count, stream):
-    """Back and forth in a square that is soon crossed everywhere: closures tie everything to everything."""
+    """Straight lines across a square, with closures between all of them."""
     half, turns, poses = 0.25 * np.sqrt(count), stream.normal(0, 0.2, count), np.zeros((count, 3))
     for k in range(1, count):
         x, y, heading = poses[k - 1]
@@ -66,7 +66,7 @@ def measured(name, count, noise=NOISE):
 
 @pytest.fixture
 def size(benchmark):
-    """The number of nodes to take for one that is asked for: few where nothing is measured."""
+    """The number of nodes: few where times are not measured."""
     return lambda count: count if benchmark.enabled else min(count, 2500)
 
 
@@ -81,7 +81,7 @@ def timed(call, rounds=5):
 
 
 def misfit(poses, edges):
-    """Chi-square a degree of freedom: 1 is what noise leaves."""
+    """Chi-square per degree of freedom; 1 at the optimum."""
     left = between(poses[edges.i], poses[edges.j]) - edges.motion
     left[:, 2] = wrap(left[:, 2])
     return float((left**2 * edges.information).sum()) / (3 * (len(edges.i) - len(poses) + 1))
@@ -198,7 +198,7 @@ def integrated(edges, count):
 
 
 def sweep(poses, edges, loops):
-    """`ratslam.classic.relaxation.relax`, compiled: in the place of the classic C++."""
+    """`ratslam.classic.relaxation.relax`, compiled, as a stand-in for the C++ original."""
     columns = [np.ascontiguousarray(column) for column in (*poses.T, edges.i, edges.j, *edges.motion.T)]
     compiled()(*columns, loops)
     return np.stack(columns[:3], axis=1)
