@@ -1,4 +1,4 @@
-"""`python -m ratslam`, and what the console script calls."""
+"""`python -m ratslam` and the entry point of the console script."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ import sys
 def main(argv: list[str] | None = None) -> int:
     """Runs the program.
 
-    Before anything else of ours is imported, it makes sure that it is ours: `tactile/__init__.py` says why.
+    First it checks that the four packages are ours: `tactile/__init__.py` says why.
 
     Args:
         argv: the arguments without the program's name; None takes those of the process.
 
     Returns:
-        The exit code: 2 after an error the user can mend.
+        The exit code: 2 after an error that the user can correct.
     """
-    strangers = [_stranger(name) for name in ("ratslam", "tactile", "robot", "evaluation")]
-    if any(strangers):
-        print("\n".join(filter(None, strangers)), file=sys.stderr)
+    errors = [package_error(name) for name in ("ratslam", "tactile", "robot", "evaluation")]
+    if any(errors):
+        print("\n".join(filter(None, errors)), file=sys.stderr)
         return 2
     from ratslam.cli import main as run
 
     return run(argv)
 
 
-def _stranger(name: str) -> str:
-    """What is wrong with the package of this name; '' if it is ours."""
+def package_error(name: str) -> str:
+    """The error for a package that is missing or of another distribution; '' if it is ours."""
     spec = importlib.util.find_spec(name)
     if spec is None:
         return f"ratslam: error: the package '{name}' is missing; install ratslam again"

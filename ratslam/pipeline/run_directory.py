@@ -1,6 +1,6 @@
-"""A run directory: what a run leaves behind, readable at every moment.
+"""The run directory: files of a run, readable at any moment.
 
-Text files grow by whole lines, a chunk at a time; everything else appears in one piece by renaming. So an
+Text files grow by whole lines, one chunk at a time; all other files appear complete, by renaming. So an
 interrupt, a kill or a full disk leaves a readable prefix.
 """
 
@@ -21,18 +21,18 @@ from tactile.base.errors import InputError
 COLUMNS = (
     "t", "place", "action", "x", "y", "heading", "sd_x", "sd_y", "sd_heading", "lost", "outcome",
 )  # fmt: skip
-"""Of steps.csv, before those of the backend: s; the pose is the one told at that step, in the map frame (m,
-rad)."""
+"""Columns of steps.csv before those of the backend: time (s), experience, action, online pose in the map
+frame and its standard deviations (m, m, rad), flag, outcome."""
 
 
 class RunDirectory:
-    """Files of one run.
+    """A new run directory.
 
     Args:
-        columns: that the backend adds to steps.csv.
+        columns: columns of steps.csv that the backend adds.
 
     Raises:
-        InputError: the directory exists already, or cannot be made.
+        InputError: the directory exists or cannot be created.
     """
 
     STREAMS = ("online.tum", "odometry.tum", "truth.tum", "steps.csv", "online_error.csv")
@@ -45,7 +45,7 @@ class RunDirectory:
             path.mkdir(parents=True)
         except OSError as error:
             raise InputError(
-                str(path), f"cannot be made ({error.strerror})", "a folder that can be written"
+                str(path), f"cannot be created ({error.strerror})", "a writable folder"
             ) from None
         self._streams: dict[str, TextIO] = {}
 
@@ -59,26 +59,26 @@ class RunDirectory:
 
     def __exit__(self, *_: object) -> None:
         for stream in self._streams.values():
-            # A full disk has been reported by the write that met it; closing would only repeat it.
+            # A full disk has been reported by the failed write; closing would report it again.
             with suppress(OSError):
                 stream.close()
 
     def append(self, lines: Mapping[str, Iterable[str]]) -> None:
-        """Adds whole lines to the streams and hands them to the operating system."""
+        """Appends whole lines to the text files and flushes them."""
         for name, added in lines.items():
             self._streams[name].write("".join(added))
             self._streams[name].flush()
 
     def text(self, name: str, content: str) -> None:
-        """A text file, in one piece."""
+        """Writes a text file atomically."""
         write_text_atomically(self.path / name, content)
 
     def manifest(self, content: Mapping[str, Any]) -> None:
-        """manifest.json, in one piece."""
+        """Writes manifest.json atomically."""
         self.text("manifest.json", json.dumps(content, indent=2, allow_nan=False) + "\n")
 
     def checkpoint(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """map.npz, in one piece."""
+        """Writes map.npz atomically."""
 
         def write(path: Path) -> None:
             with path.open("wb") as file:
@@ -87,7 +87,7 @@ class RunDirectory:
         write_atomically(self.path / "map.npz", write)
 
     def file(self, name: str, write: Any) -> None:
-        """Any file in one piece; `write(path)` makes it under a temporary name of the same ending."""
+        """Writes any file atomically: `write(path)` gets a temporary path with the same suffix."""
         write_atomically(self.path / name, write)
 
 
@@ -95,7 +95,7 @@ def read_checkpoint(path: Path) -> dict[str, np.ndarray]:
     """The arrays of a map.npz.
 
     Raises:
-        InputError: there is no such file, or it is not a whole checkpoint.
+        InputError: there is no such file, or it is not a complete checkpoint.
     """
     try:
         with np.load(path, allow_pickle=False) as archive:
@@ -105,5 +105,5 @@ def read_checkpoint(path: Path) -> dict[str, np.ndarray]:
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(str(path), f"not a checkpoint ({error})", "the map.npz of a run directory") from None
     if "steps" not in arrays:
-        raise InputError(str(path), "arrays of something else", "the map.npz of a run directory")
+        raise InputError(str(path), "an archive of other arrays", "the map.npz of a run directory")
     return arrays

@@ -1,7 +1,7 @@
-"""Golden touch sessions: recordings with their noise in them, and the decisions our engine took on them.
+"""Golden touch sessions: recordings, with their noise, and the decisions of the recall backend on them.
 
-`python -m tests.golden.touch` writes the decisions anew, for whoever changed them on purpose; it never makes
-the sessions again.
+`python -m tests.golden.touch` stores the decisions again after an intended change; it does not simulate the
+sessions again.
 """
 
 from __future__ import annotations
@@ -22,12 +22,16 @@ from tactile.base.types import Observation
 
 FOLDER = Path(__file__).parent
 SESSIONS = ("touch_circuits", "touch_kidnap")
+ROWS = 1024
+"""Rows reserved for a session, so that its kernel is compiled once."""
 
 
 def decisions(name: str) -> dict[str, Any]:
-    """What was decided on a session: experiences as [id, steps] in order, how often each action was taken,
-    closures as [later, earlier] steps, and the Experience Metric's counts."""
-    config = RunConfig.model_validate({"recording": {"file": FOLDER / f"{name}.mcap"}})
+    """The decisions on a session: experiences as [id, steps] in order, counts of actions, closures as
+    [later, earlier] steps, counts of the Experience Metric."""
+    config = RunConfig.model_validate(
+        {"recording": {"file": FOLDER / f"{name}.mcap"}, "session": {"reserve": ROWS}}
+    )
     with open_observations(config) as (config, source):
         session = build_session(config, source)
         rows: list[tuple[Any, Observation]] = list(read_observations(source))

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ValidationError
 from ratslam.config.strict_yaml.document import Document, KeyPath, Place, dotted, shown
 from ratslam.config.strict_yaml.dumper import Dumper
 from ratslam.config.strict_yaml.reader import Reader
-from ratslam.config.strict_yaml.validation_errors import complaints
+from ratslam.config.strict_yaml.validation_errors import input_errors
 from tactile.base.config import Settings
 from tactile.base.errors import InputError, InputErrors
 
@@ -32,7 +32,7 @@ def load(path: str | os.PathLike[str], assignments: Sequence[str] = ()) -> Docum
             variable that is not set.
 
     Raises:
-        InputError: with file, line and column, whatever is wrong with the file.
+        InputError: the file cannot be read or is not strict YAML; with file, line and column.
     """
     name = os.fspath(path)
     try:
@@ -69,14 +69,18 @@ def parse(text: str, name: str, replaced: Sequence[str] = ()) -> Document:
 
 
 def override(document: Document, assignments: Sequence[str]) -> Document:
-    """The document with values replaced or added, each given as `a.b=value` (list items as `a.0=value`)."""
+    """The document with values replaced or added, each given as `a.b=value` (list items as `a.0=value`).
+
+    Raises:
+        InputError: an assignment is malformed, or its path leads through a value that is not a section.
+    """
     data, places = copy.deepcopy(document.data), dict(document.places)
     for assignment in assignments:
         name, equals, text = assignment.partition("=")
         keys = name.split(".")
         where = f"--set {name}"
         if not equals or not all(keys):
-            raise InputError(where, "no key and value", "key=value such as pose_cells.excite_sigma=1e-3")
+            raise InputError(where, "not an assignment", "key=value such as pose_cells.excite_sigma=1e-3")
         section: Any = data
         path: KeyPath = ()
         for key in keys:
@@ -96,13 +100,13 @@ def validate(document: Document, model: type[Model]) -> Model:
     """The document as a model.
 
     Raises:
-        InputErrors: all that is wrong with it, each with its place.
+        InputErrors: all errors in it, each with its place.
     """
     try:
-        # As JSON, because pydantic is then strict and still takes lists for tuples and texts for paths.
+        # As JSON: pydantic is then strict, but accepts lists for tuples and texts for paths.
         return model.model_validate_json(json.dumps(document.data), strict=True)
     except ValidationError as error:
-        raise InputErrors(complaints(error, model, document)) from None
+        raise InputErrors(input_errors(error, model, document)) from None
 
 
 def dump(model: BaseModel) -> str:
@@ -117,7 +121,7 @@ def schema(model: type[BaseModel]) -> dict[str, Any]:
 
 
 def _escaped(data: Any) -> Any:
-    """The data with `${` in its texts escaped, so that reading does not take it for a variable."""
+    """The data with `${` in its texts escaped, so that it is not read as a variable."""
     match data:
         case dict():
             return {key: _escaped(value) for key, value in data.items()}
@@ -130,7 +134,7 @@ def _escaped(data: Any) -> Any:
 
 
 def _step(section: Any, key: str, where: str, path: KeyPath) -> str | int:
-    """The key or list index by which `key` leads into a section."""
+    """`key` as a key of a section or as an index of a list."""
     if isinstance(section, dict):
         return key
     if isinstance(section, list):
@@ -141,7 +145,7 @@ def _step(section: Any, key: str, where: str, path: KeyPath) -> str | int:
 
 
 def _opened(section: Any, key: str | int) -> Any:
-    """The subsection at a key, made where there is none."""
+    """The subsection at a key; created if it is missing."""
     if isinstance(section, dict) and section.get(str(key)) is None:
         section[str(key)] = {}
     return section[key]

@@ -1,4 +1,4 @@
-"""A configuration as plain data that remembers where each of its keys and values was written."""
+"""A configuration as plain data with the place of each key and value."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ KeyPath = tuple[str | int, ...]
 
 
 class Place(NamedTuple):
-    """Where a key and its value were written: `file:line:column:`, or the option that gave them."""
+    """Place of a key and of its value: `file:line:column:`, or the option that set them."""
 
     key: str
     value: str
@@ -19,26 +19,26 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True)
 class Document:
-    """What was read.
+    """A configuration file.
 
     Attributes:
         data: nested dicts, lists and scalars.
-        places: of every key path in `data`, () included, in the order of reading.
+        places: places of all key paths in `data`, including (), in the order of reading.
     """
 
     data: dict[str, Any]
     places: dict[KeyPath, Place]
 
     def at_key(self, path: KeyPath) -> str:
-        """`file:line:column: a.b` of a key, or of the nearest section above it where it is missing."""
+        """`file:line:column: a.b` of a key; of the nearest section above if it is missing."""
         return label(self.places[self.nearest(path)].key, path)
 
     def at_value(self, path: KeyPath) -> str:
-        """`file:line:column: a.b` of a value, or of the nearest section above it where it is missing."""
+        """`file:line:column: a.b` of a value; of the nearest section above if it is missing."""
         return label(self.places[path].value, path) if path in self.places else self.at_key(path)
 
     def value(self, path: KeyPath) -> Any:
-        """What stands at the path; None where nothing does."""
+        """The value at a path; None if there is none."""
         value: Any = self.data
         for key in path:
             try:
@@ -48,30 +48,30 @@ class Document:
         return value
 
     def nearest(self, path: KeyPath) -> KeyPath:
-        """The path itself, or that of the nearest section above it that was written."""
+        """The path, or the nearest section above it that exists."""
         while path not in self.places:
             path = path[:-1]
         return path
 
 
 def label(place: str, path: KeyPath) -> str:
-    """A place and a key path as messages show them: `config.yaml:5:3: pose_cells.shape`, `--set a.b`."""
+    """A place and a key path for messages: `config.yaml:5:3: pose_cells.shape`, `--set a.b`."""
     return f"{place} {dotted(path)}".rstrip(": ")
 
 
 def dotted(path: KeyPath) -> str:
-    """The path as `--set` takes it."""
+    """The path in the notation of `--set`."""
     return ".".join(str(key) if str(key).isprintable() else repr(key) for key in path)
 
 
 def either(words: Iterable[Any]) -> str:
-    """The words as a choice: `'a', 'b' or 'c'`."""
+    """The words as alternatives: `'a', 'b' or 'c'`."""
     *most, last = map(repr, words)
     return f"{', '.join(most)} or {last}" if most else last
 
 
 def shown(value: Any) -> str:
-    """A value as messages show it, short."""
+    """A short form of a value for messages."""
     match value:
         case None:
             return "nothing"

@@ -1,4 +1,4 @@
-"""Writes plain data as YAML that every reader takes for the same."""
+"""Writes plain data as YAML that readers of YAML 1.1 and of YAML 1.2 read alike."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ _TEXT = "tag:yaml.org,2002:str"
 
 
 class Dumper(yaml.SafeDumper):
-    """Quotes what any reader, of YAML 1.1 or strict, would not take for text; short lists on one line."""
+    """Quotes texts that a reader of YAML 1.1 or ours would read as another type; flat lists take one line."""
 
     def resolve(self, kind: type, value: Any, implicit: Any) -> Any:
-        """The tag a reader would give a node: that of YAML 1.1, unless ours finds a number in its text."""
+        """The tag that a reader gives a node: that of YAML 1.1, or a number if our reader finds one."""
         tag = super().resolve(kind, value, implicit)
         if kind is yaml.ScalarNode and implicit[0] and tag == _TEXT and not isinstance(plain(value), str):
             return "tag:yaml.org,2002:float"
         return tag
 
     def ignore_aliases(self, data: Any) -> bool:
-        """A list used twice is written twice, since anchors are refused."""
+        """Always true: anchors are refused on reading, so a shared list is written twice."""
         return True
 
 
@@ -32,7 +32,7 @@ def _represent_list(dumper: Dumper, items: list[Any]) -> yaml.Node:
 
 
 def _represent_text(dumper: Dumper, text: str) -> yaml.Node:
-    # The emitter folds U+0085 and its like as if they were spaces, unless they are escaped.
+    # Unless escaped, the emitter folds U+0085 and similar characters like spaces.
     return dumper.represent_scalar(_TEXT, text, style=None if text.isprintable() else '"')
 
 

@@ -1,7 +1,7 @@
-"""YAML text to plain data, strictly, with the place of everything.
+"""Reads YAML strictly into plain data with the place of every key and value.
 
-Duplicate keys, anchors and tags are refused, so that every value has one place and no file unfolds into
-a larger one.
+Duplicate keys, anchors and tags are refused: every value has one place, and no file expands into a larger
+one.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ _RECORDINGS = "the recordings are not part of the project: set RATSLAM_DATA to t
 
 
 class Reader:
-    """Reads one text.
+    """A reader of one text.
 
     Args:
         text: the YAML; `${NAME}` in its texts becomes the environment variable, `$${` a literal `${`.
-        place: what to call a line and column (from 1), ending in a colon if it should.
+        place: name of a line and column (from 1), with the final colon if it has one.
         root: the key path of the text's value.
         replaced: dotted paths of values that may name unset environment variables.
 
     Attributes:
-        places: of every key path read so far.
+        places: places of all key paths read so far.
     """
 
     def __init__(
@@ -48,15 +48,15 @@ class Reader:
         self._place = place
         self._root = root
         self._events = yaml.parse(text, Loader=yaml.SafeLoader)
-        self._line, self._column = 1, 1  # of the event read last
-        self._brackets: list[str] = []  # places of those still open
-        self._errors: list[InputError] = []  # that do not keep the rest from being read
+        self._line, self._column = 1, 1  # of the last event
+        self._brackets: list[str] = []  # places of the open ones
+        self._errors: list[InputError] = []  # after which reading continues
 
     def read(self) -> Any:
         """The data.
 
         Raises:
-            InputError: the first place where the text is not YAML, or else all values that cannot be used.
+            InputError: the first syntax error, or else all values that are refused.
         """
         try:
             data = self._document()
@@ -68,18 +68,21 @@ class Reader:
             raise self._syntax(error) from None
         except InputError:
             raise
-        except (ValueError, OverflowError):  # PyYAML's own, of escapes like "\UFFFFFFFF" and `%YAML 1.111…`
+        except (
+            ValueError,
+            OverflowError,
+        ):  # PyYAML raises these for escapes like "\UFFFFFFFF" and `%YAML 1.111…`
             raise self._error(self._root, "not YAML: an escape out of range after this") from None
         if self._errors:
             raise InputErrors(self._errors)
         return data
 
     def _error(self, path: KeyPath, found: str, expected: str = "", cure: str = "") -> InputError:
-        """An error at the event read last."""
+        """An error at the last event."""
         return InputError(label(self._place(self._line, self._column), path), found, expected, cure)
 
     def _syntax(self, error: yaml.MarkedYAMLError) -> InputError:
-        """The parser's error in our words."""
+        """A syntax error of the parser as an `InputError`."""
         problem = error.problem or error.context or ""
         if "<stream end>" in problem and self._brackets:
             return InputError(label(self._brackets[-1], self._root), "a bracket that is not closed")
@@ -96,17 +99,17 @@ class Reader:
         return event
 
     def _document(self) -> Any:
-        self._next()  # the start of the stream
+        self._next()  # stream start
         if isinstance(self._next(), yaml.StreamEndEvent):
             raise self._error(self._root, "empty", "a value" if self._root else "keys and values")
         data = self._value(self._next(), self._root)
-        self._next()  # the end of the document
+        self._next()  # document end
         if not isinstance(self._next(), yaml.StreamEndEvent):
             raise self._error(self._root, "a second document", "only one")
         return data
 
     def _value(self, event: yaml.Event, path: KeyPath, key: str = "") -> Any:
-        """The value that begins with `event`; `key` is the place of its key."""
+        """The value that starts with `event`; `key` is the place of its key."""
         place = self._place(self._line, self._column)
         self.places[path] = Place(key or place, place)
         if isinstance(event, yaml.AliasEvent):
@@ -147,7 +150,7 @@ class Reader:
 
     def _key(self, event: yaml.Event, path: KeyPath) -> str:
         if not isinstance(event, yaml.ScalarEvent) or event.anchor or event.tag:
-            raise self._error(path, "a key that is not plain text", "a name")
+            raise self._error(path, "a key that is not plain text", "a plain key")
         if not event.style and not isinstance(plain(event.value), str):
             cure = f"write '{event.value}'"
             self._errors.append(self._error(path, f"the key {event.value or 'is empty'}", "text", cure))
@@ -162,7 +165,7 @@ class Reader:
         return self._text_of(re.sub(r"(\$?)\$\{([^}]*)(\}?)", lambda m: self._variable(m, path), value), path)
 
     def _text_of(self, text: str, path: KeyPath) -> str:
-        """The text, if it can be a file's name and be written to a file."""
+        """The text; an error if it has control characters that no file name may have."""
         if re.search("[\0\ud800-\udfff]", text):
             self._errors.append(self._error(path, shown(text), "text without control characters"))
         return text

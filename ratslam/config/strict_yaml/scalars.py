@@ -1,7 +1,7 @@
-"""What an unquoted word of YAML means here: YAML 1.2, and stricter.
+"""Values of unquoted YAML words: YAML 1.2, and stricter.
 
 Only `true` and `false` are booleans (`no` is text), `1e-3` is a number, `12:30` is text, and `010`, which
-other readers take for eight or for ten, is refused.
+other readers read as eight or as ten, is refused.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _LEADING_ZERO = re.compile(r"[-+]?0[0-9]")
 
 
 class Refused(NamedTuple):
-    """A word without a safe reading."""
+    """A word that is refused because readers disagree about it."""
 
     found: str
     expected: str
@@ -26,7 +26,7 @@ class Refused(NamedTuple):
 
 
 def plain(word: str) -> Any:
-    """The value of an unquoted word: None, a bool, an int, a float, a text, or `Refused`."""
+    """Value of an unquoted word: None, bool, int, float, str or `Refused`."""
     if word in _WORDS:
         return _WORDS[word]
     integer = _INTEGER.fullmatch(word)

@@ -1,4 +1,4 @@
-"""What pydantic found wrong with a configuration, in the words and at the places of its author."""
+"""Turns validation errors of pydantic into messages with the place in the configuration file."""
 
 from __future__ import annotations
 
@@ -28,32 +28,32 @@ _WORDS = {
 }
 
 
-def complaints(error: ValidationError, model: type[Settings], document: Document) -> list[InputError]:
-    """One error for each thing wrong, in the order of the file; the alternatives of a union in one."""
+def input_errors(error: ValidationError, model: type[Settings], document: Document) -> list[InputError]:
+    """One error for each wrong value, in the order of the file; one for all alternatives of a union."""
     order = {path: rank for rank, path in enumerate(document.places)}
     found = [(_spot(details["loc"], model), details) for details in error.errors(include_url=False)]
     found.sort(key=lambda pair: order[document.nearest(pair[0].path)])
-    merged: dict[_Complaint, list[str]] = {}
-    complaints = [
-        complaint
+    merged: dict[_Problem, list[str]] = {}
+    problems = [
+        problem
         for spot, details in found
-        for complaint in _renamed(details, spot.path, model, document)
-        or [_complaint(details, spot, model, document)]
+        for problem in _renamed(details, spot.path, model, document)
+        or [_problem(details, spot, model, document)]
     ]
-    for complaint in complaints:
-        expected = merged.setdefault(complaint._replace(expected=""), [])
-        if complaint.expected not in expected:
-            expected.append(complaint.expected)
+    for problem in problems:
+        expected = merged.setdefault(problem._replace(expected=""), [])
+        if problem.expected not in expected:
+            expected.append(problem.expected)
     errors = [
-        InputError(complaint.where, complaint.found, " or ".join(filter(None, expected)), complaint.cure)
-        for complaint, expected in merged.items()
+        InputError(problem.where, problem.found, " or ".join(filter(None, expected)), problem.cure)
+        for problem, expected in merged.items()
     ]
     rest = len(errors) - _MAX_ERRORS
     return errors[:_MAX_ERRORS] + ([InputError("", f"and {rest} more errors")] if rest > 0 else [])
 
 
-class _Complaint(NamedTuple):
-    """The arguments of an `InputError`."""
+class _Problem(NamedTuple):
+    """Arguments of an `InputError`."""
 
     where: str
     found: str
@@ -62,12 +62,12 @@ class _Complaint(NamedTuple):
 
 
 class _Spot(NamedTuple):
-    """What an error is about.
+    """The place of an error in the data and in the types.
 
     Attributes:
-        path: its key path in the data.
-        owner: the model that holds the last key of the path; None if that is no model or not known.
-        kinds: the types that may stand there; several for a union, none if not known.
+        path: key path in the data.
+        owner: model of which the last key of the path is a field; None if unknown or not a model.
+        kinds: types of the value; several for a union, none if unknown.
     """
 
     path: KeyPath
@@ -77,14 +77,12 @@ class _Spot(NamedTuple):
 
 def _renamed(
     details: ErrorDetails, path: KeyPath, model: type[Settings], document: Document
-) -> list[_Complaint]:
+) -> list[_Problem]:
     """The errors for an unknown key that was renamed: one for each key in it, if it is a section."""
     if details["type"] != "extra_forbidden":
         return []
     return [
-        _Complaint(
-            document.at_key(tuple(old.split("."))), f"`{old}` is now `{new}`" if _is_path(new) else new
-        )
+        _Problem(document.at_key(tuple(old.split("."))), f"`{old}` is now `{new}`" if _is_path(new) else new)
         for old, new in _new_names(dotted(path), document.value(path), model.renamed_keys)
     ]
 
@@ -116,8 +114,8 @@ def _is_path(text: str) -> bool:
     return re.fullmatch(r"[\w.]+", text) is not None
 
 
-def _complaint(details: ErrorDetails, spot: _Spot, model: type[Settings], document: Document) -> _Complaint:
-    """The words for one error of pydantic's."""
+def _problem(details: ErrorDetails, spot: _Spot, model: type[Settings], document: Document) -> _Problem:
+    """The message for one error of pydantic."""
     path, owner, kinds = spot
     context = details.get("ctx", {})
     value = document.value(path)
@@ -125,12 +123,12 @@ def _complaint(details: ErrorDetails, spot: _Spot, model: type[Settings], docume
         case "extra_forbidden":
             known = list(owner.model_fields) if owner else []
             cure = _did_you_mean(path[-1], known) or f"the keys here are {', '.join(known) or 'none'}"
-            return _Complaint(document.at_key(path), "unknown key", cure=cure)
+            return _Problem(document.at_key(path), "unknown key", cure=cure)
         case "missing" if isinstance(path[-1], int):  # an item of a tuple
             return _wrong_length(_spot(details["loc"][:-1], model), "more values", document)
         case "missing":
             field = owner.model_fields.get(str(path[-1])) if owner else None
-            return _Complaint(document.at_key(path), "missing", cure=(field and field.description) or "")
+            return _Problem(document.at_key(path), "missing", cure=(field and field.description) or "")
         case "too_long":
             return _wrong_length(spot, f"at most {context['max_length']} values", document)
         case "too_short":
@@ -138,7 +136,7 @@ def _complaint(details: ErrorDetails, spot: _Spot, model: type[Settings], docume
         case "union_tag_not_found":
             at = (*path, context["discriminator"].strip("'"))
             words = [word for kind in kinds for word in _words(kind, at[-1])]
-            return _Complaint(document.at_key(at), "missing", either(words) if words else "")
+            return _Problem(document.at_key(at), "missing", either(words) if words else "")
         case "union_tag_invalid":
             at = (*path, context["discriminator"].strip("'"))
             return _wrong_word(at, context["expected_tags"], document)
@@ -146,40 +144,40 @@ def _complaint(details: ErrorDetails, spot: _Spot, model: type[Settings], docume
             return _wrong_word(path, context["expected"], document)
         case "value_error" | "assertion_error":
             prefix = "" if isinstance(value, dict) else f"{shown(value)}: "
-            return _Complaint(document.at_value(path), f"{prefix}{context['error']}")
+            return _Problem(document.at_value(path), f"{prefix}{context['error']}")
     message = details["msg"]
     if not message.startswith("Input should be "):
-        return _Complaint(document.at_value(path), f"{shown(value)}: {message[0].lower()}{message[1:]}")
+        return _Problem(document.at_value(path), f"{shown(value)}: {message[0].lower()}{message[1:]}")
     expected = message.removeprefix("Input should be ")
     expected = re.sub("^(greater|less|a multiple)", r"a number \1", _WORDS.get(expected, expected))
-    return _Complaint(document.at_value(path), shown(value), expected)
+    return _Problem(document.at_value(path), shown(value), expected)
 
 
-def _wrong_length(spot: _Spot, expected: str, document: Document) -> _Complaint:
+def _wrong_length(spot: _Spot, expected: str, document: Document) -> _Problem:
     for kind in spot.kinds:
         if get_origin(kind) is tuple and Ellipsis not in get_args(kind):
             expected = f"{len(get_args(kind))} values"
-    return _Complaint(document.at_value(spot.path), shown(document.value(spot.path)), expected)
+    return _Problem(document.at_value(spot.path), shown(document.value(spot.path)), expected)
 
 
-def _wrong_word(path: KeyPath, expected: str, document: Document) -> _Complaint:
+def _wrong_word(path: KeyPath, expected: str, document: Document) -> _Problem:
     found = document.value(path)
     words = re.findall("'([^']*)'", expected)
     choice = either(words) if words else expected
-    return _Complaint(document.at_value(path), shown(found), choice, _did_you_mean(found, words))
+    return _Problem(document.at_value(path), shown(found), choice, _did_you_mean(found, words))
 
 
 def _did_you_mean(found: Any, words: Sequence[str]) -> str:
-    """A suggestion, or ''."""
+    """A suggestion of a similar word, or ''."""
     close = difflib.get_close_matches(str(found).lower(), {word.lower(): word for word in words}, n=1)
     return "".join(f"did you mean '{word}'?" for word in words if close and word.lower() == close[0])
 
 
 def _spot(loc: Sequence[str | int], model: type[Settings]) -> _Spot:
-    """Follows pydantic's location through the types.
+    """Converts a location of pydantic by following it through the types.
 
-    Pydantic puts the name of the alternative it tried between the keys wherever a union stands; only the
-    types tell that name from a key.
+    At a union, pydantic's location has the name of the alternative that was tried between two keys; only the
+    types distinguish that name from a key.
     """
     path: KeyPath = ()
     owner: type[BaseModel] | None = None
@@ -199,7 +197,7 @@ def _is_model(kind: Any) -> bool:
 
 
 def _alternatives(kind: Any) -> list[Any]:
-    """The members of a union but None; the type itself where it is not a union."""
+    """Members of a union without None; the type itself if it is not a union."""
     origin = get_origin(kind)
     if origin is Annotated:
         return _alternatives(get_args(kind)[0])
@@ -209,14 +207,14 @@ def _alternatives(kind: Any) -> list[Any]:
 
 
 def _answers_to(kind: Any, name: str | int) -> bool:
-    """Whether pydantic calls this alternative of a union by `name`: by its class or by a word of a tag."""
+    """Whether `name` is how pydantic names this alternative of a union: by its class or by a tag."""
     if not _is_model(kind):
         return False
     return kind.__name__ == name or any(name in _words(kind, field) for field in kind.model_fields)
 
 
 def _words(kind: Any, field: str | int) -> Sequence[Any]:
-    """The values a model's field is restricted to."""
+    """Values that a field of a model is restricted to."""
     annotation = _inside(kind, field) if _is_model(kind) else None
     if isinstance(annotation, type) and issubclass(annotation, Enum):
         return [member.value for member in annotation]
@@ -224,7 +222,7 @@ def _words(kind: Any, field: str | int) -> Sequence[Any]:
 
 
 def _inside(kind: Any, key: str | int) -> Any:
-    """The type of what a value of type `kind` holds at a key or index; None where that is not known."""
+    """Type of the item at a key or index of a value of type `kind`; None if unknown."""
     if _is_model(kind):
         field = kind.model_fields.get(str(key))
         return field.annotation if field else None

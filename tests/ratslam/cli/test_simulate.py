@@ -1,4 +1,4 @@
-"""Simulated sessions through the program: written, replayed, interrupted, killed, refused."""
+"""The command simulate: sessions written, replayed, interrupted, killed; invalid configurations."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def folder(tmp_path_factory):
 
 
 def refused(capsys, arguments, *said):
-    """The command fails as faults must: code 2, an error that says all of `said`, no traceback."""
+    """The command ends with code 2 and an error that contains all of `said`, without a traceback."""
     capsys.readouterr()
     assert main([str(argument) for argument in arguments]) == 2
     error = capsys.readouterr().err
@@ -77,13 +77,14 @@ def test_what_was_run_can_be_run_again(folder, tmp_path):
 
 
 def test_a_run_takes_the_cell_size_and_the_head_of_the_session(folder):
-    text = (folder / "replayed" / "config.yaml").read_text()
-    assert "cell_size: 0.05" in text
-    assert "dead: [4]" in text or "- 4" in text
+    config = load_config(folder / "replayed" / "config.yaml")
+    assert config.pose_cells.cell_size == 0.05
+    assert config.touch.head.dead == (4,)
 
 
-def test_the_same_session_is_the_same_file(folder, tmp_path):
+def test_the_same_session_is_the_same_file_and_its_tier_is_printed(folder, tmp_path, capsys):
     assert main(["simulate", str(folder / "config.yaml"), "-o", str(tmp_path / "again.mcap")]) == 0
+    assert "in the kinematic tier: only contact features" in capsys.readouterr().err
     assert (tmp_path / "again.mcap").read_bytes() == (folder / "session.mcap").read_bytes()
     assert (folder / "session.mcap").stat().st_size < 300_000
     other = ["--set", "simulation.seed=6"]
@@ -92,8 +93,8 @@ def test_the_same_session_is_the_same_file(folder, tmp_path):
 
 
 @pytest.mark.parametrize("raw", [False, True])
-def test_a_session_of_raw_samples_is_given_to_the_engine_as_if_live(raw, tmp_path):
-    """With its samples or with what they tell: recorded or not, the same observations."""
+def test_a_recorded_session_gives_the_observations_of_the_simulation(raw, tmp_path):
+    """Both for raw samples and for contact features."""
     (tmp_path / "config.yaml").write_text("simulation: {path: {explore: 12}, fidelity: quasistatic}\n")
     path = tmp_path / "session.mcap"
     arguments = ["simulate", str(tmp_path / "config.yaml"), "-o", str(path), *(["--raw"] if raw else [])]
@@ -111,18 +112,13 @@ def test_a_session_of_raw_samples_is_given_to_the_engine_as_if_live(raw, tmp_pat
         assert all(np.array_equal(part, same) for part, same in zip(one[1:], other[1:], strict=True))
 
 
-def test_the_tier_is_told_and_why(capsys, folder, tmp_path):
-    assert main(["simulate", str(folder / "config.yaml"), "-o", str(tmp_path / "a.mcap")]) == 0
-    assert "in the kinematic tier: only contact features" in capsys.readouterr().err
-
-
-def test_nothing_is_overwritten(capsys, folder):
+def test_an_existing_file_is_not_changed(capsys, folder):
     before = (folder / "session.mcap").read_bytes()
     refused(capsys, ["simulate", folder / "config.yaml", "-o", folder / "session.mcap"], "exists already")
     assert (folder / "session.mcap").read_bytes() == before
 
 
-def test_there_must_be_something_to_simulate(capsys, folder, tmp_path):
+def test_a_configuration_without_a_simulation_is_refused(capsys, folder, tmp_path):
     refused(capsys, ["simulate", folder / "replay.yaml", "-o", tmp_path / "a.mcap"], "simulation: missing")
     assert not (tmp_path / "a.mcap").exists()
 

@@ -211,7 +211,7 @@ def test_not_a_number() -> None:
         ),
         ("1: a", "config.yaml:1:1: the key 1; expected text; write '1'"),
         ("a: {true: 1}", "config.yaml:1:5: a: the key true; expected text; write 'true'"),
-        ("? [a, b]\n: 1", "config.yaml:1:3: a key that is not plain text; expected a name"),
+        ("? [a, b]\n: 1", "config.yaml:1:3: a key that is not plain text; expected a plain key"),
         ("a: &x 1\nb: *x", "config.yaml:1:4: a: an anchor (&x); write the value out at each place"),
         ("a: *x", "config.yaml:1:4: a: an alias (*x); write the value out at each place"),
         (
@@ -409,9 +409,9 @@ def test_override() -> None:
 @pytest.mark.parametrize(
     ("assignment", "message"),
     [
-        ("steps", "--set steps: no key and value; expected key=value such as pose_cells.excite_sigma=1e-3"),
-        ("=1", "--set : no key and value"),
-        ("a..b=1", "--set a..b: no key and value"),
+        ("steps", "--set steps: not an assignment; expected key=value such as pose_cells.excite_sigma=1e-3"),
+        ("=1", "--set : not an assignment"),
+        ("a..b=1", "--set a..b: not an assignment"),
         ("steps=", "--set steps: empty; expected a value"),
         ("steps=yes", "--set steps: 'yes'; expected a whole number"),
         ("steps=[1", "--set steps: a bracket that is not closed"),
