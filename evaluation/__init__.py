@@ -1,3 +1,3 @@
-"""How good a map and a trajectory are, and how fast they were made."""
+"""Metrics, artifacts, plots and monitoring of SLAM runs."""
 
 RATSLAM_PACKAGE = "evaluation"  # see tactile/__init__.py

@@ -1,4 +1,4 @@
-"""The pictures of a run, drawn from its directory alone."""
+"""Plots of a run, made from its directory."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ def save_map(
     walls: np.ndarray = NO_WALLS,
     closures: np.ndarray = NO_CLOSURES,
 ) -> None:
-    """Writes `evaluation.plots.map_plot.draw_map` to a file; the same run gives the same bytes."""
+    """Saves the plot of `draw_map`; equal runs give equal bytes."""
     draw_map(run, card, walls, closures).savefig(path)
 
 
 def plot_writers(directory: Path) -> dict[str, Callable[[Path], None]]:
-    """What to call with a path to have each picture of a scored run drawn, by file name.
+    """The plots of a scored run: file name -> function that saves the plot to a path.
 
-    `map.png` of every run; of one with whiskers also `whiskers.png` and `experiences.png`; of one whose map
-    is a grid `grid.png`. The same directory gives the same bytes.
+    Every run has `map.png`, runs with whiskers also `whiskers.png` and `experiences.png`, runs with a grid
+    map also `grid.png`. Equal directories give equal bytes.
 
     Raises:
         InputError: naming the file that is missing or malformed.
@@ -53,7 +53,7 @@ def plot_writers(directory: Path) -> dict[str, Callable[[Path], None]]:
         drawn["experiences.png"] = lambda: draw_experience_history(run, card)
 
     if (directory / "grid.npz").exists():
-        drawn["grid.png"] = lambda: draw_grid(_charted(directory, run))
+        drawn["grid.png"] = lambda: draw_grid(_grid_panel(directory, run))
 
     def saver(draw: Callable[[], Figure]) -> Callable[[Path], None]:
         return lambda path: draw().savefig(path)
@@ -61,19 +61,19 @@ def plot_writers(directory: Path) -> dict[str, Callable[[Path], None]]:
     return {name: saver(draw) for name, draw in drawn.items()}
 
 
-def _charted(directory: Path, run: RunArrays) -> GridPanel:
-    """The grid of a run, with what is known of the truth."""
+def _grid_panel(directory: Path, run: RunArrays) -> GridPanel:
+    """The grid map of a run with its truth, if known."""
     grid = read_grid(directory / "grid.npz")
     if run.truth is None or not (directory / "arena.npz").exists():
         return GridPanel(directory.name, "", grid)
     truth, start = read_grid_truth(directory / "arena.npz")
-    told = GridScore.model_validate_json((directory / "gridscore.json").read_text(encoding="utf-8"))
+    score = GridScore.model_validate_json((directory / "gridscore.json").read_text(encoding="utf-8"))
     paths = GridPaths(between(start, run.truth), run.online, run.odometry)
-    return GridPanel(directory.name, grid_headline(told), grid, truth.segments, paths)
+    return GridPanel(directory.name, grid_headline(score), grid, truth.segments, paths)
 
 
 def redraw_plots(directory: Path) -> None:
-    """Draws the pictures of a scored run again, over the old ones.
+    """Makes the plots of a scored run again, in place.
 
     Raises:
         InputError: naming the file that is missing or malformed.

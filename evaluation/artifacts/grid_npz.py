@@ -1,4 +1,4 @@
-"""Occupancy maps and their truth as arrays in files."""
+"""Files `grid.npz` (occupancy map) and `arena.npz` (its ground truth)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tactile.base.errors import InputError
 
 
 def write_grid(path: str | Path, grid: OccupancyGrid) -> None:
-    """Writes the arrays of a map to an .npz; the same map gives the same bytes."""
+    """Writes a map to an .npz file; equal maps give equal bytes."""
     check_grid(grid)
     with Path(path).open("wb") as file:
         np.savez_compressed(file, **{name: np.asarray(array) for name, array in grid._asdict().items()})  # type: ignore[arg-type]
@@ -22,7 +22,7 @@ def read_grid(path: str | Path) -> OccupancyGrid:
     """The inverse of `write_grid`.
 
     Raises:
-        InputError: it is no such file.
+        InputError: the file is missing or holds something else.
     """
     expected = "probability [H, W], origin [2] and cell"
     try:
@@ -33,13 +33,13 @@ def read_grid(path: str | Path) -> OccupancyGrid:
     except FileNotFoundError:
         raise InputError(str(path), "no such file", expected) from None
     except (OSError, ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(str(path), f"no occupancy map ({error})", expected) from None
+        raise InputError(str(path), f"not an occupancy map ({error})", expected) from None
     return grid
 
 
 def write_grid_truth(path: str | Path, truth: GridTruth, start: np.ndarray) -> None:
-    """Writes what is really there, in the frame of the map, and where that frame is: the pose [3] at which
-    the robot started, in the frame of true poses."""
+    """Writes the truth in the frame of the map, and `start` [3]: the pose of that frame (where the robot
+    started) in the frame of the true poses."""
     with Path(path).open("wb") as file:
         np.savez_compressed(file, **truth._asdict(), start=start)
 
@@ -48,7 +48,7 @@ def read_grid_truth(path: str | Path) -> tuple[GridTruth, np.ndarray]:
     """The inverse of `write_grid_truth`.
 
     Raises:
-        InputError: it is no such file.
+        InputError: the file is missing or holds something else.
     """
     expected = "the arena.npz of a run directory"
     try:
@@ -57,5 +57,5 @@ def read_grid_truth(path: str | Path) -> tuple[GridTruth, np.ndarray]:
     except FileNotFoundError:
         raise InputError(str(path), "no such file", expected) from None
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(str(path), f"no truth of a map ({error})", expected) from None
+        raise InputError(str(path), f"not the truth of a map ({error})", expected) from None
     return GridTruth(occupied, inside, segments.astype(float)), start.astype(float)

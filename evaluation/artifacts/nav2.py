@@ -1,9 +1,9 @@
-"""Occupancy maps as files: the pair that nav2's map_server reads, and an .npz with every digit.
+"""Occupancy maps for nav2: `map.yaml` and `map.pgm`, as its map_server reads them.
 
-map_server takes the brightness of a pixel as how free it is (with `negate: 0`), the first row of the image as
-the one with the greatest y, and `origin` as the lower left corner. In mode `trinary` a cell is occupied above
-one threshold, free below the other and unknown between; 205 is the customary grey of an unknown cell, which
-is an occupancy of 0.196, so the usual free_thresh of 0.25 turns unknown cells into free ones.
+For map_server (with `negate: 0`) bright pixels are free, the first row of the image has the largest y, and
+`origin` is the lower left corner. In mode `trinary` a cell is occupied above one threshold, free below the
+other and unknown between. Unknown cells are customarily 205, an occupancy of 0.196, so the usual free_thresh
+of 0.25 turns them into free ones.
 """
 
 from __future__ import annotations
@@ -20,23 +20,22 @@ from tactile.base.atomic_write import write_atomically
 from tactile.base.errors import InputError
 
 Nav2Mode = Literal["trinary", "scale"]
-"""`trinary` tells occupied, free and unknown; `scale` every grade between, but then a PGM knows no unknown
-cell: the prior comes out as 24 of 100."""
+"""`trinary` distinguishes occupied, free and unknown cells; `scale` stores the occupancy, but then a PGM
+cannot mark unknown cells: the prior is read as 24 of 100."""
 
 FREE_THRESH, OCCUPIED_THRESH = 0.19, 0.65
-"""Below and above, cells are free and occupied. 205 stays unknown by a margin, even for a reader that divides
-by 256."""
+"""Thresholds of free and occupied cells; 205 stays unknown even for a reader that divides by 256."""
 
-_BLACK, _UNKNOWN, _WHITE = 0, 205, 254  # as map_saver writes them
+_BLACK, _UNKNOWN, _WHITE = 0, 205, 254  # the values of map_saver
 _HEAD = re.compile(rb"P5(?:\s+|#[^\n]*\n)+(\d+)(?:\s+|#[^\n]*\n)+(\d+)(?:\s+|#[^\n]*\n)+(\d+)\s")
 
 
 class Nav2Map(NamedTuple):
-    """A map as map_server tells it.
+    """A map as map_server publishes it.
 
     Attributes:
         cell: [H, W] int, occupancy in 0..100 or -1 for unknown; row j counts y upwards.
-        origin: [3] x, y (m) and yaw (rad) of the lower left corner. resolution: side of a cell, m.
+        origin: [3] x, y (m) and yaw (rad) of the lower left corner. resolution: cell side length, m.
     """
 
     cell: np.ndarray
@@ -45,13 +44,13 @@ class Nav2Map(NamedTuple):
 
 
 def write_nav2(folder: Path, grid: OccupancyGrid, mode: Nav2Mode = "trinary") -> None:
-    """Writes map.pgm and map.yaml into a folder, each in one piece."""
+    """Writes map.pgm and map.yaml into a folder, each atomically."""
     write_atomically(folder / "map.pgm", lambda path: write_pgm(path, grid, mode))
     write_atomically(folder / "map.yaml", lambda path: write_map_yaml(path, grid, mode))
 
 
 def write_pgm(path: str | Path, grid: OccupancyGrid, mode: Nav2Mode = "trinary") -> None:
-    """Writes a binary PGM of 8 bits: dark is occupied."""
+    """Writes a binary 8-bit PGM; dark pixels are occupied."""
     check_grid(grid)
     if mode == "scale":
         pixel = np.rint(255 * (1 - grid.probability))
@@ -65,7 +64,7 @@ def write_pgm(path: str | Path, grid: OccupancyGrid, mode: Nav2Mode = "trinary")
 def write_map_yaml(
     path: str | Path, grid: OccupancyGrid, mode: Nav2Mode = "trinary", image: str = "map.pgm"
 ) -> None:
-    """Writes the YAML beside the image; `image` is the image's name in the same folder."""
+    """Writes the YAML file; `image` is the name of the image in the same folder."""
     x, y = (_number(value) for value in grid.origin)
     lines = (
         f"image: {image}",
@@ -80,10 +79,10 @@ def write_map_yaml(
 
 
 def read_nav2(path: str | Path) -> Nav2Map:
-    """A map.yaml and its image by map_server's rules (modes trinary, scale and raw; binary PGM of 8 bits).
+    """Reads map.yaml and its image like map_server (modes trinary, scale and raw; binary 8-bit PGM).
 
     Raises:
-        InputError: naming the file, and in it the key that is missing or makes no sense.
+        InputError: naming the file and the key that is missing or invalid.
     """
     path = Path(path)
     given = _description(path)
@@ -98,7 +97,7 @@ def read_nav2(path: str | Path) -> Nav2Map:
         raise InputError(
             str(path),
             f"resolution {resolution:g}, thresholds {free:g}, {occupied:g}",
-            "a positive one, and free_thresh below occupied_thresh",
+            "a positive resolution, and free_thresh below occupied_thresh",
         )
     shade = _image(path.parent / str(given.get("image", "")))[::-1] / 255
     occupancy = shade if given.get("negate") else 1 - shade
@@ -114,7 +113,7 @@ def read_nav2(path: str | Path) -> Nav2Map:
 
 
 def _number(value: float) -> str:
-    """Every digit and never an exponent: YAML readers disagree on whether 1e-05 is a number."""
+    """All digits without an exponent, since some YAML readers take 1e-05 as a string."""
     return np.format_float_positional(float(value), trim="0")
 
 
@@ -124,7 +123,7 @@ def _description(path: Path) -> dict[str, Any]:
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise InputError(str(path), f"cannot be read ({error})", "the map.yaml of a map_server") from None
     if not isinstance(given, dict):
-        raise InputError(str(path), "no keys", "the map.yaml of a map_server")
+        raise InputError(str(path), "not a mapping", "the map.yaml of a map_server")
     return given
 
 
@@ -139,7 +138,7 @@ def _value(path: Path, given: dict[str, Any], key: str) -> float:
 
 
 def _image(path: Path) -> np.ndarray:
-    """[H, W] pixels, the first row on top."""
+    """Pixels [H, W], top row first."""
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -148,7 +147,7 @@ def _image(path: Path) -> np.ndarray:
         ) from None
     head = _HEAD.match(content)
     if head is None or int(head[3]) != 255:
-        raise InputError(str(path), "another kind of image", "a binary PGM (P5) of 8 bits")
+        raise InputError(str(path), "another kind of image", "a binary 8-bit PGM (P5)")
     width, height = int(head[1]), int(head[2])
     pixels = np.frombuffer(content[head.end() :], np.uint8)
     if len(pixels) != width * height or len(pixels) == 0:

@@ -1,4 +1,4 @@
-"""A run directory as arrays; of a run that was killed, the part it had written."""
+"""Reads a run directory; of an interrupted run, the part that was written."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tactile.base.errors import InputError
 
 
 def read_run(path: Path) -> RunArrays:
-    """The run in a directory. Without a final trajectory (a killed run) the online one stands in for it.
+    """Reads the arrays of a run. Without a final trajectory (interrupted run) the online one replaces it.
 
     Raises:
         InputError: naming the file that is missing or malformed.
@@ -27,7 +27,7 @@ def read_run(path: Path) -> RunArrays:
     place = _places(path / "steps.csv")
     steps = min(len(online_time), len(odometry_time), len(place))
     if steps == 0:
-        raise InputError(str(path), "a run without a single step", "a run directory with results")
+        raise InputError(str(path), "a run without steps", "a run directory with results")
     time = online_time[:steps]
     truth_time, truth = _tum(path / "truth.tum")
     known, row = np.isin(time, truth_time), np.searchsorted(truth_time, time)
@@ -52,34 +52,38 @@ def read_run(path: Path) -> RunArrays:
 
 
 def read_scorecard(path: Path) -> Scorecard:
-    """The scorecard in a run directory.
+    """Reads the scorecard in a run directory.
 
     Raises:
-        InputError: there is none.
+        InputError: it is missing or malformed.
     """
     try:
         return Scorecard.model_validate_json((path / "scorecard.json").read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise InputError(str(path / "scorecard.json"), "no such file", "a scored run's") from None
+        raise InputError(
+            str(path / "scorecard.json"), "no such file", "the directory of a scored run"
+        ) from None
     except ValueError as error:
-        raise InputError(str(path / "scorecard.json"), f"no scorecard ({error})", "a scored run's") from None
+        raise InputError(
+            str(path / "scorecard.json"), f"not a scorecard ({error})", "the scorecard.json of a run"
+        ) from None
 
 
 WALL_COLUMNS = ("west", "south", "east", "north", "height")
-"""The columns of walls.csv, m: boxes along the axes, in the frame of the truth."""
+"""Columns of walls.csv, m: axis-aligned boxes in the frame of the truth."""
 
 
 def write_walls(path: str | Path, walls: np.ndarray) -> None:
-    """Writes walls [B, 5] with repr-exact floats."""
+    """Writes walls [B, 5]; the floats read back equal."""
     lines = [",".join(WALL_COLUMNS), *(",".join(map(repr, row)) for row in walls.tolist())]
     Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def read_walls(path: Path) -> np.ndarray:
-    """[B, 5] the walls in a run directory; none where it knows of none.
+    """Reads the walls [B, 5] of a run directory; B is 0 without the file.
 
     Raises:
-        InputError: naming the line that holds no wall.
+        InputError: naming the malformed line.
     """
     file = path / "walls.csv"
     if not file.exists():
@@ -88,10 +92,10 @@ def read_walls(path: Path) -> np.ndarray:
 
 
 def read_closures(path: Path) -> np.ndarray:
-    """[n, 2] the steps that accepted closures join; none where the run kept no list of them.
+    """Reads the pairs of steps [n, 2] joined by accepted loop closures; n is 0 without the file.
 
     Raises:
-        InputError: naming the line that cannot be read.
+        InputError: naming the malformed line.
     """
     file = path / "closures.csv"
     if not file.exists():
@@ -105,14 +109,16 @@ def read_closures(path: Path) -> np.ndarray:
                     joined.append([int(row["match_step"]), int(row["step"])])
             except (KeyError, TypeError, ValueError):
                 raise InputError(
-                    f"{file}:{reader.line_num}", "no closure", "the columns step, match_step, verdict"
+                    f"{file}:{reader.line_num}",
+                    "a malformed closure",
+                    "the columns step, match_step, verdict",
                 ) from None
     steps = np.array(joined, int).reshape(-1, 2) - skipped
     return steps[(steps >= 0).all(axis=1)]
 
 
 def _skipped(path: Path) -> int:
-    """Steps that an earlier run had taken before this one went on from its checkpoint."""
+    """Number of steps before the checkpoint from which this run continued."""
     try:
         with (path / "map.npz").open("rb") as file, np.load(file, allow_pickle=False) as archive:
             total = int(archive["steps"])
@@ -123,13 +129,13 @@ def _skipped(path: Path) -> int:
 
 def _tum(path: Path) -> tuple[np.ndarray, np.ndarray]:
     if not path.exists():
-        raise InputError(str(path), "no such file", "a run directory's")
+        raise InputError(str(path), "no such file", "a file of a run directory")
     return read_tum(path) if path.stat().st_size else (np.zeros(0), np.zeros((0, 3)))
 
 
 def _places(path: Path) -> np.ndarray:
     if not path.exists():
-        raise InputError(str(path), "no such file", "a run directory's")
+        raise InputError(str(path), "no such file", "a file of a run directory")
     text = path.read_text(encoding="utf-8")
     header, *lines = text[: text.rfind("\n") + 1].splitlines() or [""]
     column = header.split(",").index("place") if "place" in header.split(",") else -1
@@ -140,7 +146,7 @@ def _places(path: Path) -> np.ndarray:
 
 
 def _online_errors(path: Path) -> np.ndarray:
-    """[A] the errors of a file `t,error`; none where it was never written. A cut-off last line is dropped."""
+    """The errors [A] of a file `t,error`; A is 0 without the file. An incomplete last line is dropped."""
     if not path.exists():
         return np.zeros(0)
     text = path.read_text(encoding="utf-8")
@@ -148,7 +154,7 @@ def _online_errors(path: Path) -> np.ndarray:
     try:
         return np.array([float(line.split(",")[1]) for line in lines])
     except (ValueError, IndexError):
-        raise InputError(str(path), "a row that is not t,error", "the online_error.csv of a run") from None
+        raise InputError(str(path), "a malformed row, not t,error", "the online_error.csv of a run") from None
 
 
 def _map(path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""The whisker images of a session, as the pictures need them, in one small file."""
+"""File `views.npz`: the whisker images of a session, for plots."""
 
 from __future__ import annotations
 
@@ -14,14 +14,13 @@ _WHITE = 255
 
 
 class WhiskerViews(NamedTuple):
-    """What the whiskers told; N steps, a head of R rings of C whiskers.
+    """Whisker images of N steps and a head with R rings of C whiskers.
 
     Attributes:
-        view: [N, R, C] brightness in 0..1, 0 where nothing was touched.
-        alive: [N, R, C] bool, the whisker reported at all.
-        azimuth: [C] rad, where the whiskers of each column point, counter-clockwise from ahead.
-        length: [R] m, of the whiskers of each ring.
-        tallest: height of an obstacle that is white, m.
+        view: [N, R, C] pixel values in 0..1, 0 without contact.
+        alive: [N, R, C] bool, the whisker has a signal.
+        azimuth: [C] direction of the whiskers of each column, rad counter-clockwise from ahead.
+        length: [R] length of the whiskers of each ring, m. tallest: obstacle height of pixel value 1, m.
     """
 
     view: np.ndarray
@@ -32,19 +31,19 @@ class WhiskerViews(NamedTuple):
 
 
 def write_whisker_views(path: str | Path, images: WhiskerViews) -> None:
-    """Writes them to an .npz, brightness in 255 steps; the same images give the same bytes."""
+    """Writes an .npz file with pixel values in 255 steps; equal images give equal bytes."""
     arrays = {name: np.asarray(array) for name, array in images._asdict().items()}
-    # Rounded up: what was touched is never as dark as what was not.
+    # Rounded up, so that a whisker in contact is never 0.
     arrays["view"] = np.ceil(_WHITE * images.view).astype(np.uint8)
     with Path(path).open("wb") as file:
         np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
 
 
 def read_whisker_views(path: str | Path) -> WhiskerViews:
-    """The inverse of `write_whisker_views`, but for the rounding.
+    """The inverse of `write_whisker_views`, except for rounding.
 
     Raises:
-        InputError: it is no such file.
+        InputError: the file is missing or holds something else.
     """
     try:
         with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as archive:

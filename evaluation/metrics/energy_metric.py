@@ -1,10 +1,10 @@
-"""The Energy Metric: how far the motions within a map are from the true ones (Kuemmerle et al. 2009).
+"""The Energy Metric: the error of relative motions in a map (Kuemmerle et al. 2009).
 
     energy = mean over pairs (i, j) of  trans(delta_ij (-) delta*_ij)^2 + rot(delta_ij (-) delta*_ij)^2
 
-(Salman & Pearson 2016, eq. 1 and 2.) The paper does not say over which pairs, and adds m^2 to rad^2; so the
-pairs are an argument here and the two parts stay apart. For comparing with the paper only a ratio of two
-energies over the same pairs means anything.
+(Salman & Pearson 2016, eq. 1 and 2.) The paper does not specify the pairs and adds m^2 to rad^2, so the pairs
+are an argument here and both parts are given separately. Only the ratio of two energies over the same pairs
+can be compared with the paper.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _RELATIONS = {name: () for name in ("t1", "t2", "x", "y", "z", "roll", "pitch", 
 
 
 class Energy(NamedTuple):
-    """The two parts of the energy and the number of pairs they are the means over (NaN over none).
+    """The two parts of the energy, means over `pairs` pairs (NaN without pairs).
 
     Attributes:
         trans2: mean squared translation error, m^2. rot2: mean squared rotation error, rad^2.
@@ -35,15 +35,15 @@ class Energy(NamedTuple):
 
     @property
     def total(self) -> float:
-        """The paper's figure: m^2 and rad^2 added raw."""
+        """The paper's value: the sum of m^2 and rad^2."""
         return self.trans2 + self.rot2
 
 
 class Relations(NamedTuple):
-    """True relative motions between two moments of a recording, as the benchmark publishes them.
+    """True relative motions between two times of a recording, as published with the benchmark.
 
     Attributes:
-        start: [P] s. end: [P] s. motion: [P, 3] pose at `end` in the frame of the pose at `start`, m, m, rad.
+        start: [P] s. end: [P] s. motion: [P, 3] pose at `end` relative to that at `start`, m, m, rad.
     """
 
     start: np.ndarray
@@ -55,7 +55,7 @@ class RelationErrors(NamedTuple):
     """Mean absolute errors against a relations file.
 
     Attributes:
-        translation: m. rotation_deg: degrees. used: pairs inside the recording. dropped: pairs outside it.
+        translation: m. rotation_deg: degrees. used, dropped: pairs inside and outside the recording.
     """
 
     translation: float
@@ -65,7 +65,7 @@ class RelationErrors(NamedTuple):
 
 
 def successive_pairs(count: int, step: int = 1) -> np.ndarray:
-    """The pairs (i, i + step) of `count` rows: [P, 2]; step 1 the consecutive ones, step k those of gap k."""
+    """The pairs (i, i + step) of `count` rows: [P, 2]."""
     i = np.arange(max(0, count - step))
     return np.stack([i, i + step], axis=1)
 
@@ -87,10 +87,9 @@ def energy_all_pairs(estimate: np.ndarray, truth: np.ndarray) -> Energy:
     """Energy over every pair i < j, in O(N log N) time and O(N) memory.
 
     Positions as complex numbers z (estimate) and w (truth). The translation error of a pair is
-    |a_i (z_j - z_i) - (w_j - w_i)|, a_i the turn from the estimated to the true heading at row i; so for a
-    given i the sum of its squares over j needs four running sums only. The rotation error is the difference
-    of the two rows' heading errors, wrapped: with those sorted, the pairs more than half a turn apart, which
-    are the ones to wrap, are counted by running sums again.
+    |a_i (z_j - z_i) - (w_j - w_i)|, where a_i rotates the estimated to the true heading at row i, so the sum
+    of its squares over j follows from four running sums. The rotation error is the wrapped difference of the
+    two rows' heading errors; with those sorted, running sums also correct the pairs that need wrapping.
 
     Args:
         estimate: [N, 3] poses. truth: [N, 3] true poses of the same rows.
@@ -112,7 +111,7 @@ def energy_all_pairs(estimate: np.ndarray, truth: np.ndarray) -> Energy:
 
 
 def read_relations(path: str | Path) -> Relations:
-    """A relations file, `t1 t2 x y z roll pitch yaw` a line (planar: z, roll and pitch are left out).
+    """A relations file, `t1 t2 x y z roll pitch yaw` a line (z, roll and pitch are ignored).
 
     Raises:
         InputError: naming file and line.
@@ -128,7 +127,7 @@ def relation_errors(time: np.ndarray, pose: np.ndarray, relations: Relations) ->
         time: [N] s, increasing. pose: [N, 3]; interpolated at both ends of each relation.
 
     Raises:
-        InputError: when no relation lies inside the recording.
+        InputError: no relation lies inside the recording.
     """
     found = between(interpolate(time, pose, relations.start), interpolate(time, pose, relations.end))
     inside = np.isfinite(found).all(axis=1)

@@ -1,4 +1,4 @@
-"""The experience log: which experience was current at each step, beside the true pose."""
+"""The experience log: the current experience and the true pose at each step."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _COLUMNS = {
 
 
 class ExperienceLog(NamedTuple):
-    """One row a step (a whisk cycle, a frame), of any SLAM system that tells which place it is at.
+    """One row per step (whisk cycle, frame) of any SLAM system that reports its current place.
 
     Attributes:
         time: [N] s. experience: [N] int ids, -1 where there was none. truth: [N, 3] true pose, m, m, rad.
@@ -62,10 +62,9 @@ def read_experience_log(path: str | Path) -> ExperienceLog:
 
 
 def change_rows(experience: np.ndarray) -> np.ndarray:
-    """The steps at which the current experience changed, the first step included: [M] rows.
+    """The steps [M] at which the current experience changes, including the first step.
 
-    One row a graph action: the per-action form of a per-step log. An id of -1 is no experience; such steps
-    are passed over.
+    They turn a per-step log into a per-action log. Steps with id -1 (no experience) are skipped.
     """
     rows = np.flatnonzero(np.asarray(experience) != -1)
     ids = np.asarray(experience)[rows]
@@ -73,7 +72,7 @@ def change_rows(experience: np.ndarray) -> np.ndarray:
 
 
 def creation_rows(experience: np.ndarray) -> np.ndarray:
-    """For each step, the first step with the same experience: [N] rows."""
+    """For each step [N], the first step with the same experience."""
     _, first, code = np.unique(experience, return_index=True, return_inverse=True)
     return first[code]
 

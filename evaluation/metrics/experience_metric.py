@@ -1,12 +1,12 @@
-"""The Experience Metric: how often a map was recognised again (ARR), and how often rightly (ARCR).
+"""The Experience Metric: the rates of re-localisation (ARR) and of correct re-localisation (ARCR).
 
 Source: Salman & Pearson 2016, Algorithm 1; "line" below is a line of it. As printed, its ARCR is always 0
-(the set of correct re-localisations only grows from its own members), so there are four readings:
+(the set of correct re-localisations only grows from its own members), so there are four modes:
 
-    strict   the verdict on the first step of a visit holds for the visit; an experience stands for the pose
-             it was created at; a new experience is valid if the last re-localisation was right
-    paper    the printed listing with line 26 mended as the mirror of lines 10 and 11
-    or       line 26 with "or": a wrong visit passes from its second step on; for comparison only
+    strict   the verdict on the first step of a visit holds for the visit; the pose of an experience is the
+             one at its creation; a new experience is valid if the last re-localisation was correct
+    paper    the printed listing with line 26 corrected in analogy to lines 10 and 11
+    or       line 26 with "or": a wrong visit counts as correct from its second step; for comparison only
     literal  the printed listing
 
 ARR is the same in all four.
@@ -29,39 +29,39 @@ from tactile.base.se2 import wrap
 ExmMode = Literal["strict", "paper", "or", "literal"]
 EXM_MODES: tuple[ExmMode, ...] = ("strict", "paper", "or", "literal")
 
-NO_RELOCALISATION = "nothing was re-localised: ARCR is 0/0"
+NO_RELOCALISATION = "no re-localisation: ARCR is 0/0"
 LITERAL_WARNING = "0 by construction: the printed line 26 never holds"
 
 
 class ExmConfig(Settings):
-    """What Algorithm 1 is given besides the two logs."""
+    """Settings of Algorithm 1."""
 
     mode: ExmMode = "strict"
-    """How the listing is read."""
+    """Reading of the listing (see the module)."""
     log: Literal["step", "action"] = "step"
-    """One entry a step (the paper's), or one entry a change of experience. The values do not compare."""
+    """One entry per step (the paper's) or per change of experience; their values are not comparable."""
     base: NonNegativeInt | None = None
-    """Steps before the end of the base set (i_base); by default until the first return to the start."""
+    """Number of steps in the base set (i_base); null: up to the first return to the start."""
     position: PositiveFloat = 0.1
     """Position threshold, m (Salman & Pearson 2016, section III-G)."""
     heading_deg: PositiveFloat = 25.0
-    """Heading threshold, degrees (as above)."""
+    """Heading threshold, degrees (same source)."""
 
 
 DEFAULT_EXM = ExmConfig()
 
 
 class ExperienceMetric(NamedTuple):
-    """ARR and ARCR of one run, and what they were made of.
+    """ARR and ARCR of one run with their counts.
 
     Attributes:
-        arr: re-localisations / entries after the base set; NaN when there are none.
-        arcr: correct re-localisations / re-localisations; NaN when there are none.
+        arr: re-localisations / entries after the base set; NaN without entries.
+        arcr: correct re-localisations / re-localisations; NaN without re-localisations.
         entries: entries after the base set. relocalisations: eta. correct: eta_c.
-        base: entries in the base set, counted in the log that was used.
-        mode, log: as in `ExmConfig`. note: why a value is NaN, or what to beware of ('' if nothing).
+        base: entries in the base set, in the log used.
+        mode, log: as in `ExmConfig`. note: why a value is NaN, or a warning ('' for none).
         counted: [N] bool, the entry is a re-localisation. right: [N] bool, a correct one.
-        near: [N] bool, true and perceived pose are within the thresholds (line 24; for the counted ones).
+        near: [N] bool, true and perceived pose are within the thresholds (line 24; where `counted`).
     """
 
     arr: float
@@ -79,14 +79,13 @@ class ExperienceMetric(NamedTuple):
 
 
 class PooledExperienceMetric(NamedTuple):
-    """Several runs together.
+    """ARR and ARCR over several runs.
 
     Attributes:
-        arr, arcr: the mean of the runs' values (macro average: each run weighs the same). A run without any
-            re-localisation has no ARCR and is left out of that mean.
+        arr, arcr: macro averages (each run has the same weight); runs without ARCR are left out.
         arr_interval, arcr_interval: 95 % bootstrap intervals of these means over the runs.
-        arr_pooled, arcr_pooled: the ratios of the summed counts (each entry weighs the same).
-        runs: number of runs. judged: those among them with an ARCR.
+        arr_pooled, arcr_pooled: ratios of the summed counts (each entry has the same weight).
+        runs: number of runs. judged: number of runs with an ARCR.
     """
 
     arr: float
@@ -100,7 +99,7 @@ class PooledExperienceMetric(NamedTuple):
 
 
 class _Reading(NamedTuple):
-    """Where the readings of the listing differ.
+    """The parts of the listing that differ between modes.
 
     Attributes:
         perceived: ids [N] -> [N], the entry whose true pose an entry is compared with (lines 18 to 21).
@@ -121,13 +120,13 @@ def experience_metric(
     """ARR and ARCR of one run (Algorithm 1).
 
     Args:
-        experience: [N] id of the current experience at each step, -1 where there was none (those steps are
-            passed over). Names only: any renaming gives the same result.
+        experience: [N] id of the current experience at each step, -1 for none (such steps are skipped).
+            Renumbering does not change the result.
         truth: [N, 3] true poses, m, m, rad.
 
     Raises:
-        InputError: when the logs do not fit each other, a true pose is not finite, there is no such base set,
-            or none was given and the run never returns to its start.
+        InputError: the logs differ in length, a true pose is not finite, the base set is out of range, or
+            none is given and the run never returns to its start.
     """
     experience, truth = _checked(experience, truth)
     end = base_end(truth, config.position, config.heading_deg) if config.base is None else config.base
@@ -152,10 +151,10 @@ def experience_metric(
 
 
 def relocalisations(experience: np.ndarray, base: int) -> np.ndarray:
-    """Which entries are re-localisations: [N] bool (lines 9 to 15; no truth is needed).
+    """Which entries are re-localisations: [N] bool (lines 9 to 15; needs no truth).
 
-    In closed form: an experience counts from its first entry after the base set that returns to it (it was
-    there before, but not at the entry before), and from then on always.
+    In closed form: the entries of an experience count from the first one after the base set that returns
+    to it, that is, whose previous entry is another experience and which was not created there.
 
     Args:
         experience: [N] ids. base: entries in the base set.
@@ -170,17 +169,17 @@ def relocalisations(experience: np.ndarray, base: int) -> np.ndarray:
 
 
 def base_end(truth: np.ndarray, position: float = 0.1, heading_deg: float = 25.0) -> int:
-    """Where the base set ends if nobody says: the row of the first return to the start pose.
+    """The default end of the base set: the row of the first return to the start pose.
 
-    The return counts when the robot had left the start's surroundings and travelled more than half the first
-    loop's length. A loop through the farthest point is at least twice as long as that is far, so "half" is
-    taken as the greatest distance from the start in the whole run: turning about near the start is no loop.
+    A return counts if the robot has left the start's surroundings and travelled more than half the length of
+    the first loop. A loop through the farthest point is at least twice as long as that point is far from the
+    start, so its distance stands for half a loop; turning around near the start is thus not a loop.
 
     Args:
-        truth: [N, 3] true poses. position, heading_deg: how near the start is near, m and degrees.
+        truth: [N, 3] true poses. position, heading_deg: thresholds of a return, m and degrees.
 
     Raises:
-        InputError: when the run never returns.
+        InputError: the run never returns.
     """
     away = np.hypot(truth[:, 0] - truth[0, 0], truth[:, 1] - truth[0, 1])
     turned = np.abs(wrap(truth[:, 2] - truth[0, 2]))
@@ -191,16 +190,19 @@ def base_end(truth: np.ndarray, position: float = 0.1, heading_deg: float = 25.0
     if len(back) == 0:
         where = f"within {position} m and {heading_deg} degrees of its start"
         raise InputError(
-            "true trajectory", f"never returns {where}", "a closed loop", "give the end of the base set"
+            "true trajectory",
+            f"never returns {where}",
+            "a closed loop",
+            "set `base`, the end of the base set",
         )
     return int(back[0])
 
 
 def pool_experience_metrics(results: Sequence[ExperienceMetric], *, seed: int = 0) -> PooledExperienceMetric:
-    """Several runs (data sets, seeds) together; the paper's averages are the macro ones.
+    """Combines several runs (data sets, seeds); the paper uses the macro averages.
 
     Raises:
-        InputError: when the runs were not all scored in the same mode and on the same kind of log.
+        InputError: no runs, or runs of different modes or kinds of log.
     """
     kinds = {(result.mode, result.log) for result in results}
     if len(kinds) != 1:
@@ -230,9 +232,7 @@ def _checked(experience: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.
         )
     if not np.isfinite(truth).all():
         row = int(np.argmin(np.isfinite(truth).all(axis=1)))
-        raise InputError(
-            f"true trajectory, row {row}", f"{truth[row]}", "finite numbers", "leave such rows out"
-        )
+        raise InputError(f"true trajectory, row {row}", f"{truth[row]}", "finite numbers", "remove such rows")
     return experience, truth
 
 
@@ -243,17 +243,17 @@ def _checked_base(base: int, length: int) -> int:
 
 
 def _entries(experience: np.ndarray, log: str) -> np.ndarray:
-    """The steps that are entries of such a log: [M] rows."""
+    """The steps [M] that are entries of a kind of log."""
     return change_rows(experience) if log == "action" else np.flatnonzero(experience != -1)
 
 
 def _dwell(experience: np.ndarray) -> np.ndarray:
-    """The entry is the same as the one before: [N] bool."""
+    """Whether each entry [N] equals the previous one."""
     return np.concatenate([[False], experience[1:] == experience[:-1]])
 
 
 def _last_entry(experience: np.ndarray) -> np.ndarray:
-    """For each entry the last earlier one with the same id, itself if there is none: [N]."""
+    """For each entry [N] the last earlier one with the same id, or itself."""
     order = np.argsort(experience, kind="stable")
     last = np.arange(len(experience))
     again = _dwell(experience[order])
@@ -273,7 +273,7 @@ def _verdicts(
 ) -> np.ndarray:
     """Which re-localisations are correct: [N] bool (lines 15 to 38).
 
-    One pass in order, because a verdict decides which experiences are valid later on.
+    One sequential pass, because a verdict determines which experiences are valid later.
     """
     ids_, dwell = ids.tolist(), _dwell(ids).tolist()
     novel = (creation_rows(ids) == np.arange(len(ids))).tolist()
@@ -306,8 +306,8 @@ def _as_printed(angle: np.ndarray) -> np.ndarray:
     return angle
 
 
-# The listing asks whether an experience is in R_c, the correct ones so far. In a dwell that is the verdict on
-# the entry before: were R_c never to lose a member, one right visit would excuse the rest of all wrong ones.
+# The listing tests membership in R_c, the experiences re-localised correctly so far. In a dwell this is read
+# as the verdict on the previous entry: if R_c lost no member, one correct visit would excuse all later ones.
 _READINGS: dict[ExmMode, _Reading] = {
     "strict": _Reading(
         creation_rows, wrap, lambda first, dwell, before: before if dwell else first, _this_if_novel

@@ -1,8 +1,8 @@
-"""Equation 6 of Fox et al. 2012: the mean of |map - truth| over cells, under every way to read it.
+"""Equation 6 of Fox et al. 2012: the mean of |map - truth| over cells, under all of its conventions.
 
-The paper leaves open what the truth is outside the arena and over which cells is averaged, and it smooths the
-truth; its figures turn on all three. So the error is computed under every convention, and beside maps that
-nobody had to explore for, some of which win.
+The paper does not specify the truth outside the arena or the cells of the mean, and it smooths the truth; its
+values depend on all three. So the error is computed under every convention and compared with constant maps,
+some of which have smaller errors.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from evaluation.metrics.occupancy_grid import (
 from tactile.base.config import Settings
 
 CellMask = Literal["grid", "arena"]
-"""Over which cells is averaged: all, or the arena's and its wall's."""
+"""Cells of the mean: all, or those of the arena and its wall."""
 SMOOTH_SD = 2.5
-"""Of the 5 x 5 Gaussian that smooths the truth, cells: the paper gives no unit, but its filter in cells."""
+"""Standard deviation of the 5 x 5 Gaussian that smooths the truth, cells (the unit is not in the paper)."""
 
 _TAPS = 2  # cells to either side
 _MASKS: tuple[CellMask, ...] = ("grid", "arena")
@@ -35,41 +35,41 @@ class Convention(Settings):
     """One reading of equation 6."""
 
     outside: float = PRIOR_OCCUPANCY
-    """What the truth is outside the arena and its wall."""
+    """Truth outside the arena and its wall."""
     mask: CellMask = "grid"
-    """Over which cells is averaged."""
+    """Cells of the mean."""
     smooth: bool = False
-    """Whether the truth is smoothed. Then even a perfect map errs, and a blurred one errs less."""
+    """Whether the truth is smoothed; then a perfect map has an error, and a blurred one a smaller error."""
 
 
 CONVENTIONS = tuple(
     Convention(outside=outside, mask=mask, smooth=smooth)
     for smooth, mask, outside in product((False, True), _MASKS, (PRIOR_OCCUPANCY, 0.0, 1.0))
 )
-"""All of them. Within the arena, raw, `outside` makes no difference."""
+"""All conventions. Within the arena without smoothing, `outside` makes no difference."""
 MAIN_CONVENTION = Convention()
-"""Unknown outside, all cells, raw: what a lost robot draws out there costs, and a perfect map scores 0."""
+"""Unknown outside, all cells, not smoothed: false evidence outside counts, and a perfect map scores 0."""
 PAPER_CONVENTION = Convention(smooth=True)
-"""Nearest to the paper's words."""
+"""The convention closest to the paper's text."""
 
 
 class GridError(Settings):
-    """Equation 6 under one convention: of the map, and of maps that nobody had to explore for."""
+    """Equation 6 under one convention, of the map and of maps without exploration."""
 
     convention: Convention
-    """The reading."""
+    """The convention."""
     error: float
-    """Mean of |map - truth|; of several trials the mean of their errors."""
+    """Mean of |map - truth|; for several trials the mean of their errors."""
     spread: float | None = None
     """Its standard deviation over trials; None for one."""
     prior: float
-    """The error of 0.3 everywhere."""
+    """Error of 0.3 in all cells."""
     best: float
-    """The error of the best constant: the median of the truth."""
+    """Error of the best constant, the median of the truth."""
     coin: float
-    """The error of a map of Bernoulli(0.5) cells, in expectation: 0.5 for any truth, not the printed 0.47."""
+    """Expected error of a map of Bernoulli(0.5) cells: 0.5 for any truth (the paper prints 0.47)."""
     skill: float | None
-    """1 - error / best; None where the best constant is right everywhere."""
+    """1 - error / best; None if the best constant has no error."""
 
 
 def grid_error(
@@ -80,7 +80,7 @@ def grid_error(
     true = smooth_truth(true) if convention.smooth else true
     cells = truth.inside | felt.wall if convention.mask == "arena" else np.ones_like(truth.inside)
     if not cells.any():
-        raise ValueError("a truth without an arena")
+        raise ValueError("truth without arena cells; expected at least one")
     true, ours = true[cells], grid.probability[cells]
     error, best = _mean(np.abs(ours - true)), _mean(np.abs(np.median(true) - true))
     return GridError(
@@ -96,7 +96,7 @@ def grid_error(
 def pool_errors(errors: Sequence[GridError]) -> GridError:
     """The mean of the errors of several trials, under the same convention."""
     if len({error.convention for error in errors}) != 1:
-        raise ValueError("errors under different conventions, or none")
+        raise ValueError("no errors, or errors under different conventions; expected one convention")
     every = [error.error for error in errors]
     error, best = _mean(every), _mean([each.best for each in errors])
     return GridError(
@@ -111,7 +111,7 @@ def pool_errors(errors: Sequence[GridError]) -> GridError:
 
 
 def smooth_truth(values: np.ndarray) -> np.ndarray:
-    """[H, W] after the 5 x 5 Gaussian of `SMOOTH_SD`; beyond its edges the outermost cells go on."""
+    """Applies the 5 x 5 Gaussian of `SMOOTH_SD` to [H, W], with edge cells repeated outwards."""
     from scipy.ndimage import correlate1d
 
     taps = np.exp(-(np.arange(-_TAPS, _TAPS + 1) ** 2) / (2 * SMOOTH_SD**2))

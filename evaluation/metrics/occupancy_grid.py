@@ -1,4 +1,4 @@
-"""Occupancy maps, the truth they are held against, and which cells of it a whisker can tell."""
+"""Occupancy grids, their ground truth, and the surfaces that whiskers can touch."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import NamedTuple
 import numpy as np
 
 PRIOR_OCCUPANCY = 0.3
-"""Occupancy where nothing was felt (Fox et al. 2012, III)."""
+"""Occupancy of cells without evidence (Fox et al. 2012, III)."""
 SURFACE_SPACING = 0.01
-"""Of the points that stand for the true walls, m."""
+"""Spacing of the points that sample the true walls, m."""
 
-_EVIDENCE = 1e-4  # a probability nearer to the prior was not touched: stamps are Gaussians, which end nowhere
-_NEAR, _FAR = 0.45, 0.95  # cells; from a wall on their borders or centres neither ends on a border
-_SKIN = 1 - 1e-6  # cells: a wall on the centres of cells has one layer, as one on their borders has
+_EVIDENCE = 1e-4  # closer to the prior is no evidence; the Gaussian footprints have no edge
+_NEAR, _FAR = 0.45, 0.95  # cells; from a wall on cell borders or centres, neither ends on a border
+_SKIN = 1 - 1e-6  # cells; gives walls on cell centres and on cell borders one layer each
 
 
 class OccupancyGrid(NamedTuple):
@@ -22,7 +22,7 @@ class OccupancyGrid(NamedTuple):
 
     Attributes:
         probability: [H, W] in 0..1; row j counts y upwards, column i counts x.
-        origin: [2] m, the lower left corner of cell (0, 0). cell: its side, m.
+        origin: [2] lower left corner of cell (0, 0), m. cell: side length of a cell, m.
     """
 
     probability: np.ndarray
@@ -31,12 +31,12 @@ class OccupancyGrid(NamedTuple):
 
 
 class GridTruth(NamedTuple):
-    """What is really there, on the cells of a map and exactly.
+    """The true world, on the cells of a map and as segments.
 
     Attributes:
-        occupied: [H, W] bool, the cell's centre lies in something solid; beyond the outer wall it may say
-            anything. inside: [H, W] bool, within the outer wall. segments: [S, 4] the surfaces of walls and
-            objects, x1, y1, x2, y2 in m.
+        occupied: [H, W] bool, the cell's centre is inside an object or wall; undefined beyond the outer wall.
+        inside: [H, W] bool, within the outer wall. segments: [S, 4] surfaces of walls and objects,
+            x1, y1, x2, y2, m.
     """
 
     occupied: np.ndarray
@@ -45,13 +45,13 @@ class GridTruth(NamedTuple):
 
 
 class TouchableSurface(NamedTuple):
-    """What of a truth can be felt from its free space.
+    """The part of the truth that can be touched from free space.
 
     Attributes:
         free: [H, W] bool, cells inside the arena that hold nothing.
-        wall: [H, W] bool, all others whose centre is within one cell of a surface that faces a free cell:
-            the skin of objects, and one ring around the arena even where its wall has no thickness.
-        points: [K, 2] m, those surfaces, a point every `SURFACE_SPACING`.
+        wall: [H, W] bool, other cells whose centre is within one cell of a surface that faces a free cell:
+            the boundary of objects, and one ring around the arena even if its wall has no thickness.
+        points: [K, 2] points on those surfaces, m, one every `SURFACE_SPACING`.
     """
 
     free: np.ndarray
@@ -60,39 +60,39 @@ class TouchableSurface(NamedTuple):
 
 
 def cell_centres(grid: OccupancyGrid) -> np.ndarray:
-    """[H, W, 2] centres of the cells, m."""
+    """The centres [H, W, 2] of the cells, m."""
     height, width = grid.probability.shape
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     return np.asarray(grid.origin) + grid.cell * np.stack([x, y], axis=-1)
 
 
 def has_evidence(grid: OccupancyGrid, prior: float = PRIOR_OCCUPANCY) -> np.ndarray:
-    """[H, W] bool, where evidence moved the map away from its prior."""
+    """Whether each cell [H, W] differs from the prior."""
     return np.abs(grid.probability - prior) > _EVIDENCE
 
 
 def check_grid(grid: OccupancyGrid, truth: GridTruth | None = None) -> None:
-    """Refuses a map that is none, or that lies on other cells than its truth (ValueError)."""
+    """Checks a map, and that it has the cells of its truth (ValueError)."""
     shape = grid.probability.shape
     if len(shape) != 2 or 0 in shape:
-        raise ValueError(f"a map has rows and columns, not the shape {shape}")
+        raise ValueError(f"a map of shape {shape}; expected [H, W]")
     if not (np.isfinite(grid.origin).all() and grid.cell > 0):
-        raise ValueError(f"no place for a map: origin {grid.origin}, cell {grid.cell}")
+        raise ValueError(f"origin {grid.origin}, cell {grid.cell}; expected finite and positive")
     if not ((grid.probability >= 0) & (grid.probability <= 1)).all():
-        raise ValueError("a map holds probabilities: 0 to 1, and never NaN")
+        raise ValueError("a map with a value outside 0..1 or NaN; expected probabilities")
     if truth is None:
         return
     if not shape == truth.occupied.shape == truth.inside.shape:
         raise ValueError(f"truth of {truth.occupied.shape}, {truth.inside.shape} cells, map of {shape}")
     if truth.segments.ndim != 2 or truth.segments.shape[1] != 4 or not np.isfinite(truth.segments).all():
-        raise ValueError("walls are segments [S, 4] of finite numbers")
+        raise ValueError("walls that are not segments [S, 4] of finite numbers")
 
 
 def touchable_surface(grid: OccupancyGrid, truth: GridTruth) -> TouchableSurface:
-    """What of the truth can be felt, on the cells of the map.
+    """The touchable part of the truth, on the cells of the map.
 
-    A surface faces free space where about half a cell or a whole one away from it, to either side, the cell
-    is free; so the face by which an object leans on a wall does not count.
+    A surface faces free space where the cell about half or one cell away on either side is free; so the face
+    between an object and a wall that it leans on does not count.
     """
     from scipy.spatial import cKDTree
 
@@ -109,25 +109,25 @@ def touchable_surface(grid: OccupancyGrid, truth: GridTruth) -> TouchableSurface
 
 
 def truth_occupancy(truth: GridTruth, wall: np.ndarray, outside: float = PRIOR_OCCUPANCY) -> np.ndarray:
-    """[H, W] the truth as occupancy: 1 in objects and walls, 0 in free space, `outside` beyond (Fig. 3 of Fox
-    et al. 2012)."""
+    """The truth as occupancy [H, W]: 1 in objects and walls, 0 in free space, `outside` beyond (Fox et al.
+    2012, Fig. 3)."""
     return np.where(wall | (truth.inside & truth.occupied), 1.0, np.where(truth.inside, 0.0, outside))
 
 
 def mean_grid(grids: Sequence[OccupancyGrid]) -> OccupancyGrid:
-    """The mean of maps on the same cells (Fig. 4 of Fox et al. 2012)."""
+    """The mean of maps on the same cells (Fox et al. 2012, Fig. 4)."""
     first = grids[0]
     for grid in grids:
         check_grid(grid)
         if grid.probability.shape != first.probability.shape or grid.cell != first.cell:
-            raise ValueError("maps on different cells have no mean")
+            raise ValueError("maps with different shapes or cell sizes; expected the same cells")
         if not np.array_equal(grid.origin, first.origin):
-            raise ValueError("maps at different places have no mean")
+            raise ValueError("maps with different origins; expected the same cells")
     return first._replace(probability=np.mean([grid.probability for grid in grids], axis=0))
 
 
 def _points(segments: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points along segments [S, 4] and the unit normals there: [K, 2] each."""
+    """Points along segments [S, 4] and their unit normals: [K, 2] each."""
     start, along = segments[:, :2], segments[:, 2:] - segments[:, :2]
     length = np.hypot(*along.T)
     count = np.ceil(length / SURFACE_SPACING - 1e-6).astype(int)

@@ -1,4 +1,4 @@
-"""One run of an engine as plain arrays: all that scoring and drawing it needs."""
+"""The arrays of one run that metrics and plots use."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from tactile.base.errors import InputError
 
 
 class RunArrays(NamedTuple):
-    """What was told, what became of it, and what was true; N steps, M experiences, L links.
+    """Poses, experiences and truth of a run with N steps, M experiences and L links.
 
     Attributes:
         time: [N] s, increasing.
         truth: [N, 3] true poses (m, m, rad), NaN in rows without one; or None.
-        online: [N, 3] the pose told at each step. final: [N, 3] the pose the final map gives to that step.
-        odometry: [N, 3] raw odometry, dead reckoning from any start.
-        experience: [N] current experience, an index into `nodes`, -1 where there was none.
-        created: [M] the step at which each experience was created.
+        online: [N, 3] online pose at each step. final: [N, 3] pose of each step in the final map.
+        odometry: [N, 3] dead reckoning of raw odometry from any start.
+        experience: [N] current experience, an index into `nodes`, -1 for none.
+        created: [M] step at which each experience was created.
         nodes: [M, 3] poses of the experiences in the final map, in the frame of `final`.
-        links: [L, 2] experiences joined by a link.
+        links: [L, 2] linked experiences.
         online_error: [A] position errors of the current pose in the map of that time, m; empty if unknown.
     """
 
@@ -37,7 +37,7 @@ class RunArrays(NamedTuple):
 
 
 def check_run(run: RunArrays) -> None:
-    """Refuses arrays that do not fit each other.
+    """Checks shapes, finite values and indices.
 
     Raises:
         InputError: naming the array.
@@ -57,7 +57,7 @@ def check_run(run: RunArrays) -> None:
         if array.shape != shape:
             raise InputError(f"run.{name}", f"shape {array.shape}", str(shape))
         if name != "truth" and not np.isfinite(array).all():
-            raise InputError(f"run.{name}", "a value that is not finite", "finite numbers")
+            raise InputError(f"run.{name}", "a NaN or infinite value", "finite numbers")
     if steps == 0:
         raise InputError("run.time", "no steps", "at least one")
     for name, low, high in (("experience", -1, nodes), ("created", 0, steps), ("links", 0, nodes)):
@@ -67,7 +67,7 @@ def check_run(run: RunArrays) -> None:
 
 
 def truth_rows(run: RunArrays) -> np.ndarray:
-    """The steps whose true pose is known: rows [K]."""
+    """The steps [K] with a true pose."""
     if run.truth is None:
         return np.zeros(0, int)
     return np.flatnonzero(np.isfinite(run.truth).all(axis=1))

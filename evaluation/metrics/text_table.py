@@ -1,4 +1,4 @@
-"""Text files of numbers: one row a line, separated by commas or blanks, with or without a header."""
+"""Text files of numbers: one row per line, separated by commas or blanks, with or without a header."""
 
 from __future__ import annotations
 
@@ -12,26 +12,25 @@ import numpy as np
 from tactile.base.errors import InputError
 
 Columns = Mapping[str, tuple[str, ...]]
-"""The wanted columns in order: name -> other names a header may give it (compared in lower case)."""
+"""Columns to read, in order: name -> alternative names in a header (compared in lower case)."""
 
 
 class TextTable(NamedTuple):
-    """The rows of a file: `values` [N, columns] float64 and the `line` [N] each stood in, counted from 1."""
+    """The rows of a file: `values` [N, columns] float64 and their `line` numbers [N], from 1."""
 
     values: np.ndarray
     line: np.ndarray
 
 
 def read_text_table(path: str | Path, columns: Columns) -> TextTable:
-    """The wanted columns of a file.
+    """Reads columns of a file.
 
-    A first line that is not all numbers is a header and tells where the columns are; others in the file are
-    passed over. Without a header the file holds exactly the wanted columns in their order. Blank lines and
-    lines that begin with `#` are passed over. A recording that was cut off ends without a newline: such a
-    last line is dropped when it is not a whole row.
+    A first line that is not all numbers is a header; other columns of the file are ignored. A file without a
+    header holds exactly these columns in this order. Blank lines and lines that begin with `#` are skipped. A
+    last line without a newline (a recording that was cut off) is dropped if it is not a complete row.
 
     Raises:
-        InputError: naming file and line, when the file cannot be read, lacks a column or has a malformed row.
+        InputError: the file cannot be read, lacks a column or has a malformed row (with file and line).
     """
     lines = _lines(path)
     if not lines:
@@ -55,7 +54,7 @@ def read_text_table(path: str | Path, columns: Columns) -> TextTable:
 
 
 def _lines(path: str | Path) -> list[tuple[int, list[str], bool]]:
-    """Line number, fields, and whether the line is known to be whole."""
+    """Line number, fields, and whether the line ends with a newline."""
     try:
         text = Path(path).read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -73,7 +72,7 @@ def _cells(line: str) -> list[str]:
 
 
 def _places(where: str, names: list[str], columns: Columns) -> list[int]:
-    """Where each wanted column stands among the names of the header."""
+    """Index of each column in the header."""
     found = [
         [names.index(name) for name in (wanted, *others) if name in names]
         for wanted, others in columns.items()
@@ -86,7 +85,7 @@ def _places(where: str, names: list[str], columns: Columns) -> list[int]:
 
 
 def _row(cells: list[str], width: int) -> list[float] | None:
-    """The numbers of a line, or None when it is not a row of so many finite ones."""
+    """The numbers of a line, or None unless it has `width` finite ones."""
     if len(cells) != width or not all(map(_is_number, cells)):
         return None
     row = [float(cell) for cell in cells]

@@ -1,7 +1,7 @@
-"""How far one trajectory lies from another: alignment, ATE, RPE, anytime error, and TUM files.
+"""Trajectory errors (alignment, ATE, RPE, online error), association by time and TUM files.
 
-A trajectory is an array [N, 3] of x (m), y (m), heading (rad); where two are compared, row i of one was taken
-at the same moment as row i of the other (`associate` sees to that).
+A trajectory is an array [N, 3] of x (m), y (m), heading (rad). Functions that compare two expect rows of the
+same times (`associate` makes them).
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ class MotionError(NamedTuple):
 
 
 class OnlineError(NamedTuple):
-    """How far off the robot's present pose was while it was told, all in m.
+    """Error of the current position over the course of a run, m.
 
     Attributes:
-        median: over all rows. late: root mean square over the second half of the rows.
-        jump: largest change of the error from one row to the next.
+        median: over all rows. late: RMS over the second half of the rows.
+        jump: largest change of the error between successive rows.
     """
 
     median: float
@@ -44,14 +44,14 @@ def align(estimate: np.ndarray, reference: np.ndarray) -> np.ndarray:
     Least squares over rotation and translation, without scale; compose(align(e, r), e) is e aligned to r.
 
     Raises:
-        InputError: when there is no row, or the two differ in length.
+        InputError: no rows, or different numbers of rows.
     """
     _positions(estimate, reference)
     return fit_rigid_motion(estimate, reference)
 
 
 def position_errors(estimate: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Distance of each row from the reference after one alignment over all rows: [N] m."""
+    """Distance [N] (m) of each row from the reference after one alignment over all rows."""
     aligned = compose(align(estimate, reference), estimate)
     return np.hypot(*(aligned - reference)[:, :2].T)
 
@@ -62,7 +62,7 @@ def ate(estimate: np.ndarray, reference: np.ndarray) -> float:
 
 
 def motion_errors(estimate: np.ndarray, reference: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """Estimated against true motion between two rows, delta_ij (-) delta*_ij: [P, 3] in m, m, rad.
+    """Error of the estimated motion between two rows, delta_ij (-) delta*_ij: [P, 3], m, m, rad.
 
     Args:
         pairs: [P, 2] row indices i, j.
@@ -74,20 +74,19 @@ def motion_errors(estimate: np.ndarray, reference: np.ndarray, pairs: np.ndarray
 
 
 def rpe(estimate: np.ndarray, reference: np.ndarray, step: int = 1) -> MotionError:
-    """Relative pose error over `step` rows (Sturm et al. 2012); NaN when there are not so many."""
+    """Relative pose error over `step` rows (Sturm et al. 2012); NaN with fewer rows."""
     i = np.arange(max(0, len(estimate) - step))
     error = motion_errors(estimate, reference, np.stack([i, i + step], axis=1))
     return MotionError(_rms(np.hypot(error[:, 0], error[:, 1])), _rms(error[:, 2]))
 
 
 def online_errors(online: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Distance of each row from the reference, once the rows up to it are aligned to the reference's: [N] m.
+    """Distance [N] (m) of each row from the reference after alignment of the rows up to it.
 
-    What the robot could have been blamed for at that moment: later rows do not help. The alignments of all
-    beginnings come from running sums, so that the whole takes O(N).
+    The error at a time thus depends on earlier rows only. Running sums give all alignments in O(N).
     """
     a, b = _positions(online, reference)
-    a, b = a - a.mean(), b - b.mean()  # keeps the running sums small against their differences
+    a, b = a - a.mean(), b - b.mean()  # keeps rounding errors of the running sums small
     n = np.arange(1, len(a) + 1)
     mean_a, mean_b = np.cumsum(a) / n, np.cumsum(b) / n
     turn = np.angle(np.cumsum(a.conj() * b) - n * mean_a.conj() * mean_b)
@@ -95,31 +94,31 @@ def online_errors(online: np.ndarray, reference: np.ndarray) -> np.ndarray:
 
 
 def online_error(online: np.ndarray, reference: np.ndarray) -> OnlineError:
-    """The summary of `online_errors`."""
+    """Summary of `online_errors`."""
     return summarize_errors(online_errors(online, reference))
 
 
 def current_error(path: np.ndarray, reference: np.ndarray) -> float:
-    """Distance of the last row of a path [N, 3] from the reference's, once the whole path is aligned, m.
+    """Distance (m) of the last row of a path [N, 3] from the reference after alignment of the whole path.
 
-    With the map as it was at that moment: what a robot that acts on its map is off by.
+    With the path in the map of that time, it is the error of a robot that acts on its map.
     """
     return float(position_errors(path, reference)[-1])
 
 
 def summarize_errors(error: np.ndarray) -> OnlineError:
-    """Of errors [N] at increasing moments."""
+    """Summary of errors [N] in order of time."""
     jump = np.abs(np.diff(error)).max(initial=0.0)
     return OnlineError(float(np.median(error)), _rms(error[len(error) // 2 :]), float(jump))
 
 
 def interpolate(time: np.ndarray, pose: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Poses [..., 3] at the moments `at` [...], linear between rows; NaN before the first and after the last.
+    """Poses [..., 3] at the times `at` [...], linear between rows; NaN before the first and after the last.
 
-    The heading is unwrapped first, so it goes the short way round between two rows.
+    The heading is interpolated along the shorter arc.
 
     Raises:
-        InputError: when time [N] does not increase.
+        InputError: time [N] does not increase.
     """
     if np.any(np.diff(time) <= 0):
         row = int(np.argmax(np.diff(time) <= 0))
@@ -134,7 +133,7 @@ def interpolate(time: np.ndarray, pose: np.ndarray, at: np.ndarray) -> np.ndarra
 def associate(
     time: np.ndarray, pose: np.ndarray, reference_time: np.ndarray, reference: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Time [M], pose [M, 3] and interpolated reference [M, 3] of the rows that lie inside the reference."""
+    """Time [M], pose [M, 3] and interpolated reference [M, 3] of the rows within the reference's times."""
     there = interpolate(reference_time, reference, time)
     inside = np.isfinite(there).all(axis=1)
     return time[inside], pose[inside], there[inside]
@@ -143,7 +142,7 @@ def associate(
 def read_tum(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     """Time [N] s and planar pose [N, 3] of a TUM file, `t x y z qx qy qz qw` a line.
 
-    z is left out and of the rotation only the heading is kept. A cut-off last line is dropped.
+    z, roll and pitch are ignored. An incomplete last line is dropped.
 
     Raises:
         InputError: naming file and line.
@@ -153,20 +152,20 @@ def read_tum(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     norm = qx * qx + qy * qy + qz * qz + qw * qw
     if np.any(norm == 0):
         raise InputError(
-            f"{path}:{table.line[norm == 0][0]}", "a quaternion of length 0", "a rotation qx qy qz qw"
+            f"{path}:{table.line[norm == 0][0]}", "a quaternion of length 0", "a unit quaternion qx qy qz qw"
         )
     heading = np.arctan2(2 * (qw * qz + qx * qy), norm - 2 * (qy * qy + qz * qz))
     return t, np.stack([x, y, heading], axis=1)
 
 
 def write_tum(path: str | Path, time: np.ndarray, pose: np.ndarray) -> None:
-    """Writes a planar trajectory so that `read_tum` gives back the same numbers (headings to rounding)."""
+    """Writes a planar trajectory; `read_tum` returns the same numbers (headings up to rounding)."""
     lines = (tum_line(*row) for row in zip(time, pose, strict=True))
     Path(path).write_text("".join(lines), encoding="utf-8")
 
 
 def _positions(estimate: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Both as complex numbers x + iy: [N] each."""
+    """The positions of both as complex numbers x + iy: [N] each."""
     if len(estimate) != len(reference) or len(estimate) == 0:
         found = f"{len(estimate)} and {len(reference)} rows"
         raise InputError(

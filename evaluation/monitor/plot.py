@@ -1,4 +1,4 @@
-"""The picture of a run that goes on: where it has been, where it is, and how its steps went."""
+"""Plot of a running job: path, current pose and outcomes of its steps."""
 
 from __future__ import annotations
 
@@ -17,15 +17,16 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_HEIGHT, _BOTTOM, _COUNTS = 6.4, 0.95, 1.55  # inches: of all, below the map, and for the counts beside it
-_DRAWN = 5000  # steps of a long path: a monitor must not take long
+_HEIGHT, _BOTTOM, _COUNTS = 6.4, 0.95, 1.55  # inches: total height, below the map, and width of the counts
+_DRAWN = 5000  # steps drawn of a long path, to limit the drawing time
 _ROUND = 2 * np.pi * np.arange(49) / 48
 
 
 def draw_watch(seen: RunProgress, walls: np.ndarray = NO_WALLS) -> Figure:
-    """The path as told, over the truth where it is known, and the last pose with an ellipse of two standard
-    deviations. With truth all lies in its frame: what was told is brought there by the best rigid fit so far,
-    and odometry from where it began; it leaves the picture where it drifts far off.
+    """The online path over the truth, and the last pose with an ellipse of two standard deviations.
+
+    With truth, everything is in its frame: the online path by the best rigid fit so far, odometry by its
+    start pose. Odometry that drifts far off leaves the picture.
 
     Args:
         walls: [B, 5] west, south, east, north, height in m; drawn with truth.
@@ -54,20 +55,20 @@ def _line(seen: RunProgress) -> str:
 
 
 def _paint(axes: Axes, seen: RunProgress, walls: np.ndarray) -> None:
-    """The order of drawing is the order of the legend."""
+    """Draws the layers in the order of the legend."""
     known = np.isfinite(seen.truth).all(axis=1)
     to_truth = align(seen.path[known], seen.truth[known]) if known.any() else np.zeros(3)
-    rows = np.arange(len(seen.path) - 1, -1, -len(seen.path) // _DRAWN)[::-1]  # the last one among them
+    rows = np.arange(len(seen.path) - 1, -1, -len(seen.path) // _DRAWN)[::-1]  # includes the last one
     path, truth = compose(to_truth, seen.path), seen.truth[rows]
     if known.any():
         if len(walls):
             draw_walls(axes, walls)
         axes.plot(*split_at_jumps(truth, truth).T, color=YELLOW, lw=3.5, zorder=2, label="truth")
-    axes.plot(*split_at_jumps(path[rows, :2], truth).T, color=BLUE, lw=0.9, zorder=4, label="path as told")
+    axes.plot(*split_at_jumps(path[rows, :2], truth).T, color=BLUE, lw=0.9, zorder=4, label="online path")
     _paint_now(axes, seen, to_truth)
     axes.margins(0.08)
     axes.apply_aspect()
-    axes.set(xlim=axes.get_xlim(), ylim=axes.get_ylim(), adjustable="box")  # odometry may leave the picture
+    axes.set(xlim=axes.get_xlim(), ylim=axes.get_ylim(), adjustable="box")  # odometry may leave the plot
     reckoned = compose(compose(path[0], between(seen.odometry[0], np.zeros(3))), seen.odometry[rows])
     dashed = (0, (5, 3))
     axes.plot(*reckoned[:, :2].T, color=GREY, lw=0.8, ls=dashed, zorder=1, label="raw odometry")
@@ -77,13 +78,15 @@ def _paint_now(axes: Axes, seen: RunProgress, to_truth: np.ndarray) -> None:
     x, y, heading = compose(to_truth, seen.path[-1])
     around = np.column_stack([np.cos(_ROUND), np.sin(_ROUND)]) * 2 * seen.sd[:2]
     ellipse = compose(to_truth, np.column_stack([seen.path[-1, :2] + around, np.zeros(len(_ROUND))]))
-    axes.plot(*ellipse[:, :2].T, color=VERMILLION, lw=1.2, zorder=6, label="now, two standard deviations")
+    axes.plot(
+        *ellipse[:, :2].T, color=VERMILLION, lw=1.2, zorder=6, label="current pose, 2 standard deviations"
+    )
     ahead = (3, 0, float(np.degrees(heading)) - 90.0)
     axes.plot(x, y, color=VERMILLION, ls="", marker=ahead, ms=11, mec="white", mew=0.8, zorder=7)
 
 
 def _paint_counts(figure: Figure, seen: RunProgress, left: float) -> None:
-    """How many steps went how, right of the map."""
+    """Number of steps by outcome, right of the map."""
     counts = sorted(seen.outcomes.items(), key=lambda item: -item[1])
     counts += [("lost", seen.lost)] if seen.lost else []
     steps = max(1, len(seen.path))

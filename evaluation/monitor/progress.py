@@ -1,4 +1,4 @@
-"""How far a run has come, from what its directory holds while another process fills it."""
+"""Progress of a run in another process, read from its run directory."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ import numpy as np
 from tactile.base.errors import InputError
 
 RUNNING = "running"
-"""The status of a run that has not ended, or was killed."""
+"""Status of a run without a manifest: running or killed."""
 WATCH_IMAGE = "watch.png"
-"""What a monitor leaves in the directory; no sign of life of the run."""
+"""The monitor's own image in the run directory; ignored when looking for activity of the run."""
 
 _NUMBERS = ("t", "x", "y", "heading", "sd_x", "sd_y", "sd_heading", "lost")
 
 
 class RunProgress(NamedTuple):
-    """A run so far, N steps.
+    """State of a run after N steps.
 
     Attributes:
-        status: as in its manifest; `running` while there is none. total: steps there will be, if known.
-        path: [N, 3] poses as told at the time, map frame, m, m, rad. spread: [3] standard deviations of the
-            last; NaN before. odometry: [N, 3] from where this run began. truth: [N, 2] m, NaN where unknown.
-        outcomes: how many steps went how. lost: how many were. off: by how much the present pose was when the
-            run last compared it with the truth, its whole path aligned, m.
-        saved: steps of the last checkpoint. pace: mean steps a second, by the dates of the files.
-        silent: s since the run wrote anything.
+        status: from the manifest; `running` without one. total: final number of steps, if known.
+        path: [N, 3] online poses in the map frame, m, m, rad. sd: [3] standard deviations of the last pose;
+            NaN before it. odometry: [N, 3] from the start of this run. truth: [N, 2] m, NaN if unknown.
+        outcomes: number of steps by outcome. lost: number of steps lost. online_error: position error at the
+            last comparison with the truth, after alignment of the path, m.
+        checkpoint: steps of the last checkpoint. rate: mean steps per second, by file dates.
+        silence: time since the last write of the run, s.
     """
 
     name: str
@@ -52,15 +52,15 @@ class RunProgress(NamedTuple):
 
 
 def step_count(seen: RunProgress) -> str:
-    """How many steps were made, in words."""
+    """Number of steps as text."""
     return f"{len(seen.path)} steps" if seen.total is None else f"{len(seen.path)} of {seen.total} steps"
 
 
 class RunMonitor:
-    """A run directory to look at again and again. Each line is read once, and no file is kept open.
+    """Reads a run directory repeatedly; each line is read once and no file stays open.
 
     Raises:
-        InputError: there is no run in it.
+        InputError: the directory holds no run.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -68,7 +68,7 @@ class RunMonitor:
         if not directory.is_dir():
             raise InputError(str(directory), "no such folder", "the directory of a run")
         if not any((directory / name).exists() for name in ("manifest.json", "steps.csv")):
-            raise InputError(str(directory), "no run in it", "the directory of a run")
+            raise InputError(str(directory), "no run in this folder", "the directory of a run")
         names = ("steps.csv", "odometry.tum", "truth.tum", "online_error.csv")
         self._steps, self._odometry, self._truth, self._errors = (_Lines(directory / name) for name in names)
         self._header: list[str] = []
@@ -79,14 +79,14 @@ class RunMonitor:
         self._online_error: float | None = None
 
     def read(self) -> RunProgress:
-        """The run as it is now.
+        """The current state of the run.
 
         Raises:
-            InputError: a line or a manifest that no run writes, or the directory is gone.
+            InputError: a malformed line or manifest, or the directory was removed.
         """
-        status, total = self._manifest()  # first: once it tells of the end, no line is missing
+        status, total = self._manifest()  # read first: after the end, no line is missing
         self._read()
-        count = min(len(self._rows), len(self._reckoned))  # a chunk's lines come to one file after the other
+        count = min(len(self._rows), len(self._reckoned))  # the lines of a chunk are written file by file
         rows = np.array(self._rows[:count], float).reshape(count, len(_NUMBERS))
         truth = [self._true.get(t, [np.nan, np.nan]) for t in rows[:, 0].tolist()]
         began, last = self._date("config.yaml"), self._date("steps.csv")
@@ -134,7 +134,7 @@ class RunMonitor:
         except FileNotFoundError:
             return RUNNING, None
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InputError(str(file), f"no manifest ({error})", "that of a run") from None
+            raise InputError(str(file), f"not a manifest ({error})", "the manifest of a run") from None
 
     def _saved(self) -> int:
         try:
@@ -144,31 +144,33 @@ class RunMonitor:
             return 0
 
     def _files(self) -> list[str]:
-        """All but a monitor's own."""
+        """All files except the monitor's own."""
         try:
             return [path.name for path in self.directory.iterdir() if not path.name.endswith(WATCH_IMAGE)]
         except OSError as error:
-            raise InputError(str(self.directory), f"gone ({error.strerror})", "a run's directory") from None
+            raise InputError(
+                str(self.directory), f"cannot be read ({error.strerror})", "the directory of a run"
+            ) from None
 
     def _date(self, *names: str) -> float:
-        """When the last of these files was written, s; 0 if none was."""
+        """Time of the last write to these files, s; 0 without any."""
         dates = [0.0]
         for name in names:
             try:
                 dates.append((self.directory / name).stat().st_mtime)
             except OSError:
-                continue  # not there yet, or renamed just now
+                continue  # not written yet, or just renamed
         return max(dates)
 
 
 class _Lines:
-    """A text file that grows. A last line that is half written waits for the rest of it."""
+    """A growing text file; an incomplete last line is read once it is complete."""
 
     def __init__(self, path: Path) -> None:
         self.path, self._offset, self._count = path, 0, 0
 
     def new(self) -> Iterator[tuple[str, str]]:
-        """The whole lines since the last time, each with where it stands."""
+        """The complete lines since the last call, each with `file:line`."""
         try:
             with self.path.open("rb") as file:
                 file.seek(self._offset)
@@ -188,5 +190,5 @@ def _numbers(where: str, cells: list[str], count: int) -> list[float]:
     except ValueError:
         numbers = []
     if len(numbers) != count:
-        raise InputError(where, f"'{' '.join(cells)}'", f"{count} numbers, as a run writes them")
+        raise InputError(where, f"'{' '.join(cells)}'", f"{count} numbers")
     return numbers

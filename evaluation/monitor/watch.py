@@ -1,7 +1,7 @@
-"""A monitor of a run that another process makes: a picture, and a line that tells how it goes.
+"""Live progress of a run in another process: an image and a status line.
 
-It reads what the run writes anyhow and asks it for nothing (Fox et al. 2012, II-D: monitors are processes of
-their own and do not slow the filter).
+It only reads the run directory, so it does not slow the run (Fox et al. 2012, II-D: monitors are separate
+processes).
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from tactile.base.atomic_write import write_atomically
 from tactile.base.errors import InputError
 
 SILENCE_LIMIT = 300.0
-"""A run that wrote nothing for so long was killed, s: to compile, and to draw in the end, takes less."""
+"""A run without output for this long counts as killed, s; compiling and the final plots take less."""
 SILENCE_SHOWN = 10.0
-"""It is told of silence from here on, s."""
+"""The status line reports silence longer than this, s."""
 REST_FACTOR = 9.0
-"""A monitor rests so many times as long as it works: it takes a tenth of a processor at most."""
+"""Pause per working time; limits the monitor to a tenth of a processor core."""
 
 
 def watch_run(
@@ -34,17 +34,17 @@ def watch_run(
     patience: float = SILENCE_LIMIT,
     once: bool = False,
 ) -> RunProgress:
-    """Keeps watch.png in a run's directory up to date and tells how the run stands, until it ends.
+    """Updates watch.png in a run directory and reports the status, until the run ends.
 
     Args:
-        tell: called with one line after each look. every: s from one look to the next, at least. patience: s
-            of silence after which a run counts as killed. once: whether to look but once.
+        tell: called with the status line after each update. every: least time between updates, s.
+        patience: silence after which the run counts as killed, s. once: whether to stop after one update.
 
     Returns:
-        what was seen last.
+        the last state.
 
     Raises:
-        InputError: there is no run, or no picture can be left with it.
+        InputError: the directory holds no run or cannot be written to.
     """
     monitor, before, last = RunMonitor(directory), None, 0.0
     while True:
@@ -63,7 +63,7 @@ def watch_run(
 
 
 def status_line(seen: RunProgress, pace: float | None) -> str:
-    """A run in one line; `pace`: steps a second."""
+    """The state of a run in one line; `pace` is in steps per second."""
     parts = [f"{seen.name}: {seen.status}", step_count(seen), f"{path_length(seen.odometry):.1f} m"]
     parts += [] if pace is None else [f"{pace:.0f} steps/s"]
     parts += [] if seen.online_error is None else [f"error {seen.online_error:.3g} m"]
@@ -79,7 +79,7 @@ def status_line(seen: RunProgress, pace: float | None) -> str:
 
 
 def path_length(odometry: np.ndarray) -> float:
-    """How far the robot went by its odometry [N, 3] from where it began, m."""
+    """Length of the path by odometry [N, 3] from the start of the run, m."""
     return float(np.hypot(*np.diff(odometry[:, :2], axis=0, prepend=np.zeros((1, 2))).T).sum())
 
 

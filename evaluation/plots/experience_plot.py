@@ -1,4 +1,4 @@
-"""The experience history: which experience was current at each step (Salman & Pearson 2016, Fig. 3)."""
+"""Plot of the experience history: the current experience at each step (Salman & Pearson 2016, Fig. 3)."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ _HEIGHT, _BOTTOM = 5.2, 1.05  # inches
 
 
 def draw_experience_history(run: RunArrays, card: Scorecard) -> Figure:
-    """Experience against step, the end of the base set, and what strict ExM says of each re-localisation.
+    """Draws experience against step, the end of the base set and the strict verdict on each re-localisation.
 
-    Without truth, or where the run never returns to its start, nobody can say; then all look the same.
+    Without truth or a return to the start there are no verdicts; then all steps look the same.
     """
     rows = truth_rows(run) if len(truth_rows(run)) else np.arange(len(run.time))
     judged, why = _judged(run, card, rows)
@@ -34,7 +34,7 @@ def draw_experience_history(run: RunArrays, card: Scorecard) -> Figure:
     counted = np.zeros(len(rows), bool) if judged is None else judged.counted
     right = counted if judged is None else judged.right
     free = ~counted
-    coarse = min(2.5, max(1.0, np.sqrt(600 / max(1, len(rows)))))  # larger marks for few steps
+    coarse = min(2.5, max(1.0, np.sqrt(600 / max(1, len(rows)))))  # larger markers for few steps
     for some, color, mark, size, name in (
         (free, GREY, "o", 2.2, "no re-localisation" if judged else "experience"),
         (right, BLUE, "o", 2.6, "correct re-localisation"),
@@ -57,8 +57,7 @@ def draw_experience_history(run: RunArrays, card: Scorecard) -> Figure:
 
 
 def _judged(run: RunArrays, card: Scorecard, rows: np.ndarray) -> tuple[ExperienceMetric | None, str]:
-    """Strict ExM of the steps `rows`, of which those without an experience are no entries; or why there is
-    none."""
+    """The strict Experience Metric of the steps `rows`, or None and the reason."""
     if run.truth is None or len(truth_rows(run)) == 0:
         return None, "no ground truth: re-localisations cannot be judged"
     if (run.experience[rows] < 0).all():
@@ -68,13 +67,13 @@ def _judged(run: RunArrays, card: Scorecard, rows: np.ndarray) -> tuple[Experien
     try:
         return experience_metric(run.experience[rows], run.truth[rows], config), ""
     except InputError as error:
-        return None, f"not judged: {error.where} {error.found}"
+        return None, f"no verdicts: {error.where} {error.found}"
 
 
 def _line(found: ExperienceMetric) -> str:
     parts = [
         f"base set of {found.base} steps",
         f"ARR {found.arr:.2f} ({found.relocalisations} of {found.entries} steps after it)",
-        f"ARCR {found.arcr:.2f} ({found.correct} of {found.relocalisations} correct, read strictly)",
+        f"ARCR {found.arcr:.2f} ({found.correct} of {found.relocalisations} correct, strict mode)",
     ]
     return "  ·  ".join(part for part in parts if "nan" not in part)

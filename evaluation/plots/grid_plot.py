@@ -1,6 +1,6 @@
-"""Occupancy maps as pictures: one with the paths that led to it, or many side by side.
+"""Plots of occupancy maps: one with its paths, or several side by side.
 
-Bright is occupied, as in the figures of Fox et al. 2012, on the same scale from 0 to 1 everywhere.
+Bright cells are occupied, as in the figures of Fox et al. 2012, on a fixed scale from 0 to 1.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ if TYPE_CHECKING:
 
 NO_SEGMENTS = np.zeros((0, 4))
 
-_SKY = "#56b4e9"  # Okabe and Ito's, for lines on dark ground
+_SKY = "#56b4e9"  # Okabe and Ito's light blue, for lines on a dark background
 _PALE = "#c9c9c9"
-_KEY, _BAR = 0.72, 0.15  # inches: right of the maps, and of the colours in it
+_KEY, _BAR = 0.72, 0.15  # inches: right of the maps, and width of the colour bar
 _HEAD, _GAP, _BOTTOM = 0.48, 0.42, 1.0  # inches above a small map, between two, and below all
 
 
 class GridPaths(NamedTuple):
-    """Where the robot was in the end, [T, 2] or [T, 3] each, m; truth may have NaN rows.
+    """Paths of a run, [T, 2] or [T, 3] each, m; truth may have NaN rows.
 
     Attributes:
-        truth: really. estimate: as the filter told at the time. odometry: by dead reckoning.
+        truth: true path. estimate: online poses of the filter. odometry: dead reckoning.
     """
 
     truth: np.ndarray
@@ -44,8 +44,8 @@ class GridPanel(NamedTuple):
     """A map to draw.
 
     Attributes:
-        name: what it is. line: what is measured on it. grid: the map. segments: [S, 4] true walls, m, drawn
-            as thin lines. paths: how it came about.
+        name: title. line: subtitle with its metrics. grid: the map. segments: [S, 4] true walls, m.
+        paths: the paths of the run.
     """
 
     name: str
@@ -56,21 +56,21 @@ class GridPanel(NamedTuple):
 
 
 def draw_grid(panel: GridPanel) -> Figure:
-    """One map, large, with its walls and paths (Fig. 6 of Fox et al. 2012)."""
+    """Draws one map with its walls and paths (Fox et al. 2012, Fig. 6)."""
     inner = WIDTH - style.LEFT - style.RIGHT - _KEY
     tall = inner * _aspect(panel.grid)
     figure = style.new_figure(style.TOP + tall + _BOTTOM, panel.name, panel.line)
     axes = style.add_axes(figure, style.LEFT, _BOTTOM, inner, tall)
     _paint(axes, panel)
     if panel.paths is not None:
-        _paint_paths(axes, panel.paths, told=True)
+        _paint_paths(axes, panel.paths, errors=True)
     _paint_key(figure, style.LEFT + inner, _BOTTOM, min(tall, 2.4))
     style.add_legend(figure, axes, columns=3)
     return figure
 
 
 def draw_grids(title: str, line: str, panels: Sequence[GridPanel], *, across: int = 3) -> Figure:
-    """Maps side by side, `across` in a row (Figs. 4 and 5 of Fox et al. 2012)."""
+    """Draws maps side by side, `across` per row (Fox et al. 2012, Figs. 4 and 5)."""
     across = min(across, len(panels))
     rows = -(-len(panels) // across)
     inner = WIDTH - style.LEFT - style.RIGHT - _KEY
@@ -103,9 +103,9 @@ def draw_grids(title: str, line: str, panels: Sequence[GridPanel], *, across: in
 
 
 def grid_headline(score: GridScore) -> str:
-    """The few figures that matter most, in one line."""
+    """The main quantities in one line."""
     error, found = score.under(MAIN_CONVENTION), score.quantities
-    parts = [f"eq. 6: {error.error:.3f} (0.3 everywhere: {error.prior:.3f})"]
+    parts = [f"map error (eq. 6) {error.error:.3f}, of a constant 0.3 {error.prior:.3f}"]
     skill, auc = found["map_brier_skill"].value, found["map_auc"].value
     ways = found["map_chamfer_map"].value, found["map_chamfer_walls"].value
     parts += [] if skill is None else [f"Brier skill {skill:.2f}"]
@@ -115,7 +115,7 @@ def grid_headline(score: GridScore) -> str:
 
 
 def mean_position_error(path: np.ndarray, truth: np.ndarray) -> float:
-    """Mean distance from the true positions, m, not aligned; NaN where none is known."""
+    """Mean distance from the true positions without alignment, m; NaN without truth."""
     away = np.hypot(*(np.asarray(path)[:, :2] - np.asarray(truth)[:, :2]).T)
     return float(np.nanmean(away)) if np.isfinite(away).any() else float("nan")
 
@@ -126,7 +126,7 @@ def _aspect(grid: OccupancyGrid) -> float:
 
 
 def _paint(axes: Axes, panel: GridPanel) -> None:
-    """The map and the walls; the order of drawing is the order of the legend."""
+    """Draws the map and the walls in the order of the legend."""
     from matplotlib.collections import LineCollection
 
     grid, (height, width) = panel.grid, panel.grid.probability.shape
@@ -139,7 +139,7 @@ def _paint(axes: Axes, panel: GridPanel) -> None:
     axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", autoscale_on=False)
     style.metre_grid(axes)
     axes.grid(visible=False)
-    axes.tick_params(axis="x", pad=6)  # below the lowest number of the other axis
+    axes.tick_params(axis="x", pad=6)  # clear of the lowest tick label of the other axis
     if len(panel.segments):
         walls = panel.segments.reshape(-1, 2, 2)
         axes.add_collection(
@@ -147,13 +147,13 @@ def _paint(axes: Axes, panel: GridPanel) -> None:
         )
 
 
-def _paint_paths(axes: Axes, paths: GridPaths, *, told: bool = False) -> None:
-    """The paths, with their errors in the legend if `told`; what leaves the map is cut off."""
+def _paint_paths(axes: Axes, paths: GridPaths, *, errors: bool = False) -> None:
+    """Draws the paths within the map, with their errors in the legend if `errors`."""
     truth, estimate, odometry = (np.asarray(path)[:, :2] for path in paths)
 
     def name(word: str, path: np.ndarray) -> str:
-        off = mean_position_error(path, truth) if told else np.nan
-        return word if np.isnan(off) else f"{word}, {off:.3f} m off"
+        off = mean_position_error(path, truth) if errors else np.nan
+        return word if np.isnan(off) else f"{word}, error {off:.3f} m"
 
     dashed = (0, (4, 2))
     axes.plot(*odometry.T, color=_PALE, lw=0.8, ls=dashed, zorder=3, label=name("dead reckoning", odometry))
@@ -165,7 +165,7 @@ def _paint_paths(axes: Axes, paths: GridPaths, *, told: bool = False) -> None:
 
 
 def _paint_key(figure: Figure, left: float, bottom: float, tall: float) -> None:
-    """Which grey is which occupancy, right of a map, in inches."""
+    """Draws the grey scale of occupancy right of a map, in inches."""
     bar = style.add_axes(figure, left + 0.2, bottom, _BAR, tall)
     shades = np.linspace(0, 1, 256)[:, None]
     bar.imshow(shades, cmap="gray", vmin=0, vmax=1, extent=(0, 1, 0, 1), origin="lower", aspect="auto")

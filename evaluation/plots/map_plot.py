@@ -1,4 +1,4 @@
-"""The map of a run over the truth, with raw odometry for comparison, and the walls it went between."""
+"""Plot of the map of a run with truth, raw odometry and walls."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ if TYPE_CHECKING:
 
 _BOTTOM = 1.0  # inches below the axes
 _FLATTEST, _TALLEST = 0.4, 1.15  # height / width of the axes
-_ROOM, _MARGIN = 0.2, 0.08  # shares of the map's size: for drifting odometry, and all round
-_JUMP = 5.0  # a step so many times as long as most is no motion: the robot was carried
-_PALE, _DARK = 0.86, 0.62  # greys of a wall without height and of the tallest
+_ROOM, _MARGIN = 0.2, 0.08  # shares of the map's size: for drifting odometry, and on all sides
+_JUMP = 5.0  # a step longer than this multiple of the usual one: the robot was moved by hand
+_PALE, _DARK = 0.86, 0.62  # greys of a wall of height 0 and of the tallest wall
 NO_WALLS = np.zeros((0, 5))
 NO_CLOSURES = np.zeros((0, 2), int)
 
 
 class _Layers(NamedTuple):
-    """What is drawn, in one frame (the truth's where there is one): positions [.., 2] in m."""
+    """Positions [.., 2] (m) to draw, in the frame of the truth if there is one."""
 
     truth: np.ndarray | None
     odometry: np.ndarray
@@ -38,17 +38,16 @@ class _Layers(NamedTuple):
 def draw_map(
     run: RunArrays, card: Scorecard, walls: np.ndarray = NO_WALLS, closures: np.ndarray = NO_CLOSURES
 ) -> Figure:
-    """Map over truth and raw odometry, equal axes in m.
+    """Draws the map over truth and raw odometry with equal axes.
 
-    With truth, map and odometry are each aligned to it as for ATE; without, odometry starts where the map
-    does. The frame holds truth, walls and map; odometry that drifts far off leaves it. Between walls, laps
-    lie over each other, so experiences and their links give way to the trajectory and the closures.
+    With truth, map and odometry are each aligned to it as for ATE; without, odometry starts at the first
+    pose of the map. The plot shows all of truth, walls and map, and odometry near them. In a maze laps
+    overlap, so the trajectory and the loop closures are drawn instead of experiences and links.
 
     Args:
-        run: the run. card: its scorecard, for the headline.
-        walls: [B, 5] west, south, east, north, height in m, in the frame of the truth (drawn if there is
-            one).
-        closures: [n, 2] steps that closures join; drawn with walls.
+        run: the run. card: its scorecard, for the subtitle.
+        walls: [B, 5] west, south, east, north, height, m, in the frame of the truth; needs truth.
+        closures: [n, 2] steps joined by loop closures; drawn with walls.
     """
     layers = _placed(run)
     shown = walls if layers.truth is not None else NO_WALLS
@@ -70,7 +69,7 @@ def draw_map(
 
 
 def map_headline(card: Scorecard) -> str:
-    """The few figures that matter most, in one line."""
+    """The main quantities in one line."""
     ate, online = card.quantities["ate_final"], card.quantities["ate_online"]
     parts = [f"{card.quantities['experiences'].value} experiences"]
     if ate.value is None:
@@ -86,7 +85,7 @@ def map_headline(card: Scorecard) -> str:
 
 
 def draw_walls(axes: Axes, walls: np.ndarray) -> None:
-    """Walls [B, 5] in grey, the taller the darker."""
+    """Draws walls [B, 5] in grey, tall ones darker."""
     from matplotlib.collections import PatchCollection
     from matplotlib.patches import Rectangle
 
@@ -100,13 +99,13 @@ def draw_walls(axes: Axes, walls: np.ndarray) -> None:
 
 
 def bounds(*points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The least and the greatest coordinates [2] of points [.., 2]."""
+    """The minimum and maximum coordinates [2] of points [.., 2]."""
     every = np.concatenate(points)
     return np.nanmin(every, axis=0), np.nanmax(every, axis=0)
 
 
 def wall_corners(walls: np.ndarray) -> np.ndarray:
-    """[2 B, 2] two opposite corners of each wall."""
+    """Two opposite corners [2 B, 2] of each wall."""
     return np.concatenate([walls[:, :2], walls[:, 2:4]])
 
 
@@ -127,8 +126,7 @@ def _xy(pose: np.ndarray) -> np.ndarray:
 
 
 def _frame(layers: _Layers, walls: np.ndarray) -> np.ndarray:
-    """Corners [[left, bottom], [right, top]] in m: truth, walls and map, and what lies near them of the
-    odometry."""
+    """Corners [[left, bottom], [right, top]] (m) around truth, walls, map and odometry near them."""
     truth = [] if layers.truth is None else [layers.truth]
     low, high = bounds(layers.final, layers.nodes, wall_corners(walls), *truth)
     if len(walls) == 0:
@@ -142,15 +140,15 @@ def _frame(layers: _Layers, walls: np.ndarray) -> np.ndarray:
 
 
 def _paint(axes: Axes, run: RunArrays, layers: _Layers) -> None:
-    """Draws the layers; the order of drawing is the order of the legend, `zorder` what covers what."""
+    """Draws the layers in the order of the legend; `zorder` decides what covers what."""
     from matplotlib.collections import LineCollection
 
-    crowd = min(1.0, np.sqrt(150 / max(1, len(layers.nodes))))  # finer strokes for many experiences
+    crowd = min(1.0, np.sqrt(150 / max(1, len(layers.nodes))))  # thinner strokes for many experiences
     truth, odometry, final, nodes = layers
     if truth is not None:
         axes.plot(*truth.T, color=INK, lw=0.8, zorder=5, label="truth")
     axes.plot(*odometry.T, color=GREY, lw=0.9, ls=(0, (5, 3)), zorder=1, label="raw odometry")
-    axes.plot(*final.T, color=BLUE, lw=0.8, alpha=0.4, zorder=2, label="trajectory in the map")
+    axes.plot(*final.T, color=BLUE, lw=0.8, alpha=0.4, zorder=2, label="mapped path")
     if len(nodes):
         dot = {"s": 26 * crowd**2, "color": BLUE, "edgecolors": "white", "linewidths": 0.6 * (crowd == 1)}
         axes.scatter(*nodes.T, zorder=4, label="experience", **dot)
@@ -166,7 +164,7 @@ def _paint(axes: Axes, run: RunArrays, layers: _Layers) -> None:
 
 
 def _paint_laps(axes: Axes, run: RunArrays, layers: _Layers, apart: float, closures: np.ndarray) -> None:
-    """The same between walls. A closure is wrong where it joins places more than `apart` m apart in truth."""
+    """Draws a run in a maze; a closure is wrong if its places are more than `apart` m apart in truth."""
     from matplotlib.collections import LineCollection
 
     truth, odometry, final, nodes = layers
@@ -174,15 +172,15 @@ def _paint_laps(axes: Axes, run: RunArrays, layers: _Layers, apart: float, closu
     axes.plot(
         *split_at_jumps(truth, truth).T, color=YELLOW, lw=5, solid_capstyle="butt", zorder=0.8, label="truth"
     )
-    axes.plot(*split_at_jumps(final, truth).T, color=BLUE, lw=0.7, zorder=3, label="path in the map")
+    axes.plot(*split_at_jumps(final, truth).T, color=BLUE, lw=0.7, zorder=3, label="mapped path")
     axes.plot(*odometry.T, color=GREY, lw=0.7, alpha=0.7, zorder=1, label="raw odometry")
     joined, place = (closures, final) if len(closures) else (run.links[_older(run.links)], nodes)
     steps = joined if len(closures) else run.created[joined]
     with np.errstate(invalid="ignore"):
         wrong = np.hypot(*(truth[steps[:, 0]] - truth[steps[:, 1]]).T) > apart
     for some, color, over, name in (
-        (~wrong, PURPLE, 5, "closure"),
-        (wrong, VERMILLION, 2, f"closure of places over {apart:g} m apart"),
+        (~wrong, PURPLE, 5, "loop closure"),
+        (wrong, VERMILLION, 2, f"false loop closure (over {apart:g} m)"),
     ):
         if some.any():
             axes.add_collection(
@@ -191,12 +189,12 @@ def _paint_laps(axes: Axes, run: RunArrays, layers: _Layers, apart: float, closu
 
 
 def _older(links: np.ndarray) -> np.ndarray:
-    """Which links lead to another experience than the one made just before."""
+    """Which links join experiences that were not created in succession."""
     return np.abs(links[:, 0] - links[:, 1]) > 1
 
 
 def split_at_jumps(line: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """The line [N, 2], interrupted where the true one was carried."""
+    """The line [N, 2], interrupted where the robot was moved by hand (by the truth)."""
     step = np.hypot(*np.diff(truth, axis=0).T)
     moving = step[np.isfinite(step) & (step > 0)]
     if len(moving) == 0:

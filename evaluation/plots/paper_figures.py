@@ -1,4 +1,4 @@
-"""The figures of the reproductions. Everything comes as arrays; nothing here knows what was run."""
+"""Figures of the papers' reproductions, drawn from arrays."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SERIES_COLORS = (GREY, BLUE, VERMILLION, GREEN, PURPLE, YELLOW)
-"""Colours of what is compared, in this order."""
+"""Colours of the compared series, in this order."""
 _GAP, _BOTTOM = 0.75, 0.9  # inches between panels, and below them
-_MEDIAN = 0.3  # of a mark's column
+_MEDIAN = 0.3  # half width of a median bar, share of a condition's width
 
 
 class DrivenPath(NamedTuple):
-    """A path that was driven, and what odometry made of it.
+    """A true path and its odometry.
 
     Attributes:
-        truth, odometry: [T, 2] m, from the same start. lap: [T] int, from 0.
+        truth, odometry: [T, 2] positions from the same start, m. lap: [T] number of the lap, from 0.
     """
 
     truth: np.ndarray
@@ -44,12 +44,12 @@ class DrivenPath(NamedTuple):
 
 
 class ExperienceHistory(NamedTuple):
-    """Which experience was current at each step [T], and what the Experience Metric says of it.
+    """The current experience at each of T steps and the verdict of the Experience Metric.
 
     Attributes:
-        place: [T], -1 for none. counted: [T] a re-localisation. right: [T] a correct one.
-        invalid: [T] an experience made after an incorrect one and before the next correct one.
-        base: steps of the base set.
+        place: [T] experience, -1 for none. counted: [T] a re-localisation. right: [T] a correct one.
+        invalid: [T] an experience created between an incorrect and the next correct re-localisation.
+        base: number of steps in the base set.
     """
 
     place: np.ndarray
@@ -60,11 +60,11 @@ class ExperienceHistory(NamedTuple):
 
 
 class MeasuredQuantity(NamedTuple):
-    """One quantity of several conditions.
+    """One quantity under several conditions.
 
     Attributes:
-        label: with its unit. values: by series, [C, S] over conditions and sets. paper: [C], NaN where the
-            paper gives none. log: whether it spans powers of ten.
+        label: with unit. values: by series, [C, S] over conditions and data sets. paper: [C] values of the
+            paper, NaN for none. log: whether to use a logarithmic axis.
     """
 
     label: str
@@ -74,8 +74,8 @@ class MeasuredQuantity(NamedTuple):
 
 
 def draw_drift(title: str, line: str, paths: Mapping[str, DrivenPath]) -> Figure:
-    """The path driven and the path that odometry tells, side by side for several kinds of error; later laps
-    are darker (Salman & Pearson 2016, Fig. 2)."""
+    """Draws true path and odometry side by side for several kinds of odometry error; later laps are darker
+    (Salman & Pearson 2016, Fig. 2)."""
     figure, panels = _panels(title, line, len(paths), 3.2)
     for axes, (name, path) in zip(panels, paths.items(), strict=True):
         axes.set_title(name, fontsize=9.5, color=INK, loc="left")
@@ -93,7 +93,7 @@ def draw_drift(title: str, line: str, paths: Mapping[str, DrivenPath]) -> Figure
 
 
 def draw_experiences(title: str, line: str, runs: Mapping[str, ExperienceHistory]) -> Figure:
-    """The experience at each step, the end of the base set, and what became of each (Fig. 3)."""
+    """Draws the experience at each step, the end of the base set and the verdicts (Fig. 3)."""
     figure, panels = _panels(title, line, len(runs), 3.4)
     for axes, (name, run) in zip(panels, runs.items(), strict=True):
         axes.set_title(name, fontsize=9.5, color=INK, loc="left")
@@ -118,7 +118,7 @@ def draw_experiences(title: str, line: str, runs: Mapping[str, ExperienceHistory
 def draw_measured(
     title: str, line: str, conditions: Sequence[str], measured: Sequence[MeasuredQuantity]
 ) -> Figure:
-    """A dot for each set, a bar for the median, a line where the paper has a figure (Figs. 4, 6 and 7)."""
+    """Draws a dot per data set, a bar for the median, a line for the paper's value (Figs. 4, 6 and 7)."""
     figure, panels = _panels(title, line, len(measured), 3.4, below=1.3)
     for axes, quantity in zip(panels, measured, strict=True):
         axes.set_title(quantity.label, fontsize=9.5, color=INK, loc="left")
@@ -152,10 +152,10 @@ def draw_measured(
 
 
 def draw_directions(title: str, line: str, maps: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
-    """Mapped paths, clockwise laps apart from anticlockwise ones (Fig. 5).
+    """Draws mapped paths, with clockwise and anticlockwise laps in different colours (Fig. 5).
 
     Args:
-        maps: by name, positions [T, 2] m and whether the step is of a clockwise lap, [T] bool.
+        maps: by name, positions [T, 2] (m) and whether each step is in a clockwise lap [T].
     """
     across = min(2, len(maps))
     figure, panels = _panels(title, line, len(maps), 3.2, across=across)
@@ -175,10 +175,10 @@ def draw_directions(title: str, line: str, maps: Mapping[str, tuple[np.ndarray, 
 def draw_curves(
     title: str, line: str, curves: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]]
 ) -> Figure:
-    """ARR against ARCR as the threshold rises, one curve a set.
+    """Draws ARR against ARCR for increasing thresholds, one curve per data set.
 
     Args:
-        curves: by panel and condition, ARCR and ARR [S, B] over sets and thresholds.
+        curves: by panel and condition, ARCR and ARR [S, B] over data sets and thresholds.
     """
     figure, panels = _panels(title, line, len(curves), 3.6)
     for axes, (panel, conditions) in zip(panels, curves.items(), strict=True):
@@ -203,13 +203,13 @@ def draw_tuning(
     incorrect: np.ndarray,
     winner: float | None,
 ) -> Figure:
-    """How unlike views of one place and of different ones are, and what each threshold led to.
+    """Draws histograms of view differences at the same and at different places, and results by threshold.
 
     Args:
-        edge: [B + 1] of the histograms. same, other: [B] pairs. auc: of telling them apart.
-        threshold, correct, incorrect: [G] of the grid. winner: the threshold taken, if any.
+        edge: [B + 1] edges of the histograms. same, other: [B] numbers of pairs. auc: of their separation.
+        threshold, correct, incorrect: [G] thresholds and re-localisations. winner: chosen threshold, if any.
     """
-    taken = "no threshold satisfies" if winner is None else f"threshold {winner:g}"
+    taken = "no threshold meets the target" if winner is None else f"threshold {winner:g}"
     figure, (left, right) = _panels("Tuning of the classic matcher", f"AUC {auc:.3f}  ·  {taken}", 2, 3.4)
     for count, color, label in ((same, BLUE, "same place"), (other, VERMILLION, "different places")):
         left.stairs(count / max(count.sum(), 1), edge, color=color, fill=True, alpha=0.45, label=label)
@@ -230,7 +230,7 @@ def draw_tuning(
 def _panels(
     title: str, line: str, count: int, height: float, *, across: int = 0, below: float = _BOTTOM
 ) -> tuple[Figure, list[Axes]]:
-    """A figure with so many panels of a height in inches, `across` of them in a row (0: all)."""
+    """A figure with `count` panels of a height in inches, `across` per row (0: all)."""
     across = across or count
     rows = -(-count // across)
     whole = style.TOP + rows * height + (rows - 1) * _GAP + below

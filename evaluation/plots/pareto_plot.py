@@ -1,4 +1,4 @@
-"""Speed against error: time per cycle and error of several choices, and which no other betters in both."""
+"""Plot of error against time per cycle for several configurations, with the Pareto front."""
 
 from __future__ import annotations
 
@@ -14,27 +14,21 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_TALL, _EACH, _BOTTOM = 4.4, 0.13, 0.95  # inches of the axes, more for each mark beyond a dozen, and below
+_TALL, _EACH, _BOTTOM = 4.4, 0.13, 0.95  # inches: height of the axes, extra per point beyond 12, below
 _ROOM = 0.12  # share of the axes kept free on each side
-_FLOOR = 0.5  # an error of 0 is drawn at so much of the least that is none
-_GRID, _GAP, _NEAR = (
-    3.0,
-    (5.0, 2.0),
-    14.0,
-)  # pixels: steps of labels, around them (across, up), and without a line to their mark
-_CROSSING, _MISTAKEN = (
-    8.0,
-    16.0,
-)  # pixels that a label goes further not to cross a bar, or be nearer to another mark
+_FLOOR = 0.5  # an error of 0 is drawn at this share of the least positive error
+# Pixels: grid of label positions, gap around labels (across, up), distance from which a line is drawn.
+_GRID, _GAP, _NEAR = 3.0, (5.0, 2.0), 14.0
+# Pixels of detour that avoid crossing a bar, or being nearer to another point.
+_CROSSING, _MISTAKEN = 8.0, 16.0
 _SIZE = 7.6  # of labels, points
 
 
 class ParetoPoint(NamedTuple):
-    """One choice.
+    """One configuration.
 
     Attributes:
-        name: its label. time, error: (least, median, largest) over seeds. optimal: no other is as fast and
-            as good, and better in one of them.
+        name: its label. time, error: (minimum, median, maximum) over seeds. optimal: on the Pareto front.
     """
 
     name: str
@@ -44,10 +38,10 @@ class ParetoPoint(NamedTuple):
 
 
 def draw_pareto(title: str, line: str, marks: Sequence[ParetoPoint], time: str, error: str) -> Figure:
-    """Both axes logarithmic; bars from the least to the largest over seeds.
+    """Draws the points on logarithmic axes, with bars from minimum to maximum over seeds.
 
     Args:
-        marks: at least one. time, error: what the axes are, with units.
+        marks: at least one point. time, error: axis labels with units.
     """
     inner = WIDTH - style.LEFT - style.RIGHT
     tall = _TALL + _EACH * max(0, len(marks) - 12)
@@ -70,14 +64,17 @@ def draw_pareto(title: str, line: str, marks: Sequence[ParetoPoint], time: str, 
 def place_labels(
     size: np.ndarray, anchor: np.ndarray, area: np.ndarray, blocked: np.ndarray, crossed: np.ndarray
 ) -> np.ndarray:
-    """[N, 2] lower left corners of labels, each as near to its anchor as is free when its turn comes.
+    """Places labels one after the other, each at the free position nearest to its anchor.
 
-    None overlaps another one or what is blocked as long as there is room inside the area; without any, a
-    label lies where it hides the least.
+    Labels overlap neither each other nor blocked boxes while the area has room; after that, a label goes
+    where it hides the least.
 
     Args:
-        size: [N, 2] of the labels. anchor: [N, 2] what they belong to. area: [4] left, bottom, right, top.
-            blocked: [M, 4] the same of what they may not cover. crossed: [L, 4] of what they had better not.
+        size: [N, 2] size of the labels. anchor: [N, 2] points that they belong to. area: [4] left, bottom,
+            right, top. blocked: [M, 4] boxes not to cover. crossed: [L, 4] boxes to avoid.
+
+    Returns:
+        [N, 2] lower left corners.
     """
     room = np.array([-_GAP[0], -_GAP[1], _GAP[0], _GAP[1]])
     taken, corners = list(np.asarray(blocked, float) + room / 2), np.zeros((len(size), 2))
@@ -89,7 +86,7 @@ def place_labels(
         boxes = np.concatenate([spots, spots + [width, height]], axis=1)
         away = _away(boxes, anchor)
         cost = away[:, k] + _MISTAKEN * (np.delete(away, k, axis=1) < away[:, k : k + 1]).sum(axis=1)
-        # Of spots as near, one beside the mark reads better than one above it.
+        # At equal distance, a label beside the point reads better than one above it.
         cost += 0.02 * np.abs((boxes[:, 1] + boxes[:, 3]) / 2 - at[1])
         cost += _CROSSING * (_shared(boxes, np.reshape(crossed, (-1, 4))) > 0).sum(axis=1)
         hidden = _shared(boxes, np.reshape(taken, (-1, 4))).sum(axis=1)
@@ -100,7 +97,7 @@ def place_labels(
 
 
 def _away(boxes: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """[N, M] pixels from boxes to points."""
+    """Distances [N, M] from boxes to points, pixels."""
     low, high = boxes[:, None, :2] - points, points - boxes[:, None, 2:]
     return np.hypot(*np.moveaxis(np.maximum(np.maximum(low, high), 0.0), -1, 0))
 
@@ -113,7 +110,7 @@ def _shared(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 
 def _frame(axes: Axes, spans: np.ndarray) -> None:
-    """Logarithmic axes around [N, 2, 3], with round numbers."""
+    """Sets logarithmic axes around the spans [N, 2, 3], with round tick labels."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
     axes.set(xscale="log", yscale="log")
@@ -132,13 +129,13 @@ def _frame(axes: Axes, spans: np.ndarray) -> None:
 
 
 def _front(axes: Axes, spans: np.ndarray, best: np.ndarray) -> np.ndarray:
-    """[P, 2] corners of the stairs that no mark is below, up to the right end; [0, 2] without any."""
+    """The corners [P, 2] of the staircase of the Pareto front, up to the right end; [0, 2] without points."""
     front = spans[best][:, :, 1]
     if not len(front):
         return front
     front = front[np.lexsort((front[:, 1], front[:, 0]))]
     end = np.array([[axes.get_xlim()[1], front[-1, 1]]])
-    across = np.stack([np.append(front[1:, 0], end[0, 0]), front[:, 1]], axis=1)  # on, before it falls
+    across = np.stack([np.append(front[1:, 0], end[0, 0]), front[:, 1]], axis=1)  # first right, then down
     return np.stack([front, across], axis=1).reshape(-1, 2)
 
 
@@ -149,7 +146,7 @@ def _paint(axes: Axes, spans: np.ndarray, best: np.ndarray) -> None:
         axes.plot(*front.T, color=VERMILLION, lw=1.3, label="Pareto front", zorder=2)
     for some, color, size, name in (
         (best, BLUE, 5.5, "Pareto-optimal"),
-        (~best, GREY, 4.5, "bettered by another"),
+        (~best, GREY, 4.5, "dominated"),
     ):
         if some.any():
             bars = [np.abs(values[some][:, [0, 2]] - values[some][:, 1:2]).T for values in (time, error)]
@@ -160,7 +157,7 @@ def _paint(axes: Axes, spans: np.ndarray, best: np.ndarray) -> None:
 
 
 def _label(axes: Axes, names: Sequence[str], spans: np.ndarray, best: np.ndarray) -> None:
-    """Names beside marks, the optimal ones first; a line to those that stand further off."""
+    """Labels the points, the optimal ones first; distant labels get a line to their point."""
     from matplotlib.patheffects import withStroke
 
     size = _SIZE * axes.figure.dpi / 72

@@ -1,5 +1,6 @@
-"""The look that all pictures share. matplotlib is imported when something is drawn, and without pyplot: no
-window, no global state, the same bytes each time.
+"""Shared style of all plots.
+
+matplotlib is imported on first use and without pyplot: no window, no global state, reproducible bytes.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Okabe and Ito's colours keep apart for every common kind of colour vision
+# Okabe and Ito's colours, distinguishable with common forms of colour blindness
 INK = "#222222"
 LABEL_GREY = "#767676"
 LINE_GREY = "#e6e6e6"
@@ -22,11 +23,11 @@ VERMILLION = "#d55e00"
 PURPLE = "#cc79a7"
 
 WIDTH, LEFT, RIGHT, TOP = 8.0, 0.62, 0.25, 0.90
-"""Of every picture and its margins, inches."""
+"""Width and margins of every plot, inches."""
 
 
 def new_figure(height: float, title: str, line: str) -> Figure:
-    """A figure of `WIDTH` and a height in inches, 1200 pixels wide, with a title and a line below it."""
+    """A figure of `WIDTH` (1200 pixels) and a height in inches, with a title and a subtitle."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -39,7 +40,7 @@ def new_figure(height: float, title: str, line: str) -> Figure:
 
 
 def add_axes(figure: Figure, left: float, bottom: float, width: float, height: float) -> Axes:
-    """Axes at that place of the figure, in inches, without a frame."""
+    """Frameless axes at a position of the figure, in inches."""
     across, up = figure.get_size_inches()
     axes = figure.add_axes((left / across, bottom / up, width / across, height / up))
     axes.set_axisbelow(True)
@@ -49,13 +50,13 @@ def add_axes(figure: Figure, left: float, bottom: float, width: float, height: f
 
 
 def name_axes(axes: Axes, across: str, up: str) -> None:
-    """Labels of the axes, with units."""
+    """Sets the axis labels, with units."""
     axes.set_xlabel(across, color=LABEL_GREY, fontsize=9)
     axes.set_ylabel(up, color=LABEL_GREY, fontsize=9)
 
 
 def metre_grid(axes: Axes) -> None:
-    """The same round steps on both axes, in m, and a faint grid."""
+    """Sets equal tick steps on both axes (m) and a light grid."""
     from matplotlib.ticker import MaxNLocator, MultipleLocator
 
     step = MaxNLocator(7, steps=[1, 2, 5, 10]).tick_values(*axes.get_xlim())
@@ -66,7 +67,7 @@ def metre_grid(axes: Axes) -> None:
 
 
 def add_legend(figure: Figure, axes: Axes, *, columns: int = 4) -> None:
-    """What the axes show, at the bottom left of the figure, in the order of drawing."""
+    """Adds a legend at the bottom left of the figure, in the order of drawing."""
     handles, labels = axes.get_legend_handles_labels()
     across, up = figure.get_size_inches()
     figure.legend(

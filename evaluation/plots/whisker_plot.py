@@ -1,4 +1,4 @@
-"""What the whiskers told in a session: every image as a column, and a few where they were taken."""
+"""Plot of the whisker images of a session: all as columns over time, and some at their poses."""
 
 from __future__ import annotations
 
@@ -21,32 +21,33 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MAX_HEADS = 12
-"""Images that are drawn where they were taken, at most."""
+"""Largest number of images drawn at their poses."""
 STRIP_COLUMNS = 540
-"""Whisks side by side in one strip: two pixels each."""
+"""Whisks in one strip, two pixels each."""
 MAX_STRIPS = 3
-"""Strips at most; of a longer session every so manieth whisk is shown."""
+"""Largest number of strips; of a longer session every n-th whisk is shown."""
 
 _NOTHING, _DEAD = "#f3f3f3", "#8f8f8f"
 _ROW, _GAP, _MARKS, _BOTTOM, _KEY = 0.062, 0.5, 0.22, 0.62, 1.25  # inches
 _FLATTEST, _TALLEST = 0.35, 1.3
-_REACH = 0.078  # m, of a drawn head: it fits between the walls of a cell
-_LARGEST, _LEAST = 0.08, 0.045  # the same as shares of the scene, where that is larger or smaller
-_HOLE = 0.28  # share of it that is the head itself
+_REACH = 0.078  # radius of a drawn head, m; fits between the walls of a maze cell
+_LARGEST, _LEAST = 0.08, 0.045  # limits of the radius as shares of the scene
+_HOLE = 0.28  # share of the radius without whiskers
 
 
 def draw_whiskers(
     run: RunArrays, card: Scorecard, images: WhiskerViews, walls: np.ndarray = NO_WALLS
 ) -> Figure:
-    """Strips of time against whiskers, coloured by the height that was felt, and below them some of the
-    images as rings around the head, where it was (in truth, else in the map) and as it looked.
+    """Draws strips of whiskers over time, coloured by obstacle height, and some images at their poses.
+
+    An image at its pose is drawn as rings around the head; the pose is the true one, else that in the map.
 
     Args:
-        card: for the name. images: as many as the run has steps.
-        walls: [B, 5] west, south, east, north, height, m, in the frame of the truth (drawn if there is one).
+        card: for the title. images: one for each step of the run.
+        walls: [B, 5] west, south, east, north, height, m, in the frame of the truth; needs truth.
 
     Raises:
-        InputError: another number of images than of steps.
+        InputError: the numbers of images and steps differ.
     """
     if len(images.view) != len(run.time):
         raise InputError("views.npz", f"{len(images.view)} images", f"{len(run.time)}, one for each step")
@@ -72,7 +73,7 @@ def draw_whiskers(
         bottom -= tall + _GAP
         axes = style.add_axes(figure, style.LEFT, bottom, inner, tall)
         _paint_strip(axes, run.time, pixels, images, part, chosen)
-    style.name_axes(axes, "time (s); of each ring, the whisker ahead is on top, then anticlockwise", "")
+    style.name_axes(axes, "time (s); rows: whiskers of each ring, anticlockwise from ahead", "")
 
     axes = style.add_axes(figure, style.LEFT, _BOTTOM, wide, high)
     axes.set(xlim=box[:, 0], ylim=box[:, 1], aspect="equal")
@@ -94,13 +95,13 @@ def _line(images: WhiskerViews) -> str:
     parts = [
         f"{len(images.view)} whisks",
         f"rings of {images.view.shape[2]} whiskers, {rings} mm long",
-        f"{touched:.0%} of whiskers touched",
+        f"{touched:.0%} of whiskers in contact",
     ]
     return "  ·  ".join(parts)
 
 
 def _frame(path: np.ndarray, walls: np.ndarray) -> tuple[np.ndarray, float]:
-    """Corners [[left, bottom], [right, top]] in m, and how large a head is drawn."""
+    """Corners [[left, bottom], [right, top]] (m), and the radius of a drawn head (m)."""
     low, high = bounds(path, wall_corners(walls))
     extent = max((high - low).max(), 1e-3)
     reach = float(np.clip(_REACH, _LEAST * extent, _LARGEST * extent))
@@ -110,7 +111,7 @@ def _frame(path: np.ndarray, walls: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def _first_visit(pose: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """The steps of the first loop, all of them where there is none."""
+    """The steps of the first loop, or all steps without a loop."""
     try:
         return steps[: max(1, base_end(pose[steps]))]
     except InputError:
@@ -118,9 +119,9 @@ def _first_visit(pose: np.ndarray, steps: np.ndarray) -> np.ndarray:
 
 
 def _spread(pose: np.ndarray, steps: np.ndarray, apart: float) -> np.ndarray:
-    """Up to `MAX_HEADS` of the steps, in order, as far from each other as can be and at least so far (m).
+    """Up to `MAX_HEADS` of the steps, in order, at least `apart` m from each other.
 
-    From the first on, each next one is the farthest from all before it.
+    Starting with the first, each next one is the farthest from those chosen before.
     """
     chosen = [0]
     place = pose[steps, :2]
@@ -138,7 +139,7 @@ def _colors() -> Colormap:
 
 
 def _pixels(images: WhiskerViews, colors: Colormap) -> np.ndarray:
-    """[N, R, C, 3] the colour of each whisker."""
+    """The colour [N, R, C, 3] of each whisker."""
     from matplotlib.colors import to_rgb
 
     pixels = colors(images.view)[..., :3]
@@ -178,7 +179,7 @@ def _paint_strip(
 
 
 def _paint_head(axes: Axes, pose: np.ndarray, reach: float, pixels: np.ndarray, images: WhiskerViews) -> None:
-    """One image: its rows as rings around the head, the shortest whiskers inside; a tip points ahead."""
+    """Draws an image as rings around the head, the shortest whiskers inside; the arrow points ahead."""
     from matplotlib.collections import PatchCollection
     from matplotlib.patches import Circle, Polygon, Wedge
 
@@ -203,7 +204,7 @@ def _paint_head(axes: Axes, pose: np.ndarray, reach: float, pixels: np.ndarray, 
 
 
 def _paint_key(figure: Figure, images: WhiskerViews, colors: Colormap, left: float, high: float) -> None:
-    """How to read a head, and which colour is how high."""
+    """Draws the key: rings of a head and the colour scale."""
     from matplotlib.patches import Patch
 
     rings, columns = images.view.shape[1:]
@@ -226,11 +227,11 @@ def _paint_key(figure: Figure, images: WhiskerViews, colors: Colormap, left: flo
     bar.imshow(shades, extent=(0, 1, 0, 1000 * images.tallest), origin="lower", aspect="auto")
     bar.set_xticks([])
     bar.yaxis.tick_right()
-    bar.set_title("height felt (mm)", fontsize=8, color=LABEL_GREY, loc="left", pad=8)
+    bar.set_title("height (mm)", fontsize=8, color=LABEL_GREY, loc="left", pad=8)
     across, up = figure.get_size_inches()
-    handles = [Patch(facecolor=_NOTHING, edgecolor=LABEL_GREY, lw=0.4, label="nothing touched")]
+    handles = [Patch(facecolor=_NOTHING, edgecolor=LABEL_GREY, lw=0.4, label="no contact")]
     if not images.alive.all():
-        handles.append(Patch(facecolor=_DEAD, label="does not report"))
+        handles.append(Patch(facecolor=_DEAD, label="no signal"))
     figure.legend(
         handles=handles, loc="upper left", frameon=False, fontsize=8, labelcolor=LABEL_GREY, borderpad=0,
         borderaxespad=0, handlelength=1.0, handletextpad=0.5,

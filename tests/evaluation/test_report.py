@@ -19,12 +19,12 @@ def labels(figure):
 
 def test_the_picture_shows_map_truth_and_odometry(circle, tmp_path):
     figure = draw_map(circle, score_run(circle, "circle"))
-    assert labels(figure)[:4] == ["truth", "raw odometry", "trajectory in the map", "experience"]
+    assert labels(figure)[:4] == ["truth", "raw odometry", "mapped path", "experience"]
     assert "link to an older experience" in labels(figure)
     axes = figure.axes[0]
     assert (axes.get_xlabel(), axes.get_ylabel(), axes.get_aspect()) == ("x (m)", "y (m)", 1.0)
     (truth,) = (line for line in axes.lines if line.get_label() == "truth")
-    (drawn,) = (line for line in axes.lines if line.get_label() == "trajectory in the map")
+    (drawn,) = (line for line in axes.lines if line.get_label() == "mapped path")
     assert np.array(drawn.get_data()) == pytest.approx(np.array(truth.get_data()), abs=1e-9)
     save_map(tmp_path / "map.png", circle, score_run(circle, "circle"))
     save_map(tmp_path / "again.png", circle, score_run(circle, "circle"))
@@ -46,7 +46,7 @@ def test_without_truth_odometry_starts_where_the_map_does(circle):
     figure = draw_map(blind, score_run(blind))
     odometry, final = (
         next(line for line in figure.axes[0].lines if line.get_label() == name).get_xydata()[0]
-        for name in ("raw odometry", "trajectory in the map")
+        for name in ("raw odometry", "mapped path")
     )
     assert odometry == pytest.approx(final)
     assert "truth" not in labels(figure)
@@ -85,7 +85,7 @@ def drawn(figure, label):
 def test_walls_are_drawn_in_the_frame_of_the_truth(circle):
     figure = draw_map(circle, score_run(circle), WALLS)
     axes = figure.axes[0]
-    assert labels(figure)[:3] == ["truth", "path in the map", "raw odometry"]
+    assert labels(figure)[:3] == ["truth", "mapped path", "raw odometry"]
     (boxes,) = (found for found in axes.collections if len(found.get_paths()) == len(WALLS))
     for box, path in zip(WALLS, boxes.get_paths(), strict=True):
         assert path.get_extents().extents == pytest.approx(box[:4])
@@ -98,7 +98,7 @@ def test_walls_are_drawn_in_the_frame_of_the_truth(circle):
 def test_a_closure_is_wrong_where_it_joins_places_far_apart(circle):
     right, wrong = [[0, 36], [5, 77], [36, 72]], [[0, 18], [3, 50]]
     figure = draw_map(circle, score_run(circle), WALLS, np.array(right + wrong))
-    for joined, label in ((right, "closure"), (wrong, "closure of places over 0.1 m apart")):
+    for joined, label in ((right, "loop closure"), (wrong, "false loop closure (over 0.1 m)")):
         ends = drawn(figure, label)
         assert ends == pytest.approx(circle.truth[np.array(joined)][..., :2], abs=1e-9)
 
@@ -106,7 +106,7 @@ def test_a_closure_is_wrong_where_it_joins_places_far_apart(circle):
 def test_without_a_list_of_closures_links_to_older_experiences_stand_for_them(circle):
     figure = draw_map(circle, score_run(circle), WALLS)
     links = circle.links[np.abs(circle.links[:, 0] - circle.links[:, 1]) > 1]
-    assert len(drawn(figure, "closure of places over 0.1 m apart")) == len(links) == 1  # 0.115 m apart
+    assert len(drawn(figure, "false loop closure (over 0.1 m)")) == len(links) == 1  # 0.115 m apart
 
 
 def test_walls_need_a_truth_to_lie_in(circle):

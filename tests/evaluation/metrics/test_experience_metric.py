@@ -128,7 +128,7 @@ def test_turning_about_near_the_start_is_no_loop(square):
 
 def test_a_run_that_never_returns_asks_for_the_base_set(square):
     ids, truth = square(2, 4)
-    with pytest.raises(InputError, match=r"never returns within .* give the end of the base set"):
+    with pytest.raises(InputError, match=r"never returns within .* set `base`, the end of the base set"):
         experience_metric(ids[:30], truth[:30])
     assert experience_metric(ids[:30], truth[:30], ExmConfig(base=8)).base == 8
 
@@ -138,7 +138,7 @@ def test_a_run_that_never_returns_asks_for_the_base_set(square):
     [
         (np.zeros(3, int), np.zeros((2, 3)), 0, "shapes"),
         (np.zeros(0, int), np.zeros((0, 3)), 0, "shapes"),
-        (np.zeros(3, int), np.full((3, 3), np.nan), 0, "row 0: .*leave such rows out"),
+        (np.zeros(3, int), np.full((3, 3), np.nan), 0, "row 0: .*remove such rows"),
         (np.zeros(3, int), np.zeros((3, 3)), 4, "i_base: 4; expected 0 to 3"),
     ],
 )

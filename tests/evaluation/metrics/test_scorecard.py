@@ -112,7 +112,7 @@ def test_the_table_has_units_and_raw_odometry(circle):
     ("change", "message"),
     [
         ({"final": np.zeros((3, 3))}, r"run\.final: shape \(3, 3\)"),
-        ({"online": np.full((108, 3), np.nan)}, r"run\.online: a value that is not finite"),
+        ({"online": np.full((108, 3), np.nan)}, r"run\.online: a NaN or infinite value"),
         ({"experience": np.full(108, 36)}, r"run\.experience: 36 to 36; expected -1 to 35"),
         ({"links": np.zeros(3, int)}, r"run\.links"),
         ({"truth": np.zeros((3, 3))}, r"run\.truth"),

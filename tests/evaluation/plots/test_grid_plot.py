@@ -127,9 +127,9 @@ def test_walls_and_paths_are_drawn_where_they_are():
     assert np.allclose([path.vertices for path in walls.get_paths()], SIDE.reshape(-1, 2, 2))
     lines = {line.get_label(): line for line in axes.lines}
     assert list(lines) == [
-        f"dead reckoning, {0.8:.3f} m off",
+        f"dead reckoning, error {0.8:.3f} m",
         "true path",
-        "estimated path, 0.050 m off",
+        "estimated path, error 0.050 m",
         "start",
     ]
     for line, path in zip(
@@ -145,7 +145,7 @@ def test_unknown_truth_is_left_out():
     truth = WAY.copy()
     truth[::2] = np.nan
     (axes,) = maps(draw_grid(panel(paths=PATHS._replace(truth=truth))))
-    assert [line.get_label() for line in axes.lines][2] == "estimated path, 0.050 m off"
+    assert [line.get_label() for line in axes.lines][2] == "estimated path, error 0.050 m"
     (axes,) = maps(draw_grid(panel(paths=PATHS._replace(truth=np.full_like(WAY, np.nan)))))
     assert [line.get_label() for line in axes.lines] == ["dead reckoning", "true path", "estimated path"]
     poses = np.column_stack([WAY, TURN])
@@ -158,11 +158,11 @@ def test_the_headline_says_what_there_is():
     inside[3:27, 3:27] = True
     truth = GridTruth(np.zeros_like(inside), inside, SIDE)
     line = grid_headline(score_grid(given, truth))
-    assert line.startswith("eq. 6: ")
+    assert line.startswith("map error (eq. 6) ")
     assert "wall AUC 0.50" in line
     assert "Chamfer" not in line
     drawn = given._replace(probability=np.where(inside, 0.0, 1.0))
     assert "Chamfer" in grid_headline(score_grid(drawn, truth))
     figure = draw_grid(panel(line=grid_headline(score_grid(drawn, truth))))
-    (place,) = (place for text, place in words(figure) if text.startswith("eq. 6: "))
+    (place,) = (place for text, place in words(figure) if text.startswith("map error (eq. 6) "))
     assert place.x1 <= 1200
