@@ -105,7 +105,7 @@ def draw_grids(title: str, line: str, panels: Sequence[GridPanel], *, across: in
 def grid_headline(score: GridScore) -> str:
     """The main quantities in one line."""
     error, found = score.under(MAIN_CONVENTION), score.quantities
-    parts = [f"map error (eq. 6) {error.error:.3f}, of a constant 0.3 {error.prior:.3f}"]
+    parts = [f"map error (eq. 6) {error.error:.3f} (constant map {error.prior:.3f})"]
     skill, auc = found["map_brier_skill"].value, found["map_auc"].value
     ways = found["map_chamfer_map"].value, found["map_chamfer_walls"].value
     parts += [] if skill is None else [f"Brier skill {skill:.2f}"]
@@ -173,4 +173,4 @@ def _paint_key(figure: Figure, left: float, bottom: float, tall: float) -> None:
     bar.set_yticks([0, 0.3, 0.5, 1.0])
     bar.yaxis.tick_right()
     bar.tick_params(labelsize=7.5)
-    bar.set_title("occupied", fontsize=8, color=LABEL_GREY, loc="left", pad=9)
+    bar.set_title("occupancy", fontsize=8, color=LABEL_GREY, loc="left", pad=9)
