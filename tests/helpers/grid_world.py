@@ -1,4 +1,4 @@
-"""What tests of the grid filter share: a Create's feelers, simple reports, a way to drive through them."""
+"""Shared by tests of the grid filter: the whiskers of a Create, simple reports, and a driver."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ MOUNTS = ((0.10, 0.08, 50), (0.13, 0.03, 15), (0.13, -0.03, -15), (0.10, -0.08, 
 """x m, y m, direction deg, of a Create's whiskers from left to right."""
 LENGTH = 0.14
 RADIUS = 0.13
-"""Where along a whisker a contact is told, m (Fox et al. 2012, II-D)."""
+"""Distance along a whisker at which contacts are reported, m (Fox et al. 2012, II-D)."""
 STEADY = {"session": 0.0, "move": 0.0, "step": 0.0, "heading": 0.0}
-"""Of a drift: odometry is believed to the letter."""
+"""Drift settings without odometry errors."""
 BLANK = {"edge": 0.0, "blob": 0.0, "free": 0.0, "body": 0.0}
 """Of footprint: the map stays as it is."""
 
@@ -38,7 +38,7 @@ def create(whiskers: int = len(MOUNTS)) -> PlanarWhiskers:
 
 
 TIPS = create().points(np.array([RADIUS / LENGTH]))[:, 0]
-"""[W, 2] m in base_link, where contacts are told."""
+"""[W, 2] contact points in base_link, m."""
 
 
 def report(
@@ -56,7 +56,7 @@ def report(
 
     Args:
         forward: m. turn: rad. touching: whiskers in contact. wall: distance m and bearing rad of its nearest
-            point. sd: of its direction, rad. dead: whiskers that do not report. motion: what it looks like.
+            point. sd: of its direction, rad. dead: whiskers that do not report. motion: its kind.
     """
     if motion is None:
         motion = (
@@ -84,7 +84,7 @@ def report(
 def filter_of(
     config: GridConfig, whiskers: int = len(MOUNTS), side: float = 2.5, dtype: Any = np.float64
 ) -> GridBackend:
-    """The filter of a configuration, made and compiled once."""
+    """The filter of a configuration, built and compiled once."""
     return GridBackend(config, create(whiskers), side, dtype)
 
 
@@ -95,7 +95,7 @@ def settings(**parts: Any) -> GridConfig:
 
 @cache
 def _runner(backend: GridBackend) -> Any:
-    # Little optimised: most filters take few steps here, and compiling them is what takes long.
+    # Low optimisation, because filters run few steps here and compilation dominates.
     options = {"xla_backend_optimization_level": 0}
     return jax.jit(partial(run_chunk, backend.kernel), compiler_options=options)
 
@@ -103,7 +103,7 @@ def _runner(backend: GridBackend) -> Any:
 def drive(
     backend: GridBackend, state: GridState, reports: Sequence[Observation]
 ) -> tuple[GridState, Estimate, GridEvidence]:
-    """The state after the reports, and what was said at each of them: [T, ...]."""
+    """The state after the reports, and estimates and evidence [T, ...]."""
     outputs = []
     for start in range(0, len(reports), CHUNK):
         chunk = list(reports[start : start + CHUNK])
@@ -117,7 +117,7 @@ def drive(
 
 
 def begun(backend: GridBackend, seed: int = 0) -> GridState:
-    """The state before the first report."""
+    """The initial state."""
     return backend.init(jax.random.key(seed), 256)
 
 
@@ -128,5 +128,5 @@ def standing(state: GridState, pose: Sequence[float]) -> GridState:
 
 
 def remembering(state: GridState, evidence: np.ndarray) -> GridState:
-    """All particles with one map of evidence [S, S] (rows are y)."""
+    """All particles with one map of log-odds [S, S]; rows are y."""
     return state._replace(maps=state.maps.at[:, 0].set(jnp.asarray(evidence, state.maps.dtype)[None]))

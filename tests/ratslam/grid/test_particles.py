@@ -118,7 +118,7 @@ def test_equal_weights_change_nothing(count, dtype):
         assert np.array_equal(who.ancestor, np.arange(count))
 
 
-def test_a_weightless_last_particle_is_never_drawn():
+def test_a_last_particle_of_weight_0_is_never_drawn():
     """Among so many that in float32 the last point of a systematic draw is often rounded up to 1."""
     count = 100_000
     share = particles.normalised_weights(jnp.zeros(count, np.float32).at[-1].set(-jnp.inf))
@@ -165,7 +165,7 @@ def test_copies_differ_a_little_and_survivors_not_at_all():
     assert np.abs(np.cov(jitter.T) - np.eye(5)).max() < 4.5 * np.sqrt(2 / count)
 
 
-def test_sparing_copies_nobody():
+def test_identity_makes_no_copies():
     who = particles.identity(COUNT)
     assert who.copies == 0
     assert np.array_equal(who.ancestor, np.arange(COUNT))
@@ -251,7 +251,7 @@ def test_odometry_believed_is_composed(motions):
         assert wrap(pose[2] - expected[2]) == pytest.approx(0, abs=1e-9)
 
 
-def test_a_particle_scales_odometry_by_what_it_believes():
+def test_a_particle_scales_odometry_by_its_own_errors():
     config = DriftConfig(**STEADY)
     group = swarm([[0, 0, np.pi / 2]] * 2)._replace(
         session=jnp.array([[0.1, -0.2], [0.0, 0.0]]), move=jnp.array([[0.05, 0.1], [-0.5, 0.0]])
@@ -265,7 +265,7 @@ def test_a_particle_scales_odometry_by_what_it_believes():
     assert turned.pose[:, :2] == pytest.approx(0, abs=1e-12)
 
 
-def test_scale_errors_last_as_long_as_they_should():
+def test_scale_errors_persist_over_session_movement_or_step():
     """Size: 12 variances and correlations of 40 000 particles within 4.5 standard errors: 1e-4."""
     count = 40_000
     config = DriftConfig(session=0.05, move=0.03, step=0.0, heading=0.0)
