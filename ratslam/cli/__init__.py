@@ -12,7 +12,7 @@ from tactile.base.errors import InputError
 
 GROUPS = ("run", "live", "look", "study", "papers", "files")
 """Headings of the help, in this order."""
-DESCRIPTION = "RatSLAM with whiskers, cameras or lasers: from a recording, simulation or robot to a map."
+DESCRIPTION = "Maps an area and localises a robot by whiskers, camera or laser (RatSLAM)."
 
 
 RETIRED = {"tune": "reproduce threshold", **studies.REPLACED}

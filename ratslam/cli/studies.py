@@ -9,8 +9,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from tqdm import tqdm
-
 from ratslam.cli.common import (
     INPUT_ERROR,
     Commands,
@@ -93,6 +91,8 @@ class Progress:
     def __init__(self, total: int | None, path: Path) -> None:
         self.failed: list[Any] = []
         self._path = path
+        from tqdm import tqdm
+
         self._bar = tqdm(total=total, unit="run", file=sys.stderr, mininterval=0.5, delay=1.0)
 
     def __enter__(self) -> Self:
