@@ -11,7 +11,7 @@ from ratslam.cli.common import INTERRUPTED, Commands, add_config, prepare_jax, r
 def add_commands(commands: Commands) -> None:
     """Registers them."""
     run = commands.add(
-        "run", _run, "map a recording or a simulated session, and score the map",
+        "run", _run, "map a recording or a simulated session and score it",
         "run configs/square.yaml -o runs/square", "run",
     )  # fmt: skip
     add_config(run)
