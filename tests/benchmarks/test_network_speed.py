@@ -65,11 +65,11 @@ def test_replay(benchmark, n):
     ratio = {name: us["numpy"] / us[name] for name in us}
     to_cpp = {name: value / FACTOR[n] for name, value in ratio.items()} if n in FACTOR else {}
     benchmark.extra_info.update(us=us, ratio=ratio, to_cpp=to_cpp)
-    told = ", ".join(
+    line = ", ".join(
         f"{name} {us[name]:.0f} us ({ratio[name]:.1f}x" + (f", C++ {to_cpp[name]:.1f}x)" if to_cpp else ")")
         for name in us
     )
-    print(f"\n{n} x {n} x 36: {told}")
+    print(f"\n{n} x {n} x 36: {line}")
 
 
 @pytest.mark.parametrize("n", [41, 101])

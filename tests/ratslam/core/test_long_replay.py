@@ -30,28 +30,27 @@ PLACES, DWELL = 60, 10
 """Places of the circuit, and steps at each: a lap is 600 steps."""
 VIEW = (3, 6, 1)
 KINDS = "labels", "views", "blind"
-"""What is seen: a given place id, a view, or nothing, which leaves path integration alone."""
+"""Kinds of observation: a given place id, a view, or none (path integration only)."""
 
 POSE = 24
 """Bytes of a pose."""
 MAP = 8 + POSE
-"""Bytes of a step for the final map: its node and the motion since."""
+"""Bytes per step of the final map: a node and the motion since the last."""
 KEPT = 2 * (MAP + POSE)
-"""With its true pose, known or not, in arrays that double when they are full."""
+"""Bytes per step with the true pose, in arrays that double when they are full."""
 COPIED = MAP
-"""A checkpoint is written from a copy."""
+"""Bytes per step of the copy from which a checkpoint is written."""
 ALIGNED = 6 * POSE
-"""How far off the present pose is, is asked of the whole path: so many poses a step for that moment."""
+"""Bytes per step of the alignment of the whole path for the online error."""
 SLACK = 24 * 2**20
-"""Bytes that no step is to blame for: what an allocator keeps, compiled code, buffers of files."""
+"""Bytes independent of the steps: allocator, compiled code, file buffers."""
 
 STATUS = Path("/proc/self/status")
 FORGET = Path("/proc/self/clear_refs")
 
 
 class Moment(NamedTuple):
-    """peak: most memory resident since the moment before, bytes. clock, own: s, by the clock and of this
-    process alone."""
+    """peak: largest resident memory since the last moment, bytes. clock, own: wall and processor time, s."""
 
     peak: int
     clock: float
