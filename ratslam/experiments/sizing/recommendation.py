@@ -159,7 +159,7 @@ def _tier(config: RunConfig) -> Iterator[Proposal]:
     chosen = choose_tier(simulation.model_copy(update={"fidelity": "auto"}))
     value = "auto" if simulation.fidelity == "auto" else chosen.name
     named = f"{chosen.name}: " if value == "auto" else ""
-    why = f"{named}{chosen.why}; `tiers` shows what each changes"
+    why = f"{named}{chosen.why}; `study --preset tiers` compares them"
     yield _of(config, "simulation.fidelity", value, why)
 
 
