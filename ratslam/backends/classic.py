@@ -23,17 +23,17 @@ from tactile.base.types import Array, Observation, Odometry
 
 
 class ClassicState(NamedTuple):
-    """All that the neural half remembers."""
+    """State of the kernel."""
 
     cells: PoseCells
     templates: Templates
     places: Places
     relative: Array
-    """Heading of the robot less that at which the current template was stored, rad."""
+    """Heading of the robot minus its heading when the current template was stored, rad."""
 
 
 class ClassicEvidence(NamedTuple):
-    """What one step adds to the map and to the record.
+    """Evidence of one step.
 
     Attributes:
         template: current template, int32; -1 before the first view. error: of the best match. relative: see
@@ -68,7 +68,7 @@ class ClassicBackend:
         self.units = units(config.pose_cells, self.dtype)
 
     def init(self, key: Array, capacity: int) -> ClassicState:
-        """One packet in the middle of an empty world. Nothing here is random, so `key` is not used."""
+        """One packet in the middle of the torus, empty memories. `key` is not used: nothing is random."""
         del key
         return ClassicState(
             pose_cells.start(self.config.pose_cells, self.dtype),
@@ -78,7 +78,7 @@ class ClassicBackend:
         )
 
     def rows(self, state: ClassicState) -> int:
-        """Templates, places or links, whichever are most."""
+        """Number of templates, places or links, whichever is largest."""
         return max(int(n) for n in (state.templates.count, state.places.count, state.places.links))
 
     def grow(self, state: ClassicState, capacity: int) -> ClassicState:
@@ -92,14 +92,15 @@ class ClassicBackend:
         return state._replace(templates=memories[0], places=memories[1])
 
     def apply_map_feedback(self, state: ClassicState, feedback: None) -> ClassicState:
-        """The classic map tells its kernel nothing."""
+        """The state unchanged: the classic map gives no feedback."""
         del feedback
         return state
 
     def kernel(
         self, state: ClassicState, observation: Observation
     ) -> tuple[ClassicState, Estimate, ClassicEvidence]:
-        """See, recall, inject and move, decode, learn, decide."""
+        """Matches the view, injects activity, moves the packet, learns a template and decides on the
+        place."""
         config = self.config
         odometry, view, seen, clean = finite(config.templates, self.dtype, observation)
 
@@ -155,11 +156,10 @@ class ClassicBackend:
 def finite(
     config: TemplateConfig, dtype: np.dtype, observation: Observation
 ) -> tuple[Odometry, Array, Array, Array]:
-    """The observation in this precision, with anything that is not a number masked.
+    """The observation in this precision, with values that are not finite masked.
 
     Returns:
-        odometry; the view as it is stored and compared; whether there is a view (or given id); whether all of
-        it was finite.
+        odometry; the normalised view; whether there is a view (or given id); whether all values were finite.
     """
     odometry = Odometry(*(jnp.asarray(value, dtype) for value in observation.odometry))
     moves = jnp.stack(odometry[:3])

@@ -1,7 +1,7 @@
-"""SLAM by a grid particle filter: each particle carries a pose, its own map, and a belief of the odometry.
+"""SLAM by a grid particle filter: each particle has a pose, a map of its own and lasting odometry errors.
 
-After Fox et al. 2012, Algorithm 1. What makes it work beyond the paper is ours: odometry errors that last are
-part of the state, unexplored space says nothing, and walls are expected to run on as they did.
+After Fox et al. 2012, Algorithm 1. Beyond the paper, and ours: lasting odometry errors are part of the state,
+unexplored space is no evidence, and walls are expected to continue straight.
 """
 
 from __future__ import annotations
@@ -17,23 +17,22 @@ from jax import lax
 from ratslam.core.types import Action, Estimate, Scalar
 from ratslam.grid import kernels, likelihoods, particle_maps, particles
 from ratslam.grid.config import GridConfig
+from ratslam.grid.contact_features import ContactFeatures, contact_features
 from ratslam.grid.map import GridMap
 from ratslam.grid.particle_maps import COSINE, EVIDENCE, SINE
 from ratslam.grid.particles import Particles
 from tactile.base.errors import InputError
-from tactile.base.types import Array, MotionKind, Observation, Odometry
+from tactile.base.types import Array, MotionKind, Observation
 from tactile.whiskers.planar_whiskers import PlanarWhiskers
 
 FREE = (0.2, 0.5, 0.8)
-"""Where along a whisker that meets nothing the map is told so, as shares of its length."""
+"""Points along a whisker without contact that are marked free, as shares of its length."""
 RIM = 4
-"""Points on the robot's rim that the map is asked about, besides its middle."""
+"""Number of points on the robot's rim at which the map is read, besides its centre."""
 SEGMENTS = 5
-"""Of a whisker, for eq. 2."""
+"""Number of segments of a whisker for eq. 2."""
 REACH = 2.5
 """Standard deviations of a stamp that are drawn."""
-LARGEST = 1e6
-"""Motion of one step from which on it is no motion, m or rad."""
 WALL, WALL_DIRECTIONS = 100.0, 40.0
 """Largest precision of a wall's direction against the field there, and against all walls."""
 
@@ -44,22 +43,22 @@ MOST = 2**31 - 1
 """Largest number of cells of all maps together: they are indexed in int32."""
 
 
-class Outcome(IntEnum):
-    """How a step of the filter went."""
+class GridOutcome(IntEnum):
+    """Outcome of a step of the filter."""
 
     OK = 0
     RESAMPLED = 1
-    """Particles were drawn anew."""
+    """The particles were resampled."""
     VANISHED = 2
-    """No particle explains what was felt; the weights were left as they were."""
+    """No particle explains the contacts; the weights stay as they were."""
     OUTSIDE = 3
-    """What was felt lies outside the map, at least for some particles; there it is forgotten."""
+    """Contacts lie outside the map for at least one particle and are ignored there."""
     NOT_FINITE = 4
-    """Odometry or contacts were NaN, infinite or of no possible size; taken as no motion and no contact."""
+    """Odometry or contacts were NaN, infinite or impossibly large; treated as no motion and no contact."""
 
 
 class GridState(NamedTuple):
-    """All that the filter remembers.
+    """State of the filter.
 
     Attributes:
         maps: [N, layers, S, S]. wall_directions: [N, 2] sums of unit vectors
@@ -76,11 +75,11 @@ class GridState(NamedTuple):
 
 
 class GridEvidence(NamedTuple):
-    """What one step adds to the map and to the record.
+    """Evidence of one step.
 
     Attributes:
-        ancestor: [N] int32, whom each particle is a copy of. poses: [N, 3] and weights: [N] before copies
-            were made. effective: how many particles these are worth. outcome: an `Outcome`, int32.
+        ancestor: [N] int32, the particle that each particle was copied from. poses: [N, 3] and weights: [N]
+            before resampling. effective: effective number of particles. outcome: an `GridOutcome`, int32.
     """
 
     ancestor: Array
@@ -88,26 +87,6 @@ class GridEvidence(NamedTuple):
     weights: Array
     effective: Scalar
     outcome: Scalar
-
-
-class Felt(NamedTuple):
-    """An observation as the filter takes it.
-
-    Attributes:
-        told: bool, it counts as evidence. free: [W] bool, whiskers that meet nothing. new: [W] bool, that
-            meet something and did not before. touching: [W] bool. point: [W, 2] m, where. wall: bool.
-            on_wall: [2] m, the contact upon the wall. direction: of the wall, rad. sd: of that, rad.
-    """
-
-    told: Array
-    free: Array
-    new: Array
-    touching: Array
-    point: Array
-    wall: Array
-    on_wall: Array
-    direction: Array
-    sd: Array
 
 
 class GridBackend:
@@ -161,45 +140,45 @@ class GridBackend:
         )
 
     def rows(self, state: GridState) -> int:
-        """None: nothing grows."""
+        """0: nothing grows."""
         del state
         return 0
 
     def grow(self, state: GridState, capacity: int) -> GridState:
-        """The same: nothing grows."""
+        """The state unchanged: nothing grows."""
         del capacity
         return state
 
     def apply_map_feedback(self, state: GridState, feedback: Any) -> GridState:
-        """The same: the filter asks nothing of its map."""
+        """The state unchanged: the filter takes nothing over from its map."""
         del feedback
         return state
 
     def kernel(self, state: GridState, observation: Observation) -> tuple[GridState, Estimate, GridEvidence]:
-        """Move, weigh, draw anew, leave a mark."""
+        """Moves, weighs and resamples the particles, then updates their maps."""
         key, draw, pick, jitter = jax.random.split(jax.random.wrap_key_data(state.key), 4)
-        odometry, felt, clean = self._taken(state, observation)
+        odometry, features, clean = contact_features(observation, state.touched, self.dtype)
         motion = jnp.asarray(observation.motion, jnp.int32)
         swarm = particles.move(self.config.drift, state.particles, odometry, motion != state.motion, draw)
-        swarm, vanished = particles.weigh(swarm, self._likelihood(state, swarm.pose, felt))
+        swarm, vanished = particles.weigh(swarm, self._likelihood(state, swarm.pose, features))
         share = particles.normalised_weights(swarm.weight)
         worth = particles.effective_count(share)
         pose, spread = particles.weighted_mean(swarm.pose, share)
         poses = swarm.pose
 
-        swarm, who = self._drawn(swarm, share, worth, felt.told, pick, jitter)
+        swarm, who = self._drawn(swarm, share, worth, features.told, pick, jitter)
         maps = particles.copy_rows(state.maps, who)
         wall_directions = state.wall_directions[who.ancestor]
-        maps, wall_directions, outside = self._marked(maps, wall_directions, swarm.pose, felt)
+        maps, wall_directions, outside = self._marked(maps, wall_directions, swarm.pose, features)
 
-        outcome = jnp.where(who.copies > 0, Outcome.RESAMPLED, Outcome.OK)
-        outcome = jnp.where(outside, Outcome.OUTSIDE, outcome)
-        outcome = jnp.where(vanished, Outcome.VANISHED, outcome)
-        outcome = jnp.where(clean, outcome, Outcome.NOT_FINITE).astype(jnp.int32)
-        place = jnp.int32(-1)  # a grid has none
+        outcome = jnp.where(who.copies > 0, GridOutcome.RESAMPLED, GridOutcome.OK)
+        outcome = jnp.where(outside, GridOutcome.OUTSIDE, outcome)
+        outcome = jnp.where(vanished, GridOutcome.VANISHED, outcome)
+        outcome = jnp.where(clean, outcome, GridOutcome.NOT_FINITE).astype(jnp.int32)
+        place = jnp.int32(-1)  # a grid has no places
         estimate = Estimate(pose, spread, place, place, jnp.int32(Action.NONE), vanished)
         evidence = GridEvidence(who.ancestor, poses, share, worth, outcome)
-        touched = jnp.where(felt.told, felt.touching, False)
+        touched = jnp.where(features.told, features.touching, False)
         after = GridState(swarm, maps, wall_directions, motion, touched, jax.random.key_data(key))
         return after, estimate, evidence
 
@@ -207,84 +186,47 @@ class GridBackend:
         """An empty map."""
         return GridMap(self.config, self.feelers, self.side)
 
-    def _taken(self, state: GridState, observation: Observation) -> tuple[Odometry, Felt, Array]:
-        """Odometry and contacts with anything that is not a number masked, and whether nothing was."""
-        odometry = Odometry(*(jnp.asarray(value, self.dtype) for value in observation.odometry))
-        moves = jnp.stack(odometry[:3])
-        fine = jnp.all(jnp.abs(moves) < LARGEST)  # false for NaN, too
-        dx, dy, dtheta = jnp.where(fine, moves, 0.0)
-        point = jnp.asarray(observation.point, self.dtype)
-        placed = jnp.all(jnp.isfinite(point), axis=1)
-        touching = jnp.asarray(observation.contact) & observation.alive & placed
-        clean = fine & jnp.all(placed | ~observation.contact)
-        measured = jnp.all(jnp.isfinite(jnp.append(observation.wall_point, observation.wall_sd)))
-        clean &= measured | ~observation.wall
-
-        turning = observation.motion == MotionKind.TURN
-        told = observation.motion != MotionKind.BACK
-        # Whiskers that whisk touch anew each time; fixed ones go on touching what they have met.
-        fresh = ~state.touched | (observation.motion == MotionKind.OTHER)
-        foot = jnp.asarray(observation.wall_point, self.dtype)
-        away = jnp.hypot(foot[0], foot[1])
-        wall = observation.wall & told & measured & (away > 1e-6) & jnp.any(touching)
-        normal = jnp.where(wall, foot / jnp.where(wall, away, 1.0), jnp.zeros(2, self.dtype))
-        among = touching.astype(self.dtype)
-        point = jnp.where(touching[:, None], point, 0.0)
-        middle = among @ point / jnp.maximum(jnp.sum(among), 1.0)
-        felt = Felt(
-            told=told,
-            free=told & observation.alive & ~observation.contact,
-            new=told & touching & fresh & ~turning,
-            touching=touching,
-            point=point,
-            wall=wall,
-            on_wall=middle + normal * (jnp.where(wall, away, 0.0) - normal @ middle),
-            direction=jnp.arctan2(normal[1], normal[0]) + np.pi / 2,
-            sd=jnp.where(wall, jnp.asarray(observation.wall_sd, self.dtype), 1.0),
-        )
-        return Odometry(dx, dy, dtheta, odometry.dt), felt, clean
-
-    def _likelihood(self, state: GridState, pose: Array, felt: Felt) -> Array:
+    def _likelihood(self, state: GridState, pose: Array, features: ContactFeatures) -> Array:
         config = self.config.likelihood
         if config.model != "evidence":
-            return self._printed(state.maps, pose, felt)
+            return self._printed(state.maps, pose, features)
         points = jnp.concatenate([jnp.asarray(self.free), jnp.asarray(self.body)])
         evidence = particle_maps.interpolate(state.maps, EVIDENCE, self._placed(pose, points))
-        shafts = jnp.repeat(felt.free, len(FREE))
-        body = jnp.broadcast_to(felt.told & (self.config.body > 0), len(self.body))
+        shafts = jnp.repeat(features.free, len(FREE))
+        body = jnp.broadcast_to(features.told & (self.config.body > 0), len(self.body))
         likelihood = likelihoods.free_space(config, evidence, jnp.concatenate([shafts, body]))
-        # Few reports tell of a contact: the rest is worked out for those alone.
+        # Few observations have contacts; the rest is computed for those alone.
         return likelihood + lax.cond(
-            jnp.any(felt.new) | felt.wall,
-            lambda: self._met(state, pose, felt),
+            jnp.any(features.new) | features.wall,
+            lambda: self._met(state, pose, features),
             lambda: jnp.zeros_like(likelihood),
         )
 
-    def _met(self, state: GridState, pose: Array, felt: Felt) -> Array:
+    def _met(self, state: GridState, pose: Array, features: ContactFeatures) -> Array:
         """[N] log-likelihood of new contacts, and of a wall's direction: as the map has it there, and as
         walls are at large."""
         config = self.config.likelihood
-        evidence = particle_maps.interpolate(state.maps, EVIDENCE, self._placed(pose, felt.point))
-        likelihood = likelihoods.contact(config, evidence, felt.new)
-        place = self._placed(pose, felt.on_wall[None])
+        evidence = particle_maps.interpolate(state.maps, EVIDENCE, self._placed(pose, features.point))
+        likelihood = likelihoods.contact(config, evidence, features.new)
+        place = self._placed(pose, features.on_wall[None])
         field = [particle_maps.interpolate(state.maps, layer, place) for layer in (COSINE, SINE)]
-        direction = pose[:, 2] + felt.direction
-        sharp = jnp.minimum(WALL, 1 / (4 * felt.sd**2))
+        direction = pose[:, 2] + features.direction
+        sharp = jnp.minimum(WALL, 1 / (4 * features.sd**2))
         aligned = likelihoods.wall_direction(config, jnp.concatenate(field, axis=1), 2 * direction, sharp)
         if config.wall_direction_prior:
-            sharp = jnp.minimum(WALL_DIRECTIONS, 1 / (16 * felt.sd**2))
+            sharp = jnp.minimum(WALL_DIRECTIONS, 1 / (16 * features.sd**2))
             aligned += likelihoods.wall_direction(config, state.wall_directions, 4 * direction, sharp)
-        return likelihood + jnp.where(felt.wall, aligned, 0.0)
+        return likelihood + jnp.where(features.wall, aligned, 0.0)
 
-    def _printed(self, maps: Array, pose: Array, felt: Felt) -> Array:
+    def _printed(self, maps: Array, pose: Array, features: ContactFeatures) -> Array:
         cell = jnp.round(self._placed(pose, jnp.asarray(self.shafts)))
         evidence = particle_maps.interpolate(maps, EVIDENCE, cell)
         shape = (len(pose), self.whiskers, SEGMENTS)
         likelihood = likelihoods.printed_likelihood(
             self.config.prior, evidence.reshape(shape), cell.reshape(*shape, 2),
-            felt.touching, felt.free | felt.touching, self.counted,
+            features.touching, features.free | features.touching, self.counted,
         )  # fmt: skip
-        return jnp.where(felt.told, likelihood, 0.0)
+        return jnp.where(features.told, likelihood, 0.0)
 
     def _drawn(
         self, swarm: Particles, share: Array, worth: Array, told: Array, pick: Array, jitter: Array
@@ -303,63 +245,65 @@ class GridBackend:
         return lax.cond(needed, anew, lambda: (swarm, particles.identity(self.config.particles)))
 
     def _marked(
-        self, maps: Array, wall_directions: Array, pose: Array, felt: Felt
+        self, maps: Array, wall_directions: Array, pose: Array, features: ContactFeatures
     ) -> tuple[Array, Array, Array]:
-        """Every particle's map with what was felt left in it; and whether any of it lies outside."""
+        """Every particle's map after the observation; and whether any contact lies outside."""
         config, cell = self.config.footprint, self.config.cell
         middle = self._placed(pose, jnp.zeros((1, 2), self.dtype))
         windows = particle_maps.windows_around(middle[:, 0], self.side, self.near)
-        amount = -config.free * jnp.repeat(felt.free, len(FREE)).astype(self.dtype)
+        amount = -config.free * jnp.repeat(features.free, len(FREE)).astype(self.dtype)
         place = particle_maps.to_window(self._placed(pose, jnp.asarray(self.free)), windows)
         stamp = kernels.gaussian_blobs(place, amount, self.free_sd, windows.size)
         if self.config.body:
             body = kernels.disc(
                 particle_maps.to_window(middle, windows)[:, 0], self.config.body / cell, windows.size
             )
-            stamp -= jnp.where(felt.told, config.body, 0.0) * body
+            stamp -= jnp.where(features.told, config.body, 0.0) * body
         maps = self._added(maps, EVIDENCE, windows, stamp)
 
-        met = jnp.any(felt.new) | (felt.wall & (config.wall != "blob"))
+        met = jnp.any(features.new) | (features.wall & (config.wall != "blob"))
         maps, wall_directions = lax.cond(
-            met, lambda: self._met_marked(maps, wall_directions, pose, felt), lambda: (maps, wall_directions)
+            met,
+            lambda: self._met_marked(maps, wall_directions, pose, features),
+            lambda: (maps, wall_directions),
         )
-        ends = self._placed(pose, felt.point)
+        ends = self._placed(pose, features.point)
         beyond = jnp.any((ends < 0) | (ends > self.side - 1), axis=-1)
-        return maps, wall_directions, jnp.any(beyond & felt.touching[None])
+        return maps, wall_directions, jnp.any(beyond & features.touching[None])
 
     def _met_marked(
-        self, maps: Array, wall_directions: Array, pose: Array, felt: Felt
+        self, maps: Array, wall_directions: Array, pose: Array, features: ContactFeatures
     ) -> tuple[Array, Array]:
-        """With contacts and a wall drawn in."""
+        """The maps with contacts and a wall added."""
         config, cell = self.config.footprint, self.config.cell
-        ends = self._placed(pose, felt.point)
+        ends = self._placed(pose, features.point)
         windows = particle_maps.windows_around(
             self._placed(pose, jnp.zeros((1, 2), self.dtype))[:, 0], self.side, self.far
         )
-        amount = config.blob * felt.new.astype(self.dtype)
+        amount = config.blob * features.new.astype(self.dtype)
         stamp = kernels.gaussian_blobs(
             particle_maps.to_window(ends, windows), amount, self.blob_sd, windows.size
         )
         maps = self._added(maps, EVIDENCE, windows, stamp)
         if config.wall == "blob":
             return maps, wall_directions
-        place = self._placed(pose, felt.on_wall[None])
+        place = self._placed(pose, features.on_wall[None])
         windows = particle_maps.windows_around(place[:, 0], self.side, self.long)
         place = particle_maps.to_window(place, windows)[:, 0]
-        direction = pose[:, 2] + felt.direction
+        direction = pose[:, 2] + features.direction
         if config.wall == "edge":
             shape = kernels.wall_sector(place, direction, config.along / cell, config.sector, windows.size)
         else:
             shape = kernels.wall_edge(
                 place, direction, config.along / cell, config.across / cell, windows.size
             )
-        shape = jnp.where(felt.wall, shape, 0.0)
+        shape = jnp.where(features.wall, shape, 0.0)
         maps = self._added(maps, EVIDENCE, windows, config.edge * shape)
         for layer, part in ((COSINE, jnp.cos(2 * direction)), (SINE, jnp.sin(2 * direction))):
             field = particle_maps.read_window(maps, windows, layer) + shape * part[:, None, None]
             maps = particle_maps.write_window(maps, windows, layer, field)
         pointing = jnp.stack([jnp.cos(4 * direction), jnp.sin(4 * direction)], axis=1)
-        return maps, wall_directions + jnp.where(felt.wall, pointing, 0.0)
+        return maps, wall_directions + jnp.where(features.wall, pointing, 0.0)
 
     def _added(self, maps: Array, layer: int, windows: particle_maps.Windows, stamp: Array) -> Array:
         most = self.config.footprint.max_log_odds
@@ -367,7 +311,7 @@ class GridBackend:
         return particle_maps.write_window(maps, windows, layer, evidence)
 
     def _window(self, reach: float) -> int:
-        """Cells a side of a window that shows so far, m, on every side of the place that it is about."""
+        """Side length, cells, of a window that reaches `reach` m in every direction."""
         return 2 * int(np.ceil(reach / self.config.cell)) + 2
 
     def _placed(self, pose: Array, points: Array) -> Array:

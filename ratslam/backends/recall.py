@@ -34,7 +34,7 @@ HEALTH_RATE = 0.1
 
 
 class RecallState(NamedTuple):
-    """All that the neural half remembers.
+    """State of the kernel.
 
     Attributes:
         health: running share of revisits (frames where the map has older ones) whose view fits.
@@ -46,7 +46,7 @@ class RecallState(NamedTuple):
 
 
 class RecallEvidence(NamedTuple):
-    """What one step adds to the map and to the record.
+    """Evidence of one step.
 
     Attributes:
         frame to background: see `RecallResult`. energy: injected into the pose cells. packet: [3] decoded,
@@ -87,7 +87,7 @@ class RecallBackend:
         labels = config.templates.source == "labels"
         self.config, self.ablation = config, ablation
         self.recall = config.recall.model_copy(update={"sector_fov": "none"}) if labels else config.recall
-        if self.recall.sector_fov == "whiskers" and view_shape[1] % 2:  # no whisker has one opposite
+        if self.recall.sector_fov == "whiskers" and view_shape[1] % 2:  # no whisker is opposite another
             self.recall = self.recall.model_copy(update={"shifts": 0})
         self.labels, self.view_shape = labels, view_shape
         self.size = 0 if labels else int(np.prod(view_shape))
@@ -99,7 +99,7 @@ class RecallBackend:
         self.units = units(config.pose_cells, self.dtype)
 
     def init(self, key: Array, capacity: int) -> RecallState:
-        """One packet in the middle of an empty world. Nothing here is random, so `key` is not used."""
+        """One packet in the middle of the torus, and no keyframes. `key` is not used: nothing is random."""
         del key
         return RecallState(
             pose_cells.start(self.config.pose_cells, self.dtype),
@@ -108,11 +108,11 @@ class RecallBackend:
         )
 
     def rows(self, state: RecallState) -> int:
-        """Frames."""
+        """Number of keyframes."""
         return int(state.memory.count)
 
     def grow(self, state: RecallState, capacity: int) -> RecallState:
-        """The same memories in larger arrays."""
+        """The same memory in larger arrays."""
 
         def enlarge(old: Array, new: Array) -> Array:
             return old if old.shape == new.shape else new.at[tuple(slice(0, n) for n in old.shape)].set(old)
@@ -121,44 +121,39 @@ class RecallBackend:
         return state._replace(memory=jax.tree.map(enlarge, state.memory, empty))
 
     def apply_map_feedback(self, state: RecallState, feedback: MapFeedback) -> RecallState:
-        """The filter takes up the poses, bias and scales of the map."""
+        """The filter takes over the poses, bias and scales of the map."""
         return state._replace(memory=recall_memory.apply_map_feedback(state.memory, feedback))
 
     def kernel(
         self, state: RecallState, observation: Observation
     ) -> tuple[RecallState, Estimate, RecallEvidence]:
-        """Move, look, inject softly, learn."""
+        """Moves, recalls, injects activity by posterior, and stores the view."""
         odometry, view, seen, clean = finite(self.config.templates, self.dtype, observation)
         moved = jnp.stack([odometry.dx, odometry.dy, odometry.dtheta])
         memory = recall_memory.accumulate_motion(state.memory, moved)
         frame = seen & recall_memory.is_keyframe_due(self.recall, self.cell, memory)
-        looks = self._looks(view, observation)
+        features = self._features(view, observation)
 
-        memory, recollection = lax.cond(
+        memory, result = lax.cond(
             frame,
-            lambda: self._look(memory, looks, observation.label),
+            lambda: self._look(memory, features, observation.label),
             lambda: (memory, filter.empty_result(memory)),
         )
-        recalled, energy = self._injection(memory, recollection)
+        recalled, energy = self._injection(memory, result)
         cells, told = pose_cells.step(
             self.config.pose_cells, self.window_levels, state.cells, odometry, recalled, energy
         )
         memory = lax.cond(
             frame,
-            lambda: recall_memory.store_keyframe(memory, looks, observation.label, cells.pose),
+            lambda: recall_memory.store_keyframe(memory, features, observation.label, cells.pose),
             lambda: memory,
         )
-        health = jnp.where(
-            recollection.agree >= 0,
-            state.health + HEALTH_RATE * (recollection.agree.astype(self.dtype) - state.health),
-            state.health,
-        )
-
+        health = self._health(state.health, result.agree)
         room = memory.count < memory.label.shape[0]
         outcome = jnp.where(room | ~seen, told.outcome, Outcome.FULL)
         outcome = jnp.where(clean, outcome, Outcome.NOT_FINITE).astype(jnp.int32)
         sd, sd_heading = recall_memory.pose_spread(self.recall, self.cell, memory)
-        place = jnp.int32(-1)  # places are for the map to say: it knows which recollections hold
+        place = jnp.int32(-1)  # the map assigns places, because only it verifies closures
         estimate = Estimate(
             pose=recall_memory.current_pose(memory),
             spread=jnp.stack([sd, sd, sd_heading]),
@@ -168,7 +163,7 @@ class RecallBackend:
             lost=(health < self.config.min_fit_share) | (outcome == Outcome.TOO_FAST),
         )
         evidence = RecallEvidence(
-            **recollection._asdict(),
+            **result._asdict(),
             energy=energy,
             packet=cells.pose,
             window_level=told.level,
@@ -177,8 +172,13 @@ class RecallBackend:
         )
         return RecallState(cells, memory, health), estimate, evidence
 
+    def _health(self, health: Array, agree: Array) -> Array:
+        """The running share of revisits whose view fits, after one more revisit."""
+        updated = health + HEALTH_RATE * (agree.astype(self.dtype) - health)
+        return jnp.where(agree >= 0, updated, health)
+
     def new_map(self) -> KeyframeMap:
-        """An empty frame map."""
+        """An empty keyframe map."""
         guard, closures = self.recall.guard, self.config.experience.closures
         return KeyframeMap(
             self.config.keyframes,
@@ -202,12 +202,12 @@ class RecallBackend:
     def _normalised(self, view: np.ndarray) -> np.ndarray:
         shaped = np.asarray(view.reshape(self.view_shape), self.dtype)
         config = self.config.templates
-        if not (config.normalise_mean or config.patch):  # nothing to do, and JAX would take long about it
+        if not (config.normalise_mean or config.patch):  # nothing to do, and the call to JAX takes long
             return shaped
         return np.asarray(view_templates.normalise(config, jnp.asarray(shaped)))
 
-    def _looks(self, view: Array, observation: Observation) -> Array:
-        """What is compared and remembered of a view: its values, or the levels of its whiskers."""
+    def _features(self, view: Array, observation: Observation) -> Array:
+        """The stored and compared form of a view: its values, or the levels of its whisker pixels."""
         flat = view.reshape(-1)[: self.size]
         if self.pixels is None:
             return flat
@@ -226,11 +226,11 @@ class RecallBackend:
             weighing = view_likelihood(self.recall, self.cell, memory, view)
         return filter.recognise(self.recall, self.cell, memory, weighing)
 
-    def _injection(self, memory: Memory, recollection: RecallResult) -> tuple[Array, Array]:
-        """Where a candidate's packet was, turned as the view is, and energy by its posterior."""
-        known = (recollection.frame >= 0) & (recollection.mass > self.config.keyframes.candidate_posterior)
-        turned = -recollection.shift.astype(self.dtype) * memory.angle / self.units[2]
-        packet = memory.packet[jnp.maximum(recollection.match, 0)]
+    def _injection(self, memory: Memory, result: RecallResult) -> tuple[Array, Array]:
+        """The packet of a candidate turned by its sector shift, and energy proportional to its posterior."""
+        known = (result.frame >= 0) & (result.mass > self.config.keyframes.candidate_posterior)
+        turned = -result.shift.astype(self.dtype) * memory.angle / self.units[2]
+        packet = memory.packet[jnp.maximum(result.match, 0)]
         packet = packet + jnp.stack([jnp.zeros_like(turned), jnp.zeros_like(turned), turned])
-        energy = jnp.where(known, self.recall.energy * recollection.mass, 0.0)
+        energy = jnp.where(known, self.recall.energy * result.mass, 0.0)
         return packet % self.rings, energy

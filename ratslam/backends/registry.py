@@ -78,7 +78,7 @@ BACKENDS: dict[str, BackendEntry] = {
     for entry in (
         BackendEntry("recall", RecallBackendConfig, _recall, RecallEvidence, pose_cells.Outcome),
         BackendEntry("classic", ClassicBackendConfig, _classic, ClassicEvidence, pose_cells.Outcome),
-        BackendEntry("grid", GridBackendConfig, _grid, GridEvidence, grid.Outcome),
+        BackendEntry("grid", GridBackendConfig, _grid, GridEvidence, grid.GridOutcome),
     )
 }
 """Every method that `backend` may name."""

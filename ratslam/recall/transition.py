@@ -43,19 +43,11 @@ def predict(
     anchors = jnp.stack([memory.x[at], memory.y[at], heading], axis=1)
     poses = compose(compose(anchors, memory.offset), jnp.broadcast_to(moved, anchors.shape))
 
-    def landing(pose: Array, sd: Array, sd_heading: Array) -> Array:
-        apart = ((memory.x - pose[0]) ** 2 + (memory.y - pose[1]) ** 2) / sd**2
-        turned = pose[2] - angles
-        facing = jnp.cos(turned)[:, None] * memory.cosine[None] + jnp.sin(turned)[:, None] * memory.sine[None]
-        deviation = apart[None] + (2 / sd_heading**2) * (1 - facing)
-        inside = jnp.maximum(1 - deviation / SUPPORT, 0.0)
-        return jnp.where(cells, inside**2 * inside**2, 0.0)
-
     reach = jnp.asarray(config.reach * cell, dtype), jnp.asarray(config.reach_heading, dtype)
 
     def carry(k: Array, sums: tuple[Array, Array]) -> tuple[Array, Array]:
         belief, novel = sums
-        fall = landing(poses[k], *reach)
+        fall = _overlap(memory, poses[k], angles, cells, *reach)
         total = jnp.sum(fall) + config.miss_weight
         stay = memory.mass[k] * (1 - config.mode_decay)
         belief = belief + (stay / total) * fall
@@ -66,13 +58,23 @@ def predict(
     if config.sector_fov == "whiskers":
         shut = follow_keyframes(config, cell, memory, angles, cells.astype(dtype), moved)
     belief, novel = lax.fori_loop(0, config.modes, carry, shut)
-    near = landing(here, *pose_spread(config, cell, memory))
+    near = _overlap(memory, here, angles, cells, *pose_spread(config, cell, memory))
     total = jnp.sum(near)
     local, everywhere = fresh * config.enter * config.local, fresh * config.enter * (1 - config.local)
     belief = belief + jnp.where(cells, everywhere / jnp.maximum(jnp.sum(cells), 1).astype(dtype), 0.0)
     belief = belief + (local / jnp.maximum(total, 1.0)) * near
     entered = jnp.where(jnp.any(known), everywhere, 0.0) + local * total / jnp.maximum(total, 1.0)
     return belief, novel + fresh - entered
+
+
+def _overlap(memory: Memory, pose: Array, angles: Array, cells: Array, sd: Array, sd_heading: Array) -> Array:
+    """[S, C] alignment kernel between a pose [3] and every keyframe at every shift."""
+    apart = ((memory.x - pose[0]) ** 2 + (memory.y - pose[1]) ** 2) / sd**2
+    turned = pose[2] - angles
+    facing = jnp.cos(turned)[:, None] * memory.cosine[None] + jnp.sin(turned)[:, None] * memory.sine[None]
+    deviation = apart[None] + (2 / sd_heading**2) * (1 - facing)
+    inside = jnp.maximum(1 - deviation / SUPPORT, 0.0)
+    return jnp.where(cells, inside**2 * inside**2, 0.0)
 
 
 def follow_keyframes(

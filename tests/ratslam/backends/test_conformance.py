@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ratslam.backends.config import ClassicBackendConfig, RecallBackendConfig
-from ratslam.backends.grid import GridBackend, Outcome
+from ratslam.backends.grid import GridBackend, GridOutcome
 from ratslam.backends.registry import Sensors, build
 from ratslam.core.session import CHUNK, Session, capacity_at
 from ratslam.core.types import Action
@@ -245,7 +245,7 @@ def test_touch_closes_and_weighs_in_these_walks():
 def test_the_grid_draws_anew_in_these_walks():
     # Else replay and checkpoints would prove little of it.
     outcomes = np.array([step.evidence.outcome for step in replayed(BACKENDS["grid"])[0]])
-    assert 10 < (outcomes == Outcome.RESAMPLED).sum() < 330
+    assert 10 < (outcomes == GridOutcome.RESAMPLED).sum() < 330
 
 
 def test_compiles_once_per_capacity(make):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ratslam.backends.config import GridBackendConfig
-from ratslam.backends.grid import Outcome
+from ratslam.backends.grid import GridOutcome
 from ratslam.backends.registry import Sensors, build
 from ratslam.core.session import Session
 from ratslam.grid import likelihoods, particle_maps
@@ -322,7 +322,7 @@ def test_maps_follow_their_particles():
     )
     after, _, told = drive(CORRIDOR, state, [report(0.02, whiskers=2)])
     ancestor = told.ancestor[0]
-    assert told.outcome[0] == Outcome.RESAMPLED
+    assert told.outcome[0] == GridOutcome.RESAMPLED
     assert 20 < len(np.unique(ancestor)) < 500
     assert np.array_equal(after.maps, state.maps[ancestor])
     assert np.array_equal(after.wall_directions, state.wall_directions[ancestor])
@@ -338,7 +338,12 @@ def test_the_literal_filter_draws_at_every_report_that_tells():
     _, _, told = drive(
         PRINTED, begun(PRINTED), [report(0.02), report(0.02, touching=[1]), report(-0.05), report(turn=0.1)]
     )
-    assert list(told.outcome) == [Outcome.RESAMPLED, Outcome.RESAMPLED, Outcome.OK, Outcome.RESAMPLED]
+    assert list(told.outcome) == [
+        GridOutcome.RESAMPLED,
+        GridOutcome.RESAMPLED,
+        GridOutcome.OK,
+        GridOutcome.RESAMPLED,
+    ]
     assert np.array_equal(told.ancestor[2], np.arange(30))
 
 
@@ -370,10 +375,10 @@ def test_what_is_no_number_is_named_and_left_out(backend, odd):
     start, *_ = drive(backend, begun(backend), [report(0.02)] * 2)
     plain = report(0.02, touching=[0, 1], wall=(0.3, 0.3))
     state, estimate, told = drive(backend, start, [ODD[odd](plain)])
-    assert told.outcome[0] == Outcome.NOT_FINITE
+    assert told.outcome[0] == GridOutcome.NOT_FINITE
     assert finite((state, estimate, told))
     state, estimate, told = drive(backend, state, [plain])
-    assert told.outcome[0] in (Outcome.OK, Outcome.RESAMPLED)
+    assert told.outcome[0] in (GridOutcome.OK, GridOutcome.RESAMPLED)
     assert finite((state, estimate, told))
 
 
@@ -382,7 +387,7 @@ def test_a_robot_may_leave_the_map_as_far_as_it_likes(backend):
     state, estimate, told = drive(backend, begun(backend), [report(9e5, touching=[0])] * 100)
     assert finite((state, estimate, told))
     assert np.asarray(estimate.pose)[-1, 0] > 1e7
-    assert told.outcome[-1] in (Outcome.OUTSIDE, Outcome.OK)
+    assert told.outcome[-1] in (GridOutcome.OUTSIDE, GridOutcome.OK)
     assert not np.any(state.maps[:, 1:])
 
 
@@ -412,7 +417,7 @@ def test_when_all_weights_vanish_they_are_kept(backend, odd):
         particles=start.particles._replace(weight=-0.01 * jnp.arange(30, dtype=backend.dtype))
     )
     state, estimate, told = drive(backend, start, [report(0.02)])
-    assert told.outcome[0] == Outcome.VANISHED
+    assert told.outcome[0] == GridOutcome.VANISHED
     assert estimate.lost[0]
     assert np.array_equal(state.particles.weight, start.particles.weight)
     assert finite((estimate, told))
@@ -423,12 +428,12 @@ def test_contacts_outside_the_map_are_named_and_forgotten(backend):
     rim = standing(begun(backend), [1.15, 0.0, 0.0])
     felt = report(touching=ALL, wall=(0.3, 0.0), motion=MotionKind.FORWARD)
     state, _, told = drive(backend, rim, [felt])
-    assert told.outcome[0] == Outcome.OUTSIDE
+    assert told.outcome[0] == GridOutcome.OUTSIDE
     assert finite((state, told))
     for far in ([3.0, 0.0, 0.0], [-1e3, 1e3, 2.0], [1e9, -1e9, 0.0]):
         away = standing(begun(backend), far)
         state, estimate, told = drive(backend, away, [report(0.02), felt, report(-0.1)])
-        assert told.outcome[1] == Outcome.OUTSIDE
+        assert told.outcome[1] == GridOutcome.OUTSIDE
         assert finite((state, estimate, told))
         assert np.abs(state.maps).max() < 1e-3  # a wall may reach in from outside
 
@@ -474,8 +479,8 @@ def test_contact_in_every_report():
         reports.append(report(0.0 if turn else 0.01, turn, touching=[*touching, k % 4], wall=wall))
     state, estimate, told = drive(SINGLE, begun(SINGLE), reports)
     assert sound(state, estimate, told)
-    assert Outcome.RESAMPLED in told.outcome
-    assert not np.isin(told.outcome, [Outcome.VANISHED, Outcome.NOT_FINITE]).any()
+    assert GridOutcome.RESAMPLED in told.outcome
+    assert not np.isin(told.outcome, [GridOutcome.VANISHED, GridOutcome.NOT_FINITE]).any()
     assert finite(state.wall_directions)
 
 
@@ -501,7 +506,7 @@ def test_a_kidnap_breaks_nothing(backend):
     reports = [*there, report(1.0), *there, report(0.0, 3.0), *there, report(-1.0), *there, report(0.05, 0.1)]
     state, estimate, told = drive(backend, begun(backend), reports)
     assert sound(state, estimate, told)
-    assert not np.isin(told.outcome, [Outcome.VANISHED, Outcome.NOT_FINITE]).any()
+    assert not np.isin(told.outcome, [GridOutcome.VANISHED, GridOutcome.NOT_FINITE]).any()
 
 
 # As a backend
@@ -544,7 +549,7 @@ def test_a_batch_of_seeds_equals_each():
             assert np.array_equal(proofs.ancestor[seed], told.ancestor[k])
             assert proofs.outcome[seed] == told.outcome[k]
         assert np.asarray(together.maps[seed]) == pytest.approx(np.asarray(alone.maps), abs=1e-9)
-        assert Outcome.RESAMPLED in told.outcome
+        assert GridOutcome.RESAMPLED in told.outcome
 
 
 def test_seeds_differ_and_repeat():
