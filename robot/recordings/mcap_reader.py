@@ -56,29 +56,29 @@ class Recording:
         self.path = path
         self.name = path.stem
         self.digest = _digest(path)
-        walk = McapScanner(path)
+        scanner = McapScanner(path)
         columns = array("d")
         events: list[Event] = []
         raw_whiskers = False
-        for entry in walk.entries():
+        for entry in scanner.entries():
             if isinstance(entry.content, Sample):
                 columns.extend(_column(entry.content))
                 raw_whiskers |= not isinstance(entry.content.reading, Observation)
             elif isinstance(entry.content, Event):
                 events.append(entry.content)
-        description = walk.description
-        if description is None or not walk.count:
-            raise _nothing(walk)
+        description = scanner.description
+        if description is None or not scanner.count:
+            raise _nothing(scanner)
         self.events = tuple(events)
         self.view_shape, self.whiskers = description.view_shape, description.whiskers
         self.created_by = description.created_by
         self.info = description.info.model_copy(update={"raw_whiskers": raw_whiskers})
-        self.length = walk.count
-        self.truncated = bool(walk.broken)
+        self.length = scanner.count
+        self.truncated = bool(scanner.broken)
         self.warning = ""
         if self.truncated:
-            self.warning = f"{path}: {self.length} samples are readable, the rest is lost: {walk.broken}"
-        time = self._check(np.frombuffer(columns).reshape(walk.count, -1), limits)
+            self.warning = f"{path}: {self.length} samples are readable, the rest is lost: {scanner.broken}"
+        time = self._check(np.frombuffer(columns).reshape(scanner.count, -1), limits)
         self.rate_hz = rate_of(time) or description.rate_hz
         if self.truncated and warn is not None:
             warn(self.warning)
@@ -86,7 +86,7 @@ class Recording:
     def _check(self, columns: np.ndarray, limits: UnitLimits) -> np.ndarray:
         """Times [N] s of the samples with odometry; raises the errors of all columns."""
         time, motion, truth = columns[:, 0], columns[:, 1:5], columns[:, 5:8]
-        low, high, odd, told = columns[:, 8:].T
+        low, high, odd, has_truth = columns[:, 8:].T
         moved = (motion != 0).any(axis=1)
         moved[0] = True  # the first row sets the clock
 
@@ -96,25 +96,25 @@ class Recording:
         errors = nonfinite_errors(time, "time", place) + clock_errors(time, "time", place, moved)
         errors += nonfinite_errors(motion, "odometry", place) + view_errors(low, high, "view", place)
         errors += nonfinite_errors(odd, "a number in the reading", place) + nonfinite_errors(
-            truth, "truth", place, told > 0
+            truth, "truth", place, has_truth > 0
         )
         back = motion[:, 3] < 0
         if back.any():
             row = int(back.argmax())
             errors.append(InputError(place(row), f"odometry has dt {motion[row, 3]} s", "at least 0 s"))
-        track = MotionTrack(time, moved, motion, truth if told.any() else None)
+        track = MotionTrack(time, moved, motion, truth if has_truth.any() else None)
         raise_errors(errors + unit_errors(track, str(self.path), limits))
         return time[moved]
 
     def __iter__(self) -> Iterator[Sample]:
-        walk = McapScanner(self.path)
-        for sample in walk:
+        scanner = McapScanner(self.path)
+        for sample in scanner:
             yield sample
-            if walk.count == self.length:
+            if scanner.count == self.length:
                 return
         raise InputError(
             str(self.path),
-            f"had {self.length} samples and now has {walk.count}",
+            f"had {self.length} samples and now has {scanner.count}",
             "a file that does not change while it is read",
         )
 
@@ -164,39 +164,39 @@ def recover(path: Path, out: Path) -> Recovery:
     require_file(path)
     if out.exists():
         raise InputError(str(out), "exists already", "a new file", "choose another name or move it")
-    walk = McapScanner(path)
-    entries = walk.entries()
+    scanner = McapScanner(path)
+    entries = scanner.entries()
     first = next(entries, None)
-    if first is None or walk.description is None:
-        raise _nothing(walk)
-    described = walk.description
+    if first is None or scanner.description is None:
+        raise _nothing(scanner)
+    described = scanner.description
 
     def write(path: Path) -> None:
-        tape = McapWriter(path, view_shape=described.view_shape, whiskers=described.whiskers,
+        writer = McapWriter(path, view_shape=described.view_shape, whiskers=described.whiskers,
                     rate_hz=described.rate_hz, info=described.info)  # fmt: skip
-        with closing(tape):
+        with closing(writer):
             for entry in chain([first], entries):
                 if entry.truth is not None:
-                    tape.append(TRUTH, entry.time, entry.truth)
-                tape.append(entry.name, entry.time, entry.message)
-        if not walk.count:
-            raise _nothing(walk)
+                    writer.append(TRUTH, entry.time, entry.truth)
+                writer.append(entry.name, entry.time, entry.message)
+        if not scanner.count:
+            raise _nothing(scanner)
         flush_to_disk(path)
 
     write_atomically(out, write)
-    return Recovery(walk.count, bool(walk.broken), walk.broken)
+    return Recovery(scanner.count, bool(scanner.broken), scanner.broken)
 
 
-def _nothing(walk: McapScanner) -> InputError:
+def _nothing(scanner: McapScanner) -> InputError:
     """The error for a file without a description or without samples."""
-    if walk.description is None:
-        found = f"cannot be read as a recording: {walk.broken or 'it has no ratslam metadata'}"
+    if scanner.description is None:
+        found = f"cannot be read as a recording: {scanner.broken or 'it has no ratslam metadata'}"
         return InputError(
-            str(walk.path), found, "an MCAP file written by this version of ratslam", "record it again"
+            str(scanner.path), found, "an MCAP file written by this version of ratslam", "record it again"
         )
-    found = f"holds no samples{': ' + walk.broken if walk.broken else ''}"
+    found = f"holds no samples{': ' + scanner.broken if scanner.broken else ''}"
     return InputError(
-        str(walk.path), found, "at least one sample", "record it again: nothing can be recovered"
+        str(scanner.path), found, "at least one sample", "record it again: nothing can be recovered"
     )
 
 

@@ -37,7 +37,7 @@ class Recorder:
         chunk_bytes: int = 1 << 16,
         chunk_s: float = 0.5,
     ) -> None:
-        self._tape = McapWriter(
+        self._writer = McapWriter(
             path,
             view_shape=view_shape,
             whiskers=whiskers,
@@ -50,7 +50,7 @@ class Recorder:
     @property
     def count(self) -> int:
         """Samples so far."""
-        return self._tape.count
+        return self._writer.count
 
     def write(self, sample: Sample) -> None:
         """Append a sample.
@@ -61,21 +61,21 @@ class Recorder:
         """
         if not np.isfinite(sample.time):
             raise InputError("time", f"{sample.time}", "a finite number of seconds")
-        described = self._tape.description
+        described = self._writer.description
         name, message = encode(sample, described.view_shape, described.whiskers)
         if (
             sample.truth is not None
         ):  # before its reading, so that no truncated file has a reading without its truth
-            self._tape.append(TRUTH, sample.time, encode_truth(sample.time, sample.truth))
-        self._tape.append(name, sample.time, message)
+            self._writer.append(TRUTH, sample.time, encode_truth(sample.time, sample.truth))
+        self._writer.append(name, sample.time, message)
 
     def flush(self) -> None:
         """Hand all samples so far to the operating system."""
-        self._tape.flush()
+        self._writer.flush()
 
     def close(self) -> None:
         """Finish the file; closing twice is fine."""
-        self._tape.close()
+        self._writer.close()
 
     def __enter__(self) -> Self:
         return self

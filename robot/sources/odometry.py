@@ -89,12 +89,12 @@ def simulate_odometry(
     bent = config.heading_bias * random.standard_normal()
     motion[:, 2] += bent * np.hypot(motion[:, 0], motion[:, 1])
     motion[:, :2] *= scale
-    told = np.zeros((len(time), 4))
-    told[1:, :3] = motion
-    told[1:, [0, 2]] += _errors(config, time, motion, random)
-    told[1:, 2] = wrap(told[1:, 2])
-    told[1:, 3] = np.diff(time)
-    return told
+    measured = np.zeros((len(time), 4))
+    measured[1:, :3] = motion
+    measured[1:, [0, 2]] += _errors(config, time, motion, random)
+    measured[1:, 2] = wrap(measured[1:, 2])
+    measured[1:, 3] = np.diff(time)
+    return measured
 
 
 def _errors(

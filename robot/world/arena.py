@@ -149,13 +149,13 @@ def _parsed(path: File, number: int, content: str) -> _Line | None:
     if word not in LINE_FORMS:
         raise InputError(places[0], f"{word!r}", f"one of {', '.join(LINE_FORMS)}")
     values = []
-    for (told, _), place in zip(words[1:], places[1:], strict=True):
+    for (text, _), place in zip(words[1:], places[1:], strict=True):
         try:
-            value = float(told)
+            value = float(text)
         except ValueError:
             value = np.nan
         if not np.isfinite(value):
-            raise InputError(place, f"{told!r}", "a number", f"`{LINE_FORMS[word]}`")
+            raise InputError(place, f"{text!r}", "a number", f"`{LINE_FORMS[word]}`")
         values.append(value)
     count = len(values)
     wanted = {"square": 4, "start": 3}.get(word)

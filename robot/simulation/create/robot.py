@@ -70,13 +70,13 @@ class CreateRobot:
         none = np.zeros((0, len(free), 2))
         return CreateStep(CreateState.FWD1, StepEnd.FREE, 0.0, pose, free, free.astype(bool), none)
 
-    def step(self, last: CreateStep, state: CreateState, told: WheelCommand) -> CreateStep:
+    def step(self, last: CreateStep, state: CreateState, command: WheelCommand) -> CreateStep:
         """Execute a motion until its planned or early end."""
         config = self.behaviour
-        count = max(int(np.ceil(told.duration / config.period - 1e-9)), 1)
-        time = np.minimum(np.arange(1, count + 1) * config.period, max(told.duration, MIN_DURATION))
-        near = self._near(last.pose, told)
-        poses = drive(told, last.pose, time)
+        count = max(int(np.ceil(command.duration / config.period - 1e-9)), 1)
+        time = np.minimum(np.arange(1, count + 1) * config.period, max(command.duration, MIN_DURATION))
+        near = self._near(last.pose, command)
+        poses = drive(command, last.pose, time)
         bent = bend_whiskers(self.whiskers, poses, near, last.side)
         strain = base_strains(self.sensors, self.whiskers, bent)
         known = monitor_strain(self.sensors, strain, self.whiskers.alive, config.period, self._random)
@@ -89,12 +89,12 @@ class CreateRobot:
             poses[end.row],
             bent.side[end.row],
             np.abs(known[end.row, :, 0]) > config.contact,
-            self._felt(last, near, told, duration if state == CreateState.FWD2 else 0.0),
+            self._sampled_strain(last, near, command, duration if state == CreateState.FWD2 else 0.0),
         )
 
-    def _near(self, pose: np.ndarray, told: WheelCommand) -> np.ndarray:
+    def _near(self, pose: np.ndarray, command: WheelCommand) -> np.ndarray:
         """Walls within reach of whiskers or body during a motion."""
-        room = max(self.whiskers.reach, self.behaviour.body) + abs(told.speed) * told.duration
+        room = max(self.whiskers.reach, self.behaviour.body) + abs(command.speed) * command.duration
         return self.walls[segment_distance(self.walls, pose[:2]) < room]
 
     def _bumps(self, start: np.ndarray, poses: np.ndarray, near: np.ndarray) -> np.ndarray:
@@ -104,10 +104,12 @@ class CreateRobot:
         room = segment_distance(near, np.vstack([start, poses])[:, :2]).min(axis=1)
         return (room[1:] < self.behaviour.body) & (np.diff(room) < 0)
 
-    def _felt(self, last: CreateStep, near: np.ndarray, told: WheelCommand, duration: float) -> np.ndarray:
+    def _sampled_strain(
+        self, last: CreateStep, near: np.ndarray, command: WheelCommand, duration: float
+    ) -> np.ndarray:
         time = np.arange(round(duration * self.sensors.rate)) / self.sensors.rate
         if not len(time):
             return np.zeros((0, len(self.whiskers.base), 2))
-        bent = bend_whiskers(self.whiskers, drive(told, last.pose, time), near, last.side)
+        bent = bend_whiskers(self.whiskers, drive(command, last.pose, time), near, last.side)
         strain = base_strains(self.sensors, self.whiskers, bent)
         return sample_strain(self.sensors, strain, self.whiskers.alive, self._random)

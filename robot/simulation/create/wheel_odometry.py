@@ -32,9 +32,9 @@ def simulate_wheel_odometry(
         motion: [N, 4] true motion. kind: [N] `Motion` of each step.
     """
     count = len(motion)
-    told = np.array(motion, np.float64)
+    measured = np.array(motion, np.float64)
     if config.noise == "none" or not count:
-        return told
+        return measured
     # All are drawn for every kind of noise, so that kinds differ in nothing else.
     white, run = random.standard_normal((count, 2)), random.standard_normal(2)
     if config.noise == "white":
@@ -45,6 +45,6 @@ def simulate_wheel_odometry(
     else:
         error = run + BIAS_WHITE_SHARE * white
     scale = 1 + config.level * error
-    told[:, :2] *= scale[:, :1]
-    told[:, 2] *= scale[:, 1]
-    return told
+    measured[:, :2] *= scale[:, :1]
+    measured[:, 2] *= scale[:, 1]
+    return measured

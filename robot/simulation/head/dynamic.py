@@ -40,17 +40,17 @@ def simulate_dynamic(
     give = np.einsum("itnw,wij,jtnw->tnw", arm, push[:, :3], arm, optimize=True)
     spring = WALL_STIFFNESS * model.unit
     force_per = 1 / (1 / spring + give)
-    heard = sweep.noise[..., 2].swapaxes(0, 1)
+    reading_noise = sweep.noise[..., 2].swapaxes(0, 1)
     slide, hard = sweep.drift / config.rate, stiffness(config.beam.shaft, sweep.reach)
     angle, side, moment = (np.zeros(sweep.wall.shape) for _ in range(3))
 
     size = sweep.wall.shape[1:]
     state = np.zeros((size[1], 8, size[0]))  # for each whisker: six states, command, rate of the command
-    drive, told, aim = initial_drive(*size), np.zeros(size), np.zeros(size)
+    drive, reading, aim = initial_drive(*size), np.zeros(size), np.zeros(size)
     touching, slipped = np.zeros(size, bool), np.zeros(size, bool)
     late, x, before = np.zeros(size), np.zeros(size), np.zeros(size)
     for k, time in enumerate(sweep.time):
-        last, (aim, drive) = aim, whisk_command(whisking, drive, time, told, threshold, head.shape)
+        last, (aim, drive) = aim, whisk_command(whisking, drive, time, reading, threshold, head.shape)
         state[:, 6], state[:, 7] = last.T, (aim - last).T
         state[:, :6] = step @ state
         # A wall that reaches a whisker from the side is touched where the whisker is.
@@ -68,7 +68,7 @@ def simulate_dynamic(
         limit = config.beam.friction * force * place[0] / (hard[k] * model.unit)
         x = np.minimum(np.maximum(x + slide[k], -limit), limit)
         angle[k], side[k], moment[k] = along[:, 0], hard[k] * x, y
-        told = y + heard[k]
+        reading = y + reading_noise[k]
     return angle, side, moment
 
 

@@ -71,8 +71,8 @@ def simulate_kinematic(
 ) -> WhiskColumns:
     """Contact features of whisk cycles that start at times [N] s along a path."""
     met = _met(config, whisking, surroundings, path, start)
-    felt = _pushed(config, whisking, surroundings.head, met)
-    return _sensed(config, whisking, surroundings.head, felt, random)
+    features = _pushed(config, whisking, surroundings.head, met)
+    return _sensed(config, whisking, surroundings.head, features, random)
 
 
 class _Met(NamedTuple):
@@ -162,30 +162,30 @@ def _sensed(
     config: MechanicsConfig,
     whisking: WhiskingConfig,
     head: Head,
-    felt: WhiskColumns,
+    features: WhiskColumns,
     random: np.random.Generator,
 ) -> WhiskColumns:
     """Add noise and faults of the sensors."""
-    shape, alive = felt.contact.shape, head.alive
+    shape, alive = features.contact.shape, head.alive
     missed = random.random(shape) < config.missed
-    spurious = ~felt.contact & (random.random(shape) < config.spurious)
+    spurious = ~features.contact & (random.random(shape) < config.spurious)
     anywhere = random.random(shape) * np.radians(whisking.amplitude_deg)
     noise = (
         config.noise * random.standard_normal((2, *shape)) * np.array([1.0, MEAN_NOISE_SHARE])[:, None, None]
     )
     smeared = config.reach_noise * random.standard_normal(shape)
-    contact = ((felt.contact & ~missed) | spurious) & alive
-    touched = np.where(spurious, anywhere, felt.touched)
-    highest = np.where(spurious, anywhere, felt.highest + noise[1])
+    contact = ((features.contact & ~missed) | spurious) & alive
+    touched = np.where(spurious, anywhere, features.touched)
+    highest = np.where(spurious, anywhere, features.highest + noise[1])
     return WhiskColumns(
         contact=contact,
         touched=np.where(contact, touched + noise[0], 0.0),
-        held=((felt.held & ~missed) | spurious) & alive,
+        held=((features.held & ~missed) | spurious) & alive,
         highest=np.where(alive, highest, 0.0),
-        reach=np.where(contact, np.clip(felt.reach + smeared, 0.0, 1.0), 0.0),
+        reach=np.where(contact, np.clip(features.reach + smeared, 0.0, 1.0), 0.0),
     )
 
 
-def whisk_of_row(head: Head, felt: WhiskColumns, row: int, odometry: Odometry) -> Whisk:
+def whisk_of_row(head: Head, features: WhiskColumns, row: int, odometry: Odometry) -> Whisk:
     """The features of one cycle as a reading."""
-    return Whisk(odometry, head.alive, *(column[row] for column in felt))
+    return Whisk(odometry, head.alive, *(column[row] for column in features))

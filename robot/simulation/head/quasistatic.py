@@ -30,13 +30,13 @@ class WhiskerBalance(NamedTuple):
     """State of whiskers between two samples, [N, W] each.
 
     Attributes:
-        drive: state of the whisking law. told: last reported y, rad. touching, slipped: bool.
+        drive: state of the whisking law. reading: last reported y, rad. touching, slipped: bool.
         late: protraction by which a contact is delayed, rad. side: sideways bend, rad.
         before: protraction at the last sample, rad.
     """
 
     drive: WhiskDrive
-    told: np.ndarray
+    reading: np.ndarray
     touching: np.ndarray
     slipped: np.ndarray
     late: np.ndarray
@@ -64,13 +64,13 @@ def advance_balance(
     """
     hard = stiffness(config.beam.shaft, sweep.reach)
     share = mechanics.servo / (mechanics.servo + hard)
-    heard = sweep.noise[..., 2].swapaxes(0, 1)
+    reading_noise = sweep.noise[..., 2].swapaxes(0, 1)
     slide = sweep.drift / config.rate
     angle, bent, aside = (np.zeros(sweep.wall.shape) for _ in range(3))
 
-    drive, told, touching, slipped, late, side, before = balance
+    drive, reading, touching, slipped, late, side, before = balance
     for k, time in enumerate(sweep.time.tolist()):
-        aim, drive = law(drive, time, told)
+        aim, drive = law(drive, time, reading)
         # A wall that reaches a whisker from the side is touched where the whisker is.
         late = np.where(touching, late, np.maximum(before - sweep.wall[k], 0.0))
         wall = sweep.wall[k] + late
@@ -83,8 +83,8 @@ def advance_balance(
         limit = config.beam.friction * bend
         side = np.minimum(np.maximum(side + slide[k], -limit), limit)
         angle[k], bent[k], aside[k] = before, bend, side
-        told = hard[k] * bend + heard[k]
-    after = WhiskerBalance(drive, told, touching, slipped, late, side, before)
+        reading = hard[k] * bend + reading_noise[k]
+    after = WhiskerBalance(drive, reading, touching, slipped, late, side, before)
     return (angle, hard * aside, hard * bent), after
 
 
@@ -107,6 +107,6 @@ def _law(
     shape: tuple[int, int],
     drive: WhiskDrive,
     time: float,
-    told: np.ndarray,
+    reading: np.ndarray,
 ) -> tuple[np.ndarray, WhiskDrive]:
-    return whisk_command(whisking, drive, time, told, threshold, shape)
+    return whisk_command(whisking, drive, time, reading, threshold, shape)

@@ -67,12 +67,12 @@ def simulate_cycles(
     Args:
         threshold: [W] contact threshold of y from a calibration, rad. odometry: [N, 4] dx, dy, dtheta, dt.
     """
-    told = np.zeros((len(start), 4)) if odometry is None else odometry
+    motion = np.zeros((len(start), 4)) if odometry is None else odometry
     for k in range(0, len(start), config.batch):
         some = slice(k, k + config.batch)
         sweep = _swept(config, mechanics, whisking, surroundings, path, start[some], random)
         yield from _run(
-            tier, config, mechanics, whisking, surroundings.head, sweep, threshold, start[some], told[some]
+            tier, config, mechanics, whisking, surroundings.head, sweep, threshold, start[some], motion[some]
         )
 
 

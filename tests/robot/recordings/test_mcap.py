@@ -487,9 +487,9 @@ def test_a_chunk_that_would_not_fit_into_memory_is_not_opened(
     bad[frame + 4 : frame + 13] = b"\xe0" + struct.pack("<Q", 1 << 60)
     path = tmp_path / "bomb.mcap"
     path.write_bytes(bad)
-    walk = McapScanner(path)
-    assert list(walk) == []
-    assert "a chunk of 1152921504606846976 bytes" in walk.broken
+    scanner = McapScanner(path)
+    assert list(scanner) == []
+    assert "a chunk of 1152921504606846976 bytes" in scanner.broken
 
 
 @given(
@@ -548,10 +548,10 @@ def test_source_info_is_stored_before_the_first_sample(tmp_path: Path) -> None:
     path = write_recording(tmp_path / "a.mcap", some_samples(2))
     content = path.read_bytes()
     path.write_bytes(content[: content.index(b"\x28\xb5\x2f\xfd")])
-    walk = McapScanner(path)
-    assert list(walk) == []
-    assert walk.description is not None
-    assert walk.description.info == INFO
+    scanner = McapScanner(path)
+    assert list(scanner) == []
+    assert scanner.description is not None
+    assert scanner.description.info == INFO
 
 
 def test_a_copy_of_a_recording_keeps_the_source_info(

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from robot.recordings.mcap_reader import Recording, record_source
 from robot.recordings.npz_trace import read_trace
 from robot.sources.source import Source
 from tactile.base.errors import InputError, InputErrors
@@ -82,6 +83,13 @@ def test_two_columns_are_given_ids(stream: Callable[..., Path]) -> None:
     assert [int(sample.reading.label) for sample in samples] == [0, 0, 0, 1, -1, 1, 2, 2, 2, 3, 3, 3]
     assert not any(sample.reading.view_seen for sample in samples)
     assert source.view_shape == (2, 3, 1)
+    assert source.info.labels_only
+
+
+def test_a_recorded_copy_of_labels_still_has_labels_only(stream: Callable[..., Path], tmp_path: Path) -> None:
+    ids = np.column_stack([np.arange(12) // 3, np.zeros(12)])
+    record_source(read_trace(stream(in_view=ids)), tmp_path / "labels.mcap")
+    assert Recording(tmp_path / "labels.mcap").info.labels_only
 
 
 def test_a_template_of_two_pixels_is_no_id(stream: Callable[..., Path]) -> None:
