@@ -75,11 +75,3 @@ def creation_rows(experience: np.ndarray) -> np.ndarray:
     """For each step [N], the first step with the same experience."""
     _, first, code = np.unique(experience, return_index=True, return_inverse=True)
     return first[code]
-
-
-def creation_poses(experience: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """For each step, the true pose [N, 3] when its experience was created.
-
-    What RatSLAM itself perceives when it re-localises: it stores one pose with an experience, once.
-    """
-    return truth[creation_rows(experience)]

@@ -38,9 +38,7 @@ _HOLE = 0.28  # share of the radius without whiskers
 def draw_whiskers(
     run: RunArrays, card: Scorecard, images: WhiskerViews, walls: np.ndarray = NO_WALLS
 ) -> Figure:
-    """Draws strips of whiskers over time, coloured by obstacle height, and some images at their poses.
-
-    An image at its pose is drawn as rings around the head; the pose is the true one, else that in the map.
+    """Draws whiskers over time, coloured by obstacle height, and some images at their poses.
 
     Args:
         card: for the title. images: one for each step of the run.

@@ -52,7 +52,7 @@ def back(grid, mode):
 
 @law
 @given(grids)
-def test_every_cell_is_told_as_what_it_is(grid):
+def test_cells_read_back_as_occupied_free_or_unknown(grid):
     served = back(grid, "trinary")
     p = grid.probability
     assert np.array_equal(served.cell == 100, p > OCCUPIED_THRESH)
@@ -138,7 +138,7 @@ def test_the_usual_threshold_would_turn_unknown_into_free(folder):
         (("trinary", "raw"), [[-1, -1, 0], [-1, -1, 0]]),
     ],
 )
-def test_other_peoples_maps_are_read_by_the_same_rules(folder, change, told):
+def test_maps_of_other_tools_follow_the_same_rules(folder, change, told):
     path = folder / "map.yaml"
     path.write_text(path.read_text().replace(*change))
     assert read_nav2(path).cell.tolist() == told

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evaluation.metrics.experience_log import change_rows, creation_poses
+from evaluation.metrics.experience_log import change_rows
 from evaluation.metrics.experience_metric import (
     EXM_MODES,
     LITERAL_WARNING,
@@ -73,7 +73,7 @@ def test_headings_are_compared_across_half_a_turn(square):
     assert 9 <= np.sum(wrapped.near & ~printed.near & wrapped.counted) <= 27  # half of 36, about
 
 
-def test_literal_reading_says_that_it_is_zero_by_construction(square):
+def test_literal_mode_notes_that_it_is_zero_by_construction(square):
     result = experience_metric(*square(2, 4), ExmConfig(mode="literal"))
     assert (result.arr, result.arcr, result.note) == (1.0, 0.0, LITERAL_WARNING)
 
@@ -145,11 +145,6 @@ def test_a_run_that_never_returns_asks_for_the_base_set(square):
 def test_logs_that_do_not_fit_are_refused(ids, truth, base, message):
     with pytest.raises(InputError, match=message):
         experience_metric(ids, truth, ExmConfig(base=base))
-
-
-def test_creation_poses_are_those_of_the_first_entry():
-    truth = np.arange(12.0).reshape(4, 3)
-    assert np.array_equal(creation_poses(np.array([5, 2, 5, 2]), truth), truth[[0, 1, 0, 1]])
 
 
 def test_changes_pass_over_steps_without_an_experience():

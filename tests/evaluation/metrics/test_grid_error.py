@@ -153,7 +153,7 @@ def test_no_constant_is_better_than_the_best(scene, value, convention):
 
 @law
 @given(scenes(), constants)
-def test_a_constant_tells_nothing(scene, value):
+def test_a_constant_map_has_no_skill(scene, value):
     empty, truth = scene
     score = score_grid(empty._replace(probability=np.full_like(empty.probability, value)), truth)
     found = values(score)
@@ -392,7 +392,7 @@ def test_a_pool_is_the_mean_of_its_trials(scene, several):
         assert value == pytest.approx(np.mean([values(score)[name] for score in scores]))
 
 
-def test_a_pool_says_how_many_have_no_value():
+def test_a_pool_notes_how_many_trials_have_no_value():
     empty, truth = scene()
     pooled = pool_grids([score_grid(grid, truth) for grid in (empty, empty, true_grid(empty, truth))], "some")
     quantity = pooled.quantities["map_chamfer_map"]
@@ -421,7 +421,7 @@ def mapper(name, error, spread=0.001):
 
 
 @pytest.mark.parametrize("order", list(itertools.permutations(("blob", "geometric", "template"))))
-def test_the_table_says_where_the_papers_order_holds(order):
+def test_the_table_notes_where_the_papers_order_holds(order):
     scores = {name: mapper(name, 0.2 - 0.05 * k) for k, name in enumerate(order)}
     text = render_grid_scores([scores[name] for name in ("blob", "geometric", "template")])
     said = [line.strip() for line in text.splitlines() if line.strip().startswith("order")]

@@ -34,7 +34,7 @@ def test_a_perfect_map_has_no_errors_and_odometry_has(circle):
     assert card.quantities["energy_gap"].note == "k = 10; 98 pairs"
 
 
-def test_json_says_null_and_why(circle):
+def test_undefined_values_are_null_with_a_reason(circle):
     card = score_run(circle._replace(truth=None), "no truth")
     again = json.loads(card.model_dump_json())
     assert again["quantities"]["ate_final"]["value"] is None
@@ -77,7 +77,7 @@ def test_a_backend_without_places_has_no_experience_metric(circle):
     assert values(card)["ate_final"] == pytest.approx(0, abs=1e-9)
 
 
-def test_a_run_without_a_loop_says_so(circle):
+def test_a_run_without_a_loop_has_the_reason_as_note(circle):
     half = circle._replace(
         **{
             name: getattr(circle, name)[:30]

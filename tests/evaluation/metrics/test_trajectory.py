@@ -155,7 +155,7 @@ def test_a_tum_rotation_of_length_zero_is_refused(tmp_path):
         read_tum(path)
 
 
-def test_only_the_heading_of_a_rotation_is_kept(tmp_path):
+def test_roll_and_pitch_are_ignored(tmp_path):
     path = tmp_path / "t.tum"
     path.write_text("0 1 2 3 0 0 2 2\n")  # not of length 1 either
     assert read_tum(path)[1] == pytest.approx(np.array([[1, 2, np.pi / 2]]))

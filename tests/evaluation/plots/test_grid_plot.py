@@ -152,7 +152,7 @@ def test_unknown_truth_is_left_out():
     assert mean_position_error(poses + [0.3, 0.4, 9], poses) == pytest.approx(0.5)
 
 
-def test_the_headline_says_what_there_is():
+def test_the_headline_names_the_defined_metrics():
     given = OccupancyGrid(np.full((30, 30), PRIOR_OCCUPANCY), np.array([-0.75, -0.75]), 0.05)
     inside = np.zeros((30, 30), bool)
     inside[3:27, 3:27] = True

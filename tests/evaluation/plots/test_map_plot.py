@@ -69,7 +69,7 @@ def test_a_replayed_session_knows_its_maze_and_images(folder):
         assert (folder / "run" / name).read_bytes() == (folder / "replayed" / name).read_bytes(), name
 
 
-def test_what_is_kept_is_what_was_felt_and_where(folder):
+def test_views_and_walls_are_those_of_the_session(folder):
     config = load_config(folder / "config.yaml")
     source = open_source(config)
     boxes = source.scene.surroundings.walls
@@ -84,13 +84,13 @@ def test_what_is_kept_is_what_was_felt_and_where(folder):
     assert images.length == pytest.approx([0.05, 0.11, 0.16])
 
 
-def test_the_maze_that_was_kept_can_be_run(folder):
+def test_the_stored_maze_can_be_run(folder):
     kept = MazeConfig(file=folder / "run" / "maze.txt")
     config = RunConfig.model_validate({"simulation": {"maze": kept, "path": {"explore": 5}}})
     assert open_source(config).length == 5
 
 
-def test_what_is_kept_is_small(folder):
+def test_stored_views_and_walls_are_small(folder):
     assert sum((folder / "run" / name).stat().st_size for name in KEPT) < 10_000
 
 

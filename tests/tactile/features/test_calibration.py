@@ -131,7 +131,7 @@ def test_broken_time_is_refused() -> None:
     refused([cycles[0]._replace(time=cut[0], angle=cut[1], deflection=cut[2]), *cycles[1:]], "a gap of")
 
 
-def test_it_survives_being_kept() -> None:
+def test_arrays_read_back_equal() -> None:
     found = calibrate(CONFIG, record())
     again = calibration_from_arrays(calibration_arrays(found))
     for name, value in found._asdict().items():

@@ -115,7 +115,7 @@ def test_offsets_of_the_sensors_are_taken_off() -> None:
         np.testing.assert_allclose(a, b, atol=1e-9)
 
 
-def test_whiskers_that_do_not_report_say_nothing_and_disturb_nobody() -> None:
+def test_dead_whiskers_have_no_contacts_and_do_not_affect_others() -> None:
     plain = detect_contacts(CONFIG, known(), whisk(WALLS))
     cycle = whisk(WALLS)
     cycle.angle[3, 2], cycle.deflection[700, 5, 0] = np.nan, np.inf

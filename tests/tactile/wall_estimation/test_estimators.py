@@ -134,7 +134,7 @@ def test_the_line_is_along_a_wall_that_two_whiskers_meet(angle: float) -> None:
     assert apart(geometric_wall(POINTS, two).direction, np.radians(angle)) < 6
 
 
-def test_the_winner_is_told_through_the_first_contact(templates: StrainTemplates) -> None:
+def test_the_matched_wall_passes_through_the_first_contact(templates: StrainTemplates) -> None:
     for angle in np.radians([30.0, 60.0, 90.0, 150.0]):
         there = meeting(wall(angle))
         match = match_template(templates, there.strain)

@@ -55,7 +55,7 @@ def is_blind(seen: Observation) -> bool:
 
 
 @given(st.lists(st.booleans(), min_size=4, max_size=4), st.lists(st.booleans(), min_size=4, max_size=4))
-def test_contacts_are_told_where_whiskers_touch(contact: list[bool], alive: list[bool]) -> None:
+def test_contacts_have_their_contact_points(contact: list[bool], alive: list[bool]) -> None:
     reporting = ReportFrontend(ReportFrontendConfig(walls="none"))
     step = report(StepEnd.HIT1)._replace(contact=np.array(contact), alive=np.array(alive))
     (seen,) = told(reporting, step)
@@ -73,7 +73,7 @@ def test_contacts_are_told_where_whiskers_touch(contact: list[bool], alive: list
 
 
 @pytest.mark.parametrize("motion", [MotionKind.FORWARD, MotionKind.TURN, MotionKind.OTHER])
-def test_every_step_is_told_with_its_motion(motion: MotionKind) -> None:
+def test_every_observation_has_the_motion_of_its_step(motion: MotionKind) -> None:
     odometry = Odometry(0.01, 0.02, 0.3, 0.5)
     (seen,) = told(
         ReportFrontend(ReportFrontendConfig()), report(motion=motion, contact=(2,), odometry=odometry)
@@ -83,7 +83,7 @@ def test_every_step_is_told_with_its_motion(motion: MotionKind) -> None:
     assert seen.contact[2]
 
 
-def test_back_tells_of_its_motion_alone() -> None:
+def test_a_back_step_gives_its_motion_only() -> None:
     back = report(motion=MotionKind.BACK, contact=(0, 1), odometry=Odometry(-0.025, 0, 0, 0.5))
     (seen,) = told(ReportFrontend(ReportFrontendConfig()), back)
     assert is_blind(seen)
@@ -113,7 +113,7 @@ def test_folding_back_loses_no_motion(steps: list[tuple[float, float, float, boo
 
 
 @pytest.mark.parametrize(("walls", "within"), [("fused", 1.5), ("template", 0.1)])
-def test_walls_are_told_at_the_end_of_the_slow_drive(
+def test_walls_are_estimated_at_the_end_of_the_slow_drive(
     walls: str, within: float, templates: StrainTemplates
 ) -> None:
     reporting = ReportFrontend(ReportFrontendConfig(walls=walls), templates)  # type: ignore[arg-type]
@@ -140,7 +140,7 @@ def test_two_contacts_make_the_line_where_there_are_no_templates() -> None:
         assert not told(other, hit, slow._replace(moment=int(StepEnd.ABORT)))[1].wall
 
 
-def test_none_tells_of_no_wall(templates: StrainTemplates) -> None:
+def test_walls_none_estimates_no_wall(templates: StrainTemplates) -> None:
     for seen in told(ReportFrontend(ReportFrontendConfig(walls="none"), templates), *met(wall(ANGLE))):
         assert not seen.wall
 
@@ -158,7 +158,7 @@ def test_a_slow_drive_in_pieces_is_the_same(templates: StrainTemplates) -> None:
     np.testing.assert_allclose(parts[-1].wall_point, whole.wall_point, atol=1e-9)
 
 
-def test_only_what_follows_a_hit_tells_of_a_wall(templates: StrainTemplates) -> None:
+def test_a_wall_needs_a_hit_before(templates: StrainTemplates) -> None:
     reporting = ReportFrontend(ReportFrontendConfig(), templates)
     hit, slow = met(wall(ANGLE))
     free, turn = report(), report(motion=MotionKind.TURN)
@@ -172,7 +172,7 @@ def test_only_what_follows_a_hit_tells_of_a_wall(templates: StrainTemplates) -> 
     np.testing.assert_array_equal(again.wall_point, told(reporting, hit, slow)[-1].wall_point)
 
 
-def test_whiskers_without_values_disturb_nobody(templates: StrainTemplates) -> None:
+def test_whiskers_with_nan_do_not_affect_others(templates: StrainTemplates) -> None:
     hit, slow = met(wall(ANGLE))
     broken = slow.strain.copy()
     broken[100, 0], broken[200, 1] = np.nan, np.inf

@@ -114,7 +114,7 @@ def test_whiskers_that_do_not_report_are_left_out(templates: StrainTemplates) ->
         match_template(templates, read, np.zeros(4, bool))
 
 
-def test_a_file_gives_back_what_was_kept(templates: StrainTemplates, tmp_path: Path) -> None:
+def test_templates_read_back_equal(templates: StrainTemplates, tmp_path: Path) -> None:
     path = tmp_path / "templates.npz"
     write_templates(templates, path)
     again = read_templates(path)
