@@ -26,16 +26,16 @@ DATA = {128: 0, 131: 0, 132: 0, 145: 4}  # bytes after an opcode; a query's foll
 
 
 class CreateEmulatorConfig(Settings):
-    """What is not as in the book."""
+    """Settings of an emulated Create."""
 
     wheel_base: float = WHEEL_BASE
-    """Between the wheels, m."""
+    """Distance between the wheels, m."""
     seed: int = 0
-    """Of the garbage."""
+    """Random seed of the garbage bytes."""
 
 
 class WheelState(NamedTuple):
-    """Where the robot is, m and rad, and what its wheels have done: the way ahead, m, and the turn, rad."""
+    """Pose of the robot, m and rad, and its total path, m, and turn, rad."""
 
     x: float = 0.0
     y: float = 0.0
@@ -44,7 +44,7 @@ class WheelState(NamedTuple):
     turned: float = 0.0
 
     def advance(self, right: float, left: float, wheel_base: float, seconds: float) -> WheelState:
-        """After wheels of these speeds, m/s: an arc."""
+        """The state after an arc at these wheel speeds, m/s."""
         way, turn = (right + left) / 2 * seconds, (right - left) / wheel_base * seconds
         half = turn / 2
         chord = way * (math.sin(half) / half if half else 1.0)
@@ -59,7 +59,7 @@ class WheelState(NamedTuple):
 
 
 class EmulatedCreate:
-    """The robot behind its line, in a time of its own: bytes in, bytes out."""
+    """The robot without its serial line or a clock: bytes in, bytes out."""
 
     def __init__(self, config: CreateEmulatorConfig) -> None:
         self.config = config
@@ -72,18 +72,18 @@ class EmulatedCreate:
         self._begun = b""  # a command that is not whole yet
 
     def advance(self, seconds: float) -> None:
-        """Time goes by."""
+        """Advances time."""
         self.base = self.base.advance(self.right / 1000, self.left / 1000, self.config.wheel_base, seconds)
         self.time += seconds
 
     def touch(self, bumps: Bumps, *, cliff: bool = False) -> None:
-        """Its bumper and wheels are as told. In safe mode a drop or a cliff stops it, a bump does not."""
+        """Sets bumper and wheel drops. In safe mode a drop or a cliff stops the robot, a bump does not."""
         self.bumps = bumps
         if self.mode == Mode.SAFE and (cliff or bumps & Bumps.DROPPED):
             self.mode, self.right, self.left = Mode.PASSIVE, 0, 0
 
     def receive(self, data: bytes) -> list[bytes]:
-        """The replies to what came, one for each query."""
+        """Takes bytes; returns the replies, one for each query."""
         self._begun += data
         replies = []
         while self._begun:
@@ -130,7 +130,7 @@ class EmulatedCreate:
 
 
 class LineFaults:
-    """What the line does to replies."""
+    """Faults of the serial line."""
 
     def __init__(self, seed: int) -> None:
         self._random = stream(seed, "create garbage")
@@ -148,12 +148,12 @@ class LineFaults:
         return before + reply
 
     def noise(self, reply: bytes) -> bytes:
-        """What a line of another speed makes of it."""
+        """The reply as received at another baud rate."""
         return self._random.bytes(len(reply))
 
 
 class Terminal:
-    """A pseudo-terminal, of which the program at the other end sees a serial port."""
+    """A pseudo-terminal that looks like a serial port to the program at its other end."""
 
     def __init__(self) -> None:
         try:
@@ -168,11 +168,11 @@ class Terminal:
         self.plugged = True
 
     def in_tune(self) -> bool:
-        """Whether the program at the other end has set the Create's speed."""
+        """Whether the program at the other end has set the Create's baud rate."""
         return bool(self._termios.tcgetattr(self._slave)[5] == getattr(self._termios, f"B{BAUD}"))
 
     def unplug(self) -> None:
-        """As if the cable were pulled."""
+        """Pulls the cable."""
         if self.plugged:
             self.plugged = False
             os.close(self.master)
@@ -182,7 +182,7 @@ class Terminal:
 def handle_request(
     order: dict[str, Any], robot: EmulatedCreate, faults: LineFaults, terminal: Terminal
 ) -> dict[str, Any]:
-    """Does what a line on standard input says, and answers."""
+    """Executes a request from standard input; returns the answer."""
     do = order.get("do")
     if do == "bump":
         robot.touch(robot.bumps | Bumps.BUMPED)
@@ -225,7 +225,7 @@ def _answer(line: bytes, *of: Any) -> dict[str, Any]:
 
 
 def serve(config: CreateEmulatorConfig) -> None:
-    """Serves until it is killed."""
+    """Serves until the process ends."""
     robot, faults, terminal = EmulatedCreate(config), LineFaults(config.seed), Terminal()
     print(terminal.path, flush=True)
     out: list[tuple[float, bytes]] = []  # when each piece is due

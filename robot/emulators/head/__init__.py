@@ -1,4 +1,4 @@
-"""A whisker head that is not there: a process that moves its whiskers in a maze and answers as USB would."""
+"""An emulated whisker head: moves whiskers in a maze and answers as over USB."""
 
 from robot.emulators.head.config import HeadEmulatorConfig
 from robot.emulators.head.server import serve

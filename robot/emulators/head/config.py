@@ -1,4 +1,4 @@
-"""What an emulated head is made from."""
+"""Settings of an emulated head."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from tactile.base.config import Settings
 from tactile.whiskers.head_geometry import HeadConfig
 
 CONTROL_PORT = 30099
-"""Where faults are asked for."""
+"""Port for fault requests."""
 
 
 class HeadEmulatorConfig(Settings):
-    """A head that is not there, in a maze that is not there."""
+    """An emulated head in a simulated maze."""
 
     host: str = "127.0.0.1"
     """Address to listen at."""
     port: Annotated[int, Field(ge=0, le=65535)] = PORT
-    """Of what stands for its USB."""
+    """Port of the emulated USB."""
     control_port: Annotated[int, Field(ge=0, le=65535)] = CONTROL_PORT
-    """Of the faults."""
+    """Port for fault requests."""
     head: HeadConfig = HeadConfig()
     """The whiskers."""
     mechanics: MechanicsConfig = MechanicsConfig()
@@ -35,30 +35,29 @@ class HeadEmulatorConfig(Settings):
     stream: StreamConfig = StreamConfig()
     """Sample rate, saturation, shafts."""
     maze: MazeConfig = MazeConfig()
-    """What there is to touch."""
+    """The maze."""
     path: PathConfig = PathConfig()
-    """The way that the maze is made for; the head's own where it follows."""
+    """The path for which the maze is made; the head moves along it with `follow`."""
     motion: MotionConfig = MotionConfig()
-    """How it would go along it."""
+    """Speeds along the path."""
     seed: NonNegativeInt = 0
-    """Of the maze, the way and the sensors' noise, by the streams of the simulator."""
+    """Random seed of maze, path and sensor noise, with the streams of the simulator."""
     arm: str | None = None
-    """Host of the controller whose arm carries the head; until it tells where the tool is, whiskers are in
-    free air."""
+    """Host of the controller whose arm carries the head; before its first state, whiskers are in free air."""
     arm_hz: PositiveInt = 125
-    """Of the arm's states."""
+    """Rate of the arm's states, Hz."""
     placing: BaseTransformConfig = BaseTransformConfig()
-    """Where the map lies in the arm's base."""
+    """Pose of the map in the arm's base frame."""
     follow: bool = False
-    """Without an arm: whether the head goes along the way from its first START on; else it stays where that
-    begins."""
+    """Without an arm: whether the head moves along the path from its first START on, or stays at its start.
+    """
     drift_ppm: Annotated[float, Field(ge=-1000, le=1000)] = 0.0
-    """By how much its clock is fast."""
+    """Drift of its clock, ppm; positive is fast."""
     age: Annotated[float, Field(ge=0)] = 0.0
-    """For how long it has had power when it begins, s of its clock; 4294.967 s on, times wrap, and at 2 kHz
-    numbers of samples 2147483.6 s on."""
+    """Time since power-on at the start, s of its clock. Times wrap at 4294.967 s, sample numbers (at 2 kHz)
+    at 2147483.6 s."""
     fifo: PositiveInt = 4096
-    """Frames it holds for a host that does not read."""
+    """Capacity of the frame queue."""
 
     @model_validator(mode="after")
     def _one_leads(self) -> HeadEmulatorConfig:

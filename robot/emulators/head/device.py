@@ -1,6 +1,6 @@
-"""An emulated head as its host knows it: transfers in and out, and frames as time goes on.
+"""An emulated head as seen by its host: transfers, and frames over time.
 
-Nothing here waits or reads a clock: who serves it tells the time.
+Nothing here waits or reads a clock: times are passed in.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from tactile.base.random_streams import stream
 from tactile.whiskers.head_geometry import ur10_head
 
 BLOCK = 0.01
-"""s of samples that are made, and become readable, together."""
+"""Samples are made and sent in blocks of this duration, s."""
 STRING, CONFIGURE, CONFIGURED, ALTERNATE = (0x80, 6), (0x00, 9), (0x80, 8), (0x01, 11)
-"""Standard requests that it answers, by bmRequestType and bRequest."""
+"""Supported standard requests, by bmRequestType and bRequest."""
 
 
 class EmulatedHead:
-    """A head with power.
+    """A powered head.
 
     Args:
         walls: around it. place: where it is. now: s, host's monotonic clock, when its clock begins.
@@ -73,11 +73,11 @@ class EmulatedHead:
 
     @property
     def due(self) -> float:
-        """When the next block is complete, s."""
+        """Time at which the next block is complete, s."""
         return self._when(self._made + self.samples)
 
     def advance(self, now: float) -> bool:
-        """Makes the next block, if it is complete by now; whether it was."""
+        """Makes the next block if it is complete by now; whether it was."""
         end = self.due
         if now < end:
             return False
@@ -91,7 +91,7 @@ class EmulatedHead:
         return True
 
     def bulk_in(self, size: int, now: float) -> bytes:
-        """So many bytes of frames, or what there is.
+        """Reads at most `size` bytes of frames.
 
         Raises:
             OSError: as the transfer ends.
@@ -99,7 +99,7 @@ class EmulatedHead:
         return self.fifo.take(size) if self.faults.check_in(now) else b""
 
     def bulk_out(self, packet: bytes, now: float) -> None:
-        """Takes a command; one that is none of ours is ignored."""
+        """Takes a command; an invalid one is ignored."""
         command = unpack_command(packet)
         if command is None:
             self.received[""] += 1
@@ -128,7 +128,7 @@ class EmulatedHead:
         return answer[:size]
 
     def do(self, asked: dict[str, Any], now: float) -> dict[str, Any]:
-        """Begins a fault, or tells of the head: {"do": its name, ...}.
+        """Starts a fault, or returns counts or state: {"do": name, ...}.
 
         Raises:
             ValueError, TypeError: what is asked for cannot be done.
@@ -145,7 +145,7 @@ class EmulatedHead:
         return {"ok": True}
 
     def halt(self) -> None:
-        """Retracts, makes no more frames and forgets those that nobody read."""
+        """Retracts, stops making frames and drops those not read."""
         self.streaming = False
         self.whiskers.drives.stop()
         self.fifo.clear()
@@ -163,7 +163,7 @@ class EmulatedHead:
         }
 
     def state(self, now: float) -> dict[str, Any]:
-        """Where it is and what it does, as JSON can hold it."""
+        """Pose and activity, as JSON values."""
         drives, whisk = self.whiskers.drives, self.whiskers.drives.whisk
         pose, lift = self.place.at(now)
         doing = {} if whisk is None else whisk.whisking.model_dump() | {"amplitude": whisk.amplitude.tolist()}
@@ -220,10 +220,10 @@ class EmulatedHead:
         self.fifo.push(self.faults.damage_frames(frames))
 
     def _clock(self, now: float) -> int:
-        """us since it has power, by itself."""
+        """Time since power-on by its own clock, us."""
         seconds = self.config.age + (now - self.began) * self._pace
         return max(round(seconds * 1e6) + self.faults.jump, 0)
 
     def _when(self, sample: int) -> float:
-        """Host's time of a sample, s."""
+        """Host time of a sample, s."""
         return self.began + sample / (self.config.stream.rate * self._pace)

@@ -1,4 +1,4 @@
-"""What can go wrong with a head, on demand."""
+"""Faults of an emulated head, on request."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import numpy as np
 from robot.drivers.head.protocol import to_counts
 
 HEADER = 20 - 4
-"""Bytes of a frame before its values."""
+"""Length of a frame before its values, bytes."""
 
 
 class HeadFaults:
-    """Faults that are under way; times are the host's monotonic clock, s.
+    """Active faults; times are the host's monotonic clock, s.
 
     Attributes:
         plugged: whether the head is on the bus. plugs: how often it was plugged in; whoever opened it before
@@ -43,10 +43,10 @@ class HeadFaults:
             "saturate": self._saturate,
             "die": lambda now: os._exit(1),
         }
-        """By their names; each takes the time and what it is told."""
+        """Faults by name; each takes the time and its arguments."""
 
     def do(self, name: str, now: float, told: dict[str, Any]) -> None:
-        """Begins a fault.
+        """Starts a fault.
 
         Raises:
             ValueError, TypeError: it is not known, or is not told what it takes.
@@ -56,7 +56,7 @@ class HeadFaults:
         self.known[name](now, **told)
 
     def check_in(self, now: float) -> bool:
-        """Whether the endpoint of frames gives any.
+        """Whether the endpoint of frames returns data.
 
         Raises:
             OSError: EPIPE while it is halted.
@@ -67,11 +67,11 @@ class HeadFaults:
         return now >= self._silent_until
 
     def clear_halt(self) -> None:
-        """As the host asks; while the cause lasts, it halts again."""
+        """Clears the halt; it returns while its cause lasts."""
         self._halted = False
 
     def saturate_values(self, values: np.ndarray, full_scale: float, now: float) -> np.ndarray:
-        """[T, W, 3] counts, with whiskers that are pressed to their ends."""
+        """Values [T, W, 3] with saturated whiskers."""
         for whisker, until in list(self._saturated.items()):
             if now < until:
                 values[:, whisker, 1:] = to_counts(np.array(full_scale))
@@ -80,14 +80,14 @@ class HeadFaults:
         return values
 
     def count_kept(self, count: int) -> int:
-        """How many of the next frames, from the last one backwards, are not left out."""
+        """How many of the next frames, counted from the last, are not skipped."""
         out = min(self._skip, count)
         self._skip -= out
         self.skipped += out
         return count - out
 
     def damage_frames(self, frames: list[bytes]) -> list[bytes]:
-        """The frames as they go out: their number stays."""
+        """The frames with damage; their numbers stay."""
         for k in range(min(self._corrupt, len(frames))):
             place = HEADER + int(self._random.integers(len(frames[k]) - HEADER))
             frames[k] = frames[k][:place] + bytes([frames[k][place] ^ 0x55]) + frames[k][place + 1 :]

@@ -1,4 +1,4 @@
-"""Frames that wait to be read, with exact numbers of those that never were."""
+"""Queue of frames, with exact counts of those lost."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 
 class Fifo:
-    """As many frames as fit; those made while it is full are lost.
+    """A bounded queue; frames made while it is full are lost.
 
     Attributes:
         made, sent, lost, dropped: frames ever given to it, read from it whole, lost because it was full, and
@@ -23,16 +23,16 @@ class Fifo:
         self._begun = b""  # the rest of a frame of which a part was read
 
     def __len__(self) -> int:
-        """Frames in it."""
+        """Number of frames in the queue."""
         return len(self._frames) + bool(self._begun)
 
     @property
     def room(self) -> int:
-        """Frames that still fit."""
+        """Number of frames that still fit."""
         return self.capacity - len(self)
 
     def push(self, frames: Sequence[bytes]) -> None:
-        """Takes in what fits, of the first ones."""
+        """Adds the first frames that fit."""
         fits = frames[: self.room]
         self._frames.extend(fits)
         self.made += len(frames)
@@ -40,7 +40,7 @@ class Fifo:
         self.overran = len(fits) < len(frames)
 
     def take(self, size: int) -> bytes:
-        """So many bytes, or what there is."""
+        """At most `size` bytes."""
         parts, left = [], size
         while left and (self._begun or self._frames):
             frame = self._begun or self._frames.popleft()
@@ -51,7 +51,7 @@ class Fifo:
         return b"".join(parts)
 
     def clear(self) -> None:
-        """Throws all of it away."""
+        """Drops all frames."""
         self.dropped += len(self)
         self._frames.clear()
         self._begun, self.overran = b"", False

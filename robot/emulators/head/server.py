@@ -1,7 +1,7 @@
-"""The process of an emulated head: its samples in real time, its USB and its faults on sockets.
+"""The process of an emulated head: samples in real time; USB and faults on sockets.
 
-One thread does all of it in turn, so nothing has to be locked. Deadlines are absolute: after a delay the
-blocks that are due are made one after another, with transfers served between them.
+A single thread, so no locks are needed. Deadlines are absolute: after a delay all blocks that are due are
+made, with transfers served in between.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from tactile.whiskers.head_geometry import ur10_head
 
 Client = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 ENDS = (ConnectionError, asyncio.IncompleteReadError, asyncio.CancelledError)
-"""How a connection ends."""
+"""Exceptions that end a connection."""
 
 
 def serve(config: HeadEmulatorConfig) -> None:
@@ -68,7 +68,7 @@ async def _run_server(config: HeadEmulatorConfig, bridge: EmulatedHead) -> None:
 
 
 def _ignore_disconnects(client: Client) -> Client:
-    """A client whose end is no error, nor that of the server."""
+    """Wraps a client handler so that its end is not an error."""
 
     async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         with contextlib.suppress(*ENDS):
@@ -79,7 +79,7 @@ def _ignore_disconnects(client: Client) -> Client:
 
 
 class HeadServer:
-    """What clients say to a bridge."""
+    """Connections of clients to the emulated head."""
 
     def __init__(self, bridge: EmulatedHead) -> None:
         self.bridge = bridge
@@ -115,7 +115,7 @@ class HeadServer:
             self._release(writer)
 
     async def faults(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """A line of JSON is answered by a line of JSON."""
+        """Answers each line of JSON by a line of JSON."""
         while line := await reader.readline():
             try:
                 answer = self.bridge.do(dict(json.loads(line)), time.monotonic())
@@ -153,7 +153,7 @@ class HeadServer:
         return b""
 
     async def _frames(self, size: int, timeout: int, plugs: int) -> bytes:
-        """What there is, as soon as there is any.
+        """Frames, as soon as there are any.
 
         Args:
             timeout: ms, 0 for none.
@@ -179,7 +179,7 @@ class HeadServer:
             self._owner = None
 
     def _tell(self) -> None:
-        """Wakes those who wait for frames."""
+        """Wakes connections that wait for frames."""
         self._changed.set()
         self._changed.clear()
 

@@ -1,6 +1,6 @@
-"""What the drives of an emulated head do with commands: whisk, rest, and retract when nobody commands.
+"""Drives of an emulated head: whisk, rest, and retract without commands.
 
-Whisks begin with a block of samples or where the one before ends, and are told apart by their first sample.
+A whisk starts with a block of samples or at the end of the one before.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from tactile.whiskers.head_geometry import Head
 from tactile.whiskers.whisking import WhiskDrive, WhiskingConfig, whisk_command, whisk_phase
 
 RETRACTION = 0.2
-"""s that whiskers take to go back to rest."""
+"""Duration of the retraction, s."""
 
 
 class WhiskCommand(NamedTuple):
-    """A whisk that was commanded.
+    """A commanded whisk.
 
     Attributes:
         whisking: the law. samples: of a cycle. offset: rad; the drives can reach it and the
@@ -44,7 +44,7 @@ class WhiskCommand(NamedTuple):
 
 
 class ServoDrives:
-    """The drives of one head; a sample after the other.
+    """The drives of one head, sample by sample.
 
     Attributes:
         whisk: what they do now; None while they rest or retract. sample: of the cycle, that comes next.
@@ -61,12 +61,12 @@ class ServoDrives:
 
     @property
     def resting(self) -> bool:
-        """Whether they stand at rest, and will until a command comes."""
+        """Whether they are at rest, with no command pending."""
         return self.whisk is None and self._next is None and self._from is None
 
     @property
     def left(self) -> int | None:
-        """Samples until something else begins; None while that is not known."""
+        """Samples until the next change; None while unknown."""
         if self.whisk is not None:
             return self.whisk.samples - self.sample
         return None if self._from is None else self._retraction - self.sample
@@ -76,7 +76,7 @@ class ServoDrives:
         return round(RETRACTION * self.rate)
 
     def receive(self, told: Command, time: float) -> None:
-        """Takes a command that came at a time (s, of the clock that `begin` is told)."""
+        """Takes a command received at a time (s, of the clock passed to `begin`)."""
         self._heard = time
         if told.kind == CommandKind.DRIVE:
             self._next = self._made(told) or self._next
@@ -92,7 +92,7 @@ class ServoDrives:
             self.whisk = self.whisk._replace(amplitude=np.clip(told.numbers * ANGLE, 0.0, most))
 
     def stop(self) -> None:
-        """Retracts, whatever it heard before."""
+        """Retracts, whatever was commanded before."""
         self._stopped, self._next = True, None
 
     def begin(self, time: float, balance: WhiskerBalance) -> WhiskerBalance:
@@ -138,7 +138,7 @@ class ServoDrives:
         return aim + whisk.offset if whisk.offset else aim, drive
 
     def _made(self, told: Command) -> WhiskCommand | None:
-        """The whisk that a command asks for; None, to go on as before, if no drive could do it."""
+        """The whisk that a command requests; None, to continue as before, beyond the limits of the drives."""
         threshold = np.full(len(self._centre), np.inf)
         numbers = told.numbers[: len(threshold)]
         threshold[: len(numbers)] = np.where(numbers == NO_THRESHOLD, np.inf, numbers * ANGLE)

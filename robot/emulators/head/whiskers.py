@@ -16,7 +16,7 @@ from robot.world.walls import NO_CONTACT, Surroundings, Walls
 from tactile.whiskers.head_geometry import Head
 
 STEP = 1e-4
-"""Lifts are told apart by so much, m; an arm at working height is within it."""
+"""Resolution of lifts, m; an arm at working height stays within it."""
 
 
 class Block(NamedTuple):
@@ -34,7 +34,7 @@ class Block(NamedTuple):
 
 
 class Whiskers:
-    """They remember where they are from block to block, and the walls around them.
+    """Whiskers with their state from block to block, and the walls around them.
 
     Attributes:
         drives: which take commands. pose, lift: where the head was at the end of the last block.
@@ -58,11 +58,11 @@ class Whiskers:
         self.lift = np.inf
         self._around: Surroundings | None = None
         self._lowered = np.inf
-        # Above this, no tip comes down to the tallest wall.
+        # Above this lift no tip reaches the tallest wall.
         self._clear = float(walls.height.max() + (head.length - head.base[:, 2]).max())
 
     def skip_block(self) -> None:
-        """A block passes in which nobody looks and nothing moves."""
+        """Skips a block without samples or motion."""
         self.pose = None
 
     def block(self, start: float, end: float) -> Block:
@@ -81,7 +81,7 @@ class Whiskers:
             first, left = self.drives.sample, self.drives.left
             begins[done] = self.drives.whisk is not None and first == 0
             count = size - done if left is None else min(size - done, left)
-            # Time counts from where the whisk began, which may be within the block.
+            # Time counts from the start of the whisk, which may be within the block.
             knots = np.array([first - done, first - done + size]) / rate
             time = (first + np.arange(count)) / rate
             sweep = self._sweep(pose, knots, time, noise[:, done : done + count])
@@ -101,7 +101,7 @@ class Whiskers:
         return WallSweep(time, nothing + NO_CONTACT, nothing + 1.0, nothing, noise)
 
     def _surroundings(self) -> Surroundings:
-        """The walls as a head sees them that is lifted: so much lower."""
+        """The walls as seen by a lifted head: lower by the lift."""
         lift = STEP * round(self.lift / STEP)
         if self._around is None or lift != self._lowered:
             lower = self.walls._replace(height=self.walls.height - lift)

@@ -20,9 +20,10 @@ from robot.drivers.head.usb_tcp_protocol import PORT, Op, UsbConnection
 from robot.emulators.umock.usbfs import REAP, REAP_NOW, Usbfs
 
 LOOK = 20
-"""ms between looks at whether the head is plugged in."""
+"""Period of the check whether the head is plugged in, ms."""
 PATIENCE = 0.002
-"""s that a reap waits: libusb, which takes the node for readable at any time, would else never rest."""
+"""Time that a reap waits, s: libusb takes the node as readable at any time and would otherwise never pause.
+"""
 
 
 class Bus:
@@ -36,7 +37,7 @@ class Bus:
         self._path = ""
 
     def look(self) -> bool:
-        """Brings the bus up to date; True, to be called again."""
+        """Updates the bus; True, to be called again."""
         if self._node is not None and not self._node.present():
             self._remove()
         if self._node is None and (described := self._described()):
@@ -97,7 +98,7 @@ def _name(number: int) -> str:
 
 
 def _description(number: int, described: bytes) -> str:
-    """A device as umockdev reads it."""
+    """Description of a device for umockdev."""
     vendor, product = (int.from_bytes(described[k : k + 2], "little") for k in (8, 10))
     return "\n".join(
         [

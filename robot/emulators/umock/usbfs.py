@@ -17,19 +17,19 @@ from robot.drivers.head.usb_tcp_protocol import IN, Op, UsbConnection
 
 SETINTERFACE, SETCONFIGURATION, GETDRIVER, SUBMIT, DISCARD, REAP, REAP_NOW = 4, 5, 8, 10, 11, 12, 13
 CLAIM, RELEASE, RESET, CLEAR, CAPABILITIES, CLAIM_AWAY, SPEED = 15, 16, 20, 21, 26, 27, 31
-"""The ioctls' numbers, without their sizes."""
+"""Numbers of the ioctls, without their sizes."""
 URB = struct.Struct("<BBxxiI4xQiiiiiIQ")
 """type, endpoint, status, flags, buffer, its length, actual length, ..."""
 STATUS, BUFFER, ACTUAL = 4, 16, 28
-"""Where in it."""
+"""Offsets of its fields."""
 CONTROL = 2
 """The type of a URB whose buffer begins with a setup packet."""
 SLICE = 50
-"""ms that a transfer waits before it looks whether it was discarded."""
+"""Period at which a waiting transfer checks whether it was discarded, ms."""
 
 
 class Urb:
-    """A transfer under way.
+    """A transfer in progress.
 
     Args:
         block: the client's URB, as umockdev has it.
@@ -51,7 +51,7 @@ class Urb:
         return bool(self.endpoint & IN) and not self.control
 
     def run(self, line: UsbConnection) -> None:
-        """Carries it over a line, until it ends."""
+        """Executes it over a connection."""
         try:
             if self.control:
                 kind, request, value, index, length = struct.unpack_from("<BBHHH", self.data)
@@ -77,7 +77,7 @@ class Urb:
         raise OSError(errno.ENOENT, "discarded")
 
     def write(self) -> None:
-        """Puts what came of it into the client's memory."""
+        """Writes the result into the client's memory."""
         if self.answer and self.buffer is not None:
             self.buffer.update(8 if self.control else 0, self.answer)
         self.block.update(STATUS, struct.pack("<i", self.status))
@@ -85,7 +85,7 @@ class Urb:
 
 
 class Usbfs:
-    """One device's node, from when it is plugged in until it is pulled out."""
+    """The device node of one device while it is plugged in."""
 
     def __init__(self, host: str, port: int) -> None:
         self._control = UsbConnection(host, port)
@@ -97,19 +97,19 @@ class Usbfs:
             threading.Thread(target=self._carry, args=(self._queues[way], line), daemon=True).start()
 
     def present(self) -> bool:
-        """Whether it is still plugged in, and was all the time."""
+        """Whether it has been plugged in all the time."""
         try:
             return bool(self._control.call(Op.DESCRIBE))
         except OSError:
             return False
 
     def close(self) -> None:
-        """Lets its threads end."""
+        """Ends its threads."""
         for waiting in self._queues.values():
             waiting.put(None)
 
     def ioctl(self, client: Any) -> tuple[int, int]:
-        """What an ioctl returns, and its errno."""
+        """Executes an ioctl: its return value and errno."""
         number, argument = client.get_request() & 0xFF, client.get_arg()
         try:
             return self._ioctl(number, argument), 0
@@ -117,7 +117,7 @@ class Usbfs:
             return -1, error.errno or errno.EIO
 
     def reaped(self, client: Any, patience: float) -> bool:
-        """Answers a reap with a transfer that is complete; False if there is none within `patience` s."""
+        """Answers a reap with a completed transfer; False if there is none within `patience` s."""
         try:
             urb = self._done.get(timeout=patience)
         except queue.Empty:

@@ -1,4 +1,4 @@
-"""A UR controller that is not there: RTDE, script and dashboard, for the real client libraries."""
+"""An emulated UR controller: RTDE, script and dashboard, for the real client libraries."""
 
 from robot.emulators.ur10.config import UrEmulatorConfig, WallConfig
 from robot.emulators.ur10.server import serve

@@ -1,4 +1,4 @@
-"""The arm itself: it carries out orders step by step, meets walls, and comes to rest when it is halted."""
+"""The emulated arm: executes orders step by step and meets walls."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class EmulatedArm:
 
     @property
     def busy(self) -> bool:
-        """Whether it moves, or has orders left."""
+        """Whether it moves or has orders left."""
         return self._motion is not None or bool(self._queue)
 
     @property
@@ -66,23 +66,23 @@ class EmulatedArm:
 
     @property
     def remaining(self) -> list[MoveOrder]:
-        """What it has not finished."""
+        """Orders not finished yet."""
         return ([self._order] if self._order is not None else []) + list(self._queue)
 
     def place(self, tcp: Vector6) -> None:
-        """Stand somewhere else at once, as if moved by hand. Raises `Unreachable`."""
+        """Places the arm elsewhere at once, as if moved by hand. Raises `Unreachable`."""
         self.state = MotionState(tcp, ZERO, self.model.backward(tcp, self.state.joints), ZERO)
         self._motion, self._order = None, None
         self._queue.clear()
         self._update_force()
 
     def set_tool(self, tool: Vector6) -> None:
-        """Another tool's pose in the flange: the joints stay, the tool's pose is another."""
+        """Sets the tool's pose in the flange; the joints stay."""
         self.model = self.model.with_tool(tool)
         self.state = self.state._replace(tcp=self.model.forward(self.state.joints))
 
     def order(self, orders: Iterable[MoveOrder]) -> None:
-        """Do these and nothing else. A move that finds the arm moving lets it stop first."""
+        """Replaces all orders. A move that finds the arm moving stops it first."""
         new = deque(orders)
         first = next((order for order in new if not isinstance(order, Mark)), None)
         if self.moving and isinstance(first, MoveL | MoveJ):  # these plan from rest
@@ -95,13 +95,13 @@ class EmulatedArm:
         self._queue = new
 
     def halt(self, acceleration: float) -> None:
-        """Forget all orders and come to rest, m/s^2."""
+        """Drops all orders and stops, m/s^2."""
         self._queue.clear()
         self._order = None
         self._motion = ToolSpeedMotion(ZERO, acceleration, self.turn_ratio) if self.moving else None
 
     def step(self, dt: float) -> None:
-        """One control step. Raises `Unreachable`; the arm then stands."""
+        """Advances one control step. Raises `Unreachable`; the arm then stands."""
         try:
             while self._motion is None and self._queue:
                 self._order = self._queue.popleft()
@@ -145,12 +145,12 @@ class EmulatedArm:
 
 
 def penetration(wall: WallConfig, tcp: Vector6) -> float:
-    """How far the tool is in a wall, m; 0 where it is not."""
+    """Depth of the tool in a wall, m; 0 outside."""
     return max(0.0, wall.solid * (tcp["xyz".index(wall.axis)] - wall.at))
 
 
 def wall_force(walls: Iterable[WallConfig], tcp: Vector6) -> Vector6:
-    """The force of walls on the tool: springs that push it out, N."""
+    """Force of the walls on the tool: springs that push it out, N."""
     force = [0.0, 0.0, 0.0]
     for wall in walls:
         force["xyz".index(wall.axis)] -= wall.solid * wall.stiffness * penetration(wall, tcp)
@@ -158,5 +158,5 @@ def wall_force(walls: Iterable[WallConfig], tcp: Vector6) -> Vector6:
 
 
 def force_magnitude(force: Vector6) -> float:
-    """Of a force, N."""
+    """Magnitude of a force, N."""
     return math.hypot(*force[:3])

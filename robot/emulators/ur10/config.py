@@ -1,4 +1,4 @@
-"""What an emulated UR controller is like: its address and version, its arm's start, what stands around."""
+"""Settings of an emulated UR controller: address, version, start pose, walls."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ Vector6 = tuple[float, float, float, float, float, float]
 
 
 class WallConfig(Settings):
-    """Something flat and springy that the tool can be pushed into."""
+    """A flat elastic obstacle for the tool."""
 
     axis: Literal["x", "y", "z"] = "x"
-    """The axis of the base that the plane stands across."""
+    """Axis of the base normal to the plane."""
     at: float = 0.8
-    """Where it begins on that axis, m."""
+    """Position of the plane on that axis, m."""
     solid: Literal[-1, 1] = 1
-    """The side that is solid: 1 beyond `at`, -1 before it."""
+    """Solid side: 1 beyond `at`, -1 before it."""
     stiffness: PositiveFloat = 5000.0
     """Force by penetration, N/m."""
 
@@ -45,26 +45,26 @@ class UrEmulatorConfig(Settings):
     polyscope: Annotated[str, Field(pattern=r"^(\d+\.\d+(\.\d+)?)?$")] = ""
     """PolyScope's version; "" means 3.15.8 at 125 Hz and 5.11.0 at 500 Hz."""
     start: Vector6 = (0.6, 0.0, 0.3, 3.141592653589793, 0.0, 0.0)
-    """The tool's pose when the arm is switched on: m and rotation vector in the base."""
+    """Initial tool pose: m and rotation vector rad, in the base."""
     remote: bool = True
-    """Whether an e-Series says that it is under remote control."""
+    """Whether an e-Series reports remote control."""
     walls: tuple[WallConfig, ...] = ()
-    """What the tool can hit."""
+    """Obstacles."""
     protective_force: PositiveFloat = 150.0
-    """N at the tool above which the controller makes a protective stop of its own."""
+    """Force at the tool above which the controller makes a protective stop, N."""
     turn_ratio: PositiveFloat = 4.0
-    """How fast a linear move may turn for every m/s it was given, rad/m; likewise accelerations."""
+    """Turning rate of a linear move per linear speed, rad/m; likewise accelerations."""
     halt: PositiveFloat = 2.0
     """Deceleration of a program that is stopped, m/s^2."""
     brake: PositiveFloat = 5.0
     """Deceleration of a safety stop, m/s^2."""
     starting: NonNegativeFloat = 0.02
-    """s from the end of an uploaded program to its first step."""
+    """Delay from the end of an uploaded program to its first step, s."""
     unlock_wait: NonNegativeFloat = 5.0
-    """s that a protective stop cannot be unlocked for."""
+    """Time for which a protective stop cannot be unlocked, s."""
 
     @property
     def version(self) -> Version:
-        """What the controller says it runs."""
+        """Version that the controller reports."""
         written = self.polyscope or ("3.15.8" if self.hz == 125 else "5.11.0")
         return Version(*map(int, written.split(".")))

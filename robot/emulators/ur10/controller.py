@@ -1,4 +1,4 @@
-"""The controller without its sockets: an arm, a program, safety, registers, and what faults do to them."""
+"""The emulated controller without sockets: arm, program, safety, registers."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class EmulatedController:
         self.publish()
 
     def tick(self, host: float) -> None:
-        """One control step at a host time, s."""
+        """Advances one control step at a host time, s."""
         self.time += self.dt
         if self._watchdog is not None:
             patience, register, since = self._watchdog
@@ -82,13 +82,13 @@ class EmulatedController:
         self.publish()
 
     def watch(self, frequency: float, register: int) -> None:
-        """Stop the program when a register is not written that often."""
+        """Stops the program when a register is written less often than this."""
         self._watchdog = (
             (1 / frequency, register, self.registers.written[register]) if frequency > 0 else None
         )
 
     def upload(self, text: str) -> None:
-        """A program arrives; it replaces the one that runs."""
+        """Uploads a program, which replaces the running one."""
         self.stop_program()
         if self.safety is SafetyMode.NORMAL and self.robot_mode is RobotMode.RUNNING:
             self._uploaded = (self.time + self.config.starting, text)
@@ -100,7 +100,7 @@ class EmulatedController:
         self.program = self._load_program(self, text)
 
     def stop_program(self) -> None:
-        """The program ends and the arm comes to rest."""
+        """Ends the program and stops the arm."""
         if self.program is not None:
             self.program_stops += 1
         self.program, self._uploaded, self._watchdog = None, None, None
@@ -109,17 +109,17 @@ class EmulatedController:
         self.arm.halt(self.config.halt)
 
     def protective_stop(self) -> None:
-        """The arm brakes; nothing moves until it is unlocked, and the program stays where it is."""
+        """Stops the arm; no motion until unlocked, the program is paused."""
         self._stop(SafetyMode.PROTECTIVE_STOP)
 
     def safeguard_stop(self) -> None:
-        """The arm brakes; it goes on by itself when the safeguard is closed."""
+        """Stops the arm; motion resumes when the safeguard is closed."""
         remaining = self.arm.remaining
         self._stop(SafetyMode.SAFEGUARD_STOP)
         self._resumed = remaining
 
     def emergency_stop(self) -> None:
-        """The arm brakes and loses its power; the program ends."""
+        """Stops the arm and cuts its power; ends the program."""
         self._stop(SafetyMode.ROBOT_EMERGENCY_STOP)
         self.stop_program()
         self.arm.halt(self.config.brake)
@@ -134,7 +134,7 @@ class EmulatedController:
         self.arm.halt(self.config.brake)
 
     def unlock(self) -> bool:
-        """End a protective stop; not before a while."""
+        """Ends a protective stop; not before `unlock_wait`."""
         if self.safety is SafetyMode.PROTECTIVE_STOP:
             if self.time - self._stopped_at < self.config.unlock_wait:
                 return False
@@ -142,7 +142,7 @@ class EmulatedController:
         return True
 
     def clear(self) -> None:
-        """What made it stop is gone. A safeguarded program goes on; an emergency leaves the power off."""
+        """Clears the cause of a stop. A safeguarded program resumes; after an emergency stop power stays off."""
         if self.safety is SafetyMode.SAFEGUARD_STOP and self.runtime is Runtime.PAUSED:
             self.runtime = Runtime.PLAYING
             self.arm.order(self._resumed)
@@ -150,7 +150,7 @@ class EmulatedController:
         self.safety = SafetyMode.NORMAL
 
     def power(self, mode: RobotMode) -> None:
-        """Power on, release the brakes, or power off."""
+        """Sets the power mode."""
         if self.safety is SafetyMode.NORMAL:
             self.robot_mode = mode
             if mode is not RobotMode.RUNNING:
@@ -170,7 +170,7 @@ class EmulatedController:
         return True
 
     def record_target(self, kind: str, new: Sequence[MoveOrder]) -> None:
-        """Remember what was commanded, for whoever asks."""
+        """Records a command for the fault port's `state`."""
         for order in new:
             if isinstance(order, MoveL):
                 self.waypoint = order.goal
@@ -184,7 +184,7 @@ class EmulatedController:
             self.targets.append(entry)
 
     def publish(self) -> None:
-        """Bring the published fields up to date."""
+        """Updates the published fields."""
         fields, state = self.registers.fields, self.arm.state
         playing = self.runtime is Runtime.PLAYING
         powered = self.robot_mode is not RobotMode.POWER_OFF

@@ -15,7 +15,7 @@ SERIAL = "20163000000"
 
 
 class DashboardSession:
-    """One client."""
+    """A client connection."""
 
     def __init__(self, controller: EmulatedController) -> None:
         self._controller = controller
@@ -29,11 +29,11 @@ class DashboardSession:
         )
 
     def closed(self) -> None:
-        """Nothing depends on a dashboard client."""
+        """Has no effect."""
 
 
 def answer_command(controller: EmulatedController, command: str) -> str:
-    """What a command does, and says."""
+    """Executes a command; returns the answer."""
     version = controller.config.version
     known = dict(_COMMANDS)
     if version >= (5, 6):

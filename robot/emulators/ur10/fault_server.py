@@ -40,7 +40,7 @@ NAN: Value = (math.nan,) * 6
 
 
 class ControllerFaults:
-    """Which faults hold, and what they do to what is published."""
+    """Active faults and their effect on what is published."""
 
     def __init__(self, server: ControllerServer) -> None:
         self._server = server
@@ -55,20 +55,20 @@ class ControllerFaults:
         return time.monotonic() < self._stalled_until
 
     def publishing(self, step: int) -> bool:
-        """Whether states go out at this control step."""
+        """Whether states are sent at this control step."""
         if self.stalled:
             return False
         hz = self._controller.config.hz
         return self._hz is None or math.floor(step * self._hz / hz) > math.floor((step - 1) * self._hz / hz)
 
     def overrides(self) -> dict[str, Value]:
-        """Fields that are not told as they are."""
+        """Fields with replaced values."""
         if self._nan:
             return {**self._frozen, "actual_TCP_pose": NAN, "actual_TCP_speed": NAN}
         return self._frozen
 
     def do(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Carry out one request. Raises ValueError, KeyError or TypeError where it makes no sense."""
+        """Executes a request. Raises ValueError, KeyError or TypeError for an invalid one."""
         what = request["do"]
         if what == "state":
             return self.state()
@@ -186,7 +186,7 @@ class ControllerFaults:
 
 
 class FaultSession:
-    """One client of the fault port."""
+    """A client connection of the fault port."""
 
     def __init__(self, faults: ControllerFaults) -> None:
         self._faults = faults
@@ -198,7 +198,7 @@ class FaultSession:
         return b"".join(json.dumps(self._answer(line)).encode() + b"\n" for line in lines if line.strip())
 
     def closed(self) -> None:
-        """Faults outlive whoever asked for them."""
+        """Has no effect: faults stay."""
 
     def _answer(self, line: bytes) -> dict[str, Any]:
         try:

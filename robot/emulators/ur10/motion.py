@@ -1,4 +1,4 @@
-"""Motions as values: each says what the arm's state is a time step later, and whether it goes on."""
+"""Motions as values: each gives the arm's state a time step later, and whether it continues."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ JOINT_SPEED = 2.0944  # rad/s: 120 degrees a second, what a UR10's shoulder and 
 
 
 class Unreachable(ValueError):
-    """The controller finds no joints for a pose."""
+    """No joint solution for a pose."""
 
 
 class MotionState(NamedTuple):
-    """Where the arm is.
+    """State of the arm.
 
     Attributes:
         tcp: the tool's pose in the base. speed: its speed there, m/s, rad/s. joints: rad. joint_speed: rad/s.
@@ -59,12 +59,12 @@ class Profile(NamedTuple):
 
     @property
     def ramp(self) -> float:
-        """s of speeding up, and of slowing down."""
+        """Duration of acceleration, and of deceleration, s."""
         return min(self.speed / self.acceleration, math.sqrt(self.length / self.acceleration))
 
     @property
     def duration(self) -> float:
-        """s"""
+        """Duration, s."""
         ramp = self.ramp
         return ramp + self.length / (ramp * self.acceleration) if self.length > 0 else 0.0
 
@@ -83,7 +83,7 @@ class Profile(NamedTuple):
 
 
 class LinearMotion(NamedTuple):
-    """Straight to a pose, turning evenly with the way."""
+    """Straight to a pose, turning in proportion to the path."""
 
     start: Vector6
     way: Vector6  # m in the base, and rotation vector in the base
@@ -105,7 +105,7 @@ class LinearMotion(NamedTuple):
 
 
 class JointMotion(NamedTuple):
-    """To joints, all arriving together."""
+    """To joint angles, all arriving together."""
 
     start: Vector6
     way: Vector6  # rad
@@ -124,7 +124,7 @@ class JointMotion(NamedTuple):
 
 
 class ToolSpeedMotion(NamedTuple):
-    """Towards a speed of the tool and on at it; where that speed is none, until the arm stands."""
+    """Accelerates to a tool speed and keeps it; for speed 0, until the arm stands."""
 
     goal: Vector6
     acceleration: float
@@ -150,7 +150,7 @@ class ToolSpeedMotion(NamedTuple):
 
 
 class JointSpeedMotion(NamedTuple):
-    """Towards joint speeds and on at them; where they are none, until the arm stands."""
+    """Accelerates to joint speeds and keeps them; for speed 0, until the arm stands."""
 
     goal: Vector6
     acceleration: float
@@ -166,7 +166,7 @@ class JointSpeedMotion(NamedTuple):
 
 
 class ServoMotion(NamedTuple):
-    """After joints that are told again and again, lagging by a time."""
+    """Follows joint targets sent repeatedly, with a lag."""
 
     goal: Vector6
     lag: float
@@ -188,7 +188,7 @@ Motion = LinearMotion | JointMotion | ToolSpeedMotion | JointSpeedMotion | Servo
 def linear_motion(
     state: MotionState, goal: Vector6, speed: float, acceleration: float, turn_ratio: float
 ) -> LinearMotion:
-    """The way and the turn each get the time they need; the longer one is kept by both."""
+    """A straight motion; the slower of path and turn sets the time of both."""
     x, y, z = (g - s for g, s in zip(goal[:3], state.tcp[:3], strict=True))
     way = (x, y, z, *rotation_between(state.tcp, goal))
     distance, angle = math.hypot(*way[:3]), math.hypot(*way[3:])
@@ -198,13 +198,13 @@ def linear_motion(
 
 
 def joint_motion(state: MotionState, goal: Vector6, speed: float, acceleration: float) -> JointMotion:
-    """The joint with the longest way sets the time."""
+    """A joint motion; the joint with the longest path sets the time."""
     way = subtract(goal, state.joints)
     return JointMotion(state.joints, way, Profile(max(map(abs, way)), speed, acceleration))
 
 
 def tool_state(model: ArmModel, state: MotionState, tcp: Vector6, speed: Vector6, dt: float) -> MotionState:
-    """The state after the tool was led to a pose."""
+    """The state after a step of the tool."""
     joints = model.backward(tcp, state.joints)
     return MotionState(tcp, speed, joints, scale(subtract(joints, state.joints), 1 / dt))
 
@@ -212,7 +212,7 @@ def tool_state(model: ArmModel, state: MotionState, tcp: Vector6, speed: Vector6
 def joint_state(
     model: ArmModel, state: MotionState, joints: Vector6, rate: Vector6, dt: float
 ) -> MotionState:
-    """The state after the joints were led."""
+    """The state after a step of the joints."""
     tcp = model.forward(joints)
     if not any(rate):
         return MotionState(tcp, ZERO, joints, rate)
@@ -221,7 +221,7 @@ def joint_state(
 
 
 def step_towards(now: Sequence[float], goal: Sequence[float], step: float) -> tuple[float, ...]:
-    """A vector moved at most a step towards another."""
+    """A vector moved towards another, at most by a step."""
     way = [g - n for g, n in zip(goal, now, strict=True)]
     length = math.hypot(*way)
     if length <= step:
