@@ -142,7 +142,7 @@ class EmulatedController:
         return True
 
     def clear(self) -> None:
-        """Clears the cause of a stop. A safeguarded program resumes; after an emergency stop power stays off."""
+        """Clears the cause of a stop. A safeguarded program resumes; emergency stops leave power off."""
         if self.safety is SafetyMode.SAFEGUARD_STOP and self.runtime is Runtime.PAUSED:
             self.runtime = Runtime.PLAYING
             self.arm.order(self._resumed)
