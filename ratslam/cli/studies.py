@@ -212,21 +212,25 @@ def _size(arguments: argparse.Namespace) -> int:
     settle_threads()
     prepare_jax()
     from ratslam.config.completion import complete
-    from ratslam.experiments.sizing.recommendation import proposals
-    from ratslam.experiments.sizing.report import length_text, proposed_text, snippet, tried_text
+    from ratslam.experiments.sizing.recommendation import recommend
+    from ratslam.experiments.sizing.report import (
+        changed_settings_yaml,
+        render_recommendations,
+        render_trial_runs,
+    )
     from ratslam.experiments.sizing.scene_statistics import scene_of
-    from ratslam.experiments.sizing.trial_runs import tried
+    from ratslam.experiments.sizing.trial_runs import try_settings
     from ratslam.experiments.studies.fidelity import with_tier
     from ratslam.pipeline.source import open_source
 
     path, config = arguments.config, read_config(arguments)
     with open_source(with_tier(config, "kinematic")) as source:
         scene, config = scene_of(source), complete(config, source)
-    found = proposals(config, scene)
-    print(f"{scene.told()}\n\n{proposed_text(found)}\n", flush=True)
-    steps = tried(config, found, arguments.cycles)
-    print(f"What each cheaper step costs, over {length_text(steps[0].result, scene.cycles)}:\n")
-    print(tried_text(steps))
-    text = snippet(found)
-    print(f"\nFor {path.name}:\n\n{text}" if text else f"\n{path.name} has it like that already")
+    found = recommend(config, scene)
+    print(f"{scene.describe()}\n\n{render_recommendations(found)}\n", flush=True)
+    runs = try_settings(config, found, arguments.cycles)
+    print(f"Cost of each cheaper step, over {runs[0].record.steps} of {scene.cycles} cycles, one seed:\n")
+    print(render_trial_runs(runs))
+    text = changed_settings_yaml(found)
+    print(f"\nFor {path.name}:\n\n{text}" if text else f"\n{path.name} has these settings already")
     return 0

@@ -1,1 +1,1 @@
-"""Model only what a scene needs: settings that follow from it, and what each cheaper one would cost."""
+"""Settings that fit a scene, and the cost of each cheaper one."""

@@ -1,4 +1,4 @@
-"""What a scene needs: a value for each setting that costs time or memory, and why."""
+"""Recommended values, with reasons, of the settings that cost time or memory."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from ratslam.grid.particle_maps import LAYERS
 from robot.simulation.head.session import choose_tier
 
 PART = 0.5
-"""Cells that the packet moves in one sub-step at most."""
+"""Largest motion of the activity packet in one sub-step, cells."""
 PARTS = 4
-"""Sub-steps for all but a few cycles, beyond which cells are too fine for the robot's speed."""
+"""Largest number of sub-steps of all but a few cycles; with more, cells are too fine for the speed."""
 SLOW = 0.05
-"""Cells that a usual cycle moves at least, below which cells are coarser than the robot's speed asks for."""
+"""Smallest motion of a usual cycle, cells; with less, cells are too coarse for the robot's speed."""
 FEWEST, MOST = 11, 201
-"""Cells along an axis: a packet's, and so many as the moving window is known to be as fast with."""
+"""Cells along an axis: at least those of a packet, at most those measured with the moving window."""
 PER_CELL = 100
-"""Particles for each cell by which odometry may be off once it has crossed the scene."""
+"""Particles per cell of odometry error across the scene."""
 PARTICLES = 30, 3000
-"""Fewest and most."""
+"""Smallest and largest number of particles."""
 MEMORY = 1024
-"""Of all particles' maps, MiB, at most."""
+"""Largest memory of all particles' maps, MiB."""
 
 
-class Proposal(NamedTuple):
-    """A setting: its key path, what the configuration has, what is proposed, and why in a line."""
+class Recommendation(NamedTuple):
+    """A setting: key path, present value, recommended value, reason in one line."""
 
     key: str
     now: Any
@@ -42,18 +42,18 @@ class Proposal(NamedTuple):
 
     @property
     def changed(self) -> bool:
-        """Whether the configuration has another value."""
+        """Whether the recommended value differs from the present one."""
         return bool(self.value != self.now)
 
 
-def proposals(config: RunConfig, scene: Scene) -> list[Proposal]:
-    """For a configuration that its source has completed."""
+def recommend(config: RunConfig, scene: Scene) -> list[Recommendation]:
+    """Recommendations for a configuration that its source has completed."""
     own = _grid(config, scene) if config.backend == "grid" else _rat(config, scene)
     return [*own, *_tier(config)]
 
 
 def with_settings(config: Any, settings: dict[str, Any]) -> Any:
-    """A configuration with values at key paths, taken for valid."""
+    """The configuration with values at key paths, which are not validated."""
     for key, value in settings.items():
         name, _, rest = key.partition(".")
         inner = with_settings(getattr(config, name), {rest: value}) if rest else value
@@ -61,27 +61,27 @@ def with_settings(config: Any, settings: dict[str, Any]) -> Any:
     return config
 
 
-def nice(value: float, side: int = 0) -> float:
-    """The nearest of 1, 2 and 5 times a power of ten; for a side of 1 not below it, for -1 not above."""
+def round_number(value: float, side: int = 0) -> float:
+    """The nearest of 1, 2 and 5 times a power of ten; not below the value if side is 1, not above if -1."""
     power = np.floor(np.log10(value))
     every = [float(f"{step}e{power + k:.0f}") for k in (-1, 0, 1) for step in (1, 2, 5)]
     allowed = [each for each in every if (each - value) * side >= 0]
     return min(allowed, key=lambda each: abs(np.log(each / value)))
 
 
-def covering(span: float, cell: float) -> int:
-    """Cells of a torus that does not wrap: odd, room for a packet at either end."""
+def cells_to_cover(span: float, cell: float) -> int:
+    """Odd number of cells of a torus that does not wrap, with space for a packet at either end."""
     return max(FEWEST, int(np.ceil(span / cell)) + SETTLED) | 1
 
 
-def _of(config: RunConfig, key: str, value: Any, why: str) -> Proposal:
+def _of(config: RunConfig, key: str, value: Any, why: str) -> Recommendation:
     now: Any = config
     for name in key.split("."):
         now = getattr(now, name)
-    return Proposal(key, now, value, why)
+    return Recommendation(key, now, value, why)
 
 
-def _rat(config: RunConfig, scene: Scene) -> Iterator[Proposal]:
+def _rat(config: RunConfig, scene: Scene) -> Iterator[Recommendation]:
     cells = config.pose_cells
     yield (size := _cell_size(config, scene))
     yield (across := _cells_xy(config, scene, size.value))
@@ -96,32 +96,32 @@ def _rat(config: RunConfig, scene: Scene) -> Iterator[Proposal]:
     yield _of(config, "session.precision", "float64", "what the published figures are of")
 
 
-def _cell_size(config: RunConfig, scene: Scene) -> Proposal:
+def _cell_size(config: RunConfig, scene: Scene) -> Recommendation:
     now = config.pose_cells.cell_size
     moved, most = scene.usual / now, scene.most / now
     why = f"a cycle moves {moved:.2g} cells (95 %: {most:.2g}): {_parts(most)} sub-steps of {PART:g} at most"
     value = now
     if _parts(most) > PARTS:
-        value, why = nice(scene.most / (PART * PARTS), 1), f"{why}, where {PARTS} will do"
+        value, why = round_number(scene.most / (PART * PARTS), 1), f"{why}, where {PARTS} will do"
     elif moved < SLOW:
-        value, why = nice(scene.usual / SLOW, -1), f"{why}, {1 / moved:.0f} cycles for one cell"
+        value, why = round_number(scene.usual / SLOW, -1), f"{why}, {1 / moved:.0f} cycles for one cell"
     return _of(config, "pose_cells.cell_size", value, why)
 
 
-def _cells_xy(config: RunConfig, scene: Scene, size: float) -> Proposal:
+def _cells_xy(config: RunConfig, scene: Scene, size: float) -> Recommendation:
     now, span = config.pose_cells.cells_xy, max(scene.span)
-    cover = min(covering(span, size), MOST)
+    cover = min(cells_to_cover(span, size), MOST)
     # What recall and its map do is the same on any torus: then the one there is will do.
     value = now if config.backend == "recall" and FEWEST <= now <= cover else cover
     wraps = span / (value * size)
-    told = f"the path spans {span / size:.0f} cells: " + (
+    spanned = f"the path spans {span / size:.0f} cells: " + (
         f"wraps {wraps:.1f} x" if wraps > 1 else "none twice"
     )
     free = ", which recall does not mind" if config.backend == "recall" and wraps > 1 else ""
-    return _of(config, "pose_cells.cells_xy", value, told + free)
+    return _of(config, "pose_cells.cells_xy", value, spanned + free)
 
 
-def _engine(config: RunConfig, proposed: PoseCellConfig) -> Proposal:
+def _engine(config: RunConfig, proposed: PoseCellConfig) -> Recommendation:
     levels = window_levels(proposed, np.dtype(float))
     shapes = ["x".join(map(str, level.window.shape[::-1])) for level in levels]
     if len(levels) == 1:
@@ -133,9 +133,9 @@ def _engine(config: RunConfig, proposed: PoseCellConfig) -> Proposal:
     return _of(config, "pose_cells.engine", "window", why)
 
 
-def _grid(config: RunConfig, scene: Scene) -> Iterator[Proposal]:
+def _grid(config: RunConfig, scene: Scene) -> Iterator[Recommendation]:
     grid, side = config.grid, config.grid.side or LIVE_SIDE
-    blob, cell = grid.footprint.blob_sd, nice(grid.footprint.blob_sd)
+    blob, cell = grid.footprint.blob_sd, round_number(grid.footprint.blob_sd)
     across = int(np.ceil(side / cell))
     off = _drifted(grid.drift, scene) / cell
     wanted = int(np.clip(_step(PER_CELL * off), *PARTICLES))
@@ -152,7 +152,7 @@ def _grid(config: RunConfig, scene: Scene) -> Iterator[Proposal]:
     yield _of(config, "session.precision", "float32", "half the memory; evidence needs no more digits")
 
 
-def _tier(config: RunConfig) -> Iterator[Proposal]:
+def _tier(config: RunConfig) -> Iterator[Recommendation]:
     simulation = config.simulation
     if simulation is None:
         return
@@ -164,12 +164,12 @@ def _tier(config: RunConfig) -> Iterator[Proposal]:
 
 
 def _parts(cells: float) -> int:
-    """Sub-steps for so many cells."""
+    """Number of sub-steps for a motion in cells."""
     return max(1, int(np.ceil(cells / PART - 1e-9)))
 
 
 def _drifted(drift: DriftConfig, scene: Scene) -> float:
-    """Standard deviation of odometry after crossing the scene, as the filter believes it, m."""
+    """Standard deviation of odometry after crossing the scene by the filter's drift model, m."""
     span = max(scene.span)
     cycles = max(span / scene.usual, 1.0)
     lasting = np.hypot(drift.session, drift.move)

@@ -1,4 +1,4 @@
-"""The proposals and what cheaper steps cost, as text, and as YAML for the configuration."""
+"""Recommendations and trial runs as text, and as YAML for the configuration."""
 
 from __future__ import annotations
 
@@ -8,48 +8,41 @@ from typing import Any
 import yaml
 
 from ratslam.config.strict_yaml.dumper import Dumper
-from ratslam.experiments.sizing.recommendation import Proposal
-from ratslam.experiments.sizing.trial_runs import Tried
+from ratslam.experiments.sizing.recommendation import Recommendation
+from ratslam.experiments.sizing.trial_runs import TrialRun
 from ratslam.experiments.studies.metrics import HEADINGS
-from ratslam.experiments.studies.records import RunRecord
 from ratslam.experiments.studies.report import align, number
 
 ERRORS = ("energy_all", "ate_final", "exm_arr", "exm_arcr_strict", "map_error")
 """Columns of errors."""
 
 
-def proposed_text(found: Sequence[Proposal]) -> str:
-    """Every setting: what it is, what is proposed, why."""
-    rows = [["setting", "now", "proposed", "why"]]
+def render_recommendations(found: Sequence[Recommendation]) -> str:
+    """A table of settings: present value, recommended value, reason."""
+    rows = [["setting", "now", "recommended", "why"]]
     rows += [[each.key, _plain(each.now), _plain(each.value), each.why] for each in found]
     return align(rows, "<>><")
 
 
-def tried_text(found: Sequence[Tried]) -> str:
-    """What each step costs and saves, beside the first."""
-    first = found[0].result.value("step_time")
-    names = [name for name in ERRORS if any(one.result.value(name) is not None for one in found)]
-    rows = [["", "us a cycle", "99 %", "of proposed", "whole run", *(HEADINGS[name] for name in names)]]
-    for step, result in found:
-        if result.error is not None:
-            rows.append([step.name, "-", "-", "-", "-", *("-" for _ in names)])
+def render_trial_runs(runs: Sequence[TrialRun]) -> str:
+    """A table of time and error of each step; times also relative to the recommended settings."""
+    first = runs[0].record.value("step_time")
+    names = [name for name in ERRORS if any(run.record.value(name) is not None for run in runs)]
+    rows = [["", "us/step", "99 %", "relative", "whole run", *(HEADINGS[name] for name in names)]]
+    for step, record in runs:
+        if record.error is not None:
+            rows.append([step.name, *("-" for _ in rows[0][1:])])
             continue
-        time = result.value("step_time")
+        time = record.value("step_time")
         share = f"{time / first:.2f}" if time and first else "-"
-        errors = [number(result.value(name)) for name in names]
-        rows.append([step.name, number(time), number(result.value("step_time_p99")), share,
-                     number(result.value("run_time")), *errors])  # fmt: skip
-    failed = [f"{step.name}: {result.error}" for step, result in found if result.error is not None]
-    return "\n".join([align(rows, "<" + ">" * (len(rows[0]) - 1)), *failed])
+        values = [number(record.value(name)) for name in ("run_time", *names)]
+        rows.append([step.name, number(time), number(record.value("step_time_p99")), share, *values])
+    failed = [f"{step.name}: {record.error}" for step, record in runs if record.error is not None]
+    return "\n".join([align(rows), *failed])
 
 
-def length_text(result: RunRecord, whole: int) -> str:
-    """Of how much of the session that is."""
-    return f"{result.steps} of {whole} cycles, one seed (`study --preset pareto` shows what is chance)"
-
-
-def snippet(found: Sequence[Proposal]) -> str:
-    """YAML of what the configuration has otherwise; '' if there is nothing."""
+def changed_settings_yaml(found: Sequence[Recommendation]) -> str:
+    """YAML of the settings to change; '' if there are none."""
     tree: dict[str, Any] = {}
     for each in found:
         if each.changed:

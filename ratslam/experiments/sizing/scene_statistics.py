@@ -1,4 +1,4 @@
-"""A scene in the numbers that settings follow from, and a short version of it to try them on."""
+"""Statistics of a scene that settings follow from, and a short version of its session."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from tactile.base.errors import InputError
 from tactile.base.se2 import integrate
 
 STANDING = 0.1
-"""A cycle in which less than this share of the longest distance is driven is no driving."""
+"""Share of the longest distance of a cycle below which a cycle counts as standing."""
 USUAL, MOST = 0.5, 0.95
-"""Quantiles that stand for what is usual, and for all but a few."""
+"""Quantiles of a usual cycle and of all but a few."""
 
 
 class Scene(NamedTuple):
-    """A session as its odometry tells it.
+    """Statistics of a session's odometry.
 
     Attributes:
         name: of the source. cycles: how many. rate: of them, Hz; 0 if unknown. span: [2] m, what the path
@@ -40,8 +40,8 @@ class Scene(NamedTuple):
     most: float
     turn: float
 
-    def told(self) -> str:
-        """In a sentence."""
+    def describe(self) -> str:
+        """The statistics as a sentence."""
         pace = f" at {self.rate:.3g} Hz, {self.usual * self.rate:.3g} m/s" if self.rate else ""
         return (
             f"{self.name}: {self.cycles} cycles{pace}; odometry spans {self.span[0]:.3g} x "
@@ -51,7 +51,7 @@ class Scene(NamedTuple):
 
 
 def scene_of(source: Source) -> Scene:
-    """The numbers of a source.
+    """The statistics of a source.
 
     Raises:
         InputError: it has no samples, or its odometry is not finite.
@@ -59,12 +59,12 @@ def scene_of(source: Source) -> Scene:
     moves = np.array([sample.reading.odometry[:3] for sample in source], float).reshape(-1, 3)
     moves = moves[np.isfinite(moves).all(axis=1)]
     if not len(moves):
-        raise InputError(source.name, "no odometry", "a session that goes somewhere")
+        raise InputError(source.name, "no odometry", "a session with motion")
     path = integrate(moves)[:, :2]
     distance, turn = np.hypot(moves[:, 0], moves[:, 1]), np.abs(moves[:, 2])
     driving = distance[distance > STANDING * distance.max()]
     if not len(driving):
-        raise InputError(source.name, "a robot that never moves", "a session that goes somewhere")
+        raise InputError(source.name, "a robot that never moves", "a session with motion")
     width, height = np.ptp(path, axis=0)
     return Scene(
         name=source.name,
@@ -77,9 +77,9 @@ def scene_of(source: Source) -> Scene:
     )
 
 
-def short(config: RunConfig, cycles: int, folder: Path) -> RunConfig:
-    """The configuration of about so many cycles: of circuits whole ones, two at least; of a recording its
-    beginning, which is copied to the folder.
+def short_session(config: RunConfig, cycles: int, folder: Path) -> RunConfig:
+    """The configuration with about the given number of cycles: whole circuits, two at least; of a recording
+    its beginning, which is copied to the folder.
 
     Raises:
         InputError: the recording cannot be read.

@@ -1,4 +1,4 @@
-"""What a scene needs: proposals that follow from it, and what cheaper steps are tried on."""
+"""Settings for a scene: recommendations that follow from it, and the cheaper steps that are tried."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from ratslam.experiments.sizing.recommendation import (
     PARTICLES,
     PARTS,
     SLOW,
-    covering,
-    nice,
-    proposals,
+    cells_to_cover,
+    recommend,
+    round_number,
     with_settings,
 )
-from ratslam.experiments.sizing.report import snippet
-from ratslam.experiments.sizing.scene_statistics import Scene, scene_of, short
-from ratslam.experiments.sizing.trial_runs import cheaper
+from ratslam.experiments.sizing.report import changed_settings_yaml
+from ratslam.experiments.sizing.scene_statistics import Scene, scene_of, short_session
+from ratslam.experiments.sizing.trial_runs import cheaper_steps
 from ratslam.experiments.studies.fidelity import with_tier
 from ratslam.experiments.studies.records import RunRecord
 from ratslam.grid.particle_maps import LAYERS
@@ -66,15 +66,15 @@ CONFIGS = st.builds(
 
 @given(LENGTHS, st.sampled_from([-1, 0, 1]))
 def test_nice_numbers_are_near_and_on_the_side_asked_for(value, side):
-    found = nice(value, side)
+    found = round_number(value, side)
     assert value / 2.5 <= found <= value * 2.5
     assert (found - value) * side >= 0
-    assert nice(found, side) == found
+    assert round_number(found, side) == found
 
 
 @given(LENGTHS, LENGTHS)
 def test_a_covering_torus_does_not_wrap(span, cell):
-    cells = covering(span, cell)
+    cells = cells_to_cover(span, cell)
     assert cells % 2 == 1
     assert cells >= FEWEST
     assert cells * cell >= span
@@ -82,7 +82,7 @@ def test_a_covering_torus_does_not_wrap(span, cell):
 
 @given(CONFIGS, scenes())
 def test_what_is_proposed_fits_the_scene_and_is_proposed_again(config, scene):
-    found = {each.key: each.value for each in proposals(config, scene)}
+    found = {each.key: each.value for each in recommend(config, scene)}
     proposed = with_settings(config, found)
     if config.backend != "grid":
         size, across = found["pose_cells.cell_size"], found["pose_cells.cells_xy"]
@@ -95,14 +95,14 @@ def test_what_is_proposed_fits_the_scene_and_is_proposed_again(config, scene):
         assert PARTICLES[0] <= proposed.grid.particles <= PARTICLES[1]
         assert proposed.grid.particles * LAYERS * side**2 * 4 <= MEMORY * 2**20
     fixed = config.model_copy(update={"backend": proposed.backend})  # what is proposed for recall, for recall
-    again = with_settings(fixed, {each.key: each.value for each in proposals(fixed, scene)})
-    assert not [each.key for each in proposals(again, scene) if each.changed]
+    again = with_settings(fixed, {each.key: each.value for each in recommend(fixed, scene)})
+    assert not [each.key for each in recommend(again, scene) if each.changed]
 
 
 @given(CONFIGS, scenes())
 def test_the_snippet_makes_the_configuration_the_proposed_one(config, scene):
-    found = proposals(config, scene)
-    text = snippet(found)
+    found = recommend(config, scene)
+    text = changed_settings_yaml(found)
     assert bool(text) == any(each.changed for each in found)
     if text:
         document = parse(f"simulation: {{}}\n{text}" if "simulation" not in text else text, "a")
@@ -116,7 +116,7 @@ def test_the_snippet_makes_the_configuration_the_proposed_one(config, scene):
 
 @given(CONFIGS)
 def test_a_cheaper_step_asks_for_less_of_one_thing(config):
-    for step in cheaper(config):
+    for step in cheaper_steps(config):
         less = with_settings(config, step.settings)
         assert less != config
         again = RunConfig.model_validate(less.model_dump(exclude_unset=True))
@@ -145,15 +145,15 @@ def test_a_scene_is_what_its_odometry_tells():
 
 def test_a_session_is_cut_to_about_so_many_cycles(tmp_path):
     config = configuration(simulation={"path": {"explore": 400.0}})
-    with open_source(short(config, 100, tmp_path)) as source:
+    with open_source(short_session(config, 100, tmp_path)) as source:
         assert 80 <= source.length <= 110
     config = configuration(create_simulation={"reports": 500})
-    with open_source(short(config, 60, tmp_path)) as source:
+    with open_source(short_session(config, 60, tmp_path)) as source:
         assert source.length == 60
     for name in ("a_square3.npz", "touch_circuits.mcap"):
         (tmp_path / name).mkdir()
         config = configuration(recording={"file": str(GOLDEN / name)})
-        with open_source(config) as whole, open_source(short(config, 37, tmp_path / name)) as part:
+        with open_source(config) as whole, open_source(short_session(config, 37, tmp_path / name)) as part:
             assert part.view_shape == whole.view_shape
             assert part.whiskers == whole.whiskers
             both = zip(part, islice(whole, 37), strict=True)
@@ -167,7 +167,7 @@ def test_a_session_is_cut_to_about_so_many_cycles(tmp_path):
 @pytest.mark.soak
 def test_a_small_arena_is_sized(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(
-        "ratslam.experiments.sizing.trial_runs.cheaper", lambda config: cheaper(config)[:1]
+        "ratslam.experiments.sizing.trial_runs.cheaper_steps", lambda config: cheaper_steps(config)[:1]
     )  # less to compile
     path = tmp_path / "arena.yaml"
     path.write_text("create_simulation: {reports: 80}\nbackend: grid\nsession: {precision: float32}\n")
@@ -175,11 +175,11 @@ def test_a_small_arena_is_sized(tmp_path, capsys, monkeypatch):
     told = capsys.readouterr().out
     assert "60 of 80 cycles" in told
     rows = {line.split("  ")[0]: line.split()[-8:] for line in told.splitlines() if "  " in line}
-    proposed, fewer = ([float(cell) for cell in rows[name][-7:]] for name in ("proposed", "33 particles"))
+    proposed, fewer = ([float(cell) for cell in rows[name][-7:]] for name in ("recommended", "33 particles"))
     assert proposed[2] == 1
     assert fewer[2] == pytest.approx(fewer[0] / proposed[0], abs=0.02)
     assert proposed[4:] != fewer[4:]
-    assert told.rstrip().endswith("arena.yaml has it like that already")
+    assert told.rstrip().endswith("arena.yaml has these settings already")
 
 
 @pytest.fixture
