@@ -125,10 +125,8 @@ def grid_table(
         yield markdown_row([f"{world}, {ODOMETRY_ERRORS.get(row, row)}", *_cells(found)])
 
 
-def measure_session(task: GridTask) -> GridFigures:
-    """Runs and measures one session."""
-
-    prepare_precision("float64")
+def task_config(task: GridTask) -> RunConfig:
+    """The configuration of a session."""
     noise, changes = ROWS[task.row]
     create_simulation = WORLDS[task.world] | {"wheels": {"noise": noise}, "seed": task.arena}
     given = {
@@ -136,7 +134,13 @@ def measure_session(task: GridTask) -> GridFigures:
         "backend": "grid",
         "session": {"precision": "float32"},
     } | changes
-    config = RunConfig.model_validate(given)
+    return RunConfig.model_validate(given)
+
+
+def measure_session(task: GridTask) -> GridFigures:
+    """Runs and measures one session."""
+    prepare_precision("float64")
+    config = task_config(task)
     source: Any = open_source(config)
     config = complete(config, source)
     grid = config.grid.model_copy(update={"side": MAP_SIDES[task.world]})

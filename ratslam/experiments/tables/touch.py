@@ -185,13 +185,18 @@ def measure_session(task: TouchTask) -> SessionFigures:
     )
 
 
+def task_config(task: TouchTask) -> RunConfig:
+    """The configuration of a session."""
+    row = ROWS[task.row]
+    simulation = row.simulation | {"seed": task.seed}
+    simulation["maze"] = {"seed": task.maze} | simulation.get("maze", {})
+    given = {"simulation": simulation, "touch": row.touch, "backend": task.backend}
+    return RunConfig.model_validate(given)
+
+
 def _simulate(task: TouchTask) -> tuple[InMemorySource, RunConfig, list[int]]:
     """The views of a session, its completed configuration, and the steps of its kidnaps."""
-    condition = ROWS[task.row]
-    simulation = condition.simulation | {"seed": task.seed}
-    simulation["maze"] = {"seed": task.maze} | simulation.get("maze", {})
-    given = {"simulation": simulation, "touch": condition.touch, "backend": task.backend}
-    config = RunConfig.model_validate(given)
+    config = task_config(task)
     with open_source(config) as source:
         kidnaps = np.flatnonzero(source.kidnapped).tolist()  # type: ignore[attr-defined]
         config = complete(config, source)

@@ -72,7 +72,7 @@ def test_bad_templates_have_large_errors(templates: StrainTemplates) -> None:
     mean[5] = mean[12]
     tried = drive_held_out(CONFIG, templates._replace(mean=mean))
     assert (errors(tried, "winner", True)[5] > 5).all()
-    with pytest.raises(InputError, match="do not turn"):
+    with pytest.raises(InputError, match="does not fit straight whiskers"):
         drive_held_out(CONFIG, templates._replace(mean=templates.mean[::-1].copy()))
 
 
@@ -94,7 +94,13 @@ def test_sessions_use_the_file(folder: Path, templates: StrainTemplates) -> None
     config = RunConfig.model_validate(
         {
             "create_simulation": {"reports": 60, "seed": 1},
-            "touch": {"reports": {"walls": "template", "templates": folder / "new" / "t.npz", "flat": None}},
+            "touch": {
+                "reports": {
+                    "walls": "template",
+                    "templates": folder / "new" / "t.npz",
+                    "max_template_error": None,
+                }
+            },
         }
     )
     assert config.create_simulation is not None

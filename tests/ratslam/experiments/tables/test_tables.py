@@ -38,6 +38,16 @@ def test_unknown_rows_are_refused_with_a_list():
         select_rows(["c"], {"a": 1, "b": 2}, ["b"])
 
 
+@pytest.mark.parametrize("row", touch.ROWS)
+def test_touch_rows_are_valid_configurations(row):
+    assert touch.task_config(touch.TouchTask(row, 9000, 3)).simulation.seed == 3
+
+
+@pytest.mark.parametrize("row", grid.ROWS)
+def test_grid_rows_are_valid_configurations(row):
+    assert grid.task_config(grid.GridTask("A", row, 9003)).create_simulation.seed == 9003
+
+
 def test_a_touch_row_gives_medians_worst_values_and_sums(monkeypatch):
     worse = SESSION._replace(em=0.5, arcr=0.1)
     tasks = answers(monkeypatch, touch, lambda task: worse if task.seed == 101 else SESSION)
