@@ -643,7 +643,7 @@ def test_only_a_known_id_tells_whether_the_map_is_right():
     memory = filled(FLAT, np.zeros((40, 0)), spaced(40), labels=ids)
     memory = memory._replace(pose=jnp.asarray(spaced(40)[20]))
     answers = {label: label_likelihood(memory, label) for label in (20, 3, 77)}
-    assert [bool(observation_model.telling) for *_, weighing in answers.values()] == [True, True, False]
+    assert [bool(weighing.telling) for *_, weighing in answers.values()] == [True, True, False]
     assert [int(found.agree) for _, found, _ in answers.values()] == [1, 0, -1]
 
 
