@@ -43,7 +43,7 @@ def perturb(log: InMemorySource, seed: int) -> InMemorySource:
     motion[:, 2] += moving * TURN_NOISE / np.sqrt(between) * stream.standard_normal(len(motion))
     noise = VIEW_NOISE * stream.standard_normal(log.views.shape)
     views = np.where(log.seen[:, None, None, None], np.clip(log.views + noise, 0, 1), log.views)
-    label = _wrong(log.label, stream)
+    label = corrupt_labels(log.label, stream)
 
     dropped = np.zeros(len(motion), bool)
     dropped[looks] = stream.random(len(looks)) < DROPPED
@@ -65,7 +65,7 @@ def perturb(log: InMemorySource, seed: int) -> InMemorySource:
     )
 
 
-def _wrong(label: np.ndarray, stream: np.random.Generator) -> np.ndarray:
+def corrupt_labels(label: np.ndarray, stream: np.random.Generator) -> np.ndarray:
     """Labels [N], some replaced by new ones and some by those of other rows."""
     given = np.flatnonzero(label >= 0)
     label, chance = label.copy(), stream.random(len(given))

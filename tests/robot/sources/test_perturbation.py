@@ -45,7 +45,7 @@ def test_without_noise_the_path_is_kept_whole_though_rows_are_dropped(log, monke
 
 def test_some_ids_become_new_and_some_wrong():
     label = np.where(np.arange(3000) % 3 == 0, np.arange(3000) // 300, -1).astype(np.int32)
-    changed = perturbation._wrong(label, np.random.default_rng(0))
+    changed = perturbation.corrupt_labels(label, np.random.default_rng(0))
     given = label >= 0
     assert np.array_equal(changed < 0, ~given)
     new = changed[given] > label.max()
