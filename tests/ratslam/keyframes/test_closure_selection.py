@@ -1,4 +1,4 @@
-"""Laws of arbitration: the set of sequences that leaves the least cost, and odometry cut where it broke."""
+"""Closure selection: the set of sequences with the least cost, and cuts where the odometry broke."""
 
 from __future__ import annotations
 
