@@ -151,7 +151,7 @@ class EmulatedHead:
         self.fifo.clear()
 
     def counts(self) -> dict[str, int]:
-        """Frames: made = sent + queued + lost (nobody read) + dropped (by a stop) + skipped (by a fault)."""
+        """Frames: made = sent + queued + lost (not read) + dropped (by a stop) + skipped (by a fault)."""
         fifo, skipped = self.fifo, self.faults.skipped
         return {
             "made": fifo.made + skipped,

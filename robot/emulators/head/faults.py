@@ -19,8 +19,8 @@ class HeadFaults:
     """Active faults; times are the host's monotonic clock, s.
 
     Attributes:
-        plugged: whether the head is on the bus. plugs: how often it was plugged in; whoever opened it before
-            the last time has lost it. skipped: frames left out so far. jump: us, by which its clock is off.
+        plugged: whether the head is on the bus. plugs: how often it was plugged in; connections opened before
+            the last time are lost. skipped: number of skipped frames. jump: offset of its clock, us.
     """
 
     def __init__(self, whiskers: int, random: np.random.Generator) -> None:

@@ -34,7 +34,7 @@ def serve(config: HeadEmulatorConfig) -> None:
     """Serves a head until the process ends; prints `ready` when it listens.
 
     Raises:
-        InputError: there is no such maze or way. OSError: somebody else listens there.
+        InputError: invalid maze or path. OSError: the port is in use.
     """
     set_niceness(URGENT)
     head = ur10_head(config.head)

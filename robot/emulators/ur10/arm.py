@@ -37,7 +37,7 @@ class EmulatedArm:
 
     Attributes:
         state: where it is. force: N and Nm at the tool, in the base. penetration_max: deepest in a wall, m.
-        marks: progress its orders told and nobody has taken yet. scale: the speed slider, 0 to 1.
+        marks: progress reported by its orders, not read yet. scale: the speed slider, 0 to 1.
     """
 
     def __init__(self, config: UrEmulatorConfig) -> None:

@@ -1,6 +1,6 @@
 """The real client libraries against the emulator, and against a real controller where one is named.
 
-`RATSLAM_UR_HOST=192.168.56.101 pytest tests/robot/emulators/test_ur_clients.py` runs the tests that need no
+`RATSLAM_UR_HOST=192.168.56.101 pytest tests/robot/emulators/ur10/test_clients.py` runs the tests that need no
 faults on that controller (or the vendor's simulator). They move the tool 20 mm upwards from where it stands
 and turn the last joint by 3 degrees: leave it room.
 """
