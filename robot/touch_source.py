@@ -82,6 +82,9 @@ class TouchSource:
 def open_touch_source(source: Source, config: TouchConfig) -> Source:
     """The source, its whisker readings turned into observations.
 
+    Args:
+        config: with the whiskers of the source (`head_config_of`, `report_config_of`).
+
     Raises:
         InputError: the source has another number of whiskers than the configuration, or no calibration where
             one is needed.
@@ -90,9 +93,8 @@ def open_touch_source(source: Source, config: TouchConfig) -> Source:
     if not info.raw_whiskers:
         return source
     if info.planar_whiskers is not None:
-        reports = report_config_of(info, config.reports)
-        templates = strain_templates_of(source, reports)
-        return TouchSource(source, lambda: ReportFrontend(reports, templates), "touch.reports.mounts")
+        templates = strain_templates_of(source, config.reports)
+        return TouchSource(source, lambda: ReportFrontend(config.reports, templates), "touch.reports.mounts")
     frontend = Frontend(config, info.calibration)
     return TouchSource(source, lambda: frontend, "touch.head")
 
@@ -125,12 +127,16 @@ def observation_of(sample: Sample) -> Observation:
 
 
 def planar_whiskers_of(source: Source, config: TouchConfig) -> PlanarWhiskers | None:
-    """The whiskers of a source projected to the floor; None for a source without whiskers."""
+    """The whiskers of a source projected to the floor; None for a source without whiskers.
+
+    Args:
+        config: with the whiskers of the source.
+    """
     if not source.whiskers:
         return None
     if source.info.planar_whiskers is not None:
-        return report_config_of(source.info, config.reports).feelers
-    return project_to_plane(ur10_head(head_config_of(source.info, config.head)), MAZE_WALL_HEIGHT)
+        return config.reports.feelers
+    return project_to_plane(ur10_head(config.head), MAZE_WALL_HEIGHT)
 
 
 def report_config_of(info: SourceInfo, config: ReportFrontendConfig) -> ReportFrontendConfig:
