@@ -362,7 +362,7 @@ def test_a_full_disk_is_told_once_and_the_recording_stays_readable(tmp_path: Pat
     assert fault is recorder.fault
     assert fault.outcome is SessionOutcome.DISK_FULL
     assert str(path) in fault.detail
-    assert "free room" in fault.detail
+    assert "free space" in fault.detail
     assert max(sizes) < 20_000  # no half chunks: what could not be written whole was taken off
     recording = Recording(path)
     assert recording.truncated
