@@ -34,6 +34,12 @@ class Timing(Settings):
     total_s: float
     """Time of the whole run including simulation and scoring, s."""
 
+    def values(self, steps: int) -> dict[str, float | None]:
+        """The times by their names in `studies.metrics`."""
+        whole = 1e6 * max(self.total_s - self.compile_s, 0.0) / steps if steps else None
+        times = self.median_us, self.p99_us, whole, self.compile_s
+        return dict(zip(("step_time", "step_time_p99", "run_time", "compile_time"), times, strict=True))
+
 
 class Machine(Settings):
     """Where a run was computed."""
@@ -87,23 +93,11 @@ class RunRecord(Settings):
 
     def value(self, name: str) -> float | None:
         """A quantity by any name of `studies.metrics`; None if the run has none."""
-        if self.timing is not None and name in ("step_time", "step_time_p99", "compile_time"):
-            timing = self.timing
-            return {
-                "step_time": timing.median_us,
-                "step_time_p99": timing.p99_us,
-                "compile_time": timing.compile_s,
-            }[name]
-        if name == "run_time":
-            return self._run_time()
+        if name in self.quantities:
+            return self.quantities[name].value
         if name == "memory":
             return self.memory
-        return self.quantities[name].value if name in self.quantities else None
-
-    def _run_time(self) -> float | None:
-        if self.timing is None or not self.steps:
-            return None
-        return 1e6 * max(self.timing.total_s - self.timing.compile_s, 0.0) / self.steps
+        return self.timing.values(self.steps).get(name) if self.timing else None
 
 
 def run_key(hash: str, seed: int, copy_number: int) -> str:

@@ -239,11 +239,11 @@ def _unambiguous(plan: StudyPlan, document: Document) -> None:
         if overlap(first, second):
             raise InputError(document.at_key(at), f"sets what {first!r} varies", "one or the other")
     for key, values in plan.vary.items():
-        told = [json.dumps(value, sort_keys=True) for value in values]
-        twice = next((k for k, text in enumerate(told) if text in told[:k]), None)
+        texts = [json.dumps(value, sort_keys=True) for value in values]
+        twice = next((k for k, text in enumerate(texts) if text in texts[:k]), None)
         if twice is not None:
             raise InputError(
-                document.at_value(("vary", key, twice)), f"{told[twice]} given twice", "each once"
+                document.at_value(("vary", key, twice)), f"{texts[twice]} given twice", "each once"
             )
     for key, _ in several:
         overridden = document.places.get(("set", key))
