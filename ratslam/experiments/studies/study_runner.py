@@ -26,7 +26,7 @@ def run_jobs(
         log: records of earlier calls; new ones are added.
         done: called with each record in the order of completion, once for each key.
     """
-    missing, wanted = _missing(jobs, log, done), {job.key: job for job in reversed(jobs)}
+    missing, wanted = _missing(jobs, log, done), _first_of_each_key(jobs)
     with closing(executor.completed(run_job, missing, _killed)) as completed:
         found = dict(log.records)
         for job in jobs:
@@ -58,12 +58,19 @@ def measure_jobs(jobs: Sequence[Job], log: RunLog, done: Done | None = None) -> 
 
 def _missing(jobs: Sequence[Job], log: RunLog, done: Done | None) -> list[Job]:
     """The jobs without a record, each key once."""
-    wanted = {job.key: job for job in reversed(jobs)}  # of equal ones, the first
+    wanted = _first_of_each_key(jobs)
     if done:
         for key, job in wanted.items():
             if key in log.records:
                 done(_named(log.records[key], job))
-    return [job for key, job in reversed(wanted.items()) if key not in log.records]
+    return [job for key, job in wanted.items() if key not in log.records]
+
+
+def _first_of_each_key(jobs: Sequence[Job]) -> dict[str, Job]:
+    wanted: dict[str, Job] = {}
+    for job in jobs:
+        wanted.setdefault(job.key, job)
+    return wanted
 
 
 def _keep(record: RunRecord, log: RunLog, processes: int) -> RunRecord:
