@@ -21,7 +21,7 @@ SYSTEM = "/usr/bin/python3"
 NEEDED = "apt-get install umockdev gir1.2-umockdev-1.0 python3-gi libusb-1.0-0"
 
 
-def lacking() -> str:
+def missing_packages() -> str:
     """What this machine lacks; '' if nothing."""
     if shutil.which("umockdev-wrapper") is None or not Path(SYSTEM).exists():
         return "no umockdev"
@@ -32,7 +32,7 @@ def lacking() -> str:
 
 def on_testbed(host: str, *program: str) -> tuple[int, str, str]:
     """A program run with a head on its USB: exit code, and what it printed."""
-    words = ["umockdev-wrapper", SYSTEM, "-m", "robot.emulators.umock", "--host", host, "--", *program]
+    words = ["umockdev-wrapper", SYSTEM, "-m", "tests.robot.emulators.umock", "--host", host, "--", *program]
     pipe = subprocess.PIPE
     with subprocess.Popen(
         words, cwd=ROOT, stdout=pipe, stderr=pipe, text=True, start_new_session=True
@@ -48,11 +48,11 @@ def on_testbed(host: str, *program: str) -> tuple[int, str, str]:
 @pytest.fixture(scope="module", autouse=True)
 def _needs_umockdev() -> None:
     pytest.importorskip("usb.core", reason="pyusb is not installed: pip install 'ratslam[live]'")
-    if found := lacking():
+    if found := missing_packages():
         pytest.skip(f"{found}: {NEEDED}")
 
 
-def test_libusb_reads_it_and_hears_of_everything_that_goes_wrong(tmp_path: Path, loopback: str) -> None:
+def test_libusb_reads_frames_and_reports_stalls_and_unplugging(tmp_path: Path, loopback: str) -> None:
     host = f"127.0.2.{loopback.rsplit('.', 1)[1]}"
     with running(HeadEmulatorConfig(host=host, path={"explore": 5}), tmp_path) as head:
         code, said, complained = on_testbed(
@@ -73,7 +73,7 @@ def test_libusb_reads_it_and_hears_of_everything_that_goes_wrong(tmp_path: Path,
         assert head(do="counts")["lost"] == 0
 
 
-def test_the_program_s_end_is_its_end(tmp_path: Path, loopback: str) -> None:
-    """With no head at that address, too: then the bus is empty."""
+def test_the_exit_code_is_that_of_the_program(tmp_path: Path, loopback: str) -> None:
+    """Without a head at the address, the bus is empty."""
     program = "import usb.core, sys; sys.exit(7 if usb.core.find() is None else 1)"
     assert on_testbed("127.0.3.1", sys.executable, "-c", program)[0] == 7

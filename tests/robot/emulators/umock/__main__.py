@@ -1,9 +1,11 @@
-"""A program run with an emulated head on its USB, through the system's libusb and umockdev:
+"""Runs a program with an emulated head on its USB, through the system's libusb and umockdev:
 
-    umockdev-wrapper /usr/bin/python3 -m robot.emulators.umock --host 127.0.0.11 -- PROGRAM ...
+    umockdev-wrapper /usr/bin/python3 -m tests.robot.emulators.umock --host 127.0.0.11 -- PROGRAM ...
 
-The head is `python -m robot.emulators.head` at that address. The interpreter is the one that Debian's
-python3-gi and gir1.2-umockdev-1.0 are for; the program may be any. Ends as the program does.
+umockdev stands in for the kernel; this program turns the ioctls of libusb into requests to
+`python -m robot.emulators.head` at that address. Needs Debian's `umockdev gir1.2-umockdev-1.0 python3-gi` and the
+interpreter of that package; PROGRAM may use any. It must use the system's libusb: the one in `libusb-package` gets
+unplug events from the kernel only. Exits with the exit code of PROGRAM.
 """
 
 from __future__ import annotations
@@ -17,13 +19,12 @@ import threading
 from typing import Any
 
 from robot.drivers.head.usb_tcp_protocol import PORT, Op, UsbConnection
-from robot.emulators.umock.usbfs import REAP, REAP_NOW, Usbfs
+from tests.robot.emulators.umock.usbfs import REAP, REAP_NOW, Usbfs
 
 LOOK = 20
 """Period of the check whether the head is plugged in, ms."""
 PATIENCE = 0.002
-"""Time that a reap waits, s: libusb takes the node as readable at any time and would otherwise never pause.
-"""
+"""Time that a reap waits, s; without it libusb would poll the node continuously."""
 
 
 class Bus:
@@ -126,7 +127,7 @@ def _description(number: int, described: bytes) -> str:
 
 def main() -> int:
     """The program; returns the client's exit code."""
-    parser = argparse.ArgumentParser(prog="python -m robot.emulators.umock", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tests.robot.emulators.umock", description=__doc__)
     parser.add_argument("--host", default="127.0.0.1", help="of the emulated head")
     parser.add_argument("--port", type=int, default=PORT)
     parser.add_argument("program", nargs="+")

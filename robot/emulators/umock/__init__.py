@@ -1,1 +1,0 @@
-"""An emulated head behind real libusb: umockdev stands in for the kernel. Needs no package but GObject's."""
