@@ -3,9 +3,9 @@
     umockdev-wrapper /usr/bin/python3 -m tests.robot.emulators.umock --host 127.0.0.11 -- PROGRAM ...
 
 umockdev stands in for the kernel; this program turns the ioctls of libusb into requests to
-`python -m robot.emulators.head` at that address. Needs Debian's `umockdev gir1.2-umockdev-1.0 python3-gi` and the
-interpreter of that package; PROGRAM may use any. It must use the system's libusb: the one in `libusb-package` gets
-unplug events from the kernel only. Exits with the exit code of PROGRAM.
+`python -m robot.emulators.head` at that address. Needs Debian's `umockdev gir1.2-umockdev-1.0 python3-gi` and
+the interpreter of that package; PROGRAM may use any. It must use the system's libusb: the one in
+`libusb-package` gets unplug events from the kernel only. Exits with the exit code of PROGRAM.
 """
 
 from __future__ import annotations
