@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, Protocol
 
 from robot.simulation.create.session import CreateSimulationConfig, train_strain_templates
-from robot.sources.source import Sample, Source
+from robot.sources.source import ClosedSource, Sample, Source
 from robot.sources.source_info import SourceInfo
 from tactile.base.errors import InputError
 from tactile.base.types import Observation
@@ -36,7 +35,7 @@ class ReadingProcessor(Protocol):
         """The observation of a reading, or None if its motion is added to the next one."""
 
 
-class TouchSource:
+class TouchSource(ClosedSource):
     """A source of observations made from a source of whisker readings.
 
     Args:
@@ -69,14 +68,6 @@ class TouchSource:
                     f"{self.view_shape}, the shape of whisker images",
                 )
             yield sample._replace(reading=reading)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        pass
 
 
 def open_touch_source(source: Source, config: TouchConfig) -> Source:

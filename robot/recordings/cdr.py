@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from robot.recordings.schemas import CYCLE, OBSERVATION, REPORT, WHISK
+from robot.recordings.schemas import CYCLE, OBSERVATION, REPORT, SCHEMAS, WHISK
 from robot.sources.source import Sample
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Observation, Odometry, Report, Whisk
@@ -22,6 +22,11 @@ FELT = ("touched", "highest", "reach")
 """Values of each whisker in the field `felt` of a Whisk message."""
 FLAGS = {OBSERVATION: ("contact", "dead"), WHISK: ("alive", "contact", "held"), REPORT: ("alive", "contact")}
 """Meaning of the bits of `flags`, from the lowest."""
+SCHEMA_OF_READING = {Observation: OBSERVATION, Cycle: CYCLE, Whisk: WHISK, Report: REPORT}
+SAMPLES_AT = {CYCLE: 44, REPORT: 56}
+"""Byte position of the number of samples in a message."""
+TYPES = {"float64": "<f8", "int32": "<i4", "uint32": "<u4", "uint8": "u1", "bool": "?"}
+"""NumPy types of the types in `SCHEMAS`."""
 
 
 class Malformed(ValueError):
@@ -50,20 +55,16 @@ def encode(sample: Sample, view_shape: tuple[int, int, int], whiskers: int) -> t
         InputError: a field has another shape, or values that its type cannot hold exactly.
     """
     reading = sample.reading
+    name, samples = SCHEMA_OF_READING[type(reading)], 0
     values: dict[str, Any] = {**reading._asdict(), **reading.odometry._asdict()}
-    if isinstance(reading, Cycle):
-        name, layout = CYCLE, cycle_layout(len(np.atleast_1d(reading.time)), whiskers)
-        values["sample_time"] = reading.time
+    if isinstance(reading, Cycle | Report):
+        samples, values["sample_time"] = len(np.atleast_1d(reading.time)), reading.time
     elif isinstance(reading, Whisk):
-        name, layout = WHISK, whisk_layout(whiskers)
         numbers = np.dtype(("<f8", (whiskers,)))
         values["felt"] = np.stack([_exactly(field, values[field], numbers) for field in FELT], axis=1)
-    elif isinstance(reading, Report):
-        name, layout = REPORT, report_layout(len(np.atleast_1d(reading.time)), whiskers)
-        values["sample_time"] = reading.time
     else:
-        name, layout = OBSERVATION, observation_layout(view_shape, whiskers)
         values["dead"] = ~_exactly("alive", reading.alive, np.dtype(("?", (whiskers,)))).astype(bool)
+    layout = message_layout(name, view_shape, whiskers, samples)
     if name in FLAGS:
         values["flags"] = _packed(values, FLAGS[name], whiskers)
     values["time"] = sample.time
@@ -79,20 +80,12 @@ def decode(name: str, message: bytes, view_shape: tuple[int, int, int], whiskers
     Raises:
         Malformed: the message does not fit this schema, view shape and number of whiskers.
     """
-    if name == CYCLE:
-        samples = int.from_bytes(message[44:48], "little")
+    samples = 0
+    if name in SAMPLES_AT:
+        samples = int.from_bytes(message[SAMPLES_AT[name] :][:4], "little")
         if samples * (1 + 3 * whiskers) > MAX_NUMBERS:
-            raise Malformed(f"a cycle of {samples} samples")
-        layout = cycle_layout(samples, whiskers)
-    elif name == WHISK:
-        layout = whisk_layout(whiskers)
-    elif name == REPORT:
-        samples = int.from_bytes(message[56:60], "little")
-        if samples * (1 + 2 * whiskers) > MAX_NUMBERS:
-            raise Malformed(f"a report of {samples} samples")
-        layout = report_layout(samples, whiskers)
-    else:
-        layout = observation_layout(view_shape, whiskers)
+            raise Malformed(f"a message of {samples} samples")
+    layout = message_layout(name, view_shape, whiskers, samples)
     if len(message) != layout.dtype.itemsize:
         raise Malformed(f"a message of {len(message)} bytes where {layout.dtype.itemsize} were expected")
     if any(message[start:stop] != content for start, stop, content in layout.fixed):
@@ -138,119 +131,41 @@ def decode_truth(message: bytes) -> tuple[float, np.ndarray]:
     return float(time), np.array(pose)
 
 
-@lru_cache(maxsize=16)
-def observation_layout(view_shape: tuple[int, int, int], whiskers: int) -> Layout:
-    """The packed form of the Observation schema for these shapes."""
-    pixels = int(np.prod(view_shape))
-    return _layout(
-        [
-            *_ODOMETRY,
-            ("wall_point", "<f8", (2,)),
-            ("wall_sd", "<f8"),
-            ("motion", "<i4"),
-            ("label", "<i4"),
-            ("view_shape", "<u4", (3,)),
-            ("view_length", "<u4"),
-            ("view", "<f8", view_shape),
-            ("whiskers", "<u4"),
-            ("point_length", "<u4"),
-            ("point", "<f8", (whiskers, 2)),
-            ("flags_length", "<u4"),
-            ("flags", "u1", (whiskers,)),
-            ("view_seen", "?"),
-            ("wall", "?"),
-        ],
-        view_shape=view_shape,
-        view_length=pixels,
-        whiskers=whiskers,
-        point_length=2 * whiskers,
-        flags_length=whiskers,
-    )
-
-
-@lru_cache(maxsize=16)
-def whisk_layout(whiskers: int) -> Layout:
-    """The packed form of the Whisk schema for this number of whiskers."""
-    return _layout(
-        [
-            *_ODOMETRY,
-            ("whiskers", "<u4"),
-            ("felt_length", "<u4"),
-            ("felt", "<f8", (whiskers, len(FELT))),
-            ("flags_length", "<u4"),
-            ("flags", "u1", (whiskers,)),
-        ],
-        whiskers=whiskers,
-        felt_length=len(FELT) * whiskers,
-        flags_length=whiskers,
-    )
-
-
-@lru_cache(maxsize=256)
-def report_layout(samples: int, whiskers: int) -> Layout:
-    """The packed form of the Report schema for these shapes."""
-    return _layout(
-        [
-            *_ODOMETRY,
-            ("motion", "<i4"),
-            ("moment", "<i4"),
-            ("whiskers", "<u4"),
-            ("sample_time_length", "<u4"),
-            ("sample_time", "<f8", (samples,)),
-            ("axes", "<u4"),
-            ("strain_length", "<u4"),
-            ("strain", "<f8", (samples, whiskers, 2)),
-            ("flags_length", "<u4"),
-            ("flags", "u1", (whiskers,)),
-        ],
-        whiskers=whiskers,
-        sample_time_length=samples,
-        axes=2,
-        strain_length=2 * samples * whiskers,
-        flags_length=whiskers,
-    )
-
-
-@lru_cache(maxsize=64)
-def cycle_layout(samples: int, whiskers: int) -> Layout:
-    """The packed form of the Cycle schema for these shapes."""
-    return _layout(
-        [
-            *_ODOMETRY,
-            ("samples", "<u4"),
-            ("sample_time_length", "<u4"),
-            ("sample_time", "<f8", (samples,)),
-            ("whiskers", "<u4"),
-            ("angle_length", "<u4"),
-            ("angle", "<f8", (samples, whiskers)),
-            ("axes", "<u4"),
-            ("deflection_length", "<u4"),
-            ("deflection", "<f8", (samples, whiskers, 2)),
-        ],
-        samples=samples,
-        sample_time_length=samples,
-        whiskers=whiskers,
-        angle_length=samples * whiskers,
-        axes=2,
-        deflection_length=2 * samples * whiskers,
-    )
-
-
-_ODOMETRY = [("cdr", "u1", (4,)), *((name, "<f8") for name in ("time", "dx", "dy", "dtheta", "dt"))]
-
-
-def _layout(fields: list[Any], **fixed: Any) -> Layout:
+@lru_cache(maxsize=512)
+def message_layout(name: str, view_shape: tuple[int, int, int], whiskers: int, samples: int) -> Layout:
+    """The packed form of the schema of a reading for these sizes."""
+    shapes = {
+        "view": view_shape,
+        "point": (whiskers, 2),
+        "flags": (whiskers,),
+        "felt": (whiskers, len(FELT)),
+        "sample_time": (samples,),
+        "angle": (samples, whiskers),
+        "deflection": (samples, whiskers, 2),
+        "strain": (samples, whiskers, 2),
+    }
+    fixed: dict[str, Any] = {"cdr": list(CDR)}
+    fields: list[tuple[str, str, tuple[int, ...]]] = [("cdr", "u1", (4,))]
+    for line in SCHEMAS[name].splitlines():
+        kind, field = line.split()[:2]
+        base, _, size = kind.partition("[")
+        if size == "]":
+            fixed[f"{field}_length"] = int(np.prod(shapes[field]))
+            fields.append((f"{field}_length", "<u4", ()))
+        fields.append((field, TYPES[base], (int(size[:-1]),) if size[:-1] else shapes.get(field, ())))
+    sizes = {"view_shape": view_shape, "whiskers": whiskers, "samples": samples, "axes": 2}
     dtype = np.dtype(fields)
+    fixed |= {field: size for field, size in sizes.items() if field in (dtype.names or ())}
     blank = np.zeros((), dtype)
-    for name, value in {"cdr": list(CDR), **fixed}.items():
-        blank[name] = value
+    for field, value in fixed.items():
+        blank[field] = value
     content = blank.tobytes()
-    places = [(dtype.fields[name][1], dtype[name].itemsize) for name in ("cdr", *fixed)]  # type: ignore[index]
+    places = [(dtype.fields[field][1], dtype[field].itemsize) for field in fixed]  # type: ignore[index]
     return Layout(
         dtype=dtype,
         blank=blank,
         fixed=tuple((start, start + size, content[start : start + size]) for start, size in places),
-        fields=tuple(name for name in dtype.names or () if name != "cdr" and name not in fixed),
+        fields=tuple(field for field, *_ in fields if field not in fixed),
     )
 
 

@@ -8,26 +8,25 @@ from collections.abc import Callable, Iterator
 from contextlib import closing
 from itertools import chain
 from pathlib import Path
-from types import TracebackType
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 
 from robot.recordings.cdr_live import Event
 from robot.recordings.mcap_scanner import McapScanner
-from robot.recordings.mcap_writer import McapWriter
+from robot.recordings.mcap_writer import McapWriter, existing_error
 from robot.recordings.recorder import Recorder
 from robot.recordings.sanity_checks import clock_errors, nonfinite_errors, view_errors
 from robot.recordings.schemas import TRUTH
 from robot.recordings.unit_check import DEFAULT_LIMITS, MotionTrack, UnitLimits, unit_errors
 from robot.sources.input_files import raise_errors, require_file, unreadable_error
-from robot.sources.source import Sample, Source, rate_of
+from robot.sources.source import ClosedSource, Sample, Source, rate_of
 from tactile.base.atomic_write import flush_to_disk, write_atomically
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Observation, Report, Whisk
 
 
-class Recording:
+class Recording(ClosedSource):
     """An MCAP recording as a `Source`. All samples are checked first; iteration then reads them one by one,
     so that raw recordings larger than the memory can be replayed.
 
@@ -118,14 +117,6 @@ class Recording:
             "a file that does not change while it is read",
         )
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        pass
-
 
 class Recovery(NamedTuple):
     """Result of `recover`.
@@ -163,7 +154,7 @@ def recover(path: Path, out: Path) -> Recovery:
     """
     require_file(path)
     if out.exists():
-        raise InputError(str(out), "exists already", "a new file", "choose another name or move it")
+        raise existing_error(out)
     scanner = McapScanner(path)
     entries = scanner.entries()
     first = next(entries, None)

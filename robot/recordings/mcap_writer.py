@@ -18,6 +18,14 @@ from robot.recordings.schemas import READINGS, SCHEMAS, TOPICS, TRUTH
 from robot.sources.source_info import SourceInfo
 from tactile.base.errors import InputError
 
+CHUNK_BYTES = 1 << 16
+"""Size of a chunk before compression."""
+
+
+def existing_error(path: Path) -> InputError:
+    """The error for an output file that exists."""
+    return InputError(str(path), "exists already", "a new file", "choose another name or move it")
+
 
 class RecordingWriteError(InputError):
     """The operating system refuses to write to a recording."""
@@ -34,8 +42,8 @@ class McapWriter:
         path: must not exist yet.
         view_shape, whiskers: of every sample. rate_hz: nominal rate, 0 if unknown; for information.
         info: devices, world and origin; stored at the start of the file, so that a truncated one has it.
-        chunk_bytes, chunk_s: a chunk is written when it has this size before compression, or when the time of
-            its last message differs from that of the chunk before by this many seconds.
+        chunk_s: a chunk is written when it has `CHUNK_BYTES`, or when the time of its last message differs
+            from that of the chunk before by this many seconds.
 
     Attributes:
         count: readings written so far.
@@ -53,7 +61,6 @@ class McapWriter:
         whiskers: int,
         rate_hz: float,
         info: SourceInfo,
-        chunk_bytes: int = 1 << 16,
         chunk_s: float = 0.5,
     ) -> None:
         self.description = RecordingDescription(view_shape, whiskers, rate_hz, _program(), info)
@@ -63,24 +70,18 @@ class McapWriter:
         try:
             self._file = _Whole(path)
         except FileExistsError as error:
-            raise InputError(
-                str(path), "exists already", "a new file", "choose another name or move it"
-            ) from error
+            raise existing_error(path) from error
         except OSError as error:
             raise InputError(str(path), f"cannot be written ({error.strerror})") from error
-        self._chunk_bytes, self._chunk_s = chunk_bytes, chunk_s
+        self._chunk_s = chunk_s
         self._pending, self._flushed = 0, -np.inf  # bytes in the open chunk; time of the last closed one
         self._channels: dict[str, int] = {}
         self.count = 0
         self._number = 0
         self._failed = False
         # Chunks are ended here, never by the library, so that each one reaches the operating system whole.
-        self._writer = Writer(
-            cast(Any, self._file),
-            chunk_size=1 << 62,
-            compression=CompressionType.ZSTD,
-            enable_data_crcs=True,
-        )
+        file = cast(Any, self._file)
+        self._writer = Writer(file, 1 << 62, compression=CompressionType.ZSTD, enable_data_crcs=True)
         self._writer.start(profile="ros2", library=_program())
         self._writer.add_metadata(METADATA, metadata)
         self.flush()
@@ -99,7 +100,7 @@ class McapWriter:
             return
         self._number += 1
         self.count += name in READINGS
-        if self._pending >= self._chunk_bytes or abs(time - self._flushed) >= self._chunk_s:
+        if self._pending >= CHUNK_BYTES or abs(time - self._flushed) >= self._chunk_s:
             self.flush()
             self._flushed = time
 

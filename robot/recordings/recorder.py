@@ -34,17 +34,11 @@ class Recorder:
         whiskers: int = 0,
         rate_hz: float = 0.0,
         info: SourceInfo | None = None,
-        chunk_bytes: int = 1 << 16,
         chunk_s: float = 0.5,
     ) -> None:
+        info = info or SourceInfo()
         self._writer = McapWriter(
-            path,
-            view_shape=view_shape,
-            whiskers=whiskers,
-            rate_hz=rate_hz,
-            info=info or SourceInfo(),
-            chunk_bytes=chunk_bytes,
-            chunk_s=chunk_s,
+            path, view_shape=view_shape, whiskers=whiskers, rate_hz=rate_hz, info=info, chunk_s=chunk_s
         )
 
     @property
@@ -63,9 +57,7 @@ class Recorder:
             raise InputError("time", f"{sample.time}", "a finite number of seconds")
         described = self._writer.description
         name, message = encode(sample, described.view_shape, described.whiskers)
-        if (
-            sample.truth is not None
-        ):  # before its reading, so that no truncated file has a reading without its truth
+        if sample.truth is not None:  # written first, so that no truncated file has a reading without it
             self._writer.append(TRUTH, sample.time, encode_truth(sample.time, sample.truth))
         self._writer.append(name, sample.time, message)
 

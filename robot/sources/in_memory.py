@@ -5,19 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import repeat
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 
-from robot.sources.source import Sample, Source, rate_of
+from robot.sources.source import ClosedSource, Sample, Source, rate_of
 from robot.sources.source_info import SourceInfo
 from tactile.base.errors import InputError
 from tactile.base.types import Observation, Odometry, observation
 
 
 @dataclass(frozen=True, eq=False)
-class InMemorySource:
+class InMemorySource(ClosedSource):
     """A `Source` over N rows of observations without contacts.
 
     Attributes:
@@ -81,14 +79,6 @@ class InMemorySource:
             yield from repeat(None, self.length)
         else:
             yield from (None if np.isnan(truth).any() else truth.copy() for truth in self.truth)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        pass
 
 
 def load_into_memory(source: Source) -> InMemorySource:

@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
 from robot.sources.input_files import digest_of
-from robot.sources.source import Sample
+from robot.sources.source import ClosedSource, Sample
 from tactile.base.se2 import wrap
 from tactile.base.types import Cycle, Odometry, Report, Whisk
 
@@ -19,7 +18,7 @@ NO_ODOMETRY = Odometry(0.0, 0.0, 0.0, 0.0)
 """Placeholder in a reading until its row's odometry is filled in."""
 
 
-class SimulatedSource(ABC):
+class SimulatedSource(ClosedSource, ABC):
     """A simulated session of N rows; subclasses add the remaining attributes of a `Source`.
 
     Attributes:
@@ -42,14 +41,6 @@ class SimulatedSource(ABC):
         rows = zip(self.time.tolist(), self.odometry, self.truth, self._readings(), strict=True)
         for time, motion, truth, reading in rows:
             yield Sample(time, reading._replace(odometry=Odometry(*motion)), truth.copy())
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        return None  # nothing is open
 
 
 def wrap_headings(pose: np.ndarray) -> np.ndarray:

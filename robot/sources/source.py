@@ -63,6 +63,16 @@ class Source(Protocol):
     ) -> None: ...
 
 
+class ClosedSource:
+    """Base class of sources that keep nothing open: a context manager without effect."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        pass
+
+
 def rate_of(time: np.ndarray) -> float:
     """Median rate of times [N] s, Hz; 0 with fewer than two different times."""
     steps = np.diff(time)

@@ -1,10 +1,9 @@
 """The dynamic fidelity: drives with inertia, whiskers with two bending modes, elastic walls.
 
-Each whisker is a linear system of six states, its angle and the two loads of
-`robot.simulation.head.beam.Beam` with their
-rates, driven by the command (linear between samples) and the force of the wall (constant between samples),
-and is integrated exactly by a matrix exponential. The wall is a stiff spring whose force is taken at the end
-of the sample (implicit, stable at any stiffness):
+Each whisker is a linear system of six states, its angle and the two loads of `Beam` with their rates, driven
+by the command (linear between samples) and the force of the wall (constant between samples), and is
+integrated exactly by a matrix exponential. The wall is a stiff spring whose force is taken at the end of the
+sample (implicit, stable at any stiffness):
     force = spring x (depth without force) / (1 + spring x give).
 """
 
@@ -13,28 +12,22 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import expm
 
-from robot.simulation.head.beam import Beam, StreamConfig, beam_time_unit, make_beam
-from robot.simulation.head.kinematic import MechanicsConfig
-from robot.simulation.head.whisk_stream import WallSweep
+from robot.simulation.head.beam import Beam, beam_time_unit, make_beam
+from robot.simulation.head.whisk_stream import HeadSetup, WallSweep
 from tactile.features.contact import stiffness
-from tactile.whiskers.head_geometry import Head
-from tactile.whiskers.whisking import WhiskingConfig, initial_drive, whisk_command
+from tactile.whiskers.whisking import initial_drive, whisk_command
 
 WALL_STIFFNESS = 300.0
 """Ratio of wall stiffness to whisker stiffness."""
 
 
 def simulate_dynamic(
-    config: StreamConfig,
-    mechanics: MechanicsConfig,
-    whisking: WhiskingConfig,
-    head: Head,
-    sweep: WallSweep,
-    threshold: np.ndarray,
+    setup: HeadSetup, sweep: WallSweep, threshold: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Angle, x and y, [T, N, W] rad: a `robot.simulation.head.whisk_stream.MechanicsModel`."""
+    head, config, mechanics, whisking = setup
     model = make_beam(config.beam.shaft)
-    step, push = _systems(config, mechanics, head, model)  # [W, 6, 8], [W, 6, 3]
+    step, push = _systems(setup, model)  # [W, 6, 8], [W, 6, 3]
     # Displacement of the contact point per unit of each of the first three states.
     arm = np.concatenate([sweep.reach[None], model.at(sweep.reach)])  # [3, T, N, W]
     give = np.einsum("itnw,wij,jtnw->tnw", arm, push[:, :3], arm, optimize=True)
@@ -72,15 +65,13 @@ def simulate_dynamic(
     return angle, side, moment
 
 
-def _systems(
-    config: StreamConfig, mechanics: MechanicsConfig, head: Head, model: Beam
-) -> tuple[np.ndarray, np.ndarray]:
-    """State transition of one sample [W, 6, 8], and the effect of forces along the first three states [W, 6,
-    3].
+def _systems(setup: HeadSetup, model: Beam) -> tuple[np.ndarray, np.ndarray]:
+    """State transition [W, 6, 8] of one sample, and effect [W, 6, 3] of forces along the first three states.
 
     Units are the length, rigidity and mass of each whisker; rates are per time unit of its beam, the rate of
     the command is per sample.
     """
+    head, config, mechanics, _ = setup
     servo = mechanics.servo * model.unit
     lengths, which = np.unique(head.length, return_inverse=True)
     steps, pushes = [], []

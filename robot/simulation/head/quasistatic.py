@@ -9,21 +9,19 @@ whisker bent too far slips off until the cycle ends.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from robot.simulation.head.beam import StreamConfig
 from robot.simulation.head.kinematic import MechanicsConfig
-from robot.simulation.head.whisk_stream import WallSweep
+from robot.simulation.head.whisk_stream import HeadSetup, WallSweep
 from tactile.features.contact import stiffness
-from tactile.whiskers.head_geometry import Head
-from tactile.whiskers.whisking import WhiskDrive, WhiskingConfig, initial_drive, whisk_command
+from tactile.whiskers.whisking import WhiskDrive, initial_drive, whisk_command
 
 WhiskingLaw = Callable[[WhiskDrive, float, np.ndarray], tuple[np.ndarray, WhiskDrive]]
 """Whisking law: from drive states, time in the cycle (s) and newest sensor reading y [N, W] to the commanded
-protractions [N, W] and the next drive states, such as `tactile.whiskers.whisking.whisk_command`, say."""
+protractions [N, W] and the next drive states."""
 
 
 class WhiskerBalance(NamedTuple):
@@ -89,24 +87,12 @@ def advance_balance(
 
 
 def simulate_quasistatic(
-    config: StreamConfig,
-    mechanics: MechanicsConfig,
-    whisking: WhiskingConfig,
-    head: Head,
-    sweep: WallSweep,
-    threshold: np.ndarray,
+    setup: HeadSetup, sweep: WallSweep, threshold: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Angle, x and y, [T, N, W] rad: a `robot.simulation.head.whisk_stream.MechanicsModel`."""
-    law = partial(_law, whisking, threshold, head.shape)
+    head, config, mechanics, whisking = setup
+
+    def law(drive: WhiskDrive, time: float, reading: np.ndarray) -> tuple[np.ndarray, WhiskDrive]:
+        return whisk_command(whisking, drive, time, reading, threshold, head.shape)
+
     return advance_balance(config, mechanics, law, sweep, whiskers_at_rest(*sweep.wall.shape[1:]))[0]
-
-
-def _law(
-    whisking: WhiskingConfig,
-    threshold: np.ndarray,
-    shape: tuple[int, int],
-    drive: WhiskDrive,
-    time: float,
-    reading: np.ndarray,
-) -> tuple[np.ndarray, WhiskDrive]:
-    return whisk_command(whisking, drive, time, reading, threshold, shape)

@@ -17,7 +17,7 @@ from robot.simulation.head.beam import StreamConfig
 from robot.simulation.head.dynamic import simulate_dynamic
 from robot.simulation.head.kinematic import MechanicsConfig, WhiskColumns, simulate_kinematic, whisk_of_row
 from robot.simulation.head.quasistatic import simulate_quasistatic
-from robot.simulation.head.whisk_stream import simulate_cycles, simulate_free_cycles
+from robot.simulation.head.whisk_stream import HeadSetup, simulate_cycles, simulate_free_cycles
 from robot.sources.odometry import OdometryConfig, simulate_odometry
 from robot.sources.simulated import NO_ODOMETRY, SimulatedSource, digest_of_document, wrap_headings
 from robot.sources.source_info import SimulationInfo, SourceInfo
@@ -161,6 +161,10 @@ class HeadSimulation(SimulatedSource):
         )
 
     @property
+    def _setup(self) -> HeadSetup:
+        return HeadSetup(self.head, self.config.stream, self.config.mechanics, self.config.whisking)
+
+    @property
     def rate_hz(self) -> float:
         return self.config.whisking.rate
 
@@ -197,15 +201,7 @@ class HeadSimulation(SimulatedSource):
         config = self.config
         count = int(np.ceil(config.calibration.min_duration * config.whisking.rate))
         random = stream(config.seed, "calibration")
-        record = simulate_free_cycles(
-            RAW_TIERS[self.tier.name],
-            config.stream,
-            config.mechanics,
-            config.whisking,
-            self.head,
-            count,
-            random,
-        )
+        record = simulate_free_cycles(RAW_TIERS[self.tier.name], self._setup, count, random)
         return calibrate(config.calibration, record, where="simulation")
 
     def _readings(self) -> Iterator[Whisk | Cycle]:
@@ -216,17 +212,8 @@ class HeadSimulation(SimulatedSource):
     def _cycles(self) -> Iterator[Cycle]:
         """Raw samples of each cycle, without odometry."""
         assert self.calibration is not None
-        config, random = self.config, stream(self.config.seed, "sensor")
+        random = stream(self.config.seed, "sensor")
         model, threshold = RAW_TIERS[self.tier.name], self.calibration.threshold[:, 1]
         for surroundings, rows in self._parts:
-            yield from simulate_cycles(
-                model,
-                config.stream,
-                config.mechanics,
-                config.whisking,
-                surroundings,
-                self.scene.path,
-                self.start[rows],
-                random,
-                threshold,
-            )
+            path, start = self.scene.path, self.start[rows]
+            yield from simulate_cycles(model, self._setup, surroundings, path, start, random, threshold)

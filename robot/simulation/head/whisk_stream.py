@@ -9,10 +9,11 @@ import numpy as np
 
 from robot.simulation.head.beam import StreamConfig
 from robot.simulation.head.kinematic import MechanicsConfig
+from robot.sources.simulated import NO_ODOMETRY
 from robot.world.head_trajectory import HeadPath, poses_at
 from robot.world.walls import NO_CONTACT, Surroundings
 from tactile.base.se2 import between
-from tactile.base.types import Cycle, Odometry
+from tactile.base.types import Cycle
 from tactile.whiskers.head_geometry import Head
 from tactile.whiskers.whisking import WhiskingConfig
 
@@ -34,17 +35,20 @@ class WallSweep(NamedTuple):
     noise: np.ndarray
 
 
+class HeadSetup(NamedTuple):
+    """Geometry of a simulated head, and the settings of its samples, mechanics and drives."""
+
+    head: Head
+    config: StreamConfig
+    mechanics: MechanicsConfig
+    whisking: WhiskingConfig
+
+
 class MechanicsModel(Protocol):
     """A model of the mechanics."""
 
     def __call__(
-        self,
-        config: StreamConfig,
-        mechanics: MechanicsConfig,
-        whisking: WhiskingConfig,
-        head: Head,
-        sweep: WallSweep,
-        threshold: np.ndarray,
+        self, setup: HeadSetup, sweep: WallSweep, threshold: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """True angle, x and y of every sample, [T, N, W] rad; the whisking law reads y with noise."""
         ...
@@ -52,69 +56,63 @@ class MechanicsModel(Protocol):
 
 def simulate_cycles(
     tier: MechanicsModel,
-    config: StreamConfig,
-    mechanics: MechanicsConfig,
-    whisking: WhiskingConfig,
+    setup: HeadSetup,
     surroundings: Surroundings,
     path: HeadPath,
     start: np.ndarray,
     random: np.random.Generator,
     threshold: np.ndarray,
-    odometry: np.ndarray | None = None,
 ) -> Iterator[Cycle]:
-    """Raw cycles that start at times [N] s along a path. Whiskers are at rest at the start of each cycle.
+    """Raw cycles that start at times [N] s along a path, without odometry and each with whiskers at rest.
 
     Args:
-        threshold: [W] contact threshold of y from a calibration, rad. odometry: [N, 4] dx, dy, dtheta, dt.
+        threshold: [W] contact threshold of y from a calibration, rad.
     """
-    motion = np.zeros((len(start), 4)) if odometry is None else odometry
+    config, whisking = setup.config, setup.whisking
+    knots = np.linspace(0.0, 1 / whisking.rate, config.poses + 1)
+    time = _times(setup)
     for k in range(0, len(start), config.batch):
-        some = slice(k, k + config.batch)
-        sweep = _swept(config, mechanics, whisking, surroundings, path, start[some], random)
-        yield from _run(
-            tier, config, mechanics, whisking, surroundings.head, sweep, threshold, start[some], motion[some]
-        )
+        some = start[k : k + config.batch]
+        pose = poses_at(path, some[:, None] + knots)
+        sweep = sweep_walls(surroundings, pose, knots, time, _noise(setup, len(some), random))
+        yield from _run(tier, setup, sweep, threshold, some)
 
 
 def simulate_free_cycles(
-    tier: MechanicsModel,
-    config: StreamConfig,
-    mechanics: MechanicsConfig,
-    whisking: WhiskingConfig,
-    head: Head,
-    count: int,
-    random: np.random.Generator,
+    tier: MechanicsModel, setup: HeadSetup, count: int, random: np.random.Generator
 ) -> list[Cycle]:
     """A calibration record: `count` cycles in free air with open-loop whisking."""
-    whisking = whisking.model_copy(update={"mode": "open"})
-    start = np.arange(count) / whisking.rate
+    setup = setup._replace(whisking=setup.whisking.model_copy(update={"mode": "open"}))
+    start, time = np.arange(count) / setup.whisking.rate, _times(setup)
+    threshold = np.full(len(setup.head.length), np.inf)
     record: list[Cycle] = []
-    for k in range(0, count, config.batch):
-        some = start[k : k + config.batch]
-        time = _times(config, whisking)
-        nothing = np.zeros((len(time), len(some), len(head.length)))
-        noise = mechanics.noise * random.standard_normal((len(some), len(time), len(head.length), 3))
+    for k in range(0, count, setup.config.batch):
+        some = start[k : k + setup.config.batch]
+        nothing = np.zeros((len(time), len(some), len(setup.head.length)))
+        noise = _noise(setup, len(some), random)
         sweep = WallSweep(time, nothing + NO_CONTACT, nothing + 1.0, nothing, noise)
-        threshold, still = np.full(len(head.length), np.inf), np.zeros((len(some), 4))
-        record += _run(tier, config, mechanics, whisking, head, sweep, threshold, some, still)
+        record += _run(tier, setup, sweep, threshold, some)
     return record
 
 
 def _run(
-    tier: MechanicsModel,
-    config: StreamConfig,
-    mechanics: MechanicsConfig,
-    whisking: WhiskingConfig,
-    head: Head,
-    sweep: WallSweep,
-    threshold: np.ndarray,
-    start: np.ndarray,
-    odometry: np.ndarray,
+    tier: MechanicsModel, setup: HeadSetup, sweep: WallSweep, threshold: np.ndarray, start: np.ndarray
 ) -> Iterator[Cycle]:
-    truth = tier(config, mechanics, whisking, head, sweep, threshold)
-    angle, deflection = sensor_readings(config, head, truth, sweep.noise)
+    truth = tier(setup, sweep, threshold)
+    angle, deflection = sensor_readings(setup.config, setup.head, truth, sweep.noise)
     for k in range(len(start)):
-        yield Cycle(start[k] + sweep.time, angle[k], deflection[k], Odometry(*odometry[k]))
+        yield Cycle(start[k] + sweep.time, angle[k], deflection[k], NO_ODOMETRY)
+
+
+def _times(setup: HeadSetup) -> np.ndarray:
+    """Sample times [T] of a cycle, s."""
+    return np.arange(round(setup.config.rate / setup.whisking.rate)) / setup.config.rate
+
+
+def _noise(setup: HeadSetup, cycles: int, random: np.random.Generator) -> np.ndarray:
+    """Sensor noise [N, T, W, 3], rad."""
+    shape = (cycles, len(_times(setup)), len(setup.head.length), 3)
+    return setup.mechanics.noise * random.standard_normal(shape)
 
 
 def sensor_readings(
@@ -124,26 +122,6 @@ def sensor_readings(
     # A dead whisker sends zeros.
     seen = (np.stack([part.swapaxes(0, 1) for part in truth], axis=-1) + noise) * head.alive[:, None]
     return seen[..., 0], np.clip(seen[..., 1:], -config.full_scale, config.full_scale)
-
-
-def _times(config: StreamConfig, whisking: WhiskingConfig) -> np.ndarray:
-    return np.arange(round(config.rate / whisking.rate)) / config.rate
-
-
-def _swept(
-    config: StreamConfig,
-    mechanics: MechanicsConfig,
-    whisking: WhiskingConfig,
-    surroundings: Surroundings,
-    path: HeadPath,
-    start: np.ndarray,
-    random: np.random.Generator,
-) -> WallSweep:
-    time = _times(config, whisking)
-    knots = np.linspace(0.0, 1 / whisking.rate, config.poses + 1)
-    whiskers = len(surroundings.head.length)
-    noise = mechanics.noise * random.standard_normal((len(start), len(time), whiskers, 3))
-    return sweep_walls(surroundings, poses_at(path, start[:, None] + knots), knots, time, noise)
 
 
 def sweep_walls(
@@ -182,9 +160,8 @@ def _drift(head: Head, pose: np.ndarray, step: float, wall: np.ndarray, reach: n
     motion = between(pose[:, :-1].reshape(-1, 3), pose[:, 1:].reshape(-1, 3)).reshape(*pose[:, 1:].shape)
     speed = motion.swapaxes(0, 1)[:, :, None] / step
     outwards = head.rest[:, :2] / np.linalg.norm(head.rest[:, :2], axis=1, keepdims=True)
-    opening = np.arctan2(np.hypot(*head.rest[:, :2].T), -head.rest[:, 2]) - np.where(
-        wall < NO_CONTACT, wall, 0.0
-    )
+    opening = np.arctan2(np.hypot(*head.rest[:, :2].T), -head.rest[:, 2])
+    opening = opening - np.where(wall < NO_CONTACT, wall, 0.0)
     arm = np.maximum(reach, 0.05) * head.length
     out = np.hypot(*head.base[:, :2].T) + arm * np.sin(opening)
     sideways = speed[..., 1] * outwards[:, 0] - speed[..., 0] * outwards[:, 1] + speed[..., 2] * out[:-1]

@@ -1,4 +1,4 @@
-"""Contact in closed form, against a whisker that is marched along its way and its shaft."""
+"""Contact in closed form, compared with a search over all angles and points of the shaft."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from tactile.base.random_streams import stream
 from tactile.whiskers.head_geometry import Head, HeadConfig, RingConfig, shaft_points, ur10_head
 
 STEP = 1 / 600
-"""Of the march, as a share of the sweep."""
+"""Step of the search, as a fraction of the sweep."""
 SHARES = np.arange(1, 161) / 160
-"""Points of the shaft that it looks at."""
+"""Points of the shaft that are checked, as fractions of its length."""
 WIDE = (RingConfig(length=0.05, radius=0.09, height=0.09), RingConfig(length=0.16, radius=0.12, height=0.17))
 HEADS = {
     "ur10": (HeadConfig(), 65.0),
@@ -35,24 +35,28 @@ def maze_of(seed: int, heights: tuple[float, ...] = (0.05,)) -> Walls:
     )
 
 
-def marched(head: Head, boxes: Walls, pose: np.ndarray, sweep: float) -> tuple[np.ndarray, np.ndarray]:
-    """[W] the first protraction at which a point of the shaft is inside a box, and [S, W] what is then."""
+def search_contact(head: Head, boxes: Walls, pose: np.ndarray, sweep: float) -> tuple[np.ndarray, np.ndarray]:
+    """The first protraction [W] with a point of the shaft inside a box; which points [S, W] are inside then."""
     angle = np.arange(0, sweep, sweep * STEP)
     shape = (len(angle), len(SHARES), len(head.length))
     along = SHARES[:, None] * head.length + np.zeros(shape)
     point = shaft_points(head, np.broadcast_to(angle[:, None, None], shape), along)
     c, s = np.cos(pose[2]), np.sin(pose[2])
-    x, y = pose[0] + c * point[..., 0] - s * point[..., 1], pose[1] + s * point[..., 0] + c * point[..., 1]
-    inside = np.zeros(shape, bool)
+    low = point[..., 2] < boxes.height.max()
+    u, v, z = point[low].T
+    x, y = pose[0] + c * u - s * v, pose[1] + s * u + c * v
+    within = np.zeros(len(z), bool)
     for (west, south, east, north), height in zip(boxes.box, boxes.height, strict=True):
-        inside |= (west < x) & (x < east) & (south < y) & (y < north) & (point[..., 2] < height)
+        within |= (west < x) & (x < east) & (south < y) & (y < north) & (z < height)
+    inside = np.zeros(shape, bool)
+    inside[low] = within
     hit = inside.any(axis=1)
     first = np.argmax(hit, axis=0)
     return np.where(hit.any(axis=0), angle[first], NO_CONTACT), inside[first, :, np.arange(shape[2])].T
 
 
 @pytest.mark.parametrize("name", HEADS)
-def test_contact_is_where_the_march_finds_it(name: str) -> None:
+def test_contact_agrees_with_the_search(name: str) -> None:
     config, degrees = HEADS[name]
     head, sweep = ur10_head(config), np.radians(degrees)
     random = np.random.default_rng(0)
@@ -62,22 +66,22 @@ def test_contact_is_where_the_march_finds_it(name: str) -> None:
         poses = np.column_stack([random.uniform(0, 0.54, (2, 2)), random.uniform(-9, 9, 2)])
         contact = Surroundings(boxes, head).contact(poses)
         for pose, angle, reach in zip(poses, contact.angle, contact.reach, strict=True):
-            brute, inside = marched(head, boxes, pose, sweep)
+            brute, inside = search_contact(head, boxes, pose, sweep)
             there, met = angle <= sweep, np.isfinite(brute)
-            assert (there | ~met).all()  # what the march finds is there
+            assert (there | ~met).all()  # every contact of the search is found
             late += (brute[met] - angle[met]).tolist()
             missed += (there & ~met)[there].tolist()
             nearest = np.where(inside, np.abs(SHARES[:, None] - reach), 1.0).min(axis=0)
             beside += nearest[met & (angle > 0)].tolist()
     assert len(late) > 10
-    # A corner that is grazed for less than a step is found late by the march, or not at all.
+    # The search finds a corner that is touched for less than a step late or not at all.
     assert min(late) > -1e-9
     assert np.quantile(late, 0.95) < 0.006
     assert np.mean(missed) < 0.05
     assert np.quantile(beside, 0.95) < 0.01
 
 
-def test_a_lone_wall_is_met_by_the_tip_on_its_top_and_by_the_shaft_behind_it() -> None:
+def test_the_tip_touches_the_top_of_a_wall_and_the_shaft_its_far_edge() -> None:
     """Worked by hand: a 100 mm whisker at rest out, its base 100 mm over the floor on the head's axis."""
     ring = RingConfig(length=0.1, radius=1e-9, height=0.1)
     head = ur10_head(HeadConfig(rings=(ring,), whiskers=1, rest_deg=90.0, limit_deg=90.0))
@@ -97,7 +101,7 @@ def test_a_lone_wall_is_met_by_the_tip_on_its_top_and_by_the_shaft_behind_it() -
 
 @settings(max_examples=30)
 @given(st.integers(0, 50), st.floats(0, 0.54), st.floats(0, 0.54), st.floats(-4, 4))
-def test_turning_the_head_by_a_column_moves_the_image_by_one(
+def test_a_turn_by_one_column_shifts_contacts_by_one_column(
     seed: int, x: float, y: float, heading: float
 ) -> None:
     around = Surroundings(maze_of(seed), ur10_head(HeadConfig()))
@@ -109,7 +113,7 @@ def test_turning_the_head_by_a_column_moves_the_image_by_one(
 
 @settings(max_examples=30)
 @given(st.integers(0, 50), st.integers(1, 40))
-def test_many_questions_have_the_answers_of_each(seed: int, count: int) -> None:
+def test_a_query_of_many_poses_equals_queries_of_each(seed: int, count: int) -> None:
     random = np.random.default_rng(seed)
     pose = np.column_stack([random.uniform(-0.1, 0.64, (count, 2)), random.uniform(-9, 9, count)])
     around = Surroundings(maze_of(seed), ur10_head(HeadConfig()))
@@ -122,7 +126,7 @@ def test_many_questions_have_the_answers_of_each(seed: int, count: int) -> None:
     assert (whole.reach[~np.isfinite(whole.angle)] == 0).all()
 
 
-def test_far_from_everything_nothing_is_met() -> None:
+def test_no_contact_far_from_walls() -> None:
     contact = Surroundings(maze_of(0), ur10_head(HeadConfig())).contact(np.array([[30.0, -20.0, 1.0]]))
     assert (contact.angle == NO_CONTACT).all()
     assert (contact.wall == -1).all()

@@ -21,7 +21,7 @@ from robot.emulators.head.config import HeadEmulatorConfig
 from robot.emulators.head.device import BLOCK
 from robot.emulators.head.pose_source import AHEAD, AlongPath, CarriedByArm
 from robot.simulation.head.quasistatic import simulate_quasistatic
-from robot.simulation.head.whisk_stream import simulate_cycles
+from robot.simulation.head.whisk_stream import HeadSetup, simulate_cycles
 from robot.world.head_trajectory import HeadPath
 from robot.world.walls import Surroundings
 from tactile.base.random_streams import stream
@@ -68,11 +68,10 @@ def test_a_head_on_its_way_feels_what_the_simulator_says(mode: FeedbackMode, fre
     whisking = WhiskingConfig(mode=mode.name.lower(), rate=frequency, gain=told.gain)
     start = np.arange(3 * frequency) / frequency
     knots = {"batch": 1, "poses": samples // head.bridge.samples}
+    settings = config.stream.model_copy(update=knots)
     raw = simulate_cycles(
         simulate_quasistatic,
-        config.stream.model_copy(update=knots),
-        config.mechanics,
-        whisking,
+        HeadSetup(made.surroundings.head, settings, config.mechanics, whisking),
         made.surroundings,
         made.path,
         start,

@@ -9,7 +9,12 @@ from robot.simulation.head.beam import BeamConfig, StreamConfig, beam_time_unit,
 from robot.simulation.head.dynamic import simulate_dynamic
 from robot.simulation.head.kinematic import MechanicsConfig, WhiskColumns
 from robot.simulation.head.quasistatic import simulate_quasistatic
-from robot.simulation.head.whisk_stream import MechanicsModel, simulate_cycles, simulate_free_cycles
+from robot.simulation.head.whisk_stream import (
+    HeadSetup,
+    MechanicsModel,
+    simulate_cycles,
+    simulate_free_cycles,
+)
 from robot.world.head_trajectory import HeadPath, MotionConfig, plan_path
 from robot.world.maze import random_loop, random_maze, wall_boxes
 from robot.world.walls import Surroundings, Walls
@@ -34,7 +39,7 @@ TIERS = pytest.mark.parametrize("tier", [simulate_quasistatic, simulate_dynamic]
 def calibration(
     tier: MechanicsModel, mechanics: MechanicsConfig = MECHANICS, config: StreamConfig = STREAM
 ) -> Calibration:
-    record = simulate_free_cycles(tier, config, mechanics, OPEN, HEAD, 4, stream(9, "calibration"))
+    record = simulate_free_cycles(tier, HeadSetup(HEAD, config, mechanics, OPEN), 4, stream(9, "calibration"))
     return calibrate(CalibrationConfig(), record)
 
 
@@ -52,9 +57,8 @@ def one(
     there, stays = still(wall)
     limit = np.full(18, 0.04)
     start, random = np.zeros(1), stream(0, "sensor")
-    return next(
-        iter(simulate_cycles(tier, STREAM, mechanics, whisking, there, path or stays, start, random, limit))
-    )
+    setup = HeadSetup(HEAD, STREAM, mechanics, whisking)
+    return next(simulate_cycles(tier, setup, there, path or stays, start, random, limit))
 
 
 LOW = Walls(np.array([[-1.0, -1.0, 1.0, 1.0]]), np.array([0.05]))
@@ -71,13 +75,14 @@ def maze(count: int) -> tuple[Surroundings, HeadPath, np.ndarray]:
     )
 
 
-def felt(tier: MechanicsModel, count: int, whisking: WhiskingConfig, rate: float = 2000.0) -> WhiskColumns:
+def detected_contacts(
+    tier: MechanicsModel, count: int, whisking: WhiskingConfig, rate: float = 2000.0
+) -> WhiskColumns:
     config = StreamConfig(rate=rate)
     there, path, start = maze(count)
     known = calibration(tier, config=config)
-    raw = simulate_cycles(
-        tier, config, MECHANICS, whisking, there, path, start, stream(1, "sensor"), known.threshold[:, 1]
-    )
+    setup = HeadSetup(HEAD, config, MECHANICS, whisking)
+    raw = simulate_cycles(tier, setup, there, path, start, stream(1, "sensor"), known.threshold[:, 1])
     whisks = [detect_contacts(ContactConfig(), known, cycle) for cycle in raw]
     return WhiskColumns(
         *(np.array([getattr(whisk, name) for whisk in whisks]) for name in WhiskColumns._fields)
@@ -85,7 +90,7 @@ def felt(tier: MechanicsModel, count: int, whisking: WhiskingConfig, rate: float
 
 
 @pytest.mark.parametrize("taper", [0.1, 0.2, 0.6])
-def test_the_beam_is_as_stiff_as_theory_where_it_is_loaded(taper: float) -> None:
+def test_beam_stiffness_matches_theory_at_its_load_positions(taper: float) -> None:
     model = make_beam(ShaftConfig(taper=taper))
     for reach in (1.0, 0.65):
         shape = model.at(np.array(reach))
@@ -95,7 +100,7 @@ def test_the_beam_is_as_stiff_as_theory_where_it_is_loaded(taper: float) -> None
         assert model.moment @ loads == pytest.approx(reach, rel=2e-3)
 
 
-def test_a_straight_whisker_rings_as_a_cantilever_does() -> None:
+def test_an_untapered_whisker_has_the_modes_of_a_cantilever() -> None:
     first, second = make_beam(ShaftConfig(taper=1.0)).modes
     # Two shapes can only be stiffer than the whole (Rayleigh and Ritz).
     assert 1.8751**2 <= first < 1.01 * 1.8751**2
@@ -104,7 +109,7 @@ def test_a_straight_whisker_rings_as_a_cantilever_does() -> None:
 
 
 @TIERS
-def test_free_whiskers_follow_the_command_and_feel_nothing(tier: MechanicsModel) -> None:
+def test_free_whiskers_follow_the_command_without_contact(tier: MechanicsModel) -> None:
     found = calibration(tier)
     np.testing.assert_allclose(found.free, np.radians(65), atol=0.02)
     # Beyond the sensor's noise, the inertia of the long whiskers.
@@ -115,9 +120,7 @@ def test_free_whiskers_follow_the_command_and_feel_nothing(tier: MechanicsModel)
 
 @TIERS
 @pytest.mark.parametrize("servo", [0.2, 1.0])
-def test_drive_and_whisker_share_what_is_commanded_beyond_the_wall(
-    tier: MechanicsModel, servo: float
-) -> None:
+def test_drive_and_whisker_share_the_command_beyond_contact(tier: MechanicsModel, servo: float) -> None:
     mechanics = MechanicsConfig(servo=servo, noise=0.0, slip=1.0)
     whisking = WhiskingConfig(mode="open", rate=0.25)
     cycle = one(tier, LOW, whisking, mechanics)
@@ -141,7 +144,7 @@ def test_whiskers_bent_too_far_slip_off(tier: MechanicsModel) -> None:
 
 
 @TIERS
-def test_feedback_lessens_the_push(tier: MechanicsModel) -> None:
+def test_feedback_reduces_deflections(tier: MechanicsModel) -> None:
     quiet = MechanicsConfig(noise=0.0, slip=1.0)
     most = [one(tier, LOW, whisking, quiet).deflection[..., 1].max(axis=0) for whisking in (OPEN, RCP)]
     assert (most[1] < 0.8 * most[0]).all()
@@ -149,7 +152,7 @@ def test_feedback_lessens_the_push(tier: MechanicsModel) -> None:
 
 
 @TIERS
-def test_a_head_that_moves_drags_its_whiskers_sideways_until_they_slide(tier: MechanicsModel) -> None:
+def test_a_moving_head_bends_whiskers_sideways_up_to_the_friction_limit(tier: MechanicsModel) -> None:
     ahead = HeadPath(np.array([0.0, 1.0]), np.array([[0.0, 0, 0], [0.05, 0, 0]]))
     cycle = one(tier, LOW, OPEN, MechanicsConfig(noise=0.0, slip=1.0), ahead)
     x, y = np.abs(cycle.deflection[1000]).T
@@ -160,16 +163,12 @@ def test_a_head_that_moves_drags_its_whiskers_sideways_until_they_slide(tier: Me
 
 
 @TIERS
-def test_what_is_felt_does_not_depend_on_how_cycles_are_batched(tier: MechanicsModel) -> None:
+def test_readings_do_not_depend_on_the_batch_size(tier: MechanicsModel) -> None:
     there, path, start = maze(5)
     limit = np.full(18, 0.04)
     runs = [
-        list(
-            simulate_cycles(
-                tier, StreamConfig(batch=n), MECHANICS, RCP, there, path, start, stream(1, "s"), limit
-            )
-        )
-        for n in (2, 5)
+        list(simulate_cycles(tier, setup, there, path, start, stream(1, "s"), limit))
+        for setup in (HeadSetup(HEAD, StreamConfig(batch=n), MECHANICS, RCP) for n in (2, 5))
     ]
     for a, b in zip(*runs, strict=True):
         assert np.array_equal(a.time, b.time)
@@ -178,9 +177,10 @@ def test_what_is_felt_does_not_depend_on_how_cycles_are_batched(tier: MechanicsM
 
 
 @pytest.mark.parametrize("mode", ["open", "rcp", "spread"])
-def test_the_tiers_tell_of_one_world(mode: str) -> None:
+def test_both_raw_tiers_agree_on_contacts(mode: str) -> None:
     slow, quick = (
-        felt(tier, 40, WhiskingConfig(mode=mode)) for tier in (simulate_dynamic, simulate_quasistatic)
+        detected_contacts(tier, 40, WhiskingConfig(mode=mode))
+        for tier in (simulate_dynamic, simulate_quasistatic)
     )
     assert slow.contact.mean() > 0.1
     assert (slow.contact != quick.contact).mean() < 0.02
@@ -190,52 +190,43 @@ def test_the_tiers_tell_of_one_world(mode: str) -> None:
 
 
 @TIERS
-def test_the_sample_rate_does_not_matter(tier: MechanicsModel) -> None:
-    usual = felt(tier, 16, RCP)
+def test_contacts_do_not_depend_on_the_sample_rate(tier: MechanicsModel) -> None:
+    usual = detected_contacts(tier, 16, RCP)
     for rate in (1000.0, 4000.0):
-        other = felt(tier, 16, RCP, rate)
+        other = detected_contacts(tier, 16, RCP, rate)
         assert (usual.contact != other.contact).sum() <= 1
         both = usual.contact & other.contact
         off = (usual.touched - other.touched)[both]
         assert np.sqrt((off**2).mean()) < 2e-3 * np.pi * np.radians(65)
 
 
-def test_where_drives_are_soft_feedback_brings_nothing() -> None:
-    def kept(servo: float, whisking: WhiskingConfig) -> np.ndarray:
+def test_feedback_helps_only_with_stiff_drives() -> None:
+    def held_contacts(servo: float, whisking: WhiskingConfig) -> np.ndarray:
         mechanics = MechanicsConfig(servo=servo)
         there, path, start = maze(30)
         known = calibration(simulate_quasistatic, mechanics)
-        raw = simulate_cycles(
-            simulate_quasistatic,
-            STREAM,
-            mechanics,
-            whisking,
-            there,
-            path,
-            start,
-            stream(1, "sensor"),
-            known.threshold[:, 1],
-        )
+        setup, limit = HeadSetup(HEAD, STREAM, mechanics, whisking), known.threshold[:, 1]
+        raw = simulate_cycles(simulate_quasistatic, setup, there, path, start, stream(1, "sensor"), limit)
         return np.array([detect_contacts(ContactConfig(), known, cycle).held for cycle in raw])
 
-    soft, stiff = (kept(servo, RCP).mean() - kept(servo, OPEN).mean() for servo in (0.3, 3.0))
+    soft, stiff = (
+        held_contacts(servo, RCP).mean() - held_contacts(servo, OPEN).mean() for servo in (0.3, 3.0)
+    )
     assert abs(soft) < 0.03
     assert stiff > 0.05
 
 
-def test_dead_whiskers_send_nothing_and_are_known_as_dead() -> None:
+def test_calibration_finds_dead_whiskers() -> None:
     head = ur10_head(HeadConfig(dead=(3, 7)))
-    record = simulate_free_cycles(
-        simulate_quasistatic, STREAM, MECHANICS, OPEN, head, 4, stream(0, "calibration")
-    )
+    setup = HeadSetup(head, STREAM, MECHANICS, OPEN)
+    record = simulate_free_cycles(simulate_quasistatic, setup, 4, stream(0, "calibration"))
     assert np.flatnonzero(~calibrate(CalibrationConfig(), record).alive).tolist() == [3, 7]
 
 
 @TIERS
-def test_a_record_among_walls_is_no_calibration(tier: MechanicsModel) -> None:
+def test_calibration_refuses_a_record_with_contacts(tier: MechanicsModel) -> None:
     there, path, start = maze(6)
-    raw = simulate_cycles(
-        tier, STREAM, MECHANICS, OPEN, there, path, start, stream(1, "s"), np.full(18, np.inf)
-    )
+    setup = HeadSetup(HEAD, STREAM, MECHANICS, OPEN)
+    raw = simulate_cycles(tier, setup, there, path, start, stream(1, "s"), np.full(18, np.inf))
     with pytest.raises(InputError, match="contacts of whisker"):
         calibrate(CalibrationConfig(), list(raw))
