@@ -36,7 +36,7 @@ def maze_of(seed: int, heights: tuple[float, ...] = (0.05,)) -> Walls:
 
 
 def search_contact(head: Head, boxes: Walls, pose: np.ndarray, sweep: float) -> tuple[np.ndarray, np.ndarray]:
-    """The first protraction [W] with a point of the shaft inside a box; which points [S, W] are inside then."""
+    """First protraction [W] with a point of the shaft inside a box; which points [S, W] are inside then."""
     angle = np.arange(0, sweep, sweep * STEP)
     shape = (len(angle), len(SHARES), len(head.length))
     along = SHARES[:, None] * head.length + np.zeros(shape)
