@@ -12,7 +12,6 @@ from robot.emulators.ur10.kinematics import UR10, UR10E
 from robot.emulators.ur10.motion import (
     ZERO,
     ArmModel,
-    JointMotion,
     LinearMotion,
     Motion,
     MotionState,
@@ -20,7 +19,7 @@ from robot.emulators.ur10.motion import (
     Unreachable,
 )
 from robot.emulators.ur10.rotation import Vector6
-from robot.emulators.ur10.urscript_moves import Mark, MoveJ, MoveL, MoveOrder, StopL, renews, start_motion
+from robot.emulators.ur10.urscript_moves import MoveL, MoveOrder, StopL, start_motion
 
 NEAR: Vector6 = (
     0.0,
@@ -37,7 +36,7 @@ class EmulatedArm:
 
     Attributes:
         state: where it is. force: N and Nm at the tool, in the base. penetration_max: deepest in a wall, m.
-        marks: progress reported by its orders, not read yet. scale: the speed slider, 0 to 1.
+        scale: the speed slider, 0 to 1.
     """
 
     def __init__(self, config: UrEmulatorConfig) -> None:
@@ -47,7 +46,6 @@ class EmulatedArm:
         self.scale = 1.0
         self.force: Vector6 = ZERO
         self.penetration_max = 0.0
-        self.marks: list[int] = []
         self._motion: Motion | None = None
         self._order: MoveOrder | None = None
         self._queue: deque[MoveOrder] = deque()
@@ -82,17 +80,11 @@ class EmulatedArm:
         self.state = self.state._replace(tcp=self.model.forward(self.state.joints))
 
     def order(self, orders: Iterable[MoveOrder]) -> None:
-        """Replaces all orders. A move that finds the arm moving stops it first."""
-        new = deque(orders)
-        first = next((order for order in new if not isinstance(order, Mark)), None)
-        if self.moving and isinstance(first, MoveL | MoveJ):  # these plan from rest
-            new.appendleft(StopL(first.acceleration))
-        if self._motion is not None and new and renews(new[0], self._motion):
-            self._order = new.popleft()
-            self._motion = start_motion(self._order, self.model, self.state, self.turn_ratio)
-        else:
-            self._motion, self._order = None, None
-        self._queue = new
+        """Replaces all orders. A move stops a moving arm first, since moves start at rest."""
+        self._queue = deque(orders)
+        if self.moving and self._queue and isinstance(first := self._queue[0], MoveL):
+            self._queue.appendleft(StopL(first.acceleration))
+        self._motion, self._order = None, None
 
     def halt(self, acceleration: float) -> None:
         """Drops all orders and stops, m/s^2."""
@@ -105,8 +97,6 @@ class EmulatedArm:
         try:
             while self._motion is None and self._queue:
                 self._order = self._queue.popleft()
-                if isinstance(self._order, Mark):
-                    self.marks.append(self._order.progress)
                 self._motion = start_motion(self._order, self.model, self.state, self.turn_ratio)
             if self._motion is not None:
                 self._advance(dt)
@@ -119,7 +109,7 @@ class EmulatedArm:
 
     def _advance(self, dt: float) -> None:
         assert self._motion is not None
-        scale = self.scale if isinstance(self._motion, LinearMotion | JointMotion) else 1.0
+        scale = self.scale if isinstance(self._motion, LinearMotion) else 1.0
         if scale <= 0:
             self._rest()
             return

@@ -6,12 +6,11 @@ from typing import Annotated, Literal, NamedTuple
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
+from robot.emulators.ur10.rotation import Vector6
 from tactile.base.config import Settings
 
 SCRIPT_PORT, DASHBOARD_PORT = 30003, 29999  # fixed: the client library knows no others
 FAULT_PORT = 30098
-
-Vector6 = tuple[float, float, float, float, float, float]
 
 
 class WallConfig(Settings):

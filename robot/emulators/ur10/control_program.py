@@ -1,206 +1,139 @@
-"""The program that ur_rtde uploads, as far as clients can tell: commands come through registers.
+"""The control program that ur_rtde uploads, as its client sees it: commands come through registers.
 
-The client writes a command's number into integer register 0 and its arguments into others. The program says 1
-in output register 0 when it is ready and 2 when it has done a command; then the client writes 0. Commands in
-`REALTIME` are carried out at every control step and never answered with 2. Output register 2 tells of the
-newest asynchronous operation: its number, whether it runs, its progress.
+The client writes the number of a command into integer register 0 and its arguments into others. The program
+writes 1 to output register 0 when it is ready and 2 when it has executed a command; then the client writes 0.
+Output register 2 describes the newest asynchronous operation: its number and whether it is under way.
 Source: the interface described by ur_rtde 1.6.5 (its control script and its documentation).
+
+Supported are the commands of our driver: `moveL`, `stopL`, `setTcp`, `setWatchdog`,
+`isPoseWithinSafetyLimits`. All others are accepted without effect.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from enum import IntEnum
 
-from robot.emulators.ur10.arm import EmulatedArm
 from robot.emulators.ur10.controller import EmulatedController, Program
-from robot.emulators.ur10.rotation import Vector6
-from robot.emulators.ur10.urscript_moves import MoveOrder, SpeedJ, StopJ, StopL, parse_orders
+from robot.emulators.ur10.urscript_moves import MoveL, MoveOrder, StopL, parse_moves
 
 READY, DONE = 1, 2
-REALTIME = frozenset([6, 9, 10, 11, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70, 71])
-"""Commands that the program carries out at every control step."""
-IDLE, END = 0, 255
 RUNNING_BIT = 1 << 15
 
-_PATH = re.compile(r"# inject move path\n(.*?)^\s*end\s*$", re.DOTALL | re.MULTILINE)
 _OFFSET = re.compile(r"# int register offset\n\s*(\d+)")
+
+
+class ControlCommand(IntEnum):
+    """Command numbers of ur_rtde."""
+
+    NONE = 0
+    MOVE_L = 3
+    SET_TCP = 29
+    STOP_L = 33
+    SET_WATCHDOG = 35
+    POSE_WITHIN_SAFETY_LIMITS = 36
+    END = 255
 
 
 class ControlProgram:
     """The running control program of ur_rtde.
 
     Args:
-        controller: on which it runs. text: as uploaded. commands: the action of each command number; other
-            numbers are accepted and have no effect.
-
-    Attributes:
-        path: the moves that were uploaded with it. offset: its first register of either kind.
+        controller: on which it runs. text: as uploaded.
     """
 
-    def __init__(self, controller: EmulatedController, text: str, commands: Commands) -> None:
-        self._commands = commands
+    def __init__(self, controller: EmulatedController, text: str) -> None:
         offset = _OFFSET.search(text)
-        path = _PATH.search(text)
-        self.offset: int = int(offset[1]) if offset else 0
-        self.path: list[MoveOrder] = parse_orders(path[1]) if path else []
-        self.controller: EmulatedController = controller
-        self.arm: EmulatedArm = controller.arm
-        self._registers = controller.registers
+        self._offset = int(offset[1]) if offset else 0  # first register used, of either kind
+        self._controller, self._registers = controller, controller.registers
         self._executing = False
-        self._waiting = False  # for the arm, before a command is done
-        self._moving = False  # an asynchronous move goes on
-        self._stopping = False  # an asynchronous stop goes on
-        self._stop_by_tool = False  # what a synchronous stop is, as the last asynchronous one left it
-        self._repeated: MoveOrder | None = None
+        self._waiting = False  # for the arm, before the command is done
+        self._operating = False  # an asynchronous move or stop is under way
         self._writes = self._operation = 0
-        self._progress(-1)
+        self._report_operation(running=False)
         self._answer(READY)
 
     def step(self) -> bool:
         """One control step; False when the program has ended. Raises `Unreachable`, which ends it too."""
-        self._follow_asynchronous()
+        busy = self._controller.arm.busy
+        if not busy:
+            self._end_operation()
         if self._waiting:
-            if self.arm.busy:
+            if busy:
                 return True
             self._waiting = False
             self._answer(DONE)
-        command = self._registers.ints[self.offset]
-        if command in REALTIME:
-            self._do(command)
-            self._answer(READY)
-        elif command == IDLE:
+        command = self._registers.ints[self._offset]
+        if command == ControlCommand.NONE:
             self._executing = False
             self._answer(READY)
         elif not self._executing:
             self._executing = True
-            if command == END:
+            if command == ControlCommand.END:
                 return False
-            self._do(command)
+            self._execute(command)
             if not self._waiting:
                 self._answer(DONE)
         return True
 
-    def vector(self, first: int = 0) -> Vector6:
-        """Six of the command's arguments."""
-        return self._registers.vector(first + self.offset)
+    def _execute(self, command: int) -> None:
+        controller, first = self._controller, self._registers.doubles[self._offset]
+        vector = self._registers.vector(self._offset)
+        if command == ControlCommand.MOVE_L:
+            controller.solve(vector)
+            speed, acceleration = self._registers.doubles[self._offset + 6 : self._offset + 8]
+            self._order("movel", MoveL(vector, speed, acceleration))
+        elif command == ControlCommand.STOP_L:
+            self._order("stop", StopL(first))
+        elif command == ControlCommand.SET_TCP:
+            controller.arm.set_tool(vector)
+        elif command == ControlCommand.SET_WATCHDOG:
+            controller.watch(first, self._offset)
+        elif command == ControlCommand.POSE_WITHIN_SAFETY_LIMITS:
+            self._registers.put_int(self._offset + 1, int(controller.solvable(vector)))
 
-    def number(self, index: int) -> float:
-        """One of the command's arguments."""
-        return self._registers.doubles[index + self.offset]
-
-    def put(self, numbers: Iterable[float]) -> None:
-        """A result of several numbers."""
-        self._registers.put_vector(self.offset, numbers)
-
-    def result(self, value: int) -> None:
-        """A result that is a number or yes and no."""
-        self._registers.put_int(self.offset + 1, value)
-
-    def move(self, orders: Iterable[MoveOrder], kind: str) -> None:
-        """Give orders in place of the present ones; wait for their end unless the client asked not to."""
-        orders = list(orders)
-        self._drop_move()
-        self.controller.record_target(kind, orders)
-        self.arm.order(orders)
-        if self._asynchronous:
-            self._moving = True
-            self._progress(0)
+    def _order(self, kind: str, order: MoveOrder) -> None:
+        """Replaces the arm's orders; the command is done when the arm is, or at once if asynchronous."""
+        self._end_operation()
+        self._controller.record_target(kind, order)
+        self._controller.arm.order([order])
+        if self._registers.ints[self._offset + 1] == 1:
+            self._operating = True
+            self._report_operation(running=True)
         else:
             self._waiting = True
 
-    def repeat(self, order: MoveOrder, kind: str) -> None:
-        """An order that is given again at every step until it changes."""
-        if order != self._repeated or not self.arm.busy:
-            self.controller.record_target(kind, [order])
-            self.arm.order([order])
-        self._repeated = order
-
-    def end_repeated(self, rate: float) -> None:
-        """Stop what was repeated, the way it was told."""
-        self.stop(StopJ(rate) if isinstance(self._repeated, SpeedJ) else StopL(rate))
-
-    def stop(self, order: StopL | StopJ) -> None:
-        """Stop and wait for it."""
-        self.controller.record_target("stop", [order])
-        self.arm.order([order])
-        self._waiting = True
-
-    def stop_either(self, rate: float) -> None:
-        """stopL and stopJ alike: a synchronous one goes by joints until there was an asynchronous one."""
-        if self._stopping:
-            self._stopping = False
-            self._progress(-1)
-        else:
-            self._drop_move()
-        if not self._asynchronous:
-            self.stop(StopL(rate) if self._stop_by_tool else StopJ(rate))
-            return
-        self._stop_by_tool = self._stopping = True
-        self.controller.record_target("stop", [StopL(rate)])
-        self.arm.order([StopL(rate)])
-        self._progress(0)
-
-    @property
-    def _asynchronous(self) -> bool:
-        return self._registers.ints[self.offset + 1] == 1
-
-    def _do(self, command: int) -> None:
-        action = self._commands.get(command)
-        if action is not None:
-            action(self)
-
     def _answer(self, word: int) -> None:
-        self._registers.put_int(self.offset, word)
+        self._registers.put_int(self._offset, word)
 
-    def _progress(self, value: int) -> None:
-        """The word of asynchronous progress; negative: finished, 0: a new operation."""
+    def _end_operation(self) -> None:
+        if self._operating:
+            self._operating = False
+            self._report_operation(running=False)
+
+    def _report_operation(self, *, running: bool) -> None:
+        """Writes the state of the asynchronous operation; a running one is a new one."""
         self._writes = (self._writes + 1) % 128
-        if value == 0:
-            self._operation = (self._operation + 1) % 128
-        word = self._writes << 16 | self._operation << 24
-        if value >= 0:
-            word |= min(value, RUNNING_BIT - 1) | RUNNING_BIT
-        self._registers.put_int(self.offset + 2, word)
-
-    def _follow_asynchronous(self) -> None:
-        for mark in self.arm.marks:
-            self._progress(mark)
-        self.arm.marks.clear()
-        if (self._moving or self._stopping) and not self.arm.busy:
-            self._moving = self._stopping = False
-            self._progress(-1)
-
-    def _drop_move(self) -> None:
-        if self._moving:
-            self._moving = False
-            self._progress(-1)
+        self._operation = (self._operation + running) % 128
+        word = self._writes << 16 | self._operation << 24 | RUNNING_BIT * running
+        self._registers.put_int(self._offset + 2, word)
 
 
 class ScriptProgram:
-    """Any other program: its moves and stops in order, then the end, with the 2 that clients wait for."""
+    """Any other program: its linear moves in order, then the end."""
 
     def __init__(self, controller: EmulatedController, text: str) -> None:
         self._controller = controller
-        self._answers = "write_output_integer_register" in text
-        orders = parse_orders(text)
-        controller.record_target("script", orders)
-        controller.arm.order(orders)
+        moves = parse_moves(text)
+        for move in moves:
+            controller.record_target("script", move)
+        controller.arm.order(moves)
 
     def step(self) -> bool:
         """One control step; False when the program has ended."""
-        if self._controller.arm.busy:
-            return True
-        if self._answers:
-            self._controller.registers.put_int(0, DONE)
-        return False
+        return self._controller.arm.busy
 
 
-Commands = Mapping[int, Callable[[ControlProgram], None]]
-
-
-def load_program(commands: Commands, controller: EmulatedController, text: str) -> Program:
+def load_program(controller: EmulatedController, text: str) -> Program:
     """Starts uploaded program text on a controller: ur_rtde's control program, or any other script."""
-    if "def rtde_control" in text:
-        return ControlProgram(controller, text, commands)
-    return ScriptProgram(controller, text)
+    return (ControlProgram if "def rtde_control" in text else ScriptProgram)(controller, text)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Protocol
 
 from robot.emulators.ur10.arm import EmulatedArm, force_magnitude
@@ -12,7 +12,7 @@ from robot.emulators.ur10.motion import Unreachable
 from robot.emulators.ur10.registers import Registers
 from robot.emulators.ur10.rotation import Vector6
 from robot.emulators.ur10.safety import BITS, RobotMode, Runtime, SafetyMode, StatusBits
-from robot.emulators.ur10.urscript_moves import MoveJ, MoveL, MoveOrder, Servo, SpeedJ, SpeedL
+from robot.emulators.ur10.urscript_moves import MoveL, MoveOrder
 
 MAX_TARGETS = 10_000  # orders remembered: what "state" tells within a control step or two
 
@@ -44,7 +44,6 @@ class EmulatedController:
         self.time = 0.0
         self.remote = config.remote
         self.targets: deque[dict[str, Any]] = deque(maxlen=MAX_TARGETS)
-        self.waypoint: Vector6 = self.arm.state.tcp
         self.watchdog_stops = self.program_stops = self.programs = 0
         self._uploaded: tuple[float, str] | None = None  # when it starts, and what
         self._resumed: list[MoveOrder] = []
@@ -156,32 +155,25 @@ class EmulatedController:
             if mode is not RobotMode.RUNNING:
                 self.stop_program()
 
-    def solve(self, tcp: Vector6, near: Vector6) -> Vector6:
-        """Joints for a pose. Raises `Unreachable`."""
+    def solve(self, tcp: Vector6) -> Vector6:
+        """Joints for a tool pose. Raises `Unreachable`."""
         if self.ik_fails:
-            raise Unreachable("told to fail")
-        return self.arm.model.backward(tcp, near)
+            raise Unreachable("requested failure")
+        return self.arm.model.backward(tcp, self.arm.state.joints)
 
     def solvable(self, tcp: Vector6) -> bool:
         try:
-            self.solve(tcp, self.arm.state.joints)
+            self.solve(tcp)
         except Unreachable:
             return False
         return True
 
-    def record_target(self, kind: str, new: Sequence[MoveOrder]) -> None:
+    def record_target(self, kind: str, order: MoveOrder) -> None:
         """Records a command for the fault port's `state`."""
-        for order in new:
-            if isinstance(order, MoveL):
-                self.waypoint = order.goal
-            entry: dict[str, Any] = {"time": self.time, "do": kind, "order": type(order).__name__}
-            if isinstance(order, MoveL | MoveJ | SpeedL | SpeedJ | Servo):
-                entry["goal"] = list(order.goal)
-            if isinstance(order, MoveL | MoveJ):
-                entry["speed"] = order.speed
-            if isinstance(order, MoveL | MoveJ | SpeedL | SpeedJ):
-                entry["acceleration"] = order.acceleration
-            self.targets.append(entry)
+        entry: dict[str, Any] = {"time": self.time, "do": kind, "order": type(order).__name__}
+        if isinstance(order, MoveL):
+            entry |= order._asdict() | {"goal": list(order.goal)}
+        self.targets.append(entry)
 
     def publish(self) -> None:
         """Updates the published fields."""

@@ -8,8 +8,6 @@ from typing import NamedTuple
 
 from robot.emulators.ur10.rotation import Vector6, matrix, quaternion, quaternion_of, rotation_vector
 
-UP = (0.0, -math.pi / 2, 0.0, -math.pi / 2, 0.0, 0.0)  # joints of an arm that stands straight up, rad
-
 EDGE = 1e-9  # rounding allowed where the arm is stretched to its end
 FREE = 1e-6  # sine of joint 5 below which joints 4 and 6 turn about one axis
 

@@ -10,7 +10,6 @@ from robot.emulators.ur10 import kinematics
 from robot.emulators.ur10.rotation import Vector6, compose_poses, invert_pose, rotate_by, rotation_between
 
 ZERO: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-JOINT_SPEED = 2.0944  # rad/s: 120 degrees a second, what a UR10's shoulder and base can do (data sheet)
 
 
 class Unreachable(ValueError):
@@ -104,25 +103,6 @@ class LinearMotion(NamedTuple):
         return after, None if time >= self.profile.duration else self._replace(time=time)
 
 
-class JointMotion(NamedTuple):
-    """To joint angles, all arriving together."""
-
-    start: Vector6
-    way: Vector6  # rad
-    profile: Profile
-    time: float = 0.0
-
-    def advance(
-        self, model: ArmModel, state: MotionState, dt: float
-    ) -> tuple[MotionState, JointMotion | None]:
-        time = self.time + dt
-        done, rate = self.profile.at(time)
-        length = self.profile.length or 1.0
-        joints = add(self.start, scale(self.way, done / length))
-        after = joint_state(model, state, joints, scale(self.way, rate / length), dt)
-        return after, None if time >= self.profile.duration else self._replace(time=time)
-
-
 class ToolSpeedMotion(NamedTuple):
     """Accelerates to a tool speed and keeps it; for speed 0, until the arm stands."""
 
@@ -149,40 +129,7 @@ class ToolSpeedMotion(NamedTuple):
         return after, None if not any(speed) and not any(self.goal) else self
 
 
-class JointSpeedMotion(NamedTuple):
-    """Accelerates to joint speeds and keeps them; for speed 0, until the arm stands."""
-
-    goal: Vector6
-    acceleration: float
-
-    def advance(
-        self, model: ArmModel, state: MotionState, dt: float
-    ) -> tuple[MotionState, JointSpeedMotion | None]:
-        gap = max(abs(g - r) for g, r in zip(self.goal, state.joint_speed, strict=True))
-        share = min(1.0, self.acceleration * dt / gap) if gap > 0 else 1.0
-        rate = add(state.joint_speed, scale(subtract(self.goal, state.joint_speed), share))
-        after = joint_state(model, state, add(state.joints, scale(rate, dt)), rate, dt)
-        return after, None if not any(rate) and not any(self.goal) else self
-
-
-class ServoMotion(NamedTuple):
-    """Follows joint targets sent repeatedly, with a lag."""
-
-    goal: Vector6
-    lag: float
-
-    def advance(
-        self, model: ArmModel, state: MotionState, dt: float
-    ) -> tuple[MotionState, ServoMotion | None]:
-        share = 1 - math.exp(-dt / self.lag)
-        way = scale(subtract(self.goal, state.joints), share)
-        most = max(map(abs, way))
-        if most > JOINT_SPEED * dt:
-            way = scale(way, JOINT_SPEED * dt / most)
-        return joint_state(model, state, add(state.joints, way), scale(way, 1 / dt), dt), self
-
-
-Motion = LinearMotion | JointMotion | ToolSpeedMotion | JointSpeedMotion | ServoMotion
+Motion = LinearMotion | ToolSpeedMotion
 
 
 def linear_motion(
@@ -197,27 +144,10 @@ def linear_motion(
     return LinearMotion(state.tcp, way, max(straight, turning, key=lambda profile: profile.duration))
 
 
-def joint_motion(state: MotionState, goal: Vector6, speed: float, acceleration: float) -> JointMotion:
-    """A joint motion; the joint with the longest path sets the time."""
-    way = subtract(goal, state.joints)
-    return JointMotion(state.joints, way, Profile(max(map(abs, way)), speed, acceleration))
-
-
 def tool_state(model: ArmModel, state: MotionState, tcp: Vector6, speed: Vector6, dt: float) -> MotionState:
     """The state after a step of the tool."""
     joints = model.backward(tcp, state.joints)
     return MotionState(tcp, speed, joints, scale(subtract(joints, state.joints), 1 / dt))
-
-
-def joint_state(
-    model: ArmModel, state: MotionState, joints: Vector6, rate: Vector6, dt: float
-) -> MotionState:
-    """The state after a step of the joints."""
-    tcp = model.forward(joints)
-    if not any(rate):
-        return MotionState(tcp, ZERO, joints, rate)
-    way = (*subtract(tcp, state.tcp)[:3], *rotation_between(state.tcp, tcp))
-    return MotionState(tcp, scale(way, 1 / dt), joints, rate)
 
 
 def step_towards(now: Sequence[float], goal: Sequence[float], step: float) -> tuple[float, ...]:
@@ -227,11 +157,6 @@ def step_towards(now: Sequence[float], goal: Sequence[float], step: float) -> tu
     if length <= step:
         return tuple(goal)
     return tuple(n + w * step / length for n, w in zip(now, way, strict=True))
-
-
-def add(first: Vector6, second: Vector6) -> Vector6:
-    a, b, c, d, e, f = (x + y for x, y in zip(first, second, strict=True))
-    return a, b, c, d, e, f
 
 
 def subtract(first: Vector6, second: Vector6) -> Vector6:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 from robot.drivers.ur10.rtde_protocol import OUTPUT_TYPES, REGISTERS
 
 Value = tuple[float, ...]
@@ -57,7 +55,3 @@ class Registers:
 
     def put_int(self, index: int, value: int) -> None:
         self.fields[f"output_int_register_{index}"] = (value,)
-
-    def put_vector(self, first: int, vector: Iterable[float]) -> None:
-        for index, number in enumerate(vector, first):
-            self.fields[f"output_double_register_{index}"] = (number,)

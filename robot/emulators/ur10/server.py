@@ -12,12 +12,10 @@ import socket
 import sys
 import time
 from collections.abc import Callable
-from functools import partial
 from typing import Protocol
 
 from robot.drivers.process_priority import URGENT, set_niceness
 from robot.drivers.ur10.rtde_protocol import RTDE_PORT
-from robot.emulators.ur10.commands import COMMANDS
 from robot.emulators.ur10.config import DASHBOARD_PORT, FAULT_PORT, SCRIPT_PORT, UrEmulatorConfig
 from robot.emulators.ur10.control_program import load_program
 from robot.emulators.ur10.controller import EmulatedController
@@ -163,7 +161,7 @@ class ControllerServer:
 
 def emulated_controller(config: UrEmulatorConfig) -> EmulatedController:
     """A controller that runs the control program of ur_rtde."""
-    return EmulatedController(config, partial(load_program, COMMANDS))
+    return EmulatedController(config, load_program)
 
 
 def serve(config: UrEmulatorConfig) -> None:

@@ -45,7 +45,7 @@ def settled(condition: Callable[[], bool], seconds: float = 3.0) -> bool:
 
 
 def apart(first: list[float], second: list[float]) -> float:
-    """m"""
+    """Distance of two tool positions, m."""
     return math.dist(first[:3], second[:3])
 
 
@@ -60,12 +60,8 @@ def everyone(host: str) -> dict[str, Any]:
     dashboard.connect()
     start, began = receiver.getTimestamp(), time.monotonic()
     pose = receiver.getActualTCPPose()
-    joints = receiver.getActualQ()
-    inverse = controller.getInverseKinematics(pose, joints)
+    reachable = [controller.isPoseWithinSafetyLimits(p) for p in (pose, [5.0, 0.0, 0.0, 0.0, 0.0, 0.0])]
     controller.setTcp([0.0, 0.0, 0.1, 0.0, 0.0, 0.0])
-    offset = controller.getTCPOffset()
-    forward = controller.getForwardKinematics(joints, offset)
-    lower = controller.getForwardKinematics()
     time.sleep(0.5)
     return {
         "connected": [receiver.isConnected(), controller.isConnected(), writer.isConnected()],
@@ -73,10 +69,8 @@ def everyone(host: str) -> dict[str, Any]:
         "mode": dashboard.robotmode(),
         "version": dashboard.polyscopeVersion(),
         "safety": [receiver.getSafetyMode(), receiver.getSafetyStatusBits()],
-        "offset": offset,
-        "forward_off": [apart(forward, lower), apart(forward, pose) - 0.1],
-        "inverse_off": max(abs(a - b) for a, b in zip(inverse, joints, strict=True)),
-        "unreachable": controller.getInverseKinematicsHasSolution([5.0, 0.0, 0.0, 0.0, 0.0, 0.0]),
+        "lowered": pose[2] - receiver.getActualTCPPose()[2],
+        "reachable": reachable,
         "rate": (receiver.getTimestamp() - start) / (time.monotonic() - began),
     }
 
@@ -102,36 +96,23 @@ def moves(host: str) -> dict[str, Any]:
     stood = apart(receiver.getActualTCPPose(), home)
     done = controller.moveL(goal, 0.1, 1.0)
     arrived = settled(lambda: apart(receiver.getActualTCPPose(), goal) < 1e-5)
-    path = [[*home, 0.1, 1.0, 0.0], [*goal, 0.1, 1.0, 0.0], [*home, 0.1, 1.0, 0.0]]
-    followed = controller.moveL(path)
+    done &= controller.moveL(home, 0.1, 1.0)
     back = settled(lambda: apart(receiver.getActualTCPPose(), home) < 1e-5)
-    joints = receiver.getActualQ()
-    swung = controller.moveJ([*joints[:5], joints[5] + 0.05], 0.5, 1.0)
-    turned = receiver.getActualQ()[5] - joints[5]
-    servoed = [
-        controller.servoJ([*joints[:5], joints[5] + 0.05 * (1 - k / 20)], 0, 0, 0.008, 0.1, 300)
-        for k in range(21)
-    ]
-    controller.servoStop()
-    speed = controller.speedL([0.0, 0.0, 0.01, 0.0, 0.0, 0.0], 0.5)
-    rose = settled(lambda: abs(receiver.getActualTCPSpeed()[2] - 0.01) < 1e-6)
-    controller.speedStop()
-    rested = settled(lambda: not any(receiver.getActualTCPSpeed()))
     return {
-        "told": [known, done, followed, swung, all(servoed), speed],
-        "seen": [stopped, arrived, back, rose, rested],
+        "told": [known, done],
+        "seen": [stopped, arrived, back],
         "under_way": under_way,
         "stood": stood,
-        "turned": turned,
     }
 
 
 def drive(host: str, watchdog: bool) -> dict[str, Any]:
-    """Go at a speed, kicking the watchdog, until killed."""
-    controller = control(host)
+    """Moves slowly and resets the watchdog, until killed."""
+    receiver, controller = receive(host), control(host)
     if watchdog:
         controller.setWatchdog(10)
-    controller.speedL([0.0, 0.01, 0.0, 0.0, 0.0, 0.0], 0.5)
+    x, y, *rest = receiver.getActualTCPPose()
+    controller.moveL([x, y + 0.3, *rest], 0.01, 0.5, True)
     print("here", flush=True)
     while True:
         time.sleep(0.02)
@@ -160,12 +141,13 @@ def watch(host: str) -> list[dict[str, Any]]:
 
 
 def solve(host: str) -> dict[str, Any]:
-    """Inverse kinematics before and after something that the test does."""
+    """Whether a pose can be reached, before and after something that the test does; then a move to it."""
     receiver, controller = receive(host), control(host)
     pose = receiver.getActualTCPPose()
-    before = controller.getInverseKinematics(pose)
+    before = controller.isPoseWithinSafetyLimits(pose)
     here()
-    return {"before": before, "after": controller.getInverseKinematics(pose), "moved": controller.moveL(pose)}
+    after = controller.isPoseWithinSafetyLimits(pose)
+    return {"before": before, "after": after, "moved": controller.moveL(pose)}
 
 
 def refused(host: str) -> dict[str, Any]:
@@ -181,7 +163,7 @@ def second(host: str) -> dict[str, Any]:
     """One client, then another."""
     first = control(host)
     result = refused(host)
-    return {**result, "unharmed": first.isConnected() and first.isProgramRunning() and first.isSteady()}
+    return {**result, "unharmed": first.isConnected() and first.isProgramRunning()}
 
 
 def slide(host: str) -> dict[str, Any]:

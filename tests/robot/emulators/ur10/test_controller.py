@@ -1,4 +1,4 @@
-"""The controller without sockets: recipes and masters, the handshake, watchdog, safety, dashboard."""
+"""The controller without sockets: RTDE recipes, commands, watchdog, safety stops, dashboard."""
 
 from __future__ import annotations
 
@@ -18,10 +18,7 @@ from robot.emulators.ur10.safety import RobotMode, Runtime, SafetyMode
 from robot.emulators.ur10.script_server import ScriptSession
 from robot.emulators.ur10.server import emulated_controller
 
-PROGRAM = (
-    "def rtde_control():\n    global reg_offset_int = # int register offset\n0\n"
-    "    def exec_move_path():\n      # inject move path\n{}    end\nend\n"
-)
+PROGRAM = b"def rtde_control():\n    global reg_offset_int = # int register offset\n0\nend\n"
 HERE = (0.6, 0.0, 0.3, math.pi, 0.0, 0.0)
 THERE = (0.6, 0.1, 0.3, math.pi, 0.0, 0.0)
 RUNNING = 1 << 15
@@ -30,15 +27,15 @@ RUNNING = 1 << 15
 class Bench:
     """A controller, its clock, and a client that writes registers as the library does."""
 
-    def __init__(self, path: str = "", **settings: object) -> None:
+    def __init__(self, **settings: object) -> None:
         self.controller = emulated_controller(UrEmulatorConfig.model_validate(settings))
         self.host = 0.0
         self.script = ScriptSession(self.controller)
         self.dashboard = DashboardSession(self.controller)
-        self.upload(path)
+        self.upload()
 
-    def upload(self, path: str = "") -> None:
-        self.script.received(PROGRAM.format(path).encode(), self.host)
+    def upload(self) -> None:
+        self.script.received(PROGRAM, self.host)
         self.ticks(0.1)
 
     def ticks(self, seconds: float) -> None:
@@ -59,7 +56,7 @@ class Bench:
     def command(
         self, number: int, doubles: tuple[float, ...] = (), asynchronous: int = 0, wait: float = 30
     ) -> bool:
-        """One command, answered and cleared; False where it is never answered."""
+        """Sends a command and clears it when it is done; False if it is never answered."""
         assert self.out(0) == 1
         self.write(number, doubles, asynchronous)
         for _ in range(round(wait / self.controller.dt)):
@@ -77,7 +74,7 @@ class Bench:
         return self.dashboard.received(line.encode() + b"\n", self.host).decode().strip()
 
 
-def test_a_command_is_done_once_and_the_next_waits_for_the_clearing() -> None:
+def test_a_command_is_executed_once_until_its_register_is_cleared() -> None:
     bench = Bench()
     assert bench.out(0) == 1
     assert bench.command(3, (*THERE, 0.2, 1.0))
@@ -88,7 +85,7 @@ def test_a_command_is_done_once_and_the_next_waits_for_the_clearing() -> None:
     assert len([t for t in bench.controller.targets if t["do"] == "movel"]) == 2
 
 
-def test_the_word_of_progress_tells_one_operation_from_the_next() -> None:
+def test_operations_are_numbered_in_the_progress_register() -> None:
     bench = Bench()
     before = bench.out(2)
     assert not before & RUNNING
@@ -119,26 +116,7 @@ def test_an_asynchronous_stop_ends_a_move_and_is_an_operation_itself() -> None:
     assert not bench.out(2) & RUNNING
 
 
-def test_a_stop_that_waits_goes_by_joints_until_one_has_not_waited() -> None:
-    def seconds(bench: Bench) -> float:
-        assert bench.command(3, (*THERE, 0.1, 1.0), asynchronous=1)
-        bench.ticks(0.3)
-        began = bench.controller.time
-        assert bench.command(33, (0.2,))
-        assert not bench.out(2) & RUNNING  # the move that it ended
-        return bench.controller.time - began
-
-    bench = Bench()
-    joints = seconds(bench)
-    assert bench.command(33, (1.0,), asynchronous=1)
-    assert seconds(Bench()) == pytest.approx(joints, abs=0.01)
-    bench.command(3, (*HERE, 0.2, 1.0))
-    tool = seconds(bench)
-    assert tool == pytest.approx(0.1 / 0.2, abs=0.05)
-    assert joints > 1.2 * tool
-
-
-def test_a_move_that_waits_ends_the_one_that_does_not() -> None:
+def test_a_synchronous_move_ends_an_asynchronous_one() -> None:
     bench = Bench()
     assert bench.command(3, (*THERE, 0.1, 1.0), asynchronous=1)
     bench.ticks(0.1)
@@ -148,27 +126,11 @@ def test_a_move_that_waits_ends_the_one_that_does_not() -> None:
     assert not bench.out(2) & RUNNING
 
 
-def test_a_path_reports_its_progress() -> None:
-    line = "\tsignal_async_progress({})\n\tmovel(p[{},0,0.3,3.14159,0,0],a=1,v=0.1,r=0)\n"
-    bench = Bench("".join(line.format(k, 0.62 + 0.02 * k) for k in range(3)))
-    assert bench.command(45, asynchronous=1)
-    seen = []
-    for _ in range(200):
-        bench.ticks(0.008)
-        word = bench.out(2)
-        if not word & RUNNING:
-            break
-        seen.append(word & (RUNNING - 1))
-    assert sorted(set(seen)) == [0, 1, 2]
-    assert seen == sorted(seen)
-    assert bench.controller.arm.state.tcp[0] == pytest.approx(0.66)
-
-
 @given(frequency=st.sampled_from([5.0, 10.0, 20.0]), kicks=st.integers(2, 12))
-def test_the_watchdog_stops_what_is_not_kicked_and_nothing_else(frequency: float, kicks: int) -> None:
+def test_the_watchdog_stops_the_arm_only_when_it_is_not_reset(frequency: float, kicks: int) -> None:
     bench = Bench()
     assert bench.command(35, (frequency,))
-    bench.write(10, (0.0, 0.05, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0))
+    bench.write(3, (*THERE, 0.005, 1.0), asynchronous=1)
     bench.ticks(0.008)
     for _ in range(kicks):
         bench.write(0)
@@ -181,20 +143,33 @@ def test_the_watchdog_stops_what_is_not_kicked_and_nothing_else(frequency: float
     assert not bench.controller.arm.moving
 
 
-def test_where_no_joints_are_the_program_ends() -> None:
+def test_an_unreachable_target_ends_the_program() -> None:
     bench = Bench()
     assert not bench.command(3, (3.0, *THERE[1:], 0.1, 1.0))
     assert bench.controller.runtime is Runtime.STOPPED
     bench.upload()
-    assert not bench.command(46, (math.nan,) * 6)
+    assert not bench.command(3, (math.nan,) * 8)
     bench.upload()
-    assert bench.command(46, THERE)
     bench.controller.ik_fails = True
-    assert not bench.command(46, THERE)
+    assert not bench.command(3, (*THERE, 0.1, 1.0))
     assert bench.controller.arm.state.tcp == HERE
 
 
-def test_a_protective_stop_holds_until_it_is_unlocked_late_enough() -> None:
+def test_safety_limits_of_a_pose_are_whether_it_can_be_reached() -> None:
+    bench = Bench()
+    assert bench.command(36, THERE)
+    assert bench.out(1) == 1
+    assert bench.command(36, (3.0, *THERE[1:]))
+    assert bench.out(1) == 0
+
+
+def test_the_tool_centre_point_is_set_relative_to_the_flange() -> None:
+    bench = Bench()
+    assert bench.command(29, (0.0, 0.0, 0.1, 0.0, 0.0, 0.0))
+    assert bench.controller.arm.state.tcp[:3] == pytest.approx((*HERE[:2], HERE[2] - 0.1))
+
+
+def test_a_protective_stop_can_be_unlocked_after_five_seconds() -> None:
     bench = Bench()
     assert bench.command(3, (*THERE, 0.1, 1.0), asynchronous=1)
     bench.ticks(0.3)
@@ -213,7 +188,7 @@ def test_a_protective_stop_holds_until_it_is_unlocked_late_enough() -> None:
     assert bench.command(3, (*THERE, 0.1, 1.0))
 
 
-def test_a_closed_safeguard_goes_on_by_itself() -> None:
+def test_a_move_resumes_when_the_safeguard_is_closed() -> None:
     bench = Bench()
     assert bench.command(3, (*THERE, 0.1, 1.0), asynchronous=1)
     bench.ticks(0.3)
@@ -227,7 +202,7 @@ def test_a_closed_safeguard_goes_on_by_itself() -> None:
     assert bench.controller.arm.state.tcp[1] == pytest.approx(0.1)
 
 
-def test_an_emergency_stop_takes_the_power_until_it_is_given_by_hand() -> None:
+def test_an_emergency_stop_cuts_the_power_until_it_is_switched_on() -> None:
     bench = Bench()
     assert bench.command(3, (*THERE, 0.1, 1.0), asynchronous=1)
     bench.ticks(0.3)
@@ -246,7 +221,7 @@ def test_an_emergency_stop_takes_the_power_until_it_is_given_by_hand() -> None:
     assert bench.command(3, (*THERE, 0.1, 1.0))
 
 
-def test_too_much_force_is_a_protective_stop() -> None:
+def test_excessive_force_causes_a_protective_stop() -> None:
     bench = Bench(walls=[{"axis": "y", "at": 0.02, "stiffness": 5000.0}], protective_force=100.0)
     bench.command(3, (*THERE, 0.1, 1.0), asynchronous=1)
     bench.ticks(2.0)
@@ -254,7 +229,7 @@ def test_too_much_force_is_a_protective_stop() -> None:
     assert 0.02 < bench.controller.arm.penetration_max < 0.03
 
 
-def test_the_slider_is_where_it_was_last_moved() -> None:
+def test_the_speed_slider_can_be_set_by_register_and_by_hand() -> None:
     bench = Bench()
     for name, value in (("speed_slider_mask", 1), ("speed_slider_fraction", 0.5)):
         bench.controller.registers.write(name, (value,), 0.0)
@@ -266,7 +241,7 @@ def test_the_slider_is_where_it_was_last_moved() -> None:
 
 
 @pytest.mark.parametrize(("polyscope", "modern"), [("3.4", False), ("5.5.1", False), ("5.6", True)])
-def test_the_dashboard_knows_what_its_version_knows(polyscope: str, modern: bool) -> None:
+def test_dashboard_commands_depend_on_the_version(polyscope: str, modern: bool) -> None:
     bench = Bench(polyscope=polyscope)
     assert polyscope in bench.ask("PolyscopeVersion")
     assert bench.ask("robotmode") == "Robotmode: RUNNING"
@@ -291,7 +266,7 @@ def reply(session: RtdeSession, kind: int, body: bytes = b"") -> bytes:
     return package.body
 
 
-def test_recipes_are_told_by_type_and_states_follow_them() -> None:
+def test_output_recipes_return_types_and_define_states() -> None:
     bench = Bench()
     session = RtdeSession(bench.controller, Claims())
     assert reply(session, rtde_protocol.PROTOCOL, b"\0\2") == b"\1"
@@ -311,7 +286,7 @@ def test_recipes_are_told_by_type_and_states_follow_them() -> None:
     assert tuple(rest) == (*HERE, 7, 1)
 
 
-def test_an_input_has_one_master() -> None:
+def test_an_input_variable_belongs_to_one_client() -> None:
     claims = Claims()
     controller = emulated_controller(UrEmulatorConfig())
     first, second = RtdeSession(controller, claims), RtdeSession(controller, claims)
@@ -333,7 +308,7 @@ def test_an_input_has_one_master() -> None:
 
 
 @given(data=st.lists(st.binary(max_size=60), max_size=8))
-def test_no_bytes_bring_a_session_down(data: list[bytes]) -> None:
+def test_any_bytes_leave_the_sessions_working(data: list[bytes]) -> None:
     controller = emulated_controller(UrEmulatorConfig())
     for session in (
         RtdeSession(controller, Claims()),
@@ -359,7 +334,7 @@ def test_no_bytes_bring_a_session_down(data: list[bytes]) -> None:
     ),
     body=st.binary(max_size=40),
 )
-def test_no_body_brings_the_wire_down(kind: int, body: bytes) -> None:
+def test_any_package_body_leaves_the_session_working(kind: int, body: bytes) -> None:
     session = RtdeSession(emulated_controller(UrEmulatorConfig()), Claims())
     with contextlib.suppress(ValueError):
         session.received(rtde_protocol.pack_package(kind, body), 0.0)
@@ -367,7 +342,7 @@ def test_no_body_brings_the_wire_down(kind: int, body: bytes) -> None:
 
 
 @given(data=st.binary(max_size=300), cut=st.integers(0, 300))
-def test_packages_do_not_depend_on_how_they_are_cut(data: bytes, cut: int) -> None:
+def test_packages_do_not_depend_on_how_the_stream_is_split(data: bytes, cut: int) -> None:
     stream = b"".join(rtde_protocol.pack_package(byte, data[:byte]) for byte in data[:20])
     whole, parts = rtde_protocol.PackageSplitter(), rtde_protocol.PackageSplitter()
     assert list(whole.feed(stream)) == [*parts.feed(stream[:cut]), *parts.feed(stream[cut:])]
