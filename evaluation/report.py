@@ -4,35 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-import numpy as np
 
 from evaluation.artifacts.grid_npz import read_grid, read_grid_truth
 from evaluation.artifacts.run_directory import read_closures, read_run, read_scorecard, read_walls
 from evaluation.artifacts.whisker_views import read_whisker_views
 from evaluation.metrics.grid_score import GridScore
 from evaluation.metrics.run_arrays import RunArrays
-from evaluation.metrics.scorecard import Scorecard
 from evaluation.plots.experience_plot import draw_experience_history
 from evaluation.plots.grid_plot import GridPanel, GridPaths, draw_grid, grid_headline
-from evaluation.plots.map_plot import NO_CLOSURES, NO_WALLS, draw_map
+from evaluation.plots.map_plot import draw_map
 from evaluation.plots.whisker_plot import draw_whiskers
 from tactile.base.se2 import between
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-
-def save_map(
-    path: str | Path,
-    run: RunArrays,
-    card: Scorecard,
-    walls: np.ndarray = NO_WALLS,
-    closures: np.ndarray = NO_CLOSURES,
-) -> None:
-    """Saves the plot of `draw_map`; equal runs give equal bytes."""
-    draw_map(run, card, walls, closures).savefig(path)
 
 
 def plot_writers(directory: Path) -> dict[str, Callable[[Path], None]]:
@@ -46,19 +28,16 @@ def plot_writers(directory: Path) -> dict[str, Callable[[Path], None]]:
     """
     run, card = read_run(directory), read_scorecard(directory)
     walls, closures = read_walls(directory), read_closures(directory)
-    drawn: dict[str, Callable[[], Figure]] = {"map.png": lambda: draw_map(run, card, walls, closures)}
+    writers: dict[str, Callable[[Path], None]] = {
+        "map.png": lambda path: draw_map(run, card, walls, closures).savefig(path)
+    }
     if (directory / "views.npz").exists():
         images = read_whisker_views(directory / "views.npz")
-        drawn["whiskers.png"] = lambda: draw_whiskers(run, card, images, walls)
-        drawn["experiences.png"] = lambda: draw_experience_history(run, card)
-
+        writers["whiskers.png"] = lambda path: draw_whiskers(run, card, images, walls).savefig(path)
+        writers["experiences.png"] = lambda path: draw_experience_history(run, card).savefig(path)
     if (directory / "grid.npz").exists():
-        drawn["grid.png"] = lambda: draw_grid(_grid_panel(directory, run))
-
-    def saver(draw: Callable[[], Figure]) -> Callable[[Path], None]:
-        return lambda path: draw().savefig(path)
-
-    return {name: saver(draw) for name, draw in drawn.items()}
+        writers["grid.png"] = lambda path: draw_grid(_grid_panel(directory, run)).savefig(path)
+    return writers
 
 
 def _grid_panel(directory: Path, run: RunArrays) -> GridPanel:
@@ -70,13 +49,3 @@ def _grid_panel(directory: Path, run: RunArrays) -> GridPanel:
     score = GridScore.model_validate_json((directory / "gridscore.json").read_text(encoding="utf-8"))
     paths = GridPaths(between(start, run.truth), run.online, run.odometry)
     return GridPanel(directory.name, grid_headline(score), grid, truth.segments, paths)
-
-
-def redraw_plots(directory: Path) -> None:
-    """Makes the plots of a scored run again, in place.
-
-    Raises:
-        InputError: naming the file that is missing or malformed.
-    """
-    for name, save in plot_writers(directory).items():
-        save(directory / name)

@@ -2,39 +2,28 @@
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 
 import numpy as np
 
 from evaluation.metrics.occupancy_grid import GridTruth, OccupancyGrid, check_grid
-from tactile.base.errors import InputError
-
-
-def write_grid(path: str | Path, grid: OccupancyGrid) -> None:
-    """Writes a map to an .npz file; equal maps give equal bytes."""
-    check_grid(grid)
-    with Path(path).open("wb") as file:
-        np.savez_compressed(file, **{name: np.asarray(array) for name, array in grid._asdict().items()})  # type: ignore[arg-type]
+from tactile.base.npz import read_npz
 
 
 def read_grid(path: str | Path) -> OccupancyGrid:
-    """The inverse of `write_grid`.
+    """Reads the map of a run with a grid.
 
     Raises:
         InputError: the file is missing or holds something else.
     """
-    expected = "probability [H, W], origin [2] and cell"
-    try:
-        with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            probability, origin, cell = (archive[name] for name in OccupancyGrid._fields)
+
+    def parse(probability: np.ndarray, origin: np.ndarray, cell: np.ndarray) -> OccupancyGrid:
         grid = OccupancyGrid(probability.astype(float), origin.astype(float).reshape(2), float(cell))
         check_grid(grid)
-    except FileNotFoundError:
-        raise InputError(str(path), "no such file", expected) from None
-    except (OSError, ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(str(path), f"not an occupancy map ({error})", expected) from None
-    return grid
+        return grid
+
+    expected = "an occupancy map: probability [H, W], origin [2] and cell"
+    return read_npz(path, OccupancyGrid._fields, parse, expected)
 
 
 def write_grid_truth(path: str | Path, truth: GridTruth, start: np.ndarray) -> None:
@@ -50,12 +39,9 @@ def read_grid_truth(path: str | Path) -> tuple[GridTruth, np.ndarray]:
     Raises:
         InputError: the file is missing or holds something else.
     """
-    expected = "the arena.npz of a run directory"
-    try:
-        with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            occupied, inside, segments, start = (archive[name] for name in (*GridTruth._fields, "start"))
-    except FileNotFoundError:
-        raise InputError(str(path), "no such file", expected) from None
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(str(path), f"not the truth of a map ({error})", expected) from None
-    return GridTruth(occupied, inside, segments.astype(float)), start.astype(float)
+
+    def parse(*arrays: np.ndarray) -> tuple[GridTruth, np.ndarray]:
+        occupied, inside, segments, start = arrays
+        return GridTruth(occupied, inside, segments.astype(float)), start.astype(float)
+
+    return read_npz(path, (*GridTruth._fields, "start"), parse, "the arena.npz of a run directory")

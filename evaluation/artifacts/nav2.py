@@ -10,18 +10,14 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
 
 from evaluation.metrics.occupancy_grid import OccupancyGrid, check_grid
-from tactile.base.atomic_write import write_atomically
+from tactile.base.atomic_write import write_atomically, write_text_atomically
 from tactile.base.errors import InputError
-
-Nav2Mode = Literal["trinary", "scale"]
-"""`trinary` distinguishes occupied, free and unknown cells; `scale` stores the occupancy, but then a PGM
-cannot mark unknown cells: the prior is read as 24 of 100."""
 
 FREE_THRESH, OCCUPIED_THRESH = 0.19, 0.65
 """Thresholds of free and occupied cells; 205 stays unknown even for a reader that divides by 256."""
@@ -43,39 +39,20 @@ class Nav2Map(NamedTuple):
     resolution: float
 
 
-def write_nav2(folder: Path, grid: OccupancyGrid, mode: Nav2Mode = "trinary") -> None:
-    """Writes map.pgm and map.yaml into a folder, each atomically."""
-    write_atomically(folder / "map.pgm", lambda path: write_pgm(path, grid, mode))
-    write_atomically(folder / "map.yaml", lambda path: write_map_yaml(path, grid, mode))
-
-
-def write_pgm(path: str | Path, grid: OccupancyGrid, mode: Nav2Mode = "trinary") -> None:
-    """Writes a binary 8-bit PGM; dark pixels are occupied."""
+def write_nav2(folder: Path, grid: OccupancyGrid) -> None:
+    """Writes map.pgm (binary, 8 bits, dark is occupied) and map.yaml into a folder, each atomically."""
     check_grid(grid)
-    if mode == "scale":
-        pixel = np.rint(255 * (1 - grid.probability))
-    else:
-        free, occupied = grid.probability < FREE_THRESH, grid.probability > OCCUPIED_THRESH
-        pixel = np.where(occupied, _BLACK, np.where(free, _WHITE, _UNKNOWN))
+    free, occupied = grid.probability < FREE_THRESH, grid.probability > OCCUPIED_THRESH
+    pixel = np.where(occupied, _BLACK, np.where(free, _WHITE, _UNKNOWN)).astype(np.uint8)
     height, width = pixel.shape
-    Path(path).write_bytes(f"P5\n{width} {height}\n255\n".encode() + pixel[::-1].astype(np.uint8).tobytes())
-
-
-def write_map_yaml(
-    path: str | Path, grid: OccupancyGrid, mode: Nav2Mode = "trinary", image: str = "map.pgm"
-) -> None:
-    """Writes the YAML file; `image` is the name of the image in the same folder."""
-    x, y = (_number(value) for value in grid.origin)
-    lines = (
-        f"image: {image}",
-        f"mode: {mode}",
-        f"resolution: {_number(grid.cell)}",
-        f"origin: [{x}, {y}, 0.0]",
-        "negate: 0",
-        f"occupied_thresh: {OCCUPIED_THRESH}",
-        f"free_thresh: {FREE_THRESH}",
+    image = f"P5\n{width} {height}\n255\n".encode() + pixel[::-1].tobytes()
+    write_atomically(folder / "map.pgm", lambda path: path.write_bytes(image))
+    x, y, cell = (_number(value) for value in (*grid.origin, grid.cell))
+    write_text_atomically(
+        folder / "map.yaml",
+        f"image: map.pgm\nmode: trinary\nresolution: {cell}\norigin: [{x}, {y}, 0.0]\n"
+        f"negate: 0\noccupied_thresh: {OCCUPIED_THRESH}\nfree_thresh: {FREE_THRESH}\n",
     )
-    Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def read_nav2(path: str | Path) -> Nav2Map:
@@ -94,11 +71,9 @@ def read_nav2(path: str | Path) -> Nav2Map:
         raise InputError(f"{path}: origin", repr(origin), "[x, y, yaw]")
     place = np.array([_value(path, {"origin": value}, "origin") for value in origin])
     if resolution <= 0 or not 0 <= free < occupied <= 1:
-        raise InputError(
-            str(path),
-            f"resolution {resolution:g}, thresholds {free:g}, {occupied:g}",
-            "a positive resolution, and free_thresh below occupied_thresh",
-        )
+        found = f"resolution {resolution:g}, thresholds {free:g}, {occupied:g}"
+        expected = "a positive resolution, and free_thresh below occupied_thresh"
+        raise InputError(str(path), found, expected)
     shade = _image(path.parent / str(given.get("image", "")))[::-1] / 255
     occupancy = shade if given.get("negate") else 1 - shade
     mode = given.get("mode", "trinary")
@@ -142,9 +117,8 @@ def _image(path: Path) -> np.ndarray:
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise InputError(
-            str(path), f"cannot be read ({error.strerror})", "an image beside its map.yaml"
-        ) from None
+        found = f"cannot be read ({error.strerror})"
+        raise InputError(str(path), found, "an image beside its map.yaml") from None
     head = _HEAD.match(content)
     if head is None or int(head[3]) != 255:
         raise InputError(str(path), "another kind of image", "a binary 8-bit PGM (P5)")

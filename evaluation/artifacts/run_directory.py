@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,7 @@ from evaluation.metrics.scorecard import Scorecard
 from evaluation.metrics.text_table import read_text_table
 from evaluation.metrics.trajectory import read_tum
 from tactile.base.errors import InputError
+from tactile.base.npz import read_npz
 
 
 def read_run(path: Path) -> RunArrays:
@@ -24,7 +24,7 @@ def read_run(path: Path) -> RunArrays:
     """
     online_time, online = _tum(path / "online.tum")
     odometry_time, odometry = _tum(path / "odometry.tum")
-    place = _places(path / "steps.csv")
+    place = _column(path / "steps.csv", "place").astype(int)
     steps = min(len(online_time), len(odometry_time), len(place))
     if steps == 0:
         raise InputError(str(path), "a run without steps", "a run directory with results")
@@ -34,6 +34,7 @@ def read_run(path: Path) -> RunArrays:
     true = np.full((steps, 3), np.nan)
     true[known] = truth[row[known]]
     final = _tum(path / "trajectory.tum")[1] if (path / "trajectory.tum").exists() else online
+    errors = path / "online_error.csv"
     nodes, links = _map(path / "map.json")
     place = np.where(place[:steps] < len(nodes), place[:steps], -1)
     created = np.array([int(np.argmax(place == node)) for node in range(len(nodes))], int)
@@ -47,7 +48,7 @@ def read_run(path: Path) -> RunArrays:
         created=created,
         nodes=nodes,
         links=links,
-        online_error=_online_errors(path / "online_error.csv"),
+        online_error=_column(errors, "error") if errors.exists() else np.zeros(0),
     )
 
 
@@ -57,16 +58,13 @@ def read_scorecard(path: Path) -> Scorecard:
     Raises:
         InputError: it is missing or malformed.
     """
+    file = path / "scorecard.json"
     try:
-        return Scorecard.model_validate_json((path / "scorecard.json").read_text(encoding="utf-8"))
+        return Scorecard.model_validate_json(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise InputError(
-            str(path / "scorecard.json"), "no such file", "the directory of a scored run"
-        ) from None
+        raise InputError(str(file), "no such file", "the directory of a scored run") from None
     except ValueError as error:
-        raise InputError(
-            str(path / "scorecard.json"), f"not a scorecard ({error})", "the scorecard.json of a run"
-        ) from None
+        raise InputError(str(file), f"not a scorecard ({error})", "the scorecard.json of a run") from None
 
 
 WALL_COLUMNS = ("west", "south", "east", "north", "height")
@@ -100,7 +98,6 @@ def read_closures(path: Path) -> np.ndarray:
     file = path / "closures.csv"
     if not file.exists():
         return np.zeros((0, 2), int)
-    skipped = _skipped(path)
     joined = []
     with file.open(encoding="utf-8", newline="") as lines:
         for row in (reader := csv.DictReader(lines)):
@@ -108,23 +105,21 @@ def read_closures(path: Path) -> np.ndarray:
                 if row["verdict"] == "accepted":
                     joined.append([int(row["match_step"]), int(row["step"])])
             except (KeyError, TypeError, ValueError):
-                raise InputError(
-                    f"{file}:{reader.line_num}",
-                    "a malformed closure",
-                    "the columns step, match_step, verdict",
-                ) from None
+                expected = "the columns step, match_step, verdict"
+                raise InputError(f"{file}:{reader.line_num}", "a malformed closure", expected) from None
+    # A continued run counts from the first step of the run before it.
+    saved = checkpoint_steps(path)
+    skipped = max(0, saved - len(_tum(path / "online.tum")[0])) if saved else 0
     steps = np.array(joined, int).reshape(-1, 2) - skipped
     return steps[(steps >= 0).all(axis=1)]
 
 
-def _skipped(path: Path) -> int:
-    """Number of steps before the checkpoint from which this run continued."""
+def checkpoint_steps(path: Path) -> int:
+    """Number of steps in the checkpoint (map.npz) of a run directory; 0 without a readable one."""
     try:
-        with (path / "map.npz").open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            total = int(archive["steps"])
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return read_npz(path / "map.npz", ("steps",), int, "a checkpoint")
+    except InputError:
         return 0
-    return max(0, total - len(_tum(path / "online.tum")[0]))
 
 
 def _tum(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -133,28 +128,17 @@ def _tum(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return read_tum(path) if path.stat().st_size else (np.zeros(0), np.zeros((0, 3)))
 
 
-def _places(path: Path) -> np.ndarray:
+def _column(path: Path, name: str) -> np.ndarray:
+    """A numeric column of a CSV file; an incomplete last line is dropped."""
     if not path.exists():
         raise InputError(str(path), "no such file", "a file of a run directory")
     text = path.read_text(encoding="utf-8")
-    header, *lines = text[: text.rfind("\n") + 1].splitlines() or [""]
-    column = header.split(",").index("place") if "place" in header.split(",") else -1
+    header, *lines = text[: text.rfind("\n") + 1].splitlines() or [name]
     try:
-        return np.array([int(line.split(",")[column]) for line in lines], int)
+        column = header.split(",").index(name)
+        return np.array([float(line.split(",")[column]) for line in lines])
     except (ValueError, IndexError):
-        raise InputError(str(path), "rows without a place", "the columns t,place,action,...") from None
-
-
-def _online_errors(path: Path) -> np.ndarray:
-    """The errors [A] of a file `t,error`; A is 0 without the file. An incomplete last line is dropped."""
-    if not path.exists():
-        return np.zeros(0)
-    text = path.read_text(encoding="utf-8")
-    lines = text[: text.rfind("\n") + 1].splitlines()[1:]
-    try:
-        return np.array([float(line.split(",")[1]) for line in lines])
-    except (ValueError, IndexError):
-        raise InputError(str(path), "a malformed row, not t,error", "the online_error.csv of a run") from None
+        raise InputError(str(path), f"a row without a number in column {name}", f"column {name}") from None
 
 
 def _map(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -166,7 +150,6 @@ def _map(path: Path) -> tuple[np.ndarray, np.ndarray]:
         nodes = [[node["x"], node["y"], node["heading"]] for node in content["nodes"]]
         links = [[link["source"], link["target"]] for link in content.get("edges", content.get("links"))]
     except (ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            str(path), f"not a node-link map ({error})", "the map.json of a run directory"
-        ) from None
+        expected = "the map.json of a run directory"
+        raise InputError(str(path), f"not a node-link map ({error})", expected) from None
     return np.array(nodes, float).reshape(-1, 3), np.array(links, int).reshape(-1, 2)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from tactile.base.errors import InputError
+from tactile.base.npz import read_npz
 
 _WHITE = 255
 
@@ -45,18 +44,12 @@ def read_whisker_views(path: str | Path) -> WhiskerViews:
     Raises:
         InputError: the file is missing or holds something else.
     """
-    try:
-        with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in WhiskerViews._fields}
-        view = arrays["view"] / _WHITE
-        images = WhiskerViews(**arrays | {"view": view, "tallest": float(arrays["tallest"])})
-    except FileNotFoundError:
-        raise InputError(str(path), "no such file", "the views.npz of a run directory") from None
-    except (OSError, ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(
-            str(path), f"not whisker images ({error})", "the views.npz of a run directory"
-        ) from None
-    shapes = images.view.shape[1:2], images.view.shape[2:], images.view.shape
-    if images.view.ndim != 3 or (images.length.shape, images.azimuth.shape, images.alive.shape) != shapes:
-        raise InputError(str(path), "arrays that do not fit each other", "the views.npz of a run directory")
-    return images
+
+    def parse(view: np.ndarray, *arrays: np.ndarray) -> WhiskerViews:
+        alive, azimuth, length, tallest = arrays
+        rings, columns = view.shape[1:]
+        if (length.shape, azimuth.shape, alive.shape) != ((rings,), (columns,), view.shape):
+            raise ValueError("arrays that do not fit each other")
+        return WhiskerViews(view / _WHITE, alive, azimuth, length, float(tallest))
+
+    return read_npz(path, WhiskerViews._fields, parse, "the views.npz of a run directory")

@@ -134,11 +134,9 @@ def relation_errors(time: np.ndarray, pose: np.ndarray, relations: Relations) ->
     if not inside.any():
         raise InputError("relations", "none inside the recording", f"times from {time[0]} to {time[-1]} s")
     error = between(relations.motion[inside], found[inside])
-    used = int(inside.sum())
+    used, rotation = int(inside.sum()), float(np.degrees(np.mean(np.abs(error[:, 2]))))
     translation = float(np.mean(np.hypot(error[:, 0], error[:, 1])))
-    return RelationErrors(
-        translation, float(np.degrees(np.mean(np.abs(error[:, 2])))), used, len(inside) - used
-    )
+    return RelationErrors(translation, rotation, used, len(inside) - used)
 
 
 def _after(values: np.ndarray) -> np.ndarray:

@@ -19,12 +19,7 @@ _COLUMNS = {
         "th",
         "heading",
         "yaw",
-        "true_theta",
-        "true_th",
-        "gt_th",
-        "gt_theta",
-        "truth_theta",
-        "truth_th",
+        *(f"{who}_{th}" for who in ("true", "gt", "truth") for th in ("th", "theta")),
     ),
 }
 
@@ -54,10 +49,8 @@ def read_experience_log(path: str | Path) -> ExperienceLog:
     time, experience, x, y, theta = table.values.T
     broken = np.flatnonzero(experience != np.round(experience))
     if len(broken):
-        row = broken[0]
-        raise InputError(
-            f"{path}:{table.line[row]}", f"experience id {experience[row]}", "a whole number, -1 for none"
-        )
+        where, found = f"{path}:{table.line[broken[0]]}", f"experience id {experience[broken[0]]}"
+        raise InputError(where, found, "a whole number, -1 for none")
     return ExperienceLog(time, experience.astype(np.int64), np.stack([x, y, theta], axis=1))
 
 

@@ -14,14 +14,13 @@ ARR is the same in all four.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import numpy as np
 from pydantic import NonNegativeInt, PositiveFloat
 
 from evaluation.metrics.experience_log import change_rows, creation_rows
-from evaluation.metrics.statistics import bootstrap
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.se2 import wrap
@@ -78,26 +77,6 @@ class ExperienceMetric(NamedTuple):
     near: np.ndarray
 
 
-class PooledExperienceMetric(NamedTuple):
-    """ARR and ARCR over several runs.
-
-    Attributes:
-        arr, arcr: macro averages (each run has the same weight); runs without ARCR are left out.
-        arr_interval, arcr_interval: 95 % bootstrap intervals of these means over the runs.
-        arr_pooled, arcr_pooled: ratios of the summed counts (each entry has the same weight).
-        runs: number of runs. judged: number of runs with an ARCR.
-    """
-
-    arr: float
-    arcr: float
-    arr_interval: tuple[float, float]
-    arcr_interval: tuple[float, float]
-    arr_pooled: float
-    arcr_pooled: float
-    runs: int
-    judged: int
-
-
 class _Reading(NamedTuple):
     """The parts of the listing that differ between modes.
 
@@ -138,16 +117,11 @@ def experience_metric(
     near = _near(poses, poses[reading.perceived(ids)], reading, config)
     right = _verdicts(ids, base, counted, near, reading)
     eta, eta_c, entries = int(counted.sum()), int(right.sum()), len(ids) - base
-    notes = [
-        LITERAL_WARNING if config.mode == "literal" else "",
-        "" if entries else "no entry after the base set: ARR is 0/0",
-        "" if eta else NO_RELOCALISATION,
-    ]
-    note = "; ".join(filter(None, notes))
-    arr, arcr = _ratio(eta, entries), _ratio(eta_c, eta)
-    return ExperienceMetric(
-        arr, arcr, entries, eta, eta_c, base, config.mode, config.log, note, counted, right, near
-    )
+    notes = [LITERAL_WARNING] if config.mode == "literal" else []
+    notes += [] if entries else ["no entry after the base set: ARR is 0/0"]
+    note = "; ".join(notes + ([] if eta else [NO_RELOCALISATION]))
+    counts = _ratio(eta, entries), _ratio(eta_c, eta), entries, eta, eta_c, base
+    return ExperienceMetric(*counts, config.mode, config.log, note, counted, right, near)
 
 
 def relocalisations(experience: np.ndarray, base: int) -> np.ndarray:
@@ -189,47 +163,16 @@ def base_end(truth: np.ndarray, position: float = 0.1, heading_deg: float = 25.0
     back = np.flatnonzero(near & left & (way > away.max()))
     if len(back) == 0:
         where = f"within {position} m and {heading_deg} degrees of its start"
-        raise InputError(
-            "true trajectory",
-            f"never returns {where}",
-            "a closed loop",
-            "set `base`, the end of the base set",
-        )
+        cure = "set `base`, the end of the base set"
+        raise InputError("true trajectory", f"never returns {where}", "a closed loop", cure)
     return int(back[0])
-
-
-def pool_experience_metrics(results: Sequence[ExperienceMetric], *, seed: int = 0) -> PooledExperienceMetric:
-    """Combines several runs (data sets, seeds); the paper uses the macro averages.
-
-    Raises:
-        InputError: no runs, or runs of different modes or kinds of log.
-    """
-    kinds = {(result.mode, result.log) for result in results}
-    if len(kinds) != 1:
-        raise InputError("runs", f"{sorted(kinds)}", "at least one run, all of one mode and kind of log")
-    arr = np.array([result.arr for result in results])
-    arcr = np.array([result.arcr for result in results])
-    judged = arcr[np.isfinite(arcr)]
-    arr = arr[np.isfinite(arr)]
-    eta = sum(result.relocalisations for result in results)
-    return PooledExperienceMetric(
-        arr=float(arr.mean()) if len(arr) else np.nan,
-        arcr=float(judged.mean()) if len(judged) else np.nan,
-        arr_interval=bootstrap(arr, "exm.arr", seed=seed),
-        arcr_interval=bootstrap(judged, "exm.arcr", seed=seed),
-        arr_pooled=_ratio(eta, sum(result.entries for result in results)),
-        arcr_pooled=_ratio(sum(result.correct for result in results), eta),
-        runs=len(results),
-        judged=len(judged),
-    )
 
 
 def _checked(experience: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     experience, truth = np.asarray(experience), np.asarray(truth, float)
     if experience.ndim != 1 or len(experience) == 0 or truth.shape != (len(experience), 3):
-        raise InputError(
-            "experience log", f"shapes {experience.shape} and {truth.shape}", "[N] and [N, 3], N at least 1"
-        )
+        found = f"shapes {experience.shape} and {truth.shape}"
+        raise InputError("experience log", found, "[N] and [N, 3], N at least 1")
     if not np.isfinite(truth).all():
         row = int(np.argmin(np.isfinite(truth).all(axis=1)))
         raise InputError(f"true trajectory, row {row}", f"{truth[row]}", "finite numbers", "remove such rows")

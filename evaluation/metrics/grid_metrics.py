@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from functools import cached_property
-
 import numpy as np
 
 from evaluation.metrics.metric import Direction, Finding, Metric
 from evaluation.metrics.occupancy_grid import (
+    PRIOR_OCCUPANCY,
     GridTruth,
     OccupancyGrid,
     TouchableSurface,
@@ -15,35 +14,31 @@ from evaluation.metrics.occupancy_grid import (
     has_evidence,
 )
 
+OCCUPIED_ABOVE = 0.5
+"""Cells above this probability count as occupied (Chamfer)."""
 CLAMP = 1e-3
 """Probabilities are clipped to this distance from 0 and 1 before the logarithm."""
 
 _ROUNDING = 6  # decimals; closer probabilities tie
 
 
-class GridData:
-    """The input of grid metrics: a map, its truth and the touchable surface; findings are computed once.
+def grid_findings(
+    grid: OccupancyGrid,
+    truth: GridTruth,
+    surface: TouchableSurface,
+    prior: float = PRIOR_OCCUPANCY,
+    occupied: float = OCCUPIED_ABOVE,
+) -> dict[str, Finding]:
+    """The findings of `GRID_METRICS` by name.
 
     Args:
         prior: occupancy of cells without evidence. occupied: cells above it count as occupied (Chamfer).
     """
-
-    def __init__(
-        self, grid: OccupancyGrid, truth: GridTruth, surface: TouchableSurface, prior: float, occupied: float
-    ) -> None:
-        self.grid, self.truth, self.surface = grid, truth, surface
-        self._prior, self._occupied = prior, occupied
-
-    @cached_property
-    def findings(self) -> dict[str, Finding]:
-        """All findings by name."""
-        return _cells(self.grid, self.surface, self._prior) | _chamfer(
-            self.grid, self.truth, self.surface, self._prior, self._occupied
-        )
+    return _cells(grid, surface, prior) | _chamfer(grid, truth, surface, prior, occupied)
 
 
 def _metric(name: str, label: str, unit: str, direction: Direction) -> Metric:
-    return Metric(name, label, unit, direction, "Map", lambda data: data.findings[name])
+    return Metric(name, label, unit, direction, "Map", lambda findings: findings[name])
 
 
 GRID_METRICS: tuple[Metric, ...] = (
@@ -70,23 +65,18 @@ def _cells(grid: OccupancyGrid, felt: TouchableSurface, prior: float) -> dict[st
     wall, ours = felt.wall[cells], grid.probability[cells]
     if wall.all() or not wall.any():
         reason = f"the truth has no {'wall' if felt.free.any() else 'free space'}"
-        return {
-            metric.name: Finding(np.nan, note=reason)
-            for metric in GRID_METRICS
-            if "chamfer" not in metric.name
-        }
-    driven, rate = np.minimum(ours, prior), float(wall.mean())
+        names = [metric.name for metric in GRID_METRICS if "chamfer" not in metric.name]
+        return dict.fromkeys(names, Finding(np.nan, note=reason))
+    driven, rate, clipped = np.minimum(ours, prior), float(wall.mean()), "the map clipped at its prior"
     blind, loss = rate * (1 - rate), _log_loss(np.full(len(wall), rate), wall)
     return {
         "map_brier": Finding(_brier(ours, wall), note=f"best constant, {rate:.3g}: {blind:.4g}"),
         "map_brier_skill": Finding(1 - _brier(ours, wall) / blind, note="against the best constant"),
-        "map_brier_skill_free": Finding(
-            1 - _brier(driven, wall) / blind, note="the map clipped at its prior"
-        ),
+        "map_brier_skill_free": Finding(1 - _brier(driven, wall) / blind, note=clipped),
         "map_log_loss": Finding(_log_loss(ours, wall), note=f"clamped at {CLAMP:g}"),
         "map_log_loss_constant": Finding(loss, note=f"{rate:.3g} everywhere"),
         "map_auc": Finding(_auc(ours, wall), note=f"{wall.sum()} wall and {(~wall).sum()} free cells"),
-        "map_auc_free": Finding(_auc(driven, wall), note="the map clipped at its prior"),
+        "map_auc_free": Finding(_auc(driven, wall), note=clipped),
     }
 
 

@@ -13,8 +13,8 @@ from itertools import pairwise
 import numpy as np
 
 from evaluation.metrics.grid_error import CONVENTIONS, Convention, GridError, grid_error, pool_errors
-from evaluation.metrics.grid_metrics import GRID_METRICS, GridData
-from evaluation.metrics.metric import MISSING_TRUTH, Quantity
+from evaluation.metrics.grid_metrics import GRID_METRICS, grid_findings
+from evaluation.metrics.metric import Quantity
 from evaluation.metrics.occupancy_grid import (
     PRIOR_OCCUPANCY,
     GridTruth,
@@ -24,8 +24,6 @@ from evaluation.metrics.occupancy_grid import (
 )
 from tactile.base.config import Settings
 
-OCCUPIED_ABOVE = 0.5
-"""Cells above this probability count as occupied (Chamfer)."""
 PAPER_ERRORS = {"blob": 0.40, "geometric": 0.39, "template": 0.37}
 """Equation 6 by mapper, as printed (Fox et al. 2012, III, without its convention)."""
 
@@ -47,29 +45,19 @@ class GridScore(Settings):
         return next(error for error in self.errors if error.convention == convention)
 
 
-def score_grid(
-    grid: OccupancyGrid,
-    truth: GridTruth,
-    name: str = "map",
-    *,
-    prior: float = PRIOR_OCCUPANCY,
-    occupied: float = OCCUPIED_ABOVE,
-) -> GridScore:
+def score_grid(grid: OccupancyGrid, truth: GridTruth, name: str = "map") -> GridScore:
     """Scores one map in the frame of the truth, without alignment.
-
-    Args:
-        prior: occupancy of cells without evidence. occupied: cells above it count as occupied (Chamfer).
 
     Raises:
         ValueError: the map is invalid or not on the cells of the truth.
     """
     check_grid(grid, truth)
-    felt = touchable_surface(grid, truth)
-    data = GridData(grid, truth, felt, prior, occupied)
+    surface = touchable_surface(grid, truth)
+    findings = grid_findings(grid, truth, surface)
     return GridScore(
         name=name,
-        errors=tuple(grid_error(grid, truth, felt, convention) for convention in CONVENTIONS),
-        quantities={m.name: m.quantity(m.compute(data) or MISSING_TRUTH) for m in GRID_METRICS},
+        errors=tuple(grid_error(grid, truth, surface, convention) for convention in CONVENTIONS),
+        quantities={metric.name: metric.quantity(findings[metric.name]) for metric in GRID_METRICS},
     )
 
 
@@ -133,17 +121,13 @@ def _pooled(quantities: Sequence[Quantity]) -> Quantity:
 
 def _order(scores: Sequence[GridScore], convention: Convention) -> list[str]:
     """The paper's mappers by decreasing error, compared with the paper's order."""
-    errors = {
-        score.name: (score.under(convention), score.trials) for score in scores if score.name in PAPER_ERRORS
-    }
+    known = [score for score in scores if score.name in PAPER_ERRORS]
+    errors = {score.name: (score.under(convention), score.trials) for score in known}
     if len(errors) < 2:
         return []
     names = sorted(errors, key=lambda name: -errors[name][0].error)
-    verdict = (
-        "as in the paper"
-        if names == sorted(names, key=lambda name: -PAPER_ERRORS[name])
-        else "not the paper's"
-    )
+    same = names == sorted(names, key=lambda name: -PAPER_ERRORS[name])
+    verdict = "as in the paper" if same else "not the paper's"
     close = [
         f"{a} and {b}"
         for a, b in pairwise(names)

@@ -46,8 +46,8 @@ class Metric(NamedTuple):
     Attributes:
         name: key in `scorecard.json`. label: in words. unit: SI, `deg`, or ''.
         direction: which values are better. section: heading in the table.
-        compute: the finding from the data of a run (`run_metrics.RunData`) or of a grid map
-            (`grid_metrics.GridData`); None without the ground truth that it needs.
+        compute: the finding from a `RunData`, or from the `grid_findings` of a map; None without the
+            ground truth that it needs.
     """
 
     name: str

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,71 +15,29 @@ from evaluation.metrics.energy_metric import (
     successive_pairs,
 )
 from evaluation.metrics.experience_log import change_rows
-from evaluation.metrics.experience_metric import (
-    EXM_MODES,
-    ExmConfig,
-    base_end,
-    experience_metric,
-)
+from evaluation.metrics.experience_metric import EXM_MODES, ExmConfig, base_end, experience_metric
 from evaluation.metrics.metric import Direction, Finding, Metric
 from evaluation.metrics.run_arrays import RunArrays, truth_rows
 from evaluation.metrics.trajectory import ate, online_error, rpe, summarize_errors
 from tactile.base.errors import InputError
 
 
-class RunData:
-    """The input of run metrics; findings that share work are computed together, once.
-
-    Args:
-        relations: true relative motions of the recording, if any. gap: distance of the pairs of
-            `energy_gap`, steps.
+class RunData(NamedTuple):
+    """The input of run metrics.
 
     Attributes:
-        run, exm: as given. rows: [K] steps with a true pose.
+        run, exm: as scored. rows: [K] steps with a true pose. findings: those of `RUN_METRICS` by name;
+            values that need a missing truth are left out.
     """
 
-    def __init__(self, run: RunArrays, exm: ExmConfig, relations: Relations | None, gap: int) -> None:
-        self.run, self.exm, self.rows = run, exm, truth_rows(run)
-        self._relations, self._gap = relations, gap
-
-    @cached_property
-    def extent(self) -> dict[str, Finding]:
-        """Numbers of steps, experiences and links, duration, length of the path."""
-        return _extent(self.run, self.rows)
-
-    @cached_property
-    def trajectory(self) -> dict[str, Finding]:
-        """ATE, RPE and online error; empty without truth."""
-        truth = self.run.truth
-        return _trajectories(self.run, truth, self.rows) if truth is not None and len(self.rows) else {}
-
-    @cached_property
-    def relations(self) -> dict[str, Finding]:
-        """Errors of given relative motions; empty if none are given."""
-        return {} if self._relations is None else _relations(self.run, self._relations)
-
-    @cached_property
-    def energy(self) -> dict[str, Finding]:
-        """The Energy Metric over all kinds of pairs; empty without truth."""
-        truth = self.run.truth
-        return (
-            _energies(self.run, truth, self.rows, self._gap) if truth is not None and len(self.rows) else {}
-        )
-
-    @cached_property
-    def experience(self) -> dict[str, Finding]:
-        """The Experience Metric in all modes."""
-        run, rows, base = self.run, self.rows, self.exm.base
-        if run.truth is None or len(rows) == 0:
-            return experience_findings(run.experience, None, self.exm)
-        inside = self.exm.model_copy(
-            update={"base": None if base is None else int(np.searchsorted(rows, base))}
-        )
-        return experience_findings(run.experience[rows], run.truth[rows], inside)
+    run: RunArrays
+    exm: ExmConfig
+    rows: np.ndarray
+    findings: dict[str, Finding]
 
 
-def _metric(group: str, section: str, direction: Direction, name: str, label: str, unit: str) -> Metric:
-    return Metric(name, label, unit, direction, section, lambda data: getattr(data, group).get(name))
+def _metric(section: str, direction: Direction, name: str, label: str, unit: str = "") -> Metric:
+    return Metric(name, label, unit, direction, section, lambda data: data.findings.get(name))
 
 
 _PAIRS = {
@@ -89,45 +47,32 @@ _PAIRS = {
     "links": "linked experiences",
     "all": "all pairs of steps",
 }
+_PARTS = (("", "", "m2+rad2"), ("_trans2", ", trans", "m2"), ("_rot2", ", rot", "rad2"))
 RUN_METRICS: tuple[Metric, ...] = (
-    _metric("extent", "Extent", None, "steps", "steps", ""),
-    _metric("extent", "Extent", None, "duration", "duration", "s"),
-    _metric("extent", "Extent", None, "path", "length of the true path", "m"),
-    _metric("extent", "Extent", None, "experiences", "experiences", ""),
-    _metric("extent", "Extent", None, "links", "links", ""),
+    _metric("Extent", None, "steps", "steps"),
+    _metric("Extent", None, "duration", "duration", "s"),
+    _metric("Extent", None, "path", "length of the true path", "m"),
+    _metric("Extent", None, "experiences", "experiences"),
+    _metric("Extent", None, "links", "links"),
+    _metric("Trajectory", "low", "ate_final", "ATE, final", "m"),
+    _metric("Trajectory", "low", "ate_online", "ATE, online", "m"),
+    _metric("Trajectory", "low", "anytime_median", "online error, median", "m"),
+    _metric("Trajectory", "low", "anytime_late", "online error, RMS of the second half", "m"),
+    _metric("Trajectory", "low", "anytime_jump", "online error, largest jump", "m"),
+    _metric("Trajectory", "low", "rpe_translation", "RPE over one step, translation", "m"),
+    _metric("Trajectory", "low", "rpe_rotation_deg", "RPE over one step, rotation", "deg"),
+    _metric("Trajectory", "low", "relations_translation", "relations file, translation", "m"),
+    _metric("Trajectory", "low", "relations_rotation_deg", "relations file, rotation", "deg"),
     *(
-        _metric("trajectory", "Trajectory", "low", name, label, unit)
-        for name, label, unit in (
-            ("ate_final", "ATE, final", "m"),
-            ("ate_online", "ATE, online", "m"),
-            ("anytime_median", "online error, median", "m"),
-            ("anytime_late", "online error, RMS of the second half", "m"),
-            ("anytime_jump", "online error, largest jump", "m"),
-            ("rpe_translation", "RPE over one step, translation", "m"),
-            ("rpe_rotation_deg", "RPE over one step, rotation", "deg"),
-        )
-    ),
-    _metric("relations", "Trajectory", "low", "relations_translation", "relations file, translation", "m"),
-    _metric("relations", "Trajectory", "low", "relations_rotation_deg", "relations file, rotation", "deg"),
-    *(
-        _metric("energy", "Energy Metric", "low", f"energy_{pairs}{suffix}", label + part, unit)
+        _metric("Energy Metric", "low", f"energy_{pairs}{suffix}", label + part, unit)
         for pairs, label in _PAIRS.items()
-        for suffix, part, unit in (
-            ("", "", "m2+rad2"),
-            ("_trans2", ", trans", "m2"),
-            ("_rot2", ", rot", "rad2"),
-        )
+        for suffix, part, unit in _PARTS
     ),
-    _metric("experience", "Experience Metric", None, "exm_base", "base set", "entries"),
-    _metric("experience", "Experience Metric", "high", "exm_arr", "ARR", ""),
-    *(
-        _metric("experience", "Experience Metric", "high", f"exm_arcr_{mode}", f"ARCR, {mode}", "")
-        for mode in EXM_MODES
-    ),
-    _metric("experience", "Experience Metric", "high", "exm_action_arr", "ARR, per action", ""),
-    _metric(
-        "experience", "Experience Metric", "high", "exm_action_arcr_strict", "ARCR, strict, per action", ""
-    ),
+    _metric("Experience Metric", None, "exm_base", "base set", "entries"),
+    _metric("Experience Metric", "high", "exm_arr", "ARR"),
+    *(_metric("Experience Metric", "high", f"exm_arcr_{mode}", f"ARCR, {mode}") for mode in EXM_MODES),
+    _metric("Experience Metric", "high", "exm_action_arr", "ARR, per action"),
+    _metric("Experience Metric", "high", "exm_action_arcr_strict", "ARCR, strict, per action"),
 )
 """In the order of the scorecard."""
 _EXPERIENCE = [metric.name for metric in RUN_METRICS if metric.section == "Experience Metric"]
@@ -151,28 +96,40 @@ def run_metrics() -> tuple[Metric, ...]:
     return (*RUN_METRICS, *REGISTERED_METRICS)
 
 
-def _extent(run: RunArrays, rows: np.ndarray) -> dict[str, Finding]:
-    some = f"{len(rows)} of them with a true pose" if 0 < len(rows) < len(run.time) else ""
-    path = {}
-    if run.truth is not None and len(rows):
-        path["path"] = Finding(path_length(run.truth[rows]), path_length(run.odometry[rows]))
-    return {
-        "steps": Finding(len(run.time), note=some),
+def run_data(run: RunArrays, exm: ExmConfig, relations: Relations | None, gap: int) -> RunData:
+    """Computes the findings of a run.
+
+    Args:
+        relations: true relative motions of the recording, if any. gap: distance of the pairs of
+            `energy_gap`, steps.
+    """
+    rows, truth = truth_rows(run), run.truth
+    findings = {
+        "steps": Finding(len(run.time)),
         "duration": Finding(float(run.time[-1] - run.time[0])),
-        **path,
         "experiences": Finding(len(run.nodes)),
         "links": Finding(len(run.links)),
     }
+    if relations is not None:
+        findings |= _relations(run, relations)
+    if truth is None or len(rows) == 0:
+        return RunData(run, exm, rows, findings | experience_findings(run.experience, None, exm))
+    if len(rows) < len(run.time):
+        findings["steps"] = Finding(len(run.time), note=f"{len(rows)} of them with a true pose")
+    findings["path"] = Finding(path_length(truth[rows]), path_length(run.odometry[rows]))
+    findings |= _trajectories(run, truth, rows) | _energies(run, truth, rows, gap)
+    base = None if exm.base is None else int(np.searchsorted(rows, exm.base))
+    inside = exm.model_copy(update={"base": base})
+    findings |= experience_findings(run.experience[rows], truth[rows], inside)
+    return RunData(run, exm, rows, findings)
 
 
 def _trajectories(run: RunArrays, truth: np.ndarray, rows: np.ndarray) -> dict[str, Finding]:
     truth, online, final, odometry = (poses[rows] for poses in (truth, run.online, run.final, run.odometry))
     raw_ate, raw_rpe, raw_now = ate(odometry, truth), rpe(odometry, truth), online_error(odometry, truth)
-    now, step = (
-        summarize_errors(run.online_error) if len(run.online_error) else online_error(online, truth),
-        rpe(final, truth),
-    )
-    note = "in the map of that time" if len(run.online_error) else "of the online poses"
+    step, now, note = rpe(final, truth), online_error(online, truth), "of the online poses"
+    if len(run.online_error):
+        now, note = summarize_errors(run.online_error), "in the map of that time"
     return {
         "ate_final": Finding(ate(final, truth), raw_ate),
         "ate_online": Finding(ate(online, truth), raw_ate),
@@ -196,20 +153,16 @@ def _relations(run: RunArrays, relations: Relations) -> dict[str, Finding]:
 
 def _energies(run: RunArrays, truth: np.ndarray, rows: np.ndarray, gap: int) -> dict[str, Finding]:
     at = rows[change_rows(run.experience[rows])]
-    steps = successive_pairs(len(rows)), successive_pairs(len(rows), gap)
     final, odometry, true = run.final[rows], run.odometry[rows], truth[rows]
     links = run.links[np.isin(run.created, rows)[run.links].all(axis=1)]
-    born, raw_born = truth[run.created], run.odometry[run.created]
-    moves = successive_pairs(len(at))
+    born, raw = truth[run.created], run.odometry[run.created]
+    moves, near, far = (successive_pairs(*size) for size in ((len(at),), (len(rows),), (len(rows), gap)))
+    ours = energy(run.nodes[run.experience[at]], truth[at], moves)
     return {
-        **_energy(
-            "change",
-            energy(run.nodes[run.experience[at]], truth[at], moves),
-            energy(run.odometry[at], truth[at], moves),
-        ),
-        **_energy("consecutive", energy(final, true, steps[0]), energy(odometry, true, steps[0])),
-        **_energy("gap", energy(final, true, steps[1]), energy(odometry, true, steps[1]), f"k = {gap}; "),
-        **_energy("links", energy(run.nodes, born, links), energy(raw_born, born, links)),
+        **_energy("change", ours, energy(run.odometry[at], truth[at], moves)),
+        **_energy("consecutive", energy(final, true, near), energy(odometry, true, near)),
+        **_energy("gap", energy(final, true, far), energy(odometry, true, far), f"k = {gap}; "),
+        **_energy("links", energy(run.nodes, born, links), energy(raw, born, links)),
         **_energy("all", energy_all_pairs(final, true), energy_all_pairs(odometry, true)),
     }
 
@@ -226,18 +179,18 @@ def experience_findings(
     experience: np.ndarray, truth: np.ndarray | None, config: ExmConfig
 ) -> dict[str, Finding]:
     """The Experience Metric in all modes; without truth only ARR, and only with a given base set."""
-    names = _EXPERIENCE
     if np.all(experience == -1):
-        return {name: Finding(np.nan, note="no experiences") for name in names}
+        return dict.fromkeys(_EXPERIENCE, Finding(np.nan, note="no experiences"))
     if truth is None and config.base is None:
-        return {name: Finding(np.nan, note="no ground truth, and no base set given") for name in names}
+        reason = "no ground truth, and no base set given"
+        return dict.fromkeys(_EXPERIENCE, Finding(np.nan, note=reason))
     if truth is None:  # ARR does not depend on poses
         found = experience_findings(experience, np.zeros((len(experience), 3)), config)
         return {name: value for name, value in found.items() if "arcr" not in name}
     try:
         base = base_end(truth, config.position, config.heading_deg) if config.base is None else config.base
     except InputError as error:
-        return {name: Finding(np.nan, note=str(error)) for name in names}
+        return dict.fromkeys(_EXPERIENCE, Finding(np.nan, note=str(error)))
     step = {mode: config.model_copy(update={"base": base, "log": "step", "mode": mode}) for mode in EXM_MODES}
     results = {mode: experience_metric(experience, truth, step[mode]) for mode in EXM_MODES}
     strict = results["strict"]

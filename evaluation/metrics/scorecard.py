@@ -9,7 +9,7 @@ from evaluation.metrics.experience_log import ExperienceLog
 from evaluation.metrics.experience_metric import DEFAULT_EXM, ExmConfig
 from evaluation.metrics.metric import MISSING_TRUTH, Finding, Quantity
 from evaluation.metrics.run_arrays import RunArrays, check_run
-from evaluation.metrics.run_metrics import RunData, experience_findings, path_length, run_metrics
+from evaluation.metrics.run_metrics import experience_findings, path_length, run_data, run_metrics
 from tactile.base.config import Settings
 
 
@@ -42,7 +42,7 @@ def score_run(
         InputError: the arrays do not fit each other.
     """
     check_run(run)
-    data = RunData(run, exm, relations, gap)
+    data = run_data(run, exm, relations, gap)
     quantities = {}
     for metric in run_metrics():
         if relations is not None or not metric.name.startswith("relations_"):

@@ -122,9 +122,8 @@ def interpolate(time: np.ndarray, pose: np.ndarray, at: np.ndarray) -> np.ndarra
     """
     if np.any(np.diff(time) <= 0):
         row = int(np.argmax(np.diff(time) <= 0))
-        raise InputError(
-            f"trajectory, row {row + 1}", f"time {time[row + 1]} after {time[row]}", "increasing times"
-        )
+        found = f"time {time[row + 1]} after {time[row]}"
+        raise InputError(f"trajectory, row {row + 1}", found, "increasing times")
     columns = (pose[:, 0], pose[:, 1], np.unwrap(pose[:, 2]))
     x, y, heading = (np.interp(at, time, column, left=np.nan, right=np.nan) for column in columns)
     return np.stack([x, y, wrap(heading)], axis=-1)
@@ -151,9 +150,8 @@ def read_tum(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     t, x, y, _, qx, qy, qz, qw = table.values.T
     norm = qx * qx + qy * qy + qz * qz + qw * qw
     if np.any(norm == 0):
-        raise InputError(
-            f"{path}:{table.line[norm == 0][0]}", "a quaternion of length 0", "a unit quaternion qx qy qz qw"
-        )
+        where = f"{path}:{table.line[norm == 0][0]}"
+        raise InputError(where, "a quaternion of length 0", "a unit quaternion qx qy qz qw")
     heading = np.arctan2(2 * (qw * qz + qx * qy), norm - 2 * (qy * qy + qz * qz))
     return t, np.stack([x, y, heading], axis=1)
 
@@ -167,10 +165,11 @@ def write_tum(path: str | Path, time: np.ndarray, pose: np.ndarray) -> None:
 def _positions(estimate: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The positions of both as complex numbers x + iy: [N] each."""
     if len(estimate) != len(reference) or len(estimate) == 0:
-        found = f"{len(estimate)} and {len(reference)} rows"
-        raise InputError(
-            "trajectories", found, "the same number of rows, at least one", "associate them by time first"
+        found, expected = (
+            f"{len(estimate)} and {len(reference)} rows",
+            "the same number of rows, at least one",
         )
+        raise InputError("trajectories", found, expected, "associate them by time first")
     estimate, reference = np.asarray(estimate, float), np.asarray(reference, float)
     return estimate[:, 0] + 1j * estimate[:, 1], reference[:, 0] + 1j * reference[:, 1]
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from evaluation.metrics.trajectory import align
@@ -13,16 +11,12 @@ from evaluation.plots.map_plot import NO_WALLS, draw_walls, split_at_jumps
 from evaluation.plots.style import BLUE, GREY, INK, LABEL_GREY, LINE_GREY, VERMILLION, WIDTH, YELLOW
 from tactile.base.se2 import between, compose
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
 _HEIGHT, _BOTTOM, _COUNTS = 6.4, 0.95, 1.55  # inches: total height, below the map, and width of the counts
 _DRAWN = 5000  # steps drawn of a long path, to limit the drawing time
 _ROUND = 2 * np.pi * np.arange(49) / 48
 
 
-def draw_watch(seen: RunProgress, walls: np.ndarray = NO_WALLS) -> Figure:
+def draw_watch(seen: RunProgress, walls: np.ndarray = NO_WALLS) -> style.Figure:
     """The online path over the truth, and the last pose with an ellipse of two standard deviations.
 
     With truth, everything is in its frame: the online path by the best rigid fit so far, odometry by its
@@ -54,7 +48,7 @@ def _line(seen: RunProgress) -> str:
     return "  ·  ".join(parts)
 
 
-def _paint(axes: Axes, seen: RunProgress, walls: np.ndarray) -> None:
+def _paint(axes: style.Axes, seen: RunProgress, walls: np.ndarray) -> None:
     """Draws the layers in the order of the legend."""
     known = np.isfinite(seen.truth).all(axis=1)
     to_truth = align(seen.path[known], seen.truth[known]) if known.any() else np.zeros(3)
@@ -74,18 +68,17 @@ def _paint(axes: Axes, seen: RunProgress, walls: np.ndarray) -> None:
     axes.plot(*reckoned[:, :2].T, color=GREY, lw=0.8, ls=dashed, zorder=1, label="raw odometry")
 
 
-def _paint_now(axes: Axes, seen: RunProgress, to_truth: np.ndarray) -> None:
+def _paint_now(axes: style.Axes, seen: RunProgress, to_truth: np.ndarray) -> None:
     x, y, heading = compose(to_truth, seen.path[-1])
     around = np.column_stack([np.cos(_ROUND), np.sin(_ROUND)]) * 2 * seen.sd[:2]
     ellipse = compose(to_truth, np.column_stack([seen.path[-1, :2] + around, np.zeros(len(_ROUND))]))
-    axes.plot(
-        *ellipse[:, :2].T, color=VERMILLION, lw=1.2, zorder=6, label="current pose, 2 standard deviations"
-    )
+    label = "current pose, 2 standard deviations"
+    axes.plot(*ellipse[:, :2].T, color=VERMILLION, lw=1.2, zorder=6, label=label)
     ahead = (3, 0, float(np.degrees(heading)) - 90.0)
     axes.plot(x, y, color=VERMILLION, ls="", marker=ahead, ms=11, mec="white", mew=0.8, zorder=7)
 
 
-def _paint_counts(figure: Figure, seen: RunProgress, left: float) -> None:
+def _paint_counts(figure: style.Figure, seen: RunProgress, left: float) -> None:
     """Number of steps by outcome, right of the map."""
     counts = sorted(seen.outcomes.items(), key=lambda item: -item[1])
     counts += [("lost", seen.lost)] if seen.lost else []

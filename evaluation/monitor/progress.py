@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-import zipfile
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from math import atan2
@@ -13,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evaluation.artifacts.run_directory import checkpoint_steps
 from tactile.base.errors import InputError
 
 RUNNING = "running"
@@ -101,7 +101,7 @@ class RunMonitor:
             outcomes=Counter(self._outcomes[:count]),
             lost=int(rows[:, 7].sum()),
             online_error=self._online_error,
-            checkpoint=self._saved(),
+            checkpoint=checkpoint_steps(self.directory),
             rate=count / (last - began) if 0 < began < last else None,
             silence=max(0.0, time.time() - self._date(*self._files())),
         )
@@ -136,21 +136,13 @@ class RunMonitor:
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise InputError(str(file), f"not a manifest ({error})", "the manifest of a run") from None
 
-    def _saved(self) -> int:
-        try:
-            with (self.directory / "map.npz").open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-                return int(arrays["steps"])
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-            return 0
-
     def _files(self) -> list[str]:
         """All files except the monitor's own."""
         try:
             return [path.name for path in self.directory.iterdir() if not path.name.endswith(WATCH_IMAGE)]
         except OSError as error:
-            raise InputError(
-                str(self.directory), f"cannot be read ({error.strerror})", "the directory of a run"
-            ) from None
+            found = f"cannot be read ({error.strerror})"
+            raise InputError(str(self.directory), found, "the directory of a run") from None
 
     def _date(self, *names: str) -> float:
         """Time of the last write to these files, s; 0 without any."""

@@ -70,11 +70,8 @@ def status_line(seen: RunProgress, pace: float | None) -> str:
     parts += [f"{count} {name}" for name, count in sorted(seen.outcomes.items(), key=lambda item: -item[1])]
     parts += [f"{seen.lost} lost"] if seen.lost else []
     parts += [f"checkpoint at {seen.checkpoint}"] if seen.checkpoint else []
-    parts += (
-        [f"silent for {seen.silence:.0f} s"]
-        if seen.status == RUNNING and seen.silence > SILENCE_SHOWN
-        else []
-    )
+    if seen.status == RUNNING and seen.silence > SILENCE_SHOWN:
+        parts.append(f"silent for {seen.silence:.0f} s")
     return ", ".join(parts)
 
 
@@ -84,11 +81,9 @@ def path_length(odometry: np.ndarray) -> float:
 
 
 def _draw(directory: Path, seen: RunProgress) -> None:
-    figure = draw_watch(seen, read_walls(directory))
+    figure, file = draw_watch(seen, read_walls(directory)), directory / WATCH_IMAGE
     try:
-        write_atomically(directory / WATCH_IMAGE, figure.savefig)
+        write_atomically(file, figure.savefig)
     except OSError as error:
         found = f"cannot be written ({error.strerror or error})"
-        raise InputError(
-            str(directory / WATCH_IMAGE), found, "a run directory that can be written to"
-        ) from None
+        raise InputError(str(file), found, "a run directory that can be written to") from None

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from evaluation.metrics.experience_metric import ExperienceMetric, experience_metric
@@ -13,13 +11,10 @@ from evaluation.plots import style
 from evaluation.plots.style import BLUE, GREY, INK, LINE_GREY, VERMILLION
 from tactile.base.errors import InputError
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 _HEIGHT, _BOTTOM = 5.2, 1.05  # inches
 
 
-def draw_experience_history(run: RunArrays, card: Scorecard) -> Figure:
+def draw_experience_history(run: RunArrays, card: Scorecard) -> style.Figure:
     """Draws experience against step, the end of the base set and the strict verdict on each re-localisation.
 
     Without truth or a return to the start there are no verdicts; then all steps look the same.

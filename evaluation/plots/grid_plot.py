@@ -6,7 +6,7 @@ Bright cells are occupied, as in the figures of Fox et al. 2012, on a fixed scal
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,10 +15,6 @@ from evaluation.metrics.grid_score import GridScore
 from evaluation.metrics.occupancy_grid import OccupancyGrid
 from evaluation.plots import style
 from evaluation.plots.style import GREEN, INK, LABEL_GREY, VERMILLION, WIDTH, YELLOW
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 NO_SEGMENTS = np.zeros((0, 4))
 
@@ -55,7 +51,7 @@ class GridPanel(NamedTuple):
     paths: GridPaths | None = None
 
 
-def draw_grid(panel: GridPanel) -> Figure:
+def draw_grid(panel: GridPanel) -> style.Figure:
     """Draws one map with its walls and paths (Fox et al. 2012, Fig. 6)."""
     inner = WIDTH - style.LEFT - style.RIGHT - _KEY
     tall = inner * _aspect(panel.grid)
@@ -69,7 +65,7 @@ def draw_grid(panel: GridPanel) -> Figure:
     return figure
 
 
-def draw_grids(title: str, line: str, panels: Sequence[GridPanel], *, across: int = 3) -> Figure:
+def draw_grids(title: str, line: str, panels: Sequence[GridPanel], *, across: int = 3) -> style.Figure:
     """Draws maps side by side, `across` per row (Fox et al. 2012, Figs. 4 and 5)."""
     across = min(across, len(panels))
     rows = -(-len(panels) // across)
@@ -125,7 +121,7 @@ def _aspect(grid: OccupancyGrid) -> float:
     return height / width
 
 
-def _paint(axes: Axes, panel: GridPanel) -> None:
+def _paint(axes: style.Axes, panel: GridPanel) -> None:
     """Draws the map and the walls in the order of the legend."""
     from matplotlib.collections import LineCollection
 
@@ -142,12 +138,10 @@ def _paint(axes: Axes, panel: GridPanel) -> None:
     axes.tick_params(axis="x", pad=6)  # clear of the lowest tick label of the other axis
     if len(panel.segments):
         walls = panel.segments.reshape(-1, 2, 2)
-        axes.add_collection(
-            LineCollection(list(walls), colors=VERMILLION, lw=1.0, zorder=2, label="true walls")
-        )
+        axes.add_collection(LineCollection(walls, colors=VERMILLION, lw=1.0, zorder=2, label="true walls"))
 
 
-def _paint_paths(axes: Axes, paths: GridPaths, *, errors: bool = False) -> None:
+def _paint_paths(axes: style.Axes, paths: GridPaths, *, errors: bool = False) -> None:
     """Draws the paths within the map, with their errors in the legend if `errors`."""
     truth, estimate, odometry = (np.asarray(path)[:, :2] for path in paths)
 
@@ -164,7 +158,7 @@ def _paint_paths(axes: Axes, paths: GridPaths, *, errors: bool = False) -> None:
         axes.plot(*start[0], "o", ms=9, mfc="none", mec=GREEN, mew=1.8, zorder=6, label="start")
 
 
-def _paint_key(figure: Figure, left: float, bottom: float, tall: float) -> None:
+def _paint_key(figure: style.Figure, left: float, bottom: float, tall: float) -> None:
     """Draws the grey scale of occupancy right of a map, in inches."""
     bar = style.add_axes(figure, left + 0.2, bottom, _BAR, tall)
     shades = np.linspace(0, 1, 256)[:, None]

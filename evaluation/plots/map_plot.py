@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,10 +12,6 @@ from evaluation.metrics.trajectory import align
 from evaluation.plots import style
 from evaluation.plots.style import BLUE, GREEN, GREY, INK, PURPLE, VERMILLION, YELLOW
 from tactile.base.se2 import between, compose
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _BOTTOM = 1.0  # inches below the axes
 _FLATTEST, _TALLEST = 0.4, 1.15  # height / width of the axes
@@ -37,7 +33,7 @@ class _Layers(NamedTuple):
 
 def draw_map(
     run: RunArrays, card: Scorecard, walls: np.ndarray = NO_WALLS, closures: np.ndarray = NO_CLOSURES
-) -> Figure:
+) -> style.Figure:
     """Draws the map over truth and raw odometry with equal axes.
 
     With truth, map and odometry are each aligned to it as for ATE; without, odometry starts at the first
@@ -75,25 +71,22 @@ def map_headline(card: Scorecard) -> str:
     if ate.value is None:
         parts.append("no ground truth")
     else:
-        parts.append(
-            f"ATE {ate.value:.3g} m final, {online.value:.3g} m online, {ate.odometry:.3g} m raw odometry"
-        )
+        raw = f"{ate.odometry:.3g} m raw odometry"
+        parts.append(f"ATE {ate.value:.3g} m final, {online.value:.3g} m online, {raw}")
     arr, arcr = card.quantities["exm_arr"].value, card.quantities["exm_arcr_strict"].value
     parts += [] if arr is None else [f"ARR {arr:.2f}"]
     parts += [] if arcr is None else [f"ARCR {arcr:.2f}"]
     return "  ·  ".join(parts)
 
 
-def draw_walls(axes: Axes, walls: np.ndarray) -> None:
+def draw_walls(axes: style.Axes, walls: np.ndarray) -> None:
     """Draws walls [B, 5] in grey, tall ones darker."""
     from matplotlib.collections import PatchCollection
     from matplotlib.patches import Rectangle
 
-    west, south, east, north, height = walls.T
+    height = walls[:, 4]
     shade = _PALE + (_DARK - _PALE) * height / height.max()
-    boxes = [Rectangle(corner, *size) for corner, size in zip(
-        zip(west, south, strict=True), zip(east - west, north - south, strict=True), strict=True
-    )]  # fmt: skip
+    boxes = [Rectangle((wall[0], wall[1]), wall[2] - wall[0], wall[3] - wall[1]) for wall in walls]
     greys = np.repeat(shade[:, None], 3, axis=1)
     axes.add_collection(PatchCollection(boxes, facecolors=greys, linewidths=0, zorder=0.6))
 
@@ -139,7 +132,7 @@ def _frame(layers: _Layers, walls: np.ndarray) -> np.ndarray:
     return np.stack([middle - size / 2, middle + size / 2])
 
 
-def _paint(axes: Axes, run: RunArrays, layers: _Layers) -> None:
+def _paint(axes: style.Axes, run: RunArrays, layers: _Layers) -> None:
     """Draws the layers in the order of the legend; `zorder` decides what covers what."""
     from matplotlib.collections import LineCollection
 
@@ -152,30 +145,27 @@ def _paint(axes: Axes, run: RunArrays, layers: _Layers) -> None:
     if len(nodes):
         dot = {"s": 26 * crowd**2, "color": BLUE, "edgecolors": "white", "linewidths": 0.6 * (crowd == 1)}
         axes.scatter(*nodes.T, zorder=4, label="experience", **dot)
-    older = _older(run.links)
+    older, lw = _older(run.links), 1.6 * crowd
     for links, color, label in (
         (run.links[~older], BLUE, "link"),
         (run.links[older], VERMILLION, "link to an older experience"),
     ):
         if len(links):
-            axes.add_collection(
-                LineCollection(nodes[links], colors=color, lw=1.6 * crowd, zorder=3, label=label)
-            )
+            axes.add_collection(LineCollection(nodes[links], colors=color, lw=lw, zorder=3, label=label))
 
 
-def _paint_laps(axes: Axes, run: RunArrays, layers: _Layers, apart: float, closures: np.ndarray) -> None:
+def _paint_laps(axes: style.Axes, run: RunArrays, layers: _Layers, apart: float, pairs: np.ndarray) -> None:
     """Draws a run in a maze; a closure is wrong if its places are more than `apart` m apart in truth."""
     from matplotlib.collections import LineCollection
 
     truth, odometry, final, nodes = layers
     assert truth is not None
-    axes.plot(
-        *split_at_jumps(truth, truth).T, color=YELLOW, lw=5, solid_capstyle="butt", zorder=0.8, label="truth"
-    )
+    line = split_at_jumps(truth, truth)
+    axes.plot(*line.T, color=YELLOW, lw=5, solid_capstyle="butt", zorder=0.8, label="truth")
     axes.plot(*split_at_jumps(final, truth).T, color=BLUE, lw=0.7, zorder=3, label="mapped path")
     axes.plot(*odometry.T, color=GREY, lw=0.7, alpha=0.7, zorder=1, label="raw odometry")
-    joined, place = (closures, final) if len(closures) else (run.links[_older(run.links)], nodes)
-    steps = joined if len(closures) else run.created[joined]
+    joined, place = (pairs, final) if len(pairs) else (run.links[_older(run.links)], nodes)
+    steps = joined if len(pairs) else run.created[joined]
     with np.errstate(invalid="ignore"):
         wrong = np.hypot(*(truth[steps[:, 0]] - truth[steps[:, 1]]).T) > apart
     for some, color, over, name in (
@@ -183,9 +173,8 @@ def _paint_laps(axes: Axes, run: RunArrays, layers: _Layers, apart: float, closu
         (wrong, VERMILLION, 2, f"false loop closure (over {apart:g} m)"),
     ):
         if some.any():
-            axes.add_collection(
-                LineCollection(place[joined[some]], colors=color, lw=0.7, zorder=over, label=name)
-            )
+            lines = place[joined[some]]
+            axes.add_collection(LineCollection(lines, colors=color, lw=0.7, zorder=over, label=name))
 
 
 def _older(links: np.ndarray) -> np.ndarray:
@@ -202,7 +191,7 @@ def split_at_jumps(line: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.insert(line, 1 + np.flatnonzero(step > _JUMP * np.quantile(moving, 0.9)), np.nan, axis=0)
 
 
-def _paint_start(axes: Axes, layers: _Layers) -> None:
+def _paint_start(axes: style.Axes, layers: _Layers) -> None:
     truth = layers.truth
     start = layers.final if truth is None else truth[np.isfinite(truth).all(axis=1)]
     axes.plot(*start[0], "o", ms=9, mfc="none", mec=GREEN, mew=1.8, zorder=6, label="start")

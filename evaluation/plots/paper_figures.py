@@ -2,32 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Collection, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from evaluation.plots import style
-from evaluation.plots.style import (
-    BLUE,
-    GREEN,
-    GREY,
-    INK,
-    LABEL_GREY,
-    LINE_GREY,
-    PURPLE,
-    VERMILLION,
-    WIDTH,
-    YELLOW,
-)
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from evaluation.plots.style import BLUE, GREEN, GREY, INK, LABEL_GREY, LINE_GREY, PURPLE, VERMILLION, YELLOW
 
 SERIES_COLORS = (GREY, BLUE, VERMILLION, GREEN, PURPLE, YELLOW)
 """Colours of the compared series, in this order."""
 _GAP, _BOTTOM = 0.75, 0.9  # inches between panels, and below them
+_DOTS = (0, (2, 2))
 _MEDIAN = 0.3  # half width of a median bar, share of a condition's width
 
 
@@ -73,12 +59,11 @@ class MeasuredQuantity(NamedTuple):
     log: bool = False
 
 
-def draw_drift(title: str, line: str, paths: Mapping[str, DrivenPath]) -> Figure:
+def draw_drift(title: str, line: str, paths: Mapping[str, DrivenPath]) -> style.Figure:
     """Draws true path and odometry side by side for several kinds of odometry error; later laps are darker
     (Salman & Pearson 2016, Fig. 2)."""
-    figure, panels = _panels(title, line, len(paths), 3.2)
-    for axes, (name, path) in zip(panels, paths.items(), strict=True):
-        axes.set_title(name, fontsize=9.5, color=INK, loc="left")
+    figure, panels = _panels(title, line, paths, 3.2)
+    for axes, path in zip(panels, paths.values(), strict=True):
         axes.plot(*path.truth.T, ".", ms=3, color=INK, zorder=3, label="truth")
         laps = np.unique(path.lap)
         for lap in laps:
@@ -92,11 +77,10 @@ def draw_drift(title: str, line: str, paths: Mapping[str, DrivenPath]) -> Figure
     return figure
 
 
-def draw_experiences(title: str, line: str, runs: Mapping[str, ExperienceHistory]) -> Figure:
+def draw_experiences(title: str, line: str, runs: Mapping[str, ExperienceHistory]) -> style.Figure:
     """Draws the experience at each step, the end of the base set and the verdicts (Fig. 3)."""
-    figure, panels = _panels(title, line, len(runs), 3.4)
-    for axes, (name, run) in zip(panels, runs.items(), strict=True):
-        axes.set_title(name, fontsize=9.5, color=INK, loc="left")
+    figure, panels = _panels(title, line, runs, 3.4)
+    for axes, run in zip(panels, runs.values(), strict=True):
         known = run.place >= 0
         new = known & ~run.counted
         for rows, color, mark, label in (
@@ -108,7 +92,7 @@ def draw_experiences(title: str, line: str, runs: Mapping[str, ExperienceHistory
             steps = np.flatnonzero(rows)
             axes.plot(steps, run.place[steps], mark, ms=2.6 if mark == "o" else 3.6,
                       mew=0.9 if mark == "x" else 0, color=color, label=label)  # fmt: skip
-        axes.axvline(run.base - 0.5, color=INK, lw=1.1, ls=(0, (2, 2)), label="end of the base set")
+        axes.axvline(run.base - 0.5, color=INK, lw=1.1, ls=_DOTS, label="end of the base set")
         axes.grid(color=LINE_GREY, lw=0.7)
         style.name_axes(axes, "step", "experience")
     style.add_legend(figure, panels[0], columns=3)
@@ -117,11 +101,10 @@ def draw_experiences(title: str, line: str, runs: Mapping[str, ExperienceHistory
 
 def draw_measured(
     title: str, line: str, conditions: Sequence[str], measured: Sequence[MeasuredQuantity]
-) -> Figure:
+) -> style.Figure:
     """Draws a dot per data set, a bar for the median, a line for the paper's value (Figs. 4, 6 and 7)."""
-    figure, panels = _panels(title, line, len(measured), 3.4, below=1.3)
+    figure, panels = _panels(title, line, [quantity.label for quantity in measured], 3.4, below=1.3)
     for axes, quantity in zip(panels, measured, strict=True):
-        axes.set_title(quantity.label, fontsize=9.5, color=INK, loc="left")
         count = len(quantity.values)
         for k, (name, values) in enumerate(quantity.values.items()):
             at = np.arange(len(conditions)) + (k - (count - 1) / 2) * 0.8 / max(count, 1)
@@ -134,10 +117,8 @@ def draw_measured(
             axes.hlines(middle, at[some] - half, at[some] + half, color=color, lw=2.2)
         given = np.isfinite(quantity.paper)
         if given.any():
-            where, dots = np.flatnonzero(given), (0, (2, 2))
-            axes.hlines(
-                quantity.paper[given], where - 0.42, where + 0.42, color=INK, lw=1.1, ls=dots, label="paper"
-            )
+            where, paper = np.flatnonzero(given), quantity.paper[given]
+            axes.hlines(paper, where - 0.42, where + 0.42, color=INK, lw=1.1, ls=_DOTS, label="paper")
         axes.set_xticks(range(len(conditions)), conditions, rotation=20, ha="right")
         axes.set_xlim(-0.6, len(conditions) - 0.4)
         if quantity.log:
@@ -151,20 +132,16 @@ def draw_measured(
     return figure
 
 
-def draw_directions(title: str, line: str, maps: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
+def draw_directions(title: str, line: str, maps: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> style.Figure:
     """Draws mapped paths, with clockwise and anticlockwise laps in different colours (Fig. 5).
 
     Args:
         maps: by name, positions [T, 2] (m) and whether each step is in a clockwise lap [T].
     """
-    across = min(2, len(maps))
-    figure, panels = _panels(title, line, len(maps), 3.2, across=across)
-    for axes, (name, (position, clockwise)) in zip(panels, maps.items(), strict=True):
-        axes.set_title(name, fontsize=9.5, color=INK, loc="left")
-        for rows, color, label in (
-            (clockwise, VERMILLION, "clockwise"),
-            (~clockwise, GREEN, "anticlockwise"),
-        ):
+    figure, panels = _panels(title, line, maps, 3.2, across=min(2, len(maps)))
+    for axes, (position, clockwise) in zip(panels, maps.values(), strict=True):
+        laps = ((clockwise, VERMILLION, "clockwise"), (~clockwise, GREEN, "anticlockwise"))
+        for rows, color, label in laps:
             part = np.where(rows[:, None], position, np.nan)
             axes.plot(*part.T, "-", lw=1.0, alpha=0.7, color=color, label=label)
         _map_axes(axes)
@@ -174,15 +151,14 @@ def draw_directions(title: str, line: str, maps: Mapping[str, tuple[np.ndarray, 
 
 def draw_curves(
     title: str, line: str, curves: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]]
-) -> Figure:
+) -> style.Figure:
     """Draws ARR against ARCR for increasing thresholds, one curve per data set.
 
     Args:
         curves: by panel and condition, ARCR and ARR [S, B] over data sets and thresholds.
     """
-    figure, panels = _panels(title, line, len(curves), 3.6)
-    for axes, (panel, conditions) in zip(panels, curves.items(), strict=True):
-        axes.set_title(panel, fontsize=9.5, color=INK, loc="left")
+    figure, panels = _panels(title, line, curves, 3.6)
+    for axes, conditions in zip(panels, curves.values(), strict=True):
         for color, (name, (arcr, arr)) in zip(SERIES_COLORS[1:], conditions.items(), strict=False):
             for number, (x, y) in enumerate(zip(arcr, arr, strict=True)):
                 axes.plot(x, y, "o-", ms=3, lw=0.9, alpha=0.7, color=color, label=None if number else name)
@@ -202,7 +178,7 @@ def draw_tuning(
     correct: np.ndarray,
     incorrect: np.ndarray,
     winner: float | None,
-) -> Figure:
+) -> style.Figure:
     """Draws histograms of view differences at the same and at different places, and results by threshold.
 
     Args:
@@ -210,7 +186,9 @@ def draw_tuning(
         threshold, correct, incorrect: [G] thresholds and re-localisations. winner: chosen threshold, if any.
     """
     taken = "no threshold meets the target" if winner is None else f"threshold {winner:g}"
-    figure, (left, right) = _panels("Tuning of the classic matcher", f"AUC {auc:.3f}  ·  {taken}", 2, 3.4)
+    figure, (left, right) = _panels(
+        "Tuning of the classic matcher", f"AUC {auc:.3f}  ·  {taken}", ("", ""), 3.4
+    )
     for count, color, label in ((same, BLUE, "same place"), (other, VERMILLION, "different places")):
         left.stairs(count / max(count.sum(), 1), edge, color=color, fill=True, alpha=0.45, label=label)
     left.grid(color=LINE_GREY, lw=0.7)
@@ -221,31 +199,32 @@ def draw_tuning(
     style.name_axes(right, "threshold", "re-localisations")
     for axes in (left, right):
         if winner is not None:
-            axes.axvline(winner, color=INK, lw=1.1, ls=(0, (2, 2)), label="chosen")
+            axes.axvline(winner, color=INK, lw=1.1, ls=_DOTS, label="chosen")
     right.legend(frameon=False, fontsize=9, labelcolor=INK)
     style.add_legend(figure, left)
     return figure
 
 
 def _panels(
-    title: str, line: str, count: int, height: float, *, across: int = 0, below: float = _BOTTOM
-) -> tuple[Figure, list[Axes]]:
-    """A figure with `count` panels of a height in inches, `across` per row (0: all)."""
-    across = across or count
-    rows = -(-count // across)
+    title: str, line: str, names: Collection[str], height: float, *, across: int = 0, below: float = _BOTTOM
+) -> tuple[style.Figure, list[style.Axes]]:
+    """A figure with a panel of a height in inches for each name, `across` per row (0: all)."""
+    across = across or len(names)
+    rows = -(-len(names) // across)
     whole = style.TOP + rows * height + (rows - 1) * _GAP + below
     figure = style.new_figure(whole, title, line)
-    width = (WIDTH - style.LEFT - style.RIGHT - (across - 1) * _GAP) / across
+    width = (style.WIDTH - style.LEFT - style.RIGHT - (across - 1) * _GAP) / across
     panels = []
-    for number in range(count):
+    for number, name in enumerate(names):
         row, column = divmod(number, across)
         left = style.LEFT + column * (width + _GAP)
-        bottom = whole - style.TOP - 0.2 - (row + 1) * height - row * _GAP + 0.2
+        bottom = whole - style.TOP - (row + 1) * height - row * _GAP
         panels.append(style.add_axes(figure, left, bottom, width, height - 0.2))
+        panels[-1].set_title(name, fontsize=9.5, color=INK, loc="left")
     return figure, panels
 
 
-def _map_axes(axes: Axes) -> None:
+def _map_axes(axes: style.Axes) -> None:
     axes.set_aspect("equal", adjustable="datalim")
     axes.grid(color=LINE_GREY, lw=0.7)
     axes.tick_params(labelcolor=LABEL_GREY)

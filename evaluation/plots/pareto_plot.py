@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from evaluation.plots import style
 from evaluation.plots.style import BLUE, GREY, INK, LABEL_GREY, LINE_GREY, VERMILLION, WIDTH
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _TALL, _EACH, _BOTTOM = 4.4, 0.13, 0.95  # inches: height of the axes, extra per point beyond 12, below
 _ROOM = 0.12  # share of the axes kept free on each side
@@ -37,7 +33,7 @@ class ParetoPoint(NamedTuple):
     optimal: bool
 
 
-def draw_pareto(title: str, line: str, marks: Sequence[ParetoPoint], time: str, error: str) -> Figure:
+def draw_pareto(title: str, line: str, marks: Sequence[ParetoPoint], time: str, error: str) -> style.Figure:
     """Draws the points on logarithmic axes, with bars from minimum to maximum over seeds.
 
     Args:
@@ -109,7 +105,7 @@ def _shared(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
     return np.maximum(high - low, 0.0).prod(axis=2)
 
 
-def _frame(axes: Axes, spans: np.ndarray) -> None:
+def _frame(axes: style.Axes, spans: np.ndarray) -> None:
     """Sets logarithmic axes around the spans [N, 2, 3], with round tick labels."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
@@ -128,7 +124,7 @@ def _frame(axes: Axes, spans: np.ndarray) -> None:
     axes.grid(color=LINE_GREY, lw=0.7)
 
 
-def _front(axes: Axes, spans: np.ndarray, best: np.ndarray) -> np.ndarray:
+def _front(axes: style.Axes, spans: np.ndarray, best: np.ndarray) -> np.ndarray:
     """The corners [P, 2] of the staircase of the Pareto front, up to the right end; [0, 2] without points."""
     front = spans[best][:, :, 1]
     if not len(front):
@@ -139,15 +135,12 @@ def _front(axes: Axes, spans: np.ndarray, best: np.ndarray) -> np.ndarray:
     return np.stack([front, across], axis=1).reshape(-1, 2)
 
 
-def _paint(axes: Axes, spans: np.ndarray, best: np.ndarray) -> None:
+def _paint(axes: style.Axes, spans: np.ndarray, best: np.ndarray) -> None:
     time, error = spans[:, 0], spans[:, 1]
     front = _front(axes, spans, best)
     if len(front):
         axes.plot(*front.T, color=VERMILLION, lw=1.3, label="Pareto front", zorder=2)
-    for some, color, size, name in (
-        (best, BLUE, 5.5, "Pareto-optimal"),
-        (~best, GREY, 4.5, "dominated"),
-    ):
+    for some, color, size, name in ((best, BLUE, 5.5, "Pareto-optimal"), (~best, GREY, 4.5, "dominated")):
         if some.any():
             bars = [np.abs(values[some][:, [0, 2]] - values[some][:, 1:2]).T for values in (time, error)]
             axes.errorbar(
@@ -156,22 +149,14 @@ def _paint(axes: Axes, spans: np.ndarray, best: np.ndarray) -> None:
             )  # fmt: skip
 
 
-def _label(axes: Axes, names: Sequence[str], spans: np.ndarray, best: np.ndarray) -> None:
+def _label(axes: style.Axes, names: Sequence[str], spans: np.ndarray, best: np.ndarray) -> None:
     """Labels the points, the optimal ones first; distant labels get a line to their point."""
     from matplotlib.patheffects import withStroke
 
     size = _SIZE * axes.figure.dpi / 72
-    halo = [withStroke(linewidth=2.0, foreground="white")]
+    font = {"fontsize": _SIZE, "path_effects": [withStroke(linewidth=2.0, foreground="white")], "zorder": 5}
     texts = [
-        axes.annotate(
-            name,
-            (0, 0),
-            xycoords="figure pixels",
-            fontsize=_SIZE,
-            color=INK if top else LABEL_GREY,
-            path_effects=halo,
-            zorder=5,
-        )
+        axes.annotate(name, (0, 0), xycoords="figure pixels", color=INK if top else LABEL_GREY, **font)
         for name, top in zip(names, best, strict=True)
     ]
     boxes = [text.get_window_extent() for text in texts]

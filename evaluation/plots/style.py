@@ -71,17 +71,7 @@ def add_legend(figure: Figure, axes: Axes, *, columns: int = 4) -> None:
     handles, labels = axes.get_legend_handles_labels()
     across, up = figure.get_size_inches()
     figure.legend(
-        handles,
-        labels,
-        loc="lower left",
-        bbox_to_anchor=(LEFT / across, 0.08 / up),
-        bbox_transform=figure.transFigure,
-        borderaxespad=0,
-        borderpad=0,
-        ncols=columns,
-        frameon=False,
-        fontsize=9,
-        labelcolor=INK,
-        handlelength=1.8,
-        columnspacing=1.8,
-    )
+        handles, labels, loc="lower left", bbox_to_anchor=(LEFT / across, 0.08 / up), ncols=columns,
+        bbox_transform=figure.transFigure, borderaxespad=0, borderpad=0, frameon=False, fontsize=9,
+        labelcolor=INK, handlelength=1.8, columnspacing=1.8,
+    )  # fmt: skip

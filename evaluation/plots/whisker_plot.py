@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from evaluation.artifacts.whisker_views import WhiskerViews
@@ -14,11 +12,6 @@ from evaluation.plots import style
 from evaluation.plots.map_plot import NO_WALLS, bounds, draw_walls, split_at_jumps, wall_corners
 from evaluation.plots.style import GREY, INK, LABEL_GREY, LINE_GREY
 from tactile.base.errors import InputError
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.colors import Colormap
-    from matplotlib.figure import Figure
 
 MAX_HEADS = 12
 """Largest number of images drawn at their poses."""
@@ -37,7 +30,7 @@ _HOLE = 0.28  # share of the radius without whiskers
 
 def draw_whiskers(
     run: RunArrays, card: Scorecard, images: WhiskerViews, walls: np.ndarray = NO_WALLS
-) -> Figure:
+) -> style.Figure:
     """Draws whiskers over time, coloured by obstacle height, and some images at their poses.
 
     Args:
@@ -56,46 +49,39 @@ def draw_whiskers(
     box, reach = _frame(pose[steps, :2], shown)
     chosen = _spread(pose, _first_visit(pose, steps), 2.4 * reach)
 
-    whiskers = images.view[0].size
-    strips = min(MAX_STRIPS, -(-len(run.time) // STRIP_COLUMNS))
+    parts = np.array_split(np.arange(len(run.time)), min(MAX_STRIPS, -(-len(run.time) // STRIP_COLUMNS)))
     inner = style.WIDTH - style.LEFT - style.RIGHT
-    wide = inner - _KEY
-    high = wide * (box[1, 1] - box[0, 1]) / (box[1, 0] - box[0, 0])
-    tall = whiskers * _ROW
-    total = style.TOP + _MARKS + strips * (tall + _GAP) + 0.25 + high + _BOTTOM
+    high = (inner - _KEY) * (box[1, 1] - box[0, 1]) / (box[1, 0] - box[0, 0])
+    tall = images.view[0].size * _ROW
+    total = style.TOP + _MARKS + len(parts) * (tall + _GAP) + 0.25 + high + _BOTTOM
     figure = style.new_figure(total, card.name, _line(images))
 
-    colors = _colors()
-    pixels, bottom = _pixels(images, colors), total - style.TOP - _MARKS + _GAP
-    for part in np.array_split(np.arange(len(run.time)), strips):
+    pixels, bottom = _pixels(images), total - style.TOP - _MARKS + _GAP
+    for part in parts:
         bottom -= tall + _GAP
         axes = style.add_axes(figure, style.LEFT, bottom, inner, tall)
         _paint_strip(axes, run.time, pixels, images, part, chosen)
     style.name_axes(axes, "time (s); rows: whiskers of each ring, anticlockwise from ahead", "")
 
-    axes = style.add_axes(figure, style.LEFT, _BOTTOM, wide, high)
+    axes = style.add_axes(figure, style.LEFT, _BOTTOM, inner - _KEY, high)
     axes.set(xlim=box[:, 0], ylim=box[:, 1], aspect="equal")
     style.metre_grid(axes)
     if len(shown):
         draw_walls(axes, shown)
     axes.plot(*split_at_jumps(pose[steps, :2], pose[steps, :2]).T, color=LINE_GREY, lw=0.8, zorder=0.8)
     for number, step in enumerate(chosen, start=1):
-        _paint_head(axes, pose[step], reach, pixels[step], images)
+        _paint_head(axes, pose[step], reach, pixels[step], images.azimuth)
         x, y, _ = pose[step]
         axes.text(x, y, str(number), ha="center", va="center", fontsize=7, color=INK, zorder=5)
-    _paint_key(figure, images, colors, style.LEFT + wide, high)
+    _paint_key(figure, images, style.LEFT + inner - _KEY, high)
     return figure
 
 
 def _line(images: WhiskerViews) -> str:
     rings = ", ".join(f"{1000 * length:.0f}" for length in images.length)
     touched = (images.view > 0).sum() / max(1, images.alive.sum())
-    parts = [
-        f"{len(images.view)} whisks",
-        f"rings of {images.view.shape[2]} whiskers, {rings} mm long",
-        f"{touched:.0%} of whiskers in contact",
-    ]
-    return "  ·  ".join(parts)
+    heads = f"rings of {images.view.shape[2]} whiskers, {rings} mm long"
+    return f"{len(images.view)} whisks  ·  {heads}  ·  {touched:.0%} of whiskers in contact"
 
 
 def _frame(path: np.ndarray, walls: np.ndarray) -> tuple[np.ndarray, float]:
@@ -130,24 +116,25 @@ def _spread(pose: np.ndarray, steps: np.ndarray, apart: float) -> np.ndarray:
     return np.sort(steps[chosen])
 
 
-def _colors() -> Colormap:
+def _colors(share: np.ndarray) -> np.ndarray:
+    """The colours [..., 3] of heights, given as shares [...] of the tallest."""
     import matplotlib
 
-    return matplotlib.colormaps["viridis_r"]
+    return matplotlib.colormaps["viridis_r"](share)[..., :3]
 
 
-def _pixels(images: WhiskerViews, colors: Colormap) -> np.ndarray:
+def _pixels(images: WhiskerViews) -> np.ndarray:
     """The colour [N, R, C, 3] of each whisker."""
     from matplotlib.colors import to_rgb
 
-    pixels = colors(images.view)[..., :3]
+    pixels = _colors(images.view)
     pixels[images.view == 0] = to_rgb(_NOTHING)
     pixels[~images.alive] = to_rgb(_DEAD)
     return pixels
 
 
 def _paint_strip(
-    axes: Axes,
+    axes: style.Axes,
     time: np.ndarray,
     pixels: np.ndarray,
     images: WhiskerViews,
@@ -158,10 +145,8 @@ def _paint_strip(
     some = part[:: -(-len(part) // STRIP_COLUMNS)]
     whisk = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
     start, end = float(time[part[0]]) - whisk / 2, float(time[part[-1]]) + whisk / 2
-    strip = pixels[some].reshape(len(some), rings * columns, 3).swapaxes(0, 1)
-    axes.imshow(
-        strip, extent=(start, end, rings * columns, 0), aspect="auto", interpolation="nearest", zorder=1
-    )
+    strip, extent = pixels[some].reshape(len(some), -1, 3).swapaxes(0, 1), (start, end, rings * columns, 0)
+    axes.imshow(strip, extent=extent, aspect="auto", interpolation="nearest", zorder=1)
     axes.hlines(columns * np.arange(1, rings), start, end, color="white", lw=1.2, zorder=2)
     middles = columns * (np.arange(rings) + 0.5)
     axes.set_yticks(middles, [f"{1000 * length:.0f} mm" for length in images.length])
@@ -176,7 +161,9 @@ def _paint_strip(
             )  # fmt: skip
 
 
-def _paint_head(axes: Axes, pose: np.ndarray, reach: float, pixels: np.ndarray, images: WhiskerViews) -> None:
+def _paint_head(
+    axes: style.Axes, pose: np.ndarray, reach: float, pixels: np.ndarray, azimuth: np.ndarray
+) -> None:
     """Draws an image as rings around the head, the shortest whiskers inside; the arrow points ahead."""
     from matplotlib.collections import PatchCollection
     from matplotlib.patches import Circle, Polygon, Wedge
@@ -184,7 +171,7 @@ def _paint_head(axes: Axes, pose: np.ndarray, reach: float, pixels: np.ndarray, 
     rings, columns = pixels.shape[:2]
     hole, half = _HOLE * reach, 180 / columns
     thick = (reach - hole) / rings
-    centre, middle = (float(pose[0]), float(pose[1])), np.degrees(pose[2] + images.azimuth)
+    centre, middle = (float(pose[0]), float(pose[1])), np.degrees(pose[2] + azimuth)
     wedges = [
         Wedge(centre, hole + (ring + 1) * thick, middle[column] - half, middle[column] + half, width=thick)
         for ring in range(rings)
@@ -195,13 +182,11 @@ def _paint_head(axes: Axes, pose: np.ndarray, reach: float, pixels: np.ndarray, 
     axes.add_collection(PatchCollection(wedges, facecolors=face, edgecolors="white", lw=0.6, zorder=3))
     ahead = np.array([np.cos(pose[2]), np.sin(pose[2])])
     beside = np.array([-ahead[1], ahead[0]])
-    tip = pose[:2] + reach * np.stack(
-        [1.24 * ahead, 1.05 * ahead + 0.11 * beside, 1.05 * ahead - 0.11 * beside]
-    )
-    axes.add_patch(Polygon(tip, facecolor=INK, edgecolor="none", zorder=4))
+    tip = np.stack([1.24 * ahead, 1.05 * ahead + 0.11 * beside, 1.05 * ahead - 0.11 * beside])
+    axes.add_patch(Polygon(pose[:2] + reach * tip, facecolor=INK, edgecolor="none", zorder=4))
 
 
-def _paint_key(figure: Figure, images: WhiskerViews, colors: Colormap, left: float, high: float) -> None:
+def _paint_key(figure: style.Figure, images: WhiskerViews, left: float, high: float) -> None:
     """Draws the key: rings of a head and the colour scale."""
     from matplotlib.patches import Patch
 
@@ -211,18 +196,20 @@ def _paint_key(figure: Figure, images: WhiskerViews, colors: Colormap, left: flo
     axes.set(xlim=(-1.3, 1.3), ylim=(-1.3, 1.3), aspect="equal", xticks=[], yticks=[])
     shades = np.repeat(np.linspace(0.95, 0.8, rings), columns)
     pixels = np.repeat(shades[:, None], 3, axis=1).reshape(rings, columns, 3)
-    _paint_head(axes, np.array([0.0, 0.0, np.pi / 2]), 1.0, pixels, images)
+    _paint_head(axes, np.array([0.0, 0.0, np.pi / 2]), 1.0, pixels, images.azimuth)
     axes.text(0.16, 1.14, "ahead", fontsize=7.5, color=LABEL_GREY, va="center")
     for ring, length in enumerate(images.length):
         out = _HOLE + (ring + 0.5) * (1 - _HOLE) / rings
-        axes.text(
-            0, -out, f"{1000 * length:.0f}", fontsize=6.5, color=INK, ha="center", va="center", zorder=5
-        )
+        axes.text(0, -out, f"{1000 * length:.0f}", size=6.5, color=INK, ha="center", va="center", zorder=5)
 
     tall = max(0.5, min(1.6, high - size - 1.0))
     bar = style.add_axes(figure, left + 0.35, top - size - 0.35 - tall, 0.16, tall)
-    shades = colors(np.linspace(0, 1, 256))[:, None, :3]
-    bar.imshow(shades, extent=(0, 1, 0, 1000 * images.tallest), origin="lower", aspect="auto")
+    bar.imshow(
+        _colors(np.linspace(0, 1, 256))[:, None],
+        extent=(0, 1, 0, 1000 * images.tallest),
+        origin="lower",
+        aspect="auto",
+    )
     bar.set_xticks([])
     bar.yaxis.tick_right()
     bar.set_title("height (mm)", fontsize=8, color=LABEL_GREY, loc="left", pad=8)

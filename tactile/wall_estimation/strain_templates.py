@@ -7,22 +7,23 @@ a wall straight across. (The paper uses normals, which are at right angles to it
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, NamedTuple, Self
 
 import numpy as np
-from pydantic import Field, PositiveFloat, PositiveInt, ValidationError, model_validator
+from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
+from tactile.base.npz import read_npz
 from tactile.base.types import Report
 
 FILE_VERSION = 1
 """Version of the file format."""
 TEMPLATES = "templates"
 """Name of the templates in errors."""
+TRAIN_HINT = "make one with `python -m ratslam train-templates`"
 ANGLE_TOLERANCE = np.radians(0.5)
 """Largest difference between the angle of a drive and that of its template, rad."""
 SQUARE_MEDIAN = 0.4549
@@ -167,10 +168,10 @@ def train_templates(
     near = np.abs(given[:, None] - angles) < ANGLE_TOLERANCE
     count = near.sum(axis=0)
     if (count < training.repeats).any():
-        few = ", ".join(f"{count[k]} at {np.degrees(angles[k]):.3g} degrees" for k in _less(training, count))
-        raise InputError(
-            TEMPLATES, f"too few drives: {few}", f"{training.repeats} at each angle", "add drives"
-        )
+        less = np.flatnonzero(count < training.repeats)
+        few = ", ".join(f"{count[k]} at {np.degrees(angles[k]):.3g} degrees" for k in less)
+        where = f"{training.repeats} at each angle"
+        raise InputError(TEMPLATES, f"too few drives: {few}", where, "add drives")
     sets = []
     for at in near.T:
         chosen = [drives[k].strain[: training.samples] for k in np.flatnonzero(at)]
@@ -207,14 +208,8 @@ def match_template(
 def write_templates(templates: StrainTemplates, path: Path | str) -> None:
     """Writes templates to an .npz file."""
     with open(path, "wb") as file:
-        np.savez_compressed(
-            file,
-            strain_templates=np.int64(FILE_VERSION),
-            training=np.array(templates.training.model_dump_json()),
-            angle=templates.angle,
-            mean=templates.mean,
-            spread=templates.spread,
-        )
+        arrays = templates._asdict() | {"training": np.array(templates.training.model_dump_json())}
+        np.savez_compressed(file, strain_templates=np.int64(FILE_VERSION), **arrays)
 
 
 def read_templates(path: Path | str) -> StrainTemplates:
@@ -223,35 +218,23 @@ def read_templates(path: Path | str) -> StrainTemplates:
     Raises:
         InputError: the file is missing, cannot be read or holds something else.
     """
-    try:
-        # Opened here because np.load does not close a malformed file.
-        with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
-            if "strain_templates" not in stored or int(stored["strain_templates"]) != FILE_VERSION:
-                raise ValueError("another kind or version of file")
-            training = TemplateTraining.model_validate_json(str(stored["training"]))
-            templates = StrainTemplates(training, stored["angle"], stored["mean"], stored["spread"])
-        angles, count, _, channels = templates.mean.shape
-        whole = (angles, count, channels) == (len(training.angles), training.samples, 2)
-        whole &= templates.angle.shape == (angles,)
-        if not whole or templates.spread.shape != (count, 2) or not np.isfinite(templates.mean).all():
-            raise ValueError("incomplete")
-    except FileNotFoundError:
-        raise InputError(str(path), "no such file", "strain templates", TRAIN_HINT) from None
-    except (OSError, ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile, ValidationError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        found = f"not strain templates ({reason})"
-        raise InputError(str(path), found, f"a file of version {FILE_VERSION}", TRAIN_HINT) from error
-    return templates
 
+    def parse(version: np.ndarray, settings: np.ndarray, *arrays: np.ndarray) -> StrainTemplates:
+        training, (angle, mean, spread) = TemplateTraining.model_validate_json(str(settings)), arrays
+        whole = int(version) == FILE_VERSION and angle.shape == training.angles.shape
+        whole &= mean.shape[:2] + mean.shape[3:] == (len(angle), training.samples, 2)
+        if not whole or spread.shape != (training.samples, 2) or not np.isfinite(mean).all():
+            raise ValueError("another version or incomplete")
+        return StrainTemplates(training, angle, mean, spread)
 
-TRAIN_HINT = "make one with `python -m ratslam train-templates`"
+    names = ("strain_templates", *StrainTemplates._fields)
+    return read_npz(path, names, parse, f"strain templates of version {FILE_VERSION}", TRAIN_HINT)
 
 
 def _check(training: TemplateTraining, drives: list[TrainingDrive]) -> None:
     if not drives:
-        raise InputError(
-            TEMPLATES, "no drives", f"{training.repeats} drives at each of {len(training.angles)} angles"
-        )
+        expected = f"{training.repeats} drives at each of {len(training.angles)} angles"
+        raise InputError(TEMPLATES, "no drives", expected)
     whiskers = np.shape(drives[0].strain)[1:2]
     for drive in drives:
         where = f"{TEMPLATES}: drive {drive.repeat} at {np.degrees(drive.angle):.4g} degrees"
@@ -266,14 +249,5 @@ def _check(training: TemplateTraining, drives: list[TrainingDrive]) -> None:
         if not np.isfinite(strain).all():
             raise InputError(where, "NaN samples", "finite samples", "leave this drive out")
         if np.abs(drive.angle - training.angles).min() >= ANGLE_TOLERANCE:
-            raise InputError(
-                where, "not one of the training angles", f"one of {_listed(training.angles)} degrees"
-            )
-
-
-def _less(training: TemplateTraining, count: np.ndarray) -> list[int]:
-    return np.flatnonzero(count < training.repeats).tolist()
-
-
-def _listed(angles: np.ndarray) -> str:
-    return ", ".join(f"{angle:.4g}" for angle in np.degrees(angles))
+            angles = ", ".join(f"{angle:.4g}" for angle in np.degrees(training.angles))
+            raise InputError(where, "not one of the training angles", f"one of {angles} degrees")
