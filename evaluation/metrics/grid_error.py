@@ -48,9 +48,8 @@ CONVENTIONS = tuple(
 )
 """All conventions. Within the arena without smoothing, `outside` makes no difference."""
 MAIN_CONVENTION = Convention()
-"""Unknown outside, all cells, not smoothed: false evidence outside counts, and a perfect map scores 0."""
-PAPER_CONVENTION = Convention(smooth=True)
-"""The convention closest to the paper's text."""
+"""Unknown outside, all cells, not smoothed: false evidence outside counts, and a perfect map scores 0. The
+paper's text is closest to the same with smoothing."""
 
 
 class GridError(Settings):

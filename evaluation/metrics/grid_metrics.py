@@ -11,7 +11,6 @@ from evaluation.metrics.occupancy_grid import (
     OccupancyGrid,
     TouchableSurface,
     cell_centres,
-    has_evidence,
 )
 
 OCCUPIED_ABOVE = 0.5
@@ -22,19 +21,9 @@ CLAMP = 1e-3
 _ROUNDING = 6  # decimals; closer probabilities tie
 
 
-def grid_findings(
-    grid: OccupancyGrid,
-    truth: GridTruth,
-    surface: TouchableSurface,
-    prior: float = PRIOR_OCCUPANCY,
-    occupied: float = OCCUPIED_ABOVE,
-) -> dict[str, Finding]:
-    """The findings of `GRID_METRICS` by name.
-
-    Args:
-        prior: occupancy of cells without evidence. occupied: cells above it count as occupied (Chamfer).
-    """
-    return _cells(grid, surface, prior) | _chamfer(grid, truth, surface, prior, occupied)
+def grid_findings(grid: OccupancyGrid, truth: GridTruth, surface: TouchableSurface) -> dict[str, Finding]:
+    """The findings of `GRID_METRICS` by name."""
+    return _cells(grid, surface) | _chamfer(grid, truth, surface)
 
 
 def _metric(name: str, label: str, unit: str, direction: Direction) -> Metric:
@@ -55,7 +44,7 @@ GRID_METRICS: tuple[Metric, ...] = (
 """In the order of the table."""
 
 
-def _cells(grid: OccupancyGrid, felt: TouchableSurface, prior: float) -> dict[str, Finding]:
+def _cells(grid: OccupancyGrid, felt: TouchableSurface) -> dict[str, Finding]:
     """Scores of the separation of walls from free space.
 
     Much of a map's skill comes from the free space along the robot's path, for which no whisker is needed. So
@@ -67,7 +56,11 @@ def _cells(grid: OccupancyGrid, felt: TouchableSurface, prior: float) -> dict[st
         reason = f"the truth has no {'wall' if felt.free.any() else 'free space'}"
         names = [metric.name for metric in GRID_METRICS if "chamfer" not in metric.name]
         return dict.fromkeys(names, Finding(np.nan, note=reason))
-    driven, rate, clipped = np.minimum(ours, prior), float(wall.mean()), "the map clipped at its prior"
+    driven, rate, clipped = (
+        np.minimum(ours, PRIOR_OCCUPANCY),
+        float(wall.mean()),
+        "the map clipped at its prior",
+    )
     blind, loss = rate * (1 - rate), _log_loss(np.full(len(wall), rate), wall)
     return {
         "map_brier": Finding(_brier(ours, wall), note=f"best constant, {rate:.3g}: {blind:.4g}"),
@@ -99,9 +92,7 @@ def _auc(ours: np.ndarray, wall: np.ndarray) -> float:
     return float((rank[wall].sum() - walls * (walls + 1) / 2) / (walls * free))
 
 
-def _chamfer(
-    grid: OccupancyGrid, truth: GridTruth, felt: TouchableSurface, prior: float, occupied: float
-) -> dict[str, Finding]:
+def _chamfer(grid: OccupancyGrid, truth: GridTruth, felt: TouchableSurface) -> dict[str, Finding]:
     """Mean distances between the centres of cells mapped as occupied and the true surfaces, both ways.
 
     One way alone can be minimised by a single correct cell or by marking all cells. Cells inside objects,
@@ -110,14 +101,14 @@ def _chamfer(
     from scipy.spatial import cKDTree
 
     deep = truth.inside & truth.occupied & ~felt.wall
-    drawn = (grid.probability > occupied) & has_evidence(grid, prior) & ~deep
+    drawn = (grid.probability > OCCUPIED_ABOVE) & ~deep
     if len(felt.points) and drawn.any():
         cells = cell_centres(grid)[drawn]
         to_walls, to_cells = cKDTree(felt.points).query(cells)[0], cKDTree(cells).query(felt.points)[0]
-        note = f"{len(cells)} cells above {occupied:g}"
+        note = f"{len(cells)} cells above {OCCUPIED_ABOVE:g}"
         return {
             "map_chamfer_map": Finding(float(to_walls.mean()), note=note),
             "map_chamfer_walls": Finding(float(to_cells.mean()), note=f"{len(felt.points)} points"),
         }
-    reason = f"no cell above {occupied:g}" if len(felt.points) else "the truth has no wall"
+    reason = f"no cell above {OCCUPIED_ABOVE:g}" if len(felt.points) else "the truth has no wall"
     return dict.fromkeys(("map_chamfer_map", "map_chamfer_walls"), Finding(np.nan, note=reason))

@@ -12,7 +12,6 @@ PRIOR_OCCUPANCY = 0.3
 SURFACE_SPACING = 0.01
 """Spacing of the points that sample the true walls, m."""
 
-_EVIDENCE = 1e-4  # closer to the prior is no evidence; the Gaussian footprints have no edge
 _NEAR, _FAR = 0.45, 0.95  # cells; from a wall on cell borders or centres, neither ends on a border
 _SKIN = 1 - 1e-6  # cells; gives walls on cell centres and on cell borders one layer each
 
@@ -64,11 +63,6 @@ def cell_centres(grid: OccupancyGrid) -> np.ndarray:
     height, width = grid.probability.shape
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     return np.asarray(grid.origin) + grid.cell * np.stack([x, y], axis=-1)
-
-
-def has_evidence(grid: OccupancyGrid, prior: float = PRIOR_OCCUPANCY) -> np.ndarray:
-    """Whether each cell [H, W] differs from the prior."""
-    return np.abs(grid.probability - prior) > _EVIDENCE
 
 
 def check_grid(grid: OccupancyGrid, truth: GridTruth | None = None) -> None:

@@ -137,7 +137,7 @@ def _paint(axes: style.Axes, panel: GridPanel) -> None:
     axes.grid(visible=False)
     axes.tick_params(axis="x", pad=6)  # clear of the lowest tick label of the other axis
     if len(panel.segments):
-        walls = panel.segments.reshape(-1, 2, 2)
+        walls = list(panel.segments.reshape(-1, 2, 2))
         axes.add_collection(LineCollection(walls, colors=VERMILLION, lw=1.0, zorder=2, label="true walls"))
 
 

@@ -154,11 +154,14 @@ def _label(axes: style.Axes, names: Sequence[str], spans: np.ndarray, best: np.n
     from matplotlib.patheffects import withStroke
 
     size = _SIZE * axes.figure.dpi / 72
-    font = {"fontsize": _SIZE, "path_effects": [withStroke(linewidth=2.0, foreground="white")], "zorder": 5}
+    halo = [withStroke(linewidth=2.0, foreground="white")]
     texts = [
-        axes.annotate(name, (0, 0), xycoords="figure pixels", color=INK if top else LABEL_GREY, **font)
+        axes.annotate(
+            name, (0, 0), xycoords="figure pixels", fontsize=_SIZE, path_effects=halo, zorder=5,
+            color=INK if top else LABEL_GREY,
+        )
         for name, top in zip(names, best, strict=True)
-    ]
+    ]  # fmt: skip
     boxes = [text.get_window_extent() for text in texts]
     sizes = np.array([[box.width, box.height] for box in boxes])
     at = axes.transData.transform(spans[:, :, 1])

@@ -6,7 +6,6 @@ Coordinates are those of base_link, with z = 0 on the floor.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -96,39 +95,6 @@ def ur10_head(config: HeadConfig) -> Head:
         limit=float(np.radians(config.limit_deg)),
         shape=(rows, columns),
         alive=alive,
-    )
-
-
-def create_head(
-    *,
-    length: float = 0.14,
-    limit_deg: float = 70.0,
-    height: float = 0.05,
-    mounts: Sequence[tuple[float, float, float]] = (
-        (0.14, 0.09, 100.0),
-        (0.15, 0.03, 80.0),
-        (0.15, -0.03, -80.0),
-        (0.14, -0.09, -100.0),
-    ),
-) -> Head:
-    """The four-whisker head of Fox et al. 2012 on a Create: whiskers protract forwards in a horizontal plane.
-
-    Args:
-        length: of a whisker, m. height: of the plane above the floor, m. mounts: for each whisker x (m) and y
-            (m) of its base in base_link, and its direction at rest, degrees counter-clockwise from ahead. The
-            paper does not give the mounts; these are ours.
-    """
-    x, y, direction = np.array(mounts, float).T
-    angle, side = np.radians(direction), np.sign(direction)
-    zero = np.zeros(len(x))
-    return Head(
-        base=np.stack([x, y, zero + height], axis=1),
-        rest=np.stack([np.cos(angle), np.sin(angle), zero], axis=1),
-        swing=np.stack([side * np.sin(angle), -side * np.cos(angle), zero], axis=1),
-        length=zero + length,
-        limit=float(np.radians(limit_deg)),
-        shape=(1, len(x)),
-        alive=np.ones(len(x), bool),
     )
 
 

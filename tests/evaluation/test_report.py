@@ -1,4 +1,4 @@
-"""The picture of a run: drawn for every kind of run, the same each time, without global state."""
+"""The map plot: layers, walls, closures and missing truth; equal runs give equal bytes."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ import pytest
 
 from evaluation.metrics.scorecard import score_run
 from evaluation.plots.map_plot import draw_map, map_headline, split_at_jumps
-from evaluation.report import save_map
 
 
 def labels(figure):
     return [text.get_text() for legend in figure.legends for text in legend.get_texts()]
 
 
-def test_the_picture_shows_map_truth_and_odometry(circle, tmp_path):
+def test_the_plot_shows_map_truth_and_odometry(circle):
     figure = draw_map(circle, score_run(circle, "circle"))
     assert labels(figure)[:4] == ["truth", "raw odometry", "mapped path", "experience"]
     assert "link to an older experience" in labels(figure)
@@ -26,12 +25,15 @@ def test_the_picture_shows_map_truth_and_odometry(circle, tmp_path):
     (truth,) = (line for line in axes.lines if line.get_label() == "truth")
     (drawn,) = (line for line in axes.lines if line.get_label() == "mapped path")
     assert np.array(drawn.get_data()) == pytest.approx(np.array(truth.get_data()), abs=1e-9)
-    save_map(tmp_path / "map.png", circle, score_run(circle, "circle"))
-    save_map(tmp_path / "again.png", circle, score_run(circle, "circle"))
+
+
+def test_equal_runs_give_equal_bytes(circle, tmp_path):
+    for name in ("map.png", "again.png"):
+        draw_map(circle, score_run(circle, "circle")).savefig(tmp_path / name)
     assert (tmp_path / "map.png").read_bytes() == (tmp_path / "again.png").read_bytes()
 
 
-def test_a_metre_is_as_long_upwards_as_sideways(circle):
+def test_both_axes_have_the_same_scale(circle):
     flat = circle._replace(
         **{name: getattr(circle, name) * [1, 0.1, 1] for name in ("truth", "final", "nodes")}
     )
@@ -53,7 +55,7 @@ def test_without_truth_odometry_starts_where_the_map_does(circle):
     assert "no ground truth" in map_headline(score_run(blind))
 
 
-def test_a_run_without_places_or_motion_is_drawn(circle):
+def test_a_run_without_experiences_or_motion_is_drawn(circle):
     still = circle._replace(
         truth=np.zeros((108, 3)),
         final=np.zeros((108, 3)),
@@ -95,7 +97,7 @@ def test_walls_are_drawn_in_the_frame_of_the_truth(circle):
     assert axes.get_ylim()[1] > 4.1
 
 
-def test_a_closure_is_wrong_where_it_joins_places_far_apart(circle):
+def test_a_closure_of_distant_places_is_drawn_as_false(circle):
     right, wrong = [[0, 36], [5, 77], [36, 72]], [[0, 18], [3, 50]]
     figure = draw_map(circle, score_run(circle), WALLS, np.array(right + wrong))
     for joined, label in ((right, "loop closure"), (wrong, "false loop closure (over 0.1 m)")):
@@ -103,18 +105,18 @@ def test_a_closure_is_wrong_where_it_joins_places_far_apart(circle):
         assert ends == pytest.approx(circle.truth[np.array(joined)][..., :2], abs=1e-9)
 
 
-def test_without_a_list_of_closures_links_to_older_experiences_stand_for_them(circle):
+def test_without_closures_the_links_to_older_experiences_are_drawn(circle):
     figure = draw_map(circle, score_run(circle), WALLS)
     links = circle.links[np.abs(circle.links[:, 0] - circle.links[:, 1]) > 1]
     assert len(drawn(figure, "false loop closure (over 0.1 m)")) == len(links) == 1  # 0.115 m apart
 
 
-def test_walls_need_a_truth_to_lie_in(circle):
+def test_walls_are_not_drawn_without_truth(circle):
     blind = circle._replace(truth=None)
     assert labels(draw_map(blind, score_run(blind), WALLS)) == labels(draw_map(blind, score_run(blind)))
 
 
-def test_a_line_is_interrupted_only_where_the_robot_was_carried(circle):
+def test_a_path_is_interrupted_only_where_the_robot_was_moved_by_hand(circle):
     path = circle.truth[:, :2].copy()
     assert split_at_jumps(path, path) is path or np.array_equal(split_at_jumps(path, path), path)
     path[50:] += 2.0

@@ -1,4 +1,4 @@
-"""Occupancy maps as files: what map_server would tell is what the map says."""
+"""Occupancy maps as files: nav2's map.yaml and map.pgm, and grid.npz."""
 
 from __future__ import annotations
 
@@ -12,15 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
-from evaluation.artifacts.grid_npz import read_grid, write_grid
-from evaluation.artifacts.nav2 import (
-    FREE_THRESH,
-    OCCUPIED_THRESH,
-    read_nav2,
-    write_map_yaml,
-    write_nav2,
-    write_pgm,
-)
+from evaluation.artifacts.grid_npz import read_grid
+from evaluation.artifacts.nav2 import FREE_THRESH, OCCUPIED_THRESH, read_nav2, write_nav2
 from evaluation.metrics.occupancy_grid import PRIOR_OCCUPANCY, OccupancyGrid
 from tactile.base.errors import InputError
 
@@ -44,16 +37,16 @@ def folder(tmp_path):
     return tmp_path
 
 
-def back(grid, mode):
+def written_and_read(grid):
     with tempfile.TemporaryDirectory() as folder:
-        write_nav2(Path(folder), grid, mode)
+        write_nav2(Path(folder), grid)
         return read_nav2(Path(folder) / "map.yaml")
 
 
 @law
 @given(grids)
 def test_cells_read_back_as_occupied_free_or_unknown(grid):
-    served = back(grid, "trinary")
+    served = written_and_read(grid)
     p = grid.probability
     assert np.array_equal(served.cell == 100, p > OCCUPIED_THRESH)
     assert np.array_equal(served.cell == 0, p < FREE_THRESH)
@@ -62,34 +55,23 @@ def test_cells_read_back_as_occupied_free_or_unknown(grid):
     assert served.resolution == grid.cell
 
 
-@law
-@given(grids)
-def test_scale_keeps_the_grades_between(grid):
-    served = back(grid, "scale")
-    share = np.clip((grid.probability - FREE_THRESH) / (OCCUPIED_THRESH - FREE_THRESH), 0, 1)
-    # half a step of 255 greys, stretched between the thresholds, and the rounding to 100
-    assert (
-        np.abs(served.cell - 100 * share).max() <= 100 * 0.5 / 255 / (OCCUPIED_THRESH - FREE_THRESH) + 0.501
-    )
-
-
 @given(st.floats(0.25, 0.6))
-def test_what_was_not_felt_is_unknown(prior):
-    served = back(OccupancyGrid(np.full((3, 4), prior), np.zeros(2), 0.05), "trinary")
+def test_cells_at_the_prior_are_unknown(prior):
+    served = written_and_read(OccupancyGrid(np.full((3, 4), prior), np.zeros(2), 0.05))
     assert (served.cell == -1).all()
 
 
 def test_the_thresholds_themselves_are_unknown():
-    served = back(MAP._replace(probability=np.array([[FREE_THRESH, OCCUPIED_THRESH]])), "trinary")
+    served = written_and_read(MAP._replace(probability=np.array([[FREE_THRESH, OCCUPIED_THRESH]])))
     assert (served.cell == -1).all()
 
 
-def test_the_prior_is_the_customary_grey(tmp_path):
-    write_pgm(tmp_path / "map.pgm", OccupancyGrid(np.full((3, 4), PRIOR_OCCUPANCY), np.zeros(2), 0.05))
+def test_the_prior_is_written_as_205(tmp_path):
+    write_nav2(tmp_path, OccupancyGrid(np.full((3, 4), PRIOR_OCCUPANCY), np.zeros(2), 0.05))
     assert (tmp_path / "map.pgm").read_bytes() == b"P5\n4 3\n255\n" + bytes([205]) * 12
 
 
-def test_the_files_are_these(folder):
+def test_the_files_of_a_small_map(folder):
     """The first row of the image is the one with the greatest y; no name leads out of the folder."""
     assert (folder / "map.pgm").read_bytes() == b"P5\n3 2\n255\n" + bytes([254, 205, 0, 254, 205, 0])
     assert (folder / "map.yaml").read_text() == (
@@ -99,7 +81,7 @@ def test_the_files_are_these(folder):
     assert read_nav2(folder / "map.yaml").cell.tolist() == [[0, -1, 100], [0, -1, 100]]
 
 
-def test_rows_are_not_mixed_up(tmp_path):
+def test_the_lowest_row_is_the_last_of_the_image(tmp_path):
     wall = np.full((4, 5), PRIOR_OCCUPANCY)
     wall[0] = 1.0
     write_nav2(tmp_path, MAP._replace(probability=wall))
@@ -111,10 +93,10 @@ def test_rows_are_not_mixed_up(tmp_path):
 
 @law
 @given(grids)
-def test_numbers_are_numbers_for_every_reader(grid):
-    """PyYAML takes 1e-05 for a word."""
+def test_numbers_have_no_exponent(grid):
+    """PyYAML reads 1e-05 as a string."""
     with tempfile.TemporaryDirectory() as folder:
-        write_map_yaml(Path(folder) / "map.yaml", grid)
+        write_nav2(Path(folder), grid)
         given = yaml.safe_load((Path(folder) / "map.yaml").read_text())
     assert given["origin"] == [*grid.origin.tolist(), 0.0]
     assert given["resolution"] == grid.cell
@@ -144,7 +126,7 @@ def test_maps_of_other_tools_follow_the_same_rules(folder, change, told):
     assert read_nav2(path).cell.tolist() == told
 
 
-def test_an_image_may_carry_remarks(folder):
+def test_comments_in_an_image_are_skipped(folder):
     pixels = (folder / "map.pgm").read_bytes()[-6:]
     before = read_nav2(folder / "map.yaml")
     (folder / "map.pgm").write_bytes(b"P5 # by hand\n# twice\n3\t2 # so wide\n255\n" + pixels)
@@ -167,7 +149,7 @@ def test_an_image_may_carry_remarks(folder):
         ("image", "[", "cannot be read"),
     ],
 )
-def test_a_description_that_makes_no_sense_is_refused(folder, old, new, where):
+def test_an_invalid_map_yaml_is_refused(folder, old, new, where):
     path = folder / "map.yaml"
     path.write_text(path.read_text().replace(old, new))
     with pytest.raises(InputError, match=where):
@@ -182,7 +164,7 @@ def test_another_image_is_refused(folder, content):
         read_nav2(folder / "map.yaml")
 
 
-def test_no_map_is_refused(tmp_path):
+def test_missing_and_malformed_maps_are_refused(tmp_path):
     (tmp_path / "map.yaml").write_text("- a list\n")
     for name in ("map.yaml", "missing.yaml"):
         with pytest.raises(InputError, match=name):
@@ -193,20 +175,17 @@ def test_no_map_is_refused(tmp_path):
 
 @law
 @given(grids)
-def test_the_archive_keeps_every_digit(grid):
+def test_a_grid_file_keeps_every_digit(grid):
     with tempfile.TemporaryDirectory() as folder:
-        paths = [Path(folder) / name for name in ("a.npz", "b.npz")]
-        for path in paths:
-            write_grid(path, grid)
-        assert paths[0].read_bytes() == paths[1].read_bytes()
-        found = read_grid(paths[0])
+        np.savez_compressed(Path(folder) / "grid.npz", **grid._asdict())
+        found = read_grid(Path(folder) / "grid.npz")
     assert np.array_equal(found.probability, grid.probability)
     assert np.array_equal(found.origin, grid.origin)
     assert found.cell == grid.cell
 
 
 def test_other_archives_are_refused(tmp_path):
-    write_grid(tmp_path / "whole.npz", MAP)
+    np.savez_compressed(tmp_path / "whole.npz", **MAP._asdict())
     content = (tmp_path / "whole.npz").read_bytes()
     (tmp_path / "cut.npz").write_bytes(content[: len(content) // 2])
     (tmp_path / "text.npz").write_text("no map")

@@ -15,7 +15,6 @@ from evaluation.metrics.experience_metric import (
     ExmConfig,
     base_end,
     experience_metric,
-    pool_experience_metrics,
     relocalisations,
 )
 from evaluation.metrics.statistics import bootstrap
@@ -150,16 +149,6 @@ def test_logs_that_do_not_fit_are_refused(ids, truth, base, message):
 def test_changes_pass_over_steps_without_an_experience():
     assert change_rows(np.array([-1, 4, 4, -1, 4, 2, 2, 4])).tolist() == [1, 5, 7]
     assert change_rows(np.array([-1, -1])).tolist() == []
-
-
-def test_pooled_and_macro_averages(square):
-    long, short = experience_metric(*square(4, 4)), experience_metric(np.arange(64), square(2, 4)[1])
-    both = pool_experience_metrics([long, short])
-    assert (both.arr, both.arr_pooled) == (0.5, 96 / 128)
-    assert (both.arcr, both.judged, both.runs) == (1.0, 1, 2)
-    assert both.arr_interval == (0.0, 1.0)
-    with pytest.raises(InputError, match="one mode"):
-        pool_experience_metrics([long, experience_metric(*square(4, 4), ExmConfig(mode="or"))])
 
 
 def test_bootstrap_is_fixed_by_seed_and_name():

@@ -1,4 +1,4 @@
-"""The pictures that a run on touch leaves, and the configurations that lead to them."""
+"""The plots of a simulated whisker session, and the touch configurations."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from evaluation.artifacts.run_directory import read_walls
 from evaluation.artifacts.whisker_views import read_whisker_views
-from evaluation.report import redraw_plots
+from evaluation.report import plot_writers
 from ratslam.cli import main
 from ratslam.config.run_config import RunConfig, load_config
 from ratslam.config.strict_yaml import load, validate
@@ -59,7 +59,8 @@ def test_a_run_on_touch_leaves_pictures(folder, name):
 def test_pictures_are_drawn_again_from_the_directory_alone(folder, tmp_path):
     elsewhere = tmp_path / "moved"
     shutil.copytree(folder / "run", elsewhere, ignore=shutil.ignore_patterns("*.png"))
-    redraw_plots(elsewhere)
+    for name, save in plot_writers(elsewhere).items():
+        save(elsewhere / name)
     for name in PICTURES:
         assert (elsewhere / name).read_bytes() == (folder / "run" / name).read_bytes(), name
 

@@ -257,14 +257,14 @@ def test_lines_that_no_run_writes_are_named(name, line, tmp_path):
         monitor.read()
 
 
-def test_a_run_that_is_taken_away_is_missed(tmp_path):
+def test_a_removed_run_directory_is_an_error(tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()
     (folder / "steps.csv").touch()
     monitor = RunMonitor(folder)
     assert monitor.read().status == RUNNING
     shutil.rmtree(folder)
-    with pytest.raises(InputError, match="gone"):
+    with pytest.raises(InputError, match="cannot be read"):
         monitor.read()
 
 
