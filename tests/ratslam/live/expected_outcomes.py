@@ -1,4 +1,4 @@
-"""How sessions must end."""
+"""Expected state of arm, report and recording after a session."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Takes the place of the mapper's process: follows its protocol, loads almost nothing, maps nothing."""
+"""Stub of the mapper process: follows its protocol without mapping, and loads almost nothing."""
 
 from __future__ import annotations
 

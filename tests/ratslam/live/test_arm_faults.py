@@ -1,4 +1,4 @@
-"""Whatever goes wrong with the arm ends the session under its name, with the arm at rest and nothing lost."""
+"""Faults of the arm end the session with their outcome, the arm at rest and all data recorded."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_a_fault_of_the_controller(bench: Bench, fault: dict, outcome: str) -> N
             stands(bench)
 
 
-def test_the_arms_process_crashes(bench: Bench) -> None:
+def test_the_rtde_process_crashes(bench: Bench) -> None:
     with bench.under_way() as session:
         at = bench.moment()
         os.kill(session.child(), signal.SIGSEGV)
@@ -71,7 +71,7 @@ def test_registers_in_use(bench: Bench) -> None:
         assert len(bench.arm.state()["targets"]) == sent
 
 
-def test_the_tool_hits_a_wall(bench: Bench) -> None:
+def test_a_collision_with_a_wall(bench: Bench) -> None:
     with bench.under_way() as session:
         at, touched = bench.moment(), bench.arm.state()["tcp"][0] + 0.02
         bench.arm(do="wall", x=touched, stiffness=20_000)

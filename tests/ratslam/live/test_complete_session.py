@@ -1,4 +1,4 @@
-"""A session as the README has it: emulators, `live`, and `run` on what it recorded, each by the program."""
+"""A session as in the README, by the program: emulators, `live`, and `run` on the recording."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def holds(directory: Path, whisks: int) -> dict:
     return report
 
 
-def test_twenty_whisks(loopback: str, tmp_path: Path) -> None:
+def test_twenty_whisks_and_their_replay(loopback: str, tmp_path: Path) -> None:
     """The mapper stands still for a while: images dropped live are dropped in the replay too."""
     settings = [*PATIENT, "live.whisks=20", "live.plan.whisking.rate=2", "live.budget=3"]
     settings += ["live.plan.calibration.min_duration=2"]
@@ -149,7 +149,7 @@ def test_twenty_whisks(loopback: str, tmp_path: Path) -> None:
 @pytest.mark.soak
 @pytest.mark.timeout(2400)
 @pytest.mark.parametrize("hz", [125, 500])
-def test_ten_minutes(loopback: str, tmp_path: Path, hz: int) -> None:
+def test_ten_minutes_and_their_replay(loopback: str, tmp_path: Path, hz: int) -> None:
     settings = ["live.whisks=600", f"live.arm.hz={hz}", "live.plan.path.circuits=CACACA"]
     report = holds(lived(loopback, tmp_path, *settings, longest=1000), 600)
     assert report["dropped"] == 0

@@ -1,4 +1,4 @@
-"""Whatever goes wrong with the head has a name or a number, and passes where it can."""
+"""Faults of the head are counted or end the session with their outcome; short ones are waited for."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def gaps(kept: Kept) -> int:
     ],
     ids=lambda value: value["do"] if isinstance(value, dict) else "",
 )
-def test_a_head_that_stays_away_ends_it(bench: Bench, fault: dict, outcome: str) -> None:
+def test_a_head_that_stays_away_ends_the_session(bench: Bench, fault: dict, outcome: str) -> None:
     with bench.under_way() as session:
         at = bench.moment()
         bench.head(**fault)
@@ -50,7 +50,7 @@ def test_a_head_that_stays_away_ends_it(bench: Bench, fault: dict, outcome: str)
     ],
     ids=lambda fault: fault["do"],
 )
-def test_a_head_that_comes_back_is_waited_for(bench: Bench, fault: dict) -> None:
+def test_the_session_continues_when_the_head_is_back(bench: Bench, fault: dict) -> None:
     with bench.under_way(head={"patience": PATIENCE}, waypoints=LEGS[:2]) as session:
         bench.head(**fault)
         until(bench.still, "the arm stands")
@@ -71,9 +71,9 @@ def test_a_head_that_comes_back_is_waited_for(bench: Bench, fault: dict) -> None
         assert told == pytest.approx(way, abs=1e-6)
 
 
-def test_what_is_damaged_is_counted(bench: Bench) -> None:
-    """Garbage, damaged frames, frames left out and out of sequence: exact numbers, and it goes on."""
-    with bench.under_way(whisks=12, head={"patience": PATIENCE}) as session:
+def test_damaged_frames_are_counted(bench: Bench) -> None:
+    """Exact counts of damaged, skipped and swapped frames and of garbage; the session continues."""
+    with bench.under_way(whisks=12, head={"silence": 10.0, "patience": PATIENCE}) as session:
         before = bench.head(do="counts")
         bench.head(do="corrupt", frames=7)
         bench.head(do="garbage", bytes=100_000)
@@ -107,7 +107,7 @@ def test_frames_lost_to_an_overrun_are_counted(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("jump", [500_000, pytest.param(-200_000, marks=pytest.mark.soak)])
-def test_its_clock_jumps(bench: Bench, jump: int) -> None:
+def test_a_clock_jump_ends_the_session(bench: Bench, jump: int) -> None:
     with bench.under_way() as session:
         at = bench.moment()
         bench.head(do="clock", jump_us=jump)
@@ -117,7 +117,7 @@ def test_its_clock_jumps(bench: Bench, jump: int) -> None:
     bench.head(do="clock", jump_us=-jump)
 
 
-def test_a_whisker_pressed_to_its_end(bench: Bench) -> None:
+def test_an_overloaded_whisker_ends_the_session(bench: Bench) -> None:
     with bench.under_way() as session:
         at = bench.moment()
         bench.head(do="saturate", whisker=11, seconds=0.3)

@@ -1,4 +1,4 @@
-"""Sessions killed or interrupted at any moment: the arm stands, and the recording is whole to there."""
+"""Sessions killed or interrupted at any moment: the arm stops, and the recording is complete up to then."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_the_parent_is_killed_in_motion(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("number", NUMBERS)
-def test_it_is_interrupted(bench: Bench, number: int) -> None:
+def test_an_interrupt_ends_the_session(bench: Bench, number: int) -> None:
     """From the first moment to the last: a controlled stop, and what there is is kept."""
     with bench.session(waypoints=[(0.63, 0.45, 0.0), (0.7, 0.45, 0.0)]) as session:
         session.says("disk:")
@@ -81,7 +81,7 @@ def test_it_is_interrupted(bench: Bench, number: int) -> None:
         assert bench.arm.state()["watchdog_stops"] == bench.starved
 
 
-def test_interrupted_twice(bench: Bench) -> None:
+def test_a_second_interrupt_stops_the_arm_by_the_dashboard(bench: Bench) -> None:
     """The second time nothing is waited for, but the arm."""
     with bench.under_way() as session:
         session.process.send_signal(signal.SIGINT)

@@ -1,4 +1,4 @@
-"""A mapper that is slow or gone: the arm is none the worse, and what was recorded tells."""
+"""A slow or dead mapper does not affect the arm; the recording shows which images were dropped."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a session is asked for and cannot or must not do: refused with its cure, and nothing moves."""
+"""Sessions that are refused: the error has a cure, and nothing moves."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def written(bench: Bench, folder: Path, **settings: Any) -> list[str]:
     ],
     ids=["outside", "nan", "fast", "infinite", "high", "full"],
 )
-def test_what_the_configuration_asks(
+def test_invalid_configurations_are_refused(
     bench: Bench,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
@@ -65,7 +65,7 @@ def test_what_the_configuration_asks(
     ],
     ids=["ur_rtde", "pyusb", "libusb", "head"],
 )
-def test_what_is_not_there(
+def test_missing_libraries_and_devices_are_refused(
     bench: Bench, tmp_path: Path, without: tuple[str, ...], address: str | None, said: list[str]
 ) -> None:
     """Modules that cannot be imported, in any process of the session."""

@@ -1,4 +1,4 @@
-"""The odometer: poses between states, motions between whisks, and the errors that are added."""
+"""Odometry of the arm: poses between states, motions between whisks, added errors."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def odometer(config: LiveConfig, *motion: float) -> tuple[ArmOdometry, np.ndarra
     st.floats(-0.8, 0.8),
     st.floats(0.01, 2.9),
 )
-def test_poses_are_those_of_the_map_wherever_it_lies(x, yaw, speed, turn, when):
+def test_poses_are_in_the_map_frame_for_any_base_transform(x, yaw, speed, turn, when):
     config = LiveConfig.model_validate({"arm": {"placing": {"x": x, "yaw_deg": yaw}}})
     made, time, pose = odometer(config, 3.0, speed, turn)
     k = int(np.searchsorted(time, 100.0 + when))
@@ -56,7 +56,7 @@ def test_poses_are_those_of_the_map_wherever_it_lies(x, yaw, speed, turn, when):
 
 @pytest.mark.parametrize("kind", ["pose", "velocity"])
 @pytest.mark.parametrize(("speed", "turn"), [(0.05, 0.0), (0.0, 0.4), (0.04, -0.3)])
-def test_motions_lead_along_the_way(kind, speed, turn):
+def test_motions_sum_up_to_the_path(kind, speed, turn):
     made, _, pose = odometer(LiveConfig(odometry=kind), 9.0, speed, turn)
     told, truth = zip(*(made.step(k, 100.0 + k) for k in range(9)), strict=True)
     moves = np.array([[m.dx, m.dy, m.dtheta] for m in told], float)
@@ -68,7 +68,7 @@ def test_motions_lead_along_the_way(kind, speed, turn):
     assert np.allclose(truth[-1], compose(np.zeros(3), pose[8 * int(HZ)]), atol=1e-9)
 
 
-def test_errors_are_added_and_do_not_depend_on_what_follows():
+def test_errors_do_not_depend_on_later_whisks():
     noisy = LiveConfig(noise=OdometryConfig(noise="white"), seed=4)
     short, *_ = odometer(noisy, 9.0, 0.05, 0.1)
     long, *_ = odometer(noisy, 9.0, 0.05, 0.1)
@@ -82,7 +82,7 @@ def test_errors_are_added_and_do_not_depend_on_what_follows():
     assert all(a.dx != b.dx and a.dy == b.dy for a, b in zip(first[1:], without[1:], strict=True))
 
 
-def test_it_remembers_only_the_last_seconds():
+def test_old_states_are_dropped():
     made, *_ = odometer(LiveConfig(), 9.0, 0.05, 0.0)
     time, _, tcp, rate = arc(LiveConfig(), 20.0, 0.05, 0.0)
     made.add(200.0 + time, tcp, rate)

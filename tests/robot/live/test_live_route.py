@@ -1,4 +1,4 @@
-"""The route: targets in order, each after the one before was reached, and where they come from."""
+"""The route: each target is sent after arrival at the one before."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Obedient:
         return self.there
 
 
-def test_a_target_is_sent_when_the_last_one_was_reached_and_once():
+def test_each_target_is_sent_once_after_arrival_at_the_last():
     config = LiveConfig(waypoints=((0.1, 0.1, 0.0), (0.2, 0.1, 0.0), (0.2, 0.1, 90.0)))
     route, arm = main_route(config, plan_path(config, HEAD)), Obedient()
     assert [route.advance(arm) for _ in range(3)] == [False] * 3
@@ -47,7 +47,7 @@ def test_a_target_is_sent_when_the_last_one_was_reached_and_once():
     assert np.array_equal(arm.sent, route.targets)
 
 
-def test_an_arm_that_was_stopped_is_sent_there_again():
+def test_the_target_of_a_stopped_arm_is_sent_again():
     config = LiveConfig(waypoints=((0.1, 0.1, 0.0), (0.2, 0.1, 0.0)))
     route, arm = main_route(config, plan_path(config, HEAD)), Obedient()
     route.resend_last()
@@ -58,7 +58,7 @@ def test_an_arm_that_was_stopped_is_sent_there_again():
     assert np.array_equal(arm.sent[0], arm.sent[1])
 
 
-def test_the_way_is_that_of_the_simulated_session():
+def test_the_path_is_that_of_the_simulated_session():
     config = LiveConfig()
     plan, path = config.plan, plan_path(config, HEAD)
     made = make_scene(plan.maze, plan.path, plan.motion, plan.kidnaps, HEAD, plan.seed)
@@ -73,7 +73,7 @@ def test_the_way_is_that_of_the_simulated_session():
         assert np.allclose(lift, height)
 
 
-def test_the_arm_goes_no_faster_than_it_may():
+def test_the_speed_is_the_lower_of_plan_and_arm():
     config = LiveConfig.model_validate({"arm": {"speed": 0.02}, "plan": {"motion": {"speed": 0.2}}})
     assert main_route(config, plan_path(config, HEAD)).speed == 0.02
 
@@ -85,6 +85,6 @@ def test_the_arm_goes_no_faster_than_it_may():
         ({"plan": {"kidnaps": {"count": 2}}}, "live.plan.kidnaps"),
     ],
 )
-def test_ways_that_no_arm_can_go_are_refused(settings, key):
+def test_invalid_paths_are_refused(settings, key):
     with pytest.raises(InputError, match=key):
         plan_path(LiveConfig.model_validate(settings), HEAD)

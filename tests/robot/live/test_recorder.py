@@ -1,4 +1,4 @@
-"""A live session comes back from its recording as it was handed on, up to the moment it was killed."""
+"""A live session is read back exactly, up to the moment when its process was killed."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def session(path: Path, whisks: int = 3) -> tuple[list[Cycle], Frames, np.ndarra
     return cycles, frames, states
 
 
-def test_a_session_comes_back_bit_for_bit(tmp_path: Path) -> None:
+def test_a_session_is_read_back_exactly(tmp_path: Path) -> None:
     cycles, frames, _ = session(tmp_path / "a.mcap")
     recording = Recording(tmp_path / "a.mcap")
     samples = list(recording)
@@ -153,7 +153,7 @@ def test_a_session_comes_back_bit_for_bit(tmp_path: Path) -> None:
     assert same(Frames(*(np.concatenate(part) for part in zip(*parts, strict=True))), frames)
 
 
-def test_a_whisk_says_what_its_frames_say() -> None:
+def test_a_whisk_is_assembled_from_its_frames() -> None:
     frames = some_frames(10, first=90)
     cycle = assemble_cycle(frames, make_cut(0, 3.0, 2.5, rows(frames, slice(2, 7)), moved(0)))
     np.testing.assert_allclose(cycle.time, 2.5 + np.arange(5) / RATE, rtol=0, atol=1e-12)
@@ -167,7 +167,7 @@ def test_a_whisk_says_what_its_frames_say() -> None:
 
 @settings(max_examples=40)
 @given(st.data())
-def test_whatever_way_frames_come(tmp_path_factory: Any, data: st.DataObject) -> None:
+def test_the_order_of_frames_does_not_matter(tmp_path_factory: Any, data: st.DataObject) -> None:
     """Some are lost, some late; cuts overlap, leave gaps, or are made before their frames were handed in."""
     path = tmp_path_factory.getbasetemp() / "law.mcap"
     count = data.draw(st.integers(0, 120))
@@ -204,7 +204,7 @@ def test_whatever_way_frames_come(tmp_path_factory: Any, data: st.DataObject) ->
 
 
 @given(st.integers(0, 40), st.integers(0, 5), st.integers(0, 2**32))
-def test_blocks_come_back(count: int, seed: int, first: int) -> None:
+def test_blocks_round_trip(count: int, seed: int, first: int) -> None:
     frames, states = some_frames(count, seed, first), some_states(count + 1, seed)
     assert same(decode_frames(encode_frames(3.5, frames), W), (3.5, frames))
     assert encode_frames(3.5, empty_frames(W)) == encode_frames(3.5, rows(frames, slice(0)))
@@ -220,7 +220,7 @@ def test_blocks_come_back(count: int, seed: int, first: int) -> None:
 
 
 @given(st.binary(max_size=120), st.sampled_from([0, 1, 2, 3]), st.integers(0, 400), st.integers(0, 2**32 - 1))
-def test_no_bytes_are_believed(noise: bytes, kind: int, place: int, number: int) -> None:
+def test_invalid_messages_are_refused(noise: bytes, kind: int, place: int, number: int) -> None:
     frames = some_frames(3)
     decode: Any = (lambda m: decode_frames(m, W), decode_states, decode_cut, decode_event)[kind]
     good = (
@@ -242,7 +242,7 @@ def test_no_bytes_are_believed(noise: bytes, kind: int, place: int, number: int)
         decode(good + b"\0")
 
 
-def test_everything_is_on_its_way_within_a_fifth_of_a_second(tmp_path: Path) -> None:
+def test_data_are_written_within_a_fifth_of_a_second(tmp_path: Path) -> None:
     """Counted on the times handed in: the file is read after every call."""
     path = tmp_path / "a.mcap"
     frames, recorder = some_frames(RATE), opened(path)
@@ -338,7 +338,7 @@ def test_many_killed_sessions(tmp_path: Path) -> None:
         check_killed(tmp_path, float(seconds))
 
 
-def test_a_full_disk_is_told_once_and_the_recording_stays_readable(tmp_path: Path) -> None:
+def test_a_full_disk_is_a_fault_and_the_recording_stays_readable(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     frames, recorder = some_frames(6 * RATE), opened(path)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -370,7 +370,9 @@ def test_a_full_disk_is_told_once_and_the_recording_stays_readable(tmp_path: Pat
     assert recover(path, tmp_path / "b.mcap").samples == recording.length
 
 
-def test_room_that_comes_back_makes_a_whole_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_was_full_yields_a_complete_file_in_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "a.mcap"
     frames, recorder = some_frames(3 * RATE), opened(path)
     with monkeypatch.context() as patch:
@@ -393,7 +395,7 @@ def entries_of(path: Path) -> list[RecordingEntry]:
     return list(McapScanner(path).entries())
 
 
-def test_recover_keeps_what_stands_beside_the_samples(tmp_path: Path) -> None:
+def test_recover_keeps_messages_other_than_samples(tmp_path: Path) -> None:
     session(tmp_path / "whole.mcap")
     data = (tmp_path / "whole.mcap").read_bytes()
     (tmp_path / "cut.mcap").write_bytes(data[: data.rindex(b"\x28\xb5\x2f\xfd")])  # in its last chunk
@@ -441,7 +443,7 @@ def damaged(data: bytes, seed: int, rounds: int) -> Iterator[bytes]:
 
 
 @pytest.mark.parametrize("rounds", [150, pytest.param(5000, marks=pytest.mark.soak)])
-def test_of_a_damaged_file_exactly_a_prefix_is_read(tmp_path: Path, rounds: int) -> None:
+def test_a_prefix_of_a_damaged_file_is_read(tmp_path: Path, rounds: int) -> None:
     session(tmp_path / "a.mcap", whisks=2)
     whole = [entry[:4] for entry in entries_of(tmp_path / "a.mcap")]
     lengths = set()
@@ -456,7 +458,7 @@ def test_of_a_damaged_file_exactly_a_prefix_is_read(tmp_path: Path, rounds: int)
 
 
 @pytest.mark.parametrize("unsigned", [False, True])
-def test_a_chunk_that_is_passed_over_is_missed(tmp_path: Path, unsigned: bool) -> None:
+def test_a_skipped_chunk_is_reported(tmp_path: Path, unsigned: bool) -> None:
     """Its type is damaged; and perhaps the checksum of the whole has gone too (0: there is none)."""
     session(tmp_path / "a.mcap", whisks=2)
     whole = [entry[:4] for entry in entries_of(tmp_path / "a.mcap")]
@@ -467,7 +469,7 @@ def test_a_chunk_that_is_passed_over_is_missed(tmp_path: Path, unsigned: bool) -
 
 
 @pytest.mark.parametrize("unsigned", [False, True])
-def test_a_chunk_that_was_all_is_missed(tmp_path: Path, unsigned: bool) -> None:
+def test_a_skipped_only_chunk_is_reported(tmp_path: Path, unsigned: bool) -> None:
     """The channel went with it."""
     with opened(tmp_path / "a.mcap") as recorder:
         recorder.add_event(START, "start", "and end")
@@ -496,7 +498,7 @@ CHUNK_HEADER = 1 + 8 + 3 * 8 + 4 + 8 + 8
 """Bytes from a chunk's beginning to its content."""
 
 
-def test_a_cut_must_be_of_its_frames(tmp_path: Path) -> None:
+def test_a_cut_must_match_its_frames(tmp_path: Path) -> None:
     frames, recorder = some_frames(20), opened(tmp_path / "a.mcap")
     cut = make_cut(0, START, START, frames, moved(0))
     for wrong in (cut._replace(frames=19), cut._replace(first=1), cut._replace(frames=0, first=50, last=60)):
@@ -511,7 +513,7 @@ def test_a_cut_must_be_of_its_frames(tmp_path: Path) -> None:
     assert Recording(tmp_path / "a.mcap").length == 1
 
 
-def test_a_cut_whose_frames_are_missing_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cut_without_its_frames_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """No recorder writes such a file."""
     with monkeypatch.context() as patch, opened(tmp_path / "a.mcap") as recorder:
         patch.setattr(
@@ -524,7 +526,7 @@ def test_a_cut_whose_frames_are_missing_is_told(tmp_path: Path, monkeypatch: pyt
     assert walk.broken == "a whisk of 21 frames, of which 20 are there"
 
 
-def test_the_window_holds_what_a_ring_would() -> None:
+def test_the_frame_window_agrees_with_the_ring_buffer() -> None:
     window = FrameWindow(empty_frames(W))
     assert len(window.between(0, 10**9).sequence) == 0
     block = some_frames(1000)

@@ -1,4 +1,4 @@
-"""A Create in this process, on a line of bytes in a time of its own; and one on a terminal, in real time."""
+"""A Create in this process in simulated time, and one on a pseudo-terminal in real time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the wheels are told, whatever the line and the robot do: in a time of their own."""
+"""The control loop under faults of line and robot, in simulated time."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def drive(line: Line, pilot: ControlLoop, seconds: float, forward: float, turn: 
 
 
 @given(st.floats(0.01, 0.5), st.lists(st.tuples(NUMBER, NUMBER), max_size=10))
-def test_no_speed_over_the_cap_reaches_the_wire(cap: float, wanted: list[tuple[float, float]]) -> None:
+def test_speeds_above_the_limit_are_not_sent(cap: float, wanted: list[tuple[float, float]]) -> None:
     line = Line()
     pilot = line.control_loop(speed=cap)
     for forward, turn in wanted:
@@ -48,7 +48,7 @@ def test_no_speed_over_the_cap_reaches_the_wire(cap: float, wanted: list[tuple[f
     assert all(max(abs(right), abs(left)) <= 1000 * cap + 1e-6 for _, right, left in line.robot.drives)
 
 
-def test_what_is_not_renewed_ends() -> None:
+def test_a_command_that_is_not_renewed_ends() -> None:
     line = Line()
     pilot = line.control_loop(patience=0.5)
     pilot.steer(0.1, 0.0)
@@ -64,7 +64,7 @@ def test_what_is_not_renewed_ends() -> None:
     assert rolls(line.robot)
 
 
-def test_a_bump_stops_it_and_leaves_the_way_back() -> None:
+def test_a_bump_stops_forward_motion_only() -> None:
     line = Line()
     pilot = line.control_loop()
     drive(line, pilot, 0.5, 0.1)
@@ -87,7 +87,7 @@ def test_a_bump_stops_it_and_leaves_the_way_back() -> None:
 
 @pytest.mark.parametrize("forward", [0.1, -0.1, 0.0])
 @pytest.mark.parametrize("dropped", [protocol.Bumps.DROPPED_LEFT, protocol.Bumps.DROPPED_CASTER])
-def test_a_dropped_wheel_stops_it_until_it_stands(dropped: protocol.Bumps, forward: float) -> None:
+def test_a_dropped_wheel_stops_the_robot_until_it_stands(dropped: protocol.Bumps, forward: float) -> None:
     line = Line()
     pilot = line.control_loop()
     drive(line, pilot, 0.2, forward, 0.2)
@@ -104,7 +104,7 @@ def test_a_dropped_wheel_stops_it_until_it_stands(dropped: protocol.Bumps, forwa
     assert rolls(line.robot)
 
 
-def test_a_robot_that_left_safe_mode_is_brought_back_by_release_alone() -> None:
+def test_safe_mode_is_entered_again_by_release_only() -> None:
     line = Line()
     pilot = line.control_loop()
     drive(line, pilot, 0.2, 0.1)
@@ -204,7 +204,7 @@ def test_a_late_reply_loses_nothing(fates: list[str], forward: float) -> None:
     ),
     st.floats(-0.2, 0.2),
 )
-def test_garbage_costs_no_more_than_the_replies_it_spoils(
+def test_garbage_costs_only_the_replies_that_it_damages(
     noise: list[tuple[str, bytes] | None], forward: float
 ) -> None:
     line = Line()
@@ -245,7 +245,7 @@ def test_garbage_before_a_reply_costs_nothing(count: int, noise: bytes, forward:
     assert abs(1000 * (pilot.take_odometry().dx - line.robot.base.travelled)) < 1 + 1e-6
 
 
-def test_what_is_asked_for_while_it_is_read_is_looked_at_too() -> None:
+def test_a_command_given_during_a_read_is_checked() -> None:
     line = Line()
     pilot = line.control_loop()
     line.robot.touch(protocol.Bumps.RIGHT)
@@ -260,7 +260,7 @@ def test_what_is_asked_for_while_it_is_read_is_looked_at_too() -> None:
     assert not rolls(line.robot)
 
 
-def test_nothing_asked_for_before_a_stop_is_done_after_its_release() -> None:
+def test_commands_from_before_a_stop_are_dropped() -> None:
     line = Line()
     pilot = line.control_loop()
     drive(line, pilot, 0.5, 0.1)
@@ -275,7 +275,7 @@ def test_nothing_asked_for_before_a_stop_is_done_after_its_release() -> None:
     assert pilot.halted is None
 
 
-def test_noise_behind_a_reply_casts_doubt_on_it() -> None:
+def test_a_reply_followed_by_noise_is_rejected() -> None:
     line = Line()
     pilot = line.control_loop()
     drive(line, pilot, 0.2, 0.1)

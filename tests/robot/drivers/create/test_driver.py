@@ -59,7 +59,7 @@ def settled(driver: CreateDriver) -> None:
     until(lambda: driver.counts.good > good + 1)
 
 
-def test_odometry_is_the_truth_within_quantisation(emulated: Emulated) -> None:
+def test_odometry_is_accurate_to_the_quantisation(emulated: Emulated) -> None:
     with create(emulated) as driver:
         total = 0.0
         for forward, turn in ((0.15, 0.0), (0.1, 0.5), (0.0, -0.8), (-0.1, 0.0)):
@@ -74,7 +74,7 @@ def test_odometry_is_the_truth_within_quantisation(emulated: Emulated) -> None:
     assert emulated.do("state")["mode"] == "PASSIVE"
 
 
-def test_a_straight_line_is_told_to_the_millimetre(emulated: Emulated) -> None:
+def test_a_straight_line_is_measured_to_the_millimetre(emulated: Emulated) -> None:
     with create(emulated) as driver:
         renewed(driver, 0.8, 0.2)
         settled(driver)
@@ -86,7 +86,7 @@ def test_a_straight_line_is_told_to_the_millimetre(emulated: Emulated) -> None:
     assert told.dt > 0.8
 
 
-def test_speeds_over_the_cap_never_reach_the_robot(emulated: Emulated) -> None:
+def test_speeds_above_the_limit_are_not_sent(emulated: Emulated) -> None:
     with create(emulated, speed=0.12) as driver:
         for forward, turn in ((0.121, 0), (0.1, 0.5), (math.nan, 0), (0, math.inf), (-1e300, 0), (0.12, 0)):
             try:
@@ -99,7 +99,7 @@ def test_speeds_over_the_cap_never_reach_the_robot(emulated: Emulated) -> None:
     assert max(max(abs(right), abs(left)) for _, right, left in drives) == 120
 
 
-def test_it_stops_when_it_is_forgotten(emulated: Emulated) -> None:
+def test_the_robot_stops_without_further_commands(emulated: Emulated) -> None:
     with create(emulated, patience=2.0) as driver:
         driver.drive(0.1, 0.0)
         until(lambda: emulated.do("state")["wheels"] == [100, 100])
@@ -107,7 +107,7 @@ def test_it_stops_when_it_is_forgotten(emulated: Emulated) -> None:
         assert driver.halted is None
 
 
-def test_a_bump_stops_it(emulated: Emulated) -> None:
+def test_a_bump_stops_the_robot(emulated: Emulated) -> None:
     with create(emulated) as driver:
         renewed(driver, 0.2, 0.1)
         emulated.do("bump")
@@ -119,7 +119,7 @@ def test_a_bump_stops_it(emulated: Emulated) -> None:
         until(lambda: driver.drive(-0.1, 0.0) or emulated.do("state")["wheels"] == [-100, -100])
 
 
-def test_replies_in_pieces_are_whole(emulated: Emulated) -> None:
+def test_replies_may_arrive_in_pieces(emulated: Emulated) -> None:
     with create(emulated) as driver:
         emulated.do("trickle", seconds=0.004)
         renewed(driver, 0.6, 0.2)
@@ -127,7 +127,7 @@ def test_replies_in_pieces_are_whole(emulated: Emulated) -> None:
         assert abs(driver.odometry().dx - emulated.do("state")["x"]) < 1e-3 + 1e-9
 
 
-def test_garbage_and_cut_replies_are_survived(emulated: Emulated) -> None:
+def test_driving_continues_after_garbage_and_cut_replies(emulated: Emulated) -> None:
     with create(emulated) as driver:
         for count in range(6):
             emulated.do("garbage", bytes=7 * count + 1)
@@ -185,7 +185,7 @@ while True:
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
-def test_a_program_that_is_killed_or_hangs_is_stopped_by_its_guard(emulated: Emulated, how: int) -> None:
+def test_the_watchdog_stops_a_killed_or_hanging_program(emulated: Emulated, how: int) -> None:
     process = subprocess.Popen([sys.executable, "-c", DRIVES, emulated.path])
     try:
         until(lambda: emulated.do("state")["wheels"] == [100, 100])
@@ -199,7 +199,7 @@ def test_a_program_that_is_killed_or_hangs_is_stopped_by_its_guard(emulated: Emu
         process.wait()
 
 
-def test_a_guard_that_has_ended_stops_it(emulated: Emulated) -> None:
+def test_the_robot_stops_when_the_watchdog_ends(emulated: Emulated) -> None:
     with create(emulated) as driver:
         driver.drive(0.1, 0.0)
         assert driver.watchdog is not None
@@ -210,7 +210,7 @@ def test_a_guard_that_has_ended_stops_it(emulated: Emulated) -> None:
         until(lambda: emulated.do("state")["wheels"] == [0, 0])
 
 
-def test_ports_that_are_no_create() -> None:
+def test_ports_without_a_create_are_refused() -> None:
     with pytest.raises(NoPort, match="no such port"):
         CreateDriver(CreateConfig(port="/dev/ttyNONE")).start()
     with pytest.raises(NoPort, match="/dev/null"):
@@ -224,7 +224,7 @@ def test_ports_that_are_no_create() -> None:
         os.close(slave)
 
 
-def test_two_programs_do_not_drive_one_robot(emulated: Emulated) -> None:
+def test_a_second_program_is_refused(emulated: Emulated) -> None:
     with create(emulated) as driver:
         with pytest.raises(NoPort, match="another program"):
             CreateDriver(CreateConfig(port=emulated.path)).start()
@@ -234,13 +234,13 @@ def test_two_programs_do_not_drive_one_robot(emulated: Emulated) -> None:
         assert driver.halted is None
 
 
-def test_a_robot_that_hangs_in_the_air_is_not_started(emulated: Emulated) -> None:
+def test_a_lifted_robot_is_not_started(emulated: Emulated) -> None:
     emulated.do("drop")
     with pytest.raises(NotSafe, match="set it on all its wheels"):
         CreateDriver(CreateConfig(port=emulated.path)).start()
 
 
-def test_without_pyserial_the_cure_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_for_missing_pyserial_has_a_cure(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "serial", None)
     with pytest.raises(InputError, match="pip install"):
         CreateDriver(CreateConfig(port="/dev/ttyUSB0")).start()
@@ -252,7 +252,7 @@ def test_importing_the_driver_does_not_need_pyserial() -> None:
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "set()"
 
 
-def test_the_emulator_understands_one_speed_only(emulated: Emulated) -> None:
+def test_the_emulator_requires_its_baud_rate(emulated: Emulated) -> None:
     answers = []
     for baud in (57600, 115200):
         with serial.Serial(emulated.path, baud, timeout=30) as port:
@@ -262,7 +262,7 @@ def test_the_emulator_understands_one_speed_only(emulated: Emulated) -> None:
     assert answers[1] != answers[0]
 
 
-def test_the_emulator_answers_nonsense_with_an_error(emulated: Emulated) -> None:
+def test_the_emulator_answers_invalid_requests_with_an_error(emulated: Emulated) -> None:
     assert "error" in emulated.do("dance")
     assert "error" in emulated.do("garbage")
     assert emulated.do("state")["mode"] == "OFF"

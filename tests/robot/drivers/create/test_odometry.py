@@ -1,4 +1,4 @@
-"""Odometry in whole millimetres and degrees: what is not told yet is all that is missing."""
+"""Odometry of a Create, which reports whole millimetres and degrees."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ def readings(legs: list[tuple[int, int, float, int]]) -> tuple[EmulatedCreate, l
 
 
 @given(LEGS)
-def test_sums_are_the_truth_within_what_is_not_told(legs: list[tuple[int, int, float, int]]) -> None:
+def test_sums_are_accurate_to_the_quantisation(legs: list[tuple[int, int, float, int]]) -> None:
     robot, told = readings(legs)
     assert abs(sum(m for m, _, _ in told) - 1000 * robot.base.travelled) < 1 + 1e-6
     assert abs(sum(d for _, d, _ in told) - math.degrees(robot.base.turned)) < 1 + 1e-6
 
 
 @given(LEGS)
-def test_the_pose_is_the_truth_within_quantisation(legs: list[tuple[int, int, float, int]]) -> None:
+def test_the_pose_is_accurate_to_the_quantisation(legs: list[tuple[int, int, float, int]]) -> None:
     robot, told = readings(legs)
     odometer = CreateOdometry(0.0)
     for reading in told:
@@ -58,7 +58,7 @@ def test_the_pose_is_the_truth_within_quantisation(legs: list[tuple[int, int, fl
 
 
 @given(LEGS, st.lists(st.booleans(), min_size=240, max_size=240))
-def test_taking_it_in_parts_changes_nothing(
+def test_odometry_read_in_parts_is_the_same(
     legs: list[tuple[int, int, float, int]], taken: list[bool]
 ) -> None:
     _, told = readings(legs)
@@ -78,7 +78,7 @@ def test_taking_it_in_parts_changes_nothing(
     assert time == pytest.approx(total.dt)
 
 
-def test_an_arc_is_an_arc() -> None:
+def test_motion_between_readings_is_an_arc() -> None:
     odometer = CreateOdometry(0.0)
     odometer.add(1571, 90, 1.0)  # a quarter of a circle of 1 m
     assert odometer.take_odometry() == pytest.approx((1.0, 1.0, math.pi / 2, 1.0), abs=2e-4)

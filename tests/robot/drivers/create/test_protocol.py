@@ -1,4 +1,4 @@
-"""Bytes of the Open Interface: what is sent is what was meant, and only a Create's replies are believed."""
+"""Bytes of the Open Interface: commands that are sent, replies that are accepted."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def awake() -> EmulatedCreate:
 
 
 @given(SPEED, SPEED, st.integers(1, 5))
-def test_wheels_turn_as_they_are_told_however_the_command_is_cut(right: int, left: int, cut: int) -> None:
+def test_drive_commands_work_however_the_bytes_are_split(right: int, left: int, cut: int) -> None:
     robot = awake()
     command = protocol.drive(right, left)
     robot.receive(command[:cut])
@@ -33,7 +33,7 @@ def test_wheels_turn_as_they_are_told_however_the_command_is_cut(right: int, lef
 
 
 @given(SPEED, SPEED, st.integers(0, 6))
-def test_a_stop_stops_after_a_command_that_broke_off(right: int, left: int, length: int) -> None:
+def test_a_stop_works_after_an_incomplete_command(right: int, left: int, length: int) -> None:
     for command in (protocol.drive(right, left), protocol.QUERY):
         robot = awake()
         robot.receive(protocol.drive(200, 200) + command[:length])
@@ -42,13 +42,13 @@ def test_a_stop_stops_after_a_command_that_broke_off(right: int, left: int, leng
 
 
 @pytest.mark.parametrize(("right", "left"), [(501, 0), (0, -501), (32767, 0)])
-def test_no_command_is_beyond_the_interface(right: int, left: int) -> None:
+def test_commands_beyond_the_interface_are_refused(right: int, left: int) -> None:
     with pytest.raises(ValueError, match="500 at most"):
         protocol.drive(right, left)
 
 
 @given(SPEED, SPEED, st.floats(0, 3), st.sampled_from([0, 1, 2, 3, 4, 16, 31]))
-def test_what_a_create_says_is_believed(right: int, left: int, elapsed: float, bumps: int) -> None:
+def test_valid_replies_are_accepted(right: int, left: int, elapsed: float, bumps: int) -> None:
     robot = awake()
     robot.receive(protocol.drive(right, left))
     robot.touch(protocol.Bumps(bumps))
@@ -69,7 +69,7 @@ def test_what_a_create_says_is_believed(right: int, left: int, elapsed: float, b
 @example(protocol.REPLY.pack(0, 0, 32, 2), 0.0)
 @example(protocol.REPLY.pack(0, 0, 0, 0), 0.0)
 @example(protocol.REPLY.pack(0, 0, 0, 4), 0.0)
-def test_what_is_believed_is_possible(data: bytes, elapsed: float) -> None:
+def test_accepted_replies_are_possible(data: bytes, elapsed: float) -> None:
     found = protocol.parse_reply(data, elapsed)
     if found is not None:
         assert protocol.REPLY.pack(*found) == data
@@ -86,7 +86,7 @@ def test_what_is_believed_is_possible(data: bytes, elapsed: float) -> None:
 @example(0.1996, 0.1996, 0.0)
 @example(0.2, 0.2006, 0.0)
 @example(0.5, 0.0, 3.875)
-def test_no_wheel_is_over_the_cap(cap: float, forward: float, turn: float) -> None:
+def test_wheel_speeds_are_within_the_limit(cap: float, forward: float, turn: float) -> None:
     config = CreateConfig(speed=cap)
     apart = turn * config.wheel_base / 2
     fits = max(abs(forward + apart), abs(forward - apart)) <= cap  # False of NaN
@@ -101,7 +101,7 @@ def test_no_wheel_is_over_the_cap(cap: float, forward: float, turn: float) -> No
 
 
 @given(st.floats(-0.1, 0.1), st.floats(-0.7, 0.7))
-def test_forward_and_turn_are_the_wheels_mean_and_difference(forward: float, turn: float) -> None:
+def test_wheel_speeds_of_forward_and_turn(forward: float, turn: float) -> None:
     right, left = wheel_speeds(CreateConfig(), forward, turn)
     assert (right + left) / 2000 == pytest.approx(forward, abs=1e-3)
     assert (right - left) / 1000 / 0.258 == pytest.approx(turn, abs=4e-3)

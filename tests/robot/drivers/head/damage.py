@@ -1,4 +1,4 @@
-"""Streams of a head with everything that happens to bytes on their way, from hypothesis or from a seed."""
+"""Streams of a head with damage in transit, from hypothesis or from a seed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A head in memory: what it sends is what the test puts in, what it was told is there to look at."""
+"""A head in memory: sends what a test puts in and records the commands that it gets."""
 
 from __future__ import annotations
 

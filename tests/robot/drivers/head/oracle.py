@@ -1,4 +1,4 @@
-"""A second decoder, written from the sentences of `Counts` alone: slow, one byte after another."""
+"""A second decoder, written from the definitions of `DecoderCounts` alone: slow, byte by byte."""
 
 from __future__ import annotations
 

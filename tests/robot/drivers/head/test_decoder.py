@@ -1,4 +1,4 @@
-"""What comes of a stream is what the slow decoder says of it, at every cut."""
+"""The decoder agrees with the slow one in `oracle.py` for damaged streams, however they are split."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def stream(count: int, first: int = 0, shape: tuple[int, int] = (18, 3)) -> tupl
 
 @settings(max_examples=600)
 @given(streams())
-def test_every_prefix_is_what_the_oracle_makes_of_it(drawn):
+def test_every_prefix_agrees_with_the_reference_decoder(drawn):
     data, cuts, shape = drawn
     decoder, got = Decoder(*shape), []
     for start, end in itertools.pairwise([0, *cuts, len(data)]):
@@ -51,14 +51,14 @@ def test_every_prefix_is_what_the_oracle_makes_of_it(drawn):
 
 
 @given(st.binary(max_size=400), st.integers(1, 7))
-def test_noise_gives_nothing(data, step):
+def test_noise_yields_no_frames(data, step):
     decoder = Decoder(2, 1)
     for k in range(0, len(data), step):
         assert not len(decoder.feed(data[k : k + step]).sequence)
     assert decoder.counts.good == 0
 
 
-def test_a_clean_stream_comes_out_as_it_went_in():
+def test_a_clean_stream_is_decoded_completely():
     data, values = stream(3000, first=2**32 - 1500)
     decoder = Decoder(18)
     parts = [decoder.feed(data[k : k + 4096]) for k in range(0, len(data), 4096)]
@@ -71,7 +71,7 @@ def test_a_clean_stream_comes_out_as_it_went_in():
     assert decoder.counts == DecoderCounts(good=3000)
 
 
-def test_a_damaged_frame_takes_nothing_with_it():
+def test_a_damaged_frame_costs_no_other_frame():
     data, _ = stream(9)
     for place in range(128):
         for mask in (1, 0x80, 0xFF):
@@ -91,7 +91,7 @@ def test_any_lost_bytes_cost_one_frame():
         assert frames.sequence.tolist() == [0, 1, 2, 3, 5, 6, 7, 8]
 
 
-def test_a_frame_that_comes_late_is_no_longer_missing():
+def test_a_late_frame_is_not_counted_as_missing():
     data, _ = stream(6)
     order = [0, 1, 4, 3, 3, 5, 2, 2]
     decoder, missing = Decoder(18), []
@@ -104,7 +104,7 @@ def test_a_frame_that_comes_late_is_no_longer_missing():
     assert decoder.counts == DecoderCounts(good=6, duplicates=2)
 
 
-def test_overruns_are_counted_once_each():
+def test_each_overrun_is_counted_once():
     values = np.zeros((5, 2, 1), np.int16)
     flags = [FrameFlag.OVERRUN, 0, FrameFlag.OVERRUN | FrameFlag.CYCLE, FrameFlag.FAULT, FrameFlag.RCP]
     decoder = Decoder(2, 1)
@@ -112,7 +112,7 @@ def test_overruns_are_counted_once_each():
     assert decoder.counts == DecoderCounts(good=5, overruns=2, missing=5)
 
 
-def test_a_new_stream_never_takes_a_number_again():
+def test_numbers_are_unique_over_streams():
     data, _ = stream(50)
     decoder, got = Decoder(18), []
     for _ in range(3):
@@ -124,7 +124,7 @@ def test_a_new_stream_never_takes_a_number_again():
     assert decoder.counts == DecoderCounts(good=147, skipped_bytes=3 * 98, restarts=2)
 
 
-def test_a_restart_takes_its_time_from_the_clock():
+def test_times_after_a_restart_follow_the_device_clock():
     data, _ = stream(4, first=2**33 // 500)
     decoder = Decoder(18)
     for clock in (3 * 2**32 - 7, 3 * 2**32 + 10**6):
@@ -134,7 +134,7 @@ def test_a_restart_takes_its_time_from_the_clock():
         assert (frames.time % 2**32 == 500 * (2**33 // 500 + np.arange(4)) % 2**32).all()
 
 
-def test_hostile_bytes_cost_no_more_than_their_number(monkeypatch):
+def test_decoding_time_is_linear_for_hostile_bytes(monkeypatch):
     """Every byte is judged once, not once for every frame behind it."""
     header = pack_frames([1], [1], [0], np.zeros((1, 18, 3), np.int16))[:16]
     calls, real = [], zlib.crc32
@@ -144,7 +144,7 @@ def test_hostile_bytes_cost_no_more_than_their_number(monkeypatch):
 
 
 @pytest.mark.soak
-def test_a_fuzzer_finds_nothing(tmp_path):
+def test_fuzzing(tmp_path):
     pytest.importorskip("atheris", reason="atheris is not installed: pip install atheris")
     words = [
         "-m",

@@ -1,4 +1,4 @@
-"""What pyusb's errors are called, which heads an address finds, and what is told where libraries lack."""
+"""The USB bridge: translation of pyusb's errors, addresses, missing libraries."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_transfers(device, bridge):
     ]
 
 
-def test_a_device_that_runs_is_not_configured_again(device):
+def test_a_configured_device_is_not_configured_again(device):
     UsbBridge(device, "here")
     assert device.calls == []
     device.configured = False
@@ -97,7 +97,7 @@ def test_a_device_that_runs_is_not_configured_again(device):
     assert device.calls == [("configuration",)]
 
 
-def test_waiting_in_vain_is_no_error_unless_it_was_for_an_answer(device, bridge):
+def test_a_time_out_is_an_error_only_for_requests_and_commands(device, bridge):
     device.error = usb.USBTimeoutError("late", None, errno.ETIMEDOUT)
     assert bridge.read(4096, 0.02) == b""
     for action in (lambda: bridge.write(b"x"), lambda: bridge.request(Request.CLOCK)):
@@ -116,7 +116,7 @@ def test_waiting_in_vain_is_no_error_unless_it_was_for_an_answer(device, bridge)
         (errno.EBUSY, InputError),
     ],
 )
-def test_errors_have_names(device, bridge, number, kind):
+def test_translation_of_usb_errors(device, bridge, number, kind):
     device.error = usb.USBError("as libusb says", None, number)
     for action in (
         lambda: bridge.read(4096, 0.02),
@@ -148,7 +148,7 @@ def test_addresses(text, address):
 @pytest.mark.parametrize(
     "text", ["", "usb:", "usb:12:34", "usb:1209:0001:", "host:port", "host:70000", "a b", "usbx"]
 )
-def test_what_is_no_address(text):
+def test_invalid_addresses(text):
     with pytest.raises(ValueError, match="not an address of a head"):
         HeadLinkConfig(address=text)
 
@@ -164,7 +164,7 @@ def test_usb_without_a_head():
         open_bridge("usb:1209:0001:there-is-none")
 
 
-def test_missing_libusb_is_told_with_the_cure(monkeypatch):
+def test_the_error_for_missing_libusb_has_a_cure(monkeypatch):
     from usb.backend import libusb1
 
     monkeypatch.setattr(libusb1, "get_backend", lambda find_library=None: None)
@@ -172,14 +172,14 @@ def test_missing_libusb_is_told_with_the_cure(monkeypatch):
         open_bridge("usb")
 
 
-def test_missing_pyusb_is_told_with_the_cure(monkeypatch):
+def test_the_error_for_missing_pyusb_has_a_cure(monkeypatch):
     monkeypatch.setitem(sys.modules, "usb", None)
     monkeypatch.setitem(sys.modules, "usb.core", None)
     with pytest.raises(InputError, match=r"ratslam\[live\]"):
         open_bridge("usb")
 
 
-def test_nothing_is_imported_before_it_is_needed():
+def test_usb_is_imported_lazily():
     code = """
 import sys
 import robot.drivers.head.device, robot.drivers.head.reader

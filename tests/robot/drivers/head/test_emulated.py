@@ -1,4 +1,4 @@
-"""The reader at an emulated head, by the real pyusb: what the head says went wrong is what is counted."""
+"""The reader on an emulated head, over the real pyusb: streams, faults and their counts, feedback."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def reader(loopback, emulator):
     emulator("plug")
 
 
-def test_samples_have_the_times_of_their_numbers(reader):
+def test_sample_times_follow_from_their_numbers(reader):
     before = reader.ring.newest
     until(lambda: reader.ring.newest[0] > before[0] + 1000)
     after = reader.ring.newest
@@ -87,7 +87,7 @@ def test_two_thousand_samples_a_second(reader):
     assert (after[0] - before[0]) / took == pytest.approx(2000, rel=0.1)
 
 
-def test_what_went_wrong_is_counted_exactly(reader, emulator):
+def test_damage_is_counted_exactly(reader, emulator):
     emulator("corrupt", frames=7)
     until(lambda: reader.decoder.counts.missing == 7)
     emulator("skip", frames=30)
@@ -117,7 +117,7 @@ def test_unplugged_and_plugged_in_again(reader, emulator):
     assert reader.fault is None
 
 
-def test_a_stall_and_a_silence_pass(reader, emulator):
+def test_the_stream_continues_after_a_stall_and_a_silence(reader, emulator):
     emulator("stall", seconds=0.3)
     until(lambda: reader.stalls > 0)
     until(lambda: reader.state.link == LinkState.STREAMING)
@@ -127,7 +127,7 @@ def test_a_stall_and_a_silence_pass(reader, emulator):
     assert reader.fault is None
 
 
-def test_a_whisker_pressed_to_its_end(reader, emulator):
+def test_a_saturated_whisker_is_an_overload(reader, emulator):
     assert reader.overloaded == []
     emulator("saturate", whisker=11, seconds=0.2)
     until(lambda: reader.overloaded)
@@ -161,7 +161,7 @@ def whisk(host: str, mode: str, rcp: str) -> tuple[np.ndarray, np.ndarray, float
     return size[:, 0], size[:, 2], float(np.mean((frames.flags & FrameFlag.RCP) > 0))
 
 
-def test_feedback_in_the_head_lowers_the_whiskers_that_touch(loopback, emulator):
+def test_feedback_in_the_head_reduces_amplitudes_on_contact(loopback, emulator):
     angle, bent, fed = whisk(loopback, "open", "head")
     assert angle.max() == pytest.approx(np.radians(65), abs=0.02)
     touched = bent > 0.1
@@ -175,7 +175,7 @@ def test_feedback_in_the_head_lowers_the_whiskers_that_touch(loopback, emulator)
 
 
 @pytest.mark.soak
-def test_feedback_on_the_host_lowers_the_whiskers_that_touch(loopback, emulator):
+def test_feedback_on_the_host_reduces_amplitudes_on_contact(loopback, emulator):
     """On a busy machine it is too late for that."""
     angle, bent, _ = whisk(loopback, "open", "head")
     touched = bent > 0.1

@@ -1,4 +1,4 @@
-"""Two overloaded samples in a row are found wherever a block ends, one alone never is."""
+"""Overload needs two consecutive overloaded samples, in whatever blocks they arrive."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def watcher(alive: list[bool] | None = None) -> OverloadDetector:
 @given(
     st.lists(st.lists(st.sampled_from([0, 999, 1000, -1000]), min_size=2, max_size=2), max_size=30), st.data()
 )
-def test_in_any_blocks(rows, data):
+def test_overload_does_not_depend_on_the_blocks(rows, data):
     values = np.zeros((len(rows), 2, 3), np.int16)
     values[:, :, 2] = np.array(rows, np.int16).reshape(-1, 2)
     cuts = sorted(data.draw(st.lists(st.integers(0, len(rows)), max_size=4)))
@@ -43,14 +43,14 @@ def test_in_any_blocks(rows, data):
         (2, 999, False),
     ],
 )
-def test_what_counts(channel, value, found):
+def test_which_deflections_are_an_overload(channel, value, found):
     values = np.zeros((2, 2, 3), np.int16)
     values[:, 1, channel] = value
     assert watcher().check(values) == (1 if found else None)
     assert watcher([True, False]).check(values) is None
 
 
-def test_two_whiskers_in_turn_are_no_overload():
+def test_two_whiskers_in_turn_are_not_an_overload():
     values = np.zeros((2, 2, 3), np.int16)
     values[0, 0, 1] = values[1, 1, 1] = 5000
     assert watcher().check(values) is None

@@ -1,4 +1,4 @@
-"""What is packed is unpacked as it was, and looks on the wire as the document says."""
+"""Wire format of a head: layout of frames, round trips of commands and counts."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ NUMBERS = st.lists(st.integers(-32768, 32767), max_size=255)
 FLOAT = st.floats(width=32, allow_nan=False, allow_infinity=False)
 
 
-def test_a_frame_is_what_the_document_says():
+def test_frame_layout():
     values = np.arange(54, dtype=np.int16).reshape(1, 18, 3) - 20
     frame = pack_frames([2**32 + 7], [2**33 + 9], [5], values)
     body = struct.pack("<4sIIBBBB54h", b"WHK1", 7, 9, 5, 18, 3, 1, *values.ravel())
@@ -38,7 +38,7 @@ def test_a_frame_is_what_the_document_says():
 
 
 @given(st.sampled_from(CommandKind), st.sampled_from(FeedbackMode), st.tuples(*[FLOAT] * 5), NUMBERS)
-def test_commands_come_back(kind, mode, drive, numbers):
+def test_commands_round_trip(kind, mode, drive, numbers):
     sent = Command(kind, mode, *drive, np.array(numbers, np.int16))
     packet = pack_command(sent)
     assert len(packet) == 32 + 2 * len(numbers)
@@ -70,10 +70,10 @@ def test_unknown_commands_are_refused(place, value):
 
 
 @given(st.lists(st.integers(-32768, 32767), min_size=3, max_size=3))
-def test_counts_come_back_to_the_bit(values):
+def test_counts_round_trip_exactly(values):
     values = np.array([[values]], np.int16)
     np.testing.assert_array_equal(frame_values(*to_radians(values)), values)
 
 
-def test_counts_end_where_int16_does():
+def test_counts_are_clipped_to_int16():
     assert to_counts([-4.0, -np.pi, 0.0, ANGLE, np.pi, 4.0]).tolist() == [-32768, -32768, 0, 1, 32767, 32767]

@@ -1,4 +1,4 @@
-"""The thread at the wire: what comes is kept and told, what waits is sent, and whatever ends has a name."""
+"""The reader thread: samples, commands, reconnection and faults."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_samples_reach_the_ring_and_every_listener(head, reader):
     assert reader.fault is None
 
 
-def test_times_are_the_clocks(head):
+def test_times_are_those_of_the_device_clock(head):
     head.clock = 7 * 2**32 + 100
     with HeadReader(head.connect, WHISKERS, QUICK) as reader:
         head.send(0)
@@ -71,7 +71,7 @@ def test_times_are_the_clocks(head):
         assert reader.ring.between(0, 9).time[0] == 7 * 2**32
 
 
-def test_it_is_started_and_stopped(head):
+def test_the_stream_is_started_and_stopped(head):
     reader = HeadReader(head.connect, WHISKERS, QUICK)
     assert reader.state.link == LinkState.CLOSED
     with reader:
@@ -82,25 +82,25 @@ def test_it_is_started_and_stopped(head):
     assert reader.fault is None
 
 
-def test_no_head_is_an_input_error(head):
+def test_a_missing_head_is_an_input_error(head):
     head.unplug()
     with pytest.raises(InputError, match="pulled out"):
         HeadReader(head.connect, WHISKERS, QUICK).start()
 
 
-def test_another_head_is_refused(head):
+def test_a_head_of_another_shape_is_refused(head):
     with pytest.raises(InputError, match="memory has 2 whiskers"):
         HeadReader(head.connect, 18, QUICK).start()
     assert head.closed == head.opened == 1
 
 
-def test_what_is_no_head_is_refused(head):
+def test_a_device_without_identity_is_refused(head):
     head.identity = {"name": "a printer"}
     with pytest.raises(InputError, match="printer"):
         HeadReader(head.connect, WHISKERS, QUICK).start()
 
 
-def test_a_head_is_kept_awake_only_while_it_is_to_whisk(head, reader):
+def test_keep_alives_are_sent_only_while_whisking(head, reader):
     time.sleep(0.3)
     assert head.commands == []
     reader.send(DRIVE)
@@ -114,7 +114,7 @@ def test_a_head_is_kept_awake_only_while_it_is_to_whisk(head, reader):
 
 
 @pytest.mark.soak
-def test_keep_alives_come_in_time(head, reader):
+def test_keep_alive_period(head, reader):
     reader.send(DRIVE)
     begun, gaps, last = time.monotonic(), [], None
     while time.monotonic() - begun < 1.2:
@@ -135,7 +135,7 @@ def test_only_the_newest_amplitudes_are_sent(head, reader):
     assert len(head.commands) < 20
 
 
-def test_a_head_that_comes_back_is_told_again_and_its_numbers_are_new(head, reader):
+def test_a_reconnected_head_gets_its_commands_again_and_new_numbers(head, reader):
     restarts = []
     reader.on_restart.append(lambda clock, at: restarts.append(clock))
     reader.send(CENTRE)
@@ -162,7 +162,7 @@ def test_a_head_that_comes_back_is_told_again_and_its_numbers_are_new(head, read
     assert reader.fault is None
 
 
-def test_a_head_that_stays_away_is_a_fault(head, quick_reader):
+def test_a_head_that_stays_disconnected_is_a_fault(head, quick_reader):
     head.send(0)
     until(lambda: good(quick_reader) == 10)
     head.unplug()
@@ -175,7 +175,7 @@ def test_a_head_that_stays_away_is_a_fault(head, quick_reader):
     assert quick_reader.fault.outcome == SessionOutcome.HEAD_GONE  # once one, always one
 
 
-def test_silence_is_named_and_a_silent_head_is_started_again(head, quick_reader):
+def test_a_silent_head_is_reported_and_started_again(head, quick_reader):
     head.send(0)
     until(lambda: quick_reader.state.link == LinkState.SILENT)
     until(lambda: quick_reader.fault is not None)
@@ -184,7 +184,7 @@ def test_silence_is_named_and_a_silent_head_is_started_again(head, quick_reader)
     assert head.requests.count(Request.START) >= 2
 
 
-def test_garbage_is_named(head, quick_reader):
+def test_a_garbled_stream_is_reported(head, quick_reader):
     head.send(0)
     until(lambda: good(quick_reader) == 10)
     end = time.monotonic() + 60
@@ -208,7 +208,7 @@ def test_a_stall_loses_nothing(head, reader):
     assert reader.fault is None
 
 
-def test_a_thread_that_hangs_is_seen(head):
+def test_a_hanging_thread_is_detected(head):
     held = threading.Event()
     with HeadReader(head.connect, WHISKERS, QUICK) as reader:
         reader.listeners.append(lambda frames, arrival: held.wait(5))
@@ -218,7 +218,7 @@ def test_a_thread_that_hangs_is_seen(head):
         held.set()
 
 
-def test_a_thread_that_dies_is_a_fault(head, reader, monkeypatch):
+def test_an_exception_in_the_thread_is_a_fault(head, reader, monkeypatch):
     monkeypatch.setattr(threading, "excepthook", lambda arguments: None)  # the error is expected
 
     def broken(frames, arrival):
@@ -232,7 +232,7 @@ def test_a_thread_that_dies_is_a_fault(head, reader, monkeypatch):
     until(lambda: reader.state.link == LinkState.CLOSED)
 
 
-def test_overload_is_told_with_the_whisker(head):
+def test_overload_is_reported_with_the_whisker(head):
     told = []
     with HeadReader(head.connect, WHISKERS, QUICK, on_overload=told.append) as reader:
         values = np.zeros((10, WHISKERS, 3), np.int16)

@@ -1,4 +1,4 @@
-"""A ring holds what a dictionary of the newest numbers would."""
+"""The ring buffer agrees with a dictionary of the newest numbers."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ BLOCKS = st.lists(
 
 
 @given(BLOCKS, st.integers(0, 60), st.integers(0, 40))
-def test_what_is_kept(blocks, first, length):
+def test_the_ring_holds_the_newest_frames(blocks, first, length):
     ring, kept, highest = RingBuffer(1, size=SIZE), {}, 2**32
     for k, block in enumerate(blocks):
         numbers = [highest + step for step in block]
@@ -46,13 +46,13 @@ def test_what_is_kept(blocks, first, length):
     assert got.values[:, 0, 2].tolist() == [n % 30000 for n in wanted]
 
 
-def test_an_empty_ring_has_nothing():
+def test_an_empty_ring():
     ring = RingBuffer(1)
     assert ring.newest is None
     assert not len(ring.between(0, 10).sequence)
 
 
-def test_what_is_handed_out_stays_as_it_was():
+def test_results_are_copies():
     ring = RingBuffer(1, size=SIZE)
     ring.append(frames(list(range(10))), 0.0)
     got = ring.between(0, 9)
@@ -61,6 +61,6 @@ def test_what_is_handed_out_stays_as_it_was():
     assert ring.between(0, 99).sequence.tolist() == list(range(14, 30))
 
 
-def test_sizes():
+def test_the_size_must_be_a_power_of_two():
     with pytest.raises(ValueError, match="power of two"):
         RingBuffer(1, size=100)

@@ -1,4 +1,4 @@
-"""Numbers, with a head that holds so few frames that every way they can come is tried."""
+"""Sequence numbers, with so small a range that all orders of arrival are tried."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def few():
 @given(
     st.sampled_from([0, 3, 2**32 - 5]), st.lists(STEPS, max_size=60), st.lists(st.integers(0, 60), max_size=6)
 )
-def test_every_way_to_come(few, first, steps, cuts):
+def test_all_orders_of_arrival(few, first, steps, cuts):
     raw = [(first + step) % 2**32 for step in itertools.accumulate(steps)]
     mine, streams = SequenceUnwrapper(), []
     for block in np.split(np.array(raw, np.uint32), sorted(cut for cut in cuts if cut <= len(raw))):

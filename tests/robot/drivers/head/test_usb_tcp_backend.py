@@ -1,4 +1,4 @@
-"""Real pyusb on the emulator's socket: as on a bus, with its time-outs, stalls and pulled plugs."""
+"""The socket backend under the real pyusb: transfers, time-outs, stalls and unplugging as over USB."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def read(device: Any, seconds: float, decoder: Decoder) -> Frames:
     return decoder.feed(got)
 
 
-def test_it_is_a_backend() -> None:
+def test_the_backend_has_the_methods_of_pyusb() -> None:
     tcp_backend = importlib.import_module("usb.backend").IBackend
     asked = {
         name: method
@@ -92,7 +92,7 @@ def test_it_is_a_backend() -> None:
             assert ours == list(inspect.signature(method).parameters), name
 
 
-def test_it_is_found_as_what_it_is(head: Faults, device: Any) -> None:
+def test_the_device_is_found_with_its_descriptors(head: Faults, device: Any) -> None:
     assert (device.idVendor, device.idProduct, device.speed) == (VENDOR, PRODUCT, util.SPEED_HIGH)
     assert device.serial_number == "EMULATED"
     (interface,) = device.get_active_configuration()
@@ -102,7 +102,7 @@ def test_it_is_found_as_what_it_is(head: Faults, device: Any) -> None:
     assert found(Faults(head.process, "127.0.0.1", 0)) is None or head.host == "127.0.0.1"
 
 
-def test_a_second_program_is_told_that_it_is_in_use(head: Faults, device: Any) -> None:
+def test_a_second_program_gets_a_busy_error(head: Faults, device: Any) -> None:
     util.claim_interface(device, 0)
     other = found(head)
     with pytest.raises(core.USBError) as caught:
@@ -113,7 +113,7 @@ def test_a_second_program_is_told_that_it_is_in_use(head: Faults, device: Any) -
     util.dispose_resources(other)
 
 
-def test_no_frame_is_lost_on_the_way(head: Faults, device: Any) -> None:
+def test_all_frames_are_transferred(head: Faults, device: Any) -> None:
     before = head(do="counts")
     decoder = Decoder(18, 3)
     start(device)
@@ -134,7 +134,7 @@ def test_no_frame_is_lost_on_the_way(head: Faults, device: Any) -> None:
     assert clock >= frames.time[-1]
 
 
-def test_the_process_may_stand_still_for_a_while(head: Faults, device: Any) -> None:
+def test_a_paused_process_loses_no_frames(head: Faults, device: Any) -> None:
     """What it could not do meanwhile it catches up with; the queue holds more than that."""
     decoder = Decoder(18, 3)
     start(device)
@@ -148,7 +148,7 @@ def test_the_process_may_stand_still_for_a_while(head: Faults, device: Any) -> N
     assert decoder.counts.overruns == 0
 
 
-def test_a_read_ends_when_its_time_is_up(head: Faults, device: Any) -> None:
+def test_a_read_times_out(head: Faults, device: Any) -> None:
     device.ctrl_transfer(REQUEST_OUT, Request.STOP, 0, 0, b"", 500)
     began = time.monotonic()
     with pytest.raises(core.USBTimeoutError) as caught:
@@ -175,7 +175,7 @@ def test_an_unknown_request_is_stalled(device: Any) -> None:
     assert caught.value.errno == errno.EPIPE
 
 
-def test_a_pulled_plug_is_told_and_another_one_is_another(head: Faults, device: Any) -> None:
+def test_unplugging_is_reported_and_the_old_handle_stays_invalid(head: Faults, device: Any) -> None:
     start(device)
     device.read(ENDPOINT_IN, 4096, 30_000)
     head(do="unplug")
@@ -194,7 +194,7 @@ def test_a_pulled_plug_is_told_and_another_one_is_another(head: Faults, device: 
     util.dispose_resources(again)
 
 
-def test_a_read_that_waits_hears_of_the_pulled_plug_at_once(head: Faults, device: Any) -> None:
+def test_a_pending_read_ends_when_the_device_is_unplugged(head: Faults, device: Any) -> None:
     caught: list[int | None] = []
 
     def wait() -> None:
@@ -211,7 +211,7 @@ def test_a_read_that_waits_hears_of_the_pulled_plug_at_once(head: Faults, device
     assert caught == [errno.ENODEV]
 
 
-def test_what_is_no_configuration_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_invalid_configuration_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from robot.emulators.head.__main__ import main
 
     assert main(["--config", str(tmp_path / "none.json")]) == 2
@@ -223,7 +223,7 @@ def test_what_is_no_configuration_is_refused(tmp_path: Path, capsys: pytest.Capt
     assert all(piece in said for piece in ("none.json", "hots", "simulation.maze.heights"))
 
 
-def test_an_emulator_that_dies_is_a_device_that_is_gone(tmp_path: Path, loopback: str) -> None:
+def test_a_dead_emulator_is_a_disconnected_device(tmp_path: Path, loopback: str) -> None:
     host = f"127.0.1.{loopback.rsplit('.', 1)[1]}"
     with running(HeadEmulatorConfig(host=host, path={"explore": 5}), tmp_path) as head:
         device = found(head)

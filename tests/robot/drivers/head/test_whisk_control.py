@@ -1,4 +1,4 @@
-"""What a head is told follows from the settings, and the host's feedback is the law's."""
+"""Whisking commands follow from the settings, and feedback on the host from the whisking law."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def blocks(frames: Frames, cuts: list[int]) -> list[Frames]:
         ("spread", "host", THRESHOLD, FeedbackMode.OPEN),
     ],
 )
-def test_who_feeds_back(mode, rcp, threshold, told):
+def test_where_feedback_is_computed(mode, rcp, threshold, told):
     whisking = WhiskingConfig(mode=mode, rate=2.0, amplitude_deg=50, gain=3)
     centre, drive = whisk_commands(whisking, threshold, CENTRE, rcp)
     assert (centre.kind, drive.kind, drive.mode) == (CommandKind.CENTRE, CommandKind.DRIVE, told)
@@ -56,13 +56,13 @@ def test_who_feeds_back(mode, rcp, threshold, told):
     assert len(drive.numbers) == (0 if threshold is None else 18)
 
 
-def test_whiskers_that_do_not_count_never_touch():
+def test_whiskers_without_feedback_have_no_threshold():
     threshold = np.array([0.01, np.inf, 4.0])
     drive = whisk_commands(WhiskingConfig(), threshold)[-1]
     assert drive.numbers.tolist() == [int(to_counts(0.01)), NO_THRESHOLD, NO_THRESHOLD - 1]
 
 
-def test_a_head_knows_no_spread():
+def test_the_head_does_not_support_spread():
     with pytest.raises(InputError, match="spread"):
         whisk_commands(WhiskingConfig(mode="spread"), THRESHOLD, CENTRE, "head")
 
@@ -74,7 +74,7 @@ def test_a_head_knows_no_spread():
     st.integers(0, 17),
     st.floats(0.05, 0.3),
 )
-def test_the_host_feeds_back_as_the_law_does(mode, cuts, whisker, bend):
+def test_host_feedback_follows_the_whisking_law(mode, cuts, whisker, bend):
     whisking = WhiskingConfig(mode=mode)
     touched = np.zeros((900, 18))
     touched[400:, whisker] = bend
@@ -93,7 +93,7 @@ def test_the_host_feeds_back_as_the_law_does(mode, cuts, whisker, bend):
     assert told[-1][whisker] < to_counts(np.radians(65))
 
 
-def test_a_free_whisk_is_told_once_and_each_cycle_anew():
+def test_amplitudes_of_a_free_whisk_are_sent_once_per_cycle():
     host = HostRcp(WhiskingConfig(), HEAD.shape, THRESHOLD, CENTRE)
     touched = np.zeros((6000, 18))
     touched[500:900, 3] = 0.2
@@ -109,7 +109,7 @@ def test_a_free_whisk_is_told_once_and_each_cycle_anew():
         assert all(one is None for one in told[k + 1 : k + 50])
 
 
-def test_nothing_is_known_before_a_whisk_begins():
+def test_no_amplitudes_are_sent_before_the_first_whisk():
     host = HostRcp(WhiskingConfig(), HEAD.shape, THRESHOLD, CENTRE)
     assert host.amplitudes(whisks(100, start=30)) is None
 
@@ -130,6 +130,6 @@ def test_the_driver_whisks_and_rests():
         assert len(memory.commands) == count
 
 
-def test_the_drives_limit_is_kept():
+def test_amplitudes_beyond_the_drives_are_refused():
     with pytest.raises(InputError, match="amplitude"):
         HeadDriver(HeadReader(MemoryHead(18).connect, 18), HEAD).whisk(WhiskingConfig(amplitude_deg=90))

@@ -1,4 +1,4 @@
-"""The real library against an emulated controller: whatever goes wrong has a name, and the arm stands."""
+"""The arm by the real library on an emulated controller: moves, and an outcome for each fault."""
 
 from __future__ import annotations
 
@@ -175,7 +175,7 @@ def test_the_controller_dies(arm: Arm, controller: Faults) -> None:
     assert fault.outcome is SessionOutcome.ARM_GONE
 
 
-def test_somebody_ends_the_program(arm: Arm, controller: Faults) -> None:
+def test_the_program_is_ended_on_the_controller(arm: Arm, controller: Faults) -> None:
     under_way(arm, controller)
     with Dashboard(controller.host) as dashboard:
         dashboard.stop()
@@ -190,7 +190,7 @@ def test_somebody_ends_the_program(arm: Arm, controller: Faults) -> None:
         (signal.SIGSTOP, SessionOutcome.ARM_STALE),
     ],
 )
-def test_the_arms_process_is_gone(arm: Arm, controller: Faults, number: int, outcome: SessionOutcome) -> None:
+def test_the_rtde_process_ends(arm: Arm, controller: Faults, number: int, outcome: SessionOutcome) -> None:
     under_way(arm, controller)
     os.kill(arm.pid, number)
     assert ended(arm, controller) is outcome
@@ -201,7 +201,7 @@ def test_the_arms_process_is_gone(arm: Arm, controller: Faults, number: int, out
         until(arm.arrived, "arrival after a respawn")
 
 
-def test_a_stop_that_has_no_effect_is_repeated_by_the_dashboard(controller: Faults) -> None:
+def test_a_stop_without_effect_is_repeated_by_the_dashboard(controller: Faults) -> None:
     with Arm(settings(controller.host)) as arm:
         arm.start()
         under_way(arm, controller)
@@ -214,7 +214,7 @@ def test_a_stop_that_has_no_effect_is_repeated_by_the_dashboard(controller: Faul
         os.kill(arm.pid, signal.SIGKILL)
 
 
-def test_no_joints_for_a_target(arm: Arm, controller: Faults) -> None:
+def test_a_target_without_joint_solution(arm: Arm, controller: Faults) -> None:
     first = len(controller.state()["targets"])
     controller(do="ik_fails")
     arm.move(AWAY)
@@ -222,7 +222,7 @@ def test_no_joints_for_a_target(arm: Arm, controller: Faults) -> None:
     assert moves(controller, first) == []
 
 
-def test_it_does_not_get_there(controller: Faults) -> None:
+def test_a_move_that_does_not_arrive(controller: Faults) -> None:
     with Arm(settings(controller.host, patience=0.3)) as arm:
         arm.start()
         arm.move(HOME + [0.01, 0, 0, 0, 0, 0])
@@ -241,7 +241,7 @@ def test_a_state_out_of_the_box(controller: Faults) -> None:
         assert ended(arm, controller) is SessionOutcome.OUT_OF_BOX
 
 
-def test_a_wall_is_hit(controller: Faults) -> None:
+def test_a_collision_with_a_wall(controller: Faults) -> None:
     at = HOME[0] + 0.02
     with Arm(settings(controller.host, force_limit=20.0)) as arm:
         arm.start()
@@ -257,7 +257,7 @@ def test_a_wall_is_hit(controller: Faults) -> None:
         assert arm.fault.outcome is SessionOutcome.CONTACT
 
 
-def test_somebody_else_finds_a_contact(arm: Arm, controller: Faults) -> None:
+def test_a_contact_reported_by_the_session(arm: Arm, controller: Faults) -> None:
     under_way(arm, controller)
     until(lambda: controller.state()["tcp"][0] > HOME[0] + 0.012, "a way to back off")
     arm.fail(SessionOutcome.CONTACT, "a whisker is bent too far")

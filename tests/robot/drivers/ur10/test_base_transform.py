@@ -1,4 +1,4 @@
-"""The map in the arm's base: there and back, the tool down, rigid."""
+"""Transform between map and arm base: round trip, tool pointing down, rigid motion."""
 
 import numpy as np
 from hypothesis import given
@@ -20,7 +20,7 @@ placings = st.builds(BaseTransformConfig, x=metres, y=metres, z=metres, yaw_deg=
 
 
 @given(placings, poses, metres)
-def test_there_and_back(config: BaseTransformConfig, pose: np.ndarray, lift: float) -> None:
+def test_round_trip(config: BaseTransformConfig, pose: np.ndarray, lift: float) -> None:
     back, height = pose_from_tcp(config, tcp_from_pose(config, pose, lift))
     np.testing.assert_allclose(back[:2], pose[:2], atol=1e-12)
     assert abs(wrap(back[2] - pose[2])) < 1e-9
@@ -34,7 +34,7 @@ def test_the_tool_points_down(config: BaseTransformConfig, pose: np.ndarray) -> 
 
 
 @given(placings, poses, poses)
-def test_motions_on_the_map_are_motions_of_the_tool(
+def test_motions_in_the_map_are_motions_of_the_tool(
     config: BaseTransformConfig, a: np.ndarray, b: np.ndarray
 ) -> None:
     tools = tcp_from_pose(config, np.stack([a, b]))
@@ -44,7 +44,7 @@ def test_motions_on_the_map_are_motions_of_the_tool(
     assert abs(wrap(moved[2] - meant[2])) < 1e-9
 
 
-def test_rotation_is_a_turn_about_z_after_half_a_turn_about_x() -> None:
+def test_the_rotation_is_rz_times_rx_pi() -> None:
     from scipy.spatial.transform import Rotation
 
     for heading in np.linspace(-3, 3, 13):
@@ -53,7 +53,7 @@ def test_rotation_is_a_turn_about_z_after_half_a_turn_about_x() -> None:
         np.testing.assert_allclose(Rotation.from_rotvec(tool[3:]).as_matrix(), meant.as_matrix(), atol=1e-12)
 
 
-def test_a_leaning_tool_is_seen() -> None:
+def test_tilt() -> None:
     from scipy.spatial.transform import Rotation
 
     for lean in (0.0, 0.1, 1.0, 3.0):

@@ -71,7 +71,7 @@ def command_thread(shared: SharedState) -> tuple[CommandThread, Control, list[di
 
 
 @given(poses, speeds, st.sampled_from(["move", "retreat"]))
-def test_no_order_gets_a_bad_move_to_the_wire(
+def test_no_invalid_move_is_sent_to_the_controller(
     shared: SharedState, pose: list[float], speed: float, do: str
 ) -> None:
     thread, control, told = command_thread(shared)
@@ -109,7 +109,7 @@ def test_a_stop_revokes_the_orders_before_it(shared: SharedState) -> None:
     assert len(control.moves) == 1
 
 
-def test_the_watchdog_is_fed_only_while_the_session_lives(shared: SharedState) -> None:
+def test_the_watchdog_is_reset_only_while_the_heartbeat_is_recent(shared: SharedState) -> None:
     thread, control, _ = command_thread(shared)
     shared.control["heartbeat"] = time.monotonic() + 60  # whatever delays this test
     thread.act()
@@ -119,7 +119,7 @@ def test_the_watchdog_is_fed_only_while_the_session_lives(shared: SharedState) -
     assert control.kicks == 1
 
 
-def test_a_stop_comes_before_what_was_ordered(shared: SharedState) -> None:
+def test_a_stop_is_sent_before_queued_moves(shared: SharedState) -> None:
     thread, control, _ = command_thread(shared)
     stops = int(shared.control["stops"])
     thread.put(ArmCommand("move", 1, tuple(HOME), 0.01, stops))
@@ -134,7 +134,7 @@ def test_a_stop_comes_before_what_was_ordered(shared: SharedState) -> None:
     assert len(control.moves) == 1
 
 
-def test_without_joints_nothing_is_told(shared: SharedState) -> None:
+def test_a_target_without_joint_solution_is_not_sent(shared: SharedState) -> None:
     thread, control, told = command_thread(shared)
     control.reachable = False
     thread.execute(ArmCommand("move", 1, tuple(HOME), 0.01, int(shared.control["stops"])))
@@ -169,7 +169,7 @@ def linked() -> Iterator[tuple[Arm, Link]]:
 
 
 @given(poses, st.one_of(st.none(), speeds))
-def test_no_call_gets_a_bad_move_to_the_arms_process(
+def test_no_invalid_move_is_sent_to_the_rtde_process(
     linked: tuple[Arm, Link], pose: list[float], speed: float | None
 ) -> None:
     arm, link = linked

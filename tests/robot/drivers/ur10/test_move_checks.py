@@ -1,4 +1,4 @@
-"""No invalid move reaches the controller, whatever a session or its RTDE process is asked for."""
+"""No invalid move reaches the controller, from the session or from the RTDE process."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ def runs(pid: int) -> bool:
 
 
 @pytest.mark.parametrize("what", ["killed", "hangs", "killed with the arm's process"])
-def test_a_session_that_ends_or_hangs(controller: Faults, what: str) -> None:
+def test_the_arm_stops_when_the_session_ends_or_hangs(controller: Faults, what: str) -> None:
     target = [repr(float(value)) for value in AWAY]
     session = subprocess.Popen(
         [sys.executable, "-c", SESSION, controller.host, *target],

@@ -1,4 +1,4 @@
-"""What an arm is not armed for: each reason is named with its cure, and nothing has moved."""
+"""Reasons not to arm the arm: each is reported with its cure, and nothing moves."""
 
 from __future__ import annotations
 
@@ -69,14 +69,14 @@ def elsewhere(loopback: str) -> str:
         ({"running": "Program running: true"}, "a program runs"),
     ],
 )
-def test_what_speaks_against_starting(elsewhere: str, changed: dict[str, str], found: str) -> None:
+def test_start_is_refused(elsewhere: str, changed: dict[str, str], found: str) -> None:
     with answering(elsewhere, GOOD | changed):
         with pytest.raises(StartupRefused, match=found) as refusal:
             check_controller(ArmConfig(host=elsewhere))
         assert refusal.value.cure or refusal.value.expected
 
 
-def test_a_good_controller_is_admitted_old_or_new(elsewhere: str) -> None:
+def test_controllers_of_all_versions_pass(elsewhere: str) -> None:
     with answering(elsewhere, GOOD):
         assert check_controller(ArmConfig(host=elsewhere)).remote is True
     old = GOOD | {"PolyscopeVersion": "URSoftware 3.4.5.100 (Jan 01 2018)"}
@@ -87,7 +87,7 @@ def test_a_good_controller_is_admitted_old_or_new(elsewhere: str) -> None:
         assert controller.remote is None
 
 
-def test_a_dashboard_that_does_not_answer_is_given_up(elsewhere: str) -> None:
+def test_a_silent_dashboard_times_out(elsewhere: str) -> None:
     with pytest.raises(StartupRefused, match="no dashboard server answers"):
         check_controller(ArmConfig(host=elsewhere))
     assert dashboard.stop_program(elsewhere) == ""
@@ -124,7 +124,7 @@ def test_a_slow_stream(controller: Faults) -> None:
     assert int(found[1]) < 112  # 0.9 of the nominal rate; lower still on a busy machine
 
 
-def test_standing_outside_the_box(controller: Faults) -> None:
+def test_start_outside_the_box(controller: Faults) -> None:
     refusal = refused(controller, box=BoxConfig(low=tuple(HOME[:3] + 0.1), high=tuple(HOME[:3] + 0.2)))
     assert "outside the box" in str(refusal)
 
@@ -146,7 +146,7 @@ def test_an_arm_that_was_not_started_refuses_and_closes(loopback: str) -> None:
         assert arm.age() == float("inf")
 
 
-def test_a_second_session_is_refused_and_the_first_unharmed(controller: Faults) -> None:
+def test_a_second_session_is_refused_and_the_first_continues(controller: Faults) -> None:
     with Arm(settings(controller.host)) as first:
         first.start()
         refusal = refused(controller)

@@ -1,4 +1,4 @@
-"""What the arm may do: no target, speed or state gets past the checks that breaks a limit."""
+"""Checks of targets, speeds and states against every limit."""
 
 import math
 
@@ -63,7 +63,7 @@ def test_only_finite_targets_in_the_box_with_the_tool_down_pass(target: list[flo
 
 
 @given(st.integers(0, 5), st.sampled_from([math.nan, math.inf, -math.inf]), down)
-def test_a_number_that_is_none_never_passes(where: int, bad: float, target: np.ndarray) -> None:
+def test_targets_that_are_not_finite_are_refused(where: int, bad: float, target: np.ndarray) -> None:
     check_target(CONFIG, target, HOME)
     target[where] = bad
     for check in (
@@ -76,7 +76,7 @@ def test_a_number_that_is_none_never_passes(where: int, bad: float, target: np.n
 
 
 @given(st.sampled_from([0, 1, 2]), st.booleans(), st.floats(1e-5, 10), down)
-def test_outside_the_box_never_passes(axis: int, above: bool, by: float, target: np.ndarray) -> None:
+def test_targets_outside_the_box_are_refused(axis: int, above: bool, by: float, target: np.ndarray) -> None:
     target[axis] = CONFIG.box.high[axis] + by if above else CONFIG.box.low[axis] - by
     with pytest.raises(TargetRefused, match="outside the box"):
         check_target(CONFIG, target, HOME)
@@ -85,18 +85,18 @@ def test_outside_the_box_never_passes(axis: int, above: bool, by: float, target:
 
 
 @pytest.mark.parametrize("target", [None, "home", [0.0] * 5, [0.0] * 7, [[0.0] * 6], [], 3, ["x"] * 6])
-def test_what_is_no_pose_never_passes(target: object) -> None:
+def test_targets_that_are_not_poses_are_refused(target: object) -> None:
     with pytest.raises(TargetRefused):
         check_target(CONFIG, target, HOME)
 
 
-def test_a_leaning_tool_is_refused() -> None:
+def test_a_tilted_tool_is_refused() -> None:
     with pytest.raises(TargetRefused, match="lean"):
         check_target(CONFIG, [*HOME[:3], 0.0, 0.0, 0.0], HOME)
 
 
 @given(st.one_of(anything, st.floats(0, 0.3)), down, down)
-def test_no_speed_beyond_the_settings_passes(speed: float, target: np.ndarray, start: np.ndarray) -> None:
+def test_planned_speeds_are_within_the_settings(speed: float, target: np.ndarray, start: np.ndarray) -> None:
     try:
         move = plan_move(CONFIG, target, start, speed)
     except TargetRefused:
@@ -113,9 +113,7 @@ def test_no_speed_beyond_the_settings_passes(speed: float, target: np.ndarray, s
 
 
 @given(st.one_of(anything, st.floats(0.0501, 0.3)), down, down)
-def test_the_last_check_lets_no_faster_one_through(
-    told: float, target: np.ndarray, start: np.ndarray
-) -> None:
+def test_the_last_check_refuses_faster_commands(told: float, target: np.ndarray, start: np.ndarray) -> None:
     assume(np.linalg.norm(target[:3] - start[:3]) > 0.01)
     assume(not 0 < told <= CONFIG.speed)
     with pytest.raises(TargetRefused):
@@ -135,13 +133,13 @@ def test_the_last_check_lets_no_faster_one_through(
         {"unknown": 1},
     ],
 )
-def test_settings_beyond_the_caps_are_refused(bad: dict[str, object]) -> None:
+def test_settings_above_the_caps_are_refused(bad: dict[str, object]) -> None:
     with pytest.raises(ValidationError):
         ArmConfig.model_validate(bad)
 
 
 @given(down, st.floats(-3.1, 3.1))
-def test_a_turn_is_the_angle_between_two_tools(tool: np.ndarray, by: float) -> None:
+def test_rotation_angle(tool: np.ndarray, by: float) -> None:
     from scipy.spatial.transform import Rotation
 
     after = (Rotation.from_euler("z", by) * Rotation.from_rotvec(tool[3:])).as_rotvec()
@@ -149,7 +147,7 @@ def test_a_turn_is_the_angle_between_two_tools(tool: np.ndarray, by: float) -> N
     assert rotation_angle(tool, tool) == 0
 
 
-def test_arrived_asks_for_place_and_turn() -> None:
+def test_arrival_requires_position_and_rotation() -> None:
     target = tcp_from_pose(CONFIG.placing, np.array([0.63, 0.45, 3.14159]))
     turn = np.radians(0.4)
     assert at_target(CONFIG, tcp_from_pose(CONFIG.placing, np.array([0.6305, 0.45, -3.14159])), target)
@@ -170,7 +168,7 @@ def test_good_states_have_no_finding() -> None:
 
 @pytest.mark.parametrize("field", ["tcp", "speed", "force", "joints"])
 @given(where=st.integers(0, 5), bad=st.sampled_from([math.nan, math.inf, -math.inf]))
-def test_one_number_that_is_none_is_found(field: str, where: int, bad: float) -> None:
+def test_a_state_with_one_value_that_is_not_finite(field: str, where: int, bad: float) -> None:
     state = a_state()
     state[field][where] = bad
     _, finding = check_state(CONFIG, StateMemory(), state, np.zeros(6))
@@ -179,7 +177,7 @@ def test_one_number_that_is_none_is_found(field: str, where: int, bad: float) ->
 
 
 @given(st.lists(st.floats(-1e300, 1e300), min_size=3, max_size=3))
-def test_no_place_outside_the_box_goes_unnoticed(place: list[float]) -> None:
+def test_states_outside_the_box(place: list[float]) -> None:
     _, finding = check_state(CONFIG, StateMemory(), a_state(tcp=[*place, *HOME[3:]]), np.zeros(6))
     if in_box(CONFIG, np.array(place)):
         assert finding is None
@@ -190,7 +188,7 @@ def test_no_place_outside_the_box_goes_unnoticed(place: list[float]) -> None:
 
 
 @given(st.integers(0, 2**11 - 1))
-def test_every_bit_that_is_no_good_is_found_and_the_gravest_named(bits: int) -> None:
+def test_the_most_severe_safety_bit_is_reported(bits: int) -> None:
     _, finding = check_state(CONFIG, StateMemory(), a_state(safety=bits), np.zeros(6))
     named = [outcome for mask, outcome, _ in SAFETY_BITS if bits & mask]
     assert (finding.outcome if finding else None) is (named[0] if named else None)
@@ -201,7 +199,7 @@ def test_every_bit_that_is_no_good_is_found_and_the_gravest_named(bits: int) -> 
 
 
 @given(st.lists(st.booleans(), min_size=1, max_size=12))
-def test_a_force_counts_when_two_states_in_a_row_show_it(loads: list[bool]) -> None:
+def test_a_contact_requires_two_consecutive_states(loads: list[bool]) -> None:
     rest = np.array([20.0, -40.0, 10.0, 1.0, 1.0, 1.0])
     watch, before = StateMemory(), False
     for k, loaded in enumerate(loads):
@@ -211,7 +209,7 @@ def test_a_force_counts_when_two_states_in_a_row_show_it(loads: list[bool]) -> N
         before = loaded
 
 
-def test_a_clock_that_does_not_go_on_is_found() -> None:
+def test_a_controller_clock_that_stands_still() -> None:
     watch, _ = check_state(CONFIG, StateMemory(), a_state(robot=2.0), np.zeros(6))
     for robot in (2.0, 1.0):
         _, finding = check_state(CONFIG, watch, a_state(robot=robot), np.zeros(6))
@@ -220,7 +218,7 @@ def test_a_clock_that_does_not_go_on_is_found() -> None:
 
 
 @given(st.floats(0, 2 * math.pi), st.integers(2, 200), st.floats(0.0001, 0.002))
-def test_backing_off_goes_the_way_the_tool_came_and_stays_in_the_box(
+def test_the_retreat_follows_the_path_back_and_stays_in_the_box(
     course: float, count: int, step: float
 ) -> None:
     states = np.stack([a_state() for _ in range(count)])
@@ -240,6 +238,6 @@ def test_backing_off_goes_the_way_the_tool_came_and_stays_in_the_box(
     np.testing.assert_array_equal(target[3:], HOME[3:])
 
 
-def test_a_box_is_checked() -> None:
+def test_an_inverted_box_is_refused() -> None:
     with pytest.raises(ValidationError, match="smaller"):
         BoxConfig(low=(0, 0, 0), high=(1, -1, 1))

@@ -1,4 +1,4 @@
-"""Emulated heads for tests: one in memory whose time the test tells, and one in a process of its own."""
+"""Emulated heads for tests: one in memory in simulated time, and one in a process."""
 
 from __future__ import annotations
 

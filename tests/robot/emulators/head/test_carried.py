@@ -1,4 +1,4 @@
-"""Two emulators together: the head is where the controller has its tool."""
+"""Two emulators together: the head moves with the tool of the controller."""
 
 from __future__ import annotations
 

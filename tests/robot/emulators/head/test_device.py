@@ -1,4 +1,4 @@
-"""The emulated bridge: every frame is accounted for, and every fault is what it is called."""
+"""The emulated bridge: every frame is counted, and faults have the effect requested."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_frames_are_sent_lost_or_waiting(capacity: int, steps: list[tuple[str, i
     assert fifo.made == fifo.sent + fifo.lost + fifo.dropped
 
 
-def test_what_nobody_reads_is_lost_exactly() -> None:
+def test_unread_frames_beyond_the_capacity_are_lost() -> None:
     head = started(fifo=100)
     first = head.pass_by(0.1)
     assert len(first.values) == 200
@@ -70,7 +70,7 @@ def test_what_nobody_reads_is_lost_exactly() -> None:
     assert head.decoder.counts.bad == 0
 
 
-def test_numbers_and_times_belong_together() -> None:
+def test_times_follow_from_the_numbers() -> None:
     head = started()
     head.pass_by(0.2)
     head.bridge.control(REQUEST_OUT, Request.STOP, 0, 0, head.now)
@@ -81,7 +81,7 @@ def test_numbers_and_times_belong_together() -> None:
     assert (frames.time == 500 * frames.sequence).all()
 
 
-def test_stopping_forgets_what_waits_and_retracts() -> None:
+def test_a_stop_drops_queued_frames_and_retracts() -> None:
     head = started(mechanics={"noise": 0.0})
     head.send(drive())
     head.pass_by(0.4)
@@ -106,7 +106,7 @@ def test_numbers_and_times_wrap() -> None:
         assert (np.diff(raw) < 0).sum() == 1
 
 
-def test_the_clock_is_fast_by_so_much() -> None:
+def test_clock_drift() -> None:
     head = started(drift_ppm=500.0)
     times, frames = [], 0
     for _ in range(2):
@@ -118,7 +118,7 @@ def test_the_clock_is_fast_by_so_much() -> None:
     assert 40_020 - head.bridge.samples <= frames <= 40_020
 
 
-def test_its_clock_jumps() -> None:
+def test_clock_jump() -> None:
     head = started()
     before = head.pass_by(0.1)
     head.do("clock", jump_us=123_456)
@@ -127,7 +127,7 @@ def test_its_clock_jumps() -> None:
     assert after.sequence[0] == before.sequence[-1] + 1
 
 
-def test_damage_is_counted_as_what_it_is() -> None:
+def test_counts_of_damaged_skipped_and_garbage_data() -> None:
     head = started()
     head.pass_by(0.1)
     head.do("corrupt", frames=33)
@@ -154,7 +154,7 @@ def test_frames_may_come_out_of_order() -> None:
     assert head.decoder.counts.missing == 0
 
 
-def test_a_whisker_is_pressed_to_its_end_for_so_long() -> None:
+def test_a_saturated_whisker() -> None:
     head = started()
     head.do("saturate", whisker=5, seconds=0.2)
     y = head.pass_by(0.5).values[:, :, 2] * ANGLE
@@ -164,7 +164,7 @@ def test_a_whisker_is_pressed_to_its_end_for_so_long() -> None:
     assert np.abs(np.delete(y, 5, axis=1)).max() < 0.1
 
 
-def test_a_stall_lasts_until_it_is_cleared_and_its_cause_is_gone() -> None:
+def test_a_stall_ends_when_cleared_after_its_duration() -> None:
     head = started()
     head.pass_by(0.1, read=False)
     head.do("stall", seconds=0.2)
@@ -180,7 +180,7 @@ def test_a_stall_lasts_until_it_is_cleared_and_its_cause_is_gone() -> None:
         head.bridge.bulk_in(EVER, head.now + 60)
 
 
-def test_silence_delays_what_fits() -> None:
+def test_frames_are_delayed_by_a_silence() -> None:
     head = started()
     head.do("silence", seconds=1.0)
     assert len(head.pass_by(1.0 - BLOCK).values) == 0
@@ -188,7 +188,7 @@ def test_silence_delays_what_fits() -> None:
     assert head.do("counts")["lost"] == 0
 
 
-def test_unplugged_it_forgets_its_stream() -> None:
+def test_unplugging_ends_the_stream() -> None:
     head = started()
     head.send(drive())
     head.pass_by(0.2)
@@ -201,7 +201,7 @@ def test_unplugged_it_forgets_its_stream() -> None:
     assert len(head.pass_by(0.1).values) == 200
 
 
-def test_it_says_what_it_is() -> None:
+def test_identity_and_unknown_requests() -> None:
     head = Told(HeadEmulatorConfig(head={"whiskers": 4}))
     identity = json.loads(head.bridge.control(REQUEST_IN, Request.IDENTITY, 0, 1024, 0.0))
     assert identity | {"name": "", "version": ""} == {
@@ -218,7 +218,7 @@ def test_it_says_what_it_is() -> None:
             head.bridge.control(kind, request, value, 64, 0.0)
 
 
-def test_what_is_no_command_is_ignored() -> None:
+def test_invalid_commands_are_ignored() -> None:
     head = started()
     head.send(drive())
     for packet in (b"", b"WHKC" + bytes(60), bytes(32)):
@@ -231,6 +231,6 @@ def test_what_is_no_command_is_ignored() -> None:
     "asked",
     [{}, {"do": "explode"}, {"do": "saturate", "whisker": 18}, {"do": "clock"}, {"do": "stall", "for": 3}],
 )
-def test_faults_that_are_none_are_refused(asked: dict[str, object]) -> None:
+def test_invalid_fault_requests_are_refused(asked: dict[str, object]) -> None:
     with pytest.raises((TypeError, ValueError)):
         started().bridge.do(asked, 0.0)

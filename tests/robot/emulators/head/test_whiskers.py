@@ -1,4 +1,4 @@
-"""What an emulated head feels: the simulator's whiskers, wherever an arm or its own way has it."""
+"""Whiskers of an emulated head agree with the simulator, along a path and on an arm."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Arm:
 
 @pytest.mark.parametrize("mode", [FeedbackMode.OPEN, FeedbackMode.RCP])
 @pytest.mark.parametrize("frequency", [1.0, 2.0])
-def test_a_head_on_its_way_feels_what_the_simulator_says(mode: FeedbackMode, frequency: float) -> None:
+def test_samples_along_a_path_agree_with_the_simulator(mode: FeedbackMode, frequency: float) -> None:
     config = HeadEmulatorConfig(
         follow=True, path={"explore": 9}, seed=3, stream={"rate": ODD}, head={"dead": (4,)}
     )
@@ -99,7 +99,7 @@ def test_a_whisk_may_end_within_a_block() -> None:
 
 
 @pytest.mark.parametrize("lift", [0.0, 0.02, -0.004])
-def test_an_arm_carries_the_head_as_if_it_stood_there(lift: float) -> None:
+def test_samples_of_a_carried_head_agree_with_a_fixed_one(lift: float) -> None:
     """Lifted, it feels what it would feel over walls that are so much lower."""
     config = HeadEmulatorConfig(path={"explore": 9}, mechanics={"noise": 0.0})
     walls = world(config).surroundings.walls
@@ -118,7 +118,7 @@ def test_an_arm_carries_the_head_as_if_it_stood_there(lift: float) -> None:
     assert felt.any() == ((found[0][..., 2] * ANGLE).max() > 0.05)
 
 
-def test_high_up_and_before_the_arm_tells_there_is_nothing() -> None:
+def test_no_contact_when_lifted_or_before_the_first_arm_state() -> None:
     arm = Arm()
     head = Told(HeadEmulatorConfig(mechanics={"noise": 0.0}), TABLE, CarriedByArm(arm, PLACING))
     head.start()
@@ -131,7 +131,7 @@ def test_high_up_and_before_the_arm_tells_there_is_nothing() -> None:
     assert head.do("state")["lift"] == pytest.approx(0.2)
 
 
-def test_between_states_the_arm_goes_on_by_its_speed() -> None:
+def test_poses_between_arm_states_are_extrapolated() -> None:
     arm, home = Arm(), np.array([0.5, 0.4, 3.1])
     place = CarriedByArm(arm, PLACING)
     tcp = tcp_from_pose(PLACING, home)
@@ -145,7 +145,7 @@ def test_between_states_the_arm_goes_on_by_its_speed() -> None:
     np.testing.assert_allclose(lifts, 0.02 * times, atol=1e-9)
 
 
-def test_without_commands_whiskers_go_back_and_stay() -> None:
+def test_whiskers_retract_without_commands() -> None:
     head = Told(HeadEmulatorConfig(mechanics={"noise": 0.0}))
     head.start()
     head.send(drive(FeedbackMode.OPEN))
@@ -163,7 +163,7 @@ def test_without_commands_whiskers_go_back_and_stay() -> None:
     assert to_radians(head.pass_by(1.0).values)[0].max() > 0.5
 
 
-def test_a_new_drive_waits_for_the_cycle_to_end() -> None:
+def test_a_new_drive_command_starts_with_the_next_cycle() -> None:
     head = Told(HeadEmulatorConfig(mechanics={"noise": 0.0}))
     head.start()
     head.send(drive(FeedbackMode.OPEN))
@@ -178,7 +178,7 @@ def test_a_new_drive_waits_for_the_cycle_to_end() -> None:
     assert angle[1400:].min() == pytest.approx(0.2, abs=1e-3)
 
 
-def test_the_host_lowers_amplitudes_for_one_cycle() -> None:
+def test_amplitudes_from_the_host_last_one_cycle() -> None:
     head = Told(HeadEmulatorConfig(mechanics={"noise": 0.0}), TABLE._replace(height=np.array([0.0])))
     head.start()
     head.send(drive(FeedbackMode.OPEN))
@@ -212,7 +212,7 @@ def test_feedback_is_relative_to_the_centre() -> None:
         {"window": 0.0},
     ],
 )
-def test_what_no_drive_can_do_is_not_done(bad: dict[str, float]) -> None:
+def test_invalid_drive_commands_are_ignored(bad: dict[str, float]) -> None:
     head = Told()
     head.start()
     head.send(drive(**bad))
@@ -227,7 +227,7 @@ def test_drives_stop_at_their_limit() -> None:
     assert angle.max() <= np.radians(50) + ANGLE
 
 
-def test_nothing_is_felt_while_nobody_listens() -> None:
+def test_no_samples_are_computed_without_a_stream() -> None:
     """A head that rests costs nothing, and its noise waits for the first frame."""
     quick, late = Told(), Told()
     late.pass_by(3 * BLOCK)

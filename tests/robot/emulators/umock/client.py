@@ -1,4 +1,4 @@
-"""What `test_umock` runs on a test bed: a host of the head on the system's libusb. Prints JSON."""
+"""Program that `test_umock` runs: a host of the head on the system's libusb. Prints JSON."""
 
 from __future__ import annotations
 
