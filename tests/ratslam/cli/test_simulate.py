@@ -49,7 +49,7 @@ def refused(capsys, arguments, *said):
         assert words in error
 
 
-def test_a_replayed_session_is_the_session(folder):
+def test_a_run_on_the_recording_equals_a_run_on_the_simulation(folder):
     for name in SAME:
         assert (folder / "direct" / name).read_bytes() == (folder / "replayed" / name).read_bytes(), name
     assert (folder / "direct" / "steps.csv").read_text().count("\n") == 151
@@ -70,7 +70,7 @@ def test_a_manifest_names_the_simulation(folder):
     )
 
 
-def test_what_was_run_can_be_run_again(folder, tmp_path):
+def test_a_run_can_be_repeated_from_its_configuration(folder, tmp_path):
     assert main(["run", str(folder / "direct" / "config.yaml"), "-o", str(tmp_path / "again")]) == 0
     for name in SAME:
         assert (tmp_path / "again" / name).read_bytes() == (folder / "direct" / name).read_bytes()
@@ -157,7 +157,7 @@ def started(tmp_path):
     return process, path
 
 
-def test_an_interrupted_session_is_a_whole_file(tmp_path):
+def test_an_interrupted_session_is_a_complete_file(tmp_path):
     process, path = started(tmp_path)
     process.send_signal(signal.SIGINT)
     out, said = process.communicate()

@@ -1,4 +1,4 @@
-"""CSV: what is said to be where is read from there, and every fault is told by file and line."""
+"""CSV recordings: configured columns are read, and every error names file and line."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def with_parts(**parts: Any) -> CsvConfig:
     return VELOCITY.model_copy(update=parts)
 
 
-def test_velocities_are_driven_along_the_mid_heading(write: Write) -> None:
+def test_velocities_are_integrated_along_the_mid_heading(write: Write) -> None:
     source = read_csv_recording(write(ODOMETRY), VELOCITY)
     assert isinstance(source, Source)
     assert (source.name, source.length, source.rate_hz, source.view_shape) == ("odometry", 4, 2.0, (1, 3, 1))
@@ -67,7 +67,7 @@ def test_poses_are_differenced(write: Write) -> None:
     assert tuple(odometry[2]) == pytest.approx((0, 0.5, 3.3 - np.pi / 2, 1))  # sideways
 
 
-def test_ranges_become_pixels(write: Write) -> None:
+def test_ranges_are_averaged_to_pixels(write: Write) -> None:
     path = write("t,vx,w,r0,r1,r2,r3,r4,r5\n0,0.1,0,1,3,8,9,inf,4\n1,0.1,0,,,,,,\n")
     first, second = read_csv_recording(path, with_parts(views=ViewColumns(max_range=8.0)))
     assert first.reading.view.ravel().tolist() == [0.25, 1.0, 0.75]
@@ -75,7 +75,7 @@ def test_ranges_become_pixels(write: Write) -> None:
     assert second.reading.view.shape == (1, 3, 1)
 
 
-def test_pixels_in_a_file_of_their_own_go_to_the_nearest_row(write: Write) -> None:
+def test_views_of_another_file_are_assigned_to_the_nearest_row(write: Write) -> None:
     views = write("stamp,p2,p1,p3\n0.1,.2,.1,.3\n0.9,.5,.4,.6\n", "views.csv")
     config = with_parts(views=ViewColumns(file=views, time="stamp", prefix="p", tolerance=0.11))
     samples = list(read_csv_recording(write(ODOMETRY), config))
@@ -83,7 +83,7 @@ def test_pixels_in_a_file_of_their_own_go_to_the_nearest_row(write: Write) -> No
     assert samples[2].reading.view.ravel().tolist() == [0.4, 0.5, 0.6]
 
 
-def test_labels_beside_the_odometry(write: Write) -> None:
+def test_labels_in_the_odometry_file(write: Write) -> None:
     path = write("t,vx,w,place\n0,0.1,0,3\n1,0.1,0,\n2,0.1,0,-1\n3,0.1,0,0\n")
     samples = read_csv_recording(path, with_parts(labels=LabelColumns(column="place")))
     assert [int(sample.reading.label) for sample in samples] == [3, -1, -1, 0]
@@ -100,7 +100,7 @@ def test_labels_from_a_file_and_from_pairs(write: Write) -> None:
 
 
 @given(st.lists(st.tuples(st.integers(0, 8), st.integers(1, 8), st.sampled_from([0.5, 0.75, 0.8, 0.9]))))
-def test_ids_follow_the_best_earlier_match(triples: list[tuple[int, int, float]]) -> None:
+def test_labels_follow_the_best_earlier_match(triples: list[tuple[int, int, float]]) -> None:
     later = [float(earlier + gap) for earlier, gap, _ in triples]
     earlier = [float(earlier) for earlier, _, _ in triples]
     score = [score for *_, score in triples]
@@ -123,7 +123,7 @@ def test_truth_is_interpolated_and_unwrapped(write: Write) -> None:
     assert samples[2].truth == pytest.approx([0.75, 1.5, 3.0 + 0.75 * (2 * np.pi - 6)])
 
 
-def test_truth_beside_the_odometry(write: Write) -> None:
+def test_truth_in_the_odometry_file(write: Write) -> None:
     path = write("t,vx,w,x,y,heading\n0,0.1,0,1,2,3\n1,0.1,0,1.1,2,3\n")
     samples = list(read_csv_recording(path, with_parts(truth=TruthColumns())))
     assert [sample.truth.tolist() for sample in samples if sample.truth is not None] == [
@@ -141,7 +141,7 @@ def test_the_digest_covers_every_file(write: Write) -> None:
     assert read_csv_recording(write(ODOMETRY), VELOCITY).digest != one
 
 
-def test_the_lecture_hall_is_reproduced(reference_data: Path) -> None:
+def test_the_lecture_hall_csv_equals_its_reference_trace(reference_data: Path) -> None:
     """Every label of the reference stream follows from the pairs; truth differs by the files' rounding."""
     data = reference_data / "data"
     config = CsvConfig(
@@ -161,7 +161,7 @@ def test_the_lecture_hall_is_reproduced(reference_data: Path) -> None:
     np.testing.assert_allclose(log.truth[known], stream.truth[known], atol=1e-6)
 
 
-def test_the_intel_laser_is_reproduced(reference_data: Path) -> None:
+def test_the_intel_laser_csv_equals_its_reference_trace(reference_data: Path) -> None:
     """180 beams as 3 x 6 pixels, equal in every bit; the sideways part of the motion is not lost."""
     data = reference_data / "data"
     config = CsvConfig(
@@ -213,7 +213,7 @@ FAULTS: dict[str, tuple[str, dict[str, Any], list[str]]] = {
 
 
 @pytest.mark.parametrize(("content", "parts", "pieces"), FAULTS.values(), ids=FAULTS.keys())
-def test_faults_are_named(
+def test_faulty_values_are_refused(
     content: str, parts: dict[str, Any], pieces: list[str], write: Write, refused: Callable[..., InputError]
 ) -> None:
     path = write(content)
@@ -246,7 +246,7 @@ OTHERS: dict[str, tuple[str, Callable[[Path], dict[str, Any]], list[str]]] = {
 
 
 @pytest.mark.parametrize(("content", "parts", "pieces"), OTHERS.values(), ids=OTHERS.keys())
-def test_faults_of_other_files_are_named(
+def test_faulty_values_in_other_files_are_refused(
     content: str,
     parts: Callable[[Path], dict[str, Any]],
     pieces: list[str],
@@ -257,7 +257,7 @@ def test_faults_of_other_files_are_named(
     refused(lambda: read_csv_recording(write(ODOMETRY), with_parts(**parts(path))), *pieces)
 
 
-def test_all_faults_are_told_together(write: Write, refused: Callable[..., InputError]) -> None:
+def test_all_errors_are_reported_together(write: Write, refused: Callable[..., InputError]) -> None:
     path = write("t,vx,w,r0,r1,r2\n0,1,0,0,0,0\n1,nan,0,0,0,300\n1,1,0,0,0,0\n")
     error = refused(
         lambda: read_csv_recording(path, with_parts(views=ViewColumns())), "vx is nan", "repeats", "300.0"
@@ -270,7 +270,7 @@ def test_all_faults_are_told_together(write: Write, refused: Callable[..., Input
 
 
 @given(st.text(max_size=200) | st.binary(max_size=200))
-def test_no_text_is_more_than_one_clear_error(tmp_path_factory: Any, text: str | bytes) -> None:
+def test_any_text_is_read_or_gives_one_clear_error(tmp_path_factory: Any, text: str | bytes) -> None:
     path = tmp_path_factory.getbasetemp() / "any.csv"
     for content in (text, b"t,vx,w\n" + text if isinstance(text, bytes) else "t,vx,w\n" + text):
         data = content if isinstance(content, bytes) else content.encode("utf-8", "surrogatepass")
@@ -283,7 +283,7 @@ def test_no_text_is_more_than_one_clear_error(tmp_path_factory: Any, text: str |
         assert str(path) in told
 
 
-def test_lines_are_counted_as_an_editor_counts_them(write: Write) -> None:
+def test_line_numbers_are_those_of_an_editor(write: Write) -> None:
     file = read_csv(write("\ufefft,x\r\n\r\n1,2\r\n \r\n3,4"))
     assert file.names == ("t", "x")
     assert file.values.tolist() == [[1, 2], [3, 4]]

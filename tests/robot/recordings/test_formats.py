@@ -1,4 +1,4 @@
-"""Opening: the right reader for every suffix, one clear error for every file that cannot be opened."""
+"""Opening recordings: one reader per suffix, and clear errors for files that cannot be opened."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ ROOT = Path(__file__).parents[3]
 Refused = Callable[..., InputError]
 
 
-def test_every_format_opens_as_the_same_kind_of_source(stream: Callable[..., Path], tmp_path: Path) -> None:
+def test_every_format_opens_as_a_source(stream: Callable[..., Path], tmp_path: Path) -> None:
     config = RecordingConfig(file=stream())
     with open_recording(config) as source:
         record_source(source, tmp_path / "copy.MCAP")
@@ -48,7 +48,7 @@ def test_every_format_opens_as_the_same_kind_of_source(stream: Callable[..., Pat
             assert opened.length == len(list(opened)) == len(list(opened))
 
 
-def test_a_cut_recording_warns(stream: Callable[..., Path], tmp_path: Path) -> None:
+def test_a_truncated_recording_warns(stream: Callable[..., Path], tmp_path: Path) -> None:
     path = tmp_path / "cut.mcap"
     with open_recording(RecordingConfig(file=stream())) as source:
         record_source(source, path)
@@ -59,7 +59,7 @@ def test_a_cut_recording_warns(stream: Callable[..., Path], tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
-def test_a_file_that_cannot_be_opened_is_named(suffix: str, tmp_path: Path, refused: Refused) -> None:
+def test_a_file_that_cannot_be_opened_is_refused(suffix: str, tmp_path: Path, refused: Refused) -> None:
     path = tmp_path / f"run{suffix}"
 
     def attempt() -> Source:
@@ -80,11 +80,11 @@ def test_a_file_that_cannot_be_opened_is_named(suffix: str, tmp_path: Path, refu
     refused(attempt, str(path), "is not a regular file")
 
 
-def test_a_file_in_no_folder_is_named(tmp_path: Path, refused: Refused) -> None:
+def test_a_file_in_a_missing_folder_is_refused(tmp_path: Path, refused: Refused) -> None:
     refused(lambda: read_bytes(tmp_path / "no" / "run.csv"), "no such file", "the folder", "does not exist")
 
 
-def test_a_file_without_permission_is_named(
+def test_a_file_without_permission_is_refused(
     tmp_path: Path, refused: Refused, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "run.csv"
@@ -99,7 +99,7 @@ def test_a_file_without_permission_is_named(
     )
 
 
-def test_an_unknown_format_is_named(tmp_path: Path, refused: Refused) -> None:
+def test_an_unknown_format_is_refused(tmp_path: Path, refused: Refused) -> None:
     for name, piece in (("run.bag", "no reader for '.bag' files"), ("run", "a file without a suffix")):
         (tmp_path / name).write_text("x")
         refused(
@@ -146,7 +146,7 @@ def test_the_readme_example_runs(tmp_path: Path) -> None:
     assert [sample.truth is None for sample in samples] == [False, False, True]
 
 
-def test_nothing_heavy_is_imported_to_configure() -> None:
+def test_configuring_imports_no_reader() -> None:
     code = (
         "import sys, robot.recordings.formats;"
         "heavy = {'mcap', 'zstandard', 'scipy', 'jax', 'ratslam'} & set(sys.modules);"

@@ -1,7 +1,8 @@
-"""Recordings: exactly what was written comes back, of a damaged file exactly what was before the damage."""
+"""MCAP recordings: bit-identical round trips, truncated and damaged files, other tools, refused input."""
 
 from __future__ import annotations
 
+import os
 import signal
 import struct
 import subprocess
@@ -177,7 +178,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, list[Sample]
 
 @settings(max_examples=60)
 @given(SAMPLES)
-def test_what_is_written_comes_back_bit_for_bit(tmp_path_factory: Any, samples: list[Sample]) -> None:
+def test_written_samples_are_read_back_bit_for_bit(tmp_path_factory: Any, samples: list[Sample]) -> None:
     path = write_recording(tmp_path_factory.getbasetemp() / "law.mcap", samples)
     with Recording(path) as source:
         assert isinstance(source, Source)
@@ -200,7 +201,7 @@ def test_the_file_depends_on_the_samples_alone(tmp_path: Path) -> None:
     )
 
 
-def test_a_source_is_recorded_as_it_is(trace: Path, tmp_path: Path) -> None:
+def test_a_recorded_source_equals_the_source(trace: Path, tmp_path: Path) -> None:
     with read_trace(trace) as source:
         assert record_source(source, tmp_path / "copy.mcap") == source.length
         copy = Recording(tmp_path / "copy.mcap")
@@ -209,7 +210,7 @@ def test_a_source_is_recorded_as_it_is(trace: Path, tmp_path: Path) -> None:
 
 
 def check_prefix(path: Path, samples: list[Sample]) -> int:
-    """Reads a damaged file: a prefix of the samples, or one InputError. How many samples."""
+    """Reads a damaged file: a prefix of the samples or one InputError; returns the number of samples."""
     told: list[str] = []
     source: Recording | None
     try:
@@ -229,15 +230,27 @@ def check_prefix(path: Path, samples: list[Sample]) -> int:
     return len(read)
 
 
-def test_a_recording_may_be_cut_off_anywhere(small: tuple[bytes, list[Sample]], tmp_path: Path) -> None:
+def record_ends(content: bytes) -> list[int]:
+    """Positions after each MCAP record: one byte of type, eight of length, the content."""
+    ends, place = [], 8
+    while place + 9 <= len(content) - 8:
+        place += 9 + struct.unpack_from("<Q", content, place + 1)[0]
+        ends.append(place)
+    return ends
+
+
+def test_a_truncated_recording_yields_a_prefix(small: tuple[bytes, list[Sample]], tmp_path: Path) -> None:
+    """Cut at every byte around the end of a record, and at every seventh one elsewhere."""
     content, samples = small
     path = tmp_path / "cut.mcap"
+    path.write_bytes(content)
+    near = {end + k for end in record_ends(content) for k in range(-3, 11)}
+    sizes = sorted({size for size in near if 0 <= size < len(content)} | set(range(0, len(content), 7)))
     counts = []
-    last = content.rindex(b"\x28\xb5\x2f\xfd")  # behind it stands the table of contents
-    for size in [*range(last), *range(last, len(content), 7)]:
-        path.write_bytes(content[:size])
+    for size in reversed(sizes):
+        os.truncate(path, size)
         counts.append(check_prefix(path, samples))
-    assert counts == sorted(counts)
+    assert counts == sorted(counts, reverse=True)
     assert {0, 1, len(samples)} < set(counts)
 
 
@@ -259,7 +272,7 @@ def fuzz(content: bytes, samples: list[Sample], path: Path, rounds: int, seed: i
         check_prefix(path, samples)
 
 
-def test_every_damaged_byte_is_noticed(small: tuple[bytes, list[Sample]], tmp_path: Path) -> None:
+def test_a_damaged_byte_is_noticed(small: tuple[bytes, list[Sample]], tmp_path: Path) -> None:
     content, samples = small
     path = tmp_path / "bad.mcap"
     for place in range(0, len(content), 3):
@@ -302,7 +315,7 @@ def test_a_killed_recorder_loses_no_more_than_its_last_half_second(tmp_path: Pat
     assert f"{source.length} samples are readable, the rest is lost: it ends too early" in source.warning
 
 
-def test_recover_makes_a_whole_file(small: tuple[bytes, list[Sample]], tmp_path: Path) -> None:
+def test_recover_writes_a_complete_file(small: tuple[bytes, list[Sample]], tmp_path: Path) -> None:
     content, samples = small
     cut, whole = tmp_path / "cut.mcap", tmp_path / "whole.mcap"
     cut.write_bytes(content[: len(content) * 2 // 3])
@@ -335,7 +348,7 @@ def test_a_recovery_that_fails_leaves_nothing(tmp_path: Path, refused: Callable[
     assert [path.name for path in tmp_path.iterdir()] == ["bad.mcap"]
 
 
-def test_a_file_of_another_kind_is_named(tmp_path: Path, refused: Callable[..., InputError]) -> None:
+def test_a_file_of_another_format_is_refused(tmp_path: Path, refused: Callable[..., InputError]) -> None:
     from mcap.writer import Writer
 
     path = tmp_path / "other.mcap"
@@ -351,7 +364,9 @@ def test_a_file_of_another_kind_is_named(tmp_path: Path, refused: Callable[..., 
     refused(lambda: Recording(tmp_path / "none.mcap"), "holds no samples", "at least one sample")
 
 
-def test_a_recorder_refuses_what_it_cannot_hold(tmp_path: Path, refused: Callable[..., InputError]) -> None:
+def test_a_recorder_refuses_wrong_shapes_and_values(
+    tmp_path: Path, refused: Callable[..., InputError]
+) -> None:
     good = some_samples(1)[0]
     path = tmp_path / "a.mcap"
     wrong = {
@@ -390,7 +405,7 @@ def test_a_recorder_refuses_what_it_cannot_hold(tmp_path: Path, refused: Callabl
         "truth": ({"truth": np.full(3, np.nan)}, ["row 5", "truth is nan"]),
     }.values(),
 )  # fmt: skip
-def test_faults_of_a_recording_are_named(
+def test_impossible_values_in_a_recording_are_refused(
     change: dict[str, Any], pieces: list[str], tmp_path: Path, refused: Callable[..., InputError]
 ) -> None:
     samples = some_samples(10)
@@ -412,7 +427,7 @@ def test_a_file_that_changes_while_it_is_read_is_noticed(
     refused(lambda: list(source), "had 9 samples and now has")
 
 
-def test_the_standard_reader_reads_it(small: tuple[bytes, list[Sample]], tmp_path: Path) -> None:
+def test_the_mcap_library_reads_a_recording(small: tuple[bytes, list[Sample]], tmp_path: Path) -> None:
     from mcap.reader import make_reader
 
     content, samples = small
@@ -477,10 +492,10 @@ def check_fields(sample: Sample, name: str, message: Any) -> None:
         assert (np.reshape(message.deflection, (2, WHISKERS, 2)) == reading.deflection).all()
 
 
-def test_a_chunk_that_would_not_fit_into_memory_is_not_opened(
+def test_a_chunk_of_excessive_size_is_not_decompressed(
     small: tuple[bytes, list[Sample]], tmp_path: Path
 ) -> None:
-    """A frame header that promises 2^60 bytes; nobody allocates them."""
+    """A frame header states 2^60 bytes; they are not allocated."""
     content, _ = small
     frame = content.index(b"\x28\xb5\x2f\xfd")
     bad = bytearray(content)
@@ -499,10 +514,10 @@ def test_a_chunk_that_would_not_fit_into_memory_is_not_opened(
     st.integers(-1, 1 << 40),
     st.sampled_from(["{}", "[]", "{", "1", '{"cell_size": -1}', '{"calibration": {"mean": 1}}']),
 )
-def test_a_valid_file_with_strange_contents_is_told_apart(
+def test_a_valid_mcap_file_with_other_messages_is_refused(
     tmp_path_factory: Any, name: str, message: bytes, shape: str, whiskers: int, info: str
 ) -> None:
-    """Checksums in order, contents not ours."""
+    """Checksums are right, but the contents are not those of a recording."""
     from mcap.writer import Writer
 
     path = tmp_path_factory.getbasetemp() / "strange.mcap"
@@ -519,7 +534,7 @@ def test_a_valid_file_with_strange_contents_is_told_apart(
         Recording(path)
 
 
-def test_a_file_of_another_version_is_named(
+def test_a_recording_of_another_version_is_refused(
     tmp_path: Path, refused: Callable[..., InputError], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     old = tmp_path / "old.mcap"
@@ -544,7 +559,7 @@ def test_provenance_that_is_not_json_is_refused_before_anything_is_written(
 
 
 def test_source_info_is_stored_before_the_first_sample(tmp_path: Path) -> None:
-    """It stands before the first sample, so a recorder killed at once leaves it."""
+    """A recorder killed at once leaves a file with its source info."""
     path = write_recording(tmp_path / "a.mcap", some_samples(2))
     content = path.read_bytes()
     path.write_bytes(content[: content.index(b"\x28\xb5\x2f\xfd")])
@@ -566,7 +581,7 @@ def test_a_copy_of_a_recording_keeps_the_source_info(
 
 
 def test_a_truth_in_degrees_is_refused(tmp_path: Path, refused: Callable[..., InputError]) -> None:
-    """Recordings are judged by the same units as every other reader's (see test_units)."""
+    """The unit check is that of all readers (see test_unit_check)."""
     turning = Odometry(*(np.float64(value) for value in (0.05, 0.0, 0.3, 0.5)))
     samples = [
         Sample(0.5 * i, observation(turning, view_shape=SHAPE, whiskers=WHISKERS), np.array([0, 0, 17.0 * i]))

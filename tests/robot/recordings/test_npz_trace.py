@@ -1,4 +1,4 @@
-"""Reference streams: read as they were driven, and every fault named."""
+"""Reference traces: values read, and every error named."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_a_trace_is_read_row_by_row(trace: Path) -> None:
     ("name", "expected"),
     [("b_figure8_alias", 0.174), ("f_real_intel_laser3x6", 24.16), ("f_real_tuc_lecture_hall", 12.95)],
 )
-def test_raw_odometry_errs_as_published(
+def test_the_error_of_raw_odometry_is_the_published_one(
     name: str, expected: float, find_trace: Callable[[str], Path]
 ) -> None:
     source = read_trace(find_trace(name))
@@ -75,7 +75,7 @@ def test_a_view_may_share_its_time_with_odometry(stream: Callable[..., Path]) ->
     assert source.rate_hz == 2.0
 
 
-def test_two_columns_are_given_ids(stream: Callable[..., Path]) -> None:
+def test_views_of_two_columns_are_place_labels(stream: Callable[..., Path]) -> None:
     ids = np.column_stack([np.arange(12) // 3, np.zeros(12)])
     ids[4] = np.nan
     source = read_trace(stream(in_view=ids, in_flags=np.where(np.isnan(ids[:, 0]), 2.0, 3.0)))
@@ -92,14 +92,14 @@ def test_a_recorded_copy_of_labels_still_has_labels_only(stream: Callable[..., P
     assert Recording(tmp_path / "labels.mcap").info.labels_only
 
 
-def test_a_template_of_two_pixels_is_no_id(stream: Callable[..., Path]) -> None:
+def test_a_template_of_two_pixels_is_not_a_label(stream: Callable[..., Path]) -> None:
     params = '{"template_x_size": 2, "template_y_size": 1}'
     source = read_trace(stream(in_view=np.full((12, 2), 0.25), params_json=params, truth=None))
     assert [float(sample.reading.view.sum()) for sample in source] == [0.5] * 12
     assert all(sample.truth is None for sample in source)
 
 
-def test_samples_share_nothing_that_could_be_spoilt(stream: Callable[..., Path]) -> None:
+def test_samples_share_no_writable_memory(stream: Callable[..., Path]) -> None:
     source = read_trace(stream())
     sample = next(iter(source))
     assert sample.truth is not None
@@ -111,7 +111,7 @@ def test_samples_share_nothing_that_could_be_spoilt(stream: Callable[..., Path])
     assert (again.truth == 0).all()
 
 
-def test_the_digest_names_the_content(stream: Callable[..., Path]) -> None:
+def test_the_digest_depends_on_the_content_only(stream: Callable[..., Path]) -> None:
     one = read_trace(stream()).digest
     assert read_trace(stream()).digest == one
     assert read_trace(stream(in_v=np.full(12, 0.11))).digest != one
@@ -156,7 +156,7 @@ FAULTS: dict[str, tuple[dict[str, Any], list[str]]] = {
 
 
 @pytest.mark.parametrize(("changes", "pieces"), FAULTS.values(), ids=FAULTS.keys())
-def test_faults_are_named(
+def test_faulty_values_are_refused(
     changes: dict[str, Any],
     pieces: list[str],
     stream: Callable[..., Path],
@@ -166,7 +166,7 @@ def test_faults_are_named(
     refused(lambda: read_trace(path), str(path), *pieces)
 
 
-def test_all_faults_are_told_together(
+def test_all_errors_are_reported_together(
     stream: Callable[..., Path], refused: Callable[..., InputError]
 ) -> None:
     path = stream(

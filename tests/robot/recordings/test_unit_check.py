@@ -1,4 +1,4 @@
-"""Units: every recording we have passes with room to spare, and in a wrong unit it does not."""
+"""Unit check: known recordings pass with a margin; the same data in wrong units are refused."""
 
 from __future__ import annotations
 
@@ -174,7 +174,7 @@ def test_a_wrong_unit_of_a_table_is_refused(
     refused(lambda: read_csv_recording(planted, without_truth), expected)
 
 
-def test_one_row_decides_nothing(trace: Path, tmp_path: Path) -> None:
+def test_two_outliers_do_not_change_the_verdict(trace: Path, tmp_path: Path) -> None:
     """Two wild rows, faster than anything, in a recording that hardly turns otherwise."""
     with np.load(trace) as arrays:
         kept = {
@@ -194,7 +194,7 @@ def test_the_real_row_of_five_milliseconds_passes(find_trace: Callable[[str], Pa
     assert rate.max() > 90
 
 
-def test_a_limit_may_be_raised(stream: Callable[..., Path], refused: Callable[..., InputError]) -> None:
+def test_limits_can_be_raised(stream: Callable[..., Path], refused: Callable[..., InputError]) -> None:
     path = stream(in_v=np.full(12, 40.0), truth=None)
     refused(lambda: read_trace(path), "over 40 m/s", "if it really is so, raise limits.speed (25)")
     config = RecordingConfig(file=path, limits=UnitLimits(speed=50.0))
@@ -202,7 +202,7 @@ def test_a_limit_may_be_raised(stream: Callable[..., Path], refused: Callable[..
 
 
 @pytest.mark.parametrize("turns", [0.4, 5.0])
-def test_headings_of_any_span_are_told_from_degrees(turns: float) -> None:
+def test_headings_in_degrees_are_detected(turns: float) -> None:
     """Wrapped or not, in radians they pass and in degrees they do not."""
     time = np.arange(200) * 0.5
     heading = np.linspace(0, 2 * np.pi * turns, 200) - 1.0
@@ -214,7 +214,7 @@ def test_headings_of_any_span_are_told_from_degrees(turns: float) -> None:
         assert "multiply by pi/180" in str(error)
 
 
-def test_nothing_to_judge_is_nothing_to_refuse() -> None:
+def test_an_empty_track_is_accepted() -> None:
     for rows in (0, 1, 2, 3):
         still = MotionTrack(
             np.arange(rows) * 1.0, np.ones(rows, bool), np.zeros((rows, 4)), np.zeros((rows, 3))

@@ -1,4 +1,4 @@
-"""Motions: what was integrated comes out again, and a constant twist is nearly exact."""
+"""Motion from poses and velocities: round trips, and the error of a constant twist."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MOTIONS = STEPS.flatmap(lambda n: arrays(np.float64, (n, 3), elements=st.floats(
 
 
 @given(MOTIONS)
-def test_poses_give_back_their_motions(motions: np.ndarray) -> None:
+def test_motions_are_recovered_from_integrated_poses(motions: np.ndarray) -> None:
     motions[0] = 0
     poses = integrate(motions)
     found = from_poses(np.arange(len(motions)) * 0.5, poses)

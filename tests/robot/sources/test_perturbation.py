@@ -29,7 +29,7 @@ def test_a_perturbed_copy_follows_from_its_seed(log):
     assert 10 <= len(log.time) - len(first.time) <= 80 + 40
 
 
-def test_without_noise_the_path_is_kept_whole_though_rows_are_dropped(log, monkeypatch):
+def test_dropped_rows_leave_the_path_unchanged(log, monkeypatch):
     for name in ("VIEW_NOISE", "LENGTH_NOISE", "TURN_NOISE"):
         monkeypatch.setattr(perturbation, name, 0.0)
     monkeypatch.setattr(perturbation, "DROPPED", 0.5)
@@ -43,7 +43,7 @@ def test_without_noise_the_path_is_kept_whole_though_rows_are_dropped(log, monke
     assert copy.motion[1:, 3].sum() == pytest.approx(copy.time[-1] - copy.time[0])
 
 
-def test_some_ids_become_new_and_some_wrong():
+def test_some_labels_become_new_and_some_wrong():
     label = np.where(np.arange(3000) % 3 == 0, np.arange(3000) // 300, -1).astype(np.int32)
     changed = perturbation.corrupt_labels(label, np.random.default_rng(0))
     given = label >= 0

@@ -1,4 +1,4 @@
-"""What a simulated robot believes of its motion: each structure of noise does what its name says."""
+"""Simulated odometry errors: statistics of each kind of noise."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def driven(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def errors(kind: str, scene: tuple[np.ndarray, np.ndarray], seed: int = 0, **changes: Any) -> np.ndarray:
-    """[N - 1, 3] told motion less true motion."""
+    """[N - 1, 3] measured motion minus true motion."""
     time, pose = scene
     told = simulate_odometry(OdometryConfig(noise=kind, **changes), time, pose, stream(seed, "odometry"))
     error = told[1:, :3] - between(pose[:-1], pose[1:])
@@ -46,11 +46,11 @@ def test_odometry_follows_from_its_seed(seed: int, kind: str) -> None:
     assert (one != other).any()
 
 
-def test_without_noise_it_is_the_truth() -> None:
+def test_without_noise_odometry_is_the_truth() -> None:
     assert np.abs(errors("none", driven(100))).max() < 1e-12
 
 
-def test_white_noise_is_everywhere_and_independent() -> None:
+def test_white_noise_is_in_every_step_and_independent() -> None:
     for scene in (still(4000), driven(4000)):
         error = errors("white", scene)
         assert error[:, 0].std() == pytest.approx(8.2e-3, rel=0.05)
@@ -61,7 +61,7 @@ def test_white_noise_is_everywhere_and_independent() -> None:
             assert abs(lagged) < 0.06
 
 
-def test_gated_noise_is_only_on_what_moves() -> None:
+def test_gated_noise_is_only_in_moving_parts() -> None:
     assert np.abs(errors("gated", still(500))).max() == 0
     time, pose = driven(4000)
     error = errors("gated", (time, pose))
@@ -86,7 +86,7 @@ def test_telescoping_noise_stays_bounded_and_the_others_grow() -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_noise_has_its_own_rate(kind: str) -> None:
+def test_noise_does_not_depend_on_the_row_rate(kind: str) -> None:
     """Rows twice as close add up to the same errors, whatever the rows are."""
     time, pose = driven(200)
     fine = np.arange(0, 199.5, 0.5)
@@ -96,7 +96,7 @@ def test_noise_has_its_own_rate(kind: str) -> None:
     assert np.allclose(halves[:, [0, 2]].reshape(-1, 2, 2).sum(axis=1), coarse[:, [0, 2]], atol=1e-9)
 
 
-def test_biases_belong_to_the_run() -> None:
+def test_biases_are_constant_in_a_session() -> None:
     time, pose = driven(500)
     scales, bends = [], []
     for seed in range(300):
@@ -114,7 +114,7 @@ def test_biases_belong_to_the_run() -> None:
     assert np.std(bends) == pytest.approx(0.1, rel=0.15)
 
 
-def test_who_is_carried_is_told_the_motion_before() -> None:
+def test_a_kidnap_repeats_the_motion_before() -> None:
     time, pose = driven(100)
     pose = pose.copy()
     pose[50:, :2] += [0.7, -0.4]

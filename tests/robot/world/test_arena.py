@@ -1,4 +1,4 @@
-"""Arenas: the robot gets around every object, free space is what the walls bound, faulty texts are named."""
+"""Arenas: reachable free space, geometry of walls and objects, and the file format."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ start 1 1 90
 
 @settings(max_examples=25)
 @given(SEEDS, KINDS)
-def test_ways_are_wide_enough(seed: int, config: ArenaConfig) -> None:
+def test_passages_are_wide_enough(seed: int, config: ArenaConfig) -> None:
     made = make_arena(config, seed)
     assert len(made.objects) == config.count
     for number, one in enumerate(made.objects):
@@ -63,7 +63,7 @@ def test_ways_are_wide_enough(seed: int, config: ArenaConfig) -> None:
 
 @settings(max_examples=12)
 @given(SEEDS, KINDS)
-def test_the_robot_can_reach_every_place_that_it_fits_in(seed: int, config: ArenaConfig) -> None:
+def test_all_free_space_is_connected(seed: int, config: ArenaConfig) -> None:
     made = make_arena(config, seed)
     axis = np.arange(0.005, config.side, 0.02)
     places = np.stack(np.meshgrid(axis, axis), axis=-1)
@@ -71,7 +71,7 @@ def test_the_robot_can_reach_every_place_that_it_fits_in(seed: int, config: Aren
     assert regions == 1
 
 
-def test_rotated_objects_are_turned_and_others_are_not() -> None:
+def test_only_rotated_objects_are_turned() -> None:
     def slants(rotated: bool) -> np.ndarray:
         made = make_arena(ArenaConfig(side=2.5, rotated=rotated), 3)
         along = np.array([one[1] - one[0] for one in made.objects])
@@ -81,7 +81,7 @@ def test_rotated_objects_are_turned_and_others_are_not() -> None:
     assert np.ptp(slants(True)) > 20
 
 
-def test_objects_stand_at_walls_as_often_as_asked() -> None:
+def test_the_share_of_objects_at_walls_is_configurable() -> None:
     def share(against: float) -> float:
         made = [make_arena(ArenaConfig(side=2.5, objects=4, against=against), seed) for seed in range(8)]
         return float(np.mean([polygon_gap(one, room.outer) < 1e-9 for room in made for one in room.objects]))
@@ -91,7 +91,7 @@ def test_objects_stand_at_walls_as_often_as_asked() -> None:
     assert 0.3 < share(0.5) < 0.9
 
 
-def test_an_arena_follows_from_its_seed() -> None:
+def test_an_arena_depends_on_its_seed_only() -> None:
     config = ArenaConfig()
     one, again, other = (make_arena(config, seed) for seed in (4, 4, 5))
     assert arena_text(one) == arena_text(again) != arena_text(other)
@@ -104,7 +104,7 @@ def test_the_sizes_of_the_paper_have_four_and_seven_objects() -> None:
     assert make_arena(ArenaConfig(objects=0), 0).objects == ()
 
 
-def test_what_does_not_fit_is_refused(refused: Callable[..., InputError]) -> None:
+def test_objects_that_do_not_fit_are_refused(refused: Callable[..., InputError]) -> None:
     refused(
         lambda: make_arena(ArenaConfig(objects=30), 0),
         "create_simulation.arena.objects",
@@ -120,7 +120,7 @@ def test_what_does_not_fit_is_refused(refused: Callable[..., InputError]) -> Non
 @settings(max_examples=30)
 @given(SEEDS, KINDS)
 def test_a_line_from_inside_to_outside_crosses_an_odd_number_of_walls(seed: int, config: ArenaConfig) -> None:
-    """The walls that are touched and the space that is free are the same arena."""
+    """Wall segments and free space describe the same arena."""
     made = make_arena(config, seed)
     points = np.random.default_rng(seed).uniform(-0.2, config.side + 0.2, (40, 2, 2))
     crossings = segments_cross(points.reshape(-1, 4), wall_segments(made)).sum(axis=1)
@@ -130,7 +130,7 @@ def test_a_line_from_inside_to_outside_crosses_an_odd_number_of_walls(seed: int,
     assert (free <= is_enclosed(made, points)).all()
 
 
-def test_the_share_that_is_occupied_is_that_of_the_objects() -> None:
+def test_the_occupied_area_is_that_of_the_objects() -> None:
     made = make_arena(ArenaConfig(rotated=True), 2)
     axis = (np.arange(250) + 0.5) / 250 * 1.25
     cells = np.stack(np.meshgrid(axis, axis), axis=-1)
@@ -140,7 +140,7 @@ def test_the_share_that_is_occupied_is_that_of_the_objects() -> None:
 
 
 @given(SEEDS)
-def test_distances_are_those_of_the_nearest_point(seed: int) -> None:
+def test_segment_distance_is_that_of_the_nearest_point(seed: int) -> None:
     random = np.random.default_rng(seed)
     walls, points = random.uniform(-1, 1, (5, 4)), random.uniform(-1, 1, (7, 2))
     share = np.linspace(0, 1, 2001)[:, None, None]
@@ -151,7 +151,7 @@ def test_distances_are_those_of_the_nearest_point(seed: int) -> None:
 
 
 @given(SEEDS, st.floats(-10, 10))
-def test_squares_are_square_however_they_are_turned(seed: int, angle: float) -> None:
+def test_rotated_squares_stay_square(seed: int, angle: float) -> None:
     one = square(np.array([0.3, -0.2]), 0.4, angle)
     assert polygon_area(one) == pytest.approx(0.16)
     assert polygon_contains(one, np.array([0.3, -0.2]))
@@ -161,7 +161,7 @@ def test_squares_are_square_however_they_are_turned(seed: int, angle: float) -> 
     assert (polygon_contains(one, points) == (np.maximum(u, v) < 0.2)).all()
 
 
-def test_to_touch_is_not_to_cross() -> None:
+def test_touching_segments_do_not_cross() -> None:
     sides = polygon_edges(square(np.zeros(2), 1.0, 0.0))
     assert not segments_cross(sides, sides).any()
     assert segments_cross(sides, np.array([[0.0, 0.0, 2.0, 0.1]])).sum() == 1
@@ -169,7 +169,7 @@ def test_to_touch_is_not_to_cross() -> None:
 
 @settings(max_examples=20)
 @given(SEEDS, KINDS)
-def test_an_arena_survives_its_text(
+def test_an_arena_file_is_read_back_equal(
     tmp_path_factory: pytest.TempPathFactory, seed: int, config: ArenaConfig
 ) -> None:
     made = make_arena(config, seed)
@@ -181,7 +181,7 @@ def test_an_arena_survives_its_text(
     assert np.allclose(read.start, made.start)
 
 
-def test_a_text_says_what_stands_where(tmp_path: Path) -> None:
+def test_an_arena_file_gives_walls_objects_and_start(tmp_path: Path) -> None:
     path = tmp_path / "room.txt"
     path.write_text(GOOD)
     read = read_arena(path)
@@ -220,7 +220,7 @@ def test_a_text_says_what_stands_where(tmp_path: Path) -> None:
         (("start 1 1 90", "start inf 1 90"), "room.txt:6:7", "'inf'"),
     ],
 )
-def test_a_faulty_text_is_refused(
+def test_a_faulty_arena_file_is_refused(
     tmp_path: Path, change: tuple[str, str], where: str, said: str, refused: Callable[..., InputError]
 ) -> None:
     path = tmp_path / "room.txt"
@@ -229,7 +229,7 @@ def test_a_faulty_text_is_refused(
     refused(lambda: read_arena(path), where, said)
 
 
-def test_a_file_that_is_no_text_is_refused(tmp_path: Path, refused: Callable[..., InputError]) -> None:
+def test_a_binary_file_is_refused(tmp_path: Path, refused: Callable[..., InputError]) -> None:
     refused(lambda: read_arena(tmp_path / "none.txt"), "none.txt", "no such file")
     (tmp_path / "bytes.txt").write_bytes(b"\xff\xfe\x00")
     refused(lambda: read_arena(tmp_path / "bytes.txt"), "bytes.txt", "is not text")

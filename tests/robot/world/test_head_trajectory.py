@@ -1,4 +1,4 @@
-"""Paths: through every cell, at the given speed, varied as asked, carried where asked, backwards the same."""
+"""Head paths: route, speed, variation between visits, kidnaps, and reverse tracking."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def path_of(seed: int, word: str = "CA", **changes: object) -> HeadPath:
 
 
 @given(SEEDS)
-def test_without_jitter_the_head_goes_straight_from_middle_to_middle_and_looks_ahead(seed: int) -> None:
+def test_without_jitter_the_path_joins_cell_centres_and_faces_ahead(seed: int) -> None:
     path = path_of(seed, jitter=STEADY)
     way = circuit_route(random_loop(7, 5, 20, stream(seed, "maze.loop")), "CA")
     passed = path.pose[np.concatenate([[True], np.abs(np.diff(path.pose[:, :2], axis=0)).sum(axis=1) > 1e-9])]
@@ -42,8 +42,8 @@ def test_without_jitter_the_head_goes_straight_from_middle_to_middle_and_looks_a
 
 
 @given(SEEDS)
-def test_backwards_is_the_way_there_looked_at_the_other_way(seed: int) -> None:
-    """Going a way backwards looks at every place as coming the other way along it does."""
+def test_backwards_faces_against_the_direction_of_travel(seed: int) -> None:
+    """The headings are those of the opposite direction of travel."""
     way = circuit_route(random_loop(7, 5, 20, stream(seed, "maze.loop")), "A")
     there = plan_path(MotionConfig(jitter=STEADY), way, stream(seed, "motion"))
     back = plan_path(MotionConfig(jitter=STEADY, backwards=True), way[::-1], stream(seed, "motion"))
@@ -54,7 +54,7 @@ def test_backwards_is_the_way_there_looked_at_the_other_way(seed: int) -> None:
     assert np.allclose(wrap(one[:, 2] - other[:, 2]), 0, atol=1e-9)
 
 
-def test_visits_vary_as_asked() -> None:
+def test_visits_vary_by_the_configured_jitter() -> None:
     jitter = JitterConfig(position=0.005, yaw_deg=3.0, speed=0.1)
     path = path_of(0, "A" * 60, jitter=jitter)
     steady = path_of(0, "A" * 60, jitter=STEADY)
@@ -68,14 +68,14 @@ def test_visits_vary_as_asked() -> None:
 
 
 @given(SEEDS, st.integers(0, 1000))
-def test_a_path_follows_from_its_seed(seed: int, other: int) -> None:
+def test_a_path_depends_on_its_seed_only(seed: int, other: int) -> None:
     one, again = path_of(seed), path_of(seed)
     assert (one.pose == again.pose).all()
     if other != seed:
         assert path_of(other).pose.shape != one.pose.shape or (path_of(other).pose != one.pose).any()
 
 
-def test_time_only_goes_on_and_ends_are_kept() -> None:
+def test_time_increases_and_poses_are_clamped_to_the_ends() -> None:
     path = path_of(3)
     assert (np.diff(path.time) > 0).all()
     assert (poses_at(path, np.array([-5.0, 1e9])) == path.pose[[0, -1]]).all()
@@ -83,9 +83,7 @@ def test_time_only_goes_on_and_ends_are_kept() -> None:
 
 @settings(max_examples=40)
 @given(SEEDS, st.lists(st.floats(0.05, 0.7), min_size=1, max_size=4), st.floats(1.0, 30.0))
-def test_a_kidnapped_head_goes_on_from_where_it_would_have_been(
-    seed: int, shares: list[float], ahead: float
-) -> None:
+def test_a_kidnap_continues_at_the_later_pose(seed: int, shares: list[float], ahead: float) -> None:
     path = path_of(seed)
     when = [share * path.duration for share in shares]
     there, jumps = add_kidnaps(path, when, ahead)
@@ -99,7 +97,7 @@ def test_a_kidnapped_head_goes_on_from_where_it_would_have_been(
     assert np.allclose(poses_at(there, time)[away], poses_at(path, time + skipped)[away], atol=1e-9)
 
 
-def test_who_is_carried_past_the_end_has_arrived() -> None:
+def test_a_kidnap_beyond_the_end_ends_the_path() -> None:
     path = path_of(0)
     there, jumps = add_kidnaps(path, [path.duration - 10.0], 45.0)
     assert there.duration == pytest.approx(path.duration - 10.0)

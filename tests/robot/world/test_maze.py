@@ -1,4 +1,4 @@
-"""Mazes: loops are single and closed, walls stand where they were put, text files come back as they were."""
+"""Mazes: random loops, walls as boxes, and the file format."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_seeds_differ() -> None:
 @pytest.mark.parametrize(
     ("columns", "rows", "length"), [(7, 5, 21), (7, 5, 2), (3, 3, 10), (7, 5, 36), (5, 1, 4)]
 )
-def test_a_loop_that_cannot_be_is_refused(
+def test_an_impossible_loop_length_is_refused(
     columns: int, rows: int, length: int, refused: Callable[..., InputError]
 ) -> None:
     refused(
@@ -68,7 +68,7 @@ def test_a_loop_that_cannot_be_is_refused(
 
 
 @given(SEEDS)
-def test_the_loop_is_open_and_the_rest_is_walled_in(seed: int) -> None:
+def test_the_loop_is_open_and_the_outer_wall_closed(seed: int) -> None:
     loop = random_loop(7, 5, 20, stream(seed, "maze.loop"))
     maze = random_maze(7, 5, loop, 1.0, stream(seed, "maze.walls"))
     assert maze.across[[0, -1]].all()
@@ -80,7 +80,7 @@ def test_the_loop_is_open_and_the_rest_is_walled_in(seed: int) -> None:
     assert bare.across.sum() + bare.along.sum() == 2 * 7 + 2 * 5
 
 
-def test_the_share_of_walls_is_as_asked() -> None:
+def test_the_share_of_walls_is_configurable() -> None:
     mazes = [made(seed, share=0.6) for seed in range(60)]
     inner = np.concatenate([maze.across[1:-1].ravel() for maze in mazes])
     # 10 of the 20 openings of a loop, about, are in the 28 walls that run across.
@@ -88,7 +88,7 @@ def test_the_share_of_walls_is_as_asked() -> None:
 
 
 @given(SEEDS, st.floats(0, 1), st.sampled_from([(7, 5), (12, 8), (2, 2)]))
-def test_a_maze_survives_its_text(
+def test_a_maze_file_is_read_back_equal(
     tmp_path_factory: pytest.TempPathFactory, seed: int, share: float, size: tuple[int, int]
 ) -> None:
     maze = made(seed, *size, length=4, share=share)
@@ -105,7 +105,7 @@ def test_a_maze_survives_its_text(
         assert (read.along == maze.along).all()
 
 
-def test_a_text_is_read_from_the_north(tmp_path: Path) -> None:
+def test_the_first_line_of_a_maze_file_is_the_north_wall(tmp_path: Path) -> None:
     (tmp_path / "maze.txt").write_text("o---o---o\n|     S |\no   o---o\n|   | G |\no---o---o\n")
     maze = read_maze(tmp_path / "maze.txt")
     assert is_open(maze, (0, 1), (1, 1))
@@ -127,7 +127,7 @@ def test_a_text_is_read_from_the_north(tmp_path: Path) -> None:
         (("\no   o", ""), "maze.txt", "4 columns + 1"),
     ],
 )
-def test_a_faulty_text_is_refused(
+def test_a_faulty_maze_file_is_refused(
     tmp_path: Path, change: tuple[str, str], where: str, said: str, refused: Callable[..., InputError]
 ) -> None:
     good = "\n\no---o---o\n|   |   |\no   o---o\n|   |   |\no---o---o\n"
@@ -138,7 +138,7 @@ def test_a_faulty_text_is_refused(
     refused(lambda: read_maze(path), where, said)
 
 
-def test_a_file_that_is_no_text_is_refused(tmp_path: Path, refused: Callable[..., InputError]) -> None:
+def test_a_binary_file_is_refused(tmp_path: Path, refused: Callable[..., InputError]) -> None:
     refused(lambda: read_maze(tmp_path / "none.txt"), "none.txt", "cannot be read")
     (tmp_path / "bytes.txt").write_bytes(b"\xff\xfe\x00")
     refused(lambda: read_maze(tmp_path / "bytes.txt"), "bytes.txt", "cannot be read")
@@ -147,7 +147,7 @@ def test_a_file_that_is_no_text_is_refused(tmp_path: Path, refused: Callable[...
 
 
 @given(SEEDS)
-def test_boxes_stand_where_the_maze_has_walls(seed: int) -> None:
+def test_boxes_are_at_the_walls_of_the_maze(seed: int) -> None:
     maze = made(seed)
     boxes = wall_boxes(maze, stream(seed, "maze.heights"))
     posts = 8 * 6

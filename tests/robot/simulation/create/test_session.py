@@ -1,4 +1,4 @@
-"""Sessions of the Create: same seed, same bits; parts that do not disturb each other; the paper's counts."""
+"""Simulated sessions of the Create: reproducibility, independent random streams, the paper's statistics."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def bits(source: Source) -> list[list[bytes]]:
     return [list(leaves(sample)) for sample in source]
 
 
-def test_a_session_has_the_same_bits_every_time() -> None:
+def test_a_session_is_bit_identical_for_the_same_settings() -> None:
     one = made()
     assert isinstance(one, Source)
     with one as source:
@@ -83,7 +83,7 @@ def test_streams_are_independent() -> None:
     assert (one.odometry[:20] != two.odometry[:20]).any()
 
 
-def test_the_digest_tells_what_was_asked_for(tmp_path: Path) -> None:
+def test_the_digest_depends_on_the_configuration(tmp_path: Path) -> None:
     base = made()
     path, again = tmp_path / "room.txt", tmp_path / "copy.txt"
     room = base.arena._replace(objects=base.arena.objects[1:])
@@ -99,7 +99,7 @@ def test_the_digest_tells_what_was_asked_for(tmp_path: Path) -> None:
     assert arena_text(filed.arena) == arena_text(room)
 
 
-def test_a_session_is_what_its_samples_say() -> None:
+def test_samples_agree_with_the_session() -> None:
     simulation = session(0)
     samples = list(simulation)
     assert len(samples) == simulation.length
@@ -134,7 +134,7 @@ def test_a_session_is_what_its_samples_say() -> None:
     assert not next(iter(simulation)).reading.contact.all()
 
 
-def test_without_noise_odometry_leads_along_the_truth() -> None:
+def test_odometry_without_noise_integrates_to_the_truth() -> None:
     simulation = made(wheels={"noise": "none"})
     pose = simulation.arena.start
     for sample in simulation:
@@ -144,7 +144,7 @@ def test_without_noise_odometry_leads_along_the_truth() -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_machine_goes_its_way(seed: int) -> None:
+def test_the_steps_follow_the_state_machine(seed: int) -> None:
     """Forward until contact, on slowly, back, a turn, forward; moments are told where they belong."""
     simulation = session(seed)
     state, moment, contact = (column(simulation, name) for name in ("state", "moment", "contact"))
@@ -180,7 +180,7 @@ def test_the_body_stays_out_of_walls(seed: int, side: float) -> None:
     assert room > 0.17 - 0.05 * 0.01 - 1e-6  # one look's way
 
 
-def test_six_minutes_are_as_in_the_paper() -> None:
+def test_six_minutes_have_the_statistics_of_the_paper() -> None:
     """About 30 contacts and more, 3 to 4 circuits, anticlockwise, not all of them with a second contact."""
     counts = []
     for seed in range(12):
@@ -208,7 +208,7 @@ def test_six_minutes_are_as_in_the_paper() -> None:
     assert stuck.max() < 60
 
 
-def test_whiskers_that_are_dead_never_report() -> None:
+def test_dead_whiskers_never_report() -> None:
     simulation = made(whiskers={"dead": [0, 3]})
     assert not column(simulation, "contact")[:, [0, 3]].any()
     assert (next(iter(simulation)).reading.alive == [False, True, True, False]).all()
@@ -228,7 +228,7 @@ def settled(report: Report) -> np.ndarray:
 
 
 @pytest.mark.parametrize("angle", range(20, 161, 10))
-def test_a_wall_is_first_felt_where_it_is(angle: int) -> None:
+def test_first_contact_with_a_wall_is_at_its_position(angle: int) -> None:
     report = into(angle)
     assert report.strain.shape == (4000, 4, 2)
     assert (report.odometry.dx, report.odometry.dt) == (0.04, 2.0)
@@ -246,7 +246,7 @@ def test_a_wall_is_first_felt_where_it_is(angle: int) -> None:
 
 
 @pytest.mark.parametrize("angle", [25, 50, 75])
-def test_walls_to_the_left_are_felt_as_those_to_the_right(angle: int) -> None:
+def test_walls_on_the_left_mirror_those_on_the_right(angle: int) -> None:
     calm = {"noise": 0.0, "shake": {"start": 0.0, "rumble": 0.0}}
     right, left = into(angle, whiskers=calm), into(180 - angle, whiskers=calm)
     assert np.allclose(right.strain[..., 0], -left.strain[:, ::-1, 0], atol=1e-9)
@@ -256,7 +256,7 @@ def test_walls_to_the_left_are_felt_as_those_to_the_right(angle: int) -> None:
     assert (even <= 1e-12).all()
 
 
-def test_repeats_differ_and_angles_differ_more() -> None:
+def test_repeats_differ_less_than_angles() -> None:
     same = np.abs(settled(into(60, 1)) - settled(into(60, 2))).max()
     other = np.abs(settled(into(60, 1)) - settled(into(80, 2))).max()
     assert 0 < same < 0.1 * other

@@ -1,4 +1,4 @@
-"""The state machine: what follows what, how far it turns, and what ends a motion, the first thing first."""
+"""The state machine: transitions, turn angles, and how motions end."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def end_of(
         (CreateState.TURN, StepEnd.ABORT, CreateState.BACK),
     ],
 )
-def test_what_follows_what(state: CreateState, moment: StepEnd, then: CreateState) -> None:
+def test_transitions(state: CreateState, moment: StepEnd, then: CreateState) -> None:
     doing = next_state(CONFIG, MachineState(state), moment, 0.0, stream(0, "behaviour"))
     assert doing.state == then
     assert (doing.rest != 0) == (then == CreateState.TURN)
@@ -82,7 +82,7 @@ def test_a_turn_can_be_one_step() -> None:
     assert told == WheelCommand(0.0, -0.3, pytest.approx(4.0))
 
 
-def test_speeds_and_times_are_the_papers() -> None:
+def test_speeds_and_durations_are_those_of_the_paper() -> None:
     assert wheel_command(CONFIG, MachineState(CreateState.FWD1)) == (0.05, 0.0, 0.5)
     assert wheel_command(CONFIG, MachineState(CreateState.BACK)) == (-0.05, 0.0, 0.5)
     assert wheel_command(CONFIG, MachineState(CreateState.FWD2))[:2] == (0.02, 0.0)
@@ -118,7 +118,7 @@ def test_an_undisturbed_motion_ends_as_planned() -> None:
 
 
 @given(st.integers(0, ROWS - 2), st.integers(0, ROWS - 2), st.integers(0, ROWS - 2), st.sampled_from([-1, 1]))
-def test_the_first_thing_ends_it(touch: int, over: int, bump: int, sign: int) -> None:
+def test_the_earliest_cause_ends_a_motion(touch: int, over: int, bump: int, sign: int) -> None:
     strain = quiet()
     strain[touch:, 1, 0] = sign * 1.5 * CONFIG.contact
     strain[over:, 2, 0] = sign * 1.5 * CONFIG.safety
@@ -130,7 +130,7 @@ def test_the_first_thing_ends_it(touch: int, over: int, bump: int, sign: int) ->
 
 
 @given(st.integers(0, 3), st.integers(0, 3), st.integers(10, ROWS - 2))
-def test_a_second_whisker_is_another_one(first: int, second: int, row: int) -> None:
+def test_a_second_contact_needs_another_whisker(first: int, second: int, row: int) -> None:
     strain, before = quiet(), NONE.copy()
     before[first] = True
     strain[:, first, 0] = 2 * CONFIG.contact
@@ -144,21 +144,21 @@ def test_a_second_whisker_is_another_one(first: int, second: int, row: int) -> N
     assert end_of(CreateState.FWD2, strain, before=before) == expected
 
 
-def test_two_whiskers_at_once_are_felt_for_a_while() -> None:
+def test_two_simultaneous_contacts_last_the_shortest_fwd2() -> None:
     before = np.array([False, True, True, False])
     row, moment = end_of(CreateState.FWD2, quiet(), before=before)
     assert moment == StepEnd.HIT2
     assert row == round(CONFIG.least / CONFIG.period)
 
 
-def test_too_much_in_either_channel_ends_it() -> None:
+def test_excessive_strain_in_either_channel_aborts() -> None:
     for channel in (0, 1):
         strain = quiet()
         strain[7:, 3, channel] = -1.1 * CONFIG.safety
         assert end_of(CreateState.FWD2, strain) == (7, StepEnd.ABORT)
 
 
-def test_a_turn_may_get_a_whisker_out_of_what_it_is_in() -> None:
+def test_a_turn_may_release_a_strained_whisker() -> None:
     strain = quiet()
     strain[:, 1, 0] = np.linspace(2.0, 0.5, ROWS) * CONFIG.safety
     assert end_of(CreateState.TURN, strain) == (ROWS - 1, StepEnd.FREE)
@@ -182,6 +182,6 @@ def test_motions_are_straight_or_on_the_spot(
 
 
 @pytest.mark.parametrize("changes", [{"contact": 3e-3}, {"period": 0.6}, {"least": 2.0}, {"safety": 0.0}])
-def test_a_machine_that_cannot_work_is_refused(changes: dict[str, float]) -> None:
+def test_contradicting_settings_are_refused(changes: dict[str, float]) -> None:
     with pytest.raises(ValidationError):
         BehaviourConfig.model_validate(changes)

@@ -1,4 +1,4 @@
-"""Whiskers among walls: bent no more than they must be, never through anything, and felt as beams are."""
+"""Whiskers among walls: geometry of bending, beam theory, and strain sensors."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def lines(poses: np.ndarray, turn: np.ndarray, reach: np.ndarray) -> np.ndarray:
 
 @settings(max_examples=20)
 @given(SEEDS)
-def test_whiskers_are_bent_where_they_would_enter_walls(seed: int) -> None:
+def test_whiskers_bend_only_where_they_would_enter_walls(seed: int) -> None:
     made, poses = placed(seed)
     walls, felt = wall_segments(made), each(poses, wall_segments(made))
     straight = lines(poses, np.zeros((len(poses), 4)), np.full((len(poses), 4), LENGTH))
@@ -81,8 +81,8 @@ def test_a_bent_whisker_touches_a_wall_and_enters_none(seed: int) -> None:
 
 @settings(max_examples=20)
 @given(SEEDS)
-def test_it_gives_way_by_the_least_turn(seed: int) -> None:
-    """With any lesser turn, to either side, the straight shaft would be in a wall; with more it would not."""
+def test_a_whisker_turns_by_the_smallest_free_angle(seed: int) -> None:
+    """With a smaller turn to either side the straight shaft would be in a wall."""
     made, poses = placed(seed)
     walls, felt = wall_segments(made), each(poses, wall_segments(made))
     held, whole = felt.turn != 0, np.full(felt.turn.shape, LENGTH)
@@ -103,7 +103,7 @@ def flat(felt: Bending) -> np.ndarray:
 
 @settings(max_examples=15)
 @given(SEEDS, *[st.floats(-3, 3)] * 3)
-def test_it_does_not_matter_where_the_world_is(seed: int, x: float, y: float, angle: float) -> None:
+def test_bending_does_not_depend_on_the_origin(seed: int, x: float, y: float, angle: float) -> None:
     made, poses = placed(seed)
     c, s = np.cos(angle), np.sin(angle)
     turn = np.array([[c, -s], [s, c]])
@@ -116,7 +116,7 @@ def test_it_does_not_matter_where_the_world_is(seed: int, x: float, y: float, an
 
 @settings(max_examples=15)
 @given(SEEDS)
-def test_a_mirrored_world_is_felt_mirrored(seed: int) -> None:
+def test_mirrored_walls_give_mirrored_bending(seed: int) -> None:
     made, poses = placed(seed)
     mirror = np.array([1.0, -1.0])
     walls = (wall_segments(made).reshape(-1, 2) * mirror).reshape(-1, 4)
@@ -129,8 +129,8 @@ def test_a_mirrored_world_is_felt_mirrored(seed: int) -> None:
 
 @settings(max_examples=20)
 @given(SEEDS, st.integers(1, 58))
-def test_a_motion_can_be_cut_anywhere(seed: int, cut: int) -> None:
-    """To which side whiskers are bent is all that the past says."""
+def test_a_motion_may_be_computed_in_parts(seed: int, cut: int) -> None:
+    """The bending side is the only state."""
     made, poses = placed(seed)
     assume(len(poses) > 0)
     way = poses[0] + np.linspace(0, 1, 60)[:, None] * [0.03, -0.02, 1.5]
@@ -141,7 +141,7 @@ def test_a_motion_can_be_cut_anywhere(seed: int, cut: int) -> None:
         assert (column == np.concatenate([one, two])).all()
 
 
-def test_a_whisker_keeps_to_its_side() -> None:
+def test_a_whisker_stays_on_its_side() -> None:
     """Pushed straight against a wall that then tips the other way."""
     base, direction = np.zeros((40, 1, 2)), np.zeros((40, 1))
     tips = np.radians(np.linspace(85, 95, 40))
@@ -165,7 +165,7 @@ def test_a_whisker_keeps_to_its_side() -> None:
     assert bend_shafts(FAN.shaft, base[:1], -np.full((1, 1), 0.1), wall, np.zeros(1, int)).side[0, 0] == -1
 
 
-def test_a_tip_slides_a_shaft_lies_flat_and_a_corner_is_slipped_off() -> None:
+def test_contact_with_a_tip_a_shaft_and_a_corner() -> None:
     wall = np.array([[-1.0, 0.0, 1.0, 0.0]])
     height = np.linspace(0.0999, 0.02, 400)  # of the base above the wall, seen at 45 degrees
     base = np.stack([np.zeros(400), height], axis=1)[:, None]
@@ -202,7 +202,7 @@ def test_a_tip_slides_a_shaft_lies_flat_and_a_corner_is_slipped_off() -> None:
     assert turn[rows[-1] + 1] == 0
 
 
-def test_a_wall_out_of_reach_is_not_felt() -> None:
+def test_a_wall_out_of_reach_bends_no_whisker() -> None:
     wall = np.array([[0.0, 0.5, 1.0, 0.5]])
     felt = bend_whiskers(FAN, np.zeros((3, 3)), wall, FREE)
     for column, value in zip(felt, (0.0, LENGTH, 0.0, 0), strict=True):
@@ -231,13 +231,13 @@ def test_moments_are_those_of_a_tapered_beam(reach: float, taper: float) -> None
 
 
 @given(st.floats(0.1, 1.0))
-def test_the_sense_of_touch_knows_the_same_beam(share: float) -> None:
+def test_wall_estimation_uses_the_same_beam_model(share: float) -> None:
     config = ShaftConfig(taper=0.3 / 1.45)
     mine = base_strain(FAN.shaft, np.array([1.0, 1.0]), LENGTH * np.array([share, config.reference]))
     assert mine[0] / mine[1] == pytest.approx(float(stiffness(config, share)))
 
 
-def test_horizontal_strain_tells_the_side_and_vertical_the_slant() -> None:
+def test_horizontal_strain_has_the_side_and_vertical_strain_the_slant() -> None:
     wall = np.array([[-1.0, 0.0, 1.0, 0.0]])
 
     def felt(angle: float) -> np.ndarray:
@@ -253,7 +253,7 @@ def test_horizontal_strain_tells_the_side_and_vertical_the_slant() -> None:
     assert abs(steep[1]) < abs(steep[0])
 
 
-def test_dead_whiskers_feel_nothing() -> None:
+def test_dead_whiskers_have_no_strain() -> None:
     config = WhiskersConfig(dead=(1, 2))
     one = fixed_whiskers(config)
     felt = bend_whiskers(one, np.zeros((5, 3)), np.array([[0.25, -1.0, 0.25, 1.0]]), FREE)
@@ -265,7 +265,7 @@ def test_dead_whiskers_feel_nothing() -> None:
     assert (read[:, [0, 3]] != 1).all()
 
 
-def test_the_body_shakes_at_its_frequency_and_calms_down() -> None:
+def test_body_vibration_has_its_frequency_and_decays() -> None:
     config = ShakeConfig()
     shakes = np.array([body_vibration(config, 4000, 2000.0, stream(seed, "strain")) for seed in range(60)])
     power = (np.abs(np.fft.rfft(shakes, axis=1)) ** 2).mean(axis=(0, 2))
@@ -278,7 +278,7 @@ def test_the_body_shakes_at_its_frequency_and_calms_down() -> None:
     assert body_vibration(config, 0, 2000.0, stream(0, "strain")).shape == (0, 2)
 
 
-def test_sensors_add_the_noise_that_was_asked_for() -> None:
+def test_sensor_noise_has_the_configured_level() -> None:
     calm = CONFIG.model_copy(update={"shake": ShakeConfig(start=0.0, rumble=0.0)})
     true = np.linspace(0, 1e-3, 3000)[:, None, None] * np.ones((1, 4, 2))
     error = sample_strain(calm, true, FAN.alive, stream(0, "strain")) - true
@@ -295,6 +295,6 @@ def test_sensors_add_the_noise_that_was_asked_for() -> None:
 @pytest.mark.parametrize(
     "changes", [{"dead": (4,)}, {"tip_diameter": 2e-3}, {"mounts": ()}, {"length": 0.0}, {"droop_deg": 45.0}]
 )
-def test_whiskers_that_cannot_be_are_refused(changes: dict[str, object]) -> None:
+def test_impossible_whiskers_are_refused(changes: dict[str, object]) -> None:
     with pytest.raises(ValidationError):
         WhiskersConfig.model_validate(changes)

@@ -1,4 +1,4 @@
-"""The Create's touch on simulated drives: templates of walls, and how well walls are known in new arenas."""
+"""Wall estimation on simulated drives of the Create: strain templates, and accuracy in unseen arenas."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def direction(point: np.ndarray) -> float:
 
 
 def slow(drive: Report, seconds: float) -> tuple[Report, Report]:
-    """A training drive as the state machine would have reported it, ended after so long."""
+    """A training drive as two reports of the state machine, the second one of this duration (s)."""
     count = round(seconds * CONFIG.whiskers.rate)
     first = int(np.abs(drive.strain[:20, :, 0].mean(axis=0)).argmax())
     contact = np.arange(4) == first
@@ -63,8 +63,8 @@ def slow(drive: Report, seconds: float) -> tuple[Report, Report]:
     )
 
 
-def test_held_out_walls_are_known_to_a_few_degrees(templates: StrainTemplates) -> None:
-    """At every angle, those between templates too."""
+def test_held_out_walls_are_estimated_to_a_few_degrees(templates: StrainTemplates) -> None:
+    """Also at angles between those of the templates."""
     random, reporting, off, raw = (
         stream(9, "held out"),
         ReportFrontend(ReportFrontendConfig(), templates),
@@ -105,7 +105,7 @@ CONFIGS = {
 
 
 def scored(templates: StrainTemplates, side: float) -> dict[str, Score]:
-    """How well each way knows walls in unseen arenas. The true one is nearest to the contact of HIT1."""
+    """Accuracy of each estimator in unseen arenas. The true wall is nearest to the contact of HIT1."""
     meetings = 0
     off: dict[str, list[float]] = {name: [] for name in CONFIGS}
     for seed in ARENAS:
@@ -136,7 +136,7 @@ def scored(templates: StrainTemplates, side: float) -> dict[str, Score]:
 
 
 @pytest.mark.parametrize("side", [1.25, 2.5])
-def test_walls_are_known_in_unseen_arenas(side: float, templates: StrainTemplates) -> None:
+def test_walls_are_estimated_in_unseen_arenas(side: float, templates: StrainTemplates) -> None:
     scores = scored(templates, side)
     print(f"\n{side:g} m     accepted  mean error  over 15 degrees")
     for name, score in scores.items():
@@ -145,5 +145,5 @@ def test_walls_are_known_in_unseen_arenas(side: float, templates: StrainTemplate
     assert fused.accepted > 0.6
     assert fused.mean < 5
     assert fused.far <= 0.04
-    # The paper's ways to tell know of walls worse, at corners above all.
+    # The estimators of the paper are less accurate, above all at corners.
     assert all(score.mean > fused.mean and score.far > 2 * fused.far for score in scores.values())

@@ -1,4 +1,4 @@
-"""Wheel odometry: each structure of noise does what its name says."""
+"""Wheel odometry errors: statistics of each kind of noise."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def driven(count: int) -> tuple[np.ndarray, np.ndarray]:
 def scales(
     noise: str, count: int = 3000, seed: int = 0, level: float = 0.05
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Told over true, of what moves in each step, and the kinds."""
+    """Measured over true motion of each step, and its kind."""
     motion, kind = driven(count)
     told = simulate_wheel_odometry(
         WheelsConfig(noise=noise, level=level), motion, kind, stream(seed, "wheels")
@@ -39,7 +39,7 @@ def scales(
 
 
 @given(st.integers(0, 10**6), st.sampled_from(KINDS))
-def test_only_what_moves_is_told_wrong(seed: int, noise: str) -> None:
+def test_only_moving_parts_have_errors(seed: int, noise: str) -> None:
     motion, kind = driven(40)
     config = WheelsConfig(noise=noise)
     told = simulate_wheel_odometry(config, motion, kind, stream(seed, "wheels"))
@@ -51,7 +51,7 @@ def test_only_what_moves_is_told_wrong(seed: int, noise: str) -> None:
     assert (motion == driven(40)[0]).all()
 
 
-def test_without_noise_it_is_the_truth() -> None:
+def test_without_noise_odometry_is_the_truth() -> None:
     motion, kind = driven(30)
     for config in (WheelsConfig(noise="none"), WheelsConfig(noise="move", level=0.0)):
         assert (simulate_wheel_odometry(config, motion, kind, stream(0, "wheels")) == motion).all()
@@ -67,7 +67,7 @@ def test_white_noise_is_of_its_level_and_independent() -> None:
     assert np.allclose(doubled - 1, 2 * (scale - 1))
 
 
-def test_one_error_lasts_a_move() -> None:
+def test_an_error_lasts_one_straight_or_turn() -> None:
     scale, kind = scales("move")
     same = kind[1:] == kind[:-1]
     assert np.allclose(scale[1:][same], scale[:-1][same])
@@ -75,7 +75,7 @@ def test_one_error_lasts_a_move() -> None:
     assert scale[1:][~same].std() == pytest.approx(0.05, rel=0.1)
 
 
-def test_a_bias_lasts_the_run() -> None:
+def test_a_bias_lasts_the_session() -> None:
     lengths, turns = [], []
     for seed in range(300):
         scale, kind = scales("bias", 200, seed)

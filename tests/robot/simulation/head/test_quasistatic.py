@@ -1,4 +1,4 @@
-"""The resumable loop of the quasistatic tier: in any parts, the same bits."""
+"""A quasistatic cycle may be simulated in any parts, with bit-identical results."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from robot.simulation.head.beam import StreamConfig
 from robot.simulation.head.kinematic import MechanicsConfig
 from robot.simulation.head.quasistatic import advance_balance, simulate_quasistatic, whiskers_at_rest
-from robot.simulation.head.whisk_stream import WallSweep
+from robot.simulation.head.whisk_stream import HeadSetup, WallSweep
 from robot.world.walls import NO_CONTACT
 from tactile.base.random_streams import stream
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
@@ -39,7 +39,7 @@ def part(whole: WallSweep, some: slice) -> WallSweep:
 @given(
     st.lists(st.integers(1, SAMPLES - 1), max_size=6, unique=True), st.sampled_from(["open", "rcp", "spread"])
 )
-def test_a_cycle_in_parts_is_the_cycle(cuts: list[int], mode: str) -> None:
+def test_a_cycle_simulated_in_parts_equals_the_whole(cuts: list[int], mode: str) -> None:
     config, mechanics, whole = StreamConfig(rate=SAMPLES), MechanicsConfig(slip=0.1), sweep()
     whisking, threshold = WhiskingConfig(mode=mode), np.full(18, 0.04)
 
@@ -51,14 +51,14 @@ def test_a_cycle_in_parts_is_the_cycle(cuts: list[int], mode: str) -> None:
     for first, last in itertools.pairwise(ends):
         found, balance = advance_balance(config, mechanics, law, part(whole, slice(first, last)), balance)
         parts.append(found)
-    once = simulate_quasistatic(config, mechanics, whisking, HEAD, whole, threshold)
+    once = simulate_quasistatic(HeadSetup(HEAD, config, mechanics, whisking), whole, threshold)
     assert (once[2] > 0).any()
     assert balance.slipped.any()
     for k, column in enumerate(once):
         assert np.array_equal(np.concatenate([found[k] for found in parts]), column)
 
 
-def test_a_beginning_is_not_used_up() -> None:
+def test_a_state_can_be_continued_twice() -> None:
     config, mechanics, whole = StreamConfig(rate=SAMPLES), MechanicsConfig(slip=0.1), sweep()
     whisking = WhiskingConfig(mode="open")
 

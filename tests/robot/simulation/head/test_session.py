@@ -1,4 +1,4 @@
-"""Simulated sessions: same seed, same bits; parts that do not disturb each other; faults named."""
+"""Simulated sessions of the head: reproducibility, independent random streams, refused settings."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def bits(source: Source) -> list[list[bytes]]:
     return [list(leaves(sample)) for sample in source]
 
 
-def test_a_session_has_the_same_bits_every_time() -> None:
+def test_a_session_is_bit_identical_for_the_same_settings() -> None:
     one = made()
     assert isinstance(one, Source)
     with one as source:
@@ -60,7 +60,7 @@ def test_a_session_has_the_same_bits_every_time() -> None:
     assert bits(other)[:50] != first[:50]
 
 
-def test_the_digest_tells_what_was_asked_for(tmp_path: Path) -> None:
+def test_the_digest_depends_on_the_configuration(tmp_path: Path) -> None:
     maze = tmp_path / "maze.txt"
     maze.write_text(maze_text(made().scene.maze))
     loop = made().scene.loop
@@ -81,7 +81,7 @@ def test_the_digest_tells_what_was_asked_for(tmp_path: Path) -> None:
 
 
 def test_streams_are_independent() -> None:
-    """Another odometry leaves what whiskers felt as it was, another sensor the odometry, and so on."""
+    """Other odometry errors leave contacts unchanged, another sensor the odometry, and so on."""
     base = made()
     other = made(odometry={"noise": "white"})
     assert (base.odometry != other.odometry).any()
@@ -104,7 +104,7 @@ def test_one_maze_can_have_many_sessions() -> None:
     assert (one.odometry[:99] != two.odometry[:99]).any()
 
 
-def test_a_session_is_what_its_samples_say() -> None:
+def test_samples_agree_with_the_session() -> None:
     session = made()
     samples = list(session)
     assert len(samples) == session.length
@@ -133,7 +133,7 @@ def test_twice_the_rate_is_twice_the_whisks() -> None:
     assert twice.time[0] == 0.125
 
 
-def test_a_session_backwards_sees_the_same_places_from_the_same_side() -> None:
+def test_reverse_tracking_senses_the_same_places() -> None:
     steady, calm = {"jitter": {"position": 0, "yaw_deg": 0}}, {"noise": "none"}
     quiet = {"noise": 0.0, "reach_noise": 0.0}
     there = made(path={"circuits": "C"}, motion=steady, odometry=calm, mechanics=quiet)
@@ -166,7 +166,7 @@ def test_kidnaps_are_spread_and_hidden_from_odometry() -> None:
     assert made().kidnapped.sum() == 0
 
 
-def test_later_another_maze_is_felt() -> None:
+def test_a_later_maze_changes_contacts() -> None:
     base, control = made(), made(later_maze=0.5)
     half = base.length // 2
     for one, two in zip(base.features, control.features, strict=True):
@@ -176,7 +176,7 @@ def test_later_another_maze_is_felt() -> None:
     assert (base.odometry == control.odometry).all()
 
 
-def test_exploration_lasts_as_long_as_asked() -> None:
+def test_exploration_has_the_configured_duration() -> None:
     session = made(path={"explore": 400.0})
     assert session.length == 400
     cells = {tuple(cell) for cell in np.floor(session.truth[:, :2] / CELL_SIDE).astype(int)}
@@ -187,7 +187,7 @@ def test_exploration_lasts_as_long_as_asked() -> None:
     assert made(path={"explore": 400.0}, seed=1).truth[-1].tolist() != session.truth[-1].tolist()
 
 
-def test_given_cells_are_gone_through(tmp_path: Path) -> None:
+def test_given_cells_are_visited(tmp_path: Path) -> None:
     (tmp_path / "maze.txt").write_text("o---o---o\n|       |\no   o   o\n|   |   |\no---o---o\n")
     cells = [(0, 0), (0, 1), (1, 1), (1, 0)]
     session = made(maze={"file": tmp_path / "maze.txt"}, path={"cells": cells})
@@ -242,7 +242,7 @@ LOW = HeadConfig(rings=(RingConfig(length=0.16, radius=0.045, height=0.07),), re
         ),
     ],
 )
-def test_what_cannot_be_simulated_is_named(
+def test_impossible_settings_are_refused(
     changes: dict[str, Any],
     head: HeadConfig | None,
     said: list[str],
@@ -255,8 +255,8 @@ def test_what_cannot_be_simulated_is_named(
     refused(lambda: HeadSimulation(config, head), *said)
 
 
-def test_a_low_head_may_go_where_its_whiskers_are_free(tmp_path: Path) -> None:
-    """Whiskers at rest under the tops of the walls are no fault where no wall is near."""
+def test_a_low_head_may_move_where_its_whiskers_are_free(tmp_path: Path) -> None:
+    """Whiskers at rest below the tops of walls are allowed where no wall is near."""
     wide = "o" + "---o" * 6 + "\n" + "\n".join(["|" + " " * 23 + "|", "o" + "   o" * 6] * 5)
     drawing = wide + "\n|" + " " * 23 + "|\no" + "---o" * 6 + "\n"
     (tmp_path / "maze.txt").write_text(drawing.replace("   o" * 6 + "\n|", "   o" * 6 + "\n|"))
@@ -268,18 +268,18 @@ def test_a_low_head_may_go_where_its_whiskers_are_free(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "path", [{"circuits": ""}, {"explore": 5.0, "cells": LOOP}, {"circuits": "CA", "explore": 5.0}]
 )
-def test_one_way_is_asked_for(path: dict[str, Any]) -> None:
+def test_exactly_one_kind_of_route_is_given(path: dict[str, Any]) -> None:
     with pytest.raises(ValidationError, match="give exactly one"):
         SimulationConfig.model_validate({"path": path})
 
 
-def test_a_configuration_written_out_asks_for_the_same() -> None:
+def test_a_dumped_configuration_is_read_back_equal() -> None:
     for path in ({"explore": 5.0}, {"cells": LOOP}, {"circuits": "A"}, {}):
         config = SimulationConfig.model_validate({"path": path})
         assert SimulationConfig.model_validate(config.model_dump(mode="json")) == config
 
 
-def test_the_cheapest_tier_that_serves_is_taken() -> None:
+def test_auto_chooses_the_cheapest_sufficient_tier() -> None:
     assert choose_tier(SimulationConfig()).name == "kinematic"
     assert choose_tier(SimulationConfig(raw=True)).name == "quasistatic"
     assert choose_tier(SimulationConfig(fidelity="dynamic")).name == "dynamic"
@@ -287,7 +287,7 @@ def test_the_cheapest_tier_that_serves_is_taken() -> None:
 
 
 @pytest.mark.parametrize("name", ["quasistatic", "dynamic"])
-def test_raw_sessions_have_the_same_bits_every_time_and_feel_what_the_others_do(name: str) -> None:
+def test_raw_sessions_are_bit_identical_and_agree_with_the_kinematic_tier(name: str) -> None:
     changes: dict[str, Any] = {"path": {"explore": 20.0}, "fidelity": name, "mechanics": {"noise": 1e-3}}
     raw = made(**changes)
     first = bits(raw)
@@ -310,7 +310,7 @@ def test_raw_sessions_have_the_same_bits_every_time_and_feel_what_the_others_do(
 
 
 @pytest.mark.parametrize(("radial", "raw"), list(product([False, True], repeat=2)))
-def test_a_recorded_session_is_the_session(radial: bool, raw: bool, tmp_path: Path) -> None:
+def test_a_recorded_session_equals_the_session(radial: bool, raw: bool, tmp_path: Path) -> None:
     head = HeadConfig(dead=(2,), rest_deg=70.0)
     session = made(head, raw=raw, path={"explore": 6.0 if raw else 60.0})
     record_source(session, tmp_path / "a.mcap")
@@ -330,7 +330,7 @@ def test_a_recorded_session_is_the_session(radial: bool, raw: bool, tmp_path: Pa
     assert open_touch_source(seen[0], touch) is seen[0]
 
 
-def test_a_session_in_memory_is_the_session() -> None:
+def test_a_session_in_memory_equals_the_session() -> None:
     source = open_touch_source(made(HeadConfig(dead=(5,))), TouchConfig())
     log = load_into_memory(source)
     assert (log.length, log.view_shape, log.whiskers) == (source.length, (3, 6, 1), 18)
@@ -343,11 +343,11 @@ def test_a_session_in_memory_is_the_session() -> None:
         assert (one.truth == two.truth).all()
 
 
-def test_whiskers_are_not_taken_for_observations(refused: Callable[..., InputError]) -> None:
+def test_whisker_readings_are_not_observations(refused: Callable[..., InputError]) -> None:
     refused(lambda: load_into_memory(made()), "simulation", "whisker readings")
 
 
-def test_another_head_than_the_recorded_one_is_refused(
+def test_a_head_that_differs_from_the_recorded_one_is_refused(
     tmp_path: Path, refused: Callable[..., InputError]
 ) -> None:
     record_source(made(path={"explore": 3.0}), tmp_path / "a.mcap")
@@ -360,7 +360,7 @@ def test_another_head_than_the_recorded_one_is_refused(
     )
 
 
-def test_odometry_is_that_of_the_middles() -> None:
+def test_odometry_is_between_mid_protractions() -> None:
     session = made(odometry=OdometryConfig(noise="none").model_dump())
     true = between(session.truth[:-1], session.truth[1:])
     assert np.allclose(session.odometry[1:, :2], true[:, :2], atol=1e-12)

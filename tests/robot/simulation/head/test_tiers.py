@@ -1,4 +1,4 @@
-"""The raw tiers: mechanics that can be checked by hand, and that all tiers tell of one world."""
+"""The raw tiers: mechanics compared with theory, and agreement between the tiers."""
 
 from __future__ import annotations
 
