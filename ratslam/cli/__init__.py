@@ -13,8 +13,6 @@ from tactile.base.errors import InputError
 GROUPS = ("run", "live", "look", "study", "papers", "files")
 """Headings of the help, in this order."""
 DESCRIPTION = "Maps an area and localises a robot by whiskers, camera or laser (RatSLAM)."
-
-
 RETIRED = {"tune": "reproduce threshold", **studies.REPLACED}
 """Commands of earlier versions, and what replaces each."""
 
@@ -52,9 +50,9 @@ class Program(argparse.ArgumentParser):
         lines = ["usage: ratslam COMMAND ...", "", DESCRIPTION, ""]
         for group in GROUPS:
             heading = group
-            for entry in self.commands.entries:
-                if entry.group == group:
-                    lines.append(f"{heading:<8}{entry.name:<17}{entry.help}")
+            for name, parser in self.commands.parsers.items():
+                if parser.group == group:
+                    lines.append(f"{heading:<8}{name:<17}{parser.help}")
                     heading = ""
         lines += ["", "ratslam COMMAND --help shows the options of a command and an example."]
         return "\n".join(lines) + "\n"

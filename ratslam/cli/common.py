@@ -6,7 +6,9 @@ import argparse
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
+
+import shtab
 
 if TYPE_CHECKING:
     from ratslam.config.run_config import RunConfig
@@ -17,29 +19,19 @@ INTERRUPTED = 130
 """Exit code after Ctrl-C; the results up to then are on disk."""
 
 
-class Entry(NamedTuple):
-    """A line of the program's help."""
-
-    group: str
-    name: str
-    help: str
-
-
 class CommandParser(argparse.ArgumentParser):
-    """The parser of one command.
+    """The parser of one command; a shell completes its arguments of type `Path` with file names.
 
     Attributes:
-        files: its arguments that are paths, which a shell completes with file names.
+        group, help: heading and line in the help of the program.
     """
 
-    def __init__(self, **options: Any) -> None:
-        self.files: list[argparse.Action] = []
-        super().__init__(**options)
+    group = help = ""
 
     def add_argument(self, *names: Any, **options: Any) -> argparse.Action:
         action = super().add_argument(*names, **options)
         if options.get("type") is Path:
-            self.files.append(action)
+            action.complete = shtab.FILE  # type: ignore[attr-defined]
         return action
 
 
@@ -47,15 +39,14 @@ class Commands:
     """The commands of a parser: of the program, or of a command that has commands of its own.
 
     Attributes:
-        entries, parsers: one for each command, in the order of registration.
+        parsers: of each command by its name, in the order of registration.
     """
 
     def __init__(self, parser: argparse.ArgumentParser) -> None:
-        self.entries: list[Entry] = []
-        self.parsers: list[CommandParser] = []
         self._subparsers = parser.add_subparsers(
             required=True, metavar="COMMAND", title="commands", parser_class=CommandParser
         )
+        self.parsers: dict[str, CommandParser] = self._subparsers.choices
 
     def add(
         self,
@@ -74,12 +65,11 @@ class Commands:
             example: the arguments of a call that works, without `ratslam`.
             group: heading under which the program's help lists it.
         """
-        self.entries.append(Entry(group, name, help))
         description = f"{help[0].upper()}{help[1:]}."
-        parser: CommandParser = self._subparsers.add_parser(
+        parser = self._subparsers.add_parser(
             name, help=help, description=description, epilog=f"Example: python -m ratslam {example}"
         )
-        self.parsers.append(parser)
+        parser.group, parser.help = group, help
         if run is not None:
             parser.set_defaults(command=run)
         return parser
@@ -100,14 +90,13 @@ def add_set(parser: argparse.ArgumentParser) -> None:
 
 def add_workers(parser: argparse.ArgumentParser, processes: int = 0) -> None:
     """Adds `--workers`; 0 processes mean one a core."""
-    default = processes or "number of cores"
-    parser.add_argument(
-        "--workers",
-        type=positive_integer,
-        default=processes,
-        metavar="N",
-        help=f"processes (default: {default})",
-    )
+    add_count(parser, "--workers", processes, "processes")
+
+
+def add_count(parser: argparse.ArgumentParser, name: str, default: int, help: str) -> None:
+    """Adds an option for a positive integer; the default 0 stands for the number of cores."""
+    help = f"{help} (default {default or 'number of cores'})"
+    parser.add_argument(name, type=positive_integer, default=default, metavar="N", help=help)
 
 
 def positive_integer(text: str) -> int:

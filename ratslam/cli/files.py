@@ -68,9 +68,5 @@ def _completion(arguments: argparse.Namespace) -> int:
 
     from ratslam.cli import build_parser
 
-    program = build_parser()
-    for parser in program.commands.parsers:
-        for action in parser.files:
-            action.complete = shtab.FILE  # type: ignore[attr-defined]
-    print(shtab.complete(program, arguments.shell))
+    print(shtab.complete(build_parser(), arguments.shell))
     return 0

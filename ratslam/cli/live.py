@@ -6,6 +6,8 @@ import argparse
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -54,8 +56,8 @@ def _live(arguments: argparse.Namespace) -> int:
 
     config, _ = _read_live_config(arguments, arguments.head)
     directory = run_directory(arguments)
-    with _Monitor() as monitor:
-        ended, card = run_live_session(config, directory, _print, armed=monitor.start)
+    with _monitor() as start_monitor:
+        ended, card = run_live_session(config, directory, _print, armed=start_monitor)
     if card is not None:
         print(render_scorecard(card))
         print(f"\n{directory}/map.png shows the map, `run {directory}/config.yaml` maps the recording again")
@@ -84,31 +86,25 @@ def _emulate(arguments: argparse.Namespace) -> int:
     return 0
 
 
-class _Monitor:
-    """`ratslam watch` on the session, in a separate process of low priority."""
+@contextmanager
+def _monitor() -> Iterator[Callable[[Path], None]]:
+    """Yields a function that starts `ratslam watch` on a run directory, as a process of low priority."""
+    processes = []
 
-    def __init__(self) -> None:
-        self._process: subprocess.Popen[bytes] | None = None
-
-    def start(self, directory: Path) -> None:
-        """Starts it."""
-        command = [sys.executable, "-m", "ratslam", "watch", str(directory)]
+    def start(directory: Path) -> None:
         nice = ["nice", "-n", "10"] if shutil.which("nice") else []
-        self._process = subprocess.Popen(
-            [*nice, *command],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,  # it gets no Ctrl-C
-        )
+        command = [*nice, sys.executable, "-m", "ratslam", "watch", str(directory)]
+        quiet = subprocess.DEVNULL
+        # A session of its own: it gets no Ctrl-C.
+        processes.append(subprocess.Popen(command, stdout=quiet, stderr=quiet, start_new_session=True))
         _print(f"{directory}/watch.png shows the map while it grows")
 
-    def __enter__(self) -> _Monitor:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._process is not None:
-            self._process.terminate()
-            self._process.wait()
+    try:
+        yield start
+    finally:
+        for process in processes:
+            process.terminate()
+            process.wait()
 
 
 def _read_live_config(

@@ -10,6 +10,7 @@ from ratslam.cli.common import (
     INTERRUPTED,
     Commands,
     add_config,
+    add_count,
     add_set,
     add_workers,
     positive_integer,
@@ -125,13 +126,6 @@ def add_tables(tables: Commands) -> None:
     chaos.add_argument("--motions", nargs="+", choices=MOTIONS, default=MOTIONS, help="only these motions")
 
 
-def add_count(parser: argparse.ArgumentParser, name: str, default: int, help: str) -> None:
-    """Adds an option for a positive integer."""
-    parser.add_argument(
-        name, type=positive_integer, default=default, metavar="N", help=f"{help} (default {default})"
-    )
-
-
 def _figure(arguments: argparse.Namespace) -> int:
     if arguments.seed < 0:
         raise InputError("--seed", str(arguments.seed), "a non-negative integer")
@@ -173,12 +167,8 @@ def _train(arguments: argparse.Namespace) -> int:
 
     create_simulation = read_config(arguments).create_simulation
     if create_simulation is None:
-        raise InputError(
-            str(arguments.config),
-            "no `create_simulation:`",
-            "the Create to train",
-            "`create_simulation: {}` is the usual one",
-        )
+        where, cure = f"{arguments.config}: create_simulation", "`create_simulation: {}` is the usual one"
+        raise InputError(where, "missing", "the Create to train", cure)
     templates = train_to_file(create_simulation, arguments.output)
     print(render_drives(drive_held_out(create_simulation, templates), templates.training.repeats))
     print(f"\nwrote {arguments.output}; `touch.reports.templates: {arguments.output}` uses it")

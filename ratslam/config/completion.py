@@ -41,7 +41,7 @@ def complete(config: RunConfig, source: Source, extent_m: float | None = None) -
         config = _fill(config, {"templates": {"source": "labels"}})
     names = _choose_presets(config, source) if config.presets is None else config.presets
     for name in names:
-        config = _fill(config, PRESETS[name].settings)
+        config = _fill(config, PRESETS[name])
     config = config.model_copy(update={"presets": names})
     if config.backend != "grid" or config.grid.side is not None:
         return config

@@ -2,57 +2,42 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 PresetName = Literal["touch", "arm", "create"]
 
-
-class Preset(NamedTuple):
-    """Settings for all that a configuration leaves open.
-
-    Attributes:
-        source: where the values are from. settings: nested as in a configuration.
-    """
-
-    source: str
-    settings: dict[str, dict[str, Any]]
-
-
-PRESETS: dict[PresetName, Preset] = {
-    "touch": Preset(
-        "Salman & Pearson 2016, III-C: the odometry of their arm, in pose cells of 5 cm; many whisker images "
-        "look alike, so a closure needs more evidence and all closure sequences are compared with each other",
-        {
-            "pose_cells": {"cell_size": 0.05, "cells_xy": 21},
-            "recall": {"sector_fov": "whiskers", "mode_decay": 0.003, "miss_weight": 0.01, "modes": 4},
-            "keyframes": {
-                "noise": {"per_cell": 0.22, "heading_per_cell": 0.1, "heading_per_radian": 0.2},
-                "bias_sd": 0.001,
-                "min_score": 12.0,
-                "max_distance": 60.0,
-                "sequence_agreement": 0.2,
-                "breaks": False,
-                "select_every": 50,
-                "solve_every": 20,
-                "max_turn": 0.6,
-                "place_radius": 1.3,
-                "place_heading": 0.17,
-            },
+PRESETS: dict[PresetName, dict[str, dict[str, Any]]] = {
+    # Salman & Pearson 2016, III-C: the odometry of their arm, in pose cells of 5 cm; many whisker images look
+    # alike, so a closure needs more evidence and all closure sequences are compared with each other.
+    "touch": {
+        "pose_cells": {"cell_size": 0.05, "cells_xy": 21},
+        "recall": {"sector_fov": "whiskers", "mode_decay": 0.003, "miss_weight": 0.01, "modes": 4},
+        "keyframes": {
+            "noise": {"per_cell": 0.22, "heading_per_cell": 0.1, "heading_per_radian": 0.2},
+            "bias_sd": 0.001,
+            "min_score": 12.0,
+            "max_distance": 60.0,
+            "sequence_agreement": 0.2,
+            "breaks": False,
+            "select_every": 50,
+            "solve_every": 20,
+            "max_turn": 0.6,
+            "place_radius": 1.3,
+            "place_heading": 0.17,
         },
-    ),
-    "arm": Preset(
-        "Salman & Pearson 2016, III-C: an arm has no body on the floor, its odometry errors are independent "
-        "in each sample, and the walls are 12 mm thick",
-        {
-            "grid": {
-                "particles": 300,
-                "cell": 0.02,
-                "body": 0.0,
-                "drift": {"session": 0.0, "move": 0.0, "step": 0.27, "heading": 2e-3},
-                "footprint": {"blob_sd": 0.015, "along": 0.05, "across": 0.015},
-            }
-        },
-    ),
-    "create": Preset("Fox et al. 2012, II and III: the defaults of `grid` are those of their Create", {}),
+    },
+    # Salman & Pearson 2016, III-C: an arm has no body on the floor, its odometry errors are independent in
+    # each sample, and the walls are 12 mm thick.
+    "arm": {
+        "grid": {
+            "particles": 300,
+            "cell": 0.02,
+            "body": 0.0,
+            "drift": {"session": 0.0, "move": 0.0, "step": 0.27, "heading": 2e-3},
+            "footprint": {"blob_sd": 0.015, "along": 0.05, "across": 0.015},
+        }
+    },
+    # Fox et al. 2012, II and III: the defaults of `grid` are those of their Create.
+    "create": {},
 }
-"""All presets by name."""
+"""Settings for all that a configuration leaves open, nested as in a configuration."""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from evaluation.metrics.trajectory import OnlineError, current_error, summarize_errors
+from evaluation.metrics.trajectory import current_error
 from ratslam.core.session import CHUNK, Session
 
 
@@ -37,7 +37,3 @@ class OnlineErrorLog:
         error = current_error(session.map.online_trajectory()[self._skipped :][known], true[known])
         self.errors.append(error)
         return error
-
-    def summary(self) -> OnlineError:
-        """Statistics of all values; NaN without any."""
-        return summarize_errors(np.array(self.errors)) if self.errors else OnlineError(np.nan, np.nan, np.nan)

@@ -18,7 +18,7 @@ from ratslam.core.session import CHUNK
 from ratslam.pipeline.runner import Runner, open_runner
 from ratslam.pipeline.source import open_observations, open_source
 from robot.recordings.recorder import Recorder
-from robot.sources.source import Sample, Source
+from robot.sources.source import Source
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Whisk
 from tactile.frontend import Frontend
@@ -77,12 +77,15 @@ def simulate(config: RunConfig, path: Path) -> tuple[int, bool]:
     if config.simulation is None and config.create_simulation is None:
         raise InputError("simulation", "missing", "a simulation", "`simulation: {}` is a complete session")
     source = open_source(config, _print)
-    reduce = _reduction(config, source)
+    raw = config.simulation is None or config.simulation.raw
+    frontend = None if raw else Frontend(config.touch, source.info.calibration)
     recorder = open_recorder(path, source)
     bar = tqdm(source, unit="whisk", desc=source.name, file=sys.stderr, mininterval=0.5, total=source.length)
     with recorder, bar, catch_interrupt("closing the file") as interrupted:
         for sample in bar:
-            recorder.write(reduce(sample))
+            if frontend is not None and isinstance(sample.reading, Cycle | Whisk):
+                sample = sample._replace(reading=frontend.features(sample.reading))
+            recorder.write(sample)
             if interrupted():
                 break
         return recorder.count, interrupted()
@@ -102,20 +105,6 @@ def open_recorder(path: Path, source: Source) -> Recorder:
         info=source.info,
         chunk_s=CHUNK / (source.rate_hz or 1.0),
     )
-
-
-def _reduction(config: RunConfig, source: Source) -> Callable[[Sample], Sample]:
-    """Turns a simulated sample into the one to record."""
-    if config.simulation is None or config.simulation.raw:
-        return lambda sample: sample
-    frontend = Frontend(config.touch, source.info.calibration)
-
-    def to_features(sample: Sample) -> Sample:
-        if not isinstance(sample.reading, Cycle | Whisk):
-            return sample
-        return sample._replace(reading=frontend.features(sample.reading))
-
-    return to_features
 
 
 @contextmanager

@@ -6,12 +6,11 @@ interrupt, a kill or a full disk leaves a readable prefix.
 
 from __future__ import annotations
 
-import json
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, Self
 
 import numpy as np
 
@@ -23,10 +22,12 @@ COLUMNS = (
 )  # fmt: skip
 """Columns of steps.csv before those of the backend: time (s), experience, action, online pose in the map
 frame and its standard deviations (m, m, rad), flag, outcome."""
+STREAMS = ("online.tum", "odometry.tum", "truth.tum", "steps.csv", "online_error.csv")
+"""Files that grow by whole lines."""
 
 
 class RunDirectory:
-    """A new run directory.
+    """A new run directory; a context manager that closes its text files.
 
     Args:
         columns: columns of steps.csv that the backend adds.
@@ -35,10 +36,8 @@ class RunDirectory:
         InputError: the directory exists or cannot be created.
     """
 
-    STREAMS = ("online.tum", "odometry.tum", "truth.tum", "steps.csv", "online_error.csv")
-
     def __init__(self, path: Path, columns: Iterable[str] = ()) -> None:
-        self.path, self.columns = path, (*COLUMNS, *columns)
+        self.path = path
         if path.exists():
             raise InputError(str(path), "exists already", "a new run directory", "choose another with -o")
         try:
@@ -47,14 +46,10 @@ class RunDirectory:
             raise InputError(
                 str(path), f"cannot be created ({error.strerror})", "a writable folder"
             ) from None
-        self._streams: dict[str, TextIO] = {}
+        self._streams = {name: (path / name).open("x", encoding="utf-8", newline="") for name in STREAMS}
+        self.append({"steps.csv": ",".join((*COLUMNS, *columns)) + "\n", "online_error.csv": "t,error\n"})
 
-    def __enter__(self) -> RunDirectory:
-        self._streams = {
-            name: (self.path / name).open("x", encoding="utf-8", newline="") for name in self.STREAMS
-        }
-        self._streams["steps.csv"].write(",".join(self.columns) + "\n")
-        self._streams["online_error.csv"].write("t,error\n")
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -73,20 +68,7 @@ class RunDirectory:
         """Writes a text file atomically."""
         write_text_atomically(self.path / name, content)
 
-    def manifest(self, content: Mapping[str, Any]) -> None:
-        """Writes manifest.json atomically."""
-        self.text("manifest.json", json.dumps(content, indent=2, allow_nan=False) + "\n")
-
-    def checkpoint(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Writes map.npz atomically."""
-
-        def write(path: Path) -> None:
-            with path.open("wb") as file:
-                np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
-
-        write_atomically(self.path / "map.npz", write)
-
-    def file(self, name: str, write: Any) -> None:
+    def file(self, name: str, write: Callable[[Path], Any]) -> None:
         """Writes any file atomically: `write(path)` gets a temporary path with the same suffix."""
         write_atomically(self.path / name, write)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import platform
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -69,16 +70,14 @@ class Runner:
         steps = list(self.session.replay(observations))
         self._views += [(o.view, o.alive) for o in observations] if self._source.whiskers else []
         odometry = []
-        for observation in observations:
-            motion = np.array(observation.odometry[:3], float)
-            self._odometry_pose = compose(self._odometry_pose, motion)
+        for sample, observation in zip(samples, observations, strict=True):
+            self._odometry_pose = compose(self._odometry_pose, np.array(observation.odometry[:3], float))
             odometry.append(self._odometry_pose)
-        for sample in samples:
             self._truth.append(np.nan if sample.truth is None else sample.truth)
         self._directory.append(_lines(samples, steps, odometry, BACKENDS[self._config.backend]))
         error = self._online_error.update(self.session, self._truth.rows)
         if error is not None:
-            self._directory.append({"online_error.csv": iter([f"{float(samples[-1].time)!r},{error!r}\n"])})
+            self._directory.append({"online_error.csv": f"{float(samples[-1].time)!r},{error!r}\n"})
         if self.session.steps - self._saved >= max(CHECKPOINT_EVERY, self.session.steps // CHECKPOINT_SHARE):
             self._checkpoint()
             self._saved = self.session.steps
@@ -108,11 +107,12 @@ class Runner:
         for name, save in plot_writers(directory.path).items():
             directory.file(name, save)
         status = "interrupted" if interrupted else "complete"
-        directory.manifest(self._manifest | {"status": status, "steps": self.session.steps})
+        _write_manifest(directory, self._manifest | {"status": status, "steps": self.session.steps})
         return card
 
     def _checkpoint(self) -> None:
-        self._directory.checkpoint(self.session.arrays() | {"digest": np.array(self._source.digest)})
+        arrays: dict[str, Any] = self.session.arrays() | {"digest": np.array(self._source.digest)}
+        self._directory.file("map.npz", lambda path: np.savez_compressed(path, **arrays))
 
 
 @contextmanager
@@ -132,12 +132,14 @@ def open_runner(
         read_relations(config.score.relations)  # fails before the directory is created
     session = build_session(config, source)
     skip = _resume(session, resume, source.digest) if resume else 0
-    _check_length(source, skip, resume)
+    if source.length is not None and source.length <= skip:
+        found = f"already holds all {skip} samples of {source.name}"
+        raise InputError(str(resume), found, "that of an unfinished run")
     with RunDirectory(directory, BACKENDS[config.backend].columns()) as files:
         text = dump(config)
         files.text("config.yaml", text)
         manifest = _manifest(config, text, source, resume)
-        files.manifest(manifest | {"status": "running"})
+        _write_manifest(files, manifest | {"status": "running"})
         save_world(source.info, files)
         yield Runner(config, source, files, manifest, session, skip)
 
@@ -208,13 +210,8 @@ def _resume(session: Session, path: Path, digest: str) -> int:
     return session.steps if str(arrays.get("digest", "")) == digest else 0
 
 
-def _check_length(source: Source, skip: int, resume: Path | None) -> None:
-    if source.length is not None and source.length <= skip:
-        raise InputError(
-            str(resume),
-            f"already holds all {skip} samples of {source.name}",
-            "that of an unfinished run",
-        )
+def _write_manifest(directory: RunDirectory, content: dict[str, Any]) -> None:
+    directory.text("manifest.json", json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
 def _manifest(config: RunConfig, text: str, source: Source, resume: Path | None) -> dict[str, Any]:

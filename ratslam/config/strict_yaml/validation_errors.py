@@ -33,32 +33,17 @@ def input_errors(error: ValidationError, model: type[Settings], document: Docume
     order = {path: rank for rank, path in enumerate(document.places)}
     found = [(_spot(details["loc"], model), details) for details in error.errors(include_url=False)]
     found.sort(key=lambda pair: order[document.nearest(pair[0].path)])
-    merged: dict[_Problem, list[str]] = {}
-    problems = [
-        problem
-        for spot, details in found
-        for problem in _renamed(details, spot.path, model, document)
-        or [_problem(details, spot, model, document)]
-    ]
-    for problem in problems:
-        expected = merged.setdefault(problem._replace(expected=""), [])
-        if problem.expected not in expected:
-            expected.append(problem.expected)
+    merged: dict[tuple[str, str, str], dict[str, None]] = {}
+    for spot, details in found:
+        renamed = _renamed(details, spot.path, model, document)
+        for one in renamed or [_input_error(details, spot, model, document)]:
+            merged.setdefault((one.where, one.found, one.cure), {})[one.expected] = None
     errors = [
-        InputError(problem.where, problem.found, " or ".join(filter(None, expected)), problem.cure)
-        for problem, expected in merged.items()
+        InputError(where, found, " or ".join(filter(None, expected)), cure)
+        for (where, found, cure), expected in merged.items()
     ]
     rest = len(errors) - _MAX_ERRORS
     return errors[:_MAX_ERRORS] + ([InputError("", f"and {rest} more errors")] if rest > 0 else [])
-
-
-class _Problem(NamedTuple):
-    """Arguments of an `InputError`."""
-
-    where: str
-    found: str
-    expected: str = ""
-    cure: str = ""
 
 
 class _Spot(NamedTuple):
@@ -77,18 +62,16 @@ class _Spot(NamedTuple):
 
 def _renamed(
     details: ErrorDetails, path: KeyPath, model: type[Settings], document: Document
-) -> list[_Problem]:
+) -> list[InputError]:
     """The errors for an unknown key that was renamed: one for each key in it, if it is a section."""
     if details["type"] != "extra_forbidden":
         return []
-    return [
-        _Problem(document.at_key(tuple(old.split("."))), f"`{old}` is now `{new}`" if _is_path(new) else new)
-        for old, new in _new_names(dotted(path), document.value(path), model.renamed_keys)
-    ]
+    found = _new_names(dotted(path), document.value(path), model.renamed_keys)
+    return [InputError(document.at_key(tuple(old.split("."))), sentence) for old, sentence in found]
 
 
 def _new_names(old: str, value: Any, renamed: Mapping[str, str]) -> Iterator[tuple[str, str]]:
-    """Old key and new key (or what to write instead), for each key of a section that has new names in it."""
+    """Old key and a sentence with the new one, for each key of a section that has new names in it."""
     new = _new_name(old, renamed)
     if new == old:
         return
@@ -96,7 +79,7 @@ def _new_names(old: str, value: Any, renamed: Mapping[str, str]) -> Iterator[tup
         for key, part in value.items():
             yield from _new_names(f"{old}.{key}", part, renamed)
     else:
-        yield old, new
+        yield old, f"`{old}` is now `{new}`" if _is_path(new) else new
 
 
 def _new_name(path: str, renamed: Mapping[str, str]) -> str:
@@ -114,7 +97,7 @@ def _is_path(text: str) -> bool:
     return re.fullmatch(r"[\w.]+", text) is not None
 
 
-def _problem(details: ErrorDetails, spot: _Spot, model: type[Settings], document: Document) -> _Problem:
+def _input_error(details: ErrorDetails, spot: _Spot, model: type[Settings], document: Document) -> InputError:
     """The message for one error of pydantic."""
     path, owner, kinds = spot
     context = details.get("ctx", {})
@@ -123,12 +106,12 @@ def _problem(details: ErrorDetails, spot: _Spot, model: type[Settings], document
         case "extra_forbidden":
             known = list(owner.model_fields) if owner else []
             cure = _did_you_mean(path[-1], known) or f"the keys here are {', '.join(known) or 'none'}"
-            return _Problem(document.at_key(path), "unknown key", cure=cure)
+            return InputError(document.at_key(path), "unknown key", cure=cure)
         case "missing" if isinstance(path[-1], int):  # an item of a tuple
             return _wrong_length(_spot(details["loc"][:-1], model), "more values", document)
         case "missing":
             field = owner.model_fields.get(str(path[-1])) if owner else None
-            return _Problem(document.at_key(path), "missing", cure=(field and field.description) or "")
+            return InputError(document.at_key(path), "missing", cure=(field and field.description) or "")
         case "too_long":
             return _wrong_length(spot, f"at most {context['max_length']} values", document)
         case "too_short":
@@ -136,7 +119,7 @@ def _problem(details: ErrorDetails, spot: _Spot, model: type[Settings], document
         case "union_tag_not_found":
             at = (*path, context["discriminator"].strip("'"))
             words = [word for kind in kinds for word in _words(kind, at[-1])]
-            return _Problem(document.at_key(at), "missing", either(words) if words else "")
+            return InputError(document.at_key(at), "missing", either(words) if words else "")
         case "union_tag_invalid":
             at = (*path, context["discriminator"].strip("'"))
             return _wrong_word(at, context["expected_tags"], document)
@@ -144,27 +127,27 @@ def _problem(details: ErrorDetails, spot: _Spot, model: type[Settings], document
             return _wrong_word(path, context["expected"], document)
         case "value_error" | "assertion_error":
             prefix = "" if isinstance(value, dict) else f"{shown(value)}: "
-            return _Problem(document.at_value(path), f"{prefix}{context['error']}")
+            return InputError(document.at_value(path), f"{prefix}{context['error']}")
     message = details["msg"]
     if not message.startswith("Input should be "):
-        return _Problem(document.at_value(path), f"{shown(value)}: {message[0].lower()}{message[1:]}")
+        return InputError(document.at_value(path), f"{shown(value)}: {message[0].lower()}{message[1:]}")
     expected = message.removeprefix("Input should be ")
     expected = re.sub("^(greater|less|a multiple)", r"a number \1", _WORDS.get(expected, expected))
-    return _Problem(document.at_value(path), shown(value), expected)
+    return InputError(document.at_value(path), shown(value), expected)
 
 
-def _wrong_length(spot: _Spot, expected: str, document: Document) -> _Problem:
+def _wrong_length(spot: _Spot, expected: str, document: Document) -> InputError:
     for kind in spot.kinds:
         if get_origin(kind) is tuple and Ellipsis not in get_args(kind):
             expected = f"{len(get_args(kind))} values"
-    return _Problem(document.at_value(spot.path), shown(document.value(spot.path)), expected)
+    return InputError(document.at_value(spot.path), shown(document.value(spot.path)), expected)
 
 
-def _wrong_word(path: KeyPath, expected: str, document: Document) -> _Problem:
+def _wrong_word(path: KeyPath, expected: str, document: Document) -> InputError:
     found = document.value(path)
     words = re.findall("'([^']*)'", expected)
     choice = either(words) if words else expected
-    return _Problem(document.at_value(path), shown(found), choice, _did_you_mean(found, words))
+    return InputError(document.at_value(path), shown(found), choice, _did_you_mean(found, words))
 
 
 def _did_you_mean(found: Any, words: Sequence[str]) -> str:

@@ -26,6 +26,7 @@ CONFIG = """
 simulation: {path: {explore: 40}, maze: {heights: [0.03, 0.05]}, seed: 3}
 touch: {head: {dead: [4]}}
 backend: classic
+session: {reserve: 64}
 """
 TOUCH = sorted(path.stem for path in (ROOT / "configs").glob("whisker_*.yaml"))
 
@@ -35,7 +36,9 @@ def folder(tmp_path_factory):
     """A tiny session on touch: run, and written to a file that is run."""
     path = tmp_path_factory.mktemp("pictures")
     (path / "config.yaml").write_text(CONFIG)
-    (path / "replay.yaml").write_text("recording: {file: session.mcap}\nbackend: classic\n")
+    (path / "replay.yaml").write_text(
+        "recording: {file: session.mcap}\nbackend: classic\nsession: {reserve: 64}\n"
+    )
     assert main(["simulate", str(path / "config.yaml"), "-o", str(path / "session.mcap")]) == 0
     assert main(["run", str(path / "config.yaml"), "-o", str(path / "run")]) == 0
     assert main(["run", str(path / "replay.yaml"), "-o", str(path / "replayed")]) == 0
@@ -97,7 +100,8 @@ def test_stored_views_and_walls_are_small(folder):
 
 def test_a_session_without_whiskers_has_only_its_map(folder, tmp_path):
     square = ROOT / "configs" / "square.yaml"
-    assert main(["run", str(square), "-o", str(tmp_path / "run"), "--set", "backend=classic"]) == 0
+    sets = ["--set", "backend=classic", "--set", "session.reserve=512"]
+    assert main(["run", str(square), "-o", str(tmp_path / "run"), *sets]) == 0
     assert [path.name for path in (tmp_path / "run").glob("*.png")] == ["map.png"]
     assert not {path.name for path in (tmp_path / "run").iterdir()} & set(KEPT)
 

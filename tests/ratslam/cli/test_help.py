@@ -14,18 +14,16 @@ from ratslam.cli import GROUPS, build_parser, main
 
 ROOT = Path(__file__).parents[3]
 PROGRAM = build_parser()
-COMMANDS = dict(
-    zip([entry.name for entry in PROGRAM.commands.entries], PROGRAM.commands.parsers, strict=True)
-)
+COMMANDS = PROGRAM.commands.parsers
 
 
 def test_the_help_fits_one_screen_and_lists_every_command() -> None:
     lines = PROGRAM.format_help().splitlines()
     assert len(lines) <= 24
     assert max(map(len, lines)) <= 80
-    assert {entry.group for entry in PROGRAM.commands.entries} == set(GROUPS)
-    for entry in PROGRAM.commands.entries:
-        assert any(f" {entry.name} " in line and line.endswith(entry.help) for line in lines)
+    assert {parser.group for parser in COMMANDS.values()} == set(GROUPS)
+    for name, parser in COMMANDS.items():
+        assert any(f" {name} " in line and line.endswith(parser.help) for line in lines)
 
 
 def test_the_help_loads_no_numerics() -> None:

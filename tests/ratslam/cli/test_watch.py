@@ -1,4 +1,4 @@
-"""A run monitor from another process: at work, done, killed; and what the watching changes of it: nothing."""
+"""The run monitor on a run in progress, a finished and a killed one; it changes nothing in the run."""
 
 from __future__ import annotations
 
@@ -23,87 +23,70 @@ from evaluation.monitor.plot import draw_watch
 from evaluation.monitor.progress import RUNNING, RunMonitor, RunProgress
 from evaluation.monitor.watch import path_length, status_line, watch_run
 from ratslam.cli import main
+from ratslam.config.run_config import load_config
+from ratslam.core.session import CHUNK
+from ratslam.pipeline.runner import open_runner
+from ratslam.pipeline.source import open_observations
 from tactile.base.errors import InputError
 from tactile.base.se2 import tum_line
 
 ROOT = Path(__file__).parents[3]
-
-
-SQUARE = str(ROOT / "configs" / "square.yaml")
-PACED = """
-import sys, time
-from pathlib import Path
-from ratslam.__main__ import main
-from ratslam.pipeline.run_directory import RunDirectory
-
-go, append, count = Path(sys.argv[1]), RunDirectory.append, []
-
-def paced(store, lines):
-    append(store, lines)
-    count.append(1)
-    while len(count) > 8 and not go.exists():
-        time.sleep(0.01)
-
-RunDirectory.append = paced
-sys.exit(main(sys.argv[2:]))
-"""
-"""The program; a run stands still after some chunks until a file is there."""
-
-
-def arguments(folder):
-    return ["run", SQUARE, "-o", str(folder), "--set", "backend=classic"]
+CONFIG = ROOT / "configs" / "square.yaml"
+CLASSIC = ("backend=classic", "session.reserve=512")
+STEPS_BEFORE = 5 * CHUNK
 
 
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory):
-    """What a run leaves when nobody looks."""
+    """A finished run that was not watched."""
     folder = tmp_path_factory.mktemp("alone") / "run"
-    assert main(arguments(folder)) == 0
+    assert main(["run", str(CONFIG), "-o", str(folder), "--set", CLASSIC[0], "--set", CLASSIC[1]]) == 0
     return folder
 
 
 @contextmanager
-def at_work(folder):
-    """A run in a process of its own that has made some steps and stands still, and what lets it go on."""
-    go = folder.with_name("go")
-    process = subprocess.Popen(
-        [sys.executable, "-c", PACED, str(go), *arguments(folder)],
-        cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-    )  # fmt: skip
-    try:
-        while not (folder / "steps.csv").exists() or (folder / "steps.csv").stat().st_size < 200:
-            assert process.poll() is None
-            time.sleep(0.01)
-        yield process, go
-    finally:
-        process.kill()
-        process.wait()
+def run_in_progress(folder):
+    """The same run after some steps, and what completes it; left without that, it is as if killed."""
+    with open_observations(load_config(CONFIG, CLASSIC)) as (config, source):
+        samples = list(source)
+        with open_runner(config, source, folder) as runner:
+
+            def process(first, last):
+                for start in range(first, last, CHUNK):
+                    runner.process(samples[start : min(start + CHUNK, last)])
+
+            def complete():
+                process(STEPS_BEFORE, len(samples))
+                runner.finish(False)
+
+            process(0, STEPS_BEFORE)
+            yield complete
 
 
 @pytest.fixture(scope="module")
 def killed(tmp_path_factory):
-    """A run that was killed at work."""
+    """A run that was killed in progress."""
     folder = tmp_path_factory.mktemp("killed") / "run"
-    with at_work(folder) as (process, _):
-        process.kill()
+    with run_in_progress(folder):
+        pass
     assert json.loads((folder / "manifest.json").read_text())["status"] == RUNNING
     return folder
 
 
-def test_a_run_at_work_is_watched_to_its_end_and_does_not_notice(alone, tmp_path):
+def test_a_run_in_progress_is_watched_to_its_end_and_is_not_changed(alone, tmp_path):
     folder = tmp_path / "run"
     told, pictures = [], []
-    with at_work(folder) as (process, go):
+    with run_in_progress(folder) as complete:
 
         def tell(line):
             told.append(line)
             pictures.append((folder / "watch.png").read_bytes())
-            go.touch()
+            if len(told) == 1:
+                complete()
 
         seen = watch_run(folder, tell, every=0.1)
-        assert process.wait() == 0
     steps = int(re.search(r"run: running, (\d+) of 349 steps", told[0])[1])
-    assert 0 < steps < 349
+    assert steps == STEPS_BEFORE < 349
     assert seen.status == "complete"
     assert told[-1].startswith("run: complete, 349 of 349 steps, ")
     assert pictures[0] != pictures[-1]
@@ -112,7 +95,7 @@ def test_a_run_at_work_is_watched_to_its_end_and_does_not_notice(alone, tmp_path
     assert left == {path.name: path.read_bytes() for path in alone.iterdir()}
 
 
-def test_a_run_that_is_done_is_seen_as_it_is_read(alone, tmp_path, capsys):
+def test_a_finished_run_is_seen_as_it_is_read(alone, tmp_path, capsys):
     folder = tmp_path / "run"
     shutil.copytree(alone, folder)
     assert main(["watch", str(folder)]) == 0
@@ -129,7 +112,7 @@ def test_a_run_that_is_done_is_seen_as_it_is_read(alone, tmp_path, capsys):
     assert np.isfinite(seen.sd).all()
 
 
-def test_a_killed_run_is_given_up_when_it_has_been_silent_for_long(killed, tmp_path, capsys):
+def test_a_killed_run_is_given_up_after_a_long_silence(killed, tmp_path, capsys):
     folder = tmp_path / "run"
     shutil.copytree(killed, folder)
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
@@ -162,7 +145,7 @@ def test_ctrl_c_ends_it_and_no_engine_is_loaded(killed):
 
 
 @pytest.mark.parametrize("kind", ["unknown", "empty", "file"])
-def test_where_there_is_no_run_there_is_nothing_to_watch(kind, tmp_path, capsys):
+def test_a_path_without_a_run_is_refused(kind, tmp_path, capsys):
     folder = tmp_path / kind
     if kind == "empty":
         folder.mkdir()
@@ -173,13 +156,13 @@ def test_where_there_is_no_run_there_is_nothing_to_watch(kind, tmp_path, capsys)
     assert not (folder / "watch.png").exists()
 
 
-def test_times_that_are_none_are_refused(tmp_path, capsys):
+def test_invalid_times_are_refused(tmp_path, capsys):
     for option, value in (("--every", "0"), ("--patience", "nan")):
         assert main(["watch", str(tmp_path), option, value]) == 2
         assert option in capsys.readouterr().err
 
 
-# What a run may look like at any moment
+# The files of a run at any moment
 
 
 def files(steps, random, truth=True):
@@ -202,7 +185,7 @@ def files(steps, random, truth=True):
 
 
 def same(one, other):
-    """Whether two sights are of the same steps, whatever the clock says."""
+    """Whether two readings of the progress are equal, apart from the times."""
     rest = {"rate": None, "silence": 0.0}
     parts = zip(one._replace(**rest), other._replace(**rest), strict=True)
     return all(
@@ -212,8 +195,8 @@ def same(one, other):
 
 @settings(max_examples=25)
 @given(st.integers(0, 6), st.lists(st.integers(0, 900), max_size=4), st.booleans(), st.integers(0, 99))
-def test_however_the_lines_come_the_same_is_seen(tmp_path_factory, steps, cuts, truth, seed):
-    """Cut anywhere, in mid-line too, and looked at in between."""
+def test_lines_written_in_any_pieces_give_the_same_progress(tmp_path_factory, steps, cuts, truth, seed):
+    """Pieces end anywhere, also in mid-line, and the progress is read after each."""
     folder = tmp_path_factory.mktemp("growing")
     content = {name: text.encode() for name, text in files(steps, np.random.default_rng(seed), truth).items()}
     monitor = None
@@ -232,7 +215,7 @@ def test_however_the_lines_come_the_same_is_seen(tmp_path_factory, steps, cuts, 
 
 @pytest.mark.parametrize("truth", [True, False])
 @pytest.mark.parametrize("steps", [0, 1, 2, 9])
-def test_every_sight_has_a_picture_and_the_same_one_each_time(steps, truth, tmp_path):
+def test_the_same_progress_has_the_same_picture(steps, truth, tmp_path):
     for stream, text in files(steps, np.random.default_rng(1), truth).items():
         (tmp_path / stream).write_text(text)
     for name in ("a", "b")[: 1 + (steps == 9)]:
@@ -245,7 +228,7 @@ def test_every_sight_has_a_picture_and_the_same_one_each_time(steps, truth, tmp_
     ("odometry.tum", "0 0 1\n"), ("truth.tum", "noise\n"), ("truth.tum", "0.0 1.0\n"),
     ("online_error.csv", "1.0,far\n"),
 ])  # fmt: skip
-def test_lines_that_no_run_writes_are_named(name, line, tmp_path):
+def test_the_error_for_a_broken_line_names_it(name, line, tmp_path):
     for stream, text in files(3, np.random.default_rng(0)).items():
         (tmp_path / stream).write_text(text)
     monitor = RunMonitor(tmp_path)
@@ -268,14 +251,14 @@ def test_a_removed_run_directory_is_an_error(tmp_path):
         monitor.read()
 
 
-def test_silence_is_of_the_run_and_not_of_who_watches(tmp_path):
+def test_the_monitors_own_picture_does_not_end_the_silence(tmp_path):
     (tmp_path / "steps.csv").touch()
     os.utime(tmp_path / "steps.csv", (0, time.time() - 100))
     (tmp_path / "watch.png").touch()
     assert 99 < RunMonitor(tmp_path).read().silence < 200
 
 
-def test_it_tells_steps_distance_pace_and_outcomes():
+def test_the_status_line_shows_steps_distance_pace_and_outcomes():
     nothing = np.zeros((4, 2))
     way = np.array([[0.0, 1.0, 0.0], [0.0, 2.0, 1.0], [3.0, 2.0, 2.0], [3.0, 2.0, 3.0]])
     seen = RunProgress(

@@ -57,7 +57,7 @@ def test_the_presets_that_suit_the_source_are_used_and_named(case):
     completed = complete(config, source)
     assert completed.presets == USED[name]
     for preset in USED[name]:
-        pairs = values(PRESETS[preset].settings, completed)
+        pairs = values(PRESETS[preset], completed)
         assert all(value == found for value, found in pairs)
 
 
@@ -87,7 +87,7 @@ def test_settings_of_the_configuration_go_before_presets():
     completed = complete(config, open_source(config))
     assert completed.pose_cells.cells_xy == 31
     assert completed.recall.modes == 2
-    assert completed.recall.mode_decay == PRESETS["touch"].settings["recall"]["mode_decay"]
+    assert completed.recall.mode_decay == PRESETS["touch"]["recall"]["mode_decay"]
 
 
 def test_no_preset_is_used_if_the_list_is_empty_or_views_are_not_of_whiskers():

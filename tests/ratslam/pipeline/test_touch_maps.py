@@ -328,10 +328,10 @@ def test_whiskers_bring_their_own_settings() -> None:
     assert config.simulation is not None
     completed = complete(config, HeadSimulation(config.simulation))
     assert completed.recall.sector_fov == "whiskers"
-    for name, value in PRESETS["touch"].settings["keyframes"].items():
+    for name, value in PRESETS["touch"]["keyframes"].items():
         if name != "noise":
             assert getattr(completed.keyframes, name) == value
-    assert completed.keyframes.noise.per_cell == PRESETS["touch"].settings["keyframes"]["noise"]["per_cell"]
+    assert completed.keyframes.noise.per_cell == PRESETS["touch"]["keyframes"]["noise"]["per_cell"]
     assert completed.pose_cells.cells_xy == 11  # what was asked for stays
     again = RunConfig.model_validate(completed.model_dump(mode="json"))
     assert (
@@ -344,10 +344,8 @@ def test_what_is_set_goes_before_what_whiskers_bring() -> None:
     assert config.simulation is not None
     frames = complete(config, HeadSimulation(config.simulation)).keyframes
     assert (frames.min_score, frames.noise.per_cell) == (7.0, 0.5)
-    assert frames.select_every == PRESETS["touch"].settings["keyframes"]["select_every"]
-    assert (
-        frames.noise.heading_per_cell == PRESETS["touch"].settings["keyframes"]["noise"]["heading_per_cell"]
-    )
+    assert frames.select_every == PRESETS["touch"]["keyframes"]["select_every"]
+    assert frames.noise.heading_per_cell == PRESETS["touch"]["keyframes"]["noise"]["heading_per_cell"]
 
 
 def test_saying_that_there_are_whiskers_changes_nothing() -> None:
