@@ -95,7 +95,7 @@ def add_workers(parser: argparse.ArgumentParser, processes: int = 0) -> None:
 
 def add_count(parser: argparse.ArgumentParser, name: str, default: int, help: str) -> None:
     """Adds an option for a positive integer; the default 0 stands for the number of cores."""
-    help = f"{help} (default {default or 'number of cores'})"
+    help = f"{help} (default {default or 'the number of cores'})"
     parser.add_argument(name, type=positive_integer, default=default, metavar="N", help=help)
 
 

@@ -39,7 +39,7 @@ def add_commands(commands: Commands) -> None:
         "emulate ur10 configs/live_maze.yaml", "live",
     )  # fmt: skip
     emulate.add_argument(
-        "device", choices=("ur10", "head"), help="arm controller, or whisker head in its maze"
+        "device", choices=("ur10", "head"), help="the arm's controller, or the whisker head in its maze"
     )
     add_config(emulate)
     emulate.add_argument(

@@ -73,6 +73,8 @@ def _score(arguments: argparse.Namespace) -> int:
     from evaluation.metrics.experience_metric import ExmConfig
     from evaluation.metrics.scorecard import render_scorecard, score_log, score_run
 
+    if arguments.base is not None and arguments.base < 0:
+        raise InputError("--base", str(arguments.base), "the number of a step, from 0")
     exm = ExmConfig(mode=arguments.mode, base=arguments.base)
     if arguments.log.is_dir():
         relations = read_relations(arguments.relations) if arguments.relations else None

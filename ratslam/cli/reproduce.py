@@ -112,7 +112,9 @@ def add_tables(tables: Commands) -> None:
         parser.add_argument("--rows", nargs="+", metavar="ROW", help="only these rows")
         add_workers(parser)
     speed = table("speed", _speed_lines, "microseconds per pose-cell step by network size", "--rows 21 41")
-    speed.add_argument("--rows", nargs="+", type=positive_integer, metavar="N", help="cells along one side")
+    speed.add_argument(
+        "--rows", nargs="+", type=positive_integer, metavar="N", help="only these numbers of cells a side"
+    )
     add_count(speed, "--rounds", 5, "repeats, of which the median is taken")
     precision = table("precision", _precision_lines, "float32 against float64", "--seeds 2 --backends recall")
     add_count(precision, "--seeds", 20, "sessions per method")

@@ -36,7 +36,7 @@ def add_commands(commands: Commands) -> None:
 def add_run_directory(parser: argparse.ArgumentParser) -> None:
     """Adds the option that names the run directory."""
     parser.add_argument(
-        "-o", "--output", type=Path, metavar="DIR", help="new run directory (default: runs/<CONFIG>)"
+        "-o", "--output", type=Path, metavar="DIR", help="new run directory (default runs/CONFIG)"
     )
 
 

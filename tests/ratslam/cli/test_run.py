@@ -281,6 +281,7 @@ def test_score_refuses_a_folder_or_file_without_a_log(capsys, tmp_path):
     refused(capsys, ["score", tmp_path], "online.tum")
     (tmp_path / "log.csv").write_text("t,id\n0,1\n")
     refused(capsys, ["score", tmp_path / "log.csv"], "log.csv")
+    refused(capsys, ["score", tmp_path / "log.csv", "--base", "-1"], "--base: -1")
 
 
 def test_a_scored_directory_gives_its_scorecard(capsys, square):
