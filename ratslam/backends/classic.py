@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -16,10 +15,12 @@ from ratslam.backends.config import ClassicBackendConfig
 from ratslam.classic import places, view_templates
 from ratslam.classic.experience_map import ExperienceMap
 from ratslam.classic.places import Places
-from ratslam.classic.view_templates import Match, TemplateConfig, Templates
+from ratslam.classic.view_templates import Match, Templates
+from ratslam.core.backend import enlarge
+from ratslam.core.finite_values import finite_values
 from ratslam.core.types import Estimate, Scalar
 from tactile.base.se2 import wrap
-from tactile.base.types import Array, Observation, Odometry
+from tactile.base.types import Array, Observation
 
 
 class ClassicState(NamedTuple):
@@ -51,7 +52,7 @@ class ClassicEvidence(NamedTuple):
 
 
 class ClassicBackend:
-    """RatSLAM as published (winner takes all), for views of one shape.
+    """RatSLAM as published: only the best match of a view injects activity.
 
     Args:
         view_shape: (R, C, K) of the observations' views. dtype: of all floating state.
@@ -84,12 +85,9 @@ class ClassicBackend:
     def grow(self, state: ClassicState, capacity: int) -> ClassicState:
         """The same memories in larger arrays."""
         empty = self.init(None, capacity)
-
-        def enlarge(old: Array, new: Array) -> Array:
-            return new.at[tuple(slice(0, size) for size in old.shape)].set(old) if old.shape else old
-
-        memories = jax.tree.map(enlarge, (state.templates, state.places), (empty.templates, empty.places))
-        return state._replace(templates=memories[0], places=memories[1])
+        return state._replace(
+            templates=enlarge(state.templates, empty.templates), places=enlarge(state.places, empty.places)
+        )
 
     def apply_map_feedback(self, state: ClassicState, feedback: None) -> ClassicState:
         """The state unchanged: the classic map gives no feedback."""
@@ -102,8 +100,9 @@ class ClassicBackend:
         """Matches the view, injects activity, moves the packet, learns a template and decides on the
         place."""
         config = self.config
-        odometry, view, seen, clean = finite(config.templates, self.dtype, observation)
-
+        odometry, view, visible, clean = finite_values(self.dtype, observation)
+        view = view_templates.normalise(config.templates, view)
+        seen = view_templates.is_seen(config.templates, observation, visible)
         match = self._match(state.templates, view, observation.label, seen)
         memory, energy = view_templates.recall(config.templates, state.templates, match, seen)
         memory, learnt = view_templates.learn(
@@ -117,7 +116,7 @@ class ClassicBackend:
         turned = jnp.stack([jnp.zeros_like(relative), jnp.zeros_like(relative), relative / self.units[2]])
 
         recalled = (memory.packet[jnp.maximum(match.template, 0)] + turned) % self.rings
-        cells, told = pose_cells.step(
+        cells, info = pose_cells.step(
             config.pose_cells, self.window_levels, state.cells, odometry, recalled, energy
         )
         canonical = (cells.pose - turned) % self.rings
@@ -125,19 +124,19 @@ class ClassicBackend:
             config.places, self.rings, state.places, canonical, memory.current, seen & (memory.current >= 0)
         )
 
-        outcome = jnp.where(learnt & decision.room, told.outcome, Outcome.FULL)
+        outcome = jnp.where(learnt & decision.room, info.outcome, Outcome.FULL)
         outcome = jnp.where(clean, outcome, Outcome.NOT_FINITE).astype(jnp.int32)
         pose = cells.pose * self.units
         estimate = Estimate(
             pose=jnp.stack([pose[0], pose[1], wrap(pose[2])]),
-            spread=told.spread * self.units,
+            spread=info.spread * self.units,
             place=decision.place,
             previous=decision.previous,
             action=decision.action,
             lost=(outcome == Outcome.RESEEDED) | (outcome == Outcome.TOO_FAST),
         )
         evidence = ClassicEvidence(
-            memory.current, match.error, relative, energy, cells.pose, told.level, outcome
+            memory.current, match.error, relative, energy, cells.pose, info.level, outcome
         )
         return ClassicState(cells, memory, world, relative), estimate, evidence
 
@@ -151,22 +150,3 @@ class ClassicBackend:
         else:
             match = view_templates.match_view(self.config.templates, self.view_shape, store, view)
         return match._replace(error=jnp.where(seen, match.error, jnp.inf))
-
-
-def finite(
-    config: TemplateConfig, dtype: np.dtype, observation: Observation
-) -> tuple[Odometry, Array, Array, Array]:
-    """The observation in this precision, with values that are not finite masked.
-
-    Returns:
-        odometry; the normalised view; whether there is a view (or given id); whether all values were finite.
-    """
-    odometry = Odometry(*(jnp.asarray(value, dtype) for value in observation.odometry))
-    moves = jnp.stack(odometry[:3])
-    fine = jnp.all(jnp.isfinite(moves))
-    dx, dy, dtheta = jnp.where(fine, moves, 0.0)
-    view = jnp.asarray(observation.view, dtype)
-    visible = jnp.all(jnp.isfinite(view))
-    view = view_templates.normalise(config, jnp.where(visible, view, 0.0))
-    given = observation.label >= 0 if config.source == "labels" else observation.view_seen & visible
-    return Odometry(dx, dy, dtheta, odometry.dt), view, given, fine & (visible | ~observation.view_seen)

@@ -21,7 +21,7 @@ from ratslam.backends.grid import GridEvidence
 from ratslam.backends.recall import RecallBackend, RecallEvidence
 from ratslam.core.backend import Backend
 from ratslam.core.types import Scalar
-from ratslam.keyframes.ablation import FULL, Ablation
+from ratslam.keyframes.config import FULL, Ablation
 from tactile.base.config import Settings
 from tactile.whiskers.planar_whiskers import PlanarWhiskers
 
@@ -41,17 +41,16 @@ class BackendEntry(NamedTuple):
     """A SLAM method.
 
     Attributes:
-        name: value of `backend` in a configuration. config_class: sections of the configuration it reads.
-        build: makes the backend from a `config_class`, the sensors, the dtype of all floating state
-            and what a study turns off.
+        config_class: sections of the configuration it reads.
         evidence: NamedTuple type of a step's evidence. outcomes: values of its field `outcome`.
+        build: makes the backend from a `config_class`, the sensors, the dtype of all floating state, and the
+            parts of the keyframe map that are turned off (used by `recall` only).
     """
 
-    name: str
     config_class: type[Settings]
-    build: Callable[[Any, Sensors, np.dtype, Ablation], Backend]
     evidence: type[Any]
     outcomes: type[IntEnum]
+    build: Callable[[Any, Sensors, np.dtype, Ablation], Backend]
 
     def columns(self) -> tuple[str, ...]:
         """Fields of the evidence that are annotated `Scalar`: its columns in `steps.csv`."""
@@ -59,29 +58,27 @@ class BackendEntry(NamedTuple):
         return tuple(name for name, hint in hints.items() if hint == Scalar and name != "outcome")
 
 
-def _recall(config: RecallBackendConfig, sensors: Sensors, dtype: np.dtype, ablation: Ablation) -> Backend:
-    return RecallBackend(config, sensors.view_shape, dtype, ablation)
-
-
-def _classic(config: ClassicBackendConfig, sensors: Sensors, dtype: np.dtype, ablation: Ablation) -> Backend:
-    del ablation  # nothing to turn off
-    return ClassicBackend(config, sensors.view_shape, dtype)
-
-
-def _grid(config: GridBackendConfig, sensors: Sensors, dtype: np.dtype, ablation: Ablation) -> Backend:
-    del ablation  # nothing to turn off
-    return grid.build(config.grid, sensors.feelers, dtype)
-
-
 BACKENDS: dict[str, BackendEntry] = {
-    entry.name: entry
-    for entry in (
-        BackendEntry("recall", RecallBackendConfig, _recall, RecallEvidence, pose_cells.Outcome),
-        BackendEntry("classic", ClassicBackendConfig, _classic, ClassicEvidence, pose_cells.Outcome),
-        BackendEntry("grid", GridBackendConfig, _grid, GridEvidence, grid.GridOutcome),
-    )
+    "recall": BackendEntry(
+        RecallBackendConfig,
+        RecallEvidence,
+        pose_cells.Outcome,
+        lambda config, sensors, *options: RecallBackend(config, sensors.view_shape, *options),
+    ),
+    "classic": BackendEntry(
+        ClassicBackendConfig,
+        ClassicEvidence,
+        pose_cells.Outcome,
+        lambda config, sensors, dtype, _: ClassicBackend(config, sensors.view_shape, dtype),
+    ),
+    "grid": BackendEntry(
+        GridBackendConfig,
+        GridEvidence,
+        grid.GridOutcome,
+        lambda config, sensors, dtype, _: grid.build(config.grid, sensors.feelers, dtype),
+    ),
 }
-"""Every method that `backend` may name."""
+"""Every method, by its value of `backend` in a configuration."""
 
 
 def build(

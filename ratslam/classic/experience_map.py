@@ -17,7 +17,8 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from ratslam.classic.relaxation import relax
 from ratslam.core.backend import Evidence
-from ratslam.core.growable_array import GrowableArray, copy_arrays, restore_arrays
+from ratslam.core.checkpoint import Checkpointed
+from ratslam.core.growable_array import GrowableArray
 from ratslam.core.types import Action, Estimate
 from ratslam.pose_graph import Edges, geman_mcclure, huber, least_squares, no_kernel
 from ratslam.pose_graph.io import write_g2o, write_json
@@ -90,13 +91,15 @@ def travel_from_node(relative: float) -> Travel:
     return Travel(np.array([0.0, 0.0, relative]), np.zeros(3), 0.0, 0.0)
 
 
-class ExperienceMap:
+class ExperienceMap(Checkpointed):
     """The map of the classic backend (`ratslam.core.backend.Map`).
 
     The fields of `arrays()` are its whole state: node poses [M, 3] (x m, y m, heading rad), the place each
     node stands for, links with their measured motion, and for every step its node and the motion
     since, which give the final trajectory.
     """
+
+    VALUES = ("_current", "_travel")
 
     def __init__(self, config: ExperienceConfig | None = None) -> None:
         self.config = config or ExperienceConfig()
@@ -289,18 +292,7 @@ class ExperienceMap:
     def _known(self, place: int) -> int:
         return int(self._node_of.rows[place]) if 0 <= place < len(self._node_of.rows) else -1
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """The whole state, for `restore`."""
-        travel = self._travel
-        return copy_arrays(self) | {
-            "current": np.array(self._current),
-            "travel": np.concatenate([travel.motion, travel.variance, [travel.length, travel.duration]]),
-        }
-
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Replaces the whole state."""
-        restore_arrays(self, arrays)
-        self._current = int(arrays["current"])
-        travel = np.asarray(arrays["travel"])
-        self._travel = Travel(travel[:3].copy(), travel[3:6].copy(), float(travel[6]), float(travel[7]))
+        """Replaces the whole state by that of `arrays`."""
+        super().restore(arrays)
         self._link_of = {(int(a), int(b)): k for k, (a, b) in enumerate(self._ends.rows)}

@@ -14,7 +14,7 @@ from jax import lax
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from tactile.base.config import Settings
-from tactile.base.types import Array
+from tactile.base.types import Array, Observation
 
 TIE = 1e-9
 """Errors that differ by less are equal: the earliest template at the lowest offset wins."""
@@ -110,6 +110,11 @@ def normalise(config: TemplateConfig, view: Array) -> Array:
     if config.patch:
         view = _patch_normalise(view, config.patch, config.patch_sd)
     return view
+
+
+def is_seen(config: TemplateConfig, observation: Observation, visible: Array) -> Array:
+    """bool: the observation has a given id, or a view that is finite (`visible`)."""
+    return observation.label >= 0 if config.source == "labels" else observation.view_seen & visible
 
 
 def match_view(config: TemplateConfig, shape: tuple[int, int, int], store: Templates, view: Array) -> Match:

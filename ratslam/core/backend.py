@@ -1,8 +1,8 @@
-"""The seam: what a SLAM method has to provide.
+"""The interface of a SLAM method.
 
 A backend is a pure kernel and a map that folds the kernel's results. The kernel has no access to the map and
-the map none to the kernel's state, so the kernel can be scanned, batched and replayed bit for bit. One way
-leads back: at fixed step counts the map's feedback, a plain record, is applied to the state.
+the map none to the kernel's state, so the kernel can be scanned, batched and replayed bit for bit. The only
+feedback of the map to the kernel is a plain record, applied to the state at fixed step counts.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
+import jax
 import networkx
 import numpy as np
 
@@ -23,14 +24,14 @@ Evidence = Any
 """The backend's own record of one step: a NamedTuple of arrays of fixed shapes with at least `outcome`.
 Fields annotated `ratslam.core.types.Scalar` are columns of `steps.csv`."""
 Feedback = Any
-"""What the kernel receives of the map: a record of host arrays, or None."""
+"""A record of host arrays that the map gives to the kernel, or None."""
 
 
 class Map(Protocol):
-    """The map on the host: folds one step at a time; poses are in the map frame."""
+    """The map on the host: takes one step at a time; poses are in the map frame."""
 
     def update(self, observation: Observation, estimate: Estimate, evidence: Evidence) -> Estimate:
-        """Folds one step; returns the estimate completed by the map (confirmed places)."""
+        """Adds one step; returns the estimate completed by the map (confirmed places)."""
 
     def feedback(self) -> Feedback:
         """The record that the kernel takes over, or None."""
@@ -39,10 +40,10 @@ class Map(Protocol):
         """[3] the robot's current pose in the map frame: x m, y m, heading rad."""
 
     def trajectory(self) -> np.ndarray:
-        """[T, 3] poses of all folded steps in the optimised map."""
+        """[T, 3] poses of all steps in the optimised map."""
 
     def online_trajectory(self) -> np.ndarray:
-        """[T, 3] the same in the map as it is online, without final optimisation."""
+        """[T, 3] poses of all steps in the online map, before the final optimisation."""
 
     def closures(self) -> np.ndarray:
         """[M, 2] pairs of steps joined by accepted loop closures: the later and the earlier."""
@@ -51,13 +52,13 @@ class Map(Protocol):
         """The map as a graph (empty for maps without nodes)."""
 
     def files(self) -> dict[str, Callable[[Path], None]]:
-        """Files of the map in a run directory: names, and a function that writes each."""
+        """Files of the map in a run directory: a function that writes each, by name."""
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The whole state, for a checkpoint."""
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`."""
+        """Replaces the whole state by that of `arrays`."""
 
 
 class Backend(Protocol):
@@ -80,3 +81,12 @@ class Backend(Protocol):
 
     def new_map(self) -> Map:
         """An empty map."""
+
+
+def enlarge(rows: Any, empty: Any) -> Any:
+    """The arrays of `empty` (a NamedTuple) with those of `rows` at their beginning, for `Backend.grow`."""
+
+    def filled(old: Array, new: Array) -> Array:
+        return old if old.shape == new.shape else new.at[tuple(slice(0, n) for n in old.shape)].set(old)
+
+    return jax.tree.map(filled, rows, empty)

@@ -32,23 +32,3 @@ class GrowableArray:
         self._buffer = np.zeros((capacity, *self._buffer.shape[1:]), self._buffer.dtype)
         self._buffer[: len(rows)] = rows
         self._count = len(rows)
-
-
-def growable_arrays(owner: object) -> dict[str, GrowableArray]:
-    """The attributes of `owner` that are growable arrays, by name without the leading underscore."""
-    return {
-        name.removeprefix("_"): value
-        for name, value in vars(owner).items()
-        if isinstance(value, GrowableArray)
-    }
-
-
-def copy_arrays(owner: object) -> dict[str, np.ndarray]:
-    """Copies of the rows of all growable arrays of `owner`, for a checkpoint."""
-    return {name: array.rows.copy() for name, array in growable_arrays(owner).items()}
-
-
-def restore_arrays(owner: object, saved: dict[str, np.ndarray]) -> None:
-    """Replaces the rows of all growable arrays of `owner` by those of a checkpoint."""
-    for name, array in growable_arrays(owner).items():
-        array.replace(saved[name])

@@ -18,6 +18,7 @@ import numpy as np
 from jax import lax
 
 from ratslam.core.backend import Backend, Evidence, Map
+from ratslam.core.checkpoint import with_prefix
 from ratslam.core.packing import Layout, PackedRecords, allocate, allocate_traced, layout_of
 from ratslam.core.precision import Precision, check_precision
 from ratslam.core.types import Estimate
@@ -117,8 +118,7 @@ class Session:
             if value is None or value.shape != leaf.shape or value.dtype != leaf.dtype:
                 raise ValueError("the checkpoint was made with another configuration or view shape")
         self.state = jax.tree.unflatten(jax.tree.structure(like), [jnp.asarray(value) for value in saved])
-        prefix = "map/"
-        self.map.restore({k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)})
+        self.map.restore(with_prefix(arrays, "map/"))
         self.steps, self.reserve, self._capacity = steps, reserve, capacity
 
     def compilations(self) -> int:

@@ -7,14 +7,17 @@ from __future__ import annotations
 
 import numpy as np
 
+from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.growable_array import GrowableArray
 
 MAX_POSES = 4_000_000
 """Poses stored for individual particles."""
 
 
-class Genealogy:
+class Genealogy(Checkpointed):
     """Poses and ancestors of N particles at each report."""
+
+    VALUES = ("_weight",)
 
     def __init__(self, count: int) -> None:
         self.count = count
@@ -53,22 +56,6 @@ class Genealogy:
             self._settled.append(pose)
         self._pose.replace(self._pose.rows[reports:].copy())
         self._ancestor.replace(self._ancestor.rows[reports:].copy())
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """The whole state, for `restore`."""
-        return {
-            "settled": self._settled.rows.copy(),
-            "ancestor": self._ancestor.rows.copy(),
-            "pose": self._pose.rows.copy(),
-            "weight": self._weight.copy(),
-        }
-
-    def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Replaces the whole state."""
-        self._settled.replace(arrays["settled"])
-        self._ancestor.replace(arrays["ancestor"])
-        self._pose.replace(arrays["pose"])
-        self._weight = np.array(arrays["weight"], float)
 
 
 def _mean(pose: np.ndarray, weight: np.ndarray) -> np.ndarray:

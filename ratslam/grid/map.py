@@ -9,7 +9,8 @@ from typing import Any
 import networkx
 import numpy as np
 
-from ratslam.core.growable_array import GrowableArray, copy_arrays, restore_arrays
+from ratslam.core.checkpoint import Checkpointed
+from ratslam.core.growable_array import GrowableArray
 from ratslam.core.types import Estimate
 from ratslam.grid.config import GridConfig
 from ratslam.grid.genealogy import Genealogy
@@ -18,12 +19,14 @@ from tactile.base.types import Observation
 from tactile.whiskers.planar_whiskers import PlanarWhiskers
 
 
-class GridMap:
+class GridMap(Checkpointed):
     """The map of the grid filter (`ratslam.core.backend.Map`).
 
     Args:
         feelers: the whiskers of the observations. side: of the map, cells.
     """
+
+    PARTS = ("_genealogy",)
 
     def __init__(self, config: GridConfig, feelers: PlanarWhiskers, side: int) -> None:
         self.config, self.feelers, self.side = config, feelers, side
@@ -83,17 +86,3 @@ class GridMap:
     def _contact_log(self) -> ContactLog:
         contact, alive = np.moveaxis(self._flags.rows, 2, 0)
         return contact_log(self._motion.rows, contact, alive, self._point.rows, self._wall.rows)
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """The whole state, for `restore`."""
-        return copy_arrays(self) | {
-            f"genealogy/{name}": rows for name, rows in self._genealogy.arrays().items()
-        }
-
-    def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Replaces the whole state."""
-        restore_arrays(self, arrays)
-        prefix = "genealogy/"
-        self._genealogy.restore(
-            {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
-        )

@@ -1,47 +1,54 @@
-"""What the map knows of the looks of its frames, and what it tells recall of them: given ids, views, touch.
+"""Views of the keyframes: given ids, views or whisker images, and the metric by which recall compares them.
 
-Each keeps the looks of all frames, tells recall by what measure to compare them, and answers how badly a
-frame would fit somewhere else. What has to be known about the sensor is found out from the session itself.
+Each kind stores what all keyframes looked like, gives recall the metric, and measures how badly a keyframe
+would fit at another pose. The properties of the sensor are estimated from the session itself.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
 from ratslam.core.backend import Evidence
+from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.growable_array import GrowableArray
 from ratslam.keyframes.view_sectors import NO_ESTIMATE, BiasEstimate, SectorFan
 from ratslam.recall.memory import NO_LIKENESS
-from ratslam.recall.whisker_likelihood import Pixels, background, levels, table, variation
+from ratslam.recall.whisker_likelihood import (
+    PixelLayout,
+    estimate_background,
+    estimate_variation,
+    live_pixels,
+    log_odds_table,
+    pixel_levels,
+)
 from tactile.base.types import Observation
 
-EVERY = 16
-"""Frames between two looks at the bias that the views show."""
-EARLIEST = 40
-"""Frames before the first, and before images are compared."""
-ENOUGH = 400
-"""Errors against ruled-out frames before their quantile is taken for the scale of errors."""
-BACKGROUND = (0.005, 0.01, 0.02, 0.04, 0.08)
-"""The quantiles whose geometric mean is the scale: errors so small are still seen between different places.
-Several, because the errors of places that look exactly alike make a step in the quantiles, and a scale taken
-from one quantile falls down that step."""
-ALIKE = 1e-3
-"""Least such quantile, as a share of the largest: places may look alike to the last bit."""
-LEARN = 40
-"""Frames between two lessons in the likeness of whisker images."""
-NEVER = 3.0
-"""Log-odds that stand for a whisker image never felt before."""
-DOUBT = 0.5
-"""How much a frame misfits where there is nothing to compare it with."""
-UNTOLD = float(np.log(2))
-"""The same for whisker images: what one misfits that says nothing."""
+BIAS_INTERVAL = 16
+"""Keyframes between two estimates of the heading bias from views."""
+MIN_KEYFRAMES = 40
+"""Keyframes before the first estimate, of the heading bias or of log-odds."""
+MIN_ERRORS = 400
+"""Errors against ruled-out keyframes before the scale of errors is estimated."""
+QUANTILES = (0.005, 0.01, 0.02, 0.04, 0.08)
+"""Quantiles of the errors between different places, whose geometric mean is the scale. There are several,
+because identical places make a step in the quantiles, and one quantile alone could lie below the step."""
+LEAST_QUANTILE = 1e-3
+"""Least such quantile as a share of the largest, because views of different places may be identical."""
+LOG_ODDS_INTERVAL = 40
+"""Keyframes between two estimates of the log-odds of whisker images."""
+NEW_IMAGE_LOG_ODDS = 3.0
+"""Log-odds that stand for a whisker image never seen before."""
+NEUTRAL_MISFIT = 0.5
+"""Misfit of a keyframe without others to compare it with."""
+NEUTRAL_IMAGE_MISFIT = float(np.log(2))
+"""Misfit of a whisker image without evidence."""
 
 
 class ViewMetric(NamedTuple):
-    """What recall compares by: see `MapFeedback`."""
+    """The metric of recall; see `MapFeedback`."""
 
     angle: float
     scale: float
@@ -49,70 +56,66 @@ class ViewMetric(NamedTuple):
 
 
 class ConfirmedPairs(NamedTuple):
-    """Pairs of frames [P] that the map takes for one place, and whether one was turned about [P] bool."""
+    """P pairs of keyframes at one place: keyframe [P], match [P], and bool [P]: they face opposite ways."""
 
     frame: np.ndarray
     match: np.ndarray
-    about: np.ndarray
+    reversed: np.ndarray
 
 
-class Appearance(Protocol):
-    """The looks of all frames."""
+class Appearance(Checkpointed):
+    """Views of all keyframes."""
 
-    def measure(self) -> ViewMetric:
-        """What recall compares by now."""
+    def metric(self) -> ViewMetric:
+        """The present metric of recall."""
+        raise NotImplementedError
 
     def append(self, observation: Observation, turn: float, length: float) -> None:
-        """One more frame: what was seen, and turn (rad) and way (m) since the one before."""
+        """Adds a keyframe, after a turn (rad) and a distance (m) since the one before."""
+        raise NotImplementedError
 
-    def learn(self, evidence: Evidence, known: Callable[[], ConfirmedPairs]) -> BiasEstimate:
-        """Takes up what the newest frame's recollection tells, and asks, now and then, for pairs that the map
-        is sure of; answers the heading bias that the views show, if it was looked at."""
+    def learn(self, evidence: Evidence, confirmed_pairs: Callable[[], ConfirmedPairs]) -> BiasEstimate:
+        """Updates the metric from the newest keyframe's evidence and, at intervals, from confirmed pairs.
 
-    def misfit(self, frame: int, near: np.ndarray, about: np.ndarray) -> float:
-        """How badly a frame would fit among frames [n], faced as they are or turned `about` [n]; 0 and up."""
+        Returns:
+            the heading bias that the views show, `NO_ESTIMATE` if it was not estimated.
+        """
+        return NO_ESTIMATE
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """All of its state."""
+    def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
+        """How badly a keyframe would fit among keyframes [n], seen in the same or in the opposite direction
+        (`reversed` [n] bool); 0 or more."""
+        raise NotImplementedError
 
-    def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`."""
 
-
-class LabelAppearance:
+class LabelAppearance(Appearance):
     """Ids given with the recording."""
 
     def __init__(self) -> None:
         self._label = GrowableArray((), np.int64)
 
-    def measure(self) -> ViewMetric:
+    def metric(self) -> ViewMetric:
         return ViewMetric(0.0, 0.0, NO_LIKENESS)
 
     def append(self, observation: Observation, turn: float, length: float) -> None:
         self._label.append(int(observation.label))
 
-    def learn(self, evidence: Evidence, known: Callable[[], ConfirmedPairs]) -> BiasEstimate:
-        return NO_ESTIMATE
-
-    def misfit(self, frame: int, near: np.ndarray, about: np.ndarray) -> float:
+    def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
         if not len(near):
-            return DOUBT
+            return NEUTRAL_MISFIT
         return float(not np.any(self._label.rows[near] == self._label.rows[frame]))
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        return {"label": self._label.rows.copy()}
 
-    def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        self._label.replace(arrays["label"])
-
-
-class ViewAppearance:
-    """Views that are compared by their mean absolute difference.
+class ViewAppearance(Appearance):
+    """Views compared by their mean absolute difference.
 
     Args:
-        size: values of a view. fan: its width in rad, 0: to be found out; None: not a fan. normalise: what
-            recall does to a view before it compares it.
+        size: number of values of a view. fan: field of view, rad; 0: to be estimated; None: the views are not
+            ordered sectors. normalise: the preprocessing of recall.
     """
+
+    VALUES = ("_scale",)
+    PARTS = ("_fan",)
 
     def __init__(
         self, size: int, fan: float | None, normalise: Callable[[np.ndarray], np.ndarray] = np.asarray
@@ -121,9 +124,9 @@ class ViewAppearance:
         self._fan = None if fan is None or not size else SectorFan(size, fan / size)
         self._view = GrowableArray((size,), np.float64)
         self._background = GrowableArray((), np.float64)
-        self._scale = (0, 0.0)  # errors it was taken from, and the scale
+        self._scale = (0, 0.0)  # number of errors it was estimated from, and the scale
 
-    def measure(self) -> ViewMetric:
+    def metric(self) -> ViewMetric:
         return ViewMetric(self._fan.angle if self._fan else 0.0, self._scale[1], NO_LIKENESS)
 
     def append(self, observation: Observation, turn: float, length: float) -> None:
@@ -133,107 +136,83 @@ class ViewAppearance:
         if self._fan:
             self._fan.append(self._view.rows[-1], turn, length)
 
-    def learn(self, evidence: Evidence, known: Callable[[], ConfirmedPairs]) -> BiasEstimate:
+    def learn(self, evidence: Evidence, confirmed_pairs: Callable[[], ConfirmedPairs]) -> BiasEstimate:
         for error in np.asarray(evidence.background)[np.isfinite(evidence.background)]:
             self._background.append(error)
         self._rescale()
         count = len(self._view.rows) - 1
-        if self._fan is None or count % EVERY or count < EARLIEST:
+        if self._fan is None or count % BIAS_INTERVAL or count < MIN_KEYFRAMES:
             return NO_ESTIMATE
-        before, told = self._fan.angle, self._fan.estimate()
+        before, estimate = self._fan.angle, self._fan.estimate()
         if not before and self._fan.angle:
-            # Errors are smaller now that views may shift: those known so far are of another kind.
+            # Shifted views have smaller errors, so the errors so far no longer count.
             self._background.replace(self._background.rows[:0])
             self._scale = 0, 0.0
-        return told
+        return estimate
 
-    def misfit(self, frame: int, near: np.ndarray, about: np.ndarray) -> float:
-        """0..1: the error of the best of them, against the scale."""
+    def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
+        """0..1: the smallest error against the keyframes, relative to twice the scale."""
         if not len(near):
-            return DOUBT
-        apart = np.abs(self._view.rows[near] - self._view.rows[frame]).mean(axis=1).min()
-        return float(min(apart / max(2 * self._scale[1], 1e-300), 1.0))
+            return NEUTRAL_MISFIT
+        error = np.abs(self._view.rows[near] - self._view.rows[frame]).mean(axis=1).min()
+        return float(min(error / max(2 * self._scale[1], 1e-300), 1.0))
 
     def _rescale(self) -> None:
-        """The error below which different places seldom come; taken anew when a tenth more is known."""
+        """Estimates the scale when there are a tenth more errors than at the last estimate."""
         count = len(self._background.rows)
-        if count >= max(ENOUGH, 1.1 * self._scale[0]):
-            small = np.quantile(self._background.rows, BACKGROUND)
-            # As shares of the largest, so that the sensor's unit drops out to the last bit.
+        if count >= max(MIN_ERRORS, 1.1 * self._scale[0]):
+            small = np.quantile(self._background.rows, QUANTILES)
+            # As shares of the largest, so that the result does not depend on the sensor's unit.
             share = small / small[-1] if small[-1] > 0 else small
-            scale = float(small[-1] * np.exp(np.log(np.maximum(share, ALIKE)).mean()))
+            scale = float(small[-1] * np.exp(np.log(np.maximum(share, LEAST_QUANTILE)).mean()))
             self._scale = count, scale
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        kept = {"view": self._view.rows.copy(), "background": self._background.rows.copy()}
-        kept["scale"] = np.array(self._scale)
-        return kept | {
-            f"fan/{name}": rows for name, rows in (self._fan.arrays() if self._fan else {}).items()
-        }
 
-    def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        self._view.replace(arrays["view"])
-        self._background.replace(arrays["background"])
-        count, scale = np.asarray(arrays["scale"])
-        self._scale = int(count), float(scale)
-        if self._fan:
-            self._fan.restore(
-                {name.removeprefix("fan/"): rows for name, rows in arrays.items() if name.startswith("fan/")}
-            )
-
-
-class WhiskerAppearance:
-    """Whisker images, compared by log-odds that are learned from the session.
+class WhiskerAppearance(Appearance):
+    """Whisker images compared by log-odds that are learned from the session.
 
     Args:
-        temper: share of the log-odds that counts, see `RecallConfig`. normalise: what recall does to an image
-            before it compares it.
+        temper: factor on the log-odds, see `RecallConfig`. normalise: the preprocessing of recall.
     """
 
+    VALUES = ("_likeness",)
+
     def __init__(
-        self, pixels: Pixels, temper: float, normalise: Callable[[np.ndarray], np.ndarray] = np.asarray
+        self,
+        pixels: PixelLayout,
+        temper: float,
+        normalise: Callable[[np.ndarray], np.ndarray] = np.asarray,
     ) -> None:
         self._pixels, self._temper, self._normalise = pixels, temper, normalise
         self._level = GrowableArray((len(pixels.group),), np.int64)
         self._likeness = NO_LIKENESS
 
-    def measure(self) -> ViewMetric:
-        return ViewMetric(np.pi, NEVER if self._likeness.size else 0.0, self._likeness)
+    def metric(self) -> ViewMetric:
+        return ViewMetric(np.pi, NEW_IMAGE_LOG_ODDS if self._likeness.size else 0.0, self._likeness)
 
     def append(self, observation: Observation, turn: float, length: float) -> None:
         view = self._normalise(np.asarray(observation.view, float))
-        self._level.append(levels(view.reshape(-1), alive(observation).reshape(-1)).astype(np.int64))
+        self._level.append(
+            pixel_levels(view.reshape(-1), live_pixels(observation).reshape(-1)).astype(np.int64)
+        )
 
-    def learn(self, evidence: Evidence, known: Callable[[], ConfirmedPairs]) -> BiasEstimate:
-        if len(self._level.rows) >= EARLIEST and len(self._level.rows) % LEARN == 0:
-            frame, match, about = known()
-            image, pixels = self._level.rows, self._pixels
-            then = np.where(about[:, None], image[match][:, pixels.behind], image[match])
-            common = background(image, pixels.group)
-            self._likeness = table(common, variation(image[frame], then))
+    def learn(self, evidence: Evidence, confirmed_pairs: Callable[[], ConfirmedPairs]) -> BiasEstimate:
+        if len(self._level.rows) >= MIN_KEYFRAMES and len(self._level.rows) % LOG_ODDS_INTERVAL == 0:
+            frame, match, reversed = confirmed_pairs()
+            images = self._level.rows
+            variation = estimate_variation(images[frame], self._images(match, reversed))
+            self._likeness = log_odds_table(estimate_background(images, self._pixels.group), variation)
         return NO_ESTIMATE
 
-    def misfit(self, frame: int, near: np.ndarray, about: np.ndarray) -> float:
-        """By how much the image is less likely there than the likeliest there is, at most."""
+    def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
+        """log(1 + 1 / odds) of the most similar of the keyframes."""
         if not len(near) or not self._likeness.size:
-            return UNTOLD
-        image, pixels = self._level.rows, self._pixels
-        then = np.where(about[:, None], image[near][:, pixels.behind], image[near])
-        odds = self._likeness[pixels.group, image[frame], then].sum(axis=1).max()
+            return NEUTRAL_IMAGE_MISFIT
+        image = self._level.rows[frame]
+        odds = self._likeness[self._pixels.group, image, self._images(near, reversed)].sum(axis=1).max()
         return float(np.log1p(np.exp(-self._temper * odds)))
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        return {"level": self._level.rows.copy(), "likeness": self._likeness.copy()}
-
-    def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        self._level.replace(arrays["level"])
-        self._likeness = np.asarray(arrays["likeness"], float)
-
-
-def alive(observation: Observation) -> np.ndarray:
-    """[R, C, K] bool, the pixels whose whiskers report; all of them where nothing is said about whiskers."""
-    rows, columns, channels = np.shape(observation.view)
-    told = np.asarray(observation.alive)
-    if told.size != rows * columns:
-        return np.ones((rows, columns, channels), bool)
-    return np.repeat(told.reshape(rows, columns, 1), channels, axis=2)
+    def _images(self, frames: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+        """[n, D] levels of keyframes, those `reversed` [n] as seen in the opposite direction."""
+        images = self._level.rows[frames]
+        return np.where(reversed[:, None], images[:, self._pixels.opposite], images)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.keyframes.optimizer import BiasPrior, LoopClosures, MapFit, OdometryChain, robust_cost, solve
+from ratslam.keyframes.optimizer import LoopClosures, MapFit, MapProblem, robust_cost, solve
 from tactile.base.se2 import between, compose, correct_heading_bias, integrate, inverse
 
 KEPT = 0.25
@@ -42,13 +42,11 @@ class SelectionProblem(NamedTuple):
     """The sequences to select from, and the odometry.
 
     Attributes:
-        chain, closures, prior: see `solve`; closures of all R sequences. evidence: [R] log-likelihood ratios.
-        first, last: [R] first and last keyframe of each sequence.
+        measurements: with the closures of all R sequences. evidence: [R] log-likelihood ratios. first, last:
+            [R] first and last keyframe of each sequence.
     """
 
-    chain: OdometryChain
-    closures: LoopClosures
-    prior: BiasPrior
+    measurements: MapProblem
     evidence: np.ndarray
     first: np.ndarray
     last: np.ndarray
@@ -92,8 +90,8 @@ def _anew(case: SelectionProblem, starts: Sequence[MapFit]) -> list[Selection]:
     for least in STRONG:
         strong = case.evidence >= least
         if strong.any() and not strong.all():
-            alone = _only(case.closures, strong)
-            begin.append(solve(path.poses, path.bias, case.chain, alone, case.prior, STEPS, FINE))
+            alone = _only(case.measurements.closures, strong)
+            begin.append(solve(path, case.measurements._replace(closures=alone), STEPS, FINE))
     return [optimise_with_cuts(case, start, ()) for start in begin]
 
 
@@ -127,7 +125,7 @@ def _nearest(case: SelectionProblem, best: Selection, found: list[Selection]) ->
 def _strain(case: SelectionProblem, best: Selection) -> np.ndarray:
     """[R] squared deviation between the start of each sequence and the odometry since the last accepted
     closure. Both poses are those of the closures alone, so that a map deformed by a jump does not hide it."""
-    chain, closures = cut_chain(case.chain, best.cuts), case.closures
+    chain, closures, _ = cut_odometry(case.measurements, best.cuts)
     strain = np.zeros(len(case.evidence))
     for sequence in range(len(strain)):
         since, first = _since(case, best, sequence), int(case.first[sequence])
@@ -173,7 +171,7 @@ def _cut(case: SelectionProblem, best: Selection, sequence: int, where: Where) -
     since, first = _since(case, best, sequence), int(case.first[sequence])
     if first <= since:
         return []
-    claimed = _claim(best, case.closures, first, sequence)
+    claimed = _claim(best, case.measurements.closures, first, sequence)
     frame, moved = _carried(case, best, since, first, claimed, poses, where)
     cuts = (*best.cuts, (frame, sequence))
     found = [optimise_with_cuts(case, best.fit._replace(poses=moved), cuts)]
@@ -199,7 +197,7 @@ def _carried(
 ) -> tuple[int, np.ndarray]:
     """The keyframe between `since` and `first` before which to cut so that `first` comes to the pose
     `claimed`, and the resulting poses."""
-    chain = case.chain
+    chain = case.measurements.chain
     told = correct_heading_bias(chain.motion[since:first], chain.length[since:first], best.fit.bias)
     onwards = integrate(told, poses[since])  # of frames since + 1 ... first
     carried = compose(claimed, inverse(onwards[-1]))
@@ -211,19 +209,20 @@ def _carried(
     return frame, moved
 
 
-def cut_chain(chain: OdometryChain, cuts: tuple[tuple[int, int], ...]) -> OdometryChain:
+def cut_odometry(problem: MapProblem, cuts: tuple[tuple[int, int], ...]) -> MapProblem:
+    """The problem with loose odometry at the cuts (keyframe, sequence)."""
     if not cuts:
-        return chain
-    variance = chain.variance.copy()
+        return problem
+    variance = problem.chain.variance.copy()
     variance[[frame - 1 for frame, _ in cuts]] = LOOSE**2
-    return chain._replace(variance=variance)
+    return problem._replace(chain=problem.chain._replace(variance=variance))
 
 
 def optimise_with_cuts(case: SelectionProblem, start: MapFit, cuts: tuple[tuple[int, int], ...]) -> Selection:
-    chain = cut_chain(case.chain, cuts)
-    fit = solve(start.poses, start.bias, chain, case.closures, case.prior, STEPS, FINE)
-    cost = robust_cost(fit, chain, case.closures, case.prior) + CUT * len(cuts)
-    return Selection(fit, cost, cuts)
+    """The fit and its cost with these cuts (keyframe, sequence), from the poses and bias of `start`."""
+    problem = cut_odometry(case.measurements, cuts)
+    fit = solve(start, problem, STEPS, FINE)
+    return Selection(fit, robust_cost(fit, problem) + CUT * len(cuts), cuts)
 
 
 def _only(closures: LoopClosures, sequences: np.ndarray) -> LoopClosures:
@@ -236,5 +235,5 @@ def _only(closures: LoopClosures, sequences: np.ndarray) -> LoopClosures:
         turn=closures.turn[rows],
         sequence=number[closures.sequence[rows]],
         scale=closures.scale[sequences],
-        stray=np.broadcast_to(closures.stray, closures.scale.shape)[sequences],
+        cost_limit=np.broadcast_to(closures.cost_limit, closures.scale.shape)[sequences],
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from tactile.base.config import Settings
@@ -97,3 +99,20 @@ class KeyframeMapConfig(Settings):
     """Radius of an experience, cells."""
     place_heading: PositiveFloat = 0.35
     """Largest difference in heading within an experience, rad."""
+
+
+class Ablation(NamedTuple):
+    """Parts of the keyframe map that a study can turn off, to measure what each contributes.
+
+    Attributes:
+        verify: closure sequences are tested against the map's covariance before they count. robust: sequences
+            that disagree with the map lose weight. heading_bias: the map solves for the heading bias.
+    """
+
+    verify: bool = True
+    robust: bool = True
+    heading_bias: bool = True
+
+
+FULL = Ablation()
+"""Nothing turned off."""

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
+from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.growable_array import GrowableArray
-from ratslam.keyframes.ablation import Ablation
 from ratslam.keyframes.appearance import Appearance
-from ratslam.keyframes.config import KeyframeMapConfig
+from ratslam.keyframes.config import Ablation, KeyframeMapConfig
 from ratslam.keyframes.loop_closures import ClosureLog
 from ratslam.keyframes.optimizer import (
     BiasPrior,
     LoopClosures,
     MapFit,
+    MapProblem,
     OdometryChain,
     relative_covariance,
     solve,
@@ -26,7 +27,7 @@ NO_ROBUST_SCALE = 1e12
 """Robust scale at which no closure sequence loses weight."""
 
 
-class KeyframeGraph:
+class KeyframeGraph(Checkpointed):
     """Keyframes as a chain of odometry with breaks, and the heading bias of the odometry.
 
     Args:
@@ -39,6 +40,8 @@ class KeyframeGraph:
             that shows a break of the odometry before the keyframe, -1 for none. bias: heading bias of the
             odometry, rad/m. prior: of the bias.
     """
+
+    VALUES = ("bias", "prior")
 
     def __init__(
         self, config: KeyframeMapConfig, cell: float, appearance: Appearance, guard: int, ablation: Ablation
@@ -61,7 +64,7 @@ class KeyframeGraph:
     @property
     def sector_angle(self) -> float:
         """Turn per sector shift of a view, rad; 0 while unknown."""
-        return self.appearance.measure().angle
+        return self.appearance.metric().angle
 
     def append(self, pose: np.ndarray, motion: np.ndarray, length: float, turn: float) -> None:
         """Adds a keyframe at `pose` [3], reached by `motion` [3]."""
@@ -114,24 +117,28 @@ class KeyframeGraph:
                 2 * np.maximum(closures.score - config.sequence_cost, 1.0) / np.bincount(closures.sequence)
             )
             # A sequence must be able to cost more than its evidence, else it could never be refused.
-            return closures._replace(scale=worth, stray=np.maximum(config.closure_cost_limit, 1.5 * worth))
+            return closures._replace(
+                scale=worth, cost_limit=np.maximum(config.closure_cost_limit, 1.5 * worth)
+            )
         if not self.ablation.robust:
             return closures._replace(scale=np.full_like(closures.scale, NO_ROBUST_SCALE))
         return closures
 
+    def problem(self, log: ClosureLog, cut: GrowableArray) -> MapProblem:
+        """The least-squares problem of the keyframes with the odometry broken at `cut`."""
+        return MapProblem(self.odometry(cut), self.closures(log), self.bias_prior())
+
     def solve(self, log: ClosureLog, iterations: int) -> MapFit:
         """The optimised map, from the current poses."""
-        chain, closures = self.odometry(self.cut), self.closures(log)
-        return solve(self.pose.rows, self.bias, chain, closures, self.bias_prior(), iterations)
+        return solve(self.fit(), self.problem(log, self.cut), iterations)
 
     def relative_covariance(self, log: ClosureLog, i: int, j: int, turn: float) -> np.ndarray:
         """[3, 3] covariance of keyframe j in the frame of keyframe i turned by `turn`."""
-        chain, closures = self.odometry(self.cut), self.closures(log)
-        return relative_covariance(self.fit(), chain, closures, self.bias_prior(), i, j, turn)
+        return relative_covariance(self.fit(), self.problem(log, self.cut), i, j, turn)
 
     def edges(self, fit: MapFit, log: ClosureLog, cut: GrowableArray) -> Edges:
         """Edges of a solution: odometry corrected by its bias, and closures with their robust weights."""
-        chain, closures = self.odometry(cut), self.closures(log)
+        chain, closures, _ = self.problem(log, cut)
         steps = np.arange(len(chain.length))
         zero = np.zeros(len(closures.i))
         turned = np.stack([zero, zero, closures.turn], axis=1)

@@ -7,12 +7,16 @@ map accepts a sequence, refuses it, or removes it later; every candidate stays i
 from __future__ import annotations
 
 from enum import IntEnum
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.core.growable_array import GrowableArray, copy_arrays, restore_arrays
+from ratslam.core.checkpoint import Checkpointed
+from ratslam.core.growable_array import GrowableArray
 from ratslam.keyframes.optimizer import LoopClosures
+
+CSV_COLUMNS = "keyframe,match,step,match_step,shift,posterior,log_ratio,sequence,distance,verdict,weight"
 
 
 class Verdict(IntEnum):
@@ -30,19 +34,19 @@ class Candidate(NamedTuple):
     """A proposed closure: the keyframe, the older keyframe matched, the sector shift, the posterior mass, and
     the log-likelihood ratio against novelty."""
 
-    frame: int
+    keyframe: int
     match: int
     shift: int
-    mass: float
-    gain: float
+    posterior: float
+    log_ratio: float
 
 
-class ClosureLog:
+class ClosureLog(Checkpointed):
     """All candidates and closure sequences, in order of time."""
 
     def __init__(self) -> None:
         self._candidate = GrowableArray((4,), np.int64)  # keyframe, match, shift, sequence (-1: struck out)
-        self._evidence = GrowableArray((2,), np.float64)  # mass, gain
+        self._evidence = GrowableArray((2,), np.float64)  # posterior, log-likelihood ratio
         self._verdict = GrowableArray((), np.int64)
         self._distance = GrowableArray((), np.float64)
         self._weight = GrowableArray((), np.float64)
@@ -70,8 +74,8 @@ class ClosureLog:
             self._verdict.append(Verdict.OPEN)
             self._distance.append(np.inf)
             self._weight.append(0.0)
-        self._candidate.append((candidate.frame, candidate.match, candidate.shift, self.sequences - 1))
-        self._evidence.append((candidate.mass, candidate.gain))
+        self._candidate.append((candidate.keyframe, candidate.match, candidate.shift, self.sequences - 1))
+        self._evidence.append((candidate.posterior, candidate.log_ratio))
         self._lines = None
         return self.sequences - 1
 
@@ -164,8 +168,8 @@ class ClosureLog:
         return self._weight.rows[self._candidate.rows[self.accepted(), 3]]
 
     def table(self) -> np.ndarray:
-        """[n, 9] all candidates: keyframe, match, shift, mass, gain, sequence, its distance, verdict and
-        weight."""
+        """[n, 9] all candidates: keyframe, match, shift, posterior, log-likelihood ratio, sequence, its
+        distance, verdict and weight."""
         sequence = self._candidate.rows[:, 3]
         of_sequence = np.stack([self._distance.rows, self._verdict.rows, self._weight.rows], axis=1)[sequence]
         of_sequence[sequence < 0] = np.inf, Verdict.UNDONE, 0.0
@@ -173,11 +177,19 @@ class ClosureLog:
             [self._candidate.rows[:, :3], self._evidence.rows, sequence[:, None], of_sequence], axis=1
         )
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """The whole state, for a checkpoint."""
-        return copy_arrays(self)
-
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`."""
-        restore_arrays(self, arrays)
+        """Replaces the whole state by that of `arrays`."""
+        super().restore(arrays)
         self._lines = None
+
+
+def write_closures(path: Path, table: np.ndarray, first_step: np.ndarray) -> None:
+    """Writes the candidates of `ClosureLog.table` as CSV; first_step: [N] the step of each keyframe."""
+    lines = [CSV_COLUMNS]
+    for frame, match, shift, posterior, ratio, sequence, distance, verdict, weight in table.tolist():
+        frame, match = int(frame), int(match)
+        lines.append(
+            f"{frame},{match},{first_step[frame]},{first_step[match]},{int(shift)},{posterior!r},{ratio!r},"
+            f"{int(sequence)},{distance!r},{Verdict(int(verdict)).name.lower()},{weight!r}"
+        )
+    Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -17,15 +17,14 @@ import networkx
 import numpy as np
 
 from ratslam.core.backend import Evidence
-from ratslam.core.growable_array import GrowableArray, copy_arrays, restore_arrays
+from ratslam.core.checkpoint import Checkpointed
+from ratslam.core.growable_array import GrowableArray
 from ratslam.core.types import Estimate
-from ratslam.keyframes.ablation import FULL, Ablation
 from ratslam.keyframes.appearance import Appearance, ConfirmedPairs
-from ratslam.keyframes.closures_csv import write_closures
-from ratslam.keyframes.config import KeyframeMapConfig
+from ratslam.keyframes.config import FULL, Ablation, KeyframeMapConfig
 from ratslam.keyframes.experiences import Experiences
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
-from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
+from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict, write_closures
 from ratslam.keyframes.map_solution import MapSolution, final_solution, selected_solution
 from ratslam.keyframes.odometry_breaks import break_odometry
 from ratslam.keyframes.optimizer import BiasPrior, MapFit
@@ -51,7 +50,7 @@ class Travel(NamedTuple):
 HALT = Travel(np.zeros(3), 0.0, 0.0)
 
 
-class KeyframeMap:
+class KeyframeMap(Checkpointed):
     """Folds the results of the recall kernel (`ratslam.core.backend.Map`).
 
     Args:
@@ -59,6 +58,9 @@ class KeyframeMap:
             never recalled. closures: False for a map of odometry alone. ablation: parts turned off by a
             study.
     """
+
+    VALUES = ("_travel", "_since", "_turned", "_solved")
+    PARTS = ("_graph", "_log", "_experiences", "_appearance")
 
     def __init__(
         self,
@@ -86,7 +88,7 @@ class KeyframeMap:
 
     def feedback(self) -> MapFeedback:
         """The poses, heading bias and view metric for the recall filter."""
-        return MapFeedback(self._graph.pose.rows, self._graph.bias, self._since, *self._appearance.measure())
+        return MapFeedback(self._graph.pose.rows, self._graph.bias, self._since, *self._appearance.metric())
 
     def pose(self, estimate: Estimate) -> np.ndarray:
         """[3] the newest keyframe's pose and the motion since."""
@@ -144,7 +146,7 @@ class KeyframeMap:
         """Moves by the odometry; a view that became a keyframe is added, judged and given an experience."""
         self._advance(observation.odometry)
         change = self._experiences.stay()
-        if int(evidence.frame) >= 0:
+        if int(evidence.keyframe) >= 0:
             self._append(observation)
             self._learn(evidence)
             matched = self._consider(evidence)
@@ -211,22 +213,22 @@ class KeyframeMap:
 
     def _consider(self, evidence: Evidence) -> int:
         """Logs and judges a candidate; returns the keyframe that it confirms as the present place, or -1."""
-        if int(evidence.match) < 0 or float(evidence.mass) <= self.config.candidate_posterior:
+        if int(evidence.match) < 0 or float(evidence.posterior) <= self.config.candidate_posterior:
             return -1
         candidate = Candidate(
             self._graph.count - 1,
             int(evidence.match),
             int(evidence.shift),
-            float(evidence.mass),
-            float(evidence.gain),
+            float(evidence.posterior),
+            float(evidence.log_ratio),
         )
         sequence = self._log.add(candidate, continues_sequence(self._graph, self._log, candidate))
         if self._log.verdict(sequence) == Verdict.OPEN and self.closes_loops:
             self._judge(sequence, candidate)
         if self._log.verdict(sequence) != Verdict.ACCEPTED:
             return -1
-        if sequence != self._solved[0] or candidate.frame - self._solved[1] >= self.config.solve_every:
-            self._solved = sequence, candidate.frame
+        if sequence != self._solved[0] or candidate.keyframe - self._solved[1] >= self.config.solve_every:
+            self._solved = sequence, candidate.keyframe
             self._optimise()
         self._since = self._turned = 0.0
         return candidate.match if self._has_same_heading(candidate) else -1
@@ -243,7 +245,7 @@ class KeyframeMap:
         """Whether the headings agree by odometry: a robot that has turned is in another experience, even if
         its view changes little with heading."""
         pose, turn = self._graph.pose.rows, -candidate.shift * self._graph.sector_angle
-        turned = wrap(pose[candidate.frame, 2] - pose[candidate.match, 2])
+        turned = wrap(pose[candidate.keyframe, 2] - pose[candidate.match, 2])
         drift = abs(wrap(turned - turn))
         return bool(np.cos(turn) > 0 and drift < self.config.agreement_heading * self.config.max_turn)
 
@@ -289,36 +291,7 @@ class KeyframeMap:
         origin = graph.pose.rows[-1] if graph.count else np.zeros(3)
         return compose(origin, correct_heading_bias(self._travel.motion, self._travel.length, graph.bias))
 
-    # Checkpoint
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """The whole state; a map restored from it continues bit for bit."""
-        travel, graph = self._travel, self._graph
-        parts = {
-            f"{part}/{name}": rows
-            for part, whole in self._parts().items()
-            for name, rows in whole.arrays().items()
-        }
-        return copy_arrays(self) | copy_arrays(graph) | parts | {
-            "travel": np.array([*travel.motion, travel.length, travel.turn]),
-            "drift": np.array([graph.bias, *graph.prior, self._since, self._turned]),
-            "solved": np.array(self._solved),
-        }  # fmt: skip
-
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Replaces the state by that of a checkpoint."""
-        restore_arrays(self, arrays)
-        restore_arrays(self._graph, arrays)
-        for part, whole in self._parts().items():
-            prefix = f"{part}/"
-            whole.restore({k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)})
-        travel, drift = np.asarray(arrays["travel"]), np.asarray(arrays["drift"])
-        self._travel = Travel(travel[:3].copy(), float(travel[3]), float(travel[4]))
-        self._graph.bias, self._since, self._turned = float(drift[0]), float(drift[3]), float(drift[4])
-        self._graph.prior = BiasPrior(float(drift[1]), float(drift[2]))
-        sequence, frame = np.asarray(arrays["solved"])
-        self._solved = int(sequence), int(frame)
+        """Replaces the whole state by that of `arrays`."""
+        super().restore(arrays)
         self._solution = None
-
-    def _parts(self) -> dict[str, ClosureLog | Experiences | Appearance]:
-        return {"closures": self._log, "experiences": self._experiences, "appearance": self._appearance}

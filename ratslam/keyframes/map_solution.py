@@ -42,9 +42,9 @@ def final_solution(graph: KeyframeGraph, log: ClosureLog, closures: bool) -> Map
     solution = selected_solution(graph, log) if graph.config.select_every and closures else None
     if solution is not None:
         return solution
-    fit = MapFit(graph.pose.rows.copy(), graph.bias, np.zeros(0))
-    fit = graph.solve(log, graph.config.settling) if len(log.accepted()) else fit
-    return MapSolution(fit, log, graph.cut)
+    if len(log.accepted()):
+        return MapSolution(graph.solve(log, graph.config.settling), log, graph.cut)
+    return MapSolution(graph.fit()._replace(poses=graph.pose.rows.copy()), log, graph.cut)
 
 
 def selected_solution(graph: KeyframeGraph, log: ClosureLog) -> MapSolution | None:
@@ -66,8 +66,7 @@ def selected_solution(graph: KeyframeGraph, log: ClosureLog) -> MapSolution | No
     for frame, sequence in selection.cuts:
         cut.rows[frame] = sequences[sequence]
     # Solved once more without the refused sequences, which removes their remaining pull.
-    chain, closures = graph.odometry(cut), graph.closures(log)
-    fit = solve(*selection.fit[:2], chain, closures, graph.bias_prior(), STEPS, FINE)
+    fit = solve(selection.fit, graph.problem(log, cut), STEPS, FINE)
     log.weigh(fit.weights)
     return MapSolution(fit, log, cut)
 
@@ -80,11 +79,10 @@ def _select(
     earlier: tuple[tuple[int, int], ...],
 ) -> Selection:
     """Selects among the sequences `sequences`, starting from the current map and from dead reckoning."""
-    chain, closures, pose = graph.odometry(cut), graph.closures(log), graph.pose.rows
+    problem, pose = graph.problem(log, cut), graph.pose.rows
+    chain = problem.chain
     path = integrate(correct_heading_bias(chain.motion, chain.length, graph.prior.mean), pose[0])
     reckoned = MapFit(np.concatenate([pose[:1], path]), graph.prior.mean, np.zeros(0))
-    present = MapFit(pose.copy(), graph.bias, np.zeros(0))
-    case = SelectionProblem(
-        chain, closures, graph.bias_prior(), log.scores()[sequences], *log.spans()[sequences].T
-    )
+    present = graph.fit()._replace(poses=pose.copy())
+    case = SelectionProblem(problem, log.scores()[sequences], *log.spans()[sequences].T)
     return select_closures(case, [present, reckoned], partial(find_break, graph), earlier)

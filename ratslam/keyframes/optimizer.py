@@ -1,9 +1,9 @@
-"""A chain of frames with closures in sequences and one heading bias: robust SE(2) least squares.
+"""Robust SE(2) least squares over a chain of keyframes with closure sequences and one heading bias.
 
-Odometry that always pulls to one side is one number, not many errors: the bias, in radians per metre, is
-solved for with the poses. Closures that were recognised together stand or fall together: a sequence has one
-robust weight. Frame 0 is held where it is. Sources: Geman & McClure 1985 (the kernel); Kuemmerle et al. 2011
-(the error); the bias and the weights by sequence are ours."""
+A constant turn of the odometry to one side, the heading bias (rad/m), is solved for with the poses. Each
+closure sequence has one robust weight, because its closures are right or wrong together. Keyframe 0 is fixed.
+Sources: Geman & McClure 1985 (the kernel); Kuemmerle et al. 2011 (the error); the bias and the weights by
+sequence are ours."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from tactile.base.se2 import between, correct_heading_bias, wrap
 
 
 class OdometryChain(NamedTuple):
-    """What odometry says from each frame to the next.
+    """Odometry between consecutive keyframes.
 
     Attributes:
-        motion: [N - 1, 3] the later frame in the earlier one (m, m, rad). length: [N - 1] m travelled.
-        variance: [N - 1, 3] of the motion.
+        motion: [N - 1, 3] pose of the later keyframe in the frame of the earlier one (m, m, rad).
+        length: [N - 1] distance travelled, m. variance: [N - 1, 3] of the motion.
     """
 
     motion: np.ndarray
@@ -30,12 +30,12 @@ class OdometryChain(NamedTuple):
 
 
 class LoopClosures(NamedTuple):
-    """What recall says: frame j stands where frame i does, turned by `turn`.
+    """Loop closures: keyframe j has the position of keyframe i, and its heading plus `turn`.
 
     Attributes:
-        i, j: [M] frames. turn: [M] rad. sequence: [M] which sequence each belongs to, 0..R - 1. variance: [3]
-        of each. scale: [R] mean chi-square at which the weight of a sequence has fallen to a quarter. score:
-        [R] evidence. stray: [R] or for all sequences, chi-square that one closure counts at most.
+        i, j: [M] keyframes. turn: [M] rad. sequence: [M] the sequence of each, 0..R - 1. variance: [3] of
+            each. scale: [R] mean chi-square at which the weight of a sequence is a quarter. score: [R]
+            evidence. cost_limit: largest chi-square of one closure, [R] by sequence or one for all.
     """
 
     i: np.ndarray
@@ -45,41 +45,41 @@ class LoopClosures(NamedTuple):
     variance: np.ndarray
     scale: np.ndarray
     score: np.ndarray = np.zeros(0)
-    stray: np.ndarray | float = np.inf
+    cost_limit: np.ndarray | float = np.inf
 
 
 class BiasPrior(NamedTuple):
-    """What is known of the heading bias beforehand, rad/m."""
+    """Prior mean and standard deviation of the heading bias, rad/m."""
 
     mean: float
     sd: float
 
 
+class MapProblem(NamedTuple):
+    """The measurements that a map is fitted to."""
+
+    chain: OdometryChain
+    closures: LoopClosures
+    prior: BiasPrior
+
+
 class MapFit(NamedTuple):
-    """Poses [N, 3], heading bias rad/m, the weight [R] of each sequence."""
+    """Poses [N, 3], heading bias (rad/m), and the robust weight [R] of each sequence."""
 
     poses: np.ndarray
     bias: float
     weights: np.ndarray
 
 
-def solve(
-    poses: np.ndarray,
-    bias: float,
-    chain: OdometryChain,
-    closures: LoopClosures,
-    prior: BiasPrior,
-    iterations: int,
-    tolerance: float = 1e-4,
-) -> MapFit:
-    """Gauss-Newton with weights by sequence, from the given poses [N, 3] and bias.
+def solve(start: MapFit, problem: MapProblem, iterations: int, tolerance: float = 1e-4) -> MapFit:
+    """Gauss-Newton with one robust weight per sequence, from the poses and bias of `start`.
 
     Returns:
-        the fit after the last step that changed anything by more than the tolerance (m, rad), `iterations` at
-        most; where the equations cannot be solved, what it had before.
+        the fit after the first step that changes every pose by less than the tolerance (m, rad), or after
+        `iterations` steps; the last fit before the equations become singular.
     """
-    system = _System(chain, closures, prior)
-    fit = MapFit(np.array(poses, float), bias, np.ones(len(closures.scale)))
+    system = _System(problem)
+    fit = MapFit(np.array(start.poses, float), start.bias, np.ones(len(problem.closures.scale)))
     for _ in range(iterations):
         equations = system.linearise(fit)
         fit = fit._replace(weights=equations.weights)
@@ -94,8 +94,9 @@ def solve(
     return fit
 
 
-def robust_cost(fit: MapFit, chain: OdometryChain, closures: LoopClosures, prior: BiasPrior) -> float:
-    """What is left of the contradictions between odometry and closures under a fit: what `solve` lessens."""
+def robust_cost(fit: MapFit, problem: MapProblem) -> float:
+    """The cost that `solve` minimises: chi-square of odometry and bias, robust cost of the closures."""
+    chain, closures, prior = problem
     measured = correct_heading_bias(chain.motion, chain.length, fit.bias)
     apart = between(fit.poses[:-1], fit.poses[1:]) - measured
     apart[:, 2] = wrap(apart[:, 2])
@@ -104,21 +105,17 @@ def robust_cost(fit: MapFit, chain: OdometryChain, closures: LoopClosures, prior
     error[:, 2] = wrap(error[:, 2] - closures.turn)
     spread = np.broadcast_to(closures.variance, error.shape)
     members = np.bincount(closures.sequence, minlength=len(closures.scale))
-    _, tamed = _tamed((error**2 / spread).sum(axis=1), closures)
-    total = np.bincount(closures.sequence, tamed, len(closures.scale))
-    mean = total / np.maximum(members, 1)
+    _, mean = _mean_costs((error**2 / spread).sum(axis=1), closures, members)
     lost = members * closures.scale * mean / (closures.scale + mean)
     return odometry + float(lost.sum()) + ((fit.bias - prior.mean) / prior.sd) ** 2
 
 
-def relative_covariance(
-    fit: MapFit, chain: OdometryChain, closures: LoopClosures, prior: BiasPrior, i: int, j: int, turn: float
-) -> np.ndarray:
-    """[3, 3] covariance of frame j seen from frame i turned by `turn`, under everything the map knows.
+def relative_covariance(fit: MapFit, problem: MapProblem, i: int, j: int, turn: float) -> np.ndarray:
+    """[3, 3] covariance of keyframe j in the frame of keyframe i turned by `turn`.
 
-    The exact marginal of the linearised problem, the bias included (it moves far frames together).
+    The exact marginal of the linearised problem, the bias included (it moves distant keyframes together).
     """
-    equations = _System(chain, closures, prior).linearise(fit)
+    equations = _System(problem).linearise(fit)
     a, b = fit.poses[i], fit.poses[j]
     c, s = np.cos(a[2] + turn), np.sin(a[2] + turn)
     dx, dy = (b - a)[:2]
@@ -129,19 +126,26 @@ def relative_covariance(
     return equations.covariance(change[1:])
 
 
-def _tamed(chi2: np.ndarray, closures: LoopClosures) -> tuple[np.ndarray, np.ndarray]:
-    """Weights of single closures, and their chi-squares [M] when none can cost more than `stray`: one that is
-    astray must not take its sequence with it."""
-    most = np.broadcast_to(closures.stray, closures.scale.shape)[closures.sequence]
-    if not np.isfinite(most).all():
-        return np.ones_like(chi2), chi2
-    share = most / (most + chi2)
-    return share**2, share * chi2
+def _mean_costs(
+    chi2: np.ndarray, closures: LoopClosures, members: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Weights [M] of single closures that limit the chi-square [M] of each to `cost_limit`, so that one wrong
+    closure does not cost its whole sequence; and the mean limited chi-square [R] of each sequence."""
+    limit = np.broadcast_to(closures.cost_limit, closures.scale.shape)[closures.sequence]
+    weights = np.ones_like(chi2)
+    if np.isfinite(limit).all():
+        share = limit / (limit + chi2)
+        weights, chi2 = share**2, share * chi2
+    return weights, np.bincount(closures.sequence, chi2, len(members)) / np.maximum(members, 1)
 
 
 class _Equations(NamedTuple):
-    """Normal equations of poses and bias: the factor of the poses' block, the rest bordering it; and where
-    each free frame stands among the unknowns."""
+    """Normal equations of poses and bias.
+
+    Attributes:
+        factor: of the block of the poses, None where it is singular. order: [N - 1] position of each free
+            keyframe among the unknowns. gradient, border, corner, slope: the other blocks of the equations.
+    """
 
     factor: SuperLU | None
     order: np.ndarray
@@ -162,7 +166,7 @@ class _Equations(NamedTuple):
         return np.concatenate([np.zeros((1, 3)), step.reshape(-1, 3)[self.order]]), float(bias)
 
     def covariance(self, change: np.ndarray) -> np.ndarray:
-        """Of what changes by `change` [F, 3, n] with the poses of the free frames: [n, n]."""
+        """[n, n] covariance of quantities with derivatives [N - 1, 3, n] by the free keyframes' poses."""
         if self.factor is None:
             return np.full((change.shape[2],) * 2, np.inf)
         change = change[np.argsort(self.order)].reshape(-1, change.shape[2])
@@ -173,9 +177,10 @@ class _Equations(NamedTuple):
 
 
 class _System:
-    """Where every block of the normal equations goes, worked out once for a set of edges."""
+    """The sparsity pattern of the normal equations, computed once for a set of edges."""
 
-    def __init__(self, chain: OdometryChain, closures: LoopClosures, prior: BiasPrior) -> None:
+    def __init__(self, problem: MapProblem) -> None:
+        chain, closures, self.prior = problem
         count, steps = len(chain.length) + 1, np.arange(len(chain.length))
         self.i, self.j = np.concatenate([steps, closures.i]), np.concatenate([steps + 1, closures.j])
         self.motion = np.concatenate([chain.motion, np.zeros((len(closures.i), 3))])
@@ -183,13 +188,13 @@ class _System:
         self.length = np.concatenate([chain.length, np.zeros(len(closures.i))])
         spread = np.broadcast_to(closures.variance, (len(closures.i), 3))
         self.information = 1 / np.concatenate([chain.variance, spread])
-        self.closures, self.prior, self.chained = closures, prior, len(steps)
+        self.closures, self.chained = closures, len(steps)
         self.members = np.bincount(closures.sequence, minlength=len(closures.scale))
 
         self.size = 3 * (count - 1)
         self.order = _order(self.i, self.j, count)
         ends = 3 * np.stack([self.order[self.i], self.order[self.j]], axis=1)[:, :, None]
-        at = (ends + np.arange(3)).reshape(-1, 6)  # frame 0 is held: its rows are left out
+        at = (ends + np.arange(3)).reshape(-1, 6)  # keyframe 0 is fixed: its rows are omitted
         self.free, self.row = at >= 0, at[at >= 0]
         rows, columns = np.repeat(at[:, :, None], 6, axis=2), np.repeat(at[:, None, :], 6, axis=1)
         self.used = (rows >= 0) & (columns >= 0)
@@ -208,9 +213,7 @@ class _System:
             [ahead - measured[:, 0], aside - measured[:, 1], wrap(b[:, 2] - a[:, 2] - measured[:, 2])], 1
         )
         chi2 = (error**2 * self.information).sum(axis=1)
-        keep, tamed = _tamed(chi2[self.chained :], self.closures)
-        total = np.bincount(self.closures.sequence, tamed, len(self.members))
-        mean = total / np.maximum(self.members, 1)
+        keep, mean = _mean_costs(chi2[self.chained :], self.closures, self.members)
         weights = (self.closures.scale / (self.closures.scale + mean)) ** 2
 
         jacobian = np.zeros((len(a), 3, 6))
@@ -242,13 +245,13 @@ class _System:
 
 
 def _order(i: np.ndarray, j: np.ndarray, count: int) -> np.ndarray:
-    """[N] where frames stand among the unknowns for factors with few entries: of minimum degree, as SuperLU
-    finds it, but for frames and once, not for their coordinates at every step. Frame 0 stands before all."""
+    """[N] position of each keyframe among the unknowns, -1 for keyframe 0: SuperLU's minimum-degree order,
+    computed once for keyframes instead of at every step for their coordinates."""
     free = (i > 0) & (j > 0)
     i, j = i[free] - 1, j[free] - 1
     ends, size = np.arange(count - 1), count - 1
     ties = np.ones(len(i))
-    # Only who is tied to whom matters; the diagonal keeps it from being singular.
+    # Only the sparsity pattern matters; the diagonal makes the matrix regular.
     among = csc_matrix((ties, (i, j)), (size, size))
     degree = csc_matrix((np.full(size, 4.0 * len(i) + 1), (ends, ends)), (size, size))
     factor = _factored(among + among.T + degree, "MMD_AT_PLUS_A")
@@ -258,7 +261,7 @@ def _order(i: np.ndarray, j: np.ndarray, count: int) -> np.ndarray:
 def _factor(matrix: csc_matrix) -> SuperLU | None:
     try:
         return _factored(matrix, "NATURAL")
-    except RuntimeError:  # singular: a frame that nothing ties to frame 0
+    except RuntimeError:  # singular: a keyframe is not connected to keyframe 0
         return None
 
 

@@ -32,7 +32,7 @@ def turned(pose: np.ndarray, angle: float) -> np.ndarray:
 def continues_sequence(graph: KeyframeGraph, log: ClosureLog, candidate: Candidate) -> bool:
     """Whether the candidate moved from the newest one by the same motion in memory as in odometry."""
     last, config = log.last(), graph.config
-    if last is None or candidate.frame - last.frame > config.max_gap:
+    if last is None or candidate.keyframe - last.keyframe > config.max_gap:
         return False
     remembered, travelled = _motions(graph, last, candidate)
     apart = np.hypot(*(remembered - travelled)[:2])
@@ -61,7 +61,7 @@ def _motions(graph: KeyframeGraph, first: Candidate, candidate: Candidate) -> tu
         turned(pose[first.match], -first.shift * angle),
         turned(pose[candidate.match], -candidate.shift * angle),
     )
-    return remembered, between(pose[first.frame], pose[candidate.frame])
+    return remembered, between(pose[first.keyframe], pose[candidate.keyframe])
 
 
 def _agrees_with_whole(graph: KeyframeGraph, log: ClosureLog, candidate: Candidate) -> bool:
@@ -84,9 +84,9 @@ def _distance(graph: KeyframeGraph, log: ClosureLog, candidate: Candidate) -> tu
     """
     turn = -candidate.shift * graph.sector_angle
     pose = graph.pose.rows
-    error = between(turned(pose[candidate.match], turn), pose[candidate.frame])
+    error = between(turned(pose[candidate.match], turn), pose[candidate.keyframe])
     gate = graph.config.gate_sd * graph.cell
-    allowed = graph.relative_covariance(log, candidate.match, candidate.frame, turn)
+    allowed = graph.relative_covariance(log, candidate.match, candidate.keyframe, turn)
     least = np.diag([gate**2, gate**2, graph.config.gate_heading**2])
     allowed = allowed + least
     alternatives = _alternatives(graph, candidate, turn, allowed[:2, :2], gate)
@@ -98,9 +98,9 @@ def _alternatives(
 ) -> float:
     """Log of the ratio of keyframes in the region that the map allows to those around one place."""
     pose = graph.pose.rows
-    old = pose[: candidate.frame - graph.guard]
+    old = pose[: candidate.keyframe - graph.guard]
     origin = turned(pose[candidate.match], turn)
-    centre = between(origin, pose[candidate.frame])[:2]
+    centre = between(origin, pose[candidate.keyframe])[:2]
     frames = between(origin, old)[:, :2]
     apart = frames - centre
     inside = np.exp(-np.einsum("na,ab,nb->n", apart, np.linalg.inv(allowed), apart) / 2).sum()

@@ -25,7 +25,7 @@ from ratslam.core.growable_array import GrowableArray
 from ratslam.core.precision import prepare_precision
 from ratslam.core.session import CHUNK, Session, Step
 from ratslam.core.types import Action
-from ratslam.keyframes.ablation import FULL, Ablation
+from ratslam.keyframes.config import FULL, Ablation
 from ratslam.pipeline.artifacts import WhiskerView, save_grid_map, save_whisker_views, save_world
 from ratslam.pipeline.online_error import OnlineErrorLog
 from ratslam.pipeline.run_directory import RunDirectory, read_checkpoint

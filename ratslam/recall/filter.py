@@ -36,23 +36,24 @@ class RecallResult(NamedTuple):
     """Result of recall for one view.
 
     Attributes:
-        frame: int32, the keyframe that the view became, -1 for none. match: int32, the most likely keyframe,
-            -1 for none. shift: int32, sector shift of the view against it. mass: posterior within `BASIN`
-            cells of it. gain: log-likelihood ratio of the match against novelty. novel: posterior of novelty.
-            entropy: of modes and novelty, nats. second: mass of the second heaviest mode over the heaviest.
-            agree: int32, 1 if the view fits a keyframe at the map's pose, 0 if it fits none there, -1 if none
-            is there. background: [SAMPLES] errors against ruled-out keyframes, NaN for none.
+        keyframe: int32, the keyframe that the view became, -1 for none. match: int32, the most likely
+            keyframe, -1 for none. shift: int32, sector shift of the view against it. posterior: of all
+            keyframes within `BASIN` cells of it. log_ratio: log-likelihood ratio of the match against
+            novelty. novelty: its posterior. entropy: of modes and novelty, nats. second_mode: mass of the
+            second heaviest mode over the heaviest. view_fits: int32, 1 if the view fits a keyframe at the
+            map's pose, 0 if it fits none there, -1 if none is there. background: [SAMPLES] errors against
+            ruled-out keyframes, NaN for none.
     """
 
-    frame: Array
+    keyframe: Array
     match: Array
     shift: Array
-    mass: Array
-    gain: Array
-    novel: Array
+    posterior: Array
+    log_ratio: Array
+    novelty: Array
     entropy: Array
-    second: Array
-    agree: Array
+    second_mode: Array
+    view_fits: Array
     background: Array
 
 
@@ -86,21 +87,21 @@ def recognise(
     near = known & (apart < cell**2)
     facing = memory.cosine * jnp.cos(here[2]) + memory.sine * jnp.sin(here[2]) > FACING
     best = jnp.max(jnp.where(near & facing, jnp.max(likelihood, axis=0), 0.0))
-    agree = jnp.where(
+    view_fits = jnp.where(
         certain & observation.telling & jnp.any(near & facing), (best >= novelty).astype(jnp.int32), -1
     )
 
     shares = jnp.concatenate([masses, jnp.maximum(1 - jnp.sum(masses, keepdims=True), 0.0)])
     result = RecallResult(
-        frame=memory.count,
+        keyframe=memory.count,
         match=jnp.where(certain & (mass > 0), match, -1),
         shift=jnp.where(certain & (mass > 0), jnp.asarray(shifts)[shift], 0),
-        mass=jnp.where(certain, mass, 0.0),
-        gain=jnp.where(certain & (mass > 0), gain, 0.0),
-        novel=jnp.where(certain, novel, 1.0),
+        posterior=jnp.where(certain, mass, 0.0),
+        log_ratio=jnp.where(certain & (mass > 0), gain, 0.0),
+        novelty=jnp.where(certain, novel, 1.0),
         entropy=-jnp.sum(jnp.where(shares > 0, shares * jnp.log(jnp.where(shares > 0, shares, 1.0)), 0.0)),
-        second=_second(masses),
-        agree=agree,
+        second_mode=_second_mode(masses),
+        view_fits=view_fits,
         background=observation.background,
     )
     if config.sector_fov == "whiskers":
@@ -112,8 +113,9 @@ def empty_result(memory: Memory) -> RecallResult:
     """The result of a step without a keyframe."""
     zero = jnp.zeros_like(memory.length)
     return RecallResult(
-        frame=jnp.int32(-1), match=jnp.int32(-1), shift=jnp.int32(0), mass=zero, gain=zero, novel=zero + 1,
-        entropy=zero, second=zero, agree=jnp.int32(-1), background=jnp.full(SAMPLES, jnp.nan, zero.dtype),
+        keyframe=jnp.int32(-1), match=jnp.int32(-1), shift=jnp.int32(0), posterior=zero, log_ratio=zero,
+        novelty=zero + 1, entropy=zero, second_mode=zero, view_fits=jnp.int32(-1),
+        background=jnp.full(SAMPLES, jnp.nan, zero.dtype),
     )  # fmt: skip
 
 
@@ -127,7 +129,7 @@ def _modes(
     """
     mass = jnp.sum(belief, axis=0)
     cosine, sine = jnp.cos(angles) @ belief, jnp.sin(angles) @ belief
-    ahead = cosine * memory.cosine - sine * memory.sine  # summed headings of the robot at each frame
+    ahead = cosine * memory.cosine - sine * memory.sine  # summed headings of the robot at each keyframe
     aside = cosine * memory.sine + sine * memory.cosine
 
     row = jnp.arange(len(mass), dtype=jnp.int32)
@@ -158,7 +160,7 @@ def _peak(values: Array) -> Array:
     return jnp.min(jnp.where(values >= jnp.max(values), row, len(values) - 1))
 
 
-def _second(masses: Array) -> Array:
+def _second_mode(masses: Array) -> Array:
     """The second largest mass [K] over the largest; 0 where there is none."""
     if len(masses) < 2:
         return jnp.zeros((), masses.dtype)

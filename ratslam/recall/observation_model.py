@@ -1,7 +1,4 @@
-"""ObservationLikelihood: how likely what is seen now is at every remembered frame, and where it is new.
-
-A view is weighed by its error, in scales; a whisker image by its log-odds; a given id by what ids are worth.
-"""
+"""Likelihood of a view, a whisker image or a given id at every keyframe and at a new place."""
 
 from __future__ import annotations
 
@@ -12,18 +9,18 @@ import numpy as np
 
 from ratslam.recall.config import RecallConfig, sector_shifts
 from ratslam.recall.memory import Memory, allowed_shifts, current_pose, recallable
-from ratslam.recall.whisker_likelihood import Pixels
+from ratslam.recall.whisker_likelihood import PixelLayout
 from tactile.base.types import Array
 
 SAMPLES = 20
 """Number of errors against ruled-out keyframes reported to the map at each keyframe, for calibration."""
 LABELS = {"same": 0.6, "unknown": 0.35, "other": 0.05, "new_unknown": 0.9, "new_known": 0.1}
-"""How likely a given id is where its frame was, and where it is new: ids are right more often than not, a new
-id says little (the giver may have failed to recognise), and another known id speaks against."""
+"""Likelihood of a given id at a keyframe with the same id or another one (`unknown`: a new id), and at a
+new place (new or known id). Ids are assumed to be right more often than not."""
 LABEL_TEMPER = 0.7
-"""Ids of consecutive views are not independent: each counts as this share of one."""
+"""Exponent of the likelihood of an id, because ids of consecutive views are not independent."""
 STEPS = (0.02, 0.94, 0.02, 0.02)
-"""How often, where images follow each other, the next is that of the same frame, the next one, and so on."""
+"""Probabilities that the next image is that of the same keyframe, the next one, and so on."""
 
 
 class ObservationLikelihood(NamedTuple):
@@ -43,7 +40,8 @@ class ObservationLikelihood(NamedTuple):
 
 
 def view_likelihood(config: RecallConfig, cell: float, memory: Memory, view: Array) -> ObservationLikelihood:
-    """Weighs all frames by a view [D]. A view that looks like many places makes all of them unlikely."""
+    """Likelihood of a view [D]. Novelty contains the mean over all keyframes, so that a view similar to many
+    places is little evidence for any of them."""
     error = _errors(sector_shifts(config), memory, view)
     frames = recallable(config, memory)
     width = config.sharpness * memory.scale
@@ -67,23 +65,23 @@ def view_likelihood(config: RecallConfig, cell: float, memory: Memory, view: Arr
 
 
 def touch_likelihood(
-    config: RecallConfig, memory: Memory, level: Array, pixels: Pixels
+    config: RecallConfig, memory: Memory, level: Array, pixels: PixelLayout
 ) -> tuple[Memory, ObservationLikelihood]:
-    """Weighs all frames by a whisker image: levels [D].
+    """Likelihood of a whisker image: levels [D].
 
-    Pixels are not independent, so their log-odds are tempered. A new place is as likely to look like this as
-    the places that follow those that looked like the last one: images in corridors go on as they began.
+    Pixels are not independent, so their log-odds are tempered. The likelihood at a new place is that at the
+    successors of keyframes similar to the previous image, because images in corridors change alike.
 
     Returns:
-        the memory, which has to know this image at the next one, too.
+        the memory with this image's likelihoods, which the next image needs; the likelihood.
     """
     frames = recallable(config, memory)
     row = memory.likeness[pixels.group, level]
-    then = [memory.view, memory.view[pixels.behind]][: len(sector_shifts(config))]
+    then = [memory.view, memory.view[pixels.opposite]][: len(sector_shifts(config))]
     odds = jnp.stack([jnp.sum(jnp.take_along_axis(row, levels, axis=1), axis=0) for levels in then])
     certain = (memory.scale != 0) & jnp.any(frames)
     likelihood = jnp.where(frames[None] & certain, jnp.exp(config.temper * odds), 0.0)
-    expected = jnp.where(frames[None], _onwards(memory.before), 0.0)
+    expected = jnp.where(frames[None], _successors(memory.before), 0.0)
     total = jnp.sum(expected)
     familiar = jnp.sum(expected * likelihood) / jnp.where(total > 0, total, 1.0)
     share = jnp.where(total > 0, config.familiar, 0.0)
@@ -98,8 +96,8 @@ def touch_likelihood(
     return memory._replace(before=likelihood), observation
 
 
-def _onwards(before: Array) -> Array:
-    """[S, C] where frames of such likelihoods lead: one on, or one back for a robot that has turned about."""
+def _successors(before: Array) -> Array:
+    """[S, C] likelihoods [S, C] of keyframes moved to their successors (predecessors for half turns)."""
     index = jnp.arange(before.shape[1], dtype=jnp.int32)
 
     def led(row: Array, by: int) -> Array:
@@ -117,7 +115,7 @@ def _onwards(before: Array) -> Array:
 
 
 def label_likelihood(config: RecallConfig, memory: Memory, label: Array) -> ObservationLikelihood:
-    """Weighs all frames by a given id."""
+    """Likelihood of a given id."""
     known = jnp.any(memory.label == label)
     share = 1 / jnp.maximum(memory.distinct + (~known).astype(jnp.int32), 1).astype(memory.x.dtype)
     other = jnp.where(known, LABELS["other"] * share, LABELS["unknown"])
@@ -133,8 +131,8 @@ def label_likelihood(config: RecallConfig, memory: Memory, label: Array) -> Obse
 
 
 def _errors(shifts: np.ndarray, memory: Memory, view: Array) -> Array:
-    """[S, C] mean absolute difference where view[k:] meets the stored views' [:-k]; infinite where the
-    shift is not allowed because nothing says that sectors are ordered."""
+    """[S, C] mean absolute difference between view[k:] and the stored views' [:-k] for each shift k; infinite
+    for shifts that are not allowed because the sectors are not known to be ordered."""
     size = memory.view.shape[0]
     rows = []
     for k in shifts.tolist():
@@ -143,19 +141,19 @@ def _errors(shifts: np.ndarray, memory: Memory, view: Array) -> Array:
         if size <= abs(k):
             rows.append(jnp.full(memory.view.shape[1], jnp.inf, memory.view.dtype))
             continue
-        # Written out, one pass over the frames adds all values; a reduction over them takes twice as long.
+        # An explicit sum makes one pass over the keyframes; a reduction takes twice as long.
         apart = sum((jnp.abs(stored[i] - seen[i]) for i in range(len(stored))), jnp.zeros_like(stored[0]))
         rows.append(apart / len(stored))
     return jnp.where(allowed_shifts(shifts, memory)[:, None], jnp.stack(rows), jnp.inf)
 
 
 def _background(error: Array, away: Array) -> Array:
-    """[SAMPLES] errors [C] of frames spread evenly over those that the map rules out."""
+    """[SAMPLES] of the errors [C], spread evenly over the keyframes ruled out by the map (`away` [C])."""
     rank = jnp.cumsum(away.astype(jnp.int32))
     count = rank[-1]
     wanted = (jnp.arange(SAMPLES, dtype=jnp.int32) * jnp.maximum(count - 1, 0)) // (SAMPLES - 1) + 1
     row = jnp.searchsorted(rank, wanted)
     row = jnp.minimum(row, len(rank) - 1)
-    # With fewer than SAMPLES of them each is told once.
+    # With fewer than SAMPLES keyframes each is reported once.
     fresh = jnp.concatenate([jnp.ones(1, bool), row[1:] != row[:-1]])
     return jnp.where(fresh & (count > 0), error[row], jnp.nan)

@@ -1,9 +1,8 @@
-"""How alike two whisker images are: log-odds of one place against two, learned from the session itself.
+"""Log-odds of two whisker images showing one place against two places, learned from the session itself.
 
-A pixel is silent, dead, or has one of a few heights. What a pixel says depends on how often whiskers touch
-anything here, on which heights are common, and on how much one visit to a place differs from the next. All
-three are counted: the first two over all images, the last over pairs of images that the map has found to be
-of one place. Before there are such pairs a prior stands for them. No truth is used; the model is ours.
+A pixel is silent, dead, or has one of 30 heights. Its log-odds depend on how often whiskers are in contact,
+on which heights are common (both counted over all images), and on the variation between two visits to a place
+(from pairs of images that the map has confirmed, with a prior). No ground truth is used; the model is ours.
 """
 
 from __future__ import annotations
@@ -12,83 +11,87 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tactile.base.types import Array
+from tactile.base.types import Array, Observation
 
 LEVELS = 32
-"""Of a pixel: 0 silent, 1 to 30 heights, 31 dead."""
+"""Number of levels of a pixel: 0 silent, 1 to 30 heights, 31 dead."""
 DEAD = LEVELS - 1
 HEIGHTS = DEAD - 1
 
 
 class Variation(NamedTuple):
-    """How one visit differs from the next.
+    """Variation of an image between two visits to a place.
 
     Attributes:
-        appears, vanishes: shares of silent pixels that touch, and of touching ones that are silent, on the
-            next visit. width: mean difference of heights, full scale 1. astray: share of heights that have
-            nothing to do with the former.
+        appears: share of silent pixels that are in contact on the next visit. vanishes: share of pixels in
+            contact that are silent on the next visit. width: mean difference of heights, full scale 1.
+            outliers: share of heights that are independent of those before.
     """
 
     appears: float
     vanishes: float
     width: float
-    astray: float
+    outliers: float
 
 
 PRIOR = Variation(0.07, 0.17, 0.08, 0.1)
-"""Visits of an arm whose path repeats to some 5 mm."""
+"""Variation for an arm that repeats its path to about 5 mm."""
 PRIOR_PAIRS = 20.0
-"""Pairs of images that the prior is worth."""
+"""Number of pairs of images that the prior counts as."""
 
 
-class Pixels(NamedTuple):
-    """How the pixels of a whisker image [R, C, K], flat, belong together; D of them.
+class PixelLayout(NamedTuple):
+    """Relations between the D pixels of a flattened whisker image [R, C, K].
 
     Attributes:
-        group: [D] those of one ring and channel, which are alike. behind: [D] the pixel that felt what this
-            one feels before the head turned about: of the whisker opposite. columns: whiskers in a ring.
+        group: [D] number of each pixel's ring and channel; pixels of a group are statistically alike.
+        opposite: [D] the pixel of the opposite whisker.
     """
 
     group: np.ndarray
-    behind: np.ndarray
-    columns: int
+    opposite: np.ndarray
 
 
-def pixels(view_shape: tuple[int, int, int]) -> Pixels:
-    """Of images of that shape."""
+def pixel_layout(view_shape: tuple[int, int, int]) -> PixelLayout:
+    """The layout of images of this shape."""
     _, columns, channels = view_shape
     row, _, channel = np.indices(view_shape)
     number = np.arange(row.size).reshape(view_shape)
-    behind = np.roll(number, -(columns // 2), axis=1)
-    return Pixels((row * channels + channel).reshape(-1), behind.reshape(-1), columns)
+    opposite = np.roll(number, -(columns // 2), axis=1)
+    return PixelLayout((row * channels + channel).reshape(-1), opposite.reshape(-1))
 
 
-def levels(view: Array, alive: Array) -> Array:
-    """The level of every pixel: of values [...] in 0..1, and whether their whiskers report [...] (0 or 1).
+def live_pixels(observation: Observation) -> Array:
+    """[R, C, K] bool, pixels whose whiskers report; all where the observation has no whiskers."""
+    rows, columns, channels = observation.view.shape
+    if observation.alive.size != rows * columns:
+        return np.ones((rows, columns, channels), bool)
+    return observation.alive.reshape(rows, columns, 1) & np.ones(channels, bool)
 
-    Operators only, so it serves NumPy and JAX alike; whole numbers of the view's own type, which `alive` has
-    to be of, too, where types are strict.
-    """
+
+def pixel_levels(view: Array, alive: Array) -> Array:
+    """Levels of pixels with values [...] in 0..1, dead where `alive` [...] is 0; whole numbers of the view's
+    dtype. For NumPy and JAX; with JAX `alive` has the dtype of the view."""
     height = -(-view * HEIGHTS // 1)
-    height = (height + HEIGHTS - abs(height - HEIGHTS)) / 2  # at most
+    height = (height + HEIGHTS - abs(height - HEIGHTS)) / 2  # at most HEIGHTS
     height = (height + abs(height)) / 2  # at least 0
     return alive * height + (1 - alive) * DEAD
 
 
 class Background(NamedTuple):
-    """What pixels are like anywhere.
+    """Distribution of pixels over all places.
 
     Attributes:
-        touching: [G] share of pixels that touch, by group. heights: [G, HEIGHTS] how the others' heights are
-            distributed, sums 1.
+        touching: [G] share of pixels in contact, by group. heights: [G, HEIGHTS] distribution of their
+            heights, each row sums to 1.
     """
 
     touching: np.ndarray
     heights: np.ndarray
 
 
-def background(images: np.ndarray, group: np.ndarray) -> Background:
-    """Of images [N, D] of levels, pixels in groups [D]."""
+def estimate_background(images: np.ndarray, group: np.ndarray) -> Background:
+    """The distribution in images [N, D] of levels, with pixels in groups [D]."""
     groups = int(group.max()) + 1
     touching, heights = np.zeros(groups), np.zeros((groups, HEIGHTS))
     for g in range(groups):
@@ -101,8 +104,8 @@ def background(images: np.ndarray, group: np.ndarray) -> Background:
     return Background(touching, heights)
 
 
-def variation(now: np.ndarray, then: np.ndarray) -> Variation:
-    """Of pairs [P, D] of images of one place, with the prior in it."""
+def estimate_variation(now: np.ndarray, then: np.ndarray) -> Variation:
+    """The variation in pairs of images [P, D] of one place, combined with the prior."""
     both = (now != DEAD) & (then != DEAD)
     silent, touching = both & (then == 0), both & (then > 0)
     pixels = now.shape[1] if now.ndim == 2 else 1
@@ -112,29 +115,29 @@ def variation(now: np.ndarray, then: np.ndarray) -> Variation:
         return float((part.sum() + weight * prior) / (whole.sum() + weight))
 
     apart = np.abs(now - then)[touching & (now > 0)] / HEIGHTS
-    width, astray = PRIOR.width, PRIOR.astray
+    width, outliers = PRIOR.width, PRIOR.outliers
     for _ in range(20):
-        fits = (1 - astray) * np.exp(-apart / width) / (2 * width)
-        loose = astray / (astray + fits) if len(apart) else apart
-        astray = float((loose.sum() + weight * PRIOR.astray) / (len(apart) + weight))
+        fits = (1 - outliers) * np.exp(-apart / width) / (2 * width)
+        loose = outliers / (outliers + fits) if len(apart) else apart
+        outliers = float((loose.sum() + weight * PRIOR.outliers) / (len(apart) + weight))
         width = float(((1 - loose) @ apart + weight * PRIOR.width) / ((1 - loose).sum() + weight))
     return Variation(
         share(silent & (now > 0), silent, PRIOR.appears),
         share(touching & (now == 0), touching, PRIOR.vanishes),
         width,
-        astray,
+        outliers,
     )
 
 
-def table(common: Background, visits: Variation) -> np.ndarray:
-    """[G, LEVELS, LEVELS] log-odds that a pixel of this level now (second axis) and of that level then (last
-    axis) show one place rather than two."""
+def log_odds_table(common: Background, visits: Variation) -> np.ndarray:
+    """[G, LEVELS, LEVELS] log-odds of one place against two, by a pixel's group, its level now and its level
+    in the earlier image."""
     height = (np.arange(HEIGHTS) + 0.5) / HEIGHTS
     near = np.exp(-np.abs(height[:, None] - height) / visits.width)
     near = near / near.sum(axis=0)
     log = np.zeros((len(common.touching), LEVELS, LEVELS))
     for g, (touching, heights) in enumerate(zip(common.touching, common.heights, strict=True)):
-        again = (1 - visits.astray) * near + visits.astray * heights[:, None]
+        again = (1 - visits.outliers) * near + visits.outliers * heights[:, None]
         log[g, 0, 0] = np.log((1 - visits.appears) / (1 - touching))
         log[g, 1:DEAD, 0] = np.log(visits.appears / touching)
         log[g, 0, 1:DEAD] = np.log(visits.vanishes / (1 - touching))

@@ -11,6 +11,7 @@ from ratslam.keyframes.optimizer import (
     BiasPrior,
     LoopClosures,
     MapFit,
+    MapProblem,
     OdometryChain,
     relative_covariance,
     solve,
@@ -41,9 +42,9 @@ def test_a_closure_among_1000_frames(benchmark):
     fit = MapFit(poses, 0.0, np.ones(80))
     for _ in range(9):
         start = time.perf_counter()
-        fit = solve(poses, 0.0, chain, links, prior, iterations=4)
+        fit = solve(MapFit(poses, 0.0, np.zeros(0)), MapProblem(chain, links, prior), iterations=4)
         middle = time.perf_counter()
-        relative_covariance(fit, chain, links, prior, 5, 999, 0.0)
+        relative_covariance(fit, MapProblem(chain, links, prior), 5, 999, 0.0)
         solving.append(middle - start)
         checking.append(time.perf_counter() - middle)
     ms = {"ms_solve": np.median(solving) * 1e3, "ms_check": np.median(checking) * 1e3}

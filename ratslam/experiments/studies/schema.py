@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, NonNegativeInt, field_validator, model_validator
 
 from ratslam.experiments.studies.metrics import COLUMNS, DIRECTIONS
-from ratslam.keyframes.ablation import FULL, Ablation
+from ratslam.keyframes.config import FULL, Ablation
 from tactile.base.config import Settings
 
 

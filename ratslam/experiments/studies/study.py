@@ -17,7 +17,7 @@ from ratslam.experiments.studies.config_hash import digest_of, seed_key, with_se
 from ratslam.experiments.studies.overrides import named, outermost_first, overlap, put
 from ratslam.experiments.studies.records import run_key
 from ratslam.experiments.studies.schema import SearchPlan, StudyPlan
-from ratslam.keyframes.ablation import FULL, Ablation
+from ratslam.keyframes.config import FULL, Ablation
 from tactile.base.errors import InputError, InputErrors
 
 MOST = 100_000

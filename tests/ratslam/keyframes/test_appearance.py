@@ -10,17 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ratslam.keyframes.appearance import (
-    DOUBT,
-    EARLIEST,
-    ENOUGH,
-    LEARN,
-    NEVER,
-    UNTOLD,
+    LOG_ODDS_INTERVAL,
+    MIN_ERRORS,
+    MIN_KEYFRAMES,
+    NEUTRAL_IMAGE_MISFIT,
+    NEUTRAL_MISFIT,
+    NEW_IMAGE_LOG_ODDS,
     ConfirmedPairs,
     LabelAppearance,
     ViewAppearance,
     WhiskerAppearance,
-    alive,
 )
 from ratslam.keyframes.view_sectors import NO_ESTIMATE
 from ratslam.recall.whisker_likelihood import (
@@ -28,16 +27,17 @@ from ratslam.recall.whisker_likelihood import (
     HEIGHTS,
     LEVELS,
     PRIOR,
-    background,
-    levels,
-    pixels,
-    table,
-    variation,
+    estimate_background,
+    estimate_variation,
+    live_pixels,
+    log_odds_table,
+    pixel_layout,
+    pixel_levels,
 )
 from tactile.base.types import Odometry, observation
 
 SHAPE = (3, 6, 1)
-PIXELS = pixels(SHAPE)
+PIXELS = pixel_layout(SHAPE)
 SIZE = len(PIXELS.group)
 TEMPER = 0.25
 SILENT = SimpleNamespace(background=np.full(20, np.nan))
@@ -104,37 +104,39 @@ def test_whiskers_are_compared_once_there_is_enough_to_learn_from():
             return no_pairs()
 
         assert looks.learn(SILENT, known) == NO_ESTIMATE
-        measure = looks.measure()
+        measure = looks.metric()
         assert measure.angle == np.pi
-        assert measure.scale == (NEVER if k >= EARLIEST else 0.0)
-        assert measure.likeness.size == (3 * LEVELS**2 if k >= EARLIEST else 0)
-        assert (looks.misfit(0, *alone(0)) == UNTOLD) == (k < EARLIEST)
-    assert asked == list(range(LEARN, 201, LEARN))
+        assert measure.scale == (NEW_IMAGE_LOG_ODDS if k >= MIN_KEYFRAMES else 0.0)
+        assert measure.likeness.size == (3 * LEVELS**2 if k >= MIN_KEYFRAMES else 0)
+        assert (looks.misfit(0, *alone(0)) == NEUTRAL_IMAGE_MISFIT) == (k < MIN_KEYFRAMES)
+    assert asked == list(range(LOG_ODDS_INTERVAL, 201, LOG_ODDS_INTERVAL))
 
 
 def test_what_is_learned_is_what_images_and_pairs_tell():
-    views = felt(np.random.default_rng(0), 2 * LEARN)
+    views = felt(np.random.default_rng(0), 2 * LOG_ODDS_INTERVAL)
     frame, match = np.arange(50, 70), np.arange(10, 30)
     about = np.arange(20) % 3 == 0
-    likeness = touched(views, lambda: ConfirmedPairs(frame[:0], match[:0], about[:0])).measure().likeness
-    level = levels(views.reshape(len(views), -1), np.ones(SIZE)).astype(int)
-    known = background(level, PIXELS.group)
-    assert np.array_equal(likeness, table(known, variation(level[:0], level[:0])))
-    assert np.allclose(likeness, table(known, PRIOR))
+    likeness = touched(views, lambda: ConfirmedPairs(frame[:0], match[:0], about[:0])).metric().likeness
+    level = pixel_levels(views.reshape(len(views), -1), np.ones(SIZE)).astype(int)
+    known = estimate_background(level, PIXELS.group)
+    assert np.array_equal(likeness, log_odds_table(known, estimate_variation(level[:0], level[:0])))
+    assert np.allclose(likeness, log_odds_table(known, PRIOR))
 
     then = level[match].copy()
-    then[about] = then[about][:, PIXELS.behind]
+    then[about] = then[about][:, PIXELS.opposite]
     looks = WhiskerAppearance(PIXELS, TEMPER)
     for view in views:
         looks.append(seen(view), 0.0, 0.1)
     looks.learn(SILENT, lambda: ConfirmedPairs(frame, match, about))
-    assert np.array_equal(looks.measure().likeness, table(known, variation(level[frame], then)))
+    assert np.array_equal(
+        looks.metric().likeness, log_odds_table(known, estimate_variation(level[frame], then))
+    )
 
 
 @given(seeds)
 @settings(max_examples=20)
 def test_nothing_fits_an_image_as_the_same_one_does(seed):
-    views = felt(np.random.default_rng(seed), LEARN)
+    views = felt(np.random.default_rng(seed), LOG_ODDS_INTERVAL)
     views[7] = views[3]
     looks = touched(views)
     misfits = [looks.misfit(7, *alone(k)) for k in range(len(views))]
@@ -144,7 +146,7 @@ def test_nothing_fits_an_image_as_the_same_one_does(seed):
 
 
 def test_the_more_pixels_differ_the_worse_it_fits():
-    views = felt(np.random.default_rng(0), LEARN)
+    views = felt(np.random.default_rng(0), LOG_ODDS_INTERVAL)
     for k in range(10):
         views[k] = views[0]
         views[k].reshape(-1)[:k] = 1 - np.ceil(views[0].reshape(-1)[:k])  # touching is silent and the like
@@ -154,11 +156,11 @@ def test_the_more_pixels_differ_the_worse_it_fits():
     assert misfits[9] > 2 * misfits[0]
 
 
-@given(seeds, st.lists(st.integers(0, LEARN - 1), min_size=1, max_size=8))
+@given(seeds, st.lists(st.integers(0, LOG_ODDS_INTERVAL - 1), min_size=1, max_size=8))
 @settings(max_examples=20)
 def test_a_frame_fits_where_one_of_its_neighbours_fits(seed, near):
     stream = np.random.default_rng(seed)
-    looks = touched(felt(stream, LEARN))
+    looks = touched(felt(stream, LOG_ODDS_INTERVAL))
     near, about = np.array(near), stream.random(len(near)) < 0.5
     each = [looks.misfit(5, near[k : k + 1], about[k : k + 1]) for k in range(len(near))]
     assert looks.misfit(5, near, about) == pytest.approx(min(each), rel=1e-12)
@@ -167,8 +169,8 @@ def test_a_frame_fits_where_one_of_its_neighbours_fits(seed, near):
 @given(seeds)
 @settings(max_examples=20)
 def test_a_frame_turned_about_fits_as_what_it_would_feel(seed):
-    views = felt(np.random.default_rng(seed), LEARN)
-    views[8] = views[3].reshape(-1)[PIXELS.behind].reshape(SHAPE)
+    views = felt(np.random.default_rng(seed), LOG_ODDS_INTERVAL)
+    views[8] = views[3].reshape(-1)[PIXELS.opposite].reshape(SHAPE)
     looks = touched(views)
     turned = looks.misfit(8, np.array([3]), np.array([True]))
     assert turned == looks.misfit(8, *alone(8))
@@ -181,35 +183,35 @@ def test_a_frame_turned_about_fits_as_what_it_would_feel(seed):
 def test_dead_whiskers_neither_fit_nor_misfit():
     stream = np.random.default_rng(0)
     dead = (1, 8, 15)
-    views = felt(stream, LEARN)
+    views = felt(stream, LOG_ODDS_INTERVAL)
     other = views.copy()
-    other.reshape(LEARN, -1)[:, list(dead)] = stream.random((LEARN, 3))
+    other.reshape(LOG_ODDS_INTERVAL, -1)[:, list(dead)] = stream.random((LOG_ODDS_INTERVAL, 3))
     one, two = (touched(rows, dead=dead) for rows in (views, other))
     for name, rows in one.arrays().items():
         assert np.array_equal(rows, two.arrays()[name]), name
     assert (one.arrays()["level"][:, list(dead)] == DEAD).all()
-    assert np.array_equal(one.measure().likeness, two.measure().likeness)
+    assert np.array_equal(one.metric().likeness, two.metric().likeness)
     numb = touched(views, dead=range(SIZE))
     assert numb.misfit(5, *alone(6)) == pytest.approx(np.log(2))
 
 
 @pytest.mark.parametrize("kind", ["touch", "views", "labels"])
 def test_where_there_is_nothing_to_compare_with_there_is_doubt(kind):
-    views = felt(np.random.default_rng(0), LEARN)
+    views = felt(np.random.default_rng(0), LOG_ODDS_INTERVAL)
     looks = {"touch": touched(views), "views": viewed(views), "labels": labelled([1] * 5)}[kind]
     none = np.zeros(0, int)
     assert looks.misfit(3, none, none.astype(bool)) == (
-        UNTOLD if isinstance(looks, WhiskerAppearance) else DOUBT
+        NEUTRAL_IMAGE_MISFIT if isinstance(looks, WhiskerAppearance) else NEUTRAL_MISFIT
     )
 
 
 def test_whiskers_that_nobody_speaks_of_report():
     plain = observation(Odometry(0.1, 0.0, 0.0, 1.0), np.ones((3, 6, 2)))
     assert plain.alive.shape == (0,)
-    assert alive(plain).all()
-    assert alive(plain).shape == (3, 6, 2)
+    assert live_pixels(plain).all()
+    assert live_pixels(plain).shape == (3, 6, 2)
     told = plain._replace(alive=np.arange(18) != 7)
-    assert np.array_equal(np.argwhere(~alive(told)), [[1, 1, 0], [1, 1, 1]])
+    assert np.array_equal(np.argwhere(~live_pixels(told)), [[1, 1, 0], [1, 1, 1]])
 
 
 # Views
@@ -220,8 +222,8 @@ def test_whiskers_that_nobody_speaks_of_report():
 def test_views_misfit_by_their_error_in_scales(seed):
     stream = np.random.default_rng(seed)
     views = stream.random((30, *SHAPE))
-    looks = viewed(views, stream.uniform(0.1, 0.5, ENOUGH))
-    scale = looks.measure().scale
+    looks = viewed(views, stream.uniform(0.1, 0.5, MIN_ERRORS))
+    scale = looks.metric().scale
     assert 0.1 <= scale <= 0.2
     for frame in (0, 11, 29):
         near = stream.integers(0, 30, 4)
@@ -232,14 +234,14 @@ def test_views_misfit_by_their_error_in_scales(seed):
 
 
 def test_a_scale_needs_enough_errors_and_grows_with_the_sensors_unit():
-    errors = np.random.default_rng(0).uniform(0.1, 0.5, ENOUGH)
+    errors = np.random.default_rng(0).uniform(0.1, 0.5, MIN_ERRORS)
     views = np.zeros((1, *SHAPE))
-    assert viewed(views, errors[:-20]).measure().scale == 0
-    scale = viewed(views, errors).measure().scale
-    assert viewed(views, 2 * errors).measure().scale == 2 * scale
-    half_known = np.where(np.arange(2 * ENOUGH) % 2, np.nan, np.repeat(errors, 2))
-    assert viewed(views, half_known).measure().scale == scale
-    assert viewed(views, np.zeros(ENOUGH)).measure().scale == 0
+    assert viewed(views, errors[:-20]).metric().scale == 0
+    scale = viewed(views, errors).metric().scale
+    assert viewed(views, 2 * errors).metric().scale == 2 * scale
+    half_known = np.where(np.arange(2 * MIN_ERRORS) % 2, np.nan, np.repeat(errors, 2))
+    assert viewed(views, half_known).metric().scale == scale
+    assert viewed(views, np.zeros(MIN_ERRORS)).metric().scale == 0
 
 
 def test_views_are_kept_as_recall_compares_them():
@@ -252,10 +254,10 @@ def test_views_are_kept_as_recall_compares_them():
 
 def test_only_a_fan_has_an_angle():
     views = np.zeros((1, *SHAPE))
-    assert viewed(views).measure().angle == 0
-    assert viewed(views, fan=0.0).measure().angle == 0
-    assert viewed(views, fan=3.6).measure().angle == pytest.approx(0.2)
-    assert viewed(views).measure().likeness.size == 0
+    assert viewed(views).metric().angle == 0
+    assert viewed(views, fan=0.0).metric().angle == 0
+    assert viewed(views, fan=3.6).metric().angle == pytest.approx(0.2)
+    assert viewed(views).metric().likeness.size == 0
 
 
 # Given ids
@@ -266,7 +268,7 @@ def test_ids_fit_where_they_were_given():
     assert looks.misfit(2, *alone(0)) == 0
     assert looks.misfit(2, *alone(1)) == 1
     assert looks.misfit(2, np.array([1, 3, 0]), np.zeros(3, bool)) == 0
-    assert looks.measure().scale == looks.measure().angle == 0
+    assert looks.metric().scale == looks.metric().angle == 0
     assert looks.learn(SILENT, no_pairs) == NO_ESTIMATE
 
 
@@ -313,14 +315,14 @@ def test_looks_that_were_kept_go_on_as_if_never_stopped(kind, stop):
     assert second.arrays().keys() == whole.arrays().keys()
     for name, rows in whole.arrays().items():
         assert np.array_equal(rows, second.arrays()[name]), name
-    for one, two in zip(whole.measure(), second.measure(), strict=True):
+    for one, two in zip(whole.metric(), second.metric(), strict=True):
         assert np.array_equal(one, two)
     near, about = np.arange(10), np.arange(10) % 2 == 0
     assert whole.misfit(100, near, about) == second.misfit(100, near, about)
-    assert (whole.measure().likeness.size > 0) == (kind == "touch")
-    assert (whole.measure().scale > 0) == (kind != "labels")
+    assert (whole.metric().likeness.size > 0) == (kind == "touch")
+    assert (whole.metric().scale > 0) == (kind != "labels")
 
 
 def test_a_white_pixel_is_the_tallest():
-    looks = touched(np.ones((LEARN, *SHAPE)))
+    looks = touched(np.ones((LOG_ODDS_INTERVAL, *SHAPE)))
     assert (looks.arrays()["level"] == HEIGHTS).all()

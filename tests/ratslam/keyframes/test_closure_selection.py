@@ -10,7 +10,15 @@ import pytest
 
 from ratslam.keyframes import closure_selection
 from ratslam.keyframes.closure_selection import CUT, KEPT, STEPS, SelectionProblem, select_closures
-from ratslam.keyframes.optimizer import BiasPrior, LoopClosures, MapFit, OdometryChain, robust_cost, solve
+from ratslam.keyframes.optimizer import (
+    BiasPrior,
+    LoopClosures,
+    MapFit,
+    MapProblem,
+    OdometryChain,
+    robust_cost,
+    solve,
+)
 from tactile.base.se2 import between, compose, fit_rigid_motion, integrate, wrap
 
 LAP = 60
@@ -28,13 +36,13 @@ class World(NamedTuple):
     case: SelectionProblem
 
     def reckoned(self) -> MapFit:
-        poses = integrate(self.case.chain.motion, self.truth[0])
+        poses = integrate(self.case.measurements.chain.motion, self.truth[0])
         return MapFit(np.vstack([self.truth[:1], poses]), 0.0, np.zeros(0))
 
     def starts(self) -> list[MapFit]:
         path = self.reckoned()
-        chain, closures = self.case.chain, self.case.closures
-        return [solve(path.poses, 0.0, chain, closures, PRIOR, STEPS), path]
+        chain, closures = self.case.measurements.chain, self.case.measurements.closures
+        return [solve(MapFit(path.poses, 0.0, np.zeros(0)), MapProblem(chain, closures, PRIOR), STEPS), path]
 
     def where(self, poses, onwards, carried, since):
         """From which frame on the poses carried are nearer to the truth, as ideal views would tell."""
@@ -101,10 +109,17 @@ def world(
         i=np.concatenate(match), j=np.concatenate(sequences), turn=np.zeros(members.sum()),
         sequence=np.repeat(np.arange(len(sequences)), members), variance=SPREAD**2,
         scale=2 * (evidence - 6) / members, score=evidence,
-        stray=np.maximum(6.0, 3 * (evidence - 6) / members),
+        cost_limit=np.maximum(6.0, 3 * (evidence - 6) / members),
     )  # fmt: skip
     first, last = np.array([[frames[0], frames[-1]] for frames in sequences]).T
-    return World(truth, SelectionProblem(chain, closures, PRIOR, evidence, first, last))
+    return World(truth, SelectionProblem(MapProblem(chain, closures, PRIOR), evidence, first, last))
+
+
+def rescaled(case: SelectionProblem, by: float) -> SelectionProblem:
+    """The problem with all robust scales multiplied by a factor."""
+    closures = case.measurements.closures
+    closures = closures._replace(scale=closures.scale * by)
+    return case._replace(measurements=case.measurements._replace(closures=closures))
 
 
 def off(fit: MapFit, truth: np.ndarray) -> float:
@@ -123,11 +138,9 @@ def test_runs_that_are_all_true_are_solved_for(seed):
     judged = select_closures(case, starts, made.where)
     assert (judged.fit.weights > KEPT).all()
     assert judged.cuts == ()
-    plain = solve(
-        starts[0].poses, starts[0].bias, case.chain, case.closures, PRIOR, STEPS, closure_selection.FINE
-    )
+    plain = solve(starts[0], case.measurements, STEPS, closure_selection.FINE)
     assert np.array_equal(judged.fit.poses, plain.poses)
-    assert judged.cost == robust_cost(plain, case.chain, case.closures, PRIOR)
+    assert judged.cost == robust_cost(plain, case.measurements)
     assert off(judged.fit, made.truth) < 0.1
     assert off(made.reckoned(), made.truth) > 2 * off(judged.fit, made.truth)
 
@@ -160,11 +173,13 @@ def test_a_run_that_is_false_is_outvoted_however_strong_it_is():
 def test_a_map_bent_by_a_false_run_is_set_right(seed):
     """However the present map came about, it is not the only one begun from."""
     made = world(seed, false=40.0)
-    closures = made.case.closures
+    closures = made.case.measurements.closures
     wrong = np.arange(len(made.case.evidence)) == len(made.case.evidence) - 1
     believing = closures._replace(scale=np.where(wrong, 1e12, 1e-3))
     path = made.reckoned()
-    bent = solve(path.poses, 0.0, made.case.chain, believing, PRIOR, 40)
+    bent = solve(
+        MapFit(path.poses, 0.0, np.zeros(0)), MapProblem(made.case.measurements.chain, believing, PRIOR), 40
+    )
     judged = select_closures(made.case, [bent, path], made.where)
     assert off(bent, made.truth) > 2 * off(judged.fit, made.truth)
     assert judged.fit.weights[-1] < KEPT
@@ -184,9 +199,7 @@ def test_a_hopeless_present_map_is_given_up(seed):
 def test_the_more_evidence_the_more_a_run_may_strain_the_map():
     made = world(0)
     case = made.case
-    strict, lenient = (
-        case._replace(closures=case.closures._replace(scale=case.closures.scale * by)) for by in (0.1, 10)
-    )
+    strict, lenient = (rescaled(case, by) for by in (0.1, 10))
     weights = [select_closures(one, made.starts(), made.where).fit.weights for one in (strict, case, lenient)]
     assert (weights[0] < weights[1]).all()
     assert (weights[1] < weights[2]).all()
@@ -206,29 +219,28 @@ def test_the_cost_is_never_above_that_of_the_present_map(seed):
         poses=present.poses + stream.normal(0, 0.02, present.poses.shape) * [1, 1, 0.2]
     )
     judged = select_closures(case, [present, made.reckoned()], made.where)
-    assert judged.cost <= robust_cost(present, case.chain, case.closures, PRIOR)
+    assert judged.cost <= robust_cost(present, case.measurements)
     again = select_closures(case, [judged.fit, made.reckoned()], made.where, judged.cuts)
     assert again.cost <= judged.cost + 0.5  # solver steps, not another map
-    severed = closure_selection.cut_chain(case.chain, judged.cuts)
-    whole = robust_cost(judged.fit, severed, case.closures, PRIOR) + CUT * len(judged.cuts)
+    severed = closure_selection.cut_odometry(case.measurements, judged.cuts)
+    whole = robust_cost(judged.fit, severed) + CUT * len(judged.cuts)
     assert judged.cost == pytest.approx(whole, rel=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_the_order_of_sequences_does_not_matter(seed):
     made = world(seed, jumps=((150, 25),) if seed % 2 else (), false=45.0)
-    case, closures = made.case, made.case.closures
+    case, closures = made.case, made.case.measurements.closures
     order = np.random.default_rng(seed).permutation(len(case.evidence))
     number = np.argsort(order)
     among = np.random.default_rng(seed + 1).permutation(len(closures.sequence))
     renamed = SelectionProblem(
-        case.chain,
-        closures._replace(
+        case.measurements._replace(closures=closures._replace(
             i=closures.i[among], j=closures.j[among], turn=closures.turn[among],
             sequence=number[closures.sequence[among]], scale=closures.scale[order],
-            score=closures.score[order], stray=np.asarray(closures.stray)[order],
-        ),
-        case.prior, case.evidence[order], case.first[order], case.last[order],
+            score=closures.score[order], cost_limit=np.asarray(closures.cost_limit)[order],
+        )),
+        case.evidence[order], case.first[order], case.last[order],
     )  # fmt: skip
     one, two = (select_closures(c, made.starts(), made.where) for c in (case, renamed))
     assert two.cost == pytest.approx(one.cost, rel=1e-6)

@@ -51,7 +51,7 @@ def test_the_ledger_is_a_list_of_candidates(steps):
             ledger.strike(frame, spare)
             for row in rows:
                 accepted = row[1] >= 0 and verdicts[row[1]] == Verdict.ACCEPTED
-                if row[0].frame >= frame and accepted and row[1] != spare:
+                if row[0].keyframe >= frame and accepted and row[1] != spare:
                     row[1] = -1
         # After every step, so that nothing once looked up outlives a change.
         counts = [
@@ -65,7 +65,7 @@ def test_the_ledger_is_a_list_of_candidates(steps):
     for sequence in range(ledger.sequences):
         mine = [candidate for candidate, of in rows if of == sequence]
         assert ledger.members(sequence).tolist() == [[*c[:3], sequence] for c in mine]
-        assert ledger.score(sequence) == pytest.approx(sum(c.gain for c in mine))
+        assert ledger.score(sequence) == pytest.approx(sum(c.log_ratio for c in mine))
     table = ledger.table()
     assert table.shape == (len(rows), 9)
     assert table[:, :6].tolist() == [[*candidate, sequence] for candidate, sequence in rows]
@@ -77,7 +77,7 @@ def test_the_ledger_is_a_list_of_candidates(steps):
     mine = [rows[k] for k in counts]
     sequences = sorted({sequence for _, sequence in mine})
     assert closures.i.tolist() == [candidate.match for candidate, _ in mine]
-    assert closures.j.tolist() == [candidate.frame for candidate, _ in mine]
+    assert closures.j.tolist() == [candidate.keyframe for candidate, _ in mine]
     assert np.allclose(closures.turn, [-0.2 * candidate.shift for candidate, _ in mine])
     assert closures.sequence.tolist() == [sequences.index(sequence) for _, sequence in mine]
     assert np.allclose(

@@ -12,6 +12,7 @@ from ratslam.keyframes.optimizer import (
     BiasPrior,
     LoopClosures,
     MapFit,
+    MapProblem,
     OdometryChain,
     relative_covariance,
     robust_cost,
@@ -122,7 +123,7 @@ def test_true_closures_tell_the_bias_and_all_poses(bias):
     truth, chain, closures = laps(np.random.default_rng(0), bias)
     start = reckoned(chain)
     assert apart(start, truth) > 0.5
-    fit = solve(start, 0.0, chain, closures, WIDE, 30)
+    fit = solve(MapFit(start, 0.0, np.zeros(0)), MapProblem(chain, closures, WIDE), 30)
     assert apart(fit.poses, truth) < 1e-5
     assert fit.bias == pytest.approx(bias, abs=1e-6)
     assert np.allclose(fit.weights, 1)
@@ -130,7 +131,9 @@ def test_true_closures_tell_the_bias_and_all_poses(bias):
 
 def test_a_certain_prior_holds_the_bias():
     truth, chain, closures = laps(np.random.default_rng(0), 0.05)
-    fit = solve(reckoned(chain), 0.0, chain, closures, BiasPrior(0.02, 1e-9), 30)
+    fit = solve(
+        MapFit(reckoned(chain), 0.0, np.zeros(0)), MapProblem(chain, closures, BiasPrior(0.02, 1e-9)), 30
+    )
     assert fit.bias == pytest.approx(0.02, abs=1e-9)
     assert apart(fit.poses, truth) > 0.05
 
@@ -149,7 +152,7 @@ def test_a_step_is_gauss_newtons(seed, scale):
         return residuals(x, start[0], chain, closures, prior, weights)
 
     step = np.linalg.lstsq(slopes(errors, x), -errors(x), rcond=None)[0]
-    fit = solve(start, bias, chain, closures, prior, 1)
+    fit = solve(MapFit(start, bias, np.zeros(0)), MapProblem(chain, closures, prior), 1)
     assert np.allclose(fit.weights, weights)
     assert np.allclose(wrap(unknowns(fit.poses, fit.bias) - x - step), 0, atol=1e-6)
 
@@ -160,7 +163,7 @@ def test_without_robust_weights_it_is_least_squares(seed):
     stream = np.random.default_rng(seed)
     _, chain, closures = laps(stream, 0.04, 8, 0.03)
     prior, start = BiasPrior(0.02, 0.02), reckoned(chain)
-    fit = solve(start, 0.0, chain, closures, prior, 50)
+    fit = solve(MapFit(start, 0.0, np.zeros(0)), MapProblem(chain, closures, prior), 50)
     found = least_squares(
         residuals,
         unknowns(start, 0.0),
@@ -178,7 +181,7 @@ def test_with_robust_weights_it_is_geman_mcclure_by_run():
     _, chain, closures = laps(stream, 0.04, 8, 0.02)
     # One sequence is moderately off, so that its weight, neither 0 nor 1, decides where the optimum lies.
     closures = closures._replace(scale=np.full(3, 4.0), turn=closures.turn + 0.03 * (closures.sequence == 1))
-    fit = solve(reckoned(chain), 0.04, chain, closures, WIDE, 500)
+    fit = solve(MapFit(reckoned(chain), 0.04, np.zeros(0)), MapProblem(chain, closures, WIDE), 500)
     assert ((fit.weights > 0.1) & (fit.weights < 0.999)).any()
 
     def cost(x):
@@ -199,28 +202,32 @@ def test_a_run_that_is_far_off_counts_for_nothing(bias):
     stream = np.random.default_rng(1)
     _, chain, closures = laps(stream, bias, noise=0.01)
     closures = closures._replace(scale=np.full(3, 10.0))
-    right = solve(reckoned(chain), bias, chain, closures, WIDE, 50)
+    right = solve(MapFit(reckoned(chain), bias, np.zeros(0)), MapProblem(chain, closures, WIDE), 50)
     false = closed([(k, k + 12) for k in range(2, 8)], np.zeros(6), np.full(6, 3), [10.0])
     both = LoopClosures(
         *(np.concatenate([a, b]) for a, b in zip(closures[:4], false[:4], strict=True)),
         CLOSURE,
         np.full(4, 10.0),
     )
-    fit = solve(reckoned(chain), bias, chain, both, WIDE, 50)
+    fit = solve(MapFit(reckoned(chain), bias, np.zeros(0)), MapProblem(chain, both, WIDE), 50)
     assert fit.weights[3] < 1e-4
     assert fit.weights[:3].min() > 0.5
     assert np.allclose(fit.weights[:3], right.weights, atol=0.01)
     assert apart(fit.poses, right.poses) < 5e-3
-    trusting = solve(reckoned(chain), bias, chain, both._replace(scale=np.full(4, SURE)), WIDE, 50)
+    trusting = solve(
+        MapFit(reckoned(chain), bias, np.zeros(0)),
+        MapProblem(chain, both._replace(scale=np.full(4, SURE)), WIDE),
+        50,
+    )
     assert apart(trusting.poses, right.poses) > 0.3
 
 
-def robust_case(seed, stray, count=8):
+def robust_case(seed, cost_limit, count=8):
     """Laps with noise, a start that is off, and sequences of which the second is astray."""
     stream = np.random.default_rng(seed)
     truth, chain, closures = laps(stream, 0.04, count, 0.02)
     turn = closures.turn + (closures.sequence == 1) * stream.uniform(-0.5, 0.5)
-    closures = closures._replace(scale=stream.uniform(1, 20, 3), stray=stray, turn=turn)
+    closures = closures._replace(scale=stream.uniform(1, 20, 3), cost_limit=cost_limit, turn=turn)
     start = truth + stream.normal(0, 0.05, truth.shape)
     start[0] = truth[0]
     return start, chain, closures, BiasPrior(0.03, 0.02)
@@ -231,64 +238,71 @@ def cost_by_loops(fit, chain, closures, prior):
     cost = (odometry**2).sum() + ((fit.bias - prior.mean) / prior.sd) ** 2
     for sequence, scale in enumerate(closures.scale):
         each = [(recall[k] ** 2).sum() for k in np.flatnonzero(closures.sequence == sequence)]
-        if np.isfinite(closures.stray):
-            each = [closures.stray * chi2 / (closures.stray + chi2) for chi2 in each]
+        if np.isfinite(closures.cost_limit):
+            each = [closures.cost_limit * chi2 / (closures.cost_limit + chi2) for chi2 in each]
         mean = sum(each) / max(len(each), 1)
         cost += len(each) * scale * mean / (scale + mean)
     return cost
 
 
 @given(seeds, st.sampled_from([np.inf, 6.0, 0.5]))
-def test_the_robust_cost_is_what_odometry_and_runs_lack(seed, stray):
-    start, chain, closures, prior = robust_case(seed, stray)
+def test_the_robust_cost_is_what_odometry_and_runs_lack(seed, cost_limit):
+    start, chain, closures, prior = robust_case(seed, cost_limit)
     fit = MapFit(start, 0.01, np.zeros(3))
-    assert robust_cost(fit, chain, closures, prior) == pytest.approx(
+    assert robust_cost(fit, MapProblem(chain, closures, prior)) == pytest.approx(
         cost_by_loops(fit, chain, closures, prior), rel=1e-9
     )
 
 
 def test_the_robust_cost_of_a_perfect_map_is_none():
     truth, chain, closures = laps(np.random.default_rng(0), 0.03)
-    assert robust_cost(MapFit(truth, 0.03, np.zeros(3)), chain, closures, BiasPrior(0.03, 1.0)) < 1e-12
+    assert (
+        robust_cost(MapFit(truth, 0.03, np.zeros(3)), MapProblem(chain, closures, BiasPrior(0.03, 1.0)))
+        < 1e-12
+    )
     alone = closed([])
     assert robust_cost(
-        MapFit(truth, 0.03, np.zeros(0)), chain, alone, BiasPrior(0.02, 0.01)
+        MapFit(truth, 0.03, np.zeros(0)), MapProblem(chain, alone, BiasPrior(0.02, 0.01))
     ) == pytest.approx(1.0)
 
 
 @given(seeds, st.sampled_from([np.inf, 20.0, 6.0]))
 @settings(max_examples=40)
-def test_every_step_lessens_the_robust_cost(seed, stray):
-    start, chain, closures, prior = robust_case(seed, stray)
+def test_every_step_lessens_the_robust_cost(seed, cost_limit):
+    start, chain, closures, prior = robust_case(seed, cost_limit)
     fit = MapFit(start, 0.0, np.zeros(3))
-    costs = [robust_cost(fit, chain, closures, prior)]
+    costs = [robust_cost(fit, MapProblem(chain, closures, prior))]
     for _ in range(25):
-        fit = solve(fit.poses, fit.bias, chain, closures, prior, 1)
-        costs.append(robust_cost(fit, chain, closures, prior))
+        fit = solve(MapFit(fit.poses, fit.bias, np.zeros(0)), MapProblem(chain, closures, prior), 1)
+        costs.append(robust_cost(fit, MapProblem(chain, closures, prior)))
     assert (np.diff(costs) <= 1e-9 * np.array(costs[:-1])).all()
     assert costs[-1] < 0.5 * costs[0]
 
 
-@pytest.mark.parametrize("stray", [6.0, 1.0])
-def test_where_solving_ends_the_robust_cost_is_least(stray):
-    start, chain, closures, prior = robust_case(3, stray)
-    fit = solve(start, 0.0, chain, closures, prior, 500)
+@pytest.mark.parametrize("cost_limit", [6.0, 1.0])
+def test_where_solving_ends_the_robust_cost_is_least(cost_limit):
+    start, chain, closures, prior = robust_case(3, cost_limit)
+    fit = solve(MapFit(start, 0.0, np.zeros(0)), MapProblem(chain, closures, prior), 500)
     assert ((fit.weights > 0.01) & (fit.weights < 0.999)).any()
-    least = robust_cost(fit, chain, closures, prior)
+    least = robust_cost(fit, MapProblem(chain, closures, prior))
     for k in range(1, len(fit.poses)):
         for step in 1e-3 * np.eye(3):
             for sign in (1, -1):
                 poses = fit.poses.copy()
                 poses[k] += sign * step
-                assert robust_cost(fit._replace(poses=poses), chain, closures, prior) > least
+                assert robust_cost(fit._replace(poses=poses), MapProblem(chain, closures, prior)) > least
 
 
 def test_one_closure_astray_does_not_take_its_run_with_it():
     truth, chain, closures = laps(np.random.default_rng(1), 0.0, noise=0.005)
     closures = closures._replace(scale=np.full(3, 4.0))
     astray = closures._replace(i=np.where(np.arange(len(closures.i)) == 5, 20, closures.i))
-    strict = solve(reckoned(chain), 0.0, chain, astray, WIDE, 50)
-    lenient = solve(reckoned(chain), 0.0, chain, astray._replace(stray=6.0), WIDE, 50)
+    strict = solve(MapFit(reckoned(chain), 0.0, np.zeros(0)), MapProblem(chain, astray, WIDE), 50)
+    lenient = solve(
+        MapFit(reckoned(chain), 0.0, np.zeros(0)),
+        MapProblem(chain, astray._replace(cost_limit=6.0), WIDE),
+        50,
+    )
     sequence = closures.sequence[5]
     assert strict.weights[sequence] < 0.01
     assert lenient.weights[sequence] > 0.25
@@ -297,13 +311,13 @@ def test_one_closure_astray_does_not_take_its_run_with_it():
 
 def test_a_coarser_tolerance_takes_fewer_steps():
     start, chain, closures, prior = robust_case(0, 6.0)
-    fine = solve(start, 0.0, chain, closures, prior, 100, 1e-9)
+    fine = solve(MapFit(start, 0.0, np.zeros(0)), MapProblem(chain, closures, prior), 100, 1e-9)
     for tolerance in (1e-3, 1e-5):
-        coarse = solve(start, 0.0, chain, closures, prior, 100, tolerance)
+        coarse = solve(MapFit(start, 0.0, np.zeros(0)), MapProblem(chain, closures, prior), 100, tolerance)
         assert 0 < apart(coarse.poses, fine.poses) < 100 * tolerance
     assert np.array_equal(
-        solve(start, 0.0, chain, closures, prior, 1, 1e-9).poses,
-        solve(start, 0.0, chain, closures, prior, 100, 1e3).poses,
+        solve(MapFit(start, 0.0, np.zeros(0)), MapProblem(chain, closures, prior), 1, 1e-9).poses,
+        solve(MapFit(start, 0.0, np.zeros(0)), MapProblem(chain, closures, prior), 100, 1e3).poses,
     )
 
 
@@ -331,7 +345,7 @@ def test_relative_covariance_is_the_marginal_of_the_whole_information(seed):
 
     by = slopes(seen, x)
     expected = by @ np.linalg.inv(jacobian.T @ jacobian) @ by.T
-    told = relative_covariance(fit, chain, closures, prior, i, j, turn)
+    told = relative_covariance(fit, MapProblem(chain, closures, prior), i, j, turn)
     assert np.allclose(told, expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
 
 
@@ -340,17 +354,17 @@ def test_covariance_is_one_grows_along_the_chain_and_shrinks_with_closures():
     fit, none = MapFit(reckoned(chain), 0.0, np.zeros(0)), closed([])
     for pair in [(0, 47), (5, 30), (40, 3)]:
         prior = BiasPrior(0.0, 0.02)
-        free = relative_covariance(fit, chain, none, prior, *pair, 0.3)
-        bound = relative_covariance(fit, chain, closures, prior, *pair, 0.3)
+        free = relative_covariance(fit, MapProblem(chain, none, prior), *pair, 0.3)
+        bound = relative_covariance(fit, MapProblem(chain, closures, prior), *pair, 0.3)
         for covariance in (free, bound, free - bound):
             assert np.allclose(covariance, covariance.T, rtol=0, atol=1e-9 * np.trace(free))
             assert np.linalg.eigvalsh(covariance).min() > 0
-        told = relative_covariance(fit, chain, none, BiasPrior(0.0, 0.001), *pair, 0.3)
+        told = relative_covariance(fit, MapProblem(chain, none, BiasPrior(0.0, 0.001)), *pair, 0.3)
         assert np.linalg.eigvalsh(free - told).max() > 0.1 * np.trace(free - told) > 0
     straight = chained(np.tile([0.5, 0.0, 0.0], (20, 1)))
     fit = MapFit(reckoned(straight), 0.0, np.zeros(0))
     along = np.array(
-        [np.diag(relative_covariance(fit, straight, none, WIDE, 0, k, 0.0)) for k in range(1, 21)]
+        [np.diag(relative_covariance(fit, MapProblem(straight, none, WIDE), 0, k, 0.0)) for k in range(1, 21)]
     )
     assert (np.diff(along, axis=0) > 0).all()
 
@@ -361,14 +375,16 @@ def test_the_first_frame_never_moves(seed):
     stream = np.random.default_rng(seed)
     _, chain, closures = laps(stream, 0.05, noise=0.05)
     first = stream.uniform(-3, 3, 3)
-    fit = solve(reckoned(chain, first), 0.0, chain, closures, WIDE, 10)
+    fit = solve(MapFit(reckoned(chain, first), 0.0, np.zeros(0)), MapProblem(chain, closures, WIDE), 10)
     assert np.allclose(fit.poses[0], first, rtol=0, atol=1e-14)
     assert apart(fit.poses, reckoned(chain, first)) > 0.1
 
 
 def test_a_chain_alone_is_dead_reckoning_with_the_prior_bias():
     _, chain, _ = laps(np.random.default_rng(4), 0.0)
-    fit = solve(reckoned(chain), 0.0, chain, closed([]), BiasPrior(0.03, 0.01), 30)
+    fit = solve(
+        MapFit(reckoned(chain), 0.0, np.zeros(0)), MapProblem(chain, closed([]), BiasPrior(0.03, 0.01)), 30
+    )
     expected = np.vstack([START, integrate(correct_heading_bias(chain.motion, chain.length, 0.03), START)])
     assert fit.bias == pytest.approx(0.03, abs=1e-9)
     assert apart(fit.poses, expected) < 1e-6
@@ -377,7 +393,9 @@ def test_a_chain_alone_is_dead_reckoning_with_the_prior_bias():
 
 def test_a_single_frame_is_a_map():
     chain = chained(np.zeros((0, 3)))
-    fit = solve(START[None], 0.01, chain, closed([]), BiasPrior(0.03, 0.01), 5)
+    fit = solve(
+        MapFit(START[None], 0.01, np.zeros(0)), MapProblem(chain, closed([]), BiasPrior(0.03, 0.01)), 5
+    )
     assert np.allclose(fit.poses, START[None], rtol=0, atol=1e-14)
     assert np.isfinite(fit.bias)
 
@@ -386,7 +404,7 @@ def test_a_frame_that_nothing_ties_leaves_all_as_it_was():
     chain = chained(np.tile([0.5, 0.0, 0.1], (4, 1)))
     chain.variance[-1] = np.inf
     start = reckoned(chain) + 0.01
-    fit = solve(start, 0.01, chain, closed([]), WIDE, 5)
+    fit = solve(MapFit(start, 0.01, np.zeros(0)), MapProblem(chain, closed([]), WIDE), 5)
     assert np.array_equal(fit.poses, start)
     assert fit.bias == 0.01
-    assert np.isinf(relative_covariance(fit, chain, closed([]), WIDE, 0, 4, 0.0)).all()
+    assert np.isinf(relative_covariance(fit, MapProblem(chain, closed([]), WIDE), 0, 4, 0.0)).all()

@@ -246,12 +246,12 @@ def look_by_loops(config, cell, memory, view):
     return {
         "match": match,
         "shift": shift,
-        "mass": sum(value for (_, c), value in belief.items() if apart(c, match) < BASIN * cell),
-        "gain": math.log(best / novelty),
-        "novel": novel,
+        "posterior": sum(value for (_, c), value in belief.items() if apart(c, match) < BASIN * cell),
+        "log_ratio": math.log(best / novelty),
+        "novelty": novel,
         "entropy": -sum(share * math.log(share) for share in shares if share > 0),
-        "second": np.divide(*sorted(mass for *_, mass in modes)[-2:]),
-        "agree": int(max(fits) >= novelty) if fits else -1,
+        "second_mode": np.divide(*sorted(mass for *_, mass in modes)[-2:]),
+        "view_fits": int(max(fits) >= novelty) if fits else -1,
     }, modes
 
 
@@ -275,8 +275,8 @@ def test_the_seeds_reach_what_they_are_for():
     # Without shifted matches, revisits that fit and that do not, the loops would prove less.
     found = [look(FAN, *random_case(seed))[1] for seed in SEEDS]
     assert {int(f.shift) != 0 for f in found} == {True, False}
-    assert {0, 1} <= {int(f.agree) for f in found}
-    assert max(float(f.mass) for f in found) > 0.5 > min(float(f.mass) for f in found)
+    assert {0, 1} <= {int(f.view_fits) for f in found}
+    assert max(float(f.posterior) for f in found) > 0.5 > min(float(f.posterior) for f in found)
 
 
 # Belief is a distribution
@@ -299,12 +299,12 @@ def test_mass_is_conserved(seed, kind, scale):
     }[kind]
     after, found = look(FAN, memory._replace(scale=jnp.asarray(scale)), view)
     assert (after.mass >= 0).all()
-    assert 0 <= found.mass <= 1 + 1e-12
-    assert 0 <= found.novel <= 1
+    assert 0 <= found.posterior <= 1 + 1e-12
+    assert 0 <= found.novelty <= 1
     assert 0 <= found.entropy <= math.log(FAN.modes + 1) + 1e-12
     if scale:
-        assert after.mass.sum() + found.novel <= 1 + 1e-12
-        assert found.mass + found.novel <= 1 + 1e-12
+        assert after.mass.sum() + found.novelty <= 1 + 1e-12
+        assert found.posterior + found.novelty <= 1 + 1e-12
 
 
 def test_modes_far_fewer_than_frames_lose_no_mass_that_has_a_frame():
@@ -313,7 +313,7 @@ def test_modes_far_fewer_than_frames_lose_no_mass_that_has_a_frame():
     poses = stream.uniform(-0.3, 0.3, (30, 3)) * [CELL, CELL, 1]
     views = stream.random((30, SIZE))
     after, found = look(FAN, filled(FAN, views, poses, angle=ANGLE), views[7])
-    assert after.mass[0] + found.novel == pytest.approx(1, abs=1e-12)
+    assert after.mass[0] + found.novelty == pytest.approx(1, abs=1e-12)
     assert not after.mass[1:].any()
 
 
@@ -340,13 +340,13 @@ def test_single_precision_has_no_nan(stored, scale):
 def test_the_least_scale_of_single_precision_has_no_nan():
     memory = filled(FAN, np.full((40, SIZE), 0.5), spaced(40), angle=ANGLE, scale=5e-38, dtype=np.float32)
     _, found = look(FAN, memory, np.full(SIZE, 0.5))
-    assert not np.isnan(found.mass)
+    assert not np.isnan(found.posterior)
 
 
 def test_novelty_that_all_enters_leaves_no_nan():
     config = FLAT.model_copy(update={"enter": 1.0, "local": 0.0})
     memory = filled(config, np.zeros((40, SIZE)), spaced(40), scale=1e-4)
-    assert not np.isnan(look(config, memory, np.ones(SIZE))[1].novel)
+    assert not np.isnan(look(config, memory, np.ones(SIZE))[1].novelty)
 
 
 # Units
@@ -462,7 +462,7 @@ def test_views_that_fit_nothing_have_no_shift_without_an_angle():
     # All likelihoods underflow to zero, so all of belief is a tie.
     memory = filled(FAN, np.zeros((40, SIZE)), spaced(40), scale=1e-5)
     _, found = look(FAN, memory, np.ones(SIZE))
-    assert found.mass == 0
+    assert found.posterior == 0
     assert found.shift == 0
 
 
@@ -477,7 +477,7 @@ def test_a_fan_not_found_out_is_no_fan():
     for seed in range(4):
         memory, view = random_case(seed, FAN, 0.0)
         auto, none = look(FAN, memory, view)[1], look(FLAT, memory, view)[1]
-        for name in ("match", "shift", "mass", "gain", "novel"):
+        for name in ("match", "shift", "posterior", "log_ratio", "novelty"):
             assert getattr(auto, name) == pytest.approx(getattr(none, name), abs=1e-9), name
 
 
@@ -489,8 +489,14 @@ def test_without_a_scale_nothing_is_recalled_but_all_is_remembered():
     views = stream.random((40, SIZE))
     memory = filled(FAN, views, spaced(40), angle=ANGLE, scale=0.0)
     after, found = look(FAN, memory, views[7])
-    assert (found.match, found.gain, found.mass, found.novel, found.agree) == (-1, 0, 0, 1, -1)
-    assert found.frame == 40
+    assert (found.match, found.log_ratio, found.posterior, found.novelty, found.view_fits) == (
+        -1,
+        0,
+        0,
+        1,
+        -1,
+    )
+    assert found.keyframe == 40
     assert look(FAN, memory._replace(scale=jnp.asarray(0.1)), views[7])[1].match == 7
 
     memory = accumulate_motion(jax.tree.map(jnp.asarray, after), jnp.asarray([CELL, 0.0, 0.5]))
@@ -518,10 +524,10 @@ def test_the_newest_frames_are_never_recalled():
                 continue
             assert found.match < max(count - GUARD, 0)
             assert (after.anchor[after.mass > 0] < count - GUARD).all()
-            assert found.mass < 0.1
+            assert found.posterior < 0.1
         if count <= GUARD:
             assert found.match == -1
-            assert found.novel == 1
+            assert found.novelty == 1
 
 
 # Evidence
@@ -535,7 +541,7 @@ def test_the_more_frames_share_a_view_the_less_it_says():
     for share in (1, 5, 25, old):
         views[:share] = common
         memory = filled(FLAT, views, spaced(old + GUARD), scale=0.05)
-        gains.append(float(look(FLAT, memory, common)[1].gain))
+        gains.append(float(look(FLAT, memory, common)[1].log_ratio))
     assert gains == sorted(gains, reverse=True)
     assert gains[0] > 3.5
     assert gains[-1] <= 0  # a view that all frames share says nothing for any of them
@@ -544,7 +550,9 @@ def test_the_more_frames_share_a_view_the_less_it_says():
 def test_a_view_that_all_frames_share_speaks_against_them_the_more_it_differs():
     views = np.zeros((40, SIZE))
     memory = filled(FLAT, views, spaced(40), scale=0.1)
-    gains = [float(look(FLAT, memory, np.full(SIZE, e * 0.1))[1].gain) for e in (1.0, FLAT.floor, 2.0, 4.0)]
+    gains = [
+        float(look(FLAT, memory, np.full(SIZE, e * 0.1))[1].log_ratio) for e in (1.0, FLAT.floor, 2.0, 4.0)
+    ]
     assert 0 > gains[0] > gains[1] > gains[2] > gains[3]
 
 
@@ -579,7 +587,7 @@ def test_odometry_alone_is_never_evidence():
             start = start._replace(pose=jnp.asarray([0.0, 0.0, 0.0]))
             belief, limit = start, sure
             for _ in range(20):
-                limit = limit * (1 - FLAT.leave) + (1 - limit) * FLAT.enter
+                limit = limit * (1 - FLAT.mode_decay) + (1 - limit) * FLAT.enter
                 belief = accumulate_motion(belief, jnp.asarray([0.5 * CELL, 0.0, 0.0]))
                 belief, _ = looker(FLAT)(belief, jnp.asarray(same)) if seeing else blind(belief, blank)
                 belief = belief._replace(pose=current_pose(belief), motion=jnp.zeros(3), length=jnp.zeros(()))
@@ -593,8 +601,8 @@ def test_a_hypothesis_that_comes_to_no_frame_is_lost():
     view = np.full(SIZE, FLAT.floor * 0.1)
     on_way = accumulate_motion(memory, jnp.asarray([CELL, 0.0, 0.0]))
     aside = accumulate_motion(memory, jnp.asarray([0.0, 4 * CELL, 0.0]))
-    assert look(FLAT, on_way, view)[1].novel < 0.05
-    assert look(FLAT, aside, view)[1].novel == pytest.approx(1, abs=1e-9)
+    assert look(FLAT, on_way, view)[1].novelty < 0.05
+    assert look(FLAT, aside, view)[1].novelty == pytest.approx(1, abs=1e-9)
 
 
 def test_a_hypothesis_faces_as_one_of_its_frames_does():
@@ -634,7 +642,7 @@ def test_ids_speak_for_and_against():
     assert mass[0] > 0.9
     assert max(mass[1:]) < 0.6
     assert (same[1].match, same[1].shift) == (9, 0)
-    assert same[1].gain > 0 > new[1].gain
+    assert same[1].log_ratio > 0 > new[1].log_ratio
 
 
 def test_only_a_known_id_tells_whether_the_map_is_right():
@@ -644,7 +652,7 @@ def test_only_a_known_id_tells_whether_the_map_is_right():
     memory = memory._replace(pose=jnp.asarray(spaced(40)[20]))
     answers = {label: label_likelihood(memory, label) for label in (20, 3, 77)}
     assert [bool(weighing.telling) for *_, weighing in answers.values()] == [True, True, False]
-    assert [int(found.agree) for _, found, _ in answers.values()] == [1, 0, -1]
+    assert [int(found.view_fits) for _, found, _ in answers.values()] == [1, 0, -1]
 
 
 def test_an_id_is_new_once():
@@ -705,7 +713,7 @@ def test_standing_still_makes_no_frames():
     session = make_session(reserve=10_000)  # one capacity, one compilation
     views = np.random.default_rng(0).random((16, 1, SIZE, 1))
     still = [observation(Odometry(0, 0, 0, 0.1), view) for view in views]
-    frames = sum(int(step.evidence.frame) >= 0 for _ in range(625) for step in session.replay(still))
+    frames = sum(int(step.evidence.keyframe) >= 0 for _ in range(625) for step in session.replay(still))
     assert session.steps == 10_000
     assert frames == int(session.state.memory.count) == 1
     list(session.replay([observation(Odometry(CELL, 0, 0, 0.1), views[0])]))

@@ -28,20 +28,20 @@ from ratslam.recall.whisker_likelihood import (
     HEIGHTS,
     LEVELS,
     PRIOR,
-    background,
-    levels,
-    pixels,
-    table,
+    estimate_background,
+    log_odds_table,
+    pixel_layout,
+    pixel_levels,
 )
 from tactile.base.se2 import between, compose
 
 CELL = 0.05
 SHAPE = (3, 6, 1)
-PIXELS = pixels(SHAPE)
+PIXELS = pixel_layout(SHAPE)
 SIZE = len(PIXELS.group)
 GUARD = 5
 CAPACITY = 64
-NEVER = 3.0
+NEW_IMAGE_LOG_ODDS = 3.0
 BOTH = RecallConfig(sector_fov="whiskers", guard=GUARD)
 AHEAD = BOTH.model_copy(update={"shifts": 0})
 SEEDS = range(8)
@@ -56,10 +56,10 @@ def felt(stream, count, touching=0.4, dead=0.0):
 
 def known(images):
     """The likeness that such images teach."""
-    return table(background(images, PIXELS.group), PRIOR)
+    return log_odds_table(estimate_background(images, PIXELS.group), PRIOR)
 
 
-def filled(config, images, poses, likeness, *, scale=NEVER, dtype=float):
+def filled(config, images, poses, likeness, *, scale=NEW_IMAGE_LOG_ODDS, dtype=float):
     """A memory of frames [N, D] at poses [N, 3]; the robot stands at the newest, everything is new."""
     count = len(poses)
     memory = init_memory(config, SIZE, CAPACITY, np.dtype(dtype), len(likeness))
@@ -139,7 +139,7 @@ def weighed_by_loops(config, memory, level):
         for s in range(1 + turned):
             odds = 0.0
             for d in range(SIZE):
-                then = m.view[PIXELS.behind[d] if s else d, c]
+                then = m.view[PIXELS.opposite[d] if s else d, c]
                 odds += m.likeness[PIXELS.group[d], level[d], then]
             likelihood[s, c] = math.exp(config.temper * odds)
     weight, familiar = 0.0, 0.0
@@ -237,8 +237,8 @@ def test_mass_is_conserved(seed, config, kind):
     after, found = look(config, memory, level)
     assert (after.mass >= 0).all()
     assert (after.rest >= 0).all()
-    assert after.mass.sum() + after.rest.sum() + found.novel == pytest.approx(1, abs=1e-12)
-    assert 0 <= found.mass <= 1 + 1e-12
+    assert after.mass.sum() + after.rest.sum() + found.novelty == pytest.approx(1, abs=1e-12)
+    assert 0 <= found.posterior <= 1 + 1e-12
     assert 0 <= found.entropy <= math.log(config.modes + 1) + 1e-12
 
 
@@ -250,7 +250,9 @@ def test_mass_is_conserved_along_a_way(config, dtype):
     turn, tolerance = 2 * np.pi / 20, 1e-9 if dtype is float else 1e-4
     likeness = known(felt(stream, 200))
     memory = init_memory(config, SIZE, CAPACITY, np.dtype(dtype), len(likeness))
-    memory = apply_map_feedback(memory, MapFeedback(np.zeros((1, 3)), 0.0, 0.0, np.pi, NEVER, likeness))
+    memory = apply_map_feedback(
+        memory, MapFeedback(np.zeros((1, 3)), 0.0, 0.0, np.pi, NEW_IMAGE_LOG_ODDS, likeness)
+    )
     again = []
     for k in range(60):
         level = np.where(stream.random(SIZE) < 0.9, lap[k % 20], felt(stream, 1)[0])
@@ -258,9 +260,9 @@ def test_mass_is_conserved_along_a_way(config, dtype):
         after, found = look(config, memory, level)
         assert not any(np.isnan(leaf).any() for leaf in [*after, *found[:-1]])
         assert {leaf.dtype for leaf in [*after, *found]} == {np.dtype(dtype), np.dtype(np.int32)}
-        total = after.mass.sum() + after.rest.sum() + found.novel
+        total = after.mass.sum() + after.rest.sum() + found.novelty
         assert total == pytest.approx(1, abs=tolerance)
-        again.append(found.match >= 0 and (k - found.match) % 20 == 0 and found.mass > 0.1)
+        again.append(found.match >= 0 and (k - found.match) % 20 == 0 and found.posterior > 0.1)
         memory = store_keyframe(
             jax.tree.map(jnp.asarray, after), jnp.asarray(level, jnp.int32), jnp.int32(-1),
             jnp.zeros(3, memory.x.dtype),
@@ -290,7 +292,7 @@ def test_a_dead_whisker_changes_nothing_whatever_its_pixel_says(seed):
     stream = np.random.default_rng(seed)
     view, alive = stream.random(SIZE), stream.random(SIZE) < 0.7
     other = np.where(alive, view, stream.random(SIZE))
-    first, second = (weigh(BOTH, memory, levels(seen, alive).astype(int)) for seen in (view, other))
+    first, second = (weigh(BOTH, memory, pixel_levels(seen, alive).astype(int)) for seen in (view, other))
     for one, two in zip(first[1], second[1], strict=True):
         assert np.array_equal(one, two, equal_nan=True)
     # And it is as if the head had no such whisker.
@@ -298,10 +300,10 @@ def test_a_dead_whisker_changes_nothing_whatever_its_pixel_says(seed):
     odds = np.log(first[1].likelihood[:, : int(memory.count) - GUARD])
     for d in np.flatnonzero(alive).tolist():
         only = np.full(SIZE, DEAD)
-        only[d] = levels(view, alive).astype(int)[d]
+        only[d] = pixel_levels(view, alive).astype(int)[d]
         odds = odds - np.log(weigh(BOTH, memory, only)[1].likelihood[:, : int(memory.count) - GUARD])
     assert np.allclose(odds, 0, atol=1e-9)
-    blank = weigh(BOTH, without, levels(view, alive).astype(int))[1].likelihood
+    blank = weigh(BOTH, without, pixel_levels(view, alive).astype(int))[1].likelihood
     assert (blank[:, : int(memory.count) - GUARD] == 1).all()
 
 
@@ -310,7 +312,7 @@ def test_a_whisker_that_was_dead_says_nothing_now(seed):
     memory, level = random_case(seed)
     stream = np.random.default_rng(seed)
     gone = stream.choice(SIZE, 4, replace=False)
-    gone = np.union1d(gone, PIXELS.behind[gone])  # turned about, the opposite ones feel what they felt
+    gone = np.union1d(gone, PIXELS.opposite[gone])  # turned about, the opposite ones feel what they felt
     view = np.asarray(memory.view).copy()
     view[gone] = DEAD
     then = memory._replace(view=jnp.asarray(view))
@@ -344,7 +346,7 @@ def test_nothing_is_certain_before_anything_is_known(config):
         assert found.novelty == 1
         assert not after.before.any()
         after, told = look(config, memory, images[7])
-        assert (told.match, told.gain, told.mass, told.novel, told.agree) == (-1, 0, 0, 1, -1)
+        assert (told.match, told.log_ratio, told.posterior, told.novelty, told.view_fits) == (-1, 0, 0, 1, -1)
     taught = filled(config, images, spaced(40), learnt)
     assert look(config, taught, images[7])[1].match == 7
 
@@ -368,7 +370,7 @@ def test_a_head_turned_about_is_found_with_its_heading(turned):
     images = felt(np.random.default_rng(0), 40)
     memory = filled(BOTH, images, spaced(40), known(images))
     for place in (0, 11, 34):
-        now = images[place][PIXELS.behind] if turned else images[place]
+        now = images[place][PIXELS.opposite] if turned else images[place]
         after, found = look(BOTH, memory, now)
         assert found.match == place
         assert found.shift == turned
@@ -410,7 +412,7 @@ def test_a_corridor_that_looks_alike_all_along_says_nothing():
     wall, others = felt(stream, 1)[0], felt(stream, 200)
     memory = filled(AHEAD, np.tile(wall, (50, 1)), spaced(50, 0.6), known(others))
     first, gain = look(AHEAD, memory, wall)
-    assert gain.gain > 0  # at first sight it is something known
+    assert gain.log_ratio > 0  # at first sight it is something known
     _, then = weigh(AHEAD, jax.tree.map(jnp.asarray, first), wall)
     assert np.log(then.likelihood.max() / then.novelty) < -math.log(AHEAD.familiar)
 
@@ -449,5 +451,5 @@ def test_the_heights_of_the_sensor_enter_by_the_table_alone():
         view=jnp.asarray(order[np.asarray(memory.view)], jnp.int32), likeness=jnp.asarray(likeness)
     )
     first, second = look(BOTH, memory, level), look(BOTH, renamed, order[level])
-    for name in ("match", "shift", "mass", "gain", "novel"):
+    for name in ("match", "shift", "posterior", "log_ratio", "novelty"):
         assert getattr(first[1], name) == getattr(second[1], name), name

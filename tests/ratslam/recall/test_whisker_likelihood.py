@@ -15,11 +15,11 @@ from ratslam.recall.whisker_likelihood import (
     PRIOR,
     Background,
     Variation,
-    background,
-    levels,
-    pixels,
-    table,
-    variation,
+    estimate_background,
+    estimate_variation,
+    log_odds_table,
+    pixel_layout,
+    pixel_levels,
 )
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 
@@ -60,40 +60,39 @@ def visited_again(then, visits, stream):
     drawn = stream.random(then.shape)
     close = 1 + (drawn[..., None] > cumulated.T[np.maximum(then, 1) - 1]).sum(axis=-1)
     far = stream.integers(1, DEAD, then.shape)
-    again = np.where(stream.random(then.shape) < visits.astray, far, np.minimum(close, HEIGHTS))
+    again = np.where(stream.random(then.shape) < visits.outliers, far, np.minimum(close, HEIGHTS))
     touched = np.where(stream.random(then.shape) < visits.vanishes, 0, again)
     appeared = np.where(stream.random(then.shape) < visits.appears, far, 0)
     return np.where(then == 0, appeared, touched)
 
 
-# Pixels
+# PixelLayout
 
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_turning_about_twice_is_not_turning(shape):
-    known = pixels(shape)
-    behind = known.behind
+    known = pixel_layout(shape)
+    behind = known.opposite
     assert np.array_equal(behind[behind], np.arange(known.group.size))
     assert (behind != np.arange(known.group.size)).all()
     assert np.array_equal(known.group[behind], known.group)
-    assert known.columns == shape[1]
 
 
 @given(st.tuples(st.integers(1, 4), st.integers(1, 9), st.integers(1, 3)))
 def test_pixels_of_a_ring_and_channel_are_one_group(shape):
     rows, columns, channels = shape
-    known = pixels(shape)
+    known = pixel_layout(shape)
     group = known.group.reshape(shape)
     assert (group == group[:, :1]).all()
     assert len(np.unique(group)) == rows * channels == group.max() + 1
-    assert np.array_equal(np.sort(known.behind), np.arange(rows * columns * channels))
-    assert np.array_equal(known.group[known.behind], known.group)
+    assert np.array_equal(np.sort(known.opposite), np.arange(rows * columns * channels))
+    assert np.array_equal(known.group[known.opposite], known.group)
 
 
 @pytest.mark.parametrize("columns", [2, 4, 6, 8])
 def test_behind_is_the_whisker_opposite(columns):
     head = ur10_head(HeadConfig(whiskers=columns, first_deg=17.0))
-    behind = pixels((*head.shape, 1)).behind
+    behind = pixel_layout((*head.shape, 1)).opposite
     assert np.allclose(head.rest[behind, :2], -head.rest[:, :2], atol=1e-12)
     assert np.allclose(head.base[behind, 2], head.base[:, 2])
 
@@ -105,7 +104,7 @@ def test_behind_is_the_whisker_opposite(columns):
 def test_every_value_has_a_level(values, seed):
     view = np.array(values)
     alive = np.random.default_rng(seed).random(view.shape) < 0.7
-    level = levels(view, alive)
+    level = pixel_levels(view, alive)
     assert (level == np.rint(level)).all()
     assert (level[~alive] == DEAD).all()
     assert ((level[alive] > 0) == (view[alive] > 0)).all()
@@ -114,12 +113,12 @@ def test_every_value_has_a_level(values, seed):
 
 
 def test_a_value_below_nothing_is_silent():
-    assert (levels(np.array([-1e-9, -0.5, -3.0]), np.ones(3)) == 0).all()
+    assert (pixel_levels(np.array([-1e-9, -0.5, -3.0]), np.ones(3)) == 0).all()
 
 
 @given(st.floats(0, 1), st.floats(0, 1))
 def test_levels_rise_with_the_value(low, high):
-    low, high = levels(np.array(sorted([low, high])), np.ones(2))
+    low, high = pixel_levels(np.array(sorted([low, high])), np.ones(2))
     assert low <= high
 
 
@@ -127,9 +126,9 @@ def test_levels_rise_with_the_value(low, high):
 def test_levels_are_the_same_on_the_host_and_in_the_kernel(seed):
     stream = np.random.default_rng(seed)
     view, alive = stream.random(SIZE) * (stream.random(SIZE) < 0.5), stream.random(SIZE) < 0.8
-    told = levels(jnp.asarray(view), jnp.asarray(alive, float))
-    assert np.array_equal(levels(view, alive), np.asarray(told))
-    single = levels(jnp.asarray(view, jnp.float32), jnp.asarray(alive, jnp.float32))
+    told = pixel_levels(jnp.asarray(view), jnp.asarray(alive, float))
+    assert np.array_equal(pixel_levels(view, alive), np.asarray(told))
+    single = pixel_levels(jnp.asarray(view, jnp.float32), jnp.asarray(alive, jnp.float32))
     assert single.dtype == jnp.float32
     assert np.abs(np.asarray(single) - np.asarray(told)).max() <= 1  # rounding, at a border between levels
 
@@ -138,39 +137,39 @@ def test_levels_are_the_same_on_the_host_and_in_the_kernel(seed):
 
 
 def test_without_images_all_heights_are_alike():
-    known = background(np.zeros((0, SIZE), int), pixels((3, 6, 1)).group)
+    known = estimate_background(np.zeros((0, SIZE), int), pixel_layout((3, 6, 1)).group)
     assert np.allclose(known.heights, 1 / HEIGHTS)
     assert ((known.touching > 0) & (known.touching < 1)).all()
 
 
 @given(seeds, st.floats(0, 1), st.floats(0, 1))
 def test_the_background_is_a_distribution(seed, touching, dead):
-    known = background(images(seed, 20, touching=touching, dead=dead), pixels((3, 6, 1)).group)
+    known = estimate_background(images(seed, 20, touching=touching, dead=dead), pixel_layout((3, 6, 1)).group)
     assert ((known.touching > 0) & (known.touching < 1)).all()
     assert (known.heights > 0).all()
     assert np.allclose(known.heights.sum(axis=1), 1)
 
 
 def test_the_background_is_counted_by_ring_and_channel():
-    group = pixels((3, 6, 1)).group
+    group = pixel_layout((3, 6, 1)).group
     rates = np.array([0.1, 0.5, 0.9])
     stream = np.random.default_rng(0)
     level = stream.choice([3, 20], (4000, SIZE), p=[0.25, 0.75]) * (
         stream.random((4000, SIZE)) < rates[group]
     )
-    known = background(level, group)
+    known = estimate_background(level, group)
     assert np.allclose(known.touching, rates, atol=0.01)
     assert np.allclose(known.heights[:, [2, 19]], [0.25, 0.75], atol=0.02)
 
 
 @given(seeds)
 def test_neither_order_nor_dead_images_matter_to_the_background(seed):
-    level, group = images(seed), pixels((3, 6, 1)).group
-    known = background(level, group)
+    level, group = images(seed), pixel_layout((3, 6, 1)).group
+    known = estimate_background(level, group)
     shuffled = np.random.default_rng(seed).permutation(level)
     silenced = np.concatenate([shuffled, np.full((7, SIZE), DEAD)])
     for other in (shuffled, silenced):
-        for one, two in zip(known, background(other, group), strict=True):
+        for one, two in zip(known, estimate_background(other, group), strict=True):
             assert np.array_equal(one, two)
 
 
@@ -179,10 +178,10 @@ def test_neither_order_nor_dead_images_matter_to_the_background(seed):
 
 def test_without_pairs_there_is_the_prior():
     none = np.zeros((0, SIZE), int)
-    assert variation(none, none) == pytest.approx(PRIOR, rel=1e-12)
+    assert estimate_variation(none, none) == pytest.approx(PRIOR, rel=1e-12)
     dead = np.full((50, SIZE), DEAD)
-    assert variation(dead, images(0, 50)) == pytest.approx(PRIOR, rel=1e-12)
-    assert variation(images(0, 50), dead) == pytest.approx(PRIOR, rel=1e-12)
+    assert estimate_variation(dead, images(0, 50)) == pytest.approx(PRIOR, rel=1e-12)
+    assert estimate_variation(images(0, 50), dead) == pytest.approx(PRIOR, rel=1e-12)
 
 
 KINDS = [
@@ -197,41 +196,43 @@ KINDS = [
 def test_many_pairs_tell_how_visits_differ(true):
     stream = np.random.default_rng(1)
     then = images(2, 6000, touching=0.5, dead=0)
-    found = variation(visited_again(then, true, stream), then)
+    found = estimate_variation(visited_again(then, true, stream), then)
     assert found.appears == pytest.approx(true.appears, abs=0.01)
     assert found.vanishes == pytest.approx(true.vanishes, abs=0.01)
     # Heights end at the lowest and the highest, so that wide variations look narrower, and some astray.
     assert 0.65 * true.width < found.width < 1.1 * true.width
-    assert found.astray == pytest.approx(true.astray, abs=0.12)
+    assert found.outliers == pytest.approx(true.outliers, abs=0.12)
 
 
 def test_what_varies_more_is_found_to_vary_more():
     then = images(2, 3000, touching=0.5, dead=0)
-    for name, rates in {"width": (0.02, 0.05, 0.1, 0.2), "astray": (0.02, 0.1, 0.3, 0.6)}.items():
+    for name, rates in {"width": (0.02, 0.05, 0.1, 0.2), "outliers": (0.02, 0.1, 0.3, 0.6)}.items():
         told = []
         for rate in rates:
             again = visited_again(then, PRIOR._replace(**{name: rate}), np.random.default_rng(1))
-            told.append(getattr(variation(again, then), name))
+            told.append(getattr(estimate_variation(again, then), name))
         assert told == sorted(told), name
 
 
 @pytest.mark.parametrize("true", KINDS[:3])
 def test_what_was_found_tells_new_visits_better_than_the_prior(true):
-    stream, group = np.random.default_rng(3), pixels((3, 6, 1)).group
+    stream, group = np.random.default_rng(3), pixel_layout((3, 6, 1)).group
     then = images(4, 2000, dead=0)
     now = visited_again(then, true, stream)
     seen, new = slice(1000), slice(1000, None)
-    known = background(then, group)
+    known = estimate_background(then, group)
     before, learnt = (
-        table(known, told)[group, now[new], then[new]].sum(axis=1).mean()
-        for told in (PRIOR, variation(now[seen], then[seen]))
+        log_odds_table(known, told)[group, now[new], then[new]].sum(axis=1).mean()
+        for told in (PRIOR, estimate_variation(now[seen], then[seen]))
     )
     assert learnt > before + 0.1
 
 
 def test_the_more_pairs_the_less_the_prior():
     then = images(0, 400, dead=0)
-    found = [variation(then[:count], then[:count]) for count in (0, 5, 20, 100, 400)]  # no visit differs
+    found = [
+        estimate_variation(then[:count], then[:count]) for count in (0, 5, 20, 100, 400)
+    ]  # no visit differs
     for name in Variation._fields:
         told = [getattr(v, name) for v in found]
         assert told == sorted(told, reverse=True), name
@@ -243,19 +244,19 @@ def test_neither_order_nor_dead_pixels_matter_to_the_variation(seed):
     stream = np.random.default_rng(seed)
     then = images(seed, 30)
     now = np.where(then == DEAD, DEAD, visited_again(np.minimum(then, HEIGHTS), PRIOR, stream))
-    found = variation(now, then)
+    found = estimate_variation(now, then)
     order = stream.permutation(len(then))
-    assert variation(now[order], then[order]) == pytest.approx(found, rel=1e-12)
+    assert estimate_variation(now[order], then[order]) == pytest.approx(found, rel=1e-12)
     column = stream.permutation(SIZE)
-    assert variation(now[:, column], then[:, column]) == pytest.approx(found, rel=1e-12)
+    assert estimate_variation(now[:, column], then[:, column]) == pytest.approx(found, rel=1e-12)
     noise = images(seed + 1, 30, dead=0)
-    assert variation(np.where(then == DEAD, noise, now), then) == pytest.approx(found, rel=1e-12)
-    assert variation(now, np.where(now == DEAD, noise, then)) == pytest.approx(found, rel=1e-12)
+    assert estimate_variation(np.where(then == DEAD, noise, now), then) == pytest.approx(found, rel=1e-12)
+    assert estimate_variation(now, np.where(now == DEAD, noise, then)) == pytest.approx(found, rel=1e-12)
 
 
 @given(seeds, st.integers(0, 40))
 def test_a_variation_is_always_one(seed, count):
-    found = variation(images(seed, count), images(seed + 1, count))
+    found = estimate_variation(images(seed, count), images(seed + 1, count))
     assert np.isfinite(found).all()
     assert all(0 < value < 1 for value in found)
 
@@ -268,7 +269,7 @@ def test_odds_belong_to_one_distribution(seed, visits):
     """Wherever one was then, what is felt at the same place again is some level: its shares sum to 1."""
     known = common(seed)
     known = known._replace(heights=known.heights / known.heights.sum(axis=1, keepdims=True))
-    log = table(known, visits)
+    log = log_odds_table(known, visits)
     assert log.shape == (3, LEVELS, LEVELS)
     for group in range(3):
         again = of_background(known, group)[:, None] * np.exp(log[group, :DEAD, :DEAD])
@@ -280,7 +281,7 @@ def test_odds_speak_for_what_is_so(seed, visits):
     """On average they are for one place where it is one, and against it where it is not."""
     known = common(seed)
     known = known._replace(heights=known.heights / known.heights.sum(axis=1, keepdims=True))
-    log = table(known, visits)[:, :DEAD, :DEAD]
+    log = log_odds_table(known, visits)[:, :DEAD, :DEAD]
     for group in range(3):
         anywhere = of_background(known, group)[:, None]
         here = anywhere * np.exp(log[group])
@@ -290,7 +291,7 @@ def test_odds_speak_for_what_is_so(seed, visits):
 
 @given(seeds, visits)
 def test_a_dead_pixel_says_nothing(seed, visits):
-    log = table(common(seed), visits)
+    log = log_odds_table(common(seed), visits)
     assert not log[:, DEAD].any()
     assert not log[:, :, DEAD].any()
     assert np.isfinite(log).all()
@@ -299,7 +300,7 @@ def test_a_dead_pixel_says_nothing(seed, visits):
 @pytest.mark.parametrize("touching", [0.15, 0.4, 0.7])
 def test_the_likeliest_then_is_what_is_felt_now(touching):
     known = Background(np.array([touching]), np.full((1, HEIGHTS), 1 / HEIGHTS))
-    log = table(known, PRIOR)[0]
+    log = log_odds_table(known, PRIOR)[0]
     assert (log[:DEAD, :DEAD].argmax(axis=1) == np.arange(DEAD)).all()
     assert (np.diag(log)[:DEAD] > 0).all()
     assert (log[0, 1:DEAD] < 0).all()
@@ -308,7 +309,7 @@ def test_the_likeliest_then_is_what_is_felt_now(touching):
 
 def test_heights_that_are_all_astray_tell_touch_alone():
     known = common(0)
-    log = table(known, PRIOR._replace(astray=1.0))[:, 1:DEAD, 1:DEAD]
+    log = log_odds_table(known, PRIOR._replace(outliers=1.0))[:, 1:DEAD, 1:DEAD]
     expected = np.log((1 - PRIOR.vanishes) / known.touching)[:, None, None]
     assert np.allclose(log, expected)
 
@@ -316,13 +317,13 @@ def test_heights_that_are_all_astray_tell_touch_alone():
 def test_a_rare_height_says_more_than_a_common_one():
     heights = np.full(HEIGHTS, 0.2 / (HEIGHTS - 1))
     heights[25] = 0.8
-    log = table(Background(np.array([0.4]), heights[None]), PRIOR)[0]
+    log = log_odds_table(Background(np.array([0.4]), heights[None]), PRIOR)[0]
     assert log[6, 6] > log[26, 26]
 
 
 def test_what_never_differs_says_most():
     known = common(0)
-    strict, loose = (table(known, Variation(rate, rate, 0.05, rate)) for rate in (0.01, 0.2))
+    strict, loose = (log_odds_table(known, Variation(rate, rate, 0.05, rate)) for rate in (0.01, 0.2))
     level = np.arange(DEAD)
     assert (strict[:, level, level] > loose[:, level, level]).all()
     assert (strict[:, 0, 1:DEAD] < loose[:, 0, 1:DEAD]).all()

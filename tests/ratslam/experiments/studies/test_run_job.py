@@ -16,7 +16,7 @@ from ratslam.experiments.studies.metrics import DIRECTIONS, MEASURED
 from ratslam.experiments.studies.run_job import run_job
 from ratslam.experiments.studies.study import list_jobs, read_study
 from ratslam.experiments.studies.timing import Stopwatch
-from ratslam.keyframes.ablation import FULL
+from ratslam.keyframes.config import FULL
 from ratslam.pipeline.run import run
 from robot.recordings.mcap_reader import record_source
 from robot.recordings.npz_trace import read_trace

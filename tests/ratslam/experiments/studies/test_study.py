@@ -14,8 +14,7 @@ from ratslam.cli import main
 from ratslam.config.run_config import RunConfig
 from ratslam.experiments.studies.schema import StudyPlan
 from ratslam.experiments.studies.study import Study, list_jobs, read_study
-from ratslam.keyframes.ablation import FULL
-from ratslam.keyframes.config import KeyframeMapConfig
+from ratslam.keyframes.config import FULL, KeyframeMapConfig
 from tactile.base.errors import InputError
 
 ROOT = Path(__file__).parents[4]
