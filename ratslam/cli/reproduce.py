@@ -133,12 +133,14 @@ def _figure(arguments: argparse.Namespace) -> int:
         raise InputError("--seed", str(arguments.seed), "a non-negative integer")
     prepare_jax(keep_compiled=False)
     if arguments.name in FOX2012:
-        from ratslam.experiments.fox2012.reproduction import reproduce
+        from ratslam.experiments.fox2012.reproduction import PAPER
     else:
-        from ratslam.experiments.salman2016.reproduction import reproduce
+        from ratslam.experiments.salman2016.reproduction import PAPER
+    from ratslam.experiments.trials.reproduction import reproduce
 
     name, folder = arguments.name, arguments.output
     text, interrupted = reproduce(
+        PAPER,
         name,
         folder,
         sets=arguments.sets,

@@ -17,7 +17,7 @@ from evaluation.metrics.grid_error import CONVENTIONS, Convention
 from evaluation.metrics.statistics import bootstrap
 from ratslam.experiments.fox2012.metrics import eq6_column
 from ratslam.experiments.fox2012.protocols import FILTERED, PAPERS, RECKONED, TRUE
-from ratslam.experiments.fox2012.trials import MapperResult
+from ratslam.experiments.trials.reproduction import ResultRow, column
 
 FEW = 6
 """Number of sets below which the intervals are too narrow."""
@@ -28,14 +28,13 @@ class Measure(NamedTuple):
 
     Attributes:
         key: of `metrics.FIELDS`. sign: 1 if larger is worse, else -1. trivial: score of a map without
-            information; None: that of the best constant under `convention`.
+            information, or the convention of which it is the best constant map's.
     """
 
     name: str
     key: str
     sign: int
-    trivial: float | None = None
-    convention: Convention | None = None
+    trivial: float | Convention
 
 
 class Ranking(NamedTuple):
@@ -52,55 +51,47 @@ class Ranking(NamedTuple):
     beaten: bool
 
 
-def _measures() -> tuple[Measure, ...]:
-    found = []
-    for convention in CONVENTIONS:
-        if convention.mask == "arena" and not convention.smooth:
-            if convention != Convention(mask="arena"):
-                continue  # the outside value does not matter
-            outside = "any"
-        else:
-            outside = f"{convention.outside:g}"
-        truth = "smoothed" if convention.smooth else "raw"
-        name = f"eq. 6  {outside:<5}{convention.mask:<7}{truth}"
-        found.append(Measure(name, eq6_column(convention), 1, None, convention))
-    return (
-        *found,
-        Measure("Brier skill", "map_brier_skill", -1, 0.0),
-        Measure("wall AUC", "map_auc", -1, 0.5),
-        Measure("Chamfer, map to walls", "map_chamfer_map", 1, 0.0),
-        Measure("Chamfer, walls to map", "map_chamfer_walls", 1, 0.0),
-    )
+def _anywhere(convention: Convention) -> bool:
+    """Whether the truth outside the arena does not matter."""
+    return convention.mask == "arena" and not convention.smooth
 
 
-MEASURES = _measures()
+def _eq6_measure(convention: Convention) -> Measure:
+    outside = "any" if _anywhere(convention) else f"{convention.outside:g}"
+    truth = "smoothed" if convention.smooth else "raw"
+    name = f"eq. 6  {outside:<5}{convention.mask:<7}{truth}"
+    return Measure(name, eq6_column(convention), 1, convention)
+
+
+MEASURES = (
+    *(_eq6_measure(each) for each in CONVENTIONS if not _anywhere(each) or each == Convention(mask="arena")),
+    Measure("Brier skill", "map_brier_skill", -1, 0.0),
+    Measure("wall AUC", "map_auc", -1, 0.5),
+    Measure("Chamfer, map to walls", "map_chamfer_map", 1, 0.0),
+    Measure("Chamfer, walls to map", "map_chamfer_walls", 1, 0.0),
+)
 """All measures. A map without information wins either Chamfer distance alone: with few cells, or with all."""
 
 
 def rank_mappers(
-    found: Sequence[MapperResult], method: str, measure: Measure, along: str = FILTERED
+    rows: Sequence[ResultRow], method: str, measure: Measure, along: str = FILTERED
 ) -> Ranking | None:
     """Tests the paper's ranking for a method's marks along a path; None with fewer than two complete sets."""
-    score = measure.sign * np.array([_column(found, (method, name, along), measure.key) for name in PAPERS])
+    score = measure.sign * np.array([column(rows, (method, name, along), measure.key) for name in PAPERS])
     score = score[:, np.isfinite(score).all(axis=0)]
     if score.shape[1] < 2:
         return None
     name = f"{method} {along} {measure.key}"
     steps = tuple((float((a - b).mean()), *bootstrap(a - b, name)) for a, b in pairwise(score))
-    if all(low > 0 for _, low, _ in steps):
-        word = "holds"
-    elif any(high <= 0 for *_, high in steps):
-        word = "does not hold"
-    else:
-        word = "not decided"
+    holds, fails = all(low > 0 for _, low, _ in steps), any(high <= 0 for *_, high in steps)
+    word = "holds" if holds else "does not hold" if fails else "not decided"
     trivial = measure.trivial
-    if trivial is None and measure.convention is not None:
-        trivial = float(np.mean([one.score.under(measure.convention).best for one in found]))
-    best = float(score.mean(axis=1).min())
-    return Ranking(steps, word, trivial is not None and measure.sign * trivial <= best)
+    if isinstance(trivial, Convention):
+        trivial = float(np.mean([row.session.score.under(trivial).best for row in rows]))
+    return Ranking(steps, word, bool(measure.sign * trivial <= score.mean(axis=1).min()))
 
 
-def render_rankings(method: str, found: Sequence[MapperResult]) -> list[str]:
+def render_rankings(method: str, rows: Sequence[ResultRow]) -> list[str]:
     """A line for each measure."""
     first, second, third = PAPERS
     lines = [
@@ -109,25 +100,15 @@ def render_rankings(method: str, found: Sequence[MapperResult]) -> list[str]:
         f"{f'on {RECKONED}':<19}on the {TRUE}",
     ]
     for measure in MEASURES:
-        held = rank_mappers(found, method, measure)
+        held = rank_mappers(rows, method, measure)
         if held is None:
             lines.append(f"{measure.name:<29}too few sets with a score of all three")
             continue
         steps = "".join(f"{f'{d:+.4f} [{low:+.4f}, {high:+.4f}]':<29}" for d, low, high in held.steps)
-        others = (rank_mappers(found, method, measure, along) for along in (RECKONED, TRUE))
+        others = (rank_mappers(rows, method, measure, along) for along in (RECKONED, TRUE))
         words = [other.word if other else "-" for other in others]
         beaten = "a map without information is as good" if held.beaten else ""
         lines.append(f"{measure.name:<29}{steps}{held.word:<15}{words[0]:<19}{words[1]:<18}{beaten}".rstrip())
-    if len({one.number for one in found}) < FEW:
+    if len({row.number for row in rows}) < FEW:
         lines.append(f"Intervals of fewer than {FEW} sets are too narrow.")
     return lines
-
-
-def _column(found: Sequence[MapperResult], which: tuple[str, str, str], key: str) -> np.ndarray:
-    """[S] a metric of a method, a mapper and a path over the sets, NaN for missing sets."""
-    values = np.full(1 + max(one.number for one in found), np.nan)
-    for one in found:
-        value = one.values.get(key)
-        if (one.method, one.mapper, one.along) == which and value is not None:
-            values[one.number] = value
-    return values

@@ -6,6 +6,7 @@ import numpy as np
 
 from evaluation.metrics.grid_error import CONVENTIONS, Convention
 from evaluation.metrics.grid_score import GridScore
+from ratslam.experiments.trials.arena_trial import position_error
 from tactile.base.se2 import wrap
 
 REVISIT_DISTANCE = 0.1
@@ -21,40 +22,32 @@ def eq6_column(convention: Convention) -> str:
     return f"eq6_{convention.mask}_{'smooth' if convention.smooth else 'raw'}_{convention.outside:g}"
 
 
-PATH_METRICS = (
-    "online_error", "final_error", "online_heading_error_deg", "revisits", "revisits_closed", "revisit_gap"
-)  # fmt: skip
 MAP_METRICS = (
     "map_brier_skill", "map_brier_skill_free", "map_log_loss", "map_auc", "map_auc_free", "map_chamfer_map",
     "map_chamfer_walls",
 )  # fmt: skip
-FIELDS = (*PATH_METRICS, "odometry_error", *(eq6_column(each) for each in CONVENTIONS), *MAP_METRICS)
+FIELDS = (
+    "reports", "online_error", "final_error", "online_heading_error_deg", "revisits", "revisits_closed",
+    "revisit_gap", "odometry_error", *(eq6_column(each) for each in CONVENTIONS), *MAP_METRICS,
+)  # fmt: skip
 """Columns of metrics in NAME.csv."""
 
 
-def position_error(path: np.ndarray, truth: np.ndarray) -> float:
-    """Mean position error of poses [T, 3] without alignment, m."""
-    return float(np.hypot(*(path - truth)[:, :2].T).mean())
-
-
 def path_metrics(online: np.ndarray, path: np.ndarray, truth: np.ndarray) -> dict[str, float | None]:
-    """Metrics of online, final and true poses [T, 3], by the names of `PATH_METRICS`.
+    """Metrics of online, final and true poses [T, 3].
 
     Returns:
         online_error, final_error: mean position errors, m. online_heading_error_deg: mean, degrees. revisits:
         number of reports at an earlier place. revisits_closed: share of these whose offset from the earlier
         visit the path gives to `CLOSED_GAP`. revisit_gap: mean error of that offset, m.
     """
-    again = find_revisits(truth)
-    gap = np.zeros(0)
-    if len(again):
-        later, earlier = again.T
-        gap = np.hypot(*((path[later] - path[earlier]) - (truth[later] - truth[earlier]))[:, :2].T)
+    later, earlier = find_revisits(truth).T
+    gap = np.hypot(*((path[later] - path[earlier]) - (truth[later] - truth[earlier]))[:, :2].T)
     return {
         "online_error": position_error(online, truth),
         "final_error": position_error(path, truth),
         "online_heading_error_deg": float(np.degrees(np.abs(wrap(online[:, 2] - truth[:, 2])).mean())),
-        "revisits": len(again),
+        "revisits": len(gap),
         "revisits_closed": float((gap < CLOSED_GAP).mean()) if len(gap) else None,
         "revisit_gap": float(gap.mean()) if len(gap) else None,
     }
@@ -73,7 +66,7 @@ def find_revisits(truth: np.ndarray) -> np.ndarray:
 
 
 def map_metrics(score: GridScore) -> dict[str, float | None]:
-    """Metrics of a map, by the names of `FIELDS`."""
+    """Equation 6 under all conventions, and `MAP_METRICS`."""
     errors = {eq6_column(error.convention): error.error for error in score.errors}
     values = {name: score.quantities[name].value for name in MAP_METRICS}
     return errors | {name: None if v is None else float(v) for name, v in values.items()}

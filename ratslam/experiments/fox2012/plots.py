@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import product
 from typing import TYPE_CHECKING
 
@@ -13,69 +13,60 @@ from evaluation.metrics.occupancy_grid import mean_grid
 from evaluation.plots.grid_plot import GridPanel, GridPaths, draw_grids
 from ratslam.experiments.fox2012.metrics import eq6_column
 from ratslam.experiments.fox2012.protocols import FILTERED, Protocol
-from ratslam.experiments.fox2012.trials import MapperResult
+from ratslam.experiments.trials.reproduction import ResultRow, count_sets
 from robot.world.arena import wall_segments
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+Rows = Sequence[ResultRow]
 
-def draw_reproduction(name: str, protocol: Protocol, found: Sequence[MapperResult]) -> Figure:
+
+def draw_reproduction(name: str, protocol: Protocol, rows: Rows) -> Figure:
     """The figure of a reproduction."""
-    sets = len({one.number for one in found})
-    count = f"{sets} set{'s' if sets > 1 else ''}"
-    draw, explanation = _FIGURES[name]
-    across, panels = draw(protocol, [one for one in found if one.along == FILTERED])
-    many = f"the first of {count}" if name == "fox-fig6" and sets > 1 else count
-    line = f"{protocol.source}  ·  {many}  ·  {explanation}"
-    return draw_grids(f"{name}: {protocol.title}", line, panels, across=across)
+    draw, explanation = {
+        "fox-fig4": (_means, "below each mapper: the filter, eq. 6 (mean of the trials' errors)"),
+        "fox-fig5": (_singles, "below each: the filter, position error (dead reckoning's), m"),
+        "fox-fig6": (_worlds, "odometry noise, reports; position error (dead reckoning's), m"),
+    }[name]
+    panels, lines = draw(protocol, [row for row in rows if row.key[3] == FILTERED])
+    first_only = name == "fox-fig6" and any(row.number for row in rows)
+    line = f"{protocol.source}  ·  {count_sets(rows, first_only)}  ·  {explanation}"
+    return draw_grids(f"{name}: {protocol.title}", line, panels, across=len(panels) // lines)
 
 
-def _means(protocol: Protocol, found: Sequence[MapperResult]) -> tuple[int, list[GridPanel]]:
-    """A mean map for each mapper, method below method."""
+def _means(protocol: Protocol, rows: Rows) -> tuple[list[GridPanel], int]:
+    """A mean map for each mapper, and the number of lines: method below method."""
     panels = []
     for method, mapper in product(protocol.methods, protocol.mappers):
-        these = [one for one in found if (one.method, one.mapper) == (method, mapper)]
-        error = np.mean([one.values[eq6_column(MAIN_CONVENTION)] for one in these])
-        mean = mean_grid([one.grid for one in these])
+        these = [row for row in rows if row.key[1:3] == (method, mapper)]
+        error = np.mean([row.values[eq6_column(MAIN_CONVENTION)] for row in these])
+        mean = mean_grid([row.session.grid for row in these])
         panels.append(_panel(mapper, f"{method}, {error:.3f}", these[0])._replace(grid=mean))
-    return len(protocol.mappers), panels
+    return panels, len(protocol.methods)
 
 
-def _singles(protocol: Protocol, found: Sequence[MapperResult]) -> tuple[int, list[GridPanel]]:
-    """A map for each mapper, set below set, with the paths."""
-    numbers = sorted({one.number for one in found})
-    panels = [
-        _with_paths(f"{mapper}, trial {number + 1}", method, one)
-        for method, number, mapper in product(protocol.methods, numbers, protocol.mappers)
-        for one in found
-        if (one.method, one.number, one.mapper) == (method, number, mapper)
-    ]
-    return len(protocol.mappers), panels
+def _singles(protocol: Protocol, rows: Rows) -> tuple[list[GridPanel], int]:
+    """A map with the paths for each mapper, and the number of lines: method below method, set below set."""
+    method, mapper = protocol.methods.index, protocol.mappers.index
+    rows = sorted(rows, key=lambda row: (method(row.key[1]), row.number, mapper(row.key[2])))
+    panels = [_with_paths(f"{row.key[2]}, trial {row.number + 1}", row) for row in rows]
+    return panels, len(panels) // len(protocol.mappers)
 
 
-def _worlds(protocol: Protocol, found: Sequence[MapperResult]) -> tuple[int, list[GridPanel]]:
-    """A map of the first set for each world and length, method below method."""
-    panels = [
-        _with_paths(f"{one.world}, {one.reports}", method, one)
-        for method in protocol.methods
-        for one in sorted(found, key=lambda one: (one.world, one.reports))
-        if one.method == method and one.number == 0
-    ]
-    return len(panels) // len(protocol.methods), panels
+def _worlds(protocol: Protocol, rows: Rows) -> tuple[list[GridPanel], int]:
+    """A map of the first set for each world and length, and the number of lines: method below method."""
+    first = [row for row in rows if row.number == 0]
+    first.sort(key=lambda row: (protocol.methods.index(row.key[1]), row.key[0], row.values["reports"]))
+    panels = [_with_paths(f"{row.key[0]}, {row.values['reports']}", row) for row in first]
+    return panels, len(protocol.methods)
 
 
-def _with_paths(name: str, method: str, one: MapperResult) -> GridPanel:
-    line = f"{method}, {one.values['online_error']:.3f} ({one.values['odometry_error']:.3f})"
-    return _panel(name, line, one)._replace(paths=GridPaths(one.truth, one.online, one.odometry))
+def _with_paths(name: str, row: ResultRow) -> GridPanel:
+    line = f"{row.key[1]}, {row.values['online_error']:.3f} ({row.values['odometry_error']:.3f})"
+    paths = GridPaths(row.session.truth, row.session.online, row.session.odometry)
+    return _panel(name, line, row)._replace(paths=paths)
 
 
-def _panel(name: str, line: str, one: MapperResult) -> GridPanel:
-    return GridPanel(name, line, one.grid, wall_segments(one.arena))
-
-
-_FIGURES: dict[str, tuple[Callable[[Protocol, Sequence[MapperResult]], tuple[int, list[GridPanel]]], str]] = {
-    "fox-fig4": (_means, "below each mapper: the filter, eq. 6 (mean of the trials' errors)"),
-    "fox-fig5": (_singles, "below each: the filter, position error (dead reckoning's), m"),
-    "fox-fig6": (_worlds, "odometry noise, reports; position error (dead reckoning's), m"),
-}
+def _panel(name: str, line: str, row: ResultRow) -> GridPanel:
+    return GridPanel(name, line, row.session.grid, wall_segments(row.session.arena))

@@ -8,13 +8,8 @@ from typing import NamedTuple
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import override, parse, validate
 
-MAPPERS = {
-    "blob": ("touch.reports.walls=none",),
-    "geometric": ("touch.reports.walls=geometric",),
-    "template": ("touch.reports.walls=template",),
-    "fused": ("touch.reports.walls=fused",),
-}
-"""The paper's three mappers, which differ in the estimate of wall directions (II-E to II-G), and ours."""
+MAPPERS = {"blob": "none", "geometric": "geometric", "template": "template", "fused": "fused"}
+"""`touch.reports.walls` of the paper's three mappers (II-E to II-G), and ours."""
 PAPERS = ("blob", "geometric", "template")
 """The paper's mappers from worst to best as printed (III)."""
 METHODS: dict[str, tuple[str, ...]] = {
@@ -49,19 +44,19 @@ resampled particles have moved. Footprints are the log-odds of 0.8 and 0.4. All 
 the defaults."""
 FILTERED, RECKONED, TRUE = "filter", "dead reckoning", "true path"
 """Paths along which a method's marks are drawn: the filter's, a lower bound and an upper bound."""
-PATHS = (FILTERED, RECKONED, TRUE)
 
 
 class World(NamedTuple):
     """An arena and the odometry noise in it.
 
     Attributes:
-        level: of the odometry noise; the printed filter uses it as the noise of each step. sets: overrides.
+        level: of the odometry noise; the printed filter uses it as the noise of each step.
+        settings: overrides.
     """
 
     name: str
     level: float
-    sets: tuple[str, ...] = ()
+    settings: tuple[str, ...] = ()
 
 
 class Protocol(NamedTuple):
@@ -116,17 +111,15 @@ def session_config(world: World, method: str, mapper: str, assignments: Sequence
     """The configuration of a mapper in a world.
 
     Raises:
-        InputError: an assignment that cannot be.
+        InputError: an invalid assignment.
     """
-    level = (f"create_simulation.wheels.level={world.level}",)
-    step_noise = (f"grid.drift.step={world.level}",) if method == "as printed" else ()
-    every = (
+    settings = [
         "backend=grid",
-        *level,
-        *world.sets,
+        f"create_simulation.wheels.level={world.level}",
+        *world.settings,
         *METHODS[method],
-        *step_noise,
-        *MAPPERS[mapper],
-        *assignments,
-    )
-    return validate(override(parse("create_simulation: {}\n", "the reproduction"), every), RunConfig)
+    ]
+    if method == "as printed":
+        settings.append(f"grid.drift.step={world.level}")
+    settings += [f"touch.reports.walls={MAPPERS[mapper]}", *assignments]
+    return validate(override(parse("create_simulation: {}\n", "the reproduction"), settings), RunConfig)

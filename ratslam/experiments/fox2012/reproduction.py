@@ -6,47 +6,72 @@ seed. All mappers and methods run on the same sets, so their differences are pai
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from pathlib import Path
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
+from typing import NamedTuple
 
-from ratslam.experiments.fox2012.metrics import FIELDS
+import numpy as np
+
+from evaluation.metrics.grid_score import GridScore, score_grid
+from evaluation.metrics.occupancy_grid import OccupancyGrid
+from ratslam.config.run_config import RunConfig
+from ratslam.experiments.fox2012.metrics import FIELDS, map_metrics, path_metrics
 from ratslam.experiments.fox2012.plots import draw_reproduction
-from ratslam.experiments.fox2012.protocols import PROTOCOLS, Protocol, World, session_config
+from ratslam.experiments.fox2012.protocols import (
+    FILTERED,
+    PROTOCOLS,
+    RECKONED,
+    TRUE,
+    Protocol,
+    session_config,
+)
 from ratslam.experiments.fox2012.report import render_results
-from ratslam.experiments.fox2012.trials import MapperResult, SessionJob, run_job
-from ratslam.experiments.studies.executor import run_tasks
-from ratslam.experiments.trials.csv_output import find_protocol, format_cells, progress_bar, write_rows
+from ratslam.experiments.trials.arena_trial import (
+    ArenaSession,
+    FilterResult,
+    arena_truth,
+    collect_marks,
+    draw_map,
+    observe_session,
+    position_error,
+    run_filter,
+    simulate_session,
+)
+from ratslam.experiments.trials.reproduction import Paper, ResultRow, run_with_progress
+from robot.touch_source import report_config_of
+from robot.world.arena import Arena
 from tactile.base.random_streams import stream
 
-HEADING = ("world", "method", "mapper", "along", "set", "seed", "reports", *FIELDS)
-"""Columns of NAME.csv."""
+KEY = ("world", "method", "mapper", "along")
+"""Names of a result; the map is drawn `along` the scored path: `FILTERED`, `RECKONED` or `TRUE`."""
 
 
-def reproduce(
-    name: str,
-    directory: Path,
-    *,
-    sets: int = 3,
-    workers: int = 0,
-    seed: int = 0,
-    assignments: Sequence[str] = (),
-) -> tuple[str, bool]:
-    """As `ratslam.experiments.salman2016.reproduction.reproduce`, with sets per world."""
-    protocol = find_protocol(name, PROTOCOLS)
-    jobs = plan_jobs(protocol, sets, seed, assignments)
-    found: list[MapperResult] = []
+class SessionJob(NamedTuple):
+    """A session to simulate and filter.
 
-    def batches() -> Iterator[Iterator[list[object]]]:
-        with progress_bar(name, len(jobs)) as bar:
-            for results in run_tasks(run_job, jobs, workers=workers):
-                found.extend(results)
-                yield map(_row, results)
-                bar.update()
+    Attributes:
+        seed: of the session. training: seed of the strain templates. stops: numbers of reports after which
+            the result is scored; 0: all. variants: configurations by method and mapper.
+    """
 
-    interrupted = write_rows(directory / f"{name}.csv", HEADING, batches())
-    if found and not interrupted:
-        draw_reproduction(name, protocol, found).savefig(directory / f"{name}.png")
-    return render_results(protocol, found, sets), interrupted
+    world: str
+    number: int
+    seed: int
+    training: int
+    stops: tuple[int, ...]
+    variants: Mapping[tuple[str, str], RunConfig]
+
+
+class MapResult(NamedTuple):
+    """The map and the paths [T, 3] of a row, in the frame of the arena; `stop` is the index of its stop."""
+
+    stop: int
+    score: GridScore
+    grid: OccupancyGrid
+    arena: Arena
+    truth: np.ndarray
+    odometry: np.ndarray
+    online: np.ndarray
 
 
 def plan_jobs(protocol: Protocol, sets: int, seed: int, assignments: Sequence[str] = ()) -> list[SessionJob]:
@@ -55,25 +80,61 @@ def plan_jobs(protocol: Protocol, sets: int, seed: int, assignments: Sequence[st
     Raises:
         InputError: an invalid assignment.
     """
-    return [
-        _job(protocol, world, number, seed, assignments)
-        for number in range(sets)
-        for world in protocol.worlds
-    ]
+    jobs = []
+    for number, world in product(range(sets), protocol.worlds):
+        own = int(stream(seed, f"arenas.set.{number}").integers(2**31))
+        arena = seed if protocol.one_arena else own
+        session, where = f"create_simulation.seed={own}", f"create_simulation.arena.seed={arena}"
+        settings = (session, where, f"session.seed={own}", *assignments)
+        variants = {
+            (method, mapper): session_config(world, method, mapper, settings)
+            for method, mapper in product(protocol.methods, protocol.mappers)
+        }
+        jobs.append(SessionJob(world.name, number, own, seed, protocol.stops, variants))
+    return jobs
 
 
-def _job(protocol: Protocol, world: World, number: int, seed: int, assignments: Sequence[str]) -> SessionJob:
-    own = int(stream(seed, f"arenas.set.{number}").integers(2**31))
-    arena = seed if protocol.one_arena else own
-    seeds = (f"create_simulation.seed={own}", f"create_simulation.arena.seed={arena}", f"session.seed={own}")
-    variants = {
-        (method, mapper): session_config(world, method, mapper, (*seeds, *assignments))
-        for method in protocol.methods
-        for mapper in protocol.mappers
-    }
-    return SessionJob(world.name, number, own, seed, protocol.stops, variants)
+def run_job(job: SessionJob) -> list[ResultRow]:
+    """The results of all variants on a session, and of their marks along paths without a filter.
+
+    Raises:
+        InputError: the session cannot be simulated.
+    """
+    some = next(iter(job.variants.values()))
+    assert some.create_simulation is not None
+    session = simulate_session(some.create_simulation)
+    count = len(session.truth)
+    stops = tuple(min(stop, count) if stop else count for stop in job.stops)
+    found: list[ResultRow] = []
+    for variant, config in job.variants.items():
+        reports = observe_session(config, session, job.training)
+        marks = collect_marks(reports)
+        feelers = report_config_of(session.source.info, config.touch.reports).feelers
+        for stop, filtered in enumerate(run_filter(config, session, reports, stops)):
+            found.append(_score(job, session, (*variant, FILTERED), stop, filtered))
+            for name, whole in ((RECKONED, session.odometry), (TRUE, session.truth)):
+                path = whole[: stops[stop]]
+                drawn = FilterResult(path, path, draw_map(config.grid, feelers, session.arena, path, marks))
+                found.append(_score(job, session, (*variant, name), stop, drawn))
+    return found
 
 
-def _row(one: MapperResult) -> list[object]:
-    keys = (one.world, one.method, one.mapper, one.along, one.number, one.seed, one.reports)
-    return [*keys, *format_cells(one.values, FIELDS)]
+def _score(
+    job: SessionJob, session: ArenaSession, key: tuple[str, str, str], stop: int, one: FilterResult
+) -> ResultRow:
+    count = len(one.path)
+    truth, odometry = session.truth[:count], session.odometry[:count]
+    score = score_grid(one.grid, arena_truth(session.arena, one.grid), key[1])
+    metrics = path_metrics(one.online, one.path, truth) | map_metrics(score)
+    values = {"reports": count, "odometry_error": position_error(odometry, truth), **metrics}
+    result = MapResult(stop, score, one.grid, session.arena, truth, odometry, one.online)
+    return ResultRow((job.world, *key), job.number, job.seed, values, result)
+
+
+def _run(
+    title: str, protocol: Protocol, jobs: Sequence[SessionJob], workers: int
+) -> Iterator[list[ResultRow]]:
+    return run_with_progress(run_job, title, jobs, workers)
+
+
+PAPER = Paper(PROTOCOLS, KEY, FIELDS, plan_jobs, _run, draw_reproduction, render_results)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from evaluation.metrics.statistics import bootstrap
 from ratslam.experiments.salman2016.protocols import METHODS, Claim, Protocol
+from ratslam.experiments.trials.reproduction import ResultRow, column
 
 ALIKE = 0.05
 """Shares that differ by less count as equal."""
@@ -39,22 +40,6 @@ LABELS = {
     "threshold": "threshold",
 }
 CONTROL_LABELS = {"none": "", "shuffled": "shuffled, ", "blank": "no images, "}
-
-
-class Row(NamedTuple):
-    """One session of a reproduction.
-
-    Attributes:
-        control: change of the views beside the condition's own. number: of the set. values: fields of
-            `TouchMetrics` and `direction_metrics`.
-    """
-
-    condition: str
-    method: str
-    control: str
-    number: int
-    seed: int
-    values: Mapping[str, float]
 
 
 class Verdict(NamedTuple):
@@ -97,17 +82,7 @@ def judge_claim(claim: Claim, here: np.ndarray, there: np.ndarray, seed: int = 0
     return Verdict(estimate, low, high, word, text)
 
 
-def column(rows: Sequence[Row], condition: str, method: str, control: str, quantity: str) -> np.ndarray:
-    """[S] values of a quantity over the sets, NaN for missing sets."""
-    count = 1 + max((row.number for row in rows), default=-1)
-    values = np.full(count, np.nan)
-    for row in rows:
-        if (row.condition, row.method, row.control) == (condition, method, control):
-            values[row.number] = row.values.get(quantity, np.nan)
-    return values
-
-
-def render_claims(protocol: Protocol, rows: Sequence[Row], sets: int) -> str:
+def render_claims(protocol: Protocol, rows: Sequence[ResultRow], sets: int) -> str:
     """For each quantity the paper's value and the sessions' by method and control; then the claims."""
     done = 1 + max((row.number for row in rows), default=-1)
     columns = series(protocol, rows)
@@ -119,15 +94,14 @@ def render_claims(protocol: Protocol, rows: Sequence[Row], sets: int) -> str:
         lines += ["", _line(LABELS[quantity], width, "paper", heads)]
         for condition in protocol.conditions:
             paper = protocol.paper.get((condition.name, quantity))
-            cells = [_cell(column(rows, condition.name, m, c, quantity)) for m, c in columns]
+            cells = [_cell(column(rows, (condition.name, *key), quantity)) for key in columns]
             lines.append(_line(f"  {condition.name}", width, "-" if paper is None else f"{paper:.4g}", cells))
     lines.append("")
     for claim in protocol.claims:
         lines.append(f"claim: {claim.text} ({LABELS[claim.quantity]})")
         for method in methods:
-            here, there = (
-                column(rows, name, method, "none", claim.quantity) for name in (claim.here, claim.there)
-            )
+            keys = ((name, method, "none") for name in (claim.here, claim.there))
+            here, there = (column(rows, key, claim.quantity) for key in keys)
             verdict = judge_claim(claim, here, there)
             lines.append(f"  {method:<8} {verdict.word.upper()}: {verdict.text}")
     if protocol.claims and 1 < done < DECISIVE:
@@ -138,10 +112,10 @@ def render_claims(protocol: Protocol, rows: Sequence[Row], sets: int) -> str:
     return "\n".join([*lines, *([protocol.note] if protocol.note else [])])
 
 
-def series(protocol: Protocol, rows: Sequence[Row]) -> list[tuple[str, str]]:
+def series(protocol: Protocol, rows: Sequence[ResultRow]) -> list[tuple[str, str]]:
     """Pairs of method and control with rows: first without controls, then the controls of the protocol."""
-    there = {(row.method, row.control) for row in rows}
-    methods = [method for method in METHODS if any(row.method == method for row in rows)]
+    there = {row.key[1:] for row in rows}
+    methods = [method for method in METHODS if any(row.key[1] == method for row in rows)]
     controls = [(m, c) for c in ("shuffled", "blank") for m in methods if (m, c) in there]
     return [(method, "none") for method in methods] + (controls if protocol.controls else [])
 

@@ -56,11 +56,7 @@ def direction_metrics(result: SessionResult, laps: str) -> dict[str, float]:
 
 
 def lap_of_step(truth: np.ndarray, count: int) -> np.ndarray:
-    """[T] number of each step's lap, from 0; steps after the last return belong to the last lap.
-
-    Args:
-        count: largest number of laps.
-    """
+    """[T] number of each step's lap, below `count`; steps after the last return belong to the last lap."""
     ends = lap_ends(truth)
     return np.minimum(np.searchsorted(ends, np.arange(len(truth))), max(min(len(ends), count) - 1, 0))
 
@@ -87,7 +83,5 @@ def _directions_apart(result: SessionResult, clockwise: np.ndarray) -> float:
     ahead = np.flatnonzero(clockwise)
     away, row = cKDTree(result.truth[ahead, :2]).query(result.truth[~clockwise, :2])
     beside = away < BESIDE
-    if not beside.any():
-        return np.nan
     step = result.trajectory[~clockwise][beside, :2] - result.trajectory[ahead[row[beside]], :2]
-    return float(np.median(np.hypot(*step.T)))
+    return float(np.median(np.hypot(*step.T))) if len(step) else np.nan

@@ -11,15 +11,13 @@ from ratslam.experiments.trials.controls import Control
 COMMON = ("simulation.path.circuits=CCCAAACACA", "simulation.odometry.noise=gated")
 """Settings of all sessions unless a condition overrides them: the paper's circuits (III-C), and noise
 on the moving axis only."""
-METHODS: dict[str, tuple[str, ...]] = {
+METHODS = {
     "classic": (
-        "backend=classic",
-        "pose_cells.cells_xy=31",
-        "templates.energy=0.05",
+        "backend=classic", "pose_cells.cells_xy=31", "templates.energy=0.05",
         "experience.solver.name=relaxation",
     ),
     "ours": ("backend=recall",),
-}
+}  # fmt: skip
 """The classic method is RatSLAM as published with half of the iRat's energy (III-F), on a torus larger than
 the maze."""
 THRESHOLDS = {"max_angle": 0.015, "contact_angle": 0.05}
@@ -30,34 +28,23 @@ SWEPT = (0.005, 0.01, 0.015, 0.02, 0.025, 0.03, 0.04, 0.05, 0.06, 0.08)
 LATER_MAZE_START = 0.3
 """Share of the session before the change of mazes: three of ten laps."""
 
-
-def _views(mode: str, transform: str) -> tuple[str, ...]:
-    return f"simulation.whisking.mode={mode}", f"touch.image.transform={transform}"
-
-
-OPEN_MAX, OPEN_CONTACT = _views("open", "max_angle"), _views("open", "contact_angle")
-RCP_MAX, RCP_CONTACT = _views("rcp", "max_angle"), _views("rcp", "contact_angle")
-KIDNAPPED = ("simulation.kidnaps.count=8", "simulation.kidnaps.ahead=45.0")
+(OPEN_MAX, OPEN_CONTACT), (RCP_MAX, RCP_CONTACT) = (
+    [(f"simulation.whisking.mode={mode}", f"touch.image.transform={each}") for each in THRESHOLDS]
+    for mode in ("open", "rcp")
+)
 
 
 class Condition(NamedTuple):
     """One way to run a session.
 
     Attributes:
-        sets: overrides. control: change of the views. laps: number of laps to run; 0: all.
+        settings: overrides. control: change of the views. laps: number of laps to run; 0: all.
     """
 
     name: str
-    sets: tuple[str, ...]
+    settings: tuple[str, ...]
     control: Control = "none"
     laps: int = 0
-
-    @property
-    def transform(self) -> str:
-        """The image transform, which decides the classic method's threshold."""
-        return next(
-            value for key, _, value in (one.partition("=") for one in self.sets) if "transform" in key
-        )
 
 
 class Claim(NamedTuple):
@@ -81,7 +68,8 @@ class Protocol(NamedTuple):
     Attributes:
         source: section and figure. quantities: shown, fields of `TouchMetrics` or `direction_metrics`.
         paper: printed values by condition and quantity. controls: whether to add sessions with shuffled and
-            blank views. swept: whether to compare conditions at matched ARCR. note: printed below the table.
+            blank views. swept: whether to compare conditions at matched ARCR, separately for each noise (the
+            end of a condition's name). note: printed below the table.
     """
 
     title: str
@@ -94,25 +82,26 @@ class Protocol(NamedTuple):
     swept: bool = False
     note: str = ""
 
-    def same_noise(self, condition: Condition) -> list[str]:
-        """The names of the conditions to be matched with one: those after the comma are the same."""
-        return [c.name for c in self.conditions if c.name.split(", ")[1:] == condition.name.split(", ")[1:]]
-
 
 METRICS = ("arr", "arcr", "arcr_chain_free", "em", "em_experiences", "em_ratio", "closures", "false_closures")
+PRINTED = {
+    ("open loop", "arr"): 0.1765, ("RCP", "arr"): 0.2257, ("open loop", "em"): 0.1916, ("RCP", "em"): 0.1568,
+}  # fmt: skip
+"""Values of max_angle views in the paper."""
 SAME_IMAGES = (
     "In the kinematic tier RCP acts after the contact, so open loop and RCP give the same contact_angle "
     "images; with --set simulation.fidelity=dynamic they can differ."
 )
+NOISES = ("gated", "telescoping")
+MATCHED = ("open max_angle", "RCP max_angle", "RCP contact_angle")
 
 PROTOCOLS = {
     "fig2": Protocol(
         "Odometry drift over three clockwise laps",
         "Salman & Pearson 2016, III-C, Fig. 2",
-        (
-            Condition("white", (*RCP_CONTACT, "simulation.odometry.noise=white"), laps=3),
-            Condition("gated", RCP_CONTACT, laps=3),
-            Condition("telescoping", (*RCP_CONTACT, "simulation.odometry.noise=telescoping"), laps=3),
+        tuple(
+            Condition(noise, (*RCP_CONTACT, f"simulation.odometry.noise={noise}"), laps=3)
+            for noise in ("white", *NOISES)
         ),
         ("em_odometry", "em", "em_experiences", "closures", "false_closures"),
         note="The paper gives the size of the error, not its structure: white (in every sample), gated (on "
@@ -131,7 +120,8 @@ PROTOCOLS = {
         "Salman & Pearson 2016, IV-A, Fig. 4 (there of the iRat's camera)",
         (
             Condition("not kidnapped", RCP_CONTACT),
-            Condition("8 kidnaps", (*RCP_CONTACT, *KIDNAPPED)),
+            Condition("8 kidnaps",
+                      (*RCP_CONTACT, "simulation.kidnaps.count=8", "simulation.kidnaps.ahead=45.0")),
         ),
         METRICS,
         (
@@ -143,10 +133,7 @@ PROTOCOLS = {
     "fig5": Protocol(
         "Clockwise and anticlockwise laps",
         "Salman & Pearson 2016, IV-B, Fig. 5",
-        (
-            Condition("after 3 + 3 laps", OPEN_MAX, laps=6),
-            Condition("after alternation", OPEN_MAX),
-        ),
+        (Condition("after 3 + 3 laps", OPEN_MAX, laps=6), Condition("after alternation", OPEN_MAX)),
         (
             "first_anticlockwise", "first_anticlockwise_correct", "last_anticlockwise", "associated_correct",
             "directions_apart", "em", "em_ratio",
@@ -173,12 +160,7 @@ PROTOCOLS = {
             Claim("RCP lowers EM", "em", "rises", "RCP", "open loop"),
             Claim("ARCR stays the same", "arcr", "alike", "open loop", "RCP"),
         ),
-        {
-            ("open loop", "arr"): 0.1765,
-            ("RCP", "arr"): 0.2257,
-            ("open loop", "em"): 0.1916,
-            ("RCP", "em"): 0.1568,
-        },
+        PRINTED,
         note="The paper does not say over which pairs it takes EM: compare ratios (in the paper RCP / open "
         "loop is 0.82).",
     ),
@@ -201,12 +183,7 @@ PROTOCOLS = {
                   "open loop, max_angle"),
             Claim("contact_angle raises EM with RCP", "em", "rises", "RCP, max_angle", "RCP, contact_angle"),
         ),
-        {
-            ("open loop, max_angle", "arr"): 0.1765,
-            ("RCP, max_angle", "arr"): 0.2257,
-            ("open loop, max_angle", "em"): 0.1916,
-            ("RCP, max_angle", "em"): 0.1568,
-        },
+        {(f"{mode}, max_angle", quantity): value for (mode, quantity), value in PRINTED.items()},
         note=SAME_IMAGES,
     ),
     "reverse": Protocol(
@@ -251,25 +228,19 @@ PROTOCOLS = {
         "Conditions at matched ARCR, classic method",
         "Salman & Pearson 2016, IV-C and IV-D (there each at its own tuning)",
         tuple(
-            Condition(f"{name}, {noise}", (*sets, f"simulation.odometry.noise={noise}"))
-            for noise in ("gated", "telescoping")
-            for name, sets in (
-                ("open max_angle", OPEN_MAX),
-                ("RCP max_angle", RCP_MAX),
-                ("RCP contact_angle", RCP_CONTACT),
-            )
+            Condition(f"{name}, {noise}", (*views, f"simulation.odometry.noise={noise}"))
+            for noise in NOISES
+            for name, views in zip(MATCHED, (OPEN_MAX, RCP_MAX, RCP_CONTACT), strict=True)
         ),
         ("arr", "arcr", "arcr_chain_free", "em", "threshold"),
         tuple(
             claim
-            for noise in ("gated", "telescoping")
+            for noise in NOISES
+            for open_max, rcp_max, rcp_contact in [[f"{name}, {noise}" for name in MATCHED]]
             for claim in (
-                Claim(f"RCP raises ARR ({noise})", "arr", "rises", f"open max_angle, {noise}",
-                      f"RCP max_angle, {noise}"),
-                Claim(f"contact_angle raises ARR ({noise})", "arr", "rises", f"RCP max_angle, {noise}",
-                      f"RCP contact_angle, {noise}"),
-                Claim(f"RCP lowers EM ({noise})", "em", "rises", f"RCP max_angle, {noise}",
-                      f"open max_angle, {noise}"),
+                Claim(f"RCP raises ARR ({noise})", "arr", "rises", open_max, rcp_max),
+                Claim(f"contact_angle raises ARR ({noise})", "arr", "rises", rcp_max, rcp_contact),
+                Claim(f"RCP lowers EM ({noise})", "em", "rises", rcp_max, open_max),
             )
         ),
         controls=False,

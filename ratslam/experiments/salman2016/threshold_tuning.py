@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.stats import mannwhitneyu
 
 from evaluation.metrics.experience_metric import base_end, experience_metric
 from evaluation.plots.paper_figures import draw_tuning
@@ -114,22 +115,19 @@ def choose_threshold(
     if clean:
         best = max(clean, key=lambda score: score.correct)  # the lowest of equal ones
         return best, f"{len(clean)} thresholds give at least {ENOUGH} correct and none incorrect"
+    reason = f"all thresholds with {ENOUGH} correct re-localisations have incorrect ones"
     if enough:
         least = min(enough, key=lambda score: score.incorrect)
-        reason = (
-            f"all thresholds with {ENOUGH} correct re-localisations have incorrect ones; "
-            f"{least.threshold:g} has the fewest, {least.incorrect} beside {least.correct} correct"
-        )
+        found = f"{least.threshold:g} has the fewest, {least.incorrect} beside {least.correct} correct"
     else:
         most = max(scores, key=lambda score: score.correct)
-        reason = (
-            f"no threshold gives {ENOUGH} correct re-localisations; {most.threshold:g} gives {most.correct}"
-        )
+        reason = f"no threshold gives {ENOUGH} correct re-localisations"
+        found = f"{most.threshold:g} gives {most.correct}"
     half = _quantile(views.edge, views.same, 0.5)
     below = np.interp(half, views.edge, np.concatenate([[0], np.cumsum(views.other)])) / views.other.sum()
     return None, (
-        f"{reason}. A threshold of {half:.3f} accepts half of the view pairs of one place and {below:.1%} of "
-        f"those of different places (AUC {views.auc:.3f})"
+        f"{reason}; {found}. A threshold of {half:.3f} accepts half of the view pairs of one place and "
+        f"{below:.1%} of those of different places (AUC {views.auc:.3f})"
     )
 
 
@@ -174,15 +172,12 @@ def view_differences(config: TemplateConfig, views: np.ndarray, others: np.ndarr
 
 
 def auc(same: np.ndarray, other: np.ndarray) -> float:
-    """The probability that one of `other` exceeds one of `same`, ties counted half (Mann & Whitney 1947)."""
-    ordered = np.sort(other)
-    below = np.searchsorted(ordered, same, "left")
-    up_to = np.searchsorted(ordered, same, "right")
-    return float(1 - (below + up_to).mean() / 2 / len(other))
+    """The probability that one of `other` exceeds one of `same`, ties counted half."""
+    return float(mannwhitneyu(other, same, method="asymptotic").statistic / (len(same) * len(other)))
 
 
 def render_tuning(tuning: Tuning) -> str:
-    """The tuning as text."""
+    """The differences of views, the score of each threshold, and the choice."""
     views, (start, stop) = tuning.views, tuning.steps
     lines = [
         "before any map: mean absolute difference of two views",
@@ -200,9 +195,8 @@ def render_tuning(tuning: Tuning) -> str:
     for one in tuning.scores:
         mark = "  <- the winner" if one is tuning.winner else ""
         lines.append(f"  {one.threshold:>9.3f}{one.arr:>8.3f}{one.correct:>9}{one.incorrect:>11}{mark}")
-    verdict = (
-        f"templates.threshold={tuning.winner.threshold:g}" if tuning.winner else "no threshold satisfies"
-    )
+    winner = tuning.winner
+    verdict = f"templates.threshold={winner.threshold:g}" if winner else "no threshold satisfies"
     return "\n".join([*lines, "", f"{verdict}: {tuning.reason}"])
 
 
@@ -221,8 +215,8 @@ def save_tuning(tuning: Tuning, directory: Path) -> tuple[Path, Path]:
 def _score_thresholds(task: tuple[RunConfig, InMemorySource, int, np.ndarray]) -> list[ThresholdScore]:
     config, log, base, thresholds = task
     exm = config.score.experience_metric.model_copy(update={"base": base, "mode": "strict", "log": "step"})
-    batch = sweep_thresholds(config, log, thresholds)
-    results = [experience_metric(place, np.asarray(log.truth), exm) for place in batch.place]
+    places = sweep_thresholds(config, log, thresholds)
+    results = [experience_metric(place, np.asarray(log.truth), exm) for place in places]
     return [
         ThresholdScore(float(threshold), r.arr, r.correct, r.relocalisations - r.correct)
         for threshold, r in zip(thresholds, results, strict=True)

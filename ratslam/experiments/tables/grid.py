@@ -18,7 +18,7 @@ from ratslam.config.run_config import RunConfig
 from ratslam.core.precision import prepare_precision
 from ratslam.experiments.studies.executor import run_tasks
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
-from ratslam.experiments.trials.arena_trial import session_at_start
+from ratslam.experiments.trials.arena_trial import position_error, session_at_start
 from ratslam.pipeline.artifacts import true_grid
 from ratslam.pipeline.source import open_source, read_observations
 from robot.touch_source import open_touch_source, report_config_of
@@ -51,25 +51,26 @@ ODOMETRY_ERRORS = {
     "move": "one for each straight or turn",
     "white": "new in each step",
 }
-ROWS: dict[str, tuple[str, dict[str, Any]]] = {
-    "bias": ("bias", {}),
-    "move": ("move", {}),
-    "white": ("white", {}),
-    "bias, blobs only": ("bias", {"touch": {"reports": {"walls": "none"}}}),
-    "move, blobs only": ("move", {"touch": {"reports": {"walls": "none"}}}),
-    "bias, geometric": ("bias", {"touch": {"reports": {"walls": "geometric"}}}),
-    "move, geometric": ("move", {"touch": {"reports": {"walls": "geometric"}}}),
-    "bias, as printed": ("bias", {"grid": AS_PRINTED}),
-    "move, as printed": ("move", {"grid": AS_PRINTED}),
-    "bias without run errors": ("bias", {"grid": {"drift": {"session": 0.0}}}),
-    "move, temper 1, prior 0.3": ("move", {"grid": {"likelihood": {"free": 1.0, "unexplored": 0.3}}}),
-    "bias, BACK skipped": ("bias", {}),
-    "move, BACK skipped": ("move", {}),
-    "bias, 1000 particles": ("bias", {"grid": {"particles": 1000}}),
-    "move, 1000 particles": ("move", {"grid": {"particles": 1000}}),
-    "move, no compass": ("move", {"grid": {"likelihood": {"wall_direction_prior": False}}}),
+_NO_WALLS, _GEOMETRIC = ({"touch": {"reports": {"walls": walls}}} for walls in ("none", "geometric"))
+ROWS: dict[str, dict[str, Any]] = {
+    "bias": {},
+    "move": {},
+    "white": {},
+    "bias, blobs only": _NO_WALLS,
+    "move, blobs only": _NO_WALLS,
+    "bias, geometric": _GEOMETRIC,
+    "move, geometric": _GEOMETRIC,
+    "bias, as printed": {"grid": AS_PRINTED},
+    "move, as printed": {"grid": AS_PRINTED},
+    "bias without run errors": {"grid": {"drift": {"session": 0.0}}},
+    "move, temper 1, prior 0.3": {"grid": {"likelihood": {"free": 1.0, "unexplored": 0.3}}},
+    "bias, BACK skipped": {},
+    "move, BACK skipped": {},
+    "bias, 1000 particles": {"grid": {"particles": 1000}},
+    "move, 1000 particles": {"grid": {"particles": 1000}},
+    "move, no compass": {"grid": {"likelihood": {"wall_direction_prior": False}}},
 }
-"""Model of the odometry errors, and settings."""
+"""Settings; the name begins with the model of the odometry errors."""
 DEFAULT_ROWS = (
     *((world, row) for world in "AB" for row in ODOMETRY_ERRORS),
     ("A", "bias, blobs only"),
@@ -127,14 +128,10 @@ def grid_table(
 
 def task_config(task: GridTask) -> RunConfig:
     """The configuration of a session."""
-    noise, changes = ROWS[task.row]
+    noise = task.row.replace(",", " ").split()[0]
     create_simulation = WORLDS[task.world] | {"wheels": {"noise": noise}, "seed": task.arena}
-    given = {
-        "create_simulation": create_simulation,
-        "backend": "grid",
-        "session": {"precision": "float32"},
-    } | changes
-    return RunConfig.model_validate(given)
+    given = {"create_simulation": create_simulation, "backend": "grid", "session": {"precision": "float32"}}
+    return RunConfig.model_validate(given | ROWS[task.row])
 
 
 def measure_session(task: GridTask) -> GridFigures:
@@ -157,24 +154,13 @@ def measure_session(task: GridTask) -> GridFigures:
     touch = report_config_of(source.info, config.touch.reports)
     session = session_at_start(grid, touch.mounts, touch.length, "float32", config.session.seed)
     online = np.array([step.pose for step in session.replay(observations)])
-
-    def position_error(path: np.ndarray) -> float:
-        return float(np.hypot(*(path - truth)[:, :2].T).mean())
-
+    walls = [(pose, each) for pose, each in zip(truth, observations, strict=True) if each.wall]
+    readings = (sample.reading for sample in source)
     return GridFigures(
-        error=position_error(compose(start, online)),
-        odometry=position_error(integrate(moves, start)),
-        wall_errors=np.array(
-            [
-                _wall_error(source.arena, pose, observation)
-                for pose, observation in zip(truth, observations, strict=True)
-                if observation.wall
-            ]
-        ),
-        contacts=sum(
-            int(sample.reading.moment >= 2) and sample.reading.motion == MotionKind.FORWARD
-            for sample in source
-        ),
+        error=position_error(compose(start, online), truth),
+        odometry=position_error(integrate(moves, start), truth),
+        wall_errors=np.array([_wall_error(source.arena, pose, observation) for pose, observation in walls]),
+        contacts=sum(each.moment >= 2 and each.motion == MotionKind.FORWARD for each in readings),
         map=_map_scores(session.map, source.arena),
     )
 

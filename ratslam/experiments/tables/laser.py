@@ -15,55 +15,50 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.metrics.trajectory import ate
-from ratslam.config.completion import complete
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import load, override, validate
 from ratslam.experiments.studies.executor import run_tasks
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
 from ratslam.pipeline.runner import build_session
-from ratslam.pipeline.source import open_source
+from ratslam.pipeline.source import open_observations
 from robot.sources.in_memory import load_into_memory
 from robot.sources.perturbation import perturb
-from robot.touch_source import observation_of, open_touch_source
+from robot.touch_source import observation_of
 from tactile.base.errors import InputError
 from tactile.base.se2 import integrate
 
 FALSE_CLOSURE_CELLS = 2.5
 DATA = "RATSLAM_DATA"
 """Environment variable: the folder of the real recordings, which are not part of the project."""
-CLASSIC = ("backend=classic",)
+GOLDEN = "../tests/golden"
+"""Folder of test recordings, from the folder of the configurations."""
 
 
 class Recording(NamedTuple):
-    """A row: its label, configuration file, overrides, and whether it needs the folder `DATA`."""
+    """A row: its label, configuration, another recording in `GOLDEN`, and whether it is one of `DATA`."""
 
     label: str
     config: str
-    assignments: tuple[str, ...] = ()
-    needs_data: bool = False
+    file: str = ""
+    real: bool = False
+
+    @property
+    def assignments(self) -> list[str]:
+        """Overrides of the configuration."""
+        return [f"recording.file={GOLDEN}/{self.file}"] if self.file else []
 
 
 ROWS = {
     "square": Recording("`configs/square.yaml`, synthetic", "configs/square.yaml"),
     "figure8": Recording(
-        "`b_figure8_alias`, a third of the places look alike",
-        "configs/square.yaml",
-        ("recording.file=../tests/golden/b_figure8_alias.npz",),
+        "`b_figure8_alias`, a third of the places look alike", "configs/square.yaml", "b_figure8_alias.npz"
     ),
-    "kidnap": Recording(
-        "`e_kidnap`, carried away once",
-        "configs/square.yaml",
-        ("recording.file=../tests/golden/e_kidnap.npz",),
-    ),
+    "kidnap": Recording("`e_kidnap`, carried away once", "configs/square.yaml", "e_kidnap.npz"),
     "tuc": Recording(
-        "`configs/tuc_lecture_hall.yaml`, real, given place ids",
-        "configs/tuc_lecture_hall.yaml",
-        needs_data=True,
+        "`configs/tuc_lecture_hall.yaml`, real, given place ids", "configs/tuc_lecture_hall.yaml", real=True
     ),
     "intel": Recording(
-        "`configs/intel_laser.yaml`, real, 18-number laser views",
-        "configs/intel_laser.yaml",
-        needs_data=True,
+        "`configs/intel_laser.yaml`, real, 18-number laser views", "configs/intel_laser.yaml", real=True
     ),
 }
 COLUMNS = (
@@ -102,7 +97,7 @@ def laser_table(
         task
         for row in present
         for task in (
-            RecordingTask(_config(ROWS[row], folder, CLASSIC)),
+            RecordingTask(_config(ROWS[row], folder, ["backend=classic"])),
             *(RecordingTask(_config(ROWS[row], folder), seed) for seed in range(copies + 1)),
         )
     ]
@@ -122,9 +117,8 @@ def measure_recording(task: RecordingTask) -> RecordingFigures:
     Raises:
         InputError: the recording cannot be used, or has no truth.
     """
-    with open_source(task.config) as source:
-        config = complete(task.config, source)
-        log = load_into_memory(open_touch_source(source, config.touch))
+    with open_observations(task.config) as (config, source):
+        log = load_into_memory(source)
     if log.truth is None:
         raise InputError(log.name, "no true poses", "a recording with truth")
     if task.seed:
@@ -146,7 +140,7 @@ def measure_recording(task: RecordingTask) -> RecordingFigures:
 
 def _missing(recording: Recording, folder: Path) -> str:
     """Why a recording cannot be run; "" if it can."""
-    if recording.needs_data and not os.environ.get(DATA):
+    if recording.real and not os.environ.get(DATA):
         return f"set {DATA} to the folder of the real recordings"
     files = [folder / recording.config]
     files += [files[0].parent / value.partition("=")[2] for value in recording.assignments]

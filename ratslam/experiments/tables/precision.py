@@ -56,34 +56,14 @@ LEVEL = 0.99
 """Confidence level of the intervals of medians. All figures must pass, so no correction for their number."""
 
 
-class ArmFigures(NamedTuple):
-    """The figures of one run.
-
-    Attributes:
-        em: Energy Metric over all pairs, m^2 + rad^2. arr, arcr: strict Experience Metric. ate: m.
-        closures: count. same_place: share of steps with the same current place as in float64.
-    """
-
-    em: float
-    arr: float
-    arcr: float
-    ate: float
-    closures: float
-    same_place: float
-
-
-JUDGED = ArmFigures._fields[:-1]
+FIGURES = ("em", "arr", "arcr", "ate", "closures", "same_place")
+"""Energy Metric (all pairs, m^2 + rad^2), strict Experience Metric, ATE (m), number of closures, and share of
+steps with the same current place as in float64."""
+JUDGED = FIGURES[:-1]
 """Figures that must pass."""
 COLUMNS = (
     "arm", "figure", "float64", "arm's", "spread", "mean difference", "worst", "median difference", "equal"
 )  # fmt: skip
-
-
-class ArmsTask(NamedTuple):
-    """The sessions of all arms of one backend and seed."""
-
-    backend: str
-    seed: int
 
 
 class Difference(NamedTuple):
@@ -105,33 +85,33 @@ class Difference(NamedTuple):
     spread: float
 
 
-def run_arms(task: ArmsTask) -> dict[str, ArmFigures]:
-    """The figures of each arm."""
+def run_arms(task: tuple[str, int]) -> list[list[float]]:
+    """`FIGURES` of each of `ARMS` for a backend and a seed."""
+    backend, seed = task
     prepare_precision("float64")
-    simulation = SESSION | {"seed": task.seed, "maze": {"seed": task.seed}}
-    given = {"simulation": simulation, "session": {"reserve": RESERVE}} | BACKENDS[task.backend]
+    simulation = SESSION | {"seed": seed, "maze": {"seed": seed}}
+    given = {"simulation": simulation, "session": {"reserve": RESERVE}} | BACKENDS[backend]
     config, log = collect_session(RunConfig.model_validate(given))
-    off = 1 + ROUNDING * stream(task.seed, "tests.precision").uniform(-1, 1, (log.length, 3))
+    off = 1 + ROUNDING * stream(seed, "tests.precision").uniform(-1, 1, (log.length, 3))
     rounded = replace(log, motion=np.column_stack([log.motion[:, :3] * off, log.motion[:, 3]]))
-    figures: dict[str, ArmFigures] = {}
-    places = np.zeros(0)
-    for arm in ARMS:
-        single = "float32" if arm == "float32" else "float64"
-        settings = config.session.model_copy(update={"precision": single})
-        played = run_session(
-            config.model_copy(update={"session": settings}), rounded if arm == "control" else log
-        )
-        found = touch_metrics(played)
-        places = played.place if arm == ARMS[0] else places
-        error, alike = ate(played.trajectory, played.truth), float((played.place == places).mean())
-        figures[arm] = ArmFigures(found.em, found.arr, found.arcr, error, found.closures, alike)
-    return figures
+    single = config.session.model_copy(update={"precision": "float32"})
+    arms = (config, log), (config.model_copy(update={"session": single}), log), (config, rounded)
+    played = [run_session(*arm) for arm in arms]
+    return [
+        [
+            *(getattr(metrics, name) for name in ("em", "arr", "arcr")),
+            ate(one.trajectory, one.truth),
+            metrics.closures,
+            float((one.place == played[0].place).mean()),
+        ]
+        for one, metrics in zip(played, map(touch_metrics, played), strict=True)
+    ]
 
 
 def measure_arms(seeds: Sequence[int], backend: str, workers: int = 1) -> dict[str, np.ndarray]:
     """[seeds, figures] of each arm."""
-    rows = list(run_tasks(run_arms, [ArmsTask(backend, seed) for seed in seeds], workers=workers))
-    return {arm: np.array([row[arm] for row in rows], float) for arm in ARMS}
+    rows = list(run_tasks(run_arms, [(backend, seed) for seed in seeds], workers=workers))
+    return dict(zip(ARMS, np.array(rows, float).transpose(1, 0, 2), strict=True))
 
 
 def differences(arm: np.ndarray, against: np.ndarray) -> list[Difference]:
@@ -145,11 +125,10 @@ def difference(values: np.ndarray, against: np.ndarray) -> Difference:
     apart = values[both] - against[both]
     if len(apart) < 2:
         return Difference(*[np.nan] * 8)
-    half = float(stats.t.ppf(0.975, len(apart) - 1) * stats.sem(apart))
     low, high = median_interval(apart, LEVEL)
     return Difference(
         mean=float(apart.mean()),
-        half=half,
+        half=float(stats.t.ppf(0.975, len(apart) - 1) * stats.sem(apart)),
         worst=float(apart[np.argmax(np.abs(apart))]),
         median=float(np.median(apart)),
         low=low,

@@ -14,21 +14,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from evaluation.metrics.energy_metric import energy_all_pairs
-from evaluation.metrics.experience_metric import ExmConfig, ExperienceMetric, experience_metric
-from ratslam.config.completion import complete
+from evaluation.metrics.experience_metric import ExmConfig
 from ratslam.config.run_config import RunConfig
 from ratslam.experiments.studies.executor import run_tasks
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
 from ratslam.experiments.trials.touch_trial import (
     FALSE_CLOSURE_DISTANCE,
-    SessionResult,
+    TouchMetrics,
     closure_errors,
+    experience_metric_if_defined,
     run_session,
+    touch_metrics,
 )
-from ratslam.pipeline.source import open_source
+from ratslam.pipeline.source import open_observations
 from robot.sources.in_memory import InMemorySource, load_into_memory
-from robot.touch_source import open_touch_source
-from tactile.base.errors import InputError
 
 FIRST_MAZE = 9000
 SUCCESS = 0.25
@@ -116,23 +115,16 @@ class TouchTask(NamedTuple):
 
 
 class SessionFigures(NamedTuple):
-    """The figures of one session; NaN where a figure is not defined.
+    """The figures of one session.
 
     Attributes:
-        em, em_experiences, em_odometry: Energy Metric of the map, of the map read through the experiences and
-            of dead reckoning. arr, arcr, chain_free: strict Experience Metric. revisits_closed: share of the
-            revisits with a true closure. across: closures between the parts before and after `CHANGE`.
-        recovery: whisks from each kidnap to the first true closure.
+        metrics: of `touch_metrics`, but `em_experiences` with steps without an experience at their own pose,
+            and `arcr_chain_free` 0 without re-localisations. revisits_closed: share of the revisits with a
+            true closure; NaN without revisits. across: closures between the parts before and after `CHANGE`.
+            recovery: whisks from each kidnap to the first true closure.
     """
 
-    em: float
-    em_experiences: float
-    em_odometry: float
-    arr: float
-    arcr: float
-    chain_free: float
-    closures: int
-    false_closures: int
+    metrics: TouchMetrics
     revisits_closed: float
     across: int
     recovery: tuple[int, ...]
@@ -162,23 +154,21 @@ def measure_session(task: TouchTask) -> SessionFigures:
     """Runs and measures one session."""
     log, config, kidnaps = _simulate(task)
     result = run_session(config, log)
-    truth, errors = result.truth, closure_errors(result)
-    true_closures = result.closures[errors <= FALSE_CLOSURE_DISTANCE]
-    # A step without an experience is read at its own pose.
+    truth = result.truth
+    true_closures = result.closures[closure_errors(result) <= FALSE_CLOSURE_DISTANCE]
+    exm = ExmConfig()
+    if experience_metric_if_defined(result) is None:  # never at its start again: a quarter is the base set
+        exm = ExmConfig(base=len(truth) // 4)
     read = result.trajectory.copy()
     read[result.place >= 0] = result.node[result.place[result.place >= 0]]
-    metric = _experience_metric(result)
     change = int(CHANGE * log.length)
     across = (result.closures[:, 0] >= change) & (result.closures[:, 1] < change)
+    metrics = touch_metrics(result, exm)
     return SessionFigures(
-        em=energy_all_pairs(result.trajectory, truth).total,
-        em_experiences=energy_all_pairs(read, truth).total,
-        em_odometry=energy_all_pairs(result.odometry, truth).total,
-        arr=metric.arr,
-        arcr=metric.arcr,
-        chain_free=float((metric.counted & metric.near).sum() / max(metric.counted.sum(), 1)),
-        closures=len(errors),
-        false_closures=len(errors) - len(true_closures),
+        metrics._replace(
+            em_experiences=energy_all_pairs(read, truth).total,
+            arcr_chain_free=float(np.nan_to_num(metrics.arcr_chain_free)),
+        ),
         revisits_closed=_revisits_closed(truth, true_closures),
         across=int(across.sum()),
         recovery=tuple(_recovery(jump, true_closures, log.length) for jump in kidnaps),
@@ -197,23 +187,15 @@ def task_config(task: TouchTask) -> RunConfig:
 def _simulate(task: TouchTask) -> tuple[InMemorySource, RunConfig, list[int]]:
     """The views of a session, its completed configuration, and the steps of its kidnaps."""
     config = task_config(task)
-    with open_source(config) as source:
-        kidnaps = np.flatnonzero(source.kidnapped).tolist()  # type: ignore[attr-defined]
-        config = complete(config, source)
-        log = load_into_memory(open_touch_source(source, config.touch))
+    with open_observations(config) as (config, source):
+        kidnaps = np.flatnonzero(source.source.kidnapped).tolist()  # type: ignore[attr-defined]
+        log = load_into_memory(source)
     if task.row == "control: shuffled":
         order = np.random.default_rng(task.seed).permutation(len(log.views))
         log = replace(log, views=log.views[order].copy())
     if task.row == "control: no image":
         log = replace(log, views=np.zeros_like(log.views))
     return log, config, kidnaps
-
-
-def _experience_metric(result: SessionResult) -> ExperienceMetric:
-    try:
-        return experience_metric(result.place, result.truth)
-    except InputError:  # an exploration that never returns to its start: a quarter is the base set
-        return experience_metric(result.place, result.truth, ExmConfig(base=len(result.truth) // 4))
 
 
 def _revisits_closed(truth: np.ndarray, true_closures: np.ndarray) -> float:
@@ -235,12 +217,14 @@ def _recovery(jump: int, true_closures: np.ndarray, steps: int) -> int:
 
 
 def _cells(found: Sequence[SessionFigures]) -> list[str]:
-    def median(name: str, digits: int = 3) -> str:
-        values = np.array([getattr(figures, name) for figures in found], float)
-        return f"{np.nanmedian(values):.{digits}f}" if np.isfinite(values).any() else "-"
+    values = {name: [getattr(one.metrics, name) for one in found] for name in TouchMetrics._fields}
+    values["revisits_closed"] = [one.revisits_closed for one in found]
 
-    em = np.array([figures.em for figures in found])
-    strict = np.array([figures.arcr for figures in found])
+    def median(name: str, digits: int = 3) -> str:
+        known = np.isfinite(values[name]).any()
+        return f"{np.nanmedian(values[name]):.{digits}f}" if known else "-"
+
+    em, strict = np.array(values["em"]), np.array(values["arcr"])
     worst = np.nanmin(strict) if np.isfinite(strict).any() else math.nan
     return [
         f"{np.median(em):.3f} ({em.max():.2f})",
@@ -248,9 +232,9 @@ def _cells(found: Sequence[SessionFigures]) -> list[str]:
         median("em_experiences"),
         median("em_odometry", 2),
         median("arr"),
-        f"{median('arcr')} ({worst:.2f}), {median('chain_free')}" if np.isfinite(worst) else "-",
+        f"{median('arcr')} ({worst:.2f}), {median('arcr_chain_free')}" if np.isfinite(worst) else "-",
         median("revisits_closed", 2),
-        f"{sum(figures.false_closures for figures in found)} / {sum(figures.closures for figures in found)}",
+        f"{sum(values['false_closures'])} / {sum(values['closures'])}",
     ]
 
 
@@ -258,7 +242,7 @@ def _notes(row: str, found: Sequence[SessionFigures]) -> list[str]:
     """What only some rows are for: closures across a change of mazes, recovery after kidnaps."""
     notes = []
     if row == "control: other maze":
-        across, closures = sum(one.across for one in found), sum(one.closures for one in found)
+        across, closures = sum(one.across for one in found), sum(one.metrics.closures for one in found)
         notes.append(f"{row}: {across} of {closures} closures join the parts before and after the change.")
     recovery = np.array([whisks for figures in found for whisks in figures.recovery])
     if len(recovery):

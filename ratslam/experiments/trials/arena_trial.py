@@ -166,6 +166,11 @@ def arena_side(arena: Arena) -> float:
     return float(np.ptp(arena.outer, axis=0).max())
 
 
+def position_error(path: np.ndarray, truth: np.ndarray) -> float:
+    """Mean position error of poses [T, 3] without alignment, m."""
+    return float(np.hypot(*(path - truth)[:, :2].T).mean())
+
+
 def collect_marks(reports: list[Observation]) -> ContactLog:
     """The marks that the reports add to a map."""
     rows = stack(reports)

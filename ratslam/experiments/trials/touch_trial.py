@@ -7,7 +7,7 @@ each of them.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,14 +15,12 @@ from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.experience_metric import ExmConfig, ExperienceMetric, experience_metric
 from ratslam.backends.config import select_settings
 from ratslam.backends.registry import BACKENDS, Sensors, build
-from ratslam.config.completion import complete
 from ratslam.config.run_config import RunConfig, SessionConfig
 from ratslam.core.precision import prepare_precision
 from ratslam.core.session import Session, capacity_at
-from ratslam.experiments.trials.controls import Control, apply_control
-from ratslam.pipeline.source import open_source
+from ratslam.pipeline.source import open_observations
 from robot.sources.in_memory import InMemorySource, load_into_memory
-from robot.touch_source import observation_of, open_touch_source
+from robot.touch_source import observation_of
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.se2 import integrate
@@ -31,20 +29,6 @@ FALSE_CLOSURE_DISTANCE = 0.1
 """A closure is false if its steps are farther apart in truth, m (Salman & Pearson 2016, III-G)."""
 HOME_RADIUS = 0.09
 """A robot this near to its start has returned to it, m: half a micromouse cell."""
-
-
-class TrialTask(NamedTuple):
-    """One session to run.
-
-    Attributes:
-        config: with absolute paths. control: change of the views. seed: of the control. laps: number of laps
-            to run; 0: all.
-    """
-
-    config: RunConfig
-    control: Control = "none"
-    seed: int = 0
-    laps: int = 0
 
 
 class SessionResult(NamedTuple):
@@ -95,25 +79,11 @@ def collect_session(config: RunConfig) -> tuple[RunConfig, InMemorySource]:
     Raises:
         InputError: the source cannot be read or simulated, or lacks the true pose of a step.
     """
-    with open_source(config) as source:
-        config = complete(config, source)
-        log = load_into_memory(open_touch_source(source, config.touch))
+    with open_observations(config) as (config, source):
+        log = load_into_memory(source)
     if log.truth is None or not np.isfinite(log.truth).all():
         raise InputError(log.name, "steps without a true pose", "the true pose of every step")
     return config, log
-
-
-def run_task(task: TrialTask) -> SessionResult:
-    """Runs one session.
-
-    Raises:
-        InputError: its source cannot be used.
-    """
-    config, log = collect_session(task.config)
-    log = apply_control(log, task.control, task.seed)
-    if task.laps:
-        log = truncate_log(log, int(lap_ends(np.asarray(log.truth))[task.laps - 1]) + 1)
-    return run_session(config, log)
 
 
 def run_session(config: RunConfig, log: InMemorySource) -> SessionResult:
@@ -121,21 +91,16 @@ def run_session(config: RunConfig, log: InMemorySource) -> SessionResult:
     session = _session_at_start(config, log.view_shape, capacity_for(log.length))
     steps = list(session.replay(observation_of(sample) for sample in log))
     place = np.array([int(step.estimate.place) for step in steps])
-    return session_result(log, place, session.map)
-
-
-def session_result(log: InMemorySource, place: np.ndarray, map: Any) -> SessionResult:
-    """The result of a session from its log, the current experience of each step [T] and the final map."""
-    nodes = map.graph().nodes
+    nodes = session.map.graph().nodes
     rows = (nodes[k] for k in range(len(nodes)))
     node = np.array([[row["x"], row["y"], row["heading"]] for row in rows]).reshape(-1, 3)
     return SessionResult(
         truth=np.asarray(log.truth),
         odometry=integrate(log.motion[:, :3]),
-        trajectory=map.trajectory(),
+        trajectory=session.map.trajectory(),
         place=np.where(place < len(node), place, -1),
         node=node,
-        closures=map.closures(),
+        closures=session.map.closures(),
     )
 
 

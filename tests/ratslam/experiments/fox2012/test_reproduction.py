@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,12 +13,11 @@ from hypothesis import strategies as st
 
 from ratslam.cli import main
 from ratslam.cli.reproduce import FOX2012
-from ratslam.experiments.fox2012 import reproduction
 from ratslam.experiments.fox2012.mapper_ranking import MEASURES, Measure, rank_mappers, render_rankings
 from ratslam.experiments.fox2012.metrics import FIELDS, LEAVE_DISTANCE, find_revisits, path_metrics
 from ratslam.experiments.fox2012.protocols import FILTERED, MAPPERS, PAPERS, PROTOCOLS, RECKONED, TRUE
-from ratslam.experiments.fox2012.reproduction import plan_jobs, reproduce
-from ratslam.experiments.fox2012.trials import MapperResult, run_job
+from ratslam.experiments.fox2012.reproduction import PAPER, plan_jobs, run_job
+from ratslam.experiments.trials import reproduction
 from ratslam.experiments.trials.arena_trial import (
     START_CLEARANCE,
     arena_side,
@@ -31,6 +29,7 @@ from ratslam.experiments.trials.arena_trial import (
     run_filter,
     simulate_session,
 )
+from ratslam.experiments.trials.reproduction import ResultRow, reproduce
 from ratslam.grid.config import GridConfig
 from robot.world.arena import Arena, has_clearance
 from robot.world.random_arena import ArenaConfig, make_arena
@@ -47,7 +46,7 @@ EVERYWHERE = MEASURES[0]
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, bool]:
     """The folder and the text of a small reproduction."""
     folder = tmp_path_factory.mktemp("fox")
-    text, interrupted = reproduce("fox-fig4", folder, sets=2, workers=1, assignments=TINY)
+    text, interrupted = reproduce(PAPER, "fox-fig4", folder, sets=2, workers=1, assignments=TINY)
     return folder, text, interrupted
 
 
@@ -59,32 +58,16 @@ def rows(tiny: tuple[Path, str, bool]) -> list[dict[str, str]]:
 
 def made(
     mapper: str, number: int, key: str, value: float, along: str = FILTERED, best: float = 0.0
-) -> MapperResult:
-    """A result of which nothing matters but one figure."""
-    score: Any = SimpleNamespace(under=lambda convention: SimpleNamespace(best=best))
-    nothing: Any = None
-    return MapperResult(
-        "",
-        "ours",
-        mapper,
-        along,
-        number,
-        0,
-        0,
-        40,
-        {key: value},
-        score,
-        nothing,
-        ROOMY,
-        nothing,
-        nothing,
-        nothing,
-    )
+) -> ResultRow:
+    """A result with one metric."""
+    score = SimpleNamespace(under=lambda convention: SimpleNamespace(best=best))
+    result = SimpleNamespace(stop=0, score=score)
+    return ResultRow(("1.25 m arena", "ours", mapper, along), number, 0, {"reports": 40, key: value}, result)
 
 
 def of(
     measure: Measure, table: dict[str, list[float]], along: str = FILTERED, best: float = 0.0
-) -> list[MapperResult]:
+) -> list[ResultRow]:
     return [
         made(mapper, k, measure.key, value, along, best)
         for mapper, values in table.items()
@@ -292,13 +275,15 @@ def test_a_set_is_independent_of_earlier_sessions(rows: list[dict[str, str]]) ->
 def test_an_interrupt_keeps_the_finished_sessions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(function, tasks, workers):
         yield [
-            made(mapper, 0, "online_error", 0.1)._replace(values={"online_error": 0.1, "odometry_error": 0.2})
+            made(mapper, 0, "online_error", 0.1)._replace(
+                values={"reports": 40, "online_error": 0.1, "odometry_error": 0.2}
+            )
             for mapper in PAPERS
         ]
         raise KeyboardInterrupt
 
     monkeypatch.setattr(reproduction, "run_tasks", interrupted)
-    text, stopped = reproduce("fox-fig4", tmp_path, sets=3, workers=1)
+    text, stopped = reproduce(PAPER, "fox-fig4", tmp_path, sets=3, workers=1)
     assert stopped
     assert "1 of 3 sets" in text
     assert len((tmp_path / "fox-fig4.csv").read_text().splitlines()) == 4
@@ -321,13 +306,13 @@ def test_invalid_arguments_are_refused_before_anything_is_written(
         main(["reproduce", "fox-fig3"])
     assert stopped.value.code == 2
     with pytest.raises(InputError, match="fox-fig3"):
-        reproduce("fox-fig3", tmp_path)
+        reproduce(PAPER, "fox-fig3", tmp_path)
 
 
 @pytest.mark.soak
 @pytest.mark.parametrize("name", PROTOCOLS)
 def test_reproductions_run_to_their_end(name: str, tmp_path: Path) -> None:
-    text, stopped = reproduce(name, tmp_path, sets=2, workers=2, assignments=TINY)
+    text, stopped = reproduce(PAPER, name, tmp_path, sets=2, workers=2, assignments=TINY)
     assert not stopped
     assert PROTOCOLS[name].title in text
     assert (tmp_path / f"{name}.png").exists()

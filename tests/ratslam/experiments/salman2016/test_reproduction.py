@@ -11,18 +11,14 @@ from hypothesis import strategies as st
 
 from ratslam.cli import main
 from ratslam.cli.reproduce import SALMAN2016
-from ratslam.experiments.salman2016 import reproduction
-from ratslam.experiments.salman2016.claims import Row, column, judge_claim, render_claims
+from ratslam.experiments.salman2016.claims import judge_claim, render_claims
 from ratslam.experiments.salman2016.direction_metrics import direction_metrics, lap_of_step
 from ratslam.experiments.salman2016.protocols import PROTOCOLS, THRESHOLDS, Claim
-from ratslam.experiments.salman2016.reproduction import (
-    match_thresholds,
-    plan_jobs,
-    reproduce,
-    session_config,
-)
+from ratslam.experiments.salman2016.reproduction import PAPER, match_thresholds, plan_jobs, session_config
+from ratslam.experiments.trials import reproduction
 from ratslam.experiments.trials.controls import apply_control
-from ratslam.experiments.trials.threshold_sweep import result_at_threshold, sweep_thresholds
+from ratslam.experiments.trials.reproduction import ResultRow, column, reproduce
+from ratslam.experiments.trials.threshold_sweep import sweep_thresholds
 from ratslam.experiments.trials.touch_trial import (
     SessionResult,
     capacity_for,
@@ -137,12 +133,9 @@ def test_capacities_are_sufficient_powers_of_two(steps):
 
 def test_a_threshold_sweep_equals_single_sessions(tiny):
     config, log = tiny
-    batch = sweep_thresholds(config, log, np.array([0.06, config.templates.threshold]))
-    assert len(np.unique(batch.place[0])) != len(np.unique(batch.place[1]))
-    alone, folded = run_session(config, log), result_at_threshold(config, log, batch, 1)
-    assert np.array_equal(batch.place[1], alone.place)
-    assert np.allclose(folded.trajectory, alone.trajectory, atol=1e-9)
-    assert np.array_equal(folded.closures, alone.closures)
+    first, second = sweep_thresholds(config, log, np.array([0.06, config.templates.threshold]))
+    assert len(np.unique(first)) != len(np.unique(second))
+    assert np.array_equal(second, run_session(config, log).place)
 
 
 def test_only_the_classic_method_has_thresholds(tiny):
@@ -267,15 +260,15 @@ def test_energies_are_compared_by_ratio():
 
 
 def test_sets_stay_paired_where_one_is_missing():
-    rows = [Row("a", "ours", "none", k, k, {"arr": k / 10}) for k in (0, 2)]
-    assert np.array_equal(column(rows, "a", "ours", "none", "arr"), [0, np.nan, 0.2], equal_nan=True)
+    rows = [ResultRow(("a", "ours", "none"), k, k, {"arr": k / 10}) for k in (0, 2)]
+    assert np.array_equal(column(rows, ("a", "ours", "none"), "arr"), [0, np.nan, 0.2], equal_nan=True)
 
 
 @pytest.mark.parametrize(("sets", "said"), [(1, False), (3, True), (6, False)])
 def test_a_table_states_the_significance_of_few_sets(sets, said):
     protocol = PROTOCOLS["fig6"]
     rows = [
-        Row(condition.name, "ours", "none", k, k, {"arr": 0.1 * k + number / 10})
+        ResultRow((condition.name, "ours", "none"), k, k, {"arr": 0.1 * k + number / 10})
         for k in range(sets)
         for number, condition in enumerate(protocol.conditions)
     ]
@@ -287,7 +280,7 @@ def test_a_table_states_the_significance_of_few_sets(sets, said):
 
 def test_matched_thresholds_reach_the_arcr_that_all_conditions_reach():
     def row(name, arcr, arr):
-        return Row(name, "classic", "sweep", 0, 0, {"arcr": arcr, "arr": arr, "threshold": arr})
+        return ResultRow((name, "classic", "sweep"), 0, 0, {"arcr": arcr, "arr": arr, "threshold": arr})
 
     rows = [
         row("a", 0.9, 0.1),
@@ -296,9 +289,9 @@ def test_matched_thresholds_reach_the_arcr_that_all_conditions_reach():
         row("b", 0.7, 0.2),
         row("b", 0.6, 0.4),
     ]
-    found = match_thresholds([*rows, row("c", np.nan, 0.0)], ["a", "b", "c"])
+    found = match_thresholds([*rows, row("c", np.nan, 0.0)])
     assert {name: r.values["arr"] for name, r in found.items()} == {"a": 0.3, "b": 0.2}
-    assert match_thresholds([], ["a"]) == {}
+    assert match_thresholds([]) == {}
 
 
 # The reproductions themselves
@@ -312,17 +305,17 @@ def test_the_program_lists_all_protocols():
 def test_all_conditions_are_valid_and_run_on_the_same_sets(name):
     protocol = PROTOCOLS[name]
     jobs = plan_jobs(protocol, 2, 0)
-    seeds = [{job.task.config.simulation.seed for job in jobs if job.number == n} for n in (0, 1)]
+    seeds = [{job.config.simulation.seed for job in jobs if job.number == n} for n in (0, 1)]
     assert [len(each) for each in seeds] == [1, 1]
     assert seeds[0] != seeds[1]
     names = {condition.name for condition in protocol.conditions}
     assert all({claim.here, claim.there} <= names | {""} for claim in protocol.claims)
     assert {condition for condition, _ in protocol.paper} <= names
     for job in jobs:
-        if job.method == "classic":
-            transform = job.task.config.touch.image.transform
-            assert job.task.config.templates.threshold == THRESHOLDS[transform]
-            assert job.task.config.templates.energy == 0.05
+        if job.key[1] == "classic":
+            transform = job.config.touch.image.transform
+            assert job.config.templates.threshold == THRESHOLDS[transform]
+            assert job.config.templates.energy == 0.05
 
 
 def test_a_tiny_reproduction_leaves_table_rows_and_figure(tmp_path, capsys):
@@ -347,11 +340,13 @@ def test_a_tiny_reproduction_leaves_table_rows_and_figure(tmp_path, capsys):
 
 def test_an_interrupt_keeps_the_finished_sessions(tmp_path, monkeypatch):
     def interrupted(function, tasks, workers):
-        yield from (session(square("CCC")) for _ in tasks[:2])
+        result = session(square("CCC"))
+        for job in tasks[:2]:
+            yield ResultRow(job.key, job.number, job.seed, {"across": 0.0}, (job.laps, result))
         raise KeyboardInterrupt
 
     monkeypatch.setattr(reproduction, "run_tasks", interrupted)
-    text, stopped = reproduce("fig2", tmp_path, sets=1, workers=1, assignments=TINY)
+    text, stopped = reproduce(PAPER, "fig2", tmp_path, sets=1, workers=1, assignments=TINY)
     assert stopped
     assert "Odometry drift" in text
     assert len((tmp_path / "fig2.csv").read_text().splitlines()) == 3
@@ -367,13 +362,13 @@ def test_invalid_arguments_are_refused_before_anything_is_written(tmp_path, caps
         main(["reproduce", "fig9"])
     assert stopped.value.code == 2
     with pytest.raises(InputError, match="fig9"):
-        reproduce("fig9", tmp_path)
+        reproduce(PAPER, "fig9", tmp_path)
 
 
 @pytest.mark.soak
 @pytest.mark.parametrize("name", PROTOCOLS)
 def test_reproductions_run_to_their_end(name, tmp_path):
-    text, stopped = reproduce(name, tmp_path, sets=2, workers=4, assignments=TINY)
+    text, stopped = reproduce(PAPER, name, tmp_path, sets=2, workers=4, assignments=TINY)
     assert not stopped
     assert PROTOCOLS[name].title in text
     assert (tmp_path / f"{name}.png").exists()

@@ -8,9 +8,14 @@ import pytest
 from ratslam.cli import main
 from ratslam.experiments.tables import grid, laser, touch
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row, select_rows
+from ratslam.experiments.trials.touch_trial import TouchMetrics
 from tactile.base.errors import InputError
 
-SESSION = touch.SessionFigures(0.01, 0.02, 2.0, 0.5, 0.9, 0.95, 100, 3, 0.8, 40, ())
+METRICS = TouchMetrics(
+    em=0.01, em_experiences=0.02, em_odometry=2.0, arr=0.5, arcr=0.9, arcr_chain_free=0.95,
+    relocalisations=90, closures=100, false_closures=3, experiences=50, steps=200,
+)  # fmt: skip
+SESSION = touch.SessionFigures(METRICS, revisits_closed=0.8, across=40, recovery=())
 ARENA = grid.GridFigures(0.02, 0.2, np.radians([1.0, 20.0]), 4, (0.9, 0.4, 0.3, 0.04, 0.05))
 
 
@@ -49,7 +54,7 @@ def test_grid_rows_are_valid_configurations(row):
 
 
 def test_a_touch_row_gives_medians_worst_values_and_sums(monkeypatch):
-    worse = SESSION._replace(em=0.5, arcr=0.1)
+    worse = SESSION._replace(metrics=METRICS._replace(em=0.5, arcr=0.1))
     tasks = answers(monkeypatch, touch, lambda task: worse if task.seed == 101 else SESSION)
     _, row = touch.touch_table(["clean"], mazes=2, seeds=2)
     assert [(task.maze, task.seed) for task in tasks] == [(9000, 0), (9000, 1), (9001, 100), (9001, 101)]
@@ -60,7 +65,8 @@ def test_a_touch_row_gives_medians_worst_values_and_sums(monkeypatch):
 
 
 def test_touch_sessions_without_closures_have_no_arcr(monkeypatch):
-    none = SESSION._replace(arcr=np.nan, chain_free=0.0, closures=0, false_closures=0)
+    missing = METRICS._replace(arcr=np.nan, arcr_chain_free=0.0, closures=0, false_closures=0)
+    none = SESSION._replace(metrics=missing)
     answers(monkeypatch, touch, lambda task: none)
     _, row = touch.touch_table(["control: shuffled"], mazes=1, seeds=1)
     assert row.endswith("| 0.500 | - | 0.80 | 0 / 0 |")
