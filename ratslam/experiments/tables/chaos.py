@@ -62,10 +62,8 @@ def separation(one: Variant, other: Variant, motion: np.ndarray) -> np.ndarray:
     Args:
         motion: [T, 3] cells per step.
     """
-    ring = rings(PoseCellConfig(), np.dtype(float))
-    return np.abs(ring_difference(decoded_poses(one, motion) - decoded_poses(other, motion), ring)).max(
-        axis=1
-    )
+    apart = decoded_poses(one, motion) - decoded_poses(other, motion)
+    return np.abs(ring_difference(apart, rings(PoseCellConfig(), np.dtype(float)))).max(axis=1)
 
 
 def decoded_poses(kind: Variant, motion: np.ndarray) -> np.ndarray:
@@ -78,16 +76,13 @@ def decoded_poses(kind: Variant, motion: np.ndarray) -> np.ndarray:
     if not kind.fed_back:
         start = start._replace(settling=jnp.int32(config.settle_steps))
     settled, _ = _walk(config, start, np.zeros((SETTLING, 3), dtype))
-    _, poses = _walk(config, _nudged(settled, kind.nudge), motion.astype(dtype))
+    blocks, level = list(settled.activity.blocks), int(settled.activity.level)
+    cells = blocks[level].activity
+    strongest = np.unravel_index(int(np.argmax(cells)), cells.shape)
+    blocks[level] = blocks[level]._replace(activity=cells.at[strongest].add(kind.nudge))
+    nudged = settled._replace(activity=settled.activity._replace(blocks=tuple(blocks)))
+    _, poses = _walk(config, nudged, motion.astype(dtype))
     return np.asarray(poses, float)
-
-
-def _nudged(cells: PoseCells, by: float) -> PoseCells:
-    blocks = list(cells.activity.blocks)
-    held = blocks[int(cells.activity.level)]
-    strongest = np.unravel_index(int(np.argmax(held.activity)), held.activity.shape)
-    blocks[int(cells.activity.level)] = held._replace(activity=held.activity.at[strongest].add(by))
-    return cells._replace(activity=cells.activity._replace(blocks=tuple(blocks)))
 
 
 @partial(jax.jit, static_argnums=0)

@@ -42,11 +42,6 @@ class Recording(NamedTuple):
     file: str = ""
     real: bool = False
 
-    @property
-    def assignments(self) -> list[str]:
-        """Overrides of the configuration."""
-        return [f"recording.file={GOLDEN}/{self.file}"] if self.file else []
-
 
 ROWS = {
     "square": Recording("`configs/square.yaml`, synthetic", "configs/square.yaml"),
@@ -65,13 +60,6 @@ COLUMNS = (
     "recording", "odometry", "classic (closures, false)", "ratslam (closures, false)",
     "perturbed: median, maximum",
 )  # fmt: skip
-
-
-class RecordingTask(NamedTuple):
-    """One run: a configuration with absolute paths, and the seed of the perturbation (0: none)."""
-
-    config: RunConfig
-    seed: int = 0
 
 
 class RecordingFigures(NamedTuple):
@@ -93,14 +81,10 @@ def laser_table(
     """
     missing = {row: reason for row in rows if (reason := _missing(ROWS[row], folder))}
     present = [row for row in rows if row not in missing]
-    tasks = [
-        task
-        for row in present
-        for task in (
-            RecordingTask(_config(ROWS[row], folder, ["backend=classic"])),
-            *(RecordingTask(_config(ROWS[row], folder), seed) for seed in range(copies + 1)),
-        )
-    ]
+    tasks = []
+    for row in present:
+        tasks.append((_config(ROWS[row], folder, ["backend=classic"]), 0))
+        tasks += [(_config(ROWS[row], folder), seed) for seed in range(copies + 1)]
     results = run_tasks(measure_recording, tasks, workers=workers)
     yield markdown_header(COLUMNS)
     for row in present:
@@ -111,21 +95,20 @@ def laser_table(
     yield from ["", *(f"Left out: {row}: {reason}" for row, reason in missing.items())] if missing else []
 
 
-def measure_recording(task: RecordingTask) -> RecordingFigures:
-    """Runs and measures one recording.
+def measure_recording(task: tuple[RunConfig, int]) -> RecordingFigures:
+    """Runs and measures one recording, perturbed with a seed (0: not at all).
 
     Raises:
         InputError: the recording cannot be used, or has no truth.
     """
-    with open_observations(task.config) as (config, source):
+    given, seed = task
+    with open_observations(given) as (config, source):
         log = load_into_memory(source)
     if log.truth is None:
         raise InputError(log.name, "no true poses", "a recording with truth")
-    if task.seed:
-        log = perturb(log, task.seed)
+    log = perturb(log, seed) if seed else log
     session = build_session(config, log)
-    for _ in session.replay(observation_of(sample) for sample in log):
-        pass
+    list(session.replay(observation_of(sample) for sample in log))
     truth = np.asarray(log.truth)
     known = np.isfinite(truth).all(axis=1)
     closures = session.map.closures()
@@ -142,16 +125,16 @@ def _missing(recording: Recording, folder: Path) -> str:
     """Why a recording cannot be run; "" if it can."""
     if recording.real and not os.environ.get(DATA):
         return f"set {DATA} to the folder of the real recordings"
-    files = [folder / recording.config]
-    files += [files[0].parent / value.partition("=")[2] for value in recording.assignments]
-    return next(
-        (f"{file} is not there; run this in the repository" for file in files if not file.exists()), ""
-    )
+    config = folder / recording.config
+    files = config, config.parent / GOLDEN / recording.file
+    absent = [file for file in files if not file.exists()]
+    return f"{absent[0]} is not there; run this in the repository" if absent else ""
 
 
 def _config(recording: Recording, folder: Path, assignments: Sequence[str] = ()) -> RunConfig:
     path = folder / recording.config
-    document = override(load(path), [*recording.assignments, *assignments])
+    other = [f"recording.file={GOLDEN}/{recording.file}"] if recording.file else []
+    document = override(load(path), [*other, *assignments])
     return validate(document, RunConfig).with_absolute_paths(path.parent.resolve())
 
 

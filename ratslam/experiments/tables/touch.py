@@ -6,9 +6,9 @@ success is an Energy Metric (all pairs, m^2 + rad^2) below `SUCCESS`.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,7 +27,7 @@ from ratslam.experiments.trials.touch_trial import (
     touch_metrics,
 )
 from ratslam.pipeline.source import open_observations
-from robot.sources.in_memory import InMemorySource, load_into_memory
+from robot.sources.in_memory import load_into_memory
 
 FIRST_MAZE = 9000
 SUCCESS = 0.25
@@ -39,7 +39,7 @@ REVISIT_GAP, REVISIT_DISTANCE = 60, 0.05
 """A revisit is a step within this distance (m) of the position more than this many steps before."""
 
 MAIN: dict[str, Any] = {"motion": {"jitter": {"position": 0.005, "yaw_deg": 1.5, "speed": 0.05}}}
-ROUGH: dict[str, Any] = {"motion": {"jitter": {"position": 0.010, "yaw_deg": 3.0, "speed": 0.10}}}
+ROUGH = {"motion": {"jitter": {"position": 0.010, "yaw_deg": 3.0, "speed": 0.10}}}
 MAX_ANGLE = {"image": {"transform": "max_angle"}}
 OPEN_LOOP = {"whisking": {"mode": "open"}}
 
@@ -136,9 +136,7 @@ def touch_table(
     """The lines of the table, each as soon as its sessions are done."""
     tasks = [
         TouchTask(row, FIRST_MAZE + maze, 100 * maze + seed, backend)
-        for row in rows
-        for maze in range(mazes)
-        for seed in range(seeds)
+        for row, maze, seed in product(rows, range(mazes), range(seeds))
     ]
     results = run_tasks(measure_session, tasks, workers=workers)
     notes: list[str] = []
@@ -152,42 +150,7 @@ def touch_table(
 
 def measure_session(task: TouchTask) -> SessionFigures:
     """Runs and measures one session."""
-    log, config, kidnaps = _simulate(task)
-    result = run_session(config, log)
-    truth = result.truth
-    true_closures = result.closures[closure_errors(result) <= FALSE_CLOSURE_DISTANCE]
-    exm = ExmConfig()
-    if experience_metric_if_defined(result) is None:  # never at its start again: a quarter is the base set
-        exm = ExmConfig(base=len(truth) // 4)
-    read = result.trajectory.copy()
-    read[result.place >= 0] = result.node[result.place[result.place >= 0]]
-    change = int(CHANGE * log.length)
-    across = (result.closures[:, 0] >= change) & (result.closures[:, 1] < change)
-    metrics = touch_metrics(result, exm)
-    return SessionFigures(
-        metrics._replace(
-            em_experiences=energy_all_pairs(read, truth).total,
-            arcr_chain_free=float(np.nan_to_num(metrics.arcr_chain_free)),
-        ),
-        revisits_closed=_revisits_closed(truth, true_closures),
-        across=int(across.sum()),
-        recovery=tuple(_recovery(jump, true_closures, log.length) for jump in kidnaps),
-    )
-
-
-def task_config(task: TouchTask) -> RunConfig:
-    """The configuration of a session."""
-    row = ROWS[task.row]
-    simulation = row.simulation | {"seed": task.seed}
-    simulation["maze"] = {"seed": task.maze} | simulation.get("maze", {})
-    given = {"simulation": simulation, "touch": row.touch, "backend": task.backend}
-    return RunConfig.model_validate(given)
-
-
-def _simulate(task: TouchTask) -> tuple[InMemorySource, RunConfig, list[int]]:
-    """The views of a session, its completed configuration, and the steps of its kidnaps."""
-    config = task_config(task)
-    with open_observations(config) as (config, source):
+    with open_observations(task_config(task)) as (config, source):
         kidnaps = np.flatnonzero(source.source.kidnapped).tolist()  # type: ignore[attr-defined]
         log = load_into_memory(source)
     if task.row == "control: shuffled":
@@ -195,7 +158,34 @@ def _simulate(task: TouchTask) -> tuple[InMemorySource, RunConfig, list[int]]:
         log = replace(log, views=log.views[order].copy())
     if task.row == "control: no image":
         log = replace(log, views=np.zeros_like(log.views))
-    return log, config, kidnaps
+    result = run_session(config, log)
+    truth = result.truth
+    true_closures = result.closures[closure_errors(result) <= FALSE_CLOSURE_DISTANCE]
+    returned = experience_metric_if_defined(result) is not None  # else a quarter is the base set
+    metrics = touch_metrics(result, ExmConfig(base=None if returned else len(truth) // 4))
+    read = result.trajectory.copy()
+    read[result.place >= 0] = result.node[result.place[result.place >= 0]]
+    change = int(CHANGE * log.length)
+    across = (result.closures[:, 0] >= change) & (result.closures[:, 1] < change)
+    later, earlier = true_closures.T
+    recovered = [min(later[(later >= k) & (earlier < k)] - k, default=log.length) for k in kidnaps]
+    return SessionFigures(
+        metrics._replace(
+            em_experiences=energy_all_pairs(read, truth).total,
+            arcr_chain_free=float(np.nan_to_num(metrics.arcr_chain_free)),
+        ),
+        revisits_closed=_revisits_closed(truth, true_closures),
+        across=int(across.sum()),
+        recovery=tuple(map(int, recovered)),
+    )
+
+
+def task_config(task: TouchTask) -> RunConfig:
+    """The configuration of a session."""
+    _, simulation, touch = ROWS[task.row]
+    maze = {"seed": task.maze} | simulation.get("maze", {})
+    simulation = simulation | {"seed": task.seed, "maze": maze}
+    return RunConfig.model_validate({"simulation": simulation, "touch": touch, "backend": task.backend})
 
 
 def _revisits_closed(truth: np.ndarray, true_closures: np.ndarray) -> float:
@@ -210,12 +200,6 @@ def _revisits_closed(truth: np.ndarray, true_closures: np.ndarray) -> float:
     return float(closed[revisits].mean()) if revisits else np.nan
 
 
-def _recovery(jump: int, true_closures: np.ndarray, steps: int) -> int:
-    """Whisks from a kidnap to the first true closure with a step before it; all of them if there is none."""
-    after = true_closures[(true_closures[:, 0] >= jump) & (true_closures[:, 1] < jump), 0]
-    return int(after.min() - jump) if len(after) else steps
-
-
 def _cells(found: Sequence[SessionFigures]) -> list[str]:
     values = {name: [getattr(one.metrics, name) for one in found] for name in TouchMetrics._fields}
     values["revisits_closed"] = [one.revisits_closed for one in found]
@@ -225,7 +209,7 @@ def _cells(found: Sequence[SessionFigures]) -> list[str]:
         return f"{np.nanmedian(values[name]):.{digits}f}" if known else "-"
 
     em, strict = np.array(values["em"]), np.array(values["arcr"])
-    worst = np.nanmin(strict) if np.isfinite(strict).any() else math.nan
+    worst = np.nanmin(strict) if np.isfinite(strict).any() else np.nan
     return [
         f"{np.median(em):.3f} ({em.max():.2f})",
         f"{(em < SUCCESS).sum()} of {len(found)}",
