@@ -62,11 +62,8 @@ class TouchSource(ClosedSource):
             if reading is None:
                 continue
             if reading.view.shape != self.view_shape:
-                raise InputError(
-                    self.name,
-                    f"a view of shape {reading.view.shape}",
-                    f"{self.view_shape}, the shape of whisker images",
-                )
+                found = f"a view of shape {reading.view.shape}"
+                raise InputError(self.name, found, f"{self.view_shape}, the shape of whisker images")
             yield sample._replace(reading=reading)
 
 
@@ -111,9 +108,8 @@ def observation_of(sample: Sample) -> Observation:
         InputError: it is whisker data.
     """
     if not isinstance(sample.reading, Observation):
-        raise InputError(
-            "recording.file", "whisker readings", "observations", "open it with open_touch_source"
-        )
+        cure = "open it with open_touch_source"
+        raise InputError("recording.file", "whisker readings", "observations", cure)
     return sample.reading
 
 
@@ -148,8 +144,7 @@ def strain_templates_of(source: Source, config: ReportFrontendConfig) -> StrainT
     try:
         made = CreateSimulationConfig.model_validate(source.info.provenance.get("create_simulation"))
     except ValueError as error:
-        raise InputError(
-            f"{source.name}: create_simulation", str(error), "the configuration of a simulated Create",
-            "train strain templates and name their file in touch.reports.templates",
-        ) from None  # fmt: skip
+        where, expected = f"{source.name}: create_simulation", "the configuration of a simulated Create"
+        cure = "train strain templates and name their file in touch.reports.templates"
+        raise InputError(where, str(error), expected, cure) from None
     return train_strain_templates(made)

@@ -61,16 +61,16 @@ def encode(sample: Sample, view_shape: tuple[int, int, int], whiskers: int) -> t
         samples, values["sample_time"] = len(np.atleast_1d(reading.time)), reading.time
     elif isinstance(reading, Whisk):
         numbers = np.dtype(("<f8", (whiskers,)))
-        values["felt"] = np.stack([_exactly(field, values[field], numbers) for field in FELT], axis=1)
+        values["felt"] = np.stack([_convert_exactly(field, values[field], numbers) for field in FELT], axis=1)
     else:
-        values["dead"] = ~_exactly("alive", reading.alive, np.dtype(("?", (whiskers,)))).astype(bool)
+        values["dead"] = ~_convert_exactly("alive", reading.alive, np.dtype(("?", (whiskers,)))).astype(bool)
     layout = message_layout(name, view_shape, whiskers, samples)
     if name in FLAGS:
-        values["flags"] = _packed(values, FLAGS[name], whiskers)
+        values["flags"] = _pack_flags(values, FLAGS[name], whiskers)
     values["time"] = sample.time
     record = layout.blank.copy()
     for field in layout.fields:
-        record[field] = _exactly(field, values[field], layout.dtype[field])
+        record[field] = _convert_exactly(field, values[field], layout.dtype[field])
     return name, record.tobytes()
 
 
@@ -95,7 +95,7 @@ def decode(name: str, message: bytes, view_shape: tuple[int, int, int], whiskers
     if name == CYCLE:
         time, angle, deflection = (record[field].copy() for field in ("sample_time", "angle", "deflection"))
         return float(record["time"]), Cycle(time, angle, deflection, odometry)
-    flags = _unpacked(record["flags"], FLAGS[name])
+    flags = _unpack_flags(record["flags"], FLAGS[name])
     if name == WHISK:
         felt = {field: record["felt"][:, k].copy() for k, field in enumerate(FELT)}
         return float(record["time"]), Whisk(odometry=odometry, **flags, **felt)
@@ -120,7 +120,7 @@ def decode(name: str, message: bytes, view_shape: tuple[int, int, int], whiskers
 
 def encode_truth(time: float, truth: np.ndarray) -> bytes:
     """A truth [3] as a message."""
-    return CDR + np.array([time, *_exactly("truth", truth, np.dtype(("<f8", (3,))))], "<f8").tobytes()
+    return CDR + np.array([time, *_convert_exactly("truth", truth, np.dtype(("<f8", (3,))))], "<f8").tobytes()
 
 
 def decode_truth(message: bytes) -> tuple[float, np.ndarray]:
@@ -169,31 +169,29 @@ def message_layout(name: str, view_shape: tuple[int, int, int], whiskers: int, s
     )
 
 
-def _packed(values: dict[str, Any], names: tuple[str, ...], whiskers: int) -> np.ndarray:
+def _pack_flags(values: dict[str, Any], names: tuple[str, ...], whiskers: int) -> np.ndarray:
     """[W] uint8, the boolean arrays [W] of these names as bits."""
     flags = np.zeros(whiskers, np.uint8)
     for bit, name in enumerate(names):
-        flags |= _exactly(name, values[name], np.dtype(("?", (whiskers,)))).astype(np.uint8) << bit
+        flags |= _convert_exactly(name, values[name], np.dtype(("?", (whiskers,)))).astype(np.uint8) << bit
     return flags
 
 
-def _unpacked(flags: np.ndarray, names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """The inverse of `_packed`."""
+def _unpack_flags(flags: np.ndarray, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """The inverse of `_pack_flags`."""
     if (flags >> len(names)).any():
-        raise Malformed(
-            f"whisker flags {int(flags.max())} where {2 ** len(names) - 1} is the largest possible"
-        )
+        most = 2 ** len(names) - 1
+        raise Malformed(f"whisker flags {int(flags.max())} where {most} is the largest possible")
     return {name: (flags >> bit & 1).astype(bool) for bit, name in enumerate(names)}
 
 
-def _exactly(name: str, value: Any, dtype: np.dtype) -> np.ndarray:
+def _convert_exactly(name: str, value: Any, dtype: np.dtype) -> np.ndarray:
     """The value with that dtype and shape; `InputError` if it cannot be held exactly."""
     array = np.asarray(value)
     base, shape = dtype.base, dtype.shape
     if array.shape != shape:
-        raise InputError(
-            name, f"shape {list(array.shape)}", f"{list(shape)}, as the recording was opened for"
-        )
+        expected = f"{list(shape)}, as the recording was opened for"
+        raise InputError(name, f"shape {list(array.shape)}", expected)
     if array.dtype != base:
         kinds = "biuf" if base.kind == "f" else "biu"
         if array.dtype.kind not in kinds or not np.array_equal(array.astype(base), array, equal_nan=True):

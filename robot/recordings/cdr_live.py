@@ -40,13 +40,13 @@ def encode_frames(time: float, frames: Frames) -> bytes:
     planes = frames.values.reshape(count, whiskers * channels).T
     parts = [
         struct.pack("<4sd2I", CDR, time, count, count),
-        _steps(frames.sequence, "<i8"),
+        _encode_steps(frames.sequence, "<i8"),
         struct.pack("<2I", whiskers, count),
-        _steps(frames.time, "<i8"),
+        _encode_steps(frames.time, "<i8"),
         struct.pack("<2I", channels, count),
         frames.flags.astype("<u4").tobytes(),
         struct.pack("<I", planes.size),
-        _steps(planes, "<i2"),
+        _encode_steps(planes, "<i2"),
     ]
     return b"".join(parts)
 
@@ -156,7 +156,7 @@ def decode_event(message: bytes) -> Event:
     return Event(time, name, found)
 
 
-def _steps(value: np.ndarray, kind: str) -> bytes:
+def _encode_steps(value: np.ndarray, kind: str) -> bytes:
     """The first value along the last axis, then differences; both wrap around."""
     return np.diff(value, axis=-1, prepend=value.dtype.type(0)).astype(kind).tobytes()
 

@@ -42,16 +42,15 @@ def align_views(
         errors += view_errors(values.min(axis=1), values.max(axis=1), what, place)
     else:
         values = np.where(np.isposinf(values), part.max_range, values)  # REP-117: no object in range
-        errors = nonfinite_errors(values, what, place) + _range_faults(
-            values, part.max_range, what, place, file.path
-        )
+        errors = nonfinite_errors(values, what, place)
+        errors += _range_errors(values, part.max_range, what, place, file.path)
         groups = np.minimum(values, part.max_range).reshape(len(values), pixels, -1)
         values = groups.mean(axis=2) / part.max_range
-    rows, faults = _rows(file, base, there, part.time, part.tolerance, time)
+    rows, faults = _match_rows(file, base, there, part.time, part.tolerance, time)
     return rows, values.reshape(-1, *shape), errors + faults
 
 
-def _range_faults(
+def _range_errors(
     values: np.ndarray, reach: float, what: str, place: RowName, path: Path
 ) -> list[InputError]:
     errors = []
@@ -75,13 +74,13 @@ def align_labels(
 ) -> AlignedRows:
     """Place labels [M] int32, given or derived from pairs."""
     if pairs is not None:
-        return _paired(base, files[pairs.file], pairs, time)
+        return _labels_of_file(base, files[pairs.file], pairs, time)
     assert labels is not None
     file = files[labels.file or base.path]
     ids, empty = file.column(labels.column), file.empty[:, file.names.index(labels.column)]
     there = np.flatnonzero(~empty & (ids != -1))
     ids = ids[there]
-    rows, errors = _rows(file, base, there, labels.time, labels.tolerance, time)
+    rows, errors = _match_rows(file, base, there, labels.time, labels.tolerance, time)
     bad = ~((ids >= 0) & (ids <= np.iinfo(np.int32).max) & (ids == np.round(ids)))
     if bad.any():
         row = int(bad.argmax())
@@ -90,7 +89,7 @@ def align_labels(
     return rows, ids.astype(np.int32), errors
 
 
-def _paired(base: CsvFile, file: CsvFile, part: PairColumns, time: np.ndarray) -> AlignedRows:
+def _labels_of_file(base: CsvFile, file: CsvFile, part: PairColumns, time: np.ndarray) -> AlignedRows:
     later, earlier, score = (file.column(name) for name in (part.later, part.earlier, part.score))
     errors = file.faults(part.later, part.earlier, part.score)
     crossed = later <= earlier
@@ -102,7 +101,7 @@ def _paired(base: CsvFile, file: CsvFile, part: PairColumns, time: np.ndarray) -
     if errors:
         return later, later, errors
     moments, ids = labels_from_pairs(later.tolist(), earlier.tolist(), score.tolist(), part.threshold)
-    rows, errors = _nearest(moments, time, part.tolerance, lambda i: f"{file.path}, time {moments[i]}")
+    rows, errors = _nearest_rows(moments, time, part.tolerance, lambda i: f"{file.path}, time {moments[i]}")
     return rows, ids, errors
 
 
@@ -161,7 +160,7 @@ def align_truth(
     return np.where(known[:, None], at, np.nan), errors
 
 
-def _rows(
+def _match_rows(
     file: CsvFile, base: CsvFile, there: np.ndarray, name: str, tolerance: float | None, time: np.ndarray
 ) -> tuple[np.ndarray, list[InputError]]:
     """Odometry rows of the rows [M] of a file: the same, or the nearest in time."""
@@ -170,7 +169,7 @@ def _rows(
     moments = file.column(name)[there]
     place = _place(file, there)
     errors = nonfinite_errors(moments, name, place) + clock_errors(moments, name, place)
-    return (there, errors) if errors else _nearest(moments, time, tolerance, place)
+    return (there, errors) if errors else _nearest_rows(moments, time, tolerance, place)
 
 
 def _place(file: CsvFile, there: np.ndarray) -> RowName:
@@ -178,7 +177,7 @@ def _place(file: CsvFile, there: np.ndarray) -> RowName:
     return lambda row: file.place(int(there[row]))
 
 
-def _nearest(
+def _nearest_rows(
     moments: np.ndarray, time: np.ndarray, tolerance: float | None, place: RowName
 ) -> tuple[np.ndarray, list[InputError]]:
     """The odometry row nearest in time to each of the times [M], at most the tolerance away."""

@@ -53,11 +53,8 @@ class CsvFile:
     def absences(self, wanted: Sequence[tuple[str, str]]) -> list[InputError]:
         """Errors for (column, configuration key) pairs whose column is missing."""
         where = f"{self.path}:1"
-        return [
-            missing_error(where, "column", name, self.names, key)
-            for name, key in wanted
-            if name not in self.names
-        ]
+        absent = [(name, key) for name, key in wanted if name not in self.names]
+        return [missing_error(where, "column", name, self.names, key) for name, key in absent]
 
     def numbered(self, prefix: str) -> dict[int, int]:
         """Columns prefix0, prefix1, ...: their numbers in increasing order, and their positions."""

@@ -75,17 +75,15 @@ def _absences(base: CsvFile, files: Mapping[Path, CsvFile], config: CsvConfig) -
         expected = f"one of them, naming the odometry among {', '.join(base.names)}"
         errors.append(InputError(str(base.path), found, expected))
     if config.labels is not None and config.pairs is not None:
-        errors.append(
-            InputError(str(base.path), "both table.labels and table.pairs are given", "one of them")
-        )
+        found = "both table.labels and table.pairs are given"
+        errors.append(InputError(str(base.path), found, "one of them"))
     for key in ("pose", "velocity", "labels", "pairs", "truth", "views"):
         part = getattr(config, key)
         if part is None:
             continue
         file = files[getattr(part, "file", None) or base.path]
-        named = part.model_dump(
-            exclude={"file", "tolerance", "threshold", "prefix", "max_range"}, exclude_none=True
-        )
+        numbers = {"file", "tolerance", "threshold", "prefix", "max_range"}
+        named = part.model_dump(exclude=numbers, exclude_none=True)
         if file is base:
             named.pop("time", None)  # the time of the odometry is used there
         errors += file.absences([(column, f"table.{key}.{field}") for field, column in named.items()])
@@ -97,9 +95,8 @@ def _absences(base: CsvFile, files: Mapping[Path, CsvFile], config: CsvConfig) -
 def _gap(file: CsvFile, prefix: str) -> list[InputError]:
     """The error for view columns whose numbers have a gap."""
     there = list(file.numbered(prefix))
-    absent = (
-        next((number for number in range(there[0], there[-1]) if number not in there), None) if there else 0
-    )
+    wanted = range(there[0], there[-1]) if there else [0]
+    absent = next((number for number in wanted if number not in there), None)
     if absent is None:
         return []
     return [missing_error(f"{file.path}:1", "column", f"{prefix}{absent}", file.names, "table.views.prefix")]

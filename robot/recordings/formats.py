@@ -92,8 +92,7 @@ def open_recording(config: RecordingConfig, warn: Warn = None) -> Source:
     opener = FORMATS.get(config.file.suffix.lower())
     if opener is None:
         require_file(config.file)
-        found = (
-            f"no reader for {config.file.suffix!r} files" if config.file.suffix else "a file without a suffix"
-        )
+        suffix = config.file.suffix
+        found = f"no reader for {suffix!r} files" if suffix else "a file without a suffix"
         raise InputError(str(config.file), found, f"one of {', '.join(FORMATS)}")
     return opener(config, warn)

@@ -61,13 +61,13 @@ class Recording(ClosedSource):
         raw_whiskers = False
         for entry in scanner.entries():
             if isinstance(entry.content, Sample):
-                columns.extend(_column(entry.content))
+                columns.extend(_checked_values(entry.content))
                 raw_whiskers |= not isinstance(entry.content.reading, Observation)
             elif isinstance(entry.content, Event):
                 events.append(entry.content)
         description = scanner.description
         if description is None or not scanner.count:
-            raise _nothing(scanner)
+            raise _unreadable_recording_error(scanner)
         self.events = tuple(events)
         self.view_shape, self.whiskers = description.view_shape, description.whiskers
         self.created_by = description.created_by
@@ -77,12 +77,12 @@ class Recording(ClosedSource):
         self.warning = ""
         if self.truncated:
             self.warning = f"{path}: {self.length} samples are readable, the rest is lost: {scanner.broken}"
-        time = self._check(np.frombuffer(columns).reshape(scanner.count, -1), limits)
+        time = self._check_columns(np.frombuffer(columns).reshape(scanner.count, -1), limits)
         self.rate_hz = rate_of(time) or description.rate_hz
         if self.truncated and warn is not None:
             warn(self.warning)
 
-    def _check(self, columns: np.ndarray, limits: UnitLimits) -> np.ndarray:
+    def _check_columns(self, columns: np.ndarray, limits: UnitLimits) -> np.ndarray:
         """Times [N] s of the samples with odometry; raises the errors of all columns."""
         time, motion, truth = columns[:, 0], columns[:, 1:5], columns[:, 5:8]
         low, high, odd, has_truth = columns[:, 8:].T
@@ -94,9 +94,8 @@ class Recording(ClosedSource):
 
         errors = nonfinite_errors(time, "time", place) + clock_errors(time, "time", place, moved)
         errors += nonfinite_errors(motion, "odometry", place) + view_errors(low, high, "view", place)
-        errors += nonfinite_errors(odd, "a number in the reading", place) + nonfinite_errors(
-            truth, "truth", place, has_truth > 0
-        )
+        errors += nonfinite_errors(odd, "a number in the reading", place)
+        errors += nonfinite_errors(truth, "truth", place, has_truth > 0)
         back = motion[:, 3] < 0
         if back.any():
             row = int(back.argmax())
@@ -111,11 +110,8 @@ class Recording(ClosedSource):
             yield sample
             if scanner.count == self.length:
                 return
-        raise InputError(
-            str(self.path),
-            f"had {self.length} samples and now has {scanner.count}",
-            "a file that does not change while it is read",
-        )
+        found = f"had {self.length} samples and now has {scanner.count}"
+        raise InputError(str(self.path), found, "a file that does not change while it is read")
 
 
 class Recovery(NamedTuple):
@@ -132,12 +128,9 @@ class Recovery(NamedTuple):
 
 def record_source(source: Source, path: Path) -> int:
     """Write all samples of a source to a new recording; returns their number."""
+    shape, rate = source.view_shape, source.rate_hz
     with Recorder(
-        path,
-        view_shape=source.view_shape,
-        whiskers=source.whiskers,
-        rate_hz=source.rate_hz,
-        info=source.info,
+        path, view_shape=shape, whiskers=source.whiskers, rate_hz=rate, info=source.info
     ) as recorder:
         for sample in source:
             recorder.write(sample)
@@ -159,39 +152,37 @@ def recover(path: Path, out: Path) -> Recovery:
     entries = scanner.entries()
     first = next(entries, None)
     if first is None or scanner.description is None:
-        raise _nothing(scanner)
+        raise _unreadable_recording_error(scanner)
     described = scanner.description
 
     def write(path: Path) -> None:
-        writer = McapWriter(path, view_shape=described.view_shape, whiskers=described.whiskers,
-                    rate_hz=described.rate_hz, info=described.info)  # fmt: skip
-        with closing(writer):
+        shape, whiskers, rate, _, info = described
+        with closing(
+            McapWriter(path, view_shape=shape, whiskers=whiskers, rate_hz=rate, info=info)
+        ) as writer:
             for entry in chain([first], entries):
                 if entry.truth is not None:
                     writer.append(TRUTH, entry.time, entry.truth)
                 writer.append(entry.name, entry.time, entry.message)
         if not scanner.count:
-            raise _nothing(scanner)
+            raise _unreadable_recording_error(scanner)
         flush_to_disk(path)
 
     write_atomically(out, write)
     return Recovery(scanner.count, bool(scanner.broken), scanner.broken)
 
 
-def _nothing(scanner: McapScanner) -> InputError:
+def _unreadable_recording_error(scanner: McapScanner) -> InputError:
     """The error for a file without a description or without samples."""
     if scanner.description is None:
         found = f"cannot be read as a recording: {scanner.broken or 'it has no ratslam metadata'}"
-        return InputError(
-            str(scanner.path), found, "an MCAP file written by this version of ratslam", "record it again"
-        )
-    found = f"holds no samples{': ' + scanner.broken if scanner.broken else ''}"
-    return InputError(
-        str(scanner.path), found, "at least one sample", "record it again: nothing can be recovered"
-    )
+        expected = "an MCAP file written by this version of ratslam"
+        return InputError(str(scanner.path), found, expected, "record it again")
+    found, cure = f"holds no samples{': ' + scanner.broken if scanner.broken else ''}", "record it again"
+    return InputError(str(scanner.path), found, "at least one sample", f"{cure}: nothing can be recovered")
 
 
-def _column(sample: Sample) -> tuple[float, ...]:
+def _checked_values(sample: Sample) -> tuple[float, ...]:
     """The checked columns of a sample: time, odometry, truth, smallest and largest view value, one non-finite
     number or 0, and whether there is a truth."""
     reading = sample.reading

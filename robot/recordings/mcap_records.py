@@ -23,7 +23,7 @@ CHUNK_LIMIT = 1 << 28  # bytes; ratslam writes 64 kB, or one sample if that is l
 DAMAGE_ERRORS = (McapError, zstandard.ZstdError, struct.error, ValueError, OverflowError)
 
 
-class _Bounded:
+class _BoundedFile:
     """A file whose `read` returns exactly the requested bytes or raises `EndOfFile`."""
 
     def __init__(self, file: IO[bytes]) -> None:
@@ -43,15 +43,15 @@ class _Bounded:
 
 def read_records(file: IO[bytes]) -> Iterator[McapRecord]:
     """All records in order, those in chunks included; raises one of `DAMAGE_ERRORS`."""
-    reader = StreamReader(cast(Any, _Bounded(file)), emit_chunks=True, validate_crcs=True)
+    reader = StreamReader(cast(Any, _BoundedFile(file)), emit_chunks=True, validate_crcs=True)
     for record in reader.records:
         if isinstance(record, Chunk):
-            yield from _opened(record)
+            yield from _open_chunk(record)
         elif not isinstance(record, (Message, Channel, Schema)):  # without a checksum outside a chunk
             yield record
 
 
-def _opened(chunk: Chunk) -> list[McapRecord]:
+def _open_chunk(chunk: Chunk) -> list[McapRecord]:
     if chunk.compression not in ("zstd", ""):
         raise Malformed(f"a chunk compressed with {chunk.compression!r}")
     size = len(chunk.data)

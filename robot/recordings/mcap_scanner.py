@@ -107,13 +107,14 @@ class McapScanner:
         count: samples read so far.
     """
 
+    _frames: FrameWindow
+
     def __init__(self, path: Path) -> None:
         self.path = path
         self.description: RecordingDescription | None = None
         self.broken = "it has not been read to its end"
         self.count = 0
         self._number = 0  # of the next message; a truth has the number of its reading
-        self._window: FrameWindow | None = None
 
     def __iter__(self) -> Iterator[Sample]:
         return (entry.content for entry in self.entries() if isinstance(entry.content, Sample))
@@ -134,10 +135,11 @@ class McapScanner:
             for record in read_records(file):
                 if isinstance(record, Metadata) and record.name == METADATA and self.description is None:
                     self.description = RecordingDescription.from_metadata(record.metadata)
+                    self._frames = FrameWindow(empty_frames(self.description.whiskers))
                 elif isinstance(record, Schema):
                     schemas[record.id] = record
                 elif isinstance(record, Channel):
-                    names[record.id] = _known(record, schemas) if record.topic in SCHEMA_OF else ""
+                    names[record.id] = _schema_of(record, schemas) if record.topic in SCHEMA_OF else ""
                 elif isinstance(record, Message):
                     name = names.get(record.channel_id, "")
                     if not name:
@@ -160,11 +162,10 @@ class McapScanner:
                         time, content = self._block(name, record.data)
                         yield RecordingEntry(name, time, record.data, None, content)
                 elif isinstance(record, Statistics):
-                    self._compare(record, names)
+                    self._check_counts(record, names)
         except DAMAGE_ERRORS as error:
-            self.broken = (
-                "it ends too early" if isinstance(error, EndOfFile) else str(error) or type(error).__name__
-            )
+            text = str(error) or type(error).__name__
+            self.broken = "it ends too early" if isinstance(error, EndOfFile) else text
         else:
             self.broken = ""
 
@@ -188,14 +189,7 @@ class McapScanner:
         event = decode_event(message)
         return event.time, event
 
-    @property
-    def _frames(self) -> FrameWindow:
-        if self._window is None:
-            assert self.description is not None
-            self._window = FrameWindow(empty_frames(self.description.whiskers))
-        return self._window
-
-    def _compare(self, statistics: Statistics, names: Mapping[int, str]) -> None:
+    def _check_counts(self, statistics: Statistics, names: Mapping[int, str]) -> None:
         """Compare counts: a chunk with a damaged type is skipped as an unknown record, so messages are
         missing."""
         counts = statistics.channel_message_counts
@@ -205,7 +199,7 @@ class McapScanner:
             raise Malformed(f"{self._number} messages where {written} were written")
 
 
-def _known(channel: Channel, schemas: Mapping[int, Schema]) -> str:
+def _schema_of(channel: Channel, schemas: Mapping[int, Schema]) -> str:
     """The schema name of a ratslam topic; raises `Malformed` if another version defined it differently."""
     name, schema = SCHEMA_OF[channel.topic], schemas.get(channel.schema_id)
     if schema is None or schema.data != SCHEMAS[name].encode():

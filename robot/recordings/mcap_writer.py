@@ -68,7 +68,7 @@ class McapWriter:
         RecordingDescription.from_metadata(metadata)
         self.path = path
         try:
-            self._file = _Whole(path)
+            self._file = WholeChunkFile(path)
         except FileExistsError as error:
             raise existing_error(path) from error
         except OSError as error:
@@ -142,7 +142,7 @@ class McapWriter:
         return self._channels[name]
 
 
-class _Whole:
+class WholeChunkFile:
     """A new file that is written at `flush`: all waiting bytes or none."""
 
     def __init__(self, path: Path) -> None:

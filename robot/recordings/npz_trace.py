@@ -31,6 +31,8 @@ VIEW, ODOMETRY = 1, 2
 COLUMNS = ("in_t", "in_v", "in_w", "in_flags")
 NEEDED = (*COLUMNS, "in_view", "params_json")
 
+Parameters = dict[str, float | int | str]
+
 # What NumPy and zipfile raise for a file that is damaged, truncated or of another type.
 _BROKEN = (zipfile.BadZipFile, zlib.error, ValueError, LookupError, EOFError, OSError, MemoryError,
            RuntimeError, SyntaxError)  # fmt: skip
@@ -145,7 +147,7 @@ def _shape_errors(path: Path, arrays: dict[str, np.ndarray]) -> list[InputError]
     return errors
 
 
-def _params(path: Path, text: np.ndarray) -> dict[str, float | int | str]:
+def _params(path: Path, text: np.ndarray) -> Parameters:
     """The parameters, numeric text converted to numbers."""
     try:
         params = json.loads(str(text[()]))
@@ -156,7 +158,7 @@ def _params(path: Path, text: np.ndarray) -> dict[str, float | int | str]:
     return {key: _number(value) for key, value in params.items()}
 
 
-def _info(params: dict[str, float | int | str], labels_only: bool) -> SourceInfo:
+def _info(params: Parameters, labels_only: bool) -> SourceInfo:
     cell = params.get("pc_cell_x_size")
     return SourceInfo(
         labels_only=labels_only,
@@ -189,9 +191,8 @@ def _view_shape(path: Path, params: dict, width: int) -> tuple[tuple[int, int, i
         size.append(value)
     rows, columns = size
     if width not in (rows * columns, 2):
-        expected = (
-            f"{rows * columns} (template_y_size {rows} x template_x_size {columns}), or 2 (id, relative_rad)"
-        )
+        size_text = f"template_y_size {rows} x template_x_size {columns}"
+        expected = f"{rows * columns} ({size_text}), or 2 (id, relative_rad)"
         raise InputError(str(path), f"in_view has {width} columns", expected)
     return (rows, columns, 1), width != rows * columns
 
@@ -215,8 +216,6 @@ def _id_errors(view: np.ndarray, seen: np.ndarray, place: RowName) -> list[Input
     turned = seen & (relative != 0)
     if turned.any():
         row = int(turned.argmax())
-        found = f"in_view's relative angle is {relative[row]} rad"
-        errors.append(
-            InputError(place(row), found, "0", "relative angles of given matches are not supported")
-        )
+        found, cure = f"in_view's relative angle is {relative[row]} rad", "relative angles are not supported"
+        errors.append(InputError(place(row), found, "0", cure))
     return errors

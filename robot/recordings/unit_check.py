@@ -78,16 +78,10 @@ def typical_motion(track: MotionTrack) -> TypicalMotion:
     dt = track.motion[:, 3]
     good = np.isfinite(track.motion).all(axis=1) & (dt > 0) & (dt <= PAUSE * interval)
     length, turn = np.hypot(track.motion[good, 0], track.motion[good, 1]), np.abs(track.motion[good, 2])
-    true_speed, path, turning = _beside_truth(track, good)
-    return TypicalMotion(
-        interval=interval,
-        speed=_typical(length, dt[good]),
-        turn_rate=_typical(turn, dt[good]),
-        turn=_typical(turn, np.ones_like(turn)),
-        true_speed=true_speed,
-        path=path,
-        turning=turning,
-    )
+    true_speed, path, turning = _compare_with_truth(track, good)
+    speed, turn_rate = _typical(length, dt[good]), _typical(turn, dt[good])
+    in_step = _typical(turn, np.ones_like(turn))
+    return TypicalMotion(interval, speed, turn_rate, in_step, true_speed, path, turning)
 
 
 def unit_errors(track: MotionTrack, where: str, limits: UnitLimits = DEFAULT_LIMITS) -> list[InputError]:
@@ -101,51 +95,34 @@ def unit_errors(track: MotionTrack, where: str, limits: UnitLimits = DEFAULT_LIM
         errors = heading_errors(track.truth[:, 2], track.time, "the truth's heading", where, limits)
         if errors:
             track = track._replace(truth=track.truth * (1, 1, np.pi / 180))
-    found = _unit_faults(typical_motion(track), limits)
+    found = _possible_errors(typical_motion(track), limits)
     return errors + [InputError(where, *words) for wrong, *words in found if wrong]
 
 
-def _unit_faults(robot: TypicalMotion, limits: UnitLimits) -> tuple[tuple[bool, str, str, str], ...]:
+def _possible_errors(robot: TypicalMotion, limits: UnitLimits) -> tuple[tuple[bool, str, str, str], ...]:
     """Each possible fault: whether it is there, what was found, what is expected, the cure."""
     rushes, truth_rushes = robot.speed > limits.speed, robot.true_speed > limits.speed
     spins = robot.turn_rate > limits.turn_rate or robot.turn > np.pi
+    fast, quick = _else("speed", limits), _else("turn_rate", limits)
+    slow = f"divide by 1000 if they are ms; {_else('interval', limits)}"
+    turning = f"half of the turning is done at over {robot.turn_rate:.4g} rad/s, {robot.turn:.3g} rad a step"
+    paths = "the odometry covers {:.4g} m, the truth {:.4g} m".format(*robot.path)
+    turns = "the odometry turns by {:.4g} rad, the truth by {:.4g} rad".format(*robot.turning)
+    half = "half of the {} is driven at over {:.4g} m/s"
+    unlike_paths = not rushes and not truth_rushes and _differ_by_unit(*robot.path)
+    interval = f"half of the steps take over {robot.interval:.4g} s"
     return (
-        (
-            robot.interval > limits.interval,
-            f"half of the steps take over {robot.interval:.4g} s",
-            "times in seconds",
-            f"divide by 1000 if they are ms; {_else('interval', limits)}",
-        ),
-        (
-            rushes,
-            f"half of the path is driven at over {robot.speed:.4g} m/s",
-            "odometry in metres",
-            f"{_MILLIMETRES}; {_else('speed', limits)}",
-        ),
-        (
-            spins,
-            f"half of the turning is done at over {robot.turn_rate:.4g} rad/s, {robot.turn:.3g} rad a step",
-            "odometry in radians",
-            f"{_DEGREES}; {_else('turn_rate', limits)}",
-        ),
+        (robot.interval > limits.interval, interval, "times in seconds", slow),
+        (rushes, half.format("path", robot.speed), "odometry in metres", f"{_MILLIMETRES}; {fast}"),
+        (spins, turning, "odometry in radians", f"{_DEGREES}; {quick}"),
         (
             truth_rushes,
-            f"half of the truth's path is driven at over {robot.true_speed:.4g} m/s",
+            half.format("truth's path", robot.true_speed),
             "truth in metres",
-            f"{_MILLIMETRES}; {_else('speed', limits)}",
+            f"{_MILLIMETRES}; {fast}",
         ),
-        (
-            not rushes and not truth_rushes and _unlike(*robot.path),
-            "the odometry covers {:.4g} m, the truth {:.4g} m".format(*robot.path),
-            "both in metres",
-            _MILLIMETRES,
-        ),
-        (
-            not spins and _unlike(*robot.turning),
-            "the odometry turns by {:.4g} rad, the truth by {:.4g} rad".format(*robot.turning),
-            "both in radians",
-            _DEGREES,
-        ),
+        (unlike_paths, paths, "both in metres", _MILLIMETRES),
+        (not spins and _differ_by_unit(*robot.turning), turns, "both in radians", _DEGREES),
     )
 
 
@@ -174,7 +151,7 @@ def _typical(amount: np.ndarray, duration: np.ndarray) -> float:
     return float(rate[order][np.searchsorted(done, done[-1] / 2)]) if len(done) and done[-1] > 0 else 0.0
 
 
-def _beside_truth(
+def _compare_with_truth(
     track: MotionTrack, good: np.ndarray
 ) -> tuple[float, tuple[float, float], tuple[float, float]]:
     """Speed of the truth; path and net turning of odometry and truth. NaN without truth."""
@@ -188,13 +165,13 @@ def _beside_truth(
     driven = np.diff(np.cumsum(np.hypot(motion[:, 0], motion[:, 1]))[rows])
     length, dt = np.hypot(*np.diff(truth[:, :2], axis=0).T), np.diff(track.time[rows])
     speed = _typical(length[dt > 0], dt[dt > 0])
-    path = _most_of(driven), _most_of(_ruled(truth[:, :2]))
+    path = _most_of(driven), _most_of(_ruler_steps(truth[:, :2]))
     ends = np.unique(np.linspace(0, len(rows) - 1, STRETCHES + 1).astype(int))
     turned = np.abs(np.diff(np.cumsum(motion[:, 2])[rows][ends]))
     return speed, path, (_most_of(turned), _most_of(np.abs(np.diff(np.unwrap(truth[:, 2])[ends]))))
 
 
-def _ruled(points: np.ndarray) -> np.ndarray:
+def _ruler_steps(points: np.ndarray) -> np.ndarray:
     """Lengths of steps of at least `RULER` along the points [N, 2]."""
     steps, last = [0.0], complex(*points[0])
     for point in (points[:, 0] + 1j * points[:, 1]).tolist():
@@ -208,7 +185,7 @@ def _most_of(amounts: np.ndarray) -> float:
     return float(np.sort(amounts)[:-GLITCHES].sum())
 
 
-def _unlike(a: float, b: float) -> bool:
+def _differ_by_unit(a: float, b: float) -> bool:
     """Whether two totals differ by more than `RATIO`, as with a wrong unit; never for NaN."""
     least, most = min(a, b), max(a, b)
     return least > LEAST and most > MOST and most > RATIO * least

@@ -65,12 +65,9 @@ class InMemorySource(ClosedSource):
         for time, motion, view, seen, label, truth in zip(
             self.time.tolist(), self.motion, self.views, self.seen, self.label, self._truths(), strict=True
         ):
+            picture = view if seen else None
             reading = observation(
-                Odometry(*motion),
-                view if seen else None,
-                view_shape=shape,
-                label=label,
-                whiskers=self.whiskers,
+                Odometry(*motion), picture, view_shape=shape, label=label, whiskers=self.whiskers
             )
             yield Sample(time, reading._replace(alive=self.alive.copy()), truth)
 
@@ -94,9 +91,8 @@ def load_into_memory(source: Source) -> InMemorySource:
         raise InputError(source.name, "whisker readings" if samples else "no samples", "observations")
     alive = readings[0].alive
     if any((reading.alive != alive).any() for reading in readings):
-        raise InputError(
-            source.name, "whiskers whose `alive` flag changes", "a constant flag for each whisker"
-        )
+        found = "whiskers whose `alive` flag changes"
+        raise InputError(source.name, found, "a constant flag for each whisker")
     unknown = np.full(3, np.nan)
     truth = np.array([unknown if sample.truth is None else sample.truth for sample in samples])
     return InMemorySource(

@@ -51,7 +51,7 @@ def perturb(log: InMemorySource, seed: int) -> InMemorySource:
     keep[:first] = False
     keep[first] = True
     rows = np.flatnonzero(keep)
-    motion = _merged(motion, rows, first)
+    motion = _merge_motions(motion, rows, first)
     return replace(
         log,
         digest=f"{log.digest}+{seed}",
@@ -75,7 +75,7 @@ def corrupt_labels(label: np.ndarray, stream: np.random.Generator) -> np.ndarray
     return label
 
 
-def _merged(motion: np.ndarray, rows: np.ndarray, first: int) -> np.ndarray:
+def _merge_motions(motion: np.ndarray, rows: np.ndarray, first: int) -> np.ndarray:
     """Motions [M, 4] between the remaining rows, composed of all motions in between."""
     merged = np.zeros((len(rows), 4))
     at = 0

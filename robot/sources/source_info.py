@@ -18,9 +18,8 @@ def _read_calibration(value: Any) -> Calibration | None:
         return value
     try:
         kinds = {name: bool if name == "alive" else float for name in value}
-        return calibration_from_arrays(
-            {name: np.asarray(array, kinds[name]) for name, array in value.items()}
-        )
+        arrays = {name: np.asarray(array, kinds[name]) for name, array in value.items()}
+        return calibration_from_arrays(arrays)
     except (AttributeError, TypeError) as error:
         raise ValueError(f"not a calibration: {error}") from None
 

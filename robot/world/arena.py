@@ -75,9 +75,8 @@ def is_occupied(arena: Arena, centres: np.ndarray) -> np.ndarray:
 
 def has_clearance(arena: Arena, places: np.ndarray, radius: float) -> np.ndarray:
     """[...] bool, whether a disc of this radius (m) at places [..., 2] is entirely in free space."""
-    return in_free_space(arena, places) & (
-        segment_distance(wall_segments(arena), places).min(axis=-1) >= radius
-    )
+    room = segment_distance(wall_segments(arena), places).min(axis=-1)
+    return in_free_space(arena, places) & (room >= radius)
 
 
 def read_arena(path: File) -> Arena:
@@ -90,7 +89,7 @@ def read_arena(path: File) -> Arena:
         lines = read_bytes(path).decode("utf-8").splitlines()
     except UnicodeDecodeError as error:
         raise InputError(str(path), f"is not text ({error})", "an arena file in UTF-8") from None
-    read = [line for number, content in enumerate(lines, 1) if (line := _parsed(path, number, content))]
+    read = [line for number, content in enumerate(lines, 1) if (line := _parse_line(path, number, content))]
     single: dict[str, _Line] = {}
     for line in read:
         if line.word in REQUIRED_LINES and line.word in single:
@@ -104,17 +103,14 @@ def read_arena(path: File) -> Arena:
     for line in read:
         if line.word not in REQUIRED_LINES:
             polygon = _polygon(line)
-            _placed(line, polygon, outer, objects)
+            _check_position(line, polygon, outer, objects)
             objects.append(polygon)
     x, y, heading = single["start"].values
     made = Arena(path.stem, outer, tuple(objects), np.array([x, y, np.radians(heading)]))
     if not has_clearance(made, made.start[:2], START_CLEARANCE):
-        raise InputError(
-            single["start"].places[1],
-            f"a start at {x:g} {y:g} too close to a wall or object",
-            f"{START_CLEARANCE:g} m of free space around it",
-            "move it away from walls and objects",
-        )
+        found = f"a start at {x:g} {y:g} too close to a wall or object"
+        expected = f"{START_CLEARANCE:g} m of free space around it"
+        raise InputError(single["start"].places[1], found, expected)
     return made
 
 
@@ -139,7 +135,7 @@ class _Line(NamedTuple):
     places: list[str]
 
 
-def _parsed(path: File, number: int, content: str) -> _Line | None:
+def _parse_line(path: File, number: int, content: str) -> _Line | None:
     """A parsed line, or None if it is empty."""
     words = [(found[0], found.start() + 1) for found in re.finditer(r"\S+", content.split("#")[0])]
     if not words:
@@ -177,44 +173,27 @@ def _polygon(line: _Line) -> np.ndarray:
     short = np.hypot(*(sides[:, 2:] - sides[:, :2]).T) < 1e-9
     if short.any():
         again = (int(np.argmax(short)) + 1) % len(corners)
-        raise InputError(
-            line.places[1 + 2 * again],
-            "the same corner twice in a row",
-            "different successive corners",
-            "leave it out: the polygon is closed automatically",
-        )
+        where, cure = line.places[1 + 2 * again], "leave it out: the polygon is closed automatically"
+        raise InputError(where, "the same corner twice in a row", "different successive corners", cure)
     crosses = np.argwhere(segments_cross(sides, sides))
     if len(crosses):
         one, other = sorted(crosses[0].tolist())
-        raise InputError(
-            line.places[1 + 2 * one],
-            f"walls that cross: side {one + 1} and side {other + 1}",
-            "corners in order around the area",
-        )
+        found = f"walls that cross: side {one + 1} and side {other + 1}"
+        raise InputError(line.places[1 + 2 * one], found, "corners in order around the area")
     if abs(polygon_area(corners)) < 1e-9:
         raise InputError(line.places[0], "corners on one line", "corners that enclose an area")
     return corners
 
 
-def _placed(line: _Line, polygon: np.ndarray, outer: np.ndarray, others: list[np.ndarray]) -> None:
+def _check_position(line: _Line, polygon: np.ndarray, outer: np.ndarray, others: list[np.ndarray]) -> None:
     """Raise an error for an object outside the arena or overlapping another one."""
     middle = (polygon + np.roll(polygon, -1, axis=0)) / 2
     probe = np.vstack([polygon, middle]) * (1 - 1e-6) + polygon.mean(axis=0) * 1e-6  # may touch the wall
-    if (
-        segments_cross(polygon_edges(polygon), polygon_edges(outer)).any()
-        or not polygon_contains(outer, probe).all()
-    ):
+    sides = polygon_edges(polygon)
+    if segments_cross(sides, polygon_edges(outer)).any() or not polygon_contains(outer, probe).all():
         raise InputError(line.places[0], "an object outside the walls", "objects within `outer`")
     for number, other in enumerate(others, 1):
-        over = segments_cross(polygon_edges(polygon), polygon_edges(other)).any()
-        if (
-            over
-            or polygon_contains(other, probe).any()
-            or polygon_contains(polygon, other.mean(axis=0)[None]).any()
-        ):
-            raise InputError(
-                line.places[0],
-                f"an object that overlaps object {number}",
-                "objects that do not overlap",
-                "move one of them",
-            )
+        inside = polygon_contains(other, probe).any() or polygon_contains(polygon, other.mean(axis=0))
+        if inside or segments_cross(sides, polygon_edges(other)).any():
+            found = f"an object that overlaps object {number}"
+            raise InputError(line.places[0], found, "objects that do not overlap", "move one of them")

@@ -55,7 +55,8 @@ def random_maze(columns: int, rows: int, loop: list[Cell], share: float, random:
     maze.across[[0, -1]] = True
     maze.along[:, [0, -1]] = True
     for a, b in zip(loop, loop[1:] + loop[:1], strict=True):
-        _remove(maze, a, b)
+        wall, place = between_cells(maze, a, b)
+        wall[place] = False
     return maze
 
 
@@ -70,31 +71,28 @@ def random_loop(columns: int, rows: int, length: int, random: np.random.Generato
     """
     most = columns * rows - (columns * rows) % 2
     if length % 2 or not 4 <= length <= most or min(columns, rows) < 2:
-        raise InputError(
-            "simulation.maze.loop",
-            f"{length} cells",
-            f"an even number from 4 to {most} in {columns} x {rows}",
-        )
+        expected = f"an even number from 4 to {most} in {columns} x {rows}"
+        raise InputError("simulation.maze.loop", f"{length} cells", expected)
     for _ in range(1000):
         blob = np.zeros((columns + 1, rows + 1), bool)  # squares between cell centres, with a margin
         blob[1 + int(random.integers(columns - 1)), 1 + int(random.integers(rows - 1))] = True
         for _ in range(8 * columns * rows):
-            if _outline(blob) == length:
-                return _walked(blob, random)
+            if _outline_length(blob) == length:
+                return _trace_outline(blob, random)
             i, j = 1 + int(random.integers(columns - 1)), 1 + int(random.integers(rows - 1))
-            if not blob[i, j] and _simple(blob, i, j):
+            if not blob[i, j] and _keeps_one_outline(blob, i, j):
                 blob[i, j] = True
-                if _outline(blob) > length:
+                if _outline_length(blob) > length:
                     blob[i, j] = False
     raise InputError("simulation.maze.loop", f"no loop of {length} cells found in {columns} x {rows}")
 
 
-def _outline(blob: np.ndarray) -> int:
+def _outline_length(blob: np.ndarray) -> int:
     padded = np.pad(blob, 1)
     return int((padded[1:] != padded[:-1]).sum() + (padded[:, 1:] != padded[:, :-1]).sum())
 
 
-def _simple(blob: np.ndarray, i: int, j: int) -> bool:
+def _keeps_one_outline(blob: np.ndarray, i: int, j: int) -> bool:
     """Whether adding a square keeps a single outline: its neighbours in the region are connected."""
     padded = np.pad(blob, 1)
     ring = [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)]
@@ -108,7 +106,7 @@ def _simple(blob: np.ndarray, i: int, j: int) -> bool:
     )
 
 
-def _walked(blob: np.ndarray, random: np.random.Generator) -> list[Cell]:
+def _trace_outline(blob: np.ndarray, random: np.random.Generator) -> list[Cell]:
     """The cells of the outline in counter-clockwise order from a random one."""
     # Square (i, j) lies between the centres of cells i - 1 and i, j - 1 and j; the region is on the left.
     ways: dict[Cell, Cell] = {}
@@ -127,11 +125,6 @@ def _walked(blob: np.ndarray, random: np.random.Generator) -> list[Cell]:
     while (following := ways[loop[-1]]) != start:
         loop.append(following)
     return loop
-
-
-def _remove(maze: Maze, a: Cell, b: Cell) -> None:
-    wall, place = between_cells(maze, a, b)
-    wall[place] = False
 
 
 def between_cells(maze: Maze, a: Cell, b: Cell) -> tuple[np.ndarray, tuple[int, int]]:
@@ -156,10 +149,11 @@ def neighbours(maze: Maze, cell: Cell) -> list[Cell]:
     """Reachable neighbours of a cell, in the order east, north, west, south."""
     x, y = cell
     beside = [(x + 1, y), (x, y + 1), (x - 1, y), (x, y - 1)]
-    return [b for b in beside if _inside(maze, b) and is_open(maze, cell, b)]
+    return [b for b in beside if is_inside(maze, b) and is_open(maze, cell, b)]
 
 
-def _inside(maze: Maze, cell: Cell) -> bool:
+def is_inside(maze: Maze, cell: Cell) -> bool:
+    """Whether a maze has a cell."""
     return 0 <= cell[0] < maze.columns and 0 <= cell[1] < maze.rows
 
 
@@ -171,27 +165,17 @@ def cell_centre(cell: Cell) -> np.ndarray:
 def wall_boxes(maze: Maze, random: np.random.Generator, heights: tuple[float, ...] = (WALL_HEIGHT,)) -> Walls:
     """The maze as boxes: a post at every corner with the largest height (m), and walls with random
     heights."""
-    half = WALL_THICKNESS / 2
-    boxes = []
-    for j, i in np.argwhere(maze.across).tolist():
-        boxes.append(
-            (i * CELL_SIDE + half, j * CELL_SIDE - half, (i + 1) * CELL_SIDE - half, j * CELL_SIDE + half)
-        )
-    for j, i in np.argwhere(maze.along).tolist():
-        boxes.append(
-            (i * CELL_SIDE - half, j * CELL_SIDE + half, i * CELL_SIDE + half, (j + 1) * CELL_SIDE - half)
-        )
-    count = len(boxes)
-    for j in range(maze.rows + 1):
-        for i in range(maze.columns + 1):
-            boxes.append(
-                (i * CELL_SIDE - half, j * CELL_SIDE - half, i * CELL_SIDE + half, j * CELL_SIDE + half)
-            )
-    height = np.concatenate(
-        [random.choice(heights, count) if len(heights) > 1 else np.full(count, heights[0]),
-         np.full(len(boxes) - count, max(heights))]
-    )  # fmt: skip
-    return Walls(np.array(boxes), height)
+    posts = np.ones((maze.rows + 1, maze.columns + 1), bool)
+    boxes = [_box_corners(maze.across, (1, 0)), _box_corners(maze.along, (0, 1)), _box_corners(posts, (0, 0))]
+    count = len(boxes[0]) + len(boxes[1])
+    height = random.choice(heights, count) if len(heights) > 1 else np.full(count, heights[0])
+    return Walls(np.vstack(boxes), np.concatenate([height, np.full(posts.size, max(heights))]))
+
+
+def _box_corners(there: np.ndarray, size: Cell) -> np.ndarray:
+    """Boxes [B, 4] that extend by `size` cells (east, north) from each corner in `there`, less the posts."""
+    corner, inset = np.argwhere(there)[:, ::-1], WALL_THICKNESS / 2 * (2 * np.array(size) - 1)
+    return np.hstack([corner * CELL_SIDE + inset, (corner + size) * CELL_SIDE - inset])
 
 
 def describe_box(walls: Walls, number: int) -> str:
@@ -222,11 +206,9 @@ def read_maze(path: Path) -> Maze:
     rows, width = len(lines) // 2, max((len(line) for line in lines), default=0)
     columns = (width - 1) // 4
     if len(lines) % 2 == 0 or rows < 1 or columns < 1 or width != 4 * columns + 1:
-        raise InputError(
-            str(path),
-            f"{len(lines)} lines of up to {width} characters",
-            "2 rows + 1 lines of 4 columns + 1 characters: posts `o`, walls `---` and `|`",
-        )
+        found = f"{len(lines)} lines of up to {width} characters"
+        expected = "2 rows + 1 lines of 4 columns + 1 characters: posts `o`, walls `---` and `|`"
+        raise InputError(str(path), found, expected)
 
     def expect(number: int, column: int, found: str, *kinds: str) -> None:
         if found not in kinds:
@@ -247,11 +229,11 @@ def read_maze(path: Path) -> Maze:
             if column < columns:
                 expect(number, post + 1, line[post + 1 : post + 4], "---", "   ")
                 maze.across[row, column] = line[post + 1] == "-"
-    _sealed(path, maze, skipped)
+    _check_outer_wall(path, maze, skipped)
     return maze
 
 
-def _sealed(path: Path, maze: Maze, skipped: int) -> None:
+def _check_outer_wall(path: Path, maze: Maze, skipped: int) -> None:
     """Raise an error for a gap in the outer wall."""
     last = skipped + 2 * maze.rows + 1
     for side, present, place in (
@@ -262,12 +244,8 @@ def _sealed(path: Path, maze: Maze, skipped: int) -> None:
     ):
         if not present.all():
             line, column = place(int(np.argmin(present)))
-            raise InputError(
-                f"{path}:{line}:{column}",
-                f"a gap in the {side} wall",
-                "a closed outer wall",
-                "close it",
-            )
+            where = f"{path}:{line}:{column}"
+            raise InputError(where, f"a gap in the {side} wall", "a closed outer wall", "close it")
 
 
 def maze_text(maze: Maze) -> str:

@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from robot.world.maze import Cell, Maze, is_open, neighbours
+from robot.world.maze import Cell, Maze, is_inside, is_open, neighbours
 from tactile.base.errors import InputError
 
 
@@ -25,9 +25,8 @@ def circuit_route(loop: Sequence[Cell], word: str) -> list[Cell]:
         InputError: the word is empty or has another letter.
     """
     if not word or set(word.upper()) - set("CA"):
-        raise InputError(
-            "simulation.path.circuits", repr(word), "a word of C (clockwise) and A (anticlockwise)"
-        )
+        expected = "a word of C (clockwise) and A (anticlockwise)"
+        raise InputError("simulation.path.circuits", repr(word), expected)
     way = [loop[0]]
     for letter in word.upper():
         way += [*loop[1:], loop[0]] if letter == "A" else [*loop[:0:-1], loop[0]]
@@ -77,20 +76,14 @@ def check_route(maze: Maze, way: Sequence[Cell], where: str = "simulation.path.c
         InputError: the route is not possible; names the step and the wall.
     """
     for number, cell in enumerate(way):
-        if not (0 <= cell[0] < maze.columns and 0 <= cell[1] < maze.rows):
-            raise InputError(
-                f"{where}[{number}]",
-                f"cell {tuple(cell)}",
-                f"columns 0 to {maze.columns - 1} and rows 0 to {maze.rows - 1}",
-            )
+        if not is_inside(maze, cell):
+            expected = f"columns 0 to {maze.columns - 1} and rows 0 to {maze.rows - 1}"
+            raise InputError(f"{where}[{number}]", f"cell {tuple(cell)}", expected)
     for number, (a, b) in enumerate(pairwise(way)):
         leg = f"{where}[{number}] to [{number + 1}]"
         if abs(a[0] - b[0]) + abs(a[1] - b[1]) != 1:
             raise InputError(leg, f"from cell {tuple(a)} to {tuple(b)}", "a step to a neighbouring cell")
         if not is_open(maze, a, b):
-            raise InputError(
-                leg,
-                f"a step through the wall between cells {tuple(a)} and {tuple(b)}",
-                "a way around the walls",
-                "take the wall out of the maze or lead the path around it",
-            )
+            found = f"a step through the wall between cells {tuple(a)} and {tuple(b)}"
+            cure = "take the wall out of the maze or lead the path around it"
+            raise InputError(leg, found, "a way around the walls", cure)

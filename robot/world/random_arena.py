@@ -75,34 +75,32 @@ def make_arena(config: ArenaConfig, seed: int) -> Arena:
     random = stream(seed, "arena")
     outer = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]) * config.side
     for _ in range(MAX_RESTARTS):
-        objects = _placed(config, random)
+        objects = _place_objects(config, random)
         if objects is None:
             continue
         made = Arena(f"arena {seed}", outer, tuple(objects), np.zeros(3))
-        start = _start(made, config.passage / 2, random)
+        start = _draw_start(made, config.passage / 2, random)
         if start is not None:
             return made._replace(start=start)
-    raise InputError(
-        "create_simulation.arena.objects",
-        f"{config.count} objects of {config.smallest:g} to {config.largest:g} m",
-        f"objects that fit in {config.side:g} m with passages of {config.passage:g} m",
-        "fewer or smaller objects, or a larger side",
-    )
+    found = f"{config.count} objects of {config.smallest:g} to {config.largest:g} m"
+    expected = f"objects that fit in {config.side:g} m with passages of {config.passage:g} m"
+    cure = "fewer or smaller objects, or a larger side"
+    raise InputError("create_simulation.arena.objects", found, expected, cure)
 
 
-def _placed(config: ArenaConfig, random: np.random.Generator) -> list[np.ndarray] | None:
+def _place_objects(config: ArenaConfig, random: np.random.Generator) -> list[np.ndarray] | None:
     """Corners [4, 2] of each object, placed one by one; None if they do not fit."""
     objects: list[np.ndarray] = []
     for _ in range(MAX_OBJECT_TRIES):
         if len(objects) == config.count:
             return objects
-        drawn = _drawn(config, random)
-        if _allowed(drawn, config, objects):
+        drawn = _draw_object(config, random)
+        if _leaves_passages(drawn, config, objects):
             objects.append(drawn)
     return None
 
 
-def _drawn(config: ArenaConfig, random: np.random.Generator) -> np.ndarray:
+def _draw_object(config: ArenaConfig, random: np.random.Generator) -> np.ndarray:
     """Corners [4, 2] of a random square in the arena, some of them at a wall or in a corner."""
     angle = random.uniform(0, np.pi / 2) if config.rotated else 0.0
     corners = square(np.zeros(2), random.uniform(config.smallest, config.largest), angle)
@@ -117,7 +115,7 @@ def _drawn(config: ArenaConfig, random: np.random.Generator) -> np.ndarray:
     return corners + place
 
 
-def _allowed(polygon: np.ndarray, config: ArenaConfig, others: list[np.ndarray]) -> bool:
+def _leaves_passages(polygon: np.ndarray, config: ArenaConfig, others: list[np.ndarray]) -> bool:
     """Whether an object leaves all passages wide enough."""
     room = np.concatenate([polygon.min(axis=0), config.side - polygon.max(axis=0)])
     if ((room > 1e-9) & (room < config.passage)).any():
@@ -128,7 +126,7 @@ def _allowed(polygon: np.ndarray, config: ArenaConfig, others: list[np.ndarray])
     )
 
 
-def _start(arena: Arena, room: float, random: np.random.Generator) -> np.ndarray | None:
+def _draw_start(arena: Arena, room: float, random: np.random.Generator) -> np.ndarray | None:
     """A random pose [3] with this free radius (m), or None if none was found."""
     low, high = arena.outer.min(axis=0), arena.outer.max(axis=0)
     places = random.uniform(low, high, (MAX_START_TRIES, 2))

@@ -117,18 +117,15 @@ def make_scene(
         InputError: a gap in the outer wall, a path through walls, a whisker at rest inside one, walls higher
             than the head, or a path too short for the kidnaps.
     """
-    maze, loop = _world(maze_config, path_config, seed)
+    maze, loop = _make_maze(maze_config, path_config, seed)
     carriage = kidnaps.count * kidnaps.ahead
     explored = path_config.explore + carriage if path_config.explore else 0.0
-    way = _way(path_config, maze, loop, explored, motion, seed)
+    way = _plan_route(path_config, maze, loop, explored, motion, seed)
     path = plan_path(motion, way, stream(seed, "motion"))
     duration = path_config.explore or path.duration - carriage
     if duration <= 0:
-        raise InputError(
-            "simulation.kidnaps",
-            f"{kidnaps.count} times {kidnaps.ahead:g} s ahead",
-            f"less than {path.duration:.4g} s, the whole path",
-        )
+        found = f"{kidnaps.count} times {kidnaps.ahead:g} s ahead"
+        raise InputError("simulation.kidnaps", found, f"less than {path.duration:.4g} s, the whole path")
     jumps = np.zeros(0)
     if kidnaps.count:
         when = np.linspace(0.25, 0.95, kidnaps.count) * duration
@@ -141,10 +138,9 @@ def make_scene(
 def other_surroundings(scene: Scene, config: MazeConfig, head: Head, seed: int) -> Surroundings:
     """Walls of another maze of the same size, checked along the same path."""
     columns, rows = scene.maze.columns, scene.maze.rows
-    maze = random_maze(
-        columns, rows, scene.loop, config.share, stream(_maze_seed(config, seed), "later.walls")
-    )
-    boxes = wall_boxes(maze, stream(_maze_seed(config, seed), "later.heights"), config.heights)
+    seed = _maze_seed(config, seed)
+    maze = random_maze(columns, rows, scene.loop, config.share, stream(seed, "later.walls"))
+    boxes = wall_boxes(maze, stream(seed, "later.heights"), config.heights)
     return check_surroundings(boxes, head, scene.path)
 
 
@@ -156,28 +152,22 @@ def check_surroundings(boxes: Walls, head: Head, path: HeadPath) -> Surroundings
     """
     hangs, tallest = float(head.base[:, 2].min()), float(boxes.height.max())
     if tallest >= hangs:
-        raise InputError(
-            "simulation.maze.heights",
-            f"a wall of {tallest:g} m",
-            f"less than {hangs:g} m, the height of the head",
-        )
+        expected = f"less than {hangs:g} m, the height of the head"
+        raise InputError("simulation.maze.heights", f"a wall of {tallest:g} m", expected)
     surroundings = Surroundings(boxes, head)
     if tip_points(head, np.zeros(len(head.length)))[:, 2].min() > tallest:
         return surroundings  # at rest, whiskers are above all walls
-    time = _finely(path)
+    time = _fine_times(path)
     pose = poses_at(path, time)
     met = surroundings.contact(pose)
     inside = met.angle <= 0
     if inside.any():
         row, whisker = (int(k) for k in np.argwhere(inside)[0])
         cell = tuple(int(k) for k in np.floor(pose[row, :2] / CELL_SIDE))
-        raise InputError(
-            "simulation.path",
-            f"at {time[row]:.1f} s, in cell {cell}, whisker {whisker} at rest is inside "
-            f"{describe_box(boxes, int(met.wall[row, whisker]))}",
-            "whiskers at rest without contact",
-            "lower the walls, or raise the head (touch.head.rings)",
-        )
+        box = describe_box(boxes, int(met.wall[row, whisker]))
+        found = f"at {time[row]:.1f} s, in cell {cell}, whisker {whisker} at rest is inside {box}"
+        cure = "lower the walls, or raise the head (touch.head.rings)"
+        raise InputError("simulation.path", found, "whiskers at rest without contact", cure)
     return surroundings
 
 
@@ -190,7 +180,7 @@ def _maze_seed(config: MazeConfig, seed: int) -> int:
     return seed if config.seed is None else config.seed
 
 
-def _world(config: MazeConfig, path: PathConfig, seed: int) -> tuple[Maze, list[Cell]]:
+def _make_maze(config: MazeConfig, path: PathConfig, seed: int) -> tuple[Maze, list[Cell]]:
     seed = _maze_seed(config, seed)
     loop: list[Cell] = []
     maze = read_maze(config.file) if config.file else closed_maze(config.columns, config.rows)
@@ -200,18 +190,15 @@ def _world(config: MazeConfig, path: PathConfig, seed: int) -> tuple[Maze, list[
         loop = make_anticlockwise(path.loop)
     if config.file:
         if path.circuits and not loop:
-            raise InputError(
-                "simulation.path.loop",
-                "circuits without a loop",
-                "the cells of a loop in the maze",
-                "set the loop, or explore instead of circuits",
-            )
+            cure = "set the loop, or explore instead of circuits"
+            expected = "the cells of a loop in the maze"
+            raise InputError("simulation.path.loop", "circuits without a loop", expected, cure)
         return maze, loop
     loop = loop or random_loop(config.columns, config.rows, config.loop, stream(seed, "maze.loop"))
     return random_maze(config.columns, config.rows, loop, config.share, stream(seed, "maze.walls")), loop
 
 
-def _way(
+def _plan_route(
     config: PathConfig, maze: Maze, loop: list[Cell], explored: float, motion: MotionConfig, seed: int
 ) -> list[Cell]:
     if config.circuits:
@@ -227,11 +214,10 @@ def _way(
     return way
 
 
-def _finely(path: HeadPath) -> np.ndarray:
+def _fine_times(path: HeadPath) -> np.ndarray:
     """Times (s) along a path with a motion of at most `POSE_STEP` in between."""
     step = np.abs(np.diff(path.pose, axis=0))
-    parts = np.maximum(np.ceil((np.hypot(step[:, 0], step[:, 1]) + 0.1 * step[:, 2]) / POSE_STEP), 1).astype(
-        int
-    )
+    parts = np.ceil((np.hypot(step[:, 0], step[:, 1]) + 0.1 * step[:, 2]) / POSE_STEP)
+    parts = np.maximum(parts, 1).astype(int)
     ends = zip(path.time[:-1], path.time[1:], parts, strict=True)
     return np.concatenate([*(np.linspace(a, b, n, endpoint=False) for a, b, n in ends), path.time[-1:]])

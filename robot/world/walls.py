@@ -67,41 +67,37 @@ class Surroundings:
         count, whiskers = len(pose), len(self._radius)
         angle = np.full((count, whiskers), NO_CONTACT)
         reach, wall = np.zeros((count, whiskers)), np.full((count, whiskers), -1)
-        places, place = np.unique(
-            np.floor(pose[:, :2] / BUCKET_SIDE).astype(int), axis=0, return_inverse=True
-        )
+        buckets = np.floor(pose[:, :2] / BUCKET_SIDE).astype(int)
+        places, place = np.unique(buckets, axis=0, return_inverse=True)
         for k, (i, j) in enumerate(places.tolist()):
-            near, rows = self._boxes(i, j), np.flatnonzero(place.reshape(-1) == k)
+            near, rows = self._nearby_boxes(i, j), np.flatnonzero(place.reshape(-1) == k)
             if len(near):
-                angle[rows], reach[rows], wall[rows] = self._met(pose[rows], near)
+                angle[rows], reach[rows], wall[rows] = self._first_contacts(pose[rows], near)
         return Contact(angle, reach, wall)
 
-    def _boxes(self, i: int, j: int) -> np.ndarray:
+    def _nearby_boxes(self, i: int, j: int) -> np.ndarray:
         """Boxes within range of any point of an index square."""
         if (i, j) not in self._near:
-            low, high = (
-                np.array([i, j]) * BUCKET_SIDE - self.range,
-                np.array([i + 1, j + 1]) * BUCKET_SIDE + self.range,
-            )
+            low = np.array([i, j]) * BUCKET_SIDE - self.range
+            high = np.array([i + 1, j + 1]) * BUCKET_SIDE + self.range
             box = self.walls.box
             inside = (box[:, 0] <= high[0]) & (box[:, 2] >= low[0])
             inside &= (box[:, 1] <= high[1]) & (box[:, 3] >= low[1])
             self._near[i, j] = np.flatnonzero(inside)
         return self._near[i, j]
 
-    def _met(self, pose: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        enter, leave = self._crossed(pose, self.walls.box[near])  # [P, A, B]
-        met, reach = (
-            np.full((len(pose), len(self._radius)), NO_CONTACT),
-            np.zeros((len(pose), len(self._radius))),
-        )
-        wall = np.full(met.shape, -1)
+    def _first_contacts(
+        self, pose: np.ndarray, near: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        enter, leave = self._crossings(pose, self.walls.box[near])  # [P, A, B]
+        met = np.full((len(pose), len(self._radius)), NO_CONTACT)
+        reach, wall = np.zeros(met.shape), np.full(met.shape, -1)
         row, ray, box = np.nonzero((leave > enter) & (leave > 0) & (enter < self.range))
         d1, d2, top = enter[row, ray, box], leave[row, ray, box], self.walls.height[near[box]]
         # A box that a ray crosses concerns every whisker in that direction.
         crossing, whisker = np.nonzero(ray[:, None] == self._ray)
         row, box = row[crossing], box[crossing]
-        angle, share = self._down(whisker, d1[crossing], d2[crossing], top[crossing])
+        angle, share = self._touch_from_above(whisker, d1[crossing], d2[crossing], top[crossing])
         # Of several boxes the first contact counts: the smallest protraction, which is written last.
         order = np.argsort(-angle, kind="stable")
         place = row[order], whisker[order]
@@ -110,7 +106,7 @@ class Surroundings:
         reach[free], wall[free] = 0.0, -1
         return met, reach, wall
 
-    def _crossed(self, pose: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _crossings(self, pose: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Distances [P, A, B] at which each ray of each pose enters and leaves each box."""
         heading = pose[:, 2:3] + self._rays
         far = []
@@ -120,7 +116,7 @@ class Surroundings:
             far.append((np.minimum(*edges), np.maximum(*edges)))
         return np.maximum(far[0][0], far[1][0]), np.minimum(far[0][1], far[1][1])
 
-    def _down(
+    def _touch_from_above(
         self, w: np.ndarray, d1: np.ndarray, d2: np.ndarray, top: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Protraction at which whiskers w [N] touch boxes d1 to d2 m away, and the position along the

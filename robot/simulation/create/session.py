@@ -63,9 +63,8 @@ class CreateSimulationConfig(Settings):
         """A copy with relative paths taken from the folder, such as that of the configuration file."""
         if self.arena.file is None:
             return self
-        return self.model_copy(
-            update={"arena": self.arena.model_copy(update={"file": folder / self.arena.file})}
-        )
+        arena = self.arena.model_copy(update={"file": folder / self.arena.file})
+        return self.model_copy(update={"arena": arena})
 
 
 class CreateSimulation(SimulatedSource):
@@ -85,12 +84,11 @@ class CreateSimulation(SimulatedSource):
     def __init__(self, config: CreateSimulationConfig) -> None:
         self.config = config
         self.arena = make_arena(config.arena, config.seed)
-        robot = CreateRobot(
-            config.behaviour, config.whiskers, wall_segments(self.arena), stream(config.seed, "strain")
-        )
+        walls, random = wall_segments(self.arena), stream(config.seed, "strain")
+        robot = CreateRobot(config.behaviour, config.whiskers, walls, random)
         self.whiskers = len(robot.whiskers.base)
         start = robot.at(self.arena.start)
-        self.steps = steps = list(_driven(config, robot, start))
+        self.steps = steps = list(_drive_steps(config, robot, start))
         duration = np.array([step.duration for step in steps])
         self.time = np.cumsum(duration)
         pose = np.array([start.pose, *(step.pose for step in steps)])
@@ -117,7 +115,9 @@ class CreateSimulation(SimulatedSource):
         return (make_report(self.config, step, NO_ODOMETRY) for step in self.steps)
 
 
-def _driven(config: CreateSimulationConfig, robot: CreateRobot, start: CreateStep) -> Iterator[CreateStep]:
+def _drive_steps(
+    config: CreateSimulationConfig, robot: CreateRobot, start: CreateStep
+) -> Iterator[CreateStep]:
     random = stream(config.seed, "behaviour")
     step, doing, time, count = start, MachineState(CreateState.FWD1), 0.0, 0
     while (count < config.reports) if config.reports else (time < 60 * config.minutes):
@@ -154,10 +154,8 @@ def drive_into_wall(config: CreateSimulationConfig, angle: float, random: np.ran
     if towards[0] < 0.05:
         raise ValueError(f"the robot does not drive into a wall at {angle:g} rad")
     whiskers, behaviour = config.whiskers, config.behaviour
-    room = (
-        float((fixed_whiskers(whiskers).tip @ towards).max())
-        + APPROACH * random.uniform(0.5, 1.0) * towards[0]
-    )
+    room = float((fixed_whiskers(whiskers).tip @ towards).max())
+    room += APPROACH * random.uniform(0.5, 1.0) * towards[0]
     along = HALF_WALL * np.array([np.cos(angle), np.sin(angle)])
     wall = np.concatenate([room * towards - along, room * towards + along])[None]
     robot = CreateRobot(behaviour, whiskers, wall, random)
@@ -165,16 +163,15 @@ def drive_into_wall(config: CreateSimulationConfig, angle: float, random: np.ran
     while step.moment == StepEnd.FREE and step.pose[0] < 2 * APPROACH + whiskers.length:
         step = robot.step(step, CreateState.FWD1, WheelCommand(behaviour.fast, 0.0, behaviour.step))
     if step.moment != StepEnd.HIT1:
-        raise InputError(
-            "create_simulation.behaviour.contact",
-            f"no contact at a strain of {behaviour.contact:g} with a wall at {np.degrees(angle):.0f} degrees",
-            "a lower strain, or whiskers that reach beyond the body",
+        found = (
+            f"no contact at a strain of {behaviour.contact:g} with a wall at {np.degrees(angle):.0f} degrees"
         )
+        expected = "a lower strain, or whiskers that reach beyond the body"
+        raise InputError("create_simulation.behaviour.contact", found, expected)
     patient = behaviour.model_copy(update={"safety": np.inf, "least": RECORD_TIME})
-    told = WheelCommand(behaviour.slow, 0.0, RECORD_TIME)
-    felt = CreateRobot(patient, whiskers, wall, random).step(step, CreateState.FWD2, told)
-    odometry = Odometry(behaviour.slow * RECORD_TIME, 0.0, 0.0, RECORD_TIME)
-    return make_report(config, felt, odometry)
+    command = WheelCommand(behaviour.slow, 0.0, RECORD_TIME)
+    push = CreateRobot(patient, whiskers, wall, random).step(step, CreateState.FWD2, command)
+    return make_report(config, push, Odometry(behaviour.slow * RECORD_TIME, 0.0, 0.0, RECORD_TIME))
 
 
 def make_report(config: CreateSimulationConfig, step: CreateStep, odometry: Odometry) -> Report:

@@ -114,9 +114,8 @@ def wheel_command(config: BehaviourConfig, doing: MachineState) -> WheelCommand:
     if doing.state == CreateState.BACK:
         return WheelCommand(-config.fast, 0.0, config.step)
     whole = abs(doing.rest) / config.turn.rate
-    return WheelCommand(
-        0.0, float(np.copysign(config.turn.rate, doing.rest)), min(whole, config.turn.step or whole)
-    )
+    rate = float(np.copysign(config.turn.rate, doing.rest))
+    return WheelCommand(0.0, rate, min(whole, config.turn.step or whole))
 
 
 def draw_turn(config: TurnConfig, random: np.random.Generator) -> float:
@@ -154,9 +153,7 @@ def motion_end(
     last = len(strain) - 1
     level = np.abs(strain[..., 0])
     over = np.abs(strain).max(axis=2) > config.safety
-    ends: list[tuple[int, int, StepEnd]] = [
-        (last, 9, StepEnd.ABORT if state == CreateState.FWD2 else StepEnd.FREE)
-    ]
+    ends = [(last, 9, StepEnd.ABORT if state == CreateState.FWD2 else StepEnd.FREE)]
     if state == CreateState.BACK:
         return MotionEnd(_first(bumped, last), StepEnd.FREE)  # BACK only ends early when the body touches
     if state == CreateState.TURN:

@@ -65,7 +65,7 @@ class WhiskersConfig(Settings):
     tip_diameter: PositiveFloat = 0.3e-3
     """Diameter at the tip, m."""
     droop_deg: Annotated[float, Field(ge=0, lt=45)] = 10.0
-    """Of a whisker below the level of its base."""
+    """Angle of a whisker below the level of its base, degrees."""
     friction: NonNegativeFloat = 0.2
     """Friction coefficient of whiskers on walls."""
     crosstalk: float = 0.08
@@ -82,9 +82,8 @@ class WhiskersConfig(Settings):
     @model_validator(mode="after")
     def _sound(self) -> Self:
         if any(whisker >= len(self.mounts) for whisker in self.dead):
-            raise ValueError(
-                f"dead whiskers {list(self.dead)}: there are whiskers 0 to {len(self.mounts) - 1}"
-            )
+            last = len(self.mounts) - 1
+            raise ValueError(f"dead whiskers {list(self.dead)}: there are whiskers 0 to {last}")
         if self.tip_diameter > self.base_diameter:
             raise ValueError("tip_diameter larger than base_diameter: a whisker tapers towards its tip")
         return self

@@ -48,10 +48,6 @@ class Bending(NamedTuple):
     lean: np.ndarray
     side: np.ndarray
 
-    def at(self, row: int) -> Bending:
-        """One row, with T = 1."""
-        return Bending(*(column[row : row + 1] for column in self))
-
 
 def base_strain(shaft: Shaft, turn: np.ndarray, reach: np.ndarray) -> np.ndarray:
     """Surface strain at the base, M r0 / (E I), with the sign of the rotation."""
@@ -77,22 +73,22 @@ def bend_shafts(
     nothing = Bending(free, free + shaft.length, free, no_side)
     if not len(segments):
         return nothing
-    low, high = _shadows(shaft, base, direction, segments)
+    low, high = _blocked_ends(shaft, base, direction, segments)
     blocked = np.any((low.angle < 0) & (high.angle > 0), axis=-1)
     if not blocked.any():
         return nothing
     row, whisker = np.nonzero(blocked)
     low, high = (_Ends(*(column[row, whisker] for column in ends)) for ends in (low, high))
-    left = _cleared(low, high)
-    right = _cleared(_mirrored(high), _mirrored(low))
+    left = _free_ends(low, high)
+    right = _free_ends(_mirror(high), _mirror(low))
     easier = no_side.copy()
     easier[row, whisker] = np.where(left.angle <= right.angle, 1, -1)
-    sides = _kept(blocked, easier, side)
+    sides = _bending_sides(blocked, easier, side)
     way = sides[row, whisker]
     chosen = _Ends(*(np.where(way > 0, a, b) for a, b in zip(left, right, strict=True)))
     turn, reach, lean = (free.copy() for _ in range(3))
     reach += shaft.length
-    angle, reach[row, whisker], lean[row, whisker] = _held(shaft, chosen)
+    angle, reach[row, whisker], lean[row, whisker] = _solve_contacts(shaft, chosen)
     turn[row, whisker] = way * angle
     return Bending(turn, reach, lean, sides)
 
@@ -108,7 +104,7 @@ class _Ends(NamedTuple):
     away: np.ndarray
 
 
-def _shadows(
+def _blocked_ends(
     shaft: Shaft, base: np.ndarray, direction: np.ndarray, segments: np.ndarray
 ) -> tuple[_Ends, _Ends]:
     """Lower and upper ends [T, W, S] of the angles, relative to the straight shaft, that walls block. For a
@@ -137,11 +133,11 @@ def _shadows(
     return _Ends(low, np.where(up, one, two), near, away), _Ends(high, np.where(up, two, one), near, away)
 
 
-def _mirrored(ends: _Ends) -> _Ends:
+def _mirror(ends: _Ends) -> _Ends:
     return ends._replace(angle=-ends.angle)
 
 
-def _cleared(low: _Ends, high: _Ends) -> _Ends:
+def _free_ends(low: _Ends, high: _Ends) -> _Ends:
     """The end [K] at which blocked whiskers become free counter-clockwise, from ends [K, S]."""
     angle = np.zeros(len(low.angle))
     for _ in range(MAX_JOINED_WALLS):
@@ -154,7 +150,7 @@ def _cleared(low: _Ends, high: _Ends) -> _Ends:
     return _Ends(angle, radius, near, away)
 
 
-def _kept(blocked: np.ndarray, easier: np.ndarray, side: np.ndarray) -> np.ndarray:
+def _bending_sides(blocked: np.ndarray, easier: np.ndarray, side: np.ndarray) -> np.ndarray:
     """The bending side [T, W] of each whisker: the easier one at first contact, constant afterwards."""
     was = np.vstack([side != 0, blocked[:-1]])
     row = np.arange(len(blocked))[:, None]
@@ -163,7 +159,7 @@ def _kept(blocked: np.ndarray, easier: np.ndarray, side: np.ndarray) -> np.ndarr
     return np.where(blocked, since, 0)
 
 
-def _held(shaft: Shaft, end: _Ends) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _solve_contacts(shaft: Shaft, end: _Ends) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rotation, reach and lean [K] of whiskers in contact at that end."""
     turn, reach = end.angle.copy(), end.radius.copy()
     tip = end.radius >= shaft.length * (1 - 1e-9)

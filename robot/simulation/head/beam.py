@@ -93,14 +93,14 @@ def make_beam(config: ShaftConfig) -> Beam:
     loads = np.array(LOAD_SHARES)
     thick = 1 - (1 - config.taper) * SHAFT_SHARES
     bent = np.maximum(loads[:, None] - SHAFT_SHARES, 0.0) / thick**4
-    shapes = _summed(_summed(bent))
+    shapes = _integrate(_integrate(bent))
     line = thick**2
     return Beam(
         shapes=shapes,
         stiffness=_inner(bent * thick**4, bent),
         mass=_inner(line * shapes, shapes),
-        coupled=_summed(line * SHAFT_SHARES * shapes)[:, -1],
-        inertia=float(_summed(line * SHAFT_SHARES**2)[-1]),
+        coupled=_integrate(line * SHAFT_SHARES * shapes)[:, -1],
+        inertia=float(_integrate(line * SHAFT_SHARES**2)[-1]),
         moment=loads,
         unit=3 * (1 / config.reference - (1 - config.taper)),
     )
@@ -111,11 +111,11 @@ def beam_time_unit(config: BeamConfig, length: float) -> float:
     return float(length**2 * 2 / config.radius * np.sqrt(config.density / config.modulus))
 
 
-def _summed(value: np.ndarray) -> np.ndarray:
+def _integrate(value: np.ndarray) -> np.ndarray:
     """Cumulative integral along the whisker (trapezoidal rule)."""
     steps = (value[..., 1:] + value[..., :-1]) / 2 * np.diff(SHAFT_SHARES)
     return np.concatenate([np.zeros((*value.shape[:-1], 1)), np.cumsum(steps, axis=-1)], axis=-1)
 
 
 def _inner(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return _summed(a[:, None] * b[None])[..., -1]
+    return _integrate(a[:, None] * b[None])[..., -1]

@@ -13,7 +13,8 @@ import numpy as np
 from scipy.linalg import expm
 
 from robot.simulation.head.beam import Beam, beam_time_unit, make_beam
-from robot.simulation.head.whisk_stream import HeadSetup, WallSweep
+from robot.simulation.head.kinematic import HeadSetup
+from robot.simulation.head.whisk_stream import WallSweep
 from tactile.features.contact import stiffness
 from tactile.whiskers.whisking import initial_drive, whisk_command
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 
+from robot.simulation.head.beam import StreamConfig
 from robot.world.head_trajectory import HeadPath, poses_at
 from robot.world.walls import Surroundings
 from tactile.base.config import Settings
@@ -51,6 +52,15 @@ class MechanicsConfig(Settings):
     """Number of head poses per protraction at which contacts are computed."""
 
 
+class HeadSetup(NamedTuple):
+    """Geometry of a simulated head, and the settings of its samples, mechanics and drives."""
+
+    head: Head
+    config: StreamConfig
+    mechanics: MechanicsConfig
+    whisking: WhiskingConfig
+
+
 class WhiskColumns(NamedTuple):
     """Contact features of all cycles: the columns [N, W] of `Whisk`."""
 
@@ -62,20 +72,18 @@ class WhiskColumns(NamedTuple):
 
 
 def simulate_kinematic(
-    config: MechanicsConfig,
-    whisking: WhiskingConfig,
+    setup: HeadSetup,
     surroundings: Surroundings,
     path: HeadPath,
     start: np.ndarray,
     random: np.random.Generator,
 ) -> WhiskColumns:
     """Contact features of whisk cycles that start at times [N] s along a path."""
-    met = _met(config, whisking, surroundings, path, start)
-    features = _pushed(config, whisking, surroundings.head, met)
-    return _sensed(config, whisking, surroundings.head, features, random)
+    met = _find_contacts(setup, surroundings, path, start)
+    return _add_sensor_noise(setup, _bend_whiskers(setup, met), random)
 
 
-class _Met(NamedTuple):
+class _Contacts(NamedTuple):
     """Contacts [N, W]: whether there is one, its protraction and position along the shaft, and the same two
     values (infinite where free) at the end of the protraction."""
 
@@ -86,47 +94,42 @@ class _Met(NamedTuple):
     last_reach: np.ndarray
 
 
-def _met(
-    config: MechanicsConfig,
-    whisking: WhiskingConfig,
-    surroundings: Surroundings,
-    path: HeadPath,
-    start: np.ndarray,
-) -> _Met:
-    whiskers, count = len(surroundings.head.length), len(start)
+def _find_contacts(
+    setup: HeadSetup, surroundings: Surroundings, path: HeadPath, start: np.ndarray
+) -> _Contacts:
+    head, _, config, whisking = setup
+    whiskers, count = len(head.length), len(start)
     amplitude = np.radians(whisking.amplitude_deg)
     lag = (np.arange(config.poses) + 1) / config.poses / (2 * whisking.rate)
-    command, midway = (
-        amplitude * whisk_phase(whisking, lag),
-        amplitude * whisk_phase(whisking, lag - lag[0] / 2),
-    )
+    command = amplitude * whisk_phase(whisking, lag)
+    midway = amplitude * whisk_phase(whisking, lag - lag[0] / 2)
     met = surroundings.contact(poses_at(path, start[:, None] + lag).reshape(-1, 3))
     wall, along, box = (column.reshape(count, config.poses, whiskers) for column in met)
     touches = wall <= command[:, None]
     contact, first = touches.any(axis=1), np.argmax(touches, axis=1)
 
-    def then(column: np.ndarray, row: np.ndarray) -> np.ndarray:
+    def at_pose(column: np.ndarray, row: np.ndarray) -> np.ndarray:
         return np.take_along_axis(column, row[:, None], axis=1)[:, 0]
 
     # A wall that enters the sweep by the motion of the head is touched where the whisker is by then, about
     # half-way between two poses. The delay holds for the whole cycle.
-    new = (first > 0) & (then(box, np.maximum(first - 1, 0)) != then(box, first))
+    new = (first > 0) & (at_pose(box, np.maximum(first - 1, 0)) != at_pose(box, first))
     before = np.concatenate([[0.0], command[:-1]])
-    stands = np.where(contact, then(wall, first), 0.0)
+    stands = np.where(contact, at_pose(wall, first), 0.0)
     touched = np.where(contact, np.maximum(stands, np.where(new, midway[first], before[first])), 0.0)
-    reach = np.where(contact, np.maximum(then(along, first), MIN_REACH), 1.0)
+    reach = np.where(contact, np.maximum(at_pose(along, first), MIN_REACH), 1.0)
     last = wall[:, -1] + touched - stands
-    return _Met(contact, touched, reach, last, np.where(np.isfinite(last), along[:, -1], 1.0))
+    return _Contacts(contact, touched, reach, last, np.where(np.isfinite(last), along[:, -1], 1.0))
 
 
-def _pushed(config: MechanicsConfig, whisking: WhiskingConfig, head: Head, met: _Met) -> WhiskColumns:
+def _bend_whiskers(setup: HeadSetup, met: _Contacts) -> WhiskColumns:
     """Bend and rotation of whiskers in contact. A whisker touched near its base is stiffer: it bends less
     and its sensor reads more."""
-    amplitude = np.radians(whisking.amplitude_deg)
+    config, amplitude = setup.mechanics, np.radians(setup.whisking.amplitude_deg)
     hard = stiffness(SHAFT, met.reach)
     push = hard * config.servo / (config.servo + hard)  # reading for each radian commanded beyond contact
     reading = np.where(met.contact, push * (amplitude - met.touched), 0.0)
-    reading, taken = _fed_back(config, whisking, head, reading, push)
+    reading, taken = _apply_feedback(setup, reading, push)
     there = np.isfinite(met.last)
     last = np.where(there, met.last, 0.0)
     hard_last = stiffness(SHAFT, np.maximum(met.last_reach, MIN_REACH))
@@ -135,16 +138,14 @@ def _pushed(config: MechanicsConfig, whisking: WhiskingConfig, head: Head, met: 
     # Slip depends on the bend at the end; a contact is held if its reading still exceeds the dead zone.
     held = noticed & there & (bend <= config.slip) & (hard_last * bend > config.dead_zone)
     highest = np.where(held, last + bend, amplitude - taken)
-    return WhiskColumns(
-        noticed, np.where(noticed, met.touched + config.dead_zone, 0.0), held, highest, met.reach
-    )
+    touched = np.where(noticed, met.touched + config.dead_zone, 0.0)
+    return WhiskColumns(noticed, touched, held, highest, met.reach)
 
 
-def _fed_back(
-    config: MechanicsConfig, whisking: WhiskingConfig, head: Head, reading: np.ndarray, push: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _apply_feedback(setup: HeadSetup, reading: np.ndarray, push: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Readings [N, W] and the reduction of the amplitude, rad, at the equilibrium of the whisking law: a
     reading above the contact threshold reduces the amplitude, which reduces the reading."""
+    head, _, config, whisking = setup
     if whisking.mode == "open":
         return reading, np.zeros_like(reading)
     limit, gain = HEEDED_SDS * config.noise, whisking.gain
@@ -158,21 +159,14 @@ def _fed_back(
     return reading, taken
 
 
-def _sensed(
-    config: MechanicsConfig,
-    whisking: WhiskingConfig,
-    head: Head,
-    features: WhiskColumns,
-    random: np.random.Generator,
-) -> WhiskColumns:
+def _add_sensor_noise(setup: HeadSetup, features: WhiskColumns, random: np.random.Generator) -> WhiskColumns:
     """Add noise and faults of the sensors."""
-    shape, alive = features.contact.shape, head.alive
+    config, shape, alive = setup.mechanics, features.contact.shape, setup.head.alive
     missed = random.random(shape) < config.missed
     spurious = ~features.contact & (random.random(shape) < config.spurious)
-    anywhere = random.random(shape) * np.radians(whisking.amplitude_deg)
-    noise = (
-        config.noise * random.standard_normal((2, *shape)) * np.array([1.0, MEAN_NOISE_SHARE])[:, None, None]
-    )
+    anywhere = random.random(shape) * np.radians(setup.whisking.amplitude_deg)
+    noise = config.noise * random.standard_normal((2, *shape))
+    noise = noise * np.array([1.0, MEAN_NOISE_SHARE])[:, None, None]
     smeared = config.reach_noise * random.standard_normal(shape)
     contact = ((features.contact & ~missed) | spurious) & alive
     touched = np.where(spurious, anywhere, features.touched)

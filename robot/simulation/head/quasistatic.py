@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from robot.simulation.head.beam import StreamConfig
-from robot.simulation.head.kinematic import MechanicsConfig
-from robot.simulation.head.whisk_stream import HeadSetup, WallSweep
+from robot.simulation.head.kinematic import HeadSetup, MechanicsConfig
+from robot.simulation.head.whisk_stream import WallSweep
 from tactile.features.contact import stiffness
 from tactile.whiskers.whisking import WhiskDrive, initial_drive, whisk_command
 

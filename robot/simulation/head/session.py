@@ -15,9 +15,15 @@ from pydantic import Field, NonNegativeInt
 
 from robot.simulation.head.beam import StreamConfig
 from robot.simulation.head.dynamic import simulate_dynamic
-from robot.simulation.head.kinematic import MechanicsConfig, WhiskColumns, simulate_kinematic, whisk_of_row
+from robot.simulation.head.kinematic import (
+    HeadSetup,
+    MechanicsConfig,
+    WhiskColumns,
+    simulate_kinematic,
+    whisk_of_row,
+)
 from robot.simulation.head.quasistatic import simulate_quasistatic
-from robot.simulation.head.whisk_stream import HeadSetup, simulate_cycles, simulate_free_cycles
+from robot.simulation.head.whisk_stream import simulate_cycles, simulate_free_cycles
 from robot.sources.odometry import OdometryConfig, simulate_odometry
 from robot.sources.simulated import NO_ODOMETRY, SimulatedSource, digest_of_document, wrap_headings
 from robot.sources.source_info import SimulationInfo, SourceInfo
@@ -90,9 +96,8 @@ def choose_tier(config: SimulationConfig) -> ChosenTier:
         InputError: the configured fidelity has no raw samples but they are wanted.
     """
     if config.fidelity == "kinematic" and config.raw:
-        raise InputError(
-            "simulation.fidelity", "kinematic, which makes no raw samples", "auto, quasistatic or dynamic"
-        )
+        found = "kinematic, which makes no raw samples"
+        raise InputError("simulation.fidelity", found, "auto, quasistatic or dynamic")
     if config.fidelity != "auto":
         return ChosenTier(config.fidelity, "set by simulation.fidelity")
     if config.raw:
@@ -133,21 +138,16 @@ class HeadSimulation(SimulatedSource):
         self.kidnapped = np.zeros(count, bool)
         rows = np.searchsorted(self.time, self.scene.jumps)
         self.kidnapped[rows[rows < count]] = True
-        self.odometry = simulate_odometry(
-            config.odometry, self.time, pose, stream(seed, "odometry"), self.kidnapped
-        )
+        random = stream(seed, "odometry")
+        self.odometry = simulate_odometry(config.odometry, self.time, pose, random, self.kidnapped)
         self._parts = self._surroundings()
         self.calibration = None if self.tier.name == "kinematic" else self._calibrated()
         self.features = self._kinematic() if self.calibration is None else None
 
         plain = config.model_dump(mode="json", exclude={"maze": {"file"}})
-        self.digest = digest_of_document(
-            {
-                "head": head_config.model_dump(mode="json"),
-                "simulation": plain,
-                "maze": maze_text(self.scene.maze) if config.maze.file else "",
-            }
-        )
+        drawing = maze_text(self.scene.maze) if config.maze.file else ""
+        settings = {"head": head_config.model_dump(mode="json"), "simulation": plain}
+        self.digest = digest_of_document({**settings, "maze": drawing})
         self.info = SourceInfo(
             raw_whiskers=True,
             cell_size=POSE_CELL_SIZE,
@@ -186,13 +186,12 @@ class HeadSimulation(SimulatedSource):
         return [(self.scene.surroundings, slice(change)), (other, slice(change, None))]
 
     def _kinematic(self) -> WhiskColumns:
-        config = self.config
         parts = []
         for surroundings, rows in self._parts:
-            random = stream(config.seed, "sensor")  # the noise of the whole session, whichever maze it is
-            columns = simulate_kinematic(
-                config.mechanics, config.whisking, surroundings, self.scene.path, self.start, random
-            )
+            random = stream(
+                self.config.seed, "sensor"
+            )  # the noise of the whole session, whichever maze it is
+            columns = simulate_kinematic(self._setup, surroundings, self.scene.path, self.start, random)
             parts.append([column[rows] for column in columns])
         return WhiskColumns(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 

@@ -8,14 +8,13 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from robot.simulation.head.beam import StreamConfig
-from robot.simulation.head.kinematic import MechanicsConfig
+from robot.simulation.head.kinematic import HeadSetup
 from robot.sources.simulated import NO_ODOMETRY
 from robot.world.head_trajectory import HeadPath, poses_at
 from robot.world.walls import NO_CONTACT, Surroundings
 from tactile.base.se2 import between
 from tactile.base.types import Cycle
 from tactile.whiskers.head_geometry import Head
-from tactile.whiskers.whisking import WhiskingConfig
 
 
 class WallSweep(NamedTuple):
@@ -33,15 +32,6 @@ class WallSweep(NamedTuple):
     reach: np.ndarray
     drift: np.ndarray
     noise: np.ndarray
-
-
-class HeadSetup(NamedTuple):
-    """Geometry of a simulated head, and the settings of its samples, mechanics and drives."""
-
-    head: Head
-    config: StreamConfig
-    mechanics: MechanicsConfig
-    whisking: WhiskingConfig
 
 
 class MechanicsModel(Protocol):

@@ -46,7 +46,7 @@ from robot.recordings.cdr_live import (
 )
 from robot.recordings.mcap_reader import Recording, recover
 from robot.recordings.mcap_scanner import McapScanner, RecordingEntry
-from robot.recordings.mcap_writer import _Whole
+from robot.recordings.mcap_writer import WholeChunkFile
 from robot.recordings.schemas import TRUTH
 from robot.sources.source_info import SourceInfo
 from tactile.base.errors import InputError
@@ -379,7 +379,7 @@ def test_a_disk_that_was_full_yields_a_complete_file_in_the_end(
         for k in range(3):
             mine = rows(frames, slice(k * RATE, (k + 1) * RATE))
             if k == 1:
-                patch.setattr(_Whole, "flush", _no_room)
+                patch.setattr(WholeChunkFile, "flush", _no_room)
             recorder.add_whisk(make_cut(k, START + k, START + k, mine, moved(k)), mine)
     assert recorder.fault is not None
     recorder.close()

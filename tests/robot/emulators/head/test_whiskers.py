@@ -20,8 +20,9 @@ from robot.drivers.ur10.base_transform import BaseTransformConfig, tcp_from_pose
 from robot.emulators.head.config import HeadEmulatorConfig
 from robot.emulators.head.device import BLOCK
 from robot.emulators.head.pose_source import AHEAD, AlongPath, CarriedByArm
+from robot.simulation.head.kinematic import HeadSetup
 from robot.simulation.head.quasistatic import simulate_quasistatic
-from robot.simulation.head.whisk_stream import HeadSetup, simulate_cycles
+from robot.simulation.head.whisk_stream import simulate_cycles
 from robot.world.head_trajectory import HeadPath
 from robot.world.walls import Surroundings
 from tactile.base.random_streams import stream

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robot.simulation.head.beam import StreamConfig
-from robot.simulation.head.kinematic import MechanicsConfig
+from robot.simulation.head.kinematic import HeadSetup, MechanicsConfig
 from robot.simulation.head.quasistatic import advance_balance, simulate_quasistatic, whiskers_at_rest
-from robot.simulation.head.whisk_stream import HeadSetup, WallSweep
+from robot.simulation.head.whisk_stream import WallSweep
 from robot.world.walls import NO_CONTACT
 from tactile.base.random_streams import stream
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head

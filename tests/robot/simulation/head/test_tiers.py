@@ -7,10 +7,9 @@ import pytest
 
 from robot.simulation.head.beam import BeamConfig, StreamConfig, beam_time_unit, make_beam
 from robot.simulation.head.dynamic import simulate_dynamic
-from robot.simulation.head.kinematic import MechanicsConfig, WhiskColumns
+from robot.simulation.head.kinematic import HeadSetup, MechanicsConfig, WhiskColumns
 from robot.simulation.head.quasistatic import simulate_quasistatic
 from robot.simulation.head.whisk_stream import (
-    HeadSetup,
     MechanicsModel,
     simulate_cycles,
     simulate_free_cycles,
