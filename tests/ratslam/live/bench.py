@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,10 +28,10 @@ from tests.helpers.live import HEAD_FAULTS, PATIENCE, ROOT, Faults, emulator, un
 SAMPLES = 2000.0
 """Frames of the head in a second."""
 LEGS = tuple((0.63 + 0.07 * x, 0.45 + 0.02 * (x % 2), 0.0) for x in (0, 1, 2, 3, 4, 5, 4, 3, 2, 1, 0))
-"""Where quick sessions go: legs of 1.6 s."""
+"""Route of quick sessions: legs of 1.6 s."""
 START = tcp_from_pose(BaseTransformConfig(), np.array(LEGS[0]), 0.005)
 HIGH = BaseTransformConfig(z=BaseTransformConfig().z - 0.3)
-"""Where the head believes the map to be in quick sessions: whiskers meet nothing."""
+"""Pose of the map for the emulated head in quick sessions, too low for its whiskers to touch walls."""
 
 
 class Moment(NamedTuple):
@@ -42,7 +42,7 @@ class Moment(NamedTuple):
 
 
 class Kept(NamedTuple):
-    """What a recording holds."""
+    """Content of a recording."""
 
     sequence: np.ndarray
     robot: np.ndarray
@@ -51,7 +51,7 @@ class Kept(NamedTuple):
     broken: str
 
     def lost(self, until: Moment) -> float:
-        """s that are missing of what either device had sent by then."""
+        """Duration of the data missing at the end of the recording, of either device, s."""
         return max(until.robot - float(self.robot[-1]), (until.sample - int(self.sequence[-1])) / SAMPLES)
 
     def names(self) -> list[str]:
@@ -59,14 +59,14 @@ class Kept(NamedTuple):
 
 
 def undisturbed(pid: int) -> None:
-    """Lets a process, and those that it will start, go before others where that is allowed: a device and a
-    session have their time for themselves."""
+    """Raises the priority of a process and its children where that is allowed: devices and sessions work in
+    real time."""
     with suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, pid, -10)
 
 
 def kept(path: Path) -> Kept:
-    """Reads a recording, whole or not."""
+    """Reads a recording, complete or not."""
     walk = McapScanner(path)
     sequence, robot, samples, events = [], [], [], []
     for entry in walk.entries():
@@ -106,7 +106,7 @@ class Forked:
 
 
 class SessionServer:
-    """A process that has loaded everything and forks sessions."""
+    """A process that has loaded all modules and forks sessions."""
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._count = folder, 0
@@ -121,11 +121,12 @@ class SessionServer:
         assert self._process.stdout is not None
         assert self._process.stdout.readline() == "ready\n"
 
-    def start(self, section: dict[str, Any], mapper: float) -> Session:
-        """Begins a session.
+    def start(self, section: dict[str, Any], mapper: float, without: Sequence[str]) -> Session:
+        """Starts a session.
 
         Args:
             section: `live` of its configuration. mapper: s that the stub takes for each sample.
+            without: libraries that it cannot import.
         """
         self._count += 1
         folder = self._folder / str(self._count)
@@ -139,6 +140,7 @@ class SessionServer:
             "code": str(code),
             "mapper": mapper,
             "listened": 0.3,
+            "without": list(without),
         }
         assert self._process.stdin is not None
         assert self._process.stdout is not None
@@ -180,11 +182,11 @@ class Session:
             raise
 
     def says(self, text: str) -> None:
-        """Waits until it has said something."""
+        """Waits for a text in its output."""
         self.until(lambda: text in self.said(), f"{text!r} is said")
 
     def code(self, seconds: float = 2 * PATIENCE) -> int:
-        """Its exit code, once it ends."""
+        """Waits for its end; returns the exit code."""
         try:
             return self.process.wait(seconds)
         except subprocess.TimeoutExpired:
@@ -192,16 +194,16 @@ class Session:
             raise
 
     def report(self) -> dict[str, Any]:
-        """`live.json`"""
+        """Content of `live.json`."""
         report: dict[str, Any] = json.loads((self.directory / "live.json").read_text())
         return report
 
     def kept(self) -> Kept:
-        """What it has recorded."""
+        """Content of its recording."""
         return kept(self.directory / "session.mcap")
 
     def child(self) -> int:
-        """Process of the arm."""
+        """Process id of its RTDE process."""
         for folder in Path("/proc").glob("[0-9]*"):
             with suppress(OSError):
                 words = (folder / "cmdline").read_bytes().split(b"\0")
@@ -213,7 +215,7 @@ class Session:
         raise AssertionError("no process of the arm")
 
     def lives(self) -> bool:
-        """Whether any process of it does."""
+        """Whether any of its processes runs."""
         for folder in Path("/proc").glob("[0-9]*"):
             with suppress(OSError):
                 if os.getpgid(int(folder.name)) == self.process.pid and _runs(folder):
@@ -221,23 +223,23 @@ class Session:
         return False
 
     def mapper(self) -> int:
-        """Process of the mapper."""
+        """Process id of its mapper."""
         return int((self.directory / "mapper.pid").read_text())
 
     def end(self) -> None:
-        """Nothing of it stays."""
+        """Kills its processes."""
         with suppress(ProcessLookupError):
             os.killpg(self.process.pid, signal.SIGKILL)
         self.process.wait(PATIENCE)
 
 
 def _runs(folder: Path) -> bool:
-    """Whether a process does something; one that only waits to be buried does not."""
+    """Whether a process runs; a zombie does not."""
     return (folder / "stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
 
 
 class Bench:
-    """An address with an emulated arm and head, started when they are wanted and as often as it takes."""
+    """An emulated arm and head at an address, started when needed and again after they ended."""
 
     def __init__(self, host: str, server: SessionServer, folder: Path) -> None:
         self.host, self._server, self._folder = host, server, folder
@@ -256,7 +258,7 @@ class Bench:
         return self._faults["head"]
 
     def ready(self) -> None:
-        """Both devices are in good order, the tool at `START`."""
+        """Clears the faults of both devices and places the tool at `START`."""
         if not self._runs("arm"):
             self._arm.close()
             self._faults["arm"] = self._arm.enter_context(ur_emulator(self.host, START))
@@ -278,13 +280,14 @@ class Bench:
         self.head(do="silence", seconds=0)
 
     @contextmanager
-    def session(self, mapper: float = 0.0, **settings: Any) -> Iterator[Session]:
-        """A quick session, begun; nothing of it stays behind.
+    def session(self, mapper: float = 0.0, without: Sequence[str] = (), **settings: Any) -> Iterator[Session]:
+        """A quick session, started; its processes end with the block.
 
         Args:
-            mapper: s that it takes for each sample. settings: of the section `live`.
+            mapper: s that it takes for each sample. without: libraries that it cannot import.
+            settings: of the section `live`.
         """
-        session = self._server.start(self.quick(**settings), mapper)
+        session = self._server.start(self.quick(**settings), mapper, without)
         try:
             yield session
         finally:
@@ -292,7 +295,7 @@ class Bench:
 
     @contextmanager
     def under_way(self, **settings: Any) -> Iterator[Session]:
-        """The same, some whisks later, with the arm at full speed."""
+        """A quick session after two whisks, with the arm at full speed."""
         with self.session(**settings) as session:
             session.says("armed")
             session.until(
@@ -327,7 +330,7 @@ class Bench:
         return usual | given | settings
 
     def moment(self) -> Moment:
-        """Now, by the devices' clocks."""
+        """The present time by the devices' clocks."""
         return Moment(self.arm.state()["time"], self.head.state()["sequence"])
 
     def still(self) -> bool:
@@ -335,15 +338,15 @@ class Bench:
         return not self.arm.state()["moving"]
 
     def moves(self) -> bool:
-        """Whether it goes at full speed."""
+        """Whether the arm moves at full speed."""
         return float(np.linalg.norm(self.arm.state()["speed"][:3])) > 0.045
 
     def whisked(self, session: Session) -> int:
-        """Whisks that a session has recorded, as far as its progress bar says."""
+        """Number of whisks recorded, by the progress bar."""
         return max(map(int, re.findall(r"(\d+)/\d+ \[", session.said())), default=0)
 
     def worn(self) -> None:
-        """The head cannot be put right: the next test gets another one."""
+        """Ends the emulated head, whose fault cannot be cleared; the next test gets a new one."""
         self.head.process.kill()
         self.head.process.wait(PATIENCE)
 

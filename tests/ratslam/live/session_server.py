@@ -2,11 +2,13 @@
 
 Each line of JSON on its standard input starts one; the process id is printed. The line gives the `arguments`
 of `python -m ratslam`, files for the output (`log`) and the exit code (`code`), how long the stub mapper
-takes for a sample (`mapper`, s), and how long the self-test listens (`listened`, s).
+takes for a sample (`mapper`, s), how long the self-test listens (`listened`, s), and the libraries that the
+session cannot import (`without`: modules, or `libusb`).
 """
 
 from __future__ import annotations
 
+import ctypes.util
 import importlib
 import json
 import os
@@ -27,7 +29,7 @@ LOADED = (
     "usb.core",
     "usb.util",
 )
-"""All that a session loads."""
+"""Modules that a session loads."""
 
 
 def main() -> None:
@@ -59,7 +61,7 @@ def _fork() -> int:
 
 
 def _become_session(told: dict[str, Any], program: Any) -> None:
-    """Runs the program in a session of processes of its own; does not return."""
+    """Runs the program in a new session of processes; does not return."""
     import ratslam.live.session
     from robot.live import selftest
     from tests.ratslam.live import stub_mapper
@@ -68,6 +70,7 @@ def _become_session(told: dict[str, Any], program: Any) -> None:
     log = os.open(told["log"], os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     for fd, target in ((os.open(os.devnull, os.O_RDONLY), 0), (log, 1), (log, 2)):
         os.dup2(fd, target)
+    _hide(told["without"], Path(told["code"]).parent / "hidden")
     arguments = told["arguments"]
     mapping = partial(stub_mapper.mapping, arguments[arguments.index("-o") + 1], told["mapper"])
     run = ratslam.live.session.run_live_session
@@ -81,6 +84,19 @@ def _become_session(told: dict[str, Any], program: Any) -> None:
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
+
+
+def _hide(names: list[str], folder: Path) -> None:
+    """Hides libraries from this process and, by modules in a folder on its path, from those it starts."""
+    if "libusb" in names:
+        ctypes.util.find_library = lambda name: None  # type: ignore[assignment]
+    folder.mkdir()
+    for name in names:
+        for loaded in [module for module in sys.modules if module.split(".")[0] == name]:
+            sys.modules[loaded] = None  # type: ignore[assignment]
+        sys.modules[name] = None  # type: ignore[assignment]
+        (folder / f"{name}.py").write_text("raise ImportError('hidden')\n")
+    os.environ["PYTHONPATH"] = str(folder)
 
 
 if __name__ == "__main__":

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +9,7 @@ import pytest
 import yaml
 
 from ratslam.cli import main
-from tests.helpers.live import ROOT
 from tests.ratslam.live.bench import LEGS, Bench
-
-MISSING = "raise ImportError('not here')\n"
-NO_LIBRARIES = "import ctypes.util\nctypes.util.find_library = lambda name: None\n"
 
 
 def written(bench: Bench, folder: Path, **settings: Any) -> list[str]:
@@ -58,34 +51,21 @@ def test_invalid_configurations_are_refused(
 @pytest.mark.parametrize(
     ("without", "address", "said"),
     [
-        (("rtde_control", "rtde_receive"), None, ["ur_rtde", "pip install 'ratslam[live]'"]),
-        (("usb",), None, ["usb", "pip install 'ratslam[live]'"]),
-        (("libusb_package", "sitecustomize"), "usb", ["no libusb", "pip install libusb-package"]),
-        ((), "127.0.0.200", ["no head at 127.0.0.200", "plug it in"]),
+        (["rtde_control", "rtde_receive"], None, ["ur_rtde", "pip install 'ratslam[live]'"]),
+        (["usb"], None, ["usb", "pip install 'ratslam[live]'"]),
+        (["libusb_package", "libusb"], "usb", ["no libusb", "pip install libusb-package"]),
+        ([], "127.0.0.200", ["no head at 127.0.0.200", "plug it in"]),
     ],
     ids=["ur_rtde", "pyusb", "libusb", "head"],
 )
 def test_missing_libraries_and_devices_are_refused(
-    bench: Bench, tmp_path: Path, without: tuple[str, ...], address: str | None, said: list[str]
+    bench: Bench, without: list[str], address: str | None, said: list[str]
 ) -> None:
-    """Modules that cannot be imported, in any process of the session."""
-    for name in without:
-        (tmp_path / f"{name}.py").write_text(NO_LIBRARIES if name == "sitecustomize" else MISSING)
     sent = len(bench.arm.state()["targets"])
-    done = subprocess.run(
-        [
-            *(sys.executable, "-m", "ratslam"),
-            *written(bench, tmp_path, head={"address": address or bench.host}),
-        ],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        env={**os.environ, "PYTHONPATH": str(tmp_path)},
-    )
-    assert done.returncode == 2, done.stderr
-    assert "Traceback" not in done.stderr, done.stderr
-    for text in said:
-        assert text in done.stderr
-    assert not (tmp_path / "run").exists()
+    with bench.session(without=without, head={"address": address or bench.host}) as session:
+        assert session.code() == 2, session.said()
+        assert "Traceback" not in session.said(), session.said()
+        for text in said:
+            assert text in session.said()
+        assert not session.directory.exists()
     assert len(bench.arm.state()["targets"]) == sent
