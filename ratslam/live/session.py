@@ -101,7 +101,7 @@ def run_live_session(
                 fault = error.fault
             except OperatorStop:
                 fault = Fault(SessionOutcome.INTERRUPTED, f"after {len(handed)} whisks", time.monotonic())
-            standing = rig.rest(fault.detail)
+            standing = rig.rest()
             report = _report(fault, rig, mapper, handed, standing)
         card = mapper.finish(fault.outcome is not SessionOutcome.COMPLETE) if handed else None
     with suppress(OSError):  # a full disk has been reported

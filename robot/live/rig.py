@@ -132,10 +132,10 @@ class Rig:
         self.epoch = time.monotonic()
         self.state_ages = []
 
-    def rest(self, reason: str) -> bool:
+    def rest(self) -> bool:
         """Stops the arm, unless a fault has, and retracts the whiskers; whether the arm was seen at rest."""
         if self.arm.fault is None:
-            self.arm.halt(reason)
+            self.arm.halt()
         self.driver.rest()
         began = stood = now = time.monotonic()
         while now - stood < REST_TIME and now - began < MAX_REST_TIME:

@@ -119,7 +119,7 @@ def follow_route(rig: Rig, route: Route) -> None:
 
 def wait_for_head(rig: Rig, route: Route) -> None:
     """Stops the arm until the head is back."""
-    rig.arm.halt("the head sends nothing")
+    rig.arm.halt()
     rig.record_event("held", "the head sends nothing")
     # The reader limits the waiting time and turns it into a fault.
     rig.wait_until(lambda: rig.streaming, float("inf"), SessionOutcome.HEAD_GONE, "the head")

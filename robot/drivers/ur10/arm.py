@@ -5,7 +5,7 @@
         arm.move(tcp_of(config.placing, pose))
         while not arm.arrived() and arm.fault is None: ...
 
-The first reason to stop becomes `fault`; every move is refused after it until `respawn`.
+The first reason to stop becomes `fault`; every move is refused after it.
 """
 
 from __future__ import annotations
@@ -32,8 +32,6 @@ class Arm:
 
     def __init__(self, config: ArmConfig) -> None:
         self.config = config
-        self.reason = ""
-        """Reason of the last halt."""
         self.shared = SharedState()
         self.supervisor = Supervisor(config, self.shared)
 
@@ -61,14 +59,6 @@ class Arm:
         except BaseException:
             self.supervisor.kill_process()
             raise
-
-    def respawn(self) -> None:
-        """Starts again after a fault, with all checks. The pose may differ: the motion between is not
-        odometry."""
-        self.supervisor.kill_process()
-        dashboard.stop_program(self.config.host)
-        self.reason = ""
-        self.start()
 
     def close(self) -> None:
         """Stops the arm, ends its process and releases everything."""
@@ -133,9 +123,8 @@ class Arm:
         errand = self.supervisor.pending
         return errand is not None and self.supervisor.arrived(errand)
 
-    def halt(self, reason: str) -> None:
+    def halt(self) -> None:
         """Stops the arm, by the dashboard server where it does not stop in time. Moves may follow."""
-        self.reason = reason
         self.supervisor.halt()
 
     def fail(self, outcome: SessionOutcome, detail: str) -> None:

@@ -62,12 +62,14 @@ class ArmConfig(Settings):
     """Change of the force at the tool that counts as a contact in two consecutive states, N."""
     backoff: Annotated[float, Field(ge=0, le=0.05)] = 0.01
     """Distance that the tool backs off after a contact, m."""
-    stale: Annotated[float, Field(gt=0, le=1.0)] = 0.1
-    """Largest age of the newest state before the arm counts as lost, s."""
-    heartbeat: Annotated[float, Field(gt=0, le=1.0)] = 0.15
-    """Largest age of the session's heartbeat before the RTDE process stops the arm and ends, s."""
-    watchdog_hz: Annotated[float, Field(ge=2, le=100)] = 10.0
-    """Rate of the watchdog reset below which the controller stops the arm, Hz."""
+    stale: PositiveFloat = 0.1
+    """Largest age of the newest state before the arm counts as lost, s; at most 1, except for an emulator."""
+    heartbeat: PositiveFloat = 0.15
+    """Largest age of the session's heartbeat before the RTDE process stops the arm and ends, s; at most 1,
+    except for an emulator."""
+    watchdog_hz: Annotated[float, Field(gt=0, le=100)] = 10.0
+    """Rate of the watchdog reset below which the controller stops the arm, Hz; at least 2, except for an
+    emulator."""
     arrive: PositiveFloat = 0.001
     """Position tolerance of an arrival, m."""
     arrive_turn_deg: PositiveFloat = 0.5
@@ -76,3 +78,13 @@ class ArmConfig(Settings):
     """Time beyond the expected duration of a move before it counts as not arrived, s."""
     connect: PositiveFloat = 10.0
     """Time-out of the connection, of the start of the control script and of the full state rate, s."""
+
+    @model_validator(mode="after")
+    def _stops_in_time(self) -> ArmConfig:
+        slow = self.stale > 1 or self.heartbeat > 1 or self.watchdog_hz < 2
+        if slow and not self.host.startswith("127."):
+            raise ValueError(
+                "`stale` and `heartbeat` are at most 1 s, and `watchdog_hz` is at least 2 Hz, except for an "
+                "emulator at a loopback address"
+            )
+        return self

@@ -305,7 +305,7 @@ class Bench:
 
     def quick(self, **settings: Any) -> dict[str, Any]:
         """The section `live` of a session of a few seconds, with time-outs for a busy machine."""
-        arm = {"host": self.host, "stale": 1.0, "heartbeat": 1.0, "watchdog_hz": 2.0} | {
+        arm = {"host": self.host, "stale": 30.0, "heartbeat": 30.0, "watchdog_hz": 0.05} | {
             "patience": PATIENCE,
             "connect": PATIENCE,
         }
@@ -314,7 +314,7 @@ class Bench:
             "calibration": {"min_duration": 1.0},
             "motion": {"speed": 0.05},
         }
-        head = {"address": self.host, "patience": 1.5, "silence": 0.5}
+        head = {"address": self.host, "patience": PATIENCE, "silence": 20.0}
         usual = {
             "waypoints": LEGS,
             "lift": 0.01,

@@ -11,7 +11,9 @@ from tests.ratslam.live.bench import Bench
 from tests.ratslam.live.expected_outcomes import ended, stands
 
 BLIND = {"stall", "malformed", "truncated", "huge", "nan", "freeze", "die"}
-"""Faults after which the session does not see the arm any more."""
+"""Faults after which the session gets no states of the arm."""
+LATE = {"stall", "huge", "freeze"}
+"""Faults that are found by the age of the newest state."""
 OFTEN = pytest.mark.soak
 """Every run of the suite tests the arm alone with these (`tests/robot/drivers/ur10`),
 `make soak` whole sessions."""
@@ -36,7 +38,7 @@ OFTEN = pytest.mark.soak
     ids=lambda value: "-".join(map(str, value.values())) if isinstance(value, dict) else "",
 )
 def test_a_fault_of_the_controller(bench: Bench, fault: dict, outcome: str) -> None:
-    with bench.under_way() as session:
+    with bench.under_way(arm={"stale": 1.0} if fault["do"] in LATE else {}) as session:
         at = bench.moment()
         if fault["do"] == "die":
             bench.arm.die()

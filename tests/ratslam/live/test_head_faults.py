@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from tests.helpers.live import PATIENCE, until
+from tests.helpers.live import until
 from tests.ratslam.live.bench import LEGS, START, Bench, Kept
 from tests.ratslam.live.expected_outcomes import ended
 
@@ -28,7 +28,7 @@ def gaps(kept: Kept) -> int:
     ids=lambda value: value["do"] if isinstance(value, dict) else "",
 )
 def test_a_head_that_stays_away_ends_the_session(bench: Bench, fault: dict, outcome: str) -> None:
-    with bench.under_way() as session:
+    with bench.under_way(head={"patience": 3.0, "silence": 1.0}) as session:
         at = bench.moment()
         bench.head(**fault)
         until(bench.still, "the arm stands while the head sends nothing")
@@ -45,13 +45,13 @@ def test_a_head_that_stays_away_ends_the_session(bench: Bench, fault: dict, outc
     "fault",
     [
         {"do": "unplug"},
-        {"do": "stall", "seconds": 1.5},
-        pytest.param({"do": "silence", "seconds": 1.5}, marks=pytest.mark.soak),
+        {"do": "stall", "seconds": 2.5},
+        pytest.param({"do": "silence", "seconds": 2.5}, marks=pytest.mark.soak),
     ],
     ids=lambda fault: fault["do"],
 )
 def test_the_session_continues_when_the_head_is_back(bench: Bench, fault: dict) -> None:
-    with bench.under_way(head={"patience": PATIENCE}, waypoints=LEGS[:2]) as session:
+    with bench.under_way(head={"silence": 1.0}, waypoints=LEGS[:2]) as session:
         bench.head(**fault)
         until(bench.still, "the arm stands")
         bench.head(do="plug")
@@ -73,7 +73,7 @@ def test_the_session_continues_when_the_head_is_back(bench: Bench, fault: dict) 
 
 def test_damaged_frames_are_counted(bench: Bench) -> None:
     """Exact counts of damaged, skipped and swapped frames and of garbage; the session continues."""
-    with bench.under_way(whisks=12, head={"silence": 10.0, "patience": PATIENCE}) as session:
+    with bench.under_way(whisks=12) as session:
         before = bench.head(do="counts")
         bench.head(do="corrupt", frames=7)
         bench.head(do="garbage", bytes=100_000)
@@ -94,7 +94,7 @@ def test_damaged_frames_are_counted(bench: Bench) -> None:
 
 
 def test_frames_lost_to_an_overrun_are_counted(bench: Bench) -> None:
-    with bench.under_way(head={"silence": 10.0, "patience": PATIENCE}, whisks=16) as session:
+    with bench.under_way(whisks=16) as session:
         before = bench.head(do="counts")
         bench.head(do="silence", seconds=2.4)  # more than its FIFO holds
         report, kept = ended(bench, session, "complete", bench.moment()._replace(robot=0.0, sample=0))

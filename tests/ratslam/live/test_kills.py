@@ -22,7 +22,7 @@ NUMBERS = [*FEW, *(pytest.param(number, marks=pytest.mark.soak) for number in MA
 
 
 def recovered(recording: Path) -> Path:
-    """A whole recording of what can be read of one."""
+    """A complete recording with the readable part of an incomplete one."""
     whole = recording.with_name("whole.mcap")
     told = recover(recording, whole)
     assert told.samples == Recording(whole).length > 0
@@ -31,7 +31,7 @@ def recovered(recording: Path) -> Path:
 
 @pytest.mark.parametrize("number", NUMBERS)
 def test_the_whole_session_is_killed(bench: Bench, number: int) -> None:
-    with bench.session() as session:
+    with bench.session(arm={"watchdog_hz": 10.0 if number in MANY else 0.5}) as session:
         session.says("armed")
         time.sleep(float(stream(number, "killed").uniform(0.6, 2.0)))
         at = bench.moment()
@@ -61,7 +61,7 @@ def test_the_parent_is_killed_in_motion(bench: Bench) -> None:
 
 @pytest.mark.parametrize("number", NUMBERS)
 def test_an_interrupt_ends_the_session(bench: Bench, number: int) -> None:
-    """From the first moment to the last: a controlled stop, and what there is is kept."""
+    """At any moment: a controlled stop, and a complete recording up to then."""
     with bench.session(waypoints=[(0.63, 0.45, 0.0), (0.7, 0.45, 0.0)]) as session:
         session.says("disk:")
         time.sleep(float(stream(number, "interrupted").uniform(0.0, 5.0)))
@@ -82,7 +82,7 @@ def test_an_interrupt_ends_the_session(bench: Bench, number: int) -> None:
 
 
 def test_a_second_interrupt_stops_the_arm_by_the_dashboard(bench: Bench) -> None:
-    """The second time nothing is waited for, but the arm."""
+    """The second interrupt waits for the arm only."""
     with bench.under_way() as session:
         session.process.send_signal(signal.SIGINT)
         time.sleep(0.005)

@@ -35,7 +35,7 @@ def test_no_invalid_move_reaches_the_controller(arm: Arm, controller: Faults) ->
         time.sleep(0.03)
 
     ask()
-    arm.halt("enough")
+    arm.halt()
     until(arm.still)
     told = moves(controller, first)
     assert arm.fault is None or arm.fault.outcome.name == "UNREACHABLE"

@@ -17,7 +17,7 @@ SESSION = """
 import sys, time
 from robot.drivers.ur10.arm import Arm
 from tests.robot.drivers.ur10.conftest import settings
-arm = Arm(settings(sys.argv[1]))
+arm = Arm(settings(sys.argv[1], heartbeat=1.0, watchdog_hz=2.0))
 arm.start()
 arm.move([float(number) for number in sys.argv[2:]])
 print(arm.pid, flush=True)

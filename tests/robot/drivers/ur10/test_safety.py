@@ -130,12 +130,20 @@ def test_the_last_check_refuses_faster_commands(told: float, target: np.ndarray,
         {"turn_rate": 1.1},
         {"backoff": 0.2},
         {"box": {"low": [0, 0, 0], "high": [1, 1, 0]}},
+        {"host": "192.168.1.10", "stale": 1.1},
+        {"host": "192.168.1.10", "heartbeat": 1.1},
+        {"host": "192.168.1.10", "watchdog_hz": 1.9},
         {"unknown": 1},
     ],
 )
 def test_settings_above_the_caps_are_refused(bad: dict[str, object]) -> None:
     with pytest.raises(ValidationError):
         ArmConfig.model_validate(bad)
+
+
+def test_time_limits_are_wider_for_an_emulator() -> None:
+    assert ArmConfig(host="127.0.0.12", stale=60.0, heartbeat=60.0, watchdog_hz=0.1).stale == 60.0
+    assert ArmConfig(host="192.168.1.10", stale=1.0, heartbeat=1.0, watchdog_hz=2.0).stale == 1.0
 
 
 @given(down, st.floats(-3.1, 3.1))
