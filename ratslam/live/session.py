@@ -9,7 +9,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from math import ceil
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
@@ -23,7 +23,7 @@ from robot.drivers.outcome import Fault, SessionOutcome
 from robot.live.recorder import LiveRecorder
 from robot.live.rig import OperatorStop, Rig, SessionFault
 from robot.live.route import approach_route, check_targets, descent_route, main_route, plan_path, plan_scene
-from robot.live.selftest import check_disk, reported, start_and_check
+from robot.live.selftest import check_disk, start_and_check
 from robot.live.whisk_loop import WhiskReport, follow_route, record_free_whisks, run_whisk_loop
 from robot.recordings.formats import RecordingConfig
 from robot.sources.source_info import SourceInfo
@@ -41,41 +41,22 @@ START_TIMEOUT = 300.0
 """Time limit of the mapper's start, with compilation, s."""
 
 
-class SessionEnd(NamedTuple):
-    """The end of a session.
-
-    Attributes:
-        fault: outcome and finding. report: statistics of the session (`live.json`).
-    """
-
-    fault: Fault
-    report: dict[str, Any]
-
-    @property
-    def outcome(self) -> SessionOutcome:
-        return self.fault.outcome
-
-    def __str__(self) -> str:
-        return str(self.fault)
-
-
 def run_live_session(
     config: RunConfig,
     directory: Path,
     tell: Callable[[str], None],
     mapping: Callable[..., None] | None = None,
     armed: Callable[[Path], None] = lambda directory: None,
-) -> tuple[SessionEnd, Scorecard | None]:
+) -> tuple[Fault, Scorecard | None]:
     """Tests arm and head, calibrates, moves along the route, maps and scores.
 
     Args:
-        directory: the new run directory. tell: is told a line at a time.
-        mapping: what the mapper's process does; None: `ratslam.live.mapper_process.run_mapper`. armed: is
-        told the
-            directory when the session begins.
+        directory: the new run directory. tell: called with each line of progress.
+        mapping: main function of the mapper process; None: `ratslam.live.mapper_process.run_mapper`.
+        armed: called with the directory when the session begins.
 
     Returns:
-        the end of the session, and the score of the map, if there is one.
+        the outcome of the session with its finding, and the score of the map, if there is one.
 
     Raises:
         InputError: why nothing was armed.
@@ -106,7 +87,7 @@ def run_live_session(
         card = mapper.finish(fault.outcome is not SessionOutcome.COMPLETE) if handed else None
     with suppress(OSError):  # a full disk has been reported
         (directory / REPORT).write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
-    return SessionEnd(fault, report), card
+    return fault, card
 
 
 def mapping_job(config: RunConfig, path: Way, calibration: Calibration, directory: Path) -> MappingJob:
@@ -155,7 +136,8 @@ def open_recorder(order: MappingJob) -> LiveRecorder:
 def _calibrate(rig: Rig, config: RunConfig, path: Way, tell: Callable[[str], None]) -> Calibration:
     """Tests both devices, and records free whisks above the start of the route for the calibration."""
     plan = rig.config.plan
-    reported(start_and_check(rig), tell)
+    for line in start_and_check(rig):
+        tell(line)
     tell("arm: going above the start of the way")
     follow_route(rig, approach_route(rig.config, path))
     count = ceil(plan.calibration.min_duration * plan.whisking.rate)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -73,9 +73,3 @@ def start_and_check(rig: Rig) -> Iterator[str]:
 def _listen(rig: Rig) -> None:
     end = rig.now() + LISTEN_TIME
     rig.wait_until(lambda: rig.now() >= end, LISTEN_TIME + 5.0, SessionOutcome.HEAD_SILENT, "the self-test")
-
-
-def reported(lines: Iterator[str], tell: Callable[[str], None]) -> None:
-    """Prints every line as it comes."""
-    for line in lines:
-        tell(line)

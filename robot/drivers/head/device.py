@@ -21,6 +21,7 @@ from robot.drivers.head.protocol import (
     REQUEST_OUT,
     Request,
 )
+from robot.drivers.head.usb_tcp_backend import SocketBackend
 from tactile.base.errors import InputError
 
 T = TypeVar("T")
@@ -104,7 +105,7 @@ def open_bridge(address: str) -> Bridge:
     """
     where = Address.parse(address)
     core = _pyusb()
-    backend = _libusb() if where.host is None else _socket(where.host, where.port)
+    backend = _libusb() if where.host is None else SocketBackend(where.host, where.port)
     try:
         numbers = {"idVendor": where.vendor, "idProduct": where.product}
         found = core.find(backend=backend, custom_match=_serial_filter(where.serial), **numbers)
@@ -226,9 +227,3 @@ def _libusb() -> Any:
         cure = "pip install libusb-package, or install the system's libusb-1.0"
         raise InputError("usb", "no libusb", "libusb 1.0", cure)
     return backend
-
-
-def _socket(host: str, port: int) -> Any:
-    from robot.drivers.head import usb_tcp_backend
-
-    return usb_tcp_backend.tcp_backend(host, port)

@@ -31,9 +31,9 @@ class Handle:
 
 
 class SocketBackend:
-    """A `usb.backend.IBackend` (by its methods) of a bus with at most one device."""
+    """A `usb.backend.IBackend` (by its methods) of a bus with at most one device: an emulator's."""
 
-    def __init__(self, host: str, port: int) -> None:
+    def __init__(self, host: str, port: int = PORT) -> None:
         self.host, self.port = host, port
 
     def enumerate_devices(self) -> Iterator[bytes]:
@@ -158,11 +158,6 @@ class SocketBackend:
     def _request(self, handle: Handle, op: Op, address: int = 0, **more: Any) -> bytes:
         line = handle.inwards if op == Op.BULK and address & IN else handle.other
         return _as_usb_error(lambda: line.call(op, address, **more))
-
-
-def tcp_backend(host: str, port: int = PORT) -> SocketBackend:
-    """A pyusb backend for the emulator at that address: `usb.core.find(backend=...)`."""
-    return SocketBackend(host, port)
 
 
 def _as_usb_error(action: Callable[[], T]) -> T:

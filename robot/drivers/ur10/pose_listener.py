@@ -11,7 +11,6 @@ import socket
 import struct
 import threading
 import time
-from types import TracebackType
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -53,13 +52,8 @@ class PoseListener:
         self._thread = threading.Thread(target=self._run, name="tool poses", daemon=True)
         self._thread.start()
 
-    def latest(self) -> tuple[float, np.ndarray, np.ndarray] | None:
-        """(host time s, tcp [6], speed [6]) of the newest state; None before the first."""
-        pose = self._latest
-        return None if pose is None else (pose.time, pose.tcp, pose.speed)
-
-    def newest(self) -> ToolPose | None:
-        """The newest state, with the controller's time."""
+    def latest(self) -> ToolPose | None:
+        """The newest tool pose; None before the first."""
         return self._latest
 
     def close(self) -> None:
@@ -70,9 +64,7 @@ class PoseListener:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _run(self) -> None:

@@ -161,12 +161,6 @@ def in_box(config: ArmConfig, tcp: np.ndarray) -> bool:
     return bool(((place >= low - ROUNDING) & (place <= high + ROUNDING)).all())
 
 
-def exceeds_force(config: ArmConfig, force: np.ndarray, rest: np.ndarray, most: float | None = None) -> bool:
-    """Whether a force [6] differs from that at rest by more than a limit (`most`; None: as configured)."""
-    limit = config.force_limit if most is None else most
-    return not math.hypot(*(force[:3] - rest[:3])) <= limit
-
-
 def at_rest(state: np.ndarray) -> bool:
     """Whether a state (ARM_STATE) shows an arm at rest: under 0.5 mm/s and 0.3 degrees/s."""
     speed = state["speed"]
@@ -182,7 +176,9 @@ def check_state(
         rest: [6] force of the arm at rest. most: N, in place of the configured limit.
     """
     numbers = [state["robot"], *state["tcp"], *state["speed"], *state["force"], *state["joints"]]
-    loaded = watch.loaded + 1 if exceeds_force(config, state["force"], rest, most) else 0
+    limit = config.force_limit if most is None else most
+    force = math.hypot(*(state["force"][:3] - rest[:3]))
+    loaded = 0 if force <= limit else watch.loaded + 1  # NaN counts as too large
     after = StateMemory(loaded, float(state["robot"]))
     if not np.isfinite(numbers).all():
         return after, Finding(SessionOutcome.ARM_MALFORMED, "a state has values that are not finite")
@@ -200,7 +196,6 @@ def check_state(
             SessionOutcome.OUT_OF_BOX, f"{_place(state['tcp'])} lies outside the box {_box(config)}"
         )
     if loaded >= MIN_LOADED:
-        force = math.hypot(*(state["force"][:3] - rest[:3]))
         return after, Finding(SessionOutcome.CONTACT, f"{force:.0f} N at the tool at {_place(state['tcp'])}")
     return after, None
 

@@ -7,6 +7,7 @@ from typing import Protocol
 import numpy as np
 
 from robot.drivers.ur10.base_transform import BaseTransformConfig, pose_from_tcp
+from robot.drivers.ur10.pose_listener import PoseListener
 from robot.world.head_trajectory import HeadPath, poses_at
 
 AHEAD = 0.1
@@ -25,31 +26,22 @@ class PoseSource(Protocol):
         ...
 
 
-class ToolPoses(Protocol):
-    """Source of tool poses: `robot.drivers.ur10.pose_listener.PoseListener`."""
-
-    def latest(self) -> tuple[float, np.ndarray, np.ndarray] | None:
-        """Host time of receipt (s), tool pose [6] and its rate [6]; None before the first."""
-        ...
-
-
 class CarriedByArm:
     """The newest pose of an arm, extrapolated by its speed."""
 
-    def __init__(self, arm: ToolPoses, placing: BaseTransformConfig) -> None:
+    def __init__(self, arm: PoseListener, placing: BaseTransformConfig) -> None:
         self.arm, self.placing = arm, placing
 
     def at(self, time: float) -> tuple[np.ndarray, float]:
-        told = self.arm.latest()
-        if told is None:
+        newest = self.arm.latest()
+        if newest is None:
             return np.zeros(3), np.inf
-        since, tcp, speed = told
-        ahead = min(max(time - since, -AHEAD), AHEAD)
-        tool = np.array(tcp, float)
-        tool[:3] += ahead * np.asarray(speed)[:3]
+        ahead = min(max(time - newest.time, -AHEAD), AHEAD)
+        tool = np.array(newest.tcp, float)
+        tool[:3] += ahead * newest.speed[:3]
         pose, lift = pose_from_tcp(self.placing, tool)
         # The arm's turning axis and that of the map's headings are both vertical.
-        return pose + np.array([0.0, 0.0, ahead * float(speed[5])]), float(lift)
+        return pose + np.array([0.0, 0.0, ahead * float(newest.speed[5])]), float(lift)
 
 
 class AlongPath:

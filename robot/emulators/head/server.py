@@ -17,6 +17,7 @@ from collections.abc import Awaitable, Callable
 from robot.drivers.head.protocol import ENDPOINT_IN
 from robot.drivers.head.usb_tcp_protocol import ANSWER, IN, REQUEST, Op
 from robot.drivers.process_priority import URGENT, set_niceness
+from robot.drivers.ur10.pose_listener import PoseListener
 from robot.emulators.head import usb_descriptors
 from robot.emulators.head.config import HeadEmulatorConfig
 from robot.emulators.head.device import EmulatedHead
@@ -49,8 +50,6 @@ def serve(config: HeadEmulatorConfig) -> None:
 def _place(config: HeadEmulatorConfig, path: HeadPath, stack: contextlib.ExitStack) -> PoseSource:
     if config.arm is None:
         return AlongPath(path if config.follow else HeadPath(path.time[:1], path.pose[:1]))
-    from robot.drivers.ur10.pose_listener import PoseListener
-
     arm = PoseListener(config.arm, hz=config.arm_hz)
     stack.callback(arm.close)
     return CarriedByArm(arm, config.placing)

@@ -29,7 +29,7 @@ from robot.drivers.head.protocol import (
     Request,
     pack_command,
 )
-from robot.drivers.head.usb_tcp_backend import SocketBackend, tcp_backend
+from robot.drivers.head.usb_tcp_backend import SocketBackend
 from robot.emulators.head.config import HeadEmulatorConfig
 from tests.helpers.live import Faults, until
 from tests.robot.emulators.head.heads import drive, running
@@ -53,7 +53,7 @@ def head(process: Faults) -> Faults:
 
 
 def found(head: Faults) -> Any:
-    return core.find(backend=tcp_backend(head.host), idVendor=VENDOR, idProduct=PRODUCT)
+    return core.find(backend=SocketBackend(head.host), idVendor=VENDOR, idProduct=PRODUCT)
 
 
 @pytest.fixture
@@ -79,10 +79,10 @@ def read(device: Any, seconds: float, decoder: Decoder) -> Frames:
 
 
 def test_the_backend_has_the_methods_of_pyusb() -> None:
-    tcp_backend = importlib.import_module("usb.backend").IBackend
+    interface = importlib.import_module("usb.backend").IBackend
     asked = {
         name: method
-        for name, method in inspect.getmembers(tcp_backend, inspect.isfunction)
+        for name, method in inspect.getmembers(interface, inspect.isfunction)
         if not name.startswith("_") and name != "finalize"
     }
     assert len(asked) > 20
@@ -98,7 +98,7 @@ def test_the_device_is_found_with_its_descriptors(head: Faults, device: Any) -> 
     (interface,) = device.get_active_configuration()
     assert [end.bEndpointAddress for end in interface] == [ENDPOINT_IN, ENDPOINT_OUT]
     assert util.endpoint_type(interface[0].bmAttributes) == util.ENDPOINT_TYPE_BULK
-    assert core.find(backend=tcp_backend(head.host), idVendor=0x1234) is None
+    assert core.find(backend=SocketBackend(head.host), idVendor=0x1234) is None
     assert found(Faults(head.process, "127.0.0.1", 0)) is None or head.host == "127.0.0.1"
 
 

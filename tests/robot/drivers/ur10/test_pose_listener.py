@@ -24,29 +24,29 @@ def faults(loopback: str) -> Iterator[Faults]:
 
 def test_pose_speed_and_time(faults: Faults) -> None:
     with PoseListener(faults.host) as poses:
-        _, tcp, speed = until(poses.latest)
+        _, tcp, speed, _ = until(poses.latest)
         np.testing.assert_allclose(tcp, START)
         assert not speed.any()
         with socket.create_connection((faults.host, 30003)) as script:
             script.sendall(b"movel(p[0.6,0.02,0.3,3.141592653589793,0,0],a=1,v=0.02)\n")
-            until(lambda: poses.latest()[2][1] == pytest.approx(0.02))
-            first = poses.newest()
-            then = until(lambda: (new := poses.newest()) is not first and new)
+            until(lambda: poses.latest().speed[1] == pytest.approx(0.02))
+            first = poses.latest()
+            then = until(lambda: (new := poses.latest()) is not first and new)
             assert first is not None
             assert then is not None
             steps = (then.robot_time - first.robot_time) / 0.008
             assert steps == pytest.approx(round(steps), abs=1e-6)
             assert then.tcp[1] - first.tcp[1] == pytest.approx(0.02 * (then.robot_time - first.robot_time))
-            until(lambda: poses.latest()[1][1] == pytest.approx(0.02))
-        assert poses.latest()[0] <= time.monotonic()
+            until(lambda: poses.latest().tcp[1] == pytest.approx(0.02))
+        assert poses.latest().time <= time.monotonic()
 
 
 @pytest.mark.parametrize("fault", ["close", "malformed"])
 def test_it_reconnects(faults: Faults, fault: str) -> None:
     with PoseListener(faults.host, patience=0.3) as poses:
-        before = until(poses.newest)
+        before = until(poses.latest)
         faults(do=fault)
-        until(lambda: poses.newest().robot_time > before.robot_time + 0.1)
+        until(lambda: poses.latest().robot_time > before.robot_time + 0.1)
 
 
 def test_poses_stop_during_a_stall_and_resume(faults: Faults) -> None:
@@ -54,11 +54,11 @@ def test_poses_stop_during_a_stall_and_resume(faults: Faults) -> None:
         until(poses.latest)
         faults(do="stall", seconds=600)
         time.sleep(0.3)  # states that were sent before
-        stood = poses.newest()
+        stood = poses.latest()
         time.sleep(0.2)
-        assert poses.newest() is stood
+        assert poses.latest() is stood
         faults(do="clear")
-        until(lambda: poses.newest() is not stood)
+        until(lambda: poses.latest() is not stood)
 
 
 def test_without_a_controller_there_is_no_pose() -> None:

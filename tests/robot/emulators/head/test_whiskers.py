@@ -17,6 +17,7 @@ from robot.drivers.head.protocol import (
     to_radians,
 )
 from robot.drivers.ur10.base_transform import BaseTransformConfig, tcp_from_pose
+from robot.drivers.ur10.pose_listener import ToolPose
 from robot.emulators.head.config import HeadEmulatorConfig
 from robot.emulators.head.device import BLOCK
 from robot.emulators.head.pose_source import AHEAD, AlongPath, CarriedByArm
@@ -40,13 +41,13 @@ class Arm:
     """Told by the test."""
 
     def __init__(self) -> None:
-        self.state: tuple[float, np.ndarray, np.ndarray] | None = None
+        self.state: ToolPose | None = None
 
-    def latest(self) -> tuple[float, np.ndarray, np.ndarray] | None:
+    def latest(self) -> ToolPose | None:
         return self.state
 
     def put(self, time: float, pose: list[float], lift: float = 0.0) -> None:
-        self.state = (time, tcp_from_pose(PLACING, np.array(pose), lift), np.zeros(6))
+        self.state = ToolPose(time, tcp_from_pose(PLACING, np.array(pose), lift), np.zeros(6), time)
 
 
 @pytest.mark.parametrize("mode", [FeedbackMode.OPEN, FeedbackMode.RCP])
@@ -136,7 +137,7 @@ def test_poses_between_arm_states_are_extrapolated() -> None:
     arm, home = Arm(), np.array([0.5, 0.4, 3.1])
     place = CarriedByArm(arm, PLACING)
     tcp = tcp_from_pose(PLACING, home)
-    arm.state = (10.0, tcp, np.array([0.03, -0.01, 0.02, 0.0, 0.0, 0.4]))
+    arm.state = ToolPose(10.0, tcp, np.array([0.03, -0.01, 0.02, 0.0, 0.0, 0.4]), 10.0)
     rows = [place.at(10.0 + ahead) for ahead in (0.0, 0.02, 0.05, AHEAD, 5.0)]
     poses, lifts = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
     np.testing.assert_allclose(poses[0], home, atol=1e-9)

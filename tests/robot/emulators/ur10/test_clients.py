@@ -192,11 +192,11 @@ def test_a_long_stall_ends_a_controlling_client(faults: Faults) -> None:
 def test_the_state_rate_can_be_lowered(faults: Faults) -> None:
     def told() -> int:
         with PoseListener(faults.host) as poses:
-            until(poses.newest)
+            until(poses.latest)
             times = set()
-            end = poses.newest().robot_time + 0.5
-            while poses.newest().robot_time < end:
-                times.add(poses.newest().robot_time)
+            end = poses.latest().robot_time + 0.5
+            while poses.latest().robot_time < end:
+                times.add(poses.latest().robot_time)
                 time.sleep(0.001)
         return len(times)
 
