@@ -162,7 +162,7 @@ def draw_curves(
         for color, (name, (arcr, arr)) in zip(SERIES_COLORS[1:], conditions.items(), strict=False):
             for number, (x, y) in enumerate(zip(arcr, arr, strict=True)):
                 axes.plot(x, y, "o-", ms=3, lw=0.9, alpha=0.7, color=color, label=None if number else name)
-        axes.set(xlim=(0, 1.03), ylim=(0, None))
+        axes.set(xlim=(-0.04, 1.04), ylim=(0, None))
         axes.grid(color=LINE_GREY, lw=0.7)
         style.name_axes(axes, "ARCR, strict", "ARR")
     style.add_legend(figure, panels[0])
@@ -226,6 +226,7 @@ def _panels(
 
 def _map_axes(axes: style.Axes) -> None:
     axes.set_aspect("equal", adjustable="datalim")
+    axes.locator_params(steps=[1, 2, 5, 10])  # short tick labels
     axes.grid(color=LINE_GREY, lw=0.7)
     axes.tick_params(labelcolor=LABEL_GREY)
     style.name_axes(axes, "x (m)", "y (m)")

@@ -1,4 +1,4 @@
-"""What an engine is given of a whisk, and of one that was dropped."""
+"""Observations of the front end from complete and dropped whisks."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def a_whisk(alive: np.ndarray) -> Whisk:
 
 
 @pytest.mark.parametrize("settings", [{}, {"image": {"radial": True, "transform": "max_angle"}}])
-def test_a_dropped_whisk_is_motion_without_a_view(settings: dict[str, object]) -> None:
+def test_a_dropped_whisk_has_motion_but_no_view(settings: dict[str, object]) -> None:
     frontend = Frontend(TouchConfig.model_validate(settings), CALIBRATION)
     seen = frontend.observe(DROPPED)
     assert not seen.view_seen
@@ -39,7 +39,7 @@ def test_a_dropped_whisk_is_motion_without_a_view(settings: dict[str, object]) -
     assert like(seen, frontend.observe(a_whisk(np.ones(W, bool))))
 
 
-def test_a_view_is_seen_where_any_whisker_reports() -> None:
+def test_one_live_whisker_makes_a_view() -> None:
     frontend = Frontend(TouchConfig(), CALIBRATION)
     for count in range(W + 1):
         seen = frontend.observe(a_whisk(np.arange(W) < count))

@@ -1,4 +1,4 @@
-"""What the pictures need from a run directory comes back as it was written, or is refused by name."""
+"""Reading of walls, closures and scorecards from a run directory."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ CLOSURES = """keyframe,match,step,match_step,verdict,weight
 
 
 @given(arrays(np.float64, st.tuples(st.integers(1, 9), st.just(5)), elements=st.floats(-1e6, 1e6)))
-def test_walls_come_back_to_the_last_bit(tmp_path_factory, walls):
+def test_walls_read_back_equal(tmp_path_factory, walls):
     folder = tmp_path_factory.mktemp("walls")
     write_walls(folder / "walls.csv", walls)
     assert np.array_equal(read_walls(folder), walls)
 
 
-def test_no_file_no_walls_and_no_closures(tmp_path):
+def test_without_files_there_are_no_walls_and_closures(tmp_path):
     assert read_walls(tmp_path).shape == (0, 5)
     assert read_closures(tmp_path).shape == (0, 2)
 
 
-def test_a_wall_that_is_none_is_refused(tmp_path):
+def test_malformed_walls_are_refused(tmp_path):
     (tmp_path / "walls.csv").write_text("west,south,east,north,height\n0,0,1,1,0.05\n0,0,high,1,0.05\n")
     with pytest.raises(InputError, match=r"walls\.csv:3"):
         read_walls(tmp_path)
@@ -43,8 +43,8 @@ def test_accepted_closures_are_read(tmp_path):
     assert read_closures(tmp_path).tolist() == [[10, 30], [25, 40]]
 
 
-def test_steps_before_the_checkpoint_are_not_in_the_directory(tmp_path):
-    """A run that went on from step 20 of another counts its closures from the beginning."""
+def test_closures_of_a_continued_run_count_from_its_first_step(tmp_path):
+    """The run continued from step 20 of another; closures.csv counts from that one's first step."""
     (tmp_path / "closures.csv").write_text(CLOSURES)
     (tmp_path / "online.tum").write_text("".join(f"{k} 0 0 0 0 0 0 1\n" for k in range(30)))
     np.savez(tmp_path / "map.npz", steps=np.array(50))
@@ -54,13 +54,13 @@ def test_steps_before_the_checkpoint_are_not_in_the_directory(tmp_path):
 @pytest.mark.parametrize(
     "content", ["keyframe,match\n1,2\n", CLOSURES.replace("match_step", "other"), CLOSURES.replace("30", "x")]
 )
-def test_closures_that_are_none_are_refused(tmp_path, content):
+def test_malformed_closures_are_refused(tmp_path, content):
     (tmp_path / "closures.csv").write_text(content)
     with pytest.raises(InputError, match=r"closures\.csv:2"):
         read_closures(tmp_path)
 
 
-def test_a_scorecard_comes_back(tmp_path, circle):
+def test_scorecards_read_back_equal(tmp_path, circle):
     card = score_run(circle, "circle")
     (tmp_path / "scorecard.json").write_text(card.model_dump_json())
     assert read_scorecard(tmp_path) == card

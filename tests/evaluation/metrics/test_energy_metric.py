@@ -45,7 +45,7 @@ def test_energy_by_hand():
 
 @law
 @given(pairs_of_trajectories(), motions, st.integers(1, 4))
-def test_a_rigid_motion_of_the_truth_costs_nothing(pair, motion, step):
+def test_a_rigid_motion_of_the_truth_has_no_energy(pair, motion, step):
     truth, _ = pair
     moved = compose(motion, truth)
     assert energy_all_pairs(truth, moved)[:2] == pytest.approx((0, 0), abs=1e-10)

@@ -1,4 +1,4 @@
-"""Any SLAM system's log, read from a CSV."""
+"""Reading and scoring of experience logs from CSV files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ROWS = "0,7,0.1,0.2,3\n0.5,-1,0.1,0.2,-3\n"
         "# any system\ntime,experience_id,x,y,theta\n",
     ],
 )
-def test_headers_are_taken_as_they_come(tmp_path, head):
+def test_column_names_in_a_header(tmp_path, head):
     path = tmp_path / "log.csv"
     path.write_text(head + ROWS)
     log = read_experience_log(path)
@@ -29,7 +29,7 @@ def test_headers_are_taken_as_they_come(tmp_path, head):
     assert log.truth.tolist() == [[0.1, 0.2, 3], [0.1, 0.2, -3]]
 
 
-def test_columns_may_stand_in_any_order_among_others(tmp_path):
+def test_columns_in_any_order_among_others(tmp_path):
     path = tmp_path / "log.csv"
     path.write_text("heading,gain,y,x,id,t\n3,9,0.2,0.1,7,0\n")
     log = read_experience_log(path)

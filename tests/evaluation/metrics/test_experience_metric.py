@@ -1,4 +1,4 @@
-"""The Experience Metric: the regression vectors of its four readings, and its laws."""
+"""The Experience Metric: known values in its four modes, and invariants."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_one_place_mistaken_for_another(square):
     assert scores["or"] == 62 / 64
 
 
-def test_or_launders_two_places_mistaken_for_each_other(square):
+def test_or_mode_accepts_two_exchanged_places(square):
     ids, truth = square(2, 4)
     ids[32:] = np.choose(ids[32:], [0, 1, 2, 7, 4, 5, 6, 3])
     scores = arcr(ids, truth)
@@ -99,7 +99,7 @@ def test_new_experiences_are_valid_only_after_a_right_relocalisation():
     assert paper.right[paper.counted].tolist() == [True, True, True, False, True, True]
 
 
-def test_a_log_of_actions_scores_otherwise_than_a_log_of_steps(square):
+def test_action_and_step_logs_differ(square):
     ids, truth = square(3, 4)
     ids[40:44] = 99  # a place made anew in the second lap, after which half of the third is new as well
     ids[80:96] = np.arange(100, 104).repeat(4)
@@ -109,13 +109,13 @@ def test_a_log_of_actions_scores_otherwise_than_a_log_of_steps(square):
     assert action.arr == experience_metric(ids[::4], truth[::4]).arr
 
 
-def test_steps_without_an_experience_are_passed_over(square):
+def test_steps_without_an_experience_are_skipped(square):
     ids, truth = square(2, 4)
     padded = np.concatenate([[-1, -1], ids]), np.concatenate([truth[:1], truth[:1], truth])
     assert experience_metric(*padded)[:6] == experience_metric(ids, truth)[:6]
 
 
-def test_turning_about_near_the_start_is_no_loop(square):
+def test_turning_around_near_the_start_is_not_a_loop(square):
     _, truth = square(2, 4)
     about = np.array([[0, 0, 0], [0, 0, 1.5], [0.15, 0, 3.0], [0, 0, 0.0]])
     assert base_end(np.concatenate([about, truth[1:]])) == 32 + 3
@@ -125,7 +125,7 @@ def test_turning_about_near_the_start_is_no_loop(square):
         base_end(trembling)
 
 
-def test_a_run_that_never_returns_asks_for_the_base_set(square):
+def test_a_run_that_never_returns_needs_a_base_set(square):
     ids, truth = square(2, 4)
     with pytest.raises(InputError, match=r"never returns within .* set `base`, the end of the base set"):
         experience_metric(ids[:30], truth[:30])
@@ -141,12 +141,12 @@ def test_a_run_that_never_returns_asks_for_the_base_set(square):
         (np.zeros(3, int), np.zeros((3, 3)), 4, "i_base: 4; expected 0 to 3"),
     ],
 )
-def test_logs_that_do_not_fit_are_refused(ids, truth, base, message):
+def test_invalid_logs_are_refused(ids, truth, base, message):
     with pytest.raises(InputError, match=message):
         experience_metric(ids, truth, ExmConfig(base=base))
 
 
-def test_changes_pass_over_steps_without_an_experience():
+def test_changes_skip_steps_without_an_experience():
     assert change_rows(np.array([-1, 4, 4, -1, 4, 2, 2, 4])).tolist() == [1, 5, 7]
     assert change_rows(np.array([-1, -1])).tolist() == []
 
@@ -180,7 +180,7 @@ law = settings(derandomize=True, deadline=None)
 
 @law
 @given(walks(), st.permutations(range(7)))
-def test_names_do_not_matter(walk, names):
+def test_renumbering_experiences_has_no_effect(walk, names):
     ids, truth, base = walk
     renamed = np.array(names)[ids] * 1000 - 7
     for mode in EXM_MODES:
@@ -227,7 +227,7 @@ def test_repeating_the_last_lap_does_not_lower_arr(walk, data):
 
 @law
 @given(walks(), st.lists(st.integers(-3, 3), min_size=60, max_size=60))
-def test_full_turns_of_the_heading_change_nothing(walk, turns):
+def test_full_turns_of_the_heading_have_no_effect(walk, turns):
     ids, truth, base = walk
     turned = truth + np.outer(turns[: len(ids)], [0, 0, 2 * np.pi])
     for mode in ("strict", "paper", "or"):

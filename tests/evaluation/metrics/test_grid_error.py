@@ -1,4 +1,4 @@
-"""Occupancy maps against the truth: what holds for every arena, and what no map may win without exploring."""
+"""Metrics of occupancy maps: properties that hold in any arena, constant maps, pooling and the table."""
 
 from __future__ import annotations
 
@@ -95,14 +95,14 @@ constants = st.floats(0, 1).map(lambda value: round(value, 6))
 conventions = st.sampled_from(CONVENTIONS)
 
 
-def test_every_convention_is_there_once():
+def test_there_are_twelve_different_conventions():
     assert len(set(CONVENTIONS)) == len(CONVENTIONS) == 12
     assert {MAIN_CONVENTION, ARENA} < set(CONVENTIONS)
 
 
 @law
 @given(scenes(), conventions)
-def test_a_coin_for_each_cell_errs_by_half(scene, convention):
+def test_a_random_map_has_an_error_of_one_half(scene, convention):
     empty, truth = scene
     assert error(empty, truth, convention).coin == pytest.approx(0.5, abs=1e-12)
     random = np.random.default_rng(0)
@@ -117,7 +117,7 @@ def test_a_coin_for_each_cell_errs_by_half(scene, convention):
 
 @law
 @given(scenes())
-def test_a_perfect_map_is_perfect(scene):
+def test_a_perfect_map_has_the_best_scores(scene):
     empty, truth = scene
     for convention in CONVENTIONS:
         grid = true_grid(empty, truth, convention.outside)
@@ -139,7 +139,7 @@ def test_a_perfect_map_is_perfect(scene):
 
 @law
 @given(scenes(), constants, conventions)
-def test_no_constant_is_better_than_the_best(scene, value, convention):
+def test_the_best_constant_is_the_best_constant_map(scene, value, convention):
     empty, truth = scene
     constant = empty._replace(probability=np.full_like(empty.probability, value))
     found = error(constant, truth, convention)
@@ -165,7 +165,7 @@ def test_a_constant_map_has_no_skill(scene, value):
 
 @law
 @given(scenes(), seeds)
-def test_a_mirror_changes_nothing(scene, seed):
+def test_scores_are_invariant_to_mirroring(scene, seed):
     empty, truth = scene
     grid = noisy(empty, seed)
     middle = 2 * empty.origin[0] + len(empty.probability) * CELL
@@ -182,7 +182,7 @@ def test_a_mirror_changes_nothing(scene, seed):
 
 @law
 @given(scenes(), seeds, st.integers(-3, 3), st.integers(-3, 3))
-def test_whole_cells_further_on_nothing_changes(scene, seed, across, up):
+def test_scores_are_invariant_to_shifts_by_whole_cells(scene, seed, across, up):
     empty, truth = scene
     grid = noisy(empty, seed)
     grid.probability[~np.pad(np.ones((26, 26), bool), 3)] = (
@@ -222,7 +222,7 @@ def test_a_displaced_map_is_worse(scene, by):
 
 @law
 @given(scenes(), seeds)
-def test_auc_counts_pairs(scene, seed):
+def test_auc_is_the_share_of_ordered_pairs(scene, seed):
     empty, truth = scene
     grid, felt = noisy(empty, seed), touchable_surface(empty, truth)
     walls, free = grid.probability[felt.wall][:, None], grid.probability[felt.free]
@@ -237,7 +237,7 @@ def test_auc_counts_pairs(scene, seed):
 
 @law
 @given(scenes(), seeds)
-def test_what_cannot_be_felt_does_not_count(scene, seed):
+def test_hidden_cells_do_not_count(scene, seed):
     empty, truth = scene
     grid, felt = noisy(empty, seed), touchable_surface(empty, truth)
     hidden = ~(felt.free | felt.wall)
@@ -256,14 +256,14 @@ def test_what_cannot_be_felt_does_not_count(scene, seed):
 
 @law
 @given(scenes(), seeds)
-def test_what_is_said_to_be_solid_beyond_the_wall_makes_no_difference(scene, seed):
+def test_occupancy_beyond_the_outer_wall_has_no_effect(scene, seed):
     empty, truth = scene
     grid = noisy(empty, seed)
     filled = truth._replace(occupied=truth.occupied | ~truth.inside)
     assert score_grid(grid, filled) == score_grid(grid, truth)
 
 
-def test_chamfer_is_won_one_way_only():
+def test_one_cell_or_all_cells_minimise_only_one_chamfer_distance():
     empty, truth = scene()
     felt = touchable_surface(empty, truth)
     one = empty.probability.copy()
@@ -275,7 +275,7 @@ def test_chamfer_is_won_one_way_only():
     assert to_map < CELL < 0.1 < to_walls
 
 
-def test_walls_drawn_far_outside_cost():
+def test_false_walls_outside_are_penalised():
     empty, truth = scene()
     perfect = true_grid(empty, truth)
     lost = perfect.probability.copy()
@@ -293,7 +293,7 @@ def test_an_empty_map_has_no_chamfer_distance():
 
 @law
 @given(scenes(), seeds)
-def test_free_space_alone_is_the_map_cut_off_at_its_prior(scene, seed):
+def test_free_space_scores_are_of_the_map_clipped_at_its_prior(scene, seed):
     empty, truth = scene
     grid = noisy(empty, seed)
     blunt = grid._replace(probability=np.minimum(grid.probability, PRIOR_OCCUPANCY))
@@ -302,7 +302,7 @@ def test_free_space_alone_is_the_map_cut_off_at_its_prior(scene, seed):
         assert ours[f"{name}_free"] == theirs[f"{name}_free"] == theirs[name]
 
 
-def test_certainty_of_what_is_wrong_is_finite():
+def test_log_loss_of_certain_errors_is_finite():
     empty, truth = scene()
     felt = touchable_surface(empty, truth)
     wrong = empty._replace(probability=np.where(felt.wall, 0.0, 1.0))
@@ -314,7 +314,7 @@ def test_certainty_of_what_is_wrong_is_finite():
 
 @pytest.mark.parametrize("offset", [0.0, 0.25, 0.5, 0.75])
 @pytest.mark.parametrize("cell", [0.05, 0.025])
-def test_a_wall_is_one_cell_thick_wherever_it_lies(offset, cell):
+def test_a_wall_is_one_cell_thick_at_any_offset(offset, cell):
     """A wall without thickness, `offset` cells beyond a border, is one ring of cells that are not free."""
     side, margin = 20, 6
     low, high = -offset * cell, (side + offset) * cell
@@ -342,7 +342,7 @@ def test_only_surfaces_that_face_free_space_count():
     assert truth_occupancy(truth, felt.wall)[6 + 8, 7] == 1
 
 
-def test_rotated_objects_have_a_skin():
+def test_rotated_objects_have_a_closed_surface():
     empty, truth = scene([])
     turn, middle = 0.4, 10 * CELL
     c, s = np.cos(turn), np.sin(turn)
@@ -395,7 +395,7 @@ def test_a_pool_notes_how_many_trials_have_no_value():
     assert quantity.note == "2 of 3 trials without: no cell above 0.5"
 
 
-def test_a_score_is_json_and_never_silent():
+def test_scores_are_json_with_reasons_for_missing_values():
     empty, truth = scene()
     nowhere = GridTruth(np.zeros_like(truth.inside), np.ones_like(truth.inside), np.zeros((0, 4)))
     for score in (score_grid(empty, truth), score_grid(empty, nowhere)):
@@ -428,7 +428,7 @@ def test_the_table_notes_where_the_papers_order_holds(order):
     assert "0.37" in text
 
 
-def test_an_order_within_a_standard_error_is_said_to_be():
+def test_an_order_within_a_standard_error_is_marked():
     # four trials each, so that the mean's standard error is half the spread
     text = render_grid_scores(
         [mapper("blob", 0.2, 0.05), mapper("geometric", 0.19, 0.05), mapper("template", 0.15, 0.05)]
@@ -436,7 +436,7 @@ def test_an_order_within_a_standard_error_is_said_to_be():
     assert text.count("within a standard error: blob and geometric\n") == 10
 
 
-def test_a_table_of_one_map_claims_no_order():
+def test_a_table_of_one_map_has_no_order():
     empty, truth = scene()
     text = render_grid_scores([score_grid(true_grid(empty, truth), truth, "perfect")])
     assert "order" not in text
@@ -444,7 +444,7 @@ def test_a_table_of_one_map_claims_no_order():
     assert all(line == line.rstrip() for line in text.splitlines())
 
 
-def test_what_is_no_map_is_refused():
+def test_invalid_maps_are_refused():
     empty, truth = scene()
     for bad in (np.nan, -0.1, 1.1):
         broken = empty.probability.copy()

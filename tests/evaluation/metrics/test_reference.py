@@ -1,4 +1,4 @@
-"""The check figures of published recordings and of the reference implementation's own maps."""
+"""Published recordings and maps of the reference implementation: known errors."""
 
 from __future__ import annotations
 

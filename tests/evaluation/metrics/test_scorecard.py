@@ -1,4 +1,4 @@
-"""The scorecard of a run: complete, honest about what is missing, JSON-able."""
+"""The scorecard of a run: values, reasons for missing ones, JSON and table."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def test_the_table_has_units_and_raw_odometry(circle):
         ({"truth": np.zeros((3, 3))}, r"run\.truth"),
     ],
 )
-def test_arrays_that_do_not_fit_are_refused(circle, change, message):
+def test_arrays_of_inconsistent_shapes_are_refused(circle, change, message):
     with pytest.raises(InputError, match=message):
         score_run(circle._replace(**change))
 

@@ -1,4 +1,4 @@
-"""Alignment, ATE, RPE, anytime error, association by time, TUM files."""
+"""Alignment, ATE, RPE, online error, association by time, TUM files."""
 
 from __future__ import annotations
 
@@ -84,13 +84,13 @@ def test_relative_rotations_are_compared_across_half_a_turn():
 
 @law
 @given(pairs_of_trajectories(), motions)
-def test_anytime_errors_are_those_of_each_beginning(pair, motion):
+def test_online_errors_use_the_rows_so_far(pair, motion):
     estimate, truth = pair
     slow = [position_errors(estimate[:n], truth[:n])[-1] for n in range(1, len(truth) + 1)]
     assert online_errors(compose(motion, estimate), truth) == pytest.approx(np.array(slow), abs=1e-6)
 
 
-def test_anytime_summary():
+def test_summary_of_online_errors():
     truth = np.array([[x, 0.0, 0.0] for x in range(5)])
     online = truth.copy()
     assert online_error(online, truth) == pytest.approx((0, 0, 0), abs=1e-9)
@@ -98,7 +98,7 @@ def test_anytime_summary():
     assert online_error(online, truth) == pytest.approx((0, 4 / np.sqrt(3), 4), abs=1e-9)
 
 
-def test_interpolation_goes_the_short_way_round():
+def test_headings_are_interpolated_along_the_shorter_arc():
     time, pose = np.array([0.0, 1.0]), np.array([[0, 0, np.radians(170)], [1, 2, np.radians(-170)]])
     found = interpolate(time, pose, np.array([-0.1, 0.0, 0.5, 0.75, 1.0, 1.1]))
     assert np.isnan(found[[0, 5]]).all()
@@ -123,7 +123,7 @@ def test_times_must_increase():
 
 @law
 @given(pairs_of_trajectories())
-def test_tum_files_come_back_as_they_were_written(tmp_path_factory, pair):
+def test_tum_files_read_back_equal(tmp_path_factory, pair):
     pose, _ = pair
     path = tmp_path_factory.mktemp("tum") / "t.tum"
     time = 976052890.244111 + np.arange(len(pose)) / 3

@@ -1,4 +1,4 @@
-"""The experience history: each step once, coloured as strict ExM counts it."""
+"""The experience history: every step once, coloured by the strict Experience Metric."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def confused(circle):
     return circle._replace(experience=experience)
 
 
-def test_every_step_is_drawn_once_and_as_it_was_judged(confused):
+def test_every_step_is_drawn_once_with_its_verdict(confused):
     figure = draw_experience_history(confused, score_run(confused))
     found = marks(figure)
     base = found.pop("end of the base set")
@@ -40,7 +40,7 @@ def test_every_step_is_drawn_once_and_as_it_was_judged(confused):
     assert len(found) == 3
 
 
-def test_the_legend_counts(confused):
+def test_the_legend_has_the_counts(confused):
     found = experience_metric(confused.experience, confused.truth)
     names = [
         text.get_text()
@@ -58,14 +58,14 @@ def test_the_legend_counts(confused):
         ({"truth": np.linspace([0, 0, 0], [9, 9, 0], 108)}, "never returns"),
     ],
 )
-def test_what_cannot_be_judged_is_said_and_drawn_alike(circle, change, said):
+def test_runs_without_verdicts_are_drawn_with_the_reason(circle, change, said):
     run = circle._replace(**change)
     figure = draw_experience_history(run, score_run(run))
     assert any(said in text.get_text() for text in figure.texts)
     assert set(marks(figure)) <= {"experience"}
 
 
-def test_the_picture_and_the_scorecard_agree(confused):
+def test_plot_and_scorecard_agree(confused):
     """Also where experiences begin late, or the truth has holes."""
     late = confused._replace(experience=np.where(np.arange(108) < 10, -1, confused.experience))
     truth = confused.truth.copy()

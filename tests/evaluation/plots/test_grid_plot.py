@@ -1,4 +1,4 @@
-"""Pictures of occupancy maps: what is drawn is the map where it lies, and nothing lies over a word."""
+"""Plots of occupancy maps: positions and grey levels of cells; texts do not overlap."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ PICTURES = {
 
 
 @pytest.mark.parametrize("name", PICTURES)
-def test_no_word_lies_over_another_or_over_the_edge(name):
+def test_texts_neither_overlap_nor_leave_the_figure(name):
     figure = PICTURES[name]()
     found = words(figure)
     across, up = figure.get_size_inches() * figure.dpi
@@ -89,7 +89,7 @@ def test_no_word_lies_over_another_or_over_the_edge(name):
 
 
 @pytest.mark.parametrize("name", PICTURES)
-def test_the_same_maps_are_the_same_bytes(name):
+def test_equal_maps_give_equal_bytes(name):
     files = [io.BytesIO(), io.BytesIO()]
     for file in files:
         PICTURES[name]().savefig(file)
@@ -97,7 +97,7 @@ def test_the_same_maps_are_the_same_bytes(name):
 
 
 @pytest.mark.parametrize("size", [(50, 50), (20, 70), (60, 40)])
-def test_a_cell_is_drawn_where_it_lies_and_as_bright_as_it_is_occupied(size):
+def test_cells_are_drawn_at_their_position_and_grey_level(size):
     given = grid(*size)
     for figure in (draw_grid(panel(grid=given)), draw_grids("a", "b", [panel(), panel(grid=given)])):
         axes = maps(figure)[-1]
@@ -115,13 +115,13 @@ def test_a_cell_is_drawn_where_it_lies_and_as_bright_as_it_is_occupied(size):
         assert box.height / box.width == pytest.approx(size[0] / size[1])
 
 
-def test_the_scale_is_the_same_for_every_map():
+def test_all_maps_have_the_same_scale():
     figure = draw_grids("a", "b", [panel(k, grid=grid()._replace(probability=np.full((9, 9), 0.1 * k)))
                                    for k in range(4)])  # fmt: skip
     assert {image.get_clim() for axes in figure.axes for image in axes.images} == {(0, 1)}
 
 
-def test_walls_and_paths_are_drawn_where_they_are():
+def test_walls_and_paths_are_drawn_at_their_position():
     (axes,) = maps(draw_grid(panel(paths=PATHS)))
     (walls,) = (each for each in axes.collections if isinstance(each, LineCollection))
     assert np.allclose([path.vertices for path in walls.get_paths()], SIDE.reshape(-1, 2, 2))
@@ -141,7 +141,7 @@ def test_walls_and_paths_are_drawn_where_they_are():
     assert VERMILLION not in {line.get_color() for line in axes.lines}
 
 
-def test_unknown_truth_is_left_out():
+def test_rows_without_truth_are_not_drawn():
     truth = WAY.copy()
     truth[::2] = np.nan
     (axes,) = maps(draw_grid(panel(paths=PATHS._replace(truth=truth))))

@@ -53,13 +53,13 @@ def size(path):
 
 
 @pytest.mark.parametrize("name", PICTURES)
-def test_a_run_on_touch_leaves_pictures(folder, name):
+def test_a_whisker_run_writes_its_plots(folder, name):
     width, height = size(folder / "run" / name)
     assert width == 1200
     assert 500 < height < 2500
 
 
-def test_pictures_are_drawn_again_from_the_directory_alone(folder, tmp_path):
+def test_plots_are_made_again_from_the_directory_alone(folder, tmp_path):
     elsewhere = tmp_path / "moved"
     shutil.copytree(folder / "run", elsewhere, ignore=shutil.ignore_patterns("*.png"))
     for name, save in plot_writers(elsewhere).items():
@@ -68,7 +68,7 @@ def test_pictures_are_drawn_again_from_the_directory_alone(folder, tmp_path):
         assert (elsewhere / name).read_bytes() == (folder / "run" / name).read_bytes(), name
 
 
-def test_a_replayed_session_knows_its_maze_and_images(folder):
+def test_a_replayed_session_has_the_same_maze_and_images(folder):
     for name in KEPT:
         assert (folder / "run" / name).read_bytes() == (folder / "replayed" / name).read_bytes(), name
 
@@ -107,7 +107,7 @@ def test_a_session_without_whiskers_has_only_its_map(folder, tmp_path):
 
 
 @pytest.mark.parametrize("name", TOUCH)
-def test_a_config_says_where_it_comes_from_and_only_what_is_not_default(name):
+def test_a_config_names_its_source_and_sets_no_defaults(name):
     """Every leaf that a configuration sets differs from what would be without it."""
     path = ROOT / "configs" / f"{name}.yaml"
     first = path.read_text().splitlines()[0]

@@ -1,4 +1,4 @@
-"""The figures of the reproductions: drawn from arrays alone, the same each time."""
+"""Figures of the reproductions, drawn from arrays; equal arrays give equal bytes."""
 
 from __future__ import annotations
 
@@ -78,12 +78,12 @@ def labels(figure):
 
 
 @pytest.mark.parametrize("draw", [drift, experiences, measured, directions, tuning])
-def test_the_same_arrays_give_the_same_bytes(draw):
+def test_equal_arrays_give_equal_bytes(draw):
     assert drawn(draw()) == drawn(draw())
 
 
 @pytest.mark.parametrize("draw", ALL)
-def test_panels_lie_within_the_picture_and_apart(draw):
+def test_panels_neither_overlap_nor_leave_the_figure(draw):
     figure = draw()
     boxes = [axes.get_position() for axes in figure.axes]
     assert all(box.x0 > 0 and box.x1 <= 1 and box.y0 > 0 and box.y1 < 1 for box in boxes)
@@ -101,7 +101,7 @@ def test_every_step_of_a_history_is_drawn_once():
     assert marks["end of the base set"][0] == 1.5
 
 
-def test_the_papers_figure_is_drawn_where_there_is_one():
+def test_the_papers_values_are_drawn():
     figure = measured()
     assert labels(figure) == ["classic", "ours", "paper"]
     assert figure.axes[1].get_yscale() == "log"
@@ -109,14 +109,14 @@ def test_the_papers_figure_is_drawn_where_there_is_one():
     assert np.nansum(dots[0].get_ydata()) == pytest.approx(0.6)
 
 
-def test_directions_share_a_picture_two_in_a_row():
+def test_directions_have_two_panels_per_row():
     figure = directions()
     tops = {round(axes.get_position().y1, 6) for axes in figure.axes}
     assert len(tops) == 2
     assert labels(figure) == ["clockwise", "anticlockwise"]
 
 
-def test_shares_of_pairs_add_up_and_the_winner_is_marked():
+def test_histograms_sum_to_1_and_the_chosen_threshold_is_marked():
     figure = tuning()
     shares = [patch.get_data().values.sum() for patch in figure.axes[0].patches]
     assert shares == pytest.approx([1, 1])
@@ -124,7 +124,7 @@ def test_shares_of_pairs_add_up_and_the_winner_is_marked():
     assert "chosen" not in labels(tuning(None))
 
 
-def test_laps_darken():
+def test_later_laps_are_darker():
     lines = [line for line in drift().axes[0].lines if line.get_alpha() is not None]
     assert [line.get_alpha() for line in lines] == sorted(line.get_alpha() for line in lines)
     assert len(lines) == 2

@@ -1,4 +1,4 @@
-"""The picture of speed against error: labels and any values."""
+"""The plot of error against time: label positions and extreme values."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from evaluation.plots.pareto_plot import ParetoPoint, draw_pareto, place_labels
     )
 )
 @settings(max_examples=25)
-def test_labels_lie_apart_inside_and_off_what_is_drawn(rows):
+def test_labels_neither_overlap_nor_cover_blocked_boxes(rows):
     rows = np.array(rows, float)
     area, blocked = np.array([0.0, 0.0, 600.0, 400.0]), np.array([[100.0, 100.0, 140.0, 400.0]])
     corners = place_labels(rows[:, :2], rows[:, 2:], area, blocked, blocked + 50)
@@ -32,7 +32,7 @@ def test_labels_lie_apart_inside_and_off_what_is_drawn(rows):
             assert (one[2:] <= other[:2]).any() or (other[2:] <= one[:2]).any()
 
 
-def test_a_label_without_room_still_gets_a_place():
+def test_labels_without_room_still_get_a_position():
     corners = place_labels(
         np.full((4, 2), 50.0), np.zeros((4, 2)), np.array([0.0, 0.0, 60.0, 60.0]), *[np.zeros((0, 4))] * 2
     )
@@ -40,7 +40,7 @@ def test_a_label_without_room_still_gets_a_place():
 
 
 @pytest.mark.parametrize("values", [[0.0, 0.0], [0.0, 0.2], [0.1, 0.1], [1e-9, 3e4]])
-def test_any_errors_can_be_drawn_and_come_out_the_same(values):
+def test_extreme_errors_are_drawn_with_equal_bytes(values):
     marks = [
         ParetoPoint(f"row {k}", (90.0, 100.0, 110.0), (v, v, 2 * v), k == 0) for k, v in enumerate(values)
     ]

@@ -1,4 +1,4 @@
-"""Whisker images, kept in a file and drawn: what is drawn is what was felt, where it was felt."""
+"""Whisker images: their file and their plot."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def strips(figure):
 
 
 @given(arrays(np.float64, (4, 3, 6), elements=st.floats(0, 1)))
-def test_images_come_back_within_a_step_of_brightness(tmp_path_factory, view):
+def test_images_read_back_within_one_grey_level(tmp_path_factory, view):
     images = felt(4)._replace(view=view)
     path = tmp_path_factory.mktemp("images") / "views.npz"
     write_whisker_views(path, images)
@@ -50,7 +50,7 @@ def test_images_come_back_within_a_step_of_brightness(tmp_path_factory, view):
         assert np.array_equal(getattr(found, name), getattr(images, name))
 
 
-def test_the_same_images_are_the_same_bytes(tmp_path):
+def test_equal_images_give_equal_bytes(tmp_path):
     for name in ("a", "b"):
         write_whisker_views(tmp_path / name, felt())
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
@@ -68,7 +68,7 @@ def test_other_files_are_refused(tmp_path):
             read_whisker_views(tmp_path / f"{name}.npz")
 
 
-def test_a_column_is_an_image(circle):
+def test_each_column_of_a_strip_is_an_image(circle):
     images = felt(dead=(4,))
     figure = draw_whiskers(circle, score_run(circle), images)
     (strip,) = strips(figure)
@@ -83,7 +83,7 @@ def test_a_column_is_an_image(circle):
     assert strip.get_extent() == pytest.approx((circle.time[0] - 0.25, circle.time[-1] + 0.25, 18, 0))
 
 
-def test_heads_show_the_images_of_the_steps_they_stand_for(circle):
+def test_heads_show_the_images_of_their_steps(circle):
     images = felt(seed=1)
     figure = draw_whiskers(circle, score_run(circle), images)
     strip = np.asarray(strips(figure)[0].get_array())
@@ -98,7 +98,7 @@ def test_heads_show_the_images_of_the_steps_they_stand_for(circle):
 
 @settings(max_examples=15)
 @given(st.floats(-7, 7), st.floats(-np.pi, np.pi))
-def test_a_sector_points_where_its_whisker_does(heading, first):
+def test_a_sector_points_in_the_direction_of_its_whisker(heading, first):
     from evaluation.metrics.run_arrays import RunArrays
 
     pose = np.array([[0.3, -0.2, heading]])
@@ -149,7 +149,7 @@ def test_sessions_of_any_length_are_drawn(circle, steps):
     assert drawn[-1].get_extent()[1] == pytest.approx(steps - 0.5)
 
 
-def test_without_truth_heads_stand_in_the_map(circle):
+def test_without_truth_heads_are_drawn_at_map_poses(circle):
     blind = circle._replace(truth=None)
     walls = np.array([[0.0, 0.0, 9.0, 0.1, 0.05]])
     figure = draw_whiskers(blind, score_run(blind), felt(), walls)

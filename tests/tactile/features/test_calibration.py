@@ -1,4 +1,4 @@
-"""What a free-whisking record tells, and which records are no such thing."""
+"""Calibration from free-whisking records, and records that are refused."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def refused(cycles: list[Cycle], match: str, **options: float) -> None:
 
 
 @given(st.integers(0, 50), st.floats(1e-4, 1e-2))
-def test_it_finds_mean_noise_and_amplitude(seed: int, sd: float) -> None:
+def test_mean_noise_and_amplitude_are_estimated(seed: int, sd: float) -> None:
     found = calibrate(CONFIG, record(sd=sd, seed=seed))
     np.testing.assert_allclose(found.mean, np.arange(6)[:, None] / 100 * [1, -1], atol=sd / 10)
     np.testing.assert_allclose(found.sd, sd, rtol=0.06)
@@ -53,13 +53,13 @@ def test_it_finds_mean_noise_and_amplitude(seed: int, sd: float) -> None:
 
 @pytest.mark.parametrize("size", [0.05, -0.2])
 @pytest.mark.parametrize("axis", [0, 1])
-def test_a_contact_in_it_is_refused(size: float, axis: int) -> None:
+def test_a_record_with_a_contact_is_refused(size: float, axis: int) -> None:
     cycles = record()
     cycles[2].deflection[400:420, 3, axis] += size
     refused(cycles, "contacts of whisker 3")
 
 
-def test_a_whisker_that_always_rubs_is_refused() -> None:
+def test_a_whisker_in_constant_contact_is_refused() -> None:
     cycles = record()
     for cycle in cycles:
         cycle.deflection[:, 1, 1] += 0.05 * np.sin(2 * np.pi * cycle.time)
@@ -87,7 +87,7 @@ def test_too_short_or_empty_records_are_refused() -> None:
     refused(record(count=3), "3 s.*at least 4 s")
 
 
-def test_values_missing_are_refused() -> None:
+def test_nan_samples_are_refused() -> None:
     for broken in ("angle", "deflection"):
         cycles = record()
         getattr(cycles[1], broken)[5, 2] = np.nan
@@ -121,7 +121,7 @@ def test_sample_rates_too_low_for_the_slope_window_are_refused() -> None:
     assert calibrate(CONFIG, record(rate=500.0), slope_window=0.016).rate == pytest.approx(500)
 
 
-def test_broken_time_is_refused() -> None:
+def test_times_that_do_not_increase_are_refused() -> None:
     cycles = record()
     cycles[0] = cycles[0]._replace(time=cycles[0].time[::-1])
     refused(cycles, "not increasing")
@@ -139,7 +139,7 @@ def test_arrays_read_back_equal() -> None:
 
 
 @pytest.mark.parametrize("name", Calibration._fields)
-def test_a_part_that_is_missing_or_of_another_shape_is_refused(name: str) -> None:
+def test_missing_arrays_and_wrong_shapes_are_refused(name: str) -> None:
     kept = calibration_arrays(calibrate(CONFIG, record()))
     with pytest.raises(InputError, match=name):
         calibration_from_arrays({key: value for key, value in kept.items() if key != name})

@@ -1,4 +1,4 @@
-"""Contact found in made-up streams whose truth is known."""
+"""Contact detection in constructed streams with known contacts."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ WALLS = np.linspace(0.1, 1.0, W)
 FREE = np.full(W, np.inf)
 
 
-def test_nothing_is_felt_where_nothing_is() -> None:
+def test_free_whisking_has_no_contacts() -> None:
     for seed in range(20):
         felt = detect_contacts(CONFIG, known(), whisk(FREE, seed=seed))
         assert not felt.contact.any()
@@ -53,7 +53,7 @@ def test_nothing_is_felt_where_nothing_is() -> None:
 
 
 @given(st.integers(0, 100), st.floats(0.25, 0.6))
-def test_walls_are_found_where_they_are(seed: int, share: float) -> None:
+def test_angles_at_first_contact_are_those_of_the_walls(seed: int, share: float) -> None:
     felt = detect_contacts(CONFIG, known(), whisk(WALLS, seed=seed, share=share))
     assert felt.contact.all()
     assert felt.held.all()
@@ -63,7 +63,7 @@ def test_walls_are_found_where_they_are(seed: int, share: float) -> None:
     np.testing.assert_allclose(felt.highest, WALLS + share * (AMPLITUDE - WALLS), atol=3e-3)
 
 
-def test_no_more_than_a_promille_is_false_or_missed() -> None:
+def test_false_and_missed_contacts_are_below_one_in_a_thousand() -> None:
     at = stream(1, "walls").uniform(0.05, AMPLITUDE - 0.04, (60, W))
     assert (
         sum((~detect_contacts(CONFIG, known(), whisk(at[k], seed=k)).contact).sum() for k in range(60))
@@ -75,14 +75,14 @@ def test_no_more_than_a_promille_is_false_or_missed() -> None:
     )
 
 
-def test_a_whisker_that_slips_off_has_touched_but_is_not_held() -> None:
+def test_a_whisker_that_slips_off_has_a_contact_but_is_not_held() -> None:
     felt = detect_contacts(CONFIG, known(), whisk(np.full(W, 0.3), slips=0.2))
     assert felt.contact.all()
     assert not felt.held.any()
     np.testing.assert_allclose(felt.touched, 0.31, atol=0.02)
 
 
-def test_it_feels_the_same_at_any_sample_rate() -> None:
+def test_contacts_do_not_depend_on_the_sample_rate() -> None:
     usual = [detect_contacts(CONFIG, known(), whisk(WALLS, seed=k)) for k in range(8)]
     for rate in (1000.0, 4000.0):
         other = [detect_contacts(CONFIG, known(), whisk(WALLS, rate=rate, seed=99 + k)) for k in range(8)]
@@ -100,12 +100,12 @@ def test_the_radial_distance_inverts_the_stiffness(reach: float, taper: float) -
 
 
 @pytest.mark.parametrize("reach", [0.5, 0.65, 0.8, 1.0])
-def test_the_radial_distance_is_felt(reach: float) -> None:
+def test_the_radial_distance_is_estimated(reach: float) -> None:
     felt = detect_contacts(CONFIG, known(), whisk(np.linspace(0.1, 0.8, W), reach=reach))
     np.testing.assert_allclose(felt.reach, reach, atol=0.05)
 
 
-def test_offsets_of_the_sensors_are_taken_off() -> None:
+def test_sensor_offsets_are_subtracted() -> None:
     cycle = whisk(WALLS)
     shifted = cycle._replace(deflection=cycle.deflection + [0.3, -0.2])
     there = known()._replace(mean=np.tile([0.3, -0.2], (W, 1)))
@@ -128,12 +128,12 @@ def test_dead_whiskers_have_no_contacts_and_do_not_affect_others() -> None:
         np.testing.assert_allclose(getattr(felt, name)[~silent], getattr(plain, name)[~silent], atol=1e-3)
 
 
-def test_streams_too_coarse_for_the_slope_window_are_refused() -> None:
+def test_too_low_sample_rates_are_refused() -> None:
     with pytest.raises(InputError, match=r"500 samples per second.*slope_window"):
         detect_contacts(CONFIG, known(), whisk(FREE, rate=500.0))
 
 
-def test_broken_streams_are_refused() -> None:
+def test_streams_with_gaps_are_refused() -> None:
     cycle = whisk(FREE)
     with pytest.raises(InputError, match="not increasing"):
         detect_contacts(CONFIG, known(), cycle._replace(time=cycle.time * 0))

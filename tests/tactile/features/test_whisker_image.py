@@ -1,4 +1,4 @@
-"""Whisker images: as bright as what was met is high, black where nothing was; dead whiskers say nothing."""
+"""Whisker images: pixel values are obstacle heights, 0 without contact; dead whiskers have no effect."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _whisks() -> st.SearchStrategy[Whisk]:
 
 
 @given(CONFIGS, _whisks())
-def test_black_is_nothing_and_nothing_else_is_black(config: ImageConfig, whisk: Whisk) -> None:
+def test_exactly_the_whiskers_without_contact_are_0(config: ImageConfig, whisk: Whisk) -> None:
     view = whisker_image(config, HEAD, whisk)
     assert view.shape == view_shape(config, HEAD) == (3, 6, 2 if config.radial else 1)
     assert ((view >= 0) & (view <= 1)).all()
@@ -57,7 +57,7 @@ def test_black_is_nothing_and_nothing_else_is_black(config: ImageConfig, whisk: 
 
 
 @given(_whisks())
-def test_brightness_is_height(whisk: Whisk) -> None:
+def test_pixels_grow_with_the_height(whisk: Whisk) -> None:
     for transform, felt, angle in (
         ("contact_angle", whisk.contact, whisk.touched),
         ("max_angle", whisk.held, whisk.highest),
@@ -71,7 +71,7 @@ def test_brightness_is_height(whisk: Whisk) -> None:
 
 
 @given(CONFIGS, _whisks(), st.integers(0, 17))
-def test_a_dead_whisker_changes_nothing(config: ImageConfig, whisk: Whisk, number: int) -> None:
+def test_a_dead_whisker_has_no_effect(config: ImageConfig, whisk: Whisk, number: int) -> None:
     alive = whisk.alive.copy()
     alive[number] = False
     one = whisk_observation(config, HEAD, whisk._replace(alive=alive))
@@ -86,7 +86,7 @@ def test_a_dead_whisker_changes_nothing(config: ImageConfig, whisk: Whisk, numbe
 
 
 @given(_whisks())
-def test_what_an_engine_is_given(whisk: Whisk) -> None:
+def test_the_observation_has_view_contacts_and_points(whisk: Whisk) -> None:
     seen = whisk_observation(ImageConfig(), HEAD, whisk)
     plain = observation(ODOMETRY, np.zeros((3, 6, 1)), whiskers=18)
     for one, other in zip(seen[1:], plain[1:], strict=True):
@@ -100,7 +100,7 @@ def test_what_an_engine_is_given(whisk: Whisk) -> None:
 
 
 @given(CONFIGS, _whisks())
-def test_the_front_end_is_the_image_of_what_was_felt(config: ImageConfig, whisk: Whisk) -> None:
+def test_the_front_end_observes_the_image_of_a_whisk(config: ImageConfig, whisk: Whisk) -> None:
     frontend = Frontend(TouchConfig(image=config))
     assert frontend.view_shape == view_shape(config, HEAD)
     assert frontend.whiskers == 18
@@ -111,7 +111,7 @@ def test_the_front_end_is_the_image_of_what_was_felt(config: ImageConfig, whisk:
 
 
 @given(_whisks())
-def test_a_whisker_may_be_called_dead_later(whisk: Whisk) -> None:
+def test_whiskers_configured_as_dead_are_not_alive(whisk: Whisk) -> None:
     there, dead = Frontend(TouchConfig()), Frontend(TouchConfig(head=HeadConfig(dead=(3, 11))))
     one, other = there.observe(whisk), dead.observe(whisk)
     assert not other.alive[[3, 11]].any()

@@ -1,4 +1,4 @@
-"""How walls lie, from contacts and strain of made-up walls and posts whose truth is known."""
+"""Wall directions from contacts and strain of constructed walls and posts."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_the_point_is_the_nearest_of_the_line_through(direction: float, x: float
 
 
 @given(st.floats(-0.1, 0.1), st.floats(-0.1, 0.1), st.floats(-3, 3))
-def test_points_are_carried_as_poses_are(x: float, y: float, turn: float) -> None:
+def test_points_transform_like_poses(x: float, y: float, turn: float) -> None:
     travel = np.array([x, y, turn])
     there = to_final_frame(POINTS, meeting(wall(1.2), travel=travel))
     for before, after in zip(POINTS, there, strict=True):
@@ -126,7 +126,7 @@ def test_two_contacts_give_the_line_through_them_with_the_motion_between(
 
 
 @pytest.mark.parametrize("angle", [80.0, 90.0, 97.0])
-def test_the_line_is_along_a_wall_that_two_whiskers_meet(angle: float) -> None:
+def test_two_contacts_give_the_direction_of_a_wall(angle: float) -> None:
     strain = wall(np.radians(angle))
     hit, slow = met(strain, share=1.0)
     assert slow.moment == StepEnd.HIT2
@@ -148,7 +148,7 @@ def test_the_matched_wall_passes_through_the_first_contact(templates: StrainTemp
 
 
 @pytest.mark.parametrize("angle", np.arange(25.0, 156.0, 5.0))
-def test_flat_walls_are_known_to_a_degree_after_abort_too(tip: TipModel, angle: float) -> None:
+def test_directions_of_flat_walls_are_within_a_degree_also_after_abort(tip: TipModel, angle: float) -> None:
     for seed in range(3):
         there = meeting(wall(np.radians(angle), stream(seed, "noise")))
         found = fused_wall(tip, POINTS, there)
@@ -167,7 +167,7 @@ def test_flat_walls_are_known_to_a_degree_after_abort_too(tip: TipModel, angle: 
 @pytest.mark.parametrize(
     ("whisker", "angle"), [(0, 93.0), (3, 87.0), (0, 75.0), (3, 100.0), (1, 140.0), (2, 40.0)]
 )
-def test_a_short_wall_is_known_that_an_endless_one_would_have_hidden(
+def test_a_short_wall_is_estimated_from_its_first_whisker(
     tip: TipModel, templates: StrainTemplates, whisker: int, angle: float
 ) -> None:
     there = meeting(wall(np.radians(angle), stream(1, "noise"), first=whisker))
@@ -180,11 +180,11 @@ def test_a_short_wall_is_known_that_an_endless_one_would_have_hidden(
 
 @pytest.mark.parametrize("whisker", range(4))
 @pytest.mark.parametrize("along", [0.05, 0.07, 0.09, 0.11])
-def test_a_post_is_no_wall(tip: TipModel, whisker: int, along: float) -> None:
+def test_a_post_gives_no_wall(tip: TipModel, whisker: int, along: float) -> None:
     assert is_none(fused_wall(tip, POINTS, meeting(post(whisker, along))))
 
 
-def test_what_bends_a_whisker_far_at_once_is_no_wall(tip: TipModel) -> None:
+def test_a_large_turn_at_first_contact_gives_no_wall(tip: TipModel) -> None:
     there = meeting(wall(np.radians(30.0)))
     whole = filter_strain(TRAINING, wall(np.radians(30.0)))
     level = np.abs(whole[:, 3, 0]) / tip.gain
@@ -194,7 +194,7 @@ def test_what_bends_a_whisker_far_at_once_is_no_wall(tip: TipModel) -> None:
         assert fused_wall(tip, POINTS, late).known is known
 
 
-def test_nothing_is_known_without_strain(tip: TipModel) -> None:
+def test_without_strain_there_is_no_estimate(tip: TipModel) -> None:
     there = meeting(wall(1.2))
     for lacking in (
         there._replace(strain=there.strain[:0]),
@@ -224,6 +224,6 @@ def test_templates_of_other_whiskers_are_refused(templates: StrainTemplates) -> 
         fit_tip_model(templates, FEELERS._replace(direction=turned))
 
 
-def test_the_law_is_that_of_the_made_up_whiskers(tip: TipModel) -> None:
+def test_the_fitted_model_is_that_of_the_constructed_whiskers(tip: TipModel) -> None:
     assert tip.gain == pytest.approx(3 * 0.725e-3 * (1 / 0.14 - (1 - 0.3 / 1.45) / 0.14), rel=0.01)
     assert tip.crosstalk == pytest.approx(0.08, abs=0.01)

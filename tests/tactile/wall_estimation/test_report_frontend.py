@@ -1,4 +1,4 @@
-"""From reports to observations: what is told of a step, what of a wall, and what is kept in between."""
+"""From the Create's reports to observations: motion, contacts and walls."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_a_back_step_gives_its_motion_only() -> None:
 
 
 @given(st.lists(st.tuples(*[st.floats(-0.5, 0.5)] * 3, st.booleans()), min_size=1, max_size=12))
-def test_folding_back_loses_no_motion(steps: list[tuple[float, float, float, bool]]) -> None:
+def test_fold_back_adds_the_motion_to_the_next_observation(steps: list[tuple[float, float, float, bool]]) -> None:
     def path(fold: bool) -> np.ndarray:
         reporting, pose, time = ReportFrontend(ReportFrontendConfig(fold_back=fold)), np.zeros(3), 0.0
         kinds = [MotionKind.BACK if back else MotionKind.TURN for *_, back in steps] + [MotionKind.FORWARD]
@@ -126,7 +126,7 @@ def test_walls_are_estimated_at_the_end_of_the_slow_drive(
         assert 0.1 < wall_normal(angle) @ slow.wall_point < 0.3
 
 
-def test_two_contacts_make_the_line_where_there_are_no_templates() -> None:
+def test_without_templates_two_contacts_give_the_wall() -> None:
     hit, slow = met(wall(np.radians(85.0)), share=1.0)
     assert slow.moment == StepEnd.HIT2
     reporting, plain = (
@@ -145,7 +145,7 @@ def test_walls_none_estimates_no_wall(templates: StrainTemplates) -> None:
         assert not seen.wall
 
 
-def test_a_slow_drive_in_pieces_is_the_same(templates: StrainTemplates) -> None:
+def test_a_slow_drive_of_several_reports_equals_one_report(templates: StrainTemplates) -> None:
     hit, slow = met(wall(ANGLE))
     whole = told(ReportFrontend(ReportFrontendConfig(), templates), hit, slow)[-1]
     cut = 700
@@ -158,7 +158,7 @@ def test_a_slow_drive_in_pieces_is_the_same(templates: StrainTemplates) -> None:
     np.testing.assert_allclose(parts[-1].wall_point, whole.wall_point, atol=1e-9)
 
 
-def test_a_wall_needs_a_hit_before(templates: StrainTemplates) -> None:
+def test_without_hit1_there_is_no_wall(templates: StrainTemplates) -> None:
     reporting = ReportFrontend(ReportFrontendConfig(), templates)
     hit, slow = met(wall(ANGLE))
     free, turn = report(), report(motion=MotionKind.TURN)
@@ -195,7 +195,7 @@ def test_observations_stack(templates: StrainTemplates) -> None:
         assert np.isfinite(part).all()
 
 
-def test_what_does_not_fit_is_refused(templates: StrainTemplates, tmp_path: Path) -> None:
+def test_other_whiskers_and_sample_rates_are_refused(templates: StrainTemplates, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="3 whiskers"):
         ReportFrontend(ReportFrontendConfig()).observe(report()._replace(contact=np.zeros(3, bool)))
     with pytest.raises(InputError, match="train-templates"):

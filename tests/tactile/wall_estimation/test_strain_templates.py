@@ -1,4 +1,4 @@
-"""Strain templates of made-up walls: filtered causally, trained, kept, found again, and what is refused."""
+"""Strain templates of constructed walls: filter, training, file, matching and errors."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_the_papers_fifteen_angles(templates: StrainTemplates) -> None:
 
 
 @given(st.integers(0, 99), st.integers(1, 3999))
-def test_the_filter_looks_back_only_and_forgets_no_sample(seed: int, cut: int) -> None:
+def test_the_filter_is_causal_and_uses_every_sample(seed: int, cut: int) -> None:
     strain = stream(seed, "strain").standard_normal((4000, 2))
     whole = filter_strain(TRAINING, strain)
     np.testing.assert_allclose(filter_strain(TRAINING, strain[:cut]), whole[:cut], atol=1e-12)
@@ -63,21 +63,21 @@ def test_the_filter_looks_back_only_and_forgets_no_sample(seed: int, cut: int) -
 
 
 @given(st.floats(-1, 1), st.integers(1, 100))
-def test_the_filter_starts_settled(level: float, count: int) -> None:
+def test_the_filter_starts_in_its_steady_state(level: float, count: int) -> None:
     np.testing.assert_allclose(filter_strain(TRAINING, np.full((count, 4, 2), level)), level, atol=1e-9)
 
 
 @pytest.mark.parametrize(
     ("frequency", "least", "most"), [(2.0, 0.95, 1.01), (17.0, 0.65, 0.75), (60, 0, 0.1)]
 )
-def test_the_filter_passes_what_is_slower_than_seventeen_hertz(
+def test_the_filter_passes_signals_below_its_cutoff(
     frequency: float, least: float, most: float
 ) -> None:
     wave = np.sin(2 * np.pi * frequency * np.arange(8000) / RATE)
     assert least < np.abs(filter_strain(TRAINING, wave)[4000:]).max() < most
 
 
-def test_every_drive_is_of_its_own_template(templates: StrainTemplates) -> None:
+def test_every_drive_matches_its_own_template(templates: StrainTemplates) -> None:
     random = stream(5, "held out")
     for k, angle in enumerate(templates.angle):
         read = filter_strain(TRAINING, wall(float(angle), random))
@@ -100,7 +100,7 @@ def test_the_parabola_is_nearer_than_the_winner(templates: StrainTemplates) -> N
     assert np.mean(refined) < np.mean(raw)
 
 
-def test_whiskers_that_do_not_report_are_left_out(templates: StrainTemplates) -> None:
+def test_dead_whiskers_are_left_out_of_the_match(templates: StrainTemplates) -> None:
     read = filter_strain(TRAINING, wall(np.radians(110.0)))[:1600]
     broken = read.copy()
     broken[:, 3] = 1.0
@@ -156,7 +156,7 @@ def _unfit(path: Path) -> None:
         _unfit,
     ],
 )
-def test_any_other_file_is_one_clear_error(make: object, tmp_path: Path) -> None:
+def test_other_files_are_refused(make: object, tmp_path: Path) -> None:
     path = tmp_path / "wrong.npz"
     make(path)  # type: ignore[operator]
     with pytest.raises(InputError, match=r"wrong\.npz: (no such file|another kind of file).*train-templates"):

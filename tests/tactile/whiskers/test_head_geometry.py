@@ -44,7 +44,7 @@ def test_rest_and_swing_are_unit_vectors_at_right_angles(head: Head) -> None:
 
 
 @given(HEADS, st.integers(0, 2**32 - 1))
-def test_a_whisker_never_changes_its_length(head: Head, seed: int) -> None:
+def test_whisker_lengths_do_not_depend_on_the_angle(head: Head, seed: int) -> None:
     angle = np.random.default_rng(seed).uniform(-4, 4, (5, len(head.length)))
     assert np.allclose(np.linalg.norm(tip_points(head, angle) - head.base, axis=-1), head.length, atol=1e-12)
     half = shaft_points(head, angle, head.length / 2)

@@ -1,4 +1,4 @@
-"""Laws of the drive: what contact may change of the sinusoid, and what not."""
+"""Whisking control: the effect of contact on the commanded sinusoid."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def touch(whisker: int, size: float, count: int = 1000, since: int = 200) -> np.
 
 
 @given(MODES, st.floats(0, 1), st.integers(0, 17))
-def test_contact_lowers_the_amplitude_only(mode: str, size: float, whisker: int) -> None:
+def test_contact_changes_only_the_amplitude(mode: str, size: float, whisker: int) -> None:
     config = WhiskingConfig(mode=mode)
     angles = driven(config, touch(whisker, size, count=100, since=10), rate=200.0)
     free = np.radians(config.amplitude_deg) * whisk_phase(config, np.arange(100) / 200.0)[:, None]
@@ -57,14 +57,14 @@ def test_below_the_threshold_nothing_changes(mode: str, size: float) -> None:
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
-def test_the_loss_is_the_gain_times_the_excess(sign: int) -> None:
+def test_the_reduction_is_gain_times_deflection_above_threshold(sign: int) -> None:
     config = WhiskingConfig(gain=2.0)
     top = driven(config, touch(4, sign * 0.1))[-1] / whisk_phase(config, 999 / 2000)
     np.testing.assert_allclose(np.radians(65) - top[4], 2.0 * 0.06, rtol=1e-6)
     np.testing.assert_allclose(np.delete(top, 4), np.radians(65))
 
 
-def test_a_whisker_does_not_spring_back_within_a_cycle_but_starts_the_next_afresh() -> None:
+def test_the_amplitude_stays_reduced_until_the_cycle_ends() -> None:
     config = WhiskingConfig()
     y = touch(0, 0.1)
     y[400:] = 0
@@ -84,7 +84,7 @@ def test_the_perturbation_is_the_same_at_any_sample_rate() -> None:
     np.testing.assert_allclose(coarse, fine, atol=0.02)
 
 
-def test_one_call_for_many_heads_is_many_calls() -> None:
+def test_a_batch_of_heads_equals_single_calls() -> None:
     y = np.abs(stream(0, "y").standard_normal((100, 3, 18))) * 0.1
     for mode in ("open", "rcp", "spread"):
         config = WhiskingConfig(mode=mode)
@@ -94,7 +94,7 @@ def test_one_call_for_many_heads_is_many_calls() -> None:
 
 
 @given(st.integers(0, 17), st.floats(0, 1))
-def test_free_whiskers_beside_follow_in_part(whisker: int, follow: float) -> None:
+def test_free_neighbours_follow_by_the_configured_share(whisker: int, follow: float) -> None:
     config = WhiskingConfig(mode="spread", follow=follow)
     top = driven(config, touch(whisker, 0.1, 60, 10), 120.0)[-1]
     loss = np.radians(65) * whisk_phase(config, 59 / 120) - top
@@ -104,11 +104,11 @@ def test_free_whiskers_beside_follow_in_part(whisker: int, follow: float) -> Non
         np.testing.assert_allclose(loss[other], follow * loss[whisker] if other in near else 0, atol=1e-12)
 
 
-def test_a_single_row_has_ends() -> None:
+def test_the_ends_of_a_single_row_are_not_neighbours() -> None:
     assert neighbour_max(np.array([1.0, 0, 0, 0]), (1, 4)).tolist() == [1, 1, 0, 0]
 
 
-def test_more_than_the_drives_allow_is_refused() -> None:
+def test_an_amplitude_above_the_limit_is_refused() -> None:
     head = ur10_head(HeadConfig(limit_deg=70))
     check_amplitude(WhiskingConfig(amplitude_deg=70), head)
     with pytest.raises(InputError, match=r"simulation\.whisking\.amplitude_deg: 80 degrees.*70"):
