@@ -49,9 +49,8 @@ class Frontend:
         """
         if isinstance(reading, Cycle):
             if self.calibration is None:
-                raise InputError(
-                    "calibration", "raw whisker samples without a calibration", "a free-whisking record"
-                )
+                found = "raw whisker samples without a calibration"
+                raise InputError("calibration", found, "a free-whisking record")
             reading = detect_contacts(self.config.contact, self.calibration, reading)
         alive = reading.alive & self.head.alive
         return reading._replace(alive=alive, contact=reading.contact & alive, held=reading.held & alive)

@@ -63,9 +63,8 @@ def read_nav2(path: str | Path) -> Nav2Map:
     """
     path = Path(path)
     given = _description(path)
-    resolution, free, occupied = (
-        _value(path, given, key) for key in ("resolution", "free_thresh", "occupied_thresh")
-    )
+    keys = ("resolution", "free_thresh", "occupied_thresh")
+    resolution, free, occupied = (_value(path, given, key) for key in keys)
     origin = given.get("origin")
     if not isinstance(origin, list) or len(origin) != 3:
         raise InputError(f"{path}: origin", repr(origin), "[x, y, yaw]")

@@ -84,13 +84,14 @@ class _Reading(NamedTuple):
         perceived: ids [N] -> [N], the entry whose true pose an entry is compared with (lines 18 to 21).
         turn: heading difference -> the angle that is compared (line 23).
         correct: (line 24 holds, this is a dwell step, verdict on the entry before) -> verdict (line 26).
-        joins: (entry, it is novel) -> the entry whose experience becomes valid, or None (lines 34 to 37).
+        back: 1 if the experience of the entry before becomes valid, 0 if that of this entry does when it is
+            new (lines 34 to 37).
     """
 
     perceived: Callable[[np.ndarray], np.ndarray]
     turn: Callable[[np.ndarray], np.ndarray]
     correct: Callable[[bool, bool, bool], bool]
-    joins: Callable[[int, bool], int | None]
+    back: int
 
 
 def experience_metric(
@@ -115,7 +116,7 @@ def experience_metric(
     ids, poses = experience[rows], truth[rows]
     counted = relocalisations(ids, base)
     near = _near(poses, poses[reading.perceived(ids)], reading, config)
-    right = _verdicts(ids, base, counted, near, reading)
+    right = _correct(ids, base, counted, near, config.mode)
     eta, eta_c, entries = int(counted.sum()), int(right.sum()), len(ids) - base
     notes = [LITERAL_WARNING] if config.mode == "literal" else []
     notes += [] if entries else ["no entry after the base set: ARR is 0/0"]
@@ -211,13 +212,12 @@ def _near(true: np.ndarray, perceived: np.ndarray, reading: _Reading, config: Ex
     return (distance < config.position) & (turn < np.radians(config.heading_deg))
 
 
-def _verdicts(
-    ids: np.ndarray, base: int, counted: np.ndarray, near: np.ndarray, reading: _Reading
-) -> np.ndarray:
+def _correct(ids: np.ndarray, base: int, counted: np.ndarray, near: np.ndarray, mode: ExmMode) -> np.ndarray:
     """Which re-localisations are correct: [N] bool (lines 15 to 38).
 
     One sequential pass, because a verdict determines which experiences are valid later.
     """
+    reading = _READINGS[mode]
     ids_, dwell = ids.tolist(), _dwell(ids).tolist()
     novel = (creation_rows(ids) == np.arange(len(ids))).tolist()
     counted_, near_ = counted.tolist(), near.tolist()
@@ -227,9 +227,8 @@ def _verdicts(
     for i in range(base, len(ids_)):
         if counted_[i]:
             sound = right[i] = reading.correct(near_[i] and ids_[i] in valid, dwell[i], right[i - 1])
-        joins = reading.joins(i, novel[i])
-        if sound and joins is not None:
-            valid.add(ids_[joins])
+        if sound and (i > 0 if reading.back else novel[i]):
+            valid.add(ids_[i - reading.back])
     return np.array(right, bool)
 
 
@@ -237,31 +236,11 @@ def _ratio(part: int, whole: int) -> float:
     return part / whole if whole else np.nan
 
 
-def _this_if_novel(entry: int, novel: bool) -> int | None:
-    return entry if novel else None
-
-
-def _the_one_before(entry: int, novel: bool) -> int | None:
-    return entry - 1 if entry else None
-
-
-def _as_printed(angle: np.ndarray) -> np.ndarray:
-    return angle
-
-
 # The listing tests membership in R_c, the experiences re-localised correctly so far. In a dwell this is read
 # as the verdict on the previous entry: if R_c lost no member, one correct visit would excuse all later ones.
 _READINGS: dict[ExmMode, _Reading] = {
-    "strict": _Reading(
-        creation_rows, wrap, lambda first, dwell, before: before if dwell else first, _this_if_novel
-    ),
-    "paper": _Reading(
-        _last_entry, wrap, lambda first, dwell, before: first and not (dwell and not before), _the_one_before
-    ),
-    "or": _Reading(
-        _last_entry, wrap, lambda first, dwell, before: first or (dwell and before), _the_one_before
-    ),
-    "literal": _Reading(
-        _last_entry, _as_printed, lambda first, dwell, before: first and dwell and before, _the_one_before
-    ),
+    "strict": _Reading(creation_rows, wrap, lambda near, dwell, before: before if dwell else near, 0),
+    "paper": _Reading(_last_entry, wrap, lambda near, dwell, before: near and not (dwell and not before), 1),
+    "or": _Reading(_last_entry, wrap, lambda near, dwell, before: near or (dwell and before), 1),
+    "literal": _Reading(_last_entry, np.asarray, lambda near, dwell, before: near and dwell and before, 1),
 }

@@ -72,9 +72,9 @@ class GridError(Settings):
 
 
 def grid_error(
-    grid: OccupancyGrid, truth: GridTruth, felt: TouchableSurface, convention: Convention = MAIN_CONVENTION
+    grid: OccupancyGrid, truth: GridTruth, felt: TouchableSurface, convention: Convention
 ) -> GridError:
-    """The error of one map. `felt` is `evaluation.metrics.occupancy_grid.touchable_surface(grid, truth)`."""
+    """The error of one map. `felt` is `occupancy_grid.touchable_surface(grid, truth)`."""
     true = truth_occupancy(truth, felt.wall, convention.outside)
     true = smooth_truth(true) if convention.smooth else true
     cells = truth.inside | felt.wall if convention.mask == "arena" else np.ones_like(truth.inside)

@@ -103,9 +103,8 @@ def render_grid_scores(scores: Sequence[GridScore]) -> str:
     ]
     for metric in GRID_METRICS:
         values = (_text(score.quantities[metric.name].value) for score in scores)
-        lines.append(
-            f"{metric.label:<36}" + "".join(f"{v:>{max(width, 7) + 2}}" for v in values) + f"  {metric.unit}"
-        )
+        cells = "".join(f"{value:>{max(width, 7) + 2}}" for value in values)
+        lines.append(f"{metric.label:<36}{cells}  {metric.unit}")
     return "\n".join(line.rstrip() for line in lines)
 
 

@@ -18,7 +18,7 @@ from evaluation.metrics.experience_log import change_rows
 from evaluation.metrics.experience_metric import EXM_MODES, ExmConfig, base_end, experience_metric
 from evaluation.metrics.metric import Direction, Finding, Metric
 from evaluation.metrics.run_arrays import RunArrays, truth_rows
-from evaluation.metrics.trajectory import ate, online_error, rpe, summarize_errors
+from evaluation.metrics.trajectory import ate, online_errors, rpe, summarize_errors
 from tactile.base.errors import InputError
 
 
@@ -126,10 +126,11 @@ def run_data(run: RunArrays, exm: ExmConfig, relations: Relations | None, gap: i
 
 def _trajectories(run: RunArrays, truth: np.ndarray, rows: np.ndarray) -> dict[str, Finding]:
     truth, online, final, odometry = (poses[rows] for poses in (truth, run.online, run.final, run.odometry))
-    raw_ate, raw_rpe, raw_now = ate(odometry, truth), rpe(odometry, truth), online_error(odometry, truth)
-    step, now, note = rpe(final, truth), online_error(online, truth), "of the online poses"
-    if len(run.online_error):
-        now, note = summarize_errors(run.online_error), "in the map of that time"
+    raw_ate, raw_rpe = ate(odometry, truth), rpe(odometry, truth)
+    raw_now = summarize_errors(online_errors(odometry, truth))
+    known, step = len(run.online_error) > 0, rpe(final, truth)
+    now = summarize_errors(run.online_error if known else online_errors(online, truth))
+    note = "in the map of that time" if known else "of the online poses"
     return {
         "ate_final": Finding(ate(final, truth), raw_ate),
         "ate_online": Finding(ate(online, truth), raw_ate),

@@ -35,14 +35,14 @@ def read_text_table(path: str | Path, columns: Columns) -> TextTable:
     lines = _lines(path)
     if not lines:
         raise InputError(str(path), "no rows", f"lines of {' '.join(columns)}")
-    first, fields = lines[0][0], lines[0][1]
-    header = not all(map(_is_number, fields))
+    first, fields, _ = lines[0]
+    header = _numbers(fields) is None
     names = [name.lower() for name in fields] if header else list(columns)
     where = _places(f"{path}:{first}", names, columns)
     rows, at = [], []
     for number, cells, whole in lines[header:]:
-        row = _row(cells, len(names))
-        if row is not None:
+        row = _numbers(cells)
+        if row is not None and len(row) == len(names) and all(map(isfinite, row)):
             rows.append([row[place] for place in where])
             at.append(number)
         elif whole:
@@ -84,17 +84,9 @@ def _places(where: str, names: list[str], columns: Columns) -> list[int]:
     return [at[0] for at in found]
 
 
-def _row(cells: list[str], width: int) -> list[float] | None:
-    """The numbers of a line, or None unless it has `width` finite ones."""
-    if len(cells) != width or not all(map(_is_number, cells)):
-        return None
-    row = [float(cell) for cell in cells]
-    return row if all(map(isfinite, row)) else None
-
-
-def _is_number(cell: str) -> bool:
+def _numbers(cells: list[str]) -> list[float] | None:
+    """The cells as numbers, or None if one is not a number."""
     try:
-        float(cell)
+        return [float(cell) for cell in cells]
     except ValueError:
-        return False
-    return True
+        return None

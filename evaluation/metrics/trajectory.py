@@ -1,7 +1,7 @@
-"""Trajectory errors (alignment, ATE, RPE, online error), association by time and TUM files.
+"""Trajectory errors (alignment, ATE, RPE, online error), interpolation and TUM files.
 
 A trajectory is an array [N, 3] of x (m), y (m), heading (rad). Functions that compare two expect rows of the
-same times (`associate` makes them).
+same times (`interpolate` makes them).
 """
 
 from __future__ import annotations
@@ -93,11 +93,6 @@ def online_errors(online: np.ndarray, reference: np.ndarray) -> np.ndarray:
     return np.abs(np.exp(1j * turn) * (a - mean_a) - (b - mean_b))
 
 
-def online_error(online: np.ndarray, reference: np.ndarray) -> OnlineError:
-    """Summary of `online_errors`."""
-    return summarize_errors(online_errors(online, reference))
-
-
 def current_error(path: np.ndarray, reference: np.ndarray) -> float:
     """Distance (m) of the last row of a path [N, 3] from the reference after alignment of the whole path.
 
@@ -127,15 +122,6 @@ def interpolate(time: np.ndarray, pose: np.ndarray, at: np.ndarray) -> np.ndarra
     columns = (pose[:, 0], pose[:, 1], np.unwrap(pose[:, 2]))
     x, y, heading = (np.interp(at, time, column, left=np.nan, right=np.nan) for column in columns)
     return np.stack([x, y, wrap(heading)], axis=-1)
-
-
-def associate(
-    time: np.ndarray, pose: np.ndarray, reference_time: np.ndarray, reference: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Time [M], pose [M, 3] and interpolated reference [M, 3] of the rows within the reference's times."""
-    there = interpolate(reference_time, reference, time)
-    inside = np.isfinite(there).all(axis=1)
-    return time[inside], pose[inside], there[inside]
 
 
 def read_tum(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
@@ -169,7 +155,7 @@ def _positions(estimate: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray,
             f"{len(estimate)} and {len(reference)} rows",
             "the same number of rows, at least one",
         )
-        raise InputError("trajectories", found, expected, "associate them by time first")
+        raise InputError("trajectories", found, expected, "interpolate one at the times of the other")
     estimate, reference = np.asarray(estimate, float), np.asarray(reference, float)
     return estimate[:, 0] + 1j * estimate[:, 1], reference[:, 0] + 1j * reference[:, 1]
 

@@ -67,7 +67,8 @@ def draw_map(
 def map_headline(card: Scorecard) -> str:
     """The main quantities in one line."""
     ate, online = card.quantities["ate_final"], card.quantities["ate_online"]
-    parts = [f"{card.quantities['experiences'].value} experiences"]
+    count = card.quantities["experiences"].value
+    parts = [f"{count} experiences"] if count else []
     if ate.value is None:
         parts.append("no ground truth")
     else:

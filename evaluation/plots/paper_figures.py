@@ -186,9 +186,8 @@ def draw_tuning(
         threshold, correct, incorrect: [G] thresholds and re-localisations. winner: chosen threshold, if any.
     """
     taken = "no threshold meets the target" if winner is None else f"threshold {winner:g}"
-    figure, (left, right) = _panels(
-        "Tuning of the classic matcher", f"AUC {auc:.3f}  ·  {taken}", ("", ""), 3.4
-    )
+    line = f"AUC {auc:.3f}  ·  {taken}"
+    figure, (left, right) = _panels("Tuning of the classic matcher", line, ("", ""), 3.4)
     for count, color, label in ((same, BLUE, "same place"), (other, VERMILLION, "different places")):
         left.stairs(count / max(count.sum(), 1), edge, color=color, fill=True, alpha=0.45, label=label)
     left.grid(color=LINE_GREY, lw=0.7)

@@ -60,7 +60,9 @@ def draw_whiskers(
     for part in parts:
         bottom -= tall + _GAP
         axes = style.add_axes(figure, style.LEFT, bottom, inner, tall)
-        _paint_strip(axes, run.time, pixels, images, part, chosen)
+        _paint_strip(axes, run.time, pixels, part, chosen)
+        rows_of_ring = images.view.shape[2] * (np.arange(len(images.length)) + 0.5)
+        axes.set_yticks(rows_of_ring, [f"{1000 * length:.0f} mm" for length in images.length])
     style.name_axes(axes, "time (s); rows: whiskers of each ring, anticlockwise from ahead", "")
 
     axes = style.add_axes(figure, style.LEFT, _BOTTOM, inner - _KEY, high)
@@ -134,22 +136,16 @@ def _pixels(images: WhiskerViews) -> np.ndarray:
 
 
 def _paint_strip(
-    axes: style.Axes,
-    time: np.ndarray,
-    pixels: np.ndarray,
-    images: WhiskerViews,
-    part: np.ndarray,
-    chosen: np.ndarray,
+    axes: style.Axes, time: np.ndarray, pixels: np.ndarray, part: np.ndarray, chosen: np.ndarray
 ) -> None:
-    rings, columns = images.view.shape[1:]
+    """Draws the images of the steps `part` as columns, and marks the chosen steps."""
+    rings, columns = pixels.shape[1:3]
     some = part[:: -(-len(part) // STRIP_COLUMNS)]
     whisk = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
     start, end = float(time[part[0]]) - whisk / 2, float(time[part[-1]]) + whisk / 2
     strip, extent = pixels[some].reshape(len(some), -1, 3).swapaxes(0, 1), (start, end, rings * columns, 0)
     axes.imshow(strip, extent=extent, aspect="auto", interpolation="nearest", zorder=1)
     axes.hlines(columns * np.arange(1, rings), start, end, color="white", lw=1.2, zorder=2)
-    middles = columns * (np.arange(rings) + 0.5)
-    axes.set_yticks(middles, [f"{1000 * length:.0f} mm" for length in images.length])
     axes.set(xlim=(start, end), ylim=(rings * columns, 0))
     axes.tick_params(pad=2)
     for number, step in enumerate(chosen, start=1):

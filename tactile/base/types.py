@@ -169,8 +169,7 @@ def observation(
 def stack(observations: Sequence[Observation]) -> Observation:
     """A chunk: observations stacked along a new leading axis."""
     first = observations[0]
-    odometry = Odometry(
-        *(np.stack(column) for column in zip(*(o.odometry for o in observations), strict=True))
-    )
+    motions = zip(*(o.odometry for o in observations), strict=True)
+    odometry = Odometry(*(np.stack(column) for column in motions))
     columns = zip(*(o[1:] for o in observations), strict=True)
     return type(first)(odometry, *(np.stack(column) for column in columns))

@@ -55,10 +55,7 @@ class Calibration(NamedTuple):
 
 
 def calibrate(
-    config: CalibrationConfig,
-    record: Sequence[Cycle],
-    slope_window: float = 0.01,
-    where: str = "calibration",
+    config: CalibrationConfig, record: Sequence[Cycle], slope_window: float = 0.01, where: str = "calibration"
 ) -> Calibration:
     """Calibrates a head from a free-whisking record.
 
@@ -77,15 +74,16 @@ def calibrate(
     deflection = np.concatenate([cycle.deflection for cycle in record])
     missing = ~(np.isfinite(angle).all(axis=0) & np.isfinite(deflection).all(axis=(0, 2)))
     if missing.any():
-        raise InputError(
-            where, f"{_named(missing)}: NaN samples", "finite samples", "check the wiring of these channels"
-        )
+        found, cure = f"{_named(missing)}: NaN samples", "check the wiring of these channels"
+        raise InputError(where, found, "finite samples", cure)
     stuck = np.ptp(deflection, axis=0) == 0
     alive = ~(stuck.all(axis=1) & ((np.ptp(angle, axis=0) == 0) | (deflection == 0).all(axis=(0, 2))))
     if not alive.any():
         cure = "whisk while recording; a simulated head needs sensor noise above 0 (`mechanics.noise`)"
         raise InputError(where, "no whisker has a signal", "at least one live whisker", cure)
-    _refuse_saturated(config, deflection, alive, where)
+    if (bad := _saturated(config, deflection) & alive).any():
+        found = f"deflections of {_named(bad)} are constant or at their limits"
+        raise InputError(where, found, "unclipped samples", "check the sensors or list the whiskers as dead")
 
     middle = np.median(deflection, axis=0)
     robust = 1.4826 * np.median(np.abs(deflection - middle), axis=0)
@@ -120,12 +118,9 @@ def sample_rate(time: np.ndarray, slope_window: float, where: str) -> float:
         gap = f"a gap of {step.max() / usual:.0f} sample intervals"
         raise InputError(where, gap, "a stream without gaps", "leave this cycle out")
     if slope_window / usual < MIN_WINDOW_SAMPLES - 1e-6:
-        raise InputError(
-            where,
-            f"{1 / usual:.0f} samples per second",
-            f"at least {MIN_WINDOW_SAMPLES / slope_window:.0f} for a slope window of {slope_window:g} s",
-            "sample faster, or widen `contact.slope_window`",
-        )
+        least = f"at least {MIN_WINDOW_SAMPLES / slope_window:.0f} for a slope window of {slope_window:g} s"
+        cure = "sample faster, or widen `contact.slope_window`"
+        raise InputError(where, f"{1 / usual:.0f} samples per second", least, cure)
     return 1 / usual
 
 
@@ -174,18 +169,11 @@ def _rate(config: CalibrationConfig, record: Sequence[Cycle], slope_window: floa
     return float(np.median(rates))
 
 
-def _refuse_saturated(
-    config: CalibrationConfig, deflection: np.ndarray, alive: np.ndarray, where: str
-) -> None:
-    # A clipped channel stays at one of its own extremes.
-    at_end = np.maximum(
-        (deflection == deflection.max(axis=0)).mean(axis=0),
-        (deflection == deflection.min(axis=0)).mean(axis=0),
-    )
-    bad = ((at_end > 0.05) | (np.abs(deflection) >= config.full_scale).any(axis=0)).any(axis=1) & alive
-    if bad.any():
-        found = f"deflections of {_named(bad)} are constant or at their limits"
-        raise InputError(where, found, "unclipped samples", "check the sensors or list the whiskers as dead")
+def _saturated(config: CalibrationConfig, deflection: np.ndarray) -> np.ndarray:
+    """Which whiskers [W] have a clipped channel, which is often at one of its extremes."""
+    high, low = (deflection == end for end in (deflection.max(axis=0), deflection.min(axis=0)))
+    at_end = np.maximum(high.mean(axis=0), low.mean(axis=0))
+    return ((at_end > 0.05) | (np.abs(deflection) >= config.full_scale).any(axis=0)).any(axis=1)
 
 
 def _named(which: np.ndarray) -> str:

@@ -82,9 +82,8 @@ def detect_contacts(
     rate = sample_rate(cycle.time, config.slope_window, where)
     window = round(config.slope_window * rate)
     if len(cycle.time) < 2 * window:
-        raise InputError(
-            where, f"a cycle of {len(cycle.time)} samples", "a whole whisk", "the stream is cut off"
-        )
+        found = f"a cycle of {len(cycle.time)} samples"
+        raise InputError(where, found, "a whole whisk", "the stream is cut off")
     alive = calibration.alive & np.isfinite(cycle.angle).all(axis=0)
     alive = alive & np.isfinite(cycle.deflection).all(axis=(0, 2))
     angle = np.where(alive, cycle.angle, 0.0)
@@ -98,7 +97,9 @@ def detect_contacts(
     # single whisker may go further later, when its wall moves away. Rows count from the first full window.
     last = int(np.argmax(smooth.sum(axis=1)))
     beyond = (level > config.contact_sds * sd) & (np.arange(len(level))[:, None] <= last)
-    contact, onset = beyond.any(axis=0), _onset(config, rate, sd, level, slope, beyond)
+    # At rest the deflection is within its noise, which is steep too.
+    steep = (slope > config.onset_sds * sd / config.rise_time) & (level > sd)
+    contact, onset = beyond.any(axis=0), _onset(beyond, steep, config.rise_time * rate)
     held, column = contact & beyond[last], np.arange(len(alive))
     reach = _reach(config.shaft, angle[window - 1 :], deflection[window - 1 :, :, 1], level, onset, last)
     return Whisk(
@@ -112,32 +113,22 @@ def detect_contacts(
     )
 
 
-def _onset(
-    config: ContactConfig,
-    rate: float,
-    sd: np.ndarray,
-    level: np.ndarray,
-    slope: np.ndarray,
-    beyond: np.ndarray,
-) -> np.ndarray:
+def _onset(beyond: np.ndarray, steep: np.ndarray, rise: float) -> np.ndarray:
     """[W] the row at which each contact began.
 
-    That is the first steep row within `rise_time` before the contact is detected at which the whisker has
-    left its rest (noise is steep too), or the row of detection if the deflection rises slowly.
+    That is the first steep row at most `rise` rows before the contact is detected, or the row of detection
+    if the deflection rises slowly.
     """
-    row, detected = np.arange(len(level))[:, None], np.argmax(beyond, axis=0)
-    near = (row <= detected) & (row >= detected - config.rise_time * rate)
-    steep = near & (slope > config.onset_sds * sd / config.rise_time) & (level > sd)
+    row, detected = np.arange(len(beyond))[:, None], np.argmax(beyond, axis=0)
+    steep = steep & (row <= detected) & (row >= detected - rise)
     return np.where(steep.any(axis=0), np.argmax(steep, axis=0), detected)
 
 
 def _line(value: np.ndarray, window: int) -> tuple[np.ndarray, np.ndarray]:
     """Mean and least-squares slope per sample over each full window: [T - window + 1, ...] twice."""
     index = np.arange(len(value), dtype=float).reshape(-1, *(1,) * (value.ndim - 1))
-    sums = [
-        np.concatenate([np.zeros((1, *value.shape[1:])), np.cumsum(part, axis=0)])
-        for part in (value, index * value)
-    ]
+    zero, parts = np.zeros((1, *value.shape[1:])), (value, index * value)
+    sums = [np.concatenate([zero, np.cumsum(part, axis=0)]) for part in parts]
     total, moment = (sum_[window:] - sum_[:-window] for sum_ in sums)
     centre = index[: len(total)] + (window - 1) / 2
     return total / window, (moment - centre * total) / (window * (window**2 - 1) / 12)

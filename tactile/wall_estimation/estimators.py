@@ -112,9 +112,8 @@ def geometric_wall(points: np.ndarray, contact: WallContact) -> Wall:
     """
     if contact.moment != StepEnd.HIT2:
         return no_wall()
-    there = np.concatenate(
-        [to_final_frame(points[contact.first], contact), points[contact.now & ~contact.first]]
-    )
+    before, new = to_final_frame(points[contact.first], contact), points[contact.now & ~contact.first]
+    there = np.concatenate([before, new])
     apart = np.linalg.norm(there[:, None] - there, axis=-1).max(initial=0.0)
     if apart < MIN_SEPARATION:
         return no_wall()

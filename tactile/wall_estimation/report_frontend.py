@@ -73,9 +73,8 @@ class ReportFrontendConfig(Settings):
     @model_validator(mode="after")
     def _within(self) -> Self:
         if self.contact_radius > self.length:
-            raise ValueError(
-                f"contact_radius: {self.contact_radius:g} m exceeds the whisker length of {self.length:g} m"
-            )
+            found = f"contact_radius: {self.contact_radius:g} m"
+            raise ValueError(f"{found} exceeds the whisker length of {self.length:g} m")
         return self
 
     def resolved(self, folder: Path) -> ReportFrontendConfig:
@@ -119,12 +118,8 @@ class ReportFrontend:
         if config.templates is not None and config.walls in ("template", "fused"):
             templates = read_templates(config.templates)
         if config.walls == "template" and templates is None:
-            raise InputError(
-                "walls",
-                "`template` without strain templates",
-                "`templates`: a file of strain templates",
-                f"{TRAIN_HINT}, or use `geometric`",
-            )
+            expected, cure = "`templates`: a file of strain templates", f"{TRAIN_HINT}, or use `geometric`"
+            raise InputError("walls", "`template` without strain templates", expected, cure)
         self.config, self.templates = config, templates
         self.feelers = config.feelers
         self.whiskers = len(config.mounts)
@@ -148,22 +143,16 @@ class ReportFrontend:
         wall = self._met(report)
         odometry = report.odometry if self._back is None else _joined(self._back, report.odometry)
         self._back = None
-        if report.motion == MotionKind.BACK:
-            if self.config.fold_back:
-                self._back = odometry
-                return None
-            blind = observation(
-                odometry, view_shape=self.view_shape, motion=MotionKind.BACK, whiskers=self.whiskers
-            )
-            return blind._replace(alive=np.zeros(self.whiskers, bool))
-        contact = np.asarray(report.contact & report.alive, bool)
-        plain = observation(
-            odometry,
-            contact.reshape(self.view_shape).astype(np.float64) if contact.any() else None,
-            view_shape=self.view_shape,
-            motion=MotionKind(report.motion),
-            whiskers=self.whiskers,
-        )
+        back = report.motion == MotionKind.BACK
+        if back and self.config.fold_back:
+            self._back = odometry
+            return None
+        contact = np.asarray(report.contact & report.alive, bool) & (not back)
+        view = contact.reshape(self.view_shape).astype(np.float64) if contact.any() else None
+        motion, shape = MotionKind(report.motion), self.view_shape
+        plain = observation(odometry, view, view_shape=shape, motion=motion, whiskers=self.whiskers)
+        if back:
+            return plain._replace(alive=contact)
         return plain._replace(
             contact=contact,
             alive=np.array(report.alive, bool),
@@ -181,11 +170,8 @@ class ReportFrontend:
             self._slow = _Slow(contact, np.zeros(3), ())
         if slow is None or report.motion != MotionKind.FORWARD or report.moment == StepEnd.HIT1:
             return no_wall()
-        slow = _Slow(
-            slow.first,
-            compose(slow.travel, np.array(report.odometry[:3], np.float64)),
-            (*slow.strain, self._sampled(report)),
-        )
+        travel = compose(slow.travel, np.array(report.odometry[:3], np.float64))
+        slow = _Slow(slow.first, travel, (*slow.strain, self._sampled(report)))
         if report.moment == StepEnd.FREE:
             self._slow = slow
             return no_wall()
@@ -197,12 +183,8 @@ class ReportFrontend:
         if self.templates is not None and rate:
             usual = self.templates.training.rate
             if abs(rate - usual) > RATE_TOLERANCE * usual:
-                raise InputError(
-                    "strain",
-                    f"{rate:.5g} samples per second",
-                    f"{usual:g}, as in the templates",
-                    "train templates at this rate",
-                )
+                found, cure = f"{rate:.5g} samples per second", "train templates at this rate"
+                raise InputError("strain", found, f"{usual:g}, as in the templates", cure)
         return np.asarray(report.strain, np.float64)
 
     def _wall(self, slow: _Slow, contact: np.ndarray, report: Report) -> Wall:

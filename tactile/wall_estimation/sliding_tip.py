@@ -111,12 +111,9 @@ def fit_tip_model(templates: StrainTemplates, feelers: PlanarWhiskers) -> TipMod
     gain, misfit = _scanned(tip, series, np.geomspace(strongest / 4, strongest / 0.1, 300))
     gain, misfit = _scanned(tip, series, gain * np.linspace(0.985, 1.015, 61))
     if misfit > MAX_TEMPLATE_MISFIT:
-        raise InputError(
-            TEMPLATES,
-            "the strain does not fit straight whiskers with these mounts",
-            "the whiskers that the templates were trained with",
-            "check mounts and length, or train again",
-        )
+        found = "the strain does not fit straight whiskers with these mounts"
+        expected, cure = "the whiskers of the training", "check mounts and length, or train again"
+        raise InputError(TEMPLATES, found, expected, cure)
     tip = tip._replace(gain=gain)
     crosstalk, share = _vertical(tip, series)
     return tip._replace(crosstalk=crosstalk, share=share)
@@ -129,7 +126,7 @@ def direction_misfit(tip: TipModel, whisker: int, strain: np.ndarray) -> Directi
     side = np.sign(across.sum())
     nearer = _nearer(tip, whisker, WALL_DIRECTIONS, side)
     time, noise = tip.time[: len(rows)], tip.noise[: len(rows)]
-    fit = _sliding(tip, tip.gain, nearer, np.sin(WALL_DIRECTIONS), float(tip.feelers.length[whisker]), across)
+    fit = _sliding(tip, whisker, nearer, np.sin(WALL_DIRECTIONS), across, np.ones(len(across), bool))
     expected = tip.crosstalk * across - np.abs(across) * (_between(fit.slant) @ tip.share)
     sd = np.hypot(noise[:, 1], VERTICAL_MODEL_SD * across)
     vertical = _mean(((down - expected) / sd) ** 2, fit.use)
@@ -175,21 +172,14 @@ def _nearer(tip: TipModel, whisker: int, angle: np.ndarray, side: float) -> np.n
 
 
 def _sliding(
-    tip: TipModel,
-    gain: float,
-    nearer: np.ndarray,
-    slope: np.ndarray,
-    length: float,
-    across: np.ndarray,
-    touching: np.ndarray | None = None,
+    tip: TipModel, whisker: int, nearer: np.ndarray, slope: np.ndarray, across: np.ndarray, use: np.ndarray
 ) -> _Fit:
     """Fits the distance of the wall at HIT1 for K angles `nearer` and directions (`slope`: their sines)."""
-    count = len(across)
-    turn = np.abs(across) / gain
-    use = turn < MAX_TURN if touching is None else touching & (turn < MAX_TURN)
+    count, length, turn = len(across), float(tip.feelers.length[whisker]), np.abs(across) / tip.gain
+    use = use & (turn < MAX_TURN)
     slant = nearer[:, None] - turn
     distance = length * np.sin(slant) + tip.speed * slope[:, None] * tip.time[:count]
-    sd = length * np.cos(slant) * np.hypot(tip.noise[:count, 0] / gain, HORIZONTAL_MODEL_SD * turn)
+    sd = length * np.cos(slant) * np.hypot(tip.noise[:count, 0] / tip.gain, HORIZONTAL_MODEL_SD * turn)
     weight = use / (sd**2 + SURFACE_SD**2)
     away = (weight * distance).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-300)
     return _Fit(_mean(weight * (distance - away[:, None]) ** 2, use), away, slant, use)
@@ -226,9 +216,9 @@ def _scanned(tip: TipModel, series: list[_Series], gains: np.ndarray) -> tuple[f
     total = np.zeros(len(gains))
     for one in series:
         nearer, slope = np.array([one.nearer]), np.sin([one.angle])
-        length = float(tip.feelers.length[one.whisker])
         for k, gain in enumerate(gains):
-            fit = _sliding(tip, gain, nearer, slope, length, one.across, one.touching)
+            model = tip._replace(gain=gain)
+            fit = _sliding(model, one.whisker, nearer, slope, one.across, one.touching)
             # With this gain, too many samples would be turned further than `MAX_TURN`.
             total[k] += min(fit.misfit[0], 10.0) if fit.use.sum() >= MIN_CONTACT_SAMPLES // 2 else 10.0
     best = int(total.argmin())

@@ -60,9 +60,8 @@ class TemplateTraining(Settings):
         if self.last_deg < self.first_deg:
             raise ValueError(f"last_deg: {self.last_deg:g} is less than first_deg, {self.first_deg:g}")
         if 2 * self.cutoff >= self.rate:
-            raise ValueError(
-                f"cutoff: {self.cutoff:g} Hz exceeds half the rate of {self.rate:g} samples per second"
-            )
+            found = f"cutoff: {self.cutoff:g} Hz"
+            raise ValueError(f"{found} exceeds half the rate of {self.rate:g} samples per second")
         return self
 
     @property

@@ -93,9 +93,9 @@ def whisk_command(
         last, mean, most = 0.0, np.zeros_like(mean), np.zeros_like(most)
     mean = mean + (1 - np.exp((last - time) / config.window)) * (np.abs(deflection) - mean)
     most = np.maximum(most, mean - threshold)
-    taken = (
-        most if config.mode == "rcp" else np.where(most > 0, most, config.follow * neighbour_max(most, shape))
-    )
+    taken = most
+    if config.mode == "spread":
+        taken = np.where(most > 0, most, config.follow * neighbour_max(most, shape))
     return np.maximum(amplitude - config.gain * taken, 0.0) * share, WhiskDrive(time, mean, most)
 
 
@@ -123,9 +123,6 @@ def check_amplitude(config: WhiskingConfig, head: Head, where: str = "simulation
         InputError: the amplitude exceeds the head's limit.
     """
     if np.radians(config.amplitude_deg) > head.limit + 1e-9:
-        raise InputError(
-            f"{where}.amplitude_deg",
-            f"{config.amplitude_deg:g} degrees",
-            f"at most {np.degrees(head.limit):g}, the head's limit_deg",
-            "lower the amplitude, or raise the limit if the drives allow it",
-        )
+        found, most = f"{config.amplitude_deg:g} degrees", f"at most {np.degrees(head.limit):g}, limit_deg"
+        cure = "lower the amplitude, or raise the limit if the drives allow it"
+        raise InputError(f"{where}.amplitude_deg", found, most, cure)

@@ -1,4 +1,4 @@
-"""Alignment, ATE, RPE, online error, association by time, TUM files."""
+"""Alignment, ATE, RPE, online error, interpolation, TUM files."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ from scipy.optimize import minimize
 
 from evaluation.metrics.trajectory import (
     align,
-    associate,
     ate,
     interpolate,
-    online_error,
     online_errors,
     position_errors,
     read_tum,
     rpe,
+    summarize_errors,
     write_tum,
 )
 from tactile.base.errors import InputError
@@ -93,9 +92,9 @@ def test_online_errors_use_the_rows_so_far(pair, motion):
 def test_summary_of_online_errors():
     truth = np.array([[x, 0.0, 0.0] for x in range(5)])
     online = truth.copy()
-    assert online_error(online, truth) == pytest.approx((0, 0, 0), abs=1e-9)
+    assert summarize_errors(online_errors(online, truth)) == pytest.approx((0, 0, 0), abs=1e-9)
     online[4, 0] = 9.0  # the last of five steps jumps 5 m ahead; the alignment makes up for a fifth
-    assert online_error(online, truth) == pytest.approx((0, 4 / np.sqrt(3), 4), abs=1e-9)
+    assert summarize_errors(online_errors(online, truth)) == pytest.approx((0, 4 / np.sqrt(3), 4), abs=1e-9)
 
 
 def test_headings_are_interpolated_along_the_shorter_arc():
@@ -104,16 +103,6 @@ def test_headings_are_interpolated_along_the_shorter_arc():
     assert np.isnan(found[[0, 5]]).all()
     assert found[2, :2] == pytest.approx([0.5, 1])
     assert np.degrees(wrap(found[1:5, 2] - np.radians(170))) == pytest.approx([0, 10, 15, 20])
-
-
-def test_association_drops_what_lies_outside():
-    reference = np.array([[0.0, 0, 0], [2, 0, 0]])
-    time, pose, there = associate(
-        np.array([0.0, 1.5, 2, 4]), np.ones((4, 3)), np.array([1.0, 3.0]), reference
-    )
-    assert time.tolist() == [1.5, 2]
-    assert pose.shape == (2, 3)
-    assert there[:, 0].tolist() == [0.5, 1]
 
 
 def test_times_must_increase():

@@ -93,7 +93,7 @@ def test_a_back_step_gives_its_motion_only() -> None:
 
 
 @given(st.lists(st.tuples(*[st.floats(-0.5, 0.5)] * 3, st.booleans()), min_size=1, max_size=12))
-def test_fold_back_adds_the_motion_to_the_next_observation(steps: list[tuple[float, float, float, bool]]) -> None:
+def test_fold_back_adds_to_the_next_motion(steps: list[tuple[float, float, float, bool]]) -> None:
     def path(fold: bool) -> np.ndarray:
         reporting, pose, time = ReportFrontend(ReportFrontendConfig(fold_back=fold)), np.zeros(3), 0.0
         kinds = [MotionKind.BACK if back else MotionKind.TURN for *_, back in steps] + [MotionKind.FORWARD]

@@ -70,9 +70,7 @@ def test_the_filter_starts_in_its_steady_state(level: float, count: int) -> None
 @pytest.mark.parametrize(
     ("frequency", "least", "most"), [(2.0, 0.95, 1.01), (17.0, 0.65, 0.75), (60, 0, 0.1)]
 )
-def test_the_filter_passes_signals_below_its_cutoff(
-    frequency: float, least: float, most: float
-) -> None:
+def test_the_filter_passes_signals_below_its_cutoff(frequency: float, least: float, most: float) -> None:
     wave = np.sin(2 * np.pi * frequency * np.arange(8000) / RATE)
     assert least < np.abs(filter_strain(TRAINING, wave)[4000:]).max() < most
 
