@@ -58,7 +58,9 @@ def _lines(path: str | Path) -> list[tuple[int, list[str], bool]]:
     try:
         text = Path(path).read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(str(path), f"cannot be read ({error})", "a text file of numbers") from error
+        raise InputError(
+            str(path), f"cannot be read ({getattr(error, 'strerror', error)})", "a text file of numbers"
+        ) from error
     lines = text.split("\n")
     return [
         (number, _cells(line), number < len(lines))

@@ -1,4 +1,4 @@
-"""Completes a configuration: the one place where settings are filled in from what a source states."""
+"""Completes a configuration: the one place where settings are filled in from the information of a source."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ plus the margin (m), for the whiskers."""
 def complete(config: RunConfig, source: Source, extent_m: float | None = None) -> RunConfig:
     """The configuration for a source, with nothing left open; settings that it has are kept.
 
-    What the source states goes before a preset, a preset before a default. The result is what a run writes to
-    its run directory. Completing it again changes nothing, because every setting in it is set.
+    Values of the source take precedence over presets, presets over defaults. A run writes the result to its
+    run directory. Completing it again changes nothing, because every setting in it is set.
 
     Args:
         source: raw or of observations.
@@ -45,8 +45,8 @@ def complete(config: RunConfig, source: Source, extent_m: float | None = None) -
     config = config.model_copy(update={"presets": names})
     if config.backend != "grid" or config.grid.side is not None:
         return config
-    if extent_m is None:
-        extent_m = None if source.length is None else odometry_extent(source)
+    if extent_m is None and source.length is not None:
+        extent_m = odometry_extent(source)
     if extent_m is None:
         return config
     return _fill(config, {"grid": {"side": round(2 * (EXTENT_FACTOR * extent_m + EXTENT_MARGIN), 2)}})

@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from enum import Enum
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
 
@@ -123,7 +122,7 @@ def _input_error(details: ErrorDetails, spot: _Spot, model: type[Settings], docu
         case "union_tag_invalid":
             at = (*path, context["discriminator"].strip("'"))
             return _wrong_word(at, context["expected_tags"], document)
-        case "literal_error" | "enum":
+        case "literal_error":
             return _wrong_word(path, context["expected"], document)
         case "value_error" | "assertion_error":
             prefix = "" if isinstance(value, dict) else f"{shown(value)}: "
@@ -199,8 +198,6 @@ def _answers_to(kind: Any, name: str | int) -> bool:
 def _words(kind: Any, field: str | int) -> Sequence[Any]:
     """Values that a field of a model is restricted to."""
     annotation = _inside(kind, field) if _is_model(kind) else None
-    if isinstance(annotation, type) and issubclass(annotation, Enum):
-        return [member.value for member in annotation]
     return get_args(annotation) if get_origin(annotation) is Literal else ()
 
 

@@ -65,7 +65,7 @@ def refused(capsys, arguments, *said):
         assert words in error
 
 
-def test_a_run_leaves_everything(square):
+def test_a_run_writes_all_its_files(square):
     assert {path.name for path in square.iterdir()} == FILES
     assert json.loads((square / "manifest.json").read_text())["status"] == "complete"
     card = json.loads((square / "scorecard.json").read_text())["quantities"]["ate_final"]

@@ -1,4 +1,4 @@
-"""Completion of a configuration: what fills which setting, and that a completed one is complete."""
+"""Completion of a configuration: which value fills a setting, and that nothing stays open."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def test_the_source_fills_head_cell_size_and_whiskers():
     assert reports.length == source.info.planar_whiskers.length
 
 
-def test_the_grid_covers_the_odometry_or_what_it_is_told():
+def test_the_grid_covers_the_odometry_or_the_given_extent():
     config = RunConfig.model_validate(CREATE | {"backend": "grid"})
     source = open_source(config)
     side = complete(config, source).grid.side
@@ -148,14 +148,14 @@ def test_a_building_is_chosen_by_its_recording_or_by_a_variable(name, buildings,
     assert load_config(config) == given
 
 
-def test_a_building_that_is_not_chosen_is_asked_for(monkeypatch):
+def test_a_missing_choice_of_building_is_refused(monkeypatch):
     monkeypatch.delenv("RATSLAM_BUILDING", raising=False)
     with pytest.raises(InputError, match="the environment variable RATSLAM_BUILDING is not set"):
         load_config(ROOT / "configs" / "building.yaml")
 
 
 @pytest.mark.parametrize("name", ["acapulco", "aces", "belgioioso", "freiburg_101"])
-def test_buildings_run_as_with_their_own_configurations(name, reference_data):
+def test_the_shared_configuration_equals_those_of_single_buildings(name, reference_data):
     folder = reference_data / "buildings"
     if not folder.is_dir():
         pytest.skip(f"no folder {folder}")

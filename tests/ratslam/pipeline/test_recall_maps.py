@@ -1,4 +1,4 @@
-"""Whole maps by recall: what classic matching ruins comes out right, what cannot be told is left alone."""
+"""Whole maps by recall: sequences that classic matching distorts are mapped; ambiguous ones stay odometry."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.helpers import scenes
 GOLDEN = Path(__file__).parents[2] / "golden"
 
 
-def mapped(log: InMemorySource, precision: str = "float64", **parts) -> Session:
+def map_log(log: InMemorySource, precision: str = "float64", **parts) -> Session:
     """A session that has replayed the log with one setting for all, on pose cells small enough for a test."""
     cells = {"cells_xy": 11, "cell_size": log.info.cell_size}
     config = RecallBackendConfig.model_validate({"pose_cells": cells, **parts})
@@ -64,7 +64,7 @@ def golden(name: str) -> InMemorySource:
 )
 def test_one_setting_maps_every_trace(trace, limit, broken):
     log = golden(trace)
-    session = mapped(log)
+    session = map_log(log)
     assert error(session, log) <= (limit or 1.05 * odometry_error(log) + 0.02)
     assert cuts(session) == broken
 
@@ -78,9 +78,9 @@ def test_regenerated_streams_behave_as_the_published_ones(seed):
     )
     square, eight = scenes.square(seed), scenes.figure_eight(seed)
     kidnapped = scenes.square(seed + 50, laps=4, jumps=jumps)
-    assert error(mapped(square), square) <= 0.02
-    assert error(mapped(eight), eight) <= 0.03
-    session = mapped(kidnapped)
+    assert error(map_log(square), square) <= 0.02
+    assert error(map_log(eight), eight) <= 0.03
+    session = map_log(kidnapped)
     assert error(session, kidnapped) <= 0.08
     assert cuts(session) == [row for row, _ in jumps]
 
@@ -88,22 +88,22 @@ def test_regenerated_streams_behave_as_the_published_ones(seed):
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.soak)])
 def test_a_perturbed_recording_is_mapped_as_well(seed):
     log = perturb(golden("b_figure8_alias"), seed)
-    assert error(mapped(log), log) <= 0.05
+    assert error(map_log(log), log) <= 0.05
 
 
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.soak)])
 def test_an_unknown_corridor_stays_odometry(seed):
     log = scenes.corridor(seed)
-    session = mapped(log)
+    session = map_log(log)
     assert len(session.map.closures()) == 0
     assert error(session, log) == pytest.approx(odometry_error(log), abs=1e-9)
 
 
-def test_a_lap_the_other_way_round_joins_where_it_turns():
+def test_a_lap_in_the_opposite_direction_is_closed_where_it_turns():
     # The way back shows other views (another heading), so nothing may close but what faces the same way.
     there = [(0.05, 0.0)] * 30 + [(0.0, np.pi / 18)] * 18
     log = scenes.sensed(scenes.followed(there * 8), 3)
-    session = mapped(log)
+    session = map_log(log)
     assert error(session, log) <= 0.05
     pairs = session.map.closures()
     assert len(pairs) > 20
@@ -130,9 +130,9 @@ def different(log: InMemorySource) -> InMemorySource:
 
 
 @pytest.mark.parametrize("control", [shuffled, blank, alike, different])
-def test_views_that_tell_nothing_close_nothing(control):
+def test_views_without_information_give_no_closures(control):
     log = control(golden("a_square3"))
-    session = mapped(log)
+    session = map_log(log)
     assert len(session.map.closures()) == 0
     assert error(session, log) == pytest.approx(odometry_error(log), abs=1e-9)
 
@@ -141,7 +141,7 @@ def test_views_that_tell_nothing_close_nothing(control):
 def test_the_sensors_unit_does_not_matter(factor):
     log = golden("a_square3")
     scaled = replace(log, views=log.views * factor)
-    first, second = mapped(log), mapped(scaled)
+    first, second = map_log(log), map_log(scaled)
     assert np.array_equal(first.map.trajectory(), second.map.trajectory())
     assert np.array_equal(first.map.candidates(), second.map.candidates())
 
@@ -149,7 +149,7 @@ def test_the_sensors_unit_does_not_matter(factor):
 @pytest.mark.soak
 def test_single_precision_maps_as_well():
     log = golden("b_figure8_alias")
-    session = mapped(log, "float32")
+    session = map_log(log, "float32")
     assert error(session, log) <= 0.03
     assert np.isfinite(session.map.trajectory()).all()
     assert np.isfinite(session.map.candidates()[:, 3:5]).all()
@@ -158,7 +158,7 @@ def test_single_precision_maps_as_well():
 # What is told beside the map
 
 
-def test_a_kidnapped_robot_knows_that_it_is_lost_and_then_where_it_is():
+def test_a_kidnapped_robot_is_reported_lost_and_then_localised():
     log = golden("e_kidnap")
     cells = {"cells_xy": 11, "cell_size": 0.1}
     session = Session(
@@ -172,7 +172,7 @@ def test_a_kidnapped_robot_knows_that_it_is_lost_and_then_where_it_is():
 
 def test_a_closure_sequence_can_be_undone():
     log = golden("a_square3")
-    session = mapped(log)
+    session = map_log(log)
     frames = session.map
     accepted = np.unique(frames.candidates()[frames.candidates()[:, 7] == Verdict.ACCEPTED, 5]).astype(int)
     before, path = frames.closures(), frames.trajectory()
@@ -181,14 +181,14 @@ def test_a_closure_sequence_can_be_undone():
     assert not np.array_equal(frames.trajectory(), path)
     with pytest.raises(ValueError, match="not an accepted closure sequence"):
         frames.undo(int(accepted[0]))
-    for run in accepted[1:]:
-        frames.undo(int(run))
+    for sequence in accepted[1:]:
+        frames.undo(int(sequence))
     assert len(frames.closures()) == 0
     reckoned = odometry_error(log)
     assert error(session, log) == pytest.approx(reckoned, rel=0.05)
 
 
-def test_doubt_grows_on_the_way_and_falls_at_a_closure():
+def test_the_spread_grows_along_the_path_and_falls_at_a_closure():
     log = golden("a_square3")
     config = RecallBackendConfig.model_validate({"pose_cells": {"cells_xy": 11, "cell_size": 0.1}})
     session = Session(RecallBackend(config, log.view_shape), reserve=512)

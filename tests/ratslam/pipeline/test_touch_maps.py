@@ -1,4 +1,4 @@
-"""Whole maps by whisker, from simulated sessions: what is known again closes, what is not is left alone."""
+"""Whole maps from whisker images of simulated sessions: closures at equal places, and only there."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ SMALL = {"columns": 3, "rows": 3, "loop": 8}
 WIDE = {"columns": 5, "rows": 5, "loop": 12}
 LAPS = {"maze": SMALL, "path": {"circuits": "CCCC"}}
 REACH = 0.1
-"""Metres within which a closure is true: two pose cells."""
+"""Distance within which a closure is true, m: two pose cells."""
 
 
-class Way(NamedTuple):
-    """What was felt [N] and where it truly was [N, 3]."""
+class Walk(NamedTuple):
+    """Observations [N] and true poses [N, 3]."""
 
-    felt: list[Observation]
+    readings: list[Observation]
     truth: np.ndarray
 
 
-class Mapped(NamedTuple):
-    """What a session makes of a way."""
+class MappedWalk(NamedTuple):
+    """The result of mapping a walk."""
 
     path: np.ndarray
     closures: np.ndarray
@@ -61,111 +61,111 @@ def _compiled(reserve: int) -> tuple[Session, dict[str, np.ndarray]]:
     return session, session.arrays()
 
 
-def fresh(reserve: int = 512) -> Session:
+def empty_session(reserve: int = 512) -> Session:
     """The one compiled session, with nothing in it: all mazes, heads and controls have the same kernel."""
     session, empty = _compiled(reserve)
     session.restore(empty)
     return session
 
 
-def way(seed: int, dead: Sequence[int] = (), **simulation: Any) -> Way:
-    """A session simulated and sensed."""
+def simulate_walk(seed: int, dead: Sequence[int] = (), **simulation: Any) -> Walk:
+    """A simulated session."""
     config = config_of(simulation={"seed": seed} | LAPS | simulation, touch={"head": {"dead": tuple(dead)}})
     assert config.simulation is not None
     source = HeadSimulation(config.simulation, config.touch.head)
-    felt = [
+    readings = [
         reading for _, reading in read_observations(open_touch_source(source, complete(config, source).touch))
     ]
-    return Way(felt, source.truth)
+    return Walk(readings, source.truth)
 
 
-def follow(session: Session, felt: Sequence[Observation]) -> Mapped:
-    for _ in session.replay(felt):
+def follow(session: Session, readings: Sequence[Observation]) -> MappedWalk:
+    for _ in session.replay(readings):
         pass
     settled = session.map.solution()
     first = np.searchsorted(session.map.arrays()["step_frame"], np.arange(len(settled.cut.rows)))
     cuts = first[settled.cut.rows >= 0].tolist()
-    return Mapped(session.map.trajectory(), session.map.closures(), cuts)
+    return MappedWalk(session.map.trajectory(), session.map.closures(), cuts)
 
 
-def mapped(felt: Sequence[Observation], reserve: int = 512) -> Mapped:
-    return follow(fresh(reserve), felt)
+def map_walk(readings: Sequence[Observation], reserve: int = 512) -> MappedWalk:
+    return follow(empty_session(reserve), readings)
 
 
-def reckoned(felt: Sequence[Observation]) -> np.ndarray:
-    return integrate(np.array([[o.odometry.dx, o.odometry.dy, o.odometry.dtheta] for o in felt]))
+def dead_reckoning(readings: Sequence[Observation]) -> np.ndarray:
+    return integrate(np.array([[o.odometry.dx, o.odometry.dy, o.odometry.dtheta] for o in readings]))
 
 
 def metric(path: np.ndarray, truth: np.ndarray) -> float:
     return energy_all_pairs(path, truth).total
 
 
-def true_share(found: Mapped, truth: np.ndarray) -> float:
+def true_share(found: MappedWalk, truth: np.ndarray) -> float:
     apart = truth[found.closures[:, 0]] - truth[found.closures[:, 1]]
     return float((np.hypot(*apart[:, :2].T) < REACH).mean())
 
 
-def crossing(found: Mapped, step: int) -> int:
-    """Closures that join what lies before a step with what comes after."""
+def crossing(found: MappedWalk, step: int) -> int:
+    """The number of closures between poses before a step and poses after it."""
     return int(((found.closures[:, 0] >= step) & (found.closures[:, 1] < step)).sum())
 
 
-def carried(made: Way, row: int, ahead: int) -> Way:
-    """The same way with whisks left out: the robot is carried ahead, and its odometry does not know."""
-    kept = np.r_[:row, row + ahead : len(made.felt)]
-    return Way([made.felt[k] for k in kept], made.truth[kept])
+def kidnap(walk: Walk, row: int, ahead: int) -> Walk:
+    """The same walk without some whisks: the robot is carried ahead, without odometry."""
+    kept = np.r_[:row, row + ahead : len(walk.readings)]
+    return Walk([walk.readings[k] for k in kept], walk.truth[kept])
 
 
 # Laps
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_laps_close_and_the_map_comes_right(seed: int) -> None:
-    made = way(seed)
-    found = mapped(made.felt)
+def test_laps_are_closed_and_the_map_is_corrected(seed: int) -> None:
+    walk = simulate_walk(seed)
+    found = map_walk(walk.readings)
     assert len(found.closures) > 50
-    assert true_share(found, made.truth) >= 0.95
+    assert true_share(found, walk.truth) >= 0.95
     assert found.cuts == []
-    assert metric(found.path, made.truth) < 0.3 * metric(reckoned(made.felt), made.truth)
+    assert metric(found.path, walk.truth) < 0.3 * metric(dead_reckoning(walk.readings), walk.truth)
 
 
 @pytest.mark.parametrize("seed", range(2))
 def test_three_whiskers_may_be_dead(seed: int) -> None:
-    made = way(seed, dead=(1, 8, 15))
-    found = mapped(made.felt)
+    walk = simulate_walk(seed, dead=(1, 8, 15))
+    found = map_walk(walk.readings)
     assert len(found.closures) > 50
-    assert true_share(found, made.truth) >= 0.95
-    assert metric(found.path, made.truth) < 0.3 * metric(reckoned(made.felt), made.truth)
+    assert true_share(found, walk.truth) >= 0.95
+    assert metric(found.path, walk.truth) < 0.3 * metric(dead_reckoning(walk.readings), walk.truth)
 
 
-def test_whatever_dead_whiskers_say_the_map_is_the_same() -> None:
-    made = way(0, dead=(1, 8, 15))
+def test_the_signals_of_dead_whiskers_do_not_change_the_map() -> None:
+    walk = simulate_walk(0, dead=(1, 8, 15))
     stream = np.random.default_rng(0)
 
-    def lying(felt: Observation) -> Observation:
-        view = felt.view.copy()
+    def falsify(reading: Observation) -> Observation:
+        view = reading.view.copy()
         view.reshape(-1)[[1, 8, 15]] = stream.random(3)
-        return felt._replace(view=view)
+        return reading._replace(view=view)
 
-    found, same = mapped(made.felt), mapped([lying(felt) for felt in made.felt])
+    found, same = map_walk(walk.readings), map_walk([falsify(reading) for reading in walk.readings])
     assert np.array_equal(found.path, same.path)
     assert np.array_equal(found.closures, same.closures)
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_lap_the_other_way_round_is_joined(seed: int) -> None:
+def test_laps_in_the_opposite_direction_are_closed(seed: int) -> None:
     """The head feels the same walls with the whiskers opposite."""
-    made = way(seed, path={"circuits": "CCAA"})
-    found = mapped(made.felt)
-    assert true_share(found, made.truth) >= 0.95
-    assert crossing(found, len(made.felt) // 2) > 20
-    assert metric(found.path, made.truth) < 0.5 * metric(reckoned(made.felt), made.truth)
+    walk = simulate_walk(seed, path={"circuits": "CCAA"})
+    found = map_walk(walk.readings)
+    assert true_share(found, walk.truth) >= 0.95
+    assert crossing(found, len(walk.readings) // 2) > 20
+    assert metric(found.path, walk.truth) < 0.5 * metric(dead_reckoning(walk.readings), walk.truth)
 
 
-def test_a_session_that_feels_as_recall_remembers() -> None:
+def test_the_map_compares_the_levels_in_the_memory_of_the_kernel() -> None:
     """What the map learns from are the very levels that the kernel compares."""
-    made, session = way(1, dead=(4,)), fresh()
-    follow(session, made.felt)
+    walk, session = simulate_walk(1, dead=(4,)), empty_session()
+    follow(session, walk.readings)
     level = session.map.arrays()["appearance/level"]
     assert np.array_equal(np.asarray(session.state.memory.view)[:, : len(level)].T, level)
 
@@ -173,72 +173,72 @@ def test_a_session_that_feels_as_recall_remembers() -> None:
 # Controls
 
 
-def shuffled(felt: list[Observation]) -> list[Observation]:
-    order = np.random.default_rng(0).permutation(len(felt))
-    return [one._replace(view=felt[k].view) for one, k in zip(felt, order.tolist(), strict=True)]
+def shuffled(readings: list[Observation]) -> list[Observation]:
+    order = np.random.default_rng(0).permutation(len(readings))
+    return [one._replace(view=readings[k].view) for one, k in zip(readings, order.tolist(), strict=True)]
 
 
-def blank(felt: list[Observation]) -> list[Observation]:
-    return [one._replace(view=np.zeros_like(one.view)) for one in felt]
+def blank(readings: list[Observation]) -> list[Observation]:
+    return [one._replace(view=np.zeros_like(one.view)) for one in readings]
 
 
-def unseen(felt: list[Observation]) -> list[Observation]:
-    return [one._replace(view_seen=np.bool_(False)) for one in felt]
+def unseen(readings: list[Observation]) -> list[Observation]:
+    return [one._replace(view_seen=np.bool_(False)) for one in readings]
 
 
-def numb(felt: list[Observation]) -> list[Observation]:
-    return [one._replace(alive=np.zeros_like(one.alive)) for one in felt]
+def numb(readings: list[Observation]) -> list[Observation]:
+    return [one._replace(alive=np.zeros_like(one.alive)) for one in readings]
 
 
-def alike(felt: list[Observation]) -> list[Observation]:
-    return [one._replace(view=felt[0].view) for one in felt]
+def alike(readings: list[Observation]) -> list[Observation]:
+    return [one._replace(view=readings[0].view) for one in readings]
 
 
-def different(felt: list[Observation]) -> list[Observation]:
+def different(readings: list[Observation]) -> list[Observation]:
     stream = np.random.default_rng(0)
-    touching = np.mean([one.view > 0 for one in felt])
-    shape = felt[0].view.shape
-    return [one._replace(view=stream.random(shape) * (stream.random(shape) < touching)) for one in felt]
+    touching = np.mean([one.view > 0 for one in readings])
+    shape = readings[0].view.shape
+    return [one._replace(view=stream.random(shape) * (stream.random(shape) < touching)) for one in readings]
 
 
 @pytest.mark.parametrize("control", [shuffled, blank, unseen, numb, alike, different])
-def test_images_that_tell_nothing_close_nothing(
+def test_images_without_information_give_no_closures(
     control: Callable[[list[Observation]], list[Observation]],
 ) -> None:
     for seed in (0, 1):
-        made = way(seed)
-        found = mapped(control(made.felt))
+        walk = simulate_walk(seed)
+        found = map_walk(control(walk.readings))
         assert len(found.closures) == 0
         assert found.cuts == []
-        assert np.allclose(found.path, reckoned(made.felt), atol=1e-9)
+        assert np.allclose(found.path, dead_reckoning(walk.readings), atol=1e-9)
 
 
 @pytest.mark.soak
-def test_later_laps_in_another_maze_are_hardly_joined() -> None:
-    """Small mazes share their outer walls, so the later images are those of another way as well."""
+def test_later_laps_in_another_maze_give_few_closures() -> None:
+    """Small mazes share their outer walls, so the later images are those of another path as well."""
     together, apart = 0, 0
     for seed in range(4):
-        made, other = way(seed, maze=WIDE), way(seed + 100, maze=WIDE)
-        half = len(made.felt) // 2
-        elsewhere = [other.felt[k % len(other.felt)].view for k in range(len(made.felt))]
-        later = [one._replace(view=view) for one, view in zip(made.felt, elsewhere, strict=True)]
-        together += crossing(mapped(made.felt), half)
-        apart += crossing(mapped(made.felt[:half] + later[half:]), half)
+        walk, other = simulate_walk(seed, maze=WIDE), simulate_walk(seed + 100, maze=WIDE)
+        half = len(walk.readings) // 2
+        elsewhere = [other.readings[k % len(other.readings)].view for k in range(len(walk.readings))]
+        later = [one._replace(view=view) for one, view in zip(walk.readings, elsewhere, strict=True)]
+        together += crossing(map_walk(walk.readings), half)
+        apart += crossing(map_walk(walk.readings[:half] + later[half:]), half)
     assert together > 500
     assert apart <= 0.1 * together
 
 
-# A robot that is carried
+# A kidnapped robot
 
 
-def test_a_robot_that_is_carried_is_cut_where_it_was() -> None:
+def test_the_odometry_is_cut_where_the_robot_was_kidnapped() -> None:
     found = []
     for seed in range(8):
-        made = carried(way(seed, maze=WIDE), 240, 45)
-        told = mapped(made.felt)
-        assert true_share(told, made.truth) >= 0.95
-        near = len(told.cuts) == 1 and abs(told.cuts[0] - 240) <= 5
-        right = metric(told.path, made.truth) < 0.25 * metric(reckoned(made.felt), made.truth)
+        walk = kidnap(simulate_walk(seed, maze=WIDE), 240, 45)
+        found_map = map_walk(walk.readings)
+        assert true_share(found_map, walk.truth) >= 0.95
+        near = len(found_map.cuts) == 1 and abs(found_map.cuts[0] - 240) <= 5
+        right = metric(found_map.path, walk.truth) < 0.25 * metric(dead_reckoning(walk.readings), walk.truth)
         found.append([near, right])
     assert (np.sum(found, axis=0) >= [5, 7]).all()
 
@@ -246,19 +246,19 @@ def test_a_robot_that_is_carried_is_cut_where_it_was() -> None:
 # The map while it grows
 
 
-def carried_session() -> tuple[Way, Session]:
-    made = carried(way(4, maze=WIDE), 240, 45)
-    return made, fresh()
+def kidnapped_session() -> tuple[Walk, Session]:
+    walk = kidnap(simulate_walk(4, maze=WIDE), 240, 45)
+    return walk, empty_session()
 
 
 @pytest.mark.parametrize("every", [7, 100])
-def test_asking_for_the_map_changes_nothing(every: int) -> None:
-    made, session = carried_session()
-    expected = follow(session, made.felt)
+def test_reading_the_map_does_not_change_it(every: int) -> None:
+    walk, session = kidnapped_session()
+    expected = follow(session, walk.readings)
     kept = session.arrays()
-    session = fresh()
-    for start in range(0, len(made.felt), every):
-        list(session.replay(made.felt[start : start + every]))
+    session = empty_session()
+    for start in range(0, len(walk.readings), every):
+        list(session.replay(walk.readings[start : start + every]))
         session.map.trajectory()
         session.map.closures()
         session.map.graph()
@@ -272,19 +272,19 @@ def test_asking_for_the_map_changes_nothing(every: int) -> None:
 
 
 @pytest.mark.parametrize("stop", [250, 300, 320, 330])
-def test_a_map_with_cuts_goes_on_as_if_never_stopped(stop: int) -> None:
-    made, session = carried_session()
-    expected = follow(session, made.felt)
+def test_a_restored_map_with_cuts_continues_as_the_uninterrupted_one(stop: int) -> None:
+    walk, session = kidnapped_session()
+    expected = follow(session, walk.readings)
     assert expected.cuts
     whole = session.arrays()
-    session = fresh()
-    follow(session, made.felt[:stop])
+    session = empty_session()
+    follow(session, walk.readings[:stop])
     kept = session.arrays()
     assert (kept["map/cut"] >= 0).any() == (stop >= 320)
-    session = fresh()
-    follow(session, made.felt[:50])
+    session = empty_session()
+    follow(session, walk.readings[:50])
     session.restore(kept)
-    found = follow(session, made.felt[stop:])
+    found = follow(session, walk.readings[stop:])
     assert np.array_equal(found.path, expected.path)
     assert found.cuts == expected.cuts
     again = session.arrays()
@@ -292,38 +292,38 @@ def test_a_map_with_cuts_goes_on_as_if_never_stopped(stop: int) -> None:
 
 
 def test_an_undone_closure_sequence_stays_undone() -> None:
-    made, session = way(2), fresh()
-    follow(session, made.felt[:200])
-    frames = session.map
-    before = frames.candidates()
-    runs = np.unique(before[before[:, 7] == Verdict.ACCEPTED, 5]).astype(int)
-    run = int(runs[0])
-    frames.undo(run)
-    for rest in (made.felt[200:200], made.felt[200:240], made.felt[240:]):
+    walk, session = simulate_walk(2), empty_session()
+    follow(session, walk.readings[:200])
+    keyframe_map = session.map
+    before = keyframe_map.candidates()
+    sequences = np.unique(before[before[:, 7] == Verdict.ACCEPTED, 5]).astype(int)
+    sequence = int(sequences[0])
+    keyframe_map.undo(sequence)
+    for rest in (walk.readings[200:200], walk.readings[200:240], walk.readings[240:]):
         follow(session, rest)
-        table = frames.candidates()
-        assert (table[table[:, 5] == run, 7] == Verdict.UNDONE).all()
-        first = np.searchsorted(frames.arrays()["step_frame"], table[table[:, 5] == run, :2])
-        joined = set(map(tuple, frames.closures().tolist()))
+        table = keyframe_map.candidates()
+        assert (table[table[:, 5] == sequence, 7] == Verdict.UNDONE).all()
+        first = np.searchsorted(keyframe_map.arrays()["step_frame"], table[table[:, 5] == sequence, :2])
+        joined = set(map(tuple, keyframe_map.closures().tolist()))
         assert not joined & set(map(tuple, first.tolist()))
     with pytest.raises(ValueError, match="not an accepted closure sequence"):
-        frames.undo(run)
+        keyframe_map.undo(sequence)
 
 
-def test_every_run_that_is_told_as_accepted_can_be_undone() -> None:
-    made, session = way(0), fresh()
-    follow(session, made.felt)
+def test_every_accepted_closure_sequence_can_be_undone() -> None:
+    walk, session = simulate_walk(0), empty_session()
+    follow(session, walk.readings)
     table = session.map.candidates()
-    runs = np.unique(table[table[:, 7] == Verdict.ACCEPTED, 5]).astype(int)
-    assert len(runs) > 1
-    for run in runs.tolist():
-        session.map.undo(run)
+    sequences = np.unique(table[table[:, 7] == Verdict.ACCEPTED, 5]).astype(int)
+    assert len(sequences) > 1
+    for sequence in sequences.tolist():
+        session.map.undo(sequence)
 
 
 # Settings
 
 
-def test_whiskers_bring_their_own_settings() -> None:
+def test_the_preset_for_touch_is_used_with_whiskers() -> None:
     config = config_of(simulation=LAPS)
     assert config.simulation is not None
     completed = complete(config, HeadSimulation(config.simulation))
@@ -339,16 +339,16 @@ def test_whiskers_bring_their_own_settings() -> None:
     )  # a written configuration is the same run
 
 
-def test_what_is_set_goes_before_what_whiskers_bring() -> None:
+def test_settings_go_before_the_preset_for_touch() -> None:
     config = config_of(simulation=LAPS, keyframes={"min_score": 7.0, "noise": {"per_cell": 0.5}})
     assert config.simulation is not None
-    frames = complete(config, HeadSimulation(config.simulation)).keyframes
-    assert (frames.min_score, frames.noise.per_cell) == (7.0, 0.5)
-    assert frames.select_every == PRESETS["touch"]["keyframes"]["select_every"]
-    assert frames.noise.heading_per_cell == PRESETS["touch"]["keyframes"]["noise"]["heading_per_cell"]
+    settings = complete(config, HeadSimulation(config.simulation)).keyframes
+    assert (settings.min_score, settings.noise.per_cell) == (7.0, 0.5)
+    assert settings.select_every == PRESETS["touch"]["keyframes"]["select_every"]
+    assert settings.noise.heading_per_cell == PRESETS["touch"]["keyframes"]["noise"]["heading_per_cell"]
 
 
-def test_saying_that_there_are_whiskers_changes_nothing() -> None:
+def test_an_explicit_sector_fov_of_whiskers_changes_nothing() -> None:
     plain, said = config_of(simulation=LAPS), config_of(simulation=LAPS, recall={"sector_fov": "whiskers"})
     assert plain.simulation is not None
     source = HeadSimulation(plain.simulation)
@@ -361,33 +361,33 @@ def test_saying_that_there_are_whiskers_changes_nothing() -> None:
 @pytest.mark.soak
 @pytest.mark.parametrize("seed", range(6))
 def test_ten_circuits_are_mapped(seed: int) -> None:
-    made = way(seed, maze={}, path={})
-    found = mapped(made.felt, 2048)
-    assert true_share(found, made.truth) >= 0.95
-    assert metric(found.path, made.truth) < 0.25 * metric(reckoned(made.felt), made.truth)
+    walk = simulate_walk(seed, maze={}, path={})
+    found = map_walk(walk.readings, 2048)
+    assert true_share(found, walk.truth) >= 0.95
+    assert metric(found.path, walk.truth) < 0.25 * metric(dead_reckoning(walk.readings), walk.truth)
     for control in (shuffled, unseen):
-        assert len(mapped(control(made.felt), 2048).closures) == 0
+        assert len(map_walk(control(walk.readings), 2048).closures) == 0
 
 
 @pytest.mark.soak
-def test_later_circuits_in_another_maze_are_hardly_joined() -> None:
-    """In most mazes: two may have the same walls along the way by chance, the outer ones always."""
+def test_later_circuits_in_another_maze_give_few_closures() -> None:
+    """In most mazes: two may have the same walls along the path by chance, the outer ones always."""
     shares = []
     for seed in range(6):
-        made = way(seed, maze={}, path={})
-        half = len(made.felt) // 2
-        other = way(seed, maze={}, path={}, later_maze=0.5)
-        joined = [crossing(mapped(one.felt, 2048), half) for one in (made, other)]
+        walk = simulate_walk(seed, maze={}, path={})
+        half = len(walk.readings) // 2
+        other = simulate_walk(seed, maze={}, path={}, later_maze=0.5)
+        joined = [crossing(map_walk(one.readings, 2048), half) for one in (walk, other)]
         shares.append(joined[1] / joined[0])
     assert np.median(shares) <= 0.1
 
 
 @pytest.mark.soak
 @pytest.mark.parametrize("seed", range(10, 30))
-def test_small_loops_are_mapped_whatever_the_maze(seed: int) -> None:
-    made = way(seed)
-    found = mapped(made.felt)
+def test_small_loops_are_mapped_in_every_maze(seed: int) -> None:
+    walk = simulate_walk(seed)
+    found = map_walk(walk.readings)
     assert len(found.closures) > 20
-    assert true_share(found, made.truth) >= 0.9
-    assert metric(found.path, made.truth) < metric(reckoned(made.felt), made.truth)
-    assert len(mapped(shuffled(made.felt)).closures) == 0
+    assert true_share(found, walk.truth) >= 0.9
+    assert metric(found.path, walk.truth) < metric(dead_reckoning(walk.readings), walk.truth)
+    assert len(map_walk(shuffled(walk.readings)).closures) == 0
