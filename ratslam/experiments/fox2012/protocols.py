@@ -39,7 +39,7 @@ METHODS: dict[str, tuple[str, ...]] = {
     "ours": (),
 }
 """As printed (Algorithm 1, eq. 1 to 5), except where the printed form cannot work: each cell counts once in
-eq. 2 and not as free where the contact is (`likelihood.distinct_cells`), footprints are neutral far away, and
+eq. 2 and not as free where the contact is (`distinct_cells`), footprints are neutral far away, and
 resampled particles have moved. Footprints are the log-odds of 0.8 and 0.4. All templates are used. Ours are
 the defaults."""
 FILTERED, RECKONED, TRUE = "filter", "dead reckoning", "true path"

@@ -10,6 +10,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from evaluation.metrics.occupancy_grid import GridTruth, OccupancyGrid, cell_centres
@@ -17,7 +18,6 @@ from ratslam.backends.grid import GridBackend
 from ratslam.config.run_config import RunConfig
 from ratslam.core.precision import Precision, prepare_precision
 from ratslam.core.session import Session
-from ratslam.experiments.fox2012.likelihood import distinct_cells
 from ratslam.grid.config import GridConfig
 from ratslam.grid.map_drawing import ContactLog, contact_log, draw_occupancy
 from robot.simulation.create.session import CreateSimulation, CreateSimulationConfig, train_strain_templates
@@ -27,7 +27,7 @@ from robot.world.random_arena import make_arena
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose, integrate
-from tactile.base.types import Observation, stack
+from tactile.base.types import Array, Observation, stack
 from tactile.wall_estimation.report_frontend import ReportFrontend, ReportFrontendConfig, WhiskerMount
 from tactile.wall_estimation.strain_templates import StrainTemplates
 from tactile.whiskers.planar_whiskers import PlanarWhiskers
@@ -77,9 +77,8 @@ def simulate_session(config: CreateSimulationConfig) -> ArenaSession:
     with TemporaryDirectory() as folder:
         file = Path(folder) / "arena.txt"
         file.write_text(arena_text(made), encoding="utf-8")
-        source = CreateSimulation(
-            config.model_copy(update={"arena": config.arena.model_copy(update={"file": file})})
-        )
+        arena = config.arena.model_copy(update={"file": file})
+        source = CreateSimulation(config.model_copy(update={"arena": arena}))
     return ArenaSession(source, made, source.truth, compose(made.start, integrate(source.odometry[:, :3])))
 
 
@@ -94,9 +93,8 @@ def place_start(arena: Arena, seed: int) -> Arena:
     places, heading = random.uniform(low, high, (1000, 2)), random.uniform(-np.pi, np.pi)
     there = places[has_clearance(arena, places, START_CLEARANCE)]
     if not len(there):
-        raise InputError(
-            "create_simulation.arena", "no room for a start", f"{START_CLEARANCE:g} m of free space"
-        )
+        room = f"{START_CLEARANCE:g} m of free space"
+        raise InputError("create_simulation.arena", "no room for a start", room)
     return arena._replace(start=np.array([*there[0], heading]))
 
 
@@ -113,9 +111,8 @@ def observe_session(config: RunConfig, session: ArenaSession, seed: int) -> list
     templates = None
     if reports.templates is None and reports.walls in ("template", "fused"):
         made = session.source.config
-        templates = _templates(
-            CreateSimulationConfig(whiskers=made.whiskers, behaviour=made.behaviour, seed=seed)
-        )
+        robot = CreateSimulationConfig(whiskers=made.whiskers, behaviour=made.behaviour, seed=seed)
+        templates = _templates(robot)
     source = TouchSource(session.source, lambda: ReportFrontend(reports, templates), "touch.reports.mounts")
     return [observation_of(sample) for sample in source]
 
@@ -176,6 +173,18 @@ def collect_marks(reports: list[Observation]) -> ContactLog:
     rows = stack(reports)
     wall = np.where(rows.wall[:, None], rows.wall_point, np.nan)
     return contact_log(rows.motion, rows.contact, rows.alive, rows.point, wall)
+
+
+def distinct_cells(cell: Array, contact: Array) -> Array:
+    """bool [N, W, G]: each cell along a whisker counts once in eq. 2, and not as free where its contact is.
+
+    Args:
+        cell: [N, W, G, 2] cells at the points of each whisker, from base to tip. contact: [W] bool.
+    """
+    same = jnp.all(cell[:, :, :, None] == cell[:, :, None], axis=-1)  # [N, W, G, G]
+    earlier = np.tri(cell.shape[2], k=-1, dtype=bool)
+    repeated = jnp.any(same & earlier[None, None], axis=-1)
+    return ~repeated & ~(same[..., -1] & contact[None, :, None])
 
 
 def session_at_start(

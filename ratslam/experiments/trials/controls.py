@@ -6,7 +6,6 @@ bound of the rest of the method.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal
 
@@ -29,21 +28,17 @@ def apply_control(log: InMemorySource, control: Control, seed: int) -> InMemoryS
     """The session with replaced views; steps without a view stay without one."""
     if control == "none":
         return log
-    views = np.where(log.seen[:, None, None, None], _VIEWS[control](log, seed), log.views)
+    views = np.zeros_like(log.views)
+    if control == "shuffled":
+        rows = np.flatnonzero(log.seen)
+        views[rows] = log.views[stream(seed, "control.shuffled").permutation(rows)]
+    elif control == "ideal":
+        views = _ideal_views(log, seed)
+    views = np.where(log.seen[:, None, None, None], views, log.views)
     return replace(log, digest=f"{log.digest}+{control}+{seed}", views=views)
 
 
-def _shuffled(log: InMemorySource, seed: int) -> np.ndarray:
-    rows, views = np.flatnonzero(log.seen), log.views.copy()
-    views[rows] = log.views[stream(seed, "control.shuffled").permutation(rows)]
-    return views
-
-
-def _blank(log: InMemorySource, seed: int) -> np.ndarray:
-    return np.zeros_like(log.views)
-
-
-def _ideal(log: InMemorySource, seed: int) -> np.ndarray:
+def _ideal_views(log: InMemorySource, seed: int) -> np.ndarray:
     """Random views, one for each pair of spot and heading sector."""
     assert log.truth is not None
     spot = np.round(log.truth[:, :2] / SPOT)
@@ -52,10 +47,3 @@ def _ideal(log: InMemorySource, seed: int) -> np.ndarray:
     random = stream(seed, "control.ideal")
     shape = (len(kinds), *log.view_shape)
     return (random.random(shape) * (random.random(shape) < LIT))[row.reshape(-1)]
-
-
-_VIEWS: dict[str, Callable[[InMemorySource, int], np.ndarray]] = {
-    "shuffled": _shuffled,
-    "blank": _blank,
-    "ideal": _ideal,
-}

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import expit, logit
 
-from ratslam.experiments.fox2012.likelihood import distinct_cells
+from ratslam.experiments.trials.arena_trial import distinct_cells
 from ratslam.grid import likelihoods
 from ratslam.grid.config import LikelihoodConfig
 from tests.helpers.grid_world import LENGTH
