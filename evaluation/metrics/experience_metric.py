@@ -110,7 +110,7 @@ def experience_metric(
     """
     experience, truth = _checked(experience, truth)
     end = base_end(truth, config.position, config.heading_deg) if config.base is None else config.base
-    rows = _entries(experience, config.log)
+    rows = change_rows(experience) if config.log == "action" else np.flatnonzero(experience != -1)
     base = int(np.searchsorted(rows, _checked_base(end, len(experience))))
     reading = _READINGS[config.mode]
     ids, poses = experience[rows], truth[rows]
@@ -184,11 +184,6 @@ def _checked_base(base: int, length: int) -> int:
     if not 0 <= base <= length:
         raise InputError("i_base", str(base), f"0 to {length}, the length of the log")
     return base
-
-
-def _entries(experience: np.ndarray, log: str) -> np.ndarray:
-    """The steps [M] that are entries of a kind of log."""
-    return change_rows(experience) if log == "action" else np.flatnonzero(experience != -1)
 
 
 def _dwell(experience: np.ndarray) -> np.ndarray:

@@ -113,10 +113,9 @@ def mean_grid(grids: Sequence[OccupancyGrid]) -> OccupancyGrid:
     first = grids[0]
     for grid in grids:
         check_grid(grid)
-        if grid.probability.shape != first.probability.shape or grid.cell != first.cell:
-            raise ValueError("maps with different shapes or cell sizes; expected the same cells")
-        if not np.array_equal(grid.origin, first.origin):
-            raise ValueError("maps with different origins; expected the same cells")
+        same = grid.probability.shape == first.probability.shape and grid.cell == first.cell
+        if not same or not np.array_equal(grid.origin, first.origin):
+            raise ValueError("maps with different cells; expected the same shape, cell size and origin")
     return first._replace(probability=np.mean([grid.probability for grid in grids], axis=0))
 
 

@@ -6,18 +6,15 @@ import numpy as np
 
 from tactile.base.random_streams import stream
 
-DRAWS = 10_000
-"""Number of resamples."""
-
 
 def bootstrap(values: np.ndarray, name: str, *, seed: int = 0) -> tuple[float, float]:
-    """95 % percentile interval of the mean of `values` [R] over resampled runs; NaN without runs.
+    """95 % percentile interval of the mean of `values` [R] over 10 000 resamples; NaN without runs.
 
     Args:
         name: of the random stream; with `seed` it determines the draws.
     """
     if len(values) == 0:
         return np.nan, np.nan
-    means = values[stream(seed, name).integers(0, len(values), (DRAWS, len(values)))].mean(axis=1)
+    means = values[stream(seed, name).integers(0, len(values), (10_000, len(values)))].mean(axis=1)
     low, high = np.quantile(means, [(1 - 0.95) / 2, (1 + 0.95) / 2])
     return float(low), float(high)

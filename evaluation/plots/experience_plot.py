@@ -66,9 +66,7 @@ def _judged(run: RunArrays, card: Scorecard, rows: np.ndarray) -> tuple[Experien
 
 
 def _line(found: ExperienceMetric) -> str:
-    parts = [
-        f"base set of {found.base} steps",
-        f"ARR {found.arr:.2f} ({found.relocalisations} of {found.entries} steps after it)",
-        f"ARCR {found.arcr:.2f} ({found.correct} of {found.relocalisations} correct, strict mode)",
-    ]
+    arr = f"ARR {found.arr:.2f} ({found.relocalisations} of {found.entries} steps after it)"
+    arcr = f"ARCR {found.arcr:.2f} ({found.correct} of {found.relocalisations} correct, strict mode)"
+    parts = (f"base set of {found.base} steps", arr, arcr)
     return "  ·  ".join(part for part in parts if "nan" not in part)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.plots import style
-from evaluation.plots.style import BLUE, GREEN, GREY, INK, LABEL_GREY, LINE_GREY, PURPLE, VERMILLION, YELLOW
+from evaluation.plots.style import BLUE, GREEN, GREY, INK, LINE_GREY, PURPLE, VERMILLION, YELLOW
 
 SERIES_COLORS = (GREY, BLUE, VERMILLION, GREEN, PURPLE, YELLOW)
 """Colours of the compared series, in this order."""
@@ -81,8 +81,7 @@ def draw_experiences(title: str, line: str, runs: Mapping[str, ExperienceHistory
     """Draws the experience at each step, the end of the base set and the verdicts (Fig. 3)."""
     figure, panels = _panels(title, line, runs, 3.4)
     for axes, run in zip(panels, runs.values(), strict=True):
-        known = run.place >= 0
-        new = known & ~run.counted
+        new = (run.place >= 0) & ~run.counted
         for rows, color, mark, label in (
             (new & ~run.invalid, GREY, "o", "valid experience"),
             (new & run.invalid, YELLOW, "o", "invalid experience"),
@@ -227,5 +226,4 @@ def _map_axes(axes: style.Axes) -> None:
     axes.set_aspect("equal", adjustable="datalim")
     axes.locator_params(steps=[1, 2, 5, 10])  # short tick labels
     axes.grid(color=LINE_GREY, lw=0.7)
-    axes.tick_params(labelcolor=LABEL_GREY)
     style.name_axes(axes, "x (m)", "y (m)")

@@ -460,7 +460,7 @@ def test_invalid_maps_are_refused():
     with pytest.raises(ValueError, match="segments"):
         score_grid(empty, truth._replace(segments=np.full((1, 4), np.nan)))
     for other in (empty._replace(cell=0.1), empty._replace(origin=empty.origin + 1)):
-        with pytest.raises(ValueError, match="expected the same cells"):
+        with pytest.raises(ValueError, match="expected the same shape"):
             mean_grid([empty, other])
     felt = touchable_surface(empty, truth)
     with pytest.raises(ValueError, match="different"):
