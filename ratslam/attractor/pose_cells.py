@@ -18,14 +18,7 @@ import numpy as np
 from ratslam.attractor.adaptive_window import step_at_smallest_level
 from ratslam.attractor.config import PoseCellConfig, rings, units
 from ratslam.attractor.level_step import StepInput
-from ratslam.attractor.levels import (
-    Activity,
-    Level,
-    from_full_torus,
-    point_activity,
-    to_full_torus,
-    window_levels,
-)
+from ratslam.attractor.levels import Activity, Level, point_activity, window_levels
 from ratslam.attractor.window import TIE, deposit_gain, ring_difference, rotate
 from tactile.base.types import Array, Odometry
 
@@ -80,16 +73,6 @@ def start(config: PoseCellConfig, dtype: np.dtype, levels: tuple[Level, ...] | N
     pose = jnp.asarray(rings(config, dtype) // 2)
     activity = point_activity(levels or window_levels(config, dtype), pose)
     return PoseCells(activity, pose, jnp.zeros(3, dtype), jnp.int32(0))
-
-
-def full_activity(config: PoseCellConfig, cells: PoseCells) -> Array:
-    """[K, N, N] the activity of the whole torus."""
-    return to_full_torus(window_levels(config, cells.pose.dtype), cells.activity)
-
-
-def with_activity(config: PoseCellConfig, cells: PoseCells, activity: Array) -> PoseCells:
-    """The same state with the activity [K, N, N] of the whole torus replaced."""
-    return cells._replace(activity=from_full_torus(window_levels(config, cells.pose.dtype), activity))
 
 
 def step(

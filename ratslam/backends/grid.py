@@ -1,6 +1,6 @@
-"""SLAM by a grid particle filter: each particle has a pose, a map of its own and lasting odometry errors.
+"""SLAM by a grid particle filter: each particle has a pose, its own map and persistent odometry errors.
 
-After Fox et al. 2012, Algorithm 1. Beyond the paper, and ours: lasting odometry errors are part of the state,
+After Fox et al. 2012, Algorithm 1. Unlike in the paper, persistent odometry errors are part of the state,
 unexplored space is no evidence, and walls are expected to continue straight.
 """
 
@@ -25,21 +25,19 @@ from tactile.base.errors import InputError
 from tactile.base.types import Array, MotionKind, Observation
 from tactile.whiskers.planar_whiskers import PlanarWhiskers
 
-FREE = (0.2, 0.5, 0.8)
+FREE_POINTS = (0.2, 0.5, 0.8)
 """Points along a whisker without contact that are marked free, as shares of its length."""
-RIM = 4
+RIM_POINTS = 4
 """Number of points on the robot's rim at which the map is read, besides its centre."""
 SEGMENTS = 5
 """Number of segments of a whisker for eq. 2."""
 REACH = 2.5
-"""Standard deviations of a stamp that are drawn."""
+"""Radius at which a footprint is cut off, standard deviations."""
 WALL, WALL_DIRECTIONS = 100.0, 40.0
-"""Largest precision of a wall's direction against the field there, and against all walls."""
-
-
+"""Largest precision of a wall's direction: given the field there, and given all walls."""
 LIVE_SIDE = 2.5
 """Default side length of the map, m (Fox et al. 2012, II-D)."""
-MOST = 2**31 - 1
+MAX_CELLS = 2**31 - 1
 """Largest number of cells of all maps together: they are indexed in int32."""
 
 
@@ -79,7 +77,7 @@ class GridEvidence(NamedTuple):
 
     Attributes:
         ancestor: [N] int32, the particle that each particle was copied from. poses: [N, 3] and weights: [N]
-            before resampling. effective: effective number of particles. outcome: an `GridOutcome`, int32.
+            before resampling. effective: effective number of particles. outcome: a `GridOutcome`, int32.
     """
 
     ancestor: Array
@@ -109,9 +107,9 @@ class GridBackend:
         self.config, self.feelers, self.dtype = config, feelers, np.dtype(dtype)
         self.side = int(np.ceil(side / config.cell))
         self.whiskers = len(feelers.length)
-        self.free = feelers.points(np.array(FREE)).reshape(-1, 2).astype(self.dtype)
+        self.free = feelers.points(np.array(FREE_POINTS)).reshape(-1, 2).astype(self.dtype)
         self.shafts = feelers.points((1 + np.arange(SEGMENTS)) / SEGMENTS).reshape(-1, 2).astype(self.dtype)
-        angle = np.arange(RIM) * 2 * np.pi / RIM
+        angle = np.arange(RIM_POINTS) * 2 * np.pi / RIM_POINTS
         rim = 0.85 * config.body * np.stack([np.cos(angle), np.sin(angle)], axis=1)
         self.body = np.concatenate([np.zeros((1, 2)), rim]).astype(self.dtype)
         self.blob_sd, self.free_sd = (
@@ -150,7 +148,7 @@ class GridBackend:
         return state
 
     def apply_map_feedback(self, state: GridState, feedback: Any) -> GridState:
-        """The state unchanged: the filter takes nothing over from its map."""
+        """The state unchanged: the filter does not use its map."""
         del feedback
         return state
 
@@ -166,10 +164,10 @@ class GridBackend:
         pose, spread = particles.weighted_mean(swarm.pose, share)
         poses = swarm.pose
 
-        swarm, who = self._drawn(swarm, share, worth, features.told, pick, jitter)
+        swarm, who = self._resample(swarm, share, worth, features.valid, pick, jitter)
         maps = particles.copy_rows(state.maps, who)
         wall_directions = state.wall_directions[who.ancestor]
-        maps, wall_directions, outside = self._marked(maps, wall_directions, swarm.pose, features)
+        maps, wall_directions, outside = self._update_maps(maps, wall_directions, swarm.pose, features)
 
         outcome = jnp.where(who.copies > 0, GridOutcome.RESAMPLED, GridOutcome.OK)
         outcome = jnp.where(outside, GridOutcome.OUTSIDE, outcome)
@@ -178,7 +176,7 @@ class GridBackend:
         place = jnp.int32(-1)  # a grid has no places
         estimate = Estimate(pose, spread, place, place, jnp.int32(Action.NONE), vanished)
         evidence = GridEvidence(who.ancestor, poses, share, worth, outcome)
-        touched = jnp.where(features.told, features.touching, False)
+        touched = jnp.where(features.valid, features.touching, False)
         after = GridState(swarm, maps, wall_directions, motion, touched, jax.random.key_data(key))
         return after, estimate, evidence
 
@@ -189,26 +187,26 @@ class GridBackend:
     def _likelihood(self, state: GridState, pose: Array, features: ContactFeatures) -> Array:
         config = self.config.likelihood
         if config.model != "evidence":
-            return self._printed(state.maps, pose, features)
+            return self._printed_likelihood(state.maps, pose, features)
         points = jnp.concatenate([jnp.asarray(self.free), jnp.asarray(self.body)])
-        evidence = particle_maps.interpolate(state.maps, EVIDENCE, self._placed(pose, points))
-        shafts = jnp.repeat(features.free, len(FREE))
-        body = jnp.broadcast_to(features.told & (self.config.body > 0), len(self.body))
+        evidence = particle_maps.interpolate(state.maps, EVIDENCE, self._in_cells(pose, points))
+        shafts = jnp.repeat(features.free, len(FREE_POINTS))
+        body = jnp.broadcast_to(features.valid & (self.config.body > 0), len(self.body))
         likelihood = likelihoods.free_space(config, evidence, jnp.concatenate([shafts, body]))
         # Few observations have contacts; the rest is computed for those alone.
         return likelihood + lax.cond(
             jnp.any(features.new) | features.wall,
-            lambda: self._met(state, pose, features),
+            lambda: self._contact_likelihood(state, pose, features),
             lambda: jnp.zeros_like(likelihood),
         )
 
-    def _met(self, state: GridState, pose: Array, features: ContactFeatures) -> Array:
-        """[N] log-likelihood of new contacts, and of a wall's direction: as the map has it there, and as
-        walls are at large."""
+    def _contact_likelihood(self, state: GridState, pose: Array, features: ContactFeatures) -> Array:
+        """[N] log-likelihood of new contacts, and of a wall's direction given the map there and given the
+        directions of all walls."""
         config = self.config.likelihood
-        evidence = particle_maps.interpolate(state.maps, EVIDENCE, self._placed(pose, features.point))
+        evidence = particle_maps.interpolate(state.maps, EVIDENCE, self._in_cells(pose, features.point))
         likelihood = likelihoods.contact(config, evidence, features.new)
-        place = self._placed(pose, features.on_wall[None])
+        place = self._in_cells(pose, features.on_wall[None])
         field = [particle_maps.interpolate(state.maps, layer, place) for layer in (COSINE, SINE)]
         direction = pose[:, 2] + features.direction
         sharp = jnp.minimum(WALL, 1 / (4 * features.sd**2))
@@ -218,24 +216,24 @@ class GridBackend:
             aligned += likelihoods.wall_direction(config, state.wall_directions, 4 * direction, sharp)
         return likelihood + jnp.where(features.wall, aligned, 0.0)
 
-    def _printed(self, maps: Array, pose: Array, features: ContactFeatures) -> Array:
-        cell = jnp.round(self._placed(pose, jnp.asarray(self.shafts)))
+    def _printed_likelihood(self, maps: Array, pose: Array, features: ContactFeatures) -> Array:
+        cell = jnp.round(self._in_cells(pose, jnp.asarray(self.shafts)))
         evidence = particle_maps.interpolate(maps, EVIDENCE, cell)
         shape = (len(pose), self.whiskers, SEGMENTS)
         likelihood = likelihoods.printed_likelihood(
             self.config.prior, evidence.reshape(shape), cell.reshape(*shape, 2),
             features.touching, features.free | features.touching, self.counted,
         )  # fmt: skip
-        return jnp.where(features.told, likelihood, 0.0)
+        return jnp.where(features.valid, likelihood, 0.0)
 
-    def _drawn(
-        self, swarm: Particles, share: Array, worth: Array, told: Array, pick: Array, jitter: Array
+    def _resample(
+        self, swarm: Particles, share: Array, worth: Array, valid: Array, pick: Array, jitter: Array
     ) -> tuple[Particles, particles.Resampling]:
         config = self.config.resampling
         needed = (
             worth < config.min_effective_share * self.config.particles
             if config.schedule == "needed"
-            else told
+            else valid
         )
 
         def anew() -> tuple[Particles, particles.Resampling]:
@@ -244,50 +242,50 @@ class GridBackend:
 
         return lax.cond(needed, anew, lambda: (swarm, particles.identity(self.config.particles)))
 
-    def _marked(
+    def _update_maps(
         self, maps: Array, wall_directions: Array, pose: Array, features: ContactFeatures
     ) -> tuple[Array, Array, Array]:
-        """Every particle's map after the observation; and whether any contact lies outside."""
+        """Every particle's map and wall directions after the observation; bool: a contact lies outside."""
         config, cell = self.config.footprint, self.config.cell
-        middle = self._placed(pose, jnp.zeros((1, 2), self.dtype))
+        middle = self._in_cells(pose, jnp.zeros((1, 2), self.dtype))
         windows = particle_maps.windows_around(middle[:, 0], self.side, self.near)
-        amount = -config.free * jnp.repeat(features.free, len(FREE)).astype(self.dtype)
-        place = particle_maps.to_window(self._placed(pose, jnp.asarray(self.free)), windows)
-        stamp = kernels.gaussian_blobs(place, amount, self.free_sd, windows.size)
+        amount = -config.free * jnp.repeat(features.free, len(FREE_POINTS)).astype(self.dtype)
+        place = particle_maps.to_window(self._in_cells(pose, jnp.asarray(self.free)), windows)
+        footprint = kernels.gaussian_blobs(place, amount, self.free_sd, windows.size)
         if self.config.body:
             body = kernels.disc(
                 particle_maps.to_window(middle, windows)[:, 0], self.config.body / cell, windows.size
             )
-            stamp -= jnp.where(features.told, config.body, 0.0) * body
-        maps = self._added(maps, EVIDENCE, windows, stamp)
+            footprint -= jnp.where(features.valid, config.body, 0.0) * body
+        maps = self._add_footprint(maps, EVIDENCE, windows, footprint)
 
         met = jnp.any(features.new) | (features.wall & (config.wall != "blob"))
         maps, wall_directions = lax.cond(
             met,
-            lambda: self._met_marked(maps, wall_directions, pose, features),
+            lambda: self._add_contacts(maps, wall_directions, pose, features),
             lambda: (maps, wall_directions),
         )
-        ends = self._placed(pose, features.point)
+        ends = self._in_cells(pose, features.point)
         beyond = jnp.any((ends < 0) | (ends > self.side - 1), axis=-1)
         return maps, wall_directions, jnp.any(beyond & features.touching[None])
 
-    def _met_marked(
+    def _add_contacts(
         self, maps: Array, wall_directions: Array, pose: Array, features: ContactFeatures
     ) -> tuple[Array, Array]:
-        """The maps with contacts and a wall added."""
+        """The maps and wall directions with contacts and a wall added."""
         config, cell = self.config.footprint, self.config.cell
-        ends = self._placed(pose, features.point)
+        ends = self._in_cells(pose, features.point)
         windows = particle_maps.windows_around(
-            self._placed(pose, jnp.zeros((1, 2), self.dtype))[:, 0], self.side, self.far
+            self._in_cells(pose, jnp.zeros((1, 2), self.dtype))[:, 0], self.side, self.far
         )
         amount = config.blob * features.new.astype(self.dtype)
-        stamp = kernels.gaussian_blobs(
+        footprint = kernels.gaussian_blobs(
             particle_maps.to_window(ends, windows), amount, self.blob_sd, windows.size
         )
-        maps = self._added(maps, EVIDENCE, windows, stamp)
+        maps = self._add_footprint(maps, EVIDENCE, windows, footprint)
         if config.wall == "blob":
             return maps, wall_directions
-        place = self._placed(pose, features.on_wall[None])
+        place = self._in_cells(pose, features.on_wall[None])
         windows = particle_maps.windows_around(place[:, 0], self.side, self.long)
         place = particle_maps.to_window(place, windows)[:, 0]
         direction = pose[:, 2] + features.direction
@@ -298,23 +296,25 @@ class GridBackend:
                 place, direction, config.along / cell, config.across / cell, windows.size
             )
         shape = jnp.where(features.wall, shape, 0.0)
-        maps = self._added(maps, EVIDENCE, windows, config.edge * shape)
+        maps = self._add_footprint(maps, EVIDENCE, windows, config.edge * shape)
         for layer, part in ((COSINE, jnp.cos(2 * direction)), (SINE, jnp.sin(2 * direction))):
             field = particle_maps.read_window(maps, windows, layer) + shape * part[:, None, None]
             maps = particle_maps.write_window(maps, windows, layer, field)
         pointing = jnp.stack([jnp.cos(4 * direction), jnp.sin(4 * direction)], axis=1)
         return maps, wall_directions + jnp.where(features.wall, pointing, 0.0)
 
-    def _added(self, maps: Array, layer: int, windows: particle_maps.Windows, stamp: Array) -> Array:
+    def _add_footprint(
+        self, maps: Array, layer: int, windows: particle_maps.Windows, footprint: Array
+    ) -> Array:
         most = self.config.footprint.max_log_odds
-        evidence = jnp.clip(particle_maps.read_window(maps, windows, layer) + stamp, -most, most)
+        evidence = jnp.clip(particle_maps.read_window(maps, windows, layer) + footprint, -most, most)
         return particle_maps.write_window(maps, windows, layer, evidence)
 
     def _window(self, reach: float) -> int:
         """Side length, cells, of a window that reaches `reach` m in every direction."""
         return 2 * int(np.ceil(reach / self.config.cell)) + 2
 
-    def _placed(self, pose: Array, points: Array) -> Array:
+    def _in_cells(self, pose: Array, points: Array) -> Array:
         """[N, K, 2] points [K, 2] of base_link in cells of the map."""
         c, s = jnp.cos(pose[:, 2:]), jnp.sin(pose[:, 2:])
         right, up = points.T[:, None]
@@ -334,7 +334,7 @@ def build(config: GridConfig, feelers: PlanarWhiskers | None, dtype: Any = np.fl
             "backend", "grid, for a recording without whiskers", "recall, or a session of whiskers"
         )
     side = config.side or LIVE_SIDE
-    if config.particles * particle_maps.LAYERS * int(np.ceil(side / config.cell)) ** 2 > MOST:
+    if config.particles * particle_maps.LAYERS * int(np.ceil(side / config.cell)) ** 2 > MAX_CELLS:
         found = f"{config.particles} particles with maps of {side:g} m in cells of {config.cell:g} m"
         raise InputError(
             "grid", found, "2^31 cells in all", "fewer particles, coarser cells or a smaller map"

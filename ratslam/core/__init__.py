@@ -1,1 +1,1 @@
-"""The seam between sessions and SLAM methods: types, protocols, packing of records, the session."""
+"""The interface between sessions and SLAM methods."""

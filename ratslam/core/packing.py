@@ -6,7 +6,7 @@ records are the static part of a pytree.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -75,16 +75,10 @@ class PackedRecords:
             yield _record(self.layout, [array[k] for array in arrays])
 
 
-def allocate(layout: Layout, count: int) -> PackedRecords:
-    """`count` records of zeros, host NumPy."""
+def allocate(layout: Layout, count: int, zeros: Callable[..., Array] = np.zeros) -> PackedRecords:
+    """`count` records of zeros, host NumPy; `zeros`: `jnp.zeros` inside a compiled function."""
     sizes = zip(layout.widths, layout.dtypes, strict=True)
-    return PackedRecords(layout, tuple(np.zeros((count, width), dtype) for width, dtype in sizes))
-
-
-def allocate_traced(layout: Layout, count: int) -> PackedRecords:
-    """`count` records of zeros, inside a compiled function."""
-    sizes = zip(layout.widths, layout.dtypes, strict=True)
-    return PackedRecords(layout, tuple(jnp.zeros((count, width), dtype) for width, dtype in sizes))
+    return PackedRecords(layout, tuple(zeros((count, width), dtype) for width, dtype in sizes))
 
 
 def layout_of(example: Any) -> Layout:
@@ -110,12 +104,6 @@ def _record(layout: Layout, arrays: Sequence[Array]) -> Any:
     return jax.tree.unflatten(layout.tree, values)
 
 
-def _flattened(rows: PackedRecords) -> tuple[tuple[Array, ...], Layout]:
-    return rows.arrays, rows.layout
-
-
-def _unflattened(layout: Layout, arrays: tuple[Array, ...]) -> PackedRecords:
-    return PackedRecords(layout, tuple(arrays))
-
-
-jax.tree_util.register_pytree_node(PackedRecords, _flattened, _unflattened)
+jax.tree_util.register_pytree_node(
+    PackedRecords, lambda records: (records.arrays, records.layout), lambda *parts: PackedRecords(*parts)
+)

@@ -19,7 +19,7 @@ from jax import lax
 
 from ratslam.core.backend import Backend, Evidence, Map
 from ratslam.core.checkpoint import with_prefix
-from ratslam.core.packing import Layout, PackedRecords, allocate, allocate_traced, layout_of
+from ratslam.core.packing import Layout, PackedRecords, allocate, layout_of
 from ratslam.core.precision import Precision, check_precision
 from ratslam.core.types import Estimate
 from tactile.base.types import Observation
@@ -165,4 +165,4 @@ def run_chunk(kernel: Any, state: Any, chunk: PackedRecords, count: Any) -> tupl
         return state, results.put(k, tuple(output))
 
     _, *output = jax.eval_shape(kernel, state, jax.eval_shape(chunk.at, jnp.int32(0)))
-    return lax.fori_loop(0, count, body, (state, allocate_traced(layout_of(tuple(output)), CHUNK)))
+    return lax.fori_loop(0, count, body, (state, allocate(layout_of(tuple(output)), CHUNK, jnp.zeros)))

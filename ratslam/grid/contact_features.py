@@ -17,14 +17,13 @@ class ContactFeatures(NamedTuple):
     """Contacts of W whiskers and the wall of one observation, in base_link.
 
     Attributes:
-        told: bool, the observation counts as evidence. free: [W] bool, whiskers without contact. new: [W]
-        bool,
-            whiskers in contact that were not before. touching: [W] bool, whiskers in contact. point: [W, 2]
-            contact points, m. wall: bool, there is a wall estimate. on_wall: [2] the contact's foot on the
-            wall, m. direction: of the wall, rad. sd: standard deviation of the direction, rad.
+        valid: bool, the observation counts as evidence. free: [W] bool, whiskers without contact. new: [W]
+            bool, whiskers in contact that were not before. touching: [W] bool, whiskers in contact.
+            point: [W, 2] contact points, m. wall: bool, there is a wall estimate. on_wall: [2] the contact's
+            foot on the wall, m. direction: of the wall, rad. sd: standard deviation of the direction, rad.
     """
 
-    told: Array
+    valid: Array
     free: Array
     new: Array
     touching: Array
@@ -58,20 +57,20 @@ def contact_features(
     clean &= measured | ~observation.wall
 
     turning = observation.motion == MotionKind.TURN
-    told = observation.motion != MotionKind.BACK
+    valid = observation.motion != MotionKind.BACK
     # Whisking whiskers touch anew in each cycle; a fixed one stays in contact with the same wall.
     fresh = ~touched | (observation.motion == MotionKind.OTHER)
     foot = jnp.asarray(observation.wall_point, dtype)
     away = jnp.hypot(foot[0], foot[1])
-    wall = observation.wall & told & measured & (away > 1e-6) & jnp.any(touching)
+    wall = observation.wall & valid & measured & (away > 1e-6) & jnp.any(touching)
     normal = jnp.where(wall, foot / jnp.where(wall, away, 1.0), jnp.zeros(2, dtype))
     among = touching.astype(dtype)
     point = jnp.where(touching[:, None], point, 0.0)
     middle = among @ point / jnp.maximum(jnp.sum(among), 1.0)
     features = ContactFeatures(
-        told=told,
-        free=told & observation.alive & ~observation.contact,
-        new=told & touching & fresh & ~turning,
+        valid=valid,
+        free=valid & observation.alive & ~observation.contact,
+        new=valid & touching & fresh & ~turning,
         touching=touching,
         point=point,
         wall=wall,

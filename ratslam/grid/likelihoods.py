@@ -17,7 +17,9 @@ HALF_WEIGHT_LENGTH = 0.5
 
 def free_space(config: LikelihoodConfig, evidence: Array, among: Array) -> Array:
     """[N] of free points with log-odds `evidence` [N, K]; `among` [K] bool: points that count."""
-    return -config.free * (_soft(evidence + _logit(config.unexplored)) @ among.astype(evidence.dtype))
+    return -config.free * (
+        jax.nn.softplus(evidence + _logit(config.unexplored)) @ among.astype(evidence.dtype)
+    )
 
 
 def contact(config: LikelihoodConfig, evidence: Array, among: Array) -> Array:
@@ -72,11 +74,6 @@ def printed_likelihood(
     among = counted(cell, contact) & alive[None, :, None]
     clear = jnp.sum(jnp.where(among, jnp.log1p(-chance), 0.0), axis=(1, 2))
     return clear + jnp.log(chance[:, :, -1]) @ contact.astype(evidence.dtype)
-
-
-def _soft(value: Array) -> Array:
-    """-log(1 - sigmoid)."""
-    return jax.nn.softplus(value)
 
 
 def _logit(chance: float) -> float:

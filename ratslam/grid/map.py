@@ -49,7 +49,7 @@ class GridMap(Checkpointed):
         return estimate
 
     def feedback(self) -> None:
-        """The filter asks for nothing."""
+        """None: the filter does not use its map."""
 
     def pose(self, estimate: Estimate) -> np.ndarray:
         """[3] the weighted mean of the particles."""
@@ -60,7 +60,7 @@ class GridMap(Checkpointed):
         return self._genealogy.path()
 
     def online_trajectory(self) -> np.ndarray:
-        """[T, 3] the same: it needs no settling."""
+        """[T, 3] equal to `trajectory`: there is no final optimisation."""
         return self._genealogy.path()
 
     def closures(self) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Selection of closure sequences: all are weighed against each other and against the odometry.
+"""Selection among all closure sequences, by the cost of the map with each of them accepted or refused.
 
 Refusing a sequence costs its evidence, accepting it costs the strain on the map. So the robust cost of a
 sequence is at most twice its evidence (in chi-square), and the sequences of the map with the least total cost

@@ -1,5 +1,4 @@
-"""Where the odometry broke, because the robot was carried away: found from the views, and mended by a
-closure."""
+"""Odometry breaks, where the robot was carried: located by the views, bridged by a closure sequence."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""Views that are fans of ordered sectors: whether they are, how wide a sector is, what they tell of drift.
+"""Views of ordered sectors: whether the sectors are ordered, their width, and the heading bias they show.
 
-A robot that turns sees a laser or sonar fan move sideways by its turn; a view without such order does not.
-So consecutive views tell whether sectors are ordered and how wide they are, and then, better than wheels do,
-how far the robot really turned: the part of the odometry's heading error that grows with the way, the bias.
-No truth is used. The estimators are ours.
+When the robot turns, the values of a laser or sonar view shift by the turn; those of an unordered view do
+not. So consecutive views show whether sectors are ordered and how wide they are. The shifts then measure the
+turns better than wheels do, which gives the heading bias: the odometry's heading error per metre. No ground
+truth is used. The estimators are ours.
 """
 
 from __future__ import annotations
@@ -12,26 +12,28 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.growable_array import GrowableArray
 
 FIELDS_OF_VIEW = np.radians([sign * width for width in (60, 90, 120, 180, 240, 270, 360) for sign in (1, -1)])
-"""Widths of fans that sensors have and that views can tell apart, rad; negative: clockwise."""
+"""Candidate fields of view, rad; negative: clockwise."""
 SURE = 3.0
-"""Standard errors by which shifted views must agree better than unshifted ones."""
+"""Significance of the improvement by a shift, standard errors, from which sectors count as ordered."""
 PLAIN = 0.1
-"""Share of the unshifted difference that shifting must explain: chance may be sure of a trifle."""
+"""Least share of the unshifted difference that the shift must explain, because a significant improvement may
+still be small."""
 FEWEST = 20
-"""Turns to see before views are called a fan, and pairs before they tell a bias."""
+"""Turns before the field of view is estimated, and pairs of views before the bias is."""
 LAGS = (1, 2)
-"""Frames between the views compared for the bias: two answers whose difference shows their error."""
+"""Keyframes between the views compared for the bias; two estimates, to show their error."""
 SCAN = np.arange(-2, 2.01, 0.125)
-"""Sectors around the odometry's turn in which the views' own turn is looked for."""
+"""Search range for the turn between two views, in sectors around the odometry's turn."""
 BLOCKS = 12
-"""Parts of a recording that are left out in turn to tell the standard error (jackknife)."""
+"""Blocks of a recording for the jackknife estimate of the standard error."""
 
 
 class BiasEstimate(NamedTuple):
-    """Heading error by way, rad/m, and its standard error."""
+    """Heading error per distance, rad/m, and its standard error."""
 
     value: float
     error: float
@@ -40,32 +42,34 @@ class BiasEstimate(NamedTuple):
 NO_ESTIMATE = BiasEstimate(0.0, np.inf)
 
 
-class SectorFan:
-    """What the views of consecutive frames tell; one row for each frame.
+class SectorFan(Checkpointed):
+    """Estimates sector angle and heading bias from the views of consecutive keyframes, one row for each.
 
     Args:
-        size: values of a view. angle: of a sector, counter-clockwise positive, rad; 0: to be found out.
+        size: number of values of a view. angle: of a sector, counter-clockwise positive, rad; 0: to be
+            estimated.
     """
+
+    VALUES = ("_angle", "_due")
 
     def __init__(self, size: int, angle: float) -> None:
         self.given = angle
         self._view = GrowableArray((size,), np.float64)
         self._step = GrowableArray((2,), np.float64)  # turn, length into the frame
         self._gain = GrowableArray((len(FIELDS_OF_VIEW),), np.float64)
-        self._still = GrowableArray(
-            (len(FIELDS_OF_VIEW),), np.float64
-        )  # the unshifted difference, where a fan would shift
+        # Differences of unshifted views, where a fan would shift them.
+        self._still = GrowableArray((len(FIELDS_OF_VIEW),), np.float64)
         self._pairs = _no_pairs()
         self._angle = angle
         self._due = 1
 
     @property
     def angle(self) -> float:
-        """Of a sector, rad; 0 while nothing says that sectors are ordered."""
+        """Angle of a sector, rad; 0 while sectors are not known to be ordered."""
         return self._angle
 
     def append(self, view: np.ndarray, turn: float, length: float) -> None:
-        """One more frame: its view [size], turn (rad) and way (m) since the one before."""
+        """Adds a keyframe: its view [size], turn (rad) and distance (m) since the one before."""
         self._view.append(view)
         self._step.append((turn, length))
         if len(self._view.rows) > 1:
@@ -74,8 +78,8 @@ class SectorFan:
             self._still.append(still)
 
     def estimate(self) -> BiasEstimate:
-        """The heading bias that the views show: what has to be added to the odometry's turn."""
-        self._find()
+        """The heading bias that the views show, to be added to the odometry's turn."""
+        self._estimate_angle()
         if not self._angle or len(self._view.rows) < 2 * FEWEST:
             return NO_ESTIMATE
         answers = [_slope(self._measured(lag), abs(self._angle)) for lag in LAGS]
@@ -83,9 +87,9 @@ class SectorFan:
         error = np.mean([answer.error**2 for answer in answers]) + (answers[0].value - answers[1].value) ** 2
         return BiasEstimate(value, float(np.sqrt(error)))
 
-    def _find(self) -> None:
-        """Calls the views a fan once shifting by the turn explains them far better than leaving them; looks
-        again whenever it has twice as many to go by."""
+    def _estimate_angle(self) -> None:
+        """Sets the sector angle once shifts by the turn explain the views significantly better than no shift;
+        repeated whenever the number of views has doubled."""
         gain = self._gain.rows
         if self.given or len(gain) < self._due:
             return
@@ -99,18 +103,20 @@ class SectorFan:
             self._pairs = _no_pairs()
 
     def _gains(self) -> tuple[np.ndarray, np.ndarray]:
-        """[F] by how much the newest two views agree better when shifted as each fan demands, and how much
-        they differ unshifted; 0 where a fan demands no shift."""
+        """[F] decrease of the difference between the newest two views when they are shifted for each field of
+        view, and their unshifted difference; 0 for fields of view without a shift."""
         old, now = self._view.rows[-2], self._view.rows[-1]
         size = len(now)
         shift = np.round(-self._step.rows[-1, 0] / (FIELDS_OF_VIEW / size)).astype(int)
         still = np.abs(now - old).mean()
         moves = (shift != 0) & (np.abs(shift) <= size // 2)
-        gain = [still - _apart(now, old, k) if moved else 0.0 for k, moved in zip(shift, moves, strict=True)]
+        gain = [
+            still - _difference(now, old, k) if moved else 0.0 for k, moved in zip(shift, moves, strict=True)
+        ]
         return np.array(gain), still * moves
 
     def _measured(self, lag: int) -> np.ndarray:
-        """[P, 3] for each pair of frames `lag` apart: heading error, trust in it, way between them."""
+        """[P, 3] heading error (rad), its weight, distance (m) of pairs of keyframes `lag` apart."""
         pairs = self._pairs[lag]
         done, count = len(pairs.rows), len(self._view.rows) - lag
         if count > done:
@@ -122,7 +128,9 @@ class SectorFan:
         angle, step = self._angle, np.cumsum(self._step.rows, axis=0)
         turn, length = (step[at] - step[at - lag]).T
         view, offset = self._view.rows, SCAN * abs(angle)
-        errors = np.array([_between(view[at], view[at - lag], -(turn + x) / angle) for x in offset])
+        errors = np.array(
+            [_fractional_difference(view[at], view[at - lag], -(turn + x) / angle) for x in offset]
+        )
         blind = np.isnan(errors).any(axis=0)
         errors = np.where(blind, 1.0, errors)
         best, row = errors.argmin(axis=0), np.arange(len(at))
@@ -135,24 +143,9 @@ class SectorFan:
         trust = np.where(inner & (length > 0), np.clip(depth, 0, 3), 0.0)
         return np.stack([offset[k] + fine * (offset[1] - offset[0]), trust, length], axis=1)
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Its whole state."""
-        return {
-            "view": self._view.rows.copy(),
-            "step": self._step.rows.copy(),
-            "gain": self._gain.rows.copy(),
-            "still": self._still.rows.copy(),
-            "found": np.array([self._angle, self._due]),
-        }
-
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `arrays`."""
-        self._view.replace(arrays["view"])
-        self._step.replace(arrays["step"])
-        self._gain.replace(arrays["gain"])
-        self._still.replace(arrays["still"])
-        angle, due = np.asarray(arrays["found"])
-        self._angle, self._due = float(angle), int(due)
+        """Replaces the whole state by that of `arrays`."""
+        super().restore(arrays)
         self._pairs = _no_pairs()
 
 
@@ -160,14 +153,14 @@ def _no_pairs() -> dict[int, GrowableArray]:
     return {lag: GrowableArray((3,), np.float64) for lag in LAGS}
 
 
-def _apart(now: np.ndarray, old: np.ndarray, shift: int) -> np.ndarray:
-    """[...] mean absolute difference where now[shift:] meets old[..., :-shift] (or the other way round)."""
+def _difference(now: np.ndarray, old: np.ndarray, shift: int) -> np.ndarray:
+    """[...] mean absolute difference of now[shift:] and old[..., :-shift], or reversed for shift < 0."""
     size = len(now) - abs(shift)
     return np.abs(now[max(shift, 0) :][:size] - old[..., max(-shift, 0) :][..., :size]).mean(axis=-1)
 
 
-def _between(now: np.ndarray, old: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """[P] the same for shifts between sectors, old views interpolated; NaN with less than half overlap."""
+def _fractional_difference(now: np.ndarray, old: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """[P] `_difference` for fractional shifts [P], by interpolation; NaN with less than half overlap."""
     size = now.shape[1]
     at = np.arange(size)[None] - shift[:, None]
     low = np.floor(at).astype(int)
@@ -192,6 +185,6 @@ def _slope(pairs: np.ndarray, angle: float) -> BiasEstimate:
     parts = np.array_split(np.arange(len(pairs)), BLOCKS)
     rest = np.array([bottom.sum() - bottom[part].sum() for part in parts])
     if rest.min() <= 1e-9 * bottom.sum():
-        return NO_ESTIMATE  # all of it was seen in one stretch: nothing to compare it with
+        return NO_ESTIMATE  # one block holds all the weight
     without = np.array([top.sum() - top[part].sum() for part in parts]) / rest
     return BiasEstimate(value, float(np.sqrt((1 - 1 / BLOCKS) * ((without - without.mean()) ** 2).sum())))

@@ -1,1 +1,1 @@
-"""The Bayes filter over remembered frames and its observation models."""
+"""The Bayes filter over keyframes and its observation models."""

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from ratslam.attractor import levels, pose_cells, window
 from ratslam.attractor.config import PoseCellConfig, rings, units
 from ratslam.attractor.level_step import StepInput, step_at
-from ratslam.attractor.levels import window_levels
+from ratslam.attractor.levels import to_full_torus, window_levels
 from tactile.base.types import Odometry
 
 CELLS = {11: 2, 21: 2, 41: 3, 61: 4}
@@ -38,7 +38,9 @@ def run(config, cells, motion, recall, energy, count):
     )
 
 
-full_activity = jax.jit(pose_cells.full_activity, static_argnums=0)
+@partial(jax.jit, static_argnums=0)
+def full_activity(config, cells):
+    return to_full_torus(window_levels(config, cells.pose.dtype), cells.activity)
 
 
 def compare(n, motion, recall, energy):

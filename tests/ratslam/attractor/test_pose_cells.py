@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from ratslam.attractor import pose_cells, window
 from ratslam.attractor.config import PoseCellConfig, rings, units
-from ratslam.attractor.levels import window_levels
+from ratslam.attractor.levels import from_full_torus, to_full_torus, window_levels
 from ratslam.attractor.pose_cells import Outcome
 from ratslam.attractor.window import ring_difference
 from tactile.base.se2 import integrate
@@ -58,9 +58,14 @@ def go(motion, cells=None, injections=None, config=CONFIG, dtype=float):
     return after, tuple(np.asarray(output)[:count] for output in outputs)
 
 
+def with_activity(cells, activity):
+    """The state with the activity [K, N, N] of the whole torus replaced."""
+    return cells._replace(activity=from_full_torus(window_levels(CONFIG, cells.pose.dtype), activity))
+
+
 @jax.jit
 def whole(cells):
-    return pose_cells.full_activity(CONFIG, cells)
+    return to_full_torus(window_levels(CONFIG, cells.pose.dtype), cells.activity)
 
 
 def deposited(activity, at, energy):
@@ -125,7 +130,7 @@ def test_a_circle_closes(settled):
 def test_any_activity_becomes_a_distribution(seed, dx, dy, turn):
     stream = np.random.default_rng(seed)
     activity = stream.random((36, 21, 21)) * (stream.random((36, 21, 21)) < stream.random())
-    cells = pose_cells.with_activity(CONFIG, pose_cells.start(CONFIG, np.dtype(float)), jnp.asarray(activity))
+    cells = with_activity(pose_cells.start(CONFIG, np.dtype(float)), jnp.asarray(activity))
     after, (poses, _, spread) = go([[dx, dy, turn]] * 3, cells)
     assert float(whole(after).sum()) == pytest.approx(1)
     assert float(whole(after).min()) >= 0
@@ -136,7 +141,7 @@ def test_any_activity_becomes_a_distribution(seed, dx, dy, turn):
 
 @pytest.mark.parametrize("level", [0.0, 1e-9, 1 / (36 * 21 * 21), 1.0])
 def test_uniform_activity_dies_and_is_put_back(settled, level):
-    cells = pose_cells.with_activity(CONFIG, settled, jnp.full((36, 21, 21), level))
+    cells = with_activity(settled, jnp.full((36, 21, 21), level))
     after, (poses, outcomes, _) = go(np.zeros((3, 3)), cells)
     assert outcomes[0] == Outcome.RESEEDED
     assert not np.any(outcomes[1:])
@@ -161,7 +166,7 @@ def test_the_torus_has_no_edge(shift):
     stream = np.random.default_rng(1)
     motion = stream.normal(0, 0.7, (40, 3))
     here = pose_cells.start(CONFIG, np.dtype(float))
-    there = pose_cells.with_activity(CONFIG, here, jnp.roll(whole(here), shift[::-1], (0, 1, 2)))
+    there = with_activity(here, jnp.roll(whole(here), shift[::-1], (0, 1, 2)))
     there = there._replace(pose=(here.pose + np.array(shift, float)) % RINGS)
     if shift[2]:
         motion[:, :2] = 0  # another heading moves elsewhere
@@ -194,7 +199,7 @@ def test_a_hundred_injections_at_once_settle():
     activity = whole(cells)
     for at in stream.random((100, 3)) * RINGS:
         activity = deposited(activity, jnp.asarray(at), 0.15)
-    after, (poses, outcomes, _) = go(np.zeros((150, 3)), pose_cells.with_activity(CONFIG, cells, activity))
+    after, (poses, outcomes, _) = go(np.zeros((150, 3)), with_activity(cells, activity))
     assert float((whole(after) > 0).sum()) < 500
     assert np.isfinite(poses).all()
     assert not np.any(outcomes)

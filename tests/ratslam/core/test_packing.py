@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ratslam.core.packing import PackedRecords, allocate, allocate_traced, layout_of
+from ratslam.core.packing import PackedRecords, allocate, layout_of
 
 DTYPES = [np.dtype(name) for name in ("float64", "float32", "int32", "uint32", "bool")]
 
@@ -66,7 +66,7 @@ def test_compiled_code_reads_and_writes_the_same(seed):
 
     @jax.jit
     def turned(rows: PackedRecords) -> PackedRecords:
-        out = allocate_traced(rows.layout, 3)
+        out = allocate(rows.layout, 3, jnp.zeros)
         for k in range(3):
             out = out.put(jnp.int32(2 - k), rows.at(jnp.int32(k)))
         return out

@@ -124,7 +124,7 @@ def test_the_graph_is_the_story_of_what_was_said(steps, cut):
     moved = poses + [1.0, 2.0, 0.0]  # the map bends after the frames were grouped
     graph = world.graph(moved)
     assert list(graph.nodes) == list(range(len(made)))
-    assert [graph.nodes[place]["frame"] for place in graph] == made
+    assert [graph.nodes[place]["keyframe"] for place in graph] == made
     assert {(a, b): data["traversals"] for a, b, data in graph.edges(data=True)} == ways
     stands = [np.array([node["x"], node["y"], node["heading"]]) for node in graph.nodes.values()]
     assert np.array_equal(stands, moved[made])
