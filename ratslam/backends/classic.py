@@ -16,7 +16,7 @@ from ratslam.classic import places, view_templates
 from ratslam.classic.experience_map import ExperienceMap
 from ratslam.classic.places import Places
 from ratslam.classic.view_templates import Match, Templates
-from ratslam.core.backend import enlarge
+from ratslam.core.backend import Backend, enlarge
 from ratslam.core.finite_values import finite_values
 from ratslam.core.types import Estimate, Scalar
 from tactile.base.se2 import wrap
@@ -51,7 +51,7 @@ class ClassicEvidence(NamedTuple):
     outcome: Scalar
 
 
-class ClassicBackend:
+class ClassicBackend(Backend):
     """RatSLAM as published: only the best match of a view injects activity.
 
     Args:
@@ -88,11 +88,6 @@ class ClassicBackend:
         return state._replace(
             templates=enlarge(state.templates, empty.templates), places=enlarge(state.places, empty.places)
         )
-
-    def apply_map_feedback(self, state: ClassicState, feedback: None) -> ClassicState:
-        """The state unchanged: the classic map gives no feedback."""
-        del feedback
-        return state
 
     def kernel(
         self, state: ClassicState, observation: Observation

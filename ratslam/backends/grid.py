@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from ratslam.core.backend import Backend
 from ratslam.core.types import Action, Estimate, Scalar
 from ratslam.grid import kernels, likelihoods, particle_maps, particles
 from ratslam.grid.config import GridConfig
@@ -87,8 +88,8 @@ class GridEvidence(NamedTuple):
     outcome: Scalar
 
 
-class GridBackend:
-    """The grid particle filter as a backend (`ratslam.core.backend.Backend`).
+class GridBackend(Backend):
+    """The grid particle filter as a backend.
 
     Args:
         feelers: whisker geometry of the observations. side: of the map, m. dtype: of all floating state.
@@ -136,21 +137,6 @@ class GridBackend:
             jnp.zeros(self.whiskers, bool),
             jax.random.key_data(key),
         )
-
-    def rows(self, state: GridState) -> int:
-        """0: nothing grows."""
-        del state
-        return 0
-
-    def grow(self, state: GridState, capacity: int) -> GridState:
-        """The state unchanged: nothing grows."""
-        del capacity
-        return state
-
-    def apply_map_feedback(self, state: GridState, feedback: Any) -> GridState:
-        """The state unchanged: the filter does not use its map."""
-        del feedback
-        return state
 
     def kernel(self, state: GridState, observation: Observation) -> tuple[GridState, Estimate, GridEvidence]:
         """Moves, weighs and resamples the particles, then updates their maps."""

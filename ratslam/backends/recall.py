@@ -14,7 +14,7 @@ from ratslam.attractor.levels import window_levels
 from ratslam.attractor.pose_cells import Outcome, PoseCells
 from ratslam.backends.config import RecallBackendConfig
 from ratslam.classic import view_templates
-from ratslam.core.backend import enlarge
+from ratslam.core.backend import Backend, enlarge
 from ratslam.core.finite_values import finite_values
 from ratslam.core.types import Action, Estimate, Scalar
 from ratslam.keyframes.appearance import Appearance, LabelAppearance, ViewAppearance, WhiskerAppearance
@@ -70,7 +70,7 @@ class RecallEvidence(NamedTuple):
     outcome: Scalar
 
 
-class RecallBackend:
+class RecallBackend(Backend):
     """Bayesian recall with verified loop closures, for views of one shape.
 
     Args:
@@ -101,9 +101,10 @@ class RecallBackend:
     def init(self, key: Array, capacity: int) -> RecallState:
         """One packet in the middle of the torus, and no keyframes. `key` is not used: nothing is random."""
         del key
+        groups = 0 if self.pixels is None else int(self.pixels.group.max()) + 1
         return RecallState(
             pose_cells.start(self.config.pose_cells, self.dtype),
-            recall_memory.init_memory(self.recall, self.size, capacity, self.dtype, self._groups()),
+            recall_memory.init_memory(self.recall, self.size, capacity, self.dtype, groups),
             jnp.ones((), self.dtype),
         )
 
@@ -183,9 +184,6 @@ class RecallBackend:
         if self.pixels is not None:
             return WhiskerAppearance(self.pixels, self.recall.temper, self._normalised)
         return ViewAppearance(self.size, fan_width(self.recall), self._normalised)
-
-    def _groups(self) -> int:
-        return 0 if self.pixels is None else int(self.pixels.group.max()) + 1
 
     def _normalised(self, view: np.ndarray) -> np.ndarray:
         shaped = np.asarray(view.reshape(self.view_shape), self.dtype)

@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from ratslam.classic.relaxation import relax
-from ratslam.core.backend import Evidence
+from ratslam.core.backend import Evidence, Map
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.growable_array import GrowableArray
 from ratslam.core.types import Action, Estimate
@@ -91,8 +91,8 @@ def travel_from_node(relative: float) -> Travel:
     return Travel(np.array([0.0, 0.0, relative]), np.zeros(3), 0.0, 0.0)
 
 
-class ExperienceMap(Checkpointed):
-    """The map of the classic backend (`ratslam.core.backend.Map`).
+class ExperienceMap(Checkpointed, Map):
+    """The map of the classic backend.
 
     The fields of `arrays()` are its whole state: node poses [M, 3] (x m, y m, heading rad), the place each
     node stands for, links with their measured motion, and for every step its node and the motion
@@ -143,10 +143,6 @@ class ExperienceMap(Checkpointed):
         origin = np.where(node[:, None] >= 0, self._pose.rows[np.maximum(node, 0)], 0.0)
         return compose(origin, motion)
 
-    def online_trajectory(self) -> np.ndarray:
-        """[T, 3] equal to `trajectory`."""
-        return self.trajectory()
-
     def closures(self) -> np.ndarray:
         """[M, 2] steps at which a known node was reached, and the step at which it was created."""
         return self._reached.rows.copy()
@@ -172,9 +168,6 @@ class ExperienceMap(Checkpointed):
             "map.json": lambda path: write_json(path, self.graph()),
             "map.g2o": lambda path: write_g2o(path, self.nodes(), self.edges()),
         }
-
-    def feedback(self) -> None:
-        """None: the classic kernel does not use the map."""
 
     def update(self, observation: Observation, estimate: Estimate, evidence: Evidence) -> Estimate:
         """Adds the odometry, then creates, links or reaches a node by the action of the estimate."""

@@ -28,28 +28,36 @@ Feedback = Any
 
 
 class Map(Protocol):
-    """The map on the host: takes one step at a time; poses are in the map frame."""
+    """The map on the host: takes one step at a time; poses are in the map frame.
+
+    Methods with a body are defaults for a map without graph, loop closures, feedback and optimisation.
+    """
 
     def update(self, observation: Observation, estimate: Estimate, evidence: Evidence) -> Estimate:
         """Adds one step; returns the estimate completed by the map (confirmed places)."""
 
     def feedback(self) -> Feedback:
         """The record that the kernel takes over, or None."""
+        return None
 
     def pose(self, estimate: Estimate) -> np.ndarray:
         """[3] the robot's current pose in the map frame: x m, y m, heading rad."""
+        return np.asarray(estimate.pose, float)
 
     def trajectory(self) -> np.ndarray:
         """[T, 3] poses of all steps in the optimised map."""
 
     def online_trajectory(self) -> np.ndarray:
         """[T, 3] poses of all steps in the online map, before the final optimisation."""
+        return self.trajectory()
 
     def closures(self) -> np.ndarray:
         """[M, 2] pairs of steps joined by accepted loop closures: the later and the earlier."""
+        return np.zeros((0, 2), int)
 
     def graph(self) -> networkx.DiGraph:
-        """The map as a graph (empty for maps without nodes)."""
+        """The map as a graph."""
+        return networkx.DiGraph()
 
     def files(self) -> dict[str, Callable[[Path], None]]:
         """Files of the map in a run directory: a function that writes each, by name."""
@@ -62,19 +70,25 @@ class Map(Protocol):
 
 
 class Backend(Protocol):
-    """A SLAM method."""
+    """A SLAM method.
+
+    Methods with a body are defaults for a method whose state does not grow and that uses no map feedback.
+    """
 
     def init(self, key: Array, capacity: int) -> State:
         """The state before the first step, with `capacity` rows in the arrays that grow."""
 
     def rows(self, state: State) -> int:
         """Largest number of rows in use; a step adds at most one."""
+        return 0
 
     def grow(self, state: State, capacity: int) -> State:
         """The same state with a larger capacity."""
+        return state
 
     def apply_map_feedback(self, state: State, feedback: Feedback) -> State:
         """The state after the map's feedback; same shapes and dtypes."""
+        return state
 
     def kernel(self, state: State, observation: Observation) -> tuple[State, Estimate, Evidence]:
         """One step; pure, so that it can be jitted, scanned and vmapped."""

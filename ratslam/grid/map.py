@@ -6,9 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import networkx
 import numpy as np
 
+from ratslam.core.backend import Map
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.growable_array import GrowableArray
 from ratslam.core.types import Estimate
@@ -19,8 +19,8 @@ from tactile.base.types import Observation
 from tactile.whiskers.planar_whiskers import PlanarWhiskers
 
 
-class GridMap(Checkpointed):
-    """The map of the grid filter (`ratslam.core.backend.Map`).
+class GridMap(Checkpointed, Map):
+    """The map of the grid filter.
 
     Args:
         feelers: the whiskers of the observations. side: of the map, cells.
@@ -48,28 +48,9 @@ class GridMap(Checkpointed):
         self._wall.append(observation.wall_point if observation.wall else [np.nan, np.nan])
         return estimate
 
-    def feedback(self) -> None:
-        """None: the filter does not use its map."""
-
-    def pose(self, estimate: Estimate) -> np.ndarray:
-        """[3] the weighted mean of the particles."""
-        return np.asarray(estimate.pose, float)
-
     def trajectory(self) -> np.ndarray:
         """[T, 3] the weighted mean path of the surviving particles."""
         return self._genealogy.path()
-
-    def online_trajectory(self) -> np.ndarray:
-        """[T, 3] equal to `trajectory`: there is no final optimisation."""
-        return self._genealogy.path()
-
-    def closures(self) -> np.ndarray:
-        """[0, 2]: a grid has no loop closures."""
-        return np.zeros((0, 2), int)
-
-    def graph(self) -> networkx.DiGraph:
-        """Empty: a grid has no nodes."""
-        return networkx.DiGraph()
 
     def occupancy(self) -> np.ndarray:
         """[S, S] probability of an obstacle in each cell; rows are y, columns x, the start is central."""

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import networkx
 import numpy as np
 
-from ratslam.core.backend import Evidence
+from ratslam.core.backend import Evidence, Map
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.growable_array import GrowableArray
 from ratslam.core.types import Estimate
@@ -50,8 +50,8 @@ class Travel(NamedTuple):
 HALT = Travel(np.zeros(3), 0.0, 0.0)
 
 
-class KeyframeMap(Checkpointed):
-    """Folds the results of the recall kernel (`ratslam.core.backend.Map`).
+class KeyframeMap(Checkpointed, Map):
+    """The map of the recall backend.
 
     Args:
         cell: size of a pose cell, m. appearance: of the keyframes, empty. guard: newest keyframes that are
@@ -96,11 +96,11 @@ class KeyframeMap(Checkpointed):
         return self._current_pose()
 
     def trajectory(self) -> np.ndarray:
-        """[T, 3] every folded step in the final map."""
+        """[T, 3] every step in the final map."""
         return self._steps(self.solution().fit)
 
     def online_trajectory(self) -> np.ndarray:
-        """[T, 3] every folded step in the map as it is online, before the final optimisation."""
+        """[T, 3] every step in the online map, before the final optimisation."""
         return self._steps(self._graph.fit())
 
     def closures(self) -> np.ndarray:
