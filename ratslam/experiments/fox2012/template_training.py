@@ -63,10 +63,8 @@ def drive_held_out(config: CreateSimulationConfig, templates: StrainTemplates) -
     angles = np.sort(np.concatenate([templates.angle, (templates.angle[1:] + templates.angle[:-1]) / 2]))
     mounts = tuple((mount.x, mount.y, mount.direction_deg) for mount in config.whiskers.mounts)
     settings = ReportFrontendConfig(mounts=mounts, length=config.whiskers.length)
-    points, tip = (
-        contact_points(settings.feelers, settings.contact_radius),
-        fit_tip_model(templates, settings.feelers),
-    )
+    points = contact_points(settings.feelers, settings.contact_radius)
+    tip = fit_tip_model(templates, settings.feelers)
     found = []
     for angle in angles.tolist():
         report = drive_into_wall(config, angle, random)
@@ -77,9 +75,8 @@ def drive_held_out(config: CreateSimulationConfig, templates: StrainTemplates) -
             part = strain[: max(round(seconds * config.whiskers.rate), 1)]
             match = match_template(templates, part, report.alive)
             travel = np.array([config.behaviour.slow * seconds, 0.0, 0.0])
-            wall = fused_wall(
-                tip, points, WallContact(first, first, travel, StepEnd.ABORT, part, report.alive)
-            )
+            contact = WallContact(first, first, travel, StepEnd.ABORT, part, report.alive)
+            wall = fused_wall(tip, points, contact)
             ways = match.angle, match.refined, wall.direction if wall.known else np.nan
             errors.append([_apart(way, angle) for way in ways])
         known = bool(np.isclose(templates.angle, angle).any())
@@ -101,14 +98,12 @@ def render_drives(drives: Sequence[HeldOutDrive], repeats: int) -> str:
         errors = np.array([one.error.reshape(-1) for one in drives if one.known == known])
         if len(errors):
             lines.append(f"{name:<9}".ljust(8) + "".join(f"{_mean(column):>16}" for column in errors.T))
-    return "\n".join(
-        [
-            *lines,
-            f"~ between two trained angles; ! off by more than {LARGE_ERROR_DEG:g}; - no wall was found. "
-            "Winner: eq. 5 of Fox et al. 2012; between: the\nminimum of a parabola through it and its "
-            "neighbours; fused: from the sliding tip of the first whisker (`touch.reports.walls`).",
-        ]
+    lines.append(
+        f"~ between two trained angles; ! off by more than {LARGE_ERROR_DEG:g}; - no wall was found. "
+        "Winner: eq. 5 of Fox et al. 2012; between: the\nminimum of a parabola through it and its "
+        "neighbours; fused: from the sliding tip of the first whisker (`touch.reports.walls`)."
     )
+    return "\n".join(lines)
 
 
 def _apart(one: float, other: float) -> float:

@@ -55,7 +55,6 @@ MARGIN = 0.05
 LEVEL = 0.99
 """Confidence level of the intervals of medians. All figures must pass, so no correction for their number."""
 
-
 FIGURES = ("em", "arr", "arcr", "ate", "closures", "same_place")
 """Energy Metric (all pairs, m^2 + rad^2), strict Experience Metric, ATE (m), number of closures, and share of
 steps with the same current place as in float64."""
@@ -139,16 +138,9 @@ def difference(values: np.ndarray, against: np.ndarray) -> Difference:
 
 
 def median_interval(values: np.ndarray, level: float) -> tuple[float, float]:
-    """A confidence interval of the median of a distribution from samples [N], for any distribution.
-
-    From order statistics: the k-th smallest sample is above the median only if fewer than k samples are below
-    it. Infinite where the samples are too few for the level.
-    """
-    values = np.sort(values)
-    outside = int(stats.binom.ppf((1 - level) / 2, len(values), 0.5))  # P(B <= outside) >= (1 - level) / 2
-    if outside < 1:
-        return -np.inf, np.inf
-    return float(values[outside - 1]), float(values[len(values) - outside])
+    """A confidence interval of the median of any distribution from samples [N]; infinite with too few."""
+    low, high = stats.quantile_test(values, p=0.5).confidence_interval(level)
+    return (float(low), float(high)) if np.isfinite(low) else (-np.inf, np.inf)
 
 
 def is_accepted(found: Sequence[Difference]) -> bool:
