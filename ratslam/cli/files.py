@@ -37,7 +37,8 @@ def _recover(arguments: argparse.Namespace) -> int:
     from robot.recordings.mcap_reader import recover
 
     report = recover(arguments.recording, arguments.output)
-    print(f"{arguments.output}: {report}")
+    lost = f"; the rest is lost: {report.reason}" if report.reason else ""
+    print(f"{arguments.output}: {report.samples} samples{lost}")
     return 0
 
 

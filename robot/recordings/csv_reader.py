@@ -88,11 +88,11 @@ def _absences(base: CsvFile, files: Mapping[Path, CsvFile], config: CsvConfig) -
             named.pop("time", None)  # the time of the odometry is used there
         errors += file.absences([(column, f"table.{key}.{field}") for field, column in named.items()])
         if isinstance(part, ViewColumns):
-            errors += _gap(file, part.prefix)
+            errors += _gap_errors(file, part.prefix)
     return errors
 
 
-def _gap(file: CsvFile, prefix: str) -> list[InputError]:
+def _gap_errors(file: CsvFile, prefix: str) -> list[InputError]:
     """The error for view columns whose numbers have a gap."""
     there = list(file.numbered(prefix))
     wanted = range(there[0], there[-1]) if there else [0]

@@ -118,11 +118,10 @@ class Recovery(NamedTuple):
     """Result of `recover`.
 
     Attributes:
-        samples: number of samples. truncated: whether the old file was incomplete, and reason: why.
+        samples: number of samples. reason: why the old file was incomplete, '' if it was not.
     """
 
     samples: int
-    truncated: bool
     reason: str
 
 
@@ -169,7 +168,7 @@ def recover(path: Path, out: Path) -> Recovery:
         flush_to_disk(path)
 
     write_atomically(out, write)
-    return Recovery(scanner.count, bool(scanner.broken), scanner.broken)
+    return Recovery(scanner.count, scanner.broken)
 
 
 def _unreadable_recording_error(scanner: McapScanner) -> InputError:

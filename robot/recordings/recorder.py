@@ -61,10 +61,6 @@ class Recorder:
             self._writer.append(TRUTH, sample.time, encode_truth(sample.time, sample.truth))
         self._writer.append(name, sample.time, message)
 
-    def flush(self) -> None:
-        """Hand all samples so far to the operating system."""
-        self._writer.flush()
-
     def close(self) -> None:
         """Finish the file; closing twice is fine."""
         self._writer.close()

@@ -80,7 +80,7 @@ def bend_shafts(
     row, whisker = np.nonzero(blocked)
     low, high = (_Ends(*(column[row, whisker] for column in ends)) for ends in (low, high))
     left = _free_ends(low, high)
-    right = _free_ends(_mirror(high), _mirror(low))
+    right = _free_ends(high._replace(angle=-high.angle), low._replace(angle=-low.angle))
     easier = no_side.copy()
     easier[row, whisker] = np.where(left.angle <= right.angle, 1, -1)
     sides = _bending_sides(blocked, easier, side)
@@ -131,10 +131,6 @@ def _blocked_ends(
     low = np.where(there, start + np.minimum(span, 0.0), np.inf)
     high = np.where(there, start + np.maximum(span, 0.0), -np.inf)
     return _Ends(low, np.where(up, one, two), near, away), _Ends(high, np.where(up, two, one), near, away)
-
-
-def _mirror(ends: _Ends) -> _Ends:
-    return ends._replace(angle=-ends.angle)
 
 
 def _free_ends(low: _Ends, high: _Ends) -> _Ends:

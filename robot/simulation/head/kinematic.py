@@ -16,7 +16,6 @@ from robot.simulation.head.beam import StreamConfig
 from robot.world.head_trajectory import HeadPath, poses_at
 from robot.world.walls import Surroundings
 from tactile.base.config import Settings
-from tactile.base.types import Odometry, Whisk
 from tactile.features.contact import ShaftConfig, stiffness
 from tactile.whiskers.head_geometry import Head
 from tactile.whiskers.whisking import WhiskingConfig, neighbour_max, whisk_phase
@@ -178,8 +177,3 @@ def _add_sensor_noise(setup: HeadSetup, features: WhiskColumns, random: np.rando
         highest=np.where(alive, highest, 0.0),
         reach=np.where(contact, np.clip(features.reach + smeared, 0.0, 1.0), 0.0),
     )
-
-
-def whisk_of_row(head: Head, features: WhiskColumns, row: int, odometry: Odometry) -> Whisk:
-    """The features of one cycle as a reading."""
-    return Whisk(odometry, head.alive, *(column[row] for column in features))

@@ -15,13 +15,7 @@ from pydantic import Field, NonNegativeInt
 
 from robot.simulation.head.beam import StreamConfig
 from robot.simulation.head.dynamic import simulate_dynamic
-from robot.simulation.head.kinematic import (
-    HeadSetup,
-    MechanicsConfig,
-    WhiskColumns,
-    simulate_kinematic,
-    whisk_of_row,
-)
+from robot.simulation.head.kinematic import HeadSetup, MechanicsConfig, WhiskColumns, simulate_kinematic
 from robot.simulation.head.quasistatic import simulate_quasistatic
 from robot.simulation.head.whisk_stream import simulate_cycles, simulate_free_cycles
 from robot.sources.odometry import OdometryConfig, simulate_odometry
@@ -206,7 +200,7 @@ class HeadSimulation(SimulatedSource):
     def _readings(self) -> Iterator[Whisk | Cycle]:
         if self.features is None:
             return self._cycles()
-        return (whisk_of_row(self.head, self.features, row, NO_ODOMETRY) for row in range(self.length))
+        return (Whisk(NO_ODOMETRY, self.head.alive, *row) for row in zip(*self.features, strict=True))
 
     def _cycles(self) -> Iterator[Cycle]:
         """Raw samples of each cycle, without odometry."""

@@ -401,7 +401,7 @@ def test_recover_keeps_messages_other_than_samples(tmp_path: Path) -> None:
     (tmp_path / "cut.mcap").write_bytes(data[: data.rindex(b"\x28\xb5\x2f\xfd")])  # in its last chunk
     before = entries_of(tmp_path / "cut.mcap")
     report = recover(tmp_path / "cut.mcap", tmp_path / "good.mcap")
-    assert report == (3, True, "it ends too early")
+    assert report == (3, "it ends too early")
     after = entries_of(tmp_path / "good.mcap")
     assert [entry[:4] for entry in after] == [entry[:4] for entry in before]
     assert len({entry.name for entry in after}) == 4

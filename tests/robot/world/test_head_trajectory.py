@@ -90,7 +90,10 @@ def test_a_kidnap_continues_at_the_later_pose(seed: int, shares: list[float], ah
     assert len(jumps) <= len(when)
     assert (np.diff(there.time) >= 0).all()
     assert np.allclose(jumps, sorted(when)[: len(jumps)])
-    assert there.duration == pytest.approx(path.duration - ahead * len(jumps))
+    if len(jumps) < len(when):  # the next kidnap leads beyond the end, so the path ends there
+        assert there.duration == pytest.approx(sorted(when)[len(jumps)])
+    else:
+        assert there.duration == pytest.approx(path.duration - ahead * len(jumps))
     time = np.linspace(0, there.duration, 300)
     skipped = ahead * (time[:, None] > jumps).sum(axis=1)
     away = np.abs(time[:, None] - jumps).min(axis=1) > 1e-6
