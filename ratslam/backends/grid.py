@@ -78,13 +78,13 @@ class GridEvidence(NamedTuple):
 
     Attributes:
         ancestor: [N] int32, the particle that each particle was copied from. poses: [N, 3] and weights: [N]
-            before resampling. effective: effective number of particles. outcome: a `GridOutcome`, int32.
+            before resampling. effective_particles: effective number. outcome: a `GridOutcome`, int32.
     """
 
     ancestor: Array
     poses: Array
     weights: Array
-    effective: Scalar
+    effective_particles: Scalar
     outcome: Scalar
 
 

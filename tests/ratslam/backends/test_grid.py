@@ -331,7 +331,7 @@ def test_maps_follow_their_particles():
     assert not np.any(after.particles.weight)
     # Weights are told as they were before.
     assert told.weights[0] == pytest.approx(np.exp(-0.05 * names) / np.exp(-0.05 * names).sum(), rel=0.05)
-    assert told.effective[0] == pytest.approx(40, rel=0.1)
+    assert told.effective_particles[0] == pytest.approx(40, rel=0.1)
 
 
 def test_the_literal_filter_draws_at_every_report_that_tells():
