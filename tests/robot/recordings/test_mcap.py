@@ -275,11 +275,12 @@ def fuzz(content: bytes, samples: list[Sample], path: Path, rounds: int, seed: i
 def test_a_damaged_byte_is_noticed(small: tuple[bytes, list[Sample]], tmp_path: Path) -> None:
     content, samples = small
     path = tmp_path / "bad.mcap"
-    for place in range(0, len(content), 3):
-        bad = bytearray(content)
-        bad[place] ^= 0x40
-        path.write_bytes(bad)
-        check_prefix(path, samples)
+    path.write_bytes(content)
+    with path.open("r+b", buffering=0) as file:
+        for place in range(0, len(content), 3):
+            os.pwrite(file.fileno(), bytes([content[place] ^ 0x40]), place)
+            check_prefix(path, samples)
+            os.pwrite(file.fileno(), content[place : place + 1], place)
 
 
 def test_random_damage(small: tuple[bytes, list[Sample]], tmp_path: Path) -> None:
