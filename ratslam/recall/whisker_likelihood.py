@@ -66,7 +66,7 @@ def live_pixels(observation: Observation) -> Array:
     rows, columns, channels = observation.view.shape
     if observation.alive.size != rows * columns:
         return np.ones((rows, columns, channels), bool)
-    return observation.alive.reshape(rows, columns, 1) & np.ones(channels, bool)
+    return observation.alive.reshape(rows, columns, 1) & np.ones((1, 1, channels), bool)
 
 
 def pixel_levels(view: Array, alive: Array) -> Array:
