@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -116,7 +117,7 @@ class Progress:
 
     def report_failures(self) -> int:
         """Prints the failed runs; returns the exit code."""
-        from ratslam.experiments.studies.report import label
+        from ratslam.experiments.studies.summary import label
 
         for record in self.failed:
             copy = f", copy {record.copy_number}" if record.copy_number else ""
@@ -144,20 +145,21 @@ def _study(arguments: argparse.Namespace) -> int:
     settle_threads()
     prepare_jax()
     from ratslam.experiments.studies.metrics import find_error
-    from ratslam.experiments.studies.presets import PresetOptions, preset_study
+    from ratslam.experiments.studies.presets import preset_study
     from ratslam.experiments.studies.records import RunLog
+    from ratslam.experiments.studies.search import search_plan
     from ratslam.experiments.studies.study import read_study
 
     remarks: list[str] = []
     if arguments.preset:
-        options = PresetOptions(arguments.by, arguments.seconds)
-        study, remarks = preset_study(arguments.preset, arguments.file, arguments.set, options)
+        study, remarks = preset_study(
+            arguments.preset, arguments.file, arguments.set, by=arguments.by, seconds=arguments.seconds
+        )
     else:
         study = read_study(arguments.file, arguments.set)
     error = find_error(arguments.error) if arguments.error else None
-    if arguments.search and study.plan.tune is None:
-        where = study.document.at_key(("tune",))
-        raise InputError(where, "missing", "the parameters and objectives of the search")
+    if arguments.search:
+        search_plan(study)
     log = RunLog(arguments.output or Path("runs") / study.name)
     return (
         _search(arguments, study, log) if arguments.search else _table(arguments, study, log, error, remarks)
@@ -166,11 +168,10 @@ def _study(arguments: argparse.Namespace) -> int:
 
 def _table(arguments: argparse.Namespace, study: Any, log: Any, error: Any, remarks: list[str]) -> int:
     from ratslam.experiments.studies.executor import Executor
-    from ratslam.experiments.studies.report import make_report, render_text, save_report
-    from ratslam.experiments.studies.study import list_jobs
+    from ratslam.experiments.studies.report import make_report
     from ratslam.experiments.studies.study_runner import measure_jobs, run_jobs
 
-    jobs = list_jobs(study)
+    jobs = study.jobs
     alone = study.plan.report == "pareto" and arguments.scheduler is None and arguments.workers in (None, 1)
     with (
         Progress(len({job.key for job in jobs}), log.path) as progress,
@@ -180,27 +181,32 @@ def _table(arguments: argparse.Namespace, study: Any, log: Any, error: Any, rema
             measure_jobs(jobs, log, progress) if alone else list(run_jobs(jobs, log, executor, progress))
         )
     report = make_report(study.name, study.plan, records, error)
-    report = report._replace(remarks=[*report.remarks, *remarks])
-    paths = save_report(report, log.path.parent)
-    print(render_text(report))
-    print(f"\n{log.path} holds every run, {', '.join(path.name for path in paths)} the table")
+    _save(replace(report, remarks=[*report.remarks, *remarks]), log.path)
     return progress.report_failures()
+
+
+def _save(report: Any, records: Path) -> None:
+    from ratslam.experiments.studies.report import render, save_report
+
+    paths = save_report(report, records.parent)
+    print(render(report))
+    print(f"\n{records} holds every run, {', '.join(path.name for path in paths)} the table")
 
 
 def _search(arguments: argparse.Namespace, study: Any, log: Any) -> int:
     from ratslam.experiments.studies.executor import Executor
-    from ratslam.experiments.studies.search import render_trials, save_trials, search
+    from ratslam.experiments.studies.report import make_search_report
+    from ratslam.experiments.studies.search import search
 
     plan = study.plan.tune
-    runs = len(study.plan.every_seed()) * len(study.plan.every_copy())
+    runs = len(study.plan.every_seed()) * max(study.plan.copies, 1)
     with (
         Progress(plan.trials * runs, log.path) as progress,
-        Executor(arguments.workers, arguments.scheduler, plan.batch * runs) as executor,
+        Executor(arguments.workers, arguments.scheduler) as executor,
     ):
-        trials = search(study, log, executor, progress)
-    print(render_trials(trials))
-    print(f"\n{save_trials(trials, log.path.parent)} holds all trials; with more `tune.trials` it continues")
-    if any(trial.values for trial in trials):
+        report = make_search_report(study.name, study.plan, plan, search(study, log, executor, progress))
+    _save(report, log.path)
+    if any(row.optimal for row in report.rows):
         return 0
     print("ratslam: error: no trial has a value of every objective", file=sys.stderr)
     return progress.report_failures() or INPUT_ERROR
@@ -212,15 +218,14 @@ def _size(arguments: argparse.Namespace) -> int:
     settle_threads()
     prepare_jax()
     from ratslam.config.completion import complete
-    from ratslam.experiments.sizing.recommendation import recommend
-    from ratslam.experiments.sizing.report import (
+    from ratslam.experiments.sizing.recommendation import (
         changed_settings_yaml,
+        recommend,
         render_recommendations,
-        render_trial_runs,
     )
     from ratslam.experiments.sizing.scene_statistics import scene_of
-    from ratslam.experiments.sizing.trial_runs import try_settings
-    from ratslam.experiments.studies.fidelity import with_tier
+    from ratslam.experiments.sizing.trial_runs import render_trial_runs, try_settings
+    from ratslam.experiments.studies.tiers import with_tier
     from ratslam.pipeline.source import open_source
 
     path, config = arguments.config, read_config(arguments)
@@ -229,7 +234,7 @@ def _size(arguments: argparse.Namespace) -> int:
     found = recommend(config, scene)
     print(f"{scene.describe()}\n\n{render_recommendations(found)}\n", flush=True)
     runs = try_settings(config, found, arguments.cycles)
-    print(f"Cost of each cheaper step, over {runs[0].record.steps} of {scene.cycles} cycles, one seed:\n")
+    print(f"Cost of each cheaper step, over {runs[0].steps} of {scene.cycles} cycles, one seed:\n")
     print(render_trial_runs(runs))
     text = changed_settings_yaml(found)
     print(f"\nFor {path.name}:\n\n{text}" if text else f"\n{path.name} has these settings already")

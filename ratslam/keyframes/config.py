@@ -101,17 +101,15 @@ class KeyframeMapConfig(Settings):
     """Largest difference in heading within an experience, rad."""
 
 
-class Ablation(NamedTuple):
-    """Parts of the keyframe map that a study can turn off, to measure what each contributes.
-
-    Attributes:
-        verify: closure sequences are tested against the map's covariance before they count. robust: sequences
-            that disagree with the map lose weight. heading_bias: the map solves for the heading bias.
-    """
+class Ablation(Settings):
+    """Parts of the keyframe map that a study can turn off, to measure what each contributes."""
 
     verify: bool = True
+    """Whether closure sequences are tested against the map's covariance before they count."""
     robust: bool = True
+    """Whether sequences that disagree with the map lose weight."""
     heading_bias: bool = True
+    """Whether the map solves for the heading bias."""
 
 
 FULL = Ablation()

@@ -77,16 +77,10 @@ def override(document: Document, assignments: Sequence[str]) -> Document:
     data, places = copy.deepcopy(document.data), dict(document.places)
     for assignment in assignments:
         name, equals, text = assignment.partition("=")
-        keys = name.split(".")
         where = f"--set {name}"
-        if not equals or not all(keys):
+        if not equals or not all(name.split(".")):
             raise InputError(where, "not an assignment", "key=value such as pose_cells.excite_sigma=1e-3")
-        section: Any = data
-        path: KeyPath = ()
-        for key in keys:
-            if path:
-                section = _opened(section, path[-1])
-            path += (_step(section, key, where, path),)
+        section, path = open_path(data, name, where)
         reader = Reader(text, lambda line, column: "--set", path)
         section[path[-1]] = reader.read()
         places = {at: place for at, place in places.items() if at[: len(path)] != path}
@@ -94,6 +88,23 @@ def override(document: Document, assignments: Sequence[str]) -> Document:
             places.setdefault(path[:length], Place("--set", "--set"))
         places |= reader.places
     return Document(data, places)
+
+
+def open_path(data: Any, key: str, where: str) -> tuple[Any, KeyPath]:
+    """The section or list that a dotted key is in, and the path of the key; missing sections are created.
+
+    Args:
+        where: place of the key, for messages.
+
+    Raises:
+        InputError: the path leads through a value that is not a section.
+    """
+    path: KeyPath = ()
+    for name in key.split("."):
+        if path:
+            data = _opened(data, path[-1])
+        path += (_step(data, name, where, path),)
+    return data, path
 
 
 def validate(document: Document, model: type[Model]) -> Model:

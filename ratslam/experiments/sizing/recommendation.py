@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import yaml
 
 from ratslam.attractor.config import PoseCellConfig
 from ratslam.attractor.levels import SETTLED, window_levels
 from ratslam.backends.grid import LIVE_SIDE
 from ratslam.config.run_config import RunConfig
+from ratslam.config.strict_yaml import open_path
+from ratslam.config.strict_yaml.dumper import Dumper
 from ratslam.experiments.sizing.scene_statistics import Scene
+from ratslam.experiments.studies.report import render_table
+from ratslam.experiments.studies.summary import plain
 from ratslam.grid.config import DriftConfig
 from ratslam.grid.particle_maps import LAYERS
 from robot.simulation.head.session import choose_tier
@@ -61,10 +66,10 @@ def with_settings(config: Any, settings: dict[str, Any]) -> Any:
     return config
 
 
-def round_number(value: float, side: int = 0) -> float:
-    """The nearest of 1, 2 and 5 times a power of ten; not below the value if side is 1, not above if -1."""
+def round_number(value: float, side: int = 0, steps: tuple[int, ...] = (1, 2, 5)) -> float:
+    """The nearest of some steps times a power of ten; not below the value if side is 1, not above if -1."""
     power = np.floor(np.log10(value))
-    every = [float(f"{step}e{power + k:.0f}") for k in (-1, 0, 1) for step in (1, 2, 5)]
+    every = [float(f"{step}e{power + k:.0f}") for k in (-1, 0, 1) for step in steps]
     allowed = [each for each in every if (each - value) * side >= 0]
     return min(allowed, key=lambda each: abs(np.log(each / value)))
 
@@ -72,6 +77,22 @@ def round_number(value: float, side: int = 0) -> float:
 def cells_to_cover(span: float, cell: float) -> int:
     """Odd number of cells of a torus that does not wrap, with space for a packet at either end."""
     return max(FEWEST, int(np.ceil(span / cell)) + SETTLED) | 1
+
+
+def render_recommendations(found: Sequence[Recommendation]) -> str:
+    """A table of settings: present value, recommended value, reason."""
+    rows = [[each.key, *map(plain, (each.now, each.value)), each.why] for each in found]
+    return render_table([["setting", "now", "recommended", "why"], *rows])
+
+
+def changed_settings_yaml(found: Sequence[Recommendation]) -> str:
+    """YAML of the settings to change; '' if there are none."""
+    tree: dict[str, Any] = {}
+    for each in found:
+        if each.changed:
+            section, path = open_path(tree, each.key, each.key)
+            section[path[-1]] = each.value
+    return yaml.dump(tree, Dumper=Dumper, sort_keys=False) if tree else ""
 
 
 def _of(config: RunConfig, key: str, value: Any, why: str) -> Recommendation:
@@ -138,7 +159,7 @@ def _grid(config: RunConfig, scene: Scene) -> Iterator[Recommendation]:
     blob, cell = grid.footprint.blob_sd, round_number(grid.footprint.blob_sd)
     across = int(np.ceil(side / cell))
     off = _drifted(grid.drift, scene) / cell
-    wanted = int(np.clip(_step(PER_CELL * off), *PARTICLES))
+    wanted = int(np.clip(round_number(max(PER_CELL * off, 1.0), steps=(1, 2, 3, 5)), *PARTICLES))
     each = LAYERS * across**2 * np.dtype(np.float32).itemsize / 2**20
     count = min(wanted, max(PARTICLES[0], int(MEMORY / each)))
     yield _of(config, "grid.cell", cell, f"as fine as the mark of a contact, {blob:g} m")
@@ -176,9 +197,3 @@ def _drifted(drift: DriftConfig, scene: Scene) -> float:
     along = span * np.hypot(lasting, drift.step / np.sqrt(cycles))
     aside = span * drift.heading * np.sqrt(cycles / 3)
     return float(np.hypot(along, aside))
-
-
-def _step(count: float) -> float:
-    """The nearest of 1, 2, 3 and 5 times a power of ten."""
-    power = 10.0 ** np.floor(np.log10(max(count, 1.0)))
-    return float(min((1, 2, 3, 5, 10), key=lambda step: abs(np.log(step * power / max(count, 1.0)))) * power)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ratslam.config.run_config import RunConfig
-from ratslam.experiments.studies.fidelity import shortened
+from ratslam.experiments.studies.tiers import shortened
 from ratslam.pipeline.run import open_recorder
 from ratslam.pipeline.source import open_source
 from robot.recordings.formats import RecordingConfig
@@ -84,14 +84,9 @@ def short_session(config: RunConfig, cycles: int, folder: Path) -> RunConfig:
     Raises:
         InputError: the recording cannot be read.
     """
-    if config.create_simulation is not None:
-        return config.model_copy(
-            update={
-                "create_simulation": config.create_simulation.model_copy(
-                    update={"reports": _reports(config, cycles)}
-                )
-            }
-        )
+    if (create := config.create_simulation) is not None:
+        reports = create.model_copy(update={"reports": min(create.reports or cycles, cycles)})
+        return config.model_copy(update={"create_simulation": reports})
     if config.simulation is not None:
         return shortened(config, cycles / config.simulation.whisking.rate)
     path = folder / "beginning.mcap"
@@ -99,8 +94,3 @@ def short_session(config: RunConfig, cycles: int, folder: Path) -> RunConfig:
         for sample in islice(source, cycles):
             recorder.write(sample)
     return config.model_copy(update={"recording": RecordingConfig(file=path)})
-
-
-def _reports(config: RunConfig, cycles: int) -> int:
-    assert config.create_simulation is not None
-    return min(config.create_simulation.reports or cycles, cycles)

@@ -10,10 +10,11 @@ from typing import Any, NamedTuple
 from ratslam.config.run_config import RunConfig
 from ratslam.experiments.sizing.recommendation import FEWEST, Recommendation, with_settings
 from ratslam.experiments.sizing.scene_statistics import short_session
-from ratslam.experiments.studies.environment import one_core
-from ratslam.experiments.studies.executor import run_tasks
+from ratslam.experiments.studies.machine import one_core
 from ratslam.experiments.studies.records import RunRecord
+from ratslam.experiments.studies.report import make_report, render
 from ratslam.experiments.studies.run_job import run_job
+from ratslam.experiments.studies.schema import StudyPlan
 from ratslam.experiments.studies.study import Job
 from ratslam.pipeline.source import open_source
 from tactile.base.errors import InputError
@@ -33,13 +34,6 @@ class CheaperStep(NamedTuple):
     settings: dict[str, Any]
 
 
-class TrialRun(NamedTuple):
-    """A step and the record of its run."""
-
-    step: CheaperStep
-    record: RunRecord
-
-
 def cheaper_steps(config: RunConfig) -> list[CheaperStep]:
     """The next cheaper step in every direction from a configuration with the recommended settings."""
     steps = _cheaper_grid(config) if config.backend == "grid" else _cheaper_cells(config)
@@ -51,7 +45,7 @@ def cheaper_steps(config: RunConfig) -> list[CheaperStep]:
     return steps
 
 
-def try_settings(config: RunConfig, found: Sequence[Recommendation], cycles: int) -> list[TrialRun]:
+def try_settings(config: RunConfig, found: Sequence[Recommendation], cycles: int) -> list[RunRecord]:
     """Runs of the recommended settings, of the configured ones if they differ, and of every cheaper step.
 
     Args:
@@ -69,13 +63,19 @@ def try_settings(config: RunConfig, found: Sequence[Recommendation], cycles: int
         steps = [CheaperStep("recommended", {}), *cheaper_steps(base)]
         if any(each.changed for each in found):
             steps.insert(1, CheaperStep("as configured", {each.key: each.now for each in found}))
-        jobs = [Job("", {}, with_settings(base, step.settings), "", 0, pace="live") for step in steps]
-        runs = []
-        for step, record in zip(steps, run_tasks(run_job, jobs, workers=1), strict=True):
-            if record.error is not None and step.name == "recommended":
-                raise InputError("", record.error)
-            runs.append(TrialRun(step, record))
-        return runs
+        records = []
+        for step in steps:
+            records.append(run_job(Job(step.name, {}, with_settings(base, step.settings), pace="live")))
+            if records[0].error is not None:
+                raise InputError("", records[0].error)
+        return records
+
+
+def render_trial_runs(records: Sequence[RunRecord]) -> str:
+    """A table of time and error of each step, and what failed."""
+    plan = StudyPlan(base=Path(), pace="live", report="costs")
+    failed = [f"{record.row}: {record.error}" for record in records if record.error is not None]
+    return "\n".join([render(make_report("", plan, records)), *failed])
 
 
 def _cheaper_cells(config: RunConfig) -> list[CheaperStep]:

@@ -16,8 +16,6 @@ SEEDS = {
     "recording": "session.seed",
 }
 """Key path that `seeds` sets, by kind of source."""
-DIGITS = 16
-"""Hexadecimal digits of a configuration's hash."""
 
 
 def with_seed(config: RunConfig, seed: int) -> RunConfig:
@@ -42,7 +40,7 @@ def digest_of(config: RunConfig, how: str = "replay") -> str:
     for part in parts:
         part.get(section, {}).pop(name, None)
     text = json.dumps([*parts, how], sort_keys=True, default=_content)
-    return hashlib.sha256(text.encode()).hexdigest()[:DIGITS]
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def _content(value: Any) -> Any:

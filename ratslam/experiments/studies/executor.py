@@ -12,20 +12,17 @@ import pickle
 import signal
 import sys
 import threading
-import warnings
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import CancelledError
+from concurrent import futures
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, closing, contextmanager
-from importlib.util import find_spec
-from multiprocessing.connection import Connection
-from types import TracebackType
-from typing import Any, Self, TypeVar
-from uuid import uuid4
+from functools import partial
+from typing import Any, TypeVar
 
 from tactile.base.errors import InputError
 
 DEATHS = 5
-"""Number of times that a task is repeated after its process was killed."""
+"""Number of times that processes start anew after one was killed; then each task has a process of its own."""
 ANSWER_TIME = 10
 """Time that a scheduler has for its first answer, s."""
 ENVIRONMENT = (
@@ -34,28 +31,18 @@ ENVIRONMENT = (
     "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS",
     "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES",
 )
-"""Variables that a worker process takes from this one before it loads JAX."""
-LOCAL = {
-    "distributed.worker.multiprocessing-method": "spawn",  # forked children of a process with JAX hang
-    "distributed.scheduler.allowed-failures": DEATHS,
-    "distributed.scheduler.worker-saturation": 1.0,  # a task that only waited is not to blame for a death
-    "distributed.scheduler.worker-ttl": None,  # compiling may hold a worker's heartbeat back
-    "distributed.comm.timeouts.connect": "120s",
-    "distributed.nanny.pre-spawn-environ": {},  # workers compute with as many threads as this process
-}
-"""Dask's settings for processes of this machine."""
+"""Variables that a process of a cluster takes from this one before it loads JAX."""
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
+Submit = Callable[[Any, Any], "futures.Future[Any]"]
 
 
 def run_tasks(
     function: Callable[[Task], Result],
     tasks: Sequence[Task],
-    *,
     workers: int | None = None,
     scheduler: str | None = None,
-    progress: Callable[[int], object] | None = None,
 ) -> Iterator[Result]:
     """Yields `function(task)` for each task, in the order of the tasks.
 
@@ -64,56 +51,36 @@ def run_tasks(
     Args:
         function: of a module, so that other processes can import it; what it raises is raised here.
         workers, scheduler: see `Executor`.
-        progress: called with the index of each task that is complete, in the order of completion.
 
     Raises:
-        InputError: Dask is missing, a scheduler does not answer, or a task's process was killed repeatedly.
+        InputError: Dask is missing, a scheduler does not answer, or a task's process was killed.
     """
     found: dict[int, Result] = {}
-    with (
-        Executor(workers, scheduler) as executor,
-        closing(executor.completed(function, tasks)) as completed,
-    ):
+    with Executor(workers, scheduler) as executor, closing(executor.completed(function, tasks)) as completed:
         for index in range(len(tasks)):
             while index not in found:
-                done, result = next(completed)
-                found[done] = result
-                if progress:
-                    progress(done)
+                found.update([next(completed)])
             yield found.pop(index)
 
 
-class Executor:
+class Executor(ExitStack):
     """Worker processes that start with the first tasks and serve until the end of the `with` block.
 
     Args:
-        workers: number of processes; 1: tasks run in this process; None or 0: one per core where Dask is
-            installed, else 1.
+        workers: number of processes; 1: tasks run in this process; None or 0: one per core.
         scheduler: address of a Dask scheduler whose workers are used instead.
-        most: largest number of tasks asked for at once, where that is known before.
         fresh: run every task in a new process of this machine, one after another.
+
+    Attributes:
+        processes: number of processes that share the work.
     """
 
-    def __init__(
-        self, workers: int | None = None, scheduler: str | None = None, most: int = 0, fresh: bool = False
-    ) -> None:
-        usual = (os.cpu_count() or 1) if find_spec("distributed") else 1
-        self._workers, self._scheduler, self._most, self._fresh = workers or usual, scheduler, most, fresh
-        self._client: Any = None
-        self._open = ExitStack()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._open.__exit__(kind, error, trace)
-
-    @property
-    def processes(self) -> int:
-        """Number of processes that share the work."""
-        return len(self._client.nthreads()) if self._client is not None else 1
+    def __init__(self, workers: int | None = None, scheduler: str | None = None, fresh: bool = False) -> None:
+        super().__init__()
+        self.processes = 1
+        self._workers, self._scheduler, self._fresh = workers or os.cpu_count() or 1, scheduler, fresh
+        self._submit: Submit | None = None
+        self._most = 1
 
     def completed(
         self,
@@ -124,20 +91,57 @@ class Executor:
         """Yields (index of the task, result) in the order of completion.
 
         Args:
-            killed: gives the result of a task whose process was killed `DEATHS` + 1 times, e.g. for lack of
-                memory; None: this raises an `InputError`.
+            killed: gives the result of a task whose process was killed, e.g. for lack of memory; None: this
+                raises an `InputError`.
         """
-        if self._fresh:
-            for index, task in enumerate(tasks):
-                yield index, _in_new_process(function, task, killed)
-            return
-        count = min(self._workers, max(len(tasks), self._most))
-        if self._scheduler is None and (count <= 1 or (len(tasks) <= 1 and self._client is None)):
+        left = dict(enumerate(tasks))
+        if not self._fresh and self._scheduler is None and min(self._workers, len(tasks)) <= 1:
             yield from enumerate(map(function, tasks))
             return
-        if self._client is None:
-            self._client = self._open.enter_context(_connected(count, self._scheduler))
-        yield from _answers(self._client, function, tasks, killed)
+        for _ in range(0 if self._fresh else DEATHS if self._scheduler is None else 1):
+            for index, result in self._answers(function, left.copy()):
+                del left[index]
+                yield index, result
+            if not left:
+                return
+        for index, task in left.items():
+            try:
+                yield index, self._answer_alone(function, task)
+            except BrokenProcessPool:
+                if killed is None:
+                    found = "a process was killed, for lack of memory for example"
+                    raise InputError("--workers", found, "memory for all", "ask for fewer") from None
+                yield index, killed(task)
+
+    def _answers(self, function: Callable[[Task], Result], tasks: dict[int, Task]) -> Iterator[Any]:
+        """(index, result) in the order of completion, without those of processes that were killed."""
+        if self._submit is None:
+            pool = _cluster(self._scheduler) if self._scheduler else _local(self._workers)
+            self._submit, self._most = self.enter_context(pool)
+        self.processes = max(self.processes, min(self._most, len(tasks)))
+        with _ignoring_interrupts():
+            pending = {self._submit(function, task): index for index, task in tasks.items()}
+        for future in futures.as_completed(pending):
+            try:
+                result = future.result()
+            except BrokenProcessPool:
+                self._submit = None
+            except (futures.CancelledError, ImportError, RuntimeError) as error:
+                _explain(error, self._scheduler)
+                raise
+            except Exception as error:
+                if type(error).__name__ != "KilledWorker":  # of Dask
+                    raise
+            else:
+                yield pending[future], result
+
+    def _answer_alone(self, function: Callable[[Task], Result], task: Task) -> Result:
+        if self._scheduler is not None:
+            raise BrokenProcessPool
+        with _local(1) as (submit, _):
+            with _ignoring_interrupts():
+                future = submit(function, task)
+            return future.result()
 
 
 def call_in_worker(environment: dict[str, str], packed: bytes) -> Any:
@@ -148,124 +152,66 @@ def call_in_worker(environment: dict[str, str], packed: bytes) -> Any:
     return function(task)
 
 
-def _in_new_process(
-    function: Callable[[Task], Result], task: Task, killed: Callable[[Task], Result] | None
-) -> Result:
-    context = multiprocessing.get_context("spawn")
-    answer, send = context.Pipe(duplex=False)
-    process = context.Process(target=_send_result, args=(send, function, task), daemon=True)
-    with _ignoring_interrupts():
-        process.start()
-    send.close()
+@contextmanager
+def _local(count: int) -> Iterator[tuple[Submit, int]]:
+    """Submits to processes of this machine, which end with the block, whatever they are doing."""
+    context = multiprocessing.get_context("spawn")  # forked children of a process with JAX hang
+    others = multiprocessing.active_children()
+    pool = futures.ProcessPoolExecutor(count, context, _end_with_parent)
     try:
-        result, error = answer.recv()
-    except EOFError:
-        return _after_kill(task, killed, 1)
+        yield pool.submit, count
     finally:
-        process.kill()
-        process.join()
-    if error is not None:
-        raise error
-    return result
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in multiprocessing.active_children():
+            if process not in others:
+                process.kill()
+                process.join()
 
 
-def _send_result(send: Connection, function: Callable[[Task], Result], task: Task) -> None:
-    try:
-        send.send((function(task), None))
-    except Exception as error:
-        send.send((None, error))
+def _end_with_parent() -> None:
+    """Ends this process when its parent was killed, which could not end it."""
 
+    def wait() -> None:
+        if (parent := multiprocessing.parent_process()) is not None:
+            parent.join()
+            os._exit(1)
 
-def _after_kill(task: Task, killed: Callable[[Task], Result] | None, times: int) -> Result:
-    if killed is not None:
-        return killed(task)
-    found = f"a process was killed {times} times, for lack of memory for example"
-    raise InputError("--workers", found, "memory for all", "ask for fewer")
-
-
-def _answers(
-    client: Any,
-    function: Callable[[Task], Result],
-    tasks: Sequence[Task],
-    killed: Callable[[Task], Result] | None,
-) -> Generator[tuple[int, Result], None, None]:
-    from distributed import KilledWorker, as_completed
-
-    environment = {name: os.environ[name] for name in ENVIRONMENT if name in os.environ}
-    asked = uuid4().hex  # a scheduler may be asked for the same by others
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Sending large graph")
-        pending = {
-            client.submit(
-                call_in_worker,
-                environment,
-                pickle.dumps((function, task)),
-                key=f"{asked}-{index}",
-                pure=False,
-            ): index
-            for index, task in enumerate(tasks)
-        }
-    for future in as_completed(list(pending), loop=client.loop):
-        index = pending.pop(future)
-        try:
-            result: Result = future.result()
-        except KilledWorker:
-            result = _after_kill(tasks[index], killed, DEATHS + 1)
-        except (ImportError, RuntimeError) as error:
-            if isinstance(error, ImportError) or "deserialization" in str(error):
-                found = f"its processes cannot load ratslam ({error})".splitlines()[0]
-                raise InputError("--scheduler", found, "the same ratslam, installed there too") from None
-            raise
-        except CancelledError:
-            cure = "what was done is kept; run it again"
-            raise InputError("--scheduler", "the scheduler went away", "one that stays", cure) from None
-        yield index, result
+    threading.Thread(target=wait, daemon=True).start()
 
 
 @contextmanager
-def _connected(count: int, scheduler: str | None) -> Iterator[Any]:
-    """A Dask client of `count` processes of our own, which no other machine can reach, or of a scheduler."""
+def _cluster(address: str) -> Iterator[tuple[Submit, int]]:
+    """Submits to the processes of a Dask scheduler."""
     try:
-        import dask
-        from distributed import Client, LocalCluster
+        from distributed import Client
         from distributed.utils import silence_logging_cmgr
     except ImportError:
-        option = "--workers" if scheduler is None else "--scheduler"
-        cure = "pip install 'ratslam[sweep]', or run it in this process with --workers 1"
-        raise InputError(option, "Dask is not installed", "the extra 'sweep'", cure) from None
-    if scheduler is not None:
-        # The log repeats what our errors say.
-        with silence_logging_cmgr(logging.CRITICAL), _client_of(Client, scheduler) as client:
-            yield client
+        cure = "pip install 'ratslam[sweep]'"
+        raise InputError("--scheduler", "Dask is not installed", "the extra 'sweep'", cure) from None
+    environment = {name: os.environ[name] for name in ENVIRONMENT if name in os.environ}
+    with silence_logging_cmgr(logging.CRITICAL):  # the log repeats what our errors say
+        try:
+            client = Client(address, timeout=ANSWER_TIME, set_as_default=False)
+        except (OSError, ValueError) as error:
+            found = f"no scheduler answers at {address!r} ({type(error).__name__})"
+            raise InputError("--scheduler", found, "the address of one, such as tcp://HOST:8786") from None
+        with client:
+            if not client.nthreads():
+                print(f"ratslam: waiting for workers to join {address} ...", file=sys.stderr)
+            submit = partial(client.get_executor(pure=False).submit, call_in_worker, environment)
+            yield lambda function, task: submit(pickle.dumps((function, task))), len(client.nthreads()) or 1
+
+
+def _explain(error: Exception, scheduler: str | None) -> None:
+    """Raises an `InputError` where an error is the cluster's."""
+    if scheduler is None:
         return
-    with dask.config.set(LOCAL):
-        with _ignoring_interrupts():
-            cluster = LocalCluster(
-                n_workers=count,
-                threads_per_worker=1,
-                processes=True,
-                host="127.0.0.1",
-                protocol="tcp",
-                dashboard_address="127.0.0.1:0",
-                worker_dashboard_address="127.0.0.1:0",
-                scheduler_kwargs={"dashboard": False},
-                memory_limit=0,
-                silence_logs=logging.CRITICAL,
-            )
-        with cluster, Client(cluster, set_as_default=False) as client:
-            yield client
-
-
-def _client_of(make: Any, address: str) -> Any:
-    """The client of a scheduler that runs already."""
-    try:
-        client = make(address, timeout=ANSWER_TIME, set_as_default=False)
-    except (OSError, ValueError) as error:
-        found = f"no scheduler answers at {address!r} ({type(error).__name__})"
-        raise InputError("--scheduler", found, "the address of one, such as tcp://HOST:8786") from None
-    if not client.nthreads():
-        print(f"ratslam: waiting for workers to join {address} ...", file=sys.stderr)
-    return client
+    if isinstance(error, futures.CancelledError):
+        cure = "what was done is kept; run it again"
+        raise InputError("--scheduler", "the scheduler went away", "one that stays", cure) from None
+    if isinstance(error, ImportError) or "deserialization" in str(error):
+        found = f"its processes cannot load ratslam ({error})".splitlines()[0]
+        raise InputError("--scheduler", found, "the same ratslam, installed there too") from None
 
 
 @contextmanager

@@ -3,55 +3,52 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable
-from typing import Any
+import json
+from collections.abc import Collection, Iterable
+from itertools import combinations, product
+from typing import Any, NamedTuple
 
-from ratslam.config.strict_yaml import Document, override
+from ratslam.config.strict_yaml import Document, open_path
 from ratslam.config.strict_yaml.document import KeyPath, Place
+from ratslam.experiments.studies.schema import StudyPlan
 from tactile.base.errors import InputError
 
 
-def put(document: Document, key: str, value: Any, origin: Document, at: KeyPath) -> Document:
-    """The document with a value at a dotted key.
+class Setting(NamedTuple):
+    """A dotted key of a configuration, its value, and the path in the study where that is written."""
 
-    Args:
-        origin, at: the document that the value was written in, and its path there.
+    key: str
+    value: Any
+    at: KeyPath
+
+
+def put(document: Document, setting: Setting, study: Document) -> Document:
+    """The document with a setting of the study.
 
     Raises:
         InputError: there is no such key.
     """
-    where = origin.at_key(at)
+    key, value, at = setting
+    where = study.at_key(at)
     if "=" in key or not all(key.split(".")):
         raise InputError(where, "not a key path", "names joined by dots, such as pose_cells.cells_xy")
-    try:
-        changed = override(document, [f"{key}=null"])
-    except InputError as error:
-        raise InputError(where, error.found, error.expected, error.cure) from None
-    *sections, last = _steps(changed.data, key)
-    section: Any = changed.data
-    for step in sections:
-        section = section[step]
-    section[last] = copy.deepcopy(value)
-    root: KeyPath = (*sections, last)
-    key_place, value_place = (origin.places[origin.nearest(path)] for path in (named(at), at))
+    data = copy.deepcopy(document.data)
+    section, path = open_path(data, key, where)
+    section[path[-1]] = copy.deepcopy(value)
+    key_place, value_place = (study.places[study.nearest(each)] for each in (without_index(at), at))
     here = Place(key_place.key, value_place.value)
-    made = {path for path, place in changed.places.items() if document.places.get(path) != place}
-    places = {path: here if path in made else place for path, place in changed.places.items()}
-    places |= {
-        (*root, *path[len(at) :]): place for path, place in origin.places.items() if path[: len(at)] == at
+    places = {each: place for each, place in document.places.items() if each[: len(path)] != path}
+    for length in range(1, len(path)):
+        places.setdefault(path[:length], here)
+    inside = {
+        (*path, *each[len(at) :]): place for each, place in study.places.items() if each[: len(at)] == at
     }
-    places[root] = here
-    return Document(changed.data, places)
+    return Document(data, places | inside | {path: here})
 
 
-def named(at: KeyPath) -> KeyPath:
+def without_index(at: KeyPath) -> KeyPath:
     """The path without the index of a value in a list."""
     return at[:-1] if isinstance(at[-1], int) else at
-
-
-def overlap(first: str, second: str) -> bool:
-    """Whether one key path equals the other or is a section that contains it."""
-    return f"{first}.".startswith(f"{second}.") or f"{second}.".startswith(f"{first}.")
 
 
 def outermost_first(keys: Iterable[str]) -> list[str]:
@@ -59,10 +56,32 @@ def outermost_first(keys: Iterable[str]) -> list[str]:
     return sorted(keys, key=lambda key: (key.count("."), key))
 
 
-def _steps(data: Any, key: str) -> KeyPath:
-    """The key path of a dotted key, with integers as list indices."""
-    path: KeyPath = ()
-    for name in key.split("."):
-        step = int(name) if isinstance(data, list) else name
-        path, data = (*path, step), data[step]
-    return path
+def is_study_key(assignment: str) -> bool:
+    """Whether `a.b=value` sets a key of the study; else it is a setting of all runs."""
+    return assignment.partition("=")[0].split(".")[0] in StudyPlan.model_fields
+
+
+def check_unambiguous(plan: StudyPlan, document: Document, overridden: Collection[str]) -> None:
+    """Refuses settings that overwrite each other.
+
+    Args:
+        overridden: keys of `--set` that are settings of all runs.
+
+    Raises:
+        InputError: two keys of which one contains the other, or a value given twice.
+    """
+    parameters = {key: ("tune", "parameters", key) for key in (plan.tune.parameters if plan.tune else ())}
+    rows = [(key, ("rows", name, key)) for name, row in plan.every_row().items() for key in row.settings]
+    vary = {key: ("vary", key) for key in plan.vary}
+    pairs: list[Any] = [*combinations(vary.items(), 2), *combinations(parameters.items(), 2)]
+    for (first, _), (second, at) in [*pairs, *product(vary.items(), rows)]:
+        if f"{first}.".startswith(f"{second}.") or f"{second}.".startswith(f"{first}."):
+            raise InputError(document.at_key(at), f"sets what {first!r} varies", "one or the other")
+    for key, values in plan.vary.items():
+        texts = [json.dumps(value, sort_keys=True) for value in values]
+        twice = next((k for k, text in enumerate(texts) if text in texts[:k]), None)
+        if twice is not None:
+            where = document.at_value(("vary", key, twice))
+            raise InputError(where, f"{texts[twice]} given twice", "each once")
+        if key in overridden:
+            raise InputError(f"--set {key}", "varied by the study", "a setting of all runs")

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from pydantic import BaseModel
 
@@ -12,9 +12,9 @@ from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import Document, load, override, validate
 from ratslam.config.strict_yaml.document import Place
 from ratslam.experiments.studies.config_hash import seed_key
-from ratslam.experiments.studies.fidelity import shortened
-from ratslam.experiments.studies.schema import StudyPlan
+from ratslam.experiments.studies.overrides import is_study_key
 from ratslam.experiments.studies.study import Study, check_study
+from ratslam.experiments.studies.tiers import shortened
 from robot.simulation.head.session import choose_tier
 from tactile.base.errors import InputError
 
@@ -57,28 +57,21 @@ METHODS: dict[str, dict[str, Any]] = {
 """Backends that `tiers` runs on the images of each tier."""
 
 
-class PresetOptions(NamedTuple):
-    """Options of presets: share that `vary` changes numbers by; length of the session of `tiers`, s."""
-
-    by: float = 0.2
-    seconds: float = 600.0
-
-
 def preset_study(
-    name: str, path: Path, overrides: Sequence[str], options: PresetOptions
+    name: str, path: Path, overrides: Sequence[str] = (), *, by: float = 0.2, seconds: float = 600.0
 ) -> tuple[Study, list[str]]:
     """The study of a preset on a configuration file, and remarks for its report.
 
     Args:
-        name: a key of `PRESETS`. overrides: of the study or of all runs, as for `read_study`.
+        name: one of `ratslam.cli.studies.PRESETS`. overrides: as for `read_study`.
+        by: share that `vary` changes numbers by. seconds: length of the session of `tiers`.
 
     Raises:
         InputError: the configuration is invalid or does not suit the preset.
     """
-    runs = [text for text in overrides if text.partition("=")[0].split(".")[0] not in StudyPlan.model_fields]
-    document = override(load(path), runs)
+    document = override(load(path), [text for text in overrides if not is_study_key(text)])
     config = validate(document, RunConfig)
-    content, remarks = PRESETS[name](document, config, options)
+    content, remarks = _content(name, document, config, by, seconds)
     section, _, key = seed_key(config).partition(".")
     seed = getattr(getattr(config, section), key)
     content = {"base": str(path.resolve()), "seeds": [seed]} | content
@@ -88,42 +81,44 @@ def preset_study(
     return check_study(f"{path.stem}-{name}", made, Path(), overrides), remarks
 
 
-def _ablate(
-    document: Document, config: RunConfig, options: PresetOptions
+def _content(
+    name: str, document: Document, config: RunConfig, by: float, seconds: float
 ) -> tuple[dict[str, Any], list[str]]:
-    return {"rows": PARTS, "report": "differences"}, []
+    """The content of a study file without base and seeds, and remarks."""
+    rows: dict[str, dict[str, Any]]
+    match name:
+        case "ablate":
+            return {"rows": PARTS, "report": "differences"}, []
+        case "vary":
+            moved = {f"{key} = {value:.4g}": {key: value} for key, value in variations(document, by)}
+            return {"rows": {"as configured": {}, **moved}, "report": "differences"}, []
+        case "spread":
+            rows = {"as recorded": {"copies": 0}, "perturbed": {}}
+            return {"rows": rows, "copies": 10, "report": "medians"}, []
+        case "backends":
+            first = "recall" if config.backend == "grid" else config.backend
+            return {"rows": {each: {"backend": each} for each in (first, "grid")}, "report": "medians"}, []
+        case "tiers":
+            return _tiers(config, seconds)
+    rows = dict(CHOICES)
+    if config.recording is None:
+        rows |= {
+            f"grid, {count}": {"backend": "grid", "grid.particles": count, "session.precision": "float32"}
+            for count in PARTICLES
+        }
+    if config.simulation is not None:
+        rows["quasistatic"] = {"simulation.fidelity": "quasistatic"}
+    return {"rows": rows, "seeds": 3, "pace": "live", "report": "pareto"}, []
 
 
-def _vary(document: Document, config: RunConfig, options: PresetOptions) -> tuple[dict[str, Any], list[str]]:
-    if not 0 < options.by < 1:
-        raise InputError("--by", str(options.by), "a share between 0 and 1")
-    rows: dict[str, dict[str, Any]] = {"as configured": {}}
-    rows |= {f"{key} = {value:.4g}": {key: value} for key, value in variations(document, options.by)}
-    return {"rows": rows, "report": "differences"}, []
-
-
-def _spread(
-    document: Document, config: RunConfig, options: PresetOptions
-) -> tuple[dict[str, Any], list[str]]:
-    rows: dict[str, dict[str, Any]] = {"as recorded": {"copies": 0}, "perturbed": {}}
-    return {"rows": rows, "copies": 10, "report": "medians"}, []
-
-
-def _backends(
-    document: Document, config: RunConfig, options: PresetOptions
-) -> tuple[dict[str, Any], list[str]]:
-    first = "recall" if config.backend == "grid" else config.backend
-    return {"rows": {first: {"backend": first}, "grid": {"backend": "grid"}}, "report": "medians"}, []
-
-
-def _tiers(document: Document, config: RunConfig, options: PresetOptions) -> tuple[dict[str, Any], list[str]]:
-    if not 0 < options.seconds < float("inf"):
-        raise InputError("--seconds", str(options.seconds), "a time above 0 s")
+def _tiers(config: RunConfig, seconds: float) -> tuple[dict[str, Any], list[str]]:
+    if not 0 < seconds < float("inf"):
+        raise InputError("--seconds", str(seconds), "a time above 0 s")
     if config.simulation is None:
         expected = "a scene to simulate"
         raise InputError("simulation", "missing", expected, "`simulation: {}` is a whole session")
     chosen = choose_tier(config.simulation.model_copy(update={"fidelity": "auto"}))
-    short = shortened(config, options.seconds).simulation
+    short = shortened(config, seconds).simulation
     assert short is not None
     length = {"explore": short.path.explore} if short.path.explore else {"circuits": short.path.circuits}
     rows: dict[str, dict[str, Any]] = {
@@ -138,36 +133,20 @@ def _tiers(document: Document, config: RunConfig, options: PresetOptions) -> tup
     return content, [f"fidelity: auto takes {chosen.name}: {chosen.why}"]
 
 
-def _pareto(
-    document: Document, config: RunConfig, options: PresetOptions
-) -> tuple[dict[str, Any], list[str]]:
-    rows = dict(CHOICES)
-    if config.recording is None:
-        rows |= {
-            f"grid, {count}": {"backend": "grid", "grid.particles": count, "session.precision": "float32"}
-            for count in PARTICLES
-        }
-    if config.simulation is not None:
-        rows["quasistatic"] = {"simulation.fidelity": "quasistatic"}
-    return {"rows": rows, "seeds": 3, "pace": "live", "report": "pareto"}, []
-
-
-PRESETS: dict[str, Callable[[Document, RunConfig, PresetOptions], tuple[dict[str, Any], list[str]]]] = {
-    "ablate": _ablate,
-    "vary": _vary,
-    "spread": _spread,
-    "tiers": _tiers,
-    "backends": _backends,
-    "pareto": _pareto,
-}
-"""Functions from a configuration to the content of a study file, and remarks."""
-
-
 def variations(document: Document, by: float) -> list[tuple[str, float | int]]:
-    """Every number of recall and its map moved down and up by a share; invalid values are left out."""
-    found = []
-    for key, value in _numbers(validate(document, RunConfig)):
-        for moved in (_scaled(value, 1 - by), _scaled(value, 1 + by)):
+    """Every number of recall and its map moved down and up by a share; invalid values are left out.
+
+    Raises:
+        InputError: the share is not between 0 and 1.
+    """
+    if not 0 < by < 1:
+        raise InputError("--by", str(by), "a share between 0 and 1")
+    config, found = validate(document, RunConfig), []
+    for key, value in [*_numbers(config.recall, "recall."), *_numbers(config.keyframes, "keyframes.")]:
+        for factor in (1 - by, 1 + by):
+            moved: float | int = value * factor
+            if isinstance(value, int):  # by one at least
+                moved = round(moved) if round(moved) != value else value + (1 if factor > 1 else -1)
             try:
                 validate(override(document, [f"{key}={moved!r}"]), RunConfig)
             except InputError:
@@ -177,22 +156,10 @@ def variations(document: Document, by: float) -> list[tuple[str, float | int]]:
     return found
 
 
-def _numbers(config: RunConfig) -> Iterator[tuple[str, float | int]]:
-    def walk(model: BaseModel, path: str) -> Iterator[tuple[str, float | int]]:
-        for name in type(model).model_fields:
-            value = getattr(model, name)
-            if isinstance(value, BaseModel):
-                yield from walk(value, f"{path}{name}.")
-            elif isinstance(value, int | float) and not isinstance(value, bool):
-                yield path + name, value
-
-    yield from walk(config.recall, "recall.")
-    yield from walk(config.keyframes, "keyframes.")
-
-
-def _scaled(value: float | int, factor: float) -> float | int:
-    """The value times the factor; integers move by one at least."""
-    if isinstance(value, int):
-        moved = round(value * factor)
-        return moved if moved != value else value + (1 if factor > 1 else -1)
-    return value * factor
+def _numbers(model: BaseModel, path: str) -> Iterator[tuple[str, float | int]]:
+    for name in type(model).model_fields:
+        value = getattr(model, name)
+        if isinstance(value, BaseModel):
+            yield from _numbers(value, f"{path}{name}.")
+        elif isinstance(value, int | float) and not isinstance(value, bool):
+            yield path + name, value

@@ -9,53 +9,13 @@ from typing import Any
 from pydantic import Field
 
 from evaluation.metrics.metric import Quantity
+from ratslam.experiments.studies.machine import Machine
+from ratslam.experiments.studies.study import Job, run_key
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
 
 FILE = "runs.jsonl"
 """Name of the file of records in a study's directory."""
-
-
-class Timing(Settings):
-    """Duration of a run's parts; None where too few steps were taken to measure it."""
-
-    pace: str
-    """`live`: steps were taken one at a time; `replay`: a chunk at a time."""
-    median_us: float | None
-    """Median time per step once compiled, microseconds."""
-    p99_us: float | None
-    """99 % quantile of the time per step, over steps if live, else over chunks, microseconds."""
-    compile_s: float
-    """Time spent on compiling, without the steps themselves, s."""
-    compilations: int
-    """Number of kernels compiled or fetched from the cache on disk."""
-    finish_s: float
-    """Time for the final map, s."""
-    total_s: float
-    """Time of the whole run including simulation and scoring, s."""
-
-    def values(self, steps: int) -> dict[str, float | None]:
-        """The times by their names in `studies.metrics`."""
-        whole = 1e6 * max(self.total_s - self.compile_s, 0.0) / steps if steps else None
-        times = self.median_us, self.p99_us, whole, self.compile_s
-        return dict(zip(("step_time", "step_time_p99", "run_time", "compile_time"), times, strict=True))
-
-
-class Machine(Settings):
-    """Where a run was computed."""
-
-    processor: str
-    """Name of the processor."""
-    device: str
-    """Device of the kernels: `cpu`, or the name of an accelerator."""
-    versions: dict[str, str]
-    """Versions of what decides the speed."""
-    build: str
-    """First digits of the sha256 of ratslam's code."""
-    workers: int = 1
-    """Number of processes that shared the work."""
-    other_load: float | None = None
-    """Number of cores that other processes kept busy meanwhile; None where the system does not say."""
 
 
 class RunRecord(Settings):
@@ -77,10 +37,8 @@ class RunRecord(Settings):
     """Digest of the session."""
     quantities: dict[str, Quantity] = Field(default_factory=dict)
     """Scored quantities by name."""
-    timing: Timing | None = None
-    """Duration."""
-    memory: float | None = None
-    """Peak memory, MiB: of this run where the peak can be reset (Linux), else of the process so far."""
+    measured: dict[str, float | None] = Field(default_factory=dict)
+    """Times and memory by name (`metrics.MEASURED`)."""
     machine: Machine | None = None
     """Where it was computed."""
     error: str | None = None
@@ -92,17 +50,18 @@ class RunRecord(Settings):
         return run_key(self.hash, self.seed, self.copy_number)
 
     def value(self, name: str) -> float | None:
-        """A quantity by any name of `studies.metrics`; None if the run has none."""
-        if name in self.quantities:
-            return self.quantities[name].value
-        if name == "memory":
-            return self.memory
-        return self.timing.values(self.steps).get(name) if self.timing else None
+        """A quantity by its name in `metrics.METRICS`; None if the run has none."""
+        return self.quantities[name].value if name in self.quantities else self.measured.get(name)
+
+    def odometry(self, name: str) -> float | None:
+        """A quantity of raw odometry; None if the run has none."""
+        return self.quantities[name].odometry if name in self.quantities else None
 
 
-def run_key(hash: str, seed: int, copy_number: int) -> str:
-    """The key of a run."""
-    return f"{hash}-{seed}-{copy_number}" if copy_number else f"{hash}-{seed}"
+def record_of(job: Job, error: str | None = None, machine: Machine | None = None) -> RunRecord:
+    """The record of a job without an outcome."""
+    names = {name: getattr(job, name) for name in ("hash", "seed", "copy_number", "row", "varied")}
+    return RunRecord(**names, error=error, machine=machine)
 
 
 class RunLog:
@@ -123,8 +82,7 @@ class RunLog:
             raise InputError(str(directory), found, "a folder to write to") from None
         self.path = directory / FILE
         self.records: dict[str, RunRecord] = {}
-        lines = self.path.read_bytes().splitlines() if self.path.exists() else []
-        for line in lines:
+        for line in self.path.read_bytes().splitlines() if self.path.exists() else []:
             try:
                 record = RunRecord.model_validate_json(line)
             except ValueError:  # cut off by a kill

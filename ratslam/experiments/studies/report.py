@@ -7,15 +7,18 @@ import io
 import json
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING
 
 from evaluation.plots.pareto_plot import ParetoPoint, draw_pareto
-from ratslam.experiments.studies.metrics import COLUMNS, HEADINGS, ErrorMetric, default_error
-from ratslam.experiments.studies.records import Machine, RunRecord
-from ratslam.experiments.studies.schema import StudyPlan
-from ratslam.experiments.studies.summary import Row, Spread, group_records, odometry_row, summarise
+from ratslam.experiments.studies.machine import Machine
+from ratslam.experiments.studies.metrics import COLUMNS, METRICS
+from ratslam.experiments.studies.records import RunRecord
+from ratslam.experiments.studies.schema import SearchPlan, StudyPlan
+from ratslam.experiments.studies.summary import Row, Spread, default_error, mark_optimal, plain, summarise
 from tactile.base.atomic_write import write_atomically, write_text_atomically
 
 if TYPE_CHECKING:
@@ -25,86 +28,106 @@ DISTURBED = 0.3
 """Load of other processes from which a measurement of speed counts as disturbed, cores."""
 KEPT = 1.25
 """Largest final ATE of a row that counts as kept, relative to the first row's."""
+MEANS = ("means", "search")
+"""Kinds of report that show means; others show medians."""
+COMPARED = ("differences", "costs")
+"""Kinds of report that show the difference of each row from the first."""
 PACES = {"live": "one step at a time", "replay": "a chunk of steps at a time"}
 
 
-class Report(NamedTuple):
+@dataclass(frozen=True)
+class Report:
     """The outcome of a study.
 
     Attributes:
-        name: of the study. kind: of the table, a key of `COLUMNS`. rows: in order. error: of the Pareto
-            front. measured: machine, versions, build, seeds and pace, by name. remarks: sentences.
+        name: of the study. kind: of the table. columns: quantities shown. rows: in order. error: quantity of
+            the Pareto front. measured: machine, versions, build, seeds and pace, by name. remarks: sentences.
     """
 
     name: str
     kind: str
+    columns: Sequence[str]
     rows: Sequence[Row]
-    error: ErrorMetric | None
+    error: str | None
     measured: dict[str, str]
     remarks: Sequence[str]
 
 
-def make_report(
-    name: str, plan: StudyPlan, records: Sequence[RunRecord], error: ErrorMetric | None = None
-) -> Report:
+def make_report(name: str, plan: StudyPlan, records: Sequence[RunRecord], error: str | None = None) -> Report:
     """The report of a study's records.
 
     Args:
-        error: of the Pareto front; None: the first default error that most rows have.
+        error: quantity of the Pareto front; None: the first default error that most rows have.
     """
-    groups = group_records(records)
-    if plan.report == "pareto":
-        error = error or default_error([[each for each in group if each.error is None] for group in groups])
-    rows = summarise(groups, error if plan.report == "pareto" else None)
-    if plan.report in ("medians", "differences") and groups:
-        fine = [record for record in groups[0] if record.error is None]
-        rows.append(odometry_row(fine))
-    remarks = [*_remarks(records), *(_kept(rows, plan.limit) if plan.report == "differences" else ())]
-    return Report(name, plan.report, rows, error, _measured(records, plan.pace), remarks)
+    rows = summarise(records, odometry=plan.report in ("medians", "differences"))
+    error = (error or default_error(rows)) if plan.report == "pareto" else None
+    if error is not None:
+        rows = mark_optimal(rows, {"step_time": "low", error: METRICS[error].direction}, "median")
+    columns = dict.fromkeys([*COLUMNS[plan.report], *([error] if error else [])])
+    kept = _kept(rows, plan.limit) if plan.report == "differences" else []
+    return _report(name, plan, plan.report, list(columns), rows, error, records, kept)
 
 
-def label(row: str, varied: dict[str, Any]) -> str:
-    """A row's name and combination, with the last part of each key where that is unambiguous."""
-    last = [key.rpartition(".")[2] for key in varied]
-    names = last if len(set(last)) == len(last) else list(varied)
-    parts = [f"{name}={_plain(value)}" for name, value in zip(names, varied.values(), strict=True)]
-    return " ".join([row, *parts]).strip() or "as configured"
+def make_search_report(name: str, plan: StudyPlan, tune: SearchPlan, records: Sequence[RunRecord]) -> Report:
+    """The report of a search's records, with the Pareto-optimal trials marked."""
+    rows = mark_optimal(summarise(records), tune.directions(), "mean")
+    failed = sum(bool(row.failed) for row in rows)
+    remark = f"{len(rows)} trials, {sum(row.optimal for row in rows)} of them Pareto-optimal, {failed} failed"
+    return _report(name, plan, "search", list(tune.directions()), rows, None, records, [remark])
 
 
-def render_text(report: Report) -> str:
-    """The table and its notes as plain text; `*` marks Pareto-optimal rows."""
-    pareto = report.kind == "pareto"
-    cells = _cells(report, "* {}" if pareto else "{}", "  {}" if pareto else "{}")
-    return "\n".join([align(cells), "", *_notes(report, "* ")])
+def render(report: Report) -> str:
+    """The table and its notes as Markdown; Pareto-optimal rows are bold. Of a search only those are shown."""
+    names = [name for name in report.columns if any(name in row.spreads for row in report.rows)]
+    table = [["", "runs", "steps", *(f"{name} {METRICS[name].unit}".strip() for name in names)]]
+    for row in report.rows:
+        if report.kind == "search" and not row.optimal:
+            continue
+        runs = f"{row.runs}" + (f", {row.failed} failed" if row.failed else "")
+        base = report.rows[0] if report.kind in COMPARED and row is not report.rows[0] else None
+        first = base.spreads if base else {}
+        cells = [_cell(row.spreads.get(each), report.kind, first.get(each)) for each in names]
+        name = f"**{row.label}**" if row.optimal else row.label
+        table.append([name, runs, f"{row.steps:.0f}", *cells])
+    remarks = (f"{remark[0].upper()}{remark[1:]}." for remark in report.remarks)
+    return "\n".join([render_table(table), "", _note(report), *remarks])
 
 
-def render_markdown(report: Report) -> str:
-    """The table and its notes as Markdown; Pareto-optimal rows are bold."""
-    head, *rows = _cells(report, "**{}**", "{}")
-    lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
-    table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
-    return "\n".join([table, "", *_notes(report, "Bold: ")]) + "\n"
+def render_table(rows: Sequence[Sequence[str]]) -> str:
+    """Rows of cells as a Markdown table with aligned columns: the first to the left, others to the right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    rule = [f"{'-' * (widths[0] or 1)}", *("-" * (width - 1) + ":" for width in widths[1:])]
+    head, *others = [[f"{row[0]:{widths[0]}}", *map(str.rjust, row[1:], widths[1:])] for row in rows]
+    return "\n".join(f"| {' | '.join(row)} |" for row in [head, rule, *others])
 
 
 def draw(report: Report) -> Figure | None:
-    """Time per step against error; None where no row has both."""
-    marks = [
-        ParetoPoint(label(row.row, row.varied), _ends(time), _ends(row.error), row.optimal)
-        for row in report.rows
-        if (time := row.spreads.get("step_time")) is not None and row.error is not None
-    ]
-    if report.error is None or not marks:
+    """Time per step against error; an error that is better high is taken from 1."""
+    if report.error is None:
+        return None
+    metric, marks = METRICS[report.error], []
+    text = f"{metric.label} ({metric.unit})" if metric.unit else metric.label
+    for row in report.rows:
+        time, error = row.spreads.get("step_time"), row.spreads.get(metric.name)
+        if time is not None and error is not None:
+            ends = error.low, error.median, error.high
+            if metric.direction == "high":
+                ends = 1 - error.high, 1 - error.median, 1 - error.low
+            marks.append(ParetoPoint(row.label, (time.low, time.median, time.high), ends, row.optimal))
+    if not marks:
         return None
     below = "  ·  ".join(report.measured[name] for name in ("machine", "seeds", "build"))
     title = f"Speed against error: {report.name}"
-    return draw_pareto(title, below, marks, "time per step (us), median", report.error.label)
+    error_text = f"1 - {text}" if metric.direction == "high" else text
+    return draw_pareto(title, below, marks, "time per step (us), median", error_text)
 
 
 def save_report(report: Report, directory: Path) -> list[Path]:
     """Writes table.csv, table.json and table.md, and pareto.png where there is something to draw."""
+    content = json.dumps(asdict(report), indent=1, allow_nan=False) + "\n"
     paths = [directory / f"table.{kind}" for kind in ("csv", "json", "md")]
-    for path, content in zip(paths, (_csv(report), _json(report), render_markdown(report)), strict=True):
-        write_text_atomically(path, content)
+    for path, text in zip(paths, (_csv(report), content, f"{render(report)}\n"), strict=True):
+        write_text_atomically(path, text)
     picture, figure = directory / "pareto.png", draw(report)
     if figure is None:
         picture.unlink(missing_ok=True)  # of an earlier call
@@ -113,55 +136,30 @@ def save_report(report: Report, directory: Path) -> list[Path]:
     return [*paths, picture]
 
 
-def number(value: float | None) -> str:
-    """A value with three significant digits; `-` for None."""
-    if value is None:
-        return "-"
-    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.2g}" if abs(value) < 0.1 else f"{value:.3g}"
+def _report(
+    name: str,
+    plan: StudyPlan,
+    kind: str,
+    columns: Sequence[str],
+    rows: Sequence[Row],
+    error: str | None,
+    records: Sequence[RunRecord],
+    remarks: Sequence[str],
+) -> Report:
+    machines = [record.machine for record in records if record.machine]
+    seeds = len({record.seed for record in records})
+    measured = _measured(machines, seeds) | {"pace": PACES[plan.pace]}
+    return Report(name, kind, columns, rows, error, measured, [*remarks, *_remarks(machines)])
 
 
-def align(rows: Sequence[Sequence[str]], sides: str = "") -> str:
-    """Rows of cells as lines with aligned columns.
-
-    Args:
-        sides: `<` or `>` for each column; default: the first to the left, the others to the right.
-    """
-    columns = list(zip(*rows, strict=True))
-    sides = sides or "<" + ">" * (len(columns) - 1)
-    widths = [max(map(len, column)) for column in columns]
-    lines = (
-        "  ".join(f"{cell:{side}{width}}" for cell, side, width in zip(row, sides, widths, strict=True))
-        for row in rows
-    )
-    return "\n".join(line.rstrip() for line in lines)
-
-
-def _cells(report: Report, best: str, other: str) -> list[list[str]]:
-    """Headings and rows; `best` and `other` are the formats of optimal and other names."""
-    names = [name for name in COLUMNS[report.kind] if any(name in row.spreads for row in report.rows)]
-    shown = report.error is None or report.error.quantity in names
-    own = [] if shown or report.error is None else [report.error.name]
-    table = [[other.format(""), "runs", "steps", *(HEADINGS[name] for name in names), *own]]
-    for row in report.rows:
-        name = (best if row.optimal else other).format(label(row.row, row.varied))
-        runs = f"{row.runs}" + (f", {row.failed} failed" if row.failed else "")
-        base = report.rows[0] if report.kind == "differences" and row is not report.rows[0] else None
-        cells = [_cell(row.spreads.get(each), report.kind, base and base.spreads.get(each)) for each in names]
-        table.append(
-            [name, runs, f"{row.steps:.0f}", *cells, *([_cell(row.error, report.kind)] if own else [])]
-        )
-    return table
-
-
-def _cell(found: Spread | None, kind: str, base: Spread | None = None) -> str:
+def _cell(found: Spread | None, kind: str, base: Spread | None) -> str:
     if found is None:
         return "-"
-    several = sum(value is not None for value in found.values) > 1
-    text = number(found.mean if kind == "means" else found.median)
-    if kind == "means" and found.sd is not None:
-        text += f" ± {number(found.sd)}"
-    if several and found.worst is not None:
-        text += f" ({number(found.worst)})"
+    text = _number(found.mean if kind in MEANS else found.median)
+    if kind in MEANS and found.sd is not None:
+        text += f" ± {_number(found.sd)}"
+    if found.sd is not None and found.worst is not None:
+        text += f" ({_number(found.worst)})"
     if base is not None:
         change = found.median - base.median
         share = change / base.median if base.median else math.nan
@@ -169,39 +167,37 @@ def _cell(found: Spread | None, kind: str, base: Spread | None = None) -> str:
     return text
 
 
-def _notes(report: Report, mark: str) -> list[str]:
-    kinds = {
-        "means": "Means ± standard deviation over runs (worst).",
-        "differences": "Medians over runs (worst), and the difference from the first row.",
-    }
-    notes = [kinds.get(report.kind, "Medians over runs (worst).")]
+def _number(value: float) -> str:
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.2g}" if abs(value) < 0.1 else f"{value:.3g}"
+
+
+def _note(report: Report) -> str:
+    kind = "Means ± standard deviation" if report.kind in MEANS else "Medians"
+    note = f"{kind} over runs (worst)" + ", and the difference from the first row" * (report.kind in COMPARED)
+    note += f"; {'; '.join(report.measured.values())}."
     if report.kind == "pareto":
-        optimal = "No row has an error to compare its speed with."
-        if report.error is not None:
-            optimal = f"{mark}no other row is at least as fast and as good by the {report.error.label}."
-        notes[0] += f" {optimal}"
-        notes.append(
-            "Whole run: simulation, sensing and scoring included, us a step. The first run of a row compiles "
-            "(worst), others fetch what they share."
+        note += (
+            "\nrun_time: with simulation, sensing and scoring. The first run of a row compiles (worst), the "
+            "others fetch what they share.\n"
         )
-    notes.append(f"{'; '.join(report.measured.values())}.")
-    return [*notes, *(f"{remark[0].upper()}{remark[1:]}." for remark in report.remarks)]
+        if report.error is None:
+            return note + "No row has an error to compare its speed with."
+        note += f"Bold: no other row is at least as fast and as good by {METRICS[report.error].label}."
+    return note
 
 
-def _measured(records: Sequence[RunRecord], pace: str) -> dict[str, str]:
+def _measured(machines: Sequence[Machine], seeds: int) -> dict[str, str]:
     """The conditions of a measurement of speed, by name."""
-    machines = [record.machine for record in records if record.machine]
-    seeds = len({record.seed for record in records})
 
-    def every(what: Callable[[Machine], str]) -> str:
-        return " and ".join(dict.fromkeys(map(what, machines))) or "unknown"
+    def every(texts: Sequence[str]) -> str:
+        return " and ".join(dict.fromkeys(texts)) or "unknown"
 
+    versions = [", ".join(f"{name} {value}" for name, value in each.versions.items()) for each in machines]
     return {
-        "machine": every(_machine_text),
-        "versions": every(lambda each: ", ".join(f"{name} {value}" for name, value in each.versions.items())),
-        "build": f"build {every(lambda each: each.build)}",
+        "machine": every([_machine_text(each) for each in machines]),
+        "versions": every(versions),
+        "build": f"build {every([each.build for each in machines])}",
         "seeds": f"{seeds} seed{'s' if seeds != 1 else ''}",
-        "pace": PACES[pace],
     }
 
 
@@ -212,9 +208,8 @@ def _machine_text(machine: Machine) -> str:
     return f"{machine.processor}, {os.cpu_count()} cores, {at_once}"
 
 
-def _remarks(records: Sequence[RunRecord]) -> list[str]:
+def _remarks(machines: Sequence[Machine]) -> list[str]:
     """What impairs a comparison of the records: sentences."""
-    machines = [record.machine for record in records if record.machine]
     builds, processors = {each.build for each in machines}, {each.processor for each in machines}
     found = []
     if len(builds) > 1:
@@ -241,38 +236,17 @@ def _kept(rows: Sequence[Row], limit: float | None) -> list[str]:
     return [f"{kept} of {len(others)} rows ({kept / len(others):.0%}) end at an ATE of {most:.3g} m or less"]
 
 
-def _ends(found: Spread) -> tuple[float, float, float]:
-    return found.low, found.median, found.high
-
-
 def _csv(report: Report) -> str:
-    names = list(dict.fromkeys(name for row in report.rows for name in row.spreads))
-    keys = list(dict.fromkeys(key for row in report.rows for key in row.varied))
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    parts = ("mean", "sd", "median", "low", "high", "worst")
-    heads = [f"{name}_{part}" for name in ["error", *names] for part in parts]
-    writer.writerow(["row", *keys, "runs", "failed", "steps", "optimal", *heads])
+    lines = []
     for row in report.rows:
-        spreads = [row.error, *(row.spreads.get(name) for name in names)]
-        cells = [getattr(each, part) if each else None for each in spreads for part in parts]
-        chosen = [_plain(row.varied[key]) if key in row.varied else "" for key in keys]
-        start = [row.row, *chosen, row.runs, row.failed, row.steps, int(row.optimal)]
-        writer.writerow([*start, *("" if cell is None else repr(cell) for cell in cells)])
+        cells = {name: getattr(row, name) for name in ("row", "runs", "failed", "steps")}
+        cells |= {key: plain(value) for key, value in row.varied.items()} | {"optimal": int(row.optimal)}
+        for name, found in row.spreads.items():
+            parts = {f"{name}_{part}": value for part, value in asdict(found).items() if part != "values"}
+            cells |= parts
+        lines.append(cells)
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(dict.fromkeys(chain.from_iterable(lines))), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(lines)
     return text.getvalue()
-
-
-def _json(report: Report) -> str:
-    rows = [
-        row._asdict()
-        | {"spreads": {name: each._asdict() for name, each in row.spreads.items()}}
-        | {"error": row.error and row.error._asdict()}
-        for row in report.rows
-    ]
-    error = report.error and {"name": report.error.name, "label": report.error.label}
-    content = report._asdict() | {"rows": rows, "error": error, "remarks": list(report.remarks)}
-    return json.dumps(content, indent=1, allow_nan=False) + "\n"
-
-
-def _plain(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value)

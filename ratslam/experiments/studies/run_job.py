@@ -7,8 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
-from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -17,15 +16,16 @@ from evaluation.artifacts.grid_npz import read_grid
 from evaluation.metrics.energy_metric import read_relations
 from evaluation.metrics.grid_error import MAIN_CONVENTION
 from evaluation.metrics.grid_score import score_grid
-from evaluation.metrics.metric import Quantity
+from evaluation.metrics.metric import Finding, Quantity
 from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.scorecard import score_run
 from ratslam.config.run_config import RunConfig
 from ratslam.core.session import CHUNK, Session
-from ratslam.experiments.studies.environment import machine, other_load, peak_memory
-from ratslam.experiments.studies.fidelity import compare_with_tier
-from ratslam.experiments.studies.records import RunRecord, Timing
+from ratslam.experiments.studies.machine import machine, peak_memory, reset_peak_memory, watch_load
+from ratslam.experiments.studies.metrics import quantity
+from ratslam.experiments.studies.records import RunRecord, record_of
 from ratslam.experiments.studies.study import Job
+from ratslam.experiments.studies.tiers import compare_with_tier
 from ratslam.experiments.studies.timing import Stopwatch
 from ratslam.pipeline.artifacts import true_grid
 from ratslam.pipeline.online_error import OnlineErrorLog
@@ -44,66 +44,46 @@ SAME_PLACE = 2.5
 
 def run_job(job: Job) -> RunRecord:
     """Runs a job in this process. An `InputError` is recorded, so that the study continues."""
-    blank = RunRecord(
-        hash=job.hash, seed=job.seed, copy_number=job.copy_number, row=job.row, varied=job.varied
-    )
-    with other_load() as load:
-        try:
-            with _precision(job.config.session.precision), peak_memory() as memory:
-                found = _play(job)
-        except InputError as error:
-            return blank.model_copy(update={"error": str(error), "machine": machine()})
-        here = machine().model_copy(update={"other_load": load()})
-    return blank.model_copy(update=found | {"memory": memory(), "machine": here})
+    load = watch_load()
+    reset_peak_memory()
+    try:
+        with _precision(job.config.session.precision):
+            found = _play(job)
+    except InputError as error:
+        return record_of(job, str(error), machine())
+    measured = found["measured"] | {"memory": peak_memory()}
+    here = machine().model_copy(update={"other_load": load()})
+    return record_of(job).model_copy(update=found | {"measured": measured, "machine": here})
 
 
-def run_job_alone(task: tuple[Job, Path]) -> RunRecord:
-    """Runs a job in a fresh process, with a cache of compiled kernels in the given folder."""
-    job, kernels = task
-    jax.config.update("jax_compilation_cache_dir", str(kernels))
+def run_job_alone(kernels: Path, job: Job) -> RunRecord:
+    """Runs a job in a fresh process; compiled kernels are kept in the given folder for its configuration."""
+    jax.config.update("jax_compilation_cache_dir", str(kernels / job.hash))
     return run_job(job)
-
-
-class _Steps(NamedTuple):
-    """Arrays over the steps of a session, as `Run` has them, and whether the pose was lost."""
-
-    time: np.ndarray
-    odometry: np.ndarray
-    truth: np.ndarray
-    online: np.ndarray
-    place: np.ndarray
-    lost: np.ndarray
 
 
 def _play(job: Job) -> dict[str, Any]:
     """The fields of a record that follow from playing a job's configuration."""
-    began, config = perf_counter(), job.config
+    watch, config = Stopwatch(), job.config
     relations = read_relations(config.score.relations) if config.score.relations else None
     with open_observations(config) as (config, source):
         extra: dict[str, Quantity] = {}
         if job.reference_tier is not None:
             source = load_into_memory(source)
-            extra = compare_with_tier(config, source, perf_counter() - began, job.reference_tier)
+            extra = compare_with_tier(config, source, watch.elapsed(), job.reference_tier)
         if job.copy_number:
             source = _perturbed(source, config, job.copy_number)
-        watch, present = Stopwatch(), OnlineErrorLog()
-        with watch.preparing():
+        with watch.taking(0):
             session = build_session(config, source, job.ablation)
-        steps = _take(session, source, job.pace, watch, present)
-        with watch.finishing():
-            final = session.map.trajectory()
-        run = _run(session, steps, final)
-        card = score_run(
-            run._replace(online_error=np.array(present.errors)),
-            source.name,
-            exm=config.score.experience_metric,
-            relations=relations,
-        )
-        cell = config.pose_cells.cell_size
-        extra |= _closures(session, steps, cell) | _anchored(steps, final) | _chart(session, source)
-    timing = Timing(pace=job.pace, **watch.summary(), total_s=perf_counter() - began)
-    quantities = card.quantities | extra
-    return {"steps": len(steps.time), "source": source.digest, "quantities": quantities, "timing": timing}
+        run, lost = _take_steps(session, source, job.pace, watch)
+        exm = config.score.experience_metric
+        quantities = score_run(run, source.name, exm=exm, relations=relations).quantities
+        quantities |= quantity("recognition_error", recognition_error(quantities)) | extra
+        quantities |= _closures(session, run.truth, config.pose_cells.cell_size)
+        quantities |= quantity("lost_share", Finding(lost)) | _anchored(run) | _grid_map(session, source)
+    return {
+        "steps": len(run.time), "source": source.digest, "quantities": quantities, "measured": watch.times(),
+    }  # fmt: skip
 
 
 def _perturbed(source: Source, config: RunConfig, copy_number: int) -> InMemorySource:
@@ -114,80 +94,74 @@ def _perturbed(source: Source, config: RunConfig, copy_number: int) -> InMemoryS
     return perturb(source, copy_number)
 
 
-def _take(session: Session, source: Source, pace: str, watch: Stopwatch, present: OnlineErrorLog) -> _Steps:
-    time, motion, truth, online, places, lost = [], [], [], [], [], []
-    rows = read_observations(source)
+def _take_steps(session: Session, source: Source, pace: str, watch: Stopwatch) -> tuple[RunArrays, float]:
+    """The session as arrays, as `evaluation.artifacts.run_directory.read_run` reads one from its files, and
+    the share of steps with a lost pose."""
+    time, motion, true, estimates = [], [], [], []
+    rows, present = read_observations(source), OnlineErrorLog()
     while chunk := list(islice(rows, CHUNK)):
-        steps = []
         for part in [chunk] if pace == "replay" else [[row] for row in chunk]:
             with watch.taking(len(part)):
-                steps += list(session.replay([reading for _, reading in part]))
+                estimates += list(session.replay([reading for _, reading in part]))
         time += [float(sample.time) for sample, _ in chunk]
         motion += [np.asarray(reading.odometry[:3], float) for _, reading in chunk]
-        truth += [np.full(3, np.nan) if sample.truth is None else sample.truth for sample, _ in chunk]
-        online += [step.pose for step in steps]
-        places += [int(step.estimate.place) for step in steps]
-        lost += [bool(step.estimate.lost) for step in steps]
-        present.update(session, truth)
+        true += [np.full(3, np.nan) if sample.truth is None else sample.truth for sample, _ in chunk]
+        present.update(session, true)
     if not time:
         raise InputError(source.name, "no samples", "a session")
-    every = np.array(time), integrate(np.array(motion)), np.array(truth), np.array(online)
-    return _Steps(*every, np.array(places), np.array(lost))
-
-
-def _run(session: Session, steps: _Steps, final: np.ndarray) -> RunArrays:
-    """The session as arrays, as `evaluation.artifacts.run_directory.read_run` reads one from its files."""
-    graph = session.map.graph()
+    final, graph, truth = session.map.trajectory(), session.map.graph(), np.array(true)
     nodes = np.array([[row["x"], row["y"], row["heading"]] for _, row in sorted(graph.nodes(data=True))])
-    nodes = nodes.reshape(-1, 3)
-    place = np.where(steps.place < len(nodes), steps.place, -1)
-    return RunArrays(
-        time=steps.time,
-        truth=steps.truth if np.isfinite(steps.truth).all(axis=1).any() else None,
-        online=steps.online,
+    place = np.array([int(step.estimate.place) for step in estimates])
+    place = np.where(place < len(nodes), place, -1)
+    run = RunArrays(
+        time=np.array(time),
+        truth=truth if np.isfinite(truth).all(axis=1).any() else None,
+        online=np.array([step.pose for step in estimates]),
         final=final,
-        odometry=steps.odometry,
+        odometry=integrate(np.array(motion)),
         experience=place,
         created=np.array([int(np.argmax(place == node)) for node in range(len(nodes))], int),
-        nodes=nodes,
+        nodes=nodes.reshape(-1, 3),
         links=np.array(list(graph.edges), int).reshape(-1, 2),
+        online_error=np.array(present.errors),
+    )
+    return run, float(np.mean([bool(step.estimate.lost) for step in estimates]))
+
+
+def recognition_error(quantities: dict[str, Quantity]) -> Finding:
+    """1 - ARR x ARCR; ARCR is undefined where ARR is 0."""
+    arr, arcr = (quantities[name].value for name in ("exm_arr", "exm_arcr_strict"))
+    if arr is None or (arr and arcr is None):
+        return Finding(np.nan)
+    return Finding(1 - arr * (arcr or 0.0))
+
+
+def _closures(session: Session, truth: np.ndarray | None, cell: float) -> dict[str, Quantity]:
+    """Number of loop closures and of false ones."""
+    closures, false = session.map.closures(), Finding(np.nan)
+    if truth is not None:
+        apart = np.hypot(*(truth[closures[:, 0]] - truth[closures[:, 1]])[:, :2].T)
+        false = Finding(int((apart > SAME_PLACE * cell).sum()))
+    return quantity("closures", Finding(len(closures))) | quantity("false_closures", false)
+
+
+def _anchored(run: RunArrays) -> dict[str, Quantity]:
+    """Mean position errors where the first true pose is given and paths are not aligned."""
+    truth = run.truth
+    if truth is None or not np.isfinite(truth).all():
+        return {}
+    # All backends take the first step from odometry, so its error is not theirs.
+    start = compose(truth[0], inverse(run.odometry[0]))
+    online, final, odometry = (
+        float(np.hypot(*(compose(start, path) - truth)[:, :2].T).mean())
+        for path in (run.online, run.final, run.odometry)
+    )
+    return quantity("error_online", Finding(online, odometry)) | quantity(
+        "error_final", Finding(final, odometry)
     )
 
 
-def _closures(session: Session, steps: _Steps, cell: float) -> dict[str, Quantity]:
-    """Number of loop closures, of false ones, and share of steps with a lost pose."""
-    closures, truth = session.map.closures(), steps.truth
-    false = None
-    if np.isfinite(truth).all(axis=1).any():
-        apart = np.hypot(*(truth[closures[:, 0]] - truth[closures[:, 1]])[:, :2].T)
-        false = int((apart > SAME_PLACE * cell).sum())
-    return {
-        "closures": Quantity(label="loop closures", value=len(closures), unit=""),
-        "false_closures": Quantity(label="false loop closures", value=false, unit=""),
-        "lost_share": Quantity(label="share of steps lost", value=float(steps.lost.mean()), unit=""),
-    }
-
-
-def _anchored(steps: _Steps, final: np.ndarray) -> dict[str, Quantity]:
-    """Mean position errors where the first true pose is given and paths are not aligned."""
-    if not np.isfinite(steps.truth).all():
-        return {}
-    # All backends take the first step from odometry, so its error is not theirs.
-    start = compose(steps.truth[0], inverse(steps.odometry[0]))
-
-    def error(path: np.ndarray) -> float:
-        return float(np.hypot(*(compose(start, path) - steps.truth)[:, :2].T).mean())
-
-    odometry = error(steps.odometry)
-    return {
-        f"error_{name}": Quantity(
-            label=f"position error, {name}", value=error(path), unit="m", odometry=odometry
-        )
-        for name, path in (("online", steps.online), ("final", final))
-    }
-
-
-def _chart(session: Session, source: Source) -> dict[str, Quantity]:
+def _grid_map(session: Session, source: Source) -> dict[str, Quantity]:
     """Scores of a grid map of a known arena."""
     write, arena = session.map.files().get("grid.npz"), source.info.arena
     if write is None or arena is None:
@@ -199,10 +173,8 @@ def _chart(session: Session, source: Source) -> dict[str, Quantity]:
         grid = read_grid(folder / "grid.npz")
         found = score_grid(grid, true_grid(read_arena(folder / "arena.txt"), grid))
     error = found.under(MAIN_CONVENTION)
-    beside = f"0.3 everywhere {error.prior:.3g}, the best constant {error.best:.3g}"
-    return {
-        "map_error": Quantity(label="map error, eq. 6", value=error.error, unit="", note=beside)
-    } | found.quantities
+    note = f"0.3 everywhere {error.prior:.3g}, the best constant {error.best:.3g}"
+    return quantity("map_error", Finding(error.error, note=note)) | found.quantities
 
 
 @contextmanager

@@ -6,31 +6,31 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, NonNegativeInt, field_validator, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, NonNegativeInt, field_validator, model_validator
 
-from ratslam.experiments.studies.metrics import COLUMNS, DIRECTIONS
+from evaluation.metrics.metric import Direction
+from ratslam.experiments.studies.metrics import COLUMNS, METRICS
 from ratslam.keyframes.config import FULL, Ablation
 from tactile.base.config import Settings
 
 
 def _known(name: str) -> str:
-    if name not in DIRECTIONS:
-        near = get_close_matches(name, DIRECTIONS, n=1)
+    if name not in METRICS:
+        near = get_close_matches(name, METRICS, n=1)
         cure = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(COLUMNS['means'])} and others"
         raise ValueError(f"no quantity of that name; {cure}")
     return name
 
 
 def _directed(name: str) -> str:
-    if DIRECTIONS[name] is None:
+    if METRICS[name].direction is None:
         raise ValueError("neither large nor small is better; list it in minimise or maximise")
     return name
 
 
 Values = Annotated[tuple[Any, ...], Field(min_length=1)]
 Seeds = Annotated[tuple[NonNegativeInt, ...], Field(min_length=1)]
-MOST_COPIES = 10_000
-Copies = Annotated[int, Field(ge=0, le=MOST_COPIES)]
+Copies = Annotated[int, Field(ge=0, le=10_000)]
 Known = Annotated[str, AfterValidator(_known)]
 Directed = Annotated[Known, AfterValidator(_directed)]
 
@@ -96,11 +96,26 @@ class SearchPlan(Settings):
             raise ValueError("a quantity named twice in objectives, minimise and maximise")
         return self
 
-    def directions(self) -> dict[str, Literal["minimize", "maximize"]]:
-        """Optuna's direction of each objective."""
-        high = {*self.maximise, *(name for name in self.objectives if DIRECTIONS[name] == "high")}
-        every = (*self.objectives, *self.minimise, *self.maximise)
-        return {name: "maximize" if name in high else "minimize" for name in every}
+    def directions(self) -> dict[str, Direction]:
+        """The objectives, and which values of each are better."""
+        given = {name: METRICS[name].direction for name in self.objectives}
+        return given | dict.fromkeys(self.minimise, "low") | dict.fromkeys(self.maximise, "high")
+
+
+class RowPlan(Settings):
+    """A row: settings by key path, and beside them two keys of its own."""
+
+    model_config = ConfigDict(extra="allow")
+
+    copies: Copies | None = None
+    """Number of perturbed copies in place of the study's."""
+    ablation: Ablation = FULL
+    """Parts of the keyframe map that are on."""
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The settings alone."""
+        return self.model_extra or {}
 
 
 class StudyPlan(Settings):
@@ -110,7 +125,7 @@ class StudyPlan(Settings):
     """Configuration that all runs start from; a relative path starts at the study file."""
     set: dict[str, Any] = Field(default_factory=dict)
     """Settings of all runs, by key path. Relative paths in them start at the base, as its own do."""
-    rows: dict[str, dict[str, Any] | None] = Field(default_factory=dict)
+    rows: dict[str, RowPlan | None] = Field(default_factory=dict)
     """Named sets of settings to compare, by key path. A row may also hold `copies`, in place of the study's,
     and `ablation`: parts of the keyframe map that are off, such as {verify: false}."""
     vary: dict[str, Values] = Field(default_factory=dict)
@@ -121,9 +136,10 @@ class StudyPlan(Settings):
     """Number of perturbed copies of each session to run in place of the session itself; 0: the session."""
     pace: Literal["replay", "live"] = "replay"
     """`live`: steps are taken and timed one at a time; `replay`: a chunk at a time."""
-    report: Literal["means", "medians", "differences", "tiers", "pareto"] = "means"
-    """The table: means over seeds, medians over seeds, differences from the first row, cost of simulation, or
-    speed against error; for the last, runs are measured one at a time in processes of their own."""
+    report: Literal["means", "medians", "differences", "costs", "tiers", "pareto"] = "means"
+    """The table: means over seeds, medians over seeds, differences from the first row (of errors; of times),
+    cost of simulation, or speed against error; for the last, runs are measured one at a time in processes of
+    their own."""
     limit: float | None = None
     """Largest final ATE of a row that counts as kept in `differences`, m; default 1.25 of the first row's."""
     reference_tier: Literal["kinematic", "quasistatic", "dynamic"] | None = None
@@ -141,30 +157,15 @@ class StudyPlan(Settings):
             raise ValueError("a seed given twice")
         return seeds
 
-    @field_validator("rows", mode="after")
-    @classmethod
-    def _beside_settings(cls, rows: dict[str, dict[str, Any] | None]) -> dict[str, dict[str, Any] | None]:
-        for name, row in rows.items():
-            copies, parts = (row or {}).get("copies", 0), (row or {}).get("ablation", {})
-            if type(copies) is not int or not 0 <= copies <= MOST_COPIES:
-                raise ValueError(
-                    f"copies {copies!r} of row {name!r} is not an integer from 0 to {MOST_COPIES}"
-                )
-            if not isinstance(parts, dict) or not set(parts) <= set(FULL._fields):
-                raise ValueError(f"ablation of row {name!r} has other parts than {', '.join(FULL._fields)}")
-            if not all(isinstance(on, bool) for on in parts.values()):
-                raise ValueError(f"ablation of row {name!r}: give true or false for each part")
-        return rows
-
     def every_seed(self) -> tuple[int, ...]:
         """The seeds themselves."""
         return tuple(range(self.seeds)) if isinstance(self.seeds, int) else self.seeds
 
-    def ablation(self, row: str) -> Ablation:
-        """Parts of the keyframe map that are on in a row."""
-        return Ablation(**(self.rows.get(row) or {}).get("ablation", {}))
+    def every_row(self) -> dict[str, RowPlan]:
+        """The rows; one without a name where the study has none."""
+        return {name: row or RowPlan() for name, row in (self.rows or {"": None}).items()}
 
-    def every_copy(self, row: str = "") -> tuple[int, ...]:
+    def every_copy(self, row: RowPlan) -> tuple[int, ...]:
         """Seeds of a row's perturbed copies; (0,): the session itself."""
-        copies = (self.rows.get(row) or {}).get("copies", self.copies)
+        copies = self.copies if row.copies is None else row.copies
         return tuple(range(1, copies + 1)) or (0,)

@@ -6,41 +6,35 @@ its choices, which follow from the sampler's seed and the earlier outcomes, and 
 
 from __future__ import annotations
 
-import json
 import statistics
 from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from ratslam.experiments.studies.executor import Executor
 from ratslam.experiments.studies.records import RunLog, RunRecord
-from ratslam.experiments.studies.report import align
 from ratslam.experiments.studies.schema import Parameter, SearchPlan
-from ratslam.experiments.studies.study import Job, Study, jobs_of, searched_variant
+from ratslam.experiments.studies.study import Job, Study, searched_jobs
 from ratslam.experiments.studies.study_runner import run_jobs
-from tactile.base.atomic_write import write_text_atomically
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 
 
-class Trial(NamedTuple):
-    """A parameter set that was tried.
+def search_plan(study: Study) -> SearchPlan:
+    """The study's `tune` section.
 
-    Attributes:
-        parameters: by key path. values: of the objectives; None if a run failed or lacks one.
-        optimal: no other trial is at least as good in all objectives and better in one.
+    Raises:
+        InputError: it has none.
     """
-
-    number: int
-    parameters: dict[str, Any]
-    values: dict[str, float] | None
-    optimal: bool
+    if study.plan.tune is None:
+        where = study.document.at_key(("tune",))
+        raise InputError(where, "missing", "the parameters and objectives of the search")
+    return study.plan.tune
 
 
 def search(
     study: Study, log: RunLog, executor: Executor, done: Callable[[RunRecord], object] | None = None
-) -> list[Trial]:
-    """Tries the study's number of parameter sets.
+) -> list[RunRecord]:
+    """Tries the study's number of parameter sets; returns their records, with the trial's number as row.
 
     Args:
         log, done: see `run_jobs`.
@@ -48,10 +42,7 @@ def search(
     Raises:
         InputError: the study has no `tune` section, or Optuna is missing.
     """
-    plan = study.plan.tune
-    if plan is None:
-        where = study.document.at_key(("tune",))
-        raise InputError(where, "missing", "the parameters and objectives of the search")
+    plan, found = search_plan(study), list[RunRecord]()
     try:
         import optuna
     except ImportError:
@@ -60,45 +51,22 @@ def search(
     verbosity = optuna.logging.get_verbosity()
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     try:
-        book = optuna.create_study(directions=list(plan.directions().values()))
+        high = [direction == "high" for direction in plan.directions().values()]
+        book = optuna.create_study(directions=["maximize" if each else "minimize" for each in high])
         for first in range(0, plan.trials, plan.batch):
-            asked = [
-                _ask(book, plan, number) for number in range(first, min(first + plan.batch, plan.trials))
-            ]
-            jobs = [_jobs(study, dict(trial.params)) for trial in asked]
+            numbers = range(first, min(first + plan.batch, plan.trials))
+            asked = [_ask(book, plan, number) for number in numbers]
+            jobs = [_jobs(study, number, trial) for number, trial in zip(numbers, asked, strict=True)]
             records = run_jobs([job for each in jobs for job in each], log, executor, done)
             for trial, each in zip(asked, jobs, strict=True):
-                values = _values(plan, [next(records) for _ in each])
+                own = [next(records) for _ in each]
+                values = _values(plan, own)
                 failed = {"state": optuna.trial.TrialState.FAIL} if values is None else {"values": values}
                 book.tell(trial, **failed)
-        return _trials(book, plan)
+                found += own
+        return found
     finally:
         optuna.logging.set_verbosity(verbosity)
-
-
-def render_trials(trials: Sequence[Trial]) -> str:
-    """The Pareto-optimal trials as plain text, the best by the first objective on top."""
-    best = [trial for trial in trials if trial.optimal and trial.values]
-    failed = sum(trial.values is None for trial in trials)
-    title = f"{len(trials)} trials, {len(best)} of them Pareto-optimal" + (
-        f", {failed} failed" * bool(failed)
-    )
-    if not best:
-        return title
-    rows = [["trial", *(best[0].values or {}), *best[0].parameters]]
-    for trial in sorted(best, key=lambda trial: list((trial.values or {}).values())):
-        cells = [*(trial.values or {}).values(), *trial.parameters.values()]
-        plain = [f"{cell:.4g}" if isinstance(cell, float) else str(cell) for cell in cells]
-        rows.append([f"{trial.number}", *plain])
-    return "\n".join([title, align(rows, ">" * len(rows[0]))])
-
-
-def save_trials(trials: Sequence[Trial], directory: Path) -> Path:
-    """Writes trials.json."""
-    path = directory / "trials.json"
-    content = json.dumps([trial._asdict() for trial in trials], indent=1, allow_nan=False)
-    write_text_atomically(path, content + "\n")
-    return path
 
 
 def _ask(book: Any, plan: SearchPlan, number: int) -> Any:
@@ -129,10 +97,10 @@ def _suggest(trial: Any, key: str, parameter: Parameter) -> None:
     suggest(key, parameter.low, parameter.high, log=parameter.log)
 
 
-def _jobs(study: Study, parameters: dict[str, Any]) -> list[Job]:
-    """The runs of a parameter set; none if its parameters contradict each other."""
+def _jobs(study: Study, number: int, trial: Any) -> list[Job]:
+    """The runs of a trial; none if its parameters contradict each other."""
     try:
-        return jobs_of(searched_variant(study, parameters), study.plan)
+        return [job._replace(row=f"trial {number}") for job in searched_jobs(study, dict(trial.params))]
     except InputError:
         return []
 
@@ -144,17 +112,3 @@ def _values(plan: SearchPlan, records: Sequence[RunRecord]) -> list[float] | Non
     if not records or any(len(column) < len(records) for column in known):
         return None
     return [statistics.fmean(column) for column in known]
-
-
-def _trials(book: Any, plan: SearchPlan) -> list[Trial]:
-    names, found = list(plan.directions()), book.get_trials(deepcopy=False)
-    best = {trial.number for trial in book.best_trials} if any(each.values for each in found) else set()
-    return [
-        Trial(
-            number=trial.number,
-            parameters=dict(trial.params),
-            values=dict(zip(names, trial.values, strict=True)) if trial.values else None,
-            optimal=trial.number in best,
-        )
-        for trial in found
-    ]

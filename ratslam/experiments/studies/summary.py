@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import json
 import statistics
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from ratslam.experiments.studies.metrics import DIRECTIONS, MEASURED, ErrorMetric
+from evaluation.metrics.metric import Direction
+from ratslam.experiments.studies.metrics import DEFAULT_ERRORS, MEASURED, METRICS
 from ratslam.experiments.studies.records import RunRecord
 
 DEAD_RECKONING = "dead reckoning"
 """Name of the row of raw odometry."""
 
 
-class Spread(NamedTuple):
+@dataclass(frozen=True)
+class Spread:
     """Statistics of a quantity over the runs of a row.
 
     Attributes:
@@ -33,13 +36,14 @@ class Spread(NamedTuple):
     worst: float | None
 
 
-class Row(NamedTuple):
+@dataclass(frozen=True)
+class Row:
     """One configuration of a study.
 
     Attributes:
         row, varied: name and combination. runs: number of runs with an outcome. failed: number of the others.
-        steps: median number of observations. spreads: by quantity, without those that no run has. error: of
-            the Pareto front. optimal: no other row is at least as fast and as good and better in one of both.
+        steps: median number of observations. spreads: by quantity, without those that no run has. optimal: no
+            other row is at least as fast and as good and better in one of both.
     """
 
     row: str
@@ -48,34 +52,55 @@ class Row(NamedTuple):
     failed: int
     steps: float
     spreads: dict[str, Spread]
-    error: Spread | None = None
     optimal: bool = False
 
+    @property
+    def label(self) -> str:
+        """Name and combination."""
+        return label(self.row, self.varied)
 
-def group_records(records: Sequence[RunRecord]) -> list[list[RunRecord]]:
-    """Records by row and combination, in their order."""
+
+def label(row: str, varied: dict[str, Any]) -> str:
+    """A row's name and combination, with the last part of each key where that is unambiguous."""
+    last = [key.rpartition(".")[2] for key in varied]
+    names = last if len(set(last)) == len(last) else list(varied)
+    parts = [f"{name}={plain(value)}" for name, value in zip(names, varied.values(), strict=True)]
+    return " ".join([row, *parts]).strip() or "as configured"
+
+
+def plain(value: Any) -> str:
+    """A setting's value as JSON, a text without quotes."""
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def summarise(records: Sequence[RunRecord], odometry: bool = False) -> list[Row]:
+    """A row for each name and combination, in their order; last that of raw odometry if asked for."""
     groups: dict[str, list[RunRecord]] = {}
     for record in records:
         groups.setdefault(json.dumps([record.row, record.varied]), []).append(record)
-    return list(groups.values())
+    rows = [_row(group) for group in groups.values()]
+    if odometry and groups:
+        rows.append(_row(next(iter(groups.values())), DEAD_RECKONING, odometry=True))
+    return rows
 
 
-def summarise(groups: Sequence[Sequence[RunRecord]], error: ErrorMetric | None = None) -> list[Row]:
-    """A row for each group. Only a row whose runs all have a time and an error can be optimal."""
-    rows = [_row(group, error) for group in groups]
-    costs = np.array([_cost(row) for row in rows]).reshape(-1, 2)
-    return [row._replace(optimal=bool(best)) for row, best in zip(rows, pareto_optimal(costs), strict=True)]
+def default_error(rows: Sequence[Row]) -> str | None:
+    """The first default error that most rows have in all of their runs; None if no row has any."""
+    counts = [
+        sum(name in row.spreads and None not in row.spreads[name].values for row in rows)
+        for name in DEFAULT_ERRORS
+    ]
+    return DEFAULT_ERRORS[counts.index(max(counts))] if any(counts) else None
 
 
-def odometry_row(group: Sequence[RunRecord]) -> Row:
-    """The quantities of raw odometry in a group's sessions, as a row."""
-    names = dict.fromkeys(name for record in group for name in record.quantities)
-    found = {
-        name: spread([each.quantities[name].odometry for each in group if name in each.quantities], name)
-        for name in names
-    }
-    spreads = {name: each for name, each in found.items() if each is not None}
-    return Row(DEAD_RECKONING, {}, len(group), 0, group[0].steps if group else 0, spreads)
+def mark_optimal(rows: Sequence[Row], objectives: Mapping[str, Direction], statistic: str) -> list[Row]:
+    """The rows with `optimal` set by the mean or median of each objective.
+
+    Only a row whose runs all have all objectives can be optimal.
+    """
+    costs = np.array([[_cost(row, each, objectives[each], statistic) for each in objectives] for row in rows])
+    best = pareto_optimal(costs.reshape(-1, len(objectives)))
+    return [replace(row, optimal=bool(each)) for row, each in zip(rows, best, strict=True)]
 
 
 def spread(values: Sequence[float | None], name: str) -> Spread | None:
@@ -84,7 +109,7 @@ def spread(values: Sequence[float | None], name: str) -> Spread | None:
     if not known:
         return None
     low, high = min(known), max(known)
-    worst = {"low": high, "high": low, None: None}[DIRECTIONS.get(name, "low")]
+    worst = {"low": high, "high": low, None: None}[METRICS[name].direction if name in METRICS else None]
     deviation = statistics.stdev(known) if len(known) > 1 else None
     middle = statistics.median(known)
     return Spread(tuple(values), statistics.fmean(known), deviation, middle, low, high, worst)
@@ -101,24 +126,28 @@ def pareto_optimal(costs: np.ndarray) -> np.ndarray:
     return known & ~(no_dearer & cheaper).any(axis=0)
 
 
-def _row(group: Sequence[RunRecord], error: ErrorMetric | None) -> Row:
+def _row(group: Sequence[RunRecord], name: str = "", odometry: bool = False) -> Row:
     fine = [record for record in group if record.error is None]
-    names = dict.fromkeys([*MEASURED, *(name for record in fine for name in record.quantities)])
-    found = {name: spread([record.value(name) for record in fine], name) for name in names}
+    names = dict.fromkeys([metric.name for metric in MEASURED])
+    names |= dict.fromkeys(each for record in fine for each in record.quantities)
+    values = {
+        each: [record.odometry(each) if odometry else record.value(each) for record in fine] for each in names
+    }
+    spreads = {each: spread(values[each], each) for each in names}
     return Row(
-        row=group[0].row,
-        varied=group[0].varied,
+        row=name or group[0].row,
+        varied={} if odometry else group[0].varied,
         runs=len(fine),
-        failed=len(group) - len(fine),
+        failed=0 if odometry else len(group) - len(fine),
         steps=statistics.median([record.steps for record in fine]) if fine else 0.0,
-        spreads={name: each for name, each in found.items() if each is not None},
-        error=spread([error.of(record) for record in fine], "error") if error else None,
+        spreads={each: found for each, found in spreads.items() if found is not None},
     )
 
 
-def _cost(row: Row) -> tuple[float, float]:
-    """Time per step and error; NaN where a run lacks one."""
-    time, error = row.spreads.get("step_time"), row.error
-    if row.failed or time is None or error is None or None in (*time.values, *error.values):
-        return np.nan, np.nan
-    return time.median, error.median
+def _cost(row: Row, name: str, direction: Direction, statistic: str) -> float:
+    """An objective of a row, low values better; NaN where a run lacks it."""
+    found = row.spreads.get(name)
+    if row.failed or found is None or None in found.values:
+        return np.nan
+    value: float = getattr(found, statistic)
+    return -value if direction == "high" else value

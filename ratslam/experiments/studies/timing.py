@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
 from time import perf_counter
-from typing import Any
 
 import jax
 import numpy as np
@@ -16,7 +15,7 @@ COMPILED = "/jax/core/compile/backend_compile_duration"
 
 
 class Stopwatch:
-    """Measures calls of one or more steps.
+    """Measures a run and its calls of one or more steps.
 
     Args:
         compilations: gives the number of kernels compiled so far; None: by this process.
@@ -26,42 +25,31 @@ class Stopwatch:
         self._compilations = compilations or _counter().__len__
         self._steps: list[tuple[int, float]] = []  # number of steps, duration in s
         self._compiling: list[tuple[int, float]] = []
-        self._preparing = self._finishing = 0.0
-        self._first = self._compilations()
+        self._began = perf_counter()
 
-    @contextmanager
-    def preparing(self) -> Iterator[None]:
-        """Surrounds the work before the first step."""
-        began = perf_counter()
-        yield
-        self._preparing += perf_counter() - began
+    def elapsed(self) -> float:
+        """Time since the start, s."""
+        return perf_counter() - self._began
 
     @contextmanager
     def taking(self, steps: int) -> Iterator[None]:
-        """Surrounds the given number of steps."""
+        """Surrounds the given number of steps; of none, what is prepared before the first."""
         before, began = self._compilations(), perf_counter()
         yield
         taken = steps, perf_counter() - began
-        (self._compiling if self._compilations() > before else self._steps).append(taken)
+        (self._compiling if not steps or self._compilations() > before else self._steps).append(taken)
 
-    @contextmanager
-    def finishing(self) -> Iterator[None]:
-        """Surrounds the work after the last step."""
-        began = perf_counter()
-        yield
-        self._finishing += perf_counter() - began
-
-    def summary(self) -> dict[str, Any]:
-        """Fields of `ratslam.experiments.studies.records.Timing`."""
+    def times(self) -> dict[str, float | None]:
+        """The quantities of time in `metrics.MEASURED`; None where too few steps were taken."""
         each = np.array([seconds / steps for steps, seconds in self._steps])
         usual = float(np.median(each)) if len(each) else None
-        extra = sum(seconds - steps * (usual or 0.0) for steps, seconds in self._compiling)
+        count = sum(steps for steps, _ in [*self._steps, *self._compiling])
+        compiling = max(sum(seconds - steps * (usual or 0.0) for steps, seconds in self._compiling), 0.0)
         return {
-            "median_us": None if usual is None else 1e6 * usual,
-            "p99_us": float(1e6 * np.quantile(each, 0.99)) if len(each) else None,
-            "compile_s": self._preparing + max(extra, 0.0),
-            "compilations": self._compilations() - self._first,
-            "finish_s": self._finishing,
+            "step_time": None if usual is None else 1e6 * usual,
+            "step_time_p99": float(1e6 * np.quantile(each, 0.99)) if len(each) else None,
+            "run_time": 1e6 * max(self.elapsed() - compiling, 0.0) / count if count else None,
+            "compile_time": compiling,
         }
 
 

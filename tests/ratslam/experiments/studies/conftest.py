@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from evaluation.metrics.metric import Quantity
-from ratslam.experiments.studies.environment import machine
-from ratslam.experiments.studies.records import RunRecord, Timing
+from ratslam.experiments.studies.machine import machine
+from ratslam.experiments.studies.records import RunRecord
 from ratslam.experiments.studies.study import Job
 
 TINY = {
@@ -29,12 +29,10 @@ def record(row="", seed=0, time=100.0, error=None, varied=None, odometry=None, h
     quantities = {
         name: Quantity(label=name, value=value, unit="", odometry=odometry) for name, value in values.items()
     }
-    timing = Timing(
-        pace="live", median_us=time, p99_us=2 * time, compile_s=1.0, compilations=1, finish_s=0.0, total_s=3.0
-    )
+    measured = {"step_time": time, "step_time_p99": 2 * time, "run_time": 3 * time, "compile_time": 1.0}
     return RunRecord(
         hash=hash or row or "none", seed=seed, row=row, varied=varied or {}, steps=10, quantities=quantities,
-        timing=timing, error=error, machine=machine(), memory=400.0,
+        measured=measured | {"memory": 400.0}, error=error, machine=machine(),
     )  # fmt: skip
 
 

@@ -12,21 +12,18 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from ratslam.cli import main
-from ratslam.cli.studies import PRESETS as NAMES
+from ratslam.cli.studies import PRESETS
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import load, override
-from ratslam.experiments.studies.fidelity import image_difference, shortened
 from ratslam.experiments.studies.presets import (
     METHODS,
     PARTS,
-    PRESETS,
     TIERS,
-    PresetOptions,
     preset_study,
     variations,
 )
 from ratslam.experiments.studies.records import RunLog
-from ratslam.experiments.studies.study import list_jobs
+from ratslam.experiments.studies.tiers import image_difference, shortened
 from tactile.base.errors import InputError
 
 ROOT = Path(__file__).parents[4]
@@ -41,18 +38,14 @@ VIEWS = arrays.arrays(float, (5, 3, 6, 1), elements=st.sampled_from([0.0, 0.02, 
 
 
 def preset(name, path=SQUARE, *overrides, **options):
-    return preset_study(name, path, overrides, PresetOptions(**options))
-
-
-def test_the_program_knows_all_presets():
-    assert set(NAMES) == set(PRESETS)
+    return preset_study(name, path, overrides, **options)
 
 
 @pytest.mark.parametrize("name", sorted(set(PRESETS) - {"tiers"}))
 def test_a_preset_keeps_the_seed_of_the_configuration_and_takes_overrides(name):
     study, _ = preset(name, SQUARE, "session.seed=7", "recall.modes=3")
     assert study.name == f"square-{name}"
-    jobs = list_jobs(study)
+    jobs = study.jobs
     assert {job.seed for job in jobs} == ({0, 1, 2} if name == "pareto" else {7})
     assert {job.config.recall.modes for job in jobs} & {3}
     if name != "vary":
@@ -61,11 +54,11 @@ def test_a_preset_keeps_the_seed_of_the_configuration_and_takes_overrides(name):
 
 def test_every_part_is_turned_off_in_a_row_of_its_own():
     study, _ = preset("ablate", SQUARE)
-    jobs = list_jobs(study)
+    jobs = study.jobs
     assert [job.row for job in jobs] == list(PARTS)
     assert len({job.key for job in jobs}) == len(PARTS)
     assert "classic" in {job.config.backend for job in jobs}
-    assert len(list_jobs(preset("ablate", SQUARE, "copies=3")[0])) == 3 * len(PARTS)
+    assert len(preset("ablate", SQUARE, "copies=3")[0].jobs) == 3 * len(PARTS)
 
 
 def test_every_number_is_varied_down_and_up_as_far_as_it_goes():
@@ -76,15 +69,15 @@ def test_every_number_is_varied_down_and_up_as_far_as_it_goes():
     assert names.count("recall.local") == 1  # a share: it cannot exceed 1
     assert ("recall.modes", 6) in found
     assert ("recall.modes", 10) in found
-    assert len(list_jobs(preset("vary")[0])) == 1 + len(variations(load(SQUARE), 0.2))
+    assert len(preset("vary")[0].jobs) == 1 + len(variations(load(SQUARE), 0.2))
     with pytest.raises(InputError, match="--by"):
         preset("vary", by=1.0)
 
 
 def test_backends_are_recall_or_the_configured_one_and_the_grid():
-    assert [job.config.backend for job in list_jobs(preset("backends", MAZE)[0])] == ["recall", "grid"]
+    assert [job.config.backend for job in preset("backends", MAZE)[0].jobs] == ["recall", "grid"]
     configured, _ = preset("backends", ROOT / "configs" / "create_arena.yaml")
-    assert [job.config.backend for job in list_jobs(configured)] == ["recall", "grid"]
+    assert [job.config.backend for job in configured.jobs] == ["recall", "grid"]
 
 
 def test_perturbed_copies_are_run_beside_the_session(tmp_path, capsys):

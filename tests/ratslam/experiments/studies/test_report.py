@@ -11,10 +11,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ratslam.experiments.studies.metrics import COLUMNS, DIRECTIONS, HEADINGS, default_error, find_error
-from ratslam.experiments.studies.report import label, make_report, render_markdown, render_text, save_report
+from ratslam.experiments.studies.metrics import COLUMNS, METRICS, find_error
+from ratslam.experiments.studies.report import make_report, render, save_report
+from ratslam.experiments.studies.run_job import recognition_error
 from ratslam.experiments.studies.schema import StudyPlan
-from ratslam.experiments.studies.summary import group_records, pareto_optimal, spread, summarise
+from ratslam.experiments.studies.summary import (
+    default_error,
+    label,
+    mark_optimal,
+    pareto_optimal,
+    spread,
+    summarise,
+)
 from tactile.base.errors import InputError
 from tests.ratslam.experiments.studies.conftest import record
 
@@ -63,19 +71,22 @@ def test_statistics_are_of_the_values_there_are(values, name):
     assert found.worst == {"energy_all": max(known), "exm_arr": min(known), "links": None}[name]
 
 
-def test_every_column_has_a_heading_and_a_direction():
-    columns = {name for names in COLUMNS.values() for name in names}
-    assert columns <= set(HEADINGS)
-    assert columns <= set(DIRECTIONS)
+def test_every_column_is_a_quantity():
+    assert {name for names in COLUMNS.values() for name in names} <= set(METRICS)
 
 
-def test_errors_are_small_if_good():
-    result = record(exm_arr=0.5, exm_arcr_strict=0.8, energy_all=0.1)
-    assert find_error("em").of(result) == find_error("energy_all").of(result) == 0.1
-    assert find_error("arcr").of(result) == pytest.approx(0.2)
-    assert find_error("exm").of(result) == pytest.approx(0.6)
-    assert find_error("ate").of(result) is None
-    assert find_error("exm").of(record(exm_arr=0.0)) == 1
+def test_an_error_has_a_short_and_a_full_name():
+    assert find_error("em") == find_error("energy_all") == "energy_all"
+    assert find_error("exm") == "recognition_error"
+
+
+def test_recognition_is_without_error_if_all_steps_and_all_relocalisations_are():
+    def error(**values):
+        return recognition_error(record(**values).quantities).value
+
+    assert error(exm_arr=0.5, exm_arcr_strict=0.8) == pytest.approx(0.6)
+    assert error(exm_arr=0.0, exm_arcr_strict=None) == 1
+    assert np.isnan(error(exm_arr=0.5, exm_arcr_strict=None))
 
 
 @pytest.mark.parametrize("name", ["atee", "step_time", "experiences", ""])
@@ -87,11 +98,16 @@ def test_an_unknown_error_is_refused(name):
 
 def test_the_default_error_is_the_first_that_all_rows_have():
     rat, grid, none = record(energy_all=1.0, ate_final=1.0), record(ate_final=1.0, map_error=0.2), record()
-    assert default_error([[rat], [rat]]).name == "em"
-    assert default_error([[rat], [grid]]).name == "ate"
-    assert default_error([[rat, none], [grid]]).name == "ate"
-    assert default_error([[none]]) is None
-    assert default_error([]) is None
+
+    def default(*groups):
+        named = [each.model_copy(update={"row": f"{k}"}) for k, group in enumerate(groups) for each in group]
+        return default_error(summarise(named))
+
+    assert default([rat], [rat]) == "energy_all"
+    assert default([rat], [grid]) == "ate_final"
+    assert default([rat, none], [grid]) == "ate_final"
+    assert default([none]) is None
+    assert default() is None
 
 
 def group(row, times, errors):
@@ -110,20 +126,20 @@ PARETO = [
 
 
 def test_a_row_is_judged_by_medians_and_only_if_none_of_its_runs_failed():
-    found = {row.row: row for row in summarise(group_records(PARETO), find_error("em"))}
+    objectives = {"step_time": "low", "energy_all": "low"}
+    found = {row.row: row for row in mark_optimal(summarise(PARETO), objectives, "median")}
     assert {name for name, row in found.items() if row.optimal} == {"slow", "fast", "same"}
-    assert found["slow"].spreads["step_time"][3:] == (10, 9, 40, 40)
-    assert found["slow"].error[3:] == (2, 1, 3, 3)
+    time, error = (found["slow"].spreads[name] for name in objectives)
+    assert (time.median, time.low, time.high, time.worst) == (10, 9, 40, 40)
+    assert (error.median, error.low, error.high, error.worst) == (2, 1, 3, 3)
     assert (found["lost"].runs, found["lost"].failed) == (2, 1)
-    assert not any(row.optimal for row in summarise(group_records(PARETO)))
+    assert not any(row.optimal for row in summarise(PARETO))
 
 
 def test_a_pareto_report_marks_the_front_in_every_form(tmp_path):
     report = make_report("name", plan("pareto", pace="live"), PARETO)
-    assert report.error.name == "em"
-    lines = render_text(report).splitlines()
-    assert [line.startswith("* ") for line in lines[1:5]] == [True, True, False, True]
-    table = render_markdown(report).split("\n\n")[0].splitlines()
+    assert report.error == "energy_all"
+    table = render(report).split("\n\n")[0].splitlines()
     assert len({line.count("|") for line in table}) == 1
     assert [line.startswith("| **") for line in table[2:]] == [True, True, False, True]
     paths = save_report(report, tmp_path)
@@ -154,8 +170,8 @@ def test_means_have_a_line_for_each_row_in_order(tmp_path):
         ("one k=1", 2, 0),
         ("one k=2", 1, 1),
     ]
-    head, first, second, *_ = render_text(report).splitlines()
-    assert head.split()[:4] == ["runs", "steps", "EM", "ARR"]
+    head, _, first, second, *_ = render(report).splitlines()
+    assert [cell.split()[0] for cell in head.split("|")[2:6]] == ["runs", "steps", "energy_all", "exm_arr"]
     assert "2 ± 1.41 (3)" in first
     assert "0.5 ± 0.354 (0.25)" in first
     assert "1, 1 failed" in second
@@ -173,7 +189,7 @@ def test_differences_are_from_the_first_row_and_odometry_comes_last():
         record(name, ate_final=value, odometry=9.0) for name, value in (("a", 2.0), ("b", 3.0), ("c", 2.0))
     ]
     report = make_report("name", plan("differences"), rows)
-    first, second, third, last = render_text(report).splitlines()[1:5]
+    first, second, third, last = (line.strip("| ") for line in render(report).splitlines()[2:6])
     assert first.split()[-1] == "2"
     assert second.split()[-2:] == ["3", "+50%"]
     assert third.split()[-2:] == ["2", "="]
@@ -204,4 +220,4 @@ def test_a_label_is_as_short_as_can_be():
 
 
 def test_two_values_that_look_alike_are_two_rows():
-    assert len(group_records([record(varied={"k": 1}), record(varied={"k": "1"})])) == 2
+    assert len(summarise([record(varied={"k": 1}), record(varied={"k": "1"})])) == 2

@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 import os
 import signal
+from dataclasses import replace
 
 import pytest
 
 from ratslam.cli import main
 from ratslam.experiments.studies.executor import Executor
 from ratslam.experiments.studies.records import FILE, RunLog
-from ratslam.experiments.studies.search import Trial, render_trials, search
+from ratslam.experiments.studies.report import make_search_report
+from ratslam.experiments.studies.search import search
 from ratslam.experiments.studies.study import read_study
 from tactile.base.errors import InputError
 from tests.ratslam.experiments.studies.test_study_runner import start, wait_for
@@ -32,29 +34,34 @@ class Killed(Exception):
 
 
 def tune(study, folder, done=None):
+    """The trials: rows of the report of a search."""
     with Executor(1) as executor:
-        return search(study, RunLog(folder), executor, done)
+        records = search(study, RunLog(folder), executor, done)
+    return make_search_report(study.name, study.plan, study.plan.tune, records).rows
+
+
+def mean(trial, name="energy_all"):
+    return trial.spreads[name].mean
 
 
 def dominates(a, b):
-    """Of (energy_all, exm_arr): low and high values are better."""
-    better = (a["energy_all"] <= b["energy_all"], a["exm_arr"] >= b["exm_arr"])
-    return all(better) and a != b
+    """Low values of energy_all and high ones of exm_arr are better."""
+    values = [(mean(trial), -mean(trial, "exm_arr")) for trial in (a, b)]
+    return all(x <= y for x, y in zip(*values, strict=True)) and values[0] != values[1]
 
 
 @pytest.mark.parametrize("sampler", ["tpe", "nsga2"])
 def test_trials_are_within_bounds_and_the_optimal_ones_are_not_dominated(tiny, tmp_path, stubbed, sampler):
     plan = TUNE | {"sampler": sampler, "population": 4, "batch": 3}
     trials = tune(read_study(tiny(tune=plan, seeds=2)), tmp_path / "out")
-    assert [trial.number for trial in trials] == list(range(14))
+    assert [trial.row for trial in trials] == [f"trial {number}" for number in range(14)]
     for trial in trials:
-        score = trial.parameters["keyframes.min_score"]
+        score = trial.varied["keyframes.min_score"]
         assert 1 <= score <= 39
-        assert trial.parameters["recall.modes"] in range(1, 9)
-        assert trial.values["energy_all"] == pytest.approx((score - 7) ** 2 + 0.5)
-        others = [other.values for other in trials]
-        assert trial.optimal == (not any(dominates(values, trial.values) for values in others))
-    different = {json.dumps(trial.parameters) for trial in trials}
+        assert trial.varied["recall.modes"] in range(1, 9)
+        assert mean(trial) == pytest.approx((score - 7) ** 2 + 0.5)
+        assert trial.optimal == (not any(dominates(other, trial) for other in trials))
+    different = {json.dumps(trial.varied) for trial in trials}
     assert len(different) > 8
     assert len(stubbed) == len(set(stubbed)) == 2 * len(different)
 
@@ -83,20 +90,22 @@ def test_more_trials_go_on_from_those_there_are(tiny, tmp_path, stubbed):
     few = tune(read_study(tiny(tune=TUNE | {"trials": 8})), tmp_path / "out")
     runs = len(stubbed)
     more = tune(read_study(tiny(tune=TUNE | {"trials": 12})), tmp_path / "out")
-    assert [trial[:3] for trial in more[:8]] == [trial[:3] for trial in few]
+    assert [replace(trial, optimal=False) for trial in more[:8]] == [
+        replace(trial, optimal=False) for trial in few
+    ]
     assert len(more) == 12
     assert len(stubbed) - runs <= 4
     other = tune(read_study(tiny(tune=TUNE | {"trials": 4, "seed": 1})), tmp_path / "out")
-    assert other[0].parameters != more[0].parameters
+    assert other[0].varied != more[0].varied
 
 
 def test_a_failed_run_fails_its_trial_alone(tiny, tmp_path, stubbed):
     plan = TUNE | {"parameters": {"keyframes.min_score": {"low": 20.0, "high": 60.0}}}
     trials = tune(read_study(tiny(tune=plan)), tmp_path / "out")
-    assert {trial.values is None for trial in trials} == {True, False}
+    assert {trial.failed for trial in trials} == {0, 1}
     for trial in trials:
-        assert (trial.values is None) == (trial.parameters["keyframes.min_score"] > 40)
-    assert "failed" in render_trials(trials)
+        assert trial.failed == (trial.varied["keyframes.min_score"] > 40)
+        assert not (trial.failed and trial.optimal)
 
 
 def test_a_missing_optuna_is_reported(tiny, tmp_path, monkeypatch):
@@ -116,14 +125,14 @@ def test_the_program_lists_the_optimal_trials(tiny, tmp_path, capsys, stubbed):
         "--search",
     ]
     assert main(["study", *command]) == 2
-    assert "14 trials, 0 of them Pareto-optimal, 14 failed" in capsys.readouterr().out  # no `steps` in stubs
+    assert "14 trials, 0 of them Pareto-optimal" in capsys.readouterr().out  # no `steps` in stubs
     tiny(tune=TUNE)
     assert main(["study", *command]) == 0
     lines = capsys.readouterr().out.splitlines()
-    trials = [Trial(**trial) for trial in json.loads((output / "trials.json").read_text())]
-    best = {trial.number for trial in trials if trial.optimal}
-    assert f"14 trials, {len(best)} of them Pareto-optimal" in lines
-    assert {int(line.split()[0]) for line in lines[2 : 2 + len(best)]} == best
+    trials = json.loads((output / "table.json").read_text())["rows"]
+    best = [trial["row"] for trial in trials if trial["optimal"]]
+    assert any(f"14 trials, {len(best)} of them Pareto-optimal" in line for line in lines)
+    assert [line.strip("| *").partition(" min_score")[0] for line in lines[2 : 2 + len(best)]] == best
 
 
 @pytest.mark.soak

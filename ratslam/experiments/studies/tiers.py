@@ -6,10 +6,11 @@ from functools import lru_cache
 
 import numpy as np
 
-from evaluation.metrics.metric import Quantity
+from evaluation.metrics.metric import Finding, Quantity
 from ratslam.config.run_config import RunConfig
+from ratslam.experiments.studies.metrics import quantity
 from ratslam.pipeline.source import open_observations
-from robot.simulation.head.session import HeadSimulation, SimulationConfig
+from robot.simulation.head.session import HeadSimulation
 from robot.sources.in_memory import InMemorySource, load_into_memory
 from tactile.base.errors import InputError
 
@@ -32,13 +33,11 @@ def compare_with_tier(config: RunConfig, log: InMemorySource, cost: float, tier:
     reference = _reference_views(with_tier(config, tier).model_dump_json())
     contact, height = image_difference(log.views, reference, config.touch.image.tallest)
     duration = float(log.time[-1] - log.time[0])
-    return {
-        "simulation_time": Quantity(label="simulation per second", value=1e6 * cost / duration, unit="us"),
-        "contact_difference": Quantity(label=f"contact pixels unlike {tier}", value=contact, unit=""),
-        "height_difference": Quantity(
-            label=f"height unlike {tier}", value=1e3 * height if np.isfinite(height) else None, unit="mm"
-        ),
-    }
+    return (
+        quantity("simulation_time", Finding(1e6 * cost / duration))
+        | quantity("contact_difference", Finding(contact))
+        | quantity("height_difference", Finding(1e3 * height))
+    )
 
 
 def image_difference(views: np.ndarray, reference: np.ndarray, tallest: float) -> tuple[float, float]:
@@ -73,7 +72,9 @@ def shortened(config: RunConfig, seconds: float) -> RunConfig:
     if path.explore:
         path = path.model_copy(update={"explore": min(path.explore, seconds)})
     elif path.circuits:
-        lap = _duration(simulation) / len(path.circuits)
+        cheapest = with_tier(config, "kinematic").simulation
+        assert cheapest is not None
+        lap = float(HeadSimulation(cheapest).time[-1]) / len(path.circuits)
         path = path.model_copy(update={"circuits": path.circuits[: max(FEWEST_LAPS, int(seconds / lap))]})
     return config.model_copy(update={"simulation": simulation.model_copy(update={"path": path})})
 
@@ -82,9 +83,3 @@ def shortened(config: RunConfig, seconds: float) -> RunConfig:
 def _reference_views(config: str) -> np.ndarray:
     with open_observations(RunConfig.model_validate_json(config)) as (_, source):
         return load_into_memory(source).views
-
-
-def _duration(simulation: SimulationConfig) -> float:
-    return float(
-        HeadSimulation(simulation.model_copy(update={"fidelity": "kinematic", "raw": False})).time[-1]
-    )

@@ -14,13 +14,30 @@ from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
 
-from ratslam.experiments.studies.records import Machine
+from tactile.base.config import Settings
 
 PACKAGES = ("ratslam", "tactile", "robot", "evaluation")
 OBSERVED = 0.2
 """Time over which the load of the cores is observed before one of them is chosen, s."""
 _IDLE = slice(3, 5)
 """Idle time and time waiting for a disk, among the times of a core (proc(5))."""
+
+
+class Machine(Settings):
+    """Where a run was computed."""
+
+    processor: str
+    """Name of the processor."""
+    device: str
+    """Device of the kernels: `cpu`, or the name of an accelerator."""
+    versions: dict[str, str]
+    """Versions of what decides the speed."""
+    build: str
+    """First digits of the sha256 of ratslam's code: other code may give other results."""
+    workers: int = 1
+    """Number of processes that shared the work."""
+    other_load: float | None = None
+    """Number of cores that other processes kept busy meanwhile; None where the system does not say."""
 
 
 @lru_cache(maxsize=1)
@@ -34,19 +51,8 @@ def machine() -> Machine:
         device="cpu" if device.platform == "cpu" else device.device_kind,
         versions={name: version(name) for name in ("jax", "jaxlib", "numpy")}
         | {"python": platform.python_version()},
-        build=build(),
+        build=_build(),
     )
-
-
-@lru_cache(maxsize=1)
-def build() -> str:
-    """First digits of the sha256 of all code of ratslam: other code may give other results."""
-    total = hashlib.sha256()
-    for name in PACKAGES:
-        folder = Path(str(sys.modules[name].__file__)).parent
-        for path in sorted(folder.rglob("*.py")):
-            total.update(f"{name}/{path.relative_to(folder).as_posix()}\n".encode() + path.read_bytes())
-    return total.hexdigest()[:12]
 
 
 @contextmanager
@@ -63,36 +69,41 @@ def one_core() -> Iterator[None]:
         os.sched_setaffinity(0, allowed)
 
 
-@contextmanager
-def other_load() -> Iterator[Callable[[], float | None]]:
-    """Gives a function for the mean number of cores that other processes kept busy since; None if unknown."""
+def watch_load() -> Callable[[], float | None]:
+    """A function for the mean number of cores that other processes kept busy since; None if unknown."""
     began, before, ours = time.monotonic(), _busy(), _own_time()
 
     def load() -> float | None:
         now = _busy()
-        if not before or not now:
-            return None
         taken = sum(now.values()) - sum(before.values()) - (_own_time() - ours)
-        return max(taken, 0.0) / max(time.monotonic() - began, 1e-9)
+        return max(taken, 0.0) / max(time.monotonic() - began, 1e-9) if before and now else None
 
-    yield load
+    return load
 
 
-@contextmanager
-def peak_memory() -> Iterator[Callable[[], float]]:
-    """Gives a function for the peak memory since, MiB; of the whole process where it cannot be reset."""
+def reset_peak_memory() -> None:
+    """Starts `peak_memory` anew, where the system supports that (Linux)."""
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
-    yield _peak
 
 
-def _peak() -> float:
+def peak_memory() -> float:
+    """Peak memory since it was reset, MiB; of the whole process where it cannot be reset."""
     with suppress(OSError):
         for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) / 1024
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return most / (1 << 20 if sys.platform == "darwin" else 1024)
+
+
+def _build() -> str:
+    total = hashlib.sha256()
+    for name in PACKAGES:
+        folder = Path(str(sys.modules[name].__file__)).parent
+        for path in sorted(folder.rglob("*.py")):
+            total.update(f"{name}/{path.relative_to(folder).as_posix()}\n".encode() + path.read_bytes())
+    return total.hexdigest()[:12]
 
 
 def _idlest(allowed: set[int]) -> int:
