@@ -195,7 +195,7 @@ def _save(report: Any, records: Path) -> None:
 
 def _search(arguments: argparse.Namespace, study: Any, log: Any) -> int:
     from ratslam.experiments.studies.executor import Executor
-    from ratslam.experiments.studies.report import make_search_report
+    from ratslam.experiments.studies.report import make_report
     from ratslam.experiments.studies.search import search
 
     plan = study.plan.tune
@@ -204,7 +204,8 @@ def _search(arguments: argparse.Namespace, study: Any, log: Any) -> int:
         Progress(plan.trials * runs, log.path) as progress,
         Executor(arguments.workers, arguments.scheduler) as executor,
     ):
-        report = make_search_report(study.name, study.plan, plan, search(study, log, executor, progress))
+        records = search(study, log, executor, progress)
+    report = make_report(study.name, study.plan, records, search=True)
     _save(report, log.path)
     if any(row.optimal for row in report.rows):
         return 0

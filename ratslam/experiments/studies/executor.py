@@ -126,11 +126,8 @@ class Executor(ExitStack):
                 result = future.result()
             except BrokenProcessPool:
                 self._submit = None
-            except (futures.CancelledError, ImportError, RuntimeError) as error:
-                _explain(error, self._scheduler)
-                raise
             except Exception as error:
-                if type(error).__name__ != "KilledWorker":  # of Dask
+                if self._scheduler is None or not _is_killed(error):
                     raise
             else:
                 yield pending[future], result
@@ -202,16 +199,19 @@ def _cluster(address: str) -> Iterator[tuple[Submit, int]]:
             yield lambda function, task: submit(pickle.dumps((function, task))), len(client.nthreads()) or 1
 
 
-def _explain(error: Exception, scheduler: str | None) -> None:
-    """Raises an `InputError` where an error is the cluster's."""
-    if scheduler is None:
-        return
+def _is_killed(error: Exception) -> bool:
+    """Whether an error of a cluster is that a task's process was killed.
+
+    Raises:
+        InputError: the cluster is at fault.
+    """
     if isinstance(error, futures.CancelledError):
         cure = "what was done is kept; run it again"
         raise InputError("--scheduler", "the scheduler went away", "one that stays", cure) from None
     if isinstance(error, ImportError) or "deserialization" in str(error):
         found = f"its processes cannot load ratslam ({error})".splitlines()[0]
         raise InputError("--scheduler", found, "the same ratslam, installed there too") from None
+    return type(error).__name__ == "KilledWorker"
 
 
 @contextmanager

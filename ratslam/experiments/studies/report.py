@@ -17,7 +17,7 @@ from evaluation.plots.pareto_plot import ParetoPoint, draw_pareto
 from ratslam.experiments.studies.machine import Machine
 from ratslam.experiments.studies.metrics import COLUMNS, METRICS
 from ratslam.experiments.studies.records import RunRecord
-from ratslam.experiments.studies.schema import SearchPlan, StudyPlan
+from ratslam.experiments.studies.schema import StudyPlan
 from ratslam.experiments.studies.summary import Row, Spread, default_error, mark_optimal, plain, summarise
 from tactile.base.atomic_write import write_atomically, write_text_atomically
 
@@ -53,27 +53,31 @@ class Report:
     remarks: Sequence[str]
 
 
-def make_report(name: str, plan: StudyPlan, records: Sequence[RunRecord], error: str | None = None) -> Report:
+def make_report(
+    name: str, plan: StudyPlan, records: Sequence[RunRecord], error: str | None = None, search: bool = False
+) -> Report:
     """The report of a study's records.
 
     Args:
-        error: quantity of the Pareto front; None: the first default error that most rows have.
+        error: quantity of the Pareto front; None: the first default error that most rows have. search:
+            whether the records are of the trials of a search; then the Pareto-optimal ones are marked.
     """
-    rows = summarise(records, odometry=plan.report in ("medians", "differences"))
-    error = (error or default_error(rows)) if plan.report == "pareto" else None
+    kind = "search" if search else plan.report
+    rows = summarise(records, odometry=kind in ("medians", "differences"))
+    error = (error or default_error(rows)) if kind == "pareto" else None
+    columns, remarks = [*COLUMNS.get(kind, ()), *([error] if error else [])], list[str]()
     if error is not None:
         rows = mark_optimal(rows, {"step_time": "low", error: METRICS[error].direction}, "median")
-    columns = dict.fromkeys([*COLUMNS[plan.report], *([error] if error else [])])
-    kept = _kept(rows, plan.limit) if plan.report == "differences" else []
-    return _report(name, plan, plan.report, list(columns), rows, error, records, kept)
-
-
-def make_search_report(name: str, plan: StudyPlan, tune: SearchPlan, records: Sequence[RunRecord]) -> Report:
-    """The report of a search's records, with the Pareto-optimal trials marked."""
-    rows = mark_optimal(summarise(records), tune.directions(), "mean")
-    failed = sum(bool(row.failed) for row in rows)
-    remark = f"{len(rows)} trials, {sum(row.optimal for row in rows)} of them Pareto-optimal, {failed} failed"
-    return _report(name, plan, "search", list(tune.directions()), rows, None, records, [remark])
+    if search and plan.tune is not None:
+        columns, rows = [*plan.tune.directions()], mark_optimal(rows, plan.tune.directions(), "mean")
+        best, failed = sum(row.optimal for row in rows), sum(bool(row.failed) for row in rows)
+        remarks = [f"{len(rows)} trials, {best} of them Pareto-optimal, {failed} failed"]
+    if kind == "differences":
+        remarks = _kept(rows, plan.limit)
+    machines = [record.machine for record in records if record.machine]
+    measured = _measured(machines, len({record.seed for record in records})) | {"pace": PACES[plan.pace]}
+    columns = list(dict.fromkeys(columns))
+    return Report(name, kind, columns, rows, error, measured, [*remarks, *_remarks(machines)])
 
 
 def render(report: Report) -> str:
@@ -134,22 +138,6 @@ def save_report(report: Report, directory: Path) -> list[Path]:
         return paths
     write_atomically(picture, figure.savefig)
     return [*paths, picture]
-
-
-def _report(
-    name: str,
-    plan: StudyPlan,
-    kind: str,
-    columns: Sequence[str],
-    rows: Sequence[Row],
-    error: str | None,
-    records: Sequence[RunRecord],
-    remarks: Sequence[str],
-) -> Report:
-    machines = [record.machine for record in records if record.machine]
-    seeds = len({record.seed for record in records})
-    measured = _measured(machines, seeds) | {"pace": PACES[plan.pace]}
-    return Report(name, kind, columns, rows, error, measured, [*remarks, *_remarks(machines)])
 
 
 def _cell(found: Spread | None, kind: str, base: Spread | None) -> str:

@@ -33,6 +33,7 @@ def run_jobs(
         function: runs a job; default `run_job`.
     """
     found, done = dict(log.records), done or (lambda record: None)
+    killed = partial(record_of, error=KILLED)
     wanted: dict[str, Job] = {}
     for job in jobs:
         wanted.setdefault(job.key, job)
@@ -40,7 +41,7 @@ def run_jobs(
     for key, job in wanted.items():
         if key in found:
             done(_labelled(found[key], job))
-    with closing(executor.completed(function or run_job, missing, _killed)) as completed:
+    with closing(executor.completed(function or run_job, missing, killed)) as completed:
         for job in jobs:
             while job.key not in found:
                 _, record = next(completed)
@@ -74,7 +75,3 @@ def measure_jobs(jobs: Sequence[Job], log: RunLog, done: Done | None = None) -> 
 def _labelled(record: RunRecord, job: Job) -> RunRecord:
     """The record under this job's row: several rows may have the same configuration."""
     return record.model_copy(update={"row": job.row, "varied": job.varied})
-
-
-def _killed(job: Job) -> RunRecord:
-    return record_of(job, KILLED)

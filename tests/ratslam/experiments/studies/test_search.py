@@ -12,7 +12,7 @@ import pytest
 from ratslam.cli import main
 from ratslam.experiments.studies.executor import Executor
 from ratslam.experiments.studies.records import FILE, RunLog
-from ratslam.experiments.studies.report import make_search_report
+from ratslam.experiments.studies.report import make_report
 from ratslam.experiments.studies.search import search
 from ratslam.experiments.studies.study import read_study
 from tactile.base.errors import InputError
@@ -37,7 +37,7 @@ def tune(study, folder, done=None):
     """The trials: rows of the report of a search."""
     with Executor(1) as executor:
         records = search(study, RunLog(folder), executor, done)
-    return make_search_report(study.name, study.plan, study.plan.tune, records).rows
+    return make_report(study.name, study.plan, records, search=True).rows
 
 
 def mean(trial, name="energy_all"):
