@@ -86,7 +86,11 @@ def test_perturbed_copies_are_run_beside_the_session(tmp_path, capsys):
     command = ["study", "--preset", "spread", str(tmp_path / "c.yaml"), "--set", "copies=2"]
     assert main([*command, "-o", str(output), "--workers", "1"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split("  ")[0] for line in lines[1:4]] == ["as recorded", "perturbed", "dead reckoning"]
+    assert [line.split("|")[1].strip() for line in lines[2:5]] == [
+        "as recorded",
+        "perturbed",
+        "dead reckoning",
+    ]
     copies = [each.copy_number for each in RunLog(output).records.values()]
     assert copies == [0, 1, 2]
 
