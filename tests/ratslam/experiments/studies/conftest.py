@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import jax
 import pytest
 
 from evaluation.metrics.metric import Quantity
@@ -34,6 +35,14 @@ def record(row="", seed=0, time=100.0, error=None, varied=None, odometry=None, h
         hash=hash or row or "none", seed=seed, row=row, varied=varied or {}, steps=10, quantities=quantities,
         measured=measured | {"memory": 400.0}, error=error, machine=machine(),
     )  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def shared_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Worker processes fetch the kernels that this process has compiled."""
+    for name in ("compilation_cache_dir", "persistent_cache_min_compile_time_secs",
+                 "persistent_cache_min_entry_size_bytes"):  # fmt: skip
+        monkeypatch.setenv(f"JAX_{name.upper()}", str(getattr(jax.config, f"jax_{name}")))
 
 
 @pytest.fixture
