@@ -110,7 +110,7 @@ def draw(report: Report) -> Figure | None:
     if report.error is None:
         return None
     metric, marks = METRICS[report.error], []
-    text = f"{metric.label} ({metric.unit})" if metric.unit else metric.label
+    text = _title(metric.name) + (f" ({metric.unit})" if metric.unit else "")
     for row in report.rows:
         time, error = row.spreads.get("step_time"), row.spreads.get(metric.name)
         if time is not None and error is not None:
@@ -159,6 +159,10 @@ def _number(value: float) -> str:
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.2g}" if abs(value) < 0.1 else f"{value:.3g}"
 
 
+def _title(name: str) -> str:
+    return f"{name}: {METRICS[name].label.strip()}"
+
+
 def _note(report: Report) -> str:
     kind = "Means ± standard deviation" if report.kind in MEANS else "Medians"
     note = f"{kind} over runs (worst)" + ", and the difference from the first row" * (report.kind in COMPARED)
@@ -170,7 +174,7 @@ def _note(report: Report) -> str:
         )
         if report.error is None:
             return note + "No row has an error to compare its speed with."
-        note += f"Bold: no other row is at least as fast and as good by {METRICS[report.error].label}."
+        note += f"Bold: no other row is at least as fast and as good by {_title(report.error)}."
     return note
 
 
