@@ -8,6 +8,7 @@ import itertools
 import numpy as np
 import pytest
 from matplotlib.collections import LineCollection
+from matplotlib.text import Text
 
 from evaluation.metrics.grid_score import score_grid
 from evaluation.metrics.occupancy_grid import PRIOR_OCCUPANCY, GridTruth, OccupancyGrid
@@ -50,7 +51,8 @@ def words(figure):
     renderer = figure.canvas.get_renderer()
     texts = list(figure.texts) + [text for legend in figure.legends for text in legend.get_texts()]
     for axes in figure.axes:
-        texts += [axes.title, axes._left_title, axes.xaxis.label, axes.yaxis.label]
+        texts += [child for child in axes.get_children() if isinstance(child, Text)]
+        texts += [axes.xaxis.label, axes.yaxis.label]
         for axis, limits in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
             low, high = sorted(limits)
             texts += [tick.label1 for tick in axis.get_major_ticks() if low <= tick.get_loc() <= high]
