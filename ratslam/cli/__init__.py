@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import sys
 
 # Only what argparse needs is imported here, so that `--help` does not wait for JAX and NumPy.
@@ -30,9 +31,14 @@ def main(argv: list[str] | None = None) -> int:
         print("\n".join(f"ratslam: error: {line}" for line in str(error).splitlines()), file=sys.stderr)
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        cure = (
+            "free some space or choose another folder with -o"
+            if full
+            else "check the path and its permissions"
+        )
         print(
-            f"ratslam: error: {where}{error.strerror or error}; what was written so far is complete; "
-            "free some space or choose another folder with -o",
+            f"ratslam: error: {where}{error.strerror or error}; what was written so far is complete; {cure}",
             file=sys.stderr,
         )
     except KeyboardInterrupt:

@@ -63,13 +63,23 @@ def add_commands(commands: Commands) -> None:
         help="folder of records and tables; recorded runs are not repeated (default runs/STUDY)",
     )  # fmt: skip
     study.add_argument(
-        "--error", metavar="NAME", help="of the Pareto front: em, ate, exm, map, ... or a quantity"
+        "--error",
+        metavar="NAME",
+        help="error on the Pareto front: em, ate, exm, map, ... or a scorecard quantity",
     )
     study.add_argument(
-        "--by", type=float, default=0.2, metavar="SHARE", help="of --preset vary (default 0.2)"
+        "--by",
+        type=float,
+        default=0.2,
+        metavar="SHARE",
+        help="share by which --preset vary changes a number (default 0.2)",
     )
     study.add_argument(
-        "--seconds", type=float, default=600.0, metavar="S", help="of --preset tiers (default 600)"
+        "--seconds",
+        type=float,
+        default=600.0,
+        metavar="S",
+        help="length of a session of --preset tiers, s (default 600)",
     )
 
     size = commands.add(
