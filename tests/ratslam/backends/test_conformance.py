@@ -237,8 +237,8 @@ def test_single_precision_stays_single_and_finite(kind):
 def test_touch_closes_and_weighs_in_these_walks():
     # Else replay, checkpoints and capacities would prove little of it.
     _, arrays = replayed(BACKENDS["touch"])
-    assert arrays["map/appearance/likeness"].any()
-    weight = arrays["map/closures/weight"]
+    assert arrays["map/appearance/likeness/0"].any()
+    weight = arrays["map/log/weight"]
     assert ((weight > 0) & (weight < 1)).any()
 
 

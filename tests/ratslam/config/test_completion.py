@@ -156,7 +156,7 @@ def test_a_missing_choice_of_building_is_refused(monkeypatch):
 
 @pytest.mark.parametrize("name", ["acapulco", "aces", "belgioioso", "freiburg_101"])
 def test_the_shared_configuration_equals_those_of_single_buildings(name, reference_data):
-    folder = reference_data / "buildings"
+    folder = (reference_data / "buildings").resolve()
     if not folder.is_dir():
         pytest.skip(f"no folder {folder}")
     given = load_config(ROOT / "configs" / "building.yaml", [f"recording.file={folder / name}_odom_gt.csv"])

@@ -44,7 +44,7 @@ def odometry_error(log: InMemorySource) -> float:
 
 def cuts(session: Session) -> list[int]:
     """Frames before which the odometry was cut; in these scenes every row is a frame."""
-    return np.flatnonzero(session.map.arrays()["cut"] >= 0).tolist()
+    return np.flatnonzero(session.map.arrays()["graph/cut"] >= 0).tolist()
 
 
 def golden(name: str) -> InMemorySource:
@@ -205,5 +205,5 @@ def test_standing_still_costs_nothing():
     session = Session(RecallBackend(config, (3, 6, 1)), reserve=512)
     still = observation(Odometry(0.0, 0.0, 0.0, 0.1), np.full((3, 6, 1), 0.5))
     list(session.replay(still for _ in range(300)))
-    assert len(session.map.arrays()["pose"]) == 1
+    assert len(session.map.arrays()["graph/pose"]) == 1
     assert session.map.graph().number_of_nodes() == 1

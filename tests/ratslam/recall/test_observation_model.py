@@ -378,7 +378,7 @@ def test_a_head_turned_about_is_found_with_its_heading(turned):
         assert math.cos(after.offset[0, 2]) == pytest.approx(-1 if turned else 1, abs=1e-6)
         alone = look(AHEAD, filled(AHEAD, images, spaced(40), known(images)), now)[1]
         assert alone.shift == 0
-        assert (alone.match == place and alone.gain > 0) != turned
+        assert (alone.match == place and alone.log_ratio > 0) != turned
 
 
 @pytest.mark.parametrize("turned", [False, True])
