@@ -88,3 +88,10 @@ def test_links_lead_somewhere(readme: Path) -> None:
         if not re.match(r"\w+:", target) and not (readme.parent / target).exists()
     ]
     assert missing == []
+
+
+def test_files_of_the_equations_exist() -> None:
+    text = (ROOT / "evaluation" / "RESULTS.md").read_text(encoding="utf-8")
+    files = re.findall(r"`([\w/]+(?:\.py|/))`", text[text.index("## Equations and files") :])
+    assert len(files) > 20
+    assert [file for file in files if not (ROOT / file).exists()] == []
