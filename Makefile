@@ -7,7 +7,7 @@ BASE := $(VENV)/.base
 DEV := $(VENV)/.dev
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-# A timing on one core that nothing else uses says more than one on a shared core.
+# Benchmarks run on core 0 alone, because timings spread more when the scheduler moves a process between cores.
 PINNED := $(shell taskset -c 0 true 2>/dev/null && echo taskset -c 0)
 
 # The soak runs in SOAK_PARTS parts of at most 60 minutes with two workers; `make soak PART=2` runs one of them.
@@ -40,20 +40,20 @@ clean:
 	rm -rf $(VENV) build dist *.egg-info .hypothesis .benchmarks .ruff_cache .mypy_cache .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
-# The program alone.
+# Installs the program without the dependencies of its tests.
 $(BASE): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 	  echo "ratslam needs Python 3.11 or newer, and $(PYTHON) is" \
 	    "$$($(PYTHON) --version 2>&1); choose another: make PYTHON=python3.11 ..." >&2; exit 1; }
 	@echo "Making the virtual environment $(VENV) ..."
 	@$(PYTHON) -m venv $(VENV)
-	@echo "Installing ratslam and what it needs (a minute or two) ..."
+	@echo "Installing ratslam and its dependencies (a minute or two) ..."
 	@$(INSTALL) -e .
 	@touch $@
 
-# With what its tests need. Only one test compares with gtsam, which has no wheel for some platforms.
+# Installs the dependencies of the tests. Only one test needs gtsam, which has no wheel for some platforms.
 $(DEV): $(BASE)
-	@echo "Installing what the tests need ..."
+	@echo "Installing the dependencies of the tests ..."
 	@$(INSTALL) -e '.[dev]'
 	@$(INSTALL) --only-binary gtsam -e '.[anchor]' || echo "gtsam has no wheel here; its test is skipped."
 	@touch $@

@@ -60,7 +60,7 @@ def _larger(levels: tuple[Level, ...], smallest: Block, held: Array, inputs: Ste
 def _attempt(
     levels: tuple[Level, ...], k: int, smallest: Block, held: Array, inputs: StepInput, carry: Any
 ) -> Any:
-    """The step at level k; then back to the smallest level where that holds the result.
+    """The step at level k; the result is moved to the smallest level if it fits there.
 
     Args:
         smallest: the block of the smallest level before the step; the others are in `carry`, unchanged.
@@ -83,7 +83,7 @@ def _attempt(
 
 
 def _at_smallest(levels: tuple[Level, ...], level: Level, block: Block, pose: Array) -> tuple[Block, Array]:
-    """The block at the smallest level, and bool: that holds all of it."""
+    """The block moved to the smallest level, and bool: all of its activity fits there."""
     smallest = levels[0]
     if level.window is smallest.window:
         return jax.tree.map(lambda leaf: leaf[:1], block), jnp.max(block.activity[1:]) <= 0

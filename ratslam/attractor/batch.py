@@ -81,7 +81,7 @@ def _networks(config: PoseCellConfig, levels: int | None, sets: Network, course:
     dtype = np.dtype(course.motion.dtype)
     used = window_levels(config, dtype)[:levels]
 
-    def run(network: Network) -> Track:
+    def simulate(network: Network) -> Track:
         kernels = network.excite_sigma, network.inhibit_sigma, network.global_inhibition
         tuned = tuple(level._replace(window=window.with_kernels(level.window, *kernels)) for level in used)
 
@@ -93,7 +93,7 @@ def _networks(config: PoseCellConfig, levels: int | None, sets: Network, course:
 
         return lax.scan(step, pose_cells.start(config, dtype, used), course)[1]
 
-    return lax.map(run, sets, batch_size=block)
+    return lax.map(simulate, sets, batch_size=block)
 
 
 @partial(jax.jit, static_argnames=("kernel", "block"))
@@ -101,11 +101,11 @@ def trials(kernel: Any, states: Any, observations: Observation, block: int = 1) 
     """Estimates [B, T, ...] of one kernel from B states (one for each seed) over B courses of observations
     [B, T] (one for each noise level)."""
 
-    def run(trial: Any) -> Estimate:
+    def simulate(trial: Any) -> Estimate:
         def step(state: Any, observation: Observation) -> Any:
             state, estimate, _ = kernel(state, observation)
             return state, estimate
 
         return lax.scan(step, *trial)[1]
 
-    return lax.map(run, (states, observations), batch_size=block)
+    return lax.map(simulate, (states, observations), batch_size=block)

@@ -15,7 +15,7 @@ from ratslam.attractor.levels import Block, Level, extent
 from ratslam.attractor.window import Window
 from tactile.base.types import Array
 
-LOSS = 64
+SUM_TOLERANCE = 64
 """Tolerance on the sum of activity after a step, in units of rounding."""
 
 
@@ -70,7 +70,7 @@ def step_at(level: Level, block: Block, inputs: StepInput) -> tuple[Block, StepR
 
 def equal_sums(a: Array, b: Array | float) -> Array:
     """bool: sums of activity that differ by rounding only."""
-    return jnp.abs(a - b) <= LOSS * jnp.finfo(a.dtype).eps
+    return jnp.abs(a - b) <= SUM_TOLERANCE * jnp.finfo(a.dtype).eps
 
 
 def _inject(level: Level, block: Block, inputs: StepInput) -> tuple[Block, Array]:
@@ -130,10 +130,10 @@ def _integrate(level: Level, block: Block, inputs: StepInput, s: Array) -> tuple
     shift = jnp.clip((origin - block.origin + ring // 2) % ring - ring // 2, -1, 1)
     origin = (block.origin + shift) % ring
 
-    def translated(cells: Array, first: Array, by: Array) -> Array:
+    def translate(cells: Array, first: Array, by: Array) -> Array:
         return window.integrate(shape, cells, first, moved, inputs.lag, by)
 
-    cells = _each_window(level, translated, block.activity, block.origin, shift)
+    cells = _each_window(level, translate, block.activity, block.origin, shift)
     complete = jnp.all(jax.vmap(partial(window.margin_is_empty, shape))(cells))
     return Block(cells, origin), (complete & equal_sums(jnp.sum(cells), 1.0)) | shape.is_torus
 

@@ -92,12 +92,12 @@ def from_full_torus(levels: tuple[Level, ...], activity: Array) -> Activity:
 def block_at(levels: tuple[Level, ...], k: int, activity: Activity, origin: Array) -> Block:
     """The activity at level k, from whichever level up to k holds it; a new window begins at `origin` [3]."""
 
-    def transferred(j: int) -> Callable[[], Block]:
+    def transfer_from(j: int) -> Callable[[], Block]:
         if j == k:
             return lambda: activity.blocks[k]
         return lambda: transfer(levels[j], activity.blocks[j], levels[k], origin)
 
-    return lax.switch(jnp.minimum(activity.level, k), [transferred(j) for j in range(k + 1)])
+    return lax.switch(jnp.minimum(activity.level, k), [transfer_from(j) for j in range(k + 1)])
 
 
 def transfer(source: Level, block: Block, target: Level, origin: Array) -> Block:

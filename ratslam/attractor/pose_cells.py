@@ -31,7 +31,7 @@ JUMP = 1.0
 
 
 class Outcome(IntEnum):
-    """How a step of the network went."""
+    """Outcome of a step of the network."""
 
     OK = 0
     RESEEDED = 1
@@ -98,9 +98,9 @@ def step(
 
     moved = jnp.stack([odometry.dx, odometry.dy, odometry.dtheta]) / unit
     reach = jnp.maximum(jnp.hypot(moved[0], moved[1]) + jnp.hypot(lag[0], lag[1]), jnp.abs(moved[2] + lag[2]))
-    wanted = jnp.maximum(jnp.ceil(reach / LARGEST_SUBSTEP - TIE), 1.0)
-    substeps = jnp.minimum(wanted, float(MOST_SUBSTEPS))
-    moved, lag = moved * (substeps / wanted), lag * (substeps / wanted)
+    needed = jnp.maximum(jnp.ceil(reach / LARGEST_SUBSTEP - TIE), 1.0)
+    substeps = jnp.minimum(needed, float(MOST_SUBSTEPS))
+    moved, lag = moved * (substeps / needed), lag * (substeps / needed)
 
     energy = deposit_gain(levels[0].window, recall) * energy
     parts = moved / substeps, lag / substeps
@@ -111,5 +111,5 @@ def step(
     behind = ring_difference(world + lag - (pose - cells.pose), n)
     jumped = died | (jnp.max(jnp.abs(behind)) > JUMP)
     lag = jnp.where(measured, jnp.where(jumped, jnp.zeros_like(lag), behind), cells.lag)
-    outcome = jnp.where(died, Outcome.RESEEDED, jnp.where(wanted > substeps, Outcome.TOO_FAST, Outcome.OK))
+    outcome = jnp.where(died, Outcome.RESEEDED, jnp.where(needed > substeps, Outcome.TOO_FAST, Outcome.OK))
     return PoseCells(activity, pose, lag, settling), StepInfo(spread, outcome.astype(jnp.int32), level)

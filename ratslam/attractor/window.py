@@ -286,7 +286,7 @@ def _shifter(window: Window, activity: Array, k: int, reach: int) -> Callable[[i
         before = after = jnp.zeros(
             [reach if a == k else n for a, n in enumerate(activity.shape)], activity.dtype
         )
-    # Forced into one array: reading through its three pieces would cost a branch per cell.
+    # The barrier makes one array of the three pieces; without it every cell costs a branch.
     padded = lax.optimization_barrier(jnp.concatenate([before, activity, after], axis=k))
     return lambda t: lax.slice_in_dim(padded, reach - t, reach - t + size, axis=k)
 

@@ -1,7 +1,7 @@
 """SLAM by a grid particle filter: each particle has a pose, its own map and persistent odometry errors.
 
 After Fox et al. 2012, Algorithm 1. Unlike in the paper, persistent odometry errors are part of the state,
-unexplored space is no evidence, and walls are expected to continue straight.
+unexplored space is neutral, and walls are expected to continue straight.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class GridOutcome(IntEnum):
     RESAMPLED = 1
     """The particles were resampled."""
     VANISHED = 2
-    """No particle explains the contacts; the weights stay as they were."""
+    """No particle explains the contacts; the weights are left unchanged."""
     OUTSIDE = 3
     """Contacts lie outside the map for at least one particle and are ignored there."""
     NOT_FINITE = 4
@@ -78,7 +78,7 @@ class GridEvidence(NamedTuple):
 
     Attributes:
         ancestor: [N] int32, the particle that each particle was copied from. poses: [N, 3] and weights: [N]
-            before resampling. effective_particles: effective number. outcome: a `GridOutcome`, int32.
+            before resampling. effective_particles: their effective number. outcome: a `GridOutcome`, int32.
     """
 
     ancestor: Array
@@ -150,18 +150,18 @@ class GridBackend(Backend):
         pose, spread = particles.weighted_mean(swarm.pose, share)
         poses = swarm.pose
 
-        swarm, who = self._resample(swarm, share, worth, features.valid, pick, jitter)
-        maps = particles.copy_rows(state.maps, who)
-        wall_directions = state.wall_directions[who.ancestor]
+        swarm, drawn = self._resample(swarm, share, worth, features.valid, pick, jitter)
+        maps = particles.copy_rows(state.maps, drawn)
+        wall_directions = state.wall_directions[drawn.ancestor]
         maps, wall_directions, outside = self._update_maps(maps, wall_directions, swarm.pose, features)
 
-        outcome = jnp.where(who.copies > 0, GridOutcome.RESAMPLED, GridOutcome.OK)
+        outcome = jnp.where(drawn.copies > 0, GridOutcome.RESAMPLED, GridOutcome.OK)
         outcome = jnp.where(outside, GridOutcome.OUTSIDE, outcome)
         outcome = jnp.where(vanished, GridOutcome.VANISHED, outcome)
         outcome = jnp.where(clean, outcome, GridOutcome.NOT_FINITE).astype(jnp.int32)
         place = jnp.int32(-1)  # a grid has no places
         estimate = Estimate(pose, spread, place, place, jnp.int32(Action.NONE), vanished)
-        evidence = GridEvidence(who.ancestor, poses, share, worth, outcome)
+        evidence = GridEvidence(drawn.ancestor, poses, share, worth, outcome)
         touched = jnp.where(features.valid, features.touching, False)
         after = GridState(swarm, maps, wall_directions, motion, touched, jax.random.key_data(key))
         return after, estimate, evidence
@@ -222,11 +222,11 @@ class GridBackend(Backend):
             else valid
         )
 
-        def anew() -> tuple[Particles, particles.Resampling]:
-            who = particles.resample(config, share, pick)
-            return particles.copy_particles(config, swarm, who, jitter), who
+        def draw_particles() -> tuple[Particles, particles.Resampling]:
+            drawn = particles.resample(config, share, pick)
+            return particles.copy_particles(config, swarm, drawn, jitter), drawn
 
-        return lax.cond(needed, anew, lambda: (swarm, particles.identity(self.config.particles)))
+        return lax.cond(needed, draw_particles, lambda: (swarm, particles.identity(self.config.particles)))
 
     def _update_maps(
         self, maps: Array, wall_directions: Array, pose: Array, features: ContactFeatures
@@ -317,7 +317,7 @@ def build(config: GridConfig, feelers: PlanarWhiskers | None, dtype: Any = np.fl
     """
     if feelers is None:
         raise InputError(
-            "backend", "grid, for a recording without whiskers", "recall, or a session of whiskers"
+            "backend", "grid, for a recording without whiskers", "recall, or a recording with whiskers"
         )
     side = config.side or LIVE_SIDE
     if config.particles * particle_maps.LAYERS * int(np.ceil(side / config.cell)) ** 2 > MAX_CELLS:

@@ -182,10 +182,10 @@ class RecallBackend(Backend):
         if self.labels:
             return LabelAppearance()
         if self.pixels is not None:
-            return WhiskerAppearance(self.pixels, self.recall.temper, self._normalised)
-        return ViewAppearance(self.size, fan_width(self.recall), self._normalised)
+            return WhiskerAppearance(self.pixels, self.recall.temper, self._normalise)
+        return ViewAppearance(self.size, fan_width(self.recall), self._normalise)
 
-    def _normalised(self, view: np.ndarray) -> np.ndarray:
+    def _normalise(self, view: np.ndarray) -> np.ndarray:
         shaped = np.asarray(view.reshape(self.view_shape), self.dtype)
         config = self.config.templates
         if not (config.normalise_mean or config.patch):  # saves the slow call to JAX

@@ -176,8 +176,8 @@ class ExperienceMap(Checkpointed, Map):
         relative = float(evidence.relative)
         if action == Action.CREATE:
             self._create(place, int(evidence.template), relative)
-        elif action in (Action.LINK, Action.SET) and self.config.closures and self._known(place) >= 0:
-            self._reach(self._known(place), relative)
+        elif action in (Action.LINK, Action.SET) and self.config.closures and self._find_node(place) >= 0:
+            self._reach(self._find_node(place), relative)
         self._step_node.append(self._current)
         self._step_motion.append(self._travel.motion)
         return estimate
@@ -282,7 +282,7 @@ class ExperienceMap(Checkpointed, Map):
     def _origin(self) -> np.ndarray:
         return self._pose.rows[self._current] if self._current >= 0 else np.zeros(3)
 
-    def _known(self, place: int) -> int:
+    def _find_node(self, place: int) -> int:
         return int(self._node_of.rows[place]) if 0 <= place < len(self._node_of.rows) else -1
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:

@@ -100,7 +100,7 @@ class Backend(Protocol):
 def enlarge(rows: Any, empty: Any) -> Any:
     """The arrays of `empty` (a NamedTuple) with those of `rows` at their beginning, for `Backend.grow`."""
 
-    def filled(old: Array, new: Array) -> Array:
+    def fill(old: Array, new: Array) -> Array:
         return old if old.shape == new.shape else new.at[tuple(slice(0, n) for n in old.shape)].set(old)
 
-    return jax.tree.map(filled, rows, empty)
+    return jax.tree.map(fill, rows, empty)

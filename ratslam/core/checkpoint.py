@@ -39,7 +39,7 @@ class Checkpointed:
         for name in self.VALUES:
             before = getattr(self, name)
             values = [
-                _converted(arrays[f"{name.lstrip('_')}/{k}"], old) for k, old in enumerate(_as_tuple(before))
+                _convert(arrays[f"{name.lstrip('_')}/{k}"], old) for k, old in enumerate(_as_tuple(before))
             ]
             if not isinstance(before, tuple):
                 setattr(self, name, values[0])
@@ -65,5 +65,5 @@ def _as_tuple(value: Any) -> tuple[Any, ...]:
     return value if isinstance(value, tuple) else (value,)
 
 
-def _converted(value: np.ndarray, like: Any) -> Any:
+def _convert(value: np.ndarray, like: Any) -> Any:
     return np.array(value) if isinstance(like, np.ndarray) else type(like)(value)

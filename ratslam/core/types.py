@@ -1,4 +1,4 @@
-"""The estimate of one step, and what happened to the robot's place."""
+"""The estimate of one step, and the change of the robot's place."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Estimate(NamedTuple):
         place: id of the current place, int32; -1 before the first and for backends without places.
         previous: id of the place before this step, int32.
         action: an `Action`, int32.
-        lost: whether the backend cannot tell where the robot is, bool.
+        lost: whether the backend has lost track of the robot's position, bool.
     """
 
     pose: Array

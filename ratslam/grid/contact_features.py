@@ -19,8 +19,8 @@ class ContactFeatures(NamedTuple):
     Attributes:
         valid: bool, the observation counts as evidence. free: [W] bool, whiskers without contact. new: [W]
             bool, whiskers in contact that were not before. touching: [W] bool, whiskers in contact.
-            point: [W, 2] contact points, m. wall: bool, there is a wall estimate. on_wall: [2] the contact's
-            foot on the wall, m. direction: of the wall, rad. sd: standard deviation of the direction, rad.
+            point: [W, 2] contact points, m. wall: bool, there is a wall estimate. on_wall: [2] the mean
+            contact point projected on the wall, m. direction: of the wall, rad, with standard deviation `sd`.
     """
 
     valid: Array

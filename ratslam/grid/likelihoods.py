@@ -16,21 +16,21 @@ HALF_WEIGHT_LENGTH = 0.5
 
 
 def free_space(config: LikelihoodConfig, evidence: Array, among: Array) -> Array:
-    """[N] of free points with log-odds `evidence` [N, K]; `among` [K] bool: points that count."""
+    """[N] log-likelihood of free points with log-odds `evidence` [N, K]; `among` [K]: which count."""
     return -config.free * (
         jax.nn.softplus(evidence + _logit(config.unexplored)) @ among.astype(evidence.dtype)
     )
 
 
 def contact(config: LikelihoodConfig, evidence: Array, among: Array) -> Array:
-    """[N] of contacts at points with log-odds `evidence` [N, K]; `among` [K] bool: points that count."""
+    """[N] log-likelihood of contacts at points with log-odds `evidence` [N, K]; `among` [K]: which count."""
     chance = jax.nn.sigmoid(evidence + _logit(config.unexplored))
     logs = jnp.log(config.surprise + (1 - config.surprise) * chance)
     return config.contact * (logs @ among.astype(evidence.dtype))
 
 
 def wall_direction(config: LikelihoodConfig, field: Array, angle: Array, precision: Array) -> Array:
-    """[N] of measured wall directions given fields of wall directions.
+    """[N] log-likelihood of measured wall directions given fields of wall directions.
 
     Args:
         field: [N, 2] sums of unit vectors at a multiple of the direction. angle: [N] the same multiple of the
@@ -46,7 +46,7 @@ def wall_direction(config: LikelihoodConfig, field: Array, angle: Array, precisi
 
 
 CountedCells = Callable[[Array, Array], Array]
-"""Of cells [N, W, G, 2] along whiskers and contacts [W]: bool [N, W, G], the free points that count."""
+"""Takes cells [N, W, G, 2] along whiskers and contacts [W]; gives bool [N, W, G], free points that count."""
 
 
 def all_cells(cell: Array, contact: Array) -> Array:
@@ -63,7 +63,7 @@ def printed_likelihood(
     alive: Array,
     counted: CountedCells = all_cells,
 ) -> Array:
-    """[N] eq. 1 and 2.
+    """[N] log-likelihood by eq. 1 and 2.
 
     Args:
         evidence: [N, W, G] log-odds at the points along each whisker, from base to tip. cell: [N, W, G, 2]

@@ -53,7 +53,7 @@ class GridMap(Checkpointed, Map):
         return self._genealogy.path()
 
     def occupancy(self) -> np.ndarray:
-        """[S, S] probability of an obstacle in each cell; rows are y, columns x, the start is central."""
+        """[S, S] probability of an obstacle in each cell; rows are y, columns x, the middle is the start."""
         return draw_occupancy(self.config, self.feelers, self.side, self.trajectory(), self._contact_log())
 
     def files(self) -> dict[str, Callable[[Path], None]]:

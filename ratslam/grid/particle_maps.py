@@ -45,20 +45,20 @@ def windows_around(place: Array, side: int, size: int) -> Windows:
 def read_window(maps: Array, windows: Windows, layer: int) -> Array:
     """[N, size, size] one layer of the maps inside the windows."""
 
-    def one(rows: Array, corner: Array) -> Array:
+    def read(rows: Array, corner: Array) -> Array:
         return lax.dynamic_slice(rows[layer], (corner[1], corner[0]), (windows.size, windows.size))
 
-    return jax.vmap(one)(maps, windows.corner)
+    return jax.vmap(read)(maps, windows.corner)
 
 
 def write_window(maps: Array, windows: Windows, layer: int, values: Array) -> Array:
     """The maps with one layer inside the windows replaced by values [N, size, size]."""
     zero = jnp.int32(layer)
 
-    def one(rows: Array, corner: Array, value: Array) -> Array:
+    def write(rows: Array, corner: Array, value: Array) -> Array:
         return lax.dynamic_update_slice(rows, value[None], (zero, corner[1], corner[0]))
 
-    return jax.vmap(one)(maps, windows.corner, values)
+    return jax.vmap(write)(maps, windows.corner, values)
 
 
 def to_window(place: Array, windows: Windows) -> Array:

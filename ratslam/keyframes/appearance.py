@@ -1,7 +1,7 @@
 """Views of the keyframes: given ids, views or whisker images, and the metric by which recall compares them.
 
-Each kind stores what all keyframes looked like, gives recall the metric, and measures how badly a keyframe
-would fit at another pose. The properties of the sensor are estimated from the session itself.
+Each class stores the views of all keyframes, gives recall the metric, and measures how badly a keyframe would
+fit at another pose. The properties of the sensor are estimated from the session itself.
 """
 
 from __future__ import annotations

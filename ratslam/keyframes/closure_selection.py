@@ -16,9 +16,9 @@ import numpy as np
 from ratslam.keyframes.optimizer import LoopClosures, MapFit, MapProblem, robust_cost, solve
 from tactile.base.se2 import between, compose, correct_heading_bias, integrate, inverse
 
-KEPT = 0.25
+ACCEPTED_WEIGHT = 0.25
 """Robust weight above which a sequence is accepted: its strain is then less than its evidence."""
-STRONG = (20.0, 40.0)
+START_EVIDENCE = (20.0, 40.0)
 """Least evidence of the sequences from which further starts are made."""
 STEPS = 12
 """Solver iterations from each start."""
@@ -26,13 +26,13 @@ FINE = 1e-3
 """Largest change per solver iteration at convergence, m and rad."""
 CUT = 30.0
 """Cost of a cut of the odometry, chi-square; robots are seldom carried away."""
-PLAUSIBLE = 3.0
+AGREEMENT = 3.0
 """Squared deviation up to which a sequence agrees with the odometry."""
-TELLING = 16.0
+MIN_STRAIN = 16.0
 """Least squared deviation at which a cut is tried."""
-TRIES = 5
+TRIALS = 5
 """Number of sequences at which a cut is tried before the best is taken."""
-ALIKE = 0.5
+COST_TOLERANCE = 0.5
 """Difference in cost, chi-square, below which two cuts count as equally good."""
 LOOSE = 1e4
 """Standard deviation of the odometry at a cut, m and rad."""
@@ -61,36 +61,36 @@ class Selection(NamedTuple):
     cuts: tuple[tuple[int, int], ...]
 
 
-Where = Callable[[np.ndarray, np.ndarray, np.ndarray, int], int]
+FindCut = Callable[[np.ndarray, np.ndarray, np.ndarray, int], int]
 """Finds the keyframe before which the odometry is cut. Arguments: all poses [N, 3]; poses [n, 3] by odometry
 of the keyframes that follow a keyframe; the motion [3] that moves the last of them to where it was
 recognised; the number of that keyframe."""
 
 
 def select_closures(
-    case: SelectionProblem, starts: Sequence[MapFit], where: Where, earlier: tuple[tuple[int, int], ...] = ()
+    case: SelectionProblem, starts: Sequence[MapFit], find: FindCut, earlier: tuple[tuple[int, int], ...] = ()
 ) -> Selection:
     """The selection with the least cost.
 
     Args:
-        starts: maps to start from; the first is the current map, the last dead reckoning. where: see `Where`.
-        earlier: cuts (keyframe, sequence) of the current map.
+        starts: maps to start from; the first is the current map, the last dead reckoning. find: see
+            `FindCut`. earlier: cuts (keyframe, sequence) of the current map.
     """
     best = optimise_with_cuts(case, starts[0], earlier)
-    if earlier:  # they may no longer be needed
+    if earlier:  # the map may need no cuts any more
         best = min(best, optimise_with_cuts(case, starts[0], ()), key=_cost)
-    if not (best.fit.weights > KEPT).all():
-        best = min([best, *_anew(case, starts)], key=_cost)
-    return _with_cuts(case, best, where)
+    if not (best.fit.weights > ACCEPTED_WEIGHT).all():
+        best = min([best, *_optimise_anew(case, starts)], key=_cost)
+    return _with_cuts(case, best, find)
 
 
-def _anew(case: SelectionProblem, starts: Sequence[MapFit]) -> list[Selection]:
+def _optimise_anew(case: SelectionProblem, starts: Sequence[MapFit]) -> list[Selection]:
     """Maps without cuts from all starts, and from the last one optimised with strong sequences only."""
     begin, path = list(starts), starts[-1]
-    for least in STRONG:
+    for least in START_EVIDENCE:
         strong = case.evidence >= least
         if strong.any() and not strong.all():
-            alone = _only(case.measurements.closures, strong)
+            alone = _choose(case.measurements.closures, strong)
             begin.append(solve(path, case.measurements._replace(closures=alone), STEPS, FINE))
     return [optimise_with_cuts(case, start, ()) for start in begin]
 
@@ -99,14 +99,14 @@ def _cost(selection: Selection) -> float:
     return selection.cost
 
 
-def _with_cuts(case: SelectionProblem, best: Selection, where: Where) -> Selection:
+def _with_cuts(case: SelectionProblem, best: Selection, find: FindCut) -> Selection:
     """Cuts the odometry where it is strained or contradicted most, while that lowers the cost."""
     while True:
         strain = _strain(case, best)
-        tempting = [
-            sequence for sequence in np.argsort(-strain)[:TRIES].tolist() if strain[sequence] >= TELLING
+        strained = [
+            sequence for sequence in np.argsort(-strain)[:TRIALS].tolist() if strain[sequence] >= MIN_STRAIN
         ]
-        found = [selection for sequence in tempting for selection in _cut(case, best, sequence, where)]
+        found = [selection for sequence in strained for selection in _cut(case, best, sequence, find)]
         cut = _nearest(case, best, found) if found else best
         if cut.cost >= best.cost:
             return best
@@ -115,10 +115,10 @@ def _with_cuts(case: SelectionProblem, best: Selection, where: Where) -> Selecti
 
 def _nearest(case: SelectionProblem, best: Selection, found: list[Selection]) -> Selection:
     """The cheapest selection; of equally good ones the one whose cut is shown by the earliest sequence. A cut
-    costs the same anywhere between two sequences, and views locate it better where less odometry lies
+    costs the same anywhere between two sequences, and views find it better where less odometry lies
     between."""
     least = min(selection.cost for selection in found)
-    alike = [selection for selection in found if selection.cost <= least + ALIKE]
+    alike = [selection for selection in found if selection.cost <= least + COST_TOLERANCE]
     return min(alike, key=lambda selection: case.first[selection.cuts[len(best.cuts)][1]])
 
 
@@ -131,16 +131,16 @@ def _strain(case: SelectionProblem, best: Selection) -> np.ndarray:
         since, first = _since(case, best, sequence), int(case.first[sequence])
         if first <= since:
             continue
-        told = correct_heading_bias(chain.motion[since:first], chain.length[since:first], best.fit.bias)
+        motion = correct_heading_bias(chain.motion[since:first], chain.length[since:first], best.fit.bias)
         before, claimed = _claim(best, closures, since), _claim(best, closures, first, sequence)
-        onwards = integrate(told, before)
+        onwards = integrate(motion, before)
         error = between(onwards[-1], claimed)
         variance = chain.variance[since:first]
         lever = ((onwards[:, :2] - onwards[-1, :2]) ** 2).sum(axis=1) / 2
         allowed = variance.sum(axis=0) + 2 * closures.variance
         allowed[:2] += (variance[:, 2] * lever).sum()
         strain[sequence] = (error**2 / allowed).sum()
-    contradicts = (best.fit.weights <= KEPT) & (strain > PLAUSIBLE)
+    contradicts = (best.fit.weights <= ACCEPTED_WEIGHT) & (strain > AGREEMENT)
     return np.where(contradicts, np.maximum(strain, case.evidence), strain)
 
 
@@ -150,7 +150,7 @@ def _claim(best: Selection, closures: LoopClosures, frame: int, sequence: int | 
     among &= (
         (closures.sequence == sequence)
         if sequence is not None
-        else (best.fit.weights > KEPT)[closures.sequence]
+        else (best.fit.weights > ACCEPTED_WEIGHT)[closures.sequence]
     )
     if not among.any():
         return best.fit.poses[frame]
@@ -160,11 +160,11 @@ def _claim(best: Selection, closures: LoopClosures, frame: int, sequence: int | 
 
 def _since(case: SelectionProblem, best: Selection, sequence: int) -> int:
     """The last keyframe before a sequence that an accepted sequence joins to the map."""
-    earlier = (best.fit.weights > KEPT) & (case.last < case.first[sequence])
+    earlier = (best.fit.weights > ACCEPTED_WEIGHT) & (case.last < case.first[sequence])
     return int(case.last[earlier].max(initial=0))
 
 
-def _cut(case: SelectionProblem, best: Selection, sequence: int, where: Where) -> list[Selection]:
+def _cut(case: SelectionProblem, best: Selection, sequence: int, find: FindCut) -> list[Selection]:
     """The map with a cut between a sequence and the accepted one before it; and the same with a second cut
     after the sequence, so that later accepted sequences stay in place: a robot carried twice."""
     poses = best.fit.poses
@@ -172,36 +172,36 @@ def _cut(case: SelectionProblem, best: Selection, sequence: int, where: Where) -
     if first <= since:
         return []
     claimed = _claim(best, case.measurements.closures, first, sequence)
-    frame, moved = _carried(case, best, since, first, claimed, poses, where)
+    frame, moved = _carry(case, best, since, first, claimed, poses, find)
     cuts = (*best.cuts, (frame, sequence))
     found = [optimise_with_cuts(case, best.fit._replace(poses=moved), cuts)]
-    accepted = best.fit.weights > KEPT
+    accepted = best.fit.weights > ACCEPTED_WEIGHT
     later = np.flatnonzero(accepted & (case.first > case.last[sequence]))
     if accepted[sequence] or not len(later):
         return found
     following = int(later[np.argmin(case.first[later])])
     end, back = int(case.last[sequence]), int(case.first[following])
-    again, twice = _carried(case, best, end, back, poses[back], moved, where)
+    again, twice = _carry(case, best, end, back, poses[back], moved, find)
     twice[back:] = poses[back:]
     return [*found, optimise_with_cuts(case, best.fit._replace(poses=twice), (*cuts, (again, following)))]
 
 
-def _carried(
+def _carry(
     case: SelectionProblem,
     best: Selection,
     since: int,
     first: int,
     claimed: np.ndarray,
     poses: np.ndarray,
-    where: Where,
+    find: FindCut,
 ) -> tuple[int, np.ndarray]:
     """The keyframe between `since` and `first` before which to cut so that `first` comes to the pose
     `claimed`, and the resulting poses."""
     chain = case.measurements.chain
-    told = correct_heading_bias(chain.motion[since:first], chain.length[since:first], best.fit.bias)
-    onwards = integrate(told, poses[since])  # of frames since + 1 ... first
+    motion = correct_heading_bias(chain.motion[since:first], chain.length[since:first], best.fit.bias)
+    onwards = integrate(motion, poses[since])  # of frames since + 1 ... first
     carried = compose(claimed, inverse(onwards[-1]))
-    frame = where(poses, onwards, carried, since)
+    frame = find(poses, onwards, carried, since)
     moved = poses.copy()
     moved[since + 1 : first + 1] = onwards
     moved[first + 1 :] = compose(compose(onwards[-1], inverse(poses[first])), poses[first + 1 :])
@@ -225,7 +225,7 @@ def optimise_with_cuts(case: SelectionProblem, start: MapFit, cuts: tuple[tuple[
     return Selection(fit, robust_cost(fit, problem) + CUT * len(cuts), cuts)
 
 
-def _only(closures: LoopClosures, sequences: np.ndarray) -> LoopClosures:
+def _choose(closures: LoopClosures, sequences: np.ndarray) -> LoopClosures:
     """The closures of the sequences marked in [R] bool."""
     rows = sequences[closures.sequence]
     number = np.cumsum(sequences) - 1

@@ -31,8 +31,8 @@ class KeyframeGraph(Checkpointed):
     """Keyframes as a chain of odometry with breaks, and the heading bias of the odometry.
 
     Args:
-        cell: size of a pose cell, m. appearance: of the keyframes. guard: newest keyframes that are never
-            recalled.
+        cell: size of a pose cell, m. appearance: of the keyframes. guard: number of newest keyframes, which
+            are never recalled.
 
     Attributes:
         pose: [N, 3] in the map, m, m, rad. motion: [N, 3] odometry into each keyframe. length: [N] distance

@@ -54,7 +54,7 @@ class KeyframeMap(Checkpointed, Map):
     """The map of the recall backend.
 
     Args:
-        cell: size of a pose cell, m. appearance: of the keyframes, empty. guard: newest keyframes that are
+        cell: size of a pose cell, m. appearance: of the keyframes, empty. guard: number of newest keyframes,
             never recalled. closures: False for a map of odometry alone. ablation: parts turned off by a
             study.
     """

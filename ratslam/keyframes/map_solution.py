@@ -10,8 +10,8 @@ import numpy as np
 
 from ratslam.core.growable_array import GrowableArray
 from ratslam.keyframes.closure_selection import (
+    ACCEPTED_WEIGHT,
     FINE,
-    KEPT,
     STEPS,
     Selection,
     SelectionProblem,
@@ -48,7 +48,7 @@ def final_solution(graph: KeyframeGraph, log: ClosureLog, closures: bool) -> Map
 
 
 def selected_solution(graph: KeyframeGraph, log: ClosureLog) -> MapSolution | None:
-    """The map with the closure sequences that are best accepted together; None where none has evidence."""
+    """The map with the closure sequences that are best accepted together; None if none has evidence."""
     config, log, cut = graph.config, deepcopy(log), deepcopy(graph.cut)
     candidates = (log.scores() >= config.select_score) & (log.sizes() >= config.select_length)
     candidates &= log.verdicts() != Verdict.UNDONE
@@ -62,7 +62,7 @@ def selected_solution(graph: KeyframeGraph, log: ClosureLog) -> MapSolution | No
         log.judge(sequence, Verdict.ACCEPTED if candidates[sequence] else Verdict.OPEN)
     selection = _select(graph, log, cut, sequences, earlier)
     for sequence, weight in zip(sequences.tolist(), selection.fit.weights.tolist(), strict=True):
-        log.judge(sequence, Verdict.ACCEPTED if weight > KEPT else Verdict.OPEN)
+        log.judge(sequence, Verdict.ACCEPTED if weight > ACCEPTED_WEIGHT else Verdict.OPEN)
     for frame, sequence in selection.cuts:
         cut.rows[frame] = sequences[sequence]
     # Solved once more without the refused sequences, which removes their remaining pull.

@@ -6,7 +6,7 @@ import numpy as np
 
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import ClosureLog, Verdict
-from ratslam.keyframes.verification import turned
+from ratslam.keyframes.verification import turn_on_spot
 from tactile.base.se2 import compose, inverse
 
 SEARCH = 400
@@ -17,9 +17,9 @@ def break_odometry(graph: KeyframeGraph, log: ClosureLog, sequence: int) -> None
     """Cuts the odometry where the views show the break, and joins the parts by the sequence."""
     members, pose = log.members(sequence), graph.pose.rows
     middle = members[len(members) // 2]
-    found = turned(pose[middle[1]], -middle[2] * graph.sector_angle)
+    found = turn_on_spot(pose[middle[1]], -middle[2] * graph.sector_angle)
     carried = compose(found, inverse(pose[middle[0]]))
-    at = _first_carried(graph, log, carried, int(members[0, 0]))
+    at = _find_first_carried(graph, log, carried, int(members[0, 0]))
     graph.cut.rows[at] = sequence
     pose[at:] = compose(carried, pose[at:])
     log.strike(at, sequence)
@@ -29,20 +29,20 @@ def break_odometry(graph: KeyframeGraph, log: ClosureLog, sequence: int) -> None
 def find_break(
     graph: KeyframeGraph, poses: np.ndarray, onwards: np.ndarray, carried: np.ndarray, since: int
 ) -> int:
-    """The keyframe before which the odometry is cut; see `closure_selection.Where`."""
+    """The keyframe before which the odometry is cut; see `closure_selection.FindCut`."""
     frames = np.arange(since + 1, since + 1 + len(onwards))[-SEARCH:]
-    return _turning_point(graph, frames, poses, onwards[-SEARCH:], carried)
+    return _find_turning_point(graph, frames, poses, onwards[-SEARCH:], carried)
 
 
-def _first_carried(graph: KeyframeGraph, log: ClosureLog, carried: np.ndarray, first: int) -> int:
+def _find_first_carried(graph: KeyframeGraph, log: ClosureLog, carried: np.ndarray, first: int) -> int:
     """The first keyframe whose views fit better at the poses moved by `carried` [3]."""
     anchored = log.table()[log.accepted(), 0]
     since = int(anchored[anchored < first].max(initial=0)) - graph.config.max_gap
     frames = np.arange(max(since, first - SEARCH, 1), first + 1)
-    return _turning_point(graph, frames, graph.pose.rows, graph.pose.rows[frames], carried)
+    return _find_turning_point(graph, frames, graph.pose.rows, graph.pose.rows[frames], carried)
 
 
-def _turning_point(
+def _find_turning_point(
     graph: KeyframeGraph, frames: np.ndarray, poses: np.ndarray, onwards: np.ndarray, carried: np.ndarray
 ) -> int:
     """The keyframe of `frames` [n] from which views fit better at the carried poses than at the odometry's.

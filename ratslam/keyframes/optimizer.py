@@ -254,16 +254,16 @@ def _order(i: np.ndarray, j: np.ndarray, count: int) -> np.ndarray:
     # Only the sparsity pattern matters; the diagonal makes the matrix regular.
     among = csc_matrix((ties, (i, j)), (size, size))
     degree = csc_matrix((np.full(size, 4.0 * len(i) + 1), (ends, ends)), (size, size))
-    factor = _factored(among + among.T + degree, "MMD_AT_PLUS_A")
+    factor = _decompose(among + among.T + degree, "MMD_AT_PLUS_A")
     return np.concatenate([[-1], factor.perm_c])
 
 
 def _factor(matrix: csc_matrix) -> SuperLU | None:
     try:
-        return _factored(matrix, "NATURAL")
+        return _decompose(matrix, "NATURAL")
     except RuntimeError:  # singular: a keyframe is not connected to keyframe 0
         return None
 
 
-def _factored(matrix: csc_matrix, ordering: str) -> SuperLU:
+def _decompose(matrix: csc_matrix, ordering: str) -> SuperLU:
     return splu(matrix, permc_spec=ordering, options={"SymmetricMode": True}, diag_pivot_thresh=0.0)

@@ -24,7 +24,7 @@ class SequenceTest(NamedTuple):
     breaks_odometry: bool
 
 
-def turned(pose: np.ndarray, angle: float) -> np.ndarray:
+def turn_on_spot(pose: np.ndarray, angle: float) -> np.ndarray:
     """The pose [3] turned on the spot by `angle`, rad."""
     return compose(pose, np.array([0.0, 0.0, angle]))
 
@@ -58,8 +58,8 @@ def _motions(graph: KeyframeGraph, first: Candidate, candidate: Candidate) -> tu
     """[3] motion from one candidate to a later one: between the remembered poses, and in the map."""
     pose, angle = graph.pose.rows, graph.sector_angle
     remembered = between(
-        turned(pose[first.match], -first.shift * angle),
-        turned(pose[candidate.match], -candidate.shift * angle),
+        turn_on_spot(pose[first.match], -first.shift * angle),
+        turn_on_spot(pose[candidate.match], -candidate.shift * angle),
     )
     return remembered, between(pose[first.keyframe], pose[candidate.keyframe])
 
@@ -84,7 +84,7 @@ def _distance(graph: KeyframeGraph, log: ClosureLog, candidate: Candidate) -> tu
     """
     turn = -candidate.shift * graph.sector_angle
     pose = graph.pose.rows
-    error = between(turned(pose[candidate.match], turn), pose[candidate.keyframe])
+    error = between(turn_on_spot(pose[candidate.match], turn), pose[candidate.keyframe])
     gate = graph.config.gate_sd * graph.cell
     allowed = graph.relative_covariance(log, candidate.match, candidate.keyframe, turn)
     least = np.diag([gate**2, gate**2, graph.config.gate_heading**2])
@@ -99,7 +99,7 @@ def _alternatives(
     """Log of the ratio of keyframes in the region that the map allows to those around one place."""
     pose = graph.pose.rows
     old = pose[: candidate.keyframe - graph.guard]
-    origin = turned(pose[candidate.match], turn)
+    origin = turn_on_spot(pose[candidate.match], turn)
     centre = between(origin, pose[candidate.keyframe])[:2]
     frames = between(origin, old)[:, :2]
     apart = frames - centre

@@ -17,12 +17,12 @@ from ratslam.core.growable_array import GrowableArray
 
 FIELDS_OF_VIEW = np.radians([sign * width for width in (60, 90, 120, 180, 240, 270, 360) for sign in (1, -1)])
 """Candidate fields of view, rad; negative: clockwise."""
-SURE = 3.0
+MIN_SIGNIFICANCE = 3.0
 """Significance of the improvement by a shift, standard errors, from which sectors count as ordered."""
-PLAIN = 0.1
+MIN_IMPROVEMENT = 0.1
 """Least share of the unshifted difference that the shift must explain, because a significant improvement may
 still be small."""
-FEWEST = 20
+MIN_COUNT = 20
 """Turns before the field of view is estimated, and pairs of views before the bias is."""
 LAGS = (1, 2)
 """Keyframes between the views compared for the bias; two estimates, to show their error."""
@@ -80,9 +80,9 @@ class SectorFan(Checkpointed):
     def estimate(self) -> BiasEstimate:
         """The heading bias that the views show, to be added to the odometry's turn."""
         self._estimate_angle()
-        if not self._angle or len(self._view.rows) < 2 * FEWEST:
+        if not self._angle or len(self._view.rows) < 2 * MIN_COUNT:
             return NO_ESTIMATE
-        answers = [_slope(self._measured(lag), abs(self._angle)) for lag in LAGS]
+        answers = [_slope(self._heading_errors(lag), abs(self._angle)) for lag in LAGS]
         value = float(np.mean([answer.value for answer in answers]))
         error = np.mean([answer.error**2 for answer in answers]) + (answers[0].value - answers[1].value) ** 2
         return BiasEstimate(value, float(np.sqrt(error)))
@@ -95,9 +95,9 @@ class SectorFan(Checkpointed):
             return
         total, count = gain.sum(axis=0), (gain != 0).sum(axis=0)
         sure = total / np.sqrt(np.maximum((gain**2).sum(axis=0), 1e-300))
-        best = int(np.argmax(np.where(count >= FEWEST, total, -np.inf)))
-        plain = total[best] > PLAIN * self._still.rows[:, best].sum()
-        if count[best] >= FEWEST and sure[best] > SURE and plain:
+        best = int(np.argmax(np.where(count >= MIN_COUNT, total, -np.inf)))
+        plain = total[best] > MIN_IMPROVEMENT * self._still.rows[:, best].sum()
+        if count[best] >= MIN_COUNT and sure[best] > MIN_SIGNIFICANCE and plain:
             self._angle = float(FIELDS_OF_VIEW[best] / self._view.rows.shape[1])
             self._due = 2 * len(gain)
             self._pairs = _no_pairs()
@@ -115,16 +115,16 @@ class SectorFan(Checkpointed):
         ]
         return np.array(gain), still * moves
 
-    def _measured(self, lag: int) -> np.ndarray:
+    def _heading_errors(self, lag: int) -> np.ndarray:
         """[P, 3] heading error (rad), its weight, distance (m) of pairs of keyframes `lag` apart."""
         pairs = self._pairs[lag]
         done, count = len(pairs.rows), len(self._view.rows) - lag
         if count > done:
-            for row in self._turned(np.arange(done, count) + lag, lag):
+            for row in self._measure_turns(np.arange(done, count) + lag, lag):
                 pairs.append(row)
         return pairs.rows
 
-    def _turned(self, at: np.ndarray, lag: int) -> np.ndarray:
+    def _measure_turns(self, at: np.ndarray, lag: int) -> np.ndarray:
         angle, step = self._angle, np.cumsum(self._step.rows, axis=0)
         turn, length = (step[at] - step[at - lag]).T
         view, offset = self._view.rows, SCAN * abs(angle)
@@ -175,7 +175,7 @@ def _fractional_difference(now: np.ndarray, old: np.ndarray, shift: np.ndarray) 
 def _slope(pairs: np.ndarray, angle: float) -> BiasEstimate:
     """Robust line through the origin (Huber, a quarter sector) and its jackknife error over blocks."""
     turned, trust, length = pairs.T
-    if np.count_nonzero(trust) < FEWEST:
+    if np.count_nonzero(trust) < MIN_COUNT:
         return NO_ESTIMATE
     value = 0.0
     for _ in range(12):

@@ -37,7 +37,7 @@ class RecallConfig(Settings):
     """Error that stands for a view never seen before, in scales."""
     common: NonNegativeFloat = 1.0
     """Weight of the mean likelihood over all keyframes in the likelihood of novelty; with 1, a view that all
-    places share is no evidence."""
+    places share carries no evidence."""
     fresh: NonNegativeFloat = 0.3
     """Weight of a view at `floor` in the likelihood of novelty."""
     reach: PositiveFloat = 0.85
@@ -45,7 +45,7 @@ class RecallConfig(Settings):
     reach_heading: PositiveFloat = 0.25
     """Standard deviation of a keyframe's heading relative to odometry, rad."""
     miss_weight: PositiveFloat = 0.02
-    """Weight of no keyframe being where odometry leads, relative to a keyframe exactly there."""
+    """Weight of the case that no keyframe lies where odometry leads, relative to a keyframe exactly there."""
     mode_decay: Share = 0.01
     """Share of a mode's mass that is lost at every keyframe."""
     enter: Share = 0.05
@@ -63,7 +63,7 @@ class RecallConfig(Settings):
     temper: PositiveFloat = 0.25
     """Whiskers: factor on the log-odds of an image, because pixels are not independent."""
     familiar: Share = 0.8
-    """Whiskers: weight, in the likelihood of novelty, of the successors of keyframes that looked like the
+    """Whiskers: weight, in the likelihood of novelty, of the successors of keyframes similar to the
     previous image, relative to `floor`."""
     energy: PositiveFloat = 3.0
     """Activity injected into the pose cells for a candidate of posterior 1; the packet's activity is 1. With

@@ -1,7 +1,7 @@
 """Recall: a Bayes filter over remembered keyframes, the sector shift that aligns them, and novelty.
 
-A single view seldom identifies a place. So nothing is decided on one view: the posterior is moved by odometry
-and weighed by every view, and what no keyframe explains goes to novelty. A view similar to many keyframes
+A single view seldom identifies a place, so the filter never decides on one: odometry moves the posterior,
+every view weighs it, and mass that no keyframe explains goes to novelty. A view similar to many keyframes
 carries little evidence, because the likelihood of novelty contains the mean likelihood over all of them; a
 view that contradicts a keyframe removes its mass. Odometry aligns keyframes but is never evidence. The map's
 pose enters as one more, weak, hypothesis.
@@ -88,7 +88,7 @@ def recognise(
     facing = memory.cosine * jnp.cos(here[2]) + memory.sine * jnp.sin(here[2]) > FACING
     best = jnp.max(jnp.where(near & facing, jnp.max(likelihood, axis=0), 0.0))
     view_fits = jnp.where(
-        certain & observation.telling & jnp.any(near & facing), (best >= novelty).astype(jnp.int32), -1
+        certain & observation.informative & jnp.any(near & facing), (best >= novelty).astype(jnp.int32), -1
     )
 
     shares = jnp.concatenate([masses, jnp.maximum(1 - jnp.sum(masses, keepdims=True), 0.0)])

@@ -16,7 +16,7 @@ NO_LIKENESS = np.zeros((0, 0, 0))
 
 
 class MapFeedback(NamedTuple):
-    """What the filter takes over from the map.
+    """Values of the map that the filter takes over.
 
     Attributes:
         poses: [N, 3] of all keyframes, m, m, rad. bias: heading bias, rad/m. since: distance travelled since

@@ -28,7 +28,7 @@ class ObservationLikelihood(NamedTuple):
 
     Attributes:
         likelihood: [S or 1, C] at each shift and keyframe. novelty: likelihood at a new place.
-        background: see `RecallResult`. certain: whether the filter can decide yet. telling: whether the
+        background: see `RecallResult`. certain: whether the filter can decide yet. informative: whether the
             observation is evidence about the current place (a label never given before is not).
     """
 
@@ -36,7 +36,7 @@ class ObservationLikelihood(NamedTuple):
     novelty: Array
     background: Array
     certain: Array
-    telling: Array
+    informative: Array
 
 
 def view_likelihood(config: RecallConfig, cell: float, memory: Memory, view: Array) -> ObservationLikelihood:
@@ -60,7 +60,7 @@ def view_likelihood(config: RecallConfig, cell: float, memory: Memory, view: Arr
         novelty=jnp.where(known, novelty, 1.0),
         background=_background(jnp.min(error, axis=0), frames & (apart > away**2)),
         certain=known & jnp.any(frames),
-        telling=known,
+        informative=known,
     )
 
 
@@ -91,7 +91,7 @@ def touch_likelihood(
         novelty=jnp.where(certain, novelty, 1.0),
         background=jnp.full(SAMPLES, jnp.nan, memory.x.dtype),
         certain=certain,
-        telling=certain,
+        informative=certain,
     )
     return memory._replace(before=likelihood), observation
 
@@ -100,13 +100,13 @@ def _successors(before: Array) -> Array:
     """[S, C] likelihoods [S, C] of keyframes moved to their successors (predecessors for half turns)."""
     index = jnp.arange(before.shape[1], dtype=jnp.int32)
 
-    def led(row: Array, by: int) -> Array:
+    def shift_mass(row: Array, by: int) -> Array:
         came = index - by
         return jnp.where((came >= 0) & (came < len(index)), jnp.roll(row, by), 0.0)
 
     rows = [
         sum(
-            (share * led(before[s], sign * step) for step, share in enumerate(STEPS)),
+            (share * shift_mass(before[s], sign * step) for step, share in enumerate(STEPS)),
             jnp.zeros_like(before[s]),
         )
         for s, sign in enumerate((1, -1)[: len(before)])
@@ -126,7 +126,7 @@ def label_likelihood(config: RecallConfig, memory: Memory, label: Array) -> Obse
         novelty=novelty**LABEL_TEMPER,
         background=jnp.full(SAMPLES, jnp.nan, memory.x.dtype),
         certain=jnp.any(recallable(config, memory)),
-        telling=known,
+        informative=known,
     )
 
 
@@ -151,8 +151,8 @@ def _background(error: Array, away: Array) -> Array:
     """[SAMPLES] of the errors [C], spread evenly over the keyframes ruled out by the map (`away` [C])."""
     rank = jnp.cumsum(away.astype(jnp.int32))
     count = rank[-1]
-    wanted = (jnp.arange(SAMPLES, dtype=jnp.int32) * jnp.maximum(count - 1, 0)) // (SAMPLES - 1) + 1
-    row = jnp.searchsorted(rank, wanted)
+    ranks = (jnp.arange(SAMPLES, dtype=jnp.int32) * jnp.maximum(count - 1, 0)) // (SAMPLES - 1) + 1
+    row = jnp.searchsorted(rank, ranks)
     row = jnp.minimum(row, len(rank) - 1)
     # With fewer than SAMPLES keyframes each is reported once.
     fresh = jnp.concatenate([jnp.ones(1, bool), row[1:] != row[:-1]])

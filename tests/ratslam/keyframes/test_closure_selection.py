@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ratslam.keyframes import closure_selection
-from ratslam.keyframes.closure_selection import CUT, KEPT, STEPS, SelectionProblem, select_closures
+from ratslam.keyframes.closure_selection import ACCEPTED_WEIGHT, CUT, STEPS, SelectionProblem, select_closures
 from ratslam.keyframes.optimizer import (
     BiasPrior,
     LoopClosures,
@@ -136,7 +136,7 @@ def test_runs_that_are_all_true_are_solved_for(seed):
     made = world(seed)
     case, starts = made.case, made.starts()
     judged = select_closures(case, starts, made.where)
-    assert (judged.fit.weights > KEPT).all()
+    assert (judged.fit.weights > ACCEPTED_WEIGHT).all()
     assert judged.cuts == ()
     plain = solve(starts[0], case.measurements, STEPS, closure_selection.FINE)
     assert np.array_equal(judged.fit.poses, plain.poses)
@@ -150,8 +150,8 @@ def test_runs_that_are_all_true_are_solved_for(seed):
 def test_a_run_that_is_false_is_outvoted(seed, evidence):
     made = world(seed, false=evidence)
     judged = select_closures(made.case, made.starts(), made.where)
-    assert judged.fit.weights[-1] < KEPT
-    assert (judged.fit.weights[:-1] > KEPT).all()
+    assert judged.fit.weights[-1] < ACCEPTED_WEIGHT
+    assert (judged.fit.weights[:-1] > ACCEPTED_WEIGHT).all()
     assert judged.cuts == ()
     assert off(judged.fit, made.truth) < 0.1
     within = world(seed).starts()[0]
@@ -166,7 +166,7 @@ def test_a_run_that_is_false_is_outvoted(seed, evidence):
 def test_a_run_that_is_false_is_outvoted_however_strong_it_is():
     made = world(0, false=60.0)
     judged = select_closures(made.case, made.starts(), made.where)
-    assert judged.fit.weights[-1] < KEPT
+    assert judged.fit.weights[-1] < ACCEPTED_WEIGHT
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -182,7 +182,7 @@ def test_a_map_bent_by_a_false_run_is_set_right(seed):
     )
     judged = select_closures(made.case, [bent, path], made.where)
     assert off(bent, made.truth) > 2 * off(judged.fit, made.truth)
-    assert judged.fit.weights[-1] < KEPT
+    assert judged.fit.weights[-1] < ACCEPTED_WEIGHT
     assert off(judged.fit, made.truth) < 0.1
 
 
@@ -192,7 +192,7 @@ def test_a_hopeless_present_map_is_given_up(seed):
     stream = np.random.default_rng(seed)
     lost = made.reckoned()._replace(poses=stream.uniform(-2, 2, made.truth.shape))
     judged = select_closures(made.case, [lost, made.reckoned()], made.where)
-    assert (judged.fit.weights > KEPT).all()
+    assert (judged.fit.weights > ACCEPTED_WEIGHT).all()
     assert off(judged.fit, made.truth) < 0.1
 
 
@@ -266,7 +266,7 @@ def test_a_robot_that_was_carried_is_cut_where_it_was(seed):
     judged = select_closures(made.case, made.starts(), made.where)
     assert [frame for frame, _ in judged.cuts] == [jump[0]]
     assert made.case.first[judged.cuts[0][1]] >= jump[0]
-    assert (judged.fit.weights > KEPT).all()
+    assert (judged.fit.weights > ACCEPTED_WEIGHT).all()
     assert off(judged.fit, made.truth) < 0.1
 
 
@@ -278,7 +278,7 @@ def test_a_robot_carried_away_and_back_is_cut_twice(seed):
     made = world(seed, laps=5, jumps=((away, places), (away + stay, -places)), least=35.0)
     judged = select_closures(made.case, made.starts(), made.where)
     assert sorted(frame for frame, _ in judged.cuts) == [away, away + stay]
-    assert (judged.fit.weights > KEPT).all()
+    assert (judged.fit.weights > ACCEPTED_WEIGHT).all()
     assert off(judged.fit, made.truth) < 0.1
 
 

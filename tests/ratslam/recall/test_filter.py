@@ -576,7 +576,7 @@ def test_odometry_alone_is_never_evidence():
     memory = filled(FLAT, np.zeros((40, SIZE)), spaced(40, 0.5), scale=0.1)
     blank = ObservationLikelihood(
         likelihood=jnp.ones((1, CAPACITY)), novelty=jnp.ones(()), background=jnp.full(SAMPLES, jnp.nan),
-        certain=jnp.bool_(True), telling=jnp.bool_(False),
+        certain=jnp.bool_(True), informative=jnp.bool_(False),
     )  # fmt: skip
     blind = jax.jit(partial(recognise, FLAT, CELL))
     # A view that all frames share: by views, too, nothing is told.
@@ -651,7 +651,7 @@ def test_only_a_known_id_tells_whether_the_map_is_right():
     memory = filled(FLAT, np.zeros((40, 0)), spaced(40), labels=ids)
     memory = memory._replace(pose=jnp.asarray(spaced(40)[20]))
     answers = {label: label_likelihood(memory, label) for label in (20, 3, 77)}
-    assert [bool(weighing.telling) for *_, weighing in answers.values()] == [True, True, False]
+    assert [bool(weighing.informative) for *_, weighing in answers.values()] == [True, True, False]
     assert [int(found.view_fits) for _, found, _ in answers.values()] == [1, 0, -1]
 
 

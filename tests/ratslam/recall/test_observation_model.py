@@ -190,7 +190,7 @@ def test_an_image_weighs_what_loops_find(config, seed):
     assert np.allclose(found.likelihood, likelihood, rtol=1e-9)
     assert float(found.novelty) == pytest.approx(novelty, rel=1e-9)
     assert np.array_equal(after.before, found.likelihood)
-    assert found.certain == found.telling == (int(memory.count) > GUARD)
+    assert found.certain == found.informative == (int(memory.count) > GUARD)
     assert np.isnan(found.background).all()
     same = {name for name in after._fields if name != "before"}
     assert all(np.array_equal(getattr(after, name), getattr(memory, name)) for name in same)
@@ -341,7 +341,7 @@ def test_nothing_is_certain_before_anything_is_known(config):
     for memory in (empty, untaught):
         after, found = weigh(config, memory, images[7])
         assert not found.certain
-        assert not found.telling
+        assert not found.informative
         assert (found.likelihood == 1).all()
         assert found.novelty == 1
         assert not after.before.any()
