@@ -6,6 +6,7 @@ fit at another pose. The properties of the sensor are estimated from the session
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -63,16 +64,16 @@ class ConfirmedPairs(NamedTuple):
     reversed: np.ndarray
 
 
-class Appearance(Checkpointed):
+class Appearance(Checkpointed, ABC):
     """Views of all keyframes."""
 
+    @abstractmethod
     def metric(self) -> ViewMetric:
         """The present metric of recall."""
-        raise NotImplementedError
 
+    @abstractmethod
     def append(self, observation: Observation, turn: float, length: float) -> None:
         """Adds a keyframe, after a turn (rad) and a distance (m) since the one before."""
-        raise NotImplementedError
 
     def learn(self, evidence: Evidence, confirmed_pairs: Callable[[], ConfirmedPairs]) -> BiasEstimate:
         """Updates the metric from the newest keyframe's evidence and, at intervals, from confirmed pairs.
@@ -82,10 +83,10 @@ class Appearance(Checkpointed):
         """
         return NO_ESTIMATE
 
+    @abstractmethod
     def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
         """How badly a keyframe would fit among keyframes [n], seen in the same or in the opposite direction
         (`reversed` [n] bool); 0 or more."""
-        raise NotImplementedError
 
 
 class LabelAppearance(Appearance):
