@@ -30,6 +30,17 @@ def sweep_thresholds(config: RunConfig, log: InMemorySource, thresholds: np.ndar
     Raises:
         ValueError: the configuration has another method.
     """
+    return np.asarray(sweep_steps(config, log, thresholds)[0].place)
+
+
+def sweep_steps(
+    config: RunConfig, log: InMemorySource, thresholds: np.ndarray
+) -> tuple[Estimate, ClassicEvidence]:
+    """Estimate and evidence of T steps with the classic method at thresholds [B]; leading axes [B, T].
+
+    Raises:
+        ValueError: the configuration has another method.
+    """
     if config.backend != "classic":
         raise ValueError(f"backend: {config.backend}; a sweep of thresholds needs backend: classic")
     dtype = np.dtype(config.session.precision)
@@ -38,8 +49,8 @@ def sweep_thresholds(config: RunConfig, log: InMemorySource, thresholds: np.ndar
     padding = readings[-1:] * (capacity_for(log.length) - len(readings))  # cut off below
     chunk = stack(readings + padding)
     method = select_settings(config, ClassicBackendConfig)
-    estimate, _ = _batch(method, log.view_shape, dtype.name, jnp.asarray(thresholds, dtype), chunk)
-    return np.asarray(estimate.place)[:, : log.length]
+    found = _batch(method, log.view_shape, dtype.name, jnp.asarray(thresholds, dtype), chunk)
+    return jax.tree.map(lambda column: np.asarray(column)[:, : log.length], found)
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import csv
 
+import jax
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ratslam.classic.experience_map import ExperienceMap
 from ratslam.cli import main
 from ratslam.cli.reproduce import SALMAN2016
 from ratslam.experiments.salman2016.claims import judge_claim, render_claims
@@ -18,7 +20,7 @@ from ratslam.experiments.salman2016.reproduction import PAPER, match_thresholds,
 from ratslam.experiments.trials import reproduction
 from ratslam.experiments.trials.controls import apply_control
 from ratslam.experiments.trials.reproduction import ResultRow, column, reproduce
-from ratslam.experiments.trials.threshold_sweep import sweep_thresholds
+from ratslam.experiments.trials.threshold_sweep import sweep_steps, sweep_thresholds
 from ratslam.experiments.trials.touch_trial import (
     SessionResult,
     capacity_for,
@@ -28,6 +30,7 @@ from ratslam.experiments.trials.touch_trial import (
     touch_metrics,
     truncate_log,
 )
+from robot.touch_source import observation_of
 from tactile.base.errors import InputError
 from tactile.base.se2 import compose
 
@@ -132,10 +135,21 @@ def test_capacities_are_sufficient_powers_of_two(steps):
 
 
 def test_a_threshold_sweep_equals_single_sessions(tiny):
+    """In the current experiences, and in the map that the steps of a threshold are folded into."""
     config, log = tiny
-    first, second = sweep_thresholds(config, log, np.array([0.06, config.templates.threshold]))
+    thresholds = np.array([0.06, config.templates.threshold])
+    first, second = sweep_thresholds(config, log, thresholds)
     assert len(np.unique(first)) != len(np.unique(second))
-    assert np.array_equal(second, run_session(config, log).place)
+    alone = run_session(config, log)
+    assert np.array_equal(second, alone.place)
+    folded = ExperienceMap(config.experience)
+    columns = sweep_steps(config, log, thresholds)
+    for row, sample in enumerate(log):
+        estimate, evidence = jax.tree.map(lambda column, row=row: column[1, row], columns)
+        folded.update(observation_of(sample), estimate, evidence)
+    assert len(alone.closures) > 0
+    assert np.allclose(folded.trajectory(), alone.trajectory, atol=1e-9)
+    assert np.array_equal(folded.closures(), alone.closures)
 
 
 def test_only_the_classic_method_has_thresholds(tiny):
