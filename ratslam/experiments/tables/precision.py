@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -139,8 +140,18 @@ def difference(values: np.ndarray, against: np.ndarray) -> Difference:
 
 def median_interval(values: np.ndarray, level: float) -> tuple[float, float]:
     """A confidence interval of the median of any distribution from samples [N]; infinite with too few."""
-    low, high = stats.quantile_test(values, p=0.5).confidence_interval(level)
-    return (float(low), float(high)) if np.isfinite(low) else (-np.inf, np.inf)
+    ranks = _median_ranks(len(values), level)
+    if ranks is None:
+        return -np.inf, np.inf
+    low, high = np.sort(values)[list(ranks)]
+    return float(low), float(high)
+
+
+@cache
+def _median_ranks(count: int, level: float) -> tuple[int, int] | None:
+    """The interval's ends among so many sorted values, from 0; None with too few."""
+    low, high = stats.quantile_test(np.arange(float(count)), p=0.5).confidence_interval(level)
+    return (int(low), int(high)) if np.isfinite(low) else None
 
 
 def is_accepted(found: Sequence[Difference]) -> bool:

@@ -13,7 +13,7 @@ from tactile.base.random_streams import stream
 @pytest.mark.parametrize("level", [0.9, 0.95, 0.99])
 def test_the_median_lies_in_its_interval_as_often_as_promised(count, level):
     """Of a skewed law, whose mean is elsewhere."""
-    draws, random = 1000, stream(0, "tests.precision.median")
+    draws, random = 4000, stream(0, "tests.precision.median")
     intervals = [precision.median_interval(row, level) for row in random.exponential(1.0, (draws, count))]
     held = np.mean([low <= np.log(2) <= high for low, high in intervals])
     assert held >= level - 4 * np.sqrt(level * (1 - level) / draws)
