@@ -32,6 +32,8 @@ from tactile.features.calibration import Calibration
 from tactile.whiskers.head_geometry import HeadConfig
 
 SHAPE, WHISKERS = (2, 3, 2), 4
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+"""First bytes of a compressed chunk."""
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
 
 
@@ -230,28 +232,19 @@ def check_prefix(path: Path, samples: list[Sample]) -> int:
     return len(read)
 
 
-def record_ends(content: bytes) -> list[int]:
-    """Positions after each MCAP record: one byte of type, eight of length, the content."""
-    ends, place = [], 8
-    while place + 9 <= len(content) - 8:
-        place += 9 + struct.unpack_from("<Q", content, place + 1)[0]
-        ends.append(place)
-    return ends
-
-
-def test_a_truncated_recording_yields_a_prefix(small: tuple[bytes, list[Sample]], tmp_path: Path) -> None:
-    """Cut at every byte around the end of a record, and at every seventh one elsewhere."""
-    content, samples = small
-    path = tmp_path / "cut.mcap"
-    path.write_bytes(content)
-    near = {end + k for end in record_ends(content) for k in range(-3, 11)}
-    sizes = sorted({size for size in near if 0 <= size < len(content)} | set(range(0, len(content), 7)))
+def test_a_recording_truncated_at_any_byte_yields_a_prefix(tmp_path: Path) -> None:
+    """The fewest samples that make several chunks and contain every kind of reading."""
+    samples = some_samples(5)
+    assert {type(sample.reading) for sample in samples} == {Observation, Whisk, Cycle, Report}
+    path = write_recording(tmp_path / "cut.mcap", samples, chunk_s=1.0)
+    content = path.read_bytes()
+    assert content.count(ZSTD_MAGIC) == 3
     counts = []
-    for size in reversed(sizes):
+    for size in reversed(range(len(content))):
         os.truncate(path, size)
         counts.append(check_prefix(path, samples))
     assert counts == sorted(counts, reverse=True)
-    assert {0, 1, len(samples)} < set(counts)
+    assert set(counts) == {0, 1, 3, 5}
 
 
 def fuzz(content: bytes, samples: list[Sample], path: Path, rounds: int, seed: int) -> None:
@@ -498,7 +491,7 @@ def test_a_chunk_of_excessive_size_is_not_decompressed(
 ) -> None:
     """A frame header states 2^60 bytes; they are not allocated."""
     content, _ = small
-    frame = content.index(b"\x28\xb5\x2f\xfd")
+    frame = content.index(ZSTD_MAGIC)
     bad = bytearray(content)
     bad[frame + 4 : frame + 13] = b"\xe0" + struct.pack("<Q", 1 << 60)
     path = tmp_path / "bomb.mcap"
@@ -563,7 +556,7 @@ def test_source_info_is_stored_before_the_first_sample(tmp_path: Path) -> None:
     """A recorder killed at once leaves a file with its source info."""
     path = write_recording(tmp_path / "a.mcap", some_samples(2))
     content = path.read_bytes()
-    path.write_bytes(content[: content.index(b"\x28\xb5\x2f\xfd")])
+    path.write_bytes(content[: content.index(ZSTD_MAGIC)])
     scanner = McapScanner(path)
     assert list(scanner) == []
     assert scanner.description is not None
