@@ -38,7 +38,7 @@ def main(argv: list[str] | None = None) -> int:
             else "check the path and its permissions"
         )
         print(
-            f"ratslam: error: {where}{error.strerror or error}; what was written so far is complete; {cure}",
+            f"ratslam: error: {where}{error.strerror or error}; files written so far are complete; {cure}",
             file=sys.stderr,
         )
     except KeyboardInterrupt:

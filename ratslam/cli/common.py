@@ -1,4 +1,4 @@
-"""What the commands share: registration, the configuration argument, number types, JAX settings."""
+"""Common parts of the commands: registration, the configuration argument, number types, JAX settings."""
 
 from __future__ import annotations
 
@@ -107,10 +107,10 @@ def positive_integer(text: str) -> int:
 
 
 def read_config(arguments: argparse.Namespace) -> RunConfig:
-    """The configuration that `add_config` asked for.
+    """The configuration given by the arguments of `add_config`.
 
     Raises:
-        InputErrors: what is wrong with it, and where.
+        InputErrors: all errors in it, each with its place.
     """
     from ratslam.config.run_config import load_config
 
@@ -118,7 +118,7 @@ def read_config(arguments: argparse.Namespace) -> RunConfig:
 
 
 def prepare_jax(keep_compiled: bool = True) -> None:
-    """Sets what JAX reads when it is imported: one thread (more double the latency) and a disk cache.
+    """Sets the variables that JAX reads at import: one thread (more double the latency) and a disk cache.
 
     Args:
         keep_compiled: whether compiled kernels are cached on disk; of no use to commands that run many
@@ -130,14 +130,14 @@ def prepare_jax(keep_compiled: bool = True) -> None:
     if not keep_compiled:
         return
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    wanted = {
+    settings = {
         "jax_compilation_cache_dir": str(Path(home) / "ratslam" / "jax"),
         # The defaults do not cache kernels that compile as fast as ours do on a CPU.
         "jax_persistent_cache_min_compile_time_secs": 0,
         "jax_persistent_cache_min_entry_size_bytes": -1,
     }
-    os.environ.update({name.upper(): str(value) for name, value in wanted.items()})  # for child processes
+    os.environ.update({name.upper(): str(value) for name, value in settings.items()})  # for child processes
     import jax
 
-    for name, value in wanted.items():
+    for name, value in settings.items():
         jax.config.update(name, value)

@@ -10,7 +10,7 @@ from ratslam.cli.common import Commands
 
 
 def add_commands(commands: Commands) -> None:
-    """Registers them."""
+    """Registers the commands of this module."""
     recover = commands.add(
         "recover", _recover, "repair a recording that was cut off",
         "recover runs/maze/session.mcap -o runs/whole.mcap", "files",

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def add_commands(commands: Commands) -> None:
-    """Registers them."""
+    """Registers the commands of this module."""
     live = commands.add(
         "live", _live, "map while a robot arm carries the whisker head",
         "live configs/live_maze.yaml --set live.whisks=60", "live",

@@ -12,7 +12,7 @@ from tactile.base.errors import InputError
 
 
 def add_commands(commands: Commands) -> None:
-    """Registers them."""
+    """Registers the commands of this module."""
     watch = commands.add(
         "watch", _watch, "show the progress of a run in another process", "watch runs/square", "look"
     )
@@ -60,7 +60,7 @@ def _watch(arguments: argparse.Namespace) -> int:
     finally:
         tell.end()
     if seen.status == RUNNING and not arguments.once:
-        cure = f"; `run --continue {arguments.directory / 'map.npz'}` goes on" if seen.checkpoint else ""
+        cure = f"; `run --continue {arguments.directory / 'map.npz'}` continues" if seen.checkpoint else ""
         print(f"no output for {seen.silence:.0f} s: the run was killed{cure}")
     print(f"{arguments.directory / WATCH_IMAGE} shows its map")
     return 0

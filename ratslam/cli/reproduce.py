@@ -22,7 +22,7 @@ from tactile.base.errors import InputError
 SALMAN2016 = {
     "fig2": "odometry drift over three clockwise laps",
     "fig3": "experience history",
-    "fig4": "kidnapped against not",
+    "fig4": "with and without kidnaps",
     "fig5": "clockwise and anticlockwise laps",
     "fig6": "open loop against RCP, max_angle",
     "fig7": "contact_angle against max_angle",
@@ -38,7 +38,7 @@ FOX2012 = {
 }
 """Reproductions of Fox et al. 2012."""
 SETS = {"fox-fig4": 20, "fox-fig5": 2}
-"""Default number of sets where it is not `USUAL_SETS`."""
+"""Default number of sets of figures that do not use `USUAL_SETS`."""
 USUAL_SETS = 3
 BACKENDS, MOTIONS = ("recall", "classic"), ("random", "drive")
 
@@ -93,38 +93,38 @@ def add_figure(names: Commands, name: str, title: str) -> None:
 def add_tables(tables: Commands) -> None:
     """Registers the tables."""
 
-    def table(name: str, lines: Lines, help: str, example: str) -> argparse.ArgumentParser:
+    def add(name: str, lines: Lines, help: str, example: str) -> argparse.ArgumentParser:
         parser = tables.add(name, _print_table, help, f"reproduce tables {name} {example}")
         parser.set_defaults(lines=lines)
         return parser
 
-    touch = table("touch", _touch_lines, "whisker sessions under many conditions", "--rows main --mazes 1")
+    touch = add("touch", _touch_lines, "whisker sessions under many conditions", "--rows main --mazes 1")
     add_count(touch, "--mazes", 6, "mazes per row")
     add_count(touch, "--seeds", 2, "sessions per maze")
     touch.add_argument("--backend", choices=BACKENDS, default="recall", help="the method (default recall)")
-    grid = table("grid", _grid_lines, "the grid filter in arenas", "--rows bias --worlds A --arenas 1")
+    grid = add("grid", _grid_lines, "the grid filter in arenas", "--rows bias --worlds A --arenas 1")
     add_count(grid, "--arenas", 10, "arenas per row")
     add_count(grid, "--first", 9000, "seed of the first arena")
     grid.add_argument("--worlds", nargs="+", choices=("A", "B", "rotated"), help="only these kinds of arena")
-    laser = table("laser", _laser_lines, "recordings with laser views or given places", "--rows square")
+    laser = add("laser", _laser_lines, "recordings with laser views or given places", "--rows square")
     add_count(laser, "--copies", 10, "perturbed copies per recording")
     for parser in (touch, grid, laser):
         parser.add_argument("--rows", nargs="+", metavar="ROW", help="only these rows")
         add_workers(parser)
-    speed = table("speed", _speed_lines, "microseconds per pose-cell step by network size", "--rows 21 41")
+    speed = add("speed", _speed_lines, "microseconds per pose-cell step by network size", "--rows 21 41")
     speed.add_argument(
         "--rows", nargs="+", type=positive_integer, metavar="N", help="only these numbers of cells a side"
     )
     add_count(speed, "--rounds", 5, "repeats, of which the median is taken")
-    precision = table("precision", _precision_lines, "float32 against float64", "--seeds 2 --backends recall")
+    precision = add("precision", _precision_lines, "float32 against float64", "--seeds 2 --backends recall")
     add_count(precision, "--seeds", 20, "sessions per method")
     precision.add_argument("--backends", nargs="+", choices=BACKENDS, default=BACKENDS, help="the methods")
     precision.add_argument("-o", "--output", type=Path, metavar="DIR", help="folder for BACKEND.npz")
     add_workers(precision, 1)
-    chaos = table("chaos", _chaos_lines, "separation of two almost equal pose-cell runs", "--steps 1000")
+    chaos = add("chaos", _chaos_lines, "separation of two almost equal pose-cell paths", "--steps 1000")
     add_count(chaos, "--steps", 100_000, "steps per walk")
     add_count(chaos, "--walks", 3, "walks per row")
-    chaos.add_argument("--pairs", nargs="+", metavar="PAIR", help="only these pairs of runs")
+    chaos.add_argument("--pairs", nargs="+", metavar="PAIR", help="only these pairs of paths")
     chaos.add_argument("--motions", nargs="+", choices=MOTIONS, default=MOTIONS, help="only these motions")
 
 
@@ -171,7 +171,7 @@ def _train(arguments: argparse.Namespace) -> int:
 
     create_simulation = read_config(arguments).create_simulation
     if create_simulation is None:
-        where, cure = f"{arguments.config}: create_simulation", "`create_simulation: {}` is the usual one"
+        where, cure = f"{arguments.config}: create_simulation", "`create_simulation: {}` gives the default"
         raise InputError(where, "missing", "the Create to train", cure)
     templates = train_to_file(create_simulation, arguments.output)
     print(render_drives(drive_held_out(create_simulation, templates), templates.training.repeats))

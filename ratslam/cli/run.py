@@ -9,7 +9,7 @@ from ratslam.cli.common import INTERRUPTED, Commands, add_config, prepare_jax, r
 
 
 def add_commands(commands: Commands) -> None:
-    """Registers them."""
+    """Registers the commands of this module."""
     run = commands.add(
         "run", _run, "map a recording or a simulated session and score it",
         "run configs/square.yaml -o runs/square", "run",
@@ -41,7 +41,7 @@ def add_run_directory(parser: argparse.ArgumentParser) -> None:
 
 
 def run_directory(arguments: argparse.Namespace) -> Path:
-    """The run directory that was asked for."""
+    """The run directory: `-o`, or runs/CONFIG."""
     return arguments.output or Path("runs") / arguments.config.stem
 
 

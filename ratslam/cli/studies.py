@@ -30,19 +30,19 @@ REPLACED = {
     "tiers": "study --preset tiers CONFIG",
     "compare": "study --preset backends CONFIG",
 }
-"""What to type in place of commands of earlier versions."""
+"""Replacements of commands of earlier versions."""
 PRESETS = ("ablate", "vary", "spread", "tiers", "backends", "pareto")
 """Names of presets, known before JAX is loaded."""
 CYCLES = 800
 """Cycles of the session that `size` tries settings on."""
 FEWEST_CYCLES = 50
-"""In fewer cycles nothing is recognised."""
+"""Least number of those cycles; in fewer, no place is recognised."""
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Variables for the number of threads of NumPy."""
 
 
 def add_commands(commands: Commands) -> None:
-    """Registers them."""
+    """Registers the commands of this module."""
     study = commands.add(
         "study", _study, "run many configurations over seeds and compare them",
         "study configs/study_maze.yaml", "study",
@@ -50,7 +50,7 @@ def add_commands(commands: Commands) -> None:
     study.add_argument("file", type=Path, help="study file, or a configuration with --preset (YAML)")
     study.add_argument("--preset", choices=PRESETS, help="make the study from a configuration")
     study.add_argument(
-        "--search", action="store_true", help="choose parameters as the study's `tune` section says"
+        "--search", action="store_true", help="search parameters by the study's `tune` section"
     )
     add_set(study)
     study.add_argument(
@@ -88,7 +88,7 @@ def add_commands(commands: Commands) -> None:
     add_config(size)
     size.add_argument(
         "--cycles", type=positive_integer, default=CYCLES, metavar="N",
-        help=f"of the session to try them on (default {CYCLES})",
+        help=f"length of the trial session (default {CYCLES})",
     )  # fmt: skip
 
 
@@ -142,7 +142,7 @@ class Progress:
         return INPUT_ERROR if self.failed else 0
 
 
-def settle_threads() -> None:
+def limit_threads() -> None:
     """Limits NumPy to one thread in this process and its workers, so that results are equal.
 
     Call it before NumPy is loaded.
@@ -152,7 +152,7 @@ def settle_threads() -> None:
 
 
 def _study(arguments: argparse.Namespace) -> int:
-    settle_threads()
+    limit_threads()
     prepare_jax()
     from ratslam.experiments.studies.metrics import find_error
     from ratslam.experiments.studies.presets import preset_study
@@ -226,7 +226,7 @@ def _search(arguments: argparse.Namespace, study: Any, log: Any) -> int:
 def _size(arguments: argparse.Namespace) -> int:
     if arguments.cycles < FEWEST_CYCLES:
         raise InputError("--cycles", str(arguments.cycles), f"{FEWEST_CYCLES} or more")
-    settle_threads()
+    limit_threads()
     prepare_jax()
     from ratslam.config.completion import complete
     from ratslam.experiments.sizing.recommendation import (

@@ -16,7 +16,7 @@ plus the margin (m), for the whiskers."""
 
 
 def complete(config: RunConfig, source: Source, extent_m: float | None = None) -> RunConfig:
-    """The configuration for a source, with nothing left open; settings that it has are kept.
+    """The configuration completed for a source; settings that it has are kept.
 
     Values of the source take precedence over presets, presets over defaults. A run writes the result to its
     run directory. Completing it again changes nothing, because every setting in it is set.
@@ -62,7 +62,7 @@ def _choose_presets(config: RunConfig, source: Source) -> tuple[PresetName, ...]
 
 
 def _fill(settings: Any, values: dict[str, Any]) -> Any:
-    """The settings with these values for all that is not set."""
+    """The settings, with these values where they are not set."""
     update = {}
     for name, value in values.items():
         if isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""Settings that suit a kind of robot, each with the work that they are from."""
+"""Settings for kinds of robot, each with its source."""
 
 from __future__ import annotations
 
@@ -40,4 +40,4 @@ PRESETS: dict[PresetName, dict[str, dict[str, Any]]] = {
     # Fox et al. 2012, II and III: the defaults of `grid` are those of their Create.
     "create": {},
 }
-"""Settings for all that a configuration leaves open, nested as in a configuration."""
+"""Values of settings that a configuration leaves open, nested as in a configuration."""

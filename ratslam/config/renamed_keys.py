@@ -46,6 +46,6 @@ RENAMED: dict[str, str] = {
     "grid.resampling.how": "grid.resampling.scheme",
     "grid.resampling.effective": "grid.resampling.min_effective_share",
 }
-"""Old dotted path of a setting to the new one, or to a sentence that says what to write instead.
+"""Old dotted path of a setting to the new one, or to a sentence with the replacement.
 
 A renamed section maps the keys in it as well; only those with new names of their own need a line."""

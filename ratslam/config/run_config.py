@@ -23,7 +23,7 @@ from tactile.frontend import TouchConfig
 
 
 class SessionConfig(Settings):
-    """How the backend runs."""
+    """Precision, seed and memory of the session."""
 
     precision: Literal["float64", "float32"] = "float64"
     """Floating-point type of the kernel."""
@@ -44,7 +44,7 @@ class ScoreConfig(Settings):
 
 
 class SourceConfig(Settings):
-    """What a run reads: exactly one source, and how whisker readings become views."""
+    """The source of a run, exactly one of four, and the processing of whisker readings to views."""
 
     recording: RecordingConfig | None = None
     """A recording."""
@@ -87,7 +87,7 @@ class RunConfig(RecallBackendConfig, ClassicBackendConfig, GridBackendConfig, So
     """How the result is scored."""
 
     def with_absolute_paths(self, folder: Path) -> RunConfig:
-        """The same with relative paths taken from `folder`, so that it can be used from anywhere."""
+        """The configuration with relative paths taken from `folder`, independent of the working folder."""
         relations = self.score.relations
         parts = {
             name: part and part.resolved(folder)
@@ -106,7 +106,7 @@ def load_config(path: str | os.PathLike[str], assignments: Sequence[str] = ()) -
         assignments: settings to replace, each `a.b=value`.
 
     Raises:
-        InputErrors: everything that is wrong with it, each with file, line and column.
+        InputErrors: all errors in it, each with file, line and column.
     """
     config = validate(load(path, assignments), RunConfig)
     return config.with_absolute_paths(Path(path).parent.resolve())

@@ -35,10 +35,10 @@ FINISH_TIMEOUT = 120.0
 
 
 class MappingJob(NamedTuple):
-    """What the mapper needs before the first sample.
+    """Input of the mapper before the first sample.
 
     Attributes:
-        config: with `recording` being what the session is recorded to. info: as in the recording.
+        config: its `recording` is the file that the session is recorded to. info: as in that file.
         directory: the new run directory. view_shape, whiskers, rate_hz: of the samples.
         extent_m: largest distance from the start along x or y on the planned path, m.
     """
@@ -56,8 +56,8 @@ class MappedSample(NamedTuple):
     """The result of a sample.
 
     Attributes:
-        number: of the sample. pose: [3] as estimated then, in the map. place: -1 without one. action: by
-            name. seconds: that it took.
+        number: of the sample. pose: [3] online, in the map frame (m, m, rad). place: -1 for none. action: by
+            name. seconds: computing time.
     """
 
     number: int
@@ -90,9 +90,9 @@ class Mapper:
         self._sender = Thread(target=self._send, daemon=True, name="to mapper")
         self._sender.start()
 
-    def begin(self, order: MappingJob) -> None:
-        """Lets the process make its directory and compile; returns at once. `ready` tells when it is done."""
-        self._outbox.put(order)
+    def begin(self, job: MappingJob) -> None:
+        """Sends the job: the process makes its directory and compiles. Returns at once; see `ready`."""
+        self._outbox.put(job)
 
     def ready(self) -> bool:
         """Whether the mapper is ready for samples.
@@ -131,12 +131,12 @@ class Mapper:
 
     @property
     def alive(self) -> bool:
-        """Whether the mapper works."""
+        """Whether the process runs and has reported no failure."""
         return self._process.is_alive() and not self._failed and self._refusal is None
 
     @property
     def failure(self) -> str:
-        """Why the mapper has ended, as far as known."""
+        """Reason for the end of the mapper, as far as known."""
         return self._failed or str(self._refusal or f"it ended with code {self._process.exitcode}")
 
     def finish(self, interrupted: bool) -> Scorecard | None:
@@ -152,26 +152,26 @@ class Mapper:
             self.receive()
         return self._card
 
-    def _take(self, word: Any) -> None:
-        if isinstance(word, MappedSample):
-            self.mapped.append(word)
-        elif isinstance(word, Scorecard):
-            self._card = word
-        elif isinstance(word, InputError):
-            self._refusal = word
-        elif word is True:
+    def _take(self, message: Any) -> None:
+        if isinstance(message, MappedSample):
+            self.mapped.append(message)
+        elif isinstance(message, Scorecard):
+            self._card = message
+        elif isinstance(message, InputError):
+            self._refusal = message
+        elif message is True:
             self._ready = True
         else:
-            self._failed = str(word)
+            self._failed = str(message)
 
     def _send(self) -> None:
         while True:
-            word = self._outbox.get()
+            message = self._outbox.get()
             try:
-                self._line.send(word)
+                self._line.send(message)
             except (OSError, ValueError):
                 return
-            if isinstance(word, bool):
+            if isinstance(message, bool):
                 return
 
     def __enter__(self) -> Self:
@@ -186,7 +186,7 @@ class Mapper:
 
 
 class PipeSource:
-    """The samples that come through a pipe, as a source.
+    """The samples received through a pipe, as a source.
 
     Attributes:
         interrupted: whether the session ended early. received: arrival of the last sample, s.
@@ -194,24 +194,24 @@ class PipeSource:
 
     name, digest, length = "live", "", None
 
-    def __init__(self, order: MappingJob, line: Connection) -> None:
-        self.rate_hz, self.view_shape, self.whiskers = order.rate_hz, order.view_shape, order.whiskers
-        self.info = order.info
-        self.interrupted = True  # until the parent says otherwise
+    def __init__(self, job: MappingJob, line: Connection) -> None:
+        self.rate_hz, self.view_shape, self.whiskers = job.rate_hz, job.view_shape, job.whiskers
+        self.info = job.info
+        self.interrupted = True  # until the parent sends the flag
         self.received = 0.0
         self._line = line
 
     def __iter__(self) -> Iterator[Sample]:
         while True:
             try:
-                word = self._line.recv()
+                message = self._line.recv()
             except (EOFError, OSError):
                 return  # the parent has ended
-            if isinstance(word, bool):
-                self.interrupted = word
+            if isinstance(message, bool):
+                self.interrupted = message
                 return
             self.received = time.monotonic()
-            yield word
+            yield message
 
     def __enter__(self) -> Self:
         return self
@@ -242,12 +242,12 @@ def _map(line: Connection) -> None:
     from robot.touch_source import open_touch_source
     from tactile.base.types import Odometry, observation
 
-    order = line.recv()
-    with PipeSource(order, line) as fed:
-        config = complete(order.config, fed, order.extent_m)
+    job = line.recv()
+    with PipeSource(job, line) as fed:
+        config = complete(job.config, fed, job.extent_m)
         source = open_touch_source(fed, config.touch)
-        with open_runner(config, source, order.directory) as runner:
-            _redirect_stderr(order.directory / LOG)
+        with open_runner(config, source, job.directory) as runner:
+            _redirect_stderr(job.directory / LOG)
             blank = observation(
                 Odometry(0.0, 0.0, 0.0, 0.0), view_shape=source.view_shape, whiskers=source.whiskers
             )
@@ -264,9 +264,9 @@ def _map(line: Connection) -> None:
                 _send(line, runner.finish(fed.interrupted))
 
 
-def _send(line: Connection, word: Any) -> None:
+def _send(line: Connection, message: Any) -> None:
     with suppress(OSError):  # the parent has ended: results go to the disk only
-        line.send(word)
+        line.send(message)
 
 
 def _redirect_stderr(path: Path) -> None:

@@ -27,7 +27,7 @@ from robot.live.selftest import check_disk, start_and_check
 from robot.live.whisk_loop import WhiskReport, follow_route, record_free_whisks, run_whisk_loop
 from robot.recordings.formats import RecordingConfig
 from robot.sources.source_info import SourceInfo
-from robot.world.head_trajectory import HeadPath as Way
+from robot.world.head_trajectory import HeadPath
 from robot.world.maze import POSE_CELL_SIZE
 from robot.world.scene import maze_info
 from tactile.base.errors import InputError
@@ -59,7 +59,7 @@ def run_live_session(
         the outcome of the session with its finding, and the score of the map, if there is one.
 
     Raises:
-        InputError: why nothing was armed.
+        InputError: the session could not be armed.
     """
     assert config.live is not None
     path = plan_path(config.live, ur10_head(config.touch.head))
@@ -67,30 +67,30 @@ def run_live_session(
     if directory.exists():
         raise InputError(str(directory), "exists already", "a new run directory", "choose another with -o")
     tell(check_disk(config.live, directory))
-    handed: list[WhiskReport] = []
+    whisks: list[WhiskReport] = []
     with catch_interrupt("stopping the arm") as stopped, Mapper(mapping) as mapper:
         with Rig(config.live, config.touch.head, stopped) as rig:
             try:
                 calibration = _calibrate(rig, config, path, tell)
-                order = mapping_job(config, path, calibration, directory)
-                _arm(rig, path, calibration, mapper, order, tell)
+                job = mapping_job(config, path, calibration, directory)
+                _arm(rig, path, calibration, mapper, job, tell)
                 armed(directory)
-                with open_recorder(order) as rig.recorder:
-                    _run(rig, path, mapper, handed)
-                fault = Fault(SessionOutcome.COMPLETE, f"{len(handed)} whisks", time.monotonic())
+                with open_recorder(job) as rig.recorder:
+                    _run(rig, path, mapper, whisks)
+                fault = Fault(SessionOutcome.COMPLETE, f"{len(whisks)} whisks", time.monotonic())
             except SessionFault as error:
                 fault = error.fault
             except OperatorStop:
-                fault = Fault(SessionOutcome.INTERRUPTED, f"after {len(handed)} whisks", time.monotonic())
+                fault = Fault(SessionOutcome.INTERRUPTED, f"after {len(whisks)} whisks", time.monotonic())
             standing = rig.rest()
-            report = _report(fault, rig, mapper, handed, standing)
-        card = mapper.finish(fault.outcome is not SessionOutcome.COMPLETE) if handed else None
+            report = _report(fault, rig, mapper, whisks, standing)
+        card = mapper.finish(fault.outcome is not SessionOutcome.COMPLETE) if whisks else None
     with suppress(OSError):  # a full disk has been reported
         (directory / REPORT).write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     return fault, card
 
 
-def mapping_job(config: RunConfig, path: Way, calibration: Calibration, directory: Path) -> MappingJob:
+def mapping_job(config: RunConfig, path: HeadPath, calibration: Calibration, directory: Path) -> MappingJob:
     """The job of the mapper, with the description of the robot for the recording."""
     assert config.live is not None
     head = ur10_head(config.touch.head)
@@ -122,23 +122,23 @@ def mapping_job(config: RunConfig, path: Way, calibration: Calibration, director
     )
 
 
-def open_recorder(order: MappingJob) -> LiveRecorder:
+def open_recorder(job: MappingJob) -> LiveRecorder:
     """The recorder of the session."""
     return LiveRecorder(
-        order.directory / RECORDING,
-        view_shape=order.view_shape,
-        whiskers=order.whiskers,
-        rate_hz=order.rate_hz,
-        info=order.info,
+        job.directory / RECORDING,
+        view_shape=job.view_shape,
+        whiskers=job.whiskers,
+        rate_hz=job.rate_hz,
+        info=job.info,
     )
 
 
-def _calibrate(rig: Rig, config: RunConfig, path: Way, tell: Callable[[str], None]) -> Calibration:
+def _calibrate(rig: Rig, config: RunConfig, path: HeadPath, tell: Callable[[str], None]) -> Calibration:
     """Tests both devices, and records free whisks above the start of the route for the calibration."""
     plan = rig.config.plan
     for line in start_and_check(rig):
         tell(line)
-    tell("arm: going above the start of the way")
+    tell("arm: moving above the start of the route")
     follow_route(rig, approach_route(rig.config, path))
     count = ceil(plan.calibration.min_duration * plan.whisking.rate)
     tell(f"head: {count} whisks in free air")
@@ -149,31 +149,31 @@ def _calibrate(rig: Rig, config: RunConfig, path: Way, tell: Callable[[str], Non
 
 def _arm(
     rig: Rig,
-    path: Way,
+    path: HeadPath,
     calibration: Calibration,
     mapper: Mapper,
-    order: MappingJob,
+    job: MappingJob,
     tell: Callable[[str], None],
 ) -> None:
-    """Lets the mapper compile, then lowers the head and starts whisking."""
+    """Waits until the mapper has compiled, then lowers the head and starts whisking."""
     tell("mapper: compiling")
-    mapper.begin(order)
+    mapper.begin(job)
     rig.wait_until(mapper.ready, START_TIMEOUT, SessionOutcome.MAPPER_GONE, "the mapper's start")
     follow_route(rig, descent_route(rig.config, path))
     rig.driver.whisk(rig.config.plan.whisking, calibration.threshold[:, 1], calibration.mean[:, 1])
     tell("armed")
 
 
-def _run(rig: Rig, path: Way, mapper: Mapper, handed: list[WhiskReport]) -> None:
+def _run(rig: Rig, path: HeadPath, mapper: Mapper, whisks: list[WhiskReport]) -> None:
     rate = rig.config.plan.whisking.rate
     total = rig.config.whisks or ceil(path.duration * rate)
     rig.begin()
     with tqdm(total=total, unit="whisk", desc="live", file=sys.stderr, mininterval=0.5) as bar:
 
         def tell(whisk: WhiskReport) -> None:
-            handed.append(whisk)
+            whisks.append(whisk)
             bar.update()
-            bar.set_postfix_str(_status(rig, mapper, handed), refresh=False)
+            bar.set_postfix_str(_status(rig, mapper, whisks), refresh=False)
 
         try:
             run_whisk_loop(rig, main_route(rig.config, path), mapper, tell)
@@ -182,28 +182,28 @@ def _run(rig: Rig, path: Way, mapper: Mapper, handed: list[WhiskReport]) -> None
             raise
 
 
-def _status(rig: Rig, mapper: Mapper, handed: list[WhiskReport]) -> str:
-    told = mapper.mapped[-1] if mapper.mapped else None
-    place = "" if told is None or told.place < 0 else f", place {told.place}"
-    took = "" if told is None else f"map {1e3 * told.seconds:.0f} ms{place}, "
-    dropped = sum(not whisk.seen for whisk in handed)
-    lost = sum(whisk.missing for whisk in handed)
-    return f"{took}late {1e3 * handed[-1].lateness:.0f} ms, {lost} samples lost, {dropped} images dropped"
+def _status(rig: Rig, mapper: Mapper, whisks: list[WhiskReport]) -> str:
+    result = mapper.mapped[-1] if mapper.mapped else None
+    place = "" if result is None or result.place < 0 else f", place {result.place}"
+    took = "" if result is None else f"map {1e3 * result.seconds:.0f} ms{place}, "
+    dropped = sum(not whisk.seen for whisk in whisks)
+    lost = sum(whisk.missing for whisk in whisks)
+    return f"{took}late {1e3 * whisks[-1].lateness:.0f} ms, {lost} samples lost, {dropped} images dropped"
 
 
 def _report(
-    fault: Fault, rig: Rig, mapper: Mapper, handed: list[WhiskReport], standing: bool
+    fault: Fault, rig: Rig, mapper: Mapper, whisks: list[WhiskReport], standing: bool
 ) -> dict[str, Any]:
     return {
         "outcome": fault.outcome.name.lower(),
         "detail": fault.detail,
         "standing": standing,
-        "whisks": len(handed),
-        "dropped": sum(not whisk.seen for whisk in handed),
-        "missing": sum(whisk.missing for whisk in handed),
-        "lateness_s": _quantiles([whisk.lateness for whisk in handed]),
+        "whisks": len(whisks),
+        "dropped": sum(not whisk.seen for whisk in whisks),
+        "missing": sum(whisk.missing for whisk in whisks),
+        "lateness_s": _quantiles([whisk.lateness for whisk in whisks]),
         "state_age_s": _quantiles(rig.state_ages),
-        "mapper_s": _quantiles([told.seconds for told in mapper.mapped]),
+        "mapper_s": _quantiles([result.seconds for result in mapper.mapped]),
         "head": rig.head.decoder.counts._asdict() | {"stalls": rig.head.stalls},
     }
 

@@ -20,7 +20,7 @@ from tactile.frontend import TouchConfig
 from tactile.whiskers.head_geometry import ur10_head
 
 WhiskerView = tuple[np.ndarray, np.ndarray]
-"""A whisker image: brightness [R, C, K] in 0..1, and which whiskers work, bool [W]."""
+"""A whisker image: brightness [R, C, K] in 0..1, and bool [W], the whisker has a signal."""
 
 
 def save_world(info: SourceInfo, directory: RunDirectory) -> None:

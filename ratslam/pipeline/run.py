@@ -63,7 +63,7 @@ def process_source(runner: Runner, source: Source) -> bool:
 
 
 def simulate(config: RunConfig, path: Path) -> tuple[int, bool]:
-    """Records the simulated session of a configuration: contact features, or raw samples if it says so.
+    """Records the simulated session of a configuration: contact features, or raw samples if it asks for them.
 
     Args:
         config: with absolute paths. path: the new file.
@@ -109,10 +109,10 @@ def open_recorder(path: Path, source: Source) -> Recorder:
 
 @contextmanager
 def catch_interrupt(last_task: str) -> Iterator[Callable[[], bool]]:
-    """Yields a function that says whether Ctrl-C was pressed; a second Ctrl-C raises `KeyboardInterrupt`.
+    """Yields a function that returns whether Ctrl-C was pressed; a second Ctrl-C raises `KeyboardInterrupt`.
 
     Args:
-        last_task: printed at the first Ctrl-C: what is still done before the program ends.
+        last_task: printed at the first Ctrl-C: the work left before the program ends.
     """
     pressed: list[int] = []
 

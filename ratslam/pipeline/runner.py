@@ -35,9 +35,9 @@ from tactile.base.errors import InputError
 from tactile.base.se2 import compose, tum_line
 
 CHECKPOINT_EVERY, CHECKPOINT_SHARE = 128 * CHUNK, 32
-"""Steps between two checkpoints: at least the first number, and one part in the second of the steps so far. A
-run continued after a kill repeats at most these. The interval grows because a checkpoint holds the whole run:
-at a fixed interval the cost of all would be O(N^2)."""
+"""Steps between two checkpoints: the first number, or the steps so far divided by the second if that is more.
+A run continued after a kill repeats at most these. The interval grows, because each checkpoint holds the
+whole run and would make the total cost O(N^2) at a fixed interval."""
 
 
 class Runner:

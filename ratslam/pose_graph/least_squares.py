@@ -13,12 +13,12 @@ from ratslam.pose_graph.robust_kernels import Kernel, no_kernel
 from tactile.base.se2 import wrap
 
 ELIMINATE_FROM = 2000
-"""Number of nodes from which chains are eliminated; smaller graphs are solved sooner without."""
+"""Number of nodes from which chains are eliminated; smaller graphs are solved faster without."""
 INITIAL_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e-12, 1e12
 
 
 class Termination(Enum):
-    """Why the solver stopped."""
+    """Reason for the end of the search."""
 
     CONVERGED = "converged"
     ITERATION_LIMIT = "the iteration limit was reached; raise it or start nearer"
@@ -28,7 +28,7 @@ class Termination(Enum):
 
 
 class Solution(NamedTuple):
-    """Poses [N, 3], why the solver stopped, steps taken, final cost, and robust weights [E] of the edges."""
+    """Poses [N, 3], reason for the end, number of steps, final cost, and robust weights [E] of the edges."""
 
     poses: np.ndarray
     termination: Termination
@@ -113,7 +113,7 @@ def _minimise(
     iterations: int,
     tolerance: float,
 ) -> Solution:
-    """Damped steps until one of them ends the search; damping rises after a step that raises the cost."""
+    """Takes damped steps until one ends the search; damping rises after a step that raises the cost."""
     damping, taken, schedule = INITIAL_DAMPING, 0, equations.damping
     termination = Termination.ITERATION_LIMIT
     while taken < iterations:

@@ -51,14 +51,14 @@ class _ReducedGraph:
         total = chains.sums(chains.sign * measured[..., chains.edge])
         return np.concatenate([total, measured[..., chains.direct]], axis=-1)
 
-    def weight(self, weight: np.ndarray) -> np.ndarray:
+    def reduce_weight(self, weight: np.ndarray) -> np.ndarray:
         """[C + L] weights from those of all edges [E]; along a chain variances add up."""
         chains = self.chains
         return np.concatenate([1 / chains.sums(1 / weight[chains.edge]), weight[chains.direct]])
 
     def complex_headings(self, weight: np.ndarray, turns: np.ndarray) -> np.ndarray:
         """[J] headings in (-pi, pi]: arguments of the least-squares solution of z_end = z_start e^it."""
-        chains, weight = self.chains, self.weight(weight)
+        chains, weight = self.chains, self.reduce_weight(weight)
         pull = weight * np.exp(1j * self.differences(turns))
         entries = np.concatenate([weight, weight, -pull.conj(), -pull])
         right = np.zeros(len(chains.junctions), complex)
@@ -68,7 +68,7 @@ class _ReducedGraph:
         ):
             known = (here == 0) & (there > 0)
             np.add.at(right, there[known], pulled[known])
-        fixed = self._fixed(weight)
+        fixed = self._roots(weight)
         right[fixed] += 1.0
         z = self.equations.solve(entries, fixed, right[:, None])
         return np.zeros(len(right)) if z is None else np.angle(z[:, 0]) * (np.arange(len(right)) > 0)
@@ -81,14 +81,14 @@ class _ReducedGraph:
         Args:
             change: [C + L, D] replaces the sums of the measured differences along chains.
         """
-        chains, stiff = self.chains, self.weight(weight)
+        chains, stiff = self.chains, self.reduce_weight(weight)
         change = self.differences(measured.T).T if change is None else change
         pull = stiff[:, None] * change
         size = len(chains.junctions)
         right = np.stack(
             [np.bincount(chains.end, p, size) - np.bincount(chains.start, p, size) for p in pull.T], axis=1
         )
-        at = self.equations.solve(np.concatenate([stiff, stiff, -stiff, -stiff]), self._fixed(stiff), right)
+        at = self.equations.solve(np.concatenate([stiff, stiff, -stiff, -stiff]), self._roots(stiff), right)
         values = np.zeros((count, measured.shape[1]))
         if at is None:
             return values
@@ -103,6 +103,6 @@ class _ReducedGraph:
         values[chains.inner] = chains.inner_values(a.T, steps.T).T
         return values
 
-    def _fixed(self, weight: np.ndarray) -> np.ndarray:
+    def _roots(self, weight: np.ndarray) -> np.ndarray:
         tied = weight > 0
         return component_roots(len(self.chains.junctions), self.chains.start[tied], self.chains.end[tied])

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from ratslam.config.strict_yaml.document import Document, KeyPath, Place, dotted, shown
+from ratslam.config.strict_yaml.document import Document, KeyPath, Place, describe, join_keys
 from ratslam.config.strict_yaml.dumper import Dumper
 from ratslam.config.strict_yaml.reader import Reader
 from ratslam.config.strict_yaml.validation_errors import input_errors
@@ -64,7 +64,7 @@ def parse(text: str, name: str, replaced: Sequence[str] = ()) -> Document:
     data = reader.read()
     if not isinstance(data, dict):
         where = reader.places[()].value.rstrip(":")
-        raise InputError(where, shown(data), "keys and values such as 'seed: 1'")
+        raise InputError(where, describe(data), "keys and values such as 'seed: 1'")
     return Document(data, reader.places | {(): Place(name, name)})
 
 
@@ -102,7 +102,7 @@ def open_path(data: Any, key: str, where: str) -> tuple[Any, KeyPath]:
     path: KeyPath = ()
     for name in key.split("."):
         if path:
-            data = _opened(data, path[-1])
+            data = _open_section(data, path[-1])
         path += (_step(data, name, where, path),)
     return data, path
 
@@ -122,7 +122,7 @@ def validate(document: Document, model: type[Model]) -> Model:
 
 def dump(model: BaseModel) -> str:
     """The model as YAML that `load` and `validate` turn into an equal model."""
-    data = _escaped(model.model_dump(mode="json"))
+    data = _escape(model.model_dump(mode="json"))
     return yaml.dump(data, Dumper=Dumper, sort_keys=False, allow_unicode=True, width=100)
 
 
@@ -131,13 +131,13 @@ def schema(model: type[BaseModel]) -> dict[str, Any]:
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **model.model_json_schema()}
 
 
-def _escaped(data: Any) -> Any:
+def _escape(data: Any) -> Any:
     """The data with `${` in its texts escaped, so that it is not read as a variable."""
     match data:
         case dict():
-            return {key: _escaped(value) for key, value in data.items()}
+            return {key: _escape(value) for key, value in data.items()}
         case list():
-            return [_escaped(value) for value in data]
+            return [_escape(value) for value in data]
         case str():
             return data.replace("${", "$${")
         case _:
@@ -149,13 +149,14 @@ def _step(section: Any, key: str, where: str, path: KeyPath) -> str | int:
     if isinstance(section, dict):
         return key
     if isinstance(section, list):
-        if key.isascii() and key.isdigit() and len(key) < 9 and int(key) < len(section):
+        count = len(section)
+        if key.isascii() and key.isdigit() and len(key) < 9 and int(key) < count:
             return int(key)
-        raise InputError(where, f"{dotted(path)} has {len(section)} items", f"an index below {len(section)}")
-    raise InputError(where, f"{dotted(path)} is {shown(section)}", "a section to put a key in")
+        raise InputError(where, f"{join_keys(path)} has {count} items", f"an index below {count}")
+    raise InputError(where, f"{join_keys(path)} is {describe(section)}", "a section to put a key in")
 
 
-def _opened(section: Any, key: str | int) -> Any:
+def _open_section(section: Any, key: str | int) -> Any:
     """The subsection at a key; created if it is missing."""
     if isinstance(section, dict) and section.get(str(key)) is None:
         section[str(key)] = {}

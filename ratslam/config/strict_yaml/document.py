@@ -56,21 +56,21 @@ class Document:
 
 def label(place: str, path: KeyPath) -> str:
     """A place and a key path for messages: `config.yaml:5:3: pose_cells.shape`, `--set a.b`."""
-    return f"{place} {dotted(path)}".rstrip(": ")
+    return f"{place} {join_keys(path)}".rstrip(": ")
 
 
-def dotted(path: KeyPath) -> str:
+def join_keys(path: KeyPath) -> str:
     """The path in the notation of `--set`."""
     return ".".join(str(key) if str(key).isprintable() else repr(key) for key in path)
 
 
-def either(words: Iterable[Any]) -> str:
+def join_words(words: Iterable[Any]) -> str:
     """The words as alternatives: `'a', 'b' or 'c'`."""
     *most, last = map(repr, words)
     return f"{', '.join(most)} or {last}" if most else last
 
 
-def shown(value: Any) -> str:
+def describe(value: Any) -> str:
     """A short form of a value for messages."""
     match value:
         case None:

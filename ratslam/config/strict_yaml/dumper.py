@@ -6,7 +6,7 @@ from typing import Any
 
 import yaml
 
-from ratslam.config.strict_yaml.scalars import plain
+from ratslam.config.strict_yaml.scalars import read_word
 
 _TEXT = "tag:yaml.org,2002:str"
 
@@ -17,7 +17,7 @@ class Dumper(yaml.SafeDumper):
     def resolve(self, kind: type, value: Any, implicit: Any) -> Any:
         """The tag that a reader gives a node: that of YAML 1.1, or a number if our reader finds one."""
         tag = super().resolve(kind, value, implicit)
-        if kind is yaml.ScalarNode and implicit[0] and tag == _TEXT and not isinstance(plain(value), str):
+        if kind is yaml.ScalarNode and implicit[0] and tag == _TEXT and not isinstance(read_word(value), str):
             return "tag:yaml.org,2002:float"
         return tag
 

@@ -13,8 +13,8 @@ from typing import Any
 
 import yaml
 
-from ratslam.config.strict_yaml.document import KeyPath, Place, dotted, label, shown
-from ratslam.config.strict_yaml.scalars import Refused, plain
+from ratslam.config.strict_yaml.document import KeyPath, Place, describe, join_keys, label
+from ratslam.config.strict_yaml.scalars import Refused, read_word
 from tactile.base.errors import InputError, InputErrors
 
 _MAX_DEPTH = 32
@@ -151,13 +151,13 @@ class Reader:
     def _key(self, event: yaml.Event, path: KeyPath) -> str:
         if not isinstance(event, yaml.ScalarEvent) or event.anchor or event.tag:
             raise self._error(path, "a key that is not plain text", "a plain key")
-        if not event.style and not isinstance(plain(event.value), str):
+        if not event.style and not isinstance(read_word(event.value), str):
             cure = f"write '{event.value}'"
             self._errors.append(self._error(path, f"the key {event.value or 'is empty'}", "text", cure))
         return self._text_of(event.value, path)
 
     def _scalar(self, event: yaml.ScalarEvent, path: KeyPath) -> Any:
-        value = event.value if event.style else plain(event.value)
+        value = event.value if event.style else read_word(event.value)
         if isinstance(value, Refused):
             self._errors.append(self._error(path, *value))
         if not isinstance(value, str):
@@ -167,7 +167,7 @@ class Reader:
     def _text_of(self, text: str, path: KeyPath) -> str:
         """The text; an error if it has control characters that no file name may have."""
         if re.search("[\0\ud800-\udfff]", text):
-            self._errors.append(self._error(path, shown(text), "text without control characters"))
+            self._errors.append(self._error(path, describe(text), "text without control characters"))
         return text
 
     def _variable(self, found: re.Match[str], path: KeyPath) -> str:
@@ -175,11 +175,11 @@ class Reader:
         if escaped:
             return found[0][1:]
         if not close or not re.fullmatch("[A-Za-z_][A-Za-z0-9_]*", name):
-            error = self._error(path, shown(found[0]), "${NAME}", "write $${ for a literal ${")
+            error = self._error(path, describe(found[0]), "${NAME}", "write $${ for a literal ${")
             self._errors.append(error)
             return ""
         value = os.environ.get(name, "")
-        if not value and not any(f"{dotted(path)}.".startswith(f"{key}.") for key in self._replaced):
+        if not value and not any(f"{join_keys(path)}.".startswith(f"{key}.") for key in self._replaced):
             cure = _RECORDINGS if name == "RATSLAM_DATA" else f"set {name} or write the value out"
             self._errors.append(self._error(path, f"the environment variable {name} is not set", cure=cure))
         return value

@@ -25,7 +25,7 @@ class Refused(NamedTuple):
     cure: str = ""
 
 
-def plain(word: str) -> Any:
+def read_word(word: str) -> Any:
     """Value of an unquoted word: None, bool, int, float, str or `Refused`."""
     if word in _WORDS:
         return _WORDS[word]

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_ori
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from ratslam.config.strict_yaml.document import Document, KeyPath, dotted, either, shown
+from ratslam.config.strict_yaml.document import Document, KeyPath, describe, join_keys, join_words
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
 
@@ -34,7 +34,7 @@ def input_errors(error: ValidationError, model: type[Settings], document: Docume
     found.sort(key=lambda pair: order[document.nearest(pair[0].path)])
     merged: dict[tuple[str, str, str], dict[str, None]] = {}
     for spot, details in found:
-        renamed = _renamed(details, spot.path, model, document)
+        renamed = _renaming_errors(details, spot.path, model, document)
         for one in renamed or [_input_error(details, spot, model, document)]:
             merged.setdefault((one.where, one.found, one.cure), {})[one.expected] = None
     errors = [
@@ -59,13 +59,13 @@ class _Spot(NamedTuple):
     kinds: list[Any]
 
 
-def _renamed(
+def _renaming_errors(
     details: ErrorDetails, path: KeyPath, model: type[Settings], document: Document
 ) -> list[InputError]:
     """The errors for an unknown key that was renamed: one for each key in it, if it is a section."""
     if details["type"] != "extra_forbidden":
         return []
-    found = _new_names(dotted(path), document.value(path), model.renamed_keys)
+    found = _new_names(join_keys(path), document.value(path), model.renamed_keys)
     return [InputError(document.at_key(tuple(old.split("."))), sentence) for old, sentence in found]
 
 
@@ -82,7 +82,7 @@ def _new_names(old: str, value: Any, renamed: Mapping[str, str]) -> Iterator[tup
 
 
 def _new_name(path: str, renamed: Mapping[str, str]) -> str:
-    """Follows renames of the key or of a section above it to the last name, or to what to write instead."""
+    """Follows renames of a key or a section above it to the last name, or to a sentence with a replacement."""
     for _ in range(len(renamed)):
         above = max((name for name in renamed if f"{path}.".startswith(f"{name}.")), key=len, default=None)
         if above is None or not _is_path(path):
@@ -104,7 +104,7 @@ def _input_error(details: ErrorDetails, spot: _Spot, model: type[Settings], docu
     match details["type"]:
         case "extra_forbidden":
             known = list(owner.model_fields) if owner else []
-            cure = _did_you_mean(path[-1], known) or f"the keys here are {', '.join(known) or 'none'}"
+            cure = _suggest(path[-1], known) or f"the keys here are {', '.join(known) or 'none'}"
             return InputError(document.at_key(path), "unknown key", cure=cure)
         case "missing" if isinstance(path[-1], int):  # an item of a tuple
             return _wrong_length(_spot(details["loc"][:-1], model), "more values", document)
@@ -118,38 +118,38 @@ def _input_error(details: ErrorDetails, spot: _Spot, model: type[Settings], docu
         case "union_tag_not_found":
             at = (*path, context["discriminator"].strip("'"))
             words = [word for kind in kinds for word in _words(kind, at[-1])]
-            return InputError(document.at_key(at), "missing", either(words) if words else "")
+            return InputError(document.at_key(at), "missing", join_words(words) if words else "")
         case "union_tag_invalid":
             at = (*path, context["discriminator"].strip("'"))
             return _wrong_word(at, context["expected_tags"], document)
         case "literal_error":
             return _wrong_word(path, context["expected"], document)
         case "value_error" | "assertion_error":
-            prefix = "" if isinstance(value, dict) else f"{shown(value)}: "
+            prefix = "" if isinstance(value, dict) else f"{describe(value)}: "
             return InputError(document.at_value(path), f"{prefix}{context['error']}")
     message = details["msg"]
     if not message.startswith("Input should be "):
-        return InputError(document.at_value(path), f"{shown(value)}: {message[0].lower()}{message[1:]}")
+        return InputError(document.at_value(path), f"{describe(value)}: {message[0].lower()}{message[1:]}")
     expected = message.removeprefix("Input should be ")
     expected = re.sub("^(greater|less|a multiple)", r"a number \1", _WORDS.get(expected, expected))
-    return InputError(document.at_value(path), shown(value), expected)
+    return InputError(document.at_value(path), describe(value), expected)
 
 
 def _wrong_length(spot: _Spot, expected: str, document: Document) -> InputError:
     for kind in spot.kinds:
         if get_origin(kind) is tuple and Ellipsis not in get_args(kind):
             expected = f"{len(get_args(kind))} values"
-    return InputError(document.at_value(spot.path), shown(document.value(spot.path)), expected)
+    return InputError(document.at_value(spot.path), describe(document.value(spot.path)), expected)
 
 
 def _wrong_word(path: KeyPath, expected: str, document: Document) -> InputError:
     found = document.value(path)
     words = re.findall("'([^']*)'", expected)
-    choice = either(words) if words else expected
-    return InputError(document.at_value(path), shown(found), choice, _did_you_mean(found, words))
+    choice = join_words(words) if words else expected
+    return InputError(document.at_value(path), describe(found), choice, _suggest(found, words))
 
 
-def _did_you_mean(found: Any, words: Sequence[str]) -> str:
+def _suggest(found: Any, words: Sequence[str]) -> str:
     """A suggestion of a similar word, or ''."""
     close = difflib.get_close_matches(str(found).lower(), {word.lower(): word for word in words}, n=1)
     return "".join(f"did you mean '{word}'?" for word in words if close and word.lower() == close[0])
@@ -166,7 +166,7 @@ def _spot(loc: Sequence[str | int], model: type[Settings]) -> _Spot:
     kinds: list[Any] = [model]
     for item in loc:
         if len(kinds) > 1:
-            kinds = [kind for kind in kinds if _answers_to(kind, item)][:1]
+            kinds = [kind for kind in kinds if _is_named(kind, item)][:1]
         elif item != "[key]":
             path += (item,)
             owner = kinds[0] if kinds and _is_model(kinds[0]) else None
@@ -188,8 +188,8 @@ def _alternatives(kind: Any) -> list[Any]:
     return [kind]
 
 
-def _answers_to(kind: Any, name: str | int) -> bool:
-    """Whether `name` is how pydantic names this alternative of a union: by its class or by a tag."""
+def _is_named(kind: Any, name: str | int) -> bool:
+    """Whether pydantic names this alternative of a union `name`: by its class or by a tag."""
     if not _is_model(kind):
         return False
     return kind.__name__ == name or any(name in _words(kind, field) for field in kind.model_fields)
