@@ -82,7 +82,7 @@ def _new_names(old: str, value: Any, renamed: Mapping[str, str]) -> Iterator[tup
 
 
 def _new_name(path: str, renamed: Mapping[str, str]) -> str:
-    """Follows renames of a key or a section above it to the last name, or to a sentence with a replacement."""
+    """Follows renames of a key or a section above it to the last name, or to a replacement sentence."""
     for _ in range(len(renamed)):
         above = max((name for name in renamed if f"{path}.".startswith(f"{name}.")), key=len, default=None)
         if above is None or not _is_path(path):
