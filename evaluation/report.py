@@ -24,7 +24,7 @@ def plot_writers(directory: Path) -> dict[str, Callable[[Path], None]]:
     map also `grid.png`. Equal directories give equal bytes.
 
     Raises:
-        InputError: naming the file that is missing or malformed.
+        InputError: a file is missing or malformed.
     """
     run, card = read_run(directory), read_scorecard(directory)
     walls, closures = read_walls(directory), read_closures(directory)

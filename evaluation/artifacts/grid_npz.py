@@ -14,7 +14,7 @@ def read_grid(path: str | Path) -> OccupancyGrid:
     """Reads the map of a run with a grid.
 
     Raises:
-        InputError: the file is missing or holds something else.
+        InputError: the file is missing or malformed.
     """
 
     def parse(probability: np.ndarray, origin: np.ndarray, cell: np.ndarray) -> OccupancyGrid:
@@ -37,7 +37,7 @@ def read_grid_truth(path: str | Path) -> tuple[GridTruth, np.ndarray]:
     """The inverse of `write_grid_truth`.
 
     Raises:
-        InputError: the file is missing or holds something else.
+        InputError: the file is missing or malformed.
     """
 
     def parse(*arrays: np.ndarray) -> tuple[GridTruth, np.ndarray]:

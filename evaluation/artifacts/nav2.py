@@ -59,7 +59,7 @@ def read_nav2(path: str | Path) -> Nav2Map:
     """Reads map.yaml and its image like map_server (modes trinary, scale and raw; binary 8-bit PGM).
 
     Raises:
-        InputError: naming the file and the key that is missing or invalid.
+        InputError: a file or a key is missing or invalid.
     """
     path = Path(path)
     given = _description(path)

@@ -1,4 +1,4 @@
-"""Reads a run directory; of an interrupted run, the part that was written."""
+"""Reads a run directory, also the incomplete one of an interrupted run."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def read_run(path: Path) -> RunArrays:
     """Reads the arrays of a run. Without a final trajectory (interrupted run) the online one replaces it.
 
     Raises:
-        InputError: naming the file that is missing or malformed.
+        InputError: a file is missing or malformed.
     """
     online_time, online = _tum(path / "online.tum")
     odometry_time, odometry = _tum(path / "odometry.tum")
@@ -81,7 +81,7 @@ def read_walls(path: Path) -> np.ndarray:
     """Reads the walls [B, 5] of a run directory; B is 0 without the file.
 
     Raises:
-        InputError: naming the malformed line.
+        InputError: a line is malformed.
     """
     file = path / "walls.csv"
     if not file.exists():
@@ -93,7 +93,7 @@ def read_closures(path: Path) -> np.ndarray:
     """Reads the pairs of steps [n, 2] joined by accepted loop closures; n is 0 without the file.
 
     Raises:
-        InputError: naming the malformed line.
+        InputError: a line is malformed.
     """
     file = path / "closures.csv"
     if not file.exists():
@@ -142,7 +142,7 @@ def _column(path: Path, name: str) -> np.ndarray:
 
 
 def _map(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes [M, 3] and links [L, 2] of a node-link file; none where it was never written."""
+    """Nodes [M, 3] and links [L, 2] of a node-link file; empty without the file."""
     if not path.exists():
         return np.zeros((0, 3)), np.zeros((0, 2), int)
     try:

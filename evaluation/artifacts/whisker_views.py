@@ -42,7 +42,7 @@ def read_whisker_views(path: str | Path) -> WhiskerViews:
     """The inverse of `write_whisker_views`, except for rounding.
 
     Raises:
-        InputError: the file is missing or holds something else.
+        InputError: the file is missing or malformed.
     """
 
     def parse(view: np.ndarray, *arrays: np.ndarray) -> WhiskerViews:

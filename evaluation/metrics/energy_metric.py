@@ -106,7 +106,7 @@ def energy_all_pairs(estimate: np.ndarray, truth: np.ndarray) -> Energy:
     cross = (here.conj() * (a * _after(z) - _after(w))).real
     trans2 = np.sum(squares - 2 * cross + np.arange(count)[::-1] * np.abs(here) ** 2)
     rot2 = _wrapped_differences(wrap(estimate[:, 2] - truth[:, 2]))
-    # the running sums may leave a perfect estimate a rounding error below zero
+    # rounding of the running sums may put a perfect estimate below zero
     return Energy(max(0.0, float(trans2)) / pairs, max(0.0, rot2) / pairs, pairs)
 
 
@@ -114,7 +114,7 @@ def read_relations(path: str | Path) -> Relations:
     """A relations file, `t1 t2 x y z roll pitch yaw` a line (z, roll and pitch are ignored).
 
     Raises:
-        InputError: naming file and line.
+        InputError: the file cannot be read or a line is malformed.
     """
     start, end, x, y, _, _, _, yaw = read_text_table(path, _RELATIONS).values.T
     return Relations(start, end, np.stack([x, y, yaw], axis=1))

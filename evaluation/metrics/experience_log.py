@@ -19,7 +19,7 @@ _COLUMNS = {
         "th",
         "heading",
         "yaw",
-        *(f"{who}_{th}" for who in ("true", "gt", "truth") for th in ("th", "theta")),
+        *(f"{prefix}_{th}" for prefix in ("true", "gt", "truth") for th in ("th", "theta")),
     ),
 }
 
@@ -39,11 +39,11 @@ class ExperienceLog(NamedTuple):
 def read_experience_log(path: str | Path) -> ExperienceLog:
     """A log from a CSV of time (s), experience id, true x (m), y (m) and heading (rad).
 
-    The header may say `t` or `time`, `id` or `experience`, `theta`, `th` or `heading`, and so on; without a
-    header the columns come in this order.
+    Column names may be `t` or `time`, `id` or `experience`, `theta`, `th` or `heading`, and so on; without a
+    header the columns are in this order.
 
     Raises:
-        InputError: naming file and line; also where an id is not a whole number.
+        InputError: a line is malformed, or an id is not a whole number.
     """
     table = read_text_table(path, _COLUMNS)
     time, experience, x, y, theta = table.values.T

@@ -58,7 +58,7 @@ class ExperienceMetric(NamedTuple):
         arcr: correct re-localisations / re-localisations; NaN without re-localisations.
         entries: entries after the base set. relocalisations: eta. correct: eta_c.
         base: entries in the base set, in the log used.
-        mode, log: as in `ExmConfig`. note: why a value is NaN, or a warning ('' for none).
+        mode, log: as in `ExmConfig`. note: reason for NaN, or a warning ('' for none).
         counted: [N] bool, the entry is a re-localisation. right: [N] bool, a correct one.
         near: [N] bool, true and perceived pose are within the thresholds (line 24; where `counted`).
     """
@@ -108,10 +108,10 @@ def experience_metric(
         InputError: the logs differ in length, a true pose is not finite, the base set is out of range, or
             none is given and the run never returns to its start.
     """
-    experience, truth = _checked(experience, truth)
+    experience, truth = _check_log(experience, truth)
     end = base_end(truth, config.position, config.heading_deg) if config.base is None else config.base
     rows = change_rows(experience) if config.log == "action" else np.flatnonzero(experience != -1)
-    base = int(np.searchsorted(rows, _checked_base(end, len(experience))))
+    base = int(np.searchsorted(rows, _check_base(end, len(experience))))
     reading = _READINGS[config.mode]
     ids, poses = experience[rows], truth[rows]
     counted = relocalisations(ids, base)
@@ -134,7 +134,7 @@ def relocalisations(experience: np.ndarray, base: int) -> np.ndarray:
     Args:
         experience: [N] ids. base: entries in the base set.
     """
-    base = _checked_base(base, len(experience))
+    base = _check_base(base, len(experience))
     entry = np.arange(len(experience))
     _, code = np.unique(experience, return_inverse=True)
     returns = (entry >= base) & (creation_rows(experience) < entry) & ~_dwell(experience)
@@ -169,7 +169,7 @@ def base_end(truth: np.ndarray, position: float = 0.1, heading_deg: float = 25.0
     return int(back[0])
 
 
-def _checked(experience: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _check_log(experience: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     experience, truth = np.asarray(experience), np.asarray(truth, float)
     if experience.ndim != 1 or len(experience) == 0 or truth.shape != (len(experience), 3):
         found = f"shapes {experience.shape} and {truth.shape}"
@@ -180,7 +180,7 @@ def _checked(experience: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.
     return experience, truth
 
 
-def _checked_base(base: int, length: int) -> int:
+def _check_base(base: int, length: int) -> int:
     if not 0 <= base <= length:
         raise InputError("i_base", str(base), f"0 to {length}, the length of the log")
     return base
@@ -232,7 +232,7 @@ def _ratio(part: int, whole: int) -> float:
 
 
 # The listing tests membership in R_c, the experiences re-localised correctly so far. In a dwell this is read
-# as the verdict on the previous entry: if R_c lost no member, one correct visit would excuse all later ones.
+# as the verdict on the previous entry: with an R_c that only grows, one correct visit makes all later ones correct.
 _READINGS: dict[ExmMode, _Reading] = {
     "strict": _Reading(creation_rows, wrap, lambda near, dwell, before: before if dwell else near, 0),
     "paper": _Reading(_last_entry, wrap, lambda near, dwell, before: near and not (dwell and not before), 1),

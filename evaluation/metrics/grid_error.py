@@ -49,7 +49,7 @@ CONVENTIONS = tuple(
 """All conventions. Within the arena without smoothing, `outside` makes no difference."""
 MAIN_CONVENTION = Convention()
 """Unknown outside, all cells, not smoothed: false evidence outside counts, and a perfect map scores 0. The
-paper's text is closest to the same with smoothing."""
+same convention with smoothing is closest to the paper's text."""
 
 
 class GridError(Settings):
@@ -72,12 +72,12 @@ class GridError(Settings):
 
 
 def grid_error(
-    grid: OccupancyGrid, truth: GridTruth, felt: TouchableSurface, convention: Convention
+    grid: OccupancyGrid, truth: GridTruth, surface: TouchableSurface, convention: Convention
 ) -> GridError:
-    """The error of one map. `felt` is `occupancy_grid.touchable_surface(grid, truth)`."""
-    true = truth_occupancy(truth, felt.wall, convention.outside)
+    """The error of one map. `surface` is `occupancy_grid.touchable_surface(grid, truth)`."""
+    true = truth_occupancy(truth, surface.wall, convention.outside)
     true = smooth_truth(true) if convention.smooth else true
-    cells = truth.inside | felt.wall if convention.mask == "arena" else np.ones_like(truth.inside)
+    cells = truth.inside | surface.wall if convention.mask == "arena" else np.ones_like(truth.inside)
     if not cells.any():
         raise ValueError("truth without arena cells; expected at least one")
     true, ours = true[cells], grid.probability[cells]

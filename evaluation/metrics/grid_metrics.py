@@ -44,16 +44,16 @@ GRID_METRICS: tuple[Metric, ...] = (
 """In the order of the table."""
 
 
-def _cells(grid: OccupancyGrid, felt: TouchableSurface) -> dict[str, Finding]:
+def _cells(grid: OccupancyGrid, surface: TouchableSurface) -> dict[str, Finding]:
     """Scores of the separation of walls from free space.
 
     Much of a map's skill comes from the free space along the robot's path, for which no whisker is needed. So
     each score is also given for the map clipped at its prior, which leaves free space only (`_free`).
     """
-    cells = felt.free | felt.wall
-    wall, ours = felt.wall[cells], grid.probability[cells]
+    cells = surface.free | surface.wall
+    wall, ours = surface.wall[cells], grid.probability[cells]
     if wall.all() or not wall.any():
-        reason = f"the truth has no {'wall' if felt.free.any() else 'free space'}"
+        reason = f"the truth has no {'wall' if surface.free.any() else 'free space'}"
         names = [metric.name for metric in GRID_METRICS if "chamfer" not in metric.name]
         return dict.fromkeys(names, Finding(np.nan, note=reason))
     driven, rate, clipped = (
@@ -92,7 +92,7 @@ def _auc(ours: np.ndarray, wall: np.ndarray) -> float:
     return float((rank[wall].sum() - walls * (walls + 1) / 2) / (walls * free))
 
 
-def _chamfer(grid: OccupancyGrid, truth: GridTruth, felt: TouchableSurface) -> dict[str, Finding]:
+def _chamfer(grid: OccupancyGrid, truth: GridTruth, surface: TouchableSurface) -> dict[str, Finding]:
     """Mean distances between the centres of cells mapped as occupied and the true surfaces, both ways.
 
     One way alone can be minimised by a single correct cell or by marking all cells. Cells inside objects,
@@ -100,15 +100,15 @@ def _chamfer(grid: OccupancyGrid, truth: GridTruth, felt: TouchableSurface) -> d
     """
     from scipy.spatial import cKDTree
 
-    deep = truth.inside & truth.occupied & ~felt.wall
+    deep = truth.inside & truth.occupied & ~surface.wall
     drawn = (grid.probability > OCCUPIED_ABOVE) & ~deep
-    if len(felt.points) and drawn.any():
+    if len(surface.points) and drawn.any():
         cells = cell_centres(grid)[drawn]
-        to_walls, to_cells = cKDTree(felt.points).query(cells)[0], cKDTree(cells).query(felt.points)[0]
+        to_walls, to_cells = cKDTree(surface.points).query(cells)[0], cKDTree(cells).query(surface.points)[0]
         note = f"{len(cells)} cells above {OCCUPIED_ABOVE:g}"
         return {
             "map_chamfer_map": Finding(float(to_walls.mean()), note=note),
-            "map_chamfer_walls": Finding(float(to_cells.mean()), note=f"{len(felt.points)} points"),
+            "map_chamfer_walls": Finding(float(to_cells.mean()), note=f"{len(surface.points)} points"),
         }
-    reason = f"no cell above {OCCUPIED_ABOVE:g}" if len(felt.points) else "the truth has no wall"
+    reason = f"no cell above {OCCUPIED_ABOVE:g}" if len(surface.points) else "the truth has no wall"
     return dict.fromkeys(("map_chamfer_map", "map_chamfer_walls"), Finding(np.nan, note=reason))

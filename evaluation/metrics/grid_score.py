@@ -1,8 +1,8 @@
 """The score of an occupancy map: equation 6 of Fox et al. 2012 and `grid_metrics`, as a record and a table.
 
 Other than equation 6, the metrics use only cells that a whisker can observe: free space and the surfaces that
-bound it. The inside of objects and the space behind walls cannot be felt; including them would reward
-guessing. Chamfer distances measure occupied cells that the map shows there.
+bound it. The inside of objects and the space behind walls cannot be touched; including them would
+reward guessing. Chamfer distances measure occupied cells that the map shows there.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def pool_grids(scores: Sequence[GridScore], name: str) -> GridScore:
         name=name,
         trials=len(scores),
         errors=tuple(pool_errors(each) for each in zip(*(score.errors for score in scores), strict=True)),
-        quantities={m.name: _pooled([score.quantities[m.name] for score in scores]) for m in GRID_METRICS},
+        quantities={m.name: _pool([score.quantities[m.name] for score in scores]) for m in GRID_METRICS},
     )
 
 
@@ -108,7 +108,7 @@ def render_grid_scores(scores: Sequence[GridScore]) -> str:
     return "\n".join(line.rstrip() for line in lines)
 
 
-def _pooled(quantities: Sequence[Quantity]) -> Quantity:
+def _pool(quantities: Sequence[Quantity]) -> Quantity:
     values = [quantity.value for quantity in quantities if quantity.value is not None]
     if not values or len(quantities) == 1:
         return quantities[0]

@@ -11,14 +11,14 @@ import numpy as np
 from tactile.base.config import Settings
 
 Direction = Literal["low", "high"] | None
-"""Which values are better; None where neither is."""
+"""Direction of better values; None if values have no order."""
 
 
 class Quantity(Settings):
     """One measured value."""
 
     label: str
-    """Its name in words."""
+    """Name in words."""
     value: float | int | None
     """The value; None (null in JSON) if undefined, with the reason in `note`."""
     unit: str
@@ -26,7 +26,7 @@ class Quantity(Settings):
     odometry: float | int | None = None
     """The value for raw odometry, if defined."""
     note: str = ""
-    """Why there is no value, or a remark on it."""
+    """Reason for a missing value, or a remark on the value."""
 
 
 class Finding(NamedTuple):
@@ -45,7 +45,7 @@ class Metric(NamedTuple):
 
     Attributes:
         name: key in `scorecard.json`. label: in words. unit: SI, `deg`, or ''.
-        direction: which values are better. section: heading in the table.
+        direction: of better values. section: heading in the table.
         compute: the finding from a `RunData`, or from the `grid_findings` of a map; None without the
             ground truth that it needs.
     """

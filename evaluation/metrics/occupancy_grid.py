@@ -47,7 +47,7 @@ class TouchableSurface(NamedTuple):
     """The part of the truth that can be touched from free space.
 
     Attributes:
-        free: [H, W] bool, cells inside the arena that hold nothing.
+        free: [H, W] bool, empty cells inside the arena.
         wall: [H, W] bool, other cells whose centre is within one cell of a surface that faces a free cell:
             the boundary of objects, and one ring around the arena even if its wall has no thickness.
         points: [K, 2] points on those surfaces, m, one every `SURFACE_SPACING`.

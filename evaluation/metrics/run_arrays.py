@@ -40,7 +40,7 @@ def check_run(run: RunArrays) -> None:
     """Checks shapes, finite values and indices.
 
     Raises:
-        InputError: naming the array.
+        InputError: an array is malformed.
     """
     steps, nodes = len(run.time), len(run.nodes)
     shapes: dict[str, tuple[int, ...]] = {

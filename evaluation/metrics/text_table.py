@@ -76,12 +76,12 @@ def _cells(line: str) -> list[str]:
 def _places(where: str, names: list[str], columns: Columns) -> list[int]:
     """Index of each column in the header."""
     found = [
-        [names.index(name) for name in (wanted, *others) if name in names]
-        for wanted, others in columns.items()
+        [names.index(name) for name in (column, *others) if name in names]
+        for column, others in columns.items()
     ]
-    missing = [wanted for wanted, at in zip(columns, found, strict=True) if not at]
+    missing = [column for column, at in zip(columns, found, strict=True) if not at]
     if missing:
-        known = "; ".join("/".join((wanted, *columns[wanted])) for wanted in missing)
+        known = "; ".join("/".join((column, *columns[column])) for column in missing)
         raise InputError(where, f"no column {', '.join(missing)} among {' '.join(names)}", known)
     return [at[0] for at in found]
 

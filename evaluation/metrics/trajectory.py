@@ -130,7 +130,7 @@ def read_tum(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     z, roll and pitch are ignored. An incomplete last line is dropped.
 
     Raises:
-        InputError: naming file and line.
+        InputError: the file cannot be read or a line is malformed.
     """
     table = read_text_table(path, _TUM)
     t, x, y, _, qx, qy, qz, qw = table.values.T

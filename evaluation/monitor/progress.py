@@ -107,21 +107,21 @@ class RunMonitor:
         )
 
     def _read(self) -> None:
-        for where, line in self._steps.new():
+        for where, line in self._steps.read_new():
             cells = line.split(",")
             if not self._header:
                 self._header = cells
                 continue
-            told = dict(zip(self._header, cells, strict=False))
-            self._rows.append(_numbers(where, [told.get(name, "") for name in _NUMBERS], len(_NUMBERS)))
-            self._outcomes.append(told.get("outcome", ""))
-        for where, line in self._odometry.new():
+            row = dict(zip(self._header, cells, strict=False))
+            self._rows.append(_numbers(where, [row.get(name, "") for name in _NUMBERS], len(_NUMBERS)))
+            self._outcomes.append(row.get("outcome", ""))
+        for where, line in self._odometry.read_new():
             _, x, y, *_, qz, qw = _numbers(where, line.split(), 8)
             self._reckoned.append([x, y, 2 * atan2(qz, qw)])
-        for where, line in self._truth.new():
+        for where, line in self._truth.read_new():
             t, x, y, *_ = _numbers(where, line.split(), 8)
             self._true[t] = [x, y]
-        for where, line in self._errors.new():
+        for where, line in self._errors.read_new():
             if not line.startswith("t,"):
                 self._online_error = _numbers(where, line.split(","), 2)[1]
 
@@ -161,7 +161,7 @@ class _Lines:
     def __init__(self, path: Path) -> None:
         self.path, self._offset, self._count = path, 0, 0
 
-    def new(self) -> Iterator[tuple[str, str]]:
+    def read_new(self) -> Iterator[tuple[str, str]]:
         """The complete lines since the last call, each with `file:line`."""
         try:
             with self.path.open("rb") as file:

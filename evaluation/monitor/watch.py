@@ -23,12 +23,12 @@ SILENCE_LIMIT = 300.0
 SILENCE_SHOWN = 10.0
 """The status line reports silence longer than this, s."""
 REST_FACTOR = 9.0
-"""Pause per working time; limits the monitor to a tenth of a processor core."""
+"""Pause as a multiple of the working time; limits the monitor to a tenth of a processor core."""
 
 
 def watch_run(
     directory: Path,
-    tell: Callable[[str], None],
+    report: Callable[[str], None],
     *,
     every: float = 2.0,
     patience: float = SILENCE_LIMIT,
@@ -37,7 +37,7 @@ def watch_run(
     """Updates watch.png in a run directory and reports the status, until the run ends.
 
     Args:
-        tell: called with the status line after each update. every: least time between updates, s.
+        report: called with the status line after each update. every: least time between updates, s.
         patience: silence after which the run counts as killed, s. once: whether to stop after one update.
 
     Returns:
@@ -55,7 +55,7 @@ def watch_run(
             pace = (len(seen.path) - len(before.path)) / (began - last)
         if before is None or (len(seen.path), seen.status) != (len(before.path), before.status):
             _draw(directory, seen)
-        tell(status_line(seen, pace))
+        report(status_line(seen, pace))
         if once or seen.status != RUNNING or seen.silence > patience:
             return seen
         before, last = seen, began

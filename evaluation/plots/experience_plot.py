@@ -20,10 +20,10 @@ def draw_experience_history(run: RunArrays, card: Scorecard) -> style.Figure:
     Without truth or a return to the start there are no verdicts; then all steps look the same.
     """
     rows = truth_rows(run) if len(truth_rows(run)) else np.arange(len(run.time))
-    judged, why = _judged(run, card, rows)
+    judged, reason = _judge(run, card, rows)
     rows = rows[run.experience[rows] >= 0]
     experience = run.experience[rows]
-    figure = style.new_figure(_HEIGHT, card.name, why if judged is None else _line(judged))
+    figure = style.new_figure(_HEIGHT, card.name, reason if judged is None else _line(judged))
     inner = style.WIDTH - style.LEFT - style.RIGHT
     axes = style.add_axes(figure, style.LEFT, _BOTTOM, inner, _HEIGHT - style.TOP - _BOTTOM)
     counted = np.zeros(len(rows), bool) if judged is None else judged.counted
@@ -51,7 +51,7 @@ def draw_experience_history(run: RunArrays, card: Scorecard) -> style.Figure:
     return figure
 
 
-def _judged(run: RunArrays, card: Scorecard, rows: np.ndarray) -> tuple[ExperienceMetric | None, str]:
+def _judge(run: RunArrays, card: Scorecard, rows: np.ndarray) -> tuple[ExperienceMetric | None, str]:
     """The strict Experience Metric of the steps `rows`, or None and the reason."""
     if run.truth is None or len(truth_rows(run)) == 0:
         return None, "no ground truth: re-localisations cannot be judged"

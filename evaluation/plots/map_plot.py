@@ -45,7 +45,7 @@ def draw_map(
         walls: [B, 5] west, south, east, north, height, m, in the frame of the truth; needs truth.
         closures: [n, 2] steps joined by loop closures; drawn with walls.
     """
-    layers = _placed(run)
+    layers = _align_layers(run)
     shown = walls if layers.truth is not None else NO_WALLS
     box = _frame(layers, shown)
     width, height = box[1] - box[0]
@@ -103,7 +103,7 @@ def wall_corners(walls: np.ndarray) -> np.ndarray:
     return np.concatenate([walls[:, :2], walls[:, 2:4]])
 
 
-def _placed(run: RunArrays) -> _Layers:
+def _align_layers(run: RunArrays) -> _Layers:
     rows = truth_rows(run)
     if run.truth is None or len(rows) == 0:
         to_map = compose(run.final[0], between(run.odometry[0], np.zeros(3)))
@@ -134,7 +134,7 @@ def _frame(layers: _Layers, walls: np.ndarray) -> np.ndarray:
 
 
 def _paint(axes: style.Axes, run: RunArrays, layers: _Layers) -> None:
-    """Draws the layers in the order of the legend; `zorder` decides what covers what."""
+    """Draws the layers in the order of the legend; `zorder` sets which layer is in front."""
     from matplotlib.collections import LineCollection
 
     crowd = min(1.0, np.sqrt(150 / max(1, len(layers.nodes))))  # thinner strokes for many experiences

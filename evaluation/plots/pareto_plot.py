@@ -15,7 +15,7 @@ _ROOM = 0.12  # share of the axes kept free on each side
 _FLOOR = 0.5  # an error of 0 is drawn at this share of the least positive error
 # Pixels: grid of label positions, gap around labels (across, up), distance from which a line is drawn.
 _GRID, _GAP, _NEAR = 3.0, (5.0, 2.0), 14.0
-# Pixels of detour that avoid crossing a bar, or being nearer to another point.
+# Cost, in pixels of distance, of a label that crosses a bar, or is nearer to another point.
 _CROSSING, _MISTAKEN = 8.0, 16.0
 _SIZE = 7.6  # of labels, points
 
@@ -84,8 +84,8 @@ def place_labels(
         cost = away[:, k] + _MISTAKEN * (np.delete(away, k, axis=1) < away[:, k : k + 1]).sum(axis=1)
         # At equal distance, a label beside the point reads better than one above it.
         cost += 0.02 * np.abs((boxes[:, 1] + boxes[:, 3]) / 2 - at[1])
-        cost += _CROSSING * (_shared(boxes, np.reshape(crossed, (-1, 4))) > 0).sum(axis=1)
-        hidden = _shared(boxes, np.reshape(taken, (-1, 4))).sum(axis=1)
+        cost += _CROSSING * (_overlap(boxes, np.reshape(crossed, (-1, 4))) > 0).sum(axis=1)
+        hidden = _overlap(boxes, np.reshape(taken, (-1, 4))).sum(axis=1)
         chosen = np.lexsort((cost, hidden))[0]
         corners[k] = spots[chosen]
         taken.append(boxes[chosen] + room)
@@ -98,8 +98,8 @@ def _away(boxes: np.ndarray, points: np.ndarray) -> np.ndarray:
     return np.hypot(*np.moveaxis(np.maximum(np.maximum(low, high), 0.0), -1, 0))
 
 
-def _shared(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """[N, M] how much each box covers of each other one, pixels squared."""
+def _overlap(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """[N, M] area of each box that each other box covers, pixels squared."""
     low = np.maximum(boxes[:, None, :2], others[None, :, :2])
     high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
     return np.maximum(high - low, 0.0).prod(axis=2)

@@ -52,13 +52,13 @@ def _watch(arguments: argparse.Namespace) -> int:
     for name in ("every", "patience"):
         if not 0 < getattr(arguments, name) < float("inf"):
             raise InputError(f"--{name}", str(getattr(arguments, name)), "a time above 0 s")
-    tell = _StatusLine()
+    line = _StatusLine()
     try:
         seen = watch_run(
-            arguments.directory, tell, every=arguments.every, patience=arguments.patience, once=arguments.once
+            arguments.directory, line, every=arguments.every, patience=arguments.patience, once=arguments.once
         )
     finally:
-        tell.end()
+        line.end()
     if seen.status == RUNNING and not arguments.once:
         cure = f"; `run --continue {arguments.directory / 'map.npz'}` continues" if seen.checkpoint else ""
         print(f"no output for {seen.silence:.0f} s: the run was killed{cure}")

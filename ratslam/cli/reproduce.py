@@ -121,10 +121,10 @@ def add_tables(tables: Commands) -> None:
     precision.add_argument("--backends", nargs="+", choices=BACKENDS, default=BACKENDS, help="the methods")
     precision.add_argument("-o", "--output", type=Path, metavar="DIR", help="folder for BACKEND.npz")
     add_workers(precision, 1)
-    chaos = add("chaos", _chaos_lines, "separation of two almost equal pose-cell paths", "--steps 1000")
+    chaos = add("chaos", _chaos_lines, "divergence of two almost equal pose-cell networks", "--steps 1000")
     add_count(chaos, "--steps", 100_000, "steps per walk")
     add_count(chaos, "--walks", 3, "walks per row")
-    chaos.add_argument("--pairs", nargs="+", metavar="PAIR", help="only these pairs of paths")
+    chaos.add_argument("--pairs", nargs="+", metavar="PAIR", help="only these pairs of networks")
     chaos.add_argument("--motions", nargs="+", choices=MOTIONS, default=MOTIONS, help="only these motions")
 
 

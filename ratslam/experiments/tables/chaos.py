@@ -1,9 +1,9 @@
-"""The chaos table: how fast two runs of the pose cells separate that differ by almost nothing.
+"""The chaos table: how fast two almost equal pose-cell networks diverge.
 
-Both runs of a pair get the same motion and no views: `random`, half a cell and half a heading cell per step
-along each axis, or `drive`, one cell ahead and half a heading cell of turn. The table gives the largest
-difference of their decoded poses along any axis within so many steps, in cells, the short way round the torus
-(at most 10.5 in x and y and 18 in heading): median and largest over the walks.
+Both networks of a pair get the same motion without views: `random`, half a cell and half a heading cell per
+step along each axis, or `drive`, one cell ahead and half a heading cell of turn. The table gives the largest
+difference of their decoded poses along any axis up to a number of steps, in cells, the short way round the
+torus (at most 10.5 in x and y and 18 in heading): median and largest over the walks.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from tactile.base.types import Odometry
 MARKS = 100, 1_000, 10_000, 20_000, 100_000
 """Steps after which the difference is printed."""
 SETTLING = 50
-"""Steps at rest before the runs differ."""
+"""Steps at rest before the networks differ."""
 NUDGE = 1e-13
 """Activity added to one cell; all activity sums to 1."""
 MOTIONS = {"random": ((0.0, 0.0, 0.0), (0.5, 0.5, 0.5)), "drive": ((1.0, 0.0, 0.0), (0.0, 0.0, 0.5))}
@@ -39,8 +39,8 @@ MOTIONS = {"random": ((0.0, 0.0, 0.0), (0.5, 0.5, 0.5)), "drive": ((1.0, 0.0, 0.
 
 
 class Variant(NamedTuple):
-    """One run: precision, engine, whether the lag of the packet is fed back, and the activity added to the
-    strongest cell before the first step."""
+    """One network: precision, engine, whether the lag of the packet is fed back, and the activity added to
+    the strongest cell before the first step."""
 
     dtype: str = "float64"
     engine: str = "window"
@@ -57,7 +57,7 @@ PAIRS = {
 
 
 def separation(one: Variant, other: Variant, motion: np.ndarray) -> np.ndarray:
-    """[T] largest difference between the decoded poses of two runs along any axis, cells.
+    """[T] largest difference between the decoded poses of two networks along any axis, cells.
 
     Args:
         motion: [T, 3] cells per step.
@@ -89,12 +89,12 @@ def decoded_poses(kind: Variant, motion: np.ndarray) -> np.ndarray:
 def _walk(config: PoseCellConfig, cells: PoseCells, motion: Any) -> tuple[PoseCells, Any]:
     dtype = np.dtype(motion.dtype)
     levels, unit = window_levels(config, dtype), units(config, dtype)
-    nowhere, nothing = jnp.zeros(3, dtype), jnp.zeros((), dtype)
+    no_recall, no_energy = jnp.zeros(3, dtype), jnp.zeros((), dtype)
 
     def step(cells: PoseCells, moved: Any) -> tuple[PoseCells, Any]:
         dx, dy, dtheta = moved * unit
         odometry = Odometry(dx, dy, dtheta, jnp.ones((), dtype))
-        cells, _ = pose_cells.step(config, levels, cells, odometry, nowhere, nothing)
+        cells, _ = pose_cells.step(config, levels, cells, odometry, no_recall, no_energy)
         return cells, cells.pose
 
     return lax.scan(step, cells, motion)

@@ -96,7 +96,7 @@ class GridFigures(NamedTuple):
 
     Attributes:
         error, odometry: mean position error of the filter and of dead reckoning, m. wall_errors: [n] errors
-            of the wall directions given to the filter, rad. contacts: number of contacts that could give one.
+            of the wall directions given to the filter, rad. contacts: number of them that could give one.
         map: AUC, Brier skill, Brier skill of free space alone, Chamfer map to walls and walls to map, m.
     """
 

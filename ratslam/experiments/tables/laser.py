@@ -122,13 +122,13 @@ def measure_recording(task: tuple[RunConfig, int]) -> RecordingFigures:
 
 
 def _missing(recording: Recording, folder: Path) -> str:
-    """Why a recording cannot be run; "" if it can."""
+    """The reason that a recording cannot be used; "" if it can."""
     if recording.real and not os.environ.get(DATA):
         return f"set {DATA} to the folder of the real recordings"
     config = folder / recording.config
     files = config, config.parent / GOLDEN / recording.file
     absent = [file for file in files if not file.exists()]
-    return f"{absent[0]} is not there; run this in the repository" if absent else ""
+    return f"{absent[0]} does not exist; run the command in the repository" if absent else ""
 
 
 def _config(recording: Recording, folder: Path, assignments: Sequence[str] = ()) -> RunConfig:

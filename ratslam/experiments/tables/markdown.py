@@ -1,4 +1,4 @@
-"""Rows of a Markdown table, printed one at a time while the work goes on."""
+"""Rows of a Markdown table, printed one at a time, each as soon as it is measured."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""A dense pose-cell network step in plain NumPy float64: the yardstick of all stated speeds.
+"""A dense pose-cell network step in plain NumPy float64: the baseline of all stated speeds.
 
 A straightforward implementation: separable circular convolutions as circulant products, heading layers
-translated one after another, a search for the peak. Time it beside what is measured, in the same run; only
-the ratio is meaningful.
+translated one after another, a search for the peak. Time it in the same process as the engine: only the
+ratio of both times is meaningful.
 """
 
 from __future__ import annotations

@@ -92,19 +92,19 @@ def run_arms(task: tuple[str, int]) -> list[list[float]]:
     simulation = SESSION | {"seed": seed, "maze": {"seed": seed}}
     given = {"simulation": simulation, "session": {"reserve": RESERVE}} | BACKENDS[backend]
     config, log = collect_session(RunConfig.model_validate(given))
-    off = 1 + ROUNDING * stream(seed, "tests.precision").uniform(-1, 1, (log.length, 3))
-    rounded = replace(log, motion=np.column_stack([log.motion[:, :3] * off, log.motion[:, 3]]))
+    factor = 1 + ROUNDING * stream(seed, "tests.precision").uniform(-1, 1, (log.length, 3))
+    rounded = replace(log, motion=np.column_stack([log.motion[:, :3] * factor, log.motion[:, 3]]))
     single = config.session.model_copy(update={"precision": "float32"})
     arms = (config, log), (config.model_copy(update={"session": single}), log), (config, rounded)
-    played = [run_session(*arm) for arm in arms]
+    results = [run_session(*arm) for arm in arms]
     return [
         [
             *(getattr(metrics, name) for name in ("em", "arr", "arcr")),
             ate(one.trajectory, one.truth),
             metrics.closures,
-            float((one.place == played[0].place).mean()),
+            float((one.place == results[0].place).mean()),
         ]
-        for one, metrics in zip(played, map(touch_metrics, played), strict=True)
+        for one, metrics in zip(results, map(touch_metrics, results), strict=True)
     ]
 
 

@@ -1,4 +1,4 @@
-"""The speed table: microseconds a pose-cell step takes in replay, by size of the network.
+"""The speed table: time of a pose-cell step in replay, µs, by size of the network.
 
 All columns of a row are timed in turns on one core, so that they share its state; only ratios carry over to
 other machines.
@@ -33,7 +33,7 @@ MOTION = 0.2, 0.1
 """Cells forward and heading cells per step."""
 COLUMNS = ("cells a side", "ratslam", "float32", "whole torus", "NumPy", "NumPy / ratslam")
 
-Timed = Mapping[str, tuple[Callable[[], Any], int]]
+TimedCalls = Mapping[str, tuple[Callable[[], Any], int]]
 """By name: a call, and the number of steps that it makes."""
 
 
@@ -48,7 +48,7 @@ def speed_table(sizes: Sequence[int] = SIZES, rounds: int = ROUNDS) -> Iterator[
 
 
 def network_calls(n: int, steps: int = STEPS) -> dict[str, tuple[Callable[[], Any], int]]:
-    """What is timed for networks of n x n x 36 cells, compiled."""
+    """The calls to time for networks of n x n x 36 cells, compiled."""
     few = max(5, 400 // n)
     window, start = replay_network(n, "window", steps)
     single, start32 = replay_network(n, "window", steps, np.float32)
@@ -89,7 +89,7 @@ def replay_network(
     ring = rings(PoseCellConfig(cells_xy=n), np.dtype(dtype))
 
     @jax.jit
-    def run(cells: PoseCells) -> Any:
+    def replay(cells: PoseCells) -> Any:
         def body(k: Any, carry: Any) -> Any:
             cells, above = carry
             far = (cells.pose + ring / 2 * np.array([1, 1, 0], dtype)) % ring
@@ -99,11 +99,11 @@ def replay_network(
 
         return jax.lax.fori_loop(0, steps, body, (cells, jnp.int32(0)))
 
-    jax.block_until_ready(run(start))
-    return run, start
+    jax.block_until_ready(replay(start))
+    return replay, start
 
 
-def interleaved_medians(calls: Timed, rounds: int = ROUNDS) -> dict[str, float]:
+def interleaved_medians(calls: TimedCalls, rounds: int = ROUNDS) -> dict[str, float]:
     """Median microseconds per step of each call; each round times all calls in turn."""
     times = [{name: _time(*call) for name, call in calls.items()} for _ in range(rounds)]
     return {name: float(np.median([each[name] for each in times])) for name in calls}

@@ -163,18 +163,18 @@ def measure_session(task: TouchTask) -> SessionFigures:
     true_closures = result.closures[closure_errors(result) <= FALSE_CLOSURE_DISTANCE]
     returned = experience_metric_if_defined(result) is not None  # else a quarter is the base set
     metrics = touch_metrics(result, ExmConfig(base=None if returned else len(truth) // 4))
-    read = result.trajectory.copy()
-    read[result.place >= 0] = result.node[result.place[result.place >= 0]]
+    snapped = result.trajectory.copy()
+    snapped[result.place >= 0] = result.node[result.place[result.place >= 0]]
     change = int(CHANGE * log.length)
     across = (result.closures[:, 0] >= change) & (result.closures[:, 1] < change)
     later, earlier = true_closures.T
     recovered = [min(later[(later >= k) & (earlier < k)] - k, default=log.length) for k in kidnaps]
     return SessionFigures(
         metrics._replace(
-            em_experiences=energy_all_pairs(read, truth).total,
+            em_experiences=energy_all_pairs(snapped, truth).total,
             arcr_chain_free=float(np.nan_to_num(metrics.arcr_chain_free)),
         ),
-        revisits_closed=_revisits_closed(truth, true_closures),
+        revisits_closed=_share_of_revisits_closed(truth, true_closures),
         across=int(across.sum()),
         recovery=tuple(map(int, recovered)),
     )
@@ -188,7 +188,7 @@ def task_config(task: TouchTask) -> RunConfig:
     return RunConfig.model_validate({"simulation": simulation, "touch": touch, "backend": task.backend})
 
 
-def _revisits_closed(truth: np.ndarray, true_closures: np.ndarray) -> float:
+def _share_of_revisits_closed(truth: np.ndarray, true_closures: np.ndarray) -> float:
     """Share of the revisits that a true closure has found."""
     closed = np.zeros(len(truth), bool)
     closed[true_closures[:, 0]] = True
@@ -223,7 +223,7 @@ def _cells(found: Sequence[SessionFigures]) -> list[str]:
 
 
 def _notes(row: str, found: Sequence[SessionFigures]) -> list[str]:
-    """What only some rows are for: closures across a change of mazes, recovery after kidnaps."""
+    """Lines below the table for some rows: closures across a change of mazes, recovery after kidnaps."""
     notes = []
     if row == "control: other maze":
         across, closures = sum(one.across for one in found), sum(one.metrics.closures for one in found)
