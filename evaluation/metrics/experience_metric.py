@@ -232,7 +232,7 @@ def _ratio(part: int, whole: int) -> float:
 
 
 # The listing tests membership in R_c, the experiences re-localised correctly so far. In a dwell this is read
-# as the verdict on the previous entry: with an R_c that only grows, one correct visit makes all later ones correct.
+# as the verdict on the previous entry: if R_c only grew, one correct visit would make all later ones correct.
 _READINGS: dict[ExmMode, _Reading] = {
     "strict": _Reading(creation_rows, wrap, lambda near, dwell, before: before if dwell else near, 0),
     "paper": _Reading(_last_entry, wrap, lambda near, dwell, before: near and not (dwell and not before), 1),
