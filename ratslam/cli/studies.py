@@ -55,7 +55,7 @@ def add_commands(commands: Commands) -> None:
     add_set(study)
     study.add_argument(
         "--workers", type=positive_integer, metavar="N",
-        help="processes (default: number of cores; 1 for report: pareto, which measures speed)",
+        help="Dask processes (default: one per core; 1 without Dask and for report: pareto, a measurement)",
     )  # fmt: skip
     study.add_argument("--scheduler", metavar="tcp://HOST:PORT", help="Dask scheduler to use instead")
     study.add_argument(

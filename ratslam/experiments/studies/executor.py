@@ -1,4 +1,4 @@
-"""Runs tasks in this process, in processes of this machine, or in those of a Dask cluster.
+"""Runs tasks in this process, or in Dask processes: of this machine, or of a cluster.
 
 This module loads without JAX, whose environment must be set before a worker process loads it.
 """
@@ -16,13 +16,12 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent import futures
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, closing, contextmanager
-from functools import partial
+from multiprocessing import resource_tracker
+from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
 from tactile.base.errors import InputError
 
-DEATHS = 5
-"""Number of times that processes start anew after one was killed; then each task has a process of its own."""
 ANSWER_TIME = 10
 """Time that a scheduler has for its first answer, s."""
 ENVIRONMENT = (
@@ -32,10 +31,15 @@ ENVIRONMENT = (
     "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES",
 )
 """Variables that a process of a cluster takes from this one before it loads JAX."""
+DASK_SETTINGS: dict[str, Any] = {
+    "distributed.nanny.pre-spawn-environ": {},
+    "distributed.scheduler.worker-ttl": None,
+    "distributed.worker.profile.enabled": False,
+}
+"""Processes of this machine have its environment, may compute for any time, and are not profiled."""
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
-Submit = Callable[[Any, Any], "futures.Future[Any]"]
 
 
 def run_tasks(
@@ -67,9 +71,9 @@ class Executor(ExitStack):
     """Worker processes that start with the first tasks and serve until the end of the `with` block.
 
     Args:
-        workers: number of processes; 1: tasks run in this process; None or 0: one per core.
+        workers: number of processes; 1: tasks run in this process; None or 0: one per core, without Dask 1.
         scheduler: address of a Dask scheduler whose workers are used instead.
-        fresh: run every task in a new process of this machine, one after another.
+        fresh: run every task in a new process of this machine, one after another; needs no Dask.
 
     Attributes:
         processes: number of processes that share the work.
@@ -78,9 +82,8 @@ class Executor(ExitStack):
     def __init__(self, workers: int | None = None, scheduler: str | None = None, fresh: bool = False) -> None:
         super().__init__()
         self.processes = 1
-        self._workers, self._scheduler, self._fresh = workers or os.cpu_count() or 1, scheduler, fresh
-        self._submit: Submit | None = None
-        self._most = 1
+        self._workers, self._scheduler, self._fresh = workers, scheduler, fresh
+        self._client: Any = None
 
     def completed(
         self,
@@ -95,50 +98,102 @@ class Executor(ExitStack):
                 raises an `InputError`.
         """
         left = dict(enumerate(tasks))
-        if not self._fresh and self._scheduler is None and min(self._workers, len(tasks)) <= 1:
-            yield from enumerate(map(function, tasks))
-            return
-        for _ in range(0 if self._fresh else DEATHS if self._scheduler is None else 1):
-            for index, result in self._answers(function, left.copy()):
+        if not self._fresh:
+            if not self._connect(len(tasks)):
+                yield from enumerate(map(function, tasks))
+                return
+            for index, result in self._answers(function, tasks):
                 del left[index]
                 yield index, result
-            if not left:
-                return
+            if left:
+                self._disconnect()  # all memory for the task at fault
         for index, task in left.items():
             try:
-                yield index, self._answer_alone(function, task)
+                if self._scheduler is not None:
+                    raise BrokenProcessPool
+                yield index, _call_afresh(function, task)
             except BrokenProcessPool:
                 if killed is None:
                     found = "a process was killed, for lack of memory for example"
                     raise InputError("--workers", found, "memory for all", "ask for fewer") from None
                 yield index, killed(task)
 
-    def _answers(self, function: Callable[[Task], Result], tasks: dict[int, Task]) -> Iterator[Any]:
+    def _connect(self, tasks: int) -> bool:
+        """Whether worker processes serve; else tasks run in this process."""
+        workers = min(self._workers or os.cpu_count() or 1, tasks)
+        if self._scheduler is None and workers <= 1:
+            return False
+        try:
+            import distributed  # noqa: F401
+        except ImportError:
+            cure = "pip install 'ratslam[sweep]'"
+            if self._scheduler is None and not self._workers:
+                print(f"ratslam: one process, for lack of Dask ({cure})", file=sys.stderr)
+                return False
+            option = "--workers" if self._scheduler is None else "--scheduler"
+            raise InputError(option, "Dask is not installed", "the extra 'sweep'", cure) from None
+        if self._scheduler is None and workers > self.processes:
+            self._disconnect()
+        if self._client is None:
+            with _holding_interrupts():
+                self._client = self._client_of(workers)
+        served = workers if self._scheduler is None else min(len(self._client.nthreads()) or 1, tasks)
+        self.processes = max(self.processes, served)
+        return True
+
+    def _disconnect(self) -> None:
+        self._client = None
+        self.close()
+
+    def _client_of(self, workers: int) -> Any:
+        """A client of the scheduler, or of a new one with processes of this machine."""
+        from distributed import Client
+        from distributed.utils import silence_logging_cmgr
+
+        self.enter_context(silence_logging_cmgr(logging.CRITICAL))  # the log repeats what our errors say
+        address = self._scheduler or self._start(workers)
+        try:
+            client = self.enter_context(Client(address, timeout=ANSWER_TIME, set_as_default=False))
+        except (OSError, ValueError) as error:
+            found = f"no scheduler answers at {address!r} ({type(error).__name__})"
+            raise InputError("--scheduler", found, "the address of one, such as tcp://HOST:8786") from None
+        if not client.nthreads():
+            print(f"ratslam: waiting for workers to join {address} ...", file=sys.stderr)
+        return client
+
+    def _start(self, workers: int) -> str:
+        """Starts processes of this machine; returns the address of their scheduler."""
+        import dask
+        from distributed import LocalCluster
+
+        folder = self.enter_context(TemporaryDirectory())
+        self.enter_context(dask.config.set(DASK_SETTINGS | {"temporary-directory": folder}))
+        cluster = LocalCluster(
+            n_workers=workers, threads_per_worker=1, processes=True, host="127.0.0.1", memory_limit=0,
+            dashboard_address=None, silence_logs=logging.CRITICAL,
+        )  # fmt: skip
+        self.enter_context(cluster)
+        self.callback(_kill_workers, cluster)
+        return str(cluster.scheduler_address)
+
+    def _answers(self, function: Callable[[Task], Result], tasks: Sequence[Task]) -> Iterator[Any]:
         """(index, result) in the order of completion, without those of processes that were killed."""
-        if self._submit is None:
-            pool = _cluster(self._scheduler) if self._scheduler else _local(self._workers)
-            self._submit, self._most = self.enter_context(pool)
-        self.processes = max(self.processes, min(self._most, len(tasks)))
-        with _ignoring_interrupts():
-            pending = {self._submit(function, task): index for index, task in tasks.items()}
+        environment = {name: os.environ[name] for name in ENVIRONMENT if name in os.environ}
+        pool = self._client.get_executor(pure=False)
+        pending = {
+            pool.submit(call_in_worker, environment, pickle.dumps((function, task))): index
+            for index, task in enumerate(tasks)
+        }
         for future in futures.as_completed(pending):
             try:
                 result = future.result()
-            except BrokenProcessPool:
-                self._submit = None
             except Exception as error:
-                if self._scheduler is None or not _is_killed(error):
+                if self._scheduler is not None:
+                    _check_cluster(error)
+                if type(error).__name__ != "KilledWorker":
                     raise
             else:
                 yield pending[future], result
-
-    def _answer_alone(self, function: Callable[[Task], Result], task: Task) -> Result:
-        if self._scheduler is not None:
-            raise BrokenProcessPool
-        with _local(1) as (submit, _):
-            with _ignoring_interrupts():
-                future = submit(function, task)
-            return future.result()
 
 
 def call_in_worker(environment: dict[str, str], packed: bytes) -> Any:
@@ -149,20 +204,40 @@ def call_in_worker(environment: dict[str, str], packed: bytes) -> Any:
     return function(task)
 
 
-@contextmanager
-def _local(count: int) -> Iterator[tuple[Submit, int]]:
-    """Submits to processes of this machine, which end with the block, whatever they are doing."""
-    context = multiprocessing.get_context("spawn")  # forked children of a process with JAX hang
+def _kill_workers(cluster: Any) -> None:
+    """Ends the processes of a cluster, whatever they are doing."""
+    for nanny in cluster.workers.values():
+        nanny.close_gracefully()  # it starts no other process
+        if nanny.pid is not None:
+            os.kill(nanny.pid, signal.SIGKILL)
+
+
+def _check_cluster(error: Exception) -> None:
+    """Raises an `InputError` where the cluster of a scheduler is at fault."""
+    if isinstance(error, futures.CancelledError):
+        cure = "what was done is kept; run it again"
+        raise InputError("--scheduler", "the scheduler went away", "one that stays", cure) from None
+    if isinstance(error, ImportError) or "deserialization" in str(error):
+        found = f"its processes cannot load ratslam ({error})".splitlines()[0]
+        raise InputError("--scheduler", found, "the same ratslam, installed there too") from None
+
+
+def _call_afresh(function: Callable[[Task], Result], task: Task) -> Result:
+    """The result of a task in a new process.
+
+    Raises:
+        BrokenProcessPool: it was killed.
+    """
     others = multiprocessing.active_children()
-    pool = futures.ProcessPoolExecutor(count, context, _end_with_parent)
-    try:
-        yield pool.submit, count
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)
-        for process in multiprocessing.active_children():
-            if process not in others:
+    context = multiprocessing.get_context("spawn")  # forked children of a process with JAX hang
+    with futures.ProcessPoolExecutor(1, context, _end_with_parent) as pool:
+        try:
+            with _holding_interrupts():
+                future = pool.submit(function, task)
+            return future.result()
+        finally:
+            for process in set(multiprocessing.active_children()).difference(others):
                 process.kill()
-                process.join()
 
 
 def _end_with_parent() -> None:
@@ -177,51 +252,11 @@ def _end_with_parent() -> None:
 
 
 @contextmanager
-def _cluster(address: str) -> Iterator[tuple[Submit, int]]:
-    """Submits to the processes of a Dask scheduler."""
-    try:
-        from distributed import Client
-        from distributed.utils import silence_logging_cmgr
-    except ImportError:
-        cure = "pip install 'ratslam[sweep]'"
-        raise InputError("--scheduler", "Dask is not installed", "the extra 'sweep'", cure) from None
-    environment = {name: os.environ[name] for name in ENVIRONMENT if name in os.environ}
-    with silence_logging_cmgr(logging.CRITICAL):  # the log repeats what our errors say
-        try:
-            client = Client(address, timeout=ANSWER_TIME, set_as_default=False)
-        except (OSError, ValueError) as error:
-            found = f"no scheduler answers at {address!r} ({type(error).__name__})"
-            raise InputError("--scheduler", found, "the address of one, such as tcp://HOST:8786") from None
-        with client:
-            if not client.nthreads():
-                print(f"ratslam: waiting for workers to join {address} ...", file=sys.stderr)
-            submit = partial(client.get_executor(pure=False).submit, call_in_worker, environment)
-            yield lambda function, task: submit(pickle.dumps((function, task))), len(client.nthreads()) or 1
-
-
-def _is_killed(error: Exception) -> bool:
-    """Whether an error of a cluster is that a task's process was killed.
-
-    Raises:
-        InputError: the cluster is at fault.
-    """
-    if isinstance(error, futures.CancelledError):
-        cure = "what was done is kept; run it again"
-        raise InputError("--scheduler", "the scheduler went away", "one that stays", cure) from None
-    if isinstance(error, ImportError) or "deserialization" in str(error):
-        found = f"its processes cannot load ratslam ({error})".splitlines()[0]
-        raise InputError("--scheduler", found, "the same ratslam, installed there too") from None
-    return type(error).__name__ == "KilledWorker"
-
-
-@contextmanager
-def _ignoring_interrupts() -> Iterator[None]:
-    """Processes started within ignore Ctrl-C, which this process acts on."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _holding_interrupts() -> Iterator[None]:
+    """Ctrl-C waits for the end of the block; processes started in it, and their successors, ignore it."""
+    resource_tracker.ensure_running()  # its start would end the block of the signal
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -91,11 +91,28 @@ def test_a_fresh_executor_runs_each_task_in_a_new_process_and_survives_a_kill():
             list(executor.completed(fail, [5]))
 
 
-def test_a_missing_dask_is_reported(monkeypatch):
-    for module in ("dask", "distributed"):
-        monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(InputError, match=r"pip install 'ratslam\[sweep\]'"):
-        list(run_tasks(square, [1, 2], scheduler="tcp://127.0.0.1:1"))
+@pytest.mark.parametrize("asked", [{"scheduler": "tcp://127.0.0.1:1"}, {"workers": 2}])
+def test_a_missing_dask_is_reported_to_those_who_need_it(monkeypatch, asked):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(InputError, match=rf"--{next(iter(asked))}: .*pip install 'ratslam\[sweep\]'"):
+        list(run_tasks(square, [1, 2], **asked))
+
+
+def test_without_dask_the_default_is_one_process(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    assert [pid for _, pid in run_tasks(process_of, [1, 2])] == [os.getpid()] * 2
+    assert capsys.readouterr().err.count("pip install 'ratslam[sweep]'") == 1
+
+
+def test_processes_of_this_machine_share_its_environment_and_leave_no_files(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "kernels")
+    name = "JAX_COMPILATION_CACHE_DIR"
+    assert list(run_tasks(os.getenv, [name] * 2, workers=2)) == ["kernels"] * 2
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nonsense://x"])
