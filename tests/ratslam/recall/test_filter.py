@@ -1,4 +1,4 @@
-"""Laws of recall, against loops written out."""
+"""Laws of the recall filter, compared with explicit loops."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def filled(
     dtype=float,
     capacity=CAPACITY,
 ):
-    """A memory of frames [N, D] at poses [N, 3]; the robot stands at the newest, everything is new."""
+    """A memory of frames [N, D] at poses [N, 3]; the robot is at the newest, all mass is novelty."""
     count = len(poses)
     store = np.zeros((views.shape[1], capacity))
     store[:, :count] = views.T
@@ -69,8 +69,8 @@ def filled(
     return apply_map_feedback(memory, MapFeedback(poses, bias, since, angle, scale))
 
 
-def believing(memory, frames, masses, offsets=None):
-    """The memory with hypotheses at frames."""
+def with_modes(memory, frames, masses, offsets=None):
+    """The memory with modes at these frames."""
     modes = len(memory.mass)
     anchor, mass, offset = np.zeros(modes, np.int32), np.zeros(modes), np.zeros((modes, 3))
     anchor[: len(frames)], mass[: len(frames)] = frames, masses
@@ -83,7 +83,7 @@ def believing(memory, frames, masses, offsets=None):
 
 
 @cache
-def looker(config, cell=CELL):
+def filter_of(config, cell=CELL):
     return jax.jit(
         lambda memory, view: recognise(
             config, cell, memory, observation_model.view_likelihood(config, cell, memory, view)
@@ -92,7 +92,7 @@ def looker(config, cell=CELL):
 
 
 @cache
-def labelled(config):
+def compile_label_filter(config):
     def read(memory, label):
         weighed = observation_model.label_likelihood(config, memory, label)
         return *recognise(config, CELL, memory, weighed), weighed
@@ -100,8 +100,8 @@ def labelled(config):
     return jax.jit(read)
 
 
-def look(config, memory, view, cell=CELL):
-    memory, found = looker(config, cell)(memory, jnp.asarray(view, memory.x.dtype))
+def observe(config, memory, view, cell=CELL):
+    memory, found = filter_of(config, cell)(memory, jnp.asarray(view, memory.x.dtype))
     return jax.tree.map(np.asarray, memory), jax.tree.map(np.asarray, found)
 
 
@@ -111,7 +111,7 @@ def spaced(count, cells=4.0):
 
 
 def random_case(seed, config=FAN, angle=ANGLE, dtype=float):
-    """A memory in the middle of a run, crowded enough for all shares to matter, and a view half known."""
+    """A memory in mid-session, with frames so close that all shares matter, and a half-known view."""
     stream = np.random.default_rng(seed)
     count = int(stream.integers(GUARD + 2, CAPACITY))
     poses = np.cumsum(stream.normal(0, 0.6 * CELL, (count, 3)), axis=0)
@@ -121,12 +121,12 @@ def random_case(seed, config=FAN, angle=ANGLE, dtype=float):
         config, views, poses, dtype=dtype, angle=angle, bias=float(stream.normal(0, 0.2)),
         since=float(stream.uniform(0, 1)), scale=float(stream.uniform(0.05, 0.3)),
     )  # fmt: skip
-    # Not at the newest frame, which is guarded, but where the map may have something to say.
+    # Not at the newest frame, which is guarded, but near older frames of the map.
     pose = poses[stream.integers(0, count - GUARD)] + stream.normal(0, [CELL, CELL, 0.3])
     memory = memory._replace(pose=jnp.asarray(pose, dtype))
     masses = stream.dirichlet(np.full(config.modes + 1, 0.7))[:-1]
     frames = stream.integers(0, count - GUARD, config.modes)
-    memory = believing(memory, frames, masses, stream.normal(0, 0.5 * CELL, (config.modes, 3)) * [1, 1, 4])
+    memory = with_modes(memory, frames, masses, stream.normal(0, 0.5 * CELL, (config.modes, 3)) * [1, 1, 4])
     memory = accumulate_motion(memory, jnp.asarray(stream.normal(0, [CELL, 0.2 * CELL, 0.1]), dtype))
     memory = accumulate_motion(memory, jnp.asarray(stream.normal(0, [CELL, 0.2 * CELL, 0.1]), dtype))
     near = np.roll(views[frames[int(masses.argmax())]], int(stream.choice([-2, -1, 0, 0, 0, 1, 2])))
@@ -147,7 +147,7 @@ def errors_by_loops(config, m, view):
 
 
 def moved_by_loops(m):
-    """The motion since the newest frame, freed of its bias: half the turn is made before it."""
+    """The motion since the newest frame without its bias; half of the turn precedes it."""
     turn = float(m.bias * m.length)
     x, y, _ = compose(np.array([0, 0, turn / 2]), m.motion)
     return np.array([x, y, m.motion[2] + turn])
@@ -157,8 +157,8 @@ def kernel(deviation):
     return (1 - deviation / SUPPORT) ** 4 if deviation < SUPPORT else 0.0
 
 
-def look_by_loops(config, cell, memory, view):
-    """All of `look` for a view, hypothesis by hypothesis and frame by frame."""
+def observe_by_loops(config, cell, memory, view):
+    """The whole of `observe`, mode by mode and frame by frame."""
     m = jax.tree.map(np.asarray, memory)
     heading = np.arctan2(m.sine, m.cosine)
     frame = np.stack([m.x, m.y, heading], axis=1)
@@ -257,10 +257,10 @@ def look_by_loops(config, cell, memory, view):
 
 @pytest.mark.parametrize(("config", "angle"), [(FAN, ANGLE), (FAN, -ANGLE), (FLAT, 0.0)])
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_look_is_what_loops_find(config, angle, seed):
+def test_recall_equals_explicit_loops(config, angle, seed):
     memory, view = random_case(seed, config, angle)
-    expected, modes = look_by_loops(config, CELL, memory, view)
-    after, found = look(config, memory, view)
+    expected, modes = observe_by_loops(config, CELL, memory, view)
+    after, found = observe(config, memory, view)
     got = {name: getattr(found, name).item() for name in expected}
     assert got == pytest.approx(expected, abs=1e-9)
     for k, (anchor, offset, mass) in enumerate(modes):
@@ -271,15 +271,15 @@ def test_a_look_is_what_loops_find(config, angle, seed):
             assert wrap(after.offset[k, 2] - offset[2]) == pytest.approx(0, abs=1e-7)
 
 
-def test_the_seeds_reach_what_they_are_for():
-    # Without shifted matches, revisits that fit and that do not, the loops would prove less.
-    found = [look(FAN, *random_case(seed))[1] for seed in SEEDS]
+def test_the_seeds_cover_shifted_matches_and_both_kinds_of_revisit():
+    # Without shifted matches and both kinds of revisit the comparison with loops would cover less.
+    found = [observe(FAN, *random_case(seed))[1] for seed in SEEDS]
     assert {int(f.shift) != 0 for f in found} == {True, False}
     assert {0, 1} <= {int(f.view_fits) for f in found}
     assert max(float(f.posterior) for f in found) > 0.5 > min(float(f.posterior) for f in found)
 
 
-# Belief is a distribution
+# The posterior is a distribution
 
 
 @settings(max_examples=60)
@@ -297,7 +297,7 @@ def test_mass_is_conserved(seed, kind, scale):
         "ones": np.ones(SIZE),
         "half": np.full(SIZE, 0.5),
     }[kind]
-    after, found = look(FAN, memory._replace(scale=jnp.asarray(scale)), view)
+    after, found = observe(FAN, memory._replace(scale=jnp.asarray(scale)), view)
     assert (after.mass >= 0).all()
     assert 0 <= found.posterior <= 1 + 1e-12
     assert 0 <= found.novelty <= 1
@@ -308,11 +308,11 @@ def test_mass_is_conserved(seed, kind, scale):
 
 
 def test_modes_far_fewer_than_frames_lose_no_mass_that_has_a_frame():
-    # All frames stand within a cell, so one hypothesis holds them all and the rest is novelty.
+    # All frames lie within a cell, so one mode holds them all and the rest is novelty.
     stream = np.random.default_rng(3)
     poses = stream.uniform(-0.3, 0.3, (30, 3)) * [CELL, CELL, 1]
     views = stream.random((30, SIZE))
-    after, found = look(FAN, filled(FAN, views, poses, angle=ANGLE), views[7])
+    after, found = observe(FAN, filled(FAN, views, poses, angle=ANGLE), views[7])
     assert after.mass[0] + found.novelty == pytest.approx(1, abs=1e-12)
     assert not after.mass[1:].any()
 
@@ -324,13 +324,13 @@ def test_single_precision_has_no_nan(stored, scale):
     views = stream.random((40, SIZE)) if stored is None else np.full((40, SIZE), stored)
     poses = spaced(40, 0.5)
     memory = filled(FAN, views, poses, angle=ANGLE, scale=scale, dtype=np.float32)
-    memory = believing(memory, [3, 20], [0.7, 0.3])
+    memory = with_modes(memory, [3, 20], [0.7, 0.3])
     for value in (0.0, 0.5, 1.0, None, 1.0, 0.0):
         seen = stream.random(SIZE) if value is None else np.full(SIZE, value)
         memory = accumulate_motion(memory, jnp.asarray([0.5 * CELL, 0, 0.01], jnp.float32))
-        after, found = look(FAN, memory, seen)
-        told = found._replace(background=np.zeros(0))  # there NaN says none
-        assert not any(np.isnan(leaf).any() for leaf in [*after, *told])
+        after, found = observe(FAN, memory, seen)
+        result = found._replace(background=np.zeros(0))  # there NaN says none
+        assert not any(np.isnan(leaf).any() for leaf in [*after, *result])
         assert {leaf.dtype for leaf in [*after, *found]} == {np.dtype(np.float32), np.dtype(np.int32)}
         assert (after.mass >= 0).all()
         assert after.mass.sum() <= 1 + 1e-6
@@ -339,14 +339,14 @@ def test_single_precision_has_no_nan(stored, scale):
 
 def test_the_least_scale_of_single_precision_has_no_nan():
     memory = filled(FAN, np.full((40, SIZE), 0.5), spaced(40), angle=ANGLE, scale=5e-38, dtype=np.float32)
-    _, found = look(FAN, memory, np.full(SIZE, 0.5))
+    _, found = observe(FAN, memory, np.full(SIZE, 0.5))
     assert not np.isnan(found.posterior)
 
 
-def test_novelty_that_all_enters_leaves_no_nan():
+def test_novelty_that_enters_completely_gives_no_nan():
     config = FLAT.model_copy(update={"enter": 1.0, "local": 0.0})
     memory = filled(config, np.zeros((40, SIZE)), spaced(40), scale=1e-4)
-    assert not np.isnan(look(config, memory, np.ones(SIZE))[1].novelty)
+    assert not np.isnan(observe(config, memory, np.ones(SIZE))[1].novelty)
 
 
 # Units
@@ -356,9 +356,9 @@ def test_novelty_that_all_enters_leaves_no_nan():
 @pytest.mark.parametrize("seed", range(4))
 def test_units_of_the_sensor_do_not_matter(factor, seed):
     memory, view = random_case(seed)
-    after, found = look(FAN, memory, view)
+    after, found = observe(FAN, memory, view)
     scaled = memory._replace(view=memory.view * factor, scale=memory.scale * factor)
-    after_scaled, found_scaled = look(FAN, scaled, view * factor)
+    after_scaled, found_scaled = observe(FAN, scaled, view * factor)
     assert np.array_equal(found_scaled.background, found.background * factor, equal_nan=True)
     for name in set(found._fields) - {"background"}:
         assert np.array_equal(getattr(found, name), getattr(found_scaled, name)), name
@@ -375,21 +375,21 @@ def test_the_size_of_the_world_does_not_matter():
             since=memory.since * 2, bias=memory.bias / 2,
             offset=memory.offset * jnp.asarray([[2.0, 2.0, 1.0]]),
         )  # fmt: skip
-        found, doubled = look(FAN, memory, view)[1], look(FAN, larger, view, 2 * CELL)[1]
+        found, doubled = observe(FAN, memory, view)[1], observe(FAN, larger, view, 2 * CELL)[1]
         for name in found._fields:
             assert np.array_equal(getattr(found, name), getattr(doubled, name), equal_nan=True), name
 
 
-def test_where_the_map_lies_does_not_matter():
+def test_the_frame_of_the_map_does_not_matter():
     elsewhere = np.array([1.7, -0.9, 2.1])
     for seed in range(4):
         memory, view = random_case(seed)
         frames = np.stack([memory.x, memory.y, np.arctan2(memory.sine, memory.cosine)], axis=1)
         poses = compose(elsewhere, frames[: int(memory.count)])
-        told = (float(memory.bias), float(memory.since), float(memory.angle), float(memory.scale))
-        moved = apply_map_feedback(memory, MapFeedback(poses, *told))
+        result = (float(memory.bias), float(memory.since), float(memory.angle), float(memory.scale))
+        moved = apply_map_feedback(memory, MapFeedback(poses, *result))
         moved = moved._replace(pose=jnp.asarray(compose(elsewhere, memory.pose)))
-        found, there = look(FAN, memory, view)[1], look(FAN, moved, view)[1]
+        found, there = observe(FAN, memory, view)[1], observe(FAN, moved, view)[1]
         for name in found._fields:
             same = pytest.approx(getattr(found, name), abs=1e-9, nan_ok=True)
             assert getattr(there, name) == same, name
@@ -420,7 +420,7 @@ def test_a_turned_robot_is_found_with_its_heading(turned, angle):
     memory = filled(FAN, np.stack([seen(p, heading[p]) for p in range(40)]), poses, angle=angle, scale=0.02)
     for place in (0, 11, 34):
         robot = heading[place] + turned * angle
-        after, found = look(FAN, memory, seen(place, robot))
+        after, found = observe(FAN, memory, seen(place, robot))
         assert found.match == place
         assert found.shift == -turned  # what was in sector i + turned is in sector i now
         assert after.anchor[0] == place
@@ -429,8 +429,8 @@ def test_a_turned_robot_is_found_with_its_heading(turned, angle):
         assert after.offset[0, :2] == pytest.approx(0, abs=1e-9)
 
 
-def test_a_turned_hypothesis_moves_the_way_it_faces():
-    # Found turned by two sectors, the robot drives on: the frame where it comes to must be the one ahead.
+def test_a_turned_mode_moves_along_its_own_heading():
+    # A robot turned by two sectors moves on: the frame that it reaches must be the one ahead.
     seen, heading = fan_world(40, ANGLE)
     poses = spaced(40)
     poses[:, 2] = heading
@@ -438,11 +438,11 @@ def test_a_turned_hypothesis_moves_the_way_it_faces():
     poses[12] = compose(np.array([*poses[11, :2], robot]), np.array([3 * CELL, 0, 0]))
     poses[13] = compose(np.array([*poses[11, :2], robot - 4 * ANGLE]), np.array([3 * CELL, 0, 0]))
     views = np.stack([seen(p, poses[p, 2]) for p in range(40)])
-    views[13] = views[12]  # the view alone cannot tell these two
+    views[13] = views[12]  # both views are equal
     memory = filled(FAN, views, poses, angle=ANGLE, scale=0.02)
-    after, _ = look(FAN, memory, seen(11, robot))
+    after, _ = observe(FAN, memory, seen(11, robot))
     memory = accumulate_motion(jax.tree.map(jnp.asarray, after), jnp.asarray([3 * CELL, 0, 0.0]))
-    _, found = look(FAN, memory, views[12])
+    _, found = observe(FAN, memory, views[12])
     assert found.match == 12
     assert found.shift == 0
 
@@ -454,14 +454,14 @@ def test_a_shift_needs_an_angle():
     memory = filled(FAN, np.stack([seen(p, heading[p]) for p in range(40)]), poses, angle=ANGLE, scale=0.2)
     for turned in (-3, -2, -1, 1, 2, 3):
         view = seen(11, heading[11] + turned * ANGLE)
-        assert look(FAN, memory, view)[1].shift == -turned
-        assert look(FAN, memory._replace(angle=jnp.zeros(())), view)[1].shift == 0
+        assert observe(FAN, memory, view)[1].shift == -turned
+        assert observe(FAN, memory._replace(angle=jnp.zeros(())), view)[1].shift == 0
 
 
 def test_views_that_fit_nothing_have_no_shift_without_an_angle():
-    # All likelihoods underflow to zero, so all of belief is a tie.
+    # All likelihoods underflow to zero, so the whole posterior is a tie.
     memory = filled(FAN, np.zeros((40, SIZE)), spaced(40), scale=1e-5)
-    _, found = look(FAN, memory, np.ones(SIZE))
+    _, found = observe(FAN, memory, np.ones(SIZE))
     assert found.posterior == 0
     assert found.shift == 0
 
@@ -470,25 +470,25 @@ def test_views_may_have_fewer_values_than_shifts():
     stream = np.random.default_rng(0)
     views = stream.random((40, FAN.shifts))
     memory = filled(FAN, views, spaced(40))
-    assert look(FAN, memory, views[7])[1].match == 7
+    assert observe(FAN, memory, views[7])[1].match == 7
 
 
-def test_a_fan_not_found_out_is_no_fan():
+def test_sectors_of_unknown_order_are_not_shifted():
     for seed in range(4):
         memory, view = random_case(seed, FAN, 0.0)
-        auto, none = look(FAN, memory, view)[1], look(FLAT, memory, view)[1]
+        auto, none = observe(FAN, memory, view)[1], observe(FLAT, memory, view)[1]
         for name in ("match", "shift", "posterior", "log_ratio", "novelty"):
             assert getattr(auto, name) == pytest.approx(getattr(none, name), abs=1e-9), name
 
 
-# What may be recalled
+# Recallable frames
 
 
 def test_without_a_scale_nothing_is_recalled_but_all_is_remembered():
     stream = np.random.default_rng(0)
     views = stream.random((40, SIZE))
     memory = filled(FAN, views, spaced(40), angle=ANGLE, scale=0.0)
-    after, found = look(FAN, memory, views[7])
+    after, found = observe(FAN, memory, views[7])
     assert (found.match, found.log_ratio, found.posterior, found.novelty, found.view_fits) == (
         -1,
         0,
@@ -497,7 +497,7 @@ def test_without_a_scale_nothing_is_recalled_but_all_is_remembered():
         -1,
     )
     assert found.keyframe == 40
-    assert look(FAN, memory._replace(scale=jnp.asarray(0.1)), views[7])[1].match == 7
+    assert observe(FAN, memory._replace(scale=jnp.asarray(0.1)), views[7])[1].match == 7
 
     memory = accumulate_motion(jax.tree.map(jnp.asarray, after), jnp.asarray([CELL, 0.0, 0.5]))
     memory = store_keyframe(memory, jnp.asarray(views[7]), jnp.int32(5), jnp.asarray([1.0, 2.0, 3.0]))
@@ -518,7 +518,7 @@ def test_the_newest_frames_are_never_recalled():
         views = stream.random((count, SIZE))
         memory = filled(FAN, views, spaced(count), angle=ANGLE)
         for frame in range(count):
-            after, found = look(FAN, memory, views[frame])
+            after, found = observe(FAN, memory, views[frame])
             if frame < count - GUARD:
                 assert found.match == frame
                 continue
@@ -533,7 +533,7 @@ def test_the_newest_frames_are_never_recalled():
 # Evidence
 
 
-def test_the_more_frames_share_a_view_the_less_it_says():
+def test_a_view_of_more_frames_carries_less_evidence():
     stream = np.random.default_rng(0)
     old = 50
     views, common = stream.random((old + GUARD, SIZE)), stream.random(SIZE)
@@ -541,29 +541,29 @@ def test_the_more_frames_share_a_view_the_less_it_says():
     for share in (1, 5, 25, old):
         views[:share] = common
         memory = filled(FLAT, views, spaced(old + GUARD), scale=0.05)
-        gains.append(float(look(FLAT, memory, common)[1].log_ratio))
+        gains.append(float(observe(FLAT, memory, common)[1].log_ratio))
     assert gains == sorted(gains, reverse=True)
     assert gains[0] > 3.5
-    assert gains[-1] <= 0  # a view that all frames share says nothing for any of them
+    assert gains[-1] <= 0  # a view that all frames share is evidence for none of them
 
 
-def test_a_view_that_all_frames_share_speaks_against_them_the_more_it_differs():
+def test_a_view_shared_by_all_frames_counts_against_them_as_it_differs():
     views = np.zeros((40, SIZE))
     memory = filled(FLAT, views, spaced(40), scale=0.1)
     gains = [
-        float(look(FLAT, memory, np.full(SIZE, e * 0.1))[1].log_ratio) for e in (1.0, FLAT.floor, 2.0, 4.0)
+        float(observe(FLAT, memory, np.full(SIZE, e * 0.1))[1].log_ratio) for e in (1.0, FLAT.floor, 2.0, 4.0)
     ]
     assert 0 > gains[0] > gains[1] > gains[2] > gains[3]
 
 
-def test_a_contradicting_view_takes_mass_away():
+def test_a_contradicting_view_removes_mass():
     stream = np.random.default_rng(0)
     views = stream.random((40, SIZE))
     before = 0.6
-    memory = believing(filled(FAN, views, spaced(40), angle=ANGLE), [9], [before])
+    memory = with_modes(filled(FAN, views, spaced(40), angle=ANGLE), [9], [before])
 
     def at_nine(view):
-        after, _ = look(FAN, memory, view)
+        after, _ = observe(FAN, memory, view)
         return float(after.mass[after.anchor == 9].sum())
 
     assert at_nine(views[9]) > 0.95
@@ -572,45 +572,45 @@ def test_a_contradicting_view_takes_mass_away():
 
 
 def test_odometry_alone_is_never_evidence():
-    # A straight way driven twice: odometry follows the first drive perfectly, yet nothing is seen.
+    # A straight path driven twice: odometry repeats the first drive exactly, without any views.
     memory = filled(FLAT, np.zeros((40, SIZE)), spaced(40, 0.5), scale=0.1)
     blank = ObservationLikelihood(
         likelihood=jnp.ones((1, CAPACITY)), novelty=jnp.ones(()), background=jnp.full(SAMPLES, jnp.nan),
         certain=jnp.bool_(True), informative=jnp.bool_(False),
     )  # fmt: skip
     blind = jax.jit(partial(recognise, FLAT, CELL))
-    # A view that all frames share: by views, too, nothing is told.
+    # A view that all frames share is no evidence either.
     same = np.full(SIZE, FLAT.floor * 0.1)
     for sure in (0.0, 0.3, 1.0):
         for seeing in (False, True):
-            start = believing(memory, [0], [sure])
+            start = with_modes(memory, [0], [sure])
             start = start._replace(pose=jnp.asarray([0.0, 0.0, 0.0]))
             belief, limit = start, sure
             for _ in range(20):
                 limit = limit * (1 - FLAT.mode_decay) + (1 - limit) * FLAT.enter
                 belief = accumulate_motion(belief, jnp.asarray([0.5 * CELL, 0.0, 0.0]))
-                belief, _ = looker(FLAT)(belief, jnp.asarray(same)) if seeing else blind(belief, blank)
+                belief, _ = filter_of(FLAT)(belief, jnp.asarray(same)) if seeing else blind(belief, blank)
                 belief = belief._replace(pose=current_pose(belief), motion=jnp.zeros(3), length=jnp.zeros(()))
                 assert float(belief.mass.sum()) <= limit + 1e-9
-            # Neither is it evidence against: what was believed is still there.
+            # Nor is it evidence against: the mass is still there.
             assert seeing or float(belief.mass.sum()) > 0.5 * limit
 
 
-def test_a_hypothesis_that_comes_to_no_frame_is_lost():
-    memory = believing(filled(FLAT, np.zeros((40, SIZE)), spaced(40, 1.0), scale=0.1), [9], [1.0])
+def test_a_mode_that_reaches_no_frame_becomes_novelty():
+    memory = with_modes(filled(FLAT, np.zeros((40, SIZE)), spaced(40, 1.0), scale=0.1), [9], [1.0])
     view = np.full(SIZE, FLAT.floor * 0.1)
     on_way = accumulate_motion(memory, jnp.asarray([CELL, 0.0, 0.0]))
     aside = accumulate_motion(memory, jnp.asarray([0.0, 4 * CELL, 0.0]))
-    assert look(FLAT, on_way, view)[1].novelty < 0.05
-    assert look(FLAT, aside, view)[1].novelty == pytest.approx(1, abs=1e-9)
+    assert observe(FLAT, on_way, view)[1].novelty < 0.05
+    assert observe(FLAT, aside, view)[1].novelty == pytest.approx(1, abs=1e-9)
 
 
-def test_a_hypothesis_faces_as_one_of_its_frames_does():
-    # A way driven out and back: two frames at one place face apart, and see alike.
+def test_a_mode_has_the_heading_of_its_frames():
+    # A path driven out and back: two frames at one place have opposite headings and equal views.
     stream = np.random.default_rng(0)
     views, poses = stream.random((40, SIZE)), spaced(40)
     views[10], poses[10] = views[9], poses[9] + [0, 0, np.pi]
-    after, _ = look(FLAT, filled(FLAT, views, poses), views[9])
+    after, _ = observe(FLAT, filled(FLAT, views, poses), views[9])
     assert after.anchor[0] in (9, 10)
     assert abs(math.cos(after.offset[0, 2])) == pytest.approx(1, abs=0.1)
 
@@ -619,12 +619,12 @@ def test_a_hypothesis_faces_as_one_of_its_frames_does():
 
 
 def label_likelihood(memory, label):
-    return jax.tree.map(np.asarray, labelled(FLAT)(memory, jnp.int32(label)))
+    return jax.tree.map(np.asarray, compile_label_filter(FLAT)(memory, jnp.int32(label)))
 
 
-def test_ids_speak_for_and_against():
+def test_ids_are_evidence_for_and_against_frames():
     ids = np.arange(40) // 4
-    memory = believing(filled(FLAT, np.zeros((40, 0)), spaced(40), labels=ids), [9], [0.6])
+    memory = with_modes(filled(FLAT, np.zeros((40, 0)), spaced(40), labels=ids), [9], [0.6])
     known = len(set(ids.tolist()))
     same, other, new = (label_likelihood(memory, label) for label in (ids[9], ids[30], 77))
 
@@ -645,8 +645,8 @@ def test_ids_speak_for_and_against():
     assert same[1].log_ratio > 0 > new[1].log_ratio
 
 
-def test_only_a_known_id_tells_whether_the_map_is_right():
-    # The robot stands where frame 20 is, so the map says what is to be expected.
+def test_only_a_known_id_is_evidence_about_the_maps_pose():
+    # The robot is at frame 20, so the map predicts its id.
     ids = np.arange(40)
     memory = filled(FLAT, np.zeros((40, 0)), spaced(40), labels=ids)
     memory = memory._replace(pose=jnp.asarray(spaced(40)[20]))
@@ -673,18 +673,18 @@ def test_the_newest_frames_are_not_recalled_by_id():
         assert (after.anchor[after.mass > 0] < 40 - GUARD).all()
 
 
-# What calibrates
+# Calibration
 
 
 @pytest.mark.parametrize("since", [0.0, 4.0, 12.0, 1000.0])
 @pytest.mark.parametrize("count", [GUARD, GUARD + 1, 20, 30, CAPACITY])
-def test_background_is_told_of_ruled_out_frames_each_once(count, since):
+def test_background_has_each_ruled_out_frame_once(count, since):
     stream = np.random.default_rng(count)
     views, poses = stream.random((count, SIZE)), spaced(count, 1.0)
     stream.shuffle(poses)
     memory = filled(FAN, views, poses, angle=ANGLE, since=since)
     view = stream.random(SIZE)
-    _, found = look(FAN, memory, view)
+    _, found = observe(FAN, memory, view)
     errors = errors_by_loops(FAN, jax.tree.map(np.asarray, memory), view)
     away = max(3 * CELL, 3 * (0.5 * CELL + 0.05 * since))
     ruled_out = [
@@ -692,12 +692,12 @@ def test_background_is_told_of_ruled_out_frames_each_once(count, since):
         for c in range(count - GUARD)
         if np.hypot(*(poses[c] - poses[-1])[:2]) > away
     ]
-    told = found.background[np.isfinite(found.background)]
+    result = found.background[np.isfinite(found.background)]
     assert found.background.shape == (SAMPLES,)
-    assert np.isnan(found.background).sum() == SAMPLES - len(told)
-    assert len(told) == min(len(ruled_out), SAMPLES)
-    at = [int(np.argmin(np.abs(np.array(ruled_out) - error))) for error in told]
-    assert told == pytest.approx(np.array(ruled_out)[at] if at else told, abs=1e-12)
+    assert np.isnan(found.background).sum() == SAMPLES - len(result)
+    assert len(result) == min(len(ruled_out), SAMPLES)
+    at = [int(np.argmin(np.abs(np.array(ruled_out) - error))) for error in result]
+    assert result == pytest.approx(np.array(ruled_out)[at] if at else result, abs=1e-12)
     assert at == sorted(set(at))
 
 
@@ -720,7 +720,7 @@ def test_standing_still_makes_no_frames():
     assert int(session.state.memory.count) == 2
 
 
-def test_a_run_compiles_once_per_capacity():
+def test_a_session_compiles_once_per_capacity():
     session = make_session()
     views = np.random.default_rng(0).random((30, 1, SIZE, 1))
     circle = Odometry(0.05, 0, 2 * np.pi / 30, 0.1)

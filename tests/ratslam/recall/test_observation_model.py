@@ -1,4 +1,4 @@
-"""Laws of recall by whiskers, against loops written out."""
+"""Laws of recall by whisker images, compared with explicit loops."""
 
 from __future__ import annotations
 
@@ -48,19 +48,19 @@ SEEDS = range(8)
 seeds = st.integers(0, 10_000)
 
 
-def felt(stream, count, touching=0.4, dead=0.0):
+def images_of(stream, count, touching=0.4, dead=0.0):
     """[count, D] levels."""
     level = stream.integers(1, DEAD, (count, SIZE)) * (stream.random((count, SIZE)) < touching)
     return np.where(stream.random((count, SIZE)) < dead, DEAD, level)
 
 
-def known(images):
-    """The likeness that such images teach."""
+def learn(images):
+    """The log-odds table learned from these images."""
     return log_odds_table(estimate_background(images, PIXELS.group), PRIOR)
 
 
 def filled(config, images, poses, likeness, *, scale=NEW_IMAGE_LOG_ODDS, dtype=float):
-    """A memory of frames [N, D] at poses [N, 3]; the robot stands at the newest, everything is new."""
+    """A memory of frames [N, D] at poses [N, 3]; the robot is at the newest, all mass is novelty."""
     count = len(poses)
     memory = init_memory(config, SIZE, CAPACITY, np.dtype(dtype), len(likeness))
     store = np.zeros((SIZE, CAPACITY), np.int32)
@@ -75,13 +75,13 @@ def spaced(count, cells=4.0):
 
 
 def random_case(seed, config=BOTH):
-    """A memory in the middle of a way that doubles back, everything in it filled, and an image half known."""
+    """A memory in the middle of a path that doubles back, with all arrays filled, and a half-known image."""
     stream = np.random.default_rng(seed)
     count = int(stream.integers(GUARD + 2, CAPACITY + 1))
     poses = np.cumsum(stream.normal(0, 0.5 * CELL, (count, 3)), axis=0)
     poses[:, 2] = stream.normal(0, 0.3, count) + np.pi * stream.integers(0, 2, count)
-    images = felt(stream, count, dead=0.05)
-    memory = filled(config, images, poses, known(images))
+    images = images_of(stream, count, dead=0.05)
+    memory = filled(config, images, poses, learn(images))
     old = max(count - GUARD, 0)
     rows = len(sector_shifts(config))
     before, rest = np.zeros((2, rows, CAPACITY))
@@ -97,21 +97,21 @@ def random_case(seed, config=BOTH):
     )  # fmt: skip
     memory = accumulate_motion(memory, jnp.asarray(stream.normal(0, [CELL, 0.2 * CELL, 0.1])))
     near = images[stream.integers(0, max(old, 1))]
-    return memory, np.where(stream.random(SIZE) < 0.7, near, felt(stream, 1)[0])
+    return memory, np.where(stream.random(SIZE) < 0.7, near, images_of(stream, 1)[0])
 
 
 @cache
-def weigher(config):
+def compile_likelihood(config):
     return jax.jit(lambda memory, level: touch_likelihood(config, memory, level, PIXELS))
 
 
 @cache
-def looker(config):
-    def look(memory, level):
+def filter_of(config):
+    def observe(memory, level):
         memory, weighing = touch_likelihood(config, memory, level, PIXELS)
         return recognise(config, CELL, memory, weighing)
 
-    return jax.jit(look)
+    return jax.jit(observe)
 
 
 def host(tree):
@@ -119,18 +119,18 @@ def host(tree):
 
 
 def weigh(config, memory, level):
-    return host(weigher(config)(memory, jnp.asarray(level, jnp.int32)))
+    return host(compile_likelihood(config)(memory, jnp.asarray(level, jnp.int32)))
 
 
-def look(config, memory, level):
-    return host(looker(config)(memory, jnp.asarray(level, jnp.int32)))
+def observe(config, memory, level):
+    return host(filter_of(config)(memory, jnp.asarray(level, jnp.int32)))
 
 
 # The loops
 
 
-def weighed_by_loops(config, memory, level):
-    """Likelihoods [S, C] and that of novelty, pixel by pixel."""
+def likelihood_by_loops(config, memory, level):
+    """Likelihoods [S, C] and the likelihood of novelty, pixel by pixel."""
     m = host(memory)
     old = range(int(m.count) - config.guard)
     turned = len(m.before) > 1
@@ -156,8 +156,8 @@ def weighed_by_loops(config, memory, level):
     return likelihood, config.familiar * familiar / weight + (1 - config.familiar) * unlike
 
 
-def followed_by_loops(config, m):
-    """What is believed beside the hypotheses, frame by frame: where it goes, and what becomes novel."""
+def transition_by_loops(config, m):
+    """The prior mass from outside the modes, frame by frame, and the mass that becomes novelty."""
     heading = np.arctan2(m.sine, m.cosine)
     belief, novel = np.zeros(m.rest.shape), 0.0
     old = range(int(m.count) - config.guard)
@@ -183,9 +183,9 @@ def followed_by_loops(config, m):
 
 @pytest.mark.parametrize("config", [BOTH, AHEAD], ids=["both ways", "ahead only"])
 @pytest.mark.parametrize("seed", SEEDS)
-def test_an_image_weighs_what_loops_find(config, seed):
+def test_likelihoods_equal_explicit_loops(config, seed):
     memory, level = random_case(seed, config)
-    likelihood, novelty = weighed_by_loops(config, memory, level)
+    likelihood, novelty = likelihood_by_loops(config, memory, level)
     after, found = weigh(config, memory, level)
     assert np.allclose(found.likelihood, likelihood, rtol=1e-9)
     assert float(found.novelty) == pytest.approx(novelty, rel=1e-9)
@@ -198,29 +198,29 @@ def test_an_image_weighs_what_loops_find(config, seed):
 
 @pytest.mark.parametrize("config", [BOTH, AHEAD], ids=["both ways", "ahead only"])
 @pytest.mark.parametrize("seed", SEEDS)
-def test_what_is_left_of_belief_follows_the_frames(config, seed):
+def test_mass_outside_the_modes_follows_the_frames(config, seed):
     memory, _ = random_case(seed, config)
     m = host(memory)
     shifts = sector_shifts(config)
     cells = np.ones((len(shifts), 1)) * (np.arange(CAPACITY) < int(m.count) - GUARD)
     angles = jnp.asarray(-shifts * np.pi)
     belief, novel = follow_keyframes(config, CELL, memory, angles, jnp.asarray(cells), memory.motion)
-    expected, lost = followed_by_loops(config, m)
+    expected, lost = transition_by_loops(config, m)
     assert np.allclose(belief, expected, atol=1e-12)
     assert float(novel) == pytest.approx(lost, abs=1e-12)
     assert float(belief.sum() + novel) == pytest.approx(float(m.rest.sum()), abs=1e-12)
 
 
-def test_the_seeds_reach_what_they_are_for():
+def test_the_seeds_cover_turned_matches_and_mass_outside_the_modes():
     shares = []
     for seed in SEEDS:
         memory, _ = random_case(seed)
-        belief, novel = followed_by_loops(BOTH, host(memory))
+        belief, novel = transition_by_loops(BOTH, host(memory))
         shares.append([*belief.sum(axis=1), novel])
     assert (np.array(shares).max(axis=0) > 0.05).all()
 
 
-# Belief is a distribution
+# The posterior is a distribution
 
 
 @settings(max_examples=30)
@@ -229,12 +229,12 @@ def test_mass_is_conserved(seed, config, kind):
     memory, level = random_case(seed, config)
     level = {
         "known": level,
-        "other": felt(np.random.default_rng(seed + 1), 1)[0],
+        "other": images_of(np.random.default_rng(seed + 1), 1)[0],
         "silent": np.zeros(SIZE, int),
         "dead": np.full(SIZE, DEAD),
         "full": np.full(SIZE, HEIGHTS),
     }[kind]
-    after, found = look(config, memory, level)
+    after, found = observe(config, memory, level)
     assert (after.mass >= 0).all()
     assert (after.rest >= 0).all()
     assert after.mass.sum() + after.rest.sum() + found.novelty == pytest.approx(1, abs=1e-12)
@@ -243,21 +243,21 @@ def test_mass_is_conserved(seed, config, kind):
 
 
 @pytest.mark.parametrize(("config", "dtype"), [(BOTH, float), (AHEAD, float), (BOTH, np.float32)])
-def test_mass_is_conserved_along_a_way(config, dtype):
+def test_mass_is_conserved_along_a_path(config, dtype):
     """A lap driven three times, every image remembered, from the first one on."""
     stream = np.random.default_rng(0)
-    lap = felt(stream, 20)
+    lap = images_of(stream, 20)
     turn, tolerance = 2 * np.pi / 20, 1e-9 if dtype is float else 1e-4
-    likeness = known(felt(stream, 200))
+    likeness = learn(images_of(stream, 200))
     memory = init_memory(config, SIZE, CAPACITY, np.dtype(dtype), len(likeness))
     memory = apply_map_feedback(
         memory, MapFeedback(np.zeros((1, 3)), 0.0, 0.0, np.pi, NEW_IMAGE_LOG_ODDS, likeness)
     )
     again = []
     for k in range(60):
-        level = np.where(stream.random(SIZE) < 0.9, lap[k % 20], felt(stream, 1)[0])
+        level = np.where(stream.random(SIZE) < 0.9, lap[k % 20], images_of(stream, 1)[0])
         memory = accumulate_motion(memory, jnp.asarray([0.6 * CELL, 0.0, turn], memory.x.dtype))
-        after, found = look(config, memory, level)
+        after, found = observe(config, memory, level)
         assert not any(np.isnan(leaf).any() for leaf in [*after, *found[:-1]])
         assert {leaf.dtype for leaf in [*after, *found]} == {np.dtype(dtype), np.dtype(np.int32)}
         total = after.mass.sum() + after.rest.sum() + found.novelty
@@ -268,26 +268,26 @@ def test_mass_is_conserved_along_a_way(config, dtype):
             jnp.zeros(3, memory.x.dtype),
         )  # fmt: skip
     assert not any(again[:20])
-    assert np.mean(again[20:]) > 0.9  # from the second lap on it knows where it is
+    assert np.mean(again[20:]) > 0.9  # recognised from the second lap on
 
 
-def test_what_is_beside_the_hypotheses_is_not_in_them():
+def test_mass_outside_the_modes_is_not_in_them():
     for seed in SEEDS:
         memory, level = random_case(seed)
         config = BOTH.model_copy(update={"modes": 1})
         memory = memory._replace(anchor=memory.anchor[:1], mass=memory.mass[:1], offset=memory.offset[:1])
-        after, _ = look(config, memory, level)
+        after, _ = observe(config, memory, level)
         if not after.mass[0]:
             continue
         assert not after.rest[:, after.anchor[0]].any()
         assert (after.rest[:, int(memory.count) - GUARD :] == 0).all()
 
 
-# What says nothing
+# Images without evidence
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_dead_whisker_changes_nothing_whatever_its_pixel_says(seed):
+def test_the_pixel_of_a_dead_whisker_has_no_effect(seed):
     memory, _ = random_case(seed)
     stream = np.random.default_rng(seed)
     view, alive = stream.random(SIZE), stream.random(SIZE) < 0.7
@@ -295,7 +295,7 @@ def test_a_dead_whisker_changes_nothing_whatever_its_pixel_says(seed):
     first, second = (weigh(BOTH, memory, pixel_levels(seen, alive).astype(int)) for seen in (view, other))
     for one, two in zip(first[1], second[1], strict=True):
         assert np.array_equal(one, two, equal_nan=True)
-    # And it is as if the head had no such whisker.
+    # The result is that of a head without this whisker.
     without = memory._replace(likeness=jnp.asarray(np.zeros(memory.likeness.shape)))
     odds = np.log(first[1].likelihood[:, : int(memory.count) - GUARD])
     for d in np.flatnonzero(alive).tolist():
@@ -308,16 +308,16 @@ def test_a_dead_whisker_changes_nothing_whatever_its_pixel_says(seed):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_whisker_that_was_dead_says_nothing_now(seed):
+def test_a_whisker_dead_in_memory_carries_no_evidence(seed):
     memory, level = random_case(seed)
     stream = np.random.default_rng(seed)
     gone = stream.choice(SIZE, 4, replace=False)
-    gone = np.union1d(gone, PIXELS.opposite[gone])  # turned about, the opposite ones feel what they felt
+    gone = np.union1d(gone, PIXELS.opposite[gone])  # after half a turn these measure the same
     view = np.asarray(memory.view).copy()
     view[gone] = DEAD
     then = memory._replace(view=jnp.asarray(view))
     other = level.copy()
-    other[gone] = felt(stream, 1)[0][gone]
+    other[gone] = images_of(stream, 1)[0][gone]
     first, second = weigh(BOTH, then, level)[1], weigh(BOTH, then, other)[1]
     assert np.array_equal(first.likelihood, second.likelihood)
     silenced = level.copy()
@@ -325,7 +325,7 @@ def test_a_whisker_that_was_dead_says_nothing_now(seed):
     assert np.allclose(weigh(BOTH, memory, silenced)[1].likelihood, first.likelihood, rtol=1e-12)
 
 
-def test_a_dead_head_knows_no_place():
+def test_a_head_of_dead_whiskers_recognises_no_place():
     memory, _ = random_case(1)
     found = weigh(BOTH, memory, np.full(SIZE, DEAD))[1]
     assert (found.likelihood[:, : int(memory.count) - GUARD] == 1).all()
@@ -333,9 +333,9 @@ def test_a_dead_head_knows_no_place():
 
 
 @pytest.mark.parametrize("config", [BOTH, AHEAD])
-def test_nothing_is_certain_before_anything_is_known(config):
-    images = felt(np.random.default_rng(0), 40)
-    learnt = known(images)
+def test_nothing_is_recognised_without_frames_or_log_odds(config):
+    images = images_of(np.random.default_rng(0), 40)
+    learnt = learn(images)
     empty = filled(config, images[:GUARD], spaced(GUARD), learnt)
     untaught = filled(config, images, spaced(40), np.zeros(learnt.shape), scale=0.0)
     for memory in (empty, untaught):
@@ -345,13 +345,13 @@ def test_nothing_is_certain_before_anything_is_known(config):
         assert (found.likelihood == 1).all()
         assert found.novelty == 1
         assert not after.before.any()
-        after, told = look(config, memory, images[7])
-        assert (told.match, told.log_ratio, told.posterior, told.novelty, told.view_fits) == (-1, 0, 0, 1, -1)
+        after, one = observe(config, memory, images[7])
+        assert (one.match, one.log_ratio, one.posterior, one.novelty, one.view_fits) == (-1, 0, 0, 1, -1)
     taught = filled(config, images, spaced(40), learnt)
-    assert look(config, taught, images[7])[1].match == 7
+    assert observe(config, taught, images[7])[1].match == 7
 
 
-def test_room_is_made_for_what_whiskers_need():
+def test_only_whiskers_have_arrays_for_their_history():
     for config, rows in ((BOTH, 2), (AHEAD, 1)):
         memory = init_memory(config, SIZE, CAPACITY, np.dtype(float), 3)
         assert memory.before.shape == memory.rest.shape == (rows, CAPACITY)
@@ -362,30 +362,30 @@ def test_room_is_made_for_what_whiskers_need():
         assert memory.before.size == memory.rest.size == memory.likeness.size == 0
 
 
-# What is found
+# Recognition
 
 
 @pytest.mark.parametrize("turned", [False, True])
-def test_a_head_turned_about_is_found_with_its_heading(turned):
-    images = felt(np.random.default_rng(0), 40)
-    memory = filled(BOTH, images, spaced(40), known(images))
+def test_a_head_turned_by_half_a_turn_is_recognised_with_its_heading(turned):
+    images = images_of(np.random.default_rng(0), 40)
+    memory = filled(BOTH, images, spaced(40), learn(images))
     for place in (0, 11, 34):
         now = images[place][PIXELS.opposite] if turned else images[place]
-        after, found = look(BOTH, memory, now)
+        after, found = observe(BOTH, memory, now)
         assert found.match == place
         assert found.shift == turned
         assert after.anchor[0] == place
         assert math.cos(after.offset[0, 2]) == pytest.approx(-1 if turned else 1, abs=1e-6)
-        alone = look(AHEAD, filled(AHEAD, images, spaced(40), known(images)), now)[1]
+        alone = observe(AHEAD, filled(AHEAD, images, spaced(40), learn(images)), now)[1]
         assert alone.shift == 0
         assert (alone.match == place and alone.log_ratio > 0) != turned
 
 
 @pytest.mark.parametrize("turned", [False, True])
-def test_belief_goes_on_the_way_the_head_faces(turned):
-    """What stands beside the hypotheses comes to the next frame, or, turned about, to the one before."""
-    images = felt(np.random.default_rng(0), 40)
-    memory = filled(BOTH, images, spaced(40, 1.0), known(images))
+def test_mass_follows_the_frames_in_the_direction_of_the_head(turned):
+    """Mass outside the modes moves to the next frame or, after half a turn, to the one before."""
+    images = images_of(np.random.default_rng(0), 40)
+    memory = filled(BOTH, images, spaced(40, 1.0), learn(images))
     rest = np.zeros((2, CAPACITY))
     rest[int(turned), 20] = 0.5
     memory = memory._replace(rest=jnp.asarray(rest))
@@ -397,7 +397,7 @@ def test_belief_goes_on_the_way_the_head_faces(turned):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_where_a_frame_stands_in_memory_does_not_matter_to_its_likelihood(seed):
+def test_the_row_of_a_frame_does_not_affect_its_likelihood(seed):
     memory, level = random_case(seed)
     old = int(memory.count) - GUARD
     order = np.arange(CAPACITY)
@@ -407,21 +407,21 @@ def test_where_a_frame_stands_in_memory_does_not_matter_to_its_likelihood(seed):
     assert np.allclose(first.likelihood[:, order], second.likelihood, rtol=1e-12)
 
 
-def test_a_corridor_that_looks_alike_all_along_says_nothing():
+def test_a_uniform_corridor_carries_no_evidence():
     stream = np.random.default_rng(0)
-    wall, others = felt(stream, 1)[0], felt(stream, 200)
-    memory = filled(AHEAD, np.tile(wall, (50, 1)), spaced(50, 0.6), known(others))
-    first, gain = look(AHEAD, memory, wall)
-    assert gain.log_ratio > 0  # at first sight it is something known
+    wall, others = images_of(stream, 1)[0], images_of(stream, 200)
+    memory = filled(AHEAD, np.tile(wall, (50, 1)), spaced(50, 0.6), learn(others))
+    first, gain = observe(AHEAD, memory, wall)
+    assert gain.log_ratio > 0  # the first frames are recognised
     _, then = weigh(AHEAD, jax.tree.map(jnp.asarray, first), wall)
     assert np.log(then.likelihood.max() / then.novelty) < -math.log(AHEAD.familiar)
 
 
-def test_an_image_that_many_places_lead_to_says_less():
-    """Of two equally good matches of the image before, one is followed by what is felt now, or both are."""
+def test_an_image_after_several_similar_frames_carries_less_evidence():
+    """Of two equal matches of the previous image, one or both are followed by the present image."""
     stream = np.random.default_rng(0)
-    images = felt(stream, 50)
-    likeness = known(felt(stream, 200))
+    images = images_of(stream, 50)
+    likeness = learn(images_of(stream, 200))
     gains = []
     for copies in (1, 4, 16):
         places = np.arange(2, 2 + 2 * copies, 2)
@@ -450,6 +450,6 @@ def test_the_heights_of_the_sensor_enter_by_the_table_alone():
     renamed = memory._replace(
         view=jnp.asarray(order[np.asarray(memory.view)], jnp.int32), likeness=jnp.asarray(likeness)
     )
-    first, second = look(BOTH, memory, level), look(BOTH, renamed, order[level])
+    first, second = observe(BOTH, memory, level), observe(BOTH, renamed, order[level])
     for name in ("match", "shift", "posterior", "log_ratio", "novelty"):
         assert getattr(first[1], name) == getattr(second[1], name), name

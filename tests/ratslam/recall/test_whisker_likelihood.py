@@ -1,4 +1,4 @@
-"""Laws of how alike whisker images are: what is counted, what the table says, and what says nothing."""
+"""Laws of the likelihood of whisker images: levels, background, variation and the table of log-odds."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def images(seed, count=60, size=SIZE, touching=0.4, dead=0.1):
 
 
 def common(seed, groups=3):
-    """A background as it may be: rare and common heights."""
+    """A possible background with rare and common heights."""
     stream = np.random.default_rng(seed)
     return Background(
         stream.uniform(0.02, 0.98, groups), stream.dirichlet(np.full(HEIGHTS, 0.5), groups) + 1e-9
@@ -46,7 +46,7 @@ def common(seed, groups=3):
 
 
 def of_background(known, group):
-    """[DEAD] how likely each level is anywhere."""
+    """[DEAD] probability of each level over all places."""
     touching = known.touching[group]
     heights = known.heights[group] / known.heights[group].sum()
     return np.concatenate([[1 - touching], touching * heights])
@@ -70,7 +70,7 @@ def visited_again(then, visits, stream):
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_turning_about_twice_is_not_turning(shape):
+def test_two_half_turns_are_the_identity(shape):
     known = pixel_layout(shape)
     behind = known.opposite
     assert np.array_equal(behind[behind], np.arange(known.group.size))
@@ -90,7 +90,7 @@ def test_pixels_of_a_ring_and_channel_are_one_group(shape):
 
 
 @pytest.mark.parametrize("columns", [2, 4, 6, 8])
-def test_behind_is_the_whisker_opposite(columns):
+def test_the_opposite_pixel_is_that_of_the_opposite_whisker(columns):
     head = ur10_head(HeadConfig(whiskers=columns, first_deg=17.0))
     behind = pixel_layout((*head.shape, 1)).opposite
     assert np.allclose(head.rest[behind, :2], -head.rest[:, :2], atol=1e-12)
@@ -112,7 +112,7 @@ def test_every_value_has_a_level(values, seed):
     assert (level[alive & (view >= 1)] == HEIGHTS).all()
 
 
-def test_a_value_below_nothing_is_silent():
+def test_a_negative_value_is_silent():
     assert (pixel_levels(np.array([-1e-9, -0.5, -3.0]), np.ones(3)) == 0).all()
 
 
@@ -126,11 +126,11 @@ def test_levels_rise_with_the_value(low, high):
 def test_levels_are_the_same_on_the_host_and_in_the_kernel(seed):
     stream = np.random.default_rng(seed)
     view, alive = stream.random(SIZE) * (stream.random(SIZE) < 0.5), stream.random(SIZE) < 0.8
-    told = pixel_levels(jnp.asarray(view), jnp.asarray(alive, float))
-    assert np.array_equal(pixel_levels(view, alive), np.asarray(told))
+    levels = pixel_levels(jnp.asarray(view), jnp.asarray(alive, float))
+    assert np.array_equal(pixel_levels(view, alive), np.asarray(levels))
     single = pixel_levels(jnp.asarray(view, jnp.float32), jnp.asarray(alive, jnp.float32))
     assert single.dtype == jnp.float32
-    assert np.abs(np.asarray(single) - np.asarray(told)).max() <= 1  # rounding, at a border between levels
+    assert np.abs(np.asarray(single) - np.asarray(levels)).max() <= 1  # rounding, at a border between levels
 
 
 # Background
@@ -193,50 +193,50 @@ KINDS = [
 
 
 @pytest.mark.parametrize("true", KINDS)
-def test_many_pairs_tell_how_visits_differ(true):
+def test_many_pairs_determine_the_variation(true):
     stream = np.random.default_rng(1)
     then = images(2, 6000, touching=0.5, dead=0)
     found = estimate_variation(visited_again(then, true, stream), then)
     assert found.appears == pytest.approx(true.appears, abs=0.01)
     assert found.vanishes == pytest.approx(true.vanishes, abs=0.01)
-    # Heights end at the lowest and the highest, so that wide variations look narrower, and some astray.
+    # Heights are limited, so that wide variations appear narrower, with some outliers.
     assert 0.65 * true.width < found.width < 1.1 * true.width
     assert found.outliers == pytest.approx(true.outliers, abs=0.12)
 
 
-def test_what_varies_more_is_found_to_vary_more():
+def test_the_estimate_grows_with_the_variation():
     then = images(2, 3000, touching=0.5, dead=0)
     for name, rates in {"width": (0.02, 0.05, 0.1, 0.2), "outliers": (0.02, 0.1, 0.3, 0.6)}.items():
-        told = []
+        estimates = []
         for rate in rates:
             again = visited_again(then, PRIOR._replace(**{name: rate}), np.random.default_rng(1))
-            told.append(getattr(estimate_variation(again, then), name))
-        assert told == sorted(told), name
+            estimates.append(getattr(estimate_variation(again, then), name))
+        assert estimates == sorted(estimates), name
 
 
 @pytest.mark.parametrize("true", KINDS[:3])
-def test_what_was_found_tells_new_visits_better_than_the_prior(true):
+def test_the_estimate_predicts_new_visits_better_than_the_prior(true):
     stream, group = np.random.default_rng(3), pixel_layout((3, 6, 1)).group
     then = images(4, 2000, dead=0)
     now = visited_again(then, true, stream)
     seen, new = slice(1000), slice(1000, None)
     known = estimate_background(then, group)
     before, learnt = (
-        log_odds_table(known, told)[group, now[new], then[new]].sum(axis=1).mean()
-        for told in (PRIOR, estimate_variation(now[seen], then[seen]))
+        log_odds_table(known, variation)[group, now[new], then[new]].sum(axis=1).mean()
+        for variation in (PRIOR, estimate_variation(now[seen], then[seen]))
     )
     assert learnt > before + 0.1
 
 
-def test_the_more_pairs_the_less_the_prior():
+def test_the_prior_loses_weight_with_more_pairs():
     then = images(0, 400, dead=0)
     found = [
         estimate_variation(then[:count], then[:count]) for count in (0, 5, 20, 100, 400)
     ]  # no visit differs
     for name in Variation._fields:
-        told = [getattr(v, name) for v in found]
-        assert told == sorted(told, reverse=True), name
-        assert 0 < told[-1] < 0.3 * told[0], name
+        values = [getattr(v, name) for v in found]
+        assert values == sorted(values, reverse=True), name
+        assert 0 < values[-1] < 0.3 * values[0], name
 
 
 @given(seeds)
@@ -255,7 +255,7 @@ def test_neither_order_nor_dead_pixels_matter_to_the_variation(seed):
 
 
 @given(seeds, st.integers(0, 40))
-def test_a_variation_is_always_one(seed, count):
+def test_estimates_are_always_valid_variations(seed, count):
     found = estimate_variation(images(seed, count), images(seed + 1, count))
     assert np.isfinite(found).all()
     assert all(0 < value < 1 for value in found)
@@ -265,8 +265,8 @@ def test_a_variation_is_always_one(seed, count):
 
 
 @given(seeds, visits)
-def test_odds_belong_to_one_distribution(seed, visits):
-    """Wherever one was then, what is felt at the same place again is some level: its shares sum to 1."""
+def test_odds_follow_from_one_distribution(seed, visits):
+    """Given an earlier level, the probabilities of the levels at the same place sum to 1."""
     known = common(seed)
     known = known._replace(heights=known.heights / known.heights.sum(axis=1, keepdims=True))
     log = log_odds_table(known, visits)
@@ -277,8 +277,8 @@ def test_odds_belong_to_one_distribution(seed, visits):
 
 
 @given(seeds, visits)
-def test_odds_speak_for_what_is_so(seed, visits):
-    """On average they are for one place where it is one, and against it where it is not."""
+def test_odds_favour_the_true_case_on_average(seed, visits):
+    """Their mean is positive for pairs of one place and negative for pairs of two."""
     known = common(seed)
     known = known._replace(heights=known.heights / known.heights.sum(axis=1, keepdims=True))
     log = log_odds_table(known, visits)[:, :DEAD, :DEAD]
@@ -290,7 +290,7 @@ def test_odds_speak_for_what_is_so(seed, visits):
 
 
 @given(seeds, visits)
-def test_a_dead_pixel_says_nothing(seed, visits):
+def test_a_dead_pixel_carries_no_evidence(seed, visits):
     log = log_odds_table(common(seed), visits)
     assert not log[:, DEAD].any()
     assert not log[:, :, DEAD].any()
@@ -298,7 +298,7 @@ def test_a_dead_pixel_says_nothing(seed, visits):
 
 
 @pytest.mark.parametrize("touching", [0.15, 0.4, 0.7])
-def test_the_likeliest_then_is_what_is_felt_now(touching):
+def test_the_likeliest_earlier_level_is_the_present_one(touching):
     known = Background(np.array([touching]), np.full((1, HEIGHTS), 1 / HEIGHTS))
     log = log_odds_table(known, PRIOR)[0]
     assert (log[:DEAD, :DEAD].argmax(axis=1) == np.arange(DEAD)).all()
@@ -307,21 +307,21 @@ def test_the_likeliest_then_is_what_is_felt_now(touching):
     assert (log[1:DEAD, 0] < 0).all()
 
 
-def test_heights_that_are_all_astray_tell_touch_alone():
+def test_heights_that_are_all_outliers_leave_only_contact():
     known = common(0)
     log = log_odds_table(known, PRIOR._replace(outliers=1.0))[:, 1:DEAD, 1:DEAD]
     expected = np.log((1 - PRIOR.vanishes) / known.touching)[:, None, None]
     assert np.allclose(log, expected)
 
 
-def test_a_rare_height_says_more_than_a_common_one():
+def test_a_rare_height_carries_more_evidence_than_a_common_one():
     heights = np.full(HEIGHTS, 0.2 / (HEIGHTS - 1))
     heights[25] = 0.8
     log = log_odds_table(Background(np.array([0.4]), heights[None]), PRIOR)[0]
     assert log[6, 6] > log[26, 26]
 
 
-def test_what_never_differs_says_most():
+def test_pixels_that_never_vary_carry_the_most_evidence():
     known = common(0)
     strict, loose = (log_odds_table(known, Variation(rate, rate, 0.05, rate)) for rate in (0.01, 0.2))
     level = np.arange(DEAD)
