@@ -26,7 +26,7 @@ RADIUS = 0.13
 STEADY = {"session": 0.0, "move": 0.0, "step": 0.0, "heading": 0.0}
 """Drift settings without odometry errors."""
 BLANK = {"edge": 0.0, "blob": 0.0, "free": 0.0, "body": 0.0}
-"""Of footprint: the map stays as it is."""
+"""Footprint settings that leave the map unchanged."""
 
 
 def create(whiskers: int = len(MOUNTS)) -> PlanarWhiskers:
@@ -89,7 +89,7 @@ def filter_of(
 
 
 def settings(**parts: Any) -> GridConfig:
-    """A configuration; few particles unless said otherwise."""
+    """A configuration with few particles by default."""
     return GridConfig.model_validate({"particles": 30} | parts)
 
 
@@ -116,17 +116,17 @@ def drive(
     return state, estimate, evidence
 
 
-def begun(backend: GridBackend, seed: int = 0) -> GridState:
+def initial(backend: GridBackend, seed: int = 0) -> GridState:
     """The initial state."""
     return backend.init(jax.random.key(seed), 256)
 
 
-def standing(state: GridState, pose: Sequence[float]) -> GridState:
+def at_pose(state: GridState, pose: Sequence[float]) -> GridState:
     """All particles at one pose."""
     there = jnp.broadcast_to(jnp.asarray(pose, state.particles.pose.dtype)[None], state.particles.pose.shape)
     return state._replace(particles=state.particles._replace(pose=there))
 
 
-def remembering(state: GridState, evidence: np.ndarray) -> GridState:
+def with_map(state: GridState, evidence: np.ndarray) -> GridState:
     """All particles with one map of log-odds [S, S]; rows are y."""
     return state._replace(maps=state.maps.at[:, 0].set(jnp.asarray(evidence, state.maps.dtype)[None]))

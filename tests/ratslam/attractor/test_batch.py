@@ -13,7 +13,7 @@ from ratslam.attractor.config import PoseCellConfig, units
 from ratslam.attractor.levels import window_levels
 from ratslam.attractor.window import ring_difference
 from tactile.base.types import Odometry, stack
-from tests.helpers.grid_world import begun, drive, filter_of, report, settings
+from tests.helpers.grid_world import drive, filter_of, initial, report, settings
 
 CONFIG = PoseCellConfig(cells_xy=21)
 STEPS = 60
@@ -73,5 +73,5 @@ def test_trials_of_other_seeds_and_noise_are_sessions_of_their_own():
         block=2,
     )
     for seed, rows in enumerate(courses):
-        _, estimate, _ = drive(backend, begun(backend, seed), rows)
+        _, estimate, _ = drive(backend, initial(backend, seed), rows)
         assert np.abs(np.asarray(together.pose[seed]) - estimate.pose).max() <= 1e-12

@@ -1,4 +1,4 @@
-"""Laws of the grid filter: against an exact one, of what a report leaves and weighs, and of bad input."""
+"""Laws of the grid filter: an exact filter for comparison, effects of a report, bad input."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from tests.helpers.grid_world import (
     BLANK,
     STEADY,
     TIPS,
-    begun,
+    at_pose,
     create,
     drive,
     filter_of,
-    remembering,
+    initial,
     report,
     settings,
-    standing,
+    with_map,
 )
 
 FILTER = filter_of(settings())
@@ -63,21 +63,21 @@ def placed(backend, pose, point):
 
 
 def evidence_at(backend, state, point, layer=EVIDENCE):
-    """[N, K] what each particle's map holds at points [K, 2] of base_link."""
+    """[N, K] the layer of each particle's map at points [K, 2] of base_link."""
     place = placed(backend, state.particles.pose, point).astype(backend.dtype)
     return np.asarray(particle_maps.interpolate(state.maps, layer, place))
 
 
 def column_of_wall(backend, x, *, before=-3.0, wall=4.0, width=0.1):
-    """[S, S] evidence: free before x, a wall there, nothing known behind it; m."""
+    """[S, S] evidence: free before x, a wall there, unexplored behind it, m."""
     at = (np.arange(backend.side) - (backend.side - 1) / 2) * backend.config.cell
     row = np.where(at < x - width / 2, before, np.where(at < x + width / 2, wall, 0.0))
     return np.tile(row, (backend.side, 1))
 
 
-def scattered(backend):
-    """A state of particles apart from each other, each with a map of its own."""
-    stream, state = np.random.default_rng(0), begun(backend)
+def scatter(backend):
+    """A state of separate particles, each with its own map."""
+    stream, state = np.random.default_rng(0), initial(backend)
     pose = stream.normal(0, [0.1, 0.1, 1.0], state.particles.pose.shape)
     maps = stream.normal(0, 2.0, state.maps[:, EVIDENCE].shape)
     return state._replace(
@@ -93,16 +93,16 @@ def finite(tree):
     return all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(tree))
 
 
-def known(state):
-    """The state but for contacts held, of which nothing is said at once."""
+def without_contacts(state):
+    """The state without the contacts of the last report, which only affect the next one."""
     return state._replace(touched=0)
 
 
-# What a report leaves in the map
+# Effects of a report on the map
 
 
-def test_what_meets_nothing_is_found_free():
-    state, *_ = drive(FILTER, begun(FILTER), [report(0.02)])
+def test_whiskers_without_contact_mark_free_cells():
+    state, *_ = drive(FILTER, initial(FILTER), [report(0.02)])
     shafts = np.asarray(FILTER.free)
     # Between cells the bottom of a narrow mark is cut.
     assert (evidence_at(FILTER, state, shafts) < -0.4 * FILTER.config.footprint.free).all()
@@ -114,11 +114,11 @@ def test_what_meets_nothing_is_found_free():
 
 
 @pytest.mark.parametrize("cell", [0.05, 0.02])
-def test_a_contact_leaves_evidence_where_it_was_felt(cell):
+def test_a_contact_leaves_evidence_at_its_point(cell):
     backend = FILTER if cell == 0.05 else filter_of(settings(particles=2, cell=cell))
     blob = FILTER.config.footprint.blob
     for heading in (0.0, 0.8, -2.0):
-        start = standing(begun(backend), [0.2, -0.1, heading])
+        start = at_pose(initial(backend), [0.2, -0.1, heading])
         state, *_ = drive(backend, start, [report(0.02, touching=[0, 2], dead=[1, 3])])
         found = evidence_at(backend, state, TIPS[[0, 2]])
         assert (found > 0.75 * blob).all()  # between cells the top of a blob is cut
@@ -127,14 +127,14 @@ def test_a_contact_leaves_evidence_where_it_was_felt(cell):
 
 
 def test_a_wall_is_drawn_along_itself_with_its_direction():
-    wall, start = (0.3, 0.4), standing(begun(FILTER), [0.1, 0.2, 0.7])
+    wall, start = (0.3, 0.4), at_pose(initial(FILTER), [0.1, 0.2, 0.7])
     state, *_ = drive(FILTER, start, [report(0.02, touching=[0, 1], wall=wall, dead=[2, 3])])
     normal = np.array([np.cos(wall[1]), np.sin(wall[1])])
     along = np.array([-normal[1], normal[0]])
     middle = TIPS[:2].mean(axis=0)
     foot = middle + normal * (wall[0] - normal @ middle)
     steps = np.array([-0.12, 0.0, 0.12])[:, None]
-    # The blobs of the contacts themselves lie on this side of the wall.
+    # The blobs of the contacts lie on this side of the wall.
     ahead, beyond = (
         evidence_at(FILTER, state, points) for points in (foot + steps * along, foot + 0.12 * normal[None])
     )
@@ -149,19 +149,19 @@ def test_a_wall_is_drawn_along_itself_with_its_direction():
     )
 
 
-def test_a_wall_says_the_same_from_wherever_it_is_felt():
-    """A robot turned about, at another place, feels the same wall of the room."""
+def test_a_wall_has_the_same_direction_from_any_pose():
+    """A robot at another place with the opposite heading touches the same wall."""
     fields = []
     for heading in (0.0, 1.0, 2.5, np.pi):
-        start = standing(begun(FILTER), [0.0, 0.0, heading])
+        start = at_pose(initial(FILTER), [0.0, 0.0, heading])
         state, *_ = drive(FILTER, start, [report(touching=[1, 2], wall=(0.3, 1.2 - heading), sd=0.05)])
         fields.append(np.asarray(state.wall_directions).mean(axis=0))
         assert wrap(np.asarray(state.particles.pose)[:, 2] - heading) == pytest.approx(0, abs=0.01)
     assert np.array(fields) == pytest.approx(np.tile(fields[0], (4, 1)), abs=0.01)
 
 
-def test_backing_off_brings_no_evidence_but_moves():
-    start, *_ = drive(FILTER, begun(FILTER), [report(0.02)] * 3 + [report(0.02, touching=[1, 2])])
+def test_backing_off_moves_without_evidence():
+    start, *_ = drive(FILTER, initial(FILTER), [report(0.02)] * 3 + [report(0.02, touching=[1, 2])])
     state, *_ = drive(FILTER, start, [report(-0.025, touching=[0, 1], wall=(0.3, 0.0))])
     assert np.array_equal(state.maps, start.maps)
     assert np.array_equal(state.wall_directions, start.wall_directions)
@@ -172,47 +172,47 @@ def test_backing_off_brings_no_evidence_but_moves():
 
 
 @pytest.mark.parametrize("backend", [FILTER, SINGLE], ids=["float64", "float32"])
-def test_contacts_while_turning_say_nothing(backend):
-    start = scattered(backend) if backend is FILTER else drive(backend, begun(backend), [report(0.02)] * 3)[0]
-    touched, _, told = drive(backend, start, [report(turn=0.1, touching=[0, 1])])
+def test_contacts_in_turns_carry_no_evidence(backend):
+    start = scatter(backend) if backend is FILTER else drive(backend, initial(backend), [report(0.02)] * 3)[0]
+    touched, _, evidence = drive(backend, start, [report(turn=0.1, touching=[0, 1])])
     dead, _, expected = drive(backend, start, [report(turn=0.1, dead=[0, 1])])
-    assert equal(known(touched), known(dead))
-    assert np.array_equal(told.weights, expected.weights)
+    assert equal(without_contacts(touched), without_contacts(dead))
+    assert np.array_equal(evidence.weights, expected.weights)
 
 
-def test_contacts_are_told_once():
-    start, *_ = drive(FILTER, begun(FILTER), [report(0.02, touching=[0, 1])])
-    held, _, told = drive(FILTER, start, [report(0.01, touching=[0, 1])])
+def test_a_continued_contact_counts_once():
+    start, *_ = drive(FILTER, initial(FILTER), [report(0.02, touching=[0, 1])])
+    held, _, evidence = drive(FILTER, start, [report(0.01, touching=[0, 1])])
     dead, _, expected = drive(FILTER, start, [report(0.01, dead=[0, 1])])
-    assert equal(known(held), known(dead))
-    assert np.array_equal(told.weights, expected.weights)
-    # But again after the robot has backed off.
+    assert equal(without_contacts(held), without_contacts(dead))
+    assert np.array_equal(evidence.weights, expected.weights)
+    # It counts again after the robot has backed off.
     again, *_ = drive(FILTER, start, [report(-0.01, touching=[0, 1]), report(0.01, touching=[0, 1])])
     assert (evidence_at(FILTER, again, TIPS[:2]) > 1.3 * FILTER.config.footprint.blob).all()
 
 
 @pytest.mark.parametrize("backend", [FILTER, PRINTED], ids=["evidence", "printed"])
-def test_dead_whiskers_say_nothing(backend):
-    start, told = scattered(backend), []
+def test_dead_whiskers_carry_no_evidence(backend):
+    start, results = scatter(backend), []
     for touching in ([], [0, 1]):
         state, _, evidence = drive(backend, start, [report(0.02, touching=touching, dead=[0, 1])])
-        told.append((known(state), evidence))
-    assert equal(*told)
-    # Nor does it matter what the maps hold, but for where the robot's body is.
+        results.append((without_contacts(state), evidence))
+    assert equal(*results)
+    # The maps have no effect either, except under the robot's body.
     numb = backend.config.body * (backend is FILTER)
     near = np.hypot(*np.mgrid[: backend.side, : backend.side] - (backend.side - 1) / 2) * 0.05 < numb + 0.1
     maps = jnp.where(jnp.asarray(near & (numb > 0))[None], 0.0, start.maps[:, EVIDENCE])
-    start = begun(backend)._replace(maps=start.maps.at[:, EVIDENCE].set(maps))
+    start = initial(backend)._replace(maps=start.maps.at[:, EVIDENCE].set(maps))
     _, _, evidence = drive(backend, start, [report(dead=ALL, motion=MotionKind.FORWARD)])
     assert evidence.weights[0] == pytest.approx(1 / 30)
 
 
-# What a report weighs
+# Effects of a report on the weights
 
 
 @pytest.mark.parametrize("backend", [FILTER, SINGLE], ids=["float64", "float32"])
 def test_particles_whose_map_explains_a_contact_weigh_more(backend):
-    start = remembering(begun(backend), column_of_wall(backend, 0.6))
+    start = with_map(initial(backend), column_of_wall(backend, 0.6))
     poses = jnp.zeros_like(start.particles.pose)
     tips = TIPS[1, 0]
     for k, x in enumerate((0.6 - tips, 0.9 - tips, 0.3 - tips)):  # on the wall, behind it, before it
@@ -220,24 +220,24 @@ def test_particles_whose_map_explains_a_contact_weigh_more(backend):
     start = start._replace(
         particles=start.particles._replace(pose=poses, session=0 * start.particles.session)
     )
-    _, _, told = drive(backend, start, [report(touching=[1, 2], dead=[0, 3], motion=MotionKind.OTHER)])
-    wall, unknown, empty = told.weights[0].reshape(3, 10)
+    _, _, evidence = drive(backend, start, [report(touching=[1, 2], dead=[0, 3], motion=MotionKind.OTHER)])
+    wall, unknown, empty = evidence.weights[0].reshape(3, 10)
     assert wall.min() > 3 * unknown.max()
     assert unknown.min() > empty.max()
-    _, _, told = drive(backend, start, [report(dead=[0, 3], motion=MotionKind.OTHER)])
-    wall, unknown, empty = told.weights[0].reshape(3, 10)
+    _, _, evidence = drive(backend, start, [report(dead=[0, 3], motion=MotionKind.OTHER)])
+    wall, unknown, empty = evidence.weights[0].reshape(3, 10)
     assert wall.max() < unknown.min() <= empty.min() * 1.1
 
 
-def test_particles_whose_map_has_the_wall_that_way_weigh_more():
+def test_particles_whose_map_has_the_walls_direction_weigh_more():
     wall = report(touching=[0, 1], wall=(0.3, 0.3), sd=0.04)
-    start = standing(begun(FILTER), [0.0, 0.0, 0.0])
+    start = at_pose(initial(FILTER), [0.0, 0.0, 0.0])
     start, *_ = drive(FILTER, start, [wall, report(-1e-6)] * 6)
     turned = np.repeat([0.0, 0.3, np.pi / 4], 10)
     pose = start.particles.pose.at[:, 2].set(turned)
     start = start._replace(particles=start.particles._replace(pose=pose, weight=0 * start.particles.weight))
-    _, _, told = drive(FILTER, start, [wall])
-    aligned, oblique, across = told.weights[0].reshape(3, 10)
+    _, _, evidence = drive(FILTER, start, [wall])
+    aligned, oblique, across = evidence.weights[0].reshape(3, 10)
     assert aligned.min() > oblique.max()
     assert oblique.min() > across.max()
 
@@ -256,7 +256,7 @@ def corridor(backend, reports, spread):
         .at[0, EVIDENCE]
         .set(column_of_wall(backend, 0.65))
     )
-    belief, touched, told = np.where(np.abs(x) < fine / 2, 1.0, 0.0), np.zeros(2, bool), []
+    belief, touched, moments = np.where(np.abs(x) < fine / 2, 1.0, 0.0), np.zeros(2, bool), []
 
     def evidence(points):
         place = placed(backend, pose, points).reshape(1, -1, 2)
@@ -274,8 +274,8 @@ def corridor(backend, reports, spread):
         touched = o.contact & (o.motion != MotionKind.BACK)
         belief = belief / belief.sum()
         mean = belief @ x
-        told.append([mean, belief @ (x - mean) ** 2])
-    return np.array(told)
+        moments.append([mean, belief @ (x - mean) ** 2])
+    return np.array(moments)
 
 
 def test_position_in_a_corridor_is_that_of_an_exact_filter():
@@ -283,21 +283,21 @@ def test_position_in_a_corridor_is_that_of_an_exact_filter():
     |t| < 5 in each of eight tests with 19 degrees of freedom. Size: 7e-4."""
     spread, runs = CORRIDOR.config.drift.step, 20
     backend = CORRIDOR
-    felt = partial(report, whiskers=2)
-    reports = [felt(0.1)] * 4 + [felt(0.1, touching=[1])] + [felt(-0.05)] * 2 + [felt(0.05)]
-    reports += [felt(0.06, touching=[1]), felt(0.02, touching=[0, 1])]
+    reading = partial(report, whiskers=2)
+    reports = [reading(0.1)] * 4 + [reading(0.1, touching=[1])] + [reading(-0.05)] * 2 + [reading(0.05)]
+    reports += [reading(0.06, touching=[1]), reading(0.02, touching=[0, 1])]
     checked = [3, 4, 6, 9]  # free, a contact, backed off, the last contact
     exact = corridor(backend, reports, spread)
     found, drawn = [], []
     for seed in range(runs):
-        start = remembering(begun(backend, seed), column_of_wall(backend, 0.65))
-        _, estimate, told = drive(backend, start, reports)
+        start = with_map(initial(backend, seed), column_of_wall(backend, 0.65))
+        _, estimate, evidence = drive(backend, start, reports)
         found.append(np.stack([estimate.pose[:, 0], estimate.spread[:, 0] ** 2], axis=1))
-        drawn.append((told.ancestor != np.arange(1000)).any(axis=1))
+        drawn.append((evidence.ancestor != np.arange(1000)).any(axis=1))
     found = np.array(found)
     error = found.std(axis=0, ddof=1) / np.sqrt(runs)
     assert (np.abs((found.mean(axis=0) - exact) / error)[checked] < 5).all()
-    # What would have been found without drawing anew, or without the contacts, lies far off.
+    # Without resampling, or without the contacts, the result would differ by far more.
     assert np.any(drawn, axis=1).all()
     blind = corridor(
         backend,
@@ -307,11 +307,11 @@ def test_position_in_a_corridor_is_that_of_an_exact_filter():
     assert (np.abs((blind - exact) / error)[checked[1:], 0] > 20).all()
 
 
-# Drawing anew
+# Resampling
 
 
 def test_maps_follow_their_particles():
-    state = begun(CORRIDOR)
+    state = initial(CORRIDOR)
     names = jnp.arange(1.0, 1001.0)
     state = state._replace(
         maps=state.maps + 1e-6 * names[:, None, None, None],
@@ -320,38 +320,40 @@ def test_maps_follow_their_particles():
             weight=-0.05 * names, session=1e-9 * jnp.stack([names, names], axis=1)
         ),
     )
-    after, _, told = drive(CORRIDOR, state, [report(0.02, whiskers=2)])
-    ancestor = told.ancestor[0]
-    assert told.outcome[0] == GridOutcome.RESAMPLED
+    after, _, evidence = drive(CORRIDOR, state, [report(0.02, whiskers=2)])
+    ancestor = evidence.ancestor[0]
+    assert evidence.outcome[0] == GridOutcome.RESAMPLED
     assert 20 < len(np.unique(ancestor)) < 500
     assert np.array_equal(after.maps, state.maps[ancestor])
     assert np.array_equal(after.wall_directions, state.wall_directions[ancestor])
     assert np.array_equal(after.particles.session, state.particles.session[ancestor])
-    assert np.array_equal(after.particles.pose, told.poses[0][ancestor])
+    assert np.array_equal(after.particles.pose, evidence.poses[0][ancestor])
     assert not np.any(after.particles.weight)
-    # Weights are told as they were before.
-    assert told.weights[0] == pytest.approx(np.exp(-0.05 * names) / np.exp(-0.05 * names).sum(), rel=0.05)
-    assert told.effective_particles[0] == pytest.approx(40, rel=0.1)
+    # The weights reported are those before resampling.
+    assert evidence.weights[0] == pytest.approx(np.exp(-0.05 * names) / np.exp(-0.05 * names).sum(), rel=0.05)
+    assert evidence.effective_particles[0] == pytest.approx(40, rel=0.1)
 
 
-def test_the_literal_filter_draws_at_every_report_that_tells():
-    _, _, told = drive(
-        PRINTED, begun(PRINTED), [report(0.02), report(0.02, touching=[1]), report(-0.05), report(turn=0.1)]
+def test_the_literal_filter_resamples_at_every_report_with_evidence():
+    _, _, evidence = drive(
+        PRINTED,
+        initial(PRINTED),
+        [report(0.02), report(0.02, touching=[1]), report(-0.05), report(turn=0.1)],
     )
-    assert list(told.outcome) == [
+    assert list(evidence.outcome) == [
         GridOutcome.RESAMPLED,
         GridOutcome.RESAMPLED,
         GridOutcome.OK,
         GridOutcome.RESAMPLED,
     ]
-    assert np.array_equal(told.ancestor[2], np.arange(30))
+    assert np.array_equal(evidence.ancestor[2], np.arange(30))
 
 
-def test_weights_that_agree_are_left_alone():
-    _, _, told = drive(FILTER, begun(FILTER), [report(0.02)] * 5)
-    assert not told.outcome.any()
-    assert (told.ancestor == np.arange(30)).all()
-    assert told.weights.sum(axis=1) == pytest.approx(1)
+def test_equal_weights_are_not_resampled():
+    _, _, evidence = drive(FILTER, initial(FILTER), [report(0.02)] * 5)
+    assert not evidence.outcome.any()
+    assert (evidence.ancestor == np.arange(30)).all()
+    assert evidence.weights.sum(axis=1) == pytest.approx(1)
 
 
 # Bad input
@@ -371,70 +373,70 @@ ODD = {
 
 @pytest.mark.parametrize("backend", [FILTER, SINGLE, PRINTED], ids=["float64", "float32", "printed"])
 @pytest.mark.parametrize("odd", ODD)
-def test_what_is_no_number_is_named_and_left_out(backend, odd):
-    start, *_ = drive(backend, begun(backend), [report(0.02)] * 2)
+def test_values_that_are_not_finite_are_reported_and_ignored(backend, odd):
+    start, *_ = drive(backend, initial(backend), [report(0.02)] * 2)
     plain = report(0.02, touching=[0, 1], wall=(0.3, 0.3))
-    state, estimate, told = drive(backend, start, [ODD[odd](plain)])
-    assert told.outcome[0] == GridOutcome.NOT_FINITE
-    assert finite((state, estimate, told))
-    state, estimate, told = drive(backend, state, [plain])
-    assert told.outcome[0] in (GridOutcome.OK, GridOutcome.RESAMPLED)
-    assert finite((state, estimate, told))
+    state, estimate, evidence = drive(backend, start, [ODD[odd](plain)])
+    assert evidence.outcome[0] == GridOutcome.NOT_FINITE
+    assert finite((state, estimate, evidence))
+    state, estimate, evidence = drive(backend, state, [plain])
+    assert evidence.outcome[0] in (GridOutcome.OK, GridOutcome.RESAMPLED)
+    assert finite((state, estimate, evidence))
 
 
 @pytest.mark.parametrize("backend", [FILTER, SINGLE], ids=["float64", "float32"])
-def test_a_robot_may_leave_the_map_as_far_as_it_likes(backend):
-    state, estimate, told = drive(backend, begun(backend), [report(9e5, touching=[0])] * 100)
-    assert finite((state, estimate, told))
+def test_a_robot_may_leave_the_map_by_any_distance(backend):
+    state, estimate, evidence = drive(backend, initial(backend), [report(9e5, touching=[0])] * 100)
+    assert finite((state, estimate, evidence))
     assert np.asarray(estimate.pose)[-1, 0] > 1e7
-    assert told.outcome[-1] in (GridOutcome.OUTSIDE, GridOutcome.OK)
+    assert evidence.outcome[-1] in (GridOutcome.OUTSIDE, GridOutcome.OK)
     assert not np.any(state.maps[:, 1:])
 
 
 @pytest.mark.parametrize("backend", [FILTER, SINGLE], ids=["float64", "float32"])
-def test_odometry_that_is_no_number_is_no_motion(backend):
-    start, *_ = drive(backend, begun(backend), [report(0.1)])
+def test_odometry_that_is_not_finite_is_no_motion(backend):
+    start, *_ = drive(backend, initial(backend), [report(0.1)])
     odd, *_ = drive(backend, start, [ODD["odometry"](report(0.02, touching=[1]))])
     still, *_ = drive(backend, start, [report(0.0, touching=[1], motion=MotionKind.FORWARD)])
     assert equal(odd, still)
 
 
 @pytest.mark.parametrize("backend", [FILTER, PRINTED], ids=["evidence", "printed"])
-def test_contacts_that_are_no_number_are_as_of_dead_whiskers(backend):
-    start = scattered(backend)
-    odd, _, told = drive(backend, start, [ODD["points"](report(0.02, touching=[0, 1]))])
+def test_contacts_that_are_not_finite_count_as_dead_whiskers(backend):
+    start = scatter(backend)
+    odd, _, evidence = drive(backend, start, [ODD["points"](report(0.02, touching=[0, 1]))])
     dead, _, expected = drive(backend, start, [report(0.02, dead=[0, 1])])
     assert equal(odd, dead)
-    assert np.array_equal(told.weights, expected.weights)
+    assert np.array_equal(evidence.weights, expected.weights)
 
 
 @pytest.mark.parametrize("backend", [FILTER, SINGLE], ids=["float64", "float32"])
 @pytest.mark.parametrize("odd", [np.inf, np.nan])
-def test_when_all_weights_vanish_they_are_kept(backend, odd):
-    """Maps that allow nothing of what is felt."""
-    start = remembering(begun(backend), np.full((backend.side, backend.side), odd))
+def test_vanished_weights_are_left_unchanged(backend, odd):
+    """All maps contradict the contacts."""
+    start = with_map(initial(backend), np.full((backend.side, backend.side), odd))
     start = start._replace(
         particles=start.particles._replace(weight=-0.01 * jnp.arange(30, dtype=backend.dtype))
     )
-    state, estimate, told = drive(backend, start, [report(0.02)])
-    assert told.outcome[0] == GridOutcome.VANISHED
+    state, estimate, evidence = drive(backend, start, [report(0.02)])
+    assert evidence.outcome[0] == GridOutcome.VANISHED
     assert estimate.lost[0]
     assert np.array_equal(state.particles.weight, start.particles.weight)
-    assert finite((estimate, told))
+    assert finite((estimate, evidence))
 
 
 @pytest.mark.parametrize("backend", [FILTER, SINGLE], ids=["float64", "float32"])
-def test_contacts_outside_the_map_are_named_and_forgotten(backend):
-    rim = standing(begun(backend), [1.15, 0.0, 0.0])
-    felt = report(touching=ALL, wall=(0.3, 0.0), motion=MotionKind.FORWARD)
-    state, _, told = drive(backend, rim, [felt])
-    assert told.outcome[0] == GridOutcome.OUTSIDE
-    assert finite((state, told))
+def test_contacts_outside_the_map_are_reported_and_dropped(backend):
+    rim = at_pose(initial(backend), [1.15, 0.0, 0.0])
+    reading = report(touching=ALL, wall=(0.3, 0.0), motion=MotionKind.FORWARD)
+    state, _, evidence = drive(backend, rim, [reading])
+    assert evidence.outcome[0] == GridOutcome.OUTSIDE
+    assert finite((state, evidence))
     for far in ([3.0, 0.0, 0.0], [-1e3, 1e3, 2.0], [1e9, -1e9, 0.0]):
-        away = standing(begun(backend), far)
-        state, estimate, told = drive(backend, away, [report(0.02), felt, report(-0.1)])
-        assert told.outcome[1] == GridOutcome.OUTSIDE
-        assert finite((state, estimate, told))
+        away = at_pose(initial(backend), far)
+        state, estimate, evidence = drive(backend, away, [report(0.02), reading, report(-0.1)])
+        assert evidence.outcome[1] == GridOutcome.OUTSIDE
+        assert finite((state, estimate, evidence))
         assert np.abs(state.maps).max() < 1e-3  # a wall may reach in from outside
 
 
@@ -445,16 +447,16 @@ def circuit(count):
     return [report(turn=0.3) if k % 5 == 4 else report(0.05) for k in range(count)]
 
 
-def sound(state, estimate, told):
-    """Nothing is anything but a number, and evidence stays within its limits."""
+def check_limits(state, estimate, evidence):
+    """All values are finite, and evidence stays within its limits."""
     limit = MOST * (1 + 1e-6)
-    return finite((state, estimate, told)) and float(jnp.abs(state.maps[:, EVIDENCE]).max()) <= limit
+    return finite((state, estimate, evidence)) and float(jnp.abs(state.maps[:, EVIDENCE]).max()) <= limit
 
 
 def long(count):
-    state, estimate, told = drive(SINGLE, begun(SINGLE), circuit(count))
-    assert sound(state, estimate, told)
-    assert told.weights.sum(axis=1) == pytest.approx(1, abs=1e-5)
+    state, estimate, evidence = drive(SINGLE, initial(SINGLE), circuit(count))
+    assert check_limits(state, estimate, evidence)
+    assert evidence.weights.sum(axis=1) == pytest.approx(1, abs=1e-5)
     assert {leaf.dtype for leaf in jax.tree.leaves(state)} == {
         np.dtype(t) for t in (np.float32, np.int32, bool, np.uint32)
     }
@@ -477,20 +479,20 @@ def test_contact_in_every_report():
         touching = np.flatnonzero(stream.random(4) < 0.6)
         wall = (0.3, stream.normal(0, 0.5)) if len(touching) and stream.random() < 0.5 else None
         reports.append(report(0.0 if turn else 0.01, turn, touching=[*touching, k % 4], wall=wall))
-    state, estimate, told = drive(SINGLE, begun(SINGLE), reports)
-    assert sound(state, estimate, told)
-    assert GridOutcome.RESAMPLED in told.outcome
-    assert not np.isin(told.outcome, [GridOutcome.VANISHED, GridOutcome.NOT_FINITE]).any()
+    state, estimate, evidence = drive(SINGLE, initial(SINGLE), reports)
+    assert check_limits(state, estimate, evidence)
+    assert GridOutcome.RESAMPLED in evidence.outcome
+    assert not np.isin(evidence.outcome, [GridOutcome.VANISHED, GridOutcome.NOT_FINITE]).any()
     assert finite(state.wall_directions)
 
 
-def test_a_wall_is_believed_soon_after_much_that_was_free():
-    """The clamp keeps what was found free from lasting for ever."""
+def test_a_wall_is_mapped_soon_after_many_free_reports():
+    """The clamp limits the evidence of free cells."""
     free, met = (
         [report(0.0, motion=MotionKind.FORWARD)] * 20,
         [report(touching=ALL, motion=MotionKind.FORWARD), report(-1e-6)],
     )
-    state, *_ = drive(SINGLE, begun(SINGLE), free)
+    state, *_ = drive(SINGLE, initial(SINGLE), free)
     assert evidence_at(SINGLE, state, TIPS).mean() < -2
     found = []
     for _ in range(3):
@@ -501,12 +503,12 @@ def test_a_wall_is_believed_soon_after_much_that_was_free():
 
 
 @pytest.mark.parametrize("backend", [FILTER, SINGLE], ids=["float64", "float32"])
-def test_a_kidnap_breaks_nothing(backend):
+def test_a_kidnap_leaves_finite_values(backend):
     there = [report(0.05)] * 5 + [report(0.02, touching=[0, 1], wall=(0.25, 0.2)), report(-0.05)]
     reports = [*there, report(1.0), *there, report(0.0, 3.0), *there, report(-1.0), *there, report(0.05, 0.1)]
-    state, estimate, told = drive(backend, begun(backend), reports)
-    assert sound(state, estimate, told)
-    assert not np.isin(told.outcome, [GridOutcome.VANISHED, GridOutcome.NOT_FINITE]).any()
+    state, estimate, evidence = drive(backend, initial(backend), reports)
+    assert check_limits(state, estimate, evidence)
+    assert not np.isin(evidence.outcome, [GridOutcome.VANISHED, GridOutcome.NOT_FINITE]).any()
 
 
 # As a backend
@@ -543,17 +545,17 @@ def test_a_batch_of_seeds_equals_each():
         together, *output = many(together, o)
         outputs.append(output)
     for seed in range(3):
-        alone, estimate, told = drive(backend, begun(backend, seed), reports)
+        alone, estimate, evidence = drive(backend, initial(backend, seed), reports)
         for k, (estimates, proofs) in enumerate(outputs):
             assert np.asarray(estimates.pose[seed]) == pytest.approx(estimate.pose[k], abs=1e-9)
-            assert np.array_equal(proofs.ancestor[seed], told.ancestor[k])
-            assert proofs.outcome[seed] == told.outcome[k]
+            assert np.array_equal(proofs.ancestor[seed], evidence.ancestor[k])
+            assert proofs.outcome[seed] == evidence.outcome[k]
         assert np.asarray(together.maps[seed]) == pytest.approx(np.asarray(alone.maps), abs=1e-9)
-        assert GridOutcome.RESAMPLED in told.outcome
+        assert GridOutcome.RESAMPLED in evidence.outcome
 
 
 def test_seeds_differ_and_repeat():
-    runs = [drive(FILTER, begun(FILTER, seed), circuit(10))[1].pose for seed in (0, 0, 1)]
+    runs = [drive(FILTER, initial(FILTER, seed), circuit(10))[1].pose for seed in (0, 0, 1)]
     assert np.array_equal(runs[0], runs[1])
     assert not np.array_equal(runs[0], runs[2])
 

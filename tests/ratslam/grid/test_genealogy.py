@@ -21,7 +21,7 @@ def reports(count, *, every=1, seed=0):
         yield pose, stream.dirichlet(np.ones(COUNT)), ancestor
 
 
-def told(rows, count=COUNT):
+def genealogy_of(rows, count=COUNT):
     tree = Genealogy(count)
     for row in rows:
         tree.append(*row)
@@ -29,7 +29,7 @@ def told(rows, count=COUNT):
 
 
 def by_copying(rows):
-    """The weighted mean of whole paths, copied at every draw as Algorithm 1 has it."""
+    """The weighted mean of whole paths, copied at every resampling as in Algorithm 1."""
     paths, weights = [[] for _ in range(COUNT)], np.full(COUNT, 1 / COUNT)
     ancestor = np.arange(COUNT)
     for pose, share, after in rows:
@@ -39,7 +39,7 @@ def by_copying(rows):
 
 
 def assert_same(path, expected):
-    """Headings here are so alike that it hardly matters how they are averaged."""
+    """The headings are so close that all kinds of mean agree within the tolerance."""
     assert path.shape == expected.shape
     assert path[:, :2] == pytest.approx(expected[:, :2])
     assert path[:, 2] == pytest.approx(expected[:, 2], abs=1e-3)
@@ -49,41 +49,41 @@ def assert_same(path, expected):
 @pytest.mark.parametrize("every", [1, 7])
 def test_the_path_is_that_of_the_ancestors(count, every):
     rows = list(reports(count, every=every))
-    tree = told(rows)
+    tree = genealogy_of(rows)
     assert len(tree) == count
     assert_same(tree.path(), by_copying(rows))
 
 
-def test_paths_of_particles_that_died_out_are_forgotten():
+def test_paths_of_extinct_particles_have_no_effect():
     stream = np.random.default_rng(0)
     first, second = stream.normal(0, 0.1, (2, COUNT, 3))
     ancestor = np.array([3] * COUNT)
-    path = told(
+    path = genealogy_of(
         [(first, np.full(COUNT, 1 / COUNT), ancestor), (second, np.full(COUNT, 1 / COUNT), ancestor)]
     ).path()
     assert path[0] == pytest.approx(first[3])
-    assert path[1, :2] == pytest.approx(second[:, :2].mean(axis=0))  # drawn anew only after this report
+    assert path[1, :2] == pytest.approx(second[:, :2].mean(axis=0))  # resampled only after this report
 
 
-def test_the_past_changes_with_what_is_found_later():
-    """Two particles at opposite sides; the weights of the last report say which had been right."""
+def test_the_path_changes_with_later_weights():
+    """Two particles at opposite sides; the weights of the last report select one of them."""
     left, right = np.array([[-1.0, 0, 0], [1.0, 0, 0]]), np.array([[-2.0, 0, 0], [2.0, 0, 0]])
     same = np.arange(2)
     half = (left, np.array([0.5, 0.5]), same)
-    assert told([half], 2).path()[0, 0] == 0
-    assert told([half, (right, np.array([0.0, 1.0]), same)], 2).path()[:, 0] == pytest.approx([1, 2])
+    assert genealogy_of([half], 2).path()[0, 0] == 0
+    assert genealogy_of([half, (right, np.array([0.0, 1.0]), same)], 2).path()[:, 0] == pytest.approx([1, 2])
 
 
 @pytest.mark.parametrize("levels", [1, 5 * COUNT, 40 * COUNT])
 def test_memory_is_bounded_and_settled_paths_stay(monkeypatch, levels):
-    """Where all descend from one, as they do soon, nothing is lost by settling."""
+    """Settling is exact if all particles descend from one, as they soon do."""
     stream = np.random.default_rng(1)
     rows = []
     for pose, share, _ in reports(200):
         rows.append((pose, share, np.full(COUNT, stream.integers(0, COUNT))))
-    whole = told(rows).path()
+    whole = genealogy_of(rows).path()
     monkeypatch.setattr(genealogy, "MAX_POSES", levels)
-    tree = told(rows)
+    tree = genealogy_of(rows)
     assert len(tree) == 200
     assert tree.arrays()["pose"].size // 3 <= max(levels, COUNT)
     assert tree.path() == pytest.approx(whole)
@@ -93,29 +93,29 @@ def test_memory_is_bounded_and_settled_paths_stay(monkeypatch, levels):
 def test_poses_beyond_the_bound_are_weighted_means(monkeypatch):
     monkeypatch.setattr(genealogy, "MAX_POSES", 20 * COUNT)
     rows = list(reports(60, every=9))
-    assert np.abs(told(rows).path() - by_copying(rows)).max() < 2
+    assert np.abs(genealogy_of(rows).path() - by_copying(rows)).max() < 2
 
 
 def test_headings_are_averaged_on_the_circle():
-    """As the filter averages them, and whichever of them comes first."""
+    """The mean equals that of the filter, in any order of the particles."""
     share = np.full(COUNT, 1 / COUNT)
     for heading in ([3.1, 3.2, 3.3, -3.1, -3.0, 3.14], [0.0, 1.0, 2.0, 3.0, -1.5, -0.4]):
         expected = np.angle(share @ np.exp(1j * np.array(heading)))
         for turned in range(COUNT):
             pose = np.zeros((COUNT, 3))
             pose[:, 2] = np.roll(heading, turned)
-            found = told([(pose, share, np.arange(COUNT))]).path()[0, 2]
+            found = genealogy_of([(pose, share, np.arange(COUNT))]).path()[0, 2]
             assert wrap(found - expected) == pytest.approx(0, abs=1e-9)
 
 
 @pytest.mark.parametrize("levels", [5 * COUNT, 10**6])
-def test_a_restored_one_continues_bit_for_bit(monkeypatch, levels):
+def test_a_restored_genealogy_continues_bit_for_bit(monkeypatch, levels):
     monkeypatch.setattr(genealogy, "MAX_POSES", levels)
     rows = list(reports(80, every=3))
-    whole = told(rows)
+    whole = genealogy_of(rows)
     for stop in (0, 1, 16, 43):
-        second = told(list(reports(5, seed=9)))
-        second.restore(told(rows[:stop]).arrays())
+        second = genealogy_of(list(reports(5, seed=9)))
+        second.restore(genealogy_of(rows[:stop]).arrays())
         for row in rows[stop:]:
             second.append(*row)
         assert np.array_equal(second.path(), whole.path())

@@ -1,4 +1,4 @@
-"""Laws of footprint: their shapes, and that these turn and move with what they are of."""
+"""Laws of footprints: shape, translation and rotation."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_blobs_are_sums_of_round_gaussians(places, amounts):
     assert doubled[0] == pytest.approx(2 * expected, abs=1e-12)
 
 
-def test_a_blob_has_its_amount_where_it_is_and_no_whiskers_make_none():
+def test_a_blob_has_its_amount_at_its_place_and_is_absent_without_whiskers():
     place = np.array([[[9.0, 20.0]]])  # x, y
     footprint = np.asarray(blobs(place, np.array([2.0]), 1.0, SIZE))[0]
     assert np.unravel_index(footprint.argmax(), footprint.shape) == (20, 9)
@@ -77,8 +77,8 @@ def test_a_disc_is_full_inside_and_empty_outside(place, radius):
 
 
 @given(PLACE, ANGLE)
-def test_a_wall_has_no_sense(shape, place, angle):
-    """Turned by half it is the same; and the same backward as forward."""
+def test_a_footprint_is_the_same_for_opposite_wall_directions(shape, place, angle):
+    """It is invariant to half a turn, and to a mirror along the wall."""
     footprint = shape(place, angle)
     assert footprint == pytest.approx(shape(place, angle + np.pi), abs=1e-9)
     opposite = shape(np.array([SIZE - 1, SIZE - 1]) - place, angle)[::-1, ::-1]
@@ -105,7 +105,7 @@ def test_a_footprint_is_largest_at_the_contact_and_lies_along_the_wall(shape, an
     assert np.sin(axis - angle) == pytest.approx(0, abs=0.01)
 
 
-def test_an_edge_is_as_long_and_as_wide_as_told():
+def test_an_edge_has_the_given_length_and_width():
     footprint = np.asarray(SHAPES["edge"](np.array([[MIDDLE, MIDDLE]]), np.zeros(1)))[0]
     right, up = offsets((MIDDLE, MIDDLE))
     assert footprint == pytest.approx(np.exp(-(right**2) / (2 * 4.0**2) - up**2 / (2 * 1.2**2)), abs=1e-12)

@@ -27,26 +27,26 @@ direction = jax.jit(likelihoods.wall_direction, static_argnums=0)
 weighing = jax.jit(likelihoods.printed_likelihood, static_argnums=(0, 5))
 
 
-def printed(counted, evidence, cell, felt, alive=None):
+def printed(counted, evidence, cell, hits, alive=None):
     """[N] log-likelihoods; all whiskers report unless `alive` is given."""
-    return weighing(PRIOR, evidence, cell, felt, np.ones_like(felt) if alive is None else alive, counted)
+    return weighing(PRIOR, evidence, cell, hits, np.ones_like(hits) if alive is None else alive, counted)
 
 
-def by_loops(model, evidence, cell, felt, alive):
+def by_loops(model, evidence, cell, hits, alive):
     """Eq. 1 and 2 of one particle, written out."""
     chance = expit(evidence + logit(PRIOR))
     product = 1.0
     for whisker in np.flatnonzero(alive):
         ends = tuple(cell[whisker, -1])
         points = range(SEGMENTS)
-        if felt[whisker]:
+        if hits[whisker]:
             product *= chance[whisker, -1]
             if model != "literal":
                 points = range(SEGMENTS - 1)
         passed = set()
         for k in points:
             here = tuple(cell[whisker, k])
-            if model == "distinct" and (here in passed or (felt[whisker] and here == ends)):
+            if model == "distinct" and (here in passed or (hits[whisker] and here == ends)):
                 continue
             passed.add(here)
             product *= 1 - chance[whisker, k]
@@ -54,7 +54,7 @@ def by_loops(model, evidence, cell, felt, alive):
 
 
 def walls(model, chance, whiskers):
-    """How much likelier contacts on cells of some chance are than on unknown ones; shafts are unknown."""
+    """Likelihood ratio of contacts on cells of this chance and on unknown ones; shafts are unknown."""
     cell = np.tile(np.arange(SEGMENTS)[None, :, None], (whiskers, 1, 2)).astype(float)[None]
     evidence = np.zeros((2, whiskers, SEGMENTS))
     evidence[1, :, -1] = logit(chance) - logit(PRIOR)
@@ -83,9 +83,9 @@ def test_printed_likelihoods_are_the_products_of_eq_1_and_2(model, seed):
         _, index = np.unique(cell[k, c], axis=0, return_inverse=True)
         evidence[k, c] = evidence[k, c][index.ravel()]
     alive = stream.random(3) < 0.8
-    felt = (stream.random(3) < 0.5) & alive
-    logs = printed(MODELS[model], evidence, cell, felt, alive)
-    expected = [by_loops(model, evidence[k], cell[k], felt, alive) for k in range(2)]
+    hits = (stream.random(3) < 0.5) & alive
+    logs = printed(MODELS[model], evidence, cell, hits, alive)
+    expected = [by_loops(model, evidence[k], cell[k], hits, alive) for k in range(2)]
     assert np.exp(logs) == pytest.approx(expected)
 
 
@@ -130,14 +130,14 @@ def test_five_points_on_a_whisker_hit_three_to_four_cells():
 def test_certain_cells_leave_printed_likelihoods_finite(model, dtype):
     cell = np.arange(SEGMENTS, dtype=dtype)[None, None, :, None].repeat(2, 3)
     for sign in (-1, 1):
-        for felt in (False, True):
+        for hits in (False, True):
             evidence = np.full((1, 1, SEGMENTS), sign * 1e4, dtype)
-            logs = printed(MODELS[model], evidence, cell, np.array([felt]))
+            logs = printed(MODELS[model], evidence, cell, np.array([hits]))
             assert logs.dtype == dtype
             assert np.isfinite(logs).all()
 
 
-# What works better
+# Corrections to the paper
 
 
 @given(st.lists(EVIDENCE, min_size=4, max_size=4), st.lists(st.booleans(), min_size=4, max_size=4))
@@ -158,7 +158,7 @@ def test_contacts_multiply_chances_of_an_obstacle_or_of_a_surprise(evidence, amo
 
 
 @given(EVIDENCE, st.floats(0.01, 5))
-def test_the_surer_an_obstacle_the_likelier_a_contact_and_the_less_likely_none(evidence, more):
+def test_the_likelihood_of_a_contact_rises_with_the_chance_of_an_obstacle(evidence, more):
     both, one = np.array([[evidence], [evidence + more]]), np.ones(1, bool)
     emptier, fuller = free(CONFIG, both, one)
     assert emptier >= fuller
@@ -169,8 +169,8 @@ def test_the_surer_an_obstacle_the_likelier_a_contact_and_the_less_likely_none(e
         assert less < most
 
 
-def test_unexplored_space_says_next_to_nothing():
-    """Not what a map does that holds it for obstacles at 30 %."""
+def test_unexplored_space_carries_almost_no_evidence():
+    """In contrast to a map that gives it an obstacle probability of 30 %."""
     logs = free(CONFIG, np.zeros((1, 17)), np.ones(17, bool))
     assert -0.03 < logs[0] < 0
     assert free(CONFIG, np.zeros((1, 0)), np.zeros(0, bool)) == 0
@@ -192,7 +192,7 @@ def test_a_direction_is_likeliest_along_the_field_and_the_same_about_it(precisio
 
 
 @pytest.mark.parametrize("precision", [0.16, 1.0, 9.0])
-def test_where_no_wall_was_felt_every_direction_is_as_likely(precision):
+def test_without_a_wall_all_directions_are_equally_likely(precision):
     angle = np.linspace(-np.pi, np.pi, 73)
     logs = direction(CONFIG, np.zeros((73, 2)), angle, jnp.asarray(precision))
     assert logs == pytest.approx(0, abs=1e-12)
@@ -200,8 +200,8 @@ def test_where_no_wall_was_felt_every_direction_is_as_likely(precision):
 
 @pytest.mark.parametrize("length", [0.1, 1.0, 100.0])
 @pytest.mark.parametrize("precision", [0.01, 0.16, 0.5, 1.0, 3.0, 9.0])
-def test_knowing_a_direction_makes_no_contact_likelier_on_the_whole(length, precision):
-    """Averaged over all directions it is about 1, so that a map is not believed for having walls."""
+def test_a_known_direction_does_not_raise_the_mean_likelihood(length, precision):
+    """The mean over all directions is about 1, so that maps are not favoured for having walls."""
     angle = np.arange(360) * np.pi / 180
     field = np.tile([0.6 * length, 0.8 * length], (360, 1))
     likely = np.exp(direction(CONFIG, field, angle, jnp.asarray(precision)))
@@ -209,7 +209,7 @@ def test_knowing_a_direction_makes_no_contact_likelier_on_the_whole(length, prec
     assert likely.min() >= (1 - CONFIG.wall) - 1e-9
 
 
-def test_the_more_walls_agree_the_more_a_direction_says():
+def test_a_direction_carries_more_evidence_with_more_walls():
     angle = np.zeros(5)
     length = np.array([0.0, 0.2, 1.0, 5.0, 100.0])
     aligned = np.asarray(direction(CONFIG, np.stack([length, 0 * length], axis=1), angle, jnp.asarray(9.0)))

@@ -16,7 +16,7 @@ BACKEND = filter_of(settings(particles=COUNT), side=2.55)
 
 
 def steady(pose):
-    """What a filter says whose particles all are at one pose."""
+    """Estimate and evidence of a filter with all particles at one pose."""
     weights = np.full(COUNT, 1 / COUNT)
     proof = GridEvidence(np.arange(COUNT, dtype=np.int32), np.tile(pose, (COUNT, 1)), weights, COUNT, 0)
     return Estimate(np.asarray(pose, float), np.zeros(3), -1, -1, 0, False), proof
@@ -38,18 +38,18 @@ def random_steps(count, seed=0):
         )
 
 
-def told(steps):
+def map_of_steps(steps):
     grid = BACKEND.new_map()
     for step in steps:
         grid.update(*step)
     return grid
 
 
-def felt(*reports, pose=(0.0, 0.0, 0.0)):
-    return told((o, *steady(np.array(pose))) for o in reports)
+def map_of(*reports, pose=(0.0, 0.0, 0.0)):
+    return map_of_steps((o, *steady(np.array(pose))) for o in reports)
 
 
-def test_a_map_of_nothing_is_the_prior():
+def test_an_empty_map_is_the_prior():
     grid = BACKEND.new_map()
     assert grid.trajectory().shape == grid.online_trajectory().shape == (0, 3)
     assert grid.closures().shape == (0, 2)
@@ -59,9 +59,9 @@ def test_a_map_of_nothing_is_the_prior():
     assert grid.feedback() is None
 
 
-def test_obstacles_lie_where_they_were_felt():
+def test_obstacles_lie_at_the_contacts():
     for pose in ([0.0, 0.0, 0.0], [0.3, -0.4, 0.0], [0.3, -0.4, 2.0]):
-        probability = felt(report(0.05, touching=[1, 2]), pose=pose).occupancy()
+        probability = map_of(report(0.05, touching=[1, 2]), pose=pose).occupancy()
         c, s = np.cos(pose[2]), np.sin(pose[2])
         for tip in TIPS[1:3]:
             x, y = pose[0] + c * tip[0] - s * tip[1], pose[1] + s * tip[0] + c * tip[1]
@@ -70,40 +70,40 @@ def test_obstacles_lie_where_they_were_felt():
         assert probability.max() > 0.5
 
 
-def test_what_was_not_told_is_not_drawn():
-    plain = felt(report(0.05)).occupancy()
+def test_reports_without_evidence_are_not_drawn():
+    plain = map_of(report(0.05)).occupancy()
     for silent in (
         report(-0.05, touching=[0, 1], wall=(0.3, 0.0)),
         report(0.05, touching=[0, 1, 2, 3], dead=[0, 1, 2, 3], motion=MotionKind.BACK),
     ):
-        assert np.array_equal(felt(report(0.05), silent).occupancy(), plain)
-    dead = [felt(report(0.05, touching=touching, dead=[0])).occupancy() for touching in ([], [0])]
+        assert np.array_equal(map_of(report(0.05), silent).occupancy(), plain)
+    dead = [map_of(report(0.05, touching=touching, dead=[0])).occupancy() for touching in ([], [0])]
     assert np.array_equal(*dead)
     turning, numb = (
-        felt(o).occupancy() for o in (report(turn=0.1, touching=[0]), report(turn=0.1, dead=[0]))
+        map_of(o).occupancy() for o in (report(turn=0.1, touching=[0]), report(turn=0.1, dead=[0]))
     )
     assert np.array_equal(turning, numb)
 
 
-def test_what_is_no_number_is_not_drawn():
-    """The filter says that it left them out; so does its map."""
+def test_values_that_are_not_finite_are_not_drawn():
+    """The map ignores the values that the filter ignores."""
     plain = report(0.05, touching=[0, 1], wall=(0.3, 0.1))
-    expected = felt(report(0.05, dead=[0, 1])).occupancy()
+    expected = map_of(report(0.05, dead=[0, 1])).occupancy()
     odd = plain._replace(point=np.full((4, 2), np.nan))
-    assert felt(odd).occupancy() == pytest.approx(expected)
-    unknown = felt(plain._replace(wall_point=np.full(2, np.nan))).occupancy()
-    assert unknown == pytest.approx(felt(report(0.05, touching=[0, 1])).occupancy())
-    at_foot = felt(plain._replace(wall_point=np.zeros(2))).occupancy()
-    assert at_foot == pytest.approx(felt(report(0.05, touching=[0, 1])).occupancy())
+    assert map_of(odd).occupancy() == pytest.approx(expected)
+    unknown = map_of(plain._replace(wall_point=np.full(2, np.nan))).occupancy()
+    assert unknown == pytest.approx(map_of(report(0.05, touching=[0, 1])).occupancy())
+    at_foot = map_of(plain._replace(wall_point=np.zeros(2))).occupancy()
+    assert at_foot == pytest.approx(map_of(report(0.05, touching=[0, 1])).occupancy())
 
 
-def test_the_map_is_drawn_along_the_paths_that_survived():
+def test_the_map_is_drawn_along_the_surviving_paths():
     """A particle far off that dies out leaves nothing."""
     off = np.tile([0.8, 0.8, 0.0], (COUNT, 1))
     off[2] = [-0.5, 0.0, 0.0]
     estimate, proof = steady(np.zeros(3))
     survivor = proof._replace(poses=off, ancestor=np.full(COUNT, 2, np.int32))
-    grid = told([(report(0.05, touching=[1]), estimate, survivor), (report(0.05), estimate, proof)])
+    grid = map_of_steps([(report(0.05, touching=[1]), estimate, survivor), (report(0.05), estimate, proof)])
     assert grid.trajectory()[0] == pytest.approx([-0.5, 0, 0])
     x, y = TIPS[1] + [-0.5, 0]
     probability = grid.occupancy()
@@ -111,8 +111,8 @@ def test_the_map_is_drawn_along_the_paths_that_survived():
     assert probability[25 + 10 :, 25 + 10 :] == pytest.approx(BACKEND.config.prior)
 
 
-def test_files_hold_the_map_and_where_it_lies(tmp_path):
-    grid = felt(report(0.05, touching=[1, 2]))
+def test_files_hold_the_map_and_its_origin(tmp_path):
+    grid = map_of(report(0.05, touching=[1, 2]))
     for name, write in grid.files().items():
         write(tmp_path / name)
     with np.load(tmp_path / "grid.npz") as stored:
@@ -131,8 +131,8 @@ def test_files_hold_the_map_and_where_it_lies(tmp_path):
 def test_a_restored_map_continues_bit_for_bit(monkeypatch, levels, stop):
     monkeypatch.setattr(genealogy, "MAX_POSES", levels)
     steps = list(random_steps(50))
-    whole, second = told(steps), told(random_steps(3, seed=7))
-    second.restore({name: value.copy() for name, value in told(steps[:stop]).arrays().items()})
+    whole, second = map_of_steps(steps), map_of_steps(random_steps(3, seed=7))
+    second.restore({name: value.copy() for name, value in map_of_steps(steps[:stop]).arrays().items()})
     for step in steps[stop:]:
         second.update(*step)
     assert second.arrays().keys() == whole.arrays().keys()
@@ -144,9 +144,9 @@ def test_a_restored_map_continues_bit_for_bit(monkeypatch, levels, stop):
     assert whole.trajectory().shape == (50, 3)
 
 
-def test_looking_changes_nothing():
+def test_reading_the_map_does_not_change_it():
     steps = list(random_steps(20))
-    first, second = told(steps), BACKEND.new_map()
+    first, second = map_of_steps(steps), BACKEND.new_map()
     for step in steps:
         second.update(*step)
         second.trajectory(), second.occupancy(), second.online_trajectory(), second.arrays()

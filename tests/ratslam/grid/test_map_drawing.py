@@ -20,7 +20,7 @@ PRIOR = CONFIG.prior
 
 
 def marks(count, **some):
-    """Reports of whiskers that are all dead, but for what is said."""
+    """A log of reports of dead whiskers, with the given fields replaced."""
     plain = ContactLog(
         valid=np.ones(count, bool), contact=np.zeros((count, 4), bool), free=np.zeros((count, 4), bool),
         turning=np.zeros(count, bool), point=np.zeros((count, 4, 2)), wall=np.full((count, 2), np.nan),
@@ -34,10 +34,10 @@ def touching(count, whisker, point):
     return {"contact": contact, "point": points}
 
 
-def drawn(told, path=None, config=CONFIG, side=SIDE):
-    count = len(told.valid)
+def drawn(log, path=None, config=CONFIG, side=SIDE):
+    count = len(log.valid)
     return draw_occupancy(
-        config, create(), side, np.zeros((count, 3)) if path is None else np.asarray(path, float), told
+        config, create(), side, np.zeros((count, 3)) if path is None else np.asarray(path, float), log
     )
 
 
@@ -67,11 +67,11 @@ def test_contacts_are_drawn_at_the_whisker_tip(pose):
 
 
 def test_evidence_of_many_reports_adds_up_to_a_limit():
-    told = marks(2, **touching(2, 0, [0.25, 0.0]))
-    told.valid[1] = False
+    log = marks(2, **touching(2, 0, [0.25, 0.0]))
+    log.valid[1] = False
     twice = marks(3, **touching(3, 0, [0.25, 0.0]))
     twice.valid[1] = False
-    once, both = (drawn(m)[MIDDLE, MIDDLE + 5] for m in (told, twice))
+    once, both = (drawn(m)[MIDDLE, MIDDLE + 5] for m in (log, twice))
     assert logit(both) - logit(PRIOR) == pytest.approx(2 * (logit(once) - logit(PRIOR)))
     many = marks(100, **touching(100, 0, [0.25, 0.0]))
     many.valid[1::2] = False
@@ -84,7 +84,7 @@ def test_free_whiskers_and_the_body_clear_cells():
     middle = np.rint(create().points(np.array([0.5]))[:, 0] / CONFIG.cell + MIDDLE).astype(int)
     assert (grid[middle[:, 1], middle[:, 0]] < 0.05).all()
     assert grid.min() == pytest.approx(expit(-CONFIG.drawing.max_log_odds + logit(PRIOR)))
-    assert grid[:, : MIDDLE - 2] == pytest.approx(PRIOR)  # behind the robot nothing is known
+    assert grid[:, : MIDDLE - 2] == pytest.approx(PRIOR)  # behind the robot the map is unexplored
     assert grid.max() <= PRIOR + 1e-12
     body = drawn(marks(1), config=GridConfig())
     assert np.unravel_index(body.argmin(), body.shape) == (MIDDLE, MIDDLE)
@@ -92,24 +92,24 @@ def test_free_whiskers_and_the_body_clear_cells():
 
 
 def test_a_wall_is_found_after_many_free_reports():
-    """Contacts where 20 reports found nothing: the clamp lets few of them win."""
+    """Contacts at a place of 20 free reports: the clamp makes a few contacts sufficient."""
     count, tip = 20, create().points(np.array([0.5]))[0, 0]
     met = 10
     free = np.zeros((count + met, 4), bool)
     free[:count] = True
-    told = marks(count + met, free=free, **touching(count + met, 0, tip))
-    told.contact[:count] = False
-    told.valid[count + 1 :: 2] = False
+    log = marks(count + met, free=free, **touching(count + met, 0, tip))
+    log.contact[:count] = False
+    log.valid[count + 1 :: 2] = False
     row, column = np.rint(tip[::-1] / CONFIG.cell + MIDDLE).astype(int)
-    assert drawn(ContactLog(*(rows[:count] for rows in told)))[row, column] < 0.05
-    assert drawn(told)[row, column] > 0.5
+    assert drawn(ContactLog(*(rows[:count] for rows in log)))[row, column] < 0.05
+    assert drawn(log)[row, column] > 0.5
 
 
 @pytest.mark.parametrize("angle", np.radians([0, 30, 90, 200]))
 def test_a_wall_is_drawn_both_ways_from_the_contact(angle):
     normal = np.array([np.cos(angle), np.sin(angle)])
-    told = marks(1, wall=0.3 * normal[None], **touching(1, 1, 0.2 * normal))
-    grid = logit(drawn(told)) - logit(PRIOR)
+    log = marks(1, wall=0.3 * normal[None], **touching(1, 1, 0.2 * normal))
+    grid = logit(drawn(log)) - logit(PRIOR)
     right, up = np.arange(SIDE)[None] * CONFIG.cell, np.arange(SIDE)[:, None] * CONFIG.cell
     right, up = right - MIDDLE * CONFIG.cell - 0.3 * normal[0], up - MIDDLE * CONFIG.cell - 0.3 * normal[1]
     along, across = up * normal[0] - right * normal[1], right * normal[0] + up * normal[1]
@@ -123,26 +123,26 @@ def test_a_wall_is_drawn_both_ways_from_the_contact(angle):
 
 def test_a_wall_replaces_the_blobs_of_its_contacts():
     """HIT1, then HIT2 with the wall: no blob is left at HIT1; after ABORT there is one."""
-    told = marks(3, **touching(3, 1, TIPS[1]))
-    told.valid[2] = False
-    abort = drawn(told)
+    log = marks(3, **touching(3, 1, TIPS[1]))
+    log.valid[2] = False
+    abort = drawn(log)
     assert abort.max() > 0.5
-    told.contact[1, 2], told.point[1, 2] = True, TIPS[2]
-    told.wall[1] = [TIPS[1, 0], 0.0]
-    hit = drawn(told)
-    alone = marks(1, wall=told.wall[1:2], contact=told.contact[1:2], point=told.point[1:2])
+    log.contact[1, 2], log.point[1, 2] = True, TIPS[2]
+    log.wall[1] = [TIPS[1, 0], 0.0]
+    hit = drawn(log)
+    alone = marks(1, wall=log.wall[1:2], contact=log.contact[1:2], point=log.point[1:2])
     assert hit == pytest.approx(drawn(alone))
 
 
 def test_a_wall_keeps_the_blob_of_an_earlier_contact():
     """One that ended before, also where the robot never backs off."""
-    told = marks(3, **touching(3, 1, TIPS[1]))
-    told.contact[1] = False
-    told.wall[2] = [0.25, 0.0]
+    log = marks(3, **touching(3, 1, TIPS[1]))
+    log.contact[1] = False
+    log.wall[2] = [0.25, 0.0]
     path = np.array([[-0.6, 0.0, 0.0], [-0.3, 0.0, 0.0], [0.2, 0.0, 0.0]])
     place = path[0, :2] + TIPS[1]
     column, row = np.rint(place / CONFIG.cell + MIDDLE).astype(int)
-    assert drawn(told, path)[row, column] > 0.5
+    assert drawn(log, path)[row, column] > 0.5
 
 
 def test_continued_contacts_and_contacts_in_turns_leave_no_blob():
@@ -154,18 +154,18 @@ def test_continued_contacts_and_contacts_in_turns_leave_no_blob():
 
 
 def test_invalid_reports_leave_the_map_unchanged():
-    told = marks(4, free=np.ones((4, 4), bool), wall=np.full((4, 2), 0.2), **touching(4, 0, [0.25, 0.1]))
-    assert drawn(told._replace(valid=np.zeros(4, bool)), config=GridConfig()) == pytest.approx(PRIOR)
+    log = marks(4, free=np.ones((4, 4), bool), wall=np.full((4, 2), 0.2), **touching(4, 0, [0.25, 0.1]))
+    assert drawn(log._replace(valid=np.zeros(4, bool)), config=GridConfig()) == pytest.approx(PRIOR)
 
 
 @pytest.mark.parametrize("side", [1, 4, 50])
 def test_contacts_outside_the_map_are_dropped(side):
     path = [[3.0, 0.0, 0.0], [-1e3, 1e3, 1.0], [1e9, 0.0, 0.0], [0.0, 0.0, 0.0]]
-    told = marks(4, free=np.ones((4, 4), bool), wall=np.tile([0.3, 0.0], (4, 1)), **touching(4, 0, TIPS[0]))
-    grid = drawn(told, path, side=side)
+    log = marks(4, free=np.ones((4, 4), bool), wall=np.tile([0.3, 0.0], (4, 1)), **touching(4, 0, TIPS[0]))
+    grid = drawn(log, path, side=side)
     assert grid.shape == (side, side)
     assert np.isfinite(grid).all()
-    assert drawn(ContactLog(*(rows[:3] for rows in told)), path[:3], side=side) == pytest.approx(PRIOR)
+    assert drawn(ContactLog(*(rows[:3] for rows in log)), path[:3], side=side) == pytest.approx(PRIOR)
 
 
 @given(
@@ -176,7 +176,7 @@ def test_contacts_outside_the_map_are_dropped(side):
 )
 def test_any_contacts_give_a_map_of_probabilities(seed, chances, most, side):
     random, count = np.random.default_rng(seed), 12
-    told = ContactLog(
+    log = ContactLog(
         random.random(count) < 0.8, random.random((count, 4)) < 0.3, random.random((count, 4)) < 0.6,
         random.random(count) < 0.2, random.normal(0, 0.2, (count, 4, 2)),
         np.where(random.random((count, 1)) < 0.5, np.nan, random.normal(0, 0.2, (count, 2))),
@@ -184,5 +184,5 @@ def test_any_contacts_give_a_map_of_probabilities(seed, chances, most, side):
     contact, free, body = chances
     some = {"contact": contact, "free": free, "body": body, "max_log_odds": most}
     config = GridConfig(body=0.12, drawing=PAPER.model_copy(update=some))
-    grid = drawn(told, np.cumsum(random.normal(0, 0.1, (count, 3)), axis=0), config=config, side=side)
+    grid = drawn(log, np.cumsum(random.normal(0, 0.1, (count, 3)), axis=0), config=config, side=side)
     assert ((grid > 0) & (grid < 1)).all()

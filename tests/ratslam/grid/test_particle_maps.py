@@ -38,8 +38,8 @@ def filled(side=SIDE, dtype=float, seed=0):
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("layer", range(LAYERS))
-def test_cells_are_read_as_they_are(layer, dtype):
-    """But for the last row and column, the rim, which counts as outside."""
+def test_cell_centres_are_read_exactly(layer, dtype):
+    """Except in the last row and column, the rim, which counts as outside."""
     maps = filled(dtype=dtype)
     rows, columns = np.mgrid[: SIDE - 1, : SIDE - 1]
     cells = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(dtype)  # x first
@@ -60,14 +60,14 @@ def test_between_cells_is_bilinear(dtype):
 
 
 @given(st.tuples(*[st.floats(allow_nan=True, width=32)] * 2))
-def test_nothing_is_known_outside(place):
+def test_places_outside_are_unexplored(place):
     x, y = place
     value = float(read(np.ones((1, LAYERS, SIDE, SIDE)), 0, np.array([[place]]))[0, 0])
     inside = 0 <= x < SIDE - 1 and 0 <= y < SIDE - 1
     assert value == pytest.approx(1.0 if inside else 0.0)
 
 
-def test_places_are_told_from_the_middle_of_the_map():
+def test_places_are_relative_to_the_middle_of_the_map():
     point = np.array([[0.0, 0.0], [0.1, -0.05]])
     assert particle_maps.to_cells(point, 0.05, 51) == pytest.approx(np.array([[25, 25], [27, 24]]))
     # In a map of even side the middle lies between cells.
@@ -82,7 +82,7 @@ def test_places_are_told_from_the_middle_of_the_map():
 @pytest.mark.parametrize("side", [1, 5, WINDOW - 1, WINDOW, WINDOW + 1, 40])
 @pytest.mark.parametrize("size", [5, WINDOW, 22])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_windows_lie_inside_the_map_and_hold_what_they_are_about(side, size, dtype):
+def test_windows_lie_inside_the_map_and_contain_their_place(side, size, dtype):
     stream = np.random.default_rng(side)
     near, far = (
         stream.uniform(0, side - 1, (50, 2)),
@@ -94,7 +94,7 @@ def test_windows_lie_inside_the_map_and_hold_what_they_are_about(side, size, dty
     corner = np.asarray(windows.corner)
     assert (corner >= 0).all()
     assert (corner + windows.size <= side).all()
-    # As far to one side as to the other, but at the rim of the map.
+    # The place is in the middle, except at the rim of the map.
     left, right = near - corner[:50], corner[:50] + windows.size - 1 - near
     room = windows.size // 2 - 1
     assert ((left >= room) | (corner[:50] == 0)).all()
@@ -103,7 +103,7 @@ def test_windows_lie_inside_the_map_and_hold_what_they_are_about(side, size, dty
 
 @pytest.mark.parametrize("size", [6, WINDOW, SIDE])
 @pytest.mark.parametrize("layer", range(LAYERS))
-def test_what_is_put_is_cut_and_nothing_else_changes(size, layer):
+def test_written_windows_are_read_back_and_nothing_else_changes(size, layer):
     maps = filled()
     corner = np.asarray(around(np.random.default_rng(2).uniform(-5, SIDE + 5, (COUNT, 2)), SIDE, size))
     before = cut(maps, corner, size, layer)
@@ -130,7 +130,7 @@ def test_places_in_windows_are_places_in_the_map():
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_a_blank_map_knows_nothing(dtype):
+def test_an_empty_map_has_no_evidence(dtype):
     maps = particle_maps.empty_maps(COUNT, SIDE, dtype)
     assert maps.shape == (COUNT, LAYERS, SIDE, SIDE)
     assert maps.dtype == dtype

@@ -39,8 +39,8 @@ def placed(offspring):
     return jax.tree.map(np.asarray, placing(jnp.asarray(offspring, jnp.int32)))
 
 
-def copies(who):
-    return np.bincount(who.ancestor, minlength=len(who.ancestor))
+def copies(resampling):
+    return np.bincount(resampling.ancestor, minlength=len(resampling.ancestor))
 
 
 def swarm(poses, dtype=float, session=0.0, weight=0.0):
@@ -55,7 +55,7 @@ def odometry(dx, dy, dtheta, dtype=float):
     return Odometry(*(jnp.asarray(value, dtype) for value in (dx, dy, dtheta, 0.5)))
 
 
-# Drawing anew
+# Resampling
 
 
 @given(WEIGHTS.filter(any), st.integers(0, 2**32 - 1))
@@ -70,18 +70,18 @@ def test_systematic_copies_are_within_one_of_the_share(weights, seed):
 @given(st.lists(st.integers(0, COUNT - 1), min_size=COUNT, max_size=COUNT))
 def test_survivors_stay_and_the_others_are_replaced(parents):
     offspring = np.bincount(parents, minlength=COUNT)
-    who = placed(offspring)
+    resampling = placed(offspring)
     slots = np.arange(COUNT)
-    assert np.array_equal(copies(who), offspring)
-    assert np.array_equal(who.ancestor == slots, offspring > 0)
-    assert who.copies == (offspring == 0).sum()
-    source, target = who.source[: who.copies], who.target[: who.copies]
+    assert np.array_equal(copies(resampling), offspring)
+    assert np.array_equal(resampling.ancestor == slots, offspring > 0)
+    assert resampling.copies == (offspring == 0).sum()
+    source, target = resampling.source[: resampling.copies], resampling.target[: resampling.copies]
     assert np.array_equal(target, slots[offspring == 0])
-    assert np.array_equal(who.ancestor[target], source)
+    assert np.array_equal(resampling.ancestor[target], source)
 
 
 @given(WEIGHTS.filter(any), st.integers(0, 2**32 - 1), st.sampled_from([SYSTEMATIC, MULTINOMIAL]))
-def test_what_has_no_share_has_no_copies(weights, seed, config):
+def test_particles_without_weight_have_no_copies(weights, seed, config):
     share = np.array(weights) / sum(weights)
     assert not copies(drawn(config, share, seed))[share == 0].any()
 
@@ -91,10 +91,10 @@ def test_rows_are_copied_from_the_ancestors(shape):
     stream = np.random.default_rng(0)
     rows = stream.random(shape)
     for seed in range(20):
-        who = drawn(SYSTEMATIC, stream.dirichlet(np.full(COUNT, 0.2)), seed)
-        assert who.copies > 0
-        after = jax.jit(particles.copy_rows)(rows, who)
-        assert np.array_equal(after, rows[who.ancestor])
+        resampling = drawn(SYSTEMATIC, stream.dirichlet(np.full(COUNT, 0.2)), seed)
+        assert resampling.copies > 0
+        after = jax.jit(particles.copy_rows)(rows, resampling)
+        assert np.array_equal(after, rows[resampling.ancestor])
 
 
 @pytest.mark.parametrize("config", [SYSTEMATIC, MULTINOMIAL], ids=["systematic", "multinomial"])
@@ -103,9 +103,9 @@ def test_one_heavy_particle_takes_all(config, heavy):
     share = np.zeros(COUNT)
     share[heavy] = 1
     for seed in range(10):
-        who = drawn(config, share, seed)
-        assert (who.ancestor == heavy).all()
-        assert who.copies == COUNT - 1
+        resampling = drawn(config, share, seed)
+        assert (resampling.ancestor == heavy).all()
+        assert resampling.copies == COUNT - 1
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -113,13 +113,13 @@ def test_one_heavy_particle_takes_all(config, heavy):
 def test_equal_weights_change_nothing(count, dtype):
     share = np.asarray(particles.normalised_weights(jnp.full(count, -3.0, dtype)))
     for seed in range(10):
-        who = drawn(SYSTEMATIC, share, seed)
-        assert who.copies == 0
-        assert np.array_equal(who.ancestor, np.arange(count))
+        resampling = drawn(SYSTEMATIC, share, seed)
+        assert resampling.copies == 0
+        assert np.array_equal(resampling.ancestor, np.arange(count))
 
 
 def test_a_last_particle_of_weight_0_is_never_drawn():
-    """Among so many that in float32 the last point of a systematic draw is often rounded up to 1."""
+    """With so many particles that in float32 the last systematic point is often rounded up to 1."""
     count = 100_000
     share = particles.normalised_weights(jnp.zeros(count, np.float32).at[-1].set(-jnp.inf))
     assert share[-1] == 0
@@ -135,8 +135,8 @@ def test_drawing_is_unbiased(config):
     within 4.5 standard errors of 3 % (heaviest particle)."""
     share, draws = np.array([0.01, 0.03, 0.05, 0.08, 0.1, 0.1, 0.12, 0.15, 0.16, 0.2]), 4000
     keys = jax.random.split(jax.random.key(3), draws)
-    who = jax.jit(jax.vmap(partial(particles.resample, config, share)))(keys)
-    counts = np.stack([np.bincount(row, minlength=10) for row in np.asarray(who.ancestor)])
+    resampling = jax.jit(jax.vmap(partial(particles.resample, config, share)))(keys)
+    counts = np.stack([np.bincount(row, minlength=10) for row in np.asarray(resampling.ancestor)])
     spread = np.sqrt(10 * share * (1 - share) / draws)
     assert (np.abs(counts.mean(axis=0) - 10 * share) <= 4.5 * spread).all()
     assert (counts.sum(axis=1) == 10).all()
@@ -153,8 +153,8 @@ def test_copies_differ_a_little_and_survivors_not_at_all():
     before = before._replace(
         move=before.session + jnp.arange(count, dtype=float)[:, None], weight=-before.pose[:, 0]
     )
-    who = placed(np.where(np.arange(count) == 7, count, 0))
-    after = jax.jit(particles.copy_particles, static_argnums=0)(config, before, who, jax.random.key(0))
+    resampling = placed(np.where(np.arange(count) == 7, count, 0))
+    after = jax.jit(particles.copy_particles, static_argnums=0)(config, before, resampling, jax.random.key(0))
     before, after = (jax.tree.map(np.asarray, group) for group in (before, after))
     assert np.array_equal(after.pose[7], before.pose[7])
     assert np.array_equal(after.session[7], before.session[7])
@@ -166,9 +166,9 @@ def test_copies_differ_a_little_and_survivors_not_at_all():
 
 
 def test_identity_makes_no_copies():
-    who = particles.identity(COUNT)
-    assert who.copies == 0
-    assert np.array_equal(who.ancestor, np.arange(COUNT))
+    resampling = particles.identity(COUNT)
+    assert resampling.copies == 0
+    assert np.array_equal(resampling.ancestor, np.arange(COUNT))
 
 
 # Weights
@@ -176,7 +176,7 @@ def test_identity_makes_no_copies():
 
 @settings(max_examples=50)
 @given(st.lists(st.floats(-1e4, 1e4), min_size=COUNT, max_size=COUNT), st.floats(-1e3, 1e3))
-def test_shares_are_a_distribution_whatever_is_added_to_all(logs, shift):
+def test_weights_are_a_distribution_independent_of_a_common_offset(logs, shift):
     share = particles.normalised_weights(jnp.asarray(logs))
     assert float(share.sum()) == pytest.approx(1)
     assert share == pytest.approx(
@@ -199,14 +199,14 @@ def test_likelihoods_multiply_weights():
 @pytest.mark.parametrize(
     "odd", [[-np.inf] * COUNT, [np.nan] * COUNT, [0.0] * 15 + [np.nan], [np.inf] * COUNT]
 )
-def test_vanished_weights_are_kept_and_flagged(odd):
+def test_vanished_weights_are_left_unchanged_and_flagged(odd):
     before = swarm(np.zeros((COUNT, 3)))._replace(weight=-jnp.arange(COUNT, dtype=float))
     after, vanished = weighed(before, jnp.asarray(odd))
     assert vanished
     assert np.array_equal(after.weight, before.weight)
 
 
-def test_one_particle_that_explains_what_was_felt_is_enough():
+def test_one_particle_that_explains_the_contacts_is_enough():
     likelihood = np.full(COUNT, -np.inf)
     likelihood[5] = -1e6
     after, vanished = weighed(swarm(np.zeros((COUNT, 3))), likelihood)
@@ -240,7 +240,7 @@ def test_particles_that_agree_have_no_spread(dtype):
 
 
 @given(st.lists(st.tuples(*[st.floats(-1, 1)] * 3), min_size=1, max_size=8))
-def test_odometry_believed_is_composed(motions):
+def test_odometry_without_noise_is_composed(motions):
     config = DriftConfig(**STEADY)
     expected, group = np.array([0.3, -0.2, 2.5]), swarm([[0.3, -0.2, 2.5]] * 2)
     for k, motion in enumerate(motions):
@@ -291,7 +291,7 @@ def test_scale_errors_persist_over_session_movement_or_step():
         assert np.std(scale, axis=0) == pytest.approx(sd, rel=error)
 
 
-def test_noise_of_each_step_has_the_scale_told():
+def test_noise_of_each_step_has_the_configured_scale():
     """Size: 8 means and variances of 40 000 particles within 4.5 standard errors: 1e-4."""
     count = 40_000
     config = DriftConfig(session=0.0, move=0.0, step=0.02, heading=5e-4)
@@ -304,11 +304,11 @@ def test_noise_of_each_step_has_the_scale_told():
         )
 
     straight, turn, still = after(0.5, 0.0), after(0.0, -0.8), after(0.0, 0.0)
-    told = [
+    moments = [
         (straight[:, 0], 0.5, 0.01), (straight[:, 2], 0.0, 5e-4), (straight[:, 1], 0.0, 0.5 * 2.5e-4),
         (turn[:, 2], -0.8, np.hypot(0.016, 5e-4)), (still[:, 2], 0.0, 5e-4),
     ]  # fmt: skip
-    for value, mean, sd in told:
+    for value, mean, sd in moments:
         assert value.mean() == pytest.approx(mean, abs=error * sd)
         assert value.std() == pytest.approx(sd, rel=error)
     assert not turn[:, :2].any()
