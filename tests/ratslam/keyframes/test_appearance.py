@@ -1,4 +1,4 @@
-"""Laws of the looks of frames: what fits, by what measure, and that all of it is kept."""
+"""Laws of the appearance of keyframes: metric, misfit and restored state."""
 
 from __future__ import annotations
 
@@ -50,40 +50,40 @@ def no_pairs():
 
 
 def seen(view=None, label=-1, dead=()):
-    told = observation(Odometry(0.1, 0.0, 0.0, 1.0), view, view_shape=SHAPE, label=label, whiskers=SIZE)
+    seen = observation(Odometry(0.1, 0.0, 0.0, 1.0), view, view_shape=SHAPE, label=label, whiskers=SIZE)
     reports = np.ones(SIZE, bool)
     reports[list(dead)] = False
-    return told._replace(alive=reports)
+    return seen._replace(alive=reports)
 
 
-def felt(stream, count):
+def images(stream, count):
     """[count, 3, 6, 1] whisker images."""
     return stream.random((count, *SHAPE)) * (stream.random((count, *SHAPE)) < 0.4)
 
 
 def touched(views, known=no_pairs, dead=()):
-    """Frames of these images, learned from as they came."""
-    looks = WhiskerAppearance(PIXELS, TEMPER)
+    """The appearance of frames with these images, updated after each."""
+    frames = WhiskerAppearance(PIXELS, TEMPER)
     for view in views:
-        looks.append(seen(view, dead=dead), 0.0, 0.1)
-        looks.learn(SILENT, known)
-    return looks
+        frames.append(seen(view, dead=dead), 0.0, 0.1)
+        frames.learn(SILENT, known)
+    return frames
 
 
 def viewed(views, errors=(), fan=None):
-    looks = ViewAppearance(SIZE, fan)
+    frames = ViewAppearance(SIZE, fan)
     for view in views:
-        looks.append(seen(view), 0.0, 0.1)
+        frames.append(seen(view), 0.0, 0.1)
     for k in range(0, len(errors), 20):
-        looks.learn(SimpleNamespace(background=np.asarray(errors[k : k + 20])), no_pairs)
-    return looks
+        frames.learn(SimpleNamespace(background=np.asarray(errors[k : k + 20])), no_pairs)
+    return frames
 
 
 def labelled(labels):
-    looks = LabelAppearance()
+    frames = LabelAppearance()
     for label in labels:
-        looks.append(seen(label=label), 0.0, 0.1)
-    return looks
+        frames.append(seen(label=label), 0.0, 0.1)
+    return frames
 
 
 def alone(near):
@@ -93,27 +93,27 @@ def alone(near):
 # Touch
 
 
-def test_whiskers_are_compared_once_there_is_enough_to_learn_from():
-    asked = []
-    looks = WhiskerAppearance(PIXELS, TEMPER)
-    for k, view in enumerate(felt(np.random.default_rng(0), 200), start=1):
-        looks.append(seen(view), 0.0, 0.1)
+def test_whiskers_are_compared_after_the_first_estimate():
+    calls = []
+    frames = WhiskerAppearance(PIXELS, TEMPER)
+    for k, view in enumerate(images(np.random.default_rng(0), 200), start=1):
+        frames.append(seen(view), 0.0, 0.1)
 
         def known(k=k):
-            asked.append(k)
+            calls.append(k)
             return no_pairs()
 
-        assert looks.learn(SILENT, known) == NO_ESTIMATE
-        measure = looks.metric()
+        assert frames.learn(SILENT, known) == NO_ESTIMATE
+        measure = frames.metric()
         assert measure.angle == np.pi
         assert measure.scale == (NEW_IMAGE_LOG_ODDS if k >= MIN_KEYFRAMES else 0.0)
         assert measure.likeness.size == (3 * LEVELS**2 if k >= MIN_KEYFRAMES else 0)
-        assert (looks.misfit(0, *alone(0)) == NEUTRAL_IMAGE_MISFIT) == (k < MIN_KEYFRAMES)
-    assert asked == list(range(LOG_ODDS_INTERVAL, 201, LOG_ODDS_INTERVAL))
+        assert (frames.misfit(0, *alone(0)) == NEUTRAL_IMAGE_MISFIT) == (k < MIN_KEYFRAMES)
+    assert calls == list(range(LOG_ODDS_INTERVAL, 201, LOG_ODDS_INTERVAL))
 
 
-def test_what_is_learned_is_what_images_and_pairs_tell():
-    views = felt(np.random.default_rng(0), 2 * LOG_ODDS_INTERVAL)
+def test_log_odds_follow_from_images_and_pairs():
+    views = images(np.random.default_rng(0), 2 * LOG_ODDS_INTERVAL)
     frame, match = np.arange(50, 70), np.arange(10, 30)
     about = np.arange(20) % 3 == 0
     likeness = touched(views, lambda: ConfirmedPairs(frame[:0], match[:0], about[:0])).metric().likeness
@@ -124,66 +124,66 @@ def test_what_is_learned_is_what_images_and_pairs_tell():
 
     then = level[match].copy()
     then[about] = then[about][:, PIXELS.opposite]
-    looks = WhiskerAppearance(PIXELS, TEMPER)
+    frames = WhiskerAppearance(PIXELS, TEMPER)
     for view in views:
-        looks.append(seen(view), 0.0, 0.1)
-    looks.learn(SILENT, lambda: ConfirmedPairs(frame, match, about))
+        frames.append(seen(view), 0.0, 0.1)
+    frames.learn(SILENT, lambda: ConfirmedPairs(frame, match, about))
     assert np.array_equal(
-        looks.metric().likeness, log_odds_table(known, estimate_variation(level[frame], then))
+        frames.metric().likeness, log_odds_table(known, estimate_variation(level[frame], then))
     )
 
 
 @given(seeds)
 @settings(max_examples=20)
-def test_nothing_fits_an_image_as_the_same_one_does(seed):
-    views = felt(np.random.default_rng(seed), LOG_ODDS_INTERVAL)
+def test_an_image_fits_itself_best(seed):
+    views = images(np.random.default_rng(seed), LOG_ODDS_INTERVAL)
     views[7] = views[3]
-    looks = touched(views)
-    misfits = [looks.misfit(7, *alone(k)) for k in range(len(views))]
+    frames = touched(views)
+    misfits = [frames.misfit(7, *alone(k)) for k in range(len(views))]
     assert misfits[3] == misfits[7] == min(misfits)
     assert all(misfit > misfits[3] for k, misfit in enumerate(misfits) if (views[k] != views[3]).any())
     assert min(misfits) >= 0
 
 
-def test_the_more_pixels_differ_the_worse_it_fits():
-    views = felt(np.random.default_rng(0), LOG_ODDS_INTERVAL)
+def test_the_misfit_grows_with_the_number_of_different_pixels():
+    views = images(np.random.default_rng(0), LOG_ODDS_INTERVAL)
     for k in range(10):
         views[k] = views[0]
-        views[k].reshape(-1)[:k] = 1 - np.ceil(views[0].reshape(-1)[:k])  # touching is silent and the like
-    looks = touched(views)
-    misfits = [looks.misfit(0, *alone(k)) for k in range(10)]
+        views[k].reshape(-1)[:k] = 1 - np.ceil(views[0].reshape(-1)[:k])  # contact becomes silent, and so on
+    frames = touched(views)
+    misfits = [frames.misfit(0, *alone(k)) for k in range(10)]
     assert misfits == sorted(misfits)
     assert misfits[9] > 2 * misfits[0]
 
 
 @given(seeds, st.lists(st.integers(0, LOG_ODDS_INTERVAL - 1), min_size=1, max_size=8))
 @settings(max_examples=20)
-def test_a_frame_fits_where_one_of_its_neighbours_fits(seed, near):
+def test_the_misfit_is_that_of_the_best_neighbour(seed, near):
     stream = np.random.default_rng(seed)
-    looks = touched(felt(stream, LOG_ODDS_INTERVAL))
+    frames = touched(images(stream, LOG_ODDS_INTERVAL))
     near, about = np.array(near), stream.random(len(near)) < 0.5
-    each = [looks.misfit(5, near[k : k + 1], about[k : k + 1]) for k in range(len(near))]
-    assert looks.misfit(5, near, about) == pytest.approx(min(each), rel=1e-12)
+    each = [frames.misfit(5, near[k : k + 1], about[k : k + 1]) for k in range(len(near))]
+    assert frames.misfit(5, near, about) == pytest.approx(min(each), rel=1e-12)
 
 
 @given(seeds)
 @settings(max_examples=20)
-def test_a_frame_turned_about_fits_as_what_it_would_feel(seed):
-    views = felt(np.random.default_rng(seed), LOG_ODDS_INTERVAL)
+def test_a_reversed_frame_fits_by_its_opposite_pixels(seed):
+    views = images(np.random.default_rng(seed), LOG_ODDS_INTERVAL)
     views[8] = views[3].reshape(-1)[PIXELS.opposite].reshape(SHAPE)
-    looks = touched(views)
-    turned = looks.misfit(8, np.array([3]), np.array([True]))
-    assert turned == looks.misfit(8, *alone(8))
+    frames = touched(views)
+    turned = frames.misfit(8, np.array([3]), np.array([True]))
+    assert turned == frames.misfit(8, *alone(8))
     for k in (0, 1, 2):
-        about = looks.misfit(8, np.array([k]), np.array([True]))
-        there = looks.misfit(3, *alone(k))
-        assert about == pytest.approx(there, rel=1e-9)  # both turned about is neither
+        about = frames.misfit(8, np.array([k]), np.array([True]))
+        there = frames.misfit(3, *alone(k))
+        assert about == pytest.approx(there, rel=1e-9)  # two half turns are none
 
 
 def test_dead_whiskers_neither_fit_nor_misfit():
     stream = np.random.default_rng(0)
     dead = (1, 8, 15)
-    views = felt(stream, LOG_ODDS_INTERVAL)
+    views = images(stream, LOG_ODDS_INTERVAL)
     other = views.copy()
     other.reshape(LOG_ODDS_INTERVAL, -1)[:, list(dead)] = stream.random((LOG_ODDS_INTERVAL, 3))
     one, two = (touched(rows, dead=dead) for rows in (views, other))
@@ -196,22 +196,22 @@ def test_dead_whiskers_neither_fit_nor_misfit():
 
 
 @pytest.mark.parametrize("kind", ["touch", "views", "labels"])
-def test_where_there_is_nothing_to_compare_with_there_is_doubt(kind):
-    views = felt(np.random.default_rng(0), LOG_ODDS_INTERVAL)
-    looks = {"touch": touched(views), "views": viewed(views), "labels": labelled([1] * 5)}[kind]
+def test_without_neighbours_the_misfit_is_neutral(kind):
+    views = images(np.random.default_rng(0), LOG_ODDS_INTERVAL)
+    frames = {"touch": touched(views), "views": viewed(views), "labels": labelled([1] * 5)}[kind]
     none = np.zeros(0, int)
-    assert looks.misfit(3, none, none.astype(bool)) == (
-        NEUTRAL_IMAGE_MISFIT if isinstance(looks, WhiskerAppearance) else NEUTRAL_MISFIT
+    assert frames.misfit(3, none, none.astype(bool)) == (
+        NEUTRAL_IMAGE_MISFIT if isinstance(frames, WhiskerAppearance) else NEUTRAL_MISFIT
     )
 
 
-def test_whiskers_that_nobody_speaks_of_report():
+def test_whiskers_without_a_flag_count_as_alive():
     plain = observation(Odometry(0.1, 0.0, 0.0, 1.0), np.ones((3, 6, 2)))
     assert plain.alive.shape == (0,)
     assert live_pixels(plain).all()
     assert live_pixels(plain).shape == (3, 6, 2)
-    told = plain._replace(alive=np.arange(18) != 7)
-    assert np.array_equal(np.argwhere(~live_pixels(told)), [[1, 1, 0], [1, 1, 1]])
+    partial = plain._replace(alive=np.arange(18) != 7)
+    assert np.array_equal(np.argwhere(~live_pixels(partial)), [[1, 1, 0], [1, 1, 1]])
 
 
 # Views
@@ -222,15 +222,15 @@ def test_whiskers_that_nobody_speaks_of_report():
 def test_views_misfit_by_their_error_in_scales(seed):
     stream = np.random.default_rng(seed)
     views = stream.random((30, *SHAPE))
-    looks = viewed(views, stream.uniform(0.1, 0.5, MIN_ERRORS))
-    scale = looks.metric().scale
+    frames = viewed(views, stream.uniform(0.1, 0.5, MIN_ERRORS))
+    scale = frames.metric().scale
     assert 0.1 <= scale <= 0.2
     for frame in (0, 11, 29):
         near = stream.integers(0, 30, 4)
         errors = [np.abs(views[k] - views[frame]).mean() for k in near]
         expected = min(min(errors) / (2 * scale), 1.0)
-        assert looks.misfit(frame, near, stream.random(4) < 0.5) == pytest.approx(expected, rel=1e-12)
-    assert looks.misfit(11, *alone(11)) == 0
+        assert frames.misfit(frame, near, stream.random(4) < 0.5) == pytest.approx(expected, rel=1e-12)
+    assert frames.misfit(11, *alone(11)) == 0
 
 
 def test_a_scale_needs_enough_errors_and_grows_with_the_sensors_unit():
@@ -244,15 +244,15 @@ def test_a_scale_needs_enough_errors_and_grows_with_the_sensors_unit():
     assert viewed(views, np.zeros(MIN_ERRORS)).metric().scale == 0
 
 
-def test_views_are_kept_as_recall_compares_them():
-    looks = ViewAppearance(SIZE, None, lambda view: view / 2)
+def test_views_are_stored_as_recall_compares_them():
+    frames = ViewAppearance(SIZE, None, lambda view: view / 2)
     views = np.random.default_rng(0).random((3, *SHAPE))
     for view in views:
-        looks.append(seen(view), 0.0, 0.1)
-    assert np.array_equal(looks.arrays()["view"], views.reshape(3, -1) / 2)
+        frames.append(seen(view), 0.0, 0.1)
+    assert np.array_equal(frames.arrays()["view"], views.reshape(3, -1) / 2)
 
 
-def test_only_a_fan_has_an_angle():
+def test_only_ordered_sectors_have_an_angle():
     views = np.zeros((1, *SHAPE))
     assert viewed(views).metric().angle == 0
     assert viewed(views, fan=0.0).metric().angle == 0
@@ -263,13 +263,13 @@ def test_only_a_fan_has_an_angle():
 # Given ids
 
 
-def test_ids_fit_where_they_were_given():
-    looks = labelled([4, 5, 4, 6])
-    assert looks.misfit(2, *alone(0)) == 0
-    assert looks.misfit(2, *alone(1)) == 1
-    assert looks.misfit(2, np.array([1, 3, 0]), np.zeros(3, bool)) == 0
-    assert looks.metric().scale == looks.metric().angle == 0
-    assert looks.learn(SILENT, no_pairs) == NO_ESTIMATE
+def test_ids_fit_frames_with_the_same_id():
+    frames = labelled([4, 5, 4, 6])
+    assert frames.misfit(2, *alone(0)) == 0
+    assert frames.misfit(2, *alone(1)) == 1
+    assert frames.misfit(2, np.array([1, 3, 0]), np.zeros(3, bool)) == 0
+    assert frames.metric().scale == frames.metric().angle == 0
+    assert frames.learn(SILENT, no_pairs) == NO_ESTIMATE
 
 
 # All
@@ -286,32 +286,32 @@ def fresh(kind):
 
 @pytest.mark.parametrize("kind", ["touch", "views", "fan", "labels"])
 @pytest.mark.parametrize("stop", [0, 1, 39, 40, 75])
-def test_looks_that_were_kept_go_on_as_if_never_stopped(kind, stop):
+def test_a_restored_appearance_continues_as_if_uninterrupted(kind, stop):
     stream = np.random.default_rng(0)
-    views, label = felt(stream, 120), stream.integers(0, 9, 120)
+    views, label = images(stream, 120), stream.integers(0, 9, 120)
     errors = stream.uniform(0.1, 0.5, (120, 20))
     turn, pairs = (
         stream.normal(0, 0.2, 120),
         ConfirmedPairs(np.arange(20, 30), np.arange(10), np.arange(10) % 2 == 0),
     )
 
-    def follow(looks, rows):
-        told = []
+    def follow(frames, rows):
+        estimates = []
         for k in rows:
-            looks.append(seen(views[k], label=int(label[k])), turn[k], 0.1)
-            told.append(looks.learn(SimpleNamespace(background=errors[k]), lambda: pairs))
-        return told
+            frames.append(seen(views[k], label=int(label[k])), turn[k], 0.1)
+            estimates.append(frames.learn(SimpleNamespace(background=errors[k]), lambda: pairs))
+        return estimates
 
     whole = fresh(kind)
-    told = follow(whole, range(120))
+    estimates = follow(whole, range(120))
     first = fresh(kind)
-    assert follow(first, range(stop)) == told[:stop]
-    kept = first.arrays()
-    follow(first, range(stop, 100))  # what was kept is a copy
+    assert follow(first, range(stop)) == estimates[:stop]
+    saved = first.arrays()
+    follow(first, range(stop, 100))  # the saved arrays are copies
     second = fresh(kind)
-    follow(second, range(5))  # and takes the place of everything
-    second.restore(kept)
-    assert follow(second, range(stop, 120)) == told[stop:]
+    follow(second, range(5))  # and replace the whole state
+    second.restore(saved)
+    assert follow(second, range(stop, 120)) == estimates[stop:]
     assert second.arrays().keys() == whole.arrays().keys()
     for name, rows in whole.arrays().items():
         assert np.array_equal(rows, second.arrays()[name]), name
@@ -323,6 +323,6 @@ def test_looks_that_were_kept_go_on_as_if_never_stopped(kind, stop):
     assert (whole.metric().scale > 0) == (kind != "labels")
 
 
-def test_a_white_pixel_is_the_tallest():
-    looks = touched(np.ones((LOG_ODDS_INTERVAL, *SHAPE)))
-    assert (looks.arrays()["level"] == HEIGHTS).all()
+def test_a_pixel_of_value_1_has_the_highest_level():
+    frames = touched(np.ones((LOG_ODDS_INTERVAL, *SHAPE)))
+    assert (frames.arrays()["level"] == HEIGHTS).all()

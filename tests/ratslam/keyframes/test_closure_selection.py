@@ -30,7 +30,7 @@ RUN = 12
 
 
 class World(NamedTuple):
-    """A robot on a loop: true poses [N, 3], and what there is to be judged."""
+    """A robot on a loop: true poses [N, 3], and the sequences to select from."""
 
     truth: np.ndarray
     case: SelectionProblem
@@ -44,8 +44,8 @@ class World(NamedTuple):
         chain, closures = self.case.measurements.chain, self.case.measurements.closures
         return [solve(MapFit(path.poses, 0.0, np.zeros(0)), MapProblem(chain, closures, PRIOR), STEPS), path]
 
-    def where(self, poses, onwards, carried, since):
-        """From which frame on the poses carried are nearer to the truth, as ideal views would tell."""
+    def find_cut(self, poses, onwards, carried, since):
+        """The frame from which the carried poses are nearer to the truth, as ideal views would show."""
         frames = np.arange(since + 1, since + 1 + len(onwards))
         truth = compose(fit_rigid_motion(self.truth[:LAP], poses[:LAP]), self.truth[frames])
         stays, goes = (
@@ -56,8 +56,8 @@ class World(NamedTuple):
         return int(frames[len(cost) - 1 - np.argmin(cost[::-1])])
 
 
-def round_and_round(place: np.ndarray) -> np.ndarray:
-    """[n, 3] the poses at places (in frames) along a lap that is no circle."""
+def lap_poses(place: np.ndarray) -> np.ndarray:
+    """[n, 3] the poses at places (in frames) along a lap that is not a circle."""
     at = 2 * np.pi * np.arange(LAP) / LAP
     x, y = 0.35 * np.cos(at) + 0.06 * np.cos(3 * at), 0.25 * np.sin(at)
     along = np.stack([x, y], axis=1)
@@ -84,16 +84,16 @@ def world(
     stream = np.random.default_rng(seed)
     count = laps * LAP
     place = np.arange(count)
-    steps = between(round_and_round(place[:-1]), round_and_round(place[1:]))
+    steps = between(lap_poses(place[:-1]), lap_poses(place[1:]))
     for frame, places in jumps:
         place[frame:] += places
-    truth = round_and_round(place)
+    truth = lap_poses(place)
     true = between(truth[:-1], truth[1:])
     for frame, _ in jumps:
-        true[frame - 1] = steps[frame - 1]  # what odometry tells: nothing has happened
-    told = true + stream.normal(0, NOISE, true.shape)
-    told[:, 2] = wrap(told[:, 2])
-    chain = OdometryChain(told, np.hypot(told[:, 0], told[:, 1]), np.tile(NOISE**2, (count - 1, 1)))
+        true[frame - 1] = steps[frame - 1]  # odometry does not measure the jump
+    motion = true + stream.normal(0, NOISE, true.shape)
+    motion[:, 2] = wrap(motion[:, 2])
+    chain = OdometryChain(motion, np.hypot(motion[:, 0], motion[:, 1]), np.tile(NOISE**2, (count - 1, 1)))
 
     edges = sorted({*range(LAP, count + 1, 20), *(frame for frame, _ in jumps)})
     spans = [(first + int(stream.integers(0, 4)), end) for first, end in pairwise(edges)]
@@ -128,14 +128,14 @@ def off(fit: MapFit, truth: np.ndarray) -> float:
     return float(np.hypot(*(aligned - truth)[:, :2].T).max())
 
 
-# What is believed
+# Selection
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_runs_that_are_all_true_are_solved_for(seed):
+def test_true_sequences_are_all_accepted(seed):
     made = world(seed)
     case, starts = made.case, made.starts()
-    judged = select_closures(case, starts, made.where)
+    judged = select_closures(case, starts, made.find_cut)
     assert (judged.fit.weights > ACCEPTED_WEIGHT).all()
     assert judged.cuts == ()
     plain = solve(starts[0], case.measurements, STEPS, closure_selection.FINE)
@@ -147,9 +147,9 @@ def test_runs_that_are_all_true_are_solved_for(seed):
 
 @pytest.mark.parametrize("evidence", [20.0, 40.0])
 @pytest.mark.parametrize("seed", range(6))
-def test_a_run_that_is_false_is_outvoted(seed, evidence):
+def test_a_false_sequence_is_refused(seed, evidence):
     made = world(seed, false=evidence)
-    judged = select_closures(made.case, made.starts(), made.where)
+    judged = select_closures(made.case, made.starts(), made.find_cut)
     assert judged.fit.weights[-1] < ACCEPTED_WEIGHT
     assert (judged.fit.weights[:-1] > ACCEPTED_WEIGHT).all()
     assert judged.cuts == ()
@@ -163,15 +163,15 @@ def test_a_run_that_is_false_is_outvoted(seed, evidence):
     )
 
 
-def test_a_run_that_is_false_is_outvoted_however_strong_it_is():
+def test_a_false_sequence_with_much_evidence_is_refused():
     made = world(0, false=60.0)
-    judged = select_closures(made.case, made.starts(), made.where)
+    judged = select_closures(made.case, made.starts(), made.find_cut)
     assert judged.fit.weights[-1] < ACCEPTED_WEIGHT
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_a_map_bent_by_a_false_run_is_set_right(seed):
-    """However the present map came about, it is not the only one begun from."""
+def test_a_map_bent_by_a_false_sequence_is_corrected(seed):
+    """The present map is not the only start of the search."""
     made = world(seed, false=40.0)
     closures = made.case.measurements.closures
     wrong = np.arange(len(made.case.evidence)) == len(made.case.evidence) - 1
@@ -180,27 +180,29 @@ def test_a_map_bent_by_a_false_run_is_set_right(seed):
     bent = solve(
         MapFit(path.poses, 0.0, np.zeros(0)), MapProblem(made.case.measurements.chain, believing, PRIOR), 40
     )
-    judged = select_closures(made.case, [bent, path], made.where)
+    judged = select_closures(made.case, [bent, path], made.find_cut)
     assert off(bent, made.truth) > 2 * off(judged.fit, made.truth)
     assert judged.fit.weights[-1] < ACCEPTED_WEIGHT
     assert off(judged.fit, made.truth) < 0.1
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_hopeless_present_map_is_given_up(seed):
+def test_a_present_map_of_high_cost_is_replaced(seed):
     made = world(seed)
     stream = np.random.default_rng(seed)
     lost = made.reckoned()._replace(poses=stream.uniform(-2, 2, made.truth.shape))
-    judged = select_closures(made.case, [lost, made.reckoned()], made.where)
+    judged = select_closures(made.case, [lost, made.reckoned()], made.find_cut)
     assert (judged.fit.weights > ACCEPTED_WEIGHT).all()
     assert off(judged.fit, made.truth) < 0.1
 
 
-def test_the_more_evidence_the_more_a_run_may_strain_the_map():
+def test_a_sequence_with_more_evidence_may_strain_the_map_more():
     made = world(0)
     case = made.case
     strict, lenient = (rescaled(case, by) for by in (0.1, 10))
-    weights = [select_closures(one, made.starts(), made.where).fit.weights for one in (strict, case, lenient)]
+    weights = [
+        select_closures(one, made.starts(), made.find_cut).fit.weights for one in (strict, case, lenient)
+    ]
     assert (weights[0] < weights[1]).all()
     assert (weights[1] < weights[2]).all()
 
@@ -218,9 +220,9 @@ def test_the_cost_is_never_above_that_of_the_present_map(seed):
     present = present._replace(
         poses=present.poses + stream.normal(0, 0.02, present.poses.shape) * [1, 1, 0.2]
     )
-    judged = select_closures(case, [present, made.reckoned()], made.where)
+    judged = select_closures(case, [present, made.reckoned()], made.find_cut)
     assert judged.cost <= robust_cost(present, case.measurements)
-    again = select_closures(case, [judged.fit, made.reckoned()], made.where, judged.cuts)
+    again = select_closures(case, [judged.fit, made.reckoned()], made.find_cut, judged.cuts)
     assert again.cost <= judged.cost + 0.5  # solver steps, not another map
     severed = closure_selection.cut_odometry(case.measurements, judged.cuts)
     whole = robust_cost(judged.fit, severed) + CUT * len(judged.cuts)
@@ -242,7 +244,7 @@ def test_the_order_of_sequences_does_not_matter(seed):
         )),
         case.evidence[order], case.first[order], case.last[order],
     )  # fmt: skip
-    one, two = (select_closures(c, made.starts(), made.where) for c in (case, renamed))
+    one, two = (select_closures(c, made.starts(), made.find_cut) for c in (case, renamed))
     assert two.cost == pytest.approx(one.cost, rel=1e-6)
     assert np.allclose(two.fit.poses, one.fit.poses, atol=1e-6)
     assert np.allclose(two.fit.weights, one.fit.weights[order], atol=1e-6)
@@ -255,15 +257,15 @@ def test_the_order_of_sequences_does_not_matter(seed):
 @pytest.mark.parametrize("seed", range(20))
 def test_nothing_is_cut_without_a_jump(seed):
     made = world(seed, false=50.0 * (seed % 2))
-    assert select_closures(made.case, made.starts(), made.where).cuts == ()
+    assert select_closures(made.case, made.starts(), made.find_cut).cuts == ()
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_a_robot_that_was_carried_is_cut_where_it_was(seed):
+def test_the_odometry_is_cut_where_the_robot_was_carried(seed):
     stream = np.random.default_rng(seed)
     jump = int(stream.integers(2 * LAP + 5, 3 * LAP)), int(stream.integers(15, 45))
     made = world(seed, jumps=(jump,))
-    judged = select_closures(made.case, made.starts(), made.where)
+    judged = select_closures(made.case, made.starts(), made.find_cut)
     assert [frame for frame, _ in judged.cuts] == [jump[0]]
     assert made.case.first[judged.cuts[0][1]] >= jump[0]
     assert (judged.fit.weights > ACCEPTED_WEIGHT).all()
@@ -271,21 +273,21 @@ def test_a_robot_that_was_carried_is_cut_where_it_was(seed):
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_a_robot_carried_away_and_back_is_cut_twice(seed):
-    """The visit alone contradicts all the rest, which agrees."""
+def test_two_cuts_are_made_for_a_robot_carried_away_and_back(seed):
+    """The visit alone contradicts the other sequences, which agree."""
     stream = np.random.default_rng(seed)
     away, stay, places = 2 * LAP + 5 + 20 * int(stream.integers(3)), 60, int(stream.integers(15, 45))
     made = world(seed, laps=5, jumps=((away, places), (away + stay, -places)), least=35.0)
-    judged = select_closures(made.case, made.starts(), made.where)
+    judged = select_closures(made.case, made.starts(), made.find_cut)
     assert sorted(frame for frame, _ in judged.cuts) == [away, away + stay]
     assert (judged.fit.weights > ACCEPTED_WEIGHT).all()
     assert off(judged.fit, made.truth) < 0.1
 
 
-def test_a_visit_may_be_told_by_runs_however_strong_they_are():
+def test_a_visit_is_cut_out_for_sequences_of_any_evidence():
     jumps = ((2 * LAP + 45, 34), (2 * LAP + 85, -34))
     made = world(0, laps=5, jumps=jumps, least=44.0, most=45.0)
-    judged = select_closures(made.case, made.starts(), made.where)
+    judged = select_closures(made.case, made.starts(), made.find_cut)
     whole = closure_selection.optimise_with_cuts(
         made.case, MapFit(made.truth.copy(), 0.0, np.zeros(0)), ((jumps[0][0], 5), (jumps[1][0], 7))
     )
@@ -293,18 +295,18 @@ def test_a_visit_may_be_told_by_runs_however_strong_they_are():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_cut_once_made_is_kept(seed):
+def test_an_earlier_cut_is_kept(seed):
     made = world(seed, jumps=((150, 25),))
-    first = select_closures(made.case, made.starts(), made.where)
-    again = select_closures(made.case, [first.fit, made.reckoned()], made.where, first.cuts)
+    first = select_closures(made.case, made.starts(), made.find_cut)
+    again = select_closures(made.case, [first.fit, made.reckoned()], made.find_cut, first.cuts)
     assert again.cuts == first.cuts
     assert np.allclose(again.fit.poses, first.fit.poses, atol=0.01)
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_cut_that_serves_no_purpose_is_given_up(seed):
+def test_a_useless_cut_is_removed(seed):
     made = world(seed)
-    plain = select_closures(made.case, made.starts(), made.where)
-    judged = select_closures(made.case, made.starts(), made.where, ((150, 4),))
+    plain = select_closures(made.case, made.starts(), made.find_cut)
+    judged = select_closures(made.case, made.starts(), made.find_cut, ((150, 4),))
     assert judged.cuts == ()
     assert judged.cost == pytest.approx(plain.cost, rel=1e-3)

@@ -1,4 +1,4 @@
-"""Laws of experiences as groups of frames."""
+"""Laws of experiences as groups of keyframes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ RADIUS, HEADING = 1.0, 0.5
 
 
 def walk(*frames, world=None):
-    """Folds frames (x, y, heading, matched, sure); the world and what it said."""
+    """Folds frames (x, y, heading, matched, sure); returns experiences, changes and poses."""
     world = world or Experiences(RADIUS, HEADING)
     poses = np.array([frame[:3] for frame in frames], float)
     return world, [world.arrive(poses[: k + 1], k, *frames[k][3:]) for k in range(len(frames))], poses
@@ -40,57 +40,57 @@ def test_the_first_frame_makes_an_experience():
         (at(0, 0.9), True),
         (at(0, 0, 0.4), True),
         (at(0, 0, -0.6), False),
-        (at(0.8, 0, 0.4), False),  # each within reach alone, together not
+        (at(0.8, 0, 0.4), False),  # each deviation alone is within reach, both together are not
     ],
 )
-@pytest.mark.parametrize("facing", [0.0, 3.0, -3.1])  # the seam of the angles is no border
+@pytest.mark.parametrize("facing", [0.0, 3.0, -3.1])  # also across the wrap of angles
 def test_an_experience_reaches_as_far_as_its_radius(to, stays, facing):
     there = (*to[:2], wrap(to[2] + facing), *to[3:])
-    _, said, _ = walk(at(0, 0, facing), there)
-    assert said[1] == (
+    _, changes, _ = walk(at(0, 0, facing), there)
+    assert changes[1] == (
         ExperienceChange(0, 0, Action.NONE) if stays else ExperienceChange(1, 0, Action.CREATE)
     )
 
 
-def test_reach_is_from_the_frame_it_was_made_at():
-    _, said, _ = walk(at(0), at(0.7), at(1.4))
-    assert [s.place for s in said] == [0, 0, 1]
+def test_the_radius_is_around_the_first_frame():
+    _, changes, _ = walk(at(0), at(0.7), at(1.4))
+    assert [s.place for s in changes] == [0, 0, 1]
 
 
-def test_a_matched_frame_reaches_its_experience_however_far():
-    _, said, _ = walk(at(0), at(5), at(10), at(15.2, matched=1), at(20), at(15, matched=1))
-    assert said[3] == ExperienceChange(1, 2, Action.SET)  # by the way from 1 to 2, the other way round
-    assert said[5] == ExperienceChange(1, 3, Action.SET)
+def test_a_matched_frame_reaches_its_experience_at_any_distance():
+    _, changes, _ = walk(at(0), at(5), at(10), at(15.2, matched=1), at(20), at(15, matched=1))
+    assert changes[3] == ExperienceChange(1, 2, Action.SET)  # by the link from 1 to 2, backwards
+    assert changes[5] == ExperienceChange(1, 3, Action.SET)
 
 
-def test_a_way_not_travelled_before_is_a_link_and_then_known():
+def test_a_new_connection_is_a_link_and_later_a_set():
     frames = [at(0), at(5), at(10), at(0, matched=0), at(10, matched=2), at(0, matched=0), at(0.1, matched=0)]
-    _, said, _ = walk(*frames)
-    assert [s.action for s in said[3:]] == [Action.LINK, Action.SET, Action.SET, Action.NONE]
-    assert [s.place for s in said[3:]] == [0, 2, 0, 0]
+    _, changes, _ = walk(*frames)
+    assert [s.action for s in changes[3:]] == [Action.LINK, Action.SET, Action.SET, Action.NONE]
+    assert [s.place for s in changes[3:]] == [0, 2, 0, 0]
 
 
-def test_a_match_goes_to_the_experience_of_the_frame_not_to_its_number():
-    _, said, _ = walk(at(0), at(0.5), at(5), at(10), at(0, matched=1))
-    assert said[4] == ExperienceChange(0, 2, Action.LINK)
+def test_a_match_reaches_the_experience_of_the_matched_frame():
+    _, changes, _ = walk(at(0), at(0.5), at(5), at(10), at(0, matched=1))
+    assert changes[4] == ExperienceChange(0, 2, Action.LINK)
 
 
-def test_only_a_sure_pose_finds_known_experiences():
+def test_only_a_reliable_pose_finds_known_experiences():
     frames = [at(0), at(5), at(10), at(0.9, sure=True)]
-    _, said, _ = walk(*frames)
-    assert said[3] == ExperienceChange(0, 2, Action.LINK)
-    _, said, _ = walk(*frames[:3], at(0.9))
-    assert said[3] == ExperienceChange(3, 2, Action.CREATE)
-    _, said, _ = walk(*frames[:3], at(1.1, sure=True))
-    assert said[3] == ExperienceChange(3, 2, Action.CREATE)
+    _, changes, _ = walk(*frames)
+    assert changes[3] == ExperienceChange(0, 2, Action.LINK)
+    _, changes, _ = walk(*frames[:3], at(0.9))
+    assert changes[3] == ExperienceChange(3, 2, Action.CREATE)
+    _, changes, _ = walk(*frames[:3], at(1.1, sure=True))
+    assert changes[3] == ExperienceChange(3, 2, Action.CREATE)
 
 
-def test_it_finds_the_nearest_but_stays_where_it_is_within_reach():
-    _, said, _ = walk(at(0), at(1.5), at(8), at(0.9, sure=True))
-    assert said[3].place == 1
-    _, said, _ = walk(at(0), at(1.5), at(0.7, sure=True), at(0.8, sure=True))
-    assert [s.place for s in said[2:]] == [1, 1]  # 0 is nearer, 1 is where it was
-    assert said[2].action == Action.NONE
+def test_the_nearest_experience_is_found_unless_the_current_one_is_in_reach():
+    _, changes, _ = walk(at(0), at(1.5), at(8), at(0.9, sure=True))
+    assert changes[3].place == 1
+    _, changes, _ = walk(at(0), at(1.5), at(0.7, sure=True), at(0.8, sure=True))
+    assert [s.place for s in changes[2:]] == [1, 1]  # 0 is nearer, 1 is the current one
+    assert changes[2].action == Action.NONE
 
 
 frames = st.lists(
@@ -101,13 +101,13 @@ frames = st.lists(
 
 
 @given(frames, st.integers(0, 39))
-def test_the_graph_is_the_story_of_what_was_said(steps, cut):
+def test_the_graph_follows_from_the_changes(steps, cut):
     steps = [(*s[:3], s[3] if s[3] < k else -1, s[4]) for k, s in enumerate(steps)]
     steps = [(*s[:3], max(s[3], -1), s[4]) for s in steps]
     cut = min(cut, len(steps) - 1)
-    world, said, poses = walk(*steps)
+    world, changes, poses = walk(*steps)
     made, ways, previous = [], {}, -1
-    for frame, (place, before, action) in enumerate(said):
+    for frame, (place, before, action) in enumerate(changes):
         assert before == previous
         created = place == len(made)
         if created:
@@ -117,11 +117,11 @@ def test_the_graph_is_the_story_of_what_was_said(steps, cut):
         reached = Action.NONE if place == before else Action.SET if known else Action.LINK
         assert action == (Action.CREATE if created else reached)
         if steps[frame][3] >= 0:
-            assert place == said[steps[frame][3]].place
+            assert place == changes[steps[frame][3]].place
         if place != before and before >= 0:
             ways[before, place] = ways.get((before, place), 0) + 1
         previous = place
-    moved = poses + [1.0, 2.0, 0.0]  # the map bends after the frames were grouped
+    moved = poses + [1.0, 2.0, 0.0]  # the map is deformed after the frames were grouped
     graph = world.graph(moved)
     assert list(graph.nodes) == list(range(len(made)))
     assert [graph.nodes[place]["keyframe"] for place in graph] == made
@@ -133,9 +133,9 @@ def test_the_graph_is_the_story_of_what_was_said(steps, cut):
         assert np.allclose([*gap[:2], wrap(gap[2])], 0, atol=1e-9)
 
     half, _, _ = walk(*steps[: cut + 1])
-    again, _, _ = walk(at(0), at(9))  # what it held before gives way
+    again, _, _ = walk(at(0), at(9))  # its state before is replaced
     again.restore(half.arrays())
     for k in range(cut + 1, len(steps)):
-        assert again.arrive(poses[: k + 1], k, *steps[k][3:]) == said[k]
+        assert again.arrive(poses[: k + 1], k, *steps[k][3:]) == changes[k]
     assert again.stay() == world.stay()
     assert all(np.array_equal(again.arrays()[name], rows) for name, rows in world.arrays().items())

@@ -21,9 +21,9 @@ from ratslam.keyframes.optimizer import (
 from tactile.base.se2 import between, compose, correct_heading_bias, integrate, wrap
 
 WIDE = BiasPrior(0.0, 10.0)
-SURE = 1e12  # a robust scale at which no sequence ever loses weight
+SURE = 1e12  # robust scale at which no sequence loses weight
 CLOSURE = np.array([0.02, 0.02, 0.01]) ** 2
-START = np.array([2.0, -1.0, 3.0])  # not the origin, and near the seam of the angles
+START = np.array([2.0, -1.0, 3.0])  # not the origin, and near the wrap of angles
 seeds = st.integers(0, 1000)
 
 
@@ -59,7 +59,7 @@ def reckoned(chain, start=START):
 
 
 def parts(poses, bias, chain, closures):
-    """Whitened residuals of the chain and of the closures, told by frames alone."""
+    """Whitened residuals of the chain and of the closures, from the keyframes alone."""
     odometry = between(poses[:-1], poses[1:]) - correct_heading_bias(chain.motion, chain.length, bias)
     recall = between(poses[closures.i], poses[closures.j])
     recall[:, 2] -= closures.turn
@@ -68,7 +68,7 @@ def parts(poses, bias, chain, closures):
     return odometry / np.sqrt(chain.variance), recall / np.sqrt(closures.variance)
 
 
-def run_means(recall, closures):
+def sequence_means(recall, closures):
     sequences = range(len(closures.scale))
     return np.array([(recall[closures.sequence == k] ** 2).sum(axis=1).mean() for k in sequences])
 
@@ -97,7 +97,7 @@ def apart(a, b):
 @given(
     st.tuples(st.floats(-2, 2), st.floats(-2, 2), st.floats(-3.1, 3.1)), st.floats(0, 5), st.floats(-0.2, 0.2)
 )
-def test_corrections_undo_each_other_and_none_is_none(motion, length, bias):
+def test_opposite_corrections_cancel_and_zero_changes_nothing(motion, length, bias):
     motion = np.array(motion)
     assert np.allclose(correct_heading_bias(motion, length, 0.0), motion, atol=1e-12)
     there = correct_heading_bias(motion, length, bias)
@@ -106,7 +106,7 @@ def test_corrections_undo_each_other_and_none_is_none(motion, length, bias):
 
 
 @given(st.floats(0.5, 4), st.floats(-0.05, 0.05))
-def test_a_bias_builds_up_evenly(length, bias):
+def test_a_bias_accumulates_evenly(length, bias):
     straight = np.array([length, 0.0, 0.0])
     whole, half = (
         correct_heading_bias(straight, length, bias),
@@ -114,12 +114,12 @@ def test_a_bias_builds_up_evenly(length, bias):
     )
     gap = between(whole, compose(half, half))
     assert abs(gap[2]) < 1e-12
-    # An arc is taken for its chord: an error of second order in the bend; a one-sided rule's is of first.
+    # The chord replaces the arc: an error of second order in the turn; a one-sided rule has first order.
     assert np.hypot(*gap[:2]) < length * (bias * length) ** 2 / 30 + 1e-12
 
 
 @pytest.mark.parametrize("bias", [0.06, -0.03])
-def test_true_closures_tell_the_bias_and_all_poses(bias):
+def test_true_closures_determine_the_bias_and_all_poses(bias):
     truth, chain, closures = laps(np.random.default_rng(0), bias)
     start = reckoned(chain)
     assert apart(start, truth) > 0.5
@@ -145,7 +145,7 @@ def test_a_step_is_gauss_newtons(seed, scale):
     truth, chain, closures = laps(stream, 0.04, 8, 0.02)
     closures = closures._replace(scale=np.full(3, scale))
     start, bias, prior = truth + stream.normal(0, 0.03, truth.shape), 0.01, BiasPrior(0.03, 0.02)
-    weights = (scale / (scale + run_means(parts(start, bias, chain, closures)[1], closures))) ** 2
+    weights = (scale / (scale + sequence_means(parts(start, bias, chain, closures)[1], closures))) ** 2
     x = unknowns(start, bias)
 
     def errors(x):
@@ -176,10 +176,10 @@ def test_without_robust_weights_it_is_least_squares(seed):
     assert cost <= 2 * found.cost * (1 + 1e-6)
 
 
-def test_with_robust_weights_it_is_geman_mcclure_by_run():
+def test_robust_weights_are_geman_mcclure_by_sequence():
     stream = np.random.default_rng(3)
     _, chain, closures = laps(stream, 0.04, 8, 0.02)
-    # One sequence is moderately off, so that its weight, neither 0 nor 1, decides where the optimum lies.
+    # One sequence is moderately off, so that its weight, between 0 and 1, determines the optimum.
     closures = closures._replace(scale=np.full(3, 4.0), turn=closures.turn + 0.03 * (closures.sequence == 1))
     fit = solve(MapFit(reckoned(chain), 0.04, np.zeros(0)), MapProblem(chain, closures, WIDE), 500)
     assert ((fit.weights > 0.1) & (fit.weights < 0.999)).any()
@@ -188,7 +188,7 @@ def test_with_robust_weights_it_is_geman_mcclure_by_run():
         odometry, recall = parts(
             np.vstack([fit.poses[0], x[:-1].reshape(-1, 3)]), float(x[-1]), chain, closures
         )
-        mean, members = run_means(recall, closures), np.bincount(closures.sequence)
+        mean, members = sequence_means(recall, closures), np.bincount(closures.sequence)
         kernel = (members * closures.scale * mean / (closures.scale + mean)).sum()
         return (odometry**2).sum() + kernel + (x[-1] / WIDE.sd) ** 2
 
@@ -198,7 +198,7 @@ def test_with_robust_weights_it_is_geman_mcclure_by_run():
 
 
 @pytest.mark.parametrize("bias", [0.0, 0.03])
-def test_a_run_that_is_far_off_counts_for_nothing(bias):
+def test_a_sequence_far_off_has_no_effect(bias):
     stream = np.random.default_rng(1)
     _, chain, closures = laps(stream, bias, noise=0.01)
     closures = closures._replace(scale=np.full(3, 10.0))
@@ -246,7 +246,7 @@ def cost_by_loops(fit, chain, closures, prior):
 
 
 @given(seeds, st.sampled_from([np.inf, 6.0, 0.5]))
-def test_the_robust_cost_is_what_odometry_and_runs_lack(seed, cost_limit):
+def test_the_robust_cost_equals_explicit_loops(seed, cost_limit):
     start, chain, closures, prior = robust_case(seed, cost_limit)
     fit = MapFit(start, 0.01, np.zeros(3))
     assert robust_cost(fit, MapProblem(chain, closures, prior)) == pytest.approx(
@@ -254,7 +254,7 @@ def test_the_robust_cost_is_what_odometry_and_runs_lack(seed, cost_limit):
     )
 
 
-def test_the_robust_cost_of_a_perfect_map_is_none():
+def test_the_robust_cost_of_a_perfect_map_is_zero():
     truth, chain, closures = laps(np.random.default_rng(0), 0.03)
     assert (
         robust_cost(MapFit(truth, 0.03, np.zeros(3)), MapProblem(chain, closures, BiasPrior(0.03, 1.0)))
@@ -268,7 +268,7 @@ def test_the_robust_cost_of_a_perfect_map_is_none():
 
 @given(seeds, st.sampled_from([np.inf, 20.0, 6.0]))
 @settings(max_examples=40)
-def test_every_step_lessens_the_robust_cost(seed, cost_limit):
+def test_every_step_lowers_the_robust_cost(seed, cost_limit):
     start, chain, closures, prior = robust_case(seed, cost_limit)
     fit = MapFit(start, 0.0, np.zeros(3))
     costs = [robust_cost(fit, MapProblem(chain, closures, prior))]
@@ -280,7 +280,7 @@ def test_every_step_lessens_the_robust_cost(seed, cost_limit):
 
 
 @pytest.mark.parametrize("cost_limit", [6.0, 1.0])
-def test_where_solving_ends_the_robust_cost_is_least(cost_limit):
+def test_the_solution_has_the_least_robust_cost(cost_limit):
     start, chain, closures, prior = robust_case(3, cost_limit)
     fit = solve(MapFit(start, 0.0, np.zeros(0)), MapProblem(chain, closures, prior), 500)
     assert ((fit.weights > 0.01) & (fit.weights < 0.999)).any()
@@ -293,7 +293,7 @@ def test_where_solving_ends_the_robust_cost_is_least(cost_limit):
                 assert robust_cost(fit._replace(poses=poses), MapProblem(chain, closures, prior)) > least
 
 
-def test_one_closure_astray_does_not_take_its_run_with_it():
+def test_one_false_closure_does_not_cost_its_sequence():
     truth, chain, closures = laps(np.random.default_rng(1), 0.0, noise=0.005)
     closures = closures._replace(scale=np.full(3, 4.0))
     astray = closures._replace(i=np.where(np.arange(len(closures.i)) == 5, 20, closures.i))
@@ -331,25 +331,25 @@ def test_relative_covariance_is_the_marginal_of_the_whole_information(seed):
     fit = MapFit(truth + stream.normal(0, 0.02, truth.shape), 0.01, np.zeros(3))
     i, j = stream.choice(len(truth), 2, replace=False).tolist()
     turn = stream.uniform(-3, 3)
-    mean = run_means(parts(fit.poses, fit.bias, chain, closures)[1], closures)
+    mean = sequence_means(parts(fit.poses, fit.bias, chain, closures)[1], closures)
     weights = (closures.scale / (closures.scale + mean)) ** 2
     x, first = unknowns(fit.poses, fit.bias), fit.poses[0]
     jacobian = slopes(lambda x: residuals(x, first, chain, closures, prior, weights), x)
 
     def seen(x):
         poses = np.vstack([first, x[:-1].reshape(-1, 3)])
-        # Unwrapped, so that the derivative has no seam.
+        # Unwrapped, so that the derivative has no jump.
         return np.append(
             between(compose(poses[i], np.array([0, 0, turn])), poses[j])[:2], poses[j, 2] - poses[i, 2]
         )
 
     by = slopes(seen, x)
     expected = by @ np.linalg.inv(jacobian.T @ jacobian) @ by.T
-    told = relative_covariance(fit, MapProblem(chain, closures, prior), i, j, turn)
-    assert np.allclose(told, expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
+    covariance = relative_covariance(fit, MapProblem(chain, closures, prior), i, j, turn)
+    assert np.allclose(covariance, expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
 
 
-def test_covariance_is_one_grows_along_the_chain_and_shrinks_with_closures():
+def test_covariance_is_valid_grows_along_the_chain_and_shrinks_with_closures():
     _, chain, closures = laps(np.random.default_rng(2), 0.0)
     fit, none = MapFit(reckoned(chain), 0.0, np.zeros(0)), closed([])
     for pair in [(0, 47), (5, 30), (40, 3)]:
@@ -359,8 +359,8 @@ def test_covariance_is_one_grows_along_the_chain_and_shrinks_with_closures():
         for covariance in (free, bound, free - bound):
             assert np.allclose(covariance, covariance.T, rtol=0, atol=1e-9 * np.trace(free))
             assert np.linalg.eigvalsh(covariance).min() > 0
-        told = relative_covariance(fit, MapProblem(chain, none, BiasPrior(0.0, 0.001)), *pair, 0.3)
-        assert np.linalg.eigvalsh(free - told).max() > 0.1 * np.trace(free - told) > 0
+        covariance = relative_covariance(fit, MapProblem(chain, none, BiasPrior(0.0, 0.001)), *pair, 0.3)
+        assert np.linalg.eigvalsh(free - covariance).max() > 0.1 * np.trace(free - covariance) > 0
     straight = chained(np.tile([0.5, 0.0, 0.0], (20, 1)))
     fit = MapFit(reckoned(straight), 0.0, np.zeros(0))
     along = np.array(
@@ -400,7 +400,7 @@ def test_a_single_frame_is_a_map():
     assert np.isfinite(fit.bias)
 
 
-def test_a_frame_that_nothing_ties_leaves_all_as_it_was():
+def test_an_unconnected_frame_leaves_the_map_unchanged():
     chain = chained(np.tile([0.5, 0.0, 0.1], (4, 1)))
     chain.variance[-1] = np.inf
     start = reckoned(chain) + 0.01

@@ -1,4 +1,4 @@
-"""Laws of fans: that views are sectors in order, how wide these are, and what heading bias they show."""
+"""Laws of view sectors: their order, their width and the heading bias."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ def drive(seed, width, count=200, bias=0.0, noise=0.01):
     turn, length = stream.normal(0, 0.35, count), stream.uniform(0.05, 0.4, count)
     view = surroundings(stream)(np.cumsum(turn)[:, None] + bearing)
     view = view + noise * stream.normal(0, 1, view.shape)
-    return view, turn - bias * length, length  # odometry lacks what has to be added
+    return view, turn - bias * length, length  # odometry without the correction
 
 
-def shown(fan, view, turn, length):
+def fan_of(fan, view, turn, length):
     for row in zip(view, turn, length, strict=True):
         fan.append(*row)
     return fan
@@ -35,17 +35,17 @@ def shown(fan, view, turn, length):
 
 @pytest.mark.parametrize("width", [180, -180, 270, -270])
 @pytest.mark.parametrize("seed", range(4))
-def test_the_width_and_the_sense_of_a_fan_are_found(width, seed):
-    fan = shown(SectorFan(SIZE, 0.0), *drive(seed, width))
+def test_the_width_and_direction_of_the_sectors_are_estimated(width, seed):
+    fan = fan_of(SectorFan(SIZE, 0.0), *drive(seed, width))
     assert fan.angle == 0
     fan.estimate()
     assert fan.angle == pytest.approx(np.radians(width) / SIZE)
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_mirrored_views_are_a_fan_the_other_way(seed):
+def test_mirrored_views_have_the_opposite_sector_angle(seed):
     view, turn, length = drive(seed, 180)
-    there, back = (shown(SectorFan(SIZE, 0.0), rows, turn, length) for rows in (view, view[:, ::-1]))
+    there, back = (fan_of(SectorFan(SIZE, 0.0), rows, turn, length) for rows in (view, view[:, ::-1]))
     ahead, mirrored = there.estimate(), back.estimate()
     assert there.angle == -back.angle > 0
     assert mirrored == pytest.approx(ahead, rel=1e-6, abs=1e-9)
@@ -53,7 +53,7 @@ def test_mirrored_views_are_a_fan_the_other_way(seed):
 
 @pytest.mark.parametrize("kind", ["constant", "one value each", "places", "stays", "slow"])
 @pytest.mark.parametrize("seed", range(3))
-def test_views_without_order_are_no_fan(kind, seed):
+def test_unordered_views_have_no_sector_angle(kind, seed):
     view, turn, length = drive(seed, 180)
     stream, count = np.random.default_rng(seed + 100), len(view)
     places, noise = stream.uniform(0, 1, (count, SIZE)), 0.01 * stream.normal(0, 1, view.shape)
@@ -71,8 +71,8 @@ def test_views_without_order_are_no_fan(kind, seed):
     assert fan.angle == 0
 
 
-def mistaken(changed):
-    """The share of 60 recordings, their views changed, that are called fans when asked as the map asks."""
+def share_called_ordered(changed):
+    """The share of 60 recordings with changed views whose sectors the map would count as ordered."""
     found = []
     for seed in range(60):
         view, turn, length = drive(seed, 180)
@@ -86,23 +86,23 @@ def mistaken(changed):
     return np.mean(found)
 
 
-def test_views_new_at_every_frame_are_no_fan():
-    assert mistaken(lambda stream, view: stream.uniform(0, 1, view.shape)) < 0.02
+def test_random_views_have_no_sector_angle():
+    assert share_called_ordered(lambda stream, view: stream.uniform(0, 1, view.shape)) < 0.02
 
 
 @pytest.mark.parametrize("width", [180, -180, 270])
 @pytest.mark.parametrize("bias", [0.0, 0.1, -0.05])
 @pytest.mark.parametrize("seed", range(3))
-def test_the_bias_is_what_the_odometrys_turn_lacks(width, bias, seed):
-    told = shown(SectorFan(SIZE, 0.0), *drive(seed, width, bias=bias)).estimate()
-    assert abs(told.value - bias) < 3 * told.error
-    assert told.error < 0.02  # of no use were it as large as the biases
+def test_the_estimated_bias_is_the_error_of_the_odometrys_turn(width, bias, seed):
+    bias_estimate = fan_of(SectorFan(SIZE, 0.0), *drive(seed, width, bias=bias)).estimate()
+    assert abs(bias_estimate.value - bias) < 3 * bias_estimate.error
+    assert bias_estimate.error < 0.02  # far below the biases
 
 
-def test_more_noise_is_less_sure():
+def test_the_standard_error_grows_with_noise():
     errors = [
         np.median(
-            [shown(SectorFan(SIZE, 0.0), *drive(k, 180, noise=noise)).estimate().error for k in range(5)]
+            [fan_of(SectorFan(SIZE, 0.0), *drive(k, 180, noise=noise)).estimate().error for k in range(5)]
         )
         for noise in (0.01, 0.1)
     ]
@@ -120,21 +120,21 @@ def test_a_given_angle_is_never_changed(given):
     assert fan.angle == given
 
 
-def test_a_given_angle_tells_the_bias_without_finding():
-    told = shown(SectorFan(SIZE, np.radians(10)), *drive(1, 180, 60, bias=0.1)).estimate()
-    assert abs(told.value - 0.1) < 3 * told.error < 0.3
+def test_the_bias_is_estimated_with_a_given_angle():
+    bias_estimate = fan_of(SectorFan(SIZE, np.radians(10)), *drive(1, 180, 60, bias=0.1)).estimate()
+    assert abs(bias_estimate.value - 0.1) < 3 * bias_estimate.error < 0.3
 
 
-def test_too_little_tells_nothing():
+def test_few_views_give_no_estimate():
     assert SectorFan(SIZE, 0.0).estimate() == NO_ESTIMATE
-    fan = shown(SectorFan(SIZE, 0.0), *drive(0, 180, 15))
+    fan = fan_of(SectorFan(SIZE, 0.0), *drive(0, 180, 15))
     assert fan.estimate() == NO_ESTIMATE
     assert fan.angle == 0
 
 
 @pytest.mark.parametrize("given", [0.0, np.radians(15)])
 @pytest.mark.parametrize("cut", [1, 90])
-def test_a_restored_fan_goes_on_the_same(given, cut):
+def test_a_restored_fan_continues_the_same(given, cut):
     rows = list(zip(*drive(2, 270, 150, bias=0.05), strict=True))
     whole = SectorFan(SIZE, given)
     for k, row in enumerate(rows):
@@ -142,11 +142,11 @@ def test_a_restored_fan_goes_on_the_same(given, cut):
         if k % 16 == 0:
             whole.estimate()
         if k == cut:
-            kept = {name: array.copy() for name, array in whole.arrays().items()}
+            saved = {name: array.copy() for name, array in whole.arrays().items()}
     again = SectorFan(SIZE, given)
-    for row in rows[:7]:  # what it held before gives way
+    for row in rows[:7]:  # its state before is replaced
         again.append(*row)
-    again.restore(kept)
+    again.restore(saved)
     for k, row in list(enumerate(rows))[cut + 1 :]:
         again.append(*row)
         if k % 16 == 0:
@@ -156,8 +156,8 @@ def test_a_restored_fan_goes_on_the_same(given, cut):
     assert all(np.array_equal(again.arrays()[name], rows) for name, rows in whole.arrays().items())
 
 
-def test_a_bias_seen_in_one_stretch_only_is_no_fault():
+def test_evidence_in_a_single_block_is_handled():
     view, turn, length = drive(0, 180, 480)
-    view[:445] = 0.5  # nothing in reach, say
-    told = shown(SectorFan(SIZE, np.radians(10)), view, turn, length).estimate()
-    assert told.error > 0  # unsure or endlessly so, but a number
+    view[:445] = 0.5  # for example nothing in reach
+    bias_estimate = fan_of(SectorFan(SIZE, np.radians(10)), view, turn, length).estimate()
+    assert bias_estimate.error > 0  # large or infinite, but not NaN
