@@ -22,7 +22,7 @@ CELLS = {11: 2, 21: 2, 41: 3, 61: 4}
 
 
 @partial(jax.jit, static_argnames="config")
-def run(config, cells, motion, recall, energy, count):
+def steps_of(config, cells, motion, recall, energy, count):
     """The first `count` steps of motion in cells [T, 3]: poses, spreads [T, 3], outcomes and levels [T]."""
     used, unit = window_levels(config, np.dtype(float)), units(config, np.dtype(float))
 
@@ -44,14 +44,14 @@ def full_activity(config, cells):
 
 
 def compare(n, motion, recall, energy):
-    """Both engines, in compiled runs with room for 1000 steps; returns the window levels."""
+    """Compares both engines, compiled for up to 1000 steps; returns the window levels."""
     count = len(motion)
     motion, recall = (np.pad(rows, ((0, 1000 - count), (0, 0))) for rows in (motion, recall))
     energy = np.pad(energy, (0, 1000 - count))
     moving = PoseCellConfig(cells_xy=n)
     dense = moving.model_copy(update={"engine": "dense"})
     (one, pose, spread, outcome, level), (all_, whole_pose, whole_spread, whole_outcome, whole_level) = (
-        run(config, pose_cells.start(config, np.dtype(float)), motion, recall, energy, np.int32(count))
+        steps_of(config, pose_cells.start(config, np.dtype(float)), motion, recall, energy, np.int32(count))
         for config in (moving, dense)
     )
     ring = rings(moving, np.dtype(float))
@@ -64,8 +64,8 @@ def compare(n, motion, recall, energy):
     return np.asarray(level)[:count]
 
 
-def thousand(n, seed, often, speed):
-    """Motion of any size, injections of any energy anywhere; without injections one window is enough."""
+def random_motion(n, seed, often, speed):
+    """Motion of any size, injections of any energy at any place; without injections one window is enough."""
     stream = np.random.default_rng(seed)
     motion = stream.normal(0, speed, (1000, 3)) * [1, 0.3, 0.5]
     energy = np.where(stream.random(1000) < often, stream.choice([0.02, 0.1, 0.5, 2.0], 1000), 0.0)
@@ -82,7 +82,7 @@ def thousand(n, seed, often, speed):
     st.sampled_from([0.05, 0.4, 2.0]),
 )
 def test_a_thousand_steps_equal_those_of_the_torus(n, seed, often, speed):
-    thousand(n, seed, often, speed)
+    random_motion(n, seed, often, speed)
 
 
 @settings(max_examples=6)
@@ -171,4 +171,4 @@ def test_wide_kernels_have_wide_margins():
     st.sampled_from([0.05, 0.4, 2.0]),
 )
 def test_many_thousands_of_steps_equal_those_of_the_torus(n, seed, often, speed):
-    thousand(n, seed, often, speed)
+    random_motion(n, seed, often, speed)

@@ -61,7 +61,7 @@ def test_parameter_sets_are_networks_of_those_parameters(block):
     assert not np.any(track.level[:, :30])
 
 
-def test_trials_of_other_seeds_and_noise_are_sessions_of_their_own():
+def test_trials_of_other_seeds_and_noise_equal_single_sessions():
     backend = filter_of(settings())
     stream = np.random.default_rng(0)
     courses = [[report(float(dx)) for dx in stream.uniform(0, 0.03, 12)] for _ in range(3)]

@@ -25,11 +25,11 @@ RINGS = rings(CONFIG, np.dtype(float))
 
 
 ROOMS = 256, 32768, 131072
-"""Steps that one compiled run has room for."""
+"""Largest numbers of steps of a compiled call."""
 
 
 @partial(jax.jit, static_argnames="config")
-def run(config, cells, motion, recall, energy, count):
+def steps_of(config, cells, motion, recall, energy, count):
     """The first `count` of motion in cells [T, 3]: poses [T, 3], outcomes [T], spreads [T, 3]."""
     levels = window_levels(config, np.dtype(motion.dtype))
     unit = units(config, np.dtype(motion.dtype))
@@ -37,9 +37,9 @@ def run(config, cells, motion, recall, energy, count):
     def step(k, carry):
         cells, poses, outcomes, spreads = carry
         odometry = Odometry(*(motion[k] * unit), jnp.ones((), motion.dtype))
-        cells, told = pose_cells.step(config, levels, cells, odometry, recall[k], energy[k])
-        told = poses.at[k].set(cells.pose), outcomes.at[k].set(told.outcome), spreads.at[k].set(told.spread)
-        return cells, *told
+        cells, info = pose_cells.step(config, levels, cells, odometry, recall[k], energy[k])
+        rows = poses.at[k].set(cells.pose), outcomes.at[k].set(info.outcome), spreads.at[k].set(info.spread)
+        return cells, *rows
 
     empty = jnp.zeros_like(motion), jnp.zeros(len(motion), jnp.int32), jnp.zeros_like(motion)
     return jax.lax.fori_loop(0, count, step, (cells, *empty))
@@ -54,7 +54,7 @@ def go(motion, cells=None, injections=None, config=CONFIG, dtype=float):
     for k, (at, how_much) in (injections or {}).items():
         recall[k], energy[k] = at, how_much
     cells = cells if cells is not None else pose_cells.start(config, np.dtype(dtype))
-    after, *outputs = run(config, cells, motion, recall, energy, np.int32(count))
+    after, *outputs = steps_of(config, cells, motion, recall, energy, np.int32(count))
     return after, tuple(np.asarray(output)[:count] for output in outputs)
 
 
@@ -85,7 +85,7 @@ def travelled(start, poses):
 
 @pytest.mark.parametrize("direction", [0, 25, 45, 130, 270])
 @pytest.mark.parametrize("speed", [0.001, 0.01, 0.1, 0.5, 1.7, 5.0])
-def test_decoded_motion_is_the_motion_told(settled, speed, direction):
+def test_decoded_motion_equals_odometry(settled, speed, direction):
     angle = np.deg2rad(direction)
     count = int(np.ceil(20 / speed))
     _, (poses, outcomes, _) = go(
@@ -93,13 +93,13 @@ def test_decoded_motion_is_the_motion_told(settled, speed, direction):
     )
     moved = travelled(settled.pose, poses)
     heading = float(settled.pose[2]) * UNITS[2]
-    told = count * speed * np.array([np.cos(angle + heading), np.sin(angle + heading)])
-    assert np.hypot(*(moved[:2] - told)) <= 0.02 * np.hypot(*told)
+    expected = count * speed * np.array([np.cos(angle + heading), np.sin(angle + heading)])
+    assert np.hypot(*(moved[:2] - expected)) <= 0.02 * np.hypot(*expected)
     assert not np.any(outcomes)
 
 
 @pytest.mark.parametrize("degrees", [0.01, 0.1, 1, 7, 10, 33, 60, -60, -0.05])
-def test_decoded_turning_is_the_turning_told(settled, degrees):
+def test_decoded_turning_equals_odometry(settled, degrees):
     count = int(np.ceil(200 / abs(degrees)))
     _, (poses, _, _) = go(np.tile([0, 0, np.deg2rad(degrees) / UNITS[2]], (count, 1)), settled)
     assert travelled(settled.pose, poses)[2] == pytest.approx(count * degrees / 10, rel=0.02)
@@ -140,7 +140,7 @@ def test_any_activity_becomes_a_distribution(seed, dx, dy, turn):
 
 
 @pytest.mark.parametrize("level", [0.0, 1e-9, 1 / (36 * 21 * 21), 1.0])
-def test_uniform_activity_dies_and_is_put_back(settled, level):
+def test_uniform_activity_dies_out_and_is_reseeded(settled, level):
     cells = with_activity(settled, jnp.full((36, 21, 21), level))
     after, (poses, outcomes, _) = go(np.zeros((3, 3)), cells)
     assert outcomes[0] == Outcome.RESEEDED
@@ -162,14 +162,14 @@ def test_a_deposit_between_cells_is_excited_like_one_on_a_cell(share):
 
 @pytest.mark.parametrize("shift", [(5, 0, 0), (0, 7, 0), (0, 0, 9), (20, 20, 35)])
 def test_the_torus_has_no_edge(shift):
-    """A run and the same run elsewhere on the torus are each other's shifted copies."""
+    """The same motion from another place of the torus gives a shifted copy."""
     stream = np.random.default_rng(1)
     motion = stream.normal(0, 0.7, (40, 3))
     here = pose_cells.start(CONFIG, np.dtype(float))
     there = with_activity(here, jnp.roll(whole(here), shift[::-1], (0, 1, 2)))
     there = there._replace(pose=(here.pose + np.array(shift, float)) % RINGS)
     if shift[2]:
-        motion[:, :2] = 0  # another heading moves elsewhere
+        motion[:, :2] = 0  # another heading gives another direction
     first, (a, _, _) = go(motion, here)
     second, (b, _, _) = go(motion, there)
     assert np.abs(ring_difference(b - a - shift, RINGS)).max() < 1e-9
@@ -180,17 +180,17 @@ def test_the_torus_has_no_edge(shift):
 @pytest.mark.parametrize("distance", [0.7, 2.3, 4.0, 7.0])
 @pytest.mark.parametrize("speed", [0.0, 0.02])
 def test_feedback_never_undoes_a_closure(settled, speed, distance, energy):
-    """Where recall wins or pulls without feedback, it does so with feedback, and as far."""
+    """An injection moves the packet as far with lag feedback as without."""
     at = (np.asarray(settled.pose) + [0, distance, 0.4]) % RINGS
     injections = {0: (at, energy), 1: (at, 0.7 * energy)}
     motion = np.tile([speed, 0, 0], (80, 1))
     open_loop = CONFIG.model_copy(update={"settle_steps": 10**6})
     _, (free, _, _) = go(motion, settled, injections, open_loop)
     _, (fed, _, _) = go(motion, settled, injections)
-    pulled, kept = travelled(settled.pose, free)[1], travelled(settled.pose, fed)[1]
-    assert abs(kept - pulled) < 0.3
+    pulled, actual = travelled(settled.pose, free)[1], travelled(settled.pose, fed)[1]
+    assert abs(actual - pulled) < 0.3
     if abs(pulled) > 0.5:
-        assert kept > 0.85 * pulled
+        assert actual > 0.85 * pulled
 
 
 def test_a_hundred_injections_at_once_settle():
@@ -205,7 +205,7 @@ def test_a_hundred_injections_at_once_settle():
     assert not np.any(outcomes)
 
 
-def test_too_much_motion_is_cut_and_named(settled):
+def test_too_much_motion_is_limited_and_reported(settled):
     after, (poses, outcomes, _) = go([[1e6, 0, 0], [0, 0, 1e9]], settled)
     assert list(outcomes) == [Outcome.TOO_FAST] * 2
     assert np.isfinite(poses).all()
@@ -231,7 +231,7 @@ def test_standing_still_for_a_hundred_thousand_steps(settled, dtype):
 
 
 def test_float32_makes_the_same_step(settled):
-    """Teacher-forced: both precisions from the same state, since whole runs diverge (weak chaos)."""
+    """Both precisions start each step from the same state, because long sequences diverge (weak chaos)."""
     stream = np.random.default_rng(5)
     cells, worst_pose, worst_activity = settled, 0.0, 0.0
     for _ in range(100):

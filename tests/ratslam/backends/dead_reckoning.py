@@ -1,4 +1,4 @@
-"""The smallest backend there can be: it proves that the seam asks for nothing a RatSLAM has."""
+"""A minimal backend, which shows that the interface requires no part of RatSLAM."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from ratslam.core.types import Action, Estimate
 from tactile.base.se2 import compose, wrap
 
 
-class Nothing(NamedTuple):
-    """Evidence of a backend that has none."""
+class NoEvidence(NamedTuple):
+    """Evidence with an outcome only."""
 
     moved: Any
 
@@ -50,14 +50,14 @@ class DeadReckoning:
         )
         none = jnp.int32(-1)
         estimate = Estimate(pose, jnp.zeros(3), none, none, jnp.int32(Action.NONE), jnp.bool_(False))
-        return pose, estimate, Nothing(moved)
+        return pose, estimate, NoEvidence(moved)
 
     def new_map(self):
-        return Reckoned()
+        return PathMap()
 
 
-class Reckoned:
-    """A map that is only a path."""
+class PathMap:
+    """A map that holds a path only."""
 
     def __init__(self) -> None:
         self.path: list[np.ndarray] = [np.zeros(3)]

@@ -1,4 +1,4 @@
-"""What any backend must do; every backend goes through all of it."""
+"""Requirements of any backend, tested on every backend."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ REACH = 0.2
 
 
 def _ratslam(name, source, dtype=np.float64, **more):
-    # Both engines of the pose cells have to conform; each with one source of views.
+    # Both engines of the pose cells, each with one source of views.
     engine = "window" if source == "views" and not more else "dense"
     cells = {"cells_xy": 11, "engine": engine}
     parts = {"pose_cells": cells, "templates": {"source": source}}
@@ -35,7 +35,7 @@ def _ratslam(name, source, dtype=np.float64, **more):
 
 
 def _grid(dtype=np.float64):
-    # Of little faith in odometry, so that it draws anew in mid-run wherever one stops.
+    # With large odometry noise, so that it resamples throughout the session.
     doubtful = {
         "drift": {"step": 0.3, "heading": 0.05},
         "likelihood": {"free": 0.5, "contact": 4.0},
@@ -46,7 +46,7 @@ def _grid(dtype=np.float64):
     return lambda: GridBackend(config, feelers, 3.0, dtype)
 
 
-# Weighs its runs every few frames, so that it does so in mid-run wherever one stops.
+# Selects sequences every few frames, so that it does so throughout the session.
 TOUCH = {
     "recall": {"sector_fov": "whiskers"},
     "keyframes": {"select_every": 15, "breaks": False, "sequence_agreement": 0.2},
@@ -75,7 +75,7 @@ SINGLE = {
 
 
 OFTEN = {"recall-labels"}
-"""What differs from another one by the source of its views alone: for `make soak`."""
+"""Backends that differ from another one only by the source of views: for `make soak`."""
 
 
 def some(names):
@@ -89,9 +89,9 @@ def make(request):
 
 
 def walk(count: int, seed: int = 0):
-    """Round a small circuit again and again, with views that come back; some steps see nothing, and now and
-    then whiskers touch something."""
-    stream, felt = np.random.default_rng(seed), np.random.default_rng([seed, 1])
+    """Laps of a small circuit with repeated views; some steps have no view, and in some the whiskers are in
+    contact."""
+    stream, touch = np.random.default_rng(seed), np.random.default_rng([seed, 1])
     places = stream.random((17, *VIEW))
     for k in range(count):
         turn = 2 * np.pi / 17 + stream.normal(0, 0.01)
@@ -101,7 +101,7 @@ def walk(count: int, seed: int = 0):
             odometry, places[k % 17] if seen else None, view_shape=VIEW, label=k % 17 if seen else -1,
             whiskers=WHISKERS,
         )  # fmt: skip
-        contact = felt.random(WHISKERS) < (0.2 if k % 5 == 0 else 0.0)
+        contact = touch.random(WHISKERS) < (0.2 if k % 5 == 0 else 0.0)
         yield o._replace(contact=contact, point=np.where(contact[:, None], REACH * AROUND, 0.0))
 
 
@@ -111,7 +111,7 @@ def compiled(make) -> Session:
 
 
 def fresh(make) -> Session:
-    """The session of this backend, at its start; all tests share what it has compiled."""
+    """The session of this backend, at its start; all tests share its compiled function."""
     session = compiled(make)
     session.restart()
     return session
@@ -119,7 +119,7 @@ def fresh(make) -> Session:
 
 @cache
 def replayed(make):
-    """The steps of a replay of `walk(340)`, and all that the session knew at its end."""
+    """The steps of a replay of `walk(340)`, and the arrays of the session at its end."""
     session = fresh(make)
     return list(session.replay(walk(340))), session.arrays()
 
@@ -173,7 +173,7 @@ def test_a_restored_session_continues_as_if_never_stopped(make, stop):
     assert equal(whole, second.arrays())
 
 
-def test_a_batch_of_runs_equals_each_run(make):
+def test_a_batch_of_sessions_equals_each_session(make):
     backend = make()
     runs = [list(walk(20, seed)) for seed in range(3)]
     batch = [jax.tree.map(lambda *rows: np.stack(rows), *step) for step in zip(*runs, strict=True)]
@@ -207,7 +207,7 @@ def test_places_are_consistent(make):
         previous = place
 
 
-def test_nothing_odd_comes_of_odd_input(make):
+def test_invalid_input_gives_finite_results(make):
     session = fresh(make)
     still = observation(Odometry(0, 0, 0, 0.1), np.full(VIEW, 0.5), label=3, whiskers=WHISKERS)
     odd = still._replace(odometry=Odometry(*(np.float64(v) for v in (np.nan, np.inf, 0, 0.1))))
@@ -224,9 +224,10 @@ def test_single_precision_stays_single_and_finite(kind):
     session = Session(SINGLE[kind](), precision="float32")
     for step in session.replay(walk(200)):
         assert np.isfinite(step.pose).all()
-        told = step.evidence._replace(**({"background": 0.0} if hasattr(step.evidence, "background") else {}))
-        floats = [leaf for leaf in [*step.estimate[:2], *told] if np.asarray(leaf).dtype.kind == "f"]
-        assert all(np.isfinite(leaf).all() for leaf in floats if leaf is not getattr(told, "error", None))
+        blank = {"background": 0.0} if hasattr(step.evidence, "background") else {}
+        evidence = step.evidence._replace(**blank)
+        floats = [leaf for leaf in [*step.estimate[:2], *evidence] if np.asarray(leaf).dtype.kind == "f"]
+        assert all(np.isfinite(leaf).all() for leaf in floats if leaf is not getattr(evidence, "error", None))
     grown = session.backend.grow(session.state, 512)
     kinds = {leaf.dtype for leaf in jax.tree.leaves((session.state, grown))}
     assert np.dtype(np.float64) not in kinds
@@ -234,16 +235,16 @@ def test_single_precision_stays_single_and_finite(kind):
     assert np.isfinite(session.map.trajectory()).all()
 
 
-def test_touch_closes_and_weighs_in_these_walks():
-    # Else replay, checkpoints and capacities would prove little of it.
+def test_touch_closes_loops_and_selects_sequences_in_these_walks():
+    # Otherwise the tests of replay, checkpoints and capacities would not cover it.
     _, arrays = replayed(BACKENDS["touch"])
     assert arrays["map/appearance/likeness/0"].any()
     weight = arrays["map/log/weight"]
     assert ((weight > 0) & (weight < 1)).any()
 
 
-def test_the_grid_draws_anew_in_these_walks():
-    # Else replay and checkpoints would prove little of it.
+def test_the_grid_filter_resamples_in_these_walks():
+    # Otherwise the tests of replay and checkpoints would not cover it.
     outcomes = np.array([step.evidence.outcome for step in replayed(BACKENDS["grid"])[0]])
     assert 10 < (outcomes == GridOutcome.RESAMPLED).sum() < 330
 
@@ -261,7 +262,7 @@ def test_compiles_once_per_capacity(make):
     assert reserved.compilations() == 1
 
 
-def test_warming_up_changes_nothing_but_when_it_compiles(make):
+def test_warming_up_changes_only_the_time_of_compilation(make):
     warm = Session(make())
     warm.warm(next(walk(1)))
     assert (warm.compilations(), warm.steps) == (1, 0)
@@ -270,8 +271,8 @@ def test_warming_up_changes_nothing_but_when_it_compiles(make):
 
 
 @pytest.mark.parametrize("name", ["classic", "classic-labels", "grid", "dead-reckoning"])
-def test_what_learns_nothing_new_does_not_grow(name):
-    """Else a long run on known ground would take more and more time and memory."""
+def test_memory_does_not_grow_on_known_ground(name):
+    """Otherwise time and memory of long sessions on known ground would grow."""
     session = Session(BACKENDS[name]())
     list(session.replay(walk(600)))
     assert session.compilations() == 1

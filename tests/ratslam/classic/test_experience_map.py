@@ -66,7 +66,7 @@ def square(world: ExperienceMap, bias: float, sign: float = 1.0, laps: int = 3):
 
 
 @pytest.mark.parametrize("solver", ["least_squares", "relaxation"])
-def test_relative_headings_are_taken_off(solver):
+def test_relative_headings_are_subtracted(solver):
     config = ExperienceConfig.model_validate({"solver": {"name": solver}})
     errors = {}
     for sign in (1.0, -1.0):
@@ -119,7 +119,7 @@ def test_a_restored_map_continues_bit_for_bit(stop):
         assert np.array_equal(value, second.arrays()[name]), name
 
 
-def test_odd_input_changes_nothing():
+def test_invalid_odometry_changes_nothing():
     world = ExperienceMap()
     fold(world, (0, 0, 0), Action.CREATE, 0)
     fold(world, (np.nan, 0, 0))

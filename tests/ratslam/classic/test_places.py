@@ -14,73 +14,73 @@ from ratslam.core.types import Action
 
 CONFIG = PlaceConfig(radius=2.0, radius_heading=3.0)
 RINGS = np.array([11.0, 11.0, 36.0])
-DECIDE = jax.jit(lambda *told: decide(CONFIG, RINGS, *told))
+DECIDE = jax.jit(lambda *inputs: decide(CONFIG, RINGS, *inputs))
 
 
 def walk(visits, capacity=8):
     """The store and the decisions after (packet, template, seen) or (packet, template)."""
-    store, told = start(capacity, np.dtype(float)), []
+    store, decisions = start(capacity, np.dtype(float)), []
     for packet, template, *seen in visits:
         seen = jnp.bool_(seen[0] if seen else True)
         store, decision = DECIDE(store, jnp.asarray(packet, float), jnp.int32(template), seen)
-        told.append(decision)
-    return store, told
+        decisions.append(decision)
+    return store, decisions
 
 
-def actions(told):
-    return [Action(int(decision.action)) for decision in told]
+def actions(decisions):
+    return [Action(int(decision.action)) for decision in decisions]
 
 
-def places(told):
-    return [int(decision.place) for decision in told]
+def places(decisions):
+    return [int(decision.place) for decision in decisions]
 
 
 A, B, C = (1.0, 1, 1), (5.0, 5, 1), (8.0, 1, 20)
 
 
-def test_new_views_make_places_and_seeing_on_keeps_them():
+def test_new_views_create_places_and_equal_ones_keep_them():
     """CREATE where the view is new, NONE while nothing changes, in order of creation."""
-    store, told = walk([(A, 0), (A, 0), ((1.5, 1, 1), 0), (B, 1), (B, 1)])
-    assert actions(told) == [Action.CREATE, Action.NONE, Action.NONE, Action.CREATE, Action.NONE]
-    assert places(told) == [0, 0, 0, 1, 1]
-    assert [int(decision.previous) for decision in told] == [-1, 0, 0, 0, 1]
+    store, decisions = walk([(A, 0), (A, 0), ((1.5, 1, 1), 0), (B, 1), (B, 1)])
+    assert actions(decisions) == [Action.CREATE, Action.NONE, Action.NONE, Action.CREATE, Action.NONE]
+    assert places(decisions) == [0, 0, 0, 1, 1]
+    assert [int(decision.previous) for decision in decisions] == [-1, 0, 0, 0, 1]
     assert np.asarray(store.packet[:2]).tolist() == [list(A), list(B)]
     assert np.asarray(store.template[:3]).tolist() == [0, 1, -1]
     assert np.asarray(store.link[0]).tolist() == [0, 1]
-    assert all(bool(decision.room) for decision in told)
+    assert all(bool(decision.room) for decision in decisions)
 
 
-def test_a_way_is_linked_once_then_set_in_either_direction():
+def test_a_connection_is_linked_once_then_set_in_either_direction():
     """The first time between two places is LINK (or CREATE); after that SET, there and back."""
     there = [(A, 0), (B, 1), (C, 2)]
-    store, told = walk([*there, (A, 0), (C, 2), (A, 0), (B, 1), (A, 0)])
+    store, decisions = walk([*there, (A, 0), (C, 2), (A, 0), (B, 1), (A, 0)])
     create, link, known = Action.CREATE, Action.LINK, Action.SET
-    assert actions(told) == [create, create, create, link, known, known, known, known]
-    assert places(told) == [0, 1, 2, 0, 2, 0, 1, 0]
+    assert actions(decisions) == [create, create, create, link, known, known, known, known]
+    assert places(decisions) == [0, 1, 2, 0, 2, 0, 1, 0]
     assert int(store.links) == 3
 
 
 def test_without_a_view_nothing_is_decided():
     """Unseen steps leave the store as it is, wherever the packet is."""
     store, _ = walk([(A, 0), (B, 1)])
-    after, told = walk([(A, 0), (B, 1), (C, 7, False), (A, 0, False)])
-    assert actions(told)[2:] == [Action.NONE] * 2
-    assert places(told)[2:] == [1, 1]
+    after, decisions = walk([(A, 0), (B, 1), (C, 7, False), (A, 0, False)])
+    assert actions(decisions)[2:] == [Action.NONE] * 2
+    assert places(decisions)[2:] == [1, 1]
     for one, other in zip(store, after, strict=True):
         assert (np.asarray(one) == np.asarray(other)).all()
 
 
 def test_the_same_view_elsewhere_is_another_place():
     """Places of one template lie more than a radius apart, and each is found again."""
-    _, told = walk([(A, 0), (B, 0), (A, 0), (B, 0)])
-    assert actions(told) == [Action.CREATE, Action.CREATE, Action.SET, Action.SET]
-    assert places(told) == [0, 1, 0, 1]
+    _, decisions = walk([(A, 0), (B, 0), (A, 0), (B, 0)])
+    assert actions(decisions) == [Action.CREATE, Action.CREATE, Action.SET, Action.SET]
+    assert places(decisions) == [0, 1, 0, 1]
 
 
 def test_another_view_at_the_same_spot_is_another_place():
-    """Both the view and the packet make a place."""
-    _, told = walk([(A, 0), (A, 1), (A, 0)])
-    assert actions(told) == [Action.CREATE, Action.CREATE, Action.SET]
+    """The view and the packet together define a place."""
+    _, decisions = walk([(A, 0), (A, 1), (A, 0)])
+    assert actions(decisions) == [Action.CREATE, Action.CREATE, Action.SET]
 
 
 @given(seed=st.integers(0, 2**32 - 1))
@@ -97,42 +97,42 @@ def test_distance_goes_the_short_way_round_every_ring(seed):
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_place_reaches_across_the_seam(axis):
-    """Just below N and just above 0 are the same neighbourhood."""
+def test_a_place_reaches_across_the_wrap_of_a_ring(axis):
+    """Positions just below N and just above 0 are neighbours."""
     before, after = np.array([5.0, 5, 5]), np.array([5.0, 5, 5])
     before[axis], after[axis] = RINGS[axis] - 0.25, 0.25
-    _, told = walk([(before, 0), (after, 0), (C, 1), (after, 0), (before, 0)])
+    _, decisions = walk([(before, 0), (after, 0), (C, 1), (after, 0), (before, 0)])
     none = Action.NONE
-    assert actions(told) == [Action.CREATE, none, Action.CREATE, Action.SET, none]
-    assert places(told) == [0, 0, 1, 0, 0]
+    assert actions(decisions) == [Action.CREATE, none, Action.CREATE, Action.SET, none]
+    assert places(decisions) == [0, 0, 1, 0, 0]
 
 
 def test_at_exactly_the_radius_the_robot_stays_but_does_not_arrive():
-    """On the edge the current place is kept and no other is reached; beyond it a place is made."""
+    """At the radius the current place is kept and no other is reached; beyond it a place is created."""
     edge = (3.0, 1, 1)
-    _, told = walk([(A, 0), (edge, 0)])
-    assert actions(told)[-1] is Action.NONE
-    _, told = walk([(A, 0), ((3.0 + 1e-6, 1, 1), 0)])
-    assert actions(told)[-1] is Action.CREATE
-    _, told = walk([(A, 0), (B, 1), (edge, 0)])
-    assert actions(told)[-1] is Action.CREATE
+    _, decisions = walk([(A, 0), (edge, 0)])
+    assert actions(decisions)[-1] is Action.NONE
+    _, decisions = walk([(A, 0), ((3.0 + 1e-6, 1, 1), 0)])
+    assert actions(decisions)[-1] is Action.CREATE
+    _, decisions = walk([(A, 0), (B, 1), (edge, 0)])
+    assert actions(decisions)[-1] is Action.CREATE
 
 
 def test_the_nearest_place_is_reached_and_the_earliest_of_equals():
     """Between two places of a template: the nearer one, and half-way the older one."""
     two = [((1.0, 5, 1), 0), ((4.0, 5, 1), 0), (C, 1)]
     for x, reached in ((2.9, 1), (2.1, 0), (2.5, 0)):
-        _, told = walk([*two, ((x, 5.0, 1.0), 0)])
-        assert places(told)[-1] == reached, x
+        _, decisions = walk([*two, ((x, 5.0, 1.0), 0)])
+        assert places(decisions)[-1] == reached, x
 
 
-def test_a_full_store_says_so_and_overwrites_nothing():
-    """Without room nothing is made, the place stays, and known places are still reached."""
+def test_a_full_store_is_reported_and_overwrites_nothing():
+    """Without room no place is created, the current one stays, and known ones are still reached."""
     full = [(A, 0), (B, 1)]
     store, _ = walk(full, capacity=2)
-    after, told = walk([*full, (C, 2), (A, 0)], capacity=2)
-    assert [bool(decision.room) for decision in told] == [True, True, False, True]
-    assert actions(told)[2:] == [Action.NONE, Action.SET]
-    assert places(told)[2:] == [1, 0]
+    after, decisions = walk([*full, (C, 2), (A, 0)], capacity=2)
+    assert [bool(decision.room) for decision in decisions] == [True, True, False, True]
+    assert actions(decisions)[2:] == [Action.NONE, Action.SET]
+    assert places(decisions)[2:] == [1, 0]
     for name in ("packet", "template", "count", "link", "links"):
         assert (np.asarray(getattr(store, name)) == np.asarray(getattr(after, name))).all(), name

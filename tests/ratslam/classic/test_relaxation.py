@@ -1,4 +1,4 @@
-"""The classic relaxation against the plainest version of itself."""
+"""The classic relaxation, compared with a naive implementation."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tactile.base.se2 import between, wrap
 
 
 def naive(poses, start, end, distance, heading, facing, loops, correction):
-    """Each link in turn, written down as the paper says it."""
+    """Each link in turn, as in the paper."""
     poses = poses.copy()
     for _ in range(loops):
         for link in range(len(start)):
@@ -37,8 +37,8 @@ def links(poses, ends):
 
 
 @given(seed=st.integers(0, 2**32 - 1), correction=st.floats(0.05, 1), loops=st.integers(0, 5))
-def test_it_is_the_naive_sweep(seed, correction, loops):
-    """Order, signs and shares are those of the plain loop."""
+def test_the_sweep_equals_the_naive_one(seed, correction, loops):
+    """Order, signs and shares are those of the naive loop."""
     rng = np.random.default_rng(seed)
     poses = rng.uniform(-3, 3, (12, 3))
     ends = np.array([rng.permutation(12)[:2] for _ in range(20)])
@@ -51,7 +51,7 @@ def test_it_is_the_naive_sweep(seed, correction, loops):
 
 @given(seed=st.integers(0, 2**32 - 1))
 def test_an_exact_graph_stays(seed):
-    """Where every link agrees nothing moves, however often it is swept."""
+    """If every link agrees, no number of sweeps moves a node."""
     rng = np.random.default_rng(seed)
     poses = rng.uniform(-3, 3, (10, 3))
     ends = np.array([rng.permutation(10)[:2] for _ in range(15)])
@@ -59,14 +59,14 @@ def test_an_exact_graph_stays(seed):
 
 
 def test_a_link_shares_its_error():
-    """One sweep with a half each closes a link of two nodes from both ends."""
+    """One sweep with a correction of one half closes a link of two nodes from both ends."""
     none = np.array([0.0])
     out = relax(np.zeros((2, 3)), np.array([0]), np.array([1]), np.array([2.0]), none, none, 1, 0.5)
     assert out == pytest.approx(np.array([[-1.0, 0, 0], [1.0, 0, 0]]))
 
 
-def test_no_links_and_no_nodes():
-    """Nothing to do leaves everything as it is."""
+def test_empty_graphs_are_unchanged():
+    """Without links or nodes the poses are returned unchanged."""
     empty, ids = np.zeros(0), np.zeros(0, int)
     assert relax(np.ones((1, 3)), ids, ids, empty, empty, empty, 3, 0.5).tolist() == [[1.0, 1.0, 1.0]]
     assert relax(np.zeros((0, 3)), ids, ids, empty, empty, empty, 3, 0.5).shape == (0, 3)

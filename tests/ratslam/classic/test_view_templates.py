@@ -1,4 +1,4 @@
-"""Laws of view matching, against loops written out."""
+"""Laws of view matching, compared with explicit loops."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def by_loops(config, views, view):
     ids=["in-place", "shift", "coarse-shift", "panoramic"],
 )
 @pytest.mark.parametrize("seed", range(5))
-def test_the_best_template_is_the_one_loops_find(settings, seed):
+def test_the_best_match_equals_explicit_loops(settings, seed):
     config = TemplateConfig.model_validate(settings | {"threshold": 1.0})
     stream = np.random.default_rng(seed)
     views = stream.random((7, *SHAPE))
@@ -84,7 +84,7 @@ def test_labels_of_any_number_find_their_template():
     assert int(view_templates.match_label(store, jnp.int32(7)).template) == -1
 
 
-def test_energy_fades_while_a_view_stays_and_comes_back():
+def test_energy_falls_during_a_view_and_recovers_later():
     config = TemplateConfig(recent=0)
     store = filled(config, [np.zeros(SHAPE), np.ones(SHAPE)])
     first, second = (view_templates.Match(jnp.int32(k), jnp.asarray(0.0), jnp.asarray(0.0)) for k in (0, 1))
@@ -110,7 +110,7 @@ def test_recent_templates_recall_nothing():
     assert energies[1:] == [0, 0]
 
 
-def test_a_full_store_keeps_what_it_has():
+def test_a_full_store_keeps_its_templates():
     config = TemplateConfig()
     views = np.random.default_rng(0).random((4, *SHAPE))
     store = filled(config, views, capacity=4)

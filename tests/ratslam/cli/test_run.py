@@ -23,7 +23,7 @@ FILES = {
     "map.png", "odometry.tum", "online.tum", "scorecard.json", "steps.csv", "trajectory.tum", "truth.tum",
 }  # fmt: skip
 SQUARE = (str(ROOT / "configs" / "square.yaml"), "--set", "session.reserve=512")
-"""A configuration, compiled once and not at each power of two."""
+"""A configuration that is compiled once instead of at each power of two."""
 
 
 @pytest.fixture(scope="module")
@@ -54,14 +54,14 @@ def start(config, directory):
     return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
 
 
-def refused(capsys, arguments, *said):
-    """The command ends with code 2 and an error that contains all of `said`, without a traceback."""
+def refuses(capsys, arguments, *messages):
+    """The command ends with code 2 and an error that contains all of `messages`, without a traceback."""
     capsys.readouterr()
     assert main([str(argument) for argument in arguments]) == 2
     error = capsys.readouterr().err
     assert "Traceback" not in error
     assert "ratslam: error: " in error
-    for words in said:
+    for words in messages:
         assert words in error
 
 
@@ -133,9 +133,9 @@ def test_an_interrupted_run_is_scored_and_continues(corridor, tmp_path):
     process = start(config, tmp_path / "first")
     wait_for_steps(process, tmp_path / "first")
     process.send_signal(signal.SIGINT)
-    _, said = process.communicate()
+    _, messages = process.communicate()
     first = tmp_path / "first"
-    assert process.returncode == 130, said
+    assert process.returncode == 130, messages
     assert json.loads((first / "manifest.json").read_text())["status"] == "interrupted"
     assert {path.name for path in first.iterdir()} == FILES
     second = tmp_path / "second"
@@ -160,7 +160,7 @@ def check_killed_run(corridor, directory):
 
 
 def test_a_killed_run_is_readable(corridor, tmp_path):
-    """Also before its first step: a stopped process leaves what a killed one does."""
+    """Also before its first step: a stopped process leaves the same files as a killed one."""
     process = start(corridor[0], tmp_path / "run")
     wait_for_steps(process, tmp_path / "run", -1)
     process.send_signal(signal.SIGSTOP)
@@ -194,7 +194,7 @@ def test_fifty_killed_runs_are_readable(corridor, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "messages"),
     [
         ("", ["config.yaml"]),
         (
@@ -211,10 +211,10 @@ def test_fifty_killed_runs_are_readable(corridor, tmp_path):
         ("pose_cells: {}\nplaces: {radius: 0}\n", ["recording", "places.radius"]),
     ],
 )
-def test_a_faulty_config_is_refused(capsys, tmp_path, text, said):
+def test_a_faulty_config_is_refused(capsys, tmp_path, text, messages):
     config = tmp_path / "config.yaml"
     config.write_text(text)
-    refused(capsys, ["run", config, "-o", tmp_path / "run"], *said)
+    refuses(capsys, ["run", config, "-o", tmp_path / "run"], *messages)
     assert not (tmp_path / "run").exists()
 
 
@@ -237,7 +237,7 @@ def put(row, value):
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "messages"),
     [
         ({"in_w": lambda w: w * 180 / np.pi}, "deg"),
         ({"in_v": lambda v: v * 1000}, "m"),
@@ -248,9 +248,9 @@ def put(row, value):
     ],
     ids=["degrees", "millimetres", "nan", "backwards", "bytes", "shape"],
 )
-def test_a_faulty_recording_is_refused(capsys, tmp_path, changes, said):
+def test_a_faulty_recording_is_refused(capsys, tmp_path, changes, messages):
     file = changed(tmp_path, **changes)
-    refused(capsys, ["run", *SQUARE, "-o", tmp_path / "run", "--set", f"recording.file={file}"], said)
+    refuses(capsys, ["run", *SQUARE, "-o", tmp_path / "run", "--set", f"recording.file={file}"], messages)
     assert not (tmp_path / "run").exists()
 
 
@@ -259,29 +259,29 @@ def test_cut_and_empty_recordings_are_refused(capsys, tmp_path):
     for name, content in (("cut.npz", whole[:5000]), ("empty.npz", b""), ("noise.mcap", b"noise" * 99)):
         (tmp_path / name).write_bytes(content)
         file = f"recording.file={tmp_path / name}"
-        refused(capsys, ["run", *SQUARE, "-o", tmp_path / "run", "--set", file], name)
+        refuses(capsys, ["run", *SQUARE, "-o", tmp_path / "run", "--set", file], name)
 
 
 def test_an_existing_directory_is_not_changed(capsys, square):
     before = {path: path.read_bytes() for path in square.iterdir()}
-    refused(capsys, ["run", *SQUARE, "-o", square], "exists")
+    refuses(capsys, ["run", *SQUARE, "-o", square], "exists")
     assert before == {path: path.read_bytes() for path in square.iterdir()}
 
 
 def test_wrong_checkpoints_are_refused(capsys, square, tmp_path):
     again = ["run", *SQUARE, "-o", tmp_path / "run", "--continue"]
-    refused(capsys, [*again, square / "map.npz"], "already")
-    refused(capsys, [*again, square / "steps.csv"], "checkpoint")
-    refused(capsys, [*again, tmp_path / "none.npz"], "none.npz")
-    refused(capsys, [*again, square / "map.npz", "--set", "pose_cells.cells_xy=25"], "configuration")
+    refuses(capsys, [*again, square / "map.npz"], "already")
+    refuses(capsys, [*again, square / "steps.csv"], "checkpoint")
+    refuses(capsys, [*again, tmp_path / "none.npz"], "none.npz")
+    refuses(capsys, [*again, square / "map.npz", "--set", "pose_cells.cells_xy=25"], "configuration")
     assert not (tmp_path / "run").exists()
 
 
 def test_score_refuses_a_folder_or_file_without_a_log(capsys, tmp_path):
-    refused(capsys, ["score", tmp_path], "online.tum")
+    refuses(capsys, ["score", tmp_path], "online.tum")
     (tmp_path / "log.csv").write_text("t,id\n0,1\n")
-    refused(capsys, ["score", tmp_path / "log.csv"], "log.csv")
-    refused(capsys, ["score", tmp_path / "log.csv", "--base", "-1"], "--base: -1")
+    refuses(capsys, ["score", tmp_path / "log.csv"], "log.csv")
+    refuses(capsys, ["score", tmp_path / "log.csv", "--base", "-1"], "--base: -1")
 
 
 def test_a_scored_directory_gives_its_scorecard(capsys, square):
@@ -297,7 +297,7 @@ def test_a_full_disk_is_one_clear_error(capsys, square, tmp_path):
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
-        refused(capsys, ["run", *SQUARE, "-o", tmp_path / "run"], "File too large", "free some space")
+        refuses(capsys, ["run", *SQUARE, "-o", tmp_path / "run"], "File too large", "free some space")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         signal.signal(signal.SIGXFSZ, before)
@@ -318,7 +318,7 @@ def test_a_cut_recording_is_recovered_and_run(capsys, tmp_path):
     assert main(["run", *SQUARE, "-o", str(tmp_path / "run"), "--set", file]) == 0
     steps = (tmp_path / "run" / "steps.csv").read_text().count("\n") - 1
     assert 50 < steps < 349
-    refused(capsys, ["recover", ROOT / "LICENSE", "-o", tmp_path / "x.mcap"], "LICENSE")
+    refuses(capsys, ["recover", ROOT / "LICENSE", "-o", tmp_path / "x.mcap"], "LICENSE")
 
 
 def test_the_schema_names_every_part(capsys):
@@ -330,4 +330,4 @@ def test_the_schema_names_every_part(capsys):
 
 def test_a_folder_that_cannot_be_made_is_refused(capsys, tmp_path):
     (tmp_path / "file").write_text("in the way")
-    refused(capsys, ["run", *SQUARE, "-o", tmp_path / "file" / "run"], "cannot be created")
+    refuses(capsys, ["run", *SQUARE, "-o", tmp_path / "file" / "run"], "cannot be created")

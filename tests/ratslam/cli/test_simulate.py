@@ -39,13 +39,13 @@ def folder(tmp_path_factory):
     return path
 
 
-def refused(capsys, arguments, *said):
-    """The command ends with code 2 and an error that contains all of `said`, without a traceback."""
+def refuses(capsys, arguments, *messages):
+    """The command ends with code 2 and an error that contains all of `messages`, without a traceback."""
     capsys.readouterr()
     assert main([str(argument) for argument in arguments]) == 2
     error = capsys.readouterr().err
     assert "Traceback" not in error
-    for words in ("ratslam: error: ", *said):
+    for words in ("ratslam: error: ", *messages):
         assert words in error
 
 
@@ -114,17 +114,17 @@ def test_a_recorded_session_gives_the_observations_of_the_simulation(raw, tmp_pa
 
 def test_an_existing_file_is_not_changed(capsys, folder):
     before = (folder / "session.mcap").read_bytes()
-    refused(capsys, ["simulate", folder / "config.yaml", "-o", folder / "session.mcap"], "exists already")
+    refuses(capsys, ["simulate", folder / "config.yaml", "-o", folder / "session.mcap"], "exists already")
     assert (folder / "session.mcap").read_bytes() == before
 
 
 def test_a_configuration_without_a_simulation_is_refused(capsys, folder, tmp_path):
-    refused(capsys, ["simulate", folder / "replay.yaml", "-o", tmp_path / "a.mcap"], "simulation: missing")
+    refuses(capsys, ["simulate", folder / "replay.yaml", "-o", tmp_path / "a.mcap"], "simulation: missing")
     assert not (tmp_path / "a.mcap").exists()
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "messages"),
     [
         ("touch: {}\n", ["neither recording, simulation, create_simulation nor live"]),
         ("recording: {file: a.npz}\nsimulation: {}\n", ["recording and simulation; give one"]),
@@ -136,10 +136,10 @@ def test_a_configuration_without_a_simulation_is_refused(capsys, folder, tmp_pat
         ("simulation: {maze: {loop: 7}}\n", ["simulation.maze.loop"]),
     ],
 )
-def test_a_faulty_config_is_refused(capsys, tmp_path, text, said):
+def test_a_faulty_config_is_refused(capsys, tmp_path, text, messages):
     config = tmp_path / "config.yaml"
     config.write_text(text)
-    refused(capsys, ["run", config, "-o", tmp_path / "run"], *said)
+    refuses(capsys, ["run", config, "-o", tmp_path / "run"], *messages)
     assert not (tmp_path / "run").exists()
 
 
@@ -160,8 +160,8 @@ def started(tmp_path):
 def test_an_interrupted_session_is_a_complete_file(tmp_path):
     process, path = started(tmp_path)
     process.send_signal(signal.SIGINT)
-    out, said = process.communicate()
-    assert process.returncode == 130, said
+    out, messages = process.communicate()
+    assert process.returncode == 130, messages
     source = Recording(path)
     assert not source.truncated
     assert 16 < source.length < 30_000

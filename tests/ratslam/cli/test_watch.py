@@ -75,20 +75,20 @@ def killed(tmp_path_factory):
 
 def test_a_run_in_progress_is_watched_to_its_end_and_is_not_changed(alone, tmp_path):
     folder = tmp_path / "run"
-    told, pictures = [], []
+    lines, pictures = [], []
     with run_in_progress(folder) as complete:
 
-        def tell(line):
-            told.append(line)
+        def report(line):
+            lines.append(line)
             pictures.append((folder / "watch.png").read_bytes())
-            if len(told) == 1:
+            if len(lines) == 1:
                 complete()
 
-        seen = watch_run(folder, tell, every=0.1)
-    steps = int(re.search(r"run: running, (\d+) of 349 steps", told[0])[1])
+        seen = watch_run(folder, report, every=0.1)
+    steps = int(re.search(r"run: running, (\d+) of 349 steps", lines[0])[1])
     assert steps == STEPS_BEFORE < 349
     assert seen.status == "complete"
-    assert told[-1].startswith("run: complete, 349 of 349 steps, ")
+    assert lines[-1].startswith("run: complete, 349 of 349 steps, ")
     assert pictures[0] != pictures[-1]
     assert all(content.startswith(b"\x89PNG") and content.endswith(b"IEND\xaeB`\x82") for content in pictures)
     left = {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "watch.png"}
@@ -121,10 +121,10 @@ def test_a_killed_run_is_given_up_after_a_long_silence(killed, tmp_path, capsys)
     for path in folder.iterdir():
         os.utime(path, (0, time.time() - 100))
     assert main(["watch", str(folder), "--patience", "50"]) == 0
-    said = capsys.readouterr().out
-    assert "run: running" in said
-    assert "silent for 100 s\n" in said
-    assert "the run was killed" in said
+    output = capsys.readouterr().out
+    assert "run: running" in output
+    assert "silent for 100 s\n" in output
+    assert "the run was killed" in output
     assert before == {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "watch.png"}
     assert 0 < len(RunMonitor(folder).read().path) <= (folder / "steps.csv").read_text().count("\n") - 1
 
@@ -169,8 +169,8 @@ def files(steps, random, truth=True):
     """The streams of a run of so many steps."""
     pose = random.normal(size=(steps, 3))
     rows = ["t,place,action,x,y,heading,sd_x,sd_y,sd_heading,lost,outcome,match"]
-    for k, told in enumerate(pose.tolist()):
-        cells = [k / 4, k, "none", *told, 0.1, 0.2, 0.3, k % 2, ("ok", "reseeded")[k % 3 == 1], ""]
+    for k, row in enumerate(pose.tolist()):
+        cells = [k / 4, k, "none", *row, 0.1, 0.2, 0.3, k % 2, ("ok", "reseeded")[k % 3 == 1], ""]
         rows.append(",".join(map(str, cells)))
     tum = [
         "".join(tum_line(k / 4, p) for k, p in enumerate(random.normal(size=(steps, 3)))) for _ in range(2)

@@ -1,4 +1,4 @@
-"""Completion of a configuration: which value fills a setting, and that nothing stays open."""
+"""Completion of a configuration: the precedence of values, and that every setting is filled."""
 
 from __future__ import annotations
 
@@ -124,13 +124,13 @@ def test_the_grid_covers_the_odometry_or_the_given_extent():
     assert side is not None
     assert side > 2 * EXTENT_MARGIN
     assert complete(config, source, 2.0).grid.side == round(2 * (EXTENT_FACTOR * 2.0 + EXTENT_MARGIN), 2)
-    said = RunConfig.model_validate(CREATE | {"backend": "grid", "grid": {"side": 3.0}})
-    assert complete(said, source).grid.side == 3.0
+    given = RunConfig.model_validate(CREATE | {"backend": "grid", "grid": {"side": 3.0}})
+    assert complete(given, source).grid.side == 3.0
 
 
 @pytest.fixture
 def buildings(tmp_path):
-    """Files of two buildings, the name of one the beginning of the other's, and the shared configuration."""
+    """Files of two buildings, one name a prefix of the other, and the shared configuration."""
     for name in ("hall", "hall_2"):
         for file in ("odom_gt.csv", "scans.csv"):
             (tmp_path / f"{name}_{file}").touch()

@@ -43,7 +43,7 @@ def errors_of(document, model=Outer) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "messages"),
     [
         (
             "seed: 1\nframes:\n  score: 2\n",
@@ -67,8 +67,8 @@ def errors_of(document, model=Outer) -> list[str]:
     ],
     ids=["nested", "section", "scalar", "empty", "half renamed", "sentence"],
 )  # fmt: skip
-def test_an_old_key_names_the_new_one(text: str, said: list[str]) -> None:
-    assert errors_of(parse(text, "c.yaml")) == said
+def test_an_old_key_names_the_new_one(text: str, messages: list[str]) -> None:
+    assert errors_of(parse(text, "c.yaml")) == messages
 
 
 def test_an_old_key_of_an_option_names_the_new_one() -> None:

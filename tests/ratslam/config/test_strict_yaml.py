@@ -1,4 +1,4 @@
-"""Configuration files: what is read, what is refused and where the message points."""
+"""Configuration files: accepted and refused content, and the places in messages."""
 
 from __future__ import annotations
 
@@ -486,7 +486,7 @@ def _refusal(action: Callable[[], object]) -> str:
 
 
 def _reads_or_refuses(text: str) -> None:
-    """Whatever the text is: a config, or an error with a place."""
+    """Checks that a text gives a config, or an error with a place."""
     message = _refusal(lambda: validate(parse(text, "c.yaml"), Config))
     assert not message or re.match(r"c\.yaml(:\d+:\d+)?: ", message)
     message.encode()  # it can be printed

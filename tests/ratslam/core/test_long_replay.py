@@ -1,4 +1,4 @@
-"""Long replays: all steps are written, and memory grows only by what the final map needs of each step.
+"""Long replays: all steps are written, and memory grows only by the final map's part of each step.
 
     python -m tests.ratslam.core.test_long_replay labels | views | blind [--steps 1000000] [--folder FOLDER]
 
@@ -68,7 +68,7 @@ class Circuit:
         lap = PLACES * DWELL
         random = stream(0, "tests.long_replay")
         self._views = random.random((PLACES, *VIEW))
-        # The same errors on each lap, so that the last lap is what the second was.
+        # The same errors on each lap, so that the last lap equals the second.
         self._motion = np.tile([0.01, 0.0, 2 * np.pi / lap], (lap, 1)) + random.normal(0, 2e-4, (lap, 3))
         self._truth = integrate(np.tile([0.01, 0.0, 2 * np.pi / lap], (lap, 1)))
 
@@ -102,7 +102,7 @@ class Circuit:
 
 
 def process_source(kind: str, steps: int, folder: Path) -> dict[str, Any]:
-    """Replays so many steps into a run directory; what it took.
+    """Replays steps into a run directory; returns times and memory.
 
     Returns:
         steps, and lines in steps.csv; early, late: most memory resident in the second half of the first tenth
@@ -149,8 +149,8 @@ def process_source(kind: str, steps: int, folder: Path) -> dict[str, Any]:
     }
 
 
-def apart(kind: str, steps: int, folder: Path) -> dict[str, Any]:
-    """The same in a process of its own, whose memory is that of the replay alone."""
+def replay_in_a_process(kind: str, steps: int, folder: Path) -> dict[str, Any]:
+    """Runs `process_source` in a separate process, so that only the replay uses memory."""
     if not STATUS.exists() or not FORGET.exists():
         pytest.skip("this system does not tell a process its peak memory")
     command = [sys.executable, "-m", "tests.ratslam.core.test_long_replay", kind, "--steps", str(steps)]
@@ -159,33 +159,33 @@ def apart(kind: str, steps: int, folder: Path) -> dict[str, Any]:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def bound(kind: str, steps: int) -> float:
+def memory_bound(kind: str, steps: int) -> float:
     """Bytes that memory may grow by between the first tenth of a replay and its end."""
     return (KEPT + COPIED + (0 if kind == "blind" else ALIGNED)) * steps + SLACK
 
 
-def holds(found: dict[str, Any]) -> None:
-    """Everything was written, and memory has grown by no more than what must be kept."""
+def check_memory(found: dict[str, Any]) -> None:
+    """Checks that all steps were written, and that memory has grown by the bound at most."""
     assert found["written"] == found["steps"]
-    assert found["late"] - found["early"] <= bound(found["kind"], found["steps"]), found
+    assert found["late"] - found["early"] <= memory_bound(found["kind"], found["steps"]), found
     assert found["places"] <= 2 * PLACES, "the circuit is not known again: this measures something else"
 
 
-def test_a_replay_keeps_little_of_each_step(tmp_path):
-    holds(apart("labels", 10_000, tmp_path / "run"))
+def test_memory_per_step_is_bounded(tmp_path):
+    check_memory(replay_in_a_process("labels", 10_000, tmp_path / "run"))
 
 
 @pytest.mark.soak
 @pytest.mark.timeout(7200)
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_million_steps_fit_in_memory(kind, tmp_path):
-    found = apart(kind, 1_000_000, tmp_path / "run")
+    found = replay_in_a_process(kind, 1_000_000, tmp_path / "run")
     print(json.dumps(found))
-    holds(found)
+    check_memory(found)
 
 
 def _peak() -> int:
-    """Most memory resident since `_forget`, bytes; 0 where the system does not tell."""
+    """Most memory resident since `_forget`, bytes; 0 where the system does not provide it."""
     if not STATUS.exists():
         return 0
     lines = STATUS.read_text(encoding="ascii").splitlines()

@@ -1,4 +1,4 @@
-"""Laws of records kept as rows of a few arrays."""
+"""Laws of records packed as rows of a few arrays."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def same(one, other):
 
 
 @given(kinds(), st.integers(1, 5))
-def test_what_is_written_is_read(kind, count):
+def test_records_read_back_equal(kind, count):
     records = [record(kind, seed) for seed in range(count)]
     rows = allocate(layout_of(records[0]), count + 2)
     for k, each in enumerate(records):
@@ -65,13 +65,13 @@ def test_compiled_code_reads_and_writes_the_same(seed):
         rows.write(k, each)
 
     @jax.jit
-    def turned(rows: PackedRecords) -> PackedRecords:
+    def reverse(rows: PackedRecords) -> PackedRecords:
         out = allocate(rows.layout, 3, jnp.zeros)
         for k in range(3):
             out = out.put(jnp.int32(2 - k), rows.at(jnp.int32(k)))
         return out
 
-    for one, other in zip(records, list(turned(rows).records(3))[::-1], strict=True):
+    for one, other in zip(records, list(reverse(rows).records(3))[::-1], strict=True):
         same(one, other)
 
 

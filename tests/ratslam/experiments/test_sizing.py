@@ -81,7 +81,7 @@ def test_a_covering_torus_does_not_wrap(span, cell):
 
 
 @given(CONFIGS, scenes())
-def test_what_is_proposed_fits_the_scene_and_is_proposed_again(config, scene):
+def test_proposals_fit_the_scene_and_are_stable(config, scene):
     found = {each.key: each.value for each in recommend(config, scene)}
     proposed = with_settings(config, found)
     if config.backend != "grid":
@@ -115,7 +115,7 @@ def test_the_snippet_makes_the_configuration_the_proposed_one(config, scene):
 
 
 @given(CONFIGS)
-def test_a_cheaper_step_asks_for_less_of_one_thing(config):
+def test_a_cheaper_step_lowers_one_setting(config):
     for step in cheaper_steps(config):
         less = with_settings(config, step.settings)
         assert less != config
@@ -131,7 +131,7 @@ def configuration(**content):
     return RunConfig.model_validate(content).with_absolute_paths(ROOT)
 
 
-def test_a_scene_is_what_its_odometry_tells():
+def test_a_scene_follows_from_its_odometry():
     motion = {"speed": 0.04, "jitter": {"speed": 0.0, "position": 0.0, "yaw_deg": 0.0}}
     config = configuration(simulation={"motion": motion, "path": {"circuits": "C"}})
     with open_source(with_tier(config, "kinematic")) as source:
@@ -172,36 +172,36 @@ def test_a_small_arena_is_sized(tmp_path, capsys, monkeypatch):
     path = tmp_path / "arena.yaml"
     path.write_text("create_simulation: {reports: 80}\nbackend: grid\nsession: {precision: float32}\n")
     assert main(["size", str(path), "--cycles", "60"]) == 0
-    told = capsys.readouterr().out
-    assert "60 of 80 cycles" in told
-    rows = [line for line in told.splitlines() if line.startswith(("| recommended", "| 33 particles"))]
+    output = capsys.readouterr().out
+    assert "60 of 80 cycles" in output
+    rows = [line for line in output.splitlines() if line.startswith(("| recommended", "| 33 particles"))]
     assert len(rows) == 2
     assert "%" in rows[1]
     assert "%" not in rows[0]
-    assert told.rstrip().endswith("arena.yaml has these settings already")
+    assert output.rstrip().endswith("arena.yaml has these settings already")
 
 
 @pytest.fixture
 def stubbed(monkeypatch):
-    """Nothing is run; the configurations that would have been."""
-    asked: list[RunConfig] = []
+    """Replaces sessions; returns the configurations that would be run."""
+    configurations: list[RunConfig] = []
 
     def run_job(job):
-        asked.append(job.config)
+        configurations.append(job.config)
         if job.config.backend == "classic":
             return RunRecord(hash="", seed=0, error="backend: cannot be had")
         em = Quantity(label="EM", value=float(job.config.pose_cells.cell_size), unit="")
         return RunRecord(hash="", seed=0, steps=9, quantities={"energy_all": em})
 
     monkeypatch.setattr("ratslam.experiments.sizing.trial_runs.run_job", run_job)
-    return asked
+    return configurations
 
 
 def test_every_step_is_tried_on_the_same_short_session(tmp_path, capsys, stubbed):
     path = tmp_path / "maze.yaml"
     path.write_text("simulation: {fidelity: dynamic}\npose_cells: {cell_size: 0.005, engine: dense}\n")
     assert main(["size", str(path), "--cycles", "400"]) == 0
-    told = capsys.readouterr().out
+    output = capsys.readouterr().out
     first, second, *others = stubbed
     assert first.pose_cells.cell_size > 0.005
     assert (second.pose_cells.cell_size, second.pose_cells.engine) == (0.005, "dense")
@@ -210,8 +210,8 @@ def test_every_step_is_tried_on_the_same_short_session(tmp_path, capsys, stubbed
     assert len(first.simulation.path.circuits) < 10
     assert "classic" in [config.backend for config in others]
     assert "float32" in [config.session.precision for config in others]
-    assert "backend: cannot be had" in told  # and the rest is told all the same
-    pasted = told.partition("For maze.yaml:")[2]
+    assert "backend: cannot be had" in output  # and the rest is output all the same
+    pasted = output.partition("For maze.yaml:")[2]
     changed = validate(parse(pasted, "a"), RunConfig)
     assert (changed.pose_cells, changed.simulation.fidelity) == (
         first.pose_cells.model_copy(update={"cells_xy": changed.pose_cells.cells_xy}), "kinematic",
@@ -234,7 +234,7 @@ def test_bad_input_is_one_clear_error(content, arguments, expected, tmp_path, ca
     rows = "".join(f"{k},0,0,0\n" for k in range(99))
     (tmp_path / "still.csv").write_text(f"t,x,y,heading\n{rows}")
     assert main(["size", str(tmp_path / "config.yaml"), *arguments]) == 2
-    told = capsys.readouterr().err.splitlines()
-    assert len(told) == 1
-    assert told[0].startswith("ratslam: error: ")
-    assert expected in told[0]
+    output = capsys.readouterr().err.splitlines()
+    assert len(output) == 1
+    assert output[0].startswith("ratslam: error: ")
+    assert expected in output[0]

@@ -22,8 +22,7 @@ steps = st.lists(
 
 
 def filled():
-    """Sequences of 2, 3 and 1 candidates at frames 50, 52, ..; sequence k's candidates have the gain k +
-    1."""
+    """Sequences of 2, 3 and 1 candidates at frames 50, 52, ..; those of sequence k have the gain k + 1."""
     log = ClosureLog()
     for k, sequence in enumerate([0, 0, 1, 1, 1, 2]):
         first = k in (0, 2, 5)

@@ -39,8 +39,7 @@ def closed(pairs, turn=(), sequence=(), scale=()):
 
 
 def laps(stream, bias=0.0, count=24, noise=0.0):
-    """Two laps of an ellipse, the second seen turned: truth, what odometry tells, true closures in 3
-    sequences."""
+    """Two laps of an ellipse, the second seen turned: truth, odometry, true closures in 3 sequences."""
     at = 2 * np.pi * np.arange(2 * count) / count
     truth = np.stack([3 * np.cos(at), 2 * np.sin(at), wrap(at + np.pi / 2)], axis=1)
     turn = np.where(np.arange(2 * count) < count, 0.0, stream.uniform(-0.6, 0.6, 2 * count))

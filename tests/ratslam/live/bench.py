@@ -41,7 +41,7 @@ class Moment(NamedTuple):
     sample: int
 
 
-class Kept(NamedTuple):
+class RecordedData(NamedTuple):
     """Content of a recording."""
 
     sequence: np.ndarray
@@ -58,14 +58,13 @@ class Kept(NamedTuple):
         return [event.name for event in self.events]
 
 
-def undisturbed(pid: int) -> None:
-    """Raises the priority of a process and its children where that is allowed: devices and sessions work in
-    real time."""
+def raise_priority(pid: int) -> None:
+    """Raises the priority of a process and its children where allowed, because they work in real time."""
     with suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, pid, -10)
 
 
-def kept(path: Path) -> Kept:
+def read_recorded(path: Path) -> RecordedData:
     """Reads a recording, complete or not."""
     walk = McapScanner(path)
     sequence, robot, samples, events = [], [], [], []
@@ -78,11 +77,11 @@ def kept(path: Path) -> Kept:
             events.append(entry.content)
         else:
             samples.append(entry.content)
-    return Kept(np.concatenate(sequence), np.concatenate(robot), samples, events, walk.broken)
+    return RecordedData(np.concatenate(sequence), np.concatenate(robot), samples, events, walk.broken)
 
 
 class Forked:
-    """A process started by a `SessionServer`; as a `subprocess.Popen`, as far as tests need it."""
+    """A process started by a `SessionServer`, with the methods of `subprocess.Popen` that tests use."""
 
     def __init__(self, pid: int, code: Path) -> None:
         self.pid, self._code = pid, code
@@ -146,7 +145,7 @@ class SessionServer:
         assert self._process.stdout is not None
         self._process.stdin.write(json.dumps(order) + "\n")
         session = Session(folder, Forked(int(self._process.stdout.readline()), code))
-        undisturbed(session.process.pid)
+        raise_priority(session.process.pid)
         return session
 
     def close(self) -> None:
@@ -198,9 +197,9 @@ class Session:
         report: dict[str, Any] = json.loads((self.directory / "live.json").read_text())
         return report
 
-    def kept(self) -> Kept:
+    def recorded(self) -> RecordedData:
         """Content of its recording."""
-        return kept(self.directory / "session.mcap")
+        return read_recorded(self.directory / "session.mcap")
 
     def child(self) -> int:
         """Process id of its RTDE process."""
@@ -245,7 +244,7 @@ class Bench:
         self.host, self._server, self._folder = host, server, folder
         self._arm, self._head = ExitStack(), ExitStack()
         self._faults: dict[str, Faults] = {}
-        self.starved = 0  # stops by the controller's watchdog, before the test
+        self.starved = 0  # the controller's watchdog stops it before the test
 
     @property
     def arm(self) -> Faults:
@@ -265,7 +264,7 @@ class Bench:
         if not self._runs("head"):
             self._head.close()
             self._faults["head"] = self._head.enter_context(self._a_head())
-            undisturbed(self.head.process.pid)
+            raise_priority(self.head.process.pid)
         self.arm(do="clear")
         self.arm(do="wall")
         with Dashboard(self.host) as dashboard:
@@ -294,12 +293,12 @@ class Bench:
             session.end()
 
     @contextmanager
-    def under_way(self, **settings: Any) -> Iterator[Session]:
+    def in_motion(self, **settings: Any) -> Iterator[Session]:
         """A quick session after two whisks, with the arm at full speed."""
         with self.session(**settings) as session:
             session.says("armed")
             session.until(
-                lambda: self.whisked(session) >= 2 and self.moves(), "two whisks and an arm that moves"
+                lambda: self.whisk_count(session) >= 2 and self.moves(), "two whisks and an arm that moves"
             )
             yield session
 
@@ -341,11 +340,11 @@ class Bench:
         """Whether the arm moves at full speed."""
         return float(np.linalg.norm(self.arm.state()["speed"][:3])) > 0.045
 
-    def whisked(self, session: Session) -> int:
+    def whisk_count(self, session: Session) -> int:
         """Number of whisks recorded, by the progress bar."""
         return max(map(int, re.findall(r"(\d+)/\d+ \[", session.said())), default=0)
 
-    def worn(self) -> None:
+    def replace_head(self) -> None:
         """Ends the emulated head, whose fault cannot be cleared; the next test gets a new one."""
         self.head.process.kill()
         self.head.process.wait(PATIENCE)

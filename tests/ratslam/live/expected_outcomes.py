@@ -6,19 +6,19 @@ import time
 from typing import Any
 
 from tests.helpers.live import PATIENCE, until
-from tests.ratslam.live.bench import Bench, Kept, Moment, Session
+from tests.ratslam.live.bench import Bench, Moment, RecordedData, Session
 
 LOST = 1.5
 """s of a recording that may be lost on a busy machine."""
 STRICT = 0.4
-"""The same of an idle machine, where soak tests run; also s after which an arm stands."""
+"""The same on an idle machine, where soak tests run; also s until an arm is at rest."""
 
 
-def ended(bench: Bench, session: Session, outcome: str, at: Moment) -> tuple[dict[str, Any], Kept]:
+def ended(bench: Bench, session: Session, outcome: str, at: Moment) -> tuple[dict[str, Any], RecordedData]:
     """The report and the recording of a session that ended by itself, with that outcome and nothing lost.
 
     Args:
-        at: when it happened.
+        at: moment of the event.
     """
     code = session.code()
     report = session.report()
@@ -27,10 +27,10 @@ def ended(bench: Bench, session: Session, outcome: str, at: Moment) -> tuple[dic
     assert f"{outcome}: " in session.said()
     assert "Traceback" not in session.said(), session.said()
     stands(bench)
-    kept = session.kept()
-    assert not kept.broken
-    assert kept.lost(at) <= LOST
-    return report, kept
+    recorded = session.recorded()
+    assert not recorded.broken
+    assert recorded.lost(at) <= LOST
+    return report, recorded
 
 
 def stands(bench: Bench, within: float = PATIENCE) -> None:

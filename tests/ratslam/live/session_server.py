@@ -1,4 +1,4 @@
-"""`python -m tests.ratslam.live.session_server`: forks sessions from a process that has loaded everything.
+"""`python -m tests.ratslam.live.session_server`: forks sessions from a process that has loaded all modules.
 
 Each line of JSON on its standard input starts one; the process id is printed. The line gives the `arguments`
 of `python -m ratslam`, files for the output (`log`) and the exit code (`code`), how long the stub mapper
@@ -60,23 +60,23 @@ def _fork() -> int:
         return os.fork()
 
 
-def _become_session(told: dict[str, Any], program: Any) -> None:
+def _become_session(order: dict[str, Any], program: Any) -> None:
     """Runs the program in a new session of processes; does not return."""
     import ratslam.live.session
     from robot.live import selftest
     from tests.ratslam.live import stub_mapper
 
     os.setsid()
-    log = os.open(told["log"], os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    log = os.open(order["log"], os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     for fd, target in ((os.open(os.devnull, os.O_RDONLY), 0), (log, 1), (log, 2)):
         os.dup2(fd, target)
-    _hide(told["without"], Path(told["code"]).parent / "hidden")
-    arguments = told["arguments"]
-    mapping = partial(stub_mapper.mapping, arguments[arguments.index("-o") + 1], told["mapper"])
+    _hide(order["without"], Path(order["code"]).parent / "hidden")
+    arguments = order["arguments"]
+    mapping = partial(stub_mapper.mapping, arguments[arguments.index("-o") + 1], order["mapper"])
     run = ratslam.live.session.run_live_session
-    # No program that draws the map beside it.
+    # Without the process that draws the map.
     ratslam.live.session.run_live_session = lambda *given, armed: run(*given, mapping=mapping)
-    selftest.LISTEN_TIME = told["listened"]
+    selftest.LISTEN_TIME = order["listened"]
     selftest.MIN_RATE_SHARE = 0.0  # on a busy machine the emulated head may be late in so short a time
     code = 1
     try:

@@ -11,21 +11,21 @@ from pathlib import Path
 from typing import Any
 
 SHORT = 64
-"""Bytes; a message that is shorter is no sample."""
+"""Bytes; shorter messages are not samples."""
 
 
 class Answer:
-    """Becomes `ratslam.live.mapper_process.MappedSample` on its way, which this process need not know."""
+    """Pickles as `ratslam.live.mapper_process.MappedSample`, without importing it here."""
 
     def __init__(self, *fields: Any) -> None:
         self.fields = fields
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return told, self.fields
+        return result_of, self.fields
 
 
-def told(number: int, seconds: float) -> Any:
-    """What a sample led to."""
+def result_of(number: int, seconds: float) -> Any:
+    """The result of a sample."""
     import numpy as np
 
     from ratslam.live.mapper_process import MappedSample
@@ -34,10 +34,11 @@ def told(number: int, seconds: float) -> Any:
 
 
 def mapping(directory: str, seconds: float, line: Connection) -> None:
-    """What the process does.
+    """The main function of the process.
 
     Args:
-        directory: that a mapper would make; `mapper.pid` in it tells who does. seconds: for each sample.
+        directory: that a mapper would make; `mapper.pid` in it holds the process id. seconds: for each
+            sample.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
@@ -54,4 +55,4 @@ def mapping(directory: str, seconds: float, line: Connection) -> None:
             line.send(Answer(number, seconds))
             number += 1
     except (EOFError, OSError):
-        pass  # nobody wants it any more
+        pass  # the parent has ended

@@ -38,23 +38,23 @@ OFTEN = pytest.mark.soak
     ids=lambda value: "-".join(map(str, value.values())) if isinstance(value, dict) else "",
 )
 def test_a_fault_of_the_controller(bench: Bench, fault: dict, outcome: str) -> None:
-    with bench.under_way(arm={"stale": 1.0} if fault["do"] in LATE else {}) as session:
+    with bench.in_motion(arm={"stale": 1.0} if fault["do"] in LATE else {}) as session:
         at = bench.moment()
         if fault["do"] == "die":
             bench.arm.die()
         else:
             bench.arm(**fault)
-        report, kept = ended(bench, session, outcome, at)
+        report, recorded = ended(bench, session, outcome, at)
         assert report["standing"] or fault["do"] in BLIND
-        assert kept.events[-1].name == "fault"
-        assert kept.events[-1].text.startswith(outcome)
+        assert recorded.events[-1].name == "fault"
+        assert recorded.events[-1].text.startswith(outcome)
         if fault["do"] in {"safeguard", "protective", "stall", "freeze"}:
             bench.arm(do="clear")  # nothing resumes by itself
             stands(bench)
 
 
 def test_the_rtde_process_crashes(bench: Bench) -> None:
-    with bench.under_way() as session:
+    with bench.in_motion() as session:
         at = bench.moment()
         os.kill(session.child(), signal.SIGSEGV)
         report, _ = ended(bench, session, "arm_gone", at)
@@ -74,7 +74,7 @@ def test_registers_in_use(bench: Bench) -> None:
 
 
 def test_a_collision_with_a_wall(bench: Bench) -> None:
-    with bench.under_way() as session:
+    with bench.in_motion() as session:
         at, touched = bench.moment(), bench.arm.state()["tcp"][0] + 0.02
         bench.arm(do="wall", x=touched, stiffness=20_000)
         ended(bench, session, "contact", at)

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from tests.helpers.live import HEAD_FAULTS, ROOT, UR_FAULTS, Faults, until
-from tests.ratslam.live.bench import kept, undisturbed
+from tests.ratslam.live.bench import raise_priority, read_recorded
 
 CONFIG = str(ROOT / "configs" / "live_maze.yaml")
 REPLAY = """
@@ -47,7 +47,7 @@ def emulated(what: str, port: int, host: str, *settings: str) -> Iterator[Faults
     try:
         assert process.stdout is not None
         assert process.stdout.readline().strip().endswith(b"ready")
-        undisturbed(process.pid)
+        raise_priority(process.pid)
         yield faults
     finally:
         faults.close()
@@ -66,12 +66,12 @@ def mapper_of(session: int) -> int:
 
 def _begun(session: subprocess.Popen, log: Path) -> bool:
     """Whether its progress bar shows at least three whisks; fails when it has ended."""
-    said = log.read_text()
-    assert session.poll() is None, said
-    return any(int(done) >= 3 for done in re.findall(r"(\d+)/\d+ \[", said))
+    output = log.read_text()
+    assert session.poll() is None, output
+    return any(int(done) >= 3 for done in re.findall(r"(\d+)/\d+ \[", output))
 
 
-def lived(host: str, folder: Path, *settings: str, longest: float, freeze: float = 0.0) -> Path:
+def complete_session(host: str, folder: Path, *settings: str, longest: float, freeze: float = 0.0) -> Path:
     """The run directory of a session that completes, on emulators of its own.
 
     Args:
@@ -88,7 +88,7 @@ def lived(host: str, folder: Path, *settings: str, longest: float, freeze: float
             process = subprocess.Popen(
                 [*command, "-o", str(directory), *given], cwd=ROOT, stdout=log, stderr=log
             )
-            undisturbed(process.pid)
+            raise_priority(process.pid)
             try:
                 if freeze and until(partial(_begun, process, folder / "log"), "the third whisk"):
                     mapper = mapper_of(process.pid)
@@ -99,10 +99,10 @@ def lived(host: str, folder: Path, *settings: str, longest: float, freeze: float
             finally:
                 process.kill()
                 process.wait(5)
-        said = (folder / "log").read_text()
-        assert code == 0, said
-        assert "complete: " in said
-        assert "Traceback" not in said
+        output = (folder / "log").read_text()
+        assert code == 0, output
+        assert "complete: " in output
+        assert "Traceback" not in output
         state = arm.state()
         assert not state["moving"]
         assert state["watchdog_stops"] == 0
@@ -110,7 +110,7 @@ def lived(host: str, folder: Path, *settings: str, longest: float, freeze: float
     return directory
 
 
-def holds(directory: Path, whisks: int) -> dict:
+def check_session(directory: Path, whisks: int) -> dict:
     """The report of a session; checks that nothing was lost and that the replay is identical."""
     report = json.loads((directory / "live.json").read_text())
     print(json.dumps(report, indent=1))
@@ -120,7 +120,7 @@ def holds(directory: Path, whisks: int) -> dict:
     assert report["missing"] == 0
     faults = {name: count for name, count in report["head"].items() if name != "good"}
     assert set(faults.values()) == {0}, faults
-    recorded = kept(directory / "session.mcap")
+    recorded = read_recorded(directory / "session.mcap")
     assert len(recorded.samples) == whisks
     assert (np.diff(recorded.sequence) == 1).all()
     assert recorded.names().count("dropped") == report["dropped"]
@@ -142,7 +142,7 @@ def test_twenty_whisks_and_their_replay(loopback: str, tmp_path: Path) -> None:
     """The mapper is stopped for a while: images dropped live are dropped in the replay too."""
     settings = [*PATIENT, "live.whisks=20", "live.plan.whisking.rate=2", "live.budget=3"]
     settings += ["live.plan.calibration.min_duration=2"]
-    report = holds(lived(loopback, tmp_path, *settings, longest=280, freeze=4.5), 20)
+    report = check_session(complete_session(loopback, tmp_path, *settings, longest=280, freeze=4.5), 20)
     assert 1 <= report["dropped"] < 20
 
 
@@ -151,7 +151,7 @@ def test_twenty_whisks_and_their_replay(loopback: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("hz", [125, 500])
 def test_ten_minutes_and_their_replay(loopback: str, tmp_path: Path, hz: int) -> None:
     settings = ["live.whisks=600", f"live.arm.hz={hz}", "live.plan.path.circuits=CACACA"]
-    report = holds(lived(loopback, tmp_path, *settings, longest=1000), 600)
+    report = check_session(complete_session(loopback, tmp_path, *settings, longest=1000), 600)
     assert report["dropped"] == 0
     assert report["lateness_s"]["p99"] <= 0.05
     assert report["state_age_s"]["p99"] <= 0.02

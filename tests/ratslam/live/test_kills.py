@@ -14,7 +14,7 @@ import pytest
 from robot.recordings.mcap_reader import Recording, recover
 from tactile.base.random_streams import stream
 from tests.helpers.live import PATIENCE, until
-from tests.ratslam.live.bench import Bench, kept
+from tests.ratslam.live.bench import Bench, read_recorded
 from tests.ratslam.live.expected_outcomes import LOST, STRICT, ended, stands
 
 FEW, MANY = range(3), range(3, 53)
@@ -24,8 +24,8 @@ NUMBERS = [*FEW, *(pytest.param(number, marks=pytest.mark.soak) for number in MA
 def recovered(recording: Path) -> Path:
     """A complete recording with the readable part of an incomplete one."""
     whole = recording.with_name("whole.mcap")
-    told = recover(recording, whole)
-    assert told.samples == Recording(whole).length > 0
+    report = recover(recording, whole)
+    assert report.samples == Recording(whole).length > 0
     return whole
 
 
@@ -38,21 +38,21 @@ def test_the_whole_session_is_killed(bench: Bench, number: int) -> None:
         os.killpg(session.process.pid, signal.SIGKILL)
         stands(bench, STRICT if number in MANY else PATIENCE)
         session.process.wait(PATIENCE)
-        saved = kept(recovered(session.directory / "session.mcap"))
+        saved = read_recorded(recovered(session.directory / "session.mcap"))
         assert saved.lost(at) <= (STRICT if number in MANY else LOST)
-        # What can be read of the cut one is the same.
-        cut = session.kept()
+        # The readable part of the cut recording is the same.
+        cut = session.recorded()
         assert len(cut.samples) == len(saved.samples)
         np.testing.assert_array_equal(cut.sequence, saved.sequence)
 
 
 def test_the_parent_is_killed_in_motion(bench: Bench) -> None:
-    with bench.under_way() as session:
+    with bench.in_motion() as session:
         at = bench.moment()
         session.process.kill()
         stands(bench)
         session.process.wait(PATIENCE)
-        saved = kept(recovered(session.directory / "session.mcap"))
+        saved = read_recorded(recovered(session.directory / "session.mcap"))
         assert saved.lost(at) <= LOST
         until(lambda: not session.lives(), "nothing of it stays")
         assert bench.arm.state()["runtime"] == "STOPPED"
@@ -83,7 +83,7 @@ def test_an_interrupt_ends_the_session(bench: Bench, number: int) -> None:
 
 def test_a_second_interrupt_stops_the_arm_by_the_dashboard(bench: Bench) -> None:
     """The second interrupt waits for the arm only."""
-    with bench.under_way() as session:
+    with bench.in_motion() as session:
         session.process.send_signal(signal.SIGINT)
         time.sleep(0.005)
         session.process.send_signal(signal.SIGINT)
@@ -94,7 +94,7 @@ def test_a_second_interrupt_stops_the_arm_by_the_dashboard(bench: Bench) -> None
 
 
 def test_the_disk_is_full(bench: Bench) -> None:
-    with bench.under_way() as session:
+    with bench.in_motion() as session:
         at = bench.moment()
         size = (session.directory / "session.mcap").stat().st_size
         resource.prlimit(session.process.pid, resource.RLIMIT_FSIZE, (size + 5000, size + 5000))
@@ -103,5 +103,5 @@ def test_the_disk_is_full(bench: Bench) -> None:
         assert "disk_full: " in session.said()
         assert "Traceback" not in session.said()
         stands(bench)
-        saved = kept(recovered(session.directory / "session.mcap"))
+        saved = read_recorded(recovered(session.directory / "session.mcap"))
         assert saved.lost(at) <= LOST

@@ -12,7 +12,7 @@ from ratslam.cli import main
 from tests.ratslam.live.bench import LEGS, Bench
 
 
-def written(bench: Bench, folder: Path, **settings: Any) -> list[str]:
+def write_config(bench: Bench, folder: Path, **settings: Any) -> list[str]:
     """The arguments for a session with these settings."""
     config = folder / "config.yaml"
     config.write_text(yaml.safe_dump({"live": bench.quick(**settings)}))
@@ -20,7 +20,7 @@ def written(bench: Bench, folder: Path, **settings: Any) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("settings", "said"),
+    ("settings", "messages"),
     [
         ({"waypoints": [*LEGS[:2], (3.0, 0.45, 0.0)]}, ["live.waypoints", "outside the box"]),
         ({"waypoints": [*LEGS[:2], (0.63, float("nan"), 0.0)]}, ["live.waypoints.2.1", "finite"]),
@@ -36,20 +36,20 @@ def test_invalid_configurations_are_refused(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     settings: dict[str, Any],
-    said: list[str],
+    messages: list[str],
 ) -> None:
     before = bench.arm.state()
-    assert main(written(bench, tmp_path, **settings)) == 2
-    told = capsys.readouterr().err
-    for text in said:
-        assert text in told
+    assert main(write_config(bench, tmp_path, **settings)) == 2
+    lines = capsys.readouterr().err
+    for text in messages:
+        assert text in lines
     assert not (tmp_path / "run").exists()
     after = bench.arm.state()
     assert (after["targets"], after["programs"]) == (before["targets"], before["programs"])
 
 
 @pytest.mark.parametrize(
-    ("without", "address", "said"),
+    ("without", "address", "messages"),
     [
         (["rtde_control", "rtde_receive"], None, ["ur_rtde", "pip install 'ratslam[live]'"]),
         (["usb"], None, ["usb", "pip install 'ratslam[live]'"]),
@@ -59,13 +59,13 @@ def test_invalid_configurations_are_refused(
     ids=["ur_rtde", "pyusb", "libusb", "head"],
 )
 def test_missing_libraries_and_devices_are_refused(
-    bench: Bench, without: list[str], address: str | None, said: list[str]
+    bench: Bench, without: list[str], address: str | None, messages: list[str]
 ) -> None:
     sent = len(bench.arm.state()["targets"])
     with bench.session(without=without, head={"address": address or bench.host}) as session:
-        assert session.code() == 2, session.said()
-        assert "Traceback" not in session.said(), session.said()
-        for text in said:
-            assert text in session.said()
+        assert session.code() == 2, session.messages()
+        assert "Traceback" not in session.messages(), session.messages()
+        for text in messages:
+            assert text in session.messages()
         assert not session.directory.exists()
     assert len(bench.arm.state()["targets"]) == sent

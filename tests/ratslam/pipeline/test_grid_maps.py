@@ -1,4 +1,4 @@
-"""The grid filter on whole sessions: its error against dead reckoning, the parts that matter, the map."""
+"""The grid filter on whole sessions: its error against dead reckoning, its essential parts, the map."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def ratio(row: str, arenas: tuple[int, ...] = FEW) -> float:
 
 
 @pytest.mark.soak
-def test_scale_errors_of_a_run_are_corrected():
+def test_scale_errors_of_a_session_are_corrected():
     assert ratio("bias") < 0.3
 
 

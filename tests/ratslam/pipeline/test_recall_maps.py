@@ -100,7 +100,7 @@ def test_an_unknown_corridor_stays_odometry(seed):
 
 
 def test_a_lap_in_the_opposite_direction_is_closed_where_it_turns():
-    # The way back shows other views (another heading), so nothing may close but what faces the same way.
+    # The return path has other views (another heading), so only equal headings may close.
     there = [(0.05, 0.0)] * 30 + [(0.0, np.pi / 18)] * 18
     log = scenes.sensed(scenes.followed(there * 8), 3)
     session = map_log(log)
@@ -155,7 +155,7 @@ def test_single_precision_maps_as_well():
     assert np.isfinite(session.map.candidates()[:, 3:5]).all()
 
 
-# What is told beside the map
+# Evidence beside the map
 
 
 def test_a_kidnapped_robot_is_reported_lost_and_then_localised():
@@ -200,7 +200,7 @@ def test_the_spread_grows_along_the_path_and_falls_at_a_closure():
     assert at[180] < at[100]  # the second lap is recognised
 
 
-def test_standing_still_costs_nothing():
+def test_standing_still_adds_no_keyframes():
     config = RecallBackendConfig.model_validate({"pose_cells": {"cells_xy": 11}})
     session = Session(RecallBackend(config, (3, 6, 1)), reserve=512)
     still = observation(Odometry(0.0, 0.0, 0.0, 0.1), np.full((3, 6, 1), 0.5))

@@ -62,7 +62,7 @@ def _compiled(reserve: int) -> tuple[Session, dict[str, np.ndarray]]:
 
 
 def empty_session(reserve: int = 512) -> Session:
-    """The one compiled session, with nothing in it: all mazes, heads and controls have the same kernel."""
+    """The shared compiled session, empty: all mazes, heads and controls have the same kernel."""
     session, empty = _compiled(reserve)
     session.restore(empty)
     return session
@@ -112,8 +112,8 @@ def crossing(found: MappedWalk, step: int) -> int:
 
 def kidnap(walk: Walk, row: int, ahead: int) -> Walk:
     """The same walk without some whisks: the robot is carried ahead, without odometry."""
-    kept = np.r_[:row, row + ahead : len(walk.readings)]
-    return Walk([walk.readings[k] for k in kept], walk.truth[kept])
+    rows = np.r_[:row, row + ahead : len(walk.readings)]
+    return Walk([walk.readings[k] for k in rows], walk.truth[rows])
 
 
 # Laps
@@ -154,7 +154,7 @@ def test_the_signals_of_dead_whiskers_do_not_change_the_map() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_laps_in_the_opposite_direction_are_closed(seed: int) -> None:
-    """The head feels the same walls with the whiskers opposite."""
+    """The opposite whiskers touch the same walls."""
     walk = simulate_walk(seed, path={"circuits": "CCAA"})
     found = map_walk(walk.readings)
     assert true_share(found, walk.truth) >= 0.95
@@ -163,7 +163,7 @@ def test_laps_in_the_opposite_direction_are_closed(seed: int) -> None:
 
 
 def test_the_map_compares_the_levels_in_the_memory_of_the_kernel() -> None:
-    """What the map learns from are the very levels that the kernel compares."""
+    """The map learns from the same levels that the kernel compares."""
     walk, session = simulate_walk(1, dead=(4,)), empty_session()
     follow(session, walk.readings)
     level = session.map.arrays()["appearance/level"]
@@ -255,7 +255,7 @@ def kidnapped_session() -> tuple[Walk, Session]:
 def test_reading_the_map_does_not_change_it(every: int) -> None:
     walk, session = kidnapped_session()
     expected = follow(session, walk.readings)
-    kept = session.arrays()
+    saved = session.arrays()
     session = empty_session()
     for start in range(0, len(walk.readings), every):
         list(session.replay(walk.readings[start : start + every]))
@@ -267,8 +267,8 @@ def test_reading_the_map_does_not_change_it(every: int) -> None:
     assert np.array_equal(found.path, expected.path)
     assert np.array_equal(found.closures, expected.closures)
     again = session.arrays()
-    assert again.keys() == kept.keys()
-    assert all(np.array_equal(again[name], kept[name], equal_nan=True) for name in kept)
+    assert again.keys() == saved.keys()
+    assert all(np.array_equal(again[name], saved[name], equal_nan=True) for name in saved)
 
 
 @pytest.mark.parametrize("stop", [250, 300, 320, 330])
@@ -279,11 +279,11 @@ def test_a_restored_map_with_cuts_continues_as_the_uninterrupted_one(stop: int) 
     whole = session.arrays()
     session = empty_session()
     follow(session, walk.readings[:stop])
-    kept = session.arrays()
-    assert (kept["map/graph/cut"] >= 0).any() == (stop >= 320)
+    saved = session.arrays()
+    assert (saved["map/graph/cut"] >= 0).any() == (stop >= 320)
     session = empty_session()
     follow(session, walk.readings[:50])
-    session.restore(kept)
+    session.restore(saved)
     found = follow(session, walk.readings[stop:])
     assert np.array_equal(found.path, expected.path)
     assert found.cuts == expected.cuts
@@ -332,11 +332,11 @@ def test_the_preset_for_touch_is_used_with_whiskers() -> None:
         if name != "noise":
             assert getattr(completed.keyframes, name) == value
     assert completed.keyframes.noise.per_cell == PRESETS["touch"]["keyframes"]["noise"]["per_cell"]
-    assert completed.pose_cells.cells_xy == 11  # what was asked for stays
+    assert completed.pose_cells.cells_xy == 11  # explicit settings are kept
     again = RunConfig.model_validate(completed.model_dump(mode="json"))
     assert (
         complete(again, HeadSimulation(config.simulation)) == completed
-    )  # a written configuration is the same run
+    )  # the written configuration gives the same session
 
 
 def test_settings_go_before_the_preset_for_touch() -> None:
@@ -349,10 +349,10 @@ def test_settings_go_before_the_preset_for_touch() -> None:
 
 
 def test_an_explicit_sector_fov_of_whiskers_changes_nothing() -> None:
-    plain, said = config_of(simulation=LAPS), config_of(simulation=LAPS, recall={"sector_fov": "whiskers"})
+    plain, given = config_of(simulation=LAPS), config_of(simulation=LAPS, recall={"sector_fov": "whiskers"})
     assert plain.simulation is not None
     source = HeadSimulation(plain.simulation)
-    assert complete(said, source) == complete(plain, source)
+    assert complete(given, source) == complete(plain, source)
 
 
 # Large

@@ -37,7 +37,7 @@ def test_g2o_reads_back_exactly(values, tmp_path_factory):
 
 
 def test_g2o_keeps_full_information(tmp_path):
-    """All six entries of an information matrix land where they were."""
+    """All six entries of an information matrix are read back at their places."""
     poses, edges = example()
     write_g2o(tmp_path / "map.g2o", poses, edges)
     again, read = read_g2o(tmp_path / "map.g2o")
@@ -47,7 +47,7 @@ def test_g2o_keeps_full_information(tmp_path):
 
 
 def test_g2o_sorts_ids_and_passes_over_other_lines(tmp_path):
-    """Ids may be sparse and out of order; comments, blank lines and other elements are nothing to us."""
+    """Ids may be sparse and out of order; comments, blank lines and other elements are ignored."""
     path = tmp_path / "map.g2o"
     edge = "EDGE_SE2 7 3 1 2 3 1 0 0 1 0 1"
     path.write_text(f"# note\nVERTEX_SE2 7 7 0 0\n\nFIX 3\nVERTEX_SE2 3 3 0 0\n{edge}\n")
@@ -79,8 +79,8 @@ def test_an_empty_g2o(tmp_path):
         "EDGE_SE2 0 1.5 1 0 0 1 0 0 1 0 1",
     ],
 )
-def test_a_malformed_line_is_named(tmp_path, line):
-    """The error says which file and which line."""
+def test_a_malformed_line_is_refused_with_its_place(tmp_path, line):
+    """The error names the file and the line."""
     path = tmp_path / "map.g2o"
     path.write_text(VERTICES + line + "\n")
     with pytest.raises(InputError) as raised:
@@ -88,8 +88,8 @@ def test_a_malformed_line_is_named(tmp_path, line):
     assert raised.value.where == f"{path}:3"
 
 
-def test_an_edge_to_nowhere(tmp_path):
-    """A link needs both of its nodes."""
+def test_an_edge_to_an_unknown_node_is_refused(tmp_path):
+    """Both nodes of a link must exist."""
     path = tmp_path / "map.g2o"
     path.write_text(VERTICES + "EDGE_SE2 0 9 1 0 0 1 0 0 1 0 1\n")
     with pytest.raises(InputError, match="node 9") as raised:
@@ -128,8 +128,8 @@ def test_the_same_map_is_the_same_bytes(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "{}", "3", '{"nodes": 3, "edges": []}', '{"nodes": [{}]}'])
-def test_what_is_no_graph_is_named(tmp_path, text):
-    """The error says which file."""
+def test_files_that_are_not_graphs_are_refused(tmp_path, text):
+    """The error names the file."""
     path = tmp_path / "map.json"
     path.write_text(text)
     with pytest.raises(InputError) as raised:

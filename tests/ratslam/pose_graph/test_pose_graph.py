@@ -39,7 +39,7 @@ def loops(stream, count=120, closures=20, noise=(0.0, 0.0)):
 
 
 def tangle(stream, count):
-    """Chains of all lengths hung on one another anyhow: measured forwards and backwards, twice over, with
+    """Chains of all lengths connected at random: measured forwards and backwards, twice over, with
     blind alleys, a loop at one node, two nodes in a ring and one alone; nodes and edges in any order."""
     nodes, i, j = 1, [], []
     while nodes < count:
@@ -75,7 +75,7 @@ def test_jacobians_are_the_derivatives(seed, error):
             assert np.allclose(slope[0], jacobian[0, :, axis], atol=1e-6, rtol=1e-4)
 
 
-def plainly(edges, count, heading):
+def solve_dense(edges, count, heading):
     """Positions by dense least squares, headings given; node 0 at the origin."""
     rows = np.zeros((len(edges.i), count))
     rows[np.arange(len(edges.i)), edges.j] += 1
@@ -101,8 +101,8 @@ def test_linear_initialization_is_the_dense_two_stage_solve(seed, closures, nois
     i, j = np.where(turned, edges.j, edges.i), np.where(turned, edges.i, edges.j)
     edges = Edges(i, j, motion, stream.uniform(50, 500, (len(i), 3)))
     found = linear_initialization(len(truth), edges)
-    positions, left = plainly(edges, len(truth), found[:, 2])
-    assert left < 1e-9  # no change of headings would fit them better
+    positions, left = solve_dense(edges, len(truth), found[:, 2])
+    assert left < 1e-9  # no change of the headings lowers the error
     assert np.abs(found[:, :2] - positions).max() < 1e-9
 
 
@@ -147,7 +147,7 @@ def test_chains_lead_from_junction_to_junction(seed, count):
 
 
 def ring(edges):
-    """Nodes that two edges tie to one and the same other."""
+    """Nodes whose two edges lead to the same other node."""
     pairs = np.sort(np.stack([edges.i, edges.j], axis=1), axis=1)
     kinds, times = np.unique(pairs, axis=0, return_counts=True)
     return kinds[times > 1].ravel()
@@ -161,7 +161,7 @@ def test_a_step_with_chains_eliminated_balances_the_full_graph(seed, count, erro
     reduced = ReducedEquations(len(at), edges, np.zeros(len(edges.i), bool))
     short = reduced.step(at, errors, information_matrices(edges.information), 0.0)
     residual, by_i, by_j = errors
-    # Least squares of the linearised errors, gauge free parts and all: what is left must be as little.
+    # Least squares of the linearised errors, unconnected parts included: the residuals must be equal.
     change = (
         residual
         + np.einsum("eab,eb->ea", by_i, short[edges.i])

@@ -1,4 +1,4 @@
-"""float32 is as good as float64, and how sure one is of that."""
+"""float32 is as accurate as float64, with a given confidence."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from tactile.base.random_streams import stream
 @pytest.mark.parametrize("count", [9, 20, 33])
 @pytest.mark.parametrize("level", [0.9, 0.95, 0.99])
 def test_the_median_lies_in_its_interval_as_often_as_promised(count, level):
-    """Of a skewed law, whose mean is elsewhere."""
+    """For a skewed distribution, whose mean differs from its median."""
     draws, random = 4000, stream(0, "tests.precision.median")
     intervals = [precision.median_interval(row, level) for row in random.exponential(1.0, (draws, count))]
     held = np.mean([low <= np.log(2) <= high for low, high in intervals])
     assert held >= level - 4 * np.sqrt(level * (1 - level) / draws)
 
 
-def test_too_few_values_tell_nothing_of_their_median():
+def test_too_few_values_give_an_infinite_interval():
     assert precision.median_interval(np.arange(4.0), 0.95) == (-np.inf, np.inf)
 
 
-def test_a_shift_of_all_seeds_is_refused_and_what_does_not_matter_accepted():
+def test_a_shift_of_all_seeds_is_refused_and_small_changes_are_accepted():
     random = stream(0, "tests.precision.shift")
     before = random.normal(0, 1, 20)
     shifted = precision.difference(before + 2 * precision.MARGIN, before)
@@ -49,7 +49,7 @@ def test_float32_maps_as_well_as_float64(backend):
 
 
 @pytest.mark.soak
-def test_runs_that_differ_by_one_rounding_agree_for_a_thousand_steps():
+def test_networks_that_differ_by_rounding_agree_for_a_thousand_steps():
     """No test may require much more: `python -m ratslam reproduce tables chaos` shows when they separate."""
     walk = chaos.walk(0, 1000)
     assert chaos.separation(*chaos.PAIRS["one-cell"], walk).max() < 1e-10

@@ -19,13 +19,13 @@ SESSION = touch.SessionFigures(METRICS, revisits_closed=0.8, across=40, recovery
 ARENA = grid.GridFigures(0.02, 0.2, np.radians([1.0, 20.0]), 4, (0.9, 0.4, 0.3, 0.04, 0.05))
 
 
-def answers(monkeypatch, module, result):
+def stub_sessions(monkeypatch, module, result):
     """Replaces the sessions of a table; returns the tasks that it asks for."""
     tasks = []
 
-    def run_tasks(function, wanted, workers):
-        tasks.extend(wanted)
-        return (result(task) for task in wanted)
+    def run_tasks(function, requested, workers):
+        tasks.extend(requested)
+        return (result(task) for task in requested)
 
     monkeypatch.setattr(module, "run_tasks", run_tasks)
     return tasks
@@ -55,7 +55,7 @@ def test_grid_rows_are_valid_configurations(row):
 
 def test_a_touch_row_gives_medians_worst_values_and_sums(monkeypatch):
     worse = SESSION._replace(metrics=METRICS._replace(em=0.5, arcr=0.1))
-    tasks = answers(monkeypatch, touch, lambda task: worse if task.seed == 101 else SESSION)
+    tasks = stub_sessions(monkeypatch, touch, lambda task: worse if task.seed == 101 else SESSION)
     _, row = touch.touch_table(["clean"], mazes=2, seeds=2)
     assert [(task.maze, task.seed) for task in tasks] == [(9000, 0), (9000, 1), (9001, 100), (9001, 101)]
     assert row == (
@@ -67,13 +67,13 @@ def test_a_touch_row_gives_medians_worst_values_and_sums(monkeypatch):
 def test_touch_sessions_without_closures_have_no_arcr(monkeypatch):
     missing = METRICS._replace(arcr=np.nan, arcr_chain_free=0.0, closures=0, false_closures=0)
     none = SESSION._replace(metrics=missing)
-    answers(monkeypatch, touch, lambda task: none)
+    stub_sessions(monkeypatch, touch, lambda task: none)
     _, row = touch.touch_table(["control: shuffled"], mazes=1, seeds=1)
     assert row.endswith("| 0.500 | - | 0.80 | 0 / 0 |")
 
 
 def test_kidnaps_and_the_change_of_mazes_are_reported_below_the_touch_table(monkeypatch):
-    answers(monkeypatch, touch, lambda task: SESSION._replace(recovery=(10, 20, 90)))
+    stub_sessions(monkeypatch, touch, lambda task: SESSION._replace(recovery=(10, 20, 90)))
     *_, other, kidnaps = touch.touch_table(["kidnaps", "control: other maze"], mazes=1, seeds=1)
     text = "\n".join((other, kidnaps))
     assert "40 of 100 closures" in text
@@ -81,7 +81,7 @@ def test_kidnaps_and_the_change_of_mazes_are_reported_below_the_touch_table(monk
 
 
 def test_a_grid_row_compares_with_dead_reckoning(monkeypatch):
-    tasks = answers(monkeypatch, grid, lambda task: ARENA)
+    tasks = stub_sessions(monkeypatch, grid, lambda task: ARENA)
     _, row = grid.grid_table([("A", "bias")], arenas=2, first=7)
     assert [task.arena for task in tasks] == [7, 8]
     assert "| 0.200 m | 0.020 | 0.10 | 2, 2 of 2 | 10.5 degrees, 50%, 50% |" in row
@@ -89,7 +89,7 @@ def test_a_grid_row_compares_with_dead_reckoning(monkeypatch):
 
 def test_all_rows_of_the_laser_table_without_data_are_named(monkeypatch, tmp_path):
     monkeypatch.delenv(laser.DATA, raising=False)
-    answers(monkeypatch, laser, lambda task: pytest.fail("a session without a recording"))
+    stub_sessions(monkeypatch, laser, lambda task: pytest.fail("a session without a recording"))
     text = "\n".join(laser.laser_table(folder=tmp_path))
     assert all(f"Left out: {row}: " in text for row in laser.ROWS)
     assert "set RATSLAM_DATA" in text
