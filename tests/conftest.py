@@ -1,4 +1,4 @@
-"""Strict numerics for every test, the option that runs the soak tests, and where the data lie."""
+"""Strict numerics for every test, the option for soak tests, and the paths of data."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS
 os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_multi_thread_eigen=false"
 
 if "RATSLAM_TEST_CACHE" not in os.environ:
-    # Workers share what one of them has compiled; every run of the suite starts from nothing.
+    # Workers share compiled kernels; every run of the suite starts with an empty cache.
     os.environ["RATSLAM_TEST_CACHE"] = tempfile.mkdtemp(prefix="ratslam-tests-")
     atexit.register(shutil.rmtree, os.environ["RATSLAM_TEST_CACHE"], ignore_errors=True)
-# Programs that tests start keep what they compile there too, away from the user's.
+# Programs that tests start cache their kernels there too, apart from the user's.
 os.environ["XDG_CACHE_HOME"] = os.environ["RATSLAM_TEST_CACHE"]
 
 import jax

@@ -1,4 +1,4 @@
-"""What the READMEs show works: Python blocks run, commands are understood, links lead somewhere."""
+"""The READMEs are valid: Python blocks run, commands are accepted, links have targets."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ COMMANDS = [(name(path), command) for path in READMES for command in commands(pa
 
 @pytest.fixture
 def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder that looks like the repository's root, in which blocks may write files."""
+    """A copy of the repository's root, in which blocks may write files."""
     for part in ("configs", "tests"):
         (tmp_path / part).symlink_to(ROOT / part)
     monkeypatch.chdir(tmp_path)
@@ -61,7 +61,7 @@ def test_python_blocks_run(readme: Path) -> None:
 
 
 @pytest.mark.parametrize(("readme", "command"), COMMANDS)
-def test_commands_are_understood(readme: str, command: str) -> None:
+def test_commands_are_valid(readme: str, command: str) -> None:
     arguments = build_parser().parse_args(shlex.split(command)[3:])
     assert callable(arguments.command)
 
@@ -79,7 +79,7 @@ def test_commands_of_the_root_readme_run(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("readme", READMES, ids=name)
-def test_links_lead_somewhere(readme: Path) -> None:
+def test_links_have_targets(readme: Path) -> None:
     text = re.sub(r"^```.*?^```", "", readme.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
     targets = re.findall(r"\]\(([^)#\s]+)[^)]*\)", text)
     missing = [

@@ -48,7 +48,7 @@ def test_every_foreign_package_is_named(tmp_path: Path) -> None:
 
 
 def test_a_missing_package_is_named(tmp_path: Path) -> None:
-    """An incomplete copy: only the package `ratslam` is there."""
+    """An incomplete copy with the package `ratslam` only."""
     (tmp_path / "ratslam").symlink_to(ROOT / "ratslam")
     code = f"""
 import sys

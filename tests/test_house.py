@@ -1,4 +1,4 @@
-"""The layout holds: every room explains itself, files and functions are short, tests use public names."""
+"""Rules of the layout: every room has a README, files and functions are short, tests use public names."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_functions_are_short() -> None:
 @pytest.mark.parametrize("room", ROOMS, ids=lambda room: room.relative_to(ROOT).as_posix())
 def test_every_room_has_a_readme_with_an_example(room: Path) -> None:
     text = (room / "README.md").read_text(encoding="utf-8")
-    assert re.match(r"# .+\n+\w", text), "a title, then a paragraph that says what the room is for"
+    assert re.match(r"# .+\n+\w", text), "a title, then a paragraph on the purpose of the room"
     assert "```python" in text
 
 
@@ -55,7 +55,7 @@ def test_root_readme_is_short() -> None:
     assert len(words) <= LONGEST_ROOT_README
 
 
-def test_no_test_reaches_for_a_private_name() -> None:
+def test_tests_use_no_private_names() -> None:
     """Attributes and imports with a leading underscore; those of named tuples and `os._exit` are public."""
     allowed = {"_replace", "_asdict", "_fields", "_make", "_exit"}
     found = []

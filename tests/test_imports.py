@@ -1,4 +1,4 @@
-"""Who may import whom: the contracts of pyproject.toml hold, each of them can fail, and imports are light."""
+"""Imports: the contracts of pyproject.toml hold, each of them can fail, and imports are light."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_a_planted_import_breaks_its_contract(
 
 
 def _report(code: str) -> Any:
-    """What a fresh interpreter in the root folder prints last, as JSON."""
+    """The last line printed by a fresh interpreter in the root folder, as JSON."""
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])

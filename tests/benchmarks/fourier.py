@@ -30,5 +30,5 @@ class Fourier:
     def step(self, d: float, turn: float) -> None:
         del d, turn
         left = fft.irfftn(fft.rfftn(self.activity) * self.response, self.shape)
-        kept = np.where(left >= 2e-5, left - 2e-5, 0.0)
-        self.activity = kept / kept.sum()
+        excess = np.where(left >= 2e-5, left - 2e-5, 0.0)
+        self.activity = excess / excess.sum()

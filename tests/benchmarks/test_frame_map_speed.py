@@ -1,5 +1,4 @@
-"""A closure in a map of 1000 frames: solving, and holding a sequence against the map's covariance; on one
-core."""
+"""A closure in a map of 1000 frames: solution, and test against the map's covariance; on one core."""
 
 from __future__ import annotations
 
@@ -24,15 +23,15 @@ def laps(frames: int, closures: int):
     stream = np.random.default_rng(0)
     turn = np.where(np.arange(1, frames) % 12 == 0, np.pi / 2, 0.0)
     true = np.column_stack([np.full(frames - 1, 0.5), np.zeros(frames - 1), turn])
-    told = true - [0, 0, 0.001] + stream.normal(0, [0.01, 0.01, 0.005], true.shape)
+    motion = true - [0, 0, 0.001] + stream.normal(0, [0.01, 0.01, 0.005], true.shape)
     later = stream.integers(60, frames, closures)
-    chain = OdometryChain(told, np.full(frames - 1, 0.5), np.tile([0.01, 0.01, 0.001], (frames - 1, 1)))
+    chain = OdometryChain(motion, np.full(frames - 1, 0.5), np.tile([0.01, 0.01, 0.001], (frames - 1, 1)))
     path = np.concatenate([np.zeros((1, 3)), integrate(true)])
     links = LoopClosures(
         i=later % 48, j=later, turn=(path[later] - path[later % 48])[:, 2], sequence=np.arange(closures) // 5,
         variance=np.array([0.1, 0.1, 0.02]), scale=np.full(closures // 5, 6.0),
     )  # fmt: skip
-    return np.concatenate([np.zeros((1, 3)), integrate(told)]), chain, links
+    return np.concatenate([np.zeros((1, 3)), integrate(motion)]), chain, links
 
 
 def test_a_closure_among_1000_frames(benchmark):

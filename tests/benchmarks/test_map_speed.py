@@ -18,7 +18,7 @@ from tactile.base.se2 import between, integrate, wrap
 from tactile.base.types import Odometry, observation
 
 NOISE = np.array([0.02, 0.02, 0.01])
-"""Standard deviations of every edge, m, m, rad; of the headings, ten times as much where it says so."""
+"""Standard deviations of every edge, m, m, rad; some maps have ten times the heading noise."""
 
 
 def city(count, stream):
@@ -51,7 +51,7 @@ def arena(count, stream):
 PATHS = {"city": city, "serpentine": serpentine, "arena": arena}
 
 
-def measured(name, count, noise=NOISE):
+def measure_path(name, count, noise=NOISE):
     """Odometry along a path and a tenth as many closures where it comes by again: true poses and edges."""
     stream = np.random.default_rng(0)
     truth, reach = PATHS[name](count, stream)
@@ -66,11 +66,11 @@ def measured(name, count, noise=NOISE):
 
 @pytest.fixture
 def size(benchmark):
-    """The number of nodes: few where times are not measured."""
+    """The number of nodes; few if times are not measured."""
     return lambda count: count if benchmark.enabled else min(count, 2500)
 
 
-def timed(call, rounds=5):
+def median_time(call, rounds=5):
     """Median seconds of a call, and what it returned."""
     took = []
     for _ in range(rounds):
@@ -91,10 +91,10 @@ def misfit(poses, edges):
 @pytest.mark.parametrize("count", [10_000, 100_000])
 def test_two_stages(benchmark, size, name, count):
     """Beside the classic sweep, compiled: 100 sweeps from odometry."""
-    truth, edges = measured(name, count := size(count))
+    truth, edges = measure_path(name, count := size(count))
     sweep(truth[:2].copy(), Edges(*(column[:1] for column in edges)), 1)
-    took, poses = timed(lambda: linear_initialization(count, edges))
-    swept, relaxed = timed(lambda: sweep(integrated(edges, count), edges, 100), 1)
+    took, poses = median_time(lambda: linear_initialization(count, edges))
+    swept, relaxed = median_time(lambda: sweep(integrated(edges, count), edges, 100), 1)
     print(
         f"\n{name}, {count} nodes: two stages {took * 1e3:.1f} ms, misfit {misfit(poses, edges):.3g}; "
         f"100 sweeps {swept * 1e3:.0f} ms, misfit {misfit(relaxed, edges):.3g}"
@@ -108,13 +108,13 @@ def test_two_stages(benchmark, size, name, count):
 @pytest.mark.parametrize("name", PATHS)
 def test_cold(benchmark, size, name):
     """Two stages and SE(2) least squares from there, beside the same without elimination and gtsam."""
-    truth, edges = measured(name, size(10_000))
+    truth, edges = measure_path(name, size(10_000))
 
     def cold(**how):
         return least_squares(linear_initialization(len(truth), edges), edges, **how)
 
-    took, solved = timed(cold)
-    whole, plain = timed(lambda: cold(eliminate_chains=False), 1)
+    took, solved = median_time(cold)
+    whole, plain = median_time(lambda: cold(eliminate_chains=False), 1)
     theirs, rest = gtsam_optimum(linear_initialization(len(truth), edges), edges)
     print(
         f"\n{name}: cold {took * 1e3:.0f} ms, {solved.iterations} iterations, misfit "
@@ -130,15 +130,15 @@ def test_cold(benchmark, size, name):
 @pytest.mark.parametrize("name", PATHS)
 def test_warm(benchmark, size, name):
     """One more closure in a solved map, beside the same without elimination."""
-    truth, edges = measured(name, size(10_000))
+    truth, edges = measure_path(name, size(10_000))
     before = Edges(*(column[:-1] for column in edges))
     start = least_squares(linear_initialization(len(truth), before), before).poses
 
     def warm(**how):
         return least_squares(start, edges, tolerance=1e-3, **how)
 
-    took, solved = timed(warm, 11)
-    whole, _ = timed(lambda: warm(eliminate_chains=False), 1)
+    took, solved = median_time(warm, 11)
+    whole, _ = median_time(lambda: warm(eliminate_chains=False), 1)
     print(
         f"\n{name}: warm {took * 1e3:.1f} ms, {solved.iterations} iterations; all nodes {whole * 1e3:.0f} ms"
     )
@@ -150,11 +150,11 @@ def test_warm(benchmark, size, name):
 
 @pytest.mark.parametrize("name", PATHS)
 def test_cold_with_a_tenth_of_a_radian_a_step(benchmark, size, name):
-    """Headings are lost within a hundred steps: damping decides where a solve ends."""
-    truth, edges = measured(name, size(10_000), NOISE * [1, 1, 10])
+    """Heading errors exceed a turn within a hundred steps, so damping determines the optimum reached."""
+    truth, edges = measure_path(name, size(10_000), NOISE * [1, 1, 10])
     start = linear_initialization(len(truth), edges)
-    took, solved = timed(lambda: least_squares(start, edges, iterations=100), 1)
-    whole, plain = timed(lambda: least_squares(start, edges, iterations=20, eliminate_chains=False), 1)
+    took, solved = median_time(lambda: least_squares(start, edges, iterations=100), 1)
+    whole, plain = median_time(lambda: least_squares(start, edges, iterations=20, eliminate_chains=False), 1)
     theirs, rest = gtsam_optimum(start, edges)
     print(
         f"\n{name}: {took * 1e3:.0f} ms, {solved.iterations} iterations, misfit "
@@ -169,11 +169,11 @@ def test_steps_without_a_closure(benchmark, size, monkeypatch):
     """A map of 10 000 places takes a step in the time of its own arithmetic: nothing is solved."""
     world = ExperienceMap(ExperienceConfig())
     nodes = size(10_000)
-    _, edges = measured("city", nodes)
+    _, edges = measure_path("city", nodes)
     solves = []
     monkeypatch.setattr("ratslam.classic.experience_map.least_squares", lambda *a, **k: solves.append(1))
     fold(world, edges.motion[: nodes - 1])
-    took, _ = timed(lambda: fold(world, edges.motion[:1000], start=nodes), 1)
+    took, _ = median_time(lambda: fold(world, edges.motion[:1000], start=nodes), 1)
     print(f"\na step without a closure: {took * 1e3:.1f} us")
     benchmark.pedantic(fold, args=(world, edges.motion[:10]), rounds=1)
     assert not solves
@@ -227,7 +227,7 @@ def compiled():
 
 
 def gtsam_optimum(start, edges):
-    """Seconds of gtsam's Levenberg-Marquardt from a start, and its misfit; not a number where it is not."""
+    """Seconds of gtsam's Levenberg-Marquardt from a start, and its misfit; NaN without gtsam."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -241,6 +241,6 @@ def gtsam_optimum(start, edges):
         noise = gtsam.noiseModel.Diagonal.Sigmas(1 / np.sqrt(weight))
         graph.add(gtsam.BetweenFactorPose2(int(i), int(j), gtsam.Pose2(*motion), noise))
     graph.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(*start[0]), gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)))
-    took, found = timed(gtsam.LevenbergMarquardtOptimizer(graph, values).optimize, 1)
+    took, found = median_time(gtsam.LevenbergMarquardtOptimizer(graph, values).optimize, 1)
     poses = np.array([[(p := found.atPose2(k)).x(), p.y(), p.theta()] for k in range(len(start))])
     return took, misfit(poses, edges)

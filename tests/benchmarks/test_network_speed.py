@@ -1,6 +1,6 @@
 """A step of the pose cells, in replay and live, beside the NumPy network and other ways to do it.
 
-All are timed in turns in one run, so that all see the same machine; only the ratios mean anything.
+All are timed in turns in one process, because only ratios on the same machine are meaningful.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def load_beside(name: str) -> ModuleType:
 
 
 FACTOR = {11: 3.4, 21: 2.4, 41: 2.8, 61: 3.8, 101: 3.7}
-"""How many times the C++ reference (-O3) is faster than the NumPy network, measured once side by side."""
+"""Speed of the C++ reference (-O3) relative to the NumPy network, measured once side by side."""
 
 
 def many(call, count: int):

@@ -1,4 +1,4 @@
-"""Recall inside replay: one frame looked at among many remembered ones, on one core."""
+"""Recall in replay: one frame compared with many remembered ones, on one core."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CELL = 0.6
 
 
 def remembered(config: RecallConfig, frames: int, size: int, dtype):
-    """A memory of a random walk with random views, with hypotheses under way."""
+    """A memory of a random walk with random views, with modes in use."""
     stream = np.random.default_rng(0)
     capacity = 1 << (frames - 1).bit_length()
     memory = init_memory(config, size, capacity, np.dtype(dtype))
@@ -34,7 +34,7 @@ def remembered(config: RecallConfig, frames: int, size: int, dtype):
 @pytest.mark.parametrize("shifts", [0, 3])
 @pytest.mark.parametrize("frames", [1500, 100_000])
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
-def test_a_look_back(benchmark, frames, shifts, dtype):
+def test_one_recall(benchmark, frames, shifts, dtype):
     config = RecallConfig(shifts=shifts)
     memory = remembered(config, frames, 18, dtype)
     views = jnp.asarray(np.random.default_rng(1).random((64, 18)), dtype)
@@ -43,13 +43,13 @@ def test_a_look_back(benchmark, frames, shifts, dtype):
 
     @jax.jit
     def replay(memory):
-        def look(k, memory):
+        def recall(k, memory):
             memory = accumulate_motion(memory, moved)
             weighed = observation_model.view_likelihood(config, CELL, memory, views[k % 64])
             memory, _ = recognise(config, CELL, memory, weighed)
             return memory._replace(motion=jnp.zeros_like(moved), length=jnp.zeros_like(memory.length))
 
-        return jax.lax.fori_loop(0, looks, look, memory)
+        return jax.lax.fori_loop(0, looks, recall, memory)
 
     replay(memory).mass.block_until_ready()
     times = []
@@ -59,6 +59,6 @@ def test_a_look_back(benchmark, frames, shifts, dtype):
         times.append((time.perf_counter() - start) / looks)
     median = float(np.median(times)) * 1e6
     benchmark.extra_info["us_a_look"] = median
-    print(f"\n{frames} frames, {2 * shifts + 1} shifts, {dtype}: {median:.0f} us a look")
+    print(f"\n{frames} frames, {2 * shifts + 1} shifts, {dtype}: {median:.0f} us a recall")
     after = benchmark.pedantic(replay, args=(memory,), rounds=1)
     assert np.isfinite(np.asarray(after.mass)).all()

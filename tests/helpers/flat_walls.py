@@ -90,8 +90,8 @@ def report(
 
 
 def met(strain: np.ndarray, share: float = 0.4) -> tuple[Report, Report]:
-    """HIT1 and what follows, as the first whisker of that strain touches: HIT2 when a second one does, ABORT
-    if none does in that share of it."""
+    """HIT1 of the first whisker in that strain and its successor: HIT2 when a second whisker touches, ABORT
+    if none does within `share` of the strain."""
     level = np.abs(strain[..., 0]) > CONTACT
     ever = np.logical_or.accumulate(level, axis=0)
     first = int(np.abs(strain[0, :, 0]).argmax())

@@ -110,8 +110,8 @@ def drive(
         rows = allocate(layout_of(chunk[0]), CHUNK)
         for k, report in enumerate(chunk):
             rows.write(k, report)
-        state, told = _runner(backend)(state, rows, np.int32(len(chunk)))
-        outputs += told.records(len(chunk))
+        state, results = _runner(backend)(state, rows, np.int32(len(chunk)))
+        outputs += results.records(len(chunk))
     estimate, evidence = jax.tree.map(lambda *rows: np.stack(rows), *outputs)
     return state, estimate, evidence
 

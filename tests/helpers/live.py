@@ -45,11 +45,11 @@ class Faults:
         return answer
 
     def state(self) -> dict[str, Any]:
-        """What the emulator knows."""
+        """The state of the emulator."""
         return self(do="state")
 
     def die(self) -> None:
-        """End the emulator in the midst of everything; it does not answer any more."""
+        """Ends the emulator at once; it does not answer."""
         with suppress(OSError, ValueError):
             self(do="die")
         self.process.wait(PATIENCE)
@@ -61,14 +61,14 @@ class Faults:
 
 @contextmanager
 def emulator(module: str, port: int, host: str, *arguments: str) -> Iterator[Faults]:
-    """A running `python -m MODULE --host HOST ...` that has said `ready`; it ends with the block."""
+    """A running `python -m MODULE --host HOST ...` that has printed `ready`; it ends with the block."""
     command = [sys.executable, "-m", module, "--host", host, *arguments]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, bufsize=0)
     faults = Faults(process, host, port)
     try:
         assert process.stdout is not None
-        said = process.stdout.readline()
-        assert said.strip() == b"ready", f"{module} does not start; does another one hold {host}?"
+        line = process.stdout.readline()
+        assert line.strip() == b"ready", f"{module} does not start; does another one hold {host}?"
         yield faults
     finally:
         faults.close()
@@ -85,7 +85,7 @@ def ur_emulator(host: str, start: Any, *arguments: str) -> Any:
 
 
 def moves(controller: Faults, after: int = 0) -> list[dict[str, Any]]:
-    """What reached a UR emulator after so many orders, without those that stop the arm."""
+    """Commands that a UR emulator received after the first `after`, without those that stop the arm."""
     return [order for order in controller.state()["targets"][after:] if not order["order"].startswith("Stop")]
 
 

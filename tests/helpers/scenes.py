@@ -40,7 +40,7 @@ def figure_eight(seed: int, laps: int = 6, shared: float = 1 / 3) -> InMemorySou
 
 
 def corridor(seed: int, length: int = 400) -> InMemorySource:
-    """Straight on into the unknown: nothing ever comes back."""
+    """A straight path without any revisit."""
     return sensed(followed([(STEP, 0.0)] * length), seed)
 
 
@@ -56,10 +56,10 @@ def followed(moves: list[tuple[float, float]]) -> np.ndarray:
 def sensed(
     path: np.ndarray, seed: int, carried: list[int] | None = None, shared: float = 0.0
 ) -> InMemorySource:
-    """What a robot on a path [N, 3] reports.
+    """Log of a robot on a path [N, 3].
 
     Args:
-        carried: rows that odometry knows nothing of. shared: share of places that look like another one.
+        carried: rows whose motion odometry lacks. shared: share of places with the view of another one.
     """
     stream = np.random.default_rng(seed)
     count = len(path)

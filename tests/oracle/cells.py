@@ -16,11 +16,11 @@ BOX = 3  # half width of the box that is decoded
 
 
 class NetworkDied(Exception):
-    """Nothing is left after the inhibition (Q6)."""
+    """No activity is left after the inhibition (Q6)."""
 
 
 def circulant(n: int, width: int, sigma: float) -> Array:
-    """One axis of the normalised Gaussian as a matrix: row = where it goes, column = where it comes from."""
+    """One axis of the normalised Gaussian as a matrix: row: target cell, column: source cell."""
     reach = range(-(width // 2), width // 2 + 1)
     weights = np.array([math.exp(-(o * o) / (2 * sigma * sigma)) for o in reach])
     weights /= weights.sum()

@@ -15,7 +15,7 @@ from tests.oracle.views import Match, StockTemplates
 
 @dataclass(frozen=True)
 class Step:
-    """What the stock engine decided in one row."""
+    """Decisions of the stock engine in one row."""
 
     match: Match | None
     energy: float
@@ -65,7 +65,7 @@ class StockEngine:
         return Step(match, energy, injected, delta, action, source, self.places.experience)
 
     def match(self, row: Row) -> Match:
-        """The template of the row's view, or the one that was decided elsewhere."""
+        """The template of the row's view, or the template given in the row."""
         if row.label is not None:
             template, relative = row.label
             return Match(template, 0.0, relative, novel=template >= len(self.places.memories))

@@ -57,7 +57,7 @@ class StockMap:
         self.relax()
 
     def create(self) -> None:
-        """A node where the odometry says the robot is."""
+        """Adds a node at the pose by odometry."""
         first = not self.x
         self.x.append((0.0 if first else self.x[self.current]) + self.dx)
         self.y.append((0.0 if first else self.y[self.current]) + self.dy)
@@ -78,7 +78,7 @@ class StockMap:
         self.links.append(link)
 
     def set(self, node: int, relative: float) -> None:
-        """Go to a node. Being there already, as after node 0, clears nothing (Q7)."""
+        """Goes to a node. At the current node, as after node 0, nothing is cleared (Q7)."""
         if node == self.current:
             return
         self.current = node

@@ -1,4 +1,4 @@
-"""What the network remembers: packets of templates, and places (section 4; "4. Place" of the semantics)."""
+"""The memory of the network: packets of templates, and places (section 4; "4. Place" of the semantics)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def short_way(a: float, b: float, n: float) -> float:
 
 @dataclass
 class Memory:
-    """What the network keeps of a template: where it was learnt, how worn out it is, its experiences."""
+    """The network's record of a template: its packet, its habituation and its experiences."""
 
     packet: Pose
     decay: float
@@ -49,7 +49,7 @@ class StockPlaces:
         self.viewed = self.moved = False
 
     def see(self, template: int, relative: float, best: Pose) -> tuple[float, Pose] | None:
-        """`on_view_template`; what has to be injected and where, if anything."""
+        """`on_view_template`; returns the injected energy and its pose, if any."""
         p, n = self.parameters, len(self.memories)
         recalled = None
         if template >= n:
@@ -68,11 +68,11 @@ class StockPlaces:
         return recalled
 
     def recall(self, template: int, relative: float) -> tuple[float, Pose] | None:
-        """Step 2: habituate, and inject where the template was learnt while energy is left."""
+        """Step 2: habituates, and injects at the template's packet while its energy is positive."""
         p, memory = self.parameters, self.memories[template]
         if template == self.template:
             memory.decay += p.vt_active_decay
-        # A long look habituates without limit (Q3), beyond what exp can express.
+        # A long match habituates without limit (Q3), until exp overflows.
         energy = p.pc_vt_inject_energy / 30 * (30 - math.exp(min(1.2 * memory.decay, 700.0)))
         if energy <= 0:
             return None
@@ -87,7 +87,7 @@ class StockPlaces:
         return th - self.parameters.pc_dim_th if th >= self.parameters.pc_dim_th else th
 
     def delta(self, experience: int, best: Pose) -> float:
-        """How far an experience is; cells of length and of heading count the same (Q23)."""
+        """Distance of an experience; cells of length and of heading count the same (Q23)."""
         n, headings = self.parameters.pc_dim_xy, self.parameters.pc_dim_th
         x, y, th = self.experiences[experience].packet
         return math.sqrt(

@@ -42,7 +42,7 @@ class Input:
 
 @dataclass(frozen=True)
 class PlainStep:
-    """What the plain engine decided in one step."""
+    """Decisions of the plain engine in one step."""
 
     template: int
     energy: float
@@ -93,7 +93,7 @@ class PlainTemplates:
         return Match(len(self.views) - 1, best, 0.0, novel=True)
 
     def relative(self, offset: int) -> float:
-        """The turn that an offset stands for."""
+        """The turn of an offset, rad."""
         p = self.parameters
         if p.vt_panoramic:
             return wrapped(2 * math.pi * offset / p.template_x_size)
@@ -122,7 +122,7 @@ def shifted(layers: Array, shifts: Array, axis: int) -> Array:
 
 
 class PlainCells:
-    """Steps 2 and 3: the network, its decoded pose, and how far it lags behind the odometry."""
+    """Steps 2 and 3: the network, its decoded pose, and its lag behind the odometry."""
 
     def __init__(self, parameters: Parameters, settings: Settings) -> None:
         p = parameters
@@ -219,20 +219,20 @@ class PlainCells:
     def behind(self, moved_cells: Array, lag: Array, before: Pose, died: bool) -> Pose:
         """Difference between the commanded and the decoded motion."""
         angle = (before[2] + lag[2]) * self.heading_cell
-        wanted = (
+        expected = (
             moved_cells[0] * math.cos(angle) - moved_cells[1] * math.sin(angle) + lag[0],
             moved_cells[0] * math.sin(angle) + moved_cells[1] * math.cos(angle) + lag[1],
             moved_cells[2] + lag[2],
         )
         moved = (a - b for a, b in zip(self.best, before, strict=True))
-        rest = [around(float(w - m), n) for w, m, n in zip(wanted, moved, self.rings, strict=True)]
+        rest = [around(float(w - m), n) for w, m, n in zip(expected, moved, self.rings, strict=True)]
         if died or any(abs(r) > LOST for r in rest):
             return 0.0, 0.0, 0.0
         return rest[0], rest[1], rest[2]
 
 
 class PlainPlaces:
-    """Step 4: places, and which of them are joined."""
+    """Step 4: places and the links between them."""
 
     def __init__(self, parameters: Parameters) -> None:
         self.radius = parameters.exp_delta_pc_threshold

@@ -48,14 +48,14 @@ class Parameters:
 
     @classmethod
     def from_strings(cls, strings: Mapping[str, object]) -> Parameters:
-        """Read what is named, default the rest; names that only concern camera images are not ours."""
+        """Reads the named parameters, with defaults for the others; ignores those of camera images."""
         kinds = {field.name: int if field.type == "int" else float for field in fields(cls)}
         return cls(**{name: kinds[name](str(text)) for name, text in strings.items() if name in kinds})
 
 
 @dataclass(frozen=True)
 class Row:
-    """One row of the input. `label` is a template decided elsewhere and its turn; both None: nothing seen."""
+    """One row of the input. `label` is a given template and its turn; both None: no view."""
 
     stamp: float
     v: float
@@ -98,7 +98,7 @@ class Trace:
 
 
 def load(path: Path | str) -> Trace:
-    """Open a trace, or say in one line why that is not possible."""
+    """Opens a trace; a `TraceError` gives in one line the reason that it cannot be read."""
     path = Path(path)
     try:
         with np.load(path, allow_pickle=False) as file:

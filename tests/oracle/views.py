@@ -10,13 +10,13 @@ import numpy as np
 
 from tests.oracle.trace import Array, Parameters
 
-# What the stock engine starts its search with; it stays in the error when nothing was compared.
+# Initial error of the stock engine's search; it remains when nothing was compared.
 NOTHING_COMPARED = sys.float_info.max
 
 
 @dataclass(frozen=True)
 class Match:
-    """Which template a view was taken for, at which error, turned by which angle in radians."""
+    """The matched template of a view, its error, and the turn, rad."""
 
     template: int
     error: float
@@ -41,7 +41,7 @@ def offsets(parameters: Parameters) -> range:
 
 
 def compared_pixels(parameters: Parameters) -> int:
-    """How many pixels one comparison adds up."""
+    """Number of pixels in one comparison."""
     margin = 0 if parameters.vt_panoramic else 2 * parameters.vt_shift_match
     return (parameters.template_x_size - margin) * parameters.template_y_size
 

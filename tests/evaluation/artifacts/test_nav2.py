@@ -28,7 +28,7 @@ grids = st.builds(
     st.floats(1e-6, 2),
 )
 MAP = OccupancyGrid(np.array([[0.0, 0.3, 1.0], [0.1, 0.5, 0.7]]), np.array([-1.25, 0.5]), 0.05)
-"""Two rows: the first one lies below."""
+"""Two rows, the first one below the second."""
 
 
 @pytest.fixture
@@ -37,7 +37,7 @@ def folder(tmp_path):
     return tmp_path
 
 
-def written_and_read(grid):
+def write_and_read(grid):
     with tempfile.TemporaryDirectory() as folder:
         write_nav2(Path(folder), grid)
         return read_nav2(Path(folder) / "map.yaml")
@@ -46,7 +46,7 @@ def written_and_read(grid):
 @law
 @given(grids)
 def test_cells_read_back_as_occupied_free_or_unknown(grid):
-    served = written_and_read(grid)
+    served = write_and_read(grid)
     p = grid.probability
     assert np.array_equal(served.cell == 100, p > OCCUPIED_THRESH)
     assert np.array_equal(served.cell == 0, p < FREE_THRESH)
@@ -57,12 +57,12 @@ def test_cells_read_back_as_occupied_free_or_unknown(grid):
 
 @given(st.floats(0.25, 0.6))
 def test_cells_at_the_prior_are_unknown(prior):
-    served = written_and_read(OccupancyGrid(np.full((3, 4), prior), np.zeros(2), 0.05))
+    served = write_and_read(OccupancyGrid(np.full((3, 4), prior), np.zeros(2), 0.05))
     assert (served.cell == -1).all()
 
 
 def test_the_thresholds_themselves_are_unknown():
-    served = written_and_read(MAP._replace(probability=np.array([[FREE_THRESH, OCCUPIED_THRESH]])))
+    served = write_and_read(MAP._replace(probability=np.array([[FREE_THRESH, OCCUPIED_THRESH]])))
     assert (served.cell == -1).all()
 
 
@@ -72,7 +72,7 @@ def test_the_prior_is_written_as_205(tmp_path):
 
 
 def test_the_files_of_a_small_map(folder):
-    """The first row of the image is the one with the greatest y; no name leads out of the folder."""
+    """The first row of the image has the greatest y; the image lies in the same folder."""
     assert (folder / "map.pgm").read_bytes() == b"P5\n3 2\n255\n" + bytes([254, 205, 0, 254, 205, 0])
     assert (folder / "map.yaml").read_text() == (
         "image: map.pgm\nmode: trinary\nresolution: 0.05\norigin: [-1.25, 0.5, 0.0]\n"
@@ -105,13 +105,13 @@ def test_numbers_have_no_exponent(grid):
 
 def test_the_usual_threshold_would_turn_unknown_into_free(folder):
     text = (folder / "map.yaml").read_text()
-    for threshold, told in (("0.19", -1), ("0.196", -1), ("0.25", 0)):
+    for threshold, cells in (("0.19", -1), ("0.196", -1), ("0.25", 0)):
         (folder / "map.yaml").write_text(text.replace("0.19", threshold))
-        assert read_nav2(folder / "map.yaml").cell[0, 1] == told
+        assert read_nav2(folder / "map.yaml").cell[0, 1] == cells
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "cells"),
     [
         (("negate: 0", "negate: 1"), [[100, 100, 0], [100, 100, 0]]),
         (("negate: 0", "negate: true"), [[100, 100, 0], [100, 100, 0]]),
@@ -120,10 +120,10 @@ def test_the_usual_threshold_would_turn_unknown_into_free(folder):
         (("trinary", "raw"), [[-1, -1, 0], [-1, -1, 0]]),
     ],
 )
-def test_maps_of_other_tools_follow_the_same_rules(folder, change, told):
+def test_maps_of_other_tools_follow_the_same_rules(folder, change, cells):
     path = folder / "map.yaml"
     path.write_text(path.read_text().replace(*change))
-    assert read_nav2(path).cell.tolist() == told
+    assert read_nav2(path).cell.tolist() == cells
 
 
 def test_comments_in_an_image_are_skipped(folder):

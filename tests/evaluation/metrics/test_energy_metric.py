@@ -93,7 +93,7 @@ def test_all_pairs_of_a_long_run_need_no_memory():
     assert found.rot2 == pytest.approx(2e-4, rel=0.05)
 
 
-def test_relations_interpolate_and_drop_what_lies_outside():
+def test_relations_are_interpolated_and_those_outside_dropped():
     time = np.array([0.0, 1, 2])
     pose = np.array([[0, 0, np.radians(170)], [1, 0, np.radians(-170)], [2, 0, np.radians(-170)]])
     true = between(np.array([0.5, 0, np.pi]), np.array([1.5, 0, np.radians(-170)]))

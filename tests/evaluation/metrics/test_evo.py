@@ -22,10 +22,10 @@ def evo(tmp_path):
     def run(command, *options):
         line = [command, "tum", "truth.tum", "estimate.tum", *options]
         env = {**os.environ, "HOME": str(tmp_path), "MPLBACKEND": "Agg"}
-        told = subprocess.run(
+        done = subprocess.run(
             line, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=120, check=True
         )
-        return float(re.search(r"rmse\s+(\S+)", told.stdout)[1])
+        return float(re.search(r"rmse\s+(\S+)", done.stdout)[1])
 
     return run
 

@@ -35,7 +35,7 @@ def test_a_perfect_loop_scores_one(square, dwell):
 
 def test_paper_reading_loses_places_as_wide_as_the_threshold(square):
     # a place of 6 steps is 0.10 m wide and entered 0.10 m from where it was last left, the threshold:
-    # rounding says which of the 8 places pass, and the verdict holds for the visit
+    # rounding decides which of the 8 places pass, and the verdict holds for the visit
     ids, truth = square(2, 6)
     assert arcr(ids, truth)["paper"] == 0.25
     assert arcr(ids, truth, position=0.099)["paper"] == 0.0

@@ -57,7 +57,7 @@ def scene(boxes=((5, 5, 8, 8), (13, 12, 16, 15)), side=20, margin=6, cell=CELL):
 
 
 def true_grid(grid, truth, outside=PRIOR_OCCUPANCY):
-    """The truth as a map on the cells of another: what nothing can be better than."""
+    """The truth as a map on the cells of another map: the best possible map."""
     return grid._replace(probability=truth_occupancy(truth, touchable_surface(grid, truth).wall, outside))
 
 
@@ -74,7 +74,7 @@ def scenes(draw):
 
 
 def noisy(empty, seed):
-    """A map that holds anything, also where nothing was felt."""
+    """A map with random values in all cells, hidden ones included."""
     random = np.random.default_rng(seed)
     shape = empty.probability.shape
     return empty._replace(
@@ -125,7 +125,7 @@ def test_a_perfect_map_has_the_best_scores(scene):
         if not convention.smooth:
             assert found.error == 0
             assert found.skill == 1
-        else:  # and is not, if the truth is smoothed: a blurred one is
+        else:  # but not if the truth is smoothed: a blurred map is better
             assert found.error > 0
             blurred = grid._replace(probability=smooth_truth(grid.probability))
             assert error(blurred, truth, convention).error == pytest.approx(0, abs=1e-12)
@@ -186,7 +186,7 @@ def test_scores_are_invariant_to_shifts_by_whole_cells(scene, seed, across, up):
     empty, truth = scene
     grid = noisy(empty, seed)
     grid.probability[~np.pad(np.ones((26, 26), bool), 3)] = (
-        PRIOR_OCCUPANCY  # nothing leaves the map by being moved
+        PRIOR_OCCUPANCY  # the shift moves no wall out of the map
     )
 
     def rolled(cells):
@@ -224,8 +224,8 @@ def test_a_displaced_map_is_worse(scene, by):
 @given(scenes(), seeds)
 def test_auc_is_the_share_of_ordered_pairs(scene, seed):
     empty, truth = scene
-    grid, felt = noisy(empty, seed), touchable_surface(empty, truth)
-    walls, free = grid.probability[felt.wall][:, None], grid.probability[felt.free]
+    grid, surface = noisy(empty, seed), touchable_surface(empty, truth)
+    walls, free = grid.probability[surface.wall][:, None], grid.probability[surface.free]
     pairs = (walls > free) + 0.5 * (walls == free)
     auc = values(score_grid(grid, truth))["map_auc"]
     assert auc == pytest.approx(pairs.mean(), abs=1e-4)
@@ -239,9 +239,9 @@ def test_auc_is_the_share_of_ordered_pairs(scene, seed):
 @given(scenes(), seeds)
 def test_hidden_cells_do_not_count(scene, seed):
     empty, truth = scene
-    grid, felt = noisy(empty, seed), touchable_surface(empty, truth)
-    hidden = ~(felt.free | felt.wall)
-    deep = truth.occupied & ~felt.wall
+    grid, surface = noisy(empty, seed), touchable_surface(empty, truth)
+    hidden = ~(surface.free | surface.wall)
+    deep = truth.occupied & ~surface.wall
     guessed = grid._replace(
         probability=np.where(hidden, np.where(truth.occupied, 1.0, PRIOR_OCCUPANCY), grid.probability)
     )
@@ -265,9 +265,9 @@ def test_occupancy_beyond_the_outer_wall_has_no_effect(scene, seed):
 
 def test_one_cell_or_all_cells_minimise_only_one_chamfer_distance():
     empty, truth = scene()
-    felt = touchable_surface(empty, truth)
+    surface = touchable_surface(empty, truth)
     one = empty.probability.copy()
-    one[tuple(np.argwhere(felt.wall)[0])] = 0.9
+    one[tuple(np.argwhere(surface.wall)[0])] = 0.9
     to_walls, to_map = (values(score_grid(empty._replace(probability=one), truth))[name] for name in CHAMFER)
     assert to_walls < CELL < 0.3 < to_map
     everything = empty._replace(probability=np.ones_like(one))
@@ -304,8 +304,8 @@ def test_free_space_scores_are_of_the_map_clipped_at_its_prior(scene, seed):
 
 def test_log_loss_of_certain_errors_is_finite():
     empty, truth = scene()
-    felt = touchable_surface(empty, truth)
-    wrong = empty._replace(probability=np.where(felt.wall, 0.0, 1.0))
+    surface = touchable_surface(empty, truth)
+    wrong = empty._replace(probability=np.where(surface.wall, 0.0, 1.0))
     found = values(score_grid(wrong, truth))
     assert found["map_log_loss"] == pytest.approx(-np.log(CLAMP))
     assert found["map_auc"] == 0
@@ -320,26 +320,26 @@ def test_a_wall_is_one_cell_thick_at_any_offset(offset, cell):
     low, high = -offset * cell, (side + offset) * cell
     grid = OccupancyGrid(np.full((side + 2 * margin,) * 2, PRIOR_OCCUPANCY), np.full(2, -margin * cell), cell)
     inside = ((cell_centres(grid) > low + 1e-9) & (cell_centres(grid) < high - 1e-9)).all(axis=-1)
-    felt = touchable_surface(grid, GridTruth(np.zeros_like(inside), inside, box(low, low, high, high)))
+    surface = touchable_surface(grid, GridTruth(np.zeros_like(inside), inside, box(low, low, high, high)))
     across = int(inside.any(axis=0).sum())
-    assert felt.wall.sum() - 4 * across in (0, 4)  # the cells beyond the corners may be too far off
-    assert not (felt.wall & inside).any()
+    assert surface.wall.sum() - 4 * across in (0, 4)  # the cells beyond the corners may be too far off
+    assert not (surface.wall & inside).any()
 
 
 def test_only_surfaces_that_face_free_space_count():
-    # flush with the wall by its west side, and as large as to have an inside
+    # its west side touches the wall, and it is large enough for inner cells
     empty, truth = scene([(0, 6, 5, 12)])
-    felt = touchable_surface(empty, truth)
-    points = felt.points / CELL
+    surface = touchable_surface(empty, truth)
+    points = surface.points / CELL
     assert not (np.isclose(points[:, 0], 0) & (points[:, 1] > 6) & (points[:, 1] < 12)).any()
     assert (np.isclose(points[:, 0], 5) & (points[:, 1] > 6) & (points[:, 1] < 12)).sum() == 30
-    block = felt.wall[6 + 6 : 6 + 12, 6:11]
+    block = surface.wall[6 + 6 : 6 + 12, 6:11]
     assert block[0].all()
     assert block[-1].all()
     assert block[:, -1].all()
     assert not block[1:-1, :-1].any()
-    assert not felt.wall[6 + 7 : 6 + 11, 5].any()  # the ring behind it is out of reach
-    assert truth_occupancy(truth, felt.wall)[6 + 8, 7] == 1
+    assert not surface.wall[6 + 7 : 6 + 11, 5].any()  # the ring behind it is out of reach
+    assert truth_occupancy(truth, surface.wall)[6 + 8, 7] == 1
 
 
 def test_rotated_objects_have_a_closed_surface():
@@ -353,9 +353,9 @@ def test_rotated_objects_have_a_closed_surface():
     truth = truth._replace(
         occupied=(np.abs(along) < 0.15).all(axis=-1), segments=np.vstack([truth.segments, sides])
     )
-    felt = touchable_surface(empty, truth)
+    surface = touchable_surface(empty, truth)
     depth = 0.15 - np.abs(along).max(axis=-1)
-    skin = felt.wall & truth.inside
+    skin = surface.wall & truth.inside
     assert (skin == (truth.occupied & (depth < CELL)))[np.abs(depth - CELL) > 1e-3].all()
     found = values(score_grid(true_grid(empty, truth), truth))
     assert found["map_brier_skill"] == found["map_auc"] == 1
@@ -419,9 +419,9 @@ def mapper(name, error, spread=0.001):
 def test_the_table_notes_where_the_papers_order_holds(order):
     scores = {name: mapper(name, 0.2 - 0.05 * k) for k, name in enumerate(order)}
     text = render_grid_scores([scores[name] for name in ("blob", "geometric", "template")])
-    said = [line.strip() for line in text.splitlines() if line.strip().startswith("order")]
+    orders = [line.strip() for line in text.splitlines() if line.strip().startswith("order")]
     holds = "as in the paper" if order == ("blob", "geometric", "template") else "not the paper's"
-    assert said == [f"order: {' > '.join(order)}, {holds}"] * 10
+    assert orders == [f"order: {' > '.join(order)}, {holds}"] * 10
     assert max(map(len, text.splitlines())) <= 110
     assert "0.40" in text
     assert "0.39" in text
@@ -462,6 +462,6 @@ def test_invalid_maps_are_refused():
     for other in (empty._replace(cell=0.1), empty._replace(origin=empty.origin + 1)):
         with pytest.raises(ValueError, match="expected the same shape"):
             mean_grid([empty, other])
-    felt = touchable_surface(empty, truth)
+    surface = touchable_surface(empty, truth)
     with pytest.raises(ValueError, match="different"):
-        pool_errors([grid_error(empty, truth, felt, each) for each in (MAIN_CONVENTION, ARENA)])
+        pool_errors([grid_error(empty, truth, surface, each) for each in (MAIN_CONVENTION, ARENA)])

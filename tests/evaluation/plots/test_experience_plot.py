@@ -51,17 +51,17 @@ def test_the_legend_has_the_counts(confused):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "reason"),
     [
         ({"truth": None}, "no ground truth"),
         ({"experience": np.full(108, -1)}, "no experiences"),
         ({"truth": np.linspace([0, 0, 0], [9, 9, 0], 108)}, "never returns"),
     ],
 )
-def test_runs_without_verdicts_are_drawn_with_the_reason(circle, change, said):
+def test_runs_without_verdicts_are_drawn_with_the_reason(circle, change, reason):
     run = circle._replace(**change)
     figure = draw_experience_history(run, score_run(run))
-    assert any(said in text.get_text() for text in figure.texts)
+    assert any(reason in text.get_text() for text in figure.texts)
     assert set(marks(figure)) <= {"experience"}
 
 
@@ -73,11 +73,11 @@ def test_plot_and_scorecard_agree(confused):
     for run in (confused, late, late._replace(truth=truth)):
         card = score_run(run)
         figure = draw_experience_history(run, card)
-        told = " ".join(text.get_text() for text in figure.texts)
+        texts = " ".join(text.get_text() for text in figure.texts)
         base = card.quantities["exm_base"].value
-        assert f"base set of {base} steps" in told
+        assert f"base set of {base} steps" in texts
         for name, words in (("exm_arr", "ARR"), ("exm_arcr_strict", "ARCR")):
-            assert f"{words} {card.quantities[name].value:.2f} (" in told
+            assert f"{words} {card.quantities[name].value:.2f} (" in texts
         steps = np.flatnonzero((run.experience >= 0) & np.isfinite(run.truth).all(axis=1))
         assert marks(figure)["end of the base set"][0, 0] == steps[base] - 0.5
 

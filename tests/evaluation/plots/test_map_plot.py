@@ -33,7 +33,7 @@ TOUCH = sorted(path.stem for path in (ROOT / "configs").glob("whisker_*.yaml"))
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A tiny session on touch: run, and written to a file that is run."""
+    """A tiny whisker session: mapped directly, and from its recording."""
     path = tmp_path_factory.mktemp("pictures")
     (path / "config.yaml").write_text(CONFIG)
     (path / "replay.yaml").write_text(
@@ -108,7 +108,7 @@ def test_a_session_without_whiskers_has_only_its_map(folder, tmp_path):
 
 @pytest.mark.parametrize("name", TOUCH)
 def test_a_config_names_its_source_and_sets_no_defaults(name):
-    """Every leaf that a configuration sets differs from what would be without it."""
+    """Every value that a configuration sets differs from the default."""
     path = ROOT / "configs" / f"{name}.yaml"
     first = path.read_text().splitlines()[0]
     assert first.startswith("# Salman & Pearson 2016, ")

@@ -46,10 +46,10 @@ def test_extreme_errors_are_drawn_with_equal_bytes(values):
     ]
 
     def drawn():
-        told = io.BytesIO()
+        buffer = io.BytesIO()
         figure = draw_pareto("a", "b", marks, "time", "error")
-        figure.savefig(told)
+        figure.savefig(buffer)
         assert [text.get_text() for text in figure.axes[0].texts if text.get_text()] == ["row 0", "row 1"]
-        return told.getvalue()
+        return buffer.getvalue()
 
     assert drawn() == drawn()

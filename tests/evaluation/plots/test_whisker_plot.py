@@ -18,7 +18,7 @@ AZIMUTH = np.arange(6) * np.pi / 3
 LENGTH = np.array([0.05, 0.11, 0.16])
 
 
-def felt(steps=108, seed=0, dead=()):
+def random_images(steps=108, seed=0, dead=()):
     """Random images, half of the pixels dark."""
     random = np.random.default_rng(seed)
     view = random.random((steps, 3, 6)) * (random.random((steps, 3, 6)) < 0.5)
@@ -40,7 +40,7 @@ def strips(figure):
 
 @given(arrays(np.float64, (4, 3, 6), elements=st.floats(0, 1)))
 def test_images_read_back_within_one_grey_level(tmp_path_factory, view):
-    images = felt(4)._replace(view=view)
+    images = random_images(4)._replace(view=view)
     path = tmp_path_factory.mktemp("images") / "views.npz"
     write_whisker_views(path, images)
     found = read_whisker_views(path)
@@ -52,31 +52,31 @@ def test_images_read_back_within_one_grey_level(tmp_path_factory, view):
 
 def test_equal_images_give_equal_bytes(tmp_path):
     for name in ("a", "b"):
-        write_whisker_views(tmp_path / name, felt())
+        write_whisker_views(tmp_path / name, random_images())
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
 def test_other_files_are_refused(tmp_path):
-    write_whisker_views(tmp_path / "whole.npz", felt())
+    write_whisker_views(tmp_path / "whole.npz", random_images())
     content = (tmp_path / "whole.npz").read_bytes()
     (tmp_path / "cut.npz").write_bytes(content[: len(content) // 2])
     (tmp_path / "text.npz").write_text("no images")
     np.savez(tmp_path / "other.npz", view=np.zeros(3))
-    np.savez(tmp_path / "odd.npz", **felt()._replace(length=np.zeros(2))._asdict())
+    np.savez(tmp_path / "odd.npz", **random_images()._replace(length=np.zeros(2))._asdict())
     for name in ("cut", "text", "other", "odd", "missing"):
         with pytest.raises(InputError, match=name):
             read_whisker_views(tmp_path / f"{name}.npz")
 
 
 def test_each_column_of_a_strip_is_an_image(circle):
-    images = felt(dead=(4,))
+    images = random_images(dead=(4,))
     figure = draw_whiskers(circle, score_run(circle), images)
     (strip,) = strips(figure)
     pixels = np.asarray(strip.get_array())
     assert pixels.shape == (18, 108, 3)
     dark = pixels[images.view.reshape(108, 18).T == 0]
-    assert len(np.unique(dark, axis=0)) == 2  # touched nothing, and does not report
-    # What touched nothing is pale, as nothing on the scale of heights is.
+    assert len(np.unique(dark, axis=0)) == 2  # no contact, and no signal
+    # Pixels without contact are pale, unlike all colours of the scale of heights.
     assert pixels[((images.view == 0) & images.alive).reshape(108, 18).T].min() > 0.9
     assert pixels[images.view.reshape(108, 18).T > 0].min(axis=1).max() < 0.5
     assert len(np.unique(pixels[4], axis=0)) == 1
@@ -84,7 +84,7 @@ def test_each_column_of_a_strip_is_an_image(circle):
 
 
 def test_heads_show_the_images_of_their_steps(circle):
-    images = felt(seed=1)
+    images = random_images(seed=1)
     figure = draw_whiskers(circle, score_run(circle), images)
     strip = np.asarray(strips(figure)[0].get_array())
     drawn = heads(figure)
@@ -105,7 +105,7 @@ def test_a_sector_points_in_the_direction_of_its_whisker(heading, first):
     run = RunArrays(
         np.zeros(1), pose, pose, pose, pose, np.zeros(1, int), np.zeros(1, int), pose, np.zeros((0, 2), int)
     )
-    images = felt(1)._replace(azimuth=AZIMUTH + first)
+    images = random_images(1)._replace(azimuth=AZIMUTH + first)
     ((paths, _),) = heads(draw_whiskers(run, score_run(run), images))
     radii = []
     for whisker, path in enumerate(paths):
@@ -120,7 +120,7 @@ def test_a_sector_points_in_the_direction_of_its_whisker(heading, first):
 def test_heads_do_not_cover_each_other(circle):
     still = circle._replace(truth=circle.truth * [0.2, 0.2, 1.0])
     for run in (circle, still):
-        drawn = heads(draw_whiskers(run, score_run(run), felt()))
+        drawn = heads(draw_whiskers(run, score_run(run), random_images()))
         boxes = [np.concatenate([p.vertices for p in paths]) for paths, _ in drawn]
         centres = np.array([(box.min(axis=0) + box.max(axis=0)) / 2 for box in boxes])
         reach = max(np.ptp(box, axis=0).max() for box in boxes) / 2
@@ -139,7 +139,7 @@ def test_sessions_of_any_length_are_drawn(circle, steps):
         },
         created=np.minimum(circle.created, steps - 1),
     )
-    figure = draw_whiskers(run, score_run(run), felt(steps))
+    figure = draw_whiskers(run, score_run(run), random_images(steps))
     across, down = figure.get_size_inches() * figure.dpi
     assert across == 1200
     assert 500 < down < 2500
@@ -152,7 +152,7 @@ def test_sessions_of_any_length_are_drawn(circle, steps):
 def test_without_truth_heads_are_drawn_at_map_poses(circle):
     blind = circle._replace(truth=None)
     walls = np.array([[0.0, 0.0, 9.0, 0.1, 0.05]])
-    figure = draw_whiskers(blind, score_run(blind), felt(), walls)
+    figure = draw_whiskers(blind, score_run(blind), random_images(), walls)
     for paths, _ in heads(figure):
         centre = np.mean([path.vertices.mean(axis=0) for path in paths], axis=0)
         assert np.hypot(*(circle.final[:, :2] - centre).T).min() < 0.02
@@ -162,4 +162,4 @@ def test_without_truth_heads_are_drawn_at_map_poses(circle):
 
 def test_another_number_of_images_is_refused(circle):
     with pytest.raises(InputError, match=r"views\.npz: 7 images"):
-        draw_whiskers(circle, score_run(circle), felt(7))
+        draw_whiskers(circle, score_run(circle), random_images(7))

@@ -163,7 +163,7 @@ class Session:
     def __init__(self, folder: Path, process: Forked) -> None:
         self.directory, self.log, self.process = folder / "run", folder / "log", process
 
-    def said(self) -> str:
+    def output(self) -> str:
         return self.log.read_text(errors="replace")
 
     def until(self, condition: Callable[[], Any], what: str) -> Any:
@@ -171,25 +171,25 @@ class Session:
 
         def met() -> Any:
             found = condition()
-            assert found or self.process.poll() is None, self.said()
+            assert found or self.process.poll() is None, self.output()
             return found
 
         try:
             return until(met, what)
         except AssertionError:
-            print(self.said())
+            print(self.output())
             raise
 
-    def says(self, text: str) -> None:
+    def wait_for(self, text: str) -> None:
         """Waits for a text in its output."""
-        self.until(lambda: text in self.said(), f"{text!r} is said")
+        self.until(lambda: text in self.output(), f"{text!r} is said")
 
     def code(self, seconds: float = 2 * PATIENCE) -> int:
         """Waits for its end; returns the exit code."""
         try:
             return self.process.wait(seconds)
         except subprocess.TimeoutExpired:
-            print(self.said())
+            print(self.output())
             raise
 
     def report(self) -> dict[str, Any]:
@@ -296,7 +296,7 @@ class Bench:
     def in_motion(self, **settings: Any) -> Iterator[Session]:
         """A quick session after two whisks, with the arm at full speed."""
         with self.session(**settings) as session:
-            session.says("armed")
+            session.wait_for("armed")
             session.until(
                 lambda: self.whisk_count(session) >= 2 and self.moves(), "two whisks and an arm that moves"
             )
@@ -342,7 +342,7 @@ class Bench:
 
     def whisk_count(self, session: Session) -> int:
         """Number of whisks recorded, by the progress bar."""
-        return max(map(int, re.findall(r"(\d+)/\d+ \[", session.said())), default=0)
+        return max(map(int, re.findall(r"(\d+)/\d+ \[", session.output())), default=0)
 
     def replace_head(self) -> None:
         """Ends the emulated head, whose fault cannot be cleared; the next test gets a new one."""

@@ -66,9 +66,9 @@ def test_registers_in_use(bench: Bench) -> None:
     sent = len(bench.arm.state()["targets"])
     with bench.session() as session:
         assert session.code() == 2
-        assert "registers in use" in session.said()
-        assert "EtherNet/IP" in session.said()
-        assert "Traceback" not in session.said()
+        assert "registers in use" in session.output()
+        assert "EtherNet/IP" in session.output()
+        assert "Traceback" not in session.output()
         assert not session.directory.exists()
         assert len(bench.arm.state()["targets"]) == sent
 

@@ -32,7 +32,7 @@ def recovered(recording: Path) -> Path:
 @pytest.mark.parametrize("number", NUMBERS)
 def test_the_whole_session_is_killed(bench: Bench, number: int) -> None:
     with bench.session(arm={"watchdog_hz": 10.0 if number in MANY else 0.5}) as session:
-        session.says("armed")
+        session.wait_for("armed")
         time.sleep(float(stream(number, "killed").uniform(0.6, 2.0)))
         at = bench.moment()
         os.killpg(session.process.pid, signal.SIGKILL)
@@ -63,13 +63,13 @@ def test_the_parent_is_killed_in_motion(bench: Bench) -> None:
 def test_an_interrupt_ends_the_session(bench: Bench, number: int) -> None:
     """At any moment: a controlled stop, and a complete recording up to then."""
     with bench.session(waypoints=[(0.63, 0.45, 0.0), (0.7, 0.45, 0.0)]) as session:
-        session.says("disk:")
+        session.wait_for("disk:")
         time.sleep(float(stream(number, "interrupted").uniform(0.0, 5.0)))
         at = bench.moment()
         session.process.send_signal(signal.SIGINT)
         code = session.code()
         stands(bench)
-        assert "Traceback" not in session.said()
+        assert "Traceback" not in session.output()
         if session.directory.exists() and (session.directory / "session.mcap").exists():
             outcome = session.report()["outcome"]
             assert (outcome, code) in {("interrupted", 130), ("complete", 0)}
@@ -77,7 +77,7 @@ def test_an_interrupt_ends_the_session(bench: Bench, number: int) -> None:
                 ended(bench, session, outcome, at)
         else:
             assert code == 130
-            assert "interrupted" in session.said()
+            assert "interrupted" in session.output()
         assert bench.arm.state()["watchdog_stops"] == bench.starved
 
 
@@ -100,8 +100,8 @@ def test_the_disk_is_full(bench: Bench) -> None:
         resource.prlimit(session.process.pid, resource.RLIMIT_FSIZE, (size + 5000, size + 5000))
         code = session.code()
         assert code == 2
-        assert "disk_full: " in session.said()
-        assert "Traceback" not in session.said()
+        assert "disk_full: " in session.output()
+        assert "Traceback" not in session.output()
         stands(bench)
         saved = read_recorded(recovered(session.directory / "session.mcap"))
         assert saved.lost(at) <= LOST

@@ -15,7 +15,7 @@ from tests.ratslam.live.expected_outcomes import ended
 def test_a_slow_mapper(bench: Bench) -> None:
     """Images are dropped, odometry never; the recording repeats it."""
     with bench.session(mapper=0.55, budget=0.3, whisks=10) as session:
-        assert session.code() == 0, session.said()
+        assert session.code() == 0, session.output()
         report, recorded = session.report(), session.recorded()
         assert report["outcome"] == "complete"
         assert report["standing"]

@@ -63,9 +63,9 @@ def test_missing_libraries_and_devices_are_refused(
 ) -> None:
     sent = len(bench.arm.state()["targets"])
     with bench.session(without=without, head={"address": address or bench.host}) as session:
-        assert session.code() == 2, session.messages()
-        assert "Traceback" not in session.messages(), session.messages()
+        assert session.code() == 2, session.output()
+        assert "Traceback" not in session.output(), session.output()
         for text in messages:
-            assert text in session.messages()
+            assert text in session.output()
         assert not session.directory.exists()
     assert len(bench.arm.state()["targets"]) == sent
