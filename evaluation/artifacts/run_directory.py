@@ -15,6 +15,9 @@ from evaluation.metrics.trajectory import read_tum
 from tactile.base.errors import InputError
 from tactile.base.npz import read_npz
 
+SESSION_REPORT = "live.json"
+"""Report of a live session, written when it has ended."""
+
 
 def read_run(path: Path) -> RunArrays:
     """Reads the arrays of a run. Without a final trajectory (interrupted run) the online one replaces it.

@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.artifacts.run_directory import checkpoint_steps
+from evaluation.artifacts.run_directory import SESSION_REPORT, checkpoint_steps
 from tactile.base.errors import InputError
 
 RUNNING = "running"
-"""Status of a run without a manifest: running or killed."""
+"""Status of a run that has not ended, or was killed."""
 WATCH_IMAGE = "watch.png"
 """The monitor's own image in the run directory; ignored when looking for activity of the run."""
 
@@ -27,7 +27,8 @@ class RunProgress(NamedTuple):
     """State of a run after N steps.
 
     Attributes:
-        status: from the manifest; `running` without one. total: final number of steps, if known.
+        status: from the manifest; of a live session that ended before its map was finished, the outcome from
+            its report; `running` without either. total: final number of steps, if known.
         path: [N, 3] online poses in the map frame, m, m, rad. sd: [3] standard deviations of the last pose;
             NaN before it. odometry: [N, 3] from the start of this run. truth: [N, 2] m, NaN if unknown.
         outcomes: number of steps by outcome. lost: number of steps lost. online_error: position error at the
@@ -85,6 +86,8 @@ class RunMonitor:
             InputError: a malformed line or manifest, or the directory was removed.
         """
         status, total = self._manifest()  # read first: after the end, no line is missing
+        if status == RUNNING:
+            status = self._session_outcome()
         self._read()
         count = min(len(self._rows), len(self._reckoned))  # the lines of a chunk are written file by file
         rows = np.array(self._rows[:count], float).reshape(count, len(_NUMBERS))
@@ -135,6 +138,16 @@ class RunMonitor:
             return RUNNING, None
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise InputError(str(file), f"not a manifest ({error})", "the manifest of a run") from None
+
+    def _session_outcome(self) -> str:
+        """The outcome in the report of a live session; `running` without a report."""
+        file = self.directory / SESSION_REPORT
+        try:
+            return str(json.loads(file.read_text(encoding="utf-8"))["outcome"])
+        except FileNotFoundError:
+            return RUNNING
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InputError(str(file), f"not a report ({error})", "the report of a live session") from None
 
     def _files(self) -> list[str]:
         """All files except the monitor's own."""

@@ -7,7 +7,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -56,7 +56,7 @@ def _live(arguments: argparse.Namespace) -> int:
 
     config, _ = _read_live_config(arguments, arguments.head)
     directory = run_directory(arguments)
-    with _monitor() as start_monitor:
+    with monitor() as start_monitor:
         ended, card = run_live_session(config, directory, _print, armed=start_monitor)
     if card is not None:
         print(render_scorecard(card))
@@ -87,24 +87,31 @@ def _emulate(arguments: argparse.Namespace) -> int:
 
 
 @contextmanager
-def _monitor() -> Iterator[Callable[[Path], None]]:
-    """Yields a function that starts `ratslam watch` on a run directory, as a process of low priority."""
-    processes = []
+def monitor() -> Iterator[Callable[[Path], None]]:
+    """Yields a function that starts `ratslam watch` on a run directory, as a process of low priority.
+
+    At the end of the block the process is ended, and `watch.png` is drawn once more with the final state.
+    """
+    from evaluation.monitor.watch import watch_run
+
+    processes: dict[Path, subprocess.Popen[bytes]] = {}
 
     def start(directory: Path) -> None:
         nice = ["nice", "-n", "10"] if shutil.which("nice") else []
         command = [*nice, sys.executable, "-m", "ratslam", "watch", str(directory)]
         quiet = subprocess.DEVNULL
         # A session of its own: it gets no Ctrl-C.
-        processes.append(subprocess.Popen(command, stdout=quiet, stderr=quiet, start_new_session=True))
+        processes[directory] = subprocess.Popen(command, stdout=quiet, stderr=quiet, start_new_session=True)
         _print(f"{directory}/watch.png shows the map while it grows")
 
     try:
         yield start
     finally:
-        for process in processes:
+        for directory, process in processes.items():
             process.terminate()
             process.wait()
+            with suppress(InputError):  # a full disk has been reported
+                watch_run(directory, lambda line: None, once=True)
 
 
 def _read_live_config(

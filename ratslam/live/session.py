@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from evaluation.artifacts.run_directory import SESSION_REPORT
 from evaluation.metrics.scorecard import Scorecard
 from ratslam.config.run_config import RunConfig
 from ratslam.core.session import CHUNK
@@ -35,8 +36,8 @@ from tactile.features.calibration import Calibration, calibrate
 from tactile.features.whisker_image import view_shape
 from tactile.whiskers.head_geometry import ur10_head
 
-RECORDING, REPORT = "session.mcap", "live.json"
-"""Files in the run directory: the recording, and the report of the session."""
+RECORDING = "session.mcap"
+"""The recording in the run directory."""
 START_TIMEOUT = 300.0
 """Time limit of the mapper's start, with compilation, s."""
 
@@ -86,7 +87,7 @@ def run_live_session(
             report = _report(fault, rig, mapper, whisks, standing)
         card = mapper.finish(fault.outcome is not SessionOutcome.COMPLETE) if whisks else None
     with suppress(OSError):  # a full disk has been reported
-        (directory / REPORT).write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+        (directory / SESSION_REPORT).write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     return fault, card
 
 

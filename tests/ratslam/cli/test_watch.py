@@ -18,17 +18,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evaluation.artifacts.run_directory import read_run
+from evaluation.artifacts.run_directory import SESSION_REPORT, read_run, read_walls
 from evaluation.monitor.plot import draw_watch
 from evaluation.monitor.progress import RUNNING, RunMonitor, RunProgress
 from evaluation.monitor.watch import path_length, status_line, watch_run
 from ratslam.cli import main
+from ratslam.cli.live import monitor
 from ratslam.config.run_config import load_config
 from ratslam.core.session import CHUNK
 from ratslam.pipeline.runner import open_runner
 from ratslam.pipeline.source import open_observations
 from tactile.base.errors import InputError
 from tactile.base.se2 import tum_line
+from tests.helpers.live import until
 
 ROOT = Path(__file__).parents[3]
 CONFIG = ROOT / "configs" / "square.yaml"
@@ -127,6 +129,32 @@ def test_a_killed_run_is_given_up_after_a_long_silence(killed, tmp_path, capsys)
     assert "the run was killed" in output
     assert before == {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "watch.png"}
     assert 0 < len(RunMonitor(folder).read().path) <= (folder / "steps.csv").read_text().count("\n") - 1
+
+
+def test_the_picture_beside_a_session_shows_its_end(alone, tmp_path):
+    """The session ends at once after a picture, and its process of pictures with it."""
+    folder = tmp_path / "run"
+    with run_in_progress(folder) as complete, monitor() as start_monitor:
+        start_monitor(folder)
+        until((folder / "watch.png").exists, "the first picture")
+        complete()
+    draw_watch(RunMonitor(folder).read(), read_walls(folder)).savefig(tmp_path / "complete.png")
+    assert RunMonitor(folder).read().status == "complete"
+    assert (folder / "watch.png").read_bytes() == (tmp_path / "complete.png").read_bytes()
+
+
+def test_a_session_that_lost_its_mapper_has_the_state_of_its_report(killed, tmp_path, capsys):
+    folder = tmp_path / "run"
+    shutil.copytree(killed, folder)
+    assert RunMonitor(folder).read().status == RUNNING
+    (folder / SESSION_REPORT).write_text(json.dumps({"outcome": "mapper_gone"}))
+    assert main(["watch", str(folder)]) == 0  # ends, without patience
+    said = capsys.readouterr().out
+    assert "run: mapper_gone, " in said
+    assert "the run was killed" not in said
+    (folder / SESSION_REPORT).write_text("{")
+    with pytest.raises(InputError, match="not a report"):
+        RunMonitor(folder).read()
 
 
 def test_ctrl_c_ends_it_and_no_engine_is_loaded(killed):
