@@ -5,15 +5,19 @@ writes 1 to output register 0 when it is ready and 2 when it has executed a comm
 Output register 2 describes the newest asynchronous operation: its number and whether it is under way.
 Source: the interface described by ur_rtde 1.6.5 (its control script and its documentation).
 
-Supported are the commands of our driver: `moveL`, `stopL`, `setTcp`, `setWatchdog`,
-`isPoseWithinSafetyLimits`. All others are accepted without effect.
+The commands of our driver are executed: `moveL`, `stopL`, `setTcp`, `setWatchdog`,
+`isPoseWithinSafetyLimits`. Any other command ends the program, as an error in a script does on a controller:
+the function of ur_rtde returns False or raises an error, and the emulator names it on standard error.
+Functions that do not wait for an answer (`servoJ`, `speedL`, ...) return True the first time, but end the
+program too.
 """
 
 from __future__ import annotations
 
 import re
-from enum import IntEnum
+import sys
 
+from robot.emulators.ur10.control_commands import ControlCommand, refusal_of
 from robot.emulators.ur10.controller import EmulatedController, Program
 from robot.emulators.ur10.urscript_moves import MoveL, MoveOrder, StopL, parse_moves
 
@@ -21,18 +25,6 @@ READY, DONE = 1, 2
 RUNNING_BIT = 1 << 15
 
 _OFFSET = re.compile(r"# int register offset\n\s*(\d+)")
-
-
-class ControlCommand(IntEnum):
-    """Command numbers of ur_rtde."""
-
-    NONE = 0
-    MOVE_L = 3
-    SET_TCP = 29
-    STOP_L = 33
-    SET_WATCHDOG = 35
-    POSE_WITHIN_SAFETY_LIMITS = 36
-    END = 255
 
 
 class ControlProgram:
@@ -70,6 +62,9 @@ class ControlProgram:
         elif not self._executing:
             self._executing = True
             if command == ControlCommand.END:
+                return False
+            if refusal := refusal_of(command):
+                print(f"emulated controller: {refusal}", file=sys.stderr, flush=True)
                 return False
             self._execute(command)
             if not self._waiting:

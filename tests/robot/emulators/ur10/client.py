@@ -150,6 +150,18 @@ def solve(host: str) -> dict[str, Any]:
     return {"before": before, "after": after, "moved": controller.moveL(pose)}
 
 
+def unsupported(host: str) -> dict[str, Any]:
+    """A move that is not emulated, and a linear one before and after the program is uploaded again."""
+    receiver, controller = receive(host), control(host)
+    home = receiver.getActualTCPPose()
+    moved = controller.moveJ(receiver.getActualQ())
+    stopped = settled(lambda: not controller.isProgramRunning(), 30.0)
+    after = controller.moveL(home)
+    controller.reuploadScript()
+    settled(controller.isProgramRunning, 30.0)
+    return {"moved": moved, "stopped": stopped, "after": after, "again": controller.moveL(home)}
+
+
 def refused(host: str) -> dict[str, Any]:
     """What the library says where it cannot control."""
     try:
@@ -186,6 +198,7 @@ SCENARIOS: dict[str, Callable[[str], Any]] = {
     "drive watched": lambda host: drive(host, True),
     "watch": watch,
     "solve": solve,
+    "unsupported": unsupported,
     "refused": refused,
     "second": second,
     "slide": slide,

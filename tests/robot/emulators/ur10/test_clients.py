@@ -255,6 +255,13 @@ def test_a_move_without_inverse_kinematics_ends_the_program(faults: Faults) -> N
 
 
 @emulated
+def test_a_function_that_is_not_emulated_returns_false(faults: Faults) -> None:
+    """A new program executes linear moves again."""
+    seen = found(faults.host, "unsupported")
+    assert seen == {"moved": False, "stopped": True, "after": False, "again": True}
+
+
+@emulated
 def test_registers_belong_to_one_client(faults: Faults) -> None:
     seen = found(faults.host, "second")
     assert "already in use" in seen["error"]

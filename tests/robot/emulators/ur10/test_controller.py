@@ -143,6 +143,24 @@ def test_the_watchdog_stops_the_arm_only_when_it_is_not_reset(frequency: float, 
     assert not bench.controller.arm.moving
 
 
+@pytest.mark.parametrize(("command", "name"), [(1, "moveJ"), (11, "servoJ"), (200, "an unknown function")])
+def test_a_command_that_is_not_emulated_ends_the_program(
+    command: int, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench = Bench()
+    assert bench.command(3, (*THERE, 0.1, 1.0), asynchronous=1)
+    bench.ticks(0.1)
+    assert not bench.command(command, HERE)
+    assert bench.controller.runtime is Runtime.STOPPED
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"emulated controller: {name} (command {command}) is not emulated")
+    assert "moveL, " in line
+    bench.ticks(0.5)
+    assert not bench.controller.arm.moving
+    bench.upload()
+    assert bench.command(3, (*HERE, 0.1, 1.0))
+
+
 def test_an_unreachable_target_ends_the_program() -> None:
     bench = Bench()
     assert not bench.command(3, (3.0, *THERE[1:], 0.1, 1.0))
