@@ -56,7 +56,7 @@ def rows(tiny: tuple[Path, str, bool]) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def made(
+def result_of(
     mapper: str, number: int, key: str, value: float, along: str = FILTERED, best: float = 0.0
 ) -> ResultRow:
     """A result with one metric."""
@@ -69,7 +69,7 @@ def of(
     measure: Measure, table: dict[str, list[float]], along: str = FILTERED, best: float = 0.0
 ) -> list[ResultRow]:
     return [
-        made(mapper, k, measure.key, value, along, best)
+        result_of(mapper, k, measure.key, value, along, best)
         for mapper, values in table.items()
         for k, value in enumerate(values)
     ]
@@ -101,7 +101,7 @@ def test_a_contact_is_drawn_at_its_place() -> None:
     row, column = np.unravel_index(grid.probability.argmax(), grid.probability.shape)
     there = grid.origin + grid.cell * (np.array([column, row]) + 0.5)
     assert np.abs(there - [0.4 - TIPS[1, 1], 0.52 + TIPS[1, 0]]).max() <= grid.cell / 2 + 1e-9
-    # What came later is not drawn.
+    # Later contacts are not drawn.
     first = draw_map(GridConfig(body=0.0), create(), ROOMY, path[:1], collect_marks(reports))
     assert first.probability.max() == pytest.approx(0.3)
 
@@ -145,7 +145,7 @@ def test_returns_are_found_as_revisits() -> None:
     later, earlier = find_revisits(truth).T
     assert (later >= 40).all()
     assert np.abs(truth[later, 0] - truth[earlier, 0]).max() < 0.02
-    assert truth[later, 0].max() < 1 - LEAVE_DISTANCE / 2 + 0.03  # near the turn it was never away
+    assert truth[later, 0].max() < 1 - LEAVE_DISTANCE / 2 + 0.03  # not near the turn
     assert len(find_revisits(truth[:40])) == 0
     assert len(find_revisits(there_and_back(far=LEAVE_DISTANCE))) == 0
 
@@ -172,7 +172,7 @@ def test_the_ranking_of_the_paper_holds_or_not() -> None:
     mixed = falling | {"geometric": [0.4, 0.7, 0.6]}
     words = [rank_mappers(of(EVERYWHERE, table), "ours", EVERYWHERE) for table in (falling, rising, mixed)]
     assert [one.word for one in words if one] == ["holds", "does not hold", "not decided"]
-    # More skill is better, so the same numbers say the opposite.
+    # More skill is better, so the same numbers give the opposite ranking.
     better = [rank_mappers(of(BRIER, table), "ours", BRIER) for table in (falling, rising)]
     assert [one.word for one in better if one] == ["does not hold", "holds"]
     assert rank_mappers(of(EVERYWHERE, {name: [0.1] for name in PAPERS}), "ours", EVERYWHERE) is None
@@ -275,7 +275,7 @@ def test_a_set_is_independent_of_earlier_sessions(rows: list[dict[str, str]]) ->
 def test_an_interrupt_keeps_the_finished_sessions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(function, tasks, workers):
         yield [
-            made(mapper, 0, "online_error", 0.1)._replace(
+            result_of(mapper, 0, "online_error", 0.1)._replace(
                 values={"reports": 40, "online_error": 0.1, "odometry_error": 0.2}
             )
             for mapper in PAPERS
@@ -294,13 +294,13 @@ def test_invalid_arguments_are_refused_before_anything_is_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "a"
-    for assignment, said in (
+    for assignment, message in (
         ("grid.cell=-1", "grid.cell"),
         ("create_simulation.arena.sides=2", "side"),
         ("touch.reports.walls=edges", "walls"),
     ):
         assert main(["reproduce", "fox-fig6", "-o", str(folder), "--set", assignment]) == 2
-        assert said in capsys.readouterr().err
+        assert message in capsys.readouterr().err
     assert not folder.exists()
     with pytest.raises(SystemExit) as stopped:
         main(["reproduce", "fox-fig3"])

@@ -67,7 +67,7 @@ def test_walls_without_training_are_recognised(templates: StrainTemplates) -> No
 
 
 def test_bad_templates_have_large_errors(templates: StrainTemplates) -> None:
-    # One angle's drives went wrong: its template is another one's.
+    # The template of one angle is replaced by another one's.
     mean = templates.mean.copy()
     mean[5] = mean[12]
     tried = drive_held_out(CONFIG, templates._replace(mean=mean))
@@ -125,7 +125,7 @@ def test_an_existing_file_is_not_overwritten(folder: Path, capsys: pytest.Captur
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("simulation: {}\n", "create_simulation"),
         ("create_simulation: {seed: -1}\n", "create_simulation.seed"),
@@ -133,10 +133,10 @@ def test_an_existing_file_is_not_overwritten(folder: Path, capsys: pytest.Captur
     ],
 )
 def test_invalid_sessions_are_refused(
-    text: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    text: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     config = tmp_path / "c.yaml"
     config.write_text(text)
     assert main(["train-templates", str(config), "-o", str(tmp_path / "t.npz")]) == 2
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err
     assert not (tmp_path / "t.npz").exists()

@@ -90,7 +90,7 @@ def test_a_path_that_never_returns_has_no_laps():
     assert len(lap_ends(square("C")[:40])) == 0
 
 
-def test_a_perfect_map_has_no_energy_wherever_it_lies():
+def test_a_perfect_map_has_no_energy_in_any_frame():
     truth = square("CC")
     moved = compose(np.array([3.0, -1.0, 2.0]), truth)
     place = np.arange(len(truth)) % 48
@@ -192,7 +192,7 @@ def test_ideal_views_are_equal_exactly_at_one_spot_and_heading(tiny):
     assert same.sum() > log.length
 
 
-# What single figures measure
+# Quantities of single figures
 
 
 def test_laps_the_other_way_round_are_associated_by_experience_or_closure():
@@ -278,8 +278,8 @@ def test_sets_stay_paired_where_one_is_missing():
     assert np.array_equal(column(rows, ("a", "ours", "none"), "arr"), [0, np.nan, 0.2], equal_nan=True)
 
 
-@pytest.mark.parametrize(("sets", "said"), [(1, False), (3, True), (6, False)])
-def test_a_table_states_the_significance_of_few_sets(sets, said):
+@pytest.mark.parametrize(("sets", "stated"), [(1, False), (3, True), (6, False)])
+def test_a_table_states_the_significance_of_few_sets(sets, stated):
     protocol = PROTOCOLS["fig6"]
     rows = [
         ResultRow((condition.name, "ours", "none"), k, k, {"arr": 0.1 * k + number / 10})
@@ -287,7 +287,7 @@ def test_a_table_states_the_significance_of_few_sets(sets, said):
         for number, condition in enumerate(protocol.conditions)
     ]
     text = render_claims(protocol, rows, sets)
-    assert ("in 25% of cases" in text) == said
+    assert ("in 25% of cases" in text) == stated
     assert ("CONFIRMED: difference 0.1" in text) == (sets > 1)
     assert "0.1765" in text
 

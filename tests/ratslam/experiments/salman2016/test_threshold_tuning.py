@@ -66,7 +66,7 @@ def log_of(truth, views, step=10.0):
 @given(
     st.lists(st.integers(0, 5), min_size=1, max_size=9), st.lists(st.integers(0, 5), min_size=1, max_size=9)
 )
-def test_auc_is_the_chance_that_other_places_look_less_alike(same, other):
+def test_auc_is_the_chance_that_views_of_other_places_differ_more(same, other):
     a, b = np.array(same, float), np.array(other, float)
     pairs = (b[None] > a[:, None]) + 0.5 * (b[None] == a[:, None])
     assert auc(a, b) == pytest.approx(pairs.mean())
@@ -83,8 +83,8 @@ def test_differences_equal_those_of_the_matcher(how, views):
     found = view_differences(config, views, views)
     store = view_templates.start(config, (3, 6, 2), 1, np.dtype(float))
     for i in range(3):
-        kept = store._replace(view=jnp.asarray(views[i].reshape(-1, 1)), count=jnp.int32(1))
-        match = view_templates.match_view(config, (3, 6, 2), kept, jnp.asarray(views[i - 1]))
+        stored = store._replace(view=jnp.asarray(views[i].reshape(-1, 1)), count=jnp.int32(1))
+        match = view_templates.match_view(config, (3, 6, 2), stored, jnp.asarray(views[i - 1]))
         assert found[i - 1, i] == pytest.approx(float(match.error), abs=1e-12)
 
 

@@ -62,10 +62,10 @@ def tiny(tmp_path: Path) -> Callable[..., Path]:
 @pytest.fixture
 def stubbed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Replaces runs by records that follow from settings and seed; the keys of the runs."""
-    asked: list[str] = []
+    keys: list[str] = []
 
     def run_job(job: Job) -> RunRecord:
-        asked.append(job.key)
+        keys.append(job.key)
         score = job.config.keyframes.min_score
         failed = "keyframes.min_score: too much" if score > 40 else None
         values = {
@@ -76,4 +76,4 @@ def stubbed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         return found.model_copy(update={"hash": job.hash, "seed": job.seed, "copy_number": job.copy_number})
 
     monkeypatch.setattr("ratslam.experiments.studies.study_runner.run_job", run_job)
-    return asked
+    return keys

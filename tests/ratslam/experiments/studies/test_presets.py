@@ -1,4 +1,4 @@
-"""Presets: the studies that they make of a configuration."""
+"""Presets: the studies made from a configuration."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_every_part_is_turned_off_in_a_row_of_its_own():
     assert len(preset("ablate", SQUARE, "copies=3")[0].jobs) == 3 * len(PARTS)
 
 
-def test_every_number_is_varied_down_and_up_as_far_as_it_goes():
+def test_every_number_is_varied_in_both_directions_within_its_limits():
     found = variations(override(load(SQUARE), ["recall.local=0.9"]), 0.2)
     names = [name for name, _ in found]
     assert names.count("recall.reach") == names.count("keyframes.min_score") == 2
@@ -148,7 +148,7 @@ def test_bad_input_is_refused_before_anything_runs(tmp_path, capsys, monkeypatch
     assert not Path("runs").exists()
 
 
-def test_a_fault_of_a_run_comes_out_as_it_is(tmp_path, capsys):
+def test_the_error_of_a_run_is_reported_unchanged(tmp_path, capsys):
     command = ["study", "--preset", "backends", str(SQUARE), "-o", str(tmp_path / "out"), "--workers", "1"]
     assert main([*command, "--set", "recording.file=nothing.npz"]) == 2
     assert "nothing.npz" in capsys.readouterr().err
@@ -171,7 +171,7 @@ def test_only_heights_count_where_both_touch():
     b = a.copy()
     a[0, 0, 0, 0], b[0, 0, 0, 0] = 0.4, 0.6
     a[0, 1, 0, 0] = 1.0
-    b[..., 1] = 0.7  # the radial channel says nothing about contacts
+    b[..., 1] = 0.7  # the radial channel has no effect on contacts
     contact, height = image_difference(a, b, 0.05)
     assert contact == pytest.approx(1 / 18)
     assert height == pytest.approx(0.01)

@@ -11,7 +11,7 @@ from tests.ratslam.experiments.studies.conftest import record
 FULL = record("r", varied={"a.b": [1, {"c": None}]}, time=40.0, energy_all=0.1 + 0.2, exm_arr=None)
 
 
-def test_a_record_comes_back_exactly(tmp_path):
+def test_records_read_back_equal(tmp_path):
     RunLog(tmp_path / "new" / "folder").append(FULL)
     assert RunLog(tmp_path / "new" / "folder").records == {FULL.key: FULL}
 
@@ -25,7 +25,7 @@ def test_a_copy_is_another_run(tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"", b'{"hash": "a", "se', b"{}", b"\xff\xfe", b"[1]", b"\n\n"])
-def test_a_line_that_is_no_record_is_passed_over_and_the_next_is_whole(tmp_path, content):
+def test_a_malformed_line_is_skipped_and_the_next_is_complete(tmp_path, content):
     (tmp_path / FILE).write_bytes(content)
     log = RunLog(tmp_path)
     assert log.records == {}
@@ -40,7 +40,7 @@ def test_the_last_record_of_a_run_counts(tmp_path):
     assert RunLog(tmp_path).records == {FULL.key: later}
 
 
-def test_a_folder_that_cannot_be_made_is_reported(tmp_path):
+def test_a_folder_that_cannot_be_created_is_reported(tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(InputError, match="cannot be made"):
         RunLog(tmp_path / "file" / "below")

@@ -58,7 +58,7 @@ def test_neither_order_nor_scale_changes_what_is_optimal(costs, order):
 @given(
     st.lists(st.one_of(st.none(), FINITE), max_size=9), st.sampled_from(["energy_all", "exm_arr", "links"])
 )
-def test_statistics_are_of_the_values_there_are(values, name):
+def test_statistics_use_the_defined_values(values, name):
     found = spread(values, name)
     known = [value for value in values if value is not None]
     if not known:
@@ -203,7 +203,7 @@ def test_differences_are_from_the_first_row_and_odometry_comes_last():
     )
 
 
-def test_what_disturbed_a_measurement_is_remarked_on():
+def test_disturbances_of_a_measurement_are_remarked_on():
     busy = record()
     busy = busy.model_copy(update={"machine": busy.machine.model_copy(update={"other_load": 2.5})})
     shared = busy.model_copy(update={"machine": busy.machine.model_copy(update={"workers": 2})})
@@ -212,12 +212,12 @@ def test_what_disturbed_a_measurement_is_remarked_on():
     assert "disturb" in make_report("name", plan(), [shared]).remarks[0]
 
 
-def test_a_label_is_as_short_as_can_be():
+def test_labels_are_as_short_as_possible():
     assert label("", {}) == "as configured"
     assert label("a", {}) == "a"
     assert label("a", {"x.k": "v", "y.l": 1.5}) == "a k=v l=1.5"
     assert label("", {"x.k": 1, "y.k": [2]}) == "x.k=1 y.k=[2]"
 
 
-def test_two_values_that_look_alike_are_two_rows():
+def test_two_values_with_equal_labels_are_two_rows():
     assert len(summarise([record(varied={"k": 1}), record(varied={"k": "1"})])) == 2

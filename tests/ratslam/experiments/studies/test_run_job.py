@@ -1,4 +1,4 @@
-"""One job: the same figures as a run has, whatever ran before in this process, and what it took."""
+"""One job: the quantities of a run, independent of earlier jobs in the process; time and memory."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SMALL = {"simulation.path": {"circuits": "CC"}}
 
 
 @pytest.mark.parametrize("backend", ["classic", pytest.param("recall", marks=pytest.mark.soak)])
-def test_a_job_has_the_figures_of_a_run(tiny, tmp_path, backend):
+def test_a_job_has_the_quantities_of_a_run(tiny, tmp_path, backend):
     (job,) = read_study(tiny(set=SMALL | {"backend": backend}, seeds=[3])).jobs
     result = run_job(job)
     run(job.config, tmp_path / "run")
@@ -36,13 +36,13 @@ def test_a_job_has_the_figures_of_a_run(tiny, tmp_path, backend):
     for name, quantity in card.quantities.items():
         ours = result.quantities[name]
         assert (ours.label, ours.unit) == (quantity.label, quantity.unit)
-        # Headings lose a bit on their way through a file's quaternions.
+        # Quaternions in files round headings by one bit.
         assert ours.value == (quantity.value and pytest.approx(quantity.value, rel=1e-6, abs=1e-9))
     assert result.steps == result.quantities["steps"].value
     assert (result.row, result.seed, result.error) == ("", 3, None)
 
 
-def test_a_job_is_timed_with_compiling_apart_and_weighed(tiny):
+def test_a_job_measures_steps_compilation_and_memory(tiny):
     (job,) = read_study(tiny(set=SMALL)).jobs
     result = run_job(job)
     step, compiling = result.value("step_time"), result.value("compile_time")
@@ -54,7 +54,7 @@ def test_a_job_is_timed_with_compiling_apart_and_weighed(tiny):
     assert all(result.value(metric.name) > 0 for metric in MEASURED)
 
 
-def test_pace_and_what_ran_before_change_no_figure(tiny):
+def test_pace_and_earlier_jobs_change_no_quantity(tiny):
     vary = {"session.precision": ["float32", "float64"]}
     single, double = read_study(tiny(vary=vary)).jobs
     (live, _) = read_study(tiny(vary=vary, pace="live")).jobs
@@ -84,14 +84,14 @@ def test_every_quantity_of_the_scorecards_is_known(tiny, tmp_path):
     (tmp_path / "relations").write_text("2.5,4.5,0,0,0,0,0,0\n2.5,6.5,0,0,0,0,0,0\n")
     score = job.config.score.model_copy(update={"relations": tmp_path / "relations"})
     config = job.config.model_copy(update={"score": score})
-    told = run_job(job._replace(config=config, reference_tier="kinematic"))
-    assert told.error is None
+    result = run_job(job._replace(config=config, reference_tier="kinematic"))
+    assert result.error is None
     maps = {name for name in METRICS if name.startswith("map_")}
-    assert set(told.quantities) | maps | {metric.name for metric in MEASURED} == set(METRICS)
+    assert set(result.quantities) | maps | {metric.name for metric in MEASURED} == set(METRICS)
     assert maps - {"map_error"} == {metric.name for metric in GRID_METRICS}
 
 
-def test_what_a_user_can_mend_is_a_result(tiny):
+def test_input_errors_are_results(tiny):
     (job,) = read_study(tiny(set={"simulation.maze": {"file": "nowhere.txt"}})).jobs
     result = run_job(job)
     assert "nowhere.txt" in result.error
@@ -99,14 +99,14 @@ def test_what_a_user_can_mend_is_a_result(tiny):
     assert result.value("energy_all") is None
 
 
-def test_what_nobody_can_mend_is_not_hidden(tiny, monkeypatch):
+def test_other_errors_are_raised(tiny, monkeypatch):
     monkeypatch.setattr("ratslam.experiments.studies.run_job.build_session", lambda *_: 1 / 0)
     (job,) = read_study(tiny()).jobs
     with pytest.raises(ZeroDivisionError):
         run_job(job)
 
 
-def test_a_stopwatch_keeps_compiling_out_of_the_steps(monkeypatch):
+def test_a_stopwatch_separates_compilation_from_steps(monkeypatch):
     now = [0.0]
     monkeypatch.setattr("ratslam.experiments.studies.timing.perf_counter", lambda: now[0])
     kernels = [0]
@@ -117,26 +117,26 @@ def test_a_stopwatch_keeps_compiling_out_of_the_steps(monkeypatch):
         with watch.taking(16):
             now[0] += seconds
             kernels[0] += compiles
-    told = watch.times()
-    assert told["step_time"] == pytest.approx(1000)
-    assert told["step_time_p99"] == pytest.approx(2000, rel=0.02)
-    assert told["compile_time"] == pytest.approx(18.0)
-    assert told["run_time"] == pytest.approx((now[0] - 18.0) * 1e6 / 80)
+    result = watch.times()
+    assert result["step_time"] == pytest.approx(1000)
+    assert result["step_time_p99"] == pytest.approx(2000, rel=0.02)
+    assert result["compile_time"] == pytest.approx(18.0)
+    assert result["run_time"] == pytest.approx((now[0] - 18.0) * 1e6 / 80)
 
 
-def test_a_stopwatch_counts_what_jax_compiles():
+def test_a_stopwatch_counts_compilations_of_jax():
     watch = Stopwatch()
     with watch.taking(1):
         jax.jit(lambda x: x * math.pi + 1)(1.0).block_until_ready()
-    kept = jax.jit(lambda x: x - 1)
+    compiled = jax.jit(lambda x: x - 1)
     for _ in range(3):
         with watch.taking(1):
-            kept(1.0).block_until_ready()
+            compiled(1.0).block_until_ready()
     times = watch.times()
     assert 0 < 1e-6 * times["step_time"] < times["compile_time"]
 
 
-def test_memory_is_of_this_piece_of_work():
+def test_memory_is_measured_for_one_piece_of_work():
     reset_peak_memory()
     before = peak_memory()
     large = bytearray(200 << 20)
@@ -151,7 +151,7 @@ def test_memory_is_of_this_piece_of_work():
         assert after < peak - 100
 
 
-def test_measuring_keeps_to_one_core_and_lets_go_of_it():
+def test_measuring_uses_one_core_and_releases_it():
     if not hasattr(os, "sched_getaffinity"):
         pytest.skip("this system does not say on which cores a process runs")
     cores = os.sched_getaffinity(0)

@@ -1,4 +1,4 @@
-"""Searches: the choices follow from the study alone, whatever was killed meanwhile."""
+"""Searches: the choices follow from the study alone, also after kills."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_trials_are_within_bounds_and_the_optimal_ones_are_not_dominated(tiny, t
 
 @pytest.mark.parametrize("sampler", ["tpe", "nsga2"])
 @pytest.mark.parametrize("kills", [[1], [2, 3, 5], [7, 1, 1]])
-def test_a_killed_search_goes_on_as_if_it_had_not_been(tiny, tmp_path, stubbed, sampler, kills):
+def test_a_killed_search_continues_as_if_uninterrupted(tiny, tmp_path, stubbed, sampler, kills):
     study = read_study(tiny(tune=TUNE | {"sampler": sampler, "population": 4}))
     whole = tune(study, tmp_path / "whole")
     every = list(stubbed)
@@ -86,7 +86,7 @@ def test_a_killed_search_goes_on_as_if_it_had_not_been(tiny, tmp_path, stubbed, 
     assert sorted(stubbed) == sorted(every)  # no run twice
 
 
-def test_more_trials_go_on_from_those_there_are(tiny, tmp_path, stubbed):
+def test_more_trials_continue_a_search(tiny, tmp_path, stubbed):
     few = tune(read_study(tiny(tune=TUNE | {"trials": 8})), tmp_path / "out")
     runs = len(stubbed)
     more = tune(read_study(tiny(tune=TUNE | {"trials": 12})), tmp_path / "out")
@@ -136,7 +136,7 @@ def test_the_program_lists_the_optimal_trials(tiny, tmp_path, capsys, stubbed):
 
 
 @pytest.mark.soak
-def test_a_search_that_is_killed_again_and_again_ends_the_same(tiny, tmp_path):
+def test_a_search_killed_repeatedly_has_the_same_result(tiny, tmp_path):
     plan = TUNE | {"trials": 10, "parameters": {"keyframes.min_score": {"low": 2.0, "high": 30.0}}}
     study = tiny(tune=plan, set={"backend": "recall"})
     whole = tune(read_study(study), tmp_path / "whole")

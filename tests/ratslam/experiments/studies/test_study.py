@@ -1,4 +1,4 @@
-"""Studies: what comes of a file, that no configuration is lost or run twice, and what is refused."""
+"""Studies: jobs of a file, none lost or repeated, and refused files."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_rows_by_combinations_by_seeds(folder, grid, rows, seeds):
 
 @settings(max_examples=25)
 @given(grid=GRIDS, data=st.data())
-def test_hashes_follow_from_what_is_set_and_not_from_how_it_is_written(folder, grid, data):
+def test_hashes_follow_from_settings_and_not_from_notation(folder, grid, data):
     first = {key: values[0] for key, values in grid.items()}
     shuffled = {key: grid[key] for key in data.draw(st.permutations(sorted(grid)))}
     expected = {job.key for job in read(folder, vary=grid, seeds=2).jobs}
@@ -89,8 +89,8 @@ def test_a_row_that_equals_another_is_the_same_job(folder):
     assert found[0].key == found[1].key != found[2].key
 
 
-def test_what_is_set_counts_even_if_it_is_the_default(folder):
-    """What nobody sets may be completed from the source: touch has a `keyframes.min_score` of its own."""
+def test_explicit_defaults_change_the_hash(folder):
+    """Other settings may be completed from the source: touch has its own `keyframes.min_score`."""
     usual = KeyframeMapConfig().min_score
     unset, default = read(folder, rows={"unset": {}, "default": {"keyframes.min_score": usual}}).jobs
     assert unset.config == default.config
@@ -115,12 +115,12 @@ def test_seeds_are_no_part_of_the_hash_and_the_base_may_have_any(folder):
         ("square.yaml", "session"),
     ],
 )
-def test_seeds_are_of_what_is_run_on(folder, base, section):
+def test_seeds_belong_to_the_simulation_or_the_session(folder, base, section):
     found = read(folder, base=ROOT / "configs" / base, seeds=[3, 8]).jobs
     assert [getattr(job.config, section).seed for job in found] == [3, 8]
 
 
-def test_the_content_of_a_file_counts_and_not_where_it_lies(folder):
+def test_hashes_follow_from_the_content_of_files_and_not_their_path(folder):
     golden = ROOT / "tests" / "golden" / "a_square3.npz"
     keys = []
     for name, more in (("x", b""), ("y", b""), ("x", b"more")):
@@ -137,7 +137,7 @@ def test_paths_of_the_base_start_at_the_base(folder):
     assert job.config.recording.file.samefile(ROOT / "tests" / "golden" / "a_square3.npz")
 
 
-def test_pace_counts_because_times_are_of_it(folder):
+def test_the_pace_is_part_of_the_hash(folder):
     (replay,), (live,) = (read(folder, pace=pace).jobs for pace in ("replay", "live"))
     assert (replay.pace, live.pace) == ("replay", "live")
     assert replay.key != live.key
@@ -175,15 +175,15 @@ def test_overrides_are_of_the_study_or_of_all_runs(folder):
     assert whole.jobs[0].config.keyframes.model_fields_set == {"max_distance"}
 
 
-def test_a_section_is_set_before_what_is_in_it(folder):
+def test_a_section_is_set_before_its_keys(folder):
     written = {"keyframes.min_score": 2.0, "keyframes": {"max_distance": 9.0}}
     found = [read(folder, set=dict(items)).jobs for items in (written.items(), reversed(written.items()))]
     assert found[0] == found[1]
     assert found[0][0].config.keyframes.min_score == 2.0
 
 
-def test_no_key_of_studies_is_one_of_runs():
-    assert not set(StudyPlan.model_fields) & set(RunConfig.model_fields)  # `--set` tells them apart by it
+def test_keys_of_studies_and_runs_differ():
+    assert not set(StudyPlan.model_fields) & set(RunConfig.model_fields)  # `--set` needs this
 
 
 GRID = {"keyframes.min_score": [3]}
@@ -201,7 +201,7 @@ TUNE = {"parameters": {"keyframes.min_score": {"low": 1.0, "high": 2.0}}, "objec
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "message"),
     [
         ({"base": "nowhere.yaml"}, ["nowhere.yaml", "No such file"]),
         (
@@ -246,18 +246,18 @@ TUNE = {"parameters": {"keyframes.min_score": {"low": 1.0, "high": 2.0}}, "objec
         (tune(low=2, high=3, choices=[1, 2]), ["give low and high, or choices"]),
     ],
 )  # fmt: skip
-def test_a_bad_study_is_refused_before_anything_runs(capsys, folder, content, said):
+def test_a_bad_study_is_refused_before_anything_runs(capsys, folder, content, message):
     output = folder / "never"
     assert main(["study", str(study(folder, **content)), "-o", str(output)]) == 2
     error = capsys.readouterr().err
     assert "Traceback" not in error
     assert error.startswith("ratslam: error: ")
-    for words in said:
+    for words in message:
         assert words in error
     assert not output.exists()
 
 
-def test_a_fault_is_told_once_and_all_faults_are_told(folder):
+def test_every_error_is_reported_once(folder):
     with pytest.raises(InputError) as caught:
         read(
             folder,
@@ -271,22 +271,26 @@ def test_a_fault_is_told_once_and_all_faults_are_told(folder):
 
 
 @pytest.mark.parametrize(
-    ("override", "said"),
+    ("override", "message"),
     [
         ("keyframes.min_scor=3", "--set keyframes.min_scor: unknown key"),
         ("backend=recall", "varied"),
         ("x", "not an assignment"),
     ],
 )
-def test_a_bad_override_is_refused(folder, override, said):
-    with pytest.raises(InputError, match=said):
+def test_a_bad_override_is_refused(folder, override, message):
+    with pytest.raises(InputError, match=message):
         read(folder, override, vary={"backend": ["recall", "classic"]})
 
 
 def test_an_empty_file_and_a_missing_base_are_refused(folder):
-    for text, said in (("", "empty"), ("seeds: 2\n", "base: missing"), ("base: study.yaml\n", "unknown key")):
+    for text, error in (
+        ("", "empty"),
+        ("seeds: 2\n", "base: missing"),
+        ("base: study.yaml\n", "unknown key"),
+    ):
         (folder / "study.yaml").write_text(text)
-        with pytest.raises(InputError, match=said):
+        with pytest.raises(InputError, match=error):
             read_study(folder / "study.yaml")
 
 

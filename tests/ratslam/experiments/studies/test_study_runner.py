@@ -1,4 +1,4 @@
-"""Runs of a study: none is lost or repeated, and the outcome does not depend on who ran it."""
+"""Runs of a study: none is lost or repeated, and the outcome does not depend on the process."""
 
 from __future__ import annotations
 
@@ -143,15 +143,15 @@ def test_lost_records_are_run_again_and_nothing_else(data, scores, tmp_path_fact
         assert set(RunLog(folder).records) == {job.key for job in jobs}
 
 
-def test_failed_runs_are_reported_and_the_others_go_on(tiny, tmp_path, capsys, stubbed):
+def test_failed_runs_are_reported_and_the_others_continue(tiny, tmp_path, capsys, stubbed):
     study = tiny(vary={"keyframes.min_score": [5, 41, 6]}, seeds=2)
     for _ in range(2):  # the second time nothing runs, and the failure is reported again
         assert main(["study", str(study), "-o", str(tmp_path / "out"), "--workers", "1"]) == 2
-        told = capsys.readouterr()
-        assert "min_score=41, seed 1: keyframes.min_score: too much" in told.err
-        assert "2 runs failed" in told.err
-        assert "min_score=6" in told.out
-        assert "0, 2 failed" in told.out
+        printed = capsys.readouterr()
+        assert "min_score=41, seed 1: keyframes.min_score: too much" in printed.err
+        assert "2 runs failed" in printed.err
+        assert "min_score=6" in printed.out
+        assert "0, 2 failed" in printed.out
         assert (tmp_path / "out" / "table.csv").exists()
     assert len(stubbed) == 6
 
@@ -201,10 +201,10 @@ def test_speed_is_measured_in_fresh_processes_and_is_not_measured_again(tiny, tm
 
 
 def test_speed_is_measured_seed_by_seed_with_kernels_apart(tiny, tmp_path, monkeypatch):
-    asked = []
+    requested = []
 
     def completed(self, function, tasks, killed):
-        asked.extend(tasks)
+        requested.extend(tasks)
         kernels.append(function.args)
         return ((k, killed(task)) for k, task in enumerate(tasks))
 
@@ -213,13 +213,13 @@ def test_speed_is_measured_seed_by_seed_with_kernels_apart(tiny, tmp_path, monke
     rows = {"a": {}, "b": {"session.precision": "float32"}, "twin": {}}
     jobs = read_study(tiny(rows=rows, seeds=2)).jobs
     found = measure_jobs(jobs, RunLog(tmp_path / "out"))
-    assert [(job.row, job.seed) for job in asked] == [("a", 0), ("b", 0), ("a", 1), ("b", 1)]
+    assert [(job.row, job.seed) for job in requested] == [("a", 0), ("b", 0), ("a", 1), ("b", 1)]
     assert len(kernels) == 1
     assert [each.row for each in found] == ["a", "a", "b", "b", "twin", "twin"]
 
 
 @pytest.mark.parametrize("command", ["sweep", "frontier", "ablate", "vary", "spread", "tiers", "compare"])
-def test_a_former_command_says_what_to_type_now(command, capsys):
+def test_a_former_command_names_its_replacement(command, capsys):
     assert main([command, "anything"]) == 2
     error = capsys.readouterr().err
     assert error.startswith("ratslam: error: ")
@@ -227,7 +227,7 @@ def test_a_former_command_says_what_to_type_now(command, capsys):
 
 
 @pytest.mark.soak
-def test_an_interrupt_keeps_what_is_done_and_ends_all_processes(tiny, tmp_path):
+def test_an_interrupt_keeps_finished_runs_and_ends_all_processes(tiny, tmp_path):
     study, output = tiny(seeds=60), tmp_path / "out"
     for count in (2, 6):
         process = start(study, output, "--workers", "2")
@@ -242,7 +242,7 @@ def test_an_interrupt_keeps_what_is_done_and_ends_all_processes(tiny, tmp_path):
 
 
 @pytest.mark.soak
-def test_studies_killed_at_any_moment_go_on(tiny, tmp_path):
+def test_studies_killed_at_any_moment_continue(tiny, tmp_path):
     study, output = tiny(seeds=30), tmp_path / "out"
     jobs = read_study(study).jobs
     expected = outcomes(run(jobs, tmp_path / "whole"))
