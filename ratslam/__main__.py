@@ -10,7 +10,7 @@ import sys
 def main(argv: list[str] | None = None) -> int:
     """Runs the program.
 
-    First it checks that the four packages are ours: `tactile/__init__.py` says why.
+    First it checks that the four packages belong to this distribution (reason: `tactile/__init__.py`).
 
     Args:
         argv: the arguments without the program's name; None takes those of the process.

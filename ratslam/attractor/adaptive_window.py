@@ -33,7 +33,7 @@ def step_at_smallest_level(
         return Activity((block,), missing), result._replace(level=missing)
     zero = jnp.zeros_like(inputs.pose)
     carry = (activity.level, activity.blocks[0], StepResult(zero, zero, jnp.bool_(False), jnp.int32(0)))
-    # Loops of one round or none: XLA copies the result of a branch, but not what a loop leaves unchanged.
+    # Loops of at most one round: XLA copies the results of a branch, but not the unchanged values of a loop.
     to_try, block, result = lax.while_loop(_is_smallest, partial(_smallest, levels, inputs), carry)
     now = Activity((block, *activity.blocks[1:]), jnp.int32(0))
     larger = partial(_larger, levels, activity.blocks[0], activity.level, inputs)

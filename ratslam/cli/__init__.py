@@ -6,7 +6,7 @@ import argparse
 import errno
 import sys
 
-# Only what argparse needs is imported here, so that `--help` does not wait for JAX and NumPy.
+# Only the imports of argparse are made here, so that `--help` does not wait for JAX and NumPy.
 from ratslam.cli import files, live, look, reproduce, run, studies
 from ratslam.cli.common import INPUT_ERROR, INTERRUPTED, Commands
 from tactile.base.errors import InputError
@@ -15,7 +15,7 @@ GROUPS = ("run", "live", "look", "study", "papers", "files")
 """Headings of the help, in this order."""
 DESCRIPTION = "Maps an area and localises a robot by whiskers, camera or laser (RatSLAM)."
 RETIRED = {"tune": "reproduce threshold", **studies.REPLACED}
-"""Commands of earlier versions, and what replaces each."""
+"""Commands of earlier versions, and the replacement of each."""
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -77,7 +77,7 @@ def select_closures(
             `FindCut`. earlier: cuts (keyframe, sequence) of the current map.
     """
     best = optimise_with_cuts(case, starts[0], earlier)
-    if earlier:  # the map may need no cuts any more
+    if earlier:  # the cuts may have become unnecessary
         best = min(best, optimise_with_cuts(case, starts[0], ()), key=_cost)
     if not (best.fit.weights > ACCEPTED_WEIGHT).all():
         best = min([best, *_optimise_anew(case, starts)], key=_cost)

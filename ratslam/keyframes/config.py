@@ -100,7 +100,7 @@ class KeyframeMapConfig(Settings):
 
 
 class Ablation(Settings):
-    """Parts of the keyframe map that a study can turn off, to measure what each contributes."""
+    """Parts of the keyframe map that a study can turn off, to measure its contribution."""
 
     verify: bool = True
     """Whether closure sequences are tested against the map's covariance before they count."""

@@ -130,7 +130,7 @@ class ClosureLog(Checkpointed):
         rows[(rows[:, 0] >= frame) & accepted & (rows[:, 3] != spare) & (rows[:, 3] >= 0), 3] = -1
         self._lines = None
 
-    def accepted(self) -> np.ndarray:
+    def accepted_rows(self) -> np.ndarray:
         """[M] rows of the accepted candidates."""
         if self._lines is None:
             sequence = self._candidate.rows[:, 3]
@@ -146,9 +146,9 @@ class ClosureLog(Checkpointed):
             angle: turn per sector shift, rad. variance: [3] of a closure. scales: robust scale per unit of a
                 sequence's evidence, least scale, largest scale.
         """
-        rows = self._candidate.rows[self.accepted()]
+        rows = self._candidate.rows[self.accepted_rows()]
         sequences, sequence = np.unique(rows[:, 3], return_inverse=True)
-        score = np.bincount(sequence, self._evidence.rows[self.accepted(), 1], len(sequences))
+        score = np.bincount(sequence, self._evidence.rows[self.accepted_rows(), 1], len(sequences))
         return LoopClosures(
             i=rows[:, 1],
             j=rows[:, 0],
@@ -161,11 +161,11 @@ class ClosureLog(Checkpointed):
 
     def weigh(self, weights: np.ndarray) -> None:
         """Stores the robust weights of the accepted sequences, in order."""
-        self._weight.rows[np.unique(self._candidate.rows[self.accepted(), 3])] = weights
+        self._weight.rows[np.unique(self._candidate.rows[self.accepted_rows(), 3])] = weights
 
     def weights(self) -> np.ndarray:
         """[M] robust weight of the sequence of each accepted candidate."""
-        return self._weight.rows[self._candidate.rows[self.accepted(), 3]]
+        return self._weight.rows[self._candidate.rows[self.accepted_rows(), 3]]
 
     def table(self) -> np.ndarray:
         """[n, 9] all candidates: keyframe, match, shift, posterior, log-likelihood ratio, sequence, its

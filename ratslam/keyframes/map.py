@@ -106,7 +106,7 @@ class KeyframeMap(Checkpointed, Map):
     def closures(self) -> np.ndarray:
         """[M, 2] steps of the keyframes joined by accepted loop closures."""
         log = self.solution().log
-        return self._first_step()[log.table()[log.accepted(), :2].astype(int)].reshape(-1, 2)
+        return self._first_step()[log.table()[log.accepted_rows(), :2].astype(int)].reshape(-1, 2)
 
     def candidates(self) -> np.ndarray:
         """[n, 9] all candidates of recall and their verdicts, see `ClosureLog.table`."""
@@ -200,13 +200,13 @@ class KeyframeMap(Checkpointed, Map):
         shrunk = value * max(0.0, 1 - (config.shrink * error / value) ** 2) if value else 0.0
         sd = min(np.hypot(error, value - shrunk), 2 * config.bias_sd / cell)
         graph.prior = BiasPrior(shrunk, max(sd, config.bias_least / cell))
-        if not len(self._log.accepted()) and graph.bias != graph.prior.mean:
+        if not len(self._log.accepted_rows()) and graph.bias != graph.prior.mean:
             graph.bias = graph.prior.mean
             graph.dead_reckon()
 
     def _confirmed_pairs(self) -> ConfirmedPairs:
         """Closures with a high posterior that the map has accepted."""
-        table = self._log.table()[self._log.accepted()]
+        table = self._log.table()[self._log.accepted_rows()]
         sure = (table[:, 3] > CONFIRMED_MASS) & (table[:, 8] > CONFIRMED_WEIGHT)
         frame, match, shift = table[sure, :3].astype(int).T
         return ConfirmedPairs(frame, match, np.cos(shift * self._graph.sector_angle) < 0)

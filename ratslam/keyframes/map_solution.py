@@ -42,7 +42,7 @@ def final_solution(graph: KeyframeGraph, log: ClosureLog, closures: bool) -> Map
     solution = selected_solution(graph, log) if graph.config.select_every and closures else None
     if solution is not None:
         return solution
-    if len(log.accepted()):
+    if len(log.accepted_rows()):
         return MapSolution(graph.solve(log, graph.config.settling), log, graph.cut)
     return MapSolution(graph.fit()._replace(poses=graph.pose.rows.copy()), log, graph.cut)
 

@@ -115,11 +115,8 @@ class Mapper:
     def behind(self) -> float:
         """Waiting time of the oldest sample that is not mapped yet, s."""
         self.receive()
-        return (
-            time.monotonic() - self._offered[len(self.mapped)]
-            if len(self.mapped) < len(self._offered)
-            else 0.0
-        )
+        waiting = len(self.mapped) < len(self._offered)
+        return time.monotonic() - self._offered[len(self.mapped)] if waiting else 0.0
 
     def receive(self) -> None:
         """Reads the messages of the process."""

@@ -45,14 +45,14 @@ START_TIMEOUT = 300.0
 def run_live_session(
     config: RunConfig,
     directory: Path,
-    tell: Callable[[str], None],
+    log: Callable[[str], None],
     mapping: Callable[..., None] | None = None,
     armed: Callable[[Path], None] = lambda directory: None,
 ) -> tuple[Fault, Scorecard | None]:
     """Tests arm and head, calibrates, moves along the route, maps and scores.
 
     Args:
-        directory: the new run directory. tell: called with each line of progress.
+        directory: the new run directory. log: called with each line of progress.
         mapping: main function of the mapper process; None: `ratslam.live.mapper_process.run_mapper`.
         armed: called with the directory when the session begins.
 
@@ -67,14 +67,14 @@ def run_live_session(
     check_targets(config.live, path)
     if directory.exists():
         raise InputError(str(directory), "exists already", "a new run directory", "choose another with -o")
-    tell(check_disk(config.live, directory))
+    log(check_disk(config.live, directory))
     whisks: list[WhiskReport] = []
     with catch_interrupt("stopping the arm") as stopped, Mapper(mapping) as mapper:
         with Rig(config.live, config.touch.head, stopped) as rig:
             try:
-                calibration = _calibrate(rig, config, path, tell)
+                calibration = _calibrate(rig, config, path, log)
                 job = mapping_job(config, path, calibration, directory)
-                _arm(rig, path, calibration, mapper, job, tell)
+                _arm(rig, path, calibration, mapper, job, log)
                 armed(directory)
                 with open_recorder(job) as rig.recorder:
                     _run(rig, path, mapper, whisks)
@@ -134,15 +134,15 @@ def open_recorder(job: MappingJob) -> LiveRecorder:
     )
 
 
-def _calibrate(rig: Rig, config: RunConfig, path: HeadPath, tell: Callable[[str], None]) -> Calibration:
+def _calibrate(rig: Rig, config: RunConfig, path: HeadPath, log: Callable[[str], None]) -> Calibration:
     """Tests both devices, and records free whisks above the start of the route for the calibration."""
     plan = rig.config.plan
     for line in start_and_check(rig):
-        tell(line)
-    tell("arm: moving above the start of the route")
+        log(line)
+    log("arm: moving above the start of the route")
     follow_route(rig, approach_route(rig.config, path))
     count = ceil(plan.calibration.min_duration * plan.whisking.rate)
-    tell(f"head: {count} whisks in free air")
+    log(f"head: {count} whisks in free air")
     rig.driver.whisk(plan.whisking.model_copy(update={"mode": "open"}))
     record = record_free_whisks(rig, count)
     return calibrate(plan.calibration, record, config.touch.contact.slope_window, "free whisking")
@@ -154,15 +154,15 @@ def _arm(
     calibration: Calibration,
     mapper: Mapper,
     job: MappingJob,
-    tell: Callable[[str], None],
+    log: Callable[[str], None],
 ) -> None:
     """Waits until the mapper has compiled, then lowers the head and starts whisking."""
-    tell("mapper: compiling")
+    log("mapper: compiling")
     mapper.begin(job)
     rig.wait_until(mapper.ready, START_TIMEOUT, SessionOutcome.MAPPER_GONE, "the mapper's start")
     follow_route(rig, descent_route(rig.config, path))
     rig.driver.whisk(rig.config.plan.whisking, calibration.threshold[:, 1], calibration.mean[:, 1])
-    tell("armed")
+    log("armed")
 
 
 def _run(rig: Rig, path: HeadPath, mapper: Mapper, whisks: list[WhiskReport]) -> None:
@@ -171,13 +171,13 @@ def _run(rig: Rig, path: HeadPath, mapper: Mapper, whisks: list[WhiskReport]) ->
     rig.begin()
     with tqdm(total=total, unit="whisk", desc="live", file=sys.stderr, mininterval=0.5) as bar:
 
-        def tell(whisk: WhiskReport) -> None:
+        def count_whisk(whisk: WhiskReport) -> None:
             whisks.append(whisk)
             bar.update()
             bar.set_postfix_str(_status(rig, mapper, whisks), refresh=False)
 
         try:
-            run_whisk_loop(rig, main_route(rig.config, path), mapper, tell)
+            run_whisk_loop(rig, main_route(rig.config, path), mapper, count_whisk)
         except SessionFault as error:
             rig.record_event("fault", str(error.fault))
             raise

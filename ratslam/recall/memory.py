@@ -143,7 +143,7 @@ def accumulate_motion(memory: Memory, odometry: Array) -> Memory:
 
 
 def is_keyframe_due(config: RecallConfig, cell: float, memory: Memory) -> Array:
-    """Whether a view seen now becomes a keyframe."""
+    """bool: the present view becomes a keyframe, because the robot has moved far enough."""
     moved = (memory.length >= config.frame_distance * cell) | (memory.turn > config.frame_turn)
     return (memory.count < memory.label.shape[0]) & (moved | (memory.count == 0))
 

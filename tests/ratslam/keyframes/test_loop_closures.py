@@ -58,7 +58,7 @@ def test_the_log_is_a_list_of_candidates(steps):
             for k, (_, sequence) in enumerate(rows)
             if sequence >= 0 and verdicts[sequence] == Verdict.ACCEPTED
         ]
-        assert log.accepted().tolist() == counts
+        assert log.accepted_rows().tolist() == counts
     assert log.sequences == len(verdicts)
     assert [log.verdict(sequence) for sequence in range(log.sequences)] == verdicts
     for sequence in range(log.sequences):
@@ -86,7 +86,7 @@ def test_the_log_is_a_list_of_candidates(steps):
     again.add(Candidate(1, 0, 0, 1.0, 1.0), False)
     again.restore(log.arrays())
     assert np.array_equal(again.table(), table)
-    assert np.array_equal(again.accepted(), log.accepted())
+    assert np.array_equal(again.accepted_rows(), log.accepted_rows())
     assert (again.sequences, again.last()) == (log.sequences, log.last())
 
 
@@ -103,16 +103,16 @@ def test_an_empty_log_has_no_closures():
 
 def test_a_sequence_counts_while_it_is_accepted():
     log = filled()
-    assert len(log.accepted()) == 0
+    assert len(log.accepted_rows()) == 0
     log.judge(1, Verdict.ACCEPTED, 3.0)
-    assert log.accepted().tolist() == [2, 3, 4]
+    assert log.accepted_rows().tolist() == [2, 3, 4]
     log.add(Candidate(62, 9, 0, 0.9, 1.0), True)  # of the open sequence 2
     log.judge(2, Verdict.ACCEPTED)
-    assert log.accepted().tolist() == [2, 3, 4, 5, 6]
+    assert log.accepted_rows().tolist() == [2, 3, 4, 5, 6]
     log.add(Candidate(64, 9, 0, 0.9, 1.0), True)  # of a sequence accepted already
-    assert log.accepted().tolist() == [2, 3, 4, 5, 6, 7]
+    assert log.accepted_rows().tolist() == [2, 3, 4, 5, 6, 7]
     log.judge(1, Verdict.UNDONE)
-    assert log.accepted().tolist() == [5, 6, 7]
+    assert log.accepted_rows().tolist() == [5, 6, 7]
     assert log.closures(0.1, VARIANCE, SCALES).sequence.tolist() == [0, 0, 0]
 
 
@@ -121,7 +121,7 @@ def test_a_break_strikes_out_later_candidates():
     for sequence in (0, 1):
         log.judge(sequence, Verdict.ACCEPTED)
     log.strike(56, 2)
-    assert log.accepted().tolist() == [0, 1, 2]  # sequence 1 keeps its candidates before the break
+    assert log.accepted_rows().tolist() == [0, 1, 2]  # sequence 1 keeps its candidates before the break
     assert log.score(1) == 2.0
     assert log.table()[:, 5].tolist() == [
         0,
@@ -134,7 +134,7 @@ def test_a_break_strikes_out_later_candidates():
     assert log.table()[3, 6:].tolist() == [np.inf, Verdict.UNDONE, 0.0]
     log.judge(2, Verdict.ACCEPTED)
     log.strike(0, 2)
-    assert log.accepted().tolist() == [5]
+    assert log.accepted_rows().tolist() == [5]
 
 
 @given(steps)
@@ -211,4 +211,4 @@ def test_saved_arrays_are_copies():
     log.strike(50, 2)
     log.restore(saved)
     assert np.array_equal(log.table(), before)
-    assert len(log.accepted()) == 0
+    assert len(log.accepted_rows()) == 0
