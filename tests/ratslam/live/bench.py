@@ -120,12 +120,14 @@ class SessionServer:
         assert self._process.stdout is not None
         assert self._process.stdout.readline() == "ready\n"
 
-    def start(self, section: dict[str, Any], mapper: float, without: Sequence[str]) -> Session:
+    def start(
+        self, section: dict[str, Any], mapper: float, without: Sequence[str], rate_check: bool
+    ) -> Session:
         """Starts a session.
 
         Args:
             section: `live` of its configuration. mapper: s that the stub takes for each sample.
-            without: libraries that it cannot import.
+            without: libraries that it cannot import. rate_check: whether it checks the head's rate.
         """
         self._count += 1
         folder = self._folder / str(self._count)
@@ -138,7 +140,7 @@ class SessionServer:
             "log": str(log),
             "code": str(code),
             "mapper": mapper,
-            "listened": 0.3,
+            "rate_check": rate_check,
             "without": list(without),
         }
         assert self._process.stdin is not None
@@ -279,14 +281,17 @@ class Bench:
         self.head(do="silence", seconds=0)
 
     @contextmanager
-    def session(self, mapper: float = 0.0, without: Sequence[str] = (), **settings: Any) -> Iterator[Session]:
+    def session(
+        self, mapper: float = 0.0, without: Sequence[str] = (), rate_check: bool = False, **settings: Any
+    ) -> Iterator[Session]:
         """A quick session, started; its processes end with the block.
 
         Args:
             mapper: s that it takes for each sample. without: libraries that it cannot import.
+            rate_check: whether it listens to the head for as long as in use and checks its rate.
             settings: of the section `live`.
         """
-        session = self._server.start(self.quick(**settings), mapper, without)
+        session = self._server.start(self.quick(**settings), mapper, without, rate_check)
         try:
             yield session
         finally:

@@ -102,6 +102,7 @@ def complete_session(host: str, folder: Path, *settings: str, longest: float, fr
         output = (folder / "log").read_text()
         assert code == 0, output
         assert "complete: " in output
+        assert "clocks: head" in output, "the self-test has found the head's rate"
         assert "Traceback" not in output
         state = arm.state()
         assert not state["moving"]

@@ -9,6 +9,7 @@ import pytest
 import yaml
 
 from ratslam.cli import main
+from tests.helpers.live import moves
 from tests.ratslam.live.bench import LEGS, Bench
 
 
@@ -69,3 +70,18 @@ def test_missing_libraries_and_devices_are_refused(
             assert text in session.output()
         assert not session.directory.exists()
     assert len(bench.arm.state()["targets"]) == sent
+
+
+def test_a_head_below_its_rate_is_refused(bench: Bench) -> None:
+    """It streams nothing of what it samples, so no load of the machine lets it pass."""
+    sent = len(bench.arm.state()["targets"])
+    bench.head(do="skip", frames=10**9)
+    with bench.session(rate_check=True) as session:
+        assert session.code() == 2, session.output()
+        assert "Traceback" not in session.output(), session.output()
+        for text in ("head: 0 of 2000 samples a second", "check the USB hub and cable"):
+            assert text in session.output()
+        assert not session.directory.exists()
+    assert moves(bench.arm, sent) == []
+    assert bench.head(do="counts")["skipped"] > 0
+    bench.replace_head()
