@@ -76,6 +76,14 @@ class ExperienceMetric(NamedTuple):
     right: np.ndarray
     near: np.ndarray
 
+    @property
+    def arcr_chain_free(self) -> float:
+        """Share of the re-localisations that are near the truth, whether or not earlier ones were correct.
+
+        NaN without re-localisations.
+        """
+        return float(self.near[self.counted].mean()) if self.counted.any() else np.nan
+
 
 class _Reading(NamedTuple):
     """The parts of the listing that differ between modes.

@@ -41,12 +41,28 @@ class Convention(Settings):
     smooth: bool = False
     """Whether the truth is smoothed; then a perfect map has an error, and a blurred one a smaller error."""
 
+    @property
+    def words(self) -> tuple[str, str, str]:
+        """The three settings in words; `any` where the truth outside does not matter."""
+        anywhere = self.mask == "arena" and not self.smooth
+        outside = "any" if anywhere else f"{self.outside:g}"
+        return outside, self.mask, "smoothed" if self.smooth else "raw"
+
+    @property
+    def column(self) -> str:
+        """The name of a column with the error, e.g. `eq6_grid_raw_0.3`."""
+        return f"eq6_{self.mask}_{'smooth' if self.smooth else 'raw'}_{self.outside:g}"
+
 
 CONVENTIONS = tuple(
     Convention(outside=outside, mask=mask, smooth=smooth)
     for smooth, mask, outside in product((False, True), _MASKS, (PRIOR_OCCUPANCY, 0.0, 1.0))
 )
 """All conventions. Within the arena without smoothing, `outside` makes no difference."""
+DISTINCT_CONVENTIONS = tuple(
+    each for each in CONVENTIONS if each.words[0] != "any" or each == Convention(mask="arena")
+)
+"""The conventions whose errors can differ."""
 MAIN_CONVENTION = Convention()
 """Unknown outside, all cells, not smoothed: false evidence outside counts, and a perfect map scores 0. The
 same convention with smoothing is closest to the paper's text."""

@@ -12,6 +12,7 @@ from evaluation.metrics.occupancy_grid import (
     TouchableSurface,
     cell_centres,
 )
+from evaluation.metrics.statistics import auc
 
 OCCUPIED_ABOVE = 0.5
 """Cells above this probability count as occupied (Chamfer)."""
@@ -85,11 +86,8 @@ def _log_loss(ours: np.ndarray, wall: np.ndarray) -> float:
 
 def _auc(ours: np.ndarray, wall: np.ndarray) -> float:
     """Share of (wall cell, free cell) pairs in which the wall cell is more probable; ties count half."""
-    from scipy.stats import rankdata
-
-    walls, free = int(wall.sum()), int((~wall).sum())
-    rank = rankdata(np.round(ours, _ROUNDING))
-    return float((rank[wall].sum() - walls * (walls + 1) / 2) / (walls * free))
+    rounded = np.round(ours, _ROUNDING)
+    return auc(rounded[~wall], rounded[wall])
 
 
 def _chamfer(grid: OccupancyGrid, truth: GridTruth, surface: TouchableSurface) -> dict[str, Finding]:

@@ -12,11 +12,17 @@ from itertools import pairwise
 
 import numpy as np
 
-from evaluation.metrics.grid_error import CONVENTIONS, Convention, GridError, grid_error, pool_errors
+from evaluation.metrics.grid_error import (
+    CONVENTIONS,
+    DISTINCT_CONVENTIONS,
+    Convention,
+    GridError,
+    grid_error,
+    pool_errors,
+)
 from evaluation.metrics.grid_metrics import GRID_METRICS, grid_findings
 from evaluation.metrics.metric import Quantity
 from evaluation.metrics.occupancy_grid import (
-    PRIOR_OCCUPANCY,
     GridTruth,
     OccupancyGrid,
     check_grid,
@@ -80,12 +86,9 @@ def render_grid_scores(scores: Sequence[GridScore]) -> str:
         f"Map error, eq. 6: mean |map - truth| per cell; trials: {trials}",
         head + f"{'constant 0.3':>14}{'best constant':>15}{'skill':>8}",
     ]
-    for convention in CONVENTIONS:
-        anywhere = convention.mask == "arena" and not convention.smooth
-        if anywhere and convention.outside != PRIOR_OCCUPANCY:
-            continue
-        words = "any" if anywhere else f"{convention.outside:g}"
-        label = f"{words:<9}{convention.mask:<7}{'smoothed' if convention.smooth else 'raw':<10}"
+    for convention in DISTINCT_CONVENTIONS:
+        outside, cells, truth = convention.words
+        label = f"{outside:<9}{cells:<7}{truth:<10}"
         for score in scores:
             error = score.under(convention)
             printed, spread = _text(PAPER_ERRORS.get(score.name), 2), _text(error.spread)

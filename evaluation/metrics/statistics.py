@@ -1,4 +1,4 @@
-"""Bootstrap intervals of means over runs."""
+"""Bootstrap intervals of means over runs; the separation of two samples."""
 
 from __future__ import annotations
 
@@ -18,3 +18,12 @@ def bootstrap(values: np.ndarray, name: str, *, seed: int = 0) -> tuple[float, f
     means = values[stream(seed, name).integers(0, len(values), (10_000, len(values)))].mean(axis=1)
     low, high = np.quantile(means, [(1 - 0.95) / 2, (1 + 0.95) / 2])
     return float(low), float(high)
+
+
+def auc(low: np.ndarray, high: np.ndarray) -> float:
+    """The probability that one of `high` [M] exceeds one of `low` [N], ties counted half."""
+    from scipy.stats import rankdata
+
+    rank = rankdata(np.concatenate([high, low]))
+    count = len(high)
+    return float((rank[:count].sum() - count * (count + 1) / 2) / (count * len(low)))

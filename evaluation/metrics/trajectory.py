@@ -56,6 +56,11 @@ def position_errors(estimate: np.ndarray, reference: np.ndarray) -> np.ndarray:
     return np.hypot(*(aligned - reference)[:, :2].T)
 
 
+def position_error(path: np.ndarray, truth: np.ndarray) -> float:
+    """Mean position error of poses [N, 3] without alignment, m."""
+    return float(np.hypot(*(path - truth)[:, :2].T).mean())
+
+
 def ate(estimate: np.ndarray, reference: np.ndarray) -> float:
     """Absolute trajectory error: root mean square of `position_errors`, m (Sturm et al. 2012)."""
     return _rms(position_errors(estimate, reference))

@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evaluation.metrics.experience_log import creation_rows
+from evaluation.metrics.experience_metric import ExperienceMetric
 from evaluation.plots import style
 from evaluation.plots.style import BLUE, GREEN, GREY, INK, LINE_GREY, PURPLE, VERMILLION, YELLOW
 
@@ -43,6 +45,26 @@ class ExperienceHistory(NamedTuple):
     right: np.ndarray
     invalid: np.ndarray
     base: int
+
+
+def experience_history(place: np.ndarray, metric: ExperienceMetric | None) -> ExperienceHistory:
+    """The history of T steps with the current experience `place` [T], -1 for none.
+
+    Args:
+        metric: the verdict on them; None: no step is a re-localisation.
+    """
+    none = np.zeros(len(place), bool)
+    if metric is None:
+        return ExperienceHistory(place, none, none, none, 0)
+    known = place >= 0
+    counted, right, invalid = none.copy(), none.copy(), none.copy()
+    counted[known], right[known] = metric.counted, metric.right
+    # An experience is invalid if the last re-localisation before it was wrong.
+    last = np.maximum.accumulate(np.where(counted, np.arange(len(counted)), -1))
+    wrong = (last >= 0) & ~right[last]
+    invalid[known] = wrong[creation_rows(place[known])]
+    base = int(np.flatnonzero(known)[metric.base - 1]) + 1
+    return ExperienceHistory(place, counted, right, invalid, base)
 
 
 class MeasuredQuantity(NamedTuple):

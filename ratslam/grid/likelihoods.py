@@ -55,6 +55,18 @@ def all_cells(cell: Array, contact: Array) -> Array:
     return jnp.ones(cell.shape[:-1], bool)
 
 
+def distinct_cells(cell: Array, contact: Array) -> Array:
+    """bool [N, W, G]: each cell along a whisker counts once in eq. 2, and not as free where its contact is.
+
+    Args:
+        cell: [N, W, G, 2] cells at the points of each whisker, from base to tip. contact: [W] bool.
+    """
+    same = jnp.all(cell[:, :, :, None] == cell[:, :, None], axis=-1)  # [N, W, G, G]
+    earlier = np.tri(cell.shape[2], k=-1, dtype=bool)
+    repeated = jnp.any(same & earlier[None, None], axis=-1)
+    return ~repeated & ~(same[..., -1] & contact[None, :, None])
+
+
 def printed_likelihood(
     prior: float,
     evidence: Array,

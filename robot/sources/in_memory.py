@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import repeat
 
 import numpy as np
@@ -108,3 +108,10 @@ def load_into_memory(source: Source) -> InMemorySource:
         info=source.info.model_copy(update={"raw_whiskers": False}),
         alive=alive,
     )
+
+
+def truncate_log(log: InMemorySource, steps: int) -> InMemorySource:
+    """The first steps of a source in memory; its digest is that of the whole followed by their number."""
+    columns = ("time", "motion", "moved", "views", "seen", "label", "truth")
+    cut = {name: getattr(log, name)[:steps] for name in columns if getattr(log, name) is not None}
+    return replace(log, digest=f"{log.digest}[:{steps}]", **cut)

@@ -49,6 +49,11 @@ class Arena(NamedTuple):
     objects: tuple[np.ndarray, ...]
     start: np.ndarray
 
+    @property
+    def side(self) -> float:
+        """The larger extent of the outer wall along x and y, m."""
+        return float(np.ptp(self.outer, axis=0).max())
+
 
 def wall_segments(arena: Arena) -> np.ndarray:
     """All wall segments [S, 4], x1, y1, x2, y2, m, those of objects included."""

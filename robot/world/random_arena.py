@@ -24,7 +24,10 @@ MAX_OBJECT_TRIES = 200
 MAX_RESTARTS = 50
 """Largest number of restarts when the objects did not fit."""
 MAX_START_TRIES = 400
-"""Number of positions drawn for the start."""
+"""Number of positions drawn for the start of a random arena."""
+OTHER_START_TRIES, OTHER_START_CLEARANCE = 1000, 0.2
+"""Number of positions drawn for another start, and the free space around it, m: a little over the robot's
+radius."""
 
 
 class ArenaConfig(Settings):
@@ -79,13 +82,26 @@ def make_arena(config: ArenaConfig, seed: int) -> Arena:
         if objects is None:
             continue
         made = Arena(f"arena {seed}", outer, tuple(objects), np.zeros(3))
-        start = _draw_start(made, config.passage / 2, random)
+        start = _draw_start(made, config.passage / 2, random, MAX_START_TRIES)
         if start is not None:
             return made._replace(start=start)
     found = f"{config.count} objects of {config.smallest:g} to {config.largest:g} m"
     expected = f"objects that fit in {config.side:g} m with passages of {config.passage:g} m"
     cure = "fewer or smaller objects, or a larger side"
     raise InputError("create_simulation.arena.objects", found, expected, cure)
+
+
+def place_start(arena: Arena, seed: int) -> Arena:
+    """The arena with another random start where the robot fits.
+
+    Raises:
+        InputError: it fits nowhere.
+    """
+    start = _draw_start(arena, OTHER_START_CLEARANCE, stream(seed, "start"), OTHER_START_TRIES)
+    if start is None:
+        room = f"{OTHER_START_CLEARANCE:g} m of free space"
+        raise InputError("create_simulation.arena", "no room for a start", room)
+    return arena._replace(start=start)
 
 
 def _place_objects(config: ArenaConfig, random: np.random.Generator) -> list[np.ndarray] | None:
@@ -126,10 +142,10 @@ def _leaves_passages(polygon: np.ndarray, config: ArenaConfig, others: list[np.n
     )
 
 
-def _draw_start(arena: Arena, room: float, random: np.random.Generator) -> np.ndarray | None:
+def _draw_start(arena: Arena, room: float, random: np.random.Generator, tries: int) -> np.ndarray | None:
     """A random pose [3] with this free radius (m), or None if none was found."""
     low, high = arena.outer.min(axis=0), arena.outer.max(axis=0)
-    places = random.uniform(low, high, (MAX_START_TRIES, 2))
+    places = random.uniform(low, high, (tries, 2))
     heading = random.uniform(-np.pi, np.pi)
     there = np.flatnonzero(has_clearance(arena, places, room))
     return None if not len(there) else np.array([*places[there[0]], heading])

@@ -13,9 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.metrics.grid_error import CONVENTIONS, Convention
+from evaluation.metrics.grid_error import DISTINCT_CONVENTIONS, Convention
 from evaluation.metrics.statistics import bootstrap
-from ratslam.experiments.fox2012.metrics import eq6_column
 from ratslam.experiments.fox2012.protocols import FILTERED, PAPERS, RECKONED, TRUE
 from ratslam.experiments.trials.reproduction import ResultRow, column
 
@@ -27,7 +26,7 @@ class Measure(NamedTuple):
     """A way to score a map.
 
     Attributes:
-        key: of `metrics.FIELDS`. sign: 1 if larger is worse, else -1. trivial: score of a map without
+        key: of `reproduction.FIELDS`. sign: 1 if larger is worse, else -1. trivial: score of a map without
             information, or the convention of which it is the best constant map's.
     """
 
@@ -51,20 +50,11 @@ class Ranking(NamedTuple):
     beaten: bool
 
 
-def _anywhere(convention: Convention) -> bool:
-    """Whether the truth outside the arena does not matter."""
-    return convention.mask == "arena" and not convention.smooth
-
-
-def _eq6_measure(convention: Convention) -> Measure:
-    outside = "any" if _anywhere(convention) else f"{convention.outside:g}"
-    truth = "smoothed" if convention.smooth else "raw"
-    name = f"eq. 6  {outside:<5}{convention.mask:<7}{truth}"
-    return Measure(name, eq6_column(convention), 1, convention)
-
-
 MEASURES = (
-    *(_eq6_measure(each) for each in CONVENTIONS if not _anywhere(each) or each == Convention(mask="arena")),
+    *(
+        Measure("eq. 6  {:<5}{:<7}{}".format(*each.words), each.column, 1, each)
+        for each in DISTINCT_CONVENTIONS
+    ),
     Measure("Brier skill", "map_brier_skill", -1, 0.0),
     Measure("wall AUC", "map_auc", -1, 0.5),
     Measure("Chamfer, map to walls", "map_chamfer_map", 1, 0.0),

@@ -11,7 +11,6 @@ import numpy as np
 from evaluation.metrics.grid_error import MAIN_CONVENTION
 from evaluation.metrics.occupancy_grid import mean_grid
 from evaluation.plots.grid_plot import GridPanel, GridPaths, draw_grids
-from ratslam.experiments.fox2012.metrics import eq6_column
 from ratslam.experiments.fox2012.protocols import FILTERED, Protocol
 from ratslam.experiments.trials.reproduction import ResultRow, count_sets
 from robot.world.arena import wall_segments
@@ -40,7 +39,7 @@ def _means(protocol: Protocol, rows: Rows) -> tuple[list[GridPanel], int]:
     panels = []
     for method, mapper in product(protocol.methods, protocol.mappers):
         these = [row for row in rows if row.key[1:3] == (method, mapper)]
-        error = np.mean([row.values[eq6_column(MAIN_CONVENTION)] for row in these])
+        error = np.mean([row.values[MAIN_CONVENTION.column] for row in these])
         mean = mean_grid([row.session.grid for row in these])
         panels.append(_panel(mapper, f"{method}, {error:.3f}", these[0])._replace(grid=mean))
     return panels, len(protocol.methods)

@@ -9,8 +9,8 @@ import numpy as np
 
 from evaluation.metrics.grid_error import MAIN_CONVENTION
 from evaluation.metrics.grid_score import pool_grids, render_grid_scores
+from evaluation.metrics.revisits import CLOSED_GAP
 from ratslam.experiments.fox2012.mapper_ranking import render_rankings
-from ratslam.experiments.fox2012.metrics import CLOSED_GAP, eq6_column
 from ratslam.experiments.fox2012.protocols import FILTERED, PAPERS, RECKONED, TRUE, Protocol
 from ratslam.experiments.trials.reproduction import ResultRow
 
@@ -74,7 +74,7 @@ def _line(name: str, rows: Sequence[ResultRow]) -> str:
     ratio = f"{online.mean() / odometry.mean():.2f}" if filtered and odometry.mean() > 0 else "-"
     better = f"{(online < odometry).sum()} of {len(rows)}" if filtered else "-"
     ways = f"{mean('map_chamfer_map')}, {mean('map_chamfer_walls')}"
-    error, heading = mean(eq6_column(MAIN_CONVENTION)), mean("online_heading_error_deg", 1)
+    error, heading = mean(MAIN_CONVENTION.column), mean("online_heading_error_deg", 1)
     return (
         f"{name:<30}{mean('online_error'):>7}{mean('final_error'):>7}{heading:>9}{ratio:>11}{better:>11}"
         f"{mean('revisit_gap'):>7}{mean('revisits_closed', 2):>8}{error:>8}"

@@ -12,10 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evaluation.metrics.grid_error import CONVENTIONS
 from evaluation.metrics.grid_score import GridScore, score_grid
 from evaluation.metrics.occupancy_grid import OccupancyGrid
+from evaluation.metrics.revisits import path_metrics
+from evaluation.metrics.trajectory import position_error
 from ratslam.config.run_config import RunConfig
-from ratslam.experiments.fox2012.metrics import FIELDS, map_metrics, path_metrics
 from ratslam.experiments.fox2012.plots import draw_reproduction
 from ratslam.experiments.fox2012.protocols import (
     FILTERED,
@@ -29,21 +31,29 @@ from ratslam.experiments.fox2012.report import render_results
 from ratslam.experiments.trials.arena_trial import (
     ArenaSession,
     FilterResult,
-    arena_truth,
     collect_marks,
     draw_map,
     observe_session,
-    position_error,
     run_filter,
     simulate_session,
 )
 from ratslam.experiments.trials.reproduction import Paper, ResultRow, run_with_progress
+from ratslam.pipeline.artifacts import true_grid
 from robot.touch_source import report_config_of
 from robot.world.arena import Arena
 from tactile.base.random_streams import stream
 
 KEY = ("world", "method", "mapper", "along")
 """Names of a result; the map is drawn `along` the scored path: `FILTERED`, `RECKONED` or `TRUE`."""
+MAP_METRICS = (
+    "map_brier_skill", "map_brier_skill_free", "map_log_loss", "map_auc", "map_auc_free", "map_chamfer_map",
+    "map_chamfer_walls",
+)  # fmt: skip
+FIELDS = (
+    "reports", "online_error", "final_error", "online_heading_error_deg", "revisits", "revisits_closed",
+    "revisit_gap", "odometry_error", *(each.column for each in CONVENTIONS), *MAP_METRICS,
+)  # fmt: skip
+"""Columns of metrics in NAME.csv."""
 
 
 class SessionJob(NamedTuple):
@@ -124,9 +134,14 @@ def _score(
 ) -> ResultRow:
     count = len(one.path)
     truth, odometry = session.truth[:count], session.odometry[:count]
-    score = score_grid(one.grid, arena_truth(session.arena, one.grid), key[1])
-    metrics = path_metrics(one.online, one.path, truth) | map_metrics(score)
-    values = {"reports": count, "odometry_error": position_error(odometry, truth), **metrics}
+    score = score_grid(one.grid, true_grid(session.arena._replace(start=np.zeros(3)), one.grid), key[1])
+    values = {
+        "reports": count,
+        "odometry_error": position_error(odometry, truth),
+        **path_metrics(one.online, one.path, truth),
+        **{error.convention.column: error.error for error in score.errors},
+        **{name: score.quantities[name].value for name in MAP_METRICS},
+    }
     result = MapResult(stop, score, one.grid, session.arena, truth, odometry, one.online)
     return ResultRow((job.world, *key), job.number, job.seed, values, result)
 

@@ -7,15 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evaluation.metrics.experience_log import creation_rows
+from evaluation.metrics.direction_metrics import clockwise_steps, lap_of_step
+from evaluation.metrics.session_metrics import experience_metric_if_defined
 from evaluation.metrics.trajectory import align
 from evaluation.plots import paper_figures
-from evaluation.plots.paper_figures import DrivenPath, ExperienceHistory, MeasuredQuantity
+from evaluation.plots.paper_figures import DrivenPath, MeasuredQuantity, experience_history
 from ratslam.experiments.salman2016.claims import LABELS, RATIOS, series
-from ratslam.experiments.salman2016.direction_metrics import clockwise_steps, lap_of_step
 from ratslam.experiments.salman2016.protocols import Protocol
 from ratslam.experiments.trials.reproduction import ResultRow, column, count_sets
-from ratslam.experiments.trials.touch_trial import SessionResult, experience_metric_if_defined
 from tactile.base.se2 import compose
 
 if TYPE_CHECKING:
@@ -77,24 +76,9 @@ def _drift(title: str, line: str, rows: Rows) -> Figure:
 
 
 def _history(title: str, line: str, rows: Rows) -> Figure:
-    return paper_figures.draw_experiences(
-        title, line, {row.key[1]: _experiences(row.session[1]) for row in rows}
-    )
-
-
-def _experiences(result: SessionResult) -> ExperienceHistory:
-    metric, none = experience_metric_if_defined(result), np.zeros(len(result.place), bool)
-    if metric is None:
-        return ExperienceHistory(result.place, none, none, none, 0)
-    known = result.place >= 0
-    counted, right, invalid = none.copy(), none.copy(), none.copy()
-    counted[known], right[known] = metric.counted, metric.right
-    # An experience is invalid if the last re-localisation before it was wrong.
-    last = np.maximum.accumulate(np.where(counted, np.arange(len(counted)), -1))
-    wrong = (last >= 0) & ~right[last]
-    invalid[known] = wrong[creation_rows(result.place[known])]
-    base = int(np.flatnonzero(known)[metric.base - 1]) + 1
-    return ExperienceHistory(result.place, counted, right, invalid, base)
+    runs = ((row.key[1], row.session[1]) for row in rows)
+    histories = {name: experience_history(run.place, experience_metric_if_defined(run)) for name, run in runs}
+    return paper_figures.draw_experiences(title, line, histories)
 
 
 def _directions(title: str, line: str, rows: Rows) -> Figure:

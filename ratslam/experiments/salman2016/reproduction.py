@@ -11,14 +11,16 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evaluation.metrics.direction_metrics import DIRECTION_METRICS, direction_metrics
 from evaluation.metrics.experience_metric import experience_metric
+from evaluation.metrics.session_metrics import TouchMetrics, lap_ends, touch_metrics
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import override, parse, validate
 from ratslam.experiments.salman2016.claims import render_claims
-from ratslam.experiments.salman2016.direction_metrics import DIRECTION_METRICS, direction_metrics
 from ratslam.experiments.salman2016.plots import draw_reproduction
 from ratslam.experiments.salman2016.protocols import (
     COMMON,
+    LATER_MAZE_START,
     METHODS,
     PROTOCOLS,
     SWEPT,
@@ -26,18 +28,11 @@ from ratslam.experiments.salman2016.protocols import (
     Condition,
     Protocol,
 )
-from ratslam.experiments.trials.controls import Control, apply_control
 from ratslam.experiments.trials.reproduction import Paper, ResultRow, run_with_progress
 from ratslam.experiments.trials.threshold_sweep import sweep_thresholds
-from ratslam.experiments.trials.touch_trial import (
-    TouchMetrics,
-    arcr_without_chain,
-    collect_session,
-    lap_ends,
-    run_session,
-    touch_metrics,
-    truncate_log,
-)
+from ratslam.experiments.trials.touch_trial import collect_session, run_session
+from robot.sources.in_memory import truncate_log
+from robot.sources.view_controls import Control, apply_control
 from tactile.base.random_streams import stream
 
 KEY = ("condition", "method", "control")
@@ -131,7 +126,7 @@ def run_job(job: TrialJob) -> ResultRow:
     result = run_session(config, log)
     metrics = touch_metrics(result, job.config.score.experience_metric)
     ratio = metrics.em / metrics.em_odometry if metrics.em_odometry else np.nan
-    values = {**metrics._asdict(), "em_ratio": ratio, **direction_metrics(result, job.laps)}
+    values = {**metrics._asdict(), "em_ratio": ratio, **direction_metrics(result, job.laps, LATER_MAZE_START)}
     drawn = (job.laps, result) if job.number == 0 and job.key[2] == "none" else None
     return ResultRow(job.key, job.number, job.seed, values, drawn)
 
@@ -146,7 +141,7 @@ def sweep_job(job: TrialJob) -> list[ResultRow]:
             "threshold": threshold,
             "arr": metric.arr,
             "arcr": metric.arcr,
-            "arcr_chain_free": arcr_without_chain(metric),
+            "arcr_chain_free": metric.arcr_chain_free,
             "relocalisations": metric.relocalisations,
         }
         rows.append(ResultRow((*job.key[:2], "sweep"), job.number, job.seed, values))

@@ -9,23 +9,24 @@ place, and of two places.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import mannwhitneyu
 
 from evaluation.metrics.experience_metric import base_end, experience_metric
+from evaluation.metrics.session_metrics import lap_ends
+from evaluation.metrics.view_separation import ViewDifferences, compare_views
 from evaluation.plots.paper_figures import draw_tuning
 from ratslam.classic.view_templates import TemplateConfig
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import Document, override, validate
 from ratslam.experiments.studies.executor import run_tasks
 from ratslam.experiments.trials.threshold_sweep import sweep_thresholds
-from ratslam.experiments.trials.touch_trial import collect_session, lap_ends, truncate_log
-from robot.sources.in_memory import InMemorySource
+from ratslam.experiments.trials.touch_trial import collect_session
+from robot.sources.in_memory import InMemorySource, truncate_log
 from tactile.base.errors import InputError
-from tactile.base.se2 import wrap
 
 CLASSIC = ("backend=classic", "templates.energy=0.05")
 """The tuned method: half of the iRat's energy of 0.1 (III-F; the value is of Ball et al. 2013)."""
@@ -34,29 +35,6 @@ LAPS = 3
 """Laps that are scored, the base set excepted."""
 ENOUGH = 10
 """Correct re-localisations that a threshold must give."""
-SAME_DISTANCE, SAME_HEADING, VISIT_GAP = 0.05, np.radians(15), 60.0
-"""Two views are of the same place if taken within this distance (m) and heading (rad) on two visits, at least
-this far apart in time (s)."""
-OTHER_DISTANCE = 0.3
-"""Two views are of different places if taken farther apart, m."""
-BINS = 60
-ROWS = 64
-"""Views compared with all others at a time."""
-
-
-class ViewDifferences(NamedTuple):
-    """Differences of pairs of views, as the classic method measures them.
-
-    Attributes:
-        edge: [BINS + 1] of the histograms. same, other: [BINS] pairs of views of one place, of two places.
-        auc: probability that a pair of different places differs more than a pair of the same; 0.5: the views
-            do not separate places.
-    """
-
-    edge: np.ndarray
-    same: np.ndarray
-    other: np.ndarray
-    auc: float
 
 
 class ThresholdScore(NamedTuple):
@@ -95,10 +73,10 @@ def tune_threshold(document: Document, folder: Path, workers: int = 1) -> Tuning
     config, log = collect_session(config)
     if config.templates.source == "labels" or not log.seen.all():
         raise InputError(log.name, "steps without a view", "a view at every step")
-    truth = np.asarray(log.truth)
-    base, ends = base_end(truth), lap_ends(truth)[:LAPS]
+    base, ends = base_end(np.asarray(log.truth)), lap_ends(np.asarray(log.truth))[:LAPS]
     log = truncate_log(log, int(ends[-1]) + 1 if len(ends) == LAPS else log.length)
-    views = compare_views(config.templates, log)
+    differences = partial(view_differences, config.templates)
+    views = compare_views(log.views, np.asarray(log.truth), log.time, differences, log.name)
     parts = [part for part in np.array_split(THRESHOLDS, workers) if len(part)]
     scored = run_tasks(_score_thresholds, [(config, log, base, part) for part in parts], workers=workers)
     scores = [score for part in scored for score in part]
@@ -123,37 +101,12 @@ def choose_threshold(
         most = max(scores, key=lambda score: score.correct)
         reason = f"no threshold gives {ENOUGH} correct re-localisations"
         found = f"{most.threshold:g} gives {most.correct}"
-    half = _quantile(views.edge, views.same, 0.5)
-    below = np.interp(half, views.edge, np.concatenate([[0], np.cumsum(views.other)])) / views.other.sum()
+    half = views.quantile(views.same, 0.5)
+    below = views.share_below(views.other, half)
     return None, (
         f"{reason}; {found}. A threshold of {half:.3f} accepts half of the view pairs of one place and "
         f"{below:.1%} of those of different places (AUC {views.auc:.3f})"
     )
-
-
-def compare_views(config: TemplateConfig, log: InMemorySource) -> ViewDifferences:
-    """The differences of the views of a session, of the same place and of different ones.
-
-    Raises:
-        InputError: no place was visited twice.
-    """
-    truth, views = np.asarray(log.truth), log.views
-    same, other = [np.zeros(0)], [np.zeros(0)]
-    for start in range(0, len(views), ROWS):
-        rows = slice(start, start + ROWS)
-        later = np.arange(len(views)) > np.arange(len(views))[rows, None]
-        apart = np.hypot(*(truth[None, :, :2] - truth[rows, None, :2]).transpose(2, 0, 1))
-        turned = np.abs(wrap(truth[None, :, 2] - truth[rows, None, 2]))
-        again = np.abs(log.time - log.time[rows, None]) >= VISIT_GAP
-        difference = view_differences(config, views[rows], views)
-        same.append(difference[later & again & (apart < SAME_DISTANCE) & (turned < SAME_HEADING)])
-        other.append(difference[later & (apart > OTHER_DISTANCE)])
-    a, b = np.concatenate(same), np.concatenate(other)
-    if not len(a) or not len(b):
-        found = "no place with views of two visits" if len(b) else "a path that stays at one place"
-        raise InputError(log.name, found, "a path that returns to earlier places")
-    edge = np.linspace(0.0, max(a.max(), b.max(), 1e-9), BINS + 1)
-    return ViewDifferences(edge, np.histogram(a, edge)[0], np.histogram(b, edge)[0], auc(a, b))
 
 
 def view_differences(config: TemplateConfig, views: np.ndarray, others: np.ndarray) -> np.ndarray:
@@ -171,11 +124,6 @@ def view_differences(config: TemplateConfig, views: np.ndarray, others: np.ndarr
     return np.min([np.abs(views[:, None] - other[None]).mean(axis=axes) for other in shifted], axis=0)
 
 
-def auc(same: np.ndarray, other: np.ndarray) -> float:
-    """The probability that one of `other` exceeds one of `same`, ties counted half."""
-    return float(mannwhitneyu(other, same, method="asymptotic").statistic / (len(same) * len(other)))
-
-
 def render_tuning(tuning: Tuning) -> str:
     """The differences of views, the score of each threshold, and the choice."""
     views, (start, stop) = tuning.views, tuning.steps
@@ -184,7 +132,7 @@ def render_tuning(tuning: Tuning) -> str:
         f"  {'':<18}{'5 %':>8}{'median':>8}{'95 %':>8}{'pairs':>10}",
     ]
     for name, counts in (("the same place", views.same), ("different places", views.other)):
-        cells = "".join(f"{_quantile(views.edge, counts, share):>8.3f}" for share in (0.05, 0.5, 0.95))
+        cells = "".join(f"{views.quantile(counts, share):>8.3f}" for share in (0.05, 0.5, 0.95))
         lines.append(f"  {name:<18}{cells}{counts.sum():>10}")
     lines += [
         f"  AUC {views.auc:.3f} (1: the views separate places; 0.5: they do not)",
@@ -221,7 +169,3 @@ def _score_thresholds(task: tuple[RunConfig, InMemorySource, int, np.ndarray]) -
         ThresholdScore(float(threshold), r.arr, r.correct, r.relocalisations - r.correct)
         for threshold, r in zip(thresholds, results, strict=True)
     ]
-
-
-def _quantile(edge: np.ndarray, count: np.ndarray, share: float) -> float:
-    return float(np.interp(share * count.sum(), np.concatenate([[0], np.cumsum(count)]), edge))

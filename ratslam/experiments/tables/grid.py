@@ -13,12 +13,13 @@ import numpy as np
 
 from evaluation.metrics.grid_score import score_grid
 from evaluation.metrics.occupancy_grid import OccupancyGrid
+from evaluation.metrics.trajectory import position_error
 from ratslam.config.completion import complete
 from ratslam.config.run_config import RunConfig
 from ratslam.core.precision import prepare_precision
 from ratslam.experiments.studies.executor import run_tasks
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
-from ratslam.experiments.trials.arena_trial import position_error, session_at_start
+from ratslam.experiments.trials.arena_trial import session_at_start
 from ratslam.pipeline.artifacts import true_grid
 from ratslam.pipeline.source import open_source, read_observations
 from robot.touch_source import open_touch_source, report_config_of

@@ -15,17 +15,17 @@ import numpy as np
 
 from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.experience_metric import ExmConfig
-from ratslam.config.run_config import RunConfig
-from ratslam.experiments.studies.executor import run_tasks
-from ratslam.experiments.tables.markdown import markdown_header, markdown_row
-from ratslam.experiments.trials.touch_trial import (
+from evaluation.metrics.session_metrics import (
     FALSE_CLOSURE_DISTANCE,
     TouchMetrics,
     closure_errors,
     experience_metric_if_defined,
-    run_session,
     touch_metrics,
 )
+from ratslam.config.run_config import RunConfig
+from ratslam.experiments.studies.executor import run_tasks
+from ratslam.experiments.tables.markdown import markdown_header, markdown_row
+from ratslam.experiments.trials.touch_trial import run_session
 from ratslam.pipeline.source import open_observations
 from robot.sources.in_memory import load_into_memory
 

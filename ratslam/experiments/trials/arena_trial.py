@@ -10,30 +10,26 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
-from evaluation.metrics.occupancy_grid import GridTruth, OccupancyGrid, cell_centres
+from evaluation.metrics.occupancy_grid import OccupancyGrid
 from ratslam.backends.grid import GridBackend
 from ratslam.config.run_config import RunConfig
 from ratslam.core.precision import Precision, prepare_precision
 from ratslam.core.session import Session
 from ratslam.grid.config import GridConfig
+from ratslam.grid.likelihoods import distinct_cells
 from ratslam.grid.map_drawing import ContactLog, contact_log, draw_occupancy
 from robot.simulation.create.session import CreateSimulation, CreateSimulationConfig, train_strain_templates
 from robot.touch_source import TouchSource, observation_of, report_config_of
-from robot.world.arena import Arena, arena_text, has_clearance, is_enclosed, is_occupied, wall_segments
-from robot.world.random_arena import make_arena
-from tactile.base.errors import InputError
-from tactile.base.random_streams import stream
+from robot.world.arena import Arena, arena_text
+from robot.world.random_arena import make_arena, place_start
 from tactile.base.se2 import compose, integrate
-from tactile.base.types import Array, Observation, stack
+from tactile.base.types import Observation, stack
 from tactile.wall_estimation.report_frontend import ReportFrontend, ReportFrontendConfig, WhiskerMount
 from tactile.wall_estimation.strain_templates import StrainTemplates
 from tactile.whiskers.planar_whiskers import PlanarWhiskers
 
-START_CLEARANCE = 0.2
-"""Free space around a start, m: slightly more than the robot's radius."""
 MAP_SCALE = 2.0
 """Side of a drawn map over the side of the arena (Fox et al. 2012, II-D)."""
 MAP_MARGIN = 0.4
@@ -82,22 +78,6 @@ def simulate_session(config: CreateSimulationConfig) -> ArenaSession:
     return ArenaSession(source, made, source.truth, compose(made.start, integrate(source.odometry[:, :3])))
 
 
-def place_start(arena: Arena, seed: int) -> Arena:
-    """The arena with a random start where the robot fits.
-
-    Raises:
-        InputError: it fits nowhere.
-    """
-    random = stream(seed, "start")
-    low, high = arena.outer.min(axis=0), arena.outer.max(axis=0)
-    places, heading = random.uniform(low, high, (1000, 2)), random.uniform(-np.pi, np.pi)
-    there = places[has_clearance(arena, places, START_CLEARANCE)]
-    if not len(there):
-        room = f"{START_CLEARANCE:g} m of free space"
-        raise InputError("create_simulation.arena", "no room for a start", room)
-    return arena._replace(start=np.array([*there[0], heading]))
-
-
 def observe_session(config: RunConfig, session: ArenaSession, seed: int) -> list[Observation]:
     """The filter's observations of a session, with the configured wall estimator.
 
@@ -124,7 +104,7 @@ def run_filter(
     touch = report_config_of(session.source.info, config.touch.reports)
     grid = config.grid
     if grid.side is None:
-        grid = grid.model_copy(update={"side": 2 * (arena_side(session.arena) + MAP_MARGIN)})
+        grid = grid.model_copy(update={"side": 2 * (session.arena.side + MAP_MARGIN)})
     slam = session_at_start(grid, touch.mounts, touch.length, config.session.precision, config.session.seed)
     start, marks = session.arena.start, collect_marks(reports)
     online: list[np.ndarray] = []
@@ -145,27 +125,11 @@ def draw_map(
     Args:
         marks: of at least T reports.
     """
-    side = round(MAP_SCALE * arena_side(arena) / config.cell)
+    side = round(MAP_SCALE * arena.side / config.cell)
     middle = (arena.outer.min(axis=0) + arena.outer.max(axis=0)) / 2
     first = ContactLog(*(rows[: len(path)] for rows in marks))
     probability = draw_occupancy(config, feelers, side, path - np.array([*middle, 0.0]), first)
     return OccupancyGrid(probability, middle - side * config.cell / 2, config.cell)
-
-
-def arena_truth(arena: Arena, grid: OccupancyGrid) -> GridTruth:
-    """The ground truth on the cells of a map."""
-    place = cell_centres(grid)
-    return GridTruth(is_occupied(arena, place), is_enclosed(arena, place), wall_segments(arena))
-
-
-def arena_side(arena: Arena) -> float:
-    """The larger side of an arena, m."""
-    return float(np.ptp(arena.outer, axis=0).max())
-
-
-def position_error(path: np.ndarray, truth: np.ndarray) -> float:
-    """Mean position error of poses [T, 3] without alignment, m."""
-    return float(np.hypot(*(path - truth)[:, :2].T).mean())
 
 
 def collect_marks(reports: list[Observation]) -> ContactLog:
@@ -173,18 +137,6 @@ def collect_marks(reports: list[Observation]) -> ContactLog:
     rows = stack(reports)
     wall = np.where(rows.wall[:, None], rows.wall_point, np.nan)
     return contact_log(rows.motion, rows.contact, rows.alive, rows.point, wall)
-
-
-def distinct_cells(cell: Array, contact: Array) -> Array:
-    """bool [N, W, G]: each cell along a whisker counts once in eq. 2, and not as free where its contact is.
-
-    Args:
-        cell: [N, W, G, 2] cells at the points of each whisker, from base to tip. contact: [W] bool.
-    """
-    same = jnp.all(cell[:, :, :, None] == cell[:, :, None], axis=-1)  # [N, W, G, G]
-    earlier = np.tri(cell.shape[2], k=-1, dtype=bool)
-    repeated = jnp.any(same & earlier[None, None], axis=-1)
-    return ~repeated & ~(same[..., -1] & contact[None, :, None])
 
 
 def session_at_start(
@@ -203,7 +155,8 @@ def _compiled(
     assert grid.side is not None
     feelers = ReportFrontendConfig(mounts=mounts, length=length).feelers
     prepare_precision(precision)
-    return Session(GridBackend(grid, feelers, grid.side, precision, distinct_cells), precision=precision)
+    backend = GridBackend(grid, feelers, grid.side, precision, distinct_cells)
+    return Session(backend, precision=precision)
 
 
 @lru_cache(maxsize=1)

@@ -133,11 +133,6 @@ def column(rows: Sequence[ResultRow], key: tuple[str, ...], field: str) -> np.nd
     return values
 
 
-def decide(holds: bool, fails: bool, words: tuple[str, str]) -> str:
-    """The word of a test: of `words` the first if it holds, the second if it fails."""
-    return words[0] if holds else words[1] if fails else "not decided"
-
-
 def count_sets(rows: Sequence[ResultRow], first_only: bool = False) -> str:
     """The number of sets, for the subtitle of a figure."""
     sets = len({row.number for row in rows})

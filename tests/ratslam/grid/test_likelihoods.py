@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import expit, logit
 
-from ratslam.experiments.trials.arena_trial import distinct_cells
 from ratslam.grid import likelihoods
 from ratslam.grid.config import LikelihoodConfig
 from tests.helpers.grid_world import LENGTH
@@ -18,7 +17,7 @@ from tests.helpers.grid_world import LENGTH
 CONFIG = LikelihoodConfig()
 PRIOR = 0.3
 SEGMENTS = 5
-MODELS = {"literal": likelihoods.all_cells, "distinct": distinct_cells}
+MODELS = {"literal": likelihoods.all_cells, "distinct": likelihoods.distinct_cells}
 EVIDENCE = st.floats(-30, 30)
 
 free = jax.jit(likelihoods.free_space, static_argnums=0)

@@ -31,7 +31,7 @@ from robot.world.polygons import (
     segments_cross,
     square,
 )
-from robot.world.random_arena import ArenaConfig, make_arena
+from robot.world.random_arena import OTHER_START_CLEARANCE, ArenaConfig, make_arena, place_start
 from tactile.base.errors import InputError
 
 SEEDS = st.integers(0, 10**6)
@@ -89,6 +89,23 @@ def test_the_share_of_objects_at_walls_is_configurable() -> None:
     assert share(0.0) == 0
     assert share(1.0) == 1
     assert 0.3 < share(0.5) < 0.9
+
+
+@given(st.integers(0, 50))
+def test_trials_of_one_arena_start_anywhere_that_is_free(seed: int) -> None:
+    place = make_arena(ArenaConfig(seed=1), 0)
+    one, other = place_start(place, seed), place_start(place, seed + 1)
+    assert has_clearance(one, one.start[None, :2], OTHER_START_CLEARANCE).all()
+    assert not np.allclose(one.start, other.start)
+    assert one.objects is place.objects
+
+
+def test_a_start_needs_free_space() -> None:
+    narrow = Arena(
+        "narrow", 0.3 * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]), (), np.zeros(3)
+    )
+    with pytest.raises(InputError, match="no room"):
+        place_start(narrow, 0)
 
 
 def test_an_arena_depends_on_its_seed_only() -> None:

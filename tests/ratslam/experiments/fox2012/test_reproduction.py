@@ -1,4 +1,4 @@
-"""Reproductions of Fox et al. 2012: maps, revisits, rankings, and a small reproduction."""
+"""Reproductions of Fox et al. 2012: maps, rankings, and a small reproduction."""
 
 from __future__ import annotations
 
@@ -14,24 +14,20 @@ from hypothesis import strategies as st
 from ratslam.cli import main
 from ratslam.cli.reproduce import FOX2012
 from ratslam.experiments.fox2012.mapper_ranking import MEASURES, Measure, rank_mappers, render_rankings
-from ratslam.experiments.fox2012.metrics import FIELDS, LEAVE_DISTANCE, find_revisits, path_metrics
 from ratslam.experiments.fox2012.protocols import FILTERED, MAPPERS, PAPERS, PROTOCOLS, RECKONED, TRUE
-from ratslam.experiments.fox2012.reproduction import PAPER, plan_jobs, run_job
+from ratslam.experiments.fox2012.reproduction import FIELDS, PAPER, plan_jobs, run_job
 from ratslam.experiments.trials import reproduction
 from ratslam.experiments.trials.arena_trial import (
-    START_CLEARANCE,
-    arena_side,
-    arena_truth,
     collect_marks,
     draw_map,
     observe_session,
-    place_start,
     run_filter,
     simulate_session,
 )
 from ratslam.experiments.trials.reproduction import ResultRow, reproduce
 from ratslam.grid.config import GridConfig
-from robot.world.arena import Arena, has_clearance
+from ratslam.pipeline.artifacts import true_grid
+from robot.world.arena import Arena
 from robot.world.random_arena import ArenaConfig, make_arena
 from tactile.base.errors import InputError
 from tests.helpers.grid_world import TIPS, create, report
@@ -78,20 +74,6 @@ def of(
 # Sessions and charts
 
 
-@given(st.integers(0, 50))
-def test_trials_of_one_arena_start_anywhere_that_is_free(seed: int) -> None:
-    place = make_arena(ArenaConfig(seed=1), 0)
-    one, other = place_start(place, seed), place_start(place, seed + 1)
-    assert has_clearance(one, one.start[None, :2], START_CLEARANCE).all()
-    assert not np.allclose(one.start, other.start)
-    assert one.objects is place.objects
-
-
-def test_a_start_needs_free_space() -> None:
-    with pytest.raises(InputError, match="no room"):
-        place_start(ROOMY._replace(outer=0.3 * ROOMY.outer), 0)
-
-
 def test_a_contact_is_drawn_at_its_place() -> None:
     reports = [report(forward=0.02), report(forward=0.02, touching=[1])]
     path = np.array([[0.4, 0.5, np.pi / 2], [0.4, 0.52, np.pi / 2]])
@@ -109,13 +91,13 @@ def test_a_contact_is_drawn_at_its_place() -> None:
 def test_maps_and_truth_share_cells_in_any_arena() -> None:
     place = make_arena(ArenaConfig(seed=2), 0)
     empty = draw_map(GridConfig(), create(), place, np.zeros((0, 3)), collect_marks([report()]))
-    truth = arena_truth(place, empty)
+    truth = true_grid(place._replace(start=np.zeros(3)), empty)
     assert truth.inside.mean() == pytest.approx(0.25)
     assert (truth.occupied | truth.inside).all()
-    assert arena_side(place) == 1.25
+    assert place.side == 1.25
     moved = place._replace(outer=place.outer + 3.0, objects=tuple(p + 3.0 for p in place.objects))
     grid = draw_map(GridConfig(), create(), moved, np.zeros((0, 3)), collect_marks([report()]))
-    assert np.array_equal(arena_truth(moved, grid).occupied, truth.occupied)
+    assert np.array_equal(true_grid(moved._replace(start=np.zeros(3)), grid).occupied, truth.occupied)
 
 
 def test_an_intermediate_stop_does_not_change_the_result(tiny: object) -> None:
@@ -130,37 +112,6 @@ def test_an_intermediate_stop_does_not_change_the_result(tiny: object) -> None:
     assert np.array_equal(late.grid.probability, whole.grid.probability)
     assert np.array_equal(early.online, whole.online[:23])
     assert len(early.path) == 23
-
-
-# Paths and loops
-
-
-def there_and_back(count: int = 40, far: float = 1.0) -> np.ndarray:
-    x = np.concatenate([np.linspace(0, far, count), np.linspace(far, 0, count)])
-    return np.column_stack([x, np.zeros_like(x), np.zeros_like(x)])
-
-
-def test_returns_are_found_as_revisits() -> None:
-    truth = there_and_back()
-    later, earlier = find_revisits(truth).T
-    assert (later >= 40).all()
-    assert np.abs(truth[later, 0] - truth[earlier, 0]).max() < 0.02
-    assert truth[later, 0].max() < 1 - LEAVE_DISTANCE / 2 + 0.03  # not near the turn
-    assert len(find_revisits(truth[:40])) == 0
-    assert len(find_revisits(there_and_back(far=LEAVE_DISTANCE))) == 0
-
-
-def test_revisits_are_closed_by_the_offset_of_the_two_visits() -> None:
-    truth = there_and_back()
-    shifted = truth + [3.0, -4.0, 0.1]
-    found = path_metrics(shifted, shifted, truth)
-    assert found["online_error"] == found["final_error"] == pytest.approx(5)
-    assert found["revisit_gap"] == pytest.approx(0, abs=1e-12)
-    assert found["revisits_closed"] == 1
-    assert found["online_heading_error_deg"] == pytest.approx(np.degrees(0.1))
-    drifted = truth + np.column_stack([np.zeros(80), np.linspace(0, 1, 80), np.zeros(80)])
-    assert path_metrics(truth, drifted, truth)["revisits_closed"] == 0
-    assert path_metrics(truth[:9], truth[:9], truth[:9])["revisits_closed"] is None
 
 
 # Orders

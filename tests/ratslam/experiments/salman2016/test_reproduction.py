@@ -1,4 +1,4 @@
-"""Reproductions of Salman & Pearson 2016: laps, controls, claims, threshold sweeps, a small reproduction."""
+"""Reproductions of Salman & Pearson 2016: sessions, claims, threshold sweeps, a small reproduction."""
 
 from __future__ import annotations
 
@@ -14,25 +14,16 @@ from ratslam.classic.experience_map import ExperienceMap
 from ratslam.cli import main
 from ratslam.cli.reproduce import SALMAN2016
 from ratslam.experiments.salman2016.claims import judge_claim, render_claims
-from ratslam.experiments.salman2016.direction_metrics import direction_metrics, lap_of_step
 from ratslam.experiments.salman2016.protocols import PROTOCOLS, THRESHOLDS, Claim
 from ratslam.experiments.salman2016.reproduction import PAPER, match_thresholds, plan_jobs, session_config
 from ratslam.experiments.trials import reproduction
-from ratslam.experiments.trials.controls import apply_control
 from ratslam.experiments.trials.reproduction import ResultRow, column, reproduce
 from ratslam.experiments.trials.threshold_sweep import sweep_steps, sweep_thresholds
-from ratslam.experiments.trials.touch_trial import (
-    SessionResult,
-    capacity_for,
-    collect_session,
-    lap_ends,
-    run_session,
-    touch_metrics,
-    truncate_log,
-)
+from ratslam.experiments.trials.touch_trial import capacity_for, collect_session, run_session
+from robot.sources.in_memory import truncate_log
 from robot.touch_source import observation_of
 from tactile.base.errors import InputError
-from tactile.base.se2 import compose
+from tests.helpers.laps import session, square
 
 TINY = (
     "simulation.maze.columns=2",
@@ -44,77 +35,13 @@ TINY = (
 RISES = Claim("a rises", "arr", "rises", "a", "b")
 
 
-def square(word, side=12):
-    """True poses of laps around a square of 0.36 m, 3 cm a step; C clockwise, A anticlockwise."""
-    way = np.linspace(0, 1, side, endpoint=False)
-    zero, one = np.zeros(side), np.ones(side)
-    x = 0.36 * np.concatenate([way, one, 1 - way, zero])
-    y = 0.36 * np.concatenate([zero, way, one, 1 - way])
-    heading = np.repeat([0, np.pi / 2, np.pi, -np.pi / 2], side)
-    lap = np.column_stack([x, y, heading])
-    back = np.roll(lap[::-1], 1, axis=0) + [0, 0, np.pi]
-    laps = [lap if letter == "A" else back for letter in word]
-    return np.concatenate([*laps, laps[-1][:1]])
-
-
-def session(truth, **given):
-    still = {
-        "truth": truth,
-        "odometry": truth,
-        "trajectory": truth,
-        "place": np.arange(len(truth)),
-        "node": truth,
-        "closures": np.zeros((0, 2), int),
-    }
-    return SessionResult(**{**still, **given})
-
-
 @pytest.fixture(scope="module")
 def tiny():
     """A session of the small reproduction below, which shares its compiled kernel."""
     return collect_session(session_config(PROTOCOLS["fig6"].conditions[1], "classic", 0, TINY))
 
 
-# Laps and sessions
-
-
-@pytest.mark.parametrize("word", ["C", "CA", "CCCAAACACA"])
-def test_laps_end_where_they_began(word):
-    truth = square(word)
-    ends = lap_ends(truth)
-    assert ends.tolist() == [48 * (k + 1) for k in range(len(word))]
-    assert np.bincount(lap_of_step(truth, len(word))).tolist() == [49, *[48] * (len(word) - 1)]
-
-
-def test_a_path_that_never_returns_has_no_laps():
-    assert len(lap_ends(square("C")[:40])) == 0
-
-
-def test_a_perfect_map_has_no_energy_in_any_frame():
-    truth = square("CC")
-    moved = compose(np.array([3.0, -1.0, 2.0]), truth)
-    place = np.arange(len(truth)) % 48
-    perfect = session(truth, trajectory=moved, place=place, node=moved[:48])
-    trial = touch_metrics(perfect)
-    assert trial.em == pytest.approx(0, abs=1e-9)
-    assert trial.em_experiences == pytest.approx(0, abs=1e-9)
-    assert (trial.arcr, trial.arcr_chain_free) == (1, 1)
-    assert trial.arr > 0.9  # the base set ends a few steps before the places begin again
-    assert touch_metrics(session(truth)).arr == 0
-
-
-def test_closures_are_false_from_ten_centimetres_on():
-    truth = square("CC")
-    closures = np.array([[48, 0], [50, 2], [60, 8], [60, 30]])
-    trial = touch_metrics(session(truth, closures=closures))
-    assert (trial.closures, trial.false_closures) == (4, 2)
-
-
-def test_a_step_lies_where_its_experience_does():
-    truth = square("CC")
-    spread = session(truth, place=np.arange(len(truth)) // 4, node=truth[::4])
-    trial = touch_metrics(spread)
-    assert trial.em == 0 < trial.em_experiences
+# Sessions
 
 
 def test_sessions_that_share_a_compiled_kernel_are_independent(tiny):
@@ -156,84 +83,6 @@ def test_only_the_classic_method_has_thresholds(tiny):
     config, log = tiny
     with pytest.raises(ValueError, match="classic"):
         sweep_thresholds(config.model_copy(update={"backend": "recall"}), log, np.array([0.1]))
-
-
-# Controls
-
-
-@pytest.mark.parametrize("control", ["shuffled", "blank", "ideal"])
-def test_controls_change_only_the_views(tiny, control):
-    log = tiny[1]
-    changed = apply_control(log, control, 1)
-    assert changed.views.shape == log.views.shape
-    assert not np.array_equal(changed.views, log.views)
-    assert np.array_equal(changed.motion, log.motion)
-    assert np.array_equal(changed.truth, log.truth)
-    assert np.array_equal(changed.views, apply_control(log, control, 1).views)
-    assert 0 <= changed.views.min() <= changed.views.max() <= 1
-    assert apply_control(log, "none", 1) is log
-
-
-def test_shuffled_views_are_the_same_views(tiny):
-    log = tiny[1]
-    views, shuffled = (np.sort(x.views.reshape(-1)) for x in (log, apply_control(log, "shuffled", 0)))
-    assert np.array_equal(views, shuffled)
-    assert not apply_control(log, "blank", 0).views.any()
-
-
-def test_ideal_views_are_equal_exactly_at_one_spot_and_heading(tiny):
-    log = tiny[1]
-    views = apply_control(log, "ideal", 0).views.reshape(log.length, -1)
-    x, y, heading = np.asarray(log.truth).T
-    spot = np.stack([np.round(x / 0.06), np.round(y / 0.06), np.round(heading / (np.pi / 4)) % 8], axis=1)
-    same = (spot[:, None] == spot[None]).all(axis=2)
-    alike = (views[:, None] == views[None]).all(axis=2)
-    assert np.array_equal(same, alike)
-    assert same.sum() > log.length
-
-
-# Quantities of single figures
-
-
-def test_laps_the_other_way_round_are_associated_by_experience_or_closure():
-    word, truth = "CA", square("CA")
-    new = direction_metrics(session(truth), word)
-    assert (new["first_anticlockwise"], new["directions_apart"]) == (0, 0)
-    nearest = [int(np.argmin(np.hypot(*(truth[:49, :2] - p[:2]).T))) for p in truth]
-    known = direction_metrics(session(truth, place=np.array(nearest)), word)
-    assert known["first_anticlockwise"] == known["associated_correct"] == 1
-    wrong = direction_metrics(session(truth, place=np.where(np.arange(len(truth)) > 48, 24, nearest)), word)
-    assert wrong["first_anticlockwise"] == 1 > wrong["associated_correct"]
-    closures = np.array([[k, nearest[k]] for k in range(49, 73)])
-    half = direction_metrics(session(truth, closures=closures), word)
-    assert half["first_anticlockwise"] == half["first_anticlockwise_correct"] == pytest.approx(0.5)
-    assert half["associated_correct"] == 1
-    assert wrong["first_anticlockwise_correct"] < 0.5
-
-
-def test_a_step_closed_with_an_associated_step_is_associated():
-    word, truth = "CAA", square("CAA")
-    again = np.array([[k, k - 48] for k in range(97, 145)])
-    none = direction_metrics(session(truth, closures=again), word)
-    assert none["last_anticlockwise"] == 0
-    first_lap = np.array([[k, 0] for k in range(49, 97)])
-    all_of_it = direction_metrics(session(truth, closures=np.concatenate([first_lap, again])), word)
-    assert all_of_it["last_anticlockwise"] == 1 > all_of_it["associated_correct"]
-
-
-def test_the_distance_of_the_two_directions_is_measured_in_the_map():
-    truth = square("CA")
-    moved = truth + np.where(np.arange(len(truth)) > 48, 1, 0)[:, None] * [0.3, 0, 0]
-    assert direction_metrics(session(truth, trajectory=moved), "CA")["directions_apart"] == pytest.approx(0.3)
-    assert np.isnan(direction_metrics(session(truth), "CC")["directions_apart"])
-
-
-def test_closures_across_the_change_are_counted():
-    truth = square("CCC")
-    closures = np.array([[90, 2], [100, 80], [30, 4], [44, 42]])
-    assert (
-        direction_metrics(session(truth, closures=closures), "CCC")["across"] == 2
-    )  # 145 steps: the change is at 43
 
 
 # Verdicts

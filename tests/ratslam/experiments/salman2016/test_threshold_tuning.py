@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
+from evaluation.metrics.view_separation import ViewDifferences
 from ratslam.classic import view_templates
 from ratslam.classic.view_templates import TemplateConfig
 from ratslam.cli import main
@@ -19,10 +20,7 @@ from ratslam.config.strict_yaml import parse
 from ratslam.experiments.salman2016.threshold_tuning import (
     THRESHOLDS,
     ThresholdScore,
-    ViewDifferences,
-    auc,
     choose_threshold,
-    compare_views,
     render_tuning,
     tune_threshold,
     view_differences,
@@ -63,16 +61,6 @@ def log_of(truth, views, step=10.0):
     )
 
 
-@given(
-    st.lists(st.integers(0, 5), min_size=1, max_size=9), st.lists(st.integers(0, 5), min_size=1, max_size=9)
-)
-def test_auc_is_the_chance_that_views_of_other_places_differ_more(same, other):
-    a, b = np.array(same, float), np.array(other, float)
-    pairs = (b[None] > a[:, None]) + 0.5 * (b[None] == a[:, None])
-    assert auc(a, b) == pytest.approx(pairs.mean())
-    assert auc(a, b) + auc(b, a) == pytest.approx(1)
-
-
 @pytest.mark.parametrize(
     "how", [{}, {"shift": 1}, {"shift": 2, "shift_step": 2}, {"panoramic": True, "shift_step": 3}]
 )
@@ -86,23 +74,6 @@ def test_differences_equal_those_of_the_matcher(how, views):
         stored = store._replace(view=jnp.asarray(views[i].reshape(-1, 1)), count=jnp.int32(1))
         match = view_templates.match_view(config, (3, 6, 2), stored, jnp.asarray(views[i - 1]))
         assert found[i - 1, i] == pytest.approx(float(match.error), abs=1e-12)
-
-
-def test_pairs_are_sorted_by_true_pose_and_time():
-    truth = [[0, 0, 0], [1, 0, 0], [0.04, 0, 0.2], [0, 0, 2.0], [0.2, 0, 0], [0, 0, 0]]
-    found = compare_views(TemplateConfig(), log_of(truth, np.arange(6) / 10, step=40.0))
-    # same: 0-2 and 0-5 and 2-5 (15 degrees, 5 cm, 60 s apart); other: all with row 1
-    assert found.same.sum() == 3
-    assert found.other.sum() == 5
-    late = compare_views(TemplateConfig(), log_of(truth, np.arange(6) / 10, step=20.0))
-    assert late.same.sum() == 2  # 0-2 lie only 40 s apart
-
-
-def test_a_path_without_a_second_visit_has_nothing_to_compare():
-    with pytest.raises(InputError, match="two visits"):
-        compare_views(TemplateConfig(), log_of([[k, 0, 0] for k in range(5)], np.arange(5)))
-    with pytest.raises(InputError, match="one place"):
-        compare_views(TemplateConfig(), log_of(np.zeros((20, 3)), np.arange(20)))
 
 
 def test_most_correct_with_none_incorrect_wins():

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from evaluation.metrics.session_metrics import TouchMetrics
 from ratslam.cli import main
 from ratslam.experiments.tables import grid, laser, touch
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row, select_rows
-from ratslam.experiments.trials.touch_trial import TouchMetrics
 from tactile.base.errors import InputError
 
 METRICS = TouchMetrics(

@@ -1,4 +1,4 @@
-"""Control conditions: the views of a session replaced, its odometry and truth unchanged.
+"""Control conditions: the views of a source replaced, its odometry and truth unchanged.
 
 A method that closes loops on shuffled or blank views does so by odometry alone; ideal views give the upper
 bound of the rest of the method.
@@ -25,7 +25,7 @@ LIT = 0.5
 
 
 def apply_control(log: InMemorySource, control: Control, seed: int) -> InMemorySource:
-    """The session with replaced views; steps without a view stay without one."""
+    """The source with replaced views; steps without a view stay without one."""
     if control == "none":
         return log
     views = np.zeros_like(log.views)

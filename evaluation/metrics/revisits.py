@@ -1,12 +1,10 @@
-"""Metrics of one session with one filter: path, revisits and map."""
+"""Errors of a path with known start, without alignment, and of the offsets between visits of one place."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from evaluation.metrics.grid_error import CONVENTIONS, Convention
-from evaluation.metrics.grid_score import GridScore
-from ratslam.experiments.trials.arena_trial import position_error
+from evaluation.metrics.trajectory import position_error
 from tactile.base.se2 import wrap
 
 REVISIT_DISTANCE = 0.1
@@ -15,22 +13,6 @@ LEAVE_DISTANCE = 0.5
 """Distance that the robot must have been away in between, m."""
 CLOSED_GAP = 0.1
 """A revisit is closed if the path gives the offset of the two visits to this error, m."""
-
-
-def eq6_column(convention: Convention) -> str:
-    """The column of a convention of equation 6, e.g. `eq6_grid_raw_0.3`."""
-    return f"eq6_{convention.mask}_{'smooth' if convention.smooth else 'raw'}_{convention.outside:g}"
-
-
-MAP_METRICS = (
-    "map_brier_skill", "map_brier_skill_free", "map_log_loss", "map_auc", "map_auc_free", "map_chamfer_map",
-    "map_chamfer_walls",
-)  # fmt: skip
-FIELDS = (
-    "reports", "online_error", "final_error", "online_heading_error_deg", "revisits", "revisits_closed",
-    "revisit_gap", "odometry_error", *(eq6_column(each) for each in CONVENTIONS), *MAP_METRICS,
-)  # fmt: skip
-"""Columns of metrics in NAME.csv."""
 
 
 def path_metrics(online: np.ndarray, path: np.ndarray, truth: np.ndarray) -> dict[str, float | None]:
@@ -63,10 +45,3 @@ def find_revisits(truth: np.ndarray) -> np.ndarray:
         if len(before) and before.min() < REVISIT_DISTANCE:
             found.append((k, int(before.argmin())))
     return np.array(found, int).reshape(-1, 2)
-
-
-def map_metrics(score: GridScore) -> dict[str, float | None]:
-    """Equation 6 under all conventions, and `MAP_METRICS`."""
-    errors = {eq6_column(error.convention): error.error for error in score.errors}
-    values = {name: score.quantities[name].value for name in MAP_METRICS}
-    return errors | {name: None if v is None else float(v) for name, v in values.items()}

@@ -1,13 +1,11 @@
-"""Metrics of laps in two directions, and of closures across a change of mazes."""
+"""Metrics of laps in two directions (Salman & Pearson 2016, IV-B), and of closures across a change."""
 
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from evaluation.metrics.experience_log import creation_rows
-from ratslam.experiments.salman2016.protocols import LATER_MAZE_START
-from ratslam.experiments.trials.touch_trial import FALSE_CLOSURE_DISTANCE, SessionResult, lap_ends
+from evaluation.metrics.session_metrics import FALSE_CLOSURE_DISTANCE, SessionResult, lap_ends
 
 BESIDE = 0.02
 """Steps of the two directions this near in truth count as the same spot, m."""
@@ -17,7 +15,7 @@ DIRECTION_METRICS = (
 )  # fmt: skip
 
 
-def direction_metrics(result: SessionResult, laps: str) -> dict[str, float]:
+def direction_metrics(result: SessionResult, laps: str, change: float) -> dict[str, float]:
     """How anticlockwise laps were associated with clockwise ones; NaN where the laps do not define a metric.
 
     A step is associated with the clockwise step at which its experience was created or to which a closure
@@ -25,20 +23,20 @@ def direction_metrics(result: SessionResult, laps: str) -> dict[str, float]:
     correct if the two steps are within `FALSE_CLOSURE_DISTANCE`.
 
     Args:
-        laps: direction of each lap, C or A.
+        laps: direction of each lap, C or A. change: share of the session before the change of the world.
 
     Returns:
         first_anticlockwise_correct: share of the first anticlockwise lap with a correct association.
         first_anticlockwise, last_anticlockwise: share of the lap with an association. associated_correct:
         share of the associations that are correct. directions_apart: median distance in the map of steps of
         the two directions at the same spot, m. across: closures between the parts before and after the
-        change of mazes.
+        change.
     """
     truth = result.truth
-    change = int(LATER_MAZE_START * len(truth))
+    first_after = int(change * len(truth))
     later, earlier = result.closures.reshape(-1, 2).T
     metrics = dict.fromkeys(DIRECTION_METRICS, np.nan)
-    metrics["across"] = float(((later >= change) & (earlier < change)).sum())
+    metrics["across"] = float(((later >= first_after) & (earlier < first_after)).sum())
     if not {"A", "C"} <= set(laps.upper()) or (clockwise := clockwise_steps(truth, laps)).all():
         return metrics
     lap = lap_of_step(truth, len(laps))
@@ -80,6 +78,8 @@ def _associate(result: SessionResult, clockwise: np.ndarray) -> np.ndarray:
 
 
 def _directions_apart(result: SessionResult, clockwise: np.ndarray) -> float:
+    from scipy.spatial import cKDTree
+
     ahead = np.flatnonzero(clockwise)
     away, row = cKDTree(result.truth[ahead, :2]).query(result.truth[~clockwise, :2])
     beside = away < BESIDE
