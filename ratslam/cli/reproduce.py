@@ -167,7 +167,7 @@ def _threshold(arguments: argparse.Namespace) -> int:
 
 
 def _train(arguments: argparse.Namespace) -> int:
-    from ratslam.experiments.fox2012.template_training import drive_held_out, render_drives, train_to_file
+    from robot.simulation.create.template_training import drive_held_out, render_drives, train_to_file
 
     create_simulation = read_config(arguments).create_simulation
     if create_simulation is None:

@@ -4,24 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import product
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from evaluation.metrics.grid_error import MAIN_CONVENTION
 from evaluation.metrics.occupancy_grid import mean_grid
+from evaluation.plots import style
 from evaluation.plots.grid_plot import GridPanel, GridPaths, draw_grids
 from ratslam.experiments.fox2012.protocols import FILTERED, Protocol
 from ratslam.experiments.trials.reproduction import ResultRow, count_sets
 from robot.world.arena import wall_segments
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 Rows = Sequence[ResultRow]
 
 
-def draw_reproduction(name: str, protocol: Protocol, rows: Rows) -> Figure:
+def draw_reproduction(name: str, protocol: Protocol, rows: Rows) -> style.Figure:
     """The figure of a reproduction."""
     draw, explanation = {
         "fox-fig4": (_means, "below each mapper: the filter, eq. 6 (mean of the trials' errors)"),

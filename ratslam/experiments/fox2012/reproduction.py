@@ -6,7 +6,8 @@ seed. All mappers and methods run on the same sets, so their differences are pai
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from itertools import product
 from typing import NamedTuple
 
@@ -146,10 +147,5 @@ def _score(
     return ResultRow((job.world, *key), job.number, job.seed, values, result)
 
 
-def _run(
-    title: str, protocol: Protocol, jobs: Sequence[SessionJob], workers: int
-) -> Iterator[list[ResultRow]]:
-    return run_with_progress(run_job, title, jobs, workers)
-
-
+_run = partial(run_with_progress, run_job)
 PAPER = Paper(PROTOCOLS, KEY, FIELDS, plan_jobs, _run, draw_reproduction, render_results)

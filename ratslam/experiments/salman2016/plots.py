@@ -3,27 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from evaluation.metrics.direction_metrics import clockwise_steps, lap_of_step
 from evaluation.metrics.session_metrics import experience_metric_if_defined
 from evaluation.metrics.trajectory import align
-from evaluation.plots import paper_figures
+from evaluation.plots import paper_figures, style
 from evaluation.plots.paper_figures import DrivenPath, MeasuredQuantity, experience_history
 from ratslam.experiments.salman2016.claims import LABELS, RATIOS, series
 from ratslam.experiments.salman2016.protocols import Protocol
 from ratslam.experiments.trials.reproduction import ResultRow, column, count_sets
 from tactile.base.se2 import compose
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 Rows = Sequence[ResultRow]
 
 
-def draw_reproduction(name: str, protocol: Protocol, rows: Rows) -> Figure:
+def draw_reproduction(name: str, protocol: Protocol, rows: Rows) -> style.Figure:
     """The figure of a reproduction: metrics over all sets, or sessions of the first set."""
     draw_sessions = {"fig2": _drift, "fig3": _history, "fig5": _directions}.get(name)
     title = f"{name}: {protocol.title}"
@@ -33,7 +29,7 @@ def draw_reproduction(name: str, protocol: Protocol, rows: Rows) -> Figure:
     return (_curves if protocol.swept else _dots)(title, line, protocol, rows)
 
 
-def _dots(title: str, line: str, protocol: Protocol, rows: Rows) -> Figure:
+def _dots(title: str, line: str, protocol: Protocol, rows: Rows) -> style.Figure:
     names = [condition.name for condition in protocol.conditions]
     labels = {"none": "", "shuffled": ", shuffled", "blank": ", no images"}
     shown = [(m, c) for m, c in series(protocol, rows) if c == "none" or m == "ours"]
@@ -52,7 +48,7 @@ def _dots(title: str, line: str, protocol: Protocol, rows: Rows) -> Figure:
     return paper_figures.draw_measured(title, line, names, measured)
 
 
-def _curves(title: str, line: str, protocol: Protocol, rows: Rows) -> Figure:
+def _curves(title: str, line: str, protocol: Protocol, rows: Rows) -> style.Figure:
     curves: dict[str, dict[str, tuple[np.ndarray, np.ndarray]]] = {}
     for condition in protocol.conditions:
         name, noise = condition.name.rsplit(", ", 1)
@@ -65,7 +61,7 @@ def _curves(title: str, line: str, protocol: Protocol, rows: Rows) -> Figure:
     return paper_figures.draw_curves(title, line, curves)
 
 
-def _drift(title: str, line: str, rows: Rows) -> Figure:
+def _drift(title: str, line: str, rows: Rows) -> style.Figure:
     paths: dict[str, DrivenPath] = {}
     for row in rows:
         laps, result = row.session
@@ -75,13 +71,13 @@ def _drift(title: str, line: str, rows: Rows) -> Figure:
     return paper_figures.draw_drift(title, line, paths)
 
 
-def _history(title: str, line: str, rows: Rows) -> Figure:
+def _history(title: str, line: str, rows: Rows) -> style.Figure:
     runs = ((row.key[1], row.session[1]) for row in rows)
     histories = {name: experience_history(run.place, experience_metric_if_defined(run)) for name, run in runs}
     return paper_figures.draw_experiences(title, line, histories)
 
 
-def _directions(title: str, line: str, rows: Rows) -> Figure:
+def _directions(title: str, line: str, rows: Rows) -> style.Figure:
     maps = {}
     for row in sorted(rows, key=lambda row: row.key[1]):
         laps, result = row.session

@@ -148,24 +148,22 @@ def sweep_job(job: TrialJob) -> list[ResultRow]:
     return rows
 
 
-def _run_protocol(
-    title: str, protocol: Protocol, jobs: Sequence[TrialJob], workers: int
-) -> Iterator[list[ResultRow]]:
-    if protocol.swept:
-        yield from _run_sweeps(title, jobs, workers)
+def _run_figure(name: str, jobs: Sequence[TrialJob], workers: int) -> Iterator[list[ResultRow]]:
+    if PROTOCOLS[name].swept:
+        yield from _run_sweeps(name, jobs, workers)
         return
     unchanged = 0.0  # closures across the change of mazes in the set's session without one
-    for row in run_with_progress(run_job, title, jobs, workers):
+    for row in run_with_progress(run_job, name, jobs, workers):
         share = {"across_share": row.values["across"] / unchanged} if unchanged else {}
         if row.key[0] == "unchanged":
             share, unchanged = {}, row.values["across"]
         yield [row._replace(values={**row.values, **share})]
 
 
-def _run_sweeps(title: str, jobs: Sequence[TrialJob], workers: int) -> Iterator[list[ResultRow]]:
+def _run_sweeps(name: str, jobs: Sequence[TrialJob], workers: int) -> Iterator[list[ResultRow]]:
     """First the sweeps over all thresholds, then a session at the matched threshold of each condition."""
     swept: list[ResultRow] = []
-    for rows in run_with_progress(sweep_job, f"{title}, thresholds", jobs, workers):
+    for rows in run_with_progress(sweep_job, f"{name}, thresholds", jobs, workers):
         swept += rows
         yield rows
     chosen = []
@@ -176,9 +174,9 @@ def _run_sweeps(title: str, jobs: Sequence[TrialJob], workers: int) -> Iterator[
         if best is not None:
             templates = job.config.templates.model_copy(update={"threshold": best.values["threshold"]})
             chosen.append(job._replace(config=job.config.model_copy(update={"templates": templates})))
-    matched = run_with_progress(run_job, f"{title}, matched", chosen, workers)
+    matched = run_with_progress(run_job, f"{name}, matched", chosen, workers)
     for job, row in zip(chosen, matched, strict=True):
         yield [row._replace(values={**row.values, "threshold": job.config.templates.threshold})]
 
 
-PAPER = Paper(PROTOCOLS, KEY, FIELDS, plan_jobs, _run_protocol, draw_reproduction, render_claims)
+PAPER = Paper(PROTOCOLS, KEY, FIELDS, plan_jobs, _run_figure, draw_reproduction, render_claims)

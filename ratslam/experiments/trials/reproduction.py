@@ -6,16 +6,14 @@ import csv
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from tqdm import tqdm
 
+from evaluation.plots import style
 from ratslam.experiments.studies.executor import run_tasks
 from tactile.base.errors import InputError
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -42,7 +40,7 @@ class Paper(NamedTuple):
     Attributes:
         protocols: of the figures, by name. key, fields: columns of NAME.csv: names, and metrics. plan: jobs
             from a protocol, the number of sets, a seed and overrides. run: rows in batches from the name of
-            the figure, its protocol, the jobs and the number of processes. draw: the figure from its name,
+            the figure, the jobs and the number of processes. draw: the figure from its name,
             the protocol and the rows. render: the table from the protocol, the rows and the number of sets.
     """
 
@@ -50,8 +48,8 @@ class Paper(NamedTuple):
     key: tuple[str, ...]
     fields: tuple[str, ...]
     plan: Callable[[Any, int, int, Sequence[str]], Sequence[Any]]
-    run: Callable[[str, Any, Sequence[Any], int], Iterable[Sequence[ResultRow]]]
-    draw: Callable[[str, Any, Sequence[ResultRow]], Figure]
+    run: Callable[[str, Sequence[Any], int], Iterable[Sequence[ResultRow]]]
+    draw: Callable[[str, Any, Sequence[ResultRow]], style.Figure]
     render: Callable[[Any, Sequence[ResultRow], int], str]
 
 
@@ -81,7 +79,7 @@ def reproduce(
         raise InputError("NAME", repr(name), f"one of {', '.join(paper.protocols)}")
     protocol = paper.protocols[name]
     jobs = paper.plan(protocol, sets, seed, assignments)
-    batches = paper.run(name, protocol, jobs, workers)
+    batches = paper.run(name, jobs, workers)
     rows, interrupted = write_rows(directory / f"{name}.csv", paper.key, paper.fields, batches)
     if rows and not interrupted:
         paper.draw(name, protocol, rows).savefig(directory / f"{name}.png")

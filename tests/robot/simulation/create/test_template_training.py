@@ -9,14 +9,14 @@ import pytest
 
 from ratslam.cli import main
 from ratslam.config.run_config import RunConfig
-from ratslam.experiments.fox2012.template_training import (
+from robot.simulation.create.session import CreateSimulation, CreateSimulationConfig, train_strain_templates
+from robot.simulation.create.template_training import (
     DURATIONS,
     ESTIMATORS,
     HeldOutDrive,
     drive_held_out,
     render_drives,
 )
-from robot.simulation.create.session import CreateSimulation, CreateSimulationConfig, train_strain_templates
 from robot.touch_source import observation_of, open_touch_source
 from tactile.base.errors import InputError
 from tactile.wall_estimation.strain_templates import StrainTemplates, read_templates
