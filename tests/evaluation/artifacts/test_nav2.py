@@ -72,7 +72,7 @@ def test_the_prior_is_written_as_205(tmp_path):
 
 
 def test_the_files_of_a_small_map(folder):
-    """The first row of the image has the greatest y; the image lies in the same folder."""
+    """The first row of the image has the greatest y; the image is named without a folder."""
     assert (folder / "map.pgm").read_bytes() == b"P5\n3 2\n255\n" + bytes([254, 205, 0, 254, 205, 0])
     assert (folder / "map.yaml").read_text() == (
         "image: map.pgm\nmode: trinary\nresolution: 0.05\norigin: [-1.25, 0.5, 0.0]\n"

@@ -210,7 +210,7 @@ def test_every_step_is_tried_on_the_same_short_session(tmp_path, capsys, stubbed
     assert len(first.simulation.path.circuits) < 10
     assert "classic" in [config.backend for config in others]
     assert "float32" in [config.session.precision for config in others]
-    assert "backend: cannot be had" in output  # and the rest is output all the same
+    assert "backend: cannot be had" in output  # and the rest is printed
     pasted = output.partition("For maze.yaml:")[2]
     changed = validate(parse(pasted, "a"), RunConfig)
     assert (changed.pose_cells, changed.simulation.fidelity) == (

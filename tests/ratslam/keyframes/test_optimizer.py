@@ -222,7 +222,7 @@ def test_a_sequence_far_off_has_no_effect(bias):
 
 
 def robust_case(seed, cost_limit, count=8):
-    """Laps with noise, a start that is off, and sequences of which the second is astray."""
+    """Laps with noise, a start that is off, and sequences of which the second is false."""
     stream = np.random.default_rng(seed)
     truth, chain, closures = laps(stream, 0.04, count, 0.02)
     turn = closures.turn + (closures.sequence == 1) * stream.uniform(-0.5, 0.5)

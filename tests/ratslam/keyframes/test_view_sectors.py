@@ -24,7 +24,7 @@ def drive(seed, width, count=200, bias=0.0, noise=0.01):
     turn, length = stream.normal(0, 0.35, count), stream.uniform(0.05, 0.4, count)
     view = surroundings(stream)(np.cumsum(turn)[:, None] + bearing)
     view = view + noise * stream.normal(0, 1, view.shape)
-    return view, turn - bias * length, length  # odometry without the correction
+    return view, turn - bias * length, length  # the odometry's turn lacks the bias
 
 
 def fan_of(fan, view, turn, length):

@@ -246,7 +246,7 @@ class Bench:
         self.host, self._server, self._folder = host, server, folder
         self._arm, self._head = ExitStack(), ExitStack()
         self._faults: dict[str, Faults] = {}
-        self.starved = 0  # the controller's watchdog stops it before the test
+        self.starved = 0  # number of stops by the controller's watchdog before the test
 
     @property
     def arm(self) -> Faults:

@@ -412,7 +412,7 @@ def test_a_uniform_corridor_carries_no_evidence():
     wall, others = images_of(stream, 1)[0], images_of(stream, 200)
     memory = filled(AHEAD, np.tile(wall, (50, 1)), spaced(50, 0.6), learn(others))
     first, gain = observe(AHEAD, memory, wall)
-    assert gain.log_ratio > 0  # the first frames are recognised
+    assert gain.log_ratio > 0  # the first image matches
     _, then = weigh(AHEAD, jax.tree.map(jnp.asarray, first), wall)
     assert np.log(then.likelihood.max() / then.novelty) < -math.log(AHEAD.familiar)
 

@@ -36,7 +36,7 @@ def test_a_job_has_the_quantities_of_a_run(tiny, tmp_path, backend):
     for name, quantity in card.quantities.items():
         ours = result.quantities[name]
         assert (ours.label, ours.unit) == (quantity.label, quantity.unit)
-        # Quaternions in files round headings by one bit.
+        # Quaternions in files round headings.
         assert ours.value == (quantity.value and pytest.approx(quantity.value, rel=1e-6, abs=1e-9))
     assert result.steps == result.quantities["steps"].value
     assert (result.row, result.seed, result.error) == ("", 3, None)
