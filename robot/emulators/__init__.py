@@ -1,1 +1,1 @@
-"""Emulated hardware: each a process of its own that the real client libraries cannot tell from the device."""
+"""Emulated hardware: separate processes with the wire formats of the real devices."""

@@ -1,9 +1,9 @@
 """An iRobot Create on a pseudo-terminal: `python -m robot.emulators.create`.
 
-It prints the terminal's path, then obeys JSON lines on standard input, each answered by one on standard
-output: `{"do": "state"}`, the truth and everything that reached it; `bump`, `drop`, `cliff`, `clear`, `off`;
-`garbage` (`bytes`: so many before the next reply), `cut` (`bytes`: only so many of it), `lose` (`replies`),
-`trickle` (`seconds` between bytes), `unplug`. Times are real, wheels obey at once, and nothing slips.
+It prints the terminal's path, then executes JSON lines from standard input and answers each by a line on
+standard output: `{"do": "state"}` returns true pose, mode and received commands; `bump`, `drop`, `cliff`,
+`clear`, `off`; `garbage` (`bytes` before the next reply), `cut` (next reply to `bytes`), `lose` (`replies`),
+`trickle` (`seconds` between bytes), `unplug`. Times are real; wheels react at once, without slip.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 
-DATA = {128: 0, 131: 0, 132: 0, 145: 4}  # bytes after an opcode; a query's follow from its first
+DATA = {128: 0, 131: 0, 132: 0, 145: 4}  # bytes after an opcode; a query's first byte gives its length
 
 
 class CreateEmulatorConfig(Settings):
@@ -35,7 +35,7 @@ class CreateEmulatorConfig(Settings):
 
 
 class WheelState(NamedTuple):
-    """Pose of the robot, m and rad, and its total path, m, and turn, rad."""
+    """Pose of the robot (m, rad), its total distance (m) and its total rotation (rad)."""
 
     x: float = 0.0
     y: float = 0.0
@@ -44,7 +44,7 @@ class WheelState(NamedTuple):
     turned: float = 0.0
 
     def advance(self, right: float, left: float, wheel_base: float, seconds: float) -> WheelState:
-        """The state after an arc at these wheel speeds, m/s."""
+        """The state after an arc of some seconds at these wheel speeds, m/s."""
         way, turn = (right + left) / 2 * seconds, (right - left) / wheel_base * seconds
         half = turn / 2
         chord = way * (math.sin(half) / half if half else 1.0)
@@ -66,13 +66,13 @@ class EmulatedCreate:
         self.base, self.mode, self.bumps = WheelState(), Mode.OFF, Bumps(0)
         self.right = self.left = 0
         self.time = 0.0
-        self.drives: list[tuple[float, int, int]] = []  # every command that reached it: s, mm/s, mm/s
+        self.drives: list[tuple[float, int, int]] = []  # received drive commands: s, mm/s right, mm/s left
         self.queries = self.unknown = 0
-        self._told = [0, 0]  # mm and degrees, of all replies
-        self._begun = b""  # a command that is not whole yet
+        self._reported = [0, 0]  # sums of all replies: mm and degrees
+        self._begun = b""  # an incomplete command
 
     def advance(self, seconds: float) -> None:
-        """Advances time."""
+        """Advances time by some seconds."""
         self.base = self.base.advance(self.right / 1000, self.left / 1000, self.config.wheel_base, seconds)
         self.time += seconds
 
@@ -83,7 +83,7 @@ class EmulatedCreate:
             self.mode, self.right, self.left = Mode.PASSIVE, 0, 0
 
     def receive(self, data: bytes) -> list[bytes]:
-        """Takes bytes; returns the replies, one for each query."""
+        """Executes the complete commands in the bytes received so far; returns one reply for each query."""
         self._begun += data
         replies = []
         while self._begun:
@@ -120,11 +120,11 @@ class EmulatedCreate:
         return b""
 
     def _packet(self, number: int) -> bytes:
-        if number in (19, 20):  # what is less than a unit stays for the next time
+        if number in (19, 20):  # the remainder below one unit is added to the next reply
             total = (1000 * self.base.travelled, math.degrees(self.base.turned))[number - 19]
-            whole = math.trunc(total - self._told[number - 19])
+            whole = math.trunc(total - self._reported[number - 19])
             whole = max(-(2**15), min(2**15 - 1, whole))
-            self._told[number - 19] += whole
+            self._reported[number - 19] += whole
             return whole.to_bytes(2, "big", signed=True)
         return bytes([{7: int(self.bumps), 35: int(self.mode)}.get(number, 0)])
 
@@ -138,7 +138,7 @@ class LineFaults:
         self.cut: int | None = None
 
     def disturb(self, reply: bytes) -> bytes:
-        """The reply as it arrives."""
+        """The reply after the pending faults."""
         if self.lose:
             self.lose -= 1
             return b""
@@ -162,17 +162,17 @@ class Terminal:
         except ImportError:
             raise InputError(sys.platform, "has no pseudo-terminals", "Linux or macOS") from None
         self._termios = termios
-        self.master, self._slave = os.openpty()  # its own slave: without one open, reading fails
+        self.master, self._slave = os.openpty()  # the slave stays open: without one, reads fail
         tty.setraw(self._slave)
         self.path = os.ttyname(self._slave)
         self.plugged = True
 
     def in_tune(self) -> bool:
-        """Whether the program at the other end has set the Create's baud rate."""
+        """Whether the client has set the Create's baud rate."""
         return bool(self._termios.tcgetattr(self._slave)[5] == getattr(self._termios, f"B{BAUD}"))
 
     def unplug(self) -> None:
-        """Pulls the cable."""
+        """Closes the terminal, as an unplugged cable would."""
         if self.plugged:
             self.plugged = False
             os.close(self.master)
@@ -225,10 +225,10 @@ def _answer(line: bytes, *of: Any) -> dict[str, Any]:
 
 
 def serve(config: CreateEmulatorConfig) -> None:
-    """Serves until the process ends."""
+    """Emulates a Create until the process ends."""
     robot, faults, terminal = EmulatedCreate(config), LineFaults(config.seed), Terminal()
     print(terminal.path, flush=True)
-    out: list[tuple[float, bytes]] = []  # when each piece is due
+    out: list[tuple[float, bytes]] = []  # (due time, bytes)
     orders, last, listening = b"", time.monotonic(), True
     while True:
         inputs = [terminal.master] * terminal.plugged + [0] * listening
@@ -259,8 +259,8 @@ def serve(config: CreateEmulatorConfig) -> None:
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(prog="python -m robot.emulators.create", description=__doc__)
-    parser.add_argument("--seed", type=int, default=0, help="of the garbage on the line")
-    parser.add_argument("--wheel-base", type=float, default=WHEEL_BASE, help="m")
+    parser.add_argument("--seed", type=int, default=0, help="random seed of garbage bytes")
+    parser.add_argument("--wheel-base", type=float, default=WHEEL_BASE, help="distance between the wheels, m")
     arguments = parser.parse_args()
     serve(CreateEmulatorConfig(seed=arguments.seed, wheel_base=arguments.wheel_base))
 

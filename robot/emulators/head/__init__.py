@@ -1,4 +1,4 @@
-"""An emulated whisker head: moves whiskers in a maze and answers as over USB."""
+"""An emulated whisker head: moves whiskers in a maze and answers USB requests over TCP."""
 
 from robot.emulators.head.config import HeadEmulatorConfig
 from robot.emulators.head.server import serve

@@ -1,4 +1,4 @@
-"""`python -m robot.emulators.head --host 127.0.0.11 --config FILE.json`: serves until it is killed.
+"""`python -m robot.emulators.head --host 127.0.0.11 --config FILE.json`: runs an emulated head until killed.
 
 Prints `ready` when it listens.
 """
@@ -17,10 +17,10 @@ from tactile.base.errors import InputError
 
 
 def main(words: list[str] | None = None) -> int:
-    """The program; returns its exit code."""
+    """Runs the program; returns its exit code."""
     parser = argparse.ArgumentParser(prog="python -m robot.emulators.head", description=__doc__)
-    parser.add_argument("--host", help="address to listen at, instead of the configuration's")
-    parser.add_argument("--config", type=Path, help="JSON of a HeadEmulatorConfig; its defaults without")
+    parser.add_argument("--host", help="address to listen on; overrides the configuration")
+    parser.add_argument("--config", type=Path, help="HeadEmulatorConfig as JSON (default values if omitted)")
     asked = parser.parse_args(words)
     try:
         config = _read(asked.config)

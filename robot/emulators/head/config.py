@@ -23,7 +23,7 @@ class HeadEmulatorConfig(Settings):
     """An emulated head in a simulated maze."""
 
     host: str = "127.0.0.1"
-    """Address to listen at."""
+    """Address to listen on."""
     port: Annotated[int, Field(ge=0, le=65535)] = PORT
     """Port of the emulated USB."""
     control_port: Annotated[int, Field(ge=0, le=65535)] = CONTROL_PORT
@@ -37,13 +37,13 @@ class HeadEmulatorConfig(Settings):
     maze: MazeConfig = MazeConfig()
     """The maze."""
     path: PathConfig = PathConfig()
-    """The path for which the maze is made; the head moves along it with `follow`."""
+    """The path, which also determines the maze; the head moves along it if `follow` is set."""
     motion: MotionConfig = MotionConfig()
     """Speeds along the path."""
     seed: NonNegativeInt = 0
     """Random seed of maze, path and sensor noise, with the streams of the simulator."""
     arm: str | None = None
-    """Host of the controller whose arm carries the head; before its first state, whiskers are in free air."""
+    """Host of the controller of the carrying arm; before its first state, whiskers are in free air."""
     arm_hz: PositiveInt = 125
     """Rate of the arm's states, Hz."""
     placing: BaseTransformConfig = BaseTransformConfig()
@@ -52,15 +52,15 @@ class HeadEmulatorConfig(Settings):
     """Without an arm: whether the head moves along the path from its first START on, or stays at its start.
     """
     drift_ppm: Annotated[float, Field(ge=-1000, le=1000)] = 0.0
-    """Drift of its clock, ppm; positive is fast."""
+    """Drift of the head's clock, ppm; positive is fast."""
     age: Annotated[float, Field(ge=0)] = 0.0
-    """Time since power-on at the start, s of its clock. Times wrap at 4294.967 s, sample numbers (at 2 kHz)
-    at 2147483.6 s."""
+    """Time since power-on at the start, s of the head's clock. Times wrap at 4294.967 s, sample numbers
+    at 2147483.6 s (2 kHz)."""
     fifo: PositiveInt = 4096
     """Capacity of the frame queue."""
 
     @model_validator(mode="after")
     def _one_leads(self) -> HeadEmulatorConfig:
         if self.follow and self.arm is not None:
-            raise ValueError("`follow` is for a head without an `arm`; give one of them")
+            raise ValueError("`follow` and `arm` exclude each other; give one of them")
         return self

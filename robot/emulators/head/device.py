@@ -1,6 +1,6 @@
-"""An emulated head as seen by its host: transfers, and frames over time.
+"""An emulated head at its USB interface: transfers, and frames over time.
 
-Nothing here waits or reads a clock: times are passed in.
+Times are arguments: no function waits or reads a clock.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ class EmulatedHead:
     """A powered head.
 
     Args:
-        walls: around it. place: where it is. now: s, host's monotonic clock, when its clock begins.
+        walls: of the maze. place: pose over time. now: host time at which the head's clock starts, s.
 
     Attributes:
-        fifo: frames for the host. faults: what goes wrong with it. whiskers: what it feels with.
-        streaming: whether it makes frames. heard: commands that came, by kind; "" for those it ignored.
+        fifo: frames for the host. faults: active faults. whiskers: the simulated whiskers. streaming: whether
+        frames are made. received: number of commands by kind; "" counts ignored ones.
     """
 
     def __init__(self, config: HeadEmulatorConfig, walls: Walls, place: PoseSource, now: float) -> None:
@@ -67,7 +67,7 @@ class EmulatedHead:
         self.faults = HeadFaults(len(head.length), stream(config.seed, "faults"))
         self.streaming = False
         self.received: Counter[str] = Counter()
-        self._pace = 1 + config.drift_ppm * 1e-6  # of its clock
+        self._pace = 1 + config.drift_ppm * 1e-6  # clock rate
         self._made = 0  # samples
         self._first = round(config.age * config.stream.rate)
 
@@ -77,7 +77,7 @@ class EmulatedHead:
         return self._when(self._made + self.samples)
 
     def advance(self, now: float) -> bool:
-        """Makes the next block if it is complete by now; whether it was."""
+        """Makes the next block if it is complete at `now`, s; returns whether it was."""
         end = self.due
         if now < end:
             return False
@@ -94,12 +94,12 @@ class EmulatedHead:
         """Reads at most `size` bytes of frames.
 
         Raises:
-            OSError: as the transfer ends.
+            OSError: EPIPE while the endpoint is halted.
         """
         return self.fifo.take(size) if self.faults.check_in(now) else b""
 
     def bulk_out(self, packet: bytes, now: float) -> None:
-        """Takes a command; an invalid one is ignored."""
+        """Executes a command packet; an invalid one is ignored and counted."""
         command = unpack_command(packet)
         if command is None:
             self.received[""] += 1
@@ -108,10 +108,10 @@ class EmulatedHead:
         self.whiskers.drives.receive(command, now)
 
     def control(self, kind: int, request: int, value: int, size: int, now: float) -> bytes:
-        """The answer to a control request, cut to the size.
+        """The answer to a control request, at most `size` bytes.
 
         Raises:
-            OSError: EPIPE for one that it does not know.
+            OSError: EPIPE for an unsupported request.
         """
         if (kind, request) == STRING and value >> 8 == 3:
             answer = usb_descriptors.string(value & 0xFF)
@@ -127,25 +127,25 @@ class EmulatedHead:
             raise OSError(errno.EPIPE, os.strerror(errno.EPIPE))
         return answer[:size]
 
-    def do(self, asked: dict[str, Any], now: float) -> dict[str, Any]:
+    def do(self, request: dict[str, Any], now: float) -> dict[str, Any]:
         """Starts a fault, or returns counts or state: {"do": name, ...}.
 
         Raises:
-            ValueError, TypeError: what is asked for cannot be done.
+            ValueError, TypeError: unknown fault or invalid arguments.
         """
-        told = dict(asked)
-        name = str(told.pop("do", ""))
+        arguments = dict(request)
+        name = str(arguments.pop("do", ""))
         if name == "counts":
             return self.counts()
         if name == "state":
             return self.state(now)
-        self.faults.do(name, now, told)
+        self.faults.do(name, now, arguments)
         if name == "unplug":
             self.halt()
         return {"ok": True}
 
     def halt(self) -> None:
-        """Retracts, stops making frames and drops those not read."""
+        """Retracts the whiskers, stops making frames and drops unread ones."""
         self.streaming = False
         self.whiskers.drives.stop()
         self.fifo.clear()
@@ -206,7 +206,7 @@ class EmulatedHead:
         flags = np.where(block.begins, FrameFlag.CYCLE, 0) | (FrameFlag.RCP if block.fed_back else 0)
         values = frame_values(block.angle, block.deflection)
         values = self.faults.saturate_values(values, self.config.stream.full_scale, now)
-        some = slice(self.samples - self.faults.count_kept(self.samples), None)
+        some = slice(self.samples - self.faults.count_unskipped(self.samples), None)
         sample = self._made + np.arange(self.samples)[some]
         if len(sample) == 0:
             return
@@ -220,7 +220,7 @@ class EmulatedHead:
         self.fifo.push(self.faults.damage_frames(frames))
 
     def _clock(self, now: float) -> int:
-        """Time since power-on by its own clock, us."""
+        """Time since power-on by the head's clock, us."""
         seconds = self.config.age + (now - self.began) * self._pace
         return max(round(seconds * 1e6) + self.faults.jump, 0)
 

@@ -19,8 +19,8 @@ class HeadFaults:
     """Active faults; times are the host's monotonic clock, s.
 
     Attributes:
-        plugged: whether the head is on the bus. plugs: how often it was plugged in; connections opened before
-            the last time are lost. skipped: number of skipped frames. jump: offset of its clock, us.
+        plugged: whether the head is on the bus. plugs: number of times it was plugged in; earlier connections
+            are invalid. skipped: number of skipped frames. jump: offset of the head's clock, us.
     """
 
     def __init__(self, whiskers: int, random: np.random.Generator) -> None:
@@ -31,8 +31,8 @@ class HeadFaults:
         self._saturated: dict[int, float] = {}
         self._halted, self._halted_until, self._silent_until = False, -np.inf, -np.inf
         self.known: dict[str, Callable[..., None]] = {
-            "unplug": self._unplugged,
-            "plug": self._plugged,
+            "unplug": self._unplug,
+            "plug": self._plug,
             "stall": self._stall,
             "silence": self._silence,
             "garbage": lambda now, bytes=64: self._count("_garbage", bytes),
@@ -45,21 +45,21 @@ class HeadFaults:
         }
         """Faults by name; each takes the time and its arguments."""
 
-    def do(self, name: str, now: float, told: dict[str, Any]) -> None:
+    def do(self, name: str, now: float, arguments: dict[str, Any]) -> None:
         """Starts a fault.
 
         Raises:
-            ValueError, TypeError: it is not known, or is not told what it takes.
+            ValueError, TypeError: unknown fault or invalid arguments.
         """
         if name not in self.known:
             raise ValueError(f"{name!r}; known are {', '.join(self.known)}, counts, state")
-        self.known[name](now, **told)
+        self.known[name](now, **arguments)
 
     def check_in(self, now: float) -> bool:
-        """Whether the endpoint of frames returns data.
+        """Whether the frame endpoint returns data.
 
         Raises:
-            OSError: EPIPE while it is halted.
+            OSError: EPIPE while the endpoint is halted.
         """
         if self._halted or now < self._halted_until:
             self._halted = True
@@ -71,7 +71,7 @@ class HeadFaults:
         self._halted = False
 
     def saturate_values(self, values: np.ndarray, full_scale: float, now: float) -> np.ndarray:
-        """Values [T, W, 3] with saturated whiskers."""
+        """Values [T, W, 3], with the deflections of saturated whiskers at full scale (rad)."""
         for whisker, until in list(self._saturated.items()):
             if now < until:
                 values[:, whisker, 1:] = to_counts(np.array(full_scale))
@@ -79,15 +79,15 @@ class HeadFaults:
                 del self._saturated[whisker]
         return values
 
-    def count_kept(self, count: int) -> int:
-        """How many of the next frames, counted from the last, are not skipped."""
+    def count_unskipped(self, count: int) -> int:
+        """Number of frames to send of the next `count`; the first ones are skipped."""
         out = min(self._skip, count)
         self._skip -= out
         self.skipped += out
         return count - out
 
     def damage_frames(self, frames: list[bytes]) -> list[bytes]:
-        """The frames with damage; their numbers stay."""
+        """The frames after pending faults (corrupt, garbage, swap); their number is unchanged."""
         for k in range(min(self._corrupt, len(frames))):
             place = HEADER + int(self._random.integers(len(frames[k]) - HEADER))
             frames[k] = frames[k][:place] + bytes([frames[k][place] ^ 0x55]) + frames[k][place + 1 :]
@@ -103,10 +103,10 @@ class HeadFaults:
     def _count(self, name: str, more: int) -> None:
         setattr(self, name, getattr(self, name) + int(more))
 
-    def _unplugged(self, now: float) -> None:
+    def _unplug(self, now: float) -> None:
         self.plugged = False
 
-    def _plugged(self, now: float) -> None:
+    def _plug(self, now: float) -> None:
         self.plugs += not self.plugged
         self.plugged, self._halted, self._halted_until = True, False, -np.inf
 

@@ -1,4 +1,4 @@
-"""Queue of frames, with exact counts of those lost."""
+"""Queue of frames, with exact counts of lost frames."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ class Fifo:
     """A bounded queue; frames made while it is full are lost.
 
     Attributes:
-        made, sent, lost, dropped: frames ever given to it, read from it whole, lost because it was full, and
-            thrown away with the rest by `clear`. made = sent + lost + dropped + those still in it.
+        made, sent, lost, dropped: number of frames pushed, completely read, lost because the queue was full,
+            and dropped by `clear`; made = sent + lost + dropped + len(fifo).
         overran: whether the newest frame was lost.
     """
 
@@ -20,7 +20,7 @@ class Fifo:
         self.made = self.sent = self.lost = self.dropped = 0
         self.overran = False
         self._frames: deque[bytes] = deque()
-        self._begun = b""  # the rest of a frame of which a part was read
+        self._begun = b""  # the unread rest of a partly read frame
 
     def __len__(self) -> int:
         """Number of frames in the queue."""
@@ -40,7 +40,7 @@ class Fifo:
         self.overran = len(fits) < len(frames)
 
     def take(self, size: int) -> bytes:
-        """At most `size` bytes."""
+        """Removes and returns at most `size` bytes."""
         parts, left = [], size
         while left and (self._begun or self._frames):
             frame = self._begun or self._frames.popleft()

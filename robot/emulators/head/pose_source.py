@@ -11,7 +11,7 @@ from robot.drivers.ur10.pose_listener import PoseListener
 from robot.world.head_trajectory import HeadPath, poses_at
 
 AHEAD = 0.1
-"""Time for which a pose is extrapolated by the arm's speed, s; then the head counts as standing there."""
+"""Longest extrapolation of a pose by the arm's speed, s; after that the head stands still."""
 
 
 class PoseSource(Protocol):
@@ -40,19 +40,19 @@ class CarriedByArm:
         tool = np.array(newest.tcp, float)
         tool[:3] += ahead * newest.speed[:3]
         pose, lift = pose_from_tcp(self.placing, tool)
-        # The arm's turning axis and that of the map's headings are both vertical.
+        # The rotation axes of the arm and of the map's headings are both vertical.
         return pose + np.array([0.0, 0.0, ahead * float(newest.speed[5])]), float(lift)
 
 
 class AlongPath:
-    """Along a path, from the time given to `begin`; before, at its start."""
+    """A motion along a path that starts at the time given to `begin`; before, the path's first pose."""
 
     def __init__(self, path: HeadPath) -> None:
         self.path = path
         self.began: float | None = None
 
     def begin(self, time: float) -> None:
-        """Starts, if it has not yet."""
+        """Starts the motion at a time, s; later calls have no effect."""
         self.began = time if self.began is None else self.began
 
     def at(self, time: float) -> tuple[np.ndarray, float]:

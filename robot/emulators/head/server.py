@@ -67,7 +67,7 @@ async def _run_server(config: HeadEmulatorConfig, bridge: EmulatedHead) -> None:
 
 
 def _ignore_disconnects(client: Client) -> Client:
-    """Wraps a client handler so that its end is not an error."""
+    """Wraps a client handler so that a disconnection is not an error."""
 
     async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         with contextlib.suppress(*ENDS):
@@ -83,20 +83,19 @@ class HeadServer:
     def __init__(self, bridge: EmulatedHead) -> None:
         self.bridge = bridge
         self._changed = asyncio.Event()
-        self._owner: tuple[object, int] | None = None  # of the interface, and when it was plugged in
+        self._owner: tuple[object, int] | None = None  # connection and plug count
 
     async def run(self) -> None:
         """Makes blocks when they are due."""
         while True:
             if self.bridge.advance(time.monotonic()):
-                self._tell()
+                self._notify()
                 await asyncio.sleep(0)
             else:
                 await asyncio.sleep(self.bridge.due - time.monotonic())
 
     async def usb(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """A connection of `robot.drivers.head.usb_tcp_protocol`; it belongs to the device as plugged in
-        when it began."""
+        """Serves a connection of `robot.drivers.head.usb_tcp_protocol` until the head is unplugged."""
         plugs = self.bridge.faults.plugs
         try:
             while True:
@@ -105,7 +104,7 @@ class HeadServer:
                 takes = op in (Op.CONTROL, Op.BULK) and not address & IN
                 data = await reader.readexactly(length) if takes else b""
                 try:
-                    status, answer = 0, await self._answered(header, data, plugs, writer)
+                    status, answer = 0, await self._answer(header, data, plugs, writer)
                 except OSError as error:
                     status, answer = -(error.errno or errno.EIO), b""
                 writer.write(ANSWER.pack(status, len(answer)) + answer)
@@ -114,17 +113,17 @@ class HeadServer:
             self._release(writer)
 
     async def faults(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Answers each line of JSON by a line of JSON."""
+        """Executes fault requests: one JSON line each, answered by one JSON line."""
         while line := await reader.readline():
             try:
                 answer = self.bridge.do(dict(json.loads(line)), time.monotonic())
             except (TypeError, ValueError) as error:
                 answer = {"ok": False, "error": str(error)}
-            self._tell()
+            self._notify()
             writer.write(json.dumps(answer).encode() + b"\n")
             await writer.drain()
 
-    async def _answered(self, header: tuple[int, ...], data: bytes, plugs: int, connection: object) -> bytes:
+    async def _answer(self, header: tuple[int, ...], data: bytes, plugs: int, connection: object) -> bytes:
         op, address, request, value, _, timeout, length = header
         bridge, now = self.bridge, time.monotonic()
         self._present(plugs)
@@ -152,7 +151,7 @@ class HeadServer:
         return b""
 
     async def _frames(self, size: int, timeout: int, plugs: int) -> bytes:
-        """Frames, as soon as there are any.
+        """Waits for frames and returns at most `size` bytes of them.
 
         Args:
             timeout: ms, 0 for none.
@@ -177,7 +176,7 @@ class HeadServer:
         if self._owner is not None and self._owner[0] is connection:
             self._owner = None
 
-    def _tell(self) -> None:
+    def _notify(self) -> None:
         """Wakes connections that wait for frames."""
         self._changed.set()
         self._changed.clear()

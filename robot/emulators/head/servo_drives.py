@@ -1,6 +1,6 @@
-"""Drives of an emulated head: whisk, rest, and retract without commands.
+"""Drives of an emulated head: they whisk, rest, and retract if no commands arrive.
 
-A whisk starts with a block of samples or at the end of the one before.
+A whisk starts at the start of a block of samples or at the end of the previous whisk.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ class WhiskCommand(NamedTuple):
     """A commanded whisk.
 
     Attributes:
-        whisking: the law. samples: of a cycle. offset: rad; the drives can reach it and the
-            amplitude together. threshold: [W] rad. feedback: whether the law is told deflections; else the
-            host tells amplitudes. amplitude: [W] rad, of a whisk without feedback.
+        whisking: settings of the whisking law. samples: samples per cycle. offset: added to all angles, rad;
+            with the amplitude it is within the limit of the drives. threshold: [W] rad. feedback: whether the
+            law uses deflections; if not, the host sends amplitudes. amplitude: [W] rad, without feedback.
     """
 
     whisking: WhiskingConfig
@@ -47,7 +47,7 @@ class ServoDrives:
     """The drives of one head, sample by sample.
 
     Attributes:
-        whisk: what they do now; None while they rest or retract. sample: of the cycle, that comes next.
+        whisk: the whisk in progress; None at rest or during retraction. sample: next sample of the cycle.
     """
 
     def __init__(self, head: Head, rate: float) -> None:
@@ -57,11 +57,11 @@ class ServoDrives:
         self._next: WhiskCommand | None = None
         self._heard, self._stopped = -np.inf, False
         self._centre = np.zeros(len(head.length))
-        self._from: np.ndarray | None = None  # where retraction began
+        self._from: np.ndarray | None = None  # angles at the start of the retraction
 
     @property
     def resting(self) -> bool:
-        """Whether they are at rest, with no command pending."""
+        """Whether the drives are at rest and no command is pending."""
         return self.whisk is None and self._next is None and self._from is None
 
     @property
@@ -75,34 +75,34 @@ class ServoDrives:
     def _retraction(self) -> int:
         return round(RETRACTION * self.rate)
 
-    def receive(self, told: Command, time: float) -> None:
-        """Takes a command received at a time (s, of the clock passed to `begin`)."""
+    def receive(self, command: Command, time: float) -> None:
+        """Stores a command received at a time, s (the clock of `begin`)."""
         self._heard = time
-        if told.kind == CommandKind.DRIVE:
-            self._next = self._made(told) or self._next
-        elif told.kind == CommandKind.CENTRE and len(told.numbers) == len(self._centre):
-            self._centre = told.numbers * ANGLE
+        if command.kind == CommandKind.DRIVE:
+            self._next = self._make_whisk(command) or self._next
+        elif command.kind == CommandKind.CENTRE and len(command.numbers) == len(self._centre):
+            self._centre = command.numbers * ANGLE
         elif (
-            told.kind == CommandKind.AMPLITUDES
+            command.kind == CommandKind.AMPLITUDES
             and self.whisk is not None
-            and len(told.numbers) == len(self._centre)
+            and len(command.numbers) == len(self._centre)
             and not self.whisk.feedback
         ):
             most = self.head.limit - self.whisk.offset
-            self.whisk = self.whisk._replace(amplitude=np.clip(told.numbers * ANGLE, 0.0, most))
+            self.whisk = self.whisk._replace(amplitude=np.clip(command.numbers * ANGLE, 0.0, most))
 
     def stop(self) -> None:
-        """Retracts, whatever was commanded before."""
+        """Retracts and discards pending commands."""
         self._stopped, self._next = True, None
 
     def begin(self, time: float, balance: WhiskerBalance) -> WhiskerBalance:
-        """What is to be done from here on; called at each beginning of a block and wherever `left` ended.
+        """Selects the next activity; called at the start of each block and when `left` samples have passed.
 
         Args:
-            time: s. balance: where the whiskers are.
+            time: s. balance: state of the whiskers.
 
         Returns:
-            where they are: still, at the beginning of a cycle.
+            state of the whiskers: at rest at the beginning of a cycle.
         """
         silent = time - self._heard > COMMAND_TIMEOUT
         self._next = None if silent else self._next
@@ -124,34 +124,34 @@ class ServoDrives:
             return whiskers_at_rest(*balance.before.shape)
         return balance
 
-    def law(self, drive: WhiskDrive, time: float, told: np.ndarray) -> tuple[np.ndarray, WhiskDrive]:
-        """A `robot.simulation.head.quasistatic.WhiskingLaw`; time since the whisk or the retraction began."""
+    def law(self, drive: WhiskDrive, time: float, deflection: np.ndarray) -> tuple[np.ndarray, WhiskDrive]:
+        """A `robot.simulation.head.quasistatic.WhiskingLaw`; `time` counts from the start of the whisk."""
         if self.whisk is None:
             share = 0.0 if self._from is None else max(1 - time / RETRACTION, 0.0)
-            return np.zeros_like(told) + (0.0 if self._from is None else self._from * share), drive
+            return np.zeros_like(deflection) + (0.0 if self._from is None else self._from * share), drive
         whisk = self.whisk
         if whisk.feedback:
-            heard = told - self._centre
-            aim, drive = whisk_command(whisk.whisking, drive, time, heard, whisk.threshold, self.head.shape)
+            bend = deflection - self._centre
+            aim, drive = whisk_command(whisk.whisking, drive, time, bend, whisk.threshold, self.head.shape)
         else:
-            aim = np.zeros_like(told) + whisk.amplitude * whisk_phase(whisk.whisking, time)
+            aim = np.zeros_like(deflection) + whisk.amplitude * whisk_phase(whisk.whisking, time)
         return aim + whisk.offset if whisk.offset else aim, drive
 
-    def _made(self, told: Command) -> WhiskCommand | None:
-        """The whisk that a command requests; None, to continue as before, beyond the limits of the drives."""
+    def _make_whisk(self, command: Command) -> WhiskCommand | None:
+        """The whisk of a command; None (no change) if it exceeds the limits of the drives."""
         threshold = np.full(len(self._centre), np.inf)
-        numbers = told.numbers[: len(threshold)]
+        numbers = command.numbers[: len(threshold)]
         threshold[: len(numbers)] = np.where(numbers == NO_THRESHOLD, np.inf, numbers * ANGLE)
-        feedback = told.mode == FeedbackMode.RCP
-        offset = min(max(told.offset, 0.0), self.head.limit)
-        amplitude = min(told.amplitude, self.head.limit - offset)
+        feedback = command.mode == FeedbackMode.RCP
+        offset = min(max(command.offset, 0.0), self.head.limit)
+        amplitude = min(command.amplitude, self.head.limit - offset)
         try:
             whisking = WhiskingConfig(
                 mode="rcp" if feedback else "open",
-                rate=told.frequency,
+                rate=command.frequency,
                 amplitude_deg=float(np.degrees(amplitude)),
-                gain=told.gain,
-                window=told.window if feedback else WhiskingConfig().window,
+                gain=command.gain,
+                window=command.window if feedback else WhiskingConfig().window,
             )
         except ValidationError:
             return None

@@ -1,4 +1,4 @@
-"""What the emulated bridge says about itself on the bus."""
+"""USB descriptors of the emulated bridge."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ import struct
 from robot.drivers.head.protocol import ENDPOINT_IN, ENDPOINT_OUT, INTERFACE, PRODUCT, VENDOR
 
 STRINGS = ("", "ratslam", "emulated whisker head", "EMULATED")
-"""By their number: none, manufacturer, product, serial."""
+"""String descriptors by index: none, manufacturer, product, serial."""
 LANGUAGE = 0x0409
-"""Of the strings: English."""
+"""Language of the strings: English."""
 PACKET = 512
-"""Bytes of a bulk packet, high speed."""
+"""Size of a high-speed bulk packet, bytes."""
 
 
 def device() -> bytes:
-    """The device descriptor, USB 2.0, a class of the vendor's own."""
+    """The device descriptor: USB 2.0, vendor-specific class."""
     return struct.pack("<BBHBBBBHHHBBBB", 18, 1, 0x0200, 0xFF, 0, 0, 64, VENDOR, PRODUCT, 0x0100, 1, 2, 3, 1)
 
 
 def configuration() -> bytes:
-    """The only configuration: self-powered, an interface, bulk endpoints in and out."""
+    """The only configuration descriptor: self-powered, one interface, bulk endpoints in and out."""
     interface = struct.pack("<9B", 9, 4, INTERFACE, 0, 2, 0xFF, 0, 0, 0)
     ends = b"".join(struct.pack("<BBBBHB", 7, 5, end, 2, PACKET, 0) for end in (ENDPOINT_IN, ENDPOINT_OUT))
     size = 9 + len(interface) + len(ends)
@@ -28,7 +28,7 @@ def configuration() -> bytes:
 
 
 def string(number: int) -> bytes | None:
-    """A string descriptor; that of number 0 names the language. None where there is none."""
+    """The string descriptor with an index; index 0 gives the language. None if it does not exist."""
     if not 0 <= number < len(STRINGS):
         return None
     text = STRINGS[number].encode("utf-16-le") if number else struct.pack("<H", LANGUAGE)

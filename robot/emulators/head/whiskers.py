@@ -1,4 +1,4 @@
-"""The whiskers of an emulated head, in blocks of samples as time goes on."""
+"""The whiskers of an emulated head, simulated in blocks of samples."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ class Block(NamedTuple):
 
 
 class Whiskers:
-    """Whiskers with their state from block to block, and the walls around them.
+    """The whiskers with their state between blocks, and the walls.
 
     Attributes:
-        drives: which take commands. pose, lift: where the head was at the end of the last block.
+        drives: the drives, which receive commands. pose, lift: of the head at the end of the last block.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class Whiskers:
             first, left = self.drives.sample, self.drives.left
             begins[done] = self.drives.whisk is not None and first == 0
             count = size - done if left is None else min(size - done, left)
-            # Time counts from the start of the whisk, which may be within the block.
+            # Time counts from the start of the whisk, possibly within the block.
             knots = np.array([first - done, first - done + size]) / rate
             time = (first + np.arange(count)) / rate
             sweep = self._sweep(pose, knots, time, noise[:, done : done + count])
@@ -101,7 +101,7 @@ class Whiskers:
         return WallSweep(time, nothing + NO_CONTACT, nothing + 1.0, nothing, noise)
 
     def _surroundings(self) -> Surroundings:
-        """The walls as seen by a lifted head: lower by the lift."""
+        """The walls relative to a lifted head: lower by the lift, m."""
         lift = STEP * round(self.lift / STEP)
         if self._around is None or lift != self._lowered:
             lower = self.walls._replace(height=self.walls.height - lift)

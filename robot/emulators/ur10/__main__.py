@@ -1,4 +1,4 @@
-"""`python -m robot.emulators.ur10`: an emulated controller on its own address until the process is ended."""
+"""`python -m robot.emulators.ur10`: runs an emulated controller until the process is ended."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from robot.emulators.ur10 import UrEmulatorConfig, serve
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m robot.emulators.ur10", description=__doc__)
-    parser.add_argument("--config", help="settings as JSON; the other options go before them")
+    parser.add_argument("--config", help="settings as JSON; the other options override them")
     parser.add_argument("--host", help="address to listen on (127.0.0.11)")
-    parser.add_argument("--hz", type=int, choices=(125, 500), help="control steps a second (125)")
-    parser.add_argument("--polyscope", help="its version (3.15.8 at 125 Hz, 5.11.0 at 500 Hz)")
+    parser.add_argument("--hz", type=int, choices=(125, 500), help="control steps per second (125)")
+    parser.add_argument("--polyscope", help="PolyScope version (3.15.8 at 125 Hz, 5.11.0 at 500 Hz)")
     parser.add_argument("--start", type=float, nargs=6, metavar=("x", "y", "z", "rx", "ry", "rz"))
     given: dict[str, Any] = {
         key: value for key, value in vars(parser.parse_args()).items() if value is not None

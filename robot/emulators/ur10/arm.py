@@ -1,4 +1,4 @@
-"""The emulated arm: executes orders step by step and meets walls."""
+"""The emulated arm: executes orders in control steps; walls push its tool."""
 
 from __future__ import annotations
 
@@ -21,22 +21,15 @@ from robot.emulators.ur10.motion import (
 from robot.emulators.ur10.rotation import Vector6
 from robot.emulators.ur10.urscript_moves import MoveL, MoveOrder, StopL, start_motion
 
-NEAR: Vector6 = (
-    0.0,
-    -1.6,
-    -1.6,
-    -1.6,
-    1.57,
-    0.0,
-)  # elbow up, tool down: which of eight postures it starts in
+NEAR: Vector6 = (0.0, -1.6, -1.6, -1.6, 1.57, 0.0)  # posture at the start, rad: elbow up, tool down
 
 
 class EmulatedArm:
-    """Joints and tool over time.
+    """State of the emulated arm.
 
     Attributes:
-        state: where it is. force: N and Nm at the tool, in the base. penetration_max: deepest in a wall, m.
-        scale: the speed slider, 0 to 1.
+        state: joints and tool. force: [6] at the tool in the base frame, N and Nm. penetration_max: largest
+        depth in a wall, m. scale: speed slider, 0 to 1.
     """
 
     def __init__(self, config: UrEmulatorConfig) -> None:
@@ -55,7 +48,7 @@ class EmulatedArm:
 
     @property
     def busy(self) -> bool:
-        """Whether it moves or has orders left."""
+        """Whether the arm moves or has unfinished orders."""
         return self._motion is not None or bool(self._queue)
 
     @property
@@ -64,18 +57,18 @@ class EmulatedArm:
 
     @property
     def remaining(self) -> list[MoveOrder]:
-        """Orders not finished yet."""
+        """Unfinished orders."""
         return ([self._order] if self._order is not None else []) + list(self._queue)
 
     def place(self, tcp: Vector6) -> None:
-        """Places the arm elsewhere at once, as if moved by hand. Raises `Unreachable`."""
+        """Sets the tool pose [6] (m, rotation vector rad) at once. Raises `Unreachable`."""
         self.state = MotionState(tcp, ZERO, self.model.backward(tcp, self.state.joints), ZERO)
         self._motion, self._order = None, None
         self._queue.clear()
         self._update_force()
 
     def set_tool(self, tool: Vector6) -> None:
-        """Sets the tool's pose in the flange; the joints stay."""
+        """Sets the tool's pose [6] in the flange frame (m, rotation vector rad); the joints stay."""
         self.model = self.model.with_tool(tool)
         self.state = self.state._replace(tcp=self.model.forward(self.state.joints))
 
@@ -87,13 +80,13 @@ class EmulatedArm:
         self._motion, self._order = None, None
 
     def halt(self, acceleration: float) -> None:
-        """Drops all orders and stops, m/s^2."""
+        """Drops all orders and stops with a deceleration, m/s^2."""
         self._queue.clear()
         self._order = None
         self._motion = ToolSpeedMotion(ZERO, acceleration, self.turn_ratio) if self.moving else None
 
     def step(self, dt: float) -> None:
-        """Advances one control step. Raises `Unreachable`; the arm then stands."""
+        """Advances by a control step, s. Raises `Unreachable` and stops at once if the pose has no joints."""
         try:
             while self._motion is None and self._queue:
                 self._order = self._queue.popleft()
@@ -140,7 +133,7 @@ def penetration(wall: WallConfig, tcp: Vector6) -> float:
 
 
 def wall_force(walls: Iterable[WallConfig], tcp: Vector6) -> Vector6:
-    """Force of the walls on the tool: springs that push it out, N."""
+    """Force [6] of the walls on the tool, N: linear springs."""
     force = [0.0, 0.0, 0.0]
     for wall in walls:
         force["xyz".index(wall.axis)] -= wall.solid * wall.stiffness * penetration(wall, tcp)

@@ -9,7 +9,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat
 from robot.emulators.ur10.rotation import Vector6
 from tactile.base.config import Settings
 
-SCRIPT_PORT, DASHBOARD_PORT = 30003, 29999  # fixed: the client library knows no others
+SCRIPT_PORT, DASHBOARD_PORT = 30003, 29999  # fixed in the client library
 FAULT_PORT = 30098
 
 
@@ -27,7 +27,7 @@ class WallConfig(Settings):
 
 
 class Version(NamedTuple):
-    """PolyScope's version, which is also the controller's."""
+    """Version of PolyScope and of the controller."""
 
     major: int
     minor: int
@@ -40,7 +40,7 @@ class UrEmulatorConfig(Settings):
     host: str = "127.0.0.11"
     """Address to listen on; the ports are the real ones, so every emulator needs an address of its own."""
     hz: Literal[125, 500] = 125
-    """Control steps and states a second: 125 for a CB3 (a UR-10 of 2016), 500 for an e-Series."""
+    """Control steps and states per second: 125 for a CB3 (a UR-10 of 2016), 500 for an e-Series."""
     polyscope: Annotated[str, Field(pattern=r"^(\d+\.\d+(\.\d+)?)?$")] = ""
     """PolyScope's version; "" means 3.15.8 at 125 Hz and 5.11.0 at 500 Hz."""
     start: Vector6 = (0.6, 0.0, 0.3, 3.141592653589793, 0.0, 0.0)

@@ -1,4 +1,4 @@
-"""The control program that ur_rtde uploads, as its client sees it: commands come through registers.
+"""The control program that ur_rtde uploads, emulated at its registers.
 
 The client writes the number of a command into integer register 0 and its arguments into others. The program
 writes 1 to output register 0 when it is ready and 2 when it has executed a command; then the client writes 0.
@@ -31,22 +31,22 @@ class ControlProgram:
     """The running control program of ur_rtde.
 
     Args:
-        controller: on which it runs. text: as uploaded.
+        controller: executes the commands. text: the uploaded program.
     """
 
     def __init__(self, controller: EmulatedController, text: str) -> None:
         offset = _OFFSET.search(text)
-        self._offset = int(offset[1]) if offset else 0  # first register used, of either kind
+        self._offset = int(offset[1]) if offset else 0  # first integer and double register in use
         self._controller, self._registers = controller, controller.registers
         self._executing = False
-        self._waiting = False  # for the arm, before the command is done
+        self._waiting = False  # the command is done when the arm is
         self._operating = False  # an asynchronous move or stop is under way
         self._writes = self._operation = 0
         self._report_operation(running=False)
         self._answer(READY)
 
     def step(self) -> bool:
-        """One control step; False when the program has ended. Raises `Unreachable`, which ends it too."""
+        """Runs one control step; False when the program has ended. `Unreachable` ends it too."""
         busy = self._controller.arm.busy
         if not busy:
             self._end_operation()
@@ -88,7 +88,7 @@ class ControlProgram:
             self._registers.put_int(self._offset + 1, int(controller.solvable(vector)))
 
     def _order(self, kind: str, order: MoveOrder) -> None:
-        """Replaces the arm's orders; the command is done when the arm is, or at once if asynchronous."""
+        """Replaces the arm's orders; an asynchronous command is done at once, any other with the arm."""
         self._end_operation()
         self._controller.record_target(kind, order)
         self._controller.arm.order([order])
@@ -107,7 +107,7 @@ class ControlProgram:
             self._report_operation(running=False)
 
     def _report_operation(self, *, running: bool) -> None:
-        """Writes the state of the asynchronous operation; a running one is a new one."""
+        """Writes the state of the asynchronous operation; `running` starts a new one."""
         self._writes = (self._writes + 1) % 128
         self._operation = (self._operation + running) % 128
         word = self._writes << 16 | self._operation << 24 | RUNNING_BIT * running
@@ -115,7 +115,7 @@ class ControlProgram:
 
 
 class ScriptProgram:
-    """Any other program: its linear moves in order, then the end."""
+    """Any other program: executes its linear moves in order, then ends."""
 
     def __init__(self, controller: EmulatedController, text: str) -> None:
         self._controller = controller
@@ -125,7 +125,7 @@ class ScriptProgram:
         controller.arm.order(moves)
 
     def step(self) -> bool:
-        """One control step; False when the program has ended."""
+        """Runs one control step; False when the program has ended."""
         return self._controller.arm.busy
 
 

@@ -14,7 +14,7 @@ from robot.emulators.ur10.rotation import Vector6
 from robot.emulators.ur10.safety import BITS, RobotMode, Runtime, SafetyMode, StatusBits
 from robot.emulators.ur10.urscript_moves import MoveL, MoveOrder
 
-MAX_TARGETS = 10_000  # orders remembered: what "state" tells within a control step or two
+MAX_TARGETS = 10_000  # orders kept for the fault request "state"
 
 
 class Program(Protocol):
@@ -26,7 +26,7 @@ class Program(Protocol):
 
 
 class EmulatedController:
-    """An emulated controller. `tick` is one control step; all else is what clients do to it between steps."""
+    """An emulated controller. `tick` runs a control step; clients call the other methods between steps."""
 
     def __init__(
         self, config: UrEmulatorConfig, load_program: Callable[[EmulatedController, str], Program]
@@ -45,9 +45,9 @@ class EmulatedController:
         self.remote = config.remote
         self.targets: deque[dict[str, Any]] = deque(maxlen=MAX_TARGETS)
         self.watchdog_stops = self.program_stops = self.programs = 0
-        self._uploaded: tuple[float, str] | None = None  # when it starts, and what
+        self._uploaded: tuple[float, str] | None = None  # start time s, program
         self._resumed: list[MoveOrder] = []
-        self._watchdog: tuple[float, int, float] | None = None  # s of patience, register, set at
+        self._watchdog: tuple[float, int, float] | None = None  # timeout s, register, start s
         self._stopped_at = -1e9
         self.publish()
 
@@ -55,8 +55,8 @@ class EmulatedController:
         """Advances one control step at a host time, s."""
         self.time += self.dt
         if self._watchdog is not None:
-            patience, register, since = self._watchdog
-            if host - max(self.registers.written[register], since) > patience:
+            timeout, register, since = self._watchdog
+            if host - max(self.registers.written[register], since) > timeout:
                 self.watchdog_stops += 1
                 self.stop_program()
         if self._uploaded is not None and self.time >= self._uploaded[0]:
@@ -71,7 +71,7 @@ class EmulatedController:
             self.stop_program()
         try:
             self.arm.step(self.dt)
-        except Unreachable:  # on its way: a real arm would stop for safety
+        except Unreachable:  # during a move: a real arm would make a safety stop
             self.protective_stop()
         if (
             force_magnitude(self.arm.force) > self.config.protective_force
@@ -81,7 +81,7 @@ class EmulatedController:
         self.publish()
 
     def watch(self, frequency: float, register: int) -> None:
-        """Stops the program when a register is written less often than this."""
+        """Stops the program when a register is written less often than `frequency`, Hz; 0 turns this off."""
         self._watchdog = (
             (1 / frequency, register, self.registers.written[register]) if frequency > 0 else None
         )
@@ -108,7 +108,7 @@ class EmulatedController:
         self.arm.halt(self.config.halt)
 
     def protective_stop(self) -> None:
-        """Stops the arm; no motion until unlocked, the program is paused."""
+        """Stops the arm and pauses the program until `unlock`."""
         self._stop(SafetyMode.PROTECTIVE_STOP)
 
     def safeguard_stop(self) -> None:
@@ -133,7 +133,7 @@ class EmulatedController:
         self.arm.halt(self.config.brake)
 
     def unlock(self) -> bool:
-        """Ends a protective stop; not before `unlock_wait`."""
+        """Ends a protective stop; False before `unlock_wait` has passed."""
         if self.safety is SafetyMode.PROTECTIVE_STOP:
             if self.time - self._stopped_at < self.config.unlock_wait:
                 return False
@@ -156,7 +156,7 @@ class EmulatedController:
                 self.stop_program()
 
     def solve(self, tcp: Vector6) -> Vector6:
-        """Joints for a tool pose. Raises `Unreachable`."""
+        """Joints [6] (rad) for a tool pose [6] (m, rotation vector rad). Raises `Unreachable`."""
         if self.ik_fails:
             raise Unreachable("requested failure")
         return self.arm.model.backward(tcp, self.arm.state.joints)

@@ -1,4 +1,4 @@
-"""The dashboard port: a line of text in, a line out.
+"""The dashboard port: answers each line of text with one line.
 
 Source: Universal Robots, "Dashboard Server", CB3 and e-Series.
 """
@@ -21,14 +21,14 @@ class DashboardSession:
         self._controller = controller
         self._rest = b""
 
-    def received(self, data: bytes, host: float) -> bytes:
-        """The answers, a line each."""
+    def receive(self, data: bytes, host: float) -> bytes:
+        """Executes complete lines; returns one line of answer for each."""
         *lines, self._rest = (self._rest + data).split(b"\n")
         return b"".join(
             f"{answer_command(self._controller, line.decode().strip())}\n".encode() for line in lines
         )
 
-    def closed(self) -> None:
+    def close(self) -> None:
         """Has no effect."""
 
 
@@ -51,10 +51,10 @@ def _unlock(controller: EmulatedController) -> str:
     return "Cannot unlock protective stop until 5s after occurrence. Always inspect cause of protective stop"
 
 
-def _power(mode: RobotMode, said: str) -> Callable[[EmulatedController], str]:
+def _power(mode: RobotMode, answer: str) -> Callable[[EmulatedController], str]:
     def do(controller: EmulatedController) -> str:
         controller.power(mode)
-        return said
+        return answer
 
     return do
 

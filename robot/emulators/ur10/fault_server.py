@@ -1,24 +1,24 @@
-"""The port that makes the emulator fail: one JSON object a line, answered by one JSON line.
+"""The fault port of the emulator: one JSON object per line, answered by one JSON line.
 
-{"do": "stall", "seconds": 3}      nothing is sent to or read from RTDE clients; the arm goes on
-{"do": "malformed"}                a data package with nothing in it
-{"do": "truncated"}                half a state, and the next ones behind it
-{"do": "huge"}                     a package that claims 65535 bytes
+{"do": "stall", "seconds": 3}      nothing is sent to or read from RTDE clients; the arm continues
+{"do": "malformed"}                sends an empty data package
+{"do": "truncated"}                sends half a state, then complete states
+{"do": "huge"}                     sends a package header with a length of 65535 bytes
 {"do": "nan"}                      pose and speed are NaN, until "clear"
-{"do": "freeze", "all": false}     the timestamp (or the whole state) stands still, until "clear"
-{"do": "rate", "hz": 80}           states come that often, until "clear"
+{"do": "freeze", "all": false}     the timestamp (or the whole state) is constant, until "clear"
+{"do": "rate", "hz": 80}           states are sent at this rate, until "clear"
 {"do": "close"}                    RTDE clients are disconnected
 {"do": "protective"}, {"do": "safeguard"}, {"do": "emergency"}
 {"do": "registers"}                a fieldbus holds the integer registers, until "clear"
-{"do": "ik_fails"}                 no pose has joints, until "clear"
-{"do": "slider", "fraction": 0.1}  the speed slider is moved
-{"do": "remote", "on": false}      remote control is switched
-{"do": "place", "tcp": [6]}        the arm is somewhere else at once
-{"do": "wall", "x": 0.8}           a wall at x (or y, z); "solid" 1 or -1 (else: the side the tool is not on),
-                                   "stiffness" N/m; no axis: all walls are taken away
-{"do": "clear"}                    all of these end; a safeguarded program goes on
-{"do": "state"}                    what the emulator knows: see `Faults.state`
-{"do": "die"}                      the process ends at once
+{"do": "ik_fails"}                 inverse kinematics fails, until "clear"
+{"do": "slider", "fraction": 0.1}  sets the speed slider
+{"do": "remote", "on": false}      switches remote control
+{"do": "place", "tcp": [6]}        sets the tool pose at once
+{"do": "wall", "x": 0.8}           a wall at x (or y, z); "solid" 1 or -1 (default: side without the tool),
+                                   "stiffness" N/m; without an axis: removes all walls
+{"do": "clear"}                    ends all of these; a safeguarded program resumes
+{"do": "state"}                    state of the emulator, see `ControllerFaults.state`
+{"do": "die"}                      ends the process at once
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ NAN: Value = (math.nan,) * 6
 
 
 class ControllerFaults:
-    """Active faults and their effect on what is published."""
+    """Active faults and their effect on published states."""
 
     def __init__(self, server: ControllerServer) -> None:
         self._server = server
@@ -54,7 +54,7 @@ class ControllerFaults:
     def stalled(self) -> bool:
         return time.monotonic() < self._stalled_until
 
-    def publishing(self, step: int) -> bool:
+    def sends_states(self, step: int) -> bool:
         """Whether states are sent at this control step."""
         if self.stalled:
             return False
@@ -79,7 +79,7 @@ class ControllerFaults:
         return {"ok": True}
 
     def state(self) -> dict[str, Any]:
-        """Robot time s, tool pose and speed, joints, force N; every target so far; counts; modes by name."""
+        """Robot time, s; tool pose, speed and force; joints; the last targets; counts; modes by name."""
         controller, arm = self._controller, self._controller.arm
         return {
             "time": controller.time,
@@ -145,7 +145,7 @@ class ControllerFaults:
         self._controller.emergency_stop()
 
     def _do_registers(self, request: dict[str, Any]) -> None:
-        self._server.claims.by_others = True
+        self._server.claims.held_by_fieldbus = True
 
     def _do_ik_fails(self, request: dict[str, Any]) -> None:
         self._controller.ik_fails = True
@@ -175,7 +175,7 @@ class ControllerFaults:
 
     def _do_clear(self, request: dict[str, Any]) -> None:
         self._stalled_until, self._hz, self._nan, self._frozen = -math.inf, None, False, {}
-        self._server.claims.by_others = False
+        self._server.claims.held_by_fieldbus = False
         self._controller.ik_fails = False
         self._controller.remote = self._controller.config.remote
         self._controller.arm.scale = 1.0
@@ -192,13 +192,13 @@ class FaultSession:
         self._faults = faults
         self._rest = b""
 
-    def received(self, data: bytes, host: float) -> bytes:
-        """An answer for each whole line."""
+    def receive(self, data: bytes, host: float) -> bytes:
+        """Executes complete lines; returns one JSON line of answer for each."""
         *lines, self._rest = (self._rest + data).split(b"\n")
         return b"".join(json.dumps(self._answer(line)).encode() + b"\n" for line in lines if line.strip())
 
-    def closed(self) -> None:
-        """Has no effect: faults stay."""
+    def close(self) -> None:
+        """Has no effect: faults stay active."""
 
     def _answer(self, line: bytes) -> dict[str, Any]:
         try:

@@ -1,4 +1,4 @@
-"""Where the flange is for given joints, and the joints for a given flange, in closed form: UR10 and UR10e."""
+"""Forward and inverse kinematics of the UR10 and UR10e in closed form."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 from robot.emulators.ur10.rotation import Vector6, matrix, quaternion, quaternion_of, rotation_vector
 
-EDGE = 1e-9  # rounding allowed where the arm is stretched to its end
-FREE = 1e-6  # sine of joint 5 below which joints 4 and 6 turn about one axis
+EDGE = 1e-9  # rounding tolerance at full extension
+FREE = 1e-6  # sine of joint 5 below which joints 4 and 6 count as coaxial
 
 
 class Geometry(NamedTuple):
@@ -31,13 +31,13 @@ UR10E = Geometry(0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655)
 
 
 def forward(arm: Geometry, joints: Sequence[float]) -> Vector6:
-    """The flange's pose for joints, rad. The second to fourth joint turn about one axis, so they add up."""
+    """Flange pose [6] (m, rotation vector rad) of joints [6], rad. Joints 2 to 4 are parallel: angles add."""
     q1, q2, q3, q4, q5, q6 = joints
     c1, s1, c5, s5, c6, s6 = (f(q) for q in (q1, q5, q6) for f in (math.cos, math.sin))
     c, s = math.cos(q2 + q3 + q4), math.sin(q2 + q3 + q4)
     reach = arm.a2 * math.cos(q2) + arm.a3 * math.cos(q2 + q3)
     height = arm.d1 + arm.a2 * math.sin(q2) + arm.a3 * math.sin(q2 + q3)
-    # In the frame of the plane of the arm (x out, y across, z up); across is -z of joint 2.
+    # In the frame of the arm's plane: x outwards, y along -z of joint 2, z up.
     ax, ay, az = -c * s5, -c5, -s * s5  # the flange's z axis
     x = (c * c5 * c6 - s * s6, -s5 * c6, s * c5 * c6 + c * s6)
     y = (-c * c5 * s6 - s * c6, s5 * s6, -s * c5 * s6 + c * c6)
@@ -54,10 +54,10 @@ def forward(arm: Geometry, joints: Sequence[float]) -> Vector6:
 
 
 def solutions(arm: Geometry, pose: Sequence[float], sixth: float = 0.0) -> list[Vector6]:
-    """All joints, at most eight, that bring the flange to a pose; none where it cannot get.
+    """All joint solutions [6], rad, for a flange pose: at most eight, none if it is out of reach.
 
     Args:
-        sixth: what joint 6 is where the pose leaves it free, rad.
+        sixth: angle of joint 6 if the pose leaves it free, rad.
     """
     if not all(math.isfinite(number) for number in pose):
         return []
@@ -83,8 +83,8 @@ def solutions(arm: Geometry, pose: Sequence[float], sixth: float = 0.0) -> list[
             else:
                 q6 = sixth
             c6, s6 = math.cos(q6), math.sin(q6)
-            # Turned back about joints 6 and 5, in the plane of the arm (out, up): there the x axis is at the
-            # sum of joints 2 to 4, and the y axis of joint 6's frame is the way along d5.
+            # With the rotations of joints 6 and 5 undone, in the arm's plane (out, up): the x axis is at the
+            # sum of joints 2 to 4, and the y axis of joint 6's frame points along d5.
             out = c5 * (c6 * ahead_x - s6 * ahead_y) - s5 * ahead_z
             up = c5 * (c6 * r20 - s6 * r21) - s5 * r22
             total = math.atan2(up, out)
@@ -101,7 +101,7 @@ def solutions(arm: Geometry, pose: Sequence[float], sixth: float = 0.0) -> list[
 
 
 def backward(arm: Geometry, pose: Sequence[float], near: Sequence[float]) -> Vector6 | None:
-    """The joints nearest to `near` that bring the flange to a pose, in +-2 pi; None where there are none."""
+    """Joint solution nearest to `near` [6] for a flange pose [6], within +-2 pi rad; None without one."""
     best, least = None, math.inf
     for joints in solutions(arm, pose, near[5]):
         way = [math.remainder(q - n, math.tau) for q, n in zip(joints, near, strict=True)]

@@ -1,4 +1,4 @@
-"""Motions as values: each gives the arm's state a time step later, and whether it continues."""
+"""Motions as values: `advance` gives the arm's state after a time step and the rest of the motion."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ class MotionState(NamedTuple):
     """State of the arm.
 
     Attributes:
-        tcp: the tool's pose in the base. speed: its speed there, m/s, rad/s. joints: rad. joint_speed: rad/s.
+        tcp: [6] tool pose in the base frame, m and rotation vector rad. speed: [6] tool speed, m/s and rad/s.
+        joints: [6] rad. joint_speed: [6] rad/s.
     """
 
     tcp: Vector6
@@ -50,7 +51,7 @@ class ArmModel(NamedTuple):
 
 
 class Profile(NamedTuple):
-    """From rest to rest over a length (m or rad) at no more than a speed: a trapezoid of speed over time."""
+    """Trapezoidal speed profile from rest to rest over a length (m or rad)."""
 
     length: float
     speed: float
@@ -68,7 +69,7 @@ class Profile(NamedTuple):
         return ramp + self.length / (ramp * self.acceleration) if self.length > 0 else 0.0
 
     def at(self, time: float) -> tuple[float, float]:
-        """(length done, speed) at a time."""
+        """Covered length and speed at a time, s."""
         ramp, duration = self.ramp, self.duration
         if time >= duration:
             return self.length, 0.0
@@ -82,10 +83,10 @@ class Profile(NamedTuple):
 
 
 class LinearMotion(NamedTuple):
-    """Straight to a pose, turning in proportion to the path."""
+    """A straight move of the tool to a pose; its rotation is proportional to the distance."""
 
     start: Vector6
-    way: Vector6  # m in the base, and rotation vector in the base
+    way: Vector6  # translation m and rotation vector rad, in the base frame
     profile: Profile
     time: float = 0.0
 
@@ -104,7 +105,7 @@ class LinearMotion(NamedTuple):
 
 
 class ToolSpeedMotion(NamedTuple):
-    """Accelerates to a tool speed and keeps it; for speed 0, until the arm stands."""
+    """Accelerates to a tool speed and keeps it; ends at speed 0."""
 
     goal: Vector6
     acceleration: float
@@ -135,7 +136,7 @@ Motion = LinearMotion | ToolSpeedMotion
 def linear_motion(
     state: MotionState, goal: Vector6, speed: float, acceleration: float, turn_ratio: float
 ) -> LinearMotion:
-    """A straight motion; the slower of path and turn sets the time of both."""
+    """The straight motion to `goal`; the slower of translation and rotation sets its duration."""
     x, y, z = (g - s for g, s in zip(goal[:3], state.tcp[:3], strict=True))
     way = (x, y, z, *rotation_between(state.tcp, goal))
     distance, angle = math.hypot(*way[:3]), math.hypot(*way[3:])
@@ -145,13 +146,13 @@ def linear_motion(
 
 
 def tool_state(model: ArmModel, state: MotionState, tcp: Vector6, speed: Vector6, dt: float) -> MotionState:
-    """The state after a step of the tool."""
+    """The arm's state `dt` s later, with the tool at `tcp`. Raises `Unreachable`."""
     joints = model.backward(tcp, state.joints)
     return MotionState(tcp, speed, joints, scale(subtract(joints, state.joints), 1 / dt))
 
 
 def step_towards(now: Sequence[float], goal: Sequence[float], step: float) -> tuple[float, ...]:
-    """A vector moved towards another, at most by a step."""
+    """The vector `now` moved towards `goal` by at most `step`."""
     way = [g - n for g, n in zip(goal, now, strict=True)]
     length = math.hypot(*way)
     if length <= step:

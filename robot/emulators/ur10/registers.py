@@ -1,4 +1,4 @@
-"""Registers and state fields: one table of what the controller publishes, and what clients wrote."""
+"""Registers and state fields of the controller: published outputs, inputs from clients."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _CONSTANT: dict[str, Value] = {
     "actual_joint_voltage": (48.0,) * 6,
     "joint_temperatures": (30.0,) * 6,
     "actual_tool_accelerometer": (0.0, 0.0, 9.82),
-    "joint_mode": (253,) * 6,  # each joint: running
+    "joint_mode": (253,) * 6,  # running
 }
 
 
 class Registers:
-    """What goes in and out.
+    """Outputs and inputs of the controller.
 
     Attributes:
         fields: every output variable by name, as a tuple of its numbers.
@@ -38,7 +38,7 @@ class Registers:
         self.inputs: dict[str, Value] = {}
 
     def write(self, name: str, value: Value, time: float) -> None:
-        """An input variable, from a client."""
+        """Stores an input variable of a client, received at a host time, s."""
         kind, _, index = name.rpartition("_")
         if kind == "input_int_register":
             self.ints[int(index)] = int(value[0])
@@ -49,7 +49,7 @@ class Registers:
             self.inputs[name] = value
 
     def vector(self, first: int) -> tuple[float, float, float, float, float, float]:
-        """Six input doubles."""
+        """Six consecutive input doubles."""
         a, b, c, d, e, f = self.doubles[first : first + 6]
         return a, b, c, d, e, f
 

@@ -1,4 +1,4 @@
-"""Rotations and poses as the controller writes them: a rotation vector, and a pose of 6 (m, rotation vector).
+"""Rotations and poses in the controller's notation: rotation vectors (rad), poses [6] (m, rotation vector).
 
 Plain floats: a control step handles one pose at a time, where an array costs more than its arithmetic.
 """
@@ -23,7 +23,7 @@ def quaternion(vector: Sequence[float]) -> Quaternion:
 
 
 def rotation_vector(rotation: Quaternion) -> Vector3:
-    """rad, at most pi long."""
+    """Rotation vector of a quaternion, rad, of length at most pi."""
     w, x, y, z = rotation
     if w < 0:
         w, x, y, z = -w, -x, -y, -z
@@ -33,7 +33,7 @@ def rotation_vector(rotation: Quaternion) -> Vector3:
 
 
 def product(first: Quaternion, second: Quaternion) -> Quaternion:
-    """The rotation that does `second`, then `first`."""
+    """The rotation by `second`, then by `first`."""
     a, b, c, d = first
     e, f, g, h = second
     return (
@@ -45,13 +45,13 @@ def product(first: Quaternion, second: Quaternion) -> Quaternion:
 
 
 def conjugate(rotation: Quaternion) -> Quaternion:
-    """The rotation back."""
+    """The inverse rotation."""
     w, x, y, z = rotation
     return w, -x, -y, -z
 
 
 def matrix(rotation: Quaternion) -> Matrix:
-    """Its columns are the turned axes."""
+    """Rotation matrix; its columns are the rotated axes."""
     w, x, y, z = rotation
     return (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
@@ -61,7 +61,7 @@ def matrix(rotation: Quaternion) -> Matrix:
 
 
 def rotate(rotation: Quaternion, vector: Sequence[float]) -> Vector3:
-    """A vector, turned."""
+    """The vector [3] after the rotation."""
     x, y, z = vector
     first, second, third = matrix(rotation)
     return (
@@ -72,7 +72,7 @@ def rotate(rotation: Quaternion, vector: Sequence[float]) -> Vector3:
 
 
 def compose_poses(frame: Sequence[float], pose: Sequence[float]) -> Vector6:
-    """`pose`, given in `frame`, where `frame` is given (URScript's pose_trans)."""
+    """`pose`, which is given in `frame`, in the parent frame of `frame` (URScript's pose_trans)."""
     rotation = quaternion(frame[3:6])
     x, y, z = rotate(rotation, pose[:3])
     rotate_by = rotation_vector(product(rotation, quaternion(pose[3:6])))
@@ -80,24 +80,24 @@ def compose_poses(frame: Sequence[float], pose: Sequence[float]) -> Vector6:
 
 
 def invert_pose(pose: Sequence[float]) -> Vector6:
-    """The pose that undoes a pose."""
+    """The inverse pose."""
     back = conjugate(quaternion(pose[3:6]))
     x, y, z = rotate(back, pose[:3])
     return (-x, -y, -z, *rotation_vector(back))
 
 
 def rotation_between(start: Sequence[float], goal: Sequence[float]) -> Vector3:
-    """The rotation vector, in the base, that turns pose `start` the short way into pose `goal`."""
+    """Rotation vector in the base frame, rad, of the shortest rotation from pose `start` to pose `goal`."""
     return rotation_vector(product(quaternion(goal[3:6]), conjugate(quaternion(start[3:6]))))
 
 
 def rotate_by(pose: Sequence[float], vector: Sequence[float]) -> Vector3:
-    """A pose's rotation vector after a turn by a rotation vector in the base."""
+    """Rotation vector of a pose after a rotation by a vector in the base frame, rad."""
     return rotation_vector(product(quaternion(vector), quaternion(pose[3:6])))
 
 
 def quaternion_of(rows: Matrix) -> Quaternion:
-    """Of a rotation matrix, by the largest of its four parts (Shepperd 1978)."""
+    """Quaternion of a rotation matrix, by its largest component (Shepperd 1978)."""
     (a, b, c), (d, e, f), (g, h, i) = rows
     parts = (a + e + i, a - e - i, e - a - i, i - a - e)
     largest = max(range(4), key=parts.__getitem__)

@@ -1,4 +1,4 @@
-"""One RTDE client: its handshake, its recipes, what it writes, and the states it is sent."""
+"""Sessions of RTDE clients: handshake, recipes, inputs and states."""
 
 from __future__ import annotations
 
@@ -10,33 +10,33 @@ from robot.emulators.ur10.registers import Value
 
 
 class Claims:
-    """Which client controls which input variable: each has one master.
+    """Owner of each input variable: one client at a time.
 
     Attributes:
-        by_others: whether something outside (a fieldbus, say) holds the integer registers.
+        held_by_fieldbus: whether a fieldbus holds the integer registers.
     """
 
     def __init__(self) -> None:
         self.owners: dict[str, RtdeSession] = {}
-        self.by_others = False
+        self.held_by_fieldbus = False
 
-    def free(self, name: str, asker: RtdeSession) -> bool:
-        if self.by_others and name.startswith("input_int_register"):
+    def free(self, name: str, session: RtdeSession) -> bool:
+        if self.held_by_fieldbus and name.startswith("input_int_register"):
             return False
-        return self.owners.get(name, asker) is asker
+        return self.owners.get(name, session) is session
 
     def release(self, session: RtdeSession) -> None:
         self.owners = {name: owner for name, owner in self.owners.items() if owner is not session}
 
 
 class RtdeSession:
-    """What the controller knows of one client.
+    """Connection of one client.
 
     Args:
-        controller: what it talks to. claims: shared by all clients.
+        controller: the emulated controller. claims: shared by all clients.
 
     Attributes:
-        started: whether states are sent. every: one state in so many control steps.
+        started: whether states are sent. every: control steps per state. ignored: number of invalid inputs.
     """
 
     def __init__(self, controller: EmulatedController, claims: Claims) -> None:
@@ -50,19 +50,19 @@ class RtdeSession:
         self._layout = rtde_protocol.data_layout([])
         self._inputs: list[tuple[list[str], struct.Struct]] = []
 
-    def received(self, data: bytes, host: float) -> bytes:
-        """Answers to what arrived at a host time. Raises ValueError where it is no RTDE."""
+    def receive(self, data: bytes, host: float) -> bytes:
+        """Answers to bytes that arrived at a host time, s. Raises ValueError if they are not RTDE."""
         try:
             return b"".join(self._answer(package, host) for package in self._splitter.feed(data))
         except struct.error as error:
             raise ValueError(str(error)) from error
 
-    def closed(self) -> None:
-        """The client is gone: others may write what it wrote."""
+    def close(self) -> None:
+        """Releases the client's input variables for other clients."""
         self._claims.release(self)
 
     def state(self, overrides: dict[str, Value]) -> bytes:
-        """The state now, as its recipe wants it."""
+        """The current state as a package, in the client's output recipe."""
         fields = self._controller.registers.fields
         numbers: list[float] = []
         for name in self._outputs:
@@ -114,7 +114,7 @@ class RtdeSession:
         return bytes([len(self._inputs)]) + ",".join(types).encode()
 
     def _take(self, body: bytes, host: float) -> None:
-        """What a client writes; what is too short for its recipe is passed over, what is too long cut off."""
+        """Stores inputs of a client; ignores a body shorter than its recipe, and excess bytes."""
         recipe = body[0] if body else 0
         if not 1 <= recipe <= len(self._inputs) or len(body) < self._inputs[recipe - 1][1].size:
             self.ignored += 1
@@ -130,5 +130,5 @@ class RtdeSession:
 
 
 def split(names: bytes) -> list[str]:
-    """Names from a list with commas, which may end in one."""
+    """Names in a comma-separated list; a trailing comma is allowed."""
     return [name for name in names.decode("ascii", "replace").split(",") if name]

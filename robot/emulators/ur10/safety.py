@@ -1,4 +1,4 @@
-"""The controller's safety state and the bits that tell it. Source: the RTDE guide, its tables of modes."""
+"""Modes and status bits of the controller. Source: tables of the vendor's RTDE guide."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from enum import IntEnum, IntFlag
 
 
 class SafetyMode(IntEnum):
-    """What keeps the arm from moving, if anything does."""
+    """Safety mode: the reason why the arm may not move, if any."""
 
     NORMAL = 1
     PROTECTIVE_STOP = 3
@@ -15,7 +15,7 @@ class SafetyMode(IntEnum):
 
 
 class RobotMode(IntEnum):
-    """Whether the arm has power."""
+    """Power state of the arm."""
 
     POWER_OFF = 3
     IDLE = 5
@@ -23,7 +23,7 @@ class RobotMode(IntEnum):
 
 
 class Runtime(IntEnum):
-    """What the program does."""
+    """State of the program."""
 
     STOPPED = 1
     PLAYING = 2

@@ -1,4 +1,4 @@
-"""The script port: text comes in, whole programs go to the controller."""
+"""The script port: receives text, uploads complete programs to the controller."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from robot.emulators.ur10.controller import EmulatedController
 
 
 class ScriptSession:
-    """One client. A program is all from a line `def ...` to its `end` at the margin; so is a line alone."""
+    """One client. A program runs from a line `def ...` to `end` at the margin; any other line is one, too."""
 
     def __init__(self, controller: EmulatedController) -> None:
         self._controller = controller
         self._rest = b""
         self._program: list[str] | None = None
 
-    def received(self, data: bytes, host: float) -> bytes:
-        """Nothing is answered: a real controller sends its state here, which no client of ours reads."""
+    def receive(self, data: bytes, host: float) -> bytes:
+        """Uploads complete programs. Answers nothing (a real controller sends states)."""
         *lines, self._rest = (self._rest + data).split(b"\n")
         for raw in lines:
             line = raw.decode("utf-8", "replace").rstrip("\r")
@@ -29,5 +29,5 @@ class ScriptSession:
                 self._controller.upload(line)
         return b""
 
-    def closed(self) -> None:
-        """A program that was not finished never runs; one that runs goes on."""
+    def close(self) -> None:
+        """Discards an incomplete program; a running program continues."""

@@ -1,7 +1,7 @@
-"""The emulator's one loop: control steps at absolute times, and whatever clients send in between.
+"""Main loop of the emulator: control steps at absolute times, client data in between.
 
-One thread and no locks. A step that comes late is made up for, up to `BACKLOG`, so that the mean rate is kept
-on a busy machine; what is later than that is left out and the robot's clock jumps on.
+One thread, no locks. Late steps are made up for, up to `BACKLOG`, so that the mean rate holds on a busy
+machine; steps later than that are skipped, and the robot's clock jumps.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ from robot.emulators.ur10.script_server import ScriptSession
 from tactile.base.errors import InputError
 
 BACKLOG = 0.1  # s
-PENDING = 1 << 18  # bytes that a client may leave unread before states are kept from it
+PENDING = 1 << 18  # unread bytes of a client above which it gets no states
 
 
 class ClientSession(Protocol):
-    """One client's side of a port."""
+    """State of one client of a port."""
 
-    def received(self, data: bytes, host: float) -> bytes: ...
+    def receive(self, data: bytes, host: float) -> bytes: ...
 
-    def closed(self) -> None: ...
+    def close(self) -> None: ...
 
 
 class Connection:
-    """A socket with its session and what could not be sent yet."""
+    """A socket with its session and its unsent bytes."""
 
     def __init__(self, link: socket.socket, session: ClientSession) -> None:
         link.setblocking(False)
@@ -49,7 +49,7 @@ class Connection:
         self._pending = b""
 
     def send(self, data: bytes) -> None:
-        """Send now or later, or never where the client does not read. Raises OSError when it is gone."""
+        """Sends now or later; drops them if the client does not read. Raises OSError if disconnected."""
         if self._pending:
             if len(self._pending) > PENDING:
                 return
@@ -68,26 +68,26 @@ class ControllerServer:
         self.claims = Claims()
         self.faults = ControllerFaults(self)
         self.clients: list[Connection] = []
-        self._selector = selectors.SelectSelector()  # microseconds; epoll's waits are whole milliseconds
+        self._selector = selectors.SelectSelector()  # resolution 1 us; epoll has 1 ms
         self._steps = 0
-        doors: dict[int, Callable[[], ClientSession]] = {
+        ports: dict[int, Callable[[], ClientSession]] = {
             RTDE_PORT: lambda: RtdeSession(self.controller, self.claims),
             SCRIPT_PORT: lambda: ScriptSession(self.controller),
             DASHBOARD_PORT: lambda: DashboardSession(self.controller),
             FAULT_PORT: lambda: FaultSession(self.faults),
         }
-        for port, door in doors.items():
+        for port, make_session in ports.items():
             listener = socket.create_server((config.host, port), backlog=16)
             listener.setblocking(False)
-            self._selector.register(listener, selectors.EVENT_READ, door)
+            self._selector.register(listener, selectors.EVENT_READ, make_session)
 
     @property
     def rtde(self) -> list[tuple[Connection, RtdeSession]]:
-        """The RTDE clients."""
+        """RTDE clients: connections and sessions."""
         return [(c, c.session) for c in self.clients if isinstance(c.session, RtdeSession)]
 
     def run(self) -> None:
-        """Until the process is ended."""
+        """Runs until the process is ended."""
         dt = self.controller.dt
         due = time.monotonic() + dt
         while True:
@@ -103,17 +103,17 @@ class ControllerServer:
                 due += dt
 
     def close(self, connection: Connection) -> None:
-        """A client is gone, or shall be."""
+        """Closes a client's connection, if open."""
         if connection in self.clients:
             self.clients.remove(connection)
             self._selector.unregister(connection.link)
             connection.link.close()
-            connection.session.closed()
+            connection.session.close()
 
     def _step(self, now: float) -> None:
         self.controller.tick(now)
         self._steps += 1
-        if not self.faults.publishing(self._steps):
+        if not self.faults.sends_states(self._steps):
             return
         overrides = self.faults.overrides()
         for connection, session in self.rtde:
@@ -128,11 +128,11 @@ class ControllerServer:
         if connection not in self.clients:
             return
         if self.faults.stalled and isinstance(connection.session, RtdeSession):
-            time.sleep(0.0005)  # left unread: without this the loop would spin on it
+            time.sleep(0.0005)  # the data stay unread, so `select` returns at once
             return
         try:
             data = connection.link.recv(1 << 16)
-            reply = connection.session.received(data, time.monotonic()) if data else b""
+            reply = connection.session.receive(data, time.monotonic()) if data else b""
         except BlockingIOError:
             return
         except (OSError, ValueError):
@@ -152,7 +152,7 @@ class ControllerServer:
                 self.send(connection, WELCOME)
 
     def send(self, connection: Connection, data: bytes) -> None:
-        """Send to a client; one that cannot be sent to is gone."""
+        """Sends to a client; closes the connection if that fails."""
         try:
             connection.send(data)
         except OSError:
@@ -165,7 +165,11 @@ def emulated_controller(config: UrEmulatorConfig) -> EmulatedController:
 
 
 def serve(config: UrEmulatorConfig) -> None:
-    """Emulate a controller until the process is ended; says "ready" on standard output when it listens."""
+    """Emulates a controller until the process is ended; prints "ready" when it listens.
+
+    Raises:
+        InputError: the arm cannot reach its start pose.
+    """
     try:
         server = ControllerServer(config)
     except Unreachable as error:

@@ -1,4 +1,4 @@
-"""Orders to the arm: a straight move and a stop, how each becomes a motion, and moves in URScript text."""
+"""Orders to the arm (straight move, stop), their motions, and the parsing of moves in URScript text."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from robot.emulators.ur10.motion import (
 )
 from robot.emulators.ur10.rotation import Vector6
 
-SMALL = 1e-9  # lower limit of speeds and accelerations; the client lets 0 through, which would never arrive
+SMALL = 1e-9  # least speed and acceleration; the client accepts 0, at which a move never ends
 
 
 class MoveL(NamedTuple):
@@ -38,7 +38,7 @@ MoveOrder = MoveL | StopL
 
 
 def start_motion(order: MoveOrder, model: ArmModel, state: MotionState, turn_ratio: float) -> Motion | None:
-    """The motion that executes an order; None where the tool is at the goal already.
+    """The motion that executes an order; None if the tool is at the goal already.
 
     Raises:
         Unreachable: no joint solution for the goal.

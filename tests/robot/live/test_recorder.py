@@ -1,4 +1,4 @@
-"""A live session is read back exactly, up to the moment when its process was killed."""
+"""A live session is read back exactly, also after its process was killed."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ from tactile.whiskers.head_geometry import HeadConfig
 ROOT = Path(__file__).parents[3]
 W, RATE = 4, 200
 START = 5e4
-"""Of the session, on the host's clock, s."""
+"""Start of a session, host time, s."""
 INFO = SourceInfo(raw_whiskers=True, head=HeadConfig(rest_deg=74.0))
 
 
@@ -87,20 +87,20 @@ def rows(frames: Frames, which: Any) -> Frames:
     return Frames(*(column[which] for column in frames))
 
 
-def moved(k: int) -> Odometry:
+def motion_of_whisk(k: int) -> Odometry:
     return Odometry(*(np.float64(value) for value in (0.01 * (k % 3), 0.002, 0.05, 1.0)))
 
 
-def same(one: Any, other: Any) -> bool:
+def same_bits(one: Any, other: Any) -> bool:
     """Whether two tuples of arrays are equal in every bit, shape, dtype and order in memory."""
     if isinstance(one, tuple):
-        return type(one) is type(other) and all(map(same, one, other))
+        return type(one) is type(other) and all(map(same_bits, one, other))
     a, b = np.asarray(one), np.asarray(other)
     alike = a.flags.c_contiguous == b.flags.c_contiguous
     return alike and (a.shape, a.dtype, a.tobytes()) == (b.shape, b.dtype, b.tobytes())
 
 
-def opened(path: Path) -> LiveRecorder:
+def open_recorder(path: Path) -> LiveRecorder:
     path.unlink(missing_ok=True)
     return LiveRecorder(path, view_shape=(2, 2, 1), whiskers=W, rate_hz=1.0, info=INFO)
 
@@ -110,9 +110,9 @@ def content(path: Path, kind: type) -> list[Any]:
 
 
 def session(path: Path, whisks: int = 3) -> tuple[list[Cycle], Frames, np.ndarray]:
-    """A session of whisks, arm states and two events; what was handed on, and all frames and states."""
+    """Records whisks, arm states and two events; returns the whisk cycles, all frames and all states."""
     frames, states = some_frames(whisks * RATE, seed=whisks), some_states(whisks * 125)
-    recorder = opened(path)
+    recorder = open_recorder(path)
     cycles = []
     recorder.add_event(START, "start", "emulated: a robot, über")
     for k in range(whisks):
@@ -125,7 +125,7 @@ def session(path: Path, whisks: int = 3) -> tuple[list[Cycle], Frames, np.ndarra
                 ]
             )
         mine = rows(frames, slice(k * RATE, (k + 1) * RATE))
-        cut = make_cut(k, START + k + 0.25, START + k, mine, moved(k), seen=k != 1)
+        cut = make_cut(k, START + k + 0.25, START + k, mine, motion_of_whisk(k), seen=k != 1)
         recorder.add_whisk(cut, mine, np.array([0.01 * k, 0.0, 0.05 * k]) if k != 2 else None)
         cycles.append(assemble_cycle(mine, cut))
     recorder.add_event(START + whisks, "dropped", "1 image")
@@ -137,7 +137,7 @@ def test_a_session_is_read_back_exactly(tmp_path: Path) -> None:
     cycles, frames, _ = session(tmp_path / "a.mcap")
     recording = Recording(tmp_path / "a.mcap")
     samples = list(recording)
-    assert all(same(sample.reading, cycle) for sample, cycle in zip(samples, cycles, strict=True))
+    assert all(same_bits(sample.reading, cycle) for sample, cycle in zip(samples, cycles, strict=True))
     assert [sample.time for sample in samples] == [START + 0.25, START + 1.25, START + 2.25]
     assert [sample.truth is None for sample in samples] == [False, False, True]
     assert not recording.truncated
@@ -148,27 +148,29 @@ def test_a_session_is_read_back_exactly(tmp_path: Path) -> None:
     assert [len(cycle.time) for cycle in cycles] == [RATE, 0, RATE]
     assert cycles[1].angle.shape == (0, W)
     assert cycles[1].deflection.shape == (0, W, 2)
-    # The frames of the dropped image are there all the same.
+    # The frames of a dropped image are recorded too.
     parts = content(tmp_path / "a.mcap", Frames)
-    assert same(Frames(*(np.concatenate(part) for part in zip(*parts, strict=True))), frames)
+    assert same_bits(Frames(*(np.concatenate(part) for part in zip(*parts, strict=True))), frames)
 
 
 def test_a_whisk_is_assembled_from_its_frames() -> None:
     frames = some_frames(10, first=90)
-    cycle = assemble_cycle(frames, make_cut(0, 3.0, 2.5, rows(frames, slice(2, 7)), moved(0)))
+    cycle = assemble_cycle(frames, make_cut(0, 3.0, 2.5, rows(frames, slice(2, 7)), motion_of_whisk(0)))
     np.testing.assert_allclose(cycle.time, 2.5 + np.arange(5) / RATE, rtol=0, atol=1e-12)
     np.testing.assert_allclose(cycle.angle, frames.values[2:7, :, 0] * np.pi / 32768)
     np.testing.assert_allclose(cycle.deflection, frames.values[2:7, :, 1:] * np.pi / 32768)
-    assert cycle.odometry == moved(0)
+    assert cycle.odometry == motion_of_whisk(0)
     assert all(part.flags.c_contiguous for part in cycle[:3])
     mixed = rows(frames, np.random.default_rng(0).permutation(10))
-    assert same(assemble_cycle(mixed, make_cut(0, 3.0, 2.5, rows(frames, slice(2, 7)), moved(0))), cycle)
+    assert same_bits(
+        assemble_cycle(mixed, make_cut(0, 3.0, 2.5, rows(frames, slice(2, 7)), motion_of_whisk(0))), cycle
+    )
 
 
 @settings(max_examples=40)
 @given(st.data())
 def test_the_order_of_frames_does_not_matter(tmp_path_factory: Any, data: st.DataObject) -> None:
-    """Some are lost, some late; cuts overlap, leave gaps, or are made before their frames were handed in."""
+    """Some frames are lost or late; cuts overlap, leave gaps or come before their frames."""
     path = tmp_path_factory.getbasetemp() / "law.mcap"
     count = data.draw(st.integers(0, 120))
     frames = some_frames(count, count, first=data.draw(st.sampled_from([0, 2**31, 2**40])))
@@ -176,14 +178,16 @@ def test_the_order_of_frames_does_not_matter(tmp_path_factory: Any, data: st.Dat
     order = order[np.argsort(order + np.array([3 * (k % 4 == 0) for k in range(len(order))]), kind="stable")]
     came = rows(frames, order)
     cycles, at = [], 0
-    with opened(path) as recorder:
+    with open_recorder(path) as recorder:
         while True:
             step = data.draw(st.integers(1, 30))
             block = rows(came, slice(at, at + step))
-            ahead = rows(came, slice(0, at + step))  # the ring has them before the recorder
+            ahead = rows(came, slice(0, at + step))  # the ring buffer has frames before the recorder
             first = int(frames.sequence[0]) + data.draw(st.integers(-5, 120)) if count else 0
             mine = select_frames(ahead, first, first + data.draw(st.integers(0, 60)))
-            cut = make_cut(len(cycles), START + at, START, mine, moved(at), seen=data.draw(st.booleans()))
+            cut = make_cut(
+                len(cycles), START + at, START, mine, motion_of_whisk(at), seen=data.draw(st.booleans())
+            )
             early = data.draw(st.booleans())
             if early:
                 recorder.add_whisk(cut, mine)
@@ -194,11 +198,11 @@ def test_the_order_of_frames_does_not_matter(tmp_path_factory: Any, data: st.Dat
             at += step
             if at >= len(order):
                 break
-    walk = McapScanner(path)
-    entries = list(walk.entries())
-    assert not walk.broken
+    scanner = McapScanner(path)
+    entries = list(scanner.entries())
+    assert not scanner.broken
     samples = [entry.content for entry in entries if hasattr(entry.content, "reading")]
-    assert all(same(sample.reading, cycle) for sample, cycle in zip(samples, cycles, strict=True))
+    assert all(same_bits(sample.reading, cycle) for sample, cycle in zip(samples, cycles, strict=True))
     numbers = [entry.content.sequence for entry in entries if isinstance(entry.content, Frames)]
     assert sorted(np.concatenate([np.zeros(0, int), *numbers])) == sorted(came.sequence)  # each once
 
@@ -206,14 +210,14 @@ def test_the_order_of_frames_does_not_matter(tmp_path_factory: Any, data: st.Dat
 @given(st.integers(0, 40), st.integers(0, 5), st.integers(0, 2**32))
 def test_blocks_round_trip(count: int, seed: int, first: int) -> None:
     frames, states = some_frames(count, seed, first), some_states(count + 1, seed)
-    assert same(decode_frames(encode_frames(3.5, frames), W), (3.5, frames))
+    assert same_bits(decode_frames(encode_frames(3.5, frames), W), (3.5, frames))
     assert encode_frames(3.5, empty_frames(W)) == encode_frames(3.5, rows(frames, slice(0)))
     at, again = decode_states(encode_states(states))
     assert at == states["host"][-1]
     assert again.dtype == ARM_STATE
     assert all((again[name] == states[name]).all() for name in ARM_STATE.names or ())
-    cut = make_cut(count, 1.5, 1.0, frames, moved(seed))
-    assert same(decode_cut(encode_cut(cut)), cut)
+    cut = make_cut(count, 1.5, 1.0, frames, motion_of_whisk(seed))
+    assert same_bits(decode_cut(encode_cut(cut)), cut)
     assert cut.seen == (count > 0)
     event = Event(0.1, "fault", "ünder: way")
     assert decode_event(encode_event(event)) == event
@@ -225,7 +229,7 @@ def test_invalid_messages_are_refused(noise: bytes, kind: int, place: int, numbe
     decode: Any = (lambda m: decode_frames(m, W), decode_states, decode_cut, decode_event)[kind]
     good = (
         encode_frames(1.0, frames), encode_states(some_states(2)),
-        encode_cut(make_cut(0, 1.0, 1.0, frames, moved(0))), encode_event(Event(1.0, "a", "b")),
+        encode_cut(make_cut(0, 1.0, 1.0, frames, motion_of_whisk(0))), encode_event(Event(1.0, "a", "b")),
     )[kind]  # fmt: skip
     place = place % len(good)
     for bad in (
@@ -243,9 +247,9 @@ def test_invalid_messages_are_refused(noise: bytes, kind: int, place: int, numbe
 
 
 def test_data_are_written_within_a_fifth_of_a_second(tmp_path: Path) -> None:
-    """Counted on the times handed in: the file is read after every call."""
+    """The file is read after every call; delays are differences of the passed times."""
     path = tmp_path / "a.mcap"
-    frames, recorder = some_frames(RATE), opened(path)
+    frames, recorder = some_frames(RATE), open_recorder(path)
     states = some_states(125)
     late = []
     for k in range(0, RATE, 2):
@@ -257,9 +261,9 @@ def test_data_are_written_within_a_fifth_of_a_second(tmp_path: Path) -> None:
         known = content(path, np.ndarray)
         assert now - (known[-1]["host"][-1] if known else START) < 0.2
     assert max(late) / RATE < 0.2
-    assert len(content(path, Frames)) >= 5  # and not one by one
+    assert len(content(path, Frames)) >= 5  # in blocks, not one by one
     mine = rows(frames, slice(0, RATE))
-    recorder.add_whisk(make_cut(0, START + 1.0, START, mine, moved(0)), mine)
+    recorder.add_whisk(make_cut(0, START + 1.0, START, mine, motion_of_whisk(0)), mine)
     assert McapScanner(path).__iter__().__next__().reading.angle.shape == (RATE, W)
     recorder.close()
 
@@ -279,7 +283,7 @@ recorder = LiveRecorder(path, view_shape=(3, 6, 1), whiskers=18, info=SourceInfo
 random = np.random.default_rng(0)
 pool = random.integers(-300, 300, (2000, 18, 3)).astype(np.int16)
 with beside.open("r+b") as file:
-    told = mmap.mmap(file.fileno(), 16)
+    counters = mmap.mmap(file.fileno(), 16)
 k = 0
 while True:
     number = np.arange(20 * k, 20 * k + 20)
@@ -291,12 +295,12 @@ while True:
         motion = Odometry(0.01, 0.0, 0.0, 1.0)
         recorder.add_whisk(make_cut(k // 100, 0.01 * k, 0.01 * k - 1, mine, motion), mine)
     k += 1
-    told[:16] = struct.pack("<qq", k, k // 100)
+    counters[:16] = struct.pack("<qq", k, k // 100)
 """
 
 
-def killed(folder: Path, seconds: float) -> tuple[int, int, Path]:
-    """(blocks of 10 ms, whisks) that a writer had handed in for certain when it was killed, and its file."""
+def kill_writer(folder: Path, seconds: float) -> tuple[int, int, Path]:
+    """Kills a writer after some seconds; returns its blocks of 10 ms, its whisks and its file."""
     path, beside = folder / "killed.mcap", folder / "beside"
     path.unlink(missing_ok=True)
     beside.write_bytes(bytes(16))
@@ -313,34 +317,34 @@ def killed(folder: Path, seconds: float) -> tuple[int, int, Path]:
     return blocks, whisks, path
 
 
-def check_killed(folder: Path, seconds: float) -> None:
-    blocks, whisks, path = killed(folder, seconds)
-    walk = McapScanner(path)
+def check_loss(folder: Path, seconds: float) -> None:
+    blocks, whisks, path = kill_writer(folder, seconds)
+    scanner = McapScanner(path)
     newest = -1
-    for entry in walk.entries():
+    for entry in scanner.entries():
         if isinstance(entry.content, Frames):
             assert entry.content.sequence[0] == newest + 1
             newest = int(entry.content.sequence[-1])
     assert blocks > 20
     assert blocks - (newest + 1) / 20 <= 20  # 0.2 s of the session
-    assert whisks <= walk.count <= whisks + 1
-    assert walk.broken == "it ends too early"
+    assert whisks <= scanner.count <= whisks + 1
+    assert scanner.broken == "it ends too early"
 
 
 def test_a_killed_session_loses_less_than_a_fifth_of_a_second(tmp_path: Path) -> None:
     for seconds in (0.02, 0.17, 0.4):
-        check_killed(tmp_path, seconds)
+        check_loss(tmp_path, seconds)
 
 
 @pytest.mark.soak
 def test_many_killed_sessions(tmp_path: Path) -> None:
     for seconds in np.random.default_rng(1).uniform(0, 1, 50):
-        check_killed(tmp_path, float(seconds))
+        check_loss(tmp_path, float(seconds))
 
 
 def test_a_full_disk_is_a_fault_and_the_recording_stays_readable(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    frames, recorder = some_frames(6 * RATE), opened(path)
+    frames, recorder = some_frames(6 * RATE), open_recorder(path)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))
@@ -350,10 +354,10 @@ def test_a_full_disk_is_a_fault_and_the_recording_stays_readable(tmp_path: Path)
             recorder.add_frames(mine, START + 4 * k / RATE)
             if k % 50 == 49:
                 mine = rows(frames, slice(4 * k - RATE + 4, 4 * k + 4))
-                recorder.add_whisk(make_cut(k, START + k, START, mine, moved(k)), mine)
+                recorder.add_whisk(make_cut(k, START + k, START, mine, motion_of_whisk(k)), mine)
             sizes.append(path.stat().st_size)
         fault = recorder.fault
-        recorder.add_event(START, "late", "nobody hears it")
+        recorder.add_event(START, "late", "after the fault")
         recorder.close()
         recorder.close()
     finally:
@@ -363,7 +367,7 @@ def test_a_full_disk_is_a_fault_and_the_recording_stays_readable(tmp_path: Path)
     assert fault.outcome is SessionOutcome.DISK_FULL
     assert str(path) in fault.detail
     assert "free space" in fault.detail
-    assert max(sizes) < 20_000  # no half chunks: what could not be written whole was taken off
+    assert max(sizes) < 20_000  # an incomplete chunk is truncated
     recording = Recording(path)
     assert recording.truncated
     assert 1 <= recording.length == len(list(recording)) < 6
@@ -374,13 +378,13 @@ def test_a_disk_that_was_full_yields_a_complete_file_in_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "a.mcap"
-    frames, recorder = some_frames(3 * RATE), opened(path)
+    frames, recorder = some_frames(3 * RATE), open_recorder(path)
     with monkeypatch.context() as patch:
         for k in range(3):
             mine = rows(frames, slice(k * RATE, (k + 1) * RATE))
             if k == 1:
                 patch.setattr(WholeChunkFile, "flush", _no_room)
-            recorder.add_whisk(make_cut(k, START + k, START + k, mine, moved(k)), mine)
+            recorder.add_whisk(make_cut(k, START + k, START + k, mine, motion_of_whisk(k)), mine)
     assert recorder.fault is not None
     recorder.close()
     recording = Recording(path)
@@ -409,12 +413,12 @@ def test_recover_keeps_messages_other_than_samples(tmp_path: Path) -> None:
     assert not again.truncated
     assert [event.name for event in again.events] == ["start"]
     assert all(
-        same(a.reading, b.reading) for a, b in zip(again, Recording(tmp_path / "cut.mcap"), strict=True)
+        same_bits(a.reading, b.reading) for a, b in zip(again, Recording(tmp_path / "cut.mcap"), strict=True)
     )
 
 
 def test_a_recording_without_a_whisk_is_not_recovered(tmp_path: Path) -> None:
-    with opened(tmp_path / "a.mcap") as recorder:
+    with open_recorder(tmp_path / "a.mcap") as recorder:
         recorder.add_frames(some_frames(5), START)
     for action in (
         lambda: recover(tmp_path / "a.mcap", tmp_path / "b.mcap"),
@@ -425,7 +429,7 @@ def test_a_recording_without_a_whisk_is_not_recovered(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
 
 
-def damaged(data: bytes, seed: int, rounds: int) -> Iterator[bytes]:
+def damaged_copies(data: bytes, seed: int, rounds: int) -> Iterator[bytes]:
     random = np.random.default_rng(seed)
     for _ in range(rounds):
         bad = bytearray(data)
@@ -447,37 +451,37 @@ def test_a_prefix_of_a_damaged_file_is_read(tmp_path: Path, rounds: int) -> None
     session(tmp_path / "a.mcap", whisks=2)
     whole = [entry[:4] for entry in entries_of(tmp_path / "a.mcap")]
     lengths = set()
-    for bad in damaged((tmp_path / "a.mcap").read_bytes(), rounds, rounds):
+    for bad in damaged_copies((tmp_path / "a.mcap").read_bytes(), rounds, rounds):
         (tmp_path / "bad.mcap").write_bytes(bad)
-        walk = McapScanner(tmp_path / "bad.mcap")
-        found = [entry[:4] for entry in walk.entries()]
+        scanner = McapScanner(tmp_path / "bad.mcap")
+        found = [entry[:4] for entry in scanner.entries()]
         assert found == whole[: len(found)]
-        assert walk.broken or len(found) == len(whole)
+        assert scanner.broken or len(found) == len(whole)
         lengths.add(len(found))
     assert len(lengths) > 5
 
 
 @pytest.mark.parametrize("unsigned", [False, True])
 def test_a_skipped_chunk_is_reported(tmp_path: Path, unsigned: bool) -> None:
-    """Its type is damaged; and perhaps the checksum of the whole has gone too (0: there is none)."""
+    """The chunk's type is damaged; `unsigned` also sets the file's checksum to 0 (absent)."""
     session(tmp_path / "a.mcap", whisks=2)
     whole = [entry[:4] for entry in entries_of(tmp_path / "a.mcap")]
     data = (tmp_path / "a.mcap").read_bytes()
     chunks = [found.start() - CHUNK_HEADER for found in re.finditer(re.escape(b"\x28\xb5\x2f\xfd"), data)]
     assert len(chunks) > 10
-    _check_passed_over(tmp_path, data, chunks, whole, unsigned)
+    check_skipped_chunks(tmp_path, data, chunks, whole, unsigned)
 
 
 @pytest.mark.parametrize("unsigned", [False, True])
 def test_a_skipped_only_chunk_is_reported(tmp_path: Path, unsigned: bool) -> None:
-    """The channel went with it."""
-    with opened(tmp_path / "a.mcap") as recorder:
+    """The chunk holds the channel too."""
+    with open_recorder(tmp_path / "a.mcap") as recorder:
         recorder.add_event(START, "start", "and end")
     data = (tmp_path / "a.mcap").read_bytes()
-    _check_passed_over(tmp_path, data, [data.index(b"\x28\xb5\x2f\xfd") - CHUNK_HEADER], [], unsigned)
+    check_skipped_chunks(tmp_path, data, [data.index(b"\x28\xb5\x2f\xfd") - CHUNK_HEADER], [], unsigned)
 
 
-def _check_passed_over(
+def check_skipped_chunks(
     folder: Path, data: bytes, chunks: list[int], whole: list[Any], unsigned: bool
 ) -> None:
     for chunk in chunks:
@@ -488,10 +492,10 @@ def _check_passed_over(
             end = data.index(b"\x0f" + struct.pack("<Q", 4), chunks[-1])
             bad[end + 9 : end + 13] = bytes(4)
         (folder / "bad.mcap").write_bytes(bad)
-        walk = McapScanner(folder / "bad.mcap")
-        found = [entry[:4] for entry in walk.entries()]
+        scanner = McapScanner(folder / "bad.mcap")
+        found = [entry[:4] for entry in scanner.entries()]
         assert found == whole[: len(found)]
-        assert walk.broken
+        assert scanner.broken
 
 
 CHUNK_HEADER = 1 + 8 + 3 * 8 + 4 + 8 + 8
@@ -499,8 +503,8 @@ CHUNK_HEADER = 1 + 8 + 3 * 8 + 4 + 8 + 8
 
 
 def test_a_cut_must_match_its_frames(tmp_path: Path) -> None:
-    frames, recorder = some_frames(20), opened(tmp_path / "a.mcap")
-    cut = make_cut(0, START, START, frames, moved(0))
+    frames, recorder = some_frames(20), open_recorder(tmp_path / "a.mcap")
+    cut = make_cut(0, START, START, frames, motion_of_whisk(0))
     for wrong in (cut._replace(frames=19), cut._replace(first=1), cut._replace(frames=0, first=50, last=60)):
         with pytest.raises(ValueError, match="frames for a whisk"):
             recorder.add_whisk(wrong, frames)
@@ -514,16 +518,16 @@ def test_a_cut_must_match_its_frames(tmp_path: Path) -> None:
 
 
 def test_a_cut_without_its_frames_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No recorder writes such a file."""
-    with monkeypatch.context() as patch, opened(tmp_path / "a.mcap") as recorder:
+    """The recorder is patched to state one frame too many."""
+    with monkeypatch.context() as patch, open_recorder(tmp_path / "a.mcap") as recorder:
         patch.setattr(
             "robot.live.recorder.encode_cut", lambda cut: encode_cut(cut._replace(frames=cut.frames + 1))
         )
         frames = some_frames(20)
-        recorder.add_whisk(make_cut(0, START, START, frames, moved(0)), frames)
-    walk = McapScanner(tmp_path / "a.mcap")
-    assert list(walk) == []
-    assert walk.broken == "a whisk of 21 frames, of which 20 are there"
+        recorder.add_whisk(make_cut(0, START, START, frames, motion_of_whisk(0)), frames)
+    scanner = McapScanner(tmp_path / "a.mcap")
+    assert list(scanner) == []
+    assert scanner.broken == "a whisk of 21 frames, of which 20 are there"
 
 
 def test_the_frame_window_agrees_with_the_ring_buffer() -> None:
@@ -532,16 +536,16 @@ def test_the_frame_window_agrees_with_the_ring_buffer() -> None:
     block = some_frames(1000)
     for k in range(100):
         window.add(block._replace(sequence=block.sequence + 1000 * k))
-    kept = window.between(0, 10**9).sequence
-    assert MAX_FRAMES <= len(kept) < MAX_FRAMES + 1000
-    assert (np.diff(kept) == 1).all()
-    assert kept[-1] == 99_999
+    frames = window.between(0, 10**9).sequence
+    assert MAX_FRAMES <= len(frames) < MAX_FRAMES + 1000
+    assert (np.diff(frames) == 1).all()
+    assert frames[-1] == 99_999
     assert (window.between(99_990, 99_992).sequence == [99_990, 99_991, 99_992]).all()
 
 
 def test_three_threads_write_one_recording(tmp_path: Path) -> None:
     frames, states = some_frames(4 * RATE), some_states(500)
-    recorder = opened(tmp_path / "a.mcap")
+    recorder = open_recorder(tmp_path / "a.mcap")
 
     def head() -> None:
         for k in range(0, 4 * RATE, 4):
@@ -554,7 +558,7 @@ def test_three_threads_write_one_recording(tmp_path: Path) -> None:
     def loop() -> None:
         for k in range(4):
             mine = rows(frames, slice(k * RATE, (k + 1) * RATE))
-            recorder.add_whisk(make_cut(k, START + k, START + k, mine, moved(k)), mine)
+            recorder.add_whisk(make_cut(k, START + k, START + k, mine, motion_of_whisk(k)), mine)
 
     threads = [threading.Thread(target=target) for target in (head, arm, loop)]
     interval = sys.getswitchinterval()
@@ -567,14 +571,14 @@ def test_three_threads_write_one_recording(tmp_path: Path) -> None:
     finally:
         sys.setswitchinterval(interval)
     recorder.close()
-    walk = McapScanner(tmp_path / "a.mcap")
-    entries = list(walk.entries())
-    assert not walk.broken
+    scanner = McapScanner(tmp_path / "a.mcap")
+    entries = list(scanner.entries())
+    assert not scanner.broken
     numbers = np.concatenate([e.content.sequence for e in entries if isinstance(e.content, Frames)])
     assert (np.sort(numbers) == frames.sequence).all()
-    counters = np.concatenate([e.content["host"] for e in entries if isinstance(e.content, np.ndarray)])
-    assert (counters == states["host"]).all()
-    assert walk.count == 4
+    hosts = np.concatenate([e.content["host"] for e in entries if isinstance(e.content, np.ndarray)])
+    assert (hosts == states["host"]).all()
+    assert scanner.count == 4
 
 
 def test_rosbags_reads_a_live_recording(tmp_path: Path) -> None:
@@ -592,14 +596,14 @@ def test_rosbags_reads_a_live_recording(tmp_path: Path) -> None:
 
 
 def test_an_unseen_cut_needs_no_frames(tmp_path: Path, refused: Callable[..., InputError]) -> None:
-    with opened(tmp_path / "a.mcap") as recorder:
-        cut = make_cut(0, START, START, empty_frames(W), moved(0))
+    with open_recorder(tmp_path / "a.mcap") as recorder:
+        cut = make_cut(0, START, START, empty_frames(W), motion_of_whisk(0))
         assert not cut.seen
         recorder.add_whisk(cut, empty_frames(W))
     (sample,) = Recording(tmp_path / "a.mcap")
     assert isinstance(sample.reading, Cycle)
     assert len(sample.reading.time) == 0
-    assert sample.reading.odometry == moved(0)
+    assert sample.reading.odometry == motion_of_whisk(0)
     assert isinstance(cut, Cut)
     refused(
         lambda: LiveRecorder(tmp_path / "a.mcap", view_shape=(1, 1, 1), whiskers=1, info=INFO),

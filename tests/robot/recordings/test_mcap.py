@@ -123,7 +123,7 @@ def leaves(sample: Sample) -> list[Any]:
 
 
 def same_bits(one: Sequence[Sample], other: Sequence[Sample]) -> bool:
-    """Whether two runs of samples are equal in every bit, shape and dtype."""
+    """Whether two sequences of samples are equal in every bit, shape and dtype."""
 
     def key(value: Any) -> Any:
         if isinstance(value, (np.ndarray, np.generic)):
@@ -153,15 +153,15 @@ def some_samples(count: int, seed: int = 0) -> list[Sample]:
         truth = rng.normal(size=3) if i % 3 else None
         if i % 5 == 4:
             flags, strain = rng.random((2, WHISKERS)) < 0.5, rng.normal(size=(3, WHISKERS, 2))
-            told = Report(odometry, 1, 2, *flags, time=np.arange(3) / 2000, strain=strain)
-            samples.append(Sample(0.5 * i, told, truth))
+            report = Report(odometry, 1, 2, *flags, time=np.arange(3) / 2000, strain=strain)
+            samples.append(Sample(0.5 * i, report, truth))
         elif i % 4 == 3:
             arrays_ = (rng.random(2), rng.normal(size=(2, WHISKERS)), rng.normal(size=(2, WHISKERS, 2)))
             samples.append(Sample(0.5 * i, Cycle(*arrays_, odometry), truth))
         elif i % 4 == 2:
             truths, numbers = rng.random((3, WHISKERS)) < 0.5, rng.normal(size=(3, WHISKERS))
-            felt = Whisk(odometry, truths[0], truths[1], numbers[0], truths[2], *numbers[1:])
-            samples.append(Sample(0.5 * i, felt, truth))
+            whisk = Whisk(odometry, truths[0], truths[1], numbers[0], truths[2], *numbers[1:])
+            samples.append(Sample(0.5 * i, whisk, truth))
         else:
             seen = observation(odometry, rng.random(SHAPE), label=i, whiskers=WHISKERS)
             point = rng.normal(size=(WHISKERS, 2))
@@ -185,7 +185,7 @@ def test_written_samples_are_read_back_bit_for_bit(tmp_path_factory: Any, sample
     with Recording(path) as source:
         assert isinstance(source, Source)
         assert same_bits(list(source), samples)
-        assert same_bits(list(source), samples)  # and again
+        assert same_bits(list(source), samples)  # a second iteration
         assert (source.length, source.view_shape, source.whiskers) == (len(samples), SHAPE, WHISKERS)
         assert (source.truncated, source.warning, source.rate_hz) == (False, "", 2.0)
         raw = any(not isinstance(sample.reading, Observation) for sample in samples)
@@ -212,11 +212,11 @@ def test_a_recorded_source_equals_the_source(trace: Path, tmp_path: Path) -> Non
 
 
 def check_prefix(path: Path, samples: list[Sample]) -> int:
-    """Reads a damaged file: a prefix of the samples or one InputError; returns the number of samples."""
-    told: list[str] = []
+    """Checks that a damaged file gives a prefix of the samples or one InputError; returns their number."""
+    warnings: list[str] = []
     source: Recording | None
     try:
-        source = Recording(path, warn=told.append)
+        source = Recording(path, warn=warnings.append)
     except InputError as error:
         message = str(error)
         source = None
@@ -227,13 +227,13 @@ def check_prefix(path: Path, samples: list[Sample]) -> int:
     assert same_bits(read, samples[: len(read)])
     assert source.info == INFO.model_copy(update={"raw_whiskers": source.info.raw_whiskers})
     assert source.length == len(read)
-    assert told == ([source.warning] if source.truncated else [])
+    assert warnings == ([source.warning] if source.truncated else [])
     assert source.truncated or len(read) == len(samples)
     return len(read)
 
 
 def test_a_recording_truncated_at_any_byte_yields_a_prefix(tmp_path: Path) -> None:
-    """The fewest samples that make several chunks and contain every kind of reading."""
+    """The least number of samples with several chunks and every kind of reading."""
     samples = some_samples(5)
     assert {type(sample.reading) for sample in samples} == {Observation, Whisk, Cycle, Report}
     path = write_recording(tmp_path / "cut.mcap", samples, chunk_s=1.0)
@@ -324,7 +324,7 @@ def test_recover_writes_a_complete_file(small: tuple[bytes, list[Sample]], tmp_p
     assert recover(whole, tmp_path / "third.mcap") == (found.length, "")
 
 
-def test_nothing_is_overwritten(
+def test_existing_files_are_not_overwritten(
     small: tuple[bytes, list[Sample]], tmp_path: Path, refused: Callable[..., InputError]
 ) -> None:
     path, old = tmp_path / "a.mcap", tmp_path / "old.mcap"
@@ -336,7 +336,7 @@ def test_nothing_is_overwritten(
     assert old.read_bytes() == b"precious"
 
 
-def test_a_recovery_that_fails_leaves_nothing(tmp_path: Path, refused: Callable[..., InputError]) -> None:
+def test_a_failed_recovery_leaves_no_file(tmp_path: Path, refused: Callable[..., InputError]) -> None:
     (tmp_path / "bad.mcap").write_bytes(b"not a recording")
     refused(lambda: recover(tmp_path / "bad.mcap", tmp_path / "out.mcap"), "cannot be read as a recording")
     assert [path.name for path in tmp_path.iterdir()] == ["bad.mcap"]
@@ -544,9 +544,7 @@ def test_a_recording_of_another_version_is_refused(
 
 
 @pytest.mark.parametrize("value", [np.nan, object(), np.zeros(2)])
-def test_provenance_that_is_not_json_is_refused_before_anything_is_written(
-    tmp_path: Path, value: Any
-) -> None:
+def test_provenance_that_is_not_json_is_refused_before_a_file_is_written(tmp_path: Path, value: Any) -> None:
     with pytest.raises((ValueError, TypeError)):
         Recorder(tmp_path / "a.mcap", info=SourceInfo(provenance={"a": value}))
     assert not (tmp_path / "a.mcap").exists()
@@ -575,7 +573,7 @@ def test_a_copy_of_a_recording_keeps_the_source_info(
 
 
 def test_a_truth_in_degrees_is_refused(tmp_path: Path, refused: Callable[..., InputError]) -> None:
-    """The unit check is that of all readers (see test_unit_check)."""
+    """All readers share the unit check (see test_unit_check)."""
     turning = Odometry(*(np.float64(value) for value in (0.05, 0.0, 0.3, 0.5)))
     samples = [
         Sample(0.5 * i, observation(turning, view_shape=SHAPE, whiskers=WHISKERS), np.array([0, 0, 17.0 * i]))

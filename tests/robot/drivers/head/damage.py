@@ -15,7 +15,7 @@ GARBAGE = (b"", b"\0", b"W", b"WH", b"WHK", b"WHK1", b"WHK1WHK1", b"WHKC", b"1",
 
 
 class Head:
-    """What sends the frames: keeps the number and the time."""
+    """A source of frames with consecutive numbers and times."""
 
     def __init__(self, whiskers: int, channels: int, sequence: int, time: int, seed: int = 0) -> None:
         self.shape = whiskers, channels
@@ -31,16 +31,16 @@ class Head:
         return self.sent[-1]
 
     def foreign(self, field: int, value: int) -> bytes:
-        """A frame with a right CRC, but of another head: field 0 whiskers, 1 channels, 2 version."""
+        """A frame of another head with a valid CRC; `field` 0 changes whiskers, 1 channels, 2 version."""
         body = bytearray(self.frame()[:-4])
         body[13 + field] = value
         return bytes(body) + struct.pack("<I", zlib.crc32(body))
 
-    def again(self, back: int) -> bytes:
+    def repeat(self, back: int) -> bytes:
         return self.sent[-1 - back % len(self.sent)] if self.sent else b""
 
 
-def damaged(frame: bytes, place: int, mask: int) -> bytes:
+def flip_bits(frame: bytes, place: int, mask: int) -> bytes:
     data = bytearray(frame)
     data[place % len(data)] ^= mask
     return bytes(data)
@@ -62,7 +62,7 @@ EVENTS = st.one_of(
 
 
 def bytes_of(head: Head, event: Sequence) -> bytes:
-    """What one event puts on the wire."""
+    """The bytes on the wire for one event."""
     kind, *how = event
     if kind == "frames":
         return b"".join(head.frame(flags=(how[1] + k) & 15) for k in range(how[0]))
@@ -73,13 +73,13 @@ def bytes_of(head: Head, event: Sequence) -> bytes:
     if kind == "time":
         return head.frame(later=how[0])
     if kind == "damaged":
-        return damaged(head.frame(), *how)
+        return flip_bits(head.frame(), *how)
     if kind == "front":
         return head.frame()[: how[0]]
     if kind == "tail":
         return head.frame()[how[0] :]
     if kind == "again":
-        return head.again(how[0])
+        return head.repeat(how[0])
     if kind == "foreign":
         return head.foreign(*how)
     return b"".join(how[0]) if kind == "garbage" else how[0]
@@ -87,7 +87,7 @@ def bytes_of(head: Head, event: Sequence) -> bytes:
 
 @st.composite
 def streams(draw: st.DrawFn) -> tuple[bytes, list[int], tuple[int, int]]:
-    """The bytes of a stream, where it is cut into pieces, and the shape of its head."""
+    """Bytes of a stream, cut positions, and shape (whiskers, channels) of its head."""
     shape = draw(st.sampled_from([(2, 1), (1, 3), (18, 3)]))
     start = draw(st.sampled_from([0, 1, 4000, 2**31, 2**32 - 60, 2**32 - 1]))
     head = Head(*shape, start, draw(st.sampled_from([0, 2**32 - 9000])))
@@ -96,8 +96,8 @@ def streams(draw: st.DrawFn) -> tuple[bytes, list[int], tuple[int, int]]:
     return data, sorted(cuts), shape
 
 
-def soaked(random: np.random.Generator, size: int, shape: tuple[int, int] = (18, 3)) -> bytes:
-    """A long stream in which about every sixtieth frame is followed by one of the events."""
+def damaged_stream(random: np.random.Generator, size: int, shape: tuple[int, int] = (18, 3)) -> bytes:
+    """A long stream with an event after about every sixtieth frame."""
     head, parts, length = Head(*shape, 2**32 - 5000, 2**32 - 10**6), [], 0
     while length < size:
         event = _event(random)
@@ -110,7 +110,7 @@ def soaked(random: np.random.Generator, size: int, shape: tuple[int, int] = (18,
 def _event(random: np.random.Generator) -> tuple:
     kind = random.choice(["skip", "back", "damaged", "front", "tail", "again", "foreign", "garbage", "noise"])
     number = int(random.integers(0, 200))
-    made: dict[str, tuple] = {
+    details: dict[str, tuple] = {
         "skip": (number + 2,),
         "back": (int(random.choice([1, 7, 40, 5000])),),
         "damaged": (number, int(random.integers(1, 256))),
@@ -121,4 +121,4 @@ def _event(random: np.random.Generator) -> tuple:
         "garbage": ([bytes(part) for part in random.choice(np.array(GARBAGE, object), 6)],),
         "noise": (random.bytes(number),),
     }
-    return (str(kind), *made[str(kind)])
+    return (str(kind), *details[str(kind)])

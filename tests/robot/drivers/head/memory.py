@@ -1,4 +1,4 @@
-"""A head in memory: sends what a test puts in and records the commands that it gets."""
+"""A head in memory: sends the bytes of a test and records the commands."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ WHISKERS = 2
 
 class MemoryHead:
     """Attributes:
-    plugged: whether it is there. stalls: how many of the next transfers it refuses. clock: device time, us.
-    commands, requests: what it was told. opened: how often.
+    plugged: whether it is connected. stalls: number of the next transfers to refuse. clock: device time, us.
+    commands, requests: received so far. opened, closed: number of connections opened and closed.
     """
 
     def __init__(self, whiskers: int = WHISKERS, channels: int = CHANNELS) -> None:
@@ -46,7 +46,7 @@ class MemoryHead:
             self._there.notify_all()
 
     def send(self, first: int, count: int = 10, values: np.ndarray | None = None, flags: int = 0) -> None:
-        """Frames in order, 500 us apart."""
+        """Sends frames in order, 500 us apart."""
         number = first + np.arange(count)
         if values is None:
             values = np.zeros((count, WHISKERS, CHANNELS), np.int16)

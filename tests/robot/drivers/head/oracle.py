@@ -1,4 +1,4 @@
-"""A second decoder, written from the definitions of `DecoderCounts` alone: slow, byte by byte."""
+"""A reference decoder after the definitions of `DecoderCounts`; it works byte by byte."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ class Sample(NamedTuple):
     values: tuple[int, ...]
 
 
-class Story(NamedTuple):
-    """What became of a stream: the samples, the numbers of `Counts` in their order, the bytes undecided."""
+class Decoded(NamedTuple):
+    """The samples of a stream, its counts in the order of `DecoderCounts`, the number of undecided bytes."""
 
     samples: list[Sample]
     counts: tuple[int, ...]
@@ -25,7 +25,7 @@ class Story(NamedTuple):
 
 
 class Stream:
-    """The numbers accepted since a head began to count."""
+    """Frame numbers accepted since the last restart of a head."""
 
     def __init__(self, number: int) -> None:
         self.first = self.highest = number
@@ -40,8 +40,8 @@ class Stream:
         return self.highest - self.first + 1 - len(self.numbers)
 
 
-def told(data: bytes, whiskers: int, channels: int) -> Story:
-    """What a decoder is to make of these bytes, fed in whatever pieces."""
+def decode_reference(data: bytes, whiskers: int, channels: int) -> Decoded:
+    """The correct result for these bytes; it does not depend on the pieces in which they arrive."""
     body = 16 + 2 * whiskers * channels
     samples: list[Sample] = []
     streams: list[Stream] = []
@@ -60,11 +60,11 @@ def told(data: bytes, whiskers: int, channels: int) -> Story:
             bad, skipped, place = bad + 1, skipped + 1, place + 1
             continue
         place += body + 4
-        full = placed(number, streams)
+        full = accept_number(number, streams)
         if full is None:
             duplicates += 1
             continue
-        # The candidate nearest to the time before; of two as near the earlier.
+        # The candidate nearest to the previous time; of two at the same distance, the earlier.
         if time is None:
             time = stamp
         else:
@@ -75,11 +75,11 @@ def told(data: bytes, whiskers: int, channels: int) -> Story:
         samples.append(Sample(full, time, flags, struct.unpack(f"<{whiskers * channels}h", here[16:body])))
     missing = sum(stream.missing for stream in streams)
     counts = (len(samples), bad, missing, skipped, overruns, duplicates, max(0, len(streams) - 1))
-    return Story(samples, counts, len(data) - place)
+    return Decoded(samples, counts, len(data) - place)
 
 
-def placed(number: int, streams: list[Stream]) -> int | None:
-    """The full number of a frame that is new, now added to the last stream; None for one not to be taken."""
+def accept_number(number: int, streams: list[Stream]) -> int | None:
+    """Adds a new frame number to the last stream; returns it unwrapped, or None for a duplicate."""
     if not streams:
         streams.append(Stream(number))
         return number

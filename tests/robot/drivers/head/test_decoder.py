@@ -1,4 +1,4 @@
-"""The decoder agrees with the slow one in `oracle.py` for damaged streams, however they are split."""
+"""The decoder agrees with the reference decoder in `oracle.py` for damaged streams in any pieces."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 from robot.drivers.head.decoder import Decoder, DecoderCounts, Frames
 from robot.drivers.head.protocol import FrameFlag, pack_frames
-from tests.robot.drivers.head.damage import damaged, soaked, streams
-from tests.robot.drivers.head.oracle import Sample, told
+from tests.robot.drivers.head.damage import damaged_stream, flip_bits, streams
+from tests.robot.drivers.head.oracle import Sample, decode_reference
 
 ROOT = Path(__file__).parents[4]
 
@@ -41,10 +41,10 @@ def test_every_prefix_agrees_with_the_reference_decoder(drawn):
     decoder, got = Decoder(*shape), []
     for start, end in itertools.pairwise([0, *cuts, len(data)]):
         got += samples(decoder.feed(data[start:end]))
-        story = told(data[:end], *shape)
-        assert got == story.samples
-        assert decoder.counts == DecoderCounts(*story.counts)
-        assert decoder.pending == story.pending
+        expected = decode_reference(data[:end], *shape)
+        assert got == expected.samples
+        assert decoder.counts == DecoderCounts(*expected.counts)
+        assert decoder.pending == expected.pending
         size = 20 + 2 * shape[0] * shape[1]
         whole = decoder.counts.good + decoder.counts.duplicates
         assert end == size * whole + decoder.counts.skipped_bytes + decoder.pending
@@ -76,11 +76,11 @@ def test_a_damaged_frame_costs_no_other_frame():
     for place in range(128):
         for mask in (1, 0x80, 0xFF):
             decoder = Decoder(18)
-            broken = data[: 4 * 128] + damaged(data[4 * 128 : 5 * 128], place, mask) + data[5 * 128 :]
+            broken = data[: 4 * 128] + flip_bits(data[4 * 128 : 5 * 128], place, mask) + data[5 * 128 :]
             frames = decoder.feed(broken)
             assert frames.sequence.tolist() == [0, 1, 2, 3, 5, 6, 7, 8]
             assert decoder.counts.missing == 1
-            assert decoder.counts.bad == (place >= 4)  # where the magic itself is broken nothing stood
+            assert decoder.counts.bad == (place >= 4)  # a damaged magic is no frame start
 
 
 def test_any_lost_bytes_cost_one_frame():
@@ -135,7 +135,7 @@ def test_times_after_a_restart_follow_the_device_clock():
 
 
 def test_decoding_time_is_linear_for_hostile_bytes(monkeypatch):
-    """Every byte is judged once, not once for every frame behind it."""
+    """Each byte is examined once, not once per later frame."""
     header = pack_frames([1], [1], [0], np.zeros((1, 18, 3), np.int16))[:16]
     calls, real = [], zlib.crc32
     monkeypatch.setattr(zlib, "crc32", lambda *args: calls.append(1) or real(*args))
@@ -161,7 +161,7 @@ def test_fuzzing(tmp_path):
 @pytest.mark.soak
 def test_ten_million_bytes(record_property):
     random = np.random.default_rng(17)
-    data = soaked(random, 10_000_000)
+    data = damaged_stream(random, 10_000_000)
     decoder, got, place, took = Decoder(18), [], 0, 0.0
     while place < len(data):
         step = int(random.choice([1, 7, 127, 129, 512, 4096, 65536]))
@@ -170,21 +170,21 @@ def test_ten_million_bytes(record_property):
         took += time.perf_counter() - began
         got += samples(frames)
         place += step
-    story = told(data, 18, 3)
-    assert decoder.counts == DecoderCounts(*story.counts)
-    assert got == story.samples
+    expected = decode_reference(data, 18, 3)
+    assert decoder.counts == DecoderCounts(*expected.counts)
+    assert got == expected.samples
     record_property("times_real", 10_000_000 / 256_000 / took)
     print(f"\n{decoder.counts}; {10_000_000 / 256_000 / took:.0f} x real time at 256 kB/s")
 
 
 def test_a_long_stream_in_random_pieces():
     random = np.random.default_rng(5)
-    data = soaked(random, 300_000)
+    data = damaged_stream(random, 300_000)
     decoder, got, place = Decoder(18), [], 0
     while place < len(data):
         step = int(random.choice([1, 7, 127, 129, 512, 4096, 65536]))
         got += samples(decoder.feed(data[place : place + step]))
         place += step
-    story = told(data, 18, 3)
-    assert decoder.counts == DecoderCounts(*story.counts)
-    assert got == story.samples
+    expected = decode_reference(data, 18, 3)
+    assert decoder.counts == DecoderCounts(*expected.counts)
+    assert got == expected.samples

@@ -27,7 +27,7 @@ usb = pytest.importorskip("usb.core", reason="pyusb is not installed")
 
 
 class Device:
-    """A device of pyusb whose transfers end as the test says."""
+    """A pyusb device whose transfers succeed, or raise `error`."""
 
     def __init__(self, error: Exception | None = None) -> None:
         self.error = error
@@ -159,7 +159,7 @@ def test_no_head_at_an_address():
 
 
 def test_usb_without_a_head():
-    """With a real libusb: no head, or no right to look; never a traceback of its own."""
+    """With a real libusb: no head or no permission, never another exception."""
     with pytest.raises((Disconnected, InputError)):
         open_bridge("usb:1209:0001:there-is-none")
 

@@ -25,7 +25,7 @@ HEAD = ur10_head(HeadConfig())
 
 
 class Control:
-    """The emulator's faults."""
+    """Connection to the emulator's fault port."""
 
     def __init__(self, host: str) -> None:
         self._socket = socket.create_connection((host, 30099), 60)
@@ -62,9 +62,9 @@ def emulator(loopback):
 @pytest.fixture
 def reader(loopback, emulator):
     config = HeadLinkConfig(address=loopback, silence=1.0, patience=60.0)
-    told = []
-    with HeadReader(lambda: open_bridge(loopback), 18, config, on_overload=told.append) as reader:
-        reader.overloaded = told  # type: ignore[attr-defined]
+    overloads = []
+    with HeadReader(lambda: open_bridge(loopback), 18, config, on_overload=overloads.append) as reader:
+        reader.overloaded = overloads  # type: ignore[attr-defined]
         until(lambda: reader.decoder.counts.good > 100)
         yield reader
     emulator("plug")
@@ -135,7 +135,7 @@ def test_a_saturated_whisker_is_an_overload(reader, emulator):
 
 
 def whisk(host: str, mode: str, rcp: str) -> tuple[np.ndarray, np.ndarray, float]:
-    """Largest angle and deflection [W], rad, of a whisk, and the share of it with feedback in the head."""
+    """Largest angle and deflection [W] of a whisk, rad, and its share with feedback in the head."""
     with HeadReader(
         lambda: open_bridge(host), 18, HeadLinkConfig(address=host, rcp=rcp, silence=2.0, patience=60.0)
     ) as reader:
@@ -176,7 +176,7 @@ def test_feedback_in_the_head_reduces_amplitudes_on_contact(loopback, emulator):
 
 @pytest.mark.soak
 def test_feedback_on_the_host_reduces_amplitudes_on_contact(loopback, emulator):
-    """Needs a timely host."""
+    """Feedback fails if the host is late."""
     angle, bent, _ = whisk(loopback, "open", "head")
     touched = bent > 0.1
     other, lowered, fed = whisk(loopback, "rcp", "host")

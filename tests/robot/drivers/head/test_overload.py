@@ -1,4 +1,4 @@
-"""Overload needs two consecutive overloaded samples, in whatever blocks they arrive."""
+"""Overload needs two consecutive overloaded samples, in blocks of any size."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ def test_overload_does_not_depend_on_the_blocks(rows, data):
     values[:, :, 2] = np.array(rows, np.int16).reshape(-1, 2)
     cuts = sorted(data.draw(st.lists(st.integers(0, len(rows)), max_size=4)))
     overload = watcher()
-    told = [overload.check(block) for block in np.split(values, cuts)]
+    found = [overload.check(block) for block in np.split(values, cuts)]
     over = np.abs(values[..., 2]) >= LIMIT
     twice = over[1:] & over[:-1]
-    assert {one for one in told if one is not None} <= set(np.flatnonzero(twice.any(axis=0)).tolist())
-    assert any(one is not None for one in told) == twice.any()
+    assert {one for one in found if one is not None} <= set(np.flatnonzero(twice.any(axis=0)).tolist())
+    assert any(one is not None for one in found) == twice.any()
 
 
 @pytest.mark.parametrize(

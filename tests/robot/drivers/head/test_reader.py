@@ -18,7 +18,7 @@ from tests.robot.drivers.head.memory import WHISKERS, MemoryHead
 
 QUICK = HeadLinkConfig(silence=0.5, patience=1.5)
 PATIENT = HeadLinkConfig(silence=30.0, patience=60.0)
-"""For tests in which nothing may be lost, however busy the machine."""
+"""Limits for tests that lose no data on a busy machine."""
 DRIVE = Command(CommandKind.DRIVE, FeedbackMode.RCP, 1.0, 1.0)
 CENTRE = Command(CommandKind.CENTRE, numbers=np.array([3, 4], np.int16))
 
@@ -36,7 +36,7 @@ def reader(head):
 
 @pytest.fixture
 def quick_reader(head):
-    """Gives the head up after 1.5 s."""
+    """Reports a fault after 1.5 s without the head."""
     with HeadReader(head.connect, WHISKERS, QUICK) as reader:
         yield reader
 
@@ -50,15 +50,15 @@ def kinds(head: MemoryHead) -> list[CommandKind]:
 
 
 def test_samples_reach_the_ring_and_every_listener(head, reader):
-    told = []
-    reader.listeners.append(lambda frames, arrival: told.append((frames, arrival)))
+    calls = []
+    reader.listeners.append(lambda frames, arrival: calls.append((frames, arrival)))
     began = time.monotonic()
     for k in range(5):
         head.send(10 * k)
     until(lambda: good(reader) == 50)
     assert reader.ring.between(0, 99).sequence.tolist() == list(range(50))
-    until(lambda: sum(len(frames.sequence) for frames, _ in told) == 50)
-    assert all(began <= arrival <= time.monotonic() for _, arrival in told)
+    until(lambda: sum(len(frames.sequence) for frames, _ in calls) == 50)
+    assert all(began <= arrival <= time.monotonic() for _, arrival in calls)
     assert reader.state.link == LinkState.STREAMING
     assert reader.fault is None
 
@@ -107,7 +107,7 @@ def test_keep_alives_are_sent_only_while_whisking(head, reader):
     until(lambda: len(head.commands) >= 4)
     assert kinds(head)[:4] == [CommandKind.DRIVE, CommandKind.KEEP, CommandKind.KEEP, CommandKind.KEEP]
     reader.rest()
-    time.sleep(0.3)  # commands that were under way
+    time.sleep(0.3)  # commands already sent
     count = len(head.commands)
     time.sleep(0.3)
     assert len(head.commands) == count
@@ -123,7 +123,7 @@ def test_keep_alive_period(head, reader):
         now = time.monotonic()
         gaps += [now - last] if last else []
         last = now
-    assert np.median(gaps) < 0.4  # a head waits for 0.5 s
+    assert np.median(gaps) < 0.4  # the head's time-out is 0.5 s
 
 
 def test_only_the_newest_amplitudes_are_sent(head, reader):
@@ -172,7 +172,7 @@ def test_a_head_that_stays_disconnected_is_a_fault(head, quick_reader):
     assert "pulled out" in quick_reader.fault.detail
     head.plugged = True
     until(lambda: quick_reader.state.link != LinkState.AWAY)
-    assert quick_reader.fault.outcome == SessionOutcome.HEAD_GONE  # once one, always one
+    assert quick_reader.fault.outcome == SessionOutcome.HEAD_GONE  # a fault stays
 
 
 def test_a_silent_head_is_reported_and_started_again(head, quick_reader):
@@ -233,10 +233,10 @@ def test_an_exception_in_the_thread_is_a_fault(head, reader, monkeypatch):
 
 
 def test_overload_is_reported_with_the_whisker(head):
-    told = []
-    with HeadReader(head.connect, WHISKERS, QUICK, on_overload=told.append) as reader:
+    overloads = []
+    with HeadReader(head.connect, WHISKERS, QUICK, on_overload=overloads.append) as reader:
         values = np.zeros((10, WHISKERS, 3), np.int16)
         values[4:6, 1, 2] = -20000
         head.send(0, values=values)
         until(lambda: good(reader) == 10)
-        until(lambda: told == [1])
+        until(lambda: overloads == [1])

@@ -1,4 +1,4 @@
-"""Sequence numbers, with so small a range that all orders of arrival are tried."""
+"""Sequence numbers, with a small range, so that all orders of arrival occur."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_all_orders_of_arrival(few, first, steps, cuts):
     mine, streams = SequenceUnwrapper(), []
     for block in np.split(np.array(raw, np.uint32), sorted(cut for cut in cuts if cut <= len(raw))):
         number, new = mine.take(block)
-        full = [oracle.placed(value, streams) for value in block.tolist()]
+        full = [oracle.accept_number(value, streams) for value in block.tolist()]
         assert [n if taken else None for n, taken in zip(number.tolist(), new.tolist(), strict=True)] == full
         assert mine.missing == sum(stream.missing for stream in streams)
         assert mine.streams == len(streams)

@@ -47,18 +47,18 @@ def process(loopback: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator
 
 @pytest.fixture
 def head(process: Faults) -> Faults:
-    """Plugged in, and nothing wrong with it."""
+    """A connected head without faults."""
     process(do="plug")
     return process
 
 
-def found(head: Faults) -> Any:
+def find_device(head: Faults) -> Any:
     return core.find(backend=SocketBackend(head.host), idVendor=VENDOR, idProduct=PRODUCT)
 
 
 @pytest.fixture
 def device(head: Faults) -> Iterator[Any]:
-    one = found(head)
+    one = find_device(head)
     one.get_active_configuration()
     try:
         yield one
@@ -71,7 +71,7 @@ def start(device: Any) -> None:
 
 
 def read(device: Any, count: int, decoder: Decoder) -> Frames:
-    """At least so many frames, read 4 KiB at a time."""
+    """Reads 4 KiB at a time until there are at least `count` frames."""
     parts: list[Frames] = []
     while sum(len(part.sequence) for part in parts) < count:
         parts.append(decoder.feed(device.read(ENDPOINT_IN, 4096, 30_000).tobytes()))
@@ -88,7 +88,7 @@ def test_the_backend_has_the_methods_of_pyusb() -> None:
     assert len(asked) > 20
     for name, method in asked.items():
         ours = list(inspect.signature(getattr(SocketBackend, name)).parameters)
-        if "transfer" not in ours:  # of kinds that the device has not
+        if "transfer" not in ours:  # of transfer kinds without a use here
             assert ours == list(inspect.signature(method).parameters), name
 
 
@@ -99,12 +99,12 @@ def test_the_device_is_found_with_its_descriptors(head: Faults, device: Any) -> 
     assert [end.bEndpointAddress for end in interface] == [ENDPOINT_IN, ENDPOINT_OUT]
     assert util.endpoint_type(interface[0].bmAttributes) == util.ENDPOINT_TYPE_BULK
     assert core.find(backend=SocketBackend(head.host), idVendor=0x1234) is None
-    assert found(Faults(head.process, "127.0.0.1", 0)) is None or head.host == "127.0.0.1"
+    assert find_device(Faults(head.process, "127.0.0.1", 0)) is None or head.host == "127.0.0.1"
 
 
 def test_a_second_program_gets_a_busy_error(head: Faults, device: Any) -> None:
     util.claim_interface(device, 0)
-    other = found(head)
+    other = find_device(head)
     with pytest.raises(core.USBError) as caught:
         util.claim_interface(other, 0)
     assert caught.value.errno == errno.EBUSY
@@ -133,8 +133,8 @@ def test_all_frames_are_transferred(head: Faults, device: Any) -> None:
     cycles = begins[begins < begins[0] + 2 * samples]
     assert len(cycles) == 2
     assert np.diff(cycles) == samples
-    told = {kind: count - heard.get(kind, 0) for kind, count in head.state()["commands"].items()}
-    assert (told["DRIVE"], told["KEEP"]) == (1, len(parts))
+    commands = {kind: count - heard.get(kind, 0) for kind, count in head.state()["commands"].items()}
+    assert (commands["DRIVE"], commands["KEEP"]) == (1, len(parts))
     after = head(do="counts")
     sent = after["sent"] - before["sent"]
     assert sent == decoder.counts.good == len(frames.values)
@@ -146,7 +146,7 @@ def test_all_frames_are_transferred(head: Faults, device: Any) -> None:
 
 
 def test_a_paused_process_loses_no_frames(head: Faults, device: Any) -> None:
-    """It makes the frames of the pause afterwards; its queue holds more than these."""
+    """The process makes the frames of the pause afterwards; its queue has room for them."""
     decoder = Decoder(18, 3)
     start(device)
     read(device, 200, decoder)
@@ -193,12 +193,12 @@ def test_unplugging_is_reported_and_the_old_handle_stays_invalid(head: Faults, d
         with pytest.raises(core.USBError) as caught:
             device.read(ENDPOINT_IN, 4096, 30_000)
         assert caught.value.errno == errno.ENODEV
-    assert found(head) is None
+    assert find_device(head) is None
     head(do="plug")
     with pytest.raises(core.USBError) as caught:
         device.write(ENDPOINT_OUT, pack_command(KEEP_ALIVE), 30_000)
     assert caught.value.errno == errno.ENODEV
-    again = until(lambda: found(head))
+    again = until(lambda: find_device(head))
     start(again)
     assert len(again.read(ENDPOINT_IN, 4096, 30_000)) > 0
     util.dispose_resources(again)
@@ -236,11 +236,11 @@ def test_an_invalid_configuration_is_refused(tmp_path: Path, capsys: pytest.Capt
 def test_a_dead_emulator_is_a_disconnected_device(tmp_path: Path, loopback: str) -> None:
     host = f"127.0.1.{loopback.rsplit('.', 1)[1]}"
     with running(HeadEmulatorConfig(host=host, path={"explore": 5}), tmp_path) as head:
-        device = found(head)
+        device = find_device(head)
         start(device)
         head.die()
         with pytest.raises(core.USBError) as caught:
             read(device, 2**40, Decoder(18, 3))
         assert caught.value.errno == errno.ENODEV
-        assert found(head) is None
+        assert find_device(head) is None
         util.dispose_resources(device)

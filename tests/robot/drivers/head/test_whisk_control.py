@@ -24,7 +24,7 @@ CENTRE = np.linspace(-0.01, 0.01, 18)
 
 
 def whisks(count: int, touched: np.ndarray | None = None, start: int = 0) -> Frames:
-    """Samples of 2 kHz from the beginning of a whisk on, of 1 s each; y [N, 18], rad."""
+    """Samples at 2 kHz from the start of a whisk of 1 s on; `touched` is y [N, 18], rad."""
     number = start + np.arange(count)
     values = np.zeros((count, 18, 3), np.int16)
     values[..., 2] = to_counts(CENTRE + (0.0 if touched is None else touched))
@@ -37,7 +37,7 @@ def blocks(frames: Frames, cuts: list[int]) -> list[Frames]:
 
 
 @pytest.mark.parametrize(
-    ("mode", "rcp", "threshold", "told"),
+    ("mode", "rcp", "threshold", "command_mode"),
     [
         ("open", "head", THRESHOLD, FeedbackMode.OPEN),
         ("rcp", "head", THRESHOLD, FeedbackMode.RCP),
@@ -46,10 +46,10 @@ def blocks(frames: Frames, cuts: list[int]) -> list[Frames]:
         ("spread", "host", THRESHOLD, FeedbackMode.OPEN),
     ],
 )
-def test_where_feedback_is_computed(mode, rcp, threshold, told):
+def test_where_feedback_is_computed(mode, rcp, threshold, command_mode):
     whisking = WhiskingConfig(mode=mode, rate=2.0, amplitude_deg=50, gain=3)
     centre, drive = whisk_commands(whisking, threshold, CENTRE, rcp)
-    assert (centre.kind, drive.kind, drive.mode) == (CommandKind.CENTRE, CommandKind.DRIVE, told)
+    assert (centre.kind, drive.kind, drive.mode) == (CommandKind.CENTRE, CommandKind.DRIVE, command_mode)
     np.testing.assert_allclose(centre.numbers * ANGLE, CENTRE, atol=ANGLE)
     assert drive.amplitude == np.radians(50)
     assert (drive.frequency, drive.gain, drive.window) == (2.0, 3.0, 0.01)
@@ -79,18 +79,18 @@ def test_host_feedback_follows_the_whisking_law(mode, cuts, whisker, bend):
     touched = np.zeros((900, 18))
     touched[400:, whisker] = bend
     frames = whisks(900, touched)
-    host, told = HostRcp(whisking, HEAD.shape, THRESHOLD, CENTRE), []
+    host, sent = HostRcp(whisking, HEAD.shape, THRESHOLD, CENTRE), []
     for block in blocks(frames, sorted(cuts)):
         amplitudes = host.amplitudes(block)
-        told += [] if amplitudes is None else [amplitudes]
+        sent += [] if amplitudes is None else [amplitudes]
 
     drive = initial_drive(18)
     for k in range(900):
         y = frames.values[k, :, 2] * ANGLE - CENTRE
         aim, drive = whisk_command(whisking, drive, k / 2000, y, THRESHOLD, HEAD.shape)
     share = (1 - np.cos(2 * np.pi * 899 / 2000)) / 2
-    np.testing.assert_allclose(told[-1] * ANGLE, aim / share, atol=ANGLE)
-    assert told[-1][whisker] < to_counts(np.radians(65))
+    np.testing.assert_allclose(sent[-1] * ANGLE, aim / share, atol=ANGLE)
+    assert sent[-1][whisker] < to_counts(np.radians(65))
 
 
 def test_amplitudes_of_a_free_whisk_are_sent_once_per_cycle():

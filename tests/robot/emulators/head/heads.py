@@ -28,27 +28,27 @@ from tactile.whiskers.head_geometry import ur10_head
 from tests.helpers.live import Faults, emulator
 
 TABLE = Walls(np.array([[-9.0, -9.0, 9.0, 9.0]]), np.array([0.05]))
-"""Under the whole head: every whisker meets it with its tip."""
+"""A plate under the head, 5 cm high: every whisker touches it with its tip."""
 EVER = 10**9
-"""More bytes than there ever are."""
+"""Read size above any number of queued bytes."""
 
 
 def drive(mode: FeedbackMode = FeedbackMode.RCP, threshold: float = 0.04, **changes: Any) -> Command:
-    """A whisk as the paper has it."""
+    """A whisk with the paper's settings."""
     numbers = np.full(18, to_counts(np.array(threshold)))
     usual = {"amplitude": np.radians(65), "frequency": 1.0, "gain": 4.0, "window": 0.01}
     return Command(CommandKind.DRIVE, mode, numbers=numbers, **usual | changes)
 
 
 def world(config: HeadEmulatorConfig) -> Scene:
-    """Of a configuration."""
+    """The scene of a configuration."""
     return make_scene(
         config.maze, config.path, config.motion, KidnapConfig(), ur10_head(config.head), config.seed
     )
 
 
-class Told:
-    """A head in memory, and a host that reads it and keeps it awake, a block after the other."""
+class HostedHead:
+    """An emulated head in memory with a host, which reads it and keeps it awake, in simulated time."""
 
     def __init__(
         self, config: HeadEmulatorConfig | None = None, walls: Walls = TABLE, place: PoseSource | None = None
@@ -60,14 +60,14 @@ class Told:
         self.decoder, self.now = Decoder(whiskers, 3), 0.0
 
     def start(self) -> None:
-        """Has it send frames."""
+        """Starts the stream of frames."""
         self.bridge.control(REQUEST_OUT, Request.START, 0, 0, self.now)
 
     def send(self, command: Command) -> None:
         self.bridge.bulk_out(pack_command(command), self.now)
 
     def pass_by(self, seconds: float, awake: bool = True, read: bool = True) -> Frames:
-        """Time passes; what was read meanwhile."""
+        """Advances time by some seconds; returns the frames read."""
         end, got = self.now + seconds, []
         while self.now < end - 1e-9:
             if awake:
@@ -79,12 +79,12 @@ class Told:
                 got.append(self.bridge.bulk_in(EVER, self.now))
         return self.decoder.feed(b"".join(got))
 
-    def do(self, fault: str, **told: Any) -> dict[str, Any]:
-        return self.bridge.do({"do": fault, **told}, self.now)
+    def do(self, fault: str, **arguments: Any) -> dict[str, Any]:
+        return self.bridge.do({"do": fault, **arguments}, self.now)
 
 
 def running(config: HeadEmulatorConfig, folder: Path) -> AbstractContextManager[Faults]:
-    """A head in a process of its own that listens, until the end of the block."""
+    """An emulated head in its own process, until the end of the block."""
     file = folder / "head.json"
     file.write_text(config.model_dump_json())
     return emulator("robot.emulators.head", CONTROL_PORT, config.host, "--config", str(file))

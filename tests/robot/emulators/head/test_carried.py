@@ -21,9 +21,9 @@ def test_the_head_follows_the_tool(tmp_path: Path, loopback: str) -> None:
 
         def stands(pose: np.ndarray, lift: float) -> bool:
             state = head(do="state")
-            told = state["lift"] is not None and abs(state["lift"] - lift) < 1e-6
-            return told and bool(np.allclose(state["pose"], pose, atol=1e-6))
+            level = state["lift"] is not None and abs(state["lift"] - lift) < 1e-6
+            return level and bool(np.allclose(state["pose"], pose, atol=1e-6))
 
-        until(lambda: stands(here, 0.1), "where the arm began")
+        until(lambda: stands(here, 0.1), "the head is at the arm's start")
         arm(do="place", tcp=tcp_from_pose(PLACING, there).tolist())
-        until(lambda: stands(there, 0.0), "where the arm was put")
+        until(lambda: stands(there, 0.0), "the head is at the arm's new place")

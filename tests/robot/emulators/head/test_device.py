@@ -14,13 +14,13 @@ from robot.drivers.head.protocol import ANGLE, REQUEST_IN, REQUEST_OUT, WRAP, Fr
 from robot.emulators.head.config import HeadEmulatorConfig
 from robot.emulators.head.device import BLOCK
 from robot.emulators.head.fifo import Fifo
-from tests.robot.emulators.head.heads import EVER, Told, drive
+from tests.robot.emulators.head.heads import EVER, HostedHead, drive
 
 FREE = HeadEmulatorConfig()
 
 
-def started(**changes: object) -> Told:
-    head = Told(HeadEmulatorConfig.model_validate(changes))
+def started(**changes: object) -> HostedHead:
+    head = HostedHead(HeadEmulatorConfig.model_validate(changes))
     head.start()
     return head
 
@@ -63,7 +63,7 @@ def test_unread_frames_beyond_the_capacity_are_lost() -> None:
     rest = head.pass_by(0.1)
     found = head.do("counts")
     assert found == {"made": 1400, "sent": 480, "queued": 0, "lost": 920, "dropped": 0, "skipped": 0}
-    # 100 waited; what came next says that something is missing before it.
+    # 100 frames were queued; the next one has the overrun flag.
     assert rest.sequence.tolist() == [*range(200, 300), *range(1220, 1400)]
     assert np.flatnonzero(rest.flags & FrameFlag.OVERRUN).tolist() == [100]
     assert head.decoder.counts.missing == 920
@@ -77,7 +77,7 @@ def test_times_follow_from_the_numbers() -> None:
     assert len(head.pass_by(0.3).values) == 0
     head.start()
     frames = head.pass_by(0.1)
-    assert frames.sequence[0] == 1000  # counted while it was stopped
+    assert frames.sequence[0] == 1000  # numbers advance while stopped
     assert (frames.time == 500 * frames.sequence).all()
 
 
@@ -114,7 +114,7 @@ def test_clock_drift() -> None:
         times.append(int.from_bytes(answer, "little"))
         frames += len(head.pass_by(10.0).values)
     assert times[1] - times[0] == 10_005_000
-    # It samples by its own clock, in blocks that end by then.
+    # Samples follow the head's clock, in complete blocks.
     assert 40_020 - head.bridge.samples <= frames <= 40_020
 
 
@@ -202,7 +202,7 @@ def test_unplugging_ends_the_stream() -> None:
 
 
 def test_identity_and_unknown_requests() -> None:
-    head = Told(HeadEmulatorConfig(head={"whiskers": 4}))
+    head = HostedHead(HeadEmulatorConfig(head={"whiskers": 4}))
     identity = json.loads(head.bridge.control(REQUEST_IN, Request.IDENTITY, 0, 1024, 0.0))
     assert identity | {"name": "", "version": ""} == {
         "name": "",

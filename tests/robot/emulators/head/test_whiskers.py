@@ -29,16 +29,16 @@ from robot.world.walls import Surroundings
 from tactile.base.random_streams import stream
 from tactile.whiskers.head_geometry import HeadConfig
 from tactile.whiskers.whisking import WhiskingConfig
-from tests.robot.emulators.head.heads import TABLE, Told, drive, world
+from tests.robot.emulators.head.heads import TABLE, HostedHead, drive, world
 
 PLACING = BaseTransformConfig(x=-0.4, y=0.3, z=0.12, yaw_deg=30.0)
 ODD = 2100.0
-"""A rate with no sample in the middle of a block, where walls take over from each other: there, which of them
-it is depends on the last bit of the time."""
+"""A rate without a sample in the middle of a block, where the nearest wall changes and would depend on the
+last bit of the time."""
 
 
 class Arm:
-    """Told by the test."""
+    """An arm with the state that the test sets."""
 
     def __init__(self) -> None:
         self.state: ToolPose | None = None
@@ -57,17 +57,17 @@ def test_samples_along_a_path_agree_with_the_simulator(mode: FeedbackMode, frequ
         follow=True, path={"explore": 9}, seed=3, stream={"rate": ODD}, head={"dead": (4,)}
     )
     made = world(config)
-    head = Told(config, made.surroundings.walls, AlongPath(made.path))
-    told = drive(mode, frequency=frequency)
+    head = HostedHead(config, made.surroundings.walls, AlongPath(made.path))
+    command = drive(mode, frequency=frequency)
     head.start()
-    head.send(told)
+    head.send(command)
     frames = head.pass_by(3.0)
     samples = round(ODD / frequency)
     assert np.flatnonzero(frames.flags & FrameFlag.CYCLE).tolist() == list(
         range(0, len(frames.values), samples)
     )
 
-    whisking = WhiskingConfig(mode=mode.name.lower(), rate=frequency, gain=told.gain)
+    whisking = WhiskingConfig(mode=mode.name.lower(), rate=frequency, gain=command.gain)
     start = np.arange(3 * frequency) / frequency
     knots = {"batch": 1, "poses": samples // head.bridge.samples}
     settings = config.stream.model_copy(update=knots)
@@ -78,18 +78,18 @@ def test_samples_along_a_path_agree_with_the_simulator(mode: FeedbackMode, frequ
         made.path,
         start,
         stream(config.seed, "sensor"),
-        told.numbers * ANGLE,
+        command.numbers * ANGLE,
     )
-    felt = np.concatenate([frame_values(cycle.angle, cycle.deflection) for cycle in raw])
-    off = np.abs(felt.astype(int) - frames.values)
-    assert np.abs(felt[..., 2] * ANGLE).max() > 0.05
+    expected = np.concatenate([frame_values(cycle.angle, cycle.deflection) for cycle in raw])
+    off = np.abs(expected.astype(int) - frames.values)
+    assert np.abs(expected[..., 2] * ANGLE).max() > 0.05
     assert off.max() <= 1
     assert (off == 0).mean() > 0.999
     assert (frames.flags & FrameFlag.RCP).any() == (mode == FeedbackMode.RCP)
 
 
 def test_a_whisk_may_end_within_a_block() -> None:
-    head = Told()
+    head = HostedHead()
     head.start()
     head.send(drive(FeedbackMode.OPEN, frequency=1.3))
     frames = head.pass_by(3.0)
@@ -102,7 +102,7 @@ def test_a_whisk_may_end_within_a_block() -> None:
 
 @pytest.mark.parametrize("lift", [0.0, 0.02, -0.004])
 def test_samples_of_a_carried_head_agree_with_a_fixed_one(lift: float) -> None:
-    """Lifted, it feels what it would feel over walls that are so much lower."""
+    """A lift has the effect of walls lower by that lift."""
     config = HeadEmulatorConfig(path={"explore": 9}, mechanics={"noise": 0.0})
     walls = world(config).surroundings.walls
     pose = np.array([0.63, 0.45, 2.0])
@@ -111,18 +111,18 @@ def test_samples_of_a_carried_head_agree_with_a_fixed_one(lift: float) -> None:
     lower = walls._replace(height=walls.height - lift)
     stays = AlongPath(HeadPath(np.zeros(1), pose[None]))
     found = []
-    for head in (Told(config, walls, CarriedByArm(arm, PLACING)), Told(config, lower, stays)):
+    for head in (HostedHead(config, walls, CarriedByArm(arm, PLACING)), HostedHead(config, lower, stays)):
         head.start()
         head.send(drive())
         found.append(head.pass_by(1.0).values.astype(int))
     assert np.abs(found[0] - found[1]).max() <= 1
-    felt = Surroundings(lower, head.bridge.whiskers.head).contact(pose[None]).angle[0] < np.radians(60)
-    assert felt.any() == ((found[0][..., 2] * ANGLE).max() > 0.05)
+    expected = Surroundings(lower, head.bridge.whiskers.head).contact(pose[None]).angle[0] < np.radians(60)
+    assert expected.any() == ((found[0][..., 2] * ANGLE).max() > 0.05)
 
 
 def test_no_contact_when_lifted_or_before_the_first_arm_state() -> None:
     arm = Arm()
-    head = Told(HeadEmulatorConfig(mechanics={"noise": 0.0}), TABLE, CarriedByArm(arm, PLACING))
+    head = HostedHead(HeadEmulatorConfig(mechanics={"noise": 0.0}), TABLE, CarriedByArm(arm, PLACING))
     head.start()
     head.send(drive())
     assert not to_radians(head.pass_by(1.0).values)[1].any()
@@ -148,25 +148,25 @@ def test_poses_between_arm_states_are_extrapolated() -> None:
 
 
 def test_whiskers_retract_without_commands() -> None:
-    head = Told(HeadEmulatorConfig(mechanics={"noise": 0.0}))
+    head = HostedHead(HeadEmulatorConfig(mechanics={"noise": 0.0}))
     head.start()
     head.send(drive(FeedbackMode.OPEN))
     assert to_radians(head.pass_by(0.4).values)[0].max() > 0.5
     frames = head.pass_by(2.0, awake=False)
     angle = to_radians(frames.values)[0]
-    assert len(angle) == 4000  # it goes on sending
+    assert len(angle) == 4000  # the stream continues
     silent = round(COMMAND_TIMEOUT * 2000)
     assert (angle[silent - 100] > 0.2).all()
     assert (angle[silent + 500 :] == 0).all()
     assert (np.diff(angle[silent + 60 : silent + 500], axis=0) <= 1e-9).all()
     assert not (frames.flags[silent + 20 :] & FrameFlag.CYCLE).any()
-    assert not to_radians(head.pass_by(1.0).values)[0].any()  # being kept awake is not being driven
+    assert not to_radians(head.pass_by(1.0).values)[0].any()  # keep-alives do not start a whisk
     head.send(drive(FeedbackMode.OPEN))
     assert to_radians(head.pass_by(1.0).values)[0].max() > 0.5
 
 
 def test_a_new_drive_command_starts_with_the_next_cycle() -> None:
-    head = Told(HeadEmulatorConfig(mechanics={"noise": 0.0}))
+    head = HostedHead(HeadEmulatorConfig(mechanics={"noise": 0.0}))
     head.start()
     head.send(drive(FeedbackMode.OPEN))
     head.pass_by(0.3)
@@ -181,7 +181,7 @@ def test_a_new_drive_command_starts_with_the_next_cycle() -> None:
 
 
 def test_amplitudes_from_the_host_last_one_cycle() -> None:
-    head = Told(HeadEmulatorConfig(mechanics={"noise": 0.0}), TABLE._replace(height=np.array([0.0])))
+    head = HostedHead(HeadEmulatorConfig(mechanics={"noise": 0.0}), TABLE._replace(height=np.array([0.0])))
     head.start()
     head.send(drive(FeedbackMode.OPEN))
     head.pass_by(0.1)
@@ -195,12 +195,12 @@ def test_amplitudes_from_the_host_last_one_cycle() -> None:
 def test_feedback_is_relative_to_the_centre() -> None:
     most = []
     for centre in (0.0, 0.3):
-        head = Told(HeadEmulatorConfig(mechanics={"noise": 0.0, "slip": 1.0}))
+        head = HostedHead(HeadEmulatorConfig(mechanics={"noise": 0.0, "slip": 1.0}))
         head.start()
         head.send(Command(CommandKind.CENTRE, numbers=to_counts(np.full(18, centre))))
         head.send(drive())
         most.append(to_radians(head.pass_by(1.0).values)[1].max())
-    assert most[1] < 0.7 * most[0]  # taken for pressed from the beginning
+    assert most[1] < 0.7 * most[0]  # counts as contact from the start
 
 
 @pytest.mark.parametrize(
@@ -215,14 +215,14 @@ def test_feedback_is_relative_to_the_centre() -> None:
     ],
 )
 def test_invalid_drive_commands_are_ignored(bad: dict[str, float]) -> None:
-    head = Told()
+    head = HostedHead()
     head.start()
     head.send(drive(**bad))
     assert np.abs(to_radians(head.pass_by(0.5).values)[0]).max() < 0.02
 
 
 def test_drives_stop_at_their_limit() -> None:
-    head = Told(HeadEmulatorConfig(head=HeadConfig(limit_deg=50.0), mechanics={"noise": 0.0}))
+    head = HostedHead(HeadEmulatorConfig(head=HeadConfig(limit_deg=50.0), mechanics={"noise": 0.0}))
     head.start()
     head.send(drive(FeedbackMode.OPEN, offset=0.3))
     angle = to_radians(head.pass_by(1.0).values)[0]
@@ -230,8 +230,8 @@ def test_drives_stop_at_their_limit() -> None:
 
 
 def test_no_samples_are_computed_without_a_stream() -> None:
-    """A head that rests costs nothing, and its noise waits for the first frame."""
-    quick, late = Told(), Told()
+    """A head at rest computes nothing, and its noise starts with the first frame."""
+    quick, late = HostedHead(), HostedHead()
     late.pass_by(3 * BLOCK)
     for head in (quick, late):
         head.start()

@@ -33,19 +33,19 @@ class Bus:
     def __init__(self, testbed: Any, umockdev: Any, host: str, port: int) -> None:
         self._testbed, self._umockdev = testbed, umockdev
         self._host, self._port = host, port
-        self._number = 1  # of the device on the bus; each plugging in gives a new one
+        self._number = 1  # device number on the bus; each plugging in gives a new one
         self._node: Usbfs | None = None
         self._path = ""
 
     def look(self) -> bool:
-        """Updates the bus; True, to be called again."""
+        """Updates the bus; returns True, so that the timer continues."""
         if self._node is not None and not self._node.present():
             self._remove()
-        if self._node is None and (described := self._described()):
-            self._add(described)
+        if self._node is None and (descriptors := self._read_descriptors()):
+            self._add(descriptors)
         return True
 
-    def _described(self) -> bytes:
+    def _read_descriptors(self) -> bytes:
         try:
             line = UsbConnection(self._host, self._port)
         except OSError:
@@ -57,16 +57,16 @@ class Bus:
         finally:
             line.close()
 
-    def _add(self, described: bytes) -> None:
+    def _add(self, descriptors: bytes) -> None:
         try:
             node = Usbfs(self._host, self._port)
-        except OSError:  # pulled out again
+        except OSError:  # unplugged in the meantime
             return
         self._number += 1
-        self._testbed.add_from_string(_description(self._number, described))
+        self._testbed.add_from_string(_description(self._number, descriptors))
         self._path = _path(self._number)
         handler = self._umockdev.IoctlBase()
-        handler.connect("handle-ioctl", lambda _, client: _handled(node, client))
+        handler.connect("handle-ioctl", lambda _, client: _handle(node, client))
         self._testbed.attach_ioctl(_name(self._number), handler)
         self._node, self._handler = node, handler
         self._testbed.uevent(f"/sys{self._path}", "add")
@@ -80,10 +80,10 @@ class Bus:
         self._node = None
 
 
-def _handled(node: Usbfs, client: Any) -> bool:
+def _handle(node: Usbfs, client: Any) -> bool:
     number = client.get_request() & 0xFF
     if number in (REAP, REAP_NOW):
-        done = node.reaped(client, PATIENCE)
+        done = node.reap(client, PATIENCE)
         client.complete(*((0, 0) if done else (-1, errno.EAGAIN)))
     else:
         client.complete(*node.ioctl(client))
@@ -98,9 +98,9 @@ def _name(number: int) -> str:
     return f"/dev/bus/usb/001/{number:03d}"
 
 
-def _description(number: int, described: bytes) -> str:
+def _description(number: int, descriptors: bytes) -> str:
     """Description of a device for umockdev."""
-    vendor, product = (int.from_bytes(described[k : k + 2], "little") for k in (8, 10))
+    vendor, product = (int.from_bytes(descriptors[k : k + 2], "little") for k in (8, 10))
     return "\n".join(
         [
             f"P: {_path(number)}",
@@ -119,28 +119,28 @@ def _description(number: int, described: bytes) -> str:
             "A: speed=480\\n",
             f"A: idVendor={vendor:04x}\\n",
             f"A: idProduct={product:04x}\\n",
-            f"H: descriptors={described.hex().upper()}",
+            f"H: descriptors={descriptors.hex().upper()}",
             "",
         ]
     )
 
 
 def main() -> int:
-    """The program; returns the client's exit code."""
+    """Runs the program; returns the client's exit code."""
     parser = argparse.ArgumentParser(prog="python -m tests.robot.emulators.umock", description=__doc__)
-    parser.add_argument("--host", default="127.0.0.1", help="of the emulated head")
+    parser.add_argument("--host", default="127.0.0.1", help="address of the emulated head")
     parser.add_argument("--port", type=int, default=PORT)
     parser.add_argument("program", nargs="+")
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     gi = importlib.import_module("gi")
     gi.require_version("UMockdev", "1.0")
     umockdev, glib = (importlib.import_module(f"gi.repository.{name}") for name in ("UMockdev", "GLib"))
 
-    bus = Bus(umockdev.Testbed.new(), umockdev, asked.host, asked.port)
+    bus = Bus(umockdev.Testbed.new(), umockdev, arguments.host, arguments.port)
     bus.look()
     loop = glib.MainLoop()
     glib.timeout_add(LOOK, bus.look)
-    with subprocess.Popen(asked.program) as client:
+    with subprocess.Popen(arguments.program) as client:
 
         def wait() -> None:
             client.wait()

@@ -16,8 +16,8 @@ from tests.robot.emulators.head.heads import drive
 
 
 def main(host: str) -> None:
-    """Reads, is stalled, stopped, unplugged and plugged in again."""
-    # The libusb that a package brings does not hear of unplugged devices here: it asks the kernel, not udev.
+    """Reads frames through a stall, a stop, and unplugging and plugging in."""
+    # The libusb of `libusb-package` gets unplug events from the kernel, not from umockdev.
     sys.modules["libusb_package"] = None  # type: ignore[assignment]
     seen: dict[str, Any] = {}
     bridge = open_bridge("usb")
@@ -27,7 +27,7 @@ def main(host: str) -> None:
     bridge.write(pack_command(drive()))
     seen["frames"] = read(bridge, decoder, 3000)
 
-    asked(host, do="stall")
+    request_fault(host, do="stall")
     seen["stalls"] = 0
     for _ in range(3):
         try:
@@ -42,12 +42,12 @@ def main(host: str) -> None:
     seen["idle"] = len(bridge.read(4096, 0.2)), time.monotonic() - began
     bridge.request(Request.START)
 
-    asked(host, do="unplug")
-    seen["gone"] = ended(bridge)
+    request_fault(host, do="unplug")
+    seen["gone"] = is_disconnected(bridge)
     bridge.close()
-    seen["absent"] = absent()
-    asked(host, do="plug")
-    bridge = again(5.0)
+    seen["absent"] = is_absent()
+    request_fault(host, do="plug")
+    bridge = reconnect(5.0)
     bridge.request(Request.START)
     decoder = Decoder(18, 3)
     seen["again"] = read(bridge, decoder, 1000)
@@ -57,7 +57,7 @@ def main(host: str) -> None:
 
 
 def read(bridge: Bridge, decoder: Decoder, frames: int) -> int:
-    """How many frames come, until they are so many or it takes too long."""
+    """Reads at least `frames` frames, for at most 10 s; returns their number."""
     end, got = time.monotonic() + 10.0, 0
     while got < frames and time.monotonic() < end:
         got += len(decoder.feed(bridge.read(4096, 0.5)).values)
@@ -65,8 +65,8 @@ def read(bridge: Bridge, decoder: Decoder, frames: int) -> int:
     return got
 
 
-def ended(bridge: Bridge) -> bool:
-    """Whether reading ends with a head that is gone."""
+def is_disconnected(bridge: Bridge) -> bool:
+    """Whether a read reports a disconnected head within 5 s."""
     end = time.monotonic() + 5.0
     try:
         while time.monotonic() < end:
@@ -76,8 +76,8 @@ def ended(bridge: Bridge) -> bool:
     return False
 
 
-def absent() -> bool:
-    """Whether it comes to be known that no head is there."""
+def is_absent() -> bool:
+    """Whether opening reports an absent head within 5 s."""
     end = time.monotonic() + 5.0
     while time.monotonic() < end:
         try:
@@ -85,13 +85,13 @@ def absent() -> bool:
         except Disconnected:
             return True
         except Stalled:
-            pass  # known to have been there, and not yet known to be gone
+            pass  # libusb still lists the device
         time.sleep(0.02)
     return False
 
 
-def again(seconds: float) -> Bridge:
-    """The head, as soon as it is back."""
+def reconnect(seconds: float) -> Bridge:
+    """Opens the head once it is plugged in."""
     end = time.monotonic() + seconds
     while True:
         try:
@@ -102,8 +102,8 @@ def again(seconds: float) -> Bridge:
             time.sleep(0.02)
 
 
-def asked(host: str, **fault: Any) -> None:
-    """Begins a fault."""
+def request_fault(host: str, **fault: Any) -> None:
+    """Starts a fault."""
     with socket.create_connection((host, CONTROL_PORT), 5) as link, link.makefile("rw") as lines:
         lines.write(json.dumps(fault) + "\n")
         lines.flush()

@@ -1,8 +1,8 @@
 """Linux's usbfs for one device: ioctls of libusb turned into requests to an emulated device.
 
 Numbers and layouts are those of <linux/usbdevice_fs.h> on 64-bit machines. libusb submits transfers as blocks
-of its own memory (URBs) and reaps them when they are complete; two threads carry them meanwhile, one those
-that wait for data and one all others. Memory of the client is touched only while it waits in an ioctl.
+of its own memory (URBs) and reaps them when they are complete; two threads execute them, one those that
+wait for data and one all others. Memory of the client is accessed only while it waits in an ioctl.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ CLAIM, RELEASE, RESET, CLEAR, CAPABILITIES, CLAIM_AWAY, SPEED = 15, 16, 20, 21, 
 URB = struct.Struct("<BBxxiI4xQiiiiiIQ")
 """type, endpoint, status, flags, buffer, its length, actual length, ..."""
 STATUS, BUFFER, ACTUAL = 4, 16, 28
-"""Offsets of its fields."""
+"""Offsets of fields of a URB."""
 CONTROL = 2
 """The type of a URB whose buffer begins with a setup packet."""
 SLICE = 50
@@ -32,7 +32,7 @@ class Urb:
     """A transfer in progress.
 
     Args:
-        block: the client's URB, as umockdev has it.
+        block: the client's URB in umockdev's memory.
     """
 
     def __init__(self, block: Any) -> None:
@@ -47,11 +47,11 @@ class Urb:
 
     @property
     def inwards(self) -> bool:
-        """Whether it may wait for data."""
+        """Whether the transfer reads, and so may wait for data."""
         return bool(self.endpoint & IN) and not self.control
 
     def run(self, line: UsbConnection) -> None:
-        """Executes it over a connection."""
+        """Executes the transfer over a connection."""
         try:
             if self.control:
                 kind, request, value, index, length = struct.unpack_from("<BBHHH", self.data)
@@ -97,26 +97,26 @@ class Usbfs:
             threading.Thread(target=self._carry, args=(self._queues[way], line), daemon=True).start()
 
     def present(self) -> bool:
-        """Whether it has been plugged in all the time."""
+        """Whether the device has been plugged in since the start."""
         try:
             return bool(self._control.call(Op.DESCRIBE))
         except OSError:
             return False
 
     def close(self) -> None:
-        """Ends its threads."""
+        """Ends the threads."""
         for waiting in self._queues.values():
             waiting.put(None)
 
     def ioctl(self, client: Any) -> tuple[int, int]:
-        """Executes an ioctl: its return value and errno."""
+        """Executes an ioctl; returns its value and errno."""
         number, argument = client.get_request() & 0xFF, client.get_arg()
         try:
             return self._ioctl(number, argument), 0
         except OSError as error:
             return -1, error.errno or errno.EIO
 
-    def reaped(self, client: Any, patience: float) -> bool:
+    def reap(self, client: Any, patience: float) -> bool:
         """Answers a reap with a completed transfer; False if there is none within `patience` s."""
         try:
             urb = self._done.get(timeout=patience)

@@ -1,7 +1,7 @@
-"""The real client libraries, in a process that they may take down: `python -m ... HOST SCENARIO` prints JSON.
+"""Runs the real client libraries in a process, as they may crash: `python -m ... HOST SCENARIO` prints JSON.
 
-A scenario that says "here" waits for a line on standard input before it goes on, so that a test can do
-something to the controller at that moment.
+A scenario that prints "here" waits for a line on standard input, so that a test can change the controller
+at that point.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-STEP = 0.02  # m: how far a scenario moves the tool, upwards and back
+STEP = 0.02  # m, upward move of the tool in a scenario
 
 
 def control(host: str) -> Any:
@@ -28,14 +28,14 @@ def receive(host: str) -> Any:
     return rtde_receive.RTDEReceiveInterface(host)
 
 
-def here() -> None:
-    """Let the test act."""
+def wait_for_test() -> None:
+    """Prints "here" and waits for a line of the test."""
     print("here", flush=True)
     sys.stdin.readline()
 
 
-def settled(condition: Callable[[], bool], seconds: float = 3.0) -> bool:
-    """Wait for something; False where it does not come."""
+def wait_until(condition: Callable[[], bool], seconds: float = 3.0) -> bool:
+    """Waits for a condition; False after `seconds` without it."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         if condition():
@@ -44,12 +44,12 @@ def settled(condition: Callable[[], bool], seconds: float = 3.0) -> bool:
     return False
 
 
-def apart(first: list[float], second: list[float]) -> float:
+def distance(first: list[float], second: list[float]) -> float:
     """Distance of two tool positions, m."""
     return math.dist(first[:3], second[:3])
 
 
-def everyone(host: str) -> dict[str, Any]:
+def all_clients(host: str) -> dict[str, Any]:
     import dashboard_client
     import rtde_io
 
@@ -88,18 +88,18 @@ def moves(host: str) -> dict[str, Any]:
 
     before = operation()
     controller.moveL(goal, 0.01, 0.5, True)
-    known = settled(lambda: operation() != before)
+    known = wait_until(lambda: operation() != before)
     time.sleep(0.3)
-    under_way = apart(receiver.getActualTCPPose(), home)
+    under_way = distance(receiver.getActualTCPPose(), home)
     controller.stopL(2.0)
-    stopped = settled(lambda: not any(receiver.getActualTCPSpeed()) and not running())
-    stood = apart(receiver.getActualTCPPose(), home)
+    stopped = wait_until(lambda: not any(receiver.getActualTCPSpeed()) and not running())
+    stood = distance(receiver.getActualTCPPose(), home)
     done = controller.moveL(goal, 0.1, 1.0)
-    arrived = settled(lambda: apart(receiver.getActualTCPPose(), goal) < 1e-5)
+    arrived = wait_until(lambda: distance(receiver.getActualTCPPose(), goal) < 1e-5)
     done &= controller.moveL(home, 0.1, 1.0)
-    back = settled(lambda: apart(receiver.getActualTCPPose(), home) < 1e-5)
+    back = wait_until(lambda: distance(receiver.getActualTCPPose(), home) < 1e-5)
     return {
-        "told": [known, done],
+        "accepted": [known, done],
         "seen": [stopped, arrived, back],
         "under_way": under_way,
         "stood": stood,
@@ -120,11 +120,11 @@ def drive(host: str, watchdog: bool) -> dict[str, Any]:
 
 
 def watch(host: str) -> list[dict[str, Any]]:
-    """What a receiver sees of two things that the test does."""
+    """The receiver's state after each of two actions of the test."""
     receiver = receive(host)
     seen = []
     for _ in range(2):
-        here()
+        wait_for_test()
         start = receiver.getTimestamp()
         time.sleep(0.15)
         seen.append(
@@ -141,66 +141,66 @@ def watch(host: str) -> list[dict[str, Any]]:
 
 
 def solve(host: str) -> dict[str, Any]:
-    """Whether a pose can be reached, before and after something that the test does; then a move to it."""
+    """Reachability of a pose before and after an action of the test; then a move to it."""
     receiver, controller = receive(host), control(host)
     pose = receiver.getActualTCPPose()
     before = controller.isPoseWithinSafetyLimits(pose)
-    here()
+    wait_for_test()
     after = controller.isPoseWithinSafetyLimits(pose)
     return {"before": before, "after": after, "moved": controller.moveL(pose)}
 
 
-def unsupported(host: str) -> dict[str, Any]:
+def unsupported_move(host: str) -> dict[str, Any]:
     """A move that is not emulated, and a linear one before and after the program is uploaded again."""
     receiver, controller = receive(host), control(host)
     home = receiver.getActualTCPPose()
     moved = controller.moveJ(receiver.getActualQ())
-    stopped = settled(lambda: not controller.isProgramRunning(), 30.0)
+    stopped = wait_until(lambda: not controller.isProgramRunning(), 30.0)
     after = controller.moveL(home)
     controller.reuploadScript()
-    settled(controller.isProgramRunning, 30.0)
+    wait_until(controller.isProgramRunning, 30.0)
     return {"moved": moved, "stopped": stopped, "after": after, "again": controller.moveL(home)}
 
 
-def refused(host: str) -> dict[str, Any]:
-    """What the library says where it cannot control."""
+def control_error(host: str) -> dict[str, Any]:
+    """The library's error when control is refused; "" if it is granted."""
     try:
         control(host)
-    except Exception as error:  # whatever it is: the test reads it
+    except Exception as error:  # the test checks the message
         return {"error": str(error)}
     return {"error": ""}
 
 
-def second(host: str) -> dict[str, Any]:
-    """One client, then another."""
+def two_clients(host: str) -> dict[str, Any]:
+    """A second control client beside a first."""
     first = control(host)
-    result = refused(host)
+    result = control_error(host)
     return {**result, "unharmed": first.isConnected() and first.isProgramRunning()}
 
 
 def slide(host: str) -> dict[str, Any]:
-    """The speed slider through the IO client."""
+    """Sets the speed slider by the IO client."""
     import rtde_io
 
     receiver = receive(host)
     writer = rtde_io.RTDEIOInterface(host)
     writer.setSpeedSlider(0.25)
-    seen = settled(lambda: abs(receiver.getTargetSpeedFraction() - 0.25) < 1e-9)
+    seen = wait_until(lambda: abs(receiver.getTargetSpeedFraction() - 0.25) < 1e-9)
     writer.setSpeedSlider(1.0)
-    settled(lambda: receiver.getTargetSpeedFraction() > 0.99)
+    wait_until(lambda: receiver.getTargetSpeedFraction() > 0.99)
     return {"seen": seen}
 
 
 SCENARIOS: dict[str, Callable[[str], Any]] = {
-    "everyone": everyone,
+    "all": all_clients,
     "moves": moves,
     "drive": lambda host: drive(host, False),
     "drive watched": lambda host: drive(host, True),
     "watch": watch,
     "solve": solve,
-    "unsupported": unsupported,
-    "refused": refused,
-    "second": second,
+    "unsupported move": unsupported_move,
+    "control error": control_error,
+    "two clients": two_clients,
     "slide": slide,
 }
 

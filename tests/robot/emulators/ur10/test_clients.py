@@ -1,8 +1,8 @@
-"""The real client libraries against the emulator, and against a real controller where one is named.
+"""The real client libraries against the emulator, or against a real controller.
 
-`RATSLAM_UR_HOST=192.168.56.101 pytest tests/robot/emulators/ur10/test_clients.py` runs the tests that need no
-faults on that controller (or the vendor's simulator). They move the tool 20 mm upwards from where it stands:
-leave it room.
+`RATSLAM_UR_HOST=192.168.56.101 pytest tests/robot/emulators/ur10/test_clients.py` runs the tests without
+faults on that controller (or the vendor's simulator). They move the tool 20 mm upwards from its present
+pose: leave it room.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from tests.helpers.live import ROOT, Faults, until, ur_emulator
 
 REAL = os.environ.get("RATSLAM_UR_HOST", "")
 START = (0.6, 0.0, 0.3, math.pi, 0.0, 0.0)
-WAIT = 15.0  # s, for a client that may be slow to die
+WAIT = 15.0  # time limit for the exit of a client, s
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("rtde_receive") is None, reason="needs ur_rtde")
-emulated = pytest.mark.skipif(bool(REAL), reason="needs a controller that can be made to fail")
+emulated = pytest.mark.skipif(bool(REAL), reason="needs an emulated controller")
 
 
 class Bench:
-    """One emulator after another at one address."""
+    """Emulators at one address, one at a time."""
 
     def __init__(self, host: str) -> None:
         self.host = host
@@ -41,13 +41,13 @@ class Bench:
         self._stack = ExitStack()
 
     def fresh(self, *arguments: str) -> Faults:
-        """A new one, in good order."""
+        """Starts a new emulator without faults."""
         self.close()
         self.faults = self._stack.enter_context(ur_emulator(self.host, START, *arguments))
         return self.faults
 
     def good(self) -> Faults:
-        """The present one where it is still in good order, else a new one."""
+        """The present emulator with its faults cleared, or a new one if it has ended."""
         if self.faults is None or self.faults.process.poll() is not None:
             return self.fresh()
         self.faults(do="clear")
@@ -72,7 +72,7 @@ def faults(bench: Bench) -> Faults:
 
 @contextmanager
 def client(host: str, scenario: str) -> Iterator[subprocess.Popen[str]]:
-    """A client's process; it ends with the block."""
+    """A client's process, until the end of the block."""
     command = [sys.executable, "-m", "tests.robot.emulators.ur10.client", host, scenario]
     process = subprocess.Popen(
         command, cwd=ROOT, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
@@ -84,8 +84,8 @@ def client(host: str, scenario: str) -> Iterator[subprocess.Popen[str]]:
         process.communicate()
 
 
-def at_the_word(process: subprocess.Popen[str]) -> None:
-    """Wait until a client is where the test wants to act."""
+def wait_for_client(process: subprocess.Popen[str]) -> None:
+    """Waits until a client prints "here"."""
     assert process.stdout is not None
     for line in process.stdout:
         if line.strip() == "here":
@@ -93,21 +93,21 @@ def at_the_word(process: subprocess.Popen[str]) -> None:
     raise AssertionError(process.communicate()[1])
 
 
-def go_on(process: subprocess.Popen[str]) -> None:
-    """Let a client go on."""
+def resume(process: subprocess.Popen[str]) -> None:
+    """Sends the line for which a client waits."""
     assert process.stdin is not None
     process.stdin.write("\n")
     process.stdin.flush()
 
 
 def outcome(process: subprocess.Popen[str]) -> Any:
-    """What a client found out."""
-    said, complaint = process.communicate("\n", timeout=WAIT)
-    assert process.returncode == 0, complaint
-    return json.loads(said.splitlines()[-1])
+    """The result of a client, from its last line."""
+    output, errors = process.communicate("\n", timeout=WAIT)
+    assert process.returncode == 0, errors
+    return json.loads(output.splitlines()[-1])
 
 
-def found(host: str, scenario: str) -> Any:
+def run_scenario(host: str, scenario: str) -> Any:
     with client(host, scenario) as process:
         return outcome(process)
 
@@ -124,7 +124,7 @@ VERSIONS = [
 @pytest.mark.parametrize(("hz", "polyscope"), VERSIONS)
 def test_all_four_clients_of_ur_rtde_work_with_every_version(bench: Bench, hz: str, polyscope: str) -> None:
     bench.fresh("--hz", hz, "--polyscope", polyscope)
-    seen = found(bench.host, "everyone")
+    seen = run_scenario(bench.host, "all")
     assert seen["connected"] == [True] * 3
     assert seen["program"]
     assert seen["mode"] == "Robotmode: RUNNING"
@@ -142,8 +142,8 @@ def test_moves_and_stops(bench: Bench) -> None:
     else:
         bench.good()
         host = bench.host
-    seen = found(host, "moves")
-    assert seen["told"] == [True] * 2
+    seen = run_scenario(host, "moves")
+    assert seen["accepted"] == [True] * 2
     assert seen["seen"] == [True] * 3
     assert 0.001 < seen["under_way"] <= seen["stood"] < 0.015
 
@@ -153,7 +153,7 @@ def test_moves_and_stops(bench: Bench) -> None:
 def test_the_arm_of_a_killed_client_is_stopped_only_by_the_watchdog(faults: Faults, watched: bool) -> None:
     before = faults.state()
     with client(faults.host, "drive watched" if watched else "drive") as process:
-        at_the_word(process)
+        wait_for_client(process)
         until(lambda: faults.state()["speed"][1] == pytest.approx(0.01), "the arm moves")
         time.sleep(0.3)
         assert faults.state()["moving"]
@@ -172,7 +172,7 @@ def test_the_arm_of_a_killed_client_is_stopped_only_by_the_watchdog(faults: Faul
 @emulated
 def test_a_malformed_package_aborts_the_client(faults: Faults) -> None:
     with client(faults.host, "watch") as process:
-        at_the_word(process)
+        wait_for_client(process)
         faults(do="malformed")
         process.communicate("\n", timeout=WAIT)
         assert process.returncode == -signal.SIGABRT
@@ -182,7 +182,7 @@ def test_a_malformed_package_aborts_the_client(faults: Faults) -> None:
 @pytest.mark.soak
 def test_a_long_stall_ends_a_controlling_client(faults: Faults) -> None:
     with client(faults.host, "solve") as process:
-        at_the_word(process)
+        wait_for_client(process)
         faults(do="stall", seconds=3.5)
         process.wait(WAIT)
         assert process.returncode < 0
@@ -190,7 +190,7 @@ def test_a_long_stall_ends_a_controlling_client(faults: Faults) -> None:
 
 @emulated
 def test_the_state_rate_can_be_lowered(faults: Faults) -> None:
-    def told() -> int:
+    def count_states() -> int:
         with PoseListener(faults.host) as poses:
             until(poses.latest)
             times = set()
@@ -201,9 +201,9 @@ def test_the_state_rate_can_be_lowered(faults: Faults) -> None:
         return len(times)
 
     faults(do="rate", hz=40)
-    assert 15 <= told() <= 25
+    assert 15 <= count_states() <= 25
     faults(do="clear")
-    assert told() > 30
+    assert count_states() > 30
 
 
 @emulated
@@ -231,10 +231,10 @@ def test_a_fault_is_seen_by_the_client(bench: Bench, fault: dict[str, Any], sign
     faults(do="place", tcp=START)
     faults(do="wall")
     with client(bench.host, "watch") as process:
-        at_the_word(process)
+        wait_for_client(process)
         faults(**fault)
-        go_on(process)
-        at_the_word(process)
+        resume(process)
+        wait_for_client(process)
         faults(do="clear")
         faults(do="wall")
         during, after = outcome(process)
@@ -245,7 +245,7 @@ def test_a_fault_is_seen_by_the_client(bench: Bench, fault: dict[str, Any], sign
 @emulated
 def test_a_move_without_inverse_kinematics_ends_the_program(faults: Faults) -> None:
     with client(faults.host, "solve") as process:
-        at_the_word(process)
+        wait_for_client(process)
         faults(do="ik_fails")
         seen = outcome(process)
     assert seen["before"]
@@ -263,26 +263,26 @@ def test_a_function_that_is_not_emulated_returns_false(faults: Faults) -> None:
 
 @emulated
 def test_registers_belong_to_one_client(faults: Faults) -> None:
-    seen = found(faults.host, "second")
+    seen = run_scenario(faults.host, "two clients")
     assert "already in use" in seen["error"]
     assert seen["unharmed"]
     faults(do="registers")
-    assert "already in use" in found(faults.host, "refused")["error"]
+    assert "already in use" in run_scenario(faults.host, "control error")["error"]
     faults(do="clear")
-    assert found(faults.host, "refused")["error"] == ""
+    assert run_scenario(faults.host, "control error")["error"] == ""
 
 
 @emulated
 def test_an_e_series_requires_remote_control(bench: Bench) -> None:
     faults = bench.fresh("--hz", "500")
     faults(do="remote", on=False)
-    assert "remote control" in found(bench.host, "refused")["error"]
+    assert "remote control" in run_scenario(bench.host, "control error")["error"]
     bench.close()
 
 
 @emulated
 def test_the_io_client_sets_the_speed_slider(faults: Faults) -> None:
-    assert found(faults.host, "slide")["seen"]
+    assert run_scenario(faults.host, "slide")["seen"]
 
 
 @emulated

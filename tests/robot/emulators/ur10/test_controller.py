@@ -35,7 +35,7 @@ class Bench:
         self.upload()
 
     def upload(self) -> None:
-        self.script.received(PROGRAM, self.host)
+        self.script.receive(PROGRAM, self.host)
         self.ticks(0.1)
 
     def ticks(self, seconds: float) -> None:
@@ -56,7 +56,7 @@ class Bench:
     def command(
         self, number: int, doubles: tuple[float, ...] = (), asynchronous: int = 0, wait: float = 30
     ) -> bool:
-        """Sends a command and clears it when it is done; False if it is never answered."""
+        """Sends a command and clears it when it is done; False without an answer within `wait` s."""
         assert self.out(0) == 1
         self.write(number, doubles, asynchronous)
         for _ in range(round(wait / self.controller.dt)):
@@ -71,7 +71,7 @@ class Bench:
         return False
 
     def ask(self, line: str) -> str:
-        return self.dashboard.received(line.encode() + b"\n", self.host).decode().strip()
+        return self.dashboard.receive(line.encode() + b"\n", self.host).decode().strip()
 
 
 def test_a_command_is_executed_once_until_its_register_is_cleared() -> None:
@@ -80,7 +80,7 @@ def test_a_command_is_executed_once_until_its_register_is_cleared() -> None:
     assert bench.command(3, (*THERE, 0.2, 1.0))
     assert bench.controller.arm.state.tcp[:3] == pytest.approx(THERE[:3])
     bench.write(3, (*HERE, 0.2, 1.0))
-    bench.ticks(5.0)  # never cleared: carried out once, and 2 stays
+    bench.ticks(5.0)  # the register is not cleared: executed once, and 2 stays
     assert bench.out(0) == 2
     assert len([t for t in bench.controller.targets if t["do"] == "movel"]) == 2
 
@@ -93,7 +93,7 @@ def test_operations_are_numbered_in_the_progress_register() -> None:
     first = bench.out(2)
     assert first & RUNNING
     assert first >> 24 == (before >> 24) + 1
-    assert bench.command(3, (*HERE, 0.1, 1.0), asynchronous=1)  # in the midst of the first
+    assert bench.command(3, (*HERE, 0.1, 1.0), asynchronous=1)  # during the first move
     second = bench.out(2)
     assert second & RUNNING
     assert second >> 24 == (first >> 24) + 1
@@ -199,7 +199,7 @@ def test_a_protective_stop_can_be_unlocked_after_five_seconds() -> None:
     assert bench.controller.runtime is Runtime.PAUSED
     assert bench.ask("unlock protective stop").startswith("Cannot")
     bench.upload()
-    assert bench.controller.runtime is not Runtime.PLAYING  # nothing starts while it holds
+    assert bench.controller.runtime is not Runtime.PLAYING  # a stop prevents a start
     bench.ticks(5.0)
     assert bench.ask("unlock protective stop") == "Protective stop releasing"
     bench.upload()
@@ -278,7 +278,7 @@ def names(variables: list[str], frequency: float | None = None) -> bytes:
 
 def reply(session: RtdeSession, kind: int, body: bytes = b"") -> bytes:
     (package,) = rtde_protocol.PackageSplitter().feed(
-        session.received(rtde_protocol.pack_package(kind, body), 0.0)
+        session.receive(rtde_protocol.pack_package(kind, body), 0.0)
     )
     assert package.kind == kind
     return package.body
@@ -312,16 +312,16 @@ def test_an_input_variable_belongs_to_one_client() -> None:
     assert reply(first, rtde_protocol.INPUTS, names(registers)) == b"\1INT32,DOUBLE"
     assert reply(first, rtde_protocol.INPUTS, names(registers[:1])) == b"\2INT32"
     assert reply(second, rtde_protocol.INPUTS, names(registers)) == b"\0IN_USE,IN_USE"
-    first.received(rtde_protocol.pack_package(rtde_protocol.DATA, struct.pack(">Bid", 1, 7, 0.5)), 3.0)
-    first.received(
+    first.receive(rtde_protocol.pack_package(rtde_protocol.DATA, struct.pack(">Bid", 1, 7, 0.5)), 3.0)
+    first.receive(
         rtde_protocol.pack_package(rtde_protocol.DATA, struct.pack(">Bi", 1, 8)), 4.0
     )  # too short for its recipe
     assert (controller.registers.ints[0], controller.registers.doubles[3]) == (7, 0.5)
     assert controller.registers.written[0] == 3.0
     assert first.ignored == 1
-    first.closed()
+    first.close()
     assert reply(second, rtde_protocol.INPUTS, names(registers)) == b"\1INT32,DOUBLE"
-    claims.by_others = True
+    claims.held_by_fieldbus = True
     assert reply(RtdeSession(controller, claims), rtde_protocol.INPUTS, names(registers[:1])) == b"\0IN_USE"
 
 
@@ -333,9 +333,9 @@ def test_any_bytes_leave_the_sessions_working(data: list[bytes]) -> None:
         ScriptSession(controller),
         DashboardSession(controller),
     ):
-        with contextlib.suppress(ValueError):  # which ends the one connection
+        with contextlib.suppress(ValueError):  # ends this connection
             for piece in data:
-                session.received(piece, 0.0)
+                session.receive(piece, 0.0)
         controller.tick(0.0)
 
 
@@ -355,7 +355,7 @@ def test_any_bytes_leave_the_sessions_working(data: list[bytes]) -> None:
 def test_any_package_body_leaves_the_session_working(kind: int, body: bytes) -> None:
     session = RtdeSession(emulated_controller(UrEmulatorConfig()), Claims())
     with contextlib.suppress(ValueError):
-        session.received(rtde_protocol.pack_package(kind, body), 0.0)
+        session.receive(rtde_protocol.pack_package(kind, body), 0.0)
     session.state({})
 
 

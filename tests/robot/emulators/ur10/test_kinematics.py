@@ -27,7 +27,7 @@ ARMS = pytest.mark.parametrize("arm", [UR10, UR10E], ids=["UR10", "UR10e"])
 
 
 def chain(arm: Geometry, joints: tuple[float, ...]) -> np.ndarray:
-    """The flange's frame [4, 4], joint by joint."""
+    """The flange's frame [4, 4] as a product of one matrix per joint."""
     frame = np.eye(4)
     lengths = (arm.d1, 0, 0, arm.d4, arm.d5, arm.d6), (0, arm.a2, arm.a3, 0, 0, 0)
     for q, d, a, alpha in zip(joints, *lengths, np.radians([90, 0, 0, 90, -90, 0]), strict=True):
@@ -52,7 +52,7 @@ def test_forward_is_the_chain_of_matrices(arm: Geometry, joints: tuple[float, ..
 
 @ARMS
 @given(joints=JOINTS)
-def test_every_solution_leads_to_the_pose_and_the_joints_are_among_them(
+def test_every_solution_reaches_the_pose_and_includes_the_joints(
     arm: Geometry, joints: tuple[float, ...]
 ) -> None:
     pose = forward(arm, joints)
@@ -80,7 +80,7 @@ def test_the_nearest_joints_stay_within_two_turns(
 
 
 @pytest.mark.parametrize("pose", [(3.0, 0, 0.3, 0, 0, 0), (0, 0, 0.3, math.pi, 0, 0), (math.nan,) * 6])
-def test_out_of_reach_has_no_joints(pose: tuple[float, ...]) -> None:
+def test_a_pose_out_of_reach_has_no_solution(pose: tuple[float, ...]) -> None:
     assert solutions(UR10, pose) == []
     assert backward(UR10, pose, (0.0,) * 6) is None
 
@@ -94,7 +94,7 @@ def test_poses_compose_as_frames_do(first: tuple[float, ...], second: tuple[floa
 
 
 @given(first=POSE, second=POSE)
-def test_a_turn_leads_from_one_pose_to_the_other_the_short_way(
+def test_a_rotation_between_poses_is_the_shortest(
     first: tuple[float, ...], second: tuple[float, ...]
 ) -> None:
     vector = rotation_between(first, second)

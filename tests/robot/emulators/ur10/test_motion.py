@@ -22,7 +22,7 @@ PLACE = st.tuples(st.floats(0.4, 0.8), st.floats(-0.3, 0.3), st.floats(0.2, 0.5)
 
 
 def run(arm: EmulatedArm, seconds: float, dt: float = 0.008) -> np.ndarray:
-    """(tool's pose and speed) at every step [T, 12], until it rests or the time is up."""
+    """Tool pose and speed [T, 12] at every step, until the arm rests or the time has passed."""
     rows = []
     for _ in range(round(seconds / dt)):
         arm.step(dt)
