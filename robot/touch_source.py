@@ -43,13 +43,15 @@ class TouchSource(ClosedSource):
         where: configuration key of the whiskers, for errors.
 
     Raises:
-        InputError: source and front end differ in the number of whiskers.
+        InputError: source and front end have different numbers of whiskers.
     """
 
     def __init__(self, source: Source, start: Callable[[], ReadingProcessor], where: str) -> None:
         first = start()
         if source.whiskers != first.whiskers:
-            raise InputError(where, f"{first.whiskers} whiskers", f"{source.whiskers}, as {source.name} has")
+            raise InputError(
+                where, f"{first.whiskers} whiskers", f"{source.whiskers}, those of {source.name}"
+            )
         self.source, self._start = source, start
         self.name, self.rate_hz, self.digest = source.name, source.rate_hz, source.digest
         self.view_shape, self.whiskers, self.length = first.view_shape, source.whiskers, source.length
@@ -74,8 +76,8 @@ def open_touch_source(source: Source, config: TouchConfig) -> Source:
         config: with the whiskers of the source (`head_config_of`, `report_config_of`).
 
     Raises:
-        InputError: the source has another number of whiskers than the configuration, or no calibration where
-            one is needed.
+        InputError: the source has another number of whiskers than the configuration, or lacks a required
+            calibration.
     """
     info = source.info
     if not info.raw_whiskers:
@@ -88,10 +90,10 @@ def open_touch_source(source: Source, config: TouchConfig) -> Source:
 
 
 def head_config_of(info: SourceInfo, config: HeadConfig) -> HeadConfig:
-    """The head of a source, with all values that the configuration sets in place of its own.
+    """The head of a source, with the values set in the configuration instead of its own.
 
     Raises:
-        InputError: both together are not a valid head.
+        InputError: the combined values are not a valid head.
     """
     if info.head is None:
         return config
@@ -105,7 +107,7 @@ def observation_of(sample: Sample) -> Observation:
     """The reading of a sample, which must be an observation.
 
     Raises:
-        InputError: it is whisker data.
+        InputError: the reading is whisker data.
     """
     if not isinstance(sample.reading, Observation):
         cure = "open it with open_touch_source"
@@ -127,7 +129,7 @@ def planar_whiskers_of(source: Source, config: TouchConfig) -> PlanarWhiskers | 
 
 
 def report_config_of(info: SourceInfo, config: ReportFrontendConfig) -> ReportFrontendConfig:
-    """The configuration, with the whiskers of a source wherever it does not set its own."""
+    """The configuration, with the whiskers of the source unless it sets its own."""
     found = info.planar_whiskers.model_dump() if info.planar_whiskers else {}
     return config.model_copy(update={k: v for k, v in found.items() if k not in config.model_fields_set})
 

@@ -23,7 +23,7 @@ SEGMENT = 0.25
 """Pairs enter and leave the window in segments of this length, s of device time."""
 JUMP = 0.1
 """An arrival earlier than the fitted line by this much, s, means that the device's clock jumped forward.
-Smaller differences occur after a busy host has received everything late for a while."""
+Smaller differences occur after a period of late arrivals on a busy host."""
 RESIDUAL_QUANTILE = 0.1
 """Quantile of the delays above the line that is reported as the residual."""
 MIN_SPAN = 1.0
@@ -122,7 +122,7 @@ class ClockSync:
             return False
         if device < self._newest:
             return True
-        # Only early arrivals count: a busy host receives everything late.
+        # Only early arrivals count, since late ones occur on every busy host.
         settled = device - self._pieces[0].begin >= MIN_SPAN
         return settled and arrival - self._line.at(device) < -JUMP
 

@@ -10,7 +10,7 @@ class SessionOutcome(Enum):
     """How a live session ended; the value tells the operator what to do."""
 
     COMPLETE = "nothing to do"
-    INTERRUPTED = "stopped by the operator; `run` on the recording maps the part recorded"
+    INTERRUPTED = "stopped by the operator; `run` on the recording maps the recorded part"
     REFUSED = "the arm has not moved: correct what the self-test reports and start again"
     ARM_GONE = "check the controller and its network, then start again from the present pose"
     ARM_STALE = "no states from the controller: check the network and the controller's load"
@@ -27,7 +27,7 @@ class SessionOutcome(Enum):
     HEAD_GARBLED = "unreadable data from the head: check the cable and the decoder's settings"
     CLOCK_JUMPED = "a device's clock jumped: restart that device"
     DISK_FULL = "free disk space; the recording is complete up to that point"
-    MAPPER_GONE = "the SLAM process ended: see its log; `run` on the recording maps the part recorded"
+    MAPPER_GONE = "the SLAM process ended: see its log; `run` on the recording maps the recorded part"
 
 
 class Fault(NamedTuple):

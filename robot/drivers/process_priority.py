@@ -1,4 +1,4 @@
-"""CPU priority of processes: those that control the robot before mapping and drawing."""
+"""CPU priority of processes: robot control before mapping and drawing."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import contextlib
 import os
 
 URGENT, BACKGROUND = -10, 10
-"""Nice levels: of processes that control a robot or emulate one, and of those that map or draw."""
+"""Nice levels of processes that control or emulate a robot, and of those that map or draw."""
 
 
 def set_niceness(niceness: int) -> None:
-    """Sets the nice level of this process; without effect where the system does not allow it."""
+    """Sets the nice level of this process; without effect if the system refuses."""
     with contextlib.suppress(OSError, AttributeError):
         os.setpriority(os.PRIO_PROCESS, 0, niceness)

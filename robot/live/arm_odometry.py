@@ -1,4 +1,4 @@
-"""Odometry of the arm: poses at any time, and the motion from whisk to whisk."""
+"""Odometry of the arm: poses at any time, and the motion between whisks."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tactile.base.se2 import compose, wrap
 from tactile.base.types import Odometry
 
 HISTORY = 10.0
-"""Time span of states that are kept, s."""
+"""Time span of the stored states, s."""
 
 
 class ArmOdometry:
@@ -37,12 +37,12 @@ class ArmOdometry:
 
     @property
     def span(self) -> float:
-        """Time span of the states that are kept, s."""
+        """Time span of the stored states, s."""
         return self._states[-1][0] - self._states[0][0] if self._states else 0.0
 
     def pose(self, time: float) -> np.ndarray:
-        """Pose of the head in the map [3] at a time, interpolated between two states; beyond them, that of
-        the nearest."""
+        """Pose of the head in the map [3] at a time, interpolated between two states; outside
+        their span, the nearest pose."""
         times = np.array([state[0] for state in self._states])
         k = int(np.clip(np.searchsorted(times, time), 1, len(times) - 1)) if len(times) > 1 else 0
         pair = [self._states[max(k - 1, 0)], self._states[k]]
@@ -59,11 +59,11 @@ class ArmOdometry:
         """The motion since the last call, with the configured errors, and the pose now.
 
         Args:
-            stamp: time stamp of the whisk, s. time: the same moment on the host's clock, s.
+            stamp: time stamp of the whisk, session time, s. time: the same moment in host time, s.
         """
         pose = self.pose(time)
         if self._config.odometry == "velocity" and self._time:
-            pose = self._driven(stamp - self._time[-1], time)
+            pose = self._integrate_velocity(stamp - self._time[-1], time)
         # Headings are not wrapped: errors depend on the total turn.
         last = self._pose[-1][2] if self._pose else pose[2]
         self._pose.append(np.array([*pose[:2], last + wrap(pose[2] - last)]))
@@ -76,7 +76,7 @@ class ArmOdometry:
         rows = simulate_odometry(self._config.noise, time_stamps, poses, random)
         return Odometry(*rows[-1]), self.pose(time)
 
-    def _driven(self, took: float, time: float) -> np.ndarray:
+    def _integrate_velocity(self, took: float, time: float) -> np.ndarray:
         """Pose reached from the last one at the mean velocity since then."""
         states = [state for state in self._states if time - took < state[0] <= time]
         if not states:

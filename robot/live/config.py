@@ -1,4 +1,4 @@
-"""Settings of a live session: arm, head, route, and checks before anything moves."""
+"""Settings of a live session: arm, head, route, and checks before the start."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class LiveConfig(Settings):
     head: HeadLinkConfig = HeadLinkConfig()
     """The link to the whisker head."""
     plan: SimulationConfig = SimulationConfig()
-    """Route (maze, path, motion), whisking and calibration, as in a simulated session. The emulators take the
-    rest for their world; `odometry` and `kidnaps` have no effect.
+    """Route (maze, path, motion), whisking and calibration, as in a simulated session. The emulators use the
+    other settings for their world; `odometry` and `kidnaps` have no effect.
     """
     waypoints: tuple[tuple[float, float, float], ...] = ()
     """Route instead of the plan's: x, y (m) and heading (degrees) in the map."""
@@ -36,16 +36,15 @@ class LiveConfig(Settings):
     """Errors added to the arm's odometry, which is more accurate than that of a mobile robot (Salman &
     Pearson 2016, III-C). Ground truth is the pose reported by the arm."""
     lift: NonNegativeFloat = 0.1
-    """Height above working height at which whiskers touch nothing: the free record is made there, m."""
+    """Height above working height for the free-whisking record, where whiskers touch nothing, m."""
     budget: PositiveFloat = 0.6
-    """Lag of the mapper beyond which a whisk is handed on without its image (its odometry is always kept), s.
-    """
+    """Lag of the mapper above which a whisk is passed on without image (but with its odometry), s."""
     grace: Annotated[float, Field(gt=0, le=1.0)] = 0.045
     """Waiting time for the frames of a whisk after its end, s."""
     gap: PositiveInt = 5
-    """Number of consecutive missing samples from which an image is not used."""
+    """Least number of consecutive missing samples that makes an image unusable."""
     residual: PositiveFloat = 5e-3
-    """Largest residual of the clock synchronisation with which a session starts, s."""
+    """Largest residual of the clock synchronisation at the start of a session, s."""
     room: NonNegativeFloat = 2e9
     """Free disk space required to start, bytes."""
     seed: int = 0

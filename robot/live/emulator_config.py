@@ -1,4 +1,4 @@
-"""Configurations of emulators for a live session: an arm above the start of its route, a head in its maze."""
+"""Configurations of emulators for a live session: an arm above its route's start, a head in its maze."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Recorder of a live session.
 
-Frames and arm states are collected for a short time and written as a block. All data are handed to the
-operating system within 0.2 s, counted on the times that are passed in, so a killed process loses no more
-than that.
+Frames and arm states are collected for a short time and written as a block. All data reach the operating
+system within 0.2 s, measured on the passed times, so a killed process loses no more than that.
 """
 
 from __future__ import annotations
@@ -31,17 +30,17 @@ BLOCK_TIME = 0.15
 class LiveRecorder:
     """Writes a session to a new recording; a context manager.
 
-    Any thread may add data and waits for the disk. When the disk is full, `fault` is set, all further data
-    are ignored, and the recording stays readable up to that point.
+    Any thread may add data; a call waits for the disk. When the disk is full, `fault` is set, later data are
+    ignored, and the recording stays readable up to that point.
 
     Args:
-        path: must not exist yet. view_shape, whiskers, rate_hz, info: see `Tape`.
+        path: must not exist yet. view_shape, whiskers, rate_hz, info: see `McapWriter`.
 
     Attributes:
-        fault: why writing has ended; None while it continues.
+        fault: the error that ended writing, or None.
 
     Raises:
-        InputError: the file exists or cannot be made.
+        InputError: the file exists or cannot be created.
     """
 
     def __init__(
@@ -58,8 +57,8 @@ class LiveRecorder:
         self._lock = Lock()
         self._frames: list[Frames] = []
         self._states: list[np.ndarray] = []
-        self._arrival = self._since = -np.inf  # of the newest frames; of the oldest that waits
-        self._known = np.full(MAX_FRAMES, -1, np.int64)  # sequences that were handed in
+        self._arrival = self._since = -np.inf  # times of the newest frames and of the oldest pending data
+        self._known = np.full(MAX_FRAMES, -1, np.int64)  # sequence numbers of added frames
 
     @property
     def count(self) -> int:
@@ -72,7 +71,7 @@ class LiveRecorder:
             if able:
                 self._arrival = arrival
                 self._gather(frames)
-                self._waited(arrival)
+                self._write_if_due(arrival)
 
     def add_states(self, states: np.ndarray) -> None:
         """Adds arm states [N] (`robot.drivers.ur10.shared_state.ARM_STATE`), oldest first."""
@@ -82,14 +81,13 @@ class LiveRecorder:
         with self._writing(newest) as able:
             if able:
                 self._states.append(states.copy())
-                self._waited(newest)
+                self._write_if_due(newest)
 
     def add_whisk(self, cut: Cut, frames: Frames, truth: np.ndarray | None = None) -> None:
         """Adds a whisk and flushes the file.
 
         Args:
-            frames: all of the whisk; those not added yet are written before it. truth: [3] true pose of the
-            head.
+            frames: all frames of the whisk; new ones are written first. truth: [3] true pose of the head.
 
         Raises:
             ValueError: the frames are not those of the cut.
@@ -134,8 +132,8 @@ class LiveRecorder:
         if new.any():
             self._frames.append(Frames(*(column[new] for column in frames)))
 
-    def _waited(self, time: float) -> None:
-        """Writes the collected block if it is old enough at this time."""
+    def _write_if_due(self, time: float) -> None:
+        """Writes the collected block if it is `BLOCK_TIME` old at this time, s."""
         if self._since == -np.inf:
             self._since = time
         elif time - self._since >= BLOCK_TIME:
@@ -154,7 +152,7 @@ class LiveRecorder:
 
     @contextmanager
     def _writing(self, time: float) -> Iterator[bool]:
-        """Holds the lock on the file; yields whether it still accepts data."""
+        """Holds the lock on the file; yields whether it accepts data."""
         with self._lock:
             try:
                 yield self.fault is None

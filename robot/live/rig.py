@@ -26,8 +26,7 @@ from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 TICK = 0.01
 """Period of the poll, s."""
 MAX_REST_TIME, REST_TIME = 2.0, 0.3
-"""How long a stopped arm is watched, s: at most, and until it has been at rest for this long. After a contact
-it stops and then backs off."""
+"""Longest wait for a stopped arm, and required time at rest, s: after a contact it stops, then backs off."""
 
 MAX_CLOCK_STEP = 2e-3
 """Largest step of the head's clock against its sample count, s."""
@@ -53,8 +52,9 @@ class Rig:
 
     Attributes:
         arm, head, driver: the devices. clock: of the head. odometer: of the arm. epoch: time 0 of the session
-            on the host's clock, s. ages: s, of the newest state at each look. starts: sequences of the first
-            frames of whisks. restarts: how often a head was found. journal: what all is written to, or None.
+            on the host's clock, s. state_ages: age of the newest state at each poll, s. whisk_starts:
+            sequence numbers of the first frames of whisks. restarts: number of connections of the head.
+            recorder: recorder of all data, or None.
     """
 
     def __init__(self, config: LiveConfig, head: HeadConfig, stopped: Callable[[], bool]) -> None:
@@ -78,21 +78,21 @@ class Rig:
         self._stopped = stopped
         self._arm_clock = ClockSync()
         self._seen = 0
-        self._ahead: float | None = None  # s, of the head's clock before its count
+        self._ahead: float | None = None  # s by which the head's clock leads its sample count
         self._uneven = 0.0
         self._blocks: queue.SimpleQueue[tuple[Frames, float] | None] = queue.SimpleQueue()
         self.head.on_restart.append(lambda device, host: self._blocks.put(None))
         self.head.listeners.append(lambda frames, arrival: self._blocks.put((frames, arrival)))
 
     def now(self) -> float:
-        """s of the session."""
+        """Session time, s."""
         return time.monotonic() - self.epoch
 
     def poll(self) -> None:
-        """Reads the data of both devices, and raises the reason if the session must end.
+        """Reads the data of both devices.
 
         Raises:
-            SessionFault, OperatorStop.
+            SessionFault, OperatorStop: the session must end.
         """
         self._take_frames()
         self._take_states()
@@ -105,7 +105,7 @@ class Rig:
                     Fault(SessionOutcome.CLOCK_JUMPED, f"the {whose}'s clock jumped", time.monotonic())
                 )
         if self._uneven > MAX_CLOCK_STEP:
-            detail = f"the head's clock is {self._uneven * 1e3:.1f} ms off its samples' count"
+            detail = f"the head's clock is {self._uneven * 1e3:.1f} ms off its sample count"
             raise SessionFault(Fault(SessionOutcome.CLOCK_JUMPED, detail, time.monotonic()))
         if self._stopped():
             raise OperatorStop
@@ -114,7 +114,7 @@ class Rig:
         """Polls until a condition is true.
 
         Args:
-            longest: s. late, what: outcome if it takes longer, and what was awaited.
+            longest: time limit, s. late: outcome after that time. what: the awaited event, for the fault.
 
         Raises:
             SessionFault, OperatorStop.
@@ -132,7 +132,7 @@ class Rig:
         self.state_ages = []
 
     def rest(self) -> bool:
-        """Stops the arm, unless a fault has, and retracts the whiskers; whether the arm was seen at rest."""
+        """Stops the arm, unless a fault has, and retracts the whiskers; returns whether the arm rests."""
         if self.arm.fault is None:
             self.arm.halt()
         self.driver.rest()
@@ -171,7 +171,7 @@ class Rig:
                 self.recorder.add_frames(frames, arrival - self.epoch)
 
     def _count(self, frames: Frames) -> None:
-        """Checks the head's clock against its sample count; they agree whatever the load of the host."""
+        """Checks the head's clock against its sample count; both are independent of the host's load."""
         assert self.head.identity is not None
         ahead = frames.time * 1e-6 - frames.sequence / self.head.identity.rate
         before = ahead[0] if self._ahead is None else self._ahead
@@ -193,7 +193,7 @@ class Rig:
             self.recorder.add_states(states)
 
     def _overload(self, whisker: int) -> None:
-        self.arm.fail(SessionOutcome.CONTACT, f"whisker {whisker} is bent as far as it can be")
+        self.arm.fail(SessionOutcome.CONTACT, f"whisker {whisker} is bent beyond the overload limit")
 
     def __enter__(self) -> Self:
         return self

@@ -1,4 +1,4 @@
-"""Route of the arm: a sequence of targets, each sent after arrival at the one before."""
+"""Route of the arm: a sequence of targets, each sent after arrival at the previous one."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tactile.whiskers.head_geometry import Head
 
 
 class MovableArm(Protocol):
-    """The part of `robot.drivers.ur10.arm.Arm` that a route needs."""
+    """The methods of `robot.drivers.ur10.arm.Arm` that a route calls."""
 
     def move(self, tcp: np.ndarray, speed: float | None = None) -> object: ...
     def arrived(self) -> bool: ...
@@ -36,7 +36,7 @@ class Route:
         return len(self.targets)
 
     def advance(self, arm: MovableArm) -> bool:
-        """Sends the next target if the arm has arrived; whether it has arrived at the last one.
+        """Sends the next target if the arm has arrived; returns whether it is at the last one.
 
         Raises:
             robot.drivers.ur10.safety.TargetRefused: the target is rejected.
@@ -50,7 +50,7 @@ class Route:
         return False
 
     def resend_last(self) -> None:
-        """Lets the last target be sent again, after a stop on the way to it."""
+        """Sends the last target again with the next `advance`, after a stop on the way to it."""
         self.sent = max(self.sent - 1, 0)
 
 
@@ -64,9 +64,7 @@ def plan_path(config: LiveConfig, head: Head) -> HeadPath:
         return _waypoint_path(config)
     made = plan_scene(config.plan, head)
     if len(made.jumps):
-        raise InputError(
-            "live.plan.kidnaps", "a head that is carried", "0: an arm cannot be", "leave them out"
-        )
+        raise InputError("live.plan.kidnaps", "kidnaps", "none on an arm", "remove them from the plan")
     keep = made.path.time <= made.duration
     return HeadPath(made.path.time[keep], made.path.pose[keep])
 
@@ -75,7 +73,7 @@ def plan_scene(plan: SimulationConfig, head: Head) -> Scene:
     """The maze of a plan and the path in it.
 
     Raises:
-        InputError: there is no such scene.
+        InputError: the plan gives no valid maze or path.
     """
     return make_scene(plan.maze, plan.path, plan.motion, plan.kidnaps, head, plan.seed)
 
@@ -102,7 +100,7 @@ def approach_route(config: LiveConfig, path: HeadPath) -> Route:
 
 
 def descent_route(config: LiveConfig, path: HeadPath) -> Route:
-    """The route from there down to the first pose."""
+    """The route from above the first pose down to it."""
     return Route(tcp_from_pose(config.arm.placing, path.pose[:1]), route_speed(config))
 
 
@@ -110,7 +108,7 @@ def check_targets(config: LiveConfig, path: HeadPath) -> None:
     """Checks every target before the arm moves.
 
     Raises:
-        InputError: a target is rejected; says which and why.
+        InputError: a target is rejected; the error gives its number and the reason.
     """
     routes = approach_route(config, path), descent_route(config, path), main_route(config, path)
     targets = np.concatenate([route.targets for route in routes])

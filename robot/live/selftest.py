@@ -1,4 +1,4 @@
-"""Self-test of both devices and of this machine before anything moves."""
+"""Self-test of both devices and of this machine before the arm moves."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MIN_RATE_SHARE = 0.9
 
 
 def check_disk(config: LiveConfig, directory: Path) -> str:
-    """Checks the free disk space; returns it in words.
+    """Checks the free disk space in a directory; returns a line of text.
 
     Raises:
         InputError: not enough free space.
@@ -36,10 +36,10 @@ def check_disk(config: LiveConfig, directory: Path) -> str:
 
 
 def start_and_check(rig: Rig) -> Iterator[str]:
-    """Starts both devices and checks their streams; yields a line for each check that has passed.
+    """Starts both devices and checks their streams; yields a line of text for each passed check.
 
     Raises:
-        InputError: a check failed; says which and what to do.
+        InputError: a check failed; the error gives its cure.
         robot.live.rig.SessionFault, robot.live.rig.OperatorStop.
     """
     rig.head.start()
@@ -54,7 +54,7 @@ def start_and_check(rig: Rig) -> Iterator[str]:
     rate = (after.good - before.good) / LISTEN_TIME
     if rate < MIN_RATE_SHARE * identity.rate:
         raise InputError(
-            "head", f"{rate:.0f} of {identity.rate:g} samples a second", "", "check the USB hub and cable"
+            "head", f"{rate:.0f} of {identity.rate:g} samples per second", "", "check the USB hub and cable"
         )
     if after.bad > before.bad:
         raise InputError(
@@ -64,7 +64,7 @@ def start_and_check(rig: Rig) -> Iterator[str]:
             "change the cable",
         )
     if rig.clock.residual > rig.config.residual:
-        found = f"its clock is known to {rig.clock.residual * 1e3:.1f} ms"
+        found = f"clock residual of {rig.clock.residual * 1e3:.1f} ms"
         raise InputError("head", found, f"{rig.config.residual * 1e3:g} ms", "check the load of this machine")
     age = float(np.median(rig.state_ages[-100:]))
     yield f"clocks: head {rig.clock.residual * 1e3:.1f} ms, newest state {age * 1e3:.0f} ms old"

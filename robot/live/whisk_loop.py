@@ -29,16 +29,16 @@ class AsyncMapper(Protocol):
 
     @property
     def alive(self) -> bool:
-        """Whether the mapper works."""
+        """Whether the mapper runs."""
         ...
 
     @property
     def failure(self) -> str:
-        """Why the mapper has ended."""
+        """Reason for the end of the mapper."""
         ...
 
     def behind(self) -> float:
-        """Waiting time of the oldest sample that is not mapped yet, s."""
+        """Waiting time of the oldest unmapped sample, s."""
         ...
 
     def offer(self, sample: Sample) -> None:
@@ -47,11 +47,11 @@ class AsyncMapper(Protocol):
 
 
 class WhiskReport(NamedTuple):
-    """How a whisk was passed on.
+    """Report on a passed-on whisk.
 
     Attributes:
-        number: of the whisk. lateness: s from its end until then. seen: whether its image was included.
-        missing: number of frames that had not arrived by then.
+        number: of the whisk. lateness: time from its end to passing on, s. seen: whether its image was
+            included. missing: number of frames that had not arrived.
     """
 
     number: int
@@ -64,8 +64,8 @@ class WhiskSequence(NamedTuple):
     """A sequence of consecutive whisks, timed by the head's own clock.
 
     Attributes:
-        number: of its first one. first: sequence of its first frame. device: s, that frame's time.
-        start: s of the session. samples: frames of a whisk. period: s.
+        number: of its first whisk. first: sequence number of its first frame. device: device time of that
+            frame, s. start: session time, s. samples: frames per whisk. period: of a whisk, s.
     """
 
     number: int
@@ -81,14 +81,14 @@ class WhiskSequence(NamedTuple):
         return first, first + self.samples - 1
 
     def start_of(self, number: float) -> float:
-        """Time of a whisk, or of a moment in one, since the start of the sequence, s."""
+        """Time from the start of the sequence to a whisk, or to a moment in one (fractional number), s."""
         return (number - self.number) * self.period
 
 
 def run_whisk_loop(rig: Rig, route: Route, mapper: AsyncMapper, tell: Callable[[WhiskReport], None]) -> None:
     """Moves along the route and passes on every whisk; ends with the whisk in which the arm arrives.
 
-    The arm stands while the head sends no samples.
+    The arm rests while the head sends no samples.
 
     Raises:
         robot.live.rig.SessionFault, robot.live.rig.OperatorStop.
@@ -114,16 +114,16 @@ def run_whisk_loop(rig: Rig, route: Route, mapper: AsyncMapper, tell: Callable[[
 
 def follow_route(rig: Rig, route: Route) -> None:
     """Moves along a route without whisks."""
-    rig.wait_until(lambda: _advance(rig, route), MAX_ROUTE_TIME, SessionOutcome.NOT_ARRIVED, "the way")
+    rig.wait_until(lambda: _advance(rig, route), MAX_ROUTE_TIME, SessionOutcome.NOT_ARRIVED, "the route")
 
 
 def wait_for_head(rig: Rig, route: Route) -> None:
-    """Stops the arm until the head is back."""
+    """Stops the arm until the head sends samples."""
     rig.arm.halt()
-    rig.record_event("held", "the head sends nothing")
+    rig.record_event("held", "the head sends no samples")
     # The reader limits the waiting time and turns it into a fault.
     rig.wait_until(lambda: rig.streaming, float("inf"), SessionOutcome.HEAD_GONE, "the head")
-    rig.record_event("resumed", "the head is back")
+    rig.record_event("resumed", "the head sends samples")
     route.resend_last()
 
 
@@ -131,25 +131,25 @@ def next_sequence(rig: Rig, number: int) -> WhiskSequence:
     """The sequence that starts with the next whisk.
 
     Raises:
-        InputError: the samples per whisk are not a whole number.
+        InputError: the number of samples per whisk is not an integer.
     """
     rate = rig.config.plan.whisking.rate
     assert rig.head.identity is not None
     count = rig.head.identity.rate / rate
     if abs(count - round(count)) > 1e-6:
-        raise InputError("live.plan.whisking.rate", f"{count:g} samples a whisk", "a whole number of samples")
-    rig.poll()  # samples sent since the head came back may be waiting
+        raise InputError("live.plan.whisking.rate", f"{count:g} samples per whisk", "an integer")
+    rig.poll()  # samples since the head's return may be queued
     known, life = len(rig.whisk_starts), rig.restarts
 
-    def begun() -> int | None:
-        """First frame of the first whisk to start from now on, also of a reconnected head."""
+    def first_frame() -> int | None:
+        """First frame of the next whisk, also of a reconnected head."""
         return next(iter(rig.whisk_starts[known if rig.restarts == life else 0 :]), None)
 
     longest = rig.config.head.patience + 2 / rate + 1.0
     rig.wait_until(
-        lambda: begun() is not None, longest, SessionOutcome.HEAD_SILENT, "the beginning of a whisk"
+        lambda: first_frame() is not None, longest, SessionOutcome.HEAD_SILENT, "the beginning of a whisk"
     )
-    first = begun()
+    first = first_frame()
     assert first is not None
     device = float(rig.head.ring.between(first, first).time[0]) * 1e-6
     start = float(rig.clock.to_host(device)) - rig.epoch
@@ -157,7 +157,7 @@ def next_sequence(rig: Rig, number: int) -> WhiskSequence:
 
 
 def record_free_whisks(rig: Rig, count: int) -> list[Cycle]:
-    """Whisks in free air, unprocessed, for the calibration."""
+    """Records whisks in free air, as raw cycles, for the calibration."""
     sequence = next_sequence(rig, 0)
     record = []
     for number in range(count):
@@ -173,7 +173,7 @@ def record_free_whisks(rig: Rig, count: int) -> list[Cycle]:
 
 
 def _hand_on(rig: Rig, sequence: WhiskSequence, number: int, mapper: AsyncMapper) -> WhiskReport | None:
-    """Passes on a whisk that is complete or was awaited long enough; None while it is neither."""
+    """Passes on a whisk that is complete or `grace` late; returns None before."""
     first, last = sequence.frame_range(number)
     due = float(rig.clock.to_host(sequence.device + sequence.start_of(number + 1)))
     now = time.monotonic()
@@ -201,7 +201,7 @@ def _advance(rig: Rig, route: Route) -> bool:
     """Whether the arm has arrived at the end of the route; at a target, the next one is sent."""
     try:
         return route.advance(rig.arm)
-    except TargetRefused as error:  # for what ends it anyway, or for the target
+    except TargetRefused as error:  # the arm has a fault, or the target is invalid
         fault = rig.arm.fault or Fault(SessionOutcome.OUT_OF_BOX, str(error), time.monotonic())
         raise SessionFault(fault) from error
 
@@ -213,7 +213,7 @@ def _poll(rig: Rig, mapper: AsyncMapper) -> None:
 
 
 def _has_arrived(rig: Rig, last: int) -> bool:
-    """Whether that sample or a later one has arrived."""
+    """Whether sample `last` or a later one has arrived."""
     newest = rig.head.ring.newest
     return newest is not None and newest[0] >= last
 

@@ -18,7 +18,7 @@ from tactile.base.types import Cycle, Observation, Odometry, Report, Whisk
 
 CDR = b"\x00\x01\x00\x00"
 MAX_NUMBERS = 100_000_000  # in one message; a larger number is a damaged length
-FELT = ("touched", "highest", "reach")
+FEATURES = ("touched", "highest", "reach")
 """Values of each whisker in the field `felt` of a Whisk message."""
 FLAGS = {OBSERVATION: ("contact", "dead"), WHISK: ("alive", "contact", "held"), REPORT: ("alive", "contact")}
 """Meaning of the bits of `flags`, from the lowest."""
@@ -61,7 +61,8 @@ def encode(sample: Sample, view_shape: tuple[int, int, int], whiskers: int) -> t
         samples, values["sample_time"] = len(np.atleast_1d(reading.time)), reading.time
     elif isinstance(reading, Whisk):
         numbers = np.dtype(("<f8", (whiskers,)))
-        values["felt"] = np.stack([_convert_exactly(field, values[field], numbers) for field in FELT], axis=1)
+        columns = [_convert_exactly(field, values[field], numbers) for field in FEATURES]
+        values["felt"] = np.stack(columns, axis=1)
     else:
         values["dead"] = ~_convert_exactly("alive", reading.alive, np.dtype(("?", (whiskers,)))).astype(bool)
     layout = message_layout(name, view_shape, whiskers, samples)
@@ -97,7 +98,7 @@ def decode(name: str, message: bytes, view_shape: tuple[int, int, int], whiskers
         return float(record["time"]), Cycle(time, angle, deflection, odometry)
     flags = _unpack_flags(record["flags"], FLAGS[name])
     if name == WHISK:
-        felt = {field: record["felt"][:, k].copy() for k, field in enumerate(FELT)}
+        felt = {field: record["felt"][:, k].copy() for k, field in enumerate(FEATURES)}
         return float(record["time"]), Whisk(odometry=odometry, **flags, **felt)
     if name == REPORT:
         time, strain = record["sample_time"].copy(), record["strain"].copy()
@@ -138,7 +139,7 @@ def message_layout(name: str, view_shape: tuple[int, int, int], whiskers: int, s
         "view": view_shape,
         "point": (whiskers, 2),
         "flags": (whiskers,),
-        "felt": (whiskers, len(FELT)),
+        "felt": (whiskers, len(FEATURES)),
         "sample_time": (samples,),
         "angle": (samples, whiskers),
         "deflection": (samples, whiskers, 2),

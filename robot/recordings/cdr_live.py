@@ -19,7 +19,7 @@ from tactile.base.types import Odometry
 
 NUMBERS = ("host", "robot", "tcp", "speed", "force", "joints")
 WORDS = ("mode", "safety", "runtime", "operation", "progress")
-"""Fields of an arm state that are numbers and words, in the order of the message."""
+"""Fields of an arm state: floating-point numbers and 32-bit words, in the order of the message."""
 
 
 class Event(NamedTuple):
@@ -139,7 +139,7 @@ def decode_cut(message: bytes) -> Cut:
 def encode_event(event: Event) -> bytes:
     """Encode an event."""
     if ": " in event.name:
-        raise ValueError(f"an event's name {event.name!r} with a colon in it")
+        raise ValueError(f"a colon in the event name {event.name!r}")
     text = f"{event.name}: {event.text}".encode() + b"\0"
     return struct.pack("<4sdI", CDR, event.time, len(text)) + text
 

@@ -21,7 +21,7 @@ class CsvFile:
     """The numbers of one file.
 
     Attributes:
-        names: its C columns. values: [N, C]; NaN where a cell is empty. empty: [N, C] which cells are.
+        names: its C columns. values: [N, C]; NaN in empty cells. empty: [N, C] bool, empty cells.
         lines: [N] line numbers, from 1. content: the file's bytes.
     """
 
@@ -40,7 +40,7 @@ class CsvFile:
         return self.values[:, self.names.index(name)]
 
     def faults(self, *names: str) -> list[InputError]:
-        """Errors where a named column is empty, NaN or infinite."""
+        """Errors for empty, NaN or infinite cells of the named columns."""
         errors = []
         for name in names:
             empty = self.empty[:, self.names.index(name)]
@@ -72,9 +72,10 @@ class CsvFile:
 
 
 def read_csv(path: Path) -> CsvFile:
-    """Raises:
-    InputError: the file, its header or rows are missing, or a row has another length or a cell that is not a
-    number.
+    """Reads a CSV file of numbers.
+
+    Raises:
+        InputError: the file, its header or rows are missing, or a row has another length or an invalid cell.
     """
     content = read_bytes(path)
     try:

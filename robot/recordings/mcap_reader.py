@@ -35,7 +35,7 @@ class Recording(ClosedSource):
         warn: called with one sentence if the file is truncated or damaged.
 
     Attributes:
-        truncated: whether the file ends early; the first `length` samples are readable all the same.
+        truncated: whether the file ends early; its first `length` samples are readable.
         warning: that sentence, or ''.
         created_by: program and version that recorded it.
         events: events of a live session: faults, discontinuities, dropped images.
@@ -118,7 +118,7 @@ class Recovery(NamedTuple):
     """Result of `recover`.
 
     Attributes:
-        samples: number of samples. reason: why the old file was incomplete, '' if it was not.
+        samples: number of samples. reason: fault of the old file, '' if it was complete.
     """
 
     samples: int

@@ -19,7 +19,7 @@ from robot.recordings.cdr import Malformed
 
 CHUNK_LIMIT = 1 << 28  # bytes; ratslam writes 64 kB, or one sample if that is larger
 
-# What the MCAP and zstd libraries and this package raise for damaged bytes.
+# Exceptions of the MCAP and zstd libraries and of this package for damaged bytes.
 DAMAGE_ERRORS = (McapError, zstandard.ZstdError, struct.error, ValueError, OverflowError)
 
 

@@ -1,7 +1,7 @@
 """Reads a recording from its first byte to its end, or to the first damaged byte.
 
-Every message must fit its schema and have the next sequence number, so that what is read of a damaged file is
-exactly a prefix of what was written.
+Every message must fit its schema and have the next sequence number, so that a damaged file yields exactly a
+prefix of the written messages.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ class McapScanner:
 
     Attributes:
         description: the metadata, None until they have been read.
-        broken: why reading ended before the end of the file, '' if it did not.
+        broken: the reason to stop before the end of the file, '' at its end.
         count: samples read so far.
     """
 
@@ -114,7 +114,7 @@ class McapScanner:
         self.description: RecordingDescription | None = None
         self.broken = "it has not been read to its end"
         self.count = 0
-        self._number = 0  # of the next message; a truth has the number of its reading
+        self._number = 0  # next message; a truth has the number of its reading
 
     def __iter__(self) -> Iterator[Sample]:
         return (entry.content for entry in self.entries() if isinstance(entry.content, Sample))
@@ -190,8 +190,7 @@ class McapScanner:
         return event.time, event
 
     def _check_counts(self, statistics: Statistics, names: Mapping[int, str]) -> None:
-        """Compare counts: a chunk with a damaged type is skipped as an unknown record, so messages are
-        missing."""
+        """Compare counts, since a chunk with a damaged type is skipped as an unknown record."""
         counts = statistics.channel_message_counts
         others = {channel for channel, name in names.items() if name in ("", TRUTH)}
         written = sum(count for channel, count in counts.items() if channel not in others)

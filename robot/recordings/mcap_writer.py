@@ -43,13 +43,13 @@ class McapWriter:
         view_shape, whiskers: of every sample. rate_hz: nominal rate, 0 if unknown; for information.
         info: devices, world and origin; stored at the start of the file, so that a truncated one has it.
         chunk_s: a chunk is written when it has `CHUNK_BYTES`, or when the time of its last message differs
-            from that of the chunk before by this many seconds.
+            from that of the previous chunk by this many seconds.
 
     Attributes:
         count: readings written so far.
 
     Raises:
-        InputError: the file exists or cannot be made.
+        InputError: the file exists or cannot be created.
         ValueError, TypeError: provenance in `info` is not JSON.
     """
 
@@ -118,8 +118,7 @@ class McapWriter:
         self._pending = 0
 
     def close(self) -> None:
-        """Finish the file; may be called again. A rest that could not be written before is tried once more,
-        without an error.
+        """Finish the file; may be called again. Data refused before are tried once more, without an error.
 
         Raises:
             RecordingWriteError: the operating system refuses to write the rest.
@@ -143,7 +142,7 @@ class McapWriter:
 
 
 class WholeChunkFile:
-    """A new file that is written at `flush`: all waiting bytes or none."""
+    """A new file; `flush` writes all pending bytes or none."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("xb", buffering=0)
@@ -181,5 +180,5 @@ class WholeChunkFile:
 def _program() -> str:
     try:
         return f"ratslam {version('ratslam')}"
-    except PackageNotFoundError:  # used from a checkout
+    except PackageNotFoundError:  # in a checkout
         return "ratslam"

@@ -3,7 +3,7 @@
 Arrays, N rows: `in_t` s, `in_v` m/s, `in_w` rad/s, `in_flags` (1 = the row has a view, 2 = it has odometry,
 3 = both), `in_view` (a template, row-major [rows, columns], or two columns: place id and relative angle),
 `truth` [N, 3] (x m, y m, heading rad; optional) and `params_json` (a JSON object; its `template_y_size` and
-`template_x_size` are the shape of a template). Values that the flag of a row does not announce are ignored.
+`template_x_size` are the shape of a template). Values not announced by the flag of their row are ignored.
 
 Motion is along the heading after the turn of a row, as in OpenRatSLAM. The first odometry row only sets the
 clock; a row without odometry does not advance it.
@@ -33,7 +33,7 @@ NEEDED = (*COLUMNS, "in_view", "params_json")
 
 Parameters = dict[str, float | int | str]
 
-# What NumPy and zipfile raise for a file that is damaged, truncated or of another type.
+# Exceptions of NumPy and zipfile for a file that is damaged, truncated or of another type.
 _BROKEN = (zipfile.BadZipFile, zlib.error, ValueError, LookupError, EOFError, OSError, MemoryError,
            RuntimeError, SyntaxError)  # fmt: skip
 

@@ -22,7 +22,7 @@ class Recorder:
     Args: see `McapWriter`.
 
     Raises:
-        InputError: the file exists or cannot be made.
+        InputError: the file exists or cannot be created.
         ValueError, TypeError: provenance in `info` is not JSON.
     """
 
@@ -43,7 +43,7 @@ class Recorder:
 
     @property
     def count(self) -> int:
-        """Samples so far."""
+        """Number of samples so far."""
         return self._writer.count
 
     def write(self, sample: Sample) -> None:
@@ -62,7 +62,7 @@ class Recorder:
         self._writer.append(name, sample.time, message)
 
     def close(self) -> None:
-        """Finish the file; closing twice is fine."""
+        """Finish the file; may be called again."""
         self._writer.close()
 
     def __enter__(self) -> Self:

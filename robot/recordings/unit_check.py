@@ -26,7 +26,7 @@ STRETCHES = 50  # net turning is compared over this many, so that noise does not
 
 
 class UnitLimits(Settings):
-    """Limits of the unit check. Raise one if your robot really exceeds it."""
+    """Limits of the unit check. Raise a limit for a robot that exceeds it."""
 
     speed: float = Field(default=25.0, gt=0)
     """Largest typical speed, m/s: a car in town drives 15; an arm of 30 mm/s, read as m/s, 30."""
@@ -40,7 +40,7 @@ DEFAULT_LIMITS = UnitLimits()
 
 
 class MotionTrack(NamedTuple):
-    """The part of a recording from which units are judged.
+    """The data of a recording used by the unit check.
 
     Attributes:
         time: [N] s. moved: [N] rows with odometry. motion: [N, 4] (dx m, dy m, dtheta rad, dt s).
@@ -100,7 +100,7 @@ def unit_errors(track: MotionTrack, where: str, limits: UnitLimits = DEFAULT_LIM
 
 
 def _possible_errors(robot: TypicalMotion, limits: UnitLimits) -> tuple[tuple[bool, str, str, str], ...]:
-    """Each possible fault: whether it is there, what was found, what is expected, the cure."""
+    """All possible faults: (present, finding, expectation, cure)."""
     rushes, truth_rushes = robot.speed > limits.speed, robot.true_speed > limits.speed
     spins = robot.turn_rate > limits.turn_rate or robot.turn > np.pi
     fast, quick = _else("speed", limits), _else("turn_rate", limits)

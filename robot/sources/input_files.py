@@ -1,4 +1,4 @@
-"""Reading files named by the user, with one clear error for each way in which a file is unusable."""
+"""Reading files named by the user, with one error for each cause that makes a file unusable."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ from tactile.base.errors import InputError, InputErrors
 
 
 def require_file(path: Path) -> None:
-    """Raises:
-    InputError: the file is missing, not a regular file, not readable, or empty.
+    """Checks that a file can be read and has content.
+
+    Raises:
+        InputError: the file is missing, not a regular file, not readable, or empty.
     """
     try:
         if path.is_dir():

@@ -78,7 +78,7 @@ def simulate_odometry(
 
     Args:
         time: [N] s. pose: [N, 3] true poses, headings not wrapped. kidnapped: [N] bool, the robot was moved
-            by hand since the row before; its odometry then repeats the motion of the row before.
+            by hand since the previous row; its odometry then repeats the motion of that row.
     """
     motion = between(pose[:-1], pose[1:])
     motion[:, 2] = np.diff(pose[:, 2])

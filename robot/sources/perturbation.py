@@ -23,7 +23,7 @@ START = (10, 80)
 DROPPED = 0.05
 """Fraction of views that are dropped."""
 NEW_IDS, WRONG_IDS = 0.1, 0.05
-"""Fractions of given place labels that become new ones, and those of other rows."""
+"""Fractions of given place labels replaced by new labels, and by labels of other rows."""
 
 
 def perturb(log: InMemorySource, seed: int) -> InMemorySource:
@@ -66,7 +66,7 @@ def perturb(log: InMemorySource, seed: int) -> InMemorySource:
 
 
 def corrupt_labels(label: np.ndarray, stream: np.random.Generator) -> np.ndarray:
-    """Labels [N], some replaced by new ones and some by those of other rows."""
+    """Labels [N], some replaced by new labels and some by labels of other rows."""
     given = np.flatnonzero(label >= 0)
     label, chance = label.copy(), stream.random(len(given))
     new, wrong = given[chance < NEW_IDS], given[(chance >= NEW_IDS) & (chance < NEW_IDS + WRONG_IDS)]

@@ -1,4 +1,4 @@
-"""What a source states about itself: devices, world and origin, as one typed record."""
+"""Facts about a source: devices, world and origin, as one typed record."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class MazeInfo(Settings):
     """The maze of a session on a whisker head."""
 
     text: str
-    """Its drawing, in the format of a maze file."""
+    """Drawing of the maze, in the format of a maze file."""
     heights: Annotated[tuple[PositiveFloat, ...], Field(min_length=1)]
     """Wall heights to draw from, m."""
     seed: NonNegativeInt
@@ -46,7 +46,7 @@ class PlanarWhiskersInfo(Settings):
 
 
 class SimulationInfo(Settings):
-    """How a session on a whisker head was simulated."""
+    """Simulation of a session on a whisker head."""
 
     sha256: str
     """Hash (hex) of the generating configuration."""
@@ -55,7 +55,7 @@ class SimulationInfo(Settings):
     tier: str
     """Fidelity: kinematic, quasistatic or dynamic."""
     why: str
-    """Why this fidelity was chosen."""
+    """Reason for this fidelity."""
 
 
 class SourceInfo(Settings):
@@ -86,7 +86,7 @@ class SourceInfo(Settings):
     """Set if a session on a whisker head was simulated."""
     provenance: dict[str, Any] = Field(default_factory=dict)
     """Generating configuration under its key in a run configuration (`simulation`, `create_simulation`,
-    `live`), or `parameters` that came with a recording. Its reader validates it."""
+    `live`), or `parameters` of a recording. Its reader validates it."""
 
     def to_json(self) -> str:
         """The record as a JSON document with sorted keys.

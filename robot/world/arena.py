@@ -33,7 +33,7 @@ LINE_FORMS = {
     "polygon": "polygon x y x y x y ...",
     "start": "start x y heading",
 }
-REQUIRED_LINES = {"outer": "the walls", "start": "where the robot starts"}
+REQUIRED_LINES = {"outer": "the walls", "start": "the start of the robot"}
 START_CLEARANCE = 0.17
 """Radius of free space required at the start, m."""
 
@@ -61,7 +61,7 @@ def wall_segments(arena: Arena) -> np.ndarray:
 
 
 def is_enclosed(arena: Arena, points: np.ndarray) -> np.ndarray:
-    """[...] bool, whether points [..., 2] are inside the outer wall, in objects or not."""
+    """[...] bool, whether points [..., 2] are inside the outer wall; objects are ignored."""
     return polygon_contains(arena.outer, points)
 
 
@@ -88,7 +88,7 @@ def read_arena(path: File) -> Arena:
     """Read an arena file.
 
     Raises:
-        InputError: the file is not a valid arena; names line and column.
+        InputError: the file is not a valid arena; the error gives line and column.
     """
     try:
         lines = read_bytes(path).decode("utf-8").splitlines()

@@ -55,7 +55,7 @@ def make_anticlockwise(loop: Sequence[Cell]) -> list[Cell]:
     """The loop in anticlockwise order from the same cell.
 
     Raises:
-        InputError: it has a cell twice, or fewer than four cells.
+        InputError: the loop has a cell twice, or fewer than four cells.
     """
     if len(loop) < 4 or len(set(loop)) < len(loop):
         twice = next((cell for k, cell in enumerate(loop) if cell in loop[:k]), None)
@@ -73,7 +73,7 @@ def check_route(maze: Maze, way: Sequence[Cell], where: str = "simulation.path.c
         where: name of the route in errors.
 
     Raises:
-        InputError: the route is not possible; names the step and the wall.
+        InputError: the route is not possible; the error gives the step and the wall.
     """
     for number, cell in enumerate(way):
         if not is_inside(maze, cell):

@@ -25,7 +25,7 @@ def polygon_contains(polygon: np.ndarray, points: np.ndarray) -> np.ndarray:
     x1, y1, x2, y2 = polygon_edges(polygon).T
     x, y = points[..., 0], points[..., 1]
     spans = (y1 > y) != (y2 > y)
-    run = np.where(y2 == y1, 1.0, y2 - y1)  # a horizontal side spans nothing
+    run = np.where(y2 == y1, 1.0, y2 - y1)  # avoids a division by 0; a horizontal side spans no height
     right = x < x1 + (y - y1) * (x2 - x1) / run
     return np.logical_xor.reduce(spans & right, axis=-1)
 

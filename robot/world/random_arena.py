@@ -1,4 +1,4 @@
-"""Random square arenas with square objects, all of whose free space the robot can reach.
+"""Random square arenas with square objects; the robot can reach all free space.
 
 An object either touches the wall or leaves a passage to the wall and to other objects wide enough for the
 robot.
@@ -22,7 +22,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 MAX_OBJECT_TRIES = 200
 """Largest number of positions drawn for the objects of an arena."""
 MAX_RESTARTS = 50
-"""Largest number of restarts when the objects did not fit."""
+"""Largest number of restarts if the objects do not fit."""
 MAX_START_TRIES = 400
 """Number of positions drawn for the start of a random arena."""
 OTHER_START_TRIES, OTHER_START_CLEARANCE = 1000, 0.2

@@ -148,7 +148,7 @@ def check_surroundings(boxes: Walls, head: Head, path: HeadPath) -> Surroundings
     """Walls for contact queries, after checking that no whisker at rest is inside a wall along the path.
 
     Raises:
-        InputError: names time, cell, whisker and wall; or the walls are higher than the head.
+        InputError: a whisker is inside a wall, or the walls are higher than the head.
     """
     hangs, tallest = float(head.base[:, 2].min()), float(boxes.height.max())
     if tallest >= hangs:
@@ -172,7 +172,7 @@ def check_surroundings(boxes: Walls, head: Head, path: HeadPath) -> Surroundings
 
 
 def maze_info(maze: Maze, config: MazeConfig, seed: int) -> MazeInfo:
-    """The maze of a session with that seed, as its source states it."""
+    """The maze of a session with this seed, for the `SourceInfo` of its source."""
     return MazeInfo(text=maze_text(maze), heights=config.heights, seed=_maze_seed(config, seed))
 
 
@@ -208,7 +208,7 @@ def _plan_route(
         if len(way) < 2:
             raise InputError("simulation.path.cells", "one cell", "at least two")
     else:
-        cells = int(1.2 * explored * motion.speed / CELL_SIDE) + 20  # more than can be visited in that time
+        cells = int(1.2 * explored * motion.speed / CELL_SIDE) + 20  # upper limit for that time
         way = exploration_route(maze, loop[0] if loop else (0, 0), cells, stream(seed, "path"))
     check_route(maze, way)
     return way

@@ -94,7 +94,7 @@ class Surroundings:
         reach, wall = np.zeros(met.shape), np.full(met.shape, -1)
         row, ray, box = np.nonzero((leave > enter) & (leave > 0) & (enter < self.range))
         d1, d2, top = enter[row, ray, box], leave[row, ray, box], self.walls.height[near[box]]
-        # A box that a ray crosses concerns every whisker in that direction.
+        # A box crossed by a ray is within the plane of every whisker in that direction.
         crossing, whisker = np.nonzero(ray[:, None] == self._ray)
         row, box = row[crossing], box[crossing]
         angle, share = self._touch_from_above(whisker, d1[crossing], d2[crossing], top[crossing])
@@ -130,7 +130,7 @@ class Surroundings:
         by_tip = low & (out >= d1) & (out <= d2)
         edge = np.hypot(drop, d2 - radius)
         by_edge = (low & (out > d2)) & (edge <= length)
-        # A head below the tops, or above a box, touches at once: protraction 0.
+        # A head below the tops, or above a box, is in contact at protraction 0.
         over = np.arctan2(d2 - radius, drop)
         # Beyond the vertical the tip touches the far face below that edge.
         inside = d2 < radius

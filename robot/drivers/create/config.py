@@ -22,8 +22,7 @@ class CreateConfig(Settings):
     rate: Annotated[float, Field(ge=5, le=50)] = 20.0
     """Rate of sensor readings, Hz; the motion between two readings is taken as an arc."""
     patience: Annotated[float, Field(ge=0.1, le=5)] = 0.5
-    """Time after which a drive command ends unless renewed, s; also the time in which a killed or hanging
-    program is detected."""
+    """Time after which a drive command ends unless renewed, s; also the time-out of the watchdog process."""
     silence: Annotated[float, Field(ge=0.1, le=5)] = 0.3
     """Time without a reply after which the link counts as lost and the wheels are stopped, s."""
 

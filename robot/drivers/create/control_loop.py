@@ -27,13 +27,13 @@ class WheelCommand(NamedTuple):
 
 
 class ControlLoop:
-    """Reads, checks, drives, in this order, so that wheels never move without a fresh reading.
+    """Reads, checks, commands, in this order, so that wheels never move without a recent reading.
 
     One thread polls; others may call `steer`, `take_odometry` and `release` at any time. The robot must be
-    awake, in safe mode, with its counters just cleared.
+    awake, in safe mode, with cleared counters.
 
     Args:
-        clock: s, monotonic.
+        clock: returns the host's monotonic time, s.
     """
 
     def __init__(self, config: CreateConfig, link: SerialLink, clock: Callable[[], float]) -> None:
@@ -42,7 +42,7 @@ class ControlLoop:
         self._asked = WheelCommand(0, 0, -math.inf)
         self._heard = clock()
         self._odometer = CreateOdometry(self._heard)
-        self._owed = 0  # when last asked
+        self._owed = 0  # at the last call of `gap`
         self._rearm, self._deaf = False, -math.inf
         self.halted: StopEvent | None = None
         self.sensed: protocol.SensorReply | None = None
@@ -61,18 +61,18 @@ class ControlLoop:
         right, left = wheel_speeds(self._config, forward, turn)
         with self._lock:
             if self.halted and (right or left):
-                raise CommandRefused(f"it was stopped, {self.halted}")
+                raise CommandRefused(f"the robot is stopped: {self.halted}")
             self._asked = WheelCommand(right, left, self._clock())
 
     def release(self) -> None:
         """Allows driving again after a stop; the robot stands until the next command.
 
         Raises:
-            CommandRefused: port or watchdog are lost, which requires a new driver.
+            CommandRefused: a lost port or watchdog requires a new driver.
         """
         with self._lock:
             if self.halted and self.halted.halt in (StopReason.UNPLUGGED, StopReason.UNGUARDED):
-                raise CommandRefused(f"cannot go on, {self.halted}")
+                raise CommandRefused(f"a new driver is required: {self.halted}")
             self._rearm = self.halted is not None
             self.halted = None
 
@@ -88,7 +88,7 @@ class ControlLoop:
             return self._owed > before
 
     def halt(self, halt: StopReason, detail: str) -> None:
-        """Stops the robot, at the latest with the next poll, until release. The first reason stays."""
+        """Stops the robot with the next poll, until release; the first reason is kept."""
         with self._lock:
             self._asked = WheelCommand(0, 0, -math.inf)
             self.halted = self.halted or StopEvent(halt, detail, self._clock())
@@ -103,7 +103,7 @@ class ControlLoop:
                 self._link.send(protocol.SAFE)
                 return
             found = self._read()
-            asked = self._asked  # another thread may replace it: what is checked is what is sent
+            asked = self._asked  # read once: another thread may replace it
             objected = stop_reason(found, asked.right, asked.left) if found else None
             if objected:
                 self.halt(*objected)

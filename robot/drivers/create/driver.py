@@ -1,4 +1,4 @@
-"""Driver of a Create: a control thread, and a watchdog process in case even that ends."""
+"""Driver of a Create: a control thread, and a watchdog process for the end of that thread."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tactile.base.errors import InputError
 from tactile.base.types import Odometry
 
 TRIES = 5
-"""Number of queries in which a Create must have answered."""
+"""Number of queries at the start; a Create must answer one of them."""
 
 
 class NoAnswer(InputError):
@@ -32,8 +32,8 @@ class NotSafe(InputError):
 class CreateDriver:
     """A Create that drives while commands are renewed, and stops otherwise.
 
-    Times are of `time.monotonic()`. All methods return at once, except `start`, `stop` and `close` (at most
-    some tenths of a second), and may be called from any thread.
+    Times are those of `time.monotonic()`. Any thread may call the methods. They return at once; only
+    `start`, `stop` and `close` take up to some tenths of a second.
     """
 
     def __init__(self, config: CreateConfig) -> None:
@@ -67,14 +67,14 @@ class CreateDriver:
         """Drives, m/s and rad/s counter-clockwise, for at most `patience`; call it again to continue.
 
         Raises:
-            CommandRefused: a wheel over the cap, not finite, not started, or stopped by something not
-            released.
+            CommandRefused: a speed is above the limit or not finite, or the driver is not started, or
+            stopped and not released.
         """
         self._running_loop().steer(forward, turn)
         self._wake.set()
 
     def stop(self) -> None:
-        """Stops the wheels; returns once that was sent."""
+        """Stops the wheels; returns when the command has been sent."""
         self._running_loop().steer(0.0, 0.0)
         self._next_poll()
 
@@ -97,7 +97,7 @@ class CreateDriver:
 
     @property
     def halted(self) -> StopEvent | None:
-        """What stopped the robot, until release."""
+        """The stop in effect until `release`, or None."""
         return self._pilot.halted if self._pilot else None
 
     @property
@@ -158,9 +158,9 @@ class CreateDriver:
         if found is None:
             raise NoAnswer(
                 port,
-                f"nothing answers as a Create does ({last})",
-                f"replies at {protocol.BAUD} baud",
-                "switch it on, look at the cable and the port; a Create 2 is another robot",
+                f"no valid reply ({last})",
+                f"replies of a Create at {protocol.BAUD} baud",
+                "switch it on, check cable and port; a Create 2 is not supported",
             )
         if found.bumps & protocol.Bumps.DROPPED or found.mode != protocol.Mode.SAFE:
             raise NotSafe(
@@ -185,13 +185,13 @@ class CreateDriver:
                     pilot.halt(StopReason.UNGUARDED, "the watchdog process does not respond")
                 self._wake.wait(max(0.0, due - time.monotonic()))
                 self._wake.clear()
-        finally:  # whatever ended the loop: the watchdog stops the wheels
-            pilot.halt(StopReason.UNGUARDED, "the thread that reads it has ended")
+        finally:  # the watchdog then stops the wheels
+            pilot.halt(StopReason.UNGUARDED, "the control thread has ended")
 
     def _next_poll(self) -> None:
-        """Waits until a poll has started and ended after now."""
+        """Waits for the end of a poll that starts after this call."""
         thread = self._thread
-        for _ in range(2):  # the first may have begun before
+        for _ in range(2):  # the first may have started earlier
             self._polled.clear()
             self._wake.set()
             while thread and thread.is_alive() and not self._polled.wait(0.05):

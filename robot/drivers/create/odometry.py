@@ -1,7 +1,7 @@
 """Odometry from the whole millimetres and degrees that the Create reports.
 
-The robot keeps the remainder below 1 mm and 1 degree for the next reply. As long as no reply is lost, sums
-stay within these of the wheels' motion, however often it is read.
+The robot keeps the remainder below 1 mm and 1 degree for the next reply. Unless a reply is lost, sums
+stay within these bounds of the wheels' motion, at any reading rate.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ class CreateOdometry:
     """Accumulates readings until they are taken.
 
     Args:
-        time: of the reading that cleared the robot's counters, s, host's monotonic clock.
+        time: host time of the reading that cleared the robot's counters, s.
     """
 
     def __init__(self, time: float) -> None:
@@ -24,7 +24,7 @@ class CreateOdometry:
         self._degrees = 0  # an integer, so that the sum is exact
 
     def add(self, millimetres: int, degrees: int, time: float) -> None:
-        """Adds a reading: an arc since the one before."""
+        """Adds a reading (mm, degrees, host time s): an arc since the previous one."""
         turned, turn = math.radians(self._degrees), math.radians(degrees)
         chord = millimetres / 1000 * (math.sin(turn / 2) / (turn / 2) if turn else 1.0)
         self._x += chord * math.cos(turned + turn / 2)

@@ -28,9 +28,9 @@ _WHEELS = struct.Struct(">Bhh")
 TURN_PER_SECOND = 222
 """Highest turning rate, degrees/s: both wheels at `TOP_SPEED`, opposed."""
 MAX_DELAY = 0.1
-"""Motion time that a reply may report beyond the time elapsed, s: it waited in a buffer."""
+"""Motion time that a reply may report beyond the elapsed time, s, after a delay in a buffer."""
 NUDGE = 5
-"""Motion that a reply of a standing robot may report, mm or degrees."""
+"""Largest reported motion of a robot at rest, mm or degrees."""
 
 
 class Mode(IntEnum):
@@ -58,7 +58,7 @@ class Bumps(IntFlag):
 
 
 class SensorReply(NamedTuple):
-    """One reply; distance and angle are those since the reply before.
+    """One reply; distance and angle are those since the previous reply.
 
     Attributes:
         millimetres: mean of both wheels, forward. degrees: counter-clockwise.
@@ -73,7 +73,7 @@ class SensorReply(NamedTuple):
 def drive(right: int, left: int) -> bytes:
     """The command that sets both wheel speeds, mm/s. It holds until the next: the robot has no watchdog."""
     if max(abs(right), abs(left)) > TOP_SPEED:
-        raise ValueError(f"wheels at {right} and {left} mm/s; the Create takes {TOP_SPEED} at most")
+        raise ValueError(f"wheels at {right} and {left} mm/s; the limit of the Create is {TOP_SPEED}")
     return _WHEELS.pack(DRIVE_DIRECT, right, left)
 
 

@@ -33,7 +33,7 @@ class BadReply(Exception):
 
 
 class SerialPort(Protocol):
-    """The part of `serial.Serial` that is used."""
+    """The methods of `serial.Serial` that the link uses."""
 
     timeout: float | None
 
@@ -68,8 +68,8 @@ def open_port(name: str, *, exclusive: bool = True) -> SerialPort:
     """Opens the serial port at the Create's speed.
 
     Raises:
-        NoPort: with what is wrong with it.
-        InputError: without pyserial.
+        NoPort: the port cannot be opened.
+        InputError: pyserial is not installed.
     """
     try:
         import serial
@@ -85,22 +85,22 @@ def open_port(name: str, *, exclusive: bool = True) -> SerialPort:
 
 
 def _explain(name: str, error: OSError) -> NoPort:
-    """Translates an error of pyserial, whose cause is mostly in its text only."""
+    """Translates an error of pyserial by its text, the only place of most causes."""
     cause = error.errno or getattr(error.__context__, "errno", None)
     if cause == errno.ENOENT:
         from serial.tools.list_ports import comports
 
         ports = ", ".join(sorted(port.device for port in comports())) or "none; plug the cable in"
-        return NoPort(name, "there is no such port", f"one of those there are: {ports}")
+        return NoPort(name, "no such port", f"one of the ports {ports}")
     if cause == errno.EACCES:
-        return NoPort(name, "may not be opened", "", "join its group: sudo usermod -aG dialout $USER")
+        return NoPort(name, "no permission to open it", "", "join its group: sudo usermod -aG dialout $USER")
     if cause in (errno.EAGAIN, errno.EBUSY):
         return NoPort(name, "is held by another program", "", "end that program")
     return NoPort(name, f"cannot be opened ({error})", "a serial port")
 
 
 def _replies(data: bytes, elapsed: float, most: int) -> list[protocol.SensorReply]:
-    """All bytes as replies, oldest first, the last `most`; else the end of them as one, or none."""
+    """The bytes as replies, oldest first, at most the last `most`; if invalid, their end as one, or none."""
     size = protocol.REPLY.size
     pieces = [protocol.parse_reply(data[i : i + size], elapsed) for i in range(0, len(data), size)]
     believed = [piece for piece in pieces if piece is not None]
@@ -113,8 +113,8 @@ def _replies(data: bytes, elapsed: float, most: int) -> list[protocol.SensorRepl
 class SerialLink:
     """Sends queries and reads replies.
 
-    Replies have no identifier, and a reply clears the counters it reports. A late one is therefore added to
-    the next; of a disturbed one the end is tried, since noise mostly precedes it.
+    Replies have no identifier, and a reply clears the counters it reports. A late reply is therefore added to
+    the next; of a disturbed reply the end is parsed, since noise mostly precedes it.
     """
 
     def __init__(self, port: SerialPort) -> None:
@@ -188,5 +188,5 @@ class SerialLink:
     def _attached(self) -> Iterator[None]:
         try:
             yield
-        except OSError as error:  # all of pyserial's errors are
+        except OSError as error:  # base class of pyserial's errors
             raise Unplugged(str(error)) from None

@@ -11,22 +11,22 @@ from robot.drivers.create.protocol import Bumps, Mode, SensorReply, describe_bum
 
 
 class StopReason(Enum):
-    """Why the wheels were stopped; the value tells what to do."""
+    """Reason of a stop of the wheels; the value is its cure."""
 
     BUMPED = "`release` it and drive back"
     WHEEL_DROP = "set it on its wheels, then `release` it"
-    LEFT_SAFE_MODE = "a cliff, its charger or a button ended safe mode: look at it, then `release` it"
-    SILENT = "replies stopped coming: look at its battery and cable; it may still drive"
-    GARBLED = "what comes is no reply of a Create: look at the cable, and whether another program reads it"
-    UNPLUGGED = "the port is gone, and it may still drive: lift it, plug the cable in, start again"
-    UNGUARDED = "the process that stops it when this one is killed has ended: start again"
+    LEFT_SAFE_MODE = "a cliff, the charger or a button ended safe mode: check the robot, then `release` it"
+    SILENT = "no replies: check battery and cable; the robot may still drive"
+    GARBLED = "invalid replies: check the cable, and whether another program reads the port"
+    UNPLUGGED = "the port was disconnected: lift the robot (it may still drive), plug it in, start again"
+    UNGUARDED = "the watchdog process or the control thread has ended: start again"
 
 
 class StopEvent(NamedTuple):
     """A stop of the robot.
 
     Attributes:
-        halt: which reason. detail: what was found. time: s, host's monotonic clock.
+        halt: the reason. detail: the finding. time: host's monotonic clock, s.
     """
 
     halt: StopReason
@@ -38,7 +38,7 @@ class StopEvent(NamedTuple):
 
 
 class CommandRefused(ValueError):
-    """A command that is rejected."""
+    """A rejected command."""
 
 
 def wheel_speeds(config: CreateConfig, forward: float, turn: float) -> tuple[int, int]:
@@ -57,18 +57,18 @@ def wheel_speeds(config: CreateConfig, forward: float, turn: float) -> tuple[int
     if max(abs(right), abs(left)) > 1000 * config.speed + 1e-6:
         raise CommandRefused(
             f"forward {forward:g} m/s, turn {turn:g} rad/s needs a wheel at"
-            f" {max(abs(right), abs(left)) / 1000:g} m/s; the cap is {config.speed:g} (`speed`)"
+            f" {max(abs(right), abs(left)) / 1000:g} m/s; the limit is {config.speed:g} (`speed`)"
         )
     cap = math.floor(1000 * config.speed + 1e-6)  # rounding must not exceed the limit
     return max(-cap, min(cap, round(right))), max(-cap, min(cap, round(left)))
 
 
 def stop_reason(sensed: SensorReply, right: int, left: int) -> tuple[StopReason, str] | None:
-    """Why the wheels must stop, from a reading, or None. After a bump, driving back is allowed."""
+    """Reason and detail for a stop after a reading, or None. After a bump, driving back is allowed."""
     if sensed.bumps & Bumps.DROPPED:
         return StopReason.WHEEL_DROP, describe_bumps(sensed.bumps & Bumps.DROPPED)
     if sensed.mode != Mode.SAFE:
-        return StopReason.LEFT_SAFE_MODE, f"it is in {sensed.mode.name.lower()} mode"
+        return StopReason.LEFT_SAFE_MODE, f"the robot is in {sensed.mode.name.lower()} mode"
     if sensed.bumps & Bumps.BUMPED and right + left > 0:
         return StopReason.BUMPED, describe_bumps(sensed.bumps & Bumps.BUMPED)
     return None

@@ -1,9 +1,7 @@
-"""Watchdog process: stops the wheels when the driving process has died or hangs. The Create has no watchdog
-of its own.
+"""Watchdog process: stops the wheels when the driver's process has ended or hangs. The Create has none.
 
-`python -m robot.drivers.create.watchdog PORT PATIENCE` is started by the driver and hears a beat, any
-byte, from it on
-standard input. Without one for PATIENCE s, or with the end of the input, it stops the wheels. A `q` ends it.
+The driver starts `python -m robot.drivers.create.watchdog PORT PATIENCE` and sends a heartbeat, any byte, to
+its standard input. After PATIENCE s without one, or at the end of input, it stops the wheels. `q` ends it.
 """
 
 from __future__ import annotations
@@ -38,11 +36,11 @@ class Watchdog:
             bufsize=0,
             start_new_session=True,  # an interrupt from the terminal must not end it first
         )
-        ready = threading.Thread(target=self._hear, daemon=True)
-        self._heard = b""
+        ready = threading.Thread(target=self._read_ready, daemon=True)
+        self._ready = b""
         ready.start()
         ready.join(START_LIMIT)
-        if self._heard != b"r":
+        if self._ready != b"r":
             self.close()
             raise WatchdogFailed(port, "the watchdog process did not start")
 
@@ -61,7 +59,7 @@ class Watchdog:
         return True
 
     def close(self) -> None:
-        """Ends the process; the wheels are left as they are."""
+        """Ends the process without a command to the wheels."""
         with contextlib.suppress(subprocess.TimeoutExpired, OSError):
             self._process.communicate(b"q", timeout=1)
         if self._process.poll() is None:
@@ -72,24 +70,24 @@ class Watchdog:
                 with contextlib.suppress(OSError):
                     pipe.close()
 
-    def _hear(self) -> None:
+    def _read_ready(self) -> None:
         assert self._process.stdout is not None
-        self._heard = self._process.stdout.read(1)
+        self._ready = self._process.stdout.read(1)
 
 
 def watch(port: str, patience: float) -> None:
-    """The process: stops the wheels once for each time-out of the heartbeat."""
+    """Runs the watchdog: stops the wheels once per time-out of the heartbeat (`patience`, s)."""
     line = open_port(port, exclusive=False)
     beats: queue.SimpleQueue[bytes] = queue.SimpleQueue()
 
-    def hear() -> None:
+    def read_beats() -> None:
         while data := os.read(0, 4096):
             beats.put(data)
         beats.put(b"")
 
-    threading.Thread(target=hear, daemon=True).start()
+    threading.Thread(target=read_beats, daemon=True).start()
     print("r", end="", flush=True)
-    beating = False  # nothing drives before the first heartbeat
+    beating = False  # the wheels are still before the first heartbeat
     while True:
         try:
             data = beats.get(timeout=patience if beating else None)
@@ -102,7 +100,7 @@ def watch(port: str, patience: float) -> None:
             continue
         try:
             line.write(protocol.STOP_ANYHOW)
-        except OSError:  # the port is gone
+        except OSError:  # the port was disconnected
             return
         if data is not None:
             return

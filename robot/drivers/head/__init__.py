@@ -1,1 +1,1 @@
-"""A whisker head on a wire: what it sends and takes, the link to it, and how it is driven."""
+"""Driver of a whisker head: wire format, link, whisking commands."""

@@ -1,4 +1,4 @@
-"""Address of a whisker head: on USB, or an emulated one behind a socket."""
+"""Address of a whisker head: on USB, or a socket of an emulator."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ _HOST = re.compile(r"([\w.-]+)(?::(\d{1,5}))?")
 
 class Address(NamedTuple):
     """Attributes:
-    vendor, product: USB numbers. serial: of a certain device, or None for any.
-    host, port: of an emulated head; host None for a real one.
+    vendor, product: USB ids. serial: serial number of the device, or None for any.
+    host, port: of an emulated head; host is None for a real head.
     """
 
     vendor: int = VENDOR
@@ -29,7 +29,7 @@ class Address(NamedTuple):
         """Parses an address.
 
         Raises:
-            ValueError: not an address.
+            ValueError: invalid address.
         """
         if found := _USB.fullmatch(text):
             vendor, product, serial = found.groups()

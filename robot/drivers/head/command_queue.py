@@ -1,4 +1,4 @@
-"""Queue of commands to a head, and of those to repeat when a head reconnects."""
+"""Queue of commands to a head, and the commands to repeat after a reconnection."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class CommandQueue:
         self._sent = -float("inf")
 
     def put(self, command: Command) -> None:
-        """Adds a command. Amplitudes replace older ones that wait."""
+        """Adds a command. Amplitudes replace queued ones."""
         with self._lock:
             if command.kind == CommandKind.AMPLITUDES:
                 self._waiting = deque(other for other in self._waiting if other.kind != command.kind)
@@ -41,19 +41,19 @@ class CommandQueue:
             self._awake = False
 
     def resend_persistent(self) -> None:
-        """Sends the persistent commands again: the head has lost them."""
+        """Queues the persistent commands again, which a restarted head has lost."""
         with self._lock:
             self._waiting = deque(self._lasting[kind] for kind in PERSISTENT if kind in self._lasting)
 
     def next(self, now: float) -> Command | None:
-        """Command to send now (s, host), if any: a keep-alive when nothing else was sent."""
+        """The command to send at a host time, s, or None; a keep-alive if the queue is empty."""
         with self._lock:
             if self._waiting:
                 return self._waiting[0]
             return KEEP_ALIVE if self._awake and now - self._sent >= KEEP_ALIVE_PERIOD else None
 
     def mark_sent(self, command: Command, now: float) -> None:
-        """Removes a command that was sent at that time."""
+        """Removes a command sent at a host time, s."""
         with self._lock:
             self._sent = now
             if self._waiting and self._waiting[0] is command:

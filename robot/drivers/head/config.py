@@ -19,8 +19,8 @@ class HeadLinkConfig(Settings):
     """Address and time limits of a whisker head."""
 
     address: Annotated[str, AfterValidator(_readable)] = "usb"
-    """`usb` for the only head connected, `usb:1209:0001` or `usb:1209:0001:SERIAL` for a certain one, or HOST
-    or HOST:PORT of an emulated one."""
+    """`usb` for the only connected head, `usb:1209:0001` or `usb:1209:0001:SERIAL` for a specific one, HOST
+    or HOST:PORT for an emulated one."""
     patience: PositiveFloat = 20.0
     """Time for which a disconnected, silent or unreadable head is awaited, with the arm at rest, s."""
     silence: PositiveFloat = 0.1

@@ -12,7 +12,7 @@ from robot.drivers.head.protocol import CHANNELS, to_radians
 from tactile.base.types import Cycle, Odometry
 
 MAX_FRAMES = 1 << 16
-"""Number of frames kept for whisks to come: half a minute at 2 kHz."""
+"""Number of frames kept for later whisks: half a minute at 2 kHz."""
 
 
 class Cut(NamedTuple):
@@ -20,8 +20,8 @@ class Cut(NamedTuple):
 
     Attributes:
         number: of the whisk. time: of its sample, s. start: of the whisk, s, on the same clock.
-        first, last: sequence numbers of its first and last frame. frames: how many of these arrived.
-        odometry: motion since the whisk before.
+        first, last: sequence numbers of its first and last frame. frames: number of these that arrived.
+        odometry: motion since the previous whisk.
         seen: whether its frames become a reading; False where its image was dropped, which does not affect
             the motion.
     """
@@ -53,10 +53,10 @@ def select_frames(frames: Frames, first: int, last: int) -> Frames:
 
 
 def assemble_cycle(frames: Frames, cut: Cut) -> Cycle:
-    """The whisk; without samples if the cut is not `seen`.
+    """The whisk as a cycle; without samples if the cut is not `seen`.
 
     Args:
-        frames: those of the cut, in any order; others are ignored.
+        frames: the frames of the cut, in any order; others are ignored.
 
     Raises:
         ValueError: frames of the cut are missing.
@@ -66,7 +66,7 @@ def assemble_cycle(frames: Frames, cut: Cut) -> Cycle:
         return Cycle(np.zeros(0), *to_radians(frames.values), cut.odometry)
     mine = select_frames(frames, cut.first, cut.last)
     if len(mine.sequence) != cut.frames:
-        raise ValueError(f"a whisk of {cut.frames} frames, of which {len(mine.sequence)} are there")
+        raise ValueError(f"a whisk of {cut.frames} frames, of which {len(mine.sequence)} are present")
     # The memory layout matters: it decides the order of summation.
     angle, deflection = (np.ascontiguousarray(part) for part in to_radians(mine.values))
     time = cut.start + (mine.time - mine.time[0]) * 1e-6
@@ -74,7 +74,7 @@ def assemble_cycle(frames: Frames, cut: Cut) -> Cycle:
 
 
 def empty_frames(whiskers: int) -> Frames:
-    """Frames of a head with that many whiskers: none."""
+    """A block without frames, of a head with this number of whiskers."""
     return Frames(
         np.zeros(0, np.int64),
         np.zeros(0, np.int64),
@@ -87,7 +87,7 @@ class FrameWindow:
     """The most recent frames, in blocks as they arrived.
 
     Args:
-        empty: a block without frames, for the shape.
+        empty: a block without frames, which gives the shape.
     """
 
     def __init__(self, empty: Frames) -> None:
@@ -105,7 +105,7 @@ class FrameWindow:
             self._count -= len(self._blocks.popleft().sequence)
 
     def between(self, first: int, last: int) -> Frames:
-        """The frames from first to last that are present, ordered by sequence number."""
+        """The present frames from first to last, both included, ordered by sequence number."""
         blocks = [
             block for block in self._blocks if block.sequence.min() <= last and block.sequence.max() >= first
         ]

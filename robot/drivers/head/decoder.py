@@ -1,8 +1,8 @@
-"""Decodes a head's byte stream into frames, whatever happens to the bytes on the way.
+"""Decodes a head's byte stream into frames, also after damage, loss or insertion of bytes.
 
 The decoder searches for the magic, waits for the bytes of a frame and checks them. A valid frame is consumed;
 after an invalid one the search continues at the next byte. A damaged frame therefore costs no other frame,
-the result does not depend on how the stream was cut into pieces, and
+the result does not depend on the pieces in which the stream arrives, and
 
     bytes fed = frame size x (good + duplicates) + skipped_bytes + `pending` (bytes not decided yet)
 """
@@ -37,7 +37,7 @@ class Frames(NamedTuple):
 
 
 class DecoderCounts(NamedTuple):
-    """Counts of a decoder since it was made.
+    """Counts of a decoder since its construction.
 
     Attributes:
         good: frames accepted and returned.
@@ -61,7 +61,7 @@ class DecoderCounts(NamedTuple):
 
 
 class FrameDecoder(Protocol):
-    """A decoder of a bridge's stream; another bridge brings its own."""
+    """Interface of a decoder of a bridge's stream."""
 
     @property
     def counts(self) -> DecoderCounts:
@@ -69,14 +69,14 @@ class FrameDecoder(Protocol):
         ...
 
     def feed(self, data: bytes) -> Frames:
-        """The samples that these bytes complete."""
+        """The samples completed by these bytes."""
         ...
 
     def restart(self, time: int | None = None) -> None:
         """Starts a new stream; a partial frame is dropped.
 
         Args:
-            time: approximate device clock now, us; None: the time of the next frame is used as it is.
+            time: approximate device clock now, us; None: the time of the next frame starts the stream.
         """
         ...
 
@@ -129,7 +129,7 @@ class Decoder:
         place = 0
         while 0 <= (start := buffer.find(MAGIC, place)) <= len(buffer) - self._size:
             self._skipped += start - place
-            place = start + self._whole(buffer, start) * self._size
+            place = start + self._count_valid(buffer, start) * self._size
             if place > start:
                 runs.append(buffer[start:place])
             else:
@@ -139,10 +139,10 @@ class Decoder:
         end = start if start >= 0 else len(buffer) - _partial_magic(buffer[max(place, len(buffer) - 3) :])
         self._skipped += end - place
         self._rest = buffer[end:]
-        return self._accepted(np.frombuffer(b"".join(runs), self._type))
+        return self._accept(np.frombuffer(b"".join(runs), self._type))
 
-    def _whole(self, buffer: bytes, start: int) -> int:
-        """Number of consecutive valid frames from there, among those checked at once."""
+    def _count_valid(self, buffer: bytes, start: int) -> int:
+        """Number of consecutive valid frames from `start` in the batch checked at once."""
         shape_at = start + self._shape_at
         if buffer[shape_at : shape_at + 3] != self._shape:
             return 0
@@ -161,7 +161,7 @@ class Decoder:
         self._run = min(2 * self._run, MAX_BATCH) if whole == count else BATCH
         return whole
 
-    def _accepted(self, frames: np.ndarray) -> Frames:
+    def _accept(self, frames: np.ndarray) -> Frames:
         number, new = self._numbering.take(frames["sequence"])
         if not new.all():
             frames, number = frames[new], number[new]
@@ -169,10 +169,10 @@ class Decoder:
         self._duplicates += len(new) - len(frames)
         self._overruns += int(np.count_nonzero(frames["flags"] & FrameFlag.OVERRUN))
         return Frames(
-            number, self._unwrapped(frames["time"]), frames["flags"].copy(), frames["values"].copy()
+            number, self._unwrap_times(frames["time"]), frames["flags"].copy(), frames["values"].copy()
         )
 
-    def _unwrapped(self, raw: np.ndarray) -> np.ndarray:
+    def _unwrap_times(self, raw: np.ndarray) -> np.ndarray:
         time = raw.astype(np.int64)
         if len(time):
             before = int(time[0]) if self._time is None else self._time

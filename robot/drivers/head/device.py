@@ -1,7 +1,7 @@
 """USB bridge of a head by pyusb: over libusb, or over the socket of an emulator.
 
-Errors: `Disconnected` (no such device, or no longer), `Stalled` (a transfer failed; the endpoint has been
-cleared), `InputError` (the user has to act).
+Errors: `Disconnected` (the device is absent), `Stalled` (a transfer failed; its endpoint has been cleared),
+`InputError` (the user must act).
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ class UsbBridge:
 
     def __init__(self, device: Any, where: str) -> None:
         self._device, self._where = device, where
-        self._configured()
+        self._configure()
         from usb import util
 
         util.claim_interface(device, INTERFACE)
@@ -133,7 +133,7 @@ class UsbBridge:
 
     def write(self, data: bytes) -> None:
         if self._try(lambda: self._device.write(ENDPOINT_OUT, data, TIMEOUT), ENDPOINT_OUT) is None:
-            raise Stalled(errno.ETIMEDOUT, "no command is taken")
+            raise Stalled(errno.ETIMEDOUT, "commands are not accepted")
 
     def request(self, request: Request) -> bytes:
         if request in (Request.START, Request.STOP):
@@ -150,8 +150,8 @@ class UsbBridge:
 
         util.dispose_resources(self._device)
 
-    def _configured(self) -> None:
-        # Setting a configuration resets a running device, so it is set only where there is none.
+    def _configure(self) -> None:
+        # Setting a configuration resets a running device, so it is set only if none is active.
         try:
             configured = self._device.get_active_configuration() is not None
         except _pyusb().USBError:
@@ -180,14 +180,14 @@ def _translate(error: Any, where: str) -> OSError | InputError:
     """Translates a USBError."""
     if error.errno == errno.EACCES:
         cure = "add a udev rule, see robot/drivers/head/README.md"
-        return InputError("head", f"{where} may not be opened by this user", "", cure)
+        return InputError("head", f"no permission to open {where}", "", cure)
     if error.errno == errno.EBUSY:
         return InputError("head", f"{where} is in use", "", "end the other program that uses it")
     if error.errno == errno.EPIPE:
         return Stalled(errno.EPIPE, f"{where} refused a transfer")
     # EIO and similar: returned while a device is being pulled out, just before ENODEV.
     if error.errno in (errno.ENODEV, errno.ENOENT, errno.ENXIO, errno.ESHUTDOWN, errno.EPROTO, errno.EIO):
-        return Disconnected(errno.ENODEV, f"{where} is gone")
+        return Disconnected(errno.ENODEV, f"{where} was disconnected")
     return Stalled(error.errno or errno.EIO, f"{where}: {error}")
 
 
@@ -198,7 +198,7 @@ def _serial_filter(serial: str | None) -> Callable[[Any], bool] | None:
     def matches(device: Any) -> bool:
         try:
             return device.serial_number == serial
-        except (ValueError, _pyusb().USBError):  # no permission, or no serial number: another device
+        except (ValueError, _pyusb().USBError):  # without permission or serial number it is another device
             return False
 
     return matches

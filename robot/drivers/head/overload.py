@@ -1,4 +1,4 @@
-"""Detects whiskers bent so far that the arm must stop."""
+"""Detects whiskers bent beyond the limit at which the arm must stop."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import numpy as np
 from robot.drivers.head.protocol import ANGLE
 
 FULL_SCALE = 32767
-"""Counts from which an angle is at the end of the sensor's range."""
+"""Least counts at the end of the sensor's range."""
 
 
 class OverloadDetector:
     """Finds whiskers overloaded in two consecutive samples; a single one is a transmission error or a knock.
 
     Args:
-        limit: deflection, rad, of x or y. alive: [W] whiskers that count.
+        limit: deflection of x or y, rad. alive: [W] bool, whiskers to check.
     """
 
     def __init__(self, limit: float, alive: np.ndarray) -> None:
@@ -23,8 +23,8 @@ class OverloadDetector:
         self._before = np.zeros(len(self._alive), bool)
 
     def check(self, values: np.ndarray) -> int | None:
-        """The first whisker overloaded in values [N, W, 3], or in the last ones before and the first of
-        these."""
+        """The first whisker overloaded in values [N, W, 3], int16 counts, or between these and the previous
+        ones; None without one."""
         if not len(values):
             return None
         size = np.abs(values.astype(np.int32))  # int16 has no 32768

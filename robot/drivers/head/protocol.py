@@ -70,7 +70,7 @@ class CommandKind(IntEnum):
     """Whisk with these parameters from the next cycle on. The n numbers are the contact thresholds of y."""
     AMPLITUDES = 2
     """In mode `OPEN`: the n numbers are the amplitudes of the whiskers for the rest of this cycle; in the
-    next one the common amplitude applies again, so a late command does no harm."""
+    next one the common amplitude applies again, so a late command is harmless."""
     CENTRE = 3
     """The n numbers are the means of y in free air, the reference of feedback in the head."""
 
@@ -79,7 +79,7 @@ class FeedbackMode(IntEnum):
     """Where the amplitude is reduced on contact."""
 
     OPEN = 0
-    """Not in the head; the host may, by `CommandKind.AMPLITUDES`."""
+    """On the host, if at all, by `CommandKind.AMPLITUDES`."""
     RCP = 1
     """In the head, by the law of `tactile.whiskers.whisking`."""
 
@@ -109,7 +109,7 @@ class Command(NamedTuple):
     """One command.
 
     Attributes:
-        kind, mode: see there. amplitude, offset: rad; a whisk protracts from the offset. frequency: Hz.
+        kind, mode: see their types. amplitude, offset: rad; a whisk protracts from the offset. frequency: Hz.
         gain: rad per rad. window: averaging time of deflections, s. numbers: [n] int16, meaning by kind.
     """
 
@@ -191,7 +191,7 @@ def pack_command(command: Command) -> bytes:
 
 
 def unpack_command(packet: bytes) -> Command | None:
-    """The command in a packet; None if it is not a valid one."""
+    """The command in a packet; None if it is invalid."""
     if len(packet) < COMMAND_SIZE or zlib.crc32(packet[:-4]) != int.from_bytes(packet[-4:], "little"):
         return None
     magic, version, kind, mode, count, amplitude, frequency, gain, window, offset = _COMMAND.unpack_from(

@@ -36,14 +36,14 @@ class LinkState(Enum):
     """State of the link."""
 
     STREAMING = "the head sends samples"
-    SILENT = "the head is connected but sends nothing"
+    SILENT = "the head is connected but sends no samples"
     GARBLED = "the head sends no valid samples"
     AWAY = "the head is not connected"
     CLOSED = "the reader is closed"
 
 
 class LinkStatus(NamedTuple):
-    """State of the link, and since when (s, host)."""
+    """State of the link, and host time of its start, s."""
 
     link: LinkState
     since: float
@@ -63,15 +63,15 @@ class HeadReader:
     Args:
         connect: opens the bridge; called again when the head was disconnected. whiskers: required number.
         config: time limits. decoder: of the stream; None for that of `robot.drivers.head.protocol`.
-        alive: [W] whiskers checked for overload; None for all. on_overload: called with the whisker for every
-            block of samples that shows one.
+        alive: [W] whiskers checked for overload; None for all. on_overload: called with the whisker for each
+            block of samples with an overload.
 
     Attributes:
         ring: the newest samples. listeners: called with every block of samples and its arrival time (s,
             host). on_restart: called with the device clock (us) and the host's (s) after each connection:
             numbers and clock may have restarted. All are called on the reader's thread and must return
             quickly.
-        identity: of the head connected last. stalls: number of failed transfers.
+        identity: of the last connected head. stalls: number of failed transfers.
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class HeadReader:
         """Connects to the head and starts its stream.
 
         Raises:
-            InputError: no head within `timeout` s, or the wrong one.
+            InputError: no head within `timeout` s, or one of another shape.
         """
         self._sample = self._away = time.monotonic()
         self._thread.start()
@@ -158,7 +158,7 @@ class HeadReader:
 
     @property
     def fault(self) -> Fault | None:
-        """Why the session must end; a fault stays."""
+        """The reason to end the session, or None; a fault stays."""
         link = self.state.link
         lost = link in OUTCOMES and self.age > self.config.patience
         if self._fault is None and lost:
@@ -208,7 +208,7 @@ class HeadReader:
         started = time.monotonic()
         while not self._ending.is_set():
             data = b""
-            with self._tolerant():
+            with self._ignore_stall():
                 data = bridge.read(READ_SIZE, READ_TIMEOUT)
             now = time.monotonic()
             if data:
@@ -216,13 +216,13 @@ class HeadReader:
                 self._accept(self.decoder.feed(data), now)
             elif now - max(started, self._sample) > max(RETRY_PERIOD, self.config.silence):
                 started = now
-                with self._tolerant():
+                with self._ignore_stall():
                     bridge.request(Request.START)
-            with self._tolerant():
+            with self._ignore_stall():
                 while (command := self._queue.next(now)) is not None:
                     bridge.write(pack_command(command))
                     self._queue.mark_sent(command, now)
-        with self._tolerant():
+        with self._ignore_stall():
             bridge.request(Request.STOP)
 
     def _accept(self, frames: Frames, now: float) -> None:
@@ -235,12 +235,12 @@ class HeadReader:
         whisker = self._overload.check(frames.values)
         if whisker is not None:
             self._on_overload(whisker)
-        for told in self.listeners:
-            told(frames, now)
+        for listener in self.listeners:
+            listener(frames, now)
 
     @contextlib.contextmanager
-    def _tolerant(self) -> Iterator[None]:
-        """Ignores a failed transfer and waits a moment: the next one may fail too."""
+    def _ignore_stall(self) -> Iterator[None]:
+        """Ignores a failed transfer and waits 5 ms, since the next one may fail too."""
         try:
             yield
         except Stalled:

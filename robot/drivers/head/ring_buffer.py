@@ -34,12 +34,12 @@ class RingBuffer:
 
     @property
     def newest(self) -> tuple[int, int, float] | None:
-        """Highest number, its device time (us) and the last arrival (s, host); None before any."""
+        """Highest number, its device time (us) and the last arrival (host time, s); None without samples."""
         with self._lock:
             return None if self._newest == EMPTY else (self._newest, self._latest, self._arrival)
 
     def append(self, frames: Frames, arrival: float) -> None:
-        """Adds frames that arrived at a host time, s; those older than the ring reaches are ignored."""
+        """Adds frames that arrived at a host time, s; frames older than the ring are ignored."""
         with self._lock:
             if not len(frames.sequence):
                 return
@@ -54,7 +54,7 @@ class RingBuffer:
             self._latest = int(self._time[newest % self._size])
 
     def between(self, first: int, last: int) -> Frames:
-        """The frames numbered `first` to `last`, both included, that are present; in order."""
+        """The present frames from `first` to `last`, both included, ordered by sequence number."""
         with self._lock:
             number = np.arange(max(first, self._newest - self._size + 1), min(last, self._newest) + 1)
             return self._at(number[self._sequence[number % self._size] == number] % self._size)

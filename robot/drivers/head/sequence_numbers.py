@@ -16,9 +16,9 @@ BATCH = 1024
 class SequenceUnwrapper:
     """The numbers of the frames accepted so far.
 
-    A number less than `HALF` above the highest is ahead; one less than `LATE` below it is late; one further
-    below means that the head has restarted its count, and a new stream begins. Its numbers continue in the
-    next 2^32, so that all numbers are unique.
+    A number less than `HALF` above the highest is ahead; one less than `LATE` below it is late; a lower one
+    means that the head has restarted its count, and a new stream begins. Its numbers continue in the next
+    2^32, so that all numbers are unique.
     """
 
     def __init__(self) -> None:
@@ -35,7 +35,7 @@ class SequenceUnwrapper:
         return self._before + self._lacking()
 
     def restart(self) -> None:
-        """Lets the next frame start a stream."""
+        """Starts a new stream with the next frame."""
         self._before += self._lacking()
         self._begun = False
 
@@ -61,7 +61,7 @@ class SequenceUnwrapper:
         return number, new
 
     def _rising(self, raw: np.ndarray) -> int:
-        """Length of the leading part in which each number is ahead of the one before."""
+        """Length of the leading part of numbers [N] in which each is ahead of the previous one."""
         if not self._begun:
             return 0
         ahead = (raw - self._highest) % WRAP
@@ -71,7 +71,7 @@ class SequenceUnwrapper:
         return len(raw) if rising.all() else int(rising.argmin())
 
     def _other(self, raw: int) -> tuple[int, bool]:
-        """A number that is not ahead, unwrapped, and whether it is to be accepted."""
+        """Unwraps a number that is not ahead; returns it and whether to accept it."""
         number = self._highest - (self._highest - raw) % WRAP
         if not self._begun or number <= self._highest - LATE:
             self.restart()

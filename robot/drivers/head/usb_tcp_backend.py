@@ -37,7 +37,7 @@ class SocketBackend:
         self.host, self.port = host, port
 
     def enumerate_devices(self) -> Iterator[bytes]:
-        """The device's descriptors, if it is plugged in; they identify it."""
+        """Yields the descriptors of the device, which identify it, if it is plugged in."""
         try:
             line = UsbConnection(self.host, self.port)
         except OSError:
@@ -50,7 +50,7 @@ class SocketBackend:
             line.close()
 
     def get_parent(self, dev: bytes) -> None:
-        """There is no parent."""
+        """Returns None: the device has no parent."""
 
     def get_device_descriptor(self, dev: bytes) -> SimpleNamespace:
         names = (
@@ -145,10 +145,10 @@ class SocketBackend:
         return False
 
     def detach_kernel_driver(self, dev_handle: Handle, intf: int) -> None:
-        """There is none."""
+        """Has no effect: there is no kernel driver."""
 
     def attach_kernel_driver(self, dev_handle: Handle, intf: int) -> None:
-        """There is none."""
+        """Has no effect: there is no kernel driver."""
 
     def intr_write(self, *transfer: Any) -> NoReturn:
         raise NotImplementedError("interrupt transfers")

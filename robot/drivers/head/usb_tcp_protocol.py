@@ -8,7 +8,7 @@ Little-endian:
     answer:  i32 status | u32 length | data
 
 `address` is that of an endpoint, or bmRequestType of a control transfer; its highest bit marks data to the
-host, where the request carries none. The status is 0 or a negative errno. Only the standard library is used,
+host; the request then carries none. The status is 0 or a negative errno. Only the standard library is used,
 so that interpreters without this project's packages can use it.
 """
 
@@ -49,7 +49,7 @@ class UsbConnection:
     """A connection to an emulated device; threads use it in turn.
 
     Raises:
-        OSError: ENODEV where nothing listens, or the device has been unplugged since.
+        OSError: ENODEV without a listener, or after the device was unplugged.
     """
 
     def __init__(self, host: str, port: int = PORT) -> None:
@@ -74,7 +74,7 @@ class UsbConnection:
         """Sends a request and returns the answer.
 
         Args:
-            data: to send. size: bytes wanted, where data comes in. timeout: ms, 0 waits for ever.
+            data: to send. size: largest number of bytes to receive. timeout: ms, 0 for none.
 
         Raises:
             OSError: error of the transfer; ENODEV without an emulator.
@@ -87,7 +87,7 @@ class UsbConnection:
                 status, length = ANSWER.unpack(self._exactly(ANSWER.size))
                 got = self._exactly(length)
             except OSError:
-                self._socket.close()  # a late answer would be taken for that of another request
+                self._socket.close()  # a late answer would be read as that of the next request
                 raise no_device() from None
         if status:
             raise OSError(-status, os.strerror(-status))

@@ -76,49 +76,48 @@ class HostRcp:
         self._full = np.full(len(threshold), np.radians(whisking.amplitude_deg))
         self._drive = initial_drive(len(threshold))
         self._amplitude = self._full
-        self._told: np.ndarray | None = None
+        self._sent: np.ndarray | None = None
         self._began: int | None = None
 
     def amplitudes(self, frames: Frames) -> np.ndarray | None:
         """Amplitudes [W] int16 to send; None without a change, or before the first whisk.
 
-        They are sent again in every cycle, since a late command of the cycle before may have arrived in this
-        one.
+        They are sent in every cycle, since a late command of the previous cycle may have arrived in this one.
         """
         y = frames.values[..., 2] * ANGLE - self._centre
-        for time, flags, heard in zip(frames.time.tolist(), frames.flags.tolist(), y, strict=True):
+        for time, flags, deflection in zip(frames.time.tolist(), frames.flags.tolist(), y, strict=True):
             if flags & FrameFlag.CYCLE:
                 self._began = time
                 self._drive = initial_drive(len(self._threshold))
-                self._amplitude, self._told = self._full, None
+                self._amplitude, self._sent = self._full, None
             if self._began is None:
                 continue
             since = (time - self._began) * 1e-6
             aim, self._drive = whisk_command(
-                self._whisking, self._drive, since, heard, self._threshold, self._shape
+                self._whisking, self._drive, since, deflection, self._threshold, self._shape
             )
             share = float(whisk_phase(self._whisking, since))
             # At rest the amplitude does not follow from the aim.
             if share > 1e-3:
                 self._amplitude = aim / share
-        told = to_counts(self._amplitude)
-        if self._began is None or (self._told is not None and (told == self._told).all()):
+        counts = to_counts(self._amplitude)
+        if self._began is None or (self._sent is not None and (counts == self._sent).all()):
             return None
-        self._told = told
-        return told
+        self._sent = counts
+        return counts
 
 
 class HeadDriver:
     """Controls the whisking of a head.
 
     Args:
-        reader: of the head; its settings say where feedback is computed. head: its geometry.
+        reader: of the head; its settings select the place of feedback. head: its geometry.
     """
 
     def __init__(self, reader: HeadReader, head: Head) -> None:
         self._reader, self._head = reader, head
         self._feedback: HostRcp | None = None
-        reader.listeners.append(self._heard)
+        reader.listeners.append(self._on_frames)
 
     def whisk(
         self,
@@ -129,11 +128,11 @@ class HeadDriver:
         """Starts whisking with the next cycle; without a threshold (before calibration) there is no feedback.
 
         Args:
-            threshold, centre: [W] of y, rad, as `tactile.features.calibration.Calibration` has them in
-            column 1.
+            threshold, centre: [W] of y, rad: column 1 of `threshold` and `mean` of
+            `tactile.features.calibration.Calibration`.
 
         Raises:
-            InputError: beyond the limits of the drives, or a mode that the head does not support.
+            InputError: the amplitude exceeds the drives' limit, or the head does not support the mode.
         """
         check_amplitude(whisking, self._head, WHERE)
         rcp = self._reader.config.rcp
@@ -150,7 +149,7 @@ class HeadDriver:
         self._feedback = None
         self._reader.rest()
 
-    def _heard(self, frames: Frames, arrival: float) -> None:
+    def _on_frames(self, frames: Frames, arrival: float) -> None:
         feedback = self._feedback
         amplitude = None if feedback is None else feedback.amplitudes(frames)
         if amplitude is not None:

@@ -1,11 +1,11 @@
-"""The arm as seen by a session: start after checks, move, halt, faults.
+"""Interface of the arm for a session: start after checks, move, halt, faults.
 
     with Arm(ArmConfig(host="192.168.1.10")) as arm:
         arm.start()                       # StartupRefused: a check failed, nothing has moved
         arm.move(tcp_of(config.placing, pose))
         while not arm.arrived() and arm.fault is None: ...
 
-The first reason to stop becomes `fault`; every move is refused after it.
+The first reason to stop becomes `fault`; after it every move is refused.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ __all__ = ["Arm", "StartupRefused", "TargetRefused"]
 
 
 class Arm:
-    """One arm. Its methods are for one thread; a supervisor thread keeps its state up to date."""
+    """One arm. One thread calls its methods; a supervisor thread updates its state."""
 
     def __init__(self, config: ArmConfig) -> None:
         self.config = config
@@ -61,7 +61,7 @@ class Arm:
             raise
 
     def close(self) -> None:
-        """Stops the arm, ends its process and releases everything."""
+        """Stops the arm, ends its process and releases threads and shared memory."""
         supervisor = self.supervisor
         supervisor.armed = False
         if supervisor.process is not None and not supervisor.process.end(1.0):
@@ -73,7 +73,7 @@ class Arm:
 
     @property
     def fault(self) -> Fault | None:
-        """Why the arm was stopped; None without a fault."""
+        """The fault that stopped the arm, or None."""
         return self.supervisor.fault
 
     @property
@@ -83,7 +83,7 @@ class Arm:
         return None if process is None else process.pid
 
     def states(self, after: int = 0) -> np.ndarray:
-        """All states [N] (ARM_STATE) after a counter that are still in the ring buffer, oldest first."""
+        """States [N] (ARM_STATE) in the ring buffer with counters above `after`, oldest first."""
         return self.shared.since(after)
 
     def latest(self) -> np.ndarray | None:
@@ -92,7 +92,7 @@ class Arm:
 
     @property
     def history(self) -> np.ndarray:
-        """States [N] of the last 5 s, for the report of a fault."""
+        """States [N] (ARM_STATE) of the last 5 s."""
         return self.supervisor.history()
 
     def age(self) -> float:
@@ -104,13 +104,13 @@ class Arm:
         return self.supervisor.still()
 
     def move(self, tcp: Any, speed: float | None = None) -> Move:
-        """Starts a straight move of the tool to a pose [6] and returns at once. It replaces a move under way.
+        """Starts a straight move of the tool to a pose [6] and returns at once. It replaces the present move.
 
         Raises:
             TargetRefused: the target is invalid, or the arm is not armed or has a fault.
         """
         supervisor = self.supervisor
-        with supervisor.lock:  # a fault found in between would not revoke the command
+        with supervisor.lock:  # a fault between check and command would not revoke it
             state = self.latest()
             if self.fault is not None or not supervisor.armed or state is None:
                 raise TargetRefused(f"the arm does not move: {self.fault or 'it is not armed'}")
@@ -124,11 +124,11 @@ class Arm:
         return errand is not None and self.supervisor.arrived(errand)
 
     def halt(self) -> None:
-        """Stops the arm, by the dashboard server where it does not stop in time. Moves may follow."""
+        """Stops the arm, by the dashboard server if it does not stop in time. Moves may follow."""
         self.supervisor.halt()
 
     def fail(self, outcome: SessionOutcome, detail: str) -> None:
-        """Stops the arm for a reason found elsewhere; after a contact the tool backs off the way it came."""
+        """Stops the arm with a fault from another part; after a contact the tool backs off along its path."""
         self.supervisor.fail(Finding(outcome, detail))
 
     def _await_ready(self, process: ArmProcess) -> None:
@@ -146,7 +146,7 @@ class Arm:
                 raise StartupRefused(ended.detail, "", "check the controller's ports 30003 and 30004")
             if time.monotonic() > patience:
                 raise StartupRefused(
-                    f"the controller did not take the control script in {self.config.connect:g} s",
+                    f"the controller did not start the control script in {self.config.connect:g} s",
                     "",
                     "check the pendant: remote control on, no message waiting",
                 )

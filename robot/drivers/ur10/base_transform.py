@@ -1,6 +1,6 @@
 """Transform between poses of the head in the map and tool poses in the arm's base frame.
 
-A tool pose is an array [..., 6] as UR controllers write it: x, y, z of the tool centre point in the base
+A tool pose is an array [..., 6] in UR controllers' notation: x, y, z of the tool centre point in the base
 frame, m, and a rotation vector, rad. The tool points down: its rotation is Rz(heading) Rx(pi), half a turn
 about the level axis (cos h/2, sin h/2, 0).
 """

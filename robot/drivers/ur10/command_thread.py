@@ -28,7 +28,7 @@ from robot.drivers.ur10.safety import (
 )
 from robot.drivers.ur10.shared_state import SharedState
 
-MAX_MISSING_STATES = 3  # state periods without a state that count as an interruption
+MAX_MISSING_STATES = 3  # state periods without a state before an interruption is certain
 SCRIPT_UNUSABLE = {
     SessionOutcome.ARM_GONE,
     SessionOutcome.PROTECTIVE_STOP,
@@ -54,10 +54,11 @@ class ArmCommand(NamedTuple):
 
 
 class CommandThread:
-    """Sends commands to the control interface, and decides whether to stop.
+    """Sends commands to the control interface and decides on stops.
 
     Attributes:
-        held: why no more moves are taken. ungoverned: whether the control script is left alone.
+        held: reason to refuse moves, or None. script_unusable: whether the script gets no more commands.
+        leaving: whether the process is about to end.
     """
 
     def __init__(
@@ -72,12 +73,11 @@ class CommandThread:
         self._rest = np.zeros(6)
         self._force_limit = math.inf  # N; contacts are detected once the force at rest is known
         self._own_stops = 0
-        self._stopped = self._wanted()
+        self._stopped = self._requested_stops()
         self._orders: queue.SimpleQueue[ArmCommand] = queue.SimpleQueue()
         self._wake = threading.Event()
 
     # Called by the thread that reads states.
-
     def set_rest_force(self, rest: np.ndarray) -> None:
         """Sets the force without contact [6] and starts the detection of contacts."""
         self._rest, self._force_limit = rest, self.config.force_limit
@@ -90,8 +90,7 @@ class CommandThread:
             self.hold(finding)
 
     def hold(self, finding: Finding) -> None:
-        """Stops and refuses further moves, unless a finding already did so. A retreat under way is stopped
-        too."""
+        """Stops and refuses further moves, unless an earlier finding did. Stops a retreat in any case."""
         self.script_unusable |= finding.outcome in SCRIPT_UNUSABLE
         if self.held is not None and not self._retreating:
             return
@@ -112,16 +111,15 @@ class CommandThread:
 
     def check_stop_request(self) -> None:
         """Wakes the thread if the session has requested a stop."""
-        if self._wanted() != self._stopped:
+        if self._requested_stops() != self._stopped:
             self._wake.set()
 
     @property
     def stops_sent(self) -> bool:
         """Whether every requested stop has been sent."""
-        return self.script_unusable or self._wanted() == self._stopped
+        return self.script_unusable or self._requested_stops() == self._stopped
 
     # Called by the command thread.
-
     def run(self) -> None:
         """Runs until the process ends."""
         while True:
@@ -133,10 +131,10 @@ class CommandThread:
     def act(self) -> None:
         """Sends a requested stop, then starts queued moves; resets the watchdog while the session's heartbeat
         is recent."""
-        wanted = self._wanted()
-        if wanted != self._stopped:
+        requested = self._requested_stops()
+        if requested != self._stopped:
             self.control.stopL(self.config.deceleration, True)
-            self._stopped = wanted
+            self._stopped = requested
         while not (self._orders.empty() or self.leaving):
             self.execute(self._orders.get())
         if time.monotonic() - float(self.shared.control["heartbeat"]) <= self.config.heartbeat:
@@ -156,9 +154,8 @@ class CommandThread:
             return
         # moveL accepts any target; one without joint solution ends the script on a real controller.
         if not self.control.isPoseWithinSafetyLimits(target.tolist()):
-            time.sleep(
-                MAX_MISSING_STATES / self.config.hz
-            )  # False is also returned during a stop, which a state then shows
+            # False is also the answer during a stop; the next state then shows the stop.
+            time.sleep(MAX_MISSING_STATES / self.config.hz)
             places = ", ".join(f"{v:.3f}" for v in target)
             self.hold(Finding(SessionOutcome.UNREACHABLE, f"no joint solution for ({places})"))
             return
@@ -175,10 +172,10 @@ class CommandThread:
         self.control.moveL(target.tolist(), order.speed, self.config.acceleration, True)
 
     def _revoked(self, order: ArmCommand) -> bool:
-        stopped = order.stops != int(self.shared.control["stops"]) or self._wanted() != self._stopped
+        stopped = order.stops != int(self.shared.control["stops"]) or self._requested_stops() != self._stopped
         return stopped or (self.held is not None and order.do != "retreat")
 
-    def _wanted(self) -> tuple[int, int]:
+    def _requested_stops(self) -> tuple[int, int]:
         return int(self.shared.control["stops"]), self._own_stops
 
 

@@ -1,6 +1,6 @@
 """Client of the controller's dashboard server (a line of text per request): the second way to stop the arm.
 
-Our own client: it always returns within a time limit, whatever the controller does.
+Every call returns within a time limit.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from contextlib import suppress
 from typing import NamedTuple
 
 PORT = 29999
-MIN_POLYSCOPE = (3, 4)  # PolyScope; older versions lack functions that the control script uses
+MIN_POLYSCOPE = (3, 4)  # PolyScope; older versions lack functions of the control script
 
 
 class DashboardSilent(ConnectionError):
@@ -22,8 +22,8 @@ class ControllerStatus(NamedTuple):
     """Status of a controller.
 
     Attributes:
-        version: of PolyScope, as (5, 11). mode: robot mode, as `RUNNING`. safety: safety mode, as `NORMAL`.
-        program: whether a program runs. remote: whether it is under remote control; None where it has no such
+        version: of PolyScope, as in (5, 11). mode: robot mode (`RUNNING`). safety: safety mode (`NORMAL`).
+        program: whether a program runs. remote: whether it is under remote control; None without such a
             switch (CB3, or PolyScope before 5.6).
     """
 
@@ -85,7 +85,7 @@ class Dashboard:
                 raise OSError("the server closed the connection")
             self._rest += data
             if len(self._rest) > 65536:
-                raise OSError("an answer without end")
+                raise OSError("an answer without a line end")
         line, self._rest = self._rest.split(b"\n", 1)
         return line.decode(errors="replace").strip()
 

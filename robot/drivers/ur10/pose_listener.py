@@ -1,4 +1,4 @@
-"""Listener for the tool pose of a controller: a small RTDE client that only reads.
+"""Listener for the tool pose of a controller: a read-only RTDE client.
 
 It writes nothing to the controller and claims no registers, so it can run beside the program that moves the
 arm, with a real or an emulated controller.
@@ -39,8 +39,8 @@ class PoseListener:
     """Reads poses in a separate thread, and reconnects when the connection is lost.
 
     Args:
-        host: of the controller. hz: requested state rate. patience: s without a state after which it
-            reconnects. port: of RTDE.
+        host: of the controller. hz: requested state rate, Hz. patience: time without a state before it
+            reconnects, s. port: of RTDE.
     """
 
     def __init__(self, host: str, hz: float = 125, patience: float = 1.0, port: int = RTDE_PORT) -> None:
@@ -69,7 +69,7 @@ class PoseListener:
 
     def _run(self) -> None:
         while not self._closing.is_set():
-            # also an invalid package: the connection cannot be used any further
+            # an invalid package makes the connection unusable
             with contextlib.suppress(OSError, ValueError, struct.error):
                 self._listen()
             self._closing.wait(0.1)

@@ -20,7 +20,7 @@ CONNECTION_LOST = ("closed the connection", "Connection reset", "Connection refu
 
 
 class ArmProcess:
-    """A running `robot.drivers.ur10.rtde_process`. The pipes close with this process, however it ends; the
+    """A running `robot.drivers.ur10.rtde_process`. The pipes close at any end of this process; the
     subprocess then stops the arm and ends.
 
     Args:
@@ -56,7 +56,7 @@ class ArmProcess:
         return self._process.pid
 
     def send(self, **fields: Any) -> None:
-        """Sends a command. A process that has ended is detected elsewhere."""
+        """Sends a command; without effect after the end of the process, which `exit_finding` reports."""
         with contextlib.suppress(OSError, ValueError):  # ValueError: the pipe is closed
             self._orders.write(json.dumps(fields).encode() + b"\n")
 
@@ -67,7 +67,7 @@ class ArmProcess:
         return [json.loads(line) for line in lines]
 
     def exit_finding(self) -> Finding | None:
-        """Why it ended; None while it runs."""
+        """Reason for the end of the process; None while it runs."""
         code = self._process.poll()
         if code is None:
             return None
@@ -81,8 +81,8 @@ class ArmProcess:
         return Finding(SessionOutcome.ARM_GONE, detail)
 
     def stderr_tail(self) -> str:
-        """The last 4 kB that the process and the library printed."""
-        # pread: the file position is shared with the process that writes
+        """The last 4 kB of output of the process and the library."""
+        # pread: the writing process shares the file position
         size = os.fstat(self._errors.fileno()).st_size
         return os.pread(self._errors.fileno(), 4096, max(0, size - 4096)).decode(errors="replace")
 

@@ -1,4 +1,4 @@
-"""The RTDE process: the only one that loads ur_rtde, which aborts, hangs or crashes on controller faults.
+"""The RTDE process: it alone loads ur_rtde, which aborts, hangs or crashes on controller faults.
 
     python -m robot.drivers.ur10.rtde_process FD CONFIG_JSON
 
@@ -36,7 +36,7 @@ PLAYING = 2  # runtime state
 REST_TIME = (
     0.25  # s of states at rest over which the force at rest is averaged and the session measures the rate
 )
-LAST_STOP = 0.4  # s that the last stop may take before the dashboard server is asked to stop
+LAST_STOP = 0.4  # s, duration of the last stop before the dashboard server is used
 
 VARIABLES = [
     "timestamp",
@@ -96,7 +96,7 @@ class RtdeProcess:
             self._leave("the session has closed its pipe")
 
     def _read(self, now: float) -> bool:
-        """Reads a state, all fields from one packet; whether it was a new one."""
+        """Reads a state, all fields from one packet; returns whether it is new."""
         receive, state = self.receive, self._state
         stamp = receive.getTimestamp()
         if stamp == state["robot"]:
@@ -131,7 +131,7 @@ class RtdeProcess:
         self.commands.hold(Finding(SessionOutcome.ARM_GONE, detail))
 
     def _listen(self) -> None:
-        """Reads commands; the end of the input means the end of the session."""
+        """Reads commands; at the end of the input the session has ended."""
         try:
             data = os.read(0, 65536)
         except BlockingIOError:
@@ -142,12 +142,12 @@ class RtdeProcess:
         for line in lines:
             order = ArmCommand(**json.loads(line))
             if order.do == "end":
-                self._leave("told to end")
+                self._leave("the session requested the end")
             else:
                 self.commands.put(order)
 
     def _leave(self, reason: str) -> None:
-        """Starts to end: requests a last stop."""
+        """Starts the shutdown by requesting a last stop."""
         if math.isinf(self._leaving):
             print(reason, file=sys.stderr, flush=True)
             self._leaving = time.monotonic() + LAST_STOP
@@ -155,7 +155,7 @@ class RtdeProcess:
             self.commands.stop()
 
     def _finished(self) -> bool:
-        """Whether the arm stands or the last stop has timed out; also ends the program on the controller."""
+        """Whether the arm is at rest or the last stop has timed out; also ends the controller's program."""
         stands = self.commands.leaving and self.commands.stops_sent and at_rest(self._state)
         if stands or time.monotonic() > self._leaving:
             dashboard.stop_program(self.config.host)
@@ -173,14 +173,14 @@ def connect(config: ArmConfig) -> tuple[Any, Any]:
     receive = rtde_receive.RTDEReceiveInterface(config.host, config.hz, VARIABLES)
     control = rtde_control.RTDEControlInterface(config.host, config.hz)
     if config.tool is not None and not control.setTcp(list(config.tool)):
-        raise RuntimeError("the controller did not take the tool centre point")
+        raise RuntimeError("the controller did not accept the tool centre point")
     if not control.setWatchdog(config.watchdog_hz):
-        raise RuntimeError("the controller did not take the watchdog")
+        raise RuntimeError("the controller did not accept the watchdog")
     return receive, control
 
 
 def main(shared_fd: str, text: str) -> None:
-    """The process. It ends without destructors, in which the library aborts when the connection is lost."""
+    """Runs the process. It ends without destructors, in which the library aborts after a lost connection."""
     reports = os.dup(1)
     os.dup2(2, 1)
     os.set_blocking(0, False)
@@ -188,7 +188,7 @@ def main(shared_fd: str, text: str) -> None:
     set_niceness(URGENT)
     config = ArmConfig.model_validate_json(text)
     shared = SharedState(int(shared_fd))
-    # The constructors hold the interpreter's lock and may never return; the alarm ends even those.
+    # The constructors hold the interpreter's lock and may never return; the alarm ends the process.
     signal.alarm(math.ceil(config.connect) + 1)
     try:
         receive, control = connect(config)

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 VERSION = 2
-RTDE_PORT = 30004  # fixed: the client library supports no other
+RTDE_PORT = 30004  # fixed in the client library
 HEADER = struct.Struct(">HB")
 PROTOCOL, CONTROLLER, TEXT = ord("V"), ord("v"), ord("M")
 OUTPUTS, INPUTS, START, PAUSE, DATA = ord("O"), ord("I"), ord("S"), ord("P"), ord("U")

@@ -14,9 +14,9 @@ from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10.base_transform import tcp_tilt
 from robot.drivers.ur10.config import SPEED_CAP, TURN_CAP, ArmConfig
 
-REACH = 3.0  # m; a UR-10 reaches 1.3. A tool further away means an invalid state
+REACH = 3.0  # m; a UR-10 reaches 1.3. A larger distance means an invalid state
 JOINT_RANGE = 2.2 * np.pi  # rad; a UR joint turns by 2 pi either way
-MIN_LOADED = 2  # consecutive states with too large a force that count as a contact
+MIN_LOADED = 2  # consecutive states above the force limit that count as a contact
 ROUNDING = 1e-6  # m; tolerance of the box for rounding
 RETREAT_SPEED = 0.02  # m/s; speed of backing off
 MIN_SPEED = 1e-3  # m/s; lowest speed of a move
@@ -35,7 +35,7 @@ SAFETY_BITS = (
 
 
 class TargetRefused(ValueError):
-    """A target that is rejected."""
+    """A rejected target."""
 
 
 class Move(NamedTuple):
@@ -43,7 +43,7 @@ class Move(NamedTuple):
 
     Attributes:
         target: [6] tool pose. speed: m/s, as sent to the controller. seconds: expected duration.
-        most: duration on a controller that turns by 1 rad/s for every m/s, s.
+        most: duration on a controller with 1 rad/s per m/s of commanded speed, s.
     """
 
     target: np.ndarray
@@ -53,17 +53,17 @@ class Move(NamedTuple):
 
 
 class Finding(NamedTuple):
-    """Why the arm must stop: the outcome and what was found."""
+    """A reason to stop the arm: outcome and detail."""
 
     outcome: SessionOutcome
     detail: str
 
 
 class StateMemory(NamedTuple):
-    """Memory from state to state.
+    """Memory between checks of consecutive states.
 
     Attributes:
-        loaded: consecutive states with too large a force. robot: controller time of the last state, s.
+        loaded: consecutive states above the force limit. robot: controller time of the last state, s.
     """
 
     loaded: int = 0
@@ -120,23 +120,27 @@ def plan_move(config: ArmConfig, target: Any, from_tcp: Any, speed: float | None
     start = np.asarray(from_tcp, np.float64)
     way, turn = float(np.linalg.norm(target[:3] - start[:3])), rotation_angle(start, target)
     if way <= max(speed**2 / config.acceleration, MOVED_ON) and turn / config.turn_rate > way / speed:
-        told = config.turn_rate / config.turn_ratio
+        commanded = config.turn_rate / config.turn_ratio
     else:
-        told = min(speed, config.turn_rate / config.turn_ratio if turn > way else speed)
-        told = min(told, TURN_CAP * way / turn) if turn else told
-    seconds = max(way, turn / config.turn_ratio) / told + told / config.acceleration
-    return Move(target, told, seconds, max(way, turn) / told + told / config.acceleration)
+        commanded = min(speed, config.turn_rate / config.turn_ratio if turn > way else speed)
+        commanded = min(commanded, TURN_CAP * way / turn) if turn else commanded
+    seconds = max(way, turn / config.turn_ratio) / commanded + commanded / config.acceleration
+    return Move(target, commanded, seconds, max(way, turn) / commanded + commanded / config.acceleration)
 
 
-def check_command(config: ArmConfig, target: Any, from_tcp: Any, told: float) -> np.ndarray:
-    """The last check before a command is sent: returns the target if the command keeps every limit."""
+def check_command(config: ArmConfig, target: Any, from_tcp: Any, commanded: float) -> np.ndarray:
+    """Checks target [6] and speed (m/s) just before a command is sent; returns the target.
+
+    Raises:
+        TargetRefused: a limit is exceeded.
+    """
     target = check_target(config, target, from_tcp)
     way = float(np.linalg.norm(target[:3] - np.asarray(from_tcp, np.float64)[:3]))
     short = way <= max(config.speed**2 / config.acceleration, MOVED_ON) + MOVED_ON
     most = max(config.speed, config.turn_rate / config.turn_ratio) if short else config.speed
-    if not (isinstance(told, float | int) and 0 < told <= min(most, SPEED_CAP)):
+    if not (isinstance(commanded, float | int) and 0 < commanded <= min(most, SPEED_CAP)):
         raise TargetRefused(
-            f"a commanded speed of {told!r} m/s over {way:.3f} m; at most {most:g} is allowed"
+            f"a commanded speed of {commanded!r} m/s over {way:.3f} m; at most {most:g} is allowed"
         )
     return target
 
@@ -170,15 +174,16 @@ def at_rest(state: np.ndarray) -> bool:
 def check_state(
     config: ArmConfig, watch: StateMemory, state: np.ndarray, rest: np.ndarray, most: float | None = None
 ) -> tuple[StateMemory, Finding | None]:
-    """Checks one more state (ARM_STATE): the memory for the next one, and why the arm must stop, if it must.
+    """Checks a state (ARM_STATE); returns the memory for the next one and the reason to stop, or None.
 
     Args:
-        rest: [6] force of the arm at rest. most: N, in place of the configured limit.
+        watch: memory of the previous state. rest: [6] force of the arm at rest, N and Nm. most: force limit
+            instead of the configured one, N.
     """
     numbers = [state["robot"], *state["tcp"], *state["speed"], *state["force"], *state["joints"]]
     limit = config.force_limit if most is None else most
     force = math.hypot(*(state["force"][:3] - rest[:3]))
-    loaded = 0 if force <= limit else watch.loaded + 1  # NaN counts as too large
+    loaded = 0 if force <= limit else watch.loaded + 1  # NaN counts as above the limit
     after = StateMemory(loaded, float(state["robot"]))
     if not np.isfinite(numbers).all():
         return after, Finding(SessionOutcome.ARM_MALFORMED, "a state has values that are not finite")
@@ -204,10 +209,10 @@ def retreat_target(config: ArmConfig, states: np.ndarray) -> np.ndarray | None:
     """Target of the retreat after a contact: `backoff` from the newest state towards earlier positions.
 
     Args:
-        states: [N] STATE, oldest first, up to the contact.
+        states: [N] ARM_STATE, oldest first, up to the contact.
 
     Returns:
-        [6] tool pose in the box; None where the states do not show the motion before the contact.
+        [6] tool pose in the box; None if the states do not show the motion before the contact.
     """
     here = states[-1]["tcp"]
     away = np.linalg.norm(states["tcp"][:, :3] - here[:3], axis=1)

@@ -49,8 +49,8 @@ HEADER = 64  # bytes; keeps the ring on its own cache line
 class SharedState:
     """The ring buffer of states and the control words beside it.
 
-    The memory is an anonymous file: it has no name that could stay behind, and the kernel frees it when the
-    last process that has it open ends, however it ends.
+    The memory is an anonymous file: without a name, no file stays behind, and the kernel frees it at the end
+    of the last process that has it open.
 
     Args:
         fd: file descriptor inherited from the process that created the memory; None creates it.
@@ -82,7 +82,7 @@ class SharedState:
         self.control["newest"] = counter
 
     def since(self, counter: int) -> np.ndarray:
-        """Copies of all states [N] after a counter that are still in the ring, oldest first."""
+        """Copies of the states [N] in the ring with counters above `counter`, oldest first."""
         newest = self.newest
         wanted = np.arange(max(counter + 1, newest - SLOTS + 2, 1), newest + 1, dtype=np.uint64)
         slots = wanted % np.uint64(SLOTS)
@@ -99,9 +99,9 @@ class SharedState:
         """Releases the memory in this process."""
         self.control = np.zeros((), CONTROL)
         self._ring = np.zeros(1, ARM_STATE)
-        with contextlib.suppress(BufferError):  # a view is still in use: released when the process ends
+        with contextlib.suppress(BufferError):  # a view in use keeps it until the process ends
             self._memory.close()
-        with contextlib.suppress(OSError):  # closed before
+        with contextlib.suppress(OSError):  # already closed
             os.close(self.fd)
 
 

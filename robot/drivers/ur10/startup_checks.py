@@ -37,7 +37,7 @@ def check_controller(config: ArmConfig) -> dashboard.ControllerStatus:
         with dashboard.Dashboard(config.host) as connection:
             controller = connection.controller()
             with contextlib.suppress(dashboard.DashboardSilent):
-                if controller.program:  # a stopped program may still be ending
+                if controller.program:  # a stopped program ends with a delay
                     time.sleep(0.3)
                     controller = connection.controller()
     except dashboard.DashboardSilent as silent:
@@ -67,10 +67,10 @@ def check_controller(config: ArmConfig) -> dashboard.ControllerStatus:
 def check_states(config: ArmConfig, states: Callable[[], np.ndarray]) -> None:
     """Checks the rate of the newest states and the position of the tool.
 
+    The rate may recover within `config.connect` s, since the host may have been busy.
+
     Raises:
         StartupRefused: the stream is too slow, or the tool is outside the box.
-
-    The rate may recover within `config.connect` s: the host may have been busy.
 
     Args:
         states: returns the states [N] (ARM_STATE) since the start of the RTDE process.
@@ -99,7 +99,7 @@ def state_rate(states: np.ndarray, hz: int) -> float:
 
 
 def explain_refusal(detail: str) -> StartupRefused:
-    """The refusal that explains an error message of the library."""
+    """The refusal with the cause and cure for an error message of the library."""
     if "in use" in detail:
         return StartupRefused(
             "registers in use",

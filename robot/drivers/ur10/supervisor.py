@@ -1,4 +1,4 @@
-"""Supervisor thread: watches the RTDE process and its states, and makes sure that the arm stops."""
+"""Supervisor thread: checks the RTDE process and its states, and repeats stops until the arm is at rest."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from robot.drivers.ur10.shared_state import SharedState
 from robot.drivers.ur10.startup_checks import StartupRefused, explain_refusal
 
 TICK = 0.005  # s
-DASHBOARD_DELAY = 0.3  # s that a stop may take before the dashboard server is asked to stop
+DASHBOARD_DELAY = 0.3  # s, duration of a stop before the dashboard server is used
 ELSEWHERE_TIME = 0.5  # s at rest away from the target after which a move counts as not arrived
-HISTORY = 5.0  # s of states that a fault report includes
+HISTORY = 5.0  # s, time span of states in a fault report
 PROCESS_LOST = {
     SessionOutcome.ARM_STALE,
     SessionOutcome.ARM_MALFORMED,
     SessionOutcome.ARM_GONE,
     SessionOutcome.CLOCK_JUMPED,
 }
-"""Outcomes after which the RTDE process cannot be trusted: it is killed."""
+"""Outcomes after which the RTDE process may not react: it is killed."""
 SAFETY_STOPS = {SessionOutcome.PROTECTIVE_STOP, SessionOutcome.SAFEGUARD_STOP, SessionOutcome.EMERGENCY_STOP}
-"""Outcomes after which a controller may resume its program automatically: the program is ended."""
+"""Outcomes after which a controller may resume its program: the program is ended."""
 
 
 class PendingMove(NamedTuple):
-    """A move under way.
+    """A move in progress.
 
     Attributes:
         number: of the command. move: as planned. deadline: s, host's clock.
@@ -44,11 +44,12 @@ class PendingMove(NamedTuple):
 
 
 class Supervisor:
-    """State of the RTDE process, and the thread that keeps it up to date.
+    """State of the RTDE process, and the thread that updates it.
 
     Attributes:
         fault: the first reason to stop. ready: whether the process has measured the force at rest. refused:
-            why it could not connect. armed: whether findings become faults. lock: held to read and then act.
+            the failed connection, or None. armed: whether findings become faults. lock: for a check with a
+            subsequent command.
     """
 
     def __init__(self, config: ArmConfig, shared: SharedState) -> None:
@@ -59,7 +60,7 @@ class Supervisor:
         self.refused: StartupRefused | None = None
         self.fault: Fault | None = None
         self.ready = self.armed = False
-        self._started = (0, 0)  # order and the operation that was the newest before it
+        self._started = (0, 0)  # number of a move; newest operation before it
         self._done = 0
         self._number = 0
         self._elsewhere: float | None = None
@@ -81,7 +82,7 @@ class Supervisor:
         """Lets findings become faults from now on.
 
         Raises:
-            StartupRefused: there was a finding before."""
+            StartupRefused: there is an earlier finding."""
         with self.lock:
             if self.process is not None:
                 self.read_reports(self.process)
@@ -110,7 +111,7 @@ class Supervisor:
         self.pending = PendingMove(self._order("move", move.target, move.speed), move, deadline)
 
     def halt(self) -> None:
-        """Revokes all commands and stops, by the dashboard server where the arm does not stop in time."""
+        """Revokes all commands and stops, by the dashboard server if the arm does not stop in time."""
         with self.lock:
             self.pending = None
             self.shared.control["stops"] += 1
@@ -125,7 +126,7 @@ class Supervisor:
             self.halt()
             if finding.outcome in PROCESS_LOST:
                 self.kill_process()
-                # No process is left to show a standstill; the controller's watchdog times out as well.
+                # Without the process no state shows the standstill; the controller's watchdog times out too.
                 self._stop_by = None
                 self._stop_by_dashboard()
             elif finding.outcome in SAFETY_STOPS:
@@ -142,9 +143,9 @@ class Supervisor:
         state = self.shared.latest()
         return float("inf") if state is None else time.monotonic() - float(state["host"])
 
-    def arrived(self, errand: PendingMove) -> bool:
+    def arrived(self, pending: PendingMove) -> bool:
         """Whether a move has started and ended and the arm is at its target."""
-        return self._ended(errand) and self._deviation(errand) is None
+        return self._ended(pending) and self._deviation(pending) is None
 
     def _run(self) -> None:
         while not self._closing.wait(TICK):
@@ -177,36 +178,36 @@ class Supervisor:
 
     def _check_lateness(self, now: float) -> Finding | None:
         """A finding if states are late, or the arm has not arrived in time."""
-        age, errand = self.age(), self.pending
+        age, pending = self.age(), self.pending
         if age > self.config.stale:
             return Finding(SessionOutcome.ARM_STALE, f"no new state for {age:.3f} s")
-        if errand is None or errand.number == self._done:
+        if pending is None or pending.number == self._done:
             return None
-        off = self._deviation(errand)
-        if off is None and self._ended(errand):
-            self._done = errand.number
-        elif off is not None and now > errand.deadline:
-            return Finding(SessionOutcome.NOT_ARRIVED, f"not in time, {off}")
-        elif off is not None and self._ended(errand):
+        off = self._deviation(pending)
+        if off is None and self._ended(pending):
+            self._done = pending.number
+        elif off is not None and now > pending.deadline:
+            return Finding(SessionOutcome.NOT_ARRIVED, f"late, {off}")
+        elif off is not None and self._ended(pending):
             self._elsewhere = self._elsewhere or now
             if now - self._elsewhere > ELSEWHERE_TIME:
                 return Finding(SessionOutcome.NOT_ARRIVED, off)
         return None
 
-    def _ended(self, errand: PendingMove) -> bool:
+    def _ended(self, pending: PendingMove) -> bool:
         """Whether the operation of a move has started and ended and the arm is at rest."""
         state = self.shared.latest()
         number, before = self._started
-        if state is None or number != errand.number or int(state["operation"]) == before:
+        if state is None or number != pending.number or int(state["operation"]) == before:
             return False
         return int(state["progress"]) < 0 and self.still()
 
-    def _deviation(self, errand: PendingMove) -> str | None:
+    def _deviation(self, pending: PendingMove) -> str | None:
         """Distance of the arm from its target, in words; None at the target."""
         state = self.shared.latest()
-        if state is None or at_target(self.config, state["tcp"], errand.move.target):
+        if state is None or at_target(self.config, state["tcp"], pending.move.target):
             return None
-        way = float(np.linalg.norm(state["tcp"][:3] - errand.move.target[:3]))
+        way = float(np.linalg.norm(state["tcp"][:3] - pending.move.target[:3]))
         return f"{way * 1e3:.1f} mm from its target"
 
     def _follow_up(self, now: float) -> None:

@@ -1,4 +1,4 @@
-"""The Create among walls: executes motions, each until its end or until contact of whiskers or body."""
+"""The Create among walls: executes motions until their planned end or a contact of whiskers or body."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class CreateStep(NamedTuple):
     """One motion of the robot.
 
     Attributes:
-        state: of the state machine. moment: how it ended. duration: s. pose: [3] at its end, heading not
-            wrapped. side: [W] bending side of the whiskers at its end. contact: [W] bool at its end.
+        state: of the state machine. moment: kind of end. duration: s. pose: [3] at its end (m, m, rad),
+            heading not wrapped. side: [W] bending side at its end. contact: [W] bool at its end.
         strain: [T, W, 2] during FWD2, otherwise without samples.
     """
 
@@ -47,7 +47,7 @@ class CreateStep(NamedTuple):
 
 
 class CreateRobot:
-    """The Create among walls [S, 4].
+    """The Create among walls [S, 4] (x1, y1, x2, y2, m).
 
     Attributes:
         whiskers: its whiskers.

@@ -75,7 +75,7 @@ class CreateSimulation(SimulatedSource):
         time: [N] s, end of each step. truth: [N, 3] at these times. odometry: [N, 4].
 
     Raises:
-        InputError: the configuration cannot be simulated; says what and where.
+        InputError: the configuration cannot be simulated; the error gives key and reason.
     """
 
     name = "create_simulation"

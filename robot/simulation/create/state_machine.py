@@ -1,9 +1,9 @@
-"""The finite state machine of the Create (Fox et al. 2012, II-C): transitions, motions and how they end.
+"""The finite state machine of the Create (Fox et al. 2012, II-C): transitions, motions and their ends.
 
     FWD1 -> FWD1 ... HIT1 -> FWD2 -> HIT2 or ABORT -> BACK -> TURN -> FWD1
 
-Forward until a whisker touches; slowly forward until a second one does or one is strained too much; back; a
-turn. Excessive strain or contact of the body ends a motion early and is followed by BACK.
+Forward until a whisker touches; slowly forward until a second one touches or the strain of one exceeds the
+safe limit; back; a turn. Excessive strain or contact of the body ends a motion early and is followed by BACK.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ class TurnConfig(Settings):
 
 
 class BehaviourConfig(Settings):
-    """Settings of the state machine; speeds, times and angles are those of the paper, the rest is open
-    there."""
+    """Settings of the state machine; speeds, times and angles are from the paper, other values are
+    ours."""
 
     fast: PositiveFloat = 0.05
     """Speed of FWD1 and BACK, m/s."""
@@ -68,7 +68,7 @@ class BehaviourConfig(Settings):
     step: PositiveFloat = 0.5
     """Duration of FWD1 and BACK, s."""
     least: NonNegativeFloat = 0.1
-    """Shortest FWD2, s: two whiskers that touch at once are two contacts from the start."""
+    """Shortest FWD2, s: simultaneous contacts of two whiskers count from its start on."""
     patience: PositiveFloat = 2.0
     """Longest FWD2, s; without a second contact it ends with ABORT."""
     turn: TurnConfig = TurnConfig()
@@ -155,9 +155,9 @@ def motion_end(
     over = np.abs(strain).max(axis=2) > config.safety
     ends = [(last, 9, StepEnd.ABORT if state == CreateState.FWD2 else StepEnd.FREE)]
     if state == CreateState.BACK:
-        return MotionEnd(_first(bumped, last), StepEnd.FREE)  # BACK only ends early when the body touches
+        return MotionEnd(_first(bumped, last), StepEnd.FREE)  # only a contact of the body ends BACK early
     if state == CreateState.TURN:
-        # Whiskers strained too much from the start end a turn only if their strain increases.
+        # Whiskers above the safe limit from the start end a turn only if their strain increases.
         over &= level > 1.1 * level[0]
     stop = over.any(axis=1) | bumped
     if stop.any():

@@ -1,7 +1,7 @@
 """Fixed whiskers of the Create and the readings of their strain sensors (Fox et al. 2012, II-A).
 
 Each whisker has two channels: the horizontal strain at its base from bending (see `whisker_bending`), whose
-sign tells the side, and the vertical strain. Whiskers droop a little, so a force along the shaft bends them
+sign gives the side, and the vertical strain. Whiskers droop a little, so a force along the shaft bends them
 down; sensor axes are not exactly level, so part of the horizontal strain appears in the vertical channel.
 Sensors add noise, and the body vibrates at the start of a motion and, less, throughout it: the paper
 therefore filters at 17 Hz.
@@ -48,8 +48,8 @@ class ShakeConfig(Settings):
 
 
 class WhiskersConfig(Settings):
-    """Four whiskers, tapered linearly. Lengths and diameters are the paper's; what it leaves open are these
-    defaults."""
+    """Four whiskers, tapered linearly. Lengths and diameters are from the paper, other defaults
+    are ours."""
 
     mounts: Annotated[tuple[MountConfig, ...], Field(min_length=1)] = (
         MountConfig(x=0.10, y=0.08, direction_deg=50.0),
@@ -83,7 +83,7 @@ class WhiskersConfig(Settings):
     def _sound(self) -> Self:
         if any(whisker >= len(self.mounts) for whisker in self.dead):
             last = len(self.mounts) - 1
-            raise ValueError(f"dead whiskers {list(self.dead)}: there are whiskers 0 to {last}")
+            raise ValueError(f"dead whiskers {list(self.dead)}: the robot has whiskers 0 to {last}")
         if self.tip_diameter > self.base_diameter:
             raise ValueError("tip_diameter larger than base_diameter: a whisker tapers towards its tip")
         return self

@@ -29,13 +29,13 @@ def simulate_wheel_odometry(
     """Odometry [N, 4] (dx m, dy m, dtheta rad, dt s) with errors.
 
     Args:
-        motion: [N, 4] true motion. kind: [N] `Motion` of each step.
+        motion: [N, 4] true motion. kind: [N] `MotionKind` of each step.
     """
     count = len(motion)
     measured = np.array(motion, np.float64)
     if config.noise == "none" or not count:
         return measured
-    # All are drawn for every kind of noise, so that kinds differ in nothing else.
+    # All errors are drawn for every kind of noise, so that the random streams agree.
     white, run = random.standard_normal((count, 2)), random.standard_normal(2)
     if config.noise == "white":
         error = white

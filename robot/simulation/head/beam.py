@@ -14,15 +14,15 @@ from tactile.features.contact import ShaftConfig
 SHAFT_SHARES = np.linspace(0.0, 1.0, 401)
 """Positions along a whisker for integration, as fractions of its length."""
 LOAD_SHARES = (1.0, 0.65)
-"""Load positions of the two shapes: the tip, and where walls push most often. In between, stiffness errs by
-at most 6 % and the base moment by 10 %."""
+"""Load positions of the two shapes: the tip, and the most frequent contact position. In between, stiffness
+errs by at most 6 % and the base moment by 10 %."""
 
 
 class BeamConfig(Settings):
     """A whisker as a tapered beam: a printed (ABS) whisker of the same lab; the paper gives no values."""
 
     shaft: ShaftConfig = ShaftConfig()
-    """Taper, and the position at which the sensor reads the true angle."""
+    """Taper, and the load position at which the sensor reads the true angle."""
     radius: PositiveFloat = 0.75e-3
     """Radius at the base, m."""
     modulus: PositiveFloat = 2.3e9

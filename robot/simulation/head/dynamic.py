@@ -47,7 +47,7 @@ def simulate_dynamic(
         last, (aim, drive) = aim, whisk_command(whisking, drive, time, reading, threshold, head.shape)
         state[:, 6], state[:, 7] = last.T, (aim - last).T
         state[:, :6] = step @ state
-        # A wall that reaches a whisker from the side is touched where the whisker is.
+        # A wall that reaches a whisker from the side makes contact at the whisker's present angle.
         late = np.where(touching, late, np.maximum(before - sweep.wall[k], 0.0))
         wall = sweep.wall[k] + late
         place = arm[:, k]

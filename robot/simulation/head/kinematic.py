@@ -1,8 +1,8 @@
 """The kinematic fidelity: contact features of whisk cycles in closed form, without raw samples.
 
 Contacts are computed at a few head poses along each protraction. From the first contact on, the drive bends
-the whisker by the fraction `servo / (1 + servo)` of the commanded angle beyond it. A whisker bent too far
-slips off.
+the whisker by the fraction `servo / (1 + servo)` of the commanded angle beyond it. A whisker bent beyond
+the limit slips off.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ class MechanicsConfig(Settings):
     noise: NonNegativeFloat = 2e-3
     """Standard deviation of angles and deflections, rad."""
     dead_zone: NonNegativeFloat = 0.015
-    """Largest deflection that is not detected, rad."""
+    """Largest undetected deflection, rad."""
     missed: NonNegativeFloat = 0.0
-    """Fraction of contacts that are missed."""
+    """Fraction of missed contacts."""
     spurious: NonNegativeFloat = 0.0
     """Fraction of free whiskers that report a contact."""
     reach_noise: NonNegativeFloat = 0.1
@@ -83,8 +83,8 @@ def simulate_kinematic(
 
 
 class _Contacts(NamedTuple):
-    """Contacts [N, W]: whether there is one, its protraction and position along the shaft, and the same two
-    values (infinite where free) at the end of the protraction."""
+    """Contacts [N, W]: presence, protraction, position along the shaft, and the latter two (infinite without
+    contact) at the end of the protraction."""
 
     contact: np.ndarray
     touched: np.ndarray
@@ -110,7 +110,7 @@ def _find_contacts(
     def at_pose(column: np.ndarray, row: np.ndarray) -> np.ndarray:
         return np.take_along_axis(column, row[:, None], axis=1)[:, 0]
 
-    # A wall that enters the sweep by the motion of the head is touched where the whisker is by then, about
+    # A wall that enters the sweep by the motion of the head makes contact at the whisker's angle then, about
     # half-way between two poses. The delay holds for the whole cycle.
     new = (first > 0) & (at_pose(box, np.maximum(first - 1, 0)) != at_pose(box, first))
     before = np.concatenate([[0.0], command[:-1]])

@@ -3,7 +3,7 @@ feedback.
 
 Of the commanded angle beyond the wall the whisker bends by the fraction servo / (servo + k), where k is its
 stiffness at the contact relative to that at the reference. The sensor reads the moment, k times the bend. A
-whisker bent too far slips off until the cycle ends.
+whisker bent beyond the limit slips off until the cycle ends.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def advance_balance(
     drive, reading, touching, slipped, late, side, before = balance
     for k, time in enumerate(sweep.time.tolist()):
         aim, drive = law(drive, time, reading)
-        # A wall that reaches a whisker from the side is touched where the whisker is.
+        # A wall that reaches a whisker from the side makes contact at the whisker's present angle.
         late = np.where(touching, late, np.maximum(before - sweep.wall[k], 0.0))
         wall = sweep.wall[k] + late
         bend = share[k] * (aim - wall)

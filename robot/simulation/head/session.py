@@ -64,7 +64,7 @@ class SimulationConfig(Settings):
     seed: NonNegativeInt = 0
     """Seed of all random streams."""
     fidelity: Literal["auto", "kinematic", "quasistatic", "dynamic"] = "auto"
-    """Model of the mechanics; `auto`: the cheapest one that gives the wanted data."""
+    """Model of the mechanics; `auto`: the cheapest one that gives the requested data."""
     raw: bool = False
     """Whether to give raw whisker samples, 2000 per second."""
 
@@ -84,13 +84,13 @@ class ChosenTier(NamedTuple):
 
 
 def choose_tier(config: SimulationConfig) -> ChosenTier:
-    """The fidelity in the configuration, or for `auto` the cheapest one that gives the wanted data.
+    """The fidelity in the configuration, or for `auto` the cheapest one that gives the requested data.
 
     Raises:
-        InputError: the configured fidelity has no raw samples but they are wanted.
+        InputError: raw samples are requested, but the configured fidelity has none.
     """
     if config.fidelity == "kinematic" and config.raw:
-        found = "kinematic, which makes no raw samples"
+        found = "kinematic, which has no raw samples"
         raise InputError("simulation.fidelity", found, "auto, quasistatic or dynamic")
     if config.fidelity != "auto":
         return ChosenTier(config.fidelity, "set by simulation.fidelity")
@@ -106,11 +106,11 @@ class HeadSimulation(SimulatedSource):
         config, head_config: its settings. tier: the fidelity and its reason.
         scene: maze, path and walls. calibration: of the head, None in the kinematic fidelity.
         time: [N] s. start: [N] s, start of each whisk cycle.
-        truth: [N, 3]. odometry: [N, 4]. kidnapped: [N] bool, whether there was a kidnap since the row before.
+        truth: [N, 3]. odometry: [N, 4]. kidnapped: [N] bool, whether a kidnap precedes the row.
         features: contact features [N, W], None in the raw fidelities.
 
     Raises:
-        InputError: the configuration cannot be simulated; says what and where.
+        InputError: the configuration cannot be simulated; the error gives key and reason.
     """
 
     name = "simulation"
@@ -135,7 +135,7 @@ class HeadSimulation(SimulatedSource):
         random = stream(seed, "odometry")
         self.odometry = simulate_odometry(config.odometry, self.time, pose, random, self.kidnapped)
         self._parts = self._surroundings()
-        self.calibration = None if self.tier.name == "kinematic" else self._calibrated()
+        self.calibration = None if self.tier.name == "kinematic" else self._calibrate()
         self.features = self._kinematic() if self.calibration is None else None
 
         plain = config.model_dump(mode="json", exclude={"maze": {"file"}})
@@ -171,7 +171,7 @@ class HeadSimulation(SimulatedSource):
         return len(self.head.length)
 
     def _surroundings(self) -> list[tuple[Surroundings, slice]]:
-        """Walls, and the cycles in which they stand."""
+        """Walls, and the cycles to which they apply."""
         later = self.config.later_maze
         if later is None:
             return [(self.scene.surroundings, slice(None))]
@@ -182,14 +182,12 @@ class HeadSimulation(SimulatedSource):
     def _kinematic(self) -> WhiskColumns:
         parts = []
         for surroundings, rows in self._parts:
-            random = stream(
-                self.config.seed, "sensor"
-            )  # the noise of the whole session, whichever maze it is
+            random = stream(self.config.seed, "sensor")  # noise of the whole session, independent of the maze
             columns = simulate_kinematic(self._setup, surroundings, self.scene.path, self.start, random)
             parts.append([column[rows] for column in columns])
         return WhiskColumns(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
-    def _calibrated(self) -> Calibration:
+    def _calibrate(self) -> Calibration:
         """Calibration from free whisking before the session."""
         config = self.config
         count = int(np.ceil(config.calibration.min_duration * config.whisking.rate))

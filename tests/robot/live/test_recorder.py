@@ -527,7 +527,7 @@ def test_a_cut_without_its_frames_is_an_error(tmp_path: Path, monkeypatch: pytes
         recorder.add_whisk(make_cut(0, START, START, frames, motion_of_whisk(0)), frames)
     scanner = McapScanner(tmp_path / "a.mcap")
     assert list(scanner) == []
-    assert scanner.broken == "a whisk of 21 frames, of which 20 are there"
+    assert scanner.broken == "a whisk of 21 frames, of which 20 are present"
 
 
 def test_the_frame_window_agrees_with_the_ring_buffer() -> None:

@@ -257,7 +257,7 @@ def test_a_move_without_inverse_kinematics_ends_the_program(faults: Faults) -> N
 @emulated
 def test_a_function_that_is_not_emulated_returns_false(faults: Faults) -> None:
     """A new program executes linear moves again."""
-    seen = found(faults.host, "unsupported")
+    seen = run_scenario(faults.host, "unsupported move")
     assert seen == {"moved": False, "stopped": True, "after": False, "again": True}
 
 

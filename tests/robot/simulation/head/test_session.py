@@ -356,7 +356,7 @@ def test_a_head_that_differs_from_the_recorded_one_is_refused(
         lambda: open_touch_source(source, TouchConfig(head=HeadConfig(whiskers=5))),
         "touch.head",
         "15 whiskers",
-        "18, as a has",
+        "18, those of a",
     )
 
 
