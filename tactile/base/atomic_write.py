@@ -28,7 +28,7 @@ def write_text_atomically(path: Path, text: str) -> None:
 
 
 def flush_to_disk(path: Path) -> None:
-    """Waits until the file's content is on the disk; called inside `write`, it makes the file survive a
-    power failure once it has its name."""
+    """Waits until the file's content is on the disk; called inside `write`, it makes the renamed
+    file survive a power failure."""
     with path.open("rb") as file:
         os.fsync(file.fileno())

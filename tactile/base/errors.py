@@ -28,7 +28,7 @@ class InputError(ValueError):
         super().__init__("; ".join(parts))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickles the parts, so that the error survives its way out of a worker process."""
+        """Pickles the parts, so that a worker process can return the error."""
         return type(self), (self.where, self.found, self.expected, self.cure)
 
 

@@ -74,7 +74,7 @@ class Whisk(NamedTuple):
 
 
 class StepEnd(IntEnum):
-    """How a step of the Create's state machine ended (Fox et al. 2012, II-C)."""
+    """Kind of end of a step of the Create's state machine (Fox et al. 2012, II-C)."""
 
     FREE = 0
     """As planned, without a contact."""
@@ -147,7 +147,7 @@ def observation(
     """An observation with a view, a place label or both, and without contacts.
 
     Args:
-        view: [R, C, K], or None for no view; then `view_shape` gives its shape.
+        view: [R, C, K], or None for a masked view of shape `view_shape`.
         whiskers: W, the length of the (masked) contact fields.
     """
     seen = view is not None

@@ -74,15 +74,15 @@ def calibrate(
     deflection = np.concatenate([cycle.deflection for cycle in record])
     missing = ~(np.isfinite(angle).all(axis=0) & np.isfinite(deflection).all(axis=(0, 2)))
     if missing.any():
-        found, cure = f"{_named(missing)}: NaN samples", "check the wiring of these channels"
+        found, cure = f"{_list_whiskers(missing)}: NaN samples", "check the wiring of these channels"
         raise InputError(where, found, "finite samples", cure)
     stuck = np.ptp(deflection, axis=0) == 0
     alive = ~(stuck.all(axis=1) & ((np.ptp(angle, axis=0) == 0) | (deflection == 0).all(axis=(0, 2))))
     if not alive.any():
         cure = "whisk while recording; a simulated head needs sensor noise above 0 (`mechanics.noise`)"
         raise InputError(where, "no whisker has a signal", "at least one live whisker", cure)
-    if (bad := _saturated(config, deflection) & alive).any():
-        found = f"deflections of {_named(bad)} are constant or at their limits"
+    if (bad := _is_saturated(config, deflection) & alive).any():
+        found = f"deflections of {_list_whiskers(bad)} are constant or at their limits"
         raise InputError(where, found, "unclipped samples", "check the sensors or list the whiskers as dead")
 
     middle = np.median(deflection, axis=0)
@@ -93,7 +93,7 @@ def calibrate(
     touched |= (sd > config.max_sd_ratio * np.median(sd[alive], axis=0)).any(axis=1)
     if (touched & alive).any():
         cure = "record again with nothing within reach"
-        raise InputError(where, f"contacts of {_named(touched & alive)}", "free whisking", cure)
+        raise InputError(where, f"contacts of {_list_whiskers(touched & alive)}", "free whisking", cure)
     return Calibration(
         mean=np.where(alive[:, None], deflection.mean(axis=0), 0.0),
         sd=np.where(alive[:, None], sd, 0.0),
@@ -169,13 +169,13 @@ def _rate(config: CalibrationConfig, record: Sequence[Cycle], slope_window: floa
     return float(np.median(rates))
 
 
-def _saturated(config: CalibrationConfig, deflection: np.ndarray) -> np.ndarray:
-    """Which whiskers [W] have a clipped channel, which is often at one of its extremes."""
+def _is_saturated(config: CalibrationConfig, deflection: np.ndarray) -> np.ndarray:
+    """[W] bool, whether a whisker has a clipped channel, which is often at one of its extremes."""
     high, low = (deflection == end for end in (deflection.max(axis=0), deflection.min(axis=0)))
     at_end = np.maximum(high.mean(axis=0), low.mean(axis=0))
     return ((at_end > 0.05) | (np.abs(deflection) >= config.full_scale).any(axis=0)).any(axis=1)
 
 
-def _named(which: np.ndarray) -> str:
+def _list_whiskers(which: np.ndarray) -> str:
     numbers = np.flatnonzero(which).tolist()
     return f"whisker{'s' if len(numbers) > 1 else ''} {', '.join(map(str, numbers))}"

@@ -21,7 +21,7 @@ MIN_BRIGHTNESS = 0.02
 
 
 class ImageConfig(Settings):
-    """From contact features to a whisker image."""
+    """Settings of the whisker image."""
 
     transform: Literal["max_angle", "contact_angle"] = "contact_angle"
     """The angle from which the height is computed."""

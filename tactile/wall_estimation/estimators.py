@@ -27,7 +27,7 @@ TIP_SD = 0.04
 MAX_DIRECTION_SD = 0.15
 """A direction with a larger standard deviation is discarded, rad."""
 MAX_WALL_MISFIT = 3.0
-"""A contact with a larger misfit (in variances) is not one with a straight wall."""
+"""Largest misfit of a contact with a straight wall, in variances."""
 MAX_INDEPENDENT_SAMPLES = 6
 """Upper limit of the effective sample count of a strain series, since model errors are correlated."""
 OTHER_WALL_PROBABILITY = 0.1
@@ -39,7 +39,7 @@ class WallContact(NamedTuple):
 
     Attributes:
         first, now: [W] bool, contacts at HIT1 and at the end. travel: [3] motion between them, in the frame
-            at HIT1. moment: how the contact ended.
+            at HIT1. moment: kind of its end.
         strain: [N, W, 2] filtered strain since HIT1. alive: [W] bool, whiskers with usable strain.
     """
 

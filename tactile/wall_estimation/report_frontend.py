@@ -140,8 +140,8 @@ class ReportFrontend:
         if len(report.contact) != self.whiskers:
             found = f"a report of {len(report.contact)} whiskers"
             raise InputError("mounts", found, f"of {self.whiskers}, as configured")
-        wall = self._met(report)
-        odometry = report.odometry if self._back is None else _joined(self._back, report.odometry)
+        wall = self._estimate_wall(report)
+        odometry = report.odometry if self._back is None else _add_motions(self._back, report.odometry)
         self._back = None
         back = report.motion == MotionKind.BACK
         if back and self.config.fold_back:
@@ -162,7 +162,7 @@ class ReportFrontend:
             wall_sd=np.float64(wall.sd),
         )
 
-    def _met(self, report: Report) -> Wall:
+    def _estimate_wall(self, report: Report) -> Wall:
         """Estimates the wall at the end of the step and stores the state for the next one."""
         slow, self._slow = self._slow, None
         contact = np.asarray(report.contact & report.alive, bool)
@@ -171,13 +171,13 @@ class ReportFrontend:
         if slow is None or report.motion != MotionKind.FORWARD or report.moment == StepEnd.HIT1:
             return no_wall()
         travel = compose(slow.travel, np.array(report.odometry[:3], np.float64))
-        slow = _Slow(slow.first, travel, (*slow.strain, self._sampled(report)))
+        slow = _Slow(slow.first, travel, (*slow.strain, self._check_strain(report)))
         if report.moment == StepEnd.FREE:
             self._slow = slow
             return no_wall()
         return self._wall(slow, contact, report)
 
-    def _sampled(self, report: Report) -> np.ndarray:
+    def _check_strain(self, report: Report) -> np.ndarray:
         """The strain [T, W, 2] of a step, checked against the sample rate of the templates."""
         rate = strain_sample_rate(report)
         if self.templates is not None and rate:
@@ -205,7 +205,7 @@ class ReportFrontend:
         return geometric_wall(self.point, meeting)
 
 
-def _joined(one: Odometry, other: Odometry) -> Odometry:
+def _add_motions(one: Odometry, other: Odometry) -> Odometry:
     """The composition of two motions; turns are added without wrapping."""
     x, y, _ = compose(np.array(one[:3], np.float64), np.array(other[:3], np.float64))
     return Odometry(x, y, one.dtheta + other.dtheta, one.dt + other.dt)

@@ -9,7 +9,7 @@ phi is the wall's direction and beta the angle between whisker and wall on the n
 is gain x tau. Vertical strain is crosstalk x horizontal strain minus a share of its size, which depends on
 the slant beta - tau (the angle between wall and the line from base to tip). Gain, crosstalk and shares are
 fitted to the templates of all whiskers together. The model therefore also covers angles at which a whisker
-was never the first to touch in training, and detects contacts with anything but a straight wall.
+was never the first to touch in training, and detects contacts with objects other than a straight wall.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class TipModel(NamedTuple):
     Attributes:
         gain: strain per radian. crosstalk: horizontal strain in the vertical one. share: [K] at `SLANTS`.
         noise: [T, 2] standard deviations of the filtered channels at `time` [T] s. feelers: the whiskers.
-        speed: of the robot, m/s. rate: samples per second of the strain it is compared with.
+        speed: of the robot, m/s. rate: samples per second of the compared strain.
     """
 
     gain: float
@@ -95,7 +95,7 @@ def fit_tip_model(templates: StrainTemplates, feelers: PlanarWhiskers) -> TipMod
     """Fits the model to strain templates.
 
     Raises:
-        InputError: the templates were recorded with other whiskers or mounts, or hold hardly any contact.
+        InputError: the templates are from other whiskers or mounts, or have too few contact samples.
     """
     training = templates.training
     if templates.mean.shape[2] != len(feelers.length):
@@ -108,8 +108,8 @@ def fit_tip_model(templates: StrainTemplates, feelers: PlanarWhiskers) -> TipMod
     if len(series) < 2:
         raise InputError(TEMPLATES, "hardly any contacts", "contacts with walls")
     strongest = max(float(np.abs(one.across).max()) for one in series)
-    gain, misfit = _scanned(tip, series, np.geomspace(strongest / 4, strongest / 0.1, 300))
-    gain, misfit = _scanned(tip, series, gain * np.linspace(0.985, 1.015, 61))
+    gain, misfit = _best_gain(tip, series, np.geomspace(strongest / 4, strongest / 0.1, 300))
+    gain, misfit = _best_gain(tip, series, gain * np.linspace(0.985, 1.015, 61))
     if misfit > MAX_TEMPLATE_MISFIT:
         found = "the strain does not fit straight whiskers with these mounts"
         expected, cure = "the whiskers of the training", "check mounts and length, or train again"
@@ -130,7 +130,7 @@ def direction_misfit(tip: TipModel, whisker: int, strain: np.ndarray) -> Directi
     expected = tip.crosstalk * across - np.abs(across) * (_between(fit.slant) @ tip.share)
     sd = np.hypot(noise[:, 1], VERTICAL_MODEL_SD * across)
     vertical = _mean(((down - expected) / sd) ** 2, fit.use)
-    # A whisker nearly parallel to the wall would lie on it instead of touching it with its tip.
+    # The shaft of a whisker nearly parallel to the wall, not its tip, would touch it.
     grazing = np.where(fit.use, fit.slant, np.inf).min(axis=1, initial=np.inf) < MIN_SLANT
     possible = ~grazing & (nearer < np.pi / 2 + RIGHT_ANGLE_MARGIN) & (fit.use.sum() >= 2)
     possible &= bool(np.abs(across[:1]).max(initial=0.0) < MAX_FIRST_TURN * tip.gain)
@@ -211,7 +211,7 @@ def _series(tip: TipModel, templates: StrainTemplates, rows: np.ndarray) -> list
     return series
 
 
-def _scanned(tip: TipModel, series: list[_Series], gains: np.ndarray) -> tuple[float, float]:
+def _best_gain(tip: TipModel, series: list[_Series], gains: np.ndarray) -> tuple[float, float]:
     """The gain with the least mean misfit over all series, and that misfit."""
     total = np.zeros(len(gains))
     for one in series:

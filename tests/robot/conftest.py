@@ -1,4 +1,4 @@
-"""What the tests of robot share: the traces, and what a refusal must tell."""
+"""Fixtures of the tests of `robot`: traces, and a check of errors in user input."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SYNTHETIC = (
 
 @pytest.fixture(scope="session")
 def find_trace(golden: Path, request: pytest.FixtureRequest) -> Callable[[str], Path]:
-    """The path of a reference stream: golden if it is part of the project, else among the recordings."""
+    """Finds the path of a reference trace, in the project's golden files or among the recordings."""
 
     def find(name: str) -> Path:
         path = golden / f"{name}.npz"
@@ -38,13 +38,13 @@ def find_trace(golden: Path, request: pytest.FixtureRequest) -> Callable[[str], 
 
 @pytest.fixture(params=SYNTHETIC)
 def trace(request: pytest.FixtureRequest, find_trace: Callable[[str], Path]) -> Path:
-    """Each synthetic reference stream."""
+    """Each synthetic reference trace."""
     return find_trace(request.param)
 
 
 @pytest.fixture
 def stream(tmp_path: Path) -> Callable[..., Path]:
-    """Writes a small, faultless reference stream, in which the given arrays are replaced (None: left out)."""
+    """Writes a small valid reference trace, with some arrays replaced (None: omitted)."""
 
     def write(**changes: Any) -> Path:
         rows = np.arange(12)
@@ -67,7 +67,7 @@ def stream(tmp_path: Path) -> Callable[..., Path]:
 
 @pytest.fixture
 def refused() -> Callable[..., InputError]:
-    """Calls something that must raise an InputError which tells every one of the given pieces."""
+    """Checks that an action raises an InputError with all given pieces of text; returns it."""
 
     def call(action: Callable[[], object], *pieces: str) -> InputError:
         with pytest.raises(InputError) as caught:

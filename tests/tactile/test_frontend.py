@@ -17,7 +17,7 @@ DROPPED = Cycle(np.zeros(0), np.zeros((0, W)), np.zeros((0, W, 2)), MOTION)
 
 
 def like(one: Observation, other: Observation) -> bool:
-    """The same shapes and types: one chunk can hold both."""
+    """Whether shapes and types are equal, so that one chunk can hold both."""
     parts = zip([*one.odometry, *one[1:]], [*other.odometry, *other[1:]], strict=True)
     return all((np.shape(a), np.asarray(a).dtype) == (np.shape(b), np.asarray(b).dtype) for a, b in parts)
 
@@ -35,7 +35,7 @@ def test_a_dropped_whisk_has_motion_but_no_view(settings: dict[str, object]) -> 
     assert tuple(seen.odometry) == tuple(MOTION)
     for part in (seen.view, seen.contact, seen.point, seen.wall):
         assert not np.any(part)
-    assert not seen.alive.any()  # whiskers that were not read do not say that nothing is there
+    assert not seen.alive.any()  # unread whiskers must not count as free
     assert like(seen, frontend.observe(a_whisk(np.ones(W, bool))))
 
 

@@ -11,24 +11,24 @@ from robot.drivers.clock_sync import JUMP, MAX_DRIFT, RESIDUAL_QUANTILE, WINDOW,
 from tactile.base.random_streams import stream
 
 SHORTEST = 2e-4
-"""The way's shortest delay, s."""
+"""Shortest transmission delay, s."""
 
 
 def pairs(
     seconds: float, rate: float = 100.0, ppm: float = 50.0, offset: float = 3e4, seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(device, arrival, when it really was) [N] s, with long-tailed delays of up to 32 ms."""
+    """(device, arrival, true host) times [N], s, with long-tailed delays of up to 32 ms."""
     random = stream(seed, "delays")
     host = offset + np.arange(round(seconds * rate)) / rate
     device = 17.0 + (host - offset) * (1 + ppm * 1e-6)
     delay = SHORTEST + np.minimum(random.exponential(4e-4, len(host)), 0.032)
     spikes = random.random(len(host)) < 0.02
     delay[spikes] += random.uniform(0, 0.032, spikes.sum())
-    # What comes later never overtakes.
+    # Messages arrive in order.
     return device, np.maximum.accumulate(host + delay), host
 
 
-def fed(device: np.ndarray, arrival: np.ndarray, clock: ClockSync | None = None) -> ClockSync:
+def fit_clock(device: np.ndarray, arrival: np.ndarray, clock: ClockSync | None = None) -> ClockSync:
     clock = clock or ClockSync()
     for one, other in zip(device, arrival, strict=True):
         clock.observe(one, other)
@@ -38,7 +38,7 @@ def fed(device: np.ndarray, arrival: np.ndarray, clock: ClockSync | None = None)
 @given(st.floats(-150, 150), st.integers(0, 30), st.sampled_from([100.0, 125.0, 500.0]))
 def test_host_time_is_accurate_to_the_shortest_delay(ppm: float, seed: int, rate: float) -> None:
     device, arrival, host = pairs(8, rate, ppm, seed=seed)
-    clock = fed(device, arrival)
+    clock = fit_clock(device, arrival)
     off = clock.to_host(device) - host - SHORTEST
     assert np.abs(off[-round(2 * rate) :]).max() < 2e-4  # while single arrivals are up to 32 ms off
     assert abs(clock.scale - 1 / (1 + ppm * 1e-6)) < 6e-5
@@ -48,12 +48,12 @@ def test_host_time_is_accurate_to_the_shortest_delay(ppm: float, seed: int, rate
 @given(st.floats(-150, 150), st.integers(0, 30))
 def test_the_line_is_a_lower_bound_of_all_arrivals(ppm: float, seed: int) -> None:
     device, arrival, _ = pairs(5, ppm=ppm, seed=seed)
-    assert (arrival - fed(device, arrival).to_host(device)).min() > -1e-9
+    assert (arrival - fit_clock(device, arrival).to_host(device)).min() > -1e-9
 
 
 @pytest.mark.parametrize("drift", [-0.8e-6, 0.8e-6])
 def test_drift_is_tracked(drift: float) -> None:
-    """What is older than the window says nothing any more."""
+    """Pairs older than the window have no effect."""
     device, arrival, host = pairs(4 * WINDOW, 50.0, ppm=0)
     device = device + drift * (host - host[0]) ** 2  # by 192 ppm at the end
     clock = ClockSync()
@@ -67,7 +67,7 @@ def test_drift_is_tracked(drift: float) -> None:
 
 def test_the_result_depends_on_the_observations_only() -> None:
     device, arrival, _ = pairs(3)
-    one, other = fed(device, arrival), ClockSync()
+    one, other = fit_clock(device, arrival), ClockSync()
     for k in range(len(device)):
         other.observe(device[k], arrival[k])
         other.to_host(1.0), other.residual
@@ -76,7 +76,7 @@ def test_the_result_depends_on_the_observations_only() -> None:
 
 def test_the_scale_is_limited_to_quartz_drift() -> None:
     device, arrival, _ = pairs(10, ppm=2000)
-    clock = fed(device, arrival)
+    clock = fit_clock(device, arrival)
     assert abs(clock.scale - 1) <= MAX_DRIFT * 1.0001
     assert (arrival - clock.to_host(device)).min() > -1e-9
 
@@ -84,10 +84,10 @@ def test_the_scale_is_limited_to_quartz_drift() -> None:
 def test_the_residual_is_a_quantile_of_the_delays() -> None:
     device, arrival, host = pairs(20)
     early = np.quantile(arrival - host - SHORTEST, RESIDUAL_QUANTILE)
-    assert fed(device, arrival).residual == pytest.approx(early, abs=5e-5)
-    assert fed(device, host).residual < 1e-9
+    assert fit_clock(device, arrival).residual == pytest.approx(early, abs=5e-5)
+    assert fit_clock(device, host).residual < 1e-9
     lucky = host + np.where(np.arange(len(host)) % 50 == 0, 0.0, 0.02)
-    assert fed(device, lucky).residual == pytest.approx(0.02, abs=1e-3)
+    assert fit_clock(device, lucky).residual == pytest.approx(0.02, abs=1e-3)
     assert ClockSync().residual == 0.0
 
 
@@ -95,20 +95,20 @@ def test_the_residual_is_a_quantile_of_the_delays() -> None:
 def test_jumps_are_detected_at_once_and_restart_the_fit(jump: float) -> None:
     device, arrival, host = pairs(20)
     half = len(device) // 2
-    clock = fed(device[:half], arrival[:half])
+    clock = fit_clock(device[:half], arrival[:half])
     assert clock.jumps == 0
     late = int(np.argmax((arrival - host)[half:] < JUMP / 5)) + 1
-    fed(device[half : half + late] + jump, arrival[half : half + late], clock)
+    fit_clock(device[half : half + late] + jump, arrival[half : half + late], clock)
     assert clock.jumps == 1
-    fed(device[half + late :] + jump, arrival[half + late :], clock)
+    fit_clock(device[half + late :] + jump, arrival[half + late :], clock)
     assert clock.jumps == 1
     assert np.abs(clock.to_host(device[half + 200 :] + jump) - host[half + 200 :] - SHORTEST).max() < 2e-4
 
 
 def test_a_small_step_back_is_followed_gradually() -> None:
     device, arrival, host = pairs(20 + WINDOW, rate=20.0)
-    clock = fed(device[:200], arrival[:200])
-    fed(device[200:] - 0.04, arrival[200:], clock)
+    clock = fit_clock(device[:200], arrival[:200])
+    fit_clock(device[200:] - 0.04, arrival[200:], clock)
     assert clock.jumps == 0
     assert abs(clock.to_host(device[-1] - 0.04) - host[-1] - SHORTEST) < 1e-3
 
@@ -116,28 +116,28 @@ def test_a_small_step_back_is_followed_gradually() -> None:
 def test_a_busy_host_is_not_a_jump() -> None:
     device, arrival, host = pairs(30)
     busy = (host > host[0] + 8) & (host < host[0] + 20)
-    clock = fed(device, np.maximum.accumulate(arrival + np.where(busy, 0.04, 0.0)))
+    clock = fit_clock(device, np.maximum.accumulate(arrival + np.where(busy, 0.04, 0.0)))
     assert clock.jumps == 0
     assert abs(clock.to_host(device[-1]) - host[-1] - SHORTEST) < 2e-4
 
 
 @pytest.mark.parametrize("stall", [0.5, 2.0, 5.0])
 def test_a_suspended_host_is_not_a_jump(stall: float) -> None:
-    """Everything that waited comes at once."""
+    """All delayed messages arrive at once."""
     device, arrival, host = pairs(20)
     asleep = (host > host[0] + 8) & (host < host[0] + 8 + stall)
     arrival = arrival.copy()
     arrival[asleep] = host[0] + 8 + stall + 1e-4 * np.arange(asleep.sum())
-    clock = fed(device, np.maximum.accumulate(arrival))
+    clock = fit_clock(device, np.maximum.accumulate(arrival))
     assert clock.jumps == 0
     assert np.abs(clock.to_host(device[-200:]) - host[-200:] - SHORTEST).max() < 2e-4
 
 
 def test_a_gap_in_the_stream_is_not_a_jump() -> None:
-    """Its clock went on, nothing came."""
+    """The device's clock continues without messages."""
     device, arrival, host = pairs(30)
     there = (host < host[0] + 5) | (host > host[0] + 25)
-    clock = fed(device[there], arrival[there])
+    clock = fit_clock(device[there], arrival[there])
     assert clock.jumps == 0
     assert abs(clock.to_host(device[-1]) - host[-1] - SHORTEST) < 2e-4
 
@@ -145,17 +145,17 @@ def test_a_gap_in_the_stream_is_not_a_jump() -> None:
 def test_a_late_first_arrival_is_not_a_jump() -> None:
     device, arrival, host = pairs(5)
     arrival[0] += 0.009
-    clock = fed(device, arrival)
+    clock = fit_clock(device, arrival)
     assert clock.jumps == 0
     assert abs(clock.to_host(device[-1]) - host[-1] - SHORTEST) < 2e-4
 
 
 @pytest.mark.parametrize("step", [0.002, 0.05])
 def test_repeated_time_stamps(step: float) -> None:
-    """A coarse clock: the first arrival of a stamp is what counts."""
+    """A coarse clock: the first arrival of a time stamp counts."""
     device, arrival, _ = pairs(5, rate=500.0)
     device = np.floor(device / step) * step
-    clock = fed(device, arrival)
+    clock = fit_clock(device, arrival)
     assert (arrival - clock.to_host(device)).min() > -1e-9
     assert clock.jumps == 0
 
@@ -163,14 +163,14 @@ def test_repeated_time_stamps(step: float) -> None:
 def test_without_observations() -> None:
     with pytest.raises(ValueError, match="no observation"):
         ClockSync().to_host(1.0)
-    clock = fed(np.array([5.0]), np.array([105.0]))
+    clock = fit_clock(np.array([5.0]), np.array([105.0]))
     assert clock.to_host(6.0) == 106.0
 
 
 @given(st.lists(st.tuples(st.floats(0, 0.3), st.floats(0, 0.3)), min_size=1, max_size=40))
 def test_any_observations_are_accepted(steps: list[tuple[float, float]]) -> None:
     device, arrival = np.cumsum(np.array(steps), axis=0).T
-    clock = fed(device, arrival)
+    clock = fit_clock(device, arrival)
     assert np.isfinite(clock.to_host(device)).all()
     assert abs(clock.scale - 1) <= MAX_DRIFT * 1.0001
     assert clock.residual >= 0

@@ -31,11 +31,11 @@ def arc(config: LiveConfig, seconds: float, speed: float, turn: float) -> tuple[
 
 
 def odometer(config: LiveConfig, *motion: float) -> tuple[ArmOdometry, np.ndarray, np.ndarray]:
-    """One that has seen an arc, and the arc's times and poses."""
+    """An odometer with the states of an arc, and the arc's times and poses."""
     time, pose, tcp, rate = arc(config, *motion)
-    made = ArmOdometry(config)
-    made.add(100.0 + time, tcp, rate)
-    return made, 100.0 + time, pose
+    arm = ArmOdometry(config)
+    arm.add(100.0 + time, tcp, rate)
+    return arm, 100.0 + time, pose
 
 
 @given(
@@ -47,23 +47,23 @@ def odometer(config: LiveConfig, *motion: float) -> tuple[ArmOdometry, np.ndarra
 )
 def test_poses_are_in_the_map_frame_for_any_base_transform(x, yaw, speed, turn, when):
     config = LiveConfig.model_validate({"arm": {"placing": {"x": x, "yaw_deg": yaw}}})
-    made, time, pose = odometer(config, 3.0, speed, turn)
+    arm, time, pose = odometer(config, 3.0, speed, turn)
     k = int(np.searchsorted(time, 100.0 + when))
     share = (100.0 + when - time[k - 1]) * HZ
     expected = pose[k - 1] + share * (pose[k] - pose[k - 1])
-    assert np.allclose(made.pose(100.0 + when), expected, atol=1e-9)
+    assert np.allclose(arm.pose(100.0 + when), expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("kind", ["pose", "velocity"])
 @pytest.mark.parametrize(("speed", "turn"), [(0.05, 0.0), (0.0, 0.4), (0.04, -0.3)])
 def test_motions_sum_up_to_the_path(kind, speed, turn):
-    made, _, pose = odometer(LiveConfig(odometry=kind), 9.0, speed, turn)
-    told, truth = zip(*(made.step(k, 100.0 + k) for k in range(9)), strict=True)
-    moves = np.array([[m.dx, m.dy, m.dtheta] for m in told], float)
+    arm, _, pose = odometer(LiveConfig(odometry=kind), 9.0, speed, turn)
+    motions, truth = zip(*(arm.step(k, 100.0 + k) for k in range(9)), strict=True)
+    moves = np.array([[m.dx, m.dy, m.dtheta] for m in motions], float)
     assert not moves[0].any()
-    assert np.allclose([m.dt for m in told[1:]], 1.0)
+    assert np.allclose([m.dt for m in motions[1:]], 1.0)
     reckoned = compose(truth[0], integrate(moves[1:], np.zeros(3)))
-    # Velocities are means over a whisk, driven along the middle heading.
+    # Velocities are means over a whisk, integrated along the middle heading.
     assert np.allclose(reckoned[-1, :2], truth[-1][:2], atol=1e-9 if kind == "pose" else 3e-3)
     assert np.allclose(truth[-1], compose(np.zeros(3), pose[8 * int(HZ)]), atol=1e-9)
 
@@ -83,7 +83,7 @@ def test_errors_do_not_depend_on_later_whisks():
 
 
 def test_old_states_are_dropped():
-    made, *_ = odometer(LiveConfig(), 9.0, 0.05, 0.0)
+    arm, *_ = odometer(LiveConfig(), 9.0, 0.05, 0.0)
     time, _, tcp, rate = arc(LiveConfig(), 20.0, 0.05, 0.0)
-    made.add(200.0 + time, tcp, rate)
-    assert 9.0 < made.span <= 10.0
+    arm.add(200.0 + time, tcp, rate)
+    assert 9.0 < arm.span <= 10.0

@@ -1,4 +1,4 @@
-"""The route: each target is sent after arrival at the one before."""
+"""The route: each target is sent after arrival at the previous one."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 HEAD = ur10_head(HeadConfig())
 
 
-class Obedient:
-    """An arm that reports its arrival when it is told to."""
+class StubArm:
+    """An arm that reports arrival when the test sets it."""
 
     def __init__(self) -> None:
         self.sent: list[np.ndarray] = []
@@ -33,7 +33,7 @@ class Obedient:
 
 def test_each_target_is_sent_once_after_arrival_at_the_last():
     config = LiveConfig(waypoints=((0.1, 0.1, 0.0), (0.2, 0.1, 0.0), (0.2, 0.1, 90.0)))
-    route, arm = main_route(config, plan_path(config, HEAD)), Obedient()
+    route, arm = main_route(config, plan_path(config, HEAD)), StubArm()
     assert [route.advance(arm) for _ in range(3)] == [False] * 3
     assert len(arm.sent) == 1
     arm.there = True
@@ -49,7 +49,7 @@ def test_each_target_is_sent_once_after_arrival_at_the_last():
 
 def test_the_target_of_a_stopped_arm_is_sent_again():
     config = LiveConfig(waypoints=((0.1, 0.1, 0.0), (0.2, 0.1, 0.0)))
-    route, arm = main_route(config, plan_path(config, HEAD)), Obedient()
+    route, arm = main_route(config, plan_path(config, HEAD)), StubArm()
     route.resend_last()
     route.advance(arm)
     route.resend_last()
@@ -61,8 +61,8 @@ def test_the_target_of_a_stopped_arm_is_sent_again():
 def test_the_path_is_that_of_the_simulated_session():
     config = LiveConfig()
     plan, path = config.plan, plan_path(config, HEAD)
-    made = make_scene(plan.maze, plan.path, plan.motion, plan.kidnaps, HEAD, plan.seed)
-    assert np.array_equal(path.pose, poses_at(made.path, path.time))
+    scene = make_scene(plan.maze, plan.path, plan.motion, plan.kidnaps, HEAD, plan.seed)
+    assert np.array_equal(path.pose, poses_at(scene.path, path.time))
     pose, lift = pose_from_tcp(config.arm.placing, main_route(config, path).targets)
     assert np.allclose(pose[:, :2], path.pose[1:, :2])
     assert np.allclose(np.cos(pose[:, 2] - path.pose[1:, 2]), 1.0)

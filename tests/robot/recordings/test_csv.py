@@ -35,7 +35,7 @@ Write = Callable[..., Path]
 
 @pytest.fixture
 def write(tmp_path: Path) -> Write:
-    """Writes a file of that content."""
+    """Writes a file with this content."""
 
     def to_file(content: str, name: str = "odometry.csv") -> Path:
         path = tmp_path / name
@@ -142,7 +142,7 @@ def test_the_digest_covers_every_file(write: Write) -> None:
 
 
 def test_the_lecture_hall_csv_equals_its_reference_trace(reference_data: Path) -> None:
-    """Every label of the reference stream follows from the pairs; truth differs by the files' rounding."""
+    """Every label of the reference stream follows from the pairs; truth differs by rounding in the files."""
     data = reference_data / "data"
     config = CsvConfig(
         velocity=VelocityColumns(left="vy"),
@@ -162,7 +162,7 @@ def test_the_lecture_hall_csv_equals_its_reference_trace(reference_data: Path) -
 
 
 def test_the_intel_laser_csv_equals_its_reference_trace(reference_data: Path) -> None:
-    """180 beams as 3 x 6 pixels, equal in every bit; the sideways part of the motion is not lost."""
+    """180 beams as 3 x 6 pixels, equal in every bit; the sideways part of the motion is kept."""
     data = reference_data / "data"
     config = CsvConfig(
         pose=PoseColumns(x="odo_x", y="odo_y", heading="odo_th"),
@@ -270,17 +270,17 @@ def test_all_errors_are_reported_together(write: Write, refused: Callable[..., I
 
 
 @given(st.text(max_size=200) | st.binary(max_size=200))
-def test_any_text_is_read_or_gives_one_clear_error(tmp_path_factory: Any, text: str | bytes) -> None:
+def test_any_text_is_read_or_gives_one_error(tmp_path_factory: Any, text: str | bytes) -> None:
     path = tmp_path_factory.getbasetemp() / "any.csv"
     for content in (text, b"t,vx,w\n" + text if isinstance(text, bytes) else "t,vx,w\n" + text):
         data = content if isinstance(content, bytes) else content.encode("utf-8", "surrogatepass")
         path.write_bytes(data)
-        told = str(path)
+        message = str(path)
         try:
             read_csv_recording(path, VELOCITY)
         except InputError as error:
-            told = str(error)
-        assert str(path) in told
+            message = str(error)
+        assert str(path) in message
 
 
 def test_line_numbers_are_those_of_an_editor(write: Write) -> None:

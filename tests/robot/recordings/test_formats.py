@@ -1,4 +1,4 @@
-"""Opening recordings: one reader per suffix, and clear errors for files that cannot be opened."""
+"""Opening recordings: one reader per suffix, and errors for unreadable files."""
 
 from __future__ import annotations
 
@@ -53,9 +53,9 @@ def test_a_truncated_recording_warns(stream: Callable[..., Path], tmp_path: Path
     with open_recording(RecordingConfig(file=stream())) as source:
         record_source(source, path)
     path.write_bytes(path.read_bytes()[:-300])
-    told: list[str] = []
-    opened = open_recording(RecordingConfig(file=path), told.append)
-    assert told == [f"{path}: {opened.length} samples are readable, the rest is lost: it ends too early"]
+    warnings: list[str] = []
+    opened = open_recording(RecordingConfig(file=path), warnings.append)
+    assert warnings == [f"{path}: {opened.length} samples are readable, the rest is lost: it ends too early"]
 
 
 @pytest.mark.parametrize("suffix", FORMATS)

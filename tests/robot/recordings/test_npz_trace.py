@@ -1,4 +1,4 @@
-"""Reference traces: values read, and every error named."""
+"""Reference traces: their values, and the errors of faulty ones."""
 
 from __future__ import annotations
 
@@ -177,10 +177,10 @@ def test_all_errors_are_reported_together(
     )
     error = refused(lambda: read_trace(path), "repeats", "in_w is nan", "127.5", "over 1000 m/s")
     assert isinstance(error, InputErrors)
-    assert len(error.errors) == 4  # each cause once: the truth, too, disagrees about the speed
+    assert len(error.errors) == 4  # each cause once, although the truth contradicts the speed too
 
 
-def test_a_broken_archive_is_one_clear_error(
+def test_a_broken_archive_gives_one_error(
     stream: Callable[..., Path], tmp_path: Path, refused: Callable[..., InputError]
 ) -> None:
     content = stream().read_bytes()
@@ -201,12 +201,12 @@ def _fuzz(content: bytes, path: Path, rounds: int, seed: int) -> None:
         for place in rng.integers(0, len(bad), rng.integers(1, 4)):
             bad[place] = int(rng.integers(256))
         path.write_bytes(bad)
-        told = str(path)
+        message = str(path)
         try:
             read_trace(path)
         except InputError as error:
-            told = str(error)
-        assert str(path) in told
+            message = str(error)
+        assert str(path) in message
 
 
 def test_random_damage(stream: Callable[..., Path], tmp_path: Path) -> None:

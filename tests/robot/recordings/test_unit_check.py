@@ -30,7 +30,7 @@ DEGREES, MILLIMETRES, MILLISECONDS = 180 / np.pi, 1000.0, 1000.0
 
 @pytest.fixture(params=REAL)
 def real(request: pytest.FixtureRequest, find_trace: Callable[[str], Path]) -> Path:
-    """Each real reference stream."""
+    """Each real reference trace."""
     return find_trace(request.param)
 
 
@@ -47,7 +47,7 @@ def table(request: pytest.FixtureRequest, reference_data: Path) -> tuple[Path, C
 
 
 def _margins(log: InMemorySource) -> dict[str, float]:
-    """How many times below its limit each quantity is."""
+    """Ratio of each limit to its quantity."""
     robot = typical_motion(MotionTrack(log.time, log.moved, log.motion, log.truth))
     ratios = [max(pair) / min(pair) if min(pair) else 1.0 for pair in (robot.path, robot.turning)]
     return {
@@ -94,12 +94,12 @@ def _plant(
     trace: Path, path: Path, array: str, factor: float | np.ndarray, drop: tuple[str, ...] = ()
 ) -> Path:
     with np.load(trace) as arrays:
-        kept = {
+        changed = {
             name: arrays[name] for name in arrays.files if name.startswith("in_") or name == "params_json"
         }
-        kept["truth"] = arrays["truth"]
-    kept[array] = kept[array] * factor
-    np.savez(path, **{name: value for name, value in kept.items() if name not in drop})
+        changed["truth"] = arrays["truth"]
+    changed[array] = changed[array] * factor
+    np.savez(path, **{name: value for name, value in changed.items() if name not in drop})
     return path
 
 
@@ -149,7 +149,7 @@ def test_a_wrong_unit_is_refused_without_truth(
 ) -> None:
     path = _plant(trace, tmp_path / "planted.npz", array, factor, drop=("truth",))
     if array == "in_w" and trace.stem == "j_reverse_stop":
-        read_trace(path)  # turns by 1.1 degrees a second: nobody could tell
+        read_trace(path)  # 1.1 degrees per second: undetectable
     else:
         refused(lambda: read_trace(path), str(path), expected)
 
@@ -182,20 +182,20 @@ def test_a_wrong_unit_of_a_table_is_refused(
 
 
 def test_two_outliers_do_not_change_the_verdict(trace: Path, tmp_path: Path) -> None:
-    """Two wild rows, faster than anything, in a recording that hardly turns otherwise."""
+    """Two outlier rows in a recording with little turning."""
     with np.load(trace) as arrays:
-        kept = {
+        changed = {
             name: arrays[name] for name in arrays.files if name.startswith("in_") or name == "params_json"
         }
-        kept["truth"] = arrays["truth"]
+        changed["truth"] = arrays["truth"]
     for name, value in (("in_w", 1e5), ("in_v", 1e6)):
-        kept[name] = kept[name].copy()
-        kept[name][[40, 41]] = value, -value
-    np.savez(tmp_path / "wild.npz", **kept)
-    assert read_trace(tmp_path / "wild.npz").length == len(kept["in_t"])
+        changed[name] = changed[name].copy()
+        changed[name][[40, 41]] = value, -value
+    np.savez(tmp_path / "wild.npz", **changed)
+    assert read_trace(tmp_path / "wild.npz").length == len(changed["in_t"])
 
 
-def test_the_real_row_of_five_milliseconds_passes(find_trace: Callable[[str], Path]) -> None:
+def test_a_real_row_of_five_milliseconds_passes(find_trace: Callable[[str], Path]) -> None:
     log = read_trace(find_trace("f_real_intel_laser3x6"))
     rate = np.abs(log.motion[1:, 2]) / log.motion[1:, 3]
     assert rate.max() > 90
@@ -210,11 +210,11 @@ def test_limits_can_be_raised(stream: Callable[..., Path], refused: Callable[...
 
 @pytest.mark.parametrize("turns", [0.4, 5.0])
 def test_headings_in_degrees_are_detected(turns: float) -> None:
-    """Wrapped or not, in radians they pass and in degrees they do not."""
+    """Headings in radians pass, in degrees they are refused, wrapped or not."""
     time = np.arange(200) * 0.5
     heading = np.linspace(0, 2 * np.pi * turns, 200) - 1.0
     wrapped = (heading + np.pi) % (2 * np.pi) - np.pi
-    limits = UnitLimits(turn_rate=0.5) if turns < 1 else DEFAULT_LIMITS  # a slow one needs to be told
+    limits = UnitLimits(turn_rate=0.5) if turns < 1 else DEFAULT_LIMITS  # slow turning requires a lower limit
     for column in (heading, wrapped):
         assert heading_errors(column, time, "th", "file", limits) == []
         (error,) = heading_errors(np.rad2deg(column), time, "th", "file", limits)

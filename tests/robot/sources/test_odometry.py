@@ -35,7 +35,7 @@ def test_the_first_row_only_sets_the_clock(velocities: np.ndarray, heading: floa
 
 
 def test_the_mid_heading_closes_a_circle() -> None:
-    """Forty steps of 9 degrees: the mid heading errs by the turn's second power, the new one by its first."""
+    """Forty steps of 9 degrees: the mid heading has an error of second order, the new one of first order."""
     time = np.arange(41) * 0.5
     turn = np.full(41, np.pi / 10)
     ends = [
@@ -47,6 +47,6 @@ def test_the_mid_heading_closes_a_circle() -> None:
         np.testing.assert_allclose(poses[-1], 0, atol=1e-12)
     across = [float(np.hypot(*poses[20, :2])) for poses in ends]
     assert across[0] == pytest.approx(2 * radius, rel=2e-3)
-    offset = [abs(float(poses[20, 0])) for poses in ends]  # a circle's far side is straight to the left
+    offset = [abs(float(poses[20, 0])) for poses in ends]  # half a circle ends straight to the left
     assert offset[0] < 1e-12
     assert offset[1] > 0.04

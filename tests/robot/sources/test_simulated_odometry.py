@@ -20,8 +20,8 @@ def still(count: int) -> tuple[np.ndarray, np.ndarray]:
     return np.arange(count, dtype=float), np.zeros((count, 3))
 
 
-def driven(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Twenty seconds ahead at 30 mm/s, then five of turning on the spot at 0.4 rad/s, again and again."""
+def drive_and_turn(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Repeats 20 s ahead at 30 mm/s and 5 s of turning on the spot at 0.4 rad/s."""
     turns = np.arange(count) % 25 >= 20
     motion = np.zeros((count, 3))
     motion[~turns, 0], motion[turns, 2] = 0.03, 0.4
@@ -34,24 +34,24 @@ def driven(count: int) -> tuple[np.ndarray, np.ndarray]:
 def errors(kind: str, scene: tuple[np.ndarray, np.ndarray], seed: int = 0, **changes: Any) -> np.ndarray:
     """[N - 1, 3] measured motion minus true motion."""
     time, pose = scene
-    told = simulate_odometry(OdometryConfig(noise=kind, **changes), time, pose, stream(seed, "odometry"))
-    error = told[1:, :3] - between(pose[:-1], pose[1:])
+    noisy = simulate_odometry(OdometryConfig(noise=kind, **changes), time, pose, stream(seed, "odometry"))
+    error = noisy[1:, :3] - between(pose[:-1], pose[1:])
     return np.column_stack([error[:, :2], wrap(error[:, 2])])
 
 
 @given(st.integers(0, 10**6), st.sampled_from(KINDS))
 def test_odometry_follows_from_its_seed(seed: int, kind: str) -> None:
-    one, again, other = (errors(kind, driven(60), k) for k in (seed, seed, seed + 1))
+    one, again, other = (errors(kind, drive_and_turn(60), k) for k in (seed, seed, seed + 1))
     assert (one == again).all()
     assert (one != other).any()
 
 
 def test_without_noise_odometry_is_the_truth() -> None:
-    assert np.abs(errors("none", driven(100))).max() < 1e-12
+    assert np.abs(errors("none", drive_and_turn(100))).max() < 1e-12
 
 
 def test_white_noise_is_in_every_step_and_independent() -> None:
-    for scene in (still(4000), driven(4000)):
+    for scene in (still(4000), drive_and_turn(4000)):
         error = errors("white", scene)
         assert error[:, 0].std() == pytest.approx(8.2e-3, rel=0.05)
         assert error[:, 2].std() == pytest.approx(0.103, rel=0.05)
@@ -63,7 +63,7 @@ def test_white_noise_is_in_every_step_and_independent() -> None:
 
 def test_gated_noise_is_only_in_moving_parts() -> None:
     assert np.abs(errors("gated", still(500))).max() == 0
-    time, pose = driven(4000)
+    time, pose = drive_and_turn(4000)
     error = errors("gated", (time, pose))
     turns = np.abs(np.diff(pose[:, 2])) > 0.1
     assert np.abs(error[turns, 0]).max() < 1e-12
@@ -87,8 +87,8 @@ def test_telescoping_noise_stays_bounded_and_the_others_grow() -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_noise_does_not_depend_on_the_row_rate(kind: str) -> None:
-    """Rows twice as close add up to the same errors, whatever the rows are."""
-    time, pose = driven(200)
+    """Errors at twice the row rate add up to the same errors."""
+    time, pose = drive_and_turn(200)
     fine = np.arange(0, 199.5, 0.5)
     finely = np.column_stack([np.interp(fine, time, column) for column in pose.T])
     coarse = errors(kind, (time, pose))
@@ -97,14 +97,14 @@ def test_noise_does_not_depend_on_the_row_rate(kind: str) -> None:
 
 
 def test_biases_are_constant_in_a_session() -> None:
-    time, pose = driven(500)
+    time, pose = drive_and_turn(500)
     scales, bends = [], []
     for seed in range(300):
         config = OdometryConfig(noise="none", length_bias=0.02, heading_bias=0.1)
-        told = simulate_odometry(config, time, pose, stream(seed, "odometry"))[1:]
+        noisy = simulate_odometry(config, time, pose, stream(seed, "odometry"))[1:]
         true = between(pose[:-1], pose[1:])
         ahead = true[:, 0] > 0.01
-        scale, bend = told[ahead, 0] / true[ahead, 0], (told[ahead, 2] - true[ahead, 2]) / true[ahead, 0]
+        scale, bend = noisy[ahead, 0] / true[ahead, 0], (noisy[ahead, 2] - true[ahead, 2]) / true[ahead, 0]
         assert np.allclose(scale, scale[0])
         assert np.allclose(bend, bend[0])
         scales.append(scale[0])
@@ -115,25 +115,25 @@ def test_biases_are_constant_in_a_session() -> None:
 
 
 def test_a_kidnap_repeats_the_motion_before() -> None:
-    time, pose = driven(100)
+    time, pose = drive_and_turn(100)
     pose = pose.copy()
     pose[50:, :2] += [0.7, -0.4]
     pose[50:, 2] += 2.0
     hidden = np.zeros(100, bool)
     hidden[50] = True
     random = stream(0, "odometry")
-    told = simulate_odometry(OdometryConfig(noise="none"), time, pose, random, hidden)
-    assert np.allclose(told[50, :3], told[49, :3])
+    noisy = simulate_odometry(OdometryConfig(noise="none"), time, pose, random, hidden)
+    assert np.allclose(noisy[50, :3], noisy[49, :3])
     open_ = simulate_odometry(OdometryConfig(noise="none"), time, pose, stream(0, "odometry"))
     assert np.hypot(*open_[50, :2]) > 0.5
-    assert (np.delete(told, 50, 0) == np.delete(open_, 50, 0)).all()
+    assert (np.delete(noisy, 50, 0) == np.delete(open_, 50, 0)).all()
 
 
 def test_the_first_row_only_sets_the_clock() -> None:
-    time, pose = driven(10)
+    time, pose = drive_and_turn(10)
     for kind in (*KINDS, "none"):
-        told = simulate_odometry(OdometryConfig(noise=kind), time + 7.0, pose, stream(0, "odometry"))
-        assert (told[0] == 0).all()
-        assert (told[1:, 3] == 1).all()
+        noisy = simulate_odometry(OdometryConfig(noise=kind), time + 7.0, pose, stream(0, "odometry"))
+        assert (noisy[0] == 0).all()
+        assert (noisy[1:, 3] == 1).all()
         one = simulate_odometry(OdometryConfig(noise=kind), time[:1], pose[:1], stream(0, "odometry"))
         assert (one == 0).all()

@@ -50,31 +50,31 @@ start 1 1 90
 @settings(max_examples=25)
 @given(SEEDS, KINDS)
 def test_passages_are_wide_enough(seed: int, config: ArenaConfig) -> None:
-    made = make_arena(config, seed)
-    assert len(made.objects) == config.count
-    for number, one in enumerate(made.objects):
+    arena = make_arena(config, seed)
+    assert len(arena.objects) == config.count
+    for number, one in enumerate(arena.objects):
         assert config.smallest**2 <= polygon_area(one) * (1 + 1e-9) <= config.largest**2 * (1 + 2e-9)
-        room = polygon_gap(one, made.outer)
+        room = polygon_gap(one, arena.outer)
         assert room < 1e-9 or room >= config.passage
-        for other in made.objects[:number]:
+        for other in arena.objects[:number]:
             assert polygon_gap(one, other) >= config.passage
-    assert has_clearance(made, made.start[:2], 0.2)
+    assert has_clearance(arena, arena.start[:2], 0.2)
 
 
 @settings(max_examples=12)
 @given(SEEDS, KINDS)
 def test_all_free_space_is_connected(seed: int, config: ArenaConfig) -> None:
-    made = make_arena(config, seed)
+    arena = make_arena(config, seed)
     axis = np.arange(0.005, config.side, 0.02)
     places = np.stack(np.meshgrid(axis, axis), axis=-1)
-    _, regions = label(has_clearance(made, places, 0.18))
+    _, regions = label(has_clearance(arena, places, 0.18))
     assert regions == 1
 
 
 def test_only_rotated_objects_are_turned() -> None:
     def slants(rotated: bool) -> np.ndarray:
-        made = make_arena(ArenaConfig(side=2.5, rotated=rotated), 3)
-        along = np.array([one[1] - one[0] for one in made.objects])
+        arena = make_arena(ArenaConfig(side=2.5, rotated=rotated), 3)
+        along = np.array([one[1] - one[0] for one in arena.objects])
         return np.degrees(np.arctan2(along[:, 1], along[:, 0])) % 90
 
     assert np.allclose(slants(False), 0)
@@ -83,8 +83,10 @@ def test_only_rotated_objects_are_turned() -> None:
 
 def test_the_share_of_objects_at_walls_is_configurable() -> None:
     def share(against: float) -> float:
-        made = [make_arena(ArenaConfig(side=2.5, objects=4, against=against), seed) for seed in range(8)]
-        return float(np.mean([polygon_gap(one, room.outer) < 1e-9 for room in made for one in room.objects]))
+        arenas = [make_arena(ArenaConfig(side=2.5, objects=4, against=against), seed) for seed in range(8)]
+        return float(
+            np.mean([polygon_gap(one, room.outer) < 1e-9 for room in arenas for one in room.objects])
+        )
 
     assert share(0.0) == 0
     assert share(1.0) == 1
@@ -138,22 +140,22 @@ def test_objects_that_do_not_fit_are_refused(refused: Callable[..., InputError])
 @given(SEEDS, KINDS)
 def test_a_line_from_inside_to_outside_crosses_an_odd_number_of_walls(seed: int, config: ArenaConfig) -> None:
     """Wall segments and free space describe the same arena."""
-    made = make_arena(config, seed)
+    arena = make_arena(config, seed)
     points = np.random.default_rng(seed).uniform(-0.2, config.side + 0.2, (40, 2, 2))
-    crossings = segments_cross(points.reshape(-1, 4), wall_segments(made)).sum(axis=1)
-    free = in_free_space(made, points)
+    crossings = segments_cross(points.reshape(-1, 4), wall_segments(arena)).sum(axis=1)
+    free = in_free_space(arena, points)
     assert ((crossings % 2 == 1) == (free[:, 0] != free[:, 1])).all()
-    assert (is_occupied(made, points) == ~free).all()
-    assert (free <= is_enclosed(made, points)).all()
+    assert (is_occupied(arena, points) == ~free).all()
+    assert (free <= is_enclosed(arena, points)).all()
 
 
 def test_the_occupied_area_is_that_of_the_objects() -> None:
-    made = make_arena(ArenaConfig(rotated=True), 2)
+    arena = make_arena(ArenaConfig(rotated=True), 2)
     axis = (np.arange(250) + 0.5) / 250 * 1.25
     cells = np.stack(np.meshgrid(axis, axis), axis=-1)
-    expected = sum(polygon_area(one) for one in made.objects) / 1.25**2
-    assert is_occupied(made, cells).mean() == pytest.approx(expected, rel=0.01)
-    assert is_occupied(made, cells + 5).all()
+    expected = sum(polygon_area(one) for one in arena.objects) / 1.25**2
+    assert is_occupied(arena, cells).mean() == pytest.approx(expected, rel=0.01)
+    assert is_occupied(arena, cells + 5).all()
 
 
 @given(SEEDS)
@@ -189,13 +191,13 @@ def test_touching_segments_do_not_cross() -> None:
 def test_an_arena_file_is_read_back_equal(
     tmp_path_factory: pytest.TempPathFactory, seed: int, config: ArenaConfig
 ) -> None:
-    made = make_arena(config, seed)
+    arena = make_arena(config, seed)
     path = tmp_path_factory.getbasetemp() / "room.txt"
-    path.write_text(arena_text(made))
+    path.write_text(arena_text(arena))
     read = read_arena(path)
     assert read.name == "room"
-    assert (wall_segments(read) == wall_segments(made)).all()
-    assert np.allclose(read.start, made.start)
+    assert (wall_segments(read) == wall_segments(arena)).all()
+    assert np.allclose(read.start, arena.start)
 
 
 def test_an_arena_file_gives_walls_objects_and_start(tmp_path: Path) -> None:
@@ -213,7 +215,7 @@ def test_an_arena_file_gives_walls_objects_and_start(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "where", "said"),
+    ("change", "where", "found"),
     [
         (("outer 0 0", "walls 0 0"), "room.txt:2:1", "'walls'"),
         (("2 2  0 2", "2 2  0 nan"), "room.txt:2:24", "'nan'"),
@@ -238,12 +240,12 @@ def test_an_arena_file_gives_walls_objects_and_start(tmp_path: Path) -> None:
     ],
 )
 def test_a_faulty_arena_file_is_refused(
-    tmp_path: Path, change: tuple[str, str], where: str, said: str, refused: Callable[..., InputError]
+    tmp_path: Path, change: tuple[str, str], where: str, found: str, refused: Callable[..., InputError]
 ) -> None:
     path = tmp_path / "room.txt"
     assert change[0] in GOOD
     path.write_text(GOOD.replace(*change, 1))
-    refused(lambda: read_arena(path), where, said)
+    refused(lambda: read_arena(path), where, found)
 
 
 def test_a_binary_file_is_refused(tmp_path: Path, refused: Callable[..., InputError]) -> None:

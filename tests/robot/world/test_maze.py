@@ -31,7 +31,7 @@ from tactile.base.random_streams import stream
 SEEDS = st.integers(0, 10**6)
 
 
-def made(seed: int, columns: int = 7, rows: int = 5, length: int = 20, share: float = 0.6) -> Maze:
+def maze_of(seed: int, columns: int = 7, rows: int = 5, length: int = 20, share: float = 0.6) -> Maze:
     loop = random_loop(columns, rows, length, stream(seed, "maze.loop"))
     return random_maze(columns, rows, loop, share, stream(seed, "maze.walls"))
 
@@ -81,9 +81,9 @@ def test_the_loop_is_open_and_the_outer_wall_closed(seed: int) -> None:
 
 
 def test_the_share_of_walls_is_configurable() -> None:
-    mazes = [made(seed, share=0.6) for seed in range(60)]
+    mazes = [maze_of(seed, share=0.6) for seed in range(60)]
     inner = np.concatenate([maze.across[1:-1].ravel() for maze in mazes])
-    # 10 of the 20 openings of a loop, about, are in the 28 walls that run across.
+    # About 10 of the 20 openings of a loop are in the 28 `across` walls.
     assert abs(inner.mean() - 0.6 * (1 - 10 / 28)) < 0.04
 
 
@@ -91,7 +91,7 @@ def test_the_share_of_walls_is_configurable() -> None:
 def test_a_maze_file_is_read_back_equal(
     tmp_path_factory: pytest.TempPathFactory, seed: int, share: float, size: tuple[int, int]
 ) -> None:
-    maze = made(seed, *size, length=4, share=share)
+    maze = maze_of(seed, *size, length=4, share=share)
     path = tmp_path_factory.getbasetemp() / "maze.txt"
     for written in (
         maze_text(maze),
@@ -115,7 +115,7 @@ def test_the_first_line_of_a_maze_file_is_the_north_wall(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
-    ("change", "where", "said"),
+    ("change", "where", "found"),
     [
         (("|   |   |\no", "|   |    \no"), "maze.txt:4:9", "gap in the east wall"),
         (("|   |   |\no", "    |   |\no"), "maze.txt:4:1", "gap in the west wall"),
@@ -128,14 +128,14 @@ def test_the_first_line_of_a_maze_file_is_the_north_wall(tmp_path: Path) -> None
     ],
 )
 def test_a_faulty_maze_file_is_refused(
-    tmp_path: Path, change: tuple[str, str], where: str, said: str, refused: Callable[..., InputError]
+    tmp_path: Path, change: tuple[str, str], where: str, found: str, refused: Callable[..., InputError]
 ) -> None:
     good = "\n\no---o---o\n|   |   |\no   o---o\n|   |   |\no---o---o\n"
     path = tmp_path / "maze.txt"
     path.write_text(good)
     read_maze(path)
     path.write_text(good.replace(*change, 1))
-    refused(lambda: read_maze(path), where, said)
+    refused(lambda: read_maze(path), where, found)
 
 
 def test_a_binary_file_is_refused(tmp_path: Path, refused: Callable[..., InputError]) -> None:
@@ -148,7 +148,7 @@ def test_a_binary_file_is_refused(tmp_path: Path, refused: Callable[..., InputEr
 
 @given(SEEDS)
 def test_boxes_are_at_the_walls_of_the_maze(seed: int) -> None:
-    maze = made(seed)
+    maze = maze_of(seed)
     boxes = wall_boxes(maze, stream(seed, "maze.heights"))
     posts = 8 * 6
     assert len(boxes.box) == maze.across.sum() + maze.along.sum() + posts
@@ -171,13 +171,13 @@ def test_boxes_are_at_the_walls_of_the_maze(seed: int) -> None:
 
 
 def test_walls_have_the_given_heights_and_posts_the_largest() -> None:
-    boxes = wall_boxes(made(0), stream(0, "maze.heights"), (0.03, 0.05, 0.04))
+    boxes = wall_boxes(maze_of(0), stream(0, "maze.heights"), (0.03, 0.05, 0.04))
     assert set(boxes.height[:-48]) == {0.03, 0.04, 0.05}
     assert set(boxes.height[-48:]) == {0.05}
 
 
 def test_boxes_have_names() -> None:
-    maze = made(0, share=1.0)
+    maze = maze_of(0, share=1.0)
     boxes = wall_boxes(maze, stream(0, "maze.heights"))
     names = [describe_box(boxes, k) for k in range(len(boxes.box))]
     assert len(set(names)) == len(names)
@@ -186,6 +186,6 @@ def test_boxes_have_names() -> None:
     assert names[int(maze.across.sum())] == "the wall west of cell (0, 0)"
 
 
-def test_cells_that_are_no_neighbours_are_a_fault_of_the_program() -> None:
+def test_cells_that_are_not_neighbours_are_a_programming_error() -> None:
     with pytest.raises(ValueError, match="not neighbours"):
-        is_open(made(0), (0, 0), (1, 1))
+        is_open(maze_of(0), (0, 0), (1, 1))

@@ -1,4 +1,4 @@
-"""Ways: circuits spell what they say, exploration stays where it can go, nothing passes a wall."""
+"""Routes: circuits follow their letters, and no route passes a wall."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def world(seed: int) -> tuple[Maze, list[tuple[int, int]]]:
 
 
 @given(st.text("CAca", min_size=1, max_size=12), st.integers(0, 1000))
-def test_each_letter_is_once_around(word: str, seed: int) -> None:
+def test_each_letter_is_one_circuit(word: str, seed: int) -> None:
     _, loop = world(seed)
     way = circuit_route(loop, word)
     assert len(way) == len(word) * len(loop) + 1
@@ -34,7 +34,7 @@ def test_each_letter_is_once_around(word: str, seed: int) -> None:
 
 
 @given(st.integers(0, 1000))
-def test_what_is_made_passes_no_wall(seed: int) -> None:
+def test_routes_pass_no_wall(seed: int) -> None:
     maze, loop = world(seed)
     check_route(maze, circuit_route(loop, "CA"))
     way = exploration_route(maze, loop[0], 300, stream(seed, "path"))
@@ -44,7 +44,7 @@ def test_what_is_made_passes_no_wall(seed: int) -> None:
         assert after != before or neighbours(maze, here) == [before]
 
 
-def test_exploration_goes_everywhere_it_can() -> None:
+def test_exploration_visits_all_reachable_cells() -> None:
     maze, loop = world(1)
     there, edge = {loop[0]}, [loop[0]]
     while edge:
@@ -54,35 +54,35 @@ def test_exploration_goes_everywhere_it_can() -> None:
 
 
 @pytest.mark.parametrize("word", ["", "CAB", "C A"])
-def test_another_word_is_refused(word: str, refused: Callable[..., InputError]) -> None:
+def test_invalid_words_are_refused(word: str, refused: Callable[..., InputError]) -> None:
     refused(lambda: circuit_route(SQUARE, word), "simulation.path.circuits", repr(word))
 
 
-def test_a_way_through_a_wall_is_named(refused: Callable[..., InputError]) -> None:
+def test_a_route_through_a_wall_is_refused_with_its_step(refused: Callable[..., InputError]) -> None:
     maze, loop = world(0)
     rows = [[(x, y) for x in range(7)] for y in range(5)]
     blocked = next([a, b] for row in rows for a, b in pairwise(row) if not is_open(maze, a, b))
-    said = f"the wall between cells {blocked[0]} and {blocked[1]}"
-    refused(lambda: check_route(maze, blocked), "simulation.path.cells[0] to [1]", said)
+    wall = f"the wall between cells {blocked[0]} and {blocked[1]}"
+    refused(lambda: check_route(maze, blocked), "simulation.path.cells[0] to [1]", wall)
     refused(lambda: check_route(maze, [(0, 0), (7, 0)]), "cells[1]", "cell (7, 0)", "columns 0 to 6")
     refused(lambda: check_route(maze, [(0, -1), (0, 0)]), "cells[0]", "cell (0, -1)", "rows 0 to 4")
     refused(lambda: check_route(maze, [(0, 0), (0, 0)]), "cells[0] to [1]", "neighbouring")
     refused(lambda: check_route(maze, [*loop[:2], loop[5]], "here"), "here[1] to [2]", "neighbouring")
 
 
-def test_there_is_no_way_out_of_a_closed_cell(refused: Callable[..., InputError]) -> None:
+def test_a_walled_in_start_is_refused(refused: Callable[..., InputError]) -> None:
     refused(
         lambda: exploration_route(closed_maze(3, 3), (1, 1), 5, stream(0, "path")), "cell (1, 1) is walled in"
     )
 
 
 @given(st.integers(0, 1000))
-def test_a_loop_is_turned_the_right_way_round(seed: int) -> None:
+def test_a_loop_is_made_anticlockwise(seed: int) -> None:
     _, loop = world(seed)
     assert make_anticlockwise(loop) == loop
     assert make_anticlockwise([loop[0], *loop[:0:-1]]) == loop
 
 
-def test_a_loop_is_four_different_cells_at_least(refused: Callable[..., InputError]) -> None:
+def test_a_loop_has_at_least_four_different_cells(refused: Callable[..., InputError]) -> None:
     refused(lambda: make_anticlockwise([*SQUARE, *SQUARE]), "simulation.path.loop", "cell (0, 0) twice")
     refused(lambda: make_anticlockwise([]), "0 cells")

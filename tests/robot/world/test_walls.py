@@ -15,7 +15,7 @@ from tactile.whiskers.head_geometry import Head, HeadConfig, RingConfig, shaft_p
 STEP = 1 / 600
 """Step of the search, as a fraction of the sweep."""
 SHARES = np.arange(1, 161) / 160
-"""Points of the shaft that are checked, as fractions of its length."""
+"""Checked points of the shaft, as fractions of its length."""
 WIDE = (RingConfig(length=0.05, radius=0.09, height=0.09), RingConfig(length=0.16, radius=0.12, height=0.17))
 HEADS = {
     "ur10": (HeadConfig(), 65.0),
@@ -36,7 +36,7 @@ def maze_of(seed: int, heights: tuple[float, ...] = (0.05,)) -> Walls:
 
 
 def search_contact(head: Head, boxes: Walls, pose: np.ndarray, sweep: float) -> tuple[np.ndarray, np.ndarray]:
-    """First protraction [W] with a point of the shaft inside a box; which points [S, W] are inside then."""
+    """First protraction [W] with a point of the shaft inside a box; the points [S, W] inside then."""
     angle = np.arange(0, sweep, sweep * STEP)
     shape = (len(angle), len(SHARES), len(head.length))
     along = SHARES[:, None] * head.length + np.zeros(shape)
@@ -74,7 +74,7 @@ def test_contact_agrees_with_the_search(name: str) -> None:
             nearest = np.where(inside, np.abs(SHARES[:, None] - reach), 1.0).min(axis=0)
             beside += nearest[met & (angle > 0)].tolist()
     assert len(late) > 10
-    # The search finds a corner that is touched for less than a step late or not at all.
+    # The search may miss a corner touched for less than a step.
     assert min(late) > -1e-9
     assert np.quantile(late, 0.95) < 0.006
     assert np.mean(missed) < 0.05
@@ -82,21 +82,21 @@ def test_contact_agrees_with_the_search(name: str) -> None:
 
 
 def test_the_tip_touches_the_top_of_a_wall_and_the_shaft_its_far_edge() -> None:
-    """Worked by hand: a 100 mm whisker at rest out, its base 100 mm over the floor on the head's axis."""
+    """By hand: a 100 mm whisker, horizontal at rest, with its base 100 mm above the floor on the axis."""
     ring = RingConfig(length=0.1, radius=1e-9, height=0.1)
     head = ur10_head(HeadConfig(rings=(ring,), whiskers=1, rest_deg=90.0, limit_deg=90.0))
 
-    def met(west: float, east: float, height: float) -> tuple[float, float]:
+    def first_contact(west: float, east: float, height: float) -> tuple[float, float]:
         boxes = Walls(np.array([[west, -0.5, east, 0.5]]), np.array([height]))
         contact = Surroundings(boxes, head).contact(np.zeros((1, 3)))
         return float(contact.angle[0, 0]), float(contact.reach[0, 0])
 
-    angle, reach = met(0.05, 0.2, 0.04)  # the tip comes down to 4 cm: cos = 0.6
+    angle, reach = first_contact(0.05, 0.2, 0.04)  # the tip descends to 4 cm: cos = 0.6
     assert (angle, reach) == pytest.approx((np.pi / 2 - np.arccos(0.6), 1.0))
-    angle, reach = met(0.02, 0.03, 0.06)  # the edge 3 cm out and 4 cm below the base
+    angle, reach = first_contact(0.02, 0.03, 0.06)  # the edge 3 cm out and 4 cm below the base
     assert (angle, reach) == pytest.approx((np.pi / 2 - np.arctan2(0.03, 0.04), 0.5))
-    assert met(0.09, 0.2, 0.04)[0] == NO_CONTACT  # the tip lands short of it
-    assert met(-0.2, -0.1, 0.04)[0] == NO_CONTACT  # behind
+    assert first_contact(0.09, 0.2, 0.04)[0] == NO_CONTACT  # beyond the tip's range
+    assert first_contact(-0.2, -0.1, 0.04)[0] == NO_CONTACT  # behind
 
 
 @settings(max_examples=30)

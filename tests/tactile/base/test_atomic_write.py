@@ -1,4 +1,4 @@
-"""Atomic writes leave the old file or the complete new one, and nothing else."""
+"""Atomic writes leave the old file or the complete new one, and no temporary file."""
 
 from pathlib import Path
 

@@ -140,9 +140,9 @@ def test_arrays_read_back_equal() -> None:
 
 @pytest.mark.parametrize("name", Calibration._fields)
 def test_missing_arrays_and_wrong_shapes_are_refused(name: str) -> None:
-    kept = calibration_arrays(calibrate(CONFIG, record()))
+    arrays = calibration_arrays(calibrate(CONFIG, record()))
     with pytest.raises(InputError, match=name):
-        calibration_from_arrays({key: value for key, value in kept.items() if key != name})
+        calibration_from_arrays({key: value for key, value in arrays.items() if key != name})
     if name != "alive":
         with pytest.raises(InputError, match=name):
-            calibration_from_arrays(kept | {name: np.zeros(7)})
+            calibration_from_arrays(arrays | {name: np.zeros(7)})

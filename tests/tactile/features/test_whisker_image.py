@@ -49,25 +49,25 @@ def test_exactly_the_whiskers_without_contact_are_0(config: ImageConfig, whisk: 
     view = whisker_image(config, HEAD, whisk)
     assert view.shape == view_shape(config, HEAD) == (3, 6, 2 if config.radial else 1)
     assert ((view >= 0) & (view <= 1)).all()
-    felt = whisk.contact if config.transform == "contact_angle" else whisk.held
+    touching = whisk.contact if config.transform == "contact_angle" else whisk.held
     dark = (view == 0).all(axis=2).reshape(18)
-    assert (dark == ~(felt & whisk.alive)).all()
+    assert (dark == ~(touching & whisk.alive)).all()
     assert ((view == 0).any(axis=2).reshape(18) == dark).all()
     assert (view[view > 0] >= MIN_BRIGHTNESS).all()
 
 
 @given(_whisks())
 def test_pixels_grow_with_the_height(whisk: Whisk) -> None:
-    for transform, felt, angle in (
+    for transform, touching, angle in (
         ("contact_angle", whisk.contact, whisk.touched),
         ("max_angle", whisk.held, whisk.highest),
     ):
         config = ImageConfig(transform=transform, tallest=0.06)
         view = whisker_image(config, HEAD, whisk).reshape(18)
         high = tip_height(HEAD, angle)
-        told = felt & whisk.alive & (high > MIN_BRIGHTNESS * 0.06) & (high < 0.06)
-        assert np.allclose(view[told] * 0.06, high[told])
-        assert (view[felt & whisk.alive & (high >= 0.06)] == 1).all()
+        graded = touching & whisk.alive & (high > MIN_BRIGHTNESS * 0.06) & (high < 0.06)
+        assert np.allclose(view[graded] * 0.06, high[graded])
+        assert (view[touching & whisk.alive & (high >= 0.06)] == 1).all()
 
 
 @given(CONFIGS, _whisks(), st.integers(0, 17))

@@ -103,7 +103,7 @@ def test_points_transform_like_poses(x: float, y: float, turn: float) -> None:
 def test_two_contacts_give_the_line_through_them_with_the_motion_between(
     angle: float, first: int, second: int, ahead: float
 ) -> None:
-    """The wall is put through the first contact; the robot then moves until the second lies on it too."""
+    """A wall through the first contact; the robot then moves until the second one is on it too."""
     normal, travel = wall_normal(angle), np.array([ahead, 0.02, 0.1])
     there = to_final_frame(POINTS, meeting(wall(1.2), travel=travel))
     travel[:2] += normal * ((there[second] - there[first]) @ normal)
@@ -155,7 +155,7 @@ def test_directions_of_flat_walls_are_within_a_degree_also_after_abort(tip: TipM
         assert found.known
         assert apart(found.direction, np.radians(angle)) < 1.5
         assert 0 < found.sd < MAX_DIRECTION_SD
-        # The wall lies where it is: touched by the first whisker's tip at first, nearer by what was driven.
+        # The wall passes through the first whisker's tip at HIT1, and is nearer by the distance driven.
         whisker = first_whisker(there)
         assert whisker is not None
         touched = wall_normal(np.radians(angle)) @ (FEELERS.base + 0.14 * FEELERS.direction)[whisker]

@@ -38,13 +38,13 @@ def templates() -> StrainTemplates:
     )
 
 
-def told(reporting: ReportFrontend, *reports: Report) -> list[Observation]:
+def observe(reporting: ReportFrontend, *reports: Report) -> list[Observation]:
     seen = [reporting.observe(one) for one in reports]
     return [one for one in seen if one is not None]
 
 
 def direction(seen: Observation) -> float:
-    """Of the wall: at right angles to the vector to its nearest point."""
+    """Direction of the wall, at right angles to the vector to its nearest point."""
     assert seen.wall
     return float(np.arctan2(seen.wall_point[1], seen.wall_point[0]) + np.pi / 2)
 
@@ -58,7 +58,7 @@ def is_blind(seen: Observation) -> bool:
 def test_contacts_have_their_contact_points(contact: list[bool], alive: list[bool]) -> None:
     reporting = ReportFrontend(ReportFrontendConfig(walls="none"))
     step = report(StepEnd.HIT1)._replace(contact=np.array(contact), alive=np.array(alive))
-    (seen,) = told(reporting, step)
+    (seen,) = observe(reporting, step)
     both = np.array(contact) & np.array(alive)
     assert seen.contact.tolist() == both.tolist()
     assert seen.alive.tolist() == alive
@@ -75,7 +75,7 @@ def test_contacts_have_their_contact_points(contact: list[bool], alive: list[boo
 @pytest.mark.parametrize("motion", [MotionKind.FORWARD, MotionKind.TURN, MotionKind.OTHER])
 def test_every_observation_has_the_motion_of_its_step(motion: MotionKind) -> None:
     odometry = Odometry(0.01, 0.02, 0.3, 0.5)
-    (seen,) = told(
+    (seen,) = observe(
         ReportFrontend(ReportFrontendConfig()), report(motion=motion, contact=(2,), odometry=odometry)
     )
     assert tuple(seen.odometry) == tuple(odometry)
@@ -85,7 +85,7 @@ def test_every_observation_has_the_motion_of_its_step(motion: MotionKind) -> Non
 
 def test_a_back_step_gives_its_motion_only() -> None:
     back = report(motion=MotionKind.BACK, contact=(0, 1), odometry=Odometry(-0.025, 0, 0, 0.5))
-    (seen,) = told(ReportFrontend(ReportFrontendConfig()), back)
+    (seen,) = observe(ReportFrontend(ReportFrontendConfig()), back)
     assert is_blind(seen)
     assert not seen.alive.any()
     assert seen.motion == MotionKind.BACK
@@ -98,7 +98,7 @@ def test_fold_back_adds_to_the_next_motion(steps: list[tuple[float, float, float
         reporting, pose, time = ReportFrontend(ReportFrontendConfig(fold_back=fold)), np.zeros(3), 0.0
         kinds = [MotionKind.BACK if back else MotionKind.TURN for *_, back in steps] + [MotionKind.FORWARD]
         moves = [Odometry(*step[:3], 0.5) for step in steps] + [Odometry(0.025, 0.0, 0.0, 0.5)]
-        seen = told(
+        seen = observe(
             reporting, *(report(motion=kind, odometry=move) for kind, move in zip(kinds, moves, strict=True))
         )
         assert len(seen) == (sum(kind != MotionKind.BACK for kind in kinds) if fold else len(kinds))
@@ -118,11 +118,11 @@ def test_walls_are_estimated_at_the_end_of_the_slow_drive(
 ) -> None:
     reporting = ReportFrontend(ReportFrontendConfig(walls=walls), templates)  # type: ignore[arg-type]
     for angle in np.radians([40.0, 70.0, 90.0, 130.0]):
-        hit, slow = told(reporting, *met(wall(angle)))
+        hit, slow = observe(reporting, *met(wall(angle)))
         assert not hit.wall
         assert apart(direction(slow), angle) < within
         assert 0.03 < slow.wall_sd < 0.15
-        # The robot is some 2 dm from it, seen from where it stands now.
+        # The robot is some 2 dm from the wall at the end of the step.
         assert 0.1 < wall_normal(angle) @ slow.wall_point < 0.3
 
 
@@ -133,27 +133,27 @@ def test_without_templates_two_contacts_give_the_wall() -> None:
         ReportFrontend(ReportFrontendConfig(walls="geometric")),
         ReportFrontend(ReportFrontendConfig()),
     )
-    _, seen = told(reporting, hit, slow)
+    _, seen = observe(reporting, hit, slow)
     assert apart(direction(seen), np.radians(85.0)) < 6
-    assert direction(told(plain, hit, slow)[1]) == direction(seen)
+    assert direction(observe(plain, hit, slow)[1]) == direction(seen)
     for other in (reporting, plain):
-        assert not told(other, hit, slow._replace(moment=int(StepEnd.ABORT)))[1].wall
+        assert not observe(other, hit, slow._replace(moment=int(StepEnd.ABORT)))[1].wall
 
 
 def test_walls_none_estimates_no_wall(templates: StrainTemplates) -> None:
-    for seen in told(ReportFrontend(ReportFrontendConfig(walls="none"), templates), *met(wall(ANGLE))):
+    for seen in observe(ReportFrontend(ReportFrontendConfig(walls="none"), templates), *met(wall(ANGLE))):
         assert not seen.wall
 
 
 def test_a_slow_drive_of_several_reports_equals_one_report(templates: StrainTemplates) -> None:
     hit, slow = met(wall(ANGLE))
-    whole = told(ReportFrontend(ReportFrontendConfig(), templates), hit, slow)[-1]
+    whole = observe(ReportFrontend(ReportFrontendConfig(), templates), hit, slow)[-1]
     cut = 700
     pieces = [
         report(StepEnd.FREE, contact=(2,), strain=slow.strain[:cut]),
         report(StepEnd(slow.moment), strain=slow.strain[cut:])._replace(contact=slow.contact),
     ]
-    parts = told(ReportFrontend(ReportFrontendConfig(), templates), hit, *pieces)
+    parts = observe(ReportFrontend(ReportFrontendConfig(), templates), hit, *pieces)
     assert [bool(one.wall) for one in parts] == [False, False, True]
     np.testing.assert_allclose(parts[-1].wall_point, whole.wall_point, atol=1e-9)
 
@@ -163,13 +163,13 @@ def test_without_hit1_there_is_no_wall(templates: StrainTemplates) -> None:
     hit, slow = met(wall(ANGLE))
     free, turn = report(), report(motion=MotionKind.TURN)
     back = report(motion=MotionKind.BACK)
-    assert not told(reporting, slow)[0].wall
+    assert not observe(reporting, slow)[0].wall
     for between in (turn, back):
-        assert not told(reporting, hit, between, slow)[-1].wall
-    assert not told(reporting, hit, slow, slow)[-1].wall
-    # A second session with the same reports, after any others, says the same.
-    again = told(reporting, free, turn, back, hit, slow)[-1]
-    np.testing.assert_array_equal(again.wall_point, told(reporting, hit, slow)[-1].wall_point)
+        assert not observe(reporting, hit, between, slow)[-1].wall
+    assert not observe(reporting, hit, slow, slow)[-1].wall
+    # The same reports give the same result after any other reports.
+    again = observe(reporting, free, turn, back, hit, slow)[-1]
+    np.testing.assert_array_equal(again.wall_point, observe(reporting, hit, slow)[-1].wall_point)
 
 
 def test_whiskers_with_nan_do_not_affect_others(templates: StrainTemplates) -> None:
@@ -178,17 +178,17 @@ def test_whiskers_with_nan_do_not_affect_others(templates: StrainTemplates) -> N
     broken[100, 0], broken[200, 1] = np.nan, np.inf
     for walls in ("fused", "template"):
         reporting = ReportFrontend(ReportFrontendConfig(walls=walls), templates)
-        seen = told(reporting, hit, slow._replace(strain=broken))[-1]
+        seen = observe(reporting, hit, slow._replace(strain=broken))[-1]
         assert apart(direction(seen), ANGLE) < 1.5
         broken_all = slow._replace(strain=slow.strain * np.nan)
-        assert not told(reporting, hit, broken_all)[-1].wall
+        assert not observe(reporting, hit, broken_all)[-1].wall
     lost = slow._replace(odometry=Odometry(np.nan, 0.0, 0.0, 1.0))
-    assert not told(ReportFrontend(ReportFrontendConfig(), templates), hit, lost)[-1].wall
+    assert not observe(ReportFrontend(ReportFrontendConfig(), templates), hit, lost)[-1].wall
 
 
 def test_observations_stack(templates: StrainTemplates) -> None:
     reports = [report(), *met(wall(ANGLE)), report(motion=MotionKind.BACK), report(motion=MotionKind.TURN)]
-    chunk = stack(told(ReportFrontend(ReportFrontendConfig(), templates), *reports))
+    chunk = stack(observe(ReportFrontend(ReportFrontendConfig(), templates), *reports))
     assert chunk.view.shape == (5, 1, 4, 1)
     assert chunk.point.shape == (5, 4, 2)
     for part in chunk[1:]:
@@ -205,10 +205,10 @@ def test_other_whiskers_and_sample_rates_are_refused(templates: StrainTemplates,
     path = tmp_path / "kept.npz"
     write_templates(templates, path)
     hit, slow = met(wall(ANGLE))
-    kept = ReportFrontend(ReportFrontendConfig(templates=path))
-    assert told(kept, hit, slow)[-1].wall
+    frontend = ReportFrontend(ReportFrontendConfig(templates=path))
+    assert observe(frontend, hit, slow)[-1].wall
     half = slow._replace(strain=slow.strain[::2], time=slow.time[::2])
     with pytest.raises(InputError, match="1000 samples per second; expected 2000"):
-        told(kept, hit, half)
+        observe(frontend, hit, half)
     with pytest.raises(ValueError, match="contact_radius"):
         ReportFrontendConfig(contact_radius=0.2)

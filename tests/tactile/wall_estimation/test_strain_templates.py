@@ -46,7 +46,7 @@ def templates() -> StrainTemplates:
 def test_the_papers_fifteen_angles(templates: StrainTemplates) -> None:
     np.testing.assert_allclose(np.degrees(templates.angle), np.arange(20, 161, 10))
     assert templates.mean.shape == (15, 4000, 4, 2)
-    # What is told of the noise is that of one filtered drive, not of the mean of four.
+    # The noise is that of one filtered drive, not of the mean of four.
     quiet = np.std(filter_strain(TRAINING, 4e-6 * stream(1, "noise").standard_normal((4000, 4, 2)))[400:])
     np.testing.assert_allclose(np.median(templates.spread), quiet, rtol=0.08)
 
@@ -83,7 +83,7 @@ def test_every_drive_matches_its_own_template(templates: StrainTemplates) -> Non
         assert match.winner == k
         assert match.angle == angle
         assert match.relative < 0.03
-        # Eq. 5: a mean over the samples so far of the sum over channels.
+        # Eq. 5: the mean over the samples so far of the sum over channels.
         by_hand = [((read[:1600] - mean[:1600]) ** 2).sum() / 1600 for mean in templates.mean]
         np.testing.assert_allclose(match.error, by_hand)
 
@@ -130,14 +130,14 @@ def _plain_array(path: Path) -> None:
         np.save(file, np.zeros(3))
 
 
-def _cut(path: Path) -> None:
+def _truncated_file(path: Path) -> None:
     write_templates(train_templates(DRIVES), path)
     path.write_bytes(path.read_bytes()[:9999])
 
 
-def _unfit(path: Path) -> None:
-    kept = train_templates(DRIVES)
-    write_templates(kept._replace(mean=kept.mean[:14]), path)
+def _other_shape(path: Path) -> None:
+    templates = train_templates(DRIVES)
+    write_templates(templates._replace(mean=templates.mean[:14]), path)
 
 
 @pytest.mark.parametrize(
@@ -150,8 +150,8 @@ def _unfit(path: Path) -> None:
         _plain_array,
         lambda path: path.mkdir(),
         _other_version,
-        _cut,
-        _unfit,
+        _truncated_file,
+        _other_shape,
     ],
 )
 def test_other_files_are_refused(make: object, tmp_path: Path) -> None:
@@ -164,15 +164,15 @@ def test_other_files_are_refused(make: object, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda kept: [], "no drives"),
-        (lambda kept: kept[1:], "too few drives: 3 at 20 degrees; expected 4"),
-        (lambda kept: [one for one in kept if one.repeat or one.angle < 2], "3 at 120 degrees, 3 at 130"),
-        (lambda kept: kept[4:], "0 at 20 degrees"),
-        (lambda kept: [kept[0]._replace(rate=1000.0), *kept[1:]], r"1000 samples per second; expected 2000"),
-        (lambda kept: [kept[0]._replace(strain=kept[0].strain[:3800]), *kept[1:]], r"drive 0 at 20.*1\.9 s"),
-        (lambda kept: [kept[0]._replace(strain=kept[0].strain * np.nan), *kept[1:]], "NaN samples"),
-        (lambda kept: [*kept, kept[0]._replace(angle=0.4)], "not one of the training angles"),
-        (lambda kept: [*kept, kept[0]._replace(strain=kept[0].strain[:, :3])], r"\(4000, 3, 2\)"),
+        (lambda runs: [], "no drives"),
+        (lambda runs: runs[1:], "too few drives: 3 at 20 degrees; expected 4"),
+        (lambda runs: [one for one in runs if one.repeat or one.angle < 2], "3 at 120 degrees, 3 at 130"),
+        (lambda runs: runs[4:], "0 at 20 degrees"),
+        (lambda runs: [runs[0]._replace(rate=1000.0), *runs[1:]], r"1000 samples per second; expected 2000"),
+        (lambda runs: [runs[0]._replace(strain=runs[0].strain[:3800]), *runs[1:]], r"drive 0 at 20.*1\.9 s"),
+        (lambda runs: [runs[0]._replace(strain=runs[0].strain * np.nan), *runs[1:]], "NaN samples"),
+        (lambda runs: [*runs, runs[0]._replace(angle=0.4)], "not one of the training angles"),
+        (lambda runs: [*runs, runs[0]._replace(strain=runs[0].strain[:, :3])], r"\(4000, 3, 2\)"),
     ],
 )
 def test_unfit_drives_are_refused(change: object, message: str) -> None:

@@ -84,8 +84,8 @@ def test_the_papers_head() -> None:
     assert head.shape == (3, 6)
     assert np.allclose(head.length.reshape(3, 6), [[0.05], [0.11], [0.16]])
     lowest = tip_height(head, np.full(18, np.radians(65.0)))
-    assert (lowest > 0).all()  # no whisker meets the floor
-    assert (tip_height(head, np.zeros(18)) > 0.05).all()  # at rest they are above the walls
+    assert (lowest > 0).all()  # above the floor
+    assert (tip_height(head, np.zeros(18)) > 0.05).all()  # above the walls at rest
 
 
 def test_dead_whiskers_are_named_by_number() -> None:

@@ -24,8 +24,8 @@ THRESHOLD = np.full(18, 0.04)
 MODES = st.sampled_from(["open", "rcp", "spread"])
 
 
-def driven(config: WhiskingConfig, y: np.ndarray, rate: float = 2000.0) -> np.ndarray:
-    """[T, ..., W] what is commanded over one cycle of deflections [T, ..., W]."""
+def run_cycle(config: WhiskingConfig, y: np.ndarray, rate: float = 2000.0) -> np.ndarray:
+    """Commanded protractions [T, ..., W] over one cycle of deflections [T, ..., W]."""
     drive, angles = initial_drive(*y.shape[1:]), []
     for k in range(len(y)):
         angle, drive = whisk_command(config, drive, k / rate, y[k], THRESHOLD, SHAPE)
@@ -42,7 +42,7 @@ def touch(whisker: int, size: float, count: int = 1000, since: int = 200) -> np.
 @given(MODES, st.floats(0, 1), st.integers(0, 17))
 def test_contact_changes_only_the_amplitude(mode: str, size: float, whisker: int) -> None:
     config = WhiskingConfig(mode=mode)
-    angles = driven(config, touch(whisker, size, count=100, since=10), rate=200.0)
+    angles = run_cycle(config, touch(whisker, size, count=100, since=10), rate=200.0)
     free = np.radians(config.amplitude_deg) * whisk_phase(config, np.arange(100) / 200.0)[:, None]
     assert (angles[0] == 0).all()
     assert (angles >= 0).all()
@@ -53,13 +53,13 @@ def test_contact_changes_only_the_amplitude(mode: str, size: float, whisker: int
 def test_below_the_threshold_nothing_changes(mode: str, size: float) -> None:
     config = WhiskingConfig(mode=mode)
     free = np.radians(config.amplitude_deg) * whisk_phase(config, np.arange(100) / 200.0)
-    np.testing.assert_allclose(driven(config, touch(3, -size, 100, 10), 200.0)[:, 3], free, atol=1e-12)
+    np.testing.assert_allclose(run_cycle(config, touch(3, -size, 100, 10), 200.0)[:, 3], free, atol=1e-12)
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_the_reduction_is_gain_times_deflection_above_threshold(sign: int) -> None:
     config = WhiskingConfig(gain=2.0)
-    top = driven(config, touch(4, sign * 0.1))[-1] / whisk_phase(config, 999 / 2000)
+    top = run_cycle(config, touch(4, sign * 0.1))[-1] / whisk_phase(config, 999 / 2000)
     np.testing.assert_allclose(np.radians(65) - top[4], 2.0 * 0.06, rtol=1e-6)
     np.testing.assert_allclose(np.delete(top, 4), np.radians(65))
 
@@ -68,7 +68,7 @@ def test_the_amplitude_stays_reduced_until_the_cycle_ends() -> None:
     config = WhiskingConfig()
     y = touch(0, 0.1)
     y[400:] = 0
-    assert driven(config, y)[-1, 0] < np.radians(65) - 0.2
+    assert run_cycle(config, y)[-1, 0] < np.radians(65) - 0.2
     drive = initial_drive(18)
     for time in (*np.arange(0, 1, 0.005), 0.0, 0.5):
         angle, drive = whisk_command(
@@ -79,8 +79,8 @@ def test_the_amplitude_stays_reduced_until_the_cycle_ends() -> None:
 
 def test_the_perturbation_is_the_same_at_any_sample_rate() -> None:
     config = WhiskingConfig()
-    coarse = driven(config, touch(0, 0.2, 500, 100), 1000.0)[::5]
-    fine = driven(config, touch(0, 0.2, 2000, 400), 4000.0)[::20]
+    coarse = run_cycle(config, touch(0, 0.2, 500, 100), 1000.0)[::5]
+    fine = run_cycle(config, touch(0, 0.2, 2000, 400), 4000.0)[::20]
     np.testing.assert_allclose(coarse, fine, atol=0.02)
 
 
@@ -88,15 +88,15 @@ def test_a_batch_of_heads_equals_single_calls() -> None:
     y = np.abs(stream(0, "y").standard_normal((100, 3, 18))) * 0.1
     for mode in ("open", "rcp", "spread"):
         config = WhiskingConfig(mode=mode)
-        together = driven(config, y, 200.0)
-        apart = np.stack([driven(config, y[:, k], 200.0) for k in range(3)], axis=1)
+        together = run_cycle(config, y, 200.0)
+        apart = np.stack([run_cycle(config, y[:, k], 200.0) for k in range(3)], axis=1)
         assert np.array_equal(together, apart)
 
 
 @given(st.integers(0, 17), st.floats(0, 1))
 def test_free_neighbours_follow_by_the_configured_share(whisker: int, follow: float) -> None:
     config = WhiskingConfig(mode="spread", follow=follow)
-    top = driven(config, touch(whisker, 0.1, 60, 10), 120.0)[-1]
+    top = run_cycle(config, touch(whisker, 0.1, 60, 10), 120.0)[-1]
     loss = np.radians(65) * whisk_phase(config, 59 / 120) - top
     row, column = divmod(whisker, 6)
     near = {row * 6 + (column + 1) % 6, row * 6 + (column - 1) % 6, *(r * 6 + column for r in range(3))}

@@ -16,10 +16,10 @@ from robot.emulators.create import CreateEmulatorConfig, EmulatedCreate
 
 
 class Line:
-    """A port without a wire: what is written reaches the robot at once, replies come as `mangle` leaves them.
+    """A serial port in memory: commands reach the robot at once, `mangle` changes its replies.
 
     Attributes:
-        now: s, its clock; waiting for bytes that do not come lets it go on.
+        now: its clock, s; a read that times out advances it.
     """
 
     def __init__(self) -> None:
@@ -55,7 +55,7 @@ class Line:
         return len(data)
 
     def arrive(self, data: bytes) -> None:
-        """Bytes come by themselves."""
+        """Makes bytes arrive without a query."""
         self._waiting += data
 
     def close(self) -> None: ...
@@ -65,7 +65,7 @@ class Line:
             raise OSError(5, "Input/output error")
 
     def control_loop(self, **settings: Any) -> ControlLoop:
-        """A pilot of this robot, awake and in safe mode."""
+        """A control loop of this robot, which is awake and in safe mode."""
         link = SerialLink(self)
         for command in (START, SAFE):
             link.send(command)
@@ -75,7 +75,7 @@ class Line:
 
 
 class Emulated:
-    """The emulator's process."""
+    """A process of the emulator."""
 
     def __init__(self, *arguments: str) -> None:
         self.process = subprocess.Popen(

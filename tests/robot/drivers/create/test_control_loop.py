@@ -24,25 +24,25 @@ def rolls(robot: EmulatedCreate) -> bool:
     return bool(robot.right or robot.left)
 
 
-def drive(line: Line, pilot: ControlLoop, seconds: float, forward: float, turn: float = 0.0) -> None:
-    """Drives on for so long; a driver that is refused goes on trying."""
+def drive(line: Line, loop: ControlLoop, seconds: float, forward: float, turn: float = 0.0) -> None:
+    """Polls and steers for some seconds; refused commands are repeated."""
     for _ in range(round(seconds / PERIOD)):
         try:
-            pilot.steer(forward, turn)
+            loop.steer(forward, turn)
         except CommandRefused:
-            assert pilot.halted
-        pilot.poll()
+            assert loop.halted
+        loop.poll()
         line.wait(PERIOD)
 
 
 @given(st.floats(0.01, 0.5), st.lists(st.tuples(NUMBER, NUMBER), max_size=10))
 def test_speeds_above_the_limit_are_not_sent(cap: float, wanted: list[tuple[float, float]]) -> None:
     line = Line()
-    pilot = line.control_loop(speed=cap)
+    loop = line.control_loop(speed=cap)
     for forward, turn in wanted:
         with contextlib.suppress(CommandRefused):
-            pilot.steer(forward, turn)
-        pilot.poll()
+            loop.steer(forward, turn)
+        loop.poll()
         line.wait(PERIOD)
     assert len(line.robot.drives) == len(wanted)
     assert all(max(abs(right), abs(left)) <= 1000 * cap + 1e-6 for _, right, left in line.robot.drives)
@@ -50,71 +50,71 @@ def test_speeds_above_the_limit_are_not_sent(cap: float, wanted: list[tuple[floa
 
 def test_a_command_that_is_not_renewed_ends() -> None:
     line = Line()
-    pilot = line.control_loop(patience=0.5)
-    pilot.steer(0.1, 0.0)
+    loop = line.control_loop(patience=0.5)
+    loop.steer(0.1, 0.0)
     rolled = []
     for _ in range(20):
-        pilot.poll()
+        loop.poll()
         rolled.append(rolls(line.robot))
         line.wait(PERIOD)
     assert rolled == [True] * rolled.count(True) + [False] * rolled.count(False)
     assert 0.4 <= PERIOD * rolled.count(True) <= 0.6
-    assert pilot.halted is None
-    drive(line, pilot, 0.2, 0.1)
+    assert loop.halted is None
+    drive(line, loop, 0.2, 0.1)
     assert rolls(line.robot)
 
 
 def test_a_bump_stops_forward_motion_only() -> None:
     line = Line()
-    pilot = line.control_loop()
-    drive(line, pilot, 0.5, 0.1)
+    loop = line.control_loop()
+    drive(line, loop, 0.5, 0.1)
     line.robot.touch(protocol.Bumps.LEFT)
-    pilot.poll()
+    loop.poll()
     assert not rolls(line.robot)
-    assert pilot.halted
-    assert pilot.halted.halt is StopReason.BUMPED
-    assert "left" in str(pilot.halted)
+    assert loop.halted
+    assert loop.halted.halt is StopReason.BUMPED
+    assert "left" in str(loop.halted)
     with pytest.raises(CommandRefused, match="bumped"):
-        pilot.steer(-0.1, 0.0)
-    pilot.release()
-    drive(line, pilot, 0.5, -0.1)
+        loop.steer(-0.1, 0.0)
+    loop.release()
+    drive(line, loop, 0.5, -0.1)
     assert line.robot.right == -100
     before = len(line.robot.drives)
-    drive(line, pilot, 0.5, 0.1)  # still pressed: not by a millimetre
+    drive(line, loop, 0.5, 0.1)  # still pressed: no motion
     assert all(right + left <= 0 for _, right, left in line.robot.drives[before:])
-    assert pilot.halted is not None
+    assert loop.halted is not None
 
 
 @pytest.mark.parametrize("forward", [0.1, -0.1, 0.0])
 @pytest.mark.parametrize("dropped", [protocol.Bumps.DROPPED_LEFT, protocol.Bumps.DROPPED_CASTER])
 def test_a_dropped_wheel_stops_the_robot_until_it_stands(dropped: protocol.Bumps, forward: float) -> None:
     line = Line()
-    pilot = line.control_loop()
-    drive(line, pilot, 0.2, forward, 0.2)
+    loop = line.control_loop()
+    drive(line, loop, 0.2, forward, 0.2)
     line.robot.touch(dropped)
-    drive(line, pilot, 0.2, forward, 0.2)
-    assert pilot.halted
-    assert pilot.halted.halt is StopReason.WHEEL_DROP
-    pilot.release()
-    drive(line, pilot, 0.2, forward, 0.2)
-    assert pilot.halted is not None  # it hangs still
+    drive(line, loop, 0.2, forward, 0.2)
+    assert loop.halted
+    assert loop.halted.halt is StopReason.WHEEL_DROP
+    loop.release()
+    drive(line, loop, 0.2, forward, 0.2)
+    assert loop.halted is not None  # the wheel still hangs
     line.robot.touch(protocol.Bumps(0))
-    pilot.release()
-    drive(line, pilot, 0.2, forward, 0.2)
+    loop.release()
+    drive(line, loop, 0.2, forward, 0.2)
     assert rolls(line.robot)
 
 
 def test_safe_mode_is_entered_again_by_release_only() -> None:
     line = Line()
-    pilot = line.control_loop()
-    drive(line, pilot, 0.2, 0.1)
+    loop = line.control_loop()
+    drive(line, loop, 0.2, 0.1)
     line.robot.touch(protocol.Bumps(0), cliff=True)
-    drive(line, pilot, 1.0, 0.1)
-    assert pilot.halted
-    assert pilot.halted.halt is StopReason.LEFT_SAFE_MODE
+    drive(line, loop, 1.0, 0.1)
+    assert loop.halted
+    assert loop.halted.halt is StopReason.LEFT_SAFE_MODE
     assert line.robot.mode == protocol.Mode.PASSIVE
-    pilot.release()
-    drive(line, pilot, 0.2, 0.1)
+    loop.release()
+    drive(line, loop, 0.2, 0.1)
     assert line.robot.mode == protocol.Mode.SAFE
     assert rolls(line.robot)
 
@@ -130,41 +130,41 @@ def _garbled(reply: bytes) -> bytes:
 @pytest.mark.parametrize(("mangle", "halt"), [(_lost, StopReason.SILENT), (_garbled, StopReason.GARBLED)])
 def test_a_lost_link_stops_the_wheels(mangle: Callable[[bytes], bytes], halt: StopReason) -> None:
     line = Line()
-    pilot = line.control_loop(silence=0.3)
-    drive(line, pilot, 0.5, 0.1)
+    loop = line.control_loop(silence=0.3)
+    drive(line, loop, 0.5, 0.1)
     line.mangle, since = mangle, line.now
     while rolls(line.robot):
         assert line.now - since <= 0.3 + 0.1 + 2 * PERIOD
-        drive(line, pilot, PERIOD, 0.1)
-    assert pilot.halted
-    assert pilot.halted.halt is halt
+        drive(line, loop, PERIOD, 0.1)
+    assert loop.halted
+    assert loop.halted.halt is halt
     line.mangle = lambda reply: reply
-    drive(line, pilot, 0.5, 0.1)
-    assert not rolls(line.robot)  # nothing resumes by itself
-    pilot.release()
-    drive(line, pilot, 0.5, 0.1)
+    drive(line, loop, 0.5, 0.1)
+    assert not rolls(line.robot)  # no automatic restart
+    loop.release()
+    drive(line, loop, 0.5, 0.1)
     assert rolls(line.robot)
 
 
 def test_an_unplugged_port_is_final() -> None:
     line = Line()
-    pilot = line.control_loop()
-    drive(line, pilot, 0.2, 0.1)
+    loop = line.control_loop()
+    drive(line, loop, 0.2, 0.1)
     line.gone = True
-    drive(line, pilot, 0.2, 0.1)
-    assert pilot.halted
-    assert pilot.halted.halt is StopReason.UNPLUGGED
+    drive(line, loop, 0.2, 0.1)
+    assert loop.halted
+    assert loop.halted.halt is StopReason.UNPLUGGED
     with pytest.raises(CommandRefused, match="unplugged"):
-        pilot.release()
+        loop.release()
 
 
 @given(
     st.lists(st.sampled_from(["in time", "late", "behind"]), min_size=1, max_size=30), st.floats(-0.2, 0.2)
 )
 def test_a_late_reply_loses_nothing(fates: list[str], forward: float) -> None:
-    """`late`: it arrives before the next query; `behind`: after it, just before the next reply."""
+    """`late`: the reply arrives before the next query; `behind`: after it, just before the next reply."""
     line = Line()
-    pilot = line.control_loop(silence=5.0)
+    loop = line.control_loop(silence=5.0)
     late, behind = [], []
 
     def mangle(reply: bytes) -> bytes:
@@ -179,16 +179,16 @@ def test_a_late_reply_loses_nothing(fates: list[str], forward: float) -> None:
 
     line.mangle = mangle
     while fates:
-        drive(line, pilot, PERIOD, forward)
+        drive(line, loop, PERIOD, forward)
         while late:
             line.arrive(late.pop(0))
     for _ in range(3):
-        pilot.poll()
-    total = pilot.take_odometry()
+        loop.poll()
+    total = loop.take_odometry()
     assert abs(1000 * (total.dx - line.robot.base.travelled)) < 1 + 1e-6
-    assert pilot.counts.stray == 0
-    assert pilot.counts.lost == pilot.counts.late
-    assert not pilot.gap()
+    assert loop.counts.stray == 0
+    assert loop.counts.lost == loop.counts.late
+    assert not loop.gap()
 
 
 @given(
@@ -208,7 +208,7 @@ def test_garbage_costs_only_the_replies_that_it_damages(
     noise: list[tuple[str, bytes] | None], forward: float
 ) -> None:
     line = Line()
-    pilot = line.control_loop(silence=5.0)
+    loop = line.control_loop(silence=5.0)
     pending = [*noise, *[None] * 3]
 
     def mangle(reply: bytes) -> bytes:
@@ -218,69 +218,69 @@ def test_garbage_costs_only_the_replies_that_it_damages(
     line.mangle = mangle
     spoilt, steps = 0.0, []
     while pending:
-        before, lost = line.robot.base.travelled, pilot.counts.lost
-        drive(line, pilot, PERIOD, forward)
+        before, lost = line.robot.base.travelled, loop.counts.lost
+        drive(line, loop, PERIOD, forward)
         steps.append(abs(line.robot.base.travelled - before))
-        if pilot.counts.lost > lost:  # what it told is of the time since the reading before
+        if loop.counts.lost > lost:  # it covered the time since the previous reading
             spoilt += sum(steps[-2:])
         pending.pop(0)
-    pilot.poll()
-    missing = line.robot.base.travelled - pilot.take_odometry().dx
+    loop.poll()
+    missing = line.robot.base.travelled - loop.take_odometry().dx
     assert abs(missing) <= spoilt + 1e-3 + 1e-9
-    assert pilot.gap() == (pilot.counts.lost > 0)
+    assert loop.gap() == (loop.counts.lost > 0)
     assert math.copysign(1, missing) == math.copysign(1, forward) or abs(missing) <= 1e-3 + 1e-9
 
 
 @given(st.integers(1, 40), st.sampled_from([b"\xff", b"\0"]), st.floats(-0.2, 0.2))
-@example(4, b"\xff", 0.125)  # noise and the way of 3 mm look like a reply of full mode
+@example(4, b"\xff", 0.125)  # noise and a motion of 3 mm look like a reply of full mode
 def test_garbage_before_a_reply_costs_nothing(count: int, noise: bytes, forward: float) -> None:
     line = Line()
-    pilot = line.control_loop()
+    loop = line.control_loop()
     line.mangle = lambda reply: noise * count + reply
-    drive(line, pilot, 1.0, forward)
-    drive(line, pilot, 0.1, 0.0)
-    assert pilot.halted is None
-    assert not pilot.gap()
-    assert pilot.counts.stray == count * pilot.counts.good - count  # the first came undisturbed
-    assert abs(1000 * (pilot.take_odometry().dx - line.robot.base.travelled)) < 1 + 1e-6
+    drive(line, loop, 1.0, forward)
+    drive(line, loop, 0.1, 0.0)
+    assert loop.halted is None
+    assert not loop.gap()
+    assert loop.counts.stray == count * loop.counts.good - count  # the first reply is undisturbed
+    assert abs(1000 * (loop.take_odometry().dx - line.robot.base.travelled)) < 1 + 1e-6
 
 
 def test_a_command_given_during_a_read_is_checked() -> None:
     line = Line()
-    pilot = line.control_loop()
+    loop = line.control_loop()
     line.robot.touch(protocol.Bumps.RIGHT)
 
     def mangle(reply: bytes) -> bytes:
-        pilot.steer(0.1, 0.0)
+        loop.steer(0.1, 0.0)
         return reply
 
     line.mangle = mangle
-    pilot.poll()
-    assert pilot.halted
+    loop.poll()
+    assert loop.halted
     assert not rolls(line.robot)
 
 
 def test_commands_from_before_a_stop_are_dropped() -> None:
     line = Line()
-    pilot = line.control_loop()
-    drive(line, pilot, 0.5, 0.1)
+    loop = line.control_loop()
+    drive(line, loop, 0.5, 0.1)
     line.robot.touch(protocol.Bumps.RIGHT)
-    pilot.poll()
+    loop.poll()
     line.robot.touch(protocol.Bumps(0))
-    pilot.release()
+    loop.release()
     for _ in range(3):
         line.wait(PERIOD)
-        pilot.poll()
+        loop.poll()
         assert not rolls(line.robot)
-    assert pilot.halted is None
+    assert loop.halted is None
 
 
 def test_a_reply_followed_by_noise_is_rejected() -> None:
     line = Line()
-    pilot = line.control_loop()
-    drive(line, pilot, 0.2, 0.1)
-    assert not pilot.gap()
+    loop = line.control_loop()
+    drive(line, loop, 0.2, 0.1)
+    assert not loop.gap()
     line.arrive(b"\0\0\0")
-    drive(line, pilot, 0.2, 0.1)
-    assert pilot.gap()
-    assert not pilot.gap()
+    drive(line, loop, 0.2, 0.1)
+    assert loop.gap()
+    assert not loop.gap()

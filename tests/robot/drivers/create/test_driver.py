@@ -35,25 +35,25 @@ def emulated() -> Iterator[Emulated]:
 
 
 def create(emulated: Emulated, **settings: float) -> CreateDriver:
-    """Its driver; more patient with replies than usual, for the machine may be busy."""
+    """A driver with longer time limits than usual, since the machine may be busy."""
     return CreateDriver(CreateConfig(port=emulated.path, **{"silence": 5.0, "patience": 5.0, **settings}))
 
 
-def renewed(driver: CreateDriver, seconds: float, forward: float, turn: float = 0.0) -> None:
+def drive_for(driver: CreateDriver, seconds: float, forward: float, turn: float = 0.0) -> None:
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         driver.drive(forward, turn)
         time.sleep(0.05)
 
 
-def polled(driver: CreateDriver) -> None:
-    """Drives on until two more replies were good or lost."""
+def drive_and_poll(driver: CreateDriver) -> None:
+    """Drives until two more replies are good or lost."""
     before = driver.counts.good + driver.counts.lost
     until(lambda: driver.drive(0.1, 0.0) or driver.counts.good + driver.counts.lost >= before + 2)
 
 
-def settled(driver: CreateDriver) -> None:
-    """Stands, and its last millimetres are read."""
+def stop_and_read(driver: CreateDriver) -> None:
+    """Stops and reads the last millimetres."""
     driver.stop()
     good = driver.counts.good
     until(lambda: driver.counts.good > good + 1)
@@ -63,27 +63,27 @@ def test_odometry_is_accurate_to_the_quantisation(emulated: Emulated) -> None:
     with create(emulated) as driver:
         total = 0.0
         for forward, turn in ((0.15, 0.0), (0.1, 0.5), (0.0, -0.8), (-0.1, 0.0)):
-            renewed(driver, 0.4, forward, turn)
+            drive_for(driver, 0.4, forward, turn)
             total += driver.odometry().dtheta
-        settled(driver)
+        stop_and_read(driver)
         last = driver.odometry()
         truth = emulated.do("state")
         assert driver.halted is None
     assert abs(total + last.dtheta - truth["turned"]) < math.radians(1) + 1e-6
-    assert truth["unknown"] <= 4  # zeros of a stop in any circumstance
+    assert truth["unknown"] <= 4  # zero bytes of `STOP_ANYHOW`
     assert emulated.do("state")["mode"] == "PASSIVE"
 
 
 def test_a_straight_line_is_measured_to_the_millimetre(emulated: Emulated) -> None:
     with create(emulated) as driver:
-        renewed(driver, 0.8, 0.2)
-        settled(driver)
-        told = driver.odometry()
+        drive_for(driver, 0.8, 0.2)
+        stop_and_read(driver)
+        odometry = driver.odometry()
         truth = emulated.do("state")
-    assert abs(told.dx - truth["x"]) < 1e-3 + 1e-9
-    assert told.dy == told.dtheta == 0
+    assert abs(odometry.dx - truth["x"]) < 1e-3 + 1e-9
+    assert odometry.dy == odometry.dtheta == 0
     assert truth["x"] > 0.1
-    assert told.dt > 0.8
+    assert odometry.dt > 0.8
 
 
 def test_speeds_above_the_limit_are_not_sent(emulated: Emulated) -> None:
@@ -109,7 +109,7 @@ def test_the_robot_stops_without_further_commands(emulated: Emulated) -> None:
 
 def test_a_bump_stops_the_robot(emulated: Emulated) -> None:
     with create(emulated) as driver:
-        renewed(driver, 0.2, 0.1)
+        drive_for(driver, 0.2, 0.1)
         emulated.do("bump")
         until(lambda: driver.halted)
         until(lambda: emulated.do("state")["wheels"] == [0, 0])
@@ -122,8 +122,8 @@ def test_a_bump_stops_the_robot(emulated: Emulated) -> None:
 def test_replies_may_arrive_in_pieces(emulated: Emulated) -> None:
     with create(emulated) as driver:
         emulated.do("trickle", seconds=0.004)
-        renewed(driver, 0.6, 0.2)
-        settled(driver)
+        drive_for(driver, 0.6, 0.2)
+        stop_and_read(driver)
         assert abs(driver.odometry().dx - emulated.do("state")["x"]) < 1e-3 + 1e-9
 
 
@@ -131,23 +131,23 @@ def test_driving_continues_after_garbage_and_cut_replies(emulated: Emulated) -> 
     with create(emulated) as driver:
         for count in range(6):
             emulated.do("garbage", bytes=7 * count + 1)
-            polled(driver)
+            drive_and_poll(driver)
             emulated.do("cut", bytes=count)
-            polled(driver)
-        settled(driver)
-        told, truth, counts = driver.odometry(), emulated.do("state"), driver.counts
+            drive_and_poll(driver)
+        stop_and_read(driver)
+        odometry, truth, counts = driver.odometry(), emulated.do("state"), driver.counts
         assert driver.halted is None
         assert driver.gap()
     assert counts.lost >= 6
     assert counts.stray > 0
-    assert told.dx <= truth["x"] + 1e-3  # by how much less: test_control_loop.py
+    assert odometry.dx <= truth["x"] + 1e-3  # test_control_loop.py limits the difference
 
 
 def test_unplugged_while_driving(emulated: Emulated) -> None:
     driver = create(emulated)
     driver.start()
     try:
-        renewed(driver, 0.2, 0.1)
+        drive_for(driver, 0.2, 0.1)
         emulated.do("unplug")
         until(lambda: driver.halted)
         assert driver.halted
@@ -165,7 +165,7 @@ def test_unplugged_while_driving(emulated: Emulated) -> None:
 
 def test_switched_off_while_driving(emulated: Emulated) -> None:
     with create(emulated, silence=1.0) as driver:
-        renewed(driver, 0.2, 0.1)
+        drive_for(driver, 0.2, 0.1)
         emulated.do("off")
         until(lambda: driver.halted)
         assert driver.halted
@@ -193,7 +193,7 @@ def test_the_watchdog_stops_a_killed_or_hanging_program(emulated: Emulated, how:
         until(lambda: emulated.do("state")["wheels"] == [0, 0])
         drives = len(emulated.do("state")["drives"])
         time.sleep(0.3)
-        assert len(emulated.do("state")["drives"]) == drives  # said once, and by the guard
+        assert len(emulated.do("state")["drives"]) == drives  # one stop, by the watchdog
     finally:
         process.kill()
         process.wait()
@@ -228,9 +228,9 @@ def test_a_second_program_is_refused(emulated: Emulated) -> None:
     with create(emulated) as driver:
         with pytest.raises(NoPort, match="another program"):
             CreateDriver(CreateConfig(port=emulated.path)).start()
-        renewed(driver, 0.2, 0.1)
+        drive_for(driver, 0.2, 0.1)
         assert driver.halted is None
-    with create(emulated) as driver:  # and one after the other they do
+    with create(emulated) as driver:  # the port is free again
         assert driver.halted is None
 
 

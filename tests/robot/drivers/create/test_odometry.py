@@ -20,37 +20,37 @@ LEGS = st.lists(LEG, min_size=1, max_size=12)
 
 
 def readings(legs: list[tuple[int, int, float, int]]) -> tuple[EmulatedCreate, list[tuple[int, int, float]]]:
-    """A robot driven so, and what it told: mm, degrees, time."""
+    """A robot after some legs, and its readings: mm, degrees, s."""
     robot = EmulatedCreate(CreateEmulatorConfig())
     robot.receive(protocol.START + protocol.SAFE)
-    told = []
+    replies = []
     for right, left, seconds, count in legs:
         robot.receive(protocol.drive(right, left))
         for _ in range(count):
             robot.advance(seconds)
             (reply,) = robot.receive(protocol.QUERY)
             millimetres, degrees, *_ = protocol.REPLY.unpack(reply)
-            told.append((millimetres, degrees, robot.time))
-    return robot, told
+            replies.append((millimetres, degrees, robot.time))
+    return robot, replies
 
 
 @given(LEGS)
 def test_sums_are_accurate_to_the_quantisation(legs: list[tuple[int, int, float, int]]) -> None:
-    robot, told = readings(legs)
-    assert abs(sum(m for m, _, _ in told) - 1000 * robot.base.travelled) < 1 + 1e-6
-    assert abs(sum(d for _, d, _ in told) - math.degrees(robot.base.turned)) < 1 + 1e-6
+    robot, replies = readings(legs)
+    assert abs(sum(m for m, _, _ in replies) - 1000 * robot.base.travelled) < 1 + 1e-6
+    assert abs(sum(d for _, d, _ in replies) - math.degrees(robot.base.turned)) < 1 + 1e-6
 
 
 @given(LEGS)
 def test_the_pose_is_accurate_to_the_quantisation(legs: list[tuple[int, int, float, int]]) -> None:
-    robot, told = readings(legs)
+    robot, replies = readings(legs)
     odometer = CreateOdometry(0.0)
-    for reading in told:
+    for reading in replies:
         odometer.add(*reading)
     dx, dy, dtheta, dt = odometer.take_odometry()
     driven = sum(abs(right + left) / 2000 * s * n for right, left, s, n in legs)
-    turned = math.radians(sum(abs(d) for _, d, _ in told))
-    # A heading is off by a degree at most, all along; a millimetre is told late, in another direction.
+    turned = math.radians(sum(abs(d) for _, d, _ in replies))
+    # Headings err by at most a degree; a millimetre is reported late, in another direction.
     bound = driven * math.radians(1) + 1e-3 * (1 + turned)
     assert math.hypot(dx - robot.base.x, dy - robot.base.y) <= bound + 1e-9
     assert abs(dtheta - robot.base.heading) < math.radians(1) + 1e-9
@@ -61,10 +61,10 @@ def test_the_pose_is_accurate_to_the_quantisation(legs: list[tuple[int, int, flo
 def test_odometry_read_in_parts_is_the_same(
     legs: list[tuple[int, int, float, int]], taken: list[bool]
 ) -> None:
-    _, told = readings(legs)
+    _, replies = readings(legs)
     whole, parts = CreateOdometry(0.0), CreateOdometry(0.0)
     pose, time = np.zeros(3), 0.0
-    for reading, take in zip(told, taken, strict=False):
+    for reading, take in zip(replies, taken, strict=False):
         whole.add(*reading)
         parts.add(*reading)
         if take:

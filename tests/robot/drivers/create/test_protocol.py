@@ -1,4 +1,4 @@
-"""Bytes of the Open Interface: commands that are sent, replies that are accepted."""
+"""Bytes of the Open Interface: sent commands, accepted replies."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_a_stop_works_after_an_incomplete_command(right: int, left: int, length:
 
 @pytest.mark.parametrize(("right", "left"), [(501, 0), (0, -501), (32767, 0)])
 def test_commands_beyond_the_interface_are_refused(right: int, left: int) -> None:
-    with pytest.raises(ValueError, match="500 at most"):
+    with pytest.raises(ValueError, match="limit of the Create is 500"):
         protocol.drive(right, left)
 
 
@@ -89,7 +89,7 @@ def test_accepted_replies_are_possible(data: bytes, elapsed: float) -> None:
 def test_wheel_speeds_are_within_the_limit(cap: float, forward: float, turn: float) -> None:
     config = CreateConfig(speed=cap)
     apart = turn * config.wheel_base / 2
-    fits = max(abs(forward + apart), abs(forward - apart)) <= cap  # False of NaN
+    fits = max(abs(forward + apart), abs(forward - apart)) <= cap  # False for NaN
     try:
         right, left = wheel_speeds(config, forward, turn)
     except CommandRefused:

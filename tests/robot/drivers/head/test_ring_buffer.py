@@ -26,19 +26,19 @@ BLOCKS = st.lists(
 
 @given(BLOCKS, st.integers(0, 60), st.integers(0, 40))
 def test_the_ring_holds_the_newest_frames(blocks, first, length):
-    ring, kept, highest = RingBuffer(1, size=SIZE), {}, 2**32
+    ring, stored, highest = RingBuffer(1, size=SIZE), {}, 2**32
     for k, block in enumerate(blocks):
         numbers = [highest + step for step in block]
-        highest = max([highest, *numbers]) if kept or numbers else highest
+        highest = max([highest, *numbers]) if stored or numbers else highest
         ring.append(frames(numbers), float(k))
-        kept |= {n: 500 * n for n in numbers}
-        if kept:
-            newest = max(kept)
-            kept = {n: t for n, t in kept.items() if n > newest - SIZE}
+        stored |= {n: 500 * n for n in numbers}
+        if stored:
+            newest = max(stored)
+            stored = {n: t for n, t in stored.items() if n > newest - SIZE}
             assert ring.newest is not None
             assert ring.newest[:2] == (newest, 500 * newest)
     start = 2**32 - 20 + first
-    wanted = sorted(n for n in kept if start <= n <= start + length)
+    wanted = sorted(n for n in stored if start <= n <= start + length)
     got = ring.between(start, start + length)
     assert got.sequence.tolist() == wanted
     assert got.time.tolist() == [500 * n for n in wanted]

@@ -80,13 +80,13 @@ def read(device: Any, count: int, decoder: Decoder) -> Frames:
 
 def test_the_backend_has_the_methods_of_pyusb() -> None:
     interface = importlib.import_module("usb.backend").IBackend
-    asked = {
+    required = {
         name: method
         for name, method in inspect.getmembers(interface, inspect.isfunction)
         if not name.startswith("_") and name != "finalize"
     }
-    assert len(asked) > 20
-    for name, method in asked.items():
+    assert len(required) > 20
+    for name, method in required.items():
         ours = list(inspect.signature(getattr(SocketBackend, name)).parameters)
         if "transfer" not in ours:  # of transfer kinds without a use here
             assert ours == list(inspect.signature(method).parameters), name
@@ -229,8 +229,8 @@ def test_an_invalid_configuration_is_refused(tmp_path: Path, capsys: pytest.Capt
     assert main(["--config", str(tmp_path / "bad.json")]) == 2
     (tmp_path / "wall.json").write_text('{"maze": {"heights": [0.3]}}')
     assert main(["--config", str(tmp_path / "wall.json")]) == 2
-    said = capsys.readouterr().err
-    assert all(piece in said for piece in ("none.json", "hots", "simulation.maze.heights"))
+    output = capsys.readouterr().err
+    assert all(piece in output for piece in ("none.json", "hots", "simulation.maze.heights"))
 
 
 def test_a_dead_emulator_is_a_disconnected_device(tmp_path: Path, loopback: str) -> None:

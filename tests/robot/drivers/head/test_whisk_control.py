@@ -97,16 +97,16 @@ def test_amplitudes_of_a_free_whisk_are_sent_once_per_cycle():
     host = HostRcp(WhiskingConfig(), HEAD.shape, THRESHOLD, CENTRE)
     touched = np.zeros((6000, 18))
     touched[500:900, 3] = 0.2
-    told = [host.amplitudes(block) for block in blocks(whisks(6000, touched), list(range(40, 6000, 40)))]
+    sent = [host.amplitudes(block) for block in blocks(whisks(6000, touched), list(range(40, 6000, 40)))]
     full = to_counts(np.radians(65))
-    assert told[0] is not None
-    assert (told[0] == full).all()
-    assert sum(one is not None for one in told[1:12]) == 0
-    assert min(one[3] for one in told if one is not None) < full
+    assert sent[0] is not None
+    assert (sent[0] == full).all()
+    assert sum(one is not None for one in sent[1:12]) == 0
+    assert min(one[3] for one in sent if one is not None) < full
     for k in (50, 100):  # the next cycles
-        assert told[k] is not None
-        assert (told[k] == full).all()
-        assert all(one is None for one in told[k + 1 : k + 50])
+        assert sent[k] is not None
+        assert (sent[k] == full).all()
+        assert all(one is None for one in sent[k + 1 : k + 50])
 
 
 def test_no_amplitudes_are_sent_before_the_first_whisk():

@@ -26,7 +26,7 @@ def settings(host: str, **others: Any) -> ArmConfig:
 
 
 class Bench:
-    """One emulator after the other at one address."""
+    """Emulators at one address, one at a time."""
 
     def __init__(self, host: str) -> None:
         self.host = host
@@ -34,7 +34,7 @@ class Bench:
         self._faults: Faults | None = None
 
     def controller(self) -> Faults:
-        """A running one in good order, its tool at HOME."""
+        """A running emulator without faults, with its tool at HOME."""
         if self._faults is None or self._faults.process.poll() is not None:
             self._stack.close()
             self._faults = self._stack.enter_context(ur_emulator(self.host, HOME))

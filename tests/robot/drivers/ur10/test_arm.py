@@ -18,23 +18,23 @@ from tests.helpers.live import PATIENCE, Faults, moves, until
 from tests.robot.drivers.ur10.conftest import AWAY, HOME, settings
 
 
-def under_way(arm: Arm, controller: Faults) -> None:
-    """Send the arm off and wait until it is at full speed."""
+def start_move(arm: Arm, controller: Faults) -> None:
+    """Starts a move and waits for full speed."""
     arm.move(AWAY)
     until(lambda: arm.fault or controller.state()["speed"][0] > 0.049, "the arm moves")
     assert arm.fault is None
 
 
-def ended(arm: Arm, controller: Faults, within: float = PATIENCE) -> SessionOutcome:
-    """Outcome of the fault; the arm has stopped before its target, and refuses to move.
+def check_stop(arm: Arm, controller: Faults, within: float = PATIENCE) -> SessionOutcome:
+    """Checks that a fault stops the arm before its target and that moves are refused; returns the outcome.
 
     Args:
-        within: s from the fault to the standstill.
+        within: longest time from the fault to the standstill, s.
     """
     fault = until(lambda: arm.fault, "a fault")
     until(lambda: not controller.state()["moving"], "a standstill", within)
     place = controller.state()["tcp"]
-    assert place[0] < AWAY[0] - 1e-3, "the arm went on to its target"
+    assert place[0] < AWAY[0] - 1e-3, "the arm reached its target"
     with pytest.raises(TargetRefused, match="does not move"):
         arm.move(HOME)
     time.sleep(0.1)
@@ -76,11 +76,11 @@ def test_states_are_in_order(arm: Arm, controller: Faults) -> None:
 
 def test_a_move_to_the_present_pose_arrives(arm: Arm) -> None:
     arm.move(HOME)
-    until(arm.arrived, "arrival without a way")
+    until(arm.arrived, "arrival without motion")
 
 
 def test_a_move_after_a_halt(arm: Arm, controller: Faults) -> None:
-    under_way(arm, controller)
+    start_move(arm, controller)
     arm.halt()
     until(lambda: not controller.state()["moving"], "a standstill")
     assert controller.state()["tcp"][0] < AWAY[0] - 1e-3
@@ -91,7 +91,7 @@ def test_a_move_after_a_halt(arm: Arm, controller: Faults) -> None:
 
 
 def test_a_newer_move_replaces_an_older(arm: Arm, controller: Faults) -> None:
-    under_way(arm, controller)
+    start_move(arm, controller)
     arm.move(TARGET)
     until(arm.arrived, "arrival")
     np.testing.assert_allclose(controller.state()["tcp"], TARGET, atol=1e-9)
@@ -108,10 +108,10 @@ def test_a_newer_move_replaces_an_older(arm: Arm, controller: Faults) -> None:
     ],
 )
 def test_safety_stops(arm: Arm, controller: Faults, stop: str, outcome: SessionOutcome) -> None:
-    under_way(arm, controller)
+    start_move(arm, controller)
     controller(do=stop)
-    assert ended(arm, controller) is outcome
-    # States still come, so the pose can be read again; and when the stop is released nothing goes on.
+    assert check_stop(arm, controller) is outcome
+    # States continue, so the pose stays known; after the release of the stop the program does not resume.
     until(lambda: arm.age() < 0.05, "a fresh state")
     until(lambda: controller.state()["runtime"] == "STOPPED", "the program is ended")
     place = controller.state()["tcp"]
@@ -122,9 +122,9 @@ def test_safety_stops(arm: Arm, controller: Faults, stop: str, outcome: SessionO
 
 
 def test_a_stall(alert_arm: Arm, controller: Faults) -> None:
-    under_way(alert_arm, controller)
+    start_move(alert_arm, controller)
     controller(do="stall", seconds=PATIENCE)
-    assert ended(alert_arm, controller) is SessionOutcome.ARM_STALE
+    assert check_stop(alert_arm, controller) is SessionOutcome.ARM_STALE
     assert len(alert_arm.history) > 10
 
 
@@ -133,10 +133,10 @@ def test_a_stall(alert_arm: Arm, controller: Faults) -> None:
 def test_a_stall_is_found_in_time(controller: Faults, seconds: float) -> None:
     with Arm(settings(controller.host, stale=0.5)) as arm:
         arm.start()
-        under_way(arm, controller)
+        start_move(arm, controller)
         controller(do="stall", seconds=seconds)
         began = time.monotonic()
-        assert ended(arm, controller, within=0.5) is SessionOutcome.ARM_STALE
+        assert check_stop(arm, controller, within=0.5) is SessionOutcome.ARM_STALE
         assert arm.fault is not None
         assert arm.fault.time - began < arm.config.stale + 0.3
 
@@ -150,55 +150,55 @@ def test_a_stall_is_found_in_time(controller: Faults, seconds: float) -> None:
     ],
 )
 def test_invalid_frames(alert_arm: Arm, controller: Faults, frame: str, outcome: SessionOutcome) -> None:
-    under_way(alert_arm, controller)
+    start_move(alert_arm, controller)
     controller(do=frame)
-    assert ended(alert_arm, controller) is outcome
+    assert check_stop(alert_arm, controller) is outcome
     assert np.isfinite(alert_arm.history["tcp"]).all()
 
 
 def test_a_state_that_is_not_finite(arm: Arm, controller: Faults) -> None:
-    under_way(arm, controller)
+    start_move(arm, controller)
     controller(do="nan")
-    assert ended(arm, controller) is SessionOutcome.ARM_MALFORMED
+    assert check_stop(arm, controller) is SessionOutcome.ARM_MALFORMED
 
 
 def test_a_frozen_clock(alert_arm: Arm, controller: Faults) -> None:
-    under_way(alert_arm, controller)
+    start_move(alert_arm, controller)
     controller(do="freeze")
-    assert ended(alert_arm, controller) is SessionOutcome.ARM_STALE
+    assert check_stop(alert_arm, controller) is SessionOutcome.ARM_STALE
 
 
 def test_the_controller_dies(arm: Arm, controller: Faults) -> None:
-    under_way(arm, controller)
+    start_move(arm, controller)
     controller.die()
     fault = until(lambda: arm.fault, "a fault")
     assert fault.outcome is SessionOutcome.ARM_GONE
 
 
 def test_the_program_is_ended_on_the_controller(arm: Arm, controller: Faults) -> None:
-    under_way(arm, controller)
+    start_move(arm, controller)
     with Dashboard(controller.host) as dashboard:
         dashboard.stop()
-    assert ended(arm, controller) is SessionOutcome.ARM_GONE
+    assert check_stop(arm, controller) is SessionOutcome.ARM_GONE
 
 
 @pytest.mark.parametrize("number", [signal.SIGSEGV, signal.SIGKILL])
 def test_the_rtde_process_ends(arm: Arm, controller: Faults, number: int) -> None:
-    under_way(arm, controller)
+    start_move(arm, controller)
     os.kill(arm.pid, number)
-    assert ended(arm, controller) is SessionOutcome.ARM_GONE
+    assert check_stop(arm, controller) is SessionOutcome.ARM_GONE
 
 
 def test_the_rtde_process_hangs(alert_arm: Arm, controller: Faults) -> None:
-    under_way(alert_arm, controller)
+    start_move(alert_arm, controller)
     os.kill(alert_arm.pid, signal.SIGSTOP)
-    assert ended(alert_arm, controller) is SessionOutcome.ARM_STALE
+    assert check_stop(alert_arm, controller) is SessionOutcome.ARM_STALE
 
 
 def test_a_stop_without_effect_is_repeated_by_the_dashboard(controller: Faults) -> None:
     with Arm(settings(controller.host)) as arm:
         arm.start()
-        under_way(arm, controller)
+        start_move(arm, controller)
         ends = controller.state()["program_stops"]
         os.kill(arm.pid, signal.SIGSTOP)
         arm.halt()
@@ -212,7 +212,7 @@ def test_a_target_without_joint_solution(arm: Arm, controller: Faults) -> None:
     first = len(controller.state()["targets"])
     controller(do="ik_fails")
     arm.move(AWAY)
-    assert ended(arm, controller) is SessionOutcome.UNREACHABLE
+    assert check_stop(arm, controller) is SessionOutcome.UNREACHABLE
     assert moves(controller, first) == []
 
 
@@ -221,7 +221,7 @@ def test_a_move_that_does_not_arrive(controller: Faults) -> None:
         arm.start()
         arm.move(HOME + [0.01, 0, 0, 0, 0, 0])
         controller(do="slider", fraction=0.0)
-        assert ended(arm, controller) is SessionOutcome.NOT_ARRIVED
+        assert check_stop(arm, controller) is SessionOutcome.NOT_ARRIVED
 
 
 def test_a_state_out_of_the_box(controller: Faults) -> None:
@@ -230,9 +230,9 @@ def test_a_state_out_of_the_box(controller: Faults) -> None:
     )
     with Arm(config) as arm:
         arm.start()
-        under_way(arm, controller)
+        start_move(arm, controller)
         controller(do="place", tcp=(HOME + [0, 0.21, 0, 0, 0, 0]).tolist())
-        assert ended(arm, controller) is SessionOutcome.OUT_OF_BOX
+        assert check_stop(arm, controller) is SessionOutcome.OUT_OF_BOX
 
 
 def test_a_collision_with_a_wall(controller: Faults) -> None:
@@ -241,20 +241,20 @@ def test_a_collision_with_a_wall(controller: Faults) -> None:
         arm.start()
         controller(do="wall", x=at, stiffness=20_000)
         arm.move(AWAY)
-        assert ended(arm, controller) is SessionOutcome.CONTACT
+        assert check_stop(arm, controller) is SessionOutcome.CONTACT
         assert controller.state()["penetration_max"] <= 0.003
         assert controller.state()["safety"] == "NORMAL"
-        # Backed off the way it came: out of the wall, and no further than told.
-        until(lambda: controller.state()["tcp"][0] < at - 0.006, "it backs off")
+        # The tool backs off along its path: out of the wall, at most by `backoff`.
+        until(lambda: controller.state()["tcp"][0] < at - 0.006, "the tool backs off")
         until(arm.still)
         assert at - 0.0105 < controller.state()["tcp"][0]
         assert arm.fault.outcome is SessionOutcome.CONTACT
 
 
 def test_a_contact_reported_by_the_session(arm: Arm, controller: Faults) -> None:
-    under_way(arm, controller)
-    until(lambda: controller.state()["tcp"][0] > HOME[0] + 0.012, "a way to back off")
+    start_move(arm, controller)
+    until(lambda: controller.state()["tcp"][0] > HOME[0] + 0.012, "room for the retreat")
     arm.fail(SessionOutcome.CONTACT, "a whisker is bent too far")
     furthest = until(lambda: arm.still() and controller.state()["tcp"][0], "a standstill")
-    until(lambda: controller.state()["tcp"][0] < furthest - 0.009, "it backs off")
+    until(lambda: controller.state()["tcp"][0] < furthest - 0.009, "the tool backs off")
     assert arm.fault.outcome is SessionOutcome.CONTACT

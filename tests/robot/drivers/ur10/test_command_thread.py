@@ -34,7 +34,7 @@ speeds = st.one_of(number, st.floats(0.001, 0.06), st.sampled_from([0.25, 0.2501
 
 
 class Control:
-    """Stands in for the control interface of the library."""
+    """A stub of the library's control interface."""
 
     def __init__(self) -> None:
         self.moves: list[tuple[Any, ...]] = []
@@ -66,18 +66,18 @@ def shared() -> Iterator[SharedState]:
 
 def command_thread(shared: SharedState) -> tuple[CommandThread, Control, list[dict[str, Any]]]:
     """A command thread without a controller, and its reports to the session."""
-    control, told = Control(), []
-    return CommandThread(CONFIG, shared, control, lambda **fields: told.append(fields)), control, told
+    control, reports = Control(), []
+    return CommandThread(CONFIG, shared, control, lambda **fields: reports.append(fields)), control, reports
 
 
 @given(poses, speeds, st.sampled_from(["move", "retreat"]))
 def test_no_invalid_move_is_sent_to_the_controller(
     shared: SharedState, pose: list[float], speed: float, do: str
 ) -> None:
-    thread, control, told = command_thread(shared)
+    thread, control, reports = command_thread(shared)
     thread.execute(ArmCommand(do, 1, tuple(pose), speed, int(shared.control["stops"])))
     if not control.moves:
-        (fault,) = told
+        (fault,) = reports
         assert fault["say"] == "fault"
         assert thread.held is not None
         thread.execute(ArmCommand("move", 2, tuple(HOME), 0.01, int(shared.control["stops"])))
@@ -111,7 +111,7 @@ def test_a_stop_revokes_the_orders_before_it(shared: SharedState) -> None:
 
 def test_the_watchdog_is_reset_only_while_the_heartbeat_is_recent(shared: SharedState) -> None:
     thread, control, _ = command_thread(shared)
-    shared.control["heartbeat"] = time.monotonic() + 60  # whatever delays this test
+    shared.control["heartbeat"] = time.monotonic() + 60  # longer than any delay of this test
     thread.act()
     assert (control.kicks, control.stops) == (1, 0)
     shared.control["heartbeat"] = time.monotonic() - CONFIG.heartbeat - 0.001
@@ -135,15 +135,15 @@ def test_a_stop_is_sent_before_queued_moves(shared: SharedState) -> None:
 
 
 def test_a_target_without_joint_solution_is_not_sent(shared: SharedState) -> None:
-    thread, control, told = command_thread(shared)
+    thread, control, reports = command_thread(shared)
     control.reachable = False
     thread.execute(ArmCommand("move", 1, tuple(HOME), 0.01, int(shared.control["stops"])))
     assert control.moves == []
-    assert [fault["outcome"] for fault in told] == [SessionOutcome.UNREACHABLE.name]
+    assert [fault["outcome"] for fault in reports] == [SessionOutcome.UNREACHABLE.name]
 
 
 class Link:
-    """Stands in for the RTDE process."""
+    """A stub of the RTDE process."""
 
     def __init__(self) -> None:
         self.orders: list[dict[str, Any]] = []
@@ -159,7 +159,7 @@ class Link:
 
 
 @pytest.fixture(scope="module")
-def linked() -> Iterator[tuple[Arm, Link]]:
+def stub_arm() -> Iterator[tuple[Arm, Link]]:
     """An armed arm without an RTDE process."""
     with Arm(CONFIG) as arm:
         link = Link()
@@ -170,9 +170,9 @@ def linked() -> Iterator[tuple[Arm, Link]]:
 
 @given(poses, st.one_of(st.none(), speeds))
 def test_no_invalid_move_is_sent_to_the_rtde_process(
-    linked: tuple[Arm, Link], pose: list[float], speed: float | None
+    stub_arm: tuple[Arm, Link], pose: list[float], speed: float | None
 ) -> None:
-    arm, link = linked
+    arm, link = stub_arm
     link.orders.clear()
     try:
         move = arm.move(pose, speed)

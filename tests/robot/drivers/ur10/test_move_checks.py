@@ -19,9 +19,9 @@ from tests.robot.drivers.ur10.test_command_thread import poses, speeds
 def test_no_invalid_move_reaches_the_controller(arm: Arm, controller: Faults) -> None:
     state = controller.state()
     first = len(state["targets"])
-    # One that is told for certain: after the first that no joints reach, nothing is.
-    asked: list[list[float]] = [[*state["tcp"][:2], state["tcp"][2] + 0.002, *state["tcp"][3:]]]
-    arm.move(asked[0])
+    # The first command is valid: after a target without joint solution no command is sent.
+    requested: list[list[float]] = [[*state["tcp"][:2], state["tcp"][2] + 0.002, *state["tcp"][3:]]]
+    arm.move(requested[0])
     until(arm.arrived)
 
     @settings(max_examples=60, suppress_health_check=list(HealthCheck))
@@ -31,17 +31,17 @@ def test_no_invalid_move_reaches_the_controller(arm: Arm, controller: Faults) ->
             arm.move(pose, speed)
         except TargetRefused:
             return
-        asked.append(pose)
+        requested.append(pose)
         time.sleep(0.03)
 
     ask()
     arm.halt()
     until(arm.still)
-    told = moves(controller, first)
+    sent = moves(controller, first)
     assert arm.fault is None or arm.fault.outcome.name == "UNREACHABLE"
-    assert told
-    for order in told:
-        assert order["goal"] in asked
+    assert sent
+    for order in sent:
+        assert order["goal"] in requested
         assert np.isfinite(order["goal"]).all()
         assert in_box(arm.config, np.array(order["goal"]))
         assert 0 < order["speed"] <= SPEED_CAP

@@ -1,4 +1,4 @@
-"""A session that is killed or hangs during a motion: the arm stops, and no process or memory stays behind."""
+"""A session that is killed or hangs during a motion: the arm stops, and no process or memory remains."""
 
 from __future__ import annotations
 
@@ -49,21 +49,21 @@ def test_the_arm_stops_when_the_session_ends_or_hangs(controller: Faults, what: 
         until(lambda: controller.state()["speed"][0] > 0.049, "the arm moves")
         bites = controller.state()["watchdog_stops"]
         if what == "killed with the arm's process":
-            os.kill(int(pid), signal.SIGSTOP)  # it must not find out first
+            os.kill(int(pid), signal.SIGSTOP)  # so that it does not detect the end first
         session.send_signal(signal.SIGSTOP if what == "hangs" else signal.SIGKILL)
         if what == "killed with the arm's process":
             os.kill(int(pid), signal.SIGKILL)
         until(lambda: not controller.state()["moving"], "a standstill")
         place = controller.state()["tcp"]
-        assert place[0] < AWAY[0] - 1e-3, "the arm went on to its target"
+        assert place[0] < AWAY[0] - 1e-3, "the arm reached its target"
         until(lambda: not runs(int(pid)), "the arm's process ends")
-        until(lambda: controller.state()["runtime"] == "STOPPED", "its program is ended")
+        until(lambda: controller.state()["runtime"] == "STOPPED", "the controller's program ends")
         assert controller.state()["tcp"] == place
         if what == "killed with the arm's process":
             assert controller.state()["watchdog_stops"] == bites + 1
         if what != "hangs":
             session.wait(30)
-            assert not [name for name in shared if Path(name).exists()], "shared memory stays behind"
+            assert not [name for name in shared if Path(name).exists()], "shared memory remains"
     finally:
         session.kill()
         session.wait(30)

@@ -1,4 +1,4 @@
-"""The stream of tool poses: its values, and that it reconnects."""
+"""The stream of tool poses: values and reconnection."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_pose_speed_and_time(faults: Faults) -> None:
 
 
 @pytest.mark.parametrize("fault", ["close", "malformed"])
-def test_it_reconnects(faults: Faults, fault: str) -> None:
+def test_a_lost_connection_is_restored(faults: Faults, fault: str) -> None:
     with PoseListener(faults.host, patience=0.3) as poses:
         before = until(poses.latest)
         faults(do=fault)
@@ -53,7 +53,7 @@ def test_poses_stop_during_a_stall_and_resume(faults: Faults) -> None:
     with PoseListener(faults.host, patience=30.0) as poses:
         until(poses.latest)
         faults(do="stall", seconds=600)
-        time.sleep(0.3)  # states that were sent before
+        time.sleep(0.3)  # states sent before the stall
         stood = poses.latest()
         time.sleep(0.2)
         assert poses.latest() is stood

@@ -1,4 +1,4 @@
-"""Reasons not to arm the arm: each is reported with its cure, and nothing moves."""
+"""Reasons not to arm the arm: each is reported with its cure, and the arm does not move."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ GOOD = {
 
 
 @contextmanager
-def answering(host: str, answers: dict[str, str]) -> Iterator[None]:
-    """A dashboard server that says what it is told to; to what it does not know, nothing."""
+def serve_answers(host: str, answers: dict[str, str]) -> Iterator[None]:
+    """A dashboard server with these answers; it does not answer other commands."""
     with socket.create_server((host, PORT)) as server:
 
         def serve() -> None:
@@ -69,19 +69,19 @@ def elsewhere(loopback: str) -> str:
         ({"running": "Program running: true"}, "a program runs"),
     ],
 )
-def test_start_is_refused(elsewhere: str, changed: dict[str, str], found: str) -> None:
-    with answering(elsewhere, GOOD | changed):
+def test_start_is_check_refusal(elsewhere: str, changed: dict[str, str], found: str) -> None:
+    with serve_answers(elsewhere, GOOD | changed):
         with pytest.raises(StartupRefused, match=found) as refusal:
             check_controller(ArmConfig(host=elsewhere))
         assert refusal.value.cure or refusal.value.expected
 
 
 def test_controllers_of_all_versions_pass(elsewhere: str) -> None:
-    with answering(elsewhere, GOOD):
+    with serve_answers(elsewhere, GOOD):
         assert check_controller(ArmConfig(host=elsewhere)).remote is True
     old = GOOD | {"PolyscopeVersion": "URSoftware 3.4.5.100 (Jan 01 2018)"}
-    del old["is in remote control"]  # a CB3 does not know the question
-    with answering(elsewhere, old):
+    del old["is in remote control"]  # a CB3 lacks this command
+    with serve_answers(elsewhere, old):
         controller = check_controller(ArmConfig(host=elsewhere))
         assert controller.version == (3, 4)
         assert controller.remote is None
@@ -92,15 +92,15 @@ def test_a_silent_dashboard_times_out(elsewhere: str) -> None:
         check_controller(ArmConfig(host=elsewhere))
     assert dashboard.stop_program(elsewhere) == ""
     with (
-        answering(elsewhere, {}),
+        serve_answers(elsewhere, {}),
         Dashboard(elsewhere, timeout=0.2) as connection,
         pytest.raises(DashboardSilent, match="robotmode"),
     ):
         connection.ask("robotmode")
 
 
-def refused(controller: Faults, **others: Any) -> StartupRefused:
-    """Why an arm did not start; nothing has reached the controller that moves, and the process is gone."""
+def check_refusal(controller: Faults, **others: Any) -> StartupRefused:
+    """Checks that an arm does not start, move or leave a process; returns the refusal."""
     before = len(controller.state()["targets"])
     with Arm(settings(controller.host, **others)) as arm:
         with pytest.raises(StartupRefused) as refusal:
@@ -114,23 +114,23 @@ def refused(controller: Faults, **others: Any) -> StartupRefused:
 
 def test_registers_in_use(controller: Faults) -> None:
     controller(do="registers")
-    assert refused(controller).found == "registers in use"
+    assert check_refusal(controller).found == "registers in use"
 
 
 def test_a_slow_stream(controller: Faults) -> None:
     controller(do="rate", hz=80)
-    found = re.fullmatch(r"stream at (\d+) of 125 Hz", refused(controller, connect=5.0).found)
+    found = re.fullmatch(r"stream at (\d+) of 125 Hz", check_refusal(controller, connect=5.0).found)
     assert found is not None
     assert int(found[1]) < 112  # 0.9 of the nominal rate; lower still on a busy machine
 
 
 def test_start_outside_the_box(controller: Faults) -> None:
-    refusal = refused(controller, box=BoxConfig(low=tuple(HOME[:3] + 0.1), high=tuple(HOME[:3] + 0.2)))
+    refusal = check_refusal(controller, box=BoxConfig(low=tuple(HOME[:3] + 0.1), high=tuple(HOME[:3] + 0.2)))
     assert "outside the box" in str(refusal)
 
 
 def test_a_controller_that_does_not_answer_on_its_other_ports(elsewhere: str) -> None:
-    with answering(elsewhere, GOOD), Arm(ArmConfig(host=elsewhere)) as arm, pytest.raises(StartupRefused):
+    with serve_answers(elsewhere, GOOD), Arm(ArmConfig(host=elsewhere)) as arm, pytest.raises(StartupRefused):
         arm.start()
 
 
@@ -149,7 +149,7 @@ def test_an_arm_that_was_not_started_refuses_and_closes(loopback: str) -> None:
 def test_a_second_session_is_refused_and_the_first_continues(controller: Faults) -> None:
     with Arm(settings(controller.host)) as first:
         first.start()
-        refusal = refused(controller)
+        refusal = check_refusal(controller)
         assert refusal.found == "a program runs on the controller"
         first.move(HOME + [0.003, 0, 0, 0, 0, 0])
         until(first.arrived, "arrival")

@@ -42,7 +42,7 @@ down = st.tuples(st.floats(0.02, 1.2), st.floats(0.02, 0.85), st.floats(-4, 4), 
 
 
 def a_state(**fields: object) -> np.ndarray:
-    """One state of an arm that stands at HOME in good order."""
+    """A state without faults of an arm at rest at HOME."""
     state = np.zeros((), ARM_STATE)
     state["tcp"], state["safety"], state["runtime"], state["mode"] = HOME, NORMAL, 2, 7
     state["robot"] = state["host"] = 1.0
@@ -105,7 +105,7 @@ def test_planned_speeds_are_within_the_settings(speed: float, target: np.ndarray
     assert MIN_SPEED <= speed <= CONFIG.speed
     assert 0 < move.speed <= SPEED_CAP
     way = np.linalg.norm(target[:3] - start[:3])
-    top = min(move.speed, math.sqrt(CONFIG.acceleration * way))  # of a triangle of speed over time
+    top = min(move.speed, math.sqrt(CONFIG.acceleration * way))  # peak of a triangular speed profile
     assert top <= max(speed, math.sqrt(CONFIG.acceleration * MOVED_ON)) * (1 + 1e-9)
     assert math.isfinite(move.seconds)
     assert move.seconds <= move.most
@@ -113,11 +113,11 @@ def test_planned_speeds_are_within_the_settings(speed: float, target: np.ndarray
 
 
 @given(st.one_of(anything, st.floats(0.0501, 0.3)), down, down)
-def test_the_last_check_refuses_faster_commands(told: float, target: np.ndarray, start: np.ndarray) -> None:
+def test_the_last_check_refuses_faster_commands(speed: float, target: np.ndarray, start: np.ndarray) -> None:
     assume(np.linalg.norm(target[:3] - start[:3]) > 0.01)
-    assume(not 0 < told <= CONFIG.speed)
+    assume(not 0 < speed <= CONFIG.speed)
     with pytest.raises(TargetRefused):
-        check_command(CONFIG, target, start, told)
+        check_command(CONFIG, target, start, speed)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The ring buffer in shared memory: every state complete, once and in order; nothing stays behind."""
+"""The ring buffer in shared memory: every state complete, once and in order; no file remains."""
 
 import os
 import subprocess
@@ -85,8 +85,8 @@ def test_the_memory_has_no_name_and_is_released_on_close() -> None:
     fd = shared.fd
     assert os.readlink(f"/proc/self/fd/{fd}").endswith("(deleted)")
     write(shared, 3)
-    kept = shared.since(0)
+    states = shared.since(0)
     shared.close()
     with pytest.raises(OSError, match="descriptor"):
         os.fstat(fd)
-    assert kept["counter"].tolist() == [1, 2, 3]
+    assert states["counter"].tolist() == [1, 2, 3]

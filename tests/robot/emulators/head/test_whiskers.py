@@ -56,8 +56,8 @@ def test_samples_along_a_path_agree_with_the_simulator(mode: FeedbackMode, frequ
     config = HeadEmulatorConfig(
         follow=True, path={"explore": 9}, seed=3, stream={"rate": ODD}, head={"dead": (4,)}
     )
-    made = world(config)
-    head = HostedHead(config, made.surroundings.walls, AlongPath(made.path))
+    scene = world(config)
+    head = HostedHead(config, scene.surroundings.walls, AlongPath(scene.path))
     command = drive(mode, frequency=frequency)
     head.start()
     head.send(command)
@@ -73,9 +73,9 @@ def test_samples_along_a_path_agree_with_the_simulator(mode: FeedbackMode, frequ
     settings = config.stream.model_copy(update=knots)
     raw = simulate_cycles(
         simulate_quasistatic,
-        HeadSetup(made.surroundings.head, settings, config.mechanics, whisking),
-        made.surroundings,
-        made.path,
+        HeadSetup(scene.surroundings.head, settings, config.mechanics, whisking),
+        scene.surroundings,
+        scene.path,
         start,
         stream(config.seed, "sensor"),
         command.numbers * ANGLE,

@@ -27,7 +27,7 @@ from tactile.base.types import MotionKind, Report, StepEnd
 SHORT = {"reports": 150}
 
 
-def made(**changes: Any) -> CreateSimulation:
+def simulate(**changes: Any) -> CreateSimulation:
     return CreateSimulation(CreateSimulationConfig.model_validate(SHORT | changes))
 
 
@@ -52,47 +52,48 @@ def bits(source: Source) -> list[list[bytes]]:
 
 
 def test_a_session_is_bit_identical_for_the_same_settings() -> None:
-    one = made()
+    one = simulate()
     assert isinstance(one, Source)
     with one as source:
         first = bits(source)
         assert bits(source) == first
-    assert bits(made()) == first
+    assert bits(simulate()) == first
     assert len(first) == one.length == 150
-    assert made().digest == one.digest
-    other = made(seed=1)
+    assert simulate().digest == one.digest
+    other = simulate(seed=1)
     assert other.digest != one.digest
     assert bits(other)[:20] != first[:20]
 
 
 def test_a_longer_session_begins_like_a_shorter_one() -> None:
-    assert bits(made(reports=80)) == bits(made())[:80]
+    assert bits(simulate(reports=80)) == bits(simulate())[:80]
 
 
 def test_streams_are_independent() -> None:
-    base = made()
-    other = made(wheels={"noise": "bias"})
+    base = simulate()
+    other = simulate(wheels={"noise": "bias"})
     assert (other.odometry != base.odometry).any()
     assert (other.truth == base.truth).all()
     assert all((a.strain == b.strain).all() for a, b in zip(base.steps, other.steps, strict=True))
-    elsewhere = made(behaviour={"turn": {"share": 0.0}})
+    elsewhere = simulate(behaviour={"turn": {"share": 0.0}})
     assert arena_text(elsewhere.arena) == arena_text(base.arena)
     assert (elsewhere.truth != base.truth).any()
-    one, two = (made(seed=seed, arena={"seed": 7}) for seed in (1, 2))
+    one, two = (simulate(seed=seed, arena={"seed": 7}) for seed in (1, 2))
     assert arena_text(one.arena) == arena_text(two.arena)
     assert (one.odometry[:20] != two.odometry[:20]).any()
 
 
 def test_the_digest_depends_on_the_configuration(tmp_path: Path) -> None:
-    base = made()
+    base = simulate()
     path, again = tmp_path / "room.txt", tmp_path / "copy.txt"
     room = base.arena._replace(objects=base.arena.objects[1:])
     path.write_text(arena_text(room))
     again.write_text("# the same\n" + arena_text(room))
-    filed = made(arena={"file": path})
-    sessions = [base, made(seed=3), made(whiskers={"noise": 1e-6}), filed, made(arena={"side": 2.5})]
+    filed = simulate(arena={"file": path})
+    larger = simulate(arena={"side": 2.5})
+    sessions = [base, simulate(seed=3), simulate(whiskers={"noise": 1e-6}), filed, larger]
     assert len({one.digest for one in sessions}) == len(sessions)
-    assert made(arena={"file": again}).digest == filed.digest  # what is in the file counts, not where it lies
+    assert simulate(arena={"file": again}).digest == filed.digest  # the content counts, not the path
     assert str(tmp_path) not in filed.info.to_json()
     config = CreateSimulationConfig.model_validate({"arena": {"file": "room.txt"}}).resolved(tmp_path)
     assert config.arena.file == path
@@ -128,14 +129,14 @@ def test_samples_agree_with_the_session() -> None:
             assert np.sign(moved[0]) == np.sign(report.odometry.dx)
         before = sample.truth
     assert (np.abs(simulation.truth[:, 2]) <= np.pi).all()
-    samples[0].truth[:] = 9  # a reader's own copy
+    samples[0].truth[:] = 9  # a copy
     samples[0].reading.contact[:] = True
     assert not np.all(next(iter(simulation)).truth == 9)
     assert not next(iter(simulation)).reading.contact.all()
 
 
 def test_odometry_without_noise_integrates_to_the_truth() -> None:
-    simulation = made(wheels={"noise": "none"})
+    simulation = simulate(wheels={"noise": "none"})
     pose = simulation.arena.start
     for sample in simulation:
         pose = compose(pose, np.array(sample.reading.odometry[:3]))
@@ -145,7 +146,7 @@ def test_odometry_without_noise_integrates_to_the_truth() -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_the_steps_follow_the_state_machine(seed: int) -> None:
-    """Forward until contact, on slowly, back, a turn, forward; moments are told where they belong."""
+    """States follow in the order of the paper, with the right ends."""
     simulation = session(seed)
     state, moment, contact = (column(simulation, name) for name in ("state", "moment", "contact"))
     follows = {
@@ -177,11 +178,11 @@ def test_the_body_stays_out_of_walls(seed: int, side: float) -> None:
     simulation = session(seed, side)
     assert in_free_space(simulation.arena, simulation.truth[:, :2]).all()
     room = segment_distance(wall_segments(simulation.arena), simulation.truth[:, :2]).min()
-    assert room > 0.17 - 0.05 * 0.01 - 1e-6  # one look's way
+    assert room > 0.17 - 0.05 * 0.01 - 1e-6  # motion between two checks
 
 
 def test_six_minutes_have_the_statistics_of_the_paper() -> None:
-    """About 30 contacts and more, 3 to 4 circuits, anticlockwise, not all of them with a second contact."""
+    """30 contacts or more, some without a second contact, in 3 to 4 anticlockwise circuits."""
     counts = []
     for seed in range(12):
         simulation = session(seed)
@@ -209,10 +210,10 @@ def test_six_minutes_have_the_statistics_of_the_paper() -> None:
 
 
 def test_dead_whiskers_never_report() -> None:
-    simulation = made(whiskers={"dead": [0, 3]})
+    simulation = simulate(whiskers={"dead": [0, 3]})
     assert not column(simulation, "contact")[:, [0, 3]].any()
     assert (next(iter(simulation)).reading.alive == [False, True, True, False]).all()
-    alone = made(whiskers={"dead": [0, 1, 2, 3]})  # nothing but its bumper
+    alone = simulate(whiskers={"dead": [0, 1, 2, 3]})  # only the bumper
     assert not column(alone, "contact").any()
     assert (column(alone, "moment") == StepEnd.ABORT).any()
 
@@ -222,7 +223,7 @@ def into(angle_deg: float, seed: int = 0, **changes: Any) -> Report:
     return drive_into_wall(config, np.radians(angle_deg), stream(seed, "templates"))
 
 
-def settled(report: Report) -> np.ndarray:
+def mean_strain(report: Report) -> np.ndarray:
     """[T, 4] horizontal strain without vibration: means over a tenth of a second."""
     return report.strain[..., 0].reshape(-1, 200, 4).mean(axis=1)
 
@@ -232,16 +233,16 @@ def test_first_contact_with_a_wall_is_at_its_position(angle: int) -> None:
     report = into(angle)
     assert report.strain.shape == (4000, 4, 2)
     assert (report.odometry.dx, report.odometry.dt) == (0.04, 2.0)
-    first = np.abs(settled(report)[0])
+    first = np.abs(mean_strain(report)[0])
     if angle <= 50:
         assert first.argmax() == 3  # to the right
     elif angle >= 130:
         assert first.argmax() == 0
     else:
         assert first.argmax() in (1, 2)
-    # Aligned at contact: it has just begun, and grows from there.
+    # Samples are aligned at contact: strain grows from the first one.
     assert 1.5e-4 < first.max() < 8e-4
-    level = np.abs(settled(report)).max(axis=1)
+    level = np.abs(mean_strain(report)).max(axis=1)
     assert level[-1] > 2 * level[0]
 
 
@@ -257,8 +258,8 @@ def test_walls_on_the_left_mirror_those_on_the_right(angle: int) -> None:
 
 
 def test_repeats_differ_less_than_angles() -> None:
-    same = np.abs(settled(into(60, 1)) - settled(into(60, 2))).max()
-    other = np.abs(settled(into(60, 1)) - settled(into(80, 2))).max()
+    same = np.abs(mean_strain(into(60, 1)) - mean_strain(into(60, 2))).max()
+    other = np.abs(mean_strain(into(60, 1)) - mean_strain(into(80, 2))).max()
     assert 0 < same < 0.1 * other
 
 

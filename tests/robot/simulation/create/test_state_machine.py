@@ -1,4 +1,4 @@
-"""The state machine: transitions, turn angles, and how motions end."""
+"""The state machine: transitions, turn angles, and ends of motions."""
 
 from __future__ import annotations
 
@@ -65,11 +65,11 @@ def test_a_turn_is_made_in_steps_that_add_up() -> None:
         doing = next_state(CONFIG, MachineState(CreateState.BACK), StepEnd.FREE, 0.0, random)
         whole, total, steps = doing.rest, 0.0, 0
         while doing.state == CreateState.TURN:
-            told = wheel_command(CONFIG, doing)
-            assert told.speed == 0
-            assert told.duration <= 0.5
-            total += told.rate * told.duration
-            doing = next_state(CONFIG, doing, StepEnd.FREE, told.rate * told.duration, random)
+            command = wheel_command(CONFIG, doing)
+            assert command.speed == 0
+            assert command.duration <= 0.5
+            total += command.rate * command.duration
+            doing = next_state(CONFIG, doing, StepEnd.FREE, command.rate * command.duration, random)
             steps += 1
         assert doing.state == CreateState.FWD1
         assert total == pytest.approx(whole, abs=1e-5)
@@ -78,8 +78,8 @@ def test_a_turn_is_made_in_steps_that_add_up() -> None:
 
 def test_a_turn_can_be_one_step() -> None:
     config = BehaviourConfig(turn=TurnConfig(step=None))
-    told = wheel_command(config, MachineState(CreateState.TURN, -1.2))
-    assert told == WheelCommand(0.0, -0.3, pytest.approx(4.0))
+    command = wheel_command(config, MachineState(CreateState.TURN, -1.2))
+    assert command == WheelCommand(0.0, -0.3, pytest.approx(4.0))
 
 
 def test_speeds_and_durations_are_those_of_the_paper() -> None:
@@ -94,21 +94,21 @@ def test_speeds_and_durations_are_those_of_the_paper() -> None:
     ]
 
 
-def drawn(**changes: object) -> np.ndarray:
+def draw_turns(**changes: object) -> np.ndarray:
     config, random = TurnConfig.model_validate(changes), stream(1, "behaviour")
     return np.array([draw_turn(config, random) for _ in range(4000)])
 
 
 def test_turns_are_drawn_from_the_two_gaussians() -> None:
-    angles = drawn(share=0.6)
+    angles = draw_turns(share=0.6)
     small = np.isclose(angles, 0.14 * np.pi)
     assert small.mean() == pytest.approx(0.6, abs=0.03)
     assert angles[~small].mean() == pytest.approx(0.3 * np.pi, abs=0.06)
     assert angles[~small].std() == pytest.approx(0.25 * np.pi, rel=0.05)
-    wider = drawn(share=0.0, spread="variance")
+    wider = draw_turns(share=0.0, spread="variance")
     assert wider.std() > angles[~small].std() + 0.03
     assert np.abs(wider).max() <= np.pi
-    assert (drawn()[:99] == drawn()[:99]).all()
+    assert (draw_turns()[:99] == draw_turns()[:99]).all()
 
 
 def test_an_undisturbed_motion_ends_as_planned() -> None:
@@ -123,7 +123,7 @@ def test_the_earliest_cause_ends_a_motion(touch: int, over: int, bump: int, sign
     strain[touch:, 1, 0] = sign * 1.5 * CONFIG.contact
     strain[over:, 2, 0] = sign * 1.5 * CONFIG.safety
     stop = min(over, bump)
-    # What is over the safety threshold is over the contact threshold as well: too much comes first.
+    # Strain above the safe limit is also above the contact threshold: ABORT takes precedence.
     expected = (touch, StepEnd.HIT1) if touch < stop else (stop, StepEnd.ABORT)
     assert end_of(CreateState.FWD1, strain, bump) == expected
     assert end_of(CreateState.BACK, strain, bump) == (bump, StepEnd.FREE)
@@ -138,7 +138,7 @@ def test_a_second_contact_needs_another_whisker(first: int, second: int, row: in
     other = second != first
     expected = (row, StepEnd.HIT2) if other else (ROWS - 1, StepEnd.ABORT)
     assert end_of(CreateState.FWD2, strain, before=before) == expected
-    # Also when the first one has slipped off by then.
+    # Also after the first whisker has slipped off.
     strain[row - 5 :, first] = 0
     strain[row:, second, 0] = -2 * CONFIG.contact
     assert end_of(CreateState.FWD2, strain, before=before) == expected
@@ -173,8 +173,8 @@ def test_motions_are_straight_or_on_the_spot(
     x: float, y: float, heading: float, how: tuple[float, float]
 ) -> None:
     pose, time = np.array([x, y, heading]), np.linspace(0.0, 2.0, 9)
-    told = WheelCommand(*how, 2.0)
-    poses = drive(told, pose, time)
+    command = WheelCommand(*how, 2.0)
+    poses = drive(command, pose, time)
     steps = np.column_stack([how[0] * time, 0 * time, how[1] * time])
     there = compose(pose, steps)
     assert np.allclose(poses[:, :2], there[:, :2])

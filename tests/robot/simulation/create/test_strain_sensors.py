@@ -31,22 +31,22 @@ LENGTH = FAN.shaft.length
 FREE = np.zeros(4, int)
 
 
-def placed(seed: int) -> tuple[Arena, np.ndarray]:
-    """An arena with rotated objects and free poses [50, 3] in it, most of them near walls."""
-    made, random = make_arena(ArenaConfig(rotated=True), seed % 20), np.random.default_rng(seed)
+def arena_and_poses(seed: int) -> tuple[Arena, np.ndarray]:
+    """An arena with rotated objects, and free poses [50, 3] in it, mostly near walls."""
+    room, random = make_arena(ArenaConfig(rotated=True), seed % 20), np.random.default_rng(seed)
     poses = random.uniform([0, 0, -np.pi], [1.25, 1.25, np.pi], (4000, 3))
-    near = segment_distance(wall_segments(made), poses[:, :2]).min(axis=1) < 0.25
-    return made, poses[near & has_clearance(made, poses[:, :2], 0.17)][:50]
+    near = segment_distance(wall_segments(room), poses[:, :2]).min(axis=1) < 0.25
+    return room, poses[near & has_clearance(room, poses[:, :2], 0.17)][:50]
 
 
 def each(poses: np.ndarray, walls: np.ndarray) -> Bending:
-    """Whiskers at poses that have nothing to do with one another."""
+    """Bending of whiskers at independent poses."""
     alone = [bend_whiskers(FAN, pose[None], walls, FREE) for pose in poses]
     return Bending(*(np.concatenate(column) for column in zip(*alone, strict=True)))
 
 
 def lines(poses: np.ndarray, turn: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """[N * 4, 4] From the base of each whisker so far in that direction."""
+    """Segments [N * 4, 4] from each whisker's base, of length `reach`, turned by `turn`."""
     c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
     x = poses[:, :1] + c * FAN.base[:, 0] - s * FAN.base[:, 1]
     y = poses[:, 1:2] + s * FAN.base[:, 0] + c * FAN.base[:, 1]
@@ -57,59 +57,59 @@ def lines(poses: np.ndarray, turn: np.ndarray, reach: np.ndarray) -> np.ndarray:
 @settings(max_examples=20)
 @given(SEEDS)
 def test_whiskers_bend_only_where_they_would_enter_walls(seed: int) -> None:
-    made, poses = placed(seed)
-    walls, felt = wall_segments(made), each(poses, wall_segments(made))
+    room, poses = arena_and_poses(seed)
+    walls, bend = wall_segments(room), each(poses, wall_segments(room))
     straight = lines(poses, np.zeros((len(poses), 4)), np.full((len(poses), 4), LENGTH))
-    assert ((felt.turn != 0) == segments_cross(straight, walls).any(axis=1).reshape(-1, 4)).all()
-    assert (np.sign(felt.turn) == felt.side).all()
-    assert (felt.turn != 0).sum() > 10
+    assert ((bend.turn != 0) == segments_cross(straight, walls).any(axis=1).reshape(-1, 4)).all()
+    assert (np.sign(bend.turn) == bend.side).all()
+    assert (bend.turn != 0).sum() > 10
 
 
 @settings(max_examples=20)
 @given(SEEDS)
 def test_a_bent_whisker_touches_a_wall_and_enters_none(seed: int) -> None:
-    made, poses = placed(seed)
-    walls, felt = wall_segments(made), each(poses, wall_segments(made))
-    held = (felt.turn != 0).ravel()
-    reached = lines(poses, felt.turn, felt.reach)[held]
+    room, poses = arena_and_poses(seed)
+    walls, bend = wall_segments(room), each(poses, wall_segments(room))
+    held = (bend.turn != 0).ravel()
+    reached = lines(poses, bend.turn, bend.reach)[held]
     assert segment_distance(walls, reached[:, 2:]).min(axis=1).max() < 1e-6
-    # A hair shorter and turned a hair further, the line to the contact crosses nothing.
-    clear = lines(poses, felt.turn + 1e-7 * felt.side, felt.reach - 1e-5)[held]
+    # Slightly shorter and turned slightly further, the line to the contact crosses no wall.
+    clear = lines(poses, bend.turn + 1e-7 * bend.side, bend.reach - 1e-5)[held]
     assert not segments_cross(clear, walls).any()
-    assert (felt.reach <= LENGTH * (1 + 1e-9)).all()
+    assert (bend.reach <= LENGTH * (1 + 1e-9)).all()
 
 
 @settings(max_examples=20)
 @given(SEEDS)
 def test_a_whisker_turns_by_the_smallest_free_angle(seed: int) -> None:
-    """With a smaller turn to either side the straight shaft would be in a wall."""
-    made, poses = placed(seed)
-    walls, felt = wall_segments(made), each(poses, wall_segments(made))
-    held, whole = felt.turn != 0, np.full(felt.turn.shape, LENGTH)
+    """With a smaller turn the straight shaft would be in a wall, on either side."""
+    room, poses = arena_and_poses(seed)
+    walls, bend = wall_segments(room), each(poses, wall_segments(room))
+    held, whole = bend.turn != 0, np.full(bend.turn.shape, LENGTH)
     for share in np.linspace(-0.999, 0.999, 14):
-        blocked = segments_cross(lines(poses, share * felt.turn, whole), walls).any(axis=1).reshape(-1, 4)
+        blocked = segments_cross(lines(poses, share * bend.turn, whole), walls).any(axis=1).reshape(-1, 4)
         assert blocked[held].all()
     beyond = (
-        segments_cross(lines(poses, felt.turn + 1e-6 * felt.side, whole), walls).any(axis=1).reshape(-1, 4)
+        segments_cross(lines(poses, bend.turn + 1e-6 * bend.side, whole), walls).any(axis=1).reshape(-1, 4)
     )
-    assert not beyond[felt.reach > LENGTH - 1e-9].any()
-    assert flat(felt)[beyond].all()  # lying along a wall takes less
+    assert not beyond[bend.reach > LENGTH - 1e-9].any()
+    assert flat(bend)[beyond].all()  # along a wall a smaller turn suffices
 
 
-def flat(felt: Bending) -> np.ndarray:
-    """Whiskers of which the shaft lies along what it touches, a wall or a corner."""
-    return np.isclose((shaft_tilt(FAN.shaft, felt.reach) - 1) * np.abs(felt.turn), felt.lean, atol=1e-6)
+def flat(bend: Bending) -> np.ndarray:
+    """Whiskers whose shaft lies along a wall or a corner."""
+    return np.isclose((shaft_tilt(FAN.shaft, bend.reach) - 1) * np.abs(bend.turn), bend.lean, atol=1e-6)
 
 
 @settings(max_examples=15)
 @given(SEEDS, *[st.floats(-3, 3)] * 3)
 def test_bending_does_not_depend_on_the_origin(seed: int, x: float, y: float, angle: float) -> None:
-    made, poses = placed(seed)
+    room, poses = arena_and_poses(seed)
     c, s = np.cos(angle), np.sin(angle)
     turn = np.array([[c, -s], [s, c]])
-    walls = (wall_segments(made).reshape(-1, 2) @ turn.T + [x, y]).reshape(-1, 4)
+    walls = (wall_segments(room).reshape(-1, 2) @ turn.T + [x, y]).reshape(-1, 4)
     moved = np.column_stack([poses[:, :2] @ turn.T + [x, y], poses[:, 2] + angle])
-    here, there = each(poses, wall_segments(made)), each(moved, walls)
+    here, there = each(poses, wall_segments(room)), each(moved, walls)
     assert np.allclose(here.turn, there.turn, atol=1e-7)
     assert np.allclose(here.reach, there.reach, atol=1e-7)
 
@@ -117,10 +117,10 @@ def test_bending_does_not_depend_on_the_origin(seed: int, x: float, y: float, an
 @settings(max_examples=15)
 @given(SEEDS)
 def test_mirrored_walls_give_mirrored_bending(seed: int) -> None:
-    made, poses = placed(seed)
+    room, poses = arena_and_poses(seed)
     mirror = np.array([1.0, -1.0])
-    walls = (wall_segments(made).reshape(-1, 2) * mirror).reshape(-1, 4)
-    here = each(poses, wall_segments(made))
+    walls = (wall_segments(room).reshape(-1, 2) * mirror).reshape(-1, 4)
+    here = each(poses, wall_segments(room))
     there = each(poses * [1, -1, -1], walls)
     assert np.allclose(here.turn, -there.turn[:, ::-1], atol=1e-9)  # the fan is symmetric
     one, other = base_strains(CONFIG, FAN, here), base_strains(CONFIG, FAN, there)
@@ -131,18 +131,18 @@ def test_mirrored_walls_give_mirrored_bending(seed: int) -> None:
 @given(SEEDS, st.integers(1, 58))
 def test_a_motion_may_be_computed_in_parts(seed: int, cut: int) -> None:
     """The bending side is the only state."""
-    made, poses = placed(seed)
+    room, poses = arena_and_poses(seed)
     assume(len(poses) > 0)
     way = poses[0] + np.linspace(0, 1, 60)[:, None] * [0.03, -0.02, 1.5]
-    whole = bend_whiskers(FAN, way, wall_segments(made), FREE)
-    first = bend_whiskers(FAN, way[:cut], wall_segments(made), FREE)
-    second = bend_whiskers(FAN, way[cut:], wall_segments(made), first.side[-1])
+    whole = bend_whiskers(FAN, way, wall_segments(room), FREE)
+    first = bend_whiskers(FAN, way[:cut], wall_segments(room), FREE)
+    second = bend_whiskers(FAN, way[cut:], wall_segments(room), first.side[-1])
     for column, one, two in zip(whole, first, second, strict=True):
         assert (column == np.concatenate([one, two])).all()
 
 
 def test_a_whisker_stays_on_its_side() -> None:
-    """Pushed straight against a wall that then tips the other way."""
+    """A wall first straight across, then tilted to the other side."""
     base, direction = np.zeros((40, 1, 2)), np.zeros((40, 1))
     tips = np.radians(np.linspace(85, 95, 40))
     turns = [
@@ -158,10 +158,10 @@ def test_a_whisker_stays_on_its_side() -> None:
     ]
     assert (np.array(turns[:40]) > 0).all()
     assert (np.array(turns[40:]) < 0).all()
-    # Turned on the spot before one wall, from one side of straight on to the other.
+    # Turned on the spot before one wall, from one side of the perpendicular to the other.
     wall = np.array([[0.13, -1.0, 0.13, 1.0]])
-    felt = bend_shafts(FAN.shaft, base, np.linspace(0.1, -0.1, 40)[:, None], wall, np.zeros(1, int))
-    assert (felt.side == 1).all()
+    bend = bend_shafts(FAN.shaft, base, np.linspace(0.1, -0.1, 40)[:, None], wall, np.zeros(1, int))
+    assert (bend.side == 1).all()
     assert bend_shafts(FAN.shaft, base[:1], -np.full((1, 1), 0.1), wall, np.zeros(1, int)).side[0, 0] == -1
 
 
@@ -169,8 +169,8 @@ def test_contact_with_a_tip_a_shaft_and_a_corner() -> None:
     wall = np.array([[-1.0, 0.0, 1.0, 0.0]])
     height = np.linspace(0.0999, 0.02, 400)  # of the base above the wall, seen at 45 degrees
     base = np.stack([np.zeros(400), height], axis=1)[:, None]
-    felt = bend_shafts(FAN.shaft, base, np.full((400, 1), -np.pi / 4), wall, np.zeros(1, int))
-    turn, reach = felt.turn[:, 0], felt.reach[:, 0]
+    bend = bend_shafts(FAN.shaft, base, np.full((400, 1), -np.pi / 4), wall, np.zeros(1, int))
+    turn, reach = bend.turn[:, 0], bend.reach[:, 0]
     touching = turn != 0
     assert touching.argmax() > 0
     assert (turn[touching] > 0).all()  # along the wall, away from the base
@@ -181,17 +181,17 @@ def test_contact_with_a_tip_a_shaft_and_a_corner() -> None:
     assert lies.any()
     assert lies.argmax() > touching.argmax()
     assert (np.diff(reach[lies]) < 0).all()
-    assert np.abs(np.diff(reach)).max() < 3e-3  # nothing jumps
-    # Where it lies on the wall it has turned into the wall's direction.
+    assert np.abs(np.diff(reach)).max() < 3e-3  # without jumps
+    # A whisker along the wall has the wall's direction.
     assert np.allclose(turn[lies] * shaft_tilt(FAN.shaft, reach[lies]), np.pi / 4)
 
-    # Swept past the corner of an object: held back further and further by it, then free at once.
+    # Swept past the corner of an object: the bend grows, then the whisker is free at once.
     sides = polygon_edges(square(np.array([0.12, 0.1]), 0.2, np.pi / 4))
     sweep = np.linspace(-0.7, 0.7, 400)
-    felt = bend_shafts(
+    bend = bend_shafts(
         FAN.shaft, np.zeros((400, 1, 2)), sweep[:, None], sides + [0.09, -0.1] * 2, np.zeros(1, int)
     )
-    turn, reach = felt.turn[:, 0], felt.reach[:, 0]
+    turn, reach = bend.turn[:, 0], bend.reach[:, 0]
     held = turn != 0
     assert held.any()
     assert (turn[held] < 0).all()
@@ -204,17 +204,17 @@ def test_contact_with_a_tip_a_shaft_and_a_corner() -> None:
 
 def test_a_wall_out_of_reach_bends_no_whisker() -> None:
     wall = np.array([[0.0, 0.5, 1.0, 0.5]])
-    felt = bend_whiskers(FAN, np.zeros((3, 3)), wall, FREE)
-    for column, value in zip(felt, (0.0, LENGTH, 0.0, 0), strict=True):
+    bend = bend_whiskers(FAN, np.zeros((3, 3)), wall, FREE)
+    for column, value in zip(bend, (0.0, LENGTH, 0.0, 0), strict=True):
         assert (column == value).all()
     nothing = bend_whiskers(FAN, np.zeros((3, 3)), np.zeros((0, 4)), FREE)
-    for one, other in zip(felt, nothing, strict=True):
+    for one, other in zip(bend, nothing, strict=True):
         assert (one == other).all()
 
 
 @given(st.floats(0.02, 0.139), st.floats(0.2, 1.0))
 def test_moments_are_those_of_a_tapered_beam(reach: float, taper: float) -> None:
-    """Against the integrated curvature of a cone with a force at a point of it."""
+    """Compared with the integrated curvature of a cone under a point force."""
     shaft = Shaft(0.14, 0.7e-3, (1 - taper) / 0.14)
     x = np.linspace(0, reach, 4001)
     curvature = (reach - x) / (1 - shaft.taper * x) ** 4  # F / (E I0) = 1
@@ -240,13 +240,13 @@ def test_wall_estimation_uses_the_same_beam_model(share: float) -> None:
 def test_horizontal_strain_has_the_side_and_vertical_strain_the_slant() -> None:
     wall = np.array([[-1.0, 0.0, 1.0, 0.0]])
 
-    def felt(angle: float) -> np.ndarray:
-        """[2] of a whisker pointing down at the wall by the angle, its tip bent aside by 0.1 rad."""
+    def strains(angle: float) -> np.ndarray:
+        """Strain [2] of a whisker at this angle to the wall, with its tip bent aside by 0.1 rad."""
         base = np.array([[[0.0, LENGTH * np.sin(angle - 0.1)]]])
         one = bend_shafts(FAN.shaft, base, np.array([[-angle]]), wall, np.zeros(1, int))
         return base_strains(CONFIG, FAN._replace(alive=np.ones(1, bool)), one)[0, 0]
 
-    steep, slanting = felt(1.2), felt(0.5)
+    steep, slanting = strains(1.2), strains(0.5)
     assert steep[0] == pytest.approx(slanting[0])
     assert steep[0] > 0
     assert steep[1] < slanting[1] < CONFIG.crosstalk * slanting[0]
@@ -256,9 +256,9 @@ def test_horizontal_strain_has_the_side_and_vertical_strain_the_slant() -> None:
 def test_dead_whiskers_have_no_strain() -> None:
     config = WhiskersConfig(dead=(1, 2))
     one = fixed_whiskers(config)
-    felt = bend_whiskers(one, np.zeros((5, 3)), np.array([[0.25, -1.0, 0.25, 1.0]]), FREE)
-    strain = base_strains(config, one, felt)
-    assert (felt.turn[:, 1:3] != 0).all()
+    bend = bend_whiskers(one, np.zeros((5, 3)), np.array([[0.25, -1.0, 0.25, 1.0]]), FREE)
+    strain = base_strains(config, one, bend)
+    assert (bend.turn[:, 1:3] != 0).all()
     assert (strain[:, 1:3] == 0).all()
     read = sample_strain(config, np.ones((9, 4, 2)), one.alive, stream(0, "strain"))
     assert (read[:, 1:3] == 0).all()
@@ -271,7 +271,7 @@ def test_body_vibration_has_its_frequency_and_decays() -> None:
     power = (np.abs(np.fft.rfft(shakes, axis=1)) ** 2).mean(axis=(0, 2))
     frequency = np.fft.rfftfreq(4000, 1 / 2000.0)
     assert abs(frequency[power.argmax()] - config.frequency) < 2
-    assert power[frequency < 17].sum() < 0.1 * power.sum()  # what the paper's filter takes away
+    assert power[frequency < 17].sum() < 0.1 * power.sum()  # removed by the paper's filter
     late = shakes[:, 2000:].std()
     assert late == pytest.approx(config.rumble, rel=0.1)
     assert shakes[:, :100].std() > 2 * late
@@ -284,7 +284,7 @@ def test_sensor_noise_has_the_configured_level() -> None:
     error = sample_strain(calm, true, FAN.alive, stream(0, "strain")) - true
     assert error.std() == pytest.approx(calm.noise, rel=0.03)
     assert abs(error.mean()) < 0.05 * calm.noise
-    # The body's vibration is the same for all whiskers, each channel with its own.
+    # The vibration is the same for all whiskers and differs between the channels.
     shaking = (
         sample_strain(CONFIG.model_copy(update={"noise": 0.0}), true, FAN.alive, stream(0, "strain")) - true
     )

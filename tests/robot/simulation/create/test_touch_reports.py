@@ -88,7 +88,8 @@ def test_held_out_walls_are_estimated_to_a_few_degrees(templates: StrainTemplate
 
 class Score(NamedTuple):
     """Attributes:
-    accepted: share of meetings. mean: error in degrees. far: share of errors over 15 degrees.
+    accepted: share of contacts with an estimate. mean: mean error, degrees. far: share of errors over
+    15 degrees.
     """
 
     accepted: float
@@ -104,7 +105,7 @@ CONFIGS = {
 }
 
 
-def scored(templates: StrainTemplates, side: float) -> dict[str, Score]:
+def score_estimators(templates: StrainTemplates, side: float) -> dict[str, Score]:
     """Accuracy of each estimator in unseen arenas. The true wall is nearest to the contact of HIT1."""
     meetings = 0
     off: dict[str, list[float]] = {name: [] for name in CONFIGS}
@@ -137,7 +138,7 @@ def scored(templates: StrainTemplates, side: float) -> dict[str, Score]:
 
 @pytest.mark.parametrize("side", [1.25, 2.5])
 def test_walls_are_estimated_in_unseen_arenas(side: float, templates: StrainTemplates) -> None:
-    scores = scored(templates, side)
+    scores = score_estimators(templates, side)
     print(f"\n{side:g} m     accepted  mean error  over 15 degrees")
     for name, score in scores.items():
         print(f"{name:10s} {score.accepted:8.2f} {score.mean:11.1f} {score.far:16.3f}")

@@ -14,8 +14,8 @@ from tactile.base.types import MotionKind
 KINDS = ("white", "move", "bias", "none")
 
 
-def driven(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Seven steps ahead, one back, two of turning, again and again: motions [N, 4] and kinds [N]."""
+def drive_and_turn(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Motions [N, 4] and kinds [N]: seven steps ahead, one back, two of turning, repeated."""
     phase = np.arange(count) % 10
     kind = np.where(phase < 7, MotionKind.FORWARD, np.where(phase < 8, MotionKind.BACK, MotionKind.TURN))
     motion = np.zeros((count, 4))
@@ -28,31 +28,31 @@ def driven(count: int) -> tuple[np.ndarray, np.ndarray]:
 def scales(
     noise: str, count: int = 3000, seed: int = 0, level: float = 0.05
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Measured over true motion of each step, and its kind."""
-    motion, kind = driven(count)
-    told = simulate_wheel_odometry(
+    """Ratio of measured to true motion of each step, and its kind."""
+    motion, kind = drive_and_turn(count)
+    measured = simulate_wheel_odometry(
         WheelsConfig(noise=noise, level=level), motion, kind, stream(seed, "wheels")
     )
     column = np.where(kind == MotionKind.TURN, 2, 0)
     rows = np.arange(count)
-    return told[rows, column] / motion[rows, column], kind
+    return measured[rows, column] / motion[rows, column], kind
 
 
 @given(st.integers(0, 10**6), st.sampled_from(KINDS))
 def test_only_moving_parts_have_errors(seed: int, noise: str) -> None:
-    motion, kind = driven(40)
+    motion, kind = drive_and_turn(40)
     config = WheelsConfig(noise=noise)
-    told = simulate_wheel_odometry(config, motion, kind, stream(seed, "wheels"))
-    assert (told[motion == 0] == 0).all()
-    assert (told[:, 3] == motion[:, 3]).all()
-    assert (told == simulate_wheel_odometry(config, motion, kind, stream(seed, "wheels"))).all()
+    measured = simulate_wheel_odometry(config, motion, kind, stream(seed, "wheels"))
+    assert (measured[motion == 0] == 0).all()
+    assert (measured[:, 3] == motion[:, 3]).all()
+    assert (measured == simulate_wheel_odometry(config, motion, kind, stream(seed, "wheels"))).all()
     if noise != "none":
-        assert (told != simulate_wheel_odometry(config, motion, kind, stream(seed + 1, "wheels"))).any()
-    assert (motion == driven(40)[0]).all()
+        assert (measured != simulate_wheel_odometry(config, motion, kind, stream(seed + 1, "wheels"))).any()
+    assert (motion == drive_and_turn(40)[0]).all()
 
 
 def test_without_noise_odometry_is_the_truth() -> None:
-    motion, kind = driven(30)
+    motion, kind = drive_and_turn(30)
     for config in (WheelsConfig(noise="none"), WheelsConfig(noise="move", level=0.0)):
         assert (simulate_wheel_odometry(config, motion, kind, stream(0, "wheels")) == motion).all()
     assert simulate_wheel_odometry(WheelsConfig(), motion[:0], kind[:0], stream(0, "wheels")).shape == (0, 4)

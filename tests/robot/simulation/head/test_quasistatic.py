@@ -22,7 +22,7 @@ SAMPLES, CYCLES = 80, 3
 
 
 def sweep() -> WallSweep:
-    """Walls that come, go and slide."""
+    """Walls that enter, leave and slide."""
     random = stream(0, "walls")
     size = (SAMPLES, CYCLES, 18)
     wall = np.repeat(random.uniform(0.2, 1.4, (8, CYCLES, 18)), SAMPLES // 8, axis=0)
@@ -43,8 +43,8 @@ def test_a_cycle_simulated_in_parts_equals_the_whole(cuts: list[int], mode: str)
     config, mechanics, whole = StreamConfig(rate=SAMPLES), MechanicsConfig(slip=0.1), sweep()
     whisking, threshold = WhiskingConfig(mode=mode), np.full(18, 0.04)
 
-    def law(drive: WhiskDrive, time: float, told: np.ndarray) -> tuple[np.ndarray, WhiskDrive]:
-        return whisk_command(whisking, drive, time, told, threshold, HEAD.shape)
+    def law(drive: WhiskDrive, time: float, reading: np.ndarray) -> tuple[np.ndarray, WhiskDrive]:
+        return whisk_command(whisking, drive, time, reading, threshold, HEAD.shape)
 
     ends = [0, *sorted(cuts), SAMPLES]
     balance, parts = whiskers_at_rest(CYCLES, 18), []
@@ -62,8 +62,8 @@ def test_a_state_can_be_continued_twice() -> None:
     config, mechanics, whole = StreamConfig(rate=SAMPLES), MechanicsConfig(slip=0.1), sweep()
     whisking = WhiskingConfig(mode="open")
 
-    def law(drive: WhiskDrive, time: float, told: np.ndarray) -> tuple[np.ndarray, WhiskDrive]:
-        return whisk_command(whisking, drive, time, told, np.full(18, 0.04), HEAD.shape)
+    def law(drive: WhiskDrive, time: float, reading: np.ndarray) -> tuple[np.ndarray, WhiskDrive]:
+        return whisk_command(whisking, drive, time, reading, np.full(18, 0.04), HEAD.shape)
 
     before = whiskers_at_rest(CYCLES, 18)
     first = advance_balance(config, mechanics, law, whole, before)

@@ -28,7 +28,7 @@ from tactile.whiskers.head_geometry import HeadConfig, RingConfig
 SHORT = {"path": {"circuits": "CA"}}
 
 
-def made(head: HeadConfig | None = None, **changes: Any) -> HeadSimulation:
+def simulate(head: HeadConfig | None = None, **changes: Any) -> HeadSimulation:
     return HeadSimulation(SimulationConfig.model_validate(SHORT | changes), head)
 
 
@@ -47,65 +47,65 @@ def bits(source: Source) -> list[list[bytes]]:
 
 
 def test_a_session_is_bit_identical_for_the_same_settings() -> None:
-    one = made()
+    one = simulate()
     assert isinstance(one, Source)
     with one as source:
         first = bits(source)
         assert bits(source) == first
-    assert bits(made()) == first
+    assert bits(simulate()) == first
     assert len(first) == one.length > 250
-    assert made().digest == one.digest
-    other = made(seed=1)
+    assert simulate().digest == one.digest
+    other = simulate(seed=1)
     assert other.digest != one.digest
     assert bits(other)[:50] != first[:50]
 
 
 def test_the_digest_depends_on_the_configuration(tmp_path: Path) -> None:
     maze = tmp_path / "maze.txt"
-    maze.write_text(maze_text(made().scene.maze))
-    loop = made().scene.loop
+    maze.write_text(maze_text(simulate().scene.maze))
+    loop = simulate().scene.loop
     sessions = [
-        made(),
-        made(seed=3),
-        made(HeadConfig(rest_deg=70.0)),
-        made(mechanics={"servo": 0.5}),
-        made(maze={"file": maze}, path={"loop": loop, "circuits": "CA"}),
+        simulate(),
+        simulate(seed=3),
+        simulate(HeadConfig(rest_deg=70.0)),
+        simulate(mechanics={"servo": 0.5}),
+        simulate(maze={"file": maze}, path={"loop": loop, "circuits": "CA"}),
     ]
     assert len({session.digest for session in sessions}) == len(sessions)
     again = tmp_path / "copy.txt"
     again.write_text(maze.read_text().replace("o", "+"))
-    moved = made(maze={"file": again}, path={"loop": loop, "circuits": "CA"})
-    assert moved.digest == sessions[-1].digest  # what is in the file counts, not where it lies
+    moved = simulate(maze={"file": again}, path={"loop": loop, "circuits": "CA"})
+    assert moved.digest == sessions[-1].digest  # the content counts, not the path
     maze.write_text(maze.read_text().replace("|", " ", 1).replace(" ", "|", 1))
     assert str(tmp_path) not in moved.info.to_json()
 
 
 def test_streams_are_independent() -> None:
-    """Other odometry errors leave contacts unchanged, another sensor the odometry, and so on."""
-    base = made()
-    other = made(odometry={"noise": "white"})
+    """A changed setting affects only its own stream: odometry errors leave contacts unchanged."""
+    base = simulate()
+    other = simulate(odometry={"noise": "white"})
     assert (base.odometry != other.odometry).any()
     assert all((one == two).all() for one, two in zip(base.features, other.features, strict=True))
-    noisy = made(mechanics={"noise": 5e-3})
+    noisy = simulate(mechanics={"noise": 5e-3})
     assert (noisy.odometry == base.odometry).all()
     assert (noisy.features.touched != base.features.touched).any()
-    fuller = made(maze={"share": 0.9})
+    fuller = simulate(maze={"share": 0.9})
     assert fuller.scene.loop == base.scene.loop
     assert (fuller.truth == base.truth).all()
-    rough = made(motion={"jitter": {"position": 0.005}})
+    rough = simulate(motion={"jitter": {"position": 0.005}})
     assert maze_text(rough.scene.maze) == maze_text(base.scene.maze)
     assert (rough.truth != base.truth).any()
 
 
 def test_one_maze_can_have_many_sessions() -> None:
-    one, two = (made(seed=seed, maze={"seed": 7}) for seed in (1, 2))
+    one, two = (simulate(seed=seed, maze={"seed": 7}) for seed in (1, 2))
     assert maze_text(one.scene.maze) == maze_text(two.scene.maze)
     assert one.scene.loop == two.scene.loop
     assert (one.odometry[:99] != two.odometry[:99]).any()
 
 
 def test_samples_agree_with_the_session() -> None:
-    session = made()
+    session = simulate()
     samples = list(session)
     assert len(samples) == session.length
     assert (np.diff([sample.time for sample in samples]) > 0).all()
@@ -116,18 +116,18 @@ def test_samples_agree_with_the_session() -> None:
     assert (truth[:, :2] > 0).all()
     assert (truth[:, :2] < [7 * CELL_SIDE, 5 * CELL_SIDE]).all()
     assert (np.abs(truth[:, 2]) <= np.pi).all()
-    felt = [sample.reading for sample in samples]
-    assert all(isinstance(reading, Whisk) for reading in felt)
-    contact = np.array([reading.contact for reading in felt])
+    readings = [sample.reading for sample in samples]
+    assert all(isinstance(reading, Whisk) for reading in readings)
+    contact = np.array([reading.contact for reading in readings])
     assert 0.1 < contact.mean() < 0.6
-    told = np.array([[*reading.odometry] for reading in felt])
-    assert (told == session.odometry).all()
-    samples[0].truth[:] = 9  # a reader's own copy
+    measured = np.array([[*reading.odometry] for reading in readings])
+    assert (measured == session.odometry).all()
+    samples[0].truth[:] = 9  # a copy
     assert (next(iter(session)).truth != 9).all()
 
 
 def test_twice_the_rate_is_twice_the_whisks() -> None:
-    once, twice = made(), made(whisking={"rate": 2.0})
+    once, twice = simulate(), simulate(whisking={"rate": 2.0})
     assert abs(twice.length - 2 * once.length) <= 1
     assert twice.rate_hz == 2.0
     assert twice.time[0] == 0.125
@@ -136,38 +136,40 @@ def test_twice_the_rate_is_twice_the_whisks() -> None:
 def test_reverse_tracking_senses_the_same_places() -> None:
     steady, calm = {"jitter": {"position": 0, "yaw_deg": 0}}, {"noise": "none"}
     quiet = {"noise": 0.0, "reach_noise": 0.0}
-    there = made(path={"circuits": "C"}, motion=steady, odometry=calm, mechanics=quiet)
+    there = simulate(path={"circuits": "C"}, motion=steady, odometry=calm, mechanics=quiet)
     backwards = steady | {"backwards": True}
-    back = made(path={"circuits": "A"}, motion=backwards, odometry=calm, mechanics=quiet)
+    back = simulate(path={"circuits": "A"}, motion=backwards, odometry=calm, mechanics=quiet)
     assert (there.odometry[:, 0] > -1e-9).all()
     assert (back.odometry[:, 0] < 1e-9).all()
     gap = between(there.truth[:, None], back.truth[None])
     away = np.hypot(gap[..., 0], gap[..., 1]) + 0.1 * np.abs(gap[..., 2])
     nearest = away.argmin(axis=1)
-    assert away.min(axis=1).max() < 0.04  # half a step, or half a turn's
+    assert away.min(axis=1).max() < 0.04  # half a step, or the same for half a turn
     same = there.features.contact == back.features.contact[nearest]
     apart = there.features.contact == back.features.contact[np.roll(nearest, 40)]
     assert same.mean() > 0.9 > apart.mean()
 
 
 def test_kidnaps_are_spread_and_hidden_from_odometry() -> None:
-    whole = made(path={"circuits": "CACA"})
-    session = made(path={"circuits": "CACA"}, kidnaps={"count": 3, "ahead": 30.0}, odometry={"noise": "none"})
+    whole = simulate(path={"circuits": "CACA"})
+    session = simulate(
+        path={"circuits": "CACA"}, kidnaps={"count": 3, "ahead": 30.0}, odometry={"noise": "none"}
+    )
     rows = np.flatnonzero(session.kidnapped)
     assert len(rows) == 3
     assert (rows >= session.length // 4 - 1).all()
     assert abs(session.length - (whole.length - 90)) <= 1
     true = between(session.truth[:-1], session.truth[1:])
-    told = session.odometry[1:, :3]
-    wrong = np.flatnonzero(np.abs(told[:, :2] - true[:, :2]).max(axis=1) > 0.02)
+    measured = session.odometry[1:, :3]
+    wrong = np.flatnonzero(np.abs(measured[:, :2] - true[:, :2]).max(axis=1) > 0.02)
     assert set(wrong) <= set(rows - 1)
-    assert len(wrong) >= 2  # where it is set down may look like going on
-    assert (told[rows - 1] == told[rows - 2]).all()
-    assert made().kidnapped.sum() == 0
+    assert len(wrong) >= 2  # a kidnap may look like continued motion
+    assert (measured[rows - 1] == measured[rows - 2]).all()
+    assert simulate().kidnapped.sum() == 0
 
 
 def test_a_later_maze_changes_contacts() -> None:
-    base, control = made(), made(later_maze=0.5)
+    base, control = simulate(), simulate(later_maze=0.5)
     half = base.length // 2
     for one, two in zip(base.features, control.features, strict=True):
         assert (one[:half] == two[:half]).all()
@@ -177,23 +179,23 @@ def test_a_later_maze_changes_contacts() -> None:
 
 
 def test_exploration_has_the_configured_duration() -> None:
-    session = made(path={"explore": 400.0})
+    session = simulate(path={"explore": 400.0})
     assert session.length == 400
     cells = {tuple(cell) for cell in np.floor(session.truth[:, :2] / CELL_SIDE).astype(int)}
     assert len(cells) > 12
-    carried = made(path={"explore": 400.0}, kidnaps={"count": 2, "ahead": 60.0})
+    carried = simulate(path={"explore": 400.0}, kidnaps={"count": 2, "ahead": 60.0})
     assert carried.length == 400
     assert carried.kidnapped.sum() == 2
-    assert made(path={"explore": 400.0}, seed=1).truth[-1].tolist() != session.truth[-1].tolist()
+    assert simulate(path={"explore": 400.0}, seed=1).truth[-1].tolist() != session.truth[-1].tolist()
 
 
 def test_given_cells_are_visited(tmp_path: Path) -> None:
     (tmp_path / "maze.txt").write_text("o---o---o\n|       |\no   o   o\n|   |   |\no---o---o\n")
     cells = [(0, 0), (0, 1), (1, 1), (1, 0)]
-    session = made(maze={"file": tmp_path / "maze.txt"}, path={"cells": cells})
+    session = simulate(maze={"file": tmp_path / "maze.txt"}, path={"cells": cells})
     passed = [tuple(cell) for cell in np.floor(session.truth[:, :2] / CELL_SIDE).astype(int).tolist()]
     assert list(dict.fromkeys(passed)) == cells
-    assert made(maze={"file": tmp_path / "maze.txt"}, path={"explore": 60}).length == 60
+    assert simulate(maze={"file": tmp_path / "maze.txt"}, path={"explore": 60}).length == 60
 
 
 LOOP = [(0, 0), (1, 0), (1, 1), (0, 1)]
@@ -203,7 +205,7 @@ LOW = HeadConfig(rings=(RingConfig(length=0.16, radius=0.045, height=0.07),), re
 
 
 @pytest.mark.parametrize(
-    ("changes", "head", "said"),
+    ("changes", "head", "pieces"),
     [
         ({"maze": {"loop": 21}}, None, ["simulation.maze.loop", "21 cells", "even"]),
         (
@@ -245,14 +247,14 @@ LOW = HeadConfig(rings=(RingConfig(length=0.16, radius=0.045, height=0.07),), re
 def test_impossible_settings_are_refused(
     changes: dict[str, Any],
     head: HeadConfig | None,
-    said: list[str],
+    pieces: list[str],
     tmp_path: Path,
     refused: Callable[..., InputError],
 ) -> None:
     for name, drawing in {"ROOM": ROOM, "BLOCKED": BLOCKED}.items():
         (tmp_path / name).write_text(drawing)
     config = SimulationConfig.model_validate(changes).resolved(tmp_path)
-    refused(lambda: HeadSimulation(config, head), *said)
+    refused(lambda: HeadSimulation(config, head), *pieces)
 
 
 def test_a_low_head_may_move_where_its_whiskers_are_free(tmp_path: Path) -> None:
@@ -261,7 +263,7 @@ def test_a_low_head_may_move_where_its_whiskers_are_free(tmp_path: Path) -> None
     drawing = wide + "\n|" + " " * 23 + "|\no" + "---o" * 6 + "\n"
     (tmp_path / "maze.txt").write_text(drawing.replace("   o" * 6 + "\n|", "   o" * 6 + "\n|"))
     short = HeadConfig(rings=(RingConfig(length=0.04, radius=0.02, height=0.055),))
-    session = made(short, maze={"file": tmp_path / "maze.txt"}, path={"cells": [(2, 2), (3, 2), (3, 3)]})
+    session = simulate(short, maze={"file": tmp_path / "maze.txt"}, path={"cells": [(2, 2), (3, 2), (3, 3)]})
     assert not session.features.contact.any()
 
 
@@ -289,30 +291,30 @@ def test_auto_chooses_the_cheapest_sufficient_tier() -> None:
 @pytest.mark.parametrize("name", ["quasistatic", "dynamic"])
 def test_raw_sessions_are_bit_identical_and_agree_with_the_kinematic_tier(name: str) -> None:
     changes: dict[str, Any] = {"path": {"explore": 20.0}, "fidelity": name, "mechanics": {"noise": 1e-3}}
-    raw = made(**changes)
+    raw = simulate(**changes)
     first = bits(raw)
     assert bits(raw) == first
-    assert bits(made(**changes)) == first
+    assert bits(simulate(**changes)) == first
     assert len(first) == 20
     reading = next(iter(raw)).reading
     assert isinstance(reading, Cycle)
     assert reading.angle.shape == (2000, 18)
-    simple = made(**changes | {"fidelity": "kinematic"})
+    simple = simulate(**changes | {"fidelity": "kinematic"})
     assert (raw.truth == simple.truth).all()
     assert (raw.odometry == simple.odometry).all()
-    felt = [
+    readings = [
         np.array([s.reading.contact for s in open_touch_source(source, TouchConfig())])
         for source in (raw, simple)
     ]
-    assert (felt[0] == felt[1]).mean() > 0.85
-    assert felt[0].mean() > 0.1
+    assert (readings[0] == readings[1]).mean() > 0.85
+    assert readings[0].mean() > 0.1
     assert raw.info.calibration is not None
 
 
 @pytest.mark.parametrize(("radial", "raw"), list(product([False, True], repeat=2)))
 def test_a_recorded_session_equals_the_session(radial: bool, raw: bool, tmp_path: Path) -> None:
     head = HeadConfig(dead=(2,), rest_deg=70.0)
-    session = made(head, raw=raw, path={"explore": 6.0 if raw else 60.0})
+    session = simulate(head, raw=raw, path={"explore": 6.0 if raw else 60.0})
     record_source(session, tmp_path / "a.mcap")
     again = Recording(tmp_path / "a.mcap")
     assert bits(again) == bits(session)
@@ -331,7 +333,7 @@ def test_a_recorded_session_equals_the_session(radial: bool, raw: bool, tmp_path
 
 
 def test_a_session_in_memory_equals_the_session() -> None:
-    source = open_touch_source(made(HeadConfig(dead=(5,))), TouchConfig())
+    source = open_touch_source(simulate(HeadConfig(dead=(5,))), TouchConfig())
     log = load_into_memory(source)
     assert (log.length, log.view_shape, log.whiskers) == (source.length, (3, 6, 1), 18)
     assert log.info == source.info
@@ -344,13 +346,13 @@ def test_a_session_in_memory_equals_the_session() -> None:
 
 
 def test_whisker_readings_are_not_observations(refused: Callable[..., InputError]) -> None:
-    refused(lambda: load_into_memory(made()), "simulation", "whisker readings")
+    refused(lambda: load_into_memory(simulate()), "simulation", "whisker readings")
 
 
 def test_a_head_that_differs_from_the_recorded_one_is_refused(
     tmp_path: Path, refused: Callable[..., InputError]
 ) -> None:
-    record_source(made(path={"explore": 3.0}), tmp_path / "a.mcap")
+    record_source(simulate(path={"explore": 3.0}), tmp_path / "a.mcap")
     source = Recording(tmp_path / "a.mcap")
     refused(
         lambda: open_touch_source(source, TouchConfig(head=HeadConfig(whiskers=5))),
@@ -361,7 +363,7 @@ def test_a_head_that_differs_from_the_recorded_one_is_refused(
 
 
 def test_odometry_is_between_mid_protractions() -> None:
-    session = made(odometry=OdometryConfig(noise="none").model_dump())
+    session = simulate(odometry=OdometryConfig(noise="none").model_dump())
     true = between(session.truth[:-1], session.truth[1:])
     assert np.allclose(session.odometry[1:, :2], true[:, :2], atol=1e-12)
     assert np.allclose(wrap(session.odometry[1:, 2] - true[:, 2]), 0, atol=1e-9)

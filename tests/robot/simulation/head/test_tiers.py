@@ -61,7 +61,7 @@ def one(
 
 
 LOW = Walls(np.array([[-1.0, -1.0, 1.0, 1.0]]), np.array([0.05]))
-"""A table under the whole head: every whisker meets it with its tip."""
+"""A plate under the head: every whisker touches it with its tip."""
 
 
 def maze(count: int) -> tuple[Surroundings, HeadPath, np.ndarray]:
@@ -101,7 +101,7 @@ def test_beam_stiffness_matches_theory_at_its_load_positions(taper: float) -> No
 
 def test_an_untapered_whisker_has_the_modes_of_a_cantilever() -> None:
     first, second = make_beam(ShaftConfig(taper=1.0)).modes
-    # Two shapes can only be stiffer than the whole (Rayleigh and Ritz).
+    # Two shapes are an upper bound of the stiffness (Rayleigh and Ritz).
     assert 1.8751**2 <= first < 1.01 * 1.8751**2
     assert 4.6941**2 <= second < 1.1 * 4.6941**2
     assert beam_time_unit(BeamConfig(), 0.2) == pytest.approx(4 * beam_time_unit(BeamConfig(), 0.1))
@@ -111,7 +111,7 @@ def test_an_untapered_whisker_has_the_modes_of_a_cantilever() -> None:
 def test_free_whiskers_follow_the_command_without_contact(tier: MechanicsModel) -> None:
     found = calibration(tier)
     np.testing.assert_allclose(found.free, np.radians(65), atol=0.02)
-    # Beyond the sensor's noise, the inertia of the long whiskers.
+    # Tolerance: the sensor's noise and the inertia of the long whiskers.
     assert (found.sd > 0.97 * 2e-3).all()
     assert (found.sd < 1.25 * 2e-3).all()
     np.testing.assert_allclose(found.mean, 0.0, atol=3e-4)
@@ -123,11 +123,11 @@ def test_drive_and_whisker_share_the_command_beyond_contact(tier: MechanicsModel
     mechanics = MechanicsConfig(servo=servo, noise=0.0, slip=1.0)
     whisking = WhiskingConfig(mode="open", rate=0.25)
     cycle = one(tier, LOW, whisking, mechanics)
-    met = still(LOW)[0].contact(np.zeros((1, 3))).angle[0]
+    angle = still(LOW)[0].contact(np.zeros((1, 3))).angle[0]
     hard = stiffness(ShaftConfig(), 1.0)
-    bend = servo / (servo + hard) * (np.radians(65) - met)
+    bend = servo / (servo + hard) * (np.radians(65) - angle)
     half = len(cycle.time) // 2
-    np.testing.assert_allclose(cycle.angle[half], met + bend, atol=0.01)
+    np.testing.assert_allclose(cycle.angle[half], angle + bend, atol=0.01)
     np.testing.assert_allclose(cycle.deflection[half, :, 1], hard * bend, atol=0.01)
     assert (np.abs(cycle.deflection[..., 0]) < 1e-9).all()
 
@@ -135,11 +135,11 @@ def test_drive_and_whisker_share_the_command_beyond_contact(tier: MechanicsModel
 @TIERS
 def test_whiskers_bent_too_far_slip_off(tier: MechanicsModel) -> None:
     cycle = one(tier, LOW, OPEN, MechanicsConfig(noise=0.0, slip=0.1))
-    met = still(LOW)[0].contact(np.zeros((1, 3))).angle[0]
+    angle = still(LOW)[0].contact(np.zeros((1, 3))).angle[0]
     half = len(cycle.time) // 2
-    assert (met < 0.9).any()
-    np.testing.assert_allclose(cycle.angle[half, met < 0.9], np.radians(65), atol=0.02)
-    np.testing.assert_allclose(cycle.deflection[half, met < 0.9, 1], 0.0, atol=0.02)
+    assert (angle < 0.9).any()
+    np.testing.assert_allclose(cycle.angle[half, angle < 0.9], np.radians(65), atol=0.02)
+    np.testing.assert_allclose(cycle.deflection[half, angle < 0.9, 1], 0.0, atol=0.02)
 
 
 @TIERS
