@@ -167,7 +167,7 @@ class Terminal:
         self.path = os.ttyname(self._slave)
         self.plugged = True
 
-    def in_tune(self) -> bool:
+    def has_create_baud_rate(self) -> bool:
         """Whether the client has set the Create's baud rate."""
         return bool(self._termios.tcgetattr(self._slave)[5] == getattr(self._termios, f"B{BAUD}"))
 
@@ -239,7 +239,7 @@ def serve(config: CreateEmulatorConfig) -> None:
         last = now
         if terminal.master in ready and terminal.plugged:
             for whole in robot.receive(os.read(terminal.master, 4096)):
-                reply = faults.disturb(whole if terminal.in_tune() else faults.noise(whole))
+                reply = faults.disturb(whole if terminal.has_create_baud_rate() else faults.noise(whole))
                 step = faults.trickle
                 pieces = [reply[i : i + 1] for i in range(len(reply))] if step else [reply]
                 start = max(now, out[-1][0] if out else now)

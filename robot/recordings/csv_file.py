@@ -84,14 +84,14 @@ def read_csv(path: Path) -> CsvFile:
         raise InputError(str(path), f"is not text (byte {error.start})", "a CSV file in UTF-8") from error
     lines = text.splitlines()
     names = _header(path, lines[0] if lines else "")
-    kept = [(number, line) for number, line in enumerate(lines[1:], start=2) if line.strip()]
-    if not kept:
+    full = [(number, line) for number, line in enumerate(lines[1:], start=2) if line.strip()]
+    if not full:
         raise InputError(str(path), "has no rows under its header", "at least one row")
-    values = _numbers([line for _, line in kept], len(names))
-    empty = np.zeros((len(kept), len(names)), bool)
+    values = _numbers([line for _, line in full], len(names))
+    empty = np.zeros((len(full), len(names)), bool)
     if values is None:
-        values, empty = _cells(path, names, kept)
-    return CsvFile(path, names, values, empty, np.array([number for number, _ in kept]), content)
+        values, empty = _cells(path, names, full)
+    return CsvFile(path, names, values, empty, np.array([number for number, _ in full]), content)
 
 
 def digest_of_files(files: Sequence[CsvFile]) -> str:
@@ -123,12 +123,12 @@ def _numbers(lines: list[str], width: int) -> np.ndarray | None:
     return values if values.shape == (len(lines), width) else None
 
 
-def _cells(path: Path, names: tuple[str, ...], kept: list[tuple[int, str]]) -> tuple[np.ndarray, np.ndarray]:
+def _cells(path: Path, names: tuple[str, ...], full: list[tuple[int, str]]) -> tuple[np.ndarray, np.ndarray]:
     """[N, C] values and empty flags, parsed cell by cell; raises the errors of cells that are not numbers."""
-    values = np.full((len(kept), len(names)), np.nan)
+    values = np.full((len(full), len(names)), np.nan)
     empty = np.zeros(values.shape, bool)
     errors = []
-    for row, (number, line) in enumerate(kept):
+    for row, (number, line) in enumerate(full):
         cells = _split(line)
         if len(cells) != len(names):
             found, expected = f"{len(cells)} cells", f"{len(names)}, as in the header"

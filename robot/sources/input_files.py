@@ -61,7 +61,7 @@ def missing_error(where: str, kind: str, name: str, there: Sequence[str], key: s
     """The error for a name that a file lacks; it lists the existing names and suggests a similar one.
 
     Args:
-        kind: what is missing, such as 'column' or 'array'. there: the existing names.
+        kind: of the missing name, such as 'column' or 'array'. there: the existing names.
         key: configuration key in which the name was given, if any.
     """
     close = get_close_matches(name, there, n=1)

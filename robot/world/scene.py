@@ -71,9 +71,9 @@ class PathConfig(Settings):
     def _one(self) -> PathConfig:
         if "circuits" not in self.model_fields_set and (self.explore or self.cells):
             self.__dict__["circuits"] = ""  # the default applies only without explore and cells
-        asked = [name for name in ("circuits", "explore", "cells") if getattr(self, name)]
-        if len(asked) != 1:
-            there = " and ".join(asked) or "none"
+        given = [name for name in ("circuits", "explore", "cells") if getattr(self, name)]
+        if len(given) != 1:
+            there = " and ".join(given) or "none"
             raise ValueError(f"{there} of circuits, explore and cells; give exactly one")
         return self
 

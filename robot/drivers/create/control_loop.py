@@ -39,13 +39,13 @@ class ControlLoop:
     def __init__(self, config: CreateConfig, link: SerialLink, clock: Callable[[], float]) -> None:
         self._config, self._link, self._clock = config, link, clock
         self._lock = threading.Lock()
-        self._asked = WheelCommand(0, 0, -math.inf)
-        self._heard = clock()
-        self._odometer = CreateOdometry(self._heard)
-        self._owed = 0  # at the last call of `gap`
-        self._rearm, self._deaf = False, -math.inf
-        self.halted: StopEvent | None = None
-        self.sensed: protocol.SensorReply | None = None
+        self._command = WheelCommand(0, 0, -math.inf)
+        self._reply_time = clock()
+        self._odometer = CreateOdometry(self._reply_time)
+        self._outstanding = 0  # at the last call of `gap`
+        self._enter_safe, self._pause_end = False, -math.inf
+        self.active_stop: StopEvent | None = None
+        self.last_reply: protocol.SensorReply | None = None
 
     @property
     def counts(self) -> LinkCounts:
@@ -60,9 +60,9 @@ class ControlLoop:
         """
         right, left = wheel_speeds(self._config, forward, turn)
         with self._lock:
-            if self.halted and (right or left):
-                raise CommandRefused(f"the robot is stopped: {self.halted}")
-            self._asked = WheelCommand(right, left, self._clock())
+            if self.active_stop and (right or left):
+                raise CommandRefused(f"the robot is stopped: {self.active_stop}")
+            self._command = WheelCommand(right, left, self._clock())
 
     def release(self) -> None:
         """Allows driving again after a stop; the robot stands until the next command.
@@ -71,10 +71,10 @@ class ControlLoop:
             CommandRefused: a lost port or watchdog requires a new driver.
         """
         with self._lock:
-            if self.halted and self.halted.halt in (StopReason.UNPLUGGED, StopReason.UNGUARDED):
-                raise CommandRefused(f"a new driver is required: {self.halted}")
-            self._rearm = self.halted is not None
-            self.halted = None
+            if self.active_stop and self.active_stop.reason in (StopReason.UNPLUGGED, StopReason.UNGUARDED):
+                raise CommandRefused(f"a new driver is required: {self.active_stop}")
+            self._enter_safe = self.active_stop is not None
+            self.active_stop = None
 
     def take_odometry(self) -> Odometry:
         """Motion since the last call."""
@@ -84,45 +84,45 @@ class ControlLoop:
     def gap(self) -> bool:
         """Whether a reply was lost since the last call, possibly with its motion."""
         with self._lock:
-            before, self._owed = self._owed, self._link.counts.owed
-            return self._owed > before
+            before, self._outstanding = self._outstanding, self._link.counts.outstanding
+            return self._outstanding > before
 
-    def halt(self, halt: StopReason, detail: str) -> None:
+    def halt(self, reason: StopReason, detail: str) -> None:
         """Stops the robot with the next poll, until release; the first reason is kept."""
         with self._lock:
-            self._asked = WheelCommand(0, 0, -math.inf)
-            self.halted = self.halted or StopEvent(halt, detail, self._clock())
+            self._command = WheelCommand(0, 0, -math.inf)
+            self.active_stop = self.active_stop or StopEvent(reason, detail, self._clock())
 
     def poll(self) -> None:
         """Reads the sensors and commands the wheels."""
-        if self._clock() < self._deaf:
+        if self._clock() < self._pause_end:
             return
         try:
-            if self._rearm:
-                self._rearm, self._deaf = False, self._clock() + PAUSE
+            if self._enter_safe:
+                self._enter_safe, self._pause_end = False, self._clock() + PAUSE
                 self._link.send(protocol.SAFE)
                 return
             found = self._read()
-            asked = self._asked  # read once: another thread may replace it
-            objected = stop_reason(found, asked.right, asked.left) if found else None
-            if objected:
-                self.halt(*objected)
-            fresh = self._clock() - asked.time <= self._config.patience
-            drives = fresh and self.halted is None
-            self._link.send(protocol.drive(asked.right, asked.left) if drives else protocol.STOP)
+            command = self._command  # read once: another thread may replace it
+            stop = stop_reason(found, command.right, command.left) if found else None
+            if stop:
+                self.halt(*stop)
+            fresh = self._clock() - command.time <= self._config.patience
+            drives = fresh and self.active_stop is None
+            self._link.send(protocol.drive(command.right, command.left) if drives else protocol.STOP)
         except Unplugged as error:
             self.halt(StopReason.UNPLUGGED, str(error))
 
     def _read(self) -> protocol.SensorReply | None:
         try:
-            found = self._link.ask(self._clock() - self._heard)
+            found = self._link.ask(self._clock() - self._reply_time)
         except (NoReply, BadReply) as error:
-            since = self._clock() - self._heard
+            since = self._clock() - self._reply_time
             if since >= self._config.silence:
-                halt = StopReason.SILENT if isinstance(error, NoReply) else StopReason.GARBLED
-                self.halt(halt, f"{error} for {since:.2f} s")
+                reason = StopReason.SILENT if isinstance(error, NoReply) else StopReason.GARBLED
+                self.halt(reason, f"{error} for {since:.2f} s")
             return None
         with self._lock:
-            self._heard, self.sensed = self._clock(), found
-            self._odometer.add(found.millimetres, found.degrees, self._heard)
+            self._reply_time, self.last_reply = self._clock(), found
+            self._odometer.add(found.millimetres, found.degrees, self._reply_time)
         return found

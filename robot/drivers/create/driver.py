@@ -38,7 +38,7 @@ class CreateDriver:
 
     def __init__(self, config: CreateConfig) -> None:
         self.config = config
-        self._pilot: ControlLoop | None = None
+        self._loop: ControlLoop | None = None
         self._link: SerialLink | None = None
         self.watchdog: Watchdog | None = None
         self._thread: threading.Thread | None = None
@@ -56,7 +56,7 @@ class CreateDriver:
         try:
             self.watchdog = Watchdog(self.config.port, self.config.patience)
             self._wake_up(self._link)
-            self._pilot = ControlLoop(self.config, self._link, time.monotonic)
+            self._loop = ControlLoop(self.config, self._link, time.monotonic)
         except BaseException:
             self.close()
             raise
@@ -96,14 +96,14 @@ class CreateDriver:
         return self._running_loop().gap()
 
     @property
-    def halted(self) -> StopEvent | None:
+    def active_stop(self) -> StopEvent | None:
         """The stop in effect until `release`, or None."""
-        return self._pilot.halted if self._pilot else None
+        return self._loop.active_stop if self._loop else None
 
     @property
-    def sensed(self) -> protocol.SensorReply | None:
+    def last_reply(self) -> protocol.SensorReply | None:
         """The last reading."""
-        return self._pilot.sensed if self._pilot else None
+        return self._loop.last_reply if self._loop else None
 
     @property
     def counts(self) -> LinkCounts:
@@ -125,7 +125,7 @@ class CreateDriver:
         if self.watchdog is not None:
             self.watchdog.close()
             self.watchdog = None
-        self._pilot = None
+        self._loop = None
 
     def __enter__(self) -> Self:
         self.start()
@@ -135,9 +135,9 @@ class CreateDriver:
         self.close()
 
     def _running_loop(self) -> ControlLoop:
-        if self._pilot is None:
+        if self._loop is None:
             raise CommandRefused("the driver is not started")
-        return self._pilot
+        return self._loop
 
     def _wake_up(self, link: SerialLink) -> None:
         """Enters safe mode and clears the counters."""
@@ -171,22 +171,22 @@ class CreateDriver:
             )
 
     def _run(self) -> None:
-        pilot, guard = self._pilot, self.watchdog
-        assert pilot is not None
+        loop, guard = self._loop, self.watchdog
+        assert loop is not None
         assert guard is not None
         try:
             while not self._ending.is_set():
                 due = time.monotonic() + 1 / self.config.rate
-                pilot.poll()
+                loop.poll()
                 self._polled.set()
-                if pilot.halted and pilot.halted.halt is StopReason.UNPLUGGED:
+                if loop.active_stop and loop.active_stop.reason is StopReason.UNPLUGGED:
                     return
                 if not guard.beat():
-                    pilot.halt(StopReason.UNGUARDED, "the watchdog process does not respond")
+                    loop.halt(StopReason.UNGUARDED, "the watchdog process does not respond")
                 self._wake.wait(max(0.0, due - time.monotonic()))
                 self._wake.clear()
         finally:  # the watchdog then stops the wheels
-            pilot.halt(StopReason.UNGUARDED, "the control thread has ended")
+            loop.halt(StopReason.UNGUARDED, "the control thread has ended")
 
     def _next_poll(self) -> None:
         """Waits for the end of a poll that starts after this call."""

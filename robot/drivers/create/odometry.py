@@ -34,6 +34,6 @@ class CreateOdometry:
 
     def take_odometry(self) -> Odometry:
         """Motion since the last call; dt ends at the last reading. The turn is not wrapped."""
-        told = Odometry(self._x, self._y, math.radians(self._degrees), self._time - self._taken)
+        motion = Odometry(self._x, self._y, math.radians(self._degrees), self._time - self._taken)
         self._taken, self._x, self._y, self._degrees = self._time, 0.0, 0.0, 0
-        return told
+        return motion

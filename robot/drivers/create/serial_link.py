@@ -59,7 +59,7 @@ class LinkCounts(NamedTuple):
     stray: int = 0
 
     @property
-    def owed(self) -> int:
+    def outstanding(self) -> int:
         """Lost replies that have not arrived late."""
         return self.lost - self.late
 
@@ -144,7 +144,7 @@ class SerialLink:
             # Noise and the start of a reply can look like a reply: then more bytes follow.
             if data and (self._port.in_waiting or protocol.parse_reply(data, elapsed) is None):
                 data += self._rest()
-        found = _replies(data, elapsed, 1 + self.counts.owed)
+        found = _replies(data, elapsed, 1 + self.counts.outstanding)
         if not found:
             self._count(lost=1, stray=len(data))
             raise BadReply(f"{len(data)} bytes: {data[:8].hex(' ')}") if data else NoReply("no reply")
@@ -159,8 +159,8 @@ class SerialLink:
     def _catch_up(self, elapsed: float) -> None:
         """Accepts late replies. Any other bytes make the reply before them doubtful."""
         data = self._port.read(self._port.in_waiting) if self._port.in_waiting else b""
-        owed = self.counts.owed
-        found = _replies(data, elapsed, owed) if owed else []
+        outstanding = self.counts.outstanding
+        found = _replies(data, elapsed, outstanding) if outstanding else []
         self._accept(found, late=len(found), stray=len(data) - protocol.REPLY.size * len(found))
         self._count(lost=int(bool(data) and not found))
 

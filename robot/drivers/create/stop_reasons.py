@@ -26,15 +26,15 @@ class StopEvent(NamedTuple):
     """A stop of the robot.
 
     Attributes:
-        halt: the reason. detail: the finding. time: host's monotonic clock, s.
+        reason: of the stop. detail: the finding. time: host's monotonic clock, s.
     """
 
-    halt: StopReason
+    reason: StopReason
     detail: str
     time: float
 
     def __str__(self) -> str:
-        return f"{self.halt.name.lower()}: {self.detail}; {self.halt.value}"
+        return f"{self.reason.name.lower()}: {self.detail}; {self.reason.value}"
 
 
 class CommandRefused(ValueError):
@@ -63,12 +63,12 @@ def wheel_speeds(config: CreateConfig, forward: float, turn: float) -> tuple[int
     return max(-cap, min(cap, round(right))), max(-cap, min(cap, round(left)))
 
 
-def stop_reason(sensed: SensorReply, right: int, left: int) -> tuple[StopReason, str] | None:
+def stop_reason(reply: SensorReply, right: int, left: int) -> tuple[StopReason, str] | None:
     """Reason and detail for a stop after a reading, or None. After a bump, driving back is allowed."""
-    if sensed.bumps & Bumps.DROPPED:
-        return StopReason.WHEEL_DROP, describe_bumps(sensed.bumps & Bumps.DROPPED)
-    if sensed.mode != Mode.SAFE:
-        return StopReason.LEFT_SAFE_MODE, f"the robot is in {sensed.mode.name.lower()} mode"
-    if sensed.bumps & Bumps.BUMPED and right + left > 0:
-        return StopReason.BUMPED, describe_bumps(sensed.bumps & Bumps.BUMPED)
+    if reply.bumps & Bumps.DROPPED:
+        return StopReason.WHEEL_DROP, describe_bumps(reply.bumps & Bumps.DROPPED)
+    if reply.mode != Mode.SAFE:
+        return StopReason.LEFT_SAFE_MODE, f"the robot is in {reply.mode.name.lower()} mode"
+    if reply.bumps & Bumps.BUMPED and right + left > 0:
+        return StopReason.BUMPED, describe_bumps(reply.bumps & Bumps.BUMPED)
     return None

@@ -89,9 +89,9 @@ def read_identity(bridge: Bridge) -> HeadIdentity:
     """
     answer = bridge.request(Request.IDENTITY)
     try:
-        told = json.loads(answer)
-        size = int(told["whiskers"]), int(told["channels"])
-        return HeadIdentity(str(told["name"]), str(told["version"]), *size, float(told["rate"]))
+        fields = json.loads(answer)
+        size = int(fields["whiskers"]), int(fields["channels"])
+        return HeadIdentity(str(fields["name"]), str(fields["version"]), *size, float(fields["rate"]))
     except (ValueError, KeyError, TypeError):
         cure = "check the address, or the bridge's firmware"
         raise InputError("head", f"identity {answer[:80]!r}", "name, version, shape, rate", cure) from None

@@ -193,8 +193,8 @@ class HeadReader:
                 raise InputError("head", f"{found.name} has {shape}", f"{self._whiskers} of {CHANNELS}")
             clock = int.from_bytes(bridge.request(Request.CLOCK)[:8], "little")
             self.decoder.restart(clock)
-            for told in self.on_restart:
-                told(clock, time.monotonic())
+            for callback in self.on_restart:
+                callback(clock, time.monotonic())
             self._queue.resend_persistent()
             bridge.request(Request.START)
         except BaseException:

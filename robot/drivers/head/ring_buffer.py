@@ -44,12 +44,12 @@ class RingBuffer:
             if not len(frames.sequence):
                 return
             newest = max(self._newest, int(frames.sequence.max()))
-            kept = frames.sequence > newest - self._size
-            place = frames.sequence[kept] % self._size
-            self._sequence[place] = frames.sequence[kept]
-            self._time[place] = frames.time[kept]
-            self._flags[place] = frames.flags[kept]
-            self._values[place] = frames.values[kept]
+            fresh = frames.sequence > newest - self._size
+            place = frames.sequence[fresh] % self._size
+            self._sequence[place] = frames.sequence[fresh]
+            self._time[place] = frames.time[fresh]
+            self._flags[place] = frames.flags[fresh]
+            self._values[place] = frames.values[fresh]
             self._newest, self._arrival = newest, arrival
             self._latest = int(self._time[newest % self._size])
 

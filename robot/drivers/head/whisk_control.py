@@ -136,12 +136,12 @@ class HeadDriver:
         """
         check_amplitude(whisking, self._head, WHERE)
         rcp = self._reader.config.rcp
-        told = whisk_commands(whisking, threshold, centre, rcp)
+        commands = whisk_commands(whisking, threshold, centre, rcp)
         self._feedback = None
         if rcp == "host" and whisking.mode != "open" and threshold is not None:
             middle = np.zeros(len(threshold)) if centre is None else centre
             self._feedback = HostRcp(whisking, self._head.shape, threshold, middle)
-        for one in told:
+        for one in commands:
             self._reader.send(one)
 
     def rest(self) -> None:

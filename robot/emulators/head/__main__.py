@@ -21,11 +21,11 @@ def main(words: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m robot.emulators.head", description=__doc__)
     parser.add_argument("--host", help="address to listen on; overrides the configuration")
     parser.add_argument("--config", type=Path, help="HeadEmulatorConfig as JSON (default values if omitted)")
-    asked = parser.parse_args(words)
+    arguments = parser.parse_args(words)
     try:
-        config = _read(asked.config)
-        if asked.host is not None:
-            config = config.model_copy(update={"host": asked.host})
+        config = _read(arguments.config)
+        if arguments.host is not None:
+            config = config.model_copy(update={"host": arguments.host})
         serve(config)
     except InputError as error:
         print(error, file=sys.stderr)

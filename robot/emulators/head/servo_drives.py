@@ -55,7 +55,7 @@ class ServoDrives:
         self.whisk: WhiskCommand | None = None
         self.sample = 0
         self._next: WhiskCommand | None = None
-        self._heard, self._stopped = -np.inf, False
+        self._command_time, self._stopped = -np.inf, False
         self._centre = np.zeros(len(head.length))
         self._from: np.ndarray | None = None  # angles at the start of the retraction
 
@@ -65,7 +65,7 @@ class ServoDrives:
         return self.whisk is None and self._next is None and self._from is None
 
     @property
-    def left(self) -> int | None:
+    def samples_left(self) -> int | None:
         """Samples until the next change; None while unknown."""
         if self.whisk is not None:
             return self.whisk.samples - self.sample
@@ -77,7 +77,7 @@ class ServoDrives:
 
     def receive(self, command: Command, time: float) -> None:
         """Stores a command received at a time, s (the clock of `begin`)."""
-        self._heard = time
+        self._command_time = time
         if command.kind == CommandKind.DRIVE:
             self._next = self._make_whisk(command) or self._next
         elif command.kind == CommandKind.CENTRE and len(command.numbers) == len(self._centre):
@@ -96,7 +96,7 @@ class ServoDrives:
         self._stopped, self._next = True, None
 
     def begin(self, time: float, balance: WhiskerBalance) -> WhiskerBalance:
-        """Selects the next activity; called at the start of each block and when `left` samples have passed.
+        """Selects the next activity; called at the start of each block and after `samples_left` samples.
 
         Args:
             time: s. balance: state of the whiskers.
@@ -104,7 +104,7 @@ class ServoDrives:
         Returns:
             state of the whiskers: at rest at the beginning of a cycle.
         """
-        silent = time - self._heard > COMMAND_TIMEOUT
+        silent = time - self._command_time > COMMAND_TIMEOUT
         self._next = None if silent else self._next
         stop, self._stopped = silent or self._stopped, False
         if self.whisk is not None and stop:

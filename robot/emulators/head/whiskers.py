@@ -78,7 +78,7 @@ class Whiskers:
         while done < size:
             share = done / size
             self.balance = self.drives.begin(start + share * (end - start), self.balance)
-            first, left = self.drives.sample, self.drives.left
+            first, left = self.drives.sample, self.drives.samples_left
             begins[done] = self.drives.whisk is not None and first == 0
             count = size - done if left is None else min(size - done, left)
             # Time counts from the start of the whisk, possibly within the block.

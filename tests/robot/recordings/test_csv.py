@@ -283,7 +283,7 @@ def test_any_text_is_read_or_gives_one_error(tmp_path_factory: Any, text: str | 
         assert str(path) in message
 
 
-def test_line_numbers_are_those_of_an_editor(write: Write) -> None:
+def test_line_numbers_count_empty_lines(write: Write) -> None:
     file = read_csv(write("\ufefft,x\r\n\r\n1,2\r\n \r\n3,4"))
     assert file.names == ("t", "x")
     assert file.values.tolist() == [[1, 2], [3, 4]]

@@ -519,7 +519,7 @@ def test_a_valid_mcap_file_with_other_messages_is_refused(
         writer = Writer(file)
         writer.start()
         metadata = {"format": FORMAT, "view_shape": shape, "whiskers": str(whiskers), "rate_hz": "1.0"}
-        metadata |= {"created_by": "somebody", "info": info}
+        metadata |= {"created_by": "a program", "info": info}
         writer.add_metadata("ratslam", metadata | {"crc32": metadata_checksum(metadata)})
         schema = writer.register_schema(name, "ros2msg", SCHEMAS[name].encode())
         writer.add_message(writer.register_channel(TOPICS[name], "cdr", schema), 0, b"\0\1\0\0" + message, 0)

@@ -43,7 +43,7 @@ def test_dropped_rows_leave_the_path_unchanged(log, monkeypatch):
     assert copy.motion[1:, 3].sum() == pytest.approx(copy.time[-1] - copy.time[0])
 
 
-def test_some_labels_become_new_and_some_wrong():
+def test_some_labels_are_replaced_by_new_or_wrong_ones():
     label = np.where(np.arange(3000) % 3 == 0, np.arange(3000) // 300, -1).astype(np.int32)
     changed = perturbation.corrupt_labels(label, np.random.default_rng(0))
     given = label >= 0

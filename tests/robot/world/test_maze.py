@@ -51,7 +51,7 @@ def test_a_loop_is_closed_simple_and_anticlockwise(seed: int, size: tuple[int, i
     assert loop == random_loop(columns, rows, length, stream(seed, "maze.loop"))
 
 
-def test_seeds_differ() -> None:
+def test_mazes_of_different_seeds_differ() -> None:
     loops = {tuple(random_loop(7, 5, 20, stream(seed, "maze.loop"))) for seed in range(20)}
     assert len(loops) >= 18
 

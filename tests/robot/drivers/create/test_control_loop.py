@@ -30,7 +30,7 @@ def drive(line: Line, loop: ControlLoop, seconds: float, forward: float, turn: f
         try:
             loop.steer(forward, turn)
         except CommandRefused:
-            assert loop.halted
+            assert loop.active_stop
         loop.poll()
         line.wait(PERIOD)
 
@@ -59,7 +59,7 @@ def test_a_command_that_is_not_renewed_ends() -> None:
         line.wait(PERIOD)
     assert rolled == [True] * rolled.count(True) + [False] * rolled.count(False)
     assert 0.4 <= PERIOD * rolled.count(True) <= 0.6
-    assert loop.halted is None
+    assert loop.active_stop is None
     drive(line, loop, 0.2, 0.1)
     assert rolls(line.robot)
 
@@ -71,9 +71,9 @@ def test_a_bump_stops_forward_motion_only() -> None:
     line.robot.touch(protocol.Bumps.LEFT)
     loop.poll()
     assert not rolls(line.robot)
-    assert loop.halted
-    assert loop.halted.halt is StopReason.BUMPED
-    assert "left" in str(loop.halted)
+    assert loop.active_stop
+    assert loop.active_stop.reason is StopReason.BUMPED
+    assert "left" in str(loop.active_stop)
     with pytest.raises(CommandRefused, match="bumped"):
         loop.steer(-0.1, 0.0)
     loop.release()
@@ -82,7 +82,7 @@ def test_a_bump_stops_forward_motion_only() -> None:
     before = len(line.robot.drives)
     drive(line, loop, 0.5, 0.1)  # still pressed: no motion
     assert all(right + left <= 0 for _, right, left in line.robot.drives[before:])
-    assert loop.halted is not None
+    assert loop.active_stop is not None
 
 
 @pytest.mark.parametrize("forward", [0.1, -0.1, 0.0])
@@ -93,11 +93,11 @@ def test_a_dropped_wheel_stops_the_robot_until_it_stands(dropped: protocol.Bumps
     drive(line, loop, 0.2, forward, 0.2)
     line.robot.touch(dropped)
     drive(line, loop, 0.2, forward, 0.2)
-    assert loop.halted
-    assert loop.halted.halt is StopReason.WHEEL_DROP
+    assert loop.active_stop
+    assert loop.active_stop.reason is StopReason.WHEEL_DROP
     loop.release()
     drive(line, loop, 0.2, forward, 0.2)
-    assert loop.halted is not None  # the wheel still hangs
+    assert loop.active_stop is not None  # the wheel still hangs
     line.robot.touch(protocol.Bumps(0))
     loop.release()
     drive(line, loop, 0.2, forward, 0.2)
@@ -110,8 +110,8 @@ def test_safe_mode_is_entered_again_by_release_only() -> None:
     drive(line, loop, 0.2, 0.1)
     line.robot.touch(protocol.Bumps(0), cliff=True)
     drive(line, loop, 1.0, 0.1)
-    assert loop.halted
-    assert loop.halted.halt is StopReason.LEFT_SAFE_MODE
+    assert loop.active_stop
+    assert loop.active_stop.reason is StopReason.LEFT_SAFE_MODE
     assert line.robot.mode == protocol.Mode.PASSIVE
     loop.release()
     drive(line, loop, 0.2, 0.1)
@@ -136,8 +136,8 @@ def test_a_lost_link_stops_the_wheels(mangle: Callable[[bytes], bytes], halt: St
     while rolls(line.robot):
         assert line.now - since <= 0.3 + 0.1 + 2 * PERIOD
         drive(line, loop, PERIOD, 0.1)
-    assert loop.halted
-    assert loop.halted.halt is halt
+    assert loop.active_stop
+    assert loop.active_stop.reason is halt
     line.mangle = lambda reply: reply
     drive(line, loop, 0.5, 0.1)
     assert not rolls(line.robot)  # no automatic restart
@@ -152,8 +152,8 @@ def test_an_unplugged_port_is_final() -> None:
     drive(line, loop, 0.2, 0.1)
     line.gone = True
     drive(line, loop, 0.2, 0.1)
-    assert loop.halted
-    assert loop.halted.halt is StopReason.UNPLUGGED
+    assert loop.active_stop
+    assert loop.active_stop.reason is StopReason.UNPLUGGED
     with pytest.raises(CommandRefused, match="unplugged"):
         loop.release()
 
@@ -239,7 +239,7 @@ def test_garbage_before_a_reply_costs_nothing(count: int, noise: bytes, forward:
     line.mangle = lambda reply: noise * count + reply
     drive(line, loop, 1.0, forward)
     drive(line, loop, 0.1, 0.0)
-    assert loop.halted is None
+    assert loop.active_stop is None
     assert not loop.gap()
     assert loop.counts.stray == count * loop.counts.good - count  # the first reply is undisturbed
     assert abs(1000 * (loop.take_odometry().dx - line.robot.base.travelled)) < 1 + 1e-6
@@ -256,7 +256,7 @@ def test_a_command_given_during_a_read_is_checked() -> None:
 
     line.mangle = mangle
     loop.poll()
-    assert loop.halted
+    assert loop.active_stop
     assert not rolls(line.robot)
 
 
@@ -272,7 +272,7 @@ def test_commands_from_before_a_stop_are_dropped() -> None:
         line.wait(PERIOD)
         loop.poll()
         assert not rolls(line.robot)
-    assert loop.halted is None
+    assert loop.active_stop is None
 
 
 def test_a_reply_followed_by_noise_is_rejected() -> None:

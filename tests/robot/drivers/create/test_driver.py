@@ -68,7 +68,7 @@ def test_odometry_is_accurate_to_the_quantisation(emulated: Emulated) -> None:
         stop_and_read(driver)
         last = driver.odometry()
         truth = emulated.do("state")
-        assert driver.halted is None
+        assert driver.active_stop is None
     assert abs(total + last.dtheta - truth["turned"]) < math.radians(1) + 1e-6
     assert truth["unknown"] <= 4  # zero bytes of `STOP_ANYHOW`
     assert emulated.do("state")["mode"] == "PASSIVE"
@@ -104,14 +104,14 @@ def test_the_robot_stops_without_further_commands(emulated: Emulated) -> None:
         driver.drive(0.1, 0.0)
         until(lambda: emulated.do("state")["wheels"] == [100, 100])
         until(lambda: emulated.do("state")["wheels"] == [0, 0])
-        assert driver.halted is None
+        assert driver.active_stop is None
 
 
 def test_a_bump_stops_the_robot(emulated: Emulated) -> None:
     with create(emulated) as driver:
         drive_for(driver, 0.2, 0.1)
         emulated.do("bump")
-        until(lambda: driver.halted)
+        until(lambda: driver.active_stop)
         until(lambda: emulated.do("state")["wheels"] == [0, 0])
         with pytest.raises(CommandRefused, match="bumped"):
             driver.drive(0.1, 0.0)
@@ -136,22 +136,22 @@ def test_driving_continues_after_garbage_and_cut_replies(emulated: Emulated) -> 
             drive_and_poll(driver)
         stop_and_read(driver)
         odometry, truth, counts = driver.odometry(), emulated.do("state"), driver.counts
-        assert driver.halted is None
+        assert driver.active_stop is None
         assert driver.gap()
     assert counts.lost >= 6
     assert counts.stray > 0
     assert odometry.dx <= truth["x"] + 1e-3  # test_control_loop.py limits the difference
 
 
-def test_unplugged_while_driving(emulated: Emulated) -> None:
+def test_unplugging_stops_a_driving_robot(emulated: Emulated) -> None:
     driver = create(emulated)
     driver.start()
     try:
         drive_for(driver, 0.2, 0.1)
         emulated.do("unplug")
-        until(lambda: driver.halted)
-        assert driver.halted
-        assert driver.halted.halt is StopReason.UNPLUGGED
+        until(lambda: driver.active_stop)
+        assert driver.active_stop
+        assert driver.active_stop.reason is StopReason.UNPLUGGED
         with pytest.raises(CommandRefused, match="unplugged"):
             driver.drive(0.1, 0.0)
         driver.stop()
@@ -163,13 +163,13 @@ def test_unplugged_while_driving(emulated: Emulated) -> None:
         driver.drive(0.1, 0.0)
 
 
-def test_switched_off_while_driving(emulated: Emulated) -> None:
+def test_switching_off_is_reported(emulated: Emulated) -> None:
     with create(emulated, silence=1.0) as driver:
         drive_for(driver, 0.2, 0.1)
         emulated.do("off")
-        until(lambda: driver.halted)
-        assert driver.halted
-        assert driver.halted.halt is StopReason.SILENT
+        until(lambda: driver.active_stop)
+        assert driver.active_stop
+        assert driver.active_stop.reason is StopReason.SILENT
 
 
 DRIVES = """
@@ -204,9 +204,9 @@ def test_the_robot_stops_when_the_watchdog_ends(emulated: Emulated) -> None:
         driver.drive(0.1, 0.0)
         assert driver.watchdog is not None
         os.kill(driver.watchdog.pid, signal.SIGKILL)
-        until(lambda: driver.halted)
-        assert driver.halted
-        assert driver.halted.halt is StopReason.UNGUARDED
+        until(lambda: driver.active_stop)
+        assert driver.active_stop
+        assert driver.active_stop.reason is StopReason.UNGUARDED
         until(lambda: emulated.do("state")["wheels"] == [0, 0])
 
 
@@ -229,9 +229,9 @@ def test_a_second_program_is_refused(emulated: Emulated) -> None:
         with pytest.raises(NoPort, match="another program"):
             CreateDriver(CreateConfig(port=emulated.path)).start()
         drive_for(driver, 0.2, 0.1)
-        assert driver.halted is None
+        assert driver.active_stop is None
     with create(emulated) as driver:  # the port is free again
-        assert driver.halted is None
+        assert driver.active_stop is None
 
 
 def test_a_lifted_robot_is_not_started(emulated: Emulated) -> None:

@@ -130,7 +130,7 @@ def test_a_stall(alert_arm: Arm, controller: Faults) -> None:
 
 @pytest.mark.soak
 @pytest.mark.parametrize("seconds", [1.0, 3.0])
-def test_a_stall_is_found_in_time(controller: Faults, seconds: float) -> None:
+def test_a_stall_is_detected_in_time(controller: Faults, seconds: float) -> None:
     with Arm(settings(controller.host, stale=0.5)) as arm:
         arm.start()
         start_move(arm, controller)

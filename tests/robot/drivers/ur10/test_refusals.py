@@ -69,7 +69,7 @@ def elsewhere(loopback: str) -> str:
         ({"running": "Program running: true"}, "a program runs"),
     ],
 )
-def test_start_is_check_refusal(elsewhere: str, changed: dict[str, str], found: str) -> None:
+def test_start_is_refused(elsewhere: str, changed: dict[str, str], found: str) -> None:
     with serve_answers(elsewhere, GOOD | changed):
         with pytest.raises(StartupRefused, match=found) as refusal:
             check_controller(ArmConfig(host=elsewhere))

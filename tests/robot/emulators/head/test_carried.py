@@ -19,11 +19,11 @@ def test_the_head_follows_the_tool(tmp_path: Path, loopback: str) -> None:
     config = HeadEmulatorConfig(host=loopback, path={"explore": 5}, arm=loopback, placing=PLACING)
     with ur_emulator(loopback, tcp_from_pose(PLACING, here, 0.1)) as arm, running(config, tmp_path) as head:
 
-        def stands(pose: np.ndarray, lift: float) -> bool:
+        def is_at(pose: np.ndarray, lift: float) -> bool:
             state = head(do="state")
             level = state["lift"] is not None and abs(state["lift"] - lift) < 1e-6
             return level and bool(np.allclose(state["pose"], pose, atol=1e-6))
 
-        until(lambda: stands(here, 0.1), "the head is at the arm's start")
+        until(lambda: is_at(here, 0.1), "the head is at the arm's start")
         arm(do="place", tcp=tcp_from_pose(PLACING, there).tolist())
-        until(lambda: stands(there, 0.0), "the head is at the arm's new place")
+        until(lambda: is_at(there, 0.0), "the head is at the arm's new place")

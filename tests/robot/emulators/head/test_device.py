@@ -228,9 +228,9 @@ def test_invalid_commands_are_ignored() -> None:
 
 
 @pytest.mark.parametrize(
-    "request",
+    "fault",
     [{}, {"do": "explode"}, {"do": "saturate", "whisker": 18}, {"do": "clock"}, {"do": "stall", "for": 3}],
 )
-def test_invalid_fault_requests_are_refused(request: dict[str, object]) -> None:
+def test_invalid_fault_requests_are_refused(fault: dict[str, object]) -> None:
     with pytest.raises((TypeError, ValueError)):
-        started().bridge.do(request, 0.0)
+        started().bridge.do(fault, 0.0)

@@ -173,7 +173,7 @@ def test_an_unreachable_target_ends_the_program() -> None:
     assert bench.controller.arm.state.tcp == HERE
 
 
-def test_safety_limits_of_a_pose_are_whether_it_can_be_reached() -> None:
+def test_reachable_poses_are_within_safety_limits() -> None:
     bench = Bench()
     assert bench.command(36, THERE)
     assert bench.out(1) == 1

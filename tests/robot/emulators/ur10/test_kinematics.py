@@ -46,7 +46,7 @@ def frame_of(pose: tuple[float, ...]) -> np.ndarray:
 
 @ARMS
 @given(joints=JOINTS)
-def test_forward_is_the_chain_of_matrices(arm: Geometry, joints: tuple[float, ...]) -> None:
+def test_forward_kinematics_equal_the_product_of_matrices(arm: Geometry, joints: tuple[float, ...]) -> None:
     np.testing.assert_allclose(frame_of(forward(arm, joints)), chain(arm, joints), atol=1e-9)
 
 
