@@ -114,8 +114,8 @@ def test_a_second_program_gets_a_busy_error(head: Faults, device: Any) -> None:
 
 
 def test_all_frames_are_transferred(head: Faults, device: Any) -> None:
-    """Two cycles begin within `COMMAND_TIMEOUT` after the command, so they need no timely host."""
-    before, heard = head(do="counts"), head.state()["commands"]
+    """Two cycles begin within `COMMAND_TIMEOUT` after the command, so they do not depend on the host."""
+    before, earlier = head(do="counts"), head.state()["commands"]
     decoder, samples = Decoder(18, 3), 500
     start(device)
     device.write(ENDPOINT_OUT, pack_command(drive(frequency=2000 / samples)), 30_000)
@@ -133,7 +133,7 @@ def test_all_frames_are_transferred(head: Faults, device: Any) -> None:
     cycles = begins[begins < begins[0] + 2 * samples]
     assert len(cycles) == 2
     assert np.diff(cycles) == samples
-    commands = {kind: count - heard.get(kind, 0) for kind, count in head.state()["commands"].items()}
+    commands = {kind: count - earlier.get(kind, 0) for kind, count in head.state()["commands"].items()}
     assert (commands["DRIVE"], commands["KEEP"]) == (1, len(parts))
     after = head(do="counts")
     sent = after["sent"] - before["sent"]
