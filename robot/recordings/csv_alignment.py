@@ -197,6 +197,6 @@ def _nearest_rows(
     twice = np.flatnonzero(np.diff(rows) == 0)
     if len(twice) and not errors:
         i = int(twice[0]) + 1
-        found = f"belongs to the same odometry row as the one before (one of {len(twice)} such rows)"
+        found = f"belongs to the same odometry row as the previous one (one of {len(twice)} such rows)"
         errors.append(InputError(place(i), found, "one for each odometry row", "thin them out"))
     return rows, errors

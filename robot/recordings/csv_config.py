@@ -21,7 +21,7 @@ class PoseColumns(Settings):
 
 
 class VelocityColumns(Settings):
-    """Odometry as body velocities since the row before, along the heading half-way through the turn."""
+    """Odometry as body velocities since the previous row, along the heading half-way through the turn."""
 
     forward: str = "vx"
     """Column of the forward speed, m/s."""

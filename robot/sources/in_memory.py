@@ -19,7 +19,7 @@ class InMemorySource(ClosedSource):
     """A `Source` over N rows of observations without contacts.
 
     Attributes:
-        time: [N] s. motion: [N, 4] (dx m, dy m, dtheta rad, dt s) since the row before.
+        time: [N] s. motion: [N, 4] (dx m, dy m, dtheta rad, dt s) since the previous row.
         moved: [N] whether the row has odometry (otherwise its motion is zero).
         views: [N, R, C, K] in 0..1, zero without a view. seen: [N] whether there is a view.
         label: [N] given place label, -1 for none.

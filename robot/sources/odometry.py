@@ -74,7 +74,7 @@ def simulate_odometry(
     random: np.random.Generator,
     kidnapped: np.ndarray | None = None,
 ) -> np.ndarray:
-    """[N, 4] odometry (dx m, dy m, dtheta rad, dt s) since the row before, with errors.
+    """[N, 4] odometry (dx m, dy m, dtheta rad, dt s) since the previous row, with errors.
 
     Args:
         time: [N] s. pose: [N, 3] true poses, headings not wrapped. kidnapped: [N] bool, the robot was moved

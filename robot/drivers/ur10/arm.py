@@ -120,8 +120,8 @@ class Arm:
 
     def arrived(self) -> bool:
         """Whether the last move has started and ended and the arm is at its target."""
-        errand = self.supervisor.pending
-        return errand is not None and self.supervisor.arrived(errand)
+        pending = self.supervisor.pending
+        return pending is not None and self.supervisor.arrived(pending)
 
     def halt(self) -> None:
         """Stops the arm, by the dashboard server if it does not stop in time. Moves may follow."""
