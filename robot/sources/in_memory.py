@@ -111,7 +111,7 @@ def load_into_memory(source: Source) -> InMemorySource:
 
 
 def truncate_log(log: InMemorySource, steps: int) -> InMemorySource:
-    """The first steps of a source in memory; its digest is that of the whole followed by their number."""
+    """The first steps of a source in memory; its digest is the original one followed by their number."""
     columns = ("time", "motion", "moved", "views", "seen", "label", "truth")
     cut = {name: getattr(log, name)[:steps] for name in columns if getattr(log, name) is not None}
     return replace(log, digest=f"{log.digest}[:{steps}]", **cut)

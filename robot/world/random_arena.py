@@ -26,8 +26,7 @@ MAX_RESTARTS = 50
 MAX_START_TRIES = 400
 """Number of positions drawn for the start of a random arena."""
 OTHER_START_TRIES, OTHER_START_CLEARANCE = 1000, 0.2
-"""Number of positions drawn for another start, and the free space around it, m: a little over the robot's
-radius."""
+"""Number of positions drawn for another start, and its free radius, m: a little over the robot's radius."""
 
 
 class ArenaConfig(Settings):
@@ -92,10 +91,10 @@ def make_arena(config: ArenaConfig, seed: int) -> Arena:
 
 
 def place_start(arena: Arena, seed: int) -> Arena:
-    """The arena with another random start where the robot fits.
+    """The arena with another random start in free space.
 
     Raises:
-        InputError: it fits nowhere.
+        InputError: no start was found.
     """
     start = _draw_start(arena, OTHER_START_CLEARANCE, stream(seed, "start"), OTHER_START_TRIES)
     if start is None:

@@ -1,4 +1,4 @@
-"""Numbers of the commands that ur_rtde sends to its control program.
+"""Numbers of ur_rtde's commands to its control program.
 
 The numbers were read from the register while ur_rtde 1.6.5 called the function of each name.
 """
@@ -42,7 +42,7 @@ REFUSED = {
 
 
 def refusal_of(command: int) -> str:
-    """Why a command is not executed, in one line; empty if it is emulated."""
+    """Reason for refusing a command, one line; empty if it is emulated."""
     if command in set(ControlCommand):
         return ""
     name = REFUSED.get(command, "an unknown function")

@@ -40,7 +40,7 @@ class ControlProgram:
         self._controller, self._registers = controller, controller.registers
         self._executing = False
         self._waiting = False  # the command is done when the arm is
-        self._operating = False  # an asynchronous move or stop is under way
+        self._operating = False  # an asynchronous move or stop is in progress
         self._writes = self._operation = 0
         self._report_operation(running=False)
         self._answer(READY)

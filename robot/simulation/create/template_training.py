@@ -1,4 +1,4 @@
-"""Training of strain templates, with a test on drives that they were not trained on."""
+"""Training of strain templates, with a test on held-out drives."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from tactile.wall_estimation.strain_templates import (
 )
 
 DURATIONS = (0.5, 1.0, 2.0)
-"""Durations of the drive after first contact given to the estimators, s; in arenas it is mostly 1 to 2 s."""
+"""Durations of the tested drives after first contact, s; in arenas mostly 1 to 2 s."""
 ESTIMATORS = ("winner", "between", "fused")
 """Eq. 5; the minimum of a parabola through the best template and its neighbours; ours."""
 LARGE_ERROR_DEG = 10.0
-"""Errors beyond are marked, degrees: the step between templates."""
+"""Errors above this are marked, degrees: the step between templates."""
 
 
 class HeldOutDrive(NamedTuple):
-    """One drive into a wall that no template was trained on.
+    """One drive into a wall, not used in the training.
 
     Attributes:
         angle: direction of the wall in base_link, degrees. known: whether there are templates of that angle.
-        error: [S, 3] degrees, by `DURATIONS` and `ESTIMATORS`; NaN where no wall was found.
+        error: [S, 3] degrees, by `DURATIONS` and `ESTIMATORS`; NaN without an estimate.
     """
 
     angle: float
@@ -85,7 +85,7 @@ def drive_held_out(config: CreateSimulationConfig, templates: StrainTemplates) -
 
 
 def render_drives(drives: Sequence[HeldOutDrive], repeats: int) -> str:
-    """A line for each drive, and the means."""
+    """The results as text: a line for each drive, and the means."""
     heads = [f"{way}, {seconds:g} s" for seconds in DURATIONS for way in ESTIMATORS]
     lines = [
         f"Error of the wall direction on drives without training, degrees ({repeats} drives a template)",

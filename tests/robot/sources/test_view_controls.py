@@ -1,4 +1,4 @@
-"""Views replaced by shuffled, blank and ideal ones."""
+"""Controls: shuffled, blank and ideal views."""
 
 from __future__ import annotations
 

@@ -94,7 +94,7 @@ def test_the_share_of_objects_at_walls_is_configurable() -> None:
 
 
 @given(st.integers(0, 50))
-def test_trials_of_one_arena_start_anywhere_that_is_free(seed: int) -> None:
+def test_starts_in_one_arena_differ_and_are_free(seed: int) -> None:
     place = make_arena(ArenaConfig(seed=1), 0)
     one, other = place_start(place, seed), place_start(place, seed + 1)
     assert has_clearance(one, one.start[None, :2], OTHER_START_CLEARANCE).all()

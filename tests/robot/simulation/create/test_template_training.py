@@ -26,7 +26,7 @@ CONFIG = CreateSimulationConfig(seed=4)
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a configuration and the templates that the program made of it."""
+    """A folder with a configuration and the templates made from it by the program."""
     folder = tmp_path_factory.mktemp("templates")
     (folder / "create.yaml").write_text("create_simulation: {seed: 4}\n")
     arguments = ["train-templates", str(folder / "create.yaml"), "-o", str(folder / "new" / "t.npz")]
@@ -40,11 +40,11 @@ def templates(folder: Path) -> StrainTemplates:
 
 
 def errors(drives: list[HeldOutDrive], way: str, known: bool) -> np.ndarray:
-    """[drives, DURATIONS] of one way, at trained angles or between."""
+    """Errors [drives, DURATIONS] of one estimator, at trained angles or between them."""
     return np.array([one.error[:, ESTIMATORS.index(way)] for one in drives if one.known == known])
 
 
-def test_the_file_holds_what_the_seed_gives(templates: StrainTemplates) -> None:
+def test_the_file_follows_from_the_seed(templates: StrainTemplates) -> None:
     again = train_strain_templates(CONFIG)
     assert len(templates.angle) == 15
     assert np.array_equal(templates.mean, again.mean)
@@ -59,7 +59,7 @@ def test_walls_without_training_are_recognised(templates: StrainTemplates) -> No
     assert [one.known for one in tried] == [True, False] * 14 + [True]
     assert np.allclose([one.angle for one in tried], np.arange(20, 161, 5))
     assert errors(tried, "winner", True).mean() < 2
-    # Between two templates the nearer one is half a step off, at best.
+    # Between two templates the error of the nearer one is at least half a step.
     between = errors(tried, "winner", False)
     assert between.min() == pytest.approx(5)
     assert between.mean() < 6
@@ -67,7 +67,7 @@ def test_walls_without_training_are_recognised(templates: StrainTemplates) -> No
 
 
 def test_bad_templates_have_large_errors(templates: StrainTemplates) -> None:
-    # The template of one angle is replaced by another one's.
+    # The template of one angle is replaced by that of another.
     mean = templates.mean.copy()
     mean[5] = mean[12]
     tried = drive_held_out(CONFIG, templates._replace(mean=mean))
