@@ -366,7 +366,7 @@ def test_files(tmp_path: Path) -> None:
             load(path)
 
 
-def _overridden(*assignments: str, text: str = VALID) -> Config:
+def overridden(*assignments: str, text: str = VALID) -> Config:
     return validate(override(parse(text, "config.yaml"), assignments), Config)
 
 
@@ -426,7 +426,7 @@ def test_override() -> None:
 )
 def test_override_errors(assignment: str, message: str) -> None:
     with pytest.raises(InputError) as caught:
-        _overridden(assignment, text="steps: 5\nweights: [1, 2]")
+        overridden(assignment, text="steps: 5\nweights: [1, 2]")
     assert str(caught.value).startswith(message)
 
 
@@ -493,7 +493,7 @@ def _reads_or_refuses(text: str) -> None:
 
 
 def _assigns_or_refuses(assignment: str) -> None:
-    message = _refusal(lambda: _overridden(assignment))
+    message = _refusal(lambda: overridden(assignment))
     assert not message or "--set" in message
     message.encode()
 

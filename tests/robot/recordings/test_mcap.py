@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import struct
-import subprocess
-import sys
-import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,166 +11,26 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 
-from robot.recordings.cdr import decode, encode
 from robot.recordings.mcap_reader import Recording, record_source, recover
 from robot.recordings.mcap_scanner import FORMAT, McapScanner, metadata_checksum
 from robot.recordings.npz_trace import read_trace
 from robot.recordings.recorder import Recorder
-from robot.recordings.schemas import CYCLE, OBSERVATION, REPORT, SCHEMAS, TOPICS, TRUTH, WHISK
+from robot.recordings.schemas import OBSERVATION, SCHEMAS, TOPICS
 from robot.sources.source import Sample, Source
-from robot.sources.source_info import MazeInfo, SourceInfo
+from robot.sources.source_info import SourceInfo
 from tactile.base.errors import InputError
-from tactile.base.types import Cycle, Observation, Odometry, Report, Whisk, observation
-from tactile.features.calibration import Calibration
-from tactile.whiskers.head_geometry import HeadConfig
-
-SHAPE, WHISKERS = (2, 3, 2), 4
-ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-"""First bytes of a compressed chunk."""
-NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
-
-
-def numbers(
-    *shape: int, low: float | None = None, high: float | None = None
-) -> st.SearchStrategy[np.ndarray]:
-    return arrays(np.float64, shape, elements=st.floats(low, high, allow_nan=False, allow_infinity=False))
-
-
-def flags_of(*shape: int) -> st.SearchStrategy[np.ndarray]:
-    return arrays(np.bool_, shape)
-
-
-ODOMETRIES = st.tuples(*[st.floats(-0.1, 0.1).map(np.float64)] * 3, st.just(np.float64(0.5))).map(
-    lambda values: Odometry(*values)
+from tactile.base.types import Observation, Odometry, observation
+from tests.robot.recordings.mcap_samples import (
+    INFO,
+    SAMPLES,
+    SHAPE,
+    WHISKERS,
+    ZSTD_MAGIC,
+    same_bits,
+    some_samples,
+    write_recording,
 )
-OBSERVATIONS = st.builds(
-    Observation,
-    odometry=ODOMETRIES,
-    motion=st.integers(0, 3).map(np.int32),
-    view=numbers(*SHAPE, low=0, high=1),
-    view_seen=st.booleans().map(np.bool_),
-    label=st.integers(-1, 2**31 - 1).map(np.int32),
-    contact=flags_of(WHISKERS),
-    alive=flags_of(WHISKERS),
-    point=numbers(WHISKERS, 2),
-    wall=st.booleans().map(np.bool_),
-    wall_point=numbers(2),
-    wall_sd=NUMBERS.map(np.float64),
-)
-CYCLES = st.integers(0, 5).flatmap(
-    lambda t: st.builds(
-        Cycle,
-        time=numbers(t),
-        angle=numbers(t, WHISKERS),
-        deflection=numbers(t, WHISKERS, 2),
-        odometry=ODOMETRIES,
-    )
-)
-WHISKS = st.builds(
-    Whisk,
-    odometry=ODOMETRIES,
-    alive=flags_of(WHISKERS),
-    contact=flags_of(WHISKERS),
-    touched=numbers(WHISKERS),
-    held=flags_of(WHISKERS),
-    highest=numbers(WHISKERS),
-    reach=numbers(WHISKERS),
-)
-REPORTS = st.integers(0, 5).flatmap(
-    lambda t: st.builds(
-        Report,
-        odometry=ODOMETRIES,
-        motion=st.integers(0, 3),
-        moment=st.integers(0, 3),
-        alive=flags_of(WHISKERS),
-        contact=flags_of(WHISKERS),
-        time=numbers(t),
-        strain=numbers(t, WHISKERS, 2),
-    )
-)
-INFO = SourceInfo(
-    raw_whiskers=True,
-    head=HeadConfig(rest_deg=74.0),
-    calibration=Calibration(
-        mean=np.zeros((2, 2)),
-        sd=np.array([[1e-3, 0.1], [1e-300, -0.0]]),
-        threshold=np.array([[np.inf, 1 / 3], [0.1, 5e-324]]),
-        free=np.array([0.7, 0.0]),
-        alive=np.array([True, False]),
-        rate=2000.0,
-    ),
-    maze=MazeInfo(text="o---o\n|   |\no---o\n", heights=(0.05, 0.02), seed=3),
-    provenance={"über": None, "numbers": [0.1, -0.0]},
-)
-TRUTHS = st.none() | numbers(3, low=-0.1, high=0.1)
-SAMPLES = st.lists(st.tuples(OBSERVATIONS | CYCLES | WHISKS | REPORTS, TRUTHS), min_size=1, max_size=12).map(
-    lambda parts: [Sample(100 + 0.5 * i, *part) for i, part in enumerate(parts)]
-)
-
-
-def leaves(sample: Sample) -> list[Any]:
-    parts: list[Any] = [np.float64(sample.time), type(sample.reading), sample.truth is None]
-    odometry = sample.reading.odometry
-    rest = sample.reading._replace(odometry=None)
-    return [*parts, *odometry, *(part for part in rest if part is not None), sample.truth]
-
-
-def same_bits(one: Sequence[Sample], other: Sequence[Sample]) -> bool:
-    """Whether two sequences of samples are equal in every bit, shape and dtype."""
-
-    def key(value: Any) -> Any:
-        if isinstance(value, (np.ndarray, np.generic)):
-            return np.asarray(value).tobytes(), np.shape(value), np.asarray(value).dtype
-        return value
-
-    return len(one) == len(other) and all(
-        list(map(key, leaves(a))) == list(map(key, leaves(b))) for a, b in zip(one, other, strict=True)
-    )
-
-
-def write_recording(path: Path, samples: Sequence[Sample], **options: Any) -> Path:
-    path.unlink(missing_ok=True)
-    options = {"info": INFO} | options
-    with Recorder(path, view_shape=SHAPE, whiskers=WHISKERS, rate_hz=2.0, **options) as recorder:
-        for sample in samples:
-            recorder.write(sample)
-    return path
-
-
-def some_samples(count: int, seed: int = 0) -> list[Sample]:
-    """Samples of all kinds with every field filled."""
-    rng = np.random.default_rng(seed)
-    samples = []
-    for i in range(count):
-        odometry = Odometry(*(np.float64(x) for x in (*rng.normal(0, 0.05, 3), 0.5)))
-        truth = rng.normal(size=3) if i % 3 else None
-        if i % 5 == 4:
-            flags, strain = rng.random((2, WHISKERS)) < 0.5, rng.normal(size=(3, WHISKERS, 2))
-            report = Report(odometry, 1, 2, *flags, time=np.arange(3) / 2000, strain=strain)
-            samples.append(Sample(0.5 * i, report, truth))
-        elif i % 4 == 3:
-            arrays_ = (rng.random(2), rng.normal(size=(2, WHISKERS)), rng.normal(size=(2, WHISKERS, 2)))
-            samples.append(Sample(0.5 * i, Cycle(*arrays_, odometry), truth))
-        elif i % 4 == 2:
-            truths, numbers = rng.random((3, WHISKERS)) < 0.5, rng.normal(size=(3, WHISKERS))
-            whisk = Whisk(odometry, truths[0], truths[1], numbers[0], truths[2], *numbers[1:])
-            samples.append(Sample(0.5 * i, whisk, truth))
-        else:
-            seen = observation(odometry, rng.random(SHAPE), label=i, whiskers=WHISKERS)
-            point = rng.normal(size=(WHISKERS, 2))
-            seen = seen._replace(point=point, contact=point[:, 0] > 0, alive=point[:, 1] > 0)
-            samples.append(Sample(0.5 * i, seen, truth))
-    return samples
-
-
-@pytest.fixture(scope="module")
-def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, list[Sample]]:
-    """A small recording of several chunks: its bytes and its samples."""
-    samples = some_samples(9)
-    path = write_recording(tmp_path_factory.mktemp("small") / "small.mcap", samples, chunk_s=1.5)
-    return path.read_bytes(), samples
 
 
 @settings(max_examples=60)
@@ -209,104 +64,6 @@ def test_a_recorded_source_equals_the_source(trace: Path, tmp_path: Path) -> Non
         copy = Recording(tmp_path / "copy.mcap")
         assert same_bits(list(copy), list(source))
         assert copy.rate_hz == source.rate_hz
-
-
-def check_prefix(path: Path, samples: list[Sample]) -> int:
-    """Checks that a damaged file gives a prefix of the samples or one InputError; returns their number."""
-    warnings: list[str] = []
-    source: Recording | None
-    try:
-        source = Recording(path, warn=warnings.append)
-    except InputError as error:
-        message = str(error)
-        source = None
-    if source is None:
-        assert str(path) in message
-        return 0
-    read = list(source)
-    assert same_bits(read, samples[: len(read)])
-    assert source.info == INFO.model_copy(update={"raw_whiskers": source.info.raw_whiskers})
-    assert source.length == len(read)
-    assert warnings == ([source.warning] if source.truncated else [])
-    assert source.truncated or len(read) == len(samples)
-    return len(read)
-
-
-def test_a_recording_truncated_at_any_byte_yields_a_prefix(tmp_path: Path) -> None:
-    """The least number of samples with several chunks and every kind of reading."""
-    samples = some_samples(5)
-    assert {type(sample.reading) for sample in samples} == {Observation, Whisk, Cycle, Report}
-    path = write_recording(tmp_path / "cut.mcap", samples, chunk_s=1.0)
-    content = path.read_bytes()
-    assert content.count(ZSTD_MAGIC) == 3
-    counts = []
-    for size in reversed(range(len(content))):
-        os.truncate(path, size)
-        counts.append(check_prefix(path, samples))
-    assert counts == sorted(counts, reverse=True)
-    assert set(counts) == {0, 1, 3, 5}
-
-
-def fuzz(content: bytes, samples: list[Sample], path: Path, rounds: int, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    for _ in range(rounds):
-        bad = bytearray(content)
-        for place in rng.integers(0, len(bad), rng.integers(1, 4)):
-            match int(rng.integers(4)):
-                case 0:
-                    bad[place % len(bad)] ^= 1 << int(rng.integers(8))
-                case 1:
-                    bad[place : place + 8] = struct.pack("<Q", int(rng.integers(1 << 62)) << 1)
-                case 2:
-                    bad[place : place + int(rng.integers(1, 40))] = b""
-                case _:
-                    bad[place : place + 16] = bytes(16)
-        path.write_bytes(bad)
-        check_prefix(path, samples)
-
-
-def test_a_damaged_byte_is_noticed(small: tuple[bytes, list[Sample]], tmp_path: Path) -> None:
-    content, samples = small
-    path = tmp_path / "bad.mcap"
-    path.write_bytes(content)
-    with path.open("r+b", buffering=0) as file:
-        for place in range(0, len(content), 3):
-            os.pwrite(file.fileno(), bytes([content[place] ^ 0x40]), place)
-            check_prefix(path, samples)
-            os.pwrite(file.fileno(), content[place : place + 1], place)
-
-
-def test_random_damage(small: tuple[bytes, list[Sample]], tmp_path: Path) -> None:
-    fuzz(*small, tmp_path / "bad.mcap", rounds=500, seed=1)
-
-
-@pytest.mark.soak
-@pytest.mark.parametrize("seed", range(8))
-def test_much_random_damage(small: tuple[bytes, list[Sample]], tmp_path: Path, seed: int) -> None:
-    fuzz(*small, tmp_path / "bad.mcap", rounds=5000, seed=seed + 100)
-
-
-def test_a_killed_recorder_loses_no_more_than_its_last_half_second(tmp_path: Path) -> None:
-    path = tmp_path / "killed.mcap"
-    code = f"""
-        import os, signal
-        from pathlib import Path
-        from robot.recordings.recorder import Recorder
-        from robot.sources.source import Sample
-        from tactile.base.types import Odometry, observation
-        recorder = Recorder(Path({str(path)!r}))
-        for i in range(25):
-            recorder.write(Sample(0.1 * i, observation(Odometry(0.01, 0, 0, 0.1)), None))
-        os.kill(os.getpid(), signal.SIGKILL)
-    """
-    done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(code)], cwd=Path(__file__).parents[3], check=False
-    )
-    assert done.returncode == -signal.SIGKILL
-    source = Recording(path)
-    assert 20 <= source.length <= 25
-    assert source.truncated
-    assert f"{source.length} samples are readable, the rest is lost: it ends too early" in source.warning
 
 
 def test_recover_writes_a_complete_file(small: tuple[bytes, list[Sample]], tmp_path: Path) -> None:
@@ -419,71 +176,6 @@ def test_a_file_that_changes_while_it_is_read_is_noticed(
     source = Recording(path)
     path.write_bytes(small[0][:700])
     refused(lambda: list(source), "had 9 samples and now has")
-
-
-def test_the_mcap_library_reads_a_recording(small: tuple[bytes, list[Sample]], tmp_path: Path) -> None:
-    from mcap.reader import make_reader
-
-    content, samples = small
-    (tmp_path / "a.mcap").write_bytes(content)
-    with (tmp_path / "a.mcap").open("rb") as file:
-        reader = make_reader(file)
-        assert [m.metadata["view_shape"] for m in reader.iter_metadata() if m.name == "ratslam"] == ["2,3,2"]
-        found = [(schema.encoding, channel.topic) for schema, channel, _ in reader.iter_messages()]
-    topics = ("observation", "cycle", "whisk", "report", "truth")
-    assert set(found) == {("ros2msg", f"/ratslam/{name}") for name in topics}
-    assert len(found) == len(samples) + sum(sample.truth is not None for sample in samples)
-
-
-def test_rosbags_reads_every_message_bit_for_bit(tmp_path: Path) -> None:
-    from rosbags.highlevel import AnyReader
-
-    samples = some_samples(10)
-    with AnyReader([write_recording(tmp_path / "a.mcap", samples)]) as reader:
-        read = [(connection.msgtype, data, reader.deserialize(data, connection.msgtype))
-                for connection, _, data in reader.messages()]  # fmt: skip
-        for name, data, message in read:
-            assert bytes(reader.typestore.serialize_cdr(message, name)) == data
-    readings = [part for part in read if part[0] != TRUTH]
-    assert [data for _, data, _ in readings] == [encode(sample, SHAPE, WHISKERS)[1] for sample in samples]
-    for sample, (name, data, message) in zip(samples, readings, strict=True):
-        check_fields(sample, name, message)
-        assert same_bits([Sample(*decode(name, data, SHAPE, WHISKERS), sample.truth)], [sample])
-
-
-def test_mcap_ros2_reads_every_message(tmp_path: Path) -> None:
-    from mcap.reader import make_reader
-    from mcap_ros2.decoder import DecoderFactory
-
-    samples = some_samples(10)
-    with write_recording(tmp_path / "a.mcap", samples).open("rb") as file:
-        read = list(make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages())
-    readings = [part for part in read if part.schema.name != TRUTH]
-    for sample, part in zip(samples, readings, strict=True):
-        check_fields(sample, part.schema.name, part.decoded_message)
-
-
-def check_fields(sample: Sample, name: str, message: Any) -> None:
-    """A ROS tool's message has the values of the sample."""
-    reading = sample.reading
-    assert (message.time, message.dtheta) == (sample.time, reading.odometry.dtheta)
-    if isinstance(reading, Observation):
-        assert name == OBSERVATION
-        assert (np.reshape(message.view, SHAPE) == reading.view).all()
-        assert (np.array(list(message.flags)) == reading.contact + 2 * ~reading.alive).all()
-    elif isinstance(reading, Whisk):
-        assert name == WHISK
-        features = np.stack([reading.touched, reading.highest, reading.reach], 1)
-        assert (np.reshape(message.felt, (WHISKERS, 3)) == features).all()
-        flags = reading.alive + 2 * reading.contact + 4 * reading.held
-        assert (np.array(list(message.flags)) == flags).all()
-    elif isinstance(reading, Report):
-        assert name == REPORT
-        assert (message.motion, message.moment) == (reading.motion, reading.moment)
-        assert (np.reshape(message.strain, (-1, WHISKERS, 2)) == reading.strain).all()
-    else:
-        assert name == CYCLE
-        assert (np.reshape(message.deflection, (2, WHISKERS, 2)) == reading.deflection).all()
 
 
 def test_a_chunk_of_excessive_size_is_not_decompressed(
