@@ -21,20 +21,14 @@ from ratslam.grid.config import DriftConfig
 from ratslam.grid.particle_maps import LAYERS
 from robot.simulation.head.session import choose_tier
 
-PART = 0.5
-"""Largest motion of the activity packet in one sub-step, cells."""
-PARTS = 4
-"""Largest number of sub-steps of all but a few cycles; with more, cells are too fine for the speed."""
-SLOW = 0.05
-"""Smallest motion of a usual cycle, cells; with less, cells are too coarse for the robot's speed."""
+PART = 0.5  # largest motion of the activity packet in one sub-step, cells
+PARTS = 4  # largest number of sub-steps of all but a few cycles; with more, cells are too fine for the speed
+SLOW = 0.05  # smallest motion of a usual cycle, cells; with less, cells are too coarse for the robot's speed
 FEWEST, MOST = 11, 201
 """Cells along an axis: at least those of a packet, at most those measured with the moving window."""
-PER_CELL = 100
-"""Particles per cell of odometry error across the scene."""
-PARTICLES = 30, 3000
-"""Smallest and largest number of particles."""
-MEMORY = 1024
-"""Largest memory of all particles' maps, MiB."""
+PER_CELL = 100  # particles per cell of odometry error across the scene
+PARTICLES = 30, 3000  # smallest and largest number of particles
+MEMORY = 1024  # largest memory of all particles' maps, MiB
 
 
 class Recommendation(NamedTuple):
@@ -55,15 +49,6 @@ def recommend(config: RunConfig, scene: Scene) -> list[Recommendation]:
     """Recommendations for a configuration that its source has completed."""
     own = _grid(config, scene) if config.backend == "grid" else _rat(config, scene)
     return [*own, *_tier(config)]
-
-
-def with_settings(config: Any, settings: dict[str, Any]) -> Any:
-    """The configuration with values at key paths, which are not validated."""
-    for key, value in settings.items():
-        name, _, rest = key.partition(".")
-        inner = with_settings(getattr(config, name), {rest: value}) if rest else value
-        config = config.model_copy(update={name: inner})
-    return config
 
 
 def round_number(value: float, side: int = 0, steps: tuple[int, ...] = (1, 2, 5)) -> float:

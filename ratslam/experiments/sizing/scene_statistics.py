@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ratslam.config.run_config import RunConfig
+from ratslam.experiments.studies.study import with_settings
 from ratslam.experiments.studies.tiers import shortened
 from ratslam.pipeline.run import open_recorder
 from ratslam.pipeline.source import open_source
@@ -17,10 +18,8 @@ from robot.sources.source import Source
 from tactile.base.errors import InputError
 from tactile.base.se2 import integrate
 
-STANDING = 0.1
-"""Share of the longest distance of a cycle below which a cycle counts as standing."""
-USUAL, MOST = 0.5, 0.95
-"""Quantiles of a usual cycle and of all but a few."""
+STANDING = 0.1  # share of the longest distance of a cycle below which a cycle counts as standing
+USUAL, MOST = 0.5, 0.95  # quantiles of a usual cycle and of all but a few
 
 
 class Scene(NamedTuple):
@@ -85,12 +84,12 @@ def short_session(config: RunConfig, cycles: int, folder: Path) -> RunConfig:
         InputError: the recording cannot be read.
     """
     if (create := config.create_simulation) is not None:
-        reports = create.model_copy(update={"reports": min(create.reports or cycles, cycles)})
-        return config.model_copy(update={"create_simulation": reports})
+        reports = min(create.reports or cycles, cycles)
+        return with_settings(config, {"create_simulation.reports": reports})
     if config.simulation is not None:
         return shortened(config, cycles / config.simulation.whisking.rate)
     path = folder / "beginning.mcap"
     with open_source(config) as source, open_recorder(path, source) as recorder:
         for sample in islice(source, cycles):
             recorder.write(sample)
-    return config.model_copy(update={"recording": RecordingConfig(file=path)})
+    return with_settings(config, {"recording": RecordingConfig(file=path)})

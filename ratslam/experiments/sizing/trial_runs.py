@@ -5,43 +5,37 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from ratslam.config.run_config import RunConfig
-from ratslam.experiments.sizing.recommendation import FEWEST, Recommendation, with_settings
+from ratslam.experiments.sizing.recommendation import FEWEST, Recommendation
 from ratslam.experiments.sizing.scene_statistics import short_session
 from ratslam.experiments.studies.machine import one_core
 from ratslam.experiments.studies.records import RunRecord
 from ratslam.experiments.studies.report import make_report, render
 from ratslam.experiments.studies.run_job import run_job
 from ratslam.experiments.studies.schema import StudyPlan
-from ratslam.experiments.studies.study import Job
+from ratslam.experiments.studies.study import Job, with_settings
 from ratslam.pipeline.source import open_source
 from tactile.base.errors import InputError
 
-COARSER = 1.5
-"""Factor on the size of a cell in a cheaper step."""
-FEWER = 3
-"""Divisor of the number of particles in a cheaper step."""
+COARSER = 1.5  # factor on the size of a cell in a cheaper step
+FEWER = 3  # divisor of the number of particles in a cheaper step
 ENERGY = 0.05
 """Energy that the classic backend injects for whisker views; the default outlasts their habituation."""
 
 
-class CheaperStep(NamedTuple):
-    """A cheaper choice: its name, and settings in place of the recommended ones."""
+def cheaper_steps(config: RunConfig) -> dict[str, dict[str, Any]]:
+    """The next cheaper step in every direction from a configuration with the recommended settings.
 
-    name: str
-    settings: dict[str, Any]
-
-
-def cheaper_steps(config: RunConfig) -> list[CheaperStep]:
-    """The next cheaper step in every direction from a configuration with the recommended settings."""
+    Returns:
+        settings in place of the recommended ones, by the name of the step.
+    """
     steps = _cheaper_grid(config) if config.backend == "grid" else _cheaper_cells(config)
     if config.session.precision == "float64":
-        steps.append(CheaperStep("float32", {"session.precision": "float32"}))
+        steps["float32"] = {"session.precision": "float32"}
     if config.simulation is not None and (config.simulation.raw or config.simulation.fidelity == "dynamic"):
-        settings = {"simulation.fidelity": "kinematic", "simulation.raw": False}
-        steps.append(CheaperStep("kinematic, no raw samples", settings))
+        steps["kinematic, no raw samples"] = {"simulation.fidelity": "kinematic", "simulation.raw": False}
     return steps
 
 
@@ -60,12 +54,12 @@ def try_settings(config: RunConfig, found: Sequence[Recommendation], cycles: int
             length = source.length or cycles
         # Memory for the whole session from the start: each configuration compiles once.
         base = with_settings(short, {"session.reserve": length} | {each.key: each.value for each in found})
-        steps = [CheaperStep("recommended", {}), *cheaper_steps(base)]
+        steps: dict[str, dict[str, Any]] = {"recommended": {}}
         if any(each.changed for each in found):
-            steps.insert(1, CheaperStep("as configured", {each.key: each.now for each in found}))
+            steps["as configured"] = {each.key: each.now for each in found}
         records = []
-        for step in steps:
-            records.append(run_job(Job(step.name, {}, with_settings(base, step.settings), pace="live")))
+        for step, settings in (steps | cheaper_steps(base)).items():
+            records.append(run_job(Job(step, {}, with_settings(base, settings), pace="live")))
             if records[0].error is not None:
                 raise InputError("", records[0].error)
         return records
@@ -78,30 +72,28 @@ def render_trial_runs(records: Sequence[RunRecord]) -> str:
     return "\n".join([render(make_report("", plan, records)), *failed])
 
 
-def _cheaper_cells(config: RunConfig) -> list[CheaperStep]:
-    cells, steps = config.pose_cells, []
+def _cheaper_cells(config: RunConfig) -> dict[str, dict[str, Any]]:
+    cells, steps = config.pose_cells, dict[str, dict[str, Any]]()
     if cells.cells_xy > FEWEST:
         fewer = max(FEWEST, cells.cells_xy // 2) | 1
-        steps.append(CheaperStep(f"{fewer} cells", {"pose_cells.cells_xy": fewer}))
+        steps[f"{fewer} cells"] = {"pose_cells.cells_xy": fewer}
     size = float(f"{cells.cell_size * COARSER:.3g}")
     across = max(FEWEST, round(cells.cells_xy / COARSER)) | 1
-    coarser = {"pose_cells.cell_size": size, "pose_cells.cells_xy": across}
-    steps.append(CheaperStep(f"cells of {size:g} m", coarser))
+    steps[f"cells of {size:g} m"] = {"pose_cells.cell_size": size, "pose_cells.cells_xy": across}
     turns = max(12, round(cells.cells_heading / COARSER))
     if turns < cells.cells_heading:
-        steps.append(CheaperStep(f"{turns} cells of heading", {"pose_cells.cells_heading": turns}))
+        steps[f"{turns} cells of heading"] = {"pose_cells.cells_heading": turns}
     if config.backend == "recall":
-        classic: dict[str, Any] = {"backend": "classic"}
+        steps["classic backend"] = {"backend": "classic"}
         if config.recording is None and "energy" not in config.templates.model_fields_set:
-            classic["templates.energy"] = ENERGY
-        steps.append(CheaperStep("classic backend", classic))
+            steps["classic backend"]["templates.energy"] = ENERGY
     return steps
 
 
-def _cheaper_grid(config: RunConfig) -> list[CheaperStep]:
-    grid, steps = config.grid, []
+def _cheaper_grid(config: RunConfig) -> dict[str, dict[str, Any]]:
+    grid, steps = config.grid, dict[str, dict[str, Any]]()
     fewer = max(2, grid.particles // FEWER)
     if fewer < grid.particles:
-        steps.append(CheaperStep(f"{fewer} particles", {"grid.particles": fewer}))
+        steps[f"{fewer} particles"] = {"grid.particles": fewer}
     size = float(f"{grid.cell * COARSER:.3g}")
-    return [*steps, CheaperStep(f"cells of {size:g} m", {"grid.cell": size})]
+    return steps | {f"cells of {size:g} m": {"grid.cell": size}}

@@ -22,8 +22,7 @@ from typing import Any, TypeVar
 
 from tactile.base.errors import InputError
 
-ANSWER_TIME = 10
-"""Time that a scheduler has for its first answer, s."""
+ANSWER_TIME = 10  # time that a scheduler has for its first answer, s
 ENVIRONMENT = (
     "XLA_FLAGS",
     "JAX_COMPILATION_CACHE_DIR",

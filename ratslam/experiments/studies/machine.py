@@ -1,4 +1,7 @@
-"""The machine of a run: name, versions, load of other processes, peak memory, and one core to measure on."""
+"""What a run costs: its times, its memory, and the machine with its load; one core to measure on.
+
+This module loads without NumPy and JAX, so that `one_core` can be used before they start their threads.
+"""
 
 from __future__ import annotations
 
@@ -13,29 +16,24 @@ from contextlib import contextmanager, suppress
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
+from time import perf_counter
 
 from tactile.base.config import Settings
 
 PACKAGES = ("ratslam", "tactile", "robot", "evaluation")
-OBSERVED = 0.2
-"""Time over which the load of the cores is observed before one of them is chosen, s."""
-_IDLE = slice(3, 5)
-"""Idle time and time waiting for a disk, among the times of a core (proc(5))."""
+COMPILED = "/jax/core/compile/backend_compile_duration"  # JAX's event of a compiled or fetched kernel
+OBSERVED = 0.2  # time over which the load of the cores is observed before one of them is chosen, s
+_IDLE = slice(3, 5)  # idle time and time waiting for a disk, among the times of a core (proc(5))
 
 
 class Machine(Settings):
     """Where a run was computed."""
 
-    processor: str
-    """Name of the processor."""
-    device: str
-    """Device of the kernels: `cpu`, or the name of an accelerator."""
-    versions: dict[str, str]
-    """Versions of what decides the speed."""
-    build: str
-    """First digits of the sha256 of ratslam's code: other code may give other results."""
-    workers: int = 1
-    """Number of processes that shared the work."""
+    processor: str  # name of the processor
+    device: str  # device of the kernels: `cpu`, or the name of an accelerator
+    versions: dict[str, str]  # versions of what decides the speed
+    build: str  # first digits of the sha256 of ratslam's code: other code may give other results
+    workers: int = 1  # number of processes that shared the work
     other_load: float | None = None
     """Number of cores that other processes kept busy meanwhile; None where the system does not say."""
 
@@ -43,7 +41,7 @@ class Machine(Settings):
 @lru_cache(maxsize=1)
 def machine() -> Machine:
     """This machine."""
-    import jax  # here, so that `one_core` can be used before JAX starts its threads
+    import jax
 
     device = jax.devices()[0]
     return Machine(
@@ -95,6 +93,58 @@ def peak_memory() -> float:
                 return int(line.split()[1]) / 1024
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return most / (1 << 20 if sys.platform == "darwin" else 1024)
+
+
+class Stopwatch:
+    """Measures a run and its calls of one or more steps, apart from compilation."""
+
+    def __init__(self) -> None:
+        self._compiled = _compiled()
+        self._steps: list[tuple[int, float]] = []  # number of steps, duration in s
+        self._compiling: list[tuple[int, float]] = []
+        self._began = perf_counter()
+
+    def elapsed(self) -> float:
+        """Time since the start, s."""
+        return perf_counter() - self._began
+
+    @contextmanager
+    def taking(self, steps: int) -> Iterator[None]:
+        """Surrounds the given number of steps; of none, what is prepared before the first."""
+        before, began = len(self._compiled), perf_counter()
+        yield
+        taken = steps, perf_counter() - began
+        (self._compiling if not steps or len(self._compiled) > before else self._steps).append(taken)
+
+    def times(self) -> dict[str, float | None]:
+        """The quantities of time in `metrics.MEASURED`; None where too few steps were taken."""
+        import numpy as np
+
+        each = np.array([seconds / steps for steps, seconds in self._steps])
+        usual = float(np.median(each)) if len(each) else None
+        count = sum(steps for steps, _ in [*self._steps, *self._compiling])
+        compiling = max(sum(seconds - steps * (usual or 0.0) for steps, seconds in self._compiling), 0.0)
+        return {
+            "step_time": None if usual is None else 1e6 * usual,
+            "step_time_p99": float(1e6 * np.quantile(each, 0.99)) if len(each) else None,
+            "run_time": 1e6 * max(self.elapsed() - compiling, 0.0) / count if count else None,
+            "compile_time": compiling,
+        }
+
+
+@lru_cache(maxsize=1)
+def _compiled() -> list[float]:
+    """Durations of all compilations and fetches of kernels by this process since the first call, s."""
+    import jax
+
+    found: list[float] = []
+
+    def note(event: str, duration_secs: float, **_: str | int) -> None:
+        if event == COMPILED:
+            found.append(duration_secs)
+
+    jax.monitoring.register_event_duration_secs_listener(note)
+    return found
 
 
 def _build() -> str:

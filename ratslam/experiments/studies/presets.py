@@ -11,9 +11,7 @@ from pydantic import BaseModel
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import Document, load, override, validate
 from ratslam.config.strict_yaml.document import Place
-from ratslam.experiments.studies.config_hash import seed_key
-from ratslam.experiments.studies.overrides import is_study_key
-from ratslam.experiments.studies.study import Study, check_study
+from ratslam.experiments.studies.study import Study, check_study, is_study_key, seed_key
 from ratslam.experiments.studies.tiers import shortened
 from robot.simulation.head.session import choose_tier
 from tactile.base.errors import InputError
@@ -35,8 +33,7 @@ PARTS: dict[str, dict[str, Any]] = {
     "without loop closures": {"experience.closures": False},
 }
 """Parts that `ablate` turns off, by setting."""
-CLASSIC: dict[str, Any] = {"backend": "classic", "templates.energy": 0.05}
-"""The classic backend for whiskers."""
+CLASSIC: dict[str, Any] = {"backend": "classic", "templates.energy": 0.05}  # the classic backend for whiskers
 CHOICES: dict[str, dict[str, Any]] = {
     "as configured": {},
     "11 cells": {"backend": "recall", "pose_cells.cells_xy": 11},
@@ -46,10 +43,8 @@ CHOICES: dict[str, dict[str, Any]] = {
     "classic": CLASSIC,
 }
 """Rows of `pareto`."""
-PARTICLES = (30, 100, 300)
-"""Particles of the grid filter in `pareto`, for simulated whiskers."""
-TIERS = ("kinematic", "quasistatic", "dynamic")
-"""Fidelities of simulation, the cheapest first."""
+PARTICLES = (30, 100, 300)  # particles of the grid filter in `pareto`, for simulated whiskers
+TIERS = ("kinematic", "quasistatic", "dynamic")  # fidelities of simulation, the cheapest first
 METHODS: dict[str, dict[str, Any]] = {
     "classic": CLASSIC | {"templates.threshold": 0.04},
     "recall": {"backend": "recall"},

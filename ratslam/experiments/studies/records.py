@@ -14,35 +14,24 @@ from ratslam.experiments.studies.study import Job, run_key
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
 
-FILE = "runs.jsonl"
-"""Name of the file of records in a study's directory."""
+FILE = "runs.jsonl"  # name of the file of records in a study's directory
 
 
 class RunRecord(Settings):
     """Outcome of one run. `quantities` and `steps` do not depend on the machine; the rest does."""
 
-    hash: str
-    """Hash of the configuration without its seed."""
-    seed: int
-    """Seed of the simulation or session."""
-    copy_number: int = 0
-    """Seed of the perturbed copy of the session; 0: the session itself."""
-    row: str = ""
-    """Name of the study's row."""
-    varied: dict[str, Any] = Field(default_factory=dict)
-    """Combination of the varied settings, by key path."""
-    steps: int = 0
-    """Number of observations."""
-    source: str = ""
-    """Digest of the session."""
-    quantities: dict[str, Quantity] = Field(default_factory=dict)
-    """Scored quantities by name."""
+    hash: str  # hash of the configuration without its seed
+    seed: int  # seed of the simulation or session
+    copy_number: int = 0  # seed of the perturbed copy of the session; 0: the session itself
+    row: str = ""  # name of the study's row
+    varied: dict[str, Any] = Field(default_factory=dict)  # combination of the varied settings, by key path
+    steps: int = 0  # number of observations
+    source: str = ""  # digest of the session
+    quantities: dict[str, Quantity] = Field(default_factory=dict)  # scored quantities by name
     measured: dict[str, float | None] = Field(default_factory=dict)
     """Times and memory by name (`metrics.MEASURED`)."""
-    machine: Machine | None = None
-    """Where it was computed."""
-    error: str | None = None
-    """Why there is no outcome."""
+    machine: Machine | None = None  # where it was computed
+    error: str | None = None  # why there is no outcome
 
     @property
     def key(self) -> str:

@@ -24,14 +24,10 @@ from tactile.base.atomic_write import write_atomically, write_text_atomically
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-DISTURBED = 0.3
-"""Load of other processes from which a measurement of speed counts as disturbed, cores."""
-KEPT = 1.25
-"""Largest final ATE of a row that counts as kept, relative to the first row's."""
-MEANS = ("means", "search")
-"""Kinds of report that show means; others show medians."""
-COMPARED = ("differences", "costs")
-"""Kinds of report that show the difference of each row from the first."""
+DISTURBED = 0.3  # load of other processes from which a measurement of speed counts as disturbed, cores
+KEPT = 1.25  # largest final ATE of a row that counts as kept, relative to the first row's
+MEANS = ("means", "search")  # kinds of report that show means; others show medians
+COMPARED = ("differences", "costs")  # kinds of report that show the difference of each row from the first
 PACES = {"live": "one step at a time", "replay": "a chunk of steps at a time"}
 
 

@@ -21,12 +21,11 @@ from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.scorecard import score_run
 from ratslam.config.run_config import RunConfig
 from ratslam.core.session import CHUNK, Session
-from ratslam.experiments.studies.machine import machine, peak_memory, reset_peak_memory, watch_load
+from ratslam.experiments.studies.machine import Stopwatch, machine, peak_memory, reset_peak_memory, watch_load
 from ratslam.experiments.studies.metrics import quantity
 from ratslam.experiments.studies.records import RunRecord, record_of
 from ratslam.experiments.studies.study import Job
 from ratslam.experiments.studies.tiers import compare_with_tier
-from ratslam.experiments.studies.timing import Stopwatch
 from ratslam.pipeline.artifacts import true_grid
 from ratslam.pipeline.online_error import OnlineErrorLog
 from ratslam.pipeline.runner import build_session
@@ -38,8 +37,7 @@ from robot.world.arena import read_arena
 from tactile.base.errors import InputError
 from tactile.base.se2 import compose, integrate, inverse
 
-SAME_PLACE = 2.5
-"""Largest true distance between the ends of a true loop closure, pose cells."""
+SAME_PLACE = 2.5  # largest true distance between the ends of a true loop closure, pose cells
 
 
 def run_job(job: Job) -> RunRecord:

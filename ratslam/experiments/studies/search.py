@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Sequence
+from itertools import chain, islice
 from typing import Any
 
 from ratslam.experiments.studies.executor import Executor
 from ratslam.experiments.studies.records import RunLog, RunRecord
-from ratslam.experiments.studies.schema import Parameter, SearchPlan
+from ratslam.experiments.studies.schema import SearchPlan
 from ratslam.experiments.studies.study import Job, Study, searched_jobs
 from ratslam.experiments.studies.study_runner import run_jobs
 from tactile.base.errors import InputError
@@ -57,9 +58,9 @@ def search(
             numbers = range(first, min(first + plan.batch, plan.trials))
             asked = [_ask(book, plan, number) for number in numbers]
             jobs = [_jobs(study, number, trial) for number, trial in zip(numbers, asked, strict=True)]
-            records = run_jobs([job for each in jobs for job in each], log, executor, done)
+            records = run_jobs(list(chain.from_iterable(jobs)), log, executor, done)
             for trial, each in zip(asked, jobs, strict=True):
-                own = [next(records) for _ in each]
+                own = list(islice(records, len(each)))
                 values = _values(plan, own)
                 failed = {"state": optuna.trial.TrialState.FAIL} if values is None else {"values": values}
                 book.tell(trial, **failed)
@@ -75,7 +76,12 @@ def _ask(book: Any, plan: SearchPlan, number: int) -> Any:
     trial = book.ask()
     for key, parameter in plan.parameters.items():
         book.sampler = _sampler(plan, f"tune.{number}.{key}")
-        _suggest(trial, key, parameter)
+        if parameter.choices is not None:
+            trial.suggest_categorical(key, parameter.choices)
+            continue
+        integer = isinstance(parameter.low, int) and isinstance(parameter.high, int)
+        suggest = trial.suggest_int if integer else trial.suggest_float
+        suggest(key, parameter.low, parameter.high, log=parameter.log)
     return trial
 
 
@@ -88,15 +94,6 @@ def _sampler(plan: SearchPlan, name: str) -> Any:
     return optuna.samplers.TPESampler(seed=seed)
 
 
-def _suggest(trial: Any, key: str, parameter: Parameter) -> None:
-    if parameter.choices is not None:
-        trial.suggest_categorical(key, parameter.choices)
-        return
-    integer = isinstance(parameter.low, int) and isinstance(parameter.high, int)
-    suggest = trial.suggest_int if integer else trial.suggest_float
-    suggest(key, parameter.low, parameter.high, log=parameter.log)
-
-
 def _jobs(study: Study, number: int, trial: Any) -> list[Job]:
     """The runs of a trial; none if its parameters contradict each other."""
     try:
@@ -107,8 +104,7 @@ def _jobs(study: Study, number: int, trial: Any) -> list[Job]:
 
 def _values(plan: SearchPlan, records: Sequence[RunRecord]) -> list[float] | None:
     """The objectives as means over runs; None if a run lacks one."""
-    columns = [[record.value(name) for record in records] for name in plan.directions()]
-    known = [[value for value in column if value is not None] for column in columns]
-    if not records or any(len(column) < len(records) for column in known):
+    columns: list[list[Any]] = [[each.value(name) for each in records] for name in plan.directions()]
+    if not records or any(None in column for column in columns):
         return None
-    return [statistics.fmean(column) for column in known]
+    return [statistics.fmean(map(float, column)) for column in columns]

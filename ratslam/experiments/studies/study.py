@@ -1,30 +1,37 @@
-"""A study: a base configuration, its variations, and the runs that follow from them."""
+"""A study: a base configuration, its variations, and the runs that follow from them.
+
+Settings of a study are put into a configuration so that error messages name their place in the study.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from itertools import product
+import copy
+import hashlib
+import json
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from functools import lru_cache
+from itertools import combinations, product
 from math import prod
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
+
+from pydantic import BaseModel
 
 from ratslam.config.run_config import RunConfig
-from ratslam.config.strict_yaml import Document, load, override, validate
-from ratslam.experiments.studies.config_hash import digest_of, seed_key, with_seed
-from ratslam.experiments.studies.overrides import (
-    Setting,
-    check_unambiguous,
-    is_study_key,
-    outermost_first,
-    put,
-    without_index,
-)
+from ratslam.config.strict_yaml import Document, load, open_path, override, validate
+from ratslam.config.strict_yaml.document import KeyPath, Place
 from ratslam.experiments.studies.schema import RowPlan, SearchPlan, StudyPlan
 from ratslam.keyframes.config import FULL, Ablation
 from tactile.base.errors import InputError, InputErrors
 
-MOST = 100_000
-"""Largest number of jobs of a study."""
+Model = TypeVar("Model", bound=BaseModel)
+MOST = 100_000  # largest number of jobs of a study
+SEEDS = {
+    "simulation": "simulation.seed",
+    "create_simulation": "create_simulation.seed",
+    "recording": "session.seed",
+}
+"""Key path that `seeds` sets, by kind of source."""
 
 
 class Job(NamedTuple):
@@ -51,6 +58,14 @@ class Job(NamedTuple):
     def key(self) -> str:
         """Identifies the run: two jobs with one key are the same."""
         return run_key(self.hash, self.seed, self.copy_number)
+
+
+class Setting(NamedTuple):
+    """A dotted key of a configuration, its value, and the path in the study where that is written."""
+
+    key: str
+    value: Any
+    at: KeyPath
 
 
 class Study(NamedTuple):
@@ -96,11 +111,11 @@ def check_study(name: str, document: Document, folder: Path, overrides: Sequence
     plan = validate(document, StudyPlan)
     of_runs = [text for text in overrides if not is_study_key(text)]
     keys = [text.partition("=")[0] for text in of_runs]
-    check_unambiguous(plan, document, keys)
+    _check_unambiguous(plan, document, keys)
     file = folder / plan.base
     base = load(file)
-    for key in outermost_first(plan.set):
-        base = put(base, Setting(key, plan.set[key], ("set", key)), document)
+    for key in _outermost_first(plan.set):
+        base = _put(base, Setting(key, plan.set[key], ("set", key)), document)
     study = Study(name, plan, document, override(base, of_runs), file.parent, keys, ())
     if plan.tune is not None:
         _check_search(study, plan.tune)
@@ -123,16 +138,15 @@ def _jobs(study: Study) -> Iterator[Job]:
     total = copies * prod(map(len, plan.vary.values())) * len(plan.every_seed())
     if total > MOST:
         raise InputError(study.document.at_key(()), f"{total} jobs", f"at most {MOST}", "vary less at a time")
+    alternatives = [
+        [Setting(key, value, ("vary", key, k)) for k, value in enumerate(values)]
+        for key, values in plan.vary.items()
+    ]
     wrong: dict[str, InputError] = {}
     for name, row in rows.items():
-        fixed = [
-            Setting(key, row.settings[key], ("rows", name, key)) for key in outermost_first(row.settings)
-        ]
-        for chosen in product(*(range(len(values)) for values in plan.vary.values())):
-            varied = [
-                Setting(key, plan.vary[key][k], ("vary", key, k))
-                for key, k in zip(plan.vary, chosen, strict=True)
-            ]
+        keys = _outermost_first(row.settings)
+        fixed = [Setting(key, row.settings[key], ("rows", name, key)) for key in keys]
+        for varied in product(*alternatives):
             try:
                 yield from _runs_of(study, [*fixed, *varied], name, row, {key: v for key, v, _ in varied})
             except InputError as error:
@@ -148,20 +162,19 @@ def _runs_of(
     """The study's base with further settings, under every seed and copy."""
     plan, document = study.plan, study.base
     for setting in settings:
-        document = put(document, setting, study.document)
+        document = _put(document, setting, study.document)
     config = validate(document, RunConfig).with_absolute_paths(study.folder.resolve())
     keys = {key: study.document.at_key(("set", key)) for key in plan.set}
     keys |= {key: f"--set {key}" for key in study.overridden}
-    keys |= {each.key: study.document.at_key(without_index(each.at)) for each in settings}
+    keys |= {each.key: study.document.at_key(_without_index(each.at)) for each in settings}
     if seed_key(config) in keys:
         raise InputError(keys[seed_key(config)], "a seed", "the study's `seeds`")
     parts = (plan.pace, plan.reference_tier, "" if row.ablation == FULL else repr(row.ablation))
-    digest = digest_of(config, " ".join(filter(None, parts)))
+    digest = _digest_of(config, " ".join(filter(None, parts)))
     for seed, copy_number in product(plan.every_seed(), plan.every_copy(row)):
-        yield Job(
-            name, varied, with_seed(config, seed), digest, seed, copy_number,
-            plan.pace, plan.reference_tier, row.ablation,
-        )  # fmt: skip
+        seeded = with_settings(config, {seed_key(config): seed})
+        how = plan.pace, plan.reference_tier, row.ablation
+        yield Job(name, varied, seeded, digest, seed, copy_number, *how)
 
 
 def _check_search(study: Study, plan: SearchPlan) -> None:
@@ -170,3 +183,105 @@ def _check_search(study: Study, plan: SearchPlan) -> None:
     for key, parameter in plan.parameters.items():
         for value in parameter.extremes:
             searched_jobs(study, first | {key: value})
+
+
+def _put(document: Document, setting: Setting, study: Document) -> Document:
+    """The document with a setting of the study; raises an `InputError` if there is no such key."""
+    key, value, at = setting
+    where = study.at_key(at)
+    if "=" in key or not all(key.split(".")):
+        raise InputError(where, "not a key path", "names joined by dots, such as pose_cells.cells_xy")
+    data = copy.deepcopy(document.data)
+    section, path = open_path(data, key, where)
+    section[path[-1]] = copy.deepcopy(value)
+    key_place, value_place = (study.places[study.nearest(each)] for each in (_without_index(at), at))
+    here = Place(key_place.key, value_place.value)
+    places = {each: place for each, place in document.places.items() if each[: len(path)] != path}
+    for length in range(1, len(path)):
+        places.setdefault(path[:length], here)
+    inside = {
+        (*path, *each[len(at) :]): place for each, place in study.places.items() if each[: len(at)] == at
+    }
+    return Document(data, places | inside | {path: here})
+
+
+def _without_index(at: KeyPath) -> KeyPath:
+    """The path without the index of a value in a list."""
+    return at[:-1] if isinstance(at[-1], int) else at
+
+
+def _outermost_first(keys: Iterable[str]) -> list[str]:
+    """Sections before their keys, so that the result does not depend on the order of writing."""
+    return sorted(keys, key=lambda key: (key.count("."), key))
+
+
+def is_study_key(assignment: str) -> bool:
+    """Whether `a.b=value` sets a key of the study; else it is a setting of all runs."""
+    return assignment.partition("=")[0].split(".")[0] in StudyPlan.model_fields
+
+
+def _check_unambiguous(plan: StudyPlan, document: Document, overridden: Collection[str]) -> None:
+    """Raises an `InputError` if one key contains another, or a value is given twice.
+
+    Args:
+        overridden: keys of `--set` that are settings of all runs.
+    """
+    parameters = {key: ("tune", "parameters", key) for key in (plan.tune.parameters if plan.tune else ())}
+    rows = [(key, ("rows", name, key)) for name, row in plan.every_row().items() for key in row.settings]
+    vary = {key: ("vary", key) for key in plan.vary}
+    pairs: list[Any] = [*combinations(vary.items(), 2), *combinations(parameters.items(), 2)]
+    for (first, _), (second, at) in [*pairs, *product(vary.items(), rows)]:
+        if f"{first}.".startswith(f"{second}.") or f"{second}.".startswith(f"{first}."):
+            raise InputError(document.at_key(at), f"sets what {first!r} varies", "one or the other")
+    for key, values in plan.vary.items():
+        texts = [json.dumps(value, sort_keys=True) for value in values]
+        twice = next((k for k, text in enumerate(texts) if text in texts[:k]), None)
+        if twice is not None:
+            where = document.at_value(("vary", key, twice))
+            raise InputError(where, f"{texts[twice]} given twice", "each once")
+        if key in overridden:
+            raise InputError(f"--set {key}", "varied by the study", "a setting of all runs")
+
+
+def with_settings(config: Model, settings: dict[str, Any]) -> Model:
+    """The configuration with values at key paths, which are not validated."""
+    for key, value in settings.items():
+        name, _, rest = key.partition(".")
+        inner = with_settings(getattr(config, name), {rest: value}) if rest else value
+        config = config.model_copy(update={name: inner})
+    return config
+
+
+def seed_key(config: RunConfig) -> str:
+    """The key path that `seeds` sets."""
+    return next(key for part, key in SEEDS.items() if getattr(config, part) is not None)
+
+
+def _digest_of(config: RunConfig, how: str) -> str:
+    """Hash of a configuration with absolute paths, without its seed.
+
+    It covers all values, which of them were given (others may be completed from the source), and the content
+    of each file that the configuration names.
+    """
+    section, _, name = seed_key(config).partition(".")
+    parts = [config.model_dump(), config.model_dump(exclude_unset=True)]
+    for part in parts:
+        part.get(section, {}).pop(name, None)
+    text = json.dumps([*parts, how], sort_keys=True, default=_content)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _content(path: Path) -> str:
+    """The digest of a file's content; the path of what is not a file."""
+    try:
+        stat = path.stat()
+        return _digest(path, stat.st_mtime_ns, stat.st_size) if path.is_file() else str(path)
+    except OSError:
+        return str(path)
+
+
+@lru_cache(maxsize=256)
+def _digest(path: Path, modified: int, size: int) -> str:
+    """sha256 of a file; `modified` and `size` distinguish its versions in the cache."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

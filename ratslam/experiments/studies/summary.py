@@ -14,8 +14,7 @@ from evaluation.metrics.metric import Direction
 from ratslam.experiments.studies.metrics import DEFAULT_ERRORS, MEASURED, METRICS
 from ratslam.experiments.studies.records import RunRecord
 
-DEAD_RECKONING = "dead reckoning"
-"""Name of the row of raw odometry."""
+DEAD_RECKONING = "dead reckoning"  # name of the row of raw odometry
 
 
 @dataclass(frozen=True)

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
 from evaluation.metrics.metric import Finding, Quantity
 from ratslam.config.run_config import RunConfig
 from ratslam.experiments.studies.metrics import quantity
+from ratslam.experiments.studies.study import with_settings
 from ratslam.pipeline.source import open_observations
 from robot.simulation.head.session import HeadSimulation
 from robot.sources.in_memory import InMemorySource, load_into_memory
 from tactile.base.errors import InputError
 
-FEWEST_LAPS = 2
-"""Laps of a shortened session: fewer give nothing to recognise."""
+FEWEST_LAPS = 2  # laps of a shortened session: fewer give nothing to recognise
 
 
 def compare_with_tier(config: RunConfig, log: InMemorySource, cost: float, tier: str) -> dict[str, Quantity]:
@@ -60,23 +61,20 @@ def with_tier(config: RunConfig, tier: str) -> RunConfig:
     """The configuration with another fidelity of simulation and without raw samples, if it simulates."""
     if config.simulation is None:
         return config
-    update = {"fidelity": tier, "raw": False}
-    return config.model_copy(update={"simulation": config.simulation.model_copy(update=update)})
+    return with_settings(config, {"simulation.fidelity": tier, "simulation.raw": False})
 
 
 def shortened(config: RunConfig, seconds: float) -> RunConfig:
     """The configuration with fewer circuits, two at least, or less exploration; a path of cells stays."""
-    simulation = config.simulation
-    assert simulation is not None
-    path = simulation.path
+    cheapest = with_tier(config, "kinematic").simulation
+    assert cheapest is not None
+    path, length = cheapest.path, dict[str, Any]()
     if path.explore:
-        path = path.model_copy(update={"explore": min(path.explore, seconds)})
+        length["simulation.path.explore"] = min(path.explore, seconds)
     elif path.circuits:
-        cheapest = with_tier(config, "kinematic").simulation
-        assert cheapest is not None
         lap = float(HeadSimulation(cheapest).time[-1]) / len(path.circuits)
-        path = path.model_copy(update={"circuits": path.circuits[: max(FEWEST_LAPS, int(seconds / lap))]})
-    return config.model_copy(update={"simulation": simulation.model_copy(update={"path": path})})
+        length["simulation.path.circuits"] = path.circuits[: max(FEWEST_LAPS, int(seconds / lap))]
+    return with_settings(config, length)
 
 
 @lru_cache(maxsize=1)

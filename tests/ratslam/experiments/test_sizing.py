@@ -25,11 +25,11 @@ from ratslam.experiments.sizing.recommendation import (
     changed_settings_yaml,
     recommend,
     round_number,
-    with_settings,
 )
 from ratslam.experiments.sizing.scene_statistics import Scene, scene_of, short_session
 from ratslam.experiments.sizing.trial_runs import cheaper_steps
 from ratslam.experiments.studies.records import RunRecord
+from ratslam.experiments.studies.study import with_settings
 from ratslam.experiments.studies.tiers import with_tier
 from ratslam.grid.particle_maps import LAYERS
 from ratslam.pipeline.source import open_source
@@ -116,8 +116,8 @@ def test_the_snippet_makes_the_configuration_the_proposed_one(config, scene):
 
 @given(CONFIGS)
 def test_a_cheaper_step_lowers_one_setting(config):
-    for step in cheaper_steps(config):
-        less = with_settings(config, step.settings)
+    for settings in cheaper_steps(config).values():
+        less = with_settings(config, settings)
         assert less != config
         again = RunConfig.model_validate(less.model_dump(exclude_unset=True))
         assert again.pose_cells.cells_xy <= max(config.pose_cells.cells_xy, FEWEST)
@@ -167,7 +167,8 @@ def test_a_session_is_cut_to_about_so_many_cycles(tmp_path):
 @pytest.mark.soak
 def test_a_small_arena_is_sized(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(
-        "ratslam.experiments.sizing.trial_runs.cheaper_steps", lambda config: cheaper_steps(config)[:1]
+        "ratslam.experiments.sizing.trial_runs.cheaper_steps",
+        lambda config: dict(islice(cheaper_steps(config).items(), 1)),
     )  # less to compile
     path = tmp_path / "arena.yaml"
     path.write_text("create_simulation: {reports: 80}\nbackend: grid\nsession: {precision: float32}\n")
