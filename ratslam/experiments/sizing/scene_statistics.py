@@ -23,21 +23,15 @@ USUAL, MOST = 0.5, 0.95  # quantiles of a usual cycle and of all but a few
 
 
 class Scene(NamedTuple):
-    """Statistics of a session's odometry.
+    """Statistics of a session's odometry."""
 
-    Attributes:
-        name: of the source. cycles: how many. rate: of them, Hz; 0 if unknown. span: [2] m, what the path
-            covers along x and y. usual, most: distance driven in a cycle, where one is driven, m: the median
-            and the 95 % quantile. turn: the 95 % quantile of the angle turned by in a cycle, rad.
-    """
-
-    name: str
-    cycles: int
-    rate: float
-    span: tuple[float, float]
-    usual: float
-    most: float
-    turn: float
+    name: str  # of the source
+    cycles: int  # number of cycles
+    rate: float  # of the cycles, Hz; 0 if unknown
+    span: tuple[float, float]  # m, what the path covers along x and y
+    usual: float  # m, median of the distance driven in a cycle, where one is driven
+    most: float  # m, its 95 % quantile
+    turn: float  # rad, 95 % quantile of the angle turned by in a cycle
 
     def describe(self) -> str:
         """The statistics as a sentence."""
@@ -50,11 +44,7 @@ class Scene(NamedTuple):
 
 
 def scene_of(source: Source) -> Scene:
-    """The statistics of a source.
-
-    Raises:
-        InputError: it has no samples, or its odometry is not finite.
-    """
+    """The statistics of a source; raises an `InputError` if its odometry has no finite motion."""
     moves = np.array([sample.reading.odometry[:3] for sample in source], float).reshape(-1, 3)
     moves = moves[np.isfinite(moves).all(axis=1)]
     if not len(moves):
@@ -65,24 +55,14 @@ def scene_of(source: Source) -> Scene:
     if not len(driving):
         raise InputError(source.name, "a robot that never moves", "a session with motion")
     width, height = np.ptp(path, axis=0)
-    return Scene(
-        name=source.name,
-        cycles=len(moves),
-        rate=source.rate_hz,
-        span=(float(width), float(height)),
-        usual=float(np.quantile(driving, USUAL)),
-        most=float(np.quantile(driving, MOST)),
-        turn=float(np.quantile(turn, MOST)),
-    )
+    usual, most = (float(np.quantile(driving, share)) for share in (USUAL, MOST))
+    span, most_turn = (float(width), float(height)), float(np.quantile(turn, MOST))
+    return Scene(source.name, len(moves), source.rate_hz, span, usual, most, most_turn)
 
 
 def short_session(config: RunConfig, cycles: int, folder: Path) -> RunConfig:
     """The configuration with about the given number of cycles: whole circuits, two at least; of a recording
-    its beginning, which is copied to the folder.
-
-    Raises:
-        InputError: the recording cannot be read.
-    """
+    its beginning, which is copied to the folder. An `InputError` says that it cannot be read."""
     if (create := config.create_simulation) is not None:
         reports = min(create.reports or cycles, cycles)
         return with_settings(config, {"create_simulation.reports": reports})

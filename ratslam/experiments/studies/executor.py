@@ -105,7 +105,7 @@ class Executor(ExitStack):
                 del left[index]
                 yield index, result
             if left:
-                self._disconnect()  # all memory for the task at fault
+                self.close()  # all memory for the task at fault
         for index, task in left.items():
             try:
                 if self._scheduler is not None:
@@ -132,25 +132,32 @@ class Executor(ExitStack):
             option = "--workers" if self._scheduler is None else "--scheduler"
             raise InputError(option, "Dask is not installed", "the extra 'sweep'", cure) from None
         if self._scheduler is None and workers > self.processes:
-            self._disconnect()
+            self.close()
         if self._client is None:
             with _holding_interrupts():
                 self._client = self._client_of(workers)
-        served = workers if self._scheduler is None else min(len(self._client.nthreads()) or 1, tasks)
-        self.processes = max(self.processes, served)
+                self.callback(setattr, self, "_client", None)
+        self.processes = max(self.processes, min(len(self._client.nthreads()) or 1, tasks))
         return True
-
-    def _disconnect(self) -> None:
-        self._client = None
-        self.close()
 
     def _client_of(self, workers: int) -> Any:
         """A client of the scheduler, or of a new one with processes of this machine."""
-        from distributed import Client
+        import dask
+        from distributed import Client, LocalCluster
         from distributed.utils import silence_logging_cmgr
 
         self.enter_context(silence_logging_cmgr(logging.CRITICAL))  # the log repeats what our errors say
-        address = self._scheduler or self._start(workers)
+        address = self._scheduler
+        if address is None:
+            folder = self.enter_context(TemporaryDirectory())
+            self.enter_context(dask.config.set(DASK_SETTINGS | {"temporary-directory": folder}))
+            cluster = LocalCluster(
+                n_workers=workers, threads_per_worker=1, processes=True, host="127.0.0.1", memory_limit=0,
+                dashboard_address=None, silence_logs=logging.CRITICAL,
+            )  # fmt: skip
+            self.enter_context(cluster)
+            self.callback(_kill_workers, cluster)
+            address = str(cluster.scheduler_address)
         try:
             client = self.enter_context(Client(address, timeout=ANSWER_TIME, set_as_default=False))
         except (OSError, ValueError) as error:
@@ -159,21 +166,6 @@ class Executor(ExitStack):
         if not client.nthreads():
             print(f"ratslam: waiting for workers to join {address} ...", file=sys.stderr)
         return client
-
-    def _start(self, workers: int) -> str:
-        """Starts processes of this machine; returns the address of their scheduler."""
-        import dask
-        from distributed import LocalCluster
-
-        folder = self.enter_context(TemporaryDirectory())
-        self.enter_context(dask.config.set(DASK_SETTINGS | {"temporary-directory": folder}))
-        cluster = LocalCluster(
-            n_workers=workers, threads_per_worker=1, processes=True, host="127.0.0.1", memory_limit=0,
-            dashboard_address=None, silence_logs=logging.CRITICAL,
-        )  # fmt: skip
-        self.enter_context(cluster)
-        self.callback(_kill_workers, cluster)
-        return str(cluster.scheduler_address)
 
     def _answers(self, function: Callable[[Task], Result], tasks: Sequence[Task]) -> Iterator[Any]:
         """(index, result) in the order of completion, without those of processes that were killed."""

@@ -59,8 +59,12 @@ def one_core() -> Iterator[None]:
     if not hasattr(os, "sched_setaffinity"):
         yield
         return
-    allowed = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {_idlest(allowed)})
+    allowed, before = os.sched_getaffinity(0), _busy()
+    if before and len(allowed) > 1:
+        time.sleep(OBSERVED)
+    now = _busy()
+    idlest = min(sorted(allowed), key=lambda core: now.get(core, 0.0) - before.get(core, 0.0))
+    os.sched_setaffinity(0, {idlest})
     try:
         yield
     finally:
@@ -69,11 +73,11 @@ def one_core() -> Iterator[None]:
 
 def watch_load() -> Callable[[], float | None]:
     """A function for the mean number of cores that other processes kept busy since; None if unknown."""
-    began, before, ours = time.monotonic(), _busy(), _own_time()
+    began, before, ours = time.monotonic(), _busy(), sum(os.times()[:4])  # with children that have ended
 
     def load() -> float | None:
         now = _busy()
-        taken = sum(now.values()) - sum(before.values()) - (_own_time() - ours)
+        taken = sum(now.values()) - sum(before.values()) - (sum(os.times()[:4]) - ours)
         return max(taken, 0.0) / max(time.monotonic() - began, 1e-9) if before and now else None
 
     return load
@@ -156,14 +160,6 @@ def _build() -> str:
     return total.hexdigest()[:12]
 
 
-def _idlest(allowed: set[int]) -> int:
-    before = _busy() if len(allowed) > 1 else {}
-    if before:
-        time.sleep(OBSERVED)
-    now = _busy()
-    return min(sorted(allowed), key=lambda core: now.get(core, 0.0) - before.get(core, 0.0))
-
-
 def _busy() -> dict[int, float]:
     """Time that each core has been busy, s; {} where the system does not say."""
     try:
@@ -172,13 +168,8 @@ def _busy() -> dict[int, float]:
     except (OSError, ValueError):
         return {}
     cores = [line.split() for line in lines if line.startswith("cpu") and not line.startswith("cpu ")]
-    times = {int(name[3:]): [int(part) for part in parts[:8]] for name, *parts in cores}
+    times = {int(name[3:]): list(map(int, parts[:8])) for name, *parts in cores}
     return {core: (sum(parts) - sum(parts[_IDLE])) / tick for core, parts in times.items()}
-
-
-def _own_time() -> float:
-    """Processor time of this process and of its children that have ended, s."""
-    return sum(os.times()[:4])
 
 
 def _processor() -> str:

@@ -37,11 +37,11 @@ STUDY_METRICS = (
 """Quantities of a run beside those of its scorecard."""
 METRICS = {metric.name: metric for metric in (*RUN_METRICS, *GRID_METRICS, *STUDY_METRICS, *MEASURED)}
 """All quantities."""
-_MEASURED = tuple(metric.name for metric in MEASURED)
 COLUMNS = {
     "means": ("energy_all", "exm_arr", "exm_arcr_strict", "ate_final", "anytime_late", "map_error", "map_auc",
               "step_time", "step_time_p99", "compile_time", "memory"),
-    "pareto": (*_MEASURED, "exm_arr", "exm_arcr_strict", "energy_all", "ate_final", "map_error"),
+    "pareto": (*(metric.name for metric in MEASURED), "exm_arr", "exm_arcr_strict", "energy_all",
+               "ate_final", "map_error"),
     "medians": ("error_online", "error_final", "ate_final", "energy_all", "anytime_median", "anytime_late",
                 "closures", "false_closures", "lost_share", "map_error", "step_time", "compile_time"),
     "differences": ("ate_final", "ate_online", "anytime_median", "anytime_late", "closures", "false_closures",
@@ -68,11 +68,7 @@ def quantity(name: str, finding: Finding) -> dict[str, Quantity]:
 
 
 def find_error(name: str) -> str:
-    """The quantity that a short or full name of `--error` means.
-
-    Raises:
-        InputError: there is none, or neither low nor high values of it are better.
-    """
+    """The quantity that a short or full name of `--error` means; an `InputError` if it names no error."""
     found = ERRORS.get(name, name)
     if found not in METRICS or METRICS[found].direction is None or METRICS[found] in MEASURED:
         every = [*ERRORS, *(each.name for each in METRICS.values() if each.direction)]

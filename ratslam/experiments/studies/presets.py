@@ -57,12 +57,11 @@ def preset_study(
 ) -> tuple[Study, list[str]]:
     """The study of a preset on a configuration file, and remarks for its report.
 
+    An `InputError` says that the configuration is invalid or does not suit the preset.
+
     Args:
         name: one of `ratslam.cli.studies.PRESETS`. overrides: as for `read_study`.
         by: share that `vary` changes numbers by. seconds: length of the session of `tiers`.
-
-    Raises:
-        InputError: the configuration is invalid or does not suit the preset.
     """
     document = override(load(path), [text for text in overrides if not is_study_key(text)])
     config = validate(document, RunConfig)
@@ -129,11 +128,7 @@ def _tiers(config: RunConfig, seconds: float) -> tuple[dict[str, Any], list[str]
 
 
 def variations(document: Document, by: float) -> list[tuple[str, float | int]]:
-    """Every number of recall and its map moved down and up by a share; invalid values are left out.
-
-    Raises:
-        InputError: the share is not between 0 and 1.
-    """
+    """Every number of recall and its map moved down and up by a share in (0, 1), without invalid values."""
     if not 0 < by < 1:
         raise InputError("--by", str(by), "a share between 0 and 1")
     config, found = validate(document, RunConfig), []

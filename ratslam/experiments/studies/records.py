@@ -28,8 +28,7 @@ class RunRecord(Settings):
     steps: int = 0  # number of observations
     source: str = ""  # digest of the session
     quantities: dict[str, Quantity] = Field(default_factory=dict)  # scored quantities by name
-    measured: dict[str, float | None] = Field(default_factory=dict)
-    """Times and memory by name (`metrics.MEASURED`)."""
+    measured: dict[str, float | None] = Field(default_factory=dict)  # by names of `metrics.MEASURED`
     machine: Machine | None = None  # where it was computed
     error: str | None = None  # why there is no outcome
 
@@ -57,10 +56,7 @@ class RunLog:
     """The records in a directory. A kill loses at most the record that was being written.
 
     Args:
-        directory: is created if missing.
-
-    Raises:
-        InputError: the directory cannot be created.
+        directory: is created if missing; an `InputError` says that it cannot be.
     """
 
     def __init__(self, directory: Path) -> None:

@@ -33,20 +33,15 @@ PACES = {"live": "one step at a time", "replay": "a chunk of steps at a time"}
 
 @dataclass(frozen=True)
 class Report:
-    """The outcome of a study.
+    """The outcome of a study."""
 
-    Attributes:
-        name: of the study. kind: of the table. columns: quantities shown. rows: in order. error: quantity of
-            the Pareto front. measured: machine, versions, build, seeds and pace, by name. remarks: sentences.
-    """
-
-    name: str
-    kind: str
-    columns: Sequence[str]
+    name: str  # of the study
+    kind: str  # of the table
+    columns: Sequence[str]  # quantities shown
     rows: Sequence[Row]
-    error: str | None
-    measured: dict[str, str]
-    remarks: Sequence[str]
+    error: str | None  # quantity of the Pareto front
+    measured: dict[str, str]  # machine, versions, build, seeds and pace, by name
+    remarks: Sequence[str]  # sentences
 
 
 def make_report(
@@ -230,8 +225,7 @@ def _csv(report: Report) -> str:
         cells = {name: getattr(row, name) for name in ("row", "runs", "failed", "steps")}
         cells |= {key: plain(value) for key, value in row.varied.items()} | {"optimal": int(row.optimal)}
         for name, found in row.spreads.items():
-            parts = {f"{name}_{part}": value for part, value in asdict(found).items() if part != "values"}
-            cells |= parts
+            cells |= {f"{name}_{part}": value for part, value in asdict(found).items() if part != "values"}
         lines.append(cells)
     text = io.StringIO()
     writer = csv.DictWriter(text, list(dict.fromkeys(chain.from_iterable(lines))), lineterminator="\n")

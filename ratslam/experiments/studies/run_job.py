@@ -19,7 +19,6 @@ from evaluation.metrics.grid_score import score_grid
 from evaluation.metrics.metric import Finding, Quantity
 from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.scorecard import score_run
-from ratslam.config.run_config import RunConfig
 from ratslam.core.session import CHUNK, Session
 from ratslam.experiments.studies.machine import Stopwatch, machine, peak_memory, reset_peak_memory, watch_load
 from ratslam.experiments.studies.metrics import quantity
@@ -70,7 +69,11 @@ def _play(job: Job) -> dict[str, Any]:
             source = load_into_memory(source)
             extra = compare_with_tier(config, source, watch.elapsed(), job.reference_tier)
         if job.copy_number:
-            source = _perturbed(source, config, job.copy_number)
+            if config.recording is None:
+                source = load_into_memory(source)
+            if not isinstance(source, InMemorySource):
+                raise InputError("recording.file", "a recording that is streamed", "a CSV or .npz recording")
+            source = perturb(source, job.copy_number)
         with watch.taking(0):
             session = build_session(config, source, job.ablation)
         run, lost = _take_steps(session, source, job.pace, watch)
@@ -79,17 +82,8 @@ def _play(job: Job) -> dict[str, Any]:
         quantities |= quantity("recognition_error", recognition_error(quantities)) | extra
         quantities |= _closures(session, run.truth, config.pose_cells.cell_size)
         quantities |= quantity("lost_share", Finding(lost)) | _anchored(run) | _grid_map(session, source)
-    return {
-        "steps": len(run.time), "source": source.digest, "quantities": quantities, "measured": watch.times(),
-    }  # fmt: skip
-
-
-def _perturbed(source: Source, config: RunConfig, copy_number: int) -> InMemorySource:
-    if config.recording is None:
-        source = load_into_memory(source)
-    if not isinstance(source, InMemorySource):
-        raise InputError("recording.file", "a recording that is streamed", "a CSV or .npz recording")
-    return perturb(source, copy_number)
+    outcome = {"steps": len(run.time), "source": source.digest, "quantities": quantities}
+    return outcome | {"measured": watch.times()}
 
 
 def _take_steps(session: Session, source: Source, pace: str, watch: Stopwatch) -> tuple[RunArrays, float]:
@@ -150,13 +144,11 @@ def _anchored(run: RunArrays) -> dict[str, Quantity]:
         return {}
     # All backends take the first step from odometry, so its error is not theirs.
     start = compose(truth[0], inverse(run.odometry[0]))
-    online, final, odometry = (
-        float(np.hypot(*(compose(start, path) - truth)[:, :2].T).mean())
-        for path in (run.online, run.final, run.odometry)
-    )
-    return quantity("error_online", Finding(online, odometry)) | quantity(
-        "error_final", Finding(final, odometry)
-    )
+    paths = run.online, run.final, run.odometry
+    apart = [np.hypot(*(compose(start, path) - truth)[:, :2].T) for path in paths]
+    online, final, odometry = (float(each.mean()) for each in apart)
+    error = quantity("error_online", Finding(online, odometry))
+    return error | quantity("error_final", Finding(final, odometry))
 
 
 def _grid_map(session: Session, source: Source) -> dict[str, Quantity]:

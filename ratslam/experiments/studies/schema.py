@@ -38,12 +38,9 @@ Directed = Annotated[Known, AfterValidator(_directed)]
 class Parameter(Settings):
     """Range of a searched setting: numbers from `low` to `high` (integers if both are), or `choices`."""
 
-    low: int | float | None = None
-    """Smallest value."""
-    high: int | float | None = None
-    """Largest value."""
-    log: bool = False
-    """Whether to sample the logarithm uniformly."""
+    low: int | float | None = None  # smallest value
+    high: int | float | None = None  # largest value
+    log: bool = False  # whether to sample the logarithm uniformly
     choices: Annotated[tuple[bool | int | float | str, ...], Field(min_length=2)] | None = None
     """Unordered values."""
 
@@ -67,25 +64,19 @@ class Parameter(Settings):
 class SearchPlan(Settings):
     """What `--search` optimises."""
 
-    trials: Annotated[int, Field(ge=1, le=100_000)] = 50
-    """Number of parameter sets to try."""
+    trials: Annotated[int, Field(ge=1, le=100_000)] = 50  # number of parameter sets to try
     parameters: Annotated[dict[str, Parameter], Field(min_length=1)]
     """Searched settings by key path, each with its range."""
-    objectives: tuple[Directed, ...] = ()
-    """Quantities to improve in their known direction."""
-    minimise: tuple[Known, ...] = ()
-    """Quantities to minimise."""
-    maximise: tuple[Known, ...] = ()
-    """Quantities to maximise."""
+    objectives: tuple[Directed, ...] = ()  # quantities to improve in their known direction
+    minimise: tuple[Known, ...] = ()  # quantities to minimise
+    maximise: tuple[Known, ...] = ()  # quantities to maximise
     sampler: Literal["tpe", "nsga2"] = "tpe"
     """Tree-structured Parzen estimators (Bergstra et al. 2011), or a genetic algorithm (Deb et al. 2002)."""
-    population: Annotated[int, Field(ge=2, le=10_000)] = 16
-    """Population of the genetic algorithm."""
+    population: Annotated[int, Field(ge=2, le=10_000)] = 16  # population of the genetic algorithm
     batch: Annotated[int, Field(ge=1, le=1000)] = 4
     """Parameter sets chosen at a time, before any of them has run. The choices depend on it, and not on the
     number of workers."""
-    seed: NonNegativeInt = 0
-    """Seed of the sampler."""
+    seed: NonNegativeInt = 0  # seed of the sampler
 
     @model_validator(mode="after")
     def _some(self) -> SearchPlan:
@@ -107,10 +98,8 @@ class RowPlan(Settings):
 
     model_config = ConfigDict(extra="allow")
 
-    copies: Copies | None = None
-    """Number of perturbed copies in place of the study's."""
-    ablation: Ablation = FULL
-    """Parts of the keyframe map that are on."""
+    copies: Copies | None = None  # number of perturbed copies in place of the study's
+    ablation: Ablation = FULL  # parts of the keyframe map that are on
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -121,8 +110,7 @@ class RowPlan(Settings):
 class StudyPlan(Settings):
     """A study: `python -m ratslam study FILE`."""
 
-    base: Path
-    """Configuration that all runs start from; a relative path starts at the study file."""
+    base: Path  # configuration that all runs start from; a relative path starts at the study file
     set: dict[str, Any] = Field(default_factory=dict)
     """Settings of all runs, by key path. Relative paths in them start at the base, as its own do."""
     rows: dict[str, RowPlan | None] = Field(default_factory=dict)

@@ -21,11 +21,7 @@ from tactile.base.random_streams import stream
 
 
 def search_plan(study: Study) -> SearchPlan:
-    """The study's `tune` section.
-
-    Raises:
-        InputError: it has none.
-    """
+    """The study's `tune` section; raises an `InputError` if it has none."""
     if study.plan.tune is None:
         where = study.document.at_key(("tune",))
         raise InputError(where, "missing", "the parameters and objectives of the search")

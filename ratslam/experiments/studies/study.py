@@ -35,24 +35,17 @@ SEEDS = {
 
 
 class Job(NamedTuple):
-    """One run of a study.
+    """One run of a study."""
 
-    Attributes:
-        row: name of its row; '' if the study has no rows. varied: combination of `vary`, by key path.
-        config: with absolute paths. hash: of the configuration without its seed, and of the files it names.
-        copy_number: seed of the perturbed copy; 0: none. pace, reference_tier: see `StudyPlan`. ablation:
-            parts of the keyframe map that are on.
-    """
-
-    row: str
-    varied: dict[str, Any]
-    config: RunConfig
-    hash: str = ""
+    row: str  # name of its row; '' if the study has no rows
+    varied: dict[str, Any]  # combination of `vary`, by key path
+    config: RunConfig  # with absolute paths
+    hash: str = ""  # of the configuration without its seed, and of the files it names
     seed: int = 0
-    copy_number: int = 0
-    pace: str = "replay"
-    reference_tier: str | None = None
-    ablation: Ablation = FULL
+    copy_number: int = 0  # seed of the perturbed copy; 0: none
+    pace: str = "replay"  # see `StudyPlan`
+    reference_tier: str | None = None  # see `StudyPlan`
+    ablation: Ablation = FULL  # parts of the keyframe map that are on
 
     @property
     def key(self) -> str:
@@ -69,22 +62,15 @@ class Setting(NamedTuple):
 
 
 class Study(NamedTuple):
-    """A checked study.
+    """A checked study."""
 
-    Attributes:
-        name: file name without its ending. plan: content of the file with overrides. document: the same, with
-            places. base: the base with `set` applied, with places. folder: folder of the base, where its
-            relative paths start. overridden: keys of `--set` that are settings of all runs. jobs: by row,
-            combination, seed and perturbed copy.
-    """
-
-    name: str
-    plan: StudyPlan
-    document: Document
-    base: Document
-    folder: Path
-    overridden: Sequence[str]
-    jobs: tuple[Job, ...]
+    name: str  # file name without its ending
+    plan: StudyPlan  # content of the file with overrides
+    document: Document  # the same, with places
+    base: Document  # the base with `set` applied, with places
+    folder: Path  # of the base, where its relative paths start
+    overridden: Sequence[str]  # keys of `--set` that are settings of all runs
+    jobs: tuple[Job, ...]  # by row, combination, seed and perturbed copy
 
 
 def run_key(hash: str, seed: int, copy_number: int) -> str:
@@ -98,14 +84,11 @@ def read_study(path: str | Path, overrides: Sequence[str] = ()) -> Study:
 
 
 def check_study(name: str, document: Document, folder: Path, overrides: Sequence[str] = ()) -> Study:
-    """A study all of whose configurations are valid.
+    """A study all of whose configurations are valid, else an `InputError`.
 
     Args:
         folder: start of a relative path of `base`. overrides: each `a.b=value`: a key of the study where `a`
             is one, else a setting of all runs.
-
-    Raises:
-        InputError: the file, the base or one of the configurations is invalid.
     """
     document = override(document, [text for text in overrides if is_study_key(text)])
     plan = validate(document, StudyPlan)
@@ -123,11 +106,7 @@ def check_study(name: str, document: Document, folder: Path, overrides: Sequence
 
 
 def searched_jobs(study: Study, parameters: dict[str, Any]) -> list[Job]:
-    """The runs of the study's base with chosen parameters, by key path.
-
-    Raises:
-        InputError: they contradict each other.
-    """
+    """The runs of the study's base with parameters by key path; an `InputError` if they are contradictory."""
     settings = [Setting(key, value, ("tune", "parameters", key)) for key, value in parameters.items()]
     return list(_runs_of(study, settings, "tune", RowPlan(), parameters))
 

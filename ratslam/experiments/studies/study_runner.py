@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from ratslam.experiments.studies.executor import Executor
 from ratslam.experiments.studies.machine import one_core
@@ -38,9 +38,8 @@ def run_jobs(
     for job in jobs:
         wanted.setdefault(job.key, job)
     missing = [job for key, job in wanted.items() if key not in found]
-    for key, job in wanted.items():
-        if key in found:
-            done(_labelled(found[key], job))
+    for key in filter(found.get, wanted):
+        done(_labelled(found[key], wanted[key]))
     with closing(executor.completed(function or run_job, missing, killed)) as completed:
         for job in jobs:
             while job.key not in found:
@@ -61,14 +60,9 @@ def measure_jobs(jobs: Sequence[Job], log: RunLog, done: Done | None = None) -> 
     first run of a configuration compiles its kernels.
     """
     order = sorted(range(len(jobs)), key=lambda k: (jobs[k].seed, jobs[k].copy_number))
-    with (
-        tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as kernels,
-        one_core(),
-        Executor(fresh=True) as executor,
-    ):
+    with TemporaryDirectory(ignore_cleanup_errors=True) as kernels, one_core(), Executor(fresh=True) as fresh:
         alone = partial(run_job_alone, Path(kernels))
-        found = run_jobs([jobs[k] for k in order], log, executor, done, alone)
-        records = dict(zip(order, found, strict=True))
+        records = dict(zip(order, run_jobs([jobs[k] for k in order], log, fresh, done, alone), strict=True))
     return [records[k] for k in range(len(jobs))]
 
 

@@ -19,39 +19,28 @@ DEAD_RECKONING = "dead reckoning"  # name of the row of raw odometry
 
 @dataclass(frozen=True)
 class Spread:
-    """Statistics of a quantity over the runs of a row.
+    """Statistics of a quantity over the runs of a row."""
 
-    Attributes:
-        values: by run, None where it has none. sd: standard deviation; None of a single value. worst: None
-            where neither high nor low values are better.
-    """
-
-    values: tuple[float | None, ...]
+    values: tuple[float | None, ...]  # by run, None where it has none
     mean: float
-    sd: float | None
+    sd: float | None  # standard deviation; None of a single value
     median: float
     low: float
     high: float
-    worst: float | None
+    worst: float | None  # None where neither high nor low values are better
 
 
 @dataclass(frozen=True)
 class Row:
-    """One configuration of a study.
+    """One configuration of a study."""
 
-    Attributes:
-        row, varied: name and combination. runs: number of runs with an outcome. failed: number of the others.
-        steps: median number of observations. spreads: by quantity, without those that no run has. optimal: no
-            other row is at least as fast and as good and better in one of both.
-    """
-
-    row: str
-    varied: dict[str, Any]
-    runs: int
-    failed: int
-    steps: float
-    spreads: dict[str, Spread]
-    optimal: bool = False
+    row: str  # name
+    varied: dict[str, Any]  # combination of the varied settings, by key path
+    runs: int  # number of runs with an outcome
+    failed: int  # number of the others
+    steps: float  # median number of observations
+    spreads: dict[str, Spread]  # by quantity, without those that no run has
+    optimal: bool = False  # no other row is at least as fast and as good and better in one of both
 
     @property
     def label(self) -> str:
@@ -79,17 +68,15 @@ def summarise(records: Sequence[RunRecord], odometry: bool = False) -> list[Row]
         groups.setdefault(json.dumps([record.row, record.varied]), []).append(record)
     rows = [_row(group) for group in groups.values()]
     if odometry and groups:
-        rows.append(_row(next(iter(groups.values())), DEAD_RECKONING, odometry=True))
+        rows.append(_row(next(iter(groups.values())), odometry=True))
     return rows
 
 
 def default_error(rows: Sequence[Row]) -> str | None:
     """The first default error that most rows have in all of their runs; None if no row has any."""
-    counts = [
-        sum(name in row.spreads and None not in row.spreads[name].values for row in rows)
-        for name in DEFAULT_ERRORS
-    ]
-    return DEFAULT_ERRORS[counts.index(max(counts))] if any(counts) else None
+    whole = [name for row in rows for name, found in row.spreads.items() if None not in found.values]
+    best = max(DEFAULT_ERRORS, key=whole.count)
+    return best if best in whole else None
 
 
 def mark_optimal(rows: Sequence[Row], objectives: Mapping[str, Direction], statistic: str) -> list[Row]:
@@ -110,8 +97,8 @@ def spread(values: Sequence[float | None], name: str) -> Spread | None:
     low, high = min(known), max(known)
     worst = {"low": high, "high": low, None: None}[METRICS[name].direction if name in METRICS else None]
     deviation = statistics.stdev(known) if len(known) > 1 else None
-    middle = statistics.median(known)
-    return Spread(tuple(values), statistics.fmean(known), deviation, middle, low, high, worst)
+    mean, median = statistics.fmean(known), statistics.median(known)
+    return Spread(tuple(values), mean, deviation, median, low, high, worst)
 
 
 def pareto_optimal(costs: np.ndarray) -> np.ndarray:
@@ -125,16 +112,16 @@ def pareto_optimal(costs: np.ndarray) -> np.ndarray:
     return known & ~(no_dearer & cheaper).any(axis=0)
 
 
-def _row(group: Sequence[RunRecord], name: str = "", odometry: bool = False) -> Row:
+def _row(group: Sequence[RunRecord], odometry: bool = False) -> Row:
     fine = [record for record in group if record.error is None]
     names = dict.fromkeys([metric.name for metric in MEASURED])
     names |= dict.fromkeys(each for record in fine for each in record.quantities)
-    values = {
-        each: [record.odometry(each) if odometry else record.value(each) for record in fine] for each in names
+    spreads = {
+        each: spread([run.odometry(each) if odometry else run.value(each) for run in fine], each)
+        for each in names
     }
-    spreads = {each: spread(values[each], each) for each in names}
     return Row(
-        row=name or group[0].row,
+        row=DEAD_RECKONING if odometry else group[0].row,
         varied={} if odometry else group[0].varied,
         runs=len(fine),
         failed=0 if odometry else len(group) - len(fine),
