@@ -15,7 +15,7 @@ import threading
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent import futures
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from multiprocessing import resource_tracker
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
@@ -200,7 +200,8 @@ def _kill_workers(cluster: Any) -> None:
     for nanny in cluster.workers.values():
         nanny.close_gracefully()  # it starts no other process
         if nanny.pid is not None:
-            os.kill(nanny.pid, signal.SIGKILL)
+            with suppress(ProcessLookupError):  # it has just ended
+                os.kill(nanny.pid, signal.SIGTERM)
 
 
 def _check_cluster(error: Exception) -> None:
@@ -245,6 +246,9 @@ def _end_with_parent() -> None:
 @contextmanager
 def _holding_interrupts() -> Iterator[None]:
     """Ctrl-C waits for the end of the block; processes started in it, and their successors, ignore it."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
     resource_tracker.ensure_running()  # its start would end the block of the signal
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
