@@ -26,11 +26,7 @@ ENERGY = 0.05
 
 
 def cheaper_steps(config: RunConfig) -> dict[str, dict[str, Any]]:
-    """The next cheaper step in every direction from a configuration with the recommended settings.
-
-    Returns:
-        settings in place of the recommended ones, by the name of the step.
-    """
+    """The next cheaper step in every direction: settings in place of the recommended ones, by name."""
     steps = _cheaper_grid(config) if config.backend == "grid" else _cheaper_cells(config)
     if config.session.precision == "float64":
         steps["float32"] = {"session.precision": "float32"}

@@ -215,11 +215,7 @@ def _check_cluster(error: Exception) -> None:
 
 
 def _call_afresh(function: Callable[[Task], Result], task: Task) -> Result:
-    """The result of a task in a new process.
-
-    Raises:
-        BrokenProcessPool: it was killed.
-    """
+    """The result of a task in a new process; raises a `BrokenProcessPool` if that was killed."""
     others = multiprocessing.active_children()
     context = multiprocessing.get_context("spawn")  # forked children of a process with JAX hang
     with futures.ProcessPoolExecutor(1, context, _end_with_parent) as pool:

@@ -33,11 +33,8 @@ def search(
 ) -> list[RunRecord]:
     """Tries the study's number of parameter sets; returns their records, with the trial's number as row.
 
-    Args:
-        log, done: see `run_jobs`.
-
-    Raises:
-        InputError: the study has no `tune` section, or Optuna is missing.
+    `log` and `done` are those of `run_jobs`. An `InputError` says that the study has no `tune` section, or
+    that Optuna is missing.
     """
     plan, found = search_plan(study), list[RunRecord]()
     try:

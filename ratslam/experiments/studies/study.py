@@ -20,7 +20,7 @@ from pydantic import BaseModel
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import Document, load, open_path, override, validate
 from ratslam.config.strict_yaml.document import KeyPath, Place
-from ratslam.experiments.studies.schema import RowPlan, SearchPlan, StudyPlan
+from ratslam.experiments.studies.schema import RowPlan, StudyPlan
 from ratslam.keyframes.config import FULL, Ablation
 from tactile.base.errors import InputError, InputErrors
 
@@ -100,8 +100,11 @@ def check_study(name: str, document: Document, folder: Path, overrides: Sequence
     for key in _outermost_first(plan.set):
         base = _put(base, Setting(key, plan.set[key], ("set", key)), document)
     study = Study(name, plan, document, override(base, of_runs), file.parent, keys, ())
-    if plan.tune is not None:
-        _check_search(study, plan.tune)
+    parameters = plan.tune.parameters if plan.tune else {}
+    first = {key: parameter.extremes[0] for key, parameter in parameters.items()}
+    for key, parameter in parameters.items():
+        for value in parameter.extremes:
+            searched_jobs(study, first | {key: value})
     return study._replace(jobs=tuple(_jobs(study)))
 
 
@@ -154,14 +157,6 @@ def _runs_of(
         seeded = with_settings(config, {seed_key(config): seed})
         how = plan.pace, plan.reference_tier, row.ablation
         yield Job(name, varied, seeded, digest, seed, copy_number, *how)
-
-
-def _check_search(study: Study, plan: SearchPlan) -> None:
-    """Validates each parameter at its extremes, with the others at their first."""
-    first = {key: parameter.extremes[0] for key, parameter in plan.parameters.items()}
-    for key, parameter in plan.parameters.items():
-        for value in parameter.extremes:
-            searched_jobs(study, first | {key: value})
 
 
 def _put(document: Document, setting: Setting, study: Document) -> Document:

@@ -22,11 +22,10 @@ FEWEST_LAPS = 2  # laps of a shortened session: fewer give nothing to recognise
 def compare_with_tier(config: RunConfig, log: InMemorySource, cost: float, tier: str) -> dict[str, Quantity]:
     """Cost of a simulated session, and the difference of its images from those of another tier.
 
+    An `InputError` says that the session is not simulated, or has no images.
+
     Args:
         config: completed by the source. cost: time that simulation and images took, s.
-
-    Raises:
-        InputError: the session is not simulated, or has no images.
     """
     if config.simulation is None or log.views is None:
         expected = "a session of whisker images to simulate"
