@@ -4,92 +4,21 @@ from __future__ import annotations
 
 import json
 import math
-import re
-from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import pytest
-import yaml
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from pydantic import Field, model_validator
 
 from ratslam.config.strict_yaml import dump, load, override, parse, schema, validate
-from tactile.base.config import Settings
 from tactile.base.errors import InputError
-
-
-class PoseCells(Settings):
-    """A section."""
-
-    excite_sigma: float = Field(1.0, gt=0)
-    """Width of the excitation, cells."""
-    shape: tuple[int, int, int] = (21, 21, 36)
-    """Cells along x, y and heading."""
-
-    @model_validator(mode="after")
-    def _odd(self) -> PoseCells:
-        if self.shape[0] % 2 == 0 and self.shape[1] % 2 == 0:
-            raise ValueError("one of x and y must be odd")
-        return self
-
-
-class Recording(Settings):
-    """One alternative of a union."""
-
-    kind: Literal["recording", "bag"] = "recording"
-    path: Path
-    """The file of the recording."""
-
-
-class Simulation(Settings):
-    """The other alternative."""
-
-    kind: Literal["simulation"] = "simulation"
-    simulation: int = 0
-    """A field named as the union's tag."""
-
-
-Source = Annotated[Recording | Simulation, Field(discriminator="kind")]
-
-
-class Config(Settings):
-    """A whole configuration."""
-
-    pose_cells: PoseCells = PoseCells()
-    metric: Literal["l1", "cosine"] = "l1"
-    motion: Literal["forward", "turn"] = "forward"
-    source: Source = Simulation()
-    others: tuple[Source, ...] = ()
-    optional: PoseCells | None = None
-    width: float | tuple[float, float] = 1.0
-    gains: dict[str, float] = Field(default_factory=dict)
-    learn: bool = True
-    steps: int = Field(10, ge=0)
-    name: str = Field("run", max_length=1000)
-    weights: tuple[float, ...] = Field((), max_length=50)
-
-
-VALID = """\
-# every part once
-pose_cells:
-  excite_sigma: 1e-3
-  shape: [21, 21, 36]
-metric: cosine
-source:
-  kind: recording
-  path: "data/a.mcap"
-others:
-- kind: simulation
-  simulation: 3
-- {kind: bag, path: b.bag}
-optional:
-width: [1.5, .5]
-gains: {left: 1, right: -2.5e+2}
-learn: false
-name: off
-"""
+from tests.ratslam.config.example_schema import (
+    VALID,
+    Config,
+    PoseCells,
+    Recording,
+    Simulation,
+    overridden,
+)
 
 
 def _message(text: str) -> str:
@@ -366,10 +295,6 @@ def test_files(tmp_path: Path) -> None:
             load(path)
 
 
-def overridden(*assignments: str, text: str = VALID) -> Config:
-    return validate(override(parse(text, "config.yaml"), assignments), Config)
-
-
 def test_override() -> None:
     document = parse(VALID, "config.yaml")
     config = validate(
@@ -451,130 +376,3 @@ def test_the_schema_lists_the_keys_for_editors() -> None:
     assert section["properties"]["excite_sigma"]["description"] == "Width of the excitation, cells."
     assert section["properties"]["excite_sigma"]["exclusiveMinimum"] == 0
     assert section["additionalProperties"] is False
-
-
-TEXTS = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=40)
-FLOATS = st.floats(allow_nan=False, allow_infinity=False)
-CONFIGS = st.builds(
-    Config,
-    name=TEXTS
-    | st.sampled_from(["yes", "1e-3", "010", "${HOME}", "$${", "~", "12:30", "=", "<<", "0x1", " ", "- "]),
-    gains=st.dictionaries(TEXTS, FLOATS),
-    width=FLOATS | st.tuples(FLOATS, FLOATS),
-    weights=st.lists(FLOATS, max_size=5).map(tuple),
-    steps=st.integers(0, (1 << 63) - 1),
-    metric=st.sampled_from(["l1", "cosine"]),
-    others=st.lists(st.builds(Simulation, simulation=st.integers(-9, 9)), max_size=3).map(tuple),
-)
-
-
-def _round_trip(config: Config) -> None:
-    text = dump(config)
-    assert validate(parse(text, "config.yaml"), Config) == config
-    assert validate(parse(text, "config.yaml"), Config).model_dump_json() == config.model_dump_json()  # -0.0
-    if "${" not in text:  # any other reader sees the same
-        assert yaml.safe_load(text) == config.model_dump(mode="json")
-
-
-def _refusal(action: Callable[[], object]) -> str:
-    """The message of the one error an action may end with; '' if it succeeds."""
-    try:
-        action()
-    except InputError as error:
-        return str(error)
-    return ""
-
-
-def _reads_or_refuses(text: str) -> None:
-    """Checks that a text gives a config, or an error with a place."""
-    message = _refusal(lambda: validate(parse(text, "c.yaml"), Config))
-    assert not message or re.match(r"c\.yaml(:\d+:\d+)?: ", message)
-    message.encode()  # it can be printed
-
-
-def _assigns_or_refuses(assignment: str) -> None:
-    message = _refusal(lambda: overridden(assignment))
-    assert not message or "--set" in message
-    message.encode()
-
-
-MUTATIONS = st.lists(
-    st.tuples(
-        st.integers(0, len(VALID)),
-        st.integers(0, 6),
-        st.sampled_from(
-            [
-                *"[]{}:,-\n\t #&*!|>'\"%@`?~$\\\0\ufeff\x85\u2028",
-                "\n  ",
-                ": ",
-                "- ",
-                "1e-3",
-                "? ",
-                "${",
-                "\\U",
-            ]
-        )
-        | st.text(max_size=4),
-    ),
-    min_size=1,
-    max_size=4,
-)
-ASSIGNMENTS = st.tuples(
-    st.lists(
-        st.sampled_from(["pose_cells", "shape", "others", "0", "7", "gains", "kind", ""]) | TEXTS, max_size=3
-    ),
-    st.text(max_size=20),
-)
-
-
-def _mutated(mutations: list[tuple[int, int, str]]) -> str:
-    text = VALID
-    for position, length, new in mutations:
-        text = text[:position] + new + text[position + length :]
-    return text
-
-
-@given(CONFIGS)
-def test_dump_round_trips(config: Config) -> None:
-    _round_trip(config)
-
-
-@given(st.text(max_size=60) | st.text("[]{}:,-\n\t #&*!|>'\"%ab1", max_size=40) | MUTATIONS.map(_mutated))
-def test_any_text_reads_or_is_refused(text: str) -> None:
-    _reads_or_refuses(text)
-
-
-@given(ASSIGNMENTS)
-def test_any_assignment_is_taken_or_refused(parts: tuple[list[str], str]) -> None:
-    _assigns_or_refuses(f"{'.'.join(parts[0])}={parts[1]}")
-
-
-@pytest.mark.soak
-@settings(max_examples=20_000)
-@given(CONFIGS)
-def test_dump_round_trips_often(config: Config) -> None:
-    _round_trip(config)
-
-
-@pytest.mark.soak
-@settings(max_examples=50_000)
-@given(st.text(max_size=200) | st.text("[]{}:,-\n\t #&*!|>'\"%ab1", max_size=80) | MUTATIONS.map(_mutated))
-def test_many_texts_read_or_are_refused(text: str) -> None:
-    _reads_or_refuses(text)
-
-
-@pytest.mark.soak
-@settings(max_examples=20_000)
-@given(ASSIGNMENTS)
-def test_many_assignments_are_taken_or_refused(parts: tuple[list[str], str]) -> None:
-    _assigns_or_refuses(f"{'.'.join(parts[0])}={parts[1]}")
-
-
-@pytest.mark.soak
-@settings(max_examples=20_000)
-@given(st.binary(max_size=200))
-def test_many_files_read_or_are_refused(tmp_path_factory: pytest.TempPathFactory, content: bytes) -> None:
-    file = tmp_path_factory.getbasetemp() / "c.yaml"
-    file.write_bytes(content)
-    message = _refusal(lambda: load(file))
-    assert not message or message.startswith(str(file))

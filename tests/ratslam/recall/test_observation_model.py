@@ -1,9 +1,8 @@
-"""Laws of recall by whisker images, compared with explicit loops."""
+"""Laws of recall by whisker images."""
 
 from __future__ import annotations
 
 import math
-from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -12,8 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ratslam.recall.config import RecallConfig, sector_shifts
-from ratslam.recall.filter import recognise
+from ratslam.recall.config import RecallConfig
 from ratslam.recall.memory import (
     MapFeedback,
     accumulate_motion,
@@ -21,203 +19,33 @@ from ratslam.recall.memory import (
     init_memory,
     store_keyframe,
 )
-from ratslam.recall.observation_model import STEPS, touch_likelihood
-from ratslam.recall.transition import FOLLOWERS, SUPPORT, follow_keyframes
+from ratslam.recall.transition import follow_keyframes
 from ratslam.recall.whisker_likelihood import (
     DEAD,
     HEIGHTS,
     LEVELS,
-    PRIOR,
-    estimate_background,
-    log_odds_table,
-    pixel_layout,
     pixel_levels,
 )
-from tactile.base.se2 import between, compose
+from tests.ratslam.recall.whisker_cases import (
+    AHEAD,
+    BOTH,
+    CAPACITY,
+    CELL,
+    GUARD,
+    NEW_IMAGE_LOG_ODDS,
+    PIXELS,
+    SEEDS,
+    SIZE,
+    filled,
+    images_of,
+    learn,
+    observe,
+    random_case,
+    spaced,
+    weigh,
+)
 
-CELL = 0.05
-SHAPE = (3, 6, 1)
-PIXELS = pixel_layout(SHAPE)
-SIZE = len(PIXELS.group)
-GUARD = 5
-CAPACITY = 64
-NEW_IMAGE_LOG_ODDS = 3.0
-BOTH = RecallConfig(sector_fov="whiskers", guard=GUARD)
-AHEAD = BOTH.model_copy(update={"shifts": 0})
-SEEDS = range(8)
 seeds = st.integers(0, 10_000)
-
-
-def images_of(stream, count, touching=0.4, dead=0.0):
-    """[count, D] levels."""
-    level = stream.integers(1, DEAD, (count, SIZE)) * (stream.random((count, SIZE)) < touching)
-    return np.where(stream.random((count, SIZE)) < dead, DEAD, level)
-
-
-def learn(images):
-    """The log-odds table learned from these images."""
-    return log_odds_table(estimate_background(images, PIXELS.group), PRIOR)
-
-
-def filled(config, images, poses, likeness, *, scale=NEW_IMAGE_LOG_ODDS, dtype=float):
-    """A memory of frames [N, D] at poses [N, 3]; the robot is at the newest, all mass is novelty."""
-    count = len(poses)
-    memory = init_memory(config, SIZE, CAPACITY, np.dtype(dtype), len(likeness))
-    store = np.zeros((SIZE, CAPACITY), np.int32)
-    store[:, :count] = images.T
-    memory = memory._replace(view=jnp.asarray(store), count=jnp.int32(count))
-    return apply_map_feedback(memory, MapFeedback(poses, 0.0, 0.0, np.pi, scale, likeness))
-
-
-def spaced(count, cells=4.0):
-    """Poses in a row so far apart that no frame is near another."""
-    return np.stack([np.arange(count) * cells * CELL, np.zeros(count), np.zeros(count)], axis=1)
-
-
-def random_case(seed, config=BOTH):
-    """A memory in the middle of a path that doubles back, with all arrays filled, and a half-known image."""
-    stream = np.random.default_rng(seed)
-    count = int(stream.integers(GUARD + 2, CAPACITY + 1))
-    poses = np.cumsum(stream.normal(0, 0.5 * CELL, (count, 3)), axis=0)
-    poses[:, 2] = stream.normal(0, 0.3, count) + np.pi * stream.integers(0, 2, count)
-    images = images_of(stream, count, dead=0.05)
-    memory = filled(config, images, poses, learn(images))
-    old = max(count - GUARD, 0)
-    rows = len(sector_shifts(config))
-    before, rest = np.zeros((2, rows, CAPACITY))
-    before[:, :old] = stream.exponential(1, (rows, old))
-    before[:, CAPACITY // 3] = 0.0
-    rest[:, :old] = stream.dirichlet(np.full(rows * old + 1, 0.3))[:-1].reshape(rows, old) * 0.6
-    mass = stream.dirichlet(np.full(config.modes + 1, 0.7))[:-1] * (1 - rest.sum())
-    offset = stream.normal(0, 0.5 * CELL, (config.modes, 3)) * [1, 1, 4]
-    memory = memory._replace(
-        before=jnp.asarray(before), rest=jnp.asarray(rest), mass=jnp.asarray(mass),
-        anchor=jnp.asarray(stream.integers(0, max(old, 1), config.modes), jnp.int32),
-        offset=jnp.asarray(offset),
-    )  # fmt: skip
-    memory = accumulate_motion(memory, jnp.asarray(stream.normal(0, [CELL, 0.2 * CELL, 0.1])))
-    near = images[stream.integers(0, max(old, 1))]
-    return memory, np.where(stream.random(SIZE) < 0.7, near, images_of(stream, 1)[0])
-
-
-@cache
-def compile_likelihood(config):
-    return jax.jit(lambda memory, level: touch_likelihood(config, memory, level, PIXELS))
-
-
-@cache
-def filter_of(config):
-    def observe(memory, level):
-        memory, weighing = touch_likelihood(config, memory, level, PIXELS)
-        return recognise(config, CELL, memory, weighing)
-
-    return jax.jit(observe)
-
-
-def host(tree):
-    return jax.tree.map(np.asarray, tree)
-
-
-def weigh(config, memory, level):
-    return host(compile_likelihood(config)(memory, jnp.asarray(level, jnp.int32)))
-
-
-def observe(config, memory, level):
-    return host(filter_of(config)(memory, jnp.asarray(level, jnp.int32)))
-
-
-# The loops
-
-
-def likelihood_by_loops(config, memory, level):
-    """Likelihoods [S, C] and the likelihood of novelty, pixel by pixel."""
-    m = host(memory)
-    old = range(int(m.count) - config.guard)
-    turned = len(m.before) > 1
-    likelihood = np.zeros(m.before.shape)
-    for c in old:
-        for s in range(1 + turned):
-            odds = 0.0
-            for d in range(SIZE):
-                then = m.view[PIXELS.opposite[d] if s else d, c]
-                odds += m.likeness[PIXELS.group[d], level[d], then]
-            likelihood[s, c] = math.exp(config.temper * odds)
-    weight, familiar = 0.0, 0.0
-    for s in range(1 + turned):
-        for c in range(CAPACITY):
-            for step, share in enumerate(STEPS):
-                to = c - step if s else c + step
-                if to in old:
-                    weight += m.before[s, c] * share
-                    familiar += m.before[s, c] * share * likelihood[s, to]
-    unlike = math.exp(config.temper * m.scale)
-    if not weight:
-        return likelihood, unlike
-    return likelihood, config.familiar * familiar / weight + (1 - config.familiar) * unlike
-
-
-def transition_by_loops(config, m):
-    """The prior mass from outside the modes, frame by frame, and the mass that becomes novelty."""
-    heading = np.arctan2(m.sine, m.cosine)
-    belief, novel = np.zeros(m.rest.shape), 0.0
-    old = range(int(m.count) - config.guard)
-    for s in range(len(m.rest)):
-        for c in range(CAPACITY):
-            robot = compose(np.array([m.x[c], m.y[c], heading[c] - s * np.pi]), m.motion)
-            falls = {}
-            for step in range(FOLLOWERS):
-                to = c - step if s else c + step
-                if to not in old:
-                    continue
-                apart = between(np.array([m.x[to], m.y[to], heading[to] - s * np.pi]), robot)
-                deviation = (apart[0] ** 2 + apart[1] ** 2) / (config.reach * CELL) ** 2
-                deviation += 2 * (1 - math.cos(apart[2])) / config.reach_heading**2
-                falls[to] = max(1 - deviation / SUPPORT, 0) ** 4
-            total = sum(falls.values()) + config.miss_weight
-            stay = m.rest[s, c] * (1 - config.mode_decay)
-            for to, fall in falls.items():
-                belief[s, to] += stay * fall / total
-            novel += m.rest[s, c] * config.mode_decay + stay * config.miss_weight / total
-    return belief, novel
-
-
-@pytest.mark.parametrize("config", [BOTH, AHEAD], ids=["both ways", "ahead only"])
-@pytest.mark.parametrize("seed", SEEDS)
-def test_likelihoods_equal_explicit_loops(config, seed):
-    memory, level = random_case(seed, config)
-    likelihood, novelty = likelihood_by_loops(config, memory, level)
-    after, found = weigh(config, memory, level)
-    assert np.allclose(found.likelihood, likelihood, rtol=1e-9)
-    assert float(found.novelty) == pytest.approx(novelty, rel=1e-9)
-    assert np.array_equal(after.before, found.likelihood)
-    assert found.certain == found.informative == (int(memory.count) > GUARD)
-    assert np.isnan(found.background).all()
-    same = {name for name in after._fields if name != "before"}
-    assert all(np.array_equal(getattr(after, name), getattr(memory, name)) for name in same)
-
-
-@pytest.mark.parametrize("config", [BOTH, AHEAD], ids=["both ways", "ahead only"])
-@pytest.mark.parametrize("seed", SEEDS)
-def test_mass_outside_the_modes_follows_the_frames(config, seed):
-    memory, _ = random_case(seed, config)
-    m = host(memory)
-    shifts = sector_shifts(config)
-    cells = np.ones((len(shifts), 1)) * (np.arange(CAPACITY) < int(m.count) - GUARD)
-    angles = jnp.asarray(-shifts * np.pi)
-    belief, novel = follow_keyframes(config, CELL, memory, angles, jnp.asarray(cells), memory.motion)
-    expected, lost = transition_by_loops(config, m)
-    assert np.allclose(belief, expected, atol=1e-12)
-    assert float(novel) == pytest.approx(lost, abs=1e-12)
-    assert float(belief.sum() + novel) == pytest.approx(float(m.rest.sum()), abs=1e-12)
-
-
-def test_the_seeds_cover_turned_matches_and_mass_outside_the_modes():
-    shares = []
-    for seed in SEEDS:
-        memory, _ = random_case(seed)
-        belief, novel = transition_by_loops(BOTH, host(memory))
-        shares.append([*belief.sum(axis=1), novel])
-    assert (np.array(shares).max(axis=0) > 0.05).all()
 
 
 # The posterior is a distribution

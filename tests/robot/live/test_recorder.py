@@ -1,16 +1,11 @@
-"""A live session is read back exactly, also after its process was killed."""
+"""A live session is read back exactly; invalid messages and cuts are refused."""
 
 from __future__ import annotations
 
-import re
-import resource
-import signal
 import struct
-import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -30,7 +25,6 @@ from robot.drivers.head.cycle_assembly import (
     select_frames,
 )
 from robot.drivers.head.decoder import Frames
-from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10.shared_state import ARM_STATE
 from robot.live.recorder import LiveRecorder
 from robot.recordings.cdr_live import (
@@ -44,93 +38,26 @@ from robot.recordings.cdr_live import (
     encode_frames,
     encode_states,
 )
-from robot.recordings.mcap_reader import Recording, recover
-from robot.recordings.mcap_scanner import McapScanner, RecordingEntry
-from robot.recordings.mcap_writer import WholeChunkFile
+from robot.recordings.mcap_reader import Recording
+from robot.recordings.mcap_scanner import McapScanner
 from robot.recordings.schemas import TRUTH
-from robot.sources.source_info import SourceInfo
 from tactile.base.errors import InputError
-from tactile.base.types import Cycle, Odometry
-from tactile.whiskers.head_geometry import HeadConfig
-
-ROOT = Path(__file__).parents[3]
-W, RATE = 4, 200
-START = 5e4
-"""Start of a session, host time, s."""
-INFO = SourceInfo(raw_whiskers=True, head=HeadConfig(rest_deg=74.0))
-
-
-def some_frames(count: int, seed: int = 0, first: int = 0) -> Frames:
-    random = np.random.default_rng(seed)
-    values = random.integers(-(2**15), 2**15, (count, W, 3)).astype(np.int16)
-    number = first + np.arange(count)
-    return Frames(
-        number, 7_000_000 + number * (1_000_000 // RATE), random.integers(0, 16, count, np.uint8), values
-    )
-
-
-def some_states(count: int, seed: int = 0, begin: float = START) -> np.ndarray:
-    random = np.random.default_rng(seed)
-    states = np.zeros(count, ARM_STATE)
-    for name in ARM_STATE.names or ():
-        shape = states[name].shape
-        if ARM_STATE[name].base.kind == "f":
-            states[name] = random.normal(size=shape)
-        else:
-            states[name] = random.integers(0, 2**31, shape)
-    states["progress"], states["safety"] = -1, 2**31 + 5
-    states["host"] = begin + np.arange(count) / 125
-    return states
-
-
-def rows(frames: Frames, which: Any) -> Frames:
-    return Frames(*(column[which] for column in frames))
-
-
-def motion_of_whisk(k: int) -> Odometry:
-    return Odometry(*(np.float64(value) for value in (0.01 * (k % 3), 0.002, 0.05, 1.0)))
-
-
-def same_bits(one: Any, other: Any) -> bool:
-    """Whether two tuples of arrays are equal in every bit, shape, dtype and order in memory."""
-    if isinstance(one, tuple):
-        return type(one) is type(other) and all(map(same_bits, one, other))
-    a, b = np.asarray(one), np.asarray(other)
-    alike = a.flags.c_contiguous == b.flags.c_contiguous
-    return alike and (a.shape, a.dtype, a.tobytes()) == (b.shape, b.dtype, b.tobytes())
-
-
-def open_recorder(path: Path) -> LiveRecorder:
-    path.unlink(missing_ok=True)
-    return LiveRecorder(path, view_shape=(2, 2, 1), whiskers=W, rate_hz=1.0, info=INFO)
-
-
-def content(path: Path, kind: type) -> list[Any]:
-    return [entry.content for entry in McapScanner(path).entries() if isinstance(entry.content, kind)]
-
-
-def session(path: Path, whisks: int = 3) -> tuple[list[Cycle], Frames, np.ndarray]:
-    """Records whisks, arm states and two events; returns the whisk cycles, all frames and all states."""
-    frames, states = some_frames(whisks * RATE, seed=whisks), some_states(whisks * 125)
-    recorder = open_recorder(path)
-    cycles = []
-    recorder.add_event(START, "start", "emulated: a robot, über")
-    for k in range(whisks):
-        for block in np.split(np.arange(k * RATE, (k + 1) * RATE), RATE // 4):
-            recorder.add_frames(rows(frames, block), START + block[-1] / RATE)
-            recorder.add_states(
-                states[
-                    (states["host"] > START + block[0] / RATE - 0.02)
-                    & (states["host"] <= START + block[-1] / RATE)
-                ]
-            )
-        mine = rows(frames, slice(k * RATE, (k + 1) * RATE))
-        cut = make_cut(k, START + k + 0.25, START + k, mine, motion_of_whisk(k), seen=k != 1)
-        recorder.add_whisk(cut, mine, np.array([0.01 * k, 0.0, 0.05 * k]) if k != 2 else None)
-        cycles.append(assemble_cycle(mine, cut))
-    recorder.add_event(START + whisks, "dropped", "1 image")
-    recorder.close()
-    return cycles, frames, states
+from tactile.base.types import Cycle
+from tests.robot.live.live_recordings import (
+    INFO,
+    RATE,
+    START,
+    W,
+    content,
+    entries_of,
+    motion_of_whisk,
+    open_recorder,
+    rows,
+    same_bits,
+    session,
+    some_frames,
+    some_states,
+)
 
 
 def test_a_session_is_read_back_exactly(tmp_path: Path) -> None:
@@ -266,240 +193,6 @@ def test_data_are_written_within_a_fifth_of_a_second(tmp_path: Path) -> None:
     recorder.add_whisk(make_cut(0, START + 1.0, START, mine, motion_of_whisk(0)), mine)
     assert McapScanner(path).__iter__().__next__().reading.angle.shape == (RATE, W)
     recorder.close()
-
-
-WRITER = """
-import mmap, struct, sys
-from pathlib import Path
-import numpy as np
-from robot.drivers.head.decoder import Frames
-from robot.drivers.head.cycle_assembly import make_cut
-from robot.live.recorder import LiveRecorder
-from robot.sources.source_info import SourceInfo
-from tactile.base.types import Odometry
-
-path, beside = map(Path, sys.argv[1:])
-recorder = LiveRecorder(path, view_shape=(3, 6, 1), whiskers=18, info=SourceInfo())
-random = np.random.default_rng(0)
-pool = random.integers(-300, 300, (2000, 18, 3)).astype(np.int16)
-with beside.open("r+b") as file:
-    counters = mmap.mmap(file.fileno(), 16)
-k = 0
-while True:
-    number = np.arange(20 * k, 20 * k + 20)
-    frames = Frames(number, number * 500, np.zeros(20, np.uint8), pool[number % 2000])
-    recorder.add_frames(frames, 0.01 * k)
-    if k % 100 == 99:
-        number = np.arange(20 * k - 1980, 20 * k + 20)
-        mine = Frames(number, number * 500, np.zeros(2000, np.uint8), pool[number % 2000])
-        motion = Odometry(0.01, 0.0, 0.0, 1.0)
-        recorder.add_whisk(make_cut(k // 100, 0.01 * k, 0.01 * k - 1, mine, motion), mine)
-    k += 1
-    counters[:16] = struct.pack("<qq", k, k // 100)
-"""
-
-
-def kill_writer(folder: Path, seconds: float) -> tuple[int, int, Path]:
-    """Kills a writer after some seconds; returns its blocks of 10 ms, its whisks and its file."""
-    path, beside = folder / "killed.mcap", folder / "beside"
-    path.unlink(missing_ok=True)
-    beside.write_bytes(bytes(16))
-    process = subprocess.Popen([sys.executable, "-c", WRITER, path, beside], cwd=ROOT)
-    try:
-        patience = time.monotonic() + 60
-        while not beside.read_bytes()[0] and time.monotonic() < patience:
-            time.sleep(0.01)
-        time.sleep(seconds)
-    finally:
-        process.send_signal(signal.SIGKILL)
-        process.wait(60)
-    blocks, whisks = struct.unpack("<qq", beside.read_bytes())
-    return blocks, whisks, path
-
-
-def check_loss(folder: Path, seconds: float) -> None:
-    blocks, whisks, path = kill_writer(folder, seconds)
-    scanner = McapScanner(path)
-    newest = -1
-    for entry in scanner.entries():
-        if isinstance(entry.content, Frames):
-            assert entry.content.sequence[0] == newest + 1
-            newest = int(entry.content.sequence[-1])
-    assert blocks > 20
-    assert blocks - (newest + 1) / 20 <= 20  # 0.2 s of the session
-    assert whisks <= scanner.count <= whisks + 1
-    assert scanner.broken == "it ends too early"
-
-
-def test_a_killed_session_loses_less_than_a_fifth_of_a_second(tmp_path: Path) -> None:
-    for seconds in (0.02, 0.17, 0.4):
-        check_loss(tmp_path, seconds)
-
-
-@pytest.mark.soak
-def test_many_killed_sessions(tmp_path: Path) -> None:
-    for seconds in np.random.default_rng(1).uniform(0, 1, 50):
-        check_loss(tmp_path, float(seconds))
-
-
-def test_a_full_disk_is_a_fault_and_the_recording_stays_readable(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    frames, recorder = some_frames(6 * RATE), open_recorder(path)
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    try:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))
-        sizes = []
-        for k in range(6 * RATE // 4):
-            mine = rows(frames, slice(4 * k, 4 * k + 4))
-            recorder.add_frames(mine, START + 4 * k / RATE)
-            if k % 50 == 49:
-                mine = rows(frames, slice(4 * k - RATE + 4, 4 * k + 4))
-                recorder.add_whisk(make_cut(k, START + k, START, mine, motion_of_whisk(k)), mine)
-            sizes.append(path.stat().st_size)
-        fault = recorder.fault
-        recorder.add_event(START, "late", "after the fault")
-        recorder.close()
-        recorder.close()
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert fault is not None
-    assert fault is recorder.fault
-    assert fault.outcome is SessionOutcome.DISK_FULL
-    assert str(path) in fault.detail
-    assert "free space" in fault.detail
-    assert max(sizes) < 20_000  # an incomplete chunk is truncated
-    recording = Recording(path)
-    assert recording.truncated
-    assert 1 <= recording.length == len(list(recording)) < 6
-    assert recover(path, tmp_path / "b.mcap").samples == recording.length
-
-
-def test_a_disk_that_was_full_yields_a_complete_file_in_the_end(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "a.mcap"
-    frames, recorder = some_frames(3 * RATE), open_recorder(path)
-    with monkeypatch.context() as patch:
-        for k in range(3):
-            mine = rows(frames, slice(k * RATE, (k + 1) * RATE))
-            if k == 1:
-                patch.setattr(WholeChunkFile, "flush", _no_room)
-            recorder.add_whisk(make_cut(k, START + k, START + k, mine, motion_of_whisk(k)), mine)
-    assert recorder.fault is not None
-    recorder.close()
-    recording = Recording(path)
-    assert (recording.length, recording.truncated) == (1, False)
-
-
-def _no_room(_: Any) -> None:
-    raise OSError(28, "No space left on device")
-
-
-def entries_of(path: Path) -> list[RecordingEntry]:
-    return list(McapScanner(path).entries())
-
-
-def test_recover_keeps_messages_other_than_samples(tmp_path: Path) -> None:
-    session(tmp_path / "whole.mcap")
-    data = (tmp_path / "whole.mcap").read_bytes()
-    (tmp_path / "cut.mcap").write_bytes(data[: data.rindex(b"\x28\xb5\x2f\xfd")])  # in its last chunk
-    before = entries_of(tmp_path / "cut.mcap")
-    report = recover(tmp_path / "cut.mcap", tmp_path / "good.mcap")
-    assert report == (3, "it ends too early")
-    after = entries_of(tmp_path / "good.mcap")
-    assert [entry[:4] for entry in after] == [entry[:4] for entry in before]
-    assert len({entry.name for entry in after}) == 4
-    again = Recording(tmp_path / "good.mcap")
-    assert not again.truncated
-    assert [event.name for event in again.events] == ["start"]
-    assert all(
-        same_bits(a.reading, b.reading) for a, b in zip(again, Recording(tmp_path / "cut.mcap"), strict=True)
-    )
-
-
-def test_a_recording_without_a_whisk_is_not_recovered(tmp_path: Path) -> None:
-    with open_recorder(tmp_path / "a.mcap") as recorder:
-        recorder.add_frames(some_frames(5), START)
-    for action in (
-        lambda: recover(tmp_path / "a.mcap", tmp_path / "b.mcap"),
-        lambda: Recording(tmp_path / "a.mcap"),
-    ):
-        with pytest.raises(InputError, match="holds no samples"):
-            action()
-    assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
-
-
-def damaged_copies(data: bytes, seed: int, rounds: int) -> Iterator[bytes]:
-    random = np.random.default_rng(seed)
-    for _ in range(rounds):
-        bad = bytearray(data)
-        for place in random.integers(0, len(bad), random.integers(1, 4)):
-            match int(random.integers(4)):
-                case 0:
-                    bad[place % len(bad)] ^= 1 << int(random.integers(8))
-                case 1:
-                    bad[place : place + int(random.integers(1, 4000))] = b""
-                case 2:
-                    bad[place : place + 16] = bytes(16)
-                case _:
-                    del bad[place:]
-        yield bytes(bad)
-
-
-@pytest.mark.parametrize("rounds", [150, pytest.param(5000, marks=pytest.mark.soak)])
-def test_a_prefix_of_a_damaged_file_is_read(tmp_path: Path, rounds: int) -> None:
-    session(tmp_path / "a.mcap", whisks=2)
-    whole = [entry[:4] for entry in entries_of(tmp_path / "a.mcap")]
-    lengths = set()
-    for bad in damaged_copies((tmp_path / "a.mcap").read_bytes(), rounds, rounds):
-        (tmp_path / "bad.mcap").write_bytes(bad)
-        scanner = McapScanner(tmp_path / "bad.mcap")
-        found = [entry[:4] for entry in scanner.entries()]
-        assert found == whole[: len(found)]
-        assert scanner.broken or len(found) == len(whole)
-        lengths.add(len(found))
-    assert len(lengths) > 5
-
-
-@pytest.mark.parametrize("unsigned", [False, True])
-def test_a_skipped_chunk_is_reported(tmp_path: Path, unsigned: bool) -> None:
-    """The chunk's type is damaged; `unsigned` also sets the file's checksum to 0 (absent)."""
-    session(tmp_path / "a.mcap", whisks=2)
-    whole = [entry[:4] for entry in entries_of(tmp_path / "a.mcap")]
-    data = (tmp_path / "a.mcap").read_bytes()
-    chunks = [found.start() - CHUNK_HEADER for found in re.finditer(re.escape(b"\x28\xb5\x2f\xfd"), data)]
-    assert len(chunks) > 10
-    check_skipped_chunks(tmp_path, data, chunks, whole, unsigned)
-
-
-@pytest.mark.parametrize("unsigned", [False, True])
-def test_a_skipped_only_chunk_is_reported(tmp_path: Path, unsigned: bool) -> None:
-    """The chunk holds the channel too."""
-    with open_recorder(tmp_path / "a.mcap") as recorder:
-        recorder.add_event(START, "start", "and end")
-    data = (tmp_path / "a.mcap").read_bytes()
-    check_skipped_chunks(tmp_path, data, [data.index(b"\x28\xb5\x2f\xfd") - CHUNK_HEADER], [], unsigned)
-
-
-def check_skipped_chunks(
-    folder: Path, data: bytes, chunks: list[int], whole: list[Any], unsigned: bool
-) -> None:
-    for chunk in chunks:
-        assert data[chunk] == 6
-        bad = bytearray(data)
-        bad[chunk] = 0x7F
-        if unsigned:
-            end = data.index(b"\x0f" + struct.pack("<Q", 4), chunks[-1])
-            bad[end + 9 : end + 13] = bytes(4)
-        (folder / "bad.mcap").write_bytes(bad)
-        scanner = McapScanner(folder / "bad.mcap")
-        found = [entry[:4] for entry in scanner.entries()]
-        assert found == whole[: len(found)]
-        assert scanner.broken
-
-
-CHUNK_HEADER = 1 + 8 + 3 * 8 + 4 + 8 + 8
-"""Bytes from a chunk's beginning to its content."""
 
 
 def test_a_cut_must_match_its_frames(tmp_path: Path) -> None:

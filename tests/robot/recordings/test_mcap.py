@@ -1,4 +1,4 @@
-"""MCAP recordings: bit-identical round trips, truncated and damaged files, other tools, refused input."""
+"""MCAP recordings: bit-identical round trips, recovery, refused input."""
 
 from __future__ import annotations
 

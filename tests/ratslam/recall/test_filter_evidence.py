@@ -1,0 +1,287 @@
+"""Evidence of views and ids in the recall filter, and the filter in a session."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ratslam.backends.config import RecallBackendConfig
+from ratslam.backends.recall import RecallBackend
+from ratslam.core.session import Session
+from ratslam.recall.filter import recognise
+from ratslam.recall.memory import (
+    accumulate_motion,
+    current_pose,
+    store_keyframe,
+)
+from ratslam.recall.observation_model import LABEL_TEMPER, LABELS, SAMPLES, ObservationLikelihood
+from tactile.base.se2 import compose
+from tactile.base.types import Odometry, observation
+from tests.ratslam.recall.recall_cases import (
+    ANGLE,
+    CAPACITY,
+    CELL,
+    FAN,
+    FLAT,
+    GUARD,
+    SIZE,
+    compile_label_filter,
+    errors_by_loops,
+    filled,
+    filter_of,
+    observe,
+    spaced,
+    with_modes,
+)
+
+# Recallable frames
+
+
+def test_without_a_scale_nothing_is_recalled_but_all_is_remembered():
+    stream = np.random.default_rng(0)
+    views = stream.random((40, SIZE))
+    memory = filled(FAN, views, spaced(40), angle=ANGLE, scale=0.0)
+    after, found = observe(FAN, memory, views[7])
+    assert (found.match, found.log_ratio, found.posterior, found.novelty, found.view_fits) == (
+        -1,
+        0,
+        0,
+        1,
+        -1,
+    )
+    assert found.keyframe == 40
+    assert observe(FAN, memory._replace(scale=jnp.asarray(0.1)), views[7])[1].match == 7
+
+    memory = accumulate_motion(jax.tree.map(jnp.asarray, after), jnp.asarray([CELL, 0.0, 0.5]))
+    memory = store_keyframe(memory, jnp.asarray(views[7]), jnp.int32(5), jnp.asarray([1.0, 2.0, 3.0]))
+    assert int(memory.count) == 41
+    assert np.array_equal(memory.view[:, 40], views[7])
+    assert np.array_equal(memory.packet[40], [1, 2, 3])
+    assert (int(memory.label[40]), int(memory.distinct)) == (5, 1)
+    pose = [memory.x[40], memory.y[40], np.arctan2(memory.sine[40], memory.cosine[40])]
+    assert np.array(pose) == pytest.approx(compose(spaced(40)[-1], np.array([CELL, 0, 0.5])))
+    assert np.array_equal(memory.motion, np.zeros(3))
+    assert (float(memory.length), float(memory.turn)) == (0, 0)
+    assert float(memory.since) == pytest.approx(CELL)
+
+
+def test_the_newest_frames_are_never_recalled():
+    stream = np.random.default_rng(0)
+    for count in (1, GUARD, GUARD + 1, 30, CAPACITY):
+        views = stream.random((count, SIZE))
+        memory = filled(FAN, views, spaced(count), angle=ANGLE)
+        for frame in range(count):
+            after, found = observe(FAN, memory, views[frame])
+            if frame < count - GUARD:
+                assert found.match == frame
+                continue
+            assert found.match < max(count - GUARD, 0)
+            assert (after.anchor[after.mass > 0] < count - GUARD).all()
+            assert found.posterior < 0.1
+        if count <= GUARD:
+            assert found.match == -1
+            assert found.novelty == 1
+
+
+# Evidence
+
+
+def test_a_view_of_more_frames_carries_less_evidence():
+    stream = np.random.default_rng(0)
+    old = 50
+    views, common = stream.random((old + GUARD, SIZE)), stream.random(SIZE)
+    gains = []
+    for share in (1, 5, 25, old):
+        views[:share] = common
+        memory = filled(FLAT, views, spaced(old + GUARD), scale=0.05)
+        gains.append(float(observe(FLAT, memory, common)[1].log_ratio))
+    assert gains == sorted(gains, reverse=True)
+    assert gains[0] > 3.5
+    assert gains[-1] <= 0  # a view that all frames share is evidence for none of them
+
+
+def test_a_view_shared_by_all_frames_counts_against_them_as_it_differs():
+    views = np.zeros((40, SIZE))
+    memory = filled(FLAT, views, spaced(40), scale=0.1)
+    gains = [
+        float(observe(FLAT, memory, np.full(SIZE, e * 0.1))[1].log_ratio) for e in (1.0, FLAT.floor, 2.0, 4.0)
+    ]
+    assert 0 > gains[0] > gains[1] > gains[2] > gains[3]
+
+
+def test_a_contradicting_view_removes_mass():
+    stream = np.random.default_rng(0)
+    views = stream.random((40, SIZE))
+    before = 0.6
+    memory = with_modes(filled(FAN, views, spaced(40), angle=ANGLE), [9], [before])
+
+    def at_nine(view):
+        after, _ = observe(FAN, memory, view)
+        return float(after.mass[after.anchor == 9].sum())
+
+    assert at_nine(views[9]) > 0.95
+    assert at_nine(1 - np.round(views[9])) < 0.1 * before  # fits nothing at all
+    assert at_nine(views[25]) < 0.1 * before  # fits another frame
+
+
+def test_odometry_alone_is_never_evidence():
+    # A straight path driven twice: odometry repeats the first drive exactly, without any views.
+    memory = filled(FLAT, np.zeros((40, SIZE)), spaced(40, 0.5), scale=0.1)
+    blank = ObservationLikelihood(
+        likelihood=jnp.ones((1, CAPACITY)), novelty=jnp.ones(()), background=jnp.full(SAMPLES, jnp.nan),
+        certain=jnp.bool_(True), informative=jnp.bool_(False),
+    )  # fmt: skip
+    blind = jax.jit(partial(recognise, FLAT, CELL))
+    # A view that all frames share is no evidence either.
+    same = np.full(SIZE, FLAT.floor * 0.1)
+    for sure in (0.0, 0.3, 1.0):
+        for seeing in (False, True):
+            start = with_modes(memory, [0], [sure])
+            start = start._replace(pose=jnp.asarray([0.0, 0.0, 0.0]))
+            belief, limit = start, sure
+            for _ in range(20):
+                limit = limit * (1 - FLAT.mode_decay) + (1 - limit) * FLAT.enter
+                belief = accumulate_motion(belief, jnp.asarray([0.5 * CELL, 0.0, 0.0]))
+                belief, _ = filter_of(FLAT)(belief, jnp.asarray(same)) if seeing else blind(belief, blank)
+                belief = belief._replace(pose=current_pose(belief), motion=jnp.zeros(3), length=jnp.zeros(()))
+                assert float(belief.mass.sum()) <= limit + 1e-9
+            # Nor is it evidence against: the mass is still there.
+            assert seeing or float(belief.mass.sum()) > 0.5 * limit
+
+
+def test_a_mode_that_reaches_no_frame_becomes_novelty():
+    memory = with_modes(filled(FLAT, np.zeros((40, SIZE)), spaced(40, 1.0), scale=0.1), [9], [1.0])
+    view = np.full(SIZE, FLAT.floor * 0.1)
+    on_way = accumulate_motion(memory, jnp.asarray([CELL, 0.0, 0.0]))
+    aside = accumulate_motion(memory, jnp.asarray([0.0, 4 * CELL, 0.0]))
+    assert observe(FLAT, on_way, view)[1].novelty < 0.05
+    assert observe(FLAT, aside, view)[1].novelty == pytest.approx(1, abs=1e-9)
+
+
+def test_a_mode_has_the_heading_of_its_frames():
+    # A path driven out and back: two frames at one place have opposite headings and equal views.
+    stream = np.random.default_rng(0)
+    views, poses = stream.random((40, SIZE)), spaced(40)
+    views[10], poses[10] = views[9], poses[9] + [0, 0, np.pi]
+    after, _ = observe(FLAT, filled(FLAT, views, poses), views[9])
+    assert after.anchor[0] in (9, 10)
+    assert abs(math.cos(after.offset[0, 2])) == pytest.approx(1, abs=0.1)
+
+
+# Given ids
+
+
+def label_likelihood(memory, label):
+    return jax.tree.map(np.asarray, compile_label_filter(FLAT)(memory, jnp.int32(label)))
+
+
+def test_ids_are_evidence_for_and_against_frames():
+    ids = np.arange(40) // 4
+    memory = with_modes(filled(FLAT, np.zeros((40, 0)), spaced(40), labels=ids), [9], [0.6])
+    known = len(set(ids.tolist()))
+    same, other, new = (label_likelihood(memory, label) for label in (ids[9], ids[30], 77))
+
+    weighing = same[2]
+    assert weighing.likelihood.shape == (1, CAPACITY)
+    assert set(np.flatnonzero(weighing.likelihood[0] == weighing.likelihood.max())) == {8, 9, 10, 11}
+    assert weighing.likelihood[0, 9] == pytest.approx(LABELS["same"] ** LABEL_TEMPER)
+    assert weighing.novelty == pytest.approx((LABELS["new_known"] / known) ** LABEL_TEMPER)
+    assert weighing.likelihood[0, 9] > weighing.novelty > weighing.likelihood[0, 30]
+    assert new[2].likelihood[0, :40] == pytest.approx(LABELS["unknown"] ** LABEL_TEMPER)
+    assert new[2].novelty > new[2].likelihood.max()
+    assert np.isnan(weighing.background).all()
+
+    mass = [float(after.mass[after.anchor == 9].sum()) for after, *_ in (same, other, new)]
+    assert mass[0] > 0.9
+    assert max(mass[1:]) < 0.6
+    assert (same[1].match, same[1].shift) == (9, 0)
+    assert same[1].log_ratio > 0 > new[1].log_ratio
+
+
+def test_only_a_known_id_is_evidence_about_the_maps_pose():
+    # The robot is at frame 20, so the map predicts its id.
+    ids = np.arange(40)
+    memory = filled(FLAT, np.zeros((40, 0)), spaced(40), labels=ids)
+    memory = memory._replace(pose=jnp.asarray(spaced(40)[20]))
+    answers = {label: label_likelihood(memory, label) for label in (20, 3, 77)}
+    assert [bool(weighing.informative) for *_, weighing in answers.values()] == [True, True, False]
+    assert [int(found.view_fits) for _, found, _ in answers.values()] == [1, 0, -1]
+
+
+def test_an_id_is_new_once():
+    memory = filled(FLAT, np.zeros((2, 0)), spaced(2), labels=[4, 4])
+    given_then = [(9, 2), (9, 2), (-1, 2), (4, 2), (0, 3)]
+    for label, distinct in given_then:
+        memory = store_keyframe(memory, jnp.zeros(0), jnp.int32(label), jnp.zeros(3))
+        assert int(memory.distinct) == distinct
+
+
+def test_the_newest_frames_are_not_recalled_by_id():
+    ids = np.arange(40)
+    memory = filled(FLAT, np.zeros((40, 0)), spaced(40), labels=ids)
+    assert label_likelihood(memory, 40 - GUARD - 1)[1].match == 40 - GUARD - 1
+    for label in range(40 - GUARD, 40):
+        after, found, _ = label_likelihood(memory, label)
+        assert found.match < 40 - GUARD
+        assert (after.anchor[after.mass > 0] < 40 - GUARD).all()
+
+
+# Calibration
+
+
+@pytest.mark.parametrize("since", [0.0, 4.0, 12.0, 1000.0])
+@pytest.mark.parametrize("count", [GUARD, GUARD + 1, 20, 30, CAPACITY])
+def test_background_has_each_ruled_out_frame_once(count, since):
+    stream = np.random.default_rng(count)
+    views, poses = stream.random((count, SIZE)), spaced(count, 1.0)
+    stream.shuffle(poses)
+    memory = filled(FAN, views, poses, angle=ANGLE, since=since)
+    view = stream.random(SIZE)
+    _, found = observe(FAN, memory, view)
+    errors = errors_by_loops(FAN, jax.tree.map(np.asarray, memory), view)
+    away = max(3 * CELL, 3 * (0.5 * CELL + 0.05 * since))
+    ruled_out = [
+        min(errors[k, c] for k in range(-FAN.shifts, FAN.shifts + 1))
+        for c in range(count - GUARD)
+        if np.hypot(*(poses[c] - poses[-1])[:2]) > away
+    ]
+    result = found.background[np.isfinite(found.background)]
+    assert found.background.shape == (SAMPLES,)
+    assert np.isnan(found.background).sum() == SAMPLES - len(result)
+    assert len(result) == min(len(ruled_out), SAMPLES)
+    at = [int(np.argmin(np.abs(np.array(ruled_out) - error))) for error in result]
+    assert result == pytest.approx(np.array(ruled_out)[at] if at else result, abs=1e-12)
+    assert at == sorted(set(at))
+
+
+# In the session
+
+
+def make_session(**settings):
+    parts = {"pose_cells": {"cells_xy": 11, "cells_heading": 12}}
+    return Session(RecallBackend(RecallBackendConfig.model_validate(parts), (1, SIZE, 1)), **settings)
+
+
+def test_standing_still_makes_no_frames():
+    session = make_session(reserve=10_000)  # one capacity, one compilation
+    views = np.random.default_rng(0).random((16, 1, SIZE, 1))
+    still = [observation(Odometry(0, 0, 0, 0.1), view) for view in views]
+    frames = sum(int(step.evidence.keyframe) >= 0 for _ in range(625) for step in session.replay(still))
+    assert session.steps == 10_000
+    assert frames == int(session.state.memory.count) == 1
+    list(session.replay([observation(Odometry(CELL, 0, 0, 0.1), views[0])]))
+    assert int(session.state.memory.count) == 2
+
+
+def test_a_session_compiles_once_per_capacity():
+    session = make_session()
+    views = np.random.default_rng(0).random((30, 1, SIZE, 1))
+    circle = Odometry(0.05, 0, 2 * np.pi / 30, 0.1)
+    list(session.replay(observation(circle, views[k % 30]) for k in range(320)))
+    assert int(session.state.memory.count) > 256  # so that it grew with frames in it
+    assert session.compilations() == 2
