@@ -151,9 +151,11 @@ class Executor(ExitStack):
         if address is None:
             folder = self.enter_context(TemporaryDirectory())
             self.enter_context(dask.config.set(DASK_SETTINGS | {"temporary-directory": folder}))
+            # The scheduler answers HTTP without a dashboard too, by default at port 8787 of all networks.
             cluster = LocalCluster(
                 n_workers=workers, threads_per_worker=1, processes=True, host="127.0.0.1", memory_limit=0,
-                dashboard_address=None, silence_logs=logging.CRITICAL,
+                dashboard_address=None, scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
+            silence_logs=logging.CRITICAL,
             )  # fmt: skip
             self.enter_context(cluster)
             self.callback(_kill_workers, cluster)

@@ -12,6 +12,7 @@ import time
 from contextlib import closing
 from pathlib import Path
 
+import psutil
 import pytest
 
 from ratslam.experiments.studies.executor import Executor, run_tasks
@@ -103,6 +104,16 @@ def test_without_dask_the_default_is_one_process(monkeypatch, capsys):
     monkeypatch.setattr("os.cpu_count", lambda: 2)
     assert [pid for _, pid in run_tasks(process_of, [1, 2])] == [os.getpid()] * 2
     assert capsys.readouterr().err.count("pip install 'ratslam[sweep]'") == 1
+
+
+def test_two_local_executors_answer_only_this_machine():
+    with Executor(2) as first, Executor(2) as second:
+        for executor in (first, second):
+            assert len(list(executor.completed(square, [1, 2]))) == 2
+        own = psutil.Process()
+        sockets = [each for one in (own, *own.children(recursive=True)) for each in one.net_connections()]
+        listening = {each.laddr.ip for each in sockets if each.status == psutil.CONN_LISTEN}
+    assert listening == {"127.0.0.1"}
 
 
 def test_processes_of_this_machine_share_its_environment_and_leave_no_files(tmp_path, monkeypatch):
