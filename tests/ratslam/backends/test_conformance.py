@@ -250,7 +250,7 @@ def test_the_grid_filter_resamples_in_these_walks():
 
 
 def test_compiles_once_per_capacity(make):
-    session = Session(make())
+    session = fresh(make)  # which other tests have used too
     observations = list(walk(300))
     list(session.replay(observations))
     for o in observations[:5]:

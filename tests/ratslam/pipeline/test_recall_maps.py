@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from evaluation.metrics.trajectory import ate
 from ratslam.backends.config import RecallBackendConfig
 from ratslam.backends.recall import RecallBackend
+from ratslam.core.backend import Map
 from ratslam.core.session import Session
 from ratslam.keyframes.loop_closures import Verdict
 from robot.recordings.npz_trace import read_trace
@@ -23,28 +25,44 @@ from tests.helpers import scenes
 GOLDEN = Path(__file__).parents[2] / "golden"
 
 
-def map_log(log: InMemorySource, precision: str = "float64", **parts) -> Session:
-    """A session that has replayed the log with one setting for all, on pose cells small enough for a test."""
-    cells = {"cells_xy": 11, "cell_size": log.info.cell_size}
-    config = RecallBackendConfig.model_validate({"pose_cells": cells, **parts})
-    backend = RecallBackend(config, log.view_shape, np.dtype(precision))
-    session = Session(backend, reserve=512, precision=precision)
-    for _ in session.replay(sample.reading for sample in log):
-        pass
+@cache
+def session_of(view_shape: tuple[int, ...], cell_size: float | None, precision: str) -> Session:
+    """A session with one setting for all, on pose cells small enough for a test, compiled once."""
+    config = RecallBackendConfig.model_validate({"pose_cells": {"cells_xy": 11, "cell_size": cell_size}})
+    return Session(RecallBackend(config, view_shape, np.dtype(precision)), reserve=512, precision=precision)
+
+
+def started(log: InMemorySource, precision: str = "float64") -> Session:
+    session = session_of(log.view_shape, log.info.cell_size, precision)
+    session.restart()
     return session
 
 
-def error(session: Session, log: InMemorySource) -> float:
-    return ate(session.map.trajectory(), log.truth)
+def map_log(log: InMemorySource, precision: str = "float64") -> Map:
+    """The map of a session that has replayed the log."""
+    session = started(log, precision)
+    for _ in session.replay(sample.reading for sample in log):
+        pass
+    return session.map
+
+
+@cache
+def golden_map(name: str) -> Map:
+    """The map of a stored log; tests share it and do not change it."""
+    return map_log(golden(name))
+
+
+def error(map: Map, log: InMemorySource) -> float:
+    return ate(map.trajectory(), log.truth)
 
 
 def odometry_error(log: InMemorySource) -> float:
     return ate(integrate(log.motion[:, :3]), log.truth)
 
 
-def cuts(session: Session) -> list[int]:
+def cuts(map: Map) -> list[int]:
     """Frames before which the odometry was cut; in these scenes every row is a frame."""
-    return np.flatnonzero(session.map.arrays()["graph/cut"] >= 0).tolist()
+    return np.flatnonzero(map.arrays()["graph/cut"] >= 0).tolist()
 
 
 def golden(name: str) -> InMemorySource:
@@ -63,10 +81,9 @@ def golden(name: str) -> InMemorySource:
     ],
 )
 def test_one_setting_maps_every_trace(trace, limit, broken):
-    log = golden(trace)
-    session = map_log(log)
-    assert error(session, log) <= (limit or 1.05 * odometry_error(log) + 0.02)
-    assert cuts(session) == broken
+    log, found = golden(trace), golden_map(trace)
+    assert error(found, log) <= (limit or 1.05 * odometry_error(log) + 0.02)
+    assert cuts(found) == broken
 
 
 @pytest.mark.soak
@@ -80,9 +97,9 @@ def test_regenerated_streams_behave_as_the_published_ones(seed):
     kidnapped = scenes.square(seed + 50, laps=4, jumps=jumps)
     assert error(map_log(square), square) <= 0.02
     assert error(map_log(eight), eight) <= 0.03
-    session = map_log(kidnapped)
-    assert error(session, kidnapped) <= 0.08
-    assert cuts(session) == [row for row, _ in jumps]
+    found = map_log(kidnapped)
+    assert error(found, kidnapped) <= 0.08
+    assert cuts(found) == [row for row, _ in jumps]
 
 
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.soak)])
@@ -94,18 +111,18 @@ def test_a_perturbed_recording_is_mapped_as_well(seed):
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.soak)])
 def test_an_unknown_corridor_stays_odometry(seed):
     log = scenes.corridor(seed)
-    session = map_log(log)
-    assert len(session.map.closures()) == 0
-    assert error(session, log) == pytest.approx(odometry_error(log), abs=1e-9)
+    found = map_log(log)
+    assert len(found.closures()) == 0
+    assert error(found, log) == pytest.approx(odometry_error(log), abs=1e-9)
 
 
 def test_a_lap_in_the_opposite_direction_is_closed_where_it_turns():
     # The return path has other views (another heading), so only equal headings may close.
     there = [(0.05, 0.0)] * 30 + [(0.0, np.pi / 18)] * 18
     log = scenes.sensed(scenes.followed(there * 8), 3)
-    session = map_log(log)
-    assert error(session, log) <= 0.05
-    pairs = session.map.closures()
+    found = map_log(log)
+    assert error(found, log) <= 0.05
+    pairs = found.closures()
     assert len(pairs) > 20
     assert np.hypot(*(log.truth[pairs[:, 0]] - log.truth[pairs[:, 1]])[:, :2].T).max() < 0.25
 
@@ -132,27 +149,27 @@ def different(log: InMemorySource) -> InMemorySource:
 @pytest.mark.parametrize("control", [shuffled, blank, alike, different])
 def test_views_without_information_give_no_closures(control):
     log = control(golden("a_square3"))
-    session = map_log(log)
-    assert len(session.map.closures()) == 0
-    assert error(session, log) == pytest.approx(odometry_error(log), abs=1e-9)
+    found = map_log(log)
+    assert len(found.closures()) == 0
+    assert error(found, log) == pytest.approx(odometry_error(log), abs=1e-9)
 
 
 @pytest.mark.parametrize("factor", [pytest.param(0.5, marks=pytest.mark.soak), 2.0])
 def test_the_sensors_unit_does_not_matter(factor):
     log = golden("a_square3")
     scaled = replace(log, views=log.views * factor)
-    first, second = map_log(log), map_log(scaled)
-    assert np.array_equal(first.map.trajectory(), second.map.trajectory())
-    assert np.array_equal(first.map.candidates(), second.map.candidates())
+    first, second = golden_map("a_square3"), map_log(scaled)
+    assert np.array_equal(first.trajectory(), second.trajectory())
+    assert np.array_equal(first.candidates(), second.candidates())
 
 
 @pytest.mark.soak
 def test_single_precision_maps_as_well():
     log = golden("b_figure8_alias")
-    session = map_log(log, "float32")
-    assert error(session, log) <= 0.03
-    assert np.isfinite(session.map.trajectory()).all()
-    assert np.isfinite(session.map.candidates()[:, 3:5]).all()
+    found = map_log(log, "float32")
+    assert error(found, log) <= 0.03
+    assert np.isfinite(found.trajectory()).all()
+    assert np.isfinite(found.candidates()[:, 3:5]).all()
 
 
 # Evidence beside the map
@@ -160,11 +177,7 @@ def test_single_precision_maps_as_well():
 
 def test_a_kidnapped_robot_is_reported_lost_and_then_localised():
     log = golden("e_kidnap")
-    cells = {"cells_xy": 11, "cell_size": 0.1}
-    session = Session(
-        RecallBackend(RecallBackendConfig.model_validate({"pose_cells": cells}), log.view_shape), reserve=512
-    )
-    lost = np.array([bool(s.estimate.lost) for s in session.replay(sample.reading for sample in log)])
+    lost = np.array([bool(s.estimate.lost) for s in started(log).replay(sample.reading for sample in log)])
     assert not lost[:127].any()
     assert lost[140:155].all()
     assert not lost[-60:].any()
@@ -172,8 +185,7 @@ def test_a_kidnapped_robot_is_reported_lost_and_then_localised():
 
 def test_a_closure_sequence_can_be_undone():
     log = golden("a_square3")
-    session = map_log(log)
-    frames = session.map
+    frames = map_log(log)
     accepted = np.unique(frames.candidates()[frames.candidates()[:, 7] == Verdict.ACCEPTED, 5]).astype(int)
     before, path = frames.closures(), frames.trajectory()
     frames.undo(int(accepted[0]))
@@ -185,13 +197,12 @@ def test_a_closure_sequence_can_be_undone():
         frames.undo(int(sequence))
     assert len(frames.closures()) == 0
     reckoned = odometry_error(log)
-    assert error(session, log) == pytest.approx(reckoned, rel=0.05)
+    assert error(frames, log) == pytest.approx(reckoned, rel=0.05)
 
 
 def test_the_spread_grows_along_the_path_and_falls_at_a_closure():
     log = golden("a_square3")
-    config = RecallBackendConfig.model_validate({"pose_cells": {"cells_xy": 11, "cell_size": 0.1}})
-    session = Session(RecallBackend(config, log.view_shape), reserve=512)
+    session = started(log)
     rows, at = list(log), {}
     for start in range(0, 180, 20):
         list(session.replay(sample.reading for sample in rows[start : start + 20]))
@@ -201,8 +212,7 @@ def test_the_spread_grows_along_the_path_and_falls_at_a_closure():
 
 
 def test_standing_still_adds_no_keyframes():
-    config = RecallBackendConfig.model_validate({"pose_cells": {"cells_xy": 11}})
-    session = Session(RecallBackend(config, (3, 6, 1)), reserve=512)
+    session = started(golden("a_square3"))
     still = observation(Odometry(0.0, 0.0, 0.0, 0.1), np.full((3, 6, 1), 0.5))
     list(session.replay(still for _ in range(300)))
     assert len(session.map.arrays()["graph/pose"]) == 1
