@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -16,10 +17,11 @@ from evaluation.metrics.energy_metric import (
 )
 from evaluation.metrics.experience_log import change_rows
 from evaluation.metrics.experience_metric import EXM_MODES, ExmConfig, base_end, experience_metric
-from evaluation.metrics.metric import Direction, Finding, Metric
+from evaluation.metrics.metric import Direction, Finding, Metric, Quantity
 from evaluation.metrics.run_arrays import RunArrays, truth_rows
-from evaluation.metrics.trajectory import ate, online_errors, rpe, summarize_errors
+from evaluation.metrics.trajectory import ate, online_errors, position_error, rpe, summarize_errors
 from tactile.base.errors import InputError
+from tactile.base.se2 import compose, inverse
 
 
 class RunData(NamedTuple):
@@ -208,3 +210,24 @@ def experience_findings(
 def path_length(pose: np.ndarray) -> float:
     """Length of a path [N, 3], m."""
     return float(np.sum(np.hypot(*np.diff(pose[:, :2], axis=0).T)))
+
+
+def recognition_error(quantities: Mapping[str, Quantity]) -> Finding:
+    """1 - ARR x ARCR of a scorecard; ARCR is undefined where ARR is 0."""
+    arr, arcr = (quantities[name].value for name in ("exm_arr", "exm_arcr_strict"))
+    if arr is None or (arr and arcr is None):
+        return Finding(np.nan)
+    return Finding(1 - arr * (arcr or 0.0))
+
+
+def anchored_errors(run: RunArrays) -> dict[str, Finding]:
+    """Mean position errors, m, of paths that begin at the first true pose; {} if a step has no true pose."""
+    truth = run.truth
+    if truth is None or not np.isfinite(truth).all():
+        return {}
+    # All backends take the first step from odometry, so its error is not theirs.
+    start = compose(truth[0], inverse(run.odometry[0]))
+    online, final, odometry = (
+        position_error(compose(start, path), truth) for path in (run.online, run.final, run.odometry)
+    )
+    return {"error_online": Finding(online, odometry), "error_final": Finding(final, odometry)}

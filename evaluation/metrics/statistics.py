@@ -1,4 +1,4 @@
-"""Bootstrap intervals of means over runs; the separation of two samples."""
+"""Bootstrap intervals of means over runs; the separation of two samples; Pareto-optimal rows."""
 
 from __future__ import annotations
 
@@ -27,3 +27,14 @@ def auc(low: np.ndarray, high: np.ndarray) -> float:
     rank = rankdata(np.concatenate([high, low]))
     count = len(high)
     return float((rank[:count].sum() - count * (count + 1) / 2) / (count * len(low)))
+
+
+def pareto_optimal(costs: np.ndarray) -> np.ndarray:
+    """[N] whether a row of costs [N, K] is Pareto-optimal: no other is at most equal in all and less in one.
+
+    Equal rows are optimal together. A row with a NaN is not optimal and dominates no other.
+    """
+    known = ~np.isnan(costs).any(axis=1)
+    no_dearer = (costs[:, None] <= costs[None]).all(axis=2)
+    cheaper = (costs[:, None] < costs[None]).any(axis=2)
+    return known & ~(no_dearer & cheaper).any(axis=0)

@@ -78,6 +78,22 @@ def compare_views(
     return ViewDifferences(edge, np.histogram(a, edge)[0], np.histogram(b, edge)[0], auc(a, b))
 
 
+def image_difference(views: np.ndarray, reference: np.ndarray, tallest: float) -> tuple[float, float]:
+    """Difference of images [N, R, C, K] in their first channel.
+
+    Args:
+        tallest: height of a white pixel, m.
+
+    Returns:
+        share of pixels whose contact state differs; mean absolute height difference where both have contact,
+        m, NaN where none do.
+    """
+    a, b = views[..., 0], reference[..., 0]
+    both = (a > 0) & (b > 0)
+    height = float(np.abs(a - b)[both].mean() * tallest) if both.any() else np.nan
+    return float(((a > 0) != (b > 0)).mean()), height
+
+
 def _below_edges(count: np.ndarray) -> np.ndarray:
     """[BINS + 1] number of pairs below each edge."""
     return np.concatenate([[0], np.cumsum(count)])

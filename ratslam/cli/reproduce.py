@@ -214,7 +214,7 @@ def _laser_lines(arguments: argparse.Namespace) -> Iterator[str]:
 
 
 def _speed_lines(arguments: argparse.Namespace) -> Iterator[str]:
-    from ratslam.experiments.studies.machine import one_core
+    from evaluation.metrics.resources import one_core
 
     with one_core():
         from ratslam.experiments.tables.speed import SIZES, speed_table

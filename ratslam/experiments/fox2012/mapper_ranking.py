@@ -18,8 +18,7 @@ from evaluation.metrics.statistics import bootstrap
 from ratslam.experiments.fox2012.protocols import FILTERED, PAPERS, RECKONED, TRUE
 from ratslam.experiments.trials.reproduction import ResultRow, column
 
-FEW = 6
-"""Number of sets below which the intervals are too narrow."""
+FEW = 6  # number of sets below which the intervals are too narrow
 
 
 class Measure(NamedTuple):

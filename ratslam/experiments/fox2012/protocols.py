@@ -10,8 +10,7 @@ from ratslam.config.strict_yaml import override, parse, validate
 
 MAPPERS = {"blob": "none", "geometric": "geometric", "template": "template", "fused": "fused"}
 """`touch.reports.walls` of the paper's three mappers (II-E to II-G), and ours."""
-PAPERS = ("blob", "geometric", "template")
-"""The paper's mappers from worst to best as printed (III)."""
+PAPERS = ("blob", "geometric", "template")  # the paper's mappers from worst to best as printed (III)
 METHODS: dict[str, tuple[str, ...]] = {
     "as printed": (
         "touch.reports.max_template_error=null",

@@ -11,12 +11,9 @@ from evaluation.metrics.statistics import bootstrap
 from ratslam.experiments.salman2016.protocols import METHODS, Claim, Protocol
 from ratslam.experiments.trials.reproduction import ResultRow, column
 
-ALIKE = 0.05
-"""Shares that differ by less count as equal."""
-SMALL = 0.1
-"""A share below counts as nearly zero."""
-DECISIVE = 6
-"""Number of sets from which a difference of the same sign in all sets is significant (1 in 32)."""
+ALIKE = 0.05  # shares that differ by less count as equal
+SMALL = 0.1  # a share below counts as nearly zero
+DECISIVE = 6  # number of sets from which a difference of one sign in all sets is significant (1 in 32)
 RATIOS = ("em", "em_experiences", "em_odometry", "em_ratio", "directions_apart")
 """Quantities that span powers of ten, compared by ratio so that one false loop does not decide a mean."""
 LABELS = {

@@ -25,8 +25,7 @@ THRESHOLDS = {"max_angle": 0.015, "contact_angle": 0.05}
 four mazes that are not used here. Higher for contact_angle, as in the paper (IV-D)."""
 SWEPT = (0.005, 0.01, 0.015, 0.02, 0.025, 0.03, 0.04, 0.05, 0.06, 0.08)
 """Thresholds from which matched ones are chosen."""
-LATER_MAZE_START = 0.3
-"""Share of the session before the change of mazes: three of ten laps."""
+LATER_MAZE_START = 0.3  # share of the session before the change of mazes: three of ten laps
 
 (OPEN_MAX, OPEN_CONTACT), (RCP_MAX, RCP_CONTACT) = (
     [(f"simulation.whisking.mode={mode}", f"touch.image.transform={each}") for each in THRESHOLDS]

@@ -135,7 +135,8 @@ def sweep_job(job: TrialJob) -> list[ResultRow]:
     """The Experience Metric of the classic method at the thresholds `SWEPT`, without maps."""
     config, log = collect_session(job.config)
     rows = []
-    for threshold, place in zip(SWEPT, sweep_thresholds(config, log, np.array(SWEPT)), strict=True):
+    places = sweep_thresholds(config, log, np.array(SWEPT))[0].place
+    for threshold, place in zip(SWEPT, places, strict=True):
         metric = experience_metric(place, np.asarray(log.truth), config.score.experience_metric)
         values = {
             "threshold": threshold,

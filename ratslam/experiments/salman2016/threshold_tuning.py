@@ -31,10 +31,8 @@ from tactile.base.errors import InputError
 CLASSIC = ("backend=classic", "templates.energy=0.05")
 """The tuned method: half of the iRat's energy of 0.1 (III-F; the value is of Ball et al. 2013)."""
 THRESHOLDS = tuple(np.round(np.arange(1, 33) * 0.005, 3).tolist())
-LAPS = 3
-"""Laps that are scored, the base set excepted."""
-ENOUGH = 10
-"""Correct re-localisations that a threshold must give."""
+LAPS = 3  # laps that are scored, the base set excepted
+ENOUGH = 10  # correct re-localisations that a threshold must give
 
 
 class ThresholdScore(NamedTuple):
@@ -163,7 +161,7 @@ def save_tuning(tuning: Tuning, directory: Path) -> tuple[Path, Path]:
 def _score_thresholds(task: tuple[RunConfig, InMemorySource, int, np.ndarray]) -> list[ThresholdScore]:
     config, log, base, thresholds = task
     exm = config.score.experience_metric.model_copy(update={"base": base, "mode": "strict", "log": "step"})
-    places = sweep_thresholds(config, log, thresholds)
+    places = sweep_thresholds(config, log, thresholds)[0].place
     results = [experience_metric(place, np.asarray(log.truth), exm) for place in places]
     return [
         ThresholdScore(float(threshold), r.arr, r.correct, r.relocalisations - r.correct)

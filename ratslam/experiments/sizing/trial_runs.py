@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from evaluation.metrics.resources import one_core
 from ratslam.config.run_config import RunConfig
 from ratslam.experiments.sizing.recommendation import FEWEST, Recommendation
 from ratslam.experiments.sizing.scene_statistics import short_session
-from ratslam.experiments.studies.machine import one_core
 from ratslam.experiments.studies.records import RunRecord
 from ratslam.experiments.studies.report import make_report, render
 from ratslam.experiments.studies.run_job import run_job

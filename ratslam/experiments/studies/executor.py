@@ -244,9 +244,6 @@ def _end_with_parent() -> None:
 @contextmanager
 def _holding_interrupts() -> Iterator[None]:
     """Ctrl-C waits for the end of the block; processes started in it, and their successors, ignore it."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
     resource_tracker.ensure_running()  # its start would end the block of the signal
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:

@@ -17,10 +17,12 @@ from evaluation.metrics.energy_metric import read_relations
 from evaluation.metrics.grid_error import MAIN_CONVENTION
 from evaluation.metrics.grid_score import score_grid
 from evaluation.metrics.metric import Finding, Quantity
+from evaluation.metrics.resources import peak_memory, reset_peak_memory, watch_load
 from evaluation.metrics.run_arrays import RunArrays
+from evaluation.metrics.run_metrics import anchored_errors, recognition_error
 from evaluation.metrics.scorecard import score_run
 from ratslam.core.session import CHUNK, Session
-from ratslam.experiments.studies.machine import Stopwatch, machine, peak_memory, reset_peak_memory, watch_load
+from ratslam.experiments.studies.machine import Stopwatch, machine
 from ratslam.experiments.studies.metrics import quantity
 from ratslam.experiments.studies.records import RunRecord, record_of
 from ratslam.experiments.studies.study import Job
@@ -34,7 +36,7 @@ from robot.sources.perturbation import perturb
 from robot.sources.source import Source
 from robot.world.arena import read_arena
 from tactile.base.errors import InputError
-from tactile.base.se2 import compose, integrate, inverse
+from tactile.base.se2 import integrate
 
 SAME_PLACE = 2.5  # largest true distance between the ends of a true loop closure, pose cells
 
@@ -81,7 +83,10 @@ def _play(job: Job) -> dict[str, Any]:
         quantities = score_run(run, source.name, exm=exm, relations=relations).quantities
         quantities |= quantity("recognition_error", recognition_error(quantities)) | extra
         quantities |= _closures(session, run.truth, config.pose_cells.cell_size)
-        quantities |= quantity("lost_share", Finding(lost)) | _anchored(run) | _grid_map(session, source)
+        quantities |= quantity("lost_share", Finding(lost))
+        for name, finding in anchored_errors(run).items():
+            quantities |= quantity(name, finding)
+        quantities |= _grid_map(session, source)
     outcome = {"steps": len(run.time), "source": source.digest, "quantities": quantities}
     return outcome | {"measured": watch.times()}
 
@@ -120,14 +125,6 @@ def _take_steps(session: Session, source: Source, pace: str, watch: Stopwatch) -
     return run, float(np.mean([bool(step.estimate.lost) for step in estimates]))
 
 
-def recognition_error(quantities: dict[str, Quantity]) -> Finding:
-    """1 - ARR x ARCR; ARCR is undefined where ARR is 0."""
-    arr, arcr = (quantities[name].value for name in ("exm_arr", "exm_arcr_strict"))
-    if arr is None or (arr and arcr is None):
-        return Finding(np.nan)
-    return Finding(1 - arr * (arcr or 0.0))
-
-
 def _closures(session: Session, truth: np.ndarray | None, cell: float) -> dict[str, Quantity]:
     """Number of loop closures and of false ones."""
     closures, false = session.map.closures(), Finding(np.nan)
@@ -135,20 +132,6 @@ def _closures(session: Session, truth: np.ndarray | None, cell: float) -> dict[s
         apart = np.hypot(*(truth[closures[:, 0]] - truth[closures[:, 1]])[:, :2].T)
         false = Finding(int((apart > SAME_PLACE * cell).sum()))
     return quantity("closures", Finding(len(closures))) | quantity("false_closures", false)
-
-
-def _anchored(run: RunArrays) -> dict[str, Quantity]:
-    """Mean position errors where the first true pose is given and paths are not aligned."""
-    truth = run.truth
-    if truth is None or not np.isfinite(truth).all():
-        return {}
-    # All backends take the first step from odometry, so its error is not theirs.
-    start = compose(truth[0], inverse(run.odometry[0]))
-    paths = run.online, run.final, run.odometry
-    apart = [np.hypot(*(compose(start, path) - truth)[:, :2].T) for path in paths]
-    online, final, odometry = (float(each.mean()) for each in apart)
-    error = quantity("error_online", Finding(online, odometry))
-    return error | quantity("error_final", Finding(final, odometry))
 
 
 def _grid_map(session: Session, source: Source) -> dict[str, Quantity]:

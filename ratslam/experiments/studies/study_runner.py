@@ -8,8 +8,8 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from evaluation.metrics.resources import one_core
 from ratslam.experiments.studies.executor import Executor
-from ratslam.experiments.studies.machine import one_core
 from ratslam.experiments.studies.records import RunLog, RunRecord, record_of
 from ratslam.experiments.studies.run_job import run_job, run_job_alone
 from ratslam.experiments.studies.study import Job

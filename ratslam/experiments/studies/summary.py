@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from evaluation.metrics.metric import Direction
+from evaluation.metrics.statistics import pareto_optimal
 from ratslam.experiments.studies.metrics import DEFAULT_ERRORS, MEASURED, METRICS
 from ratslam.experiments.studies.records import RunRecord
 
@@ -99,17 +100,6 @@ def spread(values: Sequence[float | None], name: str) -> Spread | None:
     deviation = statistics.stdev(known) if len(known) > 1 else None
     mean, median = statistics.fmean(known), statistics.median(known)
     return Spread(tuple(values), mean, deviation, median, low, high, worst)
-
-
-def pareto_optimal(costs: np.ndarray) -> np.ndarray:
-    """[N] whether a row of costs [N, K] is Pareto-optimal: no other is at most equal in all and less in one.
-
-    Equal rows are optimal together. A row with a NaN is not optimal and dominates no other.
-    """
-    known = ~np.isnan(costs).any(axis=1)
-    no_dearer = (costs[:, None] <= costs[None]).all(axis=2)
-    cheaper = (costs[:, None] < costs[None]).any(axis=2)
-    return known & ~(no_dearer & cheaper).any(axis=0)
 
 
 def _row(group: Sequence[RunRecord], odometry: bool = False) -> Row:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from evaluation.metrics.metric import Finding, Quantity
+from evaluation.metrics.view_separation import image_difference
 from ratslam.config.run_config import RunConfig
 from ratslam.experiments.studies.metrics import quantity
 from ratslam.experiments.studies.study import with_settings
@@ -38,22 +39,6 @@ def compare_with_tier(config: RunConfig, log: InMemorySource, cost: float, tier:
         | quantity("contact_difference", Finding(contact))
         | quantity("height_difference", Finding(1e3 * height))
     )
-
-
-def image_difference(views: np.ndarray, reference: np.ndarray, tallest: float) -> tuple[float, float]:
-    """Difference of images [N, R, C, K] in their first channel.
-
-    Args:
-        tallest: height of a white pixel, m.
-
-    Returns:
-        share of pixels whose contact state differs; mean absolute height difference where both have contact,
-        m, NaN where none do.
-    """
-    a, b = views[..., 0], reference[..., 0]
-    both = (a > 0) & (b > 0)
-    height = float(np.abs(a - b)[both].mean() * tallest) if both.any() else np.nan
-    return float(((a > 0) != (b > 0)).mean()), height
 
 
 def with_tier(config: RunConfig, tier: str) -> RunConfig:

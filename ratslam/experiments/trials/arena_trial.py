@@ -30,10 +30,8 @@ from tactile.wall_estimation.report_frontend import ReportFrontend, ReportFronte
 from tactile.wall_estimation.strain_templates import StrainTemplates
 from tactile.whiskers.planar_whiskers import PlanarWhiskers
 
-MAP_SCALE = 2.0
-"""Side of a drawn map over the side of the arena (Fox et al. 2012, II-D)."""
-MAP_MARGIN = 0.4
-"""Margin of the filter's map, which is centred on the start, beyond the arena, m."""
+MAP_SCALE = 2.0  # side of a drawn map over the side of the arena (Fox et al. 2012, II-D)
+MAP_MARGIN = 0.4  # margin of the filter's map, which is centred on the start, beyond the arena, m
 
 
 class ArenaSession(NamedTuple):

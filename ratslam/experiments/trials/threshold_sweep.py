@@ -24,16 +24,7 @@ from robot.touch_source import observation_of
 from tactile.base.types import Array, Observation, stack
 
 
-def sweep_thresholds(config: RunConfig, log: InMemorySource, thresholds: np.ndarray) -> np.ndarray:
-    """[B, T] the current experience at each of T steps with the classic method at thresholds [B].
-
-    Raises:
-        ValueError: the configuration has another method.
-    """
-    return np.asarray(sweep_steps(config, log, thresholds)[0].place)
-
-
-def sweep_steps(
+def sweep_thresholds(
     config: RunConfig, log: InMemorySource, thresholds: np.ndarray
 ) -> tuple[Estimate, ClassicEvidence]:
     """Estimate and evidence of T steps with the classic method at thresholds [B]; leading axes [B, T].

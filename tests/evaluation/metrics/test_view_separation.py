@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
 
 from evaluation.metrics.statistics import auc
-from evaluation.metrics.view_separation import ViewDifferences, compare_views
+from evaluation.metrics.view_separation import ViewDifferences, compare_views, image_difference
 from tactile.base.errors import InputError
 
+VIEWS = arrays.arrays(float, (5, 3, 6, 1), elements=st.sampled_from([0.0, 0.02, 0.5, 1.0]))
 VALUES = st.lists(st.integers(0, 5), min_size=1, max_size=9)
 
 
@@ -53,3 +55,26 @@ def test_quantiles_and_shares_are_read_from_the_histograms():
     views = ViewDifferences(np.linspace(0, 1, 11), np.eye(10, dtype=int)[1] * 8, np.ones(10, int), 0.9)
     assert views.quantile(views.same, 0.5) == pytest.approx(0.15)
     assert views.share_below(views.other, 0.15) == pytest.approx(0.15)
+
+
+@given(VIEWS, VIEWS)
+def test_images_differ_by_contacts_and_by_heights(a, b):
+    contact, height = image_difference(a, b, 0.05)
+    assert image_difference(a, a, 0.05)[0] == 0
+    assert contact == image_difference(b, a, 0.05)[0] == np.mean((a > 0) != (b > 0))
+    both = (a > 0) & (b > 0)
+    if both.any():
+        assert height == pytest.approx(0.05 * np.abs(a - b)[both].mean())
+    else:
+        assert np.isnan(height)
+
+
+def test_only_heights_count_where_both_touch():
+    a = np.zeros((1, 3, 6, 2))
+    b = a.copy()
+    a[0, 0, 0, 0], b[0, 0, 0, 0] = 0.4, 0.6
+    a[0, 1, 0, 0] = 1.0
+    b[..., 1] = 0.7  # the radial channel has no effect on contacts
+    contact, height = image_difference(a, b, 0.05)
+    assert contact == pytest.approx(1 / 18)
+    assert height == pytest.approx(0.01)

@@ -18,7 +18,7 @@ from ratslam.experiments.salman2016.protocols import PROTOCOLS, THRESHOLDS, Clai
 from ratslam.experiments.salman2016.reproduction import PAPER, match_thresholds, plan_jobs, session_config
 from ratslam.experiments.trials import reproduction
 from ratslam.experiments.trials.reproduction import ResultRow, column, reproduce
-from ratslam.experiments.trials.threshold_sweep import sweep_steps, sweep_thresholds
+from ratslam.experiments.trials.threshold_sweep import sweep_thresholds
 from ratslam.experiments.trials.touch_trial import capacity_for, collect_session, run_session
 from robot.sources.in_memory import truncate_log
 from robot.touch_source import observation_of
@@ -65,12 +65,12 @@ def test_a_threshold_sweep_equals_single_sessions(tiny):
     """In the current experiences, and in the map that the steps of a threshold are folded into."""
     config, log = tiny
     thresholds = np.array([0.06, config.templates.threshold])
-    first, second = sweep_thresholds(config, log, thresholds)
+    columns = sweep_thresholds(config, log, thresholds)
+    first, second = columns[0].place
     assert len(np.unique(first)) != len(np.unique(second))
     alone = run_session(config, log)
     assert np.array_equal(second, alone.place)
     folded = ExperienceMap(config.experience)
-    columns = sweep_steps(config, log, thresholds)
     for row, sample in enumerate(log):
         estimate, evidence = jax.tree.map(lambda column, row=row: column[1, row], columns)
         folded.update(observation_of(sample), estimate, evidence)

@@ -5,11 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as arrays
 
 from ratslam.cli import main
 from ratslam.cli.studies import PRESETS
@@ -23,7 +19,7 @@ from ratslam.experiments.studies.presets import (
     variations,
 )
 from ratslam.experiments.studies.records import RunLog
-from ratslam.experiments.studies.tiers import image_difference, shortened
+from ratslam.experiments.studies.tiers import shortened
 from tactile.base.errors import InputError
 
 ROOT = Path(__file__).parents[4]
@@ -34,7 +30,6 @@ pose_cells: {cells_xy: 11, cells_heading: 12}
 backend: classic
 """
 TINY = "simulation: {maze: {columns: 2, rows: 2, loop: 4}, path: {circuits: CC}, raw: true}\n"
-VIEWS = arrays.arrays(float, (5, 3, 6, 1), elements=st.sampled_from([0.0, 0.02, 0.5, 1.0]))
 
 
 def preset(name, path=SQUARE, *overrides, **options):
@@ -152,29 +147,6 @@ def test_the_error_of_a_run_is_reported_unchanged(tmp_path, capsys):
     command = ["study", "--preset", "backends", str(SQUARE), "-o", str(tmp_path / "out"), "--workers", "1"]
     assert main([*command, "--set", "recording.file=nothing.npz"]) == 2
     assert "nothing.npz" in capsys.readouterr().err
-
-
-@given(VIEWS, VIEWS)
-def test_images_differ_by_contacts_and_by_heights(a, b):
-    contact, height = image_difference(a, b, 0.05)
-    assert image_difference(a, a, 0.05)[0] == 0
-    assert contact == image_difference(b, a, 0.05)[0] == np.mean((a > 0) != (b > 0))
-    both = (a > 0) & (b > 0)
-    if both.any():
-        assert height == pytest.approx(0.05 * np.abs(a - b)[both].mean())
-    else:
-        assert np.isnan(height)
-
-
-def test_only_heights_count_where_both_touch():
-    a = np.zeros((1, 3, 6, 2))
-    b = a.copy()
-    a[0, 0, 0, 0], b[0, 0, 0, 0] = 0.4, 0.6
-    a[0, 1, 0, 0] = 1.0
-    b[..., 1] = 0.7  # the radial channel has no effect on contacts
-    contact, height = image_difference(a, b, 0.05)
-    assert contact == pytest.approx(1 / 18)
-    assert height == pytest.approx(0.01)
 
 
 def test_sessions_are_shortened_to_whole_laps_or_to_a_time():

@@ -11,15 +11,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from evaluation.metrics.run_metrics import recognition_error
+from evaluation.metrics.statistics import pareto_optimal
 from ratslam.experiments.studies.metrics import COLUMNS, METRICS, find_error
 from ratslam.experiments.studies.report import make_report, render, save_report
-from ratslam.experiments.studies.run_job import recognition_error
 from ratslam.experiments.studies.schema import StudyPlan
 from ratslam.experiments.studies.summary import (
     default_error,
     label,
     mark_optimal,
-    pareto_optimal,
     spread,
     summarise,
 )

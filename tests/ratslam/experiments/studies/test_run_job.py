@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from pathlib import Path
 
 import jax
@@ -11,14 +10,7 @@ import pytest
 
 from evaluation.artifacts.run_directory import read_scorecard
 from evaluation.metrics.grid_metrics import GRID_METRICS
-from ratslam.experiments.studies.machine import (
-    COMPILED,
-    Stopwatch,
-    one_core,
-    peak_memory,
-    reset_peak_memory,
-    watch_load,
-)
+from ratslam.experiments.studies.machine import COMPILED, Stopwatch
 from ratslam.experiments.studies.metrics import MEASURED, METRICS
 from ratslam.experiments.studies.run_job import run_job
 from ratslam.experiments.studies.study import read_study
@@ -140,34 +132,6 @@ def test_a_stopwatch_counts_compilations_of_jax():
             compiled(1.0).block_until_ready()
     times = watch.times()
     assert 0 < 1e-6 * times["step_time"] < times["compile_time"]
-
-
-def test_memory_is_measured_for_one_piece_of_work():
-    reset_peak_memory()
-    before = peak_memory()
-    large = bytearray(200 << 20)
-    large[::4096] = b"x" * len(large[::4096])
-    del large
-    peak = peak_memory()
-    reset_peak_memory()
-    after = peak_memory()
-    assert peak >= before > 0
-    if Path("/proc/self/clear_refs").exists():
-        assert peak - before > 150
-        assert after < peak - 100
-
-
-def test_measuring_uses_one_core_and_releases_it():
-    if not hasattr(os, "sched_getaffinity"):
-        pytest.skip("this system does not say on which cores a process runs")
-    cores = os.sched_getaffinity(0)
-    load = watch_load()
-    with one_core():
-        assert len(os.sched_getaffinity(0)) == 1
-        assert os.sched_getaffinity(0) <= cores
-    assert os.sched_getaffinity(0) == cores
-    found = load()
-    assert found is None or found >= 0
 
 
 def test_a_perturbed_copy_is_another_session(tiny):
