@@ -79,7 +79,7 @@ def test_a_head_below_its_rate_is_refused(bench: Bench) -> None:
     with bench.session(rate_check=True) as session:
         assert session.code() == 2, session.output()
         assert "Traceback" not in session.output(), session.output()
-        for text in ("head: 0 of 2000 samples a second", "check the USB hub and cable"):
+        for text in ("head: 0 of 2000 samples per second", "check the USB hub and cable"):
             assert text in session.output()
         assert not session.directory.exists()
     assert moves(bench.arm, sent) == []
