@@ -228,7 +228,7 @@ def test_a_former_command_names_its_replacement(command, capsys):
 
 @pytest.mark.soak
 def test_an_interrupt_keeps_finished_runs_and_ends_all_processes(tiny, tmp_path):
-    study, output = tiny(seeds=60), tmp_path / "out"
+    study, output = tiny(seeds=300), tmp_path / "out"
     for count in (2, 6):
         process = start(study, output, "--workers", "2")
         wait_for(count, output, process)
