@@ -155,7 +155,7 @@ class Executor(ExitStack):
             cluster = LocalCluster(
                 n_workers=workers, threads_per_worker=1, processes=True, host="127.0.0.1", memory_limit=0,
                 dashboard_address=None, scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
-            silence_logs=logging.CRITICAL,
+                silence_logs=logging.CRITICAL,
             )  # fmt: skip
             self.enter_context(cluster)
             self.callback(_kill_workers, cluster)
@@ -244,6 +244,9 @@ def _end_with_parent() -> None:
 @contextmanager
 def _holding_interrupts() -> Iterator[None]:
     """Ctrl-C waits for the end of the block; processes started in it, and their successors, ignore it."""
+    if not hasattr(signal, "pthread_sigmask"):  # not on this system
+        yield
+        return
     resource_tracker.ensure_running()  # its start would end the block of the signal
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
