@@ -18,7 +18,6 @@ PRESETS: dict[PresetName, dict[str, dict[str, Any]]] = {
             "min_score": 12.0,
             "max_distance": 60.0,
             "sequence_agreement": 0.2,
-            "breaks": False,
             "select_every": 50,
             "solve_every": 20,
             "max_turn": 0.6,

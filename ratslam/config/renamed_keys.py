@@ -19,6 +19,7 @@ RENAMED: dict[str, str] = {
     "keyframes.doubt": "keyframes.sequence_cost",
     "keyframes.stray": "keyframes.closure_cost_limit",
     "keyframes.facing": "keyframes.max_turn",
+    "keyframes.breaks": "keyframes.may_be_carried",
     "keyframes.weigh_every": "keyframes.select_every",
     "keyframes.weigh_score": "keyframes.select_score",
     "keyframes.weigh_length": "keyframes.select_length",

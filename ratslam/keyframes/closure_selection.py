@@ -2,9 +2,9 @@
 
 Refusing a sequence costs its evidence, accepting it costs the strain on the map. So the robust cost of a
 sequence is at most twice its evidence (in chi-square), and the sequences of the map with the least total cost
-are selected. The cost has many local minima, so it is minimised from several starts. The odometry is cut (the
-robot was carried away) where that saves more than the cost of a cut. The rules are ours; robust weights by
-Geman & McClure 1985, several starts after Latif et al. 2013."""
+are selected. The cost has many local minima, so it is minimised from several starts. For a robot that may be
+carried, the odometry is cut where that saves more than the cost of a cut. The rules are ours; robust weights
+by Geman & McClure 1985, several starts after Latif et al. 2013."""
 
 from __future__ import annotations
 
@@ -67,21 +67,35 @@ of the keyframes that follow a keyframe; the motion [3] that moves the last of t
 recognised; the number of that keyframe."""
 
 
-def select_closures(
-    case: SelectionProblem, starts: Sequence[MapFit], find: FindCut, earlier: tuple[tuple[int, int], ...] = ()
-) -> Selection:
-    """The selection with the least cost.
+def select_closures(case: SelectionProblem, starts: Sequence[MapFit]) -> Selection:
+    """The selection with the least cost, without cuts.
 
     Args:
-        starts: maps to start from; the first is the current map, the last dead reckoning. find: see
-            `FindCut`. earlier: cuts (keyframe, sequence) of the current map.
+        starts: maps to start from; the first is the current map, the last dead reckoning.
+    """
+    return _search(case, starts, optimise_with_cuts(case, starts[0], ()))
+
+
+def select_closures_and_cuts(
+    case: SelectionProblem, starts: Sequence[MapFit], find: FindCut, earlier: tuple[tuple[int, int], ...] = ()
+) -> Selection:
+    """The selection with the least cost for a robot that may be carried: with cuts of the odometry.
+
+    Args:
+        starts: see `select_closures`. find: see `FindCut`. earlier: cuts (keyframe, sequence) of the current
+            map.
     """
     best = optimise_with_cuts(case, starts[0], earlier)
     if earlier:  # the cuts may have become unnecessary
         best = min(best, optimise_with_cuts(case, starts[0], ()), key=_cost)
-    if not (best.fit.weights > ACCEPTED_WEIGHT).all():
-        best = min([best, *_optimise_anew(case, starts)], key=_cost)
-    return _with_cuts(case, best, find)
+    return _with_cuts(case, _search(case, starts, best), find)
+
+
+def _search(case: SelectionProblem, starts: Sequence[MapFit], best: Selection) -> Selection:
+    """The best selection of all starts, where `best` does not accept all sequences."""
+    if (best.fit.weights > ACCEPTED_WEIGHT).all():
+        return best
+    return min([best, *_optimise_anew(case, starts)], key=_cost)
 
 
 def _optimise_anew(case: SelectionProblem, starts: Sequence[MapFit]) -> list[Selection]:

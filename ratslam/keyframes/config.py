@@ -65,12 +65,13 @@ class KeyframeMapConfig(Settings):
     """Least robust scale."""
     robust_most: PositiveFloat = 20.0
     """Largest robust scale."""
-    breaks: bool = True
-    """Whether long sequences that contradict the map break the odometry."""
+    may_be_carried: bool = False
+    """Whether the robot may be carried during a session: only then the odometry is cut."""
     break_length: PositiveInt = 32
-    """Least number of candidates of a sequence that breaks the odometry."""
+    """Least number of candidates of a sequence that cuts the odometry of a robot that may be carried, without
+    selection."""
     break_score: PositiveFloat = 100.0
-    """Least evidence of a sequence that breaks the odometry."""
+    """Least evidence of such a sequence."""
     sequence_agreement: NonNegativeFloat = 0.0
     """Largest difference between a whole sequence and the odometry, beside `agreement`, as a share of the
     distance; 0: compared only from one candidate to the next."""

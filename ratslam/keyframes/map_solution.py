@@ -16,6 +16,7 @@ from ratslam.keyframes.closure_selection import (
     Selection,
     SelectionProblem,
     select_closures,
+    select_closures_and_cuts,
 )
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import ClosureLog, Verdict
@@ -78,11 +79,15 @@ def _select(
     sequences: np.ndarray,
     earlier: tuple[tuple[int, int], ...],
 ) -> Selection:
-    """Selects among the sequences `sequences`, starting from the current map and from dead reckoning."""
+    """Selects among the sequences `sequences`, starting from the current map and from dead reckoning. The
+    odometry is cut only if the robot may be carried."""
     problem, pose = graph.problem(log, cut), graph.pose.rows
     chain = problem.chain
     path = integrate(correct_heading_bias(chain.motion, chain.length, graph.prior.mean), pose[0])
     reckoned = MapFit(np.concatenate([pose[:1], path]), graph.prior.mean, np.zeros(0))
     present = graph.fit()._replace(poses=pose.copy())
     case = SelectionProblem(problem, log.scores()[sequences], *log.spans()[sequences].T)
-    return select_closures(case, [present, reckoned], partial(find_break, graph), earlier)
+    starts = [present, reckoned]
+    if not graph.config.may_be_carried:
+        return select_closures(case, starts)
+    return select_closures_and_cuts(case, starts, partial(find_break, graph), earlier)

@@ -16,7 +16,7 @@ class SequenceTest(NamedTuple):
 
     Attributes:
         fits: it is accepted. distance: squared Mahalanobis distance of its newest candidate. breaks_odometry:
-            it contradicts the map and is so long that the odometry must be broken.
+            it contradicts the map and is so long that the robot, if that is possible, was carried.
     """
 
     fits: bool
@@ -50,7 +50,8 @@ def verify_sequence(
         return None
     distance, chance = _distance(graph, log, candidate) if graph.ablation.verify else (0.0, 0.0)
     fits = distance < config.max_distance and score - distance / 2 - chance >= config.min_score
-    broken = config.breaks and length >= config.break_length and score >= config.break_score
+    carried = config.may_be_carried and not config.select_every  # selection places its own cuts
+    broken = carried and length >= config.break_length and score >= config.break_score
     return SequenceTest(fits, distance, not fits and broken and distance >= config.max_distance)
 
 

@@ -21,7 +21,8 @@ from ratslam.pipeline.source import open_observations, read_observations
 from tactile.base.types import Observation
 
 FOLDER = Path(__file__).parent
-SESSIONS = ("touch_circuits", "touch_kidnap")
+SESSIONS = {"touch_circuits": {}, "touch_kidnap": {"may_be_carried": True}}
+"""The settings `keyframes` of each session."""
 ROWS = 1024
 """Rows reserved for a session, so that its kernel is compiled once."""
 
@@ -30,7 +31,11 @@ def decisions(name: str) -> dict[str, Any]:
     """The decisions on a session: experiences as [id, steps] in order, counts of actions, closures as
     [later, earlier] steps, counts of the Experience Metric."""
     config = RunConfig.model_validate(
-        {"recording": {"file": FOLDER / f"{name}.mcap"}, "session": {"reserve": ROWS}}
+        {
+            "recording": {"file": FOLDER / f"{name}.mcap"},
+            "session": {"reserve": ROWS},
+            "keyframes": SESSIONS[name],
+        }
     )
     with open_observations(config) as (config, source):
         session = build_session(config, source)

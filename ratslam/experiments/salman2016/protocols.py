@@ -120,7 +120,8 @@ PROTOCOLS = {
         (
             Condition("not kidnapped", RCP_CONTACT),
             Condition("8 kidnaps",
-                      (*RCP_CONTACT, "simulation.kidnaps.count=8", "simulation.kidnaps.ahead=45.0")),
+                      (*RCP_CONTACT, "simulation.kidnaps.count=8", "simulation.kidnaps.ahead=45.0",
+                       "keyframes.may_be_carried=true")),
         ),
         METRICS,
         (

@@ -28,11 +28,11 @@ PARTS: dict[str, dict[str, Any]] = {
     "without heading bias in the map": {"ablation": {"heading_bias": False}},
     "without heading bias from views": {"keyframes.bias_from_views": False},
     "without both heading biases": {"keyframes.bias_from_views": False, "ablation": {"heading_bias": False}},
-    "without odometry breaks": {"keyframes.breaks": False},
+    "as a robot that may be carried": {"keyframes.may_be_carried": True},
     "without injection into the pose cells": {"recall.energy": 1.0e-12},
     "without loop closures": {"experience.closures": False},
 }
-"""Parts that `ablate` turns off, by setting."""
+"""Parts that `ablate` turns off, by setting; and cuts of the odometry, which are off unless configured."""
 CLASSIC: dict[str, Any] = {"backend": "classic", "templates.energy": 0.05}  # the classic backend for whiskers
 CHOICES: dict[str, dict[str, Any]] = {
     "as configured": {},

@@ -35,12 +35,14 @@ GOLDEN = "../tests/golden"
 
 
 class Recording(NamedTuple):
-    """A row: its label, configuration, another recording in `GOLDEN`, and whether it is one of `DATA`."""
+    """A row: its label, configuration, another recording in `GOLDEN`, whether it is one of `DATA`, and
+    assignments of settings."""
 
     label: str
     config: str
     file: str = ""
     real: bool = False
+    settings: tuple[str, ...] = ()
 
 
 ROWS = {
@@ -48,7 +50,12 @@ ROWS = {
     "figure8": Recording(
         "`b_figure8_alias`, a third of the places look alike", "configs/square.yaml", "b_figure8_alias.npz"
     ),
-    "kidnap": Recording("`e_kidnap`, carried away once", "configs/square.yaml", "e_kidnap.npz"),
+    "kidnap": Recording(
+        "`e_kidnap`, carried away once, `keyframes.may_be_carried`",
+        "configs/square.yaml",
+        "e_kidnap.npz",
+        settings=("keyframes.may_be_carried=true",),
+    ),
     "tuc": Recording(
         "`configs/tuc_lecture_hall.yaml`, real, given place ids", "configs/tuc_lecture_hall.yaml", real=True
     ),
@@ -134,7 +141,7 @@ def _missing(recording: Recording, folder: Path) -> str:
 def _config(recording: Recording, folder: Path, assignments: Sequence[str] = ()) -> RunConfig:
     path = folder / recording.config
     other = [f"recording.file={GOLDEN}/{recording.file}"] if recording.file else []
-    document = override(load(path), [*other, *assignments])
+    document = override(load(path), [*other, *recording.settings, *assignments])
     return validate(document, RunConfig).with_absolute_paths(path.parent.resolve())
 
 

@@ -49,7 +49,7 @@ def _grid(dtype=np.float64):
 # Selects sequences every few frames, so that it does so throughout the session.
 TOUCH = {
     "recall": {"sector_fov": "whiskers"},
-    "keyframes": {"select_every": 15, "breaks": False, "sequence_agreement": 0.2},
+    "keyframes": {"select_every": 15, "may_be_carried": True, "sequence_agreement": 0.2},
 }
 
 

@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 
 from ratslam.keyframes import closure_selection
-from ratslam.keyframes.closure_selection import ACCEPTED_WEIGHT, CUT, STEPS, SelectionProblem, select_closures
+from ratslam.keyframes.closure_selection import (
+    ACCEPTED_WEIGHT,
+    CUT,
+    STEPS,
+    SelectionProblem,
+    select_closures,
+    select_closures_and_cuts,
+)
 from ratslam.keyframes.optimizer import (
     BiasPrior,
     LoopClosures,
@@ -135,7 +142,7 @@ def off(fit: MapFit, truth: np.ndarray) -> float:
 def test_true_sequences_are_all_accepted(seed):
     made = world(seed)
     case, starts = made.case, made.starts()
-    judged = select_closures(case, starts, made.find_cut)
+    judged = select_closures_and_cuts(case, starts, made.find_cut)
     assert (judged.fit.weights > ACCEPTED_WEIGHT).all()
     assert judged.cuts == ()
     plain = solve(starts[0], case.measurements, STEPS, closure_selection.FINE)
@@ -149,7 +156,7 @@ def test_true_sequences_are_all_accepted(seed):
 @pytest.mark.parametrize("seed", range(6))
 def test_a_false_sequence_is_refused(seed, evidence):
     made = world(seed, false=evidence)
-    judged = select_closures(made.case, made.starts(), made.find_cut)
+    judged = select_closures_and_cuts(made.case, made.starts(), made.find_cut)
     assert judged.fit.weights[-1] < ACCEPTED_WEIGHT
     assert (judged.fit.weights[:-1] > ACCEPTED_WEIGHT).all()
     assert judged.cuts == ()
@@ -165,7 +172,7 @@ def test_a_false_sequence_is_refused(seed, evidence):
 
 def test_a_false_sequence_with_much_evidence_is_refused():
     made = world(0, false=60.0)
-    judged = select_closures(made.case, made.starts(), made.find_cut)
+    judged = select_closures_and_cuts(made.case, made.starts(), made.find_cut)
     assert judged.fit.weights[-1] < ACCEPTED_WEIGHT
 
 
@@ -180,7 +187,7 @@ def test_a_map_bent_by_a_false_sequence_is_corrected(seed):
     bent = solve(
         MapFit(path.poses, 0.0, np.zeros(0)), MapProblem(made.case.measurements.chain, believing, PRIOR), 40
     )
-    judged = select_closures(made.case, [bent, path], made.find_cut)
+    judged = select_closures_and_cuts(made.case, [bent, path], made.find_cut)
     assert off(bent, made.truth) > 2 * off(judged.fit, made.truth)
     assert judged.fit.weights[-1] < ACCEPTED_WEIGHT
     assert off(judged.fit, made.truth) < 0.1
@@ -191,7 +198,7 @@ def test_a_present_map_of_high_cost_is_replaced(seed):
     made = world(seed)
     stream = np.random.default_rng(seed)
     lost = made.reckoned()._replace(poses=stream.uniform(-2, 2, made.truth.shape))
-    judged = select_closures(made.case, [lost, made.reckoned()], made.find_cut)
+    judged = select_closures_and_cuts(made.case, [lost, made.reckoned()], made.find_cut)
     assert (judged.fit.weights > ACCEPTED_WEIGHT).all()
     assert off(judged.fit, made.truth) < 0.1
 
@@ -201,7 +208,8 @@ def test_a_sequence_with_more_evidence_may_strain_the_map_more():
     case = made.case
     strict, lenient = (rescaled(case, by) for by in (0.1, 10))
     weights = [
-        select_closures(one, made.starts(), made.find_cut).fit.weights for one in (strict, case, lenient)
+        select_closures_and_cuts(one, made.starts(), made.find_cut).fit.weights
+        for one in (strict, case, lenient)
     ]
     assert (weights[0] < weights[1]).all()
     assert (weights[1] < weights[2]).all()
@@ -220,9 +228,9 @@ def test_the_cost_is_never_above_that_of_the_present_map(seed):
     present = present._replace(
         poses=present.poses + stream.normal(0, 0.02, present.poses.shape) * [1, 1, 0.2]
     )
-    judged = select_closures(case, [present, made.reckoned()], made.find_cut)
+    judged = select_closures_and_cuts(case, [present, made.reckoned()], made.find_cut)
     assert judged.cost <= robust_cost(present, case.measurements)
-    again = select_closures(case, [judged.fit, made.reckoned()], made.find_cut, judged.cuts)
+    again = select_closures_and_cuts(case, [judged.fit, made.reckoned()], made.find_cut, judged.cuts)
     assert again.cost <= judged.cost + 0.5  # solver steps, not another map
     severed = closure_selection.cut_odometry(case.measurements, judged.cuts)
     whole = robust_cost(judged.fit, severed) + CUT * len(judged.cuts)
@@ -244,7 +252,7 @@ def test_the_order_of_sequences_does_not_matter(seed):
         )),
         case.evidence[order], case.first[order], case.last[order],
     )  # fmt: skip
-    one, two = (select_closures(c, made.starts(), made.find_cut) for c in (case, renamed))
+    one, two = (select_closures_and_cuts(c, made.starts(), made.find_cut) for c in (case, renamed))
     assert two.cost == pytest.approx(one.cost, rel=1e-6)
     assert np.allclose(two.fit.poses, one.fit.poses, atol=1e-6)
     assert np.allclose(two.fit.weights, one.fit.weights[order], atol=1e-6)
@@ -254,10 +262,26 @@ def test_the_order_of_sequences_does_not_matter(seed):
 # Cuts
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_a_robot_that_is_never_carried_keeps_its_odometry(seed):
+    """Without cuts, the selection is that of the same search; where a robot was carried, it costs more."""
+    carried = ((2 * LAP + 10, 25),) if seed % 2 else ()
+    made = world(seed, jumps=carried, false=40.0)
+    plain = select_closures(made.case, made.starts())
+    cut = select_closures_and_cuts(made.case, made.starts(), made.find_cut)
+    assert plain.cuts == ()
+    assert plain.cost == robust_cost(plain.fit, made.case.measurements)
+    if carried:
+        assert cut.cost < plain.cost
+    else:
+        assert cut.cost == plain.cost
+        assert np.array_equal(cut.fit.poses, plain.fit.poses)
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_nothing_is_cut_without_a_jump(seed):
     made = world(seed, false=50.0 * (seed % 2))
-    assert select_closures(made.case, made.starts(), made.find_cut).cuts == ()
+    assert select_closures_and_cuts(made.case, made.starts(), made.find_cut).cuts == ()
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -265,7 +289,7 @@ def test_the_odometry_is_cut_where_the_robot_was_carried(seed):
     stream = np.random.default_rng(seed)
     jump = int(stream.integers(2 * LAP + 5, 3 * LAP)), int(stream.integers(15, 45))
     made = world(seed, jumps=(jump,))
-    judged = select_closures(made.case, made.starts(), made.find_cut)
+    judged = select_closures_and_cuts(made.case, made.starts(), made.find_cut)
     assert [frame for frame, _ in judged.cuts] == [jump[0]]
     assert made.case.first[judged.cuts[0][1]] >= jump[0]
     assert (judged.fit.weights > ACCEPTED_WEIGHT).all()
@@ -278,7 +302,7 @@ def test_two_cuts_are_made_for_a_robot_carried_away_and_back(seed):
     stream = np.random.default_rng(seed)
     away, stay, places = 2 * LAP + 5 + 20 * int(stream.integers(3)), 60, int(stream.integers(15, 45))
     made = world(seed, laps=5, jumps=((away, places), (away + stay, -places)), least=35.0)
-    judged = select_closures(made.case, made.starts(), made.find_cut)
+    judged = select_closures_and_cuts(made.case, made.starts(), made.find_cut)
     assert sorted(frame for frame, _ in judged.cuts) == [away, away + stay]
     assert (judged.fit.weights > ACCEPTED_WEIGHT).all()
     assert off(judged.fit, made.truth) < 0.1
@@ -287,7 +311,7 @@ def test_two_cuts_are_made_for_a_robot_carried_away_and_back(seed):
 def test_a_visit_is_cut_out_for_sequences_of_any_evidence():
     jumps = ((2 * LAP + 45, 34), (2 * LAP + 85, -34))
     made = world(0, laps=5, jumps=jumps, least=44.0, most=45.0)
-    judged = select_closures(made.case, made.starts(), made.find_cut)
+    judged = select_closures_and_cuts(made.case, made.starts(), made.find_cut)
     whole = closure_selection.optimise_with_cuts(
         made.case, MapFit(made.truth.copy(), 0.0, np.zeros(0)), ((jumps[0][0], 5), (jumps[1][0], 7))
     )
@@ -297,8 +321,8 @@ def test_a_visit_is_cut_out_for_sequences_of_any_evidence():
 @pytest.mark.parametrize("seed", range(4))
 def test_an_earlier_cut_is_kept(seed):
     made = world(seed, jumps=((150, 25),))
-    first = select_closures(made.case, made.starts(), made.find_cut)
-    again = select_closures(made.case, [first.fit, made.reckoned()], made.find_cut, first.cuts)
+    first = select_closures_and_cuts(made.case, made.starts(), made.find_cut)
+    again = select_closures_and_cuts(made.case, [first.fit, made.reckoned()], made.find_cut, first.cuts)
     assert again.cuts == first.cuts
     assert np.allclose(again.fit.poses, first.fit.poses, atol=0.01)
 
@@ -306,7 +330,7 @@ def test_an_earlier_cut_is_kept(seed):
 @pytest.mark.parametrize("seed", range(4))
 def test_a_useless_cut_is_removed(seed):
     made = world(seed)
-    plain = select_closures(made.case, made.starts(), made.find_cut)
-    judged = select_closures(made.case, made.starts(), made.find_cut, ((150, 4),))
+    plain = select_closures_and_cuts(made.case, made.starts(), made.find_cut)
+    judged = select_closures_and_cuts(made.case, made.starts(), made.find_cut, ((150, 4),))
     assert judged.cuts == ()
     assert judged.cost == pytest.approx(plain.cost, rel=1e-3)

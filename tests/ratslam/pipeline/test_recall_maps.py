@@ -26,9 +26,12 @@ GOLDEN = Path(__file__).parents[2] / "golden"
 
 
 @cache
-def session_of(view_shape: tuple[int, ...], cell_size: float | None, precision: str) -> Session:
+def session_of(
+    view_shape: tuple[int, ...], cell_size: float | None, precision: str, **keyframes: bool
+) -> Session:
     """A session with one setting for all, on pose cells small enough for a test, compiled once."""
-    config = RecallBackendConfig.model_validate({"pose_cells": {"cells_xy": 11, "cell_size": cell_size}})
+    cells = {"cells_xy": 11, "cell_size": cell_size}
+    config = RecallBackendConfig.model_validate({"pose_cells": cells, "keyframes": keyframes})
     return Session(RecallBackend(config, view_shape, np.dtype(precision)), reserve=512, precision=precision)
 
 
@@ -40,7 +43,18 @@ def started(log: InMemorySource, precision: str = "float64") -> Session:
 
 def map_log(log: InMemorySource, precision: str = "float64") -> Map:
     """The map of a session that has replayed the log."""
-    session = started(log, precision)
+    return map_with(started(log, precision), log)
+
+
+def map_carried(log: InMemorySource) -> Map:
+    """The same of a robot that may be carried."""
+    session = session_of(log.view_shape, log.info.cell_size, "float64", may_be_carried=True)
+    session.restart()
+    return map_with(session, log)
+
+
+def map_with(session: Session, log: InMemorySource) -> Map:
+    """The map of a session at its start that replays the log."""
     for _ in session.replay(sample.reading for sample in log):
         pass
     return session.map
@@ -81,9 +95,18 @@ def golden(name: str) -> InMemorySource:
     ],
 )
 def test_one_setting_maps_every_trace(trace, limit, broken):
-    log, found = golden(trace), golden_map(trace)
+    log = golden(trace)
+    found = map_carried(log)
     assert error(found, log) <= (limit or 1.05 * odometry_error(log) + 0.02)
     assert cuts(found) == broken
+
+
+@pytest.mark.parametrize("trace", ["a_square3", "e_kidnap"])
+def test_a_map_is_cut_only_if_the_robot_may_be_carried(trace):
+    """A map that would not be cut is the same with either setting."""
+    plain, carried = golden_map(trace), map_carried(golden(trace))
+    assert cuts(plain) == []
+    assert np.array_equal(plain.trajectory(), carried.trajectory()) == (not cuts(carried))
 
 
 @pytest.mark.soak
@@ -97,7 +120,7 @@ def test_regenerated_streams_behave_as_the_published_ones(seed):
     kidnapped = scenes.square(seed + 50, laps=4, jumps=jumps)
     assert error(map_log(square), square) <= 0.02
     assert error(map_log(eight), eight) <= 0.03
-    found = map_log(kidnapped)
+    found = map_carried(kidnapped)
     assert error(found, kidnapped) <= 0.08
     assert cuts(found) == [row for row, _ in jumps]
 
@@ -177,7 +200,9 @@ def test_single_precision_maps_as_well():
 
 def test_a_kidnapped_robot_is_reported_lost_and_then_localised():
     log = golden("e_kidnap")
-    lost = np.array([bool(s.estimate.lost) for s in started(log).replay(sample.reading for sample in log)])
+    session = session_of(log.view_shape, log.info.cell_size, "float64", may_be_carried=True)
+    session.restart()
+    lost = np.array([bool(s.estimate.lost) for s in session.replay(sample.reading for sample in log)])
     assert not lost[:127].any()
     assert lost[140:155].all()
     assert not lost[-60:].any()

@@ -52,8 +52,8 @@ def config_of(**parts: Any) -> RunConfig:
 
 
 @cache
-def _compiled(reserve: int) -> tuple[Session, dict[str, np.ndarray]]:
-    config = config_of(simulation=LAPS, session={"reserve": reserve})
+def _compiled(reserve: int, **keyframes: Any) -> tuple[Session, dict[str, np.ndarray]]:
+    config = config_of(simulation=LAPS, session={"reserve": reserve}, keyframes=keyframes)
     assert config.simulation is not None
     source = HeadSimulation(config.simulation)
     config = complete(config, source)
@@ -64,6 +64,13 @@ def _compiled(reserve: int) -> tuple[Session, dict[str, np.ndarray]]:
 def empty_session(reserve: int = 512) -> Session:
     """The shared compiled session, empty: all mazes, heads and controls have the same kernel."""
     session, empty = _compiled(reserve)
+    session.restore(empty)
+    return session
+
+
+def empty_carried_session() -> Session:
+    """The shared compiled session of a robot that may be carried, empty."""
+    session, empty = _compiled(512, may_be_carried=True)
     session.restore(empty)
     return session
 
@@ -235,7 +242,7 @@ def test_the_odometry_is_cut_where_the_robot_was_kidnapped() -> None:
     found = []
     for seed in range(8):
         walk = kidnap(simulate_walk(seed, maze=WIDE), 240, 45)
-        found_map = map_walk(walk.readings)
+        found_map = follow(empty_carried_session(), walk.readings)
         assert true_share(found_map, walk.truth) >= 0.95
         near = len(found_map.cuts) == 1 and abs(found_map.cuts[0] - 240) <= 5
         right = metric(found_map.path, walk.truth) < 0.25 * metric(dead_reckoning(walk.readings), walk.truth)
@@ -243,12 +250,21 @@ def test_the_odometry_is_cut_where_the_robot_was_kidnapped() -> None:
     assert (np.sum(found, axis=0) >= [5, 7]).all()
 
 
+def test_the_odometry_of_a_robot_that_is_never_carried_is_not_cut() -> None:
+    for seed in range(2):
+        session = empty_session()
+        walk = kidnap(simulate_walk(seed, maze=WIDE), 240, 45)
+        for start in range(0, len(walk.readings), 50):
+            assert follow(session, walk.readings[start : start + 50]).cuts == []
+            assert (session.map.arrays()["graph/cut"] == -1).all()
+
+
 # The map while it grows
 
 
 def kidnapped_session() -> tuple[Walk, Session]:
     walk = kidnap(simulate_walk(4, maze=WIDE), 240, 45)
-    return walk, empty_session()
+    return walk, empty_carried_session()
 
 
 @pytest.mark.parametrize("every", [7, 100])
@@ -256,7 +272,7 @@ def test_reading_the_map_does_not_change_it(every: int) -> None:
     walk, session = kidnapped_session()
     expected = follow(session, walk.readings)
     saved = session.arrays()
-    session = empty_session()
+    session = empty_carried_session()
     for start in range(0, len(walk.readings), every):
         list(session.replay(walk.readings[start : start + every]))
         session.map.trajectory()
@@ -277,11 +293,11 @@ def test_a_restored_map_with_cuts_continues_as_the_uninterrupted_one(stop: int) 
     expected = follow(session, walk.readings)
     assert expected.cuts
     whole = session.arrays()
-    session = empty_session()
+    session = empty_carried_session()
     follow(session, walk.readings[:stop])
     saved = session.arrays()
     assert (saved["map/graph/cut"] >= 0).any() == (stop >= 320)
-    session = empty_session()
+    session = empty_carried_session()
     follow(session, walk.readings[:50])
     session.restore(saved)
     found = follow(session, walk.readings[stop:])
