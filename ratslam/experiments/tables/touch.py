@@ -41,15 +41,17 @@ REVISIT_GAP, REVISIT_DISTANCE = 60, 0.05
 MAIN: dict[str, Any] = {"motion": {"jitter": {"position": 0.005, "yaw_deg": 1.5, "speed": 0.05}}}
 ROUGH = {"motion": {"jitter": {"position": 0.010, "yaw_deg": 3.0, "speed": 0.10}}}
 MAX_ANGLE = {"image": {"transform": "max_angle"}}
+KIDNAPS = {"kidnaps": {"count": 8, "ahead": 45.0}}
 OPEN_LOOP = {"whisking": {"mode": "open"}}
 
 
 class TouchRow(NamedTuple):
-    """A row: its label in the table, and the settings `simulation` and `touch` of its sessions."""
+    """A row: its label in the table, and the settings `simulation`, `touch` and `keyframes` of its sessions."""
 
     label: str
     simulation: dict[str, Any] = {}  # noqa: RUF012
     touch: dict[str, Any] = {}  # noqa: RUF012
+    keyframes: dict[str, Any] = {}  # noqa: RUF012
 
 
 def _head(*radii: float) -> dict[str, Any]:
@@ -86,7 +88,7 @@ ROWS = {
     "6 dead": TouchRow("6 dead whiskers", {}, {"head": {"dead": [1, 6, 7, 10, 14, 17]}}),
     "noise 1e-3": TouchRow("sensor noise 1e-3 rad", {"mechanics": {"noise": 1e-3}}),
     "noise 1e-2": TouchRow("1e-2 rad", {"mechanics": {"noise": 1e-2}}),
-    "kidnaps": TouchRow("8 kidnaps of 45 s", {"kidnaps": {"count": 8, "ahead": 45.0}}),
+    "kidnaps": TouchRow("8 kidnaps of 45 s, `may_be_carried`", KIDNAPS, {}, {"may_be_carried": True}),
     "control: shuffled": TouchRow("control: shuffled images", MAIN),
     "control: no image": TouchRow("control: no images", MAIN),
     "control: other maze": TouchRow("control: later laps in another maze", MAIN | {"later_maze": CHANGE}),
@@ -182,10 +184,11 @@ def measure_session(task: TouchTask) -> SessionFigures:
 
 def task_config(task: TouchTask) -> RunConfig:
     """The configuration of a session."""
-    _, simulation, touch = ROWS[task.row]
+    _, simulation, touch, keyframes = ROWS[task.row]
     maze = {"seed": task.maze} | simulation.get("maze", {})
     simulation = simulation | {"seed": task.seed, "maze": maze}
-    return RunConfig.model_validate({"simulation": simulation, "touch": touch, "backend": task.backend})
+    parts = {"simulation": simulation, "touch": touch, "keyframes": keyframes, "backend": task.backend}
+    return RunConfig.model_validate(parts)
 
 
 def _share_of_revisits_closed(truth: np.ndarray, true_closures: np.ndarray) -> float:
