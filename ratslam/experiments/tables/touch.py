@@ -46,7 +46,7 @@ OPEN_LOOP = {"whisking": {"mode": "open"}}
 
 
 class TouchRow(NamedTuple):
-    """A row: its label in the table, and the settings `simulation`, `touch` and `keyframes` of its sessions."""
+    """A row: its label, and the settings `simulation`, `touch` and `keyframes` of its sessions."""
 
     label: str
     simulation: dict[str, Any] = {}  # noqa: RUF012
