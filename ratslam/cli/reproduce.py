@@ -108,7 +108,9 @@ def add_tables(tables: Commands) -> None:
     grid.add_argument("--worlds", nargs="+", choices=("A", "B", "rotated"), help="only these kinds of arena")
     laser = add("laser", _laser_lines, "recordings with laser views or given places", "--rows square")
     add_count(laser, "--copies", 10, "perturbed copies per recording")
-    for parser in (touch, grid, laser):
+    buildings = add("buildings", _buildings_lines, "real buildings: map against odometry", "--copies 2")
+    add_count(buildings, "--copies", 10, "perturbed copies per recording")
+    for parser in (touch, grid, laser, buildings):
         parser.add_argument("--rows", nargs="+", metavar="ROW", help="only these rows")
         add_workers(parser)
     speed = add("speed", _speed_lines, "microseconds per pose-cell step by network size", "--rows 21 41")
@@ -211,6 +213,15 @@ def _laser_lines(arguments: argparse.Namespace) -> Iterator[str]:
     from ratslam.experiments.tables.markdown import select_rows
 
     return laser_table(select_rows(arguments.rows, ROWS, tuple(ROWS)), arguments.copies, arguments.workers)
+
+
+def _buildings_lines(arguments: argparse.Namespace) -> Iterator[str]:
+    from ratslam.experiments.tables.buildings import buildings_rows, buildings_table
+    from ratslam.experiments.tables.markdown import select_rows
+
+    rows = buildings_rows()
+    names = select_rows(arguments.rows, rows, tuple(rows))
+    return buildings_table({name: rows[name] for name in names}, arguments.copies, arguments.workers)
 
 
 def _speed_lines(arguments: argparse.Namespace) -> Iterator[str]:

@@ -1,10 +1,13 @@
 """Perturbed copies of a recording, to test the robustness of results.
 
-A copy has another start, additional noise, dropped views and wrong place labels, all drawn from one seed.
+Each copy is drawn from one seed: `perturb` changes start, noise, views and place labels a little, as another
+drive would; `miscalibrate` gives the odometry errors that last; `lose_labels`, `mistake_labels` and
+`rename_labels` spoil a third of the given place labels and nothing else.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +18,7 @@ from tactile.base.se2 import compose
 VIEW_NOISE = 0.01
 """Standard deviation of the noise added to view values."""
 LENGTH_NOISE = 0.02
-"""Standard deviation of the scale of each forward motion."""
+"""Standard deviation of the scale of each forward motion, in both kinds of copies."""
 TURN_NOISE = 0.01
 """Standard deviation added to the turn between two views, rad."""
 START = (10, 80)
@@ -24,17 +27,30 @@ DROPPED = 0.05
 """Fraction of views that are dropped."""
 NEW_IDS, WRONG_IDS = 0.1, 0.05
 """Fractions of given place labels replaced by new labels, and by labels of other rows."""
+HEADING_BIAS = 0.01
+"""Standard deviation of one heading error for the whole copy, rad/m."""
+LENGTH_SCALE = 0.02
+"""Standard deviation of one scale error of all lengths of the copy, as a fraction."""
+TURN_PER_RADIAN, TURN_PER_METRE = 0.02, 0.005
+"""Standard deviations of each row's heading noise: per radian that it turned, and per metre that it moved."""
+MISCALIBRATED_DROPPED = 0.1
+"""Fraction of views that are dropped from a miscalibrated copy."""
+SPOILT_LABELS = 1 / 3
+"""Fraction of the place labels that are lost, wrong or new."""
+
+Perturbation = Callable[[InMemorySource, int], InMemorySource]
+"""A copy of a recording, drawn from a seed."""
 
 
 def perturb(log: InMemorySource, seed: int) -> InMemorySource:
-    """A perturbed copy; its digest is that of the original followed by the seed.
+    """A copy with another start, additional noise, dropped views and wrong place labels.
 
     Rows with a dropped view are removed and their motion is added to the next row, so the path is complete.
+    The digest of the copy is that of the original followed by the seed.
     """
     stream = np.random.default_rng(seed)
-    looks = np.flatnonzero(log.seen | (log.label >= 0))
-    low, high = START
-    first = looks[min(int(stream.integers(low, high + 1)), len(looks) - 1)] if len(looks) else 0
+    looks = _looks(log)
+    first = _draw_start(looks, stream)
     between = max(float(np.diff(looks).mean()), 1.0) if len(looks) > 1 else 1.0
 
     motion = log.motion.copy()
@@ -44,25 +60,58 @@ def perturb(log: InMemorySource, seed: int) -> InMemorySource:
     noise = VIEW_NOISE * stream.standard_normal(log.views.shape)
     views = np.where(log.seen[:, None, None, None], np.clip(log.views + noise, 0, 1), log.views)
     label = corrupt_labels(log.label, stream)
+    changed = replace(log, digest=f"{log.digest}+{seed}", motion=motion, views=views, label=label)
+    return _cut(changed, first, _draw_rows(log, first, DROPPED, stream))
 
-    dropped = np.zeros(len(motion), bool)
-    dropped[looks] = stream.random(len(looks)) < DROPPED
-    keep = ~dropped
-    keep[:first] = False
-    keep[first] = True
-    rows = np.flatnonzero(keep)
-    motion = _merge_motions(motion, rows, first)
-    return replace(
-        log,
-        digest=f"{log.digest}+{seed}",
-        time=log.time[rows],
-        motion=motion,
-        moved=log.moved[rows] | motion[:, :3].any(axis=1),
-        views=views[rows],
-        seen=log.seen[rows],
-        label=label[rows],
-        truth=None if log.truth is None else log.truth[rows],
-    )
+
+def miscalibrate(log: InMemorySource, seed: int) -> InMemorySource:
+    """A copy with another start, dropped views, and odometry errors that last besides noise of each row.
+
+    One heading bias per metre and one scale of all lengths hold for the whole copy. Each row's length has
+    noise in proportion to it, its turn noise in proportion to the turn and to the length, independent from
+    row to row: the more rows, the better it averages out. Rows are dropped as by `perturb`.
+    """
+    stream = np.random.default_rng(seed)
+    first = _draw_start(_looks(log), stream)
+    bias = HEADING_BIAS * stream.standard_normal()
+    scale = 1 + LENGTH_SCALE * stream.standard_normal()
+    length, turn = np.hypot(*log.motion[:, :2].T), np.abs(log.motion[:, 2])
+    moved, by_turn, by_length = stream.standard_normal((3, log.length))
+
+    motion = log.motion.copy()
+    motion[:, :2] *= (scale * (1 + LENGTH_NOISE * moved))[:, None]
+    motion[:, 2] += bias * length + TURN_PER_RADIAN * turn * by_turn + TURN_PER_METRE * length * by_length
+    changed = replace(log, digest=f"{log.digest}+miscalibrated {seed}", motion=motion)
+    return _cut(changed, first, _draw_rows(log, first, MISCALIBRATED_DROPPED, stream))
+
+
+def lose_labels(log: InMemorySource, seed: int) -> InMemorySource:
+    """A copy in which a third of the place labels are missing."""
+    stream, label = np.random.default_rng(seed), log.label.copy()
+    label[_draw_share(np.flatnonzero(label >= 0), stream)] = -1
+    return replace(log, digest=f"{log.digest}+lost {seed}", label=label)
+
+
+def mistake_labels(log: InMemorySource, seed: int) -> InMemorySource:
+    """A copy in which a third of the place labels are those of other places of the recording; with a single
+    place none are."""
+    stream, label = np.random.default_rng(seed), log.label.copy()
+    places = np.unique(label[label >= 0])
+    chosen = _draw_share(np.flatnonzero(label >= 0), stream)
+    if len(places) > 1:
+        others = stream.integers(1, len(places), len(chosen))
+        label[chosen] = places[(np.searchsorted(places, label[chosen]) + others) % len(places)]
+    return replace(log, digest=f"{log.digest}+wrong {seed}", label=label)
+
+
+def rename_labels(log: InMemorySource, seed: int) -> InMemorySource:
+    """A copy in which a third of the place labels at places known by then are labels never used before."""
+    stream, label = np.random.default_rng(seed), log.label.copy()
+    given = np.flatnonzero(label >= 0)
+    first = given[np.unique(label[given], return_index=True)[1]]
+    chosen = _draw_share(np.setdiff1d(given, first), stream)
+    label[chosen] = label.max(initial=0) + 1 + np.arange(len(chosen))
+    return replace(log, digest=f"{log.digest}+new {seed}", label=label)
 
 
 def corrupt_labels(label: np.ndarray, stream: np.random.Generator) -> np.ndarray:
@@ -73,6 +122,47 @@ def corrupt_labels(label: np.ndarray, stream: np.random.Generator) -> np.ndarray
     label[wrong] = stream.permutation(label[given])[: len(wrong)]
     label[new] = label.max(initial=0) + 1 + np.arange(len(new))
     return label
+
+
+def _looks(log: InMemorySource) -> np.ndarray:
+    """Rows with a view or a place label."""
+    return np.flatnonzero(log.seen | (log.label >= 0))
+
+
+def _draw_start(looks: np.ndarray, stream: np.random.Generator) -> int:
+    """The first row of a copy."""
+    low, high = START
+    return int(looks[min(int(stream.integers(low, high + 1)), len(looks) - 1)]) if len(looks) else 0
+
+
+def _draw_rows(log: InMemorySource, first: int, share: float, stream: np.random.Generator) -> np.ndarray:
+    """The rows of a copy: `first` and those after it, without a share of those with a view or label."""
+    looks = _looks(log)
+    keep = np.ones(log.length, bool)
+    keep[looks] = stream.random(len(looks)) >= share
+    keep[:first] = False
+    keep[first] = True
+    return np.flatnonzero(keep)
+
+
+def _draw_share(rows: np.ndarray, stream: np.random.Generator) -> np.ndarray:
+    """A random third of some rows, in order."""
+    return np.sort(stream.permutation(rows)[: round(SPOILT_LABELS * len(rows))])
+
+
+def _cut(log: InMemorySource, first: int, rows: np.ndarray) -> InMemorySource:
+    """The remaining rows, each with the motion since the remaining row before it."""
+    motion = _merge_motions(log.motion, rows, first)
+    return replace(
+        log,
+        time=log.time[rows],
+        motion=motion,
+        moved=log.moved[rows] | motion[:, :3].any(axis=1),
+        views=log.views[rows],
+        seen=log.seen[rows],
+        label=log.label[rows],
+        truth=None if log.truth is None else log.truth[rows],
+    )
 
 
 def _merge_motions(motion: np.ndarray, rows: np.ndarray, first: int) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -52,3 +53,89 @@ def test_some_labels_are_replaced_by_new_or_wrong_ones():
     assert 0.07 < new.mean() < 0.13
     assert len(np.unique(changed[given][new])) == new.sum()
     assert 0.02 < (changed[given][~new] != label[given][~new]).mean() < 0.06
+
+
+@pytest.fixture
+def drive(log):
+    """A drive of 600 views that turns in every second step."""
+    turn = np.where(np.arange(600) % 2, 0.2, 0.0)
+    step = np.full(600, 0.1)
+    return replace(
+        log, time=np.arange(600.0), motion=np.column_stack([step, 0 * step, turn, 0 * step + 1]),
+        moved=np.ones(600, bool), views=np.zeros((600, 1, 6, 1)), seen=np.ones(600, bool),
+        label=np.full(600, -1, np.int32), truth=None,
+    )  # fmt: skip
+
+
+def motions(log, copy):
+    """[n, 3] motions of a copy, and those of the log, of rows whose previous row is kept too."""
+    rows = np.searchsorted(log.time, copy.time)
+    direct = np.flatnonzero(np.diff(rows) == 1) + 1
+    return copy.motion[direct, :3], log.motion[rows[direct], :3]
+
+
+def test_a_miscalibrated_copy_follows_from_its_seed(log):
+    first, again, other = (perturbation.miscalibrate(log, seed) for seed in (1, 1, 2))
+    assert np.array_equal(first.motion, again.motion)
+    assert not np.array_equal(first.motion[:50], other.motion[:50])
+    assert first.digest != perturb(log, 1).digest
+    assert 10 <= np.searchsorted(log.time, first.time[0]) <= 80
+    assert np.array_equal(first.views, log.views[np.searchsorted(log.time, first.time)])
+
+
+def test_bias_and_scale_hold_for_the_whole_copy(drive, monkeypatch):
+    for name in ("LENGTH_NOISE", "TURN_PER_RADIAN", "TURN_PER_METRE"):
+        monkeypatch.setattr(perturbation, name, 0.0)
+    errors = []
+    for seed in range(60):
+        changed, given = motions(drive, perturbation.miscalibrate(drive, seed))
+        scale, bias = changed[:, 0] / 0.1 - 1, (changed[:, 2] - given[:, 2]) / 0.1
+        assert np.ptp(scale) < 1e-12 > np.ptp(bias)
+        errors.append((scale[0], bias[0]))
+    assert np.std(errors, axis=0) == pytest.approx([0.02, 0.01], rel=0.3)
+
+
+def test_a_tenth_of_the_views_is_dropped_and_noise_grows_with_the_motion(drive, monkeypatch):
+    monkeypatch.setattr(perturbation, "HEADING_BIAS", 0.0)
+    monkeypatch.setattr(perturbation, "LENGTH_SCALE", 0.0)
+    copies = [perturbation.miscalibrate(drive, seed) for seed in range(20)]
+    after = sum(600 - copy.time[0] for copy in copies)
+    assert sum(copy.length for copy in copies) / after == pytest.approx(0.9, abs=0.02)
+    changed, given = (np.concatenate(part) for part in zip(*(motions(drive, c) for c in copies), strict=True))
+    turning, error = given[:, 2] > 0, changed[:, 2] - given[:, 2]
+    assert np.std(changed[:, 0]) == pytest.approx(0.02 * 0.1, rel=0.05)
+    assert np.std(error[~turning]) == pytest.approx(0.005 * 0.1, rel=0.05)
+    assert np.std(error[turning]) == pytest.approx(np.hypot(0.005 * 0.1, 0.02 * 0.2), rel=0.05)
+
+
+@pytest.fixture
+def labelled(log):
+    label = np.where(np.arange(log.length) % 2 == 0, np.arange(log.length) // 2 % 50, -1).astype(np.int32)
+    return replace(log, label=label)
+
+
+def test_a_third_of_the_labels_is_lost_or_wrong(labelled):
+    given = labelled.label >= 0
+    lost = perturbation.lose_labels(labelled, 1).label
+    assert (lost[given] < 0).mean() == pytest.approx(1 / 3, abs=0.01)
+    assert np.array_equal(lost[lost >= 0], labelled.label[lost >= 0])
+    wrong = perturbation.mistake_labels(labelled, 1).label
+    assert (wrong != labelled.label)[given].mean() == pytest.approx(1 / 3, abs=0.01)
+    assert set(wrong) <= set(labelled.label)
+    assert np.array_equal(wrong < 0, ~given)
+
+
+def test_new_labels_are_used_once_and_only_at_known_places(labelled):
+    new = perturbation.rename_labels(labelled, 1).label
+    changed = np.flatnonzero(new != labelled.label)
+    assert len(np.unique(new[changed])) == len(changed)
+    assert new[changed].min() > labelled.label.max()
+    assert all(labelled.label[row] in labelled.label[:row] for row in changed)
+    known = (labelled.label >= 0).sum() - 50
+    assert len(changed) == pytest.approx(known / 3, abs=1)
+    assert not np.array_equal(new, perturbation.rename_labels(labelled, 2).label)
+
+
+@pytest.mark.parametrize("spoil", [perturbation.lose_labels, perturbation.mistake_labels])
+def test_recordings_without_labels_are_not_spoilt(log, spoil):
+    assert np.array_equal(spoil(log, 1).label, log.label)

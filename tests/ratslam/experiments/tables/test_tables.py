@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from evaluation.metrics.session_metrics import TouchMetrics
 from ratslam.cli import main
-from ratslam.experiments.tables import grid, laser, touch
+from ratslam.experiments.tables import buildings, grid, laser, recordings, touch
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row, select_rows
+from ratslam.experiments.trials.recording_trial import ClosureClaims
 from tactile.base.errors import InputError
+from tactile.base.se2 import between, integrate
+
+ROOT = Path(__file__).parents[4]
 
 METRICS = TouchMetrics(
     em=0.01, em_experiences=0.02, em_odometry=2.0, arr=0.5, arcr=0.9, arcr_chain_free=0.95,
@@ -88,11 +94,90 @@ def test_a_grid_row_compares_with_dead_reckoning(monkeypatch):
 
 
 def test_all_rows_of_the_laser_table_without_data_are_named(monkeypatch, tmp_path):
-    monkeypatch.delenv(laser.DATA, raising=False)
+    monkeypatch.delenv(recordings.DATA, raising=False)
     stub_sessions(monkeypatch, laser, lambda task: pytest.fail("a session without a recording"))
     text = "\n".join(laser.laser_table(folder=tmp_path))
     assert all(f"Left out: {row}: " in text for row in laser.ROWS)
     assert "set RATSLAM_DATA" in text
+
+
+def test_closures_are_false_by_distance_or_claimed_turn_and_sequences_by_their_median():
+    claims = ClosureClaims(
+        sequence=np.array([0, 0, 0, 2, 2, 2]),
+        accepted=np.array([True] * 3 + [False] * 3),
+        distance=np.array([0.0, 1.9, 2.1, 0.0, 0.0, 0.0]),
+        turn=np.radians([0.0, 0.0, 0.0, 31.0, 31.0, 0.0]),
+    )
+    assert buildings.is_false(claims.distance, claims.turn).tolist() == [0, 0, 1, 1, 1, 0]
+    assert buildings.judge_sequences(claims).tolist() == [[True, False], [False, True]]
+
+
+def test_a_row_of_buildings_counts_false_closures_and_runs_worse_than_odometry(monkeypatch):
+    rows = {
+        name: buildings.BuildingsRow(recordings.Recording(name, "configs/square.yaml"), copies, section)
+        for name, copies, section in (("lab", "miscalibrated", "buildings"), ("ids", "ids lost", "ids"))
+    }
+    harmless = buildings.RunFigures(
+        10.0, 1.0, 10.8, np.array([False, True]), np.array([[True, False], [True, True], [False, True]])
+    )
+    harmed = harmless._replace(odometry=2.0, final=2.5, live=2.0)
+    tasks = stub_sessions(monkeypatch, buildings, lambda task: harmed if task.seed == 2 else harmless)
+    _, lab, ids, _, total, note = buildings.buildings_table(rows, copies=2, folder=ROOT)
+    assert [(task.copies, task.seed) for task in tasks[:3]] == [("miscalibrated", seed) for seed in range(3)]
+    assert lab == (
+        "| lab | 10.00 | 1.00 | 10.80 | 1.75, 2.50 | 6.40, 10.80 | 1.25 | 1, 0 of 3 | 1 / 2 | 3 / 6 | 3 / 6 |"
+    )
+    assert ids.startswith("| ids | 10.00 |")
+    assert "3 runs: false / closures 3 / 6 (50.0%)" in total
+    assert "final 33.3%, live 0.0%" in total
+    assert note == "ids lost: worst copy 2.50 times the ATE as is."
+
+
+def test_a_recording_in_the_folder_of_buildings_is_a_row(tmp_path, monkeypatch):
+    """Five rounds on a circle in a room, by a laser of 180 beams."""
+    write_building(tmp_path / "buildings", "room")
+    monkeypatch.setenv(recordings.DATA, str(tmp_path))
+    rows = buildings.buildings_rows()
+    assert list(rows) == ["room", "intel", "tuc", "ids lost", "ids wrong", "ids new"]
+    present = {name: rows[name] for name in ("room", "tuc")}
+    _, room, _, total, missing = buildings.buildings_table(present, copies=1, workers=1, folder=ROOT)
+    cells = room.split(" | ")
+    assert cells[0] == "| room"
+    assert cells[7].endswith("of 2")
+    assert int(cells[9].split(" / ")[1]) > 0
+    assert "All buildings, 2 runs" in total
+    assert missing.startswith("Left out: tuc: ")
+    assert missing.endswith("tuc_lecture_hall_odom.csv does not exist")
+
+
+def test_all_rows_of_the_buildings_table_without_data_are_named(monkeypatch, tmp_path):
+    monkeypatch.delenv(recordings.DATA, raising=False)
+    stub_sessions(monkeypatch, buildings, lambda task: pytest.fail("a session without a recording"))
+    rows = buildings.buildings_rows()
+    text = "\n".join(buildings.buildings_table(rows, folder=tmp_path))
+    assert all(f"Left out: {row}: set RATSLAM_DATA" in text for row in rows)
+    assert "buildings" in rows
+
+
+def write_building(folder, name):
+    """A recording as those of the buildings: odometry with a heading bias, truth, and scans of a room."""
+    folder.mkdir()
+    time = np.arange(250.0)
+    angle = 2 * np.pi * time / 50
+    truth = np.column_stack([3 * np.cos(angle), 3 * np.sin(angle), angle + np.pi / 2])
+    step = between(truth[:-1], truth[1:])
+    odometry = np.vstack([np.zeros(3), integrate(step + [0, 0, 0.002])])
+    beam = truth[:, 2:] + np.radians(np.arange(-89.5, 90))
+    reach = [
+        np.where(np.cos(beam) > 0, 5 - truth[:, :1], -4 - truth[:, :1]) / np.cos(beam),
+        np.where(np.sin(beam) > 0, 4 - truth[:, 1:2], -6 - truth[:, 1:2]) / np.sin(beam),
+    ]
+    header = "t,odo_x,odo_y,odo_th,gt_x,gt_y,gt_th"
+    rows = np.column_stack([time, odometry, truth])
+    np.savetxt(folder / f"{name}_odom_gt.csv", rows, delimiter=",", header=header, comments="")
+    header = ",".join(["t", *(f"r{k}" for k in range(180))])
+    rows = np.column_stack([time, np.min(reach, axis=0)])
+    np.savetxt(folder / f"{name}_scans.csv", rows, delimiter=",", header=header, comments="")
 
 
 def test_the_command_refuses_unknown_rows(capsys):

@@ -1,0 +1,218 @@
+"""The table of real buildings: whether the map is better than odometry where nobody tuned it.
+
+Rows are recordings as they are with miscalibrated copies of them (`robot.sources.perturbation`), and a
+recording with given place ids of which a third is lost, wrong or new. ATE is the RMS position error after a
+rigid alignment, m: of the final map, of the live pose (as estimated at the time) and of odometry. A run is
+worse than odometry if its ATE exceeds `HARM_FACTOR` times odometry's by `HARM_MARGIN`. A closure is false if
+its two true positions are more than `FALSE_DISTANCE` apart, or its claimed difference of headings is off by
+more than `FALSE_TURN`; a closure sequence is false if that holds for the median of its closures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from ratslam.config.run_config import RunConfig
+from ratslam.experiments.studies.executor import run_tasks
+from ratslam.experiments.tables.markdown import markdown_header, markdown_row
+from ratslam.experiments.tables.recordings import Recording, metres, real_recordings
+from ratslam.experiments.trials.recording_trial import ClosureClaims, closure_claims, run_recording
+from robot.sources.perturbation import lose_labels, miscalibrate, mistake_labels, rename_labels
+
+FALSE_DISTANCE, FALSE_TURN = 2.0, np.radians(30)
+"""Of a closure's steps: true distance, m, and error of the claimed heading difference, rad."""
+HARM_FACTOR, HARM_MARGIN = 1.05, 0.3
+"""Of odometry's ATE, and m."""
+SUFFIX = "_odom_gt.csv"
+"""End of the file names of buildings, in the folder `buildings` of the real recordings."""
+PERTURBATIONS = {
+    "miscalibrated": miscalibrate,
+    "ids lost": lose_labels,
+    "ids wrong": mistake_labels,
+    "ids new": rename_labels,
+}
+COLUMNS = (
+    "recording", "odometry", "final", "live", "final of copies: median, worst",
+    "live of copies: median, worst",
+    "worst final / odometry", "worse than odometry: final, live", "false / closures as is",
+    "false / closures of all runs", "false / sequences of all runs",
+)  # fmt: skip
+
+Section = Literal["buildings", "ids"]
+
+
+class BuildingsRow(NamedTuple):
+    """A row: a recording, what its copies are (a key of `PERTURBATIONS`), and its section of the table."""
+
+    recording: Recording
+    copies: str
+    section: Section
+
+
+class RunTask(NamedTuple):
+    """One run: a configuration, and the copy's kind and seed (0: the recording as it is)."""
+
+    config: RunConfig
+    copies: str
+    seed: int
+
+
+class RunFigures(NamedTuple):
+    """The figures of one run.
+
+    Attributes:
+        odometry, final, live: ATE, m. closures: [K] bool, of each accepted closure, whether it is false.
+        sequences: [R, 2] bool, of each closure sequence, whether it is accepted and whether it is false.
+            Closures and sequences without known truth do not count as false.
+    """
+
+    odometry: float
+    final: float
+    live: float
+    closures: np.ndarray
+    sequences: np.ndarray
+
+
+def buildings_rows() -> dict[str, BuildingsRow]:
+    """All rows by name; those of the buildings are the files found in the folder of the real recordings, or
+    one row, `buildings`, for a file that is missing."""
+    folder = (real_recordings() or Path()).absolute() / "buildings"
+    found = {file.name.removesuffix(SUFFIX): file for file in sorted(folder.glob(f"*{SUFFIX}"))}
+    hall = "configs/tuc_lecture_hall.yaml"
+    recordings = {
+        name: Recording(name, "configs/building.yaml", (f"recording.file={file}",), real=True)
+        for name, file in (found or {"buildings": folder / f"NAME{SUFFIX}"}).items()
+    }
+    recordings["intel"] = Recording(
+        "intel (`configs/intel_laser.yaml`)", "configs/intel_laser.yaml", real=True
+    )
+    recordings["tuc"] = Recording(f"lecture hall (`{hall}`, given ids)", hall, real=True)
+    rows = {name: BuildingsRow(one, "miscalibrated", "buildings") for name, one in recordings.items()}
+    for fault in ("lost", "wrong", "new"):
+        recording = Recording(f"lecture hall, copies with a third of the ids {fault}", hall, real=True)
+        rows[f"ids {fault}"] = BuildingsRow(recording, f"ids {fault}", "ids")
+    return rows
+
+
+def buildings_table(
+    rows: Mapping[str, BuildingsRow], copies: int = 10, workers: int = 0, folder: Path = Path()
+) -> Iterator[str]:
+    """The lines of the table, each as soon as its runs are done; totals and missing recordings below it.
+
+    Args:
+        rows: those of `buildings_rows` to print. folder: of the repository, which holds `configs`.
+    """
+    missing = {name: reason for name, row in rows.items() if (reason := row.recording.missing(folder))}
+    present = [row for name, row in rows.items() if name not in missing]
+    tasks = [
+        RunTask(row.recording.configuration(folder), row.copies, seed)
+        for row in present
+        for seed in range(copies + 1)
+    ]
+    results = run_tasks(measure_run, tasks, workers=workers)
+    found: dict[Section, list[RunFigures]] = {}
+    notes = []
+    yield markdown_header(COLUMNS)
+    for row in present:
+        runs = [next(results) for _ in range(copies + 1)]
+        yield markdown_row([row.recording.label, *_cells(runs)])
+        found.setdefault(row.section, []).extend(runs)
+        notes += [_ids_note(row, runs)] if row.section == "ids" and copies else []
+    notes = ([_total(found["buildings"])] if "buildings" in found else []) + notes
+    notes += [f"Left out: {name}: {reason}" for name, reason in missing.items()]
+    yield from ["", *notes] if notes else []
+
+
+def measure_run(task: RunTask) -> RunFigures:
+    """Runs and measures a recording or a copy.
+
+    Raises:
+        InputError: the recording cannot be used, or has no truth.
+    """
+    config, copies, seed = task
+    run = run_recording(config, PERTURBATIONS[copies] if seed else None, seed)
+    claims = closure_claims(run)
+    return RunFigures(
+        odometry=run.ate(run.odometry),
+        final=run.ate(run.final),
+        live=run.ate(run.online),
+        closures=is_false(claims.distance, claims.turn)[claims.accepted],
+        sequences=judge_sequences(claims),
+    )
+
+
+def is_false(distance: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """Whether closures are false, [n] bool, from `ClosureClaims.distance` and `ClosureClaims.turn`."""
+    return (distance > FALSE_DISTANCE) | (turn > FALSE_TURN)
+
+
+def judge_sequences(claims: ClosureClaims) -> np.ndarray:
+    """[R, 2] bool, of each closure sequence, whether it is accepted and whether it is false."""
+    members = [claims.sequence == number for number in np.unique(claims.sequence)]
+    distance, turn = (
+        np.array([np.median(values[rows]) for rows in members]) for values in (claims.distance, claims.turn)
+    )
+    accepted = np.array([claims.accepted[rows].any() for rows in members], bool)
+    return np.column_stack([accepted, is_false(distance, turn)])
+
+
+def is_worse(error: np.ndarray, odometry: np.ndarray) -> np.ndarray:
+    """Whether ATEs, m, exceed those of odometry by more than the margins."""
+    return error > HARM_FACTOR * odometry + HARM_MARGIN
+
+
+def _cells(runs: Sequence[RunFigures]) -> list[str]:
+    """The cells of a row: its recording as it is, then the copies."""
+    odometry, final, live = _errors(runs)
+    ratio = (final / np.maximum(odometry, 1e-12)).max()
+    return [
+        *map(metres, runs[0][:3]),
+        _spread(final[1:]),
+        _spread(live[1:]),
+        f"{ratio:.2f}",
+        f"{is_worse(final, odometry).sum()}, {is_worse(live, odometry).sum()} of {len(runs)}",
+        _closures(runs[:1]),
+        _closures(runs),
+        _sequences(runs),
+    ]
+
+
+def _total(runs: Sequence[RunFigures]) -> str:
+    """The line below the table over all runs of buildings."""
+    odometry, final, live = _errors(runs)
+    closures = np.concatenate([run.closures for run in runs])
+    share = f" ({closures.mean():.1%})" if len(closures) else ""
+    return (
+        f"All buildings, {len(runs)} runs: false / closures {_closures(runs)}{share}; false / sequences "
+        f"{_sequences(runs)}; worse than odometry: final {is_worse(final, odometry).mean():.1%}, live "
+        f"{is_worse(live, odometry).mean():.1%}."
+    )
+
+
+def _ids_note(row: BuildingsRow, runs: Sequence[RunFigures]) -> str:
+    """The line below the table that compares spoilt ids with the recording as it is."""
+    _, final, _ = _errors(runs)
+    return f"{row.copies}: worst copy {final[1:].max() / final[0]:.2f} times the ATE as is."
+
+
+def _errors(runs: Sequence[RunFigures]) -> np.ndarray:
+    """[3, n] ATE of odometry, final and live, m."""
+    return np.array([run[:3] for run in runs]).T
+
+
+def _spread(errors: np.ndarray) -> str:
+    return f"{metres(np.median(errors))}, {metres(errors.max())}" if len(errors) else "-"
+
+
+def _closures(runs: Sequence[RunFigures]) -> str:
+    return f"{sum(run.closures.sum() for run in runs)} / {sum(len(run.closures) for run in runs)}"
+
+
+def _sequences(runs: Sequence[RunFigures]) -> str:
+    """False ones of the accepted sequences."""
+    accepted = np.concatenate([run.sequences[run.sequences[:, 0]] for run in runs])
+    return f"{accepted[:, 1].sum()} / {len(accepted)}"
