@@ -216,12 +216,9 @@ def _laser_lines(arguments: argparse.Namespace) -> Iterator[str]:
 
 
 def _buildings_lines(arguments: argparse.Namespace) -> Iterator[str]:
-    from ratslam.experiments.tables.buildings import buildings_rows, buildings_table
-    from ratslam.experiments.tables.markdown import select_rows
+    from ratslam.experiments.tables.buildings import buildings_table, choose_rows
 
-    rows = buildings_rows()
-    names = select_rows(arguments.rows, rows, tuple(rows))
-    return buildings_table({name: rows[name] for name in names}, arguments.copies, arguments.workers)
+    return buildings_table(choose_rows(arguments.rows), arguments.copies, arguments.workers)
 
 
 def _speed_lines(arguments: argparse.Namespace) -> Iterator[str]:

@@ -31,6 +31,17 @@ class VelocityColumns(Settings):
     """Column of the turn rate, rad/s, counter-clockwise."""
 
 
+class MotionColumns(Settings):
+    """Odometry as motions since the previous row, along the heading half-way through the turn."""
+
+    forward: str = "distance"
+    """Column of the distance forwards, m."""
+    left: str | None = None
+    """Column of the distance to the left, m; null for a robot that cannot move sideways."""
+    turn: str = "turn"
+    """Column of the turn, rad, counter-clockwise."""
+
+
 class ViewColumns(Settings):
     """Views of rows x columns pixels from numbered columns (r0, r1, ...)."""
 
@@ -100,9 +111,11 @@ class CsvConfig(Settings):
     time: str = "t"
     """Column of the time, s."""
     pose: PoseColumns | None = None
-    """Odometry as poses; give either poses or velocities."""
+    """Odometry as poses; give one of poses, velocities and motions."""
     velocity: VelocityColumns | None = None
     """Odometry as velocities."""
+    motion: MotionColumns | None = None
+    """Odometry as motions."""
     rows: int = Field(default=3, gt=0)
     """R, rows of a view, also of the masked view of a recording with labels only."""
     columns: int = Field(default=6, gt=0)

@@ -8,15 +8,18 @@ from pathlib import Path
 import numpy as np
 
 from robot.recordings.csv_alignment import align_labels, align_truth, align_views
-from robot.recordings.csv_config import CsvConfig, PoseColumns, ViewColumns
+from robot.recordings.csv_config import CsvConfig, PoseColumns, VelocityColumns, ViewColumns
 from robot.recordings.csv_file import CsvFile, digest_of_files, read_csv
 from robot.recordings.sanity_checks import clock_errors
 from robot.recordings.unit_check import DEFAULT_LIMITS, MotionTrack, UnitLimits, heading_errors, unit_errors
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import missing_error, raise_errors
-from robot.sources.odometry import from_poses, from_velocities
+from robot.sources.odometry import from_motions, from_poses, from_velocities
 from robot.sources.source_info import SourceInfo
 from tactile.base.errors import InputError
+
+ODOMETRY = ("pose", "velocity", "motion")
+"""Parts of the table of which one is given."""
 
 
 def read_csv_recording(path: Path, config: CsvConfig, limits: UnitLimits = DEFAULT_LIMITS) -> InMemorySource:
@@ -70,14 +73,15 @@ def read_csv_recording(path: Path, config: CsvConfig, limits: UnitLimits = DEFAU
 def _absences(base: CsvFile, files: Mapping[Path, CsvFile], config: CsvConfig) -> list[InputError]:
     """Errors for missing columns and for settings that contradict each other."""
     errors = base.absences([(config.time, "table.time")])
-    if (config.pose is None) == (config.velocity is None):
-        found = "neither table.pose nor table.velocity is given" if config.pose is None else "both are given"
+    given = sum(getattr(config, key) is not None for key in ODOMETRY)
+    if given != 1:
+        found = f"{'more than one' if given else 'none'} of {', '.join(f'table.{key}' for key in ODOMETRY)}"
         expected = f"one of them, naming the odometry among {', '.join(base.names)}"
         errors.append(InputError(str(base.path), found, expected))
     if config.labels is not None and config.pairs is not None:
         found = "both table.labels and table.pairs are given"
         errors.append(InputError(str(base.path), found, "one of them"))
-    for key in ("pose", "velocity", "labels", "pairs", "truth", "views"):
+    for key in (*ODOMETRY, "labels", "pairs", "truth", "views"):
         part = getattr(config, key)
         if part is None:
             continue
@@ -106,7 +110,7 @@ def _motion(
     base: CsvFile, time: np.ndarray, config: CsvConfig, limits: UnitLimits
 ) -> tuple[np.ndarray, list[InputError]]:
     """Motions [N, 4] and the errors of their columns."""
-    part = config.pose or config.velocity
+    part = config.pose or config.velocity or config.motion
     assert part is not None  # checked by `_absences`
     names = [name for name in part.model_dump().values() if name is not None]
     columns = {name: base.column(name) for name in names}
@@ -119,4 +123,5 @@ def _motion(
                 poses[:, 2] = np.deg2rad(poses[:, 2])  # or every other check would report it again
             return from_poses(time, poses), errors
         left = columns[part.left] if part.left is not None else 0.0
-        return from_velocities(time, columns[part.forward], left, columns[part.turn]), errors
+        convert = from_velocities if isinstance(part, VelocityColumns) else from_motions
+        return convert(time, columns[part.forward], left, columns[part.turn]), errors

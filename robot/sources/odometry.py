@@ -1,4 +1,4 @@
-"""Body-frame motion from logged velocities or poses, and simulated odometry errors.
+"""Body-frame motion from logged velocities, motions or poses, and simulated odometry errors.
 
 A motion is a row (dx m, dy m, dtheta rad, dt s): the pose after a step in the frame of the pose before it.
 The first row only sets the clock: its motion and duration are zero.
@@ -39,8 +39,31 @@ def from_velocities(
     """
     dt = np.diff(time, prepend=time[:1])
     dtheta = turn * dt
-    c, s = np.cos(heading * dtheta), np.sin(heading * dtheta)
-    return np.stack([(c * forward - s * left) * dt, (s * forward + c * left) * dt, dtheta, dt], axis=-1)
+    x, y = _turned(forward, left, heading * dtheta)
+    return np.stack([x * dt, y * dt, dtheta, dt], axis=-1)
+
+
+def from_motions(
+    time: np.ndarray, forward: np.ndarray, left: np.ndarray | float, turn: np.ndarray
+) -> np.ndarray:
+    """Motions [N, 4] for distances since the previous row, along the heading half-way through the turn.
+
+    Args:
+        time: [N] s. forward, left: [N] m in the body frame. turn: [N] rad, counter-clockwise.
+    """
+    motion = np.stack(
+        [*_turned(forward, left, MIDPOINT * turn), turn, np.diff(time, prepend=time[:1])], axis=-1
+    )
+    motion[:1] = 0.0
+    return motion
+
+
+def _turned(
+    forward: np.ndarray, left: np.ndarray | float, angle: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The vectors (forward, left) turned by angles, rad."""
+    c, s = np.cos(angle), np.sin(angle)
+    return c * forward - s * left, s * forward + c * left
 
 
 def from_poses(time: np.ndarray, poses: np.ndarray) -> np.ndarray:

@@ -1,16 +1,18 @@
 """The table of real buildings: whether the map is better than odometry where nobody tuned it.
 
 Rows are recordings as they are with miscalibrated copies of them (`robot.sources.perturbation`), and a
-recording with given place ids of which a third is lost, wrong or new. ATE is the RMS position error after a
-rigid alignment, m: of the final map, of the live pose (as estimated at the time) and of odometry. A run is
-worse than odometry if its ATE exceeds `HARM_FACTOR` times odometry's by `HARM_MARGIN`. A closure is false if
-its two true positions are more than `FALSE_DISTANCE` apart, or its claimed difference of headings is off by
-more than `FALSE_TURN`; a closure sequence is false if that holds for the median of its closures.
+recording with given place ids of which a third is lost, wrong or new; depth views of a Create are mapped at
+several cell sizes and sector widths. ATE is the RMS position error after a rigid alignment, m: of the final
+map, of the live pose (as estimated at the time) and of odometry. A run is worse than odometry if its ATE
+exceeds `HARM_FACTOR` times odometry's by `HARM_MARGIN`. A closure is false if its two true positions are more
+than `FALSE_DISTANCE` apart, or its claimed difference of headings is off by more than `FALSE_TURN`; a closure
+sequence is false if that holds for the medians over its closures.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -18,7 +20,7 @@ import numpy as np
 
 from ratslam.config.run_config import RunConfig
 from ratslam.experiments.studies.executor import run_tasks
-from ratslam.experiments.tables.markdown import markdown_header, markdown_row
+from ratslam.experiments.tables.markdown import markdown_header, markdown_row, select_rows
 from ratslam.experiments.tables.recordings import Recording, metres, real_recordings
 from ratslam.experiments.trials.recording_trial import ClosureClaims, closure_claims, run_recording
 from robot.sources.perturbation import lose_labels, miscalibrate, mistake_labels, rename_labels
@@ -42,15 +44,38 @@ COLUMNS = (
     "false / closures of all runs", "false / sequences of all runs",
 )  # fmt: skip
 
-Section = Literal["buildings", "ids"]
+Section = Literal["buildings", "ids", "create"]
+CREATE = "configs/create_lab.yaml"
+FACTORS = {"1/2": 0.5, "1": 1.0, "2": 2.0}
+"""Of cell size and sector width in the rows of the Create."""
 
 
 class BuildingsRow(NamedTuple):
-    """A row: a recording, what its copies are (a key of `PERTURBATIONS`), and its section of the table."""
+    """A row: a recording, its section of the table, what its copies are (a key of `PERTURBATIONS`; "": there
+    are none), and factors on cell size and sector width."""
 
     recording: Recording
-    copies: str
     section: Section
+    copies: str = ""
+    cell: float = 1.0
+    sector: float = 1.0
+
+    def configuration(self, folder: Path) -> RunConfig:
+        """The configuration of its runs.
+
+        Args:
+            folder: of the repository.
+        """
+        config = self.recording.configuration(folder)
+        if self.cell == self.sector == 1:
+            return config
+        fov = float(config.recall.sector_fov)
+        scaled = {
+            "pose_cells.cell_size": config.pose_cells.cell_size * self.cell,
+            "experience.match_sd": config.experience.match_sd * self.cell,
+            "recall.sector_fov": fov * self.sector,
+        }
+        return self.recording.configuration(folder, *(f"{key}={value!r}" for key, value in scaled.items()))
 
 
 class RunTask(NamedTuple):
@@ -91,11 +116,26 @@ def buildings_rows() -> dict[str, BuildingsRow]:
         "intel (`configs/intel_laser.yaml`)", "configs/intel_laser.yaml", real=True
     )
     recordings["tuc"] = Recording(f"lecture hall (`{hall}`, given ids)", hall, real=True)
-    rows = {name: BuildingsRow(one, "miscalibrated", "buildings") for name, one in recordings.items()}
+    rows = {name: BuildingsRow(one, "buildings", "miscalibrated") for name, one in recordings.items()}
     for fault in ("lost", "wrong", "new"):
         recording = Recording(f"lecture hall, copies with a third of the ids {fault}", hall, real=True)
-        rows[f"ids {fault}"] = BuildingsRow(recording, f"ids {fault}", "ids")
+        rows[f"ids {fault}"] = BuildingsRow(recording, "ids", f"ids {fault}")
+    for (cell, cells), (sector, sectors) in product(FACTORS.items(), FACTORS.items()):
+        recording = Recording(f"Create, depth, cell x {cell}, sector x {sector}", CREATE, real=True)
+        rows[f"create {cell} {sector}"] = BuildingsRow(recording, "create", "", cells, sectors)
     return rows
+
+
+def choose_rows(names: Sequence[str] | None) -> dict[str, BuildingsRow]:
+    """The rows with these names or in sections with these names; without names all.
+
+    Raises:
+        InputError: a name that is neither.
+    """
+    rows = buildings_rows()
+    sections: dict[str, BuildingsRow] = {row.section: row for row in rows.values()}
+    chosen = select_rows(names, {**sections, **rows}, tuple(sections))
+    return {name: row for name, row in rows.items() if name in chosen or row.section in chosen}
 
 
 def buildings_table(
@@ -108,21 +148,23 @@ def buildings_table(
     """
     missing = {name: reason for name, row in rows.items() if (reason := row.recording.missing(folder))}
     present = [row for name, row in rows.items() if name not in missing]
+    counts = [1 + copies * bool(row.copies) for row in present]
     tasks = [
-        RunTask(row.recording.configuration(folder), row.copies, seed)
-        for row in present
-        for seed in range(copies + 1)
+        RunTask(row.configuration(folder), row.copies, seed)
+        for row, count in zip(present, counts, strict=True)
+        for seed in range(count)
     ]
     results = run_tasks(measure_run, tasks, workers=workers)
     found: dict[Section, list[RunFigures]] = {}
     notes = []
     yield markdown_header(COLUMNS)
-    for row in present:
-        runs = [next(results) for _ in range(copies + 1)]
+    for row, count in zip(present, counts, strict=True):
+        runs = [next(results) for _ in range(count)]
         yield markdown_row([row.recording.label, *_cells(runs)])
         found.setdefault(row.section, []).extend(runs)
-        notes += [_ids_note(row, runs)] if row.section == "ids" and copies else []
+        notes += [_ids_note(row, runs)] if row.section == "ids" else []
     notes = ([_total(found["buildings"])] if "buildings" in found else []) + notes
+    notes += [_create_note(found["create"])] if "create" in found else []
     notes += [f"Left out: {name}: {reason}" for name, reason in missing.items()]
     yield from ["", *notes] if notes else []
 
@@ -197,6 +239,15 @@ def _ids_note(row: BuildingsRow, runs: Sequence[RunFigures]) -> str:
     """The line below the table that compares spoilt ids with the recording as it is."""
     _, final, _ = _errors(runs)
     return f"{row.copies}: worst copy {final[1:].max() / final[0]:.2f} times the ATE as is."
+
+
+def _create_note(runs: Sequence[RunFigures]) -> str:
+    """The line below the table over all settings of the Create."""
+    odometry, final, live = _errors(runs)
+    return (
+        f"Create, {len(runs)} settings: final median {metres(np.median(final))} m; above odometry: final "
+        f"{(final > odometry).sum()}, live {(live > odometry).sum()}."
+    )
 
 
 def _errors(runs: Sequence[RunFigures]) -> np.ndarray:

@@ -15,6 +15,7 @@ from robot.recordings.csv_alignment import labels_from_pairs
 from robot.recordings.csv_config import (
     CsvConfig,
     LabelColumns,
+    MotionColumns,
     PairColumns,
     PoseColumns,
     TruthColumns,
@@ -141,6 +142,14 @@ def test_the_digest_covers_every_file(write: Write) -> None:
     assert read_csv_recording(write(ODOMETRY), VELOCITY).digest != one
 
 
+def test_motions_equal_velocities_times_their_duration(write: Write) -> None:
+    """The steps of `ODOMETRY` last half a second; the first row only sets the clock."""
+    rows = "t,distance,turn\n0.0,9.0,1.0\n0.5,0.1,0.05\n1.0,0.1,0.0\n1.5,0.1,0.0\n"
+    config = VELOCITY.model_copy(update={"velocity": None, "motion": MotionColumns()})
+    motions = read_csv_recording(write(rows, "motions.csv"), config).motion
+    np.testing.assert_allclose(motions, read_csv_recording(write(ODOMETRY), VELOCITY).motion, atol=1e-15)
+
+
 def test_the_lecture_hall_csv_equals_its_reference_trace(reference_data: Path) -> None:
     """Every label of the reference stream follows from the pairs; truth differs by rounding in the files."""
     data = reference_data / "data"
@@ -197,8 +206,8 @@ FAULTS: dict[str, tuple[str, dict[str, Any], list[str]]] = {
     "doubled": ("t,vx,vx,w\n0,1,1,0\n", {}, [":1: several columns are called 'vx'", "once"]),
     "semicolons": ("t;vx;w\n0;1;0\n", {}, ["separated by semicolons", "commas"]),
     "tabs": ("t\tvx\tw\n0\t1\t0\n", {}, ["separated by tabs"]),
-    "neither": (ODOMETRY, {"velocity": None}, ["neither table.pose nor table.velocity", "among t, vx, w"]),
-    "both": (ODOMETRY, {"pose": PoseColumns()}, ["both are given", "one of them"]),
+    "neither": (ODOMETRY, {"velocity": None}, ["none of table.pose, table.velocity", "among t, vx, w"]),
+    "both": (ODOMETRY, {"pose": PoseColumns()}, ["more than one of table.pose", "one of them"]),
     "no views": (ODOMETRY, {"views": ViewColumns()}, ["no column 'r0'", "table.views.prefix"]),
     "gap": ("t,vx,w,r0,r2\n0,1,0,1,1\n", {"views": ViewColumns()}, ["no column 'r1'", "'r0', 'r2'"]),
     "pixels": ("t,vx,w,r0,r1\n0,1,0,1,1\n", {"views": ViewColumns()}, ["2 columns r0", "3 (table.rows 1 x"]),

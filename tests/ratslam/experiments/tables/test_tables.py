@@ -114,7 +114,7 @@ def test_closures_are_false_by_distance_or_claimed_turn_and_sequences_by_their_m
 
 def test_a_row_of_buildings_counts_false_closures_and_runs_worse_than_odometry(monkeypatch):
     rows = {
-        name: buildings.BuildingsRow(recordings.Recording(name, "configs/square.yaml"), copies, section)
+        name: buildings.BuildingsRow(recordings.Recording(name, "configs/square.yaml"), section, copies)
         for name, copies, section in (("lab", "miscalibrated", "buildings"), ("ids", "ids lost", "ids"))
     }
     harmless = buildings.RunFigures(
@@ -133,13 +133,31 @@ def test_a_row_of_buildings_counts_false_closures_and_runs_worse_than_odometry(m
     assert note == "ids lost: worst copy 2.50 times the ATE as is."
 
 
+def test_the_create_is_mapped_at_nine_settings_without_copies(monkeypatch):
+    figures = buildings.RunFigures(1.0, 0.5, 2.0, np.zeros(0, bool), np.zeros((0, 2), bool))
+    tasks = stub_sessions(monkeypatch, buildings, lambda task: figures)
+    monkeypatch.setattr(recordings.Recording, "missing", lambda self, folder: "")
+    monkeypatch.setenv(recordings.DATA, ".")
+    rows = buildings.choose_rows(["create"])
+    lines = list(buildings.buildings_table(rows, copies=2, folder=ROOT))
+    configs = [task.config for task in tasks]
+    assert [task.seed for task in tasks] == [0] * 9
+    assert len({config.recall.sector_fov for config in configs}) == 3
+    assert {round(config.pose_cells.cell_size / config.experience.match_sd, 9) for config in configs} == {1.0}
+    assert {config.pose_cells.cell_size for config in configs} == {0.15, 0.3, 0.6}
+    assert lines[1].endswith("| 1.00 | 0.500 | 2.00 | - | - | 0.50 | 0, 1 of 1 | 0 / 0 | 0 / 0 | 0 / 0 |")
+    assert lines[-1] == "Create, 9 settings: final median 0.500 m; above odometry: final 0, live 9."
+
+
 def test_a_recording_in_the_folder_of_buildings_is_a_row(tmp_path, monkeypatch):
     """Five rounds on a circle in a room, by a laser of 180 beams."""
     write_building(tmp_path / "buildings", "room")
     monkeypatch.setenv(recordings.DATA, str(tmp_path))
     rows = buildings.buildings_rows()
-    assert list(rows) == ["room", "intel", "tuc", "ids lost", "ids wrong", "ids new"]
-    present = {name: rows[name] for name in ("room", "tuc")}
+    assert list(rows)[:6] == ["room", "intel", "tuc", "ids lost", "ids wrong", "ids new"]
+    assert buildings.choose_rows(None) == rows
+    present = buildings.choose_rows(["tuc", "room"])
+    assert list(present) == ["room", "tuc"]
     _, room, _, total, missing = buildings.buildings_table(present, copies=1, workers=1, folder=ROOT)
     cells = room.split(" | ")
     assert cells[0] == "| room"
