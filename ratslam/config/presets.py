@@ -8,10 +8,18 @@ PresetName = Literal["touch", "arm", "create"]
 
 PRESETS: dict[PresetName, dict[str, dict[str, Any]]] = {
     # Salman & Pearson 2016, III-C: the odometry of their arm, in pose cells of 5 cm; many whisker images look
-    # alike, so a closure needs more evidence and all closure sequences are compared with each other.
+    # alike, so a closure needs more evidence and all closure sequences are compared with each other. Weak
+    # sequences are selected from too, and novelty gives way to recall fast: else a robot that lost its place
+    # stays lost, because all that recall finds then is weak.
     "touch": {
         "pose_cells": {"cell_size": 0.05, "cells_xy": 21},
-        "recall": {"sector_fov": "whiskers", "mode_decay": 0.003, "miss_weight": 0.01, "modes": 4},
+        "recall": {
+            "sector_fov": "whiskers",
+            "mode_decay": 0.003,
+            "miss_weight": 0.01,
+            "modes": 4,
+            "enter": 0.2,
+        },
         "keyframes": {
             "noise": {"per_cell": 0.22, "heading_per_cell": 0.1, "heading_per_radian": 0.2},
             "bias_sd": 0.001,
@@ -19,6 +27,9 @@ PRESETS: dict[PresetName, dict[str, dict[str, Any]]] = {
             "max_distance": 60.0,
             "sequence_agreement": 0.2,
             "select_every": 50,
+            "select_score": 5.0,
+            "select_length": 2,
+            "sequence_cost": 3.0,
             "solve_every": 20,
             "max_turn": 0.6,
             "place_radius": 1.3,

@@ -79,7 +79,7 @@ class KeyframeMapConfig(Settings):
     """Keyframes after which all sequences, accepted or not, are selected anew against each other (see
     `ratslam.keyframes.closure_selection`); 0: never, an accepted sequence stays."""
     select_score: PositiveFloat = 12.0
-    """Least evidence of the sequences to select from."""
+    """Least evidence of the sequences to select from; one of them has at least `min_score`."""
     select_length: PositiveInt = 4
     """Least number of candidates of the sequences to select from."""
     sequence_cost: PositiveFloat = 6.0

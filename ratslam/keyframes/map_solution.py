@@ -49,11 +49,13 @@ def final_solution(graph: KeyframeGraph, log: ClosureLog, closures: bool) -> Map
 
 
 def selected_solution(graph: KeyframeGraph, log: ClosureLog) -> MapSolution | None:
-    """The map with the closure sequences that are best accepted together; None if none has evidence."""
+    """The map with the closure sequences that are best accepted together; None if none has the evidence of an
+    accepted one: weak sequences count only beside it, as images without information give a few of them."""
     config, log, cut = graph.config, deepcopy(log), deepcopy(graph.cut)
-    candidates = (log.scores() >= config.select_score) & (log.sizes() >= config.select_length)
+    scores = log.scores()
+    candidates = (scores >= config.select_score) & (log.sizes() >= config.select_length)
     candidates &= log.verdicts() != Verdict.UNDONE
-    if not candidates.any():
+    if not (candidates & (scores >= config.min_score)).any():
         return None
     sequences = np.flatnonzero(candidates)
     broken = np.flatnonzero(np.isin(cut.rows, sequences))

@@ -220,6 +220,17 @@ def test_images_without_information_give_no_closures(
         assert np.allclose(found.path, dead_reckoning(walk.readings), atol=1e-9)
 
 
+@pytest.mark.parametrize("seed", [4, 8, 22])
+def test_weak_sequences_alone_are_not_accepted(seed: int) -> None:
+    """Recall proposes sequences in these sessions that would do beside a strong one."""
+    settings, session = PRESETS["touch"]["keyframes"], empty_session()
+    found = follow(session, shuffled(simulate_walk(seed).readings))
+    log = session.map.solution().log
+    assert (log.scores()[log.sizes() >= settings["select_length"]] >= settings["select_score"]).any()
+    assert len(found.closures) == 0
+    assert accepted_sequences(session) == []
+
+
 @pytest.mark.soak
 def test_later_laps_in_another_maze_give_few_closures() -> None:
     """Small mazes share their outer walls, so the later images are those of another path as well."""
@@ -326,14 +337,22 @@ def test_an_undone_closure_sequence_stays_undone() -> None:
         keyframe_map.undo(sequence)
 
 
+def accepted_sequences(session: Session) -> list[int]:
+    """The closure sequences of the map; each decides anew which of the others fit."""
+    table = session.map.candidates()
+    return np.unique(table[table[:, 7] == Verdict.ACCEPTED, 5]).astype(int).tolist()
+
+
 def test_every_accepted_closure_sequence_can_be_undone() -> None:
     walk, session = simulate_walk(0), empty_session()
     follow(session, walk.readings)
-    table = session.map.candidates()
-    sequences = np.unique(table[table[:, 7] == Verdict.ACCEPTED, 5]).astype(int)
-    assert len(sequences) > 1
-    for sequence in sequences.tolist():
-        session.map.undo(sequence)
+    undone = []
+    while len(sequences := accepted_sequences(session)):
+        session.map.undo(sequences[0])
+        assert sequences[0] not in accepted_sequences(session)
+        undone.append(sequences[0])
+    assert len(undone) == len(set(undone)) > 1
+    assert len(session.map.closures()) == 0
 
 
 # Settings
