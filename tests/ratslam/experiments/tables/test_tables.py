@@ -9,9 +9,10 @@ import pytest
 
 from evaluation.metrics.session_metrics import TouchMetrics
 from ratslam.cli import main
+from ratslam.config.run_config import load_config
 from ratslam.experiments.tables import buildings, grid, laser, recordings, touch
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row, select_rows
-from ratslam.experiments.trials.recording_trial import ClosureClaims
+from ratslam.experiments.trials.recording_trial import ClosureClaims, closure_claims, run_recording
 from tactile.base.errors import InputError
 from tactile.base.se2 import between, integrate
 
@@ -177,12 +178,28 @@ def test_all_rows_of_the_buildings_table_without_data_are_named(monkeypatch, tmp
     assert "buildings" in rows
 
 
-def write_building(folder, name):
-    """A recording as those of the buildings: odometry with a heading bias, truth, and scans of a room."""
+@pytest.mark.parametrize("turned_deg", [20, -20])
+def test_a_candidate_claims_the_heading_that_its_shifted_view_shows(turned_deg, tmp_path):
+    """Later rounds are driven with the head turned by two sectors of ten degrees."""
+    write_building(tmp_path / "buildings", "room", np.radians(turned_deg))
+    file = tmp_path / "buildings" / "room_odom_gt.csv"
+    settings = [f"recording.file={file}", "recall.sector_fov=3.14159"]
+    run = run_recording(load_config(ROOT / "configs" / "building.yaml", settings))
+    claims = closure_claims(run)
+    assert claims.distance.max() < 0.5
+    assert claims.turn.max() < np.radians(1)
+    blind = closure_claims(run._replace(truth=run.truth * [1, 1, 0]))  # the claims themselves
+    assert np.isclose(blind.turn, np.radians(20), atol=1e-3).sum() > 20
+
+
+def write_building(folder, name, turned=0.0):
+    """A recording as those of the buildings: odometry with a heading bias, truth, and scans of a room; from
+    half-time on, the heading is `turned` from the direction of driving, rad."""
     folder.mkdir()
     time = np.arange(250.0)
     angle = 2 * np.pi * time / 50
-    truth = np.column_stack([3 * np.cos(angle), 3 * np.sin(angle), angle + np.pi / 2])
+    heading = angle + np.pi / 2 + turned * (time >= 125)
+    truth = np.column_stack([3 * np.cos(angle), 3 * np.sin(angle), heading])
     step = between(truth[:-1], truth[1:])
     odometry = np.vstack([np.zeros(3), integrate(step + [0, 0, 0.002])])
     beam = truth[:, 2:] + np.radians(np.arange(-89.5, 90))
