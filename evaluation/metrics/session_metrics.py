@@ -22,7 +22,8 @@ class SessionResult(NamedTuple):
     Attributes:
         truth, odometry, trajectory: [T, 3] true, dead-reckoned and final mapped poses. place: [T] current
             experience, -1 for none. node: [M, 3] poses of the experiences in the final map.
-        closures: [K, 2] later and earlier step of each loop closure.
+        closures: [K, 2] later and earlier step of each loop closure. live: [T, 3] pose given at each step, in
+            the map of that time. piece: [T] piece of the map of each step.
     """
 
     truth: np.ndarray
@@ -31,6 +32,8 @@ class SessionResult(NamedTuple):
     place: np.ndarray
     node: np.ndarray
     closures: np.ndarray
+    live: np.ndarray
+    piece: np.ndarray
 
 
 class TouchMetrics(NamedTuple):

@@ -55,6 +55,10 @@ class Map(Protocol):
         """[M, 2] pairs of steps joined by accepted loop closures: the later and the earlier."""
         return np.zeros((0, 2), int)
 
+    def pieces(self) -> np.ndarray:
+        """[T] the piece of each step: pieces are parts of the map that nothing connects, numbered from 0."""
+        return np.zeros(len(self.trajectory()), int)
+
     def graph(self) -> networkx.DiGraph:
         """The map as a graph."""
         return networkx.DiGraph()

@@ -25,7 +25,12 @@ from ratslam.keyframes.config import FULL, Ablation, KeyframeMapConfig
 from ratslam.keyframes.experiences import Experiences
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict, write_closures
-from ratslam.keyframes.map_solution import MapSolution, final_solution, selected_solution
+from ratslam.keyframes.map_solution import (
+    MapSolution,
+    final_solution,
+    selected_solution,
+    solution_pieces,
+)
 from ratslam.keyframes.odometry_breaks import break_odometry
 from ratslam.keyframes.optimizer import BiasPrior, MapFit
 from ratslam.keyframes.verification import continues_sequence, verify_sequence
@@ -107,6 +112,11 @@ class KeyframeMap(Checkpointed, Map):
         """[M, 2] steps of the keyframes joined by accepted loop closures."""
         log = self.solution().log
         return self._first_step()[log.table()[log.accepted_rows(), :2].astype(int)].reshape(-1, 2)
+
+    def pieces(self) -> np.ndarray:
+        """[T] the piece of each step, see `ratslam.keyframes.pieces`."""
+        piece = solution_pieces(self.solution())
+        return piece[np.maximum(self._step_frame.rows, 0)] if len(piece) else self._step_frame.rows * 0
 
     def candidates(self) -> np.ndarray:
         """[n, 9] all candidates of recall and their verdicts, see `ClosureLog.table`."""

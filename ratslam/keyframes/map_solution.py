@@ -22,6 +22,7 @@ from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import ClosureLog, Verdict
 from ratslam.keyframes.odometry_breaks import find_break
 from ratslam.keyframes.optimizer import MapFit, solve
+from ratslam.keyframes.pieces import number_pieces
 from tactile.base.se2 import correct_heading_bias, integrate
 
 
@@ -46,6 +47,12 @@ def final_solution(graph: KeyframeGraph, log: ClosureLog, closures: bool) -> Map
     if len(log.accepted_rows()):
         return MapSolution(graph.solve(log, graph.config.settling), log, graph.cut)
     return MapSolution(graph.fit()._replace(poses=graph.pose.rows.copy()), log, graph.cut)
+
+
+def solution_pieces(solution: MapSolution) -> np.ndarray:
+    """[N] the piece of each keyframe."""
+    closures = solution.log.table()[solution.log.accepted_rows(), :2].astype(int)
+    return number_pieces(solution.cut.rows >= 0, closures)
 
 
 def selected_solution(graph: KeyframeGraph, log: ClosureLog) -> MapSolution | None:

@@ -28,5 +28,7 @@ def session(truth, **given):
         "place": np.arange(len(truth)),
         "node": truth,
         "closures": np.zeros((0, 2), int),
+        "live": truth,
+        "piece": np.zeros(len(truth), int),
     }
     return SessionResult(**{**still, **given})

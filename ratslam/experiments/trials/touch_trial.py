@@ -55,6 +55,8 @@ def run_session(config: RunConfig, log: InMemorySource) -> SessionResult:
         place=np.where(place < len(node), place, -1),
         node=node,
         closures=session.map.closures(),
+        live=np.array([step.pose for step in steps]),
+        piece=session.map.pieces(),
     )
 
 

@@ -173,6 +173,16 @@ def test_a_restored_session_continues_as_if_never_stopped(make, stop):
     assert equal(whole, second.arrays())
 
 
+def test_every_step_is_in_a_piece(make):
+    session = fresh(make)
+    assert len(session.map.pieces()) == 0
+    list(session.replay(walk(150)))
+    piece = session.map.pieces()
+    assert piece.shape == (150,)
+    assert piece[0] == 0
+    assert set(piece.tolist()) == set(range(piece.max() + 1))
+
+
 def test_a_batch_of_sessions_equals_each_session(make):
     backend = make()
     runs = [list(walk(20, seed)) for seed in range(3)]

@@ -106,6 +106,9 @@ def test_a_map_is_cut_only_if_the_robot_may_be_carried(trace):
     """A map that would not be cut is the same with either setting."""
     plain, carried = golden_map(trace), map_carried(golden(trace))
     assert cuts(plain) == []
+    assert len(plain.pieces()) == len(carried.pieces()) == len(golden(trace).views)
+    assert not plain.pieces().any()
+    assert not carried.pieces().any()  # the sequence that shows the cut joins the parts
     assert np.array_equal(plain.trajectory(), carried.trajectory()) == (not cuts(carried))
 
 

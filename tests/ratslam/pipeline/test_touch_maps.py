@@ -268,6 +268,7 @@ def test_the_odometry_of_a_robot_that_is_never_carried_is_not_cut() -> None:
         for start in range(0, len(walk.readings), 50):
             assert follow(session, walk.readings[start : start + 50]).cuts == []
             assert (session.map.arrays()["graph/cut"] == -1).all()
+            assert not session.map.pieces().any()
 
 
 # The map while it grows
