@@ -82,6 +82,9 @@ class PathMap:
     def closures(self):
         return np.zeros((0, 2), int)
 
+    def pieces(self):
+        return np.zeros(len(self.trajectory()), int)
+
     def graph(self):
         return networkx.DiGraph()
 
