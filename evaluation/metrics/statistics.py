@@ -1,4 +1,4 @@
-"""Bootstrap intervals of means over runs; the separation of two samples; Pareto-optimal rows."""
+"""Intervals of means and of rates over runs; the separation of two samples; Pareto-optimal rows."""
 
 from __future__ import annotations
 
@@ -18,6 +18,18 @@ def bootstrap(values: np.ndarray, name: str, *, seed: int = 0) -> tuple[float, f
     means = values[stream(seed, name).integers(0, len(values), (10_000, len(values)))].mean(axis=1)
     low, high = np.quantile(means, [(1 - 0.95) / 2, (1 + 0.95) / 2])
     return float(low), float(high)
+
+
+def wilson_interval(count: int, runs: int) -> tuple[float, float]:
+    """95 % interval of a rate of which `count` of `runs` were found (Wilson 1927); (0, 1) without runs."""
+    if not runs:
+        return 0.0, 1.0
+    z = 1.959963984540054
+    share, scale = count / runs, 1 + z * z / runs
+    centre = share + z * z / (2 * runs)
+    half = z * np.sqrt(share * (1 - share) / runs + z * z / (4 * runs * runs))
+    low, high = float((centre - half) / scale), float((centre + half) / scale)
+    return max(0.0, min(low, share)), min(1.0, max(high, share))  # exact at 0 and 1, without rounding
 
 
 def auc(low: np.ndarray, high: np.ndarray) -> float:

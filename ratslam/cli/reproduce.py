@@ -98,9 +98,14 @@ def add_tables(tables: Commands) -> None:
         parser.set_defaults(lines=lines)
         return parser
 
-    touch = add("touch", _touch_lines, "whisker sessions under many conditions", "--rows main --mazes 1")
-    add_count(touch, "--mazes", 6, "mazes per row")
-    add_count(touch, "--seeds", 2, "sessions per maze")
+    touch = add("touch", _touch_lines, "whisker sessions under many conditions", "--rows main --sessions 1")
+    add_count(touch, "--first", 31100, "number of the first maze; each session has the next one")
+    touch.add_argument(
+        "--sessions",
+        type=positive_integer,
+        metavar="N",
+        help="sessions per row (default: of the row, 12 to 40)",
+    )
     touch.add_argument("--backend", choices=BACKENDS, default="recall", help="the method (default recall)")
     grid = add("grid", _grid_lines, "the grid filter in arenas", "--rows bias --worlds A --arenas 1")
     add_count(grid, "--arenas", 10, "arenas per row")
@@ -193,7 +198,7 @@ def _touch_lines(arguments: argparse.Namespace) -> Iterator[str]:
     from ratslam.experiments.tables.touch import DEFAULT_ROWS, ROWS, touch_table
 
     rows = select_rows(arguments.rows, ROWS, DEFAULT_ROWS)
-    return touch_table(rows, arguments.mazes, arguments.seeds, arguments.workers, arguments.backend)
+    return touch_table(rows, arguments.first, arguments.sessions, arguments.workers, arguments.backend)
 
 
 def _grid_lines(arguments: argparse.Namespace) -> Iterator[str]:

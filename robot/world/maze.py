@@ -60,6 +60,25 @@ def random_maze(columns: int, rows: int, loop: list[Cell], share: float, random:
     return maze
 
 
+def tree_maze(columns: int, rows: int, random: np.random.Generator) -> Maze:
+    """A maze in which exactly one way joins each two cells, by depth-first search in random order."""
+    maze = closed_maze(columns, rows)
+    way: list[Cell] = [(0, 0)]
+    seen = {way[0]}
+    while way:
+        column, row = way[-1]
+        around = [(column + 1, row), (column, row + 1), (column - 1, row), (column, row - 1)]
+        onward = [cell for cell in around if is_inside(maze, cell) and cell not in seen]
+        if not onward:
+            way.pop()
+            continue
+        way.append(onward[int(random.integers(len(onward)))])
+        seen.add(way[-1])
+        wall, place = between_cells(maze, *way[-2:])
+        wall[place] = False
+    return maze
+
+
 def random_loop(columns: int, rows: int, length: int, random: np.random.Generator) -> list[Cell]:
     """A closed counter-clockwise path of this many different cells.
 

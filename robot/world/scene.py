@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path as File
-from typing import Annotated, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
@@ -21,6 +21,7 @@ from robot.world.maze import (
     random_loop,
     random_maze,
     read_maze,
+    tree_maze,
     wall_boxes,
 )
 from robot.world.maze_routes import check_route, circuit_route, exploration_route, make_anticlockwise
@@ -45,6 +46,9 @@ class MazeConfig(Settings):
     """Cells from south to north."""
     loop: PositiveInt = 20
     """Length of the open loop for circuits, cells."""
+    kind: Literal["loop", "tree"] = "loop"
+    """`loop`: an open loop, and each other wall with the probability `share`; `tree`: one way between each
+    two cells, no loops, to explore."""
     share: Annotated[float, Field(ge=0, le=1)] = 0.6
     """Probability of each wall between cells outside the loop."""
     file: File | None = None
@@ -139,7 +143,7 @@ def other_surroundings(scene: Scene, config: MazeConfig, head: Head, seed: int) 
     """Walls of another maze of the same size, checked along the same path."""
     columns, rows = scene.maze.columns, scene.maze.rows
     seed = _maze_seed(config, seed)
-    maze = random_maze(columns, rows, scene.loop, config.share, stream(seed, "later.walls"))
+    maze = _draw_walls(config, columns, rows, scene.loop, stream(seed, "later.walls"))
     boxes = wall_boxes(maze, stream(seed, "later.heights"), config.heights)
     return check_surroundings(boxes, head, scene.path)
 
@@ -194,8 +198,21 @@ def _make_maze(config: MazeConfig, path: PathConfig, seed: int) -> tuple[Maze, l
             expected = "the cells of a loop in the maze"
             raise InputError("simulation.path.loop", "circuits without a loop", expected, cure)
         return maze, loop
-    loop = loop or random_loop(config.columns, config.rows, config.loop, stream(seed, "maze.loop"))
-    return random_maze(config.columns, config.rows, loop, config.share, stream(seed, "maze.walls")), loop
+    if config.kind == "tree" and (path.circuits or loop):
+        cure = "explore, or use `simulation.maze.kind: loop`"
+        raise InputError("simulation.path", "circuits in a maze without loops", "an exploration", cure)
+    if config.kind == "loop" and not loop:
+        loop = random_loop(config.columns, config.rows, config.loop, stream(seed, "maze.loop"))
+    walls = stream(seed, "maze.walls")
+    return _draw_walls(config, config.columns, config.rows, loop, walls), loop
+
+
+def _draw_walls(
+    config: MazeConfig, columns: int, rows: int, loop: list[Cell], random: np.random.Generator
+) -> Maze:
+    if config.kind == "tree":
+        return tree_maze(columns, rows, random)
+    return random_maze(columns, rows, loop, config.share, random)
 
 
 def _plan_route(

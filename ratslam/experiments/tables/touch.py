@@ -1,20 +1,20 @@
 """The touch table: whisker sessions in mazes never used for tuning, with one setting for all conditions.
 
-Each row is a condition; each session of it has its own maze and seed. Values are medians over the sessions; a
-success is an Energy Metric (all pairs, m^2 + rad^2) below `SUCCESS`.
+Each row is a condition; each session of it has its own maze, so that an unlucky maze counts once. Values are
+medians over the sessions; a failure is an Energy Metric (all pairs, m^2 + rad^2) of `SUCCESS` or more.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.experience_metric import ExmConfig
+from evaluation.metrics.map_pieces import energy_within_pieces, unjoined_share
 from evaluation.metrics.session_metrics import (
     FALSE_CLOSURE_DISTANCE,
     TouchMetrics,
@@ -22,15 +22,19 @@ from evaluation.metrics.session_metrics import (
     experience_metric_if_defined,
     touch_metrics,
 )
+from evaluation.metrics.statistics import wilson_interval
 from ratslam.config.run_config import RunConfig
 from ratslam.experiments.studies.executor import run_tasks
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
 from ratslam.experiments.trials.touch_trial import run_session
 from ratslam.pipeline.source import open_observations
 from robot.sources.in_memory import load_into_memory
+from robot.sources.odometry import OdometryConfig
 
-FIRST_MAZE = 9000
+FIRST_MAZE = 31100
 SUCCESS = 0.25
+TOLERANCE = 1.05
+"""A map is worse than odometry if its Energy Metric is above odometry's times this."""
 CHANGE = 0.3
 """Share of a session before the change of mazes."""
 RECOVERY_LIMIT = 45
@@ -42,16 +46,19 @@ MAIN: dict[str, Any] = {"motion": {"jitter": {"position": 0.005, "yaw_deg": 1.5,
 ROUGH = {"motion": {"jitter": {"position": 0.010, "yaw_deg": 3.0, "speed": 0.10}}}
 MAX_ANGLE = {"image": {"transform": "max_angle"}}
 KIDNAPS = {"kidnaps": {"count": 8, "ahead": 45.0}}
+EXPLORATION = {"path": {"explore": 1500}}
+NOISE = OdometryConfig()
 OPEN_LOOP = {"whisking": {"mode": "open"}}
 
 
 class TouchRow(NamedTuple):
-    """A row: its label, and the settings `simulation`, `touch` and `keyframes` of its sessions."""
+    """A row: label, settings `simulation`, `touch` and `keyframes` of its sessions, and their number."""
 
     label: str
     simulation: dict[str, Any] = {}  # noqa: RUF012
     touch: dict[str, Any] = {}  # noqa: RUF012
     keyframes: dict[str, Any] = {}  # noqa: RUF012
+    sessions: int = 12
 
 
 def _head(*radii: float) -> dict[str, Any]:
@@ -62,16 +69,29 @@ def _head(*radii: float) -> dict[str, Any]:
 
 
 ROWS = {
-    "main": TouchRow("main: ten circuits, 5 mm / 1.5 deg / 5 %", MAIN),
+    "main": TouchRow("main: ten circuits, 5 mm / 1.5 deg / 5 %", MAIN, sessions=40),
     "clean": TouchRow("clean: 2 mm / 0.5 deg"),
     "rough": TouchRow("rough: 10 mm / 3 deg / 10 %", ROUGH),
     "rough, 3 % faults": TouchRow(
         "rough, 3 % contacts missed, 3 % spurious", ROUGH | {"mechanics": {"missed": 0.03, "spurious": 0.03}}
     ),
     "open, max_angle": TouchRow("open loop, max_angle", OPEN_LOOP, MAX_ANGLE),
-    "white": TouchRow("white odometry noise", {"odometry": {"noise": "white"}}),
+    "white": TouchRow("white odometry noise", {"odometry": {"noise": "white"}}, sessions=20),
     "telescoping": TouchRow("telescoping noise", {"odometry": {"noise": "telescoping"}}),
-    "exploration": TouchRow("free exploration, 1500 whisks", {"path": {"explore": 1500}}),
+    "exploration": TouchRow("free exploration, 1500 whisks", EXPLORATION, sessions=40),
+    "open arena": TouchRow(
+        "open arena, 8 % of the walls, free exploration",
+        MAIN | EXPLORATION | {"maze": {"share": 0.08}},
+        sessions=20,
+    ),
+    "tree": TouchRow(
+        "maze without loops, free exploration", MAIN | EXPLORATION | {"maze": {"kind": "tree"}}, sessions=20
+    ),
+    "noise x 2": TouchRow(
+        "odometry noise x 2",
+        MAIN | {"odometry": {"length": 2 * NOISE.length, "heading": 2 * NOISE.heading}},
+        sessions=20,
+    ),
     "exploration, 3000": TouchRow("free exploration, 3000 whisks", {"path": {"explore": 3000}}),
     "5 x 5": TouchRow("5 x 5 cells", {"maze": {"columns": 5, "rows": 5, "loop": 12}}),
     "12 x 8": TouchRow("12 x 8 cells", {"maze": {"columns": 12, "rows": 8, "loop": 32}}),
@@ -102,18 +122,22 @@ ROWS = {
 DEFAULT_ROWS = tuple(ROWS)[:-4]
 """The rows printed if none are chosen."""
 COLUMNS = (
-    "condition", "EM (worst)", "success", "through experiences", "odometry", "ARR",
-    "ARCR strict (worst), chain-free", "revisits closed", "false / closures",
+    "condition", "EM (worst)", "live EM", "odometry", "failures [95 %]", "worse than odometry (worst ratio)",
+    "through experiences", "ARR", "ARCR strict (worst), chain-free", "revisits closed", "false / closures",
 )  # fmt: skip
 
 
 class TouchTask(NamedTuple):
-    """One session of a row."""
+    """One session of a row: its maze number, which gives its seed too."""
 
     row: str
     maze: int
-    seed: int
     backend: str = "recall"
+
+    @property
+    def seed(self) -> int:
+        """Seed of the session: the last two digits of the maze."""
+        return self.maze % 100
 
 
 class SessionFigures(NamedTuple):
@@ -122,29 +146,41 @@ class SessionFigures(NamedTuple):
     Attributes:
         metrics: of `touch_metrics`, but `em_experiences` with steps without an experience at their own pose,
             and `arcr_chain_free` 0 without re-localisations. revisits_closed: share of the revisits with a
-            true closure; NaN without revisits. across: closures between the parts before and after `CHANGE`.
+            true closure; NaN without revisits. em_live: EM of the poses given at each step. em_pieces: EM
+            over pairs of steps in the same piece of the map. unjoined: share of the steps outside its largest
+            piece. across: closures between the parts before and after `CHANGE`.
             recovery: whisks from each kidnap to the first true closure.
     """
 
     metrics: TouchMetrics
     revisits_closed: float
+    em_live: float
+    em_pieces: float
+    unjoined: float
     across: int
     recovery: tuple[int, ...]
 
 
 def touch_table(
-    rows: Sequence[str], mazes: int = 6, seeds: int = 2, workers: int = 0, backend: str = "recall"
+    rows: Sequence[str],
+    first: int = FIRST_MAZE,
+    sessions: int | None = None,
+    workers: int = 0,
+    backend: str = "recall",
 ) -> Iterator[str]:
-    """The lines of the table, each as soon as its sessions are done."""
-    tasks = [
-        TouchTask(row, FIRST_MAZE + maze, 100 * maze + seed, backend)
-        for row, maze, seed in product(rows, range(mazes), range(seeds))
-    ]
+    """The lines of the table, each as soon as its sessions are done.
+
+    Args:
+        first: number of the first maze; each session has the next one. sessions: of each row; None: the row's
+            own number.
+    """
+    counts = {row: sessions or ROWS[row].sessions for row in rows}
+    tasks = [TouchTask(row, first + k, backend) for row in rows for k in range(counts[row])]
     results = run_tasks(measure_session, tasks, workers=workers)
     notes: list[str] = []
     yield markdown_header(COLUMNS)
     for row in rows:
-        found = [next(results) for _ in range(mazes * seeds)]
+        found = [next(results) for _ in range(counts[row])]
         yield markdown_row([ROWS[row].label, *_cells(found)])
         notes += _notes(row, found)
     yield from ["", *notes] if notes else []
@@ -177,6 +213,9 @@ def measure_session(task: TouchTask) -> SessionFigures:
             arcr_chain_free=float(np.nan_to_num(metrics.arcr_chain_free)),
         ),
         revisits_closed=_share_of_revisits_closed(truth, true_closures),
+        em_live=energy_all_pairs(result.live, truth).total,
+        em_pieces=energy_within_pieces(result.trajectory, truth, result.piece).total,
+        unjoined=unjoined_share(result.piece),
         across=int(across.sum()),
         recovery=tuple(map(int, recovered)),
     )
@@ -184,7 +223,7 @@ def measure_session(task: TouchTask) -> SessionFigures:
 
 def task_config(task: TouchTask) -> RunConfig:
     """The configuration of a session."""
-    _, simulation, touch, keyframes = ROWS[task.row]
+    _, simulation, touch, keyframes, _ = ROWS[task.row]
     maze = {"seed": task.maze} | simulation.get("maze", {})
     simulation = simulation | {"seed": task.seed, "maze": maze}
     parts = {"simulation": simulation, "touch": touch, "keyframes": keyframes, "backend": task.backend}
@@ -205,19 +244,22 @@ def _share_of_revisits_closed(truth: np.ndarray, true_closures: np.ndarray) -> f
 
 def _cells(found: Sequence[SessionFigures]) -> list[str]:
     values = {name: [getattr(one.metrics, name) for one in found] for name in TouchMetrics._fields}
-    values["revisits_closed"] = [one.revisits_closed for one in found]
+    values |= {name: [getattr(one, name) for one in found] for name in ("revisits_closed", "em_live")}
 
     def median(name: str, digits: int = 3) -> str:
         known = np.isfinite(values[name]).any()
         return f"{np.nanmedian(values[name]):.{digits}f}" if known else "-"
 
     em, strict = np.array(values["em"]), np.array(values["arcr"])
+    ratio = em / np.array(values["em_odometry"])
     worst = np.nanmin(strict) if np.isfinite(strict).any() else np.nan
     return [
         f"{np.median(em):.3f} ({em.max():.2f})",
-        f"{(em < SUCCESS).sum()} of {len(found)}",
-        median("em_experiences"),
+        median("em_live"),
         median("em_odometry", 2),
+        _rate(em >= SUCCESS),
+        f"{_rate(ratio > TOLERANCE)} ({ratio.max():.2f})",
+        median("em_experiences"),
         median("arr"),
         f"{median('arcr')} ({worst:.2f}), {median('arcr_chain_free')}" if np.isfinite(worst) else "-",
         median("revisits_closed", 2),
@@ -225,8 +267,15 @@ def _cells(found: Sequence[SessionFigures]) -> list[str]:
     ]
 
 
+def _rate(happened: np.ndarray) -> str:
+    """How many of the sessions [n] bool, with the interval of the rate in percent."""
+    low, high = wilson_interval(int(happened.sum()), len(happened))
+    return f"{happened.sum()} of {len(happened)} [{100 * low:.0f}-{100 * high:.0f} %]"
+
+
 def _notes(row: str, found: Sequence[SessionFigures]) -> list[str]:
-    """Lines below the table for some rows: closures across a change of mazes, recovery after kidnaps."""
+    """Lines below the table for some rows: closures across a change of mazes; recovery and the error within
+    pieces after kidnaps."""
     notes = []
     if row == "control: other maze":
         across, closures = sum(one.across for one in found), sum(one.metrics.closures for one in found)
@@ -236,5 +285,11 @@ def _notes(row: str, found: Sequence[SessionFigures]) -> list[str]:
         notes.append(
             f"{row}: whisks to the first true closure, median {np.median(recovery):.0f}; "
             f"within {RECOVERY_LIMIT}: {(recovery <= RECOVERY_LIMIT).mean():.0%}."
+        )
+        em, unjoined = np.array([(one.em_pieces, one.unjoined) for one in found]).T
+        notes.append(
+            f"{row}: EM within pieces of the map, median {np.nanmedian(em):.3f} ({np.nanmax(em):.2f}); "
+            f"share of steps outside the largest piece, median {np.median(unjoined):.0%} "
+            f"({unjoined.max():.0%})."
         )
     return notes

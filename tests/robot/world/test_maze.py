@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import networkx
 import numpy as np
 import pytest
 from hypothesis import given
@@ -23,6 +24,7 @@ from robot.world.maze import (
     random_loop,
     random_maze,
     read_maze,
+    tree_maze,
     wall_boxes,
 )
 from tactile.base.errors import InputError
@@ -49,6 +51,18 @@ def test_a_loop_is_closed_simple_and_anticlockwise(seed: int, size: tuple[int, i
     x, y = cells.T
     assert np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) > 0
     assert loop == random_loop(columns, rows, length, stream(seed, "maze.loop"))
+
+
+@given(SEEDS, st.integers(1, 9), st.integers(1, 9))
+def test_one_way_joins_each_two_cells_of_a_tree(seed: int, columns: int, rows: int) -> None:
+    maze = tree_maze(columns, rows, np.random.default_rng(seed))
+    cells = [(column, row) for column in range(columns) for row in range(rows)]
+    graph = networkx.Graph()
+    graph.add_nodes_from(cells)
+    graph.add_edges_from((cell, other) for cell in cells for other in neighbours(maze, cell))
+    assert networkx.is_tree(graph)
+    assert maze.across[[0, -1]].all()
+    assert maze.along[:, [0, -1]].all()
 
 
 def test_mazes_of_different_seeds_differ() -> None:

@@ -22,7 +22,9 @@ METRICS = TouchMetrics(
     em=0.01, em_experiences=0.02, em_odometry=2.0, arr=0.5, arcr=0.9, arcr_chain_free=0.95,
     relocalisations=90, closures=100, false_closures=3, experiences=50, steps=200,
 )  # fmt: skip
-SESSION = touch.SessionFigures(METRICS, revisits_closed=0.8, across=40, recovery=())
+SESSION = touch.SessionFigures(
+    METRICS, revisits_closed=0.8, em_live=0.04, em_pieces=0.008, unjoined=0.1, across=40, recovery=()
+)
 ARENA = grid.GridFigures(0.02, 0.2, np.radians([1.0, 20.0]), 4, (0.9, 0.4, 0.3, 0.04, 0.05))
 
 
@@ -52,7 +54,7 @@ def test_unknown_rows_are_refused_with_a_list():
 
 @pytest.mark.parametrize("row", touch.ROWS)
 def test_touch_rows_are_valid_configurations(row):
-    assert touch.task_config(touch.TouchTask(row, 9000, 3)).simulation.seed == 3
+    assert touch.task_config(touch.TouchTask(row, 31103)).simulation.seed == 3
 
 
 @pytest.mark.parametrize("row", grid.ROWS)
@@ -61,30 +63,39 @@ def test_grid_rows_are_valid_configurations(row):
 
 
 def test_a_touch_row_gives_medians_worst_values_and_sums(monkeypatch):
-    worse = SESSION._replace(metrics=METRICS._replace(em=0.5, arcr=0.1))
-    tasks = stub_sessions(monkeypatch, touch, lambda task: worse if task.seed == 101 else SESSION)
-    _, row = touch.touch_table(["clean"], mazes=2, seeds=2)
-    assert [(task.maze, task.seed) for task in tasks] == [(9000, 0), (9000, 1), (9001, 100), (9001, 101)]
+    worse = SESSION._replace(metrics=METRICS._replace(em=5.0, arcr=0.1))
+    tasks = stub_sessions(monkeypatch, touch, lambda task: worse if task.maze == 31002 else SESSION)
+    _, row = touch.touch_table(["clean"], first=31000, sessions=4)
+    assert [(task.maze, task.seed) for task in tasks] == [(31000, 0), (31001, 1), (31002, 2), (31003, 3)]
     assert row == (
-        "| clean: 2 mm / 0.5 deg | 0.010 (0.50) | 3 of 4 | 0.020 | 2.00 | 0.500 | 0.900 (0.10), 0.950 | 0.80 "
-        "| 12 / 400 |"
+        "| clean: 2 mm / 0.5 deg | 0.010 (5.00) | 0.040 | 2.00 | 1 of 4 [5-70 %] | 1 of 4 [5-70 %] (2.50) "
+        "| 0.020 | 0.500 | 0.900 (0.10), 0.950 | 0.80 | 12 / 400 |"
     )
+
+
+def test_each_touch_row_has_its_number_of_sessions(monkeypatch):
+    tasks = stub_sessions(monkeypatch, touch, lambda task: SESSION)
+    lines = list(touch.touch_table(["main", "tree", "clean"]))
+    assert [sum(task.row == row for task in tasks) for row in ("main", "tree", "clean")] == [40, 20, 12]
+    assert {task.maze for task in tasks if task.row == "tree"} == set(range(31100, 31120))
+    assert "0 of 40 [0-9 %]" in lines[1]
 
 
 def test_touch_sessions_without_closures_have_no_arcr(monkeypatch):
     missing = METRICS._replace(arcr=np.nan, arcr_chain_free=0.0, closures=0, false_closures=0)
     none = SESSION._replace(metrics=missing)
     stub_sessions(monkeypatch, touch, lambda task: none)
-    _, row = touch.touch_table(["control: shuffled"], mazes=1, seeds=1)
+    _, row = touch.touch_table(["control: shuffled"], sessions=1)
     assert row.endswith("| 0.500 | - | 0.80 | 0 / 0 |")
 
 
 def test_kidnaps_and_the_change_of_mazes_are_reported_below_the_touch_table(monkeypatch):
     stub_sessions(monkeypatch, touch, lambda task: SESSION._replace(recovery=(10, 20, 90)))
-    *_, other, kidnaps = touch.touch_table(["kidnaps", "control: other maze"], mazes=1, seeds=1)
-    text = "\n".join((other, kidnaps))
+    text = "\n".join(touch.touch_table(["kidnaps", "control: other maze"], sessions=1))
     assert "40 of 100 closures" in text
     assert "median 20; within 45: 67%" in text
+    assert "kidnaps: EM within pieces of the map, median 0.008 (0.01)" in text
+    assert "outside the largest piece, median 10% (10%)" in text
 
 
 def test_a_grid_row_compares_with_dead_reckoning(monkeypatch):

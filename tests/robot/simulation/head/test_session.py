@@ -189,6 +189,16 @@ def test_exploration_has_the_configured_duration() -> None:
     assert simulate(path={"explore": 400.0}, seed=1).truth[-1].tolist() != session.truth[-1].tolist()
 
 
+def test_a_maze_without_loops_is_explored() -> None:
+    tree = {"kind": "tree"}
+    session, other = (simulate(maze=tree, path={"explore": 300.0}, seed=seed) for seed in (0, 1))
+    assert session.length == 300
+    assert not session.scene.loop
+    inner = np.r_[session.scene.maze.across[1:-1].ravel(), session.scene.maze.along[:, 1:-1].ravel()]
+    assert (~inner).sum() == session.scene.maze.columns * session.scene.maze.rows - 1
+    assert not np.array_equal(session.scene.maze.across, other.scene.maze.across)
+
+
 def test_given_cells_are_visited(tmp_path: Path) -> None:
     (tmp_path / "maze.txt").write_text("o---o---o\n|       |\no   o   o\n|   |   |\no---o---o\n")
     cells = [(0, 0), (0, 1), (1, 1), (1, 0)]
@@ -229,6 +239,7 @@ LOW = HeadConfig(rings=(RingConfig(length=0.16, radius=0.045, height=0.07),), re
             None,
             ["cells[1]", "columns 0 to 1"],
         ),
+        ({"maze": {"kind": "tree"}}, None, ["simulation.path", "without loops", "simulation.maze.kind"]),
         ({"path": {"loop": [*LOOP, (3, 3)]}}, None, ["path.loop[3] to [4]", "neighbouring"]),
         ({"path": {"loop": [(-1, 0), (0, 0)]}}, None, ["path.loop[0]", "cell (-1, 0)"]),
         ({"path": {"cells": [(0, 0)]}}, None, ["simulation.path.cells", "at least two"]),
