@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -17,15 +18,23 @@ from ratslam.classic import view_templates
 from ratslam.core.backend import Backend, enlarge
 from ratslam.core.finite_values import finite_values
 from ratslam.core.types import Action, Estimate, Scalar
+from ratslam.keyframes.acceptance import Acceptance, AcceptByEvidence
 from ratslam.keyframes.appearance import Appearance, LabelAppearance, ViewAppearance, WhiskerAppearance
+from ratslam.keyframes.closure_odds import AcceptByOdds
 from ratslam.keyframes.config import FULL, Ablation
+from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.map import KeyframeMap
-from ratslam.recall import filter
+from ratslam.recall import filter, mirror
 from ratslam.recall import memory as recall_memory
 from ratslam.recall.config import fan_width
 from ratslam.recall.filter import RecallResult
 from ratslam.recall.memory import MapFeedback, Memory
-from ratslam.recall.observation_model import label_likelihood, touch_likelihood, view_likelihood
+from ratslam.recall.observation_model import (
+    ObservationLikelihood,
+    label_likelihood,
+    touch_likelihood,
+    view_likelihood,
+)
 from ratslam.recall.whisker_likelihood import live_pixels, pixel_layout, pixel_levels
 from tactile.base.types import Array, Observation
 
@@ -49,7 +58,8 @@ class RecallEvidence(NamedTuple):
     """Evidence of one step.
 
     Attributes:
-        keyframe to background: see `RecallResult`. energy: injected into the pose cells. packet: [3] decoded,
+        keyframe to background: see `RecallResult`. mirror_match to mirror_log_ratio: the same of the control
+            (`ratslam.recall.mirror`). energy: injected into the pose cells. packet: [3] decoded,
             cells. health: see `RecallState`. outcome: an `Outcome`, int32.
     """
 
@@ -63,6 +73,10 @@ class RecallEvidence(NamedTuple):
     second_mode: Scalar
     view_fits: Scalar
     background: Array
+    mirror_match: Scalar
+    mirror_shift: Scalar
+    mirror_posterior: Scalar
+    mirror_log_ratio: Scalar
     energy: Scalar
     packet: Array
     window_level: Scalar
@@ -89,6 +103,7 @@ class RecallBackend(Backend):
         self.recall = config.recall.model_copy(update={"sector_fov": "none"}) if labels else config.recall
         if self.recall.sector_fov == "whiskers" and view_shape[1] % 2:  # no whisker is opposite another
             self.recall = self.recall.model_copy(update={"shifts": 0})
+        self.control = mirror.control_config(self.recall)
         self.labels, self.view_shape = labels, view_shape
         self.size = 0 if labels else int(np.prod(view_shape))
         self.pixels = pixel_layout(view_shape) if self.recall.sector_fov == "whiskers" else None
@@ -132,10 +147,10 @@ class RecallBackend(Backend):
         is_keyframe = seen & recall_memory.is_keyframe_due(self.recall, self.cell, memory)
         features = self._features(view, observation)
 
-        memory, result = lax.cond(
+        memory, result, control = lax.cond(
             is_keyframe,
             lambda: self._recall(memory, features, observation.label),
-            lambda: (memory, filter.empty_result(memory)),
+            lambda: (memory, filter.empty_result(memory), _candidate(filter.empty_result(memory))),
         )
         recalled, energy = self._injection(memory, result)
         cells, info = pose_cells.step(
@@ -161,8 +176,8 @@ class RecallBackend(Backend):
             lost=(health < self.config.min_fit_share) | (outcome == Outcome.TOO_FAST),
         )
         evidence = RecallEvidence(
-            **result._asdict(), energy=energy, packet=cells.pose, window_level=info.level,
-            health=health, outcome=outcome,
+            **result._asdict(), **control._asdict(), energy=energy, packet=cells.pose,
+            window_level=info.level, health=health, outcome=outcome,
         )  # fmt: skip
         return RecallState(cells, memory, health), estimate, evidence
 
@@ -174,9 +189,14 @@ class RecallBackend(Backend):
     def new_map(self) -> KeyframeMap:
         """An empty keyframe map."""
         return KeyframeMap(
-            self.config.keyframes, self.cell, self._appearance(), guard=self.recall.guard,
+            self.config.keyframes, self.cell, self._appearance(), self._acceptance(), guard=self.recall.guard,
             closures=self.config.experience.closures, ablation=self.ablation,
         )  # fmt: skip
+
+    def _acceptance(self) -> Callable[[KeyframeGraph], Acceptance]:
+        """By odds for views and given ids; with whiskers, sequences are selected against each other."""
+        by_evidence = self.pixels is not None or not self.ablation.verify
+        return (lambda graph: AcceptByEvidence()) if by_evidence else AcceptByOdds
 
     def _appearance(self) -> Appearance:
         if self.labels:
@@ -200,14 +220,27 @@ class RecallBackend(Backend):
         alive = live_pixels(observation).reshape(-1).astype(self.dtype)
         return pixel_levels(flat, alive).astype(jnp.int32)
 
-    def _recall(self, memory: Memory, view: Array, label: Array) -> tuple[Memory, RecallResult]:
+    def _recall(
+        self, memory: Memory, view: Array, label: Array
+    ) -> tuple[Memory, RecallResult, mirror.Candidate]:
+        """Recognises the view, and by the control its mirror image."""
+        updated, result = filter.recognise(self.recall, self.cell, *self._likelihood(memory, view, label))
+        blind, other = mirror.mirrored_memory(memory), mirror.permuted_label(memory, label)
+        seen = self._likelihood(blind, self._mirrored(view, memory.angle), other)
+        blind, false = filter.recognise(self.control, self.cell, *seen)
+        return mirror.keep_control(updated, blind), result, _candidate(false)
+
+    def _likelihood(self, memory: Memory, view: Array, label: Array) -> tuple[Memory, ObservationLikelihood]:
         if self.labels:
-            likelihood = label_likelihood(self.recall, memory, label)
-        elif self.pixels is not None:
-            memory, likelihood = touch_likelihood(self.recall, memory, view, self.pixels)
-        else:
-            likelihood = view_likelihood(self.recall, self.cell, memory, view)
-        return filter.recognise(self.recall, self.cell, memory, likelihood)
+            return memory, label_likelihood(self.recall, memory, label)
+        if self.pixels is not None:
+            return touch_likelihood(self.recall, memory, view, self.pixels)
+        return memory, view_likelihood(self.recall, self.cell, memory, view)
+
+    def _mirrored(self, view: Array, angle: Array) -> Array:
+        if self.pixels is not None:
+            return view[self.pixels.mirrored]
+        return mirror.mirror_view(view, self.view_shape, angle) if len(view) else view
 
     def _injection(self, memory: Memory, result: RecallResult) -> tuple[Array, Array]:
         """The packet of a candidate turned by its sector shift, and energy proportional to its posterior."""
@@ -217,3 +250,7 @@ class RecallBackend(Backend):
         packet = packet + jnp.stack([jnp.zeros_like(turned), jnp.zeros_like(turned), turned])
         energy = jnp.where(known, self.recall.energy * result.posterior, 0.0)
         return packet % self.rings, energy
+
+
+def _candidate(result: RecallResult) -> mirror.Candidate:
+    return mirror.Candidate(result.match, result.shift, result.posterior, result.log_ratio)

@@ -33,7 +33,7 @@ class KeyframeMapConfig(Settings):
     """Standard deviation of the heading bias without views, rad per cell."""
     bias_least: PositiveFloat = 0.003
     """Least standard deviation of the views' heading bias, rad per cell."""
-    shrink: NonNegativeFloat = 3.0
+    shrink: NonNegativeFloat = 4.0
     """Number of standard errors below which the views' heading bias counts as zero."""
     candidate_posterior: PositiveFloat = 0.5
     """Posterior above which a recalled keyframe is a closure candidate."""

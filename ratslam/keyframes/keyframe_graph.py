@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import copy, deepcopy
+
 import numpy as np
 
 from ratslam.core.checkpoint import Checkpointed
@@ -12,10 +14,10 @@ from ratslam.keyframes.loop_closures import ClosureLog
 from ratslam.keyframes.optimizer import (
     BiasPrior,
     LoopClosures,
+    MapCovariance,
     MapFit,
     MapProblem,
     OdometryChain,
-    relative_covariance,
     solve,
 )
 from ratslam.pose_graph import Edges
@@ -66,6 +68,12 @@ class KeyframeGraph(Checkpointed):
         """Turn per sector shift of a view, rad; 0 while unknown."""
         return self.appearance.metric().angle
 
+    def copy(self) -> KeyframeGraph:
+        """A copy whose map may change; what never changes is shared."""
+        other = copy(self)
+        other.pose, other.cut = deepcopy(self.pose), deepcopy(self.cut)
+        return other
+
     def append(self, pose: np.ndarray, motion: np.ndarray, length: float, turn: float) -> None:
         """Adds a keyframe at `pose` [3], reached by `motion` [3]."""
         self.pose.append(pose)
@@ -96,14 +104,18 @@ class KeyframeGraph(Checkpointed):
 
     def odometry(self, cut: GrowableArray) -> OdometryChain:
         """The odometry between keyframes with its variances, loose at the breaks `cut`."""
+        return OdometryChain(self.motion.rows[1:], self.length.rows[1:], self.variances(cut)[1:])
+
+    def variances(self, cut: GrowableArray) -> np.ndarray:
+        """[N, 3] variances of the odometry into each keyframe, loose at the breaks `cut`."""
         noise, cell = self.config.noise, self.cell
-        length, turn, severed = self.length.rows[1:], self.turn.rows[1:], cut.rows[1:] >= 0
+        length, turn = self.length.rows, self.turn.rows
         along = noise.per_cell**2 * length * cell + (noise.least * cell) ** 2
         heading = noise.heading_per_cell**2 * length / cell + noise.heading_per_radian**2 * turn
         heading = heading + noise.least_heading**2
         variance = np.stack([along, along, heading], axis=1)
         loose = np.array([LOOSE * cell, LOOSE * cell, LOOSE]) ** 2
-        return OdometryChain(self.motion.rows[1:], length, np.where(severed[:, None], loose, variance))
+        return np.where(cut.rows[:, None] >= 0, loose, variance)
 
     def closures(self, log: ClosureLog) -> LoopClosures:
         """The accepted loop closures with their variances and robust scales."""
@@ -132,9 +144,15 @@ class KeyframeGraph(Checkpointed):
         """The optimised map, from the current poses."""
         return solve(self.fit(), self.problem(log, self.cut), iterations)
 
-    def relative_covariance(self, log: ClosureLog, i: int, j: int, turn: float) -> np.ndarray:
-        """[3, 3] covariance of keyframe j in the frame of keyframe i turned by `turn`."""
-        return relative_covariance(self.fit(), self.problem(log, self.cut), i, j, turn)
+    def optimise(self, log: ClosureLog) -> None:
+        """Solves for the poses and the bias, and stores the robust weights in the log."""
+        fit = self.solve(log, self.config.iterations)
+        log.weigh(fit.weights)
+        self.move_to(fit)
+
+    def map_covariance(self, log: ClosureLog) -> MapCovariance:
+        """The covariance of the current map."""
+        return MapCovariance(self.fit(), self.problem(log, self.cut))
 
     def edges(self, fit: MapFit, log: ClosureLog, cut: GrowableArray) -> Edges:
         """Edges of a solution: odometry corrected by its bias, and closures with their robust weights."""

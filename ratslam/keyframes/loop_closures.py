@@ -6,6 +6,7 @@ map accepts a sequence, refuses it, or removes it later; every candidate stays i
 
 from __future__ import annotations
 
+from copy import deepcopy
 from enum import IntEnum
 from pathlib import Path
 from typing import NamedTuple
@@ -16,7 +17,9 @@ from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.growable_array import GrowableArray
 from ratslam.keyframes.optimizer import LoopClosures
 
-CSV_COLUMNS = "keyframe,match,step,match_step,shift,posterior,log_ratio,sequence,distance,verdict,weight"
+CSV_COLUMNS = (
+    "keyframe,match,step,match_step,shift,posterior,log_ratio,sequence,distance,verdict,weight,log_odds"
+)
 
 
 class Verdict(IntEnum):
@@ -50,12 +53,17 @@ class ClosureLog(Checkpointed):
         self._verdict = GrowableArray((), np.int64)
         self._distance = GrowableArray((), np.float64)
         self._weight = GrowableArray((), np.float64)
+        self._log_odds = GrowableArray((), np.float64)
         self._lines: np.ndarray | None = None
 
     @property
     def sequences(self) -> int:
         """Number of sequences."""
         return len(self._verdict.rows)
+
+    def copy(self) -> ClosureLog:
+        """A copy, to try verdicts on."""
+        return deepcopy(self)
 
     def last(self) -> Candidate | None:
         """The newest candidate, None before the first."""
@@ -74,6 +82,7 @@ class ClosureLog(Checkpointed):
             self._verdict.append(Verdict.OPEN)
             self._distance.append(np.inf)
             self._weight.append(0.0)
+            self._log_odds.append(np.nan)
         self._candidate.append((candidate.keyframe, candidate.match, candidate.shift, self.sequences - 1))
         self._evidence.append((candidate.posterior, candidate.log_ratio))
         self._lines = None
@@ -122,6 +131,10 @@ class ClosureLog(Checkpointed):
             self._distance.rows[sequence] = distance
         self._lines = None
 
+    def rate(self, sequences: np.ndarray, log_odds: np.ndarray) -> None:
+        """Stores the log odds [n] that sequences [n] are true."""
+        self._log_odds.rows[sequences] = log_odds
+
     def strike(self, frame: int, spare: int) -> None:
         """Strikes out the candidates of accepted sequences other than `spare` at `frame` and later, because
         the odometry breaks before it."""
@@ -167,12 +180,17 @@ class ClosureLog(Checkpointed):
         """[M] robust weight of the sequence of each accepted candidate."""
         return self._weight.rows[self._candidate.rows[self.accepted_rows(), 3]]
 
+    def sequence_weights(self) -> np.ndarray:
+        """[R] robust weight of every sequence."""
+        return self._weight.rows
+
     def table(self) -> np.ndarray:
-        """[n, 9] all candidates: keyframe, match, shift, posterior, log-likelihood ratio, sequence, its
-        distance, verdict and weight."""
+        """[n, 10] all candidates: keyframe, match, shift, posterior, log-likelihood ratio, sequence, its
+        distance, verdict, weight and log odds (NaN: not judged by odds)."""
         sequence = self._candidate.rows[:, 3]
-        of_sequence = np.stack([self._distance.rows, self._verdict.rows, self._weight.rows], axis=1)[sequence]
-        of_sequence[sequence < 0] = np.inf, Verdict.UNDONE, 0.0
+        columns = self._distance.rows, self._verdict.rows, self._weight.rows, self._log_odds.rows
+        of_sequence = np.stack(columns, axis=1)[sequence]
+        of_sequence[sequence < 0] = np.inf, Verdict.UNDONE, 0.0, np.nan
         return np.concatenate(
             [self._candidate.rows[:, :3], self._evidence.rows, sequence[:, None], of_sequence], axis=1
         )
@@ -186,10 +204,10 @@ class ClosureLog(Checkpointed):
 def write_closures(path: Path, table: np.ndarray, first_step: np.ndarray) -> None:
     """Writes the candidates of `ClosureLog.table` as CSV; first_step: [N] the step of each keyframe."""
     lines = [CSV_COLUMNS]
-    for frame, match, shift, posterior, ratio, sequence, distance, verdict, weight in table.tolist():
+    for frame, match, shift, posterior, ratio, sequence, distance, verdict, weight, odds in table.tolist():
         frame, match = int(frame), int(match)
         lines.append(
             f"{frame},{match},{first_step[frame]},{first_step[match]},{int(shift)},{posterior!r},{ratio!r},"
-            f"{int(sequence)},{distance!r},{Verdict(int(verdict)).name.lower()},{weight!r}"
+            f"{int(sequence)},{distance!r},{Verdict(int(verdict)).name.lower()},{weight!r},{odds!r}"
         )
     Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -20,20 +20,15 @@ from ratslam.core.backend import Evidence, Map
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.growable_array import GrowableArray
 from ratslam.core.types import Estimate
+from ratslam.keyframes.acceptance import Acceptance
 from ratslam.keyframes.appearance import Appearance, ConfirmedPairs
 from ratslam.keyframes.config import FULL, Ablation, KeyframeMapConfig
 from ratslam.keyframes.experiences import Experiences
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict, write_closures
-from ratslam.keyframes.map_solution import (
-    MapSolution,
-    final_solution,
-    selected_solution,
-    solution_pieces,
-)
-from ratslam.keyframes.odometry_breaks import break_odometry
+from ratslam.keyframes.map_solution import MapSolution, selected_solution, solution_pieces, solved_map
 from ratslam.keyframes.optimizer import BiasPrior, MapFit
-from ratslam.keyframes.verification import continues_sequence, verify_sequence
+from ratslam.keyframes.verification import continues_sequence
 from ratslam.pose_graph import Edges
 from ratslam.pose_graph.io import write_g2o, write_json
 from ratslam.recall.memory import MapFeedback
@@ -61,17 +56,18 @@ class KeyframeMap(Checkpointed, Map):
     Args:
         cell: size of a pose cell, m. appearance: of the keyframes, empty. guard: number of newest keyframes,
             never recalled. closures: False for a map of odometry alone. ablation: parts turned off by a
-            study.
+            study. acceptance: makes the rule for closure sequences.
     """
 
     VALUES = ("_travel", "_since", "_turned", "_solved")
-    PARTS = ("_graph", "_log", "_experiences", "_appearance")
+    PARTS = ("_graph", "_log", "_experiences", "_appearance", "_acceptance")
 
     def __init__(
         self,
         config: KeyframeMapConfig,
         cell: float,
         appearance: Appearance,
+        acceptance: Callable[[KeyframeGraph], Acceptance],
         *,
         guard: int = 20,
         closures: bool = True,
@@ -81,6 +77,7 @@ class KeyframeMap(Checkpointed, Map):
         self._appearance = appearance
         self._graph = KeyframeGraph(config, cell, appearance, guard, ablation)
         self._log = ClosureLog()
+        self._acceptance = acceptance(self._graph)
         self._experiences = Experiences(config.place_radius * cell, config.place_heading)
         self._step_frame = GrowableArray((), np.int64)
         self._step_motion = GrowableArray((4,), np.float64)  # since that keyframe, and its length
@@ -119,19 +116,19 @@ class KeyframeMap(Checkpointed, Map):
         return piece[np.maximum(self._step_frame.rows, 0)] if len(piece) else self._step_frame.rows * 0
 
     def candidates(self) -> np.ndarray:
-        """[n, 9] all candidates of recall and their verdicts, see `ClosureLog.table`."""
+        """[n, 10] all candidates of recall and their verdicts, see `ClosureLog.table`."""
         return self.solution().log.table()
 
     def covariance(self) -> np.ndarray:
         """[3, 3] covariance of the newest keyframe's pose in the frame of the first one (m, m, rad)."""
         if self._graph.count < 2:
             return np.zeros((3, 3))
-        return self._graph.relative_covariance(self._log, 0, self._graph.count - 1, 0.0)
+        return self._graph.map_covariance(self._log).relative(0, self._graph.count - 1, 0.0)
 
     def solution(self) -> MapSolution:
         """The final map, as it would be if the session ended now."""
         if self._solution is None:
-            self._solution = final_solution(self._graph, self._log, self.closes_loops)
+            self._solution = self._solve_finally()
         return self._solution
 
     def graph(self) -> networkx.DiGraph:
@@ -158,6 +155,7 @@ class KeyframeMap(Checkpointed, Map):
         change = self._experiences.stay()
         if int(evidence.keyframe) >= 0:
             self._append(observation)
+            self._acceptance.observe(self._graph, evidence)
             self._learn(evidence)
             matched = self._consider(evidence)
             self._select()
@@ -182,6 +180,12 @@ class KeyframeMap(Checkpointed, Map):
             raise ValueError(f"sequence {sequence} is the only link across a break of the odometry")
         self._log.judge(sequence, Verdict.UNDONE)
         self._optimise()
+
+    def _solve_finally(self) -> MapSolution:
+        if not self.closes_loops:
+            return solved_map(self._graph, self._log)
+        selected = selected_solution(self._graph, self._log) if self.config.select_every else None
+        return selected or self._acceptance.solution(self._graph, self._log)
 
     def _advance(self, odometry: Any) -> None:
         moved = np.array([float(odometry.dx), float(odometry.dy), float(odometry.dtheta)])
@@ -209,10 +213,8 @@ class KeyframeMap(Checkpointed, Map):
         value, error = shown
         shrunk = value * max(0.0, 1 - (config.shrink * error / value) ** 2) if value else 0.0
         sd = min(np.hypot(error, value - shrunk), 2 * config.bias_sd / cell)
-        graph.prior = BiasPrior(shrunk, max(sd, config.bias_least / cell))
-        if not len(self._log.accepted_rows()) and graph.bias != graph.prior.mean:
-            graph.bias = graph.prior.mean
-            graph.dead_reckon()
+        prior = BiasPrior(shrunk, max(sd, config.bias_least / cell))
+        self._acceptance.learn_bias(graph, self._log, prior)
 
     def _confirmed_pairs(self) -> ConfirmedPairs:
         """Closures with a high posterior that the map has accepted."""
@@ -233,23 +235,23 @@ class KeyframeMap(Checkpointed, Map):
             float(evidence.log_ratio),
         )
         sequence = self._log.add(candidate, continues_sequence(self._graph, self._log, candidate))
-        if self._log.verdict(sequence) == Verdict.OPEN and self.closes_loops:
-            self._judge(sequence, candidate)
-        if self._log.verdict(sequence) != Verdict.ACCEPTED:
-            return -1
-        if sequence != self._solved[0] or candidate.keyframe - self._solved[1] >= self.config.solve_every:
+        judge = self._acceptance.judge
+        changed = self.closes_loops and judge(self._graph, self._log, sequence, candidate)
+        if changed or self._is_solution_due(sequence, candidate.keyframe):
             self._solved = sequence, candidate.keyframe
             self._optimise()
+            if changed and self._acceptance.review(self._graph, self._log):
+                self._optimise()
+        if self._log.verdict(sequence) != Verdict.ACCEPTED:
+            return -1
         self._since = self._turned = 0.0
         return candidate.match if self._has_same_heading(candidate) else -1
 
-    def _judge(self, sequence: int, candidate: Candidate) -> None:
-        test = verify_sequence(self._graph, self._log, sequence, candidate)
-        if test is None:
-            return
-        self._log.judge(sequence, Verdict.ACCEPTED if test.fits else Verdict.OPEN, test.distance)
-        if test.breaks_odometry:
-            break_odometry(self._graph, self._log, sequence)
+    def _is_solution_due(self, sequence: int, keyframe: int) -> bool:
+        """Whether the map is optimised for one more member of an accepted sequence."""
+        if self._log.verdict(sequence) != Verdict.ACCEPTED:
+            return False
+        return sequence != self._solved[0] or keyframe - self._solved[1] >= self.config.solve_every
 
     def _has_same_heading(self, candidate: Candidate) -> bool:
         """Whether the headings agree by odometry: a robot that has turned is in another experience, even if
@@ -279,9 +281,7 @@ class KeyframeMap(Checkpointed, Map):
         self._solution = None
 
     def _optimise(self) -> None:
-        fit = self._graph.solve(self._log, self.config.iterations)
-        self._log.weigh(fit.weights)
-        self._graph.move_to(fit)
+        self._graph.optimise(self._log)
         self._solution = None
 
     def _steps(self, fit: MapFit) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import deepcopy
 from functools import partial
 from typing import NamedTuple
@@ -21,7 +22,7 @@ from ratslam.keyframes.closure_selection import (
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import ClosureLog, Verdict
 from ratslam.keyframes.odometry_breaks import find_break
-from ratslam.keyframes.optimizer import MapFit, solve
+from ratslam.keyframes.optimizer import MapFit, OdometryChain, robust_cost, solve
 from ratslam.keyframes.pieces import number_pieces
 from tactile.base.se2 import correct_heading_bias, integrate
 
@@ -35,15 +36,8 @@ class MapSolution(NamedTuple):
     cut: GrowableArray
 
 
-def final_solution(graph: KeyframeGraph, log: ClosureLog, closures: bool) -> MapSolution:
-    """The map as it would be if the session ended now.
-
-    Args:
-        closures: False for odometry alone.
-    """
-    solution = selected_solution(graph, log) if graph.config.select_every and closures else None
-    if solution is not None:
-        return solution
+def solved_map(graph: KeyframeGraph, log: ClosureLog) -> MapSolution:
+    """The map with the closures accepted so far, optimised; dead reckoning without any."""
     if len(log.accepted_rows()):
         return MapSolution(graph.solve(log, graph.config.settling), log, graph.cut)
     return MapSolution(graph.fit()._replace(poses=graph.pose.rows.copy()), log, graph.cut)
@@ -53,6 +47,17 @@ def solution_pieces(solution: MapSolution) -> np.ndarray:
     """[N] the piece of each keyframe."""
     closures = solution.log.table()[solution.log.accepted_rows(), :2].astype(int)
     return number_pieces(solution.cut.rows >= 0, closures)
+
+
+def cheapest_map(graph: KeyframeGraph, log: ClosureLog, biases: Sequence[float]) -> MapSolution:
+    """The map of least cost with the closures accepted so far, reached from the current poses and from dead
+    reckoning with each of these heading biases, rad/m. The log takes over its robust weights."""
+    problem = graph.problem(log, graph.cut)
+    starts = [graph.fit(), *(_dead_reckoned(graph, problem.chain, bias) for bias in biases)]
+    fits = [solve(start, problem, 2 * graph.config.settling) for start in starts]
+    fit = min(fits, key=lambda fit: robust_cost(fit, problem))
+    log.weigh(fit.weights)
+    return MapSolution(fit, log, graph.cut)
 
 
 def selected_solution(graph: KeyframeGraph, log: ClosureLog) -> MapSolution | None:
@@ -92,11 +97,17 @@ def _select(
     odometry is cut only if the robot may be carried."""
     problem, pose = graph.problem(log, cut), graph.pose.rows
     chain = problem.chain
-    path = integrate(correct_heading_bias(chain.motion, chain.length, graph.prior.mean), pose[0])
-    reckoned = MapFit(np.concatenate([pose[:1], path]), graph.prior.mean, np.zeros(0))
+    reckoned = _dead_reckoned(graph, chain, graph.prior.mean)
     present = graph.fit()._replace(poses=pose.copy())
     case = SelectionProblem(problem, log.scores()[sequences], *log.spans()[sequences].T)
     starts = [present, reckoned]
     if not graph.config.may_be_carried:
         return select_closures(case, starts)
     return select_closures_and_cuts(case, starts, partial(find_break, graph), earlier)
+
+
+def _dead_reckoned(graph: KeyframeGraph, chain: OdometryChain, bias: float) -> MapFit:
+    """Odometry corrected by a heading bias, rad/m, from the first keyframe."""
+    first = graph.pose.rows[:1]
+    path = integrate(correct_heading_bias(chain.motion, chain.length, bias), first[0])
+    return MapFit(np.concatenate([first, path]), bias, np.zeros(0))

@@ -110,20 +110,23 @@ def robust_cost(fit: MapFit, problem: MapProblem) -> float:
     return odometry + float(lost.sum()) + ((fit.bias - prior.mean) / prior.sd) ** 2
 
 
-def relative_covariance(fit: MapFit, problem: MapProblem, i: int, j: int, turn: float) -> np.ndarray:
-    """[3, 3] covariance of keyframe j in the frame of keyframe i turned by `turn`.
+class MapCovariance:
+    """The exact marginals of the linearised problem, the bias included: it moves distant keyframes
+    together."""
 
-    The exact marginal of the linearised problem, the bias included (it moves distant keyframes together).
-    """
-    equations = _System(problem).linearise(fit)
-    a, b = fit.poses[i], fit.poses[j]
-    c, s = np.cos(a[2] + turn), np.sin(a[2] + turn)
-    dx, dy = (b - a)[:2]
-    by_i = np.array([[-c, -s, c * dy - s * dx], [s, -c, -c * dx - s * dy], [0, 0, -1.0]])
-    by_j = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
-    change = np.zeros((len(fit.poses), 3, 3))
-    change[i], change[j] = by_i.T, by_j.T
-    return equations.covariance(change[1:])
+    def __init__(self, fit: MapFit, problem: MapProblem) -> None:
+        self._poses, self._equations = fit.poses, _System(problem).linearise(fit)
+
+    def relative(self, i: int, j: int, turn: float) -> np.ndarray:
+        """[3, 3] covariance of keyframe j in the frame of keyframe i turned by `turn`."""
+        a, b = self._poses[i], self._poses[j]
+        c, s = np.cos(a[2] + turn), np.sin(a[2] + turn)
+        dx, dy = (b - a)[:2]
+        by_i = np.array([[-c, -s, c * dy - s * dx], [s, -c, -c * dx - s * dy], [0, 0, -1.0]])
+        by_j = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
+        change = np.zeros((len(self._poses), 3, 3))
+        change[i], change[j] = by_i.T, by_j.T
+        return self._equations.covariance(change[1:])
 
 
 def _mean_costs(

@@ -8,7 +8,10 @@ import numpy as np
 
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog
+from ratslam.keyframes.optimizer import MapCovariance
 from tactile.base.se2 import between, compose, wrap
+
+UNCHANGED = np.ones(3)
 
 
 class SequenceTest(NamedTuple):
@@ -24,17 +27,38 @@ class SequenceTest(NamedTuple):
     breaks_odometry: bool
 
 
+class MapClaim(NamedTuple):
+    """How a map judges a claimed place.
+
+    Attributes:
+        log_ratio: log of the probability density that the map gives to the place, over its mean density at
+            all keyframes that could be recalled. position_sd, heading_sd: largest standard deviation of the
+            map's own relative pose, m and rad.
+    """
+
+    log_ratio: float
+    position_sd: float
+    heading_sd: float
+
+
 def turn_on_spot(pose: np.ndarray, angle: float) -> np.ndarray:
     """The pose [3] turned on the spot by `angle`, rad."""
     return compose(pose, np.array([0.0, 0.0, angle]))
 
 
-def continues_sequence(graph: KeyframeGraph, log: ClosureLog, candidate: Candidate) -> bool:
-    """Whether the candidate moved from the newest one by the same motion in memory as in odometry."""
+def continues_sequence(
+    graph: KeyframeGraph, log: ClosureLog, candidate: Candidate, factors: np.ndarray = UNCHANGED
+) -> bool:
+    """Whether the candidate moved from the newest one by the same motion in memory as in odometry.
+
+    Args:
+        factors: [3] applied to the motion of the odometry, see `recall.mirror.MIRROR`.
+    """
     last, config = log.last(), graph.config
     if last is None or candidate.keyframe - last.keyframe > config.max_gap:
         return False
     remembered, travelled = _motions(graph, last, candidate)
+    travelled = travelled * factors
     apart = np.hypot(*(remembered - travelled)[:2])
     allowed = config.agreement * graph.cell + 0.1 * np.hypot(*travelled[:2])
     near = bool(apart < allowed and abs(wrap(remembered[2] - travelled[2])) < config.agreement_heading)
@@ -53,6 +77,26 @@ def verify_sequence(
     carried = config.may_be_carried and not config.select_every  # selection places its own cuts
     broken = carried and length >= config.break_length and score >= config.break_score
     return SequenceTest(fits, distance, not fits and broken and distance >= config.max_distance)
+
+
+def judge_by_map(graph: KeyframeGraph, covariance: MapCovariance, member: np.ndarray) -> MapClaim:
+    """How the map judges the place of a closure (keyframe, match, shift)."""
+    j, i, shift = (int(value) for value in member[:3])
+    config, poses, turn = graph.config, graph.pose.rows, -shift * graph.sector_angle
+    own = covariance.relative(i, j, turn)
+    gate = config.gate_sd * graph.cell
+    allowed = own + np.diag([gate**2, gate**2, config.gate_heading**2])
+    origin = turn_on_spot(poses[i], turn)
+    claims = between(origin, compose(poses[: max(j - graph.guard, 1)], np.array([0.0, 0.0, turn])))
+    error = claims - between(origin, poses[j])
+    error[:, 2] = wrap(error[:, 2])
+    distance = np.einsum("na,ab,nb->n", error, np.linalg.inv(allowed), error)
+    among = np.log(max(np.exp(-distance / 2).sum(), 1.0))
+    return MapClaim(
+        float(np.log(len(error)) - distance[i] / 2 - among),
+        float(np.sqrt(np.linalg.eigvalsh(own[:2, :2]).max())),
+        float(np.sqrt(own[2, 2])),
+    )
 
 
 def _motions(graph: KeyframeGraph, first: Candidate, candidate: Candidate) -> tuple[np.ndarray, np.ndarray]:
@@ -87,7 +131,7 @@ def _distance(graph: KeyframeGraph, log: ClosureLog, candidate: Candidate) -> tu
     pose = graph.pose.rows
     error = between(turn_on_spot(pose[candidate.match], turn), pose[candidate.keyframe])
     gate = graph.config.gate_sd * graph.cell
-    allowed = graph.relative_covariance(log, candidate.match, candidate.keyframe, turn)
+    allowed = graph.map_covariance(log).relative(candidate.match, candidate.keyframe, turn)
     least = np.diag([gate**2, gate**2, graph.config.gate_heading**2])
     allowed = allowed + least
     alternatives = _alternatives(graph, candidate, turn, allowed[:2, :2], gate)

@@ -34,6 +34,16 @@ class MapFeedback(NamedTuple):
     likeness: np.ndarray = NO_LIKENESS
 
 
+class Modes(NamedTuple):
+    """A posterior over keyframes, see `Memory`."""
+
+    anchor: Array
+    offset: Array
+    mass: Array
+    before: Array
+    rest: Array
+
+
 class Memory(NamedTuple):
     """All keyframes, rows in order of time, and the posterior over them.
 
@@ -48,6 +58,7 @@ class Memory(NamedTuple):
         bias, since, angle, scale, likeness: see `MapFeedback`.
         before: [S, C] likelihoods of the previous image, rest: [S, C] posterior outside the modes; both for
             whiskers only, else of size 0.
+        control: the posterior of the control (`ratslam.recall.mirror`).
     """
 
     view: Array
@@ -73,6 +84,7 @@ class Memory(NamedTuple):
     likeness: Array
     before: Array
     rest: Array
+    control: Modes
 
 
 def init_memory(config: RecallConfig, size: int, capacity: int, dtype: np.dtype, groups: int = 0) -> Memory:
@@ -87,6 +99,14 @@ def init_memory(config: RecallConfig, size: int, capacity: int, dtype: np.dtype,
         return jnp.zeros(shape, dtype)
 
     touch = config.sector_fov == "whiskers"
+    shape = len(sector_shifts(config)), capacity if touch else 0
+
+    def no_modes() -> Modes:
+        return Modes(
+            jnp.zeros(config.modes, jnp.int32), zeros(config.modes, 3), zeros(config.modes),
+            zeros(*shape), zeros(*shape),
+        )  # fmt: skip
+
     return Memory(
         view=jnp.zeros((size, capacity), jnp.int32) if touch else zeros(size, capacity),
         label=jnp.full(capacity, -1, jnp.int32),
@@ -97,9 +117,6 @@ def init_memory(config: RecallConfig, size: int, capacity: int, dtype: np.dtype,
         sine=zeros(capacity),
         count=jnp.int32(0),
         distinct=jnp.int32(0),
-        anchor=jnp.zeros(config.modes, jnp.int32),
-        offset=zeros(config.modes, 3),
-        mass=zeros(config.modes),
         pose=zeros(3),
         motion=zeros(3),
         length=zeros(),
@@ -109,8 +126,8 @@ def init_memory(config: RecallConfig, size: int, capacity: int, dtype: np.dtype,
         angle=zeros(),
         scale=zeros(),
         likeness=zeros(groups, LEVELS, LEVELS) if touch else zeros(0, 0, 0),
-        before=zeros(*(shape := (len(sector_shifts(config)), capacity if touch else 0))),
-        rest=zeros(*shape),
+        **no_modes()._asdict(),
+        control=no_modes(),
     )
 
 

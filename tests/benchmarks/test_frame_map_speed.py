@@ -9,10 +9,10 @@ import numpy as np
 from ratslam.keyframes.optimizer import (
     BiasPrior,
     LoopClosures,
+    MapCovariance,
     MapFit,
     MapProblem,
     OdometryChain,
-    relative_covariance,
     solve,
 )
 from tactile.base.se2 import integrate
@@ -43,7 +43,7 @@ def test_a_closure_among_1000_frames(benchmark):
         start = time.perf_counter()
         fit = solve(MapFit(poses, 0.0, np.zeros(0)), MapProblem(chain, links, prior), iterations=4)
         middle = time.perf_counter()
-        relative_covariance(fit, MapProblem(chain, links, prior), 5, 999, 0.0)
+        MapCovariance(fit, MapProblem(chain, links, prior)).relative(5, 999, 0.0)
         solving.append(middle - start)
         checking.append(time.perf_counter() - middle)
     ms = {"ms_solve": np.median(solving) * 1e3, "ms_check": np.median(checking) * 1e3}

@@ -121,8 +121,9 @@ def test_the_lecture_hall_is_mapped(reference_data, tmp_path, monkeypatch):
     assert card["quantities"]["ate_final"]["value"] <= 1.5
 
 
-def wait_for_steps(process, directory, size=200):
-    """Waits until the file of steps has so many bytes, or the process has ended."""
+def wait_for_steps(process, directory, size=400):
+    """Waits until the file of steps has so many bytes (by default some lines beside the first one, of names),
+    or the process has ended."""
     steps = directory / "steps.csv"
     while process.poll() is None and not (steps.exists() and steps.stat().st_size > size):
         time.sleep(0.005)

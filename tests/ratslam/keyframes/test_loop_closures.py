@@ -14,8 +14,8 @@ SCALES = (0.5, 2.0, 20.0)
 steps = st.lists(
     st.one_of(
         st.tuples(st.just("add"), st.booleans(), st.floats(-5, 30)),
-        st.tuples(st.just("judge"), st.integers(0, 9), st.sampled_from(Verdict)),
-        st.tuples(st.just("strike"), st.integers(0, 9), st.integers(0, 9)),
+        st.tuples(st.just("judge"), st.integers(0, 10), st.sampled_from(Verdict)),
+        st.tuples(st.just("strike"), st.integers(0, 10), st.integers(0, 10)),
     ),
     max_size=30,
 )
@@ -32,7 +32,7 @@ def filled():
 
 @given(steps)
 def test_the_log_is_a_list_of_candidates(steps):
-    log, rows, verdicts, counts = ClosureLog(), [], [], []
+    log, rows, verdicts, odds, counts = ClosureLog(), [], [], {}, []
     for kind, a, b in steps:
         if kind == "add":
             follows = a and bool(verdicts)
@@ -45,6 +45,9 @@ def test_the_log_is_a_list_of_candidates(steps):
         elif kind == "judge" and verdicts:
             verdicts[a % len(verdicts)] = b
             log.judge(a % len(verdicts), b)
+        elif kind == "rate" and verdicts:
+            odds[a % len(verdicts)] = b
+            log.rate(np.array([a % len(verdicts)]), np.array([b]))
         elif kind == "strike" and verdicts:
             frame, spare = 50 + a, b % len(verdicts)
             log.strike(frame, spare)
@@ -66,11 +69,12 @@ def test_the_log_is_a_list_of_candidates(steps):
         assert log.members(sequence).tolist() == [[*c[:3], sequence] for c in mine]
         assert log.score(sequence) == pytest.approx(sum(c.log_ratio for c in mine))
     table = log.table()
-    assert table.shape == (len(rows), 9)
+    assert table.shape == (len(rows), 10)
     assert table[:, :6].tolist() == [[*candidate, sequence] for candidate, sequence in rows]
     assert table[:, 7].tolist() == [
         verdicts[sequence] if sequence >= 0 else Verdict.UNDONE for _, sequence in rows
     ]
+    assert np.array_equal(table[:, 9], [odds.get(sequence, np.nan) for _, sequence in rows], equal_nan=True)
 
     closures = log.closures(0.2, VARIANCE, SCALES)
     mine = [rows[k] for k in counts]
@@ -85,7 +89,7 @@ def test_the_log_is_a_list_of_candidates(steps):
     again = ClosureLog()
     again.add(Candidate(1, 0, 0, 1.0, 1.0), False)
     again.restore(log.arrays())
-    assert np.array_equal(again.table(), table)
+    assert np.array_equal(again.table(), table, equal_nan=True)
     assert np.array_equal(again.accepted_rows(), log.accepted_rows())
     assert (again.sequences, again.last()) == (log.sequences, log.last())
 
@@ -94,7 +98,7 @@ def test_an_empty_log_has_no_closures():
     log = ClosureLog()
     assert log.last() is None
     assert log.sequences == 0
-    assert log.table().shape == (0, 9)
+    assert log.table().shape == (0, 10)
     assert [len(rows) for rows in log.closures(0.1, VARIANCE, SCALES)[:4]] == [0] * 4
     assert log.closures(0.1, VARIANCE, SCALES).scale.shape == (0,)
     log.weigh(np.zeros(0))
@@ -131,7 +135,8 @@ def test_a_break_strikes_out_later_candidates():
         -1,
         2,
     ]  # an open sequence is spared, accepted or not
-    assert log.table()[3, 6:].tolist() == [np.inf, Verdict.UNDONE, 0.0]
+    assert log.table()[3, 6:9].tolist() == [np.inf, Verdict.UNDONE, 0.0]
+    assert np.isnan(log.table()[3, 9])
     log.judge(2, Verdict.ACCEPTED)
     log.strike(0, 2)
     assert log.accepted_rows().tolist() == [5]
@@ -197,10 +202,12 @@ def test_the_table_has_all_evidence():
     log.judge(0, Verdict.ACCEPTED, 2.25)
     log.judge(0, Verdict.ACCEPTED)  # without a distance, the one known stays
     log.weigh(np.array([0.5]))
-    assert log.table().tolist() == [
-        [30, 4, -2, 0.75, 6.5, 0, 2.25, Verdict.ACCEPTED, 0.5],
-        [40, 5, 1, 0.5, -1.5, 1, np.inf, Verdict.OPEN, 0.0],
+    log.rate(np.array([1]), np.array([-0.75]))
+    expected = [
+        [30, 4, -2, 0.75, 6.5, 0, 2.25, Verdict.ACCEPTED, 0.5, np.nan],
+        [40, 5, 1, 0.5, -1.5, 1, np.inf, Verdict.OPEN, 0.0, -0.75],
     ]
+    assert np.array_equal(log.table(), expected, equal_nan=True)
 
 
 def test_saved_arrays_are_copies():
@@ -210,5 +217,5 @@ def test_saved_arrays_are_copies():
     log.judge(0, Verdict.ACCEPTED, 1.0)
     log.strike(50, 2)
     log.restore(saved)
-    assert np.array_equal(log.table(), before)
+    assert np.array_equal(log.table(), before, equal_nan=True)
     assert len(log.accepted_rows()) == 0

@@ -11,10 +11,10 @@ from scipy.optimize import least_squares
 from ratslam.keyframes.optimizer import (
     BiasPrior,
     LoopClosures,
+    MapCovariance,
     MapFit,
     MapProblem,
     OdometryChain,
-    relative_covariance,
     robust_cost,
     solve,
 )
@@ -344,7 +344,7 @@ def test_relative_covariance_is_the_marginal_of_the_whole_information(seed):
 
     by = slopes(seen, x)
     expected = by @ np.linalg.inv(jacobian.T @ jacobian) @ by.T
-    covariance = relative_covariance(fit, MapProblem(chain, closures, prior), i, j, turn)
+    covariance = MapCovariance(fit, MapProblem(chain, closures, prior)).relative(i, j, turn)
     assert np.allclose(covariance, expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
 
 
@@ -353,18 +353,17 @@ def test_covariance_is_valid_grows_along_the_chain_and_shrinks_with_closures():
     fit, none = MapFit(reckoned(chain), 0.0, np.zeros(0)), closed([])
     for pair in [(0, 47), (5, 30), (40, 3)]:
         prior = BiasPrior(0.0, 0.02)
-        free = relative_covariance(fit, MapProblem(chain, none, prior), *pair, 0.3)
-        bound = relative_covariance(fit, MapProblem(chain, closures, prior), *pair, 0.3)
+        free = MapCovariance(fit, MapProblem(chain, none, prior)).relative(*pair, 0.3)
+        bound = MapCovariance(fit, MapProblem(chain, closures, prior)).relative(*pair, 0.3)
         for covariance in (free, bound, free - bound):
             assert np.allclose(covariance, covariance.T, rtol=0, atol=1e-9 * np.trace(free))
             assert np.linalg.eigvalsh(covariance).min() > 0
-        covariance = relative_covariance(fit, MapProblem(chain, none, BiasPrior(0.0, 0.001)), *pair, 0.3)
+        covariance = MapCovariance(fit, MapProblem(chain, none, BiasPrior(0.0, 0.001))).relative(*pair, 0.3)
         assert np.linalg.eigvalsh(free - covariance).max() > 0.1 * np.trace(free - covariance) > 0
     straight = chained(np.tile([0.5, 0.0, 0.0], (20, 1)))
     fit = MapFit(reckoned(straight), 0.0, np.zeros(0))
-    along = np.array(
-        [np.diag(relative_covariance(fit, MapProblem(straight, none, WIDE), 0, k, 0.0)) for k in range(1, 21)]
-    )
+    covariance = MapCovariance(fit, MapProblem(straight, none, WIDE))
+    along = np.array([np.diag(covariance.relative(0, k, 0.0)) for k in range(1, 21)])
     assert (np.diff(along, axis=0) > 0).all()
 
 
@@ -406,4 +405,4 @@ def test_an_unconnected_frame_leaves_the_map_unchanged():
     fit = solve(MapFit(start, 0.01, np.zeros(0)), MapProblem(chain, closed([]), WIDE), 5)
     assert np.array_equal(fit.poses, start)
     assert fit.bias == 0.01
-    assert np.isinf(relative_covariance(fit, MapProblem(chain, closed([]), WIDE), 0, 4, 0.0)).all()
+    assert np.isinf(MapCovariance(fit, MapProblem(chain, closed([]), WIDE)).relative(0, 4, 0.0)).all()

@@ -81,8 +81,11 @@ def test_single_precision_has_no_nan(stored, scale):
         memory = accumulate_motion(memory, jnp.asarray([0.5 * CELL, 0, 0.01], jnp.float32))
         after, found = observe(FAN, memory, seen)
         result = found._replace(background=np.zeros(0))  # there NaN says none
-        assert not any(np.isnan(leaf).any() for leaf in [*after, *result])
-        assert {leaf.dtype for leaf in [*after, *found]} == {np.dtype(np.float32), np.dtype(np.int32)}
+        assert not any(np.isnan(leaf).any() for leaf in jax.tree.leaves((after, result)))
+        assert {leaf.dtype for leaf in jax.tree.leaves((after, found))} == {
+            np.dtype(np.float32),
+            np.dtype(np.int32),
+        }
         assert (after.mass >= 0).all()
         assert after.mass.sum() <= 1 + 1e-6
         memory = jax.tree.map(jnp.asarray, after)

@@ -86,8 +86,11 @@ def test_mass_is_conserved_along_a_path(config, dtype):
         level = np.where(stream.random(SIZE) < 0.9, lap[k % 20], images_of(stream, 1)[0])
         memory = accumulate_motion(memory, jnp.asarray([0.6 * CELL, 0.0, turn], memory.x.dtype))
         after, found = observe(config, memory, level)
-        assert not any(np.isnan(leaf).any() for leaf in [*after, *found[:-1]])
-        assert {leaf.dtype for leaf in [*after, *found]} == {np.dtype(dtype), np.dtype(np.int32)}
+        assert not any(np.isnan(leaf).any() for leaf in jax.tree.leaves((after, found[:-1])))
+        assert {leaf.dtype for leaf in jax.tree.leaves((after, found))} == {
+            np.dtype(dtype),
+            np.dtype(np.int32),
+        }
         total = after.mass.sum() + after.rest.sum() + found.novelty
         assert total == pytest.approx(1, abs=tolerance)
         again.append(found.match >= 0 and (k - found.match) % 20 == 0 and found.posterior > 0.1)

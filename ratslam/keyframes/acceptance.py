@@ -1,0 +1,60 @@
+"""Rules by which a map accepts closure sequences."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+from ratslam.core.backend import Evidence
+from ratslam.core.checkpoint import Checkpointed
+from ratslam.keyframes.keyframe_graph import KeyframeGraph
+from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
+from ratslam.keyframes.map_solution import MapSolution, solved_map
+from ratslam.keyframes.odometry_breaks import break_odometry
+from ratslam.keyframes.optimizer import BiasPrior
+from ratslam.keyframes.verification import verify_sequence
+
+
+class Acceptance(Checkpointed, ABC):
+    """A rule with what it has learned."""
+
+    def observe(self, graph: KeyframeGraph, evidence: Evidence) -> None:
+        """Takes note of the newest keyframe's evidence."""
+
+    def learn_bias(self, graph: KeyframeGraph, log: ClosureLog, prior: BiasPrior) -> None:
+        """Takes over the heading bias that the views show."""
+        believe(graph, log, prior)
+
+    @abstractmethod
+    def judge(self, graph: KeyframeGraph, log: ClosureLog, sequence: int, candidate: Candidate) -> bool:
+        """Judges after `candidate` was added to `sequence`; whether any sequence was accepted."""
+
+    def review(self, graph: KeyframeGraph, log: ClosureLog) -> bool:
+        """Judges again after the map has changed; whether any sequence was accepted."""
+        return False
+
+    def solution(self, graph: KeyframeGraph, log: ClosureLog) -> MapSolution:
+        """The map as it would be if the session ended now; leaves graph and log unchanged."""
+        return solved_map(graph, log)
+
+
+def believe(graph: KeyframeGraph, log: ClosureLog, prior: BiasPrior) -> None:
+    """Takes over a prior of the heading bias; the poses follow it until a closure fixes them."""
+    graph.prior = prior
+    if not len(log.accepted_rows()) and graph.bias != prior.mean:
+        graph.bias = prior.mean
+        graph.dead_reckon()
+
+
+class AcceptByEvidence(Acceptance):
+    """A sequence is accepted by its evidence less what the map's covariance says against it."""
+
+    def judge(self, graph: KeyframeGraph, log: ClosureLog, sequence: int, candidate: Candidate) -> bool:
+        if log.verdict(sequence) != Verdict.OPEN:
+            return False
+        test = verify_sequence(graph, log, sequence, candidate)
+        if test is None:
+            return False
+        log.judge(sequence, Verdict.ACCEPTED if test.fits else Verdict.OPEN, test.distance)
+        if test.breaks_odometry:
+            break_odometry(graph, log, sequence)
+        return log.verdict(sequence) == Verdict.ACCEPTED

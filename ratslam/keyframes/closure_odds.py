@@ -1,0 +1,167 @@
+"""Acceptance of closure sequences by the odds that they are true.
+
+The odds of a sequence are those of its score under the null of this session (`null_model`), times how well
+odometry foretold its place among all others (`bias_scan`, with the heading bias for which the other sequences
+vote), or how well the map does where its covariance is narrow enough to be linear. The rule is ours."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ratslam.core.backend import Evidence
+from ratslam.core.growable_array import GrowableArray
+from ratslam.keyframes.acceptance import Acceptance, believe
+from ratslam.keyframes.bias_scan import STEPS, BiasScan
+from ratslam.keyframes.bias_vote import BiasVote, vote
+from ratslam.keyframes.keyframe_graph import KeyframeGraph
+from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
+from ratslam.keyframes.map_solution import MapSolution, cheapest_map, solved_map
+from ratslam.keyframes.null_model import estimate_null, log_odds
+from ratslam.keyframes.odometry_breaks import break_odometry
+from ratslam.keyframes.optimizer import BiasPrior
+from ratslam.keyframes.verification import continues_sequence, judge_by_map
+from ratslam.recall.mirror import MIRROR
+
+MIN_LOG_ODDS = 2.3
+"""Least log odds of an accepted sequence: 10 to 1."""
+LINEAR_HEADING = 0.4
+"""Largest standard deviation of heading at which the map's covariance is trusted, rad."""
+NEAR = 1.5
+"""Largest standard deviation of position, cells, at which a sequence only confirms what the map says, and
+even odds are enough."""
+REVIEW_EVERY = 10
+"""Keyframes after which all open sequences are judged again."""
+CONFIRMED_WEIGHT = 0.5
+"""Least robust weight of a sequence that counts as true in the null."""
+REVIEWS = 4
+"""Largest number of reviews when the final map is made."""
+
+
+class Ballot(NamedTuple):
+    """R sequences [R], their log odds by score [R], and their vote on the heading bias."""
+
+    sequences: np.ndarray
+    score_odds: np.ndarray
+    result: BiasVote
+
+
+class AcceptByOdds(Acceptance):
+    """Learns the null from the control's sequences, and judges all open sequences."""
+
+    VALUES = ("_views_prior",)
+    PARTS = ("_control",)
+
+    def __init__(self, graph: KeyframeGraph) -> None:
+        self._control = ClosureLog()
+        self._scan = BiasScan(graph)
+        self._log_ratio = GrowableArray((STEPS,), np.float64)  # of each sequence, by heading bias
+        self._views_prior = graph.prior
+
+    def observe(self, graph: KeyframeGraph, evidence: Evidence) -> None:
+        """Logs a candidate of the control."""
+        posterior = float(evidence.mirror_posterior)
+        if int(evidence.mirror_match) < 0 or posterior <= graph.config.candidate_posterior:
+            return
+        candidate = Candidate(
+            graph.count - 1,
+            int(evidence.mirror_match),
+            int(evidence.mirror_shift),
+            posterior,
+            float(evidence.mirror_log_ratio),
+        )
+        self._control.add(candidate, continues_sequence(graph, self._control, candidate, MIRROR))
+
+    def learn_bias(self, graph: KeyframeGraph, log: ClosureLog, prior: BiasPrior) -> None:
+        self._views_prior = prior
+        self._rate_all(log)
+        believe(graph, log, self._vote(graph, log).result.belief)
+
+    def judge(self, graph: KeyframeGraph, log: ClosureLog, sequence: int, candidate: Candidate) -> bool:
+        while len(self._log_ratio.rows) < log.sequences:
+            self._log_ratio.append(np.full(STEPS, -np.inf))
+        if len(log.members(sequence)) < graph.config.min_length:
+            return False
+        self._rate(log, sequence)
+        believe(graph, log, self._vote(graph, log).result.belief)
+        due = candidate.keyframe % REVIEW_EVERY == 0
+        accepted = self._accept(graph, log, np.arange(log.sequences) if due else np.array([sequence]))
+        return accepted or self._break(graph, log, sequence)
+
+    def review(self, graph: KeyframeGraph, log: ClosureLog) -> bool:
+        return self._accept(graph, log, np.arange(log.sequences))
+
+    def solution(self, graph: KeyframeGraph, log: ClosureLog) -> MapSolution:
+        graph, log = graph.copy(), log.copy()
+        ballot = self._vote(graph, log)
+        if len(ballot.sequences):
+            graph.prior = ballot.result.belief
+            for _ in range(REVIEWS):
+                if not self.review(graph, log):
+                    break
+                graph.optimise(log)
+        if not len(log.accepted_rows()):
+            return solved_map(graph, log)
+        return cheapest_map(graph, log, [ballot.result.mean, graph.bias])
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """Replaces the whole state by that of `arrays`."""
+        super().restore(arrays)
+        self._scan.clear()
+
+    def _vote(self, graph: KeyframeGraph, log: ClosureLog) -> Ballot:
+        known = log.sizes()[: len(self._log_ratio.rows)] >= graph.config.min_length
+        known &= log.verdicts()[: len(known)] != Verdict.UNDONE
+        sequences = np.flatnonzero(known)
+        confirmed = (log.verdicts() == Verdict.ACCEPTED) & (log.sequence_weights() > CONFIRMED_WEIGHT)
+        null = estimate_null(self._control.scores())
+        score_odds = log_odds(log.scores()[sequences], null, float(confirmed.sum()))
+        least = graph.config.bias_least / graph.cell
+        ratios = self._log_ratio.rows[sequences]
+        return Ballot(
+            sequences, score_odds, vote(self._scan.grid, self._views_prior, ratios, score_odds, least)
+        )
+
+    def _accept(self, graph: KeyframeGraph, log: ClosureLog, among: np.ndarray) -> bool:
+        """Accepts every open sequence of `among` whose odds, by raw odometry or by the map, are high enough;
+        whether there was any."""
+        sequences, score_odds, result = self._vote(graph, log)
+        odds, open_ = result.odds, log.verdicts()[sequences] == Verdict.OPEN
+        open_ &= np.isin(sequences, among)
+        accepted = odds >= MIN_LOG_ODDS
+        undecided = open_ & ~accepted & (score_odds + np.log(graph.count) > 0)
+        if undecided.any():
+            covariance = graph.map_covariance(log)
+            for k in np.flatnonzero(undecided).tolist():
+                claim = judge_by_map(graph, covariance, log.members(int(sequences[k]))[-1])
+                if claim.heading_sd <= LINEAR_HEADING:
+                    by_map = score_odds[k] + claim.log_ratio
+                    near = claim.position_sd < NEAR * graph.cell
+                    odds[k] = max(odds[k], by_map)
+                    accepted[k] = odds[k] >= MIN_LOG_ODDS or (near and by_map >= 0)
+        log.rate(sequences, odds)
+        for sequence in sequences[open_ & accepted].tolist():
+            log.judge(sequence, Verdict.ACCEPTED)
+        return bool((open_ & accepted).any())
+
+    def _break(self, graph: KeyframeGraph, log: ClosureLog, sequence: int) -> bool:
+        """Cuts the odometry where a long sequence contradicts it, if the robot may be carried."""
+        config = graph.config
+        long = len(log.members(sequence)) >= config.break_length and log.score(sequence) >= config.break_score
+        if not (config.may_be_carried and long) or log.verdict(sequence) != Verdict.OPEN:
+            return False
+        break_odometry(graph, log, sequence)
+        self._rate_all(log)
+        return True
+
+    def _rate_all(self, log: ClosureLog) -> None:
+        for sequence in np.flatnonzero(np.isfinite(self._log_ratio.rows[:, 0])).tolist():
+            self._rate(log, sequence)
+
+    def _rate(self, log: ClosureLog, sequence: int) -> None:
+        """Compares a sequence, by its middle member, with raw odometry."""
+        members = log.members(sequence)
+        if len(members):
+            ratios = self._scan.log_ratios(members[len(members) // 2], self._views_prior)
+            self._log_ratio.rows[sequence] = ratios
