@@ -1,0 +1,69 @@
+"""What becomes of the control of recall in worlds that look the same in the mirror: there its sequences are
+as strong as true ones. These tests record the present behaviour, not a requirement."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ratslam.backends.config import RecallBackendConfig
+from ratslam.backends.recall import RecallBackend
+from ratslam.core.session import Session
+from ratslam.keyframes.loop_closures import Verdict
+from robot.sources.in_memory import InMemorySource
+from tests.helpers import scenes
+
+CORRIDOR = ([(scenes.STEP, 0.0)] * 120 + [(-scenes.STEP, 0.0)] * 120) * 2
+"""There and back, twice, never turning."""
+ROUND = [(scenes.STEP, 2 * np.pi / 150)] * 150 * 3
+"""Three laps of a circle whose turns between keyframes are too small to tell from those in the mirror."""
+
+
+def symmetric(log: InMemorySource) -> InMemorySource:
+    """The same path between walls that look alike on both sides."""
+    return replace(log, views=(log.views + log.views[:, :, ::-1]) / 2)
+
+
+@pytest.fixture(scope="module")
+def session():
+    cells = {"cells_xy": 11, "cell_size": scenes.CELL}
+    config = RecallBackendConfig.model_validate({"pose_cells": cells})
+    return Session(RecallBackend(config, (3, 6, 1), np.dtype("float64")), reserve=512)
+
+
+def replayed(session, log):
+    """The map, and the candidates of recall and of its control (number, sum of log ratios)."""
+    session.restart()
+    steps = [step.evidence for step in session.replay(sample.reading for sample in log)]
+    strength = []
+    for of in ("", "mirror_"):
+        sure = [e for e in steps if getattr(e, f"{of}match") >= 0 and getattr(e, f"{of}posterior") > 0.5]
+        strength.append((len(sure), float(sum(getattr(e, f"{of}log_ratio") for e in sure))))
+    return session.map, strength
+
+
+@pytest.mark.parametrize("moves", [CORRIDOR, ROUND], ids=["corridor", "round"])
+def test_a_symmetric_loop_is_closed_while_its_odds_collapse(session, moves):
+    """The control is as sure as recall. The first members of the revisit are accepted all the same, because
+    the map foretells their place; as the evidence of both grows, the odds fall far below zero."""
+    log = scenes.sensed(scenes.followed(moves), 1)
+    plain, (of_recall, of_control) = replayed(session, log)
+    assert of_control[1] < 0.1 * of_recall[1]
+    assert longest(plain)[1] > 100
+
+    found, (of_recall, of_control) = replayed(session, symmetric(log))
+    assert of_control == pytest.approx(of_recall, rel=0.1)
+    verdict, odds = longest(found)
+    assert verdict == Verdict.ACCEPTED
+    assert odds < -10
+    assert len(found.closures()) == pytest.approx(len(plain.closures()), rel=0.05)
+
+
+def longest(map):
+    """Verdict and log odds of the longest sequence."""
+    table = map.candidates()
+    sequence = np.bincount(table[:, 5].astype(int)).argmax()
+    row = table[table[:, 5] == sequence][0]
+    return Verdict(int(row[7])), row[9]

@@ -1,0 +1,197 @@
+"""Laws of the control of recall: a path in the mirror is to the control what the path itself is to recall."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ratslam.backends.config import RecallBackendConfig
+from ratslam.backends.recall import RecallBackend
+from ratslam.recall.config import RecallConfig
+from ratslam.recall.memory import MapFeedback, init_memory
+from ratslam.recall.mirror import NEVER_GIVEN, mirror_view, permuted_label
+from ratslam.recall.whisker_likelihood import DEAD, pixel_layout
+from tactile.base.types import Odometry, observation
+from tests.ratslam.recall.whisker_cases import images_of, learn
+
+CELL = 0.1
+SHAPE = (3, 6, 1)
+WIDE_SHAPE = (2, 5, 3)
+COUNT = 30
+"""Keyframes of one pass."""
+BIAS = 0.3
+
+# Views in the mirror
+
+shapes = st.sampled_from([(1, 1, 1), (3, 6, 1), (2, 5, 3)])
+
+
+@settings(max_examples=20)
+@given(shapes, st.sampled_from([0.0, 0.2]), st.integers(0, 99))
+def test_mirroring_twice_is_the_identity(shape, angle, seed):
+    view = np.random.default_rng(seed).random(np.prod(shape))
+    once = mirror_view(view, shape, angle)
+    assert np.array_equal(mirror_view(once, shape, angle), view)
+
+
+@settings(max_examples=10)
+@given(shapes, st.integers(0, 99))
+def test_columns_or_ordered_sectors_are_reversed(shape, seed):
+    view = np.random.default_rng(seed).random(shape)
+    flat = view.reshape(-1)
+    assert np.array_equal(mirror_view(flat, shape, 0.0).reshape(shape), view[:, ::-1])
+    assert np.array_equal(mirror_view(flat, shape, 0.1), flat[::-1])
+    assert np.array_equal(mirror_view(flat, shape, -0.1), flat[::-1])
+
+
+@given(st.tuples(st.integers(1, 4), st.integers(1, 9), st.integers(1, 3)))
+def test_whiskers_change_sides(shape):
+    pixels = pixel_layout(shape)
+    assert np.array_equal(pixels.mirrored[pixels.mirrored], np.arange(np.prod(shape)))
+    assert np.array_equal(pixels.group[pixels.mirrored], pixels.group)
+    bearing = np.broadcast_to((2 * np.pi * np.arange(shape[1]) / shape[1])[:, None], shape).reshape(-1)
+    assert np.sin(bearing[pixels.mirrored]) == pytest.approx(-np.sin(bearing), abs=1e-12)
+    assert np.cos(bearing[pixels.mirrored]) == pytest.approx(np.cos(bearing), abs=1e-12)
+    if shape[1] % 2 == 0:  # a half turn of the mirror image is the mirror image of the half turn
+        assert np.array_equal(pixels.mirrored[pixels.opposite], pixels.opposite[pixels.mirrored])
+
+
+# Permuted ids
+
+
+def remembering(labels):
+    """A memory of keyframes with these ids."""
+    memory, ids = init_memory(RecallConfig(), 0, 64, np.dtype(float)), np.full(64, -1, np.int32)
+    ids[: len(labels)] = labels
+    return memory._replace(label=jnp.asarray(ids), count=jnp.int32(len(labels)))
+
+
+@cache
+def permutation():
+    return jax.jit(permuted_label)
+
+
+def permuted(labels, label):
+    return int(permutation()(remembering(labels), jnp.int32(label)))
+
+
+ids = st.lists(st.integers(-1, 40), min_size=1, max_size=64)
+
+
+@given(ids, st.integers(0, 2**31 - 2))
+def test_a_permuted_id_is_another_one_of_the_memory(labels, label):
+    other = permuted(labels, label)
+    assert other != label
+    assert other == NEVER_GIVEN or other in set(labels) - {-1}
+
+
+@given(ids)
+def test_no_id_and_an_only_id_have_no_other(labels):
+    assert permuted(labels, -1) == NEVER_GIVEN
+    assert permuted([7] * len(labels), 7) == NEVER_GIVEN
+    assert permuted([], 7) == NEVER_GIVEN
+
+
+@given(ids, st.integers(0, 60))
+def test_a_permuted_id_stays_until_the_number_of_keyframes_doubles(labels, label):
+    known = 1 << (len(labels).bit_length() - 1)
+    assert permuted(labels, label) == permuted(labels[:known], label)
+
+
+def test_most_ids_have_another_one_and_few_share_it():
+    labels = list(range(64))
+    others = [permuted(labels, label) for label in labels]
+    assert np.mean(np.array(others) != NEVER_GIVEN) > 0.9
+    assert len(set(others)) > 30
+
+
+# The two filters change places
+
+
+def backend_of(kind):
+    recall = {"guard": COUNT - 1, "local": 0.0, "sector_fov": {"whiskers": "whiskers"}.get(kind, "none")}
+    if kind == "ordered sectors":
+        recall["sector_fov"] = 1.2
+    cells = {"cells_xy": 11, "cell_size": CELL, "engine": "dense"}
+    shape = WIDE_SHAPE if kind == "columns" else SHAPE
+    return RecallBackend(RecallBackendConfig.model_validate({"pose_cells": cells, "recall": recall}), shape)
+
+
+@cache
+def engine(kind):
+    backend = backend_of(kind)
+    return backend, jax.jit(backend.kernel)
+
+
+def reflected(kind, view):
+    """The image of a view [R, C, K] that this sensor gives in the mirror."""
+    if kind == "whiskers":
+        return view.reshape(-1)[pixel_layout(view.shape).mirrored].reshape(view.shape)
+    return view.reshape(-1)[::-1].reshape(view.shape) if kind == "ordered sectors" else view[:, ::-1]
+
+
+def second_pass(kind, seed, mirrored):
+    """The evidence of every keyframe of a path driven once more, or once more in the mirror."""
+    backend, kernel = engine(kind)
+    stream = np.random.default_rng(seed)
+    shape = backend.view_shape
+    views = stream.random((COUNT, *shape))
+    likeness = np.zeros((0, 0, 0))
+    if kind == "whiskers":
+        views = np.where(stream.random(views.shape) < 0.5, 0.0, views)
+        likeness = learn(images_of(stream, 200))
+    moves = stream.normal([0.6 * CELL, 0, 0], [0.1 * CELL, 0.1 * CELL, 0.3], (COUNT, 3))
+    moves[:, 0] = np.maximum(moves[:, 0], 0.4 * CELL)  # each step gives a keyframe
+    feedback = MapFeedback(
+        np.zeros((1, 3)), BIAS, 0.0, {"whiskers": np.pi, "ordered sectors": 0.2}.get(kind, 0.0),
+        3.0 if kind == "whiskers" else 0.3, likeness,
+    )  # fmt: skip
+    state = backend.apply_map_feedback(backend.init(jax.random.key(0), 64), feedback)
+    found = []
+    for k in range(2 * COUNT):
+        view, (dx, dy, turn) = views[k % COUNT], moves[k % COUNT]
+        if k == COUNT and mirrored:
+            memory = state.memory
+            state = state._replace(memory=memory._replace(bias=-memory.bias))
+        if k >= COUNT:
+            view = np.clip(
+                view + 0.05 * np.random.default_rng([seed, k]).normal(0, 1, shape) * (view > 0), 0, 1
+            )
+        if k >= COUNT and mirrored:
+            view, dy, turn = reflected(kind, view), -dy, -turn
+        state, _, evidence = kernel(state, observation(Odometry(dx, dy, turn, 0.1), view, whiskers=18))
+        assert int(evidence.keyframe) == k
+        if k >= COUNT:
+            found.append(evidence)
+    names = ("match", "shift", "posterior", "log_ratio")
+    return [
+        np.array([[getattr(e, f"{of}{name}") for name in names] for e in found]) for of in ("", "mirror_")
+    ]
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("kind", ["ordered sectors", "columns", "whiskers"])
+def test_a_path_in_the_mirror_swaps_recall_and_its_control(kind, seed):
+    recalled, control = second_pass(kind, seed, False)
+    in_mirror, control_in_mirror = second_pass(kind, seed, True)
+    assert control_in_mirror == pytest.approx(recalled, rel=1e-9, abs=1e-9)
+    assert in_mirror == pytest.approx(control, rel=1e-9, abs=1e-9)
+    # Each recognises the path that it looks for, and the other one does not.
+    assert np.mean(recalled[3:, 0] == np.arange(3, COUNT)) > 0.9
+    assert recalled[:, 3].sum() > 10
+    # Images of whiskers that follow each other as remembered are no evidence: there one image must tell.
+    strength = np.max if kind == "whiskers" else np.sum
+    assert strength(recalled[:, 3]) > 2 * strength(control[:, 3])
+
+
+def test_dead_whiskers_change_sides():
+    shape, view = SHAPE, np.arange(18) / 17
+    pixels = pixel_layout(shape)
+    level = np.where(np.arange(18) == 1, DEAD, np.ceil(view * 30)).astype(int)
+    assert np.flatnonzero(level[pixels.mirrored] == DEAD).tolist() == [5]
