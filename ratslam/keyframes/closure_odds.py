@@ -131,15 +131,18 @@ class AcceptByOdds(Acceptance):
         open_ &= np.isin(sequences, among)
         accepted = odds >= MIN_LOG_ODDS
         undecided = open_ & ~accepted & (score_odds + np.log(graph.count) > 0)
-        if undecided.any():
+        doubtful = open_ & accepted & graph.config.may_be_carried
+        if (undecided | doubtful).any():
             covariance = graph.map_covariance(log)
-            for k in np.flatnonzero(undecided).tolist():
+            for k in np.flatnonzero(undecided | doubtful).tolist():
                 claim = judge_by_map(graph, covariance, log.members(int(sequences[k]))[-1])
-                if claim.heading_sd <= LINEAR_HEADING:
+                if undecided[k] and claim.heading_sd <= LINEAR_HEADING:
                     by_map = score_odds[k] + claim.log_ratio
                     near = claim.position_sd < NEAR * graph.cell
                     odds[k] = max(odds[k], by_map)
                     accepted[k] = odds[k] >= MIN_LOG_ODDS or (near and by_map >= 0)
+                if graph.config.may_be_carried:  # no evidence is too much for a sequence after a cut
+                    accepted[k] &= claim.distance < graph.config.max_distance
         log.rate(sequences, odds)
         for sequence in sequences[open_ & accepted].tolist():
             log.judge(sequence, Verdict.ACCEPTED)

@@ -32,11 +32,12 @@ class MapClaim(NamedTuple):
 
     Attributes:
         log_ratio: log of the probability density that the map gives to the place, over its mean density at
-            all keyframes that could be recalled. position_sd, heading_sd: largest standard deviation of the
-            map's own relative pose, m and rad.
+            all keyframes that could be recalled. distance: squared Mahalanobis distance from it.
+            position_sd, heading_sd: largest standard deviation of the map's own relative pose, m and rad.
     """
 
     log_ratio: float
+    distance: float
     position_sd: float
     heading_sd: float
 
@@ -94,6 +95,7 @@ def judge_by_map(graph: KeyframeGraph, covariance: MapCovariance, member: np.nda
     among = np.log(max(np.exp(-distance / 2).sum(), 1.0))
     return MapClaim(
         float(np.log(len(error)) - distance[i] / 2 - among),
+        float(distance[i]),
         float(np.sqrt(np.linalg.eigvalsh(own[:2, :2]).max())),
         float(np.sqrt(own[2, 2])),
     )

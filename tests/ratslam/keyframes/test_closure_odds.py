@@ -194,6 +194,17 @@ def test_a_long_contradiction_cuts_the_odometry_of_a_robot_that_may_be_carried()
     assert (drive(new_map(), CONTRADICTION, last=150).arrays()["graph/cut"] < 0).all()
 
 
+@pytest.mark.parametrize(("at", "length"), [(130, 14), (110, 30)])
+def test_no_evidence_joins_what_a_carried_robot_contradicts(at, length):
+    """It would be accepted of a robot that is never carried, if it had evidence enough."""
+    contradiction = sequence(at, 20, length, 20.0)
+    never, maybe = (
+        drive(new_map(may_be_carried=carried, break_length=99), contradiction) for carried in (False, True)
+    )
+    assert [verdict for verdict, _ in verdicts(never).values()] == [Verdict.ACCEPTED]
+    assert [verdict for verdict, _ in verdicts(maybe).values()] == [Verdict.OPEN]
+
+
 def test_an_undone_sequence_stays_undone():
     found = drive(new_map(), TRUE)
     found.undo(0)
