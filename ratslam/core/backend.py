@@ -45,7 +45,20 @@ class Map(Protocol):
         return np.asarray(estimate.pose, float)
 
     def trajectory(self) -> np.ndarray:
-        """[T, 3] poses of all steps in the optimised map."""
+        """[T, 3] poses of all steps by the best estimate: the optimised map, or odometry if that is doubted."""
+
+    def map_trajectory(self) -> np.ndarray:
+        """[T, 3] poses of all steps in the optimised map, doubted or not."""
+        return self.trajectory()
+
+    def doubt(self) -> float:
+        """Probability that the present map's error is worse than odometry's, as judged some steps ago; NaN for
+        maps that do not judge themselves."""
+        return np.nan
+
+    def final_doubt(self) -> float:
+        """The same probability of the final map."""
+        return self.doubt()
 
     def online_trajectory(self) -> np.ndarray:
         """[T, 3] poses of all steps in the online map, before the final optimisation."""

@@ -84,6 +84,11 @@ class Appearance(Checkpointed, ABC):
         return NO_ESTIMATE
 
     @abstractmethod
+    def unlikeness(self, frame: int, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+        """[n] how unlike the view of a keyframe is that of each of the keyframes `others` [n], in
+        units of its own; `reversed` as in `misfit`."""
+
+    @abstractmethod
     def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
         """How badly a keyframe would fit among keyframes [n], seen in the same or in the opposite direction
         (`reversed` [n] bool); 0 or more."""
@@ -101,10 +106,13 @@ class LabelAppearance(Appearance):
     def append(self, observation: Observation, turn: float, length: float) -> None:
         self._label.append(int(observation.label))
 
+    def unlikeness(self, frame: int, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+        return (self._label.rows[others] != self._label.rows[frame]).astype(float)
+
     def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
         if not len(near):
             return NEUTRAL_MISFIT
-        return float(not np.any(self._label.rows[near] == self._label.rows[frame]))
+        return float(self.unlikeness(frame, near, reversed).min())
 
 
 class ViewAppearance(Appearance):
@@ -151,11 +159,15 @@ class ViewAppearance(Appearance):
             self._scale = 0, 0.0
         return estimate
 
+    def unlikeness(self, frame: int, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+        """Mean absolute differences."""
+        return np.abs(self._view.rows[others] - self._view.rows[frame]).mean(axis=1)
+
     def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
         """0..1: the smallest error against the keyframes, relative to twice the scale."""
         if not len(near):
             return NEUTRAL_MISFIT
-        error = np.abs(self._view.rows[near] - self._view.rows[frame]).mean(axis=1).min()
+        error = self.unlikeness(frame, near, reversed).min()
         return float(min(error / max(2 * self._scale[1], 1e-300), 1.0))
 
     def _rescale(self) -> None:
@@ -205,13 +217,18 @@ class WhiskerAppearance(Appearance):
             self._likeness = log_odds_table(estimate_background(images, self._pixels.group), variation)
         return NO_ESTIMATE
 
+    def unlikeness(self, frame: int, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+        """Negative log-odds; zeros while these are not learned."""
+        if not self._likeness.size:
+            return np.zeros(len(others))
+        image = self._level.rows[frame]
+        return -self._likeness[self._pixels.group, image, self._images(others, reversed)].sum(axis=1)
+
     def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
         """log(1 + 1 / odds) of the most similar of the keyframes."""
         if not len(near) or not self._likeness.size:
             return NEUTRAL_IMAGE_MISFIT
-        image = self._level.rows[frame]
-        odds = self._likeness[self._pixels.group, image, self._images(near, reversed)].sum(axis=1).max()
-        return float(np.log1p(np.exp(-self._temper * odds)))
+        return float(np.log1p(np.exp(self._temper * self.unlikeness(frame, near, reversed).min())))
 
     def _images(self, frames: np.ndarray, reversed: np.ndarray) -> np.ndarray:
         """[n, D] levels of keyframes, those `reversed` [n] as seen in the opposite direction."""

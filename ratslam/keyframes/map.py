@@ -26,6 +26,7 @@ from ratslam.keyframes.config import FULL, Ablation, KeyframeMapConfig
 from ratslam.keyframes.experiences import Experiences
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict, write_closures
+from ratslam.keyframes.map_health import DOUBTED, dead_reckoned, worse_than_odometry
 from ratslam.keyframes.map_solution import MapSolution, selected_solution, solution_pieces, solved_map
 from ratslam.keyframes.optimizer import BiasPrior, MapFit
 from ratslam.keyframes.verification import continues_sequence
@@ -37,6 +38,9 @@ from tactile.base.types import Observation
 
 CONFIRMED_MASS, CONFIRMED_WEIGHT = 0.95, 0.5
 """Least posterior mass of a closure, and weight of its sequence, for the likelihoods to learn from it."""
+
+DOUBT_EVERY = 50
+"""Keyframes between two judgements of the present map."""
 
 
 class Travel(NamedTuple):
@@ -59,7 +63,7 @@ class KeyframeMap(Checkpointed, Map):
             study. acceptance: makes the rule for closure sequences.
     """
 
-    VALUES = ("_travel", "_since", "_turned", "_solved")
+    VALUES = ("_travel", "_since", "_turned", "_solved", "_doubt")
     PARTS = ("_graph", "_log", "_experiences", "_appearance", "_acceptance")
 
     def __init__(
@@ -85,6 +89,8 @@ class KeyframeMap(Checkpointed, Map):
         self._since, self._turned = 0.0, 0.0  # distance (m) and turns (rad) since the last closure
         self._solved = (-1, -1)  # sequence and keyframe of the last optimisation
         self._solution: MapSolution | None = None
+        self._worse: float | None = None  # of that solution
+        self._doubt = 0.0  # of the map some keyframes ago
 
     # Queries
 
@@ -98,8 +104,20 @@ class KeyframeMap(Checkpointed, Map):
         return self._current_pose()
 
     def trajectory(self) -> np.ndarray:
+        """[T, 3] every step in the final map, or by odometry where that is more likely the better estimate."""
+        return self._steps(self._best())
+
+    def map_trajectory(self) -> np.ndarray:
         """[T, 3] every step in the final map."""
         return self._steps(self.solution().fit)
+
+    def doubt(self) -> float:
+        return self._doubt
+
+    def final_doubt(self) -> float:
+        if self._worse is None:
+            self._worse = worse_than_odometry(self._graph, self.solution()) if self.closes_loops else 0.0
+        return self._worse
 
     def online_trajectory(self) -> np.ndarray:
         """[T, 3] every step in the online map, before the final optimisation."""
@@ -133,7 +151,7 @@ class KeyframeMap(Checkpointed, Map):
 
     def graph(self) -> networkx.DiGraph:
         """Experiences with x, y (m), heading (rad) and their first keyframe; links with their evidence."""
-        return self._experiences.graph(self.solution().fit.poses)
+        return self._experiences.graph(self._best().poses)
 
     def edges(self) -> Edges:
         """Pose graph of the keyframes: odometry without its bias, and closures with their robust weights."""
@@ -147,6 +165,10 @@ class KeyframeMap(Checkpointed, Map):
             "closures.csv": lambda path: write_closures(path, self.candidates(), self._first_step()),
         }
 
+    def keyframes(self) -> KeyframeGraph:
+        """The keyframes of the online map, with their views."""
+        return self._graph
+
     # Changes
 
     def update(self, observation: Observation, estimate: Estimate, evidence: Evidence) -> Estimate:
@@ -159,11 +181,12 @@ class KeyframeMap(Checkpointed, Map):
             self._learn(evidence)
             matched = self._consider(evidence)
             self._select()
+            self._judge()
             poses = self._graph.pose.rows
             change = self._experiences.arrive(poses, len(poses) - 1, matched, self._is_pose_reliable())
         self._step_frame.append(self._graph.count - 1)
         self._step_motion.append([*self._travel.motion, self._travel.length])
-        self._solution = None
+        self._forget_solution()
         return estimate._replace(place=change.place, previous=change.previous, action=change.action)
 
     def undo(self, sequence: int) -> None:
@@ -278,11 +301,27 @@ class KeyframeMap(Checkpointed, Map):
             return
         self._log, self._graph.cut = solution.log, solution.cut
         self._graph.move_to(solution.fit)
-        self._solution = None
+        self._forget_solution()
+
+    def _judge(self) -> None:
+        """Every `DOUBT_EVERY` keyframes, judges the present map."""
+        graph = self._graph
+        if self.closes_loops and graph.count % DOUBT_EVERY == 0:
+            present = MapSolution(graph.fit(), self._log, graph.cut)
+            self._doubt = worse_than_odometry(graph, present)
+
+    def _best(self) -> MapFit:
+        """The map's poses, or those of raw odometry where the map is doubted."""
+        if self.final_doubt() <= DOUBTED:
+            return self.solution().fit
+        return MapFit(dead_reckoned(self._graph), 0.0, np.zeros(0))
+
+    def _forget_solution(self) -> None:
+        self._solution = self._worse = None
 
     def _optimise(self) -> None:
         self._graph.optimise(self._log)
-        self._solution = None
+        self._forget_solution()
 
     def _steps(self, fit: MapFit) -> np.ndarray:
         frame, motion = self._step_frame.rows, self._step_motion.rows
@@ -304,4 +343,4 @@ class KeyframeMap(Checkpointed, Map):
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Replaces the whole state by that of `arrays`."""
         super().restore(arrays)
-        self._solution = None
+        self._forget_solution()

@@ -1,0 +1,68 @@
+"""Revisits that the poses of a map claim, and whether the views bear them out.
+
+A keyframe near older ones that face alike claims a revisit: one of each pass of the robot there, so that a pass
+that is right does not hide one that is wrong. Where a claim is right, the view is more like those near it than
+like views elsewhere; where it is wrong, it is so by chance. The comparison is by ranks: no constant is in units
+of the sensor, and views that are alike everywhere count little. The rules are ours."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ratslam.keyframes.keyframe_graph import KeyframeGraph
+
+RADIUS = 2.0
+"""Distance within which keyframes are near each other, cells."""
+FACING = float(np.cos(0.5))
+"""Cosine of the largest difference in heading of two keyframes that face alike."""
+CONTROLS = np.arange(1, 9) / 9
+"""Shares of the older keyframes by which those near a keyframe are moved on in memory, as controls."""
+
+
+class ClaimedRevisits(NamedTuple):
+    """n claims by `examined` keyframes.
+
+    Attributes:
+        frame: [n] keyframe. match: [n] the first of the older keyframes near it, of one pass. likeness: [n]
+            share of the controls that its view fits worse than these, 0..1; ties count half; 0.5 by chance. A
+            control is as many keyframes elsewhere among the older ones, in the same order.
+    """
+
+    frame: np.ndarray
+    match: np.ndarray
+    likeness: np.ndarray
+    examined: int
+
+
+def claimed_revisits(graph: KeyframeGraph, poses: np.ndarray, most: int) -> ClaimedRevisits:
+    """The claims of poses [N, 3] of the keyframes; at most `most` keyframes are examined, spread evenly."""
+    first, count = graph.guard + 1, len(poses)
+    frames = np.unique(np.linspace(first, count - 1, max(min(count - first, most), 0)).astype(int))
+    ahead, aside = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    turned = np.cos(graph.sector_angle) < 0  # whiskers: views turned by half a turn are compared too
+    found = [np.zeros((0, 3))]
+    for frame in frames.tolist():
+        older = frame - graph.guard
+        apart = ((poses[:older, :2] - poses[frame, :2]) ** 2).sum(axis=1)
+        near = np.flatnonzero(apart < (RADIUS * graph.cell) ** 2)
+        facing = ahead[near] * ahead[frame] + aside[near] * aside[frame]
+        kept = (np.abs(facing) if turned else facing) > FACING
+        if kept.any():
+            found.append(_claims(graph, frame, near[kept], facing[kept] < 0))
+    rows = np.concatenate(found)
+    frame, match = rows[:, :2].astype(int).T
+    return ClaimedRevisits(frame, match, rows[:, 2], len(frames))
+
+
+def _claims(graph: KeyframeGraph, frame: int, near: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+    """[passes, 3] keyframe, match, likeness of the claims of a keyframe near others [n]."""
+    older = frame - graph.guard
+    start = np.concatenate([[0], np.flatnonzero(np.diff(near) > graph.guard) + 1])
+    shifts = np.concatenate([[0], (older * CONTROLS).astype(int)])
+    others = (near + shifts[:, None]) % older
+    unlike = graph.appearance.unlikeness(frame, others.ravel(), np.tile(reversed, len(shifts)))
+    best = np.minimum.reduceat(unlike.reshape(others.shape), start, axis=1)
+    likeness = (best[0] < best[1:]).mean(axis=0) + (best[0] == best[1:]).mean(axis=0) / 2
+    return np.stack([np.full(len(start), frame), near[start], likeness], axis=1)
