@@ -52,6 +52,7 @@ def read_run(path: Path) -> RunArrays:
         nodes=nodes,
         links=links,
         online_error=_column(errors, "error") if errors.exists() else np.zeros(0),
+        doubt=_doubt(path / "health.json"),
     )
 
 
@@ -142,6 +143,16 @@ def _column(path: Path, name: str) -> np.ndarray:
         return np.array([float(line.split(",")[column]) for line in lines])
     except (ValueError, IndexError):
         raise InputError(str(path), f"a row without a number in column {name}", f"column {name}") from None
+
+
+def _doubt(path: Path) -> float:
+    """Probability that the map is worse than odometry; NaN without the file."""
+    if not path.exists():
+        return np.nan
+    try:
+        return float(json.loads(path.read_text(encoding="utf-8"))["worse_than_odometry"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(str(path), f"malformed ({error})", "the health.json of a run directory") from None
 
 
 def _map(path: Path) -> tuple[np.ndarray, np.ndarray]:

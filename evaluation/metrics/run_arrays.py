@@ -21,6 +21,7 @@ class RunArrays(NamedTuple):
         created: [M] step at which each experience was created.
         nodes: [M, 3] poses of the experiences in the final map, in the frame of `final`.
         links: [L, 2] linked experiences.
+        doubt: probability, by the map itself, that its error is worse than odometry's; NaN if unknown.
         online_error: [A] position errors of the current pose in the map of that time, m; empty if unknown.
     """
 
@@ -34,6 +35,7 @@ class RunArrays(NamedTuple):
     nodes: np.ndarray
     links: np.ndarray
     online_error: np.ndarray = np.zeros(0)
+    doubt: float = np.nan
 
 
 def check_run(run: RunArrays) -> None:

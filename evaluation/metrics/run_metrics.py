@@ -56,6 +56,7 @@ RUN_METRICS: tuple[Metric, ...] = (
     _metric("Extent", None, "path", "length of the true path", "m"),
     _metric("Extent", None, "experiences", "experiences"),
     _metric("Extent", None, "links", "links"),
+    _metric("Health", None, "map_doubt", "map worse than odometry, probability"),
     _metric("Trajectory", "low", "ate_final", "ATE, final", "m"),
     _metric("Trajectory", "low", "ate_online", "ATE, online", "m"),
     _metric("Trajectory", "low", "anytime_median", "online error, median", "m"),
@@ -78,6 +79,8 @@ RUN_METRICS: tuple[Metric, ...] = (
 )
 """In the order of the scorecard."""
 _EXPERIENCE = [metric.name for metric in RUN_METRICS if metric.section == "Experience Metric"]
+DOUBTED = 0.5
+"""Probability of being worse than odometry above which a map is doubted (`ratslam.keyframes.map_health`)."""
 REGISTERED_METRICS: list[Metric] = []
 """Metrics added by `register_metric`."""
 
@@ -111,6 +114,7 @@ def run_data(run: RunArrays, exm: ExmConfig, relations: Relations | None, gap: i
         "duration": Finding(float(run.time[-1] - run.time[0])),
         "experiences": Finding(len(run.nodes)),
         "links": Finding(len(run.links)),
+        "map_doubt": _doubt(run.doubt),
     }
     if relations is not None:
         findings |= _relations(run, relations)
@@ -142,6 +146,12 @@ def _trajectories(run: RunArrays, truth: np.ndarray, rows: np.ndarray) -> dict[s
         "rpe_translation": Finding(step.translation, raw_rpe.translation),
         "rpe_rotation_deg": Finding(float(np.degrees(step.rotation)), float(np.degrees(raw_rpe.rotation))),
     }
+
+
+def _doubt(doubt: float) -> Finding:
+    if not np.isfinite(doubt):
+        return Finding(np.nan, note="not judged by this method")
+    return Finding(doubt, note="map_doubted: the trajectory is odometry" if doubt > DOUBTED else "")
 
 
 def _relations(run: RunArrays, relations: Relations) -> dict[str, Finding]:

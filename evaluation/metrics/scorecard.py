@@ -9,7 +9,7 @@ from evaluation.metrics.experience_log import ExperienceLog
 from evaluation.metrics.experience_metric import DEFAULT_EXM, ExmConfig
 from evaluation.metrics.metric import MISSING_TRUTH, Finding, Quantity
 from evaluation.metrics.run_arrays import RunArrays, check_run
-from evaluation.metrics.run_metrics import experience_findings, path_length, run_data, run_metrics
+from evaluation.metrics.run_metrics import DOUBTED, experience_findings, path_length, run_data, run_metrics
 from tactile.base.config import Settings
 
 
@@ -77,6 +77,16 @@ def render_scorecard(card: Scorecard) -> str:
             note = "as above" if above and q.note and q.note == above.note else q.note
             lines.append(f"  {q.label:<{width}}{_text(q.value):>9}  {q.unit:<8} {raw:>9}  {note}".rstrip())
     return "\n".join(lines)
+
+
+def render_health(card: Scorecard) -> str:
+    """The health of the map in one line; "" if it is not judged."""
+    found = card.quantities.get("map_doubt")
+    if found is None or found.value is None:
+        return ""
+    if found.value > DOUBTED:
+        return f"health: map_doubted, {found.value:.0%} likely worse than odometry, which is given instead"
+    return f"health: map {1 - found.value:.0%} likely no worse than odometry"
 
 
 def _text(value: float | int | None) -> str:

@@ -31,6 +31,7 @@ class RunProgress(NamedTuple):
             its report; `running` without either. total: final number of steps, if known.
         path: [N, 3] online poses in the map frame, m, m, rad. sd: [3] standard deviations of the last pose;
             NaN before it. odometry: [N, 3] from the start of this run. truth: [N, 2] m, NaN if unknown.
+        doubt: probability that the map is worse than odometry at the last step; None if it is not judged.
         outcomes: number of steps by outcome. lost: number of steps lost. online_error: position error at the
             last comparison with the truth, after alignment of the path, m.
         checkpoint: steps of the last checkpoint. rate: mean steps per second, by file dates.
@@ -50,6 +51,7 @@ class RunProgress(NamedTuple):
     checkpoint: int
     rate: float | None
     silence: float
+    doubt: float | None = None
 
 
 def step_count(seen: RunProgress) -> str:
@@ -78,6 +80,7 @@ class RunMonitor:
         self._reckoned: list[list[float]] = []  # x, y, heading
         self._true: dict[float, list[float]] = {}  # t: x, y
         self._online_error: float | None = None
+        self._doubt: float | None = None
 
     def read(self) -> RunProgress:
         """The current state of the run.
@@ -104,6 +107,7 @@ class RunMonitor:
             outcomes=Counter(self._outcomes[:count]),
             lost=int(rows[:, 7].sum()),
             online_error=self._online_error,
+            doubt=self._doubt,
             checkpoint=checkpoint_steps(self.directory),
             rate=count / (last - began) if 0 < began < last else None,
             silence=max(0.0, time.time() - self._date(*self._files())),
@@ -118,6 +122,7 @@ class RunMonitor:
             row = dict(zip(self._header, cells, strict=False))
             self._rows.append(_numbers(where, [row.get(name, "") for name in _NUMBERS], len(_NUMBERS)))
             self._outcomes.append(row.get("outcome", ""))
+            self._doubt = _numbers(where, [row["doubt"]], 1)[0] if row.get("doubt") else None
         for where, line in self._odometry.read_new():
             _, x, y, *_, qz, qw = _numbers(where, line.split(), 8)
             self._reckoned.append([x, y, 2 * atan2(qz, qw)])

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from evaluation.artifacts.run_directory import read_walls
+from evaluation.metrics.run_metrics import DOUBTED
 from evaluation.monitor.plot import draw_watch
 from evaluation.monitor.progress import RUNNING, WATCH_IMAGE, RunMonitor, RunProgress, step_count
 from tactile.base.atomic_write import write_atomically
@@ -69,6 +70,7 @@ def status_line(seen: RunProgress, pace: float | None) -> str:
     parts += [] if seen.online_error is None else [f"error {seen.online_error:.3g} m"]
     parts += [f"{count} {name}" for name, count in sorted(seen.outcomes.items(), key=lambda item: -item[1])]
     parts += [f"{seen.lost} lost"] if seen.lost else []
+    parts += [f"map_doubted ({seen.doubt:.0%})"] if (seen.doubt or 0.0) > DOUBTED else []
     parts += [f"checkpoint at {seen.checkpoint}"] if seen.checkpoint else []
     if seen.status == RUNNING and seen.silence > SILENCE_SHOWN:
         parts.append(f"silent for {seen.silence:.0f} s")

@@ -50,7 +50,7 @@ def add_commands(commands: Commands) -> None:
 
 def _live(arguments: argparse.Namespace) -> int:
     prepare_jax()
-    from evaluation.metrics.scorecard import render_scorecard
+    from evaluation.metrics.scorecard import render_health, render_scorecard
     from ratslam.live.session import run_live_session
     from robot.drivers.outcome import SessionOutcome
 
@@ -60,7 +60,8 @@ def _live(arguments: argparse.Namespace) -> int:
         ended, card = run_live_session(config, directory, _print, armed=start_monitor)
     if card is not None:
         print(render_scorecard(card))
-        print(f"\n{directory}/map.png shows the map, `run {directory}/config.yaml` maps the recording again")
+        print(f"\n{render_health(card)}".rstrip())
+        print(f"{directory}/map.png shows the map, `run {directory}/config.yaml` maps the recording again")
     _print(str(ended))
     if ended.outcome is SessionOutcome.INTERRUPTED:
         return INTERRUPTED

@@ -115,6 +115,9 @@ def add_tables(tables: Commands) -> None:
     add_count(laser, "--copies", 10, "perturbed copies per recording")
     buildings = add("buildings", _buildings_lines, "real buildings: map against odometry", "--copies 2")
     add_count(buildings, "--copies", 10, "perturbed copies per recording")
+    health = add("health", _health_lines, "whether a map knows that it is wrong", "--sessions 1")
+    add_count(health, "--sessions", 2, "sessions per row")
+    add_workers(health)
     for parser in (touch, grid, laser, buildings):
         parser.add_argument("--rows", nargs="+", metavar="ROW", help="only these rows")
         add_workers(parser)
@@ -224,6 +227,12 @@ def _buildings_lines(arguments: argparse.Namespace) -> Iterator[str]:
     from ratslam.experiments.tables.buildings import buildings_table, choose_rows
 
     return buildings_table(choose_rows(arguments.rows), arguments.copies, arguments.workers)
+
+
+def _health_lines(arguments: argparse.Namespace) -> Iterator[str]:
+    from ratslam.experiments.tables.health import health_table
+
+    return health_table(arguments.sessions, arguments.workers)
 
 
 def _speed_lines(arguments: argparse.Namespace) -> Iterator[str]:

@@ -48,7 +48,7 @@ def run_directory(arguments: argparse.Namespace) -> Path:
 def _run(arguments: argparse.Namespace) -> int:
     prepare_jax()
     from evaluation.metrics import grid_score
-    from evaluation.metrics.scorecard import render_scorecard
+    from evaluation.metrics.scorecard import render_health, render_scorecard
     from ratslam.pipeline.run import run
 
     directory = run_directory(arguments)
@@ -57,7 +57,8 @@ def _run(arguments: argparse.Namespace) -> int:
     if (directory / "gridscore.json").exists():
         text = (directory / "gridscore.json").read_text(encoding="utf-8")
         print("\n" + grid_score.render_grid_scores([grid_score.GridScore.model_validate_json(text)]))
-    print(f"\n{directory}/map.png shows the map, {directory}/trajectory.tum holds the trajectory")
+    print(f"\n{render_health(card)}".rstrip())
+    print(f"{directory}/map.png shows the map, {directory}/trajectory.tum holds the trajectory")
     return INTERRUPTED if interrupted else 0
 
 

@@ -45,15 +45,15 @@ class Map(Protocol):
         return np.asarray(estimate.pose, float)
 
     def trajectory(self) -> np.ndarray:
-        """[T, 3] poses of all steps by the best estimate: the optimised map, or odometry if that is doubted."""
+        """[T, 3] poses of all steps, best estimate: the optimised map, or odometry if that is doubted."""
 
     def map_trajectory(self) -> np.ndarray:
         """[T, 3] poses of all steps in the optimised map, doubted or not."""
         return self.trajectory()
 
     def doubt(self) -> float:
-        """Probability that the present map's error is worse than odometry's, as judged some steps ago; NaN for
-        maps that do not judge themselves."""
+        """Probability that the present map's error is worse than odometry's, as judged some steps ago; NaN
+        for maps that do not judge themselves."""
         return np.nan
 
     def final_doubt(self) -> float:

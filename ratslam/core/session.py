@@ -33,11 +33,13 @@ class Step(NamedTuple):
 
     Attributes:
         estimate, evidence: of the backend, host NumPy. pose: [3] in the map frame at that time, m, m, rad.
+        doubt: `Map.doubt` at that time.
     """
 
     estimate: Estimate
     evidence: Evidence
     pose: np.ndarray
+    doubt: float
 
 
 class Session:
@@ -141,7 +143,7 @@ class Session:
         steps = []
         for observation, (estimate, evidence) in zip(observations, results.records(count), strict=True):
             estimate = self.map.update(observation, estimate, evidence)
-            steps.append(Step(estimate, evidence, self.map.pose(estimate)))
+            steps.append(Step(estimate, evidence, self.map.pose(estimate), self.map.doubt()))
         self.steps += count
         return steps
 

@@ -104,7 +104,7 @@ class KeyframeMap(Checkpointed, Map):
         return self._current_pose()
 
     def trajectory(self) -> np.ndarray:
-        """[T, 3] every step in the final map, or by odometry where that is more likely the better estimate."""
+        """[T, 3] every step in the final map, or by odometry where that is likely the better estimate."""
         return self._steps(self._best())
 
     def map_trajectory(self) -> np.ndarray:
@@ -126,7 +126,7 @@ class KeyframeMap(Checkpointed, Map):
     def closures(self) -> np.ndarray:
         """[M, 2] steps of the keyframes joined by accepted loop closures."""
         log = self.solution().log
-        return self._first_step()[log.table()[log.accepted_rows(), :2].astype(int)].reshape(-1, 2)
+        return self.keyframe_steps()[log.table()[log.accepted_rows(), :2].astype(int)].reshape(-1, 2)
 
     def pieces(self) -> np.ndarray:
         """[T] the piece of each step, see `ratslam.keyframes.pieces`."""
@@ -162,12 +162,16 @@ class KeyframeMap(Checkpointed, Map):
         return {
             "map.json": lambda path: write_json(path, self.graph()),
             "map.g2o": lambda path: write_g2o(path, self.solution().fit.poses, self.edges()),
-            "closures.csv": lambda path: write_closures(path, self.candidates(), self._first_step()),
+            "closures.csv": lambda path: write_closures(path, self.candidates(), self.keyframe_steps()),
         }
 
     def keyframes(self) -> KeyframeGraph:
         """The keyframes of the online map, with their views."""
         return self._graph
+
+    def keyframe_steps(self) -> np.ndarray:
+        """[N] the step at which each keyframe was taken."""
+        return np.searchsorted(self._step_frame.rows, np.arange(self._graph.count))
 
     # Changes
 
@@ -330,10 +334,6 @@ class KeyframeMap(Checkpointed, Map):
             return moved
         origin = np.where(frame[:, None] >= 0, fit.poses[np.maximum(frame, 0)], 0.0)
         return compose(origin, moved)
-
-    def _first_step(self) -> np.ndarray:
-        """[N] the step at which each keyframe was taken."""
-        return np.searchsorted(self._step_frame.rows, np.arange(self._graph.count))
 
     def _current_pose(self) -> np.ndarray:
         graph = self._graph

@@ -1,9 +1,9 @@
 """Health of a map: the probability that its error is worse than odometry's, told without truth.
 
 Map and odometry are compared as predictors of revisits (`claimed_revisits`) and of the closure sequences that
-the map refused; a map that bends odometry is suspect where odometry itself foretells revisits well. A logistic
-regression on these statistics was fitted to maps with known error (`python -m ratslam reproduce tables
-health`). The statistics are ours."""
+the map refused; a map that bends odometry is suspect where odometry itself foretells revisits well. A
+logistic regression on these statistics was fitted to maps with known error (`python -m ratslam reproduce
+tables health`). The statistics are ours."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from ratslam.keyframes.loop_closures import ClosureLog, Verdict
 from ratslam.keyframes.map_solution import MapSolution
 from tactile.base.se2 import between, correct_heading_bias, integrate, wrap
 
-INTERCEPT = -0.44
-WEIGHTS = np.array([-1.4, -0.39, 0.08, 0.5, 1.0])
+INTERCEPT = -0.35
+WEIGHTS = np.array([-1.37, 0.09, 0.18, 0.81, 4.88])
 """Of `HealthFeatures`, in order; printed by `python -m ratslam reproduce tables health`."""
 DOUBTED = 0.5
 """Probability above which odometry is the better estimate."""

@@ -57,7 +57,7 @@ class MappedSample(NamedTuple):
 
     Attributes:
         number: of the sample. pose: [3] online, in the map frame (m, m, rad). place: -1 for none. action: by
-            name. seconds: computing time.
+            name. seconds: computing time. doubt: see `ratslam.core.session.Step`.
     """
 
     number: int
@@ -65,6 +65,7 @@ class MappedSample(NamedTuple):
     place: int
     action: str
     seconds: float
+    doubt: float = np.nan
 
 
 class Mapper:
@@ -254,9 +255,8 @@ def _map(line: Connection) -> None:
                 (step,) = runner.process([sample])
                 action = Action(int(step.estimate.action)).name.lower()
                 took = time.monotonic() - fed.received
-                _send(
-                    line, MappedSample(number, np.asarray(step.pose), int(step.estimate.place), action, took)
-                )
+                place = int(step.estimate.place)
+                _send(line, MappedSample(number, np.asarray(step.pose), place, action, took, step.doubt))
             if runner.session.steps:
                 _send(line, runner.finish(fed.interrupted))
 

@@ -15,6 +15,7 @@ import numpy as np
 from tqdm import tqdm
 
 from evaluation.artifacts.run_directory import SESSION_REPORT
+from evaluation.metrics.run_metrics import DOUBTED
 from evaluation.metrics.scorecard import Scorecard
 from ratslam.config.run_config import RunConfig
 from ratslam.core.session import CHUNK
@@ -186,6 +187,7 @@ def _run(rig: Rig, path: HeadPath, mapper: Mapper, whisks: list[WhiskReport]) ->
 def _status(rig: Rig, mapper: Mapper, whisks: list[WhiskReport]) -> str:
     result = mapper.mapped[-1] if mapper.mapped else None
     place = "" if result is None or result.place < 0 else f", place {result.place}"
+    place += "" if result is None or not result.doubt > DOUBTED else ", map_doubted"
     took = "" if result is None else f"map {1e3 * result.seconds:.0f} ms{place}, "
     dropped = sum(not whisk.seen for whisk in whisks)
     lost = sum(whisk.missing for whisk in whisks)

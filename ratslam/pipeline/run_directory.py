@@ -18,10 +18,11 @@ from tactile.base.atomic_write import write_atomically, write_text_atomically
 from tactile.base.errors import InputError
 
 COLUMNS = (
-    "t", "place", "action", "x", "y", "heading", "sd_x", "sd_y", "sd_heading", "lost", "outcome",
+    "t", "place", "action", "x", "y", "heading", "sd_x", "sd_y", "sd_heading", "lost", "doubt", "outcome",
 )  # fmt: skip
 """Columns of steps.csv before those of the backend: time (s), experience, action, online pose in the map
-frame and its standard deviations (m, m, rad), flag, outcome."""
+frame and its standard deviations (m, m, rad), flag, probability that the map is worse than odometry,
+outcome."""
 STREAMS = ("online.tum", "odometry.tum", "truth.tum", "steps.csv", "online_error.csv")
 """Files that grow by whole lines."""
 

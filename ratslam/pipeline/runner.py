@@ -180,6 +180,7 @@ def _step_line(time: float, step: Step, entry: BackendEntry, columns: Sequence[s
         Action(int(estimate.action)).name.lower(),
         *(repr(float(value)) for value in (*step.pose, *estimate.spread)),
         str(int(estimate.lost)),
+        _cell(np.asarray(step.doubt)),
         entry.outcomes(int(step.evidence.outcome)).name.lower(),
         *(_cell(getattr(step.evidence, name)) for name in columns),
     ]
@@ -195,7 +196,12 @@ def _cell(value: Any) -> str:
 def _write_final_map(session: Session, directory: RunDirectory) -> None:
     time = np.loadtxt(directory.path / "online.tum", usecols=0, ndmin=1)
     final = session.map.trajectory()[session.steps - len(time) :]
+    own = session.map.map_trajectory()[session.steps - len(time) :]
     directory.file("trajectory.tum", lambda path: write_tum(path, time, final))
+    directory.file("map.tum", lambda path: write_tum(path, time, own))
+    doubt = session.map.final_doubt()
+    if np.isfinite(doubt):
+        directory.text("health.json", json.dumps({"worse_than_odometry": doubt}) + "\n")
     for name, write in session.map.files().items():
         directory.file(name, write)
 

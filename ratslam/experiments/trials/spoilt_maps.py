@@ -1,0 +1,173 @@
+"""Spoilt maps of a finished session: its sequences thinned out, all accepted, or joined by false ones.
+
+A false sequence claims that a stretch of the session was driven where an earlier one was, far from it in
+truth, along which odometry moved alike: the one of `ATTEMPTS` random pairs that looks most alike, or any.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from ratslam.keyframes.keyframe_graph import NO_ROBUST_SCALE, KeyframeGraph
+from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
+from ratslam.keyframes.map import KeyframeMap
+from ratslam.keyframes.map_health import dead_reckoned
+from ratslam.keyframes.map_solution import MapSolution
+from ratslam.keyframes.optimizer import MapFit, robust_cost, solve
+from tactile.base.random_streams import stream
+from tactile.base.se2 import between, wrap
+
+ATTEMPTS = 300
+"""Pairs of stretches tried for one false sequence."""
+COUNT, LENGTH, EVIDENCE = (1, 4), (6, 39), (1.0, 4.0)
+"""Smallest and largest number of false sequences, of their candidates, and evidence of each candidate."""
+FAR, TURNED = 5.0, 0.7
+"""True distance, cells, and heading difference, rad, beyond which a place is another one."""
+AGREEMENT, AGREEMENT_HEADING = 2.0, 0.5
+"""Largest difference between the odometry of the two stretches, cells and rad."""
+STEPS, FINE = 40, 1e-3
+"""Solver iterations of a spoilt map, and change of the poses at their end, m and rad."""
+
+
+class Recipe(NamedTuple):
+    """How a map is spoilt.
+
+    Attributes:
+        kept: share of its accepted sequences that stay. more: number of refused ones accepted. least: least
+            evidence of the refused ones that are all accepted; None: not. false: whether false sequences
+            are added, `alike`: such as look alike. robust: whether sequences that disagree lose weight.
+    """
+
+    name: str
+    kept: float = 1.0
+    more: int = 0
+    least: float | None = None
+    false: bool = False
+    alike: bool = True
+    robust: bool = True
+
+
+RECIPES = (
+    Recipe("all accepted", least=2.0, robust=False),
+    Recipe("half", kept=0.5),
+    Recipe("false, alike", false=True, robust=False),
+    Recipe("false, random", false=True, alike=False, robust=False),
+    Recipe("false, alike", false=True, robust=False),
+    Recipe("half and three refused", kept=0.5, more=3),
+    Recipe("false, random", false=True, alike=False, robust=False),
+    Recipe("few", kept=0.15),
+    Recipe("only false", kept=0.0, false=True, robust=False),
+    Recipe("some and false, robust", kept=0.3, false=True),
+    Recipe("all accepted, robust", least=4.0),
+)
+
+
+def spoilt_maps(map: KeyframeMap, truth: np.ndarray, seed: int) -> Iterator[tuple[str, MapSolution]]:
+    """The final map and a map of each recipe that has closures, by name.
+
+    Args:
+        truth: [N, 3] true poses of the keyframes, NaN where unknown.
+    """
+    graph, final = map.keyframes(), map.solution()
+    random = stream(seed, "spoilt_maps")
+    yield "final", final
+    for recipe in RECIPES:
+        log = spoil(graph, final.log, truth, recipe, random)
+        if len(log.accepted_rows()):
+            yield recipe.name, solved_anew(graph, log, final, recipe.robust)
+
+
+def spoil(
+    graph: KeyframeGraph, log: ClosureLog, truth: np.ndarray, recipe: Recipe, random: np.random.Generator
+) -> ClosureLog:
+    """A copy of a log with other verdicts and, where the session has room for them, false sequences."""
+    log = log.copy()
+    verdicts, long = log.verdicts().copy(), log.sizes() >= 2
+    refused = np.flatnonzero(long & (verdicts != Verdict.ACCEPTED))
+    for sequence in np.flatnonzero(verdicts == Verdict.ACCEPTED).tolist():
+        if random.random() > recipe.kept:
+            log.judge(sequence, Verdict.OPEN)
+    chosen = random.choice(refused, min(recipe.more, len(refused)), replace=False)
+    if recipe.least is not None:
+        chosen = refused[log.scores()[refused] >= recipe.least]
+    for sequence in chosen.tolist():
+        log.judge(sequence, Verdict.ACCEPTED)
+    if recipe.false:
+        count, length = (int(random.integers(low, high + 1)) for low, high in (COUNT, LENGTH))
+        for _ in range(count):
+            add_false_sequence(graph, log, truth, length, random, ATTEMPTS if recipe.alike else 1)
+    return log
+
+
+def add_false_sequence(
+    graph: KeyframeGraph,
+    log: ClosureLog,
+    truth: np.ndarray,
+    length: int,
+    random: np.random.Generator,
+    choices: int,
+) -> bool:
+    """Accepts a false sequence, the one that looks most alike of at most `choices` pairs of stretches.
+
+    Returns:
+        whether there was one among `ATTEMPTS` random pairs.
+    """
+    found: list[tuple[float, int, int]] = []
+    first, reckoned = graph.guard + length + 5, dead_reckoned(graph)
+    if graph.count - length <= first:
+        return False
+    for _ in range(ATTEMPTS):
+        frame = int(random.integers(first, graph.count - length))
+        match = int(random.integers(0, frame - graph.guard - length))
+        if len(found) < choices and _is_false(graph, reckoned, truth, frame, match, length):
+            found.append((_unlikeness(graph, frame, match, length), frame, match))
+    if not found:
+        return False
+    _, frame, match = min(found)
+    evidence = float(random.uniform(*EVIDENCE))
+    for k in range(length):
+        sequence = log.add(Candidate(frame + k, match + k, 0, 0.9, evidence), k > 0)
+    log.judge(sequence, Verdict.ACCEPTED)
+    return True
+
+
+def solved_anew(graph: KeyframeGraph, log: ClosureLog, final: MapSolution, robust: bool) -> MapSolution:
+    """The map of a log: the cheaper one of those reached from the final map and from odometry.
+
+    Args:
+        robust: whether sequences that disagree lose weight.
+    """
+    problem = graph.problem(log, final.cut)
+    if not robust:
+        scale = np.full_like(problem.closures.scale, NO_ROBUST_SCALE)
+        problem = problem._replace(closures=problem.closures._replace(scale=scale, cost_limit=np.inf))
+    starts = [final.fit, MapFit(dead_reckoned(graph), 0.0, np.zeros(0))]
+    fits = [solve(start, problem, STEPS, FINE) for start in starts]
+    fit = min(fits, key=lambda fit: robust_cost(fit, problem))
+    log.weigh(fit.weights)
+    return MapSolution(fit, log, final.cut)
+
+
+def _is_false(
+    graph: KeyframeGraph, reckoned: np.ndarray, truth: np.ndarray, frame: int, match: int, length: int
+) -> bool:
+    """Whether two stretches are of other places, and odometry moved alike on both."""
+    apart = truth[frame] - truth[match]
+    if not np.hypot(*apart[:2]) > FAR * graph.cell and not abs(wrap(apart[2])) > TURNED:
+        return False
+    for k in (length // 2, length):
+        moved = [between(reckoned[at], reckoned[at + k]) for at in (frame, match)]
+        error = moved[0] - moved[1]
+        if np.hypot(*error[:2]) > AGREEMENT * graph.cell or abs(wrap(error[2])) > AGREEMENT_HEADING:
+            return False
+    return True
+
+
+def _unlikeness(graph: KeyframeGraph, frame: int, match: int, length: int) -> float:
+    """Mean misfit of the candidates, about every sixth."""
+    ahead = np.array([False])
+    steps = range(0, length, max(1, length // 6))
+    return float(np.mean([graph.appearance.misfit(frame + k, np.array([match + k]), ahead) for k in steps]))
