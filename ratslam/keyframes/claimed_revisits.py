@@ -1,9 +1,10 @@
 """Revisits that the poses of a map claim, and whether the views bear them out.
 
 A keyframe near older ones that face alike claims a revisit: one of each pass of the robot there, so that a
-pass that is right does not hide one that is wrong. Where a claim is right, the view is more like those near it
-than like views elsewhere; where it is wrong, it is so by chance. The comparison is by ranks: no constant is in
-units of the sensor, and views that are alike everywhere count little. The rules are ours."""
+pass that is right does not hide one that is wrong. Where a claim is right, the view is more like those near
+it than like views elsewhere; where it is wrong, it is so by chance. The comparison is by ranks: no constant
+is in units of the sensor, and views that are alike everywhere count little. The rules are ours.
+"""
 
 from __future__ import annotations
 
