@@ -76,8 +76,17 @@ class PathMap:
     def trajectory(self):
         return np.array(self.path[1:])
 
+    def map_trajectory(self):
+        return self.trajectory()
+
     def online_trajectory(self):
         return self.trajectory()
+
+    def doubt(self):
+        return np.nan
+
+    def final_doubt(self):
+        return np.nan
 
     def closures(self):
         return np.zeros((0, 2), int)

@@ -1,0 +1,118 @@
+"""Health of a map: a map with a false loop is doubted, a clean one is not, whatever the sensor."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ratslam.keyframes.appearance import Appearance, LabelAppearance, ViewAppearance
+from ratslam.keyframes.claimed_revisits import CONTROLS, claimed_revisits
+from ratslam.keyframes.config import FULL, KeyframeMapConfig
+from ratslam.keyframes.keyframe_graph import NO_ROBUST_SCALE, KeyframeGraph
+from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
+from ratslam.keyframes.map_health import DOUBTED, dead_reckoned, health_features, worse_than_odometry
+from ratslam.keyframes.map_solution import MapSolution, solved_map
+from ratslam.keyframes.optimizer import solve
+from tactile.base.se2 import between, compose
+from tactile.base.types import Odometry, observation
+from tests.helpers.laps import square
+
+CELL, GUARD, LAP, SIZE = 0.05, 20, 48, 12
+LAPS = 5
+TRUTH = square("A" * LAPS)
+DRIFT = 0.004  # heading error of the odometry, rad a step
+APPEARANCES = {"ids": LabelAppearance, "views": lambda: ViewAppearance(SIZE, None)}
+
+
+def drive(appearance: Appearance) -> KeyframeGraph:
+    """Keyframes on laps around a square, in which every place looks different, by odometry that turns."""
+    graph = KeyframeGraph(KeyframeMapConfig(), CELL, appearance, GUARD, FULL)
+    looks = np.random.default_rng(0).random((LAP, SIZE))
+    pose = TRUTH[0]
+    for k in range(len(TRUTH)):
+        motion = np.zeros(3) if k == 0 else between(TRUTH[k - 1], TRUTH[k]) + [0, 0, DRIFT]
+        pose = compose(pose, motion)
+        length = float(np.hypot(*motion[:2]))
+        graph.append(pose, motion, length, abs(motion[2]))
+        reading = observation(Odometry(*motion, 0.1), looks[k % LAP, None, :, None], label=k % LAP)
+        appearance.append(reading, motion[2], length)
+    return graph
+
+
+def closed(sequences: list[tuple[int, int, int]]) -> ClosureLog:
+    """A log of accepted sequences: first keyframe, first match, number of closures."""
+    log = ClosureLog()
+    for frame, match, count in sequences:
+        for k in range(count):
+            number = log.add(Candidate(frame + k, match + k, 0, 0.9, 3.0), k > 0)
+        log.judge(number, Verdict.ACCEPTED)
+    return log
+
+
+def solution(graph: KeyframeGraph, log: ClosureLog) -> MapSolution:
+    """The map with these closures, none of which loses weight."""
+    problem = graph.problem(log, graph.cut)
+    scale = np.full_like(problem.closures.scale, NO_ROBUST_SCALE)
+    problem = problem._replace(closures=problem.closures._replace(scale=scale))
+    return MapSolution(solve(graph.fit(), problem, 60), log, graph.cut)
+
+
+@pytest.fixture(params=APPEARANCES)
+def graph(request):
+    return drive(APPEARANCES[request.param]())
+
+
+CLEAN = [(LAP * lap + 5, LAP * (lap - 1) + 5, 20) for lap in range(1, LAPS)]
+FALSE = [(LAP * 2, 12, 30), (LAP * 3 + 5, 30, 30)]
+
+
+def test_a_map_of_true_closures_is_not_doubted(graph):
+    assert worse_than_odometry(graph, solution(graph, closed(CLEAN))) < 0.2
+
+
+def test_a_map_with_false_loops_is_doubted(graph):
+    assert worse_than_odometry(graph, solution(graph, closed(FALSE))) > DOUBTED
+    clean, false = (health_features(graph, solution(graph, closed(rows))) for rows in (CLEAN, FALSE))
+    assert clean.gain > false.gain and clean.strain < false.strain
+
+
+def test_a_map_without_closures_is_odometry_and_not_doubted(graph):
+    log = closed(FALSE)
+    for sequence in range(log.sequences):
+        log.judge(sequence, Verdict.OPEN)
+    assert worse_than_odometry(graph, solved_map(graph, log)) == 0.0
+
+
+def test_true_poses_claim_revisits_that_the_views_bear_out(graph):
+    claims = claimed_revisits(graph, TRUTH, 300)
+    assert claims.examined == len(TRUTH) - GUARD - 1
+    assert len(claims.frame) > 2 * LAP and claims.likeness.mean() > 0.8
+    assert np.all(claims.frame - claims.match > GUARD)
+
+
+def test_each_pass_is_a_claim_of_its_own(graph):
+    claims = claimed_revisits(graph, TRUTH, 300)
+    assert np.count_nonzero(claims.frame == 4 * LAP + 10) == 4
+
+
+def test_poses_alike_by_chance_are_not_borne_out():
+    """Views without information are as like here as elsewhere."""
+    appearance = LabelAppearance()
+    graph = drive(appearance)
+    appearance._label.rows[:] = 7
+    assert np.all(claimed_revisits(graph, TRUTH, 300).likeness == 0.5)
+
+
+def test_the_statistics_do_not_depend_on_where_the_map_lies(graph):
+    clean = solution(graph, closed(CLEAN))
+    moved = clean._replace(fit=clean.fit._replace(poses=compose(np.array([3.0, -2.0, 0.0]), clean.fit.poses)))
+    assert health_features(graph, moved) == pytest.approx(health_features(graph, clean), abs=1e-6)
+
+
+def test_controls_lie_among_older_keyframes():
+    assert np.all((CONTROLS > 0) & (CONTROLS < 1))
+
+
+def test_dead_reckoning_adds_up_raw_odometry(graph):
+    graph.bias = 0.3
+    assert dead_reckoned(graph) == pytest.approx(graph.pose.rows)
