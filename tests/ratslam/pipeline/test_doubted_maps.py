@@ -1,0 +1,63 @@
+"""A map that is likely wrong gives odometry as its best estimate; its doubt is the same live and in replay."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from evaluation.artifacts.run_directory import read_run
+from evaluation.metrics import run_metrics
+from evaluation.metrics.scorecard import render_health, score_run
+from evaluation.metrics.trajectory import ate
+from ratslam.experiments.trials.spoilt_maps import Recipe, solved_anew, spoil
+from ratslam.keyframes.map_health import DOUBTED
+from tactile.base.se2 import integrate
+from tests.ratslam.pipeline.test_recall_maps import golden, golden_map, map_log, started
+
+NAME = "b_figure8_alias"
+
+
+def test_a_clean_map_is_its_own_best_estimate():
+    map = golden_map(NAME)
+    assert map.final_doubt() < 0.2
+    assert np.array_equal(map.trajectory(), map.map_trajectory())
+
+
+def test_a_false_loop_makes_odometry_the_best_estimate():
+    log = golden(NAME)
+    map, odometry = map_log(log), integrate(log.motion[:, :3])
+    graph, final, truth = map.keyframes(), map.solution(), log.truth[map.keyframe_steps()]
+    recipe = Recipe("only false", kept=0.0, false=True, robust=False)
+    false = spoil(graph, final.log, truth, recipe, np.random.default_rng(0))
+    map._solution, map._worse = solved_anew(graph, false, final, robust=False), None
+    assert map.final_doubt() > DOUBTED
+    assert ate(map.trajectory(), odometry) < 1e-9  # in the frame of the map
+    assert ate(map.map_trajectory(), log.truth) > ate(map.trajectory(), log.truth)
+
+
+def test_the_doubt_is_the_same_live_and_in_replay():
+    log = golden(NAME)
+    readings = [sample.reading for sample in log]
+    replayed = [step.doubt for step in started(log).replay(readings)]
+    session = started(log)
+    assert [session.step(reading).doubt for reading in readings] == replayed
+    assert len(set(replayed)) > 2
+
+
+@pytest.mark.parametrize(("doubt", "words"), [(0.03, "97% likely no worse"), (0.8, "map_doubted, 80%")])
+def test_the_health_of_a_run_is_told(tmp_path, doubt, words):
+    pose = "0.0 0.0 0.0 0.0 0.0 0.0 1.0"
+    for name in ("online.tum", "odometry.tum", "truth.tum"):
+        (tmp_path / name).write_text(f"0.0 {pose}\n1.0 {pose}\n")
+    (tmp_path / "steps.csv").write_text("t,place\n0.0,-1\n1.0,-1\n")
+    assert render_health(score_run(read_run(tmp_path))) == ""
+    (tmp_path / "health.json").write_text(json.dumps({"worse_than_odometry": doubt}))
+    card = score_run(read_run(tmp_path))
+    assert card.quantities["map_doubt"].value == doubt
+    assert words in render_health(card)
+
+
+def test_both_sides_doubt_alike():
+    assert run_metrics.DOUBTED == DOUBTED
