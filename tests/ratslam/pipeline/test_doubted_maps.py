@@ -1,4 +1,4 @@
-"""A map that is likely wrong gives odometry as its best estimate; its doubt is the same live and in replay."""
+"""A map that is likely wrong gives odometry as its best estimate; it doubts alike live and in replay."""
 
 from __future__ import annotations
 
