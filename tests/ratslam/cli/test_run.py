@@ -21,6 +21,7 @@ ROOT = Path(__file__).parents[3]
 FILES = {
     "online_error.csv", "closures.csv", "config.yaml", "manifest.json", "map.g2o", "map.json", "map.npz",
     "map.png", "odometry.tum", "online.tum", "scorecard.json", "steps.csv", "trajectory.tum", "truth.tum",
+    "health.json", "map.tum",
 }  # fmt: skip
 SQUARE = (str(ROOT / "configs" / "square.yaml"), "--set", "session.reserve=512")
 """A configuration that is compiled once instead of at each power of two."""
@@ -75,7 +76,7 @@ def test_a_run_writes_all_its_files(square):
 def test_the_written_configuration_gives_the_same_bytes_from_another_folder(square, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["run", str(square / "config.yaml"), "-o", "again"]) == 0
-    for name in ("steps.csv", "trajectory.tum", "online.tum", "map.g2o", "map.json", "config.yaml"):
+    for name in ("steps.csv", "trajectory.tum", "map.tum", "map.g2o", "health.json", "config.yaml"):
         assert (square / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
 
 

@@ -29,7 +29,10 @@ strangers = ("rtde", "dashboard_client", "usb", "serial", "libusb_package")
 print([name for name in sys.modules if name.startswith(strangers)])
 sys.exit(code)
 """
-SAME = ("steps.csv", "trajectory.tum", "online.tum", "odometry.tum", "truth.tum", "map.json", "map.g2o")
+SAME = (
+    "steps.csv", "trajectory.tum", "online.tum", "odometry.tum", "truth.tum", "map.json", "map.g2o",
+    "map.tum",
+)  # fmt: skip
 PATIENT = (
     "live.arm.stale=30", "live.arm.heartbeat=30", "live.arm.watchdog_hz=0.05", "live.arm.patience=60",
     "live.arm.connect=60", "live.head.silence=30", "live.head.patience=60", "live.grace=1.0",
