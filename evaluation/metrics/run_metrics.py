@@ -79,7 +79,7 @@ RUN_METRICS: tuple[Metric, ...] = (
 )
 """In the order of the scorecard."""
 _EXPERIENCE = [metric.name for metric in RUN_METRICS if metric.section == "Experience Metric"]
-DOUBTED = 0.5
+DOUBTED = 0.7
 """Probability of being worse than odometry above which a map is doubted (`ratslam.keyframes.map_health`)."""
 REGISTERED_METRICS: list[Metric] = []
 """Metrics added by `register_metric`."""

@@ -22,8 +22,8 @@ from tactile.base.se2 import between, correct_heading_bias, integrate, wrap
 INTERCEPT = -0.69
 WEIGHTS = np.array([-1.22, -0.03, 0.46, 0.91, 5.19])
 """Of `HealthFeatures`, in order; printed by `python -m ratslam reproduce tables health --sessions 3`."""
-DOUBTED = 0.5
-"""Probability above which odometry is the better estimate."""
+DOUBTED = 0.7
+"""Probability above which odometry is given instead; good maps where odometry hardly drifts reach 0.6."""
 EXAMINED = 300
 """Largest number of keyframes whose claims are examined."""
 LEAST_CLAIMS = 0.03

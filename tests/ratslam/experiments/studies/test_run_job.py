@@ -86,7 +86,7 @@ def test_every_quantity_of_the_scorecards_is_known(tiny, tmp_path):
     assert result.error is None
     maps = {name for name in METRICS if name.startswith("map_")}
     assert set(result.quantities) | maps | {metric.name for metric in MEASURED} == set(METRICS)
-    assert maps - {"map_error"} == {metric.name for metric in GRID_METRICS}
+    assert maps - {"map_error", "map_doubt"} == {metric.name for metric in GRID_METRICS}
 
 
 def test_input_errors_are_results(tiny):
