@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -28,7 +29,7 @@ from ratslam.recall import filter, mirror
 from ratslam.recall import memory as recall_memory
 from ratslam.recall.config import fan_width
 from ratslam.recall.filter import RecallResult
-from ratslam.recall.memory import MapFeedback, Memory
+from ratslam.recall.memory import MapFeedback, Memory, Modes
 from ratslam.recall.observation_model import (
     ObservationLikelihood,
     label_likelihood,
@@ -103,7 +104,6 @@ class RecallBackend(Backend):
         self.recall = config.recall.model_copy(update={"sector_fov": "none"}) if labels else config.recall
         if self.recall.sector_fov == "whiskers" and view_shape[1] % 2:  # no whisker is opposite another
             self.recall = self.recall.model_copy(update={"shifts": 0})
-        self.control = mirror.control_config(self.recall)
         self.labels, self.view_shape = labels, view_shape
         self.size = 0 if labels else int(np.prod(view_shape))
         self.pixels = pixel_layout(view_shape) if self.recall.sector_fov == "whiskers" else None
@@ -224,11 +224,19 @@ class RecallBackend(Backend):
         self, memory: Memory, view: Array, label: Array
     ) -> tuple[Memory, RecallResult, mirror.Candidate]:
         """Recognises the view, and by the control its mirror image."""
-        updated, result = filter.recognise(self.recall, self.cell, *self._likelihood(memory, view, label))
-        blind, other = mirror.mirrored_memory(memory), mirror.permuted_label(memory, label)
-        seen = self._likelihood(blind, self._mirrored(view, memory.angle), other)
-        blind, false = filter.recognise(self.control, self.cell, *seen)
-        return mirror.keep_control(updated, blind), result, _candidate(false)
+        first = mirror.first_look(memory, view, label, self.recall.local)
+
+        def look(_: None, one: mirror.Look) -> tuple[None, tuple[Modes, RecallResult]]:
+            seen = memory._replace(**one.modes._asdict(), motion=one.motion, bias=one.bias)
+            seen, likelihood = self._likelihood(seen, one.view, one.label)
+            after, result = filter.recognise(self.recall, self.cell, seen, likelihood, one.local)
+            return None, (mirror.modes_of(after), result)
+
+        both = mirror.both_looks(memory, first, self._mirrored(view, memory.angle))
+        _, (modes, results) = lax.scan(look, None, both)
+        own, control = (jax.tree.map(lambda x, k=k: x[k], modes) for k in (0, 1))
+        result, false = (jax.tree.map(lambda x, k=k: x[k], results) for k in (0, 1))
+        return memory._replace(**own._asdict(), control=control), result, _candidate(false)
 
     def _likelihood(self, memory: Memory, view: Array, label: Array) -> tuple[Memory, ObservationLikelihood]:
         if self.labels:

@@ -23,6 +23,7 @@ PRESETS: dict[PresetName, dict[str, dict[str, Any]]] = {
         "keyframes": {
             "noise": {"per_cell": 0.22, "heading_per_cell": 0.1, "heading_per_radian": 0.2},
             "bias_sd": 0.001,
+            "turn_error_sd": 0.0,
             "min_score": 12.0,
             "max_distance": 60.0,
             "sequence_agreement": 0.2,

@@ -10,7 +10,7 @@ from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
 from ratslam.keyframes.map_solution import MapSolution, solved_map
 from ratslam.keyframes.odometry_breaks import break_odometry
-from ratslam.keyframes.optimizer import BiasPrior
+from ratslam.keyframes.optimizer import CalibrationPrior
 from ratslam.keyframes.verification import verify_sequence
 
 
@@ -20,7 +20,7 @@ class Acceptance(Checkpointed, ABC):
     def observe(self, graph: KeyframeGraph, evidence: Evidence) -> None:
         """Takes note of the newest keyframe's evidence."""
 
-    def learn_bias(self, graph: KeyframeGraph, log: ClosureLog, prior: BiasPrior) -> None:
+    def learn_bias(self, graph: KeyframeGraph, log: ClosureLog, prior: CalibrationPrior) -> None:
         """Takes over the heading bias that the views show."""
         believe(graph, log, prior)
 
@@ -37,11 +37,12 @@ class Acceptance(Checkpointed, ABC):
         return solved_map(graph, log)
 
 
-def believe(graph: KeyframeGraph, log: ClosureLog, prior: BiasPrior) -> None:
+def believe(graph: KeyframeGraph, log: ClosureLog, prior: CalibrationPrior) -> None:
     """Takes over a prior of the heading bias; the poses follow it until a closure fixes them."""
     graph.prior = prior
-    if not len(log.accepted_rows()) and graph.bias != prior.mean:
-        graph.bias = prior.mean
+    means = prior.bias, prior.turn_error
+    if not len(log.accepted_rows()) and (graph.bias, graph.turn_error) != means:
+        graph.bias, graph.turn_error = means
         graph.dead_reckon()
 
 

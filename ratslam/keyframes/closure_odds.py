@@ -1,8 +1,9 @@
 """Acceptance of closure sequences by the odds that they are true.
 
 The odds of a sequence are those of its score under the null of this session (`null_model`), times how well
-odometry foretold its place among all others (`bias_scan`, with the heading bias for which the other sequences
-vote), or how well the map does where its covariance is narrow enough to be linear. The rule is ours."""
+odometry foretold its place among all others (`odometry_scan`), with the calibration for which the other
+sequences vote (`calibration_vote`); or how well the map foretells it where its covariance is narrow enough to
+be linear. The rule is ours."""
 
 from __future__ import annotations
 
@@ -13,14 +14,14 @@ import numpy as np
 from ratslam.core.backend import Evidence
 from ratslam.core.growable_array import GrowableArray
 from ratslam.keyframes.acceptance import Acceptance, believe
-from ratslam.keyframes.bias_scan import STEPS, BiasScan
-from ratslam.keyframes.bias_vote import BiasVote, vote
+from ratslam.keyframes.calibration_vote import CalibrationVote, vote
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
 from ratslam.keyframes.map_solution import MapSolution, cheapest_map, solved_map
 from ratslam.keyframes.null_model import estimate_null, log_odds
 from ratslam.keyframes.odometry_breaks import break_odometry
-from ratslam.keyframes.optimizer import BiasPrior
+from ratslam.keyframes.odometry_scan import OdometryScan
+from ratslam.keyframes.optimizer import CalibrationPrior
 from ratslam.keyframes.verification import continues_sequence, judge_by_map
 from ratslam.recall.mirror import MIRROR
 
@@ -31,6 +32,8 @@ LINEAR_HEADING = 0.4
 NEAR = 1.5
 """Largest standard deviation of position, cells, at which a sequence only confirms what the map says, and
 even odds are enough."""
+WIDE = 5.0
+"""Standard deviations of the views' prior over which a sequence is compared, so that the prior may move."""
 REVIEW_EVERY = 10
 """Keyframes after which all open sequences are judged again."""
 CONFIRMED_WEIGHT = 0.5
@@ -40,11 +43,11 @@ REVIEWS = 4
 
 
 class Ballot(NamedTuple):
-    """R sequences [R], their log odds by score [R], and their vote on the heading bias."""
+    """R sequences [R], their log odds by score [R], and their vote on the calibration."""
 
     sequences: np.ndarray
     score_odds: np.ndarray
-    result: BiasVote
+    result: CalibrationVote
 
 
 class AcceptByOdds(Acceptance):
@@ -55,8 +58,8 @@ class AcceptByOdds(Acceptance):
 
     def __init__(self, graph: KeyframeGraph) -> None:
         self._control = ClosureLog()
-        self._scan = BiasScan(graph)
-        self._log_ratio = GrowableArray((STEPS,), np.float64)  # of each sequence, by heading bias
+        self._scan = OdometryScan(graph)
+        self._log_ratio = GrowableArray((len(self._scan.grid),), np.float64)  # by calibration
         self._views_prior = graph.prior
 
     def observe(self, graph: KeyframeGraph, evidence: Evidence) -> None:
@@ -73,14 +76,14 @@ class AcceptByOdds(Acceptance):
         )
         self._control.add(candidate, continues_sequence(graph, self._control, candidate, MIRROR))
 
-    def learn_bias(self, graph: KeyframeGraph, log: ClosureLog, prior: BiasPrior) -> None:
+    def learn_bias(self, graph: KeyframeGraph, log: ClosureLog, prior: CalibrationPrior) -> None:
         self._views_prior = prior
-        self._rate_all(log)
+        self._rate_uncovered(log)
         believe(graph, log, self._vote(graph, log).result.belief)
 
     def judge(self, graph: KeyframeGraph, log: ClosureLog, sequence: int, candidate: Candidate) -> bool:
         while len(self._log_ratio.rows) < log.sequences:
-            self._log_ratio.append(np.full(STEPS, -np.inf))
+            self._log_ratio.append(np.full(len(self._scan.grid), np.nan))
         if len(log.members(sequence)) < graph.config.min_length:
             return False
         self._rate(log, sequence)
@@ -103,7 +106,7 @@ class AcceptByOdds(Acceptance):
                 graph.optimise(log)
         if not len(log.accepted_rows()):
             return solved_map(graph, log)
-        return cheapest_map(graph, log, [ballot.result.mean, graph.bias])
+        return cheapest_map(graph, log, [ballot.result.mean, graph.prior])
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Replaces the whole state by that of `arrays`."""
@@ -111,17 +114,15 @@ class AcceptByOdds(Acceptance):
         self._scan.clear()
 
     def _vote(self, graph: KeyframeGraph, log: ClosureLog) -> Ballot:
-        known = log.sizes()[: len(self._log_ratio.rows)] >= graph.config.min_length
-        known &= log.verdicts()[: len(known)] != Verdict.UNDONE
-        sequences = np.flatnonzero(known)
+        near = self._scan.near(self._views_prior)
+        known = np.isfinite(self._log_ratio.rows[:, near]).all(axis=1)
+        sequences = np.flatnonzero(known & (log.verdicts()[: len(known)] != Verdict.UNDONE))
         confirmed = (log.verdicts() == Verdict.ACCEPTED) & (log.sequence_weights() > CONFIRMED_WEIGHT)
         null = estimate_null(self._control.scores())
         score_odds = log_odds(log.scores()[sequences], null, float(confirmed.sum()))
         least = graph.config.bias_least / graph.cell
-        ratios = self._log_ratio.rows[sequences]
-        return Ballot(
-            sequences, score_odds, vote(self._scan.grid, self._views_prior, ratios, score_odds, least)
-        )
+        grid, ratios = self._scan.grid[near], self._log_ratio.rows[sequences][:, near]
+        return Ballot(sequences, score_odds, vote(grid, self._views_prior, ratios, score_odds, least))
 
     def _accept(self, graph: KeyframeGraph, log: ClosureLog, among: np.ndarray) -> bool:
         """Accepts every open sequence of `among` whose odds, by raw odometry or by the map, are high enough;
@@ -155,16 +156,20 @@ class AcceptByOdds(Acceptance):
         if not (config.may_be_carried and long) or log.verdict(sequence) != Verdict.OPEN:
             return False
         break_odometry(graph, log, sequence)
-        self._rate_all(log)
+        for other in np.flatnonzero(np.isfinite(self._log_ratio.rows).any(axis=1)).tolist():
+            self._rate(log, other)
         return True
 
-    def _rate_all(self, log: ClosureLog) -> None:
-        for sequence in np.flatnonzero(np.isfinite(self._log_ratio.rows[:, 0])).tolist():
+    def _rate_uncovered(self, log: ClosureLog) -> None:
+        """Compares those sequences again whose comparison does not cover the present prior."""
+        ratios = self._log_ratio.rows
+        uncovered = np.isnan(ratios[:, self._scan.near(self._views_prior)]).any(axis=1)
+        for sequence in np.flatnonzero(uncovered & np.isfinite(ratios).any(axis=1)).tolist():
             self._rate(log, sequence)
 
     def _rate(self, log: ClosureLog, sequence: int) -> None:
         """Compares a sequence, by its middle member, with raw odometry."""
         members = log.members(sequence)
         if len(members):
-            ratios = self._scan.log_ratios(members[len(members) // 2], self._views_prior)
-            self._log_ratio.rows[sequence] = ratios
+            near = self._scan.near(self._views_prior, WIDE)
+            self._log_ratio.rows[sequence] = self._scan.log_ratios(members[len(members) // 2], near)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ratslam.keyframes.optimizer import LoopClosures, MapFit, MapProblem, robust_cost, solve
-from tactile.base.se2 import between, compose, correct_heading_bias, integrate, inverse
+from tactile.base.se2 import between, compose, integrate, inverse
 
 ACCEPTED_WEIGHT = 0.25
 """Robust weight above which a sequence is accepted: its strain is then less than its evidence."""
@@ -145,7 +145,7 @@ def _strain(case: SelectionProblem, best: Selection) -> np.ndarray:
         since, first = _since(case, best, sequence), int(case.first[sequence])
         if first <= since:
             continue
-        motion = correct_heading_bias(chain.motion[since:first], chain.length[since:first], best.fit.bias)
+        motion = best.fit.corrected(chain)[since:first]
         before, claimed = _claim(best, closures, since), _claim(best, closures, first, sequence)
         onwards = integrate(motion, before)
         error = between(onwards[-1], claimed)
@@ -212,7 +212,7 @@ def _carry(
     """The keyframe between `since` and `first` before which to cut so that `first` comes to the pose
     `claimed`, and the resulting poses."""
     chain = case.measurements.chain
-    motion = correct_heading_bias(chain.motion[since:first], chain.length[since:first], best.fit.bias)
+    motion = best.fit.corrected(chain)[since:first]
     onwards = integrate(motion, poses[since])  # of frames since + 1 ... first
     carried = compose(claimed, inverse(onwards[-1]))
     frame = find(poses, onwards, carried, since)

@@ -31,6 +31,8 @@ class KeyframeMapConfig(Settings):
     """Whether ordered views give a prior of the heading bias."""
     bias_sd: PositiveFloat = 0.012
     """Standard deviation of the heading bias without views, rad per cell."""
+    turn_error_sd: NonNegativeFloat = 0.05
+    """Standard deviation of the error of turns, rad/rad; 0: turns have no systematic error."""
     bias_least: PositiveFloat = 0.003
     """Least standard deviation of the views' heading bias, rad per cell."""
     shrink: NonNegativeFloat = 4.0
@@ -47,8 +49,8 @@ class KeyframeMapConfig(Settings):
     min_length: PositiveInt = 2
     """Least number of candidates of an accepted sequence."""
     min_score: PositiveFloat = 4.0
-    """Least evidence of an accepted sequence, after subtraction of half its squared Mahalanobis distance from
-    the map and of the log of the number of alternatives that the map allows."""
+    """Whiskers: least evidence of an accepted sequence, after subtraction of half its squared Mahalanobis
+    distance from the map and of the log of the number of alternatives that the map allows."""
     max_distance: PositiveFloat = 12.0
     """Upper limit of that squared Mahalanobis distance."""
     gate_sd: PositiveFloat = 0.7

@@ -12,7 +12,7 @@ from ratslam.keyframes.appearance import Appearance
 from ratslam.keyframes.config import Ablation, KeyframeMapConfig
 from ratslam.keyframes.loop_closures import ClosureLog
 from ratslam.keyframes.optimizer import (
-    BiasPrior,
+    CalibrationPrior,
     LoopClosures,
     MapCovariance,
     MapFit,
@@ -21,7 +21,7 @@ from ratslam.keyframes.optimizer import (
     solve,
 )
 from ratslam.pose_graph import Edges
-from tactile.base.se2 import compose, correct_heading_bias, fit_rigid_motion
+from tactile.base.se2 import compose, correct_heading, fit_rigid_motion
 
 LOOSE = 1e4
 """Standard deviation of odometry across a break, cells and rad."""
@@ -40,10 +40,10 @@ class KeyframeGraph(Checkpointed):
         pose: [N, 3] in the map, m, m, rad. motion: [N, 3] odometry into each keyframe. length: [N] distance
             travelled into it, m. turn: [N] sum of absolute turns into it, rad. cut: [N] the closure sequence
             that shows a break of the odometry before the keyframe, -1 for none. bias: heading bias of the
-            odometry, rad/m. prior: of the bias.
+            odometry, rad/m. turn_error: correction of its turns, rad/rad. prior: of both.
     """
 
-    VALUES = ("bias", "prior")
+    VALUES = ("bias", "turn_error", "prior")
 
     def __init__(
         self, config: KeyframeMapConfig, cell: float, appearance: Appearance, guard: int, ablation: Ablation
@@ -56,7 +56,8 @@ class KeyframeGraph(Checkpointed):
         self.turn = GrowableArray((), np.float64)
         self.cut = GrowableArray((), np.int64)
         self.bias = 0.0
-        self.prior = BiasPrior(0.0, config.bias_sd / cell)
+        self.turn_error = 0.0
+        self.prior = CalibrationPrior(0.0, config.bias_sd / cell, 0.0, config.turn_error_sd)
 
     @property
     def count(self) -> int:
@@ -82,9 +83,13 @@ class KeyframeGraph(Checkpointed):
         self.turn.append(turn)
         self.cut.append(-1)
 
+    def correct(self, motion: np.ndarray, length: np.ndarray | float) -> np.ndarray:
+        """Motions [..., 3] over distances [...] without the systematic errors of the odometry."""
+        return correct_heading(motion, length, self.bias, self.turn_error)
+
     def dead_reckon(self) -> None:
         """Replaces all poses by odometry corrected by the current bias."""
-        motion = correct_heading_bias(self.motion.rows, self.length.rows, self.bias)
+        motion = self.correct(self.motion.rows, self.length.rows)
         for k in range(1, len(motion)):
             self.pose.rows[k] = compose(self.pose.rows[k - 1], motion[k])
 
@@ -92,15 +97,15 @@ class KeyframeGraph(Checkpointed):
         """Takes over a fit, moved as a whole so that the keyframes move as little as possible."""
         before = self.pose.rows.copy()
         self.pose.rows[:] = compose(fit_rigid_motion(fit.poses, before), fit.poses)
-        self.bias = fit.bias
+        self.bias, self.turn_error = fit.bias, fit.turn_error
 
     def fit(self) -> MapFit:
-        """The current poses (not copied) and bias."""
-        return MapFit(self.pose.rows, self.bias, np.zeros(0))
+        """The current poses (not copied) and calibration."""
+        return MapFit(self.pose.rows, self.bias, np.zeros(0), self.turn_error)
 
-    def bias_prior(self) -> BiasPrior:
-        """Prior of the heading bias in the optimisation."""
-        return self.prior if self.ablation.heading_bias else BiasPrior(self.bias, 1e-9)
+    def calibration_prior(self) -> CalibrationPrior:
+        """Prior of the calibration in the optimisation."""
+        return self.prior if self.ablation.heading_bias else CalibrationPrior(self.bias, 1e-9)
 
     def odometry(self, cut: GrowableArray) -> OdometryChain:
         """The odometry between keyframes with its variances, loose at the breaks `cut`."""
@@ -138,7 +143,7 @@ class KeyframeGraph(Checkpointed):
 
     def problem(self, log: ClosureLog, cut: GrowableArray) -> MapProblem:
         """The least-squares problem of the keyframes with the odometry broken at `cut`."""
-        return MapProblem(self.odometry(cut), self.closures(log), self.bias_prior())
+        return MapProblem(self.odometry(cut), self.closures(log), self.calibration_prior())
 
     def solve(self, log: ClosureLog, iterations: int) -> MapFit:
         """The optimised map, from the current poses."""
@@ -164,6 +169,6 @@ class KeyframeGraph(Checkpointed):
         return Edges(
             np.concatenate([steps, closures.i]),
             np.concatenate([steps + 1, closures.j]),
-            np.concatenate([correct_heading_bias(chain.motion, chain.length, fit.bias), turned]),
+            np.concatenate([fit.corrected(chain), turned]),
             np.concatenate([1 / chain.variance, trust]),
         )

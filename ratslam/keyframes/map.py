@@ -28,12 +28,12 @@ from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict, write_closures
 from ratslam.keyframes.map_health import DOUBTED, dead_reckoned, worse_than_odometry
 from ratslam.keyframes.map_solution import MapSolution, selected_solution, solution_pieces, solved_map
-from ratslam.keyframes.optimizer import BiasPrior, MapFit
+from ratslam.keyframes.optimizer import CalibrationPrior, MapFit
 from ratslam.keyframes.verification import continues_sequence
 from ratslam.pose_graph import Edges
 from ratslam.pose_graph.io import write_g2o, write_json
 from ratslam.recall.memory import MapFeedback
-from tactile.base.se2 import compose, correct_heading_bias, wrap
+from tactile.base.se2 import compose, correct_heading, wrap
 from tactile.base.types import Observation
 
 CONFIRMED_MASS, CONFIRMED_WEIGHT = 0.95, 0.5
@@ -96,7 +96,9 @@ class KeyframeMap(Checkpointed, Map):
 
     def feedback(self) -> MapFeedback:
         """The poses, heading bias and view metric for the recall filter."""
-        return MapFeedback(self._graph.pose.rows, self._graph.bias, self._since, *self._appearance.metric())
+        graph = self._graph
+        metric = self._appearance.metric()
+        return MapFeedback(graph.pose.rows, graph.bias, graph.turn_error, self._since, *metric)
 
     def pose(self, estimate: Estimate) -> np.ndarray:
         """[3] the newest keyframe's pose and the motion since."""
@@ -240,7 +242,8 @@ class KeyframeMap(Checkpointed, Map):
         value, error = shown
         shrunk = value * max(0.0, 1 - (config.shrink * error / value) ** 2) if value else 0.0
         sd = min(np.hypot(error, value - shrunk), 2 * config.bias_sd / cell)
-        prior = BiasPrior(shrunk, max(sd, config.bias_least / cell))
+        sd = max(sd, config.bias_least / cell)
+        prior = CalibrationPrior(shrunk, float(sd), 0.0, config.turn_error_sd)
         self._acceptance.learn_bias(graph, self._log, prior)
 
     def _confirmed_pairs(self) -> ConfirmedPairs:
@@ -329,7 +332,7 @@ class KeyframeMap(Checkpointed, Map):
 
     def _steps(self, fit: MapFit) -> np.ndarray:
         frame, motion = self._step_frame.rows, self._step_motion.rows
-        moved = correct_heading_bias(motion[:, :3], motion[:, 3], fit.bias)
+        moved = correct_heading(motion[:, :3], motion[:, 3], fit.bias, fit.turn_error)
         if not len(fit.poses):
             return moved
         origin = np.where(frame[:, None] >= 0, fit.poses[np.maximum(frame, 0)], 0.0)
@@ -338,7 +341,7 @@ class KeyframeMap(Checkpointed, Map):
     def _current_pose(self) -> np.ndarray:
         graph = self._graph
         origin = graph.pose.rows[-1] if graph.count else np.zeros(3)
-        return compose(origin, correct_heading_bias(self._travel.motion, self._travel.length, graph.bias))
+        return compose(origin, graph.correct(self._travel.motion, self._travel.length))
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Replaces the whole state by that of `arrays`."""

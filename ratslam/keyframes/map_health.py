@@ -17,7 +17,7 @@ from ratslam.keyframes.closure_selection import ACCEPTED_WEIGHT
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import ClosureLog, Verdict
 from ratslam.keyframes.map_solution import MapSolution
-from tactile.base.se2 import between, correct_heading_bias, integrate, wrap
+from tactile.base.se2 import between, integrate, wrap
 
 INTERCEPT = -0.69
 WEIGHTS = np.array([-1.22, -0.03, 0.46, 0.91, 5.19])
@@ -95,7 +95,7 @@ def _claims_ratio(graph: KeyframeGraph, poses: np.ndarray) -> float:
 
 def _strain(graph: KeyframeGraph, solution: MapSolution) -> float:
     chain, poses = graph.odometry(solution.cut), solution.fit.poses
-    measured = correct_heading_bias(chain.motion, chain.length, solution.fit.bias)
+    measured = solution.fit.corrected(chain)
     error = between(poses[:-1], poses[1:]) - measured
     error[:, 2] = wrap(error[:, 2])
     sums = np.cumsum((error**2 / chain.variance).sum(axis=1))

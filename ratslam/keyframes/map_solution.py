@@ -22,9 +22,9 @@ from ratslam.keyframes.closure_selection import (
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import ClosureLog, Verdict
 from ratslam.keyframes.odometry_breaks import find_break
-from ratslam.keyframes.optimizer import MapFit, OdometryChain, robust_cost, solve
+from ratslam.keyframes.optimizer import CalibrationPrior, MapFit, OdometryChain, robust_cost, solve
 from ratslam.keyframes.pieces import number_pieces
-from tactile.base.se2 import correct_heading_bias, integrate
+from tactile.base.se2 import integrate
 
 
 class MapSolution(NamedTuple):
@@ -49,11 +49,11 @@ def solution_pieces(solution: MapSolution) -> np.ndarray:
     return number_pieces(solution.cut.rows >= 0, closures)
 
 
-def cheapest_map(graph: KeyframeGraph, log: ClosureLog, biases: Sequence[float]) -> MapSolution:
+def cheapest_map(graph: KeyframeGraph, log: ClosureLog, priors: Sequence[CalibrationPrior]) -> MapSolution:
     """The map of least cost with the closures accepted so far, reached from the current poses and from dead
-    reckoning with each of these heading biases, rad/m. The log takes over its robust weights."""
+    reckoning with the mean of each of these calibrations. The log takes over its robust weights."""
     problem = graph.problem(log, graph.cut)
-    starts = [graph.fit(), *(_dead_reckoned(graph, problem.chain, bias) for bias in biases)]
+    starts = [graph.fit(), *(_dead_reckoned(graph, problem.chain, prior) for prior in priors)]
     fits = [solve(start, problem, 2 * graph.config.settling) for start in starts]
     fit = min(fits, key=lambda fit: robust_cost(fit, problem))
     log.weigh(fit.weights)
@@ -97,7 +97,7 @@ def _select(
     odometry is cut only if the robot may be carried."""
     problem, pose = graph.problem(log, cut), graph.pose.rows
     chain = problem.chain
-    reckoned = _dead_reckoned(graph, chain, graph.prior.mean)
+    reckoned = _dead_reckoned(graph, chain, graph.prior)
     present = graph.fit()._replace(poses=pose.copy())
     case = SelectionProblem(problem, log.scores()[sequences], *log.spans()[sequences].T)
     starts = [present, reckoned]
@@ -106,8 +106,8 @@ def _select(
     return select_closures_and_cuts(case, starts, partial(find_break, graph), earlier)
 
 
-def _dead_reckoned(graph: KeyframeGraph, chain: OdometryChain, bias: float) -> MapFit:
-    """Odometry corrected by a heading bias, rad/m, from the first keyframe."""
+def _dead_reckoned(graph: KeyframeGraph, chain: OdometryChain, prior: CalibrationPrior) -> MapFit:
+    """Odometry corrected by the mean of a calibration, from the first keyframe."""
     first = graph.pose.rows[:1]
-    path = integrate(correct_heading_bias(chain.motion, chain.length, bias), first[0])
-    return MapFit(np.concatenate([first, path]), bias, np.zeros(0))
+    fit = MapFit(first, prior.bias, np.zeros(0), prior.turn_error)
+    return fit._replace(poses=np.concatenate([first, integrate(fit.corrected(chain), first[0])]))

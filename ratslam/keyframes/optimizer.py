@@ -13,7 +13,7 @@ import numpy as np
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import SuperLU, splu
 
-from tactile.base.se2 import between, correct_heading_bias, wrap
+from tactile.base.se2 import between, correct_heading, wrap
 
 
 class OdometryChain(NamedTuple):
@@ -48,11 +48,14 @@ class LoopClosures(NamedTuple):
     cost_limit: np.ndarray | float = np.inf
 
 
-class BiasPrior(NamedTuple):
-    """Prior mean and standard deviation of the heading bias, rad/m."""
+class CalibrationPrior(NamedTuple):
+    """Prior means and standard deviations of the odometry's heading bias, rad/m, and turn error, rad/rad; a
+    standard deviation of 0 fixes the turn error."""
 
-    mean: float
-    sd: float
+    bias: float
+    bias_sd: float
+    turn_error: float = 0.0
+    turn_error_sd: float = 0.0
 
 
 class MapProblem(NamedTuple):
@@ -60,15 +63,21 @@ class MapProblem(NamedTuple):
 
     chain: OdometryChain
     closures: LoopClosures
-    prior: BiasPrior
+    prior: CalibrationPrior
 
 
 class MapFit(NamedTuple):
-    """Poses [N, 3], heading bias (rad/m), and the robust weight [R] of each sequence."""
+    """Poses [N, 3], heading bias (rad/m), the robust weight [R] of each sequence, and the turn error
+    (rad/rad)."""
 
     poses: np.ndarray
     bias: float
     weights: np.ndarray
+    turn_error: float = 0.0
+
+    def corrected(self, chain: OdometryChain) -> np.ndarray:
+        """[N - 1, 3] the chain's motions without their systematic errors."""
+        return correct_heading(chain.motion, chain.length, self.bias, self.turn_error)
 
 
 def solve(start: MapFit, problem: MapProblem, iterations: int, tolerance: float = 1e-4) -> MapFit:
@@ -79,7 +88,8 @@ def solve(start: MapFit, problem: MapProblem, iterations: int, tolerance: float 
         `iterations` steps; the last fit before the equations become singular.
     """
     system = _System(problem)
-    fit = MapFit(np.array(start.poses, float), start.bias, np.ones(len(problem.closures.scale)))
+    weights = np.ones(len(problem.closures.scale))
+    fit = MapFit(np.array(start.poses, float), start.bias, weights, start.turn_error)
     for _ in range(iterations):
         equations = system.linearise(fit)
         fit = fit._replace(weights=equations.weights)
@@ -88,7 +98,8 @@ def solve(start: MapFit, problem: MapProblem, iterations: int, tolerance: float 
             break
         moved = fit.poses + step[0]
         moved[:, 2] = wrap(moved[:, 2])
-        fit = fit._replace(poses=moved, bias=fit.bias + step[1])
+        bias, turn_error = fit.bias + step[1][0], fit.turn_error + sum(step[1][1:])
+        fit = fit._replace(poses=moved, bias=float(bias), turn_error=float(turn_error))
         if np.abs(step[0]).max(initial=0.0) < tolerance:
             break
     return fit
@@ -97,8 +108,7 @@ def solve(start: MapFit, problem: MapProblem, iterations: int, tolerance: float 
 def robust_cost(fit: MapFit, problem: MapProblem) -> float:
     """The cost that `solve` minimises: chi-square of odometry and bias, robust cost of the closures."""
     chain, closures, prior = problem
-    measured = correct_heading_bias(chain.motion, chain.length, fit.bias)
-    apart = between(fit.poses[:-1], fit.poses[1:]) - measured
+    apart = between(fit.poses[:-1], fit.poses[1:]) - fit.corrected(chain)
     apart[:, 2] = wrap(apart[:, 2])
     odometry = float((apart**2 / chain.variance).sum())
     error = between(fit.poses[closures.i], fit.poses[closures.j])
@@ -107,7 +117,16 @@ def robust_cost(fit: MapFit, problem: MapProblem) -> float:
     members = np.bincount(closures.sequence, minlength=len(closures.scale))
     _, mean = _mean_costs((error**2 / spread).sum(axis=1), closures, members)
     lost = members * closures.scale * mean / (closures.scale + mean)
-    return odometry + float(lost.sum()) + ((fit.bias - prior.mean) / prior.sd) ** 2
+    off, tight = _calibration(fit, prior)
+    return odometry + float(lost.sum()) + float((tight * off**2).sum())
+
+
+def _calibration(fit: MapFit, prior: CalibrationPrior) -> tuple[np.ndarray, np.ndarray]:
+    """[K] deviation of the free calibration parameters from their prior, and its information."""
+    off = [fit.bias - prior.bias, fit.turn_error - prior.turn_error]
+    sd = np.array([prior.bias_sd, prior.turn_error_sd])
+    free = 1 + int(sd[1] > 0)
+    return np.array(off[:free]), 1 / sd[:free] ** 2
 
 
 class MapCovariance:
@@ -143,30 +162,36 @@ def _mean_costs(
 
 
 class _Equations(NamedTuple):
-    """Normal equations of poses and bias.
+    """Normal equations of poses and K calibration parameters: the bias, and the turn error if it is free.
 
     Attributes:
         factor: of the block of the poses, None where it is singular. order: [N - 1] position of each free
-            keyframe among the unknowns. gradient, border, corner, slope: the other blocks of the equations.
+            keyframe among the unknowns. gradient [n], border [n, K], corner [K, K], slope [K]: the other
+            blocks of the equations.
     """
 
     factor: SuperLU | None
     order: np.ndarray
     gradient: np.ndarray
     border: np.ndarray
-    corner: float
-    slope: float
+    corner: np.ndarray
+    slope: np.ndarray
     weights: np.ndarray
 
-    def step(self) -> tuple[np.ndarray, float] | None:
+    def step(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Steps of the poses [N, 3] and of the calibration [K]."""
         if self.factor is None:
             return None
-        free, bent = self.factor.solve(np.stack([-self.gradient, self.border], axis=1)).T
-        bias = (-self.slope - self.border @ free) / (self.corner - self.border @ bent)
-        step = free - bias * bent
+        solved = self.factor.solve(np.column_stack([-self.gradient, self.border]))
+        free, bent = solved[:, 0], solved[:, 1:]
+        change = np.linalg.solve(self._schur(bent), -self.slope - self.border.T @ free)
+        step = free - bent @ change
         if not np.isfinite(step).all():
             return None
-        return np.concatenate([np.zeros((1, 3)), step.reshape(-1, 3)[self.order]]), float(bias)
+        return np.concatenate([np.zeros((1, 3)), step.reshape(-1, 3)[self.order]]), change
+
+    def _schur(self, bent: np.ndarray) -> np.ndarray:
+        return self.corner - self.border.T @ bent
 
     def covariance(self, change: np.ndarray) -> np.ndarray:
         """[n, n] covariance of quantities with derivatives [N - 1, 3, n] by the free keyframes' poses."""
@@ -176,7 +201,7 @@ class _Equations(NamedTuple):
         spread = self.factor.solve(change)
         bent = self.factor.solve(self.border)
         pull = change.T @ bent
-        return change.T @ spread + np.outer(pull, pull) / (self.corner - self.border @ bent)
+        return change.T @ spread + pull @ np.linalg.solve(self._schur(bent), pull.T)
 
 
 class _System:
@@ -189,6 +214,9 @@ class _System:
         self.motion = np.concatenate([chain.motion, np.zeros((len(closures.i), 3))])
         self.motion[len(steps) :, 2] = closures.turn
         self.length = np.concatenate([chain.length, np.zeros(len(closures.i))])
+        self.odometry = np.arange(len(self.i)) < len(steps)
+        turn = np.where(self.odometry, self.motion[:, 2], 0.0)
+        self.regressors = np.column_stack([self.length, turn])[:, : 1 + int(self.prior.turn_error_sd > 0)]
         spread = np.broadcast_to(closures.variance, (len(closures.i), 3))
         self.information = 1 / np.concatenate([chain.variance, spread])
         self.closures, self.chained = closures, len(steps)
@@ -210,7 +238,7 @@ class _System:
         a, b = fit.poses[self.i], fit.poses[self.j]
         c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
         dx, dy = (b - a)[:, 0], (b - a)[:, 1]
-        measured = correct_heading_bias(self.motion, self.length, fit.bias)
+        measured = correct_heading(self.motion, self.length, fit.bias, fit.turn_error * self.odometry)
         ahead, aside = c * dx + s * dy, c * dy - s * dx
         error = np.stack(
             [ahead - measured[:, 0], aside - measured[:, 1], wrap(b[:, 2] - a[:, 2] - measured[:, 2])], 1
@@ -224,25 +252,27 @@ class _System:
         jacobian[:, 1, :3] = np.stack([s, -c, -ahead], axis=1)
         jacobian[:, 0, 3], jacobian[:, 0, 4], jacobian[:, 1, 3], jacobian[:, 1, 4] = c, s, -s, c
         jacobian[:, 2, 2], jacobian[:, 2, 5] = -1.0, 1.0
-        by_bias = (
-            np.stack([measured[:, 1] / 2, -measured[:, 0] / 2, -np.ones(len(a))], 1) * self.length[:, None]
-        )
+        by_turn = np.stack([measured[:, 1] / 2, -measured[:, 0] / 2, -np.ones(len(a))], 1)
+        by_parameter = by_turn[:, :, None] * self.regressors[:, None, :]
 
         trust = self.information.copy()
         trust[self.chained :] *= (keep * weights[self.closures.sequence])[:, None]
         weighted = np.swapaxes(jacobian, 1, 2) * trust[:, None, :]
         data = np.bincount(self.slot, (weighted @ jacobian)[self.used], self.count)
-        pulled = weighted @ np.stack([error, by_bias], axis=2)
-        gradient, border = (np.bincount(self.row, pulled[:, :, k][self.free], self.size) for k in (0, 1))
+        pulled = weighted @ np.concatenate([error[:, :, None], by_parameter], axis=2)
+        gradient, *border = (
+            np.bincount(self.row, pulled[:, :, k][self.free], self.size) for k in range(pulled.shape[2])
+        )
         matrix = csc_matrix((data, self.indices, self.indptr), (self.size, self.size))
-        tight = 1 / self.prior.sd**2
+        off, tight = _calibration(fit, self.prior)
+        trusted = by_parameter * trust[:, :, None]
         return _Equations(
             _factor(matrix),
             self.order[1:],
             gradient,
-            border,
-            float((by_bias**2 * trust).sum() + tight),
-            float((by_bias * trust * error).sum() + tight * (fit.bias - self.prior.mean)),
+            np.stack(border, axis=1),
+            np.einsum("mak,mal->kl", trusted, by_parameter) + np.diag(tight),
+            np.einsum("mak,ma->k", trusted, error) + tight * off,
             weights,
         )
 

@@ -58,13 +58,18 @@ class RecallResult(NamedTuple):
 
 
 def recognise(
-    config: RecallConfig, cell: float, memory: Memory, observation: ObservationLikelihood
+    config: RecallConfig,
+    cell: float,
+    memory: Memory,
+    observation: ObservationLikelihood,
+    local: Array | float,
 ) -> tuple[Memory, RecallResult]:
     """Updates the posterior for a new keyframe: moves it, weighs it by the view, and finds the best
     candidate.
 
     Args:
-        cell: m, the unit of all lengths in the configuration.
+        cell: m, the unit of all lengths in the configuration. local: share of new modes around the map's
+            pose.
     """
     shifts = sector_shifts(config)
     angles = -shifts.astype(memory.angle.dtype) * memory.angle  # robot's heading minus the keyframe's
@@ -73,7 +78,7 @@ def recognise(
     here = current_pose(memory)
     apart = (memory.x - here[0]) ** 2 + (memory.y - here[1]) ** 2
 
-    belief, novel = predict(config, cell, memory, angles, known, here)
+    belief, novel = predict(config, cell, memory, angles, known, here, local)
     belief, novel = belief * likelihood, novel * novelty
     total = jnp.maximum(jnp.sum(belief) + novel, jnp.finfo(novel.dtype).tiny)
     belief, novel = belief / total, novel / total

@@ -9,7 +9,7 @@ import numpy as np
 
 from ratslam.recall.config import RecallConfig, sector_shifts
 from ratslam.recall.whisker_likelihood import LEVELS
-from tactile.base.se2 import compose, correct_heading_bias
+from tactile.base.se2 import compose, correct_heading
 from tactile.base.types import Array
 
 NO_LIKENESS = np.zeros((0, 0, 0))
@@ -19,7 +19,8 @@ class MapFeedback(NamedTuple):
     """Values of the map that the filter takes over.
 
     Attributes:
-        poses: [N, 3] of all keyframes, m, m, rad. bias: heading bias, rad/m. since: distance travelled since
+        poses: [N, 3] of all keyframes, m, m, rad. bias: heading bias, rad/m. turn_error: correction of turns,
+            rad/rad. since: distance travelled since
             the last closure, m. angle: turn per sector shift, rad, 0 while unknown; whiskers: half a turn.
             scale: view error below which different places seldom come; whiskers: log-odds that stand for an
             image never seen before; 0 while unknown. likeness: [G, L, L] see `log_odds_table`; empty except
@@ -28,6 +29,7 @@ class MapFeedback(NamedTuple):
 
     poses: np.ndarray
     bias: float
+    turn_error: float
     since: float
     angle: float
     scale: float
@@ -55,7 +57,7 @@ class Memory(NamedTuple):
         anchor: [K] int32 keyframes of the modes, offset: [K, 3] pose of each mode in its keyframe's frame
             (m, m, rad), mass: [K]. The missing mass to 1 is novelty.
         pose: [3] of the newest keyframe. motion, length, turn: odometry since then: [3], m, rad.
-        bias, since, angle, scale, likeness: see `MapFeedback`.
+        bias, turn_error, since, angle, scale, likeness: see `MapFeedback`.
         before: [S, C] likelihoods of the previous image, rest: [S, C] posterior outside the modes; both for
             whiskers only, else of size 0.
         control: the posterior of the control (`ratslam.recall.mirror`).
@@ -78,6 +80,7 @@ class Memory(NamedTuple):
     length: Array
     turn: Array
     bias: Array
+    turn_error: Array
     since: Array
     angle: Array
     scale: Array
@@ -122,6 +125,7 @@ def init_memory(config: RecallConfig, size: int, capacity: int, dtype: np.dtype,
         length=zeros(),
         turn=zeros(),
         bias=zeros(),
+        turn_error=zeros(),
         since=zeros(),
         angle=zeros(),
         scale=zeros(),
@@ -140,13 +144,13 @@ def apply_map_feedback(memory: Memory, feedback: MapFeedback) -> Memory:
     x, y, heading = feedback.poses.T
     full[:, :count] = x, y, np.cos(heading), np.sin(heading)
     x, y, cosine, sine = (jnp.asarray(row, dtype) for row in full)
-    values = (feedback.bias, feedback.since, feedback.angle, feedback.scale)
-    bias, since, angle, scale = (jnp.asarray(value, dtype) for value in values)
+    values = (feedback.bias, feedback.turn_error, feedback.since, feedback.angle, feedback.scale)
+    bias, turn_error, since, angle, scale = (jnp.asarray(value, dtype) for value in values)
     if feedback.likeness.size:
         memory = memory._replace(likeness=jnp.asarray(feedback.likeness, dtype))
     return memory._replace(
         x=x, y=y, cosine=cosine, sine=sine, pose=jnp.asarray(feedback.poses[-1], dtype),
-        bias=bias, since=since, angle=angle, scale=scale,
+        bias=bias, turn_error=turn_error, since=since, angle=angle, scale=scale,
     )  # fmt: skip
 
 
@@ -167,7 +171,12 @@ def is_keyframe_due(config: RecallConfig, cell: float, memory: Memory) -> Array:
 
 def current_pose(memory: Memory) -> Array:
     """[3] the robot's pose in the map at the last feedback, moved on by odometry."""
-    return compose(memory.pose, correct_heading_bias(memory.motion, memory.length, memory.bias))
+    return compose(memory.pose, corrected_motion(memory))
+
+
+def corrected_motion(memory: Memory) -> Array:
+    """[3] motion since the newest keyframe without the systematic errors of the odometry."""
+    return correct_heading(memory.motion, memory.length, memory.bias, memory.turn_error)
 
 
 def pose_spread(config: RecallConfig, cell: float, memory: Memory) -> tuple[Array, Array]:

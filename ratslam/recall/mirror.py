@@ -12,12 +12,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.recall.config import RecallConfig
-from ratslam.recall.memory import Memory
+from ratslam.recall.memory import Memory, Modes
 from tactile.base.types import Array
 
 MIRROR = np.array([1.0, -1.0, -1.0])
@@ -37,21 +37,46 @@ class Candidate(NamedTuple):
     mirror_log_ratio: Array
 
 
-def control_config(config: RecallConfig) -> RecallConfig:
-    """Settings of the control: no mass enters around the map's pose, where no mirrored robot is."""
-    return config.model_copy(update={"local": 0.0})
+class Look(NamedTuple):
+    """What distinguishes the filter from its control: the posterior, the motion (m, m, rad) and heading bias
+    (rad/m) by which it moves, the view and id that it looks for, and the share of new modes around the map's
+    pose (none for the control, because no mirrored robot is there)."""
+
+    modes: Modes
+    motion: Array
+    bias: Array
+    view: Array
+    label: Array
+    local: Array
 
 
-def mirrored_memory(memory: Memory) -> Memory:
-    """The memory with the posterior of the control, mirrored motion and mirrored bias."""
-    motion = memory.motion * jnp.asarray(MIRROR, memory.motion.dtype)
-    return memory._replace(**memory.control._asdict(), motion=motion, bias=-memory.bias)
+def both_looks(memory: Memory, look: Look, mirrored: Array) -> Look:
+    """The look of the filter and that of the control, stacked along a first axis; one loop over both compiles
+    the filter once.
+
+    Args:
+        mirrored: the mirror image of the view.
+    """
+    control = Look(
+        memory.control,
+        look.motion * jnp.asarray(MIRROR, look.motion.dtype),
+        -look.bias,
+        mirrored,
+        permuted_label(memory, look.label),
+        jnp.zeros_like(look.local),
+    )
+    return jax.tree.map(lambda *pair: jnp.stack(pair), look, control)
 
 
-def keep_control(memory: Memory, mirrored: Memory) -> Memory:
-    """The memory with the posterior of the control updated from `mirrored`."""
-    values = {name: getattr(mirrored, name) for name in memory.control._fields}
-    return memory._replace(control=type(memory.control)(**values))
+def first_look(memory: Memory, view: Array, label: Array, local: float) -> Look:
+    """The look of the filter itself."""
+    share = jnp.asarray(local, memory.bias.dtype)
+    return Look(modes_of(memory), memory.motion, memory.bias, view, label, share)
+
+
+def modes_of(memory: Memory) -> Modes:
+    """The posterior of the filter."""
+    return Modes(*(getattr(memory, name) for name in Modes._fields))
 
 
 def mirror_view(view: Array, shape: tuple[int, int, int], angle: Array) -> Array:

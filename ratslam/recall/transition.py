@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jax import lax
 
 from ratslam.recall.config import RecallConfig, sector_shifts
-from ratslam.recall.memory import Memory, allowed_shifts, pose_spread
-from tactile.base.se2 import compose, correct_heading_bias
+from ratslam.recall.memory import Memory, allowed_shifts, corrected_motion, pose_spread
+from tactile.base.se2 import compose
 from tactile.base.types import Array
 
 SUPPORT = 8.0
@@ -26,18 +26,20 @@ def predict(
     angles: Array,
     known: Array,
     here: Array,
+    local_share: Array | float,
 ) -> tuple[Array, Array]:
     """The prior: every mode moves with the robot to the keyframes near it, and novelty enters as new modes.
 
     Args:
         angles: [S] turn of each shift, rad. known: [C] bool, recallable keyframes. here: [3] current pose.
+        local_share: share of new modes around the current pose.
 
     Returns:
         prior mass at each shift and keyframe [S, C], and of novelty.
     """
     dtype = memory.x.dtype
     cells = allowed_shifts(sector_shifts(config), memory)[:, None] & known[None]
-    moved = correct_heading_bias(memory.motion, memory.length, memory.bias)
+    moved = corrected_motion(memory)
     at = memory.anchor
     heading = jnp.arctan2(memory.sine[at], memory.cosine[at])
     anchors = jnp.stack([memory.x[at], memory.y[at], heading], axis=1)
@@ -60,7 +62,7 @@ def predict(
     belief, novel = lax.fori_loop(0, config.modes, carry, shut)
     near = _overlap(memory, here, angles, cells, *pose_spread(config, cell, memory))
     total = jnp.sum(near)
-    local, everywhere = fresh * config.enter * config.local, fresh * config.enter * (1 - config.local)
+    local, everywhere = fresh * config.enter * local_share, fresh * config.enter * (1 - local_share)
     belief = belief + jnp.where(cells, everywhere / jnp.maximum(jnp.sum(cells), 1).astype(dtype), 0.0)
     belief = belief + (local / jnp.maximum(total, 1.0)) * near
     entered = jnp.where(jnp.any(known), everywhere, 0.0) + local * total / jnp.maximum(total, 1.0)

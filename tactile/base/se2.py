@@ -41,14 +41,15 @@ def inverse(a: Array) -> Array:
     return between(a, xp.zeros_like(a))
 
 
-def correct_heading_bias(motion: Array, length: Array, bias: Array) -> Array:
-    """Motions [..., 3] turned by a heading correction that grows evenly along the distance travelled.
+def correct_heading(motion: Array, length: Array, bias: Array, turn_error: Array = 0.0) -> Array:
+    """Motions [..., 3] turned by a heading correction that grows evenly along the motion.
 
     Args:
-        length: [...] distance travelled in each motion, m. bias: correction, rad/m.
+        length: [...] distance travelled in each motion, m. bias: correction, rad/m. turn_error: correction as
+            a share of the turn of each motion, rad/rad.
     """
     xp, motion = _arrays(motion)
-    turn = bias * xp.asarray(length)
+    turn = bias * xp.asarray(length) + turn_error * motion[..., 2]
     c, s = xp.cos(turn / 2), xp.sin(turn / 2)
     x, y = motion[..., 0], motion[..., 1]
     return xp.stack([c * x - s * y, s * x + c * y, wrap(motion[..., 2] + turn)], axis=-1)
