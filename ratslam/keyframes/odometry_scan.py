@@ -46,11 +46,14 @@ class OdometryScan:
         self._position = np.zeros((1, len(self.grid)), np.complex64)  # half the memory; 1e-7 of the distance
 
     def near(self, prior: CalibrationPrior, reach: float = REACH) -> np.ndarray:
-        """Points of the grid whose bias is within `reach` standard deviations of the prior's; at least three
-        biases."""
-        apart = np.abs(np.unique(self.grid[:, 0]) - prior.bias)
-        most = max(reach * prior.bias_sd, float(np.sort(apart)[2]))
-        return np.flatnonzero(np.abs(self.grid[:, 0] - prior.bias) <= most)
+        """Points of the grid within `reach` standard deviations of the prior, of bias and turn error
+        together; at least three biases."""
+        bias, turn_error = np.abs(self.grid - (prior.bias, prior.turn_error)).T
+        third = float(np.sort(np.abs(np.unique(self.grid[:, 0]) - prior.bias))[2])
+        apart = bias / max(reach * prior.bias_sd, third)
+        if prior.turn_error_sd > 0:
+            apart = np.hypot(apart, turn_error / (reach * prior.turn_error_sd))
+        return np.flatnonzero(apart <= 1)
 
     def log_ratios(self, member: np.ndarray, near: np.ndarray) -> np.ndarray:
         """[G] log of the probability density that odometry gave to the place of a closure, over its mean
