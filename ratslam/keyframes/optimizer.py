@@ -1,9 +1,9 @@
-"""Robust SE(2) least squares over a chain of keyframes with closure sequences and one heading bias.
+"""Robust SE(2) least squares over a chain of keyframes with closure sequences and the odometry's calibration.
 
-A constant turn of the odometry to one side, the heading bias (rad/m), is solved for with the poses. Each
-closure sequence has one robust weight, because its closures are right or wrong together. Keyframe 0 is fixed.
-Sources: Geman & McClure 1985 (the kernel); Kuemmerle et al. 2011 (the error); the bias and the weights by
-sequence are ours."""
+A constant turn of the odometry to one side, the heading bias (rad/m), and the share by which its turns are
+wrong, the turn error (rad/rad), are solved for with the poses. Each closure sequence has one robust weight,
+because its closures are right or wrong together. Keyframe 0 is fixed. Sources: Geman & McClure 1985 (the
+kernel); Kuemmerle et al. 2011 (the error); the calibration and the weights by sequence are ours."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ class MapFit(NamedTuple):
 
 
 def solve(start: MapFit, problem: MapProblem, iterations: int, tolerance: float = 1e-4) -> MapFit:
-    """Gauss-Newton with one robust weight per sequence, from the poses and bias of `start`.
+    """Gauss-Newton with one robust weight per sequence, from the poses and calibration of `start`.
 
     Returns:
         the fit after the first step that changes every pose by less than the tolerance (m, rad), or after
@@ -106,7 +106,7 @@ def solve(start: MapFit, problem: MapProblem, iterations: int, tolerance: float 
 
 
 def robust_cost(fit: MapFit, problem: MapProblem) -> float:
-    """The cost that `solve` minimises: chi-square of odometry and bias, robust cost of the closures."""
+    """The cost that `solve` minimises: chi-square of odometry and calibration, robust cost of the closures."""
     chain, closures, prior = problem
     apart = between(fit.poses[:-1], fit.poses[1:]) - fit.corrected(chain)
     apart[:, 2] = wrap(apart[:, 2])
@@ -130,7 +130,7 @@ def _calibration(fit: MapFit, prior: CalibrationPrior) -> tuple[np.ndarray, np.n
 
 
 class MapCovariance:
-    """The exact marginals of the linearised problem, the bias included: it moves distant keyframes
+    """The exact marginals of the linearised problem, the calibration included: it moves distant keyframes
     together."""
 
     def __init__(self, fit: MapFit, problem: MapProblem) -> None:
