@@ -28,7 +28,7 @@ def remembered(config: RecallConfig, frames: int, size: int, dtype):
     memory = memory._replace(
         view=jnp.asarray(stream.random((size, capacity)), dtype), count=jnp.int32(frames - 1)
     )
-    return apply_map_feedback(memory, MapFeedback(poses, 0.01, 5.0, np.pi / 18, 0.06))
+    return apply_map_feedback(memory, MapFeedback(poses, 0.01, 0.0, 5.0, np.pi / 18, 0.06))
 
 
 @pytest.mark.parametrize("shifts", [0, 3])
@@ -46,7 +46,7 @@ def test_one_recall(benchmark, frames, shifts, dtype):
         def recall(k, memory):
             memory = accumulate_motion(memory, moved)
             weighed = observation_model.view_likelihood(config, CELL, memory, views[k % 64])
-            memory, _ = recognise(config, CELL, memory, weighed)
+            memory, _ = recognise(config, CELL, memory, weighed, config.local)
             return memory._replace(motion=jnp.zeros_like(moved), length=jnp.zeros_like(memory.length))
 
         return jax.lax.fori_loop(0, looks, recall, memory)

@@ -35,6 +35,7 @@ def filled(
     *,
     labels=None,
     bias=0.0,
+    turn_error=0.0,
     since=0.0,
     angle=0.0,
     scale=0.1,
@@ -53,7 +54,7 @@ def filled(
         count=jnp.int32(count),
         distinct=jnp.int32(len(set(ids[ids >= 0].tolist()))),
     )
-    return apply_map_feedback(memory, MapFeedback(poses, bias, since, angle, scale))
+    return apply_map_feedback(memory, MapFeedback(poses, bias, turn_error, since, angle, scale))
 
 
 def with_modes(memory, frames, masses, offsets=None):
@@ -73,7 +74,7 @@ def with_modes(memory, frames, masses, offsets=None):
 def filter_of(config, cell=CELL):
     return jax.jit(
         lambda memory, view: recognise(
-            config, cell, memory, observation_model.view_likelihood(config, cell, memory, view)
+            config, cell, memory, observation_model.view_likelihood(config, cell, memory, view), config.local
         )
     )
 
@@ -82,7 +83,7 @@ def filter_of(config, cell=CELL):
 def compile_label_filter(config):
     def read(memory, label):
         weighed = observation_model.label_likelihood(config, memory, label)
-        return *recognise(config, CELL, memory, weighed), weighed
+        return *recognise(config, CELL, memory, weighed, config.local), weighed
 
     return jax.jit(read)
 
@@ -106,7 +107,8 @@ def random_case(seed, config=FAN, angle=ANGLE, dtype=float):
     views = stream.random((count, SIZE))
     memory = filled(
         config, views, poses, dtype=dtype, angle=angle, bias=float(stream.normal(0, 0.2)),
-        since=float(stream.uniform(0, 1)), scale=float(stream.uniform(0.05, 0.3)),
+        turn_error=float(stream.normal(0, 0.2)), since=float(stream.uniform(0, 1)),
+        scale=float(stream.uniform(0.05, 0.3)),
     )  # fmt: skip
     # Not at the newest frame, which is guarded, but near older frames of the map.
     pose = poses[stream.integers(0, count - GUARD)] + stream.normal(0, [CELL, CELL, 0.3])

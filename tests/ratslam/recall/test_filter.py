@@ -140,8 +140,9 @@ def test_the_frame_of_the_map_does_not_matter():
         memory, view = random_case(seed)
         frames = np.stack([memory.x, memory.y, np.arctan2(memory.sine, memory.cosine)], axis=1)
         poses = compose(elsewhere, frames[: int(memory.count)])
-        result = (float(memory.bias), float(memory.since), float(memory.angle), float(memory.scale))
-        moved = apply_map_feedback(memory, MapFeedback(poses, *result))
+        names = ("bias", "turn_error", "since", "angle", "scale")
+        result = MapFeedback(poses, *(float(getattr(memory, name)) for name in names))
+        moved = apply_map_feedback(memory, result)
         moved = moved._replace(pose=jnp.asarray(compose(elsewhere, memory.pose)))
         found, there = observe(FAN, memory, view)[1], observe(FAN, moved, view)[1]
         for name in found._fields:

@@ -24,8 +24,8 @@ from tests.ratslam.recall.recall_cases import (
 
 
 def moved_by_loops(m):
-    """The motion since the newest frame without its bias; half of the turn precedes it."""
-    turn = float(m.bias * m.length)
+    """The motion since the newest frame without bias and turn error; half of the turn precedes it."""
+    turn = float(m.bias * m.length + m.turn_error * m.motion[2])
     x, y, _ = compose(np.array([0, 0, turn / 2]), m.motion)
     return np.array([x, y, m.motion[2] + turn])
 

@@ -136,7 +136,7 @@ def test_odometry_alone_is_never_evidence():
         likelihood=jnp.ones((1, CAPACITY)), novelty=jnp.ones(()), background=jnp.full(SAMPLES, jnp.nan),
         certain=jnp.bool_(True), informative=jnp.bool_(False),
     )  # fmt: skip
-    blind = jax.jit(partial(recognise, FLAT, CELL))
+    blind = jax.jit(partial(recognise, FLAT, CELL, local=FLAT.local))
     # A view that all frames share is no evidence either.
     same = np.full(SIZE, FLAT.floor * 0.1)
     for sure in (0.0, 0.3, 1.0):

@@ -15,9 +15,19 @@ from ratslam.backends.config import RecallBackendConfig
 from ratslam.backends.recall import RecallBackend
 from ratslam.recall.config import RecallConfig
 from ratslam.recall.memory import MapFeedback, init_memory
-from ratslam.recall.mirror import NEVER_GIVEN, mirror_view, permuted_label
+from ratslam.recall.mirror import (
+    MIRROR,
+    NEVER_GIVEN,
+    both_looks,
+    first_look,
+    mirror_view,
+    modes_of,
+    permuted_label,
+)
 from ratslam.recall.whisker_likelihood import DEAD, pixel_layout
+from tactile.base.se2 import correct_heading
 from tactile.base.types import Odometry, observation
+from tests.ratslam.recall.recall_cases import random_case
 from tests.ratslam.recall.whisker_cases import images_of, learn
 
 CELL = 0.1
@@ -25,7 +35,7 @@ SHAPE = (3, 6, 1)
 WIDE_SHAPE = (2, 5, 3)
 COUNT = 30
 """Keyframes of one pass."""
-BIAS = 0.3
+BIAS, TURN_ERROR = 0.3, 0.2
 
 # Views in the mirror
 
@@ -111,6 +121,30 @@ def test_most_ids_have_another_one_and_few_share_it():
     assert len(set(others)) > 30
 
 
+# The two filters in one loop
+
+
+def test_the_control_looks_for_the_mirror_image_and_nowhere_near_the_map():
+    """In the mirror the motion and its bias change sides, the error of turns is the same share of them."""
+    memory, view = random_case(3)
+    memory = memory._replace(label=jnp.arange(64, dtype=jnp.int32), count=jnp.int32(64))
+    memory = memory._replace(control=modes_of(memory)._replace(mass=memory.mass / 2))
+    own = first_look(memory, jnp.asarray(view), jnp.int32(7), 0.4)
+    both = jax.tree.map(np.asarray, both_looks(memory, own, jnp.asarray(view[::-1])))
+    assert both.local.tolist() == [0.4, 0.0]
+    assert both.bias.tolist() == [float(memory.bias), -float(memory.bias)]
+    assert both.motion == pytest.approx(np.stack([memory.motion, memory.motion * MIRROR]), abs=0)
+    assert np.array_equal(both.view, [view, view[::-1]])
+    assert both.label.tolist() == [7, int(permutation()(memory, jnp.int32(7)))]
+    for found, *pair in zip(both.modes, modes_of(memory), memory.control, strict=True):
+        assert np.array_equal(found, np.stack(pair))
+    straight, mirrored = (
+        correct_heading(motion, float(memory.length), bias, TURN_ERROR)
+        for motion, bias in zip(both.motion, both.bias, strict=True)
+    )
+    assert mirrored == pytest.approx(straight * MIRROR, abs=1e-12)
+
+
 # The two filters change places
 
 
@@ -149,7 +183,7 @@ def second_pass(kind, seed, mirrored):
     moves = stream.normal([0.6 * CELL, 0, 0], [0.1 * CELL, 0.1 * CELL, 0.3], (COUNT, 3))
     moves[:, 0] = np.maximum(moves[:, 0], 0.4 * CELL)  # each step gives a keyframe
     feedback = MapFeedback(
-        np.zeros((1, 3)), BIAS, 0.0, {"whiskers": np.pi, "ordered sectors": 0.2}.get(kind, 0.0),
+        np.zeros((1, 3)), BIAS, TURN_ERROR, 0.0, {"whiskers": np.pi, "ordered sectors": 0.2}.get(kind, 0.0),
         3.0 if kind == "whiskers" else 0.3, likeness,
     )  # fmt: skip
     state = backend.apply_map_feedback(backend.init(jax.random.key(0), 64), feedback)

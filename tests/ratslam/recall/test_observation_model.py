@@ -79,7 +79,7 @@ def test_mass_is_conserved_along_a_path(config, dtype):
     likeness = learn(images_of(stream, 200))
     memory = init_memory(config, SIZE, CAPACITY, np.dtype(dtype), len(likeness))
     memory = apply_map_feedback(
-        memory, MapFeedback(np.zeros((1, 3)), 0.0, 0.0, np.pi, NEW_IMAGE_LOG_ODDS, likeness)
+        memory, MapFeedback(np.zeros((1, 3)), 0.0, 0.0, 0.0, np.pi, NEW_IMAGE_LOG_ODDS, likeness)
     )
     again = []
     for k in range(60):

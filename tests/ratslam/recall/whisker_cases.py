@@ -55,7 +55,7 @@ def filled(config, images, poses, likeness, *, scale=NEW_IMAGE_LOG_ODDS, dtype=f
     store = np.zeros((SIZE, CAPACITY), np.int32)
     store[:, :count] = images.T
     memory = memory._replace(view=jnp.asarray(store), count=jnp.int32(count))
-    return apply_map_feedback(memory, MapFeedback(poses, 0.0, 0.0, np.pi, scale, likeness))
+    return apply_map_feedback(memory, MapFeedback(poses, 0.0, 0.0, 0.0, np.pi, scale, likeness))
 
 
 def spaced(count, cells=4.0):
@@ -98,7 +98,7 @@ def compile_likelihood(config):
 def filter_of(config):
     def observe(memory, level):
         memory, weighing = touch_likelihood(config, memory, level, PIXELS)
-        return recognise(config, CELL, memory, weighing)
+        return recognise(config, CELL, memory, weighing, config.local)
 
     return jax.jit(observe)
 
