@@ -18,7 +18,7 @@ from ratslam.keyframes.closure_selection import (
     select_closures_and_cuts,
 )
 from ratslam.keyframes.optimizer import (
-    BiasPrior,
+    CalibrationPrior,
     LoopClosures,
     MapFit,
     MapProblem,
@@ -32,7 +32,7 @@ LAP = 60
 STEP = 0.03
 NOISE = np.array([0.006, 0.006, 0.012])  # of odometry, at each frame
 SPREAD = np.array([0.03, 0.03, 0.08])  # of closures
-PRIOR = BiasPrior(0.0, 0.02)
+PRIOR = CalibrationPrior(0.0, 0.02)
 RUN = 12
 
 
