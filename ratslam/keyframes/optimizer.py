@@ -106,7 +106,7 @@ def solve(start: MapFit, problem: MapProblem, iterations: int, tolerance: float 
 
 
 def robust_cost(fit: MapFit, problem: MapProblem) -> float:
-    """The cost that `solve` minimises: chi-square of odometry and calibration, robust cost of the closures."""
+    """The cost that `solve` minimises: chi-square of odometry and calibration and robust cost of closures."""
     chain, closures, prior = problem
     apart = between(fit.poses[:-1], fit.poses[1:]) - fit.corrected(chain)
     apart[:, 2] = wrap(apart[:, 2])
