@@ -8,12 +8,14 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from ratslam.keyframes.acceptance import AcceptByEvidence
+from ratslam.keyframes.acceptance import AcceptByEvidence, believe
 from ratslam.keyframes.appearance import LabelAppearance
 from ratslam.keyframes.closure_odds import MIN_LOG_ODDS, AcceptByOdds
 from ratslam.keyframes.config import KeyframeMapConfig
-from ratslam.keyframes.loop_closures import Verdict
+from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
 from ratslam.keyframes.map import KeyframeMap
+from ratslam.keyframes.optimizer import CalibrationPrior
+from tactile.base.se2 import correct_heading, integrate
 from tactile.base.types import Odometry, observation
 
 CELL = 0.5
@@ -212,3 +214,24 @@ def test_an_undone_sequence_stays_undone():
     assert verdicts(found)[0][0] == Verdict.UNDONE
     drive(found, TRUE | sequence(LAP + 60, 60, 12, 4.0), first=LAP + 60, last=LAP + 80)
     assert [verdict for verdict, _ in verdicts(found).values()] == [Verdict.UNDONE, Verdict.ACCEPTED]
+
+
+def test_recall_gets_the_calibration_of_the_map():
+    found, without = drive(new_map(), TRUE), drive(new_map(turn_error_sd=0.0), TRUE)
+    for map in (found, without):
+        graph, feedback = map.keyframes(), map.feedback()
+        assert (feedback.bias, feedback.turn_error) == (graph.bias, graph.turn_error)
+    assert found.feedback().turn_error != 0.0 == without.feedback().turn_error
+
+
+def test_poses_follow_the_believed_calibration_until_a_closure_fixes_them():
+    graph, log = drive(new_map(), {}, last=50).keyframes(), ClosureLog()
+    belief = CalibrationPrior(0.05, 0.01, -0.2, 0.02)
+    moved = correct_heading(graph.motion.rows[1:], graph.length.rows[1:], belief.bias, belief.turn_error)
+    believe(graph, log, belief)
+    assert graph.pose.rows[1:] == pytest.approx(integrate(moved, graph.pose.rows[0]), abs=1e-9)
+    log.judge(log.add(Candidate(40, 3, 0, 1.0, 5.0), False), Verdict.ACCEPTED)
+    believe(graph, log, belief._replace(bias=0.0, turn_error=0.0))
+    assert (graph.bias, graph.turn_error) == (belief.bias, belief.turn_error)
+    assert graph.pose.rows[1:] == pytest.approx(integrate(moved, graph.pose.rows[0]), abs=1e-9)
+    assert graph.prior.turn_error == 0.0
