@@ -76,7 +76,6 @@ def recognise(
     known, certain, novelty = recallable(config, memory), observation.certain, observation.novelty
     likelihood = jnp.where(known[None], observation.likelihood, 0.0)
     here = current_pose(memory)
-    apart = (memory.x - here[0]) ** 2 + (memory.y - here[1]) ** 2
 
     belief, novel = predict(config, cell, memory, angles, known, here, local)
     belief, novel = belief * likelihood, novel * novelty
@@ -89,14 +88,10 @@ def recognise(
     mass = jnp.sum(jnp.where(basin[None], belief, 0.0))
     gain = jnp.log(jnp.where(certain, likelihood[shift, match], 1.0) / novelty)
     (anchor, offset, masses), rest = _modes(config, cell, memory, angles, belief)
-    near = known & (apart < cell**2)
-    facing = memory.cosine * jnp.cos(here[2]) + memory.sine * jnp.sin(here[2]) > FACING
-    best = jnp.max(jnp.where(near & facing, jnp.max(likelihood, axis=0), 0.0))
-    view_fits = jnp.where(
-        certain & observation.informative & jnp.any(near & facing), (best >= novelty).astype(jnp.int32), -1
-    )
+    near = known & _is_here(cell, memory, here)
+    best = jnp.max(jnp.where(near, jnp.max(likelihood, axis=0), 0.0))
+    told = certain & observation.informative & jnp.any(near)
 
-    shares = jnp.concatenate([masses, jnp.maximum(1 - jnp.sum(masses, keepdims=True), 0.0)])
     result = RecallResult(
         keyframe=memory.count,
         match=jnp.where(certain & (mass > 0), match, -1),
@@ -104,14 +99,27 @@ def recognise(
         posterior=jnp.where(certain, mass, 0.0),
         log_ratio=jnp.where(certain & (mass > 0), gain, 0.0),
         novelty=jnp.where(certain, novel, 1.0),
-        entropy=-jnp.sum(jnp.where(shares > 0, shares * jnp.log(jnp.where(shares > 0, shares, 1.0)), 0.0)),
+        entropy=_entropy(masses),
         second_mode=_second_mode(masses),
-        view_fits=view_fits,
+        view_fits=jnp.where(told, (best >= novelty).astype(jnp.int32), -1),
         background=observation.background,
     )
     if config.sector_fov == "whiskers":
         memory = memory._replace(rest=jnp.where(rest[None] > 0, belief, 0.0))
     return memory._replace(anchor=anchor, offset=offset, mass=masses), result
+
+
+def _entropy(masses: Array) -> Array:
+    """Entropy of the modes' masses [K] and of novelty, nat."""
+    shares = jnp.concatenate([masses, jnp.maximum(1 - jnp.sum(masses, keepdims=True), 0.0)])
+    return -jnp.sum(jnp.where(shares > 0, shares * jnp.log(jnp.where(shares > 0, shares, 1.0)), 0.0))
+
+
+def _is_here(cell: float, memory: Memory, here: Array) -> Array:
+    """[C] whether each keyframe is within a cell of the pose `here` [3] and faces alike."""
+    apart = (memory.x - here[0]) ** 2 + (memory.y - here[1]) ** 2
+    facing = memory.cosine * jnp.cos(here[2]) + memory.sine * jnp.sin(here[2]) > FACING
+    return (apart < cell**2) & facing
 
 
 def empty_result(memory: Memory) -> RecallResult:
