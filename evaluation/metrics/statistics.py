@@ -1,4 +1,4 @@
-"""Intervals of means and of rates over runs; the separation of two samples; Pareto-optimal rows."""
+"""Intervals of means and of rates over runs; separation of two samples; calibration; Pareto-optimal rows."""
 
 from __future__ import annotations
 
@@ -39,6 +39,15 @@ def auc(low: np.ndarray, high: np.ndarray) -> float:
     rank = rankdata(np.concatenate([high, low]))
     count = len(high)
     return float((rank[:count].sum() - count * (count + 1) / 2) / (count * len(low)))
+
+
+def expected_calibration_error(probability: np.ndarray, true: np.ndarray, bins: int = 10) -> float:
+    """Mean distance between probabilities [N] and the share of them that is `true` [N] bool, over `bins` bins
+    of equally many (Naeini et al. 2015); NaN without any."""
+    order = np.argsort(probability, kind="stable")
+    parts = [part for part in np.array_split(order, bins) if len(part)]
+    gaps = [len(part) * abs(probability[part].mean() - true[part].mean()) for part in parts]
+    return float(sum(gaps) / len(order)) if parts else float("nan")
 
 
 def pareto_optimal(costs: np.ndarray) -> np.ndarray:

@@ -132,8 +132,11 @@ class ClosureLog(Checkpointed):
         self._lines = None
 
     def rate(self, sequences: np.ndarray, log_odds: np.ndarray) -> None:
-        """Stores the log odds [n] that sequences [n] are true."""
-        self._log_odds.rows[sequences] = log_odds
+        """Stores the log odds [n] that sequences [n] are true; those of an accepted one do not fall, because
+        the map that it has bent foretells it no better."""
+        accepted = self._verdict.rows[sequences] == Verdict.ACCEPTED
+        before = np.where(accepted, self._log_odds.rows[sequences], np.nan)
+        self._log_odds.rows[sequences] = np.fmax(before, log_odds)
 
     def strike(self, frame: int, spare: int) -> None:
         """Strikes out the candidates of accepted sequences other than `spare` at `frame` and later, because

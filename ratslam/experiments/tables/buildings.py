@@ -17,7 +17,9 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
+from scipy.special import expit
 
+from evaluation.metrics.statistics import expected_calibration_error
 from ratslam.config.run_config import RunConfig
 from ratslam.experiments.studies.executor import run_tasks
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row, select_rows
@@ -92,7 +94,8 @@ class RunFigures(NamedTuple):
     Attributes:
         odometry, final, live: ATE, m. closures: [K] bool, of each accepted closure, whether it is false.
         sequences: [R, 2] bool, of each closure sequence, whether it is accepted and whether it is false.
-            Closures and sequences without known truth do not count as false.
+            Closures and sequences without known truth do not count as false. odds: [R] log odds that each
+            sequence is true, NaN where they are not known.
     """
 
     odometry: float
@@ -100,6 +103,7 @@ class RunFigures(NamedTuple):
     live: float
     closures: np.ndarray
     sequences: np.ndarray
+    odds: np.ndarray
 
 
 def buildings_rows() -> dict[str, BuildingsRow]:
@@ -184,6 +188,7 @@ def measure_run(task: RunTask) -> RunFigures:
         live=run.ate(run.online),
         closures=is_false(claims.distance, claims.turn)[claims.accepted],
         sequences=judge_sequences(claims),
+        odds=sequence_odds(claims),
     )
 
 
@@ -200,6 +205,13 @@ def judge_sequences(claims: ClosureClaims) -> np.ndarray:
     )
     accepted = np.array([claims.accepted[rows].any() for rows in members], bool)
     return np.column_stack([accepted, is_false(distance, turn)])
+
+
+def sequence_odds(claims: ClosureClaims) -> np.ndarray:
+    """[R] log odds that each closure sequence is true; NaN where the truth or they themselves are unknown."""
+    _, first = np.unique(claims.sequence, return_index=True)
+    known = [np.isfinite(claims.distance[claims.sequence == k]).all() for k in claims.sequence[first]]
+    return np.where(known, claims.log_odds[first], np.nan)
 
 
 def is_worse(error: np.ndarray, odometry: np.ndarray) -> np.ndarray:
@@ -231,8 +243,16 @@ def _total(runs: Sequence[RunFigures]) -> str:
     return (
         f"All buildings, {len(runs)} runs: false / closures {_closures(runs)}{share}; false / sequences "
         f"{_sequences(runs)}; worse than odometry: final {is_worse(final, odometry).mean():.1%}, live "
-        f"{is_worse(live, odometry).mean():.1%}."
+        f"{is_worse(live, odometry).mean():.1%}; {_calibration(runs)}."
     )
+
+
+def _calibration(runs: Sequence[RunFigures]) -> str:
+    """How well the odds of all sequences, accepted or not, agree with the truth."""
+    odds, sequences = np.concatenate([run.odds for run in runs]), np.vstack([run.sequences for run in runs])
+    known = np.isfinite(odds)
+    error = expected_calibration_error(expit(odds[known]), ~sequences[known, 1])
+    return f"expected calibration error of the odds of {known.sum()} sequences {error:.3f}"
 
 
 def _ids_note(row: BuildingsRow, runs: Sequence[RunFigures]) -> str:

@@ -51,13 +51,15 @@ class ClosureClaims(NamedTuple):
     Attributes:
         sequence: [n] number of its sequence. accepted: [n] bool. distance: [n] between the true positions, m;
             NaN where the truth is unknown. turn: [n] between the claimed difference of the headings and the
-            true one, rad, not negative; NaN likewise.
+            true one, rad, not negative; NaN likewise. log_odds: [n] that its sequence is true; NaN where no
+            odds decide.
     """
 
     sequence: np.ndarray
     accepted: np.ndarray
     distance: np.ndarray
     turn: np.ndarray
+    log_odds: np.ndarray
 
 
 def run_recording(config: RunConfig, perturbation: Perturbation | None = None, seed: int = 0) -> RecordingRun:
@@ -98,6 +100,7 @@ def closure_claims(run: RecordingRun) -> ClosureClaims:
         accepted=np.array([row["verdict"] == "accepted" for row in rows], bool),
         distance=np.hypot(*(later - earlier)[:, :2].T),
         turn=np.abs(wrap(later[:, 2] - earlier[:, 2] + shift * angle)),
+        log_odds=np.array([float(row["log_odds"]) for row in rows], float),
     )
 
 

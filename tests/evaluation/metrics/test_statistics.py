@@ -1,12 +1,13 @@
-"""Intervals of rates."""
+"""Intervals of rates, and the calibration of probabilities."""
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evaluation.metrics.statistics import wilson_interval
+from evaluation.metrics.statistics import expected_calibration_error, wilson_interval
 
 law = settings(derandomize=True, deadline=None, max_examples=100)
 
@@ -31,3 +32,14 @@ def test_an_interval_holds_the_rate_and_mirrors_its_complement(count, runs):
 
 def test_nothing_is_known_without_runs():
     assert wilson_interval(0, 0) == (0.0, 1.0)
+
+
+def test_probabilities_are_calibrated_where_they_equal_the_share_of_true():
+    half = np.full(20, 0.5)
+    assert expected_calibration_error(half, np.arange(20) % 2 == 0) == 0.0
+    assert expected_calibration_error(half, np.ones(20, bool)) == 0.5
+    random = np.random.default_rng(0)
+    probability = random.random(20_000)
+    assert expected_calibration_error(probability, random.random(20_000) < probability) < 0.02
+    assert expected_calibration_error(probability, random.random(20_000) < probability**2) > 0.1
+    assert np.isnan(expected_calibration_error(np.zeros(0), np.zeros(0, bool)))

@@ -120,6 +120,16 @@ def test_a_sequence_counts_while_it_is_accepted():
     assert log.closures(0.1, VARIANCE, SCALES).sequence.tolist() == [0, 0, 0]
 
 
+def test_the_odds_of_an_accepted_sequence_do_not_fall():
+    log = filled()
+    log.rate(np.array([0, 1]), np.array([3.0, 3.0]))
+    log.judge(0, Verdict.ACCEPTED)
+    log.judge(2, Verdict.ACCEPTED)
+    for odds in (1.0, 4.0, 2.0):
+        log.rate(np.arange(3), np.full(3, odds))
+    assert log.table()[[0, 2, 5], 9].tolist() == [4.0, 2.0, 4.0]
+
+
 def test_a_break_strikes_out_later_candidates():
     log = filled()
     for sequence in (0, 1):

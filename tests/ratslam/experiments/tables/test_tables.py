@@ -119,9 +119,13 @@ def test_closures_are_false_by_distance_or_claimed_turn_and_sequences_by_their_m
         accepted=np.array([True] * 3 + [False] * 3),
         distance=np.array([0.0, 1.9, 2.1, 0.0, 0.0, 0.0]),
         turn=np.radians([0.0, 0.0, 0.0, 31.0, 31.0, 0.0]),
+        log_odds=np.array([1.0, 1.0, 1.0, -2.0, -2.0, -2.0]),
     )
     assert buildings.is_false(claims.distance, claims.turn).tolist() == [0, 0, 1, 1, 1, 0]
     assert buildings.judge_sequences(claims).tolist() == [[True, False], [False, True]]
+    assert buildings.sequence_odds(claims).tolist() == [1.0, -2.0]
+    unknown = claims._replace(distance=np.array([0.0, np.nan, 2.1, 0.0, 0.0, 0.0]))
+    np.testing.assert_equal(buildings.sequence_odds(unknown), [np.nan, -2.0])
 
 
 def test_a_row_of_buildings_counts_false_closures_and_runs_worse_than_odometry(monkeypatch):
@@ -130,7 +134,12 @@ def test_a_row_of_buildings_counts_false_closures_and_runs_worse_than_odometry(m
         for name, copies, section in (("lab", "miscalibrated", "buildings"), ("ids", "ids lost", "ids"))
     }
     harmless = buildings.RunFigures(
-        10.0, 1.0, 10.8, np.array([False, True]), np.array([[True, False], [True, True], [False, True]])
+        10.0,
+        1.0,
+        10.8,
+        np.array([False, True]),
+        np.array([[True, False], [True, True], [False, True]]),
+        np.array([4.0, np.nan, -4.0]),
     )
     harmed = harmless._replace(odometry=2.0, final=2.5, live=2.0)
     tasks = stub_sessions(monkeypatch, buildings, lambda task: harmed if task.seed == 2 else harmless)
@@ -142,11 +151,12 @@ def test_a_row_of_buildings_counts_false_closures_and_runs_worse_than_odometry(m
     assert ids.startswith("| ids | 10.00 |")
     assert "3 runs: false / closures 3 / 6 (50.0%)" in total
     assert "final 33.3%, live 0.0%" in total
+    assert "of the odds of 6 sequences 0.018" in total
     assert note == "ids lost: worst copy 2.50 times the ATE as is."
 
 
 def test_the_create_is_mapped_at_nine_settings_without_copies(monkeypatch):
-    figures = buildings.RunFigures(1.0, 0.5, 2.0, np.zeros(0, bool), np.zeros((0, 2), bool))
+    figures = buildings.RunFigures(1.0, 0.5, 2.0, np.zeros(0, bool), np.zeros((0, 2), bool), np.zeros(0))
     tasks = stub_sessions(monkeypatch, buildings, lambda task: figures)
     monkeypatch.setattr(recordings.Recording, "missing", lambda self, folder: "")
     monkeypatch.setenv(recordings.DATA, ".")
