@@ -118,7 +118,9 @@ class AcceptByOdds(Acceptance):
         known = np.isfinite(self._log_ratio.rows[:, near]).all(axis=1)
         sequences = np.flatnonzero(known & (log.verdicts()[: len(known)] != Verdict.UNDONE))
         confirmed = (log.verdicts() == Verdict.ACCEPTED) & (log.sequence_weights() > CONFIRMED_WEIGHT)
-        null = estimate_null(self._control.scores())
+        null = estimate_null(
+            self._control.scores()[~finds_true_places(self._control, log, graph.config.max_gap)]
+        )
         score_odds = log_odds(log.scores()[sequences], null, float(confirmed.sum()))
         least = graph.config.bias_least / graph.cell
         grid, ratios = self._scan.grid[near], self._log_ratio.rows[sequences][:, near]
@@ -173,3 +175,20 @@ class AcceptByOdds(Acceptance):
         if len(members):
             near = self._scan.near(self._views_prior, WIDE)
             self._log_ratio.rows[sequence] = self._scan.log_ratios(members[len(members) // 2], near)
+
+
+def finds_true_places(control: ClosureLog, log: ClosureLog, gap: int) -> np.ndarray:
+    """[R] bool, sequences of the control that find what accepted sequences find: the place is its own mirror
+    image, so they do not show that different places are mistaken for each other.
+
+    Args:
+        gap: largest difference between the matches of one keyframe, keyframes.
+    """
+    accepted = log.table()[log.accepted_rows(), :2].astype(int)
+    table = control.table()
+    table = table[table[:, 5] >= 0]
+    frame, match, sequence = table[:, 0].astype(int), table[:, 1].astype(int), table[:, 5].astype(int)
+    found = np.full(max(frame.max(initial=0), accepted[:, 0].max(initial=0)) + 1, -gap - 1)
+    found[accepted[:, 0]] = accepted[:, 1]
+    same = np.abs(match - found[frame]) <= gap
+    return 2 * np.bincount(sequence, same, control.sequences) > control.sizes()

@@ -35,7 +35,8 @@ def estimate_null(scores: np.ndarray) -> NullModel:
     """The null from the scores [n] of the control's sequences."""
     above = scores[scores >= LEAST_SCORE] - LEAST_SCORE
     excess = (above.sum() + PRIOR_COUNT * PRIOR_EXCESS) / (len(above) + PRIOR_COUNT)
-    return NullModel(max(float(len(above)), PRIOR_COUNT), float(excess))
+    # A control stronger than true sequences would let evidence lower the odds.
+    return NullModel(max(float(len(above)), PRIOR_COUNT), min(float(excess), TRUE_MEAN))
 
 
 def log_odds(score: np.ndarray, null: NullModel, true_count: float) -> np.ndarray:
