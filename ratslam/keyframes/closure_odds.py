@@ -84,9 +84,11 @@ class AcceptByOdds(Acceptance):
     def judge(self, graph: KeyframeGraph, log: ClosureLog, sequence: int, candidate: Candidate) -> bool:
         while len(self._log_ratio.rows) < log.sequences:
             self._log_ratio.append(np.full(len(self._scan.grid), np.nan))
-        if len(log.members(sequence)) < graph.config.min_length:
+        length = len(log.members(sequence))
+        if length < graph.config.min_length:
             return False
-        self._rate(log, sequence)
+        if is_round(length) or length == graph.config.min_length:
+            self._rate(log, sequence)
         believe(graph, log, self._vote(graph, log).result.belief)
         due = candidate.keyframe % REVIEW_EVERY == 0
         accepted = self._accept(graph, log, np.arange(log.sequences) if due else np.array([sequence]))
@@ -175,6 +177,12 @@ class AcceptByOdds(Acceptance):
         if len(members):
             near = self._scan.near(self._views_prior, WIDE)
             self._log_ratio.rows[sequence] = self._scan.log_ratios(members[len(members) // 2], near)
+
+
+def is_round(length: int) -> bool:
+    """Whether a length has at most three significant bits: the middle of a growing sequence is compared anew
+    only then, because it moves on slowly."""
+    return length == length >> (low := max(length.bit_length() - 3, 0)) << low
 
 
 def finds_true_places(control: ClosureLog, log: ClosureLog, gap: int) -> np.ndarray:

@@ -3,6 +3,7 @@ and its control written by hand."""
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 from ratslam.keyframes.acceptance import AcceptByEvidence, believe
 from ratslam.keyframes.appearance import LabelAppearance
-from ratslam.keyframes.closure_odds import MIN_LOG_ODDS, AcceptByOdds
+from ratslam.keyframes.closure_odds import MIN_LOG_ODDS, AcceptByOdds, is_round
 from ratslam.keyframes.config import KeyframeMapConfig
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
 from ratslam.keyframes.map import KeyframeMap
@@ -241,3 +242,10 @@ def test_poses_follow_the_believed_calibration_until_a_closure_fixes_them():
     assert (graph.bias, graph.turn_error) == (belief.bias, belief.turn_error)
     assert graph.pose.rows[1:] == pytest.approx(integrate(moved, graph.pose.rows[0]), abs=1e-9)
     assert graph.prior.turn_error == 0.0
+
+
+def test_a_growing_sequence_is_compared_at_lengths_that_grow_by_a_quarter_at_most():
+    rounds = [length for length in range(1, 1000) if is_round(length)]
+    assert rounds[:8] == list(range(1, 9))
+    assert all(after <= 1.25 * before for before, after in pairwise(rounds[7:]))
+    assert len(rounds) < 4 * np.log2(1000)
