@@ -113,20 +113,22 @@ class KeyframeGraph(Checkpointed):
 
     def variances(self, cut: GrowableArray) -> np.ndarray:
         """[N, 3] variances of the odometry into each keyframe, loose at the breaks `cut`."""
-        noise, cell = self.config.noise, self.cell
-        length, turn = self.length.rows, self.turn.rows
-        along = noise.per_cell**2 * length * cell + (noise.least * cell) ** 2
-        heading = noise.heading_per_cell**2 * length / cell + noise.heading_per_radian**2 * turn
-        heading = heading + noise.least_heading**2
-        variance = np.stack([along, along, heading], axis=1)
-        loose = np.array([LOOSE * cell, LOOSE * cell, LOOSE]) ** 2
+        variance = self._odometry_variance(self.length.rows, self.turn.rows)
+        loose = np.array([LOOSE * self.cell, LOOSE * self.cell, LOOSE]) ** 2
         return np.where(cut.rows[:, None] >= 0, loose, variance)
+
+    def newest_variance(self) -> np.ndarray:
+        """[3] variance of the odometry into the newest keyframe."""
+        return self._odometry_variance(self.length.rows[-1:], self.turn.rows[-1:])[0]
+
+    def closure_variance(self) -> np.ndarray:
+        """[3] variance of a closure, m^2, m^2, rad^2."""
+        spread = self.config.closure_sd * self.cell
+        return np.array([spread**2, spread**2, self.config.closure_heading**2])
 
     def closures(self, log: ClosureLog) -> LoopClosures:
         """The accepted loop closures with their variances and robust scales."""
-        config = self.config
-        spread = config.closure_sd * self.cell
-        variance = np.array([spread**2, spread**2, config.closure_heading**2])
+        config, variance = self.config, self.closure_variance()
         scales = (config.robust_per_score, config.robust_least, config.robust_most)
         closures = log.closures(self.sector_angle, variance, scales)
         if config.select_every:
@@ -172,3 +174,11 @@ class KeyframeGraph(Checkpointed):
             np.concatenate([fit.corrected(chain), turned]),
             np.concatenate([1 / chain.variance, trust]),
         )
+
+    def _odometry_variance(self, length: np.ndarray, turn: np.ndarray) -> np.ndarray:
+        """[n, 3] variances of odometry over these distances [n] and sums of absolute turns [n]."""
+        noise, cell = self.config.noise, self.cell
+        along = noise.per_cell**2 * length * cell + (noise.least * cell) ** 2
+        heading = noise.heading_per_cell**2 * length / cell + noise.heading_per_radian**2 * turn
+        heading = heading + noise.least_heading**2
+        return np.stack([along, along, heading], axis=1)

@@ -25,6 +25,7 @@ from ratslam.keyframes.appearance import Appearance, ConfirmedPairs
 from ratslam.keyframes.config import FULL, Ablation, KeyframeMapConfig
 from ratslam.keyframes.experiences import Experiences
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
+from ratslam.keyframes.live_filter import LiveFilter
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict, write_closures
 from ratslam.keyframes.map_health import DOUBTED, dead_reckoned, worse_than_odometry
 from ratslam.keyframes.map_solution import MapSolution, selected_solution, solution_pieces, solved_map
@@ -64,7 +65,7 @@ class KeyframeMap(Checkpointed, Map):
     """
 
     VALUES = ("_travel", "_since", "_turned", "_solved", "_doubt")
-    PARTS = ("_graph", "_log", "_experiences", "_appearance", "_acceptance")
+    PARTS = ("_graph", "_log", "_experiences", "_appearance", "_acceptance", "_live")
 
     def __init__(
         self,
@@ -81,6 +82,7 @@ class KeyframeMap(Checkpointed, Map):
         self._appearance = appearance
         self._graph = KeyframeGraph(config, cell, appearance, guard, ablation)
         self._log = ClosureLog()
+        self._live = LiveFilter()
         self._acceptance = acceptance(self._graph)
         self._experiences = Experiences(config.place_radius * cell, config.place_heading)
         self._step_frame = GrowableArray((), np.int64)
@@ -228,6 +230,7 @@ class KeyframeMap(Checkpointed, Map):
     def _append(self, observation: Observation) -> None:
         motion, length, turn = self._travel
         self._graph.append(self._current_pose(), motion, length, turn)
+        self._live.advance(self._graph)
         self._since += length
         self._turned += turn
         self._travel = HALT
@@ -267,6 +270,9 @@ class KeyframeMap(Checkpointed, Map):
         sequence = self._log.add(candidate, continues_sequence(self._graph, self._log, candidate))
         judge = self._acceptance.judge
         changed = self.closes_loops and judge(self._graph, self._log, sequence, candidate)
+        if self._log.verdict(sequence) == Verdict.ACCEPTED:
+            weight = self._log.sequence_weights()[sequence]
+            self._graph.pose.rows[-1] = self._live.correct(self._graph, candidate, weight)
         if changed or self._is_solution_due(sequence, candidate.keyframe):
             self._solved = sequence, candidate.keyframe
             self._optimise()
