@@ -21,6 +21,14 @@ FACING = float(np.cos(0.5))
 CONTROLS = np.arange(1, 9) / 9
 """Shares of the older keyframes by which those near a keyframe are moved on in memory, as controls."""
 
+JUDGED = 150
+"""Largest number of keyframes by whose claims a map is compared with others."""
+SHAPE, DOUBTFUL = 4.0, 0.05
+"""The likeness of right claims has the density `SHAPE` u^(`SHAPE` - 1), and a share of uniform ones."""
+
+ALONE = 5.0
+"""Number of successive keyframes whose views count as one, because they are alike."""
+
 
 class ClaimedRevisits(NamedTuple):
     """n claims by `examined` keyframes.
@@ -67,3 +75,16 @@ def _claims(graph: KeyframeGraph, frame: int, near: np.ndarray, reversed: np.nda
     best = np.minimum.reduceat(unlike.reshape(others.shape), start, axis=1)
     likeness = (best[0] < best[1:]).mean(axis=0) + (best[0] == best[1:]).mean(axis=0) / 2
     return np.stack([np.full(len(start), frame), near[start], likeness], axis=1)
+
+
+def claims_cost(graph: KeyframeGraph, poses: np.ndarray) -> float:
+    """What the views say against poses [N, 3] of the keyframes, chi-square: -2 times the log ratio of the
+    density of the likenesses where claims are right to that where they are wrong (uniform), for as many
+    independent views as there are times `ALONE` keyframes."""
+    claims = claimed_revisits(graph, poses, JUDGED)
+    if not len(claims.frame):
+        return 0.0
+    right = DOUBTFUL + (1 - DOUBTFUL) * SHAPE * claims.likeness ** (SHAPE - 1)
+    _, frame = np.unique(claims.frame, return_inverse=True)
+    each = np.bincount(frame, np.log(right)) / np.bincount(frame)
+    return float(-2 * each.sum() * len(poses) / (claims.examined * ALONE))

@@ -18,8 +18,6 @@ from tactile.base.se2 import between, compose, integrate, inverse
 
 ACCEPTED_WEIGHT = 0.25
 """Robust weight above which a sequence is accepted: its strain is then less than its evidence."""
-START_EVIDENCE = (20.0, 40.0)
-"""Least evidence of the sequences from which further starts are made."""
 STEPS = 12
 """Solver iterations from each start."""
 FINE = 1e-3
@@ -38,18 +36,23 @@ LOOSE = 1e4
 """Standard deviation of the odometry at a cut, m and rad."""
 
 
+ViewsCost = Callable[[np.ndarray], float]
+
+
 class SelectionProblem(NamedTuple):
     """The sequences to select from, and the odometry.
 
     Attributes:
         measurements: with the closures of all R sequences. evidence: [R] log-likelihood ratios. first, last:
-            [R] first and last keyframe of each sequence.
+            [R] first and last keyframe of each sequence. views_cost: what the views say against poses [N, 3],
+            chi-square.
     """
 
     measurements: MapProblem
     evidence: np.ndarray
     first: np.ndarray
     last: np.ndarray
+    views_cost: ViewsCost
 
 
 class Selection(NamedTuple):
@@ -71,9 +74,9 @@ def select_closures(case: SelectionProblem, starts: Sequence[MapFit]) -> Selecti
     """The selection with the least cost, without cuts.
 
     Args:
-        starts: maps to start from; the first is the current map, the last dead reckoning.
+        starts: maps to start from; the first is the current map.
     """
-    return _search(case, starts, optimise_with_cuts(case, starts[0], ()))
+    return min((optimise_with_cuts(case, start, ()) for start in starts), key=_cost)
 
 
 def select_closures_and_cuts(
@@ -86,27 +89,7 @@ def select_closures_and_cuts(
             map.
     """
     best = optimise_with_cuts(case, starts[0], earlier)
-    if earlier:  # the cuts may have become unnecessary
-        best = min(best, optimise_with_cuts(case, starts[0], ()), key=_cost)
-    return _with_cuts(case, _search(case, starts, best), find)
-
-
-def _search(case: SelectionProblem, starts: Sequence[MapFit], best: Selection) -> Selection:
-    """The best selection of all starts, where `best` does not accept all sequences."""
-    if (best.fit.weights > ACCEPTED_WEIGHT).all():
-        return best
-    return min([best, *_optimise_anew(case, starts)], key=_cost)
-
-
-def _optimise_anew(case: SelectionProblem, starts: Sequence[MapFit]) -> list[Selection]:
-    """Maps without cuts from all starts, and from the last one optimised with strong sequences only."""
-    begin, path = list(starts), starts[-1]
-    for least in START_EVIDENCE:
-        strong = case.evidence >= least
-        if strong.any() and not strong.all():
-            alone = _choose(case.measurements.closures, strong)
-            begin.append(solve(path, case.measurements._replace(closures=alone), STEPS, FINE))
-    return [optimise_with_cuts(case, start, ()) for start in begin]
+    return _with_cuts(case, min(best, select_closures(case, starts), key=_cost), find)
 
 
 def _cost(selection: Selection) -> float:
@@ -236,10 +219,11 @@ def optimise_with_cuts(case: SelectionProblem, start: MapFit, cuts: tuple[tuple[
     """The fit and its cost with these cuts (keyframe, sequence), from the poses and bias of `start`."""
     problem = cut_odometry(case.measurements, cuts)
     fit = solve(start, problem, STEPS, FINE)
-    return Selection(fit, robust_cost(fit, problem) + CUT * len(cuts), cuts)
+    cost = robust_cost(fit, problem) + case.views_cost(fit.poses)
+    return Selection(fit, cost + CUT * len(cuts), cuts)
 
 
-def _choose(closures: LoopClosures, sequences: np.ndarray) -> LoopClosures:
+def choose_sequences(closures: LoopClosures, sequences: np.ndarray) -> LoopClosures:
     """The closures of the sequences marked in [R] bool."""
     rows = sequences[closures.sequence]
     number = np.cumsum(sequences) - 1

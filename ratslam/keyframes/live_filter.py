@@ -1,9 +1,9 @@
 """The newest keyframe's pose between two optimisations of the map.
 
-An optimisation costs time that grows with the map, so it does not follow every closure. In between, a Kalman
-filter moves the newest keyframe by the odometry, and corrects it by every closure of an accepted sequence; the
-matched keyframes count as known. The next optimisation replaces the pose. Source: Thrun, Burgard & Fox 2005,
-table 7.2 (extended Kalman filter with known correspondences)."""
+An optimisation costs time that grows with the map, so it does not follow every closure. In between, a
+Kalman filter moves the newest keyframe by the odometry, and corrects it by every closure of an accepted
+sequence; the matched keyframes count as known. The next optimisation replaces the pose. Source: Thrun,
+Burgard & Fox 2005, table 7.2 (extended Kalman filter with known correspondences)."""
 
 from __future__ import annotations
 

@@ -10,6 +10,7 @@ rules are ours."""
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import deepcopy
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,6 +29,7 @@ from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.live_filter import LiveFilter
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict, write_closures
 from ratslam.keyframes.map_health import DOUBTED, dead_reckoned, worse_than_odometry
+from ratslam.keyframes.map_hypotheses import MapHypotheses
 from ratslam.keyframes.map_solution import MapSolution, selected_solution, solution_pieces, solved_map
 from ratslam.keyframes.optimizer import CalibrationPrior, MapFit
 from ratslam.keyframes.verification import continues_sequence
@@ -65,7 +67,7 @@ class KeyframeMap(Checkpointed, Map):
     """
 
     VALUES = ("_travel", "_since", "_turned", "_solved", "_doubt")
-    PARTS = ("_graph", "_log", "_experiences", "_appearance", "_acceptance", "_live")
+    PARTS = ("_graph", "_log", "_experiences", "_appearance", "_acceptance", "_live", "_hypotheses")
 
     def __init__(
         self,
@@ -83,6 +85,7 @@ class KeyframeMap(Checkpointed, Map):
         self._graph = KeyframeGraph(config, cell, appearance, guard, ablation)
         self._log = ClosureLog()
         self._live = LiveFilter()
+        self._hypotheses = MapHypotheses()
         self._acceptance = acceptance(self._graph)
         self._experiences = Experiences(config.place_radius * cell, config.place_heading)
         self._step_frame = GrowableArray((), np.int64)
@@ -215,7 +218,11 @@ class KeyframeMap(Checkpointed, Map):
     def _solve_finally(self) -> MapSolution:
         if not self.closes_loops:
             return solved_map(self._graph, self._log)
-        selected = selected_solution(self._graph, self._log) if self.config.select_every else None
+        selected = (
+            selected_solution(self._graph, self._log, deepcopy(self._hypotheses))
+            if self.config.select_every
+            else None
+        )
         return selected or self._acceptance.solution(self._graph, self._log)
 
     def _advance(self, odometry: Any) -> None:
@@ -309,7 +316,7 @@ class KeyframeMap(Checkpointed, Map):
         every = self.config.select_every
         if not every or not self.closes_loops or self._graph.count % every:
             return
-        solution = selected_solution(self._graph, self._log)
+        solution = selected_solution(self._graph, self._log, self._hypotheses)
         if solution is None:
             return
         self._log, self._graph.cut = solution.log, solution.cut

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ratslam.core.growable_array import GrowableArray
+from ratslam.keyframes.claimed_revisits import claims_cost
 from ratslam.keyframes.closure_selection import (
     ACCEPTED_WEIGHT,
     FINE,
@@ -21,6 +22,7 @@ from ratslam.keyframes.closure_selection import (
 )
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import ClosureLog, Verdict
+from ratslam.keyframes.map_hypotheses import MapHypotheses
 from ratslam.keyframes.odometry_breaks import find_break
 from ratslam.keyframes.optimizer import CalibrationPrior, MapFit, OdometryChain, robust_cost, solve
 from ratslam.keyframes.pieces import number_pieces
@@ -60,7 +62,7 @@ def cheapest_map(graph: KeyframeGraph, log: ClosureLog, priors: Sequence[Calibra
     return MapSolution(fit, log, graph.cut)
 
 
-def selected_solution(graph: KeyframeGraph, log: ClosureLog) -> MapSolution | None:
+def selected_solution(graph: KeyframeGraph, log: ClosureLog, hypotheses: MapHypotheses) -> MapSolution | None:
     """The map with the closure sequences that are best accepted together; None if none has the evidence of an
     accepted one: weak sequences count only beside it, as images without information give a few of them."""
     config, log, cut = graph.config, deepcopy(log), deepcopy(graph.cut)
@@ -75,7 +77,7 @@ def selected_solution(graph: KeyframeGraph, log: ClosureLog) -> MapSolution | No
     cut.rows[:] = -1
     for sequence in np.flatnonzero(log.verdicts() != Verdict.UNDONE).tolist():
         log.judge(sequence, Verdict.ACCEPTED if candidates[sequence] else Verdict.OPEN)
-    selection = _select(graph, log, cut, sequences, earlier)
+    selection = _select(graph, log, cut, sequences, earlier, hypotheses)
     for sequence, weight in zip(sequences.tolist(), selection.fit.weights.tolist(), strict=True):
         log.judge(sequence, Verdict.ACCEPTED if weight > ACCEPTED_WEIGHT else Verdict.OPEN)
     for frame, sequence in selection.cuts:
@@ -92,15 +94,15 @@ def _select(
     cut: GrowableArray,
     sequences: np.ndarray,
     earlier: tuple[tuple[int, int], ...],
+    hypotheses: MapHypotheses,
 ) -> Selection:
     """Selects among the sequences `sequences`, starting from the current map and from dead reckoning. The
     odometry is cut only if the robot may be carried."""
     problem, pose = graph.problem(log, cut), graph.pose.rows
-    chain = problem.chain
-    reckoned = _dead_reckoned(graph, chain, graph.prior)
     present = graph.fit()._replace(poses=pose.copy())
-    case = SelectionProblem(problem, log.scores()[sequences], *log.spans()[sequences].T)
-    starts = [present, reckoned]
+    first, last = log.spans()[sequences].T
+    case = SelectionProblem(problem, log.scores()[sequences], first, last, partial(claims_cost, graph))
+    starts = [present, *hypotheses.follow(case, sequences)]
     if not graph.config.may_be_carried:
         return select_closures(case, starts)
     return select_closures_and_cuts(case, starts, partial(find_break, graph), earlier)

@@ -1,0 +1,117 @@
+"""Several maps that follow the closure sequences in the order of time.
+
+The cost of a selection of closures has many local minima: a wrong sequence accepted early bends the map so
+far that the true ones after it look wrong. So a few maps are kept side by side. Each takes every new
+sequence as it fits, and once more with the sequence forced to fit, which then has to pay for itself; the
+cheapest maps are kept. Source: a beam search over the hypotheses of multiple hypothesis tracking (Reid
+1979); that its nodes are robust maps is ours."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ratslam.core.checkpoint import Checkpointed
+from ratslam.keyframes.closure_selection import (
+    FINE,
+    STEPS,
+    SelectionProblem,
+    choose_sequences,
+)
+from ratslam.keyframes.optimizer import LoopClosures, MapFit, MapProblem, robust_cost, solve
+from tactile.base.se2 import integrate, wrap
+
+KEPT = 5
+"""Number of maps."""
+FITS = 0.5
+"""Robust weight below which a new sequence is also forced to fit."""
+FORCED = 1e3
+"""Factor on the robust scale of a forced sequence."""
+ALIKE = 3.0
+"""Standard deviations of a closure within which all keyframes of maps that count as one lie."""
+
+
+class MapHypotheses(Checkpointed):
+    """The maps kept, cheapest first."""
+
+    VALUES = ("_poses", "_calibration", "_followed")
+
+    def __init__(self) -> None:
+        self._poses = np.zeros((1, 1, 3))  # [K, N, 3]
+        self._calibration = np.zeros((1, 2))  # [K, 2] heading bias and turn error
+        self._followed = np.zeros(0, np.int64)  # sequences
+
+    def follow(self, case: SelectionProblem, sequences: np.ndarray) -> list[MapFit]:
+        """The maps, cheapest first, after the sequences that they have not followed yet.
+
+        Args:
+            case: with R sequences. sequences: [R] their numbers.
+        """
+        self._extend(case.measurements)
+        known = np.isin(sequences, self._followed)
+        fits = self._fits(int(known.sum()))
+        for k in np.flatnonzero(~known).tolist():
+            fits = _branch(fits, case, known, k)
+            known[k] = True
+        self._followed = sequences.astype(np.int64)
+        self._poses = np.stack([fit.poses for fit in fits])
+        self._calibration = np.array([[fit.bias, fit.turn_error] for fit in fits])
+        return fits
+
+    def _fits(self, count: int) -> list[MapFit]:
+        weights = np.ones(count)
+        return [
+            MapFit(poses, bias, weights, turn_error)
+            for poses, (bias, turn_error) in zip(self._poses, self._calibration.tolist(), strict=True)
+        ]
+
+    def _extend(self, problem: MapProblem) -> None:
+        """Continues all maps by odometry; the first one starts with the means of the calibration."""
+        since = self._poses.shape[1] - 1
+        if not since:
+            self._calibration = np.array([[problem.prior.bias, problem.prior.turn_error]])
+        onwards = [integrate(fit.corrected(problem.chain)[since:], fit.poses[-1]) for fit in self._fits(0)]
+        self._poses = np.concatenate([self._poses, np.stack(onwards)], axis=1)
+
+
+def _branch(fits: list[MapFit], case: SelectionProblem, known: np.ndarray, new: int) -> list[MapFit]:
+    """The cheapest maps after one more sequence.
+
+    Args:
+        known: [R] bool, sequences that the maps have followed.
+    """
+    known = known.copy()
+    known[new] = True
+    problem = case.measurements
+    part = problem._replace(closures=choose_sequences(problem.closures, known))
+    at = int(known[:new].sum())
+    maps = []
+    for fit in fits:
+        free = solve(fit, part, STEPS, FINE)
+        maps.append(free)
+        if free.weights[at] < FITS:
+            forced = solve(free, part._replace(closures=_force(part.closures, at)), STEPS, FINE)
+            maps.append(solve(forced, part, STEPS, FINE))
+    costs = [robust_cost(fit, part) for fit in maps]
+    different: list[MapFit] = []
+    for k in np.argsort(costs, kind="stable").tolist():
+        if not any(_is_alike(maps[k], other, part.closures) for other in different):
+            different.append(maps[k])
+    if len(different) == 1:
+        return different
+    return sorted(different, key=lambda fit: robust_cost(fit, part) + case.views_cost(fit.poses))[:KEPT]
+
+
+def _force(closures: LoopClosures, sequence: int) -> LoopClosures:
+    """The closures, one sequence of which can hardly be refused."""
+    factor = np.ones(len(closures.scale))
+    factor[sequence] = FORCED
+    scale = closures.scale * factor
+    limit = np.maximum(closures.cost_limit, np.where(factor > 1, 1.5 * scale, 0.0))
+    return closures._replace(scale=scale, cost_limit=limit)
+
+
+def _is_alike(one: MapFit, other: MapFit, closures: LoopClosures) -> bool:
+    """Whether no keyframe differs by more than `ALIKE` standard deviations of a closure."""
+    apart = one.poses - other.poses
+    apart[:, 2] = wrap(apart[:, 2])
+    return bool((apart**2 / closures.variance).sum(axis=1).max() < ALIKE**2)
