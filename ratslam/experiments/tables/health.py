@@ -52,6 +52,7 @@ TOUCH: dict[str, dict[str, Any]] = {
     "main": MAIN,
     "exploration": EXPLORATION,
     "open arena": MAIN | EXPLORATION | {"maze": {"share": 0.08}},
+    "tree": MAIN | EXPLORATION | {"maze": {"kind": "tree"}},
     "good odometry": EXPLORATION | _noise(0.25),
     "white": ROWS["white"].simulation,
     "noise x 2": MAIN | _noise(2.0),
