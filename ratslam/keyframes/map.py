@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import deepcopy
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import networkx
 import numpy as np
@@ -32,6 +31,7 @@ from ratslam.keyframes.map_health import DOUBTED, dead_reckoned, worse_than_odom
 from ratslam.keyframes.map_hypotheses import MapHypotheses
 from ratslam.keyframes.map_solution import MapSolution, selected_solution, solution_pieces, solved_map
 from ratslam.keyframes.optimizer import CalibrationPrior, MapFit
+from ratslam.keyframes.travel import HALT
 from ratslam.keyframes.verification import continues_sequence
 from ratslam.pose_graph import Edges
 from ratslam.pose_graph.io import write_g2o, write_json
@@ -44,17 +44,6 @@ CONFIRMED_MASS, CONFIRMED_WEIGHT = 0.95, 0.5
 
 DOUBT_EVERY = 50
 """Keyframes between two judgements of the present map."""
-
-
-class Travel(NamedTuple):
-    """Odometry since the newest keyframe: motion [3] (m, m, rad), distance m, sum of absolute turns rad."""
-
-    motion: np.ndarray
-    length: float
-    turn: float
-
-
-HALT = Travel(np.zeros(3), 0.0, 0.0)
 
 
 class KeyframeMap(Checkpointed, Map):
@@ -184,7 +173,7 @@ class KeyframeMap(Checkpointed, Map):
 
     def update(self, observation: Observation, estimate: Estimate, evidence: Evidence) -> Estimate:
         """Moves by the odometry; a view that became a keyframe is added, judged and given an experience."""
-        self._advance(observation.odometry)
+        self._travel = self._travel.onwards(observation.odometry)
         change = self._experiences.stay()
         if int(evidence.keyframe) >= 0:
             self._append(observation)
@@ -218,21 +207,10 @@ class KeyframeMap(Checkpointed, Map):
     def _solve_finally(self) -> MapSolution:
         if not self.closes_loops:
             return solved_map(self._graph, self._log)
-        selected = (
-            selected_solution(self._graph, self._log, deepcopy(self._hypotheses))
-            if self.config.select_every
-            else None
-        )
-        return selected or self._acceptance.solution(self._graph, self._log)
-
-    def _advance(self, odometry: Any) -> None:
-        moved = np.array([float(odometry.dx), float(odometry.dy), float(odometry.dtheta)])
-        if not np.isfinite(moved).all():
-            return  # the kernel reports it as an outcome; NaN would spoil the whole map
-        length, travel = float(np.hypot(moved[0], moved[1])), self._travel
-        self._travel = Travel(
-            compose(travel.motion, moved), travel.length + length, travel.turn + abs(moved[2])
-        )
+        graph, log, selected = self._graph, self._log, None
+        if self.config.select_every:
+            selected = selected_solution(graph, log, deepcopy(self._hypotheses))
+        return selected or self._acceptance.solution(graph, log)
 
     def _append(self, observation: Observation) -> None:
         motion, length, turn = self._travel

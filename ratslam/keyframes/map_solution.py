@@ -96,7 +96,7 @@ def _select(
     earlier: tuple[tuple[int, int], ...],
     hypotheses: MapHypotheses,
 ) -> Selection:
-    """Selects among the sequences `sequences`, starting from the current map and from dead reckoning. The
+    """Selects among the sequences `sequences`, starting from the current map and from the hypotheses. The
     odometry is cut only if the robot may be carried."""
     problem, pose = graph.problem(log, cut), graph.pose.rows
     present = graph.fit()._replace(poses=pose.copy())
