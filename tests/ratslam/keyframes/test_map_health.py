@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ratslam.keyframes import claimed_revisits as revisits
 from ratslam.keyframes.appearance import Appearance, LabelAppearance, ViewAppearance
-from ratslam.keyframes.claimed_revisits import CONTROLS, claimed_revisits
+from ratslam.keyframes.claimed_revisits import CONTROLS, claimed_revisits, claims_cost
 from ratslam.keyframes.config import FULL, KeyframeMapConfig
 from ratslam.keyframes.keyframe_graph import NO_ROBUST_SCALE, KeyframeGraph
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
@@ -101,6 +102,37 @@ def test_poses_alike_by_chance_are_not_borne_out():
     """Views without information are as like here as elsewhere."""
     graph = drive(LabelAppearance(), places=1)
     assert np.all(claimed_revisits(graph, TRUTH, 300).likeness == 0.5)
+
+
+TURNED_LAPS = np.stack([TRUTH[(k + 7 * (k // LAP)) % LAP] for k in range(len(TRUTH))])
+"""Poses by which every lap begins seven places ahead of the one before."""
+
+
+def test_right_poses_cost_less_than_wrong_ones(graph):
+    right, wrong = claims_cost(graph, TRUTH), claims_cost(graph, TURNED_LAPS)
+    false = claims_cost(graph, solution(graph, closed(FALSE)).fit.poses)
+    assert right < 0 < wrong
+    assert right < false
+    assert claims_cost(graph, solution(graph, closed(CLEAN)).fit.poses) < false
+
+
+def test_poses_that_claim_nothing_cost_nothing(graph):
+    apart = TRUTH + np.arange(len(TRUTH))[:, None] * [1.0, 0.0, 0.0]
+    assert claims_cost(graph, apart) == 0.0
+    assert claims_cost(graph, TRUTH[: GUARD + 1]) == 0.0
+
+
+@pytest.mark.parametrize("poses", [TRUTH, TURNED_LAPS], ids=["right", "wrong"])
+@pytest.mark.parametrize("motion", [(3.0, -2.0, 0.0), (0.0, 0.0, 2.0), (-1.0, 5.0, -3.0)])
+def test_a_map_moved_as_a_whole_costs_the_same(graph, poses, motion):
+    moved = compose(np.array(motion), poses)
+    assert claims_cost(graph, moved) == pytest.approx(claims_cost(graph, poses), rel=1e-9)
+
+
+def test_the_cost_is_that_of_all_keyframes_however_many_are_examined(graph, monkeypatch):
+    cost = claims_cost(graph, TRUTH)
+    monkeypatch.setattr(revisits, "JUDGED", 60)
+    assert claims_cost(graph, TRUTH) == pytest.approx(cost, rel=0.1)
 
 
 def test_the_statistics_do_not_depend_on_where_the_map_lies(graph):
