@@ -16,6 +16,7 @@ from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.live_filter import LEAST_WEIGHT, LiveFilter
 from ratslam.keyframes.loop_closures import Candidate
 from tactile.base.se2 import between, compose, wrap
+from tests.ratslam.keyframes.test_closure_odds import LAP, STEP, drive, new_map, sequence
 
 CELL, SECTOR = 0.05, 2 * np.pi / 12
 KNOWN = 8
@@ -218,3 +219,23 @@ def test_a_restored_filter_continues_bit_for_bit():
         live.advance(graph)
     assert np.array_equal(one.correct(graph, claim(graph, 1), 1.0), two.correct(graph, claim(graph, 1), 1.0))
     assert np.array_equal(one.covariance, two.covariance)
+
+
+# In the map
+
+
+def ahead(recalled: dict[int, tuple[int, float]], solve_every: int) -> float:
+    """How far the newest keyframe lies ahead of the one that it truly lies at, m."""
+    settings = {"solve_every": solve_every, "robust_least": 1e3, "robust_most": 1e4}
+    graph = drive(new_map(**settings), recalled, last=LAP + 18).keyframes()
+    newest = graph.count - 1
+    return float(between(graph.pose.rows[newest - LAP], graph.pose.rows[newest])[0])
+
+
+def test_the_map_follows_an_accepted_sequence_between_two_optimisations():
+    """The sequence comes to claim that the robot is a step ahead; another that stops before it does not."""
+    begun = sequence(LAP + 2, 2, 8, 4.0)
+    shifted = begun | sequence(LAP + 10, 11, 8, 4.0)
+    assert abs(ahead(begun, 1000)) < 0.1 * STEP
+    assert ahead(shifted, 1) > 0.4 * STEP  # each closure optimised
+    assert 0.4 * STEP < ahead(shifted, 1000) < STEP
