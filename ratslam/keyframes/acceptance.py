@@ -38,7 +38,7 @@ class Acceptance(Checkpointed, ABC):
 
 
 def believe(graph: KeyframeGraph, log: ClosureLog, prior: CalibrationPrior) -> None:
-    """Takes over a prior of the heading bias; the poses follow it until a closure fixes them."""
+    """Takes over a prior of the calibration; the poses follow its means until a closure fixes them."""
     graph.prior = prior
     means = prior.bias, prior.turn_error
     if not len(log.accepted_rows()) and (graph.bias, graph.turn_error) != means:

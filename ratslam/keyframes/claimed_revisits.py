@@ -20,12 +20,10 @@ FACING = float(np.cos(0.5))
 """Cosine of the largest difference in heading of two keyframes that face alike."""
 CONTROLS = np.arange(1, 9) / 9
 """Shares of the older keyframes by which those near a keyframe are moved on in memory, as controls."""
-
 JUDGED = 150
 """Largest number of keyframes by whose claims a map is compared with others."""
 SHAPE, DOUBTFUL = 4.0, 0.05
 """The likeness of right claims has the density `SHAPE` u^(`SHAPE` - 1), and a share of uniform ones."""
-
 ALONE = 5.0
 """Number of successive keyframes whose views count as one, because they are alike."""
 

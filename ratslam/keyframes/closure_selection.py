@@ -37,6 +37,7 @@ LOOSE = 1e4
 
 
 ViewsCost = Callable[[np.ndarray], float]
+"""What the views say against poses [N, 3] of the keyframes, chi-square."""
 
 
 class SelectionProblem(NamedTuple):
@@ -88,8 +89,10 @@ def select_closures_and_cuts(
         starts: see `select_closures`. find: see `FindCut`. earlier: cuts (keyframe, sequence) of the current
             map.
     """
-    best = optimise_with_cuts(case, starts[0], earlier)
-    return _with_cuts(case, min(best, select_closures(case, starts), key=_cost), find)
+    best = select_closures(case, starts)
+    if earlier:
+        best = min(optimise_with_cuts(case, starts[0], earlier), best, key=_cost)
+    return _with_cuts(case, best, find)
 
 
 def _cost(selection: Selection) -> float:

@@ -92,13 +92,13 @@ def _branch(fits: list[MapFit], case: SelectionProblem, known: np.ndarray, new: 
             forced = solve(free, part._replace(closures=_force(part.closures, at)), STEPS, FINE)
             maps.append(solve(forced, part, STEPS, FINE))
     costs = [robust_cost(fit, part) for fit in maps]
-    different: list[MapFit] = []
+    different: list[int] = []
     for k in np.argsort(costs, kind="stable").tolist():
-        if not any(_is_alike(maps[k], other, part.closures) for other in different):
-            different.append(maps[k])
-    if len(different) == 1:
-        return different
-    return sorted(different, key=lambda fit: robust_cost(fit, part) + case.views_cost(fit.poses))[:KEPT]
+        if not any(_is_alike(maps[k], maps[other], part.closures) for other in different):
+            different.append(k)
+    if len(different) > 1:  # the views, dearer to ask, only where there is a choice
+        different.sort(key=lambda k: costs[k] + case.views_cost(maps[k].poses))
+    return [maps[k] for k in different[:KEPT]]
 
 
 def _force(closures: LoopClosures, sequence: int) -> LoopClosures:
