@@ -21,7 +21,7 @@ from ratslam.keyframes.optimizer import (
     solve,
 )
 from ratslam.pose_graph import Edges
-from tactile.base.se2 import compose, correct_heading, fit_rigid_motion
+from tactile.base.se2 import compose, correct_heading, fit_rigid_motion, integrate
 
 LOOSE = 1e4
 """Standard deviation of odometry across a break, cells and rad."""
@@ -87,11 +87,17 @@ class KeyframeGraph(Checkpointed):
         """Motions [..., 3] over distances [...] without the systematic errors of the odometry."""
         return correct_heading(motion, length, self.bias, self.turn_error)
 
+    def dead_reckoned(self, bias: float = 0.0, turn_error: float = 0.0) -> np.ndarray:
+        """[N, 3] poses by odometry with this calibration, rad/m and rad/rad, from the first keyframe's."""
+        first = self.pose.rows[:1]
+        if not len(first):
+            return first
+        motion = correct_heading(self.motion.rows[1:], self.length.rows[1:], bias, turn_error)
+        return np.concatenate([first, integrate(motion, first[0])])
+
     def dead_reckon(self) -> None:
-        """Replaces all poses by odometry corrected by the current bias."""
-        motion = self.correct(self.motion.rows, self.length.rows)
-        for k in range(1, len(motion)):
-            self.pose.rows[k] = compose(self.pose.rows[k - 1], motion[k])
+        """Replaces all poses by odometry with the current calibration."""
+        self.pose.rows[:] = self.dead_reckoned(self.bias, self.turn_error)
 
     def move_to(self, fit: MapFit) -> None:
         """Takes over a fit, moved as a whole so that the keyframes move as little as possible."""

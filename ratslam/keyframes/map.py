@@ -27,7 +27,7 @@ from ratslam.keyframes.experiences import Experiences
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.live_filter import LiveFilter
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict, write_closures
-from ratslam.keyframes.map_health import DOUBTED, dead_reckoned, worse_than_odometry
+from ratslam.keyframes.map_health import DOUBTED, worse_than_odometry
 from ratslam.keyframes.map_hypotheses import MapHypotheses
 from ratslam.keyframes.map_solution import MapSolution, selected_solution, solution_pieces, solved_map
 from ratslam.keyframes.optimizer import CalibrationPrior, MapFit
@@ -312,7 +312,7 @@ class KeyframeMap(Checkpointed, Map):
         """The map's poses, or those of raw odometry where the map is doubted."""
         if self.final_doubt() <= DOUBTED:
             return self.solution().fit
-        return MapFit(dead_reckoned(self._graph), 0.0, np.zeros(0))
+        return MapFit(self._graph.dead_reckoned(), 0.0, np.zeros(0))
 
     def _forget_solution(self) -> None:
         self._solution = self._worse = None

@@ -17,7 +17,7 @@ from ratslam.keyframes.closure_selection import ACCEPTED_WEIGHT
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import ClosureLog, Verdict
 from ratslam.keyframes.map_solution import MapSolution
-from tactile.base.se2 import between, integrate, wrap
+from tactile.base.se2 import between, wrap
 
 INTERCEPT = -0.69
 WEIGHTS = np.array([-1.22, -0.03, 0.46, 0.91, 5.19])
@@ -66,7 +66,7 @@ def worse_than_odometry(graph: KeyframeGraph, solution: MapSolution) -> float:
 
 def health_features(graph: KeyframeGraph, solution: MapSolution) -> HealthFeatures:
     """The statistics of a map; of at least two keyframes."""
-    reckoned = dead_reckoned(graph)
+    reckoned = graph.dead_reckoned()
     of_map = _claims_ratio(graph, solution.fit.poses)
     of_odometry = _claims_ratio(graph, reckoned)
     strain, angle = _strain(graph, solution), graph.sector_angle
@@ -76,12 +76,6 @@ def health_features(graph: KeyframeGraph, solution: MapSolution) -> HealthFeatur
     return HealthFeatures(
         of_map - of_odometry, of_odometry, strain, strain * of_odometry, unexplained - before
     )
-
-
-def dead_reckoned(graph: KeyframeGraph) -> np.ndarray:
-    """[N, 3] the keyframes' poses by raw odometry, from the first one's."""
-    first = graph.pose.rows[:1]
-    return np.concatenate([first, integrate(graph.motion.rows[1:], first[0])]) if len(first) else first
 
 
 def _claims_ratio(graph: KeyframeGraph, poses: np.ndarray) -> float:

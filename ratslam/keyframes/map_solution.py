@@ -24,9 +24,8 @@ from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import ClosureLog, Verdict
 from ratslam.keyframes.map_hypotheses import MapHypotheses
 from ratslam.keyframes.odometry_breaks import find_break
-from ratslam.keyframes.optimizer import CalibrationPrior, MapFit, OdometryChain, robust_cost, solve
+from ratslam.keyframes.optimizer import CalibrationPrior, MapFit, robust_cost, solve
 from ratslam.keyframes.pieces import number_pieces
-from tactile.base.se2 import integrate
 
 
 class MapSolution(NamedTuple):
@@ -55,7 +54,7 @@ def cheapest_map(graph: KeyframeGraph, log: ClosureLog, priors: Sequence[Calibra
     """The map of least cost with the closures accepted so far, reached from the current poses and from dead
     reckoning with the mean of each of these calibrations. The log takes over its robust weights."""
     problem = graph.problem(log, graph.cut)
-    starts = [graph.fit(), *(_dead_reckoned(graph, problem.chain, prior) for prior in priors)]
+    starts = [graph.fit(), *(_dead_reckoned(graph, prior) for prior in priors)]
     fits = [solve(start, problem, 2 * graph.config.settling) for start in starts]
     fit = min(fits, key=lambda fit: robust_cost(fit, problem))
     log.weigh(fit.weights)
@@ -108,8 +107,7 @@ def _select(
     return select_closures_and_cuts(case, starts, partial(find_break, graph), earlier)
 
 
-def _dead_reckoned(graph: KeyframeGraph, chain: OdometryChain, prior: CalibrationPrior) -> MapFit:
+def _dead_reckoned(graph: KeyframeGraph, prior: CalibrationPrior) -> MapFit:
     """Odometry corrected by the mean of a calibration, from the first keyframe."""
-    first = graph.pose.rows[:1]
-    fit = MapFit(first, prior.bias, np.zeros(0), prior.turn_error)
-    return fit._replace(poses=np.concatenate([first, integrate(fit.corrected(chain), first[0])]))
+    poses = graph.dead_reckoned(prior.bias, prior.turn_error)
+    return MapFit(poses, prior.bias, np.zeros(0), prior.turn_error)

@@ -30,7 +30,7 @@ from ratslam.experiments.trials.recording_trial import run_recording
 from ratslam.experiments.trials.spoilt_maps import spoilt_maps
 from ratslam.keyframes.closure_selection import ACCEPTED_WEIGHT
 from ratslam.keyframes.map import KeyframeMap
-from ratslam.keyframes.map_health import DOUBTED, INTERCEPT, WEIGHTS, dead_reckoned, health_features
+from ratslam.keyframes.map_health import DOUBTED, INTERCEPT, WEIGHTS, health_features
 from robot.sources.odometry import OdometryConfig
 from robot.sources.perturbation import miscalibrate
 
@@ -128,7 +128,7 @@ def judge_session(task: HealthTask) -> JudgedMaps:
             return energy_all_pairs(poses[known], truth[known]).total
         return ate(poses[known], truth[known])
 
-    before = error(dead_reckoned(graph))
+    before = error(graph.dead_reckoned())
     limit = HARM_FACTOR * before + (0.0 if touch else HARM_MARGIN)
     rows = []
     for _, solution in spoilt_maps(map, truth, task.number):

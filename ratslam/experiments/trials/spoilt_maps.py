@@ -14,7 +14,6 @@ import numpy as np
 from ratslam.keyframes.keyframe_graph import NO_ROBUST_SCALE, KeyframeGraph
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
 from ratslam.keyframes.map import KeyframeMap
-from ratslam.keyframes.map_health import dead_reckoned
 from ratslam.keyframes.map_solution import MapSolution
 from ratslam.keyframes.optimizer import MapFit, robust_cost, solve
 from tactile.base.random_streams import stream
@@ -116,7 +115,7 @@ def add_false_sequence(
         whether there was one among `ATTEMPTS` random pairs.
     """
     found: list[tuple[float, int, int]] = []
-    first, reckoned = graph.guard + length + 5, dead_reckoned(graph)
+    first, reckoned = graph.guard + length + 5, graph.dead_reckoned()
     if graph.count - length <= first:
         return False
     for _ in range(ATTEMPTS):
@@ -144,7 +143,7 @@ def solved_anew(graph: KeyframeGraph, log: ClosureLog, final: MapSolution, robus
     if not robust:
         scale = np.full_like(problem.closures.scale, NO_ROBUST_SCALE)
         problem = problem._replace(closures=problem.closures._replace(scale=scale, cost_limit=np.inf))
-    starts = [final.fit, MapFit(dead_reckoned(graph), 0.0, np.zeros(0))]
+    starts = [final.fit, MapFit(graph.dead_reckoned(), 0.0, np.zeros(0))]
     fits = [solve(start, problem, STEPS, FINE) for start in starts]
     fit = min(fits, key=lambda fit: robust_cost(fit, problem))
     log.weigh(fit.weights)

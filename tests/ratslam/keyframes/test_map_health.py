@@ -11,7 +11,7 @@ from ratslam.keyframes.claimed_revisits import CONTROLS, claimed_revisits, claim
 from ratslam.keyframes.config import FULL, KeyframeMapConfig
 from ratslam.keyframes.keyframe_graph import NO_ROBUST_SCALE, KeyframeGraph
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
-from ratslam.keyframes.map_health import DOUBTED, dead_reckoned, health_features, worse_than_odometry
+from ratslam.keyframes.map_health import DOUBTED, health_features, worse_than_odometry
 from ratslam.keyframes.map_solution import MapSolution, solved_map
 from ratslam.keyframes.optimizer import solve
 from tactile.base.se2 import between, compose
@@ -147,4 +147,4 @@ def test_controls_lie_among_older_keyframes():
 
 def test_dead_reckoning_adds_up_raw_odometry(graph):
     graph.bias = 0.3
-    assert dead_reckoned(graph) == pytest.approx(graph.pose.rows)
+    assert graph.dead_reckoned() == pytest.approx(graph.pose.rows)

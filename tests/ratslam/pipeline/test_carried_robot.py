@@ -1,0 +1,87 @@
+"""Touch maps of a robot that was carried: the odometry is cut there, only if it may be."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ratslam.core.session import Session
+from tests.ratslam.pipeline.touch_walks import (
+    WIDE,
+    Walk,
+    dead_reckoning,
+    empty_carried_session,
+    empty_session,
+    follow,
+    kidnap,
+    metric,
+    simulate_walk,
+    true_share,
+)
+
+
+def test_the_odometry_is_cut_where_the_robot_was_kidnapped() -> None:
+    found = []
+    for seed in range(8):
+        walk = kidnap(simulate_walk(seed, maze=WIDE), 240, 45)
+        found_map = follow(empty_carried_session(), walk.readings)
+        assert true_share(found_map, walk.truth) >= 0.95
+        near = len(found_map.cuts) == 1 and abs(found_map.cuts[0] - 240) <= 5
+        right = metric(found_map.path, walk.truth) < 0.25 * metric(dead_reckoning(walk.readings), walk.truth)
+        found.append([near, right])
+    assert (np.sum(found, axis=0) >= [5, 7]).all()
+
+
+def test_the_odometry_of_a_robot_that_is_never_carried_is_not_cut() -> None:
+    for seed in range(2):
+        session = empty_session()
+        walk = kidnap(simulate_walk(seed, maze=WIDE), 240, 45)
+        for start in range(0, len(walk.readings), 50):
+            assert follow(session, walk.readings[start : start + 50]).cuts == []
+            assert (session.map.arrays()["graph/cut"] == -1).all()
+            assert not session.map.pieces().any()
+
+
+def kidnapped_session() -> tuple[Walk, Session]:
+    walk = kidnap(simulate_walk(4, maze=WIDE), 240, 45)
+    return walk, empty_carried_session()
+
+
+@pytest.mark.parametrize("every", [7, 100])
+def test_reading_the_map_does_not_change_it(every: int) -> None:
+    walk, session = kidnapped_session()
+    expected = follow(session, walk.readings)
+    saved = session.arrays()
+    session = empty_carried_session()
+    for start in range(0, len(walk.readings), every):
+        list(session.replay(walk.readings[start : start + every]))
+        session.map.trajectory()
+        session.map.closures()
+        session.map.graph()
+        session.map.edges()
+    found = follow(session, [])
+    assert np.array_equal(found.path, expected.path)
+    assert np.array_equal(found.closures, expected.closures)
+    again = session.arrays()
+    assert again.keys() == saved.keys()
+    assert all(np.array_equal(again[name], saved[name], equal_nan=True) for name in saved)
+
+
+@pytest.mark.parametrize("stop", [250, 300, 320, 330])
+def test_a_restored_map_with_cuts_continues_as_the_uninterrupted_one(stop: int) -> None:
+    walk, session = kidnapped_session()
+    expected = follow(session, walk.readings)
+    assert expected.cuts
+    whole = session.arrays()
+    session = empty_carried_session()
+    follow(session, walk.readings[:stop])
+    saved = session.arrays()
+    assert (saved["map/graph/cut"] >= 0).any() == (stop >= 320)
+    session = empty_carried_session()
+    follow(session, walk.readings[:50])
+    session.restore(saved)
+    found = follow(session, walk.readings[stop:])
+    assert np.array_equal(found.path, expected.path)
+    assert found.cuts == expected.cuts
+    again = session.arrays()
+    assert all(np.array_equal(again[name], whole[name], equal_nan=True) for name in whole)
