@@ -11,6 +11,7 @@ from ratslam.core.growable_array import GrowableArray
 from ratslam.keyframes.appearance import Appearance
 from ratslam.keyframes.config import Ablation, KeyframeMapConfig
 from ratslam.keyframes.loop_closures import ClosureLog
+from ratslam.keyframes.odometry_noise import HeadingNoise
 from ratslam.keyframes.optimizer import (
     CalibrationPrior,
     LoopClosures,
@@ -41,9 +42,10 @@ class KeyframeGraph(Checkpointed):
             travelled into it, m. turn: [N] sum of absolute turns into it, rad. cut: [N] the closure sequence
             that shows a break of the odometry before the keyframe, -1 for none. bias: heading bias of the
             odometry, rad/m. turn_error: correction of its turns, rad/rad. prior: of both.
+        heading_noise: factor on the variance of its turns.
     """
 
-    VALUES = ("bias", "turn_error", "prior")
+    VALUES = ("bias", "turn_error", "prior", "heading_noise")
 
     def __init__(
         self, config: KeyframeMapConfig, cell: float, appearance: Appearance, guard: int, ablation: Ablation
@@ -57,6 +59,7 @@ class KeyframeGraph(Checkpointed):
         self.cut = GrowableArray((), np.int64)
         self.bias = 0.0
         self.turn_error = 0.0
+        self.heading_noise = HeadingNoise()
         self.prior = CalibrationPrior(0.0, config.bias_sd / cell, 0.0, config.turn_error_sd)
 
     @property
@@ -187,4 +190,4 @@ class KeyframeGraph(Checkpointed):
         along = noise.per_cell**2 * length * cell + (noise.least * cell) ** 2
         heading = noise.heading_per_cell**2 * length / cell + noise.heading_per_radian**2 * turn
         heading = heading + noise.least_heading**2
-        return np.stack([along, along, heading], axis=1)
+        return np.stack([along, along, heading * self.heading_noise.factor], axis=1)

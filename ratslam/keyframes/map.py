@@ -30,6 +30,7 @@ from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict, writ
 from ratslam.keyframes.map_health import DOUBTED, worse_than_odometry
 from ratslam.keyframes.map_hypotheses import MapHypotheses
 from ratslam.keyframes.map_solution import MapSolution, selected_solution, solution_pieces, solved_map
+from ratslam.keyframes.odometry_noise import learn_heading_noise
 from ratslam.keyframes.optimizer import CalibrationPrior, MapFit
 from ratslam.keyframes.travel import HALT
 from ratslam.keyframes.verification import continues_sequence
@@ -290,15 +291,18 @@ class KeyframeMap(Checkpointed, Map):
         return self._since <= 5 * self.cell and variance <= self.config.place_heading**2
 
     def _select(self) -> None:
-        """Every `select_every` keyframes, selects among all sequences anew and takes over the map."""
-        every = self.config.select_every
-        if not every or not self.closes_loops or self._graph.count % every:
+        """Every `select_every` keyframes, selects among all sequences anew, takes over the map and
+        learns the noise of the odometry from it."""
+        every, graph = self.config.select_every, self._graph
+        if not every or not self.closes_loops or graph.count % every:
             return
-        solution = selected_solution(self._graph, self._log, self._hypotheses)
+        solution = selected_solution(graph, self._log, self._hypotheses)
         if solution is None:
             return
-        self._log, self._graph.cut = solution.log, solution.cut
-        self._graph.move_to(solution.fit)
+        self._log, graph.cut = solution.log, solution.cut
+        graph.move_to(solution.fit)
+        problem = graph.problem(self._log, graph.cut)
+        graph.heading_noise = learn_heading_noise(graph.heading_noise, solution.fit, problem)
         self._forget_solution()
 
     def _judge(self) -> None:

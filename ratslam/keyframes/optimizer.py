@@ -121,6 +121,15 @@ def robust_cost(fit: MapFit, problem: MapProblem) -> float:
     return odometry + float(lost.sum()) + float((tight * off**2).sum())
 
 
+def log_evidence(fit: MapFit, problem: MapProblem) -> float:
+    """Log probability of odometry and closures with poses and calibration integrated out, to second order
+    around a fit that solves the problem (Laplace's method); up to a constant that does not depend on the
+    variances of the odometry. -inf where the equations are singular."""
+    information = _System(problem).linearise(fit).log_determinant()
+    spread = float(np.log(problem.chain.variance).sum())
+    return -0.5 * (robust_cost(fit, problem) + information + spread)
+
+
 def _calibration(fit: MapFit, prior: CalibrationPrior) -> tuple[np.ndarray, np.ndarray]:
     """[K] deviation of the free calibration parameters from their prior, and its information."""
     off = [fit.bias - prior.bias, fit.turn_error - prior.turn_error]
@@ -192,6 +201,14 @@ class _Equations(NamedTuple):
 
     def _schur(self, bent: np.ndarray) -> np.ndarray:
         return self.corner - self.border.T @ bent
+
+    def log_determinant(self) -> float:
+        """Of the information of all unknowns; inf where it is singular."""
+        if self.factor is None:
+            return float(np.inf)
+        schur = self._schur(self.factor.solve(self.border))
+        pivots = np.abs(self.factor.U.diagonal())
+        return float(np.log(pivots).sum() + np.linalg.slogdet(schur)[1])
 
     def covariance(self, change: np.ndarray) -> np.ndarray:
         """[n, n] covariance of quantities with derivatives [N - 1, 3, n] by the free keyframes' poses."""

@@ -1,0 +1,59 @@
+"""The heading noise of the odometry, learned from the loop closures of the map.
+
+The noise is a factor on the variance of every turn. Its evidence is the probability of odometry and closures
+with the poses integrated out, to second order around the map (Laplace; MacKay 1992). A factor too small
+makes the closures costly, one too large wastes the odometry. The factor has a log-normal prior, and moves by
+at most `LARGEST_STEP` at a time, because the map changes with it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ratslam.keyframes.optimizer import MapFit, MapProblem, log_evidence, solve
+
+SPREAD = 1.0
+"""Standard deviation of the log of the factor before any closure."""
+LARGEST_STEP = float(np.log(2.0))
+"""Largest change of the log of the factor; also the distance between the factors compared."""
+STEPS = 2
+"""Solver iterations at each factor compared."""
+
+
+class HeadingNoise(NamedTuple):
+    """Log of the factor on the variance of the odometry's turns, and its standard deviation."""
+
+    log_factor: float = 0.0
+    sd: float = SPREAD
+
+    @property
+    def factor(self) -> float:
+        """On the variance."""
+        return float(np.exp(self.log_factor))
+
+
+def learn_heading_noise(noise: HeadingNoise, fit: MapFit, problem: MapProblem) -> HeadingNoise:
+    """The noise after one more map.
+
+    Args:
+        noise: with which `problem` was made. fit: that solves it.
+    """
+    steps = np.array([-LARGEST_STEP, 0.0, LARGEST_STEP])
+    logs = np.array([_log_posterior(noise.log_factor, step, fit, problem) for step in steps])
+    if not np.isfinite(logs).all():
+        return noise
+    slope = (logs[2] - logs[0]) / (2 * LARGEST_STEP)
+    bend = (logs[0] - 2 * logs[1] + logs[2]) / LARGEST_STEP**2
+    if bend >= 0:  # no maximum near by
+        return HeadingNoise(noise.log_factor + float(np.sign(slope)) * LARGEST_STEP, SPREAD)
+    step = float(np.clip(-slope / bend, -LARGEST_STEP, LARGEST_STEP))
+    return HeadingNoise(noise.log_factor + step, float(1 / np.sqrt(-bend)))
+
+
+def _log_posterior(log_factor: float, step: float, fit: MapFit, problem: MapProblem) -> float:
+    chain = problem.chain
+    variance = chain.variance * np.array([1.0, 1.0, np.exp(step)])
+    changed = problem._replace(chain=chain._replace(variance=variance))
+    prior = -0.5 * ((log_factor + step) / SPREAD) ** 2
+    return float(prior + log_evidence(solve(fit, changed, STEPS), changed))
