@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from tactile.base.config import Settings
 
@@ -22,11 +22,29 @@ class KeyframeNoise(Settings):
     """Least standard deviation of heading between two keyframes, rad."""
 
 
+class StartCalibration(Settings):
+    """Calibration of the odometry that the map starts from: `calibration.yaml` of a finished session."""
+
+    heading_bias: float = 0.0
+    """Heading bias, rad/m."""
+    heading_bias_sd: PositiveFloat | None = None
+    """Standard deviation of the heading bias, rad/m; null: `bias_sd` per cell."""
+    turn_error: float = Field(default=0.0, gt=-1.0)
+    """Error of turns, rad/rad."""
+    turn_error_sd: PositiveFloat | None = None
+    """Standard deviation of the error of turns, rad/rad; null: `turn_error_sd` of the map. Turns without a
+    systematic error (`turn_error_sd` 0) have none here either."""
+    heading_noise: PositiveFloat = 1.0
+    """Factor on the variances of heading in `noise`; whiskers learn it."""
+
+
 class KeyframeMapConfig(Settings):
     """Settings of the keyframe map. Lengths are in pose cells."""
 
     noise: KeyframeNoise = KeyframeNoise()
     """Noise of the odometry."""
+    calibration: StartCalibration = StartCalibration()
+    """Calibration of the odometry to start from."""
     bias_from_views: bool = True
     """Whether ordered views give a prior of the heading bias."""
     bias_sd: PositiveFloat = 0.012

@@ -9,9 +9,9 @@ import numpy as np
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.growable_array import GrowableArray
 from ratslam.keyframes.appearance import Appearance
+from ratslam.keyframes.calibration import starting_calibration, starting_noise
 from ratslam.keyframes.config import Ablation, KeyframeMapConfig
 from ratslam.keyframes.loop_closures import ClosureLog
-from ratslam.keyframes.odometry_noise import HeadingNoise
 from ratslam.keyframes.optimizer import (
     CalibrationPrior,
     LoopClosures,
@@ -57,10 +57,9 @@ class KeyframeGraph(Checkpointed):
         self.length = GrowableArray((), np.float64)
         self.turn = GrowableArray((), np.float64)
         self.cut = GrowableArray((), np.int64)
-        self.bias = 0.0
-        self.turn_error = 0.0
-        self.heading_noise = HeadingNoise()
-        self.prior = CalibrationPrior(0.0, config.bias_sd / cell, 0.0, config.turn_error_sd)
+        self.prior = starting_calibration(config, cell)
+        self.bias, self.turn_error = self.prior.bias, self.prior.turn_error
+        self.heading_noise = starting_noise(config)
 
     @property
     def count(self) -> int:
@@ -165,6 +164,11 @@ class KeyframeGraph(Checkpointed):
         fit = self.solve(log, self.config.iterations)
         log.weigh(fit.weights)
         self.move_to(fit)
+
+    def calibration(self, fit: MapFit, log: ClosureLog, cut: GrowableArray) -> CalibrationPrior:
+        """Means and standard deviations of the calibration of a solution."""
+        bias_sd, turn_error_sd = MapCovariance(fit, self.problem(log, cut)).calibration_sd()
+        return CalibrationPrior(fit.bias, bias_sd, fit.turn_error, turn_error_sd)
 
     def map_covariance(self, log: ClosureLog) -> MapCovariance:
         """The covariance of the current map."""

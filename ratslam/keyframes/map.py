@@ -22,6 +22,7 @@ from ratslam.core.growable_array import GrowableArray
 from ratslam.core.types import Estimate
 from ratslam.keyframes.acceptance import Acceptance
 from ratslam.keyframes.appearance import Appearance, ConfirmedPairs
+from ratslam.keyframes.calibration import starting_calibration, write_calibration
 from ratslam.keyframes.config import FULL, Ablation, KeyframeMapConfig
 from ratslam.keyframes.experiences import Experiences
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
@@ -31,7 +32,7 @@ from ratslam.keyframes.map_health import DOUBTED, worse_than_odometry
 from ratslam.keyframes.map_hypotheses import MapHypotheses
 from ratslam.keyframes.map_solution import MapSolution, selected_solution, solution_pieces, solved_map
 from ratslam.keyframes.odometry_noise import learn_heading_noise
-from ratslam.keyframes.optimizer import CalibrationPrior, MapFit
+from ratslam.keyframes.optimizer import MapFit
 from ratslam.keyframes.travel import HALT
 from ratslam.keyframes.verification import continues_sequence
 from ratslam.pose_graph import Edges
@@ -155,10 +156,12 @@ class KeyframeMap(Checkpointed, Map):
         return self._graph.edges(*self.solution())
 
     def files(self) -> dict[str, Callable[[Path], None]]:
-        """Experiences as node-link JSON, keyframes as a g2o graph, and the closures with their evidence."""
+        """Experiences as node-link JSON, keyframes as a g2o graph, the calibration of the odometry, and the
+        closures with their evidence."""
         return {
             "map.json": lambda path: write_json(path, self.graph()),
             "map.g2o": lambda path: write_g2o(path, self.solution().fit.poses, self.edges()),
+            "calibration.yaml": self._write_calibration,
             "closures.csv": lambda path: write_closures(path, self.candidates(), self.keyframe_steps()),
         }
 
@@ -213,6 +216,10 @@ class KeyframeMap(Checkpointed, Map):
             selected = selected_solution(graph, log, deepcopy(self._hypotheses))
         return selected or self._acceptance.solution(graph, log)
 
+    def _write_calibration(self, path: Path) -> None:
+        noise = self._graph.heading_noise if self.config.select_every else None
+        write_calibration(path, self._graph.calibration(*self.solution()), noise)
+
     def _append(self, observation: Observation) -> None:
         motion, length, turn = self._travel
         self._graph.append(self._current_pose(), motion, length, turn)
@@ -228,11 +235,12 @@ class KeyframeMap(Checkpointed, Map):
         config, cell, graph = self.config, self.cell, self._graph
         if not self.closes_loops or not np.isfinite(shown.error) or not config.bias_from_views:
             return
-        value, error = shown
-        shrunk = value * max(0.0, 1 - (config.shrink * error / value) ** 2) if value else 0.0
-        sd = min(np.hypot(error, value - shrunk), 2 * config.bias_sd / cell)
-        sd = max(sd, config.bias_least / cell)
-        prior = CalibrationPrior(shrunk, float(sd), 0.0, config.turn_error_sd)
+        start = starting_calibration(config, cell)
+        off, error = shown.value - start.bias, shown.error
+        shrunk = start.bias + (off * max(0.0, 1 - (config.shrink * error / off) ** 2) if off else 0.0)
+        sd = min(np.hypot(error, shown.value - shrunk), 2 * start.bias_sd)
+        sd = max(sd, min(config.bias_least / cell, start.bias_sd))
+        prior = start._replace(bias=shrunk, bias_sd=float(sd))
         self._acceptance.learn_bias(graph, self._log, prior)
 
     def _confirmed_pairs(self) -> ConfirmedPairs:

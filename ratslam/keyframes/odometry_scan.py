@@ -13,9 +13,10 @@ from ratslam.keyframes.optimizer import CalibrationPrior
 from tactile.base.se2 import wrap
 
 BIAS_SPAN, BIAS_STEPS = 0.06, 241
-"""Largest heading bias of the grid, rad per cell, and number of biases."""
+"""Largest difference of a heading bias of the grid from the prior's, rad per cell, and number of biases."""
 TURN_SPAN, TURN_STEPS = 3.0, 9
-"""Largest turn error of the grid, standard deviations of its prior, and number of turn errors."""
+"""Largest difference of a turn error of the grid from the prior's, standard deviations, and number of turn
+errors."""
 REACH = 3.7
 """Standard deviations of the prior beyond which points of the grid are left out."""
 UNLIKELY = -60.0
@@ -32,9 +33,9 @@ class OdometryScan:
 
     def __init__(self, graph: KeyframeGraph) -> None:
         self._graph = graph
-        bias = np.linspace(-BIAS_SPAN, BIAS_SPAN, BIAS_STEPS) / graph.cell
-        sd = graph.prior.turn_error_sd
-        turn = np.linspace(-TURN_SPAN, TURN_SPAN, TURN_STEPS) * sd if sd > 0 else np.zeros(1)
+        prior, spans = graph.prior, np.linspace(-TURN_SPAN, TURN_SPAN, TURN_STEPS)
+        bias = prior.bias + np.linspace(-BIAS_SPAN, BIAS_SPAN, BIAS_STEPS) / graph.cell
+        turn = prior.turn_error + (spans * prior.turn_error_sd if prior.turn_error_sd > 0 else np.zeros(1))
         self.grid = np.stack(np.meshgrid(bias, turn, indexing="ij"), axis=-1).reshape(-1, 2)
         self.clear()
 

@@ -145,6 +145,11 @@ class MapCovariance:
     def __init__(self, fit: MapFit, problem: MapProblem) -> None:
         self._poses, self._equations = fit.poses, _System(problem).linearise(fit)
 
+    def calibration_sd(self) -> tuple[float, float]:
+        """Standard deviations of heading bias, rad/m, and turn error, rad/rad (0 where it is fixed)."""
+        sd = np.sqrt(np.diag(self._equations.calibration_covariance()))
+        return float(sd[0]), float(sd[1]) if len(sd) > 1 else 0.0
+
     def relative(self, i: int, j: int, turn: float) -> np.ndarray:
         """[3, 3] covariance of keyframe j in the frame of keyframe i turned by `turn`."""
         a, b = self._poses[i], self._poses[j]
@@ -209,6 +214,12 @@ class _Equations(NamedTuple):
         schur = self._schur(self.factor.solve(self.border))
         pivots = np.abs(self.factor.U.diagonal())
         return float(np.log(pivots).sum() + np.linalg.slogdet(schur)[1])
+
+    def calibration_covariance(self) -> np.ndarray:
+        """[K, K] of the calibration parameters."""
+        if self.factor is None:
+            return np.full(self.corner.shape, np.inf)
+        return np.linalg.inv(self._schur(self.factor.solve(self.border)))
 
     def covariance(self, change: np.ndarray) -> np.ndarray:
         """[n, n] covariance of quantities with derivatives [N - 1, 3, n] by the free keyframes' poses."""

@@ -19,8 +19,8 @@ from ratslam.cli import main
 
 ROOT = Path(__file__).parents[3]
 FILES = {
-    "online_error.csv", "closures.csv", "config.yaml", "manifest.json", "map.g2o", "map.json", "map.npz",
-    "map.png", "odometry.tum", "online.tum", "scorecard.json", "steps.csv", "trajectory.tum", "truth.tum",
+    "online_error.csv", "calibration.yaml", "closures.csv", "config.yaml", "manifest.json", "map.g2o",
+    "map.json", "map.npz", "map.png", "odometry.tum", "online.tum", "scorecard.json", "steps.csv", "trajectory.tum", "truth.tum",
     "health.json", "map.tum",
 }  # fmt: skip
 SQUARE = (str(ROOT / "configs" / "square.yaml"), "--set", "session.reserve=512")

@@ -24,7 +24,7 @@ SURE = CalibrationPrior(0.0, 1e-6)
 
 def problem_of(stream, factor, prior=SURE, count=24):
     """Two laps whose turns have a variance that is `factor` times the chain's."""
-    truth, chain, closures = laps(stream, count=count)
+    _, chain, closures = laps(stream, count=count)
     sd = np.sqrt(chain.variance) * [1, 1, np.sqrt(factor)]
     chain = chain._replace(motion=chain.motion + sd * stream.normal(0, 1, chain.motion.shape))
     moved = closures._replace(turn=closures.turn + np.sqrt(CLOSURE[2]) * stream.normal(0, 1, len(closures.i)))
