@@ -20,8 +20,8 @@ from ratslam.cli import main
 ROOT = Path(__file__).parents[3]
 FILES = {
     "online_error.csv", "calibration.yaml", "closures.csv", "config.yaml", "manifest.json", "map.g2o",
-    "map.json", "map.npz", "map.png", "odometry.tum", "online.tum", "scorecard.json", "steps.csv", "trajectory.tum", "truth.tum",
-    "health.json", "map.tum",
+    "map.json", "map.npz", "map.png", "odometry.tum", "online.tum", "scorecard.json", "steps.csv",
+    "trajectory.tum", "truth.tum", "health.json", "map.tum",
 }  # fmt: skip
 SQUARE = (str(ROOT / "configs" / "square.yaml"), "--set", "session.reserve=512")
 """A configuration that is compiled once instead of at each power of two."""
