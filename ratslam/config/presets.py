@@ -21,7 +21,7 @@ PRESETS: dict[PresetName, dict[str, dict[str, Any]]] = {
             "enter": 0.2,
         },
         "keyframes": {
-            "noise": {"per_cell": 0.22, "heading_per_cell": 0.045, "heading_per_radian": 0.09},
+            "noise": {"per_cell": 0.22, "heading_per_cell": 0.063, "heading_per_radian": 0.126},
             "bias_sd": 0.001,
             "turn_error_sd": 0.0,
             "min_score": 12.0,

@@ -12,6 +12,7 @@ from ratslam.keyframes.appearance import Appearance
 from ratslam.keyframes.calibration import starting_calibration, starting_noise
 from ratslam.keyframes.config import Ablation, KeyframeMapConfig
 from ratslam.keyframes.loop_closures import ClosureLog
+from ratslam.keyframes.odometry_noise import learn_heading_noise
 from ratslam.keyframes.optimizer import (
     CalibrationPrior,
     LoopClosures,
@@ -169,6 +170,11 @@ class KeyframeGraph(Checkpointed):
         """Means and standard deviations of the calibration of a solution."""
         bias_sd, turn_error_sd = MapCovariance(fit, self.problem(log, cut)).calibration_sd()
         return CalibrationPrior(fit.bias, bias_sd, fit.turn_error, turn_error_sd)
+
+    def learn_noise(self, fit: MapFit, log: ClosureLog) -> None:
+        """Updates the noise of the odometry from a fit that solves the problem of the accepted closures."""
+        start, problem = starting_noise(self.config), self.problem(log, self.cut)
+        self.heading_noise = learn_heading_noise(self.heading_noise, start, fit, problem)
 
     def map_covariance(self, log: ClosureLog) -> MapCovariance:
         """The covariance of the current map."""

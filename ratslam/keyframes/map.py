@@ -31,7 +31,6 @@ from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict, writ
 from ratslam.keyframes.map_health import DOUBTED, worse_than_odometry
 from ratslam.keyframes.map_hypotheses import MapHypotheses
 from ratslam.keyframes.map_solution import MapSolution, selected_solution, solution_pieces, solved_map
-from ratslam.keyframes.odometry_noise import learn_heading_noise
 from ratslam.keyframes.optimizer import MapFit
 from ratslam.keyframes.travel import HALT
 from ratslam.keyframes.verification import continues_sequence
@@ -309,8 +308,7 @@ class KeyframeMap(Checkpointed, Map):
             return
         self._log, graph.cut = solution.log, solution.cut
         graph.move_to(solution.fit)
-        problem = graph.problem(self._log, graph.cut)
-        graph.heading_noise = learn_heading_noise(graph.heading_noise, solution.fit, problem)
+        graph.learn_noise(solution.fit, self._log)
         self._forget_solution()
 
     def _judge(self) -> None:

@@ -3,7 +3,8 @@
 The noise is a factor on the variance of every turn. Its evidence is the probability of odometry and closures
 with the poses integrated out, to second order around the map (Laplace; MacKay 1992). A factor too small
 makes the closures costly, one too large wastes the odometry. The factor has a log-normal prior, and moves by
-at most `LARGEST_STEP` at a time, because the map changes with it."""
+at most `LARGEST_STEP` at a time, because the map changes with it. It does not fall below `LEAST_FACTOR`: closures
+are accepted for agreeing with odometry, so odometry that is believed too much looks good, and refuses true ones."""
 
 from __future__ import annotations
 
@@ -17,6 +18,8 @@ SPREAD = 1.0
 """Standard deviation of the log of the factor before any closure."""
 LARGEST_STEP = float(np.log(2.0))
 """Largest change of the log of the factor; also the distance between the factors compared."""
+LEAST_FACTOR = 0.5
+"""Least factor, of the noise that the map starts from."""
 STEPS = 2
 """Solver iterations at each factor compared."""
 
@@ -33,22 +36,27 @@ class HeadingNoise(NamedTuple):
         return float(np.exp(self.log_factor))
 
 
-def learn_heading_noise(noise: HeadingNoise, fit: MapFit, problem: MapProblem) -> HeadingNoise:
+def learn_heading_noise(
+    noise: HeadingNoise, start: HeadingNoise, fit: MapFit, problem: MapProblem
+) -> HeadingNoise:
     """The noise after one more map.
 
     Args:
-        noise: with which `problem` was made. fit: that solves it.
+        noise: with which `problem` was made. start: that of the first map. fit: that solves the problem.
     """
+    least = start.log_factor + float(np.log(LEAST_FACTOR))
     steps = np.array([-LARGEST_STEP, 0.0, LARGEST_STEP])
-    logs = np.array([_log_posterior(noise.log_factor, step, fit, problem) for step in steps])
+    logs = np.array(
+        [_log_posterior(noise.log_factor - start.log_factor, step, fit, problem) for step in steps]
+    )
     if not np.isfinite(logs).all():
         return noise
     slope = (logs[2] - logs[0]) / (2 * LARGEST_STEP)
     bend = (logs[0] - 2 * logs[1] + logs[2]) / LARGEST_STEP**2
-    if bend >= 0:  # no maximum near by
-        return HeadingNoise(noise.log_factor + float(np.sign(slope)) * LARGEST_STEP, SPREAD)
-    step = float(np.clip(-slope / bend, -LARGEST_STEP, LARGEST_STEP))
-    return HeadingNoise(noise.log_factor + step, float(1 / np.sqrt(-bend)))
+    curved = bend < 0  # else there is no maximum near by
+    step = -slope / bend if curved else np.sign(slope) * LARGEST_STEP
+    moved = noise.log_factor + float(np.clip(step, -LARGEST_STEP, LARGEST_STEP))
+    return HeadingNoise(max(moved, least), float(1 / np.sqrt(-bend)) if curved else SPREAD)
 
 
 def _log_posterior(log_factor: float, step: float, fit: MapFit, problem: MapProblem) -> float:
