@@ -3,8 +3,9 @@
 The noise is a factor on the variance of every turn. Its evidence is the probability of odometry and closures
 with the poses integrated out, to second order around the map (Laplace; MacKay 1992). A factor too small
 makes the closures costly, one too large wastes the odometry. The factor has a log-normal prior, and moves by
-at most `LARGEST_STEP` at a time, because the map changes with it. It does not fall below `LEAST_FACTOR`: closures
-are accepted for agreeing with odometry, so odometry that is believed too much looks good, and refuses true ones."""
+at most `LARGEST_STEP` at a time, because the map changes with it. It does not fall below `LEAST_FACTOR`:
+closures are accepted for agreeing with odometry, so odometry that is believed too much refuses true ones and
+looks good."""
 
 from __future__ import annotations
 
@@ -46,9 +47,8 @@ def learn_heading_noise(
     """
     least = start.log_factor + float(np.log(LEAST_FACTOR))
     steps = np.array([-LARGEST_STEP, 0.0, LARGEST_STEP])
-    logs = np.array(
-        [_log_posterior(noise.log_factor - start.log_factor, step, fit, problem) for step in steps]
-    )
+    off = noise.log_factor - start.log_factor
+    logs = np.array([_log_posterior(off, step, fit, problem) for step in steps])
     if not np.isfinite(logs).all():
         return noise
     slope = (logs[2] - logs[0]) / (2 * LARGEST_STEP)
@@ -59,9 +59,9 @@ def learn_heading_noise(
     return HeadingNoise(max(moved, least), float(1 / np.sqrt(-bend)) if curved else SPREAD)
 
 
-def _log_posterior(log_factor: float, step: float, fit: MapFit, problem: MapProblem) -> float:
+def _log_posterior(off: float, step: float, fit: MapFit, problem: MapProblem) -> float:
     chain = problem.chain
     variance = chain.variance * np.array([1.0, 1.0, np.exp(step)])
     changed = problem._replace(chain=chain._replace(variance=variance))
-    prior = -0.5 * ((log_factor + step) / SPREAD) ** 2
+    prior = -0.5 * ((off + step) / SPREAD) ** 2
     return float(prior + log_evidence(solve(fit, changed, STEPS), changed))

@@ -77,9 +77,8 @@ def test_the_noise_that_was_there_is_found(factor):
 
 def test_it_moves_by_at_most_one_step():
     problem, fit = problem_of(np.random.default_rng(0), 100.0)
-    assert learn_heading_noise(HeadingNoise(), HeadingNoise(), fit, problem).log_factor == pytest.approx(
-        LARGEST_STEP
-    )
+    noise = learn_heading_noise(HeadingNoise(), HeadingNoise(), fit, problem)
+    assert noise.log_factor == pytest.approx(LARGEST_STEP)
 
 
 def test_it_does_not_fall_far_below_the_noise_it_starts_from():
