@@ -43,10 +43,12 @@ class KeyframeGraph(Checkpointed):
             travelled into it, m. turn: [N] sum of absolute turns into it, rad. cut: [N] the closure sequence
             that shows a break of the odometry before the keyframe, -1 for none. bias: heading bias of the
             odometry, rad/m. turn_error: correction of its turns, rad/rad. prior: of both.
-        heading_noise: factor on the variance of its turns.
+        start: the prior before any view.
+        heading_noise: factor on the variance of its turns. reckoned: [3] the newest keyframe by odometry
+            with the calibration of the start.
     """
 
-    VALUES = ("bias", "turn_error", "prior", "heading_noise")
+    VALUES = ("bias", "turn_error", "prior", "heading_noise", "reckoned")
 
     def __init__(
         self, config: KeyframeMapConfig, cell: float, appearance: Appearance, guard: int, ablation: Ablation
@@ -58,9 +60,10 @@ class KeyframeGraph(Checkpointed):
         self.length = GrowableArray((), np.float64)
         self.turn = GrowableArray((), np.float64)
         self.cut = GrowableArray((), np.int64)
-        self.prior = starting_calibration(config, cell)
+        self.start = self.prior = starting_calibration(config, cell)
         self.bias, self.turn_error = self.prior.bias, self.prior.turn_error
         self.heading_noise = starting_noise(config)
+        self.reckoned = np.zeros(3)
 
     @property
     def count(self) -> int:
@@ -80,11 +83,21 @@ class KeyframeGraph(Checkpointed):
 
     def append(self, pose: np.ndarray, motion: np.ndarray, length: float, turn: float) -> None:
         """Adds a keyframe at `pose` [3], reached by `motion` [3]."""
+        self.reckoned = self.reckoned_after(motion, length) if self.count else np.array(pose, float)
         self.pose.append(pose)
         self.motion.append(motion)
         self.length.append(length)
         self.turn.append(turn)
         self.cut.append(-1)
+
+    def pose_after(self, motion: np.ndarray, length: float) -> np.ndarray:
+        """[3] the pose after a motion [3] over a distance since the newest keyframe."""
+        origin = self.pose.rows[-1] if self.count else np.zeros(3)
+        return compose(origin, self.correct(motion, length))
+
+    def reckoned_after(self, motion: np.ndarray, length: float) -> np.ndarray:
+        """The same by odometry with the calibration of the start."""
+        return compose(self.reckoned, correct_heading(motion, length, self.start.bias, self.start.turn_error))
 
     def correct(self, motion: np.ndarray, length: np.ndarray | float) -> np.ndarray:
         """Motions [..., 3] over distances [...] without the systematic errors of the odometry."""

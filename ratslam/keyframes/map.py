@@ -96,9 +96,12 @@ class KeyframeMap(Checkpointed, Map):
         return MapFeedback(graph.pose.rows, graph.bias, graph.turn_error, self._since, *metric)
 
     def pose(self, estimate: Estimate) -> np.ndarray:
-        """[3] the newest keyframe's pose and the motion since."""
+        """[3] the newest keyframe's pose and the motion since; by odometry until a closure is accepted, because
+        a heading bias that only views show may be wrong, and while the map is doubted."""
         del estimate
-        return self._current_pose()
+        believed = (self._log.verdicts() == Verdict.ACCEPTED).any() and self._doubt <= DOUBTED
+        after = self._graph.pose_after if believed else self._graph.reckoned_after
+        return after(self._travel.motion, self._travel.length)
 
     def trajectory(self) -> np.ndarray:
         """[T, 3] every step in the final map, or by odometry where that is likely the better estimate."""
@@ -221,7 +224,7 @@ class KeyframeMap(Checkpointed, Map):
 
     def _append(self, observation: Observation) -> None:
         motion, length, turn = self._travel
-        self._graph.append(self._current_pose(), motion, length, turn)
+        self._graph.append(self._graph.pose_after(motion, length), motion, length, turn)
         self._live.advance(self._graph)
         self._since += length
         self._turned += turn
@@ -338,11 +341,6 @@ class KeyframeMap(Checkpointed, Map):
             return moved
         origin = np.where(frame[:, None] >= 0, fit.poses[np.maximum(frame, 0)], 0.0)
         return compose(origin, moved)
-
-    def _current_pose(self) -> np.ndarray:
-        graph = self._graph
-        origin = graph.pose.rows[-1] if graph.count else np.zeros(3)
-        return compose(origin, graph.correct(self._travel.motion, self._travel.length))
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Replaces the whole state by that of `arrays`."""

@@ -72,3 +72,17 @@ def test_standard_deviations_are_those_of_the_dense_equations(sessions):
     for session in sessions[:3]:
         found = MapCovariance(session.fit, session.problem).calibration_sd()
         assert found == pytest.approx(np.sqrt(np.diag(calibration_covariance(session))), rel=1e-4)
+
+
+def test_the_live_pose_is_odometry_until_a_closure_is_accepted():
+    """Before that, a heading bias is no more than a belief, and it may be wrong."""
+    map = drive(new_map(), {}, last=60)
+    graph = map.keyframes()
+    expected = graph.dead_reckoned()[-1]
+    graph.bias = 0.05
+    graph.dead_reckon()
+    assert graph.pose.rows[-1] != pytest.approx(expected)
+    assert map.pose(None) == pytest.approx(expected)
+    closed = drive(new_map(), TRUE)
+    assert len(closed.closures())
+    assert closed.pose(None) == pytest.approx(closed.keyframes().pose.rows[-1])
