@@ -96,8 +96,8 @@ class KeyframeMap(Checkpointed, Map):
         return MapFeedback(graph.pose.rows, graph.bias, graph.turn_error, self._since, *metric)
 
     def pose(self, estimate: Estimate) -> np.ndarray:
-        """[3] the newest keyframe's pose and the motion since; by odometry until a closure is accepted, because
-        a heading bias that only views show may be wrong, and while the map is doubted."""
+        """[3] the newest keyframe's pose and the motion since; by odometry until a closure is accepted, as
+        a bias that only views show may be wrong, and while the map is doubted."""
         del estimate
         believed = (self._log.verdicts() == Verdict.ACCEPTED).any() and self._doubt <= DOUBTED
         after = self._graph.pose_after if believed else self._graph.reckoned_after
