@@ -97,10 +97,10 @@ class KeyframeMap(Checkpointed, Map):
 
     def pose(self, estimate: Estimate) -> np.ndarray:
         """[3] the newest keyframe's pose and the motion since; by odometry until a closure is accepted, as
-        a bias that only views show may be wrong, and while the map is doubted."""
+        a bias that only views show may be wrong."""
         del estimate
-        believed = (self._log.verdicts() == Verdict.ACCEPTED).any() and self._doubt <= DOUBTED
-        after = self._graph.pose_after if believed else self._graph.reckoned_after
+        confirmed = (self._log.verdicts() == Verdict.ACCEPTED).any()
+        after = self._graph.pose_after if confirmed else self._graph.reckoned_after
         return after(self._travel.motion, self._travel.length)
 
     def trajectory(self) -> np.ndarray:
