@@ -22,7 +22,7 @@ from ratslam.core.growable_array import GrowableArray
 from ratslam.core.types import Estimate
 from ratslam.keyframes.acceptance import Acceptance
 from ratslam.keyframes.appearance import Appearance, ConfirmedPairs
-from ratslam.keyframes.calibration import starting_calibration, write_calibration
+from ratslam.keyframes.calibration import write_calibration
 from ratslam.keyframes.config import FULL, Ablation, KeyframeMapConfig
 from ratslam.keyframes.experiences import Experiences
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
@@ -237,7 +237,7 @@ class KeyframeMap(Checkpointed, Map):
         config, cell, graph = self.config, self.cell, self._graph
         if not self.closes_loops or not np.isfinite(shown.error) or not config.bias_from_views:
             return
-        start = starting_calibration(config, cell)
+        start = graph.start
         off, error = shown.value - start.bias, shown.error
         shrunk = start.bias + (off * max(0.0, 1 - (config.shrink * error / off) ** 2) if off else 0.0)
         sd = min(np.hypot(error, shown.value - shrunk), 2 * start.bias_sd)
