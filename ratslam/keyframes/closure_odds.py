@@ -120,9 +120,8 @@ class AcceptByOdds(Acceptance):
         known = np.isfinite(self._log_ratio.rows[:, near]).all(axis=1)
         sequences = np.flatnonzero(known & (log.verdicts()[: len(known)] != Verdict.UNDONE))
         confirmed = (log.verdicts() == Verdict.ACCEPTED) & (log.sequence_weights() > CONFIRMED_WEIGHT)
-        null = estimate_null(
-            self._control.scores()[~finds_true_places(self._control, log, graph.config.max_gap)]
-        )
+        false = ~finds_true_places(self._control, log, graph.config.max_gap)
+        null = estimate_null(self._control.scores()[false], graph.count)
         score_odds = log_odds(log.scores()[sequences], null, float(confirmed.sum()))
         least = graph.config.bias_least / graph.cell
         grid, ratios = self._scan.grid[near], self._log_ratio.rows[sequences][:, near]

@@ -139,6 +139,13 @@ class KeyframeGraph(Checkpointed):
         loose = np.array([LOOSE * self.cell, LOOSE * self.cell, LOOSE]) ** 2
         return np.where(cut.rows[:, None] >= 0, loose, variance)
 
+    def heading_variance(self, length: np.ndarray | float, turn: np.ndarray | float) -> np.ndarray | float:
+        """Variance of heading by odometry over distances (m) and sums of absolute turns (rad), with the
+        learned noise, rad^2."""
+        noise = self.config.noise
+        driven = noise.heading_per_cell**2 * length / self.cell + noise.heading_per_radian**2 * turn
+        return driven * self.heading_noise.factor
+
     def newest_variance(self) -> np.ndarray:
         """[3] variance of the odometry into the newest keyframe."""
         return self._odometry_variance(self.length.rows[-1:], self.turn.rows[-1:])[0]
@@ -211,6 +218,5 @@ class KeyframeGraph(Checkpointed):
         """[n, 3] variances of odometry over these distances [n] and sums of absolute turns [n]."""
         noise, cell = self.config.noise, self.cell
         along = noise.per_cell**2 * length * cell + (noise.least * cell) ** 2
-        heading = noise.heading_per_cell**2 * length / cell + noise.heading_per_radian**2 * turn
-        heading = heading + noise.least_heading**2
-        return np.stack([along, along, heading * self.heading_noise.factor], axis=1)
+        least = noise.least_heading**2 * self.heading_noise.factor
+        return np.stack([along, along, self.heading_variance(length, turn) + least], axis=1)

@@ -158,12 +158,12 @@ class KeyframeMap(Checkpointed, Map):
         return self._graph.edges(*self.solution())
 
     def files(self) -> dict[str, Callable[[Path], None]]:
-        """Experiences as node-link JSON, keyframes as a g2o graph, the calibration of the odometry, and the
-        closures with their evidence."""
-        return {
+        """Experiences as node-link JSON, keyframes as a g2o graph, the closures with their evidence, and
+        the calibration of the odometry unless the map is doubted."""
+        calibration = {} if self.final_doubt() > DOUBTED else {"calibration.yaml": self._write_calibration}
+        return calibration | {
             "map.json": lambda path: write_json(path, self.graph()),
             "map.g2o": lambda path: write_g2o(path, self.solution().fit.poses, self.edges()),
-            "calibration.yaml": self._write_calibration,
             "closures.csv": lambda path: write_closures(path, self.candidates(), self.keyframe_steps()),
         }
 
@@ -295,9 +295,7 @@ class KeyframeMap(Checkpointed, Map):
 
     def _is_pose_reliable(self) -> bool:
         """Whether the drift since the last closure is small enough to find a known experience by pose."""
-        noise = self.config.noise
-        driven = noise.heading_per_cell**2 * self._since / self.cell
-        variance = driven + noise.heading_per_radian**2 * self._turned
+        variance = self._graph.heading_variance(self._since, self._turned)
         return self._since <= 5 * self.cell and variance <= self.config.place_heading**2
 
     def _select(self) -> None:

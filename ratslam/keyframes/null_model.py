@@ -17,7 +17,9 @@ import numpy as np
 LEAST_SCORE = 2.0
 """Least score, s0, of the sequences of the control that count."""
 PRIOR_COUNT, PRIOR_EXCESS = 5.0, 7.0
-"""The prior of the null: the number of sequences that it counts as, and their mean excess over s0."""
+"""The prior of the excess: the number of sequences that it counts as, and their mean excess over s0."""
+PRIOR_SEQUENCES, PRIOR_KEYFRAMES = 3.0, 16.0
+"""The gamma prior of the rate of the control's sequences: as many sequences in as many keyframes."""
 TRUE_MEAN = 30.0
 """Mean score, m, of true sequences."""
 MIN_TRUE = 5.0
@@ -31,12 +33,13 @@ class NullModel(NamedTuple):
     excess: float
 
 
-def estimate_null(scores: np.ndarray) -> NullModel:
-    """The null from the scores [n] of the control's sequences."""
+def estimate_null(scores: np.ndarray, keyframes: int) -> NullModel:
+    """The null from the scores [n] of the control's sequences in a session of so many keyframes."""
     above = scores[scores >= LEAST_SCORE] - LEAST_SCORE
     excess = (above.sum() + PRIOR_COUNT * PRIOR_EXCESS) / (len(above) + PRIOR_COUNT)
+    number = keyframes * (PRIOR_SEQUENCES + len(above)) / (PRIOR_KEYFRAMES + keyframes)
     # A control stronger than true sequences would let evidence lower the odds.
-    return NullModel(max(float(len(above)), PRIOR_COUNT), min(float(excess), TRUE_MEAN))
+    return NullModel(number, min(float(excess), TRUE_MEAN))
 
 
 def log_odds(score: np.ndarray, null: NullModel, true_count: float) -> np.ndarray:

@@ -12,6 +12,8 @@ from ratslam.keyframes.null_model import (
     MIN_TRUE,
     PRIOR_COUNT,
     PRIOR_EXCESS,
+    PRIOR_KEYFRAMES,
+    PRIOR_SEQUENCES,
     TRUE_MEAN,
     NullModel,
     estimate_null,
@@ -20,28 +22,38 @@ from ratslam.keyframes.null_model import (
 
 scores = st.lists(st.floats(-20, 200), max_size=40).map(np.array)
 weak = st.lists(st.floats(-20, LEAST_SCORE, exclude_max=True), max_size=20).map(np.array)
-nulls = st.builds(NullModel, st.floats(PRIOR_COUNT, 500), st.floats(0.5, 0.9 * TRUE_MEAN))
+nulls = st.builds(NullModel, st.floats(0.05, 500), st.floats(0.5, 0.9 * TRUE_MEAN))
 
 
-@given(weak)
-def test_without_strong_decoys_the_null_is_its_prior(scores):
-    assert estimate_null(scores) == NullModel(PRIOR_COUNT, pytest.approx(PRIOR_EXCESS))
+keyframes = st.integers(1, 3000)
 
 
-@given(scores, weak)
-def test_the_null_depends_on_strong_decoys_alone(scores, weaker):
-    first, second = estimate_null(scores), estimate_null(np.concatenate([weaker, scores[::-1]]))
+@given(weak, keyframes)
+def test_without_strong_decoys_the_null_is_its_prior(scores, count):
+    number = PRIOR_SEQUENCES * count / (PRIOR_KEYFRAMES + count)
+    assert estimate_null(scores, count) == NullModel(pytest.approx(number), pytest.approx(PRIOR_EXCESS))
+
+
+@given(scores, weak, keyframes)
+def test_the_null_depends_on_strong_decoys_alone(scores, weaker, count):
+    first = estimate_null(scores, count)
+    second = estimate_null(np.concatenate([weaker, scores[::-1]]), count)
     assert first.number == second.number
     assert first.excess == pytest.approx(second.excess)
 
 
 @given(st.integers(1, 300), st.floats(0.1, 100))
 def test_many_decoys_outweigh_the_prior(count, excess):
-    found = estimate_null(np.full(count, LEAST_SCORE + excess))
-    assert found.number == max(count, PRIOR_COUNT)
+    found = estimate_null(np.full(count, LEAST_SCORE + excess), 20 * count)
+    assert 0.5 * count < found.number < 1.7 * count
     share = count / (count + PRIOR_COUNT)
     mean = share * excess + (1 - share) * PRIOR_EXCESS
     assert found.excess == pytest.approx(min(mean, TRUE_MEAN))
+
+
+@given(scores, keyframes)
+def test_the_expected_number_of_decoys_grows_with_the_session(scores, count):
+    assert estimate_null(scores, count + 1).number > estimate_null(scores, count).number
 
 
 @given(st.floats(0, 100), nulls, st.floats(0, 500))
