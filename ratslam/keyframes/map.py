@@ -296,7 +296,7 @@ class KeyframeMap(Checkpointed, Map):
     def _is_pose_reliable(self) -> bool:
         """Whether the drift since the last closure is small enough to find a known experience by pose."""
         variance = self._graph.heading_variance(self._since, self._turned)
-        return self._since <= 5 * self.cell and variance <= self.config.place_heading**2
+        return self._since <= 5 * self.cell and bool(variance <= self.config.place_heading**2)
 
     def _select(self) -> None:
         """Every `select_every` keyframes, selects among all sequences anew, takes over the map and
