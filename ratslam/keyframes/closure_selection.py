@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.keyframes.optimizer import LoopClosures, MapFit, MapProblem, robust_cost, solve
+from ratslam.keyframes.optimizer import LoopClosures, MapFit, MapProblem, System
 from tactile.base.se2 import between, compose, integrate, inverse
 
 ACCEPTED_WEIGHT = 0.25
@@ -77,7 +77,8 @@ def select_closures(case: SelectionProblem, starts: Sequence[MapFit]) -> Selecti
     Args:
         starts: maps to start from; the first is the current map.
     """
-    return min((optimise_with_cuts(case, start, ()) for start in starts), key=_cost)
+    system = System(case.measurements)
+    return min((_optimise(case, system, start, ()) for start in starts), key=_cost)
 
 
 def select_closures_and_cuts(
@@ -220,9 +221,14 @@ def cut_odometry(problem: MapProblem, cuts: tuple[tuple[int, int], ...]) -> MapP
 
 def optimise_with_cuts(case: SelectionProblem, start: MapFit, cuts: tuple[tuple[int, int], ...]) -> Selection:
     """The fit and its cost with these cuts (keyframe, sequence), from the poses and bias of `start`."""
-    problem = cut_odometry(case.measurements, cuts)
-    fit = solve(start, problem, STEPS, FINE)
-    cost = robust_cost(fit, problem) + case.views_cost(fit.poses)
+    return _optimise(case, System(cut_odometry(case.measurements, cuts)), start, cuts)
+
+
+def _optimise(
+    case: SelectionProblem, system: System, start: MapFit, cuts: tuple[tuple[int, int], ...]
+) -> Selection:
+    fit = system.solve(start, STEPS, FINE)
+    cost = system.robust_cost(fit) + case.views_cost(fit.poses)
     return Selection(fit, cost + CUT * len(cuts), cuts)
 
 

@@ -17,7 +17,7 @@ from ratslam.keyframes.closure_selection import (
     SelectionProblem,
     choose_sequences,
 )
-from ratslam.keyframes.optimizer import LoopClosures, MapFit, MapProblem, robust_cost, solve
+from ratslam.keyframes.optimizer import LoopClosures, MapFit, MapProblem, System
 from tactile.base.se2 import integrate, wrap
 
 KEPT = 5
@@ -84,14 +84,14 @@ def _branch(fits: list[MapFit], case: SelectionProblem, known: np.ndarray, new: 
     problem = case.measurements
     part = problem._replace(closures=choose_sequences(problem.closures, known))
     at = int(known[:new].sum())
-    maps = []
+    system, maps = System(part), []
+    forcing = system.with_problem(part._replace(closures=_force(part.closures, at)))
     for fit in fits:
-        free = solve(fit, part, STEPS, FINE)
+        free = system.solve(fit, STEPS, FINE)
         maps.append(free)
         if free.weights[at] < FITS:
-            forced = solve(free, part._replace(closures=_force(part.closures, at)), STEPS, FINE)
-            maps.append(solve(forced, part, STEPS, FINE))
-    costs = [robust_cost(fit, part) for fit in maps]
+            maps.append(system.solve(forcing.solve(free, STEPS, FINE), STEPS, FINE))
+    costs = [system.robust_cost(fit) for fit in maps]
     different: list[int] = []
     for k in np.argsort(costs, kind="stable").tolist():
         if not any(_is_alike(maps[k], maps[other], part.closures) for other in different):

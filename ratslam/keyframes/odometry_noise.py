@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.keyframes.optimizer import MapFit, MapProblem, log_evidence, solve
+from ratslam.keyframes.optimizer import MapFit, MapProblem, System
 
 SPREAD = 1.0
 """Standard deviation of the log of the factor before any closure."""
@@ -48,7 +48,8 @@ def learn_heading_noise(
     least = start.log_factor + float(np.log(LEAST_FACTOR))
     steps = np.array([-LARGEST_STEP, 0.0, LARGEST_STEP])
     off = noise.log_factor - start.log_factor
-    logs = np.array([_log_posterior(off, step, fit, problem) for step in steps])
+    system = System(problem)
+    logs = np.array([_log_posterior(off, step, fit, system, problem) for step in steps])
     if not np.isfinite(logs).all():
         return noise
     slope = (logs[2] - logs[0]) / (2 * LARGEST_STEP)
@@ -59,9 +60,9 @@ def learn_heading_noise(
     return HeadingNoise(max(moved, least), float(1 / np.sqrt(-bend)) if curved else SPREAD)
 
 
-def _log_posterior(off: float, step: float, fit: MapFit, problem: MapProblem) -> float:
+def _log_posterior(off: float, step: float, fit: MapFit, system: System, problem: MapProblem) -> float:
     chain = problem.chain
     variance = chain.variance * np.array([1.0, 1.0, np.exp(step)])
-    changed = problem._replace(chain=chain._replace(variance=variance))
+    changed = system.with_problem(problem._replace(chain=chain._replace(variance=variance)))
     prior = -0.5 * ((off + step) / SPREAD) ** 2
-    return float(prior + log_evidence(solve(fit, changed, STEPS), changed))
+    return float(prior + changed.log_evidence(changed.solve(fit, STEPS)))

@@ -7,13 +7,20 @@ kernel); Kuemmerle et al. 2011 (the error); the calibration and the weights by s
 
 from __future__ import annotations
 
+from copy import copy
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import csc_matrix
-from scipy.sparse.linalg import SuperLU, splu
 
-from tactile.base.se2 import between, correct_heading, wrap
+from ratslam.keyframes.linearisation import (
+    Equations,
+    Measurements,
+    add_measurements,
+    empty_blocks,
+    measurement_errors,
+)
+from ratslam.pose_graph.block_cholesky import BlockPattern
+from tactile.base.se2 import correct_heading, wrap
 
 
 class OdometryChain(NamedTuple):
@@ -87,47 +94,19 @@ def solve(start: MapFit, problem: MapProblem, iterations: int, tolerance: float 
         the fit after the first step that changes every pose by less than the tolerance (m, rad), or after
         `iterations` steps; the last fit before the equations become singular.
     """
-    system = _System(problem)
-    weights = np.ones(len(problem.closures.scale))
-    fit = MapFit(np.array(start.poses, float), start.bias, weights, start.turn_error)
-    for _ in range(iterations):
-        equations = system.linearise(fit)
-        fit = fit._replace(weights=equations.weights)
-        step = equations.step()
-        if step is None:
-            break
-        moved = fit.poses + step[0]
-        moved[:, 2] = wrap(moved[:, 2])
-        bias, turn_error = fit.bias + step[1][0], fit.turn_error + sum(step[1][1:])
-        fit = fit._replace(poses=moved, bias=float(bias), turn_error=float(turn_error))
-        if np.abs(step[0]).max(initial=0.0) < tolerance:
-            break
-    return fit
+    return System(problem).solve(start, iterations, tolerance)
 
 
 def robust_cost(fit: MapFit, problem: MapProblem) -> float:
     """The cost that `solve` minimises: chi-square of odometry and calibration and robust cost of closures."""
-    chain, closures, prior = problem
-    apart = between(fit.poses[:-1], fit.poses[1:]) - fit.corrected(chain)
-    apart[:, 2] = wrap(apart[:, 2])
-    odometry = float((apart**2 / chain.variance).sum())
-    error = between(fit.poses[closures.i], fit.poses[closures.j])
-    error[:, 2] = wrap(error[:, 2] - closures.turn)
-    spread = np.broadcast_to(closures.variance, error.shape)
-    members = np.bincount(closures.sequence, minlength=len(closures.scale))
-    _, mean = _mean_costs((error**2 / spread).sum(axis=1), closures, members)
-    lost = members * closures.scale * mean / (closures.scale + mean)
-    off, tight = _calibration(fit, prior)
-    return odometry + float(lost.sum()) + float((tight * off**2).sum())
+    return System(problem).robust_cost(fit)
 
 
 def log_evidence(fit: MapFit, problem: MapProblem) -> float:
     """Log probability of odometry and closures with poses and calibration integrated out, to second order
     around a fit that solves the problem (Laplace's method); up to a constant that does not depend on the
     variances of the odometry. -inf where the equations are singular."""
-    information = _System(problem).linearise(fit).log_determinant()
-    spread = float(np.log(problem.chain.variance).sum())
-    return -0.5 * (robust_cost(fit, problem) + information + spread)
+    return System(problem).log_evidence(fit)
 
 
 def _calibration(fit: MapFit, prior: CalibrationPrior) -> tuple[np.ndarray, np.ndarray]:
@@ -143,7 +122,7 @@ class MapCovariance:
     together."""
 
     def __init__(self, fit: MapFit, problem: MapProblem) -> None:
-        self._poses, self._equations = fit.poses, _System(problem).linearise(fit)
+        self._poses, self._equations = fit.poses, System(problem).linearise(fit)
 
     def calibration_sd(self) -> tuple[float, float]:
         """Standard deviations of heading bias, rad/m, and turn error, rad/rad (0 where it is fixed)."""
@@ -175,156 +154,99 @@ def _mean_costs(
     return weights, np.bincount(closures.sequence, chi2, len(members)) / np.maximum(members, 1)
 
 
-class _Equations(NamedTuple):
-    """Normal equations of poses and K calibration parameters: the bias, and the turn error if it is free.
+class System:
+    """The linear equations of a problem; their sparsity pattern is computed once.
 
-    Attributes:
-        factor: of the block of the poses, None where it is singular. order: [N - 1] position of each free
-            keyframe among the unknowns. gradient [n], border [n, K], corner [K, K], slope [K]: the other
-            blocks of the equations.
-    """
-
-    factor: SuperLU | None
-    order: np.ndarray
-    gradient: np.ndarray
-    border: np.ndarray
-    corner: np.ndarray
-    slope: np.ndarray
-    weights: np.ndarray
-
-    def step(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Steps of the poses [N, 3] and of the calibration [K]."""
-        if self.factor is None:
-            return None
-        solved = self.factor.solve(np.column_stack([-self.gradient, self.border]))
-        free, bent = solved[:, 0], solved[:, 1:]
-        change = np.linalg.solve(self._schur(bent), -self.slope - self.border.T @ free)
-        step = free - bent @ change
-        if not np.isfinite(step).all():
-            return None
-        return np.concatenate([np.zeros((1, 3)), step.reshape(-1, 3)[self.order]]), change
-
-    def _schur(self, bent: np.ndarray) -> np.ndarray:
-        return self.corner - self.border.T @ bent
-
-    def log_determinant(self) -> float:
-        """Of the information of all unknowns; inf where it is singular."""
-        if self.factor is None:
-            return float(np.inf)
-        schur = self._schur(self.factor.solve(self.border))
-        pivots = np.abs(self.factor.U.diagonal())
-        return float(np.log(pivots).sum() + np.linalg.slogdet(schur)[1])
-
-    def calibration_covariance(self) -> np.ndarray:
-        """[K, K] of the calibration parameters."""
-        if self.factor is None:
-            return np.full(self.corner.shape, np.inf)
-        return np.linalg.inv(self._schur(self.factor.solve(self.border)))
-
-    def covariance(self, change: np.ndarray) -> np.ndarray:
-        """[n, n] covariance of quantities with derivatives [N - 1, 3, n] by the free keyframes' poses."""
-        if self.factor is None:
-            return np.full((change.shape[2],) * 2, np.inf)
-        change = change[np.argsort(self.order)].reshape(-1, change.shape[2])
-        spread = self.factor.solve(change)
-        bent = self.factor.solve(self.border)
-        pull = change.T @ bent
-        return change.T @ spread + pull @ np.linalg.solve(self._schur(bent), pull.T)
-
-
-class _System:
-    """The sparsity pattern of the normal equations, computed once for a set of edges."""
+    The variances, robust scales and prior may be replaced (`with_problem`), the closures may not."""
 
     def __init__(self, problem: MapProblem) -> None:
-        chain, closures, self.prior = problem
-        count, steps = len(chain.length) + 1, np.arange(len(chain.length))
-        self.i, self.j = np.concatenate([steps, closures.i]), np.concatenate([steps + 1, closures.j])
-        self.motion = np.concatenate([chain.motion, np.zeros((len(closures.i), 3))])
-        self.motion[len(steps) :, 2] = closures.turn
-        self.length = np.concatenate([chain.length, np.zeros(len(closures.i))])
-        self.odometry = np.arange(len(self.i)) < len(steps)
-        turn = np.where(self.odometry, self.motion[:, 2], 0.0)
-        self.regressors = np.column_stack([self.length, turn])[:, : 1 + int(self.prior.turn_error_sd > 0)]
+        chain, closures, _ = problem
+        steps = np.arange(len(chain.length))
+        i, j = np.concatenate([steps, closures.i]), np.concatenate([steps + 1, closures.j])
+        free = (i > 0) & (j > 0)
+        self._pattern = BlockPattern(len(chain.length), i[free] - 1, j[free] - 1)
+        place, slot = np.concatenate([[-1], self._pattern.place]), np.full(len(i), -1)
+        slot[free] = self._pattern.slot
+        self._ends = i, j, place[i], place[j], slot
+        self._members = np.bincount(closures.sequence, minlength=len(closures.scale))
+        self._set(problem)
+
+    def with_problem(self, problem: MapProblem) -> System:
+        """The equations of a problem with the same edges."""
+        other = copy(self)
+        other._set(problem)
+        return other
+
+    def _set(self, problem: MapProblem) -> None:
+        chain, closures, prior = problem
+        i, j, at_i, at_j, slot = self._ends
+        none = np.zeros(len(closures.i))
+        regressors = np.column_stack(
+            [np.concatenate([chain.length, none]), np.concatenate([chain.motion[:, 2], none])]
+        )[:, : 1 + int(prior.turn_error_sd > 0)]
         spread = np.broadcast_to(closures.variance, (len(closures.i), 3))
-        self.information = 1 / np.concatenate([chain.variance, spread])
-        self.closures, self.chained = closures, len(steps)
-        self.members = np.bincount(closures.sequence, minlength=len(closures.scale))
+        information = 1 / np.concatenate([chain.variance, spread])
+        turned = np.column_stack([none, none, closures.turn])
+        self._edges = Measurements(i, j, information, np.ascontiguousarray(regressors), at_i, at_j, slot)
+        self._problem, self._turned = problem, turned
 
-        self.size = 3 * (count - 1)
-        self.order = _order(self.i, self.j, count)
-        ends = 3 * np.stack([self.order[self.i], self.order[self.j]], axis=1)[:, :, None]
-        at = (ends + np.arange(3)).reshape(-1, 6)  # keyframe 0 is fixed: its rows are omitted
-        self.free, self.row = at >= 0, at[at >= 0]
-        rows, columns = np.repeat(at[:, :, None], 6, axis=2), np.repeat(at[:, None, :], 6, axis=1)
-        self.used = (rows >= 0) & (columns >= 0)
-        flat = columns[self.used] * self.size + rows[self.used]
-        places, self.slot = np.unique(flat, return_inverse=True)
-        self.count, self.indices = len(places), (places % self.size).astype(np.int32)
-        self.indptr = np.searchsorted(places // self.size, np.arange(self.size + 1)).astype(np.int32)
+    def solve(self, start: MapFit, iterations: int, tolerance: float = 1e-4) -> MapFit:
+        """See `solve`."""
+        weights = np.ones(len(self._problem.closures.scale))
+        fit = MapFit(np.array(start.poses, float), start.bias, weights, start.turn_error)
+        for _ in range(iterations):
+            equations = self.linearise(fit)
+            fit = fit._replace(weights=equations.weights)
+            step = equations.step()
+            if step is None:
+                break
+            moved = fit.poses + step[0]
+            moved[:, 2] = wrap(moved[:, 2])
+            bias, turn_error = fit.bias + step[1][0], fit.turn_error + sum(step[1][1:])
+            fit = fit._replace(poses=moved, bias=float(bias), turn_error=float(turn_error))
+            if np.abs(step[0]).max(initial=0.0) < tolerance:
+                break
+        return fit
 
-    def linearise(self, fit: MapFit) -> _Equations:
-        a, b = fit.poses[self.i], fit.poses[self.j]
-        c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
-        dx, dy = (b - a)[:, 0], (b - a)[:, 1]
-        measured = correct_heading(self.motion, self.length, fit.bias, fit.turn_error * self.odometry)
-        ahead, aside = c * dx + s * dy, c * dy - s * dx
-        error = np.stack(
-            [ahead - measured[:, 0], aside - measured[:, 1], wrap(b[:, 2] - a[:, 2] - measured[:, 2])], 1
-        )
-        chi2 = (error**2 * self.information).sum(axis=1)
-        keep, mean = _mean_costs(chi2[self.chained :], self.closures, self.members)
-        weights = (self.closures.scale / (self.closures.scale + mean)) ** 2
+    def robust_cost(self, fit: MapFit) -> float:
+        """See `robust_cost`."""
+        _, chi2, chained, _ = self._errors(fit)
+        closures, members = self._problem.closures, self._members
+        _, mean = _mean_costs(chi2[chained:], closures, members)
+        lost = members * closures.scale * mean / (closures.scale + mean)
+        off, tight = _calibration(fit, self._problem.prior)
+        return float(chi2[:chained].sum() + lost.sum() + (tight * off**2).sum())
 
-        jacobian = np.zeros((len(a), 3, 6))
-        jacobian[:, 0, :3] = np.stack([-c, -s, aside], axis=1)
-        jacobian[:, 1, :3] = np.stack([s, -c, -ahead], axis=1)
-        jacobian[:, 0, 3], jacobian[:, 0, 4], jacobian[:, 1, 3], jacobian[:, 1, 4] = c, s, -s, c
-        jacobian[:, 2, 2], jacobian[:, 2, 5] = -1.0, 1.0
-        by_turn = np.stack([measured[:, 1] / 2, -measured[:, 0] / 2, -np.ones(len(a))], 1)
-        by_parameter = by_turn[:, :, None] * self.regressors[:, None, :]
+    def log_evidence(self, fit: MapFit) -> float:
+        """See `log_evidence`."""
+        information = self.linearise(fit).log_determinant()
+        spread = float(np.log(self._problem.chain.variance).sum())
+        return -0.5 * (self.robust_cost(fit) + information + spread)
 
-        trust = self.information.copy()
-        trust[self.chained :] *= (keep * weights[self.closures.sequence])[:, None]
-        weighted = np.swapaxes(jacobian, 1, 2) * trust[:, None, :]
-        data = np.bincount(self.slot, (weighted @ jacobian)[self.used], self.count)
-        pulled = weighted @ np.concatenate([error[:, :, None], by_parameter], axis=2)
-        gradient, *border = (
-            np.bincount(self.row, pulled[:, :, k][self.free], self.size) for k in range(pulled.shape[2])
-        )
-        matrix = csc_matrix((data, self.indices, self.indptr), (self.size, self.size))
-        off, tight = _calibration(fit, self.prior)
-        trusted = by_parameter * trust[:, :, None]
-        return _Equations(
-            _factor(matrix),
-            self.order[1:],
-            gradient,
-            np.stack(border, axis=1),
-            np.einsum("mak,mal->kl", trusted, by_parameter) + np.diag(tight),
-            np.einsum("mak,ma->k", trusted, error) + tight * off,
+    def linearise(self, fit: MapFit) -> Equations:
+        _, closures, prior = self._problem
+        edges, poses = self._edges, np.ascontiguousarray(fit.poses)
+        error, chi2, chained, measured = self._errors(fit)
+        keep, mean = _mean_costs(chi2[chained:], closures, self._members)
+        weights = (closures.scale / (closures.scale + mean)) ** 2
+        trust = np.concatenate([np.ones(chained), keep * weights[closures.sequence]])
+        blocks = empty_blocks(self._pattern, edges.regressors.shape[1])
+        add_measurements(edges, poses, measured, error, trust, blocks)
+        off, tight = _calibration(fit, prior)
+        return Equations(
+            self._pattern.factorise(blocks.diagonal, blocks.above),
+            self._pattern.place,
+            blocks.right,
+            blocks.corner + np.diag(tight),
+            blocks.slope + tight * off,
             weights,
         )
 
-
-def _order(i: np.ndarray, j: np.ndarray, count: int) -> np.ndarray:
-    """[N] position of each keyframe among the unknowns, -1 for keyframe 0: SuperLU's minimum-degree order,
-    computed once for keyframes instead of at every step for their coordinates."""
-    free = (i > 0) & (j > 0)
-    i, j = i[free] - 1, j[free] - 1
-    ends, size = np.arange(count - 1), count - 1
-    ties = np.ones(len(i))
-    # Only the sparsity pattern matters; the diagonal makes the matrix regular.
-    among = csc_matrix((ties, (i, j)), (size, size))
-    degree = csc_matrix((np.full(size, 4.0 * len(i) + 1), (ends, ends)), (size, size))
-    factor = _decompose(among + among.T + degree, "MMD_AT_PLUS_A")
-    return np.concatenate([[-1], factor.perm_c])
-
-
-def _factor(matrix: csc_matrix) -> SuperLU | None:
-    try:
-        return _decompose(matrix, "NATURAL")
-    except RuntimeError:  # singular: a keyframe is not connected to keyframe 0
-        return None
-
-
-def _decompose(matrix: csc_matrix, ordering: str) -> SuperLU:
-    return splu(matrix, permc_spec=ordering, options={"SymmetricMode": True}, diag_pivot_thresh=0.0)
+    def _errors(self, fit: MapFit) -> tuple[np.ndarray, np.ndarray, int, np.ndarray]:
+        """Errors [M, 3] and chi-squares [M] of all measurements, the number of those of the odometry, and the
+        measurements [M, 3]."""
+        chain, edges = self._problem.chain, self._edges
+        measured = np.concatenate([fit.corrected(chain), self._turned])
+        poses = np.ascontiguousarray(fit.poses)
+        error, chi2 = measurement_errors(poses, edges.i, edges.j, measured, edges.information)
+        return error, chi2, len(chain.length), measured
