@@ -15,6 +15,7 @@ import numpy as np
 from ratslam.core.backend import Evidence
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.growable_array import GrowableArray
+from ratslam.keyframes.view_differences import mean_differences, summed_log_odds
 from ratslam.keyframes.view_sectors import NO_ESTIMATE, BiasEstimate, SectorFan
 from ratslam.recall.memory import NO_LIKENESS
 from ratslam.recall.whisker_likelihood import (
@@ -84,9 +85,9 @@ class Appearance(Checkpointed, ABC):
         return NO_ESTIMATE
 
     @abstractmethod
-    def unlikeness(self, frame: int, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
-        """[n] how unlike the view of a keyframe is that of each of the keyframes `others` [n], in
-        units of its own; `reversed` as in `misfit`."""
+    def unlikeness(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+        """[n] how unlike the view of a keyframe, or of each of the keyframes [n], is that of each of the
+        keyframes `others` [n], in units of its own; `reversed` as in `misfit`."""
 
     @abstractmethod
     def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
@@ -106,7 +107,7 @@ class LabelAppearance(Appearance):
     def append(self, observation: Observation, turn: float, length: float) -> None:
         self._label.append(int(observation.label))
 
-    def unlikeness(self, frame: int, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+    def unlikeness(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
         return (self._label.rows[others] != self._label.rows[frame]).astype(float)
 
     def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
@@ -159,9 +160,9 @@ class ViewAppearance(Appearance):
             self._scale = 0, 0.0
         return estimate
 
-    def unlikeness(self, frame: int, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+    def unlikeness(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
         """Mean absolute differences."""
-        return np.abs(self._view.rows[others] - self._view.rows[frame]).mean(axis=1)
+        return mean_differences(self._view.rows, np.broadcast_to(frame, len(others)), others)
 
     def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
         """0..1: the smallest error against the keyframes, relative to twice the scale."""
@@ -217,12 +218,14 @@ class WhiskerAppearance(Appearance):
             self._likeness = log_odds_table(estimate_background(images, self._pixels.group), variation)
         return NO_ESTIMATE
 
-    def unlikeness(self, frame: int, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+    def unlikeness(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
         """Negative log-odds; zeros while these are not learned."""
         if not self._likeness.size:
             return np.zeros(len(others))
-        image = self._level.rows[frame]
-        return -self._likeness[self._pixels.group, image, self._images(others, reversed)].sum(axis=1)
+        pixels, frames = self._pixels, np.broadcast_to(frame, len(others))
+        return -summed_log_odds(
+            self._likeness, pixels.group, self._level.rows, pixels.opposite, frames, others, reversed
+        )
 
     def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
         """log(1 + 1 / odds) of the most similar of the keyframes."""

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
+from ratslam.keyframes.view_differences import near_facing
 
 RADIUS = 2.0
 """Distance within which keyframes are near each other, cells."""
@@ -47,32 +48,25 @@ def claimed_revisits(graph: KeyframeGraph, poses: np.ndarray, most: int) -> Clai
     """The claims of poses [N, 3] of the keyframes; at most `most` keyframes are examined, spread evenly."""
     first, count = graph.guard + 1, len(poses)
     frames = np.unique(np.linspace(first, count - 1, max(min(count - first, most), 0)).astype(int))
-    ahead, aside = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    turned = np.cos(graph.sector_angle) < 0  # whiskers: views turned by half a turn are compared too
-    found = [np.zeros((0, 3))]
-    for frame in frames.tolist():
-        older = frame - graph.guard
-        apart = ((poses[:older, :2] - poses[frame, :2]) ** 2).sum(axis=1)
-        near = np.flatnonzero(apart < (RADIUS * graph.cell) ** 2)
-        facing = ahead[near] * ahead[frame] + aside[near] * aside[frame]
-        kept = (np.abs(facing) if turned else facing) > FACING
-        if kept.any():
-            found.append(_claims(graph, frame, near[kept], facing[kept] < 0))
-    rows = np.concatenate(found)
-    frame, match = rows[:, :2].astype(int).T
-    return ClaimedRevisits(frame, match, rows[:, 2], len(frames))
-
-
-def _claims(graph: KeyframeGraph, frame: int, near: np.ndarray, reversed: np.ndarray) -> np.ndarray:
-    """[passes, 3] keyframe, match, likeness of the claims of a keyframe near others [n]."""
-    older = frame - graph.guard
-    start = np.concatenate([[0], np.flatnonzero(np.diff(near) > graph.guard) + 1])
-    shifts = np.concatenate([[0], (older * CONTROLS).astype(int)])
-    others = (near + shifts[:, None]) % older
-    unlike = graph.appearance.unlikeness(frame, others.ravel(), np.tile(reversed, len(shifts)))
-    best = np.minimum.reduceat(unlike.reshape(others.shape), start, axis=1)
-    likeness = (best[0] < best[1:]).mean(axis=0) + (best[0] == best[1:]).mean(axis=0) / 2
-    return np.stack([np.full(len(start), frame), near[start], likeness], axis=1)
+    facing = near_facing(poses, frames, graph.guard, RADIUS * graph.cell, FACING)
+    whiskers = np.cos(graph.sector_angle) < 0  # views turned by half a turn are compared too
+    row, near = np.nonzero(facing if whiskers else facing > 0)
+    frame, reversed = frames[row], facing[row, near] < 0
+    if not len(frame):
+        return ClaimedRevisits(frame, near, np.zeros(0), len(frames))
+    shares = np.concatenate([[0.0], CONTROLS])
+    older = (frame - graph.guard)[:, None]
+    others = (near[:, None] + (older * shares).astype(int)) % older
+    repeated = len(shares)
+    unlike = graph.appearance.unlikeness(
+        np.repeat(frame, repeated), others.ravel(), np.repeat(reversed, repeated)
+    )
+    passes = np.flatnonzero(np.diff(near, prepend=-1 - graph.guard) > graph.guard)
+    passes = np.union1d(passes, np.flatnonzero(np.diff(frame, prepend=-1)))
+    best = np.minimum.reduceat(unlike.reshape(others.shape), passes, axis=0)
+    here, elsewhere = best[:, :1], best[:, 1:]
+    likeness = (here < elsewhere).mean(axis=1) + (here == elsewhere).mean(axis=1) / 2
+    return ClaimedRevisits(frame[passes], near[passes], likeness, len(frames))
 
 
 def claims_cost(graph: KeyframeGraph, poses: np.ndarray) -> float:

@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ratslam.core.compiled import compiled
 from ratslam.pose_graph.block_cholesky import BlockFactor, BlockPattern
-from ratslam.pose_graph.block_kernels import compiled
 
 PI = float(np.pi)
 
@@ -38,7 +38,7 @@ class Blocks(NamedTuple):
     """The equations of n poses and K calibration parameters.
 
     Attributes:
-        diagonal [n, 3, 3], above [B, 3, 3]: of the poses. gradient: [n, 3, 1 + K] negative gradient of the
+        diagonal [n, 3, 3], above [B, 3, 3]: of the poses. right: [n, 3, 1 + K] negative gradient of the
             poses, and the border between poses and calibration. corner [K, K], slope [K]: of the calibration.
     """
 
@@ -134,9 +134,9 @@ class Equations(NamedTuple):
     """Normal equations of poses and K calibration parameters: the bias, and the turn error if it is free.
 
     Attributes:
-        factor: of the block of the poses, None where it is singular. place: [n] position of each free keyframe
-            among the unknowns. right: see `Blocks`. corner [K, K], slope [K]: of the calibration, its prior
-            included. weights: [R] robust weights of the closure sequences.
+        factor: of the block of the poses, None where it is singular. place: [n] position of each free
+            keyframe among the unknowns. right: see `Blocks`. corner [K, K], slope [K]: of the calibration,
+            its prior included. weights: [R] robust weights of the closure sequences.
     """
 
     factor: BlockFactor | None

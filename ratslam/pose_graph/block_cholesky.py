@@ -38,7 +38,7 @@ class BlockPattern:
         """The factor of a matrix; None if it is not positive definite.
 
         Args:
-            diagonal: [n, 3, 3] blocks in the order of elimination. above: [B, 3, 3] blocks above the diagonal.
+            diagonal: [n, 3, 3] blocks in the order of elimination. above: [B, 3, 3] blocks above it.
         """
         regular, rows, blocks, inverse, logarithm = factorise(
             self.start, self.row, diagonal, above, self._parent, self._first

@@ -2,23 +2,14 @@
 
 The matrix is given by its diagonal blocks [n, 3, 3] and the blocks above the diagonal, by columns: block p
 with start[k] <= p < start[k + 1] stands at (row[p], k). Source: the up-looking LDL^T of Davis 2005 (ACM TOMS
-849), with blocks in the place of numbers. The loops release Python's global lock.
+849), with blocks in the place of numbers.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, TypeVar
-
-import numba
 import numpy as np
 
-Function = TypeVar("Function", bound=Callable[..., Any])
-
-
-def compiled(function: Function) -> Function:
-    """The function compiled at its first call, or loaded from the cache of an earlier process."""
-    return numba.njit(cache=True, nogil=True, error_model="numpy")(function)  # type: ignore[no-any-return]
+from ratslam.core.compiled import compiled
 
 
 @compiled
