@@ -71,6 +71,20 @@ def measurement_errors(
 
 
 @compiled
+def add_to_pose(
+    blocks: Blocks, at: int, by_pose: np.ndarray, by_parameter: np.ndarray, weight: float, error: float
+) -> None:
+    """Adds one row of a measurement, with derivatives by a pose [3] and by the calibration [K]."""
+    for p in range(3):
+        pulled = weight * by_pose[p]
+        blocks.right[at, p, 0] -= pulled * error
+        for k in range(len(by_parameter)):
+            blocks.right[at, p, 1 + k] += pulled * by_parameter[k]
+        for q in range(3):
+            blocks.diagonal[at, p, q] += pulled * by_pose[q]
+
+
+@compiled
 def add_measurements(
     edges: Measurements,
     poses: np.ndarray,
@@ -97,35 +111,19 @@ def add_measurements(
             by_parameter[2, k] = -edges.regressors[m, k]
         for row in range(3):
             weight = edges.information[m, row] * trust[m]
+            off = error[m, row]
             if at_i >= 0:
-                for p in range(3):
-                    pulled = weight * by_i[row, p]
-                    blocks.right[at_i, p, 0] -= pulled * error[m, row]
-                    for k in range(parameters):
-                        blocks.right[at_i, p, 1 + k] += pulled * by_parameter[row, k]
-                    for q in range(3):
-                        blocks.diagonal[at_i, p, q] += pulled * by_i[row, q]
+                add_to_pose(blocks, at_i, by_i[row], by_parameter[row], weight, off)
             if at_j >= 0:
-                for p in range(3):
-                    pulled = weight * by_j[row, p]
-                    blocks.right[at_j, p, 0] -= pulled * error[m, row]
-                    for k in range(parameters):
-                        blocks.right[at_j, p, 1 + k] += pulled * by_parameter[row, k]
-                    for q in range(3):
-                        blocks.diagonal[at_j, p, q] += pulled * by_j[row, q]
+                add_to_pose(blocks, at_j, by_j[row], by_parameter[row], weight, off)
             if edges.slot[m] >= 0:
-                block = blocks.above[edges.slot[m]]
-                if at_i < at_j:
-                    for p in range(3):
-                        for q in range(3):
-                            block[p, q] += weight * by_i[row, p] * by_j[row, q]
-                else:
-                    for p in range(3):
-                        for q in range(3):
-                            block[p, q] += weight * by_j[row, p] * by_i[row, q]
+                upper, lower = (by_i[row], by_j[row]) if at_i < at_j else (by_j[row], by_i[row])
+                for p in range(3):
+                    for q in range(3):
+                        blocks.above[edges.slot[m], p, q] += weight * upper[p] * lower[q]
             for k in range(parameters):
                 pulled = weight * by_parameter[row, k]
-                blocks.slope[k] += pulled * error[m, row]
+                blocks.slope[k] += pulled * off
                 for other in range(parameters):
                     blocks.corner[k, other] += pulled * by_parameter[row, other]
 

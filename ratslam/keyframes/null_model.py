@@ -37,6 +37,7 @@ def estimate_null(scores: np.ndarray, keyframes: int) -> NullModel:
     """The null from the scores [n] of the control's sequences in a session of so many keyframes."""
     above = scores[scores >= LEAST_SCORE] - LEAST_SCORE
     excess = (above.sum() + PRIOR_COUNT * PRIOR_EXCESS) / (len(above) + PRIOR_COUNT)
+    keyframes = max(keyframes, 1)
     number = keyframes * (PRIOR_SEQUENCES + len(above)) / (PRIOR_KEYFRAMES + keyframes)
     # A control stronger than true sequences would let evidence lower the odds.
     return NullModel(number, min(float(excess), TRUE_MEAN))

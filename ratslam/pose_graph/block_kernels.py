@@ -59,6 +59,31 @@ def invert(a: np.ndarray, out: np.ndarray) -> float:
 
 
 @compiled
+def find_row(k: int, above: np.ndarray, parent: np.ndarray, seen: np.ndarray, pattern: np.ndarray) -> int:
+    """Writes the columns of row k of L, in an order in which they can be eliminated, to the end of `pattern`
+    [n]; returns where they begin there.
+
+    Args:
+        above: [m] rows of the blocks above the diagonal in column k. parent: [n] elimination tree.
+        seen: [n] the last row in which each column was found.
+    """
+    top = len(pattern)
+    seen[k] = k
+    for i in above:
+        length = 0
+        while seen[i] != k:
+            pattern[length] = i
+            length += 1
+            seen[i] = k
+            i = parent[i]
+        while length > 0:
+            length -= 1
+            top -= 1
+            pattern[top] = pattern[length]
+    return top
+
+
+@compiled
 def factorise(
     start: np.ndarray,
     row: np.ndarray,
@@ -76,21 +101,9 @@ def factorise(
     pattern, seen, filled = np.empty(n, np.int64), np.full(n, -1), first[:n].copy()
     logarithm = 0.0
     for k in range(n):
-        top = n
-        seen[k] = k
         for p in range(start[k], start[k + 1]):
-            i = row[p]
-            column[i] += above[p]
-            length = 0
-            while seen[i] != k:
-                pattern[length] = i
-                length += 1
-                seen[i] = k
-                i = parent[i]
-            while length > 0:
-                length -= 1
-                top -= 1
-                pattern[top] = pattern[length]
+            column[row[p]] += above[p]
+        top = find_row(k, row[start[k] : start[k + 1]], parent, seen, pattern)
         pivot[:] = diagonal[k]
         for t in range(top, n):
             i = pattern[t]
