@@ -9,9 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
-import networkx
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
@@ -25,6 +24,9 @@ from ratslam.pose_graph.io import write_g2o, write_json
 from tactile.base.config import Settings
 from tactile.base.se2 import between, compose, inverse
 from tactile.base.types import Observation
+
+if TYPE_CHECKING:
+    import networkx
 
 
 class OdometryNoise(Settings):
@@ -149,6 +151,8 @@ class ExperienceMap(Checkpointed, Map):
 
     def graph(self) -> networkx.DiGraph:
         """Nodes with x, y (m), heading (rad), template; links with dx, dy, dtheta, and their traversals."""
+        import networkx  # slow to import
+
         graph: networkx.DiGraph = networkx.DiGraph()
         for node, (pose, template) in enumerate(zip(self._pose.rows, self._template.rows, strict=True)):
             x, y, heading = map(float, pose)

@@ -9,14 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import jax
-import networkx
 import numpy as np
 
 from ratslam.core.types import Estimate
 from tactile.base.types import Array, Observation
+
+if TYPE_CHECKING:
+    import networkx
 
 State = Any
 """A pytree of arrays of fixed shapes and dtypes."""
@@ -74,6 +76,8 @@ class Map(Protocol):
 
     def graph(self) -> networkx.DiGraph:
         """The map as a graph."""
+        import networkx  # slow to import
+
         return networkx.DiGraph()
 
     def files(self) -> dict[str, Callable[[Path], None]]:

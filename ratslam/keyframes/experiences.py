@@ -6,15 +6,17 @@ pose shortly after such a closure; recall alone never joins two places.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-import networkx
 import numpy as np
 
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.growable_array import GrowableArray
 from ratslam.core.types import Action
 from tactile.base.se2 import between, wrap
+
+if TYPE_CHECKING:
+    import networkx
 
 
 class ExperienceChange(NamedTuple):
@@ -70,6 +72,8 @@ class Experiences(Checkpointed):
 
     def graph(self, poses: np.ndarray) -> networkx.DiGraph:
         """Nodes with x, y (m), heading (rad), keyframe; links with dx, dy, dtheta and traversals."""
+        import networkx  # slow to import
+
         graph: networkx.DiGraph = networkx.DiGraph()
         for place, frame in enumerate(self._frame.rows.tolist()):
             x, y, heading = map(float, poses[frame])

@@ -12,8 +12,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import deepcopy
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import networkx
 import numpy as np
 
 from ratslam.core.backend import Evidence, Map
@@ -39,6 +39,9 @@ from ratslam.pose_graph.io import write_g2o, write_json
 from ratslam.recall.memory import MapFeedback
 from tactile.base.se2 import compose, correct_heading, wrap
 from tactile.base.types import Observation
+
+if TYPE_CHECKING:
+    import networkx
 
 CONFIRMED_MASS, CONFIRMED_WEIGHT = 0.95, 0.5
 """Least posterior mass of a closure, and weight of its sequence, for the likelihoods to learn from it."""

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import networkx
 import numpy as np
 
 from ratslam.pose_graph.edges import Edges, information_matrices
 from tactile.base.errors import InputError
+
+if TYPE_CHECKING:
+    import networkx
 
 UPPER = tuple(zip(*np.triu_indices(3), strict=True))
 
@@ -67,6 +70,8 @@ def read_g2o(path: Path) -> tuple[np.ndarray, Edges]:
 
 def write_json(path: Path, graph: networkx.DiGraph) -> None:
     """Writes node-link JSON, which `networkx.node_link_graph` reads."""
+    import networkx  # slow to import
+
     content = networkx.node_link_data(graph, edges="edges")
     Path(path).write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
@@ -77,6 +82,8 @@ def read_json(path: Path) -> networkx.DiGraph:
     Raises:
         InputError: the file is not node-link JSON.
     """
+    import networkx  # slow to import
+
     try:
         content = json.loads(Path(path).read_text(encoding="utf-8"))
         return networkx.DiGraph(networkx.node_link_graph(content, edges="edges"))

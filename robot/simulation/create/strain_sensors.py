@@ -13,7 +13,6 @@ from typing import Annotated, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, model_validator
-from scipy.signal import lfilter
 
 from robot.simulation.create.whisker_bending import Bending, Shaft, base_strain, bend_shafts
 from tactile.base.config import Settings
@@ -142,6 +141,8 @@ def base_strains(config: WhiskersConfig, fan: FixedWhiskers, bent: Bending) -> n
 
 def body_vibration(config: ShakeConfig, count: int, rate: float, random: np.random.Generator) -> np.ndarray:
     """Horizontal and vertical strain [T, 2] from vibration of the body, from the start of a motion."""
+    from scipy.signal import lfilter  # slow to import
+
     time = np.arange(count) / rate
     damped = np.exp(-time / config.decay)
     amplitude, phase = config.start * random.standard_normal(2), random.uniform(0, 2 * np.pi, 2)
