@@ -122,6 +122,29 @@ with contextlib.suppress(SystemExit):
     assert _report(code + HEAVY) == []
 
 
+SLOW = ("matplotlib", "networkx", "numba") + tuple(
+    f"scipy.{name}" for name in ("signal", "stats", "interpolate", "optimize", "spatial", "ndimage")
+)
+"""Modules that a run needs after its first estimate, or not at all."""
+
+
+def test_a_run_begins_without_slow_imports() -> None:
+    code = f"""
+import json, sys
+from ratslam.cli.common import prepare_jax
+prepare_jax()
+import evaluation.metrics.scorecard
+from ratslam.config.run_config import load_config
+from ratslam.pipeline.run import open_observations
+from ratslam.pipeline.runner import build_session
+with open_observations(load_config("configs/whisker_maze.yaml")) as (config, source):
+    build_session(config, source)
+    next(iter(source))
+print(json.dumps([name for name in {SLOW} if name in sys.modules]))
+"""
+    assert _report(code) == []
+
+
 def test_importing_ratslam_changes_no_setting_of_jax() -> None:
     code = """
 import importlib, json, os, pkgutil

@@ -30,8 +30,8 @@ class SessionConfig(Settings):
     seed: NonNegativeInt = 0
     """Seed of all random streams."""
     reserve: Annotated[int, Field(ge=0, le=2**24)] = 0
-    """Steps to allocate memory for at the start. 0: memory grows as needed, and each power of two compiles
-    the kernel again."""
+    """Steps to allocate memory for at the start. 0: those of a source of known length of at most 4096 steps;
+    for others memory grows as needed, and each power of two compiles the kernel again."""
 
 
 class ScoreConfig(Settings):

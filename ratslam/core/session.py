@@ -65,6 +65,8 @@ class Session:
         self.backend = backend
         self.reserve = reserve
         self._layout: Layout | None = None
+        # Compiled as one: each operation by itself would be compiled too.
+        self._init = jax.jit(backend.init, static_argnums=1)
         self._run_chunk = jax.jit(partial(run_chunk, backend.kernel), donate_argnums=0)
         self.restart(seed)
 
@@ -73,7 +75,7 @@ class Session:
         self.map: Map = self.backend.new_map()
         self.steps = 0
         self._capacity = capacity_at(0, self.reserve)
-        self.state = self.backend.init(jax.random.key(seed), self._capacity)
+        self.state = self._init(jax.random.key(seed), self._capacity)
 
     def step(self, observation: Observation) -> Step:
         """Folds one observation, live."""
@@ -160,6 +162,7 @@ def run_chunk(kernel: Any, state: Any, chunk: PackedRecords, count: Any) -> tupl
     Returns:
         the state after them, and (estimate, evidence) of each step; further rows are zero.
     """
+    kernel = jax.jit(kernel, inline=True)  # traced once for both uses below
 
     def body(k: Any, carry: Any) -> Any:
         state, results = carry

@@ -46,7 +46,8 @@ class Resampling(NamedTuple):
 
 def start(config: DriftConfig, key: Array, count: int, dtype: jnp.dtype) -> Particles:
     """N particles at the origin, with random scale errors."""
-    session = config.session * jax.random.normal(key, (count, 2), dtype)
+    # Without the barrier XLA merges two factors: other bits compiled than not.
+    session = config.session * lax.optimization_barrier(jax.random.normal(key, (count, 2), dtype))
     return Particles(jnp.zeros((count, 3), dtype), session, jnp.zeros_like(session), jnp.zeros(count, dtype))
 
 

@@ -38,6 +38,9 @@ CHECKPOINT_EVERY, CHECKPOINT_SHARE = 128 * CHUNK, 32
 """Steps between two checkpoints: the first number, or the steps so far divided by the second if that is more.
 A run continued after a kill repeats at most these. The interval grows, because each checkpoint holds the
 whole run and would make the total cost O(N^2) at a fixed interval."""
+RESERVED = 4096
+"""Longest source, in steps, that has its rows reserved from the start, so that the kernel is compiled once.
+Longer sources seldom fill their rows, and a step takes time for each row, in use or not."""
 
 
 class Runner:
@@ -149,15 +152,23 @@ def build_session(config: RunConfig, source: Source, ablation: Ablation = FULL) 
 
     Args:
         ablation: parts of the keyframe map to switch off.
+
+    A configuration that reserves no rows reserves those of the source (`RESERVED`): equal sources and
+    configurations give equal capacities, and so equal bits.
     """
     prepare_precision(config.session.precision)
     sensors = Sensors(source.view_shape, planar_whiskers_of(source, config.touch))
     return Session(
         build(config.backend, config, sensors, config.session.precision, ablation),
         seed=config.session.seed,
-        reserve=config.session.reserve,
+        reserve=config.session.reserve or _known_rows(source.length),
         precision=config.session.precision,
     )
+
+
+def _known_rows(length: int | None) -> int:
+    """Rows to reserve for a source of this length, 0 if they are not worth it: a step adds at most one."""
+    return length if length is not None and length <= RESERVED else 0
 
 
 def _lines(
