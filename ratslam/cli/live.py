@@ -98,7 +98,7 @@ def monitor() -> Iterator[Callable[[Path], None]]:
     processes: dict[Path, subprocess.Popen[bytes]] = {}
 
     def start(directory: Path) -> None:
-        nice = ["nice", "-n", "10"] if shutil.which("nice") else []
+        nice = ["nice", "-n", "19"] if shutil.which("nice") else []
         command = [*nice, sys.executable, "-m", "ratslam", "watch", str(directory)]
         quiet = subprocess.DEVNULL
         # A session of its own: it gets no Ctrl-C.

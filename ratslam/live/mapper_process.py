@@ -23,10 +23,11 @@ import numpy as np
 
 from evaluation.metrics.scorecard import Scorecard
 from ratslam.config.run_config import RunConfig
-from robot.drivers.process_priority import BACKGROUND, set_niceness
+from robot.drivers.process_priority import step_back
 from robot.sources.source import Sample
 from robot.sources.source_info import SourceInfo
 from tactile.base.errors import InputError
+from tactile.features.calibration import Calibration
 
 LOG = "mapper.log"
 """Log of the mapper process, in the run directory."""
@@ -38,7 +39,8 @@ class MappingJob(NamedTuple):
     """Input of the mapper before the first sample.
 
     Attributes:
-        config: its `recording` is the file that the session is recorded to. info: as in that file.
+        config: its `recording` is the file that the session is recorded to. info: as in that file, but without
+            the calibration, which follows.
         directory: the new run directory. view_shape, whiskers, rate_hz: of the samples.
         extent_m: largest distance from the start along x or y on the planned path, m.
     """
@@ -83,7 +85,7 @@ class Mapper:
         self._process.start()
         theirs.close()
         self.mapped: list[MappedSample] = []
-        self._ready, self._failed = False, ""
+        self._stages, self._failed = 0, ""
         self._refusal: InputError | None = None
         self._card: Scorecard | None = None
         self._offered: list[float] = []
@@ -91,22 +93,25 @@ class Mapper:
         self._sender = Thread(target=self._send, daemon=True, name="to mapper")
         self._sender.start()
 
-    def begin(self, job: MappingJob) -> None:
-        """Sends the job: the process makes its directory and compiles. Returns at once; see `ready`."""
+    def compile(self, job: MappingJob) -> None:
+        """Sends the job, for which the process compiles. Returns at once; see `compiled`."""
         self._outbox.put(job)
 
-    def ready(self) -> bool:
-        """Whether the mapper is ready for samples.
+    def begin(self, calibration: Calibration) -> None:
+        """Sends the head's calibration: the process makes its directory. Returns at once; see `ready`."""
+        self._outbox.put(calibration)
+
+    def compiled(self) -> bool:
+        """Whether the mapper has compiled.
 
         Raises:
             InputError: the job was refused, or the process has ended.
         """
-        self.receive()
-        if self._refusal is not None:
-            raise self._refusal
-        if not self.alive:
-            raise InputError("live", f"the mapper ended: {self.failure}", "")
-        return self._ready
+        return self._completed_stages() >= 1
+
+    def ready(self) -> bool:
+        """Whether the mapper is ready for samples; errors as of `compiled`."""
+        return self._completed_stages() >= 2
 
     def offer(self, sample: Sample) -> None:
         """Passes the next sample; returns at once."""
@@ -150,6 +155,14 @@ class Mapper:
             self.receive()
         return self._card
 
+    def _completed_stages(self) -> int:
+        self.receive()
+        if self._refusal is not None:
+            raise self._refusal
+        if not self.alive:
+            raise InputError("live", f"the mapper ended: {self.failure}", "")
+        return self._stages
+
     def _take(self, message: Any) -> None:
         if isinstance(message, MappedSample):
             self.mapped.append(message)
@@ -158,7 +171,7 @@ class Mapper:
         elif isinstance(message, InputError):
             self._refusal = message
         elif message is True:
-            self._ready = True
+            self._stages += 1
         else:
             self._failed = str(message)
 
@@ -199,6 +212,14 @@ class PipeSource:
         self.received = 0.0
         self._line = line
 
+    def calibrate(self) -> None:
+        """Waits for the head's calibration and adds it to the information.
+
+        Raises:
+            EOFError: the parent has ended.
+        """
+        self.info = self.info.model_copy(update={"calibration": self._line.recv()})
+
     def __iter__(self) -> Iterator[Sample]:
         while True:
             try:
@@ -221,7 +242,7 @@ class PipeSource:
 def run_mapper(line: Connection) -> None:
     """The main function of the mapper process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
-    set_niceness(BACKGROUND)  # compilation uses all cores
+    step_back()  # compilation uses all cores
     try:
         _map(line)
     except InputError as error:
@@ -236,20 +257,24 @@ def run_mapper(line: Connection) -> None:
 def _map(line: Connection) -> None:
     from ratslam.config.completion import complete
     from ratslam.core.types import Action
-    from ratslam.pipeline.runner import open_runner
+    from ratslam.pipeline.runner import build_session, open_runner
     from robot.touch_source import open_touch_source
     from tactile.base.types import Odometry, observation
 
     job = line.recv()
     with PipeSource(job, line) as fed:
         config = complete(job.config, fed, job.extent_m)
+        source = open_touch_source(fed, config.touch)  # for its shapes: no sample is read without calibration
+        session = build_session(config, source)
+        blank = observation(
+            Odometry(0.0, 0.0, 0.0, 0.0), view_shape=source.view_shape, whiskers=source.whiskers
+        )
+        session.warm(blank)
+        line.send(True)
+        fed.calibrate()
         source = open_touch_source(fed, config.touch)
-        with open_runner(config, source, job.directory) as runner:
+        with open_runner(config, source, job.directory, session=session) as runner:
             _redirect_stderr(job.directory / LOG)
-            blank = observation(
-                Odometry(0.0, 0.0, 0.0, 0.0), view_shape=source.view_shape, whiskers=source.whiskers
-            )
-            runner.session.warm(blank)
             line.send(True)
             for number, sample in enumerate(source):
                 (step,) = runner.process([sample])

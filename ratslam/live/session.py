@@ -22,10 +22,11 @@ from ratslam.core.session import CHUNK
 from ratslam.live.mapper_process import Mapper, MappingJob
 from ratslam.pipeline.run import catch_interrupt
 from robot.drivers.outcome import Fault, SessionOutcome
+from robot.drivers.process_priority import urgent
 from robot.live.recorder import LiveRecorder
 from robot.live.rig import OperatorStop, Rig, SessionFault
 from robot.live.route import approach_route, check_targets, descent_route, main_route, plan_path, plan_scene
-from robot.live.selftest import check_disk, start_and_check
+from robot.live.selftest import check_disk, find_devices, start_and_check
 from robot.live.whisk_loop import WhiskReport, follow_route, record_free_whisks, run_whisk_loop
 from robot.recordings.formats import RecordingConfig
 from robot.sources.source_info import SourceInfo
@@ -50,7 +51,9 @@ def run_live_session(
     mapping: Callable[..., None] | None = None,
     armed: Callable[[Path], None] = lambda directory: None,
 ) -> tuple[Fault, Scorecard | None]:
-    """Tests arm and head, calibrates, moves along the route, maps and scores.
+    """Finds arm and head, compiles, tests both, calibrates, moves along the route, maps and scores.
+
+    The arm is started after the compilation, which takes this machine's processors for up to a minute.
 
     Args:
         directory: the new run directory. log: called with each line of progress.
@@ -70,14 +73,15 @@ def run_live_session(
         raise InputError(str(directory), "exists already", "a new run directory", "choose another with -o")
     log(check_disk(config.live, directory))
     whisks: list[WhiskReport] = []
-    with catch_interrupt("stopping the arm") as stopped, Mapper(mapping) as mapper:
+    with urgent(), catch_interrupt("stopping the arm") as stopped, Mapper(mapping) as mapper:
         with Rig(config.live, config.touch.head, stopped) as rig:
             try:
+                job = mapping_job(config, path, directory)
+                _compile(rig, mapper, job, log)
                 calibration = _calibrate(rig, config, path, log)
-                job = mapping_job(config, path, calibration, directory)
-                _arm(rig, path, calibration, mapper, job, log)
+                _arm(rig, path, calibration, mapper, log)
                 armed(directory)
-                with open_recorder(job) as rig.recorder:
+                with open_recorder(job, calibration) as rig.recorder:
                     _run(rig, path, mapper, whisks)
                 fault = Fault(SessionOutcome.COMPLETE, f"{len(whisks)} whisks", time.monotonic())
             except SessionFault as error:
@@ -92,7 +96,7 @@ def run_live_session(
     return fault, card
 
 
-def mapping_job(config: RunConfig, path: HeadPath, calibration: Calibration, directory: Path) -> MappingJob:
+def mapping_job(config: RunConfig, path: HeadPath, directory: Path) -> MappingJob:
     """The job of the mapper, with the description of the robot for the recording."""
     assert config.live is not None
     head = ur10_head(config.touch.head)
@@ -110,7 +114,6 @@ def mapping_job(config: RunConfig, path: HeadPath, calibration: Calibration, dir
             raw_whiskers=True,
             cell_size=POSE_CELL_SIZE,
             head=config.touch.head,
-            calibration=calibration,
             maze=None
             if config.live.waypoints
             else maze_info(plan_scene(plan, head).maze, plan.maze, plan.seed),
@@ -124,15 +127,24 @@ def mapping_job(config: RunConfig, path: HeadPath, calibration: Calibration, dir
     )
 
 
-def open_recorder(job: MappingJob) -> LiveRecorder:
+def open_recorder(job: MappingJob, calibration: Calibration) -> LiveRecorder:
     """The recorder of the session."""
     return LiveRecorder(
         job.directory / RECORDING,
         view_shape=job.view_shape,
         whiskers=job.whiskers,
         rate_hz=job.rate_hz,
-        info=job.info,
+        info=job.info.model_copy(update={"calibration": calibration}),
     )
+
+
+def _compile(rig: Rig, mapper: Mapper, job: MappingJob, log: Callable[[str], None]) -> None:
+    """Finds both devices, then waits until the mapper has compiled, before the arm is started."""
+    for line in find_devices(rig):
+        log(line)
+    log("mapper: compiling")
+    mapper.compile(job)
+    rig.wait_until(mapper.compiled, START_TIMEOUT, SessionOutcome.MAPPER_GONE, "compiling")
 
 
 def _calibrate(rig: Rig, config: RunConfig, path: HeadPath, log: Callable[[str], None]) -> Calibration:
@@ -154,12 +166,10 @@ def _arm(
     path: HeadPath,
     calibration: Calibration,
     mapper: Mapper,
-    job: MappingJob,
     log: Callable[[str], None],
 ) -> None:
-    """Waits until the mapper has compiled, then lowers the head and starts whisking."""
-    log("mapper: compiling")
-    mapper.begin(job)
+    """Waits until the mapper is ready, then lowers the head and starts whisking."""
+    mapper.begin(calibration)
     rig.wait_until(mapper.ready, START_TIMEOUT, SessionOutcome.MAPPER_GONE, "the mapper's start")
     follow_route(rig, descent_route(rig.config, path))
     rig.driver.whisk(rig.config.plan.whisking, calibration.threshold[:, 1], calibration.mean[:, 1])

@@ -120,20 +120,25 @@ class Runner:
 
 @contextmanager
 def open_runner(
-    config: RunConfig, source: Source, directory: Path, resume: Path | None = None
+    config: RunConfig,
+    source: Source,
+    directory: Path,
+    resume: Path | None = None,
+    session: Session | None = None,
 ) -> Iterator[Runner]:
     """A runner with a new run directory.
 
     Args:
         config: completed for the source. source: of observations. directory: its path.
-        resume: checkpoint to restore the session from.
+        resume: checkpoint to restore the session from. session: one that `build_session` has made for them
+            before; None makes it.
 
     Raises:
         InputError: the relations, the checkpoint or the run directory cannot be used.
     """
     if config.score.relations:
         read_relations(config.score.relations)  # fails before the directory is created
-    session = build_session(config, source)
+    session = session or build_session(config, source)
     skip = _resume(session, resume, source.digest) if resume else 0
     if source.length is not None and source.length <= skip:
         found = f"already holds all {skip} samples of {source.name}"

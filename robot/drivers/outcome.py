@@ -15,6 +15,7 @@ class SessionOutcome(Enum):
     ARM_GONE = "check the controller and its network, then start again from the present pose"
     ARM_STALE = "no states from the controller: check the network and the controller's load"
     ARM_MALFORMED = "invalid states: check whether another program uses the controller's ports"
+    HOST_LATE = "this machine is too busy to control the arm: end other programs, then start again"
     PROTECTIVE_STOP = "check what the arm touched, release the stop on the pendant, start again"
     SAFEGUARD_STOP = "close the safeguard and start again; nothing resumes automatically"
     EMERGENCY_STOP = "release the button and power the arm on at the pendant"

@@ -180,7 +180,8 @@ class Rig:
 
     def _take_states(self) -> None:
         states = self.arm.states(self._seen)
-        self.state_ages.append(self.arm.age())
+        if self.arm.latest() is not None:
+            self.state_ages.append(self.arm.age())
         if not len(states):
             return
         self._seen = int(states["counter"][-1])

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from robot.drivers.outcome import SessionOutcome
+from robot.drivers.ur10.startup_checks import check_controller
 from robot.live.config import LiveConfig
 from robot.live.rig import Rig
 from tactile.base.errors import InputError
@@ -35,17 +36,30 @@ def check_disk(config: LiveConfig, directory: Path) -> str:
     return f"disk: {free / 1e9:.0f} GB free"
 
 
-def start_and_check(rig: Rig) -> Iterator[str]:
-    """Starts both devices and checks their streams; yields a line of text for each passed check.
+def find_devices(rig: Rig) -> Iterator[str]:
+    """Starts the head and asks the arm's controller for its status, which starts no program on it; yields a
+    line of text for each device.
 
     Raises:
-        InputError: a check failed; the error gives its cure.
-        robot.live.rig.SessionFault, robot.live.rig.OperatorStop.
+        InputError: a device is missing or not ready; the error gives its cure.
     """
     rig.head.start()
     identity = rig.head.identity
     assert identity is not None
     yield f"head: {identity.name} {identity.version}, {identity.whiskers} whiskers at {identity.rate:g} Hz"
+    version = ".".join(map(str, check_controller(rig.config.arm).version))
+    yield f"arm: {rig.config.arm.host}, PolyScope {version}, ready to start"
+
+
+def start_and_check(rig: Rig) -> Iterator[str]:
+    """Starts the arm and checks the streams of both devices; yields a line of text for each passed check.
+
+    Raises:
+        InputError: a check failed; the error gives its cure.
+        robot.live.rig.SessionFault, robot.live.rig.OperatorStop.
+    """
+    identity = rig.head.identity
+    assert identity is not None
     rig.arm.start()
     yield f"arm: {rig.config.arm.host}, admitted, states at {rig.config.arm.hz} Hz"
     before = rig.head.decoder.counts

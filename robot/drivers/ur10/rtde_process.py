@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from robot.drivers.lateness import LatenessMeter
 from robot.drivers.outcome import SessionOutcome
 from robot.drivers.process_priority import URGENT, set_niceness
 from robot.drivers.ur10 import dashboard
@@ -68,8 +69,11 @@ class RtdeProcess:
         """Runs until the session has ended."""
         began = time.monotonic()
         threading.Thread(target=self.commands.run, daemon=True).start()
+        period = 0.25 / self.config.hz
+        lateness = LatenessMeter(period, began)
         while not self._finished():
             now = time.monotonic()
+            self.shared.control["late"] = lateness.turn(now)
             if self._read(now):
                 self.commands.check_state(self._state)
                 if self._settled and self._state["runtime"] != PLAYING:
@@ -84,9 +88,9 @@ class RtdeProcess:
             self._listen()
             silent = now - float(self.shared.control["heartbeat"])
             if silent > self.config.heartbeat:
-                self._leave(f"the session was silent for {silent:.3f} s")
+                self._leave_silent_session(silent)
             self.commands.check_stop_request()
-            time.sleep(0.25 / self.config.hz)
+            time.sleep(period)
 
     def report(self, **fields: Any) -> None:
         """Sends a report to the session."""
@@ -145,6 +149,13 @@ class RtdeProcess:
                 self._leave("the session requested the end")
             else:
                 self.commands.put(order)
+
+    def _leave_silent_session(self, silent: float) -> None:
+        """Starts the shutdown because the session sent no heartbeat for some time, s."""
+        if not self.commands.leaving:
+            detail = f"this machine was {silent:.3f} s late: the session sent no heartbeat for so long"
+            self.report(say="fault", outcome=SessionOutcome.HOST_LATE.name, detail=detail)
+            self._leave(detail)
 
     def _leave(self, reason: str) -> None:
         """Starts the shutdown by requesting a last stop."""

@@ -38,6 +38,7 @@ CONTROL = np.dtype(
         ("heartbeat", "f8"),  # s, host's monotonic clock; written by the session
         ("stops", "u8"),  # number of stops that the session has requested
         ("first", "u8"),  # counter of the first state of the present RTDE process
+        ("late", "f8"),  # s, lateness of the RTDE process within the last second; written by it
     ]
 )
 

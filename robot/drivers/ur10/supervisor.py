@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from robot.drivers.lateness import LatenessMeter
 from robot.drivers.outcome import Fault, SessionOutcome
 from robot.drivers.ur10 import dashboard
 from robot.drivers.ur10.config import ArmConfig
@@ -25,10 +26,14 @@ PROCESS_LOST = {
     SessionOutcome.ARM_MALFORMED,
     SessionOutcome.ARM_GONE,
     SessionOutcome.CLOCK_JUMPED,
+    SessionOutcome.HOST_LATE,
 }
 """Outcomes after which the RTDE process may not react: it is killed."""
 SAFETY_STOPS = {SessionOutcome.PROTECTIVE_STOP, SessionOutcome.SAFEGUARD_STOP, SessionOutcome.EMERGENCY_STOP}
 """Outcomes after which a controller may resume its program: the program is ended."""
+
+
+EXPLAINED_SHARE = 0.5  # of a time limit: a lateness of this machine that explains why the limit was exceeded
 
 
 class PendingMove(NamedTuple):
@@ -41,6 +46,17 @@ class PendingMove(NamedTuple):
     number: int
     move: Move
     deadline: float
+
+
+def blame_host(finding: Finding, late: float, limit: float) -> Finding:
+    """The finding, or `HOST_LATE` where the lateness of this machine explains it.
+
+    Args:
+        late: lateness of this machine, s. limit: the time limit that was exceeded, s.
+    """
+    if late < EXPLAINED_SHARE * limit:
+        return finding
+    return Finding(SessionOutcome.HOST_LATE, f"this machine was {late:.3f} s late: {finding.detail}")
 
 
 class Supervisor:
@@ -66,6 +82,7 @@ class Supervisor:
         self._elsewhere: float | None = None
         self._stop_by: float | None = None
         self._retreat_pending = False
+        self._late = 0.0
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="arm", daemon=True)
 
@@ -147,10 +164,17 @@ class Supervisor:
         """Whether a move has started and ended and the arm is at its target."""
         return self._ended(pending) and self._deviation(pending) is None
 
+    @property
+    def late(self) -> float:
+        """Lateness of this thread or of the RTDE process within the last second, s."""
+        return max(self._late, float(self.shared.control["late"]))
+
     def _run(self) -> None:
+        lateness = LatenessMeter(TICK, time.monotonic())
         while not self._closing.wait(TICK):
             now = time.monotonic()
             self.shared.control["heartbeat"] = now
+            self._late = lateness.turn(now)
             with self.lock:
                 if self.process is not None:
                     self.read_reports(self.process)
@@ -170,17 +194,20 @@ class Supervisor:
             elif report["say"] == "moving":
                 self._started = report["number"], report["operation"]
             elif report["say"] == "fault":
-                outcome, detail = SessionOutcome[report["outcome"]], report["detail"]
+                finding = Finding(SessionOutcome[report["outcome"]], report["detail"])
+                if finding.outcome is SessionOutcome.ARM_GONE:
+                    finding = blame_host(finding, self.late, 1 / self.config.watchdog_hz)
                 if self.armed:
-                    self.fail(Finding(outcome, detail))
+                    self.fail(finding)
                 else:
-                    self.refused = StartupRefused(detail, "", outcome.value)
+                    self.refused = StartupRefused(finding.detail, "", finding.outcome.value)
 
     def _check_lateness(self, now: float) -> Finding | None:
         """A finding if states are late, or the arm has not arrived in time."""
         age, pending = self.age(), self.pending
         if age > self.config.stale:
-            return Finding(SessionOutcome.ARM_STALE, f"no new state for {age:.3f} s")
+            finding = Finding(SessionOutcome.ARM_STALE, f"no new state for {age:.3f} s")
+            return blame_host(finding, self.late, self.config.stale)
         if pending is None or pending.number == self._done:
             return None
         off = self._deviation(pending)

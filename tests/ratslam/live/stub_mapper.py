@@ -42,7 +42,9 @@ def mapping(directory: str, seconds: float, line: Connection) -> None:
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        line.recv_bytes()  # the order
+        line.recv_bytes()  # the job
+        line.send(True)
+        line.recv_bytes()  # the calibration
         Path(directory).mkdir(parents=True)
         Path(directory, "mapper.pid").write_text(str(os.getpid()))
         line.send(True)
