@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from ratslam.cli.common import INPUT_ERROR, INTERRUPTED, Commands, add_config, prepare_jax, read_config
 from ratslam.cli.run import add_run_directory, run_directory
+from robot.drivers.process_priority import put_last
 from tactile.base.errors import InputError
 
 if TYPE_CHECKING:
@@ -98,11 +98,11 @@ def monitor() -> Iterator[Callable[[Path], None]]:
     processes: dict[Path, subprocess.Popen[bytes]] = {}
 
     def start(directory: Path) -> None:
-        nice = ["nice", "-n", "19"] if shutil.which("nice") else []
-        command = [*nice, sys.executable, "-m", "ratslam", "watch", str(directory)]
+        command = [sys.executable, "-m", "ratslam", "watch", str(directory)]
         quiet = subprocess.DEVNULL
         # A session of its own: it gets no Ctrl-C.
         processes[directory] = subprocess.Popen(command, stdout=quiet, stderr=quiet, start_new_session=True)
+        put_last(processes[directory].pid)
         _print(f"{directory}/watch.png shows the map while it grows")
 
     try:

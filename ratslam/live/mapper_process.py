@@ -39,7 +39,7 @@ class MappingJob(NamedTuple):
     """Input of the mapper before the first sample.
 
     Attributes:
-        config: its `recording` is the file that the session is recorded to. info: as in that file, but without
+        config: its `recording` is the file that the session is recorded to. info: as in that file, without
             the calibration, which follows.
         directory: the new run directory. view_shape, whiskers, rate_hz: of the samples.
         extent_m: largest distance from the start along x or y on the planned path, m.

@@ -18,9 +18,13 @@ class LatenessMeter:
         self._late, self._since = 0.0, now
 
     def turn(self, now: float) -> float:
-        """Notes a turn of the loop; returns the largest delay of a turn within the last `WINDOW`, s."""
-        late = now - self._turned - self._period
+        """Notes a turn of the loop at a time, s; returns the largest delay within the last `WINDOW`, s."""
+        late = max(now - self._turned - self._period, 0.0)
         self._turned = now
-        if late > self._late or now - self._since > WINDOW:
-            self._late, self._since = max(late, 0.0), now
+        if late >= self.worst(now):
+            self._late, self._since = late, now
         return self._late
+
+    def worst(self, now: float) -> float:
+        """The largest delay of a turn that ended within the last `WINDOW` before a time (s), s."""
+        return self._late if now - self._since <= WINDOW else 0.0

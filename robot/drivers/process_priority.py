@@ -1,4 +1,8 @@
-"""CPU priority of processes: robot control before mapping, mapping before drawing."""
+"""CPU priority of processes: robot control before mapping, mapping before drawing.
+
+Control gets a real-time policy where the system allows it: beside busy programs, a process of high ordinary
+priority (nice level -10) still waits 0.1 s and more for a processor, which is longer than an arm's watchdog.
+"""
 
 from __future__ import annotations
 
@@ -7,39 +11,60 @@ import os
 from collections.abc import Iterator
 
 URGENT = -10
-"""Nice level of processes that control or emulate a robot."""
+"""Nice level of processes that control or emulate a robot, where the system refuses a real-time policy."""
 BACKGROUND = 10
 """Nice levels by which a process that maps stands below the one that started it."""
 LOWEST = 19
-"""The lowest priority there is."""
+"""The nice level of processes that draw."""
 
 
-def set_niceness(niceness: int) -> None:
-    """Sets the nice level of all threads of this process; without effect if the system refuses."""
+def become_urgent() -> None:
+    """Gives all threads of this process the priority of control, as far as the system allows."""
     for thread in _threads():
+        _set_niceness(thread, URGENT)
         with contextlib.suppress(OSError, AttributeError):
-            os.setpriority(os.PRIO_PROCESS, thread, niceness)
-
-
-def step_back() -> None:
-    """Lowers the priority of this process by `BACKGROUND` levels, from that of the process that started it.
-
-    It is relative so that the distance is the same where the system refuses `URGENT`: a mapper at a fixed low
-    priority would hardly run beside other programs, although the control process is safe from it anyway.
-    """
-    with contextlib.suppress(OSError, AttributeError):
-        set_niceness(min(LOWEST, os.getpriority(os.PRIO_PROCESS, 0) + BACKGROUND))
+            os.sched_setscheduler(thread, os.SCHED_RR, os.sched_param(1))
 
 
 @contextlib.contextmanager
 def urgent() -> Iterator[None]:
-    """Runs the block with the priority of robot control, as far as the system allows."""
+    """Runs the block with the priority of control, as far as the system allows."""
     before = os.getpriority(os.PRIO_PROCESS, 0)
-    set_niceness(URGENT)
+    become_urgent()
     try:
         yield
     finally:
-        set_niceness(before)
+        for thread in _threads():
+            _lower(thread, before)
+
+
+def step_back() -> None:
+    """Lowers the priority of this process to `BACKGROUND` levels below the one that started it.
+
+    It is relative because a mapper would hardly run beside other programs at a fixed low priority, which it
+    needs only where the system refuses a higher one to the control process.
+    """
+    niceness = LOWEST
+    with contextlib.suppress(OSError, AttributeError):
+        niceness = min(LOWEST, os.getpriority(os.PRIO_PROCESS, os.getppid()) + BACKGROUND)
+    for thread in _threads():
+        _lower(thread, niceness)
+
+
+def put_last(process: int) -> None:
+    """Gives a process that was just started, by its id, the lowest priority."""
+    _lower(process, LOWEST)
+
+
+def _lower(thread: int, niceness: int) -> None:
+    with contextlib.suppress(OSError, AttributeError):
+        os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
+    _set_niceness(thread, niceness)
+
+
+def _set_niceness(thread: int, niceness: int) -> None:
+    with contextlib.suppress(OSError, AttributeError):
+        os.setpriority(os.PRIO_PROCESS, thread, niceness)
 
 
 def _threads() -> list[int]:

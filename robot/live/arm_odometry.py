@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
 from collections import deque
+from itertools import islice
 
 import numpy as np
 
 from robot.drivers.ur10.base_transform import pose_from_tcp, tcp_heading
 from robot.live.config import LiveConfig
-from robot.sources.odometry import MIDPOINT, from_velocities, simulate_odometry
+from robot.sources.odometry import MIDPOINT, OdometryErrors, from_velocities, motions_between
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose, wrap
 from tactile.base.types import Odometry
@@ -23,8 +25,8 @@ class ArmOdometry:
     def __init__(self, config: LiveConfig) -> None:
         self._config = config
         self._states: deque[tuple[float, np.ndarray, np.ndarray]] = deque()
-        self._time: list[float] = []
-        self._pose: list[np.ndarray] = []
+        self._errors = OdometryErrors(config.noise, stream(config.seed, "live.odometry"))
+        self._last: tuple[float, np.ndarray] | None = None  # time stamp and pose of the last call of `step`
 
     def add(self, time: np.ndarray, tcp: np.ndarray, speed: np.ndarray) -> None:
         """Adds states.
@@ -43,8 +45,8 @@ class ArmOdometry:
     def pose(self, time: float) -> np.ndarray:
         """Pose of the head in the map [3] at a time, interpolated between two states; outside
         their span, the nearest pose."""
-        times = np.array([state[0] for state in self._states])
-        k = int(np.clip(np.searchsorted(times, time), 1, len(times) - 1)) if len(times) > 1 else 0
+        last = len(self._states) - 1
+        k = min(max(bisect_left(self._states, time, key=_time_of), 1), last)
         pair = [self._states[max(k - 1, 0)], self._states[k]]
         poses, _ = pose_from_tcp(self._config.arm.placing, np.stack([state[1] for state in pair]))
         span = pair[1][0] - pair[0][0]
@@ -61,26 +63,27 @@ class ArmOdometry:
         Args:
             stamp: time stamp of the whisk, session time, s. time: the same moment in host time, s.
         """
-        pose = self.pose(time)
-        if self._config.odometry == "velocity" and self._time:
-            pose = self._integrate_velocity(stamp - self._time[-1], time)
+        truth = self.pose(time)
+        if self._last is None:
+            self._last = stamp, truth
+            return Odometry(0.0, 0.0, 0.0, 0.0), truth
+        before, start = self._last
+        pose = truth
+        if self._config.odometry == "velocity":
+            pose = self._integrate_velocity(start, stamp - before, time)
         # Headings are not wrapped: errors depend on the total turn.
-        last = self._pose[-1][2] if self._pose else pose[2]
-        self._pose.append(np.array([*pose[:2], last + wrap(pose[2] - last)]))
-        self._time.append(stamp)
-        random = stream(self._config.seed, "live.odometry")
-        # Without noise a row depends on two poses only. Errors are drawn from the start each time, so that
-        # those of a whisk do not depend on the whisks that follow.
-        first = -2 if self._config.noise.noise == "none" else 0
-        time_stamps, poses = np.array(self._time[first:]), np.array(self._pose[first:])
-        rows = simulate_odometry(self._config.noise, time_stamps, poses, random)
-        return Odometry(*rows[-1]), self.pose(time)
+        pose = np.array([*pose[:2], start[2] + wrap(pose[2] - start[2])])
+        self._last = stamp, pose
+        motion = motions_between(np.stack([start, pose]))
+        ((dx, dy, dtheta),) = self._errors.add_to(np.array([before, stamp]), motion)
+        return Odometry(dx, dy, dtheta, np.float64(stamp) - before), truth
 
-    def _integrate_velocity(self, took: float, time: float) -> np.ndarray:
+    def _integrate_velocity(self, start: np.ndarray, took: float, time: float) -> np.ndarray:
         """Pose reached from the last one at the mean velocity since then."""
-        states = [state for state in self._states if time - took < state[0] <= time]
+        since, until = (bisect_right(self._states, end, key=_time_of) for end in (time - took, time))
+        states = list(islice(self._states, since, until))
         if not states:
-            return self._pose[-1]
+            return start
         _, tcp, speed = (np.array(column) for column in zip(*states, strict=True))
         heading = tcp_heading(tcp)
         c, s = np.cos(heading), np.sin(heading)
@@ -88,4 +91,8 @@ class ArmOdometry:
         times = np.array([0.0, took])
         mean = [np.array([0.0, part.mean()]) for part in (forward, left, speed[:, 5])]
         motion = from_velocities(times, mean[0], mean[1], mean[2], MIDPOINT)[1, :3]
-        return compose(self._pose[-1], motion)
+        return compose(start, motion)
+
+
+def _time_of(state: tuple[float, np.ndarray, np.ndarray]) -> float:
+    return state[0]

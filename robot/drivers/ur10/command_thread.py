@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from robot.drivers.lateness import LatenessMeter
 from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10.config import ArmConfig
 from robot.drivers.ur10.safety import (
@@ -31,6 +32,7 @@ from robot.drivers.ur10.shared_state import SharedState
 MAX_MISSING_STATES = 3  # state periods without a state before an interruption is certain
 SCRIPT_UNUSABLE = {
     SessionOutcome.ARM_GONE,
+    SessionOutcome.HOST_LATE,
     SessionOutcome.PROTECTIVE_STOP,
     SessionOutcome.SAFEGUARD_STOP,
     SessionOutcome.EMERGENCY_STOP,
@@ -76,6 +78,8 @@ class CommandThread:
         self._stopped = self._requested_stops()
         self._orders: queue.SimpleQueue[ArmCommand] = queue.SimpleQueue()
         self._wake = threading.Event()
+        self._reset = time.monotonic()  # the last reset of the watchdog
+        self._unreset = LatenessMeter(0.0, self._reset)
 
     # Called by the thread that reads states.
     def set_rest_force(self, rest: np.ndarray) -> None:
@@ -139,6 +143,12 @@ class CommandThread:
             self.execute(self._orders.get())
         if time.monotonic() - float(self.shared.control["heartbeat"]) <= self.config.heartbeat:
             self.control.kickWatchdog()
+            self._reset = time.monotonic()
+            self._unreset.turn(self._reset)
+
+    def unreset(self, now: float) -> float:
+        """Longest time between two resets of the watchdog within the last second, up to now (s), s."""
+        return max(self._unreset.worst(now), now - self._reset)
 
     def execute(self, order: ArmCommand) -> None:
         """Starts a move after the last checks."""

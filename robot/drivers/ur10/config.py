@@ -79,10 +79,15 @@ class ArmConfig(Settings):
     connect: PositiveFloat = 10.0
     """Time-out of the connection, of the start of the control script and of the full state rate, s."""
 
+    @property
+    def emulated(self) -> bool:
+        """Whether the address is one of this machine, where only an emulator can be."""
+        return self.host.startswith("127.")
+
     @model_validator(mode="after")
     def _stops_in_time(self) -> ArmConfig:
         slow = self.stale > 1 or self.heartbeat > 1 or self.watchdog_hz < 2
-        if slow and not self.host.startswith("127."):
+        if slow and not self.emulated:
             raise ValueError(
                 "`stale` and `heartbeat` are at most 1 s, and `watchdog_hz` is at least 2 Hz, except for an "
                 "emulator at a loopback address"

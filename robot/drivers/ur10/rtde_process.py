@@ -25,10 +25,11 @@ import numpy as np
 
 from robot.drivers.lateness import LatenessMeter
 from robot.drivers.outcome import SessionOutcome
-from robot.drivers.process_priority import URGENT, set_niceness
+from robot.drivers.process_priority import become_urgent
 from robot.drivers.ur10 import dashboard
 from robot.drivers.ur10.command_thread import MAX_MISSING_STATES, ArmCommand, CommandThread
 from robot.drivers.ur10.config import ArmConfig
+from robot.drivers.ur10.late_findings import ended_script_finding, silent_session_finding
 from robot.drivers.ur10.safety import Finding, at_rest
 from robot.drivers.ur10.shared_state import ARM_STATE, SharedState
 from tactile.base.errors import InputError
@@ -77,12 +78,12 @@ class RtdeProcess:
             if self._read(now):
                 self.commands.check_state(self._state)
                 if self._settled and self._state["runtime"] != PLAYING:
-                    self._lose("the control script ended on the controller")
+                    self._lose_script(now)
             elif (
                 now - self._state["host"] > MAX_MISSING_STATES / self.config.hz
                 and not self.receive.isConnected()
             ):
-                self._lose("the controller closed the connection")
+                self.commands.hold(Finding(SessionOutcome.ARM_GONE, "the controller closed the connection"))
             if not self._settled and self.shared.newest and now - began > REST_TIME:
                 self._settle()
             self._listen()
@@ -131,8 +132,9 @@ class RtdeProcess:
         self._settled = True
         self.report(say="ready")
 
-    def _lose(self, detail: str) -> None:
-        self.commands.hold(Finding(SessionOutcome.ARM_GONE, detail))
+    def _lose_script(self, now: float) -> None:
+        unreset, late = self.commands.unreset(now), float(self.shared.control["late"])
+        self.commands.hold(ended_script_finding(self.config, unreset, late))
 
     def _listen(self) -> None:
         """Reads commands; at the end of the input the session has ended."""
@@ -153,9 +155,9 @@ class RtdeProcess:
     def _leave_silent_session(self, silent: float) -> None:
         """Starts the shutdown because the session sent no heartbeat for some time, s."""
         if not self.commands.leaving:
-            detail = f"this machine was {silent:.3f} s late: the session sent no heartbeat for so long"
-            self.report(say="fault", outcome=SessionOutcome.HOST_LATE.name, detail=detail)
-            self._leave(detail)
+            finding = silent_session_finding(silent)
+            self.report(say="fault", outcome=finding.outcome.name, detail=finding.detail)
+            self._leave(finding.detail)
 
     def _leave(self, reason: str) -> None:
         """Starts the shutdown by requesting a last stop."""
@@ -196,7 +198,7 @@ def main(shared_fd: str, text: str) -> None:
     os.dup2(2, 1)
     os.set_blocking(0, False)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the session handles interrupts
-    set_niceness(URGENT)
+    become_urgent()
     config = ArmConfig.model_validate_json(text)
     shared = SharedState(int(shared_fd))
     # The constructors hold the interpreter's lock and may never return; the alarm ends the process.

@@ -12,6 +12,7 @@ from robot.drivers.lateness import LatenessMeter
 from robot.drivers.outcome import Fault, SessionOutcome
 from robot.drivers.ur10 import dashboard
 from robot.drivers.ur10.config import ArmConfig
+from robot.drivers.ur10.late_findings import stale_finding
 from robot.drivers.ur10.process_handle import ArmProcess
 from robot.drivers.ur10.safety import RETREAT_SPEED, Finding, Move, at_rest, at_target, retreat_target
 from robot.drivers.ur10.shared_state import SharedState
@@ -33,9 +34,6 @@ SAFETY_STOPS = {SessionOutcome.PROTECTIVE_STOP, SessionOutcome.SAFEGUARD_STOP, S
 """Outcomes after which a controller may resume its program: the program is ended."""
 
 
-EXPLAINED_SHARE = 0.5  # of a time limit: a lateness of this machine that explains why the limit was exceeded
-
-
 class PendingMove(NamedTuple):
     """A move in progress.
 
@@ -46,17 +44,6 @@ class PendingMove(NamedTuple):
     number: int
     move: Move
     deadline: float
-
-
-def blame_host(finding: Finding, late: float, limit: float) -> Finding:
-    """The finding, or `HOST_LATE` where the lateness of this machine explains it.
-
-    Args:
-        late: lateness of this machine, s. limit: the time limit that was exceeded, s.
-    """
-    if late < EXPLAINED_SHARE * limit:
-        return finding
-    return Finding(SessionOutcome.HOST_LATE, f"this machine was {late:.3f} s late: {finding.detail}")
 
 
 class Supervisor:
@@ -194,20 +181,17 @@ class Supervisor:
             elif report["say"] == "moving":
                 self._started = report["number"], report["operation"]
             elif report["say"] == "fault":
-                finding = Finding(SessionOutcome[report["outcome"]], report["detail"])
-                if finding.outcome is SessionOutcome.ARM_GONE:
-                    finding = blame_host(finding, self.late, 1 / self.config.watchdog_hz)
+                outcome, detail = SessionOutcome[report["outcome"]], report["detail"]
                 if self.armed:
-                    self.fail(finding)
+                    self.fail(Finding(outcome, detail))
                 else:
-                    self.refused = StartupRefused(finding.detail, "", finding.outcome.value)
+                    self.refused = StartupRefused(detail, "", outcome.value)
 
     def _check_lateness(self, now: float) -> Finding | None:
         """A finding if states are late, or the arm has not arrived in time."""
         age, pending = self.age(), self.pending
         if age > self.config.stale:
-            finding = Finding(SessionOutcome.ARM_STALE, f"no new state for {age:.3f} s")
-            return blame_host(finding, self.late, self.config.stale)
+            return stale_finding(age, self.late, self.config.stale)
         if pending is None or pending.number == self._done:
             return None
         off = self._deviation(pending)

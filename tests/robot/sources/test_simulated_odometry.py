@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.sources.odometry import OdometryConfig, simulate_odometry
+from robot.sources.odometry import OdometryConfig, OdometryErrors, motions_between, simulate_odometry
 from tactile.base.random_streams import stream
 from tactile.base.se2 import between, integrate, wrap
 
@@ -137,3 +137,23 @@ def test_the_first_row_only_sets_the_clock() -> None:
         assert (noisy[1:, 3] == 1).all()
         one = simulate_odometry(OdometryConfig(noise=kind), time[:1], pose[:1], stream(0, "odometry"))
         assert (one == 0).all()
+
+
+@given(
+    st.integers(0, 10**6),
+    st.sampled_from([*KINDS, "none"]),
+    st.sampled_from([0.3, 1.0, 3.7]),
+    st.floats(0.2, 2.5),
+)
+def test_errors_of_a_growing_path_are_those_of_the_path_so_far(
+    seed: int, kind: str, rate: float, period: float
+) -> None:
+    """To the bit, whatever follows: a live session gives its motions one by one."""
+    config = OdometryConfig(noise=kind, rate=rate, length_bias=0.02, heading_bias=0.1)
+    _, pose = drive_and_turn(40)
+    time = 0.4 + np.cumsum(period * stream(seed, "times").uniform(0.5, 1.0, len(pose)))
+    growing = OdometryErrors(config, stream(seed, "odometry"))
+    for row in range(1, len(pose)):
+        (measured,) = growing.add_to(time[row - 1 : row + 1], motions_between(pose[row - 1 : row + 1]))
+        whole = simulate_odometry(config, time[: row + 1], pose[: row + 1], stream(seed, "odometry"))
+        assert measured.tobytes() == whole[-1, :3].tobytes(), row
