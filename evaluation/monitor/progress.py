@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from array import array
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from math import atan2
@@ -75,10 +76,13 @@ class RunMonitor:
         names = ("steps.csv", "odometry.tum", "truth.tum", "online_error.csv")
         self._steps, self._odometry, self._truth, self._errors = (_Lines(directory / name) for name in names)
         self._header: list[str] = []
-        self._rows: list[list[float]] = []  # of _NUMBERS
+        self._rows = _Rows(len(_NUMBERS))
         self._outcomes: list[str] = []
-        self._reckoned: list[list[float]] = []  # x, y, heading
-        self._true: dict[float, list[float]] = {}  # t: x, y
+        self._counted: Counter[str] = Counter()  # of the first outcomes
+        self._reckoned = _Rows(3)  # x, y, heading
+        self._true = _Rows(2)  # x, y of each step, NaN while unknown
+        self._untrue: dict[float, int] = {}  # t: number of a step without truth
+        self._early: dict[float, list[float]] = {}  # t: x, y of a step that is not read yet
         self._online_error: float | None = None
         self._doubt: float | None = None
 
@@ -93,8 +97,8 @@ class RunMonitor:
             status = self._session_outcome()
         self._read()
         count = min(len(self._rows), len(self._reckoned))  # the lines of a chunk are written file by file
-        rows = np.array(self._rows[:count], float).reshape(count, len(_NUMBERS))
-        truth = [self._true.get(t, [np.nan, np.nan]) for t in rows[:, 0].tolist()]
+        rows = self._rows.first(count)
+        self._count(count)
         began, last = self._date("config.yaml"), self._date("steps.csv")
         return RunProgress(
             name=self.directory.resolve().name,
@@ -102,9 +106,9 @@ class RunMonitor:
             total=total,
             path=rows[:, 1:4],
             sd=rows[-1, 4:7] if count else np.full(3, np.nan),
-            odometry=np.array(self._reckoned[:count], float).reshape(count, 3),
-            truth=np.array(truth, float).reshape(count, 2),
-            outcomes=Counter(self._outcomes[:count]),
+            odometry=self._reckoned.first(count),
+            truth=self._true.first(count),
+            outcomes=self._counted.copy(),
             lost=int(rows[:, 7].sum()),
             online_error=self._online_error,
             doubt=self._doubt,
@@ -120,7 +124,13 @@ class RunMonitor:
                 self._header = cells
                 continue
             row = dict(zip(self._header, cells, strict=False))
-            self._rows.append(_numbers(where, [row.get(name, "") for name in _NUMBERS], len(_NUMBERS)))
+            numbers = _numbers(where, [row.get(name, "") for name in _NUMBERS], len(_NUMBERS))
+            self._rows.append(numbers)
+            if numbers[0] in self._early:
+                self._true.append(self._early.pop(numbers[0]))
+            else:
+                self._untrue[numbers[0]] = len(self._true)
+                self._true.append([np.nan, np.nan])
             self._outcomes.append(row.get("outcome", ""))
             self._doubt = _numbers(where, [row["doubt"]], 1)[0] if row.get("doubt") else None
         for where, line in self._odometry.read_new():
@@ -128,10 +138,17 @@ class RunMonitor:
             self._reckoned.append([x, y, 2 * atan2(qz, qw)])
         for where, line in self._truth.read_new():
             t, x, y, *_ = _numbers(where, line.split(), 8)
-            self._true[t] = [x, y]
+            if t in self._untrue:
+                self._true.replace(self._untrue.pop(t), [x, y])
+            else:
+                self._early[t] = [x, y]
         for where, line in self._errors.read_new():
             if not line.startswith("t,"):
                 self._online_error = _numbers(where, line.split(","), 2)[1]
+
+    def _count(self, count: int) -> None:
+        """Counts the outcomes of the first steps that are not counted yet."""
+        self._counted.update(self._outcomes[self._counted.total() : count])
 
     def _manifest(self) -> tuple[str, int | None]:
         file = self.directory / "manifest.json"
@@ -171,6 +188,26 @@ class RunMonitor:
             except OSError:
                 continue  # not written yet, or just renamed
         return max(dates)
+
+
+class _Rows:
+    """Rows of numbers, to which more are appended; copied as one block instead of number by number."""
+
+    def __init__(self, width: int) -> None:
+        self._width, self._numbers = width, array("d")
+
+    def __len__(self) -> int:
+        return len(self._numbers) // self._width
+
+    def append(self, row: list[float]) -> None:
+        self._numbers.extend(row)
+
+    def replace(self, number: int, row: list[float]) -> None:
+        self._numbers[number * self._width : (number + 1) * self._width] = array("d", row)
+
+    def first(self, count: int) -> np.ndarray:
+        """A copy of the first rows [count, width]."""
+        return np.array(self._numbers, float).reshape(-1, self._width)[:count]
 
 
 class _Lines:

@@ -179,13 +179,16 @@ def _arm(
 def _run(rig: Rig, path: HeadPath, mapper: Mapper, whisks: list[WhiskReport]) -> None:
     rate = rig.config.plan.whisking.rate
     total = rig.config.whisks or ceil(path.duration * rate)
+    dropped = lost = 0
     rig.begin()
     with tqdm(total=total, unit="whisk", desc="live", file=sys.stderr, mininterval=0.5) as bar:
 
         def count_whisk(whisk: WhiskReport) -> None:
+            nonlocal dropped, lost
             whisks.append(whisk)
+            dropped, lost = dropped + (not whisk.seen), lost + whisk.missing
             bar.update()
-            bar.set_postfix_str(_status(rig, mapper, whisks), refresh=False)
+            bar.set_postfix_str(session_status(mapper, whisk, dropped, lost), refresh=False)
 
         try:
             run_whisk_loop(rig, main_route(rig.config, path), mapper, count_whisk)
@@ -194,14 +197,17 @@ def _run(rig: Rig, path: HeadPath, mapper: Mapper, whisks: list[WhiskReport]) ->
             raise
 
 
-def _status(rig: Rig, mapper: Mapper, whisks: list[WhiskReport]) -> str:
+def session_status(mapper: Mapper, whisk: WhiskReport, dropped: int, lost: int) -> str:
+    """The newest result of the mapper and the newest whisk, as text.
+
+    Args:
+        dropped: number of images dropped so far. lost: number of samples lost so far.
+    """
     result = mapper.mapped[-1] if mapper.mapped else None
     place = "" if result is None or result.place < 0 else f", place {result.place}"
     place += "" if result is None or not result.doubt > DOUBTED else ", map_doubted"
     took = "" if result is None else f"map {1e3 * result.seconds:.0f} ms{place}, "
-    dropped = sum(not whisk.seen for whisk in whisks)
-    lost = sum(whisk.missing for whisk in whisks)
-    return f"{took}late {1e3 * whisks[-1].lateness:.0f} ms, {lost} samples lost, {dropped} images dropped"
+    return f"{took}late {1e3 * whisk.lateness:.0f} ms, {lost} samples lost, {dropped} images dropped"
 
 
 def _report(

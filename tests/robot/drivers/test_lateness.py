@@ -1,0 +1,89 @@
+"""Lateness of a loop, priorities of processes, and which findings name this machine."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from robot.drivers.lateness import WINDOW, LatenessMeter
+from robot.drivers.outcome import SessionOutcome
+from robot.drivers.ur10.config import ArmConfig
+from robot.drivers.ur10.late_findings import ended_script_finding, silent_session_finding, stale_finding
+
+REAL = ArmConfig(host="192.168.1.10")
+PRIORITIES = """
+import os, subprocess, sys, threading
+from robot.drivers import process_priority as priority
+def of(pid):
+    return os.sched_getscheduler(pid), os.getpriority(os.PRIO_PROCESS, pid)
+waiting = threading.Event()
+other = threading.Thread(target=waiting.wait)
+other.start()
+before = of(0)
+with priority.urgent():
+    assert of(0) == of(other.native_id), "threads that run already"
+    code = "import os; from robot.drivers.process_priority import step_back; step_back();"
+    code += "print(os.sched_getscheduler(0), os.getpriority(os.PRIO_PROCESS, 0))"
+    child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    policy, niceness = map(int, child.stdout.split())
+    assert policy == os.SCHED_OTHER
+    assert niceness == min(19, of(0)[1] + priority.BACKGROUND)
+    drawing = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    priority.put_last(drawing.pid)
+    assert of(drawing.pid) == (os.SCHED_OTHER, priority.LOWEST)
+    drawing.communicate(b"\\n")
+assert of(0) == of(other.native_id) == before
+waiting.set()
+"""
+
+
+def test_the_largest_delay_of_the_last_second_counts() -> None:
+    meter = LatenessMeter(0.005, 10.0)
+    assert meter.turn(10.005) == pytest.approx(0.0, abs=1e-12)
+    assert meter.turn(10.205) == pytest.approx(0.195)
+    assert meter.turn(10.215) == pytest.approx(0.195)
+    assert meter.worst(10.205 + WINDOW) == pytest.approx(0.195)
+    assert meter.worst(10.206 + WINDOW) == 0.0
+    assert meter.turn(12.0) == pytest.approx(1.78)
+
+
+@pytest.mark.parametrize(("late", "named"), [(0.04, False), (0.06, True)])
+def test_states_that_are_missing_because_this_machine_is_late(late: float, named: bool) -> None:
+    finding = stale_finding(0.11, late, 0.1)
+    assert finding.outcome is (SessionOutcome.HOST_LATE if named else SessionOutcome.ARM_STALE)
+    assert finding.detail.endswith("no new state for 0.110 s")
+    assert ("this machine was 0.060 s late" in finding.detail) == named
+
+
+@pytest.mark.parametrize(
+    ("config", "unreset", "late", "outcome"),
+    [
+        (REAL, 0.05, 0.09, SessionOutcome.ARM_GONE),  # reset in time: something else ended the script
+        (REAL, 0.13, 0.01, SessionOutcome.ARM_GONE),  # the controller or the network is slow
+        (REAL, 0.13, 0.06, SessionOutcome.HOST_LATE),
+        (ArmConfig(), 0.13, 0.01, SessionOutcome.HOST_LATE),  # the emulator is slow, on this machine
+        (ArmConfig(), 0.05, 0.01, SessionOutcome.ARM_GONE),
+    ],
+)
+def test_a_control_script_that_ended(
+    config: ArmConfig, unreset: float, late: float, outcome: SessionOutcome
+) -> None:
+    finding = ended_script_finding(config, unreset, late)
+    assert finding.outcome is outcome
+    assert ("was not reset for 0.130 s" in finding.detail) == (unreset > 0.1)
+    assert ("this machine was" in finding.detail) == (outcome is SessionOutcome.HOST_LATE)
+
+
+def test_a_silent_session_names_this_machine() -> None:
+    finding = silent_session_finding(0.1512)
+    assert finding.outcome is SessionOutcome.HOST_LATE
+    assert "this machine was 0.151 s late" in finding.detail
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setscheduler"), reason="no scheduling policies")
+def test_control_before_mapping_before_drawing() -> None:
+    """Whatever this system allows."""
+    subprocess.run([sys.executable, "-c", PRIORITIES], check=True)
