@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from copy import copy, deepcopy
 from typing import NamedTuple
 
 import numpy as np
@@ -67,6 +68,13 @@ class ConfirmedPairs(NamedTuple):
 
 class Appearance(Checkpointed, ABC):
     """Views of all keyframes."""
+
+    def present(self) -> Appearance:
+        """The present metric with the views so far, which are shared: they never change."""
+        other = copy(self)
+        for name in self.PARTS:
+            setattr(other, name, deepcopy(getattr(self, name)))
+        return other
 
     @abstractmethod
     def metric(self) -> ViewMetric:

@@ -76,9 +76,11 @@ class KeyframeGraph(Checkpointed):
         return self.appearance.metric().angle
 
     def copy(self) -> KeyframeGraph:
-        """A copy whose map may change; what never changes is shared."""
+        """A copy of the present state, which may change independently."""
         other = copy(self)
-        other.pose, other.cut = deepcopy(self.pose), deepcopy(self.cut)
+        for name, array in self._growable_arrays().items():
+            setattr(other, name, deepcopy(array))
+        other.appearance = self.appearance.present()
         return other
 
     def append(self, pose: np.ndarray, motion: np.ndarray, length: float, turn: float) -> None:

@@ -29,9 +29,9 @@ from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.live_filter import LiveFilter
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict, write_closures
 from ratslam.keyframes.map_health import DOUBTED, worse_than_odometry
-from ratslam.keyframes.map_hypotheses import MapHypotheses
 from ratslam.keyframes.map_solution import MapSolution, selected_solution, solution_pieces, solved_map
 from ratslam.keyframes.optimizer import MapFit
+from ratslam.keyframes.selection_worker import SelectionWorker
 from ratslam.keyframes.travel import HALT
 from ratslam.keyframes.verification import continues_sequence
 from ratslam.pose_graph import Edges
@@ -60,7 +60,7 @@ class KeyframeMap(Checkpointed, Map):
     """
 
     VALUES = ("_travel", "_since", "_turned", "_solved", "_doubt")
-    PARTS = ("_graph", "_log", "_experiences", "_appearance", "_acceptance", "_live", "_hypotheses")
+    PARTS = ("_graph", "_log", "_experiences", "_appearance", "_acceptance", "_live", "_selection")
 
     def __init__(
         self,
@@ -78,7 +78,7 @@ class KeyframeMap(Checkpointed, Map):
         self._graph = KeyframeGraph(config, cell, appearance, guard, ablation)
         self._log = ClosureLog()
         self._live = LiveFilter()
-        self._hypotheses = MapHypotheses()
+        self._selection = SelectionWorker(config.select_every)
         self._acceptance = acceptance(self._graph)
         self._experiences = Experiences(config.place_radius * cell, config.place_heading)
         self._step_frame = GrowableArray((), np.int64)
@@ -218,7 +218,7 @@ class KeyframeMap(Checkpointed, Map):
             return solved_map(self._graph, self._log)
         graph, log, selected = self._graph, self._log, None
         if self.config.select_every:
-            selected = selected_solution(graph, log, deepcopy(self._hypotheses))
+            selected = selected_solution(graph, log, deepcopy(self._selection.hypotheses))
         return selected or self._acceptance.solution(graph, log)
 
     def _write_calibration(self, path: Path) -> None:
@@ -302,18 +302,12 @@ class KeyframeMap(Checkpointed, Map):
         return self._since <= 5 * self.cell and bool(variance <= self.config.place_heading**2)
 
     def _select(self) -> None:
-        """Every `select_every` keyframes, selects among all sequences anew, takes over the map and
-        learns the noise of the odometry from it."""
-        every, graph = self.config.select_every, self._graph
-        if not every or not self.closes_loops or graph.count % every:
+        """Takes over the map with the closures selected meanwhile, and begins the next selection."""
+        if not self.closes_loops:
             return
-        solution = selected_solution(graph, self._log, self._hypotheses)
-        if solution is None:
-            return
-        self._log, graph.cut = solution.log, solution.cut
-        graph.move_to(solution.fit)
-        graph.learn_noise(solution.fit, self._log)
-        self._forget_solution()
+        if self._selection.finish(self._graph, self._log):
+            self._forget_solution()
+        self._selection.begin(self._graph, self._log)
 
     def _judge(self) -> None:
         """Every `DOUBT_EVERY` keyframes, judges the present map."""
