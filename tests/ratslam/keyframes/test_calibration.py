@@ -12,8 +12,8 @@ from ratslam.keyframes.config import KeyframeMapConfig
 from ratslam.keyframes.odometry_noise import HeadingNoise
 from ratslam.keyframes.optimizer import CalibrationPrior, MapCovariance
 from tactile.base.se2 import wrap
+from tests.ratslam.keyframes.map_cases import BIAS, CELL, LAP, TRUE, drive, new_map
 from tests.ratslam.keyframes.test_calibration_consistency import calibration_covariance, sessions
-from tests.ratslam.keyframes.test_closure_odds import BIAS, CELL, LAP, TRUE, drive, new_map
 
 __all__ = ["sessions"]
 

@@ -4,76 +4,20 @@ and its control written by hand."""
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 from ratslam.keyframes.acceptance import AcceptByEvidence, believe
-from ratslam.keyframes.appearance import LabelAppearance
-from ratslam.keyframes.closure_odds import MIN_LOG_ODDS, AcceptByOdds, is_round
-from ratslam.keyframes.config import KeyframeMapConfig
+from ratslam.keyframes.closure_odds import MIN_LOG_ODDS, is_round
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
-from ratslam.keyframes.map import KeyframeMap
 from ratslam.keyframes.optimizer import CalibrationPrior
 from tactile.base.se2 import correct_heading, integrate
-from tactile.base.types import Odometry, observation
-
-CELL = 0.5
-LAP = 200
-"""Keyframes of a lap."""
-STEP = 0.4 * CELL
-BIAS = 0.01
-"""Heading bias of the odometry, rad/m."""
-NOTHING = (-1, 0.0)
-"""No candidate: match and log-likelihood ratio."""
-
-
-class Seen(NamedTuple):
-    """Evidence of one step, as recall gives it."""
-
-    keyframe: int
-    match: int
-    shift: int
-    posterior: float
-    log_ratio: float
-    mirror_match: int
-    mirror_shift: int
-    mirror_posterior: float
-    mirror_log_ratio: float
-
-
-class Pose(NamedTuple):
-    """The part of an estimate that the map changes."""
-
-    place: int
-    previous: int
-    action: int
-
-
-def new_map(acceptance=AcceptByOdds, **settings):
-    config = KeyframeMapConfig.model_validate(settings)
-    return KeyframeMap(config, CELL, LabelAppearance(), acceptance)
+from tests.ratslam.keyframes.map_cases import CELL, LAP, TRUE, drive, new_map, sequence
 
 
 def by_evidence(graph):
     return AcceptByEvidence()
-
-
-def drive(map, recalled, control=None, first=0, last=LAP + 60, bias=BIAS):
-    """Drives keyframes first to last - 1. recalled, control: match and log ratio by keyframe."""
-    turn = 2 * np.pi / LAP - bias * STEP
-    for k in range(first, last):
-        (match, ratio), (other, false) = recalled.get(k, NOTHING), (control or {}).get(k, NOTHING)
-        odometry = Odometry(STEP, 0.0, turn, 0.1) if k else Odometry(0.0, 0.0, 0.0, 0.1)
-        seen = Seen(k, match, 0, float(match >= 0), ratio, other, 0, float(other >= 0), false)
-        map.update(observation(odometry, None, view_shape=(1, 1, 1), label=k), Pose(-1, -1, 0), seen)
-    return map
-
-
-def sequence(start, match, length, ratio):
-    """Candidates of a sequence that goes on as odometry does."""
-    return {start + n: (match + n, ratio) for n in range(length)}
 
 
 def many(starts, length, ratio):
@@ -85,7 +29,6 @@ def many(starts, length, ratio):
 FALSE = sequence(LAP - 20, 0, 4, 4.0)
 """The beginning of the lap, seen too early: within the reach of the heading bias, and wrong."""
 DECOYS = many(range(50, 185, 7), 4, 4.0)
-TRUE = sequence(LAP + 2, 2, 12, 4.0)
 BOTH = FALSE | TRUE
 
 

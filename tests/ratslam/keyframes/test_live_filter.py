@@ -16,7 +16,7 @@ from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.live_filter import LEAST_WEIGHT, LiveFilter
 from ratslam.keyframes.loop_closures import Candidate
 from tactile.base.se2 import between, compose, wrap
-from tests.ratslam.keyframes.test_closure_odds import LAP, STEP, drive, new_map, sequence
+from tests.ratslam.keyframes.map_cases import LAP, STEP, drive, new_map, sequence
 
 CELL, SECTOR = 0.05, 2 * np.pi / 12
 KNOWN = 8

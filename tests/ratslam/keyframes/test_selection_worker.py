@@ -1,0 +1,94 @@
+"""Selection beside the session: its result is taken up at a fixed keyframe, however long it takes."""
+
+from __future__ import annotations
+
+from threading import Event
+
+import numpy as np
+import pytest
+
+from ratslam.keyframes import selection_worker
+from ratslam.keyframes.loop_closures import Verdict
+from ratslam.keyframes.selection_worker import DELAY, THREAD
+from tests.ratslam.keyframes.map_cases import LAP, drive, new_map, sequence
+
+EVERY = 60
+SELECTED = {"select_every": EVERY}
+BEGUN = 4 * EVERY
+"""The first selection with closures to select from."""
+SEEN = sequence(LAP + 2, 2, 80, 5.0)
+LAST = LAP + 90
+
+
+def same(a, b):
+    first, second = a.arrays(), b.arrays()
+    assert first.keys() == second.keys()
+    return all(np.array_equal(first[name], second[name], equal_nan=True) for name in first)
+
+
+@pytest.fixture
+def held(monkeypatch):
+    """Holds the thread back until the event is set."""
+    gate = Event()
+
+    def hold():
+        THREAD.submit(gate.wait, 60)
+
+    yield hold, gate
+    gate.set()
+
+
+def test_a_slow_selection_gives_the_same_bits(held, monkeypatch):
+    hold, gate = held
+    expected = drive(new_map(**SELECTED), SEEN, last=LAST)
+    hold()
+    slow = drive(new_map(**SELECTED), SEEN, last=BEGUN + DELAY - 1)
+    assert slow.keyframes().count > BEGUN  # the session went on while the selection was held back
+    gate.set()
+    assert same(drive(slow, SEEN, first=BEGUN + DELAY - 1, last=LAST), expected)
+
+
+def test_the_result_is_taken_up_after_the_delay(monkeypatch):
+    """Before, the verdicts are those of the session; a selection that refuses all closures shows when."""
+    taken = []
+    real = selection_worker.SelectedMap.take_up
+
+    def take_up(self, graph, log):
+        taken.append((len(self.poses), graph.count))
+        real(self, graph, log)
+
+    monkeypatch.setattr(selection_worker.SelectedMap, "take_up", take_up)
+    drive(new_map(**SELECTED), SEEN, last=LAST)
+    assert taken == [(BEGUN, BEGUN + DELAY)]
+
+
+def test_frequent_selections_wait_for_each_other(monkeypatch):
+    taken = []
+    real = selection_worker.SelectedMap.take_up
+
+    def take_up(self, graph, log):
+        taken.append(graph.count - len(self.poses))
+        real(self, graph, log)
+
+    monkeypatch.setattr(selection_worker.SelectedMap, "take_up", take_up)
+    drive(new_map(select_every=10), SEEN, last=LAST)
+    assert set(taken) == {10}
+    assert len(taken) > 3
+
+
+@pytest.mark.parametrize("at", [BEGUN - 3, BEGUN + 1, BEGUN + DELAY - 1, BEGUN + DELAY + 1])
+def test_a_checkpoint_during_a_selection_continues_to_the_same_bits(at):
+    whole = drive(new_map(**SELECTED), SEEN, last=LAST)
+    part = drive(new_map(**SELECTED), SEEN, last=at)
+    restored = new_map(**SELECTED)
+    restored.restore(part.arrays())
+    assert same(drive(restored, SEEN, first=at, last=LAST), whole)
+    assert same(drive(part, SEEN, first=at, last=LAST), whole)
+
+
+def test_verdicts_given_while_a_selection_works_stay():
+    """A sequence too short to be selected when the selection begins, and accepted before it is taken up."""
+    early, late = sequence(LAP + 2, 2, BEGUN - LAP - 3, 5.0), sequence(BEGUN + 2, BEGUN + 2 - LAP, 60, 5.0)
+    found = drive(new_map(**SELECTED), early | late, last=BEGUN + DELAY + 2)
+    verdicts = {int(row[5]): Verdict(int(row[7])) for row in found.candidates()}
+    assert set(verdicts.values()) == {Verdict.ACCEPTED}
