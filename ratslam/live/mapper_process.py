@@ -6,6 +6,7 @@ parent, the mapper completes the run directory with the samples so far.
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import os
 import queue
@@ -270,6 +271,8 @@ def _map(line: Connection) -> None:
             Odometry(0.0, 0.0, 0.0, 0.0), view_shape=source.view_shape, whiskers=source.whiskers
         )
         session.warm(blank)
+        gc.collect()
+        gc.freeze()  # what compiling has left need not be searched again: a full collection takes 0.1 s
         line.send(True)
         fed.calibrate()
         source = open_touch_source(fed, config.touch)
