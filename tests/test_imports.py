@@ -122,7 +122,7 @@ with contextlib.suppress(SystemExit):
     assert _report(code + HEAVY) == []
 
 
-SLOW = ("matplotlib", "networkx", "numba") + tuple(
+SLOW = ("matplotlib", "networkx") + tuple(
     f"scipy.{name}" for name in ("signal", "stats", "interpolate", "optimize", "spatial", "ndimage")
 )
 """Modules that a run needs after its first estimate, or not at all."""

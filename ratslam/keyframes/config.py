@@ -97,7 +97,7 @@ class KeyframeMapConfig(Settings):
     distance; 0: compared only from one candidate to the next."""
     select_every: NonNegativeInt = 0
     """Keyframes after which all sequences, accepted or not, are selected anew against each other (see
-    `ratslam.keyframes.closure_selection`); 0: never, an accepted sequence stays. The result is taken up 25
+    `ratslam.keyframes.closure_selection`); 0: never, an accepted sequence stays. The result is taken up 10
     keyframes later, or at the next selection if that is earlier."""
     select_score: PositiveFloat = 12.0
     """Least evidence of the sequences to select from; one of them has at least `min_score`."""

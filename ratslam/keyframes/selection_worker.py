@@ -22,7 +22,7 @@ from ratslam.keyframes.odometry_noise import HeadingNoise
 from ratslam.keyframes.optimizer import MapFit, solve
 from tactile.base.se2 import compose, inverse
 
-DELAY = 25
+DELAY = 10
 """Keyframes after which a selection is taken up, at most as many as lie between two selections."""
 THREAD = ThreadPoolExecutor(1, "closure selection")
 """Of all maps of the process."""
