@@ -8,10 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.plots import style
-from evaluation.plots.style import BLUE, GREY, INK, LABEL_GREY, LINE_GREY, VERMILLION, WIDTH
+from evaluation.plots.style import BLUE, GREY, INK, LABEL_GREY, VERMILLION, WIDTH
 
 _TALL, _EACH, _BOTTOM = 4.4, 0.13, 0.95  # inches: height of the axes, extra per point beyond 12, below
-_ROOM = 0.12  # share of the axes kept free on each side
 _FLOOR = 0.5  # an error of 0 is drawn at this share of the least positive error
 # Pixels: grid of label positions, gap around labels (across, up), distance from which a line is drawn.
 _GRID, _GAP, _NEAR = 3.0, (5.0, 2.0), 14.0
@@ -48,7 +47,7 @@ def draw_pareto(title: str, line: str, marks: Sequence[ParetoPoint], time: str, 
     floor = _FLOOR * positive.min() if len(positive) else 1.0
     spans[:, 1] = np.maximum(spans[:, 1], floor)
     best = np.array([mark.optimal for mark in marks])
-    _frame(axes, spans)
+    style.log_axes(axes, spans[:, 0], spans[:, 1])
     _paint(axes, spans, best)
     none = bool((spans[:, 1] == floor).any())
     style.name_axes(axes, time, f"{error}{', 0 at the bottom' if none else ''}")
@@ -103,25 +102,6 @@ def _overlap(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
     low = np.maximum(boxes[:, None, :2], others[None, :, :2])
     high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
     return np.maximum(high - low, 0.0).prod(axis=2)
-
-
-def _frame(axes: style.Axes, spans: np.ndarray) -> None:
-    """Sets logarithmic axes around the spans [N, 2, 3], with round tick labels."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
-
-    axes.set(xscale="log", yscale="log")
-    for axis, limit, values in (
-        (axes.xaxis, axes.set_xlim, spans[:, 0]),
-        (axes.yaxis, axes.set_ylim, spans[:, 1]),
-    ):
-        low, high = np.log(values.min()), np.log(values.max())
-        room = _ROOM * max(high - low, np.log(2.0)) / (1 - 2 * _ROOM)
-        limit(np.exp(low - room), np.exp(high + room))
-        steps = (1, 2, 5) if high - low < np.log(300) else (1,)
-        axis.set_major_locator(LogLocator(subs=steps, numticks=30))
-        axis.set_minor_locator(NullLocator())
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.10g}"))
-    axes.grid(color=LINE_GREY, lw=0.7)
 
 
 def _front(axes: style.Axes, spans: np.ndarray, best: np.ndarray) -> np.ndarray:

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -24,6 +26,8 @@ PURPLE = "#cc79a7"
 
 WIDTH, LEFT, RIGHT, TOP = 8.0, 0.62, 0.25, 0.90
 """Width and margins of every plot, inches."""
+ROOM = 0.12
+"""Share of logarithmic axes kept free on each side."""
 
 
 def new_figure(height: float, title: str, line: str) -> Figure:
@@ -53,6 +57,22 @@ def name_axes(axes: Axes, across: str, up: str) -> None:
     """Sets the axis labels, with units."""
     axes.set_xlabel(across, color=LABEL_GREY, fontsize=9)
     axes.set_ylabel(up, color=LABEL_GREY, fontsize=9)
+
+
+def log_axes(axes: Axes, across: np.ndarray, up: np.ndarray) -> None:
+    """Sets logarithmic axes around positive values of any shapes, with round tick labels and a light grid."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
+    axes.set(xscale="log", yscale="log")
+    for axis, limit, values in ((axes.xaxis, axes.set_xlim, across), (axes.yaxis, axes.set_ylim, up)):
+        low, high = np.log(values.min()), np.log(values.max())
+        room = ROOM * max(high - low, np.log(2.0)) / (1 - 2 * ROOM)
+        limit(np.exp(low - room), np.exp(high + room))
+        steps = (1, 2, 5) if high - low < np.log(300) else (1,)
+        axis.set_major_locator(LogLocator(subs=steps, numticks=30))
+        axis.set_minor_locator(NullLocator())
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.10g}"))
+    axes.grid(color=LINE_GREY, lw=0.7)
 
 
 def metre_grid(axes: Axes) -> None:

@@ -31,7 +31,9 @@ REPLACED = {
     "compare": "study --preset backends CONFIG",
 }
 """Replacements of commands of earlier versions."""
-PRESETS = ("ablate", "vary", "spread", "tiers", "backends", "pareto")
+GROWTH = "growth"
+"""Preset that measures long sessions."""
+PRESETS = ("ablate", "vary", "spread", "tiers", "backends", "pareto", GROWTH)
 """Names of presets, known before JAX is loaded."""
 CYCLES = 800
 """Cycles of the session that `size` tries settings on."""
@@ -154,6 +156,8 @@ def limit_threads() -> None:
 def _study(arguments: argparse.Namespace) -> int:
     limit_threads()
     prepare_jax()
+    if arguments.preset == GROWTH:
+        return _growth(arguments)
     from ratslam.experiments.studies.metrics import find_error
     from ratslam.experiments.studies.presets import preset_study
     from ratslam.experiments.studies.records import RunLog
@@ -193,6 +197,26 @@ def _table(arguments: argparse.Namespace, study: Any, log: Any, error: Any, rema
     report = make_report(study.name, study.plan, records, error)
     _save(replace(report, remarks=[*report.remarks, *remarks]), log.path)
     return progress.report_failures()
+
+
+def _growth(arguments: argparse.Namespace) -> int:
+    for option in ("search", "workers", "scheduler", "error"):
+        if getattr(arguments, option):
+            found = f"with --preset {GROWTH}"
+            raise InputError(f"--{option}", found, "one session at a time, without search", "leave it out")
+    from ratslam.experiments.studies.growth import growth_study
+    from ratslam.experiments.studies.growth_report import read_rows, render_growth, run_growth, save_growth
+
+    study = growth_study(arguments.file, arguments.set)
+    folder = arguments.output or Path("runs") / study.name
+    try:
+        run_growth(study, folder)
+    finally:  # an interrupted study has the table of what it measured
+        if rows := read_rows(folder):
+            paths = save_growth(study.name, rows, folder)
+            print(render_growth(rows))
+            print(f"\n{folder} holds {', '.join(path.name for path in paths)}")
+    return 0
 
 
 def _save(report: Any, records: Path) -> None:

@@ -1,4 +1,4 @@
-"""Routes through a maze as lists of cells: circuits around a loop, and free exploration.
+"""Routes through a maze as lists of cells: circuits around a loop, free exploration, a way through all cells.
 
 `CCCAAACACA` is the protocol of Salman & Pearson 2016: three circuits clockwise, three anticlockwise, then
 four in alternating directions.
@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from robot.world.maze import Cell, Maze, is_inside, is_open, neighbours
+from robot.world.maze import Cell, Maze, is_inside, is_open, neighbours, tree_maze
 from tactile.base.errors import InputError
 
 
@@ -48,6 +48,25 @@ def exploration_route(maze: Maze, start: Cell, cells: int, random: np.random.Gen
         onward = [cell for cell in options if cell != before] or options
         before = way[-1]
         way.append(onward[int(random.integers(len(onward)))])
+    return way
+
+
+def winding_loop(columns: int, rows: int, random: np.random.Generator) -> list[Cell]:
+    """A random loop through each cell of a rectangle once: the way around a random tree of 2 x 2 blocks.
+
+    Args:
+        columns, rows: even.
+    """
+    tree = tree_maze(columns // 2, rows // 2, random)
+    way: list[Cell] = [(0, 0)]
+    while len(way) < columns * rows:
+        x, y = way[-1]
+        right, up = 2 * (x % 2) - 1, 2 * (y % 2) - 1  # the side of its block on which the cell lies
+        block = x // 2, y // 2
+        joined = neighbours(tree, block)
+        beside = (x + right, y) if (block[0] + right, block[1]) in joined else (x, y - up)
+        above = (x, y + up) if (block[0], block[1] + up) in joined else (x - right, y)
+        way.append(above if way[-2:-1] == [beside] else beside)
     return way
 
 

@@ -12,11 +12,14 @@ from importlib.metadata import version
 from pathlib import Path
 from time import perf_counter
 
+from numba.core import event as events
+
 from evaluation.metrics.resources import processor_name
 from tactile.base.config import Settings
 
 PACKAGES = ("ratslam", "tactile", "robot", "evaluation")
 COMPILED = "/jax/core/compile/backend_compile_duration"  # JAX's event of a compiled or fetched kernel
+NUMBA_COMPILED = "numba:compiler_lock"  # Numba's event of a compiled or fetched function
 
 
 class Machine(Settings):
@@ -50,7 +53,7 @@ class Stopwatch:
     """Measures a run and its calls of one or more steps, apart from compilation."""
 
     def __init__(self) -> None:
-        self._compiled = _compiled()
+        self._compiled = compilations()
         self._steps: list[tuple[int, float]] = []  # number of steps, duration in s
         self._compiling: list[tuple[int, float]] = []
         self._began = perf_counter()
@@ -84,18 +87,33 @@ class Stopwatch:
 
 
 @lru_cache(maxsize=1)
-def _compiled() -> list[float]:
-    """Durations of all compilations and fetches of kernels by this process since the first call, s."""
+def compilations() -> list[str]:
+    """An event for each compilation or fetch of code by JAX and Numba in this process since the first call;
+    grows."""
     import jax
 
-    found: list[float] = []
+    found: list[str] = []
 
     def note(event: str, duration_secs: float, **_: str | int) -> None:
         if event == COMPILED:
-            found.append(duration_secs)
+            found.append(event)
 
     jax.monitoring.register_event_duration_secs_listener(note)
+    events.register(NUMBA_COMPILED, _CompilationListener(found))
     return found
+
+
+class _CompilationListener(events.Listener):
+    """Appends to a list when Numba begins to compile or to fetch."""
+
+    def __init__(self, found: list[str]) -> None:
+        self._found = found
+
+    def on_start(self, event: events.Event) -> None:
+        self._found.append(event.kind)
+
+    def on_end(self, event: events.Event) -> None:
+        pass
 
 
 def _build() -> str:

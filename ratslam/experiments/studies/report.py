@@ -66,9 +66,10 @@ def make_report(
     if kind == "differences":
         remarks = _kept(rows, plan.limit)
     machines = [record.machine for record in records if record.machine]
-    measured = _measured(machines, len({record.seed for record in records})) | {"pace": PACES[plan.pace]}
+    seeds = len({record.seed for record in records})
+    measured = describe_machines(machines, seeds) | {"pace": PACES[plan.pace]}
     columns = list(dict.fromkeys(columns))
-    return Report(name, kind, columns, rows, error, measured, [*remarks, *_remarks(machines)])
+    return Report(name, kind, columns, rows, error, measured, [*remarks, *find_disturbances(machines)])
 
 
 def render(report: Report) -> str:
@@ -134,11 +135,11 @@ def save_report(report: Report, directory: Path) -> list[Path]:
 def _cell(found: Spread | None, kind: str, base: Spread | None) -> str:
     if found is None:
         return "-"
-    text = _number(found.mean if kind in MEANS else found.median)
+    text = format_number(found.mean if kind in MEANS else found.median)
     if kind in MEANS and found.sd is not None:
-        text += f" ± {_number(found.sd)}"
+        text += f" ± {format_number(found.sd)}"
     if found.sd is not None and found.worst is not None:
-        text += f" ({_number(found.worst)})"
+        text += f" ({format_number(found.worst)})"
     if base is not None:
         change = found.median - base.median
         share = change / base.median if base.median else math.nan
@@ -146,7 +147,8 @@ def _cell(found: Spread | None, kind: str, base: Spread | None) -> str:
     return text
 
 
-def _number(value: float) -> str:
+def format_number(value: float) -> str:
+    """A number with two or three digits."""
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.2g}" if abs(value) < 0.1 else f"{value:.3g}"
 
 
@@ -169,7 +171,7 @@ def _note(report: Report) -> str:
     return note
 
 
-def _measured(machines: Sequence[Machine], seeds: int) -> dict[str, str]:
+def describe_machines(machines: Sequence[Machine], seeds: int) -> dict[str, str]:
     """The conditions of a measurement of speed, by name."""
 
     def every(texts: Sequence[str]) -> str:
@@ -191,7 +193,7 @@ def _machine_text(machine: Machine) -> str:
     return f"{machine.processor}, {os.cpu_count()} cores, {at_once}"
 
 
-def _remarks(machines: Sequence[Machine]) -> list[str]:
+def find_disturbances(machines: Sequence[Machine]) -> list[str]:
     """What impairs a comparison of the records: sentences."""
     builds, processors = {each.build for each in machines}, {each.processor for each in machines}
     found = []

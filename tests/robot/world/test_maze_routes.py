@@ -10,7 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robot.world.maze import Maze, closed_maze, is_open, neighbours, random_loop, random_maze
-from robot.world.maze_routes import check_route, circuit_route, exploration_route, make_anticlockwise
+from robot.world.maze_routes import (
+    check_route,
+    circuit_route,
+    exploration_route,
+    make_anticlockwise,
+    winding_loop,
+)
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 
@@ -51,6 +57,19 @@ def test_exploration_visits_all_reachable_cells() -> None:
         edge = [cell for here in edge for cell in neighbours(maze, here) if cell not in there]
         there.update(edge)
     assert set(exploration_route(maze, loop[0], 20_000, stream(1, "path"))) == there
+
+
+@given(st.integers(1, 8), st.integers(1, 8), st.integers(0, 1000))
+def test_a_winding_loop_visits_every_cell_once(columns: int, rows: int, seed: int) -> None:
+    columns, rows = 2 * columns, 2 * rows
+    loop = winding_loop(columns, rows, stream(seed, "loop"))
+    assert sorted(loop) == [(x, y) for x in range(columns) for y in range(rows)]
+    for (x, y), (next_x, next_y) in pairwise([*loop, loop[0]]):
+        assert abs(next_x - x) + abs(next_y - y) == 1
+
+
+def test_winding_loops_differ_by_their_random_numbers() -> None:
+    assert winding_loop(8, 8, stream(0, "loop")) != winding_loop(8, 8, stream(1, "loop"))
 
 
 @pytest.mark.parametrize("word", ["", "CAB", "C A"])
