@@ -34,14 +34,16 @@ COLUMNS = {
     "": "ground", "steps": "steps", "keyframes": "keyframes", "mean us": "mean",
     "all threads us": "process_mean", "median us": "median", "99 % us": "p99", "largest us": "largest",
     "longest us": "longest", "memory MiB": "memory", "EM m^2 + rad^2": "energy", "ATE m": "ate",
-    "end s": "end", "final EM": "energy_final", "final ATE m": "ate_final",
+    "odometry EM": "energy_odometry", "end s": "end", "final EM": "energy_final",
+    "final ATE m": "ate_final", "closures": "closures", "false": "false_closures",
 }  # fmt: skip
 """Fields of a row by their column in the table."""
 NOTE = """\
 mean, median, 99 %, largest: processor time of a step on the session's thread, over the steps since the length
 before, without those that compiled code. all threads: the mean with other threads. longest: wall time of a
-step. memory: peak since the length before. EM and ATE: of the online map so far. end: processor time of the
-final optimisation if the session ended here. final: errors of the map after it."""
+step, with waits for the selection of closures, as steps follow one another without pause. memory: peak since
+the length before. EM and ATE: of the online map so far. end: processor time of the final optimisation if the
+session ended here. final, closures, false: of the map after it; closures of places more than 0.1 m apart."""
 
 
 def run_growth(study: GrowthStudy, folder: Path) -> None:
@@ -88,14 +90,14 @@ def draw(name: str, rows: Sequence[GrowthRow]) -> Figure | None:
     curves = []
     for ground in dict.fromkeys(row.ground for row in timed):
         these = [row for row in timed if row.ground == ground]
-        cost = np.array([[row.mean, row.p99, row.largest] for row in these], float)
+        cost = np.array([[row.mean, row.p99, row.largest] for row in these], float) / 1e3
         curves.append(GrowthCurve(ground, np.array([row.steps for row in these]), cost))
     if not curves:
         return None
     measured = describe_machines([row.machine for row in rows], 1)
     line = "  ·  ".join(measured[part] for part in ("machine", "build"))
     return draw_growth(
-        f"Cost of a step against length: {name}", line, curves, "processor time of a step (us), own thread"
+        f"Cost of a step against length: {name}", line, curves, "processor time of a step (ms), own thread"
     )
 
 

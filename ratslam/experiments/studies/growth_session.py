@@ -11,6 +11,7 @@ import numpy as np
 
 from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.resources import peak_memory, reset_peak_memory, watch_load
+from evaluation.metrics.session_metrics import FALSE_CLOSURE_DISTANCE
 from evaluation.metrics.trajectory import ate
 from ratslam.core.session import Session
 from ratslam.experiments.studies.growth import Ground, GrowthTask
@@ -18,6 +19,7 @@ from ratslam.experiments.studies.machine import Machine, compilations, machine
 from ratslam.pipeline.runner import build_session
 from ratslam.pipeline.source import open_observations, read_observations
 from tactile.base.config import Settings
+from tactile.base.se2 import integrate
 from tactile.base.types import Observation
 
 TIMES = ("mean", "process_mean", "median", "p99", "largest", "longest")
@@ -36,11 +38,14 @@ class GrowthRow(Settings):
     median: float | None  # processor time of a step on the session's own thread, us
     p99: float | None  # the same, 99 % quantile, us
     largest: float | None  # the same, largest, us
-    longest: float | None  # wall time of the longest step, us
+    longest: float | None  # wall time of the longest step, with waits for other threads, us
     compiling: float  # wall time of the steps that compiled code, s
     memory: float  # peak resident memory, MiB
     energy: float  # Energy Metric of the online map, all pairs, m^2 + rad^2
     ate: float  # ATE of the online map, m
+    energy_odometry: float  # Energy Metric of odometry, all pairs, m^2 + rad^2
+    closures: int  # number of loop closures of the final map
+    false_closures: int  # number of these between steps farther apart than `FALSE_CLOSURE_DISTANCE`
     end: float  # processor time of the final optimisation if the session ended here, s
     energy_final: float  # Energy Metric of the final map, all pairs, m^2 + rad^2
     ate_final: float  # ATE of the final map, m
@@ -108,7 +113,8 @@ def measure_growth(task: GrowthTask, done: Callable[[], object] = lambda: None) 
         reserve = config.session.reserve or 1
         kept = config.session.model_copy(update={"reserve": reserve})
         session = build_session(config.model_copy(update={"session": kept}), source)
-        rows, truth, clock = read_observations(source), list[np.ndarray](), _StepClock()
+        rows, clock = read_observations(source), _StepClock()
+        truth, motion = list[np.ndarray](), list[np.ndarray]()
         for before, length in pairwise([0, *task.lengths]):
             load = watch_load()
             reset_peak_memory()
@@ -116,10 +122,11 @@ def measure_growth(task: GrowthTask, done: Callable[[], object] = lambda: None) 
                 clock.take(_step(session, observation))
                 assert sample.truth is not None
                 truth.append(sample.truth)
+                motion.append(np.asarray(observation.odometry[:3], float))
                 done()
             times = clock.read() | {"memory": peak_memory()}
             here = machine().model_copy(update={"other_load": load()})
-            errors = _errors(session, np.array(truth))
+            errors = _errors(session, np.array(truth), integrate(np.array(motion)))
             keyframes = session.backend.rows(session.state)
             found = {"keyframes": keyframes, "machine": here, **times, **errors}
             yield GrowthRow.model_validate({"ground": task.ground, "steps": length, **found})
@@ -129,12 +136,18 @@ def _step(session: Session, observation: Observation) -> Callable[[], object]:
     return lambda: session.step(observation)
 
 
-def _errors(session: Session, truth: np.ndarray) -> dict[str, float]:
+def _errors(session: Session, truth: np.ndarray, odometry: np.ndarray) -> dict[str, float]:
     """The errors of `GrowthRow`, and the time of the final optimisation; the session stays as it is."""
-    online, began = session.map.online_trajectory(), thread_time()
-    final = session.map.trajectory()
+    online = session.map.online_trajectory()
+    began = thread_time()
+    final, end = session.map.trajectory(), thread_time() - began
+    closures = session.map.closures()
+    apart = np.hypot(*(truth[closures[:, 0]] - truth[closures[:, 1]])[:, :2].T)
     return {
-        "end": thread_time() - began,
+        "end": end,
+        "energy_odometry": energy_all_pairs(odometry, truth).total,
+        "closures": len(closures),
+        "false_closures": int((apart > FALSE_CLOSURE_DISTANCE).sum()),
         "energy": energy_all_pairs(online, truth).total,
         "ate": ate(online, truth),
         "energy_final": energy_all_pairs(final, truth).total,

@@ -36,10 +36,17 @@ def config(tmp_path):
 
 def errors(row):
     """The fields of a row that no clock decides."""
-    return {
-        name: getattr(row, name)
-        for name in ("steps", "keyframes", "energy", "ate", "energy_final", "ate_final")
-    }
+    names = [
+        "steps",
+        "keyframes",
+        "closures",
+        "energy",
+        "ate",
+        "energy_odometry",
+        "energy_final",
+        "ate_final",
+    ]
+    return [getattr(row, name) for name in names]
 
 
 def test_lengths_double_up_to_the_greatest():
@@ -76,6 +83,8 @@ def test_the_program_writes_rows_table_and_picture(config, tmp_path, capsys):
         assert 0 < row.median <= row.p99 <= row.largest
         assert row.mean <= row.process_mean
         assert row.memory > 50
+        assert row.energy_odometry > 0
+        assert row.false_closures <= row.closures
         assert min(row.energy, row.ate, row.energy_final, row.ate_final, row.end) > 0
     text = capsys.readouterr().out
     assert (output / "table.md").read_text().strip() in text
