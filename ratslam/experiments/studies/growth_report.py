@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from threading import RLock
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -133,6 +134,7 @@ def _append_rows(path: Path, task: GrowthTask) -> None:
     """Measures a session, with a progress bar; appends its rows to a file."""
     from tqdm import tqdm
 
+    tqdm.set_lock(RLock())  # the default is a semaphore, which is left over when this process is ended
     with (
         tqdm(total=task.lengths[-1], desc=task.ground, unit="step", file=sys.stderr, mininterval=0.5) as bar,
         path.open("a", encoding="utf-8") as file,
