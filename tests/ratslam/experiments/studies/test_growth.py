@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import os
 import signal
 import subprocess
 import sys
@@ -109,10 +110,15 @@ def test_a_measurement_on_the_way_changes_nothing(config):
 def test_an_interrupt_leaves_table_and_picture_of_the_rows_so_far(config, tmp_path):
     output = tmp_path / "out"
     long = ["--set", "first=32", "--set", "known_ground=100000", "--set", "new_ground=0"]
-    command = [sys.executable, "-m", "ratslam", "study", "--preset", "growth", str(config), *long]
+    code = (
+        "import signal, sys\n"
+        "from ratslam.__main__ import main\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)  # what runs in the background ignores it\n"
+        "sys.exit(main(sys.argv[1:]))\n"
+    )
     process = subprocess.Popen(
-        [*command, "-o", str(output)], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        start_new_session=True,
+        [sys.executable, "-c", code, "study", "--preset", "growth", str(config), *long, "-o", str(output)],
+        cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
     )  # fmt: skip
     end = time.monotonic() + PATIENCE
     while len(read_rows(output)) < 2:
@@ -120,7 +126,11 @@ def test_an_interrupt_leaves_table_and_picture_of_the_rows_so_far(config, tmp_pa
         assert time.monotonic() < end
         time.sleep(0.02)
     process.send_signal(signal.SIGINT)
-    text, _ = process.communicate()
+    try:
+        text, _ = process.communicate(timeout=PATIENCE)
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
     assert process.returncode == 130
     rows = read_rows(output)
     assert [row.steps for row in rows[:2]] == [32, 64]
