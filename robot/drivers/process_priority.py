@@ -28,14 +28,17 @@ def become_urgent() -> None:
 
 @contextlib.contextmanager
 def urgent() -> Iterator[None]:
-    """Runs the block with the priority of control, as far as the system allows."""
-    before = os.getpriority(os.PRIO_PROCESS, 0)
+    """Runs the block with the priority of control, as far as the system allows; then all threads of this
+    process have the priority that the calling one had before."""
+    niceness, policy = os.getpriority(os.PRIO_PROCESS, 0), 0
+    with contextlib.suppress(OSError, AttributeError):
+        policy = os.sched_getscheduler(0)
     become_urgent()
     try:
         yield
     finally:
         for thread in _threads():
-            _lower(thread, before)
+            _set(thread, niceness, policy)
 
 
 def step_back() -> None:
@@ -57,8 +60,13 @@ def put_last(process: int) -> None:
 
 
 def _lower(thread: int, niceness: int) -> None:
+    _set(thread, niceness, policy=0)
+
+
+def _set(thread: int, niceness: int, policy: int) -> None:
+    """Sets nice level and policy of a thread (0: the ordinary one; the others have the least priority)."""
     with contextlib.suppress(OSError, AttributeError):
-        os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
+        os.sched_setscheduler(thread, policy, os.sched_param(os.sched_get_priority_min(policy)))
     _set_niceness(thread, niceness)
 
 

@@ -16,7 +16,7 @@ from collections.abc import Awaitable, Callable
 
 from robot.drivers.head.protocol import ENDPOINT_IN
 from robot.drivers.head.usb_tcp_protocol import ANSWER, IN, REQUEST, Op
-from robot.drivers.process_priority import become_urgent
+from robot.drivers.process_priority import urgent
 from robot.drivers.ur10.pose_listener import PoseListener
 from robot.emulators.head import usb_descriptors
 from robot.emulators.head.config import HeadEmulatorConfig
@@ -37,10 +37,9 @@ def serve(config: HeadEmulatorConfig) -> None:
     Raises:
         InputError: invalid maze or path. OSError: the port is in use.
     """
-    become_urgent()
     head = ur10_head(config.head)
     made = make_scene(config.maze, config.path, config.motion, KidnapConfig(), head, config.seed)
-    with contextlib.ExitStack() as stack:
+    with urgent(), contextlib.ExitStack() as stack:
         bridge = EmulatedHead(
             config, made.surroundings.walls, _place(config, made.path, stack), time.monotonic()
         )

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
-from robot.drivers.process_priority import become_urgent
+from robot.drivers.process_priority import urgent
 from robot.drivers.ur10.rtde_protocol import RTDE_PORT
 from robot.emulators.ur10.config import DASHBOARD_PORT, FAULT_PORT, SCRIPT_PORT, UrEmulatorConfig
 from robot.emulators.ur10.control_program import load_program
@@ -174,7 +174,7 @@ def serve(config: UrEmulatorConfig) -> None:
         server = ControllerServer(config)
     except Unreachable as error:
         raise InputError("start", str(error), "a pose within 1.3 m of the base", "move it") from error
-    become_urgent()
-    sys.stdout.write("ready\n")
-    sys.stdout.flush()
-    server.run()
+    with urgent():
+        sys.stdout.write("ready\n")
+        sys.stdout.flush()
+        server.run()

@@ -20,7 +20,7 @@ from robot.drivers import process_priority as priority
 def of(pid):
     return os.sched_getscheduler(pid), os.getpriority(os.PRIO_PROCESS, pid)
 waiting = threading.Event()
-other = threading.Thread(target=waiting.wait)
+other = threading.Thread(target=waiting.wait, daemon=True)
 other.start()
 before = of(0)
 with priority.urgent():
@@ -86,4 +86,4 @@ def test_a_silent_session_names_this_machine() -> None:
 @pytest.mark.skipif(not hasattr(os, "sched_setscheduler"), reason="no scheduling policies")
 def test_control_before_mapping_before_drawing() -> None:
     """Whatever this system allows."""
-    subprocess.run([sys.executable, "-c", PRIORITIES], check=True)
+    subprocess.run([sys.executable, "-c", PRIORITIES], check=True, timeout=60)
