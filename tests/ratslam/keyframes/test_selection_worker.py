@@ -27,7 +27,7 @@ def same(a, b):
 
 
 @pytest.fixture
-def held(monkeypatch):
+def held():
     """Holds the thread back until the event is set."""
     gate = Event()
 
@@ -38,7 +38,7 @@ def held(monkeypatch):
     gate.set()
 
 
-def test_a_slow_selection_gives_the_same_bits(held, monkeypatch):
+def test_a_slow_selection_gives_the_same_bits(held):
     hold, gate = held
     expected = drive(new_map(**SELECTED), SEEN, last=LAST)
     hold()
@@ -49,7 +49,6 @@ def test_a_slow_selection_gives_the_same_bits(held, monkeypatch):
 
 
 def test_the_result_is_taken_up_after_the_delay(monkeypatch):
-    """Before, the verdicts are those of the session; a selection that refuses all closures shows when."""
     taken = []
     real = selection_worker.SelectedMap.take_up
 
@@ -88,7 +87,10 @@ def test_a_checkpoint_during_a_selection_continues_to_the_same_bits(at):
 
 def test_verdicts_given_while_a_selection_works_stay():
     """A sequence too short to be selected when the selection begins, and accepted before it is taken up."""
-    early, late = sequence(LAP + 2, 2, BEGUN - LAP - 3, 5.0), sequence(BEGUN + 2, BEGUN + 2 - LAP, 60, 5.0)
-    found = drive(new_map(**SELECTED), early | late, last=BEGUN + DELAY + 2)
-    verdicts = {int(row[5]): Verdict(int(row[7])) for row in found.candidates()}
-    assert set(verdicts.values()) == {Verdict.ACCEPTED}
+    early, late = sequence(LAP + 2, 2, 20, 5.0), sequence(BEGUN - 1, BEGUN - 1 - LAP, 60, 5.0)
+    before, after = (
+        drive(new_map(**SELECTED), early | late, last=last).arrays()["log/verdict"]
+        for last in (BEGUN, BEGUN + DELAY)
+    )
+    assert before.tolist() == [Verdict.ACCEPTED, Verdict.OPEN]
+    assert after.tolist() == [Verdict.ACCEPTED, Verdict.ACCEPTED]
