@@ -24,7 +24,7 @@ from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import ClosureLog, Verdict
 from ratslam.keyframes.map_hypotheses import MapHypotheses
 from ratslam.keyframes.odometry_breaks import find_break
-from ratslam.keyframes.optimizer import CalibrationPrior, MapFit, robust_cost, solve
+from ratslam.keyframes.optimizer import CalibrationPrior, MapFit, System, solve
 from ratslam.keyframes.pieces import number_pieces
 
 
@@ -55,8 +55,8 @@ def cheapest_map(graph: KeyframeGraph, log: ClosureLog, priors: Sequence[Calibra
     reckoning with the mean of each of these calibrations. The log takes over its robust weights."""
     problem = graph.problem(log, graph.cut)
     starts = [graph.fit(), *(_dead_reckoned(graph, prior) for prior in priors)]
-    fits = [solve(start, problem, 2 * graph.config.settling) for start in starts]
-    fit = min(fits, key=lambda fit: robust_cost(fit, problem))
+    system = System(problem)
+    fit = min((system.solve(start, 2 * graph.config.settling) for start in starts), key=system.robust_cost)
     log.weigh(fit.weights)
     return MapSolution(fit, log, graph.cut)
 

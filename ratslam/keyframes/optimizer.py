@@ -97,18 +97,6 @@ def solve(start: MapFit, problem: MapProblem, iterations: int, tolerance: float 
     return System(problem).solve(start, iterations, tolerance)
 
 
-def robust_cost(fit: MapFit, problem: MapProblem) -> float:
-    """The cost that `solve` minimises: chi-square of odometry and calibration and robust cost of closures."""
-    return System(problem).robust_cost(fit)
-
-
-def log_evidence(fit: MapFit, problem: MapProblem) -> float:
-    """Log probability of odometry and closures with poses and calibration integrated out, to second order
-    around a fit that solves the problem (Laplace's method); up to a constant that does not depend on the
-    variances of the odometry. -inf where the equations are singular."""
-    return System(problem).log_evidence(fit)
-
-
 def _calibration(fit: MapFit, prior: CalibrationPrior) -> tuple[np.ndarray, np.ndarray]:
     """[K] deviation of the free calibration parameters from their prior, and its information."""
     off = [fit.bias - prior.bias, fit.turn_error - prior.turn_error]
@@ -209,7 +197,8 @@ class System:
         return fit
 
     def robust_cost(self, fit: MapFit) -> float:
-        """See `robust_cost`."""
+        """The cost that `solve` minimises: chi-square of odometry and calibration and robust cost of
+        closures."""
         _, chi2, chained, _ = self._errors(fit)
         closures, members = self._problem.closures, self._members
         _, mean = _mean_costs(chi2[chained:], closures, members)
@@ -218,7 +207,9 @@ class System:
         return float(chi2[:chained].sum() + lost.sum() + (tight * off**2).sum())
 
     def log_evidence(self, fit: MapFit) -> float:
-        """See `log_evidence`."""
+        """Log probability of odometry and closures with poses and calibration integrated out, to second order
+        around a fit that solves the problem (Laplace's method); up to a constant that does not depend on the
+        variances of the odometry. -inf where the equations are singular."""
         information = self.linearise(fit).log_determinant()
         spread = float(np.log(self._problem.chain.variance).sum())
         return -0.5 * (self.robust_cost(fit) + information + spread)

@@ -15,7 +15,7 @@ from ratslam.keyframes.keyframe_graph import NO_ROBUST_SCALE, KeyframeGraph
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
 from ratslam.keyframes.map import KeyframeMap
 from ratslam.keyframes.map_solution import MapSolution
-from ratslam.keyframes.optimizer import MapFit, robust_cost, solve
+from ratslam.keyframes.optimizer import MapFit, System
 from tactile.base.random_streams import stream
 from tactile.base.se2 import between, wrap
 
@@ -144,8 +144,8 @@ def solved_anew(graph: KeyframeGraph, log: ClosureLog, final: MapSolution, robus
         scale = np.full_like(problem.closures.scale, NO_ROBUST_SCALE)
         problem = problem._replace(closures=problem.closures._replace(scale=scale, cost_limit=np.inf))
     starts = [final.fit, MapFit(graph.dead_reckoned(), 0.0, np.zeros(0))]
-    fits = [solve(start, problem, STEPS, FINE) for start in starts]
-    fit = min(fits, key=lambda fit: robust_cost(fit, problem))
+    system = System(problem)
+    fit = min((system.solve(start, STEPS, FINE) for start in starts), key=system.robust_cost)
     log.weigh(fit.weights)
     return MapSolution(fit, log, final.cut)
 

@@ -14,7 +14,7 @@ from ratslam.keyframes.closure_selection import (
     select_closures,
     select_closures_and_cuts,
 )
-from ratslam.keyframes.optimizer import MapFit, robust_cost, solve
+from ratslam.keyframes.optimizer import MapFit, System, solve
 from tactile.base.se2 import compose, fit_rigid_motion
 from tests.ratslam.keyframes.selection_cases import LAP, off, world
 
@@ -39,8 +39,8 @@ def test_true_sequences_are_all_accepted(seed):
     plain = solve(starts[0], case.measurements, STEPS, closure_selection.FINE)
     assert np.allclose(judged.fit.weights, plain.weights, atol=1e-4)
     assert off(judged.fit, compose(np.array([1.0, 2.0, 0.5]), plain.poses)) < 1e-3
-    assert judged.cost == pytest.approx(robust_cost(plain, case.measurements), rel=1e-6)
-    assert judged.cost <= robust_cost(plain, case.measurements)
+    assert judged.cost == pytest.approx(System(case.measurements).robust_cost(plain), rel=1e-6)
+    assert judged.cost <= System(case.measurements).robust_cost(plain)
     assert off(judged.fit, made.truth) < 0.1
     assert off(made.reckoned(), made.truth) > 2 * off(judged.fit, made.truth)
 
@@ -119,11 +119,11 @@ def test_the_cost_is_never_above_that_of_the_present_map(seed):
         poses=present.poses + stream.normal(0, 0.02, present.poses.shape) * [1, 1, 0.2]
     )
     judged = select_closures_and_cuts(case, [present, *made.hypotheses()], made.find_cut)
-    assert judged.cost <= robust_cost(present, case.measurements)
+    assert judged.cost <= System(case.measurements).robust_cost(present)
     again = select_closures_and_cuts(case, [judged.fit, *made.hypotheses()], made.find_cut, judged.cuts)
     assert again.cost <= judged.cost + 0.5  # solver steps, not another map
     severed = closure_selection.cut_odometry(case.measurements, judged.cuts)
-    whole = robust_cost(judged.fit, severed) + CUT * len(judged.cuts)
+    whole = System(severed).robust_cost(judged.fit) + CUT * len(judged.cuts)
     assert judged.cost == pytest.approx(whole, rel=1e-9)
 
 
@@ -160,7 +160,7 @@ def test_a_robot_that_is_never_carried_keeps_its_odometry(seed):
     plain = select_closures(made.case, made.starts())
     cut = select_closures_and_cuts(made.case, made.starts(), made.find_cut)
     assert plain.cuts == ()
-    assert plain.cost == robust_cost(plain.fit, made.case.measurements)
+    assert plain.cost == System(made.case.measurements).robust_cost(plain.fit)
     if carried:
         assert cut.cost < plain.cost
     else:

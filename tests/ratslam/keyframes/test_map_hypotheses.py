@@ -14,7 +14,7 @@ from ratslam.keyframes.closure_selection import (
     select_closures,
 )
 from ratslam.keyframes.map_hypotheses import KEPT, MapHypotheses
-from ratslam.keyframes.optimizer import CalibrationPrior, MapFit, MapProblem, OdometryChain, robust_cost
+from ratslam.keyframes.optimizer import CalibrationPrior, MapFit, MapProblem, OdometryChain, System
 from tactile.base.se2 import integrate, wrap
 from tests.ratslam.keyframes.selection_cases import LAP, NOISE, PRIOR, World, closures_of, off, world
 
@@ -47,7 +47,7 @@ def numbers(case: SelectionProblem) -> np.ndarray:
 
 
 def total(case: SelectionProblem, fit: MapFit) -> float:
-    return robust_cost(fit, case.measurements) + case.views_cost(fit.poses)
+    return System(case.measurements).robust_cost(fit) + case.views_cost(fit.poses)
 
 
 def same(one: list[MapFit], other: list[MapFit]) -> bool:
@@ -162,7 +162,7 @@ def test_the_views_decide_between_maps_of_equal_cost(side):
     assert turned(fits[0]) == pytest.approx(side * TURN, abs=0.1)
     best = select_closures(case, fits)
     assert turned(best.fit) == pytest.approx(side * TURN, abs=0.1)
-    assert best.cost == pytest.approx(robust_cost(best.fit, case.measurements) - 2.5)
+    assert best.cost == pytest.approx(System(case.measurements).robust_cost(best.fit) - 2.5)
 
 
 @pytest.mark.parametrize("evidence", [(40.0, 16.0), (16.0, 40.0)])

@@ -13,7 +13,7 @@ from ratslam.keyframes.optimizer import (
     LoopClosures,
     MapFit,
     MapProblem,
-    robust_cost,
+    System,
     solve,
 )
 from tactile.base.se2 import wrap
@@ -153,26 +153,26 @@ def cost_by_loops(fit, problem):
 def test_the_robust_cost_equals_explicit_loops(seed, cost_limit, prior):
     start, problem = robust_case(seed, cost_limit, prior)
     fit = start._replace(bias=0.01, turn_error=0.02)
-    assert robust_cost(fit, problem) == pytest.approx(cost_by_loops(fit, problem), rel=1e-9)
+    assert System(problem).robust_cost(fit) == pytest.approx(cost_by_loops(fit, problem), rel=1e-9)
 
 
 def test_the_robust_cost_of_a_perfect_map_is_zero():
     truth, chain, closures = laps(np.random.default_rng(0), 0.03, turn_error=0.02)
     fit = MapFit(truth, 0.03, np.zeros(3), 0.02)
     sure = CalibrationPrior(0.03, 1.0, 0.02, 1.0)
-    assert robust_cost(fit, MapProblem(chain, closures, sure)) < 1e-12
+    assert System(MapProblem(chain, closures, sure)).robust_cost(fit) < 1e-12
     off = CalibrationPrior(0.02, 0.01, 0.08, 0.03)
-    assert robust_cost(fit, MapProblem(chain, closed([]), off)) == pytest.approx(1.0 + 4.0)
+    assert System(MapProblem(chain, closed([]), off)).robust_cost(fit) == pytest.approx(1.0 + 4.0)
 
 
 @given(seeds, st.sampled_from([np.inf, 20.0, 6.0]), priors)
 @settings(max_examples=60)
 def test_every_step_lowers_the_robust_cost(seed, cost_limit, prior):
     fit, problem = robust_case(seed, cost_limit, prior)
-    costs = [robust_cost(fit, problem)]
+    costs = [System(problem).robust_cost(fit)]
     for _ in range(25):
         fit = solve(fit, problem, 1)
-        costs.append(robust_cost(fit, problem))
+        costs.append(System(problem).robust_cost(fit))
     assert (np.diff(costs) <= 1e-9 * np.array(costs[:-1])).all()
     assert costs[-1] < 0.5 * costs[0]
 
@@ -183,10 +183,10 @@ def test_the_solution_has_the_least_robust_cost(cost_limit, prior):
     start, problem = robust_case(3, cost_limit, prior)
     fit = solve(start, problem, 500)
     assert ((fit.weights > 0.01) & (fit.weights < 0.999)).any()
-    least, x = robust_cost(fit, problem), unknowns(fit, prior)
+    least, x = System(problem).robust_cost(fit), unknowns(fit, prior)
     for step in 1e-3 * np.eye(len(x)):
         for sign in (1, -1):
-            assert robust_cost(fit_of(x + sign * step, fit, prior), problem) > least
+            assert System(problem).robust_cost(fit_of(x + sign * step, fit, prior)) > least
 
 
 def test_one_false_closure_does_not_cost_its_sequence():
