@@ -22,8 +22,9 @@ from ratslam.attractor.levels import Activity, Level, point_activity, window_lev
 from ratslam.attractor.window import TIE, deposit_gain, ring_difference, rotate
 from tactile.base.types import Array, Odometry
 
-LARGEST_SUBSTEP = 0.5
-"""Largest motion of one sub-step, cells: a packet that moves farther at once shears into a ring."""
+LARGEST_SUBSTEP = 0.75
+"""Largest motion of one sub-step, cells. The heading layers of a packet move apart in a sub-step: up to 0.75
+cells the packet's standard deviation stays within 6 % of that at 0.5, at 0.85 it differs by 12 %."""
 MOST_SUBSTEPS = 256
 """Limit on the sub-steps of one step, which bounds its computing time for any odometry."""
 JUMP = 1.0

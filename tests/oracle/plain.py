@@ -18,7 +18,7 @@ from tests.oracle.views import Match, compared_pixels, offsets, summed_differenc
 
 VIEW_TIE = PLACE_TIE = PEAK_TIE = 1e-9
 WORN_OUT = 3.0  # habituation above this injects no energy
-LONGEST_PART, MOST_PARTS = 0.5, 256
+LONGEST_PART, MOST_PARTS = 0.75, 256
 LOST = 1.0  # a difference above one cell is a jump, not a lag
 
 

@@ -10,6 +10,7 @@ import yaml
 
 from ratslam.attractor.config import PoseCellConfig
 from ratslam.attractor.levels import SETTLED, window_levels
+from ratslam.attractor.pose_cells import LARGEST_SUBSTEP
 from ratslam.backends.grid import LIVE_SIDE
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import open_path
@@ -21,7 +22,6 @@ from ratslam.grid.config import DriftConfig
 from ratslam.grid.particle_maps import LAYERS
 from robot.simulation.head.session import choose_tier
 
-PART = 0.5  # largest motion of the activity packet in one sub-step, cells
 PARTS = 4  # largest number of sub-steps of all but a few cycles; with more, cells are too fine for the speed
 SLOW = 0.05  # smallest motion of a usual cycle, cells; with less, cells are too coarse for the robot's speed
 FEWEST, MOST = 11, 201
@@ -105,10 +105,13 @@ def _rat(config: RunConfig, scene: Scene) -> Iterator[Recommendation]:
 def _cell_size(config: RunConfig, scene: Scene) -> Recommendation:
     now = config.pose_cells.cell_size
     moved, most = scene.usual / now, scene.most / now
-    why = f"a cycle moves {moved:.2g} cells (95 %: {most:.2g}): {_parts(most)} sub-steps of {PART:g} at most"
+    why = (
+        f"a cycle moves {moved:.2g} cells (95 %: {most:.2g}): "
+        f"{_parts(most)} sub-steps of {LARGEST_SUBSTEP:g} at most"
+    )
     value = now
     if _parts(most) > PARTS:
-        value, why = round_number(scene.most / (PART * PARTS), 1), f"{why}, where {PARTS} will do"
+        value, why = round_number(scene.most / (LARGEST_SUBSTEP * PARTS), 1), f"{why}, where {PARTS} will do"
     elif moved < SLOW:
         value, why = round_number(scene.usual / SLOW, -1), f"{why}, {1 / moved:.0f} cycles for one cell"
     return _of(config, "pose_cells.cell_size", value, why)
@@ -171,7 +174,7 @@ def _tier(config: RunConfig) -> Iterator[Recommendation]:
 
 def _parts(cells: float) -> int:
     """Number of sub-steps for a motion in cells."""
-    return max(1, int(np.ceil(cells / PART - 1e-9)))
+    return max(1, int(np.ceil(cells / LARGEST_SUBSTEP - 1e-9)))
 
 
 def _drifted(drift: DriftConfig, scene: Scene) -> float:

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from ratslam.attractor import pose_cells, window
 from ratslam.attractor.config import PoseCellConfig, rings, units
+from ratslam.attractor.level_step import StepInput, step_at
 from ratslam.attractor.levels import from_full_torus, to_full_torus, window_levels
 from ratslam.attractor.pose_cells import Outcome
 from ratslam.attractor.window import ring_difference
@@ -96,6 +97,19 @@ def test_decoded_motion_equals_odometry(settled, speed, direction):
     expected = count * speed * np.array([np.cos(angle + heading), np.sin(angle + heading)])
     assert np.hypot(*(moved[:2] - expected)) <= 0.02 * np.hypot(*expected)
     assert not np.any(outcomes)
+
+
+@pytest.mark.parametrize(("speed", "substeps"), [(0.51, 1), (0.75, 1), (0.76, 2), (1.5, 2)])
+def test_a_step_takes_as_few_substeps_as_keep_the_packet_whole(settled, speed, substeps):
+    still = settled._replace(lag=jnp.zeros(3))
+    motion, zero = jnp.asarray([speed, 0.0, 0.0]), jnp.zeros(3)
+    inputs = StepInput(
+        still.pose, still.pose, jnp.zeros(()), jnp.int32(substeps), motion / substeps, zero, zero[2]
+    )
+    smallest = window_levels(CONFIG, np.dtype(float))[0]
+    _, result, exact = jax.jit(partial(step_at, smallest))(still.activity.blocks[0], inputs)
+    assert exact
+    assert np.abs(go([motion], still)[1][0][0] - result.pose).max() < 1e-12
 
 
 @pytest.mark.parametrize("degrees", [0.01, 0.1, 1, 7, 10, 33, 60, -60, -0.05])

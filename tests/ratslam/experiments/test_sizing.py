@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evaluation.metrics.metric import Quantity
+from ratslam.attractor.pose_cells import LARGEST_SUBSTEP
 from ratslam.cli import main
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import override, parse, validate
@@ -86,7 +87,7 @@ def test_proposals_fit_the_scene_and_are_stable(config, scene):
     proposed = with_settings(config, found)
     if config.backend != "grid":
         size, across = found["pose_cells.cell_size"], found["pose_cells.cells_xy"]
-        assert scene.most / size <= PARTS / 2 + 1e-9
+        assert scene.most / size <= PARTS * LARGEST_SUBSTEP + 1e-9
         assert scene.usual / size >= SLOW - 1e-9 or scene.most / size > 1
         assert across * size >= max(scene.span) or across == MOST or config.backend == "recall"
         assert across >= FEWEST
