@@ -233,10 +233,12 @@ def _convolve(window: Window, kernel: Array, activity: Array) -> Array:
                 jnp.tensordot(kernel, _roll_matrices(window.axes[k], half, kernel.dtype), 1), activity, k
             )
             continue
+        shape = activity.shape
         shifted = _shifter(window, activity, k, half)
         activity = kernel[half] * shifted(0)
         for t in range(1, half + 1):
             activity = activity + kernel[half + t] * (shifted(t) + shifted(-t))
+        activity = activity.reshape(shape)
     return activity
 
 
@@ -251,9 +253,8 @@ def _translate(window: Window, activity: Array, k: int, distance: Array) -> Arra
             k,
         )
     shifted = _shifter(window, activity, k, reach)
-    return reduce(
-        jnp.add, (part * shifted(t) for t, part in zip(range(-reach, reach + 1), share, strict=True))
-    )
+    moved = (part * shifted(t) for t, part in zip(range(-reach, reach + 1), share, strict=True))
+    return reduce(jnp.add, moved).reshape(activity.shape)
 
 
 def _uses_matrices(axis: Axis) -> bool:
@@ -277,7 +278,12 @@ def _multiply_along(matrix: Array, activity: Array, k: int) -> Array:
 
 
 def _shifter(window: Window, activity: Array, k: int, reach: int) -> Callable[[int], Array]:
-    """A function of t that gives the activity moved by t cells along axis k, |t| <= reach."""
+    """A function of t that gives the activity moved by t cells along axis k, |t| <= reach.
+
+    Between products with matrices a heading layer is one row of cells; the caller restores the shape.
+    """
+    if k == 0 and _uses_matrices(window.axes[2]):
+        activity = activity.reshape(len(activity), -1)  # rows of 11 to 17 cells are slow to shift
     size = activity.shape[k]
     if window.axes[k].wraps:
         before = lax.slice_in_dim(activity, size - reach, size, axis=k)
