@@ -51,18 +51,24 @@ def step_at(level: Level, block: Block, inputs: StepInput) -> tuple[Block, StepR
     """Injection, then attractor dynamics and path integration for each sub-step, then decoding.
 
     Returns:
-        the new activity, the result, and bool: both equal those of the whole torus.
+        the new activity, the result, and bool: both equal those of the whole torus; if not, they are those of
+        an unfinished step.
     """
     block, exact = _inject(level, block, inputs)
 
-    def substep(s: Array, carry: Any) -> Any:
-        block, exact, died = carry
+    def goes_on(carry: Any) -> Array:
+        s, _, exact, _ = carry
+        return (s < inputs.substeps) & exact  # the rest of an inexact step would be thrown away
+
+    def substep(carry: Any) -> Any:
+        s, block, exact, died = carry
         exact &= _packets_apart(level, block)
         cells, dead = _attract(level, block, inputs.pose)
         block, complete = _integrate(level, block._replace(activity=cells), inputs, s)
-        return block, exact & complete, died | dead
+        return s + 1, block, exact & complete, died | dead
 
-    block, exact, died = lax.fori_loop(0, inputs.substeps, substep, (block, exact, jnp.bool_(False)))
+    carry = (jnp.int32(0), block, exact, jnp.bool_(False))
+    _, block, exact, died = lax.while_loop(goes_on, substep, carry)
     block = _strongest_first(level, block)
     pose, spread = window.decode(level.window, block.activity[0], block.origin[0])
     return block, StepResult(pose, spread, died, jnp.int32(0)), exact
