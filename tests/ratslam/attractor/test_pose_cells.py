@@ -190,6 +190,19 @@ def test_the_torus_has_no_edge(shift):
     assert np.allclose(jnp.roll(whole(first), shift[::-1], (0, 1, 2)), whole(second), atol=1e-10)
 
 
+@pytest.mark.parametrize("n", [11, 17, 18, 21, 22, 23, 41])
+def test_excitation_and_inhibition_are_the_same_everywhere(n):
+    """Rings are computed in different ways by size, and none may show where it begins."""
+    torus = window.make_window(PoseCellConfig(cells_xy=n), None, np.dtype(float))
+    activity = np.random.default_rng(n).random((36, n, n)) ** 8
+    compute = jax.jit(partial(window.excite_and_inhibit, torus))
+    here = compute(activity)
+    assert np.any(np.asarray(here)[:, :, [0, -1]] > 0)
+    for shift in ((0, 0, 1), (0, 0, n // 2), (5, 7, 3)):
+        there = compute(np.roll(activity, shift, (0, 1, 2)))
+        assert np.abs(np.roll(here, shift, (0, 1, 2)) - there).max() <= 1e-15
+
+
 @pytest.mark.parametrize("energy", [0.15, 0.3])
 @pytest.mark.parametrize("distance", [0.7, 2.3, 4.0, 7.0])
 @pytest.mark.parametrize("speed", [0.0, 0.02])
