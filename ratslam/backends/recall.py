@@ -29,7 +29,7 @@ from ratslam.recall import filter, mirror
 from ratslam.recall import memory as recall_memory
 from ratslam.recall.config import fan_width
 from ratslam.recall.filter import RecallResult
-from ratslam.recall.memory import MapFeedback, Memory, Modes
+from ratslam.recall.memory import MapFeedback, Memory, MergedRows, Modes
 from ratslam.recall.observation_model import (
     ObservationLikelihood,
     label_likelihood,
@@ -134,6 +134,10 @@ class RecallBackend(Backend):
     def apply_map_feedback(self, state: RecallState, feedback: MapFeedback) -> RecallState:
         """The filter takes over the poses, bias and scales of the map."""
         return state._replace(memory=recall_memory.apply_map_feedback(state.memory, feedback))
+
+    def merge_rows(self, state: RecallState, merged: MergedRows) -> RecallState:
+        """The memory of the keyframes that remain."""
+        return state._replace(memory=recall_memory.merge_rows(state.memory, merged))
 
     def kernel(
         self, state: RecallState, observation: Observation

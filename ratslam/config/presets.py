@@ -28,6 +28,7 @@ PRESETS: dict[PresetName, dict[str, dict[str, Any]]] = {
             "max_distance": 60.0,
             "sequence_agreement": 0.2,
             "select_every": 50,
+            "merge_stood": 4,
             "select_score": 5.0,
             "select_length": 2,
             "sequence_cost": 3.0,

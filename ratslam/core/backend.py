@@ -29,6 +29,10 @@ Feedback = Any
 """A record of host arrays that the map gives to the kernel, or None."""
 
 
+MergedRows = Any
+"""A record of host arrays by which the kernel follows the map when rows of its memory are merged."""
+
+
 class Map(Protocol):
     """The map on the host: takes one step at a time; poses are in the map frame.
 
@@ -40,6 +44,11 @@ class Map(Protocol):
 
     def feedback(self) -> Feedback:
         """The record that the kernel takes over, or None."""
+        return None
+
+    def merge(self) -> MergedRows | None:
+        """Merges rows of the memory, or restores merged ones, and returns the record that the kernel needs to
+        follow; None if nothing is to be done. Called before `feedback`."""
         return None
 
     def pose(self, estimate: Estimate) -> np.ndarray:
@@ -109,6 +118,10 @@ class Backend(Protocol):
 
     def apply_map_feedback(self, state: State, feedback: Feedback) -> State:
         """The state after the map's feedback; same shapes and dtypes."""
+        return state
+
+    def merge_rows(self, state: State, merged: MergedRows) -> State:
+        """The state after rows of the memory were merged; same shapes and dtypes."""
         return state
 
     def kernel(self, state: State, observation: Observation) -> tuple[State, Estimate, Evidence]:

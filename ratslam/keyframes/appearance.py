@@ -93,6 +93,10 @@ class Appearance(Checkpointed, ABC):
         return NO_ESTIMATE
 
     @abstractmethod
+    def stored(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The views [n, D] and ids [n] of keyframes [n], as recall stores them."""
+
+    @abstractmethod
     def unlikeness(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
         """[n] how unlike the view of a keyframe, or of each of the keyframes [n], is that of each of the
         keyframes `others` [n], in units of its own; `reversed` as in `misfit`."""
@@ -114,6 +118,9 @@ class LabelAppearance(Appearance):
 
     def append(self, observation: Observation, turn: float, length: float) -> None:
         self._label.append(int(observation.label))
+
+    def stored(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros((len(frames), 0)), self._label.rows[frames]
 
     def unlikeness(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
         return (self._label.rows[others] != self._label.rows[frame]).astype(float)
@@ -153,6 +160,9 @@ class ViewAppearance(Appearance):
         self._view.append(np.asarray(view, float).reshape(-1)[:size])
         if self._fan:
             self._fan.append(self._view.rows[-1], turn, length)
+
+    def stored(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return self._view.rows[frames], np.full(len(frames), -1)
 
     def learn(self, evidence: Evidence, confirmed_pairs: Callable[[], ConfirmedPairs]) -> BiasEstimate:
         for error in np.asarray(evidence.background)[np.isfinite(evidence.background)]:
@@ -217,6 +227,9 @@ class WhiskerAppearance(Appearance):
         self._level.append(
             pixel_levels(view.reshape(-1), live_pixels(observation).reshape(-1)).astype(np.int64)
         )
+
+    def stored(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return self._level.rows[frames], np.full(len(frames), -1)
 
     def learn(self, evidence: Evidence, confirmed_pairs: Callable[[], ConfirmedPairs]) -> BiasEstimate:
         if len(self._level.rows) >= MIN_KEYFRAMES and len(self._level.rows) % LOG_ODDS_INTERVAL == 0:

@@ -9,6 +9,7 @@ import numpy as np
 from ratslam.keyframes.config import KeyframeMapConfig
 from ratslam.keyframes.odometry_noise import HeadingNoise
 from ratslam.keyframes.optimizer import CalibrationPrior
+from ratslam.keyframes.view_sectors import BiasEstimate
 
 TEXT = """\
 # Calibration of the odometry after this session. The next session of the same robot starts from it if its
@@ -35,6 +36,18 @@ def starting_calibration(config: KeyframeMapConfig, cell: float) -> CalibrationP
         turn_sd = start.turn_error_sd
     turn = start.turn_error if turn_sd > 0 else 0.0
     return CalibrationPrior(start.heading_bias, start.heading_bias_sd or config.bias_sd / cell, turn, turn_sd)
+
+
+def calibration_from_views(
+    config: KeyframeMapConfig, cell: float, start: CalibrationPrior, shown: BiasEstimate
+) -> CalibrationPrior:
+    """The prior with the heading bias that the views show, shrunk towards that of the start where the views
+    are not certain of it."""
+    off, error = shown.value - start.bias, shown.error
+    shrunk = start.bias + (off * max(0.0, 1 - (config.shrink * error / off) ** 2) if off else 0.0)
+    sd = min(np.hypot(error, shown.value - shrunk), 2 * start.bias_sd)
+    sd = max(sd, min(config.bias_least / cell, start.bias_sd))
+    return start._replace(bias=shrunk, bias_sd=float(sd))
 
 
 def starting_noise(config: KeyframeMapConfig) -> HeadingNoise:

@@ -58,9 +58,7 @@ def claimed_revisits(graph: KeyframeGraph, poses: np.ndarray, most: int) -> Clai
     older = (frame - graph.guard)[:, None]
     others = (near[:, None] + (older * shares).astype(int)) % older
     repeated = len(shares)
-    unlike = graph.appearance.unlikeness(
-        np.repeat(frame, repeated), others.ravel(), np.repeat(reversed, repeated)
-    )
+    unlike = graph.unlikeness(np.repeat(frame, repeated), others.ravel(), np.repeat(reversed, repeated))
     passes = np.flatnonzero(np.diff(near, prepend=-1 - graph.guard) > graph.guard)
     passes = np.union1d(passes, np.flatnonzero(np.diff(frame, prepend=-1)))
     best = np.minimum.reduceat(unlike.reshape(others.shape), passes, axis=0)

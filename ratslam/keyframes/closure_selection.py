@@ -126,7 +126,7 @@ def _nearest(case: SelectionProblem, best: Selection, found: list[Selection]) ->
 def _strain(case: SelectionProblem, best: Selection) -> np.ndarray:
     """[R] squared deviation between the start of each sequence and the odometry since the last accepted
     closure. Both poses are those of the closures alone, so that a map deformed by a jump does not hide it."""
-    chain, closures, _ = cut_odometry(case.measurements, best.cuts)
+    chain, closures, *_ = cut_odometry(case.measurements, best.cuts)
     strain = np.zeros(len(case.evidence))
     for sequence in range(len(strain)):
         since, first = _since(case, best, sequence), int(case.first[sequence])

@@ -107,6 +107,11 @@ class KeyframeMapConfig(Settings):
     """Evidence that a sequence to select from needs before it may strain the map."""
     closure_cost_limit: PositiveFloat = 6.0
     """Largest chi-square of a single closure in the selection."""
+    merge_stood: NonNegativeInt = 0
+    """Number of selections in a row that a sequence must stand before the keyframes it confirms are merged
+    with older ones at the same pose; 0: keyframes are not merged."""
+    merge_newest: PositiveInt = 1000
+    """Number of newest keyframes that are not merged."""
     solve_every: PositiveInt = 1
     """Keyframes between two optimisations while a sequence goes on."""
     iterations: PositiveInt = 4

@@ -70,14 +70,23 @@ class Experiences(Checkpointed):
         self._current = place
         return ExperienceChange(place, previous, action)
 
-    def graph(self, poses: np.ndarray) -> networkx.DiGraph:
-        """Nodes with x, y (m), heading (rad), keyframe; links with dx, dy, dtheta and traversals."""
+    def merge(self, source: np.ndarray, onto: np.ndarray) -> None:
+        """Follows a merge of keyframes; see `MergedRows`."""
+        self._frame.rows[:] = onto[self._frame.rows]
+        self._place.replace(self._place.rows[source])
+
+    def graph(self, poses: np.ndarray, taken: np.ndarray) -> networkx.DiGraph:
+        """Nodes with x, y (m), heading (rad), keyframe; links with dx, dy, dtheta and traversals.
+
+        Args:
+            poses: [N, 3] of the keyframes. taken: [N] their numbers among all ever taken.
+        """
         import networkx  # slow to import
 
         graph: networkx.DiGraph = networkx.DiGraph()
         for place, frame in enumerate(self._frame.rows.tolist()):
             x, y, heading = map(float, poses[frame])
-            graph.add_node(place, x=x, y=y, heading=heading, keyframe=frame)
+            graph.add_node(place, x=x, y=y, heading=heading, keyframe=int(taken[frame]))
         for a, b, traversals in self._link.rows.tolist():
             ends = poses[self._frame.rows[[a, b]]]
             dx, dy, dtheta = map(float, between(ends[0], ends[1]))

@@ -14,6 +14,7 @@ from ratslam.keyframes.config import Ablation, KeyframeMapConfig
 from ratslam.keyframes.loop_closures import ClosureLog
 from ratslam.keyframes.odometry_noise import learn_heading_noise
 from ratslam.keyframes.optimizer import (
+    NO_LINKS,
     CalibrationPrior,
     LoopClosures,
     MapCovariance,
@@ -41,14 +42,16 @@ class KeyframeGraph(Checkpointed):
     Attributes:
         pose: [N, 3] in the map, m, m, rad. motion: [N, 3] odometry into each keyframe. length: [N] distance
             travelled into it, m. turn: [N] sum of absolute turns into it, rad. cut: [N] the closure sequence
-            that shows a break of the odometry before the keyframe, -1 for none. bias: heading bias of the
+            that shows a break of the odometry before the keyframe, -1 for none.
+            seam: [N] the motion into the keyframe is composed of that into merged ones too, and `links` count
+            in its place. taken: [N] number of the keyframe among all ever taken. bias: heading bias of the
             odometry, rad/m. turn_error: correction of its turns, rad/rad. prior: of both.
         start: the prior before any view.
         heading_noise: factor on the variance of its turns. reckoned: [3] the newest keyframe by odometry
             with the calibration of the start.
     """
 
-    VALUES = ("bias", "turn_error", "prior", "heading_noise", "reckoned")
+    VALUES = ("bias", "turn_error", "prior", "heading_noise", "reckoned", "links")
 
     def __init__(
         self, config: KeyframeMapConfig, cell: float, appearance: Appearance, guard: int, ablation: Ablation
@@ -60,6 +63,9 @@ class KeyframeGraph(Checkpointed):
         self.length = GrowableArray((), np.float64)
         self.turn = GrowableArray((), np.float64)
         self.cut = GrowableArray((), np.int64)
+        self.seam = GrowableArray((), np.bool_)
+        self.taken = GrowableArray((), np.int64)
+        self.links = NO_LINKS
         self.start = self.prior = starting_calibration(config, cell)
         self.bias, self.turn_error = self.prior.bias, self.prior.turn_error
         self.heading_noise = starting_noise(config)
@@ -69,6 +75,11 @@ class KeyframeGraph(Checkpointed):
     def count(self) -> int:
         """Number of keyframes."""
         return len(self.pose.rows)
+
+    @property
+    def ever(self) -> int:
+        """Number of keyframes ever taken; the newest one is never merged."""
+        return int(self.taken.rows[-1]) + 1 if self.count else 0
 
     @property
     def sector_angle(self) -> float:
@@ -86,11 +97,21 @@ class KeyframeGraph(Checkpointed):
     def append(self, pose: np.ndarray, motion: np.ndarray, length: float, turn: float) -> None:
         """Adds a keyframe at `pose` [3], reached by `motion` [3]."""
         self.reckoned = self.reckoned_after(motion, length) if self.count else np.array(pose, float)
+        self.taken.append(self.ever)
         self.pose.append(pose)
         self.motion.append(motion)
         self.length.append(length)
         self.turn.append(turn)
         self.cut.append(-1)
+        self.seam.append(False)
+
+    def replace(self, other: KeyframeGraph, poses: np.ndarray, cut: np.ndarray) -> None:
+        """Takes over all keyframes of a graph without links, with other poses [N, 3] and breaks [N]."""
+        for name, array in self._growable_arrays().items():
+            array.replace(getattr(other, name).rows)
+        self.pose.replace(poses)
+        self.cut.replace(cut)
+        self.links = NO_LINKS
 
     def pose_after(self, motion: np.ndarray, length: float) -> np.ndarray:
         """[3] the pose after a motion [3] over a distance since the newest keyframe."""
@@ -136,10 +157,19 @@ class KeyframeGraph(Checkpointed):
         return OdometryChain(self.motion.rows[1:], self.length.rows[1:], self.variances(cut)[1:])
 
     def variances(self, cut: GrowableArray) -> np.ndarray:
-        """[N, 3] variances of the odometry into each keyframe, loose at the breaks `cut`."""
+        """[N, 3] variances of the odometry into each keyframe, loose at the breaks `cut` and at seams."""
         variance = self._odometry_variance(self.length.rows, self.turn.rows)
         loose = np.array([LOOSE * self.cell, LOOSE * self.cell, LOOSE]) ** 2
-        return np.where(cut.rows[:, None] >= 0, loose, variance)
+        broken = (cut.rows >= 0) | self.seam.rows
+        return np.where(broken[:, None], loose, variance)
+
+    def own_variances(self) -> np.ndarray:
+        """[N, 3] variances of the odometry into each keyframe without breaks, as if no noise were learned."""
+        return self._odometry_variance(self.length.rows, self.turn.rows) / [
+            1.0,
+            1.0,
+            self.heading_noise.factor,
+        ]
 
     def heading_variance(self, length: np.ndarray | float, turn: np.ndarray | float) -> np.ndarray | float:
         """Variance of heading by odometry over distances (m) and sums of absolute turns (rad), with the
@@ -163,9 +193,7 @@ class KeyframeGraph(Checkpointed):
         scales = (config.robust_per_score, config.robust_least, config.robust_most)
         closures = log.closures(self.sector_angle, variance, scales)
         if config.select_every:
-            worth = (
-                2 * np.maximum(closures.score - config.sequence_cost, 1.0) / np.bincount(closures.sequence)
-            )
+            worth = 2 * np.maximum(closures.score - config.sequence_cost, 1.0) / closures.size
             # A sequence must be able to cost more than its evidence, else it could never be refused.
             return closures._replace(
                 scale=worth, cost_limit=np.maximum(config.closure_cost_limit, 1.5 * worth)
@@ -176,7 +204,17 @@ class KeyframeGraph(Checkpointed):
 
     def problem(self, log: ClosureLog, cut: GrowableArray) -> MapProblem:
         """The least-squares problem of the keyframes with the odometry broken at `cut`."""
-        return MapProblem(self.odometry(cut), self.closures(log), self.calibration_prior())
+        links = self.links._replace(variance=self.links.variance * [1.0, 1.0, self.heading_noise.factor])
+        return MapProblem(self.odometry(cut), self.closures(log), self.calibration_prior(), links)
+
+    def unlikeness(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+        """See `Appearance.unlikeness`."""
+        taken = self.taken.rows
+        return self.appearance.unlikeness(taken[frame], taken[others], reversed)
+
+    def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
+        """See `Appearance.misfit`."""
+        return self.appearance.misfit(int(self.taken.rows[frame]), self.taken.rows[near], reversed)
 
     def solve(self, log: ClosureLog, iterations: int) -> MapFit:
         """The optimised map, from the current poses."""
@@ -204,16 +242,16 @@ class KeyframeGraph(Checkpointed):
 
     def edges(self, fit: MapFit, log: ClosureLog, cut: GrowableArray) -> Edges:
         """Edges of a solution: odometry corrected by its bias, and closures with their robust weights."""
-        chain, closures, _ = self.problem(log, cut)
+        chain, closures, _, links = self.problem(log, cut)
         steps = np.arange(len(chain.length))
         zero = np.zeros(len(closures.i))
         turned = np.stack([zero, zero, closures.turn], axis=1)
         trust = log.weights()[:, None] / closures.variance
         return Edges(
-            np.concatenate([steps, closures.i]),
-            np.concatenate([steps + 1, closures.j]),
-            np.concatenate([fit.corrected(chain), turned]),
-            np.concatenate([1 / chain.variance, trust]),
+            np.concatenate([steps, links.i, closures.i]),
+            np.concatenate([steps + 1, links.j, closures.j]),
+            np.concatenate([fit.corrected(chain), fit.corrected_links(links), turned]),
+            np.concatenate([1 / chain.variance, 1 / links.variance, trust]),
         )
 
     def _odometry_variance(self, length: np.ndarray, turn: np.ndarray) -> np.ndarray:

@@ -22,6 +22,10 @@ CSV_COLUMNS = (
 )
 
 
+CONFIRMED_WEIGHT = 0.5
+"""Robust weight above which a sequence confirms what it joins."""
+
+
 class Verdict(IntEnum):
     """Verdict on a closure sequence."""
 
@@ -54,6 +58,8 @@ class ClosureLog(Checkpointed):
         self._distance = GrowableArray((), np.float64)
         self._weight = GrowableArray((), np.float64)
         self._log_odds = GrowableArray((), np.float64)
+        self._stood = GrowableArray((), np.int64)  # selections in a row with a confirming weight
+        self._merged = GrowableArray((2,), np.float64)  # evidence and number of the merged candidates
         self._lines: np.ndarray | None = None
 
     @property
@@ -83,6 +89,8 @@ class ClosureLog(Checkpointed):
             self._distance.append(np.inf)
             self._weight.append(0.0)
             self._log_odds.append(np.nan)
+            self._stood.append(0)
+            self._merged.append((0.0, 0.0))
         self._candidate.append((candidate.keyframe, candidate.match, candidate.shift, self.sequences - 1))
         self._evidence.append((candidate.posterior, candidate.log_ratio))
         self._lines = None
@@ -94,17 +102,65 @@ class ClosureLog(Checkpointed):
 
     def score(self, sequence: int) -> float:
         """Evidence of a sequence: the sum of the log-likelihood ratios of its candidates."""
-        return float(self._evidence.rows[self._candidate.rows[:, 3] == sequence, 1].sum())
+        own = self._evidence.rows[self._candidate.rows[:, 3] == sequence, 1].sum()
+        return float(own + self._merged.rows[sequence, 0])
 
     def scores(self) -> np.ndarray:
-        """[R] evidence of every sequence."""
+        """[R] evidence of every sequence, merged candidates included."""
         rows, known = self._candidate.rows, self._candidate.rows[:, 3] >= 0
-        return np.bincount(rows[known, 3], self._evidence.rows[known, 1], self.sequences)
+        own = np.bincount(rows[known, 3], self._evidence.rows[known, 1], self.sequences)
+        return own + self._merged.rows[:, 0]
 
     def sizes(self) -> np.ndarray:
-        """[R] number of candidates of every sequence."""
+        """[R] number of candidates of every sequence, merged ones included."""
+        return self.left() + self._merged.rows[:, 1].astype(np.int64)
+
+    def left(self) -> np.ndarray:
+        """[R] number of candidates of every sequence that are not merged."""
         sequence = self._candidate.rows[:, 3]
         return np.bincount(sequence[sequence >= 0], minlength=self.sequences)
+
+    def has_merged(self, sequence: int) -> bool:
+        """Whether candidates of a sequence belong to merged keyframes."""
+        return bool(self._merged.rows[sequence, 1] > 0)
+
+    def stood(self) -> np.ndarray:
+        """[R] number of selections in a row after which every sequence had a confirming weight."""
+        return self._stood.rows
+
+    def count_selection(self) -> None:
+        """Counts one more selection for the sequences that it confirmed."""
+        strong = (self._verdict.rows == Verdict.ACCEPTED) & (self._weight.rows > CONFIRMED_WEIGHT)
+        self._stood.rows[:] = np.where(strong, self._stood.rows + 1, 0)
+
+    def confirm(self, times: int) -> None:
+        """Lets the sequences with a confirming weight count as confirmed by at least that many selections."""
+        strong = (self._verdict.rows == Verdict.ACCEPTED) & (self._weight.rows > CONFIRMED_WEIGHT)
+        self._stood.rows[strong] = np.maximum(self._stood.rows[strong], times)
+
+    def merge(self, gone: np.ndarray, onto: np.ndarray, turned: np.ndarray) -> None:
+        """Removes the candidates of merged keyframes; their evidence still counts for their sequence.
+
+        Args:
+            gone: [N] bool, merged keyframes. onto: [N] new number of each keyframe, or of the one that it is
+                merged with. turned: [N] bool: faces opposite to that one.
+        """
+        rows, evidence = self._candidate.rows, self._evidence.rows
+        lost = gone[rows[:, 0]]
+        counted = lost & (rows[:, 3] >= 0)
+        merged = np.column_stack([evidence[counted, 1], np.ones(int(counted.sum()))])
+        np.add.at(self._merged.rows, rows[counted, 3], merged)
+        shift = np.where(turned[rows[:, 1]], 1 - rows[:, 2], rows[:, 2])
+        moved = np.column_stack([onto[rows[:, 0]], onto[rows[:, 1]], shift, rows[:, 3]])
+        self._candidate.replace(moved[~lost])
+        self._evidence.replace(evidence[~lost].copy())
+        self._lines = None
+
+    def take_verdicts(self, other: ClosureLog) -> None:
+        """Takes over all verdicts of a log of the same sequences."""
+        for name in ("_verdict", "_distance", "_weight", "_log_odds", "_stood"):
+            getattr(self, name).replace(getattr(other, name).rows.copy())
+        self._lines = None
 
     def spans(self) -> np.ndarray:
         """[R, 2] first and last keyframe of every sequence; first > last where all candidates are struck
@@ -165,6 +221,7 @@ class ClosureLog(Checkpointed):
         rows = self._candidate.rows[self.accepted_rows()]
         sequences, sequence = np.unique(rows[:, 3], return_inverse=True)
         score = np.bincount(sequence, self._evidence.rows[self.accepted_rows(), 1], len(sequences))
+        merged = self._merged.rows[sequences]
         return LoopClosures(
             i=rows[:, 1],
             j=rows[:, 0],
@@ -172,7 +229,8 @@ class ClosureLog(Checkpointed):
             sequence=sequence,
             variance=variance,
             scale=np.clip(scales[0] * score, *scales[1:]),
-            score=score,
+            score=score + merged[:, 0],
+            size=np.bincount(sequence, minlength=len(sequences)) + merged[:, 1],
         )
 
     def weigh(self, weights: np.ndarray) -> None:

@@ -18,33 +18,32 @@ import numpy as np
 
 from ratslam.core.backend import Evidence, Map
 from ratslam.core.checkpoint import Checkpointed
-from ratslam.core.growable_array import GrowableArray
 from ratslam.core.types import Estimate
 from ratslam.keyframes.acceptance import Acceptance
 from ratslam.keyframes.appearance import Appearance, ConfirmedPairs
-from ratslam.keyframes.calibration import write_calibration
+from ratslam.keyframes.archive import Archive, confirmed_pairs
+from ratslam.keyframes.calibration import calibration_from_views, write_calibration
 from ratslam.keyframes.config import FULL, Ablation, KeyframeMapConfig
 from ratslam.keyframes.experiences import Experiences
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
+from ratslam.keyframes.keyframe_merger import KeyframeMerger
 from ratslam.keyframes.live_filter import LiveFilter
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict, write_closures
 from ratslam.keyframes.map_health import DOUBTED, worse_than_odometry
 from ratslam.keyframes.map_solution import MapSolution, selected_solution, solution_pieces, solved_map
 from ratslam.keyframes.optimizer import MapFit
 from ratslam.keyframes.selection_worker import SelectionWorker
+from ratslam.keyframes.step_record import StepRecord
 from ratslam.keyframes.travel import HALT
 from ratslam.keyframes.verification import continues_sequence
 from ratslam.pose_graph import Edges
 from ratslam.pose_graph.io import write_g2o, write_json
-from ratslam.recall.memory import MapFeedback
-from tactile.base.se2 import compose, correct_heading, wrap
+from ratslam.recall.memory import MapFeedback, MergedRows
+from tactile.base.se2 import wrap
 from tactile.base.types import Observation
 
 if TYPE_CHECKING:
     import networkx
-
-CONFIRMED_MASS, CONFIRMED_WEIGHT = 0.95, 0.5
-"""Least posterior mass of a closure, and weight of its sequence, for the likelihoods to learn from it."""
 
 DOUBT_EVERY = 50
 """Keyframes between two judgements of the present map."""
@@ -60,7 +59,10 @@ class KeyframeMap(Checkpointed, Map):
     """
 
     VALUES = ("_travel", "_since", "_turned", "_solved", "_doubt")
-    PARTS = ("_graph", "_log", "_experiences", "_appearance", "_acceptance", "_live", "_selection")
+    PARTS = (
+        "_graph", "_log", "_steps", "_archive", "_merger", "_experiences", "_appearance", "_acceptance",
+        "_live", "_selection",
+    )  # fmt: skip
 
     def __init__(
         self,
@@ -77,16 +79,18 @@ class KeyframeMap(Checkpointed, Map):
         self._appearance = appearance
         self._graph = KeyframeGraph(config, cell, appearance, guard, ablation)
         self._log = ClosureLog()
+        self._archive = Archive(KeyframeGraph(config, cell, appearance, guard, ablation))
+        self._merger = KeyframeMerger(self._archive)
         self._live = LiveFilter()
         self._selection = SelectionWorker(config.select_every)
         self._acceptance = acceptance(self._graph)
         self._experiences = Experiences(config.place_radius * cell, config.place_heading)
-        self._step_frame = GrowableArray((), np.int64)
-        self._step_motion = GrowableArray((4,), np.float64)  # since that keyframe, and its length
+        self._steps = StepRecord()
         self._travel = HALT
         self._since, self._turned = 0.0, 0.0  # distance (m) and turns (rad) since the last closure
-        self._solved = (-1, -1)  # sequence and keyframe of the last optimisation
+        self._solved = (-1, -1)  # sequence and number of the keyframe of the last optimisation
         self._solution: MapSolution | None = None
+        self._kept: MapSolution | None = None  # the same without merged keyframes
         self._worse: float | None = None  # of that solution
         self._doubt = 0.0  # of the map some keyframes ago
 
@@ -94,8 +98,7 @@ class KeyframeMap(Checkpointed, Map):
 
     def feedback(self) -> MapFeedback:
         """The poses, heading bias and view metric for the recall filter."""
-        graph = self._graph
-        metric = self._appearance.metric()
+        graph, metric = self._graph, self._appearance.metric()
         return MapFeedback(graph.pose.rows, graph.bias, graph.turn_error, self._since, *metric)
 
     def pose(self, estimate: Estimate) -> np.ndarray:
@@ -108,23 +111,24 @@ class KeyframeMap(Checkpointed, Map):
 
     def trajectory(self) -> np.ndarray:
         """[T, 3] every step in the final map, or by odometry where that is likely the better estimate."""
-        return self._steps(self._best())
+        return self._steps.poses(self._best())
 
     def map_trajectory(self) -> np.ndarray:
         """[T, 3] every step in the final map."""
-        return self._steps(self.solution().fit)
+        return self._steps.poses(self.solution().fit)
 
     def doubt(self) -> float:
         return self._doubt
 
     def final_doubt(self) -> float:
         if self._worse is None:
-            self._worse = worse_than_odometry(self._graph, self.solution()) if self.closes_loops else 0.0
+            self._worse = worse_than_odometry(self.keyframes(), self.solution()) if self.closes_loops else 0.0
         return self._worse
 
     def online_trajectory(self) -> np.ndarray:
         """[T, 3] every step in the online map, before the final optimisation."""
-        return self._steps(self._graph.fit())
+        fit = self._graph.fit()
+        return self._steps.poses(fit._replace(poses=self._archive.poses(fit.poses)))
 
     def closures(self) -> np.ndarray:
         """[M, 2] steps of the keyframes joined by accepted loop closures."""
@@ -133,8 +137,7 @@ class KeyframeMap(Checkpointed, Map):
 
     def pieces(self) -> np.ndarray:
         """[T] the piece of each step, see `ratslam.keyframes.pieces`."""
-        piece = solution_pieces(self.solution())
-        return piece[np.maximum(self._step_frame.rows, 0)] if len(piece) else self._step_frame.rows * 0
+        return self._steps.of_keyframes(solution_pieces(self.solution()))
 
     def candidates(self) -> np.ndarray:
         """[n, 10] all candidates of recall and their verdicts, see `ClosureLog.table`."""
@@ -147,18 +150,21 @@ class KeyframeMap(Checkpointed, Map):
         return self._graph.map_covariance(self._log).relative(0, self._graph.count - 1, 0.0)
 
     def solution(self) -> MapSolution:
-        """The final map, as it would be if the session ended now."""
+        """The final map of all keyframes, as it would be if the session ended now."""
         if self._solution is None:
-            self._solution = self._solve_finally()
+            kept, archive = self._kept_solution(), self._archive
+            self._solution = archive.solve(kept, self._graph) if archive.begun else kept
         return self._solution
 
     def graph(self) -> networkx.DiGraph:
         """Experiences with x, y (m), heading (rad) and their first keyframe; links with their evidence."""
-        return self._experiences.graph(self._best().poses)
+        taken = self._graph.taken.rows
+        return self._experiences.graph(self._best().poses[taken], taken)
 
     def edges(self) -> Edges:
-        """Pose graph of the keyframes: odometry without its bias, and closures with their robust weights."""
-        return self._graph.edges(*self.solution())
+        """Pose graph of the keyframes that are not merged: odometry without its bias, and closures with their
+        robust weights."""
+        return self._graph.edges(*self._kept_solution())
 
     def files(self) -> dict[str, Callable[[Path], None]]:
         """Experiences as node-link JSON, keyframes as a g2o graph, the closures with their evidence, and
@@ -166,19 +172,26 @@ class KeyframeMap(Checkpointed, Map):
         calibration = {} if self.final_doubt() > DOUBTED else {"calibration.yaml": self._write_calibration}
         return calibration | {
             "map.json": lambda path: write_json(path, self.graph()),
-            "map.g2o": lambda path: write_g2o(path, self.solution().fit.poses, self.edges()),
+            "map.g2o": lambda path: write_g2o(path, self._kept_solution().fit.poses, self.edges()),
             "closures.csv": lambda path: write_closures(path, self.candidates(), self.keyframe_steps()),
         }
 
     def keyframes(self) -> KeyframeGraph:
-        """The keyframes of the online map, with their views."""
-        return self._graph
+        """All keyframes, merged ones included, with their views; poses are those of the last solution."""
+        return self._archive.graph if self._archive.begun else self._graph
 
     def keyframe_steps(self) -> np.ndarray:
         """[N] the step at which each keyframe was taken."""
-        return np.searchsorted(self._step_frame.rows, np.arange(self._graph.count))
+        return self._steps.first_steps(self._graph.ever)
 
     # Changes
+
+    def merge(self) -> MergedRows | None:
+        """Merges keyframes of known ground (`ratslam.keyframes.merging`)."""
+        merged = self._merger.merge(self._graph, self._log, self._selection, self._experiences)
+        if merged is not None:
+            self._forget_solution()
+        return merged
 
     def update(self, observation: Observation, estimate: Estimate, evidence: Evidence) -> Estimate:
         """Moves by the odometry; a view that became a keyframe is added, judged and given an experience."""
@@ -193,8 +206,7 @@ class KeyframeMap(Checkpointed, Map):
             self._judge()
             poses = self._graph.pose.rows
             change = self._experiences.arrive(poses, len(poses) - 1, matched, self._is_pose_reliable())
-        self._step_frame.append(self._graph.count - 1)
-        self._step_motion.append([*self._travel.motion, self._travel.length])
+        self._steps.append(self._graph.ever - 1, self._travel)
         self._forget_solution()
         return estimate._replace(place=change.place, previous=change.previous, action=change.action)
 
@@ -202,16 +214,23 @@ class KeyframeMap(Checkpointed, Map):
         """Removes the closures of a sequence and optimises without them.
 
         Raises:
-            ValueError: there is no such sequence, it is not accepted, or it joins the parts of broken
-            odometry.
+            ValueError: there is no such accepted sequence, its keyframes are merged, or it joins broken parts.
         """
         solution = self.solution()
         if not 0 <= sequence < self._log.sequences or solution.log.verdict(sequence) != Verdict.ACCEPTED:
             raise ValueError(f"sequence {sequence} is not an accepted closure sequence of this map")
+        if self._log.has_merged(sequence):
+            raise ValueError(f"keyframes of sequence {sequence} are merged with those that it joins them to")
         if np.any(solution.cut.rows == sequence):
             raise ValueError(f"sequence {sequence} is the only link across a break of the odometry")
         self._log.judge(sequence, Verdict.UNDONE)
         self._optimise()
+
+    def _kept_solution(self) -> MapSolution:
+        """The final map of the keyframes that are not merged."""
+        if self._kept is None:
+            self._kept = self._solve_finally()
+        return self._kept
 
     def _solve_finally(self) -> MapSolution:
         if not self.closes_loops:
@@ -223,11 +242,12 @@ class KeyframeMap(Checkpointed, Map):
 
     def _write_calibration(self, path: Path) -> None:
         noise = self._graph.heading_noise if self.config.select_every else None
-        write_calibration(path, self._graph.calibration(*self.solution()), noise)
+        write_calibration(path, self._graph.calibration(*self._kept_solution()), noise)
 
     def _append(self, observation: Observation) -> None:
         motion, length, turn = self._travel
         self._graph.append(self._graph.pose_after(motion, length), motion, length, turn)
+        self._archive.append(self._graph)
         self._live.advance(self._graph)
         self._since += length
         self._turned += turn
@@ -237,23 +257,14 @@ class KeyframeMap(Checkpointed, Map):
     def _learn(self, evidence: Evidence) -> None:
         """Updates the view metric, and the prior of the heading bias from ordered views."""
         shown = self._appearance.learn(evidence, self._confirmed_pairs)
-        config, cell, graph = self.config, self.cell, self._graph
-        if not self.closes_loops or not np.isfinite(shown.error) or not config.bias_from_views:
-            return
-        start = graph.start
-        off, error = shown.value - start.bias, shown.error
-        shrunk = start.bias + (off * max(0.0, 1 - (config.shrink * error / off) ** 2) if off else 0.0)
-        sd = min(np.hypot(error, shown.value - shrunk), 2 * start.bias_sd)
-        sd = max(sd, min(config.bias_least / cell, start.bias_sd))
-        prior = start._replace(bias=shrunk, bias_sd=float(sd))
-        self._acceptance.learn_bias(graph, self._log, prior)
+        if self.closes_loops and np.isfinite(shown.error) and self.config.bias_from_views:
+            prior = calibration_from_views(self.config, self.cell, self._graph.start, shown)
+            self._acceptance.learn_bias(self._graph, self._log, prior)
 
     def _confirmed_pairs(self) -> ConfirmedPairs:
         """Closures with a high posterior that the map has accepted."""
-        table = self._log.table()[self._log.accepted_rows()]
-        sure = (table[:, 3] > CONFIRMED_MASS) & (table[:, 8] > CONFIRMED_WEIGHT)
-        frame, match, shift = table[sure, :3].astype(int).T
-        return ConfirmedPairs(frame, match, np.cos(shift * self._graph.sector_angle) < 0)
+        pairs = np.concatenate([self._archive.pairs.rows, confirmed_pairs(self._graph, self._log)])
+        return ConfirmedPairs(pairs[:, 0], pairs[:, 1], pairs[:, 2] > 0)
 
     def _consider(self, evidence: Evidence) -> int:
         """Logs and judges a candidate; returns the keyframe that it confirms as the present place, or -1."""
@@ -266,14 +277,16 @@ class KeyframeMap(Checkpointed, Map):
             float(evidence.posterior),
             float(evidence.log_ratio),
         )
-        sequence = self._log.add(candidate, continues_sequence(self._graph, self._log, candidate))
+        follows = continues_sequence(self._graph, self._log, candidate)
+        sequence = self._log.add(candidate, follows)
+        self._archive.add(candidate, follows, self._graph)
         judge = self._acceptance.judge
         changed = self.closes_loops and judge(self._graph, self._log, sequence, candidate)
         if self._log.verdict(sequence) == Verdict.ACCEPTED:
             weight = self._log.sequence_weights()[sequence]
             self._graph.pose.rows[-1] = self._live.correct(self._graph, candidate, weight)
-        if changed or self._is_solution_due(sequence, candidate.keyframe):
-            self._solved = sequence, candidate.keyframe
+        if changed or self._is_solution_due(sequence):
+            self._solved = sequence, self._graph.ever
             self._optimise()
             if changed and self._acceptance.review(self._graph, self._log):
                 self._optimise()
@@ -282,11 +295,11 @@ class KeyframeMap(Checkpointed, Map):
         self._since = self._turned = 0.0
         return candidate.match if self._has_same_heading(candidate) else -1
 
-    def _is_solution_due(self, sequence: int, keyframe: int) -> bool:
+    def _is_solution_due(self, sequence: int) -> bool:
         """Whether the map is optimised for one more member of an accepted sequence."""
         if self._log.verdict(sequence) != Verdict.ACCEPTED:
             return False
-        return sequence != self._solved[0] or keyframe - self._solved[1] >= self.config.solve_every
+        return sequence != self._solved[0] or self._graph.ever - self._solved[1] >= self.config.solve_every
 
     def _has_same_heading(self, candidate: Candidate) -> bool:
         """Whether the headings agree by odometry: a robot that has turned is in another experience, even if
@@ -306,13 +319,15 @@ class KeyframeMap(Checkpointed, Map):
         if not self.closes_loops:
             return
         if self._selection.finish(self._graph, self._log):
+            self._merger.note_selection(self._graph)
             self._forget_solution()
         self._selection.begin(self._graph, self._log)
+        self._merger.select(self._graph, self._log)
 
     def _judge(self) -> None:
         """Every `DOUBT_EVERY` keyframes, judges the present map."""
         graph = self._graph
-        if self.closes_loops and graph.count % DOUBT_EVERY == 0:
+        if self.closes_loops and graph.ever % DOUBT_EVERY == 0:
             present = MapSolution(graph.fit(), self._log, graph.cut)
             self._doubt = worse_than_odometry(graph, present)
 
@@ -320,22 +335,14 @@ class KeyframeMap(Checkpointed, Map):
         """The map's poses, or those of raw odometry where the map is doubted."""
         if self.final_doubt() <= DOUBTED:
             return self.solution().fit
-        return MapFit(self._graph.dead_reckoned(), 0.0, np.zeros(0))
+        return MapFit(self.keyframes().dead_reckoned(), 0.0, np.zeros(0))
 
     def _forget_solution(self) -> None:
-        self._solution = self._worse = None
+        self._solution = self._kept = self._worse = None
 
     def _optimise(self) -> None:
         self._graph.optimise(self._log)
         self._forget_solution()
-
-    def _steps(self, fit: MapFit) -> np.ndarray:
-        frame, motion = self._step_frame.rows, self._step_motion.rows
-        moved = correct_heading(motion[:, :3], motion[:, 3], fit.bias, fit.turn_error)
-        if not len(fit.poses):
-            return moved
-        origin = np.where(frame[:, None] >= 0, fit.poses[np.maximum(frame, 0)], 0.0)
-        return compose(origin, moved)
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Replaces the whole state by that of `arrays`."""

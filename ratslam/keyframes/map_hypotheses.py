@@ -17,6 +17,7 @@ from ratslam.keyframes.closure_selection import (
     SelectionProblem,
     choose_sequences,
 )
+from ratslam.keyframes.merging import Merge
 from ratslam.keyframes.optimizer import LoopClosures, MapFit, MapProblem, System
 from tactile.base.se2 import integrate, wrap
 
@@ -56,6 +57,10 @@ class MapHypotheses(Checkpointed):
         self._poses = np.stack([fit.poses for fit in fits])
         self._calibration = np.array([[fit.bias, fit.turn_error] for fit in fits])
         return fits
+
+    def merge(self, merge: Merge) -> None:
+        """Follows a merge of keyframes; later ones than the maps have are kept."""
+        self._poses = self._poses[:, merge.kept[merge.kept < self._poses.shape[1]]]
 
     def _fits(self, count: int) -> list[MapFit]:
         weights = np.ones(count)

@@ -67,14 +67,15 @@ def selected_solution(graph: KeyframeGraph, log: ClosureLog, hypotheses: MapHypo
     config, log, cut = graph.config, deepcopy(log), deepcopy(graph.cut)
     scores = log.scores()
     candidates = (scores >= config.select_score) & (log.sizes() >= config.select_length)
-    candidates &= log.verdicts() != Verdict.UNDONE
+    left = log.left() > 0
+    candidates &= left & (log.verdicts() != Verdict.UNDONE)
     if not (candidates & (scores >= config.min_score)).any():
         return None
     sequences = np.flatnonzero(candidates)
     broken = np.flatnonzero(np.isin(cut.rows, sequences))
     earlier = tuple((frame, int(np.searchsorted(sequences, cut.rows[frame]))) for frame in broken.tolist())
-    cut.rows[:] = -1
-    for sequence in np.flatnonzero(log.verdicts() != Verdict.UNDONE).tolist():
+    cut.rows[broken] = -1  # those of sequences all of whose keyframes are merged stay
+    for sequence in np.flatnonzero(left & (log.verdicts() != Verdict.UNDONE)).tolist():
         log.judge(sequence, Verdict.ACCEPTED if candidates[sequence] else Verdict.OPEN)
     selection = _select(graph, log, cut, sequences, earlier, hypotheses)
     for sequence, weight in zip(sequences.tolist(), selection.fit.weights.tolist(), strict=True):

@@ -65,4 +65,4 @@ def _misfit(graph: KeyframeGraph, frame: int, pose: np.ndarray, poses: np.ndarra
     """Misfit of a keyframe's view at `pose` [3] against the older keyframes near it, at poses [N, 3]."""
     old = poses[: max(frame - graph.guard, 0)]
     near = np.flatnonzero(np.hypot(*(old - pose)[:, :2].T) < 1.5 * graph.cell)
-    return graph.appearance.misfit(frame, near, np.cos(old[near, 2] - pose[2]) < 0)
+    return graph.misfit(frame, near, np.cos(old[near, 2] - pose[2]) < 0)

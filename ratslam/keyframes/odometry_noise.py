@@ -61,8 +61,6 @@ def learn_heading_noise(
 
 
 def _log_posterior(off: float, step: float, fit: MapFit, system: System, problem: MapProblem) -> float:
-    chain = problem.chain
-    variance = chain.variance * np.array([1.0, 1.0, np.exp(step)])
-    changed = system.with_problem(problem._replace(chain=chain._replace(variance=variance)))
+    changed = system.with_problem(problem.with_heading_noise(float(np.exp(step))))
     prior = -0.5 * ((off + step) / SPREAD) ** 2
     return float(prior + changed.log_evidence(changed.solve(fit, STEPS)))

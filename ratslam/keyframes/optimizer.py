@@ -20,7 +20,7 @@ from ratslam.keyframes.linearisation import (
     measurement_errors,
 )
 from ratslam.pose_graph.block_cholesky import BlockPattern
-from tactile.base.se2 import correct_heading, wrap
+from tactile.base.se2 import bend_motion, correct_heading, wrap
 
 
 class OdometryChain(NamedTuple):
@@ -36,13 +36,36 @@ class OdometryChain(NamedTuple):
     variance: np.ndarray
 
 
+class OdometryLinks(NamedTuple):
+    """Odometry between keyframes that became neighbours when others were merged.
+
+    Attributes:
+        i, j: [L] keyframes. motion: [L, 3] pose of keyframe j in the frame of keyframe i (m, m, rad).
+            length: [L] distance travelled, m. turn: [L] turn by odometry within it, rad.
+            variance: [L, 3] of the motion.
+    """
+
+    i: np.ndarray
+    j: np.ndarray
+    motion: np.ndarray
+    length: np.ndarray
+    turn: np.ndarray
+    variance: np.ndarray
+
+
+NO_LINKS = OdometryLinks(
+    np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)), np.zeros(0), np.zeros(0), np.zeros((0, 3))
+)
+
+
 class LoopClosures(NamedTuple):
     """Loop closures: keyframe j has the position of keyframe i, and its heading plus `turn`.
 
     Attributes:
         i, j: [M] keyframes. turn: [M] rad. sequence: [M] the sequence of each, 0..R - 1. variance: [3] of
-            each. scale: [R] mean chi-square at which the weight of a sequence is a quarter. score: [R]
-            evidence. cost_limit: largest chi-square of one closure, [R] by sequence or one for all.
+            each. scale: [R] mean chi-square at which the weight of a sequence is a quarter. score, size: [R]
+            evidence and number of closures, those of merged keyframes included. cost_limit: largest
+            chi-square of one closure, [R] by sequence or one for all.
     """
 
     i: np.ndarray
@@ -52,6 +75,7 @@ class LoopClosures(NamedTuple):
     variance: np.ndarray
     scale: np.ndarray
     score: np.ndarray = np.zeros(0)
+    size: np.ndarray = np.zeros(0)
     cost_limit: np.ndarray | float = np.inf
 
 
@@ -71,6 +95,13 @@ class MapProblem(NamedTuple):
     chain: OdometryChain
     closures: LoopClosures
     prior: CalibrationPrior
+    links: OdometryLinks = NO_LINKS
+
+    def with_heading_noise(self, factor: float) -> MapProblem:
+        """The problem with the variances of the odometry's headings times `factor`."""
+        by = np.array([1.0, 1.0, factor])
+        chain = self.chain._replace(variance=self.chain.variance * by)
+        return self._replace(chain=chain, links=self.links._replace(variance=self.links.variance * by))
 
 
 class MapFit(NamedTuple):
@@ -85,6 +116,10 @@ class MapFit(NamedTuple):
     def corrected(self, chain: OdometryChain) -> np.ndarray:
         """[N - 1, 3] the chain's motions without their systematic errors."""
         return correct_heading(chain.motion, chain.length, self.bias, self.turn_error)
+
+    def corrected_links(self, links: OdometryLinks) -> np.ndarray:
+        """[L, 3] the motions of links without their systematic errors."""
+        return bend_motion(links.motion, self.bias * links.length + self.turn_error * links.turn)
 
 
 def solve(start: MapFit, problem: MapProblem, iterations: int, tolerance: float = 1e-4) -> MapFit:
@@ -148,9 +183,10 @@ class System:
     The variances, robust scales and prior may be replaced (`with_problem`), the closures may not."""
 
     def __init__(self, problem: MapProblem) -> None:
-        chain, closures, _ = problem
+        chain, closures, _, links = problem
         steps = np.arange(len(chain.length))
-        i, j = np.concatenate([steps, closures.i]), np.concatenate([steps + 1, closures.j])
+        i = np.concatenate([steps, links.i, closures.i])
+        j = np.concatenate([steps + 1, links.j, closures.j])
         free = (i > 0) & (j > 0)
         self._pattern = BlockPattern(len(chain.length), i[free] - 1, j[free] - 1)
         place, slot = np.concatenate([[-1], self._pattern.place]), np.full(len(i), -1)
@@ -166,14 +202,14 @@ class System:
         return other
 
     def _set(self, problem: MapProblem) -> None:
-        chain, closures, prior = problem
+        chain, closures, prior, links = problem
         i, j, at_i, at_j, slot = self._ends
         none = np.zeros(len(closures.i))
-        regressors = np.column_stack(
-            [np.concatenate([chain.length, none]), np.concatenate([chain.motion[:, 2], none])]
-        )[:, : 1 + int(prior.turn_error_sd > 0)]
+        lengths = np.concatenate([chain.length, links.length, none])
+        turns = np.concatenate([chain.motion[:, 2], links.turn, none])
+        regressors = np.column_stack([lengths, turns])[:, : 1 + int(prior.turn_error_sd > 0)]
         spread = np.broadcast_to(closures.variance, (len(closures.i), 3))
-        information = 1 / np.concatenate([chain.variance, spread])
+        information = 1 / np.concatenate([chain.variance, links.variance, spread])
         turned = np.column_stack([none, none, closures.turn])
         self._edges = Measurements(i, j, information, np.ascontiguousarray(regressors), at_i, at_j, slot)
         self._problem, self._turned = problem, turned
@@ -211,11 +247,12 @@ class System:
         around a fit that solves the problem (Laplace's method); up to a constant that does not depend on the
         variances of the odometry. -inf where the equations are singular."""
         information = self.linearise(fit).log_determinant()
-        spread = float(np.log(self._problem.chain.variance).sum())
+        measured = self._problem.chain.variance, self._problem.links.variance
+        spread = sum(float(np.log(variance).sum()) for variance in measured)
         return -0.5 * (self.robust_cost(fit) + information + spread)
 
     def linearise(self, fit: MapFit) -> Equations:
-        _, closures, prior = self._problem
+        _, closures, prior, _ = self._problem
         edges, poses = self._edges, np.ascontiguousarray(fit.poses)
         error, chi2, chained, measured = self._errors(fit)
         keep, mean = _mean_costs(chi2[chained:], closures, self._members)
@@ -236,8 +273,8 @@ class System:
     def _errors(self, fit: MapFit) -> tuple[np.ndarray, np.ndarray, int, np.ndarray]:
         """Errors [M, 3] and chi-squares [M] of all measurements, the number of those of the odometry, and the
         measurements [M, 3]."""
-        chain, edges = self._problem.chain, self._edges
-        measured = np.concatenate([fit.corrected(chain), self._turned])
+        chain, links, edges = self._problem.chain, self._problem.links, self._edges
+        measured = np.concatenate([fit.corrected(chain), fit.corrected_links(links), self._turned])
         poses = np.ascontiguousarray(fit.poses)
         error, chi2 = measurement_errors(poses, edges.i, edges.j, measured, edges.information)
-        return error, chi2, len(chain.length), measured
+        return error, chi2, len(chain.length) + len(links.length), measured

@@ -6,14 +6,16 @@ and replay so take up the same result at the same keyframe."""
 
 from __future__ import annotations
 
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
+from functools import partial
 
 import numpy as np
 
-from ratslam.core.checkpoint import Checkpointed, with_prefix
+from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.growable_array import GrowableArray
 from ratslam.keyframes.closure_selection import FINE, STEPS
+from ratslam.keyframes.delayed_job import DelayedJob
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import ClosureLog
 from ratslam.keyframes.map_hypotheses import MapHypotheses
@@ -59,9 +61,7 @@ class SelectedMap(Checkpointed):
 
     def take_up(self, graph: KeyframeGraph, log: ClosureLog) -> None:
         """Moves the map to the selected one, continued by the poses since; verdicts given since then stay."""
-        known = len(self.before)
-        for sequence in np.flatnonzero(log.verdicts()[:known] == self.before).tolist():
-            log.judge(sequence, self.log.verdict(sequence))
+        self.judge(log)
         size, (bias, turn_error) = len(self.poses), self.calibration
         graph.cut.rows[:size] = self.cut.rows
         graph.heading_noise = self.noise
@@ -72,6 +72,12 @@ class SelectedMap(Checkpointed):
         log.weigh(fit.weights)
         graph.move_to(fit)
 
+    def judge(self, log: ClosureLog) -> None:
+        """Takes over the verdicts on sequences whose verdict has not changed since the selection began."""
+        known = len(self.before)
+        for sequence in np.flatnonzero(log.verdicts()[:known] == self.before).tolist():
+            log.judge(sequence, self.log.verdict(sequence))
+
 
 class SelectionWorker(Checkpointed):
     """Selects every so many keyframes.
@@ -80,47 +86,32 @@ class SelectionWorker(Checkpointed):
         every: number of keyframes between two selections, 0: never.
     """
 
-    VALUES = ("_due",)
-    PARTS = ("hypotheses",)
+    PARTS = ("hypotheses", "_job")
 
     def __init__(self, every: int) -> None:
         self._every = every
-        self._due = -1  # the number of keyframes at which the selection in progress is taken up
-        self._selected: Future[SelectedMap] | None = None
+        self._job = DelayedJob(THREAD, lambda: SelectedMap(ClosureLog(), MapHypotheses()))
         self.hypotheses = MapHypotheses()
+
+    @property
+    def busy(self) -> bool:
+        """Whether a selection is in progress."""
+        return self._job.busy
 
     def begin(self, graph: KeyframeGraph, log: ClosureLog) -> None:
         """Begins a selection if it is due."""
-        if not self._every or graph.count % self._every:
-            return
-        self._due = graph.count + min(DELAY, self._every)
-        job = SelectedMap(log.copy(), deepcopy(self.hypotheses))
-        self._selected = THREAD.submit(job.select, graph.copy())
+        if self._every and graph.ever % self._every == 0:
+            selected = SelectedMap(log.copy(), deepcopy(self.hypotheses))
+            due = graph.ever + min(DELAY, self._every)
+            self._job.begin(due, partial(selected.select, graph.copy()))
 
     def finish(self, graph: KeyframeGraph, log: ClosureLog) -> bool:
         """Takes up a selection if it is due; whether it changed the map."""
-        if self._selected is None or graph.count < self._due:
+        selected = self._job.take(graph.ever)
+        if selected is None:
             return False
-        selected, self._selected, self._due = self._selected.result(), None, -1
         self.hypotheses = selected.hypotheses
         if selected.found:
             selected.take_up(graph, log)
+            log.count_selection()
         return selected.found
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """The state, with the selection in progress as its result."""
-        arrays = super().arrays()
-        if self._selected is not None:
-            found = self._selected.result().arrays()
-            arrays |= {f"selected/{name}": value for name, value in found.items()}
-        return arrays
-
-    def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Replaces the whole state by that of `arrays`."""
-        super().restore(arrays)
-        self._selected = None
-        if self._due >= 0:
-            selected = SelectedMap(ClosureLog(), MapHypotheses())
-            selected.restore(with_prefix(arrays, "selected/"))
-            self._selected = Future()
-            self._selected.set_result(selected)

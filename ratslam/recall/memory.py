@@ -36,6 +36,22 @@ class MapFeedback(NamedTuple):
     likeness: np.ndarray = NO_LIKENESS
 
 
+class MergedRows(NamedTuple):
+    """Rows of the memory after keyframes were merged or restored.
+
+    Attributes:
+        source: [n] the former row of each row, or the one that its keyframe was merged with. view: [n, D] and
+            label: [n] of their keyframes. onto: [N] the row that each former row now is or is merged with.
+            offset: [N, 3] its pose in the frame of that one, m, m, rad.
+    """
+
+    source: np.ndarray
+    view: np.ndarray
+    label: np.ndarray
+    onto: np.ndarray
+    offset: np.ndarray
+
+
 class Modes(NamedTuple):
     """A posterior over keyframes, see `Memory`."""
 
@@ -152,6 +168,59 @@ def apply_map_feedback(memory: Memory, feedback: MapFeedback) -> Memory:
         x=x, y=y, cosine=cosine, sine=sine, pose=jnp.asarray(feedback.poses[-1], dtype),
         bias=bias, turn_error=turn_error, since=since, angle=angle, scale=scale,
     )  # fmt: skip
+
+
+def merge_rows(memory: Memory, merged: MergedRows) -> Memory:
+    """The memory with these rows; the posterior of merged keyframes goes to those they are merged with.
+
+    Raises:
+        ValueError: there are more rows than the memory holds.
+    """
+    source, count = merged.source, len(merged.source)
+    if count > memory.label.shape[0]:
+        raise ValueError(f"{count} keyframes do not fit into a memory of {memory.label.shape[0]}")
+
+    def put(rows: np.ndarray, like: Array, fill: float = 0) -> Array:
+        """Rows [..., n] at the beginning of an array like another."""
+        full = np.full(like.shape, fill, like.dtype)
+        full[..., :count] = rows
+        return jnp.array(full)
+
+    def take(rows: Array) -> Array:
+        return put(np.asarray(rows)[..., source], rows)
+
+    def move(old: Modes) -> Modes:
+        anchor = np.minimum(old.anchor, len(merged.onto) - 1)
+        offset = compose(merged.offset[anchor], np.asarray(old.offset)).astype(old.offset.dtype)
+        return Modes(
+            jnp.array(merged.onto[anchor], jnp.int32), jnp.array(offset), jnp.array(old.mass),
+            take(old.before), jnp.array(_moved_mass(np.asarray(old.rest), merged)),
+        )  # fmt: skip
+
+    own = move(Modes(*(getattr(memory, name) for name in Modes._fields)))
+    return memory._replace(
+        **own._asdict(),
+        control=move(memory.control),
+        view=put(merged.view.T, memory.view),
+        label=put(merged.label, memory.label, -1),
+        packet=jnp.array(put(np.asarray(memory.packet)[source].T, memory.packet.T).T),
+        x=take(memory.x), y=take(memory.y), cosine=take(memory.cosine), sine=take(memory.sine),
+        count=jnp.array(count, jnp.int32),
+    )  # fmt: skip
+
+
+def _moved_mass(mass: np.ndarray, merged: MergedRows) -> np.ndarray:
+    """[S, C] mass by shift and row after a merge; shifts of keyframes that face opposite to the one they are
+    merged with change sides."""
+    moved = np.zeros_like(mass)
+    turned = (np.cos(merged.offset[:, 2]) < 0) & (len(mass) > 1)
+    for shift in range(len(mass)):
+        for rows, target in (
+            (np.flatnonzero(~turned), shift),
+            (np.flatnonzero(turned), len(mass) - 1 - shift),
+        ):
+            np.add.at(moved[target], merged.onto[rows], mass[shift, rows])
+    return moved
 
 
 def accumulate_motion(memory: Memory, odometry: Array) -> Memory:

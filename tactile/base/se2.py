@@ -49,7 +49,12 @@ def correct_heading(motion: Array, length: Array, bias: Array, turn_error: Array
             a share of the turn of each motion, rad/rad.
     """
     xp, motion = _arrays(motion)
-    turn = bias * xp.asarray(length) + turn_error * motion[..., 2]
+    return bend_motion(motion, bias * xp.asarray(length) + turn_error * motion[..., 2])
+
+
+def bend_motion(motion: Array, turn: Array) -> Array:
+    """Motions [..., 3] turned by [...] rad that grow evenly along each motion."""
+    xp, motion, turn = _arrays(motion, turn)
     c, s = xp.cos(turn / 2), xp.sin(turn / 2)
     x, y = motion[..., 0], motion[..., 1]
     return xp.stack([c * x - s * y, s * x + c * y, wrap(motion[..., 2] + turn)], axis=-1)

@@ -58,7 +58,7 @@ def simulated(seed):
 
 def calibration_covariance(session):
     """[2, 2] of bias and turn error, by dense inversion of the whole information."""
-    chain, closures, prior = session.problem
+    chain, closures, prior, _ = session.problem
     weights = np.ones(len(closures.scale))
     x = unknowns(session.fit, prior)
     jacobian = slopes(lambda x: residuals(x, session.fit, chain, closures, prior, weights), x)

@@ -135,7 +135,7 @@ def robust_case(seed, cost_limit, prior=PRIORS[0], count=8):
 
 
 def cost_by_loops(fit, problem):
-    chain, closures, prior = problem
+    chain, closures, prior, _ = problem
     odometry, recall = parts(fit, chain, closures)
     cost = (odometry**2).sum() + ((fit.bias - prior.bias) / prior.bias_sd) ** 2
     if prior.turn_error_sd:

@@ -1,0 +1,96 @@
+"""The odometry between keyframes after others were merged."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ratslam.keyframes.keyframe_graph import KeyframeGraph
+from ratslam.keyframes.merging import Merge
+from ratslam.keyframes.optimizer import OdometryLinks
+from tactile.base.se2 import compose, inverse, wrap
+
+ATTACHED = 0.1
+"""Standard deviation of position of a merged keyframe relative to the one it is merged with, cells."""
+
+
+def merge_keyframes(graph: KeyframeGraph, merge: Merge) -> None:
+    """Removes the merged keyframes from the graph: their odometry joins the keyframes that remain, and
+    odometry over a row of merged ones is composed (a seam), where it no longer counts."""
+    links = _links(graph, merge)
+    kept = merge.is_kept()
+    motion, length, turn = graph.motion.rows.copy(), graph.length.rows.copy(), graph.turn.rows.copy()
+    seam = graph.seam.rows.copy()
+    for frame in (np.flatnonzero(kept[1:] & ~kept[:-1]) + 1).tolist():
+        before = frame - 1
+        while not kept[before]:
+            motion[frame] = compose(motion[before], motion[frame])
+            length[frame] += length[before]
+            turn[frame] += turn[before]
+            before -= 1
+        seam[frame] = True
+    rows = merge.kept
+    graph.motion.replace(motion[rows])
+    graph.length.replace(length[rows])
+    graph.turn.replace(turn[rows])
+    graph.seam.replace(seam[rows])
+    for array in (graph.pose, graph.cut, graph.taken):
+        array.replace(array.rows[rows])
+    graph.links = links
+
+
+def _links(graph: KeyframeGraph, merge: Merge) -> OdometryLinks:
+    """Links between the remaining keyframes: those so far, and the odometry from and to merged ones; parallel
+    ones as one. Variances of headings are those of `heading_noise` 0."""
+    old, kept = graph.links, merge.is_kept()
+    broken = graph.seam.rows | (graph.cut.rows >= 0)
+    later = np.flatnonzero((~kept[1:] | ~kept[:-1]) & ~broken[1:]) + 1
+    attached = (ATTACHED * graph.cell) ** 2 * np.array([1.0, 1.0, 0.0])
+    own = graph.own_variances()[later] + attached
+    motion = np.concatenate([graph.motion.rows[later], old.motion])
+    i, j = np.concatenate([later - 1, old.i]), np.concatenate([later, old.j])
+    motion = compose(compose(merge.offset[i], motion), inverse(merge.offset[j]))
+    i, j = merge.onto[i], merge.onto[j]
+    return _fused(
+        OdometryLinks(
+            i,
+            j,
+            motion,
+            np.concatenate([graph.length.rows[later], old.length]),
+            np.concatenate([graph.motion.rows[later, 2], old.turn]),
+            np.concatenate([own, old.variance]),
+        )
+    )
+
+
+def _fused(links: OdometryLinks) -> OdometryLinks:
+    """The links from the lower to the higher keyframe, parallel ones as one by their information."""
+    swapped = links.i > links.j
+    motion = np.where(swapped[:, None], inverse(links.motion), links.motion)
+    turn, length = np.where(swapped, -links.turn, links.turn), np.where(swapped, -links.length, links.length)
+    i, j = np.minimum(links.i, links.j), np.maximum(links.i, links.j)
+    apart = i != j
+    pairs, first, group = np.unique(
+        np.stack([i[apart], j[apart]], axis=1), axis=0, return_index=True, return_inverse=True
+    )
+    group = group.reshape(-1)
+    information = 1 / links.variance[apart]
+    total = _summed(group, information, len(pairs))
+    reference = motion[apart][first]
+    off = motion[apart] - reference[group]
+    off[:, 2] = wrap(off[:, 2])
+    mean = reference + _summed(group, information * off, len(pairs)) / total
+    mean[:, 2] = wrap(mean[:, 2])
+    by_heading = information[:, 2] / total[group, 2]
+    return OdometryLinks(
+        pairs[:, 0],
+        pairs[:, 1],
+        mean,
+        np.bincount(group, by_heading * length[apart], len(pairs)),
+        np.bincount(group, by_heading * turn[apart], len(pairs)),
+        1 / total,
+    )
+
+
+def _summed(group: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
+    """[count, 3] sums of values [n, 3] by group [n]."""
+    return np.stack([np.bincount(group, values[:, c], count) for c in range(3)], axis=1)
