@@ -214,7 +214,7 @@ class KeyframeMap(Checkpointed, Map):
         """Removes the closures of a sequence and optimises without them.
 
         Raises:
-            ValueError: there is no such accepted sequence, its keyframes are merged, or it joins broken parts.
+            ValueError: no such sequence is accepted, its keyframes are merged, or it joins broken parts.
         """
         solution = self.solution()
         if not 0 <= sequence < self._log.sequences or solution.log.verdict(sequence) != Verdict.ACCEPTED:

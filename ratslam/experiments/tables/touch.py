@@ -93,6 +93,16 @@ ROWS = {
         sessions=20,
     ),
     "exploration, 3000": TouchRow("free exploration, 3000 whisks", {"path": {"explore": 3000}}),
+    "exploration, 5000": TouchRow(
+        "free exploration, 5000 whisks", MAIN | {"path": {"explore": 5000}}, sessions=5
+    ),
+    "kidnaps, 5000": TouchRow(
+        "5000 whisks with 24 kidnaps",
+        MAIN | {"path": {"explore": 5000}, "kidnaps": {"count": 24, "ahead": 45.0}},
+        {},
+        {"may_be_carried": True},
+        sessions=5,
+    ),
     "5 x 5": TouchRow("5 x 5 cells", {"maze": {"columns": 5, "rows": 5, "loop": 12}}),
     "12 x 8": TouchRow("12 x 8 cells", {"maze": {"columns": 12, "rows": 8, "loop": 32}}),
     "3 dead": TouchRow("3 dead whiskers", {}, {"head": {"dead": [7, 10, 14]}}),

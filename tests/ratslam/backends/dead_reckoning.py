@@ -67,6 +67,9 @@ class PathMap:
         self.path.append(compose(self.path[-1], evidence.moved))
         return estimate
 
+    def merge(self) -> None:
+        return None
+
     def feedback(self) -> None:
         return None
 

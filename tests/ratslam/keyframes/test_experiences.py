@@ -122,7 +122,7 @@ def test_the_graph_follows_from_the_changes(steps, cut):
             ways[before, place] = ways.get((before, place), 0) + 1
         previous = place
     moved = poses + [1.0, 2.0, 0.0]  # the map is deformed after the frames were grouped
-    graph = world.graph(moved)
+    graph = world.graph(moved, np.arange(len(moved)))
     assert list(graph.nodes) == list(range(len(made)))
     assert [graph.nodes[place]["keyframe"] for place in graph] == made
     assert {(a, b): data["traversals"] for a, b, data in graph.edges(data=True)} == ways
