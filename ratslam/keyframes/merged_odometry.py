@@ -7,7 +7,7 @@ import numpy as np
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.merging import Merge
 from ratslam.keyframes.optimizer import OdometryLinks
-from tactile.base.se2 import compose, inverse, wrap
+from tactile.base.se2 import between, compose, inverse, wrap
 
 ATTACHED = 0.1
 """Standard deviation of position of a merged keyframe relative to the one it is merged with, cells."""
@@ -16,19 +16,17 @@ ATTACHED = 0.1
 def merge_keyframes(graph: KeyframeGraph, merge: Merge) -> None:
     """Removes the merged keyframes from the graph: their odometry joins the keyframes that remain, and
     odometry over a row of merged ones is composed (a seam), where it no longer counts."""
-    links = _links(graph, merge)
-    kept = merge.is_kept()
+    links, rows = _links(graph, merge), merge.kept
     motion, length, turn = graph.motion.rows.copy(), graph.length.rows.copy(), graph.turn.rows.copy()
+    after = np.flatnonzero(np.diff(rows) > 1)
+    earlier, later = rows[after], rows[after + 1]
+    reckoned = graph.dead_reckoned()
+    motion[later] = between(reckoned[earlier], reckoned[later])
+    for values in (length, turn):
+        sums = np.cumsum(values)
+        values[later] = sums[later] - sums[earlier]
     seam = graph.seam.rows.copy()
-    for frame in (np.flatnonzero(kept[1:] & ~kept[:-1]) + 1).tolist():
-        before = frame - 1
-        while not kept[before]:
-            motion[frame] = compose(motion[before], motion[frame])
-            length[frame] += length[before]
-            turn[frame] += turn[before]
-            before -= 1
-        seam[frame] = True
-    rows = merge.kept
+    seam[later] = True
     graph.motion.replace(motion[rows])
     graph.length.replace(length[rows])
     graph.turn.replace(turn[rows])
@@ -40,7 +38,7 @@ def merge_keyframes(graph: KeyframeGraph, merge: Merge) -> None:
 
 def _links(graph: KeyframeGraph, merge: Merge) -> OdometryLinks:
     """Links between the remaining keyframes: those so far, and the odometry from and to merged ones; parallel
-    ones as one. Variances of headings are those of `heading_noise` 0."""
+    ones as one. Variances of headings are those without learned noise."""
     old, kept = graph.links, merge.is_kept()
     broken = graph.seam.rows | (graph.cut.rows >= 0)
     later = np.flatnonzero((~kept[1:] | ~kept[:-1]) & ~broken[1:]) + 1
@@ -69,10 +67,8 @@ def _fused(links: OdometryLinks) -> OdometryLinks:
     turn, length = np.where(swapped, -links.turn, links.turn), np.where(swapped, -links.length, links.length)
     i, j = np.minimum(links.i, links.j), np.maximum(links.i, links.j)
     apart = i != j
-    pairs, first, group = np.unique(
-        np.stack([i[apart], j[apart]], axis=1), axis=0, return_index=True, return_inverse=True
-    )
-    group = group.reshape(-1)
+    size = int(j.max(initial=0)) + 1
+    pairs, first, group = np.unique(i[apart] * size + j[apart], return_index=True, return_inverse=True)
     information = 1 / links.variance[apart]
     total = _summed(group, information, len(pairs))
     reference = motion[apart][first]
@@ -82,8 +78,8 @@ def _fused(links: OdometryLinks) -> OdometryLinks:
     mean[:, 2] = wrap(mean[:, 2])
     by_heading = information[:, 2] / total[group, 2]
     return OdometryLinks(
-        pairs[:, 0],
-        pairs[:, 1],
+        pairs // size,
+        pairs % size,
         mean,
         np.bincount(group, by_heading * length[apart], len(pairs)),
         np.bincount(group, by_heading * turn[apart], len(pairs)),
