@@ -126,6 +126,11 @@ def add_tables(tables: Commands) -> None:
         "--rows", nargs="+", type=positive_integer, metavar="N", help="only these numbers of cells a side"
     )
     add_count(speed, "--rounds", 5, "repeats, of which the median is taken")
+    cycles = add(
+        "cycles", _cycle_lines, "microseconds per whole cycle: views, pose cells, map", "--rows square"
+    )
+    cycles.add_argument("--rows", nargs="+", metavar="ROW", help="only these sessions")
+    add_count(cycles, "--rounds", 5, "repeats, of which the median is taken")
     precision = add("precision", _precision_lines, "float32 against float64", "--seeds 2 --backends recall")
     add_count(precision, "--seeds", 20, "sessions per method")
     precision.add_argument("--backends", nargs="+", choices=BACKENDS, default=BACKENDS, help="the methods")
@@ -242,6 +247,15 @@ def _speed_lines(arguments: argparse.Namespace) -> Iterator[str]:
         from ratslam.experiments.tables.speed import SIZES, speed_table
 
         yield from speed_table(arguments.rows or SIZES, arguments.rounds)
+
+
+def _cycle_lines(arguments: argparse.Namespace) -> Iterator[str]:
+    from evaluation.metrics.resources import one_core
+
+    with one_core():
+        from ratslam.experiments.tables.cycles import cycle_table
+
+        yield from cycle_table(arguments.rows, arguments.rounds)
 
 
 def _precision_lines(arguments: argparse.Namespace) -> Iterator[str]:
