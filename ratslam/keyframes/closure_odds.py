@@ -89,13 +89,15 @@ class AcceptByOdds(Acceptance):
             return False
         if is_round(length) or length == graph.config.min_length:
             self._rate(log, sequence)
-        believe(graph, log, self._vote(graph, log).result.belief)
+        ballot = self._vote(graph, log)
+        believe(graph, log, ballot.result.belief)
         due = candidate.keyframe % REVIEW_EVERY == 0
-        accepted = self._accept(graph, log, np.arange(log.sequences) if due else np.array([sequence]))
+        among = np.arange(log.sequences) if due else np.array([sequence])
+        accepted = self._accept(graph, log, among, ballot)
         return accepted or self._break(graph, log, sequence)
 
     def review(self, graph: KeyframeGraph, log: ClosureLog) -> bool:
-        return self._accept(graph, log, np.arange(log.sequences))
+        return self._accept(graph, log, np.arange(log.sequences), self._vote(graph, log))
 
     def solution(self, graph: KeyframeGraph, log: ClosureLog) -> MapSolution:
         graph, log = graph.copy(), log.copy()
@@ -127,10 +129,10 @@ class AcceptByOdds(Acceptance):
         grid, ratios = self._scan.grid[near], self._log_ratio.rows[sequences][:, near]
         return Ballot(sequences, score_odds, vote(grid, self._views_prior, ratios, score_odds, least))
 
-    def _accept(self, graph: KeyframeGraph, log: ClosureLog, among: np.ndarray) -> bool:
+    def _accept(self, graph: KeyframeGraph, log: ClosureLog, among: np.ndarray, ballot: Ballot) -> bool:
         """Accepts every open sequence of `among` whose odds, by raw odometry or by the map, are high enough;
         whether there was any."""
-        sequences, score_odds, result = self._vote(graph, log)
+        sequences, score_odds, result = ballot
         odds, open_ = result.odds, log.verdicts()[sequences] == Verdict.OPEN
         open_ &= np.isin(sequences, among)
         accepted = odds >= MIN_LOG_ODDS
