@@ -126,9 +126,7 @@ def add_tables(tables: Commands) -> None:
         "--rows", nargs="+", type=positive_integer, metavar="N", help="only these numbers of cells a side"
     )
     add_count(speed, "--rounds", 5, "repeats, of which the median is taken")
-    cycles = add(
-        "cycles", _cycle_lines, "microseconds per whole cycle: views, pose cells, map", "--rows square"
-    )
+    cycles = add("cycles", _cycle_lines, "microseconds per whole cycle, map included", "--rows square")
     cycles.add_argument("--rows", nargs="+", metavar="ROW", help="only these sessions")
     add_count(cycles, "--rounds", 5, "repeats, of which the median is taken")
     precision = add("precision", _precision_lines, "float32 against float64", "--seeds 2 --backends recall")

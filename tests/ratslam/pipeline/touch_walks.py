@@ -88,7 +88,7 @@ def follow(session: Session, readings: Sequence[Observation]) -> MappedWalk:
     for _ in session.replay(readings):
         pass
     settled = session.map.solution()
-    first = np.searchsorted(session.map.arrays()["step_frame"], np.arange(len(settled.cut.rows)))
+    first = session.map.keyframe_steps()
     cuts = first[settled.cut.rows >= 0].tolist()
     return MappedWalk(session.map.trajectory(), session.map.closures(), cuts)
 
