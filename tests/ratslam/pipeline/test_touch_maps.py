@@ -91,7 +91,7 @@ def test_an_undone_closure_sequence_stays_undone() -> None:
         follow(session, rest)
         table = keyframe_map.candidates()
         assert (table[table[:, 5] == sequence, 7] == Verdict.UNDONE).all()
-        first = np.searchsorted(keyframe_map.arrays()["step_frame"], table[table[:, 5] == sequence, :2])
+        first = keyframe_map.keyframe_steps()[table[table[:, 5] == sequence, :2].astype(int)]
         joined = set(map(tuple, keyframe_map.closures().tolist()))
         assert not joined & set(map(tuple, first.tolist()))
     with pytest.raises(ValueError, match="not an accepted closure sequence"):
