@@ -18,6 +18,8 @@ GUARD = 20
 CHUNK = 16
 """Steps between two merges, as in a session."""
 NONE = -1
+RATIO = 4.0
+"""Evidence of what recall finds."""
 RUN, PAUSE = 15, 5
 """Places in a row that recall finds, and that it does not find thereafter."""
 
@@ -28,7 +30,7 @@ class Route(NamedTuple):
     Attributes:
         odometry: [N, 3] motion into each keyframe. truth: [N, 3] poses. place: [N] where each keyframe is
             along a lap. look: [N] number of its view. recalled: [N] the place that recall finds, `NONE` for
-            none.
+            none. ratio: [N] its log-likelihood ratio.
     """
 
     odometry: np.ndarray
@@ -36,6 +38,7 @@ class Route(NamedTuple):
     place: np.ndarray
     look: np.ndarray
     recalled: np.ndarray
+    ratio: np.ndarray
 
 
 class LookAppearance(LabelAppearance):
@@ -71,7 +74,9 @@ class Drive:
             match = self._recall(int(self.route.recalled[k]))
             self.rows = np.append(self.rows, k)
             x, y, turn = self.route.odometry[k].tolist()
-            seen = Seen(len(self.rows) - 1, match, 0, float(match >= 0), 4.0, NONE, 0, 0.0, 0.0)
+            seen = Seen(
+                len(self.rows) - 1, match, 0, float(match >= 0), self.route.ratio[k], NONE, 0, 0.0, 0.0
+            )
             reading = observation(Odometry(x, y, turn, 0.1), None, view_shape=(1, 1, 1), label=k)
             self.map.update(reading, Pose(-1, -1, 0), seen)
         return self
@@ -122,9 +127,34 @@ def laps(lap, count, seed):
     k = np.arange(len(motion))
     place = k % len(lap)
     known = (k >= len(lap)) & (place % (RUN + PAUSE) < RUN)
-    return Route(drifting(motion, seed), truth, place, place, np.where(known, place, NONE))
+    return Route(
+        drifting(motion, seed), truth, place, place, np.where(known, place, NONE), np.full(len(k), RATIO)
+    )
 
 
 def circles(count, seed=0, size=80):
     """Laps of a circle of `size` keyframes."""
     return laps(arcs((size, 2 * np.pi)), count, seed)
+
+
+CORRIDOR = 16
+"""Keyframes of a corridor."""
+NORTH, SOUTH = 0, 74
+"""Places where the two corridors begin."""
+
+
+def corridors(count, seed=0, evidence=1.5):
+    """Laps through two parallel corridors that look the same, 1.3 m apart, heading east in both.
+
+    In the first lap recall takes the second corridor for the first one, with this evidence at each keyframe,
+    when only odometry speaks against it; later it finds nothing there.
+    """
+    ahead, back, half = (CORRIDOR, 0.0), (CORRIDOR, 0.0), np.pi
+    route = laps(arcs(ahead, (16, half), back, (26, half), ahead, (36, half), back, (26, half)), count, seed)
+    place = route.place
+    inside = (place >= SOUTH) & (place < SOUTH + CORRIDOR)
+    look = np.where(inside, place - SOUTH + NORTH, place)
+    false = (np.arange(len(place)) < SOUTH + CORRIDOR - 1) & inside & (place > SOUTH)
+    recalled = np.where(inside, NONE, route.recalled)
+    recalled[false] = look[false]
+    return route._replace(look=look, recalled=recalled, ratio=np.where(false, evidence, RATIO))

@@ -1,0 +1,93 @@
+"""Merges on ground that was wrong: a corridor is merged with one that looks the same, until the selection on
+the unmerged keyframes undoes it."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from ratslam.keyframes import archive, archive_selection
+from ratslam.keyframes.loop_closures import Verdict
+from tests.ratslam.keyframes.map_cases import CELL
+from tests.ratslam.keyframes.merging_cases import CORRIDOR, NORTH, SOUTH, Drive, corridors
+
+ROUTE = corridors(3)
+LAP = 168
+MERGED = {"select_every": 20, "merge_stood": 1, "merge_newest": 40}
+LAST = 440
+BEGUN = 2 * LAP
+"""Keyframes at the selection on the unmerged keyframes; it is taken up an eighth later."""
+NEVER = 10**6
+PLACES = np.arange(CORRIDOR)
+
+
+@cache
+def driven(first, merge_stood=1):
+    """The drive with the first selection of unmerged keyframes at this number."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(archive_selection, "FIRST", first)
+        return Drive(ROUTE, **MERGED | {"merge_stood": merge_stood}).go(LAST)
+
+
+def gap(path):
+    """Mean distance between the corridors of the first lap in a trajectory, m."""
+    return float(np.hypot(*(path[SOUTH + PLACES] - path[NORTH + PLACES])[:, :2].T).mean())
+
+
+def false_closures(drive):
+    """Number of accepted closures between the corridors."""
+    later, earlier = ROUTE.place[drive.map.closures()].T
+    return int(((later >= SOUTH) & (later < SOUTH + CORRIDOR) & (earlier < NORTH + CORRIDOR)).sum())
+
+
+def test_the_corridors_lie_apart():
+    assert gap(ROUTE.truth) > 2.5 * CELL
+
+
+def test_the_false_sequence_is_accepted_at_first():
+    drive = Drive(ROUTE, **MERGED | {"merge_stood": 0}).go(LAP)
+    assert drive.map.candidates()[0, 7] == Verdict.ACCEPTED
+    assert gap(drive.map.map_trajectory()) < CELL
+
+
+def test_without_merges_later_laps_refute_it():
+    drive = driven(NEVER, merge_stood=0)
+    assert false_closures(drive) == 0
+    assert gap(drive.map.online_trajectory()) > 2 * CELL
+
+
+def test_merged_ground_stays_wrong_by_itself(monkeypatch):
+    drive = driven(NEVER)
+    second = drive.map._archive.row.rows[SOUTH + PLACES]
+    assert (ROUTE.place[drive.rows[second]] < NORTH + CORRIDOR).all()  # merged with the first corridor
+    assert false_closures(drive) > 0
+    assert gap(drive.map.online_trajectory()) < CELL
+    monkeypatch.setattr(archive, "MOST_SOLVED", LAST - 1)  # a larger map is not solved with all keyframes
+    map = drive.restored().map
+    assert gap(map.map_trajectory()) < CELL
+
+
+def test_the_selection_on_the_unmerged_keyframes_restores_them(monkeypatch):
+    drive = driven(BEGUN)
+    second = drive.map._archive.row.rows[SOUTH + PLACES]
+    assert (np.abs(ROUTE.place[drive.rows[second]] - SOUTH - PLACES) <= 2).all()
+    assert false_closures(drive) == 0
+    assert gap(drive.map.online_trajectory()) > 2 * CELL
+    monkeypatch.setattr(archive, "MOST_SOLVED", LAST - 1)
+    assert gap(drive.restored().map.map_trajectory()) > 2 * CELL
+
+
+def test_the_restored_map_is_merged_anew_where_it_is_right():
+    drive = driven(BEGUN)
+    assert len(drive.rows) < LAST - LAP // 2
+    merged = np.setdiff1d(np.arange(LAST), drive.rows)
+    onto = drive.rows[drive.map._archive.row.rows[merged]]
+    apart = ROUTE.truth[merged] - ROUTE.truth[onto]
+    assert np.hypot(*apart[:, :2].T).max() < 1.5 * CELL
+
+
+def test_the_restored_map_is_as_good_as_without_merges():
+    restored, unmerged = driven(BEGUN).error(), driven(NEVER, merge_stood=0).error()
+    assert restored.mean() < 1.2 * unmerged.mean() + 0.02 * CELL
