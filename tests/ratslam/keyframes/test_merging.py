@@ -122,6 +122,15 @@ def test_keyframes_near_strained_odometry_are_not_merged(error):
     assert merged(graph, log_of(range(45, 76))) == sorted(set(range(45, 76)) - spared)
 
 
+def test_a_turn_near_half_a_turn_is_not_strained():
+    poses = circle(100)
+    poses[20::LAP, 2] = wrap(poses[19::LAP, 2] + np.pi - 0.001)
+    graph = graph_of(poses)
+    graph.motion.rows[60, 2] = wrap(graph.motion.rows[60, 2] + 0.002)
+    assert abs(graph.motion.rows[60, 2]) > 3.1
+    assert merged(graph, log_of(range(45, 76))) == list(range(45, 76))
+
+
 def test_odometry_at_a_seam_is_not_strained():
     graph = graph_of(circle(100))
     graph.motion.rows[60] += 0.5
@@ -135,6 +144,12 @@ def test_both_ends_of_a_seam_are_confirmed():
     assert merged(graph, ClosureLog()) == [59, 60]
     graph.seam.rows[70] = True
     assert merged(graph, ClosureLog()) == list(range(59, 71))
+
+
+def test_keyframes_without_older_ones_are_not_merged():
+    graph = graph_of(circle(100))
+    graph.seam.rows[[6, GUARD]] = True
+    assert merged(graph, ClosureLog()) == []
 
 
 def test_nothing_is_merged_on_new_ground():
