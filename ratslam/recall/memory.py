@@ -187,7 +187,8 @@ def merge_rows(memory: Memory, merged: MergedRows) -> Memory:
         return jnp.array(full)
 
     def take(rows: Array) -> Array:
-        return put(np.asarray(rows)[..., source], rows)
+        former = np.asarray(rows)
+        return put(former[..., source], rows) if former.size else jnp.array(former)
 
     def move(old: Modes) -> Modes:
         anchor = np.minimum(old.anchor, len(merged.onto) - 1)
@@ -211,7 +212,9 @@ def merge_rows(memory: Memory, merged: MergedRows) -> Memory:
 
 def _moved_mass(mass: np.ndarray, merged: MergedRows) -> np.ndarray:
     """[S, C] mass by shift and row after a merge; shifts of keyframes that face opposite to the one they are
-    merged with change sides."""
+    merged with change sides. Empty where only modes have mass."""
+    if not mass.size:
+        return mass
     moved = np.zeros_like(mass)
     turned = (np.cos(merged.offset[:, 2]) < 0) & (len(mass) > 1)
     for shift in range(len(mass)):
