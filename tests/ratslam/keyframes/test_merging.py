@@ -124,7 +124,7 @@ def test_keyframes_near_strained_odometry_are_not_merged(error):
 
 def test_a_turn_near_half_a_turn_is_not_strained():
     poses = circle(100)
-    poses[20::LAP, 2] = wrap(poses[19::LAP, 2] + np.pi - 0.001)
+    poses[[20, 60], 2] = wrap(poses[[19, 59], 2] + np.pi - 0.001)
     graph = graph_of(poses)
     graph.motion.rows[60, 2] = wrap(graph.motion.rows[60, 2] + 0.002)
     assert abs(graph.motion.rows[60, 2]) > 3.1
