@@ -53,12 +53,14 @@ class LookAppearance(LabelAppearance):
 
 
 class Drive:
-    """A map with the keyframe that each of its rows is, as a kernel keeps them."""
+    """A map with the keyframe that each of its rows is, as a kernel keeps them, and the experience of each
+    keyframe."""
 
     def __init__(self, route, **settings):
         config, looks = KeyframeMapConfig.model_validate(settings), LookAppearance(route.look)
         self.map = KeyframeMap(config, CELL, looks, lambda graph: AcceptByEvidence(), guard=GUARD)
         self.route, self.settings, self.rows = route, settings, np.zeros(0, int)
+        self.experiences: list[int] = []
 
     @property
     def steps(self):
@@ -78,14 +80,14 @@ class Drive:
                 len(self.rows) - 1, match, 0, float(match >= 0), self.route.ratio[k], NONE, 0, 0.0, 0.0
             )
             reading = observation(Odometry(x, y, turn, 0.1), None, view_shape=(1, 1, 1), label=k)
-            self.map.update(reading, Pose(-1, -1, 0), seen)
+            self.experiences.append(int(self.map.update(reading, Pose(-1, -1, 0), seen).place))
         return self
 
     def restored(self):
         """The same continued from a checkpoint."""
         other = Drive(self.route, **self.settings)
         other.map.restore(self.map.arrays())
-        other.rows = self.rows.copy()
+        other.rows, other.experiences = self.rows.copy(), list(self.experiences)
         return other
 
     def error(self):
@@ -93,6 +95,20 @@ class Drive:
         path = self.map.map_trajectory()
         truth = self.route.truth[: len(path)]
         return np.hypot(*(compose(fit_rigid_motion(path, truth), path) - truth)[:, :2].T)
+
+    def merged_apart(self):
+        """[T] true distances of keyframes from those that they are or are merged with, m."""
+        onto = self.rows[self.map._archive.row.rows]
+        return self._apart(onto)
+
+    def experience_apart(self):
+        """[T] true distances of keyframes from the first one of their experience, m."""
+        nodes = self.map.graph().nodes
+        return self._apart([nodes[place]["keyframe"] for place in self.experiences])
+
+    def _apart(self, others):
+        truth = self.route.truth
+        return np.hypot(*(truth[: len(others)] - truth[others])[:, :2].T)
 
     def _recall(self, place):
         """The row of the oldest keyframe at a place, or near it."""

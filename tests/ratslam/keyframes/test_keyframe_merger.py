@@ -52,11 +52,16 @@ def test_the_number_of_keyframes_follows_the_ground():
 def test_rows_are_the_keyframes_of_the_map():
     drive = driven()
     assert np.array_equal(drive.rows, drive.map._graph.taken.rows)
-    apart = (
-        ROUTE.truth[drive.map._archive.graph.taken.rows]
-        - ROUTE.truth[drive.rows[drive.map._archive.row.rows]]
-    )
-    assert np.hypot(*apart[:, :2].T).max() < 1.5 * CELL  # merged where they are near each other indeed
+    assert drive.merged_apart().max() < 1.5 * CELL
+
+
+def test_experiences_are_those_of_the_first_lap():
+    drive, unmerged = driven(), driven(merge_stood=0)
+    radius = drive.map.config.place_radius * CELL
+    assert max(drive.experiences) <= max(unmerged.experiences) + 2
+    assert drive.experience_apart().max() < radius
+    first, last = np.array(drive.experiences[:LAP]), np.array(drive.experiences[-LAP:])
+    assert (first == last).mean() > 0.9
 
 
 def test_the_trajectory_is_as_good_as_without_merges():
@@ -185,5 +190,7 @@ def test_the_archive_replaces_the_map_once_it_is_selected(monkeypatch, early):
     assert BEGUN * 9 // 8 <= count < BEGUN * 9 // 8 + 2 * CHUNK
     assert abs(after - before) < 40  # right ground is merged anew
     assert len(drive.rows) == drive.map._graph.count
+    assert drive.merged_apart().max() < 1.5 * CELL
+    assert drive.experience_apart().max() < drive.map.config.place_radius * CELL
     expected = driven(merge_stood=0, laps=4).error()
     assert drive.error().mean() < 1.2 * expected.mean() + 0.01 * CELL

@@ -79,13 +79,28 @@ def test_the_selection_on_the_unmerged_keyframes_restores_them(monkeypatch):
     assert gap(drive.restored().map.map_trajectory()) > 2 * CELL
 
 
+def test_the_map_is_right_as_soon_as_it_is_restored(monkeypatch):
+    monkeypatch.setattr(archive_selection, "FIRST", BEGUN)
+    drive = Drive(ROUTE, **MERGED).go(BEGUN)
+    assert drive.map._merger._archive_selection.busy
+    while drive.map._merger._archive_selection.busy:
+        assert drive.map._log.verdict(0) == Verdict.ACCEPTED
+        assert gap(drive.map.online_trajectory()) < CELL
+        drive.go(drive.steps + 1)
+    assert drive.map._log.verdict(0) == Verdict.OPEN
+    assert gap(drive.map.online_trajectory()) > 2 * CELL
+    assert len(drive.map.online_trajectory()) == drive.steps
+
+
 def test_the_restored_map_is_merged_anew_where_it_is_right():
     drive = driven(BEGUN)
     assert len(drive.rows) < LAST - LAP // 2
-    merged = np.setdiff1d(np.arange(LAST), drive.rows)
-    onto = drive.rows[drive.map._archive.row.rows[merged]]
-    apart = ROUTE.truth[merged] - ROUTE.truth[onto]
-    assert np.hypot(*apart[:, :2].T).max() < 1.5 * CELL
+    assert drive.merged_apart().max() < 1.5 * CELL
+
+
+def test_experiences_are_restored():
+    drive, radius = driven(BEGUN), driven(BEGUN).map.config.place_radius * CELL
+    assert drive.experience_apart().max() < radius + 2 * CELL
 
 
 def test_the_restored_map_is_as_good_as_without_merges():
