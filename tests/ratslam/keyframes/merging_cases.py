@@ -93,8 +93,7 @@ class Drive:
     def error(self):
         """[T] distances of the final trajectory from the truth, m."""
         path = self.map.map_trajectory()
-        truth = self.route.truth[: len(path)]
-        return np.hypot(*(compose(fit_rigid_motion(path, truth), path) - truth)[:, :2].T)
+        return off(path, self.route.truth[: len(path)])
 
     def merged_apart(self):
         """[T] true distances of keyframes from those that they are or are merged with, m."""
@@ -118,6 +117,11 @@ class Drive:
         apart = np.abs(self.route.place[old] - place)
         best = int(np.argmin(apart))
         return best if apart[best] <= 1 else NONE
+
+
+def off(poses, truth):
+    """[N] distances of poses from the true ones, moved as a whole to fit them best, m."""
+    return np.hypot(*(compose(fit_rigid_motion(poses, truth), poses) - truth)[:, :2].T)
 
 
 def drifting(motion, seed, noise=0.02, bias=0.01):

@@ -9,6 +9,8 @@ import pytest
 
 from ratslam.keyframes import archive_selection
 from ratslam.keyframes.loop_closures import Verdict
+from ratslam.keyframes.merging import NEAR
+from tactile.base.se2 import between, fit_rigid_motion
 from tests.ratslam.keyframes.map_cases import CELL
 from tests.ratslam.keyframes.merging_cases import CHUNK, Drive, circles
 
@@ -135,7 +137,13 @@ def test_a_sequence_that_is_not_merged_can_be_undone():
 BEGUN, END = 240, 320
 """Keyframes at which the archive's selection begins, and the last ones of the drive; the selection is taken
 up when there are an eighth more."""
-STOPS = {"before any merge": 100, "between merges": 230, "selecting": BEGUN + 1, "due": BEGUN + 48}
+STOPS = {
+    "before any merge": 100,
+    "merge due": 222,
+    "between merges": 230,
+    "selecting": BEGUN + 1,
+    "due": BEGUN + 48,
+}
 
 
 @pytest.fixture
@@ -159,6 +167,8 @@ def test_the_stops_are_what_they_are_named(early):
     selecting = {name for name, drive in found.items() if drive.map._merger._archive_selection.busy}
     assert selecting == {"selecting", "due"}
     assert not whole.map._merger._archive_selection.busy
+    assert found["merge due"].map._merger._is_due
+    assert not found["between merges"].map._merger._is_due
 
 
 @pytest.mark.parametrize("stop", STOPS)
@@ -178,19 +188,34 @@ def test_the_archive_replaces_the_map_once_it_is_selected(monkeypatch, early):
     real = archive_selection.UnmergedMap.replace
 
     def replace(self, graph, log, archive):
-        before = graph.count
+        before, rows = archive.poses(graph.pose.rows).copy(), graph.count
         merge = real(self, graph, log, archive)
-        taken.append((len(self.onto), archive.graph.count, before, len(merge.kept)))
+        size = len(self.onto)
+        assert size == BEGUN
+        assert BEGUN * 9 // 8 <= graph.count == archive.graph.count < BEGUN * 9 // 8 + 2 * CHUNK
+        assert abs(len(merge.kept) - rows) < 40  # right ground is merged anew
+        assert (graph.bias, graph.turn_error) == self.selected.calibration
+        assert graph.heading_noise == self.selected.noise
+        # The selected map, continued by the motions since, lies where the map did.
+        poses = graph.pose.rows
+        for part, expected in (
+            (slice(0, size), self.selected.poses),
+            (slice(size - 1, None), before[size - 1 :]),
+        ):
+            motion, wanted = (between(rows[:-1], rows[1:]) for rows in (poses[part], expected))
+            assert np.allclose(motion, wanted, atol=1e-9)
+        assert np.allclose(fit_rigid_motion(poses, before), 0.0, atol=1e-6)
+        taken.append(size)
         return merge
 
     monkeypatch.setattr(archive_selection.UnmergedMap, "replace", replace)
     drive = Drive(ROUTE, **MERGED).go(4 * LAP)
-    assert [size for size, *_ in taken] == [BEGUN]
-    ((_, count, before, after),) = taken
-    assert BEGUN * 9 // 8 <= count < BEGUN * 9 // 8 + 2 * CHUNK
-    assert abs(after - before) < 40  # right ground is merged anew
+    assert len(taken) == 1
     assert len(drive.rows) == drive.map._graph.count
     assert drive.merged_apart().max() < 1.5 * CELL
     assert drive.experience_apart().max() < drive.map.config.place_radius * CELL
+    offset = drive.map._archive.offset.rows
+    assert not offset[drive.rows].any()
+    assert 0 < np.hypot(*offset[:, :2].T).max() <= 2 * NEAR * CELL
     expected = driven(merge_stood=0, laps=4).error()
     assert drive.error().mean() < 1.2 * expected.mean() + 0.01 * CELL

@@ -11,7 +11,7 @@ import pytest
 from ratslam.keyframes import archive, archive_selection
 from ratslam.keyframes.loop_closures import Verdict
 from tests.ratslam.keyframes.map_cases import CELL
-from tests.ratslam.keyframes.merging_cases import CORRIDOR, NORTH, SOUTH, Drive, corridors
+from tests.ratslam.keyframes.merging_cases import CORRIDOR, NORTH, SOUTH, Drive, corridors, off
 
 ROUTE = corridors(3)
 LAP = 168
@@ -86,10 +86,16 @@ def test_the_map_is_right_as_soon_as_it_is_restored(monkeypatch):
     while drive.map._merger._archive_selection.busy:
         assert drive.map._log.verdict(0) == Verdict.ACCEPTED
         assert gap(drive.map.online_trajectory()) < CELL
+        rows = len(drive.rows)
         drive.go(drive.steps + 1)
+        # Nothing is merged meanwhile.
+        assert len(drive.rows) == rows + 1 or not drive.map._merger._archive_selection.busy
     assert drive.map._log.verdict(0) == Verdict.OPEN
     assert gap(drive.map.online_trajectory()) > 2 * CELL
     assert len(drive.map.online_trajectory()) == drive.steps
+    for poses in drive.map._selection.hypotheses._poses:
+        assert len(poses) <= len(drive.rows)
+        assert off(poses, ROUTE.truth[drive.rows[: len(poses)]]).max() < 2 * CELL
 
 
 def test_the_restored_map_is_merged_anew_where_it_is_right():
