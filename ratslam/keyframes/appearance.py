@@ -70,8 +70,11 @@ class Appearance(Checkpointed, ABC):
     """Views of all keyframes."""
 
     def present(self) -> Appearance:
-        """The present metric with the views so far, which are shared: they never change."""
+        """The present metric with the views so far, whose memory is shared: a view never changes."""
         other = copy(self)
+        for name, value in vars(self).items():
+            if isinstance(value, GrowableArray):  # views added or replaced later are not those of the copy
+                setattr(other, name, copy(value))
         for name in self.PARTS:
             setattr(other, name, deepcopy(getattr(self, name)))
         return other
