@@ -41,11 +41,26 @@ def held():
 def test_a_slow_selection_gives_the_same_bits(held):
     hold, gate = held
     expected = drive(new_map(**SELECTED), SEEN, last=LAST)
+    slow = drive(new_map(**SELECTED), SEEN, last=BEGUN - 1)
     hold()
-    slow = drive(new_map(**SELECTED), SEEN, last=BEGUN + DELAY - 1)
+    drive(slow, SEEN, first=BEGUN - 1, last=BEGUN + DELAY - 1)
     assert slow.keyframes().count > BEGUN  # the session went on while the selection was held back
     gate.set()
     assert same(drive(slow, SEEN, first=BEGUN + DELAY - 1, last=LAST), expected)
+
+
+def test_a_selection_in_progress_keeps_its_views_when_the_map_is_restored(held):
+    hold, gate = held
+    map = drive(new_map(**SELECTED), SEEN, last=BEGUN)
+    expected = map.arrays()
+    again = drive(new_map(**SELECTED), SEEN, last=BEGUN - 1)
+    hold()
+    drive(again, SEEN, first=BEGUN - 1, last=BEGUN)
+    selection = again._selection._job._result
+    again.restore(new_map(**SELECTED).arrays())
+    gate.set()
+    for name, value in selection.result(60).arrays().items():
+        assert np.array_equal(value, expected[f"selection/job/result/{name}"], equal_nan=True), name
 
 
 def test_the_result_is_taken_up_after_the_delay(monkeypatch):
