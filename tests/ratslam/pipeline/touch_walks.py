@@ -73,6 +73,13 @@ def empty_carried_session() -> Session:
     return session
 
 
+def empty_merging_session(merge_stood: int) -> Session:
+    """The shared compiled session that merges keyframes soon, empty; 0: none."""
+    session, empty = _compiled(512, select_every=30, merge_stood=merge_stood, merge_newest=60)
+    session.restore(empty)
+    return session
+
+
 def simulate_walk(seed: int, dead: Sequence[int] = (), **simulation: Any) -> Walk:
     """A simulated session."""
     config = config_of(simulation={"seed": seed} | LAPS | simulation, touch={"head": {"dead": tuple(dead)}})
