@@ -29,8 +29,12 @@ Feedback = Any
 """A record of host arrays that the map gives to the kernel, or None."""
 
 
-MergedRows = Any
-"""A record of host arrays by which the kernel follows the map when rows of its memory are merged."""
+class MergedRows(Protocol):
+    """A record of host arrays by which the kernel follows the map when rows of its memory are merged."""
+
+    @property
+    def rows(self) -> int:
+        """Number of rows thereafter."""
 
 
 class Map(Protocol):
@@ -120,8 +124,9 @@ class Backend(Protocol):
         """The state after the map's feedback; same shapes and dtypes."""
         return state
 
-    def merge_rows(self, state: State, merged: MergedRows) -> State:
-        """The state after rows of the memory were merged; same shapes and dtypes."""
+    def merge_rows(self, state: State, merged: Any) -> State:
+        """The state, which holds `merged.rows` rows at least, after rows of the memory were merged or
+        restored; same shapes and dtypes."""
         return state
 
     def kernel(self, state: State, observation: Observation) -> tuple[State, Estimate, Evidence]:

@@ -1,9 +1,9 @@
 """The session: feeds observations to a backend's kernel and folds its results into the map.
 
 Live and replay run the same compiled function over a chunk of fixed length with a traced count: live passes
-one observation, replay up to `CHUNK`, and both give the same bits. At the start of a chunk the kernel
-follows the map where rows of its memory are merged, the capacity grows to a power of two that depends only on
-the rows in use, and the kernel takes over the map's feedback.
+one observation, replay up to `CHUNK`, and both give the same bits. At the start of a chunk the capacity grows
+to a power of two that depends only on the rows in use, the kernel follows the map where rows of its memory
+are merged or restored, and it takes over the map's feedback.
 """
 
 from __future__ import annotations
@@ -132,12 +132,14 @@ class Session:
 
     def _advance(self, observations: list[Observation]) -> list[Step]:
         if self.steps % CHUNK == 0:
-            if (merged := self.map.merge()) is not None:
-                self.state = self.backend.merge_rows(self.state, merged)
+            merged = self.map.merge()
+            rows = self.backend.rows(self.state) if merged is None else merged.rows
             # Each step adds at most one row.
-            capacity = capacity_at(self.backend.rows(self.state) + CHUNK - 1, self.reserve)
+            capacity = capacity_at(rows + CHUNK - 1, self.reserve)
             if capacity > self._capacity:
                 self.state, self._capacity = self.backend.grow(self.state, capacity), capacity
+            if merged is not None:
+                self.state = self.backend.merge_rows(self.state, merged)
             self.state = self.backend.apply_map_feedback(self.state, self.map.feedback())
         count = len(observations)
         self._layout = self._layout or layout_of(observations[0])

@@ -51,6 +51,11 @@ class MergedRows(NamedTuple):
     onto: np.ndarray
     offset: np.ndarray
 
+    @property
+    def rows(self) -> int:
+        """Number of rows thereafter."""
+        return len(self.source)
+
 
 class Modes(NamedTuple):
     """A posterior over keyframes, see `Memory`."""
@@ -176,7 +181,7 @@ def merge_rows(memory: Memory, merged: MergedRows) -> Memory:
     Raises:
         ValueError: there are more rows than the memory holds.
     """
-    source, count = merged.source, len(merged.source)
+    source, count = merged.source, merged.rows
     if count > memory.label.shape[0]:
         raise ValueError(f"{count} keyframes do not fit into a memory of {memory.label.shape[0]}")
 

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ratslam.core.session import Session
+from ratslam.core.session import CHUNK, Session, capacity_at
 from tactile.base.types import Odometry, observation
-from tests.ratslam.backends.dead_reckoning import DeadReckoning
+from tests.ratslam.backends.dead_reckoning import DeadReckoning, PathMap
 
 
 def test_float64_without_64_bit_types_is_refused():
@@ -37,3 +39,60 @@ def test_a_restarted_session_repeats_itself_without_compiling_again():
     assert len(session.map.trajectory()) == 0
     assert np.array_equal(first, [step.pose for step in session.replay(walk)])
     assert session.compilations() == 1
+
+
+class Restored(NamedTuple):
+    """Rows of a memory after a merge."""
+
+    rows: int
+
+
+class Table(DeadReckoning):
+    """A memory of rows, one more at each step, to which its map restores merged ones."""
+
+    def __init__(self, restored):
+        self.restored, self.used, self.merged = restored, 0, []
+
+    def init(self, key, capacity):
+        return jnp.zeros(capacity)
+
+    def rows(self, state):
+        return self.used
+
+    def grow(self, state, capacity):
+        return jnp.zeros(capacity)
+
+    def merge_rows(self, state, merged):
+        self.merged.append((merged.rows, len(state)))
+        self.used = merged.rows
+        return state
+
+    def kernel(self, state, observation):
+        _, *results = super().kernel(jnp.zeros(3), observation)
+        return state, *results
+
+    def new_map(self):
+        return RestoringMap(self.restored)
+
+
+class RestoringMap(PathMap):
+    """Merges once, before the second chunk."""
+
+    def __init__(self, rows):
+        super().__init__()
+        self.rows = rows
+
+    def merge(self):
+        return Restored(self.rows) if len(self.path) == CHUNK + 1 else None
+
+
+@pytest.mark.parametrize("rows", [3, 241, 242, 1000])
+def test_the_memory_grows_before_merged_rows_are_restored(rows):
+    backend = Table(rows)
+    session = Session(backend)
+    for _ in session.replay([observation(Odometry(0.1, 0.0, 0.0, 0.1)) for _ in range(3 * CHUNK)]):
+        pass
+    capacity = capacity_at(rows + CHUNK - 1)
+    assert backend.merged == [(rows, capacity)]
+    assert session.state.shape == (capacity,)
+    assert int(session.arrays()["capacity"]) == capacity
