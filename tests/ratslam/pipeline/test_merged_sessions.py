@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -47,18 +47,26 @@ def same(one: list[np.ndarray], other: list[np.ndarray]) -> bool:
     return all(equal)
 
 
+class Replay(NamedTuple):
+    """A replayed session: all of its bits, and its trajectory."""
+
+    bits: list[np.ndarray]
+    path: np.ndarray
+
+
 @cache
-def replayed(seed: int, first: int) -> tuple[list[np.ndarray], list[Step]]:
+def replayed(seed: int, first: int) -> Replay:
+    del first  # its settings are in force
     session = empty_merging_session(1)
     steps = list(session.replay(walk_of(seed).readings))
-    return bits(session, steps), steps
+    return Replay(bits(session, steps), session.map.map_trajectory())
 
 
 def test_live_gives_the_bits_of_the_replay(first: int) -> None:
     session = empty_merging_session(1)
     steps = [session.step(reading) for reading in walk_of(0).readings]
     assert len(session.map.feedback().poses) < 0.7 * len(session.map.keyframe_steps())
-    assert same(bits(session, steps), replayed(0, first)[0])
+    assert same(bits(session, steps), replayed(0, first).bits)
     assert session.compilations() == 1
 
 
@@ -72,7 +80,7 @@ def test_a_checkpoint_continues_to_the_same_bits(at: int, first: int) -> None:
     restored = empty_merging_session(1)
     restored.restore(arrays)
     after = list(restored.replay(walk.readings[at:]))
-    assert same(bits(restored, before + after), replayed(0, first)[0])
+    assert same(bits(restored, before + after), replayed(0, first).bits)
     assert restored.compilations() == 1
 
 
@@ -123,9 +131,7 @@ def unmerged_error(seed: int) -> float:
 
 @pytest.mark.parametrize("seed", [0, 2])
 def test_the_trajectory_is_as_good_as_without_merges(seed: int, first: int) -> None:
-    walk, session = walk_of(seed), empty_merging_session(1)
-    list(session.replay(walk.readings))
-    path = session.map.map_trajectory()
+    walk, path = walk_of(seed), replayed(seed, first).path
     assert len(path) == len(walk.readings)
     assert metric(path, walk.truth) < 1.3 * unmerged_error(seed) + 0.01
     assert metric(path, walk.truth) < 0.2 * metric(dead_reckoning(walk.readings), walk.truth)
