@@ -37,6 +37,7 @@ from ratslam.recall.observation_model import (
     view_likelihood,
 )
 from ratslam.recall.whisker_likelihood import live_pixels, pixel_layout, pixel_levels
+from tactile.base.errors import InputError
 from tactile.base.types import Array, Observation
 
 HEALTH_RATE = 0.1
@@ -107,6 +108,9 @@ class RecallBackend(Backend):
         self.labels, self.view_shape = labels, view_shape
         self.size = 0 if labels else int(np.prod(view_shape))
         self.pixels = pixel_layout(view_shape) if self.recall.sector_fov == "whiskers" else None
+        if self.pixels is None and config.keyframes.merge_stood:
+            found = f"{config.keyframes.merge_stood} without whiskers"
+            raise InputError("keyframes.merge_stood", found, "0: only on touch keyframes are merged")
         self.dtype = np.dtype(dtype)
         self.cell = config.pose_cells.cell_size
         self.window_levels = window_levels(config.pose_cells, self.dtype)

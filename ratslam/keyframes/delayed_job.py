@@ -26,37 +26,37 @@ class DelayedJob(Checkpointed, Generic[Result]):
     def __init__(self, thread: Executor, blank: Callable[[], Result]) -> None:
         self._thread, self._blank = thread, blank
         self._due = -1  # the keyframe at which the result is taken up
-        self._result: Future[Result] | None = None
+        self.result: Future[Result] | None = None
 
     @property
     def busy(self) -> bool:
         """Whether a job was begun and its result not taken up."""
-        return self._result is not None
+        return self.result is not None
 
     def begin(self, due: int, work: Callable[[], Result]) -> None:
         """Begins a job whose result is taken up at keyframe `due`."""
-        self._due, self._result = due, self._thread.submit(work)
+        self._due, self.result = due, self._thread.submit(work)
 
     def take(self, now: int) -> Result | None:
         """The result if it is due at keyframe `now`, once."""
-        if self._result is None or now < self._due:
+        if self.result is None or now < self._due:
             return None
-        result, self._result, self._due = self._result.result(), None, -1
+        result, self.result, self._due = self.result.result(), None, -1
         return result
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The state, with the job in progress as its result."""
         arrays = super().arrays()
-        if self._result is not None:
-            arrays |= {f"result/{name}": value for name, value in self._result.result().arrays().items()}
+        if self.result is not None:
+            arrays |= {f"result/{name}": value for name, value in self.result.result().arrays().items()}
         return arrays
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Replaces the whole state by that of `arrays`."""
         super().restore(arrays)
-        self._result = None
+        self.result = None
         if self._due >= 0:
             result = self._blank()
             result.restore(with_prefix(arrays, "result/"))
-            self._result = Future()
-            self._result.set_result(result)
+            self.result = Future()
+            self.result.set_result(result)

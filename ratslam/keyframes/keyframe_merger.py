@@ -16,25 +16,30 @@ from ratslam.recall.memory import MergedRows
 
 
 class KeyframeMerger(Checkpointed):
-    """Merges keyframes after each closure selection; `archive` keeps them."""
+    """Merges keyframes after each closure selection; `archive` keeps them.
 
-    VALUES = ("_is_due",)
-    PARTS = ("_archive_selection",)
+    Attributes:
+        archive_selection: on the unmerged keyframes. merge_due: a selection has changed the map since the
+            last merge.
+    """
+
+    VALUES = ("merge_due",)
+    PARTS = ("archive_selection",)
 
     def __init__(self, archive: Archive) -> None:
         self._archive = archive
-        self._archive_selection = ArchiveSelection()
-        self._is_due = False
+        self.archive_selection = ArchiveSelection()
+        self.merge_due = False
 
     def note_selection(self, graph: KeyframeGraph) -> None:
         """Takes note that a selection has changed the map; a merge is due."""
-        self._is_due = graph.config.merge_stood > 0
+        self.merge_due = graph.config.merge_stood > 0
 
     def select(self, graph: KeyframeGraph, log: ClosureLog) -> None:
         """Begins a selection on the unmerged keyframes if it is due."""
         if self._archive.begun and is_due(graph.ever):
             self._archive.follow(MapSolution(graph.fit(), log, graph.cut), graph)
-            self._archive_selection.begin(self._archive)
+            self.archive_selection.begin(self._archive)
 
     def merge(
         self, graph: KeyframeGraph, log: ClosureLog, selection: SelectionWorker, experiences: Experiences
@@ -43,12 +48,12 @@ class KeyframeMerger(Checkpointed):
         unmerged keyframes, merged anew; returns what the kernel needs to follow."""
         if selection.busy:
             return None
-        unmerged = self._archive_selection.take(graph.ever)
+        unmerged = self.archive_selection.take(graph.ever)
         if unmerged is not None:
             return self._replace(unmerged, graph, log, selection, experiences)
-        if not self._is_due or self._archive_selection.busy:
+        if not self.merge_due or self.archive_selection.busy:
             return None
-        self._is_due = False
+        self.merge_due = False
         merge = find_merge(graph, log)
         if merge is None:
             return None

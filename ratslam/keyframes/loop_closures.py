@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ratslam.core.backend import Evidence
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.growable_array import GrowableArray
 from ratslam.keyframes.optimizer import LoopClosures
@@ -46,6 +47,12 @@ class Candidate(NamedTuple):
     shift: int
     posterior: float
     log_ratio: float
+
+
+def recalled_candidate(keyframe: int, evidence: Evidence) -> Candidate:
+    """The candidate that recall proposes for a keyframe."""
+    found = int(evidence.match), int(evidence.shift), float(evidence.posterior), float(evidence.log_ratio)
+    return Candidate(keyframe, *found)
 
 
 class ClosureLog(Checkpointed):

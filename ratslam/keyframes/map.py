@@ -28,18 +28,17 @@ from ratslam.keyframes.experiences import Experiences
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.keyframe_merger import KeyframeMerger
 from ratslam.keyframes.live_filter import LiveFilter
-from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict, write_closures
+from ratslam.keyframes.loop_closures import ClosureLog, Verdict, recalled_candidate, write_closures
 from ratslam.keyframes.map_health import DOUBTED, worse_than_odometry
 from ratslam.keyframes.map_solution import MapSolution, selected_solution, solution_pieces, solved_map
 from ratslam.keyframes.optimizer import MapFit
 from ratslam.keyframes.selection_worker import SelectionWorker
 from ratslam.keyframes.step_record import StepRecord
 from ratslam.keyframes.travel import HALT
-from ratslam.keyframes.verification import continues_sequence
+from ratslam.keyframes.verification import continues_sequence, has_same_heading
 from ratslam.pose_graph import Edges
 from ratslam.pose_graph.io import write_g2o, write_json
 from ratslam.recall.memory import MapFeedback, MergedRows
-from tactile.base.se2 import wrap
 from tactile.base.types import Observation
 
 if TYPE_CHECKING:
@@ -56,12 +55,15 @@ class KeyframeMap(Checkpointed, Map):
         cell: size of a pose cell, m. appearance: of the keyframes, empty. guard: number of newest keyframes,
             never recalled. closures: False for a map of odometry alone. ablation: parts turned off by a
             study. acceptance: makes the rule for closure sequences.
+
+    Attributes:
+        log: of the keyframes that are not merged. archive, appearance: of all. merger, selection: at work.
     """
 
     VALUES = ("_travel", "_since", "_turned", "_solved", "_doubt")
     PARTS = (
-        "_graph", "_log", "_steps", "_archive", "_merger", "_experiences", "_appearance", "_acceptance",
-        "_live", "_selection",
+        "_graph", "log", "_steps", "archive", "merger", "_experiences", "appearance", "_acceptance",
+        "_live", "selection",
     )  # fmt: skip
 
     def __init__(
@@ -76,13 +78,13 @@ class KeyframeMap(Checkpointed, Map):
         ablation: Ablation = FULL,
     ) -> None:
         self.config, self.cell, self.closes_loops = config, cell, closures
-        self._appearance = appearance
+        self.appearance = appearance
         self._graph = KeyframeGraph(config, cell, appearance, guard, ablation)
-        self._log = ClosureLog()
-        self._archive = Archive(KeyframeGraph(config, cell, appearance, guard, ablation))
-        self._merger = KeyframeMerger(self._archive)
+        self.log = ClosureLog()
+        self.archive = Archive(KeyframeGraph(config, cell, appearance, guard, ablation))
+        self.merger = KeyframeMerger(self.archive)
         self._live = LiveFilter()
-        self._selection = SelectionWorker(config.select_every)
+        self.selection = SelectionWorker(config.select_every)
         self._acceptance = acceptance(self._graph)
         self._experiences = Experiences(config.place_radius * cell, config.place_heading)
         self._steps = StepRecord()
@@ -98,14 +100,14 @@ class KeyframeMap(Checkpointed, Map):
 
     def feedback(self) -> MapFeedback:
         """The poses, heading bias and view metric for the recall filter."""
-        graph, metric = self._graph, self._appearance.metric()
+        graph, metric = self._graph, self.appearance.metric()
         return MapFeedback(graph.pose.rows, graph.bias, graph.turn_error, self._since, *metric)
 
     def pose(self, estimate: Estimate) -> np.ndarray:
         """[3] the newest keyframe's pose and the motion since; by odometry until a closure is accepted, as
         a bias that only views show may be wrong."""
         del estimate
-        confirmed = (self._log.verdicts() == Verdict.ACCEPTED).any()
+        confirmed = (self.log.verdicts() == Verdict.ACCEPTED).any()
         after = self._graph.pose_after if confirmed else self._graph.reckoned_after
         return after(self._travel.motion, self._travel.length)
 
@@ -128,7 +130,7 @@ class KeyframeMap(Checkpointed, Map):
     def online_trajectory(self) -> np.ndarray:
         """[T, 3] every step in the online map, before the final optimisation."""
         fit = self._graph.fit()
-        return self._steps.poses(fit._replace(poses=self._archive.poses(fit.poses)))
+        return self._steps.poses(fit._replace(poses=self.archive.poses(fit.poses)))
 
     def closures(self) -> np.ndarray:
         """[M, 2] steps of the keyframes joined by accepted loop closures."""
@@ -147,12 +149,12 @@ class KeyframeMap(Checkpointed, Map):
         """[3, 3] covariance of the newest keyframe's pose in the frame of the first one (m, m, rad)."""
         if self._graph.count < 2:
             return np.zeros((3, 3))
-        return self._graph.map_covariance(self._log).relative(0, self._graph.count - 1, 0.0)
+        return self._graph.map_covariance(self.log).relative(0, self._graph.count - 1, 0.0)
 
     def solution(self) -> MapSolution:
         """The final map of all keyframes, as it would be if the session ended now."""
         if self._solution is None:
-            kept, archive = self._kept_solution(), self._archive
+            kept, archive = self._kept_solution(), self.archive
             self._solution = archive.solve(kept, self._graph) if archive.begun else kept
         return self._solution
 
@@ -178,7 +180,11 @@ class KeyframeMap(Checkpointed, Map):
 
     def keyframes(self) -> KeyframeGraph:
         """All keyframes, merged ones included, with their views; poses are those of the last solution."""
-        return self._archive.graph if self._archive.begun else self._graph
+        return self.archive.graph if self.archive.begun else self._graph
+
+    def kept_keyframes(self) -> KeyframeGraph:
+        """The keyframes that are not merged, with the present map."""
+        return self._graph
 
     def keyframe_steps(self) -> np.ndarray:
         """[N] the step at which each keyframe was taken."""
@@ -188,7 +194,7 @@ class KeyframeMap(Checkpointed, Map):
 
     def merge(self) -> MergedRows | None:
         """Merges keyframes of known ground (`ratslam.keyframes.merging`)."""
-        merged = self._merger.merge(self._graph, self._log, self._selection, self._experiences)
+        merged = self.merger.merge(self._graph, self.log, self.selection, self._experiences)
         if merged is not None:
             self._forget_solution()
         return merged
@@ -217,13 +223,13 @@ class KeyframeMap(Checkpointed, Map):
             ValueError: no such sequence is accepted, its keyframes are merged, or it joins broken parts.
         """
         solution = self.solution()
-        if not 0 <= sequence < self._log.sequences or solution.log.verdict(sequence) != Verdict.ACCEPTED:
+        if not 0 <= sequence < self.log.sequences or solution.log.verdict(sequence) != Verdict.ACCEPTED:
             raise ValueError(f"sequence {sequence} is not an accepted closure sequence of this map")
-        if self._log.has_merged(sequence):
+        if self.log.has_merged(sequence):
             raise ValueError(f"keyframes of sequence {sequence} are merged with those that it joins them to")
         if np.any(solution.cut.rows == sequence):
             raise ValueError(f"sequence {sequence} is the only link across a break of the odometry")
-        self._log.judge(sequence, Verdict.UNDONE)
+        self.log.judge(sequence, Verdict.UNDONE)
         self._optimise()
 
     def _kept_solution(self) -> MapSolution:
@@ -234,10 +240,10 @@ class KeyframeMap(Checkpointed, Map):
 
     def _solve_finally(self) -> MapSolution:
         if not self.closes_loops:
-            return solved_map(self._graph, self._log)
-        graph, log, selected = self._graph, self._log, None
+            return solved_map(self._graph, self.log)
+        graph, log, selected = self._graph, self.log, None
         if self.config.select_every:
-            selected = selected_solution(graph, log, deepcopy(self._selection.hypotheses))
+            selected = selected_solution(graph, log, deepcopy(self.selection.hypotheses))
         return selected or self._acceptance.solution(graph, log)
 
     def _write_calibration(self, path: Path) -> None:
@@ -247,67 +253,53 @@ class KeyframeMap(Checkpointed, Map):
     def _append(self, observation: Observation) -> None:
         motion, length, turn = self._travel
         self._graph.append(self._graph.pose_after(motion, length), motion, length, turn)
-        self._archive.append(self._graph)
+        self.archive.append(self._graph)
         self._live.advance(self._graph)
         self._since += length
         self._turned += turn
         self._travel = HALT
-        self._appearance.append(observation, motion[2], length)
+        self.appearance.append(observation, motion[2], length)
 
     def _learn(self, evidence: Evidence) -> None:
         """Updates the view metric, and the prior of the heading bias from ordered views."""
-        shown = self._appearance.learn(evidence, self._confirmed_pairs)
+        shown = self.appearance.learn(evidence, self._confirmed_pairs)
         if self.closes_loops and np.isfinite(shown.error) and self.config.bias_from_views:
             prior = calibration_from_views(self.config, self.cell, self._graph.start, shown)
-            self._acceptance.learn_bias(self._graph, self._log, prior)
+            self._acceptance.learn_bias(self._graph, self.log, prior)
 
     def _confirmed_pairs(self) -> ConfirmedPairs:
         """Closures with a high posterior that the map has accepted."""
-        pairs = np.concatenate([self._archive.pairs.rows, confirmed_pairs(self._graph, self._log)])
+        pairs = np.concatenate([self.archive.pairs.rows, confirmed_pairs(self._graph, self.log)])
         return ConfirmedPairs(pairs[:, 0], pairs[:, 1], pairs[:, 2] > 0)
 
     def _consider(self, evidence: Evidence) -> int:
         """Logs and judges a candidate; returns the keyframe that it confirms as the present place, or -1."""
         if int(evidence.match) < 0 or float(evidence.posterior) <= self.config.candidate_posterior:
             return -1
-        candidate = Candidate(
-            self._graph.count - 1,
-            int(evidence.match),
-            int(evidence.shift),
-            float(evidence.posterior),
-            float(evidence.log_ratio),
-        )
-        follows = continues_sequence(self._graph, self._log, candidate)
-        sequence = self._log.add(candidate, follows)
-        self._archive.add(candidate, follows, self._graph)
+        candidate = recalled_candidate(self._graph.count - 1, evidence)
+        follows = continues_sequence(self._graph, self.log, candidate)
+        sequence = self.log.add(candidate, follows)
+        self.archive.add(candidate, follows, self._graph)
         judge = self._acceptance.judge
-        changed = self.closes_loops and judge(self._graph, self._log, sequence, candidate)
-        if self._log.verdict(sequence) == Verdict.ACCEPTED:
-            weight = self._log.sequence_weights()[sequence]
+        changed = self.closes_loops and judge(self._graph, self.log, sequence, candidate)
+        if self.log.verdict(sequence) == Verdict.ACCEPTED:
+            weight = self.log.sequence_weights()[sequence]
             self._graph.pose.rows[-1] = self._live.correct(self._graph, candidate, weight)
         if changed or self._is_solution_due(sequence):
             self._solved = sequence, self._graph.ever
             self._optimise()
-            if changed and self._acceptance.review(self._graph, self._log):
+            if changed and self._acceptance.review(self._graph, self.log):
                 self._optimise()
-        if self._log.verdict(sequence) != Verdict.ACCEPTED:
+        if self.log.verdict(sequence) != Verdict.ACCEPTED:
             return -1
         self._since = self._turned = 0.0
-        return candidate.match if self._has_same_heading(candidate) else -1
+        return candidate.match if has_same_heading(self._graph, candidate) else -1
 
     def _is_solution_due(self, sequence: int) -> bool:
         """Whether the map is optimised for one more member of an accepted sequence."""
-        if self._log.verdict(sequence) != Verdict.ACCEPTED:
+        if self.log.verdict(sequence) != Verdict.ACCEPTED:
             return False
         return sequence != self._solved[0] or self._graph.ever - self._solved[1] >= self.config.solve_every
-
-    def _has_same_heading(self, candidate: Candidate) -> bool:
-        """Whether the headings agree by odometry: a robot that has turned is in another experience, even if
-        its view changes little with heading."""
-        pose, turn = self._graph.pose.rows, -candidate.shift * self._graph.sector_angle
-        turned = wrap(pose[candidate.keyframe, 2] - pose[candidate.match, 2])
-        drift = abs(wrap(turned - turn))
-        return bool(np.cos(turn) > 0 and drift < self.config.agreement_heading * self.config.max_turn)
 
     def _is_pose_reliable(self) -> bool:
         """Whether the drift since the last closure is small enough to find a known experience by pose."""
@@ -318,17 +310,17 @@ class KeyframeMap(Checkpointed, Map):
         """Takes over the map with the closures selected meanwhile, and begins the next selection."""
         if not self.closes_loops:
             return
-        if self._selection.finish(self._graph, self._log):
-            self._merger.note_selection(self._graph)
+        if self.selection.finish(self._graph, self.log):
+            self.merger.note_selection(self._graph)
             self._forget_solution()
-        self._selection.begin(self._graph, self._log)
-        self._merger.select(self._graph, self._log)
+        self.selection.begin(self._graph, self.log)
+        self.merger.select(self._graph, self.log)
 
     def _judge(self) -> None:
         """Every `DOUBT_EVERY` keyframes, judges the present map."""
         graph = self._graph
         if self.closes_loops and graph.ever % DOUBT_EVERY == 0:
-            present = MapSolution(graph.fit(), self._log, graph.cut)
+            present = MapSolution(graph.fit(), self.log, graph.cut)
             self._doubt = worse_than_odometry(graph, present)
 
     def _best(self) -> MapFit:
@@ -341,7 +333,7 @@ class KeyframeMap(Checkpointed, Map):
         self._solution = self._kept = self._worse = None
 
     def _optimise(self) -> None:
-        self._graph.optimise(self._log)
+        self._graph.optimise(self.log)
         self._forget_solution()
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:

@@ -32,12 +32,16 @@ ALIKE = 3.0
 
 
 class MapHypotheses(Checkpointed):
-    """The maps kept, cheapest first."""
+    """The maps kept, cheapest first.
 
-    VALUES = ("_poses", "_calibration", "_followed")
+    Attributes:
+        poses: [K, N, 3] of K maps.
+    """
+
+    VALUES = ("poses", "_calibration", "_followed")
 
     def __init__(self) -> None:
-        self._poses = np.zeros((1, 1, 3))  # [K, N, 3]
+        self.poses = np.zeros((1, 1, 3))
         self._calibration = np.zeros((1, 2))  # [K, 2] heading bias and turn error
         self._followed = np.zeros(0, np.int64)  # sequences
 
@@ -54,28 +58,28 @@ class MapHypotheses(Checkpointed):
             fits = _branch(fits, case, known, k)
             known[k] = True
         self._followed = sequences.astype(np.int64)
-        self._poses = np.stack([fit.poses for fit in fits])
+        self.poses = np.stack([fit.poses for fit in fits])
         self._calibration = np.array([[fit.bias, fit.turn_error] for fit in fits])
         return fits
 
     def merge(self, merge: Merge) -> None:
         """Follows a merge of keyframes; later ones than the maps have are kept."""
-        self._poses = self._poses[:, merge.kept[merge.kept < self._poses.shape[1]]]
+        self.poses = self.poses[:, merge.kept[merge.kept < self.poses.shape[1]]]
 
     def _fits(self, count: int) -> list[MapFit]:
         weights = np.ones(count)
         return [
             MapFit(poses, bias, weights, turn_error)
-            for poses, (bias, turn_error) in zip(self._poses, self._calibration.tolist(), strict=True)
+            for poses, (bias, turn_error) in zip(self.poses, self._calibration.tolist(), strict=True)
         ]
 
     def _extend(self, problem: MapProblem) -> None:
         """Continues all maps by odometry; the first one starts with the means of the calibration."""
-        since = self._poses.shape[1] - 1
+        since = self.poses.shape[1] - 1
         if not since:
             self._calibration = np.array([[problem.prior.bias, problem.prior.turn_error]])
         onwards = [integrate(fit.corrected(problem.chain)[since:], fit.poses[-1]) for fit in self._fits(0)]
-        self._poses = np.concatenate([self._poses, np.stack(onwards)], axis=1)
+        self.poses = np.concatenate([self.poses, np.stack(onwards)], axis=1)
 
 
 def _branch(fits: list[MapFit], case: SelectionProblem, known: np.ndarray, new: int) -> list[MapFit]:

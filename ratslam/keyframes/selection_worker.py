@@ -86,28 +86,28 @@ class SelectionWorker(Checkpointed):
         every: number of keyframes between two selections, 0: never.
     """
 
-    PARTS = ("hypotheses", "_job")
+    PARTS = ("hypotheses", "job")
 
     def __init__(self, every: int) -> None:
         self._every = every
-        self._job = DelayedJob(THREAD, lambda: SelectedMap(ClosureLog(), MapHypotheses()))
+        self.job = DelayedJob(THREAD, lambda: SelectedMap(ClosureLog(), MapHypotheses()))
         self.hypotheses = MapHypotheses()
 
     @property
     def busy(self) -> bool:
         """Whether a selection is in progress."""
-        return self._job.busy
+        return self.job.busy
 
     def begin(self, graph: KeyframeGraph, log: ClosureLog) -> None:
         """Begins a selection if it is due."""
         if self._every and graph.ever % self._every == 0:
             selected = SelectedMap(log.copy(), deepcopy(self.hypotheses))
             due = graph.ever + min(DELAY, self._every)
-            self._job.begin(due, partial(selected.select, graph.copy()))
+            self.job.begin(due, partial(selected.select, graph.copy()))
 
     def finish(self, graph: KeyframeGraph, log: ClosureLog) -> bool:
         """Takes up a selection if it is due; whether it changed the map."""
-        selected = self._job.take(graph.ever)
+        selected = self.job.take(graph.ever)
         if selected is None:
             return False
         self.hypotheses = selected.hypotheses

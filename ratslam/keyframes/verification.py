@@ -80,6 +80,15 @@ def verify_sequence(
     return SequenceTest(fits, distance, not fits and broken and distance >= config.max_distance)
 
 
+def has_same_heading(graph: KeyframeGraph, candidate: Candidate) -> bool:
+    """Whether the headings of a closure agree by odometry: a robot that has turned is in another experience,
+    even if its view changes little with heading."""
+    pose, turn = graph.pose.rows, -candidate.shift * graph.sector_angle
+    turned = wrap(pose[candidate.keyframe, 2] - pose[candidate.match, 2])
+    drift = abs(wrap(turned - turn))
+    return bool(np.cos(turn) > 0 and drift < graph.config.agreement_heading * graph.config.max_turn)
+
+
 def judge_by_map(graph: KeyframeGraph, covariance: MapCovariance, member: np.ndarray) -> MapClaim:
     """How the map judges the place of a closure (keyframe, match, shift)."""
     j, i, shift = (int(value) for value in member[:3])

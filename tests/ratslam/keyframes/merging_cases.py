@@ -97,7 +97,7 @@ class Drive:
 
     def merged_apart(self):
         """[T] true distances of keyframes from those that they are or are merged with, m."""
-        onto = self.rows[self.map._archive.row.rows]
+        onto = self.rows[self.map.archive.row.rows]
         return self._apart(onto)
 
     def experience_apart(self):

@@ -34,7 +34,7 @@ def driven(laps=5, merge_stood=MERGED["merge_stood"]):
 
 
 def merged_sequences(drive):
-    log = drive.map._log
+    log = drive.map.log
     return [k for k in range(log.sequences) if log.has_merged(k)]
 
 
@@ -53,7 +53,7 @@ def test_the_number_of_keyframes_follows_the_ground():
 
 def test_rows_are_the_keyframes_of_the_map():
     drive = driven()
-    assert np.array_equal(drive.rows, drive.map._graph.taken.rows)
+    assert np.array_equal(drive.rows, drive.map.kept_keyframes().taken.rows)
     assert drive.merged_apart().max() < 1.5 * CELL
 
 
@@ -124,7 +124,7 @@ def test_a_merged_sequence_cannot_be_undone():
 
 def test_a_sequence_that_is_not_merged_can_be_undone():
     drive = driven().restored()
-    last = drive.map._log.sequences - 2
+    last = drive.map.log.sequences - 2
     assert last not in merged_sequences(drive)
     drive.map.undo(last)
     candidates = drive.map.candidates()
@@ -164,11 +164,11 @@ def test_the_stops_are_what_they_are_named(early):
     found, whole = stopped()
     merged = {name: len(drive.rows) < STOPS[name] for name, drive in found.items()}
     assert merged == {name: name != "before any merge" for name in STOPS}
-    selecting = {name for name, drive in found.items() if drive.map._merger._archive_selection.busy}
+    selecting = {name for name, drive in found.items() if drive.map.merger.archive_selection.busy}
     assert selecting == {"selecting", "due"}
-    assert not whole.map._merger._archive_selection.busy
-    assert found["merge due"].map._merger._is_due
-    assert not found["between merges"].map._merger._is_due
+    assert not whole.map.merger.archive_selection.busy
+    assert found["merge due"].map.merger.merge_due
+    assert not found["between merges"].map.merger.merge_due
 
 
 @pytest.mark.parametrize("stop", STOPS)
@@ -211,10 +211,10 @@ def test_the_archive_replaces_the_map_once_it_is_selected(monkeypatch, early):
     monkeypatch.setattr(archive_selection.UnmergedMap, "replace", replace)
     drive = Drive(ROUTE, **MERGED).go(4 * LAP)
     assert len(taken) == 1
-    assert len(drive.rows) == drive.map._graph.count
+    assert len(drive.rows) == drive.map.kept_keyframes().count
     assert drive.merged_apart().max() < 1.5 * CELL
     assert drive.experience_apart().max() < drive.map.config.place_radius * CELL
-    offset = drive.map._archive.offset.rows
+    offset = drive.map.archive.offset.rows
     assert not offset[drive.rows].any()
     assert 0 < np.hypot(*offset[:, :2].T).max() <= 2 * NEAR * CELL
     expected = driven(merge_stood=0, laps=4).error()

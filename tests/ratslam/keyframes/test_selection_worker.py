@@ -56,7 +56,7 @@ def test_a_selection_in_progress_keeps_its_views_when_the_map_is_restored(held):
     again = drive(new_map(**SELECTED), SEEN, last=BEGUN - 1)
     hold()
     drive(again, SEEN, first=BEGUN - 1, last=BEGUN)
-    selection = again._selection._job._result
+    selection = again.selection.job.result
     again.restore(new_map(**SELECTED).arrays())
     gate.set()
     for name, value in selection.result(60).arrays().items():

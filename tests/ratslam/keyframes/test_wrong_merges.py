@@ -60,7 +60,7 @@ def test_without_merges_later_laps_refute_it():
 
 def test_merged_ground_stays_wrong_by_itself(monkeypatch):
     drive = driven(NEVER)
-    second = drive.map._archive.row.rows[SOUTH + PLACES]
+    second = drive.map.archive.row.rows[SOUTH + PLACES]
     assert (ROUTE.place[drive.rows[second]] < NORTH + CORRIDOR).all()  # merged with the first corridor
     assert false_closures(drive) > 0
     assert gap(drive.map.online_trajectory()) < CELL
@@ -71,7 +71,7 @@ def test_merged_ground_stays_wrong_by_itself(monkeypatch):
 
 def test_the_selection_on_the_unmerged_keyframes_restores_them(monkeypatch):
     drive = driven(BEGUN)
-    second = drive.map._archive.row.rows[SOUTH + PLACES]
+    second = drive.map.archive.row.rows[SOUTH + PLACES]
     assert (np.abs(ROUTE.place[drive.rows[second]] - SOUTH - PLACES) <= 2).all()
     assert false_closures(drive) == 0
     assert gap(drive.map.online_trajectory()) > 2 * CELL
@@ -82,18 +82,18 @@ def test_the_selection_on_the_unmerged_keyframes_restores_them(monkeypatch):
 def test_the_map_is_right_as_soon_as_it_is_restored(monkeypatch):
     monkeypatch.setattr(archive_selection, "FIRST", BEGUN)
     drive = Drive(ROUTE, **MERGED).go(BEGUN)
-    assert drive.map._merger._archive_selection.busy
-    while drive.map._merger._archive_selection.busy:
-        assert drive.map._log.verdict(0) == Verdict.ACCEPTED
+    assert drive.map.merger.archive_selection.busy
+    while drive.map.merger.archive_selection.busy:
+        assert drive.map.log.verdict(0) == Verdict.ACCEPTED
         assert gap(drive.map.online_trajectory()) < CELL
         rows = len(drive.rows)
         drive.go(drive.steps + 1)
         # Nothing is merged meanwhile.
-        assert len(drive.rows) == rows + 1 or not drive.map._merger._archive_selection.busy
-    assert drive.map._log.verdict(0) == Verdict.OPEN
+        assert len(drive.rows) == rows + 1 or not drive.map.merger.archive_selection.busy
+    assert drive.map.log.verdict(0) == Verdict.OPEN
     assert gap(drive.map.online_trajectory()) > 2 * CELL
     assert len(drive.map.online_trajectory()) == drive.steps
-    for poses in drive.map._selection.hypotheses._poses:
+    for poses in drive.map.selection.hypotheses.poses:
         assert len(poses) <= len(drive.rows)
         assert off(poses, ROUTE.truth[drive.rows[: len(poses)]]).max() < 2 * CELL
 

@@ -100,7 +100,7 @@ def test_the_kernel_has_the_rows_of_the_map(first: int, monkeypatch: pytest.Monk
         ):
             assert np.array_equal(values[:count], expected)
             assert not np.asarray(values[count:]).any()
-        views, _ = session.map._appearance.stored(session.map._graph.taken.rows)
+        views, _ = session.map.appearance.stored(session.map.kept_keyframes().taken.rows)
         assert np.array_equal(np.asarray(memory.view)[:, :count], views.T)
         for modes in (memory, memory.control):
             assert not np.asarray(modes.rest)[:, count:].any()
