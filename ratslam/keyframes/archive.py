@@ -72,7 +72,7 @@ class Archive(Checkpointed):
     def unmerged_log(self, log: ClosureLog) -> ClosureLog:
         """A log of all candidates with the verdicts of the map's."""
         whole = self.log.copy()
-        whole.take_verdicts(log)
+        whole.follow(log)
         return whole
 
     def poses(self, poses: np.ndarray) -> np.ndarray:
@@ -85,7 +85,7 @@ class Archive(Checkpointed):
         self.graph.pose.rows[:] = poses
         self.graph.bias, self.graph.turn_error = solution.fit.bias, solution.fit.turn_error
         self.graph.prior, self.graph.heading_noise = graph.prior, graph.heading_noise
-        self.log.take_verdicts(solution.log)
+        self.log.follow(solution.log)
         cut.replace(np.full(len(poses), -1))
         cut.rows[graph.taken.rows] = solution.cut.rows
         self.graph.cut = cut

@@ -163,8 +163,14 @@ class ClosureLog(Checkpointed):
         self._evidence.replace(evidence[~lost].copy())
         self._lines = None
 
-    def take_verdicts(self, other: ClosureLog) -> None:
-        """Takes over all verdicts of a log of the same sequences."""
+    def take_verdicts(self, other: ClosureLog, sequences: np.ndarray) -> None:
+        """Takes over the verdicts and weights of sequences [n] from a log of the same candidates."""
+        self._verdict.rows[sequences] = other._verdict.rows[sequences]
+        self._weight.rows[sequences] = other._weight.rows[sequences]
+        self._lines = None
+
+    def follow(self, other: ClosureLog) -> None:
+        """Takes over everything known of all sequences from a log of the same ones."""
         for name in ("_verdict", "_distance", "_weight", "_log_odds", "_stood"):
             getattr(self, name).replace(getattr(other, name).rows.copy())
         self._lines = None

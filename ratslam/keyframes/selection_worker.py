@@ -74,9 +74,8 @@ class SelectedMap(Checkpointed):
 
     def judge(self, log: ClosureLog) -> None:
         """Takes over the verdicts on sequences whose verdict has not changed since the selection began."""
-        known = len(self.before)
-        for sequence in np.flatnonzero(log.verdicts()[:known] == self.before).tolist():
-            log.judge(sequence, self.log.verdict(sequence))
+        same = np.flatnonzero(log.verdicts()[: len(self.before)] == self.before)
+        log.take_verdicts(self.log, same)
 
 
 class SelectionWorker(Checkpointed):

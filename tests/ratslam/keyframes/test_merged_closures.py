@@ -143,7 +143,7 @@ def test_verdicts_are_taken_over_whatever_was_merged():
     log.judge(2, Verdict.UNDONE)
     log.count_selection()
     whole.accepted_rows()
-    whole.take_verdicts(log)
+    whole.follow(log)
     table = whole.table()
     assert table[:, 7].tolist() == [Verdict.ACCEPTED, Verdict.ACCEPTED, Verdict.UNDONE]
     assert table[:, 8].tolist() == [0.9, 1.0, 0.0]
