@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from robot.simulation.create.session import CreateSimulationConfig, train_strain_templates
 from robot.sources.source import ClosedSource, Sample, Source
 from robot.sources.source_info import SourceInfo
+from tactile.base.config import Settings
 from tactile.base.errors import InputError
+from tactile.base.plugins import PluginConfig, Registry, read_settings
 from tactile.base.types import Observation
 from tactile.frontend import Frontend, TouchConfig
 from tactile.wall_estimation.report_frontend import ReportFrontend, ReportFrontendConfig
@@ -33,6 +35,22 @@ class ReadingProcessor(Protocol):
     def whiskers(self) -> int: ...
     def observe(self, reading: Any) -> Observation | None:
         """The observation of a reading, or None if its motion is added to the next one."""
+
+
+class TouchEntry(NamedTuple):
+    """A registered touch front end.
+
+    Attributes:
+        config_class: its settings. build: makes a front end from these and the information of the source;
+            called for every pass through the source.
+    """
+
+    config_class: type[Settings]
+    build: Callable[[Any, SourceInfo], ReadingProcessor]
+
+
+TOUCH: Registry[TouchEntry] = Registry("ratslam.touch", "touch front end", TouchEntry, {})
+"""Touch front ends by the name in `touch.frontend.plugin`."""
 
 
 class TouchSource(ClosedSource):
@@ -80,6 +98,8 @@ def open_touch_source(source: Source, config: TouchConfig) -> Source:
             calibration.
     """
     info = source.info
+    if config.frontend is not None:
+        return _with_registered_frontend(source, config.frontend)
     if not info.raw_whiskers:
         return source
     if info.planar_whiskers is not None:
@@ -87,6 +107,13 @@ def open_touch_source(source: Source, config: TouchConfig) -> Source:
         return TouchSource(source, lambda: ReportFrontend(config.reports, templates), "touch.reports.mounts")
     frontend = Frontend(config, info.calibration)
     return TouchSource(source, lambda: frontend, "touch.head")
+
+
+def _with_registered_frontend(source: Source, config: PluginConfig) -> TouchSource:
+    where = "touch.frontend"
+    entry = TOUCH.get(config.plugin, f"{where}.plugin")
+    settings = read_settings(entry.config_class, config.settings, f"{where}.settings")
+    return TouchSource(source, lambda: entry.build(settings, source.info), where)
 
 
 def head_config_of(info: SourceInfo, config: HeadConfig) -> HeadConfig:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
+from tactile.base.plugins import PluginConfig
 from tactile.base.types import Cycle, Observation, Report, Whisk
 from tactile.features.calibration import Calibration
 from tactile.features.contact import ContactConfig, detect_contacts
@@ -23,6 +24,8 @@ class TouchConfig(Settings):
     """Whisker image."""
     reports: ReportFrontendConfig = ReportFrontendConfig()
     """Front end of a Create's reports: contacts and wall directions."""
+    frontend: PluginConfig | None = None
+    """A registered front end (`ratslam.touch`) in place of ours."""
 
 
 class Frontend:

@@ -81,24 +81,6 @@ RUN_METRICS: tuple[Metric, ...] = (
 _EXPERIENCE = [metric.name for metric in RUN_METRICS if metric.section == "Experience Metric"]
 DOUBTED = 0.7
 """Probability of being worse than odometry above which a map is doubted (`ratslam.keyframes.map_health`)."""
-REGISTERED_METRICS: list[Metric] = []
-"""Metrics added by `register_metric`."""
-
-
-def register_metric(metric: Metric) -> None:
-    """Adds a metric to every scorecard of a run; its `compute` is called with a `RunData`.
-
-    Raises:
-        ValueError: the name is taken.
-    """
-    if any(metric.name == other.name for other in run_metrics()):
-        raise ValueError(f"metric {metric.name!r} exists already; choose another name")
-    REGISTERED_METRICS.append(metric)
-
-
-def run_metrics() -> tuple[Metric, ...]:
-    """The metrics of a run: `RUN_METRICS` and the registered ones."""
-    return (*RUN_METRICS, *REGISTERED_METRICS)
 
 
 def run_data(run: RunArrays, exm: ExmConfig, relations: Relations | None, gap: int) -> RunData:

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from evaluation.metrics.energy_metric import Relations
 from evaluation.metrics.experience_log import ExperienceLog
 from evaluation.metrics.experience_metric import DEFAULT_EXM, ExmConfig
-from evaluation.metrics.metric import MISSING_TRUTH, Finding, Quantity
+from evaluation.metrics.metric import MISSING_TRUTH, Finding, Metric, Quantity
 from evaluation.metrics.run_arrays import RunArrays, check_run
-from evaluation.metrics.run_metrics import DOUBTED, experience_findings, path_length, run_data, run_metrics
+from evaluation.metrics.run_metrics import DOUBTED, RUN_METRICS, experience_findings, path_length, run_data
 from tactile.base.config import Settings
+
+REGISTERED = "Registered metrics"
+"""Heading of the metrics that are not ours."""
 
 
 class Scorecard(Settings):
@@ -31,12 +36,13 @@ def score_run(
     exm: ExmConfig = DEFAULT_EXM,
     relations: Relations | None = None,
     gap: int = 10,
+    metrics: Sequence[Metric] = (),
 ) -> Scorecard:
     """Scores one run; a quantity that is undefined (without truth, for example) is None with a reason.
 
     Args:
         relations: true relative motions of the recording, if any.
-        gap: distance of the pairs of `energy_gap`, steps.
+        gap: distance of the pairs of `energy_gap`, steps. metrics: computed besides ours.
 
     Raises:
         InputError: the arrays do not fit each other.
@@ -44,7 +50,7 @@ def score_run(
     check_run(run)
     data = run_data(run, exm, relations, gap)
     quantities = {}
-    for metric in run_metrics():
+    for metric in (*RUN_METRICS, *metrics):
         if relations is not None or not metric.name.startswith("relations_"):
             quantities[metric.name] = metric.quantity(metric.compute(data) or MISSING_TRUTH)
     return Scorecard(name=name, exm=exm, quantities=quantities)
@@ -59,7 +65,7 @@ def score_log(log: ExperienceLog, name: str = "log", *, exm: ExmConfig = DEFAULT
         "experiences": Finding(len(np.unique(log.experience[log.experience != -1]))),
         **experience_findings(log.experience, log.truth, exm),
     }
-    metrics = [metric for metric in run_metrics() if metric.name in findings]
+    metrics = [metric for metric in RUN_METRICS if metric.name in findings]
     quantities = {metric.name: metric.quantity(findings[metric.name]) for metric in metrics}
     return Scorecard(name=name, exm=exm, quantities=quantities)
 
@@ -68,9 +74,10 @@ def render_scorecard(card: Scorecard) -> str:
     """The scorecard as a text table: quantity, value, unit, value of raw odometry, note."""
     width = max(len(quantity.label) for quantity in card.quantities.values()) + 2
     lines = [f"{card.name:<{width + 2}}{'value':>9}  {'unit':<8} {'odometry':>9}"]
-    metrics = [metric for metric in run_metrics() if metric.name in card.quantities]
-    for section in dict.fromkeys(metric.section for metric in metrics):
-        shown = [card.quantities[metric.name] for metric in metrics if metric.section == section]
+    sections = {metric.name: metric.section for metric in RUN_METRICS}
+    found = [(sections.get(name, REGISTERED), quantity) for name, quantity in card.quantities.items()]
+    for section in dict.fromkeys(section for section, _ in found):
+        shown = [quantity for of, quantity in found if of == section]
         lines += ["", section]
         for above, q in zip([None, *shown], shown, strict=False):
             raw = "" if q.odometry is None else _text(q.odometry)

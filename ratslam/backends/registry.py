@@ -23,6 +23,7 @@ from ratslam.core.backend import Backend
 from ratslam.core.types import Scalar
 from ratslam.keyframes.config import FULL, Ablation
 from tactile.base.config import Settings
+from tactile.base.plugins import Registry, read_settings
 from tactile.whiskers.planar_whiskers import PlanarWhiskers
 
 
@@ -41,16 +42,16 @@ class BackendEntry(NamedTuple):
     """A SLAM method.
 
     Attributes:
-        config_class: sections of the configuration it reads.
+        config_class: its settings: for a registered method those of `backend_settings`, for one of ours the
+            sections of the configuration that it reads.
         evidence: NamedTuple type of a step's evidence. outcomes: values of its field `outcome`.
-        build: makes the backend from a `config_class`, the sensors, the dtype of all floating state, and the
-            parts of the keyframe map that are turned off (used by `recall` only).
+        build: makes the backend from a `config_class`, the sensors, and the dtype of all floating state.
     """
 
     config_class: type[Settings]
     evidence: type[Any]
     outcomes: type[IntEnum]
-    build: Callable[[Any, Sensors, np.dtype, Ablation], Backend]
+    build: Callable[[Any, Sensors, np.dtype], Backend]
 
     def columns(self) -> tuple[str, ...]:
         """Fields of the evidence that are annotated `Scalar`: its columns in `steps.csv`."""
@@ -58,40 +59,60 @@ class BackendEntry(NamedTuple):
         return tuple(name for name, hint in hints.items() if hint == Scalar and name != "outcome")
 
 
-BACKENDS: dict[str, BackendEntry] = {
-    "recall": BackendEntry(
-        RecallBackendConfig,
-        RecallEvidence,
-        pose_cells.Outcome,
-        lambda config, sensors, *options: RecallBackend(config, sensors.view_shape, *options),
-    ),
-    "classic": BackendEntry(
-        ClassicBackendConfig,
-        ClassicEvidence,
-        pose_cells.Outcome,
-        lambda config, sensors, dtype, _: ClassicBackend(config, sensors.view_shape, dtype),
-    ),
-    "grid": BackendEntry(
-        GridBackendConfig,
-        GridEvidence,
-        grid.GridOutcome,
-        lambda config, sensors, dtype, _: grid.build(config.grid, sensors.feelers, dtype),
-    ),
-}
+BACKENDS = Registry(
+    "ratslam.backends",
+    "backend",
+    BackendEntry,
+    {
+        "recall": BackendEntry(
+            RecallBackendConfig,
+            RecallEvidence,
+            pose_cells.Outcome,
+            lambda config, sensors, dtype: RecallBackend(config, sensors.view_shape, dtype),
+        ),
+        "classic": BackendEntry(
+            ClassicBackendConfig,
+            ClassicEvidence,
+            pose_cells.Outcome,
+            lambda config, sensors, dtype: ClassicBackend(config, sensors.view_shape, dtype),
+        ),
+        "grid": BackendEntry(
+            GridBackendConfig,
+            GridEvidence,
+            grid.GridOutcome,
+            lambda config, sensors, dtype: grid.build(config.grid, sensors.feelers, dtype),
+        ),
+    },
+)
 """Every method, by its value of `backend` in a configuration."""
 
 
 def build(
     name: str, config: Settings, sensors: Sensors, dtype: Any = np.float64, ablation: Ablation = FULL
 ) -> Backend:
-    """The backend `name` with its sections of `config`.
+    """The backend `name` with its settings.
 
     Args:
-        config: has the fields of the entry's `config_class`, for example a completed `RunConfig`.
-        ablation: parts of the keyframe map to turn off; other methods have none.
+        config: a completed `RunConfig`; or for our methods any settings with the fields of the entry's
+            `config_class`. ablation: parts of the keyframe map to turn off; other methods have none.
 
     Raises:
-        InputError: the method needs whiskers and there are none, or its maps have too many cells.
+        InputError: there is no such method, its settings are wrong, it needs whiskers and there are none, or
+            its maps have too many cells.
     """
-    entry = BACKENDS[name]
-    return entry.build(select_settings(config, entry.config_class), sensors, np.dtype(dtype), ablation)
+    settings, dtype = backend_settings(name, config), np.dtype(dtype)
+    if isinstance(settings, RecallBackendConfig):
+        return RecallBackend(settings, sensors.view_shape, dtype, ablation)
+    return BACKENDS.get(name, "backend").build(settings, sensors, dtype)
+
+
+def backend_settings(name: str, config: Any) -> Settings:
+    """The settings that the backend `name` reads from a configuration.
+
+    Raises:
+        InputError: there is no such method, or its settings are wrong.
+    """
+    entry = BACKENDS.get(name, "backend")
+    if name in BACKENDS.builtin:
+        return select_settings(config, entry.config_class)
+    return read_settings(entry.config_class, config.backend_settings, "backend_settings")

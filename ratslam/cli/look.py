@@ -39,6 +39,10 @@ def add_commands(commands: Commands) -> None:
         help="last step of the base set of the Experience Metric (default: the first return)",
     )  # fmt: skip
     score.add_argument(
+        "--metric", dest="metrics", action="append", metavar="NAME",
+        help="a registered metric to compute too; may be repeated",
+    )  # fmt: skip
+    score.add_argument(
         "--relations", type=Path, metavar="CSV",
         help="true relative poses (t1,t2,x,y,z,roll,pitch,yaw) for the Energy Metric",
     )  # fmt: skip
@@ -71,14 +75,19 @@ def _score(arguments: argparse.Namespace) -> int:
     from evaluation.metrics.energy_metric import read_relations
     from evaluation.metrics.experience_log import read_experience_log
     from evaluation.metrics.experience_metric import ExmConfig
+    from evaluation.metrics.registry import build_metrics
     from evaluation.metrics.scorecard import render_scorecard, score_log, score_run
+    from tactile.base.plugins import PluginConfig
 
     if arguments.base is not None and arguments.base < 0:
         raise InputError("--base", str(arguments.base), "the number of a step, from 0")
     exm = ExmConfig(mode=arguments.mode, base=arguments.base)
     if arguments.log.is_dir():
         relations = read_relations(arguments.relations) if arguments.relations else None
-        card = score_run(read_run(arguments.log), arguments.log.name, exm=exm, relations=relations)
+        metrics = build_metrics([PluginConfig(plugin=name) for name in arguments.metrics or []])
+        card = score_run(
+            read_run(arguments.log), arguments.log.name, exm=exm, relations=relations, metrics=metrics
+        )
     else:
         card = score_log(read_experience_log(arguments.log), arguments.log.stem, exm=exm)
     print(card.model_dump_json(indent=2) if arguments.json else render_scorecard(card))

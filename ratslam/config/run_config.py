@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, NonNegativeInt, ValidationInfo, field_validator
 
 from evaluation.metrics.experience_metric import ExmConfig
 from ratslam.backends.config import ClassicBackendConfig, GridBackendConfig, RecallBackendConfig
+from ratslam.config.plugin_settings import check_plugins, resolved_plugin
 from ratslam.config.presets import PresetName
 from ratslam.config.renamed_keys import RENAMED
 from ratslam.config.strict_yaml import load, validate
@@ -18,7 +19,10 @@ from robot.live.config import LiveConfig
 from robot.recordings.formats import RecordingConfig
 from robot.simulation.create.session import CreateSimulationConfig
 from robot.simulation.head.session import SimulationConfig
+from robot.sources.registry import SOURCES
+from robot.touch_source import TOUCH
 from tactile.base.config import Settings
+from tactile.base.plugins import PluginConfig
 from tactile.frontend import TouchConfig
 
 
@@ -39,12 +43,14 @@ class ScoreConfig(Settings):
 
     experience_metric: ExmConfig = ExmConfig()
     """Settings of the Experience Metric."""
+    metrics: tuple[PluginConfig, ...] = ()
+    """Registered metrics (`ratslam.metrics`) to compute besides ours."""
     relations: Path | None = None
     """File of true relative poses (t1,t2,x,y,z,roll,pitch,yaw) for the Energy Metric; null: without it."""
 
 
 class SourceConfig(Settings):
-    """The source of a run, exactly one of four, and the processing of whisker readings to views."""
+    """The source of a run, exactly one of five, and the processing of whisker readings to views."""
 
     recording: RecordingConfig | None = None
     """A recording."""
@@ -52,6 +58,8 @@ class SourceConfig(Settings):
     """Or a simulated arm with a whisker head in a maze."""
     create_simulation: CreateSimulationConfig | None = None
     """Or a simulated Create with whiskers in an arena."""
+    source: PluginConfig | None = None
+    """Or a registered source (`ratslam.sources`)."""
     live: Annotated[LiveConfig | None, Field(validate_default=True)] = None
     """Or a robot arm with a whisker head, for `python -m ratslam live`."""
     touch: TouchConfig = TouchConfig()
@@ -60,14 +68,12 @@ class SourceConfig(Settings):
     @field_validator("live", mode="after")
     @classmethod
     def _one_source(cls, live: LiveConfig | None, info: ValidationInfo) -> LiveConfig | None:
-        names = ("recording", "simulation", "create_simulation")
+        names = ("recording", "simulation", "create_simulation", "source")
         sources = {name: info.data.get(name) for name in names} | {"live": live}
         given = [name for name, source in sources.items() if source is not None]
         if all(name in info.data for name in names) and len(given) != 1:
-            there = (
-                " and ".join(given) if given else "neither recording, simulation, create_simulation nor live"
-            )
-            raise ValueError(f"{there}; give one of these four, and null for the others")
+            there = " and ".join(given) if given else f"neither {', '.join(names)} nor live"
+            raise ValueError(f"{there}; give one of these five, and null for the others")
         return live
 
 
@@ -75,9 +81,11 @@ class RunConfig(RecallBackendConfig, ClassicBackendConfig, GridBackendConfig, So
     """A run: `python -m ratslam run config.yaml`. `ratslam.backends.config` has the methods' sections."""
 
     renamed_keys = RENAMED
-    backend: Literal["recall", "classic", "grid"] = "recall"
-    """The method: RatSLAM with Bayesian recall and a keyframe map, RatSLAM as published, or a grid particle
-    filter."""
+    backend: Annotated[str, Field(json_schema_extra={"examples": ["recall", "classic", "grid"]})] = "recall"
+    """The method: `recall` is RatSLAM with Bayesian recall and a keyframe map, `classic` RatSLAM as
+    published, `grid` a grid particle filter; or a registered one (`ratslam.backends`)."""
+    backend_settings: dict[str, Any] = Field(default_factory=dict)
+    """Settings of a registered method."""
     presets: tuple[PresetName, ...] | None = None
     """Presets for the settings that are left open (`ratslam.config.presets`), the first before the others;
     null: those that suit the source. The file in the run directory names those that were used."""
@@ -94,7 +102,11 @@ class RunConfig(RecallBackendConfig, ClassicBackendConfig, GridBackendConfig, So
             for name in ("recording", "simulation", "create_simulation", "live")
             for part in [getattr(self, name)]
         }
-        parts["touch"] = self.touch.model_copy(update={"reports": self.touch.reports.resolved(folder)})
+        parts["source"] = self.source and resolved_plugin(self.source, SOURCES, folder)
+        frontend = self.touch.frontend
+        frontend = frontend and resolved_plugin(frontend, TOUCH, folder)
+        touch = {"reports": self.touch.reports.resolved(folder), "frontend": frontend}
+        parts["touch"] = self.touch.model_copy(update=touch)
         parts["score"] = self.score.model_copy(update={"relations": relations and folder / relations})
         return self.model_copy(update=parts)
 
@@ -108,5 +120,7 @@ def load_config(path: str | os.PathLike[str], assignments: Sequence[str] = ()) -
     Raises:
         InputErrors: all errors in it, each with file, line and column.
     """
-    config = validate(load(path, assignments), RunConfig)
+    document = load(path, assignments)
+    config = validate(document, RunConfig)
+    check_plugins(document, config)
     return config.with_absolute_paths(Path(path).parent.resolve())

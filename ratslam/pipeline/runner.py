@@ -15,6 +15,7 @@ import numpy as np
 
 from evaluation.artifacts.run_directory import read_run
 from evaluation.metrics.energy_metric import read_relations
+from evaluation.metrics.registry import build_metrics
 from evaluation.metrics.scorecard import Scorecard, score_run
 from evaluation.metrics.trajectory import write_tum
 from evaluation.report import plot_writers
@@ -77,7 +78,9 @@ class Runner:
             self._odometry_pose = compose(self._odometry_pose, np.array(observation.odometry[:3], float))
             odometry.append(self._odometry_pose)
             self._truth.append(np.nan if sample.truth is None else sample.truth)
-        self._directory.append(_lines(samples, steps, odometry, BACKENDS[self._config.backend]))
+        self._directory.append(
+            _lines(samples, steps, odometry, BACKENDS.get(self._config.backend, "backend"))
+        )
         error = self._online_error.update(self.session, self._truth.rows)
         if error is not None:
             self._directory.append({"online_error.csv": f"{float(samples[-1].time)!r},{error!r}\n"})
@@ -105,6 +108,7 @@ class Runner:
             directory.path.name,
             exm=config.score.experience_metric,
             relations=read_relations(config.score.relations) if config.score.relations else None,
+            metrics=build_metrics(config.score.metrics),
         )
         directory.text("scorecard.json", card.model_dump_json(indent=2) + "\n")
         for name, save in plot_writers(directory.path).items():
@@ -138,12 +142,13 @@ def open_runner(
     """
     if config.score.relations:
         read_relations(config.score.relations)  # fails before the directory is created
+    build_metrics(config.score.metrics)
     session = session or build_session(config, source)
     skip = _resume(session, resume, source.digest) if resume else 0
     if source.length is not None and source.length <= skip:
         found = f"already holds all {skip} samples of {source.name}"
         raise InputError(str(resume), found, "that of an unfinished run")
-    with RunDirectory(directory, BACKENDS[config.backend].columns()) as files:
+    with RunDirectory(directory, BACKENDS.get(config.backend, "backend").columns()) as files:
         text = dump(config)
         files.text("config.yaml", text)
         manifest = _manifest(config, text, source, resume)

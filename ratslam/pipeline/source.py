@@ -10,9 +10,11 @@ from ratslam.config.run_config import RunConfig
 from robot.recordings.formats import open_recording
 from robot.simulation.create.session import CreateSimulation
 from robot.simulation.head.session import HeadSimulation
+from robot.sources.registry import SOURCES
 from robot.sources.source import Sample, Source
 from robot.touch_source import observation_of, open_touch_source
 from tactile.base.errors import InputError
+from tactile.base.plugins import read_settings
 from tactile.base.types import Observation
 
 
@@ -32,10 +34,18 @@ def open_source(config: RunConfig, report: Callable[[str], None] | None = None) 
         if report is not None:
             report(f"simulating in the {session.tier.name} tier: {session.tier.why}")
         return session
+    if config.source is not None:
+        entry = SOURCES.get(config.source.plugin, "source.plugin")
+        settings = read_settings(entry.config_class, config.source.settings, "source.settings")
+        return entry.open(settings, _warning(report))
     if config.recording is None:
         cure = "`python -m ratslam live` runs it; `run` maps the recording that it makes"
         raise InputError("live", "a live session", "a recording or a simulation", cure)
-    return open_recording(config.recording, report and (lambda sentence: report(f"warning: {sentence}")))
+    return open_recording(config.recording, _warning(report))
+
+
+def _warning(report: Callable[[str], None] | None) -> Callable[[str], None] | None:
+    return report and (lambda sentence: report(f"warning: {sentence}"))
 
 
 @contextmanager

@@ -8,11 +8,11 @@ from pathlib import Path
 from robot.recordings.csv_config import CsvConfig
 from robot.recordings.unit_check import DEFAULT_LIMITS, UnitLimits
 from robot.sources.input_files import require_file
+from robot.sources.registry import SOURCES, SourceEntry, Warn
 from robot.sources.source import Source
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
-
-Warn = Callable[[str], None] | None
+from tactile.base.plugins import read_settings
 
 
 class RecordingConfig(Settings):
@@ -89,10 +89,20 @@ def open_recording(config: RecordingConfig, warn: Warn = None) -> Source:
     Raises:
         InputError: the file is missing, its format is unknown, or it has errors.
     """
-    opener = FORMATS.get(config.file.suffix.lower())
-    if opener is None:
+    suffix = config.file.suffix.lower()
+    if suffix in FORMATS:
+        return FORMATS[suffix](config, warn)
+    registered = _registered_formats()
+    if suffix not in registered:
         require_file(config.file)
-        suffix = config.file.suffix
-        found = f"no reader for {suffix!r} files" if suffix else "a file without a suffix"
-        raise InputError(str(config.file), found, f"one of {', '.join(FORMATS)}")
-    return opener(config, warn)
+        found = f"no reader for {config.file.suffix!r} files" if suffix else "a file without a suffix"
+        raise InputError(str(config.file), found, f"one of {', '.join([*FORMATS, *registered])}")
+    entry = registered[suffix]
+    settings = read_settings(entry.config_class, {"file": str(config.file)}, "recording")
+    return entry.open(settings, warn)
+
+
+def _registered_formats() -> dict[str, SourceEntry]:
+    """The registered sources that read files, by suffix."""
+    entries = [SOURCES.get(name, "recording.file") for name in SOURCES.names()]
+    return {suffix.lower(): entry for entry in entries for suffix in entry.suffixes}

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from types import TracebackType
-from typing import NamedTuple, Protocol, Self, runtime_checkable
+from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
 
 import numpy as np
 
 from robot.sources.source_info import SourceInfo
-from tactile.base.types import Cycle, Observation, Report, Whisk
 
 
 class Sample(NamedTuple):
@@ -17,14 +16,15 @@ class Sample(NamedTuple):
 
     Attributes:
         time: s, on the source's own clock; never decreases.
-        reading: sensor data: an `Observation`, or whisker data that a touch front end turns into one: raw
-            samples (`Cycle`), contact features (`Whisk`) or a motion of the Create (`Report`).
+        reading: sensor data: an `Observation`, or touch that a front end turns into one: raw samples
+            (`Cycle`), contact features (`Whisk`), a motion of the Create (`Report`), or whatever a registered
+            front end takes.
         truth: [3] true pose (x m, y m, heading rad), or None where unknown. It is kept apart from the
             reading so that no backend can use it.
     """
 
     time: float
-    reading: Observation | Cycle | Whisk | Report
+    reading: Any
     truth: np.ndarray | None
 
 

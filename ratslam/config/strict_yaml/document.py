@@ -24,18 +24,26 @@ class Document:
     Attributes:
         data: nested dicts, lists and scalars.
         places: places of all key paths in `data`, including (), in the order of reading.
+        above: keys that lead to `data`, if it is a section of a file.
     """
 
     data: dict[str, Any]
     places: dict[KeyPath, Place]
+    above: KeyPath = ()
+
+    def section(self, path: KeyPath) -> Document:
+        """The section at a path as a document of its own; empty if it is missing."""
+        places = {at[len(path) :]: place for at, place in self.places.items() if at[: len(path)] == path}
+        nearest = {(): self.places[self.nearest(path)]}
+        return Document(self.value(path) or {}, nearest | places, self.above + path)
 
     def at_key(self, path: KeyPath) -> str:
         """`file:line:column: a.b` of a key; of the nearest section above if it is missing."""
-        return label(self.places[self.nearest(path)].key, path)
+        return label(self.places[self.nearest(path)].key, self.above + path)
 
     def at_value(self, path: KeyPath) -> str:
         """`file:line:column: a.b` of a value; of the nearest section above if it is missing."""
-        return label(self.places[path].value, path) if path in self.places else self.at_key(path)
+        return label(self.places[path].value, self.above + path) if path in self.places else self.at_key(path)
 
     def value(self, path: KeyPath) -> Any:
         """The value at a path; None if there is none."""

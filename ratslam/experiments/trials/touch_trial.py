@@ -11,8 +11,7 @@ from functools import lru_cache
 import numpy as np
 
 from evaluation.metrics.session_metrics import SessionResult
-from ratslam.backends.config import select_settings
-from ratslam.backends.registry import BACKENDS, Sensors, build
+from ratslam.backends.registry import Sensors, backend_settings, build
 from ratslam.config.run_config import RunConfig
 from ratslam.core.precision import Precision, prepare_precision
 from ratslam.core.session import Session, capacity_at
@@ -39,7 +38,7 @@ def collect_session(config: RunConfig) -> tuple[RunConfig, InMemorySource]:
 
 def run_session(config: RunConfig, log: InMemorySource) -> SessionResult:
     """Runs a session from memory, with a configuration completed by its source."""
-    method = select_settings(config, BACKENDS[config.backend].config_class)
+    method = backend_settings(config.backend, config)
     reserve = max(capacity_for(log.length), config.session.reserve)
     session = _compiled(config.backend, method, config.session.precision, log.view_shape, reserve)
     session.restart(config.session.seed)

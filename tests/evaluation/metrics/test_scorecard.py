@@ -10,9 +10,11 @@ import pytest
 from evaluation.metrics.energy_metric import Relations
 from evaluation.metrics.experience_metric import ExmConfig
 from evaluation.metrics.metric import Finding, Metric
-from evaluation.metrics.run_metrics import REGISTERED_METRICS, register_metric
+from evaluation.metrics.registry import METRICS, MetricEntry, build_metrics
 from evaluation.metrics.scorecard import Scorecard, render_scorecard, score_run
+from tactile.base.config import Settings
 from tactile.base.errors import InputError
+from tactile.base.plugins import PluginConfig
 
 
 def values(card):
@@ -123,14 +125,29 @@ def test_arrays_of_inconsistent_shapes_are_refused(circle, change, message):
         score_run(circle._replace(**change))
 
 
-def test_a_registered_metric_is_on_the_scorecard(circle):
-    metric = Metric("my_last", "my last x", "m", "low", "Mine", lambda data: Finding(data.run.final[-1, 0]))
-    register_metric(metric)
-    try:
-        with pytest.raises(ValueError, match="exists already"):
-            register_metric(metric)
-        card = score_run(circle)
-        assert card.quantities["my_last"].value == circle.final[-1, 0]
-        assert "Mine\n  my last x" in render_scorecard(card)
-    finally:
-        REGISTERED_METRICS.remove(metric)
+class LastConfig(Settings):
+    row: int = -1
+
+
+def last_x(config):
+    return Metric(
+        "my_last", "my last x", "m", "low", "Mine", lambda data: Finding(data.run.final[config.row, 0])
+    )
+
+
+@pytest.fixture
+def registered(monkeypatch):
+    monkeypatch.setattr(METRICS, "_registered", {"last": MetricEntry(LastConfig, last_x)})
+
+
+def test_a_registered_metric_is_on_the_scorecard(circle, registered):
+    (metric,) = build_metrics([PluginConfig(plugin="last", settings={"row": 3})])
+    card = score_run(circle, metrics=[metric])
+    assert card.quantities["my_last"].value == circle.final[3, 0]
+    assert "Registered metrics\n  my last x" in render_scorecard(card)
+    assert "my_last" not in score_run(circle).quantities
+
+
+def test_a_quantity_has_one_metric(registered):
+    with pytest.raises(InputError, match=r"score.metrics.1: a second quantity named 'my_last'"):
+        build_metrics([PluginConfig(plugin="last")] * 2)

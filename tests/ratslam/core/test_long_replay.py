@@ -129,7 +129,7 @@ def process_source(kind: str, steps: int, folder: Path) -> dict[str, Any]:
         }
     )
     session = build_session(config, source)
-    with RunDirectory(folder, BACKENDS[config.backend].columns()) as store:
+    with RunDirectory(folder, BACKENDS.get(config.backend, "backend").columns()) as store:
         process_source(Runner(config, source, store, {}, session, 0), source)
     (_, early, late), rest = source.moments, 0.9 * steps
     with (folder / "steps.csv").open(encoding="utf-8") as lines:
