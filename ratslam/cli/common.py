@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import shtab
 
+from ratslam.config.packaged import find_config, packaged_configs
+
 if TYPE_CHECKING:
     from ratslam.config.run_config import RunConfig
 
@@ -75,9 +77,12 @@ class Commands:
         return parser
 
 
-def add_config(parser: argparse.ArgumentParser) -> None:
-    """Adds the configuration file and `--set`."""
-    parser.add_argument("config", type=Path, metavar="CONFIG", help="configuration file (YAML)")
+def add_config(parser: argparse.ArgumentParser, what: str = "configuration file (YAML)") -> None:
+    """Adds the configuration, `--list` for those that come with the program, and `--set`."""
+    parser.add_argument(
+        "config", type=Path, metavar="CONFIG", help=f"{what}, or the name of a packaged one (--list)"
+    )
+    parser.add_argument("--list", action=_ListConfigs, help="list the packaged configurations and exit")
     add_set(parser)
 
 
@@ -106,6 +111,19 @@ def positive_integer(text: str) -> int:
     return int(text)
 
 
+class _ListConfigs(argparse.Action):
+    """Prints the packaged configurations and ends the program."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(nargs=0, **options)
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+        configs = packaged_configs()
+        width = max(map(len, configs), default=0)
+        print("\n".join(f"{name:<{width}}  {line}" for name, line in configs.items()))
+        parser.exit()
+
+
 def read_config(arguments: argparse.Namespace) -> RunConfig:
     """The configuration given by the arguments of `add_config`.
 
@@ -114,7 +132,7 @@ def read_config(arguments: argparse.Namespace) -> RunConfig:
     """
     from ratslam.config.run_config import load_config
 
-    return load_config(arguments.config, arguments.set)
+    return load_config(find_config(arguments.config), arguments.set)
 
 
 def prepare_jax(keep_compiled: bool = True) -> None:

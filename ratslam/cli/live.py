@@ -24,7 +24,7 @@ def add_commands(commands: Commands) -> None:
     """Registers the commands of this module."""
     live = commands.add(
         "live", _live, "map while a robot arm carries the whisker head",
-        "live configs/live_maze.yaml --set live.whisks=60", "live",
+        "live live_maze --set live.whisks=60", "live",
     )  # fmt: skip
     add_config(live)
     add_run_directory(live)
@@ -36,7 +36,7 @@ def add_commands(commands: Commands) -> None:
 
     emulate = commands.add(
         "emulate", _emulate, "emulate the arm's controller or the whisker head",
-        "emulate ur10 configs/live_maze.yaml", "live",
+        "emulate ur10 live_maze", "live",
     )  # fmt: skip
     emulate.add_argument(
         "device", choices=("ur10", "head"), help="the arm's controller, or the whisker head in its maze"
@@ -129,7 +129,7 @@ def _read_live_config(
         arguments.set.append(f"live.head.address={head_address}")
     config = read_config(arguments)
     if config.live is None:
-        cure = "configs/live_maze.yaml is an example; `run` maps recordings and simulations"
+        cure = "the packaged `live_maze` is an example; `run` maps recordings and simulations"
         raise InputError(f"{arguments.config}: live", "missing", "settings of a live session", cure)
     return config, config.live
 

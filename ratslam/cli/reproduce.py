@@ -17,6 +17,7 @@ from ratslam.cli.common import (
     prepare_jax,
     read_config,
 )
+from ratslam.config.packaged import find_config
 from tactile.base.errors import InputError
 
 SALMAN2016 = {
@@ -56,7 +57,7 @@ def add_commands(commands: Commands) -> None:
             add_figure(names, name, f"{paper}: {title}")
     threshold = names.add(
         "threshold", _threshold, "Salman & Pearson: threshold tuning, classic method",
-        "reproduce threshold configs/whisker_maze.yaml -o runs/threshold",
+        "reproduce threshold whisker_maze -o runs/threshold",
     )  # fmt: skip
     add_config(threshold)
     add_workers(threshold, 1)
@@ -69,7 +70,7 @@ def add_commands(commands: Commands) -> None:
     add_tables(Commands(tables))
     train = commands.add(
         "train-templates", _train, "record strain templates of a simulated Create",
-        "train-templates configs/create_arena.yaml -o runs/templates.npz", "papers",
+        "train-templates create_arena -o runs/templates.npz", "papers",
     )  # fmt: skip
     add_config(train)
     train.add_argument("-o", "--output", type=Path, required=True, metavar="NPZ", help="the new file")
@@ -170,8 +171,8 @@ def _threshold(arguments: argparse.Namespace) -> int:
     from ratslam.config.strict_yaml import load, override
     from ratslam.experiments.salman2016.threshold_tuning import render_tuning, save_tuning, tune_threshold
 
-    document = override(load(arguments.config), arguments.set)
-    tuning = tune_threshold(document, arguments.config.parent, arguments.workers)
+    path = find_config(arguments.config)
+    tuning = tune_threshold(override(load(path), arguments.set), path.parent, arguments.workers)
     print(render_tuning(tuning))
     if arguments.output:
         plot, table = save_tuning(tuning, arguments.output)

@@ -12,7 +12,7 @@ def add_commands(commands: Commands) -> None:
     """Registers the commands of this module."""
     run = commands.add(
         "run", _run, "map a recording or a simulated session and score it",
-        "run configs/square.yaml -o runs/square", "run",
+        "run square -o runs/square", "run",
     )  # fmt: skip
     add_config(run)
     add_run_directory(run)
@@ -24,7 +24,7 @@ def add_commands(commands: Commands) -> None:
 
     simulate = commands.add(
         "simulate", _simulate, "write a simulated session to a recording",
-        "simulate configs/whisker_maze.yaml -o runs/session.mcap", "run",
+        "simulate whisker_maze -o runs/session.mcap", "run",
     )  # fmt: skip
     add_config(simulate)
     simulate.add_argument("-o", "--output", type=Path, required=True, metavar="MCAP", help="the new file")

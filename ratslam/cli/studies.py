@@ -14,16 +14,16 @@ from ratslam.cli.common import (
     INPUT_ERROR,
     Commands,
     add_config,
-    add_set,
     positive_integer,
     prepare_jax,
     read_config,
 )
+from ratslam.config.packaged import find_config
 from tactile.base.errors import InputError
 
 REPLACED = {
-    "sweep": "study FILE",
-    "frontier": "study FILE, with `report: pareto` in it",
+    "sweep": "study CONFIG",
+    "frontier": "study CONFIG, with `report: pareto` in it",
     "ablate": "study --preset ablate CONFIG",
     "vary": "study --preset vary CONFIG",
     "spread": "study --preset spread CONFIG",
@@ -47,14 +47,13 @@ def add_commands(commands: Commands) -> None:
     """Registers the commands of this module."""
     study = commands.add(
         "study", _study, "run many configurations over seeds and compare them",
-        "study configs/study_maze.yaml", "study",
+        "study study_maze", "study",
     )  # fmt: skip
-    study.add_argument("file", type=Path, help="study file, or a configuration with --preset (YAML)")
+    add_config(study, "study file, or a configuration with --preset (YAML)")
     study.add_argument("--preset", choices=PRESETS, help="make the study from a configuration")
     study.add_argument(
         "--search", action="store_true", help="search parameters by the study's `tune` section"
     )
-    add_set(study)
     study.add_argument(
         "--workers", type=positive_integer, metavar="N",
         help="Dask processes (default: one per core; 1 without Dask and for report: pareto, a measurement)",
@@ -84,9 +83,7 @@ def add_commands(commands: Commands) -> None:
         help="length of a session of --preset tiers, s (default 600)",
     )
 
-    size = commands.add(
-        "size", _size, "recommend settings for a scene", "size configs/whisker_maze.yaml", "study"
-    )
+    size = commands.add("size", _size, "recommend settings for a scene", "size whisker_maze", "study")
     add_config(size)
     size.add_argument(
         "--cycles", type=positive_integer, default=CYCLES, metavar="N",
@@ -167,10 +164,14 @@ def _study(arguments: argparse.Namespace) -> int:
     remarks: list[str] = []
     if arguments.preset:
         study, remarks = preset_study(
-            arguments.preset, arguments.file, arguments.set, by=arguments.by, seconds=arguments.seconds
+            arguments.preset,
+            find_config(arguments.config),
+            arguments.set,
+            by=arguments.by,
+            seconds=arguments.seconds,
         )
     else:
-        study = read_study(arguments.file, arguments.set)
+        study = read_study(find_config(arguments.config), arguments.set)
     error = find_error(arguments.error) if arguments.error else None
     if arguments.search:
         search_plan(study)
@@ -207,7 +208,7 @@ def _growth(arguments: argparse.Namespace) -> int:
     from ratslam.experiments.studies.growth import growth_study
     from ratslam.experiments.studies.growth_report import read_rows, render_growth, run_growth, save_growth
 
-    study = growth_study(arguments.file, arguments.set)
+    study = growth_study(find_config(arguments.config), arguments.set)
     folder = arguments.output or Path("runs") / study.name
     try:
         run_growth(study, folder)

@@ -108,9 +108,9 @@ class RowPlan(Settings):
 
 
 class StudyPlan(Settings):
-    """A study: `python -m ratslam study FILE`."""
+    """A study: `python -m ratslam study CONFIG`."""
 
-    base: Path  # configuration that all runs start from; a relative path starts at the study file
+    base: Path  # configuration of all runs: a path, from the folder of the study file, or a packaged name
     set: dict[str, Any] = Field(default_factory=dict)
     """Settings of all runs, by key path. Relative paths in them start at the base, as its own do."""
     rows: dict[str, RowPlan | None] = Field(default_factory=dict)

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from pydantic import BaseModel
 
+from ratslam.config.packaged import find_config
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import Document, load, open_path, override, validate
 from ratslam.config.strict_yaml.document import KeyPath, Place
@@ -95,7 +96,7 @@ def check_study(name: str, document: Document, folder: Path, overrides: Sequence
     of_runs = [text for text in overrides if not is_study_key(text)]
     keys = [text.partition("=")[0] for text in of_runs]
     _check_unambiguous(plan, document, keys)
-    file = folder / plan.base
+    file = find_config(plan.base, folder)
     base = load(file)
     for key in _outermost_first(plan.set):
         base = _put(base, Setting(key, plan.set[key], ("set", key)), document)
