@@ -15,7 +15,7 @@ SOAK_PARTS := 4
 
 export OMP_NUM_THREADS := 1
 
-.PHONY: run test soak lint bench clean
+.PHONY: run test soak lint bench docs clean
 
 run: $(BASE)
 	@n=1; while [ -e runs/whisker_maze-$$n ]; do n=$$((n + 1)); done; \
@@ -35,6 +35,9 @@ lint: $(DEV)
 
 bench: $(DEV)
 	$(PINNED) $(BIN)/python -m pytest tests/benchmarks --benchmark-only
+
+docs: $(DEV)
+	$(BIN)/python docs/reference.py build/docs
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .hypothesis .benchmarks .ruff_cache .mypy_cache .import_linter_cache

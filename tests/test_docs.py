@@ -18,7 +18,8 @@ ROOT = Path(__file__).parents[1]
 READMES = sorted(
     path
     for path in ROOT.rglob("*.md")
-    if not {".venv", "runs", ".git"} & set(path.relative_to(ROOT).parts) and path.name != "CHANGELOG.md"
+    if not {".venv", "runs", "build", ".git"} & set(path.relative_to(ROOT).parts)
+    and path.name != "CHANGELOG.md"
 )
 
 
@@ -95,3 +96,20 @@ def test_files_of_the_equations_exist() -> None:
     files = re.findall(r"`([\w/]+(?:\.py|/))`", text[text.index("## Equations and files") :])
     assert len(files) > 20
     assert [file for file in files if not (ROOT / file).exists()] == []
+
+
+@pytest.mark.soak
+def test_the_reference_is_built_without_warnings(tmp_path: Path) -> None:
+    pytest.importorskip("pdoc", reason="of the extra [docs]")
+    command = [sys.executable, str(ROOT / "docs" / "reference.py"), str(tmp_path)]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    for page in (
+        "index",
+        "ratslam/config/packaged",
+        "tactile/base/types",
+        "robot/sources",
+        "evaluation/metrics",
+    ):
+        assert (tmp_path / f"{page}.html").is_file()

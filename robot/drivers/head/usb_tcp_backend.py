@@ -109,12 +109,12 @@ class SocketBackend:
     def release_interface(self, dev_handle: Handle, intf: int) -> None:
         self._request(dev_handle, Op.RELEASE)
 
-    def bulk_write(self, dev_handle: Handle, ep: int, intf: int, data: array[int], timeout: int) -> int:
+    def bulk_write(self, dev_handle: Handle, ep: int, intf: int, data: array, timeout: int) -> int:
         packet = data.tobytes()
         self._request(dev_handle, Op.BULK, ep, data=packet, timeout=timeout)
         return len(packet)
 
-    def bulk_read(self, dev_handle: Handle, ep: int, intf: int, buff: array[int], timeout: int) -> int:
+    def bulk_read(self, dev_handle: Handle, ep: int, intf: int, buff: array, timeout: int) -> int:
         got = self._request(dev_handle, Op.BULK, ep, size=_size(buff), timeout=timeout)
         return _fill(buff, got)
 
@@ -125,7 +125,7 @@ class SocketBackend:
         bRequest: int,
         wValue: int,
         wIndex: int,
-        data: array[int],
+        data: array,
         timeout: int,
     ) -> int:
         setup = {"request": bRequest, "value": wValue, "index": wIndex, "timeout": timeout}
@@ -190,10 +190,10 @@ def _require_first(*index: int) -> None:
         raise IndexError(f"descriptor {index}: the device has one of each")
 
 
-def _size(buffer: array[int]) -> int:
+def _size(buffer: array) -> int:
     return len(buffer) * buffer.itemsize
 
 
-def _fill(buffer: array[int], data: bytes) -> int:
+def _fill(buffer: array, data: bytes) -> int:
     memoryview(buffer).cast("B")[: len(data)] = data
     return len(data)
