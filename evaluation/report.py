@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from evaluation.artifacts.grid_npz import read_grid, read_grid_truth
 from evaluation.artifacts.run_directory import read_closures, read_run, read_scorecard, read_walls
@@ -16,28 +18,44 @@ from evaluation.plots.map_plot import draw_map
 from evaluation.plots.whisker_plot import draw_whiskers
 from tactile.base.se2 import between
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
-def plot_writers(directory: Path) -> dict[str, Callable[[Path], None]]:
-    """The plots of a scored run: file name -> function that saves the plot to a path.
 
-    Every run has `map.png`, runs with whiskers also `whiskers.png` and `experiences.png`, runs with a grid
-    map also `grid.png`. Equal directories give equal bytes.
+def run_plots(directory: Path) -> dict[str, Callable[[], Figure]]:
+    """The plots of a scored run: name -> function that draws the plot.
+
+    Every run has `map`, runs with whiskers also `whiskers` and `experiences`, runs with a grid map also
+    `grid`.
 
     Raises:
         InputError: a file is missing or malformed.
     """
     run, card = read_run(directory), read_scorecard(directory)
     walls, closures = read_walls(directory), read_closures(directory)
-    writers: dict[str, Callable[[Path], None]] = {
-        "map.png": lambda path: draw_map(run, card, walls, closures).savefig(path)
-    }
+    plots: dict[str, Callable[[], Figure]] = {"map": lambda: draw_map(run, card, walls, closures)}
     if (directory / "views.npz").exists():
         images = read_whisker_views(directory / "views.npz")
-        writers["whiskers.png"] = lambda path: draw_whiskers(run, card, images, walls).savefig(path)
-        writers["experiences.png"] = lambda path: draw_experience_history(run, card).savefig(path)
+        plots["whiskers"] = lambda: draw_whiskers(run, card, images, walls)
+        plots["experiences"] = lambda: draw_experience_history(run, card)
     if (directory / "grid.npz").exists():
-        writers["grid.png"] = lambda path: draw_grid(_grid_panel(directory, run)).savefig(path)
-    return writers
+        plots["grid"] = lambda: draw_grid(_grid_panel(directory, run))
+    return plots
+
+
+def plot_writers(directory: Path) -> dict[str, Callable[[Path], None]]:
+    """The plots of `run_plots` as files: file name -> function that saves the plot to a path.
+
+    Equal directories give equal bytes.
+
+    Raises:
+        InputError: a file is missing or malformed.
+    """
+    return {f"{name}.png": partial(_save, draw) for name, draw in run_plots(directory).items()}
+
+
+def _save(draw: Callable[[], Figure], path: Path) -> None:
+    draw().savefig(path)
 
 
 def _grid_panel(directory: Path, run: RunArrays) -> GridPanel:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple, Protocol
 
+import numpy as np
+
 from robot.simulation.create.session import CreateSimulationConfig, train_strain_templates
 from robot.sources.source import ClosedSource, Sample, Source
 from robot.sources.source_info import SourceInfo
@@ -36,6 +38,12 @@ class ReadingProcessor(Protocol):
     def observe(self, reading: Any) -> Observation | None:
         """The observation of a reading, or None if its motion is added to the next one."""
 
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What it remembers of earlier readings, for a checkpoint."""
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """Replaces what it remembers by that of `arrays`."""
+
 
 class TouchEntry(NamedTuple):
     """A registered touch front end.
@@ -60,6 +68,9 @@ class TouchSource(ClosedSource):
         source: the source of readings. start: returns a new front end; called for every iteration.
         where: configuration key of the whiskers, for errors.
 
+    Attributes:
+        start: as given.
+
     Raises:
         InputError: source and front end have different numbers of whiskers.
     """
@@ -70,13 +81,13 @@ class TouchSource(ClosedSource):
             raise InputError(
                 where, f"{first.whiskers} whiskers", f"{source.whiskers}, those of {source.name}"
             )
-        self.source, self._start = source, start
+        self.source, self.start = source, start
         self.name, self.rate_hz, self.digest = source.name, source.rate_hz, source.digest
         self.view_shape, self.whiskers, self.length = first.view_shape, source.whiskers, source.length
         self.info = source.info.model_copy(update={"raw_whiskers": False})
 
     def __iter__(self) -> Iterator[Sample]:
-        frontend = self._start()
+        frontend = self.start()
         for sample in self.source:
             reading = frontend.observe(sample.reading)
             if reading is None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.plugins import PluginConfig
@@ -69,3 +71,10 @@ class Frontend:
         if isinstance(reading, Report):
             raise InputError("recording.file", "reports of a Create", "whisk cycles of a head")
         return whisk_observation(self.config.image, self.head, self.features(reading))
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Nothing: the front end has no memory between readings."""
+        return {}
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """Changes nothing."""

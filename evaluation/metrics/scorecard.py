@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from html import escape
+from typing import NamedTuple
 
 import numpy as np
 
@@ -70,20 +72,48 @@ def score_log(log: ExperienceLog, name: str = "log", *, exm: ExmConfig = DEFAULT
     return Scorecard(name=name, exm=exm, quantities=quantities)
 
 
+class Line(NamedTuple):
+    """One line of a table of quantities, as text.
+
+    Attributes:
+        label, value, unit, note: of the quantity; "as above" for a note that repeats. odometry: value of raw
+            odometry, "" without one.
+    """
+
+    label: str
+    value: str
+    unit: str
+    odometry: str
+    note: str
+
+
+def scorecard_lines(card: Scorecard) -> dict[str, list[Line]]:
+    """The lines of a scorecard's table under the heading of each section."""
+    known, sections = {metric.name: metric.section for metric in RUN_METRICS}, {}
+    found = [(known.get(name, REGISTERED), quantity) for name, quantity in card.quantities.items()]
+    for section in dict.fromkeys(section for section, _ in found):
+        shown = [quantity for of, quantity in found if of == section]
+        sections[section] = [_line(q, above) for above, q in zip([None, *shown], shown, strict=False)]
+    return sections
+
+
 def render_scorecard(card: Scorecard) -> str:
     """The scorecard as a text table: quantity, value, unit, value of raw odometry, note."""
     width = max(len(quantity.label) for quantity in card.quantities.values()) + 2
     lines = [f"{card.name:<{width + 2}}{'value':>9}  {'unit':<8} {'odometry':>9}"]
-    sections = {metric.name: metric.section for metric in RUN_METRICS}
-    found = [(sections.get(name, REGISTERED), quantity) for name, quantity in card.quantities.items()]
-    for section in dict.fromkeys(section for section, _ in found):
-        shown = [quantity for of, quantity in found if of == section]
+    for section, shown in scorecard_lines(card).items():
         lines += ["", section]
-        for above, q in zip([None, *shown], shown, strict=False):
-            raw = "" if q.odometry is None else _text(q.odometry)
-            note = "as above" if above and q.note and q.note == above.note else q.note
-            lines.append(f"  {q.label:<{width}}{_text(q.value):>9}  {q.unit:<8} {raw:>9}  {note}".rstrip())
+        for label, value, unit, odometry, note in shown:
+            lines.append(f"  {label:<{width}}{value:>9}  {unit:<8} {odometry:>9}  {note}".rstrip())
     return "\n".join(lines)
+
+
+def scorecard_html(card: Scorecard) -> str:
+    """The scorecard as an HTML table with the same columns; its texts are escaped."""
+    rows = [_html_row("th", (card.name, "value", "unit", "odometry", ""))]
+    for section, shown in scorecard_lines(card).items():
+        rows += [_html_row("th", (section, "", "", "", "")), *(_html_row("td", line) for line in shown)]
+    return f"<table>{''.join(rows)}</table>"
 
 
 def render_health(card: Scorecard) -> str:
@@ -94,6 +124,16 @@ def render_health(card: Scorecard) -> str:
     if found.value > DOUBTED:
         return f"health: map_doubted, {found.value:.0%} likely worse than odometry, which is given instead"
     return f"health: map {1 - found.value:.0%} likely no worse than odometry"
+
+
+def _line(quantity: Quantity, above: Quantity | None) -> Line:
+    raw = "" if quantity.odometry is None else _text(quantity.odometry)
+    note = "as above" if above and quantity.note and quantity.note == above.note else quantity.note
+    return Line(quantity.label, _text(quantity.value), quantity.unit, raw, note)
+
+
+def _html_row(cell: str, texts: tuple[str, ...]) -> str:
+    return f"<tr>{''.join(f'<{cell}>{escape(text)}</{cell}>' for text in texts)}</tr>"
 
 
 def _text(value: float | int | None) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, NonNegativeInt, ValidationInfo, field_validator
 
@@ -52,6 +52,8 @@ class ScoreConfig(Settings):
 class SourceConfig(Settings):
     """The source of a run, exactly one of five, and the processing of whisker readings to views."""
 
+    fewest_sources: ClassVar[int] = 1
+    """Least number of sources: 0 where the caller brings the readings."""
     recording: RecordingConfig | None = None
     """A recording."""
     simulation: SimulationConfig | None = None
@@ -71,7 +73,7 @@ class SourceConfig(Settings):
         names = ("recording", "simulation", "create_simulation", "source")
         sources = {name: info.data.get(name) for name in names} | {"live": live}
         given = [name for name, source in sources.items() if source is not None]
-        if all(name in info.data for name in names) and len(given) != 1:
+        if all(name in info.data for name in names) and not cls.fewest_sources <= len(given) <= 1:
             there = " and ".join(given) if given else f"neither {', '.join(names)} nor live"
             raise ValueError(f"{there}; give one of these five, and null for the others")
         return live
@@ -111,16 +113,25 @@ class RunConfig(RecallBackendConfig, ClassicBackendConfig, GridBackendConfig, So
         return self.model_copy(update=parts)
 
 
-def load_config(path: str | os.PathLike[str], assignments: Sequence[str] = ()) -> RunConfig:
+class LoopConfig(RunConfig):
+    """The configuration of one's own loop (`ratslam.Slam`): that of a run, with or without a source."""
+
+    fewest_sources = 0
+
+
+def load_config(
+    path: str | os.PathLike[str], assignments: Sequence[str] = (), *, source_required: bool = True
+) -> RunConfig:
     """Reads a configuration file; its relative paths start at its folder.
 
     Args:
         assignments: settings to replace, each `a.b=value`.
+        source_required: whether a configuration without a source is an error; `ratslam.Slam` needs none.
 
     Raises:
         InputErrors: all errors in it, each with file, line and column.
     """
     document = load(path, assignments)
-    config = validate(document, RunConfig)
+    config = validate(document, RunConfig if source_required else LoopConfig)
     check_plugins(document, config)
     return config.with_absolute_paths(Path(path).parent.resolve())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import islice
@@ -111,9 +112,14 @@ def open_recorder(path: Path, source: Source) -> Recorder:
 def catch_interrupt(last_task: str) -> Iterator[Callable[[], bool]]:
     """Yields a function that returns whether Ctrl-C was pressed; a second Ctrl-C raises `KeyboardInterrupt`.
 
+    In a thread other than the main one Ctrl-C is not caught.
+
     Args:
         last_task: printed at the first Ctrl-C: the work left before the program ends.
     """
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
     pressed: list[int] = []
 
     def press(number: int, frame: Any) -> None:

@@ -74,8 +74,11 @@ class RunDirectory:
         write_atomically(self.path / name, write)
 
 
-def read_checkpoint(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of a map.npz.
+def read_checkpoint(path: Path, expected: str = "the map.npz of a run directory") -> dict[str, np.ndarray]:
+    """The arrays of a checkpoint.
+
+    Args:
+        expected: kind of checkpoint, for errors.
 
     Raises:
         InputError: there is no such file, or it is not a complete checkpoint.
@@ -84,9 +87,9 @@ def read_checkpoint(path: Path) -> dict[str, np.ndarray]:
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
     except FileNotFoundError:
-        raise InputError(str(path), "no such file", "the map.npz of a run directory") from None
+        raise InputError(str(path), "no such file", expected) from None
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(str(path), f"not a checkpoint ({error})", "the map.npz of a run directory") from None
+        raise InputError(str(path), f"not a checkpoint ({error})", expected) from None
     if "steps" not in arrays:
-        raise InputError(str(path), "an archive of other arrays", "the map.npz of a run directory")
+        raise InputError(str(path), "an archive of other arrays", expected)
     return arrays

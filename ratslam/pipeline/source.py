@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from ratslam.config.completion import complete
-from ratslam.config.run_config import RunConfig
+from ratslam.config.run_config import RunConfig, load_config
 from robot.recordings.formats import open_recording
 from robot.simulation.create.session import CreateSimulation
 from robot.simulation.head.session import HeadSimulation
@@ -17,16 +19,35 @@ from tactile.base.errors import InputError
 from tactile.base.plugins import read_settings
 from tactile.base.types import Observation
 
+Config = str | os.PathLike[str] | RunConfig
+"""A configuration, its file, or its name."""
 
-def open_source(config: RunConfig, report: Callable[[str], None] | None = None) -> Source:
-    """The recording or simulation of a configuration with absolute paths.
+
+def read_config(config: Config, *, source_required: bool = True) -> RunConfig:
+    """The configuration with absolute paths; those of a `RunConfig` start at the working folder.
+
+    Args:
+        source_required: whether a file without a source is an error.
+
+    Raises:
+        InputErrors: all errors in the file.
+    """
+    if isinstance(config, RunConfig):
+        return config.with_absolute_paths(Path.cwd())
+    return load_config(config, source_required=source_required)
+
+
+def open_source(config: Config, report: Callable[[str], None] | None = None) -> Source:
+    """The recording or simulation of a configuration, a context manager; readings are as recorded.
 
     Args:
         report: called with one sentence about the fidelity of a simulation, or if a recording is incomplete.
 
     Raises:
-        InputError: the source cannot be read or simulated, or is a live session.
+        InputErrors: the configuration has errors.
+        InputError: the source cannot be read or simulated, is a live session, or there is none.
     """
+    config = read_config(config)
     if config.create_simulation is not None:
         return CreateSimulation(config.create_simulation)
     if config.simulation is not None:
@@ -38,6 +59,9 @@ def open_source(config: RunConfig, report: Callable[[str], None] | None = None) 
         entry = SOURCES.get(config.source.plugin, "source.plugin")
         settings = read_settings(entry.config_class, config.source.settings, "source.settings")
         return entry.open(settings, _warning(report))
+    if config.recording is None and config.live is None:
+        cure = "ratslam.Slam takes `info` instead: the source of the readings, or a SourceDescription"
+        raise InputError("config", "no source", "a recording or a simulation", cure)
     if config.recording is None:
         cure = "`python -m ratslam live` runs it; `run` maps the recording that it makes"
         raise InputError("live", "a live session", "a recording or a simulation", cure)

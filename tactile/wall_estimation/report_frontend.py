@@ -162,6 +162,20 @@ class ReportFrontend:
             wall_sd=np.float64(wall.sd),
         )
 
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The slow drive and the motion of the BACK step that the next report continues, for a checkpoint."""
+        back = {} if self._back is None else {"back": np.array(self._back, np.float64)}
+        if self._slow is None:
+            return back
+        strain = {f"strain/{k:06}": part for k, part in enumerate(self._slow.strain)}
+        return back | strain | {"first": self._slow.first, "travel": self._slow.travel}
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """Continues after the reports of a front end whose `arrays` these are."""
+        self._back = Odometry(*arrays["back"]) if "back" in arrays else None
+        strain = tuple(arrays[name] for name in sorted(arrays) if name.startswith("strain/"))
+        self._slow = _Slow(arrays["first"], arrays["travel"], strain) if "first" in arrays else None
+
     def _estimate_wall(self, report: Report) -> Wall:
         """Estimates the wall at the end of the step and stores the state for the next one."""
         slow, self._slow = self._slow, None

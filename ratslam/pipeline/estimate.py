@@ -1,0 +1,69 @@
+"""The estimate of a pose with its covariance, place and health, as users of the library get it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from evaluation.metrics.run_metrics import DOUBTED
+from ratslam.core.session import Step
+
+
+class Health(NamedTuple):
+    """How far a map can be believed, judged without truth.
+
+    Attributes:
+        doubt: probability that the map's error is worse than odometry's; NaN if the method does not judge it.
+    """
+
+    doubt: float = np.nan
+
+    @property
+    def doubted(self) -> bool:
+        """Whether the map is more likely bad than the limit of `evaluation.metrics.run_metrics` allows; final
+        trajectories are then odometry."""
+        return self.doubt > DOUBTED
+
+
+class PoseEstimate(NamedTuple):
+    """The robot's pose after a step.
+
+    Attributes:
+        pose: [3] in the map frame at that time: x m, y m, heading rad.
+        covariance: [3, 3] of the pose in the map frame, m², m rad, rad²: the spread of the backend's
+            estimate, without the uncertainty of the map.
+        place: id of the current place, -1 before the first and for methods without places.
+        outcome: what the method did in this step, by name, as in `steps.csv`; "" before the first.
+        health: of the map, judged some steps ago.
+        lost: whether the method has lost track of the robot's position.
+    """
+
+    pose: np.ndarray
+    covariance: np.ndarray
+    place: int
+    outcome: str
+    health: Health
+    lost: bool
+
+
+START = PoseEstimate(np.zeros(3), np.zeros((3, 3)), -1, "", Health(), False)
+"""The estimate before the first step."""
+
+
+def pose_estimate(step: Step, outcome: str) -> PoseEstimate:
+    """The estimate of a session's step.
+
+    Args:
+        outcome: name of the outcome in the step's evidence.
+    """
+    estimate = step.estimate
+    pose = np.array(step.pose, np.float64)
+    # The spread is along the axes of the backend's own frame, which may be turned against the map's.
+    turn = pose[2] - float(estimate.pose[2])
+    cos, sin = np.cos(turn), np.sin(turn)
+    rotation = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    spread = rotation * np.asarray(estimate.spread, np.float64)
+    return PoseEstimate(
+        pose, spread @ spread.T, int(estimate.place), outcome, Health(float(step.doubt)), bool(estimate.lost)
+    )

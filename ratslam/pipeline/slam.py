@@ -1,0 +1,222 @@
+"""Localisation and mapping in a loop of one's own: readings go in one at a time, estimates come out."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ratslam.backends.registry import BACKENDS
+from ratslam.config.completion import complete
+from ratslam.config.run_config import LoopConfig, RunConfig
+from ratslam.config.strict_yaml import dump, parse, validate
+from ratslam.core.backend import Map
+from ratslam.core.checkpoint import with_prefix
+from ratslam.pipeline.estimate import START, Health, PoseEstimate, pose_estimate
+from ratslam.pipeline.run_directory import read_checkpoint
+from ratslam.pipeline.runner import build_session
+from ratslam.pipeline.source import Config, open_source, read_config
+from robot.sources.description import SourceDescription, describe
+from robot.sources.source import Sample, Source
+from robot.sources.source_info import SourceInfo
+from robot.touch_source import TouchSource, head_config_of, open_touch_source
+from tactile.base.atomic_write import write_atomically
+from tactile.base.errors import InputError
+from tactile.base.types import Cycle, Observation, Odometry, Report, Whisk, observation
+from tactile.features.whisker_image import view_shape
+from tactile.frontend import TouchConfig
+from tactile.whiskers.head_geometry import ur10_head
+
+ODOMETRY = len(Odometry._fields)
+
+
+class Slam:
+    """A session with its configuration and its touch front end. The kernel is compiled when it is made.
+
+    Steps equal those of `ratslam.run` to the bit if the configuration names the source or `info` is the
+    source: rows of memory are reserved by its length.
+
+    Args:
+        config: a configuration, its file, or its name; of a run, or without a source.
+        info: the source of the readings, or a `SourceDescription`, or the `SourceInfo` of whiskers. None: the
+            source of the configuration, which is opened and closed again.
+
+    Attributes:
+        config: completed for the source. source: description of the readings. session: the backend's session.
+        estimate: of the last step.
+
+    Raises:
+        InputErrors: the configuration has errors.
+        InputError: the configuration names no source and there is no `info`, or they do not fit each other.
+    """
+
+    def __init__(self, config: Config, info: Source | SourceInfo | None = None) -> None:
+        config = read_config(config, source_required=False)
+        if info is None:
+            with open_source(config) as source:
+                self._build(complete(config, source), source)
+        else:
+            source = describe_whiskers(info, config.touch) if isinstance(info, SourceInfo) else info
+            self._build(complete(config, source), source)
+        self.session.warm(self._blank)
+
+    def _build(self, config: RunConfig, source: Source) -> None:
+        observed = open_touch_source(source, config.touch)
+        self.config, self.source = config, describe(source)
+        self.session = build_session(config, observed)
+        self.estimate = START
+        self._frontend = observed.start() if isinstance(observed, TouchSource) else None
+        self._blank = observation(
+            Odometry(0.0, 0.0, 0.0, 0.0), view_shape=observed.view_shape, whiskers=observed.whiskers
+        )
+
+    @property
+    def map(self) -> Map:
+        """The map of the session."""
+        return self.session.map
+
+    @property
+    def steps(self) -> int:
+        """Number of observations so far."""
+        return self.session.steps
+
+    def step(self, reading: Sample | Observation | Cycle | Whisk | Report) -> PoseEstimate:
+        """Folds the next reading into the map; whisker readings go through the touch front end.
+
+        Args:
+            reading: of the described source. The truth and the time of a `Sample` are not used.
+
+        Returns:
+            the estimate after it; that of the step before if the front end adds the motion of the reading to
+            the next one (`touch.reports.fold_back`).
+
+        Raises:
+            InputError: the reading has other shapes or types than described, or numbers that are not finite;
+                the session is then as before.
+        """
+        observed = self._observe(reading.reading if isinstance(reading, Sample) else reading)
+        if observed is not None:
+            step = self.session.step(match_observation(observed, self._blank))
+            outcome = BACKENDS[self.config.backend].outcomes(int(step.evidence.outcome))
+            self.estimate = pose_estimate(step, outcome.name.lower())
+        return self.estimate
+
+    def trajectory(self) -> np.ndarray:
+        """[T, 3] poses of all steps, best estimate at this time: the optimised map, or odometry if that is
+        doubted; x m, y m, heading rad."""
+        return self.map.trajectory() if self.steps else np.zeros((0, 3))
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Writes a checkpoint (NumPy's .npz) with the configuration and the description of the source.
+
+        Args:
+            path: of the file; its folder is made, and an older file is replaced.
+        """
+        before = self.estimate
+        arrays: dict[str, Any] = self.session.arrays() | {
+            "config": np.array(dump(self.config)),
+            "source": np.array(self.source.to_json()),
+            "estimate/pose": before.pose,
+            "estimate/covariance": before.covariance,
+            "estimate/place": np.array(before.place),
+            "estimate/outcome": np.array(before.outcome),
+            "estimate/doubt": np.array(before.health.doubt),
+            "estimate/lost": np.array(before.lost),
+        }
+        memory = {} if self._frontend is None else self._frontend.arrays()
+        arrays |= {f"frontend/{name}": value for name, value in memory.items()}
+        file = Path(path)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(file, lambda temporary: _write_arrays(temporary, arrays))
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Slam:
+        """Continues from a checkpoint made by `save`, to the same bits; the first step compiles.
+
+        Raises:
+            InputError: there is no such file, or `save` did not write it.
+        """
+        expected = "a checkpoint written by Slam.save"
+        arrays = read_checkpoint(Path(path), expected)
+        slam = cls.__new__(cls)
+        try:
+            config = validate(parse(str(arrays["config"]), str(path)), LoopConfig)
+            slam._build(config, SourceDescription.from_json(str(arrays["source"])))
+            slam._restore(arrays)
+        except KeyError as error:
+            raise InputError(str(path), f"a checkpoint without {error}", expected) from None
+        except InputError:
+            raise
+        except ValueError as error:
+            raise InputError(str(path), str(error), expected) from None
+        return slam
+
+    def _restore(self, arrays: dict[str, np.ndarray]) -> None:
+        self.session.restore(arrays)
+        last = with_prefix(arrays, "estimate/")
+        self.estimate = PoseEstimate(
+            last["pose"],
+            last["covariance"],
+            int(last["place"]),
+            str(last["outcome"]),
+            Health(float(last["doubt"])),
+            bool(last["lost"]),
+        )
+        if self._frontend is not None:
+            self._frontend.restore(with_prefix(arrays, "frontend/"))
+
+    def _observe(self, reading: Observation | Cycle | Whisk | Report) -> Observation | None:
+        if isinstance(reading, Observation):
+            return reading
+        if self._frontend is None:
+            cure = "describe the whiskers in SourceInfo, with raw_whiskers=True"
+            raise InputError("reading", f"a {type(reading).__name__}", "an Observation", cure)
+        return self._frontend.observe(reading)
+
+
+def match_observation(given: Observation, like: Observation) -> Observation:
+    """The observation with the dtypes of another one.
+
+    Raises:
+        InputError: an array has another shape, another kind of numbers, or numbers that are not finite.
+    """
+    names = (*(f"odometry.{name}" for name in Odometry._fields), *Observation._fields[1:])
+    pairs = zip((*given.odometry, *given[1:]), (*like.odometry, *like[1:]), strict=True)
+    matched = [_match_array(name, value, other) for name, (value, other) in zip(names, pairs, strict=True)]
+    return Observation(Odometry(*matched[:ODOMETRY]), *matched[ODOMETRY:])
+
+
+def _match_array(name: str, value: Any, like: np.ndarray) -> np.ndarray:
+    found = np.asarray(value)
+    if found.shape != like.shape:
+        raise InputError(name, f"shape {found.shape}", f"{like.shape}, as described")
+    if not np.can_cast(found.dtype, like.dtype, "same_kind"):
+        raise InputError(name, f"numbers of type {found.dtype}", str(like.dtype))
+    if found.dtype.kind == "f" and not np.isfinite(found).all():
+        raise InputError(name, "a number that is not finite", "finite numbers", "mask what is missing")
+    return found.astype(like.dtype)
+
+
+def describe_whiskers(info: SourceInfo, touch: TouchConfig) -> SourceDescription:
+    """The description of whiskers, whose view shape follows from their number.
+
+    Raises:
+        InputError: there are no whiskers, or the settings in `touch.head` do not fit the head.
+    """
+    if info.planar_whiskers is not None:
+        count = len(info.planar_whiskers.mounts)
+        return SourceDescription((1, count, 1), count, info=info)
+    if info.head is None:
+        cure = "give the source itself, or a SourceDescription with the view shape"
+        raise InputError(
+            "info", "a SourceInfo without whiskers", "one with `head` or `planar_whiskers`", cure
+        )
+    head = ur10_head(head_config_of(info, touch.head))
+    return SourceDescription(view_shape(touch.image, head), len(head.length), info=info)
+
+
+def _write_arrays(path: Path, arrays: dict[str, Any]) -> None:
+    with path.open("wb") as file:  # with a path, NumPy would add a suffix
+        np.savez_compressed(file, **arrays)
