@@ -56,8 +56,9 @@ def test_root_readme_is_short() -> None:
 
 
 def test_tests_use_no_private_names() -> None:
-    """Attributes and imports with a leading underscore; those of named tuples and `os._exit` are public."""
-    allowed = {"_replace", "_asdict", "_fields", "_make", "_exit"}
+    """Attributes and imports with a leading underscore; those of named tuples, notebooks and `os._exit` are
+    public."""
+    allowed = {"_replace", "_asdict", "_fields", "_make", "_exit", "_repr_html_"}
     found = []
     for path in sorted((ROOT / "tests").rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

@@ -99,7 +99,7 @@ class Slam:
         observed = self._observe(reading.reading if isinstance(reading, Sample) else reading)
         if observed is not None:
             step = self.session.step(match_observation(observed, self._blank))
-            outcome = BACKENDS[self.config.backend].outcomes(int(step.evidence.outcome))
+            outcome = BACKENDS.get(self.config.backend, "backend").outcomes(int(step.evidence.outcome))
             self.estimate = pose_estimate(step, outcome.name.lower())
         return self.estimate
 
