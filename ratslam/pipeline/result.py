@@ -118,7 +118,7 @@ class Result:
         return file.exists() and json.loads(file.read_text(encoding="utf-8"))["status"] == "interrupted"
 
     def plot(self, name: str = "map") -> Figure:
-        """A plot of the run as a matplotlib figure.
+        """A plot of the run as a matplotlib figure; a notebook shows it after `%matplotlib inline`.
 
         Args:
             name: `map`; with whiskers also `whiskers` and `experiences`, with a grid map also `grid`.

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 import ratslam
+from ratslam.core.session import Step
+from ratslam.pipeline.estimate import pose_estimate
 from ratslam.pipeline.source import open_observations
 from robot.simulation.head.session import HeadSimulation, SimulationConfig
-from tactile.base.types import Report, StepEnd, Whisk
+from tactile.base.types import MotionKind, Report, Whisk
 
 ROOT = Path(__file__).parents[3]
 SESSIONS = {
@@ -55,8 +57,8 @@ def walk(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     slam = ratslam.Slam(config)
     with ratslam.open_source(config) as source:
         samples = list(source)
-    contacts = [number for number, sample in enumerate(samples) if is_first_contact(sample)]
-    saved = {number: folder / "not yet made" / str(number) for number in (len(samples) // 2, *contacts[-1:])}
+    backwards = [number for number, sample in enumerate(samples) if is_back(sample)]
+    saved = {number: folder / "not yet made" / str(number) for number in (len(samples) // 2, *backwards[-1:])}
     estimates = []
     for number, sample in enumerate(samples):
         estimates.append(slam.step(sample))
@@ -66,9 +68,9 @@ def walk(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     return Walk(config, run, slam, samples, estimates, saved)
 
 
-def is_first_contact(sample: ratslam.Sample) -> bool:
-    """Whether the touch front end must remember this reading for the next ones."""
-    return isinstance(sample.reading, Report) and sample.reading.moment == StepEnd.HIT1
+def is_back(sample: ratslam.Sample) -> bool:
+    """Whether the touch front end remembers the motion of this reading for the next one."""
+    return isinstance(sample.reading, Report) and sample.reading.motion == MotionKind.BACK
 
 
 def new_estimates(walk: Walk) -> list[ratslam.PoseEstimate]:
@@ -115,6 +117,14 @@ def test_the_source_and_its_observations_give_the_same_steps(walk: Walk) -> None
             assert isinstance(sample.reading, ratslam.Observation)
             slam.step(sample.reading)
     assert_equal(slam.estimate, new_estimates(walk)[19])
+
+
+def test_the_covariance_is_turned_to_the_map() -> None:
+    """The backend's estimate says along x, and the map is turned by 90° against it."""
+    still = np.int32(0)
+    estimate = ratslam.Estimate(np.zeros(3), np.array([2.0, 1.0, 0.5]), still, still, still, np.bool_(False))
+    found = pose_estimate(Step(estimate, None, np.array([5.0, 0.0, np.pi / 2]), np.nan), "ok")
+    np.testing.assert_allclose(found.covariance, np.diag([1.0, 4.0, 0.25]), atol=1e-12)
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from hypothesis import given
@@ -156,6 +157,26 @@ def test_a_slow_drive_of_several_reports_equals_one_report(templates: StrainTemp
     parts = observe(ReportFrontend(ReportFrontendConfig(), templates), hit, *pieces)
     assert [bool(one.wall) for one in parts] == [False, False, True]
     np.testing.assert_allclose(parts[-1].wall_point, whole.wall_point, atol=1e-9)
+
+
+@pytest.mark.parametrize("after", range(4))
+def test_a_restored_front_end_continues_to_the_same_bits(after: int, templates: StrainTemplates) -> None:
+    hit, slow = met(wall(ANGLE))
+    back = report(motion=MotionKind.BACK, odometry=Odometry(-0.025, 0.01, 0.2, 0.5))
+    cut = report(StepEnd.FREE, contact=(2,), strain=slow.strain[:700])
+    reports = [hit, cut, slow._replace(strain=slow.strain[700:]), back, hit]
+    whole, begun, restored = (
+        ReportFrontend(ReportFrontendConfig(fold_back=True), templates) for _ in range(3)
+    )
+    expected = [whole.observe(one) for one in reports]
+    assert expected[2] is not None
+    assert expected[2].wall
+    for one in reports[: after + 1]:
+        begun.observe(one)
+    restored.observe(hit)  # forgotten by the restoration
+    restored.restore(begun.arrays())
+    for one, other in zip(reports[after + 1 :], expected[after + 1 :], strict=True):
+        jax.tree.map(np.testing.assert_array_equal, restored.observe(one), other)
 
 
 def test_without_hit1_there_is_no_wall(templates: StrainTemplates) -> None:
