@@ -21,7 +21,7 @@ from evaluation.report import run_plots
 from ratslam.config.run_config import RunConfig
 from ratslam.pipeline.estimate import Health
 from ratslam.pipeline.run import run as write_run
-from ratslam.pipeline.source import Config, read_config
+from ratslam.pipeline.source import ConfigLike, resolve_config
 from ratslam.pose_graph.io import read_json
 from tactile.base.errors import InputError
 
@@ -34,7 +34,7 @@ RUNS = Path("runs")
 
 
 def run(
-    config: Config, directory: str | os.PathLike[str] | None = None, *, resume: Path | None = None
+    config: ConfigLike, directory: str | os.PathLike[str] | None = None, *, resume: Path | None = None
 ) -> Result:
     """Maps the source of a configuration, scores the map and plots it, with a progress bar.
 
@@ -52,7 +52,7 @@ def run(
     """
     name = "run" if isinstance(config, RunConfig) else Path(config).stem
     path = new_directory(name) if directory is None else Path(directory)
-    write_run(read_config(config), path, resume)
+    write_run(resolve_config(config), path, resume)
     return Result(path)
 
 

@@ -17,7 +17,7 @@ from ratslam.core.checkpoint import with_prefix
 from ratslam.pipeline.estimate import START, Health, PoseEstimate, pose_estimate
 from ratslam.pipeline.run_directory import read_checkpoint
 from ratslam.pipeline.runner import build_session
-from ratslam.pipeline.source import Config, open_source, read_config
+from ratslam.pipeline.source import ConfigLike, open_source, resolve_config
 from robot.sources.description import SourceDescription, describe
 from robot.sources.source import Sample, Source
 from robot.sources.source_info import SourceInfo
@@ -52,8 +52,8 @@ class Slam:
         InputError: the configuration names no source and there is no `info`, or they do not fit each other.
     """
 
-    def __init__(self, config: Config, info: Source | SourceInfo | None = None) -> None:
-        config = read_config(config, source_required=False)
+    def __init__(self, config: ConfigLike, info: Source | SourceInfo | None = None) -> None:
+        config = resolve_config(config, source_required=False)
         if info is None:
             with open_source(config) as source:
                 self._build(complete(config, source), source)

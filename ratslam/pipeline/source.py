@@ -19,11 +19,11 @@ from tactile.base.errors import InputError
 from tactile.base.plugins import read_settings
 from tactile.base.types import Observation
 
-Config = str | os.PathLike[str] | RunConfig
+ConfigLike = str | os.PathLike[str] | RunConfig
 """A configuration, its file, or its name."""
 
 
-def read_config(config: Config, *, source_required: bool = True) -> RunConfig:
+def resolve_config(config: ConfigLike, *, source_required: bool = True) -> RunConfig:
     """The configuration with absolute paths; those of a `RunConfig` start at the working folder.
 
     Args:
@@ -37,7 +37,7 @@ def read_config(config: Config, *, source_required: bool = True) -> RunConfig:
     return load_config(config, source_required=source_required)
 
 
-def open_source(config: Config, report: Callable[[str], None] | None = None) -> Source:
+def open_source(config: ConfigLike, report: Callable[[str], None] | None = None) -> Source:
     """The recording or simulation of a configuration, a context manager; readings are as recorded.
 
     Args:
@@ -47,7 +47,7 @@ def open_source(config: Config, report: Callable[[str], None] | None = None) -> 
         InputErrors: the configuration has errors.
         InputError: the source cannot be read or simulated, is a live session, or there is none.
     """
-    config = read_config(config)
+    config = resolve_config(config)
     if config.create_simulation is not None:
         return CreateSimulation(config.create_simulation)
     if config.simulation is not None:
