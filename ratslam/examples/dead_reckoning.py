@@ -1,8 +1,8 @@
 """A backend of one's own: dead reckoning that corrects the scale of the odometer's distances.
 
-`python -m ratslam.examples.dead_reckoning` maps the square recording with it and prints
+`python -m ratslam.examples.dead_reckoning` maps the square recording and prints
 
-    dead reckoning: ATE 0.05 m
+    dead reckoning: ATE 0.25 m
 """
 
 from enum import IntEnum
@@ -12,26 +12,25 @@ import jax.numpy as jnp
 import numpy as np
 
 from ratslam.backends.registry import BACKENDS, BackendEntry, Sensors
-from ratslam.core.backend import Backend, Map
+from ratslam.core.backend import Backend
+from ratslam.core.finite_values import finite_values
 from ratslam.core.path_map import PathMap
 from ratslam.core.types import Action, Estimate, Scalar
+from ratslam.examples import stand_in as ratslam
 from tactile.base.config import Settings
 from tactile.base.se2 import compose
 from tactile.base.types import Observation
 
 
 class Config(Settings):
-    scale: float = 1.0
-    """Factor on the distances of the odometry."""
+    scale: float = 1.0  # factor on the distances of the odometry
 
 
-class Outcome(IntEnum):
-    OK = 0
-    NOT_FINITE = 1
+Outcome = IntEnum("Outcome", ["OK", "NOT_FINITE"], start=0)
 
 
 class Evidence(NamedTuple):
-    outcome: Any
+    outcome: Scalar
     distance: Scalar  # a column of steps.csv
 
 
@@ -43,26 +42,18 @@ class DeadReckoning(Backend):
         return jnp.zeros(3, self.dtype)
 
     def kernel(self, state: Any, observation: Observation) -> tuple[Any, Estimate, Evidence]:
-        dx, dy, turn = (jnp.asarray(value, self.dtype) for value in observation.odometry[:3])
-        moved = jnp.stack([self.scale * dx, self.scale * dy, turn])
-        clean = jnp.isfinite(moved).all()
-        pose = compose(state, jnp.where(clean, moved, 0))
-        none, unknown = jnp.int32(-1), jnp.zeros(3, self.dtype)
-        estimate = Estimate(pose, unknown, none, none, jnp.int32(Action.NONE), jnp.bool_(False))
-        outcome = jnp.where(clean, Outcome.OK, Outcome.NOT_FINITE).astype(jnp.int32)
-        return pose, estimate, Evidence(outcome, jnp.hypot(moved[0], moved[1]))
+        (dx, dy, turn, _), *_, clean = finite_values(self.dtype, observation)
+        pose = compose(state, jnp.stack([self.scale * dx, self.scale * dy, turn]))
+        none, outcome = jnp.int32(-1), jnp.where(clean, *map(jnp.int32, Outcome))
+        estimate = Estimate(pose, jnp.zeros_like(pose), none, none, jnp.int32(Action.NONE), ~clean)
+        return pose, estimate, Evidence(outcome, self.scale * jnp.hypot(dx, dy))
 
-    def new_map(self) -> Map:
-        return PathMap()
+    new_map = PathMap
 
 
-ENTRY = BackendEntry(Config, Evidence, Outcome, DeadReckoning)
-"""What a package names in its entry-point group `ratslam.backends`."""
+ENTRY = BackendEntry(Config, Evidence, Outcome, DeadReckoning)  # what an entry point names
 
 if __name__ == "__main__":
-    import ratslam
-
     BACKENDS.register("dead_reckoning", ENTRY)
-    settings = ["backend=dead_reckoning", "backend_settings.scale=0.98"]
-    result = ratslam.run(ratslam.load_config("square", settings))
-    print(f"dead reckoning: ATE {result.scorecard.quantities['ate_final'].value:.2g} m")
+    config = ratslam.load_config("square", ["backend=dead_reckoning", "backend_settings.scale=0.98"])
+    print(f"dead reckoning: ATE {ratslam.run(config).scorecard.quantities['ate_final'].value:.2g} m")
